@@ -1,0 +1,3 @@
+from battery_env.calibration.registration import register_environments
+
+register_environments()

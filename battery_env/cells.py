@@ -1,0 +1,360 @@
+"""
+Recorded discharges of real cells: read them, check them, and put them on the model's time grid.
+
+Two 18650 cells of NASA's battery data set come with the package: ``load_nasa_discharges("B0005")``, ``"B0006"``.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from datetime import datetime, timedelta
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike
+from scipy.io import loadmat
+
+from battery_env.electrochemistry import LOAD_LIMITS, FloatArray
+
+#: How to cite the bundled data.
+NASA_CITATION = (
+    "B. Saha and K. Goebel (2007). Battery Data Set, NASA Ames Prognostics Data Repository, "
+    "NASA Ames Research Center, Moffett Field, CA."
+)
+#: Cells whose discharges come with the package.
+BUNDLED_CELLS: tuple[str, ...] = ("B0005", "B0006")
+
+#: A change of the current between two samples by more than this share of its largest magnitude is a switch of the load,
+#: not a drift; the current is taken to jump midway between the two samples.
+SWITCH_SHARE = 0.1
+
+_MIN_SAMPLES = 5
+_COLUMNS = ("time_s", "voltage_V", "current_A")
+# what cycles.csv tells about each discharge beyond the samples themselves
+_META_COLUMNS = ("test_id", "start_time", "ambient_temperature_C", "capacity_Ah", "Re_ohm", "Rct_ohm")
+# name: least and largest plausible value, unit, what a value beyond usually is
+_PLAUSIBLE: dict[str, tuple[float, float, str, str]] = {
+    "voltage_V": (0.0, 5.5, "V", "Give the voltage of one cell in V, not in mV, and not that of a pack."),
+    "current_A": (-LOAD_LIMITS["current"], LOAD_LIMITS["current"], "A", "Give the current in A, not in mA."),
+    "temperature_C": (-60.0, 150.0, "degC", "Give the temperature in degrees Celsius, not in kelvin."),
+}
+_DURATION_LIMITS_S = (10.0, 1e6)
+
+
+def _checked(name: str, values: ArrayLike) -> FloatArray:
+    try:
+        array = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"{name} must be an array of numbers, got {values!r}") from error
+    if array.ndim != 1 or len(array) < _MIN_SAMPLES:
+        raise ValueError(f"{name} must hold one value a sample, at least {_MIN_SAMPLES} of them; got shape {array.shape}")
+    bad = np.flatnonzero(~np.isfinite(array))
+    if len(bad):
+        raise ValueError(f"{name} must be finite, got {array[bad[0]]} at sample {bad[0]}. Remove or fill such samples.")
+    if name in _PLAUSIBLE:
+        low, high, unit, hint = _PLAUSIBLE[name]
+        bad = np.flatnonzero((array < low) | (array > high))
+        if len(bad):
+            raise ValueError(
+                f"{name} must lie within {low:g} .. {high:g} {unit}, got {array[bad[0]]:g} at sample {bad[0]}. {hint}"
+            )
+    array.setflags(write=False)
+    return array
+
+
+def _knots(time_s: FloatArray, current_A: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The current as a piecewise-linear function of time, whose jumps are two knots at one time."""
+    switches = np.flatnonzero(np.abs(np.diff(current_A)) > SWITCH_SHARE * np.abs(current_A).max())
+    midpoints = 0.5 * (time_s[switches] + time_s[switches + 1])
+    place = np.repeat(switches + 1, 2)
+    sides = np.column_stack([current_A[switches], current_A[switches + 1]]).ravel()
+    return np.insert(time_s, place, np.repeat(midpoints, 2)), np.insert(current_A, place, sides)
+
+
+def drawn_charge_C(time_s: FloatArray, current_A: FloatArray, at_s: ArrayLike) -> FloatArray:
+    """
+    The charge drawn since the first sample. The current is linear between samples, except where the load was switched:
+    there it jumps midway (see ``SWITCH_SHARE``). Beyond the last sample it keeps its last value.
+
+    :param time_s: times of the samples, s, shape (T,)
+    :param current_A: current at the samples, positive in discharge, A, shape (T,)
+    :param at_s: times asked for, none before the first sample, s, any shape
+    :return: charge at these times, C, same shape
+    """
+    t, i = _knots(time_s, current_A)
+    width = np.diff(t)
+    charge = np.concatenate([[0.0], np.cumsum(0.5 * (i[1:] + i[:-1]) * width)])
+    slope = np.append(np.divide(np.diff(i), width, out=np.zeros_like(width), where=width > 0.0), 0.0)
+    n = np.searchsorted(t, at_s, side="right") - 1
+    since = np.asarray(at_s) - t[n]
+    return charge[n] + since * (i[n] + 0.5 * slope[n] * since)
+
+
+def resample_current(time_s: FloatArray, current_A: FloatArray, dt_s: float, n_steps: int) -> FloatArray:
+    """
+    The current on the model's time grid, which starts at the first sample: its mean over each step, so that the charge
+    drawn is kept exactly. A record whose samples lie ``dt_s`` apart, as simulated ones do, is taken as it is: there
+    ``current_A[k]`` is the current over the step that starts at sample k.
+
+    :param time_s: times of the samples, s, shape (T,)
+    :param current_A: current at the samples, positive in discharge, A, shape (T,)
+    :param dt_s: time step of the model, s
+    :param n_steps: number of steps; beyond the last sample the current keeps its last value
+    :return: current over each step, A, shape (n_steps,)
+    """
+    if np.allclose(np.diff(time_s), dt_s, rtol=1e-6, atol=0.0):
+        return current_A[np.minimum(np.arange(n_steps), len(current_A) - 1)]
+    grid_s = time_s[0] + dt_s * np.arange(n_steps + 1)
+    return np.diff(drawn_charge_C(time_s, current_A, grid_s)) / dt_s
+
+
+@dataclass(frozen=True, eq=False)
+class Discharge:
+    """
+    One recorded discharge of one cell; it checks itself when it is made, and its arrays cannot be written to.
+
+    :param time_s: times of the samples, strictly increasing, s, shape (T,)
+    :param voltage_V: terminal voltage, V, shape (T,)
+    :param current_A: current, positive in discharge, A, shape (T,)
+    :param temperature_C: temperature of the cell, degC, shape (T,); ``None`` if it was not measured
+    :param meta: what else is known, e.g. ``cell``, ``cycle``, ``capacity_Ah``, ``start_time``, ``source``
+    :raises ValueError: for arrays that do not fit together, or values that cannot be meant; it says what to do
+    """
+
+    time_s: FloatArray
+    voltage_V: FloatArray
+    current_A: FloatArray
+    temperature_C: FloatArray | None = None
+    meta: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in ("time_s", "voltage_V", "current_A", "temperature_C"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, _checked(name, getattr(self, name)))
+                if len(getattr(self, name)) != len(self.time_s):
+                    raise ValueError(f"{name} has {len(getattr(self, name))} samples, but time_s has {len(self.time_s)}")
+        stalls = np.flatnonzero(np.diff(self.time_s) <= 0.0)
+        if len(stalls):
+            n = stalls[0] + 1
+            raise ValueError(
+                f"time_s must increase from sample to sample, but sample {n} is at {self.time_s[n]:g} s, after "
+                f"{self.time_s[n - 1]:g} s. Give one discharge at a time, and each sample once."
+            )
+        duration_s = self.time_s[-1] - self.time_s[0]
+        if not _DURATION_LIMITS_S[0] <= duration_s <= _DURATION_LIMITS_S[1]:
+            raise ValueError(
+                f"time_s must span {_DURATION_LIMITS_S[0]:g} .. {_DURATION_LIMITS_S[1]:g} s, got {duration_s:g} s. "
+                "Give the time in seconds, not in hours or milliseconds."
+            )
+        if not self.charge_C > 0.0:
+            raise ValueError(
+                f"current_A is positive in discharge, but this record draws {self.charge_C:.6g} C in total. If the tester "
+                "counts discharge as negative, flip the sign (read_discharge_csv: discharge_is_negative=True; command "
+                "line: --discharge-is-negative)."
+            )
+
+    @property
+    def charge_C(self) -> float:
+        """The charge drawn from the first sample to the last, C."""
+        return float(drawn_charge_C(self.time_s, self.current_A, self.time_s[-1]))
+
+    @property
+    def load_on_time_s(self) -> float:
+        """
+        When the load was switched on, s: midway between the last sample at rest and the first one under load, as the
+        switch falls between the two.
+        """
+        first, _ = self._loaded_samples()
+        return float(self.time_s[max(first - 1, 0) : first + 1].mean())
+
+    def _loaded_samples(self) -> tuple[int, int]:
+        loaded = np.flatnonzero(self.current_A > SWITCH_SHARE * self.current_A.max())
+        return int(loaded[0]), int(loaded[-1])
+
+    def eod_time_s(self, cut_off_V: float) -> float:
+        """
+        When the voltage under load first fell to the cut-off, interpolated between the two samples around it.
+
+        :param cut_off_V: cut-off voltage, V
+        :return: the end of discharge on the clock of ``time_s``, s; NaN if the record does not reach it
+        """
+        first, last = self._loaded_samples()
+        below = np.flatnonzero(self.voltage_V[first : last + 1] <= cut_off_V)
+        if not len(below):
+            return float("nan")
+        n = int(first + below[0])
+        if n == first:
+            return float(self.time_s[n])
+        share = (self.voltage_V[n - 1] - cut_off_V) / (self.voltage_V[n - 1] - self.voltage_V[n])
+        return float(self.time_s[n - 1] + share * (self.time_s[n] - self.time_s[n - 1]))
+
+    def loaded_part(self, cut_off_V: float) -> Discharge:
+        """
+        The part that a model of the discharge can be compared with: from load-on to the cut-off, or to the last sample
+        under load if the cut-off is not reached. Its first sample is the moment of switching, with the voltage at rest
+        and the current under load; its last one, at the cut-off, is interpolated.
+
+        :param cut_off_V: cut-off voltage, V
+        :return: that part, on the same clock
+        :raises ValueError: if it has too few samples
+        """
+        first, last = self._loaded_samples()
+        start_s, end_s = self.load_on_time_s, self.eod_time_s(cut_off_V)
+        if np.isnan(end_s):
+            end_s = float(self.time_s[last])
+        time_s = np.concatenate([[start_s], self.time_s[(self.time_s > start_s) & (self.time_s < end_s)], [end_s]])
+        parts = {name: np.interp(time_s, self.time_s, getattr(self, name)) for name in ("voltage_V", "current_A")}
+        parts["voltage_V"][0], parts["current_A"][0] = self.voltage_V[max(first - 1, 0)], self.current_A[first]
+        temperature_C = None if self.temperature_C is None else np.interp(time_s, self.time_s, self.temperature_C)
+        return Discharge(time_s, **parts, temperature_C=temperature_C, meta=self.meta)
+
+    def until(self, time_s: float) -> Discharge:
+        """
+        What had been recorded by some moment.
+
+        :param time_s: that moment, on the clock of the record, s
+        :return: the samples up to then
+        :raises ValueError: if these are too few
+        """
+        n = int(np.searchsorted(self.time_s, time_s, side="right"))
+        temperature_C = None if self.temperature_C is None else self.temperature_C[:n]
+        return Discharge(self.time_s[:n], self.voltage_V[:n], self.current_A[:n], temperature_C, self.meta)
+
+
+def read_discharge_csv(path: str | Path, discharge_is_negative: bool = False) -> Discharge:
+    """
+    Read one discharge from a file of comma-separated values with a header line.
+
+    Columns ``time_s``, ``voltage_V``, ``current_A`` (positive = discharge) and, if measured, ``temperature_C``; others are
+    left aside. A name that ends in .gz, .zip, .bz2 or .xz is unpacked.
+
+    :param path: the file
+    :param discharge_is_negative: whether the file counts the current of a discharge as negative; it is flipped then
+    :return: the discharge; its ``meta`` holds ``source``
+    :raises ValueError: if columns are missing, or the values cannot be meant
+    """
+    table = _read_table(Path(path), _COLUMNS)
+    temperature_C = table["temperature_C"].to_numpy() if "temperature_C" in table else None
+    current_A = table["current_A"].to_numpy()
+    try:
+        current_A = -current_A if discharge_is_negative else current_A
+        return Discharge(
+            table["time_s"].to_numpy(), table["voltage_V"].to_numpy(), current_A, temperature_C, {"source": str(path)}
+        )
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def load_nasa_discharges(path_or_cell: str | Path) -> list[Discharge]:
+    """
+    All discharges of one cell of NASA's battery data set, in the order they were made. Cite it as ``NASA_CITATION``.
+
+    Their ``meta`` holds ``cell``, ``cycle`` (1, 2, ... over the discharges), ``source`` and, as far as the file tells,
+    ``start_time``, ``ambient_temperature_C``, ``capacity_Ah`` (charge to 2.7 V), ``Re_ohm`` and ``Rct_ohm`` (of the impedance
+    test nearest in time) and ``test_id`` (position among all tests of the cell). A discharge that fails the checks of
+    :class:`Discharge` is left out with a warning.
+
+    :param path_or_cell: a cell that comes with the package (``BUNDLED_CELLS``); or one of NASA's own files, such as
+        ``B0018.mat``; or a file of comma-separated values laid out as the bundled ones, with ``cycles.csv`` beside it if
+        there is one
+    :return: one :class:`Discharge` each
+    :raises FileNotFoundError: if there is no such cell or file
+    :raises ValueError: if the file is laid out in another way
+    """
+    if path_or_cell in BUNDLED_CELLS:
+        with as_file(files("battery_env.nasa_cells")) as folder:
+            return _read_nasa_csv(folder / f"{path_or_cell}_discharge.csv.gz")
+    path = Path(path_or_cell)
+    if not path.is_file():
+        raise FileNotFoundError(f"no file {str(path)!r}; the cells that come with the package are {', '.join(BUNDLED_CELLS)}")
+    return _read_nasa_mat(path) if path.suffix.lower() == ".mat" else _read_nasa_csv(path)
+
+
+def _read_table(path: Path, columns: Iterable[str]) -> pd.DataFrame:
+    try:
+        table = pd.read_csv(path)
+    except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is not a file of comma-separated values: {error}") from error
+    missing = [name for name in columns if name not in table]
+    if missing:
+        raise ValueError(
+            f"{path} has no column {', '.join(missing)}; it has {', '.join(map(str, table.columns))}. "
+            f"Name the columns {', '.join(columns)} and separate them by commas."
+        )
+    return table
+
+
+def _read_nasa_csv(path: Path) -> list[Discharge]:
+    table = _read_table(path, ("cycle", *_COLUMNS, "temperature_C"))
+    cell = path.name.split("_")[0].split(".")[0]
+    known: dict[int, dict[str, Any]] = {}
+    summary = path.with_name("cycles.csv")
+    if summary.is_file():
+        tests = _read_table(summary, ("battery_id", "cycle", *_META_COLUMNS))
+        tests = tests.loc[tests["battery_id"] == cell, ["cycle", *_META_COLUMNS]]
+        known = {int(row.pop("cycle")): row for row in tests.to_dict(orient="records")}
+    cycles = table["cycle"].to_numpy(dtype=np.int64)
+    samples = []
+    for cycle in map(int, np.unique(cycles)):
+        part = table[cycles == cycle]
+        arrays = {name: part[name].to_numpy() for name in (*_COLUMNS, "temperature_C")}
+        samples.append((arrays, {"cell": cell, "cycle": cycle, "source": NASA_CITATION, **known.get(cycle, {})}))
+    return _checked_discharges(path, samples)
+
+
+def _read_nasa_mat(path: Path) -> list[Discharge]:
+    content = loadmat(path, simplify_cells=True)
+    cells = {name: value for name, value in content.items() if isinstance(value, dict) and "cycle" in value}
+    if len(cells) != 1:
+        names = ", ".join(name for name in content if not name.startswith("__"))
+        raise ValueError(f"{path} is not laid out as NASA's battery files: of its variables ({names}) one must be a cell")
+    cell, value = next(iter(cells.items()))
+    tests = [(n, test, _start_time(test["time"])) for n, test in enumerate(np.atleast_1d(value["cycle"]))]
+    impedances = [(start, test["data"]) for _, test, start in tests if test["type"] == "impedance"]
+    discharges = [entry for entry in tests if entry[1]["type"] == "discharge"]
+    samples = []
+    for cycle, (n, test, start) in enumerate(discharges, start=1):
+        data = test["data"]
+        meta = {
+            "cell": cell,
+            "cycle": cycle,
+            "source": NASA_CITATION,
+            "test_id": n,
+            "start_time": start.isoformat(timespec="milliseconds"),
+            "ambient_temperature_C": float(test["ambient_temperature"]),
+        }
+        if np.size(data.get("Capacity", [])) == 1:
+            meta["capacity_Ah"] = float(data["Capacity"])
+        if impedances:
+            nearest = min(impedances, key=lambda entry: abs(entry[0] - start))[1]
+            meta.update(Re_ohm=float(np.real(nearest["Re"])), Rct_ohm=float(np.real(nearest["Rct"])))
+        arrays = {
+            "time_s": data["Time"],
+            "voltage_V": data["Voltage_measured"],
+            "current_A": -np.asarray(data["Current_measured"], dtype=np.float64),
+            "temperature_C": data["Temperature_measured"],
+        }
+        samples.append((arrays, meta))
+    return _checked_discharges(path, samples)
+
+
+def _start_time(date_vector: FloatArray) -> datetime:
+    year, month, day, hour, minute, second = map(float, date_vector)
+    return datetime(int(year), int(month), int(day)) + timedelta(hours=hour, minutes=minute, seconds=second)
+
+
+def _checked_discharges(path: Path, samples: Iterable[tuple[dict[str, Any], dict[str, Any]]]) -> list[Discharge]:
+    discharges = []
+    for arrays, meta in samples:
+        try:
+            discharges.append(Discharge(**arrays, meta=meta))
+        except (TypeError, ValueError) as error:
+            warnings.warn(f"{path}: discharge {meta['cycle']} is left out: {error}", stacklevel=4)
+    if not discharges:
+        raise ValueError(f"{path} holds no discharge that can be used")
+    return discharges

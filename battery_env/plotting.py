@@ -1,0 +1,105 @@
+"""Figures of calibrations."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+#: Colours that colour-blind readers can tell apart (Okabe & Ito).
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+LABELS = {"q_mobile": "$q^{max}$ (C)", "r_o": r"$R_o$ ($\Omega$)"}
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """
+    An empty figure in the project's style, outside pyplot's global state.
+
+    :param width: inches
+    :param height: inches
+    :return: the figure
+    """
+    figure = Figure(figsize=(width, height), dpi=150, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
+    """
+    Save a figure; the file is written beside its place and renamed, so that it is never there in part.
+
+    :param figure: the figure
+    :param path: where to; its suffix chooses the format
+    :return: the file
+    """
+    target = Path(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    part = target.with_name(f".{target.stem}.part{target.suffix}")
+    figure.savefig(part)
+    os.replace(part, target)
+    return target
+
+
+def plot_true_against_inferred(scores: Mapping[str, pd.DataFrame], parameter: str) -> Figure:
+    """
+    The paper's figure: the true parameter of each discharge against the mean of its estimates, one panel per calibrator.
+
+    :param scores: what :func:`battery_env.evaluation.evaluate` returned, by name of the calibrator
+    :param parameter: ``"q_mobile"`` or ``"r_o"``
+    :return: the figure
+    """
+    figure = new_figure(3.1 * len(scores) + 0.9, 3.6)
+    panels: list[Axes] = list(np.atleast_1d(figure.subplots(1, len(scores), sharex=True, sharey=True)))
+    low = min(table[parameter].min() for table in scores.values())
+    high = max(table[parameter].max() for table in scores.values())
+    points = None
+    for axes, (name, table) in zip(panels, scores.items(), strict=True):
+        axes.plot([low, high], [low, high], color="0.6", lw=1.0, zorder=1)
+        axes.vlines(
+            table[parameter],
+            table[f"{parameter}_hat"] - table[f"{parameter}_spread"],
+            table[f"{parameter}_hat"] + table[f"{parameter}_spread"],
+            color="0.75",
+            lw=0.6,
+            zorder=2,
+        )
+        points = axes.scatter(table[parameter], table[f"{parameter}_hat"], c=table["load"], s=5, cmap="viridis", zorder=3)
+        mape = table[f"{parameter}_mape_percent"]
+        axes.set_title(f"{name}\nMAPE {mape.mean():.2g} %, worst {mape.max():.2g} %", fontsize=10)
+        axes.set_xlabel(f"true {LABELS[parameter]}")
+    panels[0].set_ylabel(f"inferred {LABELS[parameter]}")
+    if points is not None:
+        figure.colorbar(points, ax=panels, label="mean load (W)")
+    return figure
+
+
+def plot_learning_curves(curves: Mapping[str, list[pd.DataFrame]], title: str) -> Figure:
+    """
+    Error on held-out discharges during training: one line per seed, one colour per algorithm.
+
+    :param curves: by algorithm, for each seed a table with ``timesteps``, ``mape_percent`` and ``mape_percent_worst``
+    :param title: title of the figure
+    :return: the figure
+    """
+    figure = new_figure(7.2, 3.4)
+    for axes, column, label in zip(
+        figure.subplots(1, 2, sharex=True),
+        ("mape_percent", "mape_percent_worst"),
+        ("mean over trajectories", "worst trajectory"),
+        strict=True,
+    ):
+        for colour, (name, tables) in zip(COLOURS, curves.items(), strict=False):
+            for k, table in enumerate(tables):
+                axes.plot(table["timesteps"] / 1e3, table[column], color=colour, lw=1.4, label=name if k == 0 else None)
+        axes.set(yscale="log", xlabel="environment steps (thousands)", ylabel="MAPE (%)")
+        axes.set_title(label, fontsize=10)
+        axes.grid(which="both", alpha=0.25)
+        axes.legend(frameon=False, fontsize=9)
+    figure.suptitle(title, fontsize=11)
+    return figure
