@@ -50,7 +50,7 @@ def _checked(name: str, values: ArrayLike) -> FloatArray:
     try:
         array = np.array(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise TypeError(f"{name} must be an array of numbers, got {values!r}") from error
+        raise TypeError(f"{name} must hold numbers: {error}") from error
     if array.ndim != 1 or len(array) < _MIN_SAMPLES:
         raise ValueError(f"{name} must hold one value a sample, at least {_MIN_SAMPLES} of them; got shape {array.shape}")
     bad = np.flatnonzero(~np.isfinite(array))
@@ -208,6 +208,11 @@ class Discharge:
         if np.isnan(end_s):
             end_s = float(self.time_s[last])
         time_s = np.concatenate([[start_s], self.time_s[(self.time_s > start_s) & (self.time_s < end_s)], [end_s]])
+        if len(time_s) < _MIN_SAMPLES:
+            raise ValueError(
+                f"only {len(time_s)} samples lie between load-on at {start_s:g} s and {cut_off_V:g} V or the end of the load; "
+                f"at least {_MIN_SAMPLES} are needed"
+            )
         parts = {name: np.interp(time_s, self.time_s, getattr(self, name)) for name in ("voltage_V", "current_A")}
         parts["voltage_V"][0], parts["current_A"][0] = self.voltage_V[max(first - 1, 0)], self.current_A[first]
         temperature_C = None if self.temperature_C is None else np.interp(time_s, self.time_s, self.temperature_C)
@@ -279,7 +284,7 @@ def _read_table(path: Path, columns: Iterable[str]) -> pd.DataFrame:
     try:
         table = pd.read_csv(path)
     except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is not a file of comma-separated values: {error}") from error
+        raise ValueError(f"{path} is not a file of comma-separated values: {str(error).strip()}") from error
     missing = [name for name in columns if name not in table]
     if missing:
         raise ValueError(
@@ -296,8 +301,8 @@ def _read_nasa_csv(path: Path) -> list[Discharge]:
     summary = path.with_name("cycles.csv")
     if summary.is_file():
         tests = _read_table(summary, ("battery_id", "cycle", *_META_COLUMNS))
-        tests = tests.loc[tests["battery_id"] == cell, ["cycle", *_META_COLUMNS]]
-        known = {int(row.pop("cycle")): row for row in tests.to_dict(orient="records")}
+        tests = tests[tests["battery_id"] == cell]
+        known = {int(row["cycle"]): {name: row[name] for name in _META_COLUMNS} for row in tests.to_dict(orient="records")}
     cycles = table["cycle"].to_numpy(dtype=np.int64)
     samples = []
     for cycle in map(int, np.unique(cycles)):

@@ -122,7 +122,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
         if not 0.0 <= trim[0] < trim[1] <= 1.0:
             raise ValueError(f"trim must be two increasing shares within 0 .. 1, got {trim!r}")
         if len({load.unit for load in loads}) != 1:
-            raise ValueError("loads must not be empty, and all in one unit (power or current)")
+            raise ValueError(f"loads must be all in one unit (power or current), got {[load.unit for load in loads]}")
         unit = loads[0].unit
         dt_s = check_dt(dt_s, parameters)
 
@@ -195,6 +195,8 @@ class TrajectoryDataset(Sequence[Trajectory]):
             raise ValueError(f"parameter must be 'q_mobile', 'r_o' or 'joint', got {parameter!r}")
         if n < 1:
             raise ValueError(f"n must be at least 1, got {n}")
+        if not callable(loads) and len(loads) == 0:
+            raise ValueError("loads must not be empty")
         rng = np.random.default_rng(seed)
         q = np.full(n, parameters.q_mobile) if parameter == "r_o" else rng.uniform(*q_mobile_range, size=n)
         r = np.full(n, parameters.r_o) if parameter == "q_mobile" else rng.uniform(*r_o_range, size=n)

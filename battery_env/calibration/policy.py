@@ -42,11 +42,24 @@ class PolicyEstimator(Estimator):
     def __init__(self, policy: Predictor, env_id: str) -> None:
         self.policy = policy
         self.env_id = env_id
-        env = gym.make(env_id, disable_env_checker=True).unwrapped
-        if not isinstance(env, FullStateEnv):
-            raise ValueError(f"{env_id} is no calibration environment with the full state")
+        env = self.environment(env_id)
         self.parameter = env.task.parameter
         self.formulation = env.formulation
+
+    @staticmethod
+    def environment(env_id: str, **arguments: Any) -> FullStateEnv:
+        """
+        A calibration environment without its wrappers.
+
+        :param env_id: id of a calibration environment with the full state
+        :param arguments: of the environment
+        :return: the environment
+        :raises ValueError: if it is none
+        """
+        env = gym.make(env_id, disable_env_checker=True, **arguments).unwrapped
+        if not isinstance(env, FullStateEnv):
+            raise ValueError(f"{env_id} is no calibration environment with the full state")
+        return env
 
     def estimate(self, record: Trajectory) -> Estimate:  # type: ignore[override]
         """

@@ -89,7 +89,7 @@ def _scaled_formulation(charge_C: float) -> Formulation:
         load_scale=16.0,
         error_scale=np.array([0.01, 1e-5, 1e-5, charge_C, charge_C, charge_C, charge_C]),
         innovation=True,
-        cost_limit=100.0,
+        cost_limit=5.0,
     )
 
 
@@ -208,7 +208,7 @@ class FullStateTask:
         np.divide(self.next_state[:, OBSERVED], form.state_scale, out=out[:, size : 2 * size])
         np.divide(self.load, form.load_scale, out=out[:, 2 * size])
         if form.innovation:
-            self._step(self._predicted, self.state, self._nominal_q_mobile, self._nominal_r_o)
+            self._step(self._predicted, self.model_state, self._nominal_q_mobile, self._nominal_r_o)
             innovation = out[:, 2 * size + 1 :]
             np.subtract(self.next_state[:, OBSERVED], self._predicted[:, OBSERVED], out=innovation)
             innovation /= form.error_scale

@@ -113,7 +113,7 @@ class LeastSquares(Estimator):
         thermal: bool = False,
         dt_s: float = 1.0,
         initial: ArrayLike | None = None,
-        q_mobile_bounds_C: tuple[float, float] = Q_MOBILE_LIMITS_C,
+        q_mobile_bounds_C: tuple[float, float] = (Q_MOBILE_LIMITS_C[0], 1e5),
         r_o_bounds_ohm: tuple[float, float] = (0.0, 1.0),
         prior_q_mobile_C: tuple[float, float] | None = None,
         mismatch_V: float = 0.0,
@@ -181,30 +181,48 @@ class LeastSquares(Estimator):
         time_s, current_A = self._grid(record)
         return _at(time_s, self._simulate(current_A, estimate.q_mobile, estimate.r_o))
 
-    def predict_eod_time_s(self, record: Record, estimate: Estimate, cut_off_V: float | None = None) -> float:
+    def forecast(self, record: Record, estimate: Estimate, cut_off_V: float | None = None) -> tuple[FloatArray, FloatArray]:
         """
-        When the model reaches the cut-off under the current of a record, which keeps its last value beyond the end.
+        The voltage of the model from the first sample of a record down to the cut-off, under the current of the record,
+        which keeps its last value beyond the end.
 
         :param record: one discharge, whole or in progress
         :param estimate: the parameters
         :param cut_off_V: cut-off voltage, V; ``None``: the ``VEOD`` of ``cell``
-        :return: the end of discharge on the clock of the record, interpolated between steps, s; NaN if it is never reached,
-            as the load is off at the end of the record
+        :return: time on the clock of the record, s, and voltage, V. The last point is at the cut-off, interpolated between
+            steps; if it is never reached, as the load is off at the end of the record, the last point is above it
         """
         _, current_A = self._grid(record)
         cut_off = self.cell.VEOD if cut_off_V is None else cut_off_V
         last_A = float(record.current_A[-1])
         if last_A > SWITCH_SHARE * np.abs(record.current_A).max():
-            # no cell of this q_mobile lasts longer than this, whatever it had drawn before
+            # no cell of this q_mobile lasts longer than this, whatever it had delivered before
             current_A = np.append(current_A, np.full(int(estimate.q_mobile / (last_A * self.dt_s)) + 1, last_A))
         simulation = self._simulate(current_A, estimate.q_mobile, estimate.r_o)
-        below = np.flatnonzero(simulation.voltage_V <= cut_off)
+        time_s, voltage_V = float(record.time_s[0]) + simulation.time_s, simulation.voltage_V
+        below = np.flatnonzero(voltage_V <= cut_off)
         if not len(below):
-            return float(record.time_s[0]) + simulation.eod_time_s
-        n = max(int(below[0]), 1)
-        before_V, after_V = simulation.voltage_V[n - 1 : n + 1]
-        share = min(max((before_V - cut_off) / (before_V - after_V), 0.0), 1.0)
-        return float(record.time_s[0]) + (n - 1 + share) * self.dt_s
+            if np.isnan(simulation.eod_time_s):
+                return time_s, voltage_V
+            n, end_s = len(time_s), float(record.time_s[0]) + simulation.eod_time_s  # the cell is empty one step later
+        else:
+            n = int(below[0])
+            around = [n, max(n - 1, 0)]
+            end_s = float(np.interp(cut_off, voltage_V[around], time_s[around]))
+        return np.append(time_s[:n], end_s), np.append(voltage_V[:n], cut_off)
+
+    def predict_eod_time_s(self, record: Record, estimate: Estimate, cut_off_V: float | None = None) -> float:
+        """
+        When the model reaches the cut-off (:meth:`forecast`).
+
+        :param record: one discharge, whole or in progress
+        :param estimate: the parameters
+        :param cut_off_V: cut-off voltage, V; ``None``: the ``VEOD`` of ``cell``
+        :return: the end of discharge on the clock of the record, s; NaN if it is never reached
+        """
+        cut_off = self.cell.VEOD if cut_off_V is None else cut_off_V
+        time_s, voltage_V = self.forecast(record, estimate, cut_off)
+        return float(time_s[-1]) if voltage_V[-1] <= cut_off else float("nan")
 
     def _grid(self, record: Record) -> tuple[FloatArray, FloatArray]:
         time_s = np.asarray(record.time_s, dtype=np.float64)
@@ -219,6 +237,8 @@ class LeastSquares(Estimator):
         voltage_V = np.asarray(record.voltage_V, dtype=np.float64)
         if voltage_V.shape != time_s.shape or not np.isfinite(voltage_V).all():
             raise ValueError("voltage_V of the record must hold one finite value a sample")
+        if not current_A.any():
+            raise ValueError("no current flows in this record: it says nothing about q_mobile and r_o")
         # charges are linear in q_mobile; both of these are too large for the record to exhaust
         low_q_C, high_q_C = 0.5 * _REFERENCE_Q_C, _REFERENCE_Q_C
         low, high = (self._simulate(current_A, q, _REFERENCE_R_O_OHM) for q in (low_q_C, high_q_C))
@@ -291,8 +311,11 @@ class LeastSquares(Estimator):
         def named(x: FloatArray) -> dict[str, float]:
             return start | {name: float(value) for name, value in zip(self.parameters, x, strict=True)}
 
+        def residual(x: FloatArray) -> FloatArray:
+            return self._residual(problem, named(x), prior_weight_V)
+
         result = least_squares(
-            lambda x: self._residual(problem, named(x), prior_weight_V),
+            residual,
             [start[name] for name in self.parameters],
             bounds=(low, high),
             x_scale=[_SEARCH_SCALES[name] for name in self.parameters],

@@ -1,0 +1,46 @@
+# Everything runs in .venv, which the first command makes; TORCH and PYTHON may be set on the command line.
+PYTHON ?= python3
+# the version that the published results were measured with; any torch >= 2.8 does
+TORCH ?= torch==2.13.0
+VENV := .venv
+BIN := $(VENV)/bin
+SOURCES := sb3_lac battery_env benchmarks tests examples
+
+.DEFAULT_GOAL := help
+.PHONY: help install demo test format lint type-check commit-checks clean
+
+help:  ## list the commands
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
+
+# one stamp per state of the packaging files: made again when they change
+$(VENV)/.installed: setup.cfg pyproject.toml battery_env/setup.cfg
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10) and "Python 3.10 or newer is needed: make PYTHON=...")'
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(BIN)/python -m pip install --quiet "$(TORCH)"
+	$(BIN)/python -m pip install --quiet --editable ".[zoo,peers,dev]"
+	touch $@
+
+install: $(VENV)/.installed  ## make .venv with everything in it
+
+demo: install  ## LAC, SAC and TD3 on two tasks, then the life of a real cell: minutes; figures in results/
+	$(BIN)/python -m benchmarks.demo
+
+test: install  ## all tests
+	$(BIN)/python -m pytest -n 2
+
+format: install  ## black, and what ruff can mend
+	$(BIN)/python -m ruff check --fix $(SOURCES)
+	$(BIN)/python -m black --quiet $(SOURCES)
+
+lint: install  ## what ruff and black find
+	$(BIN)/python -m ruff check $(SOURCES)
+	$(BIN)/python -m black --check --quiet $(SOURCES)
+
+type-check: install  ## mypy
+	$(BIN)/python -m mypy
+
+commit-checks: lint type-check test  ## everything that must pass before a commit
+
+clean:  ## remove what the build left (not .venv, not results)
+	rm -rf build *.egg-info battery_env/build battery_env/*.egg-info .pytest_cache .mypy_cache .ruff_cache

@@ -1,0 +1,205 @@
+"""
+The command line: what a record of a discharge says about its cell.
+
+.. code-block:: bash
+
+  python -m battery_env calibrate discharge.csv
+  python -m battery_env calibrate B0005:12 --out results/B0005
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from battery_env.cells import BUNDLED_CELLS, Discharge, load_nasa_discharges, read_discharge_csv
+from battery_env.electrochemistry import NEW_CELL, FloatArray
+from battery_env.estimators.base import Estimate
+from battery_env.estimators.least_squares import LeastSquares
+from battery_env.plotting import COLOURS, new_figure, save_figure
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m battery_env", description="Calibrate a battery model to real cells.")
+    commands = parser.add_subparsers(dest="command", required=True)
+    calibrate = commands.add_parser(
+        "calibrate",
+        help="capacity and resistance of a cell from one discharge",
+        description=(
+            "Fit the charge that can move, q_mobile, and the ohmic resistance, r_o, of the model to one discharge that "
+            "starts with a full cell, and predict when the cut-off voltage is reached."
+        ),
+    )
+    calibrate.add_argument(
+        "record",
+        help="file of comma-separated values with columns time_s, voltage_V, current_A (positive = discharge) and, if "
+        "measured, temperature_C; or a bundled cell and its discharge, such as B0005:12",
+    )
+    calibrate.add_argument(
+        "--parameters",
+        nargs="+",
+        choices=("q_mobile", "r_o"),
+        default=["q_mobile", "r_o"],
+        help="what to fit; the other is held at the new cell's value (default: both)",
+    )
+    calibrate.add_argument(
+        "--cut-off", type=float, default=2.7, metavar="V", help="voltage at which the discharge ends, V (default: %(default)s)"
+    )
+    calibrate.add_argument(
+        "--prior-q",
+        nargs=2,
+        type=float,
+        metavar=("MEAN", "SD"),
+        help="q_mobile as known from an earlier discharge, C; needed while a discharge is in progress",
+    )
+    calibrate.add_argument(
+        "--mismatch",
+        type=float,
+        default=0.05,
+        metavar="V",
+        help="error to expect of the model itself, V; 0 for simulated data (default: %(default)s)",
+    )
+    calibrate.add_argument("--isothermal", action="store_true", help="keep the temperature of the model constant")
+    calibrate.add_argument("--discharge-is-negative", action="store_true", help="the file counts discharge as negative")
+    calibrate.add_argument("--out", type=Path, metavar="DIR", help="write the estimate, the voltages and a figure there")
+    calibrate.add_argument("--force", action="store_true", help="replace results that are there already")
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """
+    Run one command.
+
+    :param arguments: of the command line; ``None``: those of this process
+    :return: 0, or 2 if the input cannot be used; then one line on standard error says why
+    """
+    options = _parser().parse_args(arguments)
+    try:
+        _calibrate(options)
+    except (ValueError, TypeError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _calibrate(options: argparse.Namespace) -> None:
+    name, discharge = _read(options.record, options.discharge_is_negative)
+    outputs = (
+        [options.out / f"{name}_{kind}" for kind in ("estimate.csv", "voltage.csv", "voltage.png")] if options.out else []
+    )
+    existing = [str(path) for path in outputs if path.exists()]
+    if existing and not options.force:
+        raise FileExistsError(f"{', '.join(existing)} would be replaced; choose another --out, or give --force")
+
+    record = discharge.loaded_part(options.cut_off)
+    calibrator = LeastSquares(
+        options.parameters,
+        thermal=not options.isothermal,
+        prior_q_mobile_C=tuple(options.prior_q) if options.prior_q else None,
+        mismatch_V=options.mismatch,
+    )
+    estimate = calibrator.estimate(record)
+    row = _summary(calibrator, record, estimate, discharge.eod_time_s(options.cut_off), options.cut_off)
+    _print(name, record, row, options.parameters, options.cut_off)
+    if outputs:
+        model_V = calibrator.predict_voltage_V(record, estimate)
+        _write_csv(pd.DataFrame([{"record": name, **row}]), outputs[0])
+        columns = {"time_s": record.time_s, "voltage_V": record.voltage_V, "current_A": record.current_A, "model_V": model_V}
+        _write_csv(pd.DataFrame(columns), outputs[1])
+        save_figure(_figure(name, record, model_V, calibrator.forecast(record, estimate, options.cut_off)), outputs[2])
+        print("\nwritten: " + ", ".join(map(str, outputs)))
+
+
+def _read(record: str, discharge_is_negative: bool) -> tuple[str, Discharge]:
+    """A file, or ``CELL:CYCLE`` of a bundled cell; and what to call its results."""
+    cell, colon, cycle = record.partition(":")
+    if cell not in BUNDLED_CELLS:
+        path = Path(record)
+        if not path.is_file():
+            raise FileNotFoundError(
+                f"no file {record!r}; the bundled cells are given as {BUNDLED_CELLS[0]}:1, {BUNDLED_CELLS[0]}:2, ..."
+            )
+        return path.name.split(".")[0], read_discharge_csv(path, discharge_is_negative)
+    discharges = load_nasa_discharges(cell)
+    if not (colon and cycle.isdecimal() and 1 <= int(cycle) <= len(discharges)):
+        raise ValueError(f"{cell} has discharges {cell}:1 .. {cell}:{len(discharges)}, got {record!r}")
+    return f"{cell}_{int(cycle):03d}", discharges[int(cycle) - 1]
+
+
+def _summary(
+    calibrator: LeastSquares, record: Discharge, estimate: Estimate, measured_eod_s: float, cut_off_V: float
+) -> dict[str, float | bool]:
+    predicted_eod_s = calibrator.predict_eod_time_s(record, estimate, cut_off_V)
+    residual_V = calibrator.predict_voltage_V(record, estimate) - record.voltage_V
+    return {
+        "q_mobile_C": estimate.q_mobile,
+        "sd_q_mobile_C": estimate.sd_q_mobile,
+        "r_o_ohm": estimate.r_o,
+        "sd_r_o_ohm": estimate.sd_r_o,
+        "settled": estimate.settled,
+        "state_of_health": estimate.q_mobile / NEW_CELL.q_mobile if "q_mobile" in calibrator.parameters else float("nan"),
+        "voltage_rmse_V": float(np.sqrt(np.nanmean(residual_V**2))),
+        "predicted_eod_time_s": predicted_eod_s,
+        # the charge still to come moves with q_mobile
+        "sd_predicted_eod_time_s": estimate.sd_q_mobile / float(record.current_A[-1]),
+        "measured_eod_time_s": measured_eod_s,
+        "remaining_s": max(predicted_eod_s - float(record.time_s[-1]), 0.0) if np.isnan(measured_eod_s) else 0.0,
+    }
+
+
+def _print(name: str, record: Discharge, row: dict[str, float | bool], fitted: Sequence[str], cut_off_V: float) -> None:
+    lines = {
+        "q_mobile": (f"{row['q_mobile_C']:.0f} C", f"{row['sd_q_mobile_C']:.0f} C"),
+        "r_o": (f"{row['r_o_ohm']:.4f} ohm", f"{row['sd_r_o_ohm']:.4f} ohm"),
+    }
+    print(f"{name}: {len(record.time_s)} samples from load-on at {record.time_s[0]:.1f} s, {record.charge_C:.0f} C drawn\n")
+    for parameter, (value, sd) in lines.items():
+        print(f"  {parameter:<22}{value:>12}   {'sd ' + sd if parameter in fitted else 'held'}")
+    print(f"  {'settled':<22}{'yes' if row['settled'] else 'no':>12}")
+    if "q_mobile" in fitted:
+        print(f"  {'state of health':<22}{row['state_of_health']:>12.3f}   q_mobile / {NEW_CELL.q_mobile:g} C")
+    print(f"  {'voltage RMSE':<22}{1e3 * row['voltage_rmse_V']:>9.1f} mV")
+    print(f"  {f'{cut_off_V:g} V, predicted at':<22}{row['predicted_eod_time_s']:>10.0f} s")
+    if np.isnan(row["measured_eod_time_s"]):
+        sure = f"sd {row['sd_predicted_eod_time_s']:.0f} s, " if "q_mobile" in fitted else ""
+        print(f"  {'remaining':<22}{row['remaining_s']:>10.0f} s   {sure}at the last current")
+    else:
+        print(f"  {f'{cut_off_V:g} V, measured at':<22}{row['measured_eod_time_s']:>10.0f} s")
+    if not row["settled"]:
+        print("\nNot settled: this record does not determine the parameters. Record to the end of discharge, or give")
+        print("--prior-q with the q_mobile of an earlier discharge of this cell.")
+
+
+def _figure(name: str, record: Discharge, model_V: FloatArray, forecast: tuple[FloatArray, FloatArray]) -> Figure:
+    figure = new_figure(6.4, 4.6)
+    voltage, error = figure.subplots(2, 1, sharex=True, height_ratios=[3, 1])
+    voltage.plot(record.time_s, record.voltage_V, "o", ms=2.5, color="0.45", label="measured")
+    voltage.plot(*forecast, color=COLOURS[0], lw=1.4, label="model")
+    voltage.set(ylabel="voltage (V)")
+    voltage.set_title(name, fontsize=10)
+    voltage.legend(frameon=False)
+    error.axhline(0.0, color="0.6", lw=0.8)
+    error.plot(record.time_s, 1e3 * (model_V - record.voltage_V), color=COLOURS[1], lw=1.2)
+    error.set(xlabel="time (s)", ylabel="error (mV)")
+    for axes in (voltage, error):
+        axes.grid(alpha=0.25)
+    figure.align_ylabels()
+    return figure
+
+
+def _write_csv(table: pd.DataFrame, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.name}.part")
+    table.to_csv(part, index=False)
+    os.replace(part, path)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

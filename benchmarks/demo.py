@@ -1,0 +1,32 @@
+"""
+The main job in minutes: a short comparison of LAC, SAC and TD3 on two tasks, then q^max and R_o over the life of a real cell.
+
+.. code-block:: bash
+
+  python -m benchmarks.demo
+
+Figures and tables go to ``results/``. Interrupted, it goes on where it was.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from benchmarks import compare, real_cells
+
+RESULTS = Path("results")
+TIMESTEPS = 48_000
+
+
+def main() -> None:
+    """Run both parts."""
+    print(f"1/2  LAC, SAC and TD3 calibrate simulated cells ({TIMESTEPS} steps each; the full runs take 200000)\n", flush=True)
+    envs = ["--envs", "BatteryRo-v0", "BatteryQmax-v0"]
+    compare.main([*envs, "--timesteps", str(TIMESTEPS), "--evaluations", "6", "--out", str(RESULTS / "demo_compare")])
+    print("\n2/2  q^max and R_o of NASA's cell B0005, from its recorded discharges\n", flush=True)
+    real_cells.main(["--cells", "B0005", "--out", str(RESULTS / "demo_real_cells")])
+    print(f"\nFigures and tables: {RESULTS.resolve()}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,57 @@
+"""What every benchmark writes: tables with the configuration and the versions that made them beside them."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import sys
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+_PACKAGES = ("torch", "stable_baselines3", "gymnasium", "numpy", "numba", "scipy", "pandas", "rl_zoo3", "progpy")
+
+
+def versions() -> dict[str, str]:
+    """
+    The versions that a result depends on.
+
+    :return: by package, with Python and the processor
+    """
+    found = {"python": platform.python_version(), "processor": platform.machine()}
+    for package in _PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def write_text(path: Path, text: str) -> None:
+    """
+    Write a file beside its place and rename it, so that it is never there in part.
+
+    :param path: where to
+    :param text: its contents
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.name}.part")
+    part.write_text(text, encoding="utf-8")
+    os.replace(part, path)
+
+
+def write_csv(path: Path, table: pd.DataFrame, configuration: dict[str, Any]) -> None:
+    """
+    Write a table as CSV, and beside it as JSON what made it: command, configuration, versions.
+
+    :param path: where to, ``.csv``
+    :param table: the table
+    :param configuration: what the caller chose
+    """
+    record = {"command": f"python -m benchmarks.{Path(sys.argv[0]).stem} {' '.join(sys.argv[1:])}".strip()}
+    record |= {"configuration": configuration, "versions": versions()}
+    write_text(path.with_suffix(".json"), json.dumps(record, indent=2, default=str) + "\n")
+    write_text(path, table.to_csv(index=False, float_format="%.6g"))

@@ -1,0 +1,18 @@
+from pathlib import Path
+
+from sb3_lac.callbacks import CalibrationCallback
+from sb3_lac.lac import LAC
+from sb3_lac.policies import CnnPolicy, LyapunovPolicy, MlpPolicy, MultiInputPolicy
+
+# Gymnasium does not import third-party environments by itself:
+# importing battery_env here makes ``LAC("MlpPolicy", "BatteryQmax-v0")`` work when it is installed
+try:
+    import battery_env  # noqa: F401
+except ModuleNotFoundError as error:
+    # Only its own absence is fine, a broken installation must be seen
+    if error.name != "battery_env":
+        raise
+
+__version__ = Path(__file__).with_name("version.txt").read_text(encoding="utf-8").strip()
+
+__all__ = ["LAC", "CalibrationCallback", "CnnPolicy", "LyapunovPolicy", "MlpPolicy", "MultiInputPolicy", "__version__"]

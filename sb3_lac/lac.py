@@ -1,0 +1,539 @@
+import math
+from collections.abc import Sequence
+from functools import reduce
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, Schedule
+from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, polyak_update, update_learning_rate
+from stable_baselines3.sac.policies import Actor
+from torch.nn import functional as F
+
+from sb3_lac.policies import CnnPolicy, LyapunovCritic, LyapunovPolicy, MlpPolicy, MultiInputPolicy
+
+SelfLAC = TypeVar("SelfLAC", bound="LAC")
+
+
+def largest_value(values: Sequence[th.Tensor]) -> th.Tensor:
+    """
+    The conservative value ``L(s, a)``: the largest of the critics' values.
+
+    :param values: One tensor of values per critic
+    :return: Element-wise maximum
+    """
+    return reduce(th.maximum, values)
+
+
+def lyapunov_target(costs: th.Tensor, dones: th.Tensor, discounts: th.Tensor | float, next_values: th.Tensor) -> th.Tensor:
+    """
+    Target of the critic (Han et al. 2020, infinite horizon candidate): the discounted sum of costs to come.
+    There is no entropy term in it, unlike in SAC.
+
+    :param costs: ``c``, the cost of the transition
+    :param dones: Whether the next state is terminal (time limits are not)
+    :param discounts: ``gamma`` (to the power of n for n-step transitions)
+    :param next_values: ``L_bar(s', a')``, the target critic's value of an action of the target actor
+    :return: ``c + gamma * (1 - done) * L_bar(s', a')``
+    """
+    return costs + (1 - dones) * discounts * next_values
+
+
+def lyapunov_critic_loss(values: Sequence[th.Tensor], targets: th.Tensor) -> th.Tensor:
+    """
+    Loss of the critics (Han et al. 2020).
+
+    :param values: ``L(s, a)``, one tensor of values per critic
+    :param targets: See ``lyapunov_target()``
+    :return: ``1/2 * mean (L(s, a) - y)^2``, summed over critics
+    """
+    return 0.5 * th.stack([F.mse_loss(value, targets) for value in values]).sum()
+
+
+def lyapunov_difference(next_values: th.Tensor, values: th.Tensor, costs: th.Tensor, alpha3: float) -> th.Tensor:
+    """
+    Violation of the decrease condition, positive when ``L`` does not decrease by ``alpha3 * c`` on average
+    (Han et al. 2020). Both values must come from the same critic, the gradient flows through ``pi(s')`` only.
+
+    :param next_values: ``L(s', pi(s'))``
+    :param values: ``L(s, a)``
+    :param costs: ``c``, the cost of the transition
+    :param alpha3: Share of the cost by which ``L`` has to decrease
+    :return: ``mean (L(s', pi(s')) - L(s, a) + alpha3 * c)``
+    """
+    return (next_values - values.detach() + alpha3 * costs).mean()
+
+
+def lyapunov_actor_loss(difference: th.Tensor, log_prob: th.Tensor, lambda_coef: th.Tensor, ent_coef: th.Tensor) -> th.Tensor:
+    """
+    Loss of the actor: Lagrangian of the decrease condition and of the entropy constraint (Han et al. 2020).
+
+    :param difference: See ``lyapunov_difference()``
+    :param log_prob: ``log pi(a~|s)`` of actions sampled from the current policy
+    :param lambda_coef: ``lambda``, multiplier of the decrease condition
+    :param ent_coef: ``beta``, multiplier of the entropy constraint
+    :return: ``lambda * d + beta * mean log pi(a~|s)``
+    """
+    return lambda_coef.detach() * difference + ent_coef.detach() * log_prob.mean()
+
+
+def multiplier_loss(log_multiplier: th.Tensor, violation: th.Tensor) -> th.Tensor:
+    """
+    Loss of a Lagrange multiplier in log space, which grows while its constraint is violated:
+    ``lambda`` with the decrease condition, ``ent_coef`` with the entropy constraint
+    (see https://github.com/rail-berkeley/softlearning/issues/37 for the logarithm).
+
+    :param log_multiplier: Logarithm of the multiplier
+    :param violation: How much the constraint is violated on average (negative when it holds)
+    :return: ``-log(multiplier) * violation``
+    """
+    return -(log_multiplier * violation.detach()).mean()
+
+
+def concatenate_observations(obs: PyTorchObs, next_obs: PyTorchObs) -> PyTorchObs:
+    """
+    Stack two batches of observations, so that one pass of a network serves both.
+
+    :param obs: First batch
+    :param next_obs: Second batch
+    :return: The first batch followed by the second one
+    """
+    if isinstance(obs, dict):
+        assert isinstance(next_obs, dict)
+        return {key: th.cat((obs[key], next_obs[key])) for key in obs}
+    assert isinstance(next_obs, th.Tensor)
+    return th.cat((obs, next_obs))
+
+
+class LAC(OffPolicyAlgorithm):
+    """
+    Lyapunov Actor-Critic (LAC)
+    Actor-Critic Reinforcement Learning for Control with Stability Guarantee.
+    Paper: https://arxiv.org/abs/2004.14288
+    This implementation uses the SB3 SAC implementation as base.
+
+    The critic ``L(s, a) >= 0`` learns the discounted sum of costs, and the actor has to make it decrease along
+    trajectories by ``alpha3`` times the cost. A Lagrange multiplier ``lambda`` enforces that condition, while
+    ``ent_coef`` keeps the entropy of the policy as in SAC.
+
+    Note: LAC minimises the cost ``c = max(0, largest reward seen) - reward``.
+    For an environment with ``reward = -cost <= 0`` this is exactly its cost.
+
+    :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...)
+    :param env: The environment to learn from (if registered in Gym, can be str)
+    :param learning_rate: learning rate for adam optimizer,
+        the same learning rate will be used for all networks (Lyapunov critic and actor) and for ``ent_coef``,
+        it can be a function of the current progress remaining (from 1 to 0)
+    :param buffer_size: size of the replay buffer
+    :param learning_starts: how many steps of the model to collect transitions for before learning starts
+    :param batch_size: Minibatch size for each gradient update
+    :param tau: the soft update coefficient ("Polyak update", between 0 and 1), for the critic and for the actor
+    :param gamma: the discount factor
+    :param train_freq: Update the model every ``train_freq`` steps. Alternatively pass a tuple of frequency and unit
+        like ``(5, "step")`` or ``(2, "episode")``.
+    :param gradient_steps: How many gradient steps to do after each rollout (see ``train_freq``)
+        Set to ``-1`` means to do as many gradient steps as steps done in the environment
+        during the rollout.
+    :param action_noise: the action noise type (None by default), this can help
+        for hard exploration problem. Cf common.noise for the different action noise type.
+    :param replay_buffer_class: Replay buffer class to use (for instance ``HerReplayBuffer``).
+        If ``None``, it will be automatically selected.
+    :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation.
+    :param optimize_memory_usage: Enable a memory efficient variant of the replay buffer
+        at a cost of more complexity.
+        See https://github.com/DLR-RM/stable-baselines3/issues/37#issuecomment-637501195
+    :param n_steps: When larger than 1, use n-step returns (with the ``NStepReplayBuffer``): the target of the critic
+        and the decrease condition then span n steps, whose discounted costs are summed.
+        Not supported for Dict observation spaces, and ignored with a custom ``replay_buffer_class``.
+    :param ent_coef: Entropy regularization coefficient (``beta`` in the paper).
+        Set it to 'auto' to learn it automatically (and 'auto_0.1' for using 0.1 as initial value)
+    :param target_update_interval: update the target networks every ``target_update_interval``
+        gradient steps.
+    :param target_entropy: target entropy when learning ``ent_coef`` (``ent_coef = 'auto'``)
+    :param alpha3: Share of the cost by which ``L`` has to decrease in each step. From 1 on the condition cannot hold
+        in stationary data: ``lambda`` then stays at ``lambda_max`` and LAC minimises the cost with that fixed weight.
+    :param lambda_init: Initial value of ``lambda``
+    :param lambda_min: Lower limit of ``lambda`` (with ``lambda`` at zero, the actor would only maximise its entropy)
+    :param lambda_max: Upper limit of ``lambda``
+    :param lambda_learning_rate: learning rate for ``lambda``, can be a function of the current progress remaining.
+        If ``None``, it is ``learning_rate``.
+    :param use_sde: Whether to use generalized State Dependent Exploration (gSDE)
+        instead of action noise exploration (default: False)
+    :param sde_sample_freq: Sample a new noise matrix every n steps when using gSDE
+        Default: -1 (only sample at the beginning of the rollout)
+    :param use_sde_at_warmup: Whether to use gSDE instead of uniform sampling
+        during the warm up phase (before learning starts)
+    :param stats_window_size: Window size for the rollout logging, specifying the number of episodes to average
+        the reported success rate, mean episode length, and mean reward over
+    :param tensorboard_log: the log location for tensorboard (if None, no logging)
+    :param policy_kwargs: additional arguments to be passed to the policy on creation, those of SAC's policy
+        and ``output_dim`` (see ``LyapunovPolicy``)
+    :param verbose: Verbosity level: 0 for no output, 1 for info messages (such as device or wrappers used), 2 for
+        debug messages
+    :param seed: Seed for the pseudo random generators
+    :param device: Device (cpu, cuda, ...) on which the code should be run.
+        Setting it to auto, the code will be run on the GPU if possible.
+    :param _init_setup_model: Whether or not to build the network at the creation of the instance
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": MlpPolicy,
+        "CnnPolicy": CnnPolicy,
+        "MultiInputPolicy": MultiInputPolicy,
+    }
+    policy: LyapunovPolicy
+    actor: Actor
+    actor_target: Actor
+    critic: LyapunovCritic
+    critic_target: LyapunovCritic
+
+    def __init__(
+        self,
+        policy: str | type[LyapunovPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 3e-4,
+        buffer_size: int = 1_000_000,  # 1e6
+        learning_starts: int = 100,
+        batch_size: int = 256,
+        tau: float = 0.005,
+        gamma: float = 0.99,
+        train_freq: int | tuple[int, str] = 1,
+        gradient_steps: int = 1,
+        action_noise: ActionNoise | None = None,
+        replay_buffer_class: type[ReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        optimize_memory_usage: bool = False,
+        n_steps: int = 1,
+        ent_coef: str | float = "auto",
+        target_update_interval: int = 1,
+        target_entropy: str | float = "auto",
+        alpha3: float = 1.0,
+        lambda_init: float = 1.0,
+        lambda_min: float = 1e-4,
+        lambda_max: float = 1.0,
+        lambda_learning_rate: float | Schedule | None = None,
+        use_sde: bool = False,
+        sde_sample_freq: int = -1,
+        use_sde_at_warmup: bool = False,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ):
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            buffer_size,
+            learning_starts,
+            batch_size,
+            tau,
+            gamma,
+            train_freq,
+            gradient_steps,
+            action_noise,
+            replay_buffer_class=replay_buffer_class,
+            replay_buffer_kwargs=replay_buffer_kwargs,
+            optimize_memory_usage=optimize_memory_usage,
+            n_steps=n_steps,
+            policy_kwargs=policy_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device=device,
+            seed=seed,
+            use_sde=use_sde,
+            sde_sample_freq=sde_sample_freq,
+            use_sde_at_warmup=use_sde_at_warmup,
+            supported_action_spaces=(spaces.Box,),
+            support_multi_env=True,
+        )
+
+        self.target_entropy = target_entropy
+        self.log_ent_coef = None  # type: th.Tensor | None
+        # Entropy coefficient / Entropy temperature
+        self.ent_coef = ent_coef
+        self.target_update_interval = target_update_interval
+        self.ent_coef_optimizer: th.optim.Adam | None = None
+        self.alpha3 = alpha3
+        self.lambda_init = lambda_init
+        self.lambda_min = lambda_min
+        self.lambda_max = lambda_max
+        self.lambda_learning_rate = lambda_learning_rate
+
+        if _init_setup_model:
+            self._setup_model()
+
+    def _setup_model(self) -> None:
+        self._check_arguments()
+        super()._setup_model()
+        if isinstance(self.replay_buffer, NStepReplayBuffer) and self.gamma >= 1:
+            raise ValueError(f"gamma={self.gamma} must be smaller than 1 with n-step returns, use for instance gamma=0.99.")
+        self._create_aliases()
+        # Running mean and running var
+        self.batch_norm_stats = get_parameters_by_name(self.actor, ["running_"])
+        self.batch_norm_stats += get_parameters_by_name(self.critic, ["running_"])
+        self.batch_norm_stats_target = get_parameters_by_name(self.actor_target, ["running_"])
+        self.batch_norm_stats_target += get_parameters_by_name(self.critic_target, ["running_"])
+        # Target entropy is used when learning the entropy coefficient
+        if self.target_entropy == "auto":
+            # automatically set target entropy if needed
+            self.target_entropy = float(-np.prod(self.action_space.shape))  # type: ignore[arg-type]
+        else:
+            # Force conversion
+            # this will also throw an error for unexpected string
+            self.target_entropy = float(self.target_entropy)
+
+        # The entropy coefficient or entropy can be learned automatically
+        # see Automating Entropy Adjustment for Maximum Entropy RL section
+        # of https://arxiv.org/abs/1812.05905
+        if isinstance(self.ent_coef, str) and self.ent_coef.startswith("auto"):
+            # Default initial value of ent_coef when learned
+            init_value = 1.0
+            if "_" in self.ent_coef:
+                init_value = float(self.ent_coef.split("_")[1])
+                if not init_value > 0.0:
+                    raise ValueError(f"The initial value of ent_coef='{self.ent_coef}' must be greater than 0.")
+
+            self.log_ent_coef = th.log(th.ones(1, device=self.device) * init_value).requires_grad_(True)
+            self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], lr=self.lr_schedule(1), fused=True)
+        else:
+            # Force conversion to float
+            # this will throw an error if a malformed string (different from 'auto')
+            # is passed
+            self.ent_coef_tensor = th.tensor(float(self.ent_coef), device=self.device)
+
+        # The multiplier of the decrease condition is learned in log space too
+        if self.lambda_learning_rate is None:
+            self.lambda_lr_schedule = self.lr_schedule
+        else:
+            self.lambda_lr_schedule = FloatSchedule(self.lambda_learning_rate)
+        self.log_lambda = th.log(th.ones(1, device=self.device) * self.lambda_init).requires_grad_(True)
+        self.lambda_optimizer = th.optim.Adam([self.log_lambda], lr=self.lambda_lr_schedule(1), fused=True)
+
+        # Largest reward seen, before any normalization, see ``_compute_costs()``
+        self.reward_bound = th.zeros(1, device=self.device)
+
+    def _check_arguments(self) -> None:
+        """Check the arguments that SAC does not have."""
+        if not self.alpha3 > 0:
+            raise ValueError(
+                f"alpha3={self.alpha3} must be greater than 0: the Lyapunov value has to decrease by alpha3 times the cost. "
+                "Use for instance alpha3=0.1, or alpha3=1.0 to minimise the cost."
+            )
+        if not self.lambda_min > 0:
+            raise ValueError(
+                f"lambda_min={self.lambda_min} must be greater than 0, because lambda is learned in log space. "
+                "Use a small value like lambda_min=1e-4."
+            )
+        if not self.lambda_min <= self.lambda_max < math.inf:
+            raise ValueError(
+                f"lambda_max={self.lambda_max} must be finite and not smaller than lambda_min={self.lambda_min}. "
+                "Raise lambda_max or lower lambda_min."
+            )
+        if not self.lambda_min <= self.lambda_init <= self.lambda_max:
+            raise ValueError(
+                f"lambda_init={self.lambda_init} must lie between lambda_min={self.lambda_min} "
+                f"and lambda_max={self.lambda_max}. Change lambda_init or widen the limits."
+            )
+
+    def _create_aliases(self) -> None:
+        self.actor = self.policy.actor
+        self.actor_target = self.policy.actor_target
+        self.critic = self.policy.critic
+        self.critic_target = self.policy.critic_target
+
+    def _compute_costs(self, rewards: th.Tensor, discounts: th.Tensor | None) -> th.Tensor:
+        """
+        Convert sampled rewards to costs ``c = bound - reward >= 0`` with ``bound = max(0, largest reward seen)``,
+        after updating the bound with the sample. The bound is kept on the device and in the units of the environment:
+        it stays valid when ``VecNormalize`` changes its scale, and when rewards are computed at sampling (HER).
+
+        :param rewards: Rewards (normalized with ``VecNormalize``), summed over n steps with n-step returns
+        :param discounts: ``gamma`` to the power of the number of summed steps, None if it is one step
+        :return: Costs, summed like the rewards
+        """
+        scale, clip = 1.0, math.inf
+        if self._vec_normalize_env is not None and self._vec_normalize_env.norm_reward:
+            scale = math.sqrt(self._vec_normalize_env.ret_rms.var + self._vec_normalize_env.epsilon)
+            clip = self._vec_normalize_env.clip_reward
+        # A constant reward counts 1 + gamma + ... + gamma^(k-1) times in the return of k steps
+        n_rewards = 1.0 if discounts is None else (1 - discounts) / (1 - self.gamma)
+        largest_reward = (rewards / n_rewards).max()
+        self.reward_bound = th.maximum(self.reward_bound, largest_reward * scale)
+        bound = th.maximum((self.reward_bound / scale).clamp(max=clip), largest_reward)
+        return bound * n_rewards - rewards
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        # Switch to train mode (this affects batch norm / dropout)
+        self.policy.set_training_mode(True)
+        # Update optimizers learning rate
+        optimizers = [self.actor.optimizer, self.critic.optimizer]
+        if self.ent_coef_optimizer is not None:
+            optimizers += [self.ent_coef_optimizer]
+
+        # Update learning rate according to lr schedule
+        self._update_learning_rate(optimizers)
+        update_learning_rate(self.lambda_optimizer, self.lambda_lr_schedule(self._current_progress_remaining))
+
+        actor_parameters = list(self.actor.parameters())
+        online_parameters: list[th.Tensor] = [*actor_parameters, *self.critic.parameters()]
+        target_parameters: list[th.Tensor] = [*self.actor_target.parameters(), *self.critic_target.parameters()]
+        log_lambda_min, log_lambda_max = math.log(self.lambda_min), math.log(self.lambda_max)
+        # Kept on the device until the end: reading one value would wait for all pending work
+        metrics: dict[str, th.Tensor] = {}
+        metrics_per_step: list[th.Tensor] = []
+
+        for gradient_step in range(gradient_steps):
+            # Sample replay buffer
+            replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
+            # For n-step replay, discount factor is gamma**n_steps (when no early termination)
+            discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
+            costs = self._compute_costs(replay_data.rewards, replay_data.discounts)
+
+            # We need to sample because `log_std` may have changed between two gradient steps
+            if self.use_sde:
+                self.actor.reset_noise()
+                self.actor_target.reset_noise()
+
+            # One pass of the actor: action and log prob for the sampled states, then for the next states
+            actions_pi, log_prob = self.actor.action_log_prob(
+                concatenate_observations(replay_data.observations, replay_data.next_observations)
+            )
+            _, next_actions_pi = actions_pi.chunk(2)
+            log_prob, _ = log_prob.chunk(2)
+
+            with th.no_grad():
+                # Next action by the lagged actor
+                next_actions = self.actor_target(replay_data.next_observations)
+                # Compute the next Lyapunov values: max over all target critics
+                next_values = largest_value(self.critic_target(replay_data.next_observations, next_actions))
+                target_values = lyapunov_target(costs, replay_data.dones, discounts, next_values)
+
+            # Get current Lyapunov values for each critic network
+            # using action from the replay buffer
+            current_values = self.critic(replay_data.observations, replay_data.actions)
+            critic_loss = lyapunov_critic_loss(current_values, target_values)
+
+            # Decrease condition: the same critic, before its update, for both values
+            values = largest_value(current_values)
+            next_values_pi = largest_value(self.critic(replay_data.next_observations, next_actions_pi))
+            difference = lyapunov_difference(next_values_pi, values, costs, self.alpha3)
+
+            # Important: detach the multipliers from the graph
+            # so we don't change them with other losses
+            # see https://github.com/rail-berkeley/softlearning/issues/60
+            lambda_coef = th.exp(self.log_lambda.detach())
+            ent_coef = self.ent_coef_tensor if self.log_ent_coef is None else th.exp(self.log_ent_coef.detach())
+            actor_loss = lyapunov_actor_loss(difference, log_prob, lambda_coef, ent_coef)
+
+            # Optimize the critic and the actor, both with the gradient at the current parameters
+            self.critic.optimizer.zero_grad()
+            critic_loss.backward()
+            self.actor.optimizer.zero_grad()
+            # The parameters of the critic need no gradient here
+            actor_loss.backward(inputs=actor_parameters)
+            self.critic.optimizer.step()
+            self.actor.optimizer.step()
+
+            # Optimize the multiplier of the decrease condition
+            lambda_loss = multiplier_loss(self.log_lambda, difference)
+            self.lambda_optimizer.zero_grad()
+            lambda_loss.backward()
+            self.lambda_optimizer.step()
+            # Project it: a logarithm beyond its limits would need as many steps to come back (wind-up)
+            with th.no_grad():
+                self.log_lambda.clamp_(log_lambda_min, log_lambda_max)
+
+            metrics = {
+                "actor_loss": actor_loss,
+                "critic_loss": critic_loss,
+                "ent_coef": ent_coef,
+                "lambda": lambda_coef,
+                "lambda_saturation": self.log_lambda >= log_lambda_max,
+                "lambda_loss": lambda_loss,
+                "lyapunov_difference": difference,
+                "lyapunov_mean": values.mean(),
+                "cost": costs.mean(),
+            }
+
+            # Optimize entropy coefficient, also called
+            # entropy temperature or beta in the paper
+            if self.ent_coef_optimizer is not None and self.log_ent_coef is not None:
+                assert isinstance(self.target_entropy, float)
+                ent_coef_loss = multiplier_loss(self.log_ent_coef, log_prob + self.target_entropy)
+                self.ent_coef_optimizer.zero_grad()
+                ent_coef_loss.backward()
+                self.ent_coef_optimizer.step()
+                metrics["ent_coef_loss"] = ent_coef_loss
+
+            with th.no_grad():
+                metrics_per_step.append(th.hstack(tuple(metrics.values())))
+
+            # Update target networks
+            if gradient_step % self.target_update_interval == 0:
+                with th.no_grad():
+                    # Same as ``polyak_update()``, for all tensors at once
+                    th._foreach_lerp_(target_parameters, online_parameters, self.tau)
+                # Copy running stats, see GH issue #996
+                polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
+
+        self._n_updates += gradient_steps
+
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        # One transfer from the device for all metrics of all gradient steps
+        for name, value in zip(metrics, th.stack(metrics_per_step).mean(dim=0).tolist(), strict=True):
+            self.logger.record(f"train/{name}", value)
+
+    def learn(
+        self: SelfLAC,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str = "LAC",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfLAC:
+        if self.verbose >= 1 and self.alpha3 >= 1 and self._n_updates == 0:
+            print(
+                f"alpha3={self.alpha3} >= 1: the decrease condition cannot hold, because L(s', a') - L(s, a) is zero "
+                f"on average in stationary data. lambda will stay at lambda_max={self.lambda_max} and LAC minimises the cost "
+                "with this weight, use alpha3 < 1 to let lambda adapt."
+            )
+        return super().learn(
+            total_timesteps=total_timesteps,
+            callback=callback,
+            log_interval=log_interval,
+            tb_log_name=tb_log_name,
+            reset_num_timesteps=reset_num_timesteps,
+            progress_bar=progress_bar,
+        )
+
+    def _excluded_save_params(self) -> list[str]:
+        # Exclude aliases, and statistics that are part of the policy
+        return super()._excluded_save_params() + [  # noqa: RUF005
+            "actor",
+            "actor_target",
+            "critic",
+            "critic_target",
+            "batch_norm_stats",
+            "batch_norm_stats_target",
+        ]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts = ["policy", "actor.optimizer", "critic.optimizer", "lambda_optimizer"]
+        saved_pytorch_variables = ["log_lambda", "reward_bound"]
+        if self.ent_coef_optimizer is not None:
+            saved_pytorch_variables.append("log_ent_coef")
+            state_dicts.append("ent_coef_optimizer")
+        else:
+            saved_pytorch_variables.append("ent_coef_tensor")
+        return state_dicts, saved_pytorch_variables

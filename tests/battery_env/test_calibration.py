@@ -1,0 +1,261 @@
+"""The calibration task and its environments."""
+
+import copy
+import pickle
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_checker import check_env as check_env_sb3
+
+import battery_env
+from battery_env.calibration.env import paper_split
+from battery_env.calibration.registration import ENTRY_POINTS
+from battery_env.calibration.task import ACTION_RANGES, FORMULATIONS, OBSERVED, FullStateTask
+from battery_env.calibration.variants import BatteryQmaxEnv
+from battery_env.electrochemistry import NEW_CELL, step
+from battery_env.loads import RandomPiecewise
+from battery_env.trajectories import TrajectoryDataset
+
+IDS = tuple(ENTRY_POINTS)
+PARAMETER = {env_id: "q_mobile" if "Qmax" in env_id else "r_o" for env_id in IDS}
+
+
+def action_for(parameter, value):
+    low, high = ACTION_RANGES[parameter]
+    return np.atleast_1d(np.asarray(2.0 * (value - low) / (high - low) - 1.0))
+
+
+def true_action(env):
+    task = env.unwrapped.task
+    return action_for(task.parameter, task.q_mobile[0] if task.parameter == "q_mobile" else task.r_o[0])
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_both_checkers_are_clean(env_id):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env = gym.make(env_id, render_mode="rgb_array").unwrapped
+        check_env(env)
+        check_env_sb3(env)
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_the_true_parameter_costs_nothing_and_any_other_does(env_id):
+    env = gym.make(env_id)
+    for seed in range(5):
+        env.reset(seed=seed)
+        for _ in range(10):
+            _, reward, terminated, truncated, info = env.step(true_action(env))
+            assert not terminated and not truncated
+            assert info["cost"] == pytest.approx(0.0, abs=1e-5)
+            assert info[PARAMETER[env_id]] == pytest.approx(info[f"{PARAMETER[env_id]}_hat"])
+        _, reward, *_, info = env.step(np.clip(true_action(env) + 0.2, -1.0, 1.0))
+        assert info["cost"] > 1e-2 and reward == -info["cost"]
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_same_seed_same_episode(env_id):
+    episodes = []
+    for _ in range(2):
+        env = gym.make(env_id)
+        observation, _ = env.reset(seed=5)
+        env.action_space.seed(5)
+        steps = [env.step(env.action_space.sample()) for _ in range(8)]
+        episodes.append([observation, *(s[0] for s in steps), [s[1] for s in steps]])
+    for a, b in zip(*episodes, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_ids_are_registered_once_and_work_from_anywhere():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        battery_env.register_environments()
+        env = gym.make("battery_env:BatteryQmax-v0")
+    assert env.spec.id == "BatteryQmax-v0"
+
+
+@pytest.mark.parametrize(("env_id", "steps"), [("BatteryQmax-v0", 64), ("BatteryRo-v0", 64), ("BatteryQmaxPaper-v0", 16)])
+def test_episodes_are_truncated_after_their_steps(env_id, steps):
+    env = gym.make(env_id)
+    env.reset(options={"trajectory": 0, "sample": int(env.unwrapped.dataset.first[0])})
+    ends = [env.step(true_action(env))[2:4] for _ in range(steps)]
+    assert ends[-1] == (False, True) and not any(t or u for t, u in ends[:-1])
+
+
+def test_the_end_of_the_data_truncates():
+    env = gym.make("BatteryRo-v0", split="all")
+    dataset = env.unwrapped.dataset
+    n = int(np.argmin(dataset.samples))
+    env.reset(options={"trajectory": n, "sample": int(dataset.first[n])})
+    steps = 0
+    truncated = False
+    while not truncated:
+        observation, _, terminated, truncated, _ = env.step(true_action(env))
+        steps += 1
+    assert not terminated and np.isfinite(observation).all()
+    # T samples hold T - 1 transitions; the observation after the last decision needs one more of them
+    assert steps == len(dataset[n].time_s) - 2 < 64
+
+
+def test_the_observation_is_what_the_documentation_says():
+    env = gym.make("BatteryQmax-v0")
+    dataset = env.unwrapped.dataset
+    trajectory, t = dataset[4], 30
+    observation, _ = env.reset(options={"trajectory": 4, "sample": int(dataset.first[4]) + t})
+    x, x_next = trajectory.state[t], trajectory.state[t + 1]
+    state_scale = np.array([0.5, 0.1, 0.01, 6840.0, 760.0, 11400.0, 1266.0])
+    error_scale = np.array([0.01, 1e-5, 1e-5, 0.4, 0.4, 0.4, 0.4])
+    predicted = step(x, trajectory.load[t], NEW_CELL.q_mobile, NEW_CELL.r_o)
+    expected = np.concatenate(
+        [
+            x[OBSERVED] / state_scale,
+            x_next[OBSERVED] / state_scale,
+            [trajectory.load[t] / 16.0],
+            (x_next - predicted)[OBSERVED] / error_scale,
+        ]
+    )
+    np.testing.assert_allclose(observation, expected, rtol=1e-5, atol=1e-5)
+
+
+def test_the_literal_observation_is_divided_by_the_new_cells_state():
+    env = gym.make("BatteryQmaxPaper-v0")
+    dataset = env.unwrapped.dataset
+    trajectory = dataset[4]
+    observation, _ = env.reset(options={"trajectory": 4, "sample": int(dataset.first[4])})
+    reference = np.array([1.0, 1.0, 1.0, 6840.0, 760.0, 4560.0, 506.67])
+    expected = [*(trajectory.state[0, 1:] / reference), *(trajectory.state[1, 1:] / reference), trajectory.load[0] / 20.0]
+    np.testing.assert_allclose(observation, expected, rtol=1e-6)
+
+
+def test_the_literal_cost():
+    cost = FORMULATIONS["paper"]["q_mobile"].cost(np.array([[3e-5, 0, 4e-5, 0, 0, 0, 0], [0.3, 0.4, 0, 0, 0, 0.6, 0.8]]))
+    np.testing.assert_allclose(cost, [2.5e-5, 50.0 * (0.25 + 0.5)])
+
+
+def test_the_cost_is_a_norm_in_error_scales_that_saturates():
+    form = FORMULATIONS["scaled"]["r_o"]
+    error = np.array([[0.03, 0, 0, 4.0, 0, 0, 0], [1.0, 0, 0, 0, 0, 0, 0]])
+    np.testing.assert_allclose(form.cost(error), [5.0, form.cost_limit])
+
+
+def test_the_perturbation_stays_in_its_bounds():
+    env = gym.make("BatteryQmax-v0", initial_perturbation=10.0)
+    scale = FORMULATIONS["scaled"]["q_mobile"].error_scale
+    draws = []
+    for seed in range(20):
+        env.reset(seed=seed)
+        task = env.unwrapped.task
+        draws.append((task.model_state - task.state)[0, OBSERVED] / scale)
+    assert np.abs(draws).max() <= 10.0 + 1e-6 and np.abs(draws).max(axis=0).min() > 2.0
+
+
+def test_the_model_runs_free():
+    env = gym.make("BatteryRo-v0")
+    env.reset(seed=1)
+    env.step(np.array([1.0]))
+    # the error of one wrong step stays in the model's state, though the next parameter is the true one
+    *_, info = env.step(true_action(env))
+    assert info["cost"] > 0.1
+
+
+@pytest.mark.parametrize("formulation", ["scaled", "paper"])
+@pytest.mark.parametrize("parameter", ["q_mobile", "r_o"])
+def test_a_batch_is_its_cells_one_by_one(parameter, formulation):
+    data = TrajectoryDataset.generate("joint", 6, RandomPiecewise(), seed=0)
+    rng = np.random.default_rng(0)
+    actions = rng.uniform(-1.0, 1.0, (30, 6))
+    start = rng.integers(0, 500, 6)
+    batch = FullStateTask(data, parameter, formulation, 6)
+    batch.begin(np.arange(6), np.arange(6), start)
+    costs = []
+    for k in range(30):
+        if k == 10:  # going on with some of the cells changes nothing for them
+            batch.keep(np.arange(6) < 4)
+        costs.append(batch.advance(actions[k, : batch.cells])[:4])
+    for n in range(4):
+        one = FullStateTask(data, parameter, formulation, 1)
+        one.begin(np.zeros(1, dtype=int), np.array([n]), start[[n]])
+        single = [one.advance(actions[k, [n]])[0] for k in range(30)]
+        np.testing.assert_array_equal(single, [c[n] for c in costs])
+        np.testing.assert_array_equal(one.observation()[0], batch.observation()[n])
+
+
+def test_wrong_parameters_never_leave_the_finite_numbers():
+    for env_id in IDS:
+        env = gym.make(env_id, split="all", episode_steps=500)
+        for action in (-1.0, 1.0):
+            env.reset(seed=0, options={"trajectory": 5500, "sample": int(env.unwrapped.dataset.first[5500])})
+            truncated = False
+            while not truncated:
+                observation, reward, _, truncated, info = env.step(np.array([action]))
+                assert env.observation_space.contains(observation) and np.isfinite(reward)
+                assert all(np.isfinite(value) for value in info.values())
+
+
+def test_info_holds_the_documented_values():
+    env = gym.make("BatteryQmax-v0")
+    _, info = env.reset(seed=0)
+    keys = {"cost", "q_mobile", "r_o", "q_mobile_hat", "r_o_hat", "voltage", "voltage_hat", "soc"}
+    assert set(info) == keys == set(env.step(env.action_space.sample())[-1])
+    assert 3.0 < info["voltage"] < 4.2 and 0.0 < info["soc"] < 1.0 and info["r_o_hat"] == info["r_o"]
+
+
+def test_training_and_test_trajectories_differ():
+    sides = [gym.make("BatteryRo-v0", split=split).unwrapped.dataset for split in ("train", "test")]
+    keys = [set(zip(data.r_o, data.load_values[data.load_start], strict=True)) for data in sides]
+    assert not keys[0] & keys[1] and len(keys[0]) + len(keys[1]) == 5511
+
+
+def test_own_trajectories_can_be_used():
+    data = TrajectoryDataset.generate("q_mobile", 3, RandomPiecewise(), seed=0)
+    env = gym.make("BatteryQmax-v0", dataset=data)
+    env.reset(seed=0)
+    assert env.unwrapped.task.q_mobile[0] in data.q_mobile
+
+
+def test_a_frame_is_a_picture():
+    env = gym.make("BatteryRo-v0", render_mode="rgb_array")
+    env.reset(seed=0)
+    for _ in range(5):
+        env.step(env.action_space.sample())
+    frame = env.render()
+    assert frame.shape == (400, 600, 3) and frame.dtype == np.uint8 and frame.std() > 10.0
+
+
+def test_environments_can_be_copied_and_pickled():
+    env = gym.make("BatteryRo-v0").unwrapped
+    env.reset(seed=3)
+    twins = [copy.deepcopy(env), pickle.loads(pickle.dumps(env))]
+    expected = env.step(np.array([0.3]))
+    for twin in twins:
+        np.testing.assert_array_equal(twin.step(np.array([0.3]))[0], expected[0])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"episode_steps": 0}, "episode_steps must be at least 1"),
+        ({"initial_perturbation": -1.0}, "initial_perturbation"),
+        ({"split": "validation"}, "split must be"),
+    ],
+)
+def test_nonsense_is_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        gym.make("BatteryQmax-v0", disable_env_checker=True, **arguments)
+    with pytest.raises(ValueError, match="render_mode must be None or one of"):
+        BatteryQmaxEnv(render_mode="human")
+
+
+def test_points_outside_the_data_are_refused():
+    env = gym.make("BatteryQmax-v0")
+    with pytest.raises(ValueError, match=r"options\['trajectory'\] must lie within 0 \.\. 3857, got 9999"):
+        env.reset(options={"trajectory": 9999})
+    with pytest.raises(ValueError, match=r"options\['sample'\] must lie within"):
+        env.reset(options={"trajectory": 0, "sample": 0})
+    with pytest.raises(ValueError, match="parameter must be one of"):
+        FullStateTask(paper_split("r_o", "test"), "capacity", "scaled", 1)
+    with pytest.raises(ValueError, match="formulation must be one of"):
+        FullStateTask(paper_split("r_o", "test"), "r_o", "exact", 1)

@@ -1,0 +1,278 @@
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import trapezoid
+from scipy.io import savemat
+
+from battery_env.cells import (
+    BUNDLED_CELLS,
+    Discharge,
+    drawn_charge_C,
+    load_nasa_discharges,
+    read_discharge_csv,
+    resample_current,
+)
+
+
+def recorded(**changes) -> dict:
+    """Two samples at rest, a load of 2 A from about 15 s on, and a cut-off between two samples."""
+    arrays = {
+        "time_s": [0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0],
+        "voltage_V": [4.19, 4.19, 3.9, 3.5, 3.0, 2.6, 3.1],
+        "current_A": [0.0, 0.01, 2.0, 2.02, 2.01, 2.0, 0.0],
+        "temperature_C": [24.0, 24.0, 24.5, 25.0, 25.5, 26.0, 26.0],
+    }
+    return arrays | changes
+
+
+@pytest.fixture(scope="module")
+def bundled() -> dict[str, list[Discharge]]:
+    return {cell: load_nasa_discharges(cell) for cell in BUNDLED_CELLS}
+
+
+class TestDischarge:
+    def test_its_arrays_are_floats_and_cannot_be_written_to(self):
+        discharge = Discharge(**recorded())
+        assert discharge.voltage_V.dtype == np.float64
+        with pytest.raises(ValueError, match="read-only"):
+            discharge.voltage_V[0] = 0.0
+
+    def test_temperature_and_meta_are_optional(self):
+        discharge = Discharge(**recorded(temperature_C=None))
+        assert discharge.temperature_C is None and discharge.meta == {}
+        assert discharge.loaded_part(2.0).until(50.0).temperature_C is None
+
+    @pytest.mark.parametrize(
+        ("changes", "message"),
+        [
+            ({"voltage_V": [4.1, 3.9]}, r"voltage_V must hold one value a sample, at least 5.*\(2,\)"),
+            ({"voltage_V": [4.1] * 6}, "voltage_V has 6 samples, but time_s has 7"),
+            ({"voltage_V": np.ones((7, 2))}, r"shape \(7, 2\)"),
+            ({"current_A": [0.0, 0.0, np.nan, 2.0, 2.0, 2.0, 0.0]}, "current_A must be finite, got nan at sample 2"),
+            ({"time_s": [0.0, 10.0, 20.0, 20.0, 40.0, 50.0, 60.0]}, "sample 3 is at 20 s, after 20 s"),
+            ({"time_s": np.arange(7) / 3600.0}, "seconds, not in hours"),
+            ({"time_s": np.arange(7) * 1e6}, "milliseconds"),
+            ({"voltage_V": np.full(7, 3900.0)}, "voltage_V must lie within 0 .. 5.5 V, got 3900 at sample 0.*not in mV"),
+            ({"current_A": np.full(7, 2000.0)}, "current_A must lie within -60 .. 60 A, got 2000.*not in mA"),
+            ({"temperature_C": np.full(7, 297.0)}, "got 297.*not in kelvin"),
+            ({"current_A": np.full(7, -2.0)}, "draws -120 C.*flip the sign.*discharge_is_negative"),
+        ],
+    )
+    def test_refuses_what_cannot_be_meant_and_says_what_to_do(self, changes, message):
+        with pytest.raises(ValueError, match=message):
+            Discharge(**recorded(**changes))
+
+    def test_refuses_text_for_numbers_in_one_line(self):
+        with pytest.raises(TypeError, match="voltage_V must hold numbers") as caught:
+            Discharge(**recorded(voltage_V=["4.1", "3.9", "ERROR", "3.5", "3.4", "3.0", "3.0"]))
+        assert "\n" not in str(caught.value)
+
+    def test_load_is_switched_on_midway_between_the_samples(self):
+        assert Discharge(**recorded()).load_on_time_s == 15.0
+
+    def test_a_record_that_starts_under_load_is_on_from_its_first_sample(self):
+        assert Discharge(**recorded(current_A=np.full(7, 2.0))).load_on_time_s == 0.0
+
+    def test_end_of_discharge_is_interpolated(self):
+        discharge = Discharge(**recorded())
+        assert discharge.eod_time_s(2.7) == pytest.approx(47.5)
+        assert discharge.eod_time_s(3.0) == 40.0
+        assert np.isnan(discharge.eod_time_s(2.5))
+
+    def test_loaded_part_runs_from_the_switch_to_the_cut_off(self):
+        part = Discharge(**recorded(), meta={"cell": "X"}).loaded_part(2.7)
+        np.testing.assert_allclose(part.time_s, [15.0, 20.0, 30.0, 40.0, 47.5])
+        np.testing.assert_allclose(part.voltage_V, [4.19, 3.9, 3.5, 3.0, 2.7])
+        np.testing.assert_allclose(part.current_A, [2.0, 2.0, 2.02, 2.01, 2.0025])
+        np.testing.assert_allclose(part.temperature_C, [24.25, 24.5, 25.0, 25.5, 25.875])
+        assert part.meta == {"cell": "X"}
+        np.testing.assert_array_equal(part.loaded_part(2.7).time_s, part.time_s)
+
+    def test_loaded_part_of_an_unfinished_discharge_ends_with_its_last_sample_under_load(self):
+        assert Discharge(**recorded()).loaded_part(2.0).time_s[-1] == 50.0
+
+    def test_until_keeps_what_was_known_then(self):
+        np.testing.assert_array_equal(Discharge(**recorded()).until(45.0).time_s, [0.0, 10.0, 20.0, 30.0, 40.0])
+        with pytest.raises(ValueError, match="at least 5"):
+            Discharge(**recorded()).until(12.0)
+
+
+class TestResampling:
+    def test_load_steps_at_the_midpoint_and_does_not_ramp(self):
+        discharge = Discharge(**recorded())
+        current_A = resample_current(discharge.time_s, discharge.current_A, 1.0, 60)
+        np.testing.assert_allclose(current_A[:10], 0.001 * (np.arange(10) + 0.5))
+        np.testing.assert_allclose(current_A[10:15], 0.01)
+        np.testing.assert_allclose(current_A[15:20], 2.0)
+        np.testing.assert_allclose(current_A[20:22], [2.001, 2.003])
+        np.testing.assert_allclose(current_A[55:], 0.0)
+
+    def test_switch_inside_a_step_is_shared_out(self):
+        time_s = np.array([0.0, 3.0, 6.0, 9.0, 12.0])
+        np.testing.assert_allclose(resample_current(time_s, np.array([0.0, 2.0, 2.0, 2.0, 2.0]), 1.0, 4), [0.0, 1.0, 2.0, 2.0])
+
+    def test_simulated_records_are_taken_as_they_are(self):
+        time_s, current_A = np.arange(50) * 1.0, np.random.default_rng(0).uniform(0.0, 5.0, 50)
+        resampled = resample_current(time_s, current_A, 1.0, 53)
+        np.testing.assert_array_equal(resampled[:50], current_A)
+        np.testing.assert_array_equal(resampled[50:], current_A[-1])
+
+    @settings(max_examples=60, deadline=None)
+    @given(
+        gaps=st.lists(st.floats(0.05, 30.0), min_size=4, max_size=40),
+        dt_s=st.floats(0.1, 5.0),
+        seed=st.integers(0, 1000),
+    )
+    def test_no_charge_is_lost(self, gaps, dt_s, seed):
+        time_s = np.concatenate([[0.0], np.cumsum(gaps)])
+        current_A = np.random.default_rng(seed).choice([0.0, 0.05, 1.9, 2.0, 2.1], size=len(time_s))
+        n_steps = int(np.ceil(time_s[-1] / dt_s)) + 1
+        drawn_C = float(drawn_charge_C(time_s, current_A, n_steps * dt_s))
+        assert dt_s * resample_current(time_s, current_A, dt_s, n_steps).sum() == pytest.approx(drawn_C, abs=1e-9)
+        # a jump at the midpoint and a ramp carry the same charge between two samples
+        assert drawn_charge_C(time_s, current_A, time_s[-1]) == pytest.approx(trapezoid(current_A, time_s), abs=1e-9)
+
+
+class TestBundledCells:
+    @pytest.mark.parametrize("cell", BUNDLED_CELLS)
+    def test_all_168_discharges_are_there(self, bundled, cell):
+        assert [discharge.meta["cycle"] for discharge in bundled[cell]] == list(range(1, 169))
+        assert {discharge.meta["cell"] for discharge in bundled[cell]} == {cell}
+
+    def test_first_discharge_is_as_published(self, bundled):
+        first = bundled["B0005"][0]
+        assert first.meta["capacity_Ah"] == pytest.approx(1.8565, abs=1e-4)
+        assert first.meta["start_time"].startswith("2008-04-02T15:25:41")
+        assert first.meta["ambient_temperature_C"] == 24
+        assert first.meta["Re_ohm"] == pytest.approx(0.04467, abs=1e-5)
+        assert "Saha" in first.meta["source"]
+        assert len(first.time_s) == 197 and first.temperature_C is not None
+        assert first.load_on_time_s == pytest.approx((16.781 + 35.703) / 2)
+
+    @pytest.mark.parametrize("cell", BUNDLED_CELLS)
+    def test_charge_to_cut_off_is_the_published_capacity(self, bundled, cell):
+        for discharge in bundled[cell]:
+            # the published one counts up to the first sample below 2.7 V, at most one interval of 20 s later
+            late_C = 3600.0 * discharge.meta["capacity_Ah"] - discharge.loaded_part(2.7).charge_C
+            assert -5.0 < late_C < 45.0
+
+    def test_a_copy_elsewhere_reads_the_same(self, bundled, tmp_path):
+        first = bundled["B0006"][0]
+        table = pd.DataFrame({name: getattr(first, name) for name in ("time_s", "voltage_V", "current_A", "temperature_C")})
+        table.insert(0, "cycle", 7)
+        table.to_csv(tmp_path / "X1_discharge.csv.gz", index=False)
+        (copy,) = load_nasa_discharges(tmp_path / "X1_discharge.csv.gz")
+        np.testing.assert_allclose(copy.voltage_V, first.voltage_V)
+        assert copy.meta["cell"] == "X1" and copy.meta["cycle"] == 7 and "capacity_Ah" not in copy.meta
+
+    def test_unknown_cell_names_the_bundled_ones(self):
+        with pytest.raises(FileNotFoundError, match=r"B0007.*B0005, B0006"):
+            load_nasa_discharges("B0007")
+
+
+class TestNasaMatFile:
+    @staticmethod
+    def write(path: Path, broken: bool = False) -> Path:
+        """A file in the layout of NASA's B0005.mat: charge, discharge, impedance, and one discharge without capacity."""
+
+        def test(kind: str, hour: float, data: dict) -> dict:
+            return {
+                "type": kind,
+                "ambient_temperature": 24,
+                "time": np.array([2008.0, 4.0, 2.0, hour, 25.0, 41.593]),
+                "data": data,
+            }
+
+        def data(**more) -> dict:
+            arrays = recorded()
+            return {
+                "Voltage_measured": np.array(arrays["voltage_V"]),
+                "Current_measured": -np.array(arrays["current_A"]),
+                "Temperature_measured": np.array(arrays["temperature_C"]),
+                "Current_load": np.ones(7),
+                "Voltage_load": np.zeros(7),
+                "Time": np.array(arrays["time_s"]),
+                **more,
+            }
+
+        short = {name: values[:2] for name, values in data().items()}
+        cycle = np.array(
+            [
+                test("charge", 13.0, {"Voltage_charge": np.ones(3)}),
+                test("discharge", 15.0, data(Capacity=1.8565)),
+                test("impedance", 16.0, {"Re": 0.0447, "Rct": 0.0695}),
+                test("impedance", 23.0, {"Re": 0.05, "Rct": 0.07}),
+                test("discharge", 22.0, short if broken else data(Capacity=np.array([]))),
+            ],
+            dtype=object,
+        )
+        savemat(path, {path.stem: {"cycle": cycle}})
+        return path
+
+    def test_discharges_are_read_with_the_sign_of_the_current_turned(self, tmp_path):
+        first, second = load_nasa_discharges(self.write(tmp_path / "B0018.mat"))
+        np.testing.assert_allclose(first.current_A, recorded()["current_A"])
+        np.testing.assert_allclose(first.time_s, recorded()["time_s"])
+        assert first.meta["cell"] == "B0018"
+        assert (first.meta["cycle"], second.meta["cycle"]) == (1, 2)
+        assert (first.meta["test_id"], second.meta["test_id"]) == (1, 4)
+        assert first.meta["start_time"] == "2008-04-02T15:25:41.593"
+        assert first.meta["capacity_Ah"] == 1.8565 and "capacity_Ah" not in second.meta
+        assert (first.meta["Re_ohm"], second.meta["Re_ohm"]) == (0.0447, 0.05)
+
+    def test_a_broken_discharge_does_not_lose_the_others(self, tmp_path):
+        path = self.write(tmp_path / "B0018.mat", broken=True)
+        with pytest.warns(UserWarning, match="discharge 2 is left out: .*at least 5"):
+            assert [discharge.meta["cycle"] for discharge in load_nasa_discharges(path)] == [1]
+
+    def test_another_layout_is_refused(self, tmp_path):
+        savemat(tmp_path / "other.mat", {"x": np.ones(3)})
+        with pytest.raises(ValueError, match=r"not laid out as NASA's battery files.*\(x\)"):
+            load_nasa_discharges(tmp_path / "other.mat")
+
+
+class TestOwnFiles:
+    @pytest.mark.parametrize("name", ["own.csv", "own.csv.gz"])
+    def test_reads_a_table_and_leaves_other_columns_aside(self, tmp_path, name):
+        pd.DataFrame(recorded()).assign(step=1).to_csv(tmp_path / name, index=False)
+        discharge = read_discharge_csv(tmp_path / name)
+        np.testing.assert_allclose(discharge.current_A, recorded()["current_A"])
+        np.testing.assert_allclose(discharge.temperature_C, recorded()["temperature_C"])
+        assert discharge.meta["source"].endswith(name)
+
+    def test_negative_discharge_is_flipped_only_when_asked(self, tmp_path):
+        table = pd.DataFrame(recorded()).drop(columns="temperature_C")
+        table["current_A"] *= -1.0
+        table.to_csv(tmp_path / "own.csv", index=False)
+        with pytest.raises(ValueError, match=r"own.csv: .*discharge_is_negative=True"):
+            read_discharge_csv(tmp_path / "own.csv")
+        discharge = read_discharge_csv(tmp_path / "own.csv", discharge_is_negative=True)
+        np.testing.assert_allclose(discharge.current_A, recorded()["current_A"])
+
+    def test_missing_columns_are_named_with_what_was_found(self, tmp_path):
+        (tmp_path / "own.csv").write_text("t;U;I\n0;4.1;2\n")
+        with pytest.raises(ValueError, match="no column time_s, voltage_V, current_A; it has t;U;I"):
+            read_discharge_csv(tmp_path / "own.csv")
+
+    @pytest.mark.parametrize("contents", [b"", b"\xff\xfe\x00\x81", b"time_s,voltage_V,current_A\n1,2\n1,2,3,4,5\n"])
+    def test_what_is_no_table_is_refused_in_one_line(self, tmp_path, contents):
+        (tmp_path / "own.csv").write_bytes(contents)
+        with pytest.raises(ValueError, match=r"own.csv") as caught:
+            read_discharge_csv(tmp_path / "own.csv")
+        assert "\n" not in str(caught.value).strip()
+
+    def test_text_in_a_column_is_refused(self, tmp_path):
+        pd.DataFrame(recorded()).astype(object).replace({3.5: "OVERLOAD"}).to_csv(tmp_path / "own.csv", index=False)
+        with pytest.raises(ValueError, match=r"voltage_V must hold numbers.*OVERLOAD"):
+            read_discharge_csv(tmp_path / "own.csv")
+
+
+def test_loading_the_bundled_cells_warns_of_nothing():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load_nasa_discharges("B0005")

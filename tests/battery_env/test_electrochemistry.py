@@ -1,0 +1,246 @@
+"""The model against the published reference, against progpy, and against its own invariants."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from battery_env.electrochemistry import (
+    FULL_CHARGE_SHARES,
+    NEW_CELL,
+    QNB,
+    CellParameters,
+    initial_state,
+    simulate,
+    state_of_charge,
+    step,
+    step_into,
+    voltage,
+)
+
+# Tb, Vo, Vsn, Vsp, qnB, qnS, qpB, qpS, V of a new cell, dt 1 s
+REFERENCE_2A_THERMAL = {
+    1: (292.100000, 0.038515, 0.000077, 0.000029, 6840.000000, 758.000000, 4560.000000, 508.666667, 4.149791),
+    60: (292.635829, 0.234425, 0.004465, 0.000966, 6754.521186, 725.478814, 4645.478814, 541.187852, 3.900787),
+    600: (293.530937, 0.234430, 0.034505, 0.001313, 5782.680000, 617.320000, 5617.320000, 649.346667, 3.733269),
+    1800: (293.715944, 0.234430, 0.065086, 0.001426, 3622.680000, 377.320000, 7777.320000, 889.346667, 3.525836),
+    3000: (293.811029, 0.234430, 0.082084, 0.002056, 1462.680000, 137.320000, 9937.320000, 1129.346667, 3.405704),
+    3571: (293.887275, 0.234430, 0.096566, 0.004254, 434.880000, 23.120000, 10965.120000, 1243.546667, 3.002716),
+}
+REFERENCE_8W_ISOTHERMAL = {
+    1: (292.1, 0.036757, 0.000075, 0.000027, 6840.000000, 758.091307, 4560.000000, 508.575359, 4.151687),
+    60: (292.1, 0.240670, 0.004503, 0.000984, 6753.399297, 724.720707, 4646.600703, 541.945959, 3.893352),
+    600: (292.1, 0.252900, 0.035448, 0.001405, 5729.593573, 609.449053, 5670.406427, 657.217613, 3.706245),
+    1800: (292.1, 0.270540, 0.069347, 0.001683, 3316.879615, 339.467750, 8083.120385, 927.198917, 3.465343),
+    3000: (292.1, 0.287304, 0.094277, 0.003586, 774.787937, 55.254009, 10625.212063, 1211.412658, 3.257963),
+    3101: (292.1, 0.309179, 0.098459, 0.004853, 546.809368, 27.789045, 10853.190632, 1238.877622, 3.004657),
+}
+# by power in W and q_mobile in C, for r_o of 0.1, 0.117215, 0.15 and 0.2 ohm
+EOD_TIMES_S = {
+    (8, 4000): (1605, 1581, 1531, 1439),
+    (8, 6000): (2464, 2427, 2350, 2206),
+    (8, 7600): (3150, 3102, 3004, 2817),
+    (12, 4000): (979, 950, 874, 395),
+    (12, 6000): (1523, 1478, 1339, 613),
+    (12, 7600): (1956, 1898, 1689, 777),
+    (16, 4000): (659, 606, 275, 27),
+    (16, 6000): (1041, 919, 440, 38),
+    (16, 7600): (1342, 1163, 565, 53),
+}
+
+Q_MOBILE = st.floats(3500.0, 8000.0)
+R_O = st.floats(0.05, 0.3)
+
+
+@pytest.mark.parametrize(
+    ("load", "load_unit", "thermal", "reference", "eod_time_s"),
+    [
+        (2.0, "current", True, REFERENCE_2A_THERMAL, 3572),
+        (8.0, "power", False, REFERENCE_8W_ISOTHERMAL, 3102),
+    ],
+)
+def test_reference_trajectories_to_all_printed_digits(load, load_unit, thermal, reference, eod_time_s):
+    discharge = simulate(load, 7600.0, 0.117215, load_unit=load_unit, thermal=thermal)
+    assert discharge.eod_time_s == eod_time_s
+    for t, expected in reference.items():
+        found = [*discharge.state[t], discharge.voltage_V[t]]
+        np.testing.assert_allclose(found, expected, rtol=0.0, atol=5.1e-7, err_msg=f"t = {t}")
+
+
+@pytest.mark.parametrize(("power", "q_mobile"), EOD_TIMES_S)
+def test_end_of_discharge_times(power, q_mobile):
+    found = [simulate(float(power), q_mobile, r_o).eod_time_s for r_o in (0.1, 0.117215, 0.15, 0.2)]
+    assert tuple(found) == EOD_TIMES_S[power, q_mobile]
+
+
+def test_thermal_model_under_power_ends_a_second_earlier():
+    assert simulate(8.0, 7600.0, 0.117215, thermal=True).eod_time_s == 3101
+
+
+def test_agrees_with_progpy_on_random_cells_and_loads():
+    progpy_models = pytest.importorskip("progpy.models")
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        q_mobile, r_o = rng.uniform(4000.0, 7600.0), rng.uniform(0.08, 0.3)
+        load = np.repeat(rng.uniform(0.0, 3.0, size=12), 25)
+        # given to the constructor: set later, progpy's initial state would stay that of the new cell
+        peer = progpy_models.BatteryElectroChemEOD(qMobile=q_mobile, Ro=r_o)
+        ours = simulate(load, q_mobile, r_o, load_unit="current", thermal=True, until=len(load) - 1.0)
+        x = peer.initialize()
+        for k in range(len(ours.time_s)):
+            values = dict(zip(x.keys(), np.asarray(x.matrix, dtype=float)[:, 0], strict=True))
+            expected = [values[name] for name in ("tb", "Vo", "Vsn", "Vsp", "qnB", "qnS", "qpB", "qpS")]
+            np.testing.assert_allclose(ours.state[k], expected, rtol=1e-9, atol=1e-9)
+            assert ours.voltage_V[k] == pytest.approx(float(peer.output(x)["v"]), abs=1e-9)
+            x = peer.next_state(x, peer.InputContainer({"i": load[k]}), 1.0)
+
+
+@given(Q_MOBILE, R_O, st.lists(st.floats(0.0, 12.0), min_size=1, max_size=200))
+@settings(max_examples=60, deadline=None)
+def test_total_charge_is_conserved_under_any_load(q_mobile, r_o, load):
+    discharge = simulate(np.array(load), q_mobile, r_o)
+    total = discharge.state[:, QNB:].sum(axis=1)
+    np.testing.assert_allclose(total, q_mobile / 0.6, rtol=1e-12)
+
+
+@given(Q_MOBILE)
+def test_full_charge_has_the_same_voltage_for_every_cell(q_mobile):
+    assert voltage(initial_state(q_mobile), q_mobile) == pytest.approx(4.191350, abs=5e-7)
+    assert state_of_charge(initial_state(q_mobile), np.array(q_mobile)) == pytest.approx(1.0)
+
+
+def test_charges_are_linear_in_q_mobile_at_fixed_current():
+    small, large = (simulate(2.0, q, 0.12, load_unit="current", until=600.0).state[-1, QNB:] for q in (5000.0, 7000.0))
+    np.testing.assert_allclose(large - small, 2000.0 * FULL_CHARGE_SHARES, rtol=1e-12)
+
+
+@pytest.mark.parametrize("load_unit", ["power", "current"])
+@pytest.mark.parametrize("thermal", [False, True])
+def test_batch_equals_scalar(load_unit, thermal):
+    rng = np.random.default_rng(1)
+    q, r, load = rng.uniform(5000, 7600, (3, 4)), rng.uniform(0.1, 0.2, 4), rng.uniform(1, 4, (3, 1))
+    state = initial_state(q)
+    batch = step(step(state, load, q, r, 1.0, load_unit, thermal), load, q, r, 1.0, load_unit, thermal)
+    volts = voltage(batch, q)
+    for m, n in np.ndindex(3, 4):
+        one = state[m, n]
+        for _ in range(2):
+            one = step(one, load[m, 0], q[m, n], r[n], 1.0, load_unit, thermal)
+        np.testing.assert_array_equal(batch[m, n], one)
+        assert volts[m, n] == voltage(one, q[m, n])
+
+
+def test_roll_out_equals_single_steps():
+    load = np.random.default_rng(2).uniform(2.0, 10.0, 50)
+    discharge = simulate(load, 6500.0, 0.13)
+    state = initial_state(6500.0)
+    for k in range(50):
+        np.testing.assert_array_equal(discharge.state[k], state)
+        assert discharge.current_A[k] == pytest.approx(load[k] / discharge.voltage_V[k], rel=1e-15)
+        state = step(state, load[k], 6500.0, 0.13)
+
+
+def test_smaller_time_steps_converge():
+    ends = [simulate(8.0, 7600.0, 0.117215, dt=dt).eod_time_s for dt in (1.0, 0.5, 0.25)]
+    assert abs(ends[1] - ends[0]) <= 2.0 and abs(ends[2] - ends[1]) <= 1.0
+
+
+def test_voltage_collapse_ends_the_discharge():
+    # power above V^2 / 4 Ro: the voltage falls from above 3 V to nothing within a step or two
+    discharge = simulate(16.0, 4000.0, 0.2)
+    assert discharge.eod_time_s == 27
+    assert np.isfinite(discharge.state).all() and (discharge.voltage_V >= 3.0).all()
+
+
+def test_a_state_without_voltage_ends_the_discharge_whatever_the_cut_off():
+    discharge = simulate(16.0, 4000.0, 0.2, cut_off_V=-np.inf)
+    assert 27 < discharge.eod_time_s < 100
+    assert np.isfinite(discharge.state).all() and np.isfinite(discharge.voltage_V).all()
+
+
+def test_simulation_stops_where_it_is_told():
+    assert len(simulate(2.0, 7600.0, 0.1, until=100.0).time_s) == 101
+    assert np.isnan(simulate(2.0, 7600.0, 0.1, until=100.0).eod_time_s)
+    assert len(simulate(np.full(40, 2.0), 7600.0, 0.1).time_s) == 40
+    assert simulate(0.0, 7600.0, 0.1, max_duration_s=1000.0).time_s[-1] == 1000.0
+
+
+def test_part_keeps_the_clock():
+    part = simulate(8.0, 7600.0, 0.117215).part(100, 200)
+    assert part.time_s[0] == 100.0 and len(part.state) == len(part.voltage_V) == len(part.load) == 100
+    assert part.eod_time_s == 3102
+
+
+def test_extended_model_is_the_model_where_it_is_defined_and_finite_where_not():
+    discharge = simulate(12.0, 6000.0, 0.12)
+    state, n = discharge.state, len(discharge.state)
+    load, q, r = np.full(n, 12.0), np.full(n, 6000.0), np.full(n, 0.12)
+    plain, extended = np.empty_like(state), np.empty_like(state)
+    step_into(plain, state, load, q, r, 1.0, "power", False, NEW_CELL)
+    step_into(extended, state, load, q, r, 1.0, "power", False, NEW_CELL, extended=True)
+    np.testing.assert_array_equal(plain, extended)
+    for wrong in (4000.0, 8000.0):
+        step_into(extended, state, load, np.full(n, wrong), r, 1.0, "power", False, NEW_CELL, extended=True)
+        assert np.isfinite(extended).all()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"q_mobile": 2.1}, "q_mobile must lie within .* C, got 2.1. Ampere-hours"),
+        ({"q_mobile": np.nan}, "q_mobile"),
+        ({"r_o": 117.0}, "r_o must lie within .* ohm, got 117. Milliohms"),
+        ({"r_o": -0.1}, "r_o"),
+        ({"load": 8000.0}, "load must lie within .* W, got 8000"),
+        ({"load": np.inf}, "load"),
+        ({"load_unit": "mA"}, "load_unit must be 'power'"),
+        ({"dt": 12.3}, "dt must be .* at most 12.17 s .* got 12.3"),
+        ({"dt": 0.0}, "dt"),
+        ({"dt": float("nan")}, "dt"),
+    ],
+)
+@pytest.mark.parametrize("function", [step, simulate])
+def test_values_out_of_range_are_refused(function, arguments, message):
+    valid = {"load": 8.0, "q_mobile": 7600.0, "r_o": 0.117215} | arguments
+    if function is step:
+        valid["state"] = initial_state(7600.0)
+    with pytest.raises(ValueError, match=message):
+        function(**valid)
+
+
+def test_wrong_shapes_are_refused():
+    with pytest.raises(ValueError, match=r"state must have shape \(\.\.\., 8\)"):
+        step(np.zeros(7), 8.0, 7600.0, 0.1)
+    with pytest.raises(ValueError, match="one value a step"):
+        simulate(np.full((3, 2), 2.0), 7600.0, 0.1, until=2.0)
+    with pytest.raises(TypeError, match="q_mobile must be a number"):
+        initial_state("full")
+    with pytest.raises(ValueError, match="until must be"):
+        simulate(8.0, 7600.0, 0.1, until="empty")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"q_mobile": -1.0}, "q_mobile"),
+        ({"kn": 0.0}, "kn must be greater than 0"),
+        ({"Ap": (np.nan,)}, "Ap must be finite"),
+        ({"Ap": (1.0,) * 14}, "1 to 13 coefficients"),
+        ({"VolSFraction": 1.5}, "VolSFraction"),
+        ({"alpha": 0.4}, "alpha"),
+    ],
+)
+def test_constants_out_of_range_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        CellParameters(**changes)
+
+
+def test_constants_are_frozen_and_replaceable():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        NEW_CELL.kn = 1.0
+    slower = NEW_CELL.replace(kn=100.0)
+    assert slower.kn == 100.0 and NEW_CELL.kn == 2120.96
+    state = initial_state(7600.0)
+    assert step(state, 8.0, 7600.0, 0.1, parameters=slower)[2] > step(state, 8.0, 7600.0, 0.1)[2]

@@ -1,0 +1,249 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from battery_env.cells import Discharge, load_nasa_discharges
+from battery_env.electrochemistry import NEW_CELL, Trajectory, initial_state, simulate
+from battery_env.estimators.base import Estimate
+from battery_env.estimators.least_squares import SETTLED_SHARES, LeastSquares
+
+
+def discharged(
+    q_mobile: float = 6000.0, r_o: float = 0.15, load=8.0, noise_V: float = 0.0, seed: int = 0, **more
+) -> Trajectory:
+    trajectory = simulate(load, q_mobile, r_o, **more)
+    noise = np.random.default_rng(seed).normal(0.0, noise_V, len(trajectory.time_s))
+    return replace(trajectory, voltage_V=trajectory.voltage_V + noise)
+
+
+def steps(seed: int) -> np.ndarray:
+    return np.repeat(np.random.default_rng(seed).uniform(2.0, 8.0, 120), 100)
+
+
+@pytest.fixture(scope="module")
+def b0005() -> list[Discharge]:
+    return [discharge.loaded_part(2.7) for discharge in load_nasa_discharges("B0005")]
+
+
+class TestCleanRecords:
+    @pytest.mark.parametrize("power_W", [4.0, 8.0, 16.0])
+    @pytest.mark.parametrize("q_mobile", [4000.0, 7600.0])
+    @pytest.mark.parametrize("r_o", [0.1, 0.2])
+    def test_both_parameters_are_recovered_even_where_the_voltage_collapses(self, power_W, q_mobile, r_o):
+        # 16 W at 0.2 ohm ends after less than a minute
+        estimate = LeastSquares().estimate(discharged(q_mobile, r_o, power_W))
+        assert estimate.q_mobile == pytest.approx(q_mobile, rel=1e-6)
+        assert estimate.r_o == pytest.approx(r_o, rel=1e-6)
+        assert estimate.settled and np.isfinite(estimate.sd_q_mobile)
+
+    @settings(max_examples=15, deadline=None)
+    @given(q_mobile=st.floats(2000.0, 12_000.0), r_o=st.floats(0.02, 0.35), seed=st.integers(0, 1000))
+    def test_both_parameters_are_recovered_under_any_steps_of_the_load(self, q_mobile, r_o, seed):
+        estimate = LeastSquares().estimate(discharged(q_mobile, r_o, steps(seed)))
+        assert estimate.q_mobile == pytest.approx(q_mobile, rel=1e-6)
+        assert estimate.r_o == pytest.approx(r_o, rel=1e-6)
+
+    def test_one_parameter_at_a_time(self):
+        record = discharged(6000.0, 0.15)
+        q_only = LeastSquares(["q_mobile"], cell=NEW_CELL.replace(r_o=0.15)).estimate(record)
+        assert q_only.q_mobile == pytest.approx(6000.0, rel=1e-6)
+        assert q_only.r_o == 0.15 and np.isnan(q_only.sd_r_o)
+        r_only = LeastSquares(["r_o"], cell=NEW_CELL.replace(q_mobile=6000.0)).estimate(record)
+        assert r_only.r_o == pytest.approx(0.15, rel=1e-6)
+        assert r_only.q_mobile == 6000.0 and np.isnan(r_only.sd_q_mobile)
+
+    @pytest.mark.parametrize("thermal", [False, True])
+    @pytest.mark.parametrize("dt_s", [0.5, 2.0])
+    def test_thermal_model_and_other_time_steps(self, thermal, dt_s):
+        record = discharged(load=2.0, load_unit="current", thermal=thermal, dt=dt_s)
+        estimate = LeastSquares(thermal=thermal, dt_s=dt_s).estimate(record)
+        assert (estimate.q_mobile, estimate.r_o) == pytest.approx((6000.0, 0.15), rel=1e-6)
+
+    def test_a_record_sampled_now_and_then(self):
+        whole = discharged(load=2.0, load_unit="current")
+        kept = np.sort(np.random.default_rng(0).choice(len(whole.time_s), 200, replace=False))
+        record = Discharge(whole.time_s[kept], whole.voltage_V[kept], whole.current_A[kept])
+        start = whole.state[kept[0]]
+        estimate = LeastSquares(initial=start).estimate(record)
+        assert (estimate.q_mobile, estimate.r_o) == pytest.approx((6000.0, 0.15), rel=1e-6)
+
+    def test_a_record_of_the_second_half_with_the_state_of_another_cell_of_the_same_history(self):
+        load = steps(3)
+        second = discharged(6000.0, 0.15, load).part(1500, 2500)
+        # the history of the current is the record's; the charges of the new cell under it differ by a share of q_mobile
+        first = simulate(discharged(6000.0, 0.15, load).current_A[:1501], 7600.0, 0.15, load_unit="current")
+        slow_ones = [2, 3]  # the surface overpotentials do depend on q_mobile
+        start = first.state[1500].copy()
+        start[slow_ones] = second.state[0][slow_ones]
+        estimate = LeastSquares(initial=start).estimate(second)
+        assert (estimate.q_mobile, estimate.r_o) == pytest.approx((6000.0, 0.15), rel=1e-6)
+
+    def test_the_trace_is_one_estimate_at_the_end(self):
+        record = discharged()
+        (trace,) = LeastSquares().trace([record])
+        assert trace.time_s == record.time_s[-1]
+        assert trace.q_mobile == pytest.approx(6000.0, rel=1e-6)
+
+
+class TestNoise:
+    def test_errors_are_as_large_as_stated(self):
+        scores = []
+        for seed in range(25):
+            estimate = LeastSquares().estimate(discharged(noise_V=0.005, seed=seed))
+            scores.append([(estimate.q_mobile - 6000.0) / estimate.sd_q_mobile, (estimate.r_o - 0.15) / estimate.sd_r_o])
+        assert np.abs(scores).max() < 4.0
+        assert 0.6 < np.sqrt(np.mean(np.square(scores), axis=0)).min()
+        assert np.sqrt(np.mean(np.square(scores), axis=0)).max() < 1.5
+
+    def test_mismatch_widens_the_deviations_and_more_samples_do_not_narrow_them(self):
+        record = discharged(noise_V=0.005)
+        thinned = Discharge(record.time_s[::20], record.voltage_V[::20], record.current_A[::20])
+        white, doubtful, few = (
+            LeastSquares(mismatch_V=mismatch_V).estimate(data)
+            for mismatch_V, data in ((0.0, record), (0.05, record), (0.05, thinned))
+        )
+        assert doubtful.q_mobile == white.q_mobile
+        assert doubtful.sd_q_mobile > 100.0 * white.sd_q_mobile
+        assert few.sd_q_mobile == pytest.approx(doubtful.sd_q_mobile, rel=0.2)
+
+    def test_the_first_minutes_do_not_settle(self):
+        beginning = discharged(noise_V=0.005).part(0, 120)
+        estimate = LeastSquares().estimate(beginning)
+        assert estimate.sd_q_mobile > SETTLED_SHARES["q_mobile"] * estimate.q_mobile
+        assert not estimate.settled
+
+    def test_a_prior_settles_them_and_a_whole_record_overrules_it(self):
+        record = discharged(noise_V=0.005)
+        fit = LeastSquares(prior_q_mobile_C=(6100.0, 60.0))
+        early, late = fit.estimate(record.part(0, 120)), fit.estimate(record)
+        assert early.q_mobile == pytest.approx(6100.0, abs=60.0)
+        assert early.sd_q_mobile <= 60.0 and early.settled
+        assert abs(late.q_mobile - 6000.0) < 4.0 * late.sd_q_mobile < 10.0
+
+    def test_prior_and_record_are_weighed_by_their_variances(self):
+        beginning = discharged(noise_V=0.005).part(0, 1500)
+        alone = LeastSquares(["q_mobile"], cell=NEW_CELL.replace(r_o=0.15)).estimate(beginning)
+        prior = (alone.q_mobile + 2.0 * alone.sd_q_mobile, alone.sd_q_mobile)
+        both = LeastSquares(["q_mobile"], cell=NEW_CELL.replace(r_o=0.15), prior_q_mobile_C=prior).estimate(beginning)
+        assert both.q_mobile == pytest.approx(alone.q_mobile + alone.sd_q_mobile, abs=0.1 * alone.sd_q_mobile)
+        assert both.sd_q_mobile == pytest.approx(alone.sd_q_mobile / np.sqrt(2.0), rel=0.05)
+
+
+class TestHeldParameter:
+    def test_too_small_a_q_mobile_leaves_what_the_model_lives_to_see(self):
+        record = discharged(6000.0, 0.15)
+        estimate = LeastSquares(["r_o"], cell=NEW_CELL.replace(q_mobile=4000.0)).estimate(record)
+        assert np.isfinite(estimate.r_o) and not estimate.settled
+
+    def test_a_q_mobile_that_is_empty_at_once_is_refused(self):
+        with pytest.raises(ValueError, match="q_mobile = 100 C is empty at the start"):
+            LeastSquares(["r_o"], cell=NEW_CELL.replace(q_mobile=100.0)).estimate(discharged(load=30.0, load_unit="current"))
+
+
+class TestEndOfDischarge:
+    @pytest.mark.parametrize("cut_off_V", [3.2, 3.0, 2.7])
+    def test_it_is_the_simulated_one_to_within_a_step(self, cut_off_V):
+        record = discharged(load=2.0, load_unit="current", cut_off_V=cut_off_V)
+        truth = Estimate(6000.0, 0.15)
+        for seen in (record, record.part(0, 900)):
+            eod_time_s = LeastSquares().predict_eod_time_s(seen, truth, cut_off_V)
+            assert record.eod_time_s - 1.0 <= eod_time_s <= record.eod_time_s
+
+    def test_forecast_follows_the_record_and_ends_at_the_cut_off(self):
+        record = discharged(load=2.0, load_unit="current")
+        time_s, voltage_V = LeastSquares().forecast(record.part(0, 900), Estimate(6000.0, 0.15))
+        np.testing.assert_allclose(voltage_V[: len(record.time_s)], record.voltage_V, atol=1e-12)
+        assert voltage_V[-1] == 3.0 and (np.diff(time_s) > 0.0).all()
+
+    def test_time_counts_on_the_clock_of_the_record(self):
+        record = discharged(load=2.0, load_unit="current")
+        later = replace(record, time_s=record.time_s + 1000.0)
+        truth, fit = Estimate(6000.0, 0.15), LeastSquares()
+        assert fit.predict_eod_time_s(later, truth) == pytest.approx(fit.predict_eod_time_s(record, truth) + 1000.0)
+
+    def test_it_is_unknown_when_the_load_is_off(self):
+        current_A = np.where(np.arange(600) < 300, 2.0, 0.0)
+        record = simulate(current_A, 6000.0, 0.15, load_unit="current")
+        assert np.isnan(LeastSquares().predict_eod_time_s(record, Estimate(6000.0, 0.15)))
+
+    def test_predicted_voltage_ends_where_the_cell_is_empty(self):
+        record = discharged(6000.0, 0.15)
+        voltage_V = LeastSquares().predict_voltage_V(record, Estimate(4000.0, 0.15))
+        assert np.isnan(voltage_V[-1]) and np.isfinite(voltage_V[: len(voltage_V) // 2]).all()
+
+
+class TestRealDischarges:
+    @pytest.mark.parametrize("cycle", [1, 90, 168])
+    def test_q_mobile_tracks_the_measured_capacity_and_predicts_the_end(self, b0005, cycle):
+        record, fit = b0005[cycle - 1], LeastSquares(thermal=True, mismatch_V=0.05)
+        estimate = fit.estimate(record)
+        assert 1.03 < estimate.q_mobile / (3600.0 * record.meta["capacity_Ah"]) < 1.07
+        assert 0.09 < estimate.r_o < 0.17
+        assert estimate.settled
+        assert abs(fit.predict_eod_time_s(record, estimate, 2.7) - record.time_s[-1]) < 0.01 * record.time_s[-1]
+
+    @pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
+    def test_an_unfinished_one_is_not_settled_and_a_prior_repairs_it(self, b0005, share):
+        previous, record = b0005[98], b0005[99]
+        fit = LeastSquares(thermal=True, mismatch_V=0.05)
+        beginning = record.until(record.time_s[0] + share * (record.time_s[-1] - record.time_s[0]))
+        alone = fit.estimate(beginning)
+        assert not alone.settled
+        assert abs(alone.q_mobile - fit.estimate(record).q_mobile) < 2.0 * alone.sd_q_mobile
+        before = fit.estimate(previous).q_mobile
+        carried = LeastSquares(thermal=True, mismatch_V=0.05, prior_q_mobile_C=(before, 0.01 * before))
+        eod_time_s = carried.predict_eod_time_s(beginning, carried.estimate(beginning), 2.7)
+        assert eod_time_s == pytest.approx(record.time_s[-1], rel=0.01)
+
+    def test_a_raw_record_with_its_rests_gives_nearly_the_same(self, b0005):
+        raw = LeastSquares(thermal=True).estimate(load_nasa_discharges("B0005")[99])
+        assert raw.q_mobile == pytest.approx(LeastSquares(thermal=True).estimate(b0005[99]).q_mobile, rel=0.01)
+
+
+class TestBadInput:
+    @pytest.mark.parametrize(
+        ("arguments", "message"),
+        [
+            ({"parameters": ["capacity"]}, "one or both"),
+            ({"parameters": []}, "one or both"),
+            ({"parameters": ["r_o", "r_o"]}, "one or both"),
+            ({"dt_s": 20.0}, "dt must"),
+            ({"initial": np.zeros(7)}, "initial must hold 8"),
+            ({"q_mobile_bounds_C": (6000.0, 5000.0)}, "bounds of q_mobile"),
+            ({"q_mobile_bounds_C": (2.1, 5000.0)}, "Ampere-hours"),
+            ({"r_o_bounds_ohm": (0.0, 80.0)}, "Milliohms"),
+            ({"prior_q_mobile_C": (6000.0, 0.0)}, "sd > 0"),
+            ({"prior_q_mobile_C": (1.9, 0.1)}, "Ampere-hours"),
+            ({"prior_q_mobile_C": (6000.0, 60.0), "parameters": ["r_o"]}, "needs 'q_mobile'"),
+            ({"mismatch_V": -0.05}, "mismatch_V"),
+        ],
+    )
+    def test_arguments_are_checked(self, arguments, message):
+        with pytest.raises(ValueError, match=message):
+            LeastSquares(**arguments)
+
+    def test_a_record_beyond_the_bounds_says_what_it_takes(self):
+        with pytest.raises(ValueError, match=r"at least 5\d\d\d.* C, which is beyond the upper bound, 4000 C"):
+            LeastSquares(q_mobile_bounds_C=(100.0, 4000.0)).estimate(discharged())
+
+    @pytest.mark.parametrize(
+        ("changes", "message"),
+        [
+            ({"voltage_V": np.full(100, np.nan)}, "finite"),
+            ({"voltage_V": np.full(99, 3.0)}, "one finite value a sample"),
+            ({"time_s": np.zeros(100)}, "order of time"),
+            ({"current_A": np.zeros(100)}, "no current"),
+        ],
+    )
+    def test_records_are_checked(self, changes, message):
+        with pytest.raises(ValueError, match=message):
+            LeastSquares().estimate(replace(discharged().part(0, 100), **changes))
+
+
+def test_full_charge_is_the_default_start():
+    record = discharged()
+    explicit = LeastSquares(initial=initial_state(5000.0)).estimate(record)
+    assert explicit.q_mobile == pytest.approx(LeastSquares().estimate(record).q_mobile, rel=1e-9)

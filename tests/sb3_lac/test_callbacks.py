@@ -1,0 +1,136 @@
+import os
+
+import numpy as np
+import pandas as pd
+import pytest
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+
+from sb3_lac import LAC, CalibrationCallback
+
+
+class Evaluation:
+    """An evaluation with known results: one mean error per call, plus and minus one."""
+
+    def __init__(self, *means):
+        self.means = list(means)
+        self.models = []
+
+    def __call__(self, model):
+        self.models.append(model)
+        mean = self.means.pop(0)
+        return pd.DataFrame({"mape_percent": [mean - 1, mean + 1], "bias": [0.5, 1.5], "label": ["a", "b"]})
+
+
+def test_mean_and_worst_are_logged_at_their_timesteps(make_model):
+    dumps = []
+    model = make_model(n_collect=0)
+    original_dump = model.logger.dump
+    model.logger.dump = lambda step: (dumps.append((step, dict(model.logger.name_to_value))), original_dump(step))
+    evaluation = Evaluation(5.0, 3.0)
+    callback = CalibrationCallback(evaluation, eval_freq=10, metrics={"mape_percent": "mape", "bias": "bias"}, verbose=0)
+    model.learn(25, callback=callback, log_interval=None)
+
+    assert evaluation.models == [model, model]
+    assert [step for step, _ in dumps] == [10, 20]
+    assert {name: value for name, value in dumps[1][1].items() if "calibration" in name} == {
+        "calibration/mape": 3.0,
+        "calibration/mape_worst": 4.0,
+        "calibration/bias": 1.0,
+        "calibration/bias_worst": 1.5,
+    }
+    assert dumps[1][1]["time/total_timesteps"] == 20
+    assert [entry["timesteps"] for entry in callback.history] == [10, 20]
+    assert callback.best_objective == 3.0
+
+
+def test_frequency_counts_calls_and_not_timesteps(make_model, make_env):
+    callback = CalibrationCallback(Evaluation(1.0, 1.0), eval_freq=5, verbose=0)
+    make_model(make_vec_env(make_env, n_envs=3), n_collect=0).learn(30, callback=callback)
+    assert [entry["timesteps"] for entry in callback.history] == [15, 30]
+
+
+def test_no_evaluation_without_frequency(make_model):
+    callback = CalibrationCallback(Evaluation(), eval_freq=-1)
+    make_model(n_collect=0).learn(10, callback=callback)
+    assert callback.history == []
+
+
+def test_history_and_best_model_are_saved_and_continued(make_model, tmp_path, monkeypatch):
+    log_path, best_path = tmp_path / "run" / "calibration.csv", tmp_path / "best"
+    renames = []
+    original_replace = os.replace
+    monkeypatch.setattr(os, "replace", lambda source, target: (renames.append(target), original_replace(source, target)))
+
+    def learn(model, n_steps, *means):
+        callback = CalibrationCallback(
+            Evaluation(*means), eval_freq=10, log_path=log_path, best_model_save_path=str(best_path), verbose=0
+        )
+        model.learn(n_steps, callback=callback, reset_num_timesteps=False)
+        return callback
+
+    model = make_model(n_collect=0)
+    learn(model, 30, 3.0, 2.0, 5.0)
+    assert pd.read_csv(log_path)["timesteps"].tolist() == [10, 20, 30]
+    assert pd.read_csv(log_path)["mape_percent"].tolist() == [3.0, 2.0, 5.0]
+    assert LAC.load(best_path / "best_model").num_timesteps == 20
+
+    # From a checkpoint of 20 steps: the evaluation at 30 is replaced, and 2.0 is still the best
+    model.num_timesteps = 20
+    callback = learn(model, 20, 4.0, 3.0)
+    frame = pd.read_csv(log_path)
+    assert frame["timesteps"].tolist() == [10, 20, 30, 40]
+    assert frame["mape_percent"].tolist() == [3.0, 2.0, 4.0, 3.0]
+    assert callback.best_objective == 2.0
+    assert LAC.load(best_path / "best_model").num_timesteps == 20
+
+    learn(model, 10, 1.0)
+    assert LAC.load(best_path / "best_model").num_timesteps == 50
+    # Nothing is left behind, and no file is written in place
+    assert sorted(path.name for path in tmp_path.rglob("*.*")) == ["best_model.zip", "calibration.csv"]
+    assert len(renames) == 6 + 3
+
+
+def test_missing_result_of_a_trajectory_is_not_hidden(make_model):
+    def evaluate(model):
+        return pd.DataFrame({"mape_percent": [1.0, np.nan]})
+
+    callback = CalibrationCallback(evaluate, eval_freq=5, verbose=0)
+    make_model(n_collect=0).learn(5, callback=callback)
+    assert np.isnan(callback.history[0]["mape_percent"]) and np.isnan(callback.history[0]["mape_percent_worst"])
+    assert callback.best_objective == np.inf
+
+
+class Count(BaseCallback):
+    def __init__(self, stop=False):
+        super().__init__()
+        self.stop = stop
+
+    def _on_step(self):
+        assert "new_obs" in self.locals
+        return not self.stop
+
+
+def test_child_callbacks_are_triggered(make_model, capsys):
+    on_new_best, after_eval = Count(), Count()
+    callback = CalibrationCallback(
+        Evaluation(3.0, 4.0, 2.0), eval_freq=5, callback_on_new_best=on_new_best, callback_after_eval=after_eval
+    )
+    make_model(n_collect=0).learn(15, callback=callback)
+    assert (on_new_best.n_calls, after_eval.n_calls) == (2, 3)
+    assert on_new_best.parent is callback
+    assert capsys.readouterr().out.count("New best mape_percent!") == 2
+
+
+@pytest.mark.parametrize("name", ["callback_on_new_best", "callback_after_eval"])
+def test_child_callback_can_stop_training(make_model, name):
+    callback = CalibrationCallback(Evaluation(3.0), eval_freq=5, verbose=0, **{name: Count(stop=True)})
+    assert make_model(n_collect=0).learn(100, callback=callback).num_timesteps == 5
+
+
+def test_wrong_columns_are_named(make_model):
+    with pytest.raises(ValueError, match="at least one column"):
+        CalibrationCallback(Evaluation(), metrics="mape_percent")
+    callback = CalibrationCallback(Evaluation(1.0), eval_freq=1, metrics=("rmse",))
+    with pytest.raises(ValueError, match=r"no column \['rmse'\], its columns are \['mape_percent', 'bias', 'label'\]"):
+        make_model(n_collect=0).learn(1, callback=callback)

@@ -1,0 +1,52 @@
+import importlib
+import sys
+from pathlib import Path
+
+import pytest
+
+import sb3_lac
+
+
+@pytest.fixture
+def reload_package(monkeypatch):
+    """Import the package again, with another battery_env."""
+
+    def _reload_package():
+        return importlib.reload(sb3_lac)
+
+    yield _reload_package
+    monkeypatch.undo()
+    importlib.reload(sb3_lac)
+
+
+def test_exports():
+    assert set(sb3_lac.__all__) == {
+        "LAC",
+        "CalibrationCallback",
+        "CnnPolicy",
+        "LyapunovPolicy",
+        "MlpPolicy",
+        "MultiInputPolicy",
+        "__version__",
+    }
+    assert all(hasattr(sb3_lac, name) for name in sb3_lac.__all__)
+
+
+def test_version_and_type_marker_are_shipped():
+    folder = Path(sb3_lac.__file__).parent
+    assert sb3_lac.__version__ == (folder / "version.txt").read_text().strip()
+    assert (folder / "py.typed").is_file()
+
+
+def test_battery_env_is_optional(monkeypatch, reload_package):
+    monkeypatch.setitem(sys.modules, "battery_env", None)
+    assert reload_package().LAC is sb3_lac.LAC
+
+
+def test_broken_battery_env_is_not_hidden(monkeypatch, reload_package, tmp_path):
+    (tmp_path / "battery_env").mkdir()
+    (tmp_path / "battery_env" / "__init__.py").write_text("import a_missing_dependency\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "battery_env", raising=False)
+    with pytest.raises(ModuleNotFoundError, match="a_missing_dependency"):
+        reload_package()

@@ -1,0 +1,129 @@
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.envs import FakeImageEnv
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from torch import nn
+
+from sb3_lac import CnnPolicy, LyapunovPolicy, MlpPolicy, MultiInputPolicy
+
+
+class BatchNormExtractor(BaseFeaturesExtractor):
+    def __init__(self, observation_space):
+        super().__init__(observation_space, features_dim=observation_space.shape[0])
+        self.batch_norm = nn.BatchNorm1d(self.features_dim)
+
+    def forward(self, observations):
+        return self.batch_norm(observations)
+
+
+def test_mlp_policy_is_the_lyapunov_policy():
+    assert MlpPolicy is LyapunovPolicy
+    assert issubclass(CnnPolicy, LyapunovPolicy) and issubclass(MultiInputPolicy, LyapunovPolicy)
+
+
+def test_value_is_the_sum_of_squares_of_the_last_layer(make_model):
+    critic = make_model(n_collect=0, policy_kwargs={"n_critics": 2, "output_dim": 5}).critic
+    obs, actions = th.randn(30, 2), th.rand(30, 2)
+    values = critic(obs, actions)
+    assert len(values) == 2
+    for value, net in zip(values, critic.lyapunov_networks, strict=True):
+        outputs = net(th.cat([obs, actions], dim=1))
+        assert outputs.shape == (30, 5)
+        th.testing.assert_close(value, (outputs**2).sum(dim=1, keepdim=True))
+    assert not th.equal(values[0], values[1])
+
+
+def test_actor_and_critic_can_have_their_own_architecture(make_model):
+    model = make_model(n_collect=0, policy_kwargs={"net_arch": {"pi": [8], "qf": [12, 10]}})
+    assert [layer.out_features for layer in model.actor.latent_pi if isinstance(layer, nn.Linear)] == [8]
+    critic_layers = [layer.out_features for layer in model.critic.lyapunov_networks[0] if isinstance(layer, nn.Linear)]
+    assert critic_layers == [12, 10, 16]
+
+
+def test_targets_start_as_copies_and_stay_in_eval_mode(make_model):
+    policy = make_model(n_collect=0).policy
+    for online, target in ((policy.actor, policy.actor_target), (policy.critic, policy.critic_target)):
+        assert online is not target
+        for parameter, target_parameter in zip(online.parameters(), target.parameters(), strict=True):
+            assert parameter is not target_parameter and th.equal(parameter, target_parameter)
+    policy.set_training_mode(True)
+    assert policy.actor.training and policy.critic.training
+    assert not policy.actor_target.training and not policy.critic_target.training
+
+
+def test_batch_norm_statistics_of_both_targets_are_updated(make_model, train_metrics):
+    model = make_model(policy_kwargs={"features_extractor_class": BatchNormExtractor})
+    assert len(model.batch_norm_stats) == len(model.batch_norm_stats_target) == 4
+    train_metrics(model, gradient_steps=3)
+    for online, target in ((model.actor, model.actor_target), (model.critic, model.critic_target)):
+        batch_norm = online.features_extractor.batch_norm
+        target_batch_norm = target.features_extractor.batch_norm
+        assert not th.equal(batch_norm.running_mean, th.zeros(2))
+        assert th.equal(batch_norm.running_mean, target_batch_norm.running_mean)
+        assert th.equal(batch_norm.running_var, target_batch_norm.running_var)
+
+
+@pytest.mark.parametrize("share_features_extractor", [False, True])
+def test_shared_features_extractor_is_trained_by_the_actor_only(make_model, train_metrics, share_features_extractor):
+    env = FakeImageEnv(screen_height=36, screen_width=36, n_channels=1, discrete=False)
+    model = make_model(
+        env,
+        n_collect=5,
+        learning_starts=5,
+        buffer_size=10,
+        batch_size=4,
+        policy="CnnPolicy",
+        policy_kwargs={"share_features_extractor": share_features_extractor, "features_extractor_kwargs": {"features_dim": 8}},
+    )
+    assert (model.actor.features_extractor is model.critic.features_extractor) == share_features_extractor
+    assert model.critic_target.features_extractor is not model.actor_target.features_extractor
+    n_optimized = sum(len(group["params"]) for group in model.critic.optimizer.param_groups)
+    n_features = len(list(model.critic.features_extractor.parameters()))
+    assert n_optimized == len(list(model.critic.parameters())) - (n_features if share_features_extractor else 0)
+    before = [parameter.clone() for parameter in model.actor.features_extractor.parameters()]
+    train_metrics(model)
+    after = model.actor.features_extractor.parameters()
+    assert any(not th.equal(old, new) for old, new in zip(before, after, strict=True))
+
+
+def test_critic_respects_no_grad(make_model):
+    model = make_model(n_collect=0)
+    with th.no_grad():
+        assert not model.critic(th.zeros(1, 2), th.zeros(1, 2))[0].requires_grad
+
+
+def test_policy_keeps_all_arguments_when_saved_and_loaded(make_model, tmp_path):
+    policy_kwargs = {
+        "net_arch": {"pi": [8], "qf": [12]},
+        "activation_fn": nn.Tanh,
+        "log_std_init": -1.5,
+        "use_expln": True,
+        "clip_mean": 1.5,
+        "optimizer_class": th.optim.AdamW,
+        "optimizer_kwargs": {"weight_decay": 0.1},
+        "output_dim": 5,
+        "n_critics": 2,
+        "share_features_extractor": True,
+    }
+    policy = make_model(n_collect=0, use_sde=True, policy_kwargs=policy_kwargs).policy
+    policy.save(tmp_path / "policy.pkl")
+    loaded = LyapunovPolicy.load(tmp_path / "policy.pkl")
+
+    arguments, loaded_arguments = (a_policy._get_constructor_parameters() for a_policy in (policy, loaded))
+    for name, value in {**policy_kwargs, "use_sde": True}.items():
+        assert arguments[name] == loaded_arguments[name] == value, name
+    assert loaded.actor.features_extractor is loaded.critic.features_extractor
+    for name, tensor in policy.state_dict().items():
+        assert th.equal(tensor, loaded.state_dict()[name])
+    obs = np.ones(2, dtype=np.float32)
+    np.testing.assert_array_equal(policy.predict(obs, deterministic=True)[0], loaded.predict(obs, deterministic=True)[0])
+
+
+def test_optimizer_is_chosen_by_the_user(make_model):
+    default = make_model(n_collect=0).policy
+    assert default.actor.optimizer.defaults["fused"] and default.critic.optimizer.defaults["fused"]
+    custom = make_model(n_collect=0, policy_kwargs={"optimizer_kwargs": {"eps": 1e-5}}).policy
+    assert custom.critic.optimizer.defaults["eps"] == 1e-5 and not custom.critic.optimizer.defaults["fused"]
+    sgd = make_model(n_collect=0, policy_kwargs={"optimizer_class": th.optim.SGD}).policy
+    assert isinstance(sgd.actor.optimizer, th.optim.SGD)

@@ -1,0 +1,129 @@
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from sb3_lac import LAC
+
+
+def assert_same(value, other):
+    """Compare nested state dicts, numbers and tensors exactly."""
+    assert type(value) is type(other)
+    if isinstance(value, dict):
+        assert value.keys() == other.keys()
+        for key in value:
+            assert_same(value[key], other[key])
+    elif isinstance(value, (list, tuple)):
+        assert len(value) == len(other)
+        for item, other_item in zip(value, other, strict=True):
+            assert_same(item, other_item)
+    elif isinstance(value, th.Tensor):
+        assert th.equal(value, other)
+    else:
+        assert value == other
+
+
+def assert_same_learned_state(model, other):
+    state_dicts, tensors = model._get_torch_save_params()
+    assert (state_dicts, tensors) == other._get_torch_save_params()
+    assert_same(model.get_parameters(), other.get_parameters())
+    for name in tensors:
+        assert th.equal(getattr(model, name), getattr(other, name)), name
+
+
+@pytest.mark.parametrize(
+    "kwargs",
+    [
+        {},
+        {"ent_coef": 0.1},
+        {"use_sde": True},
+        {"policy_kwargs": {"n_critics": 2, "share_features_extractor": True}},
+        {"learning_rate": 1e-3, "lambda_learning_rate": 0.05, "alpha3": 0.2, "lambda_init": 0.5},
+    ],
+    ids=["default", "fixed_entropy", "gsde", "twin_critics", "own_arguments"],
+)
+def test_continued_training_is_the_same_as_uninterrupted_training(make_model, make_env, train_metrics, tmp_path, kwargs):
+    # Positive rewards, so that the bound of the cost matters
+    model = make_model(make_env(offset=4.0), **kwargs)
+    train_metrics(model, gradient_steps=5)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "replay_buffer")
+
+    loaded = LAC.load(tmp_path / "model", env=make_env(offset=4.0), device="cpu")
+    loaded.set_logger(model.logger)
+    loaded.load_replay_buffer(tmp_path / "replay_buffer")
+    assert_same_learned_state(model, loaded)
+    assert loaded.reward_bound.item() > 0
+    assert loaded.actor_target is loaded.policy.actor_target
+
+    metrics = train_metrics(model, gradient_steps=5, seed=1)
+    assert_same(metrics, train_metrics(loaded, gradient_steps=5, seed=1))
+    assert_same_learned_state(model, loaded)
+
+
+def test_learned_state_differs_from_a_fresh_model(make_model, train_metrics):
+    """The comparison above would notice what is not restored."""
+    model, fresh = make_model(lambda_init=0.5), make_model(lambda_init=0.5)
+    assert_same_learned_state(model, fresh)
+    train_metrics(model, gradient_steps=2)
+    state_dicts, _ = model._get_torch_save_params()
+    for name in state_dicts:
+        with pytest.raises(AssertionError):
+            assert_same(model.get_parameters()[name], fresh.get_parameters()[name])
+    assert not th.equal(model.log_lambda, fresh.log_lambda)
+
+
+def test_arguments_are_kept(make_model, tmp_path):
+    arguments = {"alpha3": 0.2, "lambda_init": 0.3, "lambda_min": 0.01, "lambda_max": 2.0, "lambda_learning_rate": 1e-4}
+    make_model(n_collect=0, **arguments).save(tmp_path / "model")
+    loaded = LAC.load(tmp_path / "model")
+    assert {name: getattr(loaded, name) for name in arguments} == arguments
+    assert loaded.lambda_lr_schedule(0.5) == 1e-4
+
+
+def test_loaded_arguments_are_checked_and_can_be_changed(make_model, tmp_path):
+    make_model(n_collect=0).save(tmp_path / "model")
+    assert LAC.load(tmp_path / "model", alpha3=0.5).alpha3 == 0.5
+    with pytest.raises(ValueError, match="alpha3=-1 must be greater than 0"):
+        LAC.load(tmp_path / "model", alpha3=-1)
+
+
+def test_loaded_model_continues_to_learn(make_model, make_env, tmp_path):
+    model = make_model(n_collect=0).learn(60)
+    model.save(tmp_path / "model")
+    loaded = LAC.load(tmp_path / "model", env=make_env(), device="cpu")
+    loaded.learn(60, reset_num_timesteps=False)
+    assert loaded.num_timesteps == 120
+    assert loaded._n_updates > model._n_updates
+
+
+def test_loaded_model_predicts_without_env(make_model, tmp_path):
+    model = make_model()
+    model.save(tmp_path / "model")
+    obs = np.ones((3, 2), dtype=np.float32)
+    loaded = LAC.load(tmp_path / "model")
+    np.testing.assert_array_equal(model.predict(obs, deterministic=True)[0], loaded.predict(obs, deterministic=True)[0])
+
+
+def test_bound_is_saved_in_units_of_the_environment(make_model, make_env, train_metrics, tmp_path):
+    env = VecNormalize(DummyVecEnv([lambda: make_env(offset=30.0)]))
+    model = make_model(env)
+    train_metrics(model, gradient_steps=20)
+    model.save(tmp_path / "model")
+    env.save(tmp_path / "vecnormalize.pkl")
+    env = VecNormalize.load(tmp_path / "vecnormalize.pkl", DummyVecEnv([lambda: make_env(offset=30.0)]))
+    loaded = LAC.load(tmp_path / "model", env=env, device="cpu")
+    assert loaded.reward_bound.item() == model.reward_bound.item()
+    assert loaded.reward_bound.item() == pytest.approx(model.replay_buffer.rewards.max(), rel=1e-5)
+
+
+def test_saved_data_holds_no_tensor(make_model, train_metrics, tmp_path):
+    """Tensors and networks are saved as such, and not a second time as pickled attributes."""
+    model = make_model()
+    train_metrics(model)
+    model.save(tmp_path / "model")
+    data, _, _ = load_from_zip_file(tmp_path / "model")
+    for name in ("actor", "actor_target", "critic", "critic_target", "batch_norm_stats", "batch_norm_stats_target"):
+        assert name not in data
+    assert not any(isinstance(value, (th.Tensor, th.nn.Module, th.optim.Optimizer)) for value in data.values())

@@ -1,0 +1,154 @@
+"""LAC works wherever SAC works: observations, replay buffers, exploration and vectorized environments."""
+
+import inspect
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import SAC, HerReplayBuffer
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.envs import BitFlippingEnv, FakeImageEnv, SimpleMultiObsEnv
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_lac import LAC
+
+
+def check_training(model, n_steps=60):
+    before = {name: tensor.clone() for name, tensor in model.policy.state_dict().items()}
+    model.learn(n_steps)
+    assert model._n_updates > 0
+    state = model.policy.state_dict()
+    for part in ("actor.", "actor_target.", "critic.", "critic_target."):
+        names = [name for name in state if name.startswith(part)]
+        assert any(not th.equal(before[name], state[name]) for name in names), part
+    assert all(th.isfinite(tensor).all() for tensor in state.values())
+    assert model.logger.name_to_value["train/cost"] >= 0
+
+
+def test_arguments_are_those_of_sac_and_the_own_ones_follow_target_entropy():
+    parameters, sac_parameters = (list(inspect.signature(cls.__init__).parameters.values()) for cls in (LAC, SAC))
+    names = [parameter.name for parameter in parameters]
+    own = ["alpha3", "lambda_init", "lambda_min", "lambda_max", "lambda_learning_rate"]
+    start = names.index("target_entropy") + 1
+    assert names[start : start + len(own)] == own
+    shared = [(parameter.name, parameter.default) for parameter in parameters if parameter.name not in own]
+    assert shared == [(parameter.name, parameter.default) for parameter in sac_parameters]
+
+
+def test_only_continuous_actions_are_supported():
+    with pytest.raises(AssertionError, match="supports"):
+        LAC("MlpPolicy", "CartPole-v1")
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+@pytest.mark.parametrize("use_sde", [False, True])
+def test_parallel_envs_and_gsde(make_model, make_env, n_envs, use_sde):
+    env = make_vec_env(make_env, n_envs=n_envs)
+    model = make_model(env, n_collect=0, gradient_steps=-1, train_freq=2, use_sde=use_sde, sde_sample_freq=4)
+    check_training(model)
+    # As many updates as steps in each rollout of two calls that ends after step 40
+    assert model._n_updates == {1: 20, 3: 24}[n_envs]
+
+
+def test_gsde_noise_of_both_actors_is_sampled_in_each_update(make_model):
+    model = make_model(use_sde=True)
+    noise = [actor.action_dist.exploration_mat for actor in (model.actor, model.actor_target)]
+    model.train(gradient_steps=1, batch_size=16)
+    for actor, old_noise in zip((model.actor, model.actor_target), noise, strict=True):
+        assert not th.equal(actor.action_dist.exploration_mat, old_noise)
+
+
+@pytest.mark.parametrize("observation_space", [spaces.Discrete(4), spaces.MultiDiscrete([3, 2]), spaces.MultiBinary(3)])
+def test_discrete_observations(make_model, observation_space):
+    class DiscreteObservationEnv(gym.Env):
+        """Random observations."""
+
+        action_space = spaces.Box(-1, 1, (2,), np.float32)
+
+        def reset(self, seed=None, options=None):
+            return self.observation_space.sample(), {}
+
+        def step(self, action):
+            return self.observation_space.sample(), -float(np.sum(action**2)), False, False, {}
+
+    DiscreteObservationEnv.observation_space = observation_space
+    check_training(make_model(DiscreteObservationEnv(), n_collect=0))
+
+
+def test_dict_observations(make_model):
+    env = SimpleMultiObsEnv(discrete_actions=False, random_start=True)
+    features = {"features_extractor_kwargs": {"cnn_output_dim": 8}}
+    check_training(make_model(env, n_collect=0, policy="MultiInputPolicy", policy_kwargs=features, buffer_size=60))
+
+
+@pytest.mark.parametrize("n_channels", [1, 3])
+def test_image_observations(make_model, n_channels):
+    env = FakeImageEnv(screen_height=36, screen_width=36, n_channels=n_channels, discrete=False)
+    features = {"features_extractor_kwargs": {"features_dim": 8}}
+    model = make_model(
+        env, n_collect=0, policy="CnnPolicy", policy_kwargs=features, learning_starts=10, buffer_size=20, batch_size=4
+    )
+    check_training(model, n_steps=15)
+
+
+def test_hindsight_experience_replay(make_model):
+    env = BitFlippingEnv(n_bits=3, continuous=True)
+    model = make_model(env, n_collect=0, policy="MultiInputPolicy", replay_buffer_class=HerReplayBuffer)
+    check_training(model)
+    # Rewards of -1, and of 0 at the goal
+    assert model.reward_bound.item() == 0.0
+
+
+def test_rewards_computed_at_sampling_raise_the_bound(make_model):
+    class PositiveReward(BitFlippingEnv):
+        """Reward 0, and 1 at the goal, which relabelled transitions reach before the agent does."""
+
+        def compute_reward(self, achieved_goal, desired_goal, info):
+            return super().compute_reward(achieved_goal, desired_goal, info) + 1.0
+
+    model = make_model(
+        PositiveReward(n_bits=8, continuous=True),
+        policy="MultiInputPolicy",
+        replay_buffer_class=HerReplayBuffer,
+        replay_buffer_kwargs={"n_sampled_goal": 4, "goal_selection_strategy": "final"},
+    )
+    assert model.replay_buffer.rewards.max() <= 0.0
+    check_training(model)
+    assert model.reward_bound.item() == 1.0
+
+
+@pytest.mark.parametrize("norm_reward", [False, True])
+def test_vec_normalize(make_model, make_env, norm_reward):
+    env = VecNormalize(make_vec_env(lambda: make_env(offset=2.0), n_envs=2), norm_reward=norm_reward)
+    model = make_model(env, n_collect=0)
+    check_training(model)
+    assert 0 < model.reward_bound.item() <= 2.0001
+
+
+def test_n_step_returns(make_model, make_env):
+    check_training(make_model(make_env(offset=2.0), n_collect=0, n_steps=3))
+
+
+def test_memory_efficient_replay_buffer(make_model):
+    check_training(
+        make_model(
+            n_collect=0, optimize_memory_usage=True, replay_buffer_kwargs={"handle_timeout_termination": False}, buffer_size=45
+        )
+    )
+
+
+def test_action_noise(make_model):
+    noise = NormalActionNoise(mean=np.zeros(2), sigma=0.1 * np.ones(2))
+    check_training(make_model(n_collect=0, action_noise=noise, use_sde_at_warmup=True))
+
+
+def test_actions_of_any_range(make_model, make_env):
+    env = make_env()
+    env.action_space = spaces.Box(low=np.array([-3.0, 0.0]), high=np.array([5.0, 0.1]), dtype=np.float64)
+    model = make_model(env, n_collect=0)
+    check_training(model)
+    for _ in range(20):
+        assert env.action_space.contains(model.predict(env.observation_space.sample())[0].astype(np.float64))

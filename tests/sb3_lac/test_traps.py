@@ -1,0 +1,244 @@
+"""Mistakes that implementations of LAC are known for: a regression test for each."""
+
+import math
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.buffers import NStepReplayBuffer
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from torch import nn
+
+from sb3_lac import LAC
+from sb3_lac.lac import lyapunov_difference, lyapunov_target, multiplier_loss
+
+
+def flat_parameters(module):
+    return nn.utils.parameters_to_vector(module.parameters()).detach()
+
+
+def test_actor_follows_the_decrease_condition_in_proportion_to_lambda(make_model, train_metrics):
+    steps = []
+    for lambda_init in (0.25, 0.5):
+        # Without the entropy term, and with plain gradient descent
+        model = make_model(ent_coef=0.0, alpha3=0.3, lambda_init=lambda_init, policy_kwargs={"optimizer_class": th.optim.SGD})
+        before = flat_parameters(model.actor)
+        train_metrics(model)
+        steps.append(flat_parameters(model.actor) - before)
+    assert steps[0].abs().max() > 0
+    th.testing.assert_close(2 * steps[0], steps[1], rtol=1e-2, atol=1e-6)
+
+
+def test_lambda_does_not_wind_up(make_model, train_metrics):
+    model = make_model(alpha3=10.0, lambda_learning_rate=0.1, lambda_min=0.01)
+    metrics = train_metrics(model, gradient_steps=60)
+    assert metrics["lyapunov_difference"] > 0 and metrics["lambda_saturation"] == 1.0
+    assert model.log_lambda.item() == 0.0
+    # The opposite sign: without projection, it would take as many steps before lambda moves
+    model.alpha3 = -10.0
+    metrics = train_metrics(model, gradient_steps=20)
+    assert metrics["lyapunov_difference"] < 0 and model.log_lambda.item() < 0.0
+    assert 0 < metrics["lambda_saturation"] < 1
+
+
+def test_lambda_stays_above_its_lower_limit(make_model, train_metrics):
+    model = make_model(lambda_learning_rate=0.5, lambda_min=0.2, lambda_max=0.7, lambda_init=0.7)
+    model.alpha3 = -10.0
+    train_metrics(model, gradient_steps=20)
+    assert math.exp(model.log_lambda.item()) == pytest.approx(0.2)
+    assert train_metrics(model)["lambda"] == pytest.approx(0.2)
+
+
+def test_saturation_is_seen_at_limits_that_float32_rounds(make_model, train_metrics):
+    for lambda_max in (0.1, 0.3, 0.7, 3.3):
+        model = make_model(alpha3=10.0, lambda_max=lambda_max, lambda_init=lambda_max)
+        assert train_metrics(model, gradient_steps=3)["lambda_saturation"] == 1.0
+
+
+def test_condition_is_infeasible_in_stationary_data_from_alpha3_of_one():
+    # Values of states on a cycle: the next values are the same numbers in another order
+    values, costs = th.rand(1000, 1), th.rand(1000, 1)
+    difference = lyapunov_difference(values.roll(1, dims=0), values, costs, alpha3=1.0)
+    assert difference.item() == pytest.approx(costs.mean().item(), abs=1e-5)
+
+
+def test_infeasible_alpha3_is_announced_once(make_env, capsys):
+    def printed(alpha3, verbose):
+        model = LAC("MlpPolicy", make_env(), alpha3=alpha3, verbose=verbose, learning_starts=5, batch_size=4, device="cpu")
+        model.learn(10, log_interval=None).learn(10, log_interval=None)
+        return capsys.readouterr().out.count("lambda will stay at lambda_max")
+
+    assert printed(alpha3=1.0, verbose=1) == 1
+    assert printed(alpha3=1.0, verbose=0) == 0
+    assert printed(alpha3=0.3, verbose=1) == 0
+
+
+def test_initial_values_are_small_whatever_the_hidden_width(make_env):
+    def mean_value(output_dim):
+        policy_kwargs = {"net_arch": [256, 256, 256], "activation_fn": nn.LeakyReLU, "output_dim": output_dim}
+        model = LAC("MlpPolicy", make_env(), policy_kwargs=policy_kwargs, seed=0, buffer_size=10, device="cpu")
+        with th.no_grad():
+            return model.critic(th.randn(500, 2), th.rand(500, 2))[0].mean().item()
+
+    assert LAC("MlpPolicy", make_env(), buffer_size=10, device="cpu").critic.output_dim == 16
+    assert mean_value(16) < 0.5
+    assert mean_value(256) > 5 * mean_value(16)
+
+
+def test_last_layer_of_the_critic_is_linear(make_model):
+    model = make_model(n_collect=0, policy_kwargs={"activation_fn": nn.ReLU, "output_dim": 7})
+    last_layer = model.critic.lyapunov_networks[0][-1]
+    assert isinstance(last_layer, nn.Linear) and last_layer.out_features == 7
+    # Also units with negative output learn, none of them can die
+    nn.init.constant_(last_layer.bias, -5.0)
+    model.critic(th.randn(20, 2), th.rand(20, 2))[0].sum().backward()
+    assert th.all(last_layer.bias.grad < 0)
+
+
+@pytest.mark.parametrize("terminate, expected", [(False, 2.0), (True, 1.0)])
+def test_time_limits_bootstrap_and_terminations_do_not(make_model, make_env, train_metrics, terminate, expected):
+    # Reward -1 in each step, each of which ends an episode: 1 + 0.5 + 0.25 + ... or only 1
+    env = make_env(episode_length=1, terminate=terminate)
+    model = make_model(env, gamma=0.5, tau=0.1, learning_rate=3e-3)
+    model.replay_buffer.rewards[:] = -1.0
+    train_metrics(model, gradient_steps=400)
+    assert train_metrics(model, seed=1)["lyapunov_mean"] == pytest.approx(expected, abs=0.2)
+
+
+def test_terminal_transitions_cost_only_their_own_cost():
+    assert lyapunov_target(th.tensor([3.0]), th.tensor([1.0]), 0.99, th.tensor([50.0])).item() == 3.0
+
+
+def costs_of(model, rewards, discounts=None):
+    return model._compute_costs(th.tensor(rewards).reshape(-1, 1), discounts).flatten().tolist()
+
+
+def test_costs_are_the_negated_rewards_unless_rewards_are_positive(make_model):
+    model = make_model(n_collect=0)
+    assert costs_of(model, [-3.0, -0.5]) == [3.0, 0.5]
+    assert model.reward_bound.item() == 0.0
+    assert costs_of(model, [-3.0, 2.0]) == [5.0, 0.0]
+    # The bound is remembered
+    assert costs_of(model, [-1.0, 1.0]) == [3.0, 1.0]
+    assert model.reward_bound.item() == 2.0
+
+
+def test_costs_of_normalized_rewards_are_not_negative_and_the_bound_follows_the_scale(make_model, make_env):
+    env = VecNormalize(DummyVecEnv([lambda: make_env(offset=30.0)]))
+    model = make_model(env)
+    model._vec_normalize_env.ret_rms.var = 4.0
+    assert costs_of(model, [-1.0, 2.5]) == pytest.approx([3.5, 0.0])
+    assert model.reward_bound.item() == pytest.approx(5.0)
+    # Another scale: a reward of 5 is normalized to 0.5 now
+    model._vec_normalize_env.ret_rms.var = 100.0
+    assert costs_of(model, [-1.0, 0.1]) == pytest.approx([1.5, 0.4])
+    assert model.reward_bound.item() == pytest.approx(5.0)
+    # Rewards are clipped, and so is the bound
+    model._vec_normalize_env.ret_rms.var = 1e-4
+    assert costs_of(model, [10.0, -10.0]) == pytest.approx([0.0, 20.0])
+    for _ in range(100):
+        sample = model.replay_buffer.sample(16, env=model._vec_normalize_env)
+        assert model._compute_costs(sample.rewards, None).min() >= 0
+
+
+def test_bound_does_not_drift_by_rounding(make_model, make_env):
+    model = make_model(VecNormalize(DummyVecEnv([make_env])))
+    model._vec_normalize_env.ret_rms.var = 0.4321
+    costs_of(model, [1.234])
+    bound = model.reward_bound.item()
+    for var in np.linspace(0.1, 9.0, 500):
+        model._vec_normalize_env.ret_rms.var = var
+        costs_of(model, [-1.0])
+    assert model.reward_bound.item() == bound
+
+
+def test_constant_positive_reward_costs_nothing_over_n_steps(make_model, make_env):
+    model = make_model(make_env(episode_length=4, terminate=True), n_steps=3, gamma=0.9)
+    assert isinstance(model.replay_buffer, NStepReplayBuffer)
+    model.replay_buffer.rewards[:] = 5.0
+    sample = model.replay_buffer.sample(64)
+    # Some of the sums are cut by the end of the episode
+    assert len(sample.discounts.unique()) == 3
+    costs = model._compute_costs(sample.rewards, sample.discounts)
+    assert model.reward_bound.item() == pytest.approx(5.0, rel=1e-5)
+    assert costs.abs().max() < 1e-4
+
+
+def test_log_prob_is_summed_over_actions(make_model, make_env, train_metrics):
+    model = make_model(make_env(n_dim=3), ent_coef="auto_0.5", learning_rate=0.0)
+    obs = model.replay_buffer.sample(16).observations
+    _, log_prob = model.actor.action_log_prob(obs)
+    assert log_prob.shape == (16,)
+    assert model.target_entropy == -3.0
+
+    batch = model.replay_buffer.sample(16)
+    model.replay_buffer.sample = lambda *args, **kwargs: batch
+    metrics = train_metrics(model)
+    th.manual_seed(0)
+    both = th.cat([batch.observations, batch.next_observations])
+    mean, log_std, _ = model.actor.get_action_dist_params(both)
+    normal = th.distributions.Normal(mean, log_std.exp())
+    latent = normal.rsample()
+    per_action = normal.log_prob(latent) - th.log(1 - th.tanh(latent) ** 2 + 1e-6)
+    violation = per_action[:16].sum(dim=1).mean().item() - 3.0
+    assert metrics["ent_coef_loss"] == pytest.approx(-math.log(0.5) * violation, rel=1e-4)
+
+
+def test_everything_that_is_learned_is_saved(make_model, train_metrics):
+    model = make_model()
+    state_dicts, tensors = model._get_torch_save_params()
+    own_tensors = {name for name, value in vars(model).items() if isinstance(value, th.Tensor)}
+    assert own_tensors == {"log_lambda", "log_ent_coef", "reward_bound"}
+    assert set(tensors) == own_tensors
+    own_optimizers = {name for name, value in vars(model).items() if isinstance(value, th.optim.Optimizer)}
+    assert own_optimizers == {"lambda_optimizer", "ent_coef_optimizer"}
+    assert set(state_dicts) == own_optimizers | {"policy", "actor.optimizer", "critic.optimizer"}
+
+    # All weights and biases of actor and critic are parameters, have an optimizer and change
+    for module in (model.actor, model.critic):
+        assert len(list(module.parameters())) == len(module.state_dict())
+        optimized = [parameter for group in module.optimizer.param_groups for parameter in group["params"]]
+        assert {id(parameter) for parameter in optimized} == {id(parameter) for parameter in module.parameters()}
+    before = {name: tensor.clone() for name, tensor in model.policy.state_dict().items()}
+    train_metrics(model)
+    assert all(not th.equal(before[name], tensor) for name, tensor in model.policy.state_dict().items())
+
+
+def test_both_values_of_the_difference_are_from_the_online_critic(make_model, train_metrics):
+    # A critic that is the same number everywhere: the difference is alpha3 times the cost, whatever the target says
+    model = make_model(alpha3=0.3)
+    for module, value in ((model.critic, 3.0), (model.critic_target, 50.0)):
+        last_layer = module.lyapunov_networks[0][-1]
+        nn.init.zeros_(last_layer.weight)
+        nn.init.constant_(last_layer.bias, math.sqrt(value / 16))
+    metrics = train_metrics(model)
+    assert metrics["lyapunov_mean"] == pytest.approx(3.0, rel=1e-5)
+    assert metrics["lyapunov_difference"] == pytest.approx(0.3 * metrics["cost"], rel=1e-4)
+
+
+def test_multipliers_learn_in_log_space():
+    log_multiplier = th.tensor([math.log(0.01)], requires_grad=True)
+    multiplier_loss(log_multiplier, th.tensor([2.0, 4.0])).backward()
+    # Proportional to the violation only: a small multiplier is not slow to recover
+    assert log_multiplier.grad.item() == pytest.approx(-3.0)
+
+
+@pytest.mark.parametrize(
+    "kwargs, message",
+    [
+        ({"alpha3": 0.0}, "alpha3=0.0 must be greater than 0"),
+        ({"alpha3": math.nan}, "alpha3=nan must be greater than 0"),
+        ({"lambda_min": 0.0}, "lambda_min=0.0 must be greater than 0"),
+        ({"lambda_min": 2.0}, "lambda_max=1.0 must be finite and not smaller than lambda_min=2.0"),
+        ({"lambda_max": math.inf}, "lambda_max=inf must be finite"),
+        ({"lambda_init": 1.5}, "lambda_init=1.5 must lie between lambda_min=0.0001 and lambda_max=1.0"),
+        ({"lambda_init": 0.0}, "lambda_init=0.0 must lie between"),
+        ({"ent_coef": "auto_0"}, "ent_coef='auto_0' must be greater than 0"),
+        ({"n_steps": 3, "gamma": 1.0}, "gamma=1.0 must be smaller than 1 with n-step returns"),
+        ({"policy_kwargs": {"output_dim": 0}}, "output_dim=0 must be at least 1"),
+        ({"policy_kwargs": {"n_critics": 0}}, "n_critics=0 must be at least 1"),
+    ],
+)
+def test_bad_arguments_are_named(make_model, kwargs, message):
+    with pytest.raises(ValueError, match=message.replace("(", r"\(")):
+        make_model(n_collect=0, **kwargs)

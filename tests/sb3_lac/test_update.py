@@ -1,0 +1,275 @@
+"""One update of LAC, written out a second time from the equations and compared with ``train()``."""
+
+import math
+
+import numpy as np
+import pytest
+import torch as th
+
+from sb3_lac.lac import (
+    concatenate_observations,
+    largest_value,
+    lyapunov_actor_loss,
+    lyapunov_critic_loss,
+    lyapunov_difference,
+    lyapunov_target,
+    multiplier_loss,
+)
+
+GAMMA, TAU, LEARNING_RATE, LAMBDA_LEARNING_RATE, ALPHA3 = 0.9, 0.05, 1e-2, 2e-2, 0.3
+LAMBDA_MIN, LAMBDA_MAX = 0.1, 1.0
+
+
+def mlp(weights, prefix, x, n_layers):
+    """Layers ``prefix.0``, ``prefix.2``, ... with LeakyReLU after each."""
+    for i in range(n_layers):
+        x = x @ weights[f"{prefix}.{2 * i}.weight"].T + weights[f"{prefix}.{2 * i}.bias"]
+        x = th.where(x > 0, x, 0.01 * x)
+    return x
+
+
+def policy_sample(weights, obs):
+    """Sampled action of the squashed Gaussian, and its log probability summed over action dimensions."""
+    latent = mlp(weights, "latent_pi", obs, 2)
+    mean = latent @ weights["mu.weight"].T + weights["mu.bias"]
+    log_std = (latent @ weights["log_std.weight"].T + weights["log_std.bias"]).clamp(-20, 2)
+    noise = th.normal(th.zeros_like(mean), th.ones_like(mean))
+    action = th.tanh(mean + log_std.exp() * noise)
+    log_prob = -0.5 * noise**2 - log_std - 0.5 * math.log(2 * math.pi) - th.log(1 - action**2 + 1e-6)
+    return action, log_prob.sum(dim=1)
+
+
+def lyapunov(weights, obs, actions, n_critics):
+    """One value per critic: sum of squares of a linear layer."""
+    values = []
+    for i in range(n_critics):
+        latent = mlp(weights, f"lf{i}", th.cat([obs, actions], dim=1), 2)
+        outputs = latent @ weights[f"lf{i}.4.weight"].T + weights[f"lf{i}.4.bias"]
+        values.append((outputs**2).sum(dim=1))
+    return th.stack(values)
+
+
+class ScalarAdam:
+    """Adam on one number."""
+
+    def __init__(self, value):
+        self.value, self.m, self.v, self.t = value, 0.0, 0.0, 0
+
+    def step(self, gradient, learning_rate):
+        self.t += 1
+        self.m = 0.9 * self.m + 0.1 * gradient
+        self.v = 0.999 * self.v + 0.001 * gradient**2
+        m_hat, v_hat = self.m / (1 - 0.9**self.t), self.v / (1 - 0.999**self.t)
+        self.value -= learning_rate * m_hat / (math.sqrt(v_hat) + 1e-8)
+
+
+@pytest.mark.parametrize("n_critics", [1, 2])
+def test_train_is_the_published_update(make_model, n_critics):
+    model = make_model(
+        gamma=GAMMA,
+        tau=TAU,
+        learning_rate=LEARNING_RATE,
+        lambda_learning_rate=LAMBDA_LEARNING_RATE,
+        alpha3=ALPHA3,
+        lambda_init=0.5,
+        lambda_min=LAMBDA_MIN,
+        lambda_max=LAMBDA_MAX,
+        ent_coef="auto_0.7",
+        # With plain gradient descent, a wrong factor in a loss cannot hide (Adam is invariant to scale)
+        policy_kwargs={"optimizer_class": th.optim.SGD, "n_critics": n_critics, "output_dim": 3},
+    )
+    batch = model.replay_buffer.sample(16)
+    # A terminal transition, which the environment does not have
+    batch.dones[3] = 1.0
+    model.replay_buffer.sample = lambda *args, **kwargs: batch
+
+    actor, critic, actor_target, critic_target = (
+        {name: tensor.clone().requires_grad_(True) for name, tensor in module.state_dict().items()}
+        for module in (model.actor, model.critic, model.actor_target, model.critic_target)
+    )
+    log_lambda, log_beta = ScalarAdam(math.log(0.5)), ScalarAdam(math.log(0.7))
+    obs, next_obs, actions = batch.observations, batch.next_observations, batch.actions
+    costs, dones = -batch.rewards.flatten(), batch.dones.flatten()
+
+    for step in range(4):
+        th.manual_seed(step)
+        model.train(gradient_steps=1, batch_size=16)
+        logged = model.logger.name_to_value
+
+        th.manual_seed(step)
+        sampled_actions, log_prob = policy_sample(actor, th.cat([obs, next_obs]))
+        log_prob, next_actions_pi = log_prob[:16], sampled_actions[16:]
+        with th.no_grad():
+            lagged_actions, _ = policy_sample(actor_target, next_obs)
+            y = costs + GAMMA * (1 - dones) * lyapunov(critic_target, next_obs, lagged_actions, n_critics).amax(dim=0)
+        values = lyapunov(critic, obs, actions, n_critics)
+        critic_loss = (0.5 * (values - y) ** 2).mean(dim=1).sum()
+        next_values = lyapunov(critic, next_obs, next_actions_pi, n_critics).amax(dim=0)
+        d = (next_values - values.amax(dim=0).detach() + ALPHA3 * costs).mean()
+        lambda_, beta = math.exp(log_lambda.value), math.exp(log_beta.value)
+        actor_loss = lambda_ * d + beta * log_prob.mean()
+        violation = log_prob.mean().item() - 2.0  # target entropy: minus the number of actions
+
+        assert logged["train/critic_loss"] == pytest.approx(critic_loss.item(), rel=1e-4)
+        assert logged["train/actor_loss"] == pytest.approx(actor_loss.item(), rel=1e-4)
+        assert logged["train/lyapunov_difference"] == pytest.approx(d.item(), rel=1e-4)
+        assert logged["train/lyapunov_mean"] == pytest.approx(values.amax(dim=0).mean().item(), rel=1e-4)
+        assert logged["train/cost"] == pytest.approx(costs.mean().item(), rel=1e-5)
+        assert logged["train/lambda"] == pytest.approx(lambda_, rel=1e-4)
+        assert logged["train/ent_coef"] == pytest.approx(beta, rel=1e-4)
+        assert logged["train/lambda_loss"] == pytest.approx(-log_lambda.value * d.item(), rel=1e-3)
+        assert logged["train/ent_coef_loss"] == pytest.approx(-log_beta.value * violation, rel=1e-3)
+
+        for weights, loss in ((critic, critic_loss), (actor, actor_loss)):
+            gradients = th.autograd.grad(loss, list(weights.values()), retain_graph=True)
+            updates = {name: -LEARNING_RATE * gradient for name, gradient in zip(weights, gradients, strict=True)}
+            with th.no_grad():
+                weights.update({name: (weights[name] + updates[name]).requires_grad_(True) for name in weights})
+        log_lambda.step(-d.item(), LAMBDA_LEARNING_RATE)
+        log_lambda.value = min(max(log_lambda.value, math.log(LAMBDA_MIN)), math.log(LAMBDA_MAX))
+        log_beta.step(-violation, LEARNING_RATE)
+        with th.no_grad():
+            for target, online in ((actor_target, actor), (critic_target, critic)):
+                target.update({name: (1 - TAU) * target[name] + TAU * online[name] for name in target})
+
+    for module, weights in (
+        (model.actor, actor),
+        (model.critic, critic),
+        (model.actor_target, actor_target),
+        (model.critic_target, critic_target),
+    ):
+        for name, tensor in module.state_dict().items():
+            th.testing.assert_close(tensor, weights[name].detach(), rtol=1e-4, atol=1e-6)
+    assert model.log_lambda.item() == pytest.approx(log_lambda.value, rel=1e-4)
+    assert model.log_ent_coef.item() == pytest.approx(log_beta.value, rel=1e-4)
+
+
+def test_losses_of_hand_computed_numbers():
+    costs, dones = th.tensor([[1.0], [2.0]]), th.tensor([[0.0], [1.0]])
+    targets = lyapunov_target(costs, dones, 0.5, th.tensor([[4.0], [100.0]]))
+    assert targets.tolist() == [[3.0], [2.0]]
+    values = (th.tensor([[1.0], [2.0]]), th.tensor([[3.0], [4.0]]))
+    assert largest_value(values).tolist() == [[3.0], [4.0]]
+    # 1/2 (4 + 0) / 2 + 1/2 (0 + 4) / 2
+    assert lyapunov_critic_loss(values, targets).item() == 2.0
+    # ((5 - 1 + 0.1) + (5 - 2 + 0.2)) / 2
+    difference = lyapunov_difference(th.tensor([[5.0], [5.0]]), values[0], costs, alpha3=0.1)
+    assert difference.item() == pytest.approx(3.65)
+    log_prob = th.tensor([-1.0, -3.0])
+    assert lyapunov_actor_loss(difference, log_prob, th.tensor([2.0]), th.tensor(0.5)).item() == pytest.approx(6.3)
+    assert multiplier_loss(th.tensor([2.0]), difference).item() == pytest.approx(-7.3)
+
+
+def test_gradient_of_the_difference_flows_through_the_next_value_only():
+    values, next_values = th.ones(4, 1, requires_grad=True), th.ones(4, 1, requires_grad=True)
+    lyapunov_difference(next_values, values, th.ones(4, 1), alpha3=0.5).backward()
+    assert values.grad is None
+    assert next_values.grad.flatten().tolist() == [0.25] * 4
+
+
+def test_observations_are_concatenated_per_key():
+    obs = {"a": th.zeros(2, 3), "b": th.zeros(2, 1)}
+    next_obs = {"a": th.ones(2, 3), "b": th.ones(2, 1)}
+    both = concatenate_observations(obs, next_obs)
+    assert {key: tensor.shape for key, tensor in both.items()} == {"a": (4, 3), "b": (4, 1)}
+    assert both["b"].flatten().tolist() == [0, 0, 1, 1]
+
+
+def test_actor_step_leaves_no_gradient_in_the_critic(make_model, train_metrics):
+    # In the last step the critic is exact, so that any gradient must come from the loss of the actor
+    model = make_model(gamma=0.0)
+    batch = model.replay_buffer.sample(16)
+    values = model.critic(batch.observations, batch.actions)[0].detach()
+    model.replay_buffer.sample = lambda *args, **kwargs: batch._replace(rewards=-values)
+    train_metrics(model)
+    gradients = th.cat([parameter.grad.flatten() for parameter in model.critic.parameters()])
+    assert th.all(gradients == 0)
+    assert any(th.any(parameter.grad != 0) for parameter in model.actor.parameters())
+
+
+def test_targets_follow_every_target_update_interval(make_model, train_metrics):
+    model = make_model(target_update_interval=3, tau=1.0)
+    train_metrics(model, gradient_steps=3)
+    # Updated after the first of the three steps only
+    assert not th.equal(model.actor_target.mu.weight, model.actor.mu.weight)
+    model.target_update_interval = 1
+    train_metrics(model)
+    for online, target in ((model.actor, model.actor_target), (model.critic, model.critic_target)):
+        for parameter, target_parameter in zip(online.parameters(), target.parameters(), strict=True):
+            assert th.equal(parameter, target_parameter)
+
+
+def test_lambda_has_its_own_learning_rate(make_model, train_metrics):
+    def decay(progress_remaining: float) -> float:
+        return 0.5 * progress_remaining
+
+    model = make_model(learning_rate=1e-3, lambda_learning_rate=decay)
+    model._current_progress_remaining = 0.5
+    train_metrics(model)
+    assert model.lambda_optimizer.param_groups[0]["lr"] == 0.25
+    for optimizer in (model.actor.optimizer, model.critic.optimizer, model.ent_coef_optimizer):
+        assert optimizer.param_groups[0]["lr"] == 1e-3
+    assert make_model(learning_rate=2e-3, n_collect=0).lambda_optimizer.param_groups[0]["lr"] == 2e-3
+
+
+def test_fixed_entropy_coefficient_stays(make_model, train_metrics):
+    model = make_model(ent_coef=0.2)
+    metrics = train_metrics(model, gradient_steps=3)
+    assert metrics["ent_coef"] == pytest.approx(0.2)
+    assert "ent_coef_loss" not in metrics
+
+
+def test_log_names_are_those_of_sac_and_unique_when_truncated(make_model, train_metrics):
+    metrics = train_metrics(make_model(), gradient_steps=2)
+    names = {"actor_loss", "critic_loss", "ent_coef", "ent_coef_loss", "learning_rate", "n_updates"}
+    names |= {"lambda", "lambda_saturation", "lambda_loss", "lyapunov_difference", "lyapunov_mean", "cost"}
+    assert set(metrics) >= names
+    assert all(len(f"train/{name}") < 36 for name in names)
+    assert all(np.isfinite(metrics[name]) for name in names)
+
+
+def test_update_reads_no_value_back_from_the_device(make_model, monkeypatch):
+    model = make_model()
+    reads = []
+
+    def count(method):
+        original = getattr(th.Tensor, method)
+
+        def counted(self, *args):
+            reads.append(method)
+            return original(self, *args)
+
+        return counted
+
+    for method in ("item", "tolist", "__float__", "__bool__", "numpy", "cpu"):
+        monkeypatch.setattr(th.Tensor, method, count(method))
+    # Arguments of distributions are checked on the host, by PyTorch and not by the update
+    monkeypatch.setattr(th.distributions.Distribution, "_validate_args", False)
+    model.train(gradient_steps=5, batch_size=16)
+    assert reads == ["tolist"]
+
+
+def test_same_seed_same_result(make_model):
+    first, second = (make_model(n_collect=0, seed=3).learn(80) for _ in range(2))
+    assert first._n_updates == 40
+    for parameter, other in zip(first.policy.state_dict().values(), second.policy.state_dict().values(), strict=True):
+        assert th.equal(parameter, other)
+    assert th.equal(first.log_lambda, second.log_lambda)
+
+
+def test_lac_learns_to_control(make_model, make_env):
+    def mean_cost(model):
+        env, costs = make_env(n_dim=1), []
+        for episode in range(10):
+            obs, _ = env.reset(seed=episode)
+            for _ in range(20):
+                obs, _, _, _, info = env.step(model.predict(obs, deterministic=True)[0])
+                costs.append(info["cost"])
+        return np.mean(costs)
+
+    model = make_model(make_env(n_dim=1), n_collect=0, learning_rate=3e-3, gamma=0.9, tau=0.02, buffer_size=2000)
+    before = mean_cost(model)
+    model.learn(1000)
+    # Doing nothing costs 1.15 per step, the best controller 0.09
+    assert before > 0.6
+    assert mean_cost(model) < 0.2

@@ -1,0 +1,101 @@
+"""Imports run one way, and nothing needs more than it declares."""
+
+import ast
+import configparser
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+# each layer may import the ones before it, and itself
+LAYERS = (
+    ("battery_env.electrochemistry",),
+    ("battery_env.loads",),
+    ("battery_env.trajectories", "battery_env.cells", "battery_env.nasa_cells"),
+    ("battery_env.estimators",),
+    ("battery_env.calibration",),
+    ("battery_env.evaluation",),
+    ("battery_env.plotting",),
+    ("battery_env.__main__",),
+)
+
+
+def imports(path):
+    """Absolute names of all modules that a file imports, anywhere in it."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path} has a relative import"
+            yield node.module
+
+
+def module_name(path):
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def files(package):
+    return sorted((ROOT / package).rglob("*.py"))
+
+
+def layer(name):
+    for number, members in enumerate(LAYERS):
+        if any(name == member or name.startswith(f"{member}.") for member in members):
+            return number
+    return None
+
+
+@pytest.mark.parametrize("path", files("battery_env"), ids=module_name)
+def test_battery_env_imports_run_one_way(path):
+    own = layer(module_name(path))
+    if own is None:
+        assert module_name(path) == "battery_env", f"{path}: say in LAYERS which layer it belongs to"
+        return
+    for imported in imports(path):
+        if imported.startswith("battery_env"):
+            assert layer(imported) is not None and layer(imported) <= own, f"{path} imports {imported}"
+
+
+@pytest.mark.parametrize("path", files("battery_env"), ids=module_name)
+def test_battery_env_knows_nothing_of_learning(path):
+    for imported in imports(path):
+        assert imported.split(".")[0] not in {"torch", "stable_baselines3", "sb3_lac", "benchmarks"}, f"{path}: {imported}"
+
+
+@pytest.mark.parametrize("path", files("sb3_lac"), ids=module_name)
+def test_sb3_lac_knows_nothing_of_batteries(path):
+    batteries = {name for name in imports(path) if name.startswith(("battery_env", "benchmarks"))}
+    assert batteries <= ({"battery_env"} if path.name == "__init__.py" else set())
+
+
+# names of modules that differ from those of the distributions that bring them
+DISTRIBUTIONS = {"sb3_contrib": "sb3_contrib", "yaml": "rl_zoo3", "optuna": "rl_zoo3"}
+STANDARD = set(__import__("sys").stdlib_module_names)
+
+
+def declared(file, extras=()):
+    config = configparser.ConfigParser()
+    config.read(file, encoding="utf-8")
+    lines = config["options"]["install_requires"]
+    for extra in extras:
+        lines += config["options.extras_require"][extra]
+    return {re.split(r"[><=]", line)[0].strip() for line in lines.splitlines() if line.strip() and line.strip()[0] != "#"}
+
+
+@pytest.mark.parametrize(
+    ("package", "file", "extras"),
+    [
+        ("battery_env", "battery_env/setup.cfg", ()),
+        ("sb3_lac", "setup.cfg", ("zoo",)),
+        ("benchmarks", "setup.cfg", ("zoo", "peers")),
+        ("tests", "setup.cfg", ("zoo", "peers", "dev")),
+    ],
+)
+def test_every_import_is_declared(package, file, extras):
+    own = {"battery_env", "sb3_lac", "benchmarks", "tests", "examples"}
+    used = {name.split(".")[0] for path in files(package) for name in imports(path)}
+    needed = {DISTRIBUTIONS.get(name, name) for name in used - own - STANDARD}
+    assert needed <= declared(ROOT / file, extras), f"{package} uses what {file} does not declare"
