@@ -162,6 +162,27 @@ def progress_table(progress: pd.DataFrame, whole: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
+def repetition_table(whole: pd.DataFrame) -> pd.DataFrame:
+    """
+    How much a discharge is like the one before: what a prior can rest on, and what it has to compete with.
+
+    :param whole: one row per discharge
+    :return: one row per cell, as shown to readers
+    """
+    rows = []
+    for cell, part in whole.groupby("cell"):
+        move = 100.0 * part["q_mobile_C"].pct_change()
+        late = 100.0 * (part["duration_s"].shift() / part["duration_s"] - 1.0).abs()
+        rows.append(
+            {
+                "cell": cell,
+                "step of q_mobile, rms / most (%)": f"{np.sqrt((move**2).mean()):.1f} / {move.abs().max():.1f}",
+                "EOD after as long as the previous one: mean / worst error (%)": f"{late.mean():.1f} / {late.max():.1f}",
+            }
+        )
+    return pd.DataFrame(rows)
+
+
 def plot_life(whole: pd.DataFrame) -> Figure:
     """
     Both parameters over the life of each cell, with what was measured.
@@ -276,13 +297,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     write_csv(chosen.out / "in_progress.csv", progress, configuration)
     save_figure(plot_life(whole), chosen.out / "life.png")
     save_figure(plot_voltages(discharges, whole), chosen.out / "voltages.png")
-    moves = whole.groupby("cell")["q_mobile_C"].pct_change()
-    markdown = (
-        f"{whole_table(whole).to_markdown(index=False, disable_numparse=True)}\n\n"
-        f"{progress_table(progress, whole).to_markdown(index=False, disable_numparse=True)}\n\n"
-        f"q_mobile moves by {100 * np.sqrt((moves**2).mean()):.2f} % (root mean square) from one discharge to the next, "
-        f"{100 * moves.abs().max():.1f} % at most.\n"
-    )
+    tables = [whole_table(whole), progress_table(progress, whole), repetition_table(whole)]
+    markdown = "\n\n".join(table.to_markdown(index=False, disable_numparse=True) for table in tables) + "\n"
     write_text(chosen.out / "summary.md", markdown)
     print(markdown)
 

@@ -103,7 +103,7 @@ class FullStateEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         if not first <= t <= last:
             raise ValueError(f"options['sample'] must lie within {first} .. {last} for trajectory {n}, got {t}")
         bound = self.initial_perturbation
-        perturbation = self.np_random.uniform(-bound, bound, size=(1, 7)) if bound > 0.0 else 0.0
+        perturbation = self.np_random.uniform(-bound, bound, size=(1, 4)) if bound > 0.0 else None
         self.task.begin(_ROW, np.array([n]), np.array([t]), perturbation)
         self._steps_left = self.episode_steps
         self._history.clear()

@@ -35,6 +35,11 @@ OBSERVED = slice(VO, STATE_SIZE)
 OBSERVED_SIZE = STATE_SIZE - VO
 
 
+# A model that was wrong for a while has moved too much or too little charge from one electrode to the other; in both, nine
+# tenths of it are in the bulk
+_PERTURBATION = np.array([1.0, 1.0, 1.0, -0.9, -0.1, 0.9, 0.1])
+
+
 @dataclass(frozen=True, eq=False)
 class Formulation:
     """
@@ -155,14 +160,17 @@ class FullStateTask:
     def observation_size(self) -> int:
         return OBSERVED_SIZE * (3 if self.formulation.innovation else 2) + 1
 
-    def begin(self, rows: NDArray[np.intp], trajectory: IntArray, sample: IntArray, perturbation: FloatArray | float = 0.0) -> None:
+    def begin(
+        self, rows: NDArray[np.intp], trajectory: IntArray, sample: IntArray, perturbation: FloatArray | None = None
+    ) -> None:
         """
-        Start some cells at given points of given trajectories, with the model in the true state plus a perturbation.
+        Start some cells at given points of given trajectories, with the model in the true state or near it.
 
         :param rows: which cells of the batch, shape (m,)
         :param trajectory: which trajectories of the data set, shape (m,)
         :param sample: which of their samples, counted from full charge, shape (m,)
-        :param perturbation: added to the model's state, in units of the error scale, shape (m, 7)
+        :param perturbation: how far the model is off in Vo, Vsn, Vsp, and in charge that has moved from the negative to the
+            positive electrode, each in units of its error scale, shape (m, 4)
         """
         self.trajectory[rows] = trajectory
         self.sample[rows] = sample
@@ -173,7 +181,9 @@ class FullStateTask:
         self.r_o_hat[rows] = NEW_CELL.r_o if self.parameter == "r_o" else self.r_o[rows]
         state = self.dataset.states_at(trajectory, sample)
         self.state[rows] = state
-        state[:, OBSERVED] += perturbation * self.formulation.error_scale
+        if perturbation is not None:
+            offset = perturbation[:, [0, 1, 2, 3, 3, 3, 3]] * _PERTURBATION
+            state[:, OBSERVED] += offset * self.formulation.error_scale
         self.model_state[rows] = state
         self._look_ahead()
 
