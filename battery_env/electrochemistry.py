@@ -715,7 +715,7 @@ def simulate(
     duration_s = max_duration_s if until == "eod" else float(until)
     n_samples = int(np.floor(duration_s / dt + 1e-9)) + 1
     if callable(load):
-        loads = np.asarray(load(np.arange(n_samples) * dt), dtype=np.float64)
+        loads = np.asarray(load(dt * np.arange(n_samples, dtype=np.float64)), dtype=np.float64)
     else:
         loads = np.asarray(load, dtype=np.float64)
         if loads.ndim == 1:
@@ -732,7 +732,7 @@ def simulate(
     flags = (load_unit == "power", thermal)
     n = _roll_out(np.require(loads, requirements=["C", "W"]), q, r, dt, cut_off, *flags, *cell.packed, state, volts, amperes)
     return Trajectory(
-        time_s=np.arange(n) * dt,
+        time_s=dt * np.arange(n, dtype=np.float64),
         state=state[:n].copy(),
         voltage_V=volts[:n].copy(),
         current_A=amperes[:n].copy(),

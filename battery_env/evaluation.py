@@ -80,8 +80,9 @@ def _eod_time_s(dataset: TrajectoryDataset, n: int, profile: FloatArray, q_mobil
         return float("nan")
     # beyond the record its last load goes on, for as long again
     load = np.concatenate([profile, np.full(len(profile), profile[-1])])
-    options = {"load_unit": dataset.load_unit, "thermal": dataset.thermal, "parameters": dataset.parameters}
-    return simulate(load, q_mobile, r_o, dt=dataset.dt_s, **options).eod_time_s
+    cell, unit = dataset.parameters, dataset.load_unit
+    prediction = simulate(load, q_mobile, r_o, dt=dataset.dt_s, load_unit=unit, thermal=dataset.thermal, parameters=cell)
+    return prediction.eod_time_s
 
 
 def summarize(scores: pd.DataFrame, parameter: str) -> dict[str, float]:

@@ -19,7 +19,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from battery_env.electrochemistry import (
     NEW_CELL,
-    STATE_SIZE,
     CellParameters,
     FloatArray,
     LoadUnit,
@@ -406,10 +405,11 @@ class TrajectoryDataset(Sequence[Trajectory]):
         except Exception as error:
             raise ValueError(f"{path} is damaged, or no data set saved by TrajectoryDataset.save: {error}") from error
         if metadata.get("format") != FORMAT_VERSION:
-            raise ValueError(f"{path} has format {metadata.get('format')}, this version reads {FORMAT_VERSION}: generate it again")
+            found = metadata.get("format")
+            raise ValueError(f"{path} has format {found}, this version reads {FORMAT_VERSION}: generate it again")
         if _checksum(arrays) != metadata["sha256"]:
             raise ValueError(f"{path} is damaged: its contents do not match their checksum")
-        constants = {k: tuple(v) if isinstance(v, list) else v for k, v in metadata["parameters"].items()}
+        constants: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in metadata["parameters"].items()}
         return cls(
             **arrays,
             load_unit=metadata["load_unit"],

@@ -195,7 +195,8 @@ def run(algo: str, env_id: str, seed: int, timesteps: int, evaluations: int, out
     model.save(folder / "model")
 
     scores = evaluate(PolicyEstimator(model, env_id), test)
-    configuration = {"algo": algo, "env": env_id, "seed": seed, "timesteps": timesteps, "hyperparameters": dict(hyperparameters)}
+    configuration = {"algo": algo, "env": env_id, "seed": seed, "timesteps": timesteps}
+    configuration["hyperparameters"] = dict(hyperparameters)
     write_csv(folder / "scores.csv", scores, configuration)
     result = {"env": env_id, "algo": algo, "seed": seed, "timesteps": timesteps, "updates": model._n_updates}
     result |= {"training_minutes": clock.seconds / 60.0, **summarize(scores, parameter)}

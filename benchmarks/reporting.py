@@ -51,7 +51,7 @@ def write_csv(path: Path, table: pd.DataFrame, configuration: dict[str, Any]) ->
     :param table: the table
     :param configuration: what the caller chose
     """
-    record = {"command": f"python -m benchmarks.{Path(sys.argv[0]).stem} {' '.join(sys.argv[1:])}".strip()}
+    record: dict[str, Any] = {"command": f"python -m benchmarks.{Path(sys.argv[0]).stem} {' '.join(sys.argv[1:])}".strip()}
     record |= {"configuration": configuration, "versions": versions()}
     write_text(path.with_suffix(".json"), json.dumps(record, indent=2, default=str) + "\n")
     write_text(path, table.to_csv(index=False, float_format="%.6g"))

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections import deque
 from functools import lru_cache
-from typing import Any, ClassVar, Literal, SupportsFloat
+from typing import Any, Literal, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from battery_env.calibration.rendering import draw_frame
 from battery_env.calibration.task import OBSERVATION_LIMIT, FullStateTask, Parameter
 from battery_env.trajectories import TrajectoryDataset
 
@@ -43,15 +42,15 @@ class FullStateEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     :param parameter: what the action is: ``"q_mobile"`` or ``"r_o"``
     :param formulation: observation and cost: ``"scaled"`` or ``"paper"``
     :param episode_steps: decisions per episode; fewer where the data end
-    :param initial_perturbation: the model starts in the true state plus, in each component, a uniform draw within this many
-        error scales to either side
+    :param initial_perturbation: the model starts in the true state plus a uniform draw within this many error scales to
+        either side, in Vo, Vsn, Vsp and in charge that has moved between the electrodes
     :param split: side of the paper's data set that episodes are drawn from; not with ``dataset``
     :param dataset: other trajectories to draw from
     :param render_mode: ``"rgb_array"`` or ``None``
     :raises ValueError: for values out of range
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 10}
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 (as in gym.Env)
 
     def __init__(
         self,
@@ -127,7 +126,7 @@ class FullStateEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     def _info(self, cost: float) -> dict[str, Any]:
         return {"cost": cost, **{name: float(value[0]) for name, value in self.task.report().items()}}
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8] | None:
         """
         A picture of the episode so far: voltage and parameter, of the cell and of the model.
 
@@ -135,4 +134,6 @@ class FullStateEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         """
         if self.render_mode is None:
             return None
+        from battery_env.calibration.rendering import draw_frame  # matplotlib only for those who look
+
         return draw_frame(list(self._history), self.task.parameter, self.episode_steps, self.dataset.dt_s)

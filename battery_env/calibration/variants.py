@@ -25,10 +25,12 @@ class BatteryQmaxEnv(FullStateEnv):
     | 0-6   | x̂_t, the model's state |
     | 7-13  | x_{t+1}, the measured state one step ahead |
     | 14    | u_{t+1}, the power over that step, divided by 16 W |
-    | 15-21 | the innovation: x_{t+1} minus what the model with a new cell's parameters predicts from x_t, in error scales |
+    | 15-21 | the innovation: x_{t+1} minus what the model with a new cell's parameters predicts from x̂_t, in error scales |
 
-    Error scales: Vo 0.01 V, Vsn and Vsp 1e-5 V, charges 0.4 C. The observation is Markov: next model state and cost depend
-    on it and the action alone.
+    Error scales: Vo 0.01 V, Vsn and Vsp 1e-5 V, charges 20 C. The innovation holds nothing that is not in the rest of the
+    observation, but makes it readable: a parameter that is off by 1 % moves the next state by 1e-4 of its value. The
+    observation is Markov for a constant load: cost and next model state depend on it and the action alone, the next measured
+    state on the parameter too, which the observation determines.
 
     ## Action space
 
@@ -36,7 +38,8 @@ class BatteryQmaxEnv(FullStateEnv):
 
     ## Reward
 
-    Minus the cost, the Euclidean norm of x̂_{t+1} - x_{t+1} in error scales, at most 100.
+    Minus the cost d / (1 + d / 5), where d is the Euclidean norm of x̂_{t+1} - x_{t+1} in error scales: the norm while it is
+    small, never above 5.
 
     ## Starting state
 
@@ -49,7 +52,8 @@ class BatteryQmaxEnv(FullStateEnv):
 
     ## Arguments
 
-    ``episode_steps`` (64), ``initial_perturbation`` (0: in error scales, each component uniform to either side), ``split``
+    ``episode_steps`` (64), ``initial_perturbation`` (0: in error scales, uniform to either side in Vo, Vsn, Vsp
+    and in charge that has moved between the electrodes), ``split``
     (``"train"``, ``"test"`` or ``"all"``), ``dataset`` (a ``TrajectoryDataset`` to draw from instead), ``render_mode``.
 
     ## Version history
@@ -69,8 +73,7 @@ class BatteryRoEnv(FullStateEnv):
 
     ## Observation space
 
-    ``Box(-100, 100, (22,), float32)``, laid out as in ``BatteryQmax-v0``. Error scales: Vo 0.01 V, Vsn and Vsp 1e-5 V,
-    charges 1 C.
+    ``Box(-100, 100, (22,), float32)``, laid out and scaled as in ``BatteryQmax-v0``.
 
     ## Action space
 
@@ -78,7 +81,7 @@ class BatteryRoEnv(FullStateEnv):
 
     ## Reward
 
-    Minus the cost, the Euclidean norm of x̂_{t+1} - x_{t+1} in error scales, at most 100.
+    That of ``BatteryQmax-v0``.
 
     ## Starting state
 

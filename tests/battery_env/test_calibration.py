@@ -15,7 +15,7 @@ from battery_env.calibration.env import paper_split
 from battery_env.calibration.registration import ENTRY_POINTS
 from battery_env.calibration.task import ACTION_RANGES, FORMULATIONS, OBSERVED, FullStateTask
 from battery_env.calibration.variants import BatteryQmaxEnv
-from battery_env.electrochemistry import NEW_CELL, step
+from battery_env.electrochemistry import NEW_CELL, QNB, step
 from battery_env.loads import RandomPiecewise
 from battery_env.trajectories import TrajectoryDataset
 
@@ -104,14 +104,17 @@ def test_the_observation_is_what_the_documentation_says():
     env = gym.make("BatteryQmax-v0")
     dataset = env.unwrapped.dataset
     trajectory, t = dataset[4], 30
-    observation, _ = env.reset(options={"trajectory": 4, "sample": int(dataset.first[4]) + t})
+    first, _ = env.reset(options={"trajectory": 4, "sample": int(dataset.first[4]) + t - 1})
+    observation, *_ = env.step(np.array([0.5]))
     x, x_next = trajectory.state[t], trajectory.state[t + 1]
+    x_hat = step(trajectory.state[t - 1], trajectory.load[t - 1], 7000.0, NEW_CELL.r_o)
     state_scale = np.array([0.5, 0.1, 0.01, 6840.0, 760.0, 11400.0, 1266.0])
-    error_scale = np.array([0.01, 1e-5, 1e-5, 0.4, 0.4, 0.4, 0.4])
-    predicted = step(x, trajectory.load[t], NEW_CELL.q_mobile, NEW_CELL.r_o)
+    np.testing.assert_allclose(first[7:14] * state_scale, x[OBSERVED], rtol=1e-6)
+    error_scale = np.array([0.01, 1e-5, 1e-5, 20.0, 20.0, 20.0, 20.0])
+    predicted = step(x_hat, trajectory.load[t], NEW_CELL.q_mobile, NEW_CELL.r_o)
     expected = np.concatenate(
         [
-            x[OBSERVED] / state_scale,
+            x_hat[OBSERVED] / state_scale,
             x_next[OBSERVED] / state_scale,
             [trajectory.load[t] / 16.0],
             (x_next - predicted)[OBSERVED] / error_scale,
@@ -131,25 +134,24 @@ def test_the_literal_observation_is_divided_by_the_new_cells_state():
 
 
 def test_the_literal_cost():
-    cost = FORMULATIONS["paper"]["q_mobile"].cost(np.array([[3e-5, 0, 4e-5, 0, 0, 0, 0], [0.3, 0.4, 0, 0, 0, 0.6, 0.8]]))
+    cost = FORMULATIONS["paper"].cost(np.array([[3e-5, 0, 4e-5, 0, 0, 0, 0], [0.3, 0.4, 0, 0, 0, 0.6, 0.8]]))
     np.testing.assert_allclose(cost, [2.5e-5, 50.0 * (0.25 + 0.5)])
 
 
 def test_the_cost_is_a_norm_in_error_scales_that_saturates():
-    form = FORMULATIONS["scaled"]["r_o"]
-    error = np.array([[0.03, 0, 0, 4.0, 0, 0, 0], [1.0, 0, 0, 0, 0, 0, 0]])
-    np.testing.assert_allclose(form.cost(error), [5.0, form.cost_limit])
+    error = np.array([[3e-6, 0, 0, 8e-3, 0, 0, 0], [0.03, 0, 0, 80.0, 0, 0, 0], [1e6, 0, 0, 0, 0, 0, 0]])
+    np.testing.assert_allclose(FORMULATIONS["scaled"].cost(error), [5e-4, 2.5, 5.0], rtol=2e-4)
 
 
 def test_the_perturbation_stays_in_its_bounds():
     env = gym.make("BatteryQmax-v0", initial_perturbation=10.0)
-    scale = FORMULATIONS["scaled"]["q_mobile"].error_scale
+    scale = FORMULATIONS["scaled"].error_scale
     draws = []
     for seed in range(20):
         env.reset(seed=seed)
         task = env.unwrapped.task
-        draws.append((task.model_state - task.state)[0, OBSERVED] / scale)
-    assert np.abs(draws).max() <= 10.0 + 1e-6 and np.abs(draws).max(axis=0).min() > 2.0
+        draws.append((task.model_state - task.state)[0, OBSERVED][:4] / scale[:4])
+    assert np.abs(draws).max() <= 10.0 + 1e-6 and np.abs(draws).max(axis=0).min() > 5.0
 
 
 def test_the_model_runs_free():
@@ -159,6 +161,13 @@ def test_the_model_runs_free():
     # the error of one wrong step stays in the model's state, though the next parameter is the true one
     *_, info = env.step(true_action(env))
     assert info["cost"] > 0.1
+
+
+def test_a_perturbation_conserves_charge():
+    env = gym.make("BatteryQmax-v0", initial_perturbation=10.0)
+    env.reset(seed=0)
+    task = env.unwrapped.task
+    assert task.model_state[0, QNB:].sum() == pytest.approx(task.state[0, QNB:].sum(), rel=1e-12)
 
 
 @pytest.mark.parametrize("formulation", ["scaled", "paper"])

@@ -1,0 +1,51 @@
+"""The examples of the documentation run, and the commands it names exist."""
+
+import importlib.util
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+
+
+def blocks(page, language):
+    return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+
+
+def run_briefly(source, name, folder, monkeypatch):
+    """Run an example in an empty folder, with a few training steps instead of thousands."""
+    monkeypatch.chdir(folder)
+    source = re.sub(r"\.learn\((total_timesteps=)?[\d_.e]+", r".learn(\g<1>150", source)
+    exec(compile(source, name, "exec"), {"__name__": "__main__"})
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=lambda page: page.name)
+def test_examples_in_pages_run(page, tmp_path, monkeypatch):
+    run_briefly("\n".join(blocks(page, "python")), str(page), tmp_path, monkeypatch)
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda example: example.name)
+def test_example_files_run(example, tmp_path, monkeypatch):
+    run_briefly(example.read_text(encoding="utf-8"), str(example), tmp_path, monkeypatch)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_commands_in_pages_exist(page):
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    for line in "\n".join(blocks(page, "bash")).replace("\\\n", " ").splitlines():
+        words = shlex.split(line, comments=True)
+        if words[:2] == ["python", "-m"] and words[2] != "pip":
+            assert importlib.util.find_spec(words[2]) is not None, line
+        elif words[:1] == ["make"]:
+            assert re.search(rf"^{words[1]}:", makefile, flags=re.MULTILINE), line
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_between_pages_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text(encoding="utf-8")):
+        if "://" not in target:
+            assert (page.parent / target).exists(), f"{page.name} links to {target}"
