@@ -250,7 +250,13 @@ def report(envs: Sequence[str], algos: Sequence[str], seeds: Sequence[int], out:
         rows.append({"env": env_id, "algo": "closed form", **summarize(exact, parameter)})
         rows[-1]["time_per_update_us"] = 1e6 * float(exact["time_per_update_s"].iloc[0])
         save_figure(plot_true_against_inferred(inferred, parameter), out / f"{env_id}_inferred.png")
+        columns = ["load", parameter, f"{parameter}_hat", f"{parameter}_spread", f"{parameter}_mape_percent"]
+        points = pd.concat({algo: scores[columns] for algo, scores in inferred.items()}, names=["algo", "trajectory"])
+        write_csv(out / f"{env_id}_inferred.csv", points.reset_index(), configuration)
         save_figure(plot_learning_curves(curves, env_id), out / f"{env_id}_learning.png")
+        lines = {(algo, seed): line for algo, tables in curves.items() for seed, line in zip(seeds, tables, strict=True)}
+        history = pd.concat(lines, names=["algo", "seed"]).droplevel(-1)
+        write_csv(out / f"{env_id}_learning.csv", history.reset_index(), configuration)
     table = pd.DataFrame(rows)
     write_csv(out / "compare.csv", table, configuration)
     markdown = _markdown(table)

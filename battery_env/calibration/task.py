@@ -51,7 +51,7 @@ class Formulation:
     :param error_scale: what state errors are divided by, in the cost and in the innovation, shape (7,)
     :param innovation: whether the observation holds x_{t+1} minus what the model predicts from x̂_t with a new cell's
         parameters
-    :param cost_limit: what the cost tends to as the error grows
+    :param cost_limit: the largest cost
     """
 
     state_scale: FloatArray
@@ -62,15 +62,14 @@ class Formulation:
 
     def cost(self, error: FloatArray) -> FloatArray:
         """
-        The Euclidean norm of the scaled error of the state, d, with a smooth limit: d / (1 + d / cost_limit). Near the end of
-        a discharge d spans four orders of magnitude; the cost must not, or the critic does not see the small ones.
+        The Euclidean norm of the scaled error of the state, at most ``cost_limit``: near the end of a discharge the norm spans
+        four orders of magnitude; the cost must not, or the critic does not see the small ones.
 
         :param error: x̂_{t+1} - x_{t+1}, shape (n, 7)
         :return: shape (n,)
         """
         scaled = error / self.error_scale
-        distance = np.sqrt(np.einsum("ij,ij->i", scaled, scaled))
-        return distance / (1.0 + distance / self.cost_limit)
+        return np.minimum(np.sqrt(np.einsum("ij,ij->i", scaled, scaled)), self.cost_limit)
 
 
 class PaperFormulation(Formulation):

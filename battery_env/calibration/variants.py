@@ -38,8 +38,7 @@ class BatteryQmaxEnv(FullStateEnv):
 
     ## Reward
 
-    Minus the cost d / (1 + d / 5), where d is the Euclidean norm of x̂_{t+1} - x_{t+1} in error scales: the norm while it is
-    small, never above 5.
+    Minus the cost, the Euclidean norm of x̂_{t+1} - x_{t+1} in error scales, at most 5.
 
     ## Starting state
 
