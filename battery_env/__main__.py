@@ -10,7 +10,6 @@ The command line: what a record of a discharge says about its cell.
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,6 +22,7 @@ from battery_env.cells import BUNDLED_CELLS, Discharge, load_nasa_discharges, re
 from battery_env.electrochemistry import NEW_CELL, FloatArray
 from battery_env.estimators.base import Estimate
 from battery_env.estimators.least_squares import LeastSquares
+from battery_env.files import replacing
 from battery_env.plotting import COLOURS, new_figure, save_figure
 
 
@@ -110,9 +110,11 @@ def _calibrate(options: argparse.Namespace) -> None:
     _print(name, record, row, options.parameters, options.cut_off)
     if outputs:
         model_V = calibrator.predict_voltage_V(record, estimate)
-        _write_csv(pd.DataFrame([{"record": name, **row}]), outputs[0])
+        with replacing(outputs[0]) as part:
+            pd.DataFrame([{"record": name, **row}]).to_csv(part, index=False)
         columns = {"time_s": record.time_s, "voltage_V": record.voltage_V, "current_A": record.current_A, "model_V": model_V}
-        _write_csv(pd.DataFrame(columns), outputs[1])
+        with replacing(outputs[1]) as part:
+            pd.DataFrame(columns).to_csv(part, index=False)
         save_figure(_figure(name, record, model_V, calibrator.forecast(record, estimate, options.cut_off)), outputs[2])
         print("\nwritten: " + ", ".join(map(str, outputs)))
 
@@ -192,13 +194,6 @@ def _figure(name: str, record: Discharge, model_V: FloatArray, forecast: tuple[F
         axes.grid(alpha=0.25)
     figure.align_ylabels()
     return figure
-
-
-def _write_csv(table: pd.DataFrame, path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.part")
-    table.to_csv(part, index=False)
-    os.replace(part, path)
 
 
 if __name__ == "__main__":

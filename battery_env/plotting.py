@@ -12,6 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from battery_env.files import replacing
+
 #: Colours that colour-blind readers can tell apart (Okabe & Ito).
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 LABELS = {"q_mobile": "$q^{max}$ (C)", "r_o": r"$R_o$ ($\Omega$)"}
@@ -38,12 +40,9 @@ def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
     :param path: where to; its suffix chooses the format
     :return: the file
     """
-    target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    part = target.with_name(f".{target.stem}.part{target.suffix}")
-    figure.savefig(part)
-    os.replace(part, target)
-    return target
+    with replacing(path) as part:
+        figure.savefig(part)
+    return Path(path)
 
 
 def plot_true_against_inferred(scores: Mapping[str, pd.DataFrame], parameter: str) -> Figure:

@@ -6,7 +6,6 @@ import hashlib
 import json
 import os
 import platform
-import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
@@ -30,6 +29,7 @@ from battery_env.electrochemistry import (
     check_r_o,
     simulate,
 )
+from battery_env.files import replacing
 from battery_env.loads import Load, LoadSampler, constant
 
 IntArray = NDArray[np.int64]
@@ -381,10 +381,8 @@ class TrajectoryDataset(Sequence[Trajectory]):
             "versions": {"python": platform.python_version(), "numpy": np.__version__, "numba": version("numba")},
             "sha256": _checksum(arrays),
         }
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=target.parent, suffix=".part", delete=False) as file:
-            np.savez_compressed(file, allow_pickle=False, metadata=np.array(json.dumps(metadata)), **arrays)
-        os.replace(file.name, target)
+        with replacing(target) as part:
+            np.savez_compressed(part, allow_pickle=False, metadata=np.array(json.dumps(metadata)), **arrays)
         return target
 
     @classmethod

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import platform
 import sys
 from importlib.metadata import PackageNotFoundError, version
@@ -11,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+
+from battery_env.files import replacing
 
 _PACKAGES = ("torch", "stable_baselines3", "gymnasium", "numpy", "numba", "scipy", "pandas", "rl_zoo3", "progpy")
 
@@ -37,10 +38,8 @@ def write_text(path: Path, text: str) -> None:
     :param path: where to
     :param text: its contents
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.part")
-    part.write_text(text, encoding="utf-8")
-    os.replace(part, path)
+    with replacing(path) as part:
+        part.write_text(text, encoding="utf-8")
 
 
 def write_csv(path: Path, table: pd.DataFrame, configuration: dict[str, Any]) -> None:
