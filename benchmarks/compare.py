@@ -288,6 +288,22 @@ def _markdown(table: pd.DataFrame) -> str:
     return pd.DataFrame(lines).to_markdown(index=False) + "\n"
 
 
+def _run_all(runs: Sequence[tuple[Any, ...]], jobs: int) -> None:
+    if jobs == 1:
+        for job in runs:
+            run(*job)
+        return
+    # spawn: torch does not survive a fork with threads
+    with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
+        futures = [pool.submit(run, *job, position=k % jobs) for k, job in enumerate(runs)]
+        try:
+            for future in futures:
+                future.result()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """
     The command line.
@@ -311,15 +327,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for seed in chosen.seeds
         for algo in chosen.algos
     ]
-    if chosen.jobs == 1:
-        for job in runs:
-            run(*job)
-    else:
-        # spawn: torch does not survive a fork with threads
-        with ProcessPoolExecutor(chosen.jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
-            futures = [pool.submit(run, *job, position=k % chosen.jobs) for k, job in enumerate(runs)]
-            for future in futures:
-                future.result()
+    try:
+        _run_all(runs, chosen.jobs)
+    except KeyboardInterrupt:
+        sys.exit(f"\nInterrupted; what is done lies in {chosen.out}, and the same command goes on from there.")
     configuration = {name: value for name, value in vars(chosen).items() if name not in ("jobs", "out")}
     sys.stdout.write("\n" + report(chosen.envs, chosen.algos, chosen.seeds, chosen.out, configuration))
 
