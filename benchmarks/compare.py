@@ -115,7 +115,7 @@ def parameter_of(env_id: str) -> Literal["q_mobile", "r_o"]:
     return PolicyEstimator.environment(env_id).task.parameter
 
 
-def test_trajectories(env_id: str) -> TrajectoryDataset:
+def held_out_trajectories(env_id: str) -> TrajectoryDataset:
     """
     The discharges that no policy has seen.
 
@@ -147,7 +147,7 @@ def run(algo: str, env_id: str, seed: int, timesteps: int, evaluations: int, out
         if done["timesteps"] != timesteps:
             raise ValueError(f"{folder} holds a run of {done['timesteps']} steps, not {timesteps}; choose another --out")
         return
-    parameter, test = parameter_of(env_id), test_trajectories(env_id)
+    parameter, test = parameter_of(env_id), held_out_trajectories(env_id)
     resumed = (checkpoint / "model.zip").exists()
     clock = _Clock(folder / "training_seconds.json")
 
@@ -246,7 +246,7 @@ def report(envs: Sequence[str], algos: Sequence[str], seeds: Sequence[int], out:
             rows += [json.loads((folder / "summary.json").read_text()) for folder in folders]
             inferred[algo.upper()] = pd.read_csv(folders[0] / "scores.csv")
             curves[algo.upper()] = [pd.read_csv(folder / "calibration.csv") for folder in folders]
-        exact = evaluate(ClosedForm(), test_trajectories(env_id))
+        exact = evaluate(ClosedForm(), held_out_trajectories(env_id))
         rows.append({"env": env_id, "algo": "closed form", **summarize(exact, parameter)})
         rows[-1]["time_per_update_us"] = 1e6 * float(exact["time_per_update_s"].iloc[0])
         save_figure(plot_true_against_inferred(inferred, parameter), out / f"{env_id}_inferred.png")
@@ -295,7 +295,7 @@ def _run_all(runs: Sequence[tuple[Any, ...]], jobs: int) -> None:
         return
     # spawn: torch does not survive a fork with threads
     with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
-        futures = [pool.submit(run, *job, position=k % jobs) for k, job in enumerate(runs)]
+        futures = [pool.submit(run, *(*job, k % jobs)) for k, job in enumerate(runs)]
         try:
             for future in futures:
                 future.result()

@@ -24,10 +24,10 @@ BatteryRo-v0:
 """
 
 
-def patch_test_trajectories(monkeypatch):
-    data = compare.test_trajectories(ENV_ID)
+def patch_held_out_trajectories(monkeypatch):
+    data = compare.held_out_trajectories(ENV_ID)
     shortest = data.subset(np.argsort(data.samples)[:6])
-    monkeypatch.setattr(compare, "test_trajectories", lambda env_id: shortest)
+    monkeypatch.setattr(compare, "held_out_trajectories", lambda env_id: shortest)
 
 
 @pytest.fixture(autouse=True)
@@ -37,7 +37,7 @@ def small(tmp_path, monkeypatch):
     for algo in ("lac", "sac", "td3"):
         (tmp_path / "zoo_configs" / f"{algo}.yml").write_text(CONFIG)
     monkeypatch.chdir(tmp_path)
-    patch_test_trajectories(monkeypatch)
+    patch_held_out_trajectories(monkeypatch)
     monkeypatch.setattr(compare, "_EVALUATION_EPISODES", 2)
 
 
@@ -89,7 +89,7 @@ def test_an_interrupted_run_goes_on_from_its_checkpoint(tmp_path, monkeypatch):
     monkeypatch.undo()
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(compare, "ProgressCallback", Progress)
-    patch_test_trajectories(monkeypatch)
+    patch_held_out_trajectories(monkeypatch)
     compare.run("lac", ENV_ID, 0, 400, 4, tmp_path)
     assert started_at == [0, 200]
     assert list(pd.read_csv(folder / "calibration.csv")["timesteps"]) == [100, 200, 300, 400]
