@@ -6,9 +6,7 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -47,34 +45,33 @@ def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
 
 def plot_true_against_inferred(scores: Mapping[str, pd.DataFrame], parameter: str) -> Figure:
     """
-    The paper's figure: the true parameter of each discharge against the mean of its estimates, one panel per calibrator.
+    The paper's figure, one column per calibrator: the true parameter of each discharge against the mean of its estimates (bar:
+    their standard deviation), and below it the error, which the upper panel is too coarse for.
 
     :param scores: what :func:`battery_env.evaluation.evaluate` returned, by name of the calibrator
     :param parameter: ``"q_mobile"`` or ``"r_o"``
     :return: the figure
     """
-    figure = new_figure(3.1 * len(scores) + 0.9, 3.6)
-    panels: list[Axes] = list(np.atleast_1d(figure.subplots(1, len(scores), sharex=True, sharey=True)))
+    figure = new_figure(3.1 * len(scores) + 0.9, 5.2)
+    panels = figure.subplots(2, len(scores), sharex=True, sharey="row", height_ratios=[3, 2], squeeze=False)
     low = min(table[parameter].min() for table in scores.values())
     high = max(table[parameter].max() for table in scores.values())
     points = None
-    for axes, (name, table) in zip(panels, scores.items(), strict=True):
-        axes.plot([low, high], [low, high], color="0.6", lw=1.0, zorder=1)
-        axes.vlines(
-            table[parameter],
-            table[f"{parameter}_hat"] - table[f"{parameter}_spread"],
-            table[f"{parameter}_hat"] + table[f"{parameter}_spread"],
-            color="0.75",
-            lw=0.6,
-            zorder=2,
-        )
-        points = axes.scatter(table[parameter], table[f"{parameter}_hat"], c=table["load"], s=5, cmap="viridis", zorder=3)
+    for (upper, lower), (name, table) in zip(panels.T, scores.items(), strict=True):
+        true, inferred, spread = table[parameter], table[f"{parameter}_hat"], table[f"{parameter}_spread"]
         mape = table[f"{parameter}_mape_percent"]
-        axes.set_title(f"{name}\nMAPE {mape.mean():.2g} %, worst {mape.max():.2g} %", fontsize=10)
-        axes.set_xlabel(f"true {LABELS[parameter]}")
-    panels[0].set_ylabel(f"inferred {LABELS[parameter]}")
+        upper.plot([low, high], [low, high], color="0.6", lw=1.0, zorder=1)
+        upper.vlines(true, inferred - spread, inferred + spread, color="0.75", lw=0.6, zorder=2)
+        upper.scatter(true, inferred, c=table["load"], s=5, cmap="viridis", zorder=3)
+        upper.set_title(f"{name}\nMAPE {mape.mean():.2g} %, worst {mape.max():.2g} %", fontsize=10)
+        points = lower.scatter(true, mape, c=table["load"], s=3, cmap="viridis")
+        lower.set(yscale="log", xlabel=f"true {LABELS[parameter]}")
+        lower.grid(alpha=0.25)
+    panels[0, 0].set_ylabel(f"inferred {LABELS[parameter]}")
+    panels[1, 0].set_ylabel("MAPE of a discharge (%)")
+    figure.align_ylabels(panels[:, 0])
     if points is not None:
-        figure.colorbar(points, ax=panels, label="mean load (W)")
+        figure.colorbar(points, ax=panels.ravel().tolist(), label="mean load (W)")
     return figure
 
 

@@ -16,11 +16,12 @@ def scores():
 
 def test_true_against_inferred_has_a_panel_for_each_calibrator(scores, tmp_path):
     figure = plot_true_against_inferred({"LAC": scores, "SAC": scores}, "r_o")
-    panels = figure.axes[:2]
+    panels, errors = figure.axes[:2], figure.axes[2:4]
     assert [axes.get_title().split("\n")[0] for axes in panels] == ["LAC", "SAC"]
     assert "MAPE 1.5 %, worst 2.5 %" in panels[0].get_title()
     points = panels[0].collections[-1].get_offsets()
     assert points[:, 0].tolist() == scores["r_o"].tolist() and points[:, 1].tolist() == scores["r_o_hat"].tolist()
+    assert errors[0].collections[-1].get_offsets()[:, 1].tolist() == scores["r_o_mape_percent"].tolist()
     assert save_figure(figure, tmp_path / "folder" / "figure.png").stat().st_size > 0
 
 
