@@ -156,7 +156,7 @@ def test_voltage_collapse_ends_the_discharge():
 
 def test_a_state_without_voltage_ends_the_discharge_whatever_the_cut_off():
     discharge = simulate(16.0, 4000.0, 0.2, cut_off_V=-np.inf)
-    assert 27 < discharge.eod_time_s < 100
+    assert 27 < discharge.eod_time_s < 1000 and discharge.voltage_V.min() < 3.0
     assert np.isfinite(discharge.state).all() and np.isfinite(discharge.voltage_V).all()
 
 
