@@ -6,9 +6,7 @@ from battery_env.calibration.policy import PolicyEstimator
 from battery_env.calibration.registration import register_environments
 from battery_env.cells import Discharge, load_nasa_discharges, read_discharge_csv
 from battery_env.electrochemistry import NEW_CELL, CellParameters, Trajectory, initial_state, simulate, step, voltage
-from battery_env.estimators.base import Estimate, Estimator
-from battery_env.estimators.closed_form import ClosedForm
-from battery_env.estimators.least_squares import LeastSquares
+from battery_env.estimators import ClosedForm, Estimate, Estimator, LeastSquares
 from battery_env.evaluation import evaluate
 from battery_env.trajectories import TrajectoryDataset
 

@@ -149,8 +149,31 @@ class BatteryRoPaperEnv(FullStateEnv):
     """
     ## Description
 
-    As ``BatteryQmaxPaper-v0``, but R_o is to be found: action mapped linearly to r_o = 0.08 .. 0.22 ohm, and the data vary
-    r_o in 0.1 .. 0.2 ohm.
+    The R_o task in the literal form of the paper and its code, for comparison with ``BatteryRo-v0``.
+
+    ## Observation space
+
+    ``Box(-100, 100, (15,), float32)``, laid out and scaled as in ``BatteryQmaxPaper-v0``.
+
+    ## Action space
+
+    ``Box(-1, 1, (1,), float32)``, mapped linearly to r_o = 0.08 .. 0.22 ohm. q_mobile is known.
+
+    ## Reward
+
+    That of ``BatteryQmaxPaper-v0``.
+
+    ## Starting state
+
+    As ``BatteryRo-v0``.
+
+    ## Episode end
+
+    Truncated after 16 steps, or where the data end. Never terminated.
+
+    ## Arguments
+
+    Those of ``BatteryQmax-v0``, with ``episode_steps`` 16.
 
     ## Version history
 
