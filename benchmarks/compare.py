@@ -7,7 +7,8 @@ held-out discharges with each other and with the closed form.
   python -m benchmarks.compare --algos lac sac td3 --envs BatteryRo-v0 BatteryQmax-v0 --seeds 0 --timesteps 200000
 
 Hyperparameters are those of ``zoo_configs``. Every run has a folder of its own; a run that is finished is not run again, and
-an interrupted one goes on from its last checkpoint when the same command is given again. TensorBoard logs lie in
+an interrupted one goes on from its last checkpoint when the same command is given again. The table and the figures show all
+finished runs in the folder, so that runs can be added. TensorBoard logs lie in
 ``<out>/tensorboard/<env>/<ALGO>_seed<k>``, so that the algorithms overlay.
 """
 
@@ -225,39 +226,41 @@ class _Clock(BaseCallback):
             write_text(self.file, json.dumps(self.seconds))
 
 
-def report(envs: Sequence[str], algos: Sequence[str], seeds: Sequence[int], out: Path, configuration: dict[str, Any]) -> str:
+def report(out: Path, configuration: dict[str, Any]) -> str:
     """
-    Write the table of all runs (CSV, markdown) and, for each environment, the figures.
+    Write the table of all finished runs in a folder (CSV, markdown) and, for each environment, figures with their data. Where
+    an algorithm has several seeds the first one is drawn as the paper's figure.
 
-    :param envs: ids of environments
-    :param algos: algorithms
-    :param seeds: seeds
     :param out: folder of all results
     :param configuration: what was chosen on the command line
     :return: the table in markdown
     """
-    rows: list[dict[str, Any]] = []
-    for env_id in envs:
-        parameter = parameter_of(env_id)
+    runs = pd.DataFrame([json.loads(file.read_text()) for file in sorted(out.glob("*/*/summary.json"))])
+    tables = []
+    for env_id, of_env in runs.groupby("env"):
+        parameter = parameter_of(str(env_id))
         inferred: dict[str, pd.DataFrame] = {}
         curves: dict[str, list[pd.DataFrame]] = {}
-        for algo in algos:
-            folders = [out / env_id / f"{algo}_seed{seed}" for seed in seeds]
-            rows += [json.loads((folder / "summary.json").read_text()) for folder in folders]
-            inferred[algo.upper()] = pd.read_csv(folders[0] / "scores.csv")
-            curves[algo.upper()] = [pd.read_csv(folder / "calibration.csv") for folder in folders]
-        exact = evaluate(ClosedForm(), held_out_trajectories(env_id))
-        rows.append({"env": env_id, "algo": "closed form", **summarize(exact, parameter)})
-        rows[-1]["time_per_update_us"] = 1e6 * float(exact["time_per_update_s"].iloc[0])
+        histories: dict[tuple[str, int], pd.DataFrame] = {}
+        for algo, of_algo in of_env.groupby("algo"):
+            name = str(algo).upper()
+            folders = [out / str(env_id) / f"{algo}_seed{seed}" for seed in of_algo["seed"]]
+            inferred[name] = pd.read_csv(folders[0] / "scores.csv")
+            curves[name] = [pd.read_csv(folder / "calibration.csv") for folder in folders]
+            histories |= {(name, seed): line for seed, line in zip(of_algo["seed"], curves[name], strict=True)}
+        exact = evaluate(ClosedForm(), held_out_trajectories(str(env_id)))
+        row = {"env": env_id, "algo": "closed form", **summarize(exact, parameter)}
+        row["time_per_update_us"] = 1e6 * float(exact["time_per_update_s"].iloc[0])
+        tables += [of_env, pd.DataFrame([row])]
+
         save_figure(plot_true_against_inferred(inferred, parameter), out / f"{env_id}_inferred.png")
         columns = ["load", parameter, f"{parameter}_hat", f"{parameter}_spread", f"{parameter}_mape_percent"]
         points = pd.concat({algo: scores[columns] for algo, scores in inferred.items()}, names=["algo", "trajectory"])
         write_csv(out / f"{env_id}_inferred.csv", points.reset_index(), configuration)
-        save_figure(plot_learning_curves(curves, env_id), out / f"{env_id}_learning.png")
-        lines = {(algo, seed): line for algo, tables in curves.items() for seed, line in zip(seeds, tables, strict=True)}
-        history = pd.concat(lines, names=["algo", "seed"]).droplevel(-1)
+        save_figure(plot_learning_curves(curves, str(env_id)), out / f"{env_id}_learning.png")
+        history = pd.concat(histories, names=["algo", "seed"]).droplevel(-1)
         write_csv(out / f"{env_id}_learning.csv", history.reset_index(), configuration)
-    table = pd.DataFrame(rows)
+    table = pd.concat(tables, ignore_index=True)
     write_csv(out / "compare.csv", table, configuration)
     markdown = _markdown(table)
     write_text(out / "compare.md", markdown)
@@ -267,25 +270,28 @@ def report(envs: Sequence[str], algos: Sequence[str], seeds: Sequence[int], out:
 def _markdown(table: pd.DataFrame) -> str:
     # mean over seeds, with the spread (standard deviation) where there are several
     def over_seeds(values: pd.Series) -> str:
-        spread = f" ± {values.std():.2g}" if len(values) > 1 else ""
+        spread = f" ± {values.std():.1g}" if len(values) > 1 else ""
         return f"{values.mean():.2g}{spread}"
 
     lines = []
     for (env_id, algo), group in table.groupby(["env", "algo"], sort=False):
+        learned = algo != "closed form"
         lines.append(
             {
                 "environment": env_id,
-                "calibrator": algo if algo == "closed form" else str(algo).upper(),
+                "calibrator": str(algo).upper() if learned else algo,
+                "steps": f"{group['timesteps'].iloc[0]:.0f}" if learned else "",
+                "seeds": str(len(group)) if learned else "",
                 "MAPE (%)": over_seeds(group["mape_percent"]),
                 "worst discharge (%)": f"{group['mape_worst_percent'].max():.2g}",
                 "bias (%)": over_seeds(group["bias_percent"]),
                 "spread (%)": over_seeds(group["spread_percent"]),
                 "end of discharge (%)": over_seeds(group["eod_error_percent"]),
                 "time per estimate (us)": f"{group['time_per_update_us'].mean():.2g}",
-                "training (min)": "" if algo == "closed form" else f"{group['training_minutes'].mean():.1f}",
+                "training (min)": f"{group['training_minutes'].mean():.1f}" if learned else "",
             }
         )
-    return pd.DataFrame(lines).to_markdown(index=False) + "\n"
+    return pd.DataFrame(lines).to_markdown(index=False, disable_numparse=True) + "\n"
 
 
 def _run_all(runs: Sequence[tuple[Any, ...]], jobs: int) -> None:
@@ -332,7 +338,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except KeyboardInterrupt:
         sys.exit(f"\nInterrupted; what is done lies in {chosen.out}, and the same command goes on from there.")
     configuration = {name: value for name, value in vars(chosen).items() if name not in ("jobs", "out")}
-    sys.stdout.write("\n" + report(chosen.envs, chosen.algos, chosen.seeds, chosen.out, configuration))
+    sys.stdout.write("\n" + report(chosen.out, configuration))
 
 
 if __name__ == "__main__":
