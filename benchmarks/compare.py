@@ -271,7 +271,10 @@ def _markdown(table: pd.DataFrame) -> str:
     # mean over seeds, with the spread (standard deviation) where there are several
     def over_seeds(values: pd.Series) -> str:
         spread = f" ± {values.std():.1g}" if len(values) > 1 else ""
-        return f"{values.mean():.2g}{spread}"
+        return f"{two_digits(values.mean())}{spread}"
+
+    def two_digits(value: float) -> str:
+        return f"{value:.2g}" if abs(value) < 99.5 else f"{value:.0f}"
 
     lines = []
     for (env_id, algo), group in table.groupby(["env", "algo"], sort=False):
@@ -283,7 +286,7 @@ def _markdown(table: pd.DataFrame) -> str:
                 "steps": f"{group['timesteps'].iloc[0]:.0f}" if learned else "",
                 "seeds": str(len(group)) if learned else "",
                 "MAPE (%)": over_seeds(group["mape_percent"]),
-                "worst discharge (%)": f"{group['mape_worst_percent'].max():.2g}",
+                "worst discharge (%)": two_digits(group["mape_worst_percent"].max()),
                 "bias (%)": over_seeds(group["bias_percent"]),
                 "spread (%)": over_seeds(group["spread_percent"]),
                 "end of discharge (%)": over_seeds(group["eod_error_percent"]),
