@@ -63,6 +63,17 @@ class CheckpointCallback(BaseCallback):
         self.folder = folder
         self.save_freq = save_freq
 
+    @staticmethod
+    def recover(folder: Path) -> None:
+        """
+        Put the previous checkpoint back if an interruption fell between setting it aside and putting the new one in place.
+
+        :param folder: the folder
+        """
+        old = folder.with_suffix(".old")
+        if old.exists() and not folder.exists():
+            os.replace(old, folder)
+
     def _on_step(self) -> bool:
         if self.n_calls % self.save_freq == 0:
             assert isinstance(self.model, OffPolicyAlgorithm)
@@ -149,6 +160,7 @@ def run(algo: str, env_id: str, seed: int, timesteps: int, evaluations: int, out
             raise ValueError(f"{folder} holds a run of {done['timesteps']} steps, not {timesteps}; choose another --out")
         return
     parameter, test = parameter_of(env_id), held_out_trajectories(env_id)
+    CheckpointCallback.recover(checkpoint)
     resumed = (checkpoint / "model.zip").exists()
     clock = _Clock(folder / "training_seconds.json")
 

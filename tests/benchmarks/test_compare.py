@@ -97,6 +97,17 @@ def test_an_interrupted_run_goes_on_from_its_checkpoint(tmp_path, monkeypatch):
     assert summary["timesteps"] == 400 and summary["updates"] > 0
 
 
+def test_a_checkpoint_that_was_set_aside_is_put_back(tmp_path):
+    folder, old = tmp_path / "checkpoint", tmp_path / "checkpoint.old"
+    old.mkdir()
+    (old / "model.zip").write_text("previous")
+    compare.CheckpointCallback.recover(folder)
+    assert (folder / "model.zip").read_text() == "previous" and not old.exists()
+    old.mkdir()
+    compare.CheckpointCallback.recover(folder)
+    assert (folder / "model.zip").read_text() == "previous"
+
+
 def test_nonsense_on_the_command_line_is_refused(capsys):
     for command in (["--algos", "ppo"], ["--timesteps", "0"], ["--jobs", "0"]):
         with pytest.raises(SystemExit):
