@@ -1,4 +1,5 @@
 import math
+import warnings
 from collections.abc import Sequence
 from functools import reduce
 from typing import Any, ClassVar, TypeVar
@@ -12,22 +13,14 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, Schedule
 from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, polyak_update, update_learning_rate
+from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.sac.policies import Actor
 from torch.nn import functional as F
 
-from sb3_lac.policies import CnnPolicy, LyapunovCritic, LyapunovPolicy, MlpPolicy, MultiInputPolicy
+from sb3_lac.buffers import HorizonReplayBuffer, HorizonReplayBufferSamples
+from sb3_lac.policies import CnnPolicy, LyapunovCritic, LyapunovPolicy, MlpPolicy, MultiInputPolicy, largest_value
 
 SelfLAC = TypeVar("SelfLAC", bound="LAC")
-
-
-def largest_value(values: Sequence[th.Tensor]) -> th.Tensor:
-    """
-    The conservative value ``L(s, a)``: the largest of the critics' values.
-
-    :param values: One tensor of values per critic
-    :return: Element-wise maximum
-    """
-    return reduce(th.maximum, values)
 
 
 def lyapunov_target(costs: th.Tensor, dones: th.Tensor, discounts: th.Tensor | float, next_values: th.Tensor) -> th.Tensor:
@@ -52,7 +45,7 @@ def lyapunov_critic_loss(values: Sequence[th.Tensor], targets: th.Tensor) -> th.
     :param targets: See ``lyapunov_target()``
     :return: ``1/2 * mean (L(s, a) - y)^2``, summed over critics
     """
-    return 0.5 * th.stack([F.mse_loss(value, targets) for value in values]).sum()
+    return 0.5 * reduce(th.add, [F.mse_loss(value, targets) for value in values])
 
 
 def lyapunov_difference(next_values: th.Tensor, values: th.Tensor, costs: th.Tensor, alpha3: float) -> th.Tensor:
@@ -82,17 +75,58 @@ def lyapunov_actor_loss(difference: th.Tensor, log_prob: th.Tensor, lambda_coef:
     return lambda_coef.detach() * difference + ent_coef.detach() * log_prob.mean()
 
 
-def multiplier_loss(log_multiplier: th.Tensor, violation: th.Tensor) -> th.Tensor:
+def set_gradients(loss: th.Tensor, parameters: Sequence[th.Tensor]) -> None:
     """
-    Loss of a Lagrange multiplier in log space, which grows while its constraint is violated:
+    Compute the gradient of a loss with respect to some parameters, instead of all that it depends on:
+    the loss of the actor spares the weights of the critic. Earlier gradients are replaced.
+
+    :param loss: The loss
+    :param parameters: The parameters, those that the loss does not depend on get no gradient
+    """
+    for parameter, gradient in zip(parameters, th.autograd.grad(loss, parameters, allow_unused=True), strict=True):
+        parameter.grad = gradient
+
+
+def update_multiplier(log_multiplier: th.Tensor, optimizer: th.optim.Optimizer, violation: th.Tensor) -> th.Tensor:
+    """
+    Step of a Lagrange multiplier in log space, which grows while its constraint is violated:
     ``lambda`` with the decrease condition, ``ent_coef`` with the entropy constraint
     (see https://github.com/rail-berkeley/softlearning/issues/37 for the logarithm).
 
-    :param log_multiplier: Logarithm of the multiplier
+    :param log_multiplier: Logarithm of the multiplier, shape (1,)
+    :param optimizer: Optimizer of the logarithm
     :param violation: How much the constraint is violated on average (negative when it holds)
-    :return: ``-log(multiplier) * violation``
+    :return: The loss before the step, ``-log(multiplier) * violation``
     """
-    return -(log_multiplier * violation.detach()).mean()
+    violation = violation.detach()
+    loss = -log_multiplier.detach() * violation
+    # The loss is linear in the logarithm: autograd would only find the same number again
+    log_multiplier.grad = -violation.reshape(1)
+    optimizer.step()
+    return loss
+
+
+def reward_scale(vec_normalize: VecNormalize | None) -> float:
+    """
+    What a reward of the environment is divided by before the agent sees it.
+
+    :param vec_normalize: Wrapper that the rewards come from, if any
+    :return: 1 without normalization of rewards
+    """
+    if vec_normalize is None or not vec_normalize.norm_reward:
+        return 1.0
+    return math.sqrt(vec_normalize.ret_rms.var + vec_normalize.epsilon)
+
+
+def weight_of_return(discounts: th.Tensor | None, gamma: float) -> th.Tensor | float:
+    """
+    How often a constant reward counts in the return of k steps: ``1 + gamma + ... + gamma^(k-1)``.
+
+    :param discounts: ``gamma^k``, None if all returns are of one step
+    :param gamma: The discount factor, below 1 with more than one step
+    :return: Sum of the discounts in each return
+    """
+    return 1.0 if discounts is None else (1 - discounts) / (1 - gamma)
 
 
 def concatenate_observations(obs: PyTorchObs, next_obs: PyTorchObs) -> PyTorchObs:
@@ -162,6 +196,9 @@ class LAC(OffPolicyAlgorithm):
     :param lambda_max: Upper limit of ``lambda``
     :param lambda_learning_rate: learning rate for ``lambda``, can be a function of the current progress remaining.
         If ``None``, it is ``learning_rate``.
+    :param horizon: If given, ``L`` estimates the discounted sum of costs of the next ``horizon`` steps only (finite horizon
+        candidate, ``gamma`` may be 1), summed along stored episodes by the ``HorizonReplayBuffer`` without a target network.
+        Not supported for Dict observation spaces.
     :param use_sde: Whether to use generalized State Dependent Exploration (gSDE)
         instead of action noise exploration (default: False)
     :param sde_sample_freq: Sample a new noise matrix every n steps when using gSDE
@@ -217,6 +254,7 @@ class LAC(OffPolicyAlgorithm):
         lambda_min: float = 1e-4,
         lambda_max: float = 1.0,
         lambda_learning_rate: float | Schedule | None = None,
+        horizon: int | None = None,
         use_sde: bool = False,
         sde_sample_freq: int = -1,
         use_sde_at_warmup: bool = False,
@@ -268,12 +306,17 @@ class LAC(OffPolicyAlgorithm):
         self.lambda_min = lambda_min
         self.lambda_max = lambda_max
         self.lambda_learning_rate = lambda_learning_rate
+        self.horizon = horizon
 
         if _init_setup_model:
             self._setup_model()
 
     def _setup_model(self) -> None:
         self._check_arguments()
+        if self.horizon is not None:
+            self._setup_horizon(self.horizon)
+        elif self.replay_buffer_class is HorizonReplayBuffer:
+            raise ValueError("The HorizonReplayBuffer is used with a horizon, and chosen by it: set for instance horizon=5.")
         super()._setup_model()
         if isinstance(self.replay_buffer, NStepReplayBuffer) and self.gamma >= 1:
             raise ValueError(f"gamma={self.gamma} must be smaller than 1 with n-step returns, use for instance gamma=0.99.")
@@ -345,31 +388,59 @@ class LAC(OffPolicyAlgorithm):
                 f"and lambda_max={self.lambda_max}. Change lambda_init or widen the limits."
             )
 
+    def _setup_horizon(self, horizon: int) -> None:
+        """
+        Choose the replay buffer of the finite horizon candidate.
+
+        :param horizon: Number of steps
+        """
+        if not isinstance(horizon, int) or horizon < 1:
+            raise ValueError(f"horizon={horizon} must be an integer of at least 1, or None for the infinite horizon.")
+        if self.n_steps > 1:
+            raise ValueError(
+                f"horizon={horizon} and n_steps={self.n_steps} are two Lyapunov candidates: keep n_steps=1 or horizon=None."
+            )
+        if isinstance(self.observation_space, spaces.Dict):
+            raise ValueError(f"horizon={horizon} is not supported for Dict observation spaces, use horizon=None.")
+        if self.replay_buffer_class not in (None, ReplayBuffer, HorizonReplayBuffer):
+            raise ValueError(
+                f"horizon={horizon} needs the HorizonReplayBuffer and cannot be combined with "
+                f"replay_buffer_class={self.replay_buffer_class.__name__}, use horizon=None."
+            )
+        self.replay_buffer_class = HorizonReplayBuffer
+        self.replay_buffer_kwargs.update({"horizon": horizon, "gamma": self.gamma})
+
     def _create_aliases(self) -> None:
         self.actor = self.policy.actor
         self.actor_target = self.policy.actor_target
         self.critic = self.policy.critic
         self.critic_target = self.policy.critic_target
 
-    def _compute_costs(self, rewards: th.Tensor, discounts: th.Tensor | None) -> th.Tensor:
+    def cost_bound(self, vec_normalize: VecNormalize | None = None) -> th.Tensor:
         """
-        Convert sampled rewards to costs ``c = bound - reward >= 0`` with ``bound = max(0, largest reward seen)``,
-        after updating the bound with the sample. The bound is kept on the device and in the units of the environment:
-        it stays valid when ``VecNormalize`` changes its scale, and when rewards are computed at sampling (HER).
+        The reward that costs nothing: LAC minimises ``c = bound - reward >= 0`` with ``bound = max(0, largest reward seen)``.
+        The bound is kept in the units of the environment, so that it stays valid when ``VecNormalize`` changes its scale.
 
-        :param rewards: Rewards (normalized with ``VecNormalize``), summed over n steps with n-step returns
-        :param discounts: ``gamma`` to the power of the number of summed steps, None if it is one step
+        :param vec_normalize: Wrapper that the rewards come from, if any
+        :return: The bound in the units of these rewards
+        """
+        if vec_normalize is None or not vec_normalize.norm_reward:
+            # Never clipped
+            return self.reward_bound
+        return (self.reward_bound / reward_scale(vec_normalize)).clamp(max=vec_normalize.clip_reward)
+
+    def _compute_costs(self, rewards: th.Tensor, n_rewards: th.Tensor | float = 1.0) -> th.Tensor:
+        """
+        Convert sampled rewards to costs (see ``cost_bound()``), after updating the bound with the sample: it stays valid when
+        rewards are computed at sampling (HER).
+
+        :param rewards: Rewards (normalized with ``VecNormalize``), or discounted sums of them
+        :param n_rewards: How often a constant reward counts in each sum, the sum of its discounts
         :return: Costs, summed like the rewards
         """
-        scale, clip = 1.0, math.inf
-        if self._vec_normalize_env is not None and self._vec_normalize_env.norm_reward:
-            scale = math.sqrt(self._vec_normalize_env.ret_rms.var + self._vec_normalize_env.epsilon)
-            clip = self._vec_normalize_env.clip_reward
-        # A constant reward counts 1 + gamma + ... + gamma^(k-1) times in the return of k steps
-        n_rewards = 1.0 if discounts is None else (1 - discounts) / (1 - self.gamma)
         largest_reward = (rewards / n_rewards).max()
-        self.reward_bound = th.maximum(self.reward_bound, largest_reward * scale)
-        bound = th.maximum((self.reward_bound / scale).clamp(max=clip), largest_reward)
+        self.reward_bound = th.maximum(self.reward_bound, largest_reward * reward_scale(self._vec_normalize_env))
+        bound = th.maximum(self.cost_bound(self._vec_normalize_env), largest_reward)
         return bound * n_rewards - rewards
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
@@ -384,8 +455,10 @@ class LAC(OffPolicyAlgorithm):
         self._update_learning_rate(optimizers)
         update_learning_rate(self.lambda_optimizer, self.lambda_lr_schedule(self._current_progress_remaining))
 
-        actor_parameters = list(self.actor.parameters())
-        online_parameters: list[th.Tensor] = [*actor_parameters, *self.critic.parameters()]
+        actor_parameters, critic_parameters = (
+            [parameter for group in optimizer.param_groups for parameter in group["params"]] for optimizer in optimizers[:2]
+        )
+        online_parameters: list[th.Tensor] = [*self.actor.parameters(), *self.critic.parameters()]
         target_parameters: list[th.Tensor] = [*self.actor_target.parameters(), *self.critic_target.parameters()]
         log_lambda_min, log_lambda_max = math.log(self.lambda_min), math.log(self.lambda_max)
         # Kept on the device until the end: reading one value would wait for all pending work
@@ -397,7 +470,7 @@ class LAC(OffPolicyAlgorithm):
             replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
             # For n-step replay, discount factor is gamma**n_steps (when no early termination)
             discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
-            costs = self._compute_costs(replay_data.rewards, replay_data.discounts)
+            costs = self._compute_costs(replay_data.rewards, weight_of_return(replay_data.discounts, self.gamma))
 
             # We need to sample because `log_std` may have changed between two gradient steps
             if self.use_sde:
@@ -411,12 +484,15 @@ class LAC(OffPolicyAlgorithm):
             _, next_actions_pi = actions_pi.chunk(2)
             log_prob, _ = log_prob.chunk(2)
 
-            with th.no_grad():
-                # Next action by the lagged actor
-                next_actions = self.actor_target(replay_data.next_observations)
-                # Compute the next Lyapunov values: max over all target critics
-                next_values = largest_value(self.critic_target(replay_data.next_observations, next_actions))
-                target_values = lyapunov_target(costs, replay_data.dones, discounts, next_values)
+            if isinstance(replay_data, HorizonReplayBufferSamples):
+                target_values = self._compute_costs(replay_data.horizon_returns, replay_data.horizon_weights)
+            else:
+                with th.no_grad():
+                    # Next action by the lagged actor
+                    next_actions = self.actor_target(replay_data.next_observations)
+                    # Compute the next Lyapunov values: max over all target critics
+                    next_values = largest_value(self.critic_target(replay_data.next_observations, next_actions))
+                    target_values = lyapunov_target(costs, replay_data.dones, discounts, next_values)
 
             # Get current Lyapunov values for each critic network
             # using action from the replay buffer
@@ -436,19 +512,13 @@ class LAC(OffPolicyAlgorithm):
             actor_loss = lyapunov_actor_loss(difference, log_prob, lambda_coef, ent_coef)
 
             # Optimize the critic and the actor, both with the gradient at the current parameters
-            self.critic.optimizer.zero_grad()
-            critic_loss.backward()
-            self.actor.optimizer.zero_grad()
-            # The parameters of the critic need no gradient here
-            actor_loss.backward(inputs=actor_parameters)
+            set_gradients(critic_loss, critic_parameters)
+            set_gradients(actor_loss, actor_parameters)
             self.critic.optimizer.step()
             self.actor.optimizer.step()
 
             # Optimize the multiplier of the decrease condition
-            lambda_loss = multiplier_loss(self.log_lambda, difference)
-            self.lambda_optimizer.zero_grad()
-            lambda_loss.backward()
-            self.lambda_optimizer.step()
+            lambda_loss = update_multiplier(self.log_lambda, self.lambda_optimizer, difference)
             # Project it: a logarithm beyond its limits would need as many steps to come back (wind-up)
             with th.no_grad():
                 self.log_lambda.clamp_(log_lambda_min, log_lambda_max)
@@ -469,10 +539,9 @@ class LAC(OffPolicyAlgorithm):
             # entropy temperature or beta in the paper
             if self.ent_coef_optimizer is not None and self.log_ent_coef is not None:
                 assert isinstance(self.target_entropy, float)
-                ent_coef_loss = multiplier_loss(self.log_ent_coef, log_prob + self.target_entropy)
-                self.ent_coef_optimizer.zero_grad()
-                ent_coef_loss.backward()
-                self.ent_coef_optimizer.step()
+                ent_coef_loss = update_multiplier(
+                    self.log_ent_coef, self.ent_coef_optimizer, log_prob.mean() + self.target_entropy
+                )
                 metrics["ent_coef_loss"] = ent_coef_loss
 
             with th.no_grad():
@@ -503,10 +572,11 @@ class LAC(OffPolicyAlgorithm):
         progress_bar: bool = False,
     ) -> SelfLAC:
         if self.verbose >= 1 and self.alpha3 >= 1 and self._n_updates == 0:
-            print(
+            warnings.warn(
                 f"alpha3={self.alpha3} >= 1: the decrease condition cannot hold, because L(s', a') - L(s, a) is zero "
                 f"on average in stationary data. lambda will stay at lambda_max={self.lambda_max} and LAC minimises the cost "
-                "with this weight, use alpha3 < 1 to let lambda adapt."
+                "with this weight, use alpha3 < 1 to let lambda adapt.",
+                stacklevel=2,
             )
         return super().learn(
             total_timesteps=total_timesteps,

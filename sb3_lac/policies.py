@@ -1,5 +1,8 @@
+from collections.abc import Sequence
+from functools import reduce
 from typing import Any
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BaseModel, BasePolicy
@@ -15,6 +18,18 @@ from stable_baselines3.common.torch_layers import (
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import Actor
 from torch import nn
+
+from sb3_lac.distributions import SquashedGaussianDistribution
+
+
+def largest_value(values: Sequence[th.Tensor]) -> th.Tensor:
+    """
+    The conservative value ``L(s, a)``: the largest of the critics' values.
+
+    :param values: One tensor of values per critic
+    :return: Element-wise maximum
+    """
+    return reduce(th.maximum, values)
 
 
 class LyapunovCritic(BaseModel):
@@ -125,6 +140,7 @@ class LyapunovPolicy(BasePolicy):
     actor_target: Actor
     critic: LyapunovCritic
     critic_target: LyapunovCritic
+    action_space: spaces.Box
 
     def __init__(
         self,
@@ -266,7 +282,10 @@ class LyapunovPolicy(BasePolicy):
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
         actor_kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
-        return Actor(**actor_kwargs).to(self.device)
+        actor = Actor(**actor_kwargs)
+        if not actor.use_sde:
+            actor.action_dist = SquashedGaussianDistribution(get_action_dim(self.action_space))  # type: ignore[assignment]
+        return actor.to(self.device)
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> LyapunovCritic:
         critic_kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
@@ -277,6 +296,31 @@ class LyapunovPolicy(BasePolicy):
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return self.actor(observation, deterministic)
+
+    def predict_lyapunov(self, observation: np.ndarray | dict[str, np.ndarray], action: np.ndarray) -> np.ndarray:
+        """
+        Get the Lyapunov values ``L(s, a)`` (largest over the critics) of observations and actions.
+        The observations are preprocessed as in ``predict()``.
+
+        :param observation: n observations (or a single one), normalized with ``VecNormalize`` if the model was trained with it
+        :param action: As many actions, in the units of the action space
+        :return: The n values, an array of shape ``(n,)``
+        """
+        shape = self.action_space.shape
+        action = np.asarray(action, dtype=np.float32)
+        if action.shape != shape and action.shape[1:] != shape:
+            raise ValueError(f"The actions of shape {action.shape} must have the shape {shape}, or (n, ...) for n actions.")
+        # Switch to eval mode (this affects batch norm / dropout)
+        self.set_training_mode(False)
+        obs_tensor, _ = self.obs_to_tensor(observation)
+        n_observations = len(next(iter(obs_tensor.values()))) if isinstance(obs_tensor, dict) else len(obs_tensor)
+        # The critic was trained with flat actions in [-1, 1]
+        scaled_actions = self.scale_action(action.reshape((-1, *shape))).reshape((-1, get_action_dim(self.action_space)))
+        if n_observations != len(scaled_actions):
+            raise ValueError(f"There are {n_observations} observations and {len(scaled_actions)} actions, one each is needed.")
+        with th.no_grad():
+            values = self.critic(obs_tensor, th.as_tensor(scaled_actions, dtype=th.float32, device=self.device))
+        return largest_value(values).flatten().cpu().numpy()
 
     def set_training_mode(self, mode: bool) -> None:
         """

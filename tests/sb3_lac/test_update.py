@@ -8,13 +8,13 @@ import torch as th
 
 from sb3_lac.lac import (
     concatenate_observations,
-    largest_value,
     lyapunov_actor_loss,
     lyapunov_critic_loss,
     lyapunov_difference,
     lyapunov_target,
-    multiplier_loss,
+    update_multiplier,
 )
+from sb3_lac.policies import largest_value
 
 GAMMA, TAU, LEARNING_RATE, LAMBDA_LEARNING_RATE, ALPHA3 = 0.9, 0.05, 1e-2, 2e-2, 0.3
 LAMBDA_MIN, LAMBDA_MAX = 0.1, 1.0
@@ -157,7 +157,10 @@ def test_losses_of_hand_computed_numbers():
     assert difference.item() == pytest.approx(3.65)
     log_prob = th.tensor([-1.0, -3.0])
     assert lyapunov_actor_loss(difference, log_prob, th.tensor([2.0]), th.tensor(0.5)).item() == pytest.approx(6.3)
-    assert multiplier_loss(th.tensor([2.0]), difference).item() == pytest.approx(-7.3)
+    log_multiplier = th.tensor([2.0])
+    loss = update_multiplier(log_multiplier, th.optim.SGD([log_multiplier], lr=0.1), difference)
+    assert loss.item() == pytest.approx(-7.3)
+    assert log_multiplier.item() == pytest.approx(2.365)
 
 
 def test_gradient_of_the_difference_flows_through_the_next_value_only():

@@ -1,0 +1,26 @@
+import math
+
+import torch as th
+from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
+
+
+class SquashedGaussianDistribution(SquashedDiagGaussianDistribution):
+    """
+    The distribution of SAC's actor, with half the operations: the same samples and probabilities for the same random state.
+
+    The probability of a sample follows from the noise that it was made of. Its parent recovers that noise from the sample, for
+    which autograd computes a gradient that is zero, and checks its arguments in each call. On a CPU that costs a tenth of an
+    update.
+    """
+
+    def log_prob_from_params(self, mean_actions: th.Tensor, log_std: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        noise = th.randn_like(mean_actions)
+        actions = th.tanh(th.addcmul(mean_actions, noise, log_std.exp()))
+        # Gaussian density of the noise, and derivative of the squashing
+        log_prob = -0.5 * noise.square() - log_std - th.log(1 - actions * actions + self.epsilon)
+        return actions, log_prob.sum(dim=1) - 0.5 * math.log(2 * math.pi) * mean_actions.shape[1]
+
+    def actions_from_params(self, mean_actions: th.Tensor, log_std: th.Tensor, deterministic: bool = False) -> th.Tensor:
+        if deterministic:
+            return th.tanh(mean_actions)
+        return th.tanh(th.addcmul(mean_actions, th.randn_like(mean_actions), log_std.exp()))

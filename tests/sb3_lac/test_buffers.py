@@ -1,0 +1,178 @@
+"""The finite horizon candidate: sums of costs along stored episodes."""
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import NStepReplayBuffer
+from stable_baselines3.common.envs import SimpleMultiObsEnv
+
+from sb3_lac import LAC
+from sb3_lac.buffers import HorizonReplayBuffer
+
+SPACE = spaces.Box(-np.inf, np.inf, (1,))
+ACTIONS = spaces.Box(-1, 1, (1,))
+
+
+class Recorder:
+    """Fills a buffer with numbered steps: the reward of step i of environment e is i + 1000 e, and so is its observation."""
+
+    def __init__(self, horizon, gamma=1.0, buffer_size=20, n_envs=1):
+        self.buffer = HorizonReplayBuffer(
+            buffer_size * n_envs, SPACE, ACTIONS, device="cpu", n_envs=n_envs, horizon=horizon, gamma=gamma
+        )
+        self.n_envs = n_envs
+        self.steps = 0
+
+    def add(self, n_steps, terminated=None, truncated=None, env_idx=0):
+        """Add steps, the last of which may end the episode of one environment."""
+        for i in range(n_steps):
+            now = self.steps + 1000.0 * np.arange(self.n_envs)
+            done, timeout = np.zeros(self.n_envs), np.zeros(self.n_envs, dtype=bool)
+            if i == n_steps - 1:
+                done[env_idx] = float(bool(terminated or truncated))
+                timeout[env_idx] = bool(truncated)
+            infos = [{"TimeLimit.truncated": bool(flag)} for flag in timeout]
+            self.buffer.add(now[:, None], now[:, None] + 1, np.zeros((self.n_envs, 1)), now, done, infos)
+            self.steps += 1
+        return self
+
+    def sums(self):
+        """Observation -> sum, of everything that can be sampled."""
+        assert self.buffer.n_complete == self.buffer.complete.sum()
+        sample = self.buffer.sample(2000)
+        known = set(self.buffer.observations[self.buffer.complete].flatten().tolist())
+        sums = dict(zip(sample.observations.flatten().tolist(), sample.horizon_returns.flatten().tolist(), strict=True))
+        assert set(sums) == known
+        return sums
+
+
+def test_sum_covers_the_next_steps():
+    assert Recorder(horizon=3).add(6).sums() == {0: 3, 1: 6, 2: 9, 3: 12}
+
+
+def test_sum_is_discounted():
+    assert Recorder(horizon=3, gamma=0.5).add(4).sums() == {0: 1.0, 1: 1 + 1 + 0.75}
+
+
+def test_unfinished_episode_is_used_as_far_as_it_is_known():
+    recorder = Recorder(horizon=4)
+    with pytest.raises(ValueError, match="horizon=4 steps: use a smaller horizon"):
+        recorder.add(3).buffer.sample(1)
+    assert recorder.add(1).sums() == {0: 6}
+    assert recorder.add(1).sums() == {0: 6, 1: 10}
+
+
+def test_after_a_termination_nothing_is_paid():
+    recorder = Recorder(horizon=3).add(5, terminated=True).add(2)
+    assert recorder.sums() == {0: 3, 1: 6, 2: 9, 3: 7, 4: 4}
+    sample = recorder.buffer.sample(500)
+    by_step = dict(zip(sample.observations.flatten().tolist(), sample.horizon_weights.flatten().tolist(), strict=True))
+    assert by_step == {0: 3, 1: 3, 2: 3, 3: 2, 4: 1}
+
+
+def test_future_beyond_a_time_limit_is_unknown():
+    assert Recorder(horizon=3).add(5, truncated=True).add(3).sums() == {0: 3, 1: 6, 2: 9, 5: 18}
+
+
+def test_episode_shorter_than_the_horizon_counts_if_it_terminated():
+    assert Recorder(horizon=10).add(2, terminated=True).add(3, truncated=True).add(1).sums() == {0: 1, 1: 1}
+
+
+def test_overwritten_transitions_are_forgotten():
+    recorder = Recorder(horizon=3, buffer_size=6).add(9)
+    assert recorder.sums() == {3: 12, 4: 15, 5: 18, 6: 21}
+    assert recorder.add(1, terminated=True).sums() == {4: 15, 5: 18, 6: 21, 7: 24, 8: 17, 9: 9}
+
+
+def test_environments_have_episodes_of_their_own():
+    recorder = Recorder(horizon=2, n_envs=2).add(3, terminated=True, env_idx=1).add(2)
+    sums = recorder.sums()
+    assert {key: value for key, value in sums.items() if key < 1000} == {0: 1, 1: 3, 2: 5, 3: 7}
+    assert {key: value for key, value in sums.items() if key >= 1000} == {1000: 2001, 1001: 2003, 1002: 1002, 1003: 2007}
+
+
+def test_episode_does_not_go_on_after_a_new_start_of_the_training():
+    recorder = Recorder(horizon=3).add(4)
+    recorder.steps = 50
+    assert recorder.add(3).sums() == {0: 3, 1: 6, 50: 153}
+
+
+def test_reset_forgets_everything():
+    recorder = Recorder(horizon=2).add(5)
+    recorder.buffer.reset()
+    with pytest.raises(ValueError, match="No stored episode"):
+        recorder.buffer.sample(1)
+    assert recorder.add(2).sums() == {5: 11}
+
+
+def test_transitions_are_sampled_evenly():
+    recorder = Recorder(horizon=5, buffer_size=200).add(100, terminated=True).add(7, truncated=True)
+    sample = recorder.buffer.sample(20_000)
+    _, counts = np.unique(sample.observations.numpy(), return_counts=True)
+    assert len(counts) == 103
+    assert counts.min() > 120 and counts.max() < 270
+
+
+def test_sum_of_one_step_is_the_reward():
+    sample = Recorder(horizon=1).add(5, truncated=True).add(3).buffer.sample(50)
+    assert th.equal(sample.horizon_returns, sample.rewards)
+    assert set(sample.observations.flatten().tolist()) == set(range(8))
+
+
+def test_critic_learns_the_sum_of_a_finite_horizon(make_model, make_env, train_metrics):
+    # Cost 3 in each step, whatever happens: L is 3 (1 + 0.9 + 0.81), neither more nor with a tail
+    model = make_model(make_env(), horizon=3, gamma=0.9, learning_rate=1e-2)
+    model.replay_buffer.rewards[:] = -3.0
+    train_metrics(model, gradient_steps=400)
+    assert train_metrics(model, seed=1)["lyapunov_mean"] == pytest.approx(3 * 2.71, abs=0.2)
+
+
+def test_costs_of_positive_rewards_are_summed_below_the_bound(make_model, make_env, train_metrics):
+    model = make_model(make_env(offset=100.0), horizon=3, gamma=1.0)
+    targets = []
+    compute_costs = model._compute_costs
+    model._compute_costs = lambda *args: targets.append(compute_costs(*args)) or targets[-1]
+    train_metrics(model, gradient_steps=5)
+    assert min(target.min() for target in targets) >= 0
+    assert 90 < model.reward_bound.item() <= 100
+
+
+def test_model_with_a_horizon_is_saved_loaded_and_continued(make_model, make_env, tmp_path):
+    model = make_model(horizon=4, gamma=1.0)
+    assert isinstance(model.replay_buffer, HorizonReplayBuffer)
+    model.learn(30, reset_num_timesteps=False)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    loaded = LAC.load(tmp_path / "model", env=make_env())
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    assert loaded.horizon == loaded.replay_buffer.horizon == 4
+    loaded.learn(30, reset_num_timesteps=False)
+    assert loaded._n_updates > model._n_updates
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"horizon": 0}, "horizon=0 must be an integer of at least 1"),
+        ({"horizon": 2.5}, "horizon=2.5 must be an integer"),
+        ({"horizon": 5, "n_steps": 3}, "horizon=5 and n_steps=3 are two Lyapunov candidates"),
+        ({"horizon": 5, "replay_buffer_class": NStepReplayBuffer}, "replay_buffer_class=NStepReplayBuffer"),
+        ({"replay_buffer_class": HorizonReplayBuffer}, "set for instance horizon=5"),
+        ({"horizon": 600}, "horizon=600 must not be larger than the 500 steps"),
+        (
+            {"horizon": 5, "env": SimpleMultiObsEnv(discrete_actions=False), "policy": "MultiInputPolicy"},
+            "not supported for Dict",
+        ),
+    ],
+)
+def test_bad_horizons_are_named(make_model, kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        make_model(n_collect=0, **kwargs)
+
+
+def test_memory_cannot_be_optimized(make_model):
+    with pytest.raises(NotImplementedError, match="optimize_memory_usage"):
+        make_model(
+            n_collect=0, horizon=5, optimize_memory_usage=True, replay_buffer_kwargs={"handle_timeout_termination": False}
+        )
