@@ -1,0 +1,122 @@
+import numpy as np
+from gymnasium import spaces
+
+from sb3_lac.envs.base import CostEnv
+
+
+class CartPoleCostEnv(CostEnv):
+    """
+    ## Description
+
+    A pole stands on a cart, which is to be kept at the origin with the pole upright: the stabilisation task of Han et al.
+    (2020), with the dynamics of Barto, Sutton and Anderson (1983), integrated by Euler steps of 0.02 s.
+
+    ## Action Space
+
+    One number in [-1, 1]: the horizontal force on the cart, in units of `force_max_N`.
+
+    ## Observation Space
+
+    | index | variable | range | unit |
+    | --- | --- | --- | --- |
+    | 0 | position of the cart x | -20 .. 20 | m |
+    | 1 | velocity of the cart | -1000 .. 1000 | m/s |
+    | 2 | angle of the pole theta | -1 .. 1 | rad |
+    | 3 | angular velocity of the pole | -1000 .. 1000 | rad/s |
+
+    ## Cost
+
+    `(x / 10)^2 + 20 * (theta / 0.349)^2` of the next state, and 100 for a transition that ends the episode. The reward is
+    minus the cost.
+
+    ## Starting State
+
+    x is uniform in -5 .. 5, the other variables in -0.2 .. 0.2.
+
+    ## Episode End
+
+    Termination: |x| > 10 m or |theta| > 0.349 rad (20 degrees). Truncation: 250 steps.
+
+    ## Arguments
+
+    | argument | default | meaning |
+    | --- | --- | --- |
+    | `cart_mass_kg` | 1.0 | mass of the cart |
+    | `pole_mass_kg` | 0.1 | mass of the pole |
+    | `pole_half_length_m` | 0.5 | half the length of the pole |
+    | `force_max_N` | 20.0 | force of action 1 |
+    | `impulse_N` | 0.0 | disturbance: a force on the cart for one step, in a random direction |
+    | `impulse_interval` | 50 | steps from one impulse to the next |
+
+    ## Version History
+
+    * v0: first version
+    """
+
+    state_names = ("x (m)", "dx/dt (m/s)", "theta (rad)", "dtheta/dt (rad/s)")
+
+    GRAVITY_M_S2 = 10.0
+    DT_S = 0.02
+    X_MAX_M = 10.0
+    THETA_MAX_RAD = 0.349
+    TERMINAL_COST = 100.0
+
+    def __init__(
+        self,
+        cart_mass_kg: float = 1.0,
+        pole_mass_kg: float = 0.1,
+        pole_half_length_m: float = 0.5,
+        force_max_N: float = 20.0,
+        impulse_N: float = 0.0,
+        impulse_interval: int = 50,
+        render_mode: str | None = None,
+    ) -> None:
+        positive = {
+            "cart_mass_kg": cart_mass_kg,
+            "pole_mass_kg": pole_mass_kg,
+            "pole_half_length_m": pole_half_length_m,
+            "force_max_N": force_max_N,
+            "impulse_interval": impulse_interval,
+        }
+        for name, value in positive.items():
+            if not 0 < value < np.inf:
+                raise ValueError(f"{name}={value} must be positive and finite.")
+        if not 0 <= impulse_N < np.inf:
+            raise ValueError(f"impulse_N={impulse_N} must be finite and at least 0; its direction is random.")
+        state_high = np.array([2 * self.X_MAX_M, 1000.0, 1.0, 1000.0])
+        observation_space = spaces.Box(-state_high.astype(np.float32), state_high.astype(np.float32))
+        super().__init__(-state_high, state_high, observation_space, n_actions=1, render_mode=render_mode)
+        self.cart_mass_kg = cart_mass_kg
+        self.pole_mass_kg = pole_mass_kg
+        self.pole_half_length_m = pole_half_length_m
+        self.force_max_N = force_max_N
+        self.impulse_N = impulse_N
+        self.impulse_interval = impulse_interval
+
+    def _initial_state(self) -> np.ndarray:
+        return self.np_random.uniform(-1.0, 1.0, 4) * (5.0, 0.2, 0.2, 0.2)
+
+    def _transition(self, state: np.ndarray, action: np.ndarray) -> tuple[np.ndarray, float, bool]:
+        force = self.force_max_N * float(action[0])
+        if self.impulse_N > 0 and (self.n_steps + 1) % self.impulse_interval == 0:
+            force += self.impulse_N * (1.0 if self.np_random.random() < 0.5 else -1.0)
+        x, x_dot, theta, theta_dot = state.tolist()
+        sine, cosine = float(np.sin(theta)), float(np.cos(theta))
+        mass, half_length = self.cart_mass_kg + self.pole_mass_kg, self.pole_half_length_m
+        push = (force + self.pole_mass_kg * half_length * theta_dot**2 * sine) / mass
+        theta_acceleration = (self.GRAVITY_M_S2 * sine - cosine * push) / (
+            half_length * (4.0 / 3.0 - self.pole_mass_kg * cosine**2 / mass)
+        )
+        x_acceleration = push - self.pole_mass_kg * half_length * theta_acceleration * cosine / mass
+        next_state = np.array(
+            [
+                x + self.DT_S * x_dot,
+                x_dot + self.DT_S * x_acceleration,
+                theta + self.DT_S * theta_dot,
+                theta_dot + self.DT_S * theta_acceleration,
+            ]
+        )
+        if abs(next_state[0]) > self.X_MAX_M or abs(next_state[2]) > self.THETA_MAX_RAD:
+            return next_state, self.TERMINAL_COST, True
+        cost = (next_state[0] / self.X_MAX_M) ** 2 + 20.0 * (next_state[2] / self.THETA_MAX_RAD) ** 2
+        return next_state, float(cost), False

@@ -1,0 +1,147 @@
+import numpy as np
+from gymnasium import spaces
+from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
+
+from sb3_lac.envs.base import CostEnv
+
+
+class LinearCostEnv(CostEnv):
+    """
+    ## Description
+
+    A lightly damped oscillator that a force brings to rest, with a little noise: the linear-quadratic regulator.
+    Everything that LAC learns can be computed exactly here: the best policy (`optimal_gain`), the value L of a linear policy
+    (`cost_to_go`), and the largest alpha3 that the decrease condition allows (`largest_feasible_alpha3`).
+
+        s' = A s + B u + w,    A = [[0.96, 0.2], [-0.2, 0.96]],  B = [[0], [0.5]],  w ~ N(0, noise_std^2 I)
+
+    ## Action Space
+
+    One number in [-1, 1]: the control u in units of `control_max`.
+
+    ## Observation Space
+
+    | index | variable | range |
+    | --- | --- | --- |
+    | 0 | position | -100 .. 100 |
+    | 1 | velocity | -100 .. 100 |
+
+    ## Cost
+
+    `s^T Q s + u^T R u` of the current state and control, with Q = I and R = 1. The reward is minus the cost.
+
+    ## Starting State
+
+    Both variables are uniform in -1 .. 1.
+
+    ## Episode End
+
+    No termination. Truncation: 100 steps.
+
+    ## Arguments
+
+    | argument | default | meaning |
+    | --- | --- | --- |
+    | `noise_std` | 0.01 | standard deviation of the noise on each state |
+    | `control_max` | 2.0 | control of action 1 |
+
+    ## Version History
+
+    * v0: first version
+    """
+
+    state_names = ("position", "velocity")
+
+    A = np.array([[0.96, 0.2], [-0.2, 0.96]])
+    B = np.array([[0.0], [0.5]])
+    Q = np.eye(2)
+    R = np.eye(1)
+    STATE_MAX = 100.0
+
+    def __init__(self, noise_std: float = 0.01, control_max: float = 2.0, render_mode: str | None = None) -> None:
+        if not 0 <= noise_std < np.inf:
+            raise ValueError(f"noise_std={noise_std} must be finite and at least 0.")
+        if not 0 < control_max < np.inf:
+            raise ValueError(f"control_max={control_max} must be positive and finite.")
+        observation_space = spaces.Box(-self.STATE_MAX, self.STATE_MAX, (2,), np.float32)
+        super().__init__(
+            np.full(2, -self.STATE_MAX), np.full(2, self.STATE_MAX), observation_space, n_actions=1, render_mode=render_mode
+        )
+        self.noise_std = noise_std
+        self.control_max = control_max
+
+    def _initial_state(self) -> np.ndarray:
+        return self.np_random.uniform(-1.0, 1.0, 2)
+
+    def _transition(self, state: np.ndarray, action: np.ndarray) -> tuple[np.ndarray, float, bool]:
+        control = self.control_max * action
+        cost = float(state @ self.Q @ state + control @ self.R @ control)
+        next_state = self.A @ state + self.B @ control + self.noise_std * self.np_random.standard_normal(2)
+        return next_state, cost, False
+
+    def optimal_gain(self, gamma: float = 1.0) -> np.ndarray:
+        """
+        Gain of the policy ``u = -K s`` that minimises the discounted sum of costs (discrete algebraic Riccati equation).
+
+        :param gamma: The discount factor
+        :return: K, shape (1, 2)
+        """
+        a, b = np.sqrt(gamma) * self.A, np.sqrt(gamma) * self.B
+        p = solve_discrete_are(a, b, self.Q, self.R)
+        return np.linalg.solve(self.R + b.T @ p @ b, b.T @ p @ a)
+
+    def value_matrix(self, gain: np.ndarray, gamma: float) -> np.ndarray:
+        """
+        Matrix P of the discounted cost to go ``s^T P s + const`` of a linear policy (discrete Lyapunov equation).
+
+        :param gain: K of the policy ``u = -K s``, shape (1, 2)
+        :param gamma: The discount factor
+        :return: P, shape (2, 2)
+        :raises ValueError: If the discounted sum of costs is infinite with this policy
+        """
+        closed_loop = np.sqrt(gamma) * (self.A - self.B @ gain)
+        radius = np.abs(np.linalg.eigvals(closed_loop)).max()
+        if not radius < 1:
+            raise ValueError(
+                f"gain={np.asarray(gain).tolist()} makes the discounted sum of costs infinite: the spectral radius of "
+                f"sqrt(gamma) (A - B K) is {radius:.4g} and must be below 1."
+            )
+        return solve_discrete_lyapunov(closed_loop.T, self.Q + gain.T @ self.R @ gain)
+
+    def cost_to_go(self, states: np.ndarray, controls: np.ndarray, gain: np.ndarray, gamma: float) -> np.ndarray:
+        """
+        The exact ``L(s, a)``: discounted sum of costs of a control now and of the linear policy from the next step on.
+
+        :param states: Shape (n, 2)
+        :param controls: u, not scaled, shape (n, 1)
+        :param gain: K of the policy ``u = -K s``, shape (1, 2)
+        :param gamma: The discount factor, below 1
+        :return: Shape (n,)
+        """
+        p = self.value_matrix(gain, gamma)
+        # The noise of each step adds its variance times the curvature of the value
+        noise = gamma / (1 - gamma) * self.noise_std**2 * np.trace(p)
+        next_states = states @ self.A.T + controls @ self.B.T
+        now = np.einsum("ni,ij,nj->n", states, self.Q, states) + np.einsum("ni,ij,nj->n", controls, self.R, controls)
+        return now + gamma * np.einsum("ni,ij,nj->n", next_states, p, next_states) + noise
+
+    def largest_feasible_alpha3(self, gain: np.ndarray, gamma: float, n_steps: int = 100) -> float:
+        """
+        The largest ``alpha3`` with which ``E[L(s', a')] - L(s, a) <= -alpha3 * c`` holds on average over roll-outs of a linear
+        policy from the starting states. The differences telescope: what counts is ``L`` at the start and at the end, and the
+        sum of the costs between.
+
+        :param gain: K of the policy ``u = -K s``, shape (1, 2)
+        :param gamma: The discount factor of ``L``
+        :param n_steps: Length of the roll-outs
+        :return: ``sum E[L - L'] / sum E[c]``
+        """
+        p = self.value_matrix(gain, gamma)
+        closed_loop = self.A - self.B @ gain
+        stage = self.Q + gain.T @ self.R @ gain
+        start = np.eye(2) / 3.0  # second moments of the uniform distribution on -1 .. 1
+        moments, costs = start, 0.0
+        for _ in range(n_steps):
+            costs += float(np.trace(stage @ moments))
+            moments = closed_loop @ moments @ closed_loop.T + self.noise_std**2 * np.eye(2)
+        return float(np.trace(p @ (start - moments)) / costs)

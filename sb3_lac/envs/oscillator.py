@@ -1,0 +1,127 @@
+import numpy as np
+from gymnasium import spaces
+
+from sb3_lac.envs.base import CostEnv
+
+
+class OscillatorEnv(CostEnv):
+    """
+    ## Description
+
+    A synthetic gene network, the repressilator: three messengers m and their proteins p, each of which represses the next
+    messenger. The first protein has to follow a sine by light that drives the messengers: the tracking task of Han et al.
+    (2020), after Elowitz and Leibler (2000).
+
+    With j = 3, 1, 2 for i = 1, 2, 3 and steps of dt = 1:
+
+        m_i' = transcription / (half_saturation + p_j^2) - messenger_decay * m_i + light * u_i
+        p_i' = translation * m_i - protein_decay * p_i
+
+    ## Action Space
+
+    Three numbers in [-1, 1], mapped to light u in [0, 1].
+
+    ## Observation Space
+
+    | index | variable | range |
+    | --- | --- | --- |
+    | 0 - 2 | messengers m_1, m_2, m_3 | 0 .. 1000 |
+    | 3 - 5 | proteins p_1, p_2, p_3 | 0 .. 1000 |
+    | 6 | reference now, r(t) | 0 .. 1000 |
+    | 7 | reference of the next step, r(t+1) | 0 .. 1000 |
+
+    The reference is `r(t) = 8 + 7 sin(2 pi t / 200)`; its two values tell the phase, so that the observation is Markov.
+
+    ## Cost
+
+    `(p_1 - r)^2` of the next state, with the reference of that step. The reward is minus the cost.
+
+    ## Starting State
+
+    Messengers and proteins are uniform in 0 .. 5, and the reference starts at t = 0.
+
+    ## Episode End
+
+    No termination. Truncation: 400 steps, two periods.
+
+    ## Arguments
+
+    | argument | default | meaning |
+    | --- | --- | --- |
+    | `transcription` | 1.6 | largest rate of transcription |
+    | `half_saturation` | 1.0 | repression: squared protein at half the rate |
+    | `messenger_decay` | 0.16 | rate at which messengers decay |
+    | `light` | 5.0 | effect of full light |
+    | `translation` | 0.16 | rate at which messengers make proteins |
+    | `protein_decay` | 0.06 | rate at which proteins decay |
+    | `process_noise` | 0.0 | standard deviation of Gaussian noise that is added to each state in each step |
+
+    ## Version History
+
+    * v0: first version
+    """
+
+    state_names = ("m1", "m2", "m3", "p1", "p2", "p3")
+
+    PERIOD_STEPS = 200
+    STATE_MAX = 1000.0
+
+    def __init__(
+        self,
+        transcription: float = 1.6,
+        half_saturation: float = 1.0,
+        messenger_decay: float = 0.16,
+        light: float = 5.0,
+        translation: float = 0.16,
+        protein_decay: float = 0.06,
+        process_noise: float = 0.0,
+        render_mode: str | None = None,
+    ) -> None:
+        positive = {
+            "transcription": transcription,
+            "half_saturation": half_saturation,
+            "messenger_decay": messenger_decay,
+            "light": light,
+            "translation": translation,
+            "protein_decay": protein_decay,
+        }
+        for name, value in positive.items():
+            if not 0 < value < np.inf:
+                raise ValueError(f"{name}={value} must be positive and finite.")
+        if not 0 <= process_noise < np.inf:
+            raise ValueError(f"process_noise={process_noise} must be finite and at least 0.")
+        observation_space = spaces.Box(0.0, self.STATE_MAX, (8,), np.float32)
+        super().__init__(np.zeros(6), np.full(6, self.STATE_MAX), observation_space, n_actions=3, render_mode=render_mode)
+        self.transcription = transcription
+        self.half_saturation = half_saturation
+        self.messenger_decay = messenger_decay
+        self.light = light
+        self.translation = translation
+        self.protein_decay = protein_decay
+        self.process_noise = process_noise
+
+    def reference(self, step: int) -> float:
+        """
+        :param step: Steps since the start
+        :return: What the first protein should be
+        """
+        return 8.0 + 7.0 * float(np.sin(2.0 * np.pi * step / self.PERIOD_STEPS))
+
+    def _initial_state(self) -> np.ndarray:
+        return self.np_random.uniform(0.0, 5.0, 6)
+
+    def _observation(self) -> np.ndarray:
+        assert self.state is not None
+        return np.array([*self.state, self.reference(self.n_steps), self.reference(self.n_steps + 1)], dtype=np.float32)
+
+    def _transition(self, state: np.ndarray, action: np.ndarray) -> tuple[np.ndarray, float, bool]:
+        messengers, proteins = state[:3], state[3:]
+        repression = self.transcription / (self.half_saturation + np.roll(proteins, 1) ** 2)
+        messenger_rate = repression - self.messenger_decay * messengers + self.light * 0.5 * (action + 1.0)
+        protein_rate = self.translation * messengers - self.protein_decay * proteins
+        next_state = state + np.concatenate((messenger_rate, protein_rate))
+        if self.process_noise > 0:
+            next_state += self.process_noise * self.np_random.standard_normal(6)
+        next_state = np.maximum(next_state, 0.0)
+        cost = (next_state[3] - self.reference(self.n_steps + 1)) ** 2
+        return next_state, float(cost), False
