@@ -1,8 +1,10 @@
 from pathlib import Path
 
-from sb3_lac.callbacks import CalibrationCallback
+import sb3_lac.envs  # noqa: F401  (registers the ids of the cost environments)
+from sb3_lac.callbacks import CalibrationCallback, LyapunovCallback
 from sb3_lac.lac import LAC
 from sb3_lac.policies import CnnPolicy, LyapunovPolicy, MlpPolicy, MultiInputPolicy
+from sb3_lac.stability import LyapunovReport, evaluate_lyapunov
 
 # Gymnasium does not import third-party environments by itself:
 # importing battery_env here makes ``LAC("MlpPolicy", "BatteryQmax-v0")`` work when it is installed
@@ -15,4 +17,15 @@ except ModuleNotFoundError as error:
 
 __version__ = Path(__file__).with_name("version.txt").read_text(encoding="utf-8").strip()
 
-__all__ = ["LAC", "CalibrationCallback", "CnnPolicy", "LyapunovPolicy", "MlpPolicy", "MultiInputPolicy", "__version__"]
+__all__ = [
+    "LAC",
+    "CalibrationCallback",
+    "CnnPolicy",
+    "LyapunovCallback",
+    "LyapunovPolicy",
+    "LyapunovReport",
+    "MlpPolicy",
+    "MultiInputPolicy",
+    "__version__",
+    "evaluate_lyapunov",
+]

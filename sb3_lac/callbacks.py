@@ -1,12 +1,51 @@
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
+import gymnasium as gym
 import numpy as np
 import pandas as pd
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, EventCallback
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, sync_envs_normalization
+
+from sb3_lac.lac import LAC
+from sb3_lac.stability import LyapunovReport, evaluate_lyapunov, prepare_evaluation
+
+
+def _read_history(log_path: Path) -> list[dict[str, float]]:
+    """
+    Read the evaluations of a training that is continued, and create the folder for those to come.
+
+    :param log_path: Path of a CSV file
+    :return: One entry per evaluation
+    """
+    log_path.parent.mkdir(parents=True, exist_ok=True)
+    if not log_path.exists():
+        return []
+    records = pd.read_csv(log_path).to_dict("records")
+    return [{str(name): value for name, value in record.items()} for record in records]
+
+
+def _add_to_history(history: list[dict[str, float]], entry: dict[str, float], log_path: Path | None) -> list[dict[str, float]]:
+    """
+    Add an evaluation, in place of an older one after as many timesteps (when continuing from a checkpoint).
+
+    :param history: One entry per evaluation
+    :param entry: Timesteps and values of the evaluation
+    :param log_path: Path of a CSV file to save them in, if any
+    :return: All entries, sorted by timesteps
+    """
+    by_timesteps = {int(old["timesteps"]): old for old in history}
+    by_timesteps[int(entry["timesteps"])] = entry
+    history = [by_timesteps[timesteps] for timesteps in sorted(by_timesteps)]
+    if log_path is not None:
+        # Renaming is atomic: an interrupted training never leaves half a file
+        temporary_path = log_path.with_name(f"{log_path.name}.tmp")
+        pd.DataFrame(history).to_csv(temporary_path, index=False)
+        os.replace(temporary_path, log_path)
+    return history
 
 
 class CalibrationCallback(EventCallback):
@@ -70,12 +109,8 @@ class CalibrationCallback(EventCallback):
         if self.best_model_save_path is not None:
             self.best_model_save_path.mkdir(parents=True, exist_ok=True)
         if self.log_path is not None:
-            self.log_path.parent.mkdir(parents=True, exist_ok=True)
-            if self.log_path.exists():
-                # Continued training
-                records = pd.read_csv(self.log_path).to_dict("records")
-                self.history = [{str(name): value for name, value in record.items()} for record in records]
-                self.best_objective = min((entry.get(self.objective, np.inf) for entry in self.history), default=np.inf)
+            self.history = _read_history(self.log_path)
+            self.best_objective = min((entry.get(self.objective, np.inf) for entry in self.history), default=np.inf)
 
         # Init callback called on new best model
         if self.callback_on_new_best is not None:
@@ -93,7 +128,7 @@ class CalibrationCallback(EventCallback):
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(self.num_timesteps)
 
-        self._add_to_history({"timesteps": self.num_timesteps, **entry})
+        self.history = _add_to_history(self.history, {"timesteps": self.num_timesteps, **entry}, self.log_path)
 
         objective = entry[self.objective]
         if self.verbose >= 1:
@@ -130,21 +165,6 @@ class CalibrationCallback(EventCallback):
             summary[f"{name}_worst"] = float(trajectories[column].max(skipna=False))
         return summary
 
-    def _add_to_history(self, entry: dict[str, float]) -> None:
-        """
-        Add an evaluation, in place of an older one after as many timesteps (when continuing from a checkpoint).
-
-        :param entry: Timesteps and values of the evaluation
-        """
-        by_timesteps = {int(old["timesteps"]): old for old in self.history}
-        by_timesteps[int(entry["timesteps"])] = entry
-        self.history = [by_timesteps[timesteps] for timesteps in sorted(by_timesteps)]
-        if self.log_path is not None:
-            # Renaming is atomic: an interrupted training never leaves half a file
-            temporary_path = self.log_path.with_name(f"{self.log_path.name}.tmp")
-            pd.DataFrame(self.history).to_csv(temporary_path, index=False)
-            os.replace(temporary_path, self.log_path)
-
     def update_child_locals(self, locals_: dict[str, Any]) -> None:
         """
         Update the references to the local variables.
@@ -154,3 +174,99 @@ class CalibrationCallback(EventCallback):
         super().update_child_locals(locals_)
         if self.callback_on_new_best is not None:
             self.callback_on_new_best.update_locals(locals_)
+
+
+class LyapunovCallback(EventCallback):
+    """
+    Callback for evaluating the learned Lyapunov function along roll-outs of the policy (see ``evaluate_lyapunov()``).
+    The training is not changed by it.
+
+    .. warning::
+
+      When using multiple environments, each call to  ``env.step()``
+      will effectively correspond to ``n_envs`` steps.
+      To account for that, you can use ``eval_freq = max(eval_freq // n_envs, 1)``
+
+    :param eval_env: The environment used for evaluation, wrapped with ``VecNormalize`` if the training environment is:
+        its statistics are synchronized before each evaluation.
+    :param callback_after_eval: Callback to trigger after every evaluation, which finds the report in
+        ``self.parent.last_report``
+    :param n_eval_episodes: The number of episodes to test the agent
+    :param eval_freq: Evaluate the agent every ``eval_freq`` call of the callback.
+    :param deterministic: Whether the evaluation should use stochastic or deterministic actions
+    :param seed: Seed of each evaluation, so that all of them have the same start states
+    :param log_path: Path of a CSV file with the metrics and their confidence intervals, updated at each evaluation.
+        If it exists already, its evaluations are kept, so that the history of a continued training is complete.
+    :param verbose: Verbosity level: 0 for no output, 1 for the summary of each evaluation
+    """
+
+    #: Metrics that are logged, with their names in the log
+    METRICS: ClassVar[dict[str, str]] = {
+        "decrease": "decrease",
+        "share_decreasing": "share_decreasing",
+        "largest_feasible_alpha3": "feasible_alpha3",
+        "mean_cost": "mean_cost",
+        "calibration_slope": "calibration_slope",
+        "rank_correlation": "rank_correlation",
+        "ultimate_bound": "ultimate_bound",
+        "death_rate": "death_rate",
+    }
+    model: LAC
+
+    def __init__(
+        self,
+        eval_env: gym.Env | VecEnv,
+        callback_after_eval: BaseCallback | None = None,
+        n_eval_episodes: int = 20,
+        eval_freq: int = 10_000,
+        deterministic: bool = False,
+        seed: int | None = None,
+        log_path: str | os.PathLike[str] | None = None,
+        verbose: int = 1,
+    ):
+        super().__init__(callback_after_eval, verbose=verbose)
+        # Convert to VecEnv for consistency
+        if not isinstance(eval_env, VecEnv):
+            eval_env = DummyVecEnv([lambda: eval_env])  # type: ignore[list-item, return-value]
+        self.eval_env = eval_env
+        self.n_eval_episodes = n_eval_episodes
+        self.eval_freq = eval_freq
+        self.deterministic = deterministic
+        self.seed = seed
+        self.log_path = None if log_path is None else Path(log_path)
+        # One entry per evaluation, sorted by timesteps
+        self.history: list[dict[str, float]] = []
+        self.last_report: LyapunovReport | None = None
+
+    def _init_callback(self) -> None:
+        # A mistake is seen before the training, and not at its first evaluation
+        self.eval_env = prepare_evaluation(self.model, self.eval_env, self.n_eval_episodes)
+        if self.log_path is not None:
+            self.history = _read_history(self.log_path)
+
+    def _on_step(self) -> bool:
+        if self.eval_freq <= 0 or self.n_calls % self.eval_freq != 0:
+            return True
+
+        # Sync training and eval env if there is VecNormalize
+        if self.model.get_vec_normalize_env() is not None:
+            sync_envs_normalization(self.training_env, self.eval_env)
+
+        self.last_report = evaluate_lyapunov(
+            self.model, self.eval_env, self.n_eval_episodes, deterministic=self.deterministic, seed=self.seed
+        )
+        entry: dict[str, float] = {"timesteps": self.num_timesteps}
+        for metric, name in self.METRICS.items():
+            estimate = self.last_report.metrics[metric]
+            self.logger.record(f"lyapunov/{name}", estimate.value)
+            entry.update({name: estimate.value, f"{name}_low": estimate.low, f"{name}_high": estimate.high})
+        # Dump log so the evaluation results are printed with the correct timestep
+        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+        self.logger.dump(self.num_timesteps)
+
+        self.history = _add_to_history(self.history, entry, self.log_path)
+        if self.verbose >= 1:
+            print(f"Eval num_timesteps={self.num_timesteps}, {self.last_report.summary()}")
+
+        # Trigger callback after every evaluation, if needed
+        return self._on_event()

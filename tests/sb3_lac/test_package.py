@@ -24,10 +24,13 @@ def test_exports():
         "LAC",
         "CalibrationCallback",
         "CnnPolicy",
+        "LyapunovCallback",
         "LyapunovPolicy",
+        "LyapunovReport",
         "MlpPolicy",
         "MultiInputPolicy",
         "__version__",
+        "evaluate_lyapunov",
     }
     assert all(hasattr(sb3_lac, name) for name in sb3_lac.__all__)
 

@@ -1,0 +1,671 @@
+"""The statistics of the learned Lyapunov function are right, known cases are recognized, and nothing is changed by them."""
+
+import itertools
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+import pytest
+import torch as th
+from gymnasium import spaces
+from matplotlib.figure import Figure
+from scipy.stats import spearmanr
+from stable_baselines3 import SAC
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.envs import FakeImageEnv, SimpleMultiObsEnv
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize, VecTransposeImage, sync_envs_normalization
+from torch import nn
+
+from sb3_lac import LAC, LyapunovCallback, evaluate_lyapunov
+from sb3_lac import stability as module
+from sb3_lac.stability import Bootstrap, ratio
+
+RHO = 0.5
+
+
+class ContractionEnv(gym.Env):
+    """
+    ``s' = rho * s`` with the cost ``|s|^2``, whatever the action.
+
+    :param starts: Start states of the episodes, repeated
+    :param lengths: Lengths of the episodes, repeated
+    :param deaths: Whether the episodes terminate at their end, repeated
+    :param rho: Contraction per step
+    """
+
+    def __init__(self, starts=((1.0, 0.5),), lengths=(40,), deaths=(False,), rho=RHO):
+        self.observation_space = spaces.Box(-10, 10, (len(starts[0]),), np.float32)
+        self.action_space = spaces.Box(-1, 1, (1,), np.float32)
+        self.plan = zip(*(itertools.cycle(values) for values in (starts, lengths, deaths)), strict=False)
+        self.rho = rho
+
+    def reset(self, seed=None, options=None):
+        super().reset(seed=seed)
+        start, self.length, self.death = next(self.plan)
+        self.state, self.n_steps = np.array(start, dtype=np.float32), 0
+        return self.state, {}
+
+    def step(self, action):
+        cost = float(np.sum(self.state**2))
+        self.state = (self.rho * self.state).astype(np.float32)
+        self.n_steps += 1
+        end = self.n_steps >= self.length
+        return self.state, -cost, end and self.death, end and not self.death, {}
+
+
+@pytest.fixture
+def make_exact_model(make_model, monkeypatch):
+    def _make_exact_model(gamma=0.5, alpha3=0.5, rho=RHO, factor=1.0, **kwargs):
+        """A model with ``L = factor * |s|^2 / (1 - gamma * rho^2)``: the exact one of ``ContractionEnv``, with factor 1."""
+        model = make_model(ContractionEnv(**kwargs), n_collect=0, gamma=gamma, alpha3=alpha3)
+
+        def predict_lyapunov(observation, action):
+            assert len(observation) == len(action)
+            return factor * np.sum(np.asarray(observation, dtype=np.float64) ** 2, axis=1) / (1 - gamma * rho**2)
+
+        monkeypatch.setattr(model.policy, "predict_lyapunov", predict_lyapunov)
+        return model
+
+    return _make_exact_model
+
+
+def without_order(frame):
+    """Transitions whatever the numbers of the episodes."""
+    return frame.drop(columns="episode").sort_values(["step", "cost"]).reset_index(drop=True)
+
+
+# Values of L
+
+
+def test_value_is_the_largest_of_the_critics_for_actions_in_units_of_the_space(make_model, make_env):
+    env = make_env(n_dim=3)
+    env.action_space = spaces.Box(np.array([-1, 0, 2], np.float32), np.array([3, 1, 4], np.float32))
+    policy = make_model(env, n_collect=0, policy_kwargs={"n_critics": 2}).policy
+    observations = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
+    actions = np.array([[3, 0.5, 2]] * 50, np.float32)
+    values = policy.predict_lyapunov(observations, actions)
+    scaled = th.tensor([[1.0, 0.0, -1.0]] * 50)
+    first, second = (value.detach().numpy()[:, 0] for value in policy.critic(th.as_tensor(observations), scaled))
+    assert (first > second).any() and (second > first).any()
+    np.testing.assert_array_equal(values, np.maximum(first, second))
+    # A single one
+    np.testing.assert_allclose(policy.predict_lyapunov(observations[7], actions[7]), values[7:8], rtol=1e-6)
+
+
+def test_values_are_computed_in_eval_mode(make_model):
+    class Dropout(BaseFeaturesExtractor):
+        def __init__(self, observation_space):
+            super().__init__(observation_space, features_dim=observation_space.shape[0])
+            self.dropout = nn.Dropout(0.5)
+
+        def forward(self, observations):
+            return self.dropout(observations)
+
+    policy = make_model(n_collect=0, policy_kwargs={"features_extractor_class": Dropout}).policy
+    policy.set_training_mode(True)
+    values = policy.predict_lyapunov(np.ones((100, 2), np.float32), np.zeros((100, 2), np.float32))
+    assert values.shape == (100,) and np.ptp(values) < 1e-5
+
+
+def test_values_need_one_action_of_the_right_shape_per_observation(make_model):
+    policy = make_model(n_collect=0).policy
+    with pytest.raises(ValueError, match=r"actions of shape \(4, 1\) must have the shape \(2,\)"):
+        policy.predict_lyapunov(np.zeros((4, 2)), np.zeros((4, 1)))
+    with pytest.raises(ValueError, match="3 observations and 4 actions"):
+        policy.predict_lyapunov(np.zeros((3, 2), np.float32), np.zeros((4, 2)))
+
+
+# Known cases
+
+
+@pytest.mark.parametrize(("gamma", "alpha3"), [(0.5, 0.5), (0.8, 0.9), (0.8, 0.95)])
+def test_exact_lyapunov_function_is_recognized(make_exact_model, gamma, alpha3):
+    # No two states of different episodes have the same cost
+    starts = ((1.0, 0.5), (2.0, -1.5), (0.25, 0.0))
+    model = make_exact_model(gamma, alpha3, starts=starts, lengths=(50,))
+    report = evaluate_lyapunov(model, ContractionEnv(starts, (50,)), 3, max_tail_weight=1e-4)
+    values = {name: estimate.value for name, estimate in report.metrics.items()}
+    feasible = (1 - RHO**2) / (1 - gamma * RHO**2)
+    # |s|^2 of the starts, and the sum over an episode
+    squares, series = np.array([1.25, 6.25, 0.0625]), 1 / (1 - RHO**2)
+    assert values == pytest.approx(
+        {
+            "decrease": (alpha3 - feasible) * squares.sum() * series / 150,
+            "share_decreasing": float(alpha3 <= feasible),
+            "largest_feasible_alpha3": feasible,
+            "mean_cost": squares.sum() * series / 150,
+            "calibration_slope": 1.0,
+            "calibration_intercept": 0.0,
+            "rank_correlation": 1.0,
+            "ultimate_bound": 0.0,
+            "death_rate": 0.0,
+        },
+        rel=1e-9,
+        abs=1e-12,
+    )
+    # The intervals of what is the same in each episode have no width, the mean cost differs
+    assert report.metrics["largest_feasible_alpha3"].low == pytest.approx(feasible, rel=1e-9)
+    assert (
+        report.metrics["mean_cost"].low
+        < 0.8 * values["mean_cost"]
+        < 1.2 * values["mean_cost"]
+        < report.metrics["mean_cost"].high
+    )
+    verdict = "holds on average" if alpha3 <= feasible else "is violated on average"
+    assert f"With alpha3={alpha3:g} the decrease condition {verdict}" in report.summary()
+    assert "no proof" in report.summary()
+
+
+def test_scale_of_lyapunov_function_shows_in_calibration_only(make_exact_model):
+    model = make_exact_model(factor=4.0)
+    report = evaluate_lyapunov(model, ContractionEnv(((1.0, 0.5), (2.0, 0.0))), 4, max_tail_weight=1e-6, alpha3=4.0)
+    assert report.metrics["calibration_slope"].value == pytest.approx(0.25)
+    assert report.metrics["rank_correlation"].value == pytest.approx(1.0)
+    assert report.metrics["largest_feasible_alpha3"].value == pytest.approx(4 * 0.75 / 0.875)
+    # The argument counts, and not the alpha3 of the model
+    assert report.alpha3 == 4.0 and report.metrics["share_decreasing"].value == 0.0
+
+
+def test_increasing_function_is_no_lyapunov_function(make_exact_model):
+    # An expansion, whose L grows with the costs
+    arguments = {"starts": ((0.1, 0.0), (0.2, 0.1)), "lengths": (10,), "rho": 1.2}
+    report = evaluate_lyapunov(make_exact_model(**arguments), ContractionEnv(**arguments), 4)
+    assert report.metrics["largest_feasible_alpha3"].value == pytest.approx(-0.44 / (1 - 0.5 * 1.44), rel=1e-5)
+    assert report.metrics["share_decreasing"].value == 0
+    assert report.metrics["decrease"].low > 0
+    assert "is violated on average" in report.summary()
+
+
+def test_ends_of_episodes(make_exact_model):
+    # Dies after two steps, and survives three
+    arguments = {"starts": ((1.0,),), "lengths": (2, 3), "deaths": (True, False)}
+    report = evaluate_lyapunov(make_exact_model(gamma=0.5, alpha3=1.0, **arguments), ContractionEnv(**arguments), 2)
+    scale = 1 / 0.875
+    frame = report.transitions
+    assert frame["episode"].tolist() == [0, 0, 1, 1, 1] and frame["step"].tolist() == [0, 1, 0, 1, 2]
+    assert frame["terminated"].tolist() == [False, True, False, False, False]
+    np.testing.assert_allclose(frame["cost"], [1, 1 / 4, 1, 1 / 4, 1 / 16])
+    np.testing.assert_allclose(frame["reward"], -frame["cost"])
+    np.testing.assert_allclose(frame["lyapunov"], scale * frame["cost"])
+    # No L in the terminal state, but after the time limit
+    np.testing.assert_allclose(frame["next_lyapunov"], scale * np.array([1 / 4, np.nan, 1 / 4, 1 / 16, 1 / 64]))
+    np.testing.assert_allclose(frame["difference"], frame["next_lyapunov"] - frame["lyapunov"] + frame["cost"])
+    # All is paid at a termination, while half of the weight of the costs to come and more is unseen after a time limit
+    np.testing.assert_allclose(frame["cost_to_go"], [1 + 1 / 8, 1 / 4, np.nan, np.nan, np.nan])
+    np.testing.assert_array_equal(report.observations, [[1], [0.5], [1], [0.5], [0.25]])
+
+    assert report.episodes["length"].tolist() == [2, 3] and report.episodes["terminated"].tolist() == [True, False]
+    np.testing.assert_allclose(report.episodes["total_cost"], [5 / 4, 21 / 16])
+    np.testing.assert_allclose(report.episodes["final_cost"], [1 / 4, 1 / 16])
+    assert report.metrics["decrease"].value == pytest.approx(frame["difference"].sum() / 4)
+    assert report.metrics["mean_cost"].value == pytest.approx(frame["cost"].sum() / 5)
+    # The survivor's last fifth is its last step; one episode has no spread
+    assert report.metrics["ultimate_bound"].value == 1 / 16 and np.isnan(report.metrics["ultimate_bound"].low)
+    # Wilson's interval of one death in two episodes
+    assert report.metrics["death_rate"] == pytest.approx((0.5, 0.0945, 0.9055), abs=1e-4)
+    assert report.by_cost["n_transitions"].sum() == 4
+
+
+@pytest.mark.parametrize(("max_tail_weight", "n_used"), [(0.5, 10), (0.25, 9), (0.1, 7), (1e-3, 1), (1e-4, 0)])
+def test_transitions_are_compared_if_their_tail_is_negligible(make_exact_model, max_tail_weight, n_used):
+    model = make_exact_model(gamma=0.5)
+    report = evaluate_lyapunov(model, ContractionEnv(lengths=(10,)), 3, max_tail_weight=max_tail_weight)
+    assert report.n_calibrated == 3 * n_used
+    known = report.transitions["cost_to_go"].notna().to_numpy().reshape(3, 10)
+    assert known[:, :n_used].all() and not known[:, n_used:].any()
+    np.testing.assert_allclose(report.transitions["cost_to_go"][known.ravel()].iloc[:1], 1.25 * (1 - 0.125**10) / 0.875)
+    # All episodes are the same, and one point has no slope
+    assert np.isnan(report.metrics["calibration_slope"].value) == (n_used <= 1)
+
+
+def test_nothing_to_compare_is_explained(make_exact_model):
+    model = make_exact_model(gamma=0.9)
+    summary = evaluate_lyapunov(model, ContractionEnv(lengths=(10,)), 3).summary()
+    assert "It takes 29 steps to forget them, the longest episode has 10 steps" in summary
+    assert "max_episode_steps" in summary and "larger max_tail_weight" in summary
+    assert evaluate_lyapunov(model, ContractionEnv(lengths=(28,)), 3).n_calibrated == 0
+    report = evaluate_lyapunov(model, ContractionEnv(lengths=(29,)), 3)
+    assert report.n_calibrated == 3 and "cost-to-go of 3 transitions" in report.summary()
+    model.horizon = 20
+    assert (
+        "20 steps of the horizon (the longest episode has 10 steps)"
+        in evaluate_lyapunov(model, ContractionEnv(lengths=(10,)), 3).summary()
+    )
+    model.horizon, model.gamma = None, 1.0
+    assert "with gamma=1" in evaluate_lyapunov(model, ContractionEnv(lengths=(10,)), 3).summary()
+    assert evaluate_lyapunov(model, ContractionEnv(lengths=(10,)), 3, max_tail_weight=1).n_calibrated == 30
+
+
+@pytest.mark.parametrize("gamma", [0.5, 1.0])
+def test_finite_horizon_sums_complete_windows(make_exact_model, gamma):
+    arguments = {"starts": ((1.0,),), "lengths": (5,), "deaths": (False, True)}
+    model = make_exact_model(**arguments)
+    model.gamma, model.horizon = gamma, 3
+    report = evaluate_lyapunov(model, ContractionEnv(**arguments), 2)
+    window = 1 + gamma / 4 + gamma**2 / 16
+    survived = np.array([window, window / 4, window / 16, np.nan, np.nan])
+    died = [window, window / 4, window / 16, (1 + gamma / 4) / 64, 1 / 256]
+    np.testing.assert_allclose(report.transitions["cost_to_go"], np.concatenate([survived, died]))
+    assert report.n_calibrated == 8 and "horizon of 3 steps" in report.summary()
+
+
+def test_ultimate_bound_is_a_high_percentile_of_the_survivors_late_costs(make_exact_model):
+    starts = [(float(start),) for start in range(1, 11)]
+    # The largest start dies, it does not count
+    arguments = {"starts": starts, "lengths": (20,), "deaths": (False,) * 9 + (True,)}
+    report = evaluate_lyapunov(make_exact_model(**arguments), ContractionEnv(**arguments), 10)
+    # The last four of 20 steps
+    late_costs = np.arange(1, 11) ** 2 * 0.25**16
+    np.testing.assert_allclose(report.episodes["largest_late_cost"], late_costs, rtol=1e-6)
+    value, low, high = report.metrics["ultimate_bound"]
+    assert value == pytest.approx(np.percentile(late_costs[:9], 95), rel=1e-6)
+    assert low < value <= high <= late_costs[8] * (1 + 1e-6)
+
+
+def test_all_dead(make_exact_model):
+    arguments = {"lengths": (1,), "deaths": (True,)}
+    report = evaluate_lyapunov(make_exact_model(**arguments), ContractionEnv(**arguments), 3)
+    for name in ("decrease", "share_decreasing", "largest_feasible_alpha3", "ultimate_bound"):
+        assert np.isnan(report.metrics[name]).all(), name
+    assert report.metrics["death_rate"].value == 1 and report.by_cost.empty
+    assert "is undecided" in report.summary()
+    assert len(report.plot().axes) == 4
+
+
+def test_rewards_above_the_bound_cost_nothing(make_model, make_env):
+    model = make_model(n_collect=0)
+    model.reward_bound.fill_(3.0)
+    report = evaluate_lyapunov(model, make_env(offset=5.0), 4)
+    rewards = report.transitions["reward"]
+    assert rewards.max() > 3
+    np.testing.assert_allclose(report.transitions["cost"], np.maximum(3.0 - rewards, 0.0))
+    # Without any cost there is no share of it
+    report = evaluate_lyapunov(model, make_env(offset=1000.0), 4)
+    assert np.isnan(report.metrics["largest_feasible_alpha3"]).all() and np.isnan(report.metrics["rank_correlation"]).all()
+    assert len(report.by_cost) == 1
+
+
+# Statistics
+
+
+def test_metrics_agree_with_scipy_and_numpy(make_model, make_env):
+    model = make_model(gamma=0.8)
+    report = evaluate_lyapunov(model, make_env(), 15, seed=1)
+    known = report.transitions.dropna()
+    assert 0 < report.n_calibrated == len(known) < len(report.transitions)
+    line = np.polyfit(known["lyapunov"], known["cost_to_go"], 1)
+    assert report.metrics["calibration_slope"].value == pytest.approx(line[0])
+    assert report.metrics["calibration_intercept"].value == pytest.approx(line[1])
+    expected = spearmanr(known["lyapunov"], known["cost_to_go"]).statistic
+    assert report.metrics["rank_correlation"].value == pytest.approx(expected)
+    for name, (value, low, high) in report.metrics.items():
+        assert low <= value <= high, name
+        if name not in ("death_rate", "ultimate_bound"):
+            assert low < value < high, name
+    frame = report.to_frame()
+    assert frame.columns.tolist() == ["value", "low", "high"] and frame.index.tolist() == list(report.metrics)
+    assert frame.loc["decrease", "low"] == report.metrics["decrease"].low
+
+
+def test_interval_covers_the_mean_of_dependent_transitions():
+    rng = np.random.default_rng(0)
+    n_episodes, n_steps, covered, widths = 40, 25, 0, []
+    episode = np.repeat(np.arange(n_episodes), n_steps)
+    for _ in range(200):
+        # Most of the spread is between episodes
+        values = 1.0 + rng.normal(size=n_episodes)[episode] + 0.3 * rng.normal(size=len(episode))
+        _, low, high = Bootstrap(n_episodes, 500).estimate(ratio, episode, values, np.ones(len(values)))
+        covered += low < 1.0 < high
+        widths.append(high - low)
+    assert 180 <= covered <= 198
+    # 2 * 1.96 / sqrt(40): resampling transitions would give intervals five times narrower, that cover half as often
+    assert np.mean(widths) == pytest.approx(0.62, rel=0.05)
+
+
+def test_one_episode_has_no_interval(make_exact_model):
+    report = evaluate_lyapunov(make_exact_model(), ContractionEnv(), 1)
+    for name, (value, low, high) in report.metrics.items():
+        if name != "death_rate":
+            assert not np.isnan(value) and np.isnan(low) and np.isnan(high), name
+    assert "is undecided: one episode" in report.summary()
+
+
+def test_levels_of_cost():
+    rng = np.random.default_rng(0)
+    # Half of the costs are zero
+    cost = np.where(np.arange(1000) % 2 == 0, 0.0, rng.permutation(1000) + 1.0)
+    frame = pd.DataFrame({"episode": np.arange(1000) // 100, "cost": cost, "difference": 2 - cost, "terminated": False})
+    table = module.decrease_by_cost(frame, 5, Bootstrap(10, 100))
+    # Two of the five quantiles are zero: the zeros have a level of their own
+    assert len(table) == 4
+    assert table["cost_low"].iloc[0] == table["cost_high"].iloc[0] == 0 and table["n_transitions"].tolist()[0] == 500
+    assert table["n_transitions"].sum() == 1000
+    assert (table["cost_low"].to_numpy()[1:] > table["cost_high"].to_numpy()[:-1]).all()
+    assert (table["cost_low"] <= table["cost_high"]).all()
+    for row in table.itertuples():
+        chosen = frame[frame["cost"].between(row.cost_low, row.cost_high)]
+        assert row.decrease == pytest.approx(chosen["difference"].mean())
+        assert row.share_decreasing == pytest.approx((chosen["difference"] <= 0).mean())
+        assert row.decrease_low <= row.decrease <= row.decrease_high
+    assert list(table.columns) == [
+        "cost_low", "cost_high", "n_transitions", "decrease", "decrease_low", "decrease_high", "share_decreasing",
+    ]  # fmt: skip
+    assert len(module.decrease_by_cost(frame.assign(cost=3.0), 5, Bootstrap(10, 100))) == 1
+    assert (
+        module.decrease_by_cost(frame.assign(cost=rng.random(1000)), 5, Bootstrap(10, 100))["n_transitions"].tolist()
+        == [200] * 5
+    )
+
+
+# Environments
+
+
+def test_parallel_envs_give_the_same_transitions(make_model):
+    def make_env(rank):
+        return lambda: ContractionEnv(starts=((1.0 + rank, 0.5),), lengths=(7,), deaths=(rank == 1,))
+
+    model = make_model(ContractionEnv(), n_collect=0)
+    parallel = evaluate_lyapunov(model, DummyVecEnv([make_env(rank) for rank in range(3)]), 6, deterministic=True)
+    one_by_one = ContractionEnv(starts=((1.0, 0.5), (2.0, 0.5), (3.0, 0.5)), lengths=(7,), deaths=(False, True, False))
+    single = evaluate_lyapunov(model, one_by_one, 6, deterministic=True)
+    # One episode after the other, each from its own environment
+    assert parallel.transitions["episode"].tolist() == np.repeat(np.arange(6), 7).tolist()
+    assert parallel.observations[::7, 0].tolist() == [1, 1, 2, 2, 3, 3]
+    np.testing.assert_allclose(
+        parallel.transitions["next_lyapunov"].dropna().iloc[:6], parallel.transitions["lyapunov"].iloc[1:7]
+    )
+    pd.testing.assert_frame_equal(without_order(parallel.transitions), without_order(single.transitions), rtol=1e-5)
+    for name in parallel.metrics:
+        assert parallel.metrics[name].value == pytest.approx(single.metrics[name].value, rel=1e-4), name
+
+
+def test_short_episodes_are_not_over_represented(make_model):
+    model = make_model(ContractionEnv(), n_collect=0)
+    env = DummyVecEnv([lambda: ContractionEnv(lengths=(2,)), lambda: ContractionEnv(lengths=(30,))])
+    assert evaluate_lyapunov(model, env, 5).episodes["length"].tolist() == [2, 2, 30, 30, 30]
+
+
+def test_chunks_do_not_matter(make_model, make_env, monkeypatch):
+    model, env = make_model(n_collect=0), make_vec_env(make_env, n_envs=3, seed=0)
+    expected = evaluate_lyapunov(model, env, 7, seed=0)
+    sizes = []
+    predict_lyapunov = model.policy.predict_lyapunov
+    monkeypatch.setattr(
+        model.policy, "predict_lyapunov", lambda obs, action: (sizes.append(len(action)), predict_lyapunov(obs, action))[1]
+    )
+    monkeypatch.setattr(module, "CHUNK_SIZE", 10)
+    report = evaluate_lyapunov(model, env, 7, seed=0)
+    pd.testing.assert_frame_equal(report.transitions, expected.transitions, rtol=1e-5)
+    assert max(sizes[:-1]) <= 12 and sum(sizes[:-1]) == 140 and sizes[-1] == 7
+
+
+def make_normalized(make_env, **kwargs):
+    return VecNormalize(make_vec_env(make_env, n_envs=2), gamma=0.9, **kwargs)
+
+
+def test_costs_have_the_units_of_the_training(make_model, make_env):
+    env, eval_env = make_normalized(lambda: make_env(offset=2.0)), make_normalized(lambda: make_env(offset=2.0))
+    model = make_model(env, gamma=0.9)
+    model.reward_bound.fill_(2.0)
+    sync_envs_normalization(env, eval_env)
+    before = eval_env.obs_rms.mean.copy(), eval_env.ret_rms.var
+    report = evaluate_lyapunov(model, eval_env, 6, seed=0)
+    # Nothing was learned from the evaluation
+    assert eval_env.training
+    np.testing.assert_array_equal(eval_env.obs_rms.mean, before[0])
+    assert eval_env.ret_rms.var == before[1]
+    scale = np.sqrt(eval_env.ret_rms.var + eval_env.epsilon)
+    states = eval_env.unnormalize_obs(report.observations)
+    np.testing.assert_allclose(report.transitions["cost"], np.sum(states**2, axis=1) / scale, rtol=1e-3, atol=1e-4)
+    # L is that of the normalized observations
+    assert (np.abs(report.observations) <= eval_env.clip_obs).all()
+
+
+def test_differently_normalized_env_is_refused(make_model, make_env):
+    model = make_model(make_normalized(make_env))
+    with pytest.raises(ValueError, match=r"has no normalization, but the training environment has norm_obs=True"):
+        evaluate_lyapunov(model, make_env())
+    with pytest.raises(ValueError, match=r"norm_reward=False, .* norm_reward=True: .*sync_envs_normalization"):
+        evaluate_lyapunov(model, make_normalized(make_env, norm_reward=False))
+    with pytest.raises(ValueError, match=r"norm_obs=True and norm_reward=True, but .* no normalization"):
+        evaluate_lyapunov(make_model(make_env()), make_normalized(make_env))
+    with pytest.raises(ValueError, match="training environment has norm_obs=True"):
+        model.learn(10, callback=LyapunovCallback(make_env()))
+
+
+def test_dict_observations_and_images(make_model):
+    for env, policy in (
+        (SimpleMultiObsEnv(discrete_actions=False), "MultiInputPolicy"),
+        (FakeImageEnv(screen_height=36, screen_width=36, n_channels=1, discrete=False), "CnnPolicy"),
+    ):
+        model = make_model(env, policy=policy, n_collect=5, policy_kwargs={"net_arch": [8]}, buffer_size=100)
+        report = evaluate_lyapunov(model, env, 2)
+        assert report.observations is None and report.transitions["lyapunov"].notna().all()
+        assert len(report.transitions) >= 2 and len(report.plot().axes) == 4
+        for plot in (report.plot_phase, report.plot_region_of_attraction):
+            with pytest.raises(ValueError, match="observations that are vectors"):
+                plot()
+
+
+def test_image_env_is_transposed_as_for_the_training(make_model):
+    env = FakeImageEnv(screen_height=36, screen_width=36, n_channels=1, discrete=False)
+    model = make_model(env, policy="CnnPolicy", n_collect=5, policy_kwargs={"net_arch": [8]}, buffer_size=100)
+    assert isinstance(model.get_env(), VecTransposeImage)
+    callback = LyapunovCallback(env, n_eval_episodes=1, eval_freq=4, verbose=0)
+    model.learn(5, callback=callback)
+    assert callback.last_report is not None and isinstance(callback.eval_env, VecTransposeImage)
+
+
+# Nothing is changed
+
+
+def test_same_seed_gives_the_same_report(make_model, make_env):
+    model, env = make_model(n_collect=0), make_env()
+    reports = []
+    for seed in (5, 5, 6):
+        th.rand(1)
+        reports.append(evaluate_lyapunov(model, env, 3, seed=seed))
+    pd.testing.assert_frame_equal(reports[0].transitions, reports[1].transitions)
+    pd.testing.assert_frame_equal(reports[0].to_frame(), reports[1].to_frame())
+    assert reports[0].summary() == reports[1].summary() != reports[2].summary()
+    # Actions are sampled: the start is the same, but not the trajectory
+    deterministic = evaluate_lyapunov(model, env, 3, deterministic=True, seed=5)
+    assert (deterministic.observations[0] == reports[0].observations[0]).all()
+    assert (deterministic.observations[1] != reports[0].observations[1]).all()
+
+
+@pytest.mark.parametrize("seed", [None, 3])
+def test_random_states_are_left_alone(make_model, make_env, seed):
+    model = make_model(n_collect=0)
+    th.manual_seed(1)
+    np.random.seed(1)
+    expected = th.rand(3).tolist(), np.random.rand(3).tolist()
+    th.manual_seed(1)
+    np.random.seed(1)
+    evaluate_lyapunov(model, make_env(), 2, seed=seed)
+    assert (th.rand(3).tolist(), np.random.rand(3).tolist()) == expected
+
+
+@pytest.mark.parametrize("normalize", [False, True])
+def test_training_with_callback_is_the_same_to_the_bit(make_model, make_env, normalize):
+    def train(callback):
+        env = make_vec_env(make_env, n_envs=2, seed=0)
+        model = make_model(VecNormalize(env, gamma=0.99) if normalize else env, n_collect=0)
+        model.learn(120, callback=callback)
+        return model
+
+    eval_env = make_vec_env(make_env, n_envs=3)
+    callback = LyapunovCallback(VecNormalize(eval_env) if normalize else eval_env, n_eval_episodes=4, eval_freq=7, verbose=0)
+    states = [train(callback).policy.state_dict(), train(None).policy.state_dict()]
+    assert len(callback.history) == 120 // 14
+    for name, tensor in states[0].items():
+        assert th.equal(tensor, states[1][name]), name
+
+
+# Mistakes
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"n_eval_episodes": 0}, "n_eval_episodes=0 must be at least 1"),
+        ({"alpha3": 0.0}, "alpha3=0.0 must be greater than 0"),
+        ({"alpha3": float("nan")}, "alpha3=nan must be greater than 0"),
+        ({"max_tail_weight": 0.0}, "max_tail_weight=0.0 must be greater than 0"),
+        ({"max_tail_weight": 1.5}, "max_tail_weight=1.5 .* at most 1"),
+        ({"n_cost_levels": 0}, "n_cost_levels=0"),
+        ({"n_bootstrap": 0}, "n_bootstrap=0"),
+    ],
+)
+def test_wrong_arguments_are_named_before_any_work(make_model, make_env, arguments, message):
+    env = make_env()
+    with pytest.raises(ValueError, match=message):
+        evaluate_lyapunov(make_model(n_collect=0), env, **arguments)
+    assert not hasattr(env, "state")
+
+
+def test_model_and_env_must_fit(make_model, make_env):
+    with pytest.raises(ValueError, match="must be a LAC model"):
+        evaluate_lyapunov(SAC("MlpPolicy", make_env(), buffer_size=10), make_env())
+    with pytest.raises(ValueError, match="Observation spaces do not match"):
+        evaluate_lyapunov(make_model(n_collect=0), make_env(n_dim=3))
+    # Before the training starts, and not at the first evaluation
+    model = make_model(n_collect=0)
+    with pytest.raises(ValueError, match="n_eval_episodes=-1"):
+        model.learn(10, callback=LyapunovCallback(make_env(), n_eval_episodes=-1))
+    assert model.num_timesteps == 0
+
+
+def test_loaded_model_can_be_evaluated_without_its_env(make_model, make_env, tmp_path):
+    model = make_model(n_collect=0)
+    model.save(tmp_path / "model")
+    loaded = LAC.load(tmp_path / "model", device="cpu")
+    pd.testing.assert_frame_equal(
+        evaluate_lyapunov(loaded, make_env(), 2, seed=0).transitions,
+        evaluate_lyapunov(model, make_env(), 2, seed=0).transitions,
+    )
+
+
+# Figures
+
+
+def test_figures(make_exact_model, tmp_path):
+    starts = np.random.default_rng(0).uniform(-2, 2, (30, 3)).tolist()
+    arguments = {"starts": starts, "lengths": (10, 12), "deaths": (False, False, True)}
+    report = evaluate_lyapunov(make_exact_model(**arguments), ContractionEnv(**arguments), 30)
+    figure = report.plot()
+    assert isinstance(figure, Figure) and len(figure.axes) == 4
+    lines = figure.axes[0].get_lines()
+    assert sum(len(line.get_xdata()) > 1 for line in lines) == 8
+    # A panel and a colour bar
+    names = ["position", "velocity", "angle"]
+    for plot in (report.plot_phase, report.plot_region_of_attraction):
+        figure = plot(x=2, y=1, names=names)
+        assert len(figure.axes) == 2
+        assert (figure.axes[0].get_xlabel(), figure.axes[0].get_ylabel()) == ("angle", "velocity")
+        figure.savefig(tmp_path / f"{plot.__name__}.png")
+    assert report.plot_phase().axes[0].get_xlabel() == "observation 0"
+    # Trajectories do not run from one episode to the next
+    segments = report.plot_phase().axes[0].collections[0].get_segments()
+    assert len(segments) == len(report.transitions) - 30
+
+    for plot in (report.plot_phase, report.plot_region_of_attraction):
+        with pytest.raises(ValueError, match="x=0 and y=3 must lie between 0 and 2"):
+            plot(y=3)
+        with pytest.raises(ValueError, match="must lie between"):
+            plot(x=-1)
+        with pytest.raises(ValueError, match="must name all 3 dimensions"):
+            plot(names=["position", "velocity"])
+
+
+def test_outcomes_of_start_states(make_exact_model):
+    starts = [(float(k), float(k % 3)) for k in range(1, 13)]
+    arguments = {"starts": starts, "lengths": (5,), "deaths": (False,) * 11 + (True,), "rho": 1.0}
+    report = evaluate_lyapunov(make_exact_model(**arguments), ContractionEnv(**arguments), 12)
+
+    def counts(**kwargs):
+        return [text.get_text() for text in report.plot_region_of_attraction(**kwargs).legends[0].get_texts()]
+
+    assert counts(threshold=26.0) == ["settled (4)", "not settled (7)", "died (1)"]
+    # 95 % of the survivors are below the ultimate bound by definition
+    assert counts() == ["settled (10)", "not settled (1)", "died (1)"]
+
+
+@pytest.mark.parametrize("starts", [((1.0, 0.5),), [(float(k), 2.0 * k) for k in range(1, 16)]], ids=["one", "on a line"])
+def test_no_level_sets_without_a_triangulation(make_exact_model, starts):
+    report = evaluate_lyapunov(make_exact_model(starts=starts), ContractionEnv(starts), 15)
+    assert len(report.plot_region_of_attraction().axes) == 1
+
+
+def test_figure_without_calibration(make_exact_model):
+    report = evaluate_lyapunov(make_exact_model(gamma=0.99), ContractionEnv(lengths=(5,)), 3)
+    assert report.plot().axes[2].texts[0].get_text() == "no episode is long enough"
+
+
+# Callback
+
+
+def test_callback_logs_the_metrics(make_model, make_env, tmp_path, capsys):
+    dumps, reports = [], []
+
+    class AfterEval(BaseCallback):
+        def _on_step(self):
+            reports.append(self.parent.last_report)
+            assert "new_obs" in self.locals
+            return True
+
+    model = make_model(n_collect=0, gamma=0.8)
+    original_dump = model.logger.dump
+    model.logger.dump = lambda step: (dumps.append((step, dict(model.logger.name_to_value))), original_dump(step))
+    log_path = tmp_path / "run" / "lyapunov.csv"
+    callback = LyapunovCallback(make_env(), AfterEval(), n_eval_episodes=3, eval_freq=10, seed=4, log_path=log_path)
+    model.learn(25, callback=callback, log_interval=None)
+
+    assert [step for step, _ in dumps] == [10, 20]
+    values = {name.split("/")[1]: value for name, value in dumps[1][1].items() if name.startswith("lyapunov/")}
+    assert set(values) == {
+        "decrease", "share_decreasing", "feasible_alpha3", "calibration_slope", "rank_correlation", "ultimate_bound",
+        "death_rate", "mean_cost",
+    }  # fmt: skip
+    # SB3 cuts names after 36 characters
+    assert all(len(f"lyapunov/{name}") <= 36 for name in values)
+    report = evaluate_lyapunov(model, make_env(), 3, seed=4)
+    assert [len(report.episodes) for report in reports] == [3, 3]
+    assert values["feasible_alpha3"] == reports[1].metrics["largest_feasible_alpha3"].value
+    assert reports[1].transitions.equals(report.transitions)
+
+    frame = pd.read_csv(log_path)
+    assert frame["timesteps"].tolist() == [10, 20]
+    assert frame["decrease"].iloc[1] == pytest.approx(values["decrease"])
+    assert frame["feasible_alpha3_low"].iloc[1] == pytest.approx(report.metrics["largest_feasible_alpha3"].low)
+    assert frame["death_rate_high"].iloc[1] == pytest.approx(report.metrics["death_rate"].high)
+    assert capsys.readouterr().out.count("no proof of stability") == 2
+    assert [path.name for path in tmp_path.rglob("*.*")] == ["lyapunov.csv"]
+
+    # A training that is continued from a checkpoint
+    callback = LyapunovCallback(make_env(), n_eval_episodes=2, eval_freq=10, log_path=log_path, verbose=0)
+    model.num_timesteps = 10
+    model.learn(20, callback=callback, reset_num_timesteps=False)
+    assert pd.read_csv(log_path)["timesteps"].tolist() == [10, 20, 30]
+    assert [entry["timesteps"] for entry in callback.history] == [10, 20, 30]
+
+
+def test_callback_synchronizes_normalization(make_model, make_env):
+    env, eval_env = make_normalized(make_env), make_normalized(make_env)
+    callback = LyapunovCallback(eval_env, n_eval_episodes=2, eval_freq=20, verbose=0)
+    make_model(env, n_collect=0).learn(40, callback=callback)
+    np.testing.assert_array_equal(eval_env.obs_rms.mean, env.obs_rms.mean)
+    assert eval_env.ret_rms.var == env.ret_rms.var != 1
+
+
+def test_callback_can_stop_training(make_model, make_env):
+    class Stop(BaseCallback):
+        def _on_step(self):
+            return False
+
+    callback = LyapunovCallback(make_env(), Stop(), n_eval_episodes=1, eval_freq=5, verbose=0)
+    assert make_model(n_collect=0).learn(100, callback=callback).num_timesteps == 5
+    callback = LyapunovCallback(make_env(), eval_freq=-1)
+    assert make_model(n_collect=0).learn(10, callback=callback).num_timesteps == 10 and callback.last_report is None
