@@ -5,7 +5,7 @@ from stable_baselines3.common.envs import FakeImageEnv
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from sb3_lac import CnnPolicy, LyapunovPolicy, MlpPolicy, MultiInputPolicy
+from sb3_lac import LAC, CnnPolicy, LyapunovPolicy, MlpPolicy, MultiInputPolicy
 
 
 class BatchNormExtractor(BaseFeaturesExtractor):
@@ -15,6 +15,18 @@ class BatchNormExtractor(BaseFeaturesExtractor):
 
     def forward(self, observations):
         return self.batch_norm(observations)
+
+
+class BatchNormDropoutExtractor(BatchNormExtractor):
+    def forward(self, observations):
+        return nn.functional.dropout(super().forward(observations), training=self.training)
+
+
+class PolicyWithOwnActor(LyapunovPolicy):
+    def make_actor(self, features_extractor=None):
+        actor = super().make_actor(features_extractor)
+        actor.register_buffer("own", th.ones(1))
+        return actor
 
 
 def test_mlp_policy_is_the_lyapunov_policy():
@@ -62,6 +74,19 @@ def test_batch_norm_statistics_of_both_targets_are_updated(make_model, train_met
         assert not th.equal(batch_norm.running_mean, th.zeros(2))
         assert th.equal(batch_norm.running_mean, target_batch_norm.running_mean)
         assert th.equal(batch_norm.running_var, target_batch_norm.running_var)
+
+
+def test_batch_norm_and_dropout_work_in_training_only(make_model, train_metrics):
+    model = make_model(n_collect=80, gradient_steps=0, policy_kwargs={"features_extractor_class": BatchNormDropoutExtractor})
+    statistics = [tensor.clone() for tensor in model.batch_norm_stats]
+    obs = np.ones(2, dtype=np.float32)
+    actions = [model.predict(obs, deterministic=True)[0] for _ in range(5)]
+    assert all(np.array_equal(action, actions[0]) for action in actions)
+    # Neither collecting transitions nor predicting has changed the statistics
+    model.learn(10, reset_num_timesteps=False)
+    assert all(th.equal(before, after) for before, after in zip(statistics, model.batch_norm_stats, strict=True))
+    train_metrics(model)
+    assert not any(th.equal(before, after) for before, after in zip(statistics, model.batch_norm_stats, strict=True))
 
 
 @pytest.mark.parametrize("share_features_extractor", [False, True])
@@ -118,6 +143,15 @@ def test_policy_keeps_all_arguments_when_saved_and_loaded(make_model, tmp_path):
         assert th.equal(tensor, loaded.state_dict()[name])
     obs = np.ones(2, dtype=np.float32)
     np.testing.assert_array_equal(policy.predict(obs, deterministic=True)[0], loaded.predict(obs, deterministic=True)[0])
+
+
+def test_custom_policy_class_is_saved_with_the_model(make_model, train_metrics, tmp_path):
+    model = make_model(policy=PolicyWithOwnActor, policy_kwargs={"net_arch": []})
+    train_metrics(model)
+    model.save(tmp_path / "model")
+    loaded = LAC.load(tmp_path / "model")
+    assert type(model.policy) is type(loaded.policy) is PolicyWithOwnActor
+    assert loaded.actor.own.item() == loaded.actor_target.own.item() == 1.0
 
 
 def test_optimizer_is_chosen_by_the_user(make_model):

@@ -10,10 +10,25 @@ from gymnasium import spaces
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import BitFlippingEnv, FakeImageEnv, SimpleMultiObsEnv
-from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_lac import LAC
+
+
+class RandomEnv(gym.Env):
+    """Random observations, and a cost of actions."""
+
+    def __init__(self, observation_space, action_space):
+        self.observation_space = observation_space
+        self.action_space = action_space
+
+    def reset(self, seed=None, options=None):
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        assert self.action_space.contains(np.asarray(action, dtype=self.action_space.dtype))
+        return self.observation_space.sample(), -float(np.sum(np.square(action))), False, False, {}
 
 
 def check_training(model, n_steps=60):
@@ -31,16 +46,27 @@ def check_training(model, n_steps=60):
 def test_arguments_are_those_of_sac_and_the_own_ones_follow_target_entropy():
     parameters, sac_parameters = (list(inspect.signature(cls.__init__).parameters.values()) for cls in (LAC, SAC))
     names = [parameter.name for parameter in parameters]
-    own = ["alpha3", "lambda_init", "lambda_min", "lambda_max", "lambda_learning_rate"]
+    own = ["alpha3", "lambda_init", "lambda_min", "lambda_max", "lambda_learning_rate", "horizon"]
     start = names.index("target_entropy") + 1
     assert names[start : start + len(own)] == own
     shared = [(parameter.name, parameter.default) for parameter in parameters if parameter.name not in own]
     assert shared == [(parameter.name, parameter.default) for parameter in sac_parameters]
 
 
-def test_only_continuous_actions_are_supported():
-    with pytest.raises(AssertionError, match="supports"):
-        LAC("MlpPolicy", "CartPole-v1")
+@pytest.mark.parametrize(
+    ("action_space", "message"),
+    [
+        (spaces.Discrete(3), "only supports .* as action spaces but Discrete"),
+        (spaces.MultiDiscrete([2, 2]), "only supports .* as action spaces but MultiDiscrete"),
+        (spaces.MultiBinary(2), "only supports .* as action spaces but MultiBinary"),
+        (spaces.Dict({"force": spaces.Box(-1, 1)}), "only supports .* as action spaces but Dict"),
+        (spaces.Box(-1, np.inf, (2,)), "must have a finite lower and upper bound"),
+    ],
+    ids=["discrete", "multi_discrete", "multi_binary", "dict", "unbounded"],
+)
+def test_only_bounded_continuous_actions_are_supported(make_model, action_space, message):
+    with pytest.raises(AssertionError, match=message):
+        make_model(RandomEnv(spaces.Box(-1, 1, (2,)), action_space), n_collect=0)
 
 
 @pytest.mark.parametrize("n_envs", [1, 3])
@@ -63,19 +89,7 @@ def test_gsde_noise_of_both_actors_is_sampled_in_each_update(make_model):
 
 @pytest.mark.parametrize("observation_space", [spaces.Discrete(4), spaces.MultiDiscrete([3, 2]), spaces.MultiBinary(3)])
 def test_discrete_observations(make_model, observation_space):
-    class DiscreteObservationEnv(gym.Env):
-        """Random observations."""
-
-        action_space = spaces.Box(-1, 1, (2,), np.float32)
-
-        def reset(self, seed=None, options=None):
-            return self.observation_space.sample(), {}
-
-        def step(self, action):
-            return self.observation_space.sample(), -float(np.sum(action**2)), False, False, {}
-
-    DiscreteObservationEnv.observation_space = observation_space
-    check_training(make_model(DiscreteObservationEnv(), n_collect=0))
+    check_training(make_model(RandomEnv(observation_space, spaces.Box(-1, 1, (2,))), n_collect=0))
 
 
 def test_dict_observations(make_model):
@@ -145,10 +159,32 @@ def test_action_noise(make_model):
     check_training(make_model(n_collect=0, action_noise=noise, use_sde_at_warmup=True))
 
 
-def test_actions_of_any_range(make_model, make_env):
-    env = make_env()
-    env.action_space = spaces.Box(low=np.array([-3.0, 0.0]), high=np.array([5.0, 0.1]), dtype=np.float64)
-    model = make_model(env, n_collect=0)
+def test_each_env_has_its_own_action_noise_until_its_episode_ends(make_model, make_env):
+    env = make_vec_env(make_env, n_envs=2)
+    noise = OrnsteinUhlenbeckActionNoise(mean=np.zeros(2), sigma=0.1 * np.ones(2))
+    model = make_model(env, n_collect=0, action_noise=noise)
+    check_training(model, n_steps=78)
+    assert isinstance(model.action_noise, VectorizedActionNoise)
+    first, second = (own_noise.noise_prev for own_noise in model.action_noise.noises)
+    assert np.all(first != 0) and np.all(first != second)
+    # Episodes of both environments end after 20 steps of each
+    model.learn(2, reset_num_timesteps=False)
+    assert all(np.all(own_noise.noise_prev == 0) for own_noise in model.action_noise.noises)
+
+
+@pytest.mark.parametrize(
+    "action_space",
+    [
+        spaces.Box(-1, 1, (1,)),
+        spaces.Box(-2, 2, (2, 3)),
+        spaces.Box(np.array([-3.0, 0.0]), np.array([5.0, 0.1]), dtype=np.float64),
+    ],
+    ids=["one", "matrix", "asymmetric_float64"],
+)
+def test_actions_of_any_shape_and_range(make_model, action_space):
+    model = make_model(RandomEnv(spaces.Box(-1, 1, (3,)), action_space), n_collect=0)
     check_training(model)
-    for _ in range(20):
-        assert env.action_space.contains(model.predict(env.observation_space.sample())[0].astype(np.float64))
+    assert model.target_entropy == -np.prod(action_space.shape)
+    actions, _ = model.predict(np.ones((20, 3), dtype=np.float32))
+    assert actions.shape == (20, *action_space.shape)
+    assert all(action_space.contains(action.astype(action_space.dtype)) for action in actions)
