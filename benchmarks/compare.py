@@ -18,13 +18,11 @@ import argparse
 import contextlib
 import io
 import json
-import multiprocessing
 import os
 import shutil
 import sys
 import time
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any, Literal
 
@@ -42,6 +40,7 @@ from battery_env.evaluation import evaluate, summarize
 from battery_env.plotting import plot_learning_curves, plot_true_against_inferred, save_figure
 from battery_env.trajectories import TrajectoryDataset
 from benchmarks.reporting import write_csv, write_text
+from benchmarks.training import run_all
 from sb3_lac import CalibrationCallback
 from sb3_lac.zoo import LACExperimentManager, find_config
 
@@ -309,22 +308,6 @@ def _markdown(table: pd.DataFrame) -> str:
     return pd.DataFrame(lines).to_markdown(index=False, disable_numparse=True) + "\n"
 
 
-def _run_all(runs: Sequence[tuple[Any, ...]], jobs: int) -> None:
-    if jobs == 1:
-        for job in runs:
-            run(*job)
-        return
-    # spawn: torch does not survive a fork with threads
-    with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
-        futures = [pool.submit(run, *(*job, k % jobs)) for k, job in enumerate(runs)]
-        try:
-            for future in futures:
-                future.result()
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """
     The command line.
@@ -349,7 +332,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for algo in chosen.algos
     ]
     try:
-        _run_all(runs, chosen.jobs)
+        run_all(run, [(*job, 1 + k % chosen.jobs) for k, job in enumerate(runs)], chosen.jobs)
     except KeyboardInterrupt:
         sys.exit(f"\nInterrupted; what is done lies in {chosen.out}, and the same command goes on from there.")
     configuration = {name: value for name, value in vars(chosen).items() if name not in ("jobs", "out")}

@@ -1,0 +1,148 @@
+"""
+What alpha3 and lambda_max do: LAC with a grid of both, on the three cost environments.
+
+.. code-block:: bash
+
+  python -m benchmarks.multipliers
+
+For each combination: the cost of the policy, where lambda ended, and what ``evaluate_lyapunov`` says of the decrease
+condition. A policy that is trained is not trained again when the command is repeated.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+
+from battery_env.plotting import new_figure, save_figure
+from benchmarks.reporting import write_csv, write_text
+from benchmarks.training import run_all, train_or_load
+from sb3_lac import LAC, evaluate_lyapunov
+
+_EVALUATION_SEED = 10_000  # no training seed comes close
+_TIMESTEPS = {"LinearCost-v0": 4_000, "CartPoleCost-v0": 16_000, "Oscillator-v0": 20_000}
+_EPISODES = 20
+
+
+def run(env_id: str, alpha3: float, lambda_max: float, seed: int, out: Path) -> dict[str, object]:
+    """
+    Train and evaluate one policy.
+
+    :param env_id: id of the environment
+    :param alpha3: see ``LAC``
+    :param lambda_max: see ``LAC``, also the start of lambda
+    :param seed: seed of the training
+    :param out: folder of all results
+    :return: what came out
+    """
+    hyperparameters = {"alpha3": alpha3, "lambda_max": lambda_max, "lambda_init": lambda_max}
+    folder = out / "models" / f"{env_id}_alpha3_{alpha3:g}_lambda_max_{lambda_max:g}_seed{seed}"
+    model = train_or_load("lac", env_id, seed, _TIMESTEPS[env_id], folder, hyperparameters)
+    assert isinstance(model, LAC)
+    env = Monitor(gym.make(env_id))
+    env.reset(seed=_EVALUATION_SEED)
+    returns, lengths = evaluate_policy(model, env, _EPISODES, return_episode_rewards=True)
+    assert isinstance(returns, list) and isinstance(lengths, list)
+    report = evaluate_lyapunov(model, gym.make(env_id), n_eval_episodes=_EPISODES, seed=_EVALUATION_SEED).to_frame()
+    return {
+        "env": env_id,
+        "alpha3": alpha3,
+        "lambda_max": lambda_max,
+        "seed": seed,
+        # per step of the whole episode, so that an early death is not cheap
+        "cost": -np.sum(returns) / np.sum(lengths),
+        "death_rate": report.loc["death_rate", "value"],
+        "lambda": float(model.log_lambda.detach().exp()),
+        "decrease": report.loc["decrease", "value"],
+        "largest_feasible_alpha3": report.loc["largest_feasible_alpha3", "value"],
+    }
+
+
+def plot(results: pd.DataFrame) -> Figure:
+    """
+    One column per environment: cost, and where lambda ended relative to its upper limit, over alpha3.
+
+    :param results: see ``run()``, of all runs
+    :return: the figure
+    """
+    figure = new_figure(3.4 * results["env"].nunique(), 5.0)
+    panels = figure.subplots(2, results["env"].nunique(), sharex=True, squeeze=False)
+    for (upper, lower), (env_id, of_env) in zip(panels.T, results.groupby("env", sort=False), strict=True):
+        for number, (lambda_max, group) in enumerate(of_env.groupby("lambda_max")):
+            colour = f"C{number}"
+            for axes, values in ((upper, group["cost"]), (lower, group["lambda"] / group["lambda_max"])):
+                by_alpha3 = values.groupby(group["alpha3"])
+                axes.plot(by_alpha3.median(), color=colour, marker="o", ms=4, label=f"lambda_max = {lambda_max:g}")
+                axes.fill_between(by_alpha3.median().index, by_alpha3.min(), by_alpha3.max(), color=colour, alpha=0.2, lw=0)
+        upper.set(title=str(env_id), ylabel="cost per step", yscale="log")
+        lower.set(xlabel="alpha3", ylabel="lambda / lambda_max at the end", yscale="log", xscale="log")
+        upper.legend(frameon=False, fontsize="small")
+    return figure
+
+
+def report(results: pd.DataFrame) -> str:
+    """
+    Medians over seeds, as Markdown.
+
+    :param results: see ``run()``, of all runs
+    :return: one table
+    """
+    columns = {
+        "cost": "cost per step",
+        "death_rate": "death rate",
+        "lambda": "lambda",
+        "decrease": "decrease",
+        "largest_feasible_alpha3": "largest feasible alpha3",
+    }
+    groups = results.groupby(["env", "alpha3", "lambda_max"], sort=False)
+    table = groups[list(columns)].median().rename(columns=columns)
+    table.insert(
+        1, "cost, best to worst seed", [f"{low:.3g} to {high:.3g}" for low, high in groups["cost"].agg(["min", "max"]).values]
+    )
+    return table.reset_index().to_markdown(index=False, floatfmt=".3g") + "\n"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """
+    The command line.
+
+    :param arguments: of the command line by default
+    """
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--envs", nargs="+", default=list(_TIMESTEPS), choices=list(_TIMESTEPS))
+    parser.add_argument("--alpha3", nargs="+", type=float, default=[0.1, 0.3, 0.6, 1.0])
+    parser.add_argument("--lambda-max", nargs="+", type=float, default=[0.1, 1.0, 10.0])
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1])
+    parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1), help="runs at the same time, one core each")
+    parser.add_argument("--out", type=Path, default=Path("results/multipliers"))
+    chosen = parser.parse_args(arguments)
+
+    runs = [
+        (env_id, alpha3, lambda_max, seed)
+        for env_id in chosen.envs
+        for seed in chosen.seeds
+        for alpha3 in chosen.alpha3
+        for lambda_max in chosen.lambda_max
+    ]
+    results = pd.DataFrame(run_all(partial(run, out=chosen.out), runs, chosen.jobs))
+    configuration = {name: value for name, value in vars(chosen).items() if name not in ("jobs", "out")}
+    write_csv(chosen.out / "multipliers.csv", results, {**configuration, "timesteps": _TIMESTEPS})
+    save_figure(plot(results), chosen.out / "multipliers.png")
+    text = report(results.sort_values(["env", "alpha3", "lambda_max"]))
+    write_text(chosen.out / "multipliers.md", text)
+    sys.stdout.write("\n" + text)
+
+
+if __name__ == "__main__":
+    main()

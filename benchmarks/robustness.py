@@ -1,0 +1,246 @@
+"""
+How well policies of LAC, SAC and TD3 stand what they were not trained for: impulses, other parameters, noisy measurements.
+
+.. code-block:: bash
+
+  python -m benchmarks.robustness
+
+Policies are trained on ``CartPoleCost-v0`` and ``Oscillator-v0`` as they are, with the hyperparameters of ``zoo_configs``, and
+then run under each condition. A policy that is trained is not trained again when the command is repeated.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from battery_env.plotting import COLOURS, new_figure, save_figure
+from benchmarks.reporting import write_csv, write_text
+from benchmarks.training import run_all, train_or_load
+
+_ALGORITHMS = ("lac", "sac", "td3")
+_EVALUATION_SEED = 10_000  # no training seed comes close
+
+# each study: environment, the arguments that vary with their values, and standard deviations of the noise on observations
+_STUDIES: dict[str, tuple[str, dict[str, tuple[float, ...]], tuple[float, ...]]] = {
+    "impulse": ("CartPoleCost-v0", {"impulse_N": (0.0, 40.0, 80.0, 100.0, 120.0, 150.0)}, (0.0,)),
+    "cart and pole": (
+        "CartPoleCost-v0",
+        {"cart_mass_kg": (0.5, 1.0, 2.0, 4.0), "pole_half_length_m": (0.25, 0.5, 1.0, 2.0)},
+        (0.0,),
+    ),
+    "measurement noise": ("CartPoleCost-v0", {}, (0.0, 0.01, 0.03, 0.1)),
+    "gene network": (
+        "Oscillator-v0",
+        {"light": (2.5, 5.0, 10.0), "protein_decay": (0.03, 0.06, 0.12)},
+        (0.0,),
+    ),
+    "process noise": ("Oscillator-v0", {"process_noise": (0.0, 0.1, 0.3, 1.0)}, (0.0,)),
+}
+
+
+def roll_out(model: BaseAlgorithm, env: gym.Env[Any, Any], episodes: int, observation_noise: float) -> pd.DataFrame:
+    """
+    Run a policy, deterministically.
+
+    :param model: the policy
+    :param env: the environment
+    :param episodes: how many; the same starts and disturbances for every policy
+    :param observation_noise: standard deviation of the noise on each observed variable
+    :return: one row per episode: mean cost per step, length, and whether it died
+    """
+    rows = []
+    for episode in range(episodes):
+        rng = np.random.default_rng((_EVALUATION_SEED, episode))
+        observation, _ = env.reset(seed=_EVALUATION_SEED + episode)
+        costs, done = [], False
+        while not done:
+            noisy = observation + observation_noise * rng.standard_normal(observation.shape).astype(np.float32)
+            action, _ = model.predict(noisy, deterministic=True)
+            observation, _, terminated, truncated, info = env.step(action)
+            costs.append(info["cost"])
+            done = terminated or truncated
+        rows.append({"cost": np.mean(costs), "length": len(costs), "died": terminated})
+    return pd.DataFrame(rows)
+
+
+def conditions(study: str) -> list[tuple[dict[str, Any], float]]:
+    """
+    All combinations of a study.
+
+    :param study: its name
+    :return: arguments of the environment and noise on observations
+    """
+    _, arguments, noises = _STUDIES[study]
+    grid = np.array(np.meshgrid(*arguments.values(), indexing="ij")).reshape(len(arguments), -1).T
+    return [(dict(zip(arguments, map(float, values), strict=True)), noise) for values in grid for noise in noises]
+
+
+def run(algo: str, seed: int, timesteps: dict[str, int], episodes: int, out: Path) -> pd.DataFrame:
+    """
+    Train a policy for each environment, and try it under all conditions.
+
+    :param algo: ``lac``, ``sac`` or ``td3``
+    :param seed: seed of the training
+    :param timesteps: environment steps of the training, by environment
+    :param episodes: episodes for each condition
+    :param out: folder of all results
+    :return: one row per condition
+    """
+    rows = []
+    for study, (env_id, _, _) in _STUDIES.items():
+        model = train_or_load(algo, env_id, seed, timesteps[env_id], out / "models" / f"{env_id}_{algo}_seed{seed}")
+        for arguments, noise in conditions(study):
+            outcome = roll_out(model, gym.make(env_id, **arguments), episodes, noise)
+            rows.append(
+                {
+                    "study": study,
+                    "algo": algo.upper(),
+                    "seed": seed,
+                    **arguments,
+                    "observation_noise": noise,
+                    "death_rate": outcome["died"].mean(),
+                    "cost": outcome["cost"].mean(),
+                    "cost_worst": outcome["cost"].max(),
+                }
+            )
+    return pd.DataFrame(rows)
+
+
+def varied(study: str) -> list[str]:
+    """
+    What varies in a study.
+
+    :param study: its name
+    :return: columns of the table
+    """
+    return [*_STUDIES[study][1]] or ["observation_noise"]
+
+
+def _draw_lines(results: pd.DataFrame, column: str, metric: str, axes: Any) -> None:
+    # median over seeds, band from the best to the worst one
+    for colour, (algo, of_algo) in zip(COLOURS, results.groupby("algo"), strict=False):
+        by_value = of_algo.groupby(column)[metric]
+        axes.plot(by_value.median(), color=colour, marker="o", ms=4, label=str(algo))
+        axes.fill_between(by_value.median().index, by_value.min(), by_value.max(), color=colour, alpha=0.2, lw=0)
+    axes.set(xlabel=column, ylabel=metric.replace("_", " "))
+    axes.legend(frameon=False, fontsize="small")
+
+
+def plot_lines(results: pd.DataFrame, studies: Sequence[tuple[str, str]]) -> Figure:
+    """
+    One panel per study: a metric over what varies, median and range over seeds.
+
+    :param results: see ``run()``, of all runs
+    :param studies: names of studies with one varied column, each with the metric to show
+    :return: the figure
+    """
+    figure = new_figure(3.4 * len(studies), 3.0)
+    for axes, (study, metric) in zip(figure.subplots(1, len(studies), squeeze=False)[0], studies, strict=True):
+        _draw_lines(results[results["study"] == study], varied(study)[0], metric, axes)
+        axes.set_title(study)
+        if metric == "cost":
+            axes.set_yscale("log")
+        else:
+            axes.set_ylim(-0.03, 1.03)
+    return figure
+
+
+def plot_grid(results: pd.DataFrame, study: str, metric: str) -> Figure:
+    """
+    One map per algorithm: the mean over seeds of a metric over two parameters.
+
+    :param results: see ``run()``, of all runs
+    :param study: name of a study with two varied columns
+    :param metric: ``"death_rate"`` or ``"cost"``
+    :return: the figure
+    """
+    results = results[results["study"] == study]
+    row, column = varied(study)
+    tables = {
+        str(algo): of_algo.pivot_table(index=row, columns=column, values=metric) for algo, of_algo in results.groupby("algo")
+    }
+    shown = {algo: np.log10(table) if metric == "cost" else table for algo, table in tables.items()}
+    low, high = min(table.min().min() for table in shown.values()), max(table.max().max() for table in shown.values())
+    if metric == "death_rate":
+        low, high = 0.0, 1.0
+    figure = new_figure(3.2 * len(tables), 3.0)
+    for axes, (algo, table) in zip(figure.subplots(1, len(tables), squeeze=False)[0], tables.items(), strict=True):
+        axes.imshow(shown[algo], origin="lower", aspect="auto", vmin=low, vmax=high, cmap="cividis_r")
+        for i, j in np.ndindex(table.shape):
+            dark = shown[algo].iloc[i, j] > (low + high) / 2
+            axes.text(j, i, f"{table.iloc[i, j]:.2g}", ha="center", va="center", color="white" if dark else "black", size=8)
+        axes.set_xticks(range(table.shape[1]), [f"{value:g}" for value in table.columns])
+        axes.set_yticks(range(table.shape[0]), [f"{value:g}" for value in table.index])
+        axes.set(xlabel=column, ylabel=row, title=f"{algo}: {metric.replace('_', ' ')}")
+    return figure
+
+
+def report(results: pd.DataFrame) -> str:
+    """
+    Mean and standard deviation over seeds, as Markdown.
+
+    :param results: see ``run()``, of all runs
+    :return: one table per study
+    """
+
+    def spread(values: pd.Series) -> str:
+        return f"{values.mean():.2g} ± {values.std():.1g}" if len(values) > 1 else f"{values.mean():.2g}"
+
+    text = ""
+    for study, of_study in results.groupby("study", sort=False):
+        columns = varied(str(study))
+        metrics = ["death_rate", "cost"] if of_study["death_rate"].any() else ["cost"]
+        table = of_study.pivot_table(index=columns, columns="algo", values=metrics, aggfunc=spread)[metrics]
+        table.columns = [f"{algo} {metric.replace('_', ' ')}" for metric, algo in table.columns]
+        text += f"**{study}** ({_STUDIES[str(study)][0]}, {of_study['seed'].nunique()} seeds)\n\n"
+        text += table.reset_index().to_markdown(index=False, disable_numparse=True) + "\n\n"
+    return text
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """
+    The command line.
+
+    :param arguments: of the command line by default
+    """
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--algos", nargs="+", default=list(_ALGORITHMS), choices=_ALGORITHMS)
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
+    parser.add_argument("--cart-pole-timesteps", type=float, default=2e4, help="environment steps of each training")
+    parser.add_argument("--oscillator-timesteps", type=float, default=2e4, help="environment steps of each training")
+    parser.add_argument("--episodes", type=int, default=100, help="episodes for each policy and condition")
+    parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1), help="runs at the same time, one core each")
+    parser.add_argument("--out", type=Path, default=Path("results/robustness"))
+    chosen = parser.parse_args(arguments)
+    if min(chosen.cart_pole_timesteps, chosen.oscillator_timesteps, chosen.episodes, chosen.jobs) < 1:
+        parser.error("--cart-pole-timesteps, --oscillator-timesteps, --episodes and --jobs must be at least 1")
+
+    timesteps = {"CartPoleCost-v0": int(chosen.cart_pole_timesteps), "Oscillator-v0": int(chosen.oscillator_timesteps)}
+    one_run = partial(run, timesteps=timesteps, episodes=chosen.episodes, out=chosen.out)
+    results = pd.concat(run_all(one_run, [(algo, seed) for seed in chosen.seeds for algo in chosen.algos], chosen.jobs))
+
+    configuration = {name: value for name, value in vars(chosen).items() if name not in ("jobs", "out")}
+    write_csv(chosen.out / "robustness.csv", results, configuration)
+    lines = [("impulse", "death_rate"), ("measurement noise", "death_rate"), ("process noise", "cost")]
+    save_figure(plot_lines(results, lines), chosen.out / "disturbances.png")
+    save_figure(plot_grid(results, "cart and pole", "death_rate"), chosen.out / "cart_and_pole.png")
+    save_figure(plot_grid(results, "gene network", "cost"), chosen.out / "gene_network.png")
+    text = report(results)
+    write_text(chosen.out / "robustness.md", text)
+    sys.stdout.write("\n" + text)
+
+
+if __name__ == "__main__":
+    main()
