@@ -31,7 +31,7 @@ from benchmarks.training import run_all, train_or_load
 from sb3_lac import LAC, evaluate_lyapunov
 
 _EVALUATION_SEED = 10_000  # no training seed comes close
-_TIMESTEPS = {"LinearCost-v0": 4_000, "CartPoleCost-v0": 16_000, "Oscillator-v0": 20_000}
+_TIMESTEPS = {"LinearCost-v0": 3_000, "CartPoleCost-v0": 10_000, "Oscillator-v0": 12_000}
 _EPISODES = 20
 
 
@@ -121,12 +121,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--envs", nargs="+", default=list(_TIMESTEPS), choices=list(_TIMESTEPS))
-    parser.add_argument("--alpha3", nargs="+", type=float, default=[0.1, 0.3, 0.6, 1.0])
+    parser.add_argument("--alpha3", nargs="+", type=float, default=[0.1, 0.3, 1.0])
     parser.add_argument("--lambda-max", nargs="+", type=float, default=[0.1, 1.0, 10.0])
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1])
     parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1), help="runs at the same time, one core each")
     parser.add_argument("--out", type=Path, default=Path("results/multipliers"))
     chosen = parser.parse_args(arguments)
+    if chosen.jobs < 1 or min(*chosen.alpha3, *chosen.lambda_max) <= 0:
+        parser.error("--jobs must be at least 1, --alpha3 and --lambda-max greater than 0")
 
     runs = [
         (env_id, alpha3, lambda_max, seed)

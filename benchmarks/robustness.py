@@ -12,9 +12,10 @@ then run under each condition. A policy that is trained is not trained again whe
 from __future__ import annotations
 
 import argparse
+import itertools
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -50,29 +51,36 @@ _STUDIES: dict[str, tuple[str, dict[str, tuple[float, ...]], tuple[float, ...]]]
 }
 
 
-def roll_out(model: BaseAlgorithm, env: gym.Env[Any, Any], episodes: int, observation_noise: float) -> pd.DataFrame:
+def roll_out(model: BaseAlgorithm, make_env: Callable[[], gym.Env[Any, Any]], episodes: int, noise_std: float) -> pd.DataFrame:
     """
-    Run a policy, deterministically.
+    Run a policy, deterministically, in all episodes at once.
 
     :param model: the policy
-    :param env: the environment
+    :param make_env: makes the environment
     :param episodes: how many; the same starts and disturbances for every policy
-    :param observation_noise: standard deviation of the noise on each observed variable
+    :param noise_std: standard deviation of the noise on each observed variable
     :return: one row per episode: mean cost per step, length, and whether it died
     """
-    rows = []
-    for episode in range(episodes):
-        rng = np.random.default_rng((_EVALUATION_SEED, episode))
-        observation, _ = env.reset(seed=_EVALUATION_SEED + episode)
-        costs, done = [], False
-        while not done:
-            noisy = observation + observation_noise * rng.standard_normal(observation.shape).astype(np.float32)
-            action, _ = model.predict(noisy, deterministic=True)
-            observation, _, terminated, truncated, info = env.step(action)
-            costs.append(info["cost"])
-            done = terminated or truncated
-        rows.append({"cost": np.mean(costs), "length": len(costs), "died": terminated})
-    return pd.DataFrame(rows)
+    envs = [make_env() for _ in range(episodes)]
+    rngs = [np.random.default_rng((_EVALUATION_SEED, episode)) for episode in range(episodes)]
+    observations = np.array([env.reset(seed=_EVALUATION_SEED + episode)[0] for episode, env in enumerate(envs)])
+    costs, lengths, died = np.zeros(episodes), np.zeros(episodes, dtype=int), np.zeros(episodes, dtype=bool)
+    running = np.arange(episodes)
+    while len(running) > 0:
+        noisy = observations[running]
+        if noise_std > 0:
+            noisy += noise_std * np.array([rngs[episode].standard_normal(noisy.shape[1]) for episode in running], np.float32)
+        actions, _ = model.predict(noisy, deterministic=True)
+        going_on = []
+        for episode, action in zip(running, actions, strict=True):
+            observations[episode], _, terminated, truncated, info = envs[episode].step(action)
+            costs[episode] += info["cost"]
+            lengths[episode] += 1
+            died[episode] = terminated
+            if not (terminated or truncated):
+                going_on.append(episode)
+        running = np.array(going_on, dtype=int)
+    return pd.DataFrame({"cost": costs / lengths, "length": lengths, "died": died})
 
 
 def conditions(study: str) -> list[tuple[dict[str, Any], float]]:
@@ -83,8 +91,8 @@ def conditions(study: str) -> list[tuple[dict[str, Any], float]]:
     :return: arguments of the environment and noise on observations
     """
     _, arguments, noises = _STUDIES[study]
-    grid = np.array(np.meshgrid(*arguments.values(), indexing="ij")).reshape(len(arguments), -1).T
-    return [(dict(zip(arguments, map(float, values), strict=True)), noise) for values in grid for noise in noises]
+    grid = itertools.product(*arguments.values())
+    return [(dict(zip(arguments, values, strict=True)), noise) for values in grid for noise in noises]
 
 
 def run(algo: str, seed: int, timesteps: dict[str, int], episodes: int, out: Path) -> pd.DataFrame:
@@ -102,7 +110,7 @@ def run(algo: str, seed: int, timesteps: dict[str, int], episodes: int, out: Pat
     for study, (env_id, _, _) in _STUDIES.items():
         model = train_or_load(algo, env_id, seed, timesteps[env_id], out / "models" / f"{env_id}_{algo}_seed{seed}")
         for arguments, noise in conditions(study):
-            outcome = roll_out(model, gym.make(env_id, **arguments), episodes, noise)
+            outcome = roll_out(model, partial(gym.make, env_id, **arguments), episodes, noise)
             rows.append(
                 {
                     "study": study,

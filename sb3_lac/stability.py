@@ -1,28 +1,22 @@
 """Is the learned ``L`` a certificate? Statistics of the decrease condition along roll-outs of a policy."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
-from typing import Any, Literal, NamedTuple
+from typing import NamedTuple
 
 import gymnasium as gym
 import numpy as np
 import pandas as pd
 import torch as th
 from gymnasium import spaces
-from matplotlib.axes import Axes
-from matplotlib.axis import Axis
-from matplotlib.collections import LineCollection
-from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogFormatter
 from scipy.signal import lfilter
 from scipy.stats import binomtest, rankdata
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
+from sb3_lac import stability_plots
 from sb3_lac.lac import LAC
 
 Observations = np.ndarray | dict[str, np.ndarray]
@@ -30,8 +24,6 @@ Observations = np.ndarray | dict[str, np.ndarray]
 #: Transitions whose ``L`` is computed at once
 CHUNK_SIZE = 2048
 CONFIDENCE = 0.95
-#: Colours that colour-blind readers can tell apart (Okabe & Ito)
-BLUE, VERMILION, GREEN, ORANGE, GREY = "#0072b2", "#d55e00", "#009e73", "#e69f00", "#7f7f7f"
 
 
 class Estimate(NamedTuple):
@@ -46,64 +38,6 @@ class Estimate(NamedTuple):
     value: float
     low: float
     high: float
-
-
-NO_ESTIMATE = Estimate(math.nan, math.nan, math.nan)
-
-
-def new_figure(width: float, height: float) -> Figure:
-    """
-    An empty figure, outside pyplot's global state.
-
-    :param width: In inches
-    :param height: In inches
-    :return: The figure
-    """
-    return Figure(figsize=(width, height), dpi=150, layout="constrained")
-
-
-def is_wide(values: pd.Series | np.ndarray) -> bool:
-    """
-    Whether values are best shown on a logarithmic scale.
-
-    :param values: The values
-    :return: True if they are positive and span more than a decade
-    """
-    return 0 < 10 * values.min() < values.max()
-
-
-def set_log_scale(axes: Axes, which: Literal["x", "y"], values: pd.Series | np.ndarray) -> None:
-    """
-    Make an axis logarithmic if that suits its values.
-
-    :param axes: The panel
-    :param which: Which axis
-    :param values: Values on this axis
-    """
-    if is_wide(values):
-        axes.set(**{f"{which}scale": "log"})
-        format_log_axis(axes.xaxis if which == "x" else axes.yaxis)
-
-
-def format_log_axis(axis: Axis) -> None:
-    """
-    Label a logarithmic axis with numbers like 5 instead of powers like 5 * 10^0.
-
-    :param axis: The axis
-    """
-    axis.set_major_formatter("{x:g}")
-    axis.set_minor_formatter(LogFormatter())
-
-
-def add_legend(axes: Axes) -> None:
-    """
-    Add a legend with one entry per label, if there are labels.
-
-    :param axes: The panel
-    """
-    handles = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
-    if handles:
-        axes.legend(handles.values(), handles.keys(), fontsize=8)
 
 
 def prepare_evaluation(model: LAC, env: gym.Env | VecEnv, n_eval_episodes: int) -> VecEnv:
@@ -145,80 +79,29 @@ def normalization(vec_normalize: VecNormalize | None) -> str:
     return f"norm_obs={vec_normalize.norm_obs} and norm_reward={vec_normalize.norm_reward}"
 
 
-@contextmanager
-def frozen_normalization(vec_normalize: VecNormalize | None) -> Iterator[None]:
+def combine(function: Callable[[list[np.ndarray]], np.ndarray], observations: Sequence[Observations]) -> Observations:
     """
-    Keep the statistics of a ``VecNormalize`` wrapper as they are, so that all costs have the same units.
+    Make one batch of several observations or batches, of each key if they are dicts.
 
-    :param vec_normalize: The wrapper, if any
+    :param function: What to do with the arrays, like ``np.concatenate``
+    :param observations: At least one
+    :return: The batch
     """
-    if vec_normalize is None:
-        yield
-        return
-    training = vec_normalize.training
-    vec_normalize.training = False
-    try:
-        yield
-    finally:
-        vec_normalize.training = training
-
-
-def concatenate(batches: Sequence[Observations]) -> Observations:
-    """
-    Concatenate batches of observations.
-
-    :param batches: At least one batch
-    :return: All observations
-    """
-    first = batches[0]
+    first = observations[0]
     if isinstance(first, dict):
-        return {key: np.concatenate([batch[key] for batch in batches]) for key in first}
-    return np.concatenate(batches)  # type: ignore[arg-type]
+        return {key: function([observation[key] for observation in observations]) for key in first}
+    return function(list(observations))  # type: ignore[arg-type]
 
 
-def take(observations: Observations, rows: np.ndarray) -> Observations:
+def take(observations: Observations, rows: np.ndarray | slice) -> Observations:
     """
-    Copy some observations of a batch.
+    Choose some observations of a batch.
 
     :param observations: The batch
-    :param rows: Indices of the observations
+    :param rows: Which ones
     :return: The chosen ones
     """
-    if isinstance(observations, dict):
-        return {key: values[rows] for key, values in observations.items()}
-    return observations[rows]
-
-
-def add_batch_dimension(observation: Observations) -> Observations:
-    """
-    Make a batch of a single observation.
-
-    :param observation: The observation
-    :return: A batch of one
-    """
-    if isinstance(observation, dict):
-        return {key: np.asarray(value)[None] for key, value in observation.items()}
-    return np.asarray(observation)[None]
-
-
-def predict_in_chunks(model: LAC, observations: list[Observations], actions: list[np.ndarray]) -> np.ndarray:
-    """
-    Compute ``L`` of many small batches, with few passes of the critic and without one huge tensor.
-
-    :param model: The model
-    :param observations: Batches of observations
-    :param actions: Batches of actions
-    :return: All values
-    """
-    chunks = np.cumsum([len(batch) for batch in actions]) // CHUNK_SIZE
-    starts = np.append(np.unique(chunks, return_index=True)[1], len(chunks))
-    return np.concatenate(
-        [
-            model.policy.predict_lyapunov(concatenate(observations[start:end]), np.concatenate(actions[start:end]))
-            for start, end in pairwise(starts)
-        ],
-        dtype=np.float64,
-    )
+    return combine(lambda arrays: arrays[0][rows], [observations])
 
 
 def roll_out(model: LAC, env: VecEnv, n_eval_episodes: int, deterministic: bool) -> tuple[pd.DataFrame, np.ndarray | None]:
@@ -251,19 +134,23 @@ def roll_out(model: LAC, env: VecEnv, n_eval_episodes: int, deterministic: bool)
         actions_taken.append(actions[active])
         columns = {"reward": rewards, "done": dones, "truncated": truncated}
         steps.append({"env": active, **{name: column[active] for name, column in columns.items()}})
-        last_observations += [add_batch_dimension(infos[i]["terminal_observation"]) for i in active if truncated[i]]
+        last_observations += [infos[i]["terminal_observation"] for i in active if truncated[i]]
         counts += dones
         observations = new_observations
 
     transitions = pd.DataFrame({name: np.concatenate([step[name] for step in steps]) for name in steps[0]})
     transitions["reward"] = transitions["reward"].astype(np.float64)
-    transitions["lyapunov"] = predict_in_chunks(model, batches, actions_taken)
+    states, all_actions = combine(np.concatenate, batches), np.concatenate(actions_taken)
+    # Few passes of the critic, but not one huge tensor
+    chunks = [slice(start, start + CHUNK_SIZE) for start in range(0, len(all_actions), CHUNK_SIZE)]
+    values = [model.policy.predict_lyapunov(take(states, chunk), all_actions[chunk]) for chunk in chunks]
+    transitions["lyapunov"] = np.concatenate(values, dtype=np.float64)
     # The action in the last state of an episode that goes on is not taken
     transitions["last_lyapunov"] = np.nan
     if last_observations:
-        states = concatenate(last_observations)
-        last_actions, _ = model.predict(states, deterministic=deterministic)
-        transitions.loc[transitions["truncated"], "last_lyapunov"] = model.policy.predict_lyapunov(states, last_actions)
+        last_states = combine(np.stack, last_observations)
+        last_actions, _ = model.predict(last_states, deterministic=deterministic)
+        transitions.loc[transitions["truncated"], "last_lyapunov"] = model.policy.predict_lyapunov(last_states, last_actions)
 
     # From the order of time to one episode after the other
     order = np.argsort(transitions["env"], kind="stable")
@@ -277,7 +164,6 @@ def roll_out(model: LAC, env: VecEnv, n_eval_episodes: int, deterministic: bool)
     space = model.observation_space
     if not isinstance(space, spaces.Box) or len(space.shape) > 1:
         return transitions, None
-    states = concatenate(batches)
     assert isinstance(states, np.ndarray)
     return transitions, states[order].reshape((len(order), -1))
 
@@ -330,7 +216,7 @@ def summarize_episodes(transitions: pd.DataFrame) -> pd.DataFrame:
     )
 
 
-def divide(numerator: np.ndarray, denominator: np.ndarray) -> np.ndarray:
+def ratio(numerator: np.ndarray, denominator: np.ndarray) -> np.ndarray:
     """
     Divide where that is possible.
 
@@ -359,19 +245,19 @@ class Bootstrap:
         self.counts = self.rng.multinomial(n_episodes, np.full(n_episodes, 1 / n_episodes), size=n_samples)
 
     def estimate(
-        self, statistic: Callable[[np.ndarray], np.ndarray], episode: np.ndarray | pd.Series, *values: np.ndarray | pd.Series
+        self, statistic: Callable[..., np.ndarray], episode: np.ndarray | pd.Series, *values: np.ndarray | pd.Series
     ) -> Estimate:
         """
         Estimate a statistic.
 
-        :param statistic: Function of the sums of the values, which are in the first dimension of its argument
+        :param statistic: Function of the sums of the values
         :param episode: Episode that each value belongs to
         :param values: What to sum
         :return: The estimate
         """
         sums = np.stack([np.bincount(episode, value, minlength=self.n_episodes) for value in values])
-        samples = statistic(sums @ self.counts.T)
-        return interval(float(statistic(sums.sum(axis=1))), samples, len(np.unique(episode)))
+        samples = statistic(*(sums @ self.counts.T))
+        return interval(float(statistic(*sums.sum(axis=1))), samples, len(np.unique(episode)))
 
     def percentile(self, values: np.ndarray, percent: float) -> Estimate:
         """
@@ -382,7 +268,7 @@ class Bootstrap:
         :return: The estimate
         """
         if len(values) == 0:
-            return NO_ESTIMATE
+            return Estimate(math.nan, math.nan, math.nan)
         samples = np.percentile(self.rng.choice(values, size=(self.n_samples, len(values))), percent, axis=1)
         return interval(float(np.percentile(values, percent)), samples, len(values))
 
@@ -403,16 +289,6 @@ def interval(value: float, samples: np.ndarray, n_episodes: int) -> Estimate:
     return Estimate(value, float(low), float(high))
 
 
-def ratio(sums: np.ndarray) -> np.ndarray:
-    """
-    Ratio of two sums.
-
-    :param sums: The sums
-    :return: The ratio
-    """
-    return divide(sums[0], sums[1])
-
-
 def spread(n: np.ndarray, x: np.ndarray, xx: np.ndarray) -> np.ndarray:
     """
     Variance of x, times n^2.
@@ -426,44 +302,55 @@ def spread(n: np.ndarray, x: np.ndarray, xx: np.ndarray) -> np.ndarray:
     return np.where(result > 1e-12 * n * xx, result, 0.0)
 
 
-def slope(sums: np.ndarray) -> np.ndarray:
+def slope(n: np.ndarray, x: np.ndarray, y: np.ndarray, xx: np.ndarray, xy: np.ndarray, yy: np.ndarray) -> np.ndarray:
     """
-    Slope of the least squares line.
+    Slope of the least squares line, of sums as ``intercept()`` and ``correlation()``.
 
-    :param sums: Sums of 1, x, y, x^2, x * y, y^2
+    :param n: Number of values
+    :param x: Sum of x
+    :param y: Sum of y
+    :param xx: Sum of x^2
+    :param xy: Sum of x * y
+    :param yy: Sum of y^2
     :return: The slope
     """
-    n, x, y, xx, xy, _ = sums
-    return divide(n * xy - x * y, spread(n, x, xx))
+    return ratio(n * xy - x * y, spread(n, x, xx))
 
 
-def intercept(sums: np.ndarray) -> np.ndarray:
+def intercept(n: np.ndarray, x: np.ndarray, y: np.ndarray, *squares: np.ndarray) -> np.ndarray:
     """
     Intercept of the least squares line.
 
-    :param sums: Sums of 1, x, y, x^2, x * y, y^2
+    :param n: Number of values
+    :param x: Sum of x
+    :param y: Sum of y
+    :param squares: Sums of x^2, x * y and y^2
     :return: The intercept
     """
-    n, x, y, *_ = sums
-    return divide(y - slope(sums) * x, n)
+    return ratio(y - slope(n, x, y, *squares) * x, n)
 
 
-def correlation(sums: np.ndarray) -> np.ndarray:
+def correlation(n: np.ndarray, x: np.ndarray, y: np.ndarray, xx: np.ndarray, xy: np.ndarray, yy: np.ndarray) -> np.ndarray:
     """
     Pearson's correlation coefficient.
 
-    :param sums: Sums of 1, x, y, x^2, x * y, y^2
+    :param n: Number of values
+    :param x: Sum of x
+    :param y: Sum of y
+    :param xx: Sum of x^2
+    :param xy: Sum of x * y
+    :param yy: Sum of y^2
     :return: The coefficient
     """
-    n, x, y, xx, xy, yy = sums
-    return divide(n * xy - x * y, np.sqrt(spread(n, x, xx) * spread(n, y, yy)))
+    return ratio(n * xy - x * y, np.sqrt(spread(n, x, xx) * spread(n, y, yy)))
 
 
-def decrease_metrics(transitions: pd.DataFrame, bootstrap: Bootstrap) -> dict[str, Estimate]:
+def estimate_metrics(transitions: pd.DataFrame, episodes: pd.DataFrame, bootstrap: Bootstrap) -> dict[str, Estimate]:
     """
-    Statistics of the decrease condition, and the mean cost.
+    Estimate the metrics that ``evaluate_lyapunov()`` lists.
 
     :param transitions: One row per transition
+    :param episodes: One row per episode
     :param bootstrap: Bootstrap of the episodes
     :return: Estimates by name
     """
@@ -471,48 +358,25 @@ def decrease_metrics(transitions: pd.DataFrame, bootstrap: Bootstrap) -> dict[st
     known = transitions[~transitions["terminated"]]
     ones = np.ones(len(known))
     decreases = known["lyapunov"] - known["next_lyapunov"]
+
+    calibrated = transitions[transitions["cost_to_go"].notna()]
+    lyapunov, costs_to_go = calibrated["lyapunov"].to_numpy(), calibrated["cost_to_go"].to_numpy()
+
+    def compare(statistic: Callable[..., np.ndarray], x: np.ndarray, y: np.ndarray) -> Estimate:
+        return bootstrap.estimate(statistic, calibrated["episode"], np.ones(len(x)), x, y, x**2, x * y, y**2)
+
+    n_deaths = int(episodes["terminated"].sum())
+    # A bootstrap of no deaths would have no width
+    wilson = binomtest(n_deaths, len(episodes)).proportion_ci(CONFIDENCE, method="wilson")
     return {
         "decrease": bootstrap.estimate(ratio, known["episode"], known["difference"], ones),
         "share_decreasing": bootstrap.estimate(ratio, known["episode"], known["difference"] <= 0, ones),
         "largest_feasible_alpha3": bootstrap.estimate(ratio, known["episode"], decreases, known["cost"]),
         "mean_cost": bootstrap.estimate(ratio, transitions["episode"], transitions["cost"], np.ones(len(transitions))),
-    }
-
-
-def calibration_metrics(transitions: pd.DataFrame, bootstrap: Bootstrap) -> dict[str, Estimate]:
-    """
-    How well ``L`` agrees with the cost-to-go.
-
-    :param transitions: One row per transition
-    :param bootstrap: Bootstrap of the episodes
-    :return: Estimates by name
-    """
-    known = transitions[transitions["cost_to_go"].notna()]
-
-    def estimate(statistic: Callable[[np.ndarray], np.ndarray], x: np.ndarray, y: np.ndarray) -> Estimate:
-        return bootstrap.estimate(statistic, known["episode"], np.ones(len(x)), x, y, x**2, x * y, y**2)
-
-    lyapunov, costs_to_go = known["lyapunov"].to_numpy(), known["cost_to_go"].to_numpy()
-    return {
-        "calibration_slope": estimate(slope, lyapunov, costs_to_go),
-        "calibration_intercept": estimate(intercept, lyapunov, costs_to_go),
+        "calibration_slope": compare(slope, lyapunov, costs_to_go),
+        "calibration_intercept": compare(intercept, lyapunov, costs_to_go),
         # Spearman's correlation is Pearson's of the ranks, the bootstrap keeps the ranks among all transitions
-        "rank_correlation": estimate(correlation, rankdata(lyapunov), rankdata(costs_to_go)),
-    }
-
-
-def episode_metrics(episodes: pd.DataFrame, bootstrap: Bootstrap) -> dict[str, Estimate]:
-    """
-    Where the episodes end.
-
-    :param episodes: One row per episode
-    :param bootstrap: Bootstrap of the episodes
-    :return: Estimates by name
-    """
-    n_deaths = int(episodes["terminated"].sum())
-    # A bootstrap of no deaths would have no width
-    wilson = binomtest(n_deaths, len(episodes)).proportion_ci(CONFIDENCE, method="wilson")
-    return {
+        "rank_correlation": compare(correlation, rankdata(lyapunov), rankdata(costs_to_go)),
         "ultimate_bound": bootstrap.percentile(episodes.loc[~episodes["terminated"], "largest_late_cost"].to_numpy(), 95),
         "death_rate": Estimate(n_deaths / len(episodes), float(wilson.low), float(wilson.high)),
     }
@@ -638,71 +502,7 @@ class LyapunovReport:
 
         :return: The figure
         """
-        figure = new_figure(9.5, 7.0)
-        panels = figure.subplots(2, 2)
-        self._plot_episodes(panels[0, 0])
-        self._plot_by_cost(panels[0, 1])
-        self._plot_calibration(panels[1, 0])
-        self._plot_costs(panels[1, 1])
-        return figure
-
-    def _plot_episodes(self, axes: Axes) -> None:
-        # Few enough that each line can be followed
-        chosen = np.unique(np.linspace(0, len(self.episodes) - 1, 8).astype(int))
-        for number in chosen:
-            episode = self.transitions[self.transitions["episode"] == number]
-            axes.plot(episode["step"], episode["lyapunov"], color=BLUE, alpha=0.55, lw=1.1)
-            if self.episodes["terminated"].iloc[number]:
-                axes.plot(episode["step"].iloc[-1], episode["lyapunov"].iloc[-1], "x", color=VERMILION, label="died")
-        set_log_scale(axes, "y", self.transitions["lyapunov"])
-        axes.set(xlabel="step", ylabel="$L(s, a)$", title=f"L along {len(chosen)} episodes")
-        add_legend(axes)
-
-    def _plot_by_cost(self, axes: Axes) -> None:
-        table = self.by_cost
-        positions = np.arange(len(table))
-        axes.axhline(0, color="0.4", lw=1)
-        colours = np.select([table["decrease_high"] < 0, table["decrease_low"] > 0], [GREEN, VERMILION], GREY).tolist()
-        axes.vlines(positions, table["decrease_low"], table["decrease_high"], colors=colours, lw=2)
-        axes.scatter(positions, table["decrease"], c=colours, s=30, zorder=3)
-        labels = [f"{low:.2g}\nto {high:.2g}" for low, high in zip(table["cost_low"], table["cost_high"], strict=True)]
-        axes.set_xticks(positions, labels, fontsize=8)
-        axes.margins(x=0.1)
-        axes.set(
-            xlabel="cost of the transition",
-            ylabel=r"mean of $L(s', a') - L(s, a) + \alpha_3 c$",
-            title=f"Decrease condition by cost, alpha3={self.alpha3:g}",
-        )
-
-    def _plot_calibration(self, axes: Axes) -> None:
-        axes.set(xlabel="$L(s, a)$", ylabel="cost-to-go", title="L against the cost-to-go")
-        known = self.transitions[self.transitions["cost_to_go"].notna()]
-        if known.empty:
-            axes.text(0.5, 0.5, "no episode is long enough", transform=axes.transAxes, ha="center", color="0.4")
-            return
-        limits = [
-            min(known["lyapunov"].min(), known["cost_to_go"].min()),
-            max(known["lyapunov"].max(), known["cost_to_go"].max()),
-        ]
-        axes.plot(limits, limits, color="0.4", lw=1, label="identity", zorder=3)
-        # More points would only cover each other
-        shown = known.iloc[:: math.ceil(len(known) / 5000)]
-        axes.scatter(shown["lyapunov"], shown["cost_to_go"], s=4, color=BLUE, alpha=0.3, lw=0, rasterized=True)
-        set_log_scale(axes, "x", known["lyapunov"])
-        set_log_scale(axes, "y", known["cost_to_go"])
-        add_legend(axes)
-
-    def _plot_costs(self, axes: Axes) -> None:
-        low, median, high = self.transitions.groupby("step")["cost"].quantile(np.array([0.1, 0.5, 0.9])).unstack().to_numpy().T
-        steps = np.arange(len(median))
-        axes.fill_between(steps, low, high, color=BLUE, alpha=0.2, lw=0, label="10 % to 90 % of the episodes")
-        axes.plot(steps, median, color=BLUE, lw=1.4, label="median")
-        ultimate_bound = self.metrics["ultimate_bound"].value
-        if not math.isnan(ultimate_bound):
-            axes.axhline(ultimate_bound, color=ORANGE, ls="--", lw=1.2, label=f"ultimate bound {ultimate_bound:.2g}")
-        set_log_scale(axes, "y", low)
-        axes.set(xlabel="step", ylabel="cost", title="Costs over time")
-        add_legend(axes)
+        return stability_plots.plot_report(self)
 
     def plot_phase(self, x: int = 0, y: int = 1, names: Sequence[str] | None = None) -> Figure:
         """
@@ -713,41 +513,7 @@ class LyapunovReport:
         :param names: Names of all dimensions
         :return: The figure
         """
-        points = self._dimensions(x, y)
-        figure = new_figure(6.4, 5.2)
-        axes = figure.subplots()
-        lyapunov, episode = self.transitions["lyapunov"].to_numpy(), self.transitions["episode"].to_numpy()
-        inside = episode[1:] == episode[:-1]
-        lines = LineCollection(np.stack([points[:-1], points[1:]], axis=1)[inside], cmap="viridis_r", lw=0.9)
-        lines.set_array(lyapunov[:-1][inside])
-        if is_wide(lyapunov):
-            lines.set_norm(LogNorm())
-        axes.add_collection(lines)
-        ends = np.append(np.flatnonzero(~inside), len(points) - 1)
-        died = self.episodes["terminated"].to_numpy()
-        axes.scatter(
-            points[ends[~died], 0],
-            points[ends[~died], 1],
-            s=16,
-            color="black",
-            zorder=3,
-            label=f"end, survived ({np.sum(~died)})",
-        )
-        axes.scatter(
-            points[ends[died], 0],
-            points[ends[died], 1],
-            s=28,
-            color=VERMILION,
-            marker="x",
-            zorder=3,
-            label=f"end, died ({np.sum(died)})",
-        )
-        bar = figure.colorbar(lines, ax=axes, label="$L(s, a)$")
-        if is_wide(lyapunov):
-            format_log_axis(bar.ax.yaxis)
-        axes.set(title=f"Trajectories of {len(self.episodes)} episodes", **self._labels(x, y, names))
-        figure.legend(loc="outside lower center", ncols=2, fontsize=8)
-        return figure
+        return stability_plots.plot_phase(self, x, y, names)
 
     def plot_region_of_attraction(
         self, x: int = 0, y: int = 1, names: Sequence[str] | None = None, threshold: float | None = None
@@ -762,61 +528,7 @@ class LyapunovReport:
         :param threshold: An episode has settled if no cost in its last fifth is larger, ``ultimate_bound`` by default
         :return: The figure
         """
-        points = self._dimensions(x, y)
-        if threshold is None:
-            threshold = self.metrics["ultimate_bound"].value
-        starts = (self.transitions["step"] == 0).to_numpy()
-        points, lyapunov = points[starts], self.transitions["lyapunov"].to_numpy()[starts]
-        died = self.episodes["terminated"].to_numpy()
-        settled = ~died & (self.episodes["largest_late_cost"].to_numpy() <= threshold)
-
-        figure = new_figure(6.4, 5.2)
-        axes = figure.subplots()
-        # A triangulation needs points that are neither few nor on one line
-        distinct, first = np.unique(points, axis=0, return_index=True)
-        if len(distinct) >= 10 and np.linalg.matrix_rank(distinct - distinct.mean(axis=0)) == 2:
-            levels = axes.tricontourf(distinct[:, 0], distinct[:, 1], lyapunov[first], levels=12, cmap="Blues")
-            figure.colorbar(levels, ax=axes, label="$L(s, a)$ at the start")
-        for chosen, label, colour, marker in (
-            (settled, "settled", GREEN, "o"),
-            (~settled & ~died, "not settled", ORANGE, "s"),
-            (died, "died", VERMILION, "X"),
-        ):
-            label = f"{label} ({np.sum(chosen)})"
-            axes.scatter(
-                points[chosen, 0], points[chosen, 1], s=30, color=colour, marker=marker, edgecolor="white", lw=0.6, label=label
-            )
-        # Contours end at the outermost points, whose markers would be cut
-        axes.use_sticky_edges = False
-        axes.set(title=f"What became of {len(points)} start states", **self._labels(x, y, names))
-        figure.legend(loc="outside lower center", ncols=3, fontsize=8)
-        return figure
-
-    def _dimensions(self, x: int, y: int) -> np.ndarray:
-        """
-        Two dimensions of the observations.
-
-        :param x: First dimension
-        :param y: Second dimension
-        :return: Array with two columns
-        """
-        if self.observations is None:
-            raise ValueError("This figure needs observations that are vectors (a Box space with at most one dimension).")
-        n_dims = self.observations.shape[1]
-        if not (0 <= x < n_dims and 0 <= y < n_dims):
-            raise ValueError(
-                f"x={x} and y={y} must lie between 0 and {n_dims - 1}, the observations have {n_dims} dimensions."
-            )
-        return self.observations[:, [x, y]]
-
-    def _labels(self, x: int, y: int, names: Sequence[str] | None) -> dict[str, Any]:
-        assert self.observations is not None
-        n_dims = self.observations.shape[1]
-        if names is None:
-            names = [f"observation {k}" for k in range(n_dims)]
-        if len(names) != n_dims:
-            raise ValueError(f"names={list(names)} must name all {n_dims} dimensions of the observations.")
-        return {"xlabel": names[x], "ylabel": names[y]}
+        return stability_plots.plot_region_of_attraction(self, x, y, names, threshold)
 
 
 def evaluate_lyapunov(
@@ -879,17 +591,25 @@ def evaluate_lyapunov(
     if n_cost_levels < 1 or n_bootstrap < 1:
         raise ValueError(f"n_cost_levels={n_cost_levels} and n_bootstrap={n_bootstrap} must be at least 1.")
 
+    vec_normalize = unwrap_vec_normalize(env)
     if seed is not None:
         env.seed(seed)
     # A training goes on as if there had been no evaluation
     with th.random.fork_rng(devices=[model.device] if model.device.type == "cuda" else []):
         if seed is not None:
             th.manual_seed(seed)
-        with frozen_normalization(unwrap_vec_normalize(env)):
+        training = vec_normalize is not None and vec_normalize.training
+        try:
+            # All costs have the same units
+            if vec_normalize is not None:
+                vec_normalize.training = False
             transitions, observations = roll_out(model, env, n_eval_episodes, deterministic)
+        finally:
+            if vec_normalize is not None:
+                vec_normalize.training = training
 
     # A reward above all those of the training would have a negative cost, which L cannot learn
-    bound = float(model.cost_bound(unwrap_vec_normalize(env)))
+    bound = float(model.cost_bound(vec_normalize))
     transitions["cost"] = np.maximum(bound - transitions["reward"], 0.0)
     transitions["difference"] = transitions["next_lyapunov"] - transitions["lyapunov"] + alpha3 * transitions["cost"]
     transitions["cost_to_go"] = cost_to_go(transitions, model.gamma, model.horizon, max_tail_weight)
@@ -902,11 +622,7 @@ def evaluate_lyapunov(
         transitions=transitions,
         episodes=episodes,
         observations=observations,
-        metrics={
-            **decrease_metrics(transitions, bootstrap),
-            **calibration_metrics(transitions, bootstrap),
-            **episode_metrics(episodes, bootstrap),
-        },
+        metrics=estimate_metrics(transitions, episodes, bootstrap),
         by_cost=decrease_by_cost(transitions, n_cost_levels, bootstrap),
         alpha3=alpha3,
         gamma=model.gamma,

@@ -7,6 +7,8 @@ from pathlib import Path
 import gymnasium as gym
 import pytest
 
+import sb3_lac  # noqa: F401  (registers all environments)
+
 ROOT = Path(__file__).parents[1]
 
 
@@ -44,5 +46,6 @@ def test_packages_are_typed(package):
 def test_every_environment_has_tuned_hyperparameters(algo):
     yaml = pytest.importorskip("yaml")
     config = yaml.safe_load((ROOT / "zoo_configs" / f"{algo}.yml").read_text())
-    ids = {env_id for env_id, spec in gym.registry.items() if str(spec.entry_point).startswith("battery_env.")}
+    packages = ("battery_env.", "sb3_lac.envs.")
+    ids = {env_id for env_id, spec in gym.registry.items() if str(spec.entry_point).startswith(packages)}
     assert ids and ids | {"default"} <= set(config)

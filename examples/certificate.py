@@ -1,0 +1,41 @@
+"""Train LAC to balance a pole, and look at what its Lyapunov function is worth as a certificate."""
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from torch import nn
+
+from sb3_lac import LAC, evaluate_lyapunov
+
+model = LAC(
+    "MlpPolicy",
+    "CartPoleCost-v0",
+    learning_starts=1000,
+    policy_kwargs={"net_arch": [64, 64], "activation_fn": nn.LeakyReLU},
+    seed=0,
+)
+model.learn(10_000, progress_bar=False)
+
+
+class WideStarts(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]):
+    """Starts far beyond those of the training, so that some of them are lost."""
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=seed)
+        return self.env.reset(options={"state": self.np_random.uniform(-1.0, 1.0, 4) * (5.0, 2.0, 0.3, 3.0)})
+
+
+folder = Path("results/certificate")
+folder.mkdir(parents=True, exist_ok=True)
+names = ["x (m)", "dx/dt (m/s)", "theta (rad)", "dtheta/dt (rad/s)"]
+
+# Episodes of 600 steps: with a discount of 0.99, costs beyond them count for little
+report = evaluate_lyapunov(model, gym.make("CartPoleCost-v0", max_episode_steps=600), n_eval_episodes=50, seed=1)
+print(report.summary())
+report.plot().savefig(folder / "certificate.png")
+report.plot_phase(2, 3, names).savefig(folder / "phase.png")
+
+wide = evaluate_lyapunov(model, WideStarts(gym.make("CartPoleCost-v0")), n_eval_episodes=300, deterministic=True, seed=1)
+wide.plot_region_of_attraction(2, 3, names).savefig(folder / "region_of_attraction.png")

@@ -1,0 +1,279 @@
+"""Figures of a ``LyapunovReport``."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.collections import LineCollection
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter
+
+if TYPE_CHECKING:
+    from sb3_lac.stability import LyapunovReport
+
+#: Colours that colour-blind readers can tell apart (Okabe & Ito)
+BLUE, VERMILION, GREEN, ORANGE, GREY = "#0072b2", "#d55e00", "#009e73", "#e69f00", "#7f7f7f"
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """
+    An empty figure, outside pyplot's global state.
+
+    :param width: In inches
+    :param height: In inches
+    :return: The figure
+    """
+    return Figure(figsize=(width, height), dpi=150, layout="constrained")
+
+
+def is_wide(values: pd.Series | np.ndarray) -> bool:
+    """
+    Whether values are best shown on a logarithmic scale.
+
+    :param values: The values
+    :return: True if they are positive and span more than a decade
+    """
+    return 0 < 10 * values.min() < values.max()
+
+
+def format_log_axis(axis: Axis) -> None:
+    """
+    Label a logarithmic axis with numbers like 5 instead of powers like 5 * 10^0.
+
+    :param axis: The axis
+    """
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter(LogFormatter())
+
+
+def set_log_scale(axes: Axes, which: Literal["x", "y"], values: pd.Series | np.ndarray) -> None:
+    """
+    Make an axis logarithmic if that suits its values.
+
+    :param axes: The panel
+    :param which: Which axis
+    :param values: Values on this axis
+    """
+    if is_wide(values):
+        axes.set(**{f"{which}scale": "log"})
+        format_log_axis(axes.xaxis if which == "x" else axes.yaxis)
+
+
+def project(report: LyapunovReport, x: int, y: int, names: Sequence[str] | None) -> tuple[np.ndarray, dict[str, Any]]:
+    """
+    Two dimensions of the observations, and the labels of their axes.
+
+    :param report: The report
+    :param x: First dimension
+    :param y: Second dimension
+    :param names: Names of all dimensions
+    :return: Array with two columns, and arguments for ``axes.set()``
+    """
+    if report.observations is None:
+        raise ValueError("This figure needs observations that are vectors (a Box space with at most one dimension).")
+    n_dims = report.observations.shape[1]
+    if not (0 <= x < n_dims and 0 <= y < n_dims):
+        raise ValueError(f"x={x} and y={y} must lie between 0 and {n_dims - 1}, the observations have {n_dims} dimensions.")
+    if names is None:
+        names = [f"observation {k}" for k in range(n_dims)]
+    if len(names) != n_dims:
+        raise ValueError(f"names={list(names)} must name all {n_dims} dimensions of the observations.")
+    return report.observations[:, [x, y]], {"xlabel": names[x], "ylabel": names[y]}
+
+
+def scatter_groups(axes: Axes, points: np.ndarray, groups: Sequence[tuple[np.ndarray, str, dict[str, Any]]]) -> None:
+    """
+    Mark groups of points, with their sizes in a legend below the panel.
+
+    :param axes: The only panel of its figure
+    :param points: All points, shape (n, 2)
+    :param groups: Which points, label and style of each group
+    """
+    for chosen, label, style in groups:
+        axes.scatter(points[chosen, 0], points[chosen, 1], label=f"{label} ({np.sum(chosen)})", zorder=3, **style)
+    axes.figure.legend(loc="outside lower center", ncols=len(groups), fontsize=8)
+
+
+def draw_episodes(report: LyapunovReport, axes: Axes) -> None:
+    """
+    Draw ``L`` along some episodes.
+
+    :param report: The report
+    :param axes: The panel
+    """
+    # Few enough that each line can be followed
+    chosen = np.unique(np.linspace(0, len(report.episodes) - 1, 8).astype(int))
+    transitions = report.transitions[report.transitions["episode"].isin(chosen)]
+    for _, episode in transitions.groupby("episode"):
+        axes.plot(episode["step"], episode["lyapunov"], color=BLUE, alpha=0.55, lw=1.1)
+    deaths = transitions[transitions["terminated"]]
+    if not deaths.empty:
+        axes.scatter(deaths["step"], deaths["lyapunov"], s=36, color=VERMILION, marker="x", lw=1, zorder=3, label="died")
+        axes.legend(fontsize=8)
+    set_log_scale(axes, "y", report.transitions["lyapunov"])
+    axes.set(xlabel="step", ylabel="$L(s, a)$", title=f"L along {len(chosen)} episodes")
+
+
+def draw_by_cost(report: LyapunovReport, axes: Axes) -> None:
+    """
+    Draw the decrease condition by level of the cost.
+
+    :param report: The report
+    :param axes: The panel
+    """
+    table = report.by_cost
+    positions = np.arange(len(table))
+    axes.axhline(0, color="0.4", lw=1)
+    colours = np.select([table["decrease_high"] < 0, table["decrease_low"] > 0], [GREEN, VERMILION], GREY).tolist()
+    axes.vlines(positions, table["decrease_low"], table["decrease_high"], colors=colours, lw=2)
+    axes.scatter(positions, table["decrease"], c=colours, s=30, zorder=3)
+    labels = [f"{low:.2g}\nto {high:.2g}" for low, high in zip(table["cost_low"], table["cost_high"], strict=True)]
+    axes.set_xticks(positions, labels, fontsize=8)
+    axes.margins(x=0.1)
+    axes.set(
+        xlabel="cost of the transition",
+        ylabel=r"mean of $L(s', a') - L(s, a) + \alpha_3 c$",
+        title=f"Decrease condition by cost, alpha3={report.alpha3:g}",
+    )
+
+
+def draw_calibration(report: LyapunovReport, axes: Axes) -> None:
+    """
+    Draw ``L`` against the cost-to-go.
+
+    :param report: The report
+    :param axes: The panel
+    """
+    axes.set(xlabel="$L(s, a)$", ylabel="cost-to-go", title="L against the cost-to-go")
+    known = report.transitions.loc[report.transitions["cost_to_go"].notna(), ["lyapunov", "cost_to_go"]]
+    if known.empty:
+        axes.text(0.5, 0.5, "no episode is long enough", transform=axes.transAxes, ha="center", color="0.4")
+        return
+    limits = [known.to_numpy().min(), known.to_numpy().max()]
+    axes.plot(limits, limits, color="0.4", lw=1, label="identity", zorder=3)
+    # More points would only cover each other
+    shown = known.iloc[:: math.ceil(len(known) / 5000)]
+    axes.scatter(shown["lyapunov"], shown["cost_to_go"], s=4, color=BLUE, alpha=0.3, lw=0, rasterized=True)
+    set_log_scale(axes, "x", known["lyapunov"])
+    set_log_scale(axes, "y", known["cost_to_go"])
+    axes.legend(fontsize=8)
+
+
+def draw_costs(report: LyapunovReport, axes: Axes) -> None:
+    """
+    Draw the costs over time.
+
+    :param report: The report
+    :param axes: The panel
+    """
+    low, median, high = report.transitions.groupby("step")["cost"].quantile(np.array([0.1, 0.5, 0.9])).unstack().to_numpy().T
+    steps = np.arange(len(median))
+    axes.fill_between(steps, low, high, color=BLUE, alpha=0.2, lw=0, label="10 % to 90 % of the episodes")
+    axes.plot(steps, median, color=BLUE, lw=1.4, label="median")
+    ultimate_bound = report.metrics["ultimate_bound"].value
+    if not math.isnan(ultimate_bound):
+        axes.axhline(ultimate_bound, color=ORANGE, ls="--", lw=1.2, label=f"ultimate bound {ultimate_bound:.2g}")
+    set_log_scale(axes, "y", low)
+    axes.set(xlabel="step", ylabel="cost", title="Costs over time")
+    axes.legend(fontsize=8)
+
+
+def plot_report(report: LyapunovReport) -> Figure:
+    """
+    See ``LyapunovReport.plot()``.
+
+    :param report: The report
+    :return: The figure
+    """
+    figure = new_figure(9.5, 7.0)
+    panels = figure.subplots(2, 2).flat
+    for draw, axes in zip((draw_episodes, draw_by_cost, draw_calibration, draw_costs), panels, strict=True):
+        draw(report, axes)
+    return figure
+
+
+def plot_phase(report: LyapunovReport, x: int, y: int, names: Sequence[str] | None) -> Figure:
+    """
+    See ``LyapunovReport.plot_phase()``.
+
+    :param report: The report
+    :param x: Dimension of the observation on the horizontal axis
+    :param y: Dimension of the observation on the vertical axis
+    :param names: Names of all dimensions
+    :return: The figure
+    """
+    points, labels = project(report, x, y, names)
+    figure = new_figure(6.4, 5.2)
+    axes = figure.subplots()
+    lyapunov, episode = report.transitions["lyapunov"].to_numpy(), report.transitions["episode"].to_numpy()
+    inside = episode[1:] == episode[:-1]
+    lines = LineCollection(np.stack([points[:-1], points[1:]], axis=1)[inside], cmap="viridis_r", lw=0.9)
+    lines.set_array(lyapunov[:-1][inside])
+    if is_wide(lyapunov):
+        lines.set_norm(LogNorm())
+    axes.add_collection(lines)
+    bar = figure.colorbar(lines, ax=axes, label="$L(s, a)$")
+    if is_wide(lyapunov):
+        format_log_axis(bar.ax.yaxis)
+    died = report.episodes["terminated"].to_numpy()
+    scatter_groups(
+        axes,
+        points[np.append(~inside, True)],
+        [
+            (~died, "end, survived", {"s": 16, "color": "black"}),
+            (died, "end, died", {"s": 28, "color": VERMILION, "marker": "x"}),
+        ],
+    )
+    axes.set(title=f"Trajectories of {len(report.episodes)} episodes", **labels)
+    return figure
+
+
+def plot_region_of_attraction(
+    report: LyapunovReport, x: int, y: int, names: Sequence[str] | None, threshold: float | None
+) -> Figure:
+    """
+    See ``LyapunovReport.plot_region_of_attraction()``.
+
+    :param report: The report
+    :param x: Dimension of the observation on the horizontal axis
+    :param y: Dimension of the observation on the vertical axis
+    :param names: Names of all dimensions
+    :param threshold: An episode has settled if no cost in its last fifth is larger, ``ultimate_bound`` by default
+    :return: The figure
+    """
+    points, labels = project(report, x, y, names)
+    if threshold is None:
+        threshold = report.metrics["ultimate_bound"].value
+    starts = (report.transitions["step"] == 0).to_numpy()
+    points, lyapunov = points[starts], report.transitions["lyapunov"].to_numpy()[starts]
+    died = report.episodes["terminated"].to_numpy()
+    settled = ~died & (report.episodes["largest_late_cost"].to_numpy() <= threshold)
+
+    figure = new_figure(6.4, 5.2)
+    axes = figure.subplots()
+    # A triangulation needs points that are neither few nor on one line
+    distinct, first = np.unique(points, axis=0, return_index=True)
+    if len(distinct) >= 10 and np.linalg.matrix_rank(distinct - distinct.mean(axis=0)) == 2:
+        levels = axes.tricontourf(distinct[:, 0], distinct[:, 1], lyapunov[first], levels=12, cmap="Blues")
+        figure.colorbar(levels, ax=axes, label="$L(s, a)$ at the start")
+    style = {"s": 30, "edgecolor": "white", "lw": 0.6}
+    scatter_groups(
+        axes,
+        points,
+        [
+            (settled, "settled", {"color": GREEN, "marker": "o", **style}),
+            (~settled & ~died, "not settled", {"color": ORANGE, "marker": "s", **style}),
+            (died, "died", {"color": VERMILION, "marker": "X", **style}),
+        ],
+    )
+    # Contours end at the outermost points, whose markers would be cut
+    axes.use_sticky_edges = False
+    axes.set(title=f"What became of {len(points)} start states", **labels)
+    return figure

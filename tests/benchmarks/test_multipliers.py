@@ -1,0 +1,97 @@
+"""Each combination is trained as asked, and what came out is in the table, the figure and the report."""
+
+import json
+
+import pandas as pd
+import pytest
+
+from benchmarks import multipliers
+from sb3_lac import LAC
+
+ENV_ID = "LinearCost-v0"
+
+
+@pytest.fixture(autouse=True)
+def trained(monkeypatch):
+    """Policies that are not trained; returns what was asked to be trained."""
+    calls = []
+
+    def train_or_load(algo, env_id, seed, timesteps, folder, hyperparameters):
+        calls.append((algo, env_id, seed, timesteps, folder, hyperparameters))
+        return LAC(
+            "MlpPolicy", env_id, seed=seed, device="cpu", buffer_size=10, policy_kwargs={"net_arch": [8]}, **hyperparameters
+        )
+
+    monkeypatch.setattr(multipliers, "train_or_load", train_or_load)
+    monkeypatch.setattr(multipliers, "_EPISODES", 2)
+    return calls
+
+
+def test_a_run_trains_with_its_combination(tmp_path, trained):
+    row = multipliers.run(ENV_ID, 0.3, 4.0, 7, tmp_path)
+    ((algo, env_id, seed, timesteps, folder, hyperparameters),) = trained
+    assert (algo, env_id, seed, timesteps) == ("lac", ENV_ID, 7, multipliers._TIMESTEPS[ENV_ID])
+    assert hyperparameters == {"alpha3": 0.3, "lambda_max": 4.0, "lambda_init": 4.0}
+    assert (row["env"], row["alpha3"], row["lambda_max"], row["seed"]) == (ENV_ID, 0.3, 4.0, 7)
+    # nothing was learned: lambda is where it started, and nobody dies here
+    assert row["lambda"] == pytest.approx(4.0) and row["death_rate"] == 0 and row["cost"] > 0
+    # no two combinations share a folder
+    folders = {folder}
+    for arguments in ((ENV_ID, 0.1, 4.0, 7), (ENV_ID, 0.3, 1.0, 7), (ENV_ID, 0.3, 4.0, 8)):
+        multipliers.run(*arguments, tmp_path)
+        folders.add(trained[-1][4])
+    assert len(folders) == 4
+
+
+def test_the_same_run_has_the_same_result(tmp_path):
+    assert multipliers.run(ENV_ID, 0.3, 1.0, 0, tmp_path) == multipliers.run(ENV_ID, 0.3, 1.0, 0, tmp_path)
+
+
+def test_table_figure_and_report_are_written(tmp_path, trained, capsys):
+    command = ["--envs", ENV_ID, "--alpha3", "0.1", "1.0", "--lambda-max", "2.0", "--seeds", "0", "1", "--jobs", "1"]
+    multipliers.main([*command, "--out", str(tmp_path)])
+    assert len(trained) == 4
+    table = pd.read_csv(tmp_path / "multipliers.csv")
+    assert table[["alpha3", "lambda_max", "seed"]].to_numpy().tolist() == [[0.1, 2, 0], [1, 2, 0], [0.1, 2, 1], [1, 2, 1]]
+    record = json.loads((tmp_path / "multipliers.json").read_text())
+    assert record["configuration"]["timesteps"] == multipliers._TIMESTEPS and record["configuration"]["alpha3"] == [0.1, 1.0]
+    assert (tmp_path / "multipliers.png").stat().st_size > 0
+    text = (tmp_path / "multipliers.md").read_text()
+    assert text in capsys.readouterr().out and text.count(ENV_ID) == 2
+
+
+def test_report_has_medians_over_seeds():
+    results = pd.DataFrame(
+        {"env": ENV_ID, "alpha3": 0.1, "lambda_max": 1.0, "seed": [0, 1, 2], "cost": [1.0, 9.0, 2.0], "death_rate": 0.0}
+        | {"lambda": [0.25, 0.5, 0.75], "decrease": -3.0, "largest_feasible_alpha3": 0.125}
+    )
+    _, _, line = multipliers.report(results).strip().splitlines()
+    cells = [cell.strip() for cell in line.strip("|").split("|")]
+    assert cells == [ENV_ID, "0.1", "1", "2", "1 to 9", "0", "0.5", "-3", "0.125"]
+
+
+def test_figure_has_one_column_per_environment():
+    results = pd.DataFrame(
+        [
+            {"env": env_id, "alpha3": alpha3, "lambda_max": lambda_max, "seed": seed, "cost": 1.0 + seed, "lambda": lambda_max}
+            for env_id in ("LinearCost-v0", "Oscillator-v0")
+            for alpha3 in (0.1, 1.0)
+            for lambda_max in (0.1, 10.0)
+            for seed in (0, 1)
+        ]
+    )
+    figure = multipliers.plot(results)
+    assert [axes.get_title() for axes in figure.axes] == ["LinearCost-v0", "Oscillator-v0", "", ""]
+    line, _ = figure.axes[0].get_lines()
+    assert line.get_xydata().tolist() == [[0.1, 1.5], [1.0, 1.5]] and line.get_label() == "lambda_max = 0.1"
+    # lambda, relative to its limit
+    assert figure.axes[2].get_lines()[1].get_ydata().tolist() == [1.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    "command", [["--envs", "Pendulum-v1"], ["--alpha3", "0.5", "0"], ["--lambda-max", "-1"], ["--jobs", "0"]]
+)
+def test_nonsense_on_the_command_line_is_refused(command, trained):
+    with pytest.raises(SystemExit):
+        multipliers.main(command)
+    assert not trained

@@ -1,0 +1,100 @@
+"""The models take turns, the shares of a profile are complete, and both are written."""
+
+import itertools
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch as th
+
+from benchmarks import throughput
+
+ENV_ID = "LinearCost-v0"
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    """Few transitions, and the threads of torch as they were."""
+    threads = th.get_num_threads()
+    monkeypatch.setattr(throughput, "_TRANSITIONS", 40)
+    monkeypatch.setattr(throughput, "_WARM_UP_UPDATES", 1)
+    yield
+    th.set_num_threads(threads)
+
+
+def test_models_take_turns_in_alternating_order(monkeypatch):
+    clock, calls = itertools.count(), []
+    monkeypatch.setattr(throughput.time, "perf_counter", lambda: clock.__next__())
+
+    class Model:
+        def __init__(self, name, seconds):
+            self.name, self.seconds = name, seconds
+
+        def train(self, gradient_steps, batch_size):
+            calls.append((self.name, gradient_steps, batch_size))
+            for _ in range(self.seconds - 1):
+                next(clock)
+
+    models = {"LAC": Model("LAC", 2), "SAC": Model("SAC", 4), "TD3": Model("TD3", 1)}
+    speeds = throughput.measure(models, 4, 8, 16)
+    assert [name for name, _, _ in calls] == ["LAC", "SAC", "TD3", "TD3", "SAC", "LAC"] * 2
+    assert {call[1:] for call in calls} == {(8, 16)}
+    # updates divided by seconds
+    pd.testing.assert_frame_equal(speeds, pd.DataFrame({"LAC": [4.0] * 4, "SAC": [2.0] * 4, "TD3": [8.0] * 4}))
+
+
+@pytest.mark.parametrize("algo", list(throughput._ALGORITHMS))
+def test_models_are_ready_for_updates_and_equal_in_size(algo):
+    model = throughput.filled_model(algo, ENV_ID, [8, 4], 16)
+    assert type(model).__name__ == algo and model.replay_buffer.full and model._n_updates == 1
+    for network in (model.actor, model.critic):
+        # the first layer of each network
+        assert any(isinstance(layer, th.nn.Linear) and layer.out_features == 8 for layer in network.modules())
+
+
+def test_shares_of_the_time_are_complete():
+    model = throughput.filled_model("LAC", ENV_ID, [8], 16)
+    shares = throughput.profile(model, 2, 16)
+    assert list(shares) == [*throughput._PARTS, "Python"]
+    assert sum(shares.values()) == pytest.approx(1.0)
+    assert all(0 <= share <= 1 for share in shares.values())
+    assert shares["matrix products"] > 0 and shares["autograd"] > 0 and shares["optimizers and target networks"] > 0
+    assert model._n_updates == 3
+
+
+def test_report_compares_within_each_round():
+    # the machine is half as fast in the second round: the ratio does not care
+    speeds = pd.DataFrame({"LAC": [100.0, 50.0], "SAC": [50.0, 25.0], "TD3": [200.0, 100.0]})
+    parts = pd.DataFrame({"Python": [0.25, 0.5], "autograd": [0.75, 0.5]}, index=["LAC", "SAC"])
+    text = throughput.report(speeds, parts)
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line]
+    assert rows[2:5] == [
+        ["LAC", "75.0 (62.5 to 87.5)", "1.00 (1.00 to 1.00)"],
+        ["SAC", "37.5 (31.2 to 43.8)", "2.00 (2.00 to 2.00)"],
+        ["TD3", "150.0 (125.0 to 175.0)", "0.50 (0.50 to 0.50)"],
+    ]
+    assert rows[5] == ["share of the time", "Python", "autograd"] and rows[7:] == [
+        ["LAC", "25 %", "75 %"],
+        ["SAC", "50 %", "50 %"],
+    ]
+
+
+def test_tables_are_written(tmp_path, capsys):
+    command = ["--rounds", "2", "--updates", "1", "--env", ENV_ID, "--net-arch", "8", "--batch-size", "8"]
+    throughput.main([*command, "--out", str(tmp_path)])
+    speeds = pd.read_csv(tmp_path / "updates.csv")
+    assert list(speeds) == ["LAC", "SAC", "TD3"] and len(speeds) == 2 and (speeds > 0).all(axis=None)
+    profile = pd.read_csv(tmp_path / "updates_profile.csv", index_col="algorithm")
+    assert list(profile.index) == ["LAC", "SAC", "TD3"]
+    np.testing.assert_allclose(profile.sum(axis=1), 1.0, atol=1e-4)
+    record = json.loads((tmp_path / "updates.json").read_text())
+    assert record["configuration"]["net_arch"] == [8] and record["configuration"]["threads"] == 1
+    assert (tmp_path / "updates.md").read_text() in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("option", ["--rounds", "--updates", "--net-arch", "--batch-size", "--threads"])
+def test_nonsense_on_the_command_line_is_refused(option, capsys):
+    with pytest.raises(SystemExit):
+        throughput.main([option, "0"])
+    assert "must be at least 1" in capsys.readouterr().err

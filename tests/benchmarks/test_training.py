@@ -1,0 +1,106 @@
+"""A policy is trained once, with the hyperparameters it should have; runs side by side come back in order."""
+
+import operator
+import os
+
+import numpy as np
+import pytest
+import torch as th
+
+from benchmarks import training
+from sb3_lac import LAC
+
+ENV_ID = "LinearCost-v0"
+CONFIG = """
+LinearCost-v0:
+  policy: 'MlpPolicy'
+  n_timesteps: 40
+  learning_starts: 20
+  batch_size: 8
+  buffer_size: 100
+  alpha3: 0.7
+  policy_kwargs: "dict(net_arch=[8])"
+"""
+
+
+@pytest.fixture(autouse=True)
+def trainings(tmp_path, monkeypatch):
+    """Tiny networks, and a list of the seeds that were trained with."""
+    (tmp_path / "zoo_configs").mkdir()
+    (tmp_path / "zoo_configs" / "lac.yml").write_text(CONFIG)
+    monkeypatch.chdir(tmp_path)
+    seeds = []
+
+    class Manager(training.LACExperimentManager):
+        def __init__(self, *args, **kwargs):
+            seeds.append(kwargs["seed"])
+            super().__init__(*args, **kwargs)
+
+    monkeypatch.setattr(training, "LACExperimentManager", Manager)
+    return seeds
+
+
+def parameters(model):
+    return np.concatenate([values.detach().numpy().ravel() for values in model.policy.parameters()])
+
+
+def test_a_policy_is_trained_once(tmp_path, trainings):
+    first = training.train_or_load("lac", ENV_ID, 0, 40, tmp_path / "run")
+    assert isinstance(first, LAC) and first.num_timesteps == 40 and trainings == [0]
+    assert {path.name for path in (tmp_path / "run").glob("*.*")} == {"model_40.zip", "progress.csv"}
+    again = training.train_or_load("lac", ENV_ID, 0, 40, tmp_path / "run")
+    assert trainings == [0]
+    np.testing.assert_array_equal(parameters(again), parameters(first))
+    # another length is another policy
+    assert training.train_or_load("lac", ENV_ID, 0, 25, tmp_path / "run").num_timesteps == 25
+    assert trainings == [0, 0]
+
+
+def test_the_seed_decides_everything(tmp_path):
+    models = []
+    for number, seed in enumerate((3, 3, 4)):
+        th.rand(number)
+        models.append(training.train_or_load("lac", ENV_ID, seed, 30, tmp_path / f"run{number}"))
+    np.testing.assert_array_equal(parameters(models[0]), parameters(models[1]))
+    assert (parameters(models[0]) != parameters(models[2])).any()
+
+
+def test_hyperparameters_are_those_of_zoo_configs_where_none_are_given(tmp_path):
+    default = training.train_or_load("lac", ENV_ID, 0, 25, tmp_path / "default")
+    assert (default.alpha3, default.batch_size, default.policy_kwargs["net_arch"]) == (0.7, 8, [8])
+    other = training.train_or_load("lac", ENV_ID, 0, 25, tmp_path / "other", {"alpha3": 0.2, "lambda_max": 5.0})
+    assert (other.alpha3, other.lambda_max) == (0.2, 5.0)
+    assert (other.batch_size, other.policy_kwargs["net_arch"]) == (8, [8])
+
+
+def test_an_interrupted_training_leaves_no_model(tmp_path, monkeypatch, trainings):
+    def interrupt(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(LAC, "train", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            training.train_or_load("lac", ENV_ID, 0, 40, tmp_path / "run")
+    assert not list((tmp_path / "run").glob("*.zip"))
+    assert training.train_or_load("lac", ENV_ID, 0, 40, tmp_path / "run").num_timesteps == 40 and trainings == [0, 0]
+
+
+def test_one_job_stays_in_this_process():
+    # what is defined here could not be pickled
+    assert training.run_all(lambda *run: (os.getpid(), run), [(1, "a"), (2, "b")], 1) == [
+        (os.getpid(), (1, "a")),
+        (os.getpid(), (2, "b")),
+    ]
+    with pytest.raises(ZeroDivisionError):
+        training.run_all(operator.truediv, [(1, 1), (1, 0)], 1)
+
+
+def test_several_jobs_are_other_processes_whose_results_keep_their_order():
+    # the first takes longest
+    assert training.run_all(sum, [(range(3_000_000),), (range(3),), (range(4),)], 2) == [4_499_998_500_000, 3, 6]
+    assert os.getpid() not in training.run_all(os.getpid, [(), ()], 2)
+
+
+def test_an_error_in_another_process_is_raised_here():
+    with pytest.raises(ZeroDivisionError):
+        training.run_all(operator.truediv, [(1, 1), (1, 0), (2, 1)], 2)
