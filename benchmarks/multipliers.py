@@ -33,6 +33,7 @@ from sb3_lac import LAC, evaluate_lyapunov
 _EVALUATION_SEED = 10_000  # no training seed comes close
 _TIMESTEPS = {"LinearCost-v0": 3_000, "CartPoleCost-v0": 10_000, "Oscillator-v0": 12_000}
 _EPISODES = 20
+_LAMBDA_LEARNING_RATE = 1e-2  # fast, so that lambda finds its place within these short trainings
 
 
 def run(env_id: str, alpha3: float, lambda_max: float, seed: int, out: Path) -> dict[str, object]:
@@ -46,7 +47,12 @@ def run(env_id: str, alpha3: float, lambda_max: float, seed: int, out: Path) -> 
     :param out: folder of all results
     :return: what came out
     """
-    hyperparameters = {"alpha3": alpha3, "lambda_max": lambda_max, "lambda_init": lambda_max}
+    hyperparameters = {
+        "alpha3": alpha3,
+        "lambda_max": lambda_max,
+        "lambda_init": lambda_max,
+        "lambda_learning_rate": _LAMBDA_LEARNING_RATE,
+    }
     folder = out / "models" / f"{env_id}_alpha3_{alpha3:g}_lambda_max_{lambda_max:g}_seed{seed}"
     model = train_or_load("lac", env_id, seed, _TIMESTEPS[env_id], folder, hyperparameters)
     assert isinstance(model, LAC)
@@ -139,7 +145,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     ]
     results = pd.DataFrame(run_all(partial(run, out=chosen.out), runs, chosen.jobs))
     configuration = {name: value for name, value in vars(chosen).items() if name not in ("jobs", "out")}
-    write_csv(chosen.out / "multipliers.csv", results, {**configuration, "timesteps": _TIMESTEPS})
+    write_csv(
+        chosen.out / "multipliers.csv",
+        results,
+        {**configuration, "timesteps": _TIMESTEPS, "lambda_learning_rate": _LAMBDA_LEARNING_RATE},
+    )
     save_figure(plot(results), chosen.out / "multipliers.png")
     text = report(results.sort_values(["env", "alpha3", "lambda_max"]))
     write_text(chosen.out / "multipliers.md", text)

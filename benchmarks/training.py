@@ -5,13 +5,16 @@ from __future__ import annotations
 import argparse
 import contextlib
 import io
+import json
 import multiprocessing
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypeVar
 
 import torch as th
+import yaml
 from rl_zoo3 import ALGOS
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import configure
@@ -38,7 +41,10 @@ def train_or_load(
     :return: the model
     """
     th.set_num_threads(1)
-    file = folder / f"model_{timesteps}.zip"
+    # Named by all that it depends on: with other hyperparameters, a policy is trained anew
+    recipe = {**yaml.safe_load(find_config(algo).read_text(encoding="utf-8"))[env_id], **(hyperparameters or {})}
+    digest = sha256(json.dumps([recipe, timesteps, seed], sort_keys=True).encode()).hexdigest()[:8]
+    file = folder / f"model_{digest}.zip"
     if not file.exists():
         manager = LACExperimentManager(
             argparse.Namespace(),
