@@ -51,6 +51,19 @@ _STUDIES: dict[str, tuple[str, dict[str, tuple[float, ...]], tuple[float, ...]]]
 }
 
 
+_LABELS = {
+    "impulse_N": "impulse (N)",
+    "cart_mass_kg": "mass of the cart (kg)",
+    "pole_half_length_m": "half length of the pole (m)",
+    "observation_noise": "noise on each observed variable",
+    "light": "effect of light",
+    "protein_decay": "decay rate of proteins",
+    "process_noise": "noise on each state",
+    "death_rate": "death rate",
+    "cost": "cost per step",
+}
+
+
 def roll_out(model: BaseAlgorithm, make_env: Callable[[], gym.Env[Any, Any]], episodes: int, noise_std: float) -> pd.DataFrame:
     """
     Run a policy, deterministically, in all episodes at once.
@@ -142,7 +155,7 @@ def _draw_lines(results: pd.DataFrame, column: str, metric: str, axes: Any) -> N
         by_value = of_algo.groupby(column)[metric]
         axes.plot(by_value.median(), color=colour, marker="o", ms=4, label=str(algo))
         axes.fill_between(by_value.median().index, by_value.min(), by_value.max(), color=colour, alpha=0.2, lw=0)
-    axes.set(xlabel=column, ylabel=metric.replace("_", " "))
+    axes.set(xlabel=_LABELS[column], ylabel=_LABELS[metric])
     axes.legend(frameon=False, fontsize="small")
 
 
@@ -191,7 +204,7 @@ def plot_grid(results: pd.DataFrame, study: str, metric: str) -> Figure:
             axes.text(j, i, f"{table.iloc[i, j]:.2g}", ha="center", va="center", color="white" if dark else "black", size=8)
         axes.set_xticks(range(table.shape[1]), [f"{value:g}" for value in table.columns])
         axes.set_yticks(range(table.shape[0]), [f"{value:g}" for value in table.index])
-        axes.set(xlabel=column, ylabel=row, title=f"{algo}: {metric.replace('_', ' ')}")
+        axes.set(xlabel=_LABELS[column], ylabel=_LABELS[row], title=f"{algo}: {_LABELS[metric]}")
     return figure
 
 
@@ -203,17 +216,20 @@ def report(results: pd.DataFrame) -> str:
     :return: one table per study
     """
 
+    def digits(value: float, count: int) -> str:
+        return f"{value:.{count}g}" if abs(value) < 9.5 else f"{value:.0f}"
+
     def spread(values: pd.Series) -> str:
-        return f"{values.mean():.2g} ± {values.std():.1g}" if len(values) > 1 else f"{values.mean():.2g}"
+        return digits(values.mean(), 2) + (f" ± {digits(values.std(), 1)}" if len(values) > 1 else "")
 
     text = ""
     for study, of_study in results.groupby("study", sort=False):
         columns = varied(str(study))
         metrics = ["death_rate", "cost"] if of_study["death_rate"].any() else ["cost"]
         table = of_study.pivot_table(index=columns, columns="algo", values=metrics, aggfunc=spread)[metrics]
-        table.columns = [f"{algo} {metric.replace('_', ' ')}" for metric, algo in table.columns]
+        table.columns = [f"{algo}, {_LABELS[metric]}" for metric, algo in table.columns]
         text += f"**{study}** ({_STUDIES[str(study)][0]}, {of_study['seed'].nunique()} seeds)\n\n"
-        text += table.reset_index().to_markdown(index=False, disable_numparse=True) + "\n\n"
+        text += table.reset_index().rename(columns=_LABELS).to_markdown(index=False, disable_numparse=True) + "\n\n"
     return text
 
 
@@ -241,7 +257,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     configuration = {name: value for name, value in vars(chosen).items() if name not in ("jobs", "out")}
     write_csv(chosen.out / "robustness.csv", results, configuration)
-    lines = [("impulse", "death_rate"), ("measurement noise", "death_rate"), ("process noise", "cost")]
+    lines = [("impulse", "death_rate"), ("measurement noise", "cost"), ("process noise", "cost")]
     save_figure(plot_lines(results, lines), chosen.out / "disturbances.png")
     save_figure(plot_grid(results, "cart and pole", "death_rate"), chosen.out / "cart_and_pole.png")
     save_figure(plot_grid(results, "gene network", "cost"), chosen.out / "gene_network.png")

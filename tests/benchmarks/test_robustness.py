@@ -153,18 +153,23 @@ def test_report_has_one_row_per_condition_with_the_spread_over_seeds(monkeypatch
         for arguments, noise in robustness.conditions(study)
     ]
     first, second = robustness.report(pd.DataFrame(rows)).strip().split("\n\n**")
-    assert first.startswith("**cart and pole** (CartPoleCost-v0, 2 seeds)\n\n| cart_mass_kg ")
-    assert second.startswith("measurement noise** (CartPoleCost-v0, 2 seeds)\n\n| observation_noise ")
+    assert first.startswith("**cart and pole** (CartPoleCost-v0, 2 seeds)\n\n| mass of the cart (kg) ")
+    assert second.startswith("measurement noise** (CartPoleCost-v0, 2 seeds)\n\n| noise on each observed variable ")
     header, _, *lines = [line for line in first.splitlines() if line.startswith("|")]
     assert [name.strip() for name in header.strip("|").split("|")] == [
-        "cart_mass_kg", "pole_half_length_m", "LAC death rate", "SAC death rate", "LAC cost", "SAC cost",
-    ]  # fmt: skip
+        "mass of the cart (kg)",
+        "half length of the pole (m)",
+        "LAC, death rate",
+        "SAC, death rate",
+        "LAC, cost per step",
+        "SAC, cost per step",
+    ]
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     assert [[float(cell) for cell in row[:2]] for row in cells] == [[1, 0.5], [1, 1], [2, 0.5], [2, 1]]
     assert cells[0][2:] == ["0.5 ± 0.4", "0.5 ± 0.4", "1 ± 0", "20 ± 0"]
     # nobody dies: no such column
     alive = robustness.report(pd.DataFrame(rows).assign(death_rate=0.0))
-    assert "death" not in alive and "LAC cost" in alive
+    assert "death" not in alive and "LAC, cost per step" in alive
 
 
 @pytest.mark.parametrize(
