@@ -16,7 +16,7 @@ model = LAC(
     policy_kwargs={"net_arch": [64, 64], "activation_fn": nn.LeakyReLU},
     seed=0,
 )
-model.learn(10_000, progress_bar=False)
+model.learn(8_000)
 
 
 class WideStarts(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]):

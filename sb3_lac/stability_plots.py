@@ -161,8 +161,10 @@ def draw_calibration(report: LyapunovReport, axes: Axes) -> None:
     # More points would only cover each other
     shown = known.iloc[:: math.ceil(len(known) / 5000)]
     axes.scatter(shown["lyapunov"], shown["cost_to_go"], s=4, color=BLUE, alpha=0.3, lw=0, rasterized=True)
-    set_log_scale(axes, "x", known["lyapunov"])
-    set_log_scale(axes, "y", known["cost_to_go"])
+    # Both or none: the identity is a straight line
+    if is_wide(known["lyapunov"]) and is_wide(known["cost_to_go"]):
+        set_log_scale(axes, "x", known["lyapunov"])
+        set_log_scale(axes, "y", known["cost_to_go"])
     axes.legend(fontsize=8)
 
 
