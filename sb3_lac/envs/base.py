@@ -6,6 +6,30 @@ import numpy as np
 from gymnasium import spaces
 
 
+def check_positive(**values: float) -> None:
+    """
+    Refuse parameters that make no sense.
+
+    :param values: Parameters by name
+    :raises ValueError: If one is not positive and finite
+    """
+    for name, value in values.items():
+        if not 0 < value < np.inf:
+            raise ValueError(f"{name}={value} must be positive and finite.")
+
+
+def check_not_negative(**values: float) -> None:
+    """
+    Refuse parameters that make no sense.
+
+    :param values: Parameters by name
+    :raises ValueError: If one is negative or not finite
+    """
+    for name, value in values.items():
+        if not 0 <= value < np.inf:
+            raise ValueError(f"{name}={value} must be finite and at least 0.")
+
+
 class CostEnv(gym.Env[np.ndarray, np.ndarray]):
     """
     A control problem with a cost: the reward is ``-cost``, and ``info["cost"]`` holds the cost itself.

@@ -1,7 +1,7 @@
 import numpy as np
 from gymnasium import spaces
 
-from sb3_lac.envs.base import CostEnv
+from sb3_lac.envs.base import CostEnv, check_not_negative, check_positive
 
 
 class CartPoleCostEnv(CostEnv):
@@ -71,18 +71,14 @@ class CartPoleCostEnv(CostEnv):
         impulse_interval: int = 50,
         render_mode: str | None = None,
     ) -> None:
-        positive = {
-            "cart_mass_kg": cart_mass_kg,
-            "pole_mass_kg": pole_mass_kg,
-            "pole_half_length_m": pole_half_length_m,
-            "force_max_N": force_max_N,
-            "impulse_interval": impulse_interval,
-        }
-        for name, value in positive.items():
-            if not 0 < value < np.inf:
-                raise ValueError(f"{name}={value} must be positive and finite.")
-        if not 0 <= impulse_N < np.inf:
-            raise ValueError(f"impulse_N={impulse_N} must be finite and at least 0; its direction is random.")
+        check_positive(
+            cart_mass_kg=cart_mass_kg,
+            pole_mass_kg=pole_mass_kg,
+            pole_half_length_m=pole_half_length_m,
+            force_max_N=force_max_N,
+            impulse_interval=impulse_interval,
+        )
+        check_not_negative(impulse_N=impulse_N)
         state_high = np.array([2 * self.X_MAX_M, 1000.0, 1.0, 1000.0])
         observation_space = spaces.Box(-state_high.astype(np.float32), state_high.astype(np.float32))
         super().__init__(-state_high, state_high, observation_space, n_actions=1, render_mode=render_mode)

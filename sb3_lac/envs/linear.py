@@ -2,7 +2,7 @@ import numpy as np
 from gymnasium import spaces
 from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 
-from sb3_lac.envs.base import CostEnv
+from sb3_lac.envs.base import CostEnv, check_not_negative, check_positive
 
 
 class LinearCostEnv(CostEnv):
@@ -59,10 +59,8 @@ class LinearCostEnv(CostEnv):
     STATE_MAX = 100.0
 
     def __init__(self, noise_std: float = 0.01, control_max: float = 2.0, render_mode: str | None = None) -> None:
-        if not 0 <= noise_std < np.inf:
-            raise ValueError(f"noise_std={noise_std} must be finite and at least 0.")
-        if not 0 < control_max < np.inf:
-            raise ValueError(f"control_max={control_max} must be positive and finite.")
+        check_not_negative(noise_std=noise_std)
+        check_positive(control_max=control_max)
         observation_space = spaces.Box(-self.STATE_MAX, self.STATE_MAX, (2,), np.float32)
         super().__init__(
             np.full(2, -self.STATE_MAX), np.full(2, self.STATE_MAX), observation_space, n_actions=1, render_mode=render_mode

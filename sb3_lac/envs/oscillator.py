@@ -1,7 +1,7 @@
 import numpy as np
 from gymnasium import spaces
 
-from sb3_lac.envs.base import CostEnv
+from sb3_lac.envs.base import CostEnv, check_not_negative, check_positive
 
 
 class OscillatorEnv(CostEnv):
@@ -77,19 +77,15 @@ class OscillatorEnv(CostEnv):
         process_noise: float = 0.0,
         render_mode: str | None = None,
     ) -> None:
-        positive = {
-            "transcription": transcription,
-            "half_saturation": half_saturation,
-            "messenger_decay": messenger_decay,
-            "light": light,
-            "translation": translation,
-            "protein_decay": protein_decay,
-        }
-        for name, value in positive.items():
-            if not 0 < value < np.inf:
-                raise ValueError(f"{name}={value} must be positive and finite.")
-        if not 0 <= process_noise < np.inf:
-            raise ValueError(f"process_noise={process_noise} must be finite and at least 0.")
+        check_positive(
+            transcription=transcription,
+            half_saturation=half_saturation,
+            messenger_decay=messenger_decay,
+            light=light,
+            translation=translation,
+            protein_decay=protein_decay,
+        )
+        check_not_negative(process_noise=process_noise)
         observation_space = spaces.Box(0.0, self.STATE_MAX, (8,), np.float32)
         super().__init__(np.zeros(6), np.full(6, self.STATE_MAX), observation_space, n_actions=3, render_mode=render_mode)
         self.transcription = transcription
