@@ -31,7 +31,12 @@ def test_a_run_trains_with_its_combination(tmp_path, trained):
     row = multipliers.run(ENV_ID, 0.3, 4.0, 7, tmp_path)
     ((algo, env_id, seed, timesteps, folder, hyperparameters),) = trained
     assert (algo, env_id, seed, timesteps) == ("lac", ENV_ID, 7, multipliers._TIMESTEPS[ENV_ID])
-    assert hyperparameters == {"alpha3": 0.3, "lambda_max": 4.0, "lambda_init": 4.0}
+    assert hyperparameters == {
+        "alpha3": 0.3,
+        "lambda_max": 4.0,
+        "lambda_init": 4.0,
+        "lambda_learning_rate": multipliers._LAMBDA_LEARNING_RATE,
+    }
     assert (row["env"], row["alpha3"], row["lambda_max"], row["seed"]) == (ENV_ID, 0.3, 4.0, 7)
     # nothing was learned: lambda is where it started, and nobody dies here
     assert row["lambda"] == pytest.approx(4.0) and row["death_rate"] == 0 and row["cost"] > 0
