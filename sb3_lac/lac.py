@@ -455,8 +455,10 @@ class LAC(OffPolicyAlgorithm):
         self._update_learning_rate(optimizers)
         update_learning_rate(self.lambda_optimizer, self.lambda_lr_schedule(self._current_progress_remaining))
 
+        # Those that are optimized, without layers that were frozen
         actor_parameters, critic_parameters = (
-            [parameter for group in optimizer.param_groups for parameter in group["params"]] for optimizer in optimizers[:2]
+            [parameter for group in optimizer.param_groups for parameter in group["params"] if parameter.requires_grad]
+            for optimizer in optimizers[:2]
         )
         online_parameters: list[th.Tensor] = [*self.actor.parameters(), *self.critic.parameters()]
         target_parameters: list[th.Tensor] = [*self.actor_target.parameters(), *self.critic_target.parameters()]

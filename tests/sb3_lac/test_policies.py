@@ -181,3 +181,15 @@ def test_activations_in_place_change_no_value_and_no_gradient(make_model, activa
         results.append([*outputs, *th.autograd.grad(sum(outputs), parameters, allow_unused=True)])
     for tensor, expected in zip(*results, strict=True):
         assert (tensor is None and expected is None) or th.equal(tensor, expected)
+
+
+def test_frozen_layers_stay_as_they_are(make_model, train_metrics):
+    model = make_model()
+    frozen = [model.actor.latent_pi[0], model.critic.lyapunov_networks[0][0]]
+    free = [model.actor.latent_pi[2], model.critic.lyapunov_networks[0][2]]
+    for layer in frozen:
+        layer.requires_grad_(False)
+    before = [layer.weight.clone() for layer in frozen + free]
+    train_metrics(model, gradient_steps=2)
+    unchanged = [th.equal(weight, layer.weight) for weight, layer in zip(before, frozen + free, strict=True)]
+    assert unchanged == [True, True, False, False]
