@@ -27,7 +27,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import pandas as pd
-import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.logger import configure
@@ -40,9 +39,8 @@ from battery_env.evaluation import evaluate, summarize
 from battery_env.plotting import plot_learning_curves, plot_true_against_inferred, save_figure
 from battery_env.trajectories import TrajectoryDataset
 from benchmarks.reporting import write_csv, write_text
-from benchmarks.training import run_all
+from benchmarks.training import run_all, set_up
 from sb3_lac import CalibrationCallback
-from sb3_lac.zoo import LACExperimentManager, find_config
 
 _EVALUATION_TRAJECTORIES = 64  # of the test part, evenly spaced, while training; all of them at the end
 _EVALUATION_EPISODES = 20
@@ -150,7 +148,6 @@ def run(algo: str, env_id: str, seed: int, timesteps: int, evaluations: int, out
     :param position: line of the terminal for the progress bar
     :raises ValueError: if the folder of the run holds one with another number of steps
     """
-    th.set_num_threads(1)
     folder = out / env_id / f"{algo}_seed{seed}"
     summary_file, checkpoint = folder / "summary.json", folder / "checkpoint"
     if summary_file.exists():
@@ -163,24 +160,17 @@ def run(algo: str, env_id: str, seed: int, timesteps: int, evaluations: int, out
     resumed = (checkpoint / "model.zip").exists()
     clock = _Clock(folder / "training_seconds.json")
 
-    manager = LACExperimentManager(
-        argparse.Namespace(),
+    manager, model, hyperparameters = set_up(
         algo,
         env_id,
-        log_folder=str(folder / "zoo"),
-        n_timesteps=timesteps,
-        eval_freq=-1,
+        seed,
+        timesteps,
+        folder / "zoo",
         eval_env_kwargs={"split": "test"},
-        seed=seed,
-        verbose=0,
-        device="cpu",
-        config=str(find_config(algo)),
         trained_agent=str(checkpoint / "model.zip") if resumed else "",
     )
-    with contextlib.redirect_stdout(io.StringIO()):  # the zoo prints every hyperparameter, and saves them too
-        model, hyperparameters = manager.setup_experiment()  # type: ignore[misc]
+    with contextlib.redirect_stdout(io.StringIO()):
         evaluation_env = manager.create_envs(n_envs=1, eval_env=True, no_log=True)
-    assert isinstance(model, OffPolicyAlgorithm)
     model.set_logger(configure(str(out / "tensorboard" / env_id / f"{algo.upper()}_seed{seed}"), ["tensorboard"]))
 
     every = max(timesteps // (evaluations * manager.n_envs), 1)

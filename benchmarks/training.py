@@ -18,12 +18,47 @@ import yaml
 from rl_zoo3 import ALGOS
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import configure
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from tqdm import tqdm
 
 from battery_env.files import replacing
 from sb3_lac.zoo import LACExperimentManager, find_config
 
 Result = TypeVar("Result")
+
+
+def set_up(
+    algo: str, env_id: str, seed: int, timesteps: int, folder: Path, **options: Any
+) -> tuple[LACExperimentManager, OffPolicyAlgorithm, dict[str, Any]]:
+    """
+    A model with the hyperparameters of ``zoo_configs``, on one thread of the CPU.
+
+    :param algo: ``lac``, ``sac`` or ``td3``
+    :param env_id: id of the environment
+    :param seed: seed of everything
+    :param timesteps: environment steps
+    :param folder: where the zoo writes what it does
+    :param options: other arguments of the zoo's experiment manager
+    :return: the manager, the model, and its hyperparameters
+    """
+    th.set_num_threads(1)
+    manager = LACExperimentManager(
+        argparse.Namespace(),
+        algo,
+        env_id,
+        log_folder=str(folder),
+        n_timesteps=timesteps,
+        eval_freq=-1,
+        seed=seed,
+        verbose=0,
+        device="cpu",
+        config=str(find_config(algo)),
+        **options,
+    )
+    with contextlib.redirect_stdout(io.StringIO()):  # the zoo prints every hyperparameter, and saves them too
+        model, hyperparameters = manager.setup_experiment()  # type: ignore[misc]
+    assert isinstance(model, OffPolicyAlgorithm)
+    return manager, model, hyperparameters
 
 
 def train_or_load(
@@ -40,27 +75,12 @@ def train_or_load(
     :param hyperparameters: what differs from ``zoo_configs``
     :return: the model
     """
-    th.set_num_threads(1)
     # Named by all that it depends on: with other hyperparameters, a policy is trained anew
     recipe = {**yaml.safe_load(find_config(algo).read_text(encoding="utf-8"))[env_id], **(hyperparameters or {})}
     digest = sha256(json.dumps([recipe, timesteps, seed], sort_keys=True).encode()).hexdigest()[:8]
     file = folder / f"model_{digest}.zip"
     if not file.exists():
-        manager = LACExperimentManager(
-            argparse.Namespace(),
-            algo,
-            env_id,
-            log_folder=str(folder / "zoo"),
-            n_timesteps=timesteps,
-            eval_freq=-1,
-            seed=seed,
-            verbose=0,
-            device="cpu",
-            config=str(find_config(algo)),
-            hyperparams=hyperparameters,
-        )
-        with contextlib.redirect_stdout(io.StringIO()):  # the zoo prints every hyperparameter, and saves them too
-            model, _ = manager.setup_experiment()  # type: ignore[misc]
+        _, model, _ = set_up(algo, env_id, seed, timesteps, folder / "zoo", hyperparams=hyperparameters)
         model.set_logger(configure(str(folder), ["csv"]))
         model.learn(timesteps)
         with replacing(file) as part:

@@ -6,11 +6,10 @@ from stable_baselines3.common.distributions import SquashedDiagGaussianDistribut
 
 class SquashedGaussianDistribution(SquashedDiagGaussianDistribution):
     """
-    The distribution of SAC's actor, with half the operations: the same samples and probabilities for the same random state.
+    The distribution of SAC's actor, with fewer operations: the same samples and probabilities for the same random state.
 
     The probability of a sample follows from the noise that it was made of. Its parent recovers that noise from the sample, for
-    which autograd computes a gradient that is zero, and checks its arguments in each call. On a CPU that costs a tenth of an
-    update.
+    which autograd computes a gradient that is zero, and checks its arguments in each call.
     """
 
     def log_prob_from_params(self, mean_actions: th.Tensor, log_std: th.Tensor) -> tuple[th.Tensor, th.Tensor]:

@@ -35,7 +35,7 @@ def largest_value(values: Sequence[th.Tensor]) -> th.Tensor:
 def activate_in_place(network: nn.Module) -> None:
     """
     Let the activations of a multilayer perceptron overwrite the outputs of its linear layers, which no gradient needs:
-    less memory is moved, which is a twentieth of the time of an update on a CPU.
+    less memory is moved.
 
     :param network: Network of linear layers, each followed by an activation
     """

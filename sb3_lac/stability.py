@@ -1,23 +1,24 @@
 """Is the learned ``L`` a certificate? Statistics of the decrease condition along roll-outs of a policy."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 import pandas as pd
 import torch as th
 from gymnasium import spaces
-from matplotlib.figure import Figure
-from scipy.signal import lfilter
-from scipy.stats import binomtest, rankdata
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
-from sb3_lac import stability_plots
 from sb3_lac.lac import LAC
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Observations = np.ndarray | dict[str, np.ndarray]
 
@@ -183,6 +184,9 @@ def cost_to_go(transitions: pd.DataFrame, gamma: float, horizon: int | None, max
     lengths = np.bincount(episode)
     costs = np.zeros((len(lengths), lengths.max()))
     costs[episode, step] = transitions["cost"]
+    # Slow to import like scipy.stats and matplotlib below, and only an evaluation needs them
+    from scipy.signal import lfilter
+
     # G = c + gamma * G' as a filter that runs back in time
     if horizon is None:
         numerator, denominator = np.ones(1), np.array([1.0, -gamma])
@@ -354,6 +358,8 @@ def estimate_metrics(transitions: pd.DataFrame, episodes: pd.DataFrame, bootstra
     :param bootstrap: Bootstrap of the episodes
     :return: Estimates by name
     """
+    from scipy.stats import binomtest, rankdata
+
     # There is no L in a terminal state
     known = transitions[~transitions["terminated"]]
     ones = np.ones(len(known))
@@ -502,6 +508,8 @@ class LyapunovReport:
 
         :return: The figure
         """
+        from sb3_lac import stability_plots
+
         return stability_plots.plot_report(self)
 
     def plot_phase(self, x: int = 0, y: int = 1, names: Sequence[str] | None = None) -> Figure:
@@ -513,6 +521,8 @@ class LyapunovReport:
         :param names: Names of all dimensions
         :return: The figure
         """
+        from sb3_lac import stability_plots
+
         return stability_plots.plot_phase(self, x, y, names)
 
     def plot_region_of_attraction(
@@ -528,6 +538,8 @@ class LyapunovReport:
         :param threshold: An episode has settled if no cost in its last fifth is larger, ``ultimate_bound`` by default
         :return: The figure
         """
+        from sb3_lac import stability_plots
+
         return stability_plots.plot_region_of_attraction(self, x, y, names, threshold)
 
 
