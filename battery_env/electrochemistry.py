@@ -31,14 +31,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from math import log, sqrt
 from typing import Any, Literal
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-FloatArray = NDArray[np.float64]
+from battery_env.kernels import FloatArray, PackedConstants, advance_batch, roll_out, step_batch, voltage_batch
+
 LoadUnit = Literal["power", "current"]
 
 STATE_NAMES: tuple[str, ...] = ("Tb", "Vo", "Vsn", "Vsp", "qnB", "qnS", "qpB", "qpS")
@@ -57,12 +56,11 @@ Q_MOBILE_LIMITS_C = (100.0, 1e6)
 #: Range of ``r_o`` in ohm; its upper end catches milliohms.
 R_O_LIMITS_OHM = (0.0, 5.0)
 
+#: Constants that nobody can measure well, as they lie in :meth:`CellParameters.packed_with`.
+UNCERTAIN_CONSTANTS: tuple[str, ...] = ("kn", "tDiffusion", "to", "tsn")
+
 _SIX_TENTHS = 0.6  # xnMax - xnMin: the share of all lithium sites that a full discharge uses
 _POLYNOMIAL_SIZE = 14
-# The extended model holds mole fractions and the voltage that turns power into current inside these bounds, which no
-# discharge reaches above the cut-off
-_MOLE_FRACTION_MARGIN = 1e-3
-_VOLTAGE_FLOOR_V = 1.0
 
 
 def _redlich_kister_polynomial(coefficients: tuple[float, ...], faraday: float) -> FloatArray:
@@ -183,32 +181,50 @@ class CellParameters:
         return replace(self, **changes)
 
     @cached_property
-    def packed(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def packed(self) -> PackedConstants:
         """
         What the compiled kernels read: constants of the equations, and both equilibrium-potential polynomials.
 
-        :return: constants (14,), polynomial of the negative electrode, polynomial of the positive one (V, lowest first)
+        :return: one row of constants, and the polynomials
         """
         volume_surface = self.VolSFraction * self.Vol
-        constants = np.array(
-            [
-                _SIX_TENTHS / self.VolSFraction,  # mole fraction = constant * surface charge / q_mobile
-                1.0 / ((self.Vol - volume_surface) * self.tDiffusion),
-                1.0 / (volume_surface * self.tDiffusion),
-                self.R / self.F,
-                1.0 / self.alpha,
-                1.0 / (2.0 * self.Sn * self.kn),
-                1.0 / (2.0 * self.Sp * self.kp),
-                1.0 / self.to,
-                1.0 / self.tsn,
-                1.0 / self.tsp,
-                self.U0p - self.U0n,
-                1.0 / self.mC,
-                1.0 / self.tau,
-                self.Tb0,
-            ]
+        constants = [
+            _SIX_TENTHS / self.VolSFraction,  # mole fraction = constant * surface charge / q_mobile
+            1.0 / ((self.Vol - volume_surface) * self.tDiffusion),
+            1.0 / (volume_surface * self.tDiffusion),
+            self.R / self.F,
+            1.0 / self.alpha,
+            1.0 / (2.0 * self.Sn * self.kn),
+            1.0 / (2.0 * self.Sp * self.kp),
+            1.0 / self.to,
+            1.0 / self.tsn,
+            1.0 / self.tsp,
+            self.U0p - self.U0n,
+            1.0 / self.mC,
+            1.0 / self.tau,
+            self.Tb0,
+        ]
+        return PackedConstants(
+            np.array([constants]),
+            _redlich_kister_polynomial(self.An, self.F),
+            _redlich_kister_polynomial(self.Ap, self.F),
         )
-        return constants, _redlich_kister_polynomial(self.An, self.F), _redlich_kister_polynomial(self.Ap, self.F)
+
+    def packed_with(self, factors: FloatArray) -> PackedConstants:
+        """
+        Constants of many cells that differ from this one in what is known least, for the unchecked functions.
+
+        :param factors: what each of ``UNCERTAIN_CONSTANTS`` is multiplied by, shape (n, 4)
+        :return: constants with one row a cell
+        """
+        packed = self.packed
+        constants = np.repeat(packed.constants, len(factors), axis=0)
+        kn, t_diffusion, to, tsn = factors.T
+        constants[:, 5] /= kn
+        constants[:, [1, 2]] /= t_diffusion[:, None]
+        constants[:, 7] /= to
+        constants[:, 8] /= tsn
+        return packed._replace(constants=constants)
 
 
 def _check_range(name: str, value: ArrayLike, limits: tuple[float, float], unit: str, hint: str) -> FloatArray:
@@ -278,184 +294,6 @@ def check_dt(dt: float, parameters: CellParameters) -> float:
     return float(dt)
 
 
-# The kernels take whole arrays and a row, never a slice: making slices would cost more than the arithmetic.
-
-
-@njit(cache=True, error_model="numpy")
-def _polynomial(a: FloatArray, y: float) -> float:
-    # degree 13, Estrin's scheme: half the latency of Horner's
-    y2 = y * y
-    y4 = y2 * y2
-    low = (a[0] + a[1] * y) + (a[2] + a[3] * y) * y2 + ((a[4] + a[5] * y) + (a[6] + a[7] * y) * y2) * y4
-    high = (a[8] + a[9] * y) + (a[10] + a[11] * y) * y2 + (a[12] + a[13] * y) * y4
-    return low + high * (y4 * y4)
-
-
-@njit(cache=True, error_model="numpy")
-def _asinh_ratio(a: float, w: float) -> float:
-    # asinh(a / sqrt(w)) with one root and one logarithm; absolute error below 1e-15
-    root = abs(a) + sqrt(a * a + w)
-    magnitude = 0.5 * log(root * root / w)
-    return magnitude if a >= 0.0 else -magnitude
-
-
-@njit(cache=True, error_model="numpy")
-def _mole_fraction(surface_charge: float, q: float, extended: bool, constants: FloatArray) -> float:
-    fraction = constants[0] / q * surface_charge
-    if extended:
-        return min(max(fraction, _MOLE_FRACTION_MARGIN), 1.0 - _MOLE_FRACTION_MARGIN)
-    return fraction
-
-
-@njit(cache=True, error_model="numpy")
-def _voltage(
-    x: FloatArray, n: int, q: float, extended: bool, constants: FloatArray, poly_n: FloatArray, poly_p: FloatArray
-) -> float:
-    # V = Vep(xp) - Ven(xn) - Vo - Vsn - Vsp; both logarithms of the Nernst terms are taken as one
-    xn = _mole_fraction(x[n, 5], q, extended, constants)
-    xp = _mole_fraction(x[n, 7], q, extended, constants)
-    if not (0.0 < xn < 1.0 and 0.0 < xp < 1.0):
-        return np.nan  # empty or overfull electrode: the model has no voltage there
-    nernst = constants[3] * x[n, 0] * log((1.0 - xp) * xn / (xp * (1.0 - xn)))
-    equilibrium = _polynomial(poly_p, 2.0 * xp - 1.0) - _polynomial(poly_n, 2.0 * xn - 1.0)
-    return constants[10] + nernst + equilibrium - x[n, 1] - x[n, 2] - x[n, 3]
-
-
-@njit(cache=True, error_model="numpy")
-def _step(
-    x: FloatArray,
-    n: int,
-    i: float,
-    q: float,
-    r_o: float,
-    dt: float,
-    thermal: bool,
-    extended: bool,
-    constants: FloatArray,
-    out: FloatArray,
-    m: int,
-) -> None:
-    # One step of explicit Euler of row n of x under the current i, into row m of out; may work in place.
-    tb, vo, vsn, vsp = x[n, 0], x[n, 1], x[n, 2], x[n, 3]
-    qnb, qns, qpb, qps = x[n, 4], x[n, 5], x[n, 6], x[n, 7]
-    xn = _mole_fraction(qns, q, extended, constants)
-    xp = _mole_fraction(qps, q, extended, constants)
-    diffusion_n = qnb * constants[1] - qns * constants[2]
-    diffusion_p = qpb * constants[1] - qps * constants[2]
-    if 0.0 < xn < 1.0 and 0.0 < xp < 1.0:
-        # Butler-Volmer with alpha = 1/2: Jn0 = kn * sqrt(xn * (1 - xn))
-        thermal_voltage = constants[3] * tb * constants[4]
-        vsn_nominal = thermal_voltage * _asinh_ratio(i * constants[5], (1.0 - xn) * xn)
-        vsp_nominal = thermal_voltage * _asinh_ratio(i * constants[6], (1.0 - xp) * xp)
-    else:
-        vsn_nominal = np.nan
-        vsp_nominal = np.nan
-    out[m, 0] = tb
-    if thermal:
-        out[m, 0] += dt * ((vo + vsn + vsp) * i * constants[11] + (constants[13] - tb) * constants[12])
-    out[m, 1] = vo + dt * (i * r_o - vo) * constants[7]
-    out[m, 2] = vsn + dt * (vsn_nominal - vsn) * constants[8]
-    out[m, 3] = vsp + dt * (vsp_nominal - vsp) * constants[9]
-    out[m, 4] = qnb - dt * diffusion_n
-    out[m, 5] = qns + dt * (diffusion_n - i)
-    out[m, 6] = qpb - dt * diffusion_p
-    out[m, 7] = qps + dt * (diffusion_p + i)
-
-
-@njit(cache=True, error_model="numpy")
-def _current(load: float, power: bool, voltage: float, extended: bool) -> float:
-    if not power:
-        return load
-    if extended:
-        return load / max(voltage, _VOLTAGE_FLOOR_V)
-    return load / voltage if voltage > 0.0 else np.nan
-
-
-@njit(cache=True, error_model="numpy")
-def _voltage_batch(
-    state: FloatArray,
-    q: FloatArray,
-    extended: bool,
-    constants: FloatArray,
-    poly_n: FloatArray,
-    poly_p: FloatArray,
-    out: FloatArray,
-) -> None:
-    for n in range(out.shape[0]):
-        out[n] = _voltage(state, n, q[n], extended, constants, poly_n, poly_p)
-
-
-@njit(cache=True, error_model="numpy")
-def _step_batch(
-    state: FloatArray,
-    load: FloatArray,
-    q: FloatArray,
-    r_o: FloatArray,
-    dt: float,
-    power: bool,
-    thermal: bool,
-    extended: bool,
-    constants: FloatArray,
-    poly_n: FloatArray,
-    poly_p: FloatArray,
-    out: FloatArray,
-) -> None:
-    for n in range(out.shape[0]):
-        volts = _voltage(state, n, q[n], extended, constants, poly_n, poly_p) if power else 0.0
-        i = _current(load[n], power, volts, extended)
-        _step(state, n, i, q[n], r_o[n], dt, thermal, extended, constants, out, n)
-
-
-@njit(cache=True, error_model="numpy")
-def _advance_batch(
-    state: FloatArray,
-    load: FloatArray,
-    first: NDArray[np.int64],
-    steps: NDArray[np.int64],
-    q: FloatArray,
-    r_o: FloatArray,
-    dt: float,
-    power: bool,
-    thermal: bool,
-    constants: FloatArray,
-    poly_n: FloatArray,
-    poly_p: FloatArray,
-) -> None:
-    for n in range(state.shape[0]):
-        for k in range(steps[n]):
-            volts = _voltage(state, n, q[n], False, constants, poly_n, poly_p) if power else 0.0
-            i = _current(load[first[n] + k], power, volts, False)
-            _step(state, n, i, q[n], r_o[n], dt, thermal, False, constants, state, n)
-
-
-@njit(cache=True, error_model="numpy")
-def _roll_out(
-    load: FloatArray,
-    q: float,
-    r_o: float,
-    dt: float,
-    cut_off: float,
-    power: bool,
-    thermal: bool,
-    constants: FloatArray,
-    poly_n: FloatArray,
-    poly_p: FloatArray,
-    state: FloatArray,
-    voltage: FloatArray,
-    current: FloatArray,
-) -> int:
-    # state has one row more than there are samples, and its row 0 is the start. Fills the samples up to the last one whose
-    # voltage is a number and at least the cut-off; returns how many they are. The condition is written so that NaN ends
-    # the discharge too: near its end V can fall from 3.3 V to NaN in one step.
-    for k in range(load.shape[0]):
-        voltage[k] = _voltage(state, k, q, False, constants, poly_n, poly_p)
-        if not voltage[k] >= cut_off:
-            return k
-        current[k] = _current(load[k], power, voltage[k], False)
-        _step(state, k, current[k], q, r_o, dt, thermal, False, constants, state, k + 1)
-    return int(load.shape[0])
-
-
 def initial_state(q_mobile: ArrayLike, parameters: CellParameters | None = None) -> FloatArray:
     """
     The state of a fully charged cell at rest: V = 4.191350 V for every ``q_mobile``.
@@ -496,7 +334,7 @@ def voltage(state: ArrayLike, q_mobile: ArrayLike, parameters: CellParameters | 
     x, q = _check_state(state), check_q_mobile(q_mobile)
     shape = np.broadcast_shapes(x.shape[:-1], q.shape)
     out = np.empty(int(np.prod(shape)))
-    voltage_into(out, _flat(x, shape, STATE_SIZE), _flat(q, shape), parameters or NEW_CELL)
+    voltage_into(out, _flat(x, shape, STATE_SIZE), _flat(q, shape), (parameters or NEW_CELL).packed)
     return out.reshape(shape)[()]
 
 
@@ -539,7 +377,7 @@ def step(
         check_dt(dt, cell),
         load_unit,
         thermal,
-        cell,
+        cell.packed,
     )
     return out.reshape((*shape, STATE_SIZE))
 
@@ -553,7 +391,7 @@ def step_into(
     dt: float,
     load_unit: LoadUnit,
     thermal: bool,
-    parameters: CellParameters,
+    packed: PackedConstants,
     extended: bool = False,
 ) -> None:
     """
@@ -567,12 +405,12 @@ def step_into(
     :param dt: time step, s
     :param load_unit: ``"power"`` or ``"current"``
     :param thermal: whether the temperature moves
-    :param parameters: constants of the cell
+    :param packed: ``CellParameters.packed``, or with one row a cell ``CellParameters.packed_with``
     :param extended: continue the model where it is not defined: the same numbers wherever it is, but finite for a
         ``q_mobile`` that the charges of ``state`` contradict (mole fractions kept within 0.001 .. 0.999), and in voltage
         collapse (power is turned into current at 1 V or more). For calibrators, which try wrong parameters
     """
-    _step_batch(state, load, q_mobile, r_o, dt, load_unit == "power", thermal, extended, *parameters.packed, out)
+    step_batch(state, load, q_mobile, r_o, dt, load_unit == "power", thermal, extended, *packed, out)
 
 
 def advance_in_place(
@@ -585,7 +423,7 @@ def advance_in_place(
     dt: float,
     load_unit: LoadUnit,
     thermal: bool,
-    parameters: CellParameters,
+    packed: PackedConstants,
 ) -> None:
     """
     Advance every cell by its own number of steps under its own stretch of ``load``; unchecked, like :func:`step_into`.
@@ -599,13 +437,13 @@ def advance_in_place(
     :param dt: time step, s
     :param load_unit: ``"power"`` or ``"current"``
     :param thermal: whether the temperature moves
-    :param parameters: constants of the cell
+    :param packed: ``CellParameters.packed``, or with one row a cell ``CellParameters.packed_with``
     """
-    _advance_batch(state, load, first, steps, q_mobile, r_o, dt, load_unit == "power", thermal, *parameters.packed)
+    advance_batch(state, load, first, steps, q_mobile, r_o, dt, load_unit == "power", thermal, *packed)
 
 
 def voltage_into(
-    out: FloatArray, state: FloatArray, q_mobile: FloatArray, parameters: CellParameters, extended: bool = False
+    out: FloatArray, state: FloatArray, q_mobile: FloatArray, packed: PackedConstants, extended: bool = False
 ) -> None:
     """
     :func:`voltage` for inner loops: no checks, no broadcasting, no allocation; all arrays contiguous float64.
@@ -613,10 +451,10 @@ def voltage_into(
     :param out: voltage in V, shape (n,)
     :param state: shape (n, 8)
     :param q_mobile: shape (n,)
-    :param parameters: constants of the cell
+    :param packed: ``CellParameters.packed``, or with one row a cell ``CellParameters.packed_with``
     :param extended: as in :func:`step_into`
     """
-    _voltage_batch(state, q_mobile, extended, *parameters.packed, out)
+    voltage_batch(state, q_mobile, extended, *packed, out)
 
 
 def state_of_charge(state: FloatArray, q_mobile: FloatArray) -> FloatArray:
@@ -730,7 +568,7 @@ def simulate(
     state, volts, amperes = np.empty((n_samples + 1, STATE_SIZE)), np.empty(n_samples), np.empty(n_samples)
     state[0] = start
     flags = (load_unit == "power", thermal)
-    n = _roll_out(np.require(loads, requirements=["C", "W"]), q, r, dt, cut_off, *flags, *cell.packed, state, volts, amperes)
+    n = roll_out(np.require(loads, requirements=["C", "W"]), q, r, dt, cut_off, *flags, *cell.packed, state, volts, amperes)
     return Trajectory(
         time_s=dt * np.arange(n, dtype=np.float64),
         state=state[:n].copy(),

@@ -302,7 +302,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
             self.dt_s,
             self.load_unit,
             self.thermal,
-            self.parameters,
+            self.parameters.packed,
         )
         return state
 

@@ -11,7 +11,8 @@ ROOT = Path(__file__).parents[1]
 
 # each layer may import the ones before it, and itself
 LAYERS = (
-    ("battery_env.files", "battery_env.electrochemistry"),
+    ("battery_env.files", "battery_env.kernels"),
+    ("battery_env.electrochemistry",),
     ("battery_env.loads",),
     ("battery_env.trajectories", "battery_env.cells", "battery_env.nasa_cells"),
     ("battery_env.estimators",),

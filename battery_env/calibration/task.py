@@ -196,7 +196,16 @@ class FullStateTask:
     def _step(self, out: FloatArray, state: FloatArray, q_mobile: FloatArray, r_o: FloatArray) -> None:
         data = self.dataset
         step_into(
-            out, state, self.load, q_mobile, r_o, data.dt_s, data.load_unit, data.thermal, data.parameters, extended=True
+            out,
+            state,
+            self.load,
+            q_mobile,
+            r_o,
+            data.dt_s,
+            data.load_unit,
+            data.thermal,
+            data.parameters.packed,
+            extended=True,
         )
 
     def transitions_left(self) -> IntArray:
@@ -269,8 +278,8 @@ class FullStateTask:
             of charge of the cell
         """
         voltage, voltage_hat = np.empty(self.cells), np.empty(self.cells)
-        voltage_into(voltage, self.state, self.q_mobile, self.dataset.parameters, extended=True)
-        voltage_into(voltage_hat, self.model_state, self.q_mobile_hat, self.dataset.parameters, extended=True)
+        voltage_into(voltage, self.state, self.q_mobile, self.dataset.parameters.packed, extended=True)
+        voltage_into(voltage_hat, self.model_state, self.q_mobile_hat, self.dataset.parameters.packed, extended=True)
         return {
             "q_mobile": self.q_mobile.copy(),
             "r_o": self.r_o.copy(),

@@ -178,11 +178,11 @@ def test_extended_model_is_the_model_where_it_is_defined_and_finite_where_not():
     state, n = discharge.state, len(discharge.state)
     load, q, r = np.full(n, 12.0), np.full(n, 6000.0), np.full(n, 0.12)
     plain, extended = np.empty_like(state), np.empty_like(state)
-    step_into(plain, state, load, q, r, 1.0, "power", False, NEW_CELL)
-    step_into(extended, state, load, q, r, 1.0, "power", False, NEW_CELL, extended=True)
+    step_into(plain, state, load, q, r, 1.0, "power", False, NEW_CELL.packed)
+    step_into(extended, state, load, q, r, 1.0, "power", False, NEW_CELL.packed, extended=True)
     np.testing.assert_array_equal(plain, extended)
     for wrong in (4000.0, 8000.0):
-        step_into(extended, state, load, np.full(n, wrong), r, 1.0, "power", False, NEW_CELL, extended=True)
+        step_into(extended, state, load, np.full(n, wrong), r, 1.0, "power", False, NEW_CELL.packed, extended=True)
         assert np.isfinite(extended).all()
 
 
