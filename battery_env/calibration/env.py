@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from battery_env.calibration.task import OBSERVATION_LIMIT, FullStateTask, Parameter
+from battery_env.calibration.full_state import OBSERVATION_LIMIT, FullStateTask, Parameter
 from battery_env.trajectories import TrajectoryDataset
 
 _ROW = np.zeros(1, dtype=np.intp)

@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 
 from battery_env.calibration.env import FullStateEnv
-from battery_env.calibration.task import FullStateTask
+from battery_env.calibration.full_state import FullStateTask
 from battery_env.electrochemistry import Trajectory
 from battery_env.estimators.base import Estimate, EstimateTrace, Estimator
 from battery_env.trajectories import TrajectoryDataset

@@ -13,7 +13,7 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 import battery_env
 from battery_env.calibration.env import paper_split
 from battery_env.calibration.registration import ENTRY_POINTS
-from battery_env.calibration.task import ACTION_RANGES, FORMULATIONS, OBSERVED, FullStateTask
+from battery_env.calibration.full_state import ACTION_RANGES, FORMULATIONS, OBSERVED, FullStateTask
 from battery_env.calibration.variants import BatteryQmaxEnv
 from battery_env.electrochemistry import NEW_CELL, QNB, step
 from battery_env.loads import RandomPiecewise
