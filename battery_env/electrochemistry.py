@@ -424,6 +424,7 @@ def advance_in_place(
     load_unit: LoadUnit,
     thermal: bool,
     packed: PackedConstants,
+    extended: bool = False,
 ) -> None:
     """
     Advance every cell by its own number of steps under its own stretch of ``load``; unchecked, like :func:`step_into`.
@@ -438,8 +439,13 @@ def advance_in_place(
     :param load_unit: ``"power"`` or ``"current"``
     :param thermal: whether the temperature moves
     :param packed: ``CellParameters.packed``, or with one row a cell ``CellParameters.packed_with``
+    :param extended: as in :func:`step_into`
     """
-    advance_batch(state, load, first, steps, q_mobile, r_o, dt, load_unit == "power", thermal, *packed)
+    order = np.argsort(-steps)
+    ordered = packed if len(packed.constants) == 1 else packed._replace(constants=packed.constants[order])
+    ahead, flags = state[order], (load_unit == "power", thermal, extended)
+    advance_batch(ahead, load, first[order], steps[order], q_mobile[order], r_o[order], dt, *flags, *ordered)
+    state[order] = ahead
 
 
 def voltage_into(
@@ -558,7 +564,10 @@ def simulate(
         loads = np.asarray(load, dtype=np.float64)
         if loads.ndim == 1:
             n_samples = min(n_samples, len(loads))
-    loads = check_load(loads[..., :n_samples] if loads.ndim else np.full(n_samples, loads), load_unit)
+    if loads.ndim == 0:
+        loads = np.full(n_samples, check_load(loads, load_unit))
+    else:
+        loads = check_load(loads[..., :n_samples], load_unit)
     if loads.shape != (n_samples,):
         raise ValueError(f"load must be a number or one value a step, shape (steps,), got shape {loads.shape}")
     start = initial_state(q, cell) if initial is None else _check_state(initial)

@@ -2,13 +2,17 @@
 The compiled kernels (numba) of the electrochemistry model; :mod:`battery_env.electrochemistry` is their public face and
 documents equations and units.
 
-They take whole arrays and a row, never a slice: making slices would cost more than the arithmetic. ``constants`` has one row
-that all cells share, or one row a cell.
+Scalar functions take whole arrays and a row, never a slice: making slices would cost more than the arithmetic. Batches are
+computed in blocks of cells, state by state instead of cell by cell, and in loops without branches, so that the compiler uses
+vector instructions. Both call the same arithmetic, whose every operation is exact to the bit by IEEE 754, so that a cell comes
+out the same alone, in a batch of any size, and on any machine.
+
+``constants`` has one row that all cells share, or one row a cell.
 """
 
 from __future__ import annotations
 
-from math import log, sqrt
+from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +25,27 @@ FloatArray = NDArray[np.float64]
 # discharge reaches above the cut-off
 _MOLE_FRACTION_MARGIN = 1e-3
 _VOLTAGE_FLOOR_V = 1.0
+
+# ln(x) for x = 2^k * m, m within sqrt(1/2) .. sqrt(2): bit patterns of float64, and the polynomial of (ln(1 + f) - 2 s) / s in
+# s^2, s = f / (2 + f), of FreeBSD's e_log.c (Sun Microsystems 1993)
+_ONE_OVER_ROOT_OF_HALF = np.uint64(0x3FF0000000000000 - 0x3FE6A09E667F3BCD)
+_MANTISSA_BITS = np.uint64(52)
+_EXPONENT_OF_ONE = np.uint64(1023)
+_TWO_TO_THE_52 = np.uint64(0x4330000000000000)
+_LN_2_HIGH, _LN_2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
+_L1, _L2, _L3, _L4 = 6.666666666666735130e-01, 3.999999999940941908e-01, 2.857142874366239149e-01, 2.222219843214978396e-01
+_L5, _L6, _L7 = 1.818357216161805012e-01, 1.531383769920937332e-01, 1.479819860511658591e-01
+
+#: A block of cells is one array: rows of this many values, of states, of what else a step needs, and of constants. Rows start
+#: at multiples that the compiler knows, so that it sees that they do not overlap.
+BLOCK = 64
+_LOAD, _Q, _R_O, _XN, _XP, _CONSTANTS = 8, 9, 10, 11, 12, 14
+#: Where the voltages of a block start, and how long a block is.
+VOLTAGE, BLOCK_SIZE = 13 * BLOCK, 28 * BLOCK
+
+_compiled = njit(cache=True, error_model="numpy")
+# the compiler makes vector loops only of what is inlined
+_inlined = njit(cache=True, error_model="numpy", forceinline=True)
 
 
 class PackedConstants(NamedTuple):
@@ -38,7 +63,24 @@ class PackedConstants(NamedTuple):
     polynomial_p: FloatArray
 
 
-@njit(cache=True, error_model="numpy")
+@_inlined
+def logarithm(x: float) -> float:
+    # ln(x) within 1 ulp for x >= 2.3e-308, in operations that exist as vector instructions; the C library's has branches, and
+    # differs from machine to machine
+    bits = np.float64(x).view(np.uint64)
+    exponent = np.uint64((bits + _ONE_OVER_ROOT_OF_HALF) >> _MANTISSA_BITS)
+    k = np.uint64(exponent | _TWO_TO_THE_52).view(np.float64) - (2.0**52 + 1023.0)
+    f = np.uint64(bits - ((exponent - _EXPONENT_OF_ONE) << _MANTISSA_BITS)).view(np.float64) - 1.0
+    s = f / (2.0 + f)
+    z = s * s
+    w = z * z
+    r = w * (_L2 + w * (_L4 + w * _L6)) + z * (_L1 + w * (_L3 + w * (_L5 + w * _L7)))
+    half_f_f = 0.5 * f * f
+    value = k * _LN_2_HIGH - ((half_f_f - (s * (half_f_f + r) + k * _LN_2_LOW)) - f)
+    return value if x < np.inf else x  # infinity and NaN stay what they are
+
+
+@_inlined
 def polynomial(a: FloatArray, y: float) -> float:
     # degree 13, Estrin's scheme: half the latency of Horner's
     y2 = y * y
@@ -48,32 +90,105 @@ def polynomial(a: FloatArray, y: float) -> float:
     return low + high * (y4 * y4)
 
 
-@njit(cache=True, error_model="numpy")
+@_inlined
 def asinh_ratio(a: float, w: float) -> float:
     # asinh(a / sqrt(w)) with one root and one logarithm; absolute error below 1e-15
     root = abs(a) + sqrt(a * a + w)
-    magnitude = 0.5 * log(root * root / w)
+    magnitude = 0.5 * logarithm(root * root / w)
     return magnitude if a >= 0.0 else -magnitude
 
 
-@njit(cache=True, error_model="numpy")
-def mole_fraction(surface_charge: float, q: float, extended: bool, constants: FloatArray, c: int) -> float:
-    fraction = constants[c, 0] / q * surface_charge
+@_inlined
+def _fraction(share: float, charge: float, extended: bool) -> float:
+    # comparisons in place of min and max: NaN stays NaN
+    fraction = share * charge
     if extended:
-        return min(max(fraction, _MOLE_FRACTION_MARGIN), 1.0 - _MOLE_FRACTION_MARGIN)
+        fraction = _MOLE_FRACTION_MARGIN if fraction < _MOLE_FRACTION_MARGIN else fraction
+        fraction = 1.0 - _MOLE_FRACTION_MARGIN if fraction > 1.0 - _MOLE_FRACTION_MARGIN else fraction
     return fraction
 
 
-@njit(cache=True, error_model="numpy")
+@_inlined
+def _has_voltage(xn: float, xp: float) -> bool:
+    # an empty or overfull electrode has none
+    return (xn > 0.0) & (xn < 1.0) & (xp > 0.0) & (xp < 1.0)
+
+
+@_inlined
+def _equilibrium(xn: float, xp: float, tb: float, gas: float, u0: float, poly_n: FloatArray, poly_p: FloatArray) -> float:
+    # Vep(xp) - Ven(xn); both logarithms of the Nernst terms are taken as one
+    nernst = gas * tb * logarithm((1.0 - xp) * xn / (xp * (1.0 - xn)))
+    return u0 + nernst + (polynomial(poly_p, 2.0 * xp - 1.0) - polynomial(poly_n, 2.0 * xn - 1.0))
+
+
+@_inlined
+def _current(load: float, voltage: float, extended: bool) -> float:
+    # of a load that is power
+    if extended:
+        return load / (_VOLTAGE_FLOOR_V if voltage < _VOLTAGE_FLOOR_V else voltage)
+    return load / voltage if voltage > 0.0 else np.nan
+
+
+@_inlined
+def _overpotential(i: float, x: float, scale: float, area: float) -> float:
+    # what Vsn or Vsp relaxes to: Butler-Volmer with alpha = 1/2, J0 = k * sqrt(x * (1 - x))
+    return scale * asinh_ratio(i * area, (1.0 - x) * x)
+
+
+@_inlined
+def _euler(
+    x: tuple[float, float, float, float, float, float, float, float],
+    i: float,
+    xn: float,
+    xp: float,
+    r_o: float,
+    dt: float,
+    thermal: bool,
+    k: tuple[float, float, float, float, float, float, float, float, float, float, float, float],
+) -> tuple[float, float, float, float, float, float, float, float]:
+    # One step of explicit Euler of the state x under the current i; k: the constants, without those of the voltage
+    tb, vo, vsn, vsp, qnb, qns, qpb, qps = x
+    by_bulk, by_surface, gas, two, area_n, area_p, rate_o, rate_n, rate_p, heat, cooling, surroundings = k
+    scale = gas * tb * two
+    has_voltage = _has_voltage(xn, xp)
+    vsn_nominal = _overpotential(i, xn, scale, area_n) if has_voltage else np.nan
+    vsp_nominal = _overpotential(i, xp, scale, area_p) if has_voltage else np.nan
+    diffusion_n = qnb * by_bulk - qns * by_surface
+    diffusion_p = qpb * by_bulk - qps * by_surface
+    warming = dt * ((vo + vsn + vsp) * i * heat + (surroundings - tb) * cooling)
+    return (
+        tb + warming if thermal else tb,
+        vo + dt * (i * r_o - vo) * rate_o,
+        vsn + dt * (vsn_nominal - vsn) * rate_n,
+        vsp + dt * (vsp_nominal - vsp) * rate_p,
+        qnb - dt * diffusion_n,
+        qns + dt * (diffusion_n - i),
+        qpb - dt * diffusion_p,
+        qps + dt * (diffusion_p + i),
+    )
+
+
+@_compiled
+def mole_fraction(surface_charge: float, q: float, extended: bool, constants: FloatArray, c: int) -> float:
+    return _fraction(constants[c, 0] / q, surface_charge, extended)
+
+
+@_compiled
 def equilibrium_voltage(
     xn: float, xp: float, tb: float, constants: FloatArray, c: int, poly_n: FloatArray, poly_p: FloatArray
 ) -> float:
-    # Vep(xp) - Ven(xn), for mole fractions inside 0 .. 1; both logarithms of the Nernst terms are taken as one
-    nernst = constants[c, 3] * tb * log((1.0 - xp) * xn / (xp * (1.0 - xn)))
-    return constants[c, 10] + nernst + (polynomial(poly_p, 2.0 * xp - 1.0) - polynomial(poly_n, 2.0 * xn - 1.0))
+    # for mole fractions inside 0 .. 1
+    return _equilibrium(xn, xp, tb, constants[c, 3], constants[c, 10], poly_n, poly_p)
 
 
-@njit(cache=True, error_model="numpy")
+@_compiled
+def nominal_overpotentials(i: float, xn: float, xp: float, tb: float, constants: FloatArray, c: int) -> tuple[float, float]:
+    # for mole fractions inside 0 .. 1
+    scale = constants[c, 3] * tb * constants[c, 4]
+    return _overpotential(i, xn, scale, constants[c, 5]), _overpotential(i, xp, scale, constants[c, 6])
+
+
+@_inlined
 def cell_voltage(
     x: FloatArray,
     n: int,
@@ -85,23 +200,14 @@ def cell_voltage(
     poly_p: FloatArray,
 ) -> float:
     # V = Vep(xp) - Ven(xn) - Vo - Vsn - Vsp
-    xn = mole_fraction(x[n, 5], q, extended, constants, c)
-    xp = mole_fraction(x[n, 7], q, extended, constants, c)
-    if not (0.0 < xn < 1.0 and 0.0 < xp < 1.0):
-        return np.nan  # empty or overfull electrode: the model has no voltage there
-    return equilibrium_voltage(xn, xp, x[n, 0], constants, c, poly_n, poly_p) - x[n, 1] - x[n, 2] - x[n, 3]
+    share = constants[c, 0] / q
+    xn, xp = _fraction(share, x[n, 5], extended), _fraction(share, x[n, 7], extended)
+    if not _has_voltage(xn, xp):
+        return np.nan
+    return _equilibrium(xn, xp, x[n, 0], constants[c, 3], constants[c, 10], poly_n, poly_p) - x[n, 1] - x[n, 2] - x[n, 3]
 
 
-@njit(cache=True, error_model="numpy")
-def nominal_overpotentials(i: float, xn: float, xp: float, tb: float, constants: FloatArray, c: int) -> tuple[float, float]:
-    # What Vsn and Vsp relax to: Butler-Volmer with alpha = 1/2, Jn0 = kn * sqrt(xn * (1 - xn)); mole fractions inside 0 .. 1
-    thermal_voltage = constants[c, 3] * tb * constants[c, 4]
-    vsn = thermal_voltage * asinh_ratio(i * constants[c, 5], (1.0 - xn) * xn)
-    vsp = thermal_voltage * asinh_ratio(i * constants[c, 6], (1.0 - xp) * xp)
-    return vsn, vsp
-
-
-@njit(cache=True, error_model="numpy")
+@_inlined
 def cell_step(
     x: FloatArray,
     n: int,
@@ -116,38 +222,148 @@ def cell_step(
     out: FloatArray,
     m: int,
 ) -> None:
-    # One step of explicit Euler of row n of x under the current i, into row m of out; may work in place.
-    tb, vo, vsn, vsp = x[n, 0], x[n, 1], x[n, 2], x[n, 3]
-    qnb, qns, qpb, qps = x[n, 4], x[n, 5], x[n, 6], x[n, 7]
-    xn = mole_fraction(qns, q, extended, constants, c)
-    xp = mole_fraction(qps, q, extended, constants, c)
-    diffusion_n = qnb * constants[c, 1] - qns * constants[c, 2]
-    diffusion_p = qpb * constants[c, 1] - qps * constants[c, 2]
-    vsn_nominal, vsp_nominal = np.nan, np.nan
-    if 0.0 < xn < 1.0 and 0.0 < xp < 1.0:
-        vsn_nominal, vsp_nominal = nominal_overpotentials(i, xn, xp, tb, constants, c)
-    out[m, 0] = tb
-    if thermal:
-        out[m, 0] += dt * ((vo + vsn + vsp) * i * constants[c, 11] + (constants[c, 13] - tb) * constants[c, 12])
-    out[m, 1] = vo + dt * (i * r_o - vo) * constants[c, 7]
-    out[m, 2] = vsn + dt * (vsn_nominal - vsn) * constants[c, 8]
-    out[m, 3] = vsp + dt * (vsp_nominal - vsp) * constants[c, 9]
-    out[m, 4] = qnb - dt * diffusion_n
-    out[m, 5] = qns + dt * (diffusion_n - i)
-    out[m, 6] = qpb - dt * diffusion_p
-    out[m, 7] = qps + dt * (diffusion_p + i)
+    # One step of row n of x, into row m of out; may work in place
+    share = constants[c, 0] / q
+    xn, xp = _fraction(share, x[n, 5], extended), _fraction(share, x[n, 7], extended)
+    state = (x[n, 0], x[n, 1], x[n, 2], x[n, 3], x[n, 4], x[n, 5], x[n, 6], x[n, 7])
+    k = (
+        constants[c, 1],
+        constants[c, 2],
+        constants[c, 3],
+        constants[c, 4],
+        constants[c, 5],
+        constants[c, 6],
+        constants[c, 7],
+        constants[c, 8],
+        constants[c, 9],
+        constants[c, 11],
+        constants[c, 12],
+        constants[c, 13],
+    )
+    y = _euler(state, i, xn, xp, r_o, dt, thermal, k)
+    out[m, 0], out[m, 1], out[m, 2], out[m, 3] = y[0], y[1], y[2], y[3]
+    out[m, 4], out[m, 5], out[m, 6], out[m, 7] = y[4], y[5], y[6], y[7]
 
 
-@njit(cache=True, error_model="numpy")
+@_inlined
 def cell_current(load: float, power: bool, voltage: float, extended: bool) -> float:
-    if not power:
-        return load
-    if extended:
-        return load / max(voltage, _VOLTAGE_FLOOR_V)
-    return load / voltage if voltage > 0.0 else np.nan
+    return _current(load, voltage, extended) if power else load
 
 
-@njit(cache=True, error_model="numpy")
+@_compiled
+def fill_block(
+    block: FloatArray,
+    first: int,
+    cells: int,
+    state: FloatArray,
+    load: FloatArray,
+    q: FloatArray,
+    r_o: FloatArray,
+    constants: FloatArray,
+) -> None:
+    # Take ``cells`` cells, from row ``first`` on, into a block of shape (BLOCK_SIZE,); the first block is the largest
+    for j in range(cells):
+        n = first + j
+        for k in range(8):
+            block[k * BLOCK + j] = state[n, k]
+        block[_LOAD * BLOCK + j] = load[n]
+        block[_Q * BLOCK + j] = q[n]
+        block[_R_O * BLOCK + j] = r_o[n]
+    if constants.shape[0] > 1:
+        for j in range(cells):
+            for k in range(14):
+                block[(_CONSTANTS + k) * BLOCK + j] = constants[first + j, k]
+    elif first == 0:
+        for k in range(14):
+            for j in range(cells):
+                block[(_CONSTANTS + k) * BLOCK + j] = constants[0, k]
+
+
+@_compiled
+def voltage_of_block(block: FloatArray, cells: int, extended: bool, poly_n: FloatArray, poly_p: FloatArray) -> None:
+    # the voltages are in block[VOLTAGE : VOLTAGE + cells] then
+    _fractions_of_block(block, cells, extended)
+    for j in range(cells):
+        xn, xp = block[_XN * BLOCK + j], block[_XP * BLOCK + j]
+        gas, u0 = block[(_CONSTANTS + 3) * BLOCK + j], block[(_CONSTANTS + 10) * BLOCK + j]
+        equilibrium = _equilibrium(xn, xp, block[j], gas, u0, poly_n, poly_p)
+        volts = equilibrium - block[BLOCK + j] - block[2 * BLOCK + j] - block[3 * BLOCK + j]
+        block[VOLTAGE + j] = volts if _has_voltage(xn, xp) else np.nan
+
+
+@_compiled
+def _fractions_of_block(block: FloatArray, cells: int, extended: bool) -> None:
+    for j in range(cells):
+        share = block[_CONSTANTS * BLOCK + j] / block[_Q * BLOCK + j]
+        block[_XN * BLOCK + j] = _fraction(share, block[5 * BLOCK + j], extended)
+        block[_XP * BLOCK + j] = _fraction(share, block[7 * BLOCK + j], extended)
+
+
+@_compiled
+def step_of_block(
+    block: FloatArray,
+    cells: int,
+    dt: float,
+    power: bool,
+    voltage: bool,
+    thermal: bool,
+    extended: bool,
+    poly_n: FloatArray,
+    poly_p: FloatArray,
+) -> None:
+    # the states are in the first eight rows of the block; if asked for (as power asks), the voltages before the step in theirs
+    if voltage:
+        voltage_of_block(block, cells, extended, poly_n, poly_p)
+    else:
+        _fractions_of_block(block, cells, extended)
+    if power:
+        for j in range(cells):
+            block[_LOAD * BLOCK + j] = _current(block[_LOAD * BLOCK + j], block[VOLTAGE + j], extended)
+    for j in range(cells):
+        x = (
+            block[j],
+            block[BLOCK + j],
+            block[2 * BLOCK + j],
+            block[3 * BLOCK + j],
+            block[4 * BLOCK + j],
+            block[5 * BLOCK + j],
+            block[6 * BLOCK + j],
+            block[7 * BLOCK + j],
+        )
+        k = (
+            block[(_CONSTANTS + 1) * BLOCK + j],
+            block[(_CONSTANTS + 2) * BLOCK + j],
+            block[(_CONSTANTS + 3) * BLOCK + j],
+            block[(_CONSTANTS + 4) * BLOCK + j],
+            block[(_CONSTANTS + 5) * BLOCK + j],
+            block[(_CONSTANTS + 6) * BLOCK + j],
+            block[(_CONSTANTS + 7) * BLOCK + j],
+            block[(_CONSTANTS + 8) * BLOCK + j],
+            block[(_CONSTANTS + 9) * BLOCK + j],
+            block[(_CONSTANTS + 11) * BLOCK + j],
+            block[(_CONSTANTS + 12) * BLOCK + j],
+            block[(_CONSTANTS + 13) * BLOCK + j],
+        )
+        i, r_o = block[_LOAD * BLOCK + j], block[_R_O * BLOCK + j]
+        y = _euler(x, i, block[_XN * BLOCK + j], block[_XP * BLOCK + j], r_o, dt, thermal, k)
+        block[j] = y[0]
+        block[BLOCK + j] = y[1]
+        block[2 * BLOCK + j] = y[2]
+        block[3 * BLOCK + j] = y[3]
+        block[4 * BLOCK + j] = y[4]
+        block[5 * BLOCK + j] = y[5]
+        block[6 * BLOCK + j] = y[6]
+        block[7 * BLOCK + j] = y[7]
+
+
+@_compiled
+def states_of_block(block: FloatArray, first: int, cells: int, out: FloatArray) -> None:
+    for j in range(cells):
+        for k in range(8):
+            out[first + j, k] = block[k * BLOCK + j]
+
+
+@_compiled
 def voltage_batch(
     state: FloatArray,
     q: FloatArray,
@@ -157,12 +373,16 @@ def voltage_batch(
     poly_p: FloatArray,
     out: FloatArray,
 ) -> None:
-    for n in range(out.shape[0]):
-        c = n if constants.shape[0] > 1 else 0
-        out[n] = cell_voltage(state, n, q[n], extended, constants, c, poly_n, poly_p)
+    block = np.empty(BLOCK_SIZE)
+    for first in range(0, out.shape[0], BLOCK):
+        cells = min(BLOCK, out.shape[0] - first)
+        fill_block(block, first, cells, state, q, q, q, constants)  # load and r_o play no part
+        voltage_of_block(block, cells, extended, poly_n, poly_p)
+        for j in range(cells):
+            out[first + j] = block[VOLTAGE + j]
 
 
-@njit(cache=True, error_model="numpy")
+@_compiled
 def step_batch(
     state: FloatArray,
     load: FloatArray,
@@ -177,14 +397,15 @@ def step_batch(
     poly_p: FloatArray,
     out: FloatArray,
 ) -> None:
-    for n in range(out.shape[0]):
-        c = n if constants.shape[0] > 1 else 0
-        volts = cell_voltage(state, n, q[n], extended, constants, c, poly_n, poly_p) if power else 0.0
-        i = cell_current(load[n], power, volts, extended)
-        cell_step(state, n, i, q[n], r_o[n], dt, thermal, extended, constants, c, out, n)
+    block = np.empty(BLOCK_SIZE)
+    for first in range(0, out.shape[0], BLOCK):
+        cells = min(BLOCK, out.shape[0] - first)
+        fill_block(block, first, cells, state, load, q, r_o, constants)
+        step_of_block(block, cells, dt, power, power, thermal, extended, poly_n, poly_p)
+        states_of_block(block, first, cells, out)
 
 
-@njit(cache=True, error_model="numpy")
+@_compiled
 def advance_batch(
     state: FloatArray,
     load: FloatArray,
@@ -195,19 +416,26 @@ def advance_batch(
     dt: float,
     power: bool,
     thermal: bool,
+    extended: bool,
     constants: FloatArray,
     poly_n: FloatArray,
     poly_p: FloatArray,
 ) -> None:
-    for n in range(state.shape[0]):
-        c = n if constants.shape[0] > 1 else 0
-        for k in range(steps[n]):
-            volts = cell_voltage(state, n, q[n], False, constants, c, poly_n, poly_p) if power else 0.0
-            i = cell_current(load[first[n] + k], power, volts, False)
-            cell_step(state, n, i, q[n], r_o[n], dt, thermal, False, constants, c, state, n)
+    # the cells with most steps come first, so that those of a block that are still on their way are always its first ones
+    block = np.empty(BLOCK_SIZE)
+    for start in range(0, state.shape[0], BLOCK):
+        cells = running = min(BLOCK, state.shape[0] - start)
+        fill_block(block, start, cells, state, q, q, r_o, constants)  # the load comes below
+        for k in range(steps[start]):
+            while steps[start + running - 1] <= k:
+                running -= 1
+            for j in range(running):
+                block[_LOAD * BLOCK + j] = load[first[start + j] + k]
+            step_of_block(block, running, dt, power, power, thermal, extended, poly_n, poly_p)
+        states_of_block(block, start, cells, state)
 
 
-@njit(cache=True, error_model="numpy")
+@_compiled
 def roll_out(
     load: FloatArray,
     q: float,

@@ -11,14 +11,18 @@ from battery_env.electrochemistry import (
     FULL_CHARGE_SHARES,
     NEW_CELL,
     QNB,
+    UNCERTAIN_CONSTANTS,
     CellParameters,
+    advance_in_place,
     initial_state,
     simulate,
     state_of_charge,
     step,
     step_into,
     voltage,
+    voltage_into,
 )
+from battery_env.kernels import logarithm
 
 # Tb, Vo, Vsn, Vsp, qnB, qnS, qpB, qpS, V of a new cell, dt 1 s
 REFERENCE_2A_THERMAL = {
@@ -106,6 +110,7 @@ def test_total_charge_is_conserved_under_any_load(q_mobile, r_o, load):
 
 
 @given(Q_MOBILE)
+@settings(deadline=None)  # the first call compiles
 def test_full_charge_has_the_same_voltage_for_every_cell(q_mobile):
     assert voltage(initial_state(q_mobile), q_mobile) == pytest.approx(4.191350, abs=5e-7)
     assert state_of_charge(initial_state(q_mobile), np.array(q_mobile)) == pytest.approx(1.0)
@@ -130,6 +135,46 @@ def test_batch_equals_scalar(load_unit, thermal):
             one = step(one, load[m, 0], q[m, n], r[n], 1.0, load_unit, thermal)
         np.testing.assert_array_equal(batch[m, n], one)
         assert volts[m, n] == voltage(one, q[m, n])
+
+
+@pytest.mark.parametrize("load_unit", ["power", "current"])
+def test_a_cell_comes_out_the_same_in_a_batch_of_any_size_and_on_its_own_way(load_unit):
+    # blocks, their remainders, constants of each cell's own, and ways of different lengths
+    rng = np.random.default_rng(3)
+    n = 150
+    q, r, steps = rng.uniform(5000.0, 7600.0, n), rng.uniform(0.1, 0.2, n), rng.integers(0, 9, n)
+    loads, first = rng.uniform(1.0, 3.0, 60), rng.integers(0, 50, n)
+    factors = np.exp(0.1 * rng.standard_normal((n, 4)))
+    known = np.array([getattr(NEW_CELL, name) for name in UNCERTAIN_CONSTANTS])
+    cells = [NEW_CELL.replace(**dict(zip(UNCERTAIN_CONSTANTS, known * own, strict=True))) for own in factors]
+    for packed, constants in ((NEW_CELL.packed, [NEW_CELL] * n), (NEW_CELL.packed_with(factors), cells)):
+        state = initial_state(q)
+        advance_in_place(state, loads, first, steps, q, r, 1.0, load_unit, False, packed)
+        volts = np.empty(n)
+        voltage_into(volts, state, q, packed)
+        for m in range(0, n, 7):
+            one = initial_state(q[m])
+            for k in range(steps[m]):
+                one = step(one, loads[first[m] + k], q[m], r[m], load_unit=load_unit, parameters=constants[m])
+            rtol = 0.0 if constants[m] is NEW_CELL else 1e-14  # a constant times a factor is rounded twice
+            np.testing.assert_allclose(state[m], one, rtol=rtol)
+            np.testing.assert_allclose(volts[m], voltage(one, q[m]), rtol=rtol)
+        out = np.empty_like(state)
+        step_into(out, state, loads[first], q, r, 1.0, load_unit, False, packed)
+        for size in (1, 3, 64, 65):
+            part = np.empty((size, 8))
+            some = packed._replace(constants=packed.constants[:size])
+            step_into(part, state[:size], loads[first][:size], q[:size], r[:size], 1.0, load_unit, False, some)
+            np.testing.assert_array_equal(part, out[:size])
+
+
+def test_the_logarithm_is_that_of_the_c_library_to_one_unit_in_the_last_place():
+    rng = np.random.default_rng(4)
+    near_one = 1.0 + rng.uniform(-1.0, 1.0, 1000) * 10.0 ** rng.uniform(-15.0, -0.4, 1000)
+    values = [*np.exp(rng.uniform(-700.0, 700.0, 1000)), *near_one, 0.5**0.5, 2.0**0.5, 1.0, 2.3e-308, 1.7e308]
+    found, expected = np.array([logarithm(value) for value in values]), np.log(values)
+    assert (np.abs(found - expected) <= np.spacing(np.abs(expected))).all()
+    assert np.isnan(logarithm(np.nan)) and logarithm(np.inf) == np.inf and logarithm(1.0) == 0.0
 
 
 def test_roll_out_equals_single_steps():
@@ -184,6 +229,9 @@ def test_extended_model_is_the_model_where_it_is_defined_and_finite_where_not():
     for wrong in (4000.0, 8000.0):
         step_into(extended, state, load, np.full(n, wrong), r, 1.0, "power", False, NEW_CELL.packed, extended=True)
         assert np.isfinite(extended).all()
+        far, first, steps = state.copy(), np.zeros(n, dtype=np.int64), np.full(n, n)
+        advance_in_place(far, load, first, steps, np.full(n, wrong), r, 1.0, "power", False, NEW_CELL.packed, extended=True)
+        assert np.isfinite(far).all()
 
 
 @pytest.mark.parametrize(
