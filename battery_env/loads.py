@@ -4,11 +4,44 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from numbers import Real
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from battery_env.electrochemistry import FloatArray, LoadUnit, check_load
+
+
+def checked_range(name: str, ends: tuple[float, float]) -> tuple[float, float]:
+    """
+    Refuse what is not two finite numbers in ascending order.
+
+    :param name: what the range is called, for the message
+    :param ends: lower and upper end
+    :return: the same as floats
+    :raises TypeError: if they are not two numbers
+    :raises ValueError: if they are not finite, or descend
+    """
+    try:
+        low, high = map(float, ends)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"{name} must be two numbers, lower and upper end, got {ends!r}") from error
+    if not -np.inf < low <= high < np.inf:
+        raise ValueError(f"{name} must be finite and increasing, got {ends!r}")
+    return low, high
+
+
+def _numbers(name: str, values: ArrayLike) -> FloatArray:
+    try:
+        return np.array(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"{name} must be a number or an array of numbers, got {values!r}") from error
+
+
+def _check_positive(name: str, value: float) -> None:
+    if not isinstance(value, Real) or not 0.0 < value < np.inf:
+        raise ValueError(f"{name} must be a positive, finite number, got {value!r}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,8 +61,8 @@ class Load:
     unit: LoadUnit = "power"
 
     def __post_init__(self) -> None:
-        start = np.array(self.start_s, dtype=np.float64)
-        value = check_load(np.array(self.value, dtype=np.float64), self.unit)
+        start = _numbers("start_s", self.start_s)
+        value = check_load(_numbers("value", self.value), self.unit)
         if start.ndim != 1 or start.size == 0 or start.shape != value.shape:
             raise ValueError(f"start_s and value must be 1-D, alike and not empty, got shapes {start.shape} and {value.shape}")
         if start[0] != 0.0 or not (np.diff(start) > 0.0).all() or not np.isfinite(start).all():
@@ -45,10 +78,20 @@ class Load:
         :return: the load, same shape
         :raises ValueError: for a negative time
         """
-        time = np.asarray(time_s, dtype=np.float64)
+        time = _numbers("time_s", time_s)
         if not (time >= 0.0).all():
-            raise ValueError(f"time_s must be at least 0, got {time.min() if time.size else time}")
+            raise ValueError(f"time_s must be at least 0, got {time[~(time >= 0.0)][0]:g}")
         return np.asarray(self.value[np.searchsorted(self.start_s, time, side="right") - 1])
+
+    def on_grid(self, time_s: FloatArray) -> FloatArray:
+        """
+        The same for times in ascending order, many times faster: it looks up the segments instead of the times.
+
+        :param time_s: s, at least 0, ascending, shape (T,)
+        :return: the load, shape (T,)
+        """
+        bounds = np.append(np.searchsorted(time_s, self.start_s), len(time_s))
+        return np.repeat(self.value, np.diff(bounds))
 
 
 #: Draws a load at random: what :meth:`battery_env.trajectories.TrajectoryDataset.generate` takes for random loads.
@@ -63,7 +106,7 @@ def constant(value: float, unit: LoadUnit = "power") -> Load:
     :param unit: ``"power"`` or ``"current"``
     :return: the load
     """
-    return Load(np.zeros(1), np.array([value], dtype=np.float64), unit)
+    return Load(np.zeros(1), _numbers("value", [value]), unit)
 
 
 def piecewise(values: ArrayLike, durations_s: ArrayLike, unit: LoadUnit = "power") -> Load:
@@ -75,10 +118,51 @@ def piecewise(values: ArrayLike, durations_s: ArrayLike, unit: LoadUnit = "power
     :param unit: ``"power"`` or ``"current"``
     :return: the load
     """
-    durations = np.asarray(durations_s, dtype=np.float64)
+    durations = _numbers("durations_s", durations_s)
     if durations.ndim != 1 or not (durations > 0.0).all():
         raise ValueError(f"durations_s must be 1-D and positive, got {durations_s!r}")
-    return Load(np.concatenate([[0.0], np.cumsum(durations)[:-1]]), np.asarray(values, dtype=np.float64), unit)
+    return Load(np.concatenate([[0.0], np.cumsum(durations)[:-1]]), _numbers("values", values), unit)
+
+
+class Recording(Protocol):
+    """What was measured during one discharge, arrays of shape (T,): a :class:`battery_env.cells.Discharge` is one."""
+
+    @property
+    def time_s(self) -> FloatArray: ...
+
+    @property
+    def voltage_V(self) -> FloatArray: ...
+
+    @property
+    def current_A(self) -> FloatArray: ...
+
+
+def recorded(recording: Recording, unit: LoadUnit = "power", dt_s: float = 1.0) -> Load:
+    """
+    The load of a recorded discharge, from its first sample on; beyond the last one its last value goes on, so give the part
+    under load (:meth:`battery_env.cells.Discharge.loaded_part`).
+
+    Each sample stands for the time nearest to it, so that a switch of the load falls midway between two samples, and the
+    drawn energy (power) or charge (current) is that of the trapezoidal rule. The load is its mean over each time step, which
+    keeps both exactly.
+
+    :param recording: the discharge
+    :param unit: ``"power"`` (voltage times current) or ``"current"``
+    :param dt_s: time step of the simulation that is to follow it, s
+    :return: the load
+    :raises ValueError: for another unit, or a time step that is not positive or longer than the recording
+    """
+    if unit not in ("power", "current"):
+        raise ValueError(f"unit must be 'power' (W) or 'current' (A), got {unit!r}")
+    time = np.asarray(recording.time_s) - recording.time_s[0]
+    _check_positive("dt_s", dt_s)
+    if dt_s > time[-1]:
+        raise ValueError(f"dt_s must be at most the recording's {time[-1]:g} s, got {dt_s!r}")
+    value = recording.current_A * recording.voltage_V if unit == "power" else recording.current_A
+    edges = np.concatenate([[0.0], 0.5 * (time[1:] + time[:-1]), [time[-1]]])
+    drawn = np.concatenate([[0.0], np.cumsum(value * np.diff(edges))])
+    grid = dt_s * np.arange(int(time[-1] / dt_s + 1e-9) + 1, dtype=np.float64)
+    return Load(grid[:-1], np.diff(np.interp(grid, edges, drawn)) / dt_s, unit)
 
 
 @dataclass(frozen=True)
@@ -99,13 +183,11 @@ class RandomPiecewise:
     unit: LoadUnit = "power"
 
     def __post_init__(self) -> None:
-        check_load(np.array(self.value_range), self.unit)
+        check_load(checked_range("value_range", self.value_range), self.unit)
+        checked_range("duration_range_s", self.duration_range_s)
         for name in ("value_range", "duration_range_s"):
-            low, high = getattr(self, name)
-            if not 0.0 < low <= high:
-                raise ValueError(f"{name} must be positive and increasing, got {(low, high)}")
-        if not self.total_s > 0.0:
-            raise ValueError(f"total_s must be positive, got {self.total_s!r}")
+            _check_positive(f"the lower end of {name}", getattr(self, name)[0])
+        _check_positive("total_s", self.total_s)
 
     def __call__(self, rng: np.random.Generator) -> Load:
         """
@@ -118,3 +200,48 @@ class RandomPiecewise:
         durations = rng.uniform(*self.duration_range_s, size=segments)
         count = int(np.searchsorted(np.cumsum(durations), self.total_s)) + 1
         return piecewise(rng.uniform(*self.value_range, size=segments)[:count], durations[:count], self.unit)
+
+
+@dataclass(frozen=True)
+class RandomWalk:
+    """
+    A sampler of piecewise-constant loads that remember: each value is the last one plus a step, uniform at random, reflected
+    at the bounds; the first one is uniform between the bounds, and so is then every other.
+
+    :param value_range: lowest and highest value, W or A
+    :param largest_step: largest change from one segment to the next, W or A
+    :param segment_s: how long each value holds, s
+    :param total_s: for how long the load changes; beyond, its last value goes on
+    :param unit: ``"power"`` or ``"current"``
+    :raises ValueError: for a range that is not increasing and positive, or other values that are not positive
+    """
+
+    value_range: tuple[float, float] = (2.0, 8.0)
+    largest_step: float = 2.0
+    segment_s: float = 60.0
+    total_s: float = 20_000.0
+    unit: LoadUnit = "power"
+
+    def __post_init__(self) -> None:
+        low, high = checked_range("value_range", self.value_range)
+        check_load((low, high), self.unit)
+        _check_positive("the lower end of value_range", low)
+        _check_positive("the width of value_range", high - low)
+        for name in ("largest_step", "segment_s", "total_s"):
+            _check_positive(name, getattr(self, name))
+
+    def __call__(self, rng: np.random.Generator) -> Load:
+        """
+        Draw one load.
+
+        :param rng: source of randomness
+        :return: the load
+        """
+        low, high = self.value_range
+        width = high - low
+        segments = int(np.ceil(self.total_s / self.segment_s))
+        steps = rng.uniform(-self.largest_step, self.largest_step, size=segments - 1)
+        free = np.cumsum(np.concatenate([[rng.uniform(0.0, width)], steps]))
+        # a walk between two mirrors is a free walk, folded
+        folded = width - np.abs(free % (2.0 * width) - width)
+        return Load(self.segment_s * np.arange(segments, dtype=np.float64), low + folded, self.unit)

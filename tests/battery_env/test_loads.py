@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.integrate import trapezoid
 
-from battery_env.loads import Load, RandomPiecewise, constant, piecewise
+from battery_env.cells import Discharge, load_nasa_discharges
+from battery_env.electrochemistry import NEW_CELL
+from battery_env.loads import Load, RandomPiecewise, RandomWalk, constant, piecewise, recorded
 
 
 def test_a_segment_holds_from_its_start_to_the_next():
@@ -31,6 +34,57 @@ def test_random_piecewise_stays_in_its_ranges_and_follows_its_seed(seed):
     assert load.start_s[-1] < 1000.0
 
 
+@given(
+    durations=st.lists(st.floats(0.1, 30.0), min_size=1, max_size=20),
+    dt_s=st.floats(0.1, 12.0),
+    steps=st.integers(0, 50),
+    seed=st.integers(0, 1000),
+)
+def test_a_load_on_a_grid_is_the_load_at_its_times(durations, dt_s, steps, seed):
+    load = piecewise(np.random.default_rng(seed).uniform(1.0, 9.0, len(durations)), durations)
+    grid = dt_s * np.arange(steps)
+    np.testing.assert_array_equal(load.on_grid(grid), load(grid))
+    np.testing.assert_array_equal(load.on_grid(load.start_s), load.value)
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0.1, 30.0))
+def test_a_random_walk_stays_in_its_bounds_and_follows_its_seed(seed, largest_step):
+    walk = RandomWalk(value_range=(2.0, 8.0), largest_step=largest_step, segment_s=30.0, total_s=1000.0)
+    load, again = walk(np.random.default_rng(seed)), walk(np.random.default_rng(seed))
+    np.testing.assert_array_equal(load.value, again.value)
+    assert (load.value >= 2.0).all() and (load.value <= 8.0).all()
+    assert (np.abs(np.diff(load.value)) <= largest_step * (1.0 + 1e-9)).all()
+    np.testing.assert_array_equal(load.start_s, np.arange(0.0, 1000.0, 30.0))
+
+
+def test_a_random_walk_visits_all_values_alike_and_remembers():
+    rng = np.random.default_rng(0)
+    walks = np.array([RandomWalk()(rng).value for _ in range(1000)])
+    for segment in (0, 5, -1):  # were the walk cut off at its bounds instead of reflected, it would dwell there
+        shares, _ = np.histogram(walks[:, segment], bins=6, range=(2.0, 8.0))
+        np.testing.assert_allclose(shares / 1000.0, 1.0 / 6.0, atol=0.04)
+    assert np.corrcoef(walks[:, 0], walks[:, 1])[0, 1] > 0.7
+
+
+def test_a_recorded_load_keeps_charge_and_energy():
+    part = load_nasa_discharges("B0006")[100].loaded_part(NEW_CELL.VEOD)
+    time_s = part.time_s - part.time_s[0]
+    for unit, value in (("current", part.current_A), ("power", part.current_A * part.voltage_V)):
+        for steps in (100, 3000):
+            dt_s = time_s[-1] / steps
+            load = recorded(part, unit, dt_s)
+            assert load.unit == unit and len(load.value) == steps and load(1e6) == load.value[-1]
+            assert dt_s * load.value.sum() == pytest.approx(trapezoid(value, time_s), rel=1e-12)
+    assert recorded(part, "power", 1.0).start_s[-1] == int(time_s[-1]) - 1.0
+
+
+def test_a_recorded_load_is_switched_midway_between_the_samples():
+    time_s, current_A = np.array([5.0, 15.0, 25.0, 35.0, 45.0]), np.array([0.0, 0.0, 2.0, 2.0, 1.0])
+    switched = Discharge(time_s, np.full(5, 4.0), current_A)
+    np.testing.assert_allclose(recorded(switched, "current", 1.0)(np.arange(40.0)), np.repeat([0.0, 2.0, 1.0], [15, 20, 5]))
+    np.testing.assert_allclose(recorded(switched, dt_s=10.0).value, [0.0, 4.0, 8.0, 6.0])
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -42,9 +96,21 @@ def test_random_piecewise_stays_in_its_ranges_and_follows_its_seed(seed):
         (lambda: piecewise([2.0, 3.0], [10.0, -1.0]), "durations_s"),
         (lambda: constant(2.0)(-1.0), "time_s must be at least 0"),
         (lambda: RandomPiecewise(value_range=(8.0, 2.0)), "value_range"),
+        (lambda: RandomPiecewise(value_range=(0.0, 2.0)), "lower end of value_range"),
+        (lambda: RandomPiecewise(duration_range_s=(60.0, np.inf)), "duration_range_s must be finite"),
         (lambda: RandomPiecewise(total_s=0.0), "total_s"),
+        (lambda: RandomWalk(value_range=(2.0, 2.0)), "width of value_range"),
+        (lambda: RandomWalk(value_range=(2.0, 8000.0)), "got 8000.*unit of the load is power"),
+        (lambda: RandomWalk(largest_step=-1.0), "largest_step must be a positive, finite number, got -1.0"),
+        (lambda: RandomWalk(segment_s="60"), "segment_s .* got '60'"),
+        (lambda: RandomWalk(value_range=(2.0,)), "value_range must be two numbers"),
+        (lambda: recorded(load_nasa_discharges("B0005")[0], "energy"), "unit must be 'power'.* got 'energy'"),
+        (
+            lambda: recorded(load_nasa_discharges("B0005")[0], dt_s=1e5),
+            "dt_s must be at most the recording's 3690.* got 100000",
+        ),
     ],
 )
 def test_nonsense_is_refused(make, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises((TypeError, ValueError), match=message):
         make()

@@ -1,19 +1,37 @@
 """Data sets of simulated discharges."""
 
+import dataclasses
 import json
+import pickle
+import sys
 import zipfile
+from functools import partial
+from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from battery_env.electrochemistry import initial_state, simulate
+from battery_env.electrochemistry import NEW_CELL, STATE_NAMES, UNCERTAIN_CONSTANTS, initial_state, simulate
 from battery_env.loads import RandomPiecewise, constant
-from battery_env.trajectories import PAPER_LOADS_W, TrajectoryDataset
+from battery_env.trajectories import _ARRAYS, PAPER_LOADS_W, TrajectoryDataset, _checksum
 
 
 @pytest.fixture(scope="module")
 def small():
     return TrajectoryDataset.generate("joint", 12, [constant(p) for p in (8.0, 10.0, 12.0)], seed=3, trim=(0.05, 0.95))
+
+
+@pytest.fixture(scope="module")
+def saved(small, tmp_path_factory):
+    return small.save(tmp_path_factory.mktemp("saved") / "data.npz")
+
+
+@pytest.fixture(scope="module")
+def wrong():
+    return TrajectoryDataset.generate("joint", 12, [constant(8.0), constant(12.0)], seed=3, mismatch=0.2)
 
 
 @pytest.mark.parametrize("parameter", ["q_mobile", "r_o"])
@@ -97,6 +115,28 @@ def test_single_trajectories_become_a_data_set(small):
         TrajectoryDataset.from_trajectories([])
 
 
+def test_single_trajectories_keep_what_is_known_of_their_end():
+    whole = simulate(8.0, 7600.0, 0.1)
+    unknown = simulate(8.0, 7600.0, 0.1, until=500.0)
+    data = TrajectoryDataset.from_trajectories([whole, whole.part(100, 200), unknown])
+    assert data[0].eod_time_s == whole.eod_time_s and data[1].eod_time_s == whole.eod_time_s - 100.0
+    assert np.isnan(data[2].eod_time_s) and np.isnan(data.subset([2]).eod_time_s[0])
+    other = simulate(8.0, 7600.0, 0.1, thermal=True)
+    with pytest.raises(ValueError, match="trajectory 1 is not an isothermal simulation"):
+        TrajectoryDataset.from_trajectories([whole, other])
+
+
+def test_a_trajectory_that_does_not_fit_its_states_is_not_made_up(small):
+    load_values = np.full_like(small.load_values, 100.0)
+    with pytest.raises(ValueError, match="trajectory 0 cannot be simulated again"):
+        dataclasses.replace(small, load_values=load_values)[0]
+
+
+def test_trimming_never_reaches_beyond_the_data():
+    data = TrajectoryDataset.simulated(4000.0, 0.2, [constant(16.0)], 0, trim=(0.95, 1.0))
+    assert (data.samples[0], data.first[0], data.stop[0]) == (27, 23, 27) and len(data[0].time_s) == 4
+
+
 def test_what_is_saved_is_loaded(small, tmp_path):
     path = small.save(tmp_path / "folder" / "data")
     assert path.name == "data.npz" and list(path.parent.iterdir()) == [path]
@@ -108,26 +148,218 @@ def test_what_is_saved_is_loaded(small, tmp_path):
         small.save(path)
 
 
-def test_damaged_and_foreign_files_are_refused(small, tmp_path):
-    path = small.save(tmp_path / "data.npz")
-    with np.load(path) as file:
-        arrays = dict(file)
-    for change, message in (
-        ({"q_mobile": arrays["q_mobile"] + 1.0}, "checksum"),
-        ({"metadata": np.array(json.dumps({"format": 99}))}, "format 99"),
-    ):
-        changed = tmp_path / "changed.npz"
-        np.savez(changed, **{**arrays, **change})
-        with pytest.raises(ValueError, match=message):
-            TrajectoryDataset.load(changed)
-    (tmp_path / "cut.npz").write_bytes(path.read_bytes()[:500])
-    with zipfile.ZipFile(tmp_path / "foreign.npz", "w") as file:
-        file.writestr("a.npy", b"")
-    for name in ("cut.npz", "foreign.npz"):
-        with pytest.raises(ValueError, match="damaged"):
-            TrajectoryDataset.load(tmp_path / name)
-    with pytest.raises(FileNotFoundError):
-        TrajectoryDataset.load(tmp_path / "none.npz")
+class TestFiles:
+    @staticmethod
+    def rewritten(saved, folder, **changes):
+        """The file with other arrays, and with a checksum that fits them: as a faulty program would have written it."""
+        with np.load(saved) as file:
+            arrays = dict(file) | changes
+        arrays = {name: array for name, array in arrays.items() if array is not None}
+        metadata = str(arrays.pop("metadata"))
+        given = arrays.pop("checksum")
+        if set(_ARRAYS) <= set(arrays):
+            given = np.array(_checksum(metadata, {name: np.asarray(arrays[name]) for name in _ARRAYS}))
+        path = folder / "changed.npz"
+        np.savez(path, metadata=np.array(metadata), checksum=given, **arrays)
+        return path
+
+    @settings(max_examples=200, deadline=None)
+    @given(place=st.floats(0.0, 1.0, exclude_max=True), flip=st.integers(1, 255))
+    def test_a_damaged_byte_is_found_or_does_no_harm(self, small, saved, place, flip):
+        contents = bytearray(saved.read_bytes())
+        contents[int(place * len(contents))] ^= flip
+        damaged = saved.with_name("damaged.npz")
+        damaged.write_bytes(contents)
+        try:
+            again = TrajectoryDataset.load(damaged)
+        except ValueError as error:
+            assert "damaged.npz" in str(error)
+        else:
+            assert again._metadata() == small._metadata()
+            for name in _ARRAYS:
+                np.testing.assert_array_equal(getattr(again, name), getattr(small, name))
+
+    @pytest.mark.parametrize("length", [0, 1, 100, 5000])
+    def test_a_truncated_file_is_refused(self, saved, tmp_path, length):
+        (tmp_path / "cut.npz").write_bytes(saved.read_bytes()[:length])
+        with pytest.raises(ValueError, match=r"cut.npz is damaged, or no data set"):
+            TrajectoryDataset.load(tmp_path / "cut.npz")
+
+    def test_foreign_files_are_refused(self, tmp_path):
+        with zipfile.ZipFile(tmp_path / "zip.npz", "w") as file:
+            file.writestr("metadata.npy", b"no array")
+        np.savez(tmp_path / "arrays.npz", q_mobile=np.ones(3))
+        np.save(tmp_path / "array.npy", np.ones(3))
+        (tmp_path / "pickle.npz").write_bytes(pickle.dumps({"format": 2}))
+        for name in ("zip.npz", "arrays.npz", "array.npy", "pickle.npz"):
+            with pytest.raises(ValueError, match=rf"{name} is damaged, or no data set"):
+                TrajectoryDataset.load(tmp_path / name)
+        with pytest.raises(FileNotFoundError):
+            TrajectoryDataset.load(tmp_path / "none.npz")
+
+    def test_no_pickle_is_ever_run(self, saved, tmp_path):
+        class Bomb:
+            def __reduce__(self):
+                return Path.touch, (tmp_path / "exploded",)
+
+        bomb = np.empty(1, dtype=object)
+        bomb[0] = Bomb()
+        for name in ("q_mobile", "metadata"):
+            with np.load(saved) as file:
+                np.savez(tmp_path / "bomb.npz", **{**file, name: bomb})
+            with pytest.raises(ValueError, match="allow_pickle=False"):
+                TrajectoryDataset.load(tmp_path / "bomb.npz")
+        assert not (tmp_path / "exploded").exists()
+
+    def test_version_1_had_no_factors_and_is_refused(self, saved, tmp_path):
+        metadata = np.array(json.dumps({"format": 1, "sha256": "0"}))
+        old = self.rewritten(saved, tmp_path, metadata=metadata, factors=None, eod_time_s=None)
+        with pytest.raises(ValueError, match="has format 1, this version reads 2: generate it again"):
+            TrajectoryDataset.load(old)
+
+    def test_changed_contents_do_not_match_their_checksum(self, small, saved, tmp_path):
+        with np.load(saved) as file:
+            arrays = dict(file)
+        other_dt = str(arrays["metadata"]).replace('"dt_s": 1.0', '"dt_s": 2.0')
+        assert other_dt != str(arrays["metadata"])
+        for changes in ({"q_mobile": small.q_mobile + 1.0}, {"metadata": np.array(other_dt)}):
+            np.savez(tmp_path / "changed.npz", **{**arrays, **changes})
+            with pytest.raises(ValueError, match="do not match their checksum"):
+                TrajectoryDataset.load(tmp_path / "changed.npz")
+
+    @pytest.mark.parametrize(
+        ("name", "change", "message"),
+        [
+            ("q_mobile", lambda a: a[:-1], r"must be an array of float64 of shape \(11,.*, got float64 \(12,"),
+            ("checkpoint", lambda a: a[:, :7], r"checkpoint must be an array of float64 of shape"),
+            ("checkpoint", lambda a: a[:-1], "checkpoint_start of trajectory 11 lie outside"),
+            ("checkpoint", lambda a: a * np.nan, "checkpoint must be finite"),
+            ("load_values", lambda a: a[:-1], "load_start of trajectory .* lie outside"),
+            ("load_values", lambda a: a * np.nan, "load must lie within .* got nan"),
+            ("load_start", lambda a: a - 1, "load_start of trajectory .* lie outside"),
+            ("factors", lambda a: a * 0.0, "factors must be finite and greater than 0, got 0"),
+            ("factors", lambda a: a * 0.05, "dt must be"),
+            ("first", lambda a: a.astype(np.float64), r"first must be an array of int64 .* got float64"),
+            ("stop", lambda a: a + 10_000, "first and stop of trajectory 0 lie outside"),
+            ("samples", lambda a: a.astype(np.int32), "samples must be an array of int64 .* got int32"),
+            ("r_o", lambda a: a * 1000.0, "r_o must lie within .* Milliohms"),
+            ("r_o", lambda a: None, "r_o"),
+        ],
+    )
+    def test_arrays_that_cannot_be_a_data_set_are_refused(self, small, saved, tmp_path, name, change, message):
+        with pytest.raises(ValueError, match=rf"changed.npz .*{message}"):
+            TrajectoryDataset.load(self.rewritten(saved, tmp_path, **{name: change(getattr(small, name))}))
+
+    def test_settings_that_cannot_be_meant_are_refused(self, small, saved, tmp_path):
+        for change, message in (({"load_unit": "kW"}, "load_unit must be"), ({"parameters": {"kN": 1.0}}, "kN")):
+            metadata = np.array(json.dumps(json.loads(small._metadata()) | change))
+            with pytest.raises(ValueError, match=rf"changed.npz holds no valid data set: .*{message}"):
+                TrajectoryDataset.load(self.rewritten(saved, tmp_path, metadata=metadata))
+
+
+class TestMismatch:
+    def test_only_the_constants_differ_and_by_as_much_as_asked(self):
+        exact, wrong = (
+            TrajectoryDataset.generate("joint", 300, [constant(14.0)], seed=3, mismatch=mismatch) for mismatch in (0.0, 0.3)
+        )
+        np.testing.assert_array_equal(exact.q_mobile, wrong.q_mobile)
+        np.testing.assert_array_equal(exact.r_o, wrong.r_o)
+        assert (exact.factors == 1.0).all()
+        np.testing.assert_allclose(np.median(wrong.factors, axis=0), 1.0, atol=0.07)
+        np.testing.assert_allclose(wrong.factors.std(axis=0) / wrong.factors.mean(axis=0), 0.3, atol=0.05)
+        assert np.abs(np.corrcoef(wrong.factors.T) - np.eye(4)).max() < 0.2
+
+    def test_a_trajectory_is_the_simulation_of_its_own_constants(self, wrong):
+        for n in (0, 7):
+            kn, t_diffusion, to, tsn = wrong.factors[n]
+            cell = NEW_CELL.replace(
+                kn=NEW_CELL.kn * kn, tDiffusion=NEW_CELL.tDiffusion * t_diffusion, to=NEW_CELL.to * to, tsn=NEW_CELL.tsn * tsn
+            )
+            whole = simulate(wrong[n].load[0], wrong.q_mobile[n], wrong.r_o[n], parameters=cell)
+            nominal = simulate(wrong[n].load[0], wrong.q_mobile[n], wrong.r_o[n])
+            np.testing.assert_allclose(wrong[n].state, whole.state, rtol=1e-9)
+            assert wrong[n].eod_time_s == whole.eod_time_s
+            assert np.abs(wrong[n].voltage_V[:100] - nominal.voltage_V[:100]).max() > 1e-3
+
+    def test_states_between_checkpoints_are_the_same_to_the_bit(self, wrong):
+        for index in (np.arange(12), np.array([5])):
+            for sample in (0, 63, 200):
+                states = wrong.states_at(index, np.full(len(index), sample))
+                np.testing.assert_array_equal(states, [wrong[n].state[sample] for n in index])
+
+    def test_constants_are_packed_row_by_row_or_shared(self, small, wrong):
+        assert small.packed(np.array([3, 4])) is small.parameters.packed
+        np.testing.assert_array_equal(
+            wrong.packed(np.array([3, 4])).constants, NEW_CELL.packed_with(wrong.factors[[3, 4]]).constants
+        )
+
+    def test_subsets_and_files_keep_them(self, wrong, tmp_path):
+        part = wrong.subset([7, 2])
+        np.testing.assert_array_equal(part[1].state, wrong[2].state)
+        again = TrajectoryDataset.load(part.save(tmp_path / "part"))
+        np.testing.assert_array_equal(again[0].state, wrong[7].state)
+        np.testing.assert_array_equal(again.factors, part.factors)
+
+    def test_a_new_cells_data_set_does_not_take_them_in(self, wrong):
+        with pytest.raises(ValueError, match="trajectory 0 is not an isothermal simulation with a new cell's constants"):
+            TrajectoryDataset.from_trajectories([wrong[0]])
+
+    def test_a_time_step_must_suit_the_fastest_cell(self):
+        for dt_s in (6.0, 7.0):
+            make = partial(TrajectoryDataset.simulated, 7600.0, 0.1, [constant(8.0)], 0, dt_s=dt_s)
+            if dt_s < 6.08671:
+                assert len(make(factors=np.array([[1.0, 1.0, 0.5, 1.0]]))) == 1
+            else:
+                with pytest.raises(ValueError, match=r"at most 6.087 s .* got 7.0"):
+                    make(factors=np.array([[1.0, 1.0, 0.5, 1.0]]))
+
+
+class TestTables:
+    def test_a_frame_holds_every_sample(self, small):
+        frame = small.to_frame()
+        assert list(frame) == [
+            *("trajectory", "time_s", "voltage_V", "current_A", "load"),
+            *(*STATE_NAMES, "q_mobile", "r_o"),
+        ]
+        assert len(frame) == (small.stop - small.first).sum()
+        for n in (0, 11):
+            rows = frame[frame["trajectory"] == n]
+            np.testing.assert_array_equal(rows["time_s"], small[n].time_s)
+            np.testing.assert_array_equal(rows["voltage_V"], small[n].voltage_V)
+            np.testing.assert_array_equal(rows[list(STATE_NAMES)], small[n].state)
+            assert (rows["q_mobile"] == small.q_mobile[n]).all()
+
+    def test_the_summary_says_what_each_discharge_was(self):
+        data = TrajectoryDataset.generate("r_o", 6, RandomPiecewise(), seed=1, trim=(0.1, 0.7), mismatch=0.1)
+        summary = data.summary()
+        assert len(summary) == 6
+        row, trajectory = summary.iloc[5], data[5]
+        assert (row["trajectory"], row["q_mobile"], row["r_o"]) == (5, data.q_mobile[5], data.r_o[5])
+        assert [row[f"{name}_factor"] for name in UNCERTAIN_CONSTANTS] == list(data.factors[5])
+        assert (row["samples"], row["start_time_s"]) == (len(trajectory.time_s), trajectory.time_s[0])
+        loads = trajectory.load
+        assert (row["load_mean"], row["load_lowest"], row["load_highest"]) == (loads.mean(), loads.min(), loads.max())
+        assert row["eod_time_s"] == trajectory.eod_time_s
+
+    def test_a_parquet_file_holds_the_frame_and_where_it_comes_from(self, small, tmp_path, monkeypatch):
+        parquet = pytest.importorskip("pyarrow.parquet")
+        monkeypatch.setattr("battery_env.trajectories._ROWS_PER_GROUP", 5000)
+        path = small.to_parquet(tmp_path / "folder" / "data")
+        assert path.name == "data.parquet" and list(path.parent.iterdir()) == [path]
+        pd.testing.assert_frame_equal(pd.read_parquet(path), small.to_frame())
+        file = parquet.ParquetFile(path)
+        assert 1 < file.num_row_groups < len(small)
+        metadata = json.loads(file.schema_arrow.metadata[b"battery_env"])
+        assert metadata["description"]["seed"] == 3 and metadata["parameters"]["kn"] == 2120.96
+        assert set(metadata["versions"]) == {"python", "numpy", "numba"} and len(metadata["checksum"]) == 64
+        with pytest.raises(FileExistsError, match="exists already"):
+            small.to_parquet(path)
+
+    def test_without_pyarrow_the_extra_is_named(self, small, tmp_path, monkeypatch):
+        monkeypatch.setitem(sys.modules, "pyarrow", None)
+        with pytest.raises(ImportError, match=r"battery_env\[parquet\]"):
+            small.to_parquet(tmp_path / "data")
+        assert not any(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
@@ -141,10 +373,22 @@ def test_damaged_and_foreign_files_are_refused(small, tmp_path):
         ({"loads": [constant(0.0)]}, "raise its load"),
         ({"trim": (0.9, 0.1)}, "trim"),
         ({"q_mobile_range": (1.0, 2.0)}, "q_mobile"),
+        ({"q_mobile_range": (7600.0, 4000.0)}, "q_mobile_range must be finite and increasing, got"),
+        ({"r_o_range": (0.1, np.nan)}, "r_o_range must be finite"),
+        ({"loads": constant(8.0)}, "list of Loads or a sampler of them, got Load"),
+        ({"loads": ["8 W"]}, r"loads must be Loads, .* got \['str'\]"),
+        ({"loads": lambda rng: 8.0}, r"loads must be Loads, .* got \['float'\]"),
+        ({"n": 2.5}, "n must be a whole number, got 2.5"),
+        ({"seed": None}, "seed must be a whole number, got None"),
+        ({"seed": -1}, "seed = -1"),
+        ({"mismatch": -0.1}, r"mismatch .* 0 \.\. 0.5, got -0.1"),
+        ({"mismatch": 0.6}, r"mismatch .* 0 \.\. 0.5, got 0.6"),
+        ({"mismatch": "10 %"}, "mismatch .* got '10 %'"),
+        ({"mismatch": np.nan}, "mismatch .* got nan"),
     ],
 )
 def test_nonsense_is_refused(arguments, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises((TypeError, ValueError), match=message):
         TrajectoryDataset.generate(**{"parameter": "q_mobile", "n": 2, "loads": [constant(8.0)], "seed": 0} | arguments)
 
 

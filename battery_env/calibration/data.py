@@ -1,0 +1,98 @@
+"""The data sets that the calibration tasks draw from."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Literal, get_args
+
+import numpy as np
+
+from battery_env.cells import BUNDLED_CELLS, load_nasa_discharges
+from battery_env.electrochemistry import NEW_CELL
+from battery_env.loads import Load, LoadSampler, RandomPiecewise, RandomWalk, constant, recorded
+from battery_env.trajectories import PAPER_LOADS_W, PAPER_RANGES, PAPER_TRIM, AgedParameter, TrajectoryDataset
+
+LoadKind = Literal["paper", "constant", "piecewise", "random_walk", "recorded"]
+Split = Literal["train", "test", "all"]
+
+#: Discharges in a data set, but for the paper's.
+DISCHARGES = 1000
+#: Seed of ages, loads and of the division into train and test: all data sets of a parameter hold the same cells.
+SEED = 0
+TEST_SHARE = 0.3
+#: Ages of the cells that discharge under other loads than the paper's, C and ohm.
+Q_MOBILE_RANGE_C = (4000.0, 7600.0)
+R_O_RANGE_OHM = (0.1, 0.3)
+#: Powers of the constant loads, W; the ends are those of the piecewise-constant and the random-walk loads.
+CONSTANT_LOADS_W: tuple[float, ...] = tuple(np.linspace(2.0, 8.0, 13))
+
+
+def standard_dataset(
+    parameter: AgedParameter, load: LoadKind, split: Split, dt_s: float = 1.0, mismatch: float = 0.0
+) -> TrajectoryDataset:
+    """
+    A data set, or one side of its 70/30 split by trajectory, made once per process. All are at power, isothermal, and
+    follow the seed 0.
+
+    =============== ============================================================== ============ ============== ==========
+    load            what                                                           q_mobile     r_o            discharges
+    =============== ============================================================== ============ ============== ==========
+    ``paper``       eleven constant loads, 8 to 16 W                               4000-7000 C  0.1-0.2 ohm    1000, 5511
+    ``constant``    thirteen constant loads, 2 to 8 W                              4000-7600 C  0.1-0.3 ohm    1000
+    ``piecewise``   2 to 8 W, uniform, changed every 60 to 140 s                   4000-7600 C  0.1-0.3 ohm    1000
+    ``random_walk`` 2 to 8 W, changed every 60 s by at most 2 W                    4000-7600 C  0.1-0.3 ohm    1000
+    ``recorded``    the power of the 336 discharges of the bundled cells, 5 to 9 W 4000-7600 C  0.1-0.3 ohm    1000
+    =============== ============================================================== ============ ============== ==========
+
+    ``paper`` is trimmed to 5 .. 95 % of each discharge and, for one parameter at 1 s without mismatch, the paper's own grid
+    of 5511; the others run from full charge to the end of discharge. A parameter that does not age is the new cell's.
+
+    :param parameter: what ages: ``"q_mobile"``, ``"r_o"`` or ``"joint"``
+    :param load: kind of load
+    :param split: ``"train"``, ``"test"`` or ``"all"``
+    :param dt_s: time step, s
+    :param mismatch: how wrong the constants are that nobody can measure well, see
+        :meth:`~battery_env.trajectories.TrajectoryDataset.generate`; ages and loads do not depend on it
+    :return: the trajectories
+    :raises ValueError: for another parameter, load or split, or values out of range
+    """
+    if load not in get_args(LoadKind):
+        raise ValueError(f"load must be one of {get_args(LoadKind)}, got {load!r}")
+    if split not in get_args(Split):
+        raise ValueError(f"split must be 'train', 'test' or 'all', got {split!r}")
+    return _splits(parameter, load, dt_s, mismatch)[split]
+
+
+@lru_cache(maxsize=6)
+def _splits(parameter: AgedParameter, load: LoadKind, dt_s: float, mismatch: float) -> dict[Split, TrajectoryDataset]:
+    whole = _whole(parameter, load, dt_s, mismatch)
+    train, test = whole.split(test=TEST_SHARE, by="trajectory", seed=SEED)
+    return {"train": train, "test": test, "all": whole}
+
+
+def _whole(parameter: AgedParameter, load: LoadKind, dt_s: float, mismatch: float) -> TrajectoryDataset:
+    if load == "paper" and parameter != "joint" and dt_s == 1.0 and mismatch == 0.0:
+        return TrajectoryDataset.paper(parameter)
+    paper = load == "paper"
+    return TrajectoryDataset.generate(
+        parameter,
+        DISCHARGES,
+        _loads(load, dt_s),
+        SEED,
+        q_mobile_range=PAPER_RANGES["q_mobile"] if paper else Q_MOBILE_RANGE_C,
+        r_o_range=PAPER_RANGES["r_o"] if paper else R_O_RANGE_OHM,
+        trim=PAPER_TRIM if paper else (0.0, 1.0),
+        dt_s=dt_s,
+        mismatch=mismatch,
+    )
+
+
+def _loads(load: LoadKind, dt_s: float) -> list[Load] | LoadSampler:
+    if load == "piecewise":
+        return RandomPiecewise()
+    if load == "random_walk":
+        return RandomWalk()
+    if load == "recorded":
+        discharges = (discharge for cell in BUNDLED_CELLS for discharge in load_nasa_discharges(cell))
+        return [recorded(discharge.loaded_part(NEW_CELL.VEOD), "power", dt_s) for discharge in discharges]
+    return [constant(power) for power in (PAPER_LOADS_W if load == "paper" else CONSTANT_LOADS_W)]
