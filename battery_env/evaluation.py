@@ -4,85 +4,194 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 
-from battery_env.electrochemistry import FloatArray, Trajectory, initial_state, simulate
-from battery_env.estimators.base import EstimateTrace, Estimator
+from battery_env.electrochemistry import (
+    Q_MOBILE_LIMITS_C,
+    R_O_LIMITS_OHM,
+    FloatArray,
+    Trajectory,
+    initial_state,
+    simulate,
+)
+from battery_env.estimators.base import PARAMETERS, BoolArray, EstimateTrace, Estimator
+from battery_env.estimators.cramer_rao import cramer_rao_bound
+from battery_env.estimators.record_model import RecordModel
+from battery_env.sensors import RandomSensorErrors, SensorErrors
 from battery_env.trajectories import TrajectoryDataset
 
-PARAMETERS = ("q_mobile", "r_o")
 #: An estimate has settled when it stays within this share of the truth from then on.
 SETTLING_BANDS_PERCENT = (5.0, 1.0)
+#: The end of discharge is also forecast with the estimates held at these times, as shares of its true time.
+FORECAST_PERCENT = (25, 50, 75)
 
 
-def evaluate(estimator: Estimator, data: TrajectoryDataset | Sequence[Trajectory]) -> pd.DataFrame:
+def evaluate(
+    estimator: Estimator,
+    data: TrajectoryDataset | Sequence[Trajectory],
+    sensor_errors: SensorErrors | RandomSensorErrors | None = None,
+    seed: int = 0,
+) -> pd.DataFrame:
     """
     Let a calibrator estimate the parameters of every discharge, and compare its estimates with the true ones.
 
-    Columns, per parameter p (``q_mobile`` in C, ``r_o`` in ohm): ``p`` (true), ``p_hat`` (mean of its estimates),
-    ``p_final`` (the last one), ``p_mae``, ``p_mape_percent``, ``p_bias`` (mean error), ``p_spread`` (standard deviation of
-    the estimates), ``p_settling_time_5_percent_s`` and ``p_settling_time_1_percent_s`` (time since the first sample from
-    which on all estimates are that close; infinite if the last one is not). Further ``load`` (mean of the record, W or A),
-    ``eod_time_s``, ``eod_error_s`` (end of discharge predicted from full charge with the last estimate, minus the true one;
-    NaN for records that do not start at full charge or do not say when it is), ``updates`` and ``time_per_update_s``
-    (wall time of the whole batch over its number of estimates).
+    Columns for each parameter p (``q_mobile`` in C, ``r_o`` in ohm):
+
+    ==================================== =============================================================================
+    ``p``                                the true value
+    ``p_hat``, ``p_final``               mean of its estimates, the last one
+    ``p_mae``, ``p_rmse``, ``p_worst``   mean, root mean square and largest absolute error
+    ``p_mape_percent``                   mean absolute error, % of the true value
+    ``p_second_half_mape_percent``       likewise, of the estimates in the second half of the discharge
+    ``p_final_error_percent``            likewise, of the last one
+    ``p_bias``, ``p_spread``             mean error, standard deviation of the estimates
+    ``p_settling_time_5_percent_s``,     time since the first sample from which on all estimates are that close; infinite
+    ``p_settling_time_1_percent_s``      if the last one is not
+    ``p_coverage_percent``               share of the estimates within two stated standard deviations of the truth
+    ``p_bound``                          the Cramér-Rao bound: standard deviation that no unbiased calibrator can be below
+                                         with these sensors, from all samples of the voltage. Unknown to it are the
+                                         parameters that it states an uncertainty of (both, if it states none) and the
+                                         offset of the voltage, if there is one
+    ==================================== =============================================================================
+
+    And of each discharge:
+
+    ==================================== =============================================================================
+    ``load``                             mean of the record, W or A
+    ``eod_time_s``                       its end
+    ``eod_error_s``                      end predicted from full charge with the last estimate, minus the true one
+    ``eod_error_at_25_percent_s``, ...   likewise with the estimate held after 25, 50, 75 % of the time. The load goes on
+                                         as recorded
+    ``settled_time_s``                   time since the first sample from which on the calibrator says that it has settled;
+                                         infinite if it does not in the end
+    ``updates``                          number of estimates
+    ``time_per_update_s``                wall time of the whole batch over its number of estimates
+    ==================================== =============================================================================
+
+    NaN stands for what there is not: no estimate in that part of the discharge, no stated uncertainty, no noise, or a record
+    that does not start at full charge or does not say when it ends.
 
     :param estimator: the calibrator
     :param data: the discharges
+    :param sensor_errors: what the calibrator sees instead of the true voltage and current; ``None``: ``data`` as it is
+    :param seed: seed of the noise; that of one discharge does not depend on the others
     :return: one row per discharge, in their order
     """
     dataset = data if isinstance(data, TrajectoryDataset) else TrajectoryDataset.from_trajectories(data)
+    # on the clock of the data set, in which single trajectories start at 0
+    truth = data if isinstance(data, TrajectoryDataset) else [_from_zero(record) for record in data]
+    seen: Sequence[Trajectory] = truth
+    drawn: list[SensorErrors | None] = [None] * len(truth)
+    if sensor_errors is not None:
+        generators = [np.random.default_rng((seed, n)) for n in range(len(truth))]
+        drawn = [sensor_errors.draw(rng) for rng in generators]
+        seen = [each.apply(record, rng) for each, record, rng in zip(drawn, truth, generators, strict=True) if each]
     start = time.perf_counter()
-    traces = estimator.trace(dataset)
+    traces = estimator.trace(seen)
     elapsed_s = time.perf_counter() - start
     updates = sum(len(trace.time_s) for trace in traces)
     rows = []
-    for n, trace in enumerate(traces):
+    for n, (record, trace, errors) in enumerate(zip(truth, traces, drawn, strict=True)):
         row: dict[str, float] = {"trajectory": n}
         for name in PARAMETERS:
-            row.update(_errors(name, float(getattr(dataset, name)[n]), trace, dataset.first[n] * dataset.dt_s))
-        profile = dataset.load_values[dataset.load_start[n] : dataset.load_start[n] + dataset.samples[n]]
-        row["load"] = float(profile[dataset.first[n] : dataset.stop[n]].mean())
-        row["eod_time_s"] = dataset.samples[n] * dataset.dt_s
-        row["eod_error_s"] = _eod_time_s(dataset, n, profile, row["q_mobile_final"], row["r_o_final"]) - row["eod_time_s"]
+            row |= _errors(name, record, trace)
+        row["load"] = record.load.mean()
+        row["eod_time_s"] = record.eod_time_s
+        row |= _forecasts(dataset, n, record, trace)
+        settled_s = np.nan if trace.settled is None else _since(trace.settled, trace.time_s)
+        row["settled_time_s"] = settled_s - record.time_s[0]
+        row |= _bounds(dataset, record, trace, errors)
         row["updates"] = len(trace.time_s)
         row["time_per_update_s"] = elapsed_s / updates
         rows.append(row)
-    return pd.DataFrame(rows).astype({"trajectory": int, "updates": int})
+    return pd.DataFrame(rows)
 
 
-def _errors(name: str, true: float, trace: EstimateTrace, start_s: float) -> dict[str, float]:
-    estimates: FloatArray = getattr(trace, name)
+def _from_zero(record: Trajectory) -> Trajectory:
+    start_s = record.time_s[0]
+    return replace(record, time_s=record.time_s - start_s, eod_time_s=record.eod_time_s - start_s)
+
+
+def _errors(name: str, record: Trajectory, trace: EstimateTrace) -> dict[str, float]:
+    true, estimates, sd = getattr(record, name), getattr(trace, name), getattr(trace, f"sd_{name}")
     error = estimates - true
     magnitude = np.abs(error)
+    percent = 100.0 * magnitude / true
+    second_half = percent[trace.time_s >= 0.5 * record.eod_time_s]
     scores = {
         name: true,
-        f"{name}_hat": float(estimates.mean()),
-        f"{name}_final": float(estimates[-1]),
-        f"{name}_mae": float(magnitude.mean()),
-        f"{name}_mape_percent": float(100.0 * magnitude.mean() / true),
-        f"{name}_bias": float(error.mean()),
-        f"{name}_spread": float(estimates.std()),
+        f"{name}_hat": estimates.mean(),
+        f"{name}_final": estimates[-1],
+        f"{name}_mae": magnitude.mean(),
+        f"{name}_rmse": np.sqrt(np.mean(error**2)),
+        f"{name}_worst": magnitude.max(),
+        f"{name}_mape_percent": percent.mean(),
+        f"{name}_second_half_mape_percent": second_half.mean() if len(second_half) else np.nan,
+        f"{name}_final_error_percent": percent[-1],
+        f"{name}_bias": error.mean(),
+        f"{name}_spread": estimates.std(),
+        f"{name}_coverage_percent": 100.0 * np.mean(magnitude <= 2.0 * sd) if _states_sd(trace, name) else np.nan,
     }
     for band in SETTLING_BANDS_PERCENT:
-        outside = np.flatnonzero(~(100.0 * magnitude <= band * true))
-        settled = 0 if outside.size == 0 else outside[-1] + 1
-        time_s = trace.time_s[settled] - start_s if settled < len(magnitude) else np.inf
-        scores[f"{name}_settling_time_{band:g}_percent_s"] = float(time_s)
+        settled_s = _since(percent <= band, trace.time_s)
+        scores[f"{name}_settling_time_{band:g}_percent_s"] = settled_s - record.time_s[0]
     return scores
 
 
-def _eod_time_s(dataset: TrajectoryDataset, n: int, profile: FloatArray, q_mobile: float, r_o: float) -> float:
-    full = initial_state(dataset.q_mobile[n], dataset.parameters)
-    if not (np.array_equal(dataset.checkpoint[dataset.checkpoint_start[n]], full) and np.isfinite([q_mobile, r_o]).all()):
-        return float("nan")
+def _since(holds: BoolArray, time_s: FloatArray) -> float:
+    """
+    The time of the first estimate from which on something holds.
+
+    :param holds: whether it does at each estimate, shape (K,)
+    :param time_s: of the estimates, shape (K,)
+    :return: s; infinite if it does not hold at the last one
+    """
+    fails = np.flatnonzero(~holds)
+    first = fails[-1] + 1 if len(fails) else 0
+    return float(time_s[first]) if first < len(time_s) else np.inf
+
+
+def _forecasts(dataset: TrajectoryDataset, n: int, record: Trajectory, trace: EstimateTrace) -> dict[str, float]:
+    cell = dataset.parameters
+    profile = dataset.load_values[dataset.load_start[n] : dataset.load_start[n] + dataset.samples[n]]
     # beyond the record its last load goes on, for as long again
     load = np.concatenate([profile, np.full(len(profile), profile[-1])])
-    cell, unit = dataset.parameters, dataset.load_unit
-    prediction = simulate(load, q_mobile, r_o, dt=dataset.dt_s, load_unit=unit, thermal=dataset.thermal, parameters=cell)
-    return prediction.eod_time_s
+    starts_full = np.array_equal(dataset.checkpoint[dataset.checkpoint_start[n]], initial_state(record.q_mobile, cell))
+
+    def error_s(estimate: int) -> float:
+        if not starts_full or estimate < 0:
+            return np.nan
+        q_mobile, r_o = trace.q_mobile[estimate], trace.r_o[estimate]
+        if not (Q_MOBILE_LIMITS_C[0] <= q_mobile <= Q_MOBILE_LIMITS_C[1] and R_O_LIMITS_OHM[0] <= r_o <= R_O_LIMITS_OHM[1]):
+            return np.nan
+        unit, thermal = dataset.load_unit, dataset.thermal
+        forecast = simulate(load, q_mobile, r_o, dt=dataset.dt_s, load_unit=unit, thermal=thermal, parameters=cell)
+        return forecast.eod_time_s - record.eod_time_s
+
+    errors = {"eod_error_s": error_s(len(trace.time_s) - 1)}
+    for percent in FORECAST_PERCENT:
+        made = np.searchsorted(trace.time_s, 0.01 * percent * record.eod_time_s, side="right")
+        errors[f"eod_error_at_{percent}_percent_s"] = error_s(int(made) - 1)
+    return errors
+
+
+def _bounds(
+    dataset: TrajectoryDataset, record: Trajectory, trace: EstimateTrace, sensor_errors: SensorErrors | None
+) -> dict[str, float]:
+    if sensor_errors is None or sensor_errors.noise_V == 0.0:
+        return {f"{name}_bound": np.nan for name in PARAMETERS}
+    model = RecordModel(dataset.parameters, dataset.thermal, dataset.dt_s, initial=record.state[0])
+    unknown = [name for name in PARAMETERS if _states_sd(trace, name)] or PARAMETERS
+    bound = cramer_rao_bound(record, sensor_errors.noise_V, unknown, offset=sensor_errors.offset_V != 0.0, model=model)
+    return {f"{name}_bound": getattr(bound, f"sd_{name}")[-1] for name in PARAMETERS}
+
+
+def _states_sd(trace: EstimateTrace, name: str) -> bool:
+    sd = getattr(trace, f"sd_{name}")
+    return sd is not None and not np.isnan(sd).all()
 
 
 def summarize(scores: pd.DataFrame, parameter: str) -> dict[str, float]:
@@ -91,16 +200,26 @@ def summarize(scores: pd.DataFrame, parameter: str) -> dict[str, float]:
 
     :param scores: what :func:`evaluate` returned
     :param parameter: ``"q_mobile"`` or ``"r_o"``
-    :return: mean, median and worst MAPE (%), mean bias and spread (% of the truth), median settling time to 1 % (s), mean
-        absolute error of the end of discharge (% of its time)
+    :return: mean, median and worst MAPE (%), RMSE (% of the truth); mean MAPE of the second halves (%), mean and worst error
+        of the last estimates (%); mean bias and spread (% of the truth); median settling times (s); mean coverage (%); mean
+        bound (% of the truth); mean absolute errors of the end of discharge (% of its time). NaN as in :func:`evaluate`
     """
     true, mape = scores[parameter], scores[f"{parameter}_mape_percent"]
-    return {
-        "mape_percent": float(mape.mean()),
-        "mape_median_percent": float(mape.median()),
-        "mape_worst_percent": float(mape.max()),
-        "bias_percent": float((100.0 * scores[f"{parameter}_bias"] / true).mean()),
-        "spread_percent": float((100.0 * scores[f"{parameter}_spread"] / true).mean()),
-        "settling_time_1_percent_s": float(scores[f"{parameter}_settling_time_1_percent_s"].median()),
-        "eod_error_percent": float((100.0 * scores["eod_error_s"].abs() / scores["eod_time_s"]).mean()),
+    summary = {
+        "mape_percent": mape.mean(),
+        "mape_median_percent": mape.median(),
+        "mape_worst_percent": mape.max(),
+        "rmse_percent": (100.0 * scores[f"{parameter}_rmse"] / true).mean(),
+        "second_half_mape_percent": scores[f"{parameter}_second_half_mape_percent"].mean(),
+        "final_error_percent": scores[f"{parameter}_final_error_percent"].mean(),
+        "final_error_worst_percent": scores[f"{parameter}_final_error_percent"].max(),
+        "bias_percent": (100.0 * scores[f"{parameter}_bias"] / true).mean(),
+        "spread_percent": (100.0 * scores[f"{parameter}_spread"] / true).mean(),
+        "coverage_percent": scores[f"{parameter}_coverage_percent"].mean(),
+        "bound_percent": (100.0 * scores[f"{parameter}_bound"] / true).mean(),
     }
+    for band in SETTLING_BANDS_PERCENT:
+        summary[f"settling_time_{band:g}_percent_s"] = scores[f"{parameter}_settling_time_{band:g}_percent_s"].median()
+    for when in ("", *(f"_at_{percent}_percent" for percent in FORECAST_PERCENT)):
+        summary[f"eod_error_percent{when}"] = (100.0 * scores[f"eod_error{when}_s"].abs() / scores["eod_time_s"]).mean()
+    return {name: float(value) for name, value in summary.items()}

@@ -15,6 +15,7 @@ LAYERS = (
     ("battery_env.electrochemistry",),
     ("battery_env.loads",),
     ("battery_env.trajectories", "battery_env.cells", "battery_env.nasa_cells"),
+    ("battery_env.sensors",),
     ("battery_env.estimators",),
     ("battery_env.calibration",),
     ("battery_env.evaluation",),

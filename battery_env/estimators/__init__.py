@@ -1,7 +1,26 @@
 """Calibration without learning."""
 
-from battery_env.estimators.base import Estimate, EstimateTrace, Estimator, Record
+from battery_env.estimators.base import Estimate, EstimateTrace, Estimator, OnlineEstimator, Record
 from battery_env.estimators.closed_form import ClosedForm
+from battery_env.estimators.cramer_rao import CramerRaoBound, Sensitivities, cramer_rao_bound, sensitivities
+from battery_env.estimators.greedy import GreedyOneStep
+from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
+from battery_env.estimators.record_model import RecordModel
 
-__all__ = ["ClosedForm", "Estimate", "EstimateTrace", "Estimator", "LeastSquares", "Record"]
+__all__ = [
+    "ClosedForm",
+    "CramerRaoBound",
+    "Estimate",
+    "EstimateTrace",
+    "Estimator",
+    "ExtendedKalmanFilter",
+    "GreedyOneStep",
+    "LeastSquares",
+    "OnlineEstimator",
+    "Record",
+    "RecordModel",
+    "Sensitivities",
+    "cramer_rao_bound",
+    "sensitivities",
+]

@@ -1,15 +1,22 @@
-"""What every calibrator returns, and the interface that evaluation relies on."""
+"""What every calibrator returns, and the interfaces that evaluation and live use rely on."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
-from battery_env.electrochemistry import FloatArray
+from battery_env.cells import drawn_charge_C
+from battery_env.electrochemistry import FloatArray, check_q_mobile, check_r_o
+
+#: What can be calibrated.
+PARAMETERS: tuple[str, ...] = ("q_mobile", "r_o")
+
+BoolArray = NDArray[np.bool_]
 
 
 class Record(Protocol):
@@ -57,6 +64,7 @@ class EstimateTrace:
     :param r_o: ohm
     :param sd_q_mobile: stated standard deviations, C; ``None`` if the calibrator states none
     :param sd_r_o: likewise, ohm
+    :param settled: whether the calibrator takes each estimate for settled; ``None`` if it does not say
     """
 
     time_s: FloatArray
@@ -64,6 +72,19 @@ class EstimateTrace:
     r_o: FloatArray
     sd_q_mobile: FloatArray | None = None
     sd_r_o: FloatArray | None = None
+    settled: BoolArray | None = None
+
+    @classmethod
+    def of(cls, time_s: Sequence[float] | FloatArray, estimates: Sequence[Estimate]) -> EstimateTrace:
+        """
+        A trace of single estimates.
+
+        :param time_s: time of the last sample that each has seen, s
+        :param estimates: as many
+        :return: the trace
+        """
+        names = ("q_mobile", "r_o", "sd_q_mobile", "sd_r_o", "settled")
+        return cls(np.array(time_s), *(np.array([getattr(estimate, name) for estimate in estimates]) for name in names))
 
 
 class Estimator(ABC):
@@ -87,16 +108,165 @@ class Estimator(ABC):
         :param records: discharges
         :return: one trace per discharge, in the same order
         """
+        return [EstimateTrace.of([record.time_s[-1]], [self.estimate(record)]) for record in records]
+
+
+class OnlineEstimator(Estimator):
+    """
+    A calibrator that runs along with a discharge: one estimate a sample, from what was measured until then.
+
+    .. code-block:: python
+
+      estimator.reset()  # the cell is fully charged and at rest
+      for voltage_V, current_A in measurements:
+          estimate = estimator.update(voltage_V, current_A, dt_s=1.0)
+
+    The methods that take whole records start anew with each, and leave the estimator reset.
+    """
+
+    #: Time step of the model, s. The current of a record whose samples lie that far apart, as simulated ones do, is taken as
+    #: it is.
+    dt_s: float
+
+    @abstractmethod
+    def reset(self) -> None:
+        """
+        Forget all samples: the next one is the first of a discharge.
+        """
+
+    @abstractmethod
+    def update(self, voltage_V: float, current_A: float, dt_s: float) -> Estimate:
+        """
+        Take in one sample.
+
+        :param voltage_V: terminal voltage, V
+        :param current_A: current that flows from this sample to the next one, positive in discharge, A
+        :param dt_s: time since the previous sample, s; without meaning at the first one
+        :return: the estimate
+        :raises ValueError: for values that cannot be meant
+        """
+
+    def estimate(self, record: Record) -> Estimate:
+        """
+        The estimate at the last sample of a record.
+
+        :param record: one discharge
+        :return: the estimate
+        :raises ValueError: if the record cannot be used
+        """
+        trace = self.trace([record])[0]
+        assert trace.sd_q_mobile is not None and trace.sd_r_o is not None and trace.settled is not None
+        return Estimate(
+            q_mobile=float(trace.q_mobile[-1]),
+            r_o=float(trace.r_o[-1]),
+            sd_q_mobile=float(trace.sd_q_mobile[-1]),
+            sd_r_o=float(trace.sd_r_o[-1]),
+            settled=bool(trace.settled[-1]),
+        )
+
+    def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:
+        """
+        One estimate for every sample of many discharges.
+
+        :param records: discharges
+        :return: one trace per discharge, in the same order
+        :raises ValueError: if a record cannot be used
+        """
         traces = []
         for record in records:
-            final = self.estimate(record)
-            traces.append(
-                EstimateTrace(
-                    time_s=np.array([record.time_s[-1]]),
-                    q_mobile=np.array([final.q_mobile]),
-                    r_o=np.array([final.r_o]),
-                    sd_q_mobile=np.array([final.sd_q_mobile]),
-                    sd_r_o=np.array([final.sd_r_o]),
-                )
-            )
+            samples = Samples.of(record, self.dt_s)
+            self.reset()
+            traces.append(EstimateTrace.of(samples.time_s, [self.update(*sample) for sample in samples.measured()]))
+        self.reset()
         return traces
+
+
+class Samples(NamedTuple):
+    """
+    A record in the form in which it is measured live, arrays of shape (T,).
+
+    :param time_s: s
+    :param voltage_V: V
+    :param current_A: mean current from each sample to the next, A
+    :param dt_s: time since the previous sample, s; 0 for the first one
+    """
+
+    time_s: FloatArray
+    voltage_V: FloatArray
+    current_A: FloatArray
+    dt_s: FloatArray
+
+    @classmethod
+    def of(cls, record: Record, dt_s: float) -> Samples:
+        """
+        Check a record and convert it. Between samples the current is linear, as
+        :func:`battery_env.cells.drawn_charge_C` has it, so that the charge drawn is kept exactly.
+
+        :param record: one discharge
+        :param dt_s: in a record whose samples lie this far apart the current is taken as it is, s
+        :return: its samples
+        :raises ValueError: if the arrays do not fit together or are not finite, or time does not increase
+        """
+        time_s, voltage_V, current_A = (
+            np.asarray(getattr(record, name), dtype=np.float64) for name in ("time_s", "voltage_V", "current_A")
+        )
+        for name, values in (("time_s", time_s), ("voltage_V", voltage_V), ("current_A", current_A)):
+            if values.ndim != 1 or values.size == 0 or values.shape != time_s.shape:
+                raise ValueError(
+                    f"{name} of a record must hold one value a sample, got shape {values.shape} with time_s of shape "
+                    f"{time_s.shape}"
+                )
+            bad = np.flatnonzero(~np.isfinite(values))
+            if len(bad):
+                raise ValueError(f"{name} of a record must be finite, got {values[bad[0]]} at sample {bad[0]}. Leave it out.")
+        step_s = np.diff(time_s)
+        stalls = np.flatnonzero(step_s <= 0.0)
+        if len(stalls):
+            n = stalls[0] + 1
+            raise ValueError(
+                f"time_s of a record must increase, but sample {n} is at {time_s[n]:g} s, after {time_s[n - 1]:g} s"
+            )
+        if not np.allclose(step_s, dt_s, rtol=1e-6, atol=0.0):
+            mean_A = np.diff(drawn_charge_C(time_s, current_A, time_s)) / step_s
+            current_A = np.append(mean_A, current_A[-1])
+        return cls(time_s, voltage_V, current_A, np.append(0.0, step_s))
+
+    def measured(self) -> zip[tuple[float, float, float]]:
+        """
+        What :meth:`OnlineEstimator.update` takes, sample by sample.
+
+        :return: voltage, current and time since the previous sample
+        """
+        return zip(self.voltage_V.tolist(), self.current_A.tolist(), self.dt_s.tolist(), strict=True)
+
+
+def check_parameters(parameters: Sequence[str]) -> tuple[str, ...]:
+    """
+    Refuse a choice of parameters that a calibrator cannot search for.
+
+    :param parameters: their names
+    :return: the same as a tuple
+    :raises ValueError: unless they are one or both of ``PARAMETERS``
+    """
+    names = tuple(parameters)
+    if not names or len(set(names)) < len(names) or set(names) - set(PARAMETERS):
+        raise ValueError(f"parameters must be one or both of {PARAMETERS}, got {parameters!r}")
+    return names
+
+
+def check_bounds(
+    q_mobile_bounds_C: tuple[float, float], r_o_bounds_ohm: tuple[float, float]
+) -> dict[str, tuple[float, float]]:
+    """
+    Refuse bounds that cannot be meant.
+
+    :param q_mobile_bounds_C: least and largest ``q_mobile``, C
+    :param r_o_bounds_ohm: least and largest ``r_o``, ohm
+    :return: both, by name
+    :raises ValueError: if they are out of range or not in order
+    """
+    bounds = {"q_mobile": q_mobile_bounds_C, "r_o": r_o_bounds_ohm}
+    for name, limits in (("q_mobile", check_q_mobile(q_mobile_bounds_C)), ("r_o", check_r_o(r_o_bounds_ohm))):
+        if limits.shape != (2,) or not limits[0] < limits[1]:
+            raise ValueError(f"the bounds of {name} must be (lower, upper) with lower < upper, got {bounds[name]!r}")
+    return bounds

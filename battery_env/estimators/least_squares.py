@@ -3,48 +3,58 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
+from math import inf, isnan, sqrt
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
-from battery_env.cells import SWITCH_SHARE, resample_current
-from battery_env.electrochemistry import (
-    FULL_CHARGE_SHARES,
-    NEW_CELL,
-    Q_MOBILE_LIMITS_C,
-    QNB,
-    QNS,
-    QPS,
-    STATE_SIZE,
-    VO,
-    CellParameters,
-    FloatArray,
-    Trajectory,
-    check_dt,
-    check_q_mobile,
-    check_r_o,
-    initial_state,
-    simulate,
+from battery_env.cells import SWITCH_SHARE
+from battery_env.electrochemistry import Q_MOBILE_LIMITS_C, CellParameters, FloatArray, check_q_mobile
+from battery_env.estimators.base import (
+    PARAMETERS,
+    BoolArray,
+    Estimate,
+    EstimateTrace,
+    Estimator,
+    Record,
+    check_bounds,
+    check_parameters,
 )
-from battery_env.estimators.base import Estimate, Estimator, Record
+from battery_env.estimators.record_model import RecordModel
 
 #: An estimate counts as settled when its standard deviation is below this share of its value. That of ``r_o`` is wider: on a
 #: real cell the error of the model divided by the current is a quarter of it already.
 SETTLED_SHARES = {"q_mobile": 0.02, "r_o": 0.3}
 
-_NAMES = ("q_mobile", "r_o")
-# Where the search for q_mobile starts: this much above the least value that the record allows. The narrow ones serve whole
+# Where the search for q_mobile may start: this much above the least value that the record allows. The narrow ones serve whole
 # discharges, the wide ones the first minutes of one.
-_START_EXCESS = 0.003 * 5.0 ** np.arange(7)
-_REFERENCE_Q_C = Q_MOBILE_LIMITS_C[1]
-_REFERENCE_R_O_OHM = 1.0
-# The total of the four charges is q_mobile / 0.6 at all times.
-_Q_PER_CHARGE = 1.0 / float(FULL_CHARGE_SHARES.sum())
+_START_EXCESS = 0.003 * 2.2 ** np.arange(13)
+# Starts whose squares are within this ratio of the least are promising. The intervals beside them are cut into so many parts,
+# and the search goes on from each that is a local minimum then.
+_RIVAL_RATIO = 2.0
+_FINER = 4
+# Starts are compared on a coarse grid of time if it has at least this many points.
+_COARSE_POINTS = 100
 # How far the search keeps from the least q_mobile, as a share of it: more than rounding, less than anyone measures.
 _MARGIN = 1e-6
-_SEARCH_SCALES = {"q_mobile": 1000.0, "r_o": 0.1}
+_SEARCH_SCALES = {"q_mobile": 1.0, "r_o": 0.1}
+# The distance of q_mobile to its least value is below exp of this, so that no step of the search overflows.
+_LOG_LIMIT = 50.0
+# Residuals whose variance is this many of its standard deviations above the one expected are not noise.
+_EXCESS_LIMIT = 5.0
+# With fewer samples than this beyond the number of parameters, the residuals do not tell how large the noise is.
+_SPARE_SAMPLES = 10
+
+
+class _Samples(NamedTuple):
+    """Some samples of a record, which is a record."""
+
+    time_s: FloatArray
+    voltage_V: FloatArray
+    current_A: FloatArray
 
 
 class _Problem(NamedTuple):
@@ -53,19 +63,27 @@ class _Problem(NamedTuple):
     time_s: FloatArray  # of the samples, since the first one
     voltage_V: FloatArray
     current_A: FloatArray  # over each step of the model
+    on_grid: bool  # whether the samples are the points of the grid
     least_q_C: float  # below it the model cell is empty before the record ends
-    ohmic_A: FloatArray  # the ohmic voltage drop at the samples per ohm of r_o
+
+
+class _Prior(NamedTuple):
+    """What is known of q_mobile, as one more residual."""
+
+    mean_C: float
+    V_per_C: float
 
 
 class _Start(NamedTuple):
     values: dict[str, float]
-    square_V2: float  # sum of the squared residuals, but for the small effect of r_o on the temperature
+    square_V2: float  # sum of the squared residuals on a coarse grid of time
 
 
 class _Fit(NamedTuple):
     values: dict[str, float]
     jacobian: FloatArray  # of the residuals, V, with respect to the parameters searched for
-    square_V2: float  # sum of the squared residuals
+    residual_V: FloatArray  # at the samples
+    square_V2: float  # sum of all squared residuals, that of the prior included
     at_bound: bool
 
 
@@ -77,19 +95,26 @@ class LeastSquares(Estimator):
     follows the recorded current (:func:`battery_env.cells.resample_current`). For a recorded discharge give
     :meth:`battery_env.cells.Discharge.loaded_part`, which starts when the load is switched on.
 
-    *The least q_mobile.* At a fixed current the charges of the model are linear in ``q_mobile``; so one simulation gives
-    exactly the value below which the model cell would be empty before the record ends. The search stays above it, where
-    every simulation lasts as long as the record and the voltage is smooth in both parameters.
+    *The search.* At a fixed current the charges of the model are linear in ``q_mobile``; so one simulation gives exactly the
+    value below which the model cell would be empty before the record ends. The search stays above it, where every simulation
+    lasts as long as the record; it is over the logarithm of the distance to it, in which the knee of a discharge is nearly
+    straight. It is Levenberg-Marquardt's (MINPACK's) with exact derivatives, from the best of several starts on a coarse grid
+    of time. A parameter that leaves its bounds is held there.
 
     *Standard deviations.* The covariance is (s^2 + n m^2) (J^T J)^-1: J is the Jacobian of the n simulated voltages, s^2 the
     variance of the residuals, m ``mismatch_V``. With m = 0 this holds for white residuals, as of simulated records with
     noise. On a real cell the residuals are the model's error, which is far from white and which a fit of half a discharge
     hides in its parameters: the white formula then claims 1 % where the estimate is 40 % off. There set ``mismatch_V`` to
     the error expected of the model (0.05 V for the cells that come with the package): it counts as one error common to
-    the record, which more samples do not make smaller.
+    the record, which more samples do not make smaller. Where the noise is known, give it as ``voltage_noise_V``: it then
+    takes the place of s, which a few samples cannot tell.
 
     *Settled* means that every parameter searched for is inside its bounds, with a standard deviation below
-    ``SETTLED_SHARES`` of its value, and that the model lasts as long as the record.
+    ``SETTLED_SHARES`` of its value, and that the model lasts as long as the record. If ``voltage_noise_V`` is given, the
+    residuals must also be no larger than it and ``mismatch_V`` explain; they are where the sensor has an offset, or where the
+    parameter that is held is wrong. Otherwise there must be at least 10 samples more than parameters.
+
+    *During a discharge*, :meth:`trace` with ``window_every_s`` estimates again and again from all samples so far.
 
     *Prior.* Before its knee a discharge says little about ``q_mobile``. To calibrate during a discharge, carry
     (mean, standard deviation) over from an earlier one as ``prior_q_mobile_C``; it enters as one more residual.
@@ -104,12 +129,14 @@ class LeastSquares(Estimator):
     :param r_o_bounds_ohm: where to search, ohm
     :param prior_q_mobile_C: mean and standard deviation of ``q_mobile`` before this record, C; ``None``: nothing is known
     :param mismatch_V: error to expect of the model itself, V, as above
+    :param voltage_noise_V: standard deviation of the noise of the voltage sensor, V; ``None``: that of the residuals
+    :param window_every_s: time between the estimates of :meth:`trace`, s; ``None``: one estimate, at the end
     :raises ValueError: for an argument out of range
     """
 
     def __init__(
         self,
-        parameters: Sequence[str] = _NAMES,
+        parameters: Sequence[str] = PARAMETERS,
         cell: CellParameters | None = None,
         thermal: bool = False,
         dt_s: float = 1.0,
@@ -118,20 +145,12 @@ class LeastSquares(Estimator):
         r_o_bounds_ohm: tuple[float, float] = (0.0, 1.0),
         prior_q_mobile_C: tuple[float, float] | None = None,
         mismatch_V: float = 0.0,
+        voltage_noise_V: float | None = None,
+        window_every_s: float | None = None,
     ) -> None:
-        self.parameters = tuple(parameters)
-        if not self.parameters or len(set(self.parameters)) < len(self.parameters) or set(self.parameters) - set(_NAMES):
-            raise ValueError(f"parameters must be one or both of {_NAMES}, got {parameters!r}")
-        self.cell = cell or NEW_CELL
-        self.thermal = thermal
-        self.dt_s = check_dt(dt_s, self.cell)
-        self.initial = initial_state(_REFERENCE_Q_C, self.cell) if initial is None else np.array(initial, dtype=np.float64)
-        if self.initial.shape != (STATE_SIZE,) or not np.isfinite(self.initial).all():
-            raise ValueError(f"initial must hold {STATE_SIZE} finite numbers, got {initial!r}")
-        self.bounds = {"q_mobile": q_mobile_bounds_C, "r_o": r_o_bounds_ohm}
-        for name, limits in (("q_mobile", check_q_mobile(q_mobile_bounds_C)), ("r_o", check_r_o(r_o_bounds_ohm))):
-            if limits.shape != (2,) or not limits[0] < limits[1]:
-                raise ValueError(f"the bounds of {name} must be (lower, upper) with lower < upper, got {self.bounds[name]!r}")
+        self.parameters = check_parameters(parameters)
+        self.model = RecordModel(cell, thermal, dt_s, initial)
+        self.bounds = check_bounds(q_mobile_bounds_C, r_o_bounds_ohm)
         if prior_q_mobile_C is not None:
             if "q_mobile" not in self.parameters:
                 raise ValueError("prior_q_mobile_C needs 'q_mobile' among the parameters to search for")
@@ -142,6 +161,11 @@ class LeastSquares(Estimator):
         if not 0.0 <= mismatch_V < np.inf:
             raise ValueError(f"mismatch_V must be at least 0 V, got {mismatch_V!r}")
         self.mismatch_V = mismatch_V
+        for name, value in (("voltage_noise_V", voltage_noise_V), ("window_every_s", window_every_s)):
+            if value is not None and not 0.0 < value < np.inf:
+                raise ValueError(f"{name} must be greater than 0, got {value!r}")
+        self.voltage_noise_V = voltage_noise_V
+        self.window_every_s = window_every_s
 
     def estimate(self, record: Record) -> Estimate:
         """
@@ -151,25 +175,69 @@ class LeastSquares(Estimator):
         :return: the estimate
         :raises ValueError: if the record cannot be used, or the least ``q_mobile`` it allows is outside the bounds
         """
+        return self._estimate(record)
+
+    def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:
+        """
+        With ``window_every_s``: estimates over time, each from all samples so far, and starting from the one before as well;
+        otherwise one estimate at the end of each record.
+
+        :param records: discharges
+        :return: one trace per discharge, in the same order
+        :raises ValueError: as :meth:`estimate`
+        """
+        if self.window_every_s is None:
+            return super().trace(records)
+        return [self._growing_trace(record, self.window_every_s) for record in records]
+
+    def _growing_trace(self, record: Record, every_s: float) -> EstimateTrace:
+        time_s = np.asarray(record.time_s)
+        samples = np.searchsorted(time_s, np.arange(time_s[0] + every_s, time_s[-1], every_s), side="right")
+        # the current of a sample shows at the next one
+        fewest = max(len(self.parameters), *np.flatnonzero(record.current_A)[:1] + 1) + 1
+        stops = np.unique(np.append(samples[samples >= fewest], len(time_s)))
+        estimates: list[Estimate] = []
+        for stop in stops:
+            window = _Samples(time_s[:stop], record.voltage_V[:stop], record.current_A[:stop])
+            estimates.append(self._estimate(window, *estimates[-1:]))
+        return EstimateTrace.of(time_s[stops - 1], estimates)
+
+    def _estimate(self, record: Record, previous: Estimate | None = None) -> Estimate:
         problem = self._problem(record)
-        candidates = problem.least_q_C * (1.0 + _START_EXCESS)
-        if "q_mobile" not in self.parameters:
-            candidates, problem = np.array([self.cell.q_mobile]), self._until_empty(problem)
-        starts = [self._start(problem, q) for q in candidates]
-        fit = self._search(problem, min(starts, key=lambda start: start.square_V2).values)
+        if "q_mobile" in self.parameters:
+            starts = self._best_starts(problem, [] if previous is None else [previous.q_mobile])
+        else:
+            problem = self._until_empty(problem)
+            starts = [self._starts(problem, [self.model.cell.q_mobile])[0].values]
         n = len(problem.time_s)
-        variance_V2 = fit.square_V2 / (n - len(self.parameters)) + n * self.mismatch_V**2
+        if self.voltage_noise_V is None:
+            fit = self._search(problem, starts)
+            starts, noise_V2 = [fit.values], _square(fit.residual_V) / (n - len(self.parameters))
+        else:
+            noise_V2 = self.voltage_noise_V**2
+        variance_V2 = noise_V2 + n * self.mismatch_V**2
         if self.prior_q_mobile_C is not None:
-            weight_V, middle = float(np.sqrt(variance_V2)), self._start(problem, self.prior_q_mobile_C[0]).values
-            fit = min(
-                (self._search(problem, start, weight_V) for start in (fit.values, middle)), key=lambda fit: fit.square_V2
-            )
-        sd = dict.fromkeys(_NAMES, float("nan"))
+            mean_C, sd_C = self.prior_q_mobile_C
+            (middle,) = self._starts(problem, [mean_C])
+            prior = _Prior(mean_C, sqrt(variance_V2) / sd_C)
+            fit = self._search(problem, [*starts, middle.values], prior)
+        elif self.voltage_noise_V is not None:
+            fit = self._search(problem, starts)
+        sd = dict.fromkeys(PARAMETERS, float("nan"))
         for name, root in zip(self.parameters, _root_inverse_diagonal(fit.jacobian), strict=True):
-            sd[name] = float(np.sqrt(variance_V2) * root)
+            sd[name] = sqrt(variance_V2) * float(root)
         settled = n == len(record.time_s) and not fit.at_bound
         settled &= all(sd[name] < SETTLED_SHARES[name] * fit.values[name] for name in self.parameters)
+        settled &= self._is_noise_known(fit.residual_V)
         return Estimate(fit.values["q_mobile"], fit.values["r_o"], sd["q_mobile"], sd["r_o"], settled)
+
+    def _is_noise_known(self, residual_V: FloatArray) -> bool:
+        """Whether there are enough residuals to tell the noise, or they agree with what is stated about noise and model."""
+        n = len(residual_V)
+        if self.voltage_noise_V is None:
+            return n >= len(self.parameters) + _SPARE_SAMPLES
+        expected_V2 = self.voltage_noise_V**2 + self.mismatch_V**2
+        return _square(residual_V) < n * expected_V2 * (1.0 + _EXCESS_LIMIT * sqrt(2.0 / n))
 
     def predict_voltage_V(self, record: Record, estimate: Estimate) -> FloatArray:
         """
@@ -179,8 +247,9 @@ class LeastSquares(Estimator):
         :param estimate: the parameters
         :return: voltage in V, shape (T,); NaN after the model cell is empty
         """
-        time_s, current_A = self._grid(record)
-        return _at(time_s, self._simulate(current_A, estimate.q_mobile, estimate.r_o))
+        time_s, current_A = self.model.grid(record)
+        simulation = self.model.simulate(current_A, estimate.q_mobile, estimate.r_o)
+        return np.interp(time_s, simulation.time_s, simulation.voltage_V, right=np.nan)
 
     def forecast(self, record: Record, estimate: Estimate, cut_off_V: float | None = None) -> tuple[FloatArray, FloatArray]:
         """
@@ -193,13 +262,13 @@ class LeastSquares(Estimator):
         :return: time on the clock of the record, s, and voltage, V. The last point is at the cut-off, interpolated between
             steps; if it is never reached, as the load is off at the end of the record, the last point is above it
         """
-        _, current_A = self._grid(record)
-        cut_off = self.cell.VEOD if cut_off_V is None else cut_off_V
+        _, current_A = self.model.grid(record)
+        cut_off = self.model.cell.VEOD if cut_off_V is None else cut_off_V
         last_A = float(record.current_A[-1])
         if last_A > SWITCH_SHARE * np.abs(record.current_A).max():
             # no cell of this q_mobile lasts longer than this, whatever it had delivered before
-            current_A = np.append(current_A, np.full(int(estimate.q_mobile / (last_A * self.dt_s)) + 1, last_A))
-        simulation = self._simulate(current_A, estimate.q_mobile, estimate.r_o)
+            current_A = np.append(current_A, np.full(int(estimate.q_mobile / (last_A * self.model.dt_s)) + 1, last_A))
+        simulation = self.model.simulate(current_A, estimate.q_mobile, estimate.r_o)
         time_s, voltage_V = float(record.time_s[0]) + simulation.time_s, simulation.voltage_V
         below = np.flatnonzero(voltage_V <= cut_off)
         if not len(below):
@@ -221,121 +290,162 @@ class LeastSquares(Estimator):
         :param cut_off_V: cut-off voltage, V; ``None``: the ``VEOD`` of ``cell``
         :return: the end of discharge on the clock of the record, s; NaN if it is never reached
         """
-        cut_off = self.cell.VEOD if cut_off_V is None else cut_off_V
+        cut_off = self.model.cell.VEOD if cut_off_V is None else cut_off_V
         time_s, voltage_V = self.forecast(record, estimate, cut_off)
         return float(time_s[-1]) if voltage_V[-1] <= cut_off else float("nan")
 
-    def _grid(self, record: Record) -> tuple[FloatArray, FloatArray]:
-        time_s = np.asarray(record.time_s, dtype=np.float64)
-        if time_s.ndim != 1 or len(time_s) <= len(self.parameters) or not (np.diff(time_s) > 0.0).all():
-            raise ValueError(f"a record needs more than {len(self.parameters)} samples, in the order of time")
-        n_steps = int(np.ceil((time_s[-1] - time_s[0]) / self.dt_s - 1e-6)) + 1
-        current_A = resample_current(time_s, np.asarray(record.current_A, dtype=np.float64), self.dt_s, n_steps)
-        return time_s - time_s[0], current_A
-
     def _problem(self, record: Record) -> _Problem:
-        time_s, current_A = self._grid(record)
+        time_s, current_A = self.model.grid(record)
+        if len(time_s) <= len(self.parameters):
+            raise ValueError(f"a record needs more than {len(self.parameters)} samples, got {len(time_s)}")
         voltage_V = np.asarray(record.voltage_V, dtype=np.float64)
         if voltage_V.shape != time_s.shape or not np.isfinite(voltage_V).all():
             raise ValueError("voltage_V of the record must hold one finite value a sample")
-        if not current_A.any():
+        if not current_A[:-1].any():
             raise ValueError("no current flows in this record: it says nothing about q_mobile and r_o")
-        # charges are linear in q_mobile; both of these are too large for the record to exhaust
-        low_q_C, high_q_C = 0.5 * _REFERENCE_Q_C, _REFERENCE_Q_C
-        low, high = (self._simulate(current_A, q, _REFERENCE_R_O_OHM) for q in (low_q_C, high_q_C))
-        if len(low.time_s) < len(current_A):
-            raise ValueError(f"the record draws too much charge for a q_mobile of {low_q_C:g} C. Is its current in A?")
-        slope = (high.state[:, [QNS, QPS]] - low.state[:, [QNS, QPS]]) / (high_q_C - low_q_C)
-        moved_C = high.state[:, [QNS, QPS]] - slope * high_q_C
-        # neither surface is empty or overfull: 0 < slope * q + moved < (share of all sites that are at the surface) * q
-        full = self.cell.VolSFraction * FULL_CHARGE_SHARES.sum()
-        least_q_C = float(max((-moved_C / slope).max(), (moved_C / (full - slope)).max(), 0.0))
-        ohmic_A = np.interp(time_s, high.time_s, high.state[:, VO]) / _REFERENCE_R_O_OHM
-        return _Problem(time_s, voltage_V, current_A, least_q_C * (1.0 + _MARGIN), ohmic_A)
-
-    def _simulate(self, current_A: FloatArray, q_mobile: float, r_o: float) -> Trajectory:
-        start = self.initial.copy()
-        start[QNB:] += (q_mobile - _Q_PER_CHARGE * start[QNB:].sum()) * FULL_CHARGE_SHARES
-        return simulate(
-            current_A,
-            q_mobile,
-            r_o,
-            dt=self.dt_s,
-            load_unit="current",
-            thermal=self.thermal,
-            parameters=self.cell,
-            initial=start,
-            cut_off_V=-np.inf,
-            max_duration_s=len(current_A) * self.dt_s,
-        )
+        grid_s = self.model.dt_s * np.arange(len(current_A))
+        on_grid = len(grid_s) == len(time_s) and np.allclose(time_s, grid_s, rtol=0.0, atol=1e-6 * self.model.dt_s)
+        return _Problem(time_s, voltage_V, current_A, on_grid, self.model.least_q_mobile_C(current_A))
 
     def _until_empty(self, problem: _Problem) -> _Problem:
         """The samples that a cell of the held ``q_mobile`` lives to see, whatever its ``r_o``."""
-        n = len(self._simulate(problem.current_A, self.cell.q_mobile, 0.0).time_s)
-        seen = problem.time_s <= (n - 1) * self.dt_s
+        q_mobile = self.model.cell.q_mobile
+        n = len(self.model.simulate(problem.current_A, q_mobile, 0.0).time_s)
+        seen = problem.time_s <= (n - 1) * self.model.dt_s
         if seen.sum() <= len(self.parameters):
             raise ValueError(
-                f"a cell with q_mobile = {self.cell.q_mobile:g} C is empty at the start of this record, which takes at least "
+                f"a cell with q_mobile = {q_mobile:g} C is empty at the start of this record, which takes at least "
                 f"{problem.least_q_C:g} C. Search for q_mobile too, or hold it at another value."
             )
         return problem._replace(
-            time_s=problem.time_s[seen],
-            voltage_V=problem.voltage_V[seen],
-            ohmic_A=problem.ohmic_A[seen],
-            current_A=problem.current_A[:n],
-            least_q_C=0.0,
+            time_s=problem.time_s[seen], voltage_V=problem.voltage_V[seen], current_A=problem.current_A[:n], least_q_C=0.0
         )
 
-    def _start(self, problem: _Problem, q_mobile: float) -> _Start:
-        """The given ``q_mobile`` within its bounds, and the ``r_o`` that goes best with it: the voltage is linear in it."""
-        if "q_mobile" in self.parameters:
-            low, high = self.bounds["q_mobile"]
-            q_mobile = min(max(q_mobile, low, problem.least_q_C), high)
-        if "r_o" not in self.parameters:
-            values = {"q_mobile": q_mobile, "r_o": self.cell.r_o}
-            return _Start(values, _square(self._residual(problem, values)))
-        excess_V = self._residual(problem, {"q_mobile": q_mobile, "r_o": 0.0})
-        r_o = float(np.clip(excess_V @ problem.ohmic_A / _square(problem.ohmic_A), *self.bounds["r_o"]))
-        return _Start({"q_mobile": q_mobile, "r_o": r_o}, _square(excess_V - r_o * problem.ohmic_A))
+    def _q_bounds_C(self, problem: _Problem) -> tuple[float, float]:
+        low_C, high_C = self.bounds["q_mobile"]
+        return max(low_C, problem.least_q_C * (1.0 + _MARGIN)), high_C
 
-    def _search(self, problem: _Problem, start: dict[str, float], prior_weight_V: float = 0.0) -> _Fit:
-        low, high = np.array([self.bounds[name] for name in self.parameters]).T
-        if "q_mobile" in self.parameters:
-            n = self.parameters.index("q_mobile")
-            low[n] = max(low[n], problem.least_q_C)
-            if not low[n] < high[n]:
-                raise ValueError(
-                    f"this record takes a q_mobile of at least {low[n]:g} C, which is beyond the upper bound, {high[n]:g} C. "
-                    "Raise q_mobile_bounds_C, or check that time is in s and current in A."
-                )
+    def _starts(self, problem: _Problem, q_candidates: Sequence[float]) -> list[_Start]:
+        """
+        Values of ``q_mobile`` within their bounds, each with the ``r_o`` that goes best with it (the voltage is linear in it
+        but for its small effect on the temperature), and how far from the record they are, all on a coarse grid of time.
+        """
+        # the largest step for which no voltage drop of explicit Euler oscillates
+        cell = self.model.cell
+        stride = max(int(min(cell.to, cell.tsn, cell.tsp) / self.model.dt_s), 1)
+        if len(problem.current_A) < _COARSE_POINTS * stride:
+            stride = 1
+        points = len(problem.current_A) // stride
+        current_A = problem.current_A[: points * stride].reshape(points, stride).mean(axis=1)
+        voltage_V = np.interp(stride * self.model.dt_s * np.arange(points), problem.time_s, problem.voltage_V)
+        starts = []
+        for candidate in q_candidates:
+            q_mobile, r_o = candidate, self.model.cell.r_o
+            if "q_mobile" in self.parameters:
+                low_C, high_C = self._q_bounds_C(problem)
+                q_mobile = min(max(q_mobile, low_C), high_C)
+            model_V, _, by_r_o_A = self.model.sensitivities(current_A, q_mobile, r_o, stride)
+            residual_V = model_V - voltage_V
+            if "r_o" in self.parameters:
+                low_ohm, high_ohm = self.bounds["r_o"]
+                best_ohm = min(max(r_o - float(residual_V @ by_r_o_A) / _square(by_r_o_A), low_ohm), high_ohm)
+                residual_V += (best_ohm - r_o) * by_r_o_A
+                r_o = best_ohm
+            square_V2 = _square(residual_V)
+            # on the coarse grid a cell may be empty a little too early
+            starts.append(_Start({"q_mobile": q_mobile, "r_o": r_o}, inf if isnan(square_V2) else square_V2))
+        return starts
 
-        def named(x: FloatArray) -> dict[str, float]:
-            return start | {name: float(value) for name, value in zip(self.parameters, x, strict=True)}
+    def _best_starts(self, problem: _Problem, more_q_C: Sequence[float]) -> list[dict[str, float]]:
+        """The local minima on a grid of ``q_mobile``, refined where it is promising, that may lead to the global one."""
+        excess = _START_EXCESS
+        starts = self._starts(problem, (problem.least_q_C * (1.0 + excess)).tolist())
+        promising = _is_near_best(starts)
+        left = np.flatnonzero(promising[:-1] | promising[1:])
+        finer = excess[left, None] * (excess[left + 1] / excess[left])[:, None] ** (np.arange(1, _FINER) / _FINER)
+        starts += self._starts(problem, [*(problem.least_q_C * (1.0 + finer.ravel())).tolist(), *more_q_C])
+        starts.sort(key=lambda start: start.values["q_mobile"])
+        squares_V2 = np.pad([start.square_V2 for start in starts], 1, constant_values=np.inf)
+        minima = (squares_V2[1:-1] <= squares_V2[:-2]) & (squares_V2[1:-1] < squares_V2[2:]) & _is_near_best(starts)
+        return [starts[n].values for n in np.union1d(np.flatnonzero(minima), squares_V2[1:-1].argmin())]
 
+    def _search(self, problem: _Problem, starts: Sequence[dict[str, float]], prior: _Prior | None = None) -> _Fit:
+        """The best fit that is found from any of the starts."""
+        bounds = self.bounds | {"q_mobile": self._q_bounds_C(problem)}
+        if "q_mobile" in self.parameters and not bounds["q_mobile"][0] < bounds["q_mobile"][1]:
+            raise ValueError(
+                "this record takes a q_mobile of at least {:g} C, which is beyond the upper bound, {:g} C. Raise "
+                "q_mobile_bounds_C, or check that time is in s and current in A.".format(*bounds["q_mobile"])
+            )
+        return min((self._fit(problem, start, bounds, prior) for start in starts), key=lambda fit: fit.square_V2)
+
+    def _fit(
+        self, problem: _Problem, start: dict[str, float], bounds: dict[str, tuple[float, float]], prior: _Prior | None
+    ) -> _Fit:
+        free, values = list(self.parameters), start
+        while True:
+            values = self._minimize(problem, values, free, prior)
+            clipped = {name: min(max(values[name], bounds[name][0]), bounds[name][1]) for name in free}
+            inside = [name for name in free if clipped[name] == values[name]]
+            values = values | clipped
+            if len(inside) in (0, len(free)):
+                break
+            free = inside
+        residual_V, jacobian = self._residual(problem, values, prior)
+        at_bound = len(inside) < len(self.parameters)
+        return _Fit(values, jacobian, residual_V[: len(problem.time_s)], _square(residual_V), at_bound)
+
+    def _minimize(self, problem: _Problem, start: dict[str, float], free: list[str], prior: _Prior | None) -> dict[str, float]:
+        columns = [self.parameters.index(name) for name in free]
+
+        def values_at(x: FloatArray) -> dict[str, float]:
+            values = start | {name: float(value) for name, value in zip(free, x, strict=True)}
+            if "q_mobile" in free:
+                values["q_mobile"] = problem.least_q_C + float(np.exp(min(values["q_mobile"], _LOG_LIMIT)))
+            return values
+
+        @lru_cache(maxsize=1)
+        def evaluated(x: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
+            values = values_at(np.array(x))
+            residual_V, by_parameter = self._residual(problem, values, prior)
+            slopes = [values[name] - problem.least_q_C if name == "q_mobile" else 1.0 for name in free]
+            return residual_V, by_parameter[:, columns] * slopes
+
+        # scipy asks for them one after the other; one roll-out gives both
         def residual(x: FloatArray) -> FloatArray:
-            return self._residual(problem, named(x), prior_weight_V)
+            return evaluated(tuple(x))[0]
+
+        def jacobian(x: FloatArray) -> FloatArray:
+            return evaluated(tuple(x))[1]
 
         result = least_squares(
             residual,
-            [start[name] for name in self.parameters],
-            bounds=(low, high),
-            x_scale=[_SEARCH_SCALES[name] for name in self.parameters],
+            [np.log(start[name] - problem.least_q_C) if name == "q_mobile" else start[name] for name in free],
+            jac=jacobian,
+            method="lm",
+            x_scale=[_SEARCH_SCALES[name] for name in free],
             gtol=1e-10,
         )
-        at_bound = bool(np.any(result.active_mask))
-        return _Fit(named(result.x), np.asarray(result.jac), 2.0 * float(result.cost), at_bound)
+        return values_at(result.x)
 
-    def _residual(self, problem: _Problem, values: dict[str, float], prior_weight_V: float = 0.0) -> FloatArray:
-        simulation = self._simulate(problem.current_A, values["q_mobile"], values["r_o"])
-        residual_V = _at(problem.time_s, simulation) - problem.voltage_V
-        if prior_weight_V == 0.0 or self.prior_q_mobile_C is None:
-            return residual_V
-        mean_C, sd_C = self.prior_q_mobile_C
-        return np.append(residual_V, prior_weight_V * (values["q_mobile"] - mean_C) / sd_C)
+    def _residual(self, problem: _Problem, values: dict[str, float], prior: _Prior | None) -> tuple[FloatArray, FloatArray]:
+        """The residuals at the samples, V, and if there is a prior one more; and their derivatives by ``parameters``."""
+        model_V, *slopes = self.model.sensitivities(problem.current_A, values["q_mobile"], values["r_o"])
+        by_parameter = dict(zip(PARAMETERS, slopes, strict=True))
+        columns = [model_V, *(by_parameter[name] for name in self.parameters)]
+        if not problem.on_grid:
+            grid_s = self.model.dt_s * np.arange(len(model_V))
+            columns = [np.interp(problem.time_s, grid_s, column) for column in columns]
+        residual_V, jacobian = columns[0] - problem.voltage_V, np.column_stack(columns[1:])
+        if prior is None:
+            return residual_V, jacobian
+        row = [prior.V_per_C if name == "q_mobile" else 0.0 for name in self.parameters]
+        return np.append(residual_V, prior.V_per_C * (values["q_mobile"] - prior.mean_C)), np.vstack([jacobian, row])
 
 
-def _at(time_s: FloatArray, simulation: Trajectory) -> FloatArray:
-    return np.interp(time_s, simulation.time_s, simulation.voltage_V, right=np.nan)
+def _is_near_best(starts: Sequence[_Start]) -> BoolArray:
+    squares_V2 = np.array([start.square_V2 for start in starts])
+    return squares_V2 <= _RIVAL_RATIO * squares_V2.min()
 
 
 def _square(array: FloatArray) -> float:

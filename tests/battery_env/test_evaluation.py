@@ -3,13 +3,15 @@
 import numpy as np
 import pytest
 
-from battery_env.calibration.policy import PolicyEstimator
 from battery_env.calibration.full_state import ACTION_RANGES
+from battery_env.calibration.policy import PolicyEstimator
 from battery_env.electrochemistry import simulate
 from battery_env.estimators.base import Estimate, EstimateTrace, Estimator
 from battery_env.estimators.closed_form import ClosedForm
+from battery_env.estimators.cramer_rao import cramer_rao_bound
 from battery_env.evaluation import evaluate, summarize
 from battery_env.loads import RandomPiecewise, constant
+from battery_env.sensors import SensorErrors
 from battery_env.trajectories import TrajectoryDataset
 
 
@@ -29,10 +31,10 @@ class Constant(Estimator):
 
 
 class Sequence(Estimator):
-    """Gives a fixed sequence of estimates of q_mobile, as shares of the truth."""
+    """Gives a fixed sequence of estimates of q_mobile, as shares of the truth, one a second or at given shares of the time."""
 
-    def __init__(self, shares):
-        self.shares = np.array(shares)
+    def __init__(self, shares, at=None, sd_share=None, settled=None):
+        self.shares, self.at, self.sd_share, self.settled = np.array(shares), at, sd_share, settled
 
     def estimate(self, record):
         raise NotImplementedError
@@ -40,12 +42,25 @@ class Sequence(Estimator):
     def trace(self, records):
         return [
             EstimateTrace(
-                time_s=np.arange(len(self.shares)) + record.time_s[0] + 1.0,
+                time_s=(
+                    np.arange(len(self.shares)) + record.time_s[0] + 1.0
+                    if self.at is None
+                    else np.array(self.at) * record.eod_time_s
+                ),
                 q_mobile=self.shares * record.q_mobile,
                 r_o=np.full(len(self.shares), record.r_o),
+                sd_q_mobile=None if self.sd_share is None else np.full(len(self.shares), self.sd_share * record.q_mobile),
+                settled=None if self.settled is None else np.array(self.settled),
             )
             for record in records
         ]
+
+
+class Reader(Estimator):
+    """Says what it was shown last."""
+
+    def estimate(self, record):
+        return Estimate(1000.0 * record.voltage_V[-1], record.current_A[-1])
 
 
 class FixedPolicy:
@@ -82,6 +97,9 @@ def test_scores_of_known_errors(data):
     assert row["q_mobile_settling_time_5_percent_s"] == 2.0
     assert row["q_mobile_settling_time_1_percent_s"] == 4.0
     assert row["q_mobile_final"] == pytest.approx(0.996 * row["q_mobile"])
+    assert row["q_mobile_final_error_percent"] == pytest.approx(0.4)
+    assert row["q_mobile_worst"] == pytest.approx(0.2 * row["q_mobile"])
+    assert row["q_mobile_rmse"] == pytest.approx(row["q_mobile"] * np.sqrt((0.2**2 + 2 * 0.02**2 + 2 * 0.004**2) / 5))
     assert row["updates"] == 5 and len(scores) == len(data)
     assert row["eod_error_s"] < 0.0
 
@@ -132,3 +150,93 @@ def test_the_summary_is_over_discharges():
     scores = evaluate(Constant(6000.0, 0.117215), data)
     summary = summarize(scores, "q_mobile")
     assert summary["mape_worst_percent"] == scores["q_mobile_mape_percent"].max() > summary["mape_percent"]
+
+
+def test_the_second_half_is_that_of_the_discharge(data):
+    scores = evaluate(Sequence([1.2, 1.1, 1.04, 0.98], at=[0.1, 0.45, 0.55, 0.9]), data)
+    np.testing.assert_allclose(scores["q_mobile_second_half_mape_percent"], 3.0)
+    early = evaluate(Sequence([1.2, 1.1], at=[0.1, 0.45]), data)
+    assert early["q_mobile_second_half_mape_percent"].isna().all()
+
+
+def test_forecasts_hold_the_estimate_of_the_time():
+    data = TrajectoryDataset.generate("q_mobile", 2, [constant(8.0)], seed=1)
+    scores = evaluate(Sequence([0.8, 0.9, 1.1], at=[0.3, 0.5, 0.7]), data)
+    for row, truth in zip(scores.itertuples(), data, strict=True):
+        assert np.isnan(row.eod_error_at_25_percent_s)
+        for share, error_s in ((0.9, row.eod_error_at_50_percent_s), (1.1, row.eod_error_at_75_percent_s)):
+            assert error_s == simulate(8.0, share * truth.q_mobile, truth.r_o).eod_time_s - truth.eod_time_s != 0.0
+        assert row.eod_error_s == row.eod_error_at_75_percent_s
+    summary = summarize(scores, "q_mobile")
+    late = scores["eod_error_at_50_percent_s"].abs() / scores["eod_time_s"]
+    assert summary["eod_error_percent_at_50_percent"] == pytest.approx(100.0 * late.mean())
+
+
+def test_there_is_no_forecast_for_estimates_that_no_cell_can_have(data):
+    assert evaluate(Constant(6000.0, -0.1), data)["eod_error_s"].isna().all()
+    assert evaluate(Constant(np.nan, 0.1), data)["eod_error_s"].isna().all()
+
+
+def test_coverage_is_the_share_within_two_stated_deviations(data):
+    scores = evaluate(Sequence([1.025, 0.99, 1.015, 1.0], sd_share=0.01), data)
+    np.testing.assert_allclose(scores["q_mobile_coverage_percent"], 75.0)
+    assert scores["r_o_coverage_percent"].isna().all()
+    assert summarize(scores, "q_mobile")["coverage_percent"] == pytest.approx(75.0)
+
+
+def test_the_calibrator_is_asked_when_it_has_settled(data):
+    shares = [1.0, 1.0, 1.0, 1.0]
+    assert (evaluate(Sequence(shares, settled=[True, False, True, True]), data)["settled_time_s"] == 3.0).all()
+    assert (evaluate(Sequence(shares, settled=[True, True, True, False]), data)["settled_time_s"] == np.inf).all()
+    assert evaluate(Sequence(shares), data)["settled_time_s"].isna().all()
+
+
+def test_the_calibrator_sees_what_the_sensors_show(data):
+    errors = SensorErrors(noise_V=0.01, offset_V=0.1, current_gain=1.02, current_offset_A=0.5)
+    scores = evaluate(Reader(), data, errors, seed=3)
+    truth = [(record.voltage_V[-1], record.current_A[-1]) for record in data]
+    voltage_V, current_A = np.array(truth).T
+    np.testing.assert_allclose(scores["r_o_final"], 1.02 * current_A + 0.5)
+    noise_V = scores["q_mobile_final"] / 1000.0 - voltage_V - 0.1
+    assert 0.0 < noise_V.abs().min() and noise_V.abs().max() < 0.05
+    np.testing.assert_array_equal(scores["q_mobile"], data.q_mobile)
+    # reproducible, and one discharge does not depend on those after it
+    few = evaluate(Reader(), data[:3], errors, seed=3)
+    np.testing.assert_array_equal(few["q_mobile_final"], scores["q_mobile_final"][:3])
+    assert (evaluate(Reader(), data, errors, seed=4)["q_mobile_final"] != scores["q_mobile_final"]).all()
+
+
+def test_single_trajectories_are_seen_as_they_are():
+    whole = simulate(8.0, 6000.0, 0.15)
+    shown = SensorErrors(offset_V=0.1).apply(whole, np.random.default_rng(0))
+    assert evaluate(Reader(), [shown])["q_mobile_final"][0] == 1000.0 * (whole.voltage_V[-1] + 0.1)
+    part = evaluate(Sequence([1.0]), [whole.part(100, 500)]).iloc[0]
+    assert part["q_mobile_settling_time_1_percent_s"] == 1.0
+    assert part["eod_time_s"] == whole.eod_time_s - 100.0 and np.isnan(part["eod_error_s"])
+
+
+def test_noise_bounds_the_error(data):
+    whole = TrajectoryDataset.generate("q_mobile", 3, [constant(8.0)], seed=1)
+    scores = evaluate(Sequence([1.0], sd_share=0.01), whole, SensorErrors(noise_V=0.005))
+    joint = evaluate(Sequence([1.0]), whole, SensorErrors(noise_V=0.005, offset_V=0.01))
+    for n, record in enumerate(whole):
+        bound = cramer_rao_bound(record, 0.005, ["q_mobile"])
+        assert scores["q_mobile_bound"][n] == pytest.approx(bound.sd_q_mobile[-1]) and np.isnan(scores["r_o_bound"][n])
+        bound = cramer_rao_bound(record, 0.005, offset=True)
+        assert joint["r_o_bound"][n] == pytest.approx(bound.sd_r_o[-1])
+    assert evaluate(Sequence([1.0]), whole)["q_mobile_bound"].isna().all()
+    # a part that starts in the midst of a discharge, from a known state
+    assert (evaluate(Sequence([1.0]), data, SensorErrors(noise_V=0.005))["q_mobile_bound"] > 0.0).all()
+
+
+@pytest.mark.parametrize(
+    ("errors", "message"),
+    [
+        ({"noise_V": -0.1}, "noise_V is a standard deviation and must be at least 0 V, got -0.1"),
+        ({"offset_V": np.nan}, "offset_V must be finite, got nan"),
+        ({"current_gain": 0.0}, "current_gain must be greater than 0 .1: exact., got 0.0"),
+    ],
+)
+def test_sensor_errors_that_cannot_be_meant_are_refused(errors, message):
+    with pytest.raises(ValueError, match=message):
+        SensorErrors(**errors)

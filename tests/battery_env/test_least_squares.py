@@ -8,7 +8,9 @@ from hypothesis import strategies as st
 from battery_env.cells import Discharge, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, Trajectory, initial_state, simulate
 from battery_env.estimators.base import Estimate
+from battery_env.estimators.cramer_rao import cramer_rao_bound
 from battery_env.estimators.least_squares import SETTLED_SHARES, LeastSquares
+from battery_env.estimators.record_model import RecordModel
 
 
 def discharged(
@@ -87,6 +89,49 @@ class TestCleanRecords:
         assert trace.time_s == record.time_s[-1]
         assert trace.q_mobile == pytest.approx(6000.0, rel=1e-6)
 
+    @pytest.mark.parametrize("parameters", [["q_mobile"], ["r_o"], ["q_mobile", "r_o"]])
+    def test_a_fit_takes_few_roll_outs(self, parameters, monkeypatch):
+        record = discharged(6000.0, 0.15, steps(1), noise_V=0.005)
+        lengths, sensitivities = [], RecordModel.sensitivities
+
+        def counted(self, current_A, *more):
+            lengths.append(len(current_A))
+            return sensitivities(self, current_A, *more)
+
+        monkeypatch.setattr(RecordModel, "sensitivities", counted)
+        LeastSquares(parameters, cell=NEW_CELL.replace(q_mobile=6000.0, r_o=0.15)).estimate(record)
+        assert sum(lengths) < 12 * len(record.time_s)
+
+
+class TestGrowingWindow:
+    def test_each_estimate_is_that_of_the_samples_so_far(self):
+        record = discharged(6000.0, 0.15, steps(0), noise_V=0.005)
+        record = replace(record, time_s=record.time_s + 500.0)
+        fit = LeastSquares(window_every_s=400.0)
+        (trace,) = fit.trace([record])
+        expected_s = np.append(np.arange(900.0, record.time_s[-1], 400.0), record.time_s[-1])
+        np.testing.assert_array_equal(trace.time_s, expected_s)
+        for n, time_s in enumerate(trace.time_s):
+            alone = fit.estimate(record.part(0, int(time_s - 500.0) + 1))
+            for name in ("q_mobile", "r_o", "sd_q_mobile", "sd_r_o"):
+                assert getattr(trace, name)[n] == pytest.approx(getattr(alone, name), rel=1e-3)
+            assert trace.settled[n] == alone.settled
+        assert trace.settled[-1] and (np.diff(trace.sd_q_mobile) < 0.0).all()
+
+    def test_it_waits_until_a_current_shows(self):
+        current_A = np.where(np.arange(300) < 100, 0.0, 2.0)
+        record = simulate(current_A, 6000.0, 0.15, load_unit="current")
+        (trace,) = LeastSquares(["r_o"], cell=NEW_CELL.replace(q_mobile=6000.0), window_every_s=10.0).trace([record])
+        assert trace.time_s[0] == 110.0 and trace.time_s[-1] == 299.0
+        np.testing.assert_allclose(trace.r_o, 0.15, rtol=1e-9)
+
+    def test_recorded_discharges(self, b0005):
+        record = b0005[0]
+        (trace,) = LeastSquares(thermal=True, mismatch_V=0.05, window_every_s=600.0).trace([record])
+        assert trace.time_s[-1] == record.time_s[-1] and trace.settled[-1]
+        assert not trace.settled[:-2].any()
+        assert np.diff(trace.time_s)[:-1] == pytest.approx(600.0, abs=20.0)
+
 
 class TestNoise:
     def test_errors_are_as_large_as_stated(self):
@@ -108,6 +153,37 @@ class TestNoise:
         assert doubtful.q_mobile == white.q_mobile
         assert doubtful.sd_q_mobile > 100.0 * white.sd_q_mobile
         assert few.sd_q_mobile == pytest.approx(doubtful.sd_q_mobile, rel=0.2)
+
+    def test_a_known_noise_takes_the_place_of_the_residuals(self):
+        record = discharged(noise_V=0.005).part(0, 200)
+        unknown, known, doubled = (LeastSquares(voltage_noise_V=noise_V).estimate(record) for noise_V in (None, 0.005, 0.01))
+        assert (unknown.q_mobile, unknown.r_o) == pytest.approx((known.q_mobile, known.r_o), rel=1e-6)
+        assert unknown.sd_q_mobile == pytest.approx(known.sd_q_mobile, rel=0.2)
+        assert doubled.sd_q_mobile == pytest.approx(2.0 * known.sd_q_mobile)
+        bound = cramer_rao_bound(record, 0.005)
+        assert known.sd_q_mobile == pytest.approx(bound.sd_q_mobile[-1], rel=0.2)
+        # and a prior is weighed with it
+        sd = known.sd_q_mobile
+        fit = LeastSquares(voltage_noise_V=0.005, prior_q_mobile_C=(known.q_mobile, sd))
+        assert fit.estimate(record).sd_q_mobile == pytest.approx(sd / np.sqrt(2.0), rel=1e-3)
+
+    @pytest.mark.parametrize(
+        ("held", "offset_V"), [({}, 0.0), ({"r_o": 0.12}, 0.0), ({}, 0.02)], ids=["sound", "wrong r_o held", "offset"]
+    )
+    def test_residuals_beyond_the_known_noise_are_not_settled(self, held, offset_V):
+        record = discharged(6000.0, 0.15, steps(3), noise_V=0.005)
+        record = replace(record, voltage_V=record.voltage_V + offset_V)
+        cell = NEW_CELL.replace(**{"r_o": 0.15, **held})
+        sound = not held and offset_V == 0.0
+        assert LeastSquares(["q_mobile"], cell=cell, voltage_noise_V=0.005).estimate(record).settled == sound
+        # who states no noise cannot be told
+        assert LeastSquares(["q_mobile"], cell=cell).estimate(record).settled
+
+    def test_a_few_samples_do_not_tell_the_noise(self):
+        fit = LeastSquares(["r_o"], cell=NEW_CELL.replace(q_mobile=6000.0))
+        record = discharged(noise_V=0.001)
+        assert not fit.estimate(record.part(0, 10)).settled
+        assert fit.estimate(record.part(0, 11)).settled
 
     def test_the_first_minutes_do_not_settle(self):
         beginning = discharged(noise_V=0.005).part(0, 120)
@@ -141,6 +217,31 @@ class TestHeldParameter:
     def test_a_q_mobile_that_is_empty_at_once_is_refused(self):
         with pytest.raises(ValueError, match="q_mobile = 100 C is empty at the start"):
             LeastSquares(["r_o"], cell=NEW_CELL.replace(q_mobile=100.0)).estimate(discharged(load=30.0, load_unit="current"))
+
+
+class TestBounds:
+    @pytest.mark.parametrize(
+        ("bounds", "name", "value"),
+        [
+            ({"q_mobile_bounds_C": (100.0, 5900.0)}, "q_mobile", 5900.0),
+            ({"q_mobile_bounds_C": (6100.0, 9000.0)}, "q_mobile", 6100.0),
+            ({"r_o_bounds_ohm": (0.0, 0.14)}, "r_o", 0.14),
+            ({"r_o_bounds_ohm": (0.16, 1.0)}, "r_o", 0.16),
+        ],
+    )
+    def test_a_parameter_beyond_is_held_there_and_the_other_one_fits_to_it(self, bounds, name, value):
+        record = discharged(6000.0, 0.15).part(0, 2000)
+        estimate = LeastSquares(**bounds).estimate(record)
+        assert getattr(estimate, name) == value and not estimate.settled
+        other = {"q_mobile": "r_o", "r_o": "q_mobile"}[name]
+        alone = LeastSquares([other], cell=NEW_CELL.replace(**{name: value})).estimate(record)
+        assert getattr(estimate, other) == pytest.approx(getattr(alone, other), rel=1e-6)
+
+    def test_both_may_be_beyond(self):
+        estimate = LeastSquares(q_mobile_bounds_C=(5000.0, 5500.0), r_o_bounds_ohm=(0.2, 0.3)).estimate(
+            discharged(6000.0, 0.15).part(0, 1000)
+        )
+        assert (estimate.q_mobile, estimate.r_o) == (5500.0, 0.2) and not estimate.settled
 
 
 class TestEndOfDischarge:
@@ -198,6 +299,22 @@ class TestRealDischarges:
         eod_time_s = carried.predict_eod_time_s(beginning, carried.estimate(beginning), 2.7)
         assert eod_time_s == pytest.approx(record.time_s[-1], rel=0.01)
 
+    @pytest.mark.parametrize("cycle", [95, 125])
+    def test_the_deeper_of_two_minima_is_found(self, b0005, cycle):
+        # the middle of these discharges is explained nearly as well by 3600 C as by 4500 C, and by 3200 C as by 4100 C
+        record = b0005[cycle]
+        half = record.until(record.time_s[0] + 0.5 * (record.time_s[-1] - record.time_s[0]))
+
+        def square_V2(estimate):
+            residual_V = LeastSquares(thermal=True).predict_voltage_V(half, estimate) - half.voltage_V
+            return residual_V @ residual_V
+
+        def profile(q_mobile):
+            return LeastSquares(["r_o"], cell=NEW_CELL.replace(q_mobile=q_mobile), thermal=True).estimate(half)
+
+        best = LeastSquares(thermal=True).estimate(half)
+        assert square_V2(best) < min(square_V2(profile(q_mobile)) for q_mobile in np.linspace(3000.0, 6000.0, 40))
+
     def test_a_raw_record_with_its_rests_gives_nearly_the_same(self, b0005):
         raw = LeastSquares(thermal=True).estimate(load_nasa_discharges("B0005")[99])
         assert raw.q_mobile == pytest.approx(LeastSquares(thermal=True).estimate(b0005[99]).q_mobile, rel=0.01)
@@ -219,6 +336,8 @@ class TestBadInput:
             ({"prior_q_mobile_C": (1.9, 0.1)}, "Ampere-hours"),
             ({"prior_q_mobile_C": (6000.0, 60.0), "parameters": ["r_o"]}, "needs 'q_mobile'"),
             ({"mismatch_V": -0.05}, "mismatch_V"),
+            ({"voltage_noise_V": 0.0}, "voltage_noise_V must be greater than 0"),
+            ({"window_every_s": -1.0}, "window_every_s must be greater than 0"),
         ],
     )
     def test_arguments_are_checked(self, arguments, message):
@@ -236,6 +355,7 @@ class TestBadInput:
             ({"voltage_V": np.full(99, 3.0)}, "one finite value a sample"),
             ({"time_s": np.zeros(100)}, "order of time"),
             ({"current_A": np.zeros(100)}, "no current"),
+            ({"current_A": np.where(np.arange(100) < 99, 0.0, 2.0)}, "no current"),
         ],
     )
     def test_records_are_checked(self, changes, message):

@@ -1,0 +1,121 @@
+"""The bound is the published one, and least squares attain it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from battery_env.cells import load_nasa_discharges
+from battery_env.electrochemistry import NEW_CELL, simulate
+from battery_env.estimators.base import Estimate
+from battery_env.estimators.cramer_rao import CramerRaoBound, Sensitivities, cramer_rao_bound, sensitivities
+from battery_env.estimators.least_squares import LeastSquares
+from battery_env.estimators.record_model import RecordModel
+
+NOISE_V = 0.010
+BOTH = ("q_mobile", "r_o")
+
+
+@pytest.fixture(scope="module")
+def record():
+    return simulate(8.0, 6000.0, NEW_CELL.r_o)
+
+
+@pytest.fixture(scope="module")
+def slopes_at_known_power(record):
+    # the reference took the power for known exactly, not the current: then the current moves with the parameters
+    n, q, r_o = len(record.time_s), record.q_mobile, record.r_o
+
+    def voltage_V(q, r_o):
+        return simulate(8.0, q, r_o, cut_off_V=-np.inf).voltage_V[:n]
+
+    by_q = (voltage_V(q + 0.01, r_o) - voltage_V(q - 0.01, r_o)) / 0.02
+    by_r = (voltage_V(q, r_o + 1e-6) - voltage_V(q, r_o - 1e-6)) / 2e-6
+    return Sensitivities(record.time_s, record.voltage_V, by_q, by_r)
+
+
+@pytest.mark.parametrize(
+    ("samples", "alone_C", "jointly_C"),
+    [(16, 626, 5733), (101, 94, 465), (301, 33, 131), (1214, 9.1, 30.2), (2427, 0.71, 0.953)],
+)
+def test_bounds_of_the_reference_case(slopes_at_known_power, samples, alone_C, jointly_C):
+    # 10 mV, 8 W, q_mobile = 6000 C: after 16 s, 100 s, 300 s, half of the discharge, at its end
+    for parameters, expected_C in ((["q_mobile"], alone_C), (BOTH, jointly_C)):
+        bound = CramerRaoBound.of(slopes_at_known_power, NOISE_V, parameters)
+        assert bound.sd_q_mobile[samples - 1] == pytest.approx(expected_C, rel=0.015)
+
+
+def test_a_known_current_tells_a_little_less_than_a_known_power(record, slopes_at_known_power):
+    for parameters in (["q_mobile"], BOTH):
+        at_current = cramer_rao_bound(record, NOISE_V, parameters).sd_q_mobile[15:]
+        ratio = at_current / CramerRaoBound.of(slopes_at_known_power, NOISE_V, parameters).sd_q_mobile[15:]
+        assert 1.0 < ratio.min() and ratio.max() < 1.4
+
+
+def test_it_is_the_inverse_of_the_information(record):
+    slopes = sensitivities(record)
+    gradient = np.column_stack([slopes.by_q_mobile_V_per_C, slopes.by_r_o_A, np.ones(len(record.time_s))])
+    for n in (100, 1000, len(record.time_s)):
+        covariance = NOISE_V**2 * np.linalg.inv(gradient[:n].T @ gradient[:n])
+        bound = cramer_rao_bound(record, NOISE_V, offset=True)
+        assert bound.sd_q_mobile[n - 1] == pytest.approx(np.sqrt(covariance[0, 0]), rel=1e-6)
+        assert bound.sd_r_o[n - 1] == pytest.approx(np.sqrt(covariance[1, 1]), rel=1e-6)
+
+
+@pytest.mark.parametrize(("parameters", "offset"), [(["q_mobile"], False), (["r_o"], False), (BOTH, False), (BOTH, True)])
+def test_more_samples_tell_more_and_more_unknowns_less(record, parameters, offset):
+    bound = cramer_rao_bound(record, NOISE_V, parameters, offset)
+    easier = cramer_rao_bound(record, NOISE_V, parameters)
+    for name in parameters:
+        sd = getattr(bound, f"sd_{name}")
+        # a full cell at rest shows nothing of either, but for rounding
+        assert sd[0] > 1e9 and np.isfinite(sd[4:]).all()
+        # one more sample cannot make anything less certain
+        assert (np.diff(sd[4:]) <= 1e-6 * sd[4:-1]).all()
+        assert (sd >= getattr(easier, f"sd_{name}")).all()
+    for name in set(BOTH) - set(parameters):
+        assert np.isnan(getattr(bound, f"sd_{name}")).all()
+
+
+def test_it_is_proportional_to_the_noise(record):
+    one, two = (cramer_rao_bound(record, noise_V).sd_q_mobile[5:] for noise_V in (0.005, 0.010))
+    np.testing.assert_allclose(two, 2.0 * one)
+
+
+@pytest.mark.parametrize("share", [0.5, 1.0])
+def test_least_squares_attain_it(share):
+    whole = simulate(np.repeat(np.random.default_rng(1).uniform(4.0, 10.0, 100), 60), 6000.0, 0.15)
+    record = whole.part(0, int(share * len(whole.time_s)))
+    bound = cramer_rao_bound(record, NOISE_V)
+    rng, fit, errors = np.random.default_rng(2), LeastSquares(), []
+    for _ in range(60):
+        noise_V = rng.normal(0.0, NOISE_V, len(record.time_s))
+        estimate = fit.estimate(replace(record, voltage_V=record.voltage_V + noise_V))
+        errors.append([estimate.q_mobile - 6000.0, estimate.r_o - 0.15])
+    spread = np.sqrt(np.mean(np.square(errors), axis=0))
+    # the standard deviation of 60 values is known to 9 %
+    np.testing.assert_allclose(spread, [bound.sd_q_mobile[-1], bound.sd_r_o[-1]], rtol=0.25)
+
+
+def test_recorded_discharges_and_other_models():
+    record = load_nasa_discharges("B0005")[0].loaded_part(2.7)
+    at, model = Estimate(7000.0, 0.11), RecordModel(thermal=True)
+    slopes = sensitivities(record, at, model)
+    assert slopes.time_s.shape == slopes.by_r_o_A.shape == record.time_s.shape
+    np.testing.assert_array_equal(slopes.time_s, record.time_s)
+    # once the load has been on for a while; the heat of the resistance raises the voltage a little
+    np.testing.assert_allclose(slopes.by_r_o_A[10:], -record.current_A[10:], rtol=0.1)
+    np.testing.assert_allclose(
+        slopes.voltage_V, LeastSquares(thermal=True).predict_voltage_V(record, at), rtol=0.0, atol=1e-12
+    )
+    assert 0.0 < cramer_rao_bound(record, NOISE_V, at=at, model=model).sd_q_mobile[-1] < 100.0
+    with pytest.raises(ValueError, match="give the parameters of a recorded discharge"):
+        sensitivities(record)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"), [({"parameters": ["kn"]}, "one or both"), ({"voltage_noise_V": 0.0}, "greater than 0 V")]
+)
+def test_arguments_are_checked(record, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        cramer_rao_bound(record, **({"voltage_noise_V": NOISE_V} | arguments))
