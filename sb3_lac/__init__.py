@@ -5,6 +5,7 @@ from sb3_lac.callbacks import CalibrationCallback, LyapunovCallback
 from sb3_lac.lac import LAC
 from sb3_lac.policies import CnnPolicy, LyapunovPolicy, MlpPolicy, MultiInputPolicy
 from sb3_lac.stability import LyapunovReport, evaluate_lyapunov
+from sb3_lac.vec_env import GymnasiumVecEnv
 
 # Gymnasium does not import third-party environments by itself:
 # importing battery_env here makes ``LAC("MlpPolicy", "BatteryQmax-v0")`` work when it is installed
@@ -21,6 +22,7 @@ __all__ = [
     "LAC",
     "CalibrationCallback",
     "CnnPolicy",
+    "GymnasiumVecEnv",
     "LyapunovCallback",
     "LyapunovPolicy",
     "LyapunovReport",

@@ -13,10 +13,16 @@ and hyperparameters come from ``zoo_configs/<algo>.yml``.
 """
 
 import argparse
+import inspect
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+import gymnasium as gym
+from gymnasium.envs.registration import EnvSpec, load_env_creator
+from gymnasium.vector import AutoresetMode
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 
 try:
     import optuna
@@ -32,7 +38,7 @@ try:
 except ImportError as error:
     raise ImportError("sb3_lac.zoo needs the RL Zoo, install it with: pip install 'sb3_lac[zoo]'") from error
 
-from sb3_lac import LAC
+from sb3_lac import LAC, GymnasiumVecEnv
 
 
 def convert_lac_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
@@ -87,8 +93,40 @@ def sample_lac_params(trial: optuna.Trial, n_actions: int, n_envs: int, addition
     return convert_lac_params(sampled_params)
 
 
+def steps_as_one_batch(spec: EnvSpec) -> bool:
+    """
+    Whether all copies of an environment can be stepped by one call: it is registered with a vector environment that lets
+    Stable-Baselines3 say when episodes start anew, and without wrappers that a vector environment would go without.
+
+    :param spec: How the environment is registered
+    :return: Whether it is
+    """
+    if spec.vector_entry_point is None or spec.max_episode_steps is not None or spec.additional_wrappers:
+        return False
+    entry_point = spec.vector_entry_point
+    creator = load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
+    return "autoreset_mode" in inspect.signature(creator).parameters
+
+
 class LACExperimentManager(ExperimentManager):
-    """Experiment manager that also understands schedules like ``lin_5e-5`` for the learning rate of lambda."""
+    """
+    Experiment manager that steps all copies of an environment by one call where it can, and understands schedules like
+    ``lin_5e-5`` for the learning rate of lambda.
+    """
+
+    def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
+        spec = gym.spec(self.env_name.gym_id)
+        asked_otherwise = self.env_wrapper is not None or self.frame_stack is not None or self.vec_env_class is not DummyVecEnv
+        if asked_otherwise or not steps_as_one_batch(spec):
+            return super().create_envs(n_envs, eval_env, no_log)
+        env_kwargs = self.eval_env_kwargs if eval_env else self.env_kwargs
+        env: VecEnv = GymnasiumVecEnv(gym.make_vec(spec, n_envs, autoreset_mode=AutoresetMode.SAME_STEP, **env_kwargs))
+        env.seed(self.seed)
+        log_file = None if eval_env or no_log else str(Path(self.save_path) / "0")
+        env = VecMonitor(env, log_file, **self.monitor_kwargs)
+        if self.vec_env_wrapper is not None:
+            env = self.vec_env_wrapper(env)
+        return self._maybe_normalize(env, eval_env)
 
     @staticmethod
     def _preprocess_schedules(hyperparams: dict[str, Any]) -> dict[str, Any]:

@@ -1,134 +1,116 @@
-"""The calibration task as a Gymnasium environment."""
+"""A calibration task as a Gymnasium environment."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import deque
-from functools import lru_cache
-from typing import Any, Literal, SupportsFloat
+from typing import Any, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from battery_env.calibration.full_state import OBSERVATION_LIMIT, FullStateTask, Parameter
-from battery_env.trajectories import TrajectoryDataset
+from battery_env.calibration.task import OBSERVATION_LIMIT, CalibrationTask
 
 _ROW = np.zeros(1, dtype=np.intp)
+FloatSpace = gym.Space[NDArray[np.float32]]
+_RENDER_MODES = ["rgb_array"]
 
-Split = Literal["train", "test", "all"]
 
-
-@lru_cache(maxsize=4)
-def paper_split(parameter: Parameter, split: Split) -> TrajectoryDataset:
+def spaces_of(task: CalibrationTask) -> tuple[FloatSpace, FloatSpace]:
     """
-    The paper's data set, or one side of its 70/30 split by trajectory (seed 0), made once per process.
+    What one cell of a task shows and takes.
 
-    :param parameter: what ages
-    :param split: ``"train"``, ``"test"`` or ``"all"``
-    :return: the trajectories
-    :raises ValueError: for another split
+    :param task: the task
+    :return: observation space, action space
     """
-    if split == "all":
-        return TrajectoryDataset.paper(parameter)
-    if split not in ("train", "test"):
-        raise ValueError(f"split must be 'train', 'test' or 'all', got {split!r}")
-    return TrajectoryDataset.paper(parameter).split(test=0.3, by="trajectory", seed=0)[split == "test"]
+    limit = OBSERVATION_LIMIT
+    return (
+        gym.spaces.Box(-limit, limit, shape=(task.observation_size,), dtype=np.float32),
+        gym.spaces.Box(-1.0, 1.0, shape=(len(task.parameters),), dtype=np.float32),
+    )
 
 
-class FullStateEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
+def check_render_mode(render_mode: str | None) -> str | None:
     """
-    What the full-state environments share; see the registered ones.
+    Refuse a render mode that does not exist.
 
-    :param parameter: what the action is: ``"q_mobile"`` or ``"r_o"``
-    :param formulation: observation and cost: ``"scaled"`` or ``"paper"``
-    :param episode_steps: decisions per episode; fewer where the data end
-    :param initial_perturbation: the model starts in the true state plus a uniform draw within this many error scales to
-        either side, in Vo, Vsn, Vsp and in charge that has moved between the electrodes
-    :param split: side of the paper's data set that episodes are drawn from; not with ``dataset``
-    :param dataset: other trajectories to draw from
     :param render_mode: ``"rgb_array"`` or ``None``
+    :return: the same
+    :raises ValueError: for another one
+    """
+    if render_mode is not None and render_mode not in _RENDER_MODES:
+        raise ValueError(f"render_mode must be None or one of {_RENDER_MODES}, got {render_mode!r}")
+    return render_mode
+
+
+class CalibrationEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]], ABC):
+    """
+    A calibration task for one cell; see the registered environments. The reward is minus the cost, and ``info`` holds the cost
+    and what :meth:`~battery_env.calibration.task.CalibrationTask.report` says.
+
+    :param render_mode: ``"rgb_array"`` or ``None``
+    :param options: of the task
+    :raises TypeError: for an option that the task does not have
     :raises ValueError: for values out of range
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 (as in gym.Env)
+    metadata: dict[str, Any] = {"render_modes": _RENDER_MODES, "render_fps": 10}  # noqa: RUF012 (as in gym.Env)
 
-    def __init__(
-        self,
-        parameter: Parameter,
-        formulation: str,
-        episode_steps: int,
-        initial_perturbation: float = 0.0,
-        split: Split = "train",
-        dataset: TrajectoryDataset | None = None,
-        render_mode: str | None = None,
-    ) -> None:
-        if episode_steps < 1:
-            raise ValueError(f"episode_steps must be at least 1, got {episode_steps!r}")
-        if not 0.0 <= initial_perturbation < np.inf:
-            raise ValueError(f"initial_perturbation must be finite and at least 0, got {initial_perturbation!r}")
-        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
-            raise ValueError(f"render_mode must be None or one of {self.metadata['render_modes']}, got {render_mode!r}")
-        self.dataset = paper_split(parameter, split) if dataset is None else dataset
-        self.task = FullStateTask(self.dataset, parameter, formulation, cells=1)
-        self.formulation = formulation
-        self.episode_steps = episode_steps
-        self.initial_perturbation = initial_perturbation
-        self.render_mode = render_mode
-        self.observation_space = gym.spaces.Box(
-            -OBSERVATION_LIMIT, OBSERVATION_LIMIT, shape=(self.task.observation_size,), dtype=np.float32
-        )
-        self.action_space = gym.spaces.Box(-1.0, 1.0, shape=(1,), dtype=np.float32)
-        self._steps_left = 0
-        self._history: deque[dict[str, float]] = deque(maxlen=episode_steps)
+    def __init__(self, render_mode: str | None = None, **options: Any) -> None:
+        self.render_mode = check_render_mode(render_mode)
+        self.task = self.make_task(1, **options)
+        self.observation_space, self.action_space = spaces_of(self.task)
+        self._history: deque[dict[str, float]] = deque(maxlen=self.task.episode_steps)
+
+    @staticmethod
+    @abstractmethod
+    def make_task(cells: int, **options: Any) -> CalibrationTask:
+        """
+        The task of this environment, for any number of cells.
+
+        :param cells: size of the batch
+        :param options: of the task
+        :return: the task
+        """
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """
-        Start an episode at a random point of a random trajectory.
+        Start an episode.
 
         :param seed: seed of this and the following episodes
-        :param options: ``trajectory`` and ``sample`` (counted from full charge) choose the point instead
+        :param options: choices that replace random draws; the page of the environment names them
         :return: observation, info
         """
         super().reset(seed=seed)
-        chosen = options or {}
-        dataset = self.dataset
-        n = int(chosen.get("trajectory", self.np_random.integers(len(dataset))))
-        if not 0 <= n < len(dataset):
-            raise ValueError(f"options['trajectory'] must lie within 0 .. {len(dataset) - 1}, got {n}")
-        first, last = int(dataset.first[n]), int(dataset.stop[n]) - 3  # one decision needs the two samples that follow
-        t = int(chosen.get("sample", self.np_random.integers(first, last + 1)))
-        if not first <= t <= last:
-            raise ValueError(f"options['sample'] must lie within {first} .. {last} for trajectory {n}, got {t}")
-        bound = self.initial_perturbation
-        perturbation = self.np_random.uniform(-bound, bound, size=(1, 4)) if bound > 0.0 else None
-        self.task.begin(_ROW, np.array([n]), np.array([t]), perturbation)
-        self._steps_left = self.episode_steps
+        self.task.start(_ROW, [self.np_random], options)
         self._history.clear()
         return self.task.observation()[0], self._info(0.0)
 
     def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], SupportsFloat, bool, bool, dict[str, Any]]:
         """
-        Run the model for one time step with the parameter that the action stands for.
+        Take one decision.
 
-        :param action: shape (1,), in [-1, 1]
+        :param action: shape (number of parameters,), in [-1, 1]
         :return: observation, reward (minus the cost), terminated (never), truncated (end of the episode or of the data), info
         """
-        cost = float(self.task.advance(action)[0])
-        self._steps_left -= 1
-        truncated = self._steps_left <= 0 or self.task.transitions_left()[0] <= 0
+        task = self.task
+        cost = task.advance(np.asarray(action).reshape(1, -1)).item()
         info = self._info(cost)
         if self.render_mode is not None:
             self._history.append(info)
-        return self.task.observation()[0], -cost, False, bool(truncated), info
+        return task.observation()[0], -cost, False, task.truncated().item(), info
 
     def _info(self, cost: float) -> dict[str, Any]:
-        return {"cost": cost, **{name: float(value[0]) for name, value in self.task.report().items()}}
+        info = {name: value.item() for name, value in self.task.report().items()}
+        info["cost"] = cost
+        return info
 
     def render(self) -> NDArray[np.uint8] | None:
         """
-        A picture of the episode so far: voltage and parameter, of the cell and of the model.
+        A picture of the episode so far: voltage and parameters, of the cell and of the model.
 
         :return: shape (height, width, 3), or ``None`` without a render mode
         """
@@ -136,4 +118,5 @@ class FullStateEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             return None
         from battery_env.calibration.rendering import draw_frame  # matplotlib only for those who look
 
-        return draw_frame(list(self._history), self.task.parameter, self.episode_steps, self.dataset.dt_s)
+        task = self.task
+        return draw_frame(list(self._history), task.parameters, task.episode_steps, task.decision_s)

@@ -8,24 +8,26 @@ a policy is evaluated on the batch of all test trajectories: both run this code.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from battery_env.calibration.full_state_kernels import decide, look_ahead, observe
+from battery_env.calibration.task import OBSERVATION_LIMIT, CalibrationTask
 from battery_env.electrochemistry import (
     NEW_CELL,
+    QNB,
     STATE_SIZE,
     VO,
     FloatArray,
-    state_of_charge,
-    step_into,
+    advance_in_place,
+    initial_state,
     voltage_into,
 )
-from battery_env.trajectories import IntArray, TrajectoryDataset
-
-Parameter = Literal["q_mobile", "r_o"]
+from battery_env.trajectories import AgedParameter, IntArray, TrajectoryDataset
 
 #: What the action's range [-1, 1] is mapped to (the authors' code), C and ohm.
 ACTION_RANGES: dict[str, tuple[float, float]] = {"q_mobile": (4000.0, 8000.0), "r_o": (0.08, 0.22)}
@@ -34,10 +36,66 @@ ACTION_RANGES: dict[str, tuple[float, float]] = {"q_mobile": (4000.0, 8000.0), "
 OBSERVED = slice(VO, STATE_SIZE)
 OBSERVED_SIZE = STATE_SIZE - VO
 
+#: Error scales of Vo, Vsn, Vsp, qnB, qnS, qpB, qpS, V and C: a step with a parameter that is off by 10 % is off by some tenths
+#: in Vo, Vsn and Vsp. Charges count little on purpose: they never forget an error, so that any weight in the cost makes the
+#: agent repay old errors with wrong parameters.
+ERROR_SCALE: FloatArray = np.array([0.01, 1e-5, 1e-5, 20.0, 20.0, 20.0, 20.0])
 
 # A model that was wrong for a while has moved too much or too little charge from one electrode to the other; in both, nine
 # tenths of it are in the bulk
 _PERTURBATION = np.array([1.0, 1.0, 1.0, -0.9, -0.1, 0.9, 0.1])
+
+
+@dataclass(frozen=True)
+class FullStateOptions:
+    """
+    What the full-state tasks can be asked for. Error scales are ``ERROR_SCALE``.
+
+    :param episode_steps: decisions per episode; fewer where the data end
+    :param start: the model's first state: ``"true"``, the cell's; or ``"new_cell"``, that of a cell that was full when the
+        discharge began, is new in what is to be found, and has carried the same load since
+    :param initial_perturbation: the first state is off by a uniform draw within this many error scales to either side, in Vo,
+        Vsn, Vsp and in charge that has moved between the electrodes
+    :param resync: after every so many decisions the model is set to the measured state; ``None``: it runs free
+    :param process_noise_V: standard deviation of white noise on Vo, Vsn and Vsp of the cell, V per root of a second
+    :param sensor_noise: standard deviation of white noise on measured states, in error scales
+    :param sensor_offset: constant error of measured states, in error scales
+    :param sensor_gain: measured states are the true ones times this
+    :param consistency: cost of a change of the action, per unit of its Euclidean length; above 0 the observation ends with the
+        action before (at the start the one that stands for a new cell)
+    :param cost_scale: what the distance of the states is multiplied by to give the cost
+    :param cost_limit: largest cost of a distance; ``None``: that of the formulation
+    :raises ValueError: for values out of range
+    """
+
+    episode_steps: int = 64
+    start: Literal["true", "new_cell"] = "true"
+    initial_perturbation: float = 0.0
+    resync: int | None = None
+    process_noise_V: float = 0.0
+    sensor_noise: float = 0.0
+    sensor_offset: float = 0.0
+    sensor_gain: float = 1.0
+    consistency: float = 0.0
+    cost_scale: float = 1.0
+    cost_limit: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.episode_steps < 1:
+            raise ValueError(f"episode_steps must be at least 1, got {self.episode_steps!r}")
+        if self.start not in ("true", "new_cell"):
+            raise ValueError(f"start must be 'true' or 'new_cell', got {self.start!r}")
+        if self.resync is not None and self.resync < 1:
+            raise ValueError(f"resync must be None or at least 1, got {self.resync!r}")
+        for name in ("initial_perturbation", "process_noise_V", "sensor_noise", "consistency"):
+            if not 0.0 <= getattr(self, name) < np.inf:
+                raise ValueError(f"{name} must be finite and at least 0, got {getattr(self, name)!r}")
+        if not np.isfinite(self.sensor_offset):
+            raise ValueError(f"sensor_offset must be finite, got {self.sensor_offset!r}")
+        for name in ("sensor_gain", "cost_scale", "cost_limit"):
+            value = getattr(self, name)
+            if value is not None and not 0.0 < value < np.inf:
+                raise ValueError(f"{name} must be finite and greater than 0, got {value!r}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,162 +109,290 @@ class Formulation:
     :param error_scale: what state errors are divided by, in the cost and in the innovation, shape (7,)
     :param innovation: whether the observation holds x_{t+1} minus what the model predicts from x̂_t with a new cell's
         parameters
-    :param cost_limit: the largest cost
+    :param literal_cost: the authors' cost: 0.5 times the norm of the error of the voltages plus 0.5 times that of the charges,
+        times 50 where it exceeds 1e-4. Otherwise it is the norm of all errors
+    :param cost_limit: the largest cost of a distance. Near the end of a discharge distances span four orders of magnitude;
+        costs must not, or the critic does not see the small ones
     """
 
     state_scale: FloatArray
     load_scale: float
     error_scale: FloatArray
     innovation: bool
+    literal_cost: bool
     cost_limit: float
 
-    def cost(self, error: FloatArray) -> FloatArray:
-        """
-        The Euclidean norm of the scaled error of the state, at most ``cost_limit``: near the end of a discharge the norm spans
-        four orders of magnitude; the cost must not, or the critic does not see the small ones.
 
-        :param error: x̂_{t+1} - x_{t+1}, shape (n, 7)
-        :return: shape (n,)
-        """
-        scaled = error / self.error_scale
-        return np.minimum(np.sqrt(np.einsum("ij,ij->i", scaled, scaled)), self.cost_limit)
+FORMULATIONS: dict[str, Formulation] = {
+    "scaled": Formulation(
+        # what a new cell's states reach under 8 to 16 W
+        state_scale=np.array([0.5, 0.1, 0.01, 6840.0, 760.0, 11400.0, 1266.0]),
+        load_scale=16.0,
+        error_scale=ERROR_SCALE,
+        innovation=True,
+        literal_cost=False,
+        cost_limit=5.0,
+    ),
+    # the authors' code: a new cell's charges, 1 V and 20 W
+    "paper": Formulation(
+        state_scale=np.array([1.0, 1.0, 1.0, 6840.0, 760.0, 4560.0, 506.67]),
+        load_scale=20.0,
+        error_scale=np.ones(OBSERVED_SIZE),
+        innovation=False,
+        literal_cost=True,
+        cost_limit=1e4,
+    ),
+}
 
-
-class PaperFormulation(Formulation):
-    """
-    The authors' literal observation and cost: states divided by the new cell's, loads by 20 W; cost 0.5 times the norm of the
-    error of the voltages in V plus 0.5 times that of the charges in C, times 50 where it exceeds 1e-4.
-    """
-
-    def cost(self, error: FloatArray) -> FloatArray:
-        """
-        The authors' cost.
-
-        :param error: x̂_{t+1} - x_{t+1}, shape (n, 7)
-        :return: shape (n,)
-        """
-        distance = 0.5 * np.linalg.norm(error[:, :3], axis=1) + 0.5 * np.linalg.norm(error[:, 3:], axis=1)
-        return np.minimum(np.where(distance > 1e-4, 50.0 * distance, distance), self.cost_limit)
-
-
-# State scales: what a new cell's states reach under 8 to 16 W. Error scales: a step with a parameter that is off by 10 % is
-# off by some tenths in Vo, Vsn and Vsp. Charges count little on purpose: they never forget an error, so that any weight in
-# the cost makes the agent repay old errors with wrong parameters.
-_SCALED = Formulation(
-    state_scale=np.array([0.5, 0.1, 0.01, 6840.0, 760.0, 11400.0, 1266.0]),
-    load_scale=16.0,
-    error_scale=np.array([0.01, 1e-5, 1e-5, 20.0, 20.0, 20.0, 20.0]),
-    innovation=True,
-    cost_limit=5.0,
+# What belongs to a cell of the batch
+_PER_CELL = (
+    "trajectory",
+    "sample",
+    "decisions",
+    "state",
+    "next_state",
+    "model_state",
+    "load",
+    "q_mobile",
+    "r_o",
+    "q_mobile_hat",
+    "r_o_hat",
+    "voltage",
+    "soc",
+    "last_action",
+    "_sensed",
+    "_last_sample",
+    "_last_decision",
+    "_load_start",
+    "_nominal_q_mobile",
+    "_nominal_r_o",
+    "_noise",
 )
 
-# The authors' code
-_PAPER = PaperFormulation(
-    state_scale=np.array([1.0, 1.0, 1.0, 6840.0, 760.0, 4560.0, 506.67]),
-    load_scale=20.0,
-    error_scale=np.ones(OBSERVED_SIZE),
-    innovation=False,
-    cost_limit=1e4,
-)
 
-FORMULATIONS: dict[str, Formulation] = {"scaled": _SCALED, "paper": _PAPER}
-
-#: Observations are clipped here; what a calibrated model shows is of order 1.
-OBSERVATION_LIMIT = 100.0
-
-
-class FullStateTask:
+class FullStateTask(CalibrationTask):
     """
-    The paper's task for ``cells`` cells side by side: the state of the cell is measured, one parameter is to be found, the
-    other one is known.
+    The paper's task for ``cells`` cells side by side: the state of the cell is measured; one parameter is to be found and the
+    other one is known, or both are to be found.
 
     The truth is simulated beside the model, from the data set's parameters and loads. The model is continued where a wrong
     parameter leaves its domain (:func:`battery_env.electrochemistry.step_into`, ``extended``).
 
     :param dataset: the discharges
-    :param parameter: what the action is: ``"q_mobile"`` or ``"r_o"``
+    :param parameter: what the action is: ``"q_mobile"``, ``"r_o"`` or ``"joint"``, both in this order
     :param formulation: observation and cost: ``"scaled"`` or ``"paper"``
     :param cells: size of the batch
+    :param options: of the task
     :raises ValueError: for an unknown parameter or formulation
     """
 
-    def __init__(self, dataset: TrajectoryDataset, parameter: Parameter, formulation: str, cells: int) -> None:
-        if parameter not in ACTION_RANGES:
-            raise ValueError(f"parameter must be one of {tuple(ACTION_RANGES)}, got {parameter!r}")
+    def __init__(
+        self,
+        dataset: TrajectoryDataset,
+        parameter: AgedParameter,
+        formulation: str,
+        cells: int,
+        options: FullStateOptions | None = None,
+    ) -> None:
+        if parameter not in (*ACTION_RANGES, "joint"):
+            raise ValueError(f"parameter must be one of {(*ACTION_RANGES, 'joint')}, got {parameter!r}")
         if formulation not in FORMULATIONS:
             raise ValueError(f"formulation must be one of {tuple(FORMULATIONS)}, got {formulation!r}")
         self.dataset = dataset
-        self.parameter: Parameter = parameter
-        self.formulation = FORMULATIONS[formulation]
-        self.action_low, self.action_high = ACTION_RANGES[parameter]
-        self.trajectory: IntArray = np.zeros(cells, dtype=np.int64)
-        self.sample: IntArray = np.zeros(cells, dtype=np.int64)  # t: x̂_t and x_t are at this sample
-        self.state = np.zeros((cells, STATE_SIZE))  # x_t
-        self.next_state = np.zeros((cells, STATE_SIZE))  # x_{t+1}
-        self.model_state = np.zeros((cells, STATE_SIZE))  # x̂_t
+        self.parameter: AgedParameter = parameter
+        self.parameters = ("q_mobile", "r_o") if parameter == "joint" else (parameter,)
+        self.formulation = form = FORMULATIONS[formulation]
+        self.options = chosen = options or FullStateOptions()
+        self.cells = cells
+        self.episode_steps = chosen.episode_steps
+        self.decision_s = dataset.dt_s
+        shows_action = chosen.consistency > 0.0
+        shown = (2, 3)[form.innovation] * OBSERVED_SIZE + 1
+        self.observation_size = shown + (len(self.parameters) if shows_action else 0)
+        self._action_range = np.array([ACTION_RANGES[name] for name in self.parameters]).T
+        self._first_action = self.action_of({"q_mobile": NEW_CELL.q_mobile, "r_o": NEW_CELL.r_o})
+        # one decision needs the two samples that follow
+        self._starts = list(zip(dataset.first.tolist(), (dataset.stop - 2).tolist(), strict=True))
+
+        self.trajectory, self.sample, self.decisions = np.zeros((3, cells), dtype=np.int64)  # the sample is t
+        self.state, self.next_state, self.model_state = np.zeros((3, cells, STATE_SIZE))  # x_t, x_{t+1}, x̂_t
         self.load = np.zeros(cells)  # u_{t+1}: holds over the step from t to t + 1
-        self.q_mobile, self.r_o = np.ones(cells), np.zeros(cells)
-        self.q_mobile_hat, self.r_o_hat = np.ones(cells), np.zeros(cells)
-        self._nominal_q_mobile = np.full(cells, NEW_CELL.q_mobile)
-        self._nominal_r_o = np.full(cells, NEW_CELL.r_o)
-        self._predicted = np.zeros((cells, STATE_SIZE))
+        self.q_mobile, self.r_o, self.q_mobile_hat, self.r_o_hat = np.ones((4, cells))
+        self.voltage, self.soc = np.zeros((2, cells))  # at t
+        self.last_action = np.zeros((cells, len(self.parameters)))
+        self._last_sample, self._last_decision, self._load_start = np.zeros((3, cells), dtype=np.int64)
+        self._nominal_q_mobile, self._nominal_r_o = np.full(cells, NEW_CELL.q_mobile), np.full(cells, NEW_CELL.r_o)
+
+        self._has_sensor_errors = (chosen.sensor_noise, chosen.sensor_offset, chosen.sensor_gain) != (0.0, 0.0, 1.0)
+        self._is_disturbed = self._has_sensor_errors or chosen.process_noise_V > 0.0
+        self._sensed = np.zeros((cells if self._has_sensor_errors else 0, STATE_SIZE))
+        # standard normal, of the process first
+        columns = (OBSERVED_SIZE if chosen.sensor_noise > 0.0 else 0) + (3 if chosen.process_noise_V > 0.0 else 0)
+        self._noise = np.zeros((cells, self.episode_steps + 1, columns))
+
+        self._model_packed = self._true_packed = dataset.parameters.packed
+        self._has_own_constants = bool((dataset.factors != 1.0).any())
+        if self._has_own_constants:
+            own = np.repeat(self._model_packed.constants, cells, axis=0)
+            self._true_packed = self._model_packed._replace(constants=own)
+        # what the kernels read, in their order
+        self._of_step = (dataset.dt_s, dataset.load_unit == "power", dataset.thermal)
+        cost = (form.literal_cost, chosen.cost_scale, chosen.cost_limit or form.cost_limit, chosen.consistency)
+        finds = ("q_mobile" in self.parameters, "r_o" in self.parameters)
+        self._of_decision = (
+            self._action_range[0],
+            self._action_range[1],
+            *finds,
+            *self._of_step,
+            *cost,
+            1.0 / form.error_scale,
+        )
+        scales = (1.0 / form.state_scale, 1.0 / form.load_scale, 1.0 / form.error_scale)
+        self._of_observation = (*scales, form.innovation, shows_action, OBSERVATION_LIMIT, *self._of_step)
 
     @property
-    def cells(self) -> int:
-        return len(self.sample)
+    def measured(self) -> FloatArray:
+        """x_{t+1} as the sensors have it, shape (cells, 8)."""
+        return self._sensed if self._has_sensor_errors else self.next_state
 
-    @property
-    def observation_size(self) -> int:
-        return OBSERVED_SIZE * (3 if self.formulation.innovation else 2) + 1
-
-    def begin(
-        self, rows: NDArray[np.intp], trajectory: IntArray, sample: IntArray, perturbation: FloatArray | None = None
+    def start(
+        self,
+        rows: NDArray[np.intp],
+        generators: Sequence[np.random.Generator],
+        options: Mapping[str, Any] | None = None,
     ) -> None:
         """
-        Start some cells at given points of given trajectories, with the model in the true state or near it.
+        Start some cells at random points of random trajectories.
 
         :param rows: which cells of the batch, shape (m,)
-        :param trajectory: which trajectories of the data set, shape (m,)
-        :param sample: which of their samples, counted from full charge, shape (m,)
-        :param perturbation: how far the model is off in Vo, Vsn, Vsp, and in charge that has moved from the negative to the
-            positive electrode, each in units of its error scale, shape (m, 4)
+        :param generators: one source of randomness for each of them, of length m
+        :param options: ``trajectory`` and ``sample`` (counted from the start of the discharge) choose the point instead
+        :raises ValueError: for an unknown option, or a point outside the data
         """
-        self.trajectory[rows] = trajectory
-        self.sample[rows] = sample
-        self.q_mobile[rows] = self.dataset.q_mobile[trajectory]
-        self.r_o[rows] = self.dataset.r_o[trajectory]
-        # before the first action the model is the new cell's; the parameter that is known stays the true one
-        self.q_mobile_hat[rows] = NEW_CELL.q_mobile if self.parameter == "q_mobile" else self.q_mobile[rows]
-        self.r_o_hat[rows] = NEW_CELL.r_o if self.parameter == "r_o" else self.r_o[rows]
-        state = self.dataset.states_at(trajectory, sample)
-        self.state[rows] = state
-        if perturbation is not None:
-            offset = perturbation[:, [0, 1, 2, 3, 3, 3, 3]] * _PERTURBATION
-            state[:, OBSERVED] += offset * self.formulation.error_scale
-        self.model_state[rows] = state
-        self._look_ahead()
+        chosen = options or {}
+        unknown = set(chosen) - {"trajectory", "sample"}
+        if unknown:
+            raise ValueError(f"options of reset are 'trajectory' and 'sample', got {sorted(unknown)}")
+        bound = self.options.initial_perturbation
+        trajectories = len(self.dataset)
+        trajectory, sample = np.empty((2, len(rows)), dtype=np.int64)
+        perturbation = np.zeros((len(rows), 4))
+        for k, generator in enumerate(generators):
+            n = int(generator.integers(trajectories))
+            if "trajectory" in chosen:
+                n = int(chosen["trajectory"])
+                if not 0 <= n < trajectories:
+                    raise ValueError(f"options['trajectory'] must lie within 0 .. {trajectories - 1}, got {n}")
+            first, stop = self._starts[n]
+            t = int(generator.integers(first, stop))
+            if "sample" in chosen:
+                t = int(chosen["sample"])
+                if not first <= t < stop:
+                    raise ValueError(f"options['sample'] must lie within {first} .. {stop - 1} for trajectory {n}, got {t}")
+            trajectory[k], sample[k] = n, t
+            if bound > 0.0:
+                perturbation[k] = generator.uniform(-bound, bound, size=4)
+            if self._noise.size > 0:
+                generator.standard_normal(out=self._noise[rows[k]])
+        self._begin(rows, trajectory, sample, perturbation)
 
-    def _look_ahead(self) -> None:
-        # u_{t+1} and x_{t+1} for all cells; at the end of its data a cell stays on its last sample, and is not asked for more
+    def _begin(self, rows: NDArray[np.intp], trajectory: IntArray, sample: IntArray, perturbation: FloatArray) -> None:
         dataset = self.dataset
-        last = dataset.samples[self.trajectory] - 1
-        self.load[:] = dataset.load_values[dataset.load_start[self.trajectory] + np.minimum(self.sample, last)]
-        self._step(self.next_state, self.state, self.q_mobile, self.r_o)
+        load_start, last_sample = dataset.load_start[trajectory], dataset.samples[trajectory] - 1
+        q_mobile, r_o = dataset.q_mobile[trajectory], dataset.r_o[trajectory]
+        # before the first action the model is the new cell's; the parameter that is known stays the true one
+        q_mobile_hat = self._nominal_q_mobile[rows] if "q_mobile" in self.parameters else q_mobile
+        r_o_hat = self._nominal_r_o[rows] if "r_o" in self.parameters else r_o
+        state = dataset.states_at(trajectory, sample)
+        if self.options.start == "new_cell":
+            model_state = initial_state(q_mobile_hat, dataset.parameters)
+            of_step = (dataset.dt_s, dataset.load_unit, dataset.thermal, self._model_packed)
+            advance_in_place(
+                model_state, dataset.load_values, load_start, sample, q_mobile_hat, r_o_hat, *of_step, extended=True
+            )
+        else:
+            model_state = state.copy()
+        if self.options.initial_perturbation > 0.0:
+            model_state[:, OBSERVED] += perturbation[:, [0, 1, 2, 3, 3, 3, 3]] * _PERTURBATION * ERROR_SCALE
+        packed = self._true_packed
+        if self._has_own_constants:
+            packed = dataset.packed(trajectory)
+            self._true_packed.constants[rows] = packed.constants
+        self.trajectory[rows], self.sample[rows], self.decisions[rows] = trajectory, sample, 0
+        self._load_start[rows], self._last_sample[rows] = load_start, last_sample
+        self._last_decision[rows] = dataset.stop[trajectory] - 2
+        self.q_mobile[rows], self.r_o[rows] = q_mobile, r_o
+        self.q_mobile_hat[rows], self.r_o_hat[rows] = q_mobile_hat, r_o_hat
+        self.last_action[rows] = self._first_action
+        self.state[rows], self.model_state[rows] = state, model_state
 
-    def _step(self, out: FloatArray, state: FloatArray, q_mobile: FloatArray, r_o: FloatArray) -> None:
-        data = self.dataset
-        step_into(
-            out,
-            state,
+        next_state = np.empty_like(state)
+        load, voltage, soc = np.empty((3, len(rows)))
+        path = (sample, last_sample, load_start, dataset.load_values)
+        look_ahead(*path, *self._of_step, state, q_mobile, r_o, *packed, load, next_state, voltage, soc)
+        self.next_state[rows] = next_state
+        self.load[rows], self.voltage[rows], self.soc[rows] = load, voltage, soc
+        if self._is_disturbed:
+            self._disturb(rows)
+
+    def _disturb(self, rows: NDArray[np.intp]) -> None:
+        # the noise of the process on x_{t+1}, then the errors of the sensors
+        options = self.options
+        noise = self._noise[rows, np.minimum(self.decisions[rows], self.episode_steps)]
+        if options.process_noise_V > 0.0:
+            self.next_state[rows, VO:QNB] += options.process_noise_V * np.sqrt(self.dataset.dt_s) * noise[:, :3]
+        if self._has_sensor_errors:
+            error = np.full((len(rows), OBSERVED_SIZE), options.sensor_offset)
+            if options.sensor_noise > 0.0:
+                error += options.sensor_noise * noise[:, -OBSERVED_SIZE:]
+            self._sensed[rows] = self.next_state[rows]
+            self._sensed[rows, OBSERVED] = options.sensor_gain * self.next_state[rows, OBSERVED] + error * ERROR_SCALE
+
+    def advance(self, action: NDArray[np.floating]) -> FloatArray:
+        """
+        Take the actions, step the model, and move on to the next sample.
+
+        :param action: in [-1, 1] (beyond, it is clipped), mapped to the parameters' ranges, shape (cells, len(parameters))
+        :return: cost, shape (cells,)
+        """
+        cost = np.empty(self.cells)
+        measured = self.measured
+        decide(
+            action,
+            *self._of_decision,
+            measured,
             self.load,
-            q_mobile,
-            r_o,
-            data.dt_s,
-            data.load_unit,
-            data.thermal,
-            data.parameters.packed,
-            extended=True,
+            *self._model_packed,
+            self.last_action,
+            self.model_state,
+            self.q_mobile_hat,
+            self.r_o_hat,
+            self.decisions,
+            self.sample,
+            cost,
         )
+        if self.options.resync is not None:
+            due = self.decisions % self.options.resync == 0
+            self.model_state[due] = measured[due]
+        self.state, self.next_state = self.next_state, self.state
+        look_ahead(
+            self.sample,
+            self._last_sample,
+            self._load_start,
+            self.dataset.load_values,
+            *self._of_step,
+            self.state,
+            self.q_mobile,
+            self.r_o,
+            *self._true_packed,
+            self.load,
+            self.next_state,
+            self.voltage,
+            self.soc,
+        )
+        if self._is_disturbed:
+            self._disturb(np.arange(self.cells))
+        return cost
 
     def transitions_left(self) -> IntArray:
         """
@@ -214,51 +400,58 @@ class FullStateTask:
 
         :return: shape (cells,)
         """
-        return self.dataset.stop[self.trajectory] - 2 - self.sample
+        return self._last_decision - self.sample
+
+    def truncated(self) -> NDArray[np.bool_]:
+        """
+        Whose episode is over, as its steps or its data have come to an end.
+
+        :return: shape (cells,)
+        """
+        return (self.decisions >= self.episode_steps) | (self.sample >= self._last_decision)
 
     def observation(self) -> NDArray[np.float32]:
         """
-        s_t = [x̂_t, x_{t+1}, u_{t+1}] and, with an innovation, x_{t+1} - f(x̂_t, u_{t+1}; new cell), all scaled.
+        s_t = [x̂_t, x_{t+1}, u_{t+1}] and, with an innovation, x_{t+1} - f(x̂_t, u_{t+1}; new cell), all scaled; with a price on
+        changes of the action, the action before.
 
         :return: shape (cells, observation_size)
         """
-        form, size = self.formulation, OBSERVED_SIZE
-        out = np.empty((self.cells, self.observation_size))
-        np.divide(self.model_state[:, OBSERVED], form.state_scale, out=out[:, :size])
-        np.divide(self.next_state[:, OBSERVED], form.state_scale, out=out[:, size : 2 * size])
-        np.divide(self.load, form.load_scale, out=out[:, 2 * size])
-        if form.innovation:
-            self._step(self._predicted, self.model_state, self._nominal_q_mobile, self._nominal_r_o)
-            innovation = out[:, 2 * size + 1 :]
-            np.subtract(self.next_state[:, OBSERVED], self._predicted[:, OBSERVED], out=innovation)
-            innovation /= form.error_scale
-        return np.clip(out, -OBSERVATION_LIMIT, OBSERVATION_LIMIT, dtype=np.float32, casting="same_kind")
+        out = np.empty((self.cells, self.observation_size), dtype=np.float32)
+        observe(
+            self.model_state,
+            self.measured,
+            self.load,
+            self.last_action,
+            *self._of_observation,
+            self._nominal_q_mobile,
+            self._nominal_r_o,
+            *self._model_packed,
+            out,
+        )
+        return out
 
-    def advance(self, action: NDArray[np.floating]) -> FloatArray:
+    def parameters_of(self, action: NDArray[np.floating]) -> FloatArray:
         """
-        Take the actions, step the model, and move on to the next sample.
+        The parameters that actions stand for.
 
-        :param action: in [-1, 1], mapped to the parameter's range, shape (cells,)
-        :return: cost, shape (cells,)
+        :param action: in [-1, 1], shape (..., len(parameters))
+        :return: C and ohm, same shape
         """
-        hat = self.q_mobile_hat if self.parameter == "q_mobile" else self.r_o_hat
-        hat[:] = self.parameter_of(action)
-        self._step(self.model_state, self.model_state, self.q_mobile_hat, self.r_o_hat)
-        cost = self.formulation.cost(self.model_state[:, OBSERVED] - self.next_state[:, OBSERVED])
-        self.state, self.next_state = self.next_state, self.state
-        self.sample += 1
-        self._look_ahead()
-        return cost
+        share = 0.5 * (np.asarray(action, dtype=np.float64) + 1.0)
+        lowest, highest = self._action_range
+        return lowest + share * (highest - lowest)
 
-    def parameter_of(self, action: NDArray[np.floating]) -> FloatArray:
+    def action_of(self, values: Mapping[str, ArrayLike]) -> FloatArray:
         """
-        The parameter that an action stands for.
+        The actions that stand for parameters.
 
-        :param action: in [-1, 1] (beyond, it is clipped), any shape
-        :return: C or ohm, same shape
+        :param values: at least those to be found, by name, C and ohm, shape (...)
+        :return: shape (..., len(parameters)), beyond [-1, 1] for parameters out of the actions' range
         """
-        share = 0.5 * (np.clip(np.asarray(action, dtype=np.float64), -1.0, 1.0) + 1.0)
-        return self.action_low + share * (self.action_high - self.action_low)
+        wanted = np.stack([np.asarray(values[name], dtype=np.float64) for name in self.parameters], axis=-1)
+        lowest, highest = self._action_range
+        return 2.0 * (wanted - lowest) / (highest - lowest) - 1.0
 
     def keep(self, rows: NDArray[np.bool_]) -> None:
         """
@@ -266,9 +459,13 @@ class FullStateTask:
 
         :param rows: which cells to keep, shape (cells,)
         """
-        for name, value in vars(self).items():
-            if isinstance(value, np.ndarray):
-                setattr(self, name, np.ascontiguousarray(value[rows]))
+        for name in _PER_CELL:
+            values = getattr(self, name)
+            if len(values) == self.cells:  # what no option asks for is empty
+                setattr(self, name, np.ascontiguousarray(values[rows]))
+        if self._has_own_constants:
+            self._true_packed = self._true_packed._replace(constants=self._true_packed.constants[rows])
+        self.cells = len(self.sample)
 
     def report(self) -> dict[str, FloatArray]:
         """
@@ -277,15 +474,14 @@ class FullStateTask:
         :return: arrays of shape (cells,): true and inferred parameters, C and ohm; voltages of cell and model, V; the state
             of charge of the cell
         """
-        voltage, voltage_hat = np.empty(self.cells), np.empty(self.cells)
-        voltage_into(voltage, self.state, self.q_mobile, self.dataset.parameters.packed, extended=True)
-        voltage_into(voltage_hat, self.model_state, self.q_mobile_hat, self.dataset.parameters.packed, extended=True)
+        voltage_hat = np.empty(self.cells)
+        voltage_into(voltage_hat, self.model_state, self.q_mobile_hat, self._model_packed, extended=True)
         return {
             "q_mobile": self.q_mobile.copy(),
             "r_o": self.r_o.copy(),
             "q_mobile_hat": self.q_mobile_hat.copy(),
             "r_o_hat": self.r_o_hat.copy(),
-            "voltage": voltage,
+            "voltage": self.voltage.copy(),
             "voltage_hat": voltage_hat,
-            "soc": state_of_charge(self.state, self.q_mobile),
+            "soc": self.soc.copy(),
         }

@@ -10,28 +10,29 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-_LABELS = {"q_mobile": "$q^{max}$ (C)", "r_o": "$R_o$ (ohm)"}
+_LABELS = {"voltage": "voltage (V)", "q_mobile": "$q^{max}$ (C)", "r_o": "$R_o$ (ohm)"}
 
 
-def draw_frame(history: Sequence[dict[str, Any]], parameter: str, steps: int, dt_s: float) -> NDArray[np.uint8]:
+def draw_frame(
+    history: Sequence[dict[str, Any]], parameters: Sequence[str], steps: int, decision_s: float
+) -> NDArray[np.uint8]:
     """
-    Draw voltage and parameter over the episode, of the cell and of the model.
+    Draw voltage and parameters over the episode, of the cell and of the model.
 
     :param history: the ``info`` of each step so far
-    :param parameter: ``"q_mobile"`` or ``"r_o"``
+    :param parameters: which of ``"q_mobile"`` and ``"r_o"``
     :param steps: length of the episode, the width of the time axis
-    :param dt_s: time step, s
+    :param decision_s: time between two decisions, s
     :return: shape (400, 600, 3)
     """
     figure = Figure(figsize=(6, 4), dpi=100, layout="constrained")
     canvas = FigureCanvasAgg(figure)
-    time = dt_s * np.arange(1, len(history) + 1)
-    for axes, name, label in zip(
-        figure.subplots(2, 1, sharex=True), ("voltage", parameter), ("voltage (V)", _LABELS[parameter]), strict=True
-    ):
+    time = decision_s * np.arange(1, len(history) + 1)
+    names = ("voltage", *parameters)
+    for axes, name in zip(figure.subplots(len(names), 1, sharex=True), names, strict=True):
         axes.plot(time, [info[name] for info in history], color="0.2", lw=2.5, label="cell")
         axes.plot(time, [info[f"{name}_hat"] for info in history], color="#d55e00", lw=1.2, label="model")
-        axes.set(ylabel=label, xlim=(0.0, steps * dt_s))
+        axes.set(ylabel=_LABELS[name], xlim=(0.0, steps * decision_s))
         axes.ticklabel_format(useOffset=False)
     axes.set_xlabel("time in the episode (s)")
     axes.legend(loc="best", fontsize="small", frameon=False)

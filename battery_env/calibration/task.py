@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -17,6 +17,19 @@ Parameter = Literal["q_mobile", "r_o"]
 OBSERVATION_LIMIT = 100.0
 
 
+def check_options(given: Iterable[str], known: Iterable[str]) -> None:
+    """
+    Refuse options that a task does not have.
+
+    :param given: names of the options that were given
+    :param known: names of those that there are
+    :raises TypeError: if one is not known
+    """
+    unknown = set(given) - set(known)
+    if unknown:
+        raise TypeError(f"{', '.join(sorted(unknown))}: no such option. There are {', '.join(sorted(known))}")
+
+
 class CalibrationTask(ABC):
     """
     A calibration task as a Markov decision process, for ``cells`` cells side by side, each in its own episode.
@@ -27,6 +40,7 @@ class CalibrationTask(ABC):
     :param cells: size of the batch
     :param parameters: what the action stands for, in its order
     :param observation_size: length of an observation
+    :param episode_steps: decisions per episode; fewer where the data end
     :param decision_s: time between two decisions, s
     """
 
@@ -60,13 +74,14 @@ class CalibrationTask(ABC):
         """
         What the agent sees.
 
-        :return: shape (cells, observation_size), within ``OBSERVATION_LIMIT``
+        :return: shape (cells, observation_size), within ``OBSERVATION_LIMIT``; a new array each time
         """
 
     @abstractmethod
     def advance(self, action: NDArray[np.floating]) -> FloatArray:
         """
-        Take one decision for every cell.
+        Take one decision for every cell. A batch goes on while some of its episodes are over: what such a cell does until it
+        is started again means nothing, but must not fail.
 
         :param action: in [-1, 1], beyond it is clipped, shape (cells, len(parameters))
         :return: cost, shape (cells,), at least 0
@@ -77,7 +92,7 @@ class CalibrationTask(ABC):
         """
         Whose episode is over, as its steps or its data have come to an end. No episode terminates.
 
-        :return: shape (cells,)
+        :return: shape (cells,); a new array each time
         """
 
     @abstractmethod
@@ -85,6 +100,6 @@ class CalibrationTask(ABC):
         """
         Where each cell stands after its last decision; for ``info``, rendering and evaluation, never for the policy.
 
-        :return: by name of ``REPORTED``, arrays of shape (cells,): true and estimated parameters, C and ohm; voltage of cell
-            and model, V; the state of charge of the cell
+        :return: by name of ``REPORTED``, arrays of shape (cells,), new each time: true and estimated parameters, C and ohm;
+            voltage of cell and model, V; the state of charge of the cell
         """

@@ -1,10 +1,60 @@
-"""The registered full-state environments; the docstring of each is its page."""
+"""The registered environments, for one cell and for many; the docstring of each scalar one is the page of both."""
 
 from __future__ import annotations
 
+from abc import abstractmethod
+from dataclasses import fields
+from functools import lru_cache
 from typing import Any
 
-from battery_env.calibration.env import FullStateEnv
+import numpy as np
+
+from battery_env.calibration.data import LoadKind, Split, standard_dataset
+from battery_env.calibration.env import CalibrationEnv
+from battery_env.calibration.full_state import ACTION_RANGES, FullStateOptions, FullStateTask
+from battery_env.calibration.task import check_options
+from battery_env.calibration.vector_env import CalibrationVectorEnv
+from battery_env.trajectories import AgedParameter, TrajectoryDataset
+
+# arguments of standard_dataset, with their defaults
+_DATA: dict[str, Any] = {"load": "paper", "split": "train", "dt_s": 1.0, "mismatch": 0.0}
+
+
+@lru_cache(maxsize=4)
+def _reachable(parameter: AgedParameter, load: LoadKind, split: Split, dt_s: float, mismatch: float) -> TrajectoryDataset:
+    # the discharges of the standard data set whose parameters actions can stand for
+    dataset = standard_dataset(parameter, load, split, dt_s, mismatch)
+    values = {"q_mobile": dataset.q_mobile, "r_o": dataset.r_o}
+    within = np.all([(low <= values[name]) & (values[name] <= high) for name, (low, high) in ACTION_RANGES.items()], axis=0)
+    return dataset if within.all() else dataset.subset(np.flatnonzero(within))
+
+
+def _full_state_task(parameter: AgedParameter, formulation: str, cells: int, options: dict[str, Any]) -> FullStateTask:
+    names = tuple(field.name for field in fields(FullStateOptions))
+    check_options(options, (*names, *_DATA, "dataset"))
+    task_options = FullStateOptions(**{name: options[name] for name in names if name in options})
+    data = {name: options[name] for name in _DATA if name in options}
+    dataset = options.get("dataset")
+    if dataset is None:
+        dataset = _reachable(parameter, **{**_DATA, **data})
+    elif data:
+        raise ValueError(f"dataset stands in place of {', '.join(data)}: give one or the other")
+    return FullStateTask(dataset, parameter, formulation, cells, task_options)
+
+
+class FullStateEnv(CalibrationEnv):
+    """What the full-state environments share; see the registered ones."""
+
+    task: FullStateTask
+
+    @staticmethod
+    @abstractmethod
+    def make_task(cells: int, **options: Any) -> FullStateTask: ...
+
+    @property
+    def dataset(self) -> TrajectoryDataset:
+        """The discharges that episodes are drawn from."""
+        return self.task.dataset
 
 
 class BatteryQmaxEnv(FullStateEnv):
@@ -28,9 +78,14 @@ class BatteryQmaxEnv(FullStateEnv):
     | 15-21 | the innovation: x_{t+1} minus what the model with a new cell's parameters predicts from x̂_t, in error scales |
 
     Error scales: Vo 0.01 V, Vsn and Vsp 1e-5 V, charges 20 C. The innovation holds nothing that is not in the rest of the
-    observation, but makes it readable: a parameter that is off by 1 % moves the next state by 1e-4 of its value. The
-    observation is Markov for a constant load: cost and next model state depend on it and the action alone, the next measured
-    state on the parameter too, which the observation determines.
+    observation, but makes it readable: a parameter that is off by 1 % moves the next state by 1e-4 of its value.
+
+    The observation is Markov for a constant load: cost and next model state depend on it and the action alone, the next
+    measured state on the parameter too, which the observation determines. It stays so with ``start``,
+    ``initial_perturbation``, ``process_noise_V``, ``sensor_offset``, ``sensor_gain``, ``consistency`` (which appends what is
+    needed) and ``resync`` = 1. It is not Markov, though the cost of a decision still depends on observation and action alone,
+    with a load that changes (when, is hidden), ``resync`` > 1 (so is the step in the cycle), ``sensor_noise`` (so is the true
+    state) or ``mismatch`` (so are constants of the cell).
 
     ## Action space
 
@@ -44,6 +99,7 @@ class BatteryQmaxEnv(FullStateEnv):
 
     A random second of a random discharge of the training part (70 %) of the paper's data: eleven loads times 501 values
     of q_mobile in 4000 .. 7000 C, without the first and last 5 % of each discharge. The model starts in the true state.
+    ``reset(options=...)`` takes ``trajectory`` and ``sample`` (counted from the start of the discharge) in place of random ones.
 
     ## Episode end
 
@@ -51,17 +107,47 @@ class BatteryQmaxEnv(FullStateEnv):
 
     ## Arguments
 
-    ``episode_steps`` (64), ``initial_perturbation`` (0: in error scales, uniform to either side in Vo, Vsn, Vsp
-    and in charge that has moved between the electrodes), ``split``
-    (``"train"``, ``"test"`` or ``"all"``), ``dataset`` (a ``TrajectoryDataset`` to draw from instead), ``render_mode``.
+    | argument | default | meaning |
+    |----------|---------|---------|
+    | ``episode_steps`` | 64 | decisions per episode |
+    | ``start`` | ``"true"`` | the model's first state: the cell's; or ``"new_cell"``: that of a cell that was full when the discharge began, is new in what is to be found, and has carried the same load since. No action makes up for the charge that it has too much |
+    | ``initial_perturbation`` | 0 | the first state is off by a uniform draw within this many error scales to either side, in Vo, Vsn, Vsp and in charge that has moved between the electrodes |
+    | ``resync`` | none | the model is set to the measured state after every so many decisions |
+    | ``process_noise_V`` | 0 | standard deviation of white noise on Vo, Vsn and Vsp of the cell, V per root of a second |
+    | ``sensor_noise`` | 0 | standard deviation of white noise on measured states, in error scales. Observation, cost and ``resync`` all use the measured state |
+    | ``sensor_offset`` | 0 | constant error of measured states, in error scales |
+    | ``sensor_gain`` | 1 | measured states are the true ones times this |
+    | ``consistency`` | 0 | cost of a change of the action per unit of its Euclidean length (the paper's consistency penalty); above 0 the action before is appended to the observation, at first the one that stands for a new cell |
+    | ``cost_scale`` | 1 | the norm is multiplied by this to give the cost |
+    | ``cost_limit`` | 5 | largest cost, without that of a change |
+    | ``load`` | ``"paper"`` | or ``"constant"``, ``"piecewise"``, ``"random_walk"``, ``"recorded"``: see ``battery_env.calibration.data.standard_dataset``; cells whose parameters no action stands for are left out |
+    | ``split`` | ``"train"`` | or ``"test"``, ``"all"`` |
+    | ``dt_s`` | 1 | time step, s |
+    | ``mismatch`` | 0 | how far kn, tDiffusion, to and tsn of the cell are from the model's (relative standard deviation) |
+    | ``dataset`` | none | a ``TrajectoryDataset`` to draw from, in place of the last four |
+    | ``render_mode`` | none | ``"rgb_array"`` |
+
+    ``gymnasium.make_vec`` takes ``num_envs`` and ``autoreset_mode`` besides.
+
+    ## Info
+
+    ``cost``; ``q_mobile``, ``r_o`` (true), ``q_mobile_hat``, ``r_o_hat`` (the model's), C and ohm; ``voltage`` and
+    ``voltage_hat`` of cell and model, V; ``soc``, the state of charge of the cell.
 
     ## Version history
 
     * v0: initial version
-    """
+    """  # noqa: E501 (rows of a table)
 
-    def __init__(self, episode_steps: int = 64, **arguments: Any) -> None:
-        super().__init__("q_mobile", "scaled", episode_steps, **arguments)
+    @staticmethod
+    def make_task(cells: int, **options: Any) -> FullStateTask:
+        return _full_state_task("q_mobile", "scaled", cells, options)
+
+
+class BatteryQmaxVectorEnv(CalibrationVectorEnv):
+    """``BatteryQmax-v0`` for many cells."""
+
+    make_task = staticmethod(BatteryQmaxEnv.make_task)
 
 
 class BatteryRoEnv(FullStateEnv):
@@ -99,8 +185,15 @@ class BatteryRoEnv(FullStateEnv):
     * v0: initial version
     """
 
-    def __init__(self, episode_steps: int = 64, **arguments: Any) -> None:
-        super().__init__("r_o", "scaled", episode_steps, **arguments)
+    @staticmethod
+    def make_task(cells: int, **options: Any) -> FullStateTask:
+        return _full_state_task("r_o", "scaled", cells, options)
+
+
+class BatteryRoVectorEnv(CalibrationVectorEnv):
+    """``BatteryRo-v0`` for many cells."""
+
+    make_task = staticmethod(BatteryRoEnv.make_task)
 
 
 class BatteryQmaxPaperEnv(FullStateEnv):
@@ -134,15 +227,22 @@ class BatteryQmaxPaperEnv(FullStateEnv):
 
     ## Arguments
 
-    Those of ``BatteryQmax-v0``, with ``episode_steps`` 16.
+    Those of ``BatteryQmax-v0``, with ``episode_steps`` 16 and ``cost_limit`` 10000; error scales are the same.
 
     ## Version history
 
     * v0: initial version
     """
 
-    def __init__(self, episode_steps: int = 16, **arguments: Any) -> None:
-        super().__init__("q_mobile", "paper", episode_steps, **arguments)
+    @staticmethod
+    def make_task(cells: int, **options: Any) -> FullStateTask:
+        return _full_state_task("q_mobile", "paper", cells, {"episode_steps": 16, **options})
+
+
+class BatteryQmaxPaperVectorEnv(CalibrationVectorEnv):
+    """``BatteryQmaxPaper-v0`` for many cells."""
+
+    make_task = staticmethod(BatteryQmaxPaperEnv.make_task)
 
 
 class BatteryRoPaperEnv(FullStateEnv):
@@ -173,12 +273,68 @@ class BatteryRoPaperEnv(FullStateEnv):
 
     ## Arguments
 
-    Those of ``BatteryQmax-v0``, with ``episode_steps`` 16.
+    Those of ``BatteryQmax-v0``, with ``episode_steps`` 16 and ``cost_limit`` 10000; error scales are the same.
 
     ## Version history
 
     * v0: initial version
     """
 
-    def __init__(self, episode_steps: int = 16, **arguments: Any) -> None:
-        super().__init__("r_o", "paper", episode_steps, **arguments)
+    @staticmethod
+    def make_task(cells: int, **options: Any) -> FullStateTask:
+        return _full_state_task("r_o", "paper", cells, {"episode_steps": 16, **options})
+
+
+class BatteryRoPaperVectorEnv(CalibrationVectorEnv):
+    """``BatteryRoPaper-v0`` for many cells."""
+
+    make_task = staticmethod(BatteryRoPaperEnv.make_task)
+
+
+class BatteryJointEnv(FullStateEnv):
+    """
+    ## Description
+
+    As ``BatteryQmax-v0``, but q^max and R_o (``r_o``), the ohmic resistance, have both aged and are to be found together.
+
+    ## Observation space
+
+    ``Box(-100, 100, (22,), float32)``, laid out and scaled as in ``BatteryQmax-v0``, and Markov under the same conditions. An
+    R_o that is off shows in Vo alone (0.8 error scales for 10 %), a q_mobile in all three voltages (0.1, 0.1 and 0.2).
+
+    ## Action space
+
+    ``Box(-1, 1, (2,), float32)``, mapped linearly to q_mobile = 4000 .. 8000 C and r_o = 0.08 .. 0.22 ohm.
+
+    ## Reward
+
+    That of ``BatteryQmax-v0``.
+
+    ## Starting state
+
+    A random second of a random discharge of the training part (700 of 1000 discharges), with q_mobile in 4000 .. 7000 C and
+    r_o in 0.1 .. 0.2 ohm drawn independently, eleven loads of 8 to 16 W, without the first and last 5 % of each discharge. The
+    model starts in the true state.
+
+    ## Episode end
+
+    Truncated after 64 steps, or where the data end. Never terminated.
+
+    ## Arguments
+
+    Those of ``BatteryQmax-v0``.
+
+    ## Version history
+
+    * v0: initial version
+    """
+
+    @staticmethod
+    def make_task(cells: int, **options: Any) -> FullStateTask:
+        return _full_state_task("joint", "scaled", cells, options)
+
+
+class BatteryJointVectorEnv(CalibrationVectorEnv):
+    """``BatteryJoint-v0`` for many cells."""
+
+    make_task = staticmethod(BatteryJointEnv.make_task)

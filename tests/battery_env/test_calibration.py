@@ -11,26 +11,20 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 import battery_env
-from battery_env.calibration.env import paper_split
-from battery_env.calibration.registration import ENTRY_POINTS
-from battery_env.calibration.full_state import ACTION_RANGES, FORMULATIONS, OBSERVED, FullStateTask
+from battery_env.calibration.data import standard_dataset
+from battery_env.calibration.full_state import FORMULATIONS, OBSERVED, FullStateTask
+from battery_env.calibration.full_state_kernels import state_distance
 from battery_env.calibration.variants import BatteryQmaxEnv
 from battery_env.electrochemistry import NEW_CELL, QNB, step
 from battery_env.loads import RandomPiecewise
 from battery_env.trajectories import TrajectoryDataset
 
-IDS = tuple(ENTRY_POINTS)
-PARAMETER = {env_id: "q_mobile" if "Qmax" in env_id else "r_o" for env_id in IDS}
-
-
-def action_for(parameter, value):
-    low, high = ACTION_RANGES[parameter]
-    return np.atleast_1d(np.asarray(2.0 * (value - low) / (high - low) - 1.0))
+IDS = ("BatteryQmax-v0", "BatteryRo-v0", "BatteryJoint-v0", "BatteryQmaxPaper-v0", "BatteryRoPaper-v0")
 
 
 def true_action(env):
     task = env.unwrapped.task
-    return action_for(task.parameter, task.q_mobile[0] if task.parameter == "q_mobile" else task.r_o[0])
+    return task.action_of({"q_mobile": task.q_mobile, "r_o": task.r_o})[0]
 
 
 @pytest.mark.parametrize("env_id", IDS)
@@ -51,7 +45,7 @@ def test_the_true_parameter_costs_nothing_and_any_other_does(env_id):
             _, reward, terminated, truncated, info = env.step(true_action(env))
             assert not terminated and not truncated
             assert info["cost"] == pytest.approx(0.0, abs=1e-5)
-            assert info[PARAMETER[env_id]] == pytest.approx(info[f"{PARAMETER[env_id]}_hat"])
+            assert info["q_mobile"] == pytest.approx(info["q_mobile_hat"]) and info["r_o"] == pytest.approx(info["r_o_hat"])
         _, reward, *_, info = env.step(np.clip(true_action(env) + 0.2, -1.0, 1.0))
         assert info["cost"] > 1e-2 and reward == -info["cost"]
 
@@ -133,14 +127,20 @@ def test_the_literal_observation_is_divided_by_the_new_cells_state():
     np.testing.assert_allclose(observation, expected, rtol=1e-6)
 
 
+def distances(formulation, *errors):
+    form, measured = FORMULATIONS[formulation], np.random.default_rng(0).uniform(0.0, 1e-3, (len(errors), 8))
+    model = measured + np.pad(errors, ((0, 0), (1, 0)))
+    return [state_distance(model, measured, n, 1.0 / form.error_scale, form.literal_cost) for n in range(len(errors))]
+
+
 def test_the_literal_cost():
-    cost = FORMULATIONS["paper"].cost(np.array([[3e-5, 0, 4e-5, 0, 0, 0, 0], [0.3, 0.4, 0, 0, 0, 0.6, 0.8]]))
-    np.testing.assert_allclose(cost, [2.5e-5, 50.0 * (0.25 + 0.5)])
+    found = distances("paper", [3e-5, 0, 4e-5, 0, 0, 0, 0], [0.3, 0.4, 0, 0, 0, 0.6, 0.8])
+    np.testing.assert_allclose(found, [2.5e-5, 50.0 * (0.25 + 0.5)])
 
 
-def test_the_cost_is_a_norm_in_error_scales_that_saturates():
-    error = np.array([[0.003, 0, 0, 8.0, 0, 0, 0], [0, 2e-5, 0, 0, 0, 0, 0], [0, 0, 1e-3, 0, 0, 0, 0]])
-    np.testing.assert_allclose(FORMULATIONS["scaled"].cost(error), [0.5, 2.0, 5.0])
+def test_the_distance_is_a_norm_in_error_scales():
+    found = distances("scaled", [0.003, 0, 0, 8.0, 0, 0, 0], [0, 2e-5, 0, 0, 0, 0, 0])
+    np.testing.assert_allclose(found, [0.5, 2.0])
 
 
 def test_the_perturbation_stays_in_its_bounds():
@@ -171,14 +171,19 @@ def test_a_perturbation_conserves_charge():
 
 
 @pytest.mark.parametrize("formulation", ["scaled", "paper"])
-@pytest.mark.parametrize("parameter", ["q_mobile", "r_o"])
+@pytest.mark.parametrize("parameter", ["q_mobile", "r_o", "joint"])
 def test_a_batch_is_its_cells_one_by_one(parameter, formulation):
     data = TrajectoryDataset.generate("joint", 6, RandomPiecewise(), seed=0)
     rng = np.random.default_rng(0)
-    actions = rng.uniform(-1.0, 1.0, (30, 6))
-    start = rng.integers(0, 500, 6)
+    actions = rng.uniform(-1.0, 1.0, (30, 6, 2 if parameter == "joint" else 1))
+    samples = rng.integers(0, 500, 6)
+
+    def start(task, row, n):
+        task.start(np.array([row]), [np.random.default_rng()], {"trajectory": n, "sample": samples[n]})
+
     batch = FullStateTask(data, parameter, formulation, 6)
-    batch.begin(np.arange(6), np.arange(6), start)
+    for n in range(6):
+        start(batch, n, n)
     costs = []
     for k in range(30):
         if k == 10:  # going on with some of the cells changes nothing for them
@@ -186,7 +191,7 @@ def test_a_batch_is_its_cells_one_by_one(parameter, formulation):
         costs.append(batch.advance(actions[k, : batch.cells])[:4])
     for n in range(4):
         one = FullStateTask(data, parameter, formulation, 1)
-        one.begin(np.zeros(1, dtype=int), np.array([n]), start[[n]])
+        start(one, 0, n)
         single = [one.advance(actions[k, [n]])[0] for k in range(30)]
         np.testing.assert_array_equal(single, [c[n] for c in costs])
         np.testing.assert_array_equal(one.observation()[0], batch.observation()[n])
@@ -195,11 +200,12 @@ def test_a_batch_is_its_cells_one_by_one(parameter, formulation):
 def test_wrong_parameters_never_leave_the_finite_numbers():
     for env_id in IDS:
         env = gym.make(env_id, split="all", episode_steps=500)
+        n = len(env.unwrapped.dataset) - 11
         for action in (-1.0, 1.0):
-            env.reset(seed=0, options={"trajectory": 5500, "sample": int(env.unwrapped.dataset.first[5500])})
+            env.reset(seed=0, options={"trajectory": n, "sample": int(env.unwrapped.dataset.first[n])})
             truncated = False
             while not truncated:
-                observation, reward, _, truncated, info = env.step(np.array([action]))
+                observation, reward, _, truncated, info = env.step(np.full(env.action_space.shape, action))
                 assert env.observation_space.contains(observation) and np.isfinite(reward)
                 assert all(np.isfinite(value) for value in info.values())
 
@@ -265,6 +271,6 @@ def test_points_outside_the_data_are_refused():
     with pytest.raises(ValueError, match=r"options\['sample'\] must lie within"):
         env.reset(options={"trajectory": 0, "sample": 0})
     with pytest.raises(ValueError, match="parameter must be one of"):
-        FullStateTask(paper_split("r_o", "test"), "capacity", "scaled", 1)
+        FullStateTask(standard_dataset("r_o", "paper", "test"), "capacity", "scaled", 1)
     with pytest.raises(ValueError, match="formulation must be one of"):
-        FullStateTask(paper_split("r_o", "test"), "r_o", "exact", 1)
+        FullStateTask(standard_dataset("r_o", "paper", "test"), "r_o", "exact", 1)

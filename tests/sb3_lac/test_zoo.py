@@ -1,8 +1,14 @@
+import argparse
 import subprocess
 import sys
+from pathlib import Path
 
+import gymnasium as gym
+import numpy as np
+import pandas as pd
 import pytest
 import yaml
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize, is_vecenv_wrapped
 from torch import nn
 
 pytest.importorskip("rl_zoo3")
@@ -11,8 +17,8 @@ import optuna
 import rl_zoo3
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 
-from sb3_lac import LAC
-from sb3_lac.zoo import find_config, main
+from sb3_lac import LAC, GymnasiumVecEnv
+from sb3_lac.zoo import LACExperimentManager, find_config, main, steps_as_one_batch
 
 ENV = "Pendulum-v1"
 CONFIG = {
@@ -127,3 +133,36 @@ def test_module_runs_as_a_command():
 def test_missing_zoo_names_the_extra():
     result = run_python("-c", "import sys; sys.modules['rl_zoo3'] = None; import sb3_lac.zoo")
     assert result.returncode != 0 and "pip install 'sb3_lac[zoo]'" in result.stderr
+
+
+class TestEnvironments:
+    """Copies of an environment are stepped by one call where it is registered with a vector environment that can."""
+
+    @pytest.fixture
+    def model_of(self, workdir):
+        (workdir / "zoo_configs" / "lac.yml").write_text(yaml.dump({"default": {**CONFIG["default"], "n_envs": 3}}))
+
+        def set_up(env_id):
+            options = {"config": "zoo_configs/lac.yml", "eval_freq": -1, "verbose": 0, "seed": 5}
+            manager = LACExperimentManager(argparse.Namespace(), "lac", env_id, str(workdir), **options)
+            return manager.setup_experiment()[0], Path(manager.save_path)
+
+        return set_up
+
+    def test_one_call_makes_the_episodes_of_single_environments(self, model_of, monkeypatch):
+        batched, folder = model_of("BatteryRo-v0")
+        monkeypatch.setattr("sb3_lac.zoo.steps_as_one_batch", lambda spec: False)
+        single, _ = model_of("BatteryRo-v0")
+        assert isinstance(batched.env.unwrapped, GymnasiumVecEnv) and isinstance(single.env.unwrapped, DummyVecEnv)
+        assert all(is_vecenv_wrapped(model.env, VecNormalize) for model in (batched, single))
+        np.testing.assert_array_equal(batched.env.reset(), single.env.reset())
+        for _ in range(70):  # longer than an episode
+            action = np.full((3, 1), 0.1, dtype=np.float32)
+            steps = batched.env.step(action), single.env.step(action)
+            for left, right in zip(steps[0][:3], steps[1][:3], strict=True):
+                np.testing.assert_allclose(left, right, rtol=1e-6)
+        assert len(pd.read_csv(folder / "0.monitor.csv", comment="#")) == 3
+
+    def test_others_are_stepped_one_by_one(self, model_of):
+        assert isinstance(model_of(ENV)[0].env.unwrapped, DummyVecEnv)
+        assert not steps_as_one_batch(gym.spec("CartPole-v1"))  # it would go without its own choice of new episodes

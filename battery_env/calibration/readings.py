@@ -1,0 +1,297 @@
+"""What voltage and current of a discharge say about the parameters: the model's misfit to all readings so far."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike
+from scipy.signal import lfilter
+
+from battery_env.cells import resample_current
+from battery_env.electrochemistry import (
+    NEW_CELL,
+    QNB,
+    QNS,
+    VO,
+    CellParameters,
+    FloatArray,
+    Trajectory,
+    initial_state,
+    simulate,
+)
+from battery_env.estimators.base import Record
+from battery_env.kernels import equilibrium_voltage, mole_fraction, nominal_overpotentials
+from battery_env.trajectories import IntArray
+
+# Far more charge and exactly as much resistance as it takes to read the linear part of the model off one simulation
+_PLENTY_C = 1e6
+_ONE_OHM = 1.0
+#: Share of ``q_mobile`` in the surface of each electrode at full charge.
+_SURFACE_SHARES = (0.1, 1.0 / 15.0)
+#: Step of the difference quotient dV/dq, as a share of q.
+_RELATIVE_STEP = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Readings:
+    """
+    Discharges that start fully charged, read at a fixed interval, with what the model's linear part makes of their current.
+
+    At a given history of the current the charges of the model are linear in ``q_mobile`` and its ohmic drop is linear in
+    ``r_o``; so both follow for every (q_mobile, r_o) from two numbers a reading. Only the surface overpotentials must be
+    integrated anew, which takes one step a reading (:func:`explain`). All discharges lie end to end.
+
+    :param start: where each discharge starts, shape (n,)
+    :param count: how many readings it has, shape (n,)
+    :param voltage_V: terminal voltage at the readings, shape (total,)
+    :param current_A: mean current since the reading before, shape (total,)
+    :param drawn_C: charge drawn since the start, shape (total,)
+    :param moved_C: how much of it has left the surface of the negative electrode, shape (total,)
+    :param ohmic_A: ohmic drop per ohm of ``r_o``, shape (total,)
+    :param q_mobile: true value, C, NaN where it is not known, shape (n,)
+    :param r_o: true value, ohm, NaN where it is not known, shape (n,)
+    :param interval_s: time between readings, s; the first lies one interval after the start
+    :param dt_s: time step at which the current was followed, s
+    :param parameters: constants of the model
+    """
+
+    start: IntArray
+    count: IntArray
+    voltage_V: FloatArray
+    current_A: FloatArray
+    drawn_C: FloatArray
+    moved_C: FloatArray
+    ohmic_A: FloatArray
+    q_mobile: FloatArray
+    r_o: FloatArray
+    interval_s: float
+    dt_s: float
+    parameters: CellParameters
+
+    @classmethod
+    def of(
+        cls, records: Sequence[Record], interval_s: float = 10.0, dt_s: float = 1.0, parameters: CellParameters = NEW_CELL
+    ) -> Readings:
+        """
+        Read discharges.
+
+        :param records: simulated or recorded discharges that start fully charged and at rest; of recorded ones,
+            :meth:`battery_env.cells.Discharge.loaded_part`
+        :param interval_s: time between readings, s, a multiple of ``dt_s``
+        :param dt_s: time step at which the current is followed, s
+        :param parameters: constants of the model
+        :return: their readings
+        :raises ValueError: for an interval that is no multiple of the time step, or a discharge shorter than two intervals
+        """
+        steps = round(interval_s / dt_s)
+        if steps < 1 or abs(steps * dt_s - interval_s) > 1e-9 * interval_s:
+            raise ValueError(f"interval_s must be a multiple of the time step, {dt_s:g} s, got {interval_s!r}")
+        columns: list[tuple[FloatArray, ...]] = []
+        for n, record in enumerate(records):
+            time_s = np.asarray(record.time_s, dtype=np.float64) - record.time_s[0]
+            count = int(np.floor(time_s[-1] / interval_s + 1e-9))
+            if count < 2:
+                raise ValueError(
+                    f"discharge {n} lasts {time_s[-1]:g} s, at least two intervals of {interval_s:g} s are needed"
+                )
+            current_A = resample_current(time_s, np.asarray(record.current_A), dt_s, count * steps)
+            at_s = interval_s * np.arange(1, count + 1)
+            drawn_C, moved_C, ohmic_A = _linear_part(current_A, steps, dt_s, parameters)
+            columns.append(
+                (
+                    np.interp(at_s, time_s, record.voltage_V),
+                    current_A.reshape(count, steps).mean(axis=1),
+                    drawn_C,
+                    moved_C,
+                    ohmic_A,
+                )
+            )
+        if not columns:
+            raise ValueError("there must be at least one discharge to read")
+        counts = np.array([len(column[0]) for column in columns], dtype=np.int64)
+        voltage_V, current_A, drawn_C, moved_C, ohmic_A = (np.concatenate(parts) for parts in zip(*columns, strict=True))
+        return cls(
+            start=np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64),
+            count=counts,
+            voltage_V=voltage_V,
+            current_A=current_A,
+            drawn_C=drawn_C,
+            moved_C=moved_C,
+            ohmic_A=ohmic_A,
+            q_mobile=np.array([r.q_mobile if isinstance(r, Trajectory) else np.nan for r in records]),
+            r_o=np.array([r.r_o if isinstance(r, Trajectory) else np.nan for r in records]),
+            interval_s=interval_s,
+            dt_s=dt_s,
+            parameters=parameters,
+        )
+
+    def __len__(self) -> int:
+        return len(self.count)
+
+    def part(self, discharge: int) -> slice:
+        """
+        Where the readings of one discharge lie.
+
+        :param discharge: which
+        :return: the slice of the arrays of all readings
+        """
+        return slice(int(self.start[discharge]), int(self.start[discharge] + self.count[discharge]))
+
+    def decay(self, time_constant_s: ArrayLike) -> FloatArray:
+        """
+        What is left after one interval of a quantity that decays, in the model's own steps.
+
+        :param time_constant_s: s, any shape
+        :return: shares, same shape
+        """
+        return (1.0 - self.dt_s / np.asarray(time_constant_s)) ** round(self.interval_s / self.dt_s)
+
+    def remeasured(self, discharge: int, gain: FloatArray, offset_A: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """
+        What another current sensor makes of one discharge. All is linear in the current: what each interval adds to the
+        states is multiplied by its gain, and what a constant current adds is added.
+
+        :param discharge: which
+        :param gain: measured over true current, one value an interval, shape (count,)
+        :param offset_A: added to the measured current, A
+        :return: ``current_A``, ``moved_C`` and ``ohmic_A`` of the measured current, shape (count,)
+        """
+        part = self.part(discharge)
+        constants = self.parameters.packed.constants[0]
+        rate = constants[1] + constants[2]
+        stay, at_rest = float(self.decay(1.0 / rate)), constants[1] / rate
+        steps = round(self.interval_s / self.dt_s)
+        unit = _linear_part(np.ones(steps), steps, self.dt_s, self.parameters)
+        before = np.concatenate([[0.0], self.drawn_C[part][:-1]])
+
+        def refiltered(values: FloatArray, left: float, free: FloatArray, by_unit: float, free_now: FloatArray) -> FloatArray:
+            added = values - left * np.concatenate([[0.0], values[:-1]]) - free
+            return np.asarray(lfilter([1.0], [1.0, -left], gain * added + offset_A * by_unit + free_now))
+
+        drawn_C = np.cumsum(gain * np.diff(self.drawn_C[part], prepend=0.0) + offset_A * self.interval_s)
+        # charge that is missing in the bulk flows after what has left the surface
+        to_rest = (1.0 - stay) * at_rest
+        before_now = np.concatenate([[0.0], drawn_C[:-1]])
+        moved_C = refiltered(self.moved_C[part], stay, to_rest * before, unit[1].item(), to_rest * before_now)
+        nothing = np.zeros_like(before)
+        ohmic_A = refiltered(self.ohmic_A[part], float(self.decay(self.parameters.to)), nothing, unit[2].item(), nothing)
+        return gain * self.current_A[part] + offset_A, moved_C, ohmic_A
+
+
+def _linear_part(
+    current_A: FloatArray, steps: int, dt_s: float, parameters: CellParameters
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    start = initial_state(_PLENTY_C, parameters)
+    state = simulate(
+        np.append(current_A, 0.0),
+        _PLENTY_C,
+        _ONE_OHM,
+        dt=dt_s,
+        load_unit="current",
+        parameters=parameters,
+        cut_off_V=-np.inf,
+        max_duration_s=len(current_A) * dt_s,
+    ).state[steps::steps]
+    moved_C = start[QNS] - state[:, QNS]
+    return moved_C + start[QNB] - state[:, QNB], moved_C, state[:, VO] / _ONE_OHM
+
+
+@njit(cache=True, error_model="numpy")
+def explain(
+    count: IntArray,
+    first: IntArray,
+    q_mobile: FloatArray,
+    r_o: FloatArray,
+    voltage_V: FloatArray,
+    current_A: FloatArray,
+    moved_C: FloatArray,
+    ohmic_A: FloatArray,
+    temperature_K: float,
+    relaxed_n: float,
+    relaxed_p: float,
+    constants: FloatArray,
+    polynomial_n: FloatArray,
+    polynomial_p: FloatArray,
+    residual_V: FloatArray,
+    slope_V_per_C: FloatArray,
+    ohmic_means_A: FloatArray,
+    rms_V: FloatArray,
+    last_V: FloatArray,
+) -> None:
+    """
+    Compare the model with the readings of many cells; unchecked, all arrays contiguous.
+
+    :param count: how many readings each cell has so far, at least 1, shape (n,)
+    :param first: first reading that counts, less than ``count``, shape (n,)
+    :param q_mobile: estimate, C, shape (n,)
+    :param r_o: estimate, ohm, shape (n,)
+    :param voltage_V: measured, shape (n, K)
+    :param current_A: mean measured current since the reading before, shape (n, K)
+    :param moved_C: as in :class:`Readings`, of the measured current, shape (n, K)
+    :param ohmic_A: likewise, shape (n, K)
+    :param temperature_K: of the cell
+    :param relaxed_n: by what share Vsn nears its nominal value in one interval
+    :param relaxed_p: likewise for Vsp
+    :param constants: of the model, shape (1, 14)
+    :param polynomial_n: of the negative electrode
+    :param polynomial_p: of the positive electrode
+    :param residual_V: measured minus modelled voltage, shape (n, J, 2), overwritten: the readings that count are cut into J
+        equal stretches (which share them where they are fewer), each of these into the readings with less and with more than
+        its mean ohmic drop; and residuals averaged over each part. A wrong ``r_o`` and an offset of the sensor look alike in
+        the mean of a stretch, and differ in its halves
+    :param slope_V_per_C: likewise dV/dq of the model, overwritten
+    :param ohmic_means_A: likewise -dV/dr_o, overwritten
+    :param rms_V: root mean square of all residuals that count, shape (n,), overwritten
+    :param last_V: voltage of the model at the last reading, shape (n,), overwritten
+    """
+    stretches = residual_V.shape[1]
+    values, sums = np.empty((2, voltage_V.shape[1])), np.empty((2, 4))
+    for n in range(len(count)):
+        for trial in range(2):
+            q = q_mobile[n] * (1.0 + trial * _RELATIVE_STEP)
+            vsn, vsp, moved_before = 0.0, 0.0, 0.0
+            for k in range(count[n]):
+                # the overpotentials relax towards their value half way between two readings
+                half = 0.5 * (moved_before + moved_C[n, k])
+                moved_before = moved_C[n, k]
+                xn = mole_fraction(_SURFACE_SHARES[0] * q - half, q, True, constants, 0)
+                xp = mole_fraction(_SURFACE_SHARES[1] * q + half, q, True, constants, 0)
+                vsn_nominal, vsp_nominal = nominal_overpotentials(current_A[n, k], xn, xp, temperature_K, constants, 0)
+                vsn += relaxed_n * (vsn_nominal - vsn)
+                vsp += relaxed_p * (vsp_nominal - vsp)
+                if k < first[n]:
+                    continue
+                xn = mole_fraction(_SURFACE_SHARES[0] * q - moved_before, q, True, constants, 0)
+                xp = mole_fraction(_SURFACE_SHARES[1] * q + moved_before, q, True, constants, 0)
+                equilibrium = equilibrium_voltage(xn, xp, temperature_K, constants, 0, polynomial_n, polynomial_p)
+                values[trial, k] = equilibrium - vsn - vsp - r_o[n] * ohmic_A[n, k]
+        span = count[n] - first[n]
+        square = 0.0
+        for k in range(first[n], count[n]):
+            square += (voltage_V[n, k] - values[0, k]) ** 2
+        rms_V[n] = np.sqrt(square / span)
+        last_V[n] = values[0, count[n] - 1]
+        step_C = q_mobile[n] * _RELATIVE_STEP
+        for j in range(stretches):
+            low = first[n] + j * span // stretches
+            high = max(low + 1, first[n] + (j + 1) * span // stretches)
+            middle_A = 0.0
+            for k in range(low, high):
+                middle_A += ohmic_A[n, k]
+            middle_A /= high - low
+            sums[:] = 0.0
+            for k in range(low, high):
+                half = 1 if ohmic_A[n, k] > middle_A else 0
+                sums[half, 0] += voltage_V[n, k] - values[0, k]
+                sums[half, 1] += (values[1, k] - values[0, k]) / step_C
+                sums[half, 2] += ohmic_A[n, k]
+                sums[half, 3] += 1.0
+            for half in range(2):
+                # under a constant current there is one half only
+                source = half if sums[half, 3] > 0.0 else 1 - half
+                residual_V[n, j, half] = sums[source, 0] / sums[source, 3]
+                slope_V_per_C[n, j, half] = sums[source, 1] / sums[source, 3]
+                ohmic_means_A[n, j, half] = sums[source, 2] / sums[source, 3]

@@ -1,0 +1,392 @@
+"""
+Calibration from current and voltage alone, for a batch of cells at once: no state of the cell is measured.
+
+The paper names this as future work. The parameters are constant within a discharge, so that the agent is asked to explain all
+data so far with one (q_mobile, r_o): it holds an estimate, sees what the data say against it, and moves it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from battery_env.calibration.readings import Readings, explain
+from battery_env.calibration.task import OBSERVATION_LIMIT, CalibrationTask, Parameter
+from battery_env.electrochemistry import NEW_CELL, FloatArray
+from battery_env.trajectories import IntArray
+
+#: Where estimates are kept, C and ohm.
+ESTIMATE_RANGES: dict[str, tuple[float, float]] = {"q_mobile": (3500.0, 8100.0), "r_o": (0.05, 0.35)}
+#: By how much an action of 1 moves the estimate, C and ohm.
+LARGEST_STEPS: dict[str, float] = {"q_mobile": 1500.0, "r_o": 0.12}
+
+#: Equal stretches of the data so far; each is averaged in two halves, of less and of more current.
+STRETCHES = 16
+# An estimate needs more readings than it has parameters
+_FEWEST_READINGS = 3
+
+# What the parts of an observation are divided by
+_MISFIT_FLOOR_V = 0.001
+_SLOPE_SCALE_V_PER_C = 5e-5
+_CURRENT_SCALE_A = 3.0
+_MISFIT_SCALE_V = 0.010
+_TIME_SCALE_S = 3000.0
+
+
+@dataclass(frozen=True)
+class VoltageOptions:
+    """
+    What the voltage-only tasks can be asked for.
+
+    :param episode_steps: decisions per episode
+    :param reading_s: time between two readings of voltage and current, s
+    :param new_readings: fewest and most readings that arrive between two decisions, drawn uniformly
+    :param noise_V: least and greatest standard deviation of the noise of the voltage sensor, V; drawn log-uniformly per
+        episode, white within it
+    :param offset_V: bound of the sensor's offset, V: drawn uniformly to either side per episode, and constant within it. The
+        agent is told the bound, not the offset: a misfit that such an offset explains costs nothing
+    :param current_gain: the relative error of the current sensor's gain, likewise
+    :param current_offset_A: the offset of the current sensor, likewise, A
+    :param process_noise_V: standard deviation of the noise on each of Vo, Vsn and Vsp, V per root of a second
+    :param measured: ``"current"``, or ``"power"``: current is what the power meter says over the measured voltage
+    :param data: which data an estimate has to explain: ``"all"`` so far, or the ``"last"`` reading
+    :param start: the first estimate: ``"random"`` within the range, ``"new_cell"`` or ``"true"``
+    :param consistency: cost of a change of the action, per unit of its Euclidean length; above 0 the observation holds the
+        action before
+    :param cost: ``"logarithmic"``: asinh(misfit / ``cost_scale_V``), which counts a misfit twice as large alike wherever it
+        is above the scale; or ``"linear"``: misfit / ``cost_scale_V``
+    :param cost_scale_V: V
+    :raises ValueError: for values out of range
+    """
+
+    episode_steps: int = 8
+    reading_s: float = 10.0
+    new_readings: tuple[int, int] = (0, 29)
+    noise_V: tuple[float, float] = (0.001, 0.030)
+    offset_V: float = 0.010
+    current_gain: float = 0.0
+    current_offset_A: float = 0.0
+    process_noise_V: float = 0.0
+    measured: Literal["current", "power"] = "current"
+    data: Literal["all", "last"] = "all"
+    start: Literal["random", "new_cell", "true"] = "random"
+    consistency: float = 0.0
+    cost: Literal["logarithmic", "linear"] = "logarithmic"
+    cost_scale_V: float = 0.002
+
+    def __post_init__(self) -> None:
+        if self.episode_steps < 1:
+            raise ValueError(f"episode_steps must be at least 1, got {self.episode_steps!r}")
+        if not 0 <= self.new_readings[0] <= self.new_readings[1]:
+            raise ValueError(f"new_readings must be (fewest, most) with 0 <= fewest <= most, got {self.new_readings!r}")
+        if not (0.0 <= self.noise_V[0] <= self.noise_V[1] < 1.0 and (self.noise_V[0] > 0.0 or self.noise_V[1] == 0.0)):
+            raise ValueError(
+                f"noise_V must be (least, greatest) in V with 0 < least <= greatest < 1, or (0, 0), got {self.noise_V!r}"
+            )
+        for name in ("offset_V", "current_gain", "current_offset_A", "process_noise_V"):
+            if not 0.0 <= getattr(self, name) < 0.5:
+                raise ValueError(f"{name} must be at least 0 and less than 0.5, got {getattr(self, name)!r}")
+        if not 0.0 <= self.consistency < np.inf:
+            raise ValueError(f"consistency must be finite and at least 0, got {self.consistency!r}")
+        if not 0.0 < self.cost_scale_V < np.inf:
+            raise ValueError(f"cost_scale_V must be finite and greater than 0, got {self.cost_scale_V!r}")
+        for name, choices in (
+            ("measured", ("current", "power")),
+            ("data", ("all", "last")),
+            ("start", ("random", "new_cell", "true")),
+            ("cost", ("logarithmic", "linear")),
+        ):
+            if getattr(self, name) not in choices:
+                raise ValueError(f"{name} must be one of {choices}, got {getattr(self, name)!r}")
+
+
+class VoltageTask(CalibrationTask):
+    """
+    Find ``parameters`` from voltage and current, in ``cells`` episodes side by side.
+
+    An action moves the estimate by ``sign(a) * a**2`` times ``LARGEST_STEPS``: far where the misfit is large, finely near the
+    optimum. Then new readings arrive, and the cost grows with the misfit to all data so far at the new estimate: the root mean
+    square of the mean residuals of equal stretches of the data, whose noise is smaller than that of single readings, after
+    the offset that the sensor may have. It knows no true parameter, so that a task can be made of recorded discharges too.
+
+    :param readings: the discharges
+    :param parameters: what to find: one or both of ``"q_mobile"`` and ``"r_o"``; the other one is known, the true one of a
+        simulated discharge and the new cell's of a recorded one
+    :param cells: size of the batch
+    :param options: of the task
+    """
+
+    def __init__(
+        self, readings: Readings, parameters: tuple[Parameter, ...], cells: int, options: VoltageOptions | None = None
+    ) -> None:
+        self.readings = readings
+        self.parameters = parameters
+        self.cells = cells
+        self.options = options or VoltageOptions()
+        self.episode_steps = self.options.episode_steps
+        self.decision_s = readings.interval_s * (sum(self.options.new_readings) / 2.0)
+        self._stretches = STRETCHES if self.options.data == "all" else 1
+        self._previous = len(parameters) if self.options.consistency > 0.0 else 0
+        self.observation_size = 6 * self._stretches + 4 + len(parameters) + self._previous
+        self._columns = [("q_mobile", "r_o").index(name) for name in parameters]
+        self._low, self._high = np.array([ESTIMATE_RANGES[name] for name in parameters]).T
+        self._step = np.array([LARGEST_STEPS[name] for name in parameters])
+
+        longest = int(readings.count.max())
+        self.discharge: IntArray = np.zeros(cells, dtype=np.int64)
+        self.count: IntArray = np.ones(cells, dtype=np.int64)
+        self._arrivals: IntArray = np.zeros((cells, self.episode_steps), dtype=np.int64)
+        self._step_of_episode: IntArray = np.zeros(cells, dtype=np.int64)
+        self.estimate = np.tile([NEW_CELL.q_mobile, NEW_CELL.r_o], (cells, 1))
+        self._action = np.zeros((cells, len(parameters)))
+        self._voltage_V, self._current_A, self._moved_C, self._ohmic_A = np.zeros((4, cells, longest))
+        self._residual_V, self._slope_V_per_C, self._ohmic_means_A = np.zeros((3, cells, self._stretches, 2))
+        self._rms_V, self._last_V, self._offset_V, self._misfit_V = np.zeros((4, cells))
+
+    def start(
+        self,
+        rows: NDArray[np.intp],
+        generators: Sequence[np.random.Generator],
+        options: Mapping[str, Any] | None = None,
+    ) -> None:
+        """
+        Begin new episodes, each at a random reading of a random discharge.
+
+        :param rows: which cells of the batch, shape (m,)
+        :param generators: one source of randomness for each of them
+        :param options: ``discharge`` (its number), ``reading`` (how many readings there are at first), ``q_mobile_hat`` and
+            ``r_o_hat`` (the first estimate)
+        :raises ValueError: for an option that is unknown or out of range
+        """
+        chosen = dict(options or {})
+        discharge = chosen.pop("discharge", None)
+        reading = chosen.pop("reading", None)
+        first = {name: chosen.pop(f"{name}_hat") for name in self.parameters if f"{name}_hat" in chosen}
+        if chosen:
+            raise ValueError(
+                f"unknown reset options {tuple(chosen)}; known: discharge, reading, "
+                + ", ".join(f"{name}_hat" for name in self.parameters)
+            )
+        if discharge is not None and not 0 <= discharge < len(self.readings):
+            raise ValueError(f"options['discharge'] must lie within 0 .. {len(self.readings) - 1}, got {discharge!r}")
+        for name in first:
+            low, high = ESTIMATE_RANGES[name]
+            if not low <= first[name] <= high:
+                raise ValueError(f"options['{name}_hat'] must lie within {low:g} .. {high:g}, got {first[name]!r}")
+        fewest, most = self.options.new_readings
+        for row, generator in zip(rows, generators, strict=True):
+            n = self._draw_discharge(generator) if discharge is None else int(discharge)
+            length = int(self.readings.count[n])
+            count = self._draw_count(n, generator) if reading is None else int(reading)
+            if not 1 <= count <= length:
+                raise ValueError(f"options['reading'] must lie within 1 .. {length} for discharge {n}, got {count}")
+            self._arrivals[row] = generator.integers(fewest, most + 1, size=self.episode_steps)
+            estimate = self._first_estimate(n, generator)
+            for name, value in first.items():
+                estimate[("q_mobile", "r_o").index(name)] = value
+            self.place(row, n, count, estimate)
+            self._measure(row, n, generator)
+        self._action[rows] = 0.0
+        self._step_of_episode[rows] = 0
+        self._explain()
+
+    def _draw_discharge(self, generator: np.random.Generator) -> int:
+        return int(generator.integers(len(self.readings)))
+
+    def _draw_count(self, discharge: int, generator: np.random.Generator) -> int:
+        return int(generator.integers(_FEWEST_READINGS, self.readings.count[discharge], endpoint=True))
+
+    def follow(self, every: int) -> None:
+        """
+        Begin as many discharges as there are cells, each at its first readings, measured as they are; from then on ``every``
+        readings arrive between two decisions. For evaluation: nothing is random, and no episode ends.
+
+        :param every: readings between two decisions, and before the first one
+        """
+        for n in range(self.cells):
+            self.place(n, n, min(every, int(self.readings.count[n])), self._first_estimate(n, None))
+        self._arrivals[:] = every
+        self._step_of_episode[:] = 0
+        self._action[:] = 0.0
+        self._explain()
+
+    def place(self, row: int, discharge: int, count: int, estimate: FloatArray) -> None:
+        """
+        Put one cell at one point of one discharge, measured without error.
+
+        :param row: which cell of the batch
+        :param discharge: which discharge
+        :param count: how many of its readings there are so far
+        :param estimate: (q_mobile, r_o), C and ohm
+        """
+        data = self.readings
+        part, length = data.part(discharge), data.count[discharge]
+        self.discharge[row], self.count[row] = discharge, count
+        self._voltage_V[row, :length] = data.voltage_V[part]
+        self._current_A[row, :length] = data.current_A[part]
+        self._moved_C[row, :length] = data.moved_C[part]
+        self._ohmic_A[row, :length] = data.ohmic_A[part]
+        self.estimate[row] = estimate
+
+    def known(self, discharge: int) -> FloatArray:
+        """
+        The true parameters of a discharge, or the new cell's where they are not known.
+
+        :param discharge: which discharge
+        :return: (q_mobile, r_o), C and ohm
+        """
+        true = np.array([self.readings.q_mobile[discharge], self.readings.r_o[discharge]])
+        return np.where(np.isnan(true), [NEW_CELL.q_mobile, NEW_CELL.r_o], true)
+
+    def _first_estimate(self, discharge: int, generator: np.random.Generator | None) -> FloatArray:
+        estimate = self.known(discharge)
+        if self.options.start == "random" and generator is not None:
+            estimate[self._columns] = generator.uniform(self._low, self._high)
+        elif self.options.start != "true":
+            estimate[self._columns] = np.array([NEW_CELL.q_mobile, NEW_CELL.r_o])[self._columns]
+        return estimate
+
+    def _measure(self, row: int, discharge: int, generator: np.random.Generator) -> None:
+        """The errors of the sensors, and the noise of the cell, over one discharge."""
+        choice, length = self.options, int(self.readings.count[discharge])
+        least, greatest = choice.noise_V
+        voltage_V = self._voltage_V[row, :length]
+        true_V = voltage_V.copy()
+        if choice.process_noise_V > 0.0:
+            voltage_V += self._process_noise_V(generator.standard_normal((3, length)))
+        if greatest > 0.0:
+            sd_V = np.exp(generator.uniform(np.log(least), np.log(greatest)))
+            voltage_V += sd_V * generator.standard_normal(length)
+        offset_V, gain_error, offset_A = (
+            generator.uniform(-bound, bound) if bound > 0.0 else 0.0
+            for bound in (choice.offset_V, choice.current_gain, choice.current_offset_A)
+        )
+        voltage_V += offset_V
+        if choice.measured == "power" or gain_error != 0.0 or offset_A != 0.0:
+            gain = np.full(length, 1.0 + gain_error)
+            if choice.measured == "power":
+                gain *= true_V / voltage_V
+            measured = self.readings.remeasured(discharge, gain, offset_A)
+            for array, values in zip((self._current_A, self._moved_C, self._ohmic_A), measured, strict=True):
+                array[row, :length] = values
+
+    def _process_noise_V(self, draws: FloatArray) -> FloatArray:
+        cell, dt_s = self.readings.parameters, self.readings.dt_s
+        total = np.zeros(draws.shape[1])
+        for draw, time_constant_s in zip(draws, (cell.to, cell.tsn, cell.tsp), strict=True):
+            left = float(self.readings.decay(time_constant_s))
+            # the variance of a sum of steps that decay on the way, over one interval
+            variance = dt_s * (1.0 - left**2) / (1.0 - (1.0 - dt_s / time_constant_s) ** 2)
+            total -= lfilter([self.options.process_noise_V * np.sqrt(variance)], [1.0, -left], draw)
+        return total
+
+    def _explain(self) -> None:
+        cell = self.readings.parameters
+        first = np.zeros_like(self.count) if self.options.data == "all" else self.count - 1
+        explain(
+            self.count,
+            first,
+            np.ascontiguousarray(self.estimate[:, 0]),
+            np.ascontiguousarray(self.estimate[:, 1]),
+            self._voltage_V,
+            self._current_A,
+            self._moved_C,
+            self._ohmic_A,
+            cell.Tb0,
+            1.0 - float(self.readings.decay(cell.tsn)),
+            1.0 - float(self.readings.decay(cell.tsp)),
+            *cell.packed,
+            self._residual_V,
+            self._slope_V_per_C,
+            self._ohmic_means_A,
+            self._rms_V,
+            self._last_V,
+        )
+        # in a single reading nothing tells an offset from a misfit
+        bound_V = self.options.offset_V if self.options.data == "all" else 0.0
+        self._offset_V = np.clip(self._residual_V.mean(axis=(1, 2)), -bound_V, bound_V)
+        self._misfit_V = np.sqrt(np.mean((self._residual_V - self._offset_V[:, None, None]) ** 2, axis=(1, 2)))
+
+    def observation(self) -> NDArray[np.float32]:
+        """
+        Residuals over the misfit, sensitivities and ohmic drops per ohm over the data so far; how large misfit, noise and
+        offset are; how long the discharge has lasted; and the estimate.
+
+        :return: shape (cells, observation_size)
+        """
+        clipped = np.clip(np.concatenate(self._parts(), axis=1), -OBSERVATION_LIMIT, OBSERVATION_LIMIT)
+        return clipped.astype(np.float32)
+
+    def _parts(self) -> list[FloatArray]:
+        unexplained_V = self._residual_V - self._offset_V[:, None, None]
+        return [
+            (unexplained_V / (self._misfit_V + _MISFIT_FLOOR_V)[:, None, None]).reshape(self.cells, -1),
+            np.arcsinh(self._slope_V_per_C / _SLOPE_SCALE_V_PER_C).reshape(self.cells, -1),
+            (self._ohmic_means_A / _CURRENT_SCALE_A).reshape(self.cells, -1),
+            np.log((np.stack([self._misfit_V, self._rms_V], axis=1) + 0.1 * _MISFIT_FLOOR_V) / _MISFIT_SCALE_V),
+            np.arcsinh(self._residual_V.mean(axis=(1, 2)) / _MISFIT_SCALE_V)[:, None],
+            (self.count * (self.readings.interval_s / _TIME_SCALE_S))[:, None],
+            self._scaled(self.estimate),
+            self._action[:, : self._previous],
+        ]
+
+    def _scaled(self, estimate: FloatArray) -> FloatArray:
+        return np.asarray((2.0 * estimate[:, self._columns] - self._low - self._high) / (self._high - self._low))
+
+    def advance(self, action: NDArray[np.floating], arriving: bool = True) -> FloatArray:
+        """
+        Move the estimates, let new readings arrive, and compare all data so far with the model.
+
+        :param action: in [-1, 1], beyond it is clipped, shape (cells, len(parameters))
+        :param arriving: whether readings arrive
+        :return: cost, shape (cells,)
+        """
+        step = np.clip(np.asarray(action, dtype=np.float64).reshape(self.cells, -1), -1.0, 1.0)
+        moved = self.estimate[:, self._columns] + np.sign(step) * step**2 * self._step
+        self.estimate[:, self._columns] = np.clip(moved, self._low, self._high)
+        if arriving:
+            self._arrive()
+        self._explain()
+        cost = self._misfit_V / self.options.cost_scale_V
+        if self.options.cost == "logarithmic":
+            cost = np.arcsinh(cost)
+        cost += self.options.consistency * np.linalg.norm(step - self._action, axis=1)
+        self._action = step
+        return cost
+
+    def _arrive(self) -> None:
+        arrived = self._arrivals[np.arange(self.cells), np.minimum(self._step_of_episode, self.episode_steps - 1)]
+        self.count = np.minimum(self.count + arrived, self.readings.count[self.discharge])
+        self._step_of_episode += 1
+
+    def truncated(self) -> NDArray[np.bool_]:
+        """
+        Whose episode is over. An episode goes on after the last reading: the estimate may still be moved.
+
+        :return: shape (cells,)
+        """
+        return self._step_of_episode >= self.episode_steps
+
+    def report(self) -> dict[str, FloatArray]:
+        """
+        Where each cell stands; true parameters are NaN for recorded discharges.
+
+        :return: by name of ``REPORTED``, arrays of shape (cells,); ``voltage`` is the measured one
+        """
+        data, last = self.readings, self.count - 1
+        true_q_C = data.q_mobile[self.discharge]
+        return {
+            "q_mobile": true_q_C,
+            "r_o": data.r_o[self.discharge],
+            "q_mobile_hat": self.estimate[:, 0].copy(),
+            "r_o_hat": self.estimate[:, 1].copy(),
+            "voltage": self._voltage_V[np.arange(self.cells), last],
+            "voltage_hat": self._last_V.copy(),
+            # a full cell holds q_mobile in its negative electrode
+            "soc": 1.0 - data.drawn_C[data.start[self.discharge] + last] / true_q_C,
+        }

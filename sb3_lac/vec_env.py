@@ -1,0 +1,201 @@
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from stable_baselines3.common.env_util import is_wrapped
+from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
+
+
+class GymnasiumVecEnv(VecEnv):
+    """
+    A vector environment of Gymnasium as a vectorized environment of Stable-Baselines3: one call steps all environments.
+
+    .. code-block:: python
+
+        env = gym.make_vec("BatteryQmax-v0", num_envs=64, autoreset_mode="SameStep")
+        model = LAC("MlpPolicy", VecMonitor(GymnasiumVecEnv(env)))
+
+    The environments must start a new episode in the step that ends the last one, as Stable-Baselines3 expects, or leave it to
+    the caller; with Gymnasium's default, a step later, the replay buffer would hold transitions from the end of one episode to
+    the start of the next.
+
+    :param env: The vector environment, wrapped or not
+    :raises ValueError: If it starts new episodes one step late, or does not say when
+    """
+
+    actions: np.ndarray
+
+    def __init__(self, env: gym.vector.VectorEnv) -> None:
+        self.autoreset_mode = env.metadata.get("autoreset_mode")
+        if self.autoreset_mode not in (AutoresetMode.SAME_STEP, AutoresetMode.DISABLED):
+            raise ValueError(
+                f"{env} has autoreset mode {self.autoreset_mode}; Stable-Baselines3 needs AutoresetMode.SAME_STEP or "
+                "DISABLED. Pass autoreset_mode='SameStep' to gymnasium.make_vec if the environment has a vector entry point, "
+                "vector_kwargs={'autoreset_mode': 'SameStep'} if not."
+            )
+        self.env = env
+        self._all = np.arange(env.num_envs)
+        base = env.unwrapped
+        # Gymnasium's own vector environments hold single ones; others compute all of them at once
+        self._single_envs = base if isinstance(base, (gym.vector.SyncVectorEnv, gym.vector.AsyncVectorEnv)) else None
+        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+
+    def reset(self) -> VecEnvObs:
+        if any(options != self._options[0] for options in self._options):
+            raise ValueError(f"A vector environment takes the same options for all its environments, not {self._options}.")
+        # Seeds count up from the first one, as in Gymnasium
+        observations, infos = self.env.reset(seed=self._seeds[0], options=self._options[0] or None)
+        self.reset_infos = _unbatched(infos, self._all)
+        # Seeds and options are only used once
+        self._reset_seeds()
+        self._reset_options()
+        return _copied(observations)
+
+    def step_async(self, actions: np.ndarray) -> None:
+        self.actions = actions
+
+    def step_wait(self) -> VecEnvStepReturn:
+        observations, rewards, terminated, truncated, batch = self.env.step(self.actions)
+        dones = np.logical_or(terminated, truncated)
+        time_limits = np.logical_and(truncated, ~terminated)
+        infos = _unbatched({**batch, "TimeLimit.truncated": time_limits}, self._all)
+        if dones.any():
+            ended = np.flatnonzero(dones)
+            if self.autoreset_mode is AutoresetMode.SAME_STEP:
+                last_observations, last_infos = batch["final_obs"], _unbatched(batch.get("final_info", {}), ended)
+                started = [infos[n] for n in ended]
+            else:
+                # Copied, for the environment may reuse its arrays
+                last_observations, last_infos = _copied(observations), [infos[n] for n in ended]
+                observations, batch = self.env.reset(options={"reset_mask": dones.copy()})
+                started = _unbatched(batch, ended)
+            for n, last, start in zip(ended.tolist(), last_infos, started, strict=True):
+                self.reset_infos[n] = {key: value for key, value in start.items() if key != "TimeLimit.truncated"}
+                last["TimeLimit.truncated"] = bool(time_limits[n])
+                last["terminal_observation"] = _of_one(last_observations, n)
+                infos[n] = last
+        return _copied(observations), rewards.astype(np.float32), dones, infos
+
+    def close(self) -> None:
+        self.env.close()
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        frames: Any = self.env.render()
+        return [None] * self.num_envs if frames is None else list(frames)
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """
+        Attributes of the environments, or of the vector environment if it is not made of single ones.
+
+        :param attr_name: Name of the attribute
+        :param indices: Which environments, all by default
+        :return: One value per environment
+        """
+        if self._single_envs is not None:
+            values = self._single_envs.get_attr(attr_name)
+        else:
+            values = (getattr(self.env, attr_name),) * self.num_envs
+        return [values[n] for n in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """
+        Set an attribute of the environments, or of the vector environment if it is not made of single ones.
+
+        :param attr_name: Name of the attribute
+        :param value: Its new value
+        :param indices: Which environments, all by default
+        :raises ValueError: If only some of the environments are meant, but share the attribute
+        """
+        chosen = set(self._get_indices(indices))
+        if self._single_envs is not None:
+            old = self._single_envs.get_attr(attr_name) if len(chosen) < self.num_envs else (value,) * self.num_envs
+            self._single_envs.set_attr(attr_name, [value if n in chosen else old[n] for n in range(self.num_envs)])
+        elif len(chosen) < self.num_envs:
+            raise ValueError(
+                f"All {self.num_envs} environments share {attr_name!r}: it cannot be set for {sorted(chosen)} only."
+            )
+        else:
+            setattr(self.env.unwrapped, attr_name, value)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """
+        Call a method of every environment; if the vector environment is not made of single ones its own method, once.
+
+        :param method_name: Name of the method
+        :param method_args: Its positional arguments
+        :param indices: Whose results to return, all by default
+        :param method_kwargs: Its keyword arguments
+        :return: One result per environment, or for each of them the result of the one call
+        """
+        if self._single_envs is not None:
+            results = self._single_envs.call(method_name, *method_args, **method_kwargs)
+        else:
+            results = (getattr(self.env, method_name)(*method_args, **method_kwargs),) * self.num_envs
+        return [results[n] for n in self._get_indices(indices)]
+
+    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
+        """
+        Whether the environments are wrapped.
+
+        :param wrapper_class: The wrapper
+        :param indices: Which environments, all by default
+        :return: One answer per environment; False where they run in processes of their own, or there are no single ones
+        """
+        envs = getattr(self.env.unwrapped, "envs", None)
+        return [envs is not None and is_wrapped(envs[n], wrapper_class) for n in self._get_indices(indices)]
+
+
+def _unbatched(batch: dict[str, Any], rows: np.ndarray) -> list[dict[str, Any]]:
+    """
+    The infos of single environments.
+
+    :param batch: The infos of a vector environment: arrays (or dicts of them) by name, and under ``_name`` for which
+        environments they hold, by default for all
+    :param rows: Which environments
+    :return: One dict per row
+    """
+    names, columns, partial = [], [], []
+    for name, values in batch.items():
+        if name in ("final_obs", "final_info") or (name[:1] == "_" and name[1:] in batch):
+            continue
+        if isinstance(values, dict):
+            column: list[Any] = _unbatched(values, rows)
+        else:
+            chosen = np.asarray(values)[rows]
+            # Numbers as an environment of its own would return them
+            column = chosen.tolist() if chosen.ndim == 1 else list(chosen)
+        mask = batch.get(f"_{name}")
+        if mask is None or mask[rows].all():
+            names.append(name)
+            columns.append(column)
+        else:
+            partial.append((name, column, mask[rows].tolist()))
+    infos: list[dict[str, Any]] = [dict(zip(names, row, strict=False)) for row in zip(*columns, strict=True)]
+    if not columns:
+        infos = [{} for _ in rows]
+    for name, column, holds in partial:
+        for info, value, hold in zip(infos, column, holds, strict=True):
+            if hold:
+                info[name] = value
+    return infos
+
+
+def _copied(observations: Any) -> Any:
+    # The replay buffer is filled one step later: an environment that reuses its arrays must not change them meanwhile
+    if isinstance(observations, dict):
+        return {name: _copied(part) for name, part in observations.items()}
+    if isinstance(observations, tuple):
+        return tuple(_copied(part) for part in observations)
+    return np.array(observations)
+
+
+def _of_one(observations: Any, n: int) -> Any:
+    if isinstance(observations, dict):
+        return {name: _of_one(part, n) for name, part in observations.items()}
+    if isinstance(observations, tuple):
+        return tuple(_of_one(part, n) for part in observations)
+    return observations[n]

@@ -1,0 +1,270 @@
+"""The options of the full-state tasks, and what the joint task shows."""
+
+import numpy as np
+import pytest
+
+from battery_env.calibration.data import standard_dataset
+from battery_env.calibration.full_state import ACTION_RANGES, ERROR_SCALE, OBSERVED, FullStateOptions, FullStateTask
+from battery_env.calibration.policy import PolicyEstimator
+from battery_env.calibration.variants import BatteryJointEnv, BatteryQmaxEnv, BatteryQmaxPaperEnv, BatteryRoEnv
+from battery_env.electrochemistry import (
+    NEW_CELL,
+    QNB,
+    UNCERTAIN_CONSTANTS,
+    VO,
+    initial_state,
+    simulate,
+    step,
+    step_into,
+    voltage,
+)
+from battery_env.loads import RandomPiecewise, constant
+from battery_env.trajectories import TrajectoryDataset
+
+STATE_SCALE = np.array([0.5, 0.1, 0.01, 6840.0, 760.0, 11400.0, 1266.0])
+
+
+@pytest.fixture(scope="module")
+def discharges():
+    return TrajectoryDataset.generate("joint", 5, RandomPiecewise(), seed=0, r_o_range=(0.1, 0.2))
+
+
+def started(task, trajectory=2, sample=300):
+    generators = [np.random.default_rng(n) for n in range(task.cells)]
+    task.start(np.arange(task.cells), generators, {"trajectory": trajectory, "sample": sample})
+    return task
+
+
+def make(data, parameter="q_mobile", cells=1, formulation="scaled", **options):
+    return FullStateTask(data, parameter, formulation, cells, FullStateOptions(**options))
+
+
+def true_action(task):
+    return task.action_of({"q_mobile": task.q_mobile, "r_o": task.r_o})
+
+
+def scaled_distance(task, model_state, measured):
+    return np.linalg.norm((model_state - measured)[:, OBSERVED] / ERROR_SCALE, axis=1)
+
+
+def test_the_defaults_disturb_nothing(discharges):
+    task = started(make(discharges))
+    for k in range(5):
+        trajectory = discharges[2]
+        np.testing.assert_array_equal(task.state[0], trajectory.state[300 + k])
+        np.testing.assert_array_equal(task.measured[0], trajectory.state[301 + k])
+        task.advance(np.zeros((1, 1)))
+
+
+@pytest.mark.parametrize("wrong", [0, 1])
+def test_the_joint_task_shows_and_punishes_both_errors(discharges, wrong):
+    task = started(make(discharges, "joint"))
+    assert task.parameters == ("q_mobile", "r_o") and task.observation().shape == (1, 22)
+    action = true_action(task)
+    assert task.advance(action) == pytest.approx(0.0, abs=1e-9)
+    np.testing.assert_allclose([task.q_mobile_hat, task.r_o_hat], [task.q_mobile, task.r_o])
+    values = {"q_mobile": task.q_mobile, "r_o": task.r_o}
+    name = task.parameters[wrong]
+    action = task.action_of({**values, name: 1.05 * values[name]})
+    cost = task.advance(action)
+    assert 0.02 < cost < 1.0
+    np.testing.assert_allclose({"q_mobile": task.q_mobile_hat, "r_o": task.r_o_hat}[name], 1.05 * values[name])
+
+
+def test_the_joint_environment_draws_from_cells_whose_parameters_have_both_aged():
+    task = BatteryJointEnv.make_task(1, split="test")
+    assert len(task.dataset) == 300 and abs(np.corrcoef(task.dataset.q_mobile, task.dataset.r_o)[0, 1]) < 0.2
+    for name, values in (("q_mobile", task.dataset.q_mobile), ("r_o", task.dataset.r_o)):
+        low, high = ACTION_RANGES[name]
+        assert low <= values.min() and values.max() <= high and values.std() > 0.15 * (high - low)
+
+
+def test_resync_sets_the_model_to_the_measured_state(discharges):
+    task = started(make(discharges, resync=3, sensor_offset=0.5))
+    for decision in range(1, 8):
+        measured = task.measured.copy()
+        task.advance(np.full((1, 1), -1.0))
+        assert (task.model_state == measured).all() == (decision % 3 == 0)
+        np.testing.assert_array_equal(task.report()["voltage_hat"], voltage(task.model_state, task.q_mobile_hat))
+
+
+def test_the_model_of_a_new_cell_has_carried_the_same_load(discharges):
+    task = started(make(discharges, start="new_cell"), sample=333)
+    trajectory = discharges[2]
+    new = simulate(trajectory.load[:334], NEW_CELL.q_mobile, trajectory.r_o)
+    np.testing.assert_array_equal(task.model_state[0], new.state[333])
+    # no action makes up for the charge that a new cell has more
+    task.advance(true_action(task))
+    assert task.model_state[0, QNB:].sum() == pytest.approx(initial_state(NEW_CELL.q_mobile)[QNB:].sum(), rel=1e-12)
+    both = started(make(discharges, "joint", start="new_cell"), sample=333)
+    new = simulate(trajectory.load[:334], NEW_CELL.q_mobile, NEW_CELL.r_o)
+    np.testing.assert_array_equal(both.model_state[0], new.state[333])
+
+
+def test_process_noise_moves_the_voltages_of_the_cell():
+    data = TrajectoryDataset.generate("q_mobile", 1, [constant(8.0)], seed=0, dt_s=0.5)
+    task = started(make(data, cells=500, process_noise_V=1e-3), trajectory=0)
+    draws = []
+    for _ in range(4):
+        state, q, r = task.state, task.q_mobile, task.r_o
+        noise = task.next_state - step(state, task.load, q, r, dt=0.5)
+        assert not noise[:, [0, 4, 5, 6, 7]].any()
+        draws.append(noise[:, VO:QNB])
+        task.advance(np.zeros((500, 1)))
+    # white: over cells, states and time
+    drawn = np.concatenate(draws, axis=1) / (1e-3 * np.sqrt(0.5))
+    np.testing.assert_allclose(np.cov(drawn, rowvar=False), np.eye(12), atol=0.25)
+    assert drawn.std() == pytest.approx(1.0, abs=0.05) and abs(drawn.mean()) < 0.05
+
+
+def test_sensor_noise_is_white_and_in_what_is_paid(discharges):
+    task = started(make(discharges, cells=500, sensor_noise=2.0))
+    draws = []
+    for _ in range(3):
+        draws.append(((task.measured - task.next_state) / np.insert(ERROR_SCALE, 0, 1.0)).copy())
+        measured = task.measured.copy()
+        cost = task.advance(true_action(task))
+        expected = np.minimum(scaled_distance(task, task.model_state, measured), 5.0)
+        np.testing.assert_allclose(cost, expected, rtol=1e-9)
+    assert not np.array(draws)[..., 0].any()
+    drawn = np.concatenate([d[:, 1:] for d in draws], axis=1) / 2.0
+    np.testing.assert_allclose(np.cov(drawn, rowvar=False), np.eye(21), atol=0.25)
+    # the cell itself goes its way
+    np.testing.assert_array_equal(task.state[7], discharges[2].state[303])
+
+
+def test_sensors_may_have_an_offset_and_a_gain(discharges):
+    task = started(make(discharges, sensor_offset=-3.0, sensor_gain=1.02))
+    expected = 1.02 * discharges[2].state[301, OBSERVED] - 3.0 * ERROR_SCALE
+    np.testing.assert_allclose(task.measured[0, OBSERVED], expected, rtol=1e-12)
+    observation = task.observation()[0]
+    np.testing.assert_allclose(observation[7:14], expected / STATE_SCALE, rtol=1e-6)
+    predicted = step(task.model_state[0], task.load[0], NEW_CELL.q_mobile, NEW_CELL.r_o)
+    innovation = np.clip((expected - predicted[OBSERVED]) / ERROR_SCALE, -100.0, 100.0)
+    np.testing.assert_allclose(observation[15:22], innovation, rtol=1e-5)
+
+
+def test_both_noises_at_once_do_not_share_draws(discharges):
+    task = started(make(discharges, cells=300, sensor_noise=1.0, process_noise_V=1e-3))
+    predicted = np.empty_like(task.state)
+    step_into(predicted, task.state, task.load, task.q_mobile, task.r_o, 1.0, "power", False, NEW_CELL.packed)
+    process = (task.next_state - predicted)[:, VO:QNB]
+    sensor = (task.measured - task.next_state)[:, VO:QNB]
+    assert np.abs(np.corrcoef(process.T, sensor.T)[:3, 3:]).max() < 0.25
+
+
+@pytest.mark.parametrize("parameter", ["q_mobile", "joint"])
+def test_changes_of_the_action_cost_and_the_action_before_is_shown(discharges, parameter):
+    size = 2 if parameter == "joint" else 1
+    plain = started(make(discharges, parameter, cells=2))
+    task = started(make(discharges, parameter, cells=2, consistency=0.7))
+    assert task.observation_size == plain.observation_size + size
+    before = np.array([[0.8, 2.0 * (NEW_CELL.r_o - 0.08) / 0.14 - 1.0]])[:, :size].repeat(2, axis=0)
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        np.testing.assert_array_equal(task.observation()[:, :-size], plain.observation())
+        np.testing.assert_allclose(task.observation()[:, -size:], before, rtol=1e-6)
+        action = rng.uniform(-1.5, 1.5, (2, size))
+        change = np.linalg.norm(np.clip(action, -1.0, 1.0) - before, axis=1)
+        np.testing.assert_allclose(task.advance(action), plain.advance(action) + 0.7 * change, rtol=1e-12)
+        before = np.clip(action, -1.0, 1.0)
+
+
+def test_the_cost_is_scaled_then_limited(discharges):
+    task = started(make(discharges, cells=2, cost_scale=100.0, cost_limit=20.0))
+    measured = task.measured.copy()
+    cost = task.advance(true_action(task) + np.array([[0.02], [1.0]]))
+    distance = scaled_distance(task, task.model_state, measured)
+    np.testing.assert_allclose(cost, np.minimum(100.0 * distance, 20.0), rtol=1e-9)
+    assert cost[0] < 20.0 == cost[1]
+
+
+def test_constants_may_differ_from_those_of_the_model():
+    data = TrajectoryDataset.generate("q_mobile", 5, [constant(12.0)], seed=0, mismatch=0.2)
+    task = make(data, cells=3)
+    task.start(np.array([0, 2]), [np.random.default_rng()] * 2, {"trajectory": 1})
+    task.start(np.array([1]), [np.random.default_rng()], {"trajectory": 4})
+    for row, n in enumerate((1, 4, 1)):
+        true = NEW_CELL.replace(
+            **{c: getattr(NEW_CELL, c) * f for c, f in zip(UNCERTAIN_CONSTANTS, data.factors[n], strict=True)}
+        )
+        expected = step(task.state[row], task.load[row], task.q_mobile[row], task.r_o[row], parameters=true)
+        np.testing.assert_allclose(task.next_state[row], expected, rtol=1e-13)
+    model, load, q, r = task.model_state.copy(), task.load.copy(), task.q_mobile, task.r_o
+    assert (task.advance(true_action(task)) > 0.01).all()
+    np.testing.assert_allclose(task.model_state, step(model, load, q, r), rtol=1e-13)
+
+
+def test_loads_of_other_kinds_and_time_steps():
+    task = BatteryRoEnv.make_task(1, load="piecewise", split="test", dt_s=2.0)
+    whole = standard_dataset("r_o", "piecewise", "test", dt_s=2.0)
+    within = whole.r_o <= ACTION_RANGES["r_o"][1]
+    np.testing.assert_array_equal(task.dataset.r_o, whole.r_o[within])
+    assert 100 < len(task.dataset) < len(whole)
+    assert task.decision_s == 2.0 and len(np.unique(task.dataset[0].load)) > 5
+    task.start(np.zeros(1, dtype=int), [np.random.default_rng(0)])
+    np.testing.assert_array_equal(task.next_state, step(task.state, task.load, task.q_mobile, task.r_o, dt=2.0))
+
+
+def test_perturbations_of_the_literal_form_are_in_error_scales_too(discharges):
+    task = BatteryQmaxPaperEnv.make_task(50, dataset=discharges, initial_perturbation=10.0)
+    started(task)
+    off = (task.model_state - task.state)[:, OBSERVED] / ERROR_SCALE
+    assert 5.0 < np.abs(off).max() <= 10.0
+
+
+@pytest.mark.parametrize("parameter", ["q_mobile", "joint"])
+def test_going_on_with_some_cells_changes_nothing_for_them(parameter):
+    data = TrajectoryDataset.generate("joint", 4, RandomPiecewise(), seed=0, mismatch=0.1)
+    options = {"sensor_noise": 1.0, "process_noise_V": 1e-4, "consistency": 0.5, "resync": 4, "start": "new_cell"}
+    size = 2 if parameter == "joint" else 1
+    tasks = [started(make(data, parameter, cells=4, **options)) for _ in range(2)]
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (10, 4, size))
+    kept = np.array([True, False, True, True])
+    for k, action in enumerate(actions):
+        if k == 3:
+            tasks[1].keep(kept)
+        costs = [task.advance(action[kept] if task.cells == 3 else action) for task in tasks]
+        np.testing.assert_array_equal(costs[0][kept], costs[1] if k >= 3 else costs[1][kept])
+    np.testing.assert_array_equal(tasks[0].observation()[kept], tasks[1].observation())
+
+
+def test_a_policy_is_evaluated_under_the_options_it_is_given(discharges):
+    class Repeater:
+        """Repeats the action before, which the observation ends with."""
+
+        def predict(self, observation, deterministic=False):
+            assert observation.shape[1] == 23
+            return observation[:, -1:], None
+
+    trace = PolicyEstimator(Repeater(), "BatteryQmax-v0", consistency=0.1).trace(discharges)[0]
+    np.testing.assert_allclose(trace.q_mobile, NEW_CELL.q_mobile, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "message"),
+    [
+        ("episode_steps", 0, "episode_steps must be at least 1, got 0"),
+        ("start", "old_cell", "start must be 'true' or 'new_cell', got 'old_cell'"),
+        ("resync", 0, "resync must be None or at least 1, got 0"),
+        ("initial_perturbation", -1.0, "initial_perturbation must be finite and at least 0, got -1.0"),
+        ("process_noise_V", np.nan, "process_noise_V must be finite and at least 0, got nan"),
+        ("sensor_noise", np.inf, "sensor_noise"),
+        ("consistency", -0.1, "consistency"),
+        ("sensor_offset", np.inf, "sensor_offset must be finite, got inf"),
+        ("sensor_gain", 0.0, "sensor_gain must be finite and greater than 0, got 0.0"),
+        ("cost_scale", -1.0, "cost_scale"),
+        ("cost_limit", 0.0, "cost_limit must be finite and greater than 0, got 0.0"),
+        ("load", "sine", "load must be one of"),
+        ("mismatch", -0.1, "mismatch"),
+        ("dt_s", 20.0, "dt must be"),
+    ],
+)
+def test_options_out_of_range_are_refused(option, value, message):
+    with pytest.raises(ValueError, match=message):
+        BatteryQmaxEnv.make_task(1, **{option: value})
+
+
+def test_a_data_set_stands_in_place_of_what_would_choose_one(discharges):
+    with pytest.raises(ValueError, match="dataset stands in place of load, split: give one or the other"):
+        BatteryQmaxEnv.make_task(1, dataset=discharges, load="piecewise", split="test")

@@ -1,0 +1,348 @@
+"""What is handed to the package from outside gives a right result, or an error that says what was wrong with what."""
+
+import copy
+import dataclasses
+import pickle
+from datetime import datetime
+from functools import partial
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import array_shapes, arrays
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+
+import battery_env
+from battery_env.calibration.registration import ENTRY_POINTS
+from battery_env.loads import RandomPiecewise, RandomWalk, constant, piecewise, recorded
+
+NUMBERS = st.floats() | st.integers(-(2**63), 2**63 - 1) | st.floats(0.0, 1e4)
+ARRAYS = arrays(np.float64, array_shapes(min_side=0), elements=st.floats() | st.floats(0.0, 1e4))
+JUNK = st.one_of(
+    st.none(),
+    st.text(),
+    st.binary(min_size=1),
+    st.just(1j),
+    st.lists(st.text(min_size=1), min_size=1),
+    st.just([[1.0], [1.0, 2.0]]),
+    st.dictionaries(st.text(), st.floats()),
+    st.builds(object),
+    st.just(datetime(2020, 1, 1)),
+)
+FAST = settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+def right_or_refused(call, *names):
+    """The result, or ``None`` if it was refused with an error that names one of ``names``."""
+    try:
+        return call()
+    except (TypeError, ValueError) as error:
+        assert any(name in str(error) for name in names), f"{error!r} names none of {names}"
+        return None
+
+
+@pytest.fixture(scope="module")
+def data():
+    return battery_env.TrajectoryDataset.generate("joint", 20, RandomPiecewise(), seed=0)
+
+
+class TestModel:
+    @FAST
+    @given(name=st.sampled_from(["load", "q_mobile", "r_o"]), value=NUMBERS | ARRAYS | JUNK)
+    def test_a_step_is_a_number_wherever_there_is_a_voltage(self, name, value):
+        state = battery_env.initial_state(7600.0)
+        arguments = {"load": 8.0, "q_mobile": 7600.0, "r_o": 0.1} | {name: value}
+        after = right_or_refused(lambda: battery_env.step(state, **arguments), name)
+        if after is not None:
+            assert after.shape == (*np.shape(value), 8) and after.dtype == np.float64
+            volts = battery_env.voltage(state, arguments["q_mobile"])
+            np.testing.assert_array_equal(np.isfinite(after).all(axis=-1), np.broadcast_to(volts > 0.0, after.shape[:-1]))
+
+    @FAST
+    @given(shapes=st.tuples(*[array_shapes(min_dims=0, max_side=3, min_side=0)] * 3))
+    def test_arguments_broadcast_or_their_shapes_are_named(self, shapes):
+        state, load, q_mobile = (np.full((*shape, *tail), 5.0) for shape, tail in zip(shapes, [(8,), (), ()], strict=True))
+        after = right_or_refused(lambda: battery_env.step(state, load, q_mobile * 1000.0, 0.1), "shape")
+        if after is not None:
+            assert after.shape == (*np.broadcast_shapes(*shapes), 8)
+
+    @FAST
+    @given(
+        change=st.tuples(st.sampled_from(["q_mobile", "r_o", "load", "until"]), NUMBERS)
+        | st.tuples(st.just("dt"), st.floats(0.05, 20.0) | st.sampled_from([0.0, -1.0, np.nan, np.inf]))
+    )
+    def test_a_simulation_is_made_of_numbers_above_the_cut_off(self, change):
+        name, value = change
+        arguments = {"load": 8.0, "q_mobile": 7600.0, "r_o": 0.1, "until": 300.0} | {name: value}
+        result = right_or_refused(lambda: battery_env.simulate(**arguments), name)
+        if result is not None:
+            assert len(result.time_s) >= 1 and (result.voltage_V >= 3.0).all()
+            for array in (result.time_s, result.state, result.voltage_V, result.current_A, result.load):
+                assert np.isfinite(array).all() and len(array) == len(result.time_s)
+
+    @FAST
+    @given(value=arrays(np.float64, st.integers(1, 40), elements=st.floats() | st.floats(-20.0, 20.0)))
+    def test_a_load_in_an_array_is_taken_whole_or_refused(self, value):
+        result = right_or_refused(lambda: battery_env.simulate(value, 7600.0, 0.1), "load")
+        if result is not None:
+            np.testing.assert_array_equal(result.load, value[: len(result.load)])
+            assert len(result.load) == len(value) or np.isfinite(result.eod_time_s)
+
+    @FAST
+    @given(
+        name=st.sampled_from([field.name for field in dataclasses.fields(battery_env.CellParameters)]),
+        value=st.floats(-1e6, 1e6) | st.sampled_from([np.nan, np.inf, -np.inf]),
+    )
+    def test_constants_are_kept_or_refused(self, name, value):
+        value = (value,) if name in ("An", "Ap") else value
+        cell = right_or_refused(lambda: battery_env.CellParameters(**{name: value}), name)
+        assert cell is None or getattr(cell, name) == value
+
+
+class TestLoads:
+    @FAST
+    @given(name=st.sampled_from(["values", "durations_s"]), value=NUMBERS | ARRAYS | JUNK)
+    def test_piecewise(self, name, value):
+        arguments = {"values": [2.0, 3.0], "durations_s": [10.0, 20.0]} | {name: value}
+        load = right_or_refused(lambda: piecewise(**arguments), "values", "value", "durations_s", "load", "start_s")
+        if load is not None:
+            np.testing.assert_array_equal(load(load.start_s), load.value)
+
+    @FAST
+    @given(time_s=NUMBERS | ARRAYS | JUNK)
+    def test_at_any_time(self, time_s):
+        value = right_or_refused(lambda: constant(2.0)(time_s), "time_s")
+        assert value is None or ((value == 2.0).all() and value.shape == np.shape(time_s))
+
+    @FAST
+    @given(
+        sampler=st.sampled_from([RandomPiecewise, RandomWalk]),
+        name=st.sampled_from(["value_range", "duration_range_s", "largest_step", "segment_s", "total_s"]),
+        value=st.floats(1.0, 1e5) | st.sampled_from([0.0, -1.0, np.nan, np.inf]) | JUNK | st.tuples(NUMBERS, NUMBERS),
+    )
+    def test_samplers(self, sampler, name, value):
+        assume(name in {field.name for field in dataclasses.fields(sampler)})
+        made = right_or_refused(lambda: sampler(**{name: value}), name, "load")
+        if made is not None:
+            load = made(np.random.default_rng(0))
+            assert (load.value >= made.value_range[0]).all() and (load.value <= made.value_range[1]).all()
+
+    @FAST
+    @given(dt_s=NUMBERS | JUNK, unit=st.sampled_from(["power", "current", "energy"]))
+    def test_recorded(self, data, dt_s, unit):
+        assume(not isinstance(dt_s, (int, float)) or not 0.0 < dt_s < 1.0)  # as many steps as there is memory for
+        load = right_or_refused(lambda: recorded(data[0], unit, dt_s), "dt_s", "unit")
+        assert load is None or np.isfinite(load.value).all()
+
+
+class TestDataSets:
+    @pytest.mark.parametrize(
+        ("name", "values"),
+        [
+            ("parameter", JUNK),
+            ("n", JUNK | st.floats() | st.integers(-5, 3)),
+            ("loads", JUNK | NUMBERS | st.just(constant(8.0)) | st.just([constant(8.0), "8 W"])),
+            ("seed", JUNK | NUMBERS),
+            ("q_mobile_range", JUNK | NUMBERS | st.tuples(NUMBERS, NUMBERS)),
+            ("r_o_range", JUNK | NUMBERS | st.tuples(NUMBERS, NUMBERS)),
+            ("trim", JUNK | NUMBERS | st.tuples(st.floats(-0.1, 1.1), st.floats(-0.1, 1.1))),
+            ("dt_s", NUMBERS),
+            ("thermal", JUNK | NUMBERS | st.booleans()),
+            ("parameters", JUNK | NUMBERS),
+            ("mismatch", JUNK | NUMBERS | st.floats(0.0, 0.6)),
+        ],
+    )
+    def test_generating(self, name, values):
+        @settings(FAST, max_examples=15)
+        @given(values)
+        def generate(value):
+            arguments = {"parameter": "joint", "n": 2, "loads": [constant(14.0)], "seed": 0} | {name: value}
+            meant = {"dt_s": "dt", "q_mobile_range": "q_mobile", "r_o_range": "r_o"}.get(name, name)
+            # fast cells and long steps may not go together, nor may a lot of resistance and power
+            others = {"mismatch": ("dt",), "r_o_range": ("at least 8 are needed",), "dt_s": ("dt_s", "at least 8")}
+            make = partial(battery_env.TrajectoryDataset.generate, **arguments)
+            made = right_or_refused(make, meant, *others.get(name, ()), "within a day")
+            assert made is None or all(np.isfinite(trajectory.state).all() for trajectory in made)
+
+        generate()
+
+    @FAST
+    @given(
+        index=ARRAYS
+        | JUNK
+        | st.lists(st.booleans())
+        | arrays(np.int64, array_shapes(max_dims=2), elements=st.integers(-2, 22))
+    )
+    def test_choosing(self, data, index):
+        part = right_or_refused(lambda: data.subset(index), "index")
+        if part is not None:
+            np.testing.assert_array_equal(part.q_mobile, data.q_mobile[np.asarray(index)])
+
+    def test_a_mask_is_not_taken_for_numbers(self, data):
+        with pytest.raises(TypeError, match=r"np.flatnonzero.*got bool"):
+            data.subset(data.q_mobile > 5000.0)
+
+    @FAST
+    @given(test=NUMBERS | JUNK, by=st.sampled_from(["trajectory", "load", "parameter"]) | st.text(), seed=st.integers() | JUNK)
+    def test_splitting(self, data, test, by, seed):
+        parts = right_or_refused(lambda: data.split(test, by, seed), "test", "by", "seed", "non-negative")
+        assert parts is None or len(parts[0]) + len(parts[1]) == len(data)
+
+    @FAST
+    @given(value=JUNK)
+    def test_gathering(self, value):
+        assert (
+            right_or_refused(lambda: battery_env.TrajectoryDataset.from_trajectories(value), "trajector", "iterable") is None
+        )
+
+    @pytest.mark.parametrize("path", [None, 3, b"data.npz", 1.5])
+    def test_paths(self, data, path):
+        for method in (battery_env.TrajectoryDataset.load, data.save):
+            with pytest.raises(TypeError, match="str"):
+                method(path)
+
+
+class TestRecordings:
+    CSV = b"time_s,voltage_V,current_A,temperature_C\n" + b"".join(
+        b"%d,%.2f,2.0,24.5\n" % (10 * k, 4.0 - k / 20) for k in range(20)
+    )
+
+    @settings(FAST, max_examples=100)
+    @given(
+        start=st.integers(0, len(CSV)),
+        length=st.integers(0, 40),
+        middle=st.binary(max_size=30) | st.text("0123456789.,-\n e").map(str.encode),
+    )
+    def test_a_damaged_table_is_refused_by_name_or_is_a_discharge(self, tmp_path, start, length, middle):
+        path = tmp_path / "own.csv"
+        path.write_bytes(self.CSV[:start] + middle + self.CSV[start + length :])
+        discharge = right_or_refused(lambda: battery_env.read_discharge_csv(path), "own.csv")
+        if discharge is not None:
+            assert (np.diff(discharge.time_s) > 0.0).all() and discharge.charge_C > 0.0
+            assert ((discharge.voltage_V >= 0.0) & (discharge.voltage_V <= 5.5)).all()
+
+    @pytest.mark.parametrize(
+        ("contents", "message"),
+        [
+            (CSV.splitlines()[0] + b"\n", "at least 5"),
+            (CSV + b"200,,2.0,24\n", "voltage_V must be finite, got nan at sample 20"),
+            (CSV + b"200,1e999,2.0,24\n", "voltage_V must be finite, got inf"),
+            (CSV + b"190,3.0,2.0,24\n", "sample 20 is at 190 s, after 190 s"),
+            (CSV + b"2020-01-01 00:03,3.0,2.0,24\n", "time_s must hold numbers"),
+            (CSV + b"\x00\x00", "own.csv"),
+            (CSV[:100] + b'"' + CSV[100:], "own.csv"),
+            (CSV.replace(b",", b"\t"), "separate them by commas"),
+        ],
+    )
+    def test_what_is_wrong_with_a_table_is_said(self, tmp_path, contents, message):
+        (tmp_path / "own.csv").write_bytes(contents)
+        with pytest.raises(ValueError, match=f"(?s)own.csv.*{message}|{message}"):
+            battery_env.read_discharge_csv(tmp_path / "own.csv")
+
+    def test_a_byte_order_mark_does_no_harm(self, tmp_path):
+        (tmp_path / "own.csv").write_bytes(b"\xef\xbb\xbf" + self.CSV)
+        assert len(battery_env.read_discharge_csv(tmp_path / "own.csv").time_s) == 20
+
+    @FAST
+    @given(name=st.sampled_from(["voltage_V", "current_A", "temperature_C"]), value=ARRAYS | NUMBERS | arrays(np.float64, 20))
+    def test_a_discharge_holds_plausible_numbers(self, name, value):
+        arguments = {"time_s": np.arange(20.0), "voltage_V": np.full(20, 4.0), "current_A": np.full(20, 2.0)} | {name: value}
+        discharge = right_or_refused(lambda: battery_env.Discharge(**arguments), name)
+        if discharge is not None:
+            kept = getattr(discharge, name)
+            assert np.isfinite(kept).all() and kept.shape == (20,) and discharge.charge_C > 0.0
+
+
+class TestEstimators:
+    @FAST
+    @given(
+        name=st.sampled_from(["voltage_V", "current_A"]),
+        sample=st.integers(0, 199),
+        value=st.sampled_from([np.nan, np.inf, -np.inf]),
+    )
+    def test_a_hole_in_a_record_is_not_bridged(self, data, name, sample, value):
+        record = data[0].part(0, 200)
+        values = getattr(record, name).copy()
+        values[sample] = value
+        with pytest.raises(ValueError, match=name):
+            battery_env.LeastSquares().estimate(dataclasses.replace(record, **{name: values}))
+
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            (lambda record: record.part(0, 1), "at least 2 samples"),
+            (lambda record: dataclasses.replace(record, time_s=record.time_s[::-1]), "time"),
+            (lambda record: dataclasses.replace(record, voltage_V=record.voltage_V[:-1]), "voltage_V"),
+            (lambda record: dataclasses.replace(record, current_A=0.0 * record.current_A), "no current"),
+            (lambda record: dataclasses.replace(record, current_A=1000.0 * record.current_A), "current in A"),
+        ],
+    )
+    def test_records_that_cannot_be_calibrated_with(self, data, change, message):
+        with pytest.raises(ValueError, match=message):
+            battery_env.LeastSquares().estimate(change(data[0]))
+
+    @pytest.mark.parametrize("given", ["B0005", [1.0], [battery_env.load_nasa_discharges("B0005")[0]]])
+    def test_evaluation_needs_trajectories_whose_parameters_are_known(self, given):
+        with pytest.raises(TypeError, match="trajectories must hold Trajectory, got"):
+            battery_env.evaluate(battery_env.ClosedForm(), given)
+
+
+@pytest.mark.parametrize("env_id", ENTRY_POINTS)
+class TestEnvironments:
+    @staticmethod
+    def run(env, steps=5):
+        actions = np.random.default_rng(1).uniform(-1.0, 1.0, (steps, *env.action_space.shape)).astype(np.float32)
+        return [env.step(action)[:2] for action in actions]
+
+    def test_copies_go_on_as_the_original_does(self, data, env_id):
+        env = gym.make(env_id, dataset=data).unwrapped
+        env.reset(seed=3)
+        env.step(env.action_space.low)
+        twins = [copy.deepcopy(env), pickle.loads(pickle.dumps(env))]
+        expected = self.run(env)
+        for twin in twins:
+            for (observation, reward), (other, other_reward) in zip(expected, self.run(twin), strict=True):
+                np.testing.assert_array_equal(observation, other)
+                assert reward == other_reward
+            np.testing.assert_array_equal(twin.reset()[0], copy.deepcopy(env).reset()[0])
+
+    def test_actions_beyond_the_range_count_as_its_ends(self, data, env_id):
+        env = gym.make(env_id, dataset=data).unwrapped
+        found = []
+        for action in (env.action_space.high, 7.0 * env.action_space.high, np.full(env.action_space.shape, np.inf)):
+            env.reset(seed=0)
+            found.append(env.step(action)[0])
+        np.testing.assert_array_equal(found[0], found[1])
+        np.testing.assert_array_equal(found[0], found[2])
+
+    def test_the_kind_of_an_actions_numbers_does_not_matter(self, data, env_id):
+        env = gym.make(env_id, dataset=data).unwrapped
+        found = []
+        for dtype in (np.float32, np.float64, np.int64):
+            env.reset(seed=0)
+            found.append(env.step(np.zeros(env.action_space.shape, dtype))[0])
+        np.testing.assert_array_equal(found[0], found[1])
+        np.testing.assert_array_equal(found[0], found[2])
+
+    def test_unknown_arguments_and_options_are_named(self, data, env_id):
+        with pytest.raises(TypeError, match="episode_step"):
+            gym.make(env_id, dataset=data, episode_step=3)
+        env = gym.make(env_id, dataset=data)
+        with pytest.raises(ValueError, match=r"cycle_number"):
+            env.reset(options={"cycle_number": 1})
+
+
+def test_processes_run_the_same_episodes_as_one(data):
+    make = [partial(gym.make, "battery_env:BatteryRo-v0", dataset=data) for _ in range(2)]
+    one, many = DummyVecEnv(make), SubprocVecEnv(make)
+    try:
+        for env in (one, many):
+            env.seed(5)
+        np.testing.assert_array_equal(one.reset(), many.reset())
+        for action in np.random.default_rng(0).uniform(-1.0, 1.0, (70, 2, 1)).astype(np.float32):
+            for a, b in zip(one.step(action)[:3], many.step(action)[:3], strict=True):
+                np.testing.assert_array_equal(a, np.asarray(b, dtype=a.dtype))
+    finally:
+        many.close()

@@ -1,0 +1,92 @@
+"""Voltage-only policies as estimators."""
+
+import numpy as np
+import pytest
+
+from battery_env import PolicyEstimator, load_nasa_discharges
+from battery_env.calibration.voltage import LARGEST_STEPS
+from battery_env.electrochemistry import NEW_CELL
+from battery_env.evaluation import evaluate
+from battery_env.loads import RandomPiecewise
+from battery_env.sensors import SensorErrors
+from battery_env.trajectories import TrajectoryDataset
+
+
+class Constant:
+    """A policy that always does the same, and remembers what it saw."""
+
+    def __init__(self, *action):
+        self.action = np.array(action)
+        self.seen = []
+
+    def predict(self, observation, deterministic=False):
+        assert deterministic
+        self.seen.append(observation)
+        return np.tile(self.action, (len(observation), 1)), None
+
+
+@pytest.fixture(scope="module")
+def data():
+    return TrajectoryDataset.generate("joint", 5, RandomPiecewise(), seed=5, r_o_range=(0.1, 0.3))
+
+
+def test_one_estimate_at_each_decision_of_each_discharge(data):
+    policy = Constant(-0.1, 0.1)
+    traces = PolicyEstimator(policy, "BatteryVoltageJoint-v0", decision_s=60.0).trace(data)
+    for trace, trajectory in zip(traces, data, strict=True):
+        readings = int(trajectory.time_s[-1] // 10)
+        expected_s = np.append(np.arange(60.0, 10.0 * readings, 60.0), 10.0 * readings)
+        np.testing.assert_array_equal(trace.time_s, expected_s)
+        moved_C = 0.01 * LARGEST_STEPS["q_mobile"] * np.arange(1, len(expected_s) + 1)
+        np.testing.assert_allclose(trace.q_mobile, np.maximum(NEW_CELL.q_mobile - moved_C, 3500.0))
+    assert policy.seen[0].shape == (5, 102)
+
+
+def test_several_moves_each_time(data):
+    once, thrice = (
+        PolicyEstimator(Constant(-0.1, 0.1), "BatteryVoltageJoint-v0", moves=moves).trace(data[:1])[0] for moves in (1, 3)
+    )
+    np.testing.assert_array_equal(once.time_s, thrice.time_s)
+    assert thrice.q_mobile[0] - NEW_CELL.q_mobile == pytest.approx(3.0 * (once.q_mobile[0] - NEW_CELL.q_mobile))
+
+
+def test_discharges_do_not_influence_each_other(data):
+    policy = Constant(-0.2, 0.1)
+    together = PolicyEstimator(policy, "BatteryVoltageJoint-v0").trace(data)
+    alone = PolicyEstimator(policy, "BatteryVoltageJoint-v0").trace(data[2:3])
+    np.testing.assert_array_equal(together[2].q_mobile, alone[0].q_mobile)
+
+
+def test_it_sees_what_the_sensors_show_and_nothing_more(data):
+    exact, noisy = Constant(0.0, 0.0), Constant(0.0, 0.0)
+    evaluate(PolicyEstimator(exact, "BatteryVoltageJoint-v0"), data)
+    scores = evaluate(PolicyEstimator(noisy, "BatteryVoltageJoint-v0"), data, SensorErrors(offset_V=0.05))
+    shift = np.sinh(noisy.seen[0][:, 98].astype(np.float64)) - np.sinh(exact.seen[0][:, 98].astype(np.float64))
+    np.testing.assert_allclose(shift, 5.0, rtol=1e-4)  # the mean residual in units of 10 mV
+    assert scores["q_mobile_final"].tolist() == [NEW_CELL.q_mobile] * 5
+
+
+def test_what_is_not_searched_for_is_known(data):
+    traces = PolicyEstimator(Constant(-0.1), "BatteryVoltageRo-v0").trace(data)
+    for trace, q_mobile in zip(traces, data.q_mobile, strict=True):
+        assert (trace.q_mobile == q_mobile).all() and trace.r_o[0] < NEW_CELL.r_o
+
+
+def test_recorded_discharges():
+    discharge = load_nasa_discharges("B0005")[0].loaded_part(3.0)
+    estimator = PolicyEstimator(Constant(-0.1, 0.0), "BatteryVoltageJoint-v0")
+    estimate, trace = estimator.estimate(discharge), estimator.trace([discharge])[0]
+    assert estimate.q_mobile == trace.q_mobile[-1] < NEW_CELL.q_mobile
+    assert discharge.time_s[0] + 60.0 == trace.time_s[0]
+    assert discharge.time_s[-1] - 10.0 <= trace.time_s[-1] <= discharge.time_s[-1]
+
+
+def test_bad_arguments_are_refused():
+    with pytest.raises(ValueError, match=r"decision_s must be a multiple of the interval between readings, 10 s, got 25\.0"):
+        PolicyEstimator(Constant(0.0), "BatteryVoltageRo-v0", decision_s=25.0)
+    with pytest.raises(ValueError, match="moves must be at least 1, got 0"):
+        PolicyEstimator(Constant(0.0), "BatteryVoltageRo-v0", moves=0)
+    with pytest.raises(ValueError, match="BatteryAging-v0 is no calibration environment of single discharges"):
+        PolicyEstimator(Constant(0.0), "BatteryAging-v0")
+    with pytest.raises(ValueError, match="CartPole-v1 is no calibration environment"):
+        PolicyEstimator(Constant(0.0), "CartPole-v1")

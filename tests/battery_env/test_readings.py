@@ -1,0 +1,173 @@
+"""Readings of discharges, and the model's misfit to them."""
+
+import numpy as np
+import pytest
+
+from battery_env.calibration.readings import Readings, explain
+from battery_env.cells import load_nasa_discharges
+from battery_env.electrochemistry import NEW_CELL, QNB, QNS, VO, simulate
+from battery_env.loads import RandomPiecewise
+from battery_env.trajectories import TrajectoryDataset
+
+
+@pytest.fixture(scope="module")
+def data():
+    return TrajectoryDataset.generate("joint", 12, RandomPiecewise(), seed=3, r_o_range=(0.1, 0.3))
+
+
+@pytest.fixture(scope="module")
+def readings(data):
+    return Readings.of(data)
+
+
+def rows(readings, *arrays):
+    out = np.zeros((len(arrays), len(readings), readings.count.max()))
+    for n in range(len(readings)):
+        for k, array in enumerate(arrays):
+            out[k, n, : readings.count[n]] = array[readings.part(n)]
+    return out
+
+
+def compare(readings, q_mobile, r_o, count=None, first=None, stretches=12):
+    """The outputs of explain, of all discharges."""
+    n, cell = len(readings), readings.parameters
+    out = [np.full((n, stretches, 2), np.nan) for _ in range(3)] + [np.full(n, np.nan) for _ in range(2)]
+    explain(
+        readings.count if count is None else count,
+        np.zeros(n, dtype=np.int64) if first is None else first,
+        q_mobile,
+        r_o,
+        *rows(readings, readings.voltage_V, readings.current_A, readings.moved_C, readings.ohmic_A),
+        cell.Tb0,
+        1.0 - float(readings.decay(cell.tsn)),
+        1.0 - float(readings.decay(cell.tsp)),
+        *cell.packed,
+        *out,
+    )
+    return out
+
+
+def test_linear_part_is_that_of_the_simulation(data, readings):
+    for n, trajectory in enumerate(data):
+        part, at = readings.part(n), slice(10, 10 * readings.count[n] + 1, 10)
+        np.testing.assert_array_equal(readings.voltage_V[part], trajectory.voltage_V[at])
+        np.testing.assert_allclose(readings.moved_C[part], 0.1 * trajectory.q_mobile - trajectory.state[at, QNS], atol=1e-6)
+        in_bulk = 0.9 * trajectory.q_mobile - trajectory.state[at, QNB]
+        np.testing.assert_allclose(readings.drawn_C[part] - readings.moved_C[part], in_bulk, atol=1e-6)
+        np.testing.assert_allclose(readings.ohmic_A[part] * trajectory.r_o, trajectory.state[at, VO], atol=1e-9)
+
+
+def test_the_true_parameters_explain_a_discharge(readings):
+    rms_V = compare(readings, readings.q_mobile, readings.r_o)[3]
+    assert rms_V.max() < 2e-4  # a step of ten seconds for the overpotentials; the prototype of a fixed table had 1.6 mV
+
+
+def test_misfit_is_that_of_a_whole_simulation(data, readings):
+    """Also where the parameters are wrong: against simulations that follow the same current."""
+    q_mobile, r_o = np.full(len(readings), 7600.0), np.full(len(readings), 0.15)
+    rms_V, last_V = compare(readings, q_mobile, r_o)[3:]
+    for n, trajectory in enumerate(data):
+        model = simulate(
+            trajectory.current_A, 7600.0, 0.15, load_unit="current", cut_off_V=-np.inf, max_duration_s=len(trajectory.time_s)
+        )
+        modelled_V = model.voltage_V[10 : 10 * readings.count[n] + 1 : 10]
+        exact_V = np.sqrt(np.mean((readings.voltage_V[readings.part(n)] - modelled_V) ** 2))
+        assert rms_V[n] == pytest.approx(exact_V, abs=2e-4)
+        assert last_V[n] == pytest.approx(modelled_V[-1], abs=1e-3)
+
+
+def test_stretches_are_averaged_in_halves_of_less_and_of_more_current(readings):
+    count = np.full(len(readings), 48)
+    fine = compare(readings, readings.q_mobile * 1.05, readings.r_o + 0.01, count, stretches=48)
+    coarse = compare(readings, readings.q_mobile * 1.05, readings.r_o + 0.01, count, stretches=6)
+    np.testing.assert_allclose(fine[3], np.sqrt((fine[0][:, :, 0] ** 2).mean(axis=1)), rtol=1e-12)
+    for n in range(len(readings)):
+        for stretch in range(6):
+            inside = slice(8 * stretch, 8 * stretch + 8)
+            ohmic_A = fine[2][n, inside, 0]
+            more = ohmic_A > ohmic_A.mean()
+            for k in range(3):
+                values = fine[k][n, inside, 0]
+                np.testing.assert_allclose(coarse[k][n, stretch], [values[~more].mean(), values[more].mean()], rtol=1e-9)
+
+
+def test_under_a_constant_current_both_halves_are_the_whole(data, readings):
+    constant = Readings(**{**readings.__dict__, "ohmic_A": np.ones_like(readings.ohmic_A)})
+    for values in compare(constant, readings.q_mobile * 1.05, readings.r_o)[:3]:
+        np.testing.assert_array_equal(values[:, :, 0], values[:, :, 1])
+
+
+def test_fewer_readings_than_stretches_share_them(readings):
+    count = np.full(len(readings), 3)
+    fine = compare(readings, readings.q_mobile, readings.r_o * 1.1, count, stretches=3)[0]
+    shared = compare(readings, readings.q_mobile, readings.r_o * 1.1, count, stretches=12)[0]
+    np.testing.assert_array_equal(shared, np.repeat(fine, 4, axis=1))
+
+
+def test_only_what_counts_counts(readings):
+    count = np.full(len(readings), 30)
+    whole = compare(readings, readings.q_mobile * 1.05, readings.r_o, count, stretches=30)
+    last = compare(readings, readings.q_mobile * 1.05, readings.r_o, count, first=count - 1, stretches=1)
+    np.testing.assert_array_equal(last[0][:, 0], whole[0][:, 29])
+    np.testing.assert_allclose(last[3], np.abs(whole[0][:, 29, 0]), rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["q_mobile", "r_o"])
+def test_sensitivities_are_the_slopes_of_the_residuals(readings, name):
+    q_mobile, r_o = readings.q_mobile * 1.1, readings.r_o.copy()
+    before = compare(readings, q_mobile, r_o)
+    step = {"q_mobile": 1.0, "r_o": 1e-3}[name]
+    after = compare(readings, q_mobile + step * (name == "q_mobile"), r_o + step * (name == "r_o"))
+    slope = -(after[0] - before[0]) / step
+    expected = before[1] if name == "q_mobile" else -before[2]
+    np.testing.assert_allclose(slope, expected, rtol=0.05, atol=1e-8)
+
+
+def test_the_misfit_grows_with_every_coulomb_below_what_was_drawn(readings):
+    """Also where the model cell is empty before the readings end: there is no second minimum of such cells."""
+    misfits_V = [compare(readings, readings.q_mobile * share, readings.r_o)[3] for share in (0.98, 0.95, 0.9, 0.8, 0.6)]
+    assert np.isfinite(misfits_V).all()
+    assert (np.diff(misfits_V, axis=0) > 0.0).all()
+    assert np.median(misfits_V[-1]) > 0.1
+
+
+class TestAnotherCurrentSensor:
+    def test_an_exact_one_changes_nothing(self, readings):
+        for n in range(3):
+            part = readings.part(n)
+            measured = readings.remeasured(n, np.ones(readings.count[n]), 0.0)
+            for array, name in zip(measured, ("current_A", "moved_C", "ohmic_A"), strict=True):
+                np.testing.assert_allclose(array, getattr(readings, name)[part], rtol=1e-9, atol=1e-6)
+
+    def test_gain_and_offset_are_those_of_a_record_with_that_current(self, data, readings):
+        trajectory = data[0]
+        n_steps = 10 * readings.count[0]
+        gains = np.random.default_rng(0).uniform(0.9, 1.1, readings.count[0])
+        current_A = trajectory.current_A.copy()
+        current_A[:n_steps] = np.repeat(gains, 10) * current_A[:n_steps] + 0.05
+        again = Readings.of([type(trajectory)(**{**trajectory.__dict__, "current_A": current_A})])
+        measured = readings.remeasured(0, gains, 0.05)
+        for array, name in zip(measured, ("current_A", "moved_C", "ohmic_A"), strict=True):
+            np.testing.assert_allclose(array, getattr(again, name), rtol=1e-9, atol=1e-6)
+
+
+def test_recorded_discharges_can_be_read():
+    discharges = [discharge.loaded_part(3.0) for discharge in load_nasa_discharges("B0005")[:2]]
+    readings = Readings.of(discharges)
+    assert np.isnan(readings.q_mobile).all()
+    for n, discharge in enumerate(discharges):
+        drawn_C = np.trapezoid(discharge.current_A, discharge.time_s)
+        assert readings.drawn_C[readings.part(n)][-1] == pytest.approx(drawn_C, rel=0.01)
+
+
+def test_other_intervals_and_time_steps():
+    data = TrajectoryDataset.generate("joint", 3, RandomPiecewise(), seed=3, dt_s=0.5)
+    readings = Readings.of(data, interval_s=30.0, dt_s=0.5)
+    assert compare(readings, readings.q_mobile, readings.r_o)[3].max() < 1e-3
+    with pytest.raises(ValueError, match=r"interval_s must be a multiple of the time step, 1 s, got 2.5"):
+        Readings.of(data, interval_s=2.5)
+    with pytest.raises(ValueError, match="discharge 0 lasts 2 s, at least two intervals of 10 s"):
+        Readings.of([data[0].part(0, 5)], interval_s=10.0, dt_s=0.5)
+    with pytest.raises(ValueError, match="at least one discharge"):
+        Readings.of([])
+    assert NEW_CELL is readings.parameters

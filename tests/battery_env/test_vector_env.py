@@ -1,0 +1,179 @@
+"""The vector environments make the episodes of the scalar ones."""
+
+import copy
+import pickle
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.seeding import np_random
+from gymnasium.vector import AutoresetMode
+from stable_baselines3.common.vec_env import SubprocVecEnv
+
+from battery_env.calibration.task import CalibrationTask
+from battery_env.loads import RandomPiecewise
+from battery_env.trajectories import TrajectoryDataset
+
+IDS = ("BatteryQmax-v0", "BatteryRo-v0", "BatteryJoint-v0", "BatteryQmaxPaper-v0", "BatteryRoPaper-v0")
+# whatever draws at random
+NOISY = {"initial_perturbation": 3.0, "process_noise_V": 1e-4, "sensor_noise": 0.5, "start": "new_cell", "resync": 3}
+
+
+@pytest.fixture(scope="module")
+def discharges():
+    return TrajectoryDataset.generate("joint", 6, RandomPiecewise(), seed=0, mismatch=0.1)
+
+
+def make_pair(env_id, mode, cells=3, **options):
+    """A vector environment, and Gymnasium's own over as many scalar environments."""
+    kwargs = {"num_envs": cells, "disable_env_checker": True, **options}
+    sync = gym.make_vec(env_id, vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode}, **kwargs)
+    del kwargs["disable_env_checker"]
+    return gym.make_vec(env_id, autoreset_mode=mode, **kwargs), sync
+
+
+def assert_same_infos(found, expected, mask=None):
+    assert found.keys() == expected.keys()
+    for name, values in expected.items():
+        if isinstance(values, dict):
+            assert_same_infos(found[name], values, expected[f"_{name}"])
+        elif name == "final_obs":
+            assert [o is None for o in found[name]] == [o is None for o in values]
+            for a, b in zip(found[name], values, strict=True):
+                np.testing.assert_array_equal(a, b)
+        elif name.startswith("_"):
+            np.testing.assert_array_equal(found[name], values)
+        else:  # where the mask is False, there is no value
+            assert found[name].dtype == values.dtype
+            valid = expected.get(f"_{name}", mask)
+            np.testing.assert_array_equal(found[name][valid], values[valid])
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+@pytest.mark.parametrize("options", [{}, NOISY], ids=["plain", "noisy"])
+@pytest.mark.parametrize("env_id", IDS)
+def test_a_batch_makes_the_episodes_of_scalar_environments_to_the_bit(env_id, options, mode, discharges):
+    batch, sync = make_pair(env_id, mode, episode_steps=4, dataset=discharges, **options)
+    assert (batch.observation_space, batch.action_space) == (sync.observation_space, sync.action_space)
+    assert batch.metadata["autoreset_mode"] is mode
+    sync.action_space.seed(0)
+    for seed in (3, [7, 1, 5], None):
+        found, expected = batch.reset(seed=seed), sync.reset(seed=seed)
+        np.testing.assert_array_equal(found[0], expected[0])
+        assert_same_infos(found[1], expected[1])
+        for _ in range(11):
+            actions = sync.action_space.sample()
+            *step, info = batch.step(actions)
+            *other_step, other_info = sync.step(actions)
+            for a, b in zip(step, other_step, strict=True):
+                assert a.dtype == b.dtype
+                np.testing.assert_array_equal(a, b)
+            assert_same_infos(info, other_info)
+
+
+def test_row_n_has_the_generator_of_seed_plus_n(discharges):
+    batch = gym.make_vec("BatteryQmax-v0", num_envs=4, dataset=discharges)
+    batch.reset(seed=10)
+    drawn = [np_random(10 + n)[0].integers(len(discharges)) for n in range(4)]
+    np.testing.assert_array_equal(batch.unwrapped.task.trajectory, drawn)
+
+
+def test_the_mode_is_gymnasiums_default_and_its_reset_step_ignores_the_action(discharges):
+    episodes = []
+    for action in (-1.0, 1.0):
+        batch = gym.make_vec("BatteryQmax-v0", num_envs=2, dataset=discharges, episode_steps=2)
+        assert batch.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+        batch.reset(seed=0)
+        batch.step(np.zeros((2, 1)))
+        assert batch.step(np.zeros((2, 1)))[3].all()
+        observation, reward, _, truncated, info = batch.step(np.full((2, 1), action))
+        assert not truncated.any() and not reward.any() and not info["cost"].any()
+        episodes.append(observation)
+    np.testing.assert_array_equal(*episodes)
+
+
+def test_without_autoreset_the_caller_says_which_cells_start(discharges):
+    batch = gym.make_vec("BatteryQmax-v0", num_envs=3, autoreset_mode="Disabled", dataset=discharges, episode_steps=3)
+    task = batch.unwrapped.task
+    batch.reset(seed=0)
+    mask = np.array([False, True, False])
+    batch.step(np.zeros((3, 1)))
+    *_, info = batch.reset(seed=[None, 8, None], options={"reset_mask": mask, "trajectory": 4})
+    np.testing.assert_array_equal(info["_cost"], mask)
+    assert task.decisions.tolist() == [1, 0, 1] and task.trajectory[1] == 4
+    batch.step(np.zeros((3, 1)))
+    assert batch.step(np.zeros((3, 1)))[3].tolist() == [True, False, True]
+    with pytest.raises(gym.error.ResetNeeded, match=r"episodes of cells \[0, 2\] are over"):
+        batch.step(np.zeros((3, 1)))
+    batch.reset(options={"reset_mask": ~mask})
+    assert batch.step(np.zeros((3, 1)))[3].tolist() == [False, True, False]
+
+
+def test_environments_can_be_copied_and_pickled_within_episodes(discharges):
+    batch = gym.make_vec("BatteryJoint-v0", num_envs=3, dataset=discharges, episode_steps=3, **NOISY)
+    batch.reset(seed=3)
+    batch.step(np.zeros((3, 2)))
+    twins = [copy.deepcopy(batch), pickle.loads(pickle.dumps(batch))]
+    for _ in range(5):
+        expected = batch.step(np.full((3, 2), 0.3))[0]
+        for twin in twins:
+            np.testing.assert_array_equal(twin.step(np.full((3, 2), 0.3))[0], expected)
+
+
+def test_worker_processes_make_the_same_episodes(discharges):
+    def make():
+        return gym.make("BatteryQmax-v0", dataset=discharges, episode_steps=3)
+
+    workers = SubprocVecEnv([make, make], start_method="fork")
+    batch = gym.make_vec("BatteryQmax-v0", num_envs=2, autoreset_mode="SameStep", dataset=discharges, episode_steps=3)
+    workers.seed(4)
+    np.testing.assert_array_equal(workers.reset(), batch.reset(seed=4)[0])
+    for _ in range(4):
+        np.testing.assert_array_equal(workers.step(np.zeros((2, 1)))[0], batch.step(np.zeros((2, 1)))[0])
+    workers.close()
+
+
+def test_pictures_of_all_cells(discharges):
+    batch = gym.make_vec("BatteryJoint-v0", num_envs=2, render_mode="rgb_array", dataset=discharges, episode_steps=3)
+    assert gym.make_vec("BatteryJoint-v0", dataset=discharges).render() is None
+    batch.reset(seed=0)
+    empty = batch.render()
+    for _ in range(3):
+        batch.step(np.zeros((2, 2)))
+    drawn = batch.render()
+    assert len(drawn) == 2 and drawn[0].shape == (400, 600, 3) and (drawn[0] != drawn[1]).any()
+    batch.step(np.zeros((2, 2)))  # starts a new episode
+    for frame, other in zip(batch.render(), empty, strict=True):
+        np.testing.assert_array_equal(frame, other)
+
+
+def test_nonsense_is_refused(discharges):
+    with pytest.raises(ValueError, match="num_envs must be at least 1, got 0"):
+        gym.make_vec("BatteryQmax-v0", num_envs=0, dataset=discharges)
+    with pytest.raises(ValueError, match="render_mode must be None or one of"):
+        gym.make_vec("BatteryQmax-v0", render_mode="human", dataset=discharges)
+    for make in (gym.make, gym.make_vec):
+        with pytest.raises(TypeError, match=r"horizon: no such option\. There are .*episode_steps"):
+            make("BatteryQmax-v0", dataset=discharges, horizon=3)
+    batch = gym.make_vec("BatteryQmax-v0", num_envs=2, dataset=discharges)
+    with pytest.raises(gym.error.ResetNeeded, match="before step"):
+        batch.step(np.zeros((2, 1)))
+    with pytest.raises(ValueError, match="one for each of the 2 cells, got 3"):
+        batch.reset(seed=[1, 2, 3])
+    for mask in ([True, False], np.ones(3, dtype=bool), np.zeros(2, dtype=bool), np.ones(2)):
+        with pytest.raises(ValueError, match="reset_mask"):
+            batch.reset(options={"reset_mask": mask})
+    with pytest.raises(ValueError, match=r"'trajectory' and 'sample', got \['where'\]"):
+        batch.reset(options={"where": 3})
+
+
+def test_every_task_reports_what_info_promises(discharges):
+    batch = gym.make_vec("BatteryQmax-v0", num_envs=2, dataset=discharges)
+    _, info = batch.reset(seed=0)
+    names = {"cost", *CalibrationTask.REPORTED}
+    assert set(info) == names | {f"_{name}" for name in names}
+    # arrays of their own: the next step does not change them
+    before = {name: values.copy() for name, values in info.items()}
+    batch.step(np.ones((2, 1)))
+    for name, values in info.items():
+        np.testing.assert_array_equal(values, before[name])

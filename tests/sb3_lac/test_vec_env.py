@@ -1,0 +1,195 @@
+"""A vector environment of Gymnasium does in Stable-Baselines3 what as many single environments do."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from stable_baselines3 import SAC, TD3
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
+
+from battery_env.loads import constant
+from battery_env.trajectories import TrajectoryDataset
+from sb3_lac import LAC, GymnasiumVecEnv
+
+N_ENVS = 3
+
+
+@pytest.fixture(scope="module")
+def discharges():
+    return TrajectoryDataset.generate("q_mobile", 4, [constant(12.0)], seed=0)
+
+
+@pytest.fixture
+def problems(discharges, make_env):
+    """By name: a vector environment in any autoreset mode, and the same as single environments."""
+    battery = {"dataset": discharges, "episode_steps": 5}
+
+    def sync(make):
+        return (
+            lambda mode: SyncVectorEnv([make] * N_ENVS, autoreset_mode=mode),
+            lambda: DummyVecEnv([make] * N_ENVS),
+        )
+
+    return {
+        "battery": (
+            lambda mode: gym.make_vec("BatteryQmax-v0", num_envs=N_ENVS, autoreset_mode=mode, **battery),
+            lambda: DummyVecEnv([lambda: gym.make("BatteryQmax-v0", **battery)] * N_ENVS),
+        ),
+        "time limit": sync(lambda: gym.make("Pendulum-v1", max_episode_steps=4)),
+        "termination": sync(lambda: make_env(episode_length=4, terminate=True)),
+    }
+
+
+def assert_same(found, expected):
+    assert found.keys() == expected.keys()
+    for name, value in expected.items():
+        assert type(found[name]) is type(value), name
+        np.testing.assert_array_equal(found[name], value, err_msg=name)
+
+
+@pytest.mark.parametrize("mode", ["SameStep", "Disabled"])
+@pytest.mark.parametrize("name", ["battery", "time limit", "termination"])
+def test_transitions_are_those_of_single_environments(problems, name, mode):
+    make_vector, make_single = problems[name]
+    found, expected = GymnasiumVecEnv(make_vector(mode)), make_single()
+    assert (found.observation_space, found.action_space) == (expected.observation_space, expected.action_space)
+    for env in (found, expected):
+        env.seed(5)
+    np.testing.assert_array_equal(found.reset(), expected.reset())
+    found.action_space.seed(0)
+    ends = 0
+    for _ in range(12):
+        for info, other in zip(found.reset_infos, expected.reset_infos, strict=True):
+            assert_same(info, other)
+        actions = np.array([found.action_space.sample() for _ in range(N_ENVS)])
+        *step, infos = found.step(actions)
+        *other_step, other_infos = expected.step(actions)
+        for a, b in zip(step, other_step, strict=True):
+            assert a.dtype == b.dtype
+            np.testing.assert_array_equal(a, b)
+        for info, other in zip(infos, other_infos, strict=True):
+            assert_same(info, other)
+        ends += step[2].sum()
+    assert ends >= 2 * N_ENVS
+
+
+def test_time_limits_are_told_from_terminations(problems):
+    for name, expected in (("battery", True), ("time limit", True), ("termination", False)):
+        env = GymnasiumVecEnv(problems[name][0]("SameStep"))
+        env.reset()
+        for _ in range(5):
+            observations, _, dones, infos = env.step(np.zeros((N_ENVS, *env.action_space.shape)))
+            if dones.any():
+                break
+            assert not any(info["TimeLimit.truncated"] for info in infos)
+        assert dones.all() and all(info["TimeLimit.truncated"] is expected for info in infos)
+        # the observation is already the next episode's
+        assert all((info["terminal_observation"] != o).any() for info, o in zip(infos, observations, strict=True))
+
+
+def test_episodes_may_not_start_one_step_late(problems):
+    for name in ("battery", "time limit"):
+        with pytest.raises(ValueError, match=r"has autoreset mode AutoresetMode.NEXT_STEP.*autoreset_mode='SameStep'"):
+            GymnasiumVecEnv(problems[name][0](AutoresetMode.NEXT_STEP))
+
+
+def test_arrays_that_the_environment_reuses_stay_as_they_were(make_env):
+    env = GymnasiumVecEnv(SyncVectorEnv([make_env] * N_ENVS, copy=False, autoreset_mode="SameStep"))
+    first = env.reset()
+    kept = first.copy()
+    env.step(np.ones((N_ENVS, 2)))
+    np.testing.assert_array_equal(first, kept)
+
+
+def test_dicts_of_observations(make_env):
+    class Split(gym.ObservationWrapper):
+        def __init__(self):
+            super().__init__(make_env(episode_length=3))
+            self.observation_space = gym.spaces.Dict({"a": self.env.observation_space, "b": self.env.observation_space})
+
+        def observation(self, observation):
+            return {"a": observation, "b": -observation}
+
+    env = GymnasiumVecEnv(SyncVectorEnv([Split] * N_ENVS, autoreset_mode="SameStep"))
+    env.reset()
+    for _ in range(3):
+        observations, _, dones, infos = env.step(np.ones((N_ENVS, 2)))
+    assert dones.all() and observations["a"].shape == (N_ENVS, 2)
+    last = infos[1]["terminal_observation"]
+    np.testing.assert_array_equal(last["a"], -last["b"])
+
+
+@pytest.mark.parametrize("algorithm", [LAC, SAC, TD3])
+def test_algorithms_train_and_come_back_from_a_file(discharges, algorithm, tmp_path):
+    def make():
+        env = gym.make_vec("BatteryQmax-v0", num_envs=8, autoreset_mode="SameStep", dataset=discharges, episode_steps=6)
+        return VecNormalize(VecMonitor(GymnasiumVecEnv(env)), norm_reward=False)
+
+    model = algorithm("MlpPolicy", make(), learning_starts=16, batch_size=16, policy_kwargs={"net_arch": [8]}, seed=0)
+    model.learn(160)
+    assert model._n_updates > 0 and len(model.ep_info_buffer) > 0
+    assert {episode["l"] for episode in model.ep_info_buffer} == {6}
+    buffer = model.replay_buffer
+    # every sixth transition ends in a time limit, and leads to the last observation of its episode
+    np.testing.assert_array_equal(buffer.timeouts[: buffer.pos].sum(axis=0), buffer.pos // 6)
+    end, env = np.argwhere(buffer.timeouts)[0]
+    assert (buffer.next_observations[end, env] != buffer.observations[end + 1, env]).any()
+    model.save(tmp_path / "model")
+    again = algorithm.load(tmp_path / "model", env=make())
+    again.learn(16)
+    observation = buffer.observations[:1, 0]
+    assert again.predict(observation, deterministic=True)[0].shape == (1, 1)
+
+
+def test_seeds_are_used_once(problems):
+    env = GymnasiumVecEnv(problems["battery"][0]("SameStep"))
+    env.seed(1)
+    first, second = env.reset(), env.reset()
+    assert (first != second).any()
+    env.seed(1)
+    np.testing.assert_array_equal(env.reset(), first)
+
+
+def test_options_are_those_of_the_environment_and_the_same_for_all(problems):
+    env = GymnasiumVecEnv(problems["battery"][0]("SameStep"))
+    env.set_options({"trajectory": 2, "sample": 100})
+    env.reset()
+    np.testing.assert_array_equal(env.env.unwrapped.task.trajectory, 2)
+    env.set_options([{"trajectory": n} for n in range(N_ENVS)])
+    with pytest.raises(ValueError, match="the same options for all"):
+        env.reset()
+
+
+def test_attributes_and_methods_of_single_environments(problems):
+    env = GymnasiumVecEnv(problems["time limit"][0]("SameStep"))
+    assert env.get_attr("g") == [10.0] * N_ENVS and env.has_attr("g") and not env.has_attr("gravity")
+    env.set_attr("g", 1.62, indices=[1])
+    assert env.get_attr("g", indices=[0, 1]) == [10.0, 1.62]
+    env.set_attr("g", 9.81)
+    assert env.get_attr("g") == [9.81] * N_ENVS
+    env.reset()
+    assert len(env.env_method("_get_obs", indices=[2])) == 1
+    assert env.env_is_wrapped(gym.wrappers.TimeLimit) == [True] * N_ENVS and not any(env.env_is_wrapped(Monitor))
+
+
+def test_attributes_and_methods_of_an_environment_that_computes_all_at_once(problems):
+    env = GymnasiumVecEnv(problems["battery"][0]("SameStep"))
+    assert env.get_attr("num_envs", indices=[0, 1]) == [N_ENVS] * 2 and not env.has_attr("gravity")
+    env.set_attr("mark", 3)
+    assert env.env.unwrapped.mark == 3
+    with pytest.raises(ValueError, match=r"All 3 environments share 'mark': it cannot be set for \[1\] only"):
+        env.set_attr("mark", 4, indices=1)
+    env.reset()
+    assert env.env_method("render", indices=0) == [None]
+    assert env.env_is_wrapped(Monitor) == [False] * N_ENVS
+
+
+def test_pictures(discharges):
+    vector = gym.make_vec("BatteryQmax-v0", num_envs=2, autoreset_mode="SameStep", render_mode="rgb_array", dataset=discharges)
+    env = GymnasiumVecEnv(vector)
+    env.reset()
+    env.step(np.zeros((2, 1)))
+    assert env.render_mode == "rgb_array" and env.render("rgb_array").shape == (800, 600, 3)
+    env.close()
+    assert vector.closed
