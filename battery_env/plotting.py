@@ -3,18 +3,33 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from battery_env.electrochemistry import LOAD_UNIT_SYMBOLS, FloatArray, LoadUnit
+from battery_env.estimators.base import Estimate, EstimateTrace, Record
+from battery_env.estimators.cramer_rao import CramerRaoBound, Sensitivities, sensitivities
+from battery_env.estimators.record_model import RecordModel
 from battery_env.files import replacing
 
 #: Colours that colour-blind readers can tell apart (Okabe & Ito).
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 LABELS = {"q_mobile": "$q^{max}$ (C)", "r_o": r"$R_o$ ($\Omega$)"}
+
+# What an axis of estimates shows: all but this share at either end, and some room; the first estimates of a discharge can be
+# anything.
+_OUTLIERS = 0.02
+_ROOM = 0.35
+# Bins of the lines through clouds of points.
+_BINS = 11
+# dV/dq is drawn on a scale that is linear within this, V/C, and logarithmic beyond: it spans three decades, from zero.
+_LINEAR_SLOPE_V_PER_C = 1e-6
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -98,4 +113,147 @@ def plot_learning_curves(curves: Mapping[str, list[pd.DataFrame]], title: str) -
         axes.grid(which="both", alpha=0.25)
         axes.legend(frameon=False, fontsize=9)
     figure.suptitle(title, fontsize=11)
+    return figure
+
+
+def plot_discharge(record: Record, estimates: Mapping[str, Estimate], model: RecordModel | None = None) -> Figure:
+    """
+    The measured voltage of one discharge with that of the model at some estimates, and below it the error of the model.
+
+    :param record: one discharge, simulated or recorded
+    :param estimates: parameters of the model, by name for the legend
+    :param model: the model; ``None``: isothermal, in steps of 1 s, of a new cell that is full at the first sample
+    :return: the figure; a line ends where its model cell is empty
+    """
+    figure = new_figure(6.4, 4.6)
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[3, 2])
+    upper.plot(record.time_s, record.voltage_V, "o", ms=2.2, color="0.6", label="measured")
+    lower.axhline(0.0, color="0.6", lw=0.8)
+    for colour, (name, estimate) in zip(COLOURS, estimates.items(), strict=False):
+        model_V = sensitivities(record, estimate, model).voltage_V
+        upper.plot(record.time_s, model_V, color=colour, lw=1.4, label=name)
+        lower.plot(record.time_s, 1e3 * (model_V - record.voltage_V), color=colour, lw=1.0, label=name)
+    upper.set_ylabel("voltage (V)")
+    upper.legend(frameon=False, fontsize=9)
+    lower.set(xlabel="time (s)", ylabel="model - measured (mV)")
+    return _finished(figure, upper, lower)
+
+
+def plot_estimates(
+    traces: Mapping[str, EstimateTrace],
+    true: Estimate | None = None,
+    bound: CramerRaoBound | None = None,
+    parameters: Sequence[str] = ("q_mobile", "r_o"),
+) -> Figure:
+    """
+    Estimates during one discharge, one panel per parameter and one colour per calibrator, with bands of two stated standard
+    deviations to either side. Estimates that their calibrator does not take for settled are dotted.
+
+    :param traces: estimates of that discharge, by name of the calibrator
+    :param true: the true parameters, if they are known
+    :param bound: the least standard deviations that are possible, drawn around ``true``
+    :param parameters: which to show
+    :return: the figure
+    :raises ValueError: for a bound without true parameters
+    """
+    if bound is not None and true is None:
+        raise ValueError("the bound is drawn around the true parameters: give them as `true`")
+    figure = new_figure(6.8, 2.4 * len(parameters) + 0.5)
+    panels = figure.subplots(len(parameters), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, parameter in zip(panels, parameters, strict=True):
+        shown = [getattr(trace, parameter) for trace in traces.values()]
+        if true is not None:
+            shown.append(np.array([getattr(true, parameter)]))
+            axes.axhline(getattr(true, parameter), color="0.25", lw=1.0, label="true")
+            if bound is not None:
+                _band(axes, bound.time_s, shown[-1], getattr(bound, f"sd_{parameter}"), "0.5", "Cramér-Rao bound, ± 2 sd")
+        for colour, (name, trace) in zip(COLOURS, traces.items(), strict=False):
+            _trace_line(axes, trace, parameter, colour, name)
+        axes.set(ylabel=LABELS[parameter], ylim=_limits(shown))
+        axes.ticklabel_format(useOffset=False)
+    panels[-1].set_xlabel("time (s)")
+    handles, labels = panels[0].get_legend_handles_labels()
+    if any(trace.settled is not None and not trace.settled.all() for trace in traces.values()):
+        handles += panels[0].plot([], [], ":", color="0.25")
+        labels.append("not settled yet")
+    figure.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False, fontsize=9)
+    return _finished(figure, *panels)
+
+
+def _trace_line(axes: Axes, trace: EstimateTrace, parameter: str, colour: str, name: str) -> None:
+    estimates, sd = getattr(trace, parameter), getattr(trace, f"sd_{parameter}")
+    if sd is not None:
+        _band(axes, trace.time_s, estimates, sd, colour)
+    settled = np.ones(len(estimates), dtype=np.bool_) if trace.settled is None else trace.settled
+    # a single estimate is no line
+    marker = "o" if len(estimates) == 1 else ""
+    axes.plot(trace.time_s, np.where(settled, estimates, np.nan), color=colour, lw=1.5, marker=marker, label=name)
+    if not settled.all():
+        # up to the next settled one, so that no gap is left
+        dotted = ~settled | np.append(~settled[1:], False) | np.append(False, ~settled[:-1])
+        axes.plot(trace.time_s, np.where(dotted, estimates, np.nan), ":", color=colour, lw=1.5, marker=marker)
+
+
+def _band(axes: Axes, time_s: FloatArray, middle: FloatArray, sd: FloatArray, colour: str, label: str | None = None) -> None:
+    # a standard deviation that is not finite is a band without a visible end
+    reach = np.where(np.isinf(sd), 1e3 * np.abs(middle).max(), 2.0 * sd)
+    axes.fill_between(time_s, middle - reach, middle + reach, color=colour, alpha=0.18, lw=0, label=label)
+
+
+def _limits(shown: Sequence[FloatArray]) -> tuple[float, float]:
+    ends = np.array([np.nanquantile(values, [_OUTLIERS, 1.0 - _OUTLIERS]) for values in shown])
+    low, high = float(ends.min()), float(ends.max())
+    room = max(_ROOM * (high - low), 1e-3 * abs(high))
+    return low - room, high + room
+
+
+def plot_errors(scores: Mapping[str, pd.DataFrame], parameter: str, load_unit: LoadUnit = "power") -> Figure:
+    """
+    On which discharges a calibrator errs: the error of each against its mean load and against its true parameter, with a line
+    through the medians of bins.
+
+    :param scores: what :func:`battery_env.evaluation.evaluate` returned, by name of the calibrator
+    :param parameter: ``"q_mobile"`` or ``"r_o"``
+    :param load_unit: of the discharges: ``"power"`` or ``"current"``
+    :return: the figure
+    """
+    figure = new_figure(7.6, 3.4)
+    panels = figure.subplots(1, 2, sharey=True)
+    columns = {"load": f"mean load ({LOAD_UNIT_SYMBOLS[load_unit]})", parameter: f"true {LABELS[parameter]}"}
+    for axes, (column, label) in zip(panels, columns.items(), strict=True):
+        for colour, (name, table) in zip(COLOURS, scores.items(), strict=False):
+            mape = table[f"{parameter}_mape_percent"]
+            axes.scatter(table[column], mape, s=5, color=colour, alpha=0.35, lw=0, rasterized=True)
+            bins = pd.cut(table[column], _BINS) if table[column].nunique() > _BINS else table[column]
+            middles = table.groupby(bins, observed=True)[column].mean()
+            axes.plot(middles, mape.groupby(bins, observed=True).median(), "o-", ms=3.5, lw=1.4, color=colour, label=name)
+        axes.set(yscale="log", xlabel=label)
+    panels[0].set_ylabel("MAPE of a discharge (%)")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=4, frameon=False, fontsize=9)
+    return _finished(figure, *panels)
+
+
+def plot_sensitivities(slopes: Mapping[str, Sensitivities]) -> Figure:
+    """
+    How much the voltage says about either parameter over a discharge: its derivatives.
+
+    :param slopes: what :func:`battery_env.estimators.cramer_rao.sensitivities` returned, by name for the legend
+    :return: the figure
+    """
+    figure = new_figure(6.4, 4.6)
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    for colour, (name, slope) in zip(COLOURS, slopes.items(), strict=False):
+        upper.plot(slope.time_s, 1e6 * slope.by_q_mobile_V_per_C, color=colour, lw=1.3, label=name)
+        lower.plot(slope.time_s, slope.by_r_o_A, color=colour, lw=1.3, label=name)
+    upper.set_yscale("symlog", linthresh=1e6 * _LINEAR_SLOPE_V_PER_C, linscale=0.5)
+    upper.set_ylabel(r"$\partial V / \partial q^{max}$ ($\mu$V/C)")
+    upper.legend(frameon=False, fontsize=9)
+    lower.set(xlabel="time (s)", ylabel=r"$\partial V / \partial R_o$ (mV/m$\Omega$)")
+    return _finished(figure, upper, lower)
+
+
+def _finished(figure: Figure, *panels: Axes) -> Figure:
+    for axes in panels:
+        axes.grid(alpha=0.25)
+    figure.align_ylabels()
     return figure

@@ -1,10 +1,25 @@
 """Figures, and the files they go to."""
 
+import numpy as np
 import pandas as pd
 import pytest
 
+from battery_env.electrochemistry import simulate
+from battery_env.estimators import CramerRaoBound, Estimate, EstimateTrace, RecordModel, cramer_rao_bound, sensitivities
 from battery_env.files import replacing
-from battery_env.plotting import new_figure, plot_learning_curves, plot_true_against_inferred, save_figure
+from battery_env.plotting import (
+    COLOURS,
+    LABELS,
+    new_figure,
+    plot_discharge,
+    plot_errors,
+    plot_estimates,
+    plot_learning_curves,
+    plot_sensitivities,
+    plot_true_against_inferred,
+    save_figure,
+)
+from battery_env.sensors import SensorErrors
 
 
 @pytest.fixture
@@ -31,6 +46,106 @@ def test_learning_curves_have_a_line_for_each_seed():
     for axes in figure.axes:
         assert len(axes.lines) == 3
         assert [text.get_text() for text in axes.get_legend().get_texts()] == ["LAC", "TD3"]
+
+
+@pytest.fixture
+def record():
+    return simulate(2.0, 6000.0, 0.15, load_unit="current")
+
+
+def test_discharge_shows_the_measured_voltage_the_model_and_its_error(record):
+    offset = SensorErrors(offset_V=0.010).apply(record, np.random.default_rng(0))
+    figure = plot_discharge(offset, {"true": Estimate(6000.0, 0.15), "aged": Estimate(5000.0, 0.15)})
+    voltage, error = figure.axes
+    measured, model, _ = voltage.lines
+    np.testing.assert_array_equal(measured.get_ydata(), offset.voltage_V)
+    np.testing.assert_allclose(model.get_ydata(), record.voltage_V, atol=1e-9)
+    np.testing.assert_allclose(error.lines[1].get_ydata(), -10.0, atol=1e-6)
+    # the aged cell is empty before the record ends
+    aged = error.lines[2].get_ydata()
+    assert np.isnan(aged[-1]) and not np.isnan(aged[: len(aged) // 2]).any()
+    assert [text.get_text() for text in voltage.get_legend().get_texts()] == ["measured", "true", "aged"]
+    labels = (voltage.get_ylabel(), error.get_ylabel(), error.get_xlabel())
+    assert labels == ("voltage (V)", "model - measured (mV)", "time (s)")
+
+
+def test_discharge_follows_the_model_that_is_given(record):
+    figure = plot_discharge(record, {"warm": Estimate(6000.0, 0.15)}, RecordModel(thermal=True))
+    assert np.abs(figure.axes[1].lines[1].get_ydata()).max() > 1.0
+
+
+@pytest.fixture
+def traces():
+    time_s, sd = np.array([10.0, 20.0, 30.0, 40.0]), np.array([np.inf, 300.0, 60.0, 10.0])
+    settled = np.array([False, False, True, True])
+    q_mobile = np.array([7000.0, 6200.0, 6050.0, 6001.0])
+    filtered = EstimateTrace(time_s, q_mobile, 0.15 + 0.0 * time_s, sd, 1e-5 * sd, settled)
+    single = EstimateTrace(time_s[-1:], np.array([6010.0]), np.array([0.151]))
+    return {"filter": filtered, "policy": single}
+
+
+def test_estimates_have_a_panel_per_parameter_bands_and_a_dotted_part_that_is_not_settled(traces):
+    time_s = np.array([0.0, 40.0])
+    bound = CramerRaoBound(time_s, np.array([np.inf, 5.0]), np.array([np.inf, 1e-4]))
+    figure = plot_estimates(traces, Estimate(6000.0, 0.15), bound)
+    upper, lower = figure.axes
+    assert (upper.get_ylabel(), lower.get_ylabel(), lower.get_xlabel()) == (
+        LABELS["q_mobile"],
+        LABELS["r_o"],
+        "time (s)",
+    )
+    true, settled, dotted, single = upper.lines[:4]
+    assert set(true.get_ydata()) == {6000.0}
+    np.testing.assert_array_equal(settled.get_ydata(), [np.nan, np.nan, 6050.0, 6001.0])
+    np.testing.assert_array_equal(dotted.get_ydata(), [7000.0, 6200.0, 6050.0, np.nan])
+    assert dotted.get_linestyle() == ":" and single.get_marker() == "o" and single.get_color() == COLOURS[1]
+    # around the truth, and around the filter's estimates; the policy states none
+    _, band = upper.collections
+    assert band.get_paths()[0].vertices[:, 1].max() > 1e6
+    assert 6001.0 + 2.0 * 10.0 in band.get_paths()[0].vertices[:, 1]
+    low, high = upper.get_ylim()
+    assert 4000.0 < low < 6000.0 and 7000.0 < high < 8000.0
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert labels == ["true", "Cramér-Rao bound, ± 2 sd", "filter", "policy", "not settled yet"]
+
+
+def test_estimates_of_a_real_cell_have_no_truth(traces):
+    figure = plot_estimates({"policy": traces["policy"]}, parameters=["r_o"])
+    (axes,) = figure.axes
+    assert len(axes.lines) == 1 and not axes.collections
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["policy"]
+
+
+def test_a_bound_needs_the_true_parameters(traces, record):
+    with pytest.raises(ValueError, match="true"):
+        plot_estimates(traces, bound=cramer_rao_bound(record, 0.01))
+
+
+def test_errors_are_drawn_against_load_and_parameter(scores):
+    many = pd.DataFrame({"load": np.linspace(1.0, 3.0, 60), "r_o": np.linspace(0.1, 0.2, 60)})
+    many["r_o_mape_percent"] = many["load"]
+    figure = plot_errors({"LAC": scores, "EKF": many}, "r_o", load_unit="current")
+    by_load, by_parameter = figure.axes
+    assert (by_load.get_xlabel(), by_parameter.get_xlabel()) == ("mean load (A)", f"true {LABELS['r_o']}")
+    assert by_load.get_ylabel() == "MAPE of a discharge (%)" and by_load.get_yscale() == "log"
+    assert by_load.collections[0].get_offsets()[:, 0].tolist() == [8.0, 12.0, 16.0]
+    assert by_parameter.collections[0].get_offsets()[:, 1].tolist() == [1.0, 1.0, 2.5]
+    # a line through every load if these are few, through bins if they are many
+    assert by_load.lines[0].get_xdata().tolist() == [8.0, 12.0, 16.0]
+    assert by_load.lines[0].get_ydata().tolist() == [1.0, 1.0, 2.5]
+    assert len(by_load.lines[1].get_xdata()) < 20
+    np.testing.assert_allclose(by_load.lines[1].get_ydata(), by_load.lines[1].get_xdata(), rtol=0.05)
+
+
+def test_sensitivities_are_drawn_in_microvolts_per_coulomb_and_volts_per_ohm(record):
+    slopes = sensitivities(record)
+    figure = plot_sensitivities({"2 A": slopes})
+    upper, lower = figure.axes
+    np.testing.assert_allclose(upper.lines[0].get_ydata(), 1e6 * slopes.by_q_mobile_V_per_C)
+    np.testing.assert_allclose(lower.lines[0].get_ydata()[100:], -2.0, atol=1e-3)
+    assert r"$\mu$V/C" in upper.get_ylabel() and r"mV/m$\Omega$" in lower.get_ylabel()
+    assert lower.get_xlabel() == "time (s)"
+    assert [text.get_text() for text in upper.get_legend().get_texts()] == ["2 A"]
 
 
 def test_a_figure_replaces_the_one_before(tmp_path):

@@ -1,0 +1,203 @@
+"""
+Write the parts of docs/battery_env.md that stand in the code already: the environments, from the docstrings of their classes,
+and the data sets, estimators and columns of the evaluation, from theirs.
+
+.. code-block:: bash
+
+  python -m benchmarks.environment_page
+
+The rest of the page is written by hand. What is not stands between ``<!-- begin NAME -->`` and ``<!-- end NAME -->``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+import re
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from importlib import import_module
+from pathlib import Path
+
+import battery_env.estimators
+from battery_env.calibration.data import standard_dataset
+from battery_env.calibration.env import CalibrationEnv
+from battery_env.calibration.registration import ENTRY_POINTS
+from battery_env.calibration.variants import FullStateEnv
+from battery_env.estimators import Estimator, OnlineEstimator
+from battery_env.evaluation import evaluate
+from battery_env.loads import constant
+from battery_env.trajectories import TrajectoryDataset
+from benchmarks.reporting import write_text
+
+PAGE = Path(__file__).parents[1] / "docs" / "battery_env.md"
+
+
+def environment_class(env_id: str) -> type[CalibrationEnv]:
+    """
+    The class of a registered environment for one cell, whose docstring is its page.
+
+    :param env_id: its id
+    :return: the class
+    """
+    module, name = ENTRY_POINTS[env_id].split(":")
+    found: type[CalibrationEnv] = getattr(import_module(module), name)
+    return found
+
+
+def ids() -> str:
+    """
+    All environments in one table.
+
+    :return: Markdown
+    """
+    # spaces and episodes do not depend on the discharges; these are quickly made, and as many as a life has cycles
+    dataset = TrajectoryDataset.generate("joint", 20, [constant(8.0)], seed=0)
+    rows = []
+    for env_id in ENTRY_POINTS:
+        env = environment_class(env_id)(dataset=dataset)
+        rows.append(
+            {
+                "id": f"[`{env_id}`](#{env_id.lower()})",
+                "measured": "the full state" if isinstance(env, FullStateEnv) else "current and voltage",
+                "to be found": " and ".join(f"`{name}`" for name in env.task.parameters),
+                "numbers in an observation": env.task.observation_size,
+                "in an action": len(env.task.parameters),
+                "decisions in an episode": env.task.episode_steps,
+            }
+        )
+    return _markdown(rows)
+
+
+def environments() -> str:
+    """
+    The pages of all environments.
+
+    :return: Markdown
+    """
+    pages = []
+    for env_id in ENTRY_POINTS:
+        page = inspect.getdoc(environment_class(env_id)) or ""
+        pages.append(f"### {env_id}\n\n" + re.sub(r"^## ", "#### ", page, flags=re.MULTILINE))
+    return "\n\n".join(pages)
+
+
+def data_sets() -> str:
+    """
+    The standard data sets.
+
+    :return: Markdown
+    """
+    (table,) = _tables(standard_dataset)
+    return _markdown([dict(zip(table[0], row, strict=True)) for row in table[1:]])
+
+
+def columns() -> str:
+    """
+    The columns of the evaluation.
+
+    :return: Markdown
+    """
+    return _markdown([{"column": name, "meaning": meaning} for table in _tables(evaluate) for name, meaning in table])
+
+
+def estimators() -> str:
+    """
+    All calibrators that need no learning in one table.
+
+    :return: Markdown
+    """
+    offered = [getattr(battery_env.estimators, name) for name in battery_env.estimators.__all__]
+    rows = []
+    for calibrator in offered:
+        if not (inspect.isclass(calibrator) and issubclass(calibrator, Estimator)) or inspect.isabstract(calibrator):
+            continue
+        # full states are what simulated discharges have and records in general have not
+        needs_state = inspect.signature(calibrator.estimate).parameters["record"].annotation == "Trajectory"
+        summary = " ".join((inspect.getdoc(calibrator) or "").split("\n\n")[0].split())
+        rows.append(
+            {
+                "class": f"`{calibrator.__name__}`",
+                "estimate": re.split(r"(?<=[a-z)])\. ", summary)[0].rstrip("."),
+                "needs": "the full state" if needs_state else "current and voltage",
+                "sample by sample": "yes, `update`" if issubclass(calibrator, OnlineEstimator) else "",
+            }
+        )
+    return _markdown(rows)
+
+
+#: The parts of the page that are not written by hand.
+PARTS: dict[str, Callable[[], str]] = {
+    "ids": ids,
+    "environments": environments,
+    "data sets": data_sets,
+    "estimators": estimators,
+    "columns": columns,
+}
+
+
+def _markdown(rows: Sequence[Mapping[str, object]]) -> str:
+    names = list(rows[0])
+    lines = [names, ["---"] * len(names), *([str(row[name]) for name in names] for row in rows)]
+    # a bar within a cell would end it
+    return "\n".join("| " + " | ".join(cell.replace("|", r"\|") for cell in line) + " |" for line in lines)
+
+
+def _tables(documented: Callable[..., object]) -> list[list[list[str]]]:
+    """
+    The tables of a docstring, in reStructuredText's simple form.
+
+    :param documented: what has the docstring
+    :return: for each table its rows of cells; a line that goes on with the one before has been joined to it
+    """
+    tables: list[list[list[str]]] = []
+    columns_of_text: list[slice] = []  # of the table that the present line belongs to, if any
+    for line in (inspect.getdoc(documented) or "").splitlines():
+        if re.fullmatch(r"=+( +=+)+", line):
+            if not columns_of_text:
+                tables.append([])
+            starts = [match.start() for match in re.finditer("=+", line)]
+            columns_of_text = [slice(*ends) for ends in zip(starts, [*starts[1:], None], strict=True)]
+        elif not line.strip():
+            columns_of_text = []
+        elif columns_of_text:
+            rows, row = tables[-1], [line[part].strip() for part in columns_of_text]
+            if rows and (not row[0] or rows[-1][0].endswith(",")):
+                rows[-1] = [" ".join(filter(None, cells)) for cells in zip(rows[-1], row, strict=True)]
+            else:
+                rows.append(row)
+    return tables
+
+
+def render(page: str) -> str:
+    """
+    A page with its parts as the code has them now.
+
+    :param page: the page
+    :return: the same, with all that stands between markers written anew
+    :raises ValueError: if a marker is missing
+    """
+    for name, write in PARTS.items():
+        begin, end = f"<!-- begin {name} -->", f"<!-- end {name} -->"
+        if page.count(begin) != 1 or page.count(end) != 1:
+            raise ValueError(f"the page must have {begin} and {end}, once each")
+        before, rest = page.split(begin)
+        page = f"{before}{begin}\n\n{write()}\n\n{end}{rest.split(end)[1]}"
+    return page
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """
+    The command line.
+
+    :param arguments: of the command line by default
+    """
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--page", type=Path, default=PAGE)
+    chosen = parser.parse_args(arguments)
+    write_text(chosen.page, render(chosen.page.read_text(encoding="utf-8")))
+    sys.stdout.write(f"{chosen.page}\n")
+
+
+if __name__ == "__main__":
+    main()

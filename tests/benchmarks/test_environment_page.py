@@ -1,0 +1,125 @@
+"""The page of the environments: what it takes from the code is what the code says now."""
+
+import inspect
+import re
+
+import pytest
+
+from battery_env import ClosedForm, TrajectoryDataset, evaluate, plotting
+from battery_env.calibration.registration import ENTRY_POINTS
+from battery_env.loads import constant
+from benchmarks import environment_page
+
+TEXT = environment_page.PAGE.read_text(encoding="utf-8")
+
+
+def first_cells(section):
+    """The first column of the tables of one section, without its code marks."""
+    part = re.search(rf"^#+ {section}\n(.*?)(?=^#)", TEXT + "\n#", flags=re.MULTILINE | re.DOTALL)[1]
+    cells = [line.split("|")[1].strip() for line in part.splitlines() if re.match(r"\| `", line)]
+    return [name for cell in cells for name in re.findall(r"`+(.*?)`+", cell)]
+
+
+@pytest.fixture(scope="module")
+def dataset():
+    return TrajectoryDataset.generate("joint", 20, [constant(8.0)], seed=0)
+
+
+def test_the_page_says_what_the_code_says():
+    assert environment_page.render(TEXT) == TEXT, "run python -m benchmarks.environment_page"
+
+
+def test_every_environment_has_all_sections_of_its_page():
+    wanted = ["Description", "Observation space", "Action space", "Reward", "Starting state", "Episode end", "Arguments"]
+    for env_id in ENTRY_POINTS:
+        page = inspect.getdoc(environment_page.environment_class(env_id))
+        headings = re.findall(r"^## (.*)", page, flags=re.MULTILINE)
+        assert [heading for heading in headings if heading in wanted] == wanted, env_id
+        assert headings[-1] == "Version history", env_id
+        assert f"### {env_id}\n" in TEXT and f"[`{env_id}`](#{env_id.lower()})" in TEXT
+
+
+def test_boxes_in_the_docstrings_are_the_spaces(dataset):
+    for env_id in ENTRY_POINTS:
+        env = environment_page.environment_class(env_id)(dataset=dataset)
+        shapes = re.findall(r"Box\(-?\d+, \d+, \((\d+),\), float32\)", inspect.getdoc(type(env)))
+        found = [str(space.shape[0]) for space in (env.observation_space, env.action_space)]
+        # a page may refer to another one for the action
+        assert shapes == found[: len(shapes)] and shapes, env_id
+
+
+def test_common_options_are_options_of_all(dataset):
+    names = first_cells("Options that all of them take")
+    options = {
+        "split": "test",
+        "start": "true",
+        "consistency": 0.1,
+        "process_noise_V": 1e-4,
+        "render_mode": "rgb_array",
+        "load": "constant",
+        "mismatch": 0.1,
+        "dt_s": 1.0,
+        "episode_steps": 4,
+    }
+    assert set(names) == {*options, "dataset"}
+    for env_id in ENTRY_POINTS:
+        for name, value in options.items():
+            if env_id == "BatteryAging-v0" and name in ("load", "mismatch", "dt_s", "episode_steps"):
+                continue
+            try:
+                environment_page.environment_class(env_id)(dataset=dataset, **{name: value})
+            except ValueError as error:
+                # known, but not beside a data set of one's own
+                assert "dataset stands in place of" in str(error), (env_id, name)
+
+
+def test_columns_in_the_page_are_those_of_the_evaluation(dataset):
+    scores = evaluate(ClosedForm(), dataset[:1])
+    names = [name.strip(",. ") for name in first_cells("Evaluation")]
+    shown = {name.replace("p_", f"{p}_", 1) if name.startswith("p_") else name for name in names for p in ("q_mobile", "r_o")}
+    shown |= {p if name == "p" else name for name in names for p in ("q_mobile", "r_o")}
+    shown |= {name.replace("25", share) for name in names for share in ("50", "75") if "at_25" in name}
+    assert set(scores.columns) - {"trajectory"} <= shown
+
+
+def test_all_plots_are_listed():
+    functions = {name for name in vars(plotting) if name.startswith("plot_")}
+    assert set(first_cells("Plots")) == functions
+
+
+def documented():
+    """
+    Something.
+
+    ====== =========
+    name   meaning
+    ====== =========
+    ``a``  the first,
+           going on
+    ``b``, both
+    ``c``  of them
+    ====== =========
+
+    ====== =========
+    ``d``  alone
+    ====== =========
+    """
+
+
+def test_tables_of_docstrings_are_read_with_their_continued_lines():
+    one, other = environment_page._tables(documented)
+    assert one == [["name", "meaning"], ["``a``", "the first, going on"], ["``b``, ``c``", "both of them"]]
+    assert other == [["``d``", "alone"]]
+
+
+def test_only_what_stands_between_markers_is_written(tmp_path, capsys):
+    page = tmp_path / "page.md"
+    stale = re.sub(r"(<!-- begin columns -->).*?(<!-- end columns -->)", r"\1 old \2", TEXT, flags=re.DOTALL)
+    page.write_text(stale, encoding="utf-8")
+    environment_page.main(["--page", str(page)])
+    assert page.read_text(encoding="utf-8") == TEXT and str(page) in capsys.readouterr().out
+
+
+def test_a_page_without_its_markers_is_refused():
+    with pytest.raises(ValueError, match="begin ids"):
+        environment_page.render(TEXT.replace("<!-- begin ids -->", ""))
