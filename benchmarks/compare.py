@@ -22,9 +22,9 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import pandas as pd
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -34,6 +34,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from tqdm import tqdm
 
 from battery_env.calibration.policy import PolicyEstimator
+from battery_env.calibration.task import Parameter
+from battery_env.calibration.variants import FullStateEnv
 from battery_env.estimators.closed_form import ClosedForm
 from battery_env.evaluation import evaluate, summarize
 from battery_env.plotting import plot_learning_curves, plot_true_against_inferred, save_figure
@@ -107,21 +109,21 @@ class ProgressCallback(BaseCallback):
     def _on_step(self) -> bool:
         self.bar.update(self.num_timesteps - self.bar.n)
         if self.calibration.history:
-            self.bar.set_postfix_str(f"MAPE {self.calibration.history[-1]['mape_percent']:.2f} %", refresh=False)
+            self.bar.set_postfix_str(f"MAPE {self.calibration.history[-1][self.calibration.objective]:.2f} %", refresh=False)
         return True
 
     def _on_training_end(self) -> None:
         self.bar.close()
 
 
-def parameter_of(env_id: str) -> Literal["q_mobile", "r_o"]:
+def parameters_of(env_id: str) -> tuple[Parameter, ...]:
     """
-    Which parameter an environment is about.
+    Which parameters an environment is about.
 
     :param env_id: id of a full-state environment
-    :return: ``"q_mobile"`` or ``"r_o"``
+    :return: one or both of ``"q_mobile"`` and ``"r_o"``
     """
-    return PolicyEstimator.environment(env_id).task.parameter
+    return PolicyEstimator.environment(env_id).task.parameters
 
 
 def held_out_trajectories(env_id: str) -> TrajectoryDataset:
@@ -130,8 +132,12 @@ def held_out_trajectories(env_id: str) -> TrajectoryDataset:
 
     :param env_id: id of a full-state environment
     :return: the test part of its data set
+    :raises ValueError: for another environment
     """
-    return PolicyEstimator.environment(env_id, split="test").dataset
+    env = PolicyEstimator.environment(env_id, split="test")
+    if not isinstance(env, FullStateEnv):
+        raise ValueError(f"{env_id} is no full-state environment; voltage-only ones are compared by benchmarks.voltage")
+    return env.dataset
 
 
 def run(algo: str, env_id: str, seed: int, timesteps: int, evaluations: int, out: Path, position: int = 0) -> None:
@@ -155,7 +161,7 @@ def run(algo: str, env_id: str, seed: int, timesteps: int, evaluations: int, out
         if done["timesteps"] != timesteps:
             raise ValueError(f"{folder} holds a run of {done['timesteps']} steps, not {timesteps}; choose another --out")
         return
-    parameter, test = parameter_of(env_id), held_out_trajectories(env_id)
+    parameters, test = parameters_of(env_id), held_out_trajectories(env_id)
     CheckpointCallback.recover(checkpoint)
     resumed = (checkpoint / "model.zip").exists()
     clock = _Clock(folder / "training_seconds.json")
@@ -182,7 +188,7 @@ def run(algo: str, env_id: str, seed: int, timesteps: int, evaluations: int, out
     calibration = CalibrationCallback(
         scores_on_subset,
         eval_freq=every,
-        metrics={f"{parameter}_mape_percent": "mape_percent"},
+        metrics={f"{name}_mape_percent": _metric(name, parameters) for name in parameters},
         log_path=folder / "calibration.csv",
         verbose=0,
     )
@@ -201,10 +207,16 @@ def run(algo: str, env_id: str, seed: int, timesteps: int, evaluations: int, out
     configuration["hyperparameters"] = dict(hyperparameters)
     write_csv(folder / "scores.csv", scores, configuration)
     result = {"env": env_id, "algo": algo, "seed": seed, "timesteps": timesteps, "updates": model._n_updates}
-    result |= {"training_minutes": clock.seconds / 60.0, **summarize(scores, parameter)}
+    result["training_minutes"] = clock.seconds / 60.0
     result["time_per_update_us"] = 1e6 * float(scores["time_per_update_s"].iloc[0])
+    result["scores"] = {name: summarize(scores, name) for name in parameters}
     write_text(summary_file, json.dumps(result, indent=2) + "\n")
     shutil.rmtree(checkpoint, ignore_errors=True)
+
+
+def _metric(parameter: str, parameters: Sequence[str]) -> str:
+    # as it is called in TensorBoard and in files: by its parameter only where there are two
+    return "mape_percent" if len(parameters) == 1 else f"{parameter}_mape_percent"
 
 
 class _Clock(BaseCallback):
@@ -236,10 +248,11 @@ def report(out: Path, configuration: dict[str, Any]) -> str:
     :param configuration: what was chosen on the command line
     :return: the table in markdown
     """
-    runs = pd.DataFrame([json.loads(file.read_text()) for file in sorted(out.glob("*/*/summary.json"))])
+    runs = _rows(sorted(out.glob("*/*/summary.json")))
     tables = []
-    for env_id, of_env in runs.groupby("env"):
-        parameter = parameter_of(str(env_id))
+    for (env_id, name_of_parameter), of_env in runs.groupby(["env", "parameter"]):
+        parameters, parameter = parameters_of(str(env_id)), str(name_of_parameter)
+        metric = _metric(parameter, parameters)
         inferred: dict[str, pd.DataFrame] = {}
         curves: dict[str, list[pd.DataFrame]] = {}
         histories: dict[tuple[str, int], pd.DataFrame] = {}
@@ -247,25 +260,42 @@ def report(out: Path, configuration: dict[str, Any]) -> str:
             name = str(algo).upper()
             folders = [out / str(env_id) / f"{algo}_seed{seed}" for seed in of_algo["seed"]]
             inferred[name] = pd.read_csv(folders[0] / "scores.csv")
-            curves[name] = [pd.read_csv(folder / "calibration.csv") for folder in folders]
+            histories_of_algo = [pd.read_csv(folder / "calibration.csv") for folder in folders]
+            curves[name] = [
+                table.rename(columns={metric: "mape_percent", f"{metric}_worst": "mape_percent_worst"})
+                for table in histories_of_algo
+            ]
             histories |= {(name, seed): line for seed, line in zip(of_algo["seed"], curves[name], strict=True)}
         exact = evaluate(ClosedForm(), held_out_trajectories(str(env_id)))
-        row = {"env": env_id, "algo": "closed form", **summarize(exact, parameter)}
+        row = {"env": env_id, "parameter": parameter, "algo": "closed form", **summarize(exact, parameter)}
         row["time_per_update_us"] = 1e6 * float(exact["time_per_update_s"].iloc[0])
         tables += [of_env, pd.DataFrame([row])]
 
-        save_figure(plot_true_against_inferred(inferred, parameter), out / f"{env_id}_inferred.png")
+        stem = str(env_id) if len(parameters) == 1 else f"{env_id}_{parameter}"
+        save_figure(plot_true_against_inferred(inferred, parameter), out / f"{stem}_inferred.png")
         columns = ["load", parameter, f"{parameter}_hat", f"{parameter}_spread", f"{parameter}_mape_percent"]
         points = pd.concat({algo: scores[columns] for algo, scores in inferred.items()}, names=["algo", "trajectory"])
-        write_csv(out / f"{env_id}_inferred.csv", points.reset_index(), configuration)
-        save_figure(plot_learning_curves(curves, str(env_id)), out / f"{env_id}_learning.png")
+        write_csv(out / f"{stem}_inferred.csv", points.reset_index(), configuration)
+        save_figure(plot_learning_curves(curves, stem), out / f"{stem}_learning.png")
         history = pd.concat(histories, names=["algo", "seed"]).droplevel(-1)
-        write_csv(out / f"{env_id}_learning.csv", history.reset_index(), configuration)
+        write_csv(out / f"{stem}_learning.csv", history.reset_index(), configuration)
     table = pd.concat(tables, ignore_index=True)
     write_csv(out / "compare.csv", table, configuration)
     markdown = _markdown(table)
     write_text(out / "compare.md", markdown)
     return markdown
+
+
+def _rows(files: Iterable[Path]) -> pd.DataFrame:
+    # one row per run and parameter
+    rows = []
+    for file in files:
+        run = json.loads(file.read_text(encoding="utf-8"))
+        if "scores" not in run:
+            raise ValueError(f"{file} was written by an earlier version: choose another --out")
+        scores = run.pop("scores")
+        rows += [{**run, "parameter": parameter, **of_parameter} for parameter, of_parameter in scores.items()]
+    return pd.DataFrame(rows)
 
 
 def _markdown(table: pd.DataFrame) -> str:
@@ -278,11 +308,12 @@ def _markdown(table: pd.DataFrame) -> str:
         return f"{value:.2g}" if abs(value) < 99.5 else f"{value:.0f}"
 
     lines = []
-    for (env_id, algo), group in table.groupby(["env", "algo"], sort=False):
+    for (env_id, parameter, algo), group in table.groupby(["env", "parameter", "algo"], sort=False):
         learned = algo != "closed form"
         lines.append(
             {
                 "environment": env_id,
+                "parameter": parameter,
                 "calibrator": str(algo).upper() if learned else algo,
                 "steps": f"{group['timesteps'].iloc[0]:.0f}" if learned else "",
                 "seeds": str(len(group)) if learned else "",

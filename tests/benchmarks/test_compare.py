@@ -47,8 +47,9 @@ def test_a_comparison_writes_table_figures_and_logs(tmp_path, capsys):
     out = tmp_path / "out"
     table = pd.read_csv(out / "compare.csv")
     assert list(table["algo"]) == ["lac", "sac", "td3", "closed form"]
+    assert set(table["parameter"]) == {"r_o"}
     assert (table["timesteps"][:3] == 400).all() and table["mape_percent"].iloc[3] < 1e-9
-    assert "| BatteryRo-v0  | LAC " in capsys.readouterr().out
+    assert "| BatteryRo-v0  | r_o         | LAC " in capsys.readouterr().out
     for name in ("inferred.png", "inferred.csv", "learning.png", "learning.csv", "learning.json"):
         assert (out / f"{ENV_ID}_{name}").stat().st_size > 0
     record = json.loads((out / "compare.json").read_text())
