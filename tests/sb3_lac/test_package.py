@@ -24,6 +24,7 @@ def test_exports():
         "LAC",
         "CalibrationCallback",
         "CnnPolicy",
+        "GymnasiumVecEnv",
         "LyapunovCallback",
         "LyapunovPolicy",
         "LyapunovReport",
