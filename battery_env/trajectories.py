@@ -56,7 +56,7 @@ MISMATCH_LIMIT = 0.5
 FORMAT_VERSION = 2
 _CHECKPOINT_EVERY = 64  # steps between stored states: a window starts with 32 steps of re-simulation on average
 _MIN_SAMPLES = 8
-_LEAST_DT_S = 0.01
+_LEAST_DT_S = 0.01  # of a discharge that may take a day
 _INDICES = ("load_start", "samples", "first", "stop", "checkpoint_start")
 _PER_TRAJECTORY = ("q_mobile", "r_o", "factors", "eod_time_s", *_INDICES)
 _ARRAYS = (*_PER_TRAJECTORY, "load_values", "checkpoint")
@@ -187,6 +187,8 @@ class TrajectoryDataset(Sequence[Trajectory]):
         _check_factors(multiples)
         _check_cell(parameters, thermal)
         dt_s = _check_dt(dt_s, parameters, multiples)
+        if dt_s < _LEAST_DT_S:
+            raise ValueError(f"dt_s must be at least {_LEAST_DT_S:g} s (a day of it must fit in memory), got {dt_s!r}")
 
         day = dt_s * np.arange(round(86_400 / dt_s), dtype=np.float64)
         start = initial_state(q, parameters)
@@ -291,7 +293,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
             drawn, index = list(loads), rng.integers(len(loads), size=n)
         # drawn last, so that all else is the same with and without a mismatch
         factors = np.exp(np.sqrt(np.log1p(mismatch**2)) * rng.standard_normal((n, len(UNCERTAIN_CONSTANTS))))
-        asked = {"parameter": parameter, "n": n, "seed": seed, "trim": [low, high], "mismatch": mismatch}
+        asked = {"parameter": parameter, "n": n, "seed": seed, "trim": [low, high], "mismatch": float(mismatch)}
         return cls.simulated(q, r, drawn, index, trim, dt_s, thermal, parameters, {"made_by": "generate", **asked}, factors)
 
     @classmethod
@@ -634,8 +636,6 @@ def _check_factors(factors: FloatArray) -> None:
 
 
 def _check_dt(dt_s: float, parameters: CellParameters, factors: FloatArray) -> float:
-    if dt_s < _LEAST_DT_S:
-        raise ValueError(f"dt_s must be at least {_LEAST_DT_S:g} s (a day of smaller steps is too much to hold), got {dt_s!r}")
     # explicit Euler must be stable for the cell whose constants are fastest
     fastest = dict(zip(UNCERTAIN_CONSTANTS, factors.min(axis=0), strict=True))
     return check_dt(dt_s, parameters.replace(to=parameters.to * fastest["to"], tsn=parameters.tsn * fastest["tsn"]))

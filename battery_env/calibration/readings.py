@@ -201,6 +201,7 @@ def _linear_part(
 
 @njit(cache=True, error_model="numpy")
 def explain(
+    rows: IntArray,
     count: IntArray,
     first: IntArray,
     q_mobile: FloatArray,
@@ -224,6 +225,7 @@ def explain(
     """
     Compare the model with the readings of many cells; unchecked, all arrays contiguous.
 
+    :param rows: which of the n cells to compare; of the others nothing is overwritten
     :param count: how many readings each cell has so far, at least 1, shape (n,)
     :param first: first reading that counts, less than ``count``, shape (n,)
     :param q_mobile: estimate, C, shape (n,)
@@ -249,7 +251,7 @@ def explain(
     """
     stretches = residual_V.shape[1]
     values, sums = np.empty((2, voltage_V.shape[1])), np.empty((2, 4))
-    for n in range(len(count)):
+    for n in rows:
         for trial in range(2):
             q = q_mobile[n] * (1.0 + trial * _RELATIVE_STEP)
             vsn, vsp, moved_before = 0.0, 0.0, 0.0

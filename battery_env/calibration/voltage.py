@@ -138,6 +138,7 @@ class VoltageTask(CalibrationTask):
         self._step = np.array([LARGEST_STEPS[name] for name in parameters])
 
         longest = int(readings.count.max())
+        self._all: IntArray = np.arange(cells)
         self.discharge: IntArray = np.zeros(cells, dtype=np.int64)
         self.count: IntArray = np.ones(cells, dtype=np.int64)
         self._arrivals: IntArray = np.zeros((cells, self.episode_steps), dtype=np.int64)
@@ -193,7 +194,7 @@ class VoltageTask(CalibrationTask):
             self._measure(row, n, generator)
         self._action[rows] = 0.0
         self._step_of_episode[rows] = 0
-        self._explain()
+        self._explain(rows)
 
     def _draw_discharge(self, generator: np.random.Generator) -> int:
         return int(generator.integers(len(self.readings)))
@@ -285,10 +286,12 @@ class VoltageTask(CalibrationTask):
             total -= lfilter([self.options.process_noise_V * np.sqrt(variance)], [1.0, -left], draw)
         return total
 
-    def _explain(self) -> None:
+    def _explain(self, rows: NDArray[np.intp] | None = None) -> None:
+        """Compare some cells with their readings, all by default."""
         cell = self.readings.parameters
         first = np.zeros_like(self.count) if self.options.data == "all" else self.count - 1
         explain(
+            self._all if rows is None else np.asarray(rows, dtype=np.int64),
             self.count,
             first,
             np.ascontiguousarray(self.estimate[:, 0]),

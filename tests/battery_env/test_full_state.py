@@ -184,15 +184,15 @@ def test_constants_may_differ_from_those_of_the_model():
     task = make(data, cells=3)
     task.start(np.array([0, 2]), [np.random.default_rng()] * 2, {"trajectory": 1})
     task.start(np.array([1]), [np.random.default_rng()], {"trajectory": 4})
-    for row, n in enumerate((1, 4, 1)):
-        true = NEW_CELL.replace(
-            **{c: getattr(NEW_CELL, c) * f for c, f in zip(UNCERTAIN_CONSTANTS, data.factors[n], strict=True)}
-        )
-        expected = step(task.state[row], task.load[row], task.q_mobile[row], task.r_o[row], parameters=true)
-        np.testing.assert_allclose(task.next_state[row], expected, rtol=1e-13)
-    model, load, q, r = task.model_state.copy(), task.load.copy(), task.q_mobile, task.r_o
-    assert (task.advance(true_action(task)) > 0.01).all()
-    np.testing.assert_allclose(task.model_state, step(model, load, q, r), rtol=1e-13)
+    for _ in range(2):
+        for row, n in enumerate((1, 4, 1)):
+            own = zip(UNCERTAIN_CONSTANTS, data.factors[n], strict=True)
+            true = NEW_CELL.replace(**{name: getattr(NEW_CELL, name) * factor for name, factor in own})
+            expected = step(task.state[row], task.load[row], task.q_mobile[row], task.r_o[row], parameters=true)
+            np.testing.assert_allclose(task.next_state[row], expected, rtol=1e-13)
+        model, load, q, r = task.model_state.copy(), task.load.copy(), task.q_mobile, task.r_o
+        assert (task.advance(true_action(task)) > 0.01).all()
+        np.testing.assert_allclose(task.model_state, step(model, load, q, r), rtol=1e-13)
 
 
 def test_loads_of_other_kinds_and_time_steps():
@@ -218,7 +218,10 @@ def test_going_on_with_some_cells_changes_nothing_for_them(parameter):
     data = TrajectoryDataset.generate("joint", 4, RandomPiecewise(), seed=0, mismatch=0.1)
     options = {"sensor_noise": 1.0, "process_noise_V": 1e-4, "consistency": 0.5, "resync": 4, "start": "new_cell"}
     size = 2 if parameter == "joint" else 1
-    tasks = [started(make(data, parameter, cells=4, **options)) for _ in range(2)]
+    tasks = [make(data, parameter, cells=4, **options) for _ in range(2)]
+    for task in tasks:
+        for n in range(4):
+            task.start(np.array([n]), [np.random.default_rng(n)], {"trajectory": n})
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (10, 4, size))
     kept = np.array([True, False, True, True])
     for k, action in enumerate(actions):

@@ -22,10 +22,10 @@ NUMBERS = st.floats() | st.integers(-(2**63), 2**63 - 1) | st.floats(0.0, 1e4)
 ARRAYS = arrays(np.float64, array_shapes(min_side=0), elements=st.floats() | st.floats(0.0, 1e4))
 JUNK = st.one_of(
     st.none(),
-    st.text(),
-    st.binary(min_size=1),
+    st.text("AhmWΩ, "),
+    st.binary(min_size=1).map(lambda contents: contents + b"W"),
     st.just(1j),
-    st.lists(st.text(min_size=1), min_size=1),
+    st.lists(st.text("AhmWΩ, "), min_size=1),
     st.just([[1.0], [1.0, 2.0]]),
     st.dictionaries(st.text(), st.floats()),
     st.builds(object),

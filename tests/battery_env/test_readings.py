@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from battery_env.calibration.readings import Readings, explain
+from battery_env.calibration.voltage import VoltageOptions, VoltageTask
 from battery_env.cells import load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, QNB, QNS, VO, simulate
 from battery_env.loads import RandomPiecewise
@@ -33,6 +34,7 @@ def compare(readings, q_mobile, r_o, count=None, first=None, stretches=12):
     n, cell = len(readings), readings.parameters
     out = [np.full((n, stretches, 2), np.nan) for _ in range(3)] + [np.full(n, np.nan) for _ in range(2)]
     explain(
+        np.arange(n),
         readings.count if count is None else count,
         np.zeros(n, dtype=np.int64) if first is None else first,
         q_mobile,
@@ -55,6 +57,16 @@ def test_linear_part_is_that_of_the_simulation(data, readings):
         in_bulk = 0.9 * trajectory.q_mobile - trajectory.state[at, QNB]
         np.testing.assert_allclose(readings.drawn_C[part] - readings.moved_C[part], in_bulk, atol=1e-6)
         np.testing.assert_allclose(readings.ohmic_A[part] * trajectory.r_o, trajectory.state[at, VO], atol=1e-9)
+
+
+def test_cells_that_are_not_asked_for_stay_as_they_are(readings):
+    task = VoltageTask(readings, ("q_mobile", "r_o"), 3, VoltageOptions())
+    task.start(np.arange(3), [np.random.default_rng(k) for k in range(3)])
+    before = task.observation()
+    task.start(np.array([1]), [np.random.default_rng(7)])
+    after = task.observation()
+    np.testing.assert_array_equal(after[[0, 2]], before[[0, 2]])
+    assert (after[1] != before[1]).any()
 
 
 def test_the_true_parameters_explain_a_discharge(readings):
