@@ -1,0 +1,465 @@
+"""
+What a user would pick instead of a learned policy, on the same work: calibrators that need no training, and the bound on all.
+
+.. code-block:: bash
+
+  python -m benchmarks.peers
+
+Simulated discharges under power that changes every 60 to 140 s, 30 of cells with a worn q_mobile and 30 with a worn r_o; then
+30 with both, and the same with worse sensors. The cells are full and at rest when a discharge starts, and every calibrator
+starts from a new cell's parameters. Finished parts are kept in ``<out>/parts`` and not run again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from tqdm import tqdm
+
+from battery_env.electrochemistry import NEW_CELL
+from battery_env.estimators.base import PARAMETERS, Estimator
+from battery_env.estimators.closed_form import ClosedForm
+from battery_env.estimators.greedy import GreedyOneStep
+from battery_env.estimators.kalman import ExtendedKalmanFilter
+from battery_env.estimators.least_squares import LeastSquares
+from battery_env.evaluation import evaluate
+from battery_env.loads import RandomPiecewise
+from battery_env.plotting import COLOURS, LABELS, new_figure, save_figure
+from battery_env.sensors import SensorErrors
+from battery_env.trajectories import AgedParameter, TrajectoryDataset
+from benchmarks.progpy_filters import ProgpyFilter
+from benchmarks.reporting import write_csv, write_text
+
+R_O_RANGE_OHM = (0.117, 0.35)
+#: A cell that is a little worn in both parameters: 10 % less q_mobile, 10 % more r_o.
+WORN_CELL = NEW_CELL.replace(q_mobile=0.9 * NEW_CELL.q_mobile, r_o=1.1 * NEW_CELL.r_o)
+SEEDS = {"q_mobile": 0, "r_o": 1, "joint": 2}
+#: What calibrators are told about the noise of the voltage, whatever it is.
+STATED_NOISE_V = 0.005
+#: Time between the estimates of least squares during a discharge.
+WINDOW_EVERY_S = 60.0
+#: Standard deviations of the filters' priors, about the new cell's values, C and ohm.
+PRIOR_SD = {"q_mobile": 1900.0, "r_o": 0.15}
+#: Discharges that are timed, and how often each.
+TIMED_DISCHARGES, TIMED_REPETITIONS = 3, 3
+#: A calibrator that is off by more than this at the end has lost the discharge.
+LOST_PERCENT = 5.0
+
+# The mean magnitude of a normal error is this times its standard deviation
+_MEAN_MAGNITUDE = float(np.sqrt(2.0 / np.pi))
+_SYMBOLS = {"q_mobile": "q^max", "r_o": "R_o"}
+
+
+@dataclass(frozen=True)
+class Method:
+    """
+    A calibrator in the comparison.
+
+    :param name: as shown to readers
+    :param needs: what it takes, beside the model
+    :param make: makes it, from the names of what is unknown
+    :param full_state: whether it is shown the state instead of voltage and current
+    :param slow: whether it is run on a few discharges only
+    """
+
+    name: str
+    needs: str
+    make: Callable[[Sequence[str]], Estimator]
+    full_state: bool = False
+    slow: bool = False
+
+
+def _least_squares(unknown: Sequence[str], window_every_s: float | None = None) -> LeastSquares:
+    return LeastSquares(unknown, thermal=True, voltage_noise_V=STATED_NOISE_V, window_every_s=window_every_s)
+
+
+def _progpy(parameter: str, kind: Literal["ukf", "particles"]) -> ProgpyFilter:
+    return ProgpyFilter(parameter, kind, PRIOR_SD[parameter], STATED_NOISE_V)
+
+
+METHODS = (
+    Method("closed form", "full state", lambda unknown: ClosedForm(), full_state=True),
+    Method("greedy one-step cost", "full state", lambda unknown: GreedyOneStep(unknown[0], thermal=True), full_state=True),
+    Method(
+        "greedy, free-running",
+        "full state",
+        lambda unknown: GreedyOneStep(unknown[0], resync=False, thermal=True),
+        full_state=True,
+    ),
+    Method("least squares, whole discharge", "voltage", lambda unknown: _least_squares(unknown)),
+    Method("least squares, growing window", "voltage", lambda unknown: _least_squares(unknown, WINDOW_EVERY_S)),
+    Method(
+        "extended Kalman filter",
+        "voltage, prior",
+        lambda unknown: ExtendedKalmanFilter(unknown, thermal=True, voltage_noise_V=STATED_NOISE_V),
+    ),
+    Method("progpy, unscented Kalman filter", "voltage, prior", lambda unknown: _progpy(unknown[0], "ukf"), slow=True),
+    Method("progpy, 100 particles", "voltage, prior", lambda unknown: _progpy(unknown[0], "particles"), slow=True),
+)
+#: Those that are tried under worse conditions too.
+TRIED = ("least squares, whole discharge", "extended Kalman filter")
+
+
+@dataclass(frozen=True)
+class Case:
+    """
+    A condition.
+
+    :param name: as shown to readers
+    :param sensors: errors of the sensors
+    :param other_worn: whether the parameter that is held at the new cell's value is a little worn
+    :param both_unknown: whether both are worn and searched for
+    """
+
+    name: str
+    sensors: SensorErrors
+    other_worn: bool = False
+    both_unknown: bool = False
+
+
+_NOISE = SensorErrors(noise_V=STATED_NOISE_V)
+BASE = Case("5 mV noise", _NOISE)
+CASES = (
+    BASE,
+    Case("20 mV noise", SensorErrors(noise_V=0.020)),
+    Case("+10 mV offset", SensorErrors(noise_V=STATED_NOISE_V, offset_V=0.010)),
+    Case("+1 % current", SensorErrors(noise_V=STATED_NOISE_V, current_gain=1.01)),
+    Case("other one 10 % worn, held new", _NOISE, other_worn=True),
+    Case("both unknown", _NOISE, both_unknown=True),
+)
+
+
+def discharges(case: Case, unknown: Sequence[str], n: int) -> TrajectoryDataset:
+    """
+    The work: discharges as progpy simulates them (the model with a temperature; tests compare both).
+
+    :param case: the condition
+    :param unknown: what is worn, from a little to much
+    :param n: how many
+    :return: the discharges
+    """
+    kind = "joint" if case.both_unknown else unknown[0]
+    return TrajectoryDataset.generate(
+        cast(AgedParameter, kind),
+        n,
+        RandomPiecewise(),
+        seed=SEEDS[kind],
+        r_o_range=R_O_RANGE_OHM,
+        thermal=True,
+        parameters=WORN_CELL if case.other_worn else NEW_CELL,
+    )
+
+
+def cpu_time_per_estimate_s(estimator: Estimator, data: TrajectoryDataset, slow: bool) -> float:
+    """
+    What an estimate costs on one core, on a few discharges; the least of several times, as others may use the machine.
+
+    :param estimator: the calibrator
+    :param data: discharges
+    :param slow: whether to take the beginning of one of them only
+    :return: CPU time, s
+    """
+    records = [data[0].part(0, 200)] if slow else [data[n] for n in range(min(len(data), TIMED_DISCHARGES))]
+    spent_s, estimates = 0.0, 0
+    for record in records:
+        times_s = []
+        for _ in range(TIMED_REPETITIONS):
+            start_s = time.process_time()
+            trace = estimator.trace([record])[0]
+            times_s.append(time.process_time() - start_s)
+        spent_s += min(times_s)
+        estimates += len(trace.time_s)
+    return spent_s / estimates
+
+
+def run(method: Method, case: Case, unknown: Sequence[str], n: int) -> pd.DataFrame:
+    """
+    Score one calibrator under one condition.
+
+    :param method: the calibrator
+    :param case: the condition
+    :param unknown: what it searches for
+    :param n: number of discharges
+    :return: one row per discharge and unknown parameter
+    """
+    data = discharges(case, unknown, n)
+    estimator = method.make(unknown)
+    scores = evaluate(estimator, data, None if method.full_state else case.sensors)
+    scores["cpu_time_per_estimate_s"] = cpu_time_per_estimate_s(estimator, data, method.slow)
+    columns = {
+        "true": "",
+        "final_error_percent": "_final_error_percent",
+        "second_half_mape_percent": "_second_half_mape_percent",
+        "settling_time_1_percent_s": "_settling_time_1_percent_s",
+        "coverage_percent": "_coverage_percent",
+        "bound": "_bound",
+    }
+    tables = []
+    for name in unknown:
+        table = pd.DataFrame({column: scores[f"{name}{suffix}"] for column, suffix in columns.items()})
+        table.insert(0, "parameter", name)
+        tables.append(table.join(scores[["trajectory", "settled_time_s", "updates", "cpu_time_per_estimate_s"]]))
+    together = pd.concat(tables)
+    together.insert(0, "case", case.name)
+    together.insert(0, "method", method.name)
+    return together
+
+
+def runs() -> list[tuple[Method, Case, tuple[str, ...]]]:
+    """
+    All parts of this study.
+
+    :return: calibrator, condition, and what is unknown
+    """
+    parts = []
+    for case in CASES:
+        for method in METHODS:
+            if case is BASE or method.name in TRIED:
+                unknowns = [PARAMETERS] if case.both_unknown else [(name,) for name in PARAMETERS]
+                parts += [(method, case, unknown) for unknown in unknowns]
+    return parts
+
+
+def run_or_read(part: tuple[Method, Case, tuple[str, ...]], n: int, folder: Path) -> pd.DataFrame:
+    """
+    A part of this study, from its file if it was finished before with the same configuration.
+
+    :param part: see :func:`runs`
+    :param n: number of discharges
+    :param folder: where files of parts are
+    :return: what :func:`run` returned
+    """
+    method, case, unknown = part
+    configuration = {"method": method.name, "case": asdict(case), "unknown": list(unknown), "discharges": n, "seeds": SEEDS}
+    name = "_".join([method.name, case.name, *unknown])
+    path = folder / f"{''.join(c if c.isalnum() else '_' for c in name)}.csv"
+    if path.exists() and path.with_suffix(".json").exists():
+        if json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))["configuration"] == configuration:
+            return pd.read_csv(path)
+    table = run(method, case, unknown, n)
+    write_csv(path, table, configuration)
+    return pd.read_csv(path)
+
+
+def _digits(value: float) -> str:
+    if not np.isfinite(value):
+        return "never" if value == np.inf else "-"
+    return f"{value:.2g}" if abs(value) < 99.5 else f"{value:.0f}"
+
+
+def _duration(seconds: float) -> str:
+    for unit, size in (("s", 1.0), ("ms", 1e-3)):
+        if seconds >= size:
+            return f"{_digits(seconds / size)} {unit}"
+    return f"{_digits(seconds / 1e-6)} µs"
+
+
+def bound_percent(results: pd.DataFrame, case: Case, parameter: str) -> float:
+    """
+    What the mean error of an unbiased calibrator is at least, at the end of the discharges.
+
+    :param results: of all parts
+    :param case: the condition
+    :param parameter: what is unknown
+    :return: % of the truth
+    """
+    rows = results[(results["method"] == TRIED[0]) & (results["case"] == case.name) & (results["parameter"] == parameter)]
+    return float(_MEAN_MAGNITUDE * 100.0 * (rows["bound"] / rows["true"]).mean())
+
+
+def methods_table(results: pd.DataFrame) -> pd.DataFrame:
+    """
+    All calibrators under the first condition.
+
+    :param results: of all parts
+    :return: one row per calibrator, as shown to readers
+    """
+    base = results[results["case"] == BASE.name]
+    rows = []
+    for method in METHODS:
+        of_method = base[base["method"] == method.name]
+        row = {"calibrator": method.name, "needs": method.needs}
+        for parameter, part in of_method.groupby("parameter", sort=False):
+            symbol = _SYMBOLS[str(parameter)]
+            last, settled_s = part["final_error_percent"], part["settling_time_1_percent_s"]
+            many = (part["updates"] > 1).all()
+            half = _digits(part["second_half_mape_percent"].mean()) if many else "-"
+            row[f"{symbol}: last / 2nd half (worst last), %"] = f"{_digits(last.mean())} / {half} ({_digits(last.max())})"
+            row[f"{symbol} within 1 % after: median / worst, s"] = (
+                f"{_digits(settled_s.median())} / {_digits(settled_s.max())}" if many else "-"
+            )
+        row["discharges"] = str(int(of_method.groupby("parameter").size().sum()))
+        row["time per estimate"] = _duration(of_method["cpu_time_per_estimate_s"].mean())
+        rows.append(row)
+    bounds = {name: _digits(bound_percent(results, BASE, name)) for name in PARAMETERS}
+    bound_row = {f"{_SYMBOLS[name]}: last / 2nd half (worst last), %": f"{value} / - (-)" for name, value in bounds.items()}
+    rows.append({"calibrator": "Cramér-Rao bound", "needs": "voltage", **bound_row})
+    return pd.DataFrame(rows).fillna("-")
+
+
+def cases_table(results: pd.DataFrame) -> pd.DataFrame:
+    """
+    Those that were tried under all conditions.
+
+    :param results: of all parts
+    :return: one row per condition, as shown to readers
+    """
+    rows = []
+    for case in CASES:
+        row = {"case": case.name}
+        for name in TRIED:
+            for parameter in PARAMETERS:
+                part = _of(results, name, case, parameter)
+                error, lost = part["final_error_percent"], (part["final_error_percent"] > LOST_PERCENT).sum()
+                settled = np.isfinite(part["settled_time_s"]).sum()
+                row[f"{name}, {_SYMBOLS[parameter]}: last (worst), %"] = f"{_digits(error.mean())} ({_digits(error.max())})"
+                row[f"{name}, {_SYMBOLS[parameter]}: lost / says settled"] = f"{lost} / {settled} of {len(part)}"
+        bounds = " / ".join(_digits(bound_percent(results, case, parameter)) for parameter in PARAMETERS)
+        rows.append(row | {"bound, %": bounds})
+    return pd.DataFrame(rows)
+
+
+def _of(results: pd.DataFrame, method: str, case: Case, parameter: str) -> pd.DataFrame:
+    chosen = (results["method"] == method) & (results["case"] == case.name) & (results["parameter"] == parameter)
+    return results[chosen]
+
+
+def _draw_errors(axes: Axes, row: float, errors: pd.Series, colour: str, label: str | None = None) -> None:
+    # one dot per discharge, a bar at their mean
+    visible = np.maximum(errors.to_numpy(), 1e-13)
+    axes.plot(visible, np.full(len(visible), row), "o", ms=3.5, mew=0, alpha=0.35, color=colour)
+    axes.plot([errors.mean()] * 2, [row - 0.3, row + 0.3], color=colour, lw=2.2, label=label)
+
+
+def _finish(panels: Sequence[Axes], labels: Sequence[str]) -> None:
+    for axes, parameter in zip(panels, PARAMETERS, strict=True):
+        axes.set(xscale="log", xlabel="error of the last estimate (%)", title=LABELS[parameter].split(" (")[0])
+        axes.grid(axis="x", alpha=0.25)
+    panels[0].set_yticks(range(len(labels)), labels)
+    panels[0].invert_yaxis()
+
+
+def plot_methods(results: pd.DataFrame) -> Figure:
+    """
+    The errors of all calibrators under the first condition.
+
+    :param results: of all parts
+    :return: the figure
+    """
+    figure = new_figure(9.6, 3.8)
+    panels = figure.subplots(1, len(PARAMETERS), sharey=True)
+    for axes, parameter in zip(panels, PARAMETERS, strict=True):
+        for row, method in enumerate(METHODS):
+            errors = _of(results, method.name, BASE, parameter)["final_error_percent"]
+            _draw_errors(axes, row, errors, COLOURS[2 if method.full_state else 4 if method.slow else 0])
+        axes.axvline(bound_percent(results, BASE, parameter), color="0.3", lw=1.2, ls="--", label="Cramér-Rao bound")
+    _finish(panels, [method.name for method in METHODS])
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower right", frameon=False, fontsize=9)
+    return figure
+
+
+def plot_cases(results: pd.DataFrame) -> Figure:
+    """
+    The errors of those that were tried under all conditions.
+
+    :param results: of all parts
+    :return: the figure
+    """
+    figure = new_figure(9.6, 4.0)
+    panels = figure.subplots(1, len(PARAMETERS), sharey=True)
+    for axes, parameter in zip(panels, PARAMETERS, strict=True):
+        for row, case in enumerate(CASES):
+            for shift, name, colour in zip((-0.19, 0.19), TRIED, COLOURS, strict=False):
+                errors = _of(results, name, case, parameter)["final_error_percent"]
+                _draw_errors(axes, row + shift, errors, colour, name if row == 0 else None)
+            bound = bound_percent(results, case, parameter)
+            axes.plot(
+                [bound] * 2, [row - 0.5, row + 0.5], "--", color="0.3", lw=1.2, label="Cramér-Rao bound" if row == 0 else None
+            )
+    _finish(panels, [case.name for case in CASES])
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=9)
+    return figure
+
+
+def report(results: pd.DataFrame, configuration: dict[str, Any]) -> str:
+    """
+    Both tables, with what they show.
+
+    :param results: of all parts
+    :param configuration: of this study
+    :return: Markdown
+    """
+    n, slow_n = configuration["discharges"], configuration["progpy_discharges"]
+    noise_mV, (low_ohm, high_ohm) = 1e3 * STATED_NOISE_V, R_O_RANGE_OHM
+    methods, cases = (
+        table.to_markdown(index=False, disable_numparse=True) for table in (methods_table(results), cases_table(results))
+    )
+    return f"""Simulated discharges down to {NEW_CELL.VEOD:g} V under 2 to 8 W that change every 60 to 140 s, one sample each
+second: {n} of cells with q^max of 4000 to 7600 C, {n} with R_o of {low_ohm:g} to {high_ohm:g} ohm, the other parameter new
+and known. Voltage with {noise_mV:g} mV of noise, exact current; calibrators with the full state see it exactly. progpy's
+filters: {slow_n} discharges for each parameter. Errors are means over discharges, of the last estimate and over the second
+half of the discharge. The bound is the least mean error of an unbiased calibrator. Times are CPU times on one core.
+
+{methods}
+
+The same with other sensors or other cells. All calibrators are told {noise_mV:g} mV; the Kalman filter allows for an offset
+of the voltage, least squares do not. Lost: off by more than {LOST_PERCENT:g} % in the end. Says settled: the calibrator takes
+its last estimate for settled. With both unknown, both vary at once over the ranges above.
+
+{cases}
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """
+    The command line.
+
+    :param arguments: of the command line by default
+    """
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--discharges", type=int, default=30, help="for each parameter, and with both worn")
+    parser.add_argument("--progpy-discharges", type=int, default=2, help="for each parameter and estimator of progpy; slow")
+    parser.add_argument("--out", type=Path, default=Path("results/peers"))
+    chosen = parser.parse_args(arguments)
+    if min(chosen.discharges, chosen.progpy_discharges) < 1:
+        parser.error("--discharges and --progpy-discharges must be at least 1")
+
+    tables = []
+    for part in tqdm(runs(), unit="part", file=sys.stderr):
+        n = min(chosen.progpy_discharges, chosen.discharges) if part[0].slow else chosen.discharges
+        tables.append(run_or_read(part, n, chosen.out / "parts"))
+    results = pd.concat(tables)
+    configuration: dict[str, Any] = {
+        "discharges": chosen.discharges,
+        "progpy_discharges": chosen.progpy_discharges,
+        "seeds": SEEDS,
+        "loads": asdict(RandomPiecewise()),
+        "r_o_range_ohm": R_O_RANGE_OHM,
+        "new_cell": {name: getattr(NEW_CELL, name) for name in PARAMETERS},
+        "cases": [asdict(case) for case in CASES],
+        "stated_noise_V": STATED_NOISE_V,
+        "prior_sd": PRIOR_SD,
+        "window_every_s": WINDOW_EVERY_S,
+        "thermal": True,
+    }
+    write_csv(chosen.out / "peers.csv", results, configuration)
+    save_figure(plot_methods(results), chosen.out / "peers.png")
+    save_figure(plot_cases(results), chosen.out / "limits.png")
+    text = report(results, configuration)
+    write_text(chosen.out / "peers.md", text)
+    sys.stdout.write("\n" + text)
+
+
+if __name__ == "__main__":
+    main()
