@@ -1,12 +1,14 @@
 """
-How many updates a second LAC makes on the CPU, beside Stable-Baselines3's SAC and TD3 at equal networks.
+How many updates a second LAC makes on the CPU, beside Stable-Baselines3's SAC and TD3 at equal networks; how many steps a
+second the model makes, beside NASA's progpy; and how many the environments make, for one cell and for many.
 
 .. code-block:: bash
 
   python -m benchmarks.throughput
+  python -m benchmarks.throughput --only model environments
 
-The algorithms take turns in short blocks, so that whatever else the machine does hits all of them; the ratio is taken within
-each turn, and its median and quartiles are reported. A profile says where the time of an update goes.
+Contestants take turns in short blocks, so that whatever else the machine does hits all of them; ratios are taken within each
+round, and their median and quartiles are reported. A profile says where the time of an update goes.
 """
 
 from __future__ import annotations
@@ -14,9 +16,12 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pandas as pd
 import torch as th
@@ -27,12 +32,22 @@ from tabulate import tabulate
 from torch import nn
 from tqdm import trange
 
+from battery_env.electrochemistry import NEW_CELL, initial_state, simulate, step_into, voltage_into
 from benchmarks.reporting import write_csv, write_text
 from sb3_lac import LAC
 
 _ALGORITHMS: dict[str, type[LAC] | type[SAC] | type[TD3]] = {"LAC": LAC, "SAC": SAC, "TD3": TD3}
 _TRANSITIONS = 5_000
 _WARM_UP_UPDATES = 10
+
+SECTIONS = ("updates", "model", "environments")
+# of one turn
+_SIMULATED_STEPS = 1500
+_SIMULATIONS = 20
+_BATCHED_STEPS = 100
+_ENV_STEPS = 512
+# and how often all cells of each decide in one turn: whole episodes
+_ENVIRONMENTS = {"BatteryQmax-v0": 128, "BatteryVoltageJoint-v0": 8}
 
 # which operators of torch belong to what, by the beginnings of their names; the first that fits counts
 _PARTS = {
@@ -70,6 +85,27 @@ def filled_model(algo: str, env_id: str, net_arch: list[int], batch_size: int) -
     return model
 
 
+def race(contestants: dict[str, Callable[[], int]], rounds: int, clock: Callable[[], float]) -> pd.DataFrame:
+    """
+    How much each contestant does a second, in turns.
+
+    :param contestants: by name, what makes one turn and returns how much it did
+    :param rounds: how often each has its turn
+    :param clock: seconds
+    :return: one row per round, one column per contestant
+    """
+    speeds = []
+    for number in trange(rounds, desc="rounds", disable=None):
+        speed = {}
+        # each order as often as its reverse: nobody always comes first
+        for name in list(contestants)[:: 1 if number % 2 == 0 else -1]:
+            start = clock()
+            done = contestants[name]()
+            speed[name] = done / (clock() - start)
+        speeds.append(speed)
+    return pd.DataFrame(speeds)[list(contestants)]
+
+
 def measure(models: dict[str, OffPolicyAlgorithm], rounds: int, updates: int, batch_size: int) -> pd.DataFrame:
     """
     Updates a second of each model, in turns.
@@ -80,16 +116,12 @@ def measure(models: dict[str, OffPolicyAlgorithm], rounds: int, updates: int, ba
     :param batch_size: batch size
     :return: one row per round, one column per model
     """
-    speeds = []
-    for number in trange(rounds, desc="rounds", disable=None):
-        speed = {}
-        # each order as often as its reverse: nobody always comes first
-        for name in list(models)[:: 1 if number % 2 == 0 else -1]:
-            start = time.perf_counter()
-            models[name].train(gradient_steps=updates, batch_size=batch_size)
-            speed[name] = updates / (time.perf_counter() - start)
-        speeds.append(speed)
-    return pd.DataFrame(speeds)[list(models)]
+
+    def turn(model: OffPolicyAlgorithm) -> int:
+        model.train(gradient_steps=updates, batch_size=batch_size)
+        return updates
+
+    return race({name: partial(turn, model) for name, model in models.items()}, rounds, time.perf_counter)
 
 
 def profile(model: OffPolicyAlgorithm, updates: int, batch_size: int) -> dict[str, float]:
@@ -112,21 +144,115 @@ def profile(model: OffPolicyAlgorithm, updates: int, batch_size: int) -> dict[st
     return {**shares, "Python": 1.0 - sum(shares.values())}
 
 
+def model_contestants(cells: int) -> dict[str, Callable[[], int]]:
+    """
+    The thermal model under a current of 2 A, from full charge, here and in progpy: one cell, and many at once. Under current
+    the step itself needs no voltage, under power, which progpy does not take, it does.
+
+    :param cells: how many are many
+    :return: by name, what makes a turn of steps and returns how many
+    """
+    from progpy.models import BatteryElectroChemEOD  # heavy, and needed here only
+
+    peer = BatteryElectroChemEOD()
+    load = peer.InputContainer({"i": 2.0})
+    load_of_all = peer.InputContainer({"i": np.full(cells, 2.0)})
+    full = {name: float(np.ravel(value)[0]) for name, value in peer.initialize().items()}
+
+    def simulated() -> int:
+        for _ in range(_SIMULATIONS):
+            simulate(2.0, NEW_CELL.q_mobile, NEW_CELL.r_o, _SIMULATED_STEPS, load_unit="current", thermal=True)
+        return _SIMULATIONS * _SIMULATED_STEPS
+
+    def peer_simulated() -> int:
+        peer.simulate_to(_SIMULATED_STEPS, lambda t, x=None: load, dt=1.0, save_freq=1.0)
+        return _SIMULATED_STEPS
+
+    def peer_stepped() -> int:
+        state = peer.initialize()
+        for _ in range(_SIMULATED_STEPS):
+            state = peer.next_state(state, load, 1.0)
+            peer.output(state)
+        return _SIMULATED_STEPS
+
+    def batched(load_unit: Any, amount: float, with_voltage: bool) -> int:
+        q_mobile, r_o = np.full(cells, NEW_CELL.q_mobile), np.full(cells, NEW_CELL.r_o)
+        state, loads, volts = initial_state(q_mobile), np.full(cells, amount), np.empty(cells)
+        for _ in range(_BATCHED_STEPS):
+            step_into(state, state, loads, q_mobile, r_o, 1.0, load_unit, True, NEW_CELL.packed)
+            if with_voltage:
+                voltage_into(volts, state, q_mobile, NEW_CELL.packed)
+        return _BATCHED_STEPS * cells
+
+    def peer_batched(with_voltage: bool) -> int:
+        state = peer.StateContainer({name: np.full(cells, value) for name, value in full.items()})
+        for _ in range(_BATCHED_STEPS):
+            state = peer.next_state(state, load_of_all, 1.0)
+            if with_voltage:
+                peer.output(state)
+        return _BATCHED_STEPS * cells
+
+    return {
+        "1 cell, step and voltage: simulate()": simulated,
+        "1 cell, step and voltage: progpy simulate_to()": peer_simulated,
+        "1 cell, step and voltage: progpy next_state(), output()": peer_stepped,
+        f"{cells} cells, step and voltage: step_into(), voltage_into()": partial(batched, "current", 2.0, True),
+        f"{cells} cells, step and voltage: progpy next_state(), output()": partial(peer_batched, True),
+        f"{cells} cells, step: step_into()": partial(batched, "current", 2.0, False),
+        f"{cells} cells, step: progpy next_state()": partial(peer_batched, False),
+        f"{cells} cells, step under power: step_into()": partial(batched, "power", 8.0, False),
+    }
+
+
+def environment_contestants(cells: int) -> dict[str, Callable[[], int]]:
+    """
+    The environments for one cell and for many, with all that belongs to a step: observation, reward, info, new episodes.
+
+    :param cells: how many are many
+    :return: by name, what makes a turn of steps with random actions and returns how many
+    """
+    contestants: dict[str, Callable[[], int]] = {}
+
+    def turn_of_one(env: gym.Env[Any, Any], actions: Any) -> int:
+        for n in range(_ENV_STEPS):
+            if env.step(actions[n % len(actions)])[3]:
+                env.reset()
+        return _ENV_STEPS
+
+    def turn_of_many(env: gym.vector.VectorEnv[Any, Any, Any], actions: Any, steps: int) -> int:
+        for n in range(steps):
+            env.step(actions[n % len(actions)])
+        return steps * cells
+
+    for env_id, steps in _ENVIRONMENTS.items():
+        one = gym.make(env_id, disable_env_checker=True)
+        one.reset(seed=0)
+        one.action_space.seed(0)
+        contestants[f"{env_id}, 1 cell"] = partial(turn_of_one, one, [one.action_space.sample() for _ in range(64)])
+        for mode in ("NextStep", "SameStep"):
+            many = gym.make_vec(env_id, num_envs=cells, autoreset_mode=mode)
+            many.reset(seed=0)
+            many.action_space.seed(0)
+            actions = [many.action_space.sample() for _ in range(64)]
+            contestants[f"{env_id}, {cells} cells, {mode}"] = partial(turn_of_many, many, actions, steps)
+    return contestants
+
+
+def _spread(values: pd.Series, digits: int) -> str:
+    low, median, high = np.quantile(values, [0.25, 0.5, 0.75])
+    return f"{median:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
+
+
 def report(speeds: pd.DataFrame, parts: pd.DataFrame) -> str:
     """
-    What was measured, as Markdown.
+    What was measured of updates, as Markdown.
 
     :param speeds: see ``measure()``
     :param parts: shares by part, one row per algorithm
     :return: two tables
     """
-
-    def spread(values: pd.Series, digits: int) -> str:
-        low, median, high = np.quantile(values, [0.25, 0.5, 0.75])
-        return f"{median:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
-
     lac = speeds["LAC"]
-    rows = [[name, spread(values, 1), spread(lac / values, 2)] for name, values in speeds.items()]
+    rows = [[name, _spread(values, 1), _spread(lac / values, 2)] for name, values in speeds.items()]
     header = ["algorithm", "updates a second, median (quartiles)", "LAC is faster by a factor of"]
     shares = [
         [name, *(f"{100 * share:.0f} %" for share in row)] for name, row in zip(parts.index, parts.to_numpy(), strict=True)
@@ -139,6 +265,24 @@ def report(speeds: pd.DataFrame, parts: pd.DataFrame) -> str:
     )
 
 
+def report_steps(speeds: pd.DataFrame) -> str:
+    """
+    What was measured of steps, as Markdown. Where progpy does the same work, the ratio is to the contestant of this package.
+
+    :param speeds: see ``race()``; a column is called ``work: who``
+    :return: a table
+    """
+    rows = []
+    for name, values in speeds.items():
+        work, _, who = str(name).partition(": ")
+        own = next(column for column in speeds if str(column).partition(": ")[0] == work)
+        faster = _spread(speeds[own] / values, 0) if who.startswith("progpy") else ""
+        rows.append([name, _spread(values / 1000.0, 1), faster])
+    header = ["", "thousand steps per second of one core, median (quartiles)", "battery_env is faster by a factor of"]
+    columns = 3 if any(row[2] for row in rows) else 2
+    return tabulate([row[:columns] for row in rows], headers=header[:columns], tablefmt="github") + "\n"
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """
     The command line.
@@ -146,27 +290,39 @@ def main(arguments: Sequence[str] | None = None) -> None:
     :param arguments: of the command line by default
     """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=40, help="turns of each algorithm")
+    parser.add_argument("--only", nargs="+", choices=SECTIONS, default=list(SECTIONS), help="what to measure, all by default")
+    parser.add_argument("--rounds", type=int, default=40, help="turns of each contestant")
     parser.add_argument("--updates", type=int, default=25, help="updates of a turn")
     parser.add_argument("--env", default="BatteryQmax-v0", help="id of the environment, for the sizes of the input layers")
     parser.add_argument("--net-arch", type=int, nargs="+", default=[256, 256, 256], help="widths of the hidden layers")
     parser.add_argument("--batch-size", type=int, default=256)
+    parser.add_argument("--cells", type=int, default=1024, help="cells of a batch of the model, and of a vector environment")
     parser.add_argument("--threads", type=int, default=1, help="threads of torch")
     parser.add_argument("--out", type=Path, default=Path("results/throughput"))
     chosen = parser.parse_args(arguments)
-    if min(chosen.rounds, chosen.updates, chosen.batch_size, chosen.threads, *chosen.net_arch) < 1:
-        parser.error("--rounds, --updates, --net-arch, --batch-size and --threads must be at least 1")
+    if min(chosen.rounds, chosen.updates, chosen.batch_size, chosen.cells, chosen.threads, *chosen.net_arch) < 1:
+        parser.error("--rounds, --updates, --net-arch, --batch-size, --cells and --threads must be at least 1")
 
     th.set_num_threads(chosen.threads)
-    models = {name: filled_model(name, chosen.env, chosen.net_arch, chosen.batch_size) for name in _ALGORITHMS}
-    speeds = measure(models, chosen.rounds, chosen.updates, chosen.batch_size)
-    parts = pd.DataFrame({name: profile(model, chosen.updates, chosen.batch_size) for name, model in models.items()}).T
     configuration = {name: value for name, value in vars(chosen).items() if name != "out"}
-    write_csv(chosen.out / "updates.csv", speeds, configuration)
-    write_csv(chosen.out / "updates_profile.csv", parts.rename_axis("algorithm").reset_index(), configuration)
-    text = report(speeds, parts)
-    write_text(chosen.out / "updates.md", text)
-    sys.stdout.write(text)
+    if "updates" in chosen.only:
+        models = {name: filled_model(name, chosen.env, chosen.net_arch, chosen.batch_size) for name in _ALGORITHMS}
+        speeds = measure(models, chosen.rounds, chosen.updates, chosen.batch_size)
+        parts = pd.DataFrame({name: profile(model, chosen.updates, chosen.batch_size) for name, model in models.items()}).T
+        write_csv(chosen.out / "updates.csv", speeds, configuration)
+        write_csv(chosen.out / "updates_profile.csv", parts.rename_axis("algorithm").reset_index(), configuration)
+        _publish(chosen.out / "updates.md", report(speeds, parts))
+    for section, contestants in (("model", model_contestants), ("environments", environment_contestants)):
+        if section in chosen.only:
+            # they run on one core each: its time, other processes not counted
+            speeds = race(contestants(chosen.cells), chosen.rounds, time.process_time)
+            write_csv(chosen.out / f"{section}.csv", speeds, configuration)
+            _publish(chosen.out / f"{section}.md", report_steps(speeds))
+
+
+def _publish(path: Path, text: str) -> None:
+    write_text(path, text)
+    sys.stdout.write(text + "\n")
 
 
 if __name__ == "__main__":

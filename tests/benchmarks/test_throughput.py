@@ -81,7 +81,7 @@ def test_report_compares_within_each_round():
 
 
 def test_tables_are_written(tmp_path, capsys):
-    command = ["--rounds", "2", "--updates", "1", "--env", ENV_ID, "--net-arch", "8", "--batch-size", "8"]
+    command = ["--only", "updates", "--rounds", "2", "--updates", "1", "--env", ENV_ID, "--net-arch", "8", "--batch-size", "8"]
     throughput.main([*command, "--out", str(tmp_path)])
     speeds = pd.read_csv(tmp_path / "updates.csv")
     assert list(speeds) == ["LAC", "SAC", "TD3"] and len(speeds) == 2 and (speeds > 0).all(axis=None)
@@ -93,7 +93,73 @@ def test_tables_are_written(tmp_path, capsys):
     assert (tmp_path / "updates.md").read_text() in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("option", ["--rounds", "--updates", "--net-arch", "--batch-size", "--threads"])
+@pytest.fixture
+def short(monkeypatch):
+    """Turns of a few steps."""
+    for name in ("_SIMULATED_STEPS", "_SIMULATIONS", "_BATCHED_STEPS", "_ENV_STEPS"):
+        monkeypatch.setattr(throughput, name, 3)
+
+
+def test_the_model_does_the_same_work_as_progpy(short, monkeypatch):
+    pytest.importorskip("progpy")
+    final = {}
+    for name, module in (("step_into", throughput), ("voltage_into", throughput)):
+        original = getattr(module, name)
+
+        def recorded(out, *arguments, name=name, original=original):
+            original(out, *arguments)
+            final[name] = out.copy()
+
+        monkeypatch.setattr(module, name, recorded)
+    from progpy.models import BatteryElectroChemEOD
+
+    output = BatteryElectroChemEOD.output
+    monkeypatch.setattr(
+        BatteryElectroChemEOD, "output", lambda self, x: final.update(progpy=(x, output(self, x))) or output(self, x)
+    )
+    contestants = throughput.model_contestants(2)
+    assert [turn() for turn in contestants.values()] == [9, 3, 3, 6, 6, 6, 6, 6]
+    both = [turn for name, turn in contestants.items() if name.startswith("2 cells, step and voltage")]
+    assert len(both) == 2
+    for turn in both:
+        turn()
+    state, outputs = final["progpy"]
+    np.testing.assert_allclose(final["voltage_into"], outputs["v"], rtol=1e-9)
+    np.testing.assert_allclose(final["step_into"][:, 0], state["tb"], rtol=1e-9)
+
+
+def test_environments_are_raced_for_one_cell_and_for_many(short, monkeypatch):
+    monkeypatch.setattr(throughput, "_ENVIRONMENTS", {"BatteryRo-v0": 3})
+    contestants = throughput.environment_contestants(4)
+    expected = {"BatteryRo-v0, 1 cell": 3, "BatteryRo-v0, 4 cells, NextStep": 12, "BatteryRo-v0, 4 cells, SameStep": 12}
+    assert {name: turn() for name, turn in contestants.items()} == expected
+
+
+def test_steps_are_compared_with_those_of_the_same_work():
+    speeds = pd.DataFrame({"a: ours": [8e3, 4e3], "a: progpy x": [2e3, 1e3], "b: ours": [9e3, 9e3], "b: progpy y": [3e3, 1e3]})
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in throughput.report_steps(speeds).splitlines()]
+    assert rows[2:] == [
+        ["a: ours", "6.0 (5.0 to 7.0)", ""],
+        ["a: progpy x", "1.5 (1.2 to 1.8)", "4 (4 to 4)"],
+        ["b: ours", "9.0 (9.0 to 9.0)", ""],
+        ["b: progpy y", "2.0 (1.5 to 2.5)", "6 (4 to 8)"],
+    ]
+    assert "faster" not in throughput.report_steps(speeds[["a: ours"]])
+
+
+def test_sections_are_chosen_and_written(short, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(throughput, "_ENVIRONMENTS", {"BatteryRo-v0": 3})
+    throughput.main(["--only", "environments", "--rounds", "2", "--cells", "4", "--out", str(tmp_path)])
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["environments.csv", "environments.json", "environments.md"]
+    speeds = pd.read_csv(tmp_path / "environments.csv")
+    assert speeds.shape == (2, 3) and (speeds > 0).all(axis=None)
+    assert json.loads((tmp_path / "environments.json").read_text())["configuration"]["cells"] == 4
+    assert (tmp_path / "environments.md").read_text() in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        throughput.main(["--only", "everything"])
+
+
+@pytest.mark.parametrize("option", ["--rounds", "--updates", "--net-arch", "--batch-size", "--cells", "--threads"])
 def test_nonsense_on_the_command_line_is_refused(option, capsys):
     with pytest.raises(SystemExit):
         throughput.main([option, "0"])
