@@ -12,6 +12,8 @@ from numpy.typing import ArrayLike
 
 from battery_env.electrochemistry import FloatArray, LoadUnit, check_load
 
+_MOST_SEGMENTS = 1e6  # of a random load; beyond, a time is meant in another unit
+
 
 def checked_range(name: str, ends: tuple[float, float]) -> tuple[float, float]:
     """
@@ -42,6 +44,11 @@ def _numbers(name: str, values: ArrayLike) -> FloatArray:
 def _check_positive(name: str, value: float) -> None:
     if not isinstance(value, Real) or not 0.0 < value < np.inf:
         raise ValueError(f"{name} must be a positive, finite number, got {value!r}")
+
+
+def _check_segments(total_s: float, name: str, shortest_s: float) -> None:
+    if total_s / shortest_s > _MOST_SEGMENTS:
+        raise ValueError(f"total_s and {name} make more than {_MOST_SEGMENTS:g} segments, got {total_s!r} and {shortest_s!r}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,6 +195,7 @@ class RandomPiecewise:
         for name in ("value_range", "duration_range_s"):
             _check_positive(f"the lower end of {name}", getattr(self, name)[0])
         _check_positive("total_s", self.total_s)
+        _check_segments(self.total_s, "duration_range_s", self.duration_range_s[0])
 
     def __call__(self, rng: np.random.Generator) -> Load:
         """
@@ -229,6 +237,7 @@ class RandomWalk:
         _check_positive("the width of value_range", high - low)
         for name in ("largest_step", "segment_s", "total_s"):
             _check_positive(name, getattr(self, name))
+        _check_segments(self.total_s, "segment_s", self.segment_s)
 
     def __call__(self, rng: np.random.Generator) -> Load:
         """

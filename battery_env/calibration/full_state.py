@@ -354,11 +354,15 @@ class FullStateTask(CalibrationTask):
 
         :param action: in [-1, 1] (beyond, it is clipped), mapped to the parameters' ranges, shape (cells, len(parameters))
         :return: cost, shape (cells,)
+        :raises ValueError: for another shape
         """
+        chosen = np.asarray(action, dtype=np.float64, order="C")
+        if chosen.shape != self.last_action.shape:
+            raise ValueError(f"action must have shape {self.last_action.shape} (cells, parameters), got {chosen.shape}")
         cost = np.empty(self.cells)
         measured = self.measured
         decide(
-            action,
+            chosen,
             *self._of_decision,
             measured,
             self.load,

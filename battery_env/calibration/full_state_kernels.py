@@ -45,7 +45,7 @@ def state_distance(model_state: FloatArray, measured: FloatArray, n: int, per_er
 
 @_compiled
 def decide(
-    action: NDArray[np.floating],
+    action: FloatArray,
     lowest: FloatArray,
     highest: FloatArray,
     finds_q: bool,
@@ -79,7 +79,7 @@ def decide(
         sample[n] += 1
         squared_change = 0.0
         for k in range(action.shape[1]):
-            chosen = _clipped(np.float64(action[n, k]), 1.0)
+            chosen = _clipped(action[n, k], 1.0)
             squared_change += (chosen - last_action[n, k]) ** 2
             last_action[n, k] = chosen
         cost[n] = consistency * sqrt(squared_change)

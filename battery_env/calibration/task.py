@@ -85,6 +85,7 @@ class CalibrationTask(ABC):
 
         :param action: in [-1, 1], beyond it is clipped, shape (cells, len(parameters))
         :return: cost, shape (cells,), at least 0
+        :raises ValueError: for another shape
         """
 
     @abstractmethod

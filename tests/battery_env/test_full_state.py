@@ -244,6 +244,15 @@ def test_a_policy_is_evaluated_under_the_options_it_is_given(discharges):
     np.testing.assert_allclose(trace.q_mobile, NEW_CELL.q_mobile, rtol=1e-6)
 
 
+def test_a_cell_whose_data_have_ended_goes_on_without_failing(discharges):
+    task = started(make(discharges), sample=int(discharges.stop[2]) - 3)
+    assert not task.truncated()
+    for _ in range(5):
+        task.advance(np.zeros((1, 1)))
+        assert task.truncated() and np.isfinite(task.observation()).all()
+    assert task.load == discharges[2].load[-1]
+
+
 @pytest.mark.parametrize(
     ("option", "value", "message"),
     [
@@ -266,6 +275,13 @@ def test_a_policy_is_evaluated_under_the_options_it_is_given(discharges):
 def test_options_out_of_range_are_refused(option, value, message):
     with pytest.raises(ValueError, match=message):
         BatteryQmaxEnv.make_task(1, **{option: value})
+
+
+@pytest.mark.parametrize("shape", [(2,), (2, 2), (1, 1), (3, 1)])
+def test_actions_of_another_shape_are_refused(discharges, shape):
+    task = started(make(discharges, cells=2))
+    with pytest.raises(ValueError, match=r"action must have shape \(2, 1\) \(cells, parameters\), got \(\d"):
+        task.advance(np.zeros(shape))
 
 
 def test_a_data_set_stands_in_place_of_what_would_choose_one(discharges):

@@ -99,6 +99,8 @@ def test_a_recorded_load_is_switched_midway_between_the_samples():
         (lambda: RandomPiecewise(value_range=(0.0, 2.0)), "lower end of value_range"),
         (lambda: RandomPiecewise(duration_range_s=(60.0, np.inf)), "duration_range_s must be finite"),
         (lambda: RandomPiecewise(total_s=0.0), "total_s"),
+        (lambda: RandomPiecewise(duration_range_s=(1e-3, 1.0)), "more than 1e.06 segments, got 20000.0 and 0.001"),
+        (lambda: RandomWalk(total_s=1e9), "more than 1e.06 segments, got 1000000000.0 and 60.0"),
         (lambda: RandomWalk(value_range=(2.0, 2.0)), "width of value_range"),
         (lambda: RandomWalk(value_range=(2.0, 8000.0)), "got 8000.*unit of the load is power"),
         (lambda: RandomWalk(largest_step=-1.0), "largest_step must be a positive, finite number, got -1.0"),

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from battery_env.electrochemistry import NEW_CELL, initial_state, simulate
+from battery_env.electrochemistry import NEW_CELL, QNS, QPS, initial_state, simulate
 from battery_env.estimators.record_model import RecordModel
 
 CURRENT_A = np.repeat(np.random.default_rng(0).uniform(0.5, 2.5, 40), 75)
@@ -20,8 +20,9 @@ PARTLY_DISCHARGED = simulate(2.0, 6000.0, 0.15, until=600.0, load_unit="current"
         RecordModel(thermal=True, dt_s=2.0),
         RecordModel(initial=PARTLY_DISCHARGED),
         RecordModel(cell=NEW_CELL.replace(VolSFraction=0.2, kn=1000.0)),
+        RecordModel(cell=NEW_CELL.replace(mC=2.0, kn=20.0, kp=20.0), thermal=True),
     ],
-    ids=["isothermal", "thermal", "2 s", "partly discharged", "another cell"],
+    ids=["isothermal", "thermal", "2 s", "partly discharged", "another cell", "a hot cell"],
 )
 def test_derivatives_are_those_of_the_simulated_voltage(model):
     current_A, q, r_o, dq, dr = CURRENT_A[:1200], 6000.0, 0.15, 0.03, 1e-5
@@ -35,9 +36,32 @@ def test_derivatives_are_those_of_the_simulated_voltage(model):
 
 @pytest.mark.parametrize("model", [RecordModel(), RecordModel(initial=PARTLY_DISCHARGED), RecordModel(dt_s=2.0)])
 def test_the_model_lasts_just_as_long_as_the_current_at_the_least_q_mobile(model):
-    least_C = model.least_q_mobile_C(CURRENT_A)
-    assert len(model.simulate(CURRENT_A, least_C * (1.0 + 1e-9), 0.1).time_s) == len(CURRENT_A)
-    assert len(model.simulate(CURRENT_A, least_C * (1.0 - 1e-9), 0.1).time_s) < len(CURRENT_A)
+    check_least_q_mobile(model, CURRENT_A)
+
+
+# In the long run one electrode is empty when the other one is overfull. Within seconds it is the surface that is short of
+# charge, or has too much of it.
+@pytest.mark.parametrize(
+    ("state", "surface", "shift_C", "current_A"),
+    [
+        (PARTLY_DISCHARGED, QNS, -20.0, 3.0),
+        (PARTLY_DISCHARGED, QPS, 20.0, 3.0),
+        (initial_state(6000.0), QNS, 20.0, -3.0),
+        (initial_state(6000.0), QPS, -20.0, -3.0),
+    ],
+    ids=["negative empty", "positive overfull", "negative overfull", "positive empty"],
+)
+def test_either_surface_may_be_the_first(state, surface, shift_C, current_A):
+    shifted = state.copy()
+    shifted[surface] += shift_C
+    shifted[surface - 1] -= shift_C
+    check_least_q_mobile(RecordModel(initial=shifted), np.full(5, current_A))
+
+
+def check_least_q_mobile(model, current_A):
+    least_C = model.least_q_mobile_C(current_A)
+    assert len(model.simulate(current_A, least_C * (1.0 + 1e-9), 0.1).time_s) == len(current_A)
+    assert len(model.simulate(current_A, least_C * (1.0 - 1e-9), 0.1).time_s) < len(current_A)
 
 
 def test_nothing_is_known_after_the_model_cell_is_empty():

@@ -69,6 +69,7 @@ def test_a_batch_makes_the_episodes_of_scalar_environments_to_the_bit(env_id, op
                 assert a.dtype == b.dtype
                 np.testing.assert_array_equal(a, b)
             assert_same_infos(info, other_info)
+            step[3][:] = False  # what was returned is the caller's
 
 
 def test_row_n_has_the_generator_of_seed_plus_n(discharges):

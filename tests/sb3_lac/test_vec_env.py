@@ -94,12 +94,50 @@ def test_episodes_may_not_start_one_step_late(problems):
             GymnasiumVecEnv(problems[name][0](AutoresetMode.NEXT_STEP))
 
 
-def test_arrays_that_the_environment_reuses_stay_as_they_were(make_env):
-    env = GymnasiumVecEnv(SyncVectorEnv([make_env] * N_ENVS, copy=False, autoreset_mode="SameStep"))
+@pytest.mark.parametrize("mode", ["SameStep", "Disabled"])
+def test_arrays_that_the_environment_reuses_stay_as_they_were(make_env, mode):
+    def make():
+        return make_env(episode_length=2)
+
+    env, other = (GymnasiumVecEnv(SyncVectorEnv([make] * N_ENVS, copy=copy, autoreset_mode=mode)) for copy in (False, True))
+    for each in (env, other):
+        each.seed(0)
     first = env.reset()
+    np.testing.assert_array_equal(first, other.reset())
     kept = first.copy()
-    env.step(np.ones((N_ENVS, 2)))
+    for _ in range(2):
+        infos, other_infos = (each.step(np.ones((N_ENVS, 2)))[3] for each in (env, other))
     np.testing.assert_array_equal(first, kept)
+    for info, other_info in zip(infos, other_infos, strict=True):
+        assert_same(info, other_info)
+
+
+class Events(gym.Wrapper):
+    """Tells of every third step only, and ends in a termination at its time limit."""
+
+    def step(self, action):
+        observation, reward, _, truncated, info = self.env.step(action)
+        if self.env.unwrapped.n_steps % 3 == 0:
+            info["event"] = {"step": self.env.unwrapped.n_steps, "name": "third"}
+        return observation, reward, truncated, truncated, info
+
+
+@pytest.mark.parametrize("mode", ["SameStep", "Disabled"])
+def test_infos_that_only_some_environments_have_and_ends_of_both_kinds(make_env, mode):
+    lengths = (3, 4, 5)
+    makes = [lambda length=length: Events(make_env(episode_length=length)) for length in lengths]
+    found, expected = GymnasiumVecEnv(SyncVectorEnv(makes, autoreset_mode=mode)), DummyVecEnv(makes)
+    for env in (found, expected):
+        env.seed(0)
+        env.reset()
+    events = []
+    for _ in range(7):
+        infos, other_infos = (env.step(np.zeros((3, 2)))[3] for env in (found, expected))
+        for info, other in zip(infos, other_infos, strict=True):
+            assert_same(info, other)
+            assert not info["TimeLimit.truncated"]
+        events.append(sum("event" in info for info in infos))
+    assert set(events) == {0, 1, 3}
 
 
 def test_dicts_of_observations(make_env):
