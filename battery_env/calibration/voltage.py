@@ -348,8 +348,16 @@ class VoltageTask(CalibrationTask):
         :param action: in [-1, 1], beyond it is clipped, shape (cells, len(parameters))
         :param arriving: whether readings arrive
         :return: cost, shape (cells,)
+        :raises ValueError: for another shape, or an action that is no number
         """
-        step = np.clip(np.asarray(action, dtype=np.float64).reshape(self.cells, -1), -1.0, 1.0)
+        chosen = np.asarray(action, dtype=np.float64)
+        if chosen.shape != self._action.shape:
+            raise ValueError(f"action must have shape {self._action.shape} (cells, parameters), got {chosen.shape}")
+        if np.isnan(chosen).any():
+            raise ValueError(
+                f"action must hold numbers, got NaN for cells {np.flatnonzero(np.isnan(chosen).any(axis=1)).tolist()}"
+            )
+        step = np.clip(chosen, -1.0, 1.0)
         moved = self.estimate[:, self._columns] + np.sign(step) * step**2 * self._step
         self.estimate[:, self._columns] = np.clip(moved, self._low, self._high)
         if arriving:

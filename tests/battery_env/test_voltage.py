@@ -162,6 +162,15 @@ class TestTask:
         for count in counts[1:]:
             np.testing.assert_array_equal(count, readings.count[task.discharge])
 
+    def test_actions_that_cannot_be_meant_are_refused(self, readings):
+        task = started(readings)
+        before = task.estimate.copy()
+        with pytest.raises(ValueError, match=r"action must have shape \(4, 2\) \(cells, parameters\), got \(2,\)"):
+            task.advance(np.zeros(2))
+        with pytest.raises(ValueError, match=r"action must hold numbers, got NaN for cells \[1\]"):
+            task.advance(np.array([[0.0, 0.0], [np.nan, 0.0], [0.0, 0.0], [0.0, 0.0]]))
+        np.testing.assert_array_equal(task.estimate, before)
+
     @pytest.mark.parametrize(
         ("options", "message"),
         [
