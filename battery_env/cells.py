@@ -11,6 +11,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from importlib.resources import as_file, files
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -47,9 +48,11 @@ _DURATION_LIMITS_S = (10.0, 1e6)
 
 
 def _checked(name: str, values: ArrayLike) -> FloatArray:
+    if values is None or np.ma.is_masked(values) or np.iscomplexobj(values):
+        raise TypeError(f"{name} must hold real numbers, none of them masked, got {type(values).__name__}")
     try:
         array = np.array(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (OverflowError, TypeError, ValueError) as error:
         raise TypeError(f"{name} must hold numbers: {error}") from error
     if array.ndim != 1 or len(array) < _MIN_SAMPLES:
         raise ValueError(f"{name} must hold one value a sample, at least {_MIN_SAMPLES} of them; got shape {array.shape}")
@@ -134,7 +137,7 @@ class Discharge:
 
     def __post_init__(self) -> None:
         for name in ("time_s", "voltage_V", "current_A", "temperature_C"):
-            if getattr(self, name) is not None:
+            if name != "temperature_C" or self.temperature_C is not None:
                 object.__setattr__(self, name, _checked(name, getattr(self, name)))
                 if len(getattr(self, name)) != len(self.time_s):
                     raise ValueError(f"{name} has {len(getattr(self, name))} samples, but time_s has {len(self.time_s)}")
@@ -183,6 +186,8 @@ class Discharge:
         :param cut_off_V: cut-off voltage, V
         :return: the end of discharge on the clock of ``time_s``, s; NaN if the record does not reach it
         """
+        if not isinstance(cut_off_V, Real) or np.isnan(cut_off_V):
+            raise ValueError(f"cut_off_V must be a voltage in V, got {cut_off_V!r}")
         first, last = self._loaded_samples()
         below = np.flatnonzero(self.voltage_V[first : last + 1] <= cut_off_V)
         if not len(below):
@@ -226,6 +231,8 @@ class Discharge:
         :return: the samples up to then
         :raises ValueError: if these are too few
         """
+        if not isinstance(time_s, Real) or np.isnan(time_s):
+            raise ValueError(f"time_s must be a time in s, got {time_s!r}")
         n = int(np.searchsorted(self.time_s, time_s, side="right"))
         temperature_C = None if self.temperature_C is None else self.temperature_C[:n]
         return Discharge(self.time_s[:n], self.voltage_V[:n], self.current_A[:n], temperature_C, self.meta)
@@ -283,7 +290,9 @@ def load_nasa_discharges(path_or_cell: str | Path) -> list[Discharge]:
 def _read_table(path: Path, columns: Iterable[str]) -> pd.DataFrame:
     try:
         table = pd.read_csv(path)
-    except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
+    except (FileNotFoundError, IsADirectoryError, PermissionError):
+        raise
+    except Exception as error:  # pandas and the unpackers raise whatever the damage leads them to
         raise ValueError(f"{path} is not a file of comma-separated values: {str(error).strip()}") from error
     missing = [name for name in columns if name not in table]
     if missing:
@@ -303,7 +312,10 @@ def _read_nasa_csv(path: Path) -> list[Discharge]:
         tests = _read_table(summary, ("battery_id", "cycle", *_META_COLUMNS))
         tests = tests[tests["battery_id"] == cell]
         known = {int(row["cycle"]): {name: row[name] for name in _META_COLUMNS} for row in tests.to_dict(orient="records")}
-    cycles = table["cycle"].to_numpy(dtype=np.int64)
+    cycles = pd.to_numeric(table["cycle"], errors="coerce").to_numpy()
+    if not (np.mod(cycles, 1.0) == 0.0).all():
+        raise ValueError(f"{path}: cycle must hold whole numbers")
+    cycles = cycles.astype(np.int64)
     samples = []
     for cycle in map(int, np.unique(cycles)):
         part = table[cycles == cycle]
@@ -313,7 +325,15 @@ def _read_nasa_csv(path: Path) -> list[Discharge]:
 
 
 def _read_nasa_mat(path: Path) -> list[Discharge]:
-    content = loadmat(path, simplify_cells=True)
+    try:
+        content = loadmat(path, simplify_cells=True)
+        samples = _samples_of_mat(path, content)
+    except Exception as error:  # scipy raises whatever the damage leads it to, and a field may be missing anywhere
+        raise ValueError(f"{path} is damaged, or not laid out as NASA's battery files: {error!r}") from error
+    return _checked_discharges(path, samples)
+
+
+def _samples_of_mat(path: Path, content: dict[str, Any]) -> list[tuple[dict[str, Any], dict[str, Any]]]:
     cells = {name: value for name, value in content.items() if isinstance(value, dict) and "cycle" in value}
     if len(cells) != 1:
         names = ", ".join(name for name in content if not name.startswith("__"))
@@ -345,7 +365,7 @@ def _read_nasa_mat(path: Path) -> list[Discharge]:
             "temperature_C": data["Temperature_measured"],
         }
         samples.append((arrays, meta))
-    return _checked_discharges(path, samples)
+    return samples
 
 
 def _start_time(date_vector: FloatArray) -> datetime:

@@ -31,6 +31,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from numbers import Real
 from typing import Any, Literal
 
 import numpy as np
@@ -61,6 +62,7 @@ UNCERTAIN_CONSTANTS: tuple[str, ...] = ("kn", "tDiffusion", "to", "tsn")
 
 _SIX_TENTHS = 0.6  # xnMax - xnMin: the share of all lithium sites that a full discharge uses
 _POLYNOMIAL_SIZE = 14
+_MAX_STEPS = 1e8  # of one simulation, in memory
 
 
 def _redlich_kister_polynomial(coefficients: tuple[float, ...], faraday: float) -> FloatArray:
@@ -157,7 +159,10 @@ class CellParameters:
         check_r_o(self.r_o)
         for field in fields(self):
             value = getattr(self, field.name)
-            if not np.all(np.isfinite(value)):
+            numbers = value if field.name in ("An", "Ap") and isinstance(value, tuple) else (value,)
+            if not all(isinstance(number, Real) for number in numbers):
+                raise TypeError(f"CellParameters: {field.name} must be {field.type}, got {value!r}")
+            if not np.all(np.isfinite(np.array(value, dtype=np.float64))):
                 raise ValueError(f"CellParameters: {field.name} must be finite, got {value!r}")
             if field.name not in ("U0n", "U0p", "An", "Ap", "r_o") and not value > 0.0:
                 raise ValueError(f"CellParameters: {field.name} must be greater than 0, got {value!r}")
@@ -227,11 +232,23 @@ class CellParameters:
         return packed._replace(constants=constants)
 
 
-def _check_range(name: str, value: ArrayLike, limits: tuple[float, float], unit: str, hint: str) -> FloatArray:
+def _numbers(name: str, value: ArrayLike, what: str = "") -> FloatArray:
     try:
-        array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise TypeError(f"{name} must be a number or an array of numbers in {unit}, got {value!r}") from error
+        return np.asarray(value, dtype=np.float64)
+    except (OverflowError, TypeError, ValueError) as error:
+        raise TypeError(f"{name} must be a number or an array of numbers{what}, got {value!r}") from error
+
+
+def _checked_cell(parameters: CellParameters | None, thermal: bool = False) -> CellParameters:
+    if parameters is not None and not isinstance(parameters, CellParameters):
+        raise TypeError(f"parameters must be CellParameters or None, got {parameters!r}")
+    if not isinstance(thermal, (bool, np.bool_)):
+        raise TypeError(f"thermal must be True or False, got {thermal!r}")
+    return NEW_CELL if parameters is None else parameters
+
+
+def _check_range(name: str, value: ArrayLike, limits: tuple[float, float], unit: str, hint: str) -> FloatArray:
+    array = _numbers(name, value, f" in {unit}")
     inside = (array >= limits[0]) & (array <= limits[1])
     if not inside.all():
         worst = array[~inside].flat[0]
@@ -270,7 +287,7 @@ def check_load(load: ArrayLike, load_unit: LoadUnit) -> FloatArray:
     :return: the load as a float64 array
     :raises ValueError: for another unit, or beyond ``LOAD_LIMITS``
     """
-    if load_unit not in LOAD_LIMITS:
+    if not isinstance(load_unit, str) or load_unit not in LOAD_LIMITS:
         raise ValueError(f"load_unit must be 'power' (W) or 'current' (A), got {load_unit!r}")
     limit = LOAD_LIMITS[load_unit]
     return _check_range("load", load, (-limit, limit), LOAD_UNIT_SYMBOLS[load_unit], f"The unit of the load is {load_unit}.")
@@ -286,7 +303,7 @@ def check_dt(dt: float, parameters: CellParameters) -> float:
     :raises ValueError: unless 0 < dt <= 2 * to
     """
     limit = 2.0 * min(parameters.to, parameters.tsn, parameters.tsp)
-    if not 0.0 < dt <= limit:
+    if not isinstance(dt, Real) or not 0.0 < dt <= limit:
         raise ValueError(
             f"dt must be greater than 0 and at most {limit:.4g} s (twice the fastest time constant: explicit Euler is "
             f"unstable beyond), got {dt!r}. Use a smaller dt."
@@ -305,13 +322,13 @@ def initial_state(q_mobile: ArrayLike, parameters: CellParameters | None = None)
     """
     q = check_q_mobile(q_mobile)
     state = np.zeros((*q.shape, STATE_SIZE))
-    state[..., TB] = (parameters or NEW_CELL).Tb0
+    state[..., TB] = _checked_cell(parameters).Tb0
     state[..., QNB:] = q[..., None] * FULL_CHARGE_SHARES
     return state
 
 
 def _check_state(state: ArrayLike) -> FloatArray:
-    array = np.asarray(state, dtype=np.float64)
+    array = _numbers("state", state)
     if array.ndim == 0 or array.shape[-1] != STATE_SIZE:
         raise ValueError(f"state must have shape (..., {STATE_SIZE}) in the order {STATE_NAMES}, got shape {array.shape}")
     return array
@@ -334,7 +351,7 @@ def voltage(state: ArrayLike, q_mobile: ArrayLike, parameters: CellParameters | 
     x, q = _check_state(state), check_q_mobile(q_mobile)
     shape = np.broadcast_shapes(x.shape[:-1], q.shape)
     out = np.empty(int(np.prod(shape)))
-    voltage_into(out, _flat(x, shape, STATE_SIZE), _flat(q, shape), (parameters or NEW_CELL).packed)
+    voltage_into(out, _flat(x, shape, STATE_SIZE), _flat(q, shape), _checked_cell(parameters).packed)
     return out.reshape(shape)[()]
 
 
@@ -364,7 +381,7 @@ def step(
     :return: the next state, shape (..., 8)
     :raises ValueError: for a wrong shape, or a value out of range
     """
-    cell = parameters or NEW_CELL
+    cell = _checked_cell(parameters, thermal)
     x, u, q, r = _check_state(state), check_load(load, load_unit), check_q_mobile(q_mobile), check_r_o(r_o)
     shape = np.broadcast_shapes(x.shape[:-1], u.shape, q.shape, r.shape)
     out = np.empty((int(np.prod(shape)), STATE_SIZE))
@@ -551,33 +568,55 @@ def simulate(
     :return: the samples down to the cut-off, and the time of the end of discharge
     :raises ValueError: for a value out of range
     """
-    cell = parameters or NEW_CELL
+    cell = _checked_cell(parameters, thermal)
     dt = check_dt(dt, cell)
-    q, r = float(check_q_mobile(q_mobile)), float(check_r_o(r_o))
+    q, r = check_q_mobile(q_mobile), check_r_o(r_o)
+    if q.ndim or r.ndim:
+        raise ValueError(f"q_mobile and r_o must be single numbers, got shapes {q.shape} and {r.shape}")
+    given_unit = getattr(load, "unit", load_unit)
+    if given_unit != load_unit:
+        raise ValueError(f"the load is a {given_unit}, but load_unit is {load_unit!r}: give load_unit={given_unit!r}")
     if until != "eod" and not (isinstance(until, (int, float)) and 0.0 < until <= max_duration_s):
         raise ValueError(f"until must be 'eod' or a duration within 0 .. {max_duration_s:g} s, got {until!r}")
     duration_s = max_duration_s if until == "eod" else float(until)
+    if not isinstance(max_duration_s, Real) or not 0.0 < max_duration_s / dt <= _MAX_STEPS:
+        raise ValueError(
+            f"max_duration_s must be greater than 0 and at most {_MAX_STEPS:g} steps of dt, got {max_duration_s!r}"
+        )
     n_samples = int(np.floor(duration_s / dt + 1e-9)) + 1
     if callable(load):
-        loads = np.asarray(load(dt * np.arange(n_samples, dtype=np.float64)), dtype=np.float64)
+        loads = _numbers("load", load(dt * np.arange(n_samples, dtype=np.float64)))
     else:
-        loads = np.asarray(load, dtype=np.float64)
+        loads = _numbers("load", load)
         if loads.ndim == 1:
             n_samples = min(n_samples, len(loads))
     if loads.ndim == 0:
         loads = np.full(n_samples, check_load(loads, load_unit))
     else:
         loads = check_load(loads[..., :n_samples], load_unit)
-    if loads.shape != (n_samples,):
+    if loads.shape != (n_samples,) or n_samples == 0:
         raise ValueError(f"load must be a number or one value a step, shape (steps,), got shape {loads.shape}")
     start = initial_state(q, cell) if initial is None else _check_state(initial)
     if start.shape != (STATE_SIZE,):
         raise ValueError(f"initial must have shape ({STATE_SIZE},), got {start.shape}")
     cut_off = cell.VEOD if cut_off_V is None else cut_off_V
+    if not isinstance(cut_off, Real) or np.isnan(cut_off):
+        raise ValueError(f"cut_off_V must be a number or None, got {cut_off_V!r}")
     state, volts, amperes = np.empty((n_samples + 1, STATE_SIZE)), np.empty(n_samples), np.empty(n_samples)
     state[0] = start
     flags = (load_unit == "power", thermal)
-    n = roll_out(np.require(loads, requirements=["C", "W"]), q, r, dt, cut_off, *flags, *cell.packed, state, volts, amperes)
+    n = roll_out(
+        np.require(loads, requirements=["C", "W"]),
+        float(q),
+        float(r),
+        dt,
+        cut_off,
+        *flags,
+        *cell.packed,
+        state,
+        volts,
+        amperes,
+    )
     return Trajectory(
         time_s=dt * np.arange(n, dtype=np.float64),
         state=state[:n].copy(),
@@ -585,8 +624,8 @@ def simulate(
         current_A=amperes[:n].copy(),
         load=np.array(loads[:n]),
         load_unit=load_unit,
-        q_mobile=q,
-        r_o=r,
+        q_mobile=float(q),
+        r_o=float(r),
         eod_time_s=n * dt if n < n_samples else float("nan"),
     )
 

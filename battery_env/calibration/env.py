@@ -95,9 +95,10 @@ class CalibrationEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]], ABC):
 
         :param action: shape (number of parameters,), in [-1, 1]
         :return: observation, reward (minus the cost), terminated (never), truncated (end of the episode or of the data), info
+        :raises ValueError: for an action of another shape, NaN, or what is no number
         """
         task = self.task
-        cost = task.advance(np.asarray(action).reshape(1, -1)).item()
+        cost = task.advance(np.asarray(action)[None]).item()
         info = self._info(cost)
         if self.render_mode is not None:
             self._history.append(info)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from battery_env.calibration.full_state_kernels import decide, look_ahead, observe
-from battery_env.calibration.task import OBSERVATION_LIMIT, CalibrationTask
+from battery_env.calibration.task import OBSERVATION_LIMIT, CalibrationTask, checked_action
 from battery_env.electrochemistry import (
     NEW_CELL,
     QNB,
@@ -354,11 +354,9 @@ class FullStateTask(CalibrationTask):
 
         :param action: in [-1, 1] (beyond, it is clipped), mapped to the parameters' ranges, shape (cells, len(parameters))
         :return: cost, shape (cells,)
-        :raises ValueError: for another shape
+        :raises ValueError: for another shape, NaN, or what is no number
         """
-        chosen = np.asarray(action, dtype=np.float64, order="C")
-        if chosen.shape != self.last_action.shape:
-            raise ValueError(f"action must have shape {self.last_action.shape} (cells, parameters), got {chosen.shape}")
+        chosen = checked_action(action, self.last_action.shape)
         cost = np.empty(self.cells)
         measured = self.measured
         decide(

@@ -30,6 +30,23 @@ def check_options(given: Iterable[str], known: Iterable[str]) -> None:
         raise TypeError(f"{', '.join(sorted(unknown))}: no such option. There are {', '.join(sorted(known))}")
 
 
+def checked_action(action: NDArray[np.floating], shape: tuple[int, ...]) -> FloatArray:
+    """
+    Refuse what is no action: compiled code would read beyond a short one, and NaN would spread through the episode.
+
+    :param action: the action
+    :param shape: its shape
+    :return: the same as a contiguous float64 array
+    :raises ValueError: for another shape, NaN, or what is no number
+    """
+    array = np.asarray(action)
+    if array.dtype.kind not in "fiu" or array.shape != shape:
+        raise ValueError(f"action must hold numbers, shape {shape}, got {array.dtype} values of shape {array.shape}")
+    if np.isnan(array).any():
+        raise ValueError(f"action must hold numbers in [-1, 1], got NaN: {array}")
+    return np.asarray(array, dtype=np.float64, order="C")
+
+
 class CalibrationTask(ABC):
     """
     A calibration task as a Markov decision process, for ``cells`` cells side by side, each in its own episode.
@@ -85,7 +102,7 @@ class CalibrationTask(ABC):
 
         :param action: in [-1, 1], beyond it is clipped, shape (cells, len(parameters))
         :return: cost, shape (cells,), at least 0
-        :raises ValueError: for another shape
+        :raises ValueError: for another shape, NaN, or what is no number
         """
 
     @abstractmethod

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from battery_env.calibration.readings import Readings, explain
-from battery_env.calibration.task import OBSERVATION_LIMIT, CalibrationTask, Parameter
+from battery_env.calibration.task import OBSERVATION_LIMIT, CalibrationTask, Parameter, checked_action
 from battery_env.electrochemistry import NEW_CELL, FloatArray
 from battery_env.trajectories import IntArray
 
@@ -348,15 +348,9 @@ class VoltageTask(CalibrationTask):
         :param action: in [-1, 1], beyond it is clipped, shape (cells, len(parameters))
         :param arriving: whether readings arrive
         :return: cost, shape (cells,)
-        :raises ValueError: for another shape, or an action that is no number
+        :raises ValueError: for another shape, NaN, or what is no number
         """
-        chosen = np.asarray(action, dtype=np.float64)
-        if chosen.shape != self._action.shape:
-            raise ValueError(f"action must have shape {self._action.shape} (cells, parameters), got {chosen.shape}")
-        if np.isnan(chosen).any():
-            raise ValueError(
-                f"action must hold numbers, got NaN for cells {np.flatnonzero(np.isnan(chosen).any(axis=1)).tolist()}"
-            )
+        chosen = checked_action(action, self._action.shape)
         step = np.clip(chosen, -1.0, 1.0)
         moved = self.estimate[:, self._columns] + np.sign(step) * step**2 * self._step
         self.estimate[:, self._columns] = np.clip(moved, self._low, self._high)

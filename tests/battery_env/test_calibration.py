@@ -234,9 +234,12 @@ def test_own_trajectories_can_be_used():
 def test_a_frame_is_a_picture():
     env = gym.make("BatteryRo-v0", render_mode="rgb_array")
     env.reset(seed=0)
+    empty = env.render()
     for _ in range(5):
         env.step(env.action_space.sample())
     frame = env.render()
+    env.reset()
+    np.testing.assert_array_equal(env.render(), empty)
     assert frame.shape == (400, 600, 3) and frame.dtype == np.uint8 and frame.std() > 10.0
 
 

@@ -280,7 +280,7 @@ def test_options_out_of_range_are_refused(option, value, message):
 @pytest.mark.parametrize("shape", [(2,), (2, 2), (1, 1), (3, 1)])
 def test_actions_of_another_shape_are_refused(discharges, shape):
     task = started(make(discharges, cells=2))
-    with pytest.raises(ValueError, match=r"action must have shape \(2, 1\) \(cells, parameters\), got \(\d"):
+    with pytest.raises(ValueError, match=r"action must hold numbers, shape \(2, 1\), got float64 values of shape \(\d"):
         task.advance(np.zeros(shape))
 
 

@@ -5,13 +5,16 @@ import dataclasses
 import pickle
 from datetime import datetime
 from functools import partial
+from io import BytesIO
 
 import gymnasium as gym
 import numpy as np
+import pandas as pd
 import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
+from scipy.io import savemat
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 import battery_env
@@ -99,6 +102,31 @@ class TestModel:
         value = (value,) if name in ("An", "Ap") else value
         cell = right_or_refused(lambda: battery_env.CellParameters(**{name: value}), name)
         assert cell is None or getattr(cell, name) == value
+
+    @FAST
+    @given(
+        change=st.tuples(st.sampled_from(["load", "q_mobile", "r_o", "until", "dt", "initial", "max_duration_s"]), JUNK)
+        | st.tuples(st.sampled_from(["thermal", "parameters", "load_unit", "cut_off_V"]), JUNK | st.just(np.nan))
+    )
+    def test_arguments_of_another_kind_are_refused(self, change):
+        name, value = change
+        assume(value is not None or name not in ("initial", "parameters", "cut_off_V"))
+        arguments = {"load": 8.0, "q_mobile": 7600.0, "r_o": 0.1} | {name: value}
+        assert right_or_refused(lambda: battery_env.simulate(**arguments), "state" if name == "initial" else name) is None
+        if name in ("dt", "thermal", "parameters", "load_unit"):
+            state = battery_env.initial_state(7600.0)
+            assert right_or_refused(lambda: battery_env.step(state, **arguments), name) is None
+
+    def test_a_load_is_not_taken_for_one_in_another_unit(self):
+        with pytest.raises(ValueError, match="the load is a current, but load_unit is 'power'"):
+            battery_env.simulate(constant(2.0, "current"), 7600.0, 0.1)
+        with pytest.raises(ValueError, match="load must be a number or one value a step"):
+            battery_env.simulate([], 7600.0, 0.1)
+
+    @FAST
+    @given(name=st.sampled_from([field.name for field in dataclasses.fields(battery_env.CellParameters)]), value=JUNK)
+    def test_constants_are_numbers(self, name, value):
+        assert right_or_refused(lambda: battery_env.CellParameters(**{name: value}), name) is None
 
 
 class TestLoads:
@@ -241,6 +269,49 @@ class TestRecordings:
         with pytest.raises(ValueError, match=f"(?s)own.csv.*{message}|{message}"):
             battery_env.read_discharge_csv(tmp_path / "own.csv")
 
+    @pytest.mark.parametrize("name", ["own.csv.gz", "own.csv.zip", "own.csv.bz2", "own.csv.xz"])
+    @pytest.mark.parametrize("length", [0, 10, 60])
+    def test_a_damaged_archive_is_refused_by_name(self, tmp_path, name, length):
+        pd.read_csv(BytesIO(self.CSV)).to_csv(tmp_path / name, index=False)
+        assert len(battery_env.read_discharge_csv(tmp_path / name).time_s) == 20
+        (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:length])
+        with pytest.raises(ValueError, match=name):
+            battery_env.read_discharge_csv(tmp_path / name)
+
+    @pytest.mark.parametrize("cycle", ["", "first", "1.5"])
+    def test_cycles_are_counted_in_whole_numbers(self, tmp_path, cycle):
+        rows = [f"{cycle},{row}" for row in self.CSV.decode().splitlines()[1:]]
+        (tmp_path / "X1.csv").write_text("\n".join(["cycle,time_s,voltage_V,current_A,temperature_C", *rows]))
+        with pytest.raises(ValueError, match=r"X1.csv: cycle must hold whole numbers"):
+            battery_env.load_nasa_discharges(tmp_path / "X1.csv")
+
+    @pytest.mark.parametrize("length", [0, 1, 100, 200, 1000])
+    def test_a_truncated_mat_file_is_refused_by_name(self, tmp_path, length):
+        savemat(tmp_path / "B1.mat", {"B1": {"cycle": np.array([{"type": "charge", "data": np.ones(200)}] * 2, dtype=object)}})
+        (tmp_path / "B1.mat").write_bytes((tmp_path / "B1.mat").read_bytes()[:length])
+        with pytest.raises(ValueError, match=r"B1.mat is damaged, or not laid out"):
+            battery_env.load_nasa_discharges(tmp_path / "B1.mat")
+
+    @pytest.mark.parametrize("cycle", [np.ones(3), "abc", {"type": "discharge"}, {"type": "discharge", "time": np.ones(2)}])
+    def test_a_mat_file_with_other_tests_is_refused_by_name(self, tmp_path, cycle):
+        savemat(tmp_path / "B1.mat", {"B1": {"cycle": cycle}})
+        with pytest.raises(ValueError, match=r"B1.mat is damaged, or not laid out"):
+            battery_env.load_nasa_discharges(tmp_path / "B1.mat")
+
+    @pytest.mark.parametrize("name", ["time_s", "voltage_V", "current_A"])
+    @pytest.mark.parametrize("value", [None, np.full(20, 3.0 + 1.0j), np.ma.masked_less(np.arange(20.0), 1.0)])
+    def test_no_number_is_made_up(self, name, value):
+        arguments = {"time_s": np.arange(20.0), "voltage_V": np.full(20, 4.0), "current_A": np.full(20, 2.0)} | {name: value}
+        with pytest.raises(TypeError, match=f"{name} must hold real numbers"):
+            battery_env.Discharge(**arguments)
+
+    @pytest.mark.parametrize("value", [None, "3.0", np.nan])
+    def test_parts_of_a_discharge_need_a_number(self, value):
+        discharge = battery_env.load_nasa_discharges("B0005")[0]
+        for method, name in ((discharge.until, "time_s"), (discharge.loaded_part, "cut_off_V")):
+            with pytest.raises(ValueError, match=f"{name} must be a"):
+                method(value)
+
     def test_a_byte_order_mark_does_no_harm(self, tmp_path):
         (tmp_path / "own.csv").write_bytes(b"\xef\xbb\xbf" + self.CSV)
         assert len(battery_env.read_discharge_csv(tmp_path / "own.csv").time_s) == 20
@@ -317,6 +388,17 @@ class TestEnvironments:
         np.testing.assert_array_equal(found[0], found[1])
         np.testing.assert_array_equal(found[0], found[2])
 
+    def test_what_is_no_action_is_refused(self, data, env_id):
+        env = gym.make(env_id, dataset=data).unwrapped
+        vector_env = gym.make_vec(env_id, num_envs=2, dataset=data)
+        for each in (env, vector_env):
+            each.reset(seed=0)
+            shape = each.action_space.shape
+            wrong = [None, "0", 0.0, np.full(shape, np.nan), np.zeros(0), np.zeros((*shape, 1)), np.zeros(9)]
+            for action in (*wrong, np.zeros(shape, complex), np.zeros(shape, object)):
+                with pytest.raises(ValueError, match="action must hold numbers"):
+                    each.step(action)
+
     def test_the_kind_of_an_actions_numbers_does_not_matter(self, data, env_id):
         env = gym.make(env_id, dataset=data).unwrapped
         found = []
@@ -334,15 +416,15 @@ class TestEnvironments:
             env.reset(options={"cycle_number": 1})
 
 
-def test_processes_run_the_same_episodes_as_one(data):
-    make = [partial(gym.make, "battery_env:BatteryRo-v0", dataset=data) for _ in range(2)]
-    one, many = DummyVecEnv(make), SubprocVecEnv(make)
+def test_another_process_runs_the_same_episodes(data):
+    make = [partial(gym.make, "battery_env:BatteryRo-v0", dataset=data)]
+    here, there = DummyVecEnv(make), SubprocVecEnv(make)
     try:
-        for env in (one, many):
-            env.seed(5)
-        np.testing.assert_array_equal(one.reset(), many.reset())
-        for action in np.random.default_rng(0).uniform(-1.0, 1.0, (70, 2, 1)).astype(np.float32):
-            for a, b in zip(one.step(action)[:3], many.step(action)[:3], strict=True):
+        here.seed(5)
+        there.seed(5)
+        np.testing.assert_array_equal(here.reset(), there.reset())
+        for action in np.random.default_rng(0).uniform(-1.0, 1.0, (70, 1, 1)).astype(np.float32):
+            for a, b in zip(here.step(action)[:3], there.step(action)[:3], strict=True):
                 np.testing.assert_array_equal(a, np.asarray(b, dtype=a.dtype))
     finally:
-        many.close()
+        there.close()

@@ -165,9 +165,9 @@ class TestTask:
     def test_actions_that_cannot_be_meant_are_refused(self, readings):
         task = started(readings)
         before = task.estimate.copy()
-        with pytest.raises(ValueError, match=r"action must have shape \(4, 2\) \(cells, parameters\), got \(2,\)"):
+        with pytest.raises(ValueError, match=r"action must hold numbers, shape \(4, 2\), got float64 values of shape \(2,\)"):
             task.advance(np.zeros(2))
-        with pytest.raises(ValueError, match=r"action must hold numbers, got NaN for cells \[1\]"):
+        with pytest.raises(ValueError, match="got NaN"):
             task.advance(np.array([[0.0, 0.0], [np.nan, 0.0], [0.0, 0.0], [0.0, 0.0]]))
         np.testing.assert_array_equal(task.estimate, before)
 
