@@ -107,8 +107,8 @@ class Formulation:
     :param state_scale: what observed states are divided by, shape (7,)
     :param load_scale: what observed loads are divided by, W
     :param error_scale: what state errors are divided by, in the cost and in the innovation, shape (7,)
-    :param innovation: whether the observation holds x_{t+1} minus what the model predicts from x̂_t with a new cell's
-        parameters
+    :param innovations: whether the observation holds x_{t+1} minus what a model with a new cell's parameters predicts, once
+        from the model's state x̂_t and once from the measured state x_t
     :param literal_cost: the authors' cost: 0.5 times the norm of the error of the voltages plus 0.5 times that of the charges,
         times 50 where it exceeds 1e-4. Otherwise it is the norm of all errors
     :param cost_limit: the largest cost of a distance. Near the end of a discharge distances span four orders of magnitude;
@@ -118,7 +118,7 @@ class Formulation:
     state_scale: FloatArray
     load_scale: float
     error_scale: FloatArray
-    innovation: bool
+    innovations: bool
     literal_cost: bool
     cost_limit: float
 
@@ -129,7 +129,7 @@ FORMULATIONS: dict[str, Formulation] = {
         state_scale=np.array([0.5, 0.1, 0.01, 6840.0, 760.0, 11400.0, 1266.0]),
         load_scale=16.0,
         error_scale=ERROR_SCALE,
-        innovation=True,
+        innovations=True,
         literal_cost=False,
         cost_limit=5.0,
     ),
@@ -138,7 +138,7 @@ FORMULATIONS: dict[str, Formulation] = {
         state_scale=np.array([1.0, 1.0, 1.0, 6840.0, 760.0, 4560.0, 506.67]),
         load_scale=20.0,
         error_scale=np.ones(OBSERVED_SIZE),
-        innovation=False,
+        innovations=False,
         literal_cost=True,
         cost_limit=1e4,
     ),
@@ -161,6 +161,7 @@ _PER_CELL = (
     "soc",
     "last_action",
     "_sensed",
+    "_sensed_before",
     "_last_sample",
     "_last_decision",
     "_load_start",
@@ -207,7 +208,7 @@ class FullStateTask(CalibrationTask):
         self.episode_steps = chosen.episode_steps
         self.decision_s = dataset.dt_s
         shows_action = chosen.consistency > 0.0
-        shown = (2, 3)[form.innovation] * OBSERVED_SIZE + 1
+        shown = (4 if form.innovations else 2) * OBSERVED_SIZE + 1
         self.observation_size = shown + (len(self.parameters) if shows_action else 0)
         self._action_range = np.array([ACTION_RANGES[name] for name in self.parameters]).T
         self._first_action = self.action_of({"q_mobile": NEW_CELL.q_mobile, "r_o": NEW_CELL.r_o})
@@ -225,10 +226,10 @@ class FullStateTask(CalibrationTask):
 
         self._has_sensor_errors = (chosen.sensor_noise, chosen.sensor_offset, chosen.sensor_gain) != (0.0, 0.0, 1.0)
         self._is_disturbed = self._has_sensor_errors or chosen.process_noise_V > 0.0
-        self._sensed = np.zeros((cells if self._has_sensor_errors else 0, STATE_SIZE))
-        # standard normal, of the process first
+        self._sensed, self._sensed_before = np.zeros((2, cells if self._has_sensor_errors else 0, STATE_SIZE))
+        # standard normal, of the process first; one row for each measured state, of which the first is x_t at the start
         columns = (OBSERVED_SIZE if chosen.sensor_noise > 0.0 else 0) + (3 if chosen.process_noise_V > 0.0 else 0)
-        self._noise = np.zeros((cells, self.episode_steps + 1, columns))
+        self._noise = np.zeros((cells, self.episode_steps + 2, columns))
 
         self._model_packed = self._true_packed = dataset.parameters.packed
         self._has_own_constants = bool((dataset.factors != 1.0).any())
@@ -248,12 +249,17 @@ class FullStateTask(CalibrationTask):
             1.0 / form.error_scale,
         )
         scales = (1.0 / form.state_scale, 1.0 / form.load_scale, 1.0 / form.error_scale)
-        self._of_observation = (*scales, form.innovation, shows_action, OBSERVATION_LIMIT, *self._of_step)
+        self._of_observation = (*scales, form.innovations, shows_action, OBSERVATION_LIMIT, *self._of_step)
 
     @property
     def measured(self) -> FloatArray:
         """x_{t+1} as the sensors have it, shape (cells, 8)."""
         return self._sensed if self._has_sensor_errors else self.next_state
+
+    @property
+    def measured_before(self) -> FloatArray:
+        """x_t as the sensors had it, shape (cells, 8)."""
+        return self._sensed_before if self._has_sensor_errors else self.state
 
     def start(
         self,
@@ -332,21 +338,26 @@ class FullStateTask(CalibrationTask):
         look_ahead(*path, *self._of_step, state, q_mobile, r_o, *packed, load, next_state, voltage, soc)
         self.next_state[rows] = next_state
         self.load[rows], self.voltage[rows], self.soc[rows] = load, voltage, soc
+        if self._has_sensor_errors:
+            self._sensed_before[rows] = self._as_sensed(state, self._noise[rows, 0])
         if self._is_disturbed:
             self._disturb(rows)
 
     def _disturb(self, rows: NDArray[np.intp]) -> None:
         # the noise of the process on x_{t+1}, then the errors of the sensors
-        options = self.options
-        noise = self._noise[rows, np.minimum(self.decisions[rows], self.episode_steps)]
-        if options.process_noise_V > 0.0:
-            self.next_state[rows, VO:QNB] += options.process_noise_V * np.sqrt(self.dataset.dt_s) * noise[:, :3]
+        noise = self._noise[rows, 1 + np.minimum(self.decisions[rows], self.episode_steps)]
+        if self.options.process_noise_V > 0.0:
+            self.next_state[rows, VO:QNB] += self.options.process_noise_V * np.sqrt(self.dataset.dt_s) * noise[:, :3]
         if self._has_sensor_errors:
-            error = np.full((len(rows), OBSERVED_SIZE), options.sensor_offset)
-            if options.sensor_noise > 0.0:
-                error += options.sensor_noise * noise[:, -OBSERVED_SIZE:]
-            self._sensed[rows] = self.next_state[rows]
-            self._sensed[rows, OBSERVED] = options.sensor_gain * self.next_state[rows, OBSERVED] + error * ERROR_SCALE
+            self._sensed[rows] = self._as_sensed(self.next_state[rows], noise)
+
+    def _as_sensed(self, state: FloatArray, noise: FloatArray) -> FloatArray:
+        error = np.full((len(state), OBSERVED_SIZE), self.options.sensor_offset)
+        if self.options.sensor_noise > 0.0:
+            error += self.options.sensor_noise * noise[:, -OBSERVED_SIZE:]
+        sensed = state.copy()
+        sensed[:, OBSERVED] = self.options.sensor_gain * state[:, OBSERVED] + error * ERROR_SCALE
+        return sensed
 
     def advance(self, action: NDArray[np.floating]) -> FloatArray:
         """
@@ -377,6 +388,7 @@ class FullStateTask(CalibrationTask):
             due = self.decisions % self.options.resync == 0
             self.model_state[due] = measured[due]
         self.state, self.next_state = self.next_state, self.state
+        self._sensed_before, self._sensed = self._sensed, self._sensed_before
         look_ahead(
             self.sample,
             self._last_sample,
@@ -414,14 +426,15 @@ class FullStateTask(CalibrationTask):
 
     def observation(self) -> NDArray[np.float32]:
         """
-        s_t = [x̂_t, x_{t+1}, u_{t+1}] and, with an innovation, x_{t+1} - f(x̂_t, u_{t+1}; new cell), all scaled; with a price on
-        changes of the action, the action before.
+        s_t = [x̂_t, x_{t+1}, u_{t+1}] and, with innovations, x_{t+1} - f(x̂_t, u_{t+1}; new cell) and
+        x_{t+1} - f(x_t, u_{t+1}; new cell), all scaled; with a price on changes of the action, the action before.
 
         :return: shape (cells, observation_size)
         """
         out = np.empty((self.cells, self.observation_size), dtype=np.float32)
         observe(
             self.model_state,
+            self.measured_before,
             self.measured,
             self.load,
             self.last_action,

@@ -138,13 +138,14 @@ def look_ahead(
 @_compiled
 def observe(
     model_state: FloatArray,
+    measured_before: FloatArray,
     measured: FloatArray,
     load: FloatArray,
     last_action: FloatArray,
     per_state: FloatArray,
     per_load: float,
     per_error: FloatArray,
-    innovation: bool,
+    innovations: bool,
     shows_action: bool,
     limit: float,
     dt: float,
@@ -160,20 +161,22 @@ def observe(
     # The observations, into out
     block = np.empty(BLOCK_SIZE)
     cells = len(load)
-    for first in range(0, cells, BLOCK):
-        size = min(BLOCK, cells - first)
-        if innovation:
-            fill_block(block, first, size, model_state, load, nominal_q, nominal_r_o, constants)
+    for n in range(cells):
+        for k in range(7):
+            out[n, k] = _clipped(model_state[n, k + 1] * per_state[k], limit)
+            out[n, k + 7] = _clipped(measured[n, k + 1] * per_state[k], limit)
+        out[n, 14] = _clipped(load[n] * per_load, limit)
+        if shows_action:
+            for k in range(last_action.shape[1]):
+                out[n, out.shape[1] - last_action.shape[1] + k] = last_action[n, k]
+    if not innovations:
+        return
+    for column, origin in ((15, model_state), (22, measured_before)):
+        for first in range(0, cells, BLOCK):
+            size = min(BLOCK, cells - first)
+            fill_block(block, first, size, origin, load, nominal_q, nominal_r_o, constants)
             step_of_block(block, size, dt, power, power, thermal, True, poly_n, poly_p)
-        for j in range(size):
-            n = first + j
-            for k in range(7):
-                out[n, k] = _clipped(model_state[n, k + 1] * per_state[k], limit)
-                out[n, k + 7] = _clipped(measured[n, k + 1] * per_state[k], limit)
-            out[n, 14] = _clipped(load[n] * per_load, limit)
-            if innovation:
+            for j in range(size):
+                n = first + j
                 for k in range(7):
-                    out[n, k + 15] = _clipped((measured[n, k + 1] - block[(k + 1) * BLOCK + j]) * per_error[k], limit)
-            if shows_action:
-                for k in range(last_action.shape[1]):
-                    out[n, out.shape[1] - last_action.shape[1] + k] = last_action[n, k]
+                    out[n, k + column] = _clipped((measured[n, k + 1] - block[(k + 1) * BLOCK + j]) * per_error[k], limit)

@@ -67,7 +67,7 @@ class BatteryQmaxEnv(FullStateEnv):
 
     ## Observation space
 
-    ``Box(-100, 100, (22,), float32)``. States are Vo, Vsn, Vsp (divided by 0.5, 0.1, 0.01 V), qnB, qnS, qpB, qpS (divided by
+    ``Box(-100, 100, (29,), float32)``. States are Vo, Vsn, Vsp (divided by 0.5, 0.1, 0.01 V), qnB, qnS, qpB, qpS (divided by
     6840, 760, 11400, 1266 C).
 
     | index | content |
@@ -75,10 +75,12 @@ class BatteryQmaxEnv(FullStateEnv):
     | 0-6   | x̂_t, the model's state |
     | 7-13  | x_{t+1}, the measured state one step ahead |
     | 14    | u_{t+1}, the power over that step, divided by 16 W |
-    | 15-21 | the innovation: x_{t+1} minus what the model with a new cell's parameters predicts from x̂_t, in error scales |
+    | 15-21 | x_{t+1} minus what the model with a new cell's parameters predicts from x̂_t, in error scales |
+    | 22-28 | x_{t+1} minus what the model with a new cell's parameters predicts from x_t, the state measured before, in error scales |
 
-    Error scales: Vo 0.01 V, Vsn and Vsp 1e-5 V, charges 20 C. The innovation holds nothing that is not in the rest of the
-    observation, but makes it readable: a parameter that is off by 1 % moves the next state by 1e-4 of its value.
+    Error scales: Vo 0.01 V, Vsn and Vsp 1e-5 V, charges 20 C. The two innovations make the measurements readable: a parameter
+    that is off by 1 % moves the next state by 1e-4 of its value. The second one shows what the parameter did in this second.
+    The first one shows besides how far the model has drifted, which is most of the cost.
 
     The observation is Markov for a constant load: cost and next model state depend on it and the action alone, the next
     measured state on the parameter too, which the observation determines. It stays so with ``start``,
@@ -136,7 +138,7 @@ class BatteryQmaxEnv(FullStateEnv):
 
     ## Version history
 
-    * v0: initial version
+    * v0: initial version; since 0.2.0 with the second innovation
     """  # noqa: E501 (rows of a table)
 
     @staticmethod
@@ -158,7 +160,7 @@ class BatteryRoEnv(FullStateEnv):
 
     ## Observation space
 
-    ``Box(-100, 100, (22,), float32)``, laid out and scaled as in ``BatteryQmax-v0``.
+    ``Box(-100, 100, (29,), float32)``, laid out and scaled as in ``BatteryQmax-v0``.
 
     ## Action space
 
@@ -299,7 +301,7 @@ class BatteryJointEnv(FullStateEnv):
 
     ## Observation space
 
-    ``Box(-100, 100, (22,), float32)``, laid out and scaled as in ``BatteryQmax-v0``, and Markov under the same conditions. An
+    ``Box(-100, 100, (29,), float32)``, laid out and scaled as in ``BatteryQmax-v0``, and Markov under the same conditions. An
     R_o that is off shows in Vo alone (0.8 error scales for 10 %), a q_mobile in all three voltages (0.1, 0.1 and 0.2).
 
     ## Action space

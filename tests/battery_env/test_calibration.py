@@ -105,13 +105,14 @@ def test_the_observation_is_what_the_documentation_says():
     state_scale = np.array([0.5, 0.1, 0.01, 6840.0, 760.0, 11400.0, 1266.0])
     np.testing.assert_allclose(first[7:14] * state_scale, x[OBSERVED], rtol=1e-6)
     error_scale = np.array([0.01, 1e-5, 1e-5, 20.0, 20.0, 20.0, 20.0])
-    predicted = step(x_hat, trajectory.load[t], NEW_CELL.q_mobile, NEW_CELL.r_o)
+    from_model, from_cell = (step(origin, trajectory.load[t], NEW_CELL.q_mobile, NEW_CELL.r_o) for origin in (x_hat, x))
     expected = np.concatenate(
         [
             x_hat[OBSERVED] / state_scale,
             x_next[OBSERVED] / state_scale,
             [trajectory.load[t] / 16.0],
-            (x_next - predicted)[OBSERVED] / error_scale,
+            (x_next - from_model)[OBSERVED] / error_scale,
+            (x_next - from_cell)[OBSERVED] / error_scale,
         ]
     )
     np.testing.assert_allclose(observation, expected, rtol=1e-5, atol=1e-5)

@@ -59,7 +59,7 @@ def test_the_defaults_disturb_nothing(discharges):
 @pytest.mark.parametrize("wrong", [0, 1])
 def test_the_joint_task_shows_and_punishes_both_errors(discharges, wrong):
     task = started(make(discharges, "joint"))
-    assert task.parameters == ("q_mobile", "r_o") and task.observation().shape == (1, 22)
+    assert task.parameters == ("q_mobile", "r_o") and task.observation().shape == (1, 29)
     action = true_action(task)
     assert task.advance(action) == pytest.approx(0.0, abs=1e-9)
     np.testing.assert_allclose([task.q_mobile_hat, task.r_o_hat], [task.q_mobile, task.r_o])
@@ -135,13 +135,35 @@ def test_sensor_noise_is_white_and_in_what_is_paid(discharges):
 
 def test_sensors_may_have_an_offset_and_a_gain(discharges):
     task = started(make(discharges, sensor_offset=-3.0, sensor_gain=1.02))
-    expected = 1.02 * discharges[2].state[301, OBSERVED] - 3.0 * ERROR_SCALE
+    before, expected = (1.02 * discharges[2].state[t, OBSERVED] - 3.0 * ERROR_SCALE for t in (300, 301))
+    np.testing.assert_allclose(task.measured_before[0, OBSERVED], before, rtol=1e-12)
     np.testing.assert_allclose(task.measured[0, OBSERVED], expected, rtol=1e-12)
     observation = task.observation()[0]
     np.testing.assert_allclose(observation[7:14], expected / STATE_SCALE, rtol=1e-6)
-    predicted = step(task.model_state[0], task.load[0], NEW_CELL.q_mobile, NEW_CELL.r_o)
-    innovation = np.clip((expected - predicted[OBSERVED]) / ERROR_SCALE, -100.0, 100.0)
-    np.testing.assert_allclose(observation[15:22], innovation, rtol=1e-5)
+    for origin, columns in ((task.model_state, slice(15, 22)), (task.measured_before, slice(22, 29))):
+        predicted = step(origin[0], task.load[0], NEW_CELL.q_mobile, NEW_CELL.r_o)
+        innovation = np.clip((expected - predicted[OBSERVED]) / ERROR_SCALE, -100.0, 100.0)
+        np.testing.assert_allclose(observation[columns], innovation, rtol=1e-5)
+
+
+def test_the_second_innovation_does_not_see_the_drift_of_the_model(discharges):
+    task, drifted = started(make(discharges)), started(make(discharges))
+    np.testing.assert_array_equal(task.observation()[:, 15:22], task.observation()[:, 22:])  # the model starts as the cell
+    task.advance(true_action(task))
+    drifted.advance(true_action(drifted) - 0.1)
+    np.testing.assert_array_equal(drifted.observation()[:, 22:], task.observation()[:, 22:])
+    assert np.abs(drifted.observation()[:, 15:18] - task.observation()[:, 15:18]).max() > 0.01
+
+
+def test_what_is_measured_becomes_what_was_measured(discharges):
+    task = started(make(discharges, cells=3, sensor_noise=2.0))
+    for _ in range(3):
+        measured = task.measured.copy()
+        assert (measured[:, OBSERVED] != task.next_state[:, OBSERVED]).all()
+        task.advance(true_action(task))
+        np.testing.assert_array_equal(task.measured_before, measured)
+    task.keep(np.array([True, False, True]))
+    np.testing.assert_array_equal(task.measured_before, measured[[0, 2]])
 
 
 def test_both_noises_at_once_do_not_share_draws(discharges):
@@ -237,7 +259,7 @@ def test_a_policy_is_evaluated_under_the_options_it_is_given(discharges):
         """Repeats the action before, which the observation ends with."""
 
         def predict(self, observation, deterministic=False):
-            assert observation.shape[1] == 23
+            assert observation.shape[1] == 30
             return observation[:, -1:], None
 
     trace = PolicyEstimator(Repeater(), "BatteryQmax-v0", consistency=0.1).trace(discharges)[0]

@@ -1,0 +1,176 @@
+"""
+Search the hyperparameters of LAC, SAC and TD3 on a full-state task: the same number of trials, updates and varied settings for
+each algorithm, starting from the entry in ``zoo_configs``.
+
+.. code-block:: bash
+
+  python -m benchmarks.search --env BatteryQmax-v0 --trials 14 --updates 2400
+
+A trial trains with the entry of ``zoo_configs``, changed where the search varies it. Its score is the mean error of the mean
+action on whole discharges of the training part, the model running free; the test part is not touched. Trials lie in a journal
+of Optuna: after an interruption the same command goes on (with other trials than an uninterrupted search would have tried).
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import optuna
+import pandas as pd
+from optuna.storages import JournalStorage
+from optuna.storages.journal import JournalFileBackend
+from optuna.trial import Trial, TrialState
+
+from battery_env.calibration.policy import PolicyEstimator
+from battery_env.calibration.variants import FullStateEnv
+from battery_env.evaluation import evaluate
+from benchmarks.reporting import write_csv, write_text
+from benchmarks.training import run_all, set_up
+
+_DISCHARGES = 64  # whole ones, evenly spaced in the training part
+_WORST_ERROR = 100.0  # %, what a policy is given that does worse
+
+
+def _sample_common(trial: Trial) -> dict[str, Any]:
+    return {
+        "learning_rate": f"lin_{trial.suggest_float('learning_rate', 3e-4, 3e-3, log=True):.2g}",
+        "gamma": trial.suggest_categorical("gamma", [0.3, 0.6, 0.8, 0.9]),
+        "tau": trial.suggest_categorical("tau", [0.005, 0.01, 0.02]),
+    }
+
+
+def _sample_soft(trial: Trial) -> dict[str, Any]:
+    return {
+        **_sample_common(trial),
+        "ent_coef": f"auto_{trial.suggest_float('ent_coef', 0.005, 0.2, log=True):.2g}",
+        "target_entropy": trial.suggest_categorical("target_entropy", [-2.0, -3.0, -4.0, -6.0]),
+    }
+
+
+def _sample_td3(trial: Trial) -> dict[str, Any]:
+    target_noise = trial.suggest_float("target_policy_noise", 0.01, 0.2, log=True)
+    return {
+        **_sample_common(trial),
+        "noise_std": float(f"{trial.suggest_float('noise_std', 0.01, 0.3, log=True):.2g}"),
+        "target_policy_noise": float(f"{target_noise:.2g}"),
+        "target_noise_clip": float(f"{2.0 * target_noise:.2g}"),
+    }
+
+
+#: What is varied, five settings for each algorithm.
+SAMPLERS: dict[str, Callable[[Trial], dict[str, Any]]] = {"lac": _sample_soft, "sac": _sample_soft, "td3": _sample_td3}
+#: The first trial of each, whatever it varies of this.
+FIRST_TRIAL = {
+    "learning_rate": 1e-3,
+    "gamma": 0.6,
+    "tau": 0.005,
+    "ent_coef": 0.02,
+    "target_entropy": -4.0,
+    "noise_std": 0.05,
+    "target_policy_noise": 0.05,
+}
+
+
+def score(algo: str, env_id: str, updates: int, folder: Path, trial: Trial) -> float:
+    """
+    Train one policy and score it.
+
+    :param algo: ``lac``, ``sac`` or ``td3``
+    :param env_id: id of a full-state environment with one parameter
+    :param updates: gradient steps
+    :param folder: where the zoo writes what it does
+    :param trial: what chooses the settings, and is told the median and the worst discharge
+    :return: error of q_mobile or r_o, mean over whole discharges of the training part, %
+    """
+    hyperparameters = SAMPLERS[algo](trial)
+    manager, model, _ = set_up(algo, env_id, trial.number, updates, folder, hyperparams=hyperparameters)
+    model.learn(model.learning_starts + updates * manager.n_envs // model.gradient_steps)
+    env = PolicyEstimator.environment(env_id)
+    assert isinstance(env, FullStateEnv)
+    discharges = env.dataset.subset(range(0, len(env.dataset), len(env.dataset) // _DISCHARGES))
+    errors = evaluate(PolicyEstimator(model, env_id), discharges)[f"{env.task.parameters[0]}_mape_percent"]
+    trial.set_user_attr("updates", model._n_updates)
+    trial.set_user_attr("median_percent", float(errors.median()))
+    trial.set_user_attr("worst_percent", float(errors.max()))
+    return min(float(np.nan_to_num(errors.mean(), nan=_WORST_ERROR)), _WORST_ERROR)
+
+
+def search(algo: str, env_id: str, trials: int, updates: int, out: Path) -> pd.DataFrame:
+    """
+    The search of one algorithm, or what is left of it.
+
+    :param algo: ``lac``, ``sac`` or ``td3``
+    :param env_id: id of a full-state environment with one parameter
+    :param trials: trials in all
+    :param updates: gradient steps of each
+    :param out: folder of the journal
+    :return: one row per finished trial
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    study = optuna.create_study(
+        study_name=f"{env_id} {algo} {updates} updates",
+        storage=JournalStorage(JournalFileBackend(str(out / "journal.log"))),
+        sampler=optuna.samplers.TPESampler(n_startup_trials=trials // 2, multivariate=True, seed=0),
+        load_if_exists=True,
+    )
+    if not study.trials:
+        study.enqueue_trial(FIRST_TRIAL)
+    finished = [trial for trial in study.trials if trial.state == TrialState.COMPLETE]
+    study.optimize(partial(score, algo, env_id, updates, out / "zoo"), n_trials=max(trials - len(finished), 0))
+    rows = [
+        {"algo": algo, "trial": trial.number, "mean_percent": trial.value, **trial.user_attrs, **trial.params}
+        for trial in study.get_trials(states=[TrialState.COMPLETE])
+    ]
+    return pd.DataFrame(rows)
+
+
+def report(trials: pd.DataFrame) -> str:
+    """
+    The three best trials of each algorithm and the first one, as Markdown.
+
+    :param trials: see ``search()``, of all algorithms
+    :return: one table per algorithm
+    """
+    text = ""
+    for algo, of_algo in trials.groupby("algo", sort=False):
+        best = of_algo.sort_values("mean_percent").head(3)
+        shown = pd.concat([best, of_algo[of_algo["trial"] == 0]]).drop_duplicates().dropna(axis=1, how="all")
+        table = shown.drop(columns=["algo", "updates"]).to_markdown(index=False, floatfmt=".2g")
+        text += f"**{str(algo).upper()}**, {len(of_algo)} trials\n\n{table}\n\n"
+    return text
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """
+    The command line.
+
+    :param arguments: of the command line by default
+    """
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--env", default="BatteryQmax-v0", choices=["BatteryQmax-v0", "BatteryRo-v0"])
+    parser.add_argument("--algos", nargs="+", default=list(SAMPLERS), choices=list(SAMPLERS))
+    parser.add_argument("--trials", type=int, default=14, help="trials of each algorithm")
+    parser.add_argument("--updates", type=int, default=2400, help="gradient steps of each trial")
+    parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1), help="searches at once, one core each")
+    parser.add_argument("--out", type=Path, default=Path("results/search"))
+    chosen = parser.parse_args(arguments)
+    if min(chosen.trials, chosen.updates, chosen.jobs) < 1:
+        parser.error("--trials, --updates and --jobs must be at least 1")
+    one_search = partial(search, env_id=chosen.env, trials=chosen.trials, updates=chosen.updates, out=chosen.out)
+    trials = pd.concat(run_all(one_search, [(algo,) for algo in chosen.algos], chosen.jobs), ignore_index=True)
+    configuration = {name: value for name, value in vars(chosen).items() if name not in ("jobs", "out")}
+    write_csv(chosen.out / "search.csv", trials, configuration)
+    text = report(trials)
+    write_text(chosen.out / "search.md", text)
+    sys.stdout.write("\n" + text)
+
+
+if __name__ == "__main__":
+    main()

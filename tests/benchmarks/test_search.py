@@ -1,0 +1,66 @@
+"""The search gives every algorithm the same budget, goes on where it was, and reports what it found."""
+
+import json
+
+import optuna
+import pandas as pd
+import pytest
+
+from benchmarks import search
+
+
+@pytest.fixture
+def trials(monkeypatch):
+    """Scores without training: the learning rate, in per cent; returns the settings that were tried."""
+    tried = []
+
+    def score(algo, env_id, updates, folder, trial):
+        tried.append((algo, search.SAMPLERS[algo](trial)))
+        trial.set_user_attr("updates", updates)
+        trial.set_user_attr("worst_percent", 7.0)
+        return 100.0 * trial.params["learning_rate"]
+
+    monkeypatch.setattr(search, "score", score)
+    return tried
+
+
+def test_every_algorithm_gets_the_same_trials_of_as_many_settings(trials, tmp_path, capsys):
+    search.main(["--trials", "4", "--updates", "9", "--jobs", "1", "--out", str(tmp_path)])
+    assert [algo for algo, _ in trials] == ["lac"] * 4 + ["sac"] * 4 + ["td3"] * 4
+    assert {len(settings) for algo, settings in trials if algo != "td3"} == {5}
+    # the clip of TD3's noise follows the noise
+    assert {len(settings) for algo, settings in trials if algo == "td3"} == {6}
+    table = pd.read_csv(tmp_path / "search.csv")
+    assert len(table) == 12 and (table["updates"] == 9).all()
+    assert table.groupby("algo")["learning_rate"].first().tolist() == [1e-3] * 3
+    text = capsys.readouterr().out
+    assert text.count("**, 4 trials") == 3 and (tmp_path / "search.md").read_text() in text
+    assert json.loads((tmp_path / "search.json").read_text())["configuration"]["trials"] == 4
+
+
+def test_a_search_goes_on_and_is_not_done_twice(trials, tmp_path):
+    first = search.search("sac", "BatteryRo-v0", 3, 9, tmp_path)
+    longer = search.search("sac", "BatteryRo-v0", 5, 9, tmp_path)
+    again = search.search("sac", "BatteryRo-v0", 5, 9, tmp_path)
+    assert len(trials) == 5
+    pd.testing.assert_frame_equal(longer.head(3), first)
+    pd.testing.assert_frame_equal(again, longer)
+    # other numbers of updates are another search
+    assert len(search.search("sac", "BatteryRo-v0", 1, 10, tmp_path)) == 1
+
+
+def test_a_trial_is_trained_for_its_updates_and_scored_on_training_discharges(tmp_path):
+    study = optuna.create_study()
+    study.enqueue_trial(search.FIRST_TRIAL)
+    study.optimize(lambda trial: search.score("td3", "BatteryRo-v0", 3, tmp_path, trial), n_trials=1)
+    (trial,) = study.trials
+    assert trial.user_attrs["updates"] == 3
+    assert 0.0 < trial.user_attrs["median_percent"] < trial.user_attrs["worst_percent"] <= 100.0
+    assert 0.0 < trial.value < trial.user_attrs["worst_percent"]
+
+
+@pytest.mark.parametrize("command", [["--trials", "0"], ["--updates", "0"], ["--jobs", "0"], ["--env", "CartPoleCost-v0"]])
+def test_nonsense_on_the_command_line_is_refused(command, trials):
+    with pytest.raises(SystemExit):
+        search.main(command)
+    assert not trials
