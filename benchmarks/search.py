@@ -4,7 +4,7 @@ each algorithm, starting from the entry in ``zoo_configs``.
 
 .. code-block:: bash
 
-  python -m benchmarks.search --env BatteryQmax-v0 --trials 14 --updates 2400
+  python -m benchmarks.search --env BatteryQmax-v0 --trials 10 --updates 2400
 
 A trial trains with the entry of ``zoo_configs``, changed where the search varies it. Its score is the mean error of the mean
 action on whole discharges of the training part, the model running free; the test part is not touched. Trials lie in a journal
@@ -32,7 +32,7 @@ from battery_env.calibration.policy import PolicyEstimator
 from battery_env.calibration.variants import FullStateEnv
 from battery_env.evaluation import evaluate
 from benchmarks.reporting import write_csv, write_text
-from benchmarks.training import run_all, set_up
+from benchmarks.training import Recipe, run_all, set_up
 
 _DISCHARGES = 64  # whole ones, evenly spaced in the training part
 _WORST_ERROR = 100.0  # %, what a policy is given that does worse
@@ -89,8 +89,7 @@ def score(algo: str, env_id: str, updates: int, folder: Path, trial: Trial) -> f
     :param trial: what chooses the settings, and is told the median and the worst discharge
     :return: error of q_mobile or r_o, mean over whole discharges of the training part, %
     """
-    hyperparameters = SAMPLERS[algo](trial)
-    manager, model, _ = set_up(algo, env_id, trial.number, updates, folder, hyperparams=hyperparameters)
+    manager, model = set_up(Recipe.of(algo, env_id, trial.number, hyperparameters=SAMPLERS[algo](trial)), folder)
     model.learn(model.learning_starts + updates * manager.n_envs // model.gradient_steps)
     env = PolicyEstimator.environment(env_id)
     assert isinstance(env, FullStateEnv)
@@ -117,9 +116,10 @@ def search(algo: str, env_id: str, trials: int, updates: int, out: Path) -> pd.D
     study = optuna.create_study(
         study_name=f"{env_id} {algo} {updates} updates",
         storage=JournalStorage(JournalFileBackend(str(out / "journal.log"))),
-        sampler=optuna.samplers.TPESampler(n_startup_trials=trials // 2, multivariate=True, seed=0),
         load_if_exists=True,
     )
+    # another seed after an interruption, or the first draws would come again
+    study.sampler = optuna.samplers.TPESampler(n_startup_trials=trials // 2, multivariate=True, seed=len(study.trials))
     if not study.trials:
         study.enqueue_trial(FIRST_TRIAL)
     finished = [trial for trial in study.trials if trial.state == TrialState.COMPLETE]
@@ -156,7 +156,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--env", default="BatteryQmax-v0", choices=["BatteryQmax-v0", "BatteryRo-v0"])
     parser.add_argument("--algos", nargs="+", default=list(SAMPLERS), choices=list(SAMPLERS))
-    parser.add_argument("--trials", type=int, default=14, help="trials of each algorithm")
+    parser.add_argument("--trials", type=int, default=10, help="trials of each algorithm")
     parser.add_argument("--updates", type=int, default=2400, help="gradient steps of each trial")
     parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1), help="searches at once, one core each")
     parser.add_argument("--out", type=Path, default=Path("results/search"))

@@ -1,0 +1,191 @@
+"""
+What each choice of the q^max task is worth: LAC with the settings of ``zoo_configs``, and with one thing changed at a time.
+
+.. code-block:: bash
+
+  python -m benchmarks.ablations --seeds 0 1 2 --updates 2400
+
+Every policy is scored on whole held-out discharges, the model running free. A run that is finished is not run again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+
+from battery_env.calibration.data import standard_dataset
+from battery_env.calibration.policy import PolicyEstimator, Predictor
+from battery_env.evaluation import evaluate
+from battery_env.trajectories import TrajectoryDataset
+from benchmarks.reporting import write_csv, write_text
+from benchmarks.training import Recipe, run_all, train_or_load
+
+_ENV_ID = "BatteryQmax-v0"
+_DISCHARGES = 64  # of the test part, evenly spaced
+_FROM_MODEL, _FROM_CELL = tuple(range(15, 22)), tuple(range(22, 29))  # columns of the two innovations
+
+
+class Variant(NamedTuple):
+    """
+    One thing that is changed.
+
+    :param label: what, for the table
+    :param hyperparameters: in place of those of ``zoo_configs``, arguments of the environment (``env_kwargs``) among them
+    :param hidden: columns of the observation that the agent does not see
+    """
+
+    label: str
+    hyperparameters: Mapping[str, Any] = MappingProxyType({})
+    hidden: tuple[int, ...] = ()
+
+
+VARIANTS: dict[str, Variant] = {
+    "published": Variant("nothing"),
+    "from_model": Variant("innovation from the model's state only", hidden=_FROM_CELL),
+    "from_cell": Variant("innovation from the measured state only", hidden=_FROM_MODEL),
+    "none": Variant("no innovation", hidden=_FROM_MODEL + _FROM_CELL),
+    "gamma": Variant("discount 0.9", {"gamma": 0.9}),
+    "entropy": Variant("target entropy -1, SAC's default", {"target_entropy": -1.0}),
+    "limit": Variant("cost limit 100", {"env_kwargs": {"cost_limit": 100.0}}),
+    "short": Variant("episodes of 16 steps, the paper's", {"env_kwargs": {"episode_steps": 16}}),
+    "perturbed": Variant("starts up to 5 error scales off", {"env_kwargs": {"initial_perturbation": 5.0}}),
+}
+
+
+def shown_columns(size: int, hidden: Sequence[int]) -> np.ndarray:
+    """
+    What is left of an observation.
+
+    :param size: numbers in it
+    :param hidden: columns that are left out
+    :return: the others, in order
+    """
+    return np.setdiff1d(np.arange(size), hidden)
+
+
+class HideColumns(gym.ObservationWrapper):
+    """
+    Leaves numbers out of the observation.
+
+    :param env: the environment
+    :param hidden: their columns
+    """
+
+    def __init__(self, env: gym.Env, hidden: Sequence[int]) -> None:
+        super().__init__(env)
+        assert isinstance(env.observation_space, gym.spaces.Box)
+        self.columns = shown_columns(env.observation_space.shape[0], hidden)
+        low, high = env.observation_space.low[self.columns], env.observation_space.high[self.columns]
+        self.observation_space = gym.spaces.Box(low, high, dtype=np.float32)
+
+    def observation(self, observation: np.ndarray) -> np.ndarray:
+        """
+        The rest of an observation.
+
+        :param observation: shape (size,)
+        :return: shape (size - hidden,)
+        """
+        return observation[self.columns]
+
+
+class _Blinkered:
+    # a policy that does not see the hidden columns
+    def __init__(self, policy: Predictor, hidden: Sequence[int]) -> None:
+        self.policy, self.hidden = policy, hidden
+
+    def predict(self, observation: np.ndarray, deterministic: bool = False) -> tuple[Any, Any]:
+        columns = shown_columns(observation.shape[1], self.hidden)
+        return self.policy.predict(observation[:, columns], deterministic=deterministic)
+
+
+def run(name: str, seed: int, updates: int, test: TrajectoryDataset, out: Path) -> dict[str, Any]:
+    """
+    Train one policy, unless that has been done, and score it.
+
+    :param name: of the variant
+    :param seed: seed of everything
+    :param updates: gradient steps
+    :param test: discharges
+    :param out: folder of all results
+    :return: what came out
+    """
+    variant = VARIANTS[name]
+    hyperparameters = dict(variant.hyperparameters)
+    if variant.hidden:
+        hyperparameters["env_wrapper"] = [{"benchmarks.ablations.HideColumns": {"hidden": list(variant.hidden)}}]
+    entry = Recipe.of("lac", _ENV_ID, seed).hyperparameters
+    timesteps = entry["learning_starts"] + updates * entry["n_envs"]
+    model = train_or_load("lac", _ENV_ID, seed, timesteps, out / "models" / name, hyperparameters)
+    errors = evaluate(PolicyEstimator(_Blinkered(model, variant.hidden), _ENV_ID), test)["q_mobile_mape_percent"]
+    return {
+        "variant": name,
+        "changed": variant.label,
+        "seed": seed,
+        "mean_percent": errors.mean(),
+        "median_percent": errors.median(),
+        "worst_percent": errors.max(),
+    }
+
+
+def report(results: pd.DataFrame) -> str:
+    """
+    Errors of all seeds side by side, as Markdown.
+
+    :param results: see ``run()``, of all runs
+    :return: one table
+    """
+
+    def digits(values: pd.Series) -> str:
+        return " / ".join(f"{value:.2g}" if value < 99.5 else f"{value:.0f}" for value in values)
+
+    rows = [
+        {
+            "changed": str(label),
+            "mean over discharges (%)": digits(of_variant["mean_percent"]),
+            "median (%)": digits(of_variant["median_percent"]),
+            "worst (%)": digits(of_variant["worst_percent"]),
+        }
+        for label, of_variant in results.groupby("changed", sort=False)
+    ]
+    return pd.DataFrame(rows).to_markdown(index=False, disable_numparse=True) + "\n"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """
+    The command line.
+
+    :param arguments: of the command line by default
+    """
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--variants", nargs="+", default=list(VARIANTS), choices=list(VARIANTS), metavar="NAME")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--updates", type=int, default=2400, help="gradient steps of each training")
+    parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1), help="runs at once, one core each")
+    parser.add_argument("--out", type=Path, default=Path("results/ablations"))
+    chosen = parser.parse_args(arguments)
+    if min(chosen.updates, chosen.jobs) < 1:
+        parser.error("--updates and --jobs must be at least 1")
+    test = standard_dataset("q_mobile", "paper", "test")
+    subset = test.subset(range(0, len(test), len(test) // _DISCHARGES))
+    runs = [(name, seed) for name in chosen.variants for seed in chosen.seeds]
+    one_run = partial(run, updates=chosen.updates, test=subset, out=chosen.out)
+    results = pd.DataFrame(run_all(one_run, runs, chosen.jobs))
+    configuration = {name: value for name, value in vars(chosen).items() if name not in ("jobs", "out")}
+    write_csv(chosen.out / "ablations.csv", results, configuration)
+    text = report(results)
+    write_text(chosen.out / "ablations.md", text)
+    sys.stdout.write("\n" + text)
+
+
+if __name__ == "__main__":
+    main()
