@@ -16,10 +16,8 @@ class HorizonReplayBufferSamples(NamedTuple):
     dones: th.Tensor
     rewards: th.Tensor
     discounts: th.Tensor | None
-    #: Discounted sum of the rewards of the next ``horizon`` steps
+    #: Discounted sum of the rewards of the next ``horizon`` steps, 0 after a termination
     horizon_returns: th.Tensor
-    #: Sum of the discounts in it, smaller where the episode terminated earlier
-    horizon_weights: th.Tensor
 
 
 class HorizonReplayBuffer(ReplayBuffer):
@@ -132,7 +130,6 @@ class HorizonReplayBuffer(ReplayBuffer):
             rewards=self.to_torch(rewards[:, :1]),
             discounts=None,
             horizon_returns=self.to_torch((weights * rewards).sum(axis=1, keepdims=True)),
-            horizon_weights=self.to_torch(weights.sum(axis=1, keepdims=True)),
         )
 
     def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> ReplayBufferSamples:

@@ -28,11 +28,15 @@ def lyapunov_target(costs: th.Tensor, dones: th.Tensor, discounts: th.Tensor | f
     Target of the critic (Han et al. 2020, infinite horizon candidate): the discounted sum of costs to come.
     There is no entropy term in it, unlike in SAC.
 
-    :param costs: ``c``, the cost of the transition
+    The offset of ``L`` is the same in all states, terminal ones included (there nothing is paid any more), and is left out on
+    both sides: ``y = c + gamma * ((1 - done) * L_bar(s', a') + done * offset)`` with ``c = bound - reward`` and
+    ``offset = bound / (1 - gamma)`` becomes what is returned.
+
+    :param costs: ``-reward``, the cost of the transition below a bound of 0
     :param dones: Whether the next state is terminal (time limits are not)
     :param discounts: ``gamma`` (to the power of n for n-step transitions)
-    :param next_values: ``L_bar(s', a')``, the target critic's value of an action of the target actor
-    :return: ``c + gamma * (1 - done) * L_bar(s', a')``
+    :param next_values: ``L_bar(s', a') - offset``, the target critic's value of an action of the target actor
+    :return: ``y - offset = -reward + gamma * (1 - done) * (L_bar(s', a') - offset)``
     """
     return costs + (1 - dones) * discounts * next_values
 
@@ -75,18 +79,6 @@ def lyapunov_actor_loss(difference: th.Tensor, log_prob: th.Tensor, lambda_coef:
     return lambda_coef.detach() * difference + ent_coef.detach() * log_prob.mean()
 
 
-def set_gradients(loss: th.Tensor, parameters: Sequence[th.Tensor]) -> None:
-    """
-    Compute the gradient of a loss with respect to some parameters, instead of all that it depends on:
-    the loss of the actor spares the weights of the critic. Earlier gradients are replaced.
-
-    :param loss: The loss
-    :param parameters: The parameters, those that the loss does not depend on get no gradient
-    """
-    for parameter, gradient in zip(parameters, th.autograd.grad(loss, parameters, allow_unused=True), strict=True):
-        parameter.grad = gradient
-
-
 def update_multiplier(log_multiplier: th.Tensor, optimizer: th.optim.Optimizer, violation: th.Tensor) -> th.Tensor:
     """
     Step of a Lagrange multiplier in log space, which grows while its constraint is violated:
@@ -116,6 +108,17 @@ def reward_scale(vec_normalize: VecNormalize | None) -> float:
     if vec_normalize is None or not vec_normalize.norm_reward:
         return 1.0
     return math.sqrt(vec_normalize.ret_rms.var + vec_normalize.epsilon)
+
+
+def sum_of_discounts(gamma: float, horizon: int | None) -> float:
+    """
+    How often a constant cost counts in ``L``.
+
+    :param gamma: The discount factor, below 1 with an infinite horizon
+    :param horizon: Number of steps, None for all to come
+    :return: ``1 + gamma + gamma^2 + ...``
+    """
+    return 1 / (1 - gamma) if horizon is None else math.fsum(gamma**k for k in range(horizon))
 
 
 def weight_of_return(discounts: th.Tensor | None, gamma: float) -> th.Tensor | float:
@@ -155,8 +158,9 @@ class LAC(OffPolicyAlgorithm):
     trajectories by ``alpha3`` times the cost. A Lagrange multiplier ``lambda`` enforces that condition, while
     ``ent_coef`` keeps the entropy of the policy as in SAC.
 
-    Note: LAC minimises the cost ``c = max(0, largest reward seen) - reward``.
-    For an environment with ``reward = -cost <= 0`` this is exactly its cost.
+    Note: LAC minimises the cost ``c = bound - reward``, where ``bound`` is the largest reward (``reward_bound`` or the largest
+    one seen, at least 0). For an environment with ``reward = -cost <= 0`` this is exactly its cost. A termination pays 0 for
+    ever after, as everywhere in reinforcement learning, and so costs ``bound`` per step: with positive rewards it is better to live.
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...)
     :param env: The environment to learn from (if registered in Gym, can be str)
@@ -199,6 +203,10 @@ class LAC(OffPolicyAlgorithm):
     :param horizon: If given, ``L`` estimates the discounted sum of costs of the next ``horizon`` steps only (finite horizon
         candidate, ``gamma`` may be 1), summed along stored episodes by the ``HorizonReplayBuffer`` without a target network.
         Not supported for Dict observation spaces.
+    :param reward_bound: Largest reward that the environment can pay (before ``VecNormalize``), at least 0. Costs and ``L`` are
+        then the same from the start. If a larger reward is seen, a warning says so and the bound rises to it.
+        If ``None``, the bound is the largest reward seen, at least 0. A rise shifts all values of ``L`` alike and
+        changes no gradient. ``gamma`` must be below 1 with a bound above 0, or a ``horizon`` be given.
     :param use_sde: Whether to use generalized State Dependent Exploration (gSDE)
         instead of action noise exploration (default: False)
     :param sde_sample_freq: Sample a new noise matrix every n steps when using gSDE
@@ -255,6 +263,7 @@ class LAC(OffPolicyAlgorithm):
         lambda_max: float = 1.0,
         lambda_learning_rate: float | Schedule | None = None,
         horizon: int | None = None,
+        reward_bound: float | None = None,
         use_sde: bool = False,
         sde_sample_freq: int = -1,
         use_sde_at_warmup: bool = False,
@@ -307,16 +316,26 @@ class LAC(OffPolicyAlgorithm):
         self.lambda_max = lambda_max
         self.lambda_learning_rate = lambda_learning_rate
         self.horizon = horizon
+        self.stated_reward_bound = reward_bound
+        self.largest_stored_reward = 0.0
+        if horizon is None and replay_buffer_class is HorizonReplayBuffer:
+            raise ValueError("The HorizonReplayBuffer is used with a horizon, and chosen by it: set for instance horizon=5.")
 
         if _init_setup_model:
             self._setup_model()
 
     def _setup_model(self) -> None:
+        # ``LAC.load()`` sets an argument under its own name
+        self.stated_reward_bound = vars(self).pop("reward_bound", self.stated_reward_bound)
         self._check_arguments()
+        if self.replay_buffer_class is HorizonReplayBuffer:
+            # Of a loaded model, whose horizon may be another one by now
+            self.replay_buffer_class = None
+            self.replay_buffer_kwargs = {
+                name: value for name, value in self.replay_buffer_kwargs.items() if name not in ("horizon", "gamma")
+            }
         if self.horizon is not None:
-            self._setup_horizon(self.horizon)
-        elif self.replay_buffer_class is HorizonReplayBuffer:
-            raise ValueError("The HorizonReplayBuffer is used with a horizon, and chosen by it: set for instance horizon=5.")
+            self._setup_horizon()
         super()._setup_model()
         if isinstance(self.replay_buffer, NStepReplayBuffer) and self.gamma >= 1:
             raise ValueError(f"gamma={self.gamma} must be smaller than 1 with n-step returns, use for instance gamma=0.99.")
@@ -362,8 +381,9 @@ class LAC(OffPolicyAlgorithm):
         self.log_lambda = th.log(th.ones(1, device=self.device) * self.lambda_init).requires_grad_(True)
         self.lambda_optimizer = th.optim.Adam([self.log_lambda], lr=self.lambda_lr_schedule(1), fused=True)
 
-        # Largest reward seen, before any normalization, see ``_compute_costs()``
+        # Largest reward seen, before any normalization, see ``cost_bound()``
         self.reward_bound = th.zeros(1, device=self.device)
+        self.update_offset(self._vec_normalize_env)
 
     def _check_arguments(self) -> None:
         """Check the arguments that SAC does not have."""
@@ -387,28 +407,46 @@ class LAC(OffPolicyAlgorithm):
                 f"lambda_init={self.lambda_init} must lie between lambda_min={self.lambda_min} "
                 f"and lambda_max={self.lambda_max}. Change lambda_init or widen the limits."
             )
+        bound = self.stated_reward_bound
+        if bound is not None and not 0 <= bound < math.inf:
+            raise ValueError(
+                f"reward_bound={bound} must be finite and at least 0, because nothing is paid after a termination. "
+                "Use the largest reward that the environment can pay, or 0 if that is negative."
+            )
+        if bound:
+            self._check_discount(bound)
 
-    def _setup_horizon(self, horizon: int) -> None:
+    def _check_discount(self, bound: float) -> None:
         """
-        Choose the replay buffer of the finite horizon candidate.
+        Check that ``L`` is finite.
 
-        :param horizon: Number of steps
+        :param bound: The reward that costs nothing
         """
-        if not isinstance(horizon, int) or horizon < 1:
+        if bound > 0 and self.horizon is None and self.gamma >= 1:
+            raise ValueError(
+                f"gamma={self.gamma} must be smaller than 1 with rewards up to {bound:g}: each step below that reward has a cost, "
+                "whose sum over all time is infinite. Use for instance gamma=0.99, a finite horizon, or rewards that are not positive."
+            )
+
+    def _setup_horizon(self) -> None:
+        """Choose the replay buffer of the finite horizon candidate."""
+        horizon = self.horizon
+        if not isinstance(horizon, (int, np.integer)) or isinstance(horizon, bool) or horizon < 1:
             raise ValueError(f"horizon={horizon} must be an integer of at least 1, or None for the infinite horizon.")
+        self.horizon = horizon = int(horizon)
         if self.n_steps > 1:
             raise ValueError(
                 f"horizon={horizon} and n_steps={self.n_steps} are two Lyapunov candidates: keep n_steps=1 or horizon=None."
             )
         if isinstance(self.observation_space, spaces.Dict):
             raise ValueError(f"horizon={horizon} is not supported for Dict observation spaces, use horizon=None.")
-        if self.replay_buffer_class not in (None, ReplayBuffer, HorizonReplayBuffer):
+        if self.replay_buffer_class not in (None, ReplayBuffer):
             raise ValueError(
                 f"horizon={horizon} needs the HorizonReplayBuffer and cannot be combined with "
                 f"replay_buffer_class={self.replay_buffer_class.__name__}, use horizon=None."
             )
         self.replay_buffer_class = HorizonReplayBuffer
-        self.replay_buffer_kwargs.update({"horizon": horizon, "gamma": self.gamma})
+        self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "horizon": horizon, "gamma": self.gamma}
 
     def _create_aliases(self) -> None:
         self.actor = self.policy.actor
@@ -418,21 +456,62 @@ class LAC(OffPolicyAlgorithm):
 
     def cost_bound(self, vec_normalize: VecNormalize | None = None) -> th.Tensor:
         """
-        The reward that costs nothing: LAC minimises ``c = bound - reward >= 0`` with ``bound = max(0, largest reward seen)``.
-        The bound is kept in the units of the environment, so that it stays valid when ``VecNormalize`` changes its scale.
+        The reward that costs nothing: LAC minimises ``c = bound - reward >= 0``, and ``bound`` is the largest of ``reward_bound``,
+        of all rewards seen, and of 0. It is kept in the units of the environment, so that it stays valid when ``VecNormalize``
+        changes its scale.
 
         :param vec_normalize: Wrapper that the rewards come from, if any
         :return: The bound in the units of these rewards
         """
+        bound = self.reward_bound.clamp(min=self.stated_reward_bound or 0.0)
         if vec_normalize is None or not vec_normalize.norm_reward:
             # Never clipped
-            return self.reward_bound
-        return (self.reward_bound / reward_scale(vec_normalize)).clamp(max=vec_normalize.clip_reward)
+            return bound
+        return (bound / reward_scale(vec_normalize)).clamp(max=vec_normalize.clip_reward)
+
+    def update_offset(self, vec_normalize: VecNormalize | None) -> None:
+        """
+        Let the critics have the offset of the present bound, the value of ``L`` where nothing is ever paid. When the bound
+        rises by D, all exact values of ``L`` rise by ``D / (1 - gamma)`` (with a horizon, by D times its sum of discounts),
+        and so do those of the critics: there is nothing to learn anew.
+
+        :param vec_normalize: Wrapper that the rewards come from, if any
+        """
+        # With gamma=1 no reward is positive, and neither is the offset
+        if self.horizon is not None or self.gamma < 1:
+            offset = self.cost_bound(vec_normalize) * sum_of_discounts(self.gamma, self.horizon)
+            self.critic.offset.copy_(offset)
+            self.critic_target.offset.copy_(offset)
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        vec_normalize = self._vec_normalize_env
+        largest_reward = float(np.max(reward if vec_normalize is None else vec_normalize.get_original_reward()))
+        if largest_reward > self.largest_stored_reward:
+            self._check_discount(largest_reward)
+            stated = self.stated_reward_bound
+            if stated is not None and self.largest_stored_reward <= stated < largest_reward:
+                warnings.warn(
+                    f"A reward of {largest_reward:g} is larger than reward_bound={stated:g}. The bound follows the largest reward "
+                    "from here on, and L is shifted with it. State a larger reward_bound to keep costs and L comparable.",
+                    stacklevel=2,
+                )
+            self.largest_stored_reward = largest_reward
+            self.reward_bound = self.reward_bound.clamp(min=largest_reward)
+            self.update_offset(vec_normalize)
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)  # type: ignore[arg-type]
 
     def _compute_costs(self, rewards: th.Tensor, n_rewards: th.Tensor | float = 1.0) -> th.Tensor:
         """
         Convert sampled rewards to costs (see ``cost_bound()``), after updating the bound with the sample: it stays valid when
-        rewards are computed at sampling (HER).
+        rewards are computed at sampling (HER) or were stored elsewhere. Of the latter, sums of n steps tell their mean reward only.
 
         :param rewards: Rewards (normalized with ``VecNormalize``), or discounted sums of them
         :param n_rewards: How often a constant reward counts in each sum, the sum of its discounts
@@ -472,7 +551,10 @@ class LAC(OffPolicyAlgorithm):
             replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
             # For n-step replay, discount factor is gamma**n_steps (when no early termination)
             discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
-            costs = self._compute_costs(replay_data.rewards, weight_of_return(replay_data.discounts, self.gamma))
+            rewards = replay_data.rewards
+            costs = self._compute_costs(rewards, weight_of_return(replay_data.discounts, self.gamma))
+            # The bound may have risen, or the scale of the rewards have changed
+            self.update_offset(self._vec_normalize_env)
 
             # We need to sample because `log_std` may have changed between two gradient steps
             if self.use_sde:
@@ -487,17 +569,19 @@ class LAC(OffPolicyAlgorithm):
             log_prob, _ = log_prob.chunk(2)
 
             if isinstance(replay_data, HorizonReplayBufferSamples):
-                target_values = self._compute_costs(replay_data.horizon_returns, replay_data.horizon_weights)
+                target_values = -replay_data.horizon_returns
             else:
                 with th.no_grad():
                     # Next action by the lagged actor
                     next_actions = self.actor_target(replay_data.next_observations)
                     # Compute the next Lyapunov values: max over all target critics
                     next_values = largest_value(self.critic_target(replay_data.next_observations, next_actions))
-                    target_values = lyapunov_target(costs, replay_data.dones, discounts, next_values)
+                    # L is never negative
+                    next_values = th.maximum(next_values, -self.critic_target.offset)
+                    target_values = lyapunov_target(-rewards, replay_data.dones, discounts, next_values)
 
             # Get current Lyapunov values for each critic network
-            # using action from the replay buffer
+            # using action from the replay buffer (all values are relative to the offset)
             current_values = self.critic(replay_data.observations, replay_data.actions)
             critic_loss = lyapunov_critic_loss(current_values, target_values)
 
@@ -514,8 +598,11 @@ class LAC(OffPolicyAlgorithm):
             actor_loss = lyapunov_actor_loss(difference, log_prob, lambda_coef, ent_coef)
 
             # Optimize the critic and the actor, both with the gradient at the current parameters
-            set_gradients(critic_loss, critic_parameters)
-            set_gradients(actor_loss, actor_parameters)
+            self.critic.optimizer.zero_grad()
+            critic_loss.backward(inputs=critic_parameters)
+            # Without the gradient of the critic's weights, which the loss of the actor depends on too
+            self.actor.optimizer.zero_grad()
+            actor_loss.backward(inputs=actor_parameters)
             self.critic.optimizer.step()
             self.actor.optimizer.step()
 
@@ -533,7 +620,7 @@ class LAC(OffPolicyAlgorithm):
                 "lambda_saturation": self.log_lambda >= log_lambda_max,
                 "lambda_loss": lambda_loss,
                 "lyapunov_difference": difference,
-                "lyapunov_mean": values.mean(),
+                "lyapunov_mean": values.mean() + self.critic.offset,
                 "cost": costs.mean(),
             }
 
@@ -560,9 +647,13 @@ class LAC(OffPolicyAlgorithm):
         self._n_updates += gradient_steps
 
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        # One transfer from the device for all metrics of all gradient steps
-        for name, value in zip(metrics, th.stack(metrics_per_step).mean(dim=0).tolist(), strict=True):
-            self.logger.record(f"train/{name}", value)
+        if metrics_per_step:
+            # One transfer from the device for all metrics of all gradient steps
+            for name, value in zip(metrics, th.stack(metrics_per_step).mean(dim=0).tolist(), strict=True):
+                self.logger.record(f"train/{name}", value)
+        if self.gamma >= 1:
+            # Positive rewards that were computed at sampling (HER) have not been seen before
+            self._check_discount(self.reward_bound.item())
 
     def learn(
         self: SelfLAC,
@@ -573,13 +664,6 @@ class LAC(OffPolicyAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfLAC:
-        if self.verbose >= 1 and self.alpha3 >= 1 and self._n_updates == 0:
-            warnings.warn(
-                f"alpha3={self.alpha3} >= 1: the decrease condition cannot hold, because L(s', a') - L(s, a) is zero "
-                f"on average in stationary data. lambda will stay at lambda_max={self.lambda_max} and LAC minimises the cost "
-                "with this weight, use alpha3 < 1 to let lambda adapt.",
-                stacklevel=2,
-            )
         return super().learn(
             total_timesteps=total_timesteps,
             callback=callback,

@@ -53,6 +53,10 @@ class LyapunovCritic(BaseModel):
     The last layer is linear (no unit of it can die), and narrow by default because a sum of squares grows with the
     number of its terms: a wide last layer starts far above the values that small costs lead to.
 
+    Where rewards are positive, ``L`` has an ``offset``, the value of states from which nothing is ever paid, and the networks
+    only learn the difference to it, ``L(s, a) - offset``. It is negative wherever rewards are collected, so that it takes a
+    linear term beside the sum of squares. Without an offset that term is zero and stays zero.
+
     :param observation_space: Observation space
     :param action_space: Action space
     :param net_arch: Sizes of the hidden layers
@@ -102,20 +106,55 @@ class LyapunovCritic(BaseModel):
         self.share_features_extractor = share_features_extractor
         self.output_dim = output_dim
         self.n_critics = n_critics
-        self.lyapunov_networks: list[nn.Module] = []
+        self.lyapunov_networks: list[nn.Sequential] = []
+        self.linear_terms: list[nn.Linear] = []
+        # What all exact values have in common. Set by the algorithm, saved with the weights
+        self.offset: th.Tensor
+        self.register_buffer("offset", th.zeros(1))
         for idx in range(n_critics):
             lyapunov_net = nn.Sequential(*create_mlp(features_dim + action_dim, output_dim, net_arch, activation_fn))
             activate_in_place(lyapunov_net)
             self.add_module(f"lf{idx}", lyapunov_net)
             self.lyapunov_networks.append(lyapunov_net)
+            # Starts at zero and takes no random numbers: nothing changes until there is an offset
+            linear_term = nn.utils.skip_init(nn.Linear, lyapunov_net[-1].in_features, 1)
+            nn.init.zeros_(linear_term.weight)
+            nn.init.zeros_(linear_term.bias)
+            self.add_module(f"linear_term{idx}", linear_term)
+            self.linear_terms.append(linear_term)
 
     def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:
+        """
+        The values relative to the offset, which differences and the errors of the critic do not depend on.
+
+        :param obs: Observations, preprocessed by ``extract_features()``
+        :param actions: As many flat actions in [-1, 1]
+        :return: ``L(s, a) - offset``, one tensor of shape (n, 1) per critic
+        """
         # Learn the features extractor using the policy loss only
         # when the features_extractor is shared with the actor
         with th.set_grad_enabled(th.is_grad_enabled() and not self.share_features_extractor):
             features = self.extract_features(obs, self.features_extractor)
         lyapunov_input = th.cat([features, actions], dim=1)
-        return tuple(net(lyapunov_input).square().sum(dim=1, keepdim=True) for net in self.lyapunov_networks)
+        has_offset = self.offset > 0
+        values = []
+        for net, linear_term in zip(self.lyapunov_networks, self.linear_terms, strict=True):
+            latent = lyapunov_input
+            *hidden_layers, last_layer = net
+            for layer in hidden_layers:
+                latent = layer(latent)
+            values.append(last_layer(latent).square().sum(dim=1, keepdim=True) + has_offset * linear_term(latent))
+        return tuple(values)
+
+    def lyapunov(self, obs: PyTorchObs, actions: th.Tensor) -> th.Tensor:
+        """
+        The conservative values ``L(s, a)``, offset included.
+
+        :param obs: Observations, preprocessed by ``extract_features()``
+        :param actions: As many flat actions in [-1, 1]
+        :return: The largest of the critics' values and never negative, shape (n, 1)
+        """
+        return (largest_value(self(obs, actions)) + self.offset).clamp(min=0.0)
 
 
 class LyapunovPolicy(BasePolicy):
@@ -142,7 +181,7 @@ class LyapunovPolicy(BasePolicy):
         ``th.optim.Adam`` by default
     :param optimizer_kwargs: Additional keyword arguments,
         excluding the learning rate, to pass to the optimizer
-        (``None`` selects the fused implementation of ``th.optim.Adam``)
+        (the fused implementation of ``th.optim.Adam`` is used, unless ``fused``, ``foreach`` or ``differentiable`` is given)
     :param output_dim: Width of the last layer of the Lyapunov critic, the number of squares that are summed
     :param n_critics: Number of Lyapunov critic networks to create, the largest of their values is used.
     :param share_features_extractor: Whether to share or not the features extractor
@@ -175,9 +214,10 @@ class LyapunovPolicy(BasePolicy):
         n_critics: int = 1,
         share_features_extractor: bool = False,
     ):
-        if optimizer_kwargs is None and optimizer_class is th.optim.Adam:
+        # Other implementations of Adam, which exclude the fused one
+        if optimizer_class is th.optim.Adam and not {"fused", "foreach", "differentiable"} & (optimizer_kwargs or {}).keys():
             # One kernel per step instead of several per tensor
-            optimizer_kwargs = {"fused": True}
+            optimizer_kwargs = {"fused": True, **(optimizer_kwargs or {})}
 
         super().__init__(
             observation_space,
@@ -313,7 +353,7 @@ class LyapunovPolicy(BasePolicy):
 
     def predict_lyapunov(self, observation: np.ndarray | dict[str, np.ndarray], action: np.ndarray) -> np.ndarray:
         """
-        Get the Lyapunov values ``L(s, a)`` (largest over the critics) of observations and actions.
+        Get the Lyapunov values ``L(s, a)`` (largest over the critics, offset included) of observations and actions.
         The observations are preprocessed as in ``predict()``.
 
         :param observation: n observations (or a single one), normalized with ``VecNormalize`` if the model was trained with it
@@ -333,8 +373,8 @@ class LyapunovPolicy(BasePolicy):
         if n_observations != len(scaled_actions):
             raise ValueError(f"There are {n_observations} observations and {len(scaled_actions)} actions, one each is needed.")
         with th.no_grad():
-            values = self.critic(obs_tensor, th.as_tensor(scaled_actions, dtype=th.float32, device=self.device))
-        return largest_value(values).flatten().cpu().numpy()
+            values = self.critic.lyapunov(obs_tensor, th.as_tensor(scaled_actions, dtype=th.float32, device=self.device))
+        return values.flatten().cpu().numpy()
 
     def set_training_mode(self, mode: bool) -> None:
         """
@@ -376,7 +416,7 @@ class CnnPolicy(LyapunovPolicy):
         ``th.optim.Adam`` by default
     :param optimizer_kwargs: Additional keyword arguments,
         excluding the learning rate, to pass to the optimizer
-        (``None`` selects the fused implementation of ``th.optim.Adam``)
+        (the fused implementation of ``th.optim.Adam`` is used, unless ``fused``, ``foreach`` or ``differentiable`` is given)
     :param output_dim: Width of the last layer of the Lyapunov critic, the number of squares that are summed
     :param n_critics: Number of Lyapunov critic networks to create, the largest of their values is used.
     :param share_features_extractor: Whether to share or not the features extractor
@@ -448,7 +488,7 @@ class MultiInputPolicy(LyapunovPolicy):
         ``th.optim.Adam`` by default
     :param optimizer_kwargs: Additional keyword arguments,
         excluding the learning rate, to pass to the optimizer
-        (``None`` selects the fused implementation of ``th.optim.Adam``)
+        (the fused implementation of ``th.optim.Adam`` is used, unless ``fused``, ``foreach`` or ``differentiable`` is given)
     :param output_dim: Width of the last layer of the Lyapunov critic, the number of squares that are summed
     :param n_critics: Number of Lyapunov critic networks to create, the largest of their values is used.
     :param share_features_extractor: Whether to share or not the features extractor

@@ -1,6 +1,7 @@
 """Each combination is trained as asked, and what came out is in the table, the figure and the report."""
 
 import json
+import math
 
 import pandas as pd
 import pytest
@@ -33,19 +34,30 @@ def test_a_run_trains_with_its_combination(tmp_path, trained):
     assert (algo, env_id, seed, timesteps) == ("lac", ENV_ID, 7, multipliers._TIMESTEPS[ENV_ID])
     assert hyperparameters == {
         "alpha3": 0.3,
+        "lambda_min": 4e-4,
         "lambda_max": 4.0,
         "lambda_init": 4.0,
-        "lambda_learning_rate": multipliers._LAMBDA_LEARNING_RATE,
     }
     assert (row["env"], row["alpha3"], row["lambda_max"], row["seed"]) == (ENV_ID, 0.3, 4.0, 7)
     # nothing was learned: lambda is where it started, and nobody dies here
-    assert row["lambda"] == pytest.approx(4.0) and row["death_rate"] == 0 and row["cost"] > 0
+    assert row["lambda"] == pytest.approx(4.0) and row["ent_coef"] == pytest.approx(1.0)
+    assert row["death_rate"] == 0 and row["cost"] > 0
     # no two combinations share a folder
     folders = {folder}
     for arguments in ((ENV_ID, 0.1, 4.0, 7), (ENV_ID, 0.3, 1.0, 7), (ENV_ID, 0.3, 4.0, 8)):
         multipliers.run(*arguments, tmp_path)
         folders.add(trained[-1][4])
     assert len(folders) == 4
+
+
+def test_the_mean_action_is_judged(tmp_path, monkeypatch):
+    judged = []
+    evaluate_lyapunov = multipliers.evaluate_lyapunov
+    monkeypatch.setattr(
+        multipliers, "evaluate_lyapunov", lambda *args, **kwargs: judged.append(kwargs) or evaluate_lyapunov(*args, **kwargs)
+    )
+    multipliers.run(ENV_ID, 0.3, 1.0, 0, tmp_path)
+    assert judged[0]["deterministic"] is True
 
 
 def test_the_same_run_has_the_same_result(tmp_path):
@@ -65,14 +77,23 @@ def test_table_figure_and_report_are_written(tmp_path, trained, capsys):
     assert text in capsys.readouterr().out and text.count(ENV_ID) == 2
 
 
-def test_report_has_medians_over_seeds():
+def test_report_has_means_with_intervals_over_seeds():
     results = pd.DataFrame(
         {"env": ENV_ID, "alpha3": 0.1, "lambda_max": 1.0, "seed": [0, 1, 2], "cost": [1.0, 9.0, 2.0], "death_rate": 0.0}
-        | {"lambda": [0.25, 0.5, 0.75], "decrease": -3.0, "largest_feasible_alpha3": 0.125}
+        | {"lambda": [0.25, 0.5, 0.75], "ent_coef": 0.1, "decrease": -3.0, "condition_holds": [True, False, True]}
+        | {"largest_feasible_alpha3": 0.125}
     )
     _, _, line = multipliers.report(results).strip().splitlines()
     cells = [cell.strip() for cell in line.strip("|").split("|")]
-    assert cells == [ENV_ID, "0.1", "1", "2", "1 to 9", "0", "0.5", "-3", "0.125"]
+    # 4 -+ t(0.975, 2) sqrt(19 / 3), with t = 4.303
+    assert cells == [
+        ENV_ID, "0.1", "1", "4 [-6.83, 14.8]", "0", "0.5", "5", "0.125 [0.125, 0.125]", "2 of 3",
+    ]  # fmt: skip
+
+
+def test_one_seed_has_no_interval():
+    mean, low, high = multipliers.mean_interval(pd.Series([3.0]))
+    assert mean == 3.0 and math.isnan(low) and math.isnan(high)
 
 
 def test_figure_has_one_column_per_environment():
@@ -87,8 +108,12 @@ def test_figure_has_one_column_per_environment():
     )
     figure = multipliers.plot(results)
     assert [axes.get_title() for axes in figure.axes] == ["LinearCost-v0", "Oscillator-v0", "", ""]
-    line, _ = figure.axes[0].get_lines()
-    assert line.get_xydata().tolist() == [[0.1, 1.5], [1.0, 1.5]] and line.get_label() == "lambda_max = 0.1"
+    container = figure.axes[0].containers[0]
+    assert container.lines[0].get_xydata().tolist() == [[0.1, 1.5], [1.0, 1.5]]
+    assert container.get_label() == "lambda_max = 0.1"
+    # t(0.975, 1) = 12.71, times the standard error of 0.5
+    segments = container.lines[2][0].get_segments()
+    assert segments[0][:, 1].tolist() == pytest.approx([1.5 - 12.706 / 2, 1.5 + 12.706 / 2], rel=1e-3)
     # lambda, relative to its limit
     assert figure.axes[2].get_lines()[1].get_ydata().tolist() == [1.0, 1.0]
 

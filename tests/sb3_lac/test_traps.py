@@ -63,17 +63,11 @@ def test_condition_is_infeasible_in_stationary_data_from_alpha3_of_one():
     assert difference.item() == pytest.approx(costs.mean().item(), abs=1e-5)
 
 
-def test_infeasible_alpha3_is_announced_once(make_env):
-    def warnings_of(alpha3, verbose):
-        model = LAC("MlpPolicy", make_env(), alpha3=alpha3, verbose=verbose, learning_starts=5, batch_size=4, device="cpu")
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            model.learn(10, log_interval=None).learn(10, log_interval=None)
-        return sum("lambda will stay at lambda_max" in str(warning.message) for warning in caught)
-
-    assert warnings_of(alpha3=1.0, verbose=1) == 1
-    assert warnings_of(alpha3=1.0, verbose=0) == 0
-    assert warnings_of(alpha3=0.3, verbose=1) == 0
+def test_default_arguments_do_not_warn(make_env):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model = LAC("MlpPolicy", make_env(), verbose=1, learning_starts=5, batch_size=4, buffer_size=10, device="cpu")
+        model.learn(10, log_interval=None)
 
 
 def test_initial_values_are_small_whatever_the_hidden_width(make_env):
@@ -129,6 +123,8 @@ def test_costs_are_the_negated_rewards_unless_rewards_are_positive(make_model):
 def test_costs_of_normalized_rewards_are_not_negative_and_the_bound_follows_the_scale(make_model, make_env):
     env = VecNormalize(DummyVecEnv([lambda: make_env(offset=30.0)]))
     model = make_model(env)
+    # Forget the rewards that were collected
+    model.reward_bound.zero_()
     model._vec_normalize_env.ret_rms.var = 4.0
     assert costs_of(model, [-1.0, 2.5]) == pytest.approx([3.5, 0.0])
     assert model.reward_bound.item() == pytest.approx(5.0)
@@ -199,12 +195,15 @@ def test_everything_that_is_learned_is_saved(make_model, train_metrics):
 
     # All weights and biases of actor and critic are parameters, have an optimizer and change
     for module in (model.actor, model.critic):
-        assert len(list(module.parameters())) == len(module.state_dict())
+        assert {name for name, _ in module.named_parameters()} == set(module.state_dict()) - {"offset"}
         optimized = [parameter for group in module.optimizer.param_groups for parameter in group["params"]]
         assert {id(parameter) for parameter in optimized} == {id(parameter) for parameter in module.parameters()}
     before = {name: tensor.clone() for name, tensor in model.policy.state_dict().items()}
     train_metrics(model)
-    assert all(not th.equal(before[name], tensor) for name, tensor in model.policy.state_dict().items())
+    unchanged = {name for name, tensor in model.policy.state_dict().items() if th.equal(before[name], tensor)}
+    # Those that wait for positive rewards
+    expected = {"linear_term0.weight", "linear_term0.bias", "offset"}
+    assert unchanged == {f"{critic}.{name}" for critic in ("critic", "critic_target") for name in expected}
 
 
 def test_both_values_of_the_difference_are_from_the_online_critic(make_model, train_metrics):

@@ -39,13 +39,16 @@ def policy_sample(weights, obs):
     return action, log_prob.sum(dim=1)
 
 
-def lyapunov(weights, obs, actions, n_critics):
-    """One value per critic: sum of squares of a linear layer."""
+def lyapunov(weights, obs, actions, n_critics, offset=0.0):
+    """One value per critic: sum of squares of a linear layer and, with an offset, the offset and a linear term."""
     values = []
     for i in range(n_critics):
         latent = mlp(weights, f"lf{i}", th.cat([obs, actions], dim=1), 2)
         outputs = latent @ weights[f"lf{i}.4.weight"].T + weights[f"lf{i}.4.bias"]
         values.append((outputs**2).sum(dim=1))
+        if offset > 0:
+            linear_term = latent @ weights[f"linear_term{i}.weight"].T + weights[f"linear_term{i}.bias"]
+            values[-1] = values[-1] + offset + linear_term[:, 0]
     return th.stack(values)
 
 
@@ -63,9 +66,11 @@ class ScalarAdam:
         self.value -= learning_rate * m_hat / (math.sqrt(v_hat) + 1e-8)
 
 
-@pytest.mark.parametrize("n_critics", [1, 2])
-def test_train_is_the_published_update(make_model, n_critics):
+@pytest.mark.parametrize(("n_critics", "bound"), [(1, 0.0), (2, 0.0), (1, 3.0), (2, 3.0)])
+def test_train_is_the_published_update(make_model, make_env, n_critics, bound):
     model = make_model(
+        make_env(offset=bound),
+        reward_bound=bound,
         gamma=GAMMA,
         tau=TAU,
         learning_rate=LEARNING_RATE,
@@ -84,12 +89,14 @@ def test_train_is_the_published_update(make_model, n_critics):
     model.replay_buffer.sample = lambda *args, **kwargs: batch
 
     actor, critic, actor_target, critic_target = (
-        {name: tensor.clone().requires_grad_(True) for name, tensor in module.state_dict().items()}
+        {name: tensor.detach().clone().requires_grad_(True) for name, tensor in module.named_parameters()}
         for module in (model.actor, model.critic, model.actor_target, model.critic_target)
     )
     log_lambda, log_beta = ScalarAdam(math.log(0.5)), ScalarAdam(math.log(0.7))
     obs, next_obs, actions = batch.observations, batch.next_observations, batch.actions
-    costs, dones = -batch.rewards.flatten(), batch.dones.flatten()
+    costs, dones = bound - batch.rewards.flatten(), batch.dones.flatten()
+    # After a termination nothing is paid, which costs the bound in every step
+    offset = bound / (1 - GAMMA)
 
     for step in range(4):
         th.manual_seed(step)
@@ -101,10 +108,11 @@ def test_train_is_the_published_update(make_model, n_critics):
         log_prob, next_actions_pi = log_prob[:16], sampled_actions[16:]
         with th.no_grad():
             lagged_actions, _ = policy_sample(actor_target, next_obs)
-            y = costs + GAMMA * (1 - dones) * lyapunov(critic_target, next_obs, lagged_actions, n_critics).amax(dim=0)
-        values = lyapunov(critic, obs, actions, n_critics)
+            next_values = lyapunov(critic_target, next_obs, lagged_actions, n_critics, offset).amax(dim=0)
+            y = costs + GAMMA * ((1 - dones) * next_values + dones * offset)
+        values = lyapunov(critic, obs, actions, n_critics, offset)
         critic_loss = (0.5 * (values - y) ** 2).mean(dim=1).sum()
-        next_values = lyapunov(critic, next_obs, next_actions_pi, n_critics).amax(dim=0)
+        next_values = lyapunov(critic, next_obs, next_actions_pi, n_critics, offset).amax(dim=0)
         d = (next_values - values.amax(dim=0).detach() + ALPHA3 * costs).mean()
         lambda_, beta = math.exp(log_lambda.value), math.exp(log_beta.value)
         actor_loss = lambda_ * d + beta * log_prob.mean()
@@ -121,10 +129,11 @@ def test_train_is_the_published_update(make_model, n_critics):
         assert logged["train/ent_coef_loss"] == pytest.approx(-log_beta.value * violation, rel=1e-3)
 
         for weights, loss in ((critic, critic_loss), (actor, actor_loss)):
-            gradients = th.autograd.grad(loss, list(weights.values()), retain_graph=True)
-            updates = {name: -LEARNING_RATE * gradient for name, gradient in zip(weights, gradients, strict=True)}
-            with th.no_grad():
-                weights.update({name: (weights[name] + updates[name]).requires_grad_(True) for name in weights})
+            # Without an offset there is no linear term
+            used = [name for name in weights if bound > 0 or "linear_term" not in name]
+            gradients = th.autograd.grad(loss, [weights[name] for name in used], retain_graph=True)
+            for name, gradient in zip(used, gradients, strict=True):
+                weights[name] = (weights[name] - LEARNING_RATE * gradient).detach().requires_grad_(True)
         log_lambda.step(-d.item(), LAMBDA_LEARNING_RATE)
         log_lambda.value = min(max(log_lambda.value, math.log(LAMBDA_MIN)), math.log(LAMBDA_MAX))
         log_beta.step(-violation, LEARNING_RATE)
@@ -138,7 +147,7 @@ def test_train_is_the_published_update(make_model, n_critics):
         (model.actor_target, actor_target),
         (model.critic_target, critic_target),
     ):
-        for name, tensor in module.state_dict().items():
+        for name, tensor in module.named_parameters():
             th.testing.assert_close(tensor, weights[name].detach(), rtol=1e-4, atol=1e-6)
     assert model.log_lambda.item() == pytest.approx(log_lambda.value, rel=1e-4)
     assert model.log_ent_coef.item() == pytest.approx(log_beta.value, rel=1e-4)
