@@ -15,7 +15,7 @@ from gymnasium import spaces
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
-from sb3_lac.lac import LAC
+from sb3_lac.lac import LAC, sum_of_discounts
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -169,15 +169,18 @@ def roll_out(model: LAC, env: VecEnv, n_eval_episodes: int, deterministic: bool)
     return transitions, states[order].reshape((len(order), -1))
 
 
-def cost_to_go(transitions: pd.DataFrame, gamma: float, horizon: int | None, max_tail_weight: float) -> np.ndarray:
+def cost_to_go(
+    transitions: pd.DataFrame, gamma: float, horizon: int | None, max_tail_weight: float, bound: float
+) -> np.ndarray:
     """
     What ``L`` estimates, of one roll-out: the discounted sum of the costs to come (in the next ``horizon`` steps).
-    Nothing is to come after a termination, while the costs after a time limit are not seen.
+    After a termination nothing is paid any more, while the costs after a time limit are not seen.
 
     :param transitions: One row per transition with ``episode``, ``step``, ``cost`` and ``terminated``
     :param gamma: The discount factor
     :param horizon: Number of steps, None for all
     :param max_tail_weight: Largest weight of costs that are not seen, with an infinite horizon
+    :param bound: Cost of each step after a termination, 0 with an infinite horizon that is not discounted
     :return: The sums, NaN where too much is not seen
     """
     episode, step = transitions["episode"].to_numpy(), transitions["step"].to_numpy()
@@ -196,6 +199,11 @@ def cost_to_go(transitions: pd.DataFrame, gamma: float, horizon: int | None, max
     remaining = lengths[episode] - step
     seen = gamma**remaining <= max_tail_weight if horizon is None else remaining >= horizon
     terminated = transitions.groupby("episode")["terminated"].transform("any").to_numpy()
+    if bound > 0:
+        # Of the steps from now on, those after the termination
+        passed = remaining if horizon is None else np.minimum(remaining, horizon)
+        weights = np.array([sum_of_discounts(gamma, int(steps)) for steps in range(lengths.max() + 1)])
+        sums = sums + terminated * bound * (sum_of_discounts(gamma, horizon) - weights[passed])
     return np.where(seen | terminated, sums, np.nan)
 
 
@@ -604,6 +612,8 @@ def evaluate_lyapunov(
         raise ValueError(f"n_cost_levels={n_cost_levels} and n_bootstrap={n_bootstrap} must be at least 1.")
 
     vec_normalize = unwrap_vec_normalize(env)
+    # The scale of normalized rewards may have changed since the last update
+    model.update_offset(vec_normalize)
     if seed is not None:
         env.seed(seed)
     # A training goes on as if there had been no evaluation
@@ -621,10 +631,10 @@ def evaluate_lyapunov(
                 vec_normalize.training = training
 
     # A reward above all those of the training would have a negative cost, which L cannot learn
-    bound = float(model.cost_bound(vec_normalize))
+    bound = model.cost_bound(vec_normalize).item()
     transitions["cost"] = np.maximum(bound - transitions["reward"], 0.0)
     transitions["difference"] = transitions["next_lyapunov"] - transitions["lyapunov"] + alpha3 * transitions["cost"]
-    transitions["cost_to_go"] = cost_to_go(transitions, model.gamma, model.horizon, max_tail_weight)
+    transitions["cost_to_go"] = cost_to_go(transitions, model.gamma, model.horizon, max_tail_weight, bound)
     columns = ["episode", "step", "reward", "cost", "lyapunov", "next_lyapunov", "difference", "cost_to_go", "terminated"]
     transitions = transitions[columns]
 
