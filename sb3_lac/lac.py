@@ -13,7 +13,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, Schedule
 from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, polyak_update, update_learning_rate
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.her import HerReplayBuffer
 from stable_baselines3.sac.policies import Actor
 from torch.nn import functional as F
 
@@ -130,6 +131,16 @@ def weight_of_return(discounts: th.Tensor | None, gamma: float) -> th.Tensor | f
     :return: Sum of the discounts in each return
     """
     return 1.0 if discounts is None else (1 - discounts) / (1 - gamma)
+
+
+def time_limits(env: VecEnv) -> list[int | None]:
+    """
+    Gymnasium's time limits.
+
+    :param env: Vectorized environment
+    :return: ``max_episode_steps`` of each environment, None where it has none
+    """
+    return [getattr(spec, "max_episode_steps", None) for spec in env.get_attr("spec")]
 
 
 def concatenate_observations(obs: PyTorchObs, next_obs: PyTorchObs) -> PyTorchObs:
@@ -434,6 +445,13 @@ class LAC(OffPolicyAlgorithm):
         if not isinstance(horizon, (int, np.integer)) or isinstance(horizon, bool) or horizon < 1:
             raise ValueError(f"horizon={horizon} must be an integer of at least 1, or None for the infinite horizon.")
         self.horizon = horizon = int(horizon)
+        if self.env is not None:
+            longest = max(horizon if limit is None else limit for limit in time_limits(self.env))
+            if longest < horizon:
+                raise ValueError(
+                    f"horizon={horizon} is longer than the episodes, which the environment's max_episode_steps={longest} ends: what "
+                    "follows a time limit is unknown, and there would be nothing to learn from. Use a smaller horizon or longer episodes."
+                )
         if self.n_steps > 1:
             raise ValueError(
                 f"horizon={horizon} and n_steps={self.n_steps} are two Lyapunov candidates: keep n_steps=1 or horizon=None."
@@ -453,6 +471,27 @@ class LAC(OffPolicyAlgorithm):
         self.actor_target = self.policy.actor_target
         self.critic = self.policy.critic
         self.critic_target = self.policy.critic_target
+
+    def end_episodes(self) -> None:
+        """
+        Let the next call of ``learn()`` reset the training environment, which was used for something else: the episodes that
+        it was in are stored as if a time limit had ended them. Not for use during ``learn()``.
+        """
+        self._last_obs = None
+        buffer = self.replay_buffer
+        if buffer is None or buffer.size() == 0:
+            return
+        if isinstance(buffer, HerReplayBuffer):
+            with warnings.catch_warnings():
+                # Its warning is about loading a buffer
+                warnings.simplefilter("ignore")
+                buffer.truncate_last_trajectory()
+            return
+        last = (buffer.pos - 1) % buffer.buffer_size
+        unfinished = buffer.dones[last] == 0
+        buffer.dones[last, unfinished] = 1
+        # With ``optimize_memory_usage`` the next state is not stored, and must not be used
+        buffer.timeouts[last, unfinished] = not buffer.optimize_memory_usage
 
     def cost_bound(self, vec_normalize: VecNormalize | None = None) -> th.Tensor:
         """
