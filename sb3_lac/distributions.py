@@ -1,8 +1,8 @@
 import math
 
 import torch as th
-from torch.distributions import Normal
 from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
+from torch.distributions import Normal
 
 
 class SquashedGaussianDistribution(SquashedDiagGaussianDistribution):

@@ -171,7 +171,7 @@ class LAC(OffPolicyAlgorithm):
 
     Note: LAC minimises the cost ``c = bound - reward``, where ``bound`` is the largest reward (``reward_bound`` or the largest
     one seen, at least 0). For an environment with ``reward = -cost <= 0`` this is exactly its cost. A termination pays 0 for
-    ever after, as everywhere in reinforcement learning, and so costs ``bound`` per step: with positive rewards it is better to live.
+    ever after, as everywhere in reinforcement learning, and so costs ``bound`` per step: where living pays, LAC lives.
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...)
     :param env: The environment to learn from (if registered in Gym, can be str)
@@ -435,8 +435,9 @@ class LAC(OffPolicyAlgorithm):
         """
         if bound > 0 and self.horizon is None and self.gamma >= 1:
             raise ValueError(
-                f"gamma={self.gamma} must be smaller than 1 with rewards up to {bound:g}: each step below that reward has a cost, "
-                "whose sum over all time is infinite. Use for instance gamma=0.99, a finite horizon, or rewards that are not positive."
+                f"gamma={self.gamma} must be smaller than 1 with rewards up to {bound:g}: each step below that reward "
+                "has a cost, whose sum over all time is infinite. Use for instance gamma=0.99, a finite horizon, or rewards "
+                "that are not positive."
             )
 
     def _setup_horizon(self) -> None:
@@ -449,8 +450,9 @@ class LAC(OffPolicyAlgorithm):
             longest = max(horizon if limit is None else limit for limit in time_limits(self.env))
             if longest < horizon:
                 raise ValueError(
-                    f"horizon={horizon} is longer than the episodes, which the environment's max_episode_steps={longest} ends: what "
-                    "follows a time limit is unknown, and there would be nothing to learn from. Use a smaller horizon or longer episodes."
+                    f"horizon={horizon} is longer than the episodes, which max_episode_steps={longest} cuts: "
+                    "what follows a time limit is unknown, and there would be nothing to learn from. "
+                    "Use a smaller horizon or longer episodes."
                 )
         if self.n_steps > 1:
             raise ValueError(
@@ -495,9 +497,9 @@ class LAC(OffPolicyAlgorithm):
 
     def cost_bound(self, vec_normalize: VecNormalize | None = None) -> th.Tensor:
         """
-        The reward that costs nothing: LAC minimises ``c = bound - reward >= 0``, and ``bound`` is the largest of ``reward_bound``,
-        of all rewards seen, and of 0. It is kept in the units of the environment, so that it stays valid when ``VecNormalize``
-        changes its scale.
+        The reward that costs nothing: LAC minimises ``c = bound - reward >= 0``, and ``bound`` is the largest of
+        ``reward_bound``, of all rewards seen, and of 0. It is kept in the units of the environment, so that it stays valid
+        when ``VecNormalize`` changes its scale.
 
         :param vec_normalize: Wrapper that the rewards come from, if any
         :return: The bound in the units of these rewards
@@ -538,8 +540,8 @@ class LAC(OffPolicyAlgorithm):
             stated = self.stated_reward_bound
             if stated is not None and self.largest_stored_reward <= stated < largest_reward:
                 warnings.warn(
-                    f"A reward of {largest_reward:g} is larger than reward_bound={stated:g}. The bound follows the largest reward "
-                    "from here on, and L is shifted with it. State a larger reward_bound to keep costs and L comparable.",
+                    f"A reward of {largest_reward:g} is larger than reward_bound={stated:g}. The bound follows the largest "
+                    "reward from here on, and L is shifted with it. A larger reward_bound keeps costs and L comparable.",
                     stacklevel=2,
                 )
             self.largest_stored_reward = largest_reward
@@ -550,7 +552,7 @@ class LAC(OffPolicyAlgorithm):
     def _compute_costs(self, rewards: th.Tensor, n_rewards: th.Tensor | float = 1.0) -> th.Tensor:
         """
         Convert sampled rewards to costs (see ``cost_bound()``), after updating the bound with the sample: it stays valid when
-        rewards are computed at sampling (HER) or were stored elsewhere. Of the latter, sums of n steps tell their mean reward only.
+        rewards are computed at sampling (HER) or were stored elsewhere. Of the latter, sums of n steps only tell their mean.
 
         :param rewards: Rewards (normalized with ``VecNormalize``), or discounted sums of them
         :param n_rewards: How often a constant reward counts in each sum, the sum of its discounts

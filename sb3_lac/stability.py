@@ -525,7 +525,9 @@ class LyapunovReport:
     def _why_not_available(self, name: str) -> str:
         if name == "ultimate_bound":
             return "Every episode terminated: train longer, or start closer to the goal."
-        if name in ("decrease", "share_decreasing") or (name == "largest_feasible_alpha3" and self.metrics["mean_cost"].value > 0):
+        if name in ("decrease", "share_decreasing") or (
+            name == "largest_feasible_alpha3" and self.metrics["mean_cost"].value > 0
+        ):
             return "Every episode terminated in its first step, or without a cost before its last one: train longer."
         if name == "largest_feasible_alpha3":
             return "Nothing had a cost, so that L has nothing to decrease by: start further away from the goal."
@@ -550,8 +552,8 @@ class LyapunovReport:
             longer = f"evaluate with longer episodes, gym.make(id, max_episode_steps={2 * n_steps})"
         else:
             longer = (
-                f"evaluate with episodes of {2 * n_steps} steps. The environment ends them itself, where max_episode_steps changes "
-                "nothing: use its own argument for their length, like episode_steps"
+                f"evaluate with episodes of {2 * n_steps} steps. The environment ends them itself, where max_episode_steps "
+                "changes nothing: use its own argument for their length, like episode_steps"
             )
         if self.horizon is not None:
             return f"no episode terminated or has the {self.horizon} steps of the horizon ({longest}); {longer}."

@@ -46,7 +46,9 @@ def gradients_of(monkeypatch, train_metrics):
         targets = []
         loss = lac.lyapunov_critic_loss
         with monkeypatch.context() as patch:
-            patch.setattr(lac, "lyapunov_critic_loss", lambda values, y: targets.append(y + model.critic.offset) or loss(values, y))
+            patch.setattr(
+                lac, "lyapunov_critic_loss", lambda values, y: targets.append(y + model.critic.offset) or loss(values, y)
+            )
             patch.setattr(model, "lr_schedule", lambda _: 0.0)
             patch.setattr(model, "tau", 0.0)
             train_metrics(model)
@@ -69,7 +71,9 @@ def gradients_of(monkeypatch, train_metrics):
         ({"gamma": 0.5, "horizon": 3}, 1.75),
     ],
 )
-def test_rise_of_the_bound_shifts_all_values_and_no_gradient(make_model, make_env, gradients_of, train_metrics, kwargs, sum_of_discounts):
+def test_rise_of_the_bound_shifts_all_values_and_no_gradient(
+    make_model, make_env, gradients_of, train_metrics, kwargs, sum_of_discounts
+):
     # Also with terminations
     model = make_model(make_env(episode_length=7, terminate=True), **kwargs)
     train_metrics(model, gradient_steps=20)
