@@ -1,3 +1,4 @@
+import warnings
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -52,6 +53,7 @@ class HorizonReplayBuffer(ReplayBuffer):
         self.complete = np.zeros((self.buffer_size, self.n_envs), dtype=bool)
         self.n_complete = 0
         self.episode_lengths = np.zeros(self.n_envs, dtype=np.int64)
+        self.warned = False
 
     def reset(self) -> None:
         super().reset()
@@ -81,6 +83,15 @@ class HorizonReplayBuffer(ReplayBuffer):
         self.complete[(pos - self.horizon + 1) % self.buffer_size, has_horizon] = True
         self.n_complete += int(has_horizon.sum())
         finished = self.dones[pos] > 0
+        cut_short = finished & (self.timeouts[pos] > 0) & ~has_horizon
+        if cut_short.any() and not self.warned:
+            self.warned = True
+            warnings.warn(
+                f"A time limit ended an episode of {self.episode_lengths[cut_short].min()} steps, which is shorter than "
+                f"horizon={self.horizon}: what follows is unknown, and nothing is learned from such an episode. "
+                "Use a smaller horizon or longer episodes.",
+                stacklevel=2,
+            )
         for env_idx in np.flatnonzero(finished & (self.timeouts[pos] == 0)):
             n_steps = min(self.horizon, int(self.episode_lengths[env_idx]))
             ends = (pos - np.arange(n_steps)) % self.buffer_size

@@ -11,7 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback, EventCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, sync_envs_normalization
 
 from sb3_lac.lac import LAC
-from sb3_lac.stability import LyapunovReport, evaluate_lyapunov, prepare_evaluation
+from sb3_lac.stability import LyapunovReport, evaluate_lyapunov, prepare_evaluation, trains_on
 
 
 def _read_history(log_path: Path) -> list[dict[str, float]]:
@@ -188,7 +188,8 @@ class LyapunovCallback(EventCallback):
       To account for that, you can use ``eval_freq = max(eval_freq // n_envs, 1)``
 
     :param eval_env: The environment used for evaluation, wrapped with ``VecNormalize`` if the training environment is:
-        its statistics are synchronized before each evaluation.
+        its statistics are synchronized before each evaluation. It cannot be the training environment itself, whose episodes
+        the evaluation would end.
     :param callback_after_eval: Callback to trigger after every evaluation, which finds the report in
         ``self.parent.last_report``
     :param n_eval_episodes: The number of episodes to test the agent
@@ -219,7 +220,7 @@ class LyapunovCallback(EventCallback):
         callback_after_eval: BaseCallback | None = None,
         n_eval_episodes: int = 20,
         eval_freq: int = 10_000,
-        deterministic: bool = False,
+        deterministic: bool = True,
         seed: int | None = None,
         log_path: str | os.PathLike[str] | None = None,
         verbose: int = 1,
@@ -241,6 +242,11 @@ class LyapunovCallback(EventCallback):
     def _init_callback(self) -> None:
         # A mistake is seen before the training, and not at its first evaluation
         self.eval_env = prepare_evaluation(self.model, self.eval_env, self.n_eval_episodes)
+        if trains_on(self.model, self.eval_env):
+            raise ValueError(
+                "The evaluation environment is the training environment: an evaluation would end its episodes, and the "
+                "replay buffer would join them with others. Make a second environment for the evaluation."
+            )
         if self.log_path is not None:
             self.history = _read_history(self.log_path)
 

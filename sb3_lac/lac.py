@@ -13,7 +13,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, Schedule
 from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, polyak_update, update_learning_rate
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.her import HerReplayBuffer
 from stable_baselines3.sac.policies import Actor
 from torch.nn import functional as F
 
@@ -132,6 +133,16 @@ def weight_of_return(discounts: th.Tensor | None, gamma: float) -> th.Tensor | f
     return 1.0 if discounts is None else (1 - discounts) / (1 - gamma)
 
 
+def time_limits(env: VecEnv) -> list[int | None]:
+    """
+    Gymnasium's time limits.
+
+    :param env: Vectorized environment
+    :return: ``max_episode_steps`` of each environment, None where it has none
+    """
+    return [getattr(spec, "max_episode_steps", None) for spec in env.get_attr("spec")]
+
+
 def concatenate_observations(obs: PyTorchObs, next_obs: PyTorchObs) -> PyTorchObs:
     """
     Stack two batches of observations, so that one pass of a network serves both.
@@ -160,7 +171,7 @@ class LAC(OffPolicyAlgorithm):
 
     Note: LAC minimises the cost ``c = bound - reward``, where ``bound`` is the largest reward (``reward_bound`` or the largest
     one seen, at least 0). For an environment with ``reward = -cost <= 0`` this is exactly its cost. A termination pays 0 for
-    ever after, as everywhere in reinforcement learning, and so costs ``bound`` per step: with positive rewards it is better to live.
+    ever after, as everywhere in reinforcement learning, and so costs ``bound`` per step: where living pays, LAC lives.
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...)
     :param env: The environment to learn from (if registered in Gym, can be str)
@@ -424,8 +435,9 @@ class LAC(OffPolicyAlgorithm):
         """
         if bound > 0 and self.horizon is None and self.gamma >= 1:
             raise ValueError(
-                f"gamma={self.gamma} must be smaller than 1 with rewards up to {bound:g}: each step below that reward has a cost, "
-                "whose sum over all time is infinite. Use for instance gamma=0.99, a finite horizon, or rewards that are not positive."
+                f"gamma={self.gamma} must be smaller than 1 with rewards up to {bound:g}: each step below that reward "
+                "has a cost, whose sum over all time is infinite. Use for instance gamma=0.99, a finite horizon, or rewards "
+                "that are not positive."
             )
 
     def _setup_horizon(self) -> None:
@@ -434,6 +446,14 @@ class LAC(OffPolicyAlgorithm):
         if not isinstance(horizon, (int, np.integer)) or isinstance(horizon, bool) or horizon < 1:
             raise ValueError(f"horizon={horizon} must be an integer of at least 1, or None for the infinite horizon.")
         self.horizon = horizon = int(horizon)
+        if self.env is not None:
+            longest = max(horizon if limit is None else limit for limit in time_limits(self.env))
+            if longest < horizon:
+                raise ValueError(
+                    f"horizon={horizon} is longer than the episodes, which max_episode_steps={longest} cuts: "
+                    "what follows a time limit is unknown, and there would be nothing to learn from. "
+                    "Use a smaller horizon or longer episodes."
+                )
         if self.n_steps > 1:
             raise ValueError(
                 f"horizon={horizon} and n_steps={self.n_steps} are two Lyapunov candidates: keep n_steps=1 or horizon=None."
@@ -454,11 +474,32 @@ class LAC(OffPolicyAlgorithm):
         self.critic = self.policy.critic
         self.critic_target = self.policy.critic_target
 
+    def end_episodes(self) -> None:
+        """
+        Let the next call of ``learn()`` reset the training environment, which was used for something else: the episodes that
+        it was in are stored as if a time limit had ended them. Not for use during ``learn()``.
+        """
+        self._last_obs = None
+        buffer = self.replay_buffer
+        if buffer is None or buffer.size() == 0:
+            return
+        if isinstance(buffer, HerReplayBuffer):
+            with warnings.catch_warnings():
+                # Its warning is about loading a buffer
+                warnings.simplefilter("ignore")
+                buffer.truncate_last_trajectory()
+            return
+        last = (buffer.pos - 1) % buffer.buffer_size
+        unfinished = buffer.dones[last] == 0
+        buffer.dones[last, unfinished] = 1
+        # With ``optimize_memory_usage`` the next state is not stored, and must not be used
+        buffer.timeouts[last, unfinished] = not buffer.optimize_memory_usage
+
     def cost_bound(self, vec_normalize: VecNormalize | None = None) -> th.Tensor:
         """
-        The reward that costs nothing: LAC minimises ``c = bound - reward >= 0``, and ``bound`` is the largest of ``reward_bound``,
-        of all rewards seen, and of 0. It is kept in the units of the environment, so that it stays valid when ``VecNormalize``
-        changes its scale.
+        The reward that costs nothing: LAC minimises ``c = bound - reward >= 0``, and ``bound`` is the largest of
+        ``reward_bound``, of all rewards seen, and of 0. It is kept in the units of the environment, so that it stays valid
+        when ``VecNormalize`` changes its scale.
 
         :param vec_normalize: Wrapper that the rewards come from, if any
         :return: The bound in the units of these rewards
@@ -499,8 +540,8 @@ class LAC(OffPolicyAlgorithm):
             stated = self.stated_reward_bound
             if stated is not None and self.largest_stored_reward <= stated < largest_reward:
                 warnings.warn(
-                    f"A reward of {largest_reward:g} is larger than reward_bound={stated:g}. The bound follows the largest reward "
-                    "from here on, and L is shifted with it. State a larger reward_bound to keep costs and L comparable.",
+                    f"A reward of {largest_reward:g} is larger than reward_bound={stated:g}. The bound follows the largest "
+                    "reward from here on, and L is shifted with it. A larger reward_bound keeps costs and L comparable.",
                     stacklevel=2,
                 )
             self.largest_stored_reward = largest_reward
@@ -511,7 +552,7 @@ class LAC(OffPolicyAlgorithm):
     def _compute_costs(self, rewards: th.Tensor, n_rewards: th.Tensor | float = 1.0) -> th.Tensor:
         """
         Convert sampled rewards to costs (see ``cost_bound()``), after updating the bound with the sample: it stays valid when
-        rewards are computed at sampling (HER) or were stored elsewhere. Of the latter, sums of n steps tell their mean reward only.
+        rewards are computed at sampling (HER) or were stored elsewhere. Of the latter, sums of n steps only tell their mean.
 
         :param rewards: Rewards (normalized with ``VecNormalize``), or discounted sums of them
         :param n_rewards: How often a constant reward counts in each sum, the sum of its discounts

@@ -15,7 +15,7 @@ from gymnasium import spaces
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
-from sb3_lac.lac import LAC
+from sb3_lac.lac import LAC, sum_of_discounts, time_limits
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -66,6 +66,25 @@ def prepare_evaluation(model: LAC, env: gym.Env | VecEnv, n_eval_episodes: int) 
                 "with VecNormalize in the same way, and synchronize its statistics with sync_envs_normalization()."
             )
     return env
+
+
+def trains_on(model: LAC, env: VecEnv) -> bool:
+    """
+    Whether a model collects its training data in an environment, or in one of those that it consists of.
+
+    :param model: The model
+    :param env: The environment, wrapped or not
+    :return: True if stepping the one steps the other
+    """
+    training_env = model.get_env()
+    if training_env is None:
+        return False
+    if env.unwrapped is training_env.unwrapped:
+        return True
+    first, second = (
+        {id(single.unwrapped) for single in getattr(vec_env.unwrapped, "envs", [])} for vec_env in (env, training_env)
+    )
+    return not first.isdisjoint(second)
 
 
 def normalization(vec_normalize: VecNormalize | None) -> str:
@@ -169,15 +188,18 @@ def roll_out(model: LAC, env: VecEnv, n_eval_episodes: int, deterministic: bool)
     return transitions, states[order].reshape((len(order), -1))
 
 
-def cost_to_go(transitions: pd.DataFrame, gamma: float, horizon: int | None, max_tail_weight: float) -> np.ndarray:
+def cost_to_go(
+    transitions: pd.DataFrame, gamma: float, horizon: int | None, max_tail_weight: float, bound: float
+) -> np.ndarray:
     """
     What ``L`` estimates, of one roll-out: the discounted sum of the costs to come (in the next ``horizon`` steps).
-    Nothing is to come after a termination, while the costs after a time limit are not seen.
+    After a termination nothing is paid any more, while the costs after a time limit are not seen.
 
     :param transitions: One row per transition with ``episode``, ``step``, ``cost`` and ``terminated``
     :param gamma: The discount factor
     :param horizon: Number of steps, None for all
     :param max_tail_weight: Largest weight of costs that are not seen, with an infinite horizon
+    :param bound: Cost of each step after a termination, 0 with an infinite horizon that is not discounted
     :return: The sums, NaN where too much is not seen
     """
     episode, step = transitions["episode"].to_numpy(), transitions["step"].to_numpy()
@@ -196,6 +218,11 @@ def cost_to_go(transitions: pd.DataFrame, gamma: float, horizon: int | None, max
     remaining = lengths[episode] - step
     seen = gamma**remaining <= max_tail_weight if horizon is None else remaining >= horizon
     terminated = transitions.groupby("episode")["terminated"].transform("any").to_numpy()
+    if bound > 0:
+        # Of the steps from now on, those after the termination
+        passed = remaining if horizon is None else np.minimum(remaining, horizon)
+        weights = np.array([sum_of_discounts(gamma, int(steps)) for steps in range(lengths.max() + 1)])
+        sums = sums + terminated * bound * (sum_of_discounts(gamma, horizon) - weights[passed])
     return np.where(seen | terminated, sums, np.nan)
 
 
@@ -425,6 +452,7 @@ class LyapunovReport:
     :param gamma: The discount factor
     :param horizon: Number of steps whose costs ``L`` estimates, None for all to come
     :param max_tail_weight: Largest weight of the costs to come after the end of an episode, in ``cost_to_go``
+    :param max_episode_steps: Gymnasium's time limit of the environment, None if it ends its episodes itself
     """
 
     transitions: pd.DataFrame
@@ -436,6 +464,7 @@ class LyapunovReport:
     gamma: float
     horizon: int | None
     max_tail_weight: float
+    max_episode_steps: int | None
 
     @property
     def n_calibrated(self) -> int:
@@ -462,12 +491,18 @@ class LyapunovReport:
             f"(alpha3={self.alpha3:g}, gamma={self.gamma:g}, {horizon})",
             f"  {'metric':<24}{'value':>12}   95 % interval",
         ]
+        missing: dict[str, list[str]] = {}
         for name, (value, low, high) in self.metrics.items():
-            lines.append(f"  {name:<24}{value:>12.4g}   [{low:.4g}, {high:.4g}]")
+            if math.isnan(value):
+                missing.setdefault(self._why_not_available(name), []).append(name)
+                lines.append(f"  {name:<24}not available")
+            elif math.isnan(low):
+                lines.append(f"  {name:<24}{value:>12.4g}   not available: it takes two episodes with data")
+            else:
+                lines.append(f"  {name:<24}{value:>12.4g}   [{low:.4g}, {high:.4g}]")
+        lines += [f"Not available: {', '.join(names)}. {reason}" for reason, names in missing.items()]
         lines.append(f"With alpha3={self.alpha3:g} the decrease condition {self._verdict()}.")
-        if self.n_calibrated == 0:
-            lines.append(f"L could not be compared with the cost-to-go: {self._why_not_calibrated()}")
-        else:
+        if self.n_calibrated > 0:
             lines.append(f"L was compared with the cost-to-go of {self.n_calibrated} transitions.")
         lines.append(
             "This is an empirical statement about these roll-outs of this policy in this environment, "
@@ -481,24 +516,50 @@ class LyapunovReport:
             return "holds on average: the interval of decrease lies below 0"
         if decrease.low > 0:
             return "is violated on average: the interval of decrease lies above 0"
+        if math.isnan(decrease.value):
+            return "is undecided: no transition ends in a state that has an L"
         if math.isnan(decrease.low):
             return "is undecided: one episode with a decrease gives no interval, use more episodes"
         return "is undecided: the interval of decrease contains 0"
 
+    def _why_not_available(self, name: str) -> str:
+        if name == "ultimate_bound":
+            return "Every episode terminated: train longer, or start closer to the goal."
+        if name in ("decrease", "share_decreasing") or (
+            name == "largest_feasible_alpha3" and self.metrics["mean_cost"].value > 0
+        ):
+            return "Every episode terminated in its first step, or without a cost before its last one: train longer."
+        if name == "largest_feasible_alpha3":
+            return "Nothing had a cost, so that L has nothing to decrease by: start further away from the goal."
+        if self.n_calibrated > 0:
+            return (
+                f"L or the cost-to-go is the same in all {self.n_calibrated} transitions that can be compared: "
+                "use more episodes, with other start states."
+            )
+        return f"L could not be compared with the cost-to-go: {self._why_not_calibrated()}"
+
     def _why_not_calibrated(self) -> str:
-        longest = f"the longest episode has {self.episodes['length'].max()} steps"
-        longer = "use longer episodes in the evaluation environment, like gym.make(id, max_episode_steps=...)"
-        if self.horizon is not None:
-            return f"no episode terminated or has the {self.horizon} steps of the horizon ({longest}); {longer}."
-        if self.gamma >= 1:
+        length = int(self.episodes["length"].max())
+        longest = f"the longest episode has {length} steps"
+        if self.horizon is None and self.gamma >= 1:
             return (
                 "no episode terminated, and with gamma=1 the costs after a time limit weigh as much as those before it; "
                 "max_tail_weight=1 leaves them out."
             )
-        n_steps = math.ceil(math.log(self.max_tail_weight) / math.log(self.gamma))
+        n_steps = self.horizon or math.ceil(math.log(self.max_tail_weight) / math.log(self.gamma))
+        # As many transitions that can be compared as cannot
+        if self.max_episode_steps is not None and length >= self.max_episode_steps:
+            longer = f"evaluate with longer episodes, gym.make(id, max_episode_steps={2 * n_steps})"
+        else:
+            longer = (
+                f"evaluate with episodes of {2 * n_steps} steps. The environment ends them itself, where max_episode_steps "
+                "changes nothing: use its own argument for their length, like episode_steps"
+            )
+        if self.horizon is not None:
+            return f"no episode terminated or has the {self.horizon} steps of the horizon ({longest}); {longer}."
         return (
             f"the costs to come after the time limit weigh more than max_tail_weight={self.max_tail_weight:g} everywhere. "
-            f"It takes {n_steps} steps to forget them, {longest}; {longer}, or a larger max_tail_weight."
+            f"It takes {n_steps} steps to forget them, {longest}; {longer}, or set a larger max_tail_weight."
         )
 
     def plot(self) -> Figure:
@@ -547,7 +608,7 @@ def evaluate_lyapunov(
     model: LAC,
     env: gym.Env | VecEnv,
     n_eval_episodes: int = 20,
-    deterministic: bool = False,
+    deterministic: bool = True,
     alpha3: float | None = None,
     max_tail_weight: float = 0.05,
     n_cost_levels: int = 5,
@@ -579,12 +640,14 @@ def evaluate_lyapunov(
         Costs are those that ``L`` was trained on, of rewards and ends of episodes as they appear with ``env.step`` calls:
         wrap ``env`` as the training environment. Unlike in ``evaluate_policy()``, a ``Monitor`` makes no difference.
         With gSDE, the noise matrix of the last roll-out is kept.
+        The training environment (``model.get_env()``) may be used between two calls of ``learn()``: the next one then starts
+        with a reset, and the unfinished episodes in the replay buffer end as by a time limit.
 
     :param model: The LAC model you want to evaluate
     :param env: The gym environment or ``VecEnv`` environment. Its normalization statistics are used as they are:
         call ``sync_envs_normalization()`` before, if it is not the training environment.
     :param n_eval_episodes: Number of episodes, divided onto the elements of a vector env as in ``evaluate_policy()``
-    :param deterministic: Whether to use deterministic or stochastic actions
+    :param deterministic: Whether to judge the policy's mean action, as it is used after the training, or sampled actions
     :param alpha3: Share of the cost by which ``L`` has to decrease, that of the model by default
     :param max_tail_weight: The costs after a time limit are not seen. A transition is used for the comparison of ``L`` with
         the cost-to-go if they weigh at most that much in it, ``gamma ** remaining_steps <= max_tail_weight``.
@@ -604,6 +667,8 @@ def evaluate_lyapunov(
         raise ValueError(f"n_cost_levels={n_cost_levels} and n_bootstrap={n_bootstrap} must be at least 1.")
 
     vec_normalize = unwrap_vec_normalize(env)
+    # The scale of normalized rewards may have changed since the last update
+    model.update_offset(vec_normalize)
     if seed is not None:
         env.seed(seed)
     # A training goes on as if there had been no evaluation
@@ -617,14 +682,16 @@ def evaluate_lyapunov(
                 vec_normalize.training = False
             transitions, observations = roll_out(model, env, n_eval_episodes, deterministic)
         finally:
+            if trains_on(model, env):
+                model.end_episodes()
             if vec_normalize is not None:
                 vec_normalize.training = training
 
     # A reward above all those of the training would have a negative cost, which L cannot learn
-    bound = float(model.cost_bound(vec_normalize))
+    bound = model.cost_bound(vec_normalize).item()
     transitions["cost"] = np.maximum(bound - transitions["reward"], 0.0)
     transitions["difference"] = transitions["next_lyapunov"] - transitions["lyapunov"] + alpha3 * transitions["cost"]
-    transitions["cost_to_go"] = cost_to_go(transitions, model.gamma, model.horizon, max_tail_weight)
+    transitions["cost_to_go"] = cost_to_go(transitions, model.gamma, model.horizon, max_tail_weight, bound)
     columns = ["episode", "step", "reward", "cost", "lyapunov", "next_lyapunov", "difference", "cost_to_go", "terminated"]
     transitions = transitions[columns]
 
@@ -640,4 +707,5 @@ def evaluate_lyapunov(
         gamma=model.gamma,
         horizon=model.horizon,
         max_tail_weight=max_tail_weight,
+        max_episode_steps=max((limit for limit in time_limits(env) if limit is not None), default=None),
     )

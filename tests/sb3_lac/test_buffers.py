@@ -1,10 +1,12 @@
 """The finite horizon candidate: sums of costs along stored episodes."""
 
+import warnings
+
 import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.buffers import NStepReplayBuffer
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.envs import SimpleMultiObsEnv
 
 from sb3_lac import LAC, lac
@@ -73,7 +75,36 @@ def test_future_beyond_a_time_limit_is_unknown():
 
 
 def test_episode_shorter_than_the_horizon_counts_if_it_terminated():
-    assert Recorder(horizon=10).add(2, terminated=True).add(3, truncated=True).add(1).sums() == {0: 1, 1: 1}
+    recorder = Recorder(horizon=10).add(2, terminated=True)
+    with pytest.warns(UserWarning, match="episode of 3 steps, which is shorter than horizon=10"):
+        recorder.add(3, truncated=True)
+    # Said once
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        recorder.add(3, truncated=True)
+    assert recorder.add(1).sums() == {0: 1, 1: 1}
+
+
+def test_horizon_beyond_the_time_limit_is_refused_before_the_training():
+    with pytest.raises(ValueError, match=r"horizon=201 is longer than the episodes, which max_episode_steps=200 cuts"):
+        LAC("MlpPolicy", "Pendulum-v1", horizon=201)
+    assert LAC("MlpPolicy", "Pendulum-v1", horizon=200, buffer_size=300).horizon == 200
+
+
+def test_horizon_can_be_changed_on_loading(make_model, make_env, tmp_path):
+    make_model(n_collect=0, horizon=4).save(tmp_path / "model")
+    loaded = LAC.load(tmp_path / "model", env=make_env(), horizon=None, device="cpu")
+    assert loaded.horizon is None and type(loaded.replay_buffer) is ReplayBuffer
+    loaded.learn(60)
+    assert loaded._n_updates > 0
+    assert LAC.load(tmp_path / "model", env=make_env(), horizon=7, device="cpu").replay_buffer.horizon == 7
+    assert LAC.load(tmp_path / "model", env=make_env(), device="cpu").replay_buffer.horizon == 4
+    make_model(n_collect=0).save(tmp_path / "model")
+    assert LAC.load(tmp_path / "model", env=make_env(), horizon=7, device="cpu").replay_buffer.horizon == 7
+
+
+def test_horizon_is_any_whole_number(make_model):
+    assert make_model(n_collect=0, horizon=np.int64(4)).replay_buffer.horizon == 4
 
 
 def test_overwritten_transitions_are_forgotten():
@@ -131,7 +162,9 @@ def test_steps_after_a_termination_cost_the_bound(make_model, make_env, train_me
     model.replay_buffer.rewards[:] = 3.0
     targets = []
     loss = lac.lyapunov_critic_loss
-    monkeypatch.setattr(lac, "lyapunov_critic_loss", lambda values, y: targets.append(y + model.critic.offset) or loss(values, y))
+    monkeypatch.setattr(
+        lac, "lyapunov_critic_loss", lambda values, y: targets.append(y + model.critic.offset) or loss(values, y)
+    )
     metrics = train_metrics(model, gradient_steps=5)
     assert th.cat(targets).unique().tolist() == [6.0, 9.0]
     # These steps themselves cost nothing
@@ -156,6 +189,7 @@ def test_model_with_a_horizon_is_saved_loaded_and_continued(make_model, make_env
     [
         ({"horizon": 0}, "horizon=0 must be an integer of at least 1"),
         ({"horizon": 2.5}, "horizon=2.5 must be an integer"),
+        ({"horizon": True}, "horizon=True must be an integer"),
         ({"horizon": 5, "n_steps": 3}, "horizon=5 and n_steps=3 are two Lyapunov candidates"),
         ({"horizon": 5, "replay_buffer_class": NStepReplayBuffer}, "replay_buffer_class=NStepReplayBuffer"),
         ({"replay_buffer_class": HorizonReplayBuffer}, "set for instance horizon=5"),

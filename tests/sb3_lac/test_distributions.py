@@ -37,6 +37,20 @@ def test_actions_are_those_of_sac(parameters, deterministic):
     th.testing.assert_close(*actions)
 
 
+def test_mode_is_that_of_the_last_call(parameters, make_model):
+    ours, theirs = SquashedGaussianDistribution(3), SquashedDiagGaussianDistribution(3)
+    for distribution in (ours, theirs):
+        distribution.actions_from_params(*parameters)
+    assert th.equal(ours.mode(), theirs.mode())
+    assert ours.sample().shape == (50, 3)
+    ours.log_prob_from_params(parameters[0] + 1, parameters[1])
+    assert th.equal(ours.mode(), th.tanh(parameters[0] + 1))
+
+    actor, obs = make_model(n_collect=0).actor, th.ones(4, 2)
+    actor(obs)
+    assert th.equal(actor.action_dist.mode(), actor(obs, deterministic=True))
+
+
 def test_model_uses_it_unless_noise_depends_on_the_state(make_model):
     policy = make_model(n_collect=0).policy
     for actor in (policy.actor, policy.actor_target):

@@ -158,7 +158,10 @@ def test_optimizer_is_chosen_by_the_user(make_model):
     default = make_model(n_collect=0).policy
     assert default.actor.optimizer.defaults["fused"] and default.critic.optimizer.defaults["fused"]
     custom = make_model(n_collect=0, policy_kwargs={"optimizer_kwargs": {"eps": 1e-5}}).policy
-    assert custom.critic.optimizer.defaults["eps"] == 1e-5 and not custom.critic.optimizer.defaults["fused"]
+    assert custom.critic.optimizer.defaults["eps"] == 1e-5 and custom.critic.optimizer.defaults["fused"]
+    for optimizer_kwargs in ({"fused": False}, {"foreach": True}, {"differentiable": True}):
+        other = make_model(n_collect=0, policy_kwargs={"optimizer_kwargs": optimizer_kwargs}).policy
+        assert not other.critic.optimizer.defaults["fused"]
     sgd = make_model(n_collect=0, policy_kwargs={"optimizer_class": th.optim.SGD}).policy
     assert isinstance(sgd.actor.optimizer, th.optim.SGD)
 
@@ -193,3 +196,47 @@ def test_frozen_layers_stay_as_they_are(make_model, train_metrics):
     train_metrics(model, gradient_steps=2)
     unchanged = [th.equal(weight, layer.weight) for weight, layer in zip(before, frozen + free, strict=True)]
     assert unchanged == [True, True, False, False]
+
+
+class Einsum(BaseFeaturesExtractor):
+    """A layer whose gradient has the layout of the transposed weight, and a parameter that nothing depends on."""
+
+    def __init__(self, observation_space):
+        super().__init__(observation_space, features_dim=8)
+        self.weight = nn.Parameter(th.randn(8, 48, generator=th.Generator().manual_seed(0)))
+        self.unused = nn.Parameter(th.ones(3))
+
+    def forward(self, observations):
+        return th.einsum("bi,oi->bo", observations, self.weight)
+
+
+class TransposedWeight(Einsum):
+    def forward(self, observations):
+        return observations @ self.weight.T.contiguous()
+
+
+class ChannelsLast(BaseFeaturesExtractor):
+    """A convolution of images whose last dimension is the colour."""
+
+    def __init__(self, observation_space):
+        super().__init__(observation_space, features_dim=16)
+        self.convolution = nn.Conv2d(3, 4, 3)
+
+    def forward(self, observations):
+        return self.convolution(observations.reshape(-1, 4, 4, 3).permute(0, 3, 1, 2)).flatten(1)
+
+
+@pytest.mark.parametrize("extractor", [Einsum, TransposedWeight, ChannelsLast])
+def test_fused_optimizer_updates_layers_of_any_memory_layout(make_model, make_env, train_metrics, extractor):
+    policies = []
+    for fused in (True, False):
+        policy_kwargs = {"features_extractor_class": extractor, "optimizer_kwargs": {"fused": fused}}
+        model = make_model(make_env(n_dim=48), policy_kwargs=policy_kwargs, learning_rate=1e-2)
+        train_metrics(model, gradient_steps=2)
+        policies.append(model.policy)
+    for module in ("actor", "critic"):
+        expected = dict(getattr(policies[1], module).named_parameters())
+        for name, parameter in getattr(policies[0], module).named_parameters():
+            th.testing.assert_close(parameter, expected[name], rtol=0, atol=1e-5, msg=f"{module}.{name}")
+            if name.endswith("unused"):
+                assert parameter.grad is None and (parameter == 1).all()

@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 import torch as th
 from gymnasium import spaces
+from gymnasium.wrappers import TimeLimit
 from matplotlib.figure import Figure
 from scipy.stats import spearmanr
 from stable_baselines3 import SAC
@@ -224,7 +225,15 @@ def test_nothing_to_compare_is_explained(make_exact_model):
     model = make_exact_model(gamma=0.9)
     summary = evaluate_lyapunov(model, ContractionEnv(lengths=(10,)), 3).summary()
     assert "It takes 29 steps to forget them, the longest episode has 10 steps" in summary
-    assert "max_episode_steps" in summary and "larger max_tail_weight" in summary
+    assert "larger max_tail_weight" in summary
+    assert "Not available: calibration_slope, calibration_intercept, rank_correlation. L could not be compared" in summary
+    assert "nan" not in summary
+    # What lengthens the episodes depends on who ends them
+    assert "episodes of 58 steps. The environment ends them itself, where max_episode_steps changes nothing" in summary
+    limited = TimeLimit(ContractionEnv(lengths=(100,)), 10)
+    limited.env.spec = gym.envs.registration.EnvSpec("Contraction-v0", max_episode_steps=10)
+    summary = evaluate_lyapunov(model, limited, 3).summary()
+    assert "gym.make(id, max_episode_steps=58)" in summary and "itself" not in summary
     assert evaluate_lyapunov(model, ContractionEnv(lengths=(28,)), 3).n_calibrated == 0
     report = evaluate_lyapunov(model, ContractionEnv(lengths=(29,)), 3)
     assert report.n_calibrated == 3 and "cost-to-go of 3 transitions" in report.summary()
@@ -270,7 +279,8 @@ def test_all_dead(make_exact_model):
     for name in ("decrease", "share_decreasing", "largest_feasible_alpha3", "ultimate_bound"):
         assert np.isnan(report.metrics[name]).all(), name
     assert report.metrics["death_rate"].value == 1 and report.by_cost.empty
-    assert "is undecided" in report.summary()
+    assert "is undecided" in report.summary() and "nan" not in report.summary()
+    assert "Not available: ultimate_bound. Every episode terminated" in report.summary()
     assert len(report.plot().axes) == 4
 
 
@@ -284,6 +294,7 @@ def test_rewards_above_the_bound_cost_nothing(make_model, make_env):
     # Without any cost there is no share of it
     report = evaluate_lyapunov(model, make_env(offset=1000.0), 4)
     assert np.isnan(report.metrics["largest_feasible_alpha3"]).all() and np.isnan(report.metrics["rank_correlation"]).all()
+    assert "Nothing had a cost" in report.summary() and "nan" not in report.summary()
     assert len(report.by_cost) == 1
 
 
@@ -292,7 +303,8 @@ def test_rewards_above_the_bound_cost_nothing(make_model, make_env):
 
 def test_metrics_agree_with_scipy_and_numpy(make_model, make_env):
     model = make_model(gamma=0.8)
-    report = evaluate_lyapunov(model, make_env(), 15, seed=1)
+    # Sampled actions spread more
+    report = evaluate_lyapunov(model, make_env(), 15, deterministic=False, seed=1)
     known = report.transitions.dropna()
     assert 0 < report.n_calibrated == len(known) < len(report.transitions)
     line = np.polyfit(known["lyapunov"], known["cost_to_go"], 1)
@@ -329,7 +341,8 @@ def test_one_episode_has_no_interval(make_exact_model):
     for name, (value, low, high) in report.metrics.items():
         if name != "death_rate":
             assert not np.isnan(value) and np.isnan(low) and np.isnan(high), name
-    assert "is undecided: one episode" in report.summary()
+    assert "is undecided: one episode" in report.summary() and "nan" not in report.summary()
+    assert report.summary().count("not available: it takes two episodes") == 8
 
 
 def test_levels_of_cost():
@@ -450,10 +463,10 @@ def test_dict_observations_and_images(make_model):
 
 
 def test_image_env_is_transposed_as_for_the_training(make_model):
-    env = FakeImageEnv(screen_height=36, screen_width=36, n_channels=1, discrete=False)
+    env, eval_env = (FakeImageEnv(screen_height=36, screen_width=36, n_channels=1, discrete=False) for _ in range(2))
     model = make_model(env, policy="CnnPolicy", n_collect=5, policy_kwargs={"net_arch": [8]}, buffer_size=100)
     assert isinstance(model.get_env(), VecTransposeImage)
-    callback = LyapunovCallback(env, n_eval_episodes=1, eval_freq=4, verbose=0)
+    callback = LyapunovCallback(eval_env, n_eval_episodes=1, eval_freq=4, verbose=0)
     model.learn(5, callback=callback)
     assert callback.last_report is not None and isinstance(callback.eval_env, VecTransposeImage)
 
@@ -466,12 +479,15 @@ def test_same_seed_gives_the_same_report(make_model, make_env):
     reports = []
     for seed in (5, 5, 6):
         th.rand(1)
-        reports.append(evaluate_lyapunov(model, env, 3, seed=seed))
+        reports.append(evaluate_lyapunov(model, env, 3, deterministic=False, seed=seed))
     pd.testing.assert_frame_equal(reports[0].transitions, reports[1].transitions)
     pd.testing.assert_frame_equal(reports[0].to_frame(), reports[1].to_frame())
     assert reports[0].summary() == reports[1].summary() != reports[2].summary()
-    # Actions are sampled: the start is the same, but not the trajectory
-    deterministic = evaluate_lyapunov(model, env, 3, deterministic=True, seed=5)
+    # The mean action is judged unless asked otherwise: the start is the same, but not the trajectory
+    deterministic = evaluate_lyapunov(model, env, 3, seed=5)
+    actions, _ = model.predict(deterministic.observations, deterministic=True)
+    expected = model.policy.predict_lyapunov(deterministic.observations, actions)
+    np.testing.assert_allclose(deterministic.transitions["lyapunov"], expected, rtol=1e-4, atol=1e-6)
     assert (deterministic.observations[0] == reports[0].observations[0]).all()
     assert (deterministic.observations[1] != reports[0].observations[1]).all()
 
@@ -502,6 +518,59 @@ def test_training_with_callback_is_the_same_to_the_bit(make_model, make_env, nor
     assert len(callback.history) == 120 // 14
     for name, tensor in states[0].items():
         assert th.equal(tensor, states[1][name]), name
+
+
+def assert_no_transition_joins_two_episodes(model, step=0.5):
+    """``LinearCostEnv`` moves by half of the action."""
+    buffer = model.replay_buffer
+    size = buffer.size()
+    moved = buffer.next_observations[:size] - buffer.observations[:size]
+    np.testing.assert_allclose(moved, step * buffer.actions[:size], atol=1e-5)
+
+
+@pytest.mark.parametrize("of_the_model", [True, False])
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_training_goes_on_from_a_reset_after_an_evaluation_on_its_env(make_model, make_env, of_the_model, n_envs):
+    envs = [make_env() for _ in range(n_envs)]
+    model = make_model(DummyVecEnv([lambda env=env: env for env in envs]), n_collect=0, learning_starts=1000)
+    # In the middle of an episode of 20 steps
+    model.learn(30 * n_envs)
+    # As one or by itself
+    evaluate_lyapunov(model, model.get_env() if of_the_model else envs[-1], 1)
+    model.learn(30 * n_envs, reset_num_timesteps=False)
+    assert model.replay_buffer.pos == 60
+    assert_no_transition_joins_two_episodes(model)
+    assert model.replay_buffer.dones[:60, 0].nonzero()[0].tolist() == [19, 29, 49]
+    # Its end is a time limit, whose next state has a value
+    assert model.replay_buffer.timeouts[29].all()
+
+
+def test_finished_episode_stays_a_termination_after_an_evaluation_on_its_env(make_model, make_env):
+    model = make_model(make_env(terminate=True), n_collect=40)
+    evaluate_lyapunov(model, model.get_env(), 1)
+    assert model.replay_buffer.dones[39, 0] == 1 and model.replay_buffer.timeouts[39, 0] == 0
+    # Also before any training
+    model = make_model(n_collect=0)
+    evaluate_lyapunov(model, model.get_env(), 1)
+
+
+def test_returns_of_n_steps_do_not_run_across_an_evaluation(make_model, make_env):
+    model = make_model(make_env(), n_collect=0, n_steps=3, gamma=0.5, learning_starts=1000)
+    model.learn(30)
+    evaluate_lyapunov(model, model.get_env(), 1)
+    model.learn(30, reset_num_timesteps=False)
+    buffer = model.replay_buffer
+    sample = buffer._get_samples(np.full(50, 29))
+    assert sample.rewards.unique().item() == buffer.rewards[29, 0] and sample.discounts.unique().item() == 0.5
+
+
+@pytest.mark.parametrize("of_the_model", [True, False])
+def test_callback_refuses_the_training_env(make_model, make_env, of_the_model):
+    env = make_env()
+    model = make_model(env, n_collect=0)
+    with pytest.raises(ValueError, match="is the training environment"):
+        model.learn(10, callback=LyapunovCallback(model.get_env() if of_the_model else env))
+    assert model.num_timesteps == 0
 
 
 # Mistakes

@@ -261,6 +261,13 @@ def test_update_reads_no_value_back_from_the_device(make_model, monkeypatch):
     assert reads == ["tolist"]
 
 
+def test_no_gradient_step_changes_nothing(make_model, train_metrics):
+    model = make_model()
+    before = {name: tensor.clone() for name, tensor in model.policy.state_dict().items()}
+    assert train_metrics(model, gradient_steps=0)["n_updates"] == 0
+    assert all(th.equal(before[name], tensor) for name, tensor in model.policy.state_dict().items())
+
+
 def test_same_seed_same_result(make_model):
     first, second = (make_model(n_collect=0, seed=3).learn(80) for _ in range(2))
     assert first._n_updates == 40

@@ -1,0 +1,236 @@
+"""Positive rewards: what a termination costs, and the offset that carries the bound of the rewards."""
+
+import math
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from sb3_lac import LAC, evaluate_lyapunov, lac
+
+
+class BalanceEnv(gym.Env):
+    """An unstable state that ends the episode beyond 1. Each step pays a random reward, from 0.2 to 1 whatever the state."""
+
+    def __init__(self):
+        self.observation_space = spaces.Box(-2, 2, (1,), np.float32)
+        self.action_space = spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, seed=None, options=None):
+        super().reset(seed=seed)
+        self.n_steps, self.state = 0, self.np_random.uniform(-0.5, 0.5)
+        return np.array([self.state], np.float32), {}
+
+    def step(self, action):
+        self.n_steps += 1
+        self.state = 1.1 * self.state + 0.3 * float(action[0])
+        reward = self.np_random.uniform(0.2, 1.0)
+        return np.array([self.state], np.float32), reward, abs(self.state) > 1, self.n_steps >= 100, {}
+
+
+def predictions(model):
+    """L of all stored transitions."""
+    buffer = model.replay_buffer
+    return model.policy.predict_lyapunov(buffer.observations[: buffer.pos, 0], buffer.actions[: buffer.pos, 0])
+
+
+@pytest.fixture
+def gradients_of(monkeypatch, train_metrics):
+    """The targets of an update without a step, with the gradients of actor and critic."""
+
+    def _gradients_of(model):
+        targets = []
+        loss = lac.lyapunov_critic_loss
+        with monkeypatch.context() as patch:
+            patch.setattr(
+                lac, "lyapunov_critic_loss", lambda values, y: targets.append(y + model.critic.offset) or loss(values, y)
+            )
+            patch.setattr(model, "lr_schedule", lambda _: 0.0)
+            patch.setattr(model, "tau", 0.0)
+            train_metrics(model)
+        gradients = [
+            {name: parameter.grad.clone() for name, parameter in module.named_parameters()}
+            for module in (model.actor, model.critic)
+        ]
+        return targets[0], *gradients
+
+    return _gradients_of
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "sum_of_discounts"),
+    [
+        ({"gamma": 0.75}, 4.0),
+        ({"gamma": 0.75, "policy_kwargs": {"n_critics": 2}}, 4.0),
+        ({"gamma": 0.5, "n_steps": 3}, 2.0),
+        ({"gamma": 1.0, "horizon": 3}, 3.0),
+        ({"gamma": 0.5, "horizon": 3}, 1.75),
+    ],
+)
+def test_rise_of_the_bound_shifts_all_values_and_no_gradient(
+    make_model, make_env, gradients_of, train_metrics, kwargs, sum_of_discounts
+):
+    # Also with terminations
+    model = make_model(make_env(episode_length=7, terminate=True), **kwargs)
+    train_metrics(model, gradient_steps=20)
+    # From no bound at all, and once more after learning below the first bound
+    for rise in (2.0, 1.0):
+        before, (targets, actor, critic) = predictions(model), gradients_of(model)
+        model.reward_bound += rise
+        new_targets, new_actor, new_critic = gradients_of(model)
+        np.testing.assert_allclose(predictions(model) - before, rise * sum_of_discounts, atol=1e-4)
+        th.testing.assert_close(new_targets - targets, th.full_like(targets, rise * sum_of_discounts), atol=1e-4, rtol=0)
+        assert actor.keys() == new_actor.keys() and all(th.equal(actor[name], new_actor[name]) for name in actor)
+        for name, gradient in critic.items():
+            # With the first bound the linear term starts to learn
+            if rise == 1.0 or "linear_term" not in name:
+                assert th.equal(gradient, new_critic[name]), name
+        train_metrics(model, gradient_steps=20)
+
+
+@pytest.mark.parametrize(
+    ("terminate", "reward", "expected"),
+    [
+        # 2 in each step for ever costs nothing
+        (False, 2.0, 0.0),
+        # 1 below the bound, and then 2 below it for ever: 1 + 2 / 2 + 2 / 4 + ...
+        (True, 1.0, 3.0),
+        (True, 2.0, 2.0),
+        (False, 1.0, 2.0),
+    ],
+)
+def test_value_counts_the_bound_after_a_termination(make_model, make_env, train_metrics, terminate, reward, expected):
+    env = make_env(episode_length=1, terminate=terminate)
+    model = make_model(env, gamma=0.5, tau=0.1, learning_rate=3e-3, reward_bound=2.0)
+    model.replay_buffer.rewards[:] = reward
+    train_metrics(model, gradient_steps=600)
+    assert train_metrics(model, seed=1)["lyapunov_mean"] == pytest.approx(expected, abs=0.2)
+
+
+def test_values_are_never_negative(make_model, make_env, train_metrics):
+    model = make_model(make_env(offset=3.0), learning_rate=3e-2)
+    train_metrics(model, gradient_steps=50)
+    th.nn.init.constant_(model.critic.linear_terms[0].bias, -1e4)
+    assert (predictions(model) == 0).all()
+
+
+def test_lac_learns_to_live():
+    # If the cost of each step ended with the episode, LAC would learn to die within 10 steps
+    model = LAC(
+        "MlpPolicy",
+        BalanceEnv(),
+        learning_rate=3e-3,
+        batch_size=64,
+        gamma=0.9,
+        policy_kwargs={"net_arch": [16, 16]},
+        buffer_size=5000,
+        seed=0,
+        device="cpu",
+    )
+    model.learn(600)
+    report = evaluate_lyapunov(model, BalanceEnv(), 10, deterministic=True, seed=0)
+    assert report.episodes["length"].mean() > 60
+
+
+def test_report_counts_the_bound_after_a_termination(make_model, make_env):
+    model = make_model(make_env(), n_collect=0, gamma=0.5, reward_bound=2.0)
+    report = evaluate_lyapunov(model, make_env(episode_length=3, terminate=True, offset=1.0), 2, seed=0)
+    costs = report.transitions["cost"].to_numpy().reshape(2, 3)
+    np.testing.assert_allclose(costs, 2.0 - report.transitions["reward"].to_numpy().reshape(2, 3))
+    last = costs[:, 2] + 0.5 * 4.0
+    expected = np.stack([costs[:, 0] + 0.5 * (costs[:, 1] + 0.5 * last), costs[:, 1] + 0.5 * last, last], axis=1)
+    np.testing.assert_allclose(report.transitions["cost_to_go"].to_numpy().reshape(2, 3), expected)
+    # Of four steps, those after the termination cost 2 each
+    model = make_model(make_env(), n_collect=0, gamma=0.5, horizon=4, reward_bound=2.0)
+    report = evaluate_lyapunov(model, make_env(episode_length=3, terminate=True, offset=1.0), 2, seed=0)
+    np.testing.assert_allclose(report.transitions["cost_to_go"].iloc[2::3], report.transitions["cost"].iloc[2::3] + 1.75)
+
+
+def test_offset_has_the_units_of_normalized_rewards(make_model, make_env, train_metrics):
+    env = VecNormalize(DummyVecEnv([lambda: make_env(offset=3.0)]), gamma=0.75)
+    model = make_model(env, gamma=0.75, reward_bound=3.0)
+    for scale in (2.0, 5.0):
+        env.ret_rms.var = scale**2 - env.epsilon
+        train_metrics(model)
+        assert model.policy.critic.offset.item() == pytest.approx(4 * 3.0 / scale)
+        assert model.policy.critic_target.offset.item() == pytest.approx(4 * 3.0 / scale)
+    # Rewards are clipped, and so is the bound
+    env.ret_rms.var, env.epsilon = 1e-4, 0.0
+    train_metrics(model)
+    assert model.policy.critic.offset.item() == pytest.approx(4 * env.clip_reward)
+
+
+def test_bound_of_n_step_returns_is_the_largest_reward_of_one_step(make_model, make_env):
+    model = make_model(make_env(offset=4.0), n_steps=3)
+    assert model.reward_bound.item() == model.replay_buffer.rewards.max()
+    # Seen before the first update, and in L
+    assert model.critic.offset.item() == pytest.approx(100 * model.replay_buffer.rewards.max(), rel=1e-4)
+
+
+def test_bound_of_normalized_rewards_is_that_of_the_environment(make_model, make_env):
+    model = make_model(VecNormalize(DummyVecEnv([lambda: make_env(offset=4.0)])))
+    assert model.reward_bound.item() == model.replay_buffer.rewards.max() > 1
+
+
+# reward_bound
+
+
+def test_stated_bound_holds_from_the_start(make_model, make_env, train_metrics):
+    model = make_model(make_env(offset=4.0), gamma=0.75, reward_bound=5.0)
+    assert model.cost_bound().item() == 5.0 and model.critic.offset.item() == 20.0
+    metrics = train_metrics(model, gradient_steps=10)
+    assert model.cost_bound().item() == 5.0 and model.critic.offset.item() == 20.0
+    assert metrics["cost"] >= 1.0
+
+
+def test_larger_reward_raises_a_stated_bound_with_one_warning(make_model, make_env):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        model = make_model(make_env(offset=4.0), gamma=0.75, reward_bound=0.5)
+    messages = [str(warning.message) for warning in caught if "larger than reward_bound=0.5" in str(warning.message)]
+    assert len(messages) == 1
+    assert model.cost_bound().item() == model.replay_buffer.rewards.max() > 0.5
+
+
+def test_bound_and_offset_are_saved_and_a_bound_can_be_stated_on_loading(make_model, make_env, train_metrics, tmp_path):
+    model = make_model(make_env(offset=4.0), gamma=0.75, reward_bound=5.0)
+    train_metrics(model, gradient_steps=5)
+    model.save(tmp_path / "model")
+    loaded = LAC.load(tmp_path / "model", device="cpu")
+    assert loaded.cost_bound().item() == 5.0
+    observations, actions = np.ones((3, 2), np.float32), np.zeros((3, 2), np.float32)
+    values = model.policy.predict_lyapunov(observations, actions)
+    np.testing.assert_array_equal(loaded.policy.predict_lyapunov(observations, actions), values)
+    changed = LAC.load(tmp_path / "model", reward_bound=7.0, device="cpu")
+    assert changed.cost_bound().item() == 7.0
+    # The certificate is that of the new bound
+    evaluate_lyapunov(changed, make_env(), 1)
+    np.testing.assert_allclose(changed.policy.predict_lyapunov(observations, actions), values + 8.0, rtol=1e-5)
+    # Without an argument, the bound that was stated first is kept
+    changed.save(tmp_path / "changed")
+    assert LAC.load(tmp_path / "changed", device="cpu").cost_bound().item() == 7.0
+
+
+@pytest.mark.parametrize("bound", [-1.0, math.inf, math.nan])
+def test_bad_bounds_are_named(make_model, bound):
+    with pytest.raises(ValueError, match=f"reward_bound={bound} must be finite and at least 0"):
+        make_model(n_collect=0, reward_bound=bound)
+
+
+def test_positive_rewards_need_a_discount_or_a_horizon(make_model, make_env, train_metrics):
+    message = "gamma=1.0 must be smaller than 1 with rewards up to"
+    with pytest.raises(ValueError, match=message):
+        make_model(n_collect=0, gamma=1.0, reward_bound=0.5)
+    with pytest.raises(ValueError, match=message):
+        make_model(make_env(offset=4.0), gamma=1.0)
+    # Rewards that replay computes, as HER does
+    model = make_model(gamma=1.0)
+    train_metrics(model)
+    model.replay_buffer.rewards[:] = 1.0
+    with pytest.raises(ValueError, match=message):
+        train_metrics(model)
+    assert make_model(make_env(offset=4.0), gamma=1.0, horizon=3).critic.offset.item() > 0
