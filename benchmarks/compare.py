@@ -4,12 +4,16 @@ held-out discharges with each other and with the closed form.
 
 .. code-block:: bash
 
-  python -m benchmarks.compare --algos lac sac td3 --envs BatteryRo-v0 BatteryQmax-v0 --seeds 0 --timesteps 200000
+  python -m benchmarks.compare --envs BatteryQmax-v0 BatteryRo-v0 --seeds 0 1 2
+  python -m benchmarks.compare --defaults --out results/compare_defaults
 
-Hyperparameters are those of ``zoo_configs``. Every run has a folder of its own; a run that is finished is not run again, and
-an interrupted one goes on from its last checkpoint when the same command is given again. The table and the figures show all
-finished runs in the folder, so that runs can be added. TensorBoard logs lie in
-``<out>/tensorboard/<env>/<ALGO>_seed<k>``, so that the algorithms overlay.
+Hyperparameters and numbers of steps are those of ``zoo_configs``; with ``--defaults``, those of ``ALGO("MlpPolicy", env_id)``.
+
+Every run has a folder of its own, named by its recipe: algorithm, environment, seed, steps, evaluations, hyperparameters and
+version of this project. A run that is finished is not run again; with another recipe it is. An interrupted run goes on from
+its last checkpoint when the same command is given again; it does not equal an uninterrupted one then, and the table says so.
+The table and the figures show all finished runs in the folder, so that runs can be added, and name the recipe of each row;
+``compare.json`` spells the recipes out. TensorBoard logs lie in ``<out>/tensorboard/<env>``, so that the algorithms overlay.
 """
 
 from __future__ import annotations
@@ -22,10 +26,12 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import pandas as pd
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
@@ -40,8 +46,8 @@ from battery_env.estimators.closed_form import ClosedForm
 from battery_env.evaluation import evaluate, summarize
 from battery_env.plotting import plot_learning_curves, plot_true_against_inferred, save_figure
 from battery_env.trajectories import TrajectoryDataset
-from benchmarks.reporting import write_csv, write_text
-from benchmarks.training import run_all, set_up
+from benchmarks.reporting import versions, write_csv, write_text
+from benchmarks.training import DEFAULTS_TIMESTEPS, Recipe, run_all, set_up
 from sb3_lac import CalibrationCallback
 
 _EVALUATION_TRAJECTORIES = 64  # of the test part, evenly spaced, while training; all of them at the end
@@ -51,9 +57,9 @@ _EVALUATION_EPISODES = 20
 class CheckpointCallback(BaseCallback):
     """
     Saves model and replay buffer in one folder that is replaced as a whole, so that a training can be resumed whenever it is
-    interrupted.
+    interrupted; and counts interruptions and time.
 
-    :param folder: the folder
+    :param folder: the folder, of an earlier part of the same training if it exists
     :param save_freq: calls between checkpoints
     """
 
@@ -61,6 +67,20 @@ class CheckpointCallback(BaseCallback):
         super().__init__()
         self.folder = folder
         self.save_freq = save_freq
+        self.recover(folder)
+        #: How often the training was continued from a checkpoint.
+        self.resumed = 0
+        #: Wall time of the training, evaluations included.
+        self.seconds = 0.0
+        if folder.exists():
+            before = json.loads((folder / "progress.json").read_text(encoding="utf-8"))
+            self.resumed, self.seconds = before["resumed"] + 1, before["seconds"]
+
+    def _on_training_start(self) -> None:
+        self._start = time.perf_counter() - self.seconds
+
+    def _on_training_end(self) -> None:
+        self.seconds = time.perf_counter() - self._start
 
     @staticmethod
     def recover(folder: Path) -> None:
@@ -82,6 +102,8 @@ class CheckpointCallback(BaseCallback):
             part.mkdir(parents=True)
             self.model.save(part / "model")
             self.model.save_replay_buffer(part / "replay_buffer.pkl")
+            progress = {"resumed": self.resumed, "seconds": time.perf_counter() - self._start}
+            (part / "progress.json").write_text(json.dumps(progress), encoding="utf-8")
             if self.folder.exists():
                 os.replace(self.folder, old)
             os.replace(part, self.folder)
@@ -122,8 +144,9 @@ def parameters_of(env_id: str) -> tuple[Parameter, ...]:
 
     :param env_id: id of a full-state environment
     :return: one or both of ``"q_mobile"`` and ``"r_o"``
+    :raises ValueError: for another environment
     """
-    return PolicyEstimator.environment(env_id).task.parameters
+    return _environment(env_id).task.parameters
 
 
 def held_out_trajectories(env_id: str) -> TrajectoryDataset:
@@ -134,52 +157,46 @@ def held_out_trajectories(env_id: str) -> TrajectoryDataset:
     :return: the test part of its data set
     :raises ValueError: for another environment
     """
-    env = PolicyEstimator.environment(env_id, split="test")
+    return _environment(env_id, split="test").dataset
+
+
+def _environment(env_id: str, **options: Any) -> FullStateEnv:
+    env = PolicyEstimator.environment(env_id, **options)
     if not isinstance(env, FullStateEnv):
         raise ValueError(f"{env_id} is no full-state environment; voltage-only ones are compared by benchmarks.voltage")
-    return env.dataset
+    return env
 
 
-def run(algo: str, env_id: str, seed: int, timesteps: int, evaluations: int, out: Path, position: int = 0) -> None:
+def run(recipe: Recipe, out: Path, position: int = 0) -> None:
     """
     Train one policy and score it on all test trajectories. Does nothing if that has been done, and goes on from the last
     checkpoint if it was interrupted.
 
-    :param algo: ``lac``, ``sac`` or ``td3``
-    :param env_id: id of the environment
-    :param seed: seed of everything
-    :param timesteps: environment steps
-    :param evaluations: how often to evaluate, and to save a checkpoint, in between
+    :param recipe: of the training, with how often to evaluate, and to save a checkpoint, in between
     :param out: folder of all results
     :param position: line of the terminal for the progress bar
-    :raises ValueError: if the folder of the run holds one with another number of steps
     """
-    folder = out / env_id / f"{algo}_seed{seed}"
-    summary_file, checkpoint = folder / "summary.json", folder / "checkpoint"
-    if summary_file.exists():
-        done = json.loads(summary_file.read_text())
-        if done["timesteps"] != timesteps:
-            raise ValueError(f"{folder} holds a run of {done['timesteps']} steps, not {timesteps}; choose another --out")
+    assert recipe.evaluations is not None
+    env_id, timesteps = recipe.env_id, recipe.timesteps
+    folder = out / env_id / recipe.name
+    if (folder / "summary.json").exists():
         return
     parameters, test = parameters_of(env_id), held_out_trajectories(env_id)
-    CheckpointCallback.recover(checkpoint)
-    resumed = (checkpoint / "model.zip").exists()
-    clock = _Clock(folder / "training_seconds.json")
+    n_envs = recipe.hyperparameters.get("n_envs", 1)
+    every = max(timesteps // (recipe.evaluations * n_envs), 1)
+    checkpoint = CheckpointCallback(folder / "checkpoint", every)
 
-    manager, model, hyperparameters = set_up(
-        algo,
-        env_id,
-        seed,
-        timesteps,
+    manager, model = set_up(
+        recipe,
         folder / "zoo",
         eval_env_kwargs={"split": "test"},
-        trained_agent=str(checkpoint / "model.zip") if resumed else "",
+        trained_agent=str(checkpoint.folder / "model.zip") if checkpoint.resumed else "",
     )
     with contextlib.redirect_stdout(io.StringIO()):
         evaluation_env = manager.create_envs(n_envs=1, eval_env=True, no_log=True)
-    model.set_logger(configure(str(out / "tensorboard" / env_id / f"{algo.upper()}_seed{seed}"), ["tensorboard"]))
+    log = out / "tensorboard" / env_id / f"{recipe.label.replace(' ', '_')}_seed{recipe.seed}_{recipe.digest}"
+    model.set_logger(configure(str(log), ["tensorboard"]))
 
-    every = max(timesteps // (evaluations * manager.n_envs), 1)
     subset = test.subset(range(0, len(test), max(len(test) // _EVALUATION_TRAJECTORIES, 1)))
 
     def scores_on_subset(candidate: BaseAlgorithm) -> pd.DataFrame:
@@ -195,23 +212,25 @@ def run(algo: str, env_id: str, seed: int, timesteps: int, evaluations: int, out
     callbacks: list[BaseCallback] = [
         calibration,
         EvalCallback(evaluation_env, n_eval_episodes=_EVALUATION_EPISODES, eval_freq=every, verbose=0),
-        clock,
-        CheckpointCallback(checkpoint, every),
-        ProgressCallback(f"{env_id} {algo} seed {seed}", timesteps, calibration, position),
+        checkpoint,
+        ProgressCallback(f"{env_id} {recipe.label} seed {recipe.seed}", timesteps, calibration, position),
     ]
     model.learn(timesteps - model.num_timesteps, callback=callbacks, reset_num_timesteps=False)
     model.save(folder / "model")
 
     scores = evaluate(PolicyEstimator(model, env_id), test)
-    configuration = {"algo": algo, "env": env_id, "seed": seed, "timesteps": timesteps}
-    configuration["hyperparameters"] = dict(hyperparameters)
-    write_csv(folder / "scores.csv", scores, configuration)
-    result = {"env": env_id, "algo": algo, "seed": seed, "timesteps": timesteps, "updates": model._n_updates}
-    result["training_minutes"] = clock.seconds / 60.0
-    result["time_per_update_us"] = 1e6 * float(scores["time_per_update_s"].iloc[0])
-    result["scores"] = {name: summarize(scores, name) for name in parameters}
-    write_text(summary_file, json.dumps(result, indent=2) + "\n")
-    shutil.rmtree(checkpoint, ignore_errors=True)
+    summary = {
+        "recipe": asdict(recipe),
+        "versions": versions(),
+        "resumed": checkpoint.resumed,
+        "updates": model._n_updates,
+        "training_minutes": checkpoint.seconds / 60.0,
+        "time_per_update_us": 1e6 * float(scores["time_per_update_s"].iloc[0]),
+        "scores": {name: summarize(scores, name) for name in parameters},
+    }
+    write_csv(folder / "scores.csv", scores, {"recipe": summary["recipe"], "resumed": summary["resumed"]})
+    write_text(folder / "summary.json", json.dumps(summary, indent=2, default=str) + "\n")
+    shutil.rmtree(checkpoint.folder, ignore_errors=True)
 
 
 def _metric(parameter: str, parameters: Sequence[str]) -> str:
@@ -219,36 +238,53 @@ def _metric(parameter: str, parameters: Sequence[str]) -> str:
     return "mape_percent" if len(parameters) == 1 else f"{parameter}_mape_percent"
 
 
-class _Clock(BaseCallback):
-    # wall time of the training, evaluations included, over interruptions
-    def __init__(self, file: Path) -> None:
-        super().__init__()
-        self.file = file
-        self.seconds = float(json.loads(file.read_text())) if file.exists() else 0.0
+def finished_runs(out: Path) -> pd.DataFrame:
+    """
+    What the finished runs in a folder say, one row per run and parameter.
 
-    def _on_training_start(self) -> None:
-        self.last = time.perf_counter()
+    :param out: folder of all results
+    :return: what was learned and how well, with the ``folder`` of the run, its ``recipe`` and its ``label`` in tables
+    :raises ValueError: if there is one that does not say what made it
+    """
+    rows = []
+    for file in sorted(out.glob("*/*/summary.json")):
+        summary = json.loads(file.read_text(encoding="utf-8"))
+        if set(summary.get("recipe", ())) != {field.name for field in fields(Recipe)}:
+            raise ValueError(f"{file} was written by an earlier version: choose another --out")
+        recipe = Recipe(**summary["recipe"])
+        of_run: dict[str, Any] = {"env": recipe.env_id, "algo": recipe.algo, "hyperparameters": recipe.source, "recipe": recipe.digest}
+        of_run |= {"seed": recipe.seed, "timesteps": recipe.timesteps, "label": recipe.label, "folder": file.parent}
+        of_run |= {name: summary[name] for name in ("updates", "resumed", "training_minutes", "time_per_update_us")}
+        rows += [{**of_run, "parameter": name, **scores} for name, scores in summary["scores"].items()]
+    if not rows:
+        return pd.DataFrame()
+    runs = pd.DataFrame(rows)
+    recipes = runs.groupby(["env", "label"])["recipe"].transform("nunique")
+    runs["label"] = runs["label"].where(recipes == 1, runs["label"] + " " + runs["recipe"])
+    order = ["env", "parameter", "algo", "hyperparameters", "recipe", "seed"]
+    return runs.sort_values(order, ascending=[name != "hyperparameters" for name in order], ignore_index=True)
 
-    def _on_step(self) -> bool:
-        return True
 
-    def _on_rollout_start(self) -> None:
-        now = time.perf_counter()
-        self.seconds, self.last = self.seconds + now - self.last, now
-        if self.n_calls % 500 == 0:
-            write_text(self.file, json.dumps(self.seconds))
+def _made_by(runs: pd.DataFrame) -> dict[str, Any]:
+    # each recipe once, with the seeds that were run
+    recipes: dict[str, Any] = {}
+    for _, of_run in runs.drop_duplicates("folder").iterrows():
+        summary = json.loads((of_run["folder"] / "summary.json").read_text(encoding="utf-8"))
+        recipe = summary["recipe"]
+        seed = {"seed": recipe.pop("seed"), "resumed": summary["resumed"], "versions": summary["versions"]}
+        recipes.setdefault(of_run["recipe"], {**recipe, "runs": []})["runs"].append(seed)
+    return {"recipes": recipes}
 
 
-def report(out: Path, configuration: dict[str, Any]) -> str:
+def report(out: Path) -> str:
     """
     Write the table of all finished runs in a folder (CSV, markdown) and, for each environment, figures with their data. Where
     an algorithm has several seeds the first one is drawn as the paper's figure.
 
     :param out: folder of all results
-    :param configuration: what was chosen on the command line
     :return: the table in markdown
     """
-    runs = _rows(sorted(out.glob("*/*/summary.json")))
+    runs = finished_runs(out)
     tables = []
     for (env_id, name_of_parameter), of_env in runs.groupby(["env", "parameter"]):
         parameters, parameter = parameters_of(str(env_id)), str(name_of_parameter)
@@ -256,46 +292,34 @@ def report(out: Path, configuration: dict[str, Any]) -> str:
         inferred: dict[str, pd.DataFrame] = {}
         curves: dict[str, list[pd.DataFrame]] = {}
         histories: dict[tuple[str, int], pd.DataFrame] = {}
-        for algo, of_algo in of_env.groupby("algo"):
-            name = str(algo).upper()
-            folders = [out / str(env_id) / f"{algo}_seed{seed}" for seed in of_algo["seed"]]
-            inferred[name] = pd.read_csv(folders[0] / "scores.csv")
-            histories_of_algo = [pd.read_csv(folder / "calibration.csv") for folder in folders]
+        for label, of_label in of_env.groupby("label", sort=False):
+            name = str(label)
+            inferred[name] = pd.read_csv(of_label["folder"].iloc[0] / "scores.csv")
+            histories_of_label = [pd.read_csv(folder / "calibration.csv") for folder in of_label["folder"]]
             curves[name] = [
                 table.rename(columns={metric: "mape_percent", f"{metric}_worst": "mape_percent_worst"})
-                for table in histories_of_algo
+                for table in histories_of_label
             ]
-            histories |= {(name, seed): line for seed, line in zip(of_algo["seed"], curves[name], strict=True)}
+            histories |= {(name, seed): line for seed, line in zip(of_label["seed"], curves[name], strict=True)}
         exact = evaluate(ClosedForm(), held_out_trajectories(str(env_id)))
-        row = {"env": env_id, "parameter": parameter, "algo": "closed form", **summarize(exact, parameter)}
+        row = {"env": env_id, "parameter": parameter, "algo": "closed form", "label": "closed form"}
+        row |= summarize(exact, parameter)
         row["time_per_update_us"] = 1e6 * float(exact["time_per_update_s"].iloc[0])
         tables += [of_env, pd.DataFrame([row])]
 
-        stem = str(env_id) if len(parameters) == 1 else f"{env_id}_{parameter}"
+        stem, made_by = str(env_id) if len(parameters) == 1 else f"{env_id}_{parameter}", _made_by(of_env)
         save_figure(plot_true_against_inferred(inferred, parameter), out / f"{stem}_inferred.png")
         columns = ["load", parameter, f"{parameter}_hat", f"{parameter}_spread", f"{parameter}_mape_percent"]
-        points = pd.concat({algo: scores[columns] for algo, scores in inferred.items()}, names=["algo", "trajectory"])
-        write_csv(out / f"{stem}_inferred.csv", points.reset_index(), configuration)
+        points = pd.concat({name: scores[columns] for name, scores in inferred.items()}, names=["algo", "trajectory"])
+        write_csv(out / f"{stem}_inferred.csv", points.reset_index(), made_by)
         save_figure(plot_learning_curves(curves, stem), out / f"{stem}_learning.png")
         history = pd.concat(histories, names=["algo", "seed"]).droplevel(-1)
-        write_csv(out / f"{stem}_learning.csv", history.reset_index(), configuration)
+        write_csv(out / f"{stem}_learning.csv", history.reset_index(), made_by)
     table = pd.concat(tables, ignore_index=True)
-    write_csv(out / "compare.csv", table, configuration)
+    write_csv(out / "compare.csv", table.drop(columns=["label", "folder"]), _made_by(runs))
     markdown = _markdown(table)
     write_text(out / "compare.md", markdown)
     return markdown
-
-
-def _rows(files: Iterable[Path]) -> pd.DataFrame:
-    # one row per run and parameter
-    rows = []
-    for file in files:
-        run = json.loads(file.read_text(encoding="utf-8"))
-        if "scores" not in run:
-            raise ValueError(f"{file} was written by an earlier version: choose another --out")
-        scores = run.pop("scores")
-        rows += [{**run, "parameter": parameter, **of_parameter} for parameter, of_parameter in scores.items()]
-    return pd.DataFrame(rows)
 
 
 def _markdown(table: pd.DataFrame) -> str:
@@ -308,13 +332,14 @@ def _markdown(table: pd.DataFrame) -> str:
         return f"{value:.2g}" if abs(value) < 99.5 else f"{value:.0f}"
 
     lines = []
-    for (env_id, parameter, algo), group in table.groupby(["env", "parameter", "algo"], sort=False):
-        learned = algo != "closed form"
+    for (env_id, parameter, label), group in table.groupby(["env", "parameter", "label"], sort=False):
+        learned = label != "closed form"
         lines.append(
             {
                 "environment": env_id,
                 "parameter": parameter,
-                "calibrator": str(algo).upper() if learned else algo,
+                "calibrator": label,
+                "recipe": group["recipe"].iloc[0] if learned else "",
                 "steps": f"{group['timesteps'].iloc[0]:.0f}" if learned else "",
                 "seeds": str(len(group)) if learned else "",
                 "MAPE (%)": over_seeds(group["mape_percent"]),
@@ -326,7 +351,14 @@ def _markdown(table: pd.DataFrame) -> str:
                 "training (min)": f"{group['training_minutes'].mean():.1f}" if learned else "",
             }
         )
-    return pd.DataFrame(lines).to_markdown(index=False, disable_numparse=True) + "\n"
+    text = pd.DataFrame(lines).to_markdown(index=False, disable_numparse=True) + "\n"
+    resumed = table[table["resumed"] > 0].drop_duplicates("folder")
+    if len(resumed) > 0:
+        text += "\nInterrupted and continued from a checkpoint, with other random numbers than an uninterrupted run has:\n\n"
+    for _, of_run in resumed.iterrows():
+        times = "once" if of_run["resumed"] == 1 else f"{of_run['resumed']:.0f} times"
+        text += f"- {of_run['label']} on {of_run['env']}, seed {of_run['seed']:.0f}: {times}\n"
+    return text
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -335,29 +367,53 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     :param arguments: of the command line by default
     """
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.compare", description=__doc__.splitlines()[1])
-    parser.add_argument("--algos", nargs="+", default=["lac", "sac", "td3"], choices=["lac", "sac", "td3"])
-    parser.add_argument("--envs", nargs="+", default=["BatteryRo-v0", "BatteryQmax-v0"])
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.compare", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--algos", nargs="+", default=["lac", "sac", "td3"], help="off-policy algorithms of the RL Zoo, or lac"
+    )
+    parser.add_argument("--envs", nargs="+", default=["BatteryRo-v0", "BatteryQmax-v0"], help="full-state environments")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
-    parser.add_argument("--timesteps", type=float, default=2e5, help="environment steps of each run")
+    parser.add_argument(
+        "--timesteps",
+        type=float,
+        help=f"environment steps of each run; those of zoo_configs by default, {DEFAULTS_TIMESTEPS} with --defaults",
+    )
+    parser.add_argument(
+        "--defaults", action="store_true", help="the algorithms' own hyperparameters and one environment, not zoo_configs"
+    )
     parser.add_argument("--evaluations", type=int, default=10, help="evaluations and checkpoints during each run")
     parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1), help="runs at the same time, one core each")
     parser.add_argument("--out", type=Path, default=Path("results/compare"))
     chosen = parser.parse_args(arguments)
-    if chosen.timesteps < 1 or chosen.evaluations < 1 or chosen.jobs < 1:
+    if not (chosen.timesteps is None or chosen.timesteps >= 1) or chosen.evaluations < 1 or chosen.jobs < 1:
         parser.error("--timesteps, --evaluations and --jobs must be at least 1")
-    runs = [
-        (algo, env_id, seed, int(chosen.timesteps), chosen.evaluations, chosen.out)
-        for env_id in chosen.envs
-        for seed in chosen.seeds
-        for algo in chosen.algos
-    ]
     try:
-        run_all(run, [(*job, 1 + k % chosen.jobs) for k, job in enumerate(runs)], chosen.jobs)
+        finished_runs(chosen.out)
+        for env_id in chosen.envs:
+            parameters_of(env_id)
+        recipes = [
+            Recipe.of(
+                algo,
+                env_id,
+                seed,
+                None if chosen.timesteps is None else int(chosen.timesteps),
+                defaults=chosen.defaults,
+                evaluations=chosen.evaluations,
+            )
+            for env_id in dict.fromkeys(chosen.envs)
+            for seed in dict.fromkeys(chosen.seeds)
+            for algo in dict.fromkeys(chosen.algos)
+        ]
+    except (ValueError, FileNotFoundError, gym.error.Error) as error:
+        parser.error(str(error))
+    jobs = [(recipe, chosen.out, 1 + k % chosen.jobs) for k, recipe in enumerate(recipes)]
+    try:
+        run_all(run, jobs, chosen.jobs)
     except KeyboardInterrupt:
         sys.exit(f"\nInterrupted; what is done lies in {chosen.out}, and the same command goes on from there.")
-    configuration = {name: value for name, value in vars(chosen).items() if name not in ("jobs", "out")}
-    sys.stdout.write("\n" + report(chosen.out, configuration))
+    sys.stdout.write("\n" + report(chosen.out))
 
 
 if __name__ == "__main__":

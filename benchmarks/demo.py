@@ -10,6 +10,8 @@ Figures and tables go to ``results/``. Interrupted, it goes on where it was.
 
 from __future__ import annotations
 
+import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks import compare, real_cells
@@ -18,8 +20,15 @@ RESULTS = Path("results")
 TIMESTEPS = 48_000
 
 
-def main() -> None:
-    """Run both parts."""
+def main(arguments: Sequence[str] | None = None) -> None:
+    """
+    Run both parts.
+
+    :param arguments: of the command line by default; there are none but ``--help``
+    """
+    argparse.ArgumentParser(
+        prog="python -m benchmarks.demo", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    ).parse_args(arguments)
     print(f"1/2  LAC, SAC and TD3 calibrate simulated cells ({TIMESTEPS} steps each; the full runs take 200000)\n", flush=True)
     envs = ["--envs", "BatteryRo-v0", "BatteryQmax-v0"]
     compare.main([*envs, "--timesteps", str(TIMESTEPS), "--evaluations", "6", "--out", str(RESULTS / "demo_compare")])

@@ -271,7 +271,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     :param arguments: of the command line by default
     """
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.real_cells", description=__doc__.splitlines()[1])
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.real_cells", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--cells", nargs="+", default=list(BUNDLED_CELLS), choices=BUNDLED_CELLS)
     parser.add_argument("--out", type=Path, default=Path("results/real_cells"))
     chosen = parser.parse_args(arguments)

@@ -11,6 +11,8 @@ from typing import Any
 
 import pandas as pd
 
+import battery_env
+import sb3_lac
 from battery_env.files import replacing
 
 _PACKAGES = ("torch", "stable_baselines3", "gymnasium", "numpy", "numba", "scipy", "pandas", "rl_zoo3", "progpy")
@@ -22,7 +24,8 @@ def versions() -> dict[str, str]:
 
     :return: by package, with Python and the processor
     """
-    found = {"python": platform.python_version(), "processor": platform.machine()}
+    found = {"sb3_lac": sb3_lac.__version__, "battery_env": battery_env.__version__}
+    found |= {"python": platform.python_version(), "processor": platform.machine()}
     for package in _PACKAGES:
         try:
             found[package] = version(package)

@@ -14,16 +14,15 @@ again, so that an interrupted command goes on where it was when it is given agai
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import sys
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-import yaml
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
@@ -36,8 +35,7 @@ from battery_env.plotting import COLOURS, LABELS, new_figure, save_figure
 from battery_env.sensors import RandomSensorErrors, SensorErrors
 from battery_env.trajectories import TrajectoryDataset
 from benchmarks.reporting import write_csv, write_text
-from benchmarks.training import run_all, train_or_load
-from sb3_lac.zoo import find_config
+from benchmarks.training import Recipe, record_file, run_all, train_or_load
 
 #: What the voltmeter does to the test discharges.
 SENSORS: dict[str, SensorErrors | RandomSensorErrors] = {
@@ -91,15 +89,10 @@ def train_and_score(algo: str, env_id: str, seed: int, timesteps: int, discharge
     :return: what :func:`score` returns, with ``calibrator``, ``seed`` and ``training_minutes``
     """
     folder = out / env_id / f"{algo}_seed{seed}_{timesteps}"
-    clock = folder / "training_minutes.txt"
-    start = time.perf_counter()
-    trained = clock.exists()
     model = train_or_load(algo, env_id, seed, timesteps, folder)
-    if not trained:
-        write_text(clock, f"{(time.perf_counter() - start) / 60.0:.3f}\n")
+    record = json.loads(record_file(Recipe.of(algo, env_id, seed, timesteps), folder).read_text(encoding="utf-8"))
     scores = score(PolicyEstimator(model, env_id, decision_s=DECISION_S), test_discharges(env_id, discharges))
-    minutes = float(clock.read_text(encoding="utf-8"))
-    return scores.assign(calibrator=algo.upper(), seed=seed, training_minutes=minutes)
+    return scores.assign(calibrator=algo.upper(), seed=seed, training_minutes=record["training_minutes"])
 
 
 def peers(env_id: str) -> dict[str, Estimator]:
@@ -234,8 +227,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     :param arguments: of the command line by default
     """
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.voltage", description=__doc__.splitlines()[1])
-    parser.add_argument("--algos", nargs="+", default=["lac", "sac", "td3"], choices=["lac", "sac", "td3"])
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.voltage", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--algos", nargs="+", default=["lac", "sac", "td3"], help="off-policy algorithms of the RL Zoo, or lac"
+    )
     parser.add_argument("--env", default="BatteryVoltageJoint-v0", choices=list(_ENVIRONMENTS))
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1])
     parser.add_argument("--timesteps", type=float, help="environment steps of each run; those of zoo_configs by default")
@@ -245,12 +242,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     chosen = parser.parse_args(arguments)
     if not (chosen.timesteps is None or chosen.timesteps >= 1) or chosen.jobs < 1 or not 1 <= chosen.discharges <= 300:
         parser.error("--timesteps and --jobs must be at least 1, --discharges within 1 .. 300")
-    runs = []
-    for seed in chosen.seeds:
-        for algo in chosen.algos:
-            recipe = yaml.safe_load(find_config(algo).read_text(encoding="utf-8"))[chosen.env]
-            timesteps = int(chosen.timesteps or float(recipe["n_timesteps"]))
-            runs.append((algo, chosen.env, seed, timesteps, chosen.discharges, chosen.out))
+    timesteps = None if chosen.timesteps is None else int(chosen.timesteps)
+    try:
+        recipes = [
+            Recipe.of(algo, chosen.env, seed, timesteps)
+            for seed in dict.fromkeys(chosen.seeds)
+            for algo in dict.fromkeys(chosen.algos)
+        ]
+    except (ValueError, FileNotFoundError) as error:
+        parser.error(str(error))
+    runs = [(recipe.algo, chosen.env, recipe.seed, recipe.timesteps, chosen.discharges, chosen.out) for recipe in recipes]
     try:
         tables = run_all(train_and_score, runs, chosen.jobs)
     except KeyboardInterrupt:

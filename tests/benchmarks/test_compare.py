@@ -1,15 +1,20 @@
-"""The comparison runs end to end, and an interrupted run goes on where it was."""
+"""The comparison runs end to end, an interrupted run goes on where it was, and each result is named by what made it."""
 
 import json
+import re
+from dataclasses import asdict
 
 import numpy as np
 import pandas as pd
 import pytest
+import torch as th
+from rl_zoo3 import ALGOS
 from stable_baselines3.common.callbacks import BaseCallback
 
+from battery_env.estimators.closed_form import ClosedForm
+from battery_env.evaluation import evaluate, summarize
 from benchmarks import compare
-
-pytest.importorskip("rl_zoo3")
+from benchmarks.training import Recipe
 
 ENV_ID = "BatteryRo-v0"
 CONFIG = """
@@ -41,35 +46,125 @@ def small(tmp_path, monkeypatch):
     monkeypatch.setattr(compare, "_EVALUATION_EPISODES", 2)
 
 
+def recipe(algo="lac", timesteps=400, evaluations=2, **others):
+    return Recipe.of(algo, ENV_ID, 0, timesteps, evaluations=evaluations, **others)
+
+
+def command(*others):
+    return ["--envs", ENV_ID, "--evaluations", "2", "--jobs", "1", "--out", "out", *others]
+
+
 def test_a_comparison_writes_table_figures_and_logs(tmp_path, capsys):
-    command = ["--envs", ENV_ID, "--timesteps", "400", "--evaluations", "2", "--jobs", "1", "--out", "out"]
-    compare.main(command)
+    compare.main(command())
     out = tmp_path / "out"
     table = pd.read_csv(out / "compare.csv")
     assert list(table["algo"]) == ["lac", "sac", "td3", "closed form"]
     assert set(table["parameter"]) == {"r_o"}
+    # as many steps as zoo_configs says
     assert (table["timesteps"][:3] == 400).all() and table["mape_percent"].iloc[3] < 1e-9
-    assert "| BatteryRo-v0  | r_o         | LAC " in capsys.readouterr().out
+    assert (table["resumed"][:3] == 0).all()
+    shown = capsys.readouterr().out
+    assert f"| BatteryRo-v0  | r_o         | LAC          | {recipe().digest} " in shown
+    assert "Interrupted" not in shown
     for name in ("inferred.png", "inferred.csv", "learning.png", "learning.csv", "learning.json"):
         assert (out / f"{ENV_ID}_{name}").stat().st_size > 0
-    record = json.loads((out / "compare.json").read_text())
-    assert record["configuration"]["timesteps"] == 400 and "torch" in record["versions"]
     logs = {path.parent.name for path in (out / "tensorboard" / ENV_ID).rglob("events*")}
-    assert logs == {"LAC_seed0", "SAC_seed0", "TD3_seed0"}
-    assert not (out / ENV_ID / "lac_seed0" / "checkpoint").exists()
+    assert logs == {f"{algo.upper()}_seed0_{recipe(algo).digest}" for algo in ("lac", "sac", "td3")}
+    assert {path.name for path in (out / ENV_ID).iterdir()} == {recipe(algo).name for algo in ("lac", "sac", "td3")}
+    assert not list(out.rglob("checkpoint"))
 
-    # a second time nothing is trained again, and another number of steps is refused
-    before = (out / ENV_ID / "lac_seed0" / "summary.json").stat().st_mtime_ns
-    compare.main(command)
-    assert (out / ENV_ID / "lac_seed0" / "summary.json").stat().st_mtime_ns == before
-    with pytest.raises(ValueError, match="holds a run of 400 steps, not 800"):
-        compare.run("lac", ENV_ID, 0, 800, 2, out)
+    record = json.loads((out / "compare.json").read_text())
+    made_by = record["configuration"]["recipes"][recipe("sac").digest]
+    assert (made_by["algo"], made_by["env_id"], made_by["timesteps"], made_by["evaluations"]) == ("sac", ENV_ID, 400, 2)
+    assert made_by["hyperparameters"]["batch_size"] == 16 and made_by["arguments"]["tau"] == 0.005
+    (run,) = made_by["runs"]
+    assert (run["seed"], run["resumed"]) == (0, 0) and {"torch", "sb3_lac"} <= set(run["versions"])
 
 
-def test_an_interrupted_run_goes_on_from_its_checkpoint(tmp_path, monkeypatch):
+@pytest.fixture
+def finished(monkeypatch):
+    """The recipes of runs that only leave what a training would have left."""
+    trained = []
+
+    def run(recipe, out, position=0):
+        folder = out / recipe.env_id / recipe.name
+        if (folder / "summary.json").exists():
+            return
+        trained.append(recipe)
+        folder.mkdir(parents=True)
+        data = compare.held_out_trajectories(recipe.env_id)
+        evaluate(ClosedForm(), data).to_csv(folder / "scores.csv", index=False)
+        history = {"timesteps": [recipe.timesteps], "mape_percent": [1.0], "mape_percent_worst": [2.0]}
+        pd.DataFrame(history).to_csv(folder / "calibration.csv", index=False)
+        scores = summarize(evaluate(ClosedForm(), data), "r_o")
+        summary = {"recipe": asdict(recipe), "versions": {"torch": "2"}, "resumed": 2 * recipe.seed, "updates": 3}
+        summary |= {"training_minutes": 0.5, "time_per_update_us": 1.0, "scores": {"r_o": scores}}
+        (folder / "summary.json").write_text(json.dumps(summary))
+
+    monkeypatch.setattr(compare, "run", run)
+    # drawn by another test
+    for name in ("plot_true_against_inferred", "plot_learning_curves", "save_figure"):
+        monkeypatch.setattr(compare, name, lambda *args: None)
+    return trained
+
+
+def test_a_finished_run_stands_for_its_own_recipe_only(tmp_path, finished, capsys):
+    compare.main(command("--algos", "lac"))
+    compare.main(command("--algos", "lac"))
+    assert len(finished) == 1
+    before = recipe().digest
+    (tmp_path / "zoo_configs" / "lac.yml").write_text(CONFIG.replace("batch_size: 16", "batch_size: 32"))
+    for changed in ([], ["--timesteps", "500"], ["--defaults", "--timesteps", "300"], ["--evaluations", "1"]):
+        compare.main([*command("--algos", "lac"), *changed])
+    assert len(finished) == 5
+    table = pd.read_csv(tmp_path / "out" / "compare.csv", dtype={"recipe": str})[:-1]
+    assert table["recipe"].is_unique and before in set(table["recipe"])
+    assert sorted(table["timesteps"]) == [300, 400, 400, 400, 500]
+    assert list(table["hyperparameters"]) == ["zoo_configs"] * 4 + ["defaults"]
+    recipes = json.loads((tmp_path / "out" / "compare.json").read_text())["configuration"]["recipes"]
+    assert [recipes[digest]["timesteps"] for digest in table["recipe"]] == list(table["timesteps"])
+    assert recipes[before]["hyperparameters"]["batch_size"] == 16
+    assert recipes[recipe().digest]["hyperparameters"]["batch_size"] == 32
+    # in tables and figures each has a name of its own
+    names = set(pd.read_csv(tmp_path / "out" / f"{ENV_ID}_learning.csv")["algo"])
+    assert names == {"LAC defaults", *(f"LAC {digest}" for digest in table["recipe"][:4])}
+    shown = capsys.readouterr().out
+    assert all(name in shown for name in names)
+
+
+def test_seeds_are_one_row_and_continued_runs_are_named(tmp_path, finished, capsys):
+    compare.main(command("--algos", "lac", "sac", "lac", "--seeds", "0", "1", "1"))
+    assert len(finished) == 4
+    shown = capsys.readouterr().out
+    assert re.search(r"\| LAC +\| \w{8} +\| 400 +\| 2 ", shown)
+    assert "- LAC on BatteryRo-v0, seed 1: 2 times\n- SAC on BatteryRo-v0, seed 1: 2 times\n" in shown
+    assert (tmp_path / "out" / "compare.md").read_text() in shown
+    assert list(pd.read_csv(tmp_path / "out" / "compare.csv")["resumed"][:4]) == [0, 2, 0, 2]
+
+
+@pytest.mark.parametrize("algo", ["lac", "td3"])
+def test_defaults_are_the_line_as_typed(algo, tmp_path, monkeypatch):
+    captured = []
+    monkeypatch.setattr(
+        compare, "evaluate", lambda estimator, data: captured.append(estimator.policy) or evaluate(estimator, data)
+    )
+    chosen = recipe(algo, timesteps=150, evaluations=1, defaults=True)
+    assert chosen.name.startswith(f"{algo}_defaults_seed0_")
+    compare.run(chosen, tmp_path)
+    typed = ALGOS[algo]("MlpPolicy", ENV_ID, seed=0, device="cpu").learn(150)
+    assert typed._n_updates == captured[-1]._n_updates == 50
+    for ours, expected in zip(captured[-1].policy.parameters(), typed.policy.parameters(), strict=True):
+        assert th.equal(ours, expected)
+
+
+def test_an_interrupted_run_goes_on_from_its_checkpoint_and_says_so(tmp_path, monkeypatch):
     class Interrupt(BaseCallback):
+        def __init__(self, at):
+            super().__init__()
+            self.at = at
+
         def _on_step(self):
-            if self.num_timesteps == 240:
+            if self.num_timesteps in self.at:
                 raise KeyboardInterrupt
             return True
 
@@ -80,22 +175,26 @@ def test_an_interrupted_run_goes_on_from_its_checkpoint(tmp_path, monkeypatch):
             started_at.append(self.num_timesteps)
             super()._on_training_start()
 
-    monkeypatch.setattr(compare, "EvalCallback", lambda *args, **kwargs: Interrupt())
     monkeypatch.setattr(compare, "ProgressCallback", Progress)
-    with pytest.raises(KeyboardInterrupt):
-        compare.run("lac", ENV_ID, 0, 400, 4, tmp_path)
-    folder = tmp_path / ENV_ID / "lac_seed0"
+    chosen = recipe(evaluations=4)
+    # the first interruption is before the first checkpoint: what follows is a run from the start
+    for at in (60, 240, 340):
+        with monkeypatch.context() as patch:
+            patch.setattr(compare, "EvalCallback", lambda *args, at=at, **kwargs: Interrupt([at]))
+            with pytest.raises(KeyboardInterrupt):
+                compare.run(chosen, tmp_path)
+    folder = tmp_path / ENV_ID / chosen.name
     assert (folder / "checkpoint" / "model.zip").exists() and not (folder / "summary.json").exists()
-
-    monkeypatch.undo()
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(compare, "ProgressCallback", Progress)
-    patch_held_out_trajectories(monkeypatch)
-    compare.run("lac", ENV_ID, 0, 400, 4, tmp_path)
-    assert started_at == [0, 200]
+    compare.run(chosen, tmp_path)
+    assert started_at == [0, 0, 200, 300]
     assert list(pd.read_csv(folder / "calibration.csv")["timesteps"]) == [100, 200, 300, 400]
     summary = json.loads((folder / "summary.json").read_text())
-    assert summary["timesteps"] == 400 and summary["updates"] > 0
+    assert summary["recipe"]["timesteps"] == 400 and summary["updates"] > 0 and summary["training_minutes"] > 0
+    assert summary["resumed"] == 2
+
+    # an unfinished run of another recipe is another one
+    compare.run(recipe(evaluations=1), tmp_path)
+    assert started_at[-1] == 0
 
 
 def test_a_checkpoint_that_was_set_aside_is_put_back(tmp_path):
@@ -109,8 +208,35 @@ def test_a_checkpoint_that_was_set_aside_is_put_back(tmp_path):
     assert (folder / "model.zip").read_text() == "previous"
 
 
-def test_nonsense_on_the_command_line_is_refused(capsys):
-    for command in (["--algos", "ppo"], ["--timesteps", "0"], ["--jobs", "0"]):
-        with pytest.raises(SystemExit):
-            compare.main(command)
-    assert "must be at least 1" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (["--timesteps", "0"], "must be at least 1"),
+        (["--jobs", "0"], "must be at least 1"),
+        (["--algos", "ppo"], "ppo is no off-policy algorithm of the RL Zoo; choose from"),
+        (["--algos", "lack"], "lack is no off-policy algorithm"),
+        (["--algos", "tqc"], "tqc.yml"),
+        (["--envs", "BatteryR-v0"], "Environment `BatteryR` doesn't exist"),
+        (["--envs", "CartPoleCost-v0"], "CartPoleCost-v0 is no calibration environment"),
+        (["--envs", "BatteryVoltageRo-v0"], "BatteryVoltageRo-v0 is no full-state environment"),
+        (["--envs", "BatteryQmax-v0"], "lac.yml has no entry for BatteryQmax-v0"),
+        (["--seeds", "-1"], "a seed must lie within 0 .. 2**32 - 1, got -1"),
+        (["--timesteps", "40"], "starts to learn after 40 steps (learning_starts): timesteps=40 must be more"),
+    ],
+)
+def test_nonsense_on_the_command_line_is_refused_before_any_training(wrong, message, capsys, finished):
+    with pytest.raises(SystemExit):
+        compare.main([*command(), *wrong])
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith("python -m benchmarks.compare: error: ") and message in last
+    assert finished == []
+
+
+def test_results_that_do_not_say_what_made_them_are_refused_before_any_training(tmp_path, capsys, finished):
+    folder = tmp_path / "out" / ENV_ID / "lac_seed0"
+    folder.mkdir(parents=True)
+    (folder / "summary.json").write_text(json.dumps({"env": ENV_ID, "algo": "lac", "seed": 0, "scores": {}}))
+    with pytest.raises(SystemExit):
+        compare.main(command())
+    assert "lac_seed0/summary.json was written by an earlier version: choose another --out" in capsys.readouterr().err
+    assert finished == []

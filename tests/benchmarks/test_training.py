@@ -1,8 +1,10 @@
 """A policy is trained once, with the hyperparameters it should have; runs side by side come back in order."""
 
+import json
 import operator
 import os
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -72,6 +74,54 @@ def test_hyperparameters_are_those_of_zoo_configs_where_none_are_given(tmp_path)
     other = training.train_or_load("lac", ENV_ID, 0, 25, tmp_path / "other", {"alpha3": 0.2, "lambda_max": 5.0})
     assert (other.alpha3, other.lambda_max) == (0.2, 5.0)
     assert (other.batch_size, other.policy_kwargs["net_arch"]) == (8, [8])
+
+
+def test_a_recipe_names_all_that_a_policy_depends_on(tmp_path, monkeypatch):
+    def of(**chosen):
+        return training.Recipe.of("lac", ENV_ID, 0, **chosen)
+
+    class OtherDefault(LAC):
+        def __init__(self, policy, env, tau=0.006, **others):
+            super().__init__(policy, env, tau=tau, **others)
+
+    recipe = of()
+    assert (recipe.timesteps, of(timesteps=40).digest) == (40, recipe.digest)
+    assert of(defaults=True).timesteps == training.DEFAULTS_TIMESTEPS
+    others = [of(timesteps=41), of(hyperparameters={"alpha3": 0.6}), of(defaults=True), of(evaluations=3), of(evaluations=4)]
+    with monkeypatch.context() as patch:
+        patch.setitem(training.ALGOS, "lac", OtherDefault)
+        others.append(of())
+    with monkeypatch.context() as patch:
+        patch.setattr(training.sb3_lac, "__version__", "99.0.0")
+        others.append(of())
+    with monkeypatch.context() as patch:
+        patch.setitem(gym.registry[ENV_ID].kwargs, "control_max", 1.5)
+        training._environment.cache_clear()
+        others.append(of())
+    training._environment.cache_clear()
+    (tmp_path / "zoo_configs" / "lac.yml").write_text(CONFIG.replace("alpha3: 0.7", "alpha3: 0.8"))
+    others.append(of())
+    assert len({recipe.digest, *(other.digest for other in others)}) == 1 + len(others)
+    assert len({recipe.name, *(other.name for other in others)}) == 1 + len(others)
+
+    # seeds of one recipe share the digest, not the name
+    (tmp_path / "zoo_configs" / "lac.yml").write_text(CONFIG)
+    seeds = [training.Recipe.of("lac", ENV_ID, seed) for seed in (0, 1)]
+    assert seeds[0] == recipe and seeds[0].digest == seeds[1].digest and seeds[0].name != seeds[1].name
+
+
+def test_training_follows_the_recipe_even_if_the_file_has_changed_since(tmp_path):
+    recipe = training.Recipe.of("lac", ENV_ID, 0)
+    (tmp_path / "zoo_configs" / "lac.yml").write_text(CONFIG.replace("alpha3: 0.7", "alpha3: 0.8"))
+    assert training.set_up(recipe, tmp_path / "run")[1].alpha3 == 0.7
+
+
+def test_beside_a_model_stands_what_made_it(tmp_path):
+    training.train_or_load("lac", ENV_ID, 0, 25, tmp_path)
+    recipe = training.Recipe.of("lac", ENV_ID, 0, 25)
+    record = json.loads(training.record_file(recipe, tmp_path).read_text())
+    assert training.Recipe(**record["recipe"]) == recipe
+    assert record["training_minutes"] > 0 and "torch" in record["versions"]
 
 
 def test_an_interrupted_training_leaves_no_model(tmp_path, monkeypatch, trainings):

@@ -64,3 +64,10 @@ def test_bad_numbers_are_refused(extra, capsys):
     with pytest.raises(SystemExit):
         voltage.main([*COMMAND, *extra])
     assert "--discharges within 1 .. 300" in capsys.readouterr().err
+
+
+def test_an_unknown_algorithm_is_refused_before_any_training(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        voltage.main([*COMMAND, "--algos", "lac", "lack"])
+    assert "error: lack is no off-policy algorithm of the RL Zoo" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
