@@ -252,8 +252,16 @@ def finished_runs(out: Path) -> pd.DataFrame:
         if set(summary.get("recipe", ())) != {field.name for field in fields(Recipe)}:
             raise ValueError(f"{file} was written by an earlier version: choose another --out")
         recipe = Recipe(**summary["recipe"])
-        of_run: dict[str, Any] = {"env": recipe.env_id, "algo": recipe.algo, "hyperparameters": recipe.source, "recipe": recipe.digest}
-        of_run |= {"seed": recipe.seed, "timesteps": recipe.timesteps, "label": recipe.label, "folder": file.parent}
+        of_run: dict[str, Any] = {
+            "env": recipe.env_id,
+            "algo": recipe.algo,
+            "hyperparameters": recipe.source,
+            "recipe": recipe.digest,
+            "seed": recipe.seed,
+            "timesteps": recipe.timesteps,
+            "label": recipe.label,
+            "folder": file.parent,
+        }
         of_run |= {name: summary[name] for name in ("updates", "resumed", "training_minutes", "time_per_update_us")}
         rows += [{**of_run, "parameter": name, **scores} for name, scores in summary["scores"].items()]
     if not rows:
