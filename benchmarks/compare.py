@@ -257,8 +257,11 @@ def finished_runs(out: Path) -> pd.DataFrame:
             "algo": recipe.algo,
             "hyperparameters": recipe.source,
             "recipe": recipe.digest,
+            "seed": recipe.seed,
+            "timesteps": recipe.timesteps,
+            "label": recipe.label,
+            "folder": file.parent,
         }
-        of_run |= {"seed": recipe.seed, "timesteps": recipe.timesteps, "label": recipe.label, "folder": file.parent}
         of_run |= {name: summary[name] for name in ("updates", "resumed", "training_minutes", "time_per_update_us")}
         rows += [{**of_run, "parameter": name, **scores} for name, scores in summary["scores"].items()]
     if not rows:

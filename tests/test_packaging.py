@@ -33,8 +33,8 @@ def test_both_distributions_ask_for_the_same_versions():
 def test_versions_agree():
     assert (ROOT / "sb3_lac/version.txt").read_text() == (ROOT / "battery_env/version.txt").read_text()
     version = (ROOT / "sb3_lac/version.txt").read_text().strip()
-    assert f"version: {version}" in (ROOT / "CITATION.cff").read_text()
-    assert version in (ROOT / "CHANGELOG.md").read_text()
+    assert f"version: {version}" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert version in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("package", ["sb3_lac", "battery_env"])
@@ -45,7 +45,7 @@ def test_packages_are_typed(package):
 @pytest.mark.parametrize("algo", ["lac", "sac", "td3"])
 def test_every_environment_has_tuned_hyperparameters(algo):
     yaml = pytest.importorskip("yaml")
-    config = yaml.safe_load((ROOT / "zoo_configs" / f"{algo}.yml").read_text())
+    config = yaml.safe_load((ROOT / "zoo_configs" / f"{algo}.yml").read_text(encoding="utf-8"))
     packages = ("battery_env.", "sb3_lac.envs.")
     ids = {env_id for env_id, spec in gym.registry.items() if str(spec.entry_point).startswith(packages)}
     assert ids and ids | {"default"} <= set(config)

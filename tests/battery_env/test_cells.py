@@ -122,7 +122,7 @@ class TestResampling:
         np.testing.assert_array_equal(resampled[:50], current_A)
         np.testing.assert_array_equal(resampled[50:], current_A[-1])
 
-    @settings(max_examples=60, deadline=None)
+    @settings(max_examples=60)
     @given(
         gaps=st.lists(st.floats(0.05, 30.0), min_size=4, max_size=40),
         dt_s=st.floats(0.1, 5.0),

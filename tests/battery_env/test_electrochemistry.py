@@ -102,7 +102,7 @@ def test_agrees_with_progpy_on_random_cells_and_loads():
 
 
 @given(Q_MOBILE, R_O, st.lists(st.floats(0.0, 12.0), min_size=1, max_size=200))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_total_charge_is_conserved_under_any_load(q_mobile, r_o, load):
     discharge = simulate(np.array(load), q_mobile, r_o)
     total = discharge.state[:, QNB:].sum(axis=1)
@@ -110,7 +110,6 @@ def test_total_charge_is_conserved_under_any_load(q_mobile, r_o, load):
 
 
 @given(Q_MOBILE)
-@settings(deadline=None)  # the first call compiles
 def test_full_charge_has_the_same_voltage_for_every_cell(q_mobile):
     assert voltage(initial_state(q_mobile), q_mobile) == pytest.approx(4.191350, abs=5e-7)
     assert state_of_charge(initial_state(q_mobile), np.array(q_mobile)) == pytest.approx(1.0)

@@ -34,7 +34,7 @@ JUNK = st.one_of(
     st.builds(object),
     st.just(datetime(2020, 1, 1)),
 )
-FAST = settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+FAST = settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 
 
 def right_or_refused(call, *names):

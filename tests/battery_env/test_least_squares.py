@@ -41,7 +41,7 @@ class TestCleanRecords:
         assert estimate.r_o == pytest.approx(r_o, rel=1e-6)
         assert estimate.settled and np.isfinite(estimate.sd_q_mobile)
 
-    @settings(max_examples=15, deadline=None)
+    @settings(max_examples=15)
     @given(q_mobile=st.floats(2000.0, 12_000.0), r_o=st.floats(0.02, 0.35), seed=st.integers(0, 1000))
     def test_both_parameters_are_recovered_under_any_steps_of_the_load(self, q_mobile, r_o, seed):
         estimate = LeastSquares().estimate(discharged(q_mobile, r_o, steps(seed)))

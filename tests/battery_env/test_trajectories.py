@@ -163,7 +163,7 @@ class TestFiles:
         np.savez(path, metadata=np.array(metadata), checksum=given, **arrays)
         return path
 
-    @settings(max_examples=200, deadline=None)
+    @settings(max_examples=200)
     @given(place=st.floats(0.0, 1.0, exclude_max=True), flip=st.integers(1, 255))
     def test_a_damaged_byte_is_found_or_does_no_harm(self, small, saved, place, flip):
         contents = bytearray(saved.read_bytes())

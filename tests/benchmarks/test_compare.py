@@ -138,7 +138,7 @@ def test_seeds_are_one_row_and_continued_runs_are_named(tmp_path, finished, caps
     shown = capsys.readouterr().out
     assert re.search(r"\| LAC +\| \w{8} +\| 400 +\| 2 ", shown)
     assert "- LAC on BatteryRo-v0, seed 1: 2 times\n- SAC on BatteryRo-v0, seed 1: 2 times\n" in shown
-    assert (tmp_path / "out" / "compare.md").read_text() in shown
+    assert (tmp_path / "out" / "compare.md").read_text(encoding="utf-8") in shown
     assert list(pd.read_csv(tmp_path / "out" / "compare.csv")["resumed"][:4]) == [0, 2, 0, 2]
 
 

@@ -90,7 +90,7 @@ def test_the_study_writes_tables_and_figures(brief, tmp_path, capsys):
     names = {path.name for path in PUBLISHED.iterdir()}
     assert {path.name for path in tmp_path.iterdir()} == names
     assert json.loads((tmp_path / "bounds.json").read_text())["configuration"]["draws"] == 2
-    assert (tmp_path / "summary.md").read_text() in capsys.readouterr().out
+    assert (tmp_path / "summary.md").read_text(encoding="utf-8") in capsys.readouterr().out
     least_squares = pd.read_csv(tmp_path / "least_squares.csv")
     assert len(least_squares) == 2 * 2 * 4 and (least_squares["q_mobile_rms_percent"] < 20.0).all()
     faults = pd.read_csv(tmp_path / "faults.csv").set_index(["load", "fault", "seen_percent"]).sort_index()

@@ -66,7 +66,7 @@ def test_tables_and_figure_are_written(tmp_path, exact_model, capsys):
     record = json.loads((tmp_path / "linear_cost.json").read_text())
     assert record["configuration"] == {"seeds": [1, 2], "timesteps": 50, "episodes": 3}
     assert (tmp_path / "linear_cost.png").stat().st_size > 0
-    text = (tmp_path / "linear_cost.md").read_text()
+    text = (tmp_path / "linear_cost.md").read_text(encoding="utf-8")
     assert text in capsys.readouterr().out and len(text.splitlines()) == 4
     assert "| 1.0000 " in text and "1.000, " in text
 

@@ -73,7 +73,7 @@ def test_table_figure_and_report_are_written(tmp_path, trained, capsys):
     record = json.loads((tmp_path / "multipliers.json").read_text())
     assert record["configuration"]["timesteps"] == multipliers._TIMESTEPS and record["configuration"]["alpha3"] == [0.1, 1.0]
     assert (tmp_path / "multipliers.png").stat().st_size > 0
-    text = (tmp_path / "multipliers.md").read_text()
+    text = (tmp_path / "multipliers.md").read_text(encoding="utf-8")
     assert text in capsys.readouterr().out and text.count(ENV_ID) == 2
 
 

