@@ -148,14 +148,17 @@ def find_config(algo: str) -> Path:
     Find the tuned hyperparameters of an algorithm.
 
     :param algo: Name of the algorithm in the RL Zoo
-    :return: ``zoo_configs/<algo>.yml`` of the current directory, or else of the source checkout
+    :return: ``zoo_configs/<algo>.yml`` of the current directory, or else of this package
+    :raises FileNotFoundError: If neither has one
     """
-    candidates = [folder / "zoo_configs" / f"{algo}.yml" for folder in (Path.cwd(), Path(__file__).resolve().parents[1])]
+    package = Path(__file__).resolve().parent
+    # In a source checkout, which an editable installation is too, the folder lies beside the package
+    candidates = [folder / "zoo_configs" / f"{algo}.yml" for folder in (Path.cwd(), package, package.parent)]
     for candidate in candidates:
         if candidate.is_file():
             return candidate
     raise FileNotFoundError(
-        f"No hyperparameters for '{algo}': neither {candidates[0]} nor {candidates[1]} exists. "
+        f"No hyperparameters for '{algo}': there is no {candidates[0]}, and sb3_lac brings none. "
         "Run from a folder with zoo_configs, or pass a YAML file with -conf."
     )
 
