@@ -12,14 +12,22 @@ SOURCES := sb3_lac battery_env benchmarks tests examples
 help:  ## list the commands
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
 
+# pip has much to say: it is shown only if the command fails
+logged = ($(1)) > $(VENV)/install.log 2>&1 || { cat $(VENV)/install.log >&2; exit 1; }
+comma := ,
+
 # one stamp per state of the packaging files: made again when they change
 $(VENV)/.installed: setup.cfg pyproject.toml battery_env/setup.cfg
-	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10) and "Python 3.10 or newer is needed: make PYTHON=...")'
-	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet "$(TORCH)"
-	$(BIN)/python -m pip install --quiet --editable ".[zoo,peers,dev]"
-	touch $@
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10) and "Python 3.10 or newer is needed: make PYTHON=...")'
+	@echo "making $(VENV)"
+	@mkdir -p $(VENV)
+	@$(call logged,test -x $(BIN)/python || $(PYTHON) -m venv $(VENV))
+	@$(call logged,$(BIN)/python -m pip install --upgrade pip)
+	@echo "installing $(TORCH)"
+	@$(call logged,$(BIN)/python -m pip install "$(TORCH)")
+	@echo "installing sb3_lac and battery_env, with all extras"
+	@$(call logged,$(BIN)/python -m pip install --editable ".[zoo$(comma)peers$(comma)dev]")
+	@touch $@
 
 install: $(VENV)/.installed  ## make .venv with everything in it
 

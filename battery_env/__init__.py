@@ -1,25 +1,59 @@
-"""Calibration of Li-ion battery models: the plant, its data, the tasks, and the calibrators that need no learning."""
+"""
+Calibration of Li-ion battery models: the plant, its data, the tasks, and the calibrators that need no learning.
 
-from importlib.resources import files as _files
+Importing this package registers the environments and loads nothing else: each name below is imported when it is first used.
+"""
 
-from battery_env.calibration.policy import PolicyEstimator
+from importlib import import_module
+from importlib.resources import files
+from typing import TYPE_CHECKING, Any
+
 from battery_env.calibration.registration import register_environments
-from battery_env.cells import Discharge, load_nasa_discharges, read_discharge_csv
-from battery_env.electrochemistry import NEW_CELL, CellParameters, Trajectory, initial_state, simulate, step, voltage
-from battery_env.estimators import (
-    ClosedForm,
-    Estimate,
-    Estimator,
-    ExtendedKalmanFilter,
-    GreedyOneStep,
-    LeastSquares,
-    cramer_rao_bound,
-)
-from battery_env.evaluation import evaluate
-from battery_env.sensors import RandomSensorErrors, SensorErrors
-from battery_env.trajectories import TrajectoryDataset
 
-__version__ = _files("battery_env").joinpath("version.txt").read_text(encoding="utf-8").strip()
+if TYPE_CHECKING:
+    from battery_env.calibration.policy import PolicyEstimator
+    from battery_env.cells import Discharge, load_nasa_discharges, read_discharge_csv
+    from battery_env.electrochemistry import NEW_CELL, CellParameters, Trajectory, initial_state, simulate, step, voltage
+    from battery_env.estimators import (
+        ClosedForm,
+        Estimate,
+        Estimator,
+        ExtendedKalmanFilter,
+        GreedyOneStep,
+        LeastSquares,
+        cramer_rao_bound,
+    )
+    from battery_env.evaluation import evaluate
+    from battery_env.sensors import RandomSensorErrors, SensorErrors
+    from battery_env.trajectories import TrajectoryDataset
+
+# Where each name comes from: numba, pandas and scipy take seconds to import, and an environment by its id needs none of them
+_MODULES = {
+    "NEW_CELL": "battery_env.electrochemistry",
+    "CellParameters": "battery_env.electrochemistry",
+    "ClosedForm": "battery_env.estimators",
+    "Discharge": "battery_env.cells",
+    "Estimate": "battery_env.estimators",
+    "Estimator": "battery_env.estimators",
+    "ExtendedKalmanFilter": "battery_env.estimators",
+    "GreedyOneStep": "battery_env.estimators",
+    "LeastSquares": "battery_env.estimators",
+    "PolicyEstimator": "battery_env.calibration.policy",
+    "RandomSensorErrors": "battery_env.sensors",
+    "SensorErrors": "battery_env.sensors",
+    "Trajectory": "battery_env.electrochemistry",
+    "TrajectoryDataset": "battery_env.trajectories",
+    "cramer_rao_bound": "battery_env.estimators",
+    "evaluate": "battery_env.evaluation",
+    "initial_state": "battery_env.electrochemistry",
+    "load_nasa_discharges": "battery_env.cells",
+    "read_discharge_csv": "battery_env.cells",
+    "simulate": "battery_env.electrochemistry",
+    "step": "battery_env.electrochemistry",
+    "voltage": "battery_env.electrochemistry",
+}
+
+__version__ = files("battery_env").joinpath("version.txt").read_text(encoding="utf-8").strip()
 
 __all__ = [
     "NEW_CELL",
@@ -46,5 +80,19 @@ __all__ = [
     "step",
     "voltage",
 ]
+
+
+if not TYPE_CHECKING:  # a type checker would take every name for one that exists
+
+    def __getattr__(name: str) -> Any:
+        if name not in _MODULES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        value = globals()[name] = getattr(import_module(_MODULES[name]), name)
+        return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
 
 register_environments()

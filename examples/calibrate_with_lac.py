@@ -27,7 +27,6 @@ model = LAC(
 callback = CalibrationCallback(
     lambda candidate: evaluate(PolicyEstimator(candidate, ENV_ID), test_discharges),
     eval_freq=1000,
-    metrics={"r_o_mape_percent": "mape_percent"},
 )
 model.learn(50_000, callback=callback)
 

@@ -1,17 +1,21 @@
+from __future__ import annotations
+
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
-import pandas as pd
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, EventCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, sync_envs_normalization
 
 from sb3_lac.lac import LAC
 from sb3_lac.stability import LyapunovReport, evaluate_lyapunov, prepare_evaluation, trains_on
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 def _read_history(log_path: Path) -> list[dict[str, float]]:
@@ -21,6 +25,8 @@ def _read_history(log_path: Path) -> list[dict[str, float]]:
     :param log_path: Path of a CSV file
     :return: One entry per evaluation
     """
+    import pandas as pd  # slow to import, and only an evaluation needs it
+
     log_path.parent.mkdir(parents=True, exist_ok=True)
     if not log_path.exists():
         return []
@@ -41,6 +47,8 @@ def _add_to_history(history: list[dict[str, float]], entry: dict[str, float], lo
     by_timesteps[int(entry["timesteps"])] = entry
     history = [by_timesteps[timesteps] for timesteps in sorted(by_timesteps)]
     if log_path is not None:
+        import pandas as pd
+
         # Renaming is atomic: an interrupted training never leaves half a file
         temporary_path = log_path.with_name(f"{log_path.name}.tmp")
         pd.DataFrame(history).to_csv(temporary_path, index=False)
@@ -61,10 +69,12 @@ class CalibrationCallback(EventCallback):
       To account for that, you can use ``eval_freq = max(eval_freq // n_envs, 1)``
 
     :param evaluate: Function that evaluates the model and returns a data frame with one row per held-out trajectory
-        and one column per metric.
+        and one column per metric, for instance ``lambda model: battery_env.evaluate(PolicyEstimator(model, env_id), test)``.
+        It is also called once before the training, to see that it works and has the columns; those results are not logged.
     :param eval_freq: Evaluate the agent every ``eval_freq`` call of the callback.
     :param metrics: Columns to log, or a mapping from columns to the names to log them under.
-        The first one decides which model is the best.
+        The first one decides which model is the best. By default ``<parameter>_mape_percent`` for each parameter that the
+        training environment finds (its ``task.parameters``), the mean errors in ``battery_env.evaluate()``.
     :param log_path: Path of a CSV file, updated at each evaluation. If it exists already, its evaluations are kept and
         count for the best model, so that the history of a continued training is complete.
     :param best_model_save_path: Path to a folder where the best model (lowest mean of the first metric) will be saved
@@ -78,7 +88,7 @@ class CalibrationCallback(EventCallback):
         self,
         evaluate: Callable[[BaseAlgorithm], pd.DataFrame],
         eval_freq: int = 10_000,
-        metrics: Sequence[str] | Mapping[str, str] = ("mape_percent",),
+        metrics: Sequence[str] | Mapping[str, str] | None = None,
         log_path: str | os.PathLike[str] | None = None,
         best_model_save_path: str | os.PathLike[str] | None = None,
         callback_on_new_best: BaseCallback | None = None,
@@ -86,8 +96,8 @@ class CalibrationCallback(EventCallback):
         verbose: int = 1,
     ):
         super().__init__(callback_after_eval, verbose=verbose)
-        if isinstance(metrics, str) or len(metrics) == 0:
-            raise ValueError(f"metrics={metrics!r} must be a sequence of at least one column, like ('mape_percent',).")
+        if metrics is not None and (isinstance(metrics, str) or len(metrics) == 0):
+            raise ValueError(f"metrics={metrics!r} must be a sequence of at least one column, like ('r_o_mape_percent',).")
 
         self.callback_on_new_best = callback_on_new_best
         if self.callback_on_new_best is not None:
@@ -96,16 +106,33 @@ class CalibrationCallback(EventCallback):
 
         self.evaluate = evaluate
         self.eval_freq = eval_freq
-        self.metrics = dict(metrics) if isinstance(metrics, Mapping) else {column: column for column in metrics}
+        # The names to log by column: if none are chosen, they are those of the training environment
+        self.metrics = dict(metrics) if isinstance(metrics, Mapping) else {column: column for column in metrics or ()}
         self.log_path = None if log_path is None else Path(log_path)
         self.best_model_save_path = None if best_model_save_path is None else Path(best_model_save_path)
-        # Name of the metric that decides which model is the best
-        self.objective = next(iter(self.metrics.values()))
         self.best_objective = np.inf
         # One entry per evaluation, sorted by timesteps
         self.history: list[dict[str, float]] = []
 
+    @property
+    def objective(self) -> str:
+        """Name of the metric that decides which model is the best."""
+        return next(iter(self.metrics.values()))
+
+    def _default_metrics(self) -> dict[str, str]:
+        if not self.training_env.has_attr("task"):
+            raise ValueError(
+                "metrics must be given: the training environment has no task whose parameters name the default ones."
+            )
+        columns = [f"{parameter}_mape_percent" for parameter in self.training_env.get_attr("task", indices=0)[0].parameters]
+        return {column: column for column in columns}
+
     def _init_callback(self) -> None:
+        if not self.metrics:
+            self.metrics = self._default_metrics()
+        if self.eval_freq > 0:
+            # A mistake is seen before the training, and not at its first evaluation
+            self._summarize(self.evaluate(self.model))
         if self.best_model_save_path is not None:
             self.best_model_save_path.mkdir(parents=True, exist_ok=True)
         if self.log_path is not None:
@@ -158,7 +185,9 @@ class CalibrationCallback(EventCallback):
         """
         missing = [column for column in self.metrics if column not in trajectories.columns]
         if missing:
-            raise ValueError(f"The evaluation has no column {missing}, its columns are {list(trajectories.columns)}.")
+            raise ValueError(
+                f"The evaluation has no column {missing}, its columns are {list(trajectories.columns)}: choose from them."
+            )
         summary = {}
         for column, name in self.metrics.items():
             summary[name] = float(trajectories[column].mean(skipna=False))

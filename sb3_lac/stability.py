@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import gymnasium as gym
 import numpy as np
-import pandas as pd
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.utils import check_for_correct_spaces
@@ -18,6 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_no
 from sb3_lac.lac import LAC, sum_of_discounts, time_limits
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.figure import Figure
 
 Observations = np.ndarray | dict[str, np.ndarray]
@@ -135,6 +135,9 @@ def roll_out(model: LAC, env: VecEnv, n_eval_episodes: int, deterministic: bool)
     :return: One row per transition with ``episode``, ``step``, ``reward``, ``lyapunov``, ``next_lyapunov`` and ``terminated``,
         and the observations if they are vectors
     """
+    # Slow to import like scipy and matplotlib below, and only an evaluation needs them
+    import pandas as pd
+
     # As in ``evaluate_policy()``: each environment runs a fixed number of episodes,
     # if the first episodes to end were taken, they would be the short ones
     targets = np.array([(n_eval_episodes + i) // env.num_envs for i in range(env.num_envs)])
@@ -206,7 +209,6 @@ def cost_to_go(
     lengths = np.bincount(episode)
     costs = np.zeros((len(lengths), lengths.max()))
     costs[episode, step] = transitions["cost"]
-    # Slow to import like scipy.stats and matplotlib below, and only an evaluation needs them
     from scipy.signal import lfilter
 
     # G = c + gamma * G' as a filter that runs back in time
@@ -233,6 +235,8 @@ def summarize_episodes(transitions: pd.DataFrame) -> pd.DataFrame:
     :param transitions: One row per transition
     :return: One row per episode with ``length``, ``total_cost``, ``final_cost``, ``largest_late_cost`` and ``terminated``
     """
+    import pandas as pd
+
     groups = transitions.groupby("episode")
     length = groups["step"].transform("size")
     late = length - transitions["step"] <= np.maximum(length // 5, 1)
@@ -477,6 +481,8 @@ class LyapunovReport:
 
         :return: One row per metric, with columns ``value``, ``low`` and ``high``
         """
+        import pandas as pd
+
         return pd.DataFrame.from_dict(self.metrics, orient="index", columns=list(Estimate._fields)).rename_axis("metric")
 
     def summary(self) -> str:

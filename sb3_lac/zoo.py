@@ -1,27 +1,37 @@
 """
-RL Zoo with LAC: training, continuing, hyperparameter search and evaluation from the command line.
+RL Zoo with LAC: training, continuing, hyperparameter search, evaluation, videos and plots from the command line.
 
 .. code-block:: bash
 
   python -m sb3_lac.zoo train --env Pendulum-v1
   python -m sb3_lac.zoo train --env Pendulum-v1 -i logs/lac/Pendulum-v1_1/Pendulum-v1.zip
   python -m sb3_lac.zoo enjoy --env Pendulum-v1 -f logs --no-render
+  python -m sb3_lac.zoo record_video --env Pendulum-v1 -f logs
   python -m sb3_lac.zoo optimize --env Pendulum-v1 --n-trials 50
+  python -m sb3_lac.zoo all_plots --algos lac sac --env Pendulum-v1 -f logs
+  python -m sb3_lac.zoo benchmark --log-dir logs --no-hub
 
-Options are those of ``rl_zoo3.train`` and ``rl_zoo3.enjoy``, with two other defaults: the algorithm is LAC,
-and hyperparameters come from ``zoo_configs/<algo>.yml``.
+Options are those of the RL Zoo's modules of these names, with two other defaults: the algorithm is LAC, and the
+hyperparameters of ``train`` and ``optimize`` come from ``zoo_configs/<algo>.yml``. ``optimize`` has samplers of its own for
+LAC, SAC and TD3, which reach equally far.
 """
 
 import argparse
 import inspect
+import runpy
+import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 from gymnasium.vector import AutoresetMode
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 
 try:
@@ -40,57 +50,139 @@ except ImportError as error:
 
 from sb3_lac import LAC, GymnasiumVecEnv
 
+# What a sampler of the RL Zoo returns, and what it gets: see ``HYPERPARAMS_SAMPLER``
+Hyperparams = dict[str, Any]
 
-def convert_lac_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
+
+def _sample_common_params(trial: optuna.Trial) -> Hyperparams:
+    # n_envs, train_freq and gradient_steps stay those of the configuration: they belong together
+    return {
+        # gamma from 0.5 to 0.9999
+        "one_minus_gamma": trial.suggest_float("one_minus_gamma", 0.0001, 0.5, log=True),
+        # From 2**5=32 to 2**10=1024
+        "batch_size_pow": trial.suggest_int("batch_size_pow", 5, 10),
+        "learning_rate": trial.suggest_float("learning_rate", 1e-5, 0.002, log=True),
+        # Polyak coeff
+        "tau": trial.suggest_float("tau", 0.001, 0.08, log=True),
+        "net_arch": trial.suggest_categorical("net_arch", ["small", "medium", "large"]),
+        "activation_fn": trial.suggest_categorical("activation_fn", ["relu", "leaky_relu"]),
+    }
+
+
+def _sample_entropy_params(trial: optuna.Trial, n_actions: int) -> Hyperparams:
+    return {
+        "ent_coef_init": trial.suggest_float("ent_coef_init", 0.01, 100.0, log=True),
+        # -n_actions is the default of SAC and LAC
+        "target_entropy": trial.suggest_float("target_entropy", -5.0 * n_actions, 0.0),
+    }
+
+
+def _finish_sample(trial: optuna.Trial, sampled_params: Hyperparams, additional_args: dict[str, Any]) -> Hyperparams:
+    # Display true values
+    trial.set_user_attr("gamma", 1 - sampled_params["one_minus_gamma"])
+    trial.set_user_attr("batch_size", 2 ** sampled_params["batch_size_pow"])
+    if additional_args["using_her_replay_buffer"]:
+        sampled_params = sample_her_params(trial, sampled_params, additional_args["her_kwargs"])
+    return sampled_params
+
+
+def convert_sac_params(sampled_params: Hyperparams) -> Hyperparams:
+    """
+    Convert sampled values to the hyperparameters of SAC.
+
+    :param sampled_params: See ``sample_sac_params()``
+    :return: Keyword arguments of ``SAC``
+    """
+    hyperparams = convert_offpolicy_params(sampled_params)
+    hyperparams["ent_coef"] = f"auto_{hyperparams.pop('ent_coef_init')}"
+    return hyperparams
+
+
+def convert_lac_params(sampled_params: Hyperparams) -> Hyperparams:
     """
     Convert sampled values to the hyperparameters of LAC.
 
     :param sampled_params: See ``sample_lac_params()``
     :return: Keyword arguments of ``LAC``
     """
-    hyperparams = convert_offpolicy_params(sampled_params)
+    hyperparams = convert_sac_params(sampled_params)
     hyperparams["policy_kwargs"]["output_dim"] = hyperparams.pop("output_dim")
     # Start with the full weight on the cost, as in the paper
     hyperparams["lambda_init"] = hyperparams["lambda_max"]
     return hyperparams
 
 
-def sample_lac_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+def convert_td3_params(sampled_params: Hyperparams) -> Hyperparams:
+    """
+    Convert sampled values to the hyperparameters of TD3, as they stand in a configuration of the RL Zoo.
+
+    :param sampled_params: See ``sample_td3_params()``
+    :return: Hyperparameters of ``TD3``
+    """
+    hyperparams = convert_offpolicy_params(sampled_params)
+    hyperparams["noise_type"] = "normal"
+    # The ratio of the defaults is 0.5 to 0.2
+    hyperparams["target_noise_clip"] = 2.5 * hyperparams["target_policy_noise"]
+    return hyperparams
+
+
+def sample_lac_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> Hyperparams:
     """
     Sampler for LAC hyperparams.
 
     :param trial: Optuna trial
-    :param n_actions: Number of actions, not needed
+    :param n_actions: Number of actions
     :param n_envs: Number of environments, not needed
     :param additional_args: Whether hindsight experience replay is used, and its arguments
     :return: Keyword arguments of ``LAC``
     """
-    sampled_params: dict[str, Any] = {
-        "one_minus_gamma": trial.suggest_float("one_minus_gamma", 0.0001, 0.03, log=True),
-        # From 2**5=32 to 2**10=1024
-        "batch_size_pow": trial.suggest_int("batch_size_pow", 5, 10),
-        "learning_rate": trial.suggest_float("learning_rate", 1e-5, 0.002, log=True),
+    sampled_params = {
+        **_sample_common_params(trial),
+        **_sample_entropy_params(trial, n_actions),
         "lambda_learning_rate": trial.suggest_float("lambda_learning_rate", 1e-5, 0.002, log=True),
-        "train_freq": trial.suggest_int("train_freq", 1, 10),
-        # Polyak coeff
-        "tau": trial.suggest_float("tau", 0.001, 0.08, log=True),
         # Up to 1, from where the decrease condition cannot hold and lambda stays at lambda_max
         "alpha3": trial.suggest_float("alpha3", 0.01, 1.0, log=True),
         # Weight of the cost relative to the entropy
         "lambda_max": trial.suggest_float("lambda_max", 0.1, 10.0, log=True),
         "output_dim": trial.suggest_categorical("output_dim", [8, 16, 32, 64]),
-        "net_arch": trial.suggest_categorical("net_arch", ["small", "medium", "large"]),
-        "activation_fn": trial.suggest_categorical("activation_fn", ["relu", "leaky_relu"]),
     }
+    return convert_lac_params(_finish_sample(trial, sampled_params, additional_args))
 
-    # Display true values
-    trial.set_user_attr("gamma", 1 - sampled_params["one_minus_gamma"])
-    trial.set_user_attr("batch_size", 2 ** sampled_params["batch_size_pow"])
 
-    if additional_args["using_her_replay_buffer"]:
-        sampled_params = sample_her_params(trial, sampled_params, additional_args["her_kwargs"])
+def sample_sac_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> Hyperparams:
+    """
+    Sampler for SAC hyperparams that reaches as far as that of LAC: the RL Zoo's own has gamma >= 0.97 and no entropy.
 
-    return convert_lac_params(sampled_params)
+    :param trial: Optuna trial
+    :param n_actions: Number of actions
+    :param n_envs: Number of environments, not needed
+    :param additional_args: Whether hindsight experience replay is used, and its arguments
+    :return: Keyword arguments of ``SAC``
+    """
+    sampled_params = {**_sample_common_params(trial), **_sample_entropy_params(trial, n_actions)}
+    return convert_sac_params(_finish_sample(trial, sampled_params, additional_args))
+
+
+def sample_td3_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> Hyperparams:
+    """
+    Sampler for TD3 hyperparams that reaches as far as that of LAC: the RL Zoo's own has gamma >= 0.97 and no target noise.
+
+    :param trial: Optuna trial
+    :param n_actions: Number of actions
+    :param n_envs: Number of environments, not needed
+    :param additional_args: Whether hindsight experience replay is used, and its arguments
+    :return: Keyword arguments of ``TD3``
+    """
+    sampled_params = {
+        **_sample_common_params(trial),
+        "noise_std": trial.suggest_float("noise_std", 0.01, 0.5, log=True),
+        "target_policy_noise": trial.suggest_float("target_policy_noise", 0.01, 0.5, log=True),
+    }
+    hyperparams = convert_td3_params(_finish_sample(trial, sampled_params, additional_args))
+    # The RL Zoo reads the type of noise from configurations only
+    del hyperparams["noise_type"]
+    sigma = np.full(n_actions, hyperparams.pop("noise_std"))
+    return {**hyperparams, "action_noise": NormalActionNoise(np.zeros(n_actions), sigma)}
 
 
 def steps_as_one_batch(spec: EnvSpec) -> bool:
@@ -110,9 +202,18 @@ def steps_as_one_batch(spec: EnvSpec) -> bool:
 
 class LACExperimentManager(ExperimentManager):
     """
-    Experiment manager that steps all copies of an environment by one call where it can, and understands schedules like
-    ``lin_5e-5`` for the learning rate of lambda.
+    Experiment manager that steps all copies of an environment by one call where it can, understands schedules like
+    ``lin_5e-5`` for the learning rate of lambda, and refuses trainings without an update. The hyperparameters of LAC are
+    those of ``find_config()`` by default. Trials of a search are scored on held-out discharges where the environment is one
+    of battery_env.
     """
+
+    def __init__(self, args: argparse.Namespace, algo: str, env_id: str, *others: Any, **options: Any) -> None:
+        if algo == "lac" and options.get("config") is None:
+            options["config"] = str(find_config(algo))
+        super().__init__(args, algo, env_id, *others, **options)
+        if self.optimize_hyperparameters and "battery_env." in self.entry_point(env_id) and self._eval_env_kwargs_args is None:
+            self.eval_env_kwargs = self._eval_env_kwargs_args = {**self.env_kwargs, "split": "test"}
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
         spec = gym.spec(self.env_name.gym_id)
@@ -127,6 +228,21 @@ class LACExperimentManager(ExperimentManager):
         if self.vec_env_wrapper is not None:
             env = self.vec_env_wrapper(env)
         return self._maybe_normalize(env, eval_env)
+
+    def _preprocess_hyperparams(
+        self, hyperparams: dict[str, Any]
+    ) -> tuple[dict[str, Any], Callable | None, list[BaseCallback], Callable | None]:
+        # Before anything is written
+        processed = super()._preprocess_hyperparams(hyperparams)
+        signature = inspect.signature(rl_zoo3.ALGOS[self.algo]).parameters
+        if "learning_starts" in signature:
+            learning_starts = processed[0].get("learning_starts", signature["learning_starts"].default)
+            if self.n_timesteps <= learning_starts:
+                raise ValueError(
+                    f"n_timesteps={self.n_timesteps} must be more than learning_starts={learning_starts}, or nothing is "
+                    "learned. Train longer (-n), or start earlier (-params learning_starts:100)."
+                )
+        return processed
 
     @staticmethod
     def _preprocess_schedules(hyperparams: dict[str, Any]) -> dict[str, Any]:
@@ -148,16 +264,38 @@ def find_config(algo: str) -> Path:
     Find the tuned hyperparameters of an algorithm.
 
     :param algo: Name of the algorithm in the RL Zoo
-    :return: ``zoo_configs/<algo>.yml`` of the current directory, or else of the source checkout
+    :return: ``zoo_configs/<algo>.yml`` of the current directory, or else of this package
+    :raises FileNotFoundError: If neither has one
     """
-    candidates = [folder / "zoo_configs" / f"{algo}.yml" for folder in (Path.cwd(), Path(__file__).resolve().parents[1])]
+    package = Path(__file__).resolve().parent
+    # In a source checkout, which an editable installation is too, the folder lies beside the package
+    candidates = [folder / "zoo_configs" / f"{algo}.yml" for folder in (Path.cwd(), package, package.parent)]
     for candidate in candidates:
         if candidate.is_file():
             return candidate
     raise FileNotFoundError(
-        f"No hyperparameters for '{algo}': neither {candidates[0]} nor {candidates[1]} exists. "
+        f"No hyperparameters for '{algo}': there is no {candidates[0]}, and sb3_lac brings none. "
         "Run from a folder with zoo_configs, or pass a YAML file with -conf."
     )
+
+
+def _run_script(name: str) -> None:
+    runpy.run_module(f"rl_zoo3.{name}", run_name="__main__")
+
+
+def _run_benchmark() -> None:
+    # The RL Zoo's calls ``python enjoy.py``, which lies in its own checkout and does not know LAC
+    call = subprocess.call
+    subprocess.call = lambda command: call([sys.executable, "-m", "sb3_lac.zoo", "enjoy", *command[2:]])  # type: ignore
+    try:
+        _run_script("benchmark")
+    finally:
+        subprocess.call = call
+
+
+def _run_plots(name: str) -> None:
+    # Slow to import, and nothing else needs it
+    getattr(import_module("rl_zoo3.plots"), name)()
 
 
 def main(args: Sequence[str] | None = None) -> None:
@@ -166,32 +304,45 @@ def main(args: Sequence[str] | None = None) -> None:
 
     :param args: Command and options, those of the command line by default
     """
+    commands: dict[str, Callable[[], None]] = {
+        "train": lambda: rl_zoo3.train.train(),
+        "optimize": lambda: rl_zoo3.train.train(),
+        "enjoy": lambda: rl_zoo3.enjoy.enjoy(),
+        "record_video": lambda: _run_script("record_video"),
+        "benchmark": _run_benchmark,
+        "all_plots": lambda: _run_plots("all_plots"),
+        "plot_train": lambda: _run_plots("plot_train"),
+        "plot_from_file": lambda: _run_plots("plot_from_file"),
+    }
     prog = "python -m sb3_lac.zoo"
     parser = argparse.ArgumentParser(prog=prog, description="RL Zoo with LAC")
-    parser.add_argument("command", choices=["train", "enjoy", "optimize"], help="what to do")
+    parser.add_argument("command", choices=commands, help="what to do")
     parser.add_argument("options", nargs=argparse.REMAINDER, help="options of the RL Zoo, add --help to see them")
     parsed = parser.parse_args(args)
+    trains = parsed.command in ("train", "optimize")
 
     # Only the options with another default are read here, the RL Zoo reads all of them from sys.argv
-    defaults = argparse.ArgumentParser(prog=prog, add_help=False)
-    defaults.add_argument("--algo", default="lac")
-    if parsed.command != "enjoy":
-        defaults.add_argument("-conf", "--conf-file")
-    known, options = defaults.parse_known_args(parsed.options)
-    options += ["--algo", known.algo]
-    if parsed.command != "enjoy":
-        try:
-            options += ["--conf-file", known.conf_file or str(find_config(known.algo))]
-        except FileNotFoundError as error:
-            parser.error(str(error))
+    options = parsed.options
+    if trains or parsed.command in ("enjoy", "record_video"):
+        defaults = argparse.ArgumentParser(prog=prog, add_help=False)
+        defaults.add_argument("--algo", default="lac")
+        if trains:
+            defaults.add_argument("-conf", "--conf-file")
+        known, options = defaults.parse_known_args(options)
+        options += ["--algo", known.algo]
+        if trains:
+            try:
+                options += ["--conf-file", known.conf_file or str(find_config(known.algo))]
+            except FileNotFoundError as error:
+                parser.error(str(error))
     if parsed.command == "optimize":
         options += ["--optimize-hyperparameters"]
 
+    # Here and not where LAC is registered: who imports this module to use ``rl_zoo3.train`` keeps its search for SAC and TD3
+    HYPERPARAMS_SAMPLER.update(sac=sample_sac_params, td3=sample_td3_params)
+    HYPERPARAMS_CONVERTER.update(sac=convert_sac_params, td3=convert_td3_params)
     sys.argv = [f"{prog} {parsed.command}", *options]
-    if parsed.command == "enjoy":
-        rl_zoo3.enjoy.enjoy()
-    else:
-        rl_zoo3.train.train()
+    commands[parsed.command]()
 
 
 if __name__ == "__main__":

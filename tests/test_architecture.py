@@ -2,10 +2,15 @@
 
 import ast
 import configparser
+import pickle
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
+
+import battery_env
 
 ROOT = Path(__file__).parents[1]
 
@@ -73,9 +78,35 @@ def test_sb3_lac_knows_nothing_of_batteries(path):
     assert batteries <= ({"battery_env"} if path.name == "__init__.py" else set())
 
 
+# each takes a good part of a second to import
+HEAVY = {"matplotlib", "numba", "pandas", "pyarrow", "scipy", "yaml"}
+
+
+@pytest.mark.parametrize(("package", "base"), [("sb3_lac", "stable_baselines3"), ("battery_env", "gymnasium")])
+def test_importing_a_package_registers_its_environments_and_loads_nothing_slow(package, base):
+    code = f"import sys, {base}, gymnasium; before = set(sys.modules); import {package}; "
+    code += "print(*set(sys.modules) - before); gymnasium.spec('BatteryRo-v0')"
+    result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert not HEAVY & {name.split(".")[0] for name in result.stdout.split()}
+
+
+def test_every_public_name_of_battery_env_is_the_one_that_type_checkers_see():
+    tree = ast.parse((ROOT / "battery_env/__init__.py").read_text(encoding="utf-8"))
+    typed = next(node for node in tree.body if isinstance(node, ast.If))
+    for node in typed.body:
+        for alias in node.names:
+            value = getattr(battery_env, alias.name)
+            assert value is getattr(sys.modules[node.module], alias.name)
+            assert pickle.loads(pickle.dumps(value)) is value or alias.name == "NEW_CELL"
+    seen = {alias.name for node in typed.body for alias in node.names}
+    assert seen | {"register_environments"} == set(battery_env.__all__) <= set(dir(battery_env))
+    with pytest.raises(AttributeError, match="'battery_env' has no attribute 'evalute'"):
+        battery_env.evalute  # noqa: B018
+
+
 # names of modules that differ from those of the distributions that bring them
 DISTRIBUTIONS = {"sb3_contrib": "sb3_contrib", "yaml": "rl_zoo3", "optuna": "rl_zoo3"}
-STANDARD = set(__import__("sys").stdlib_module_names)
+STANDARD = set(sys.stdlib_module_names)
 
 
 def declared(file, extras=()):

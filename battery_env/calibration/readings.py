@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike
-from scipy.signal import lfilter
 
 from battery_env.cells import resample_current
 from battery_env.electrochemistry import (
@@ -159,6 +158,8 @@ class Readings:
         :param offset_A: added to the measured current, A
         :return: ``current_A``, ``moved_C`` and ``ohmic_A`` of the measured current, shape (count,)
         """
+        from scipy.signal import lfilter  # slow to import, and only another current sensor needs it
+
         part = self.part(discharge)
         constants = self.parameters.packed.constants[0]
         rate = constants[1] + constants[2]

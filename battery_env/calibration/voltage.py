@@ -13,7 +13,6 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from battery_env.calibration.readings import Readings, explain
 from battery_env.calibration.task import OBSERVATION_LIMIT, CalibrationTask, Parameter, checked_action
@@ -277,6 +276,8 @@ class VoltageTask(CalibrationTask):
                 array[row, :length] = values
 
     def _process_noise_V(self, draws: FloatArray) -> FloatArray:
+        from scipy.signal import lfilter  # slow to import, and only process noise needs it
+
         cell, dt_s = self.readings.parameters, self.readings.dt_s
         total = np.zeros(draws.shape[1])
         for draw, time_constant_s in zip(draws, (cell.to, cell.tsn, cell.tsp), strict=True):

@@ -1,6 +1,5 @@
 import numpy as np
 from gymnasium import spaces
-from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 
 from sb3_lac.envs.base import CostEnv, check_not_negative, check_positive
 
@@ -84,6 +83,8 @@ class LinearCostEnv(CostEnv):
         :param gamma: The discount factor
         :return: K, shape (1, 2)
         """
+        from scipy.linalg import solve_discrete_are  # slow to import, and no training needs it
+
         a, b = np.sqrt(gamma) * self.A, np.sqrt(gamma) * self.B
         p = solve_discrete_are(a, b, self.Q, self.R)
         return np.linalg.solve(self.R + b.T @ p @ b, b.T @ p @ a)
@@ -97,6 +98,8 @@ class LinearCostEnv(CostEnv):
         :return: P, shape (2, 2)
         :raises ValueError: If the discounted sum of costs is infinite with this policy
         """
+        from scipy.linalg import solve_discrete_lyapunov
+
         closed_loop = np.sqrt(gamma) * (self.A - self.B @ gain)
         radius = np.abs(np.linalg.eigvals(closed_loop)).max()
         if not radius < 1:

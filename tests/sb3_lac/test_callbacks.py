@@ -1,19 +1,26 @@
 import os
 
+import gymnasium as gym
 import numpy as np
 import pandas as pd
 import pytest
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 
-from sb3_lac import LAC, CalibrationCallback
+from battery_env import PolicyEstimator, TrajectoryDataset, evaluate
+from sb3_lac import LAC, CalibrationCallback, GymnasiumVecEnv
+
+
+def callback_of(*args, **kwargs):
+    """A callback for the metric of the evaluations below."""
+    return CalibrationCallback(*args, **{"metrics": ("mape_percent",), **kwargs})
 
 
 class Evaluation:
-    """An evaluation with known results: one mean error per call, plus and minus one."""
+    """An evaluation with known results: one mean error per call after the one before the training, plus and minus one."""
 
     def __init__(self, *means):
-        self.means = list(means)
+        self.means = [0.0, *means]
         self.models = []
 
     def __call__(self, model):
@@ -28,10 +35,10 @@ def test_mean_and_worst_are_logged_at_their_timesteps(make_model):
     original_dump = model.logger.dump
     model.logger.dump = lambda step: (dumps.append((step, dict(model.logger.name_to_value))), original_dump(step))
     evaluation = Evaluation(5.0, 3.0)
-    callback = CalibrationCallback(evaluation, eval_freq=10, metrics={"mape_percent": "mape", "bias": "bias"}, verbose=0)
+    callback = callback_of(evaluation, eval_freq=10, metrics={"mape_percent": "mape", "bias": "bias"}, verbose=0)
     model.learn(25, callback=callback, log_interval=None)
 
-    assert evaluation.models == [model, model]
+    assert evaluation.models == [model] * 3
     assert [step for step, _ in dumps] == [10, 20]
     assert {name: value for name, value in dumps[1][1].items() if "calibration" in name} == {
         "calibration/mape": 3.0,
@@ -45,13 +52,13 @@ def test_mean_and_worst_are_logged_at_their_timesteps(make_model):
 
 
 def test_frequency_counts_calls_and_not_timesteps(make_model, make_env):
-    callback = CalibrationCallback(Evaluation(1.0, 1.0), eval_freq=5, verbose=0)
+    callback = callback_of(Evaluation(1.0, 1.0), eval_freq=5, verbose=0)
     make_model(make_vec_env(make_env, n_envs=3), n_collect=0).learn(30, callback=callback)
     assert [entry["timesteps"] for entry in callback.history] == [15, 30]
 
 
 def test_no_evaluation_without_frequency(make_model):
-    callback = CalibrationCallback(Evaluation(), eval_freq=-1)
+    callback = callback_of(Evaluation(), eval_freq=-1)
     make_model(n_collect=0).learn(10, callback=callback)
     assert callback.history == []
 
@@ -63,7 +70,7 @@ def test_history_and_best_model_are_saved_and_continued(make_model, tmp_path, mo
     monkeypatch.setattr(os, "replace", lambda source, target: (renames.append(target), original_replace(source, target)))
 
     def learn(model, n_steps, *means):
-        callback = CalibrationCallback(
+        callback = callback_of(
             Evaluation(*means), eval_freq=10, log_path=log_path, best_model_save_path=str(best_path), verbose=0
         )
         model.learn(n_steps, callback=callback, reset_num_timesteps=False)
@@ -95,7 +102,7 @@ def test_missing_result_of_a_trajectory_is_not_hidden(make_model):
     def evaluate(model):
         return pd.DataFrame({"mape_percent": [1.0, np.nan]})
 
-    callback = CalibrationCallback(evaluate, eval_freq=5, verbose=0)
+    callback = callback_of(evaluate, eval_freq=5, verbose=0)
     make_model(n_collect=0).learn(5, callback=callback)
     assert np.isnan(callback.history[0]["mape_percent"]) and np.isnan(callback.history[0]["mape_percent_worst"])
     assert callback.best_objective == np.inf
@@ -113,7 +120,7 @@ class Count(BaseCallback):
 
 def test_child_callbacks_are_triggered(make_model, capsys):
     on_new_best, after_eval = Count(), Count()
-    callback = CalibrationCallback(
+    callback = callback_of(
         Evaluation(3.0, 4.0, 2.0), eval_freq=5, callback_on_new_best=on_new_best, callback_after_eval=after_eval
     )
     make_model(n_collect=0).learn(15, callback=callback)
@@ -124,13 +131,32 @@ def test_child_callbacks_are_triggered(make_model, capsys):
 
 @pytest.mark.parametrize("name", ["callback_on_new_best", "callback_after_eval"])
 def test_child_callback_can_stop_training(make_model, name):
-    callback = CalibrationCallback(Evaluation(3.0), eval_freq=5, verbose=0, **{name: Count(stop=True)})
+    callback = callback_of(Evaluation(3.0), eval_freq=5, verbose=0, **{name: Count(stop=True)})
     assert make_model(n_collect=0).learn(100, callback=callback).num_timesteps == 5
 
 
-def test_wrong_columns_are_named(make_model):
+def test_wrong_columns_are_named_before_the_training(make_model, tmp_path):
     with pytest.raises(ValueError, match="at least one column"):
-        CalibrationCallback(Evaluation(), metrics="mape_percent")
-    callback = CalibrationCallback(Evaluation(1.0), eval_freq=1, metrics=("rmse",))
+        callback_of(Evaluation(), metrics="mape_percent")
+    model = make_model(n_collect=0)
+    callback = callback_of(Evaluation(), metrics=("rmse",), best_model_save_path=tmp_path / "best")
     with pytest.raises(ValueError, match=r"no column \['rmse'\], its columns are \['mape_percent', 'bias', 'label'\]"):
-        make_model(n_collect=0).learn(1, callback=callback)
+        model.learn(1, callback=callback)
+    assert model.num_timesteps == 0 and not (tmp_path / "best").exists()
+
+
+@pytest.mark.parametrize("env_id, parameters", [("BatteryRo-v0", ("r_o",)), ("BatteryJoint-v0", ("q_mobile", "r_o"))])
+@pytest.mark.parametrize("batched", [False, True])
+def test_default_metrics_are_those_of_the_parameters_that_the_environment_finds(env_id, parameters, batched):
+    env = GymnasiumVecEnv(gym.make_vec(env_id, 2, autoreset_mode="SameStep")) if batched else make_vec_env(env_id)
+    discharges = TrajectoryDataset.paper("r_o")[:2]
+    callback = CalibrationCallback(lambda model: evaluate(PolicyEstimator(model, env_id), discharges), eval_freq=2, verbose=0)
+    LAC("MlpPolicy", env, buffer_size=10, device="cpu").learn(4, callback=callback)
+    names = [f"{parameter}_mape_percent{which}" for parameter in parameters for which in ("", "_worst")]
+    assert list(callback.history[0]) == ["timesteps", *names]
+    assert callback.objective == names[0]
+
+
+def test_environments_that_do_not_say_what_they_find_need_metrics(make_model):
+    with pytest.raises(ValueError, match="metrics must be given"):
+        make_model(n_collect=0).learn(1, callback=CalibrationCallback(Evaluation()))

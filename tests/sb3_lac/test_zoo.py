@@ -17,7 +17,7 @@ import optuna
 import rl_zoo3
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 
-from sb3_lac import LAC, GymnasiumVecEnv
+from sb3_lac import LAC, GymnasiumVecEnv, zoo
 from sb3_lac.zoo import LACExperimentManager, find_config, main, steps_as_one_batch
 
 ENV = "Pendulum-v1"
@@ -69,6 +69,28 @@ def test_train_continue_and_enjoy(workdir, capsys):
     assert "1 Episodes" in capsys.readouterr().out
 
 
+def test_videos_and_plots_of_a_training(workdir, monkeypatch):
+    shown = []
+    monkeypatch.setattr("matplotlib.pyplot.show", lambda: shown.append(True))
+    main(["train", "--env", ENV, "--eval-freq", "30", "--eval-episodes", "2", "-n", "300"])
+    main(["record_video", "--env", ENV, "-f", "logs", "-n", "3"])
+    assert list((workdir / "logs" / "lac" / f"{ENV}_1" / "videos").glob("*.mp4"))
+    main(["all_plots", "-a", "lac", "-e", ENV, "-f", "logs", "-o", "plots", "--no-display"])
+    assert (workdir / "plots.pkl").exists() and not shown
+    main(["plot_train", "-a", "lac", "-e", ENV, "-f", "logs", "-w", "1"])
+    assert shown
+
+
+def test_benchmark_runs_enjoy_with_lac(workdir, monkeypatch, capsys):
+    commands = []
+    monkeypatch.setattr(subprocess, "call", lambda command: commands.append(command) or 1)
+    (workdir / "logs" / "lac" / "run" / ENV).mkdir(parents=True)
+    (workdir / "logs" / "lac" / "run" / ENV / "args.yml").write_text(f"env: {ENV}")
+    with pytest.raises(FileNotFoundError):  # the report, for which there is no folder as nothing was run
+        main(["benchmark", "--log-dir", "logs", "--no-hub"])
+    assert commands[0][:4] == [sys.executable, "-m", "sb3_lac.zoo", "enjoy"] and "lac" in commands[0]
+
+
 def test_optimize(workdir):
     options = ["--n-trials", "2", "--n-startup-trials", "1", "--n-evaluations", "1", "--eval-episodes", "1"]
     storage = ["--storage", str(workdir / "study.log"), "--study-name", "lac"]
@@ -79,17 +101,67 @@ def test_optimize(workdir):
     assert {"alpha3", "lambda_max", "output_dim", "lambda_learning_rate"} <= set(trials[0].params)
 
 
-def test_every_sample_is_a_valid_model(make_env):
+@pytest.fixture
+def wrapped(workdir, monkeypatch):
+    """The samplers as the commands of the wrapper set them, taken back afterwards."""
+    monkeypatch.setattr(zoo, "HYPERPARAMS_SAMPLER", (sampler := {**HYPERPARAMS_SAMPLER}))
+    monkeypatch.setattr(zoo, "HYPERPARAMS_CONVERTER", (converter := {**HYPERPARAMS_CONVERTER}))
+    monkeypatch.setattr(rl_zoo3.train, "train", lambda: None)
+    main(["optimize"])
+    return sampler, converter
+
+
+def tuned(algo):
+    """Hyperparameters of the battery tasks with the full state."""
+    return yaml.safe_load((Path(__file__).parents[2] / "zoo_configs" / f"{algo}.yml").read_text())["BatteryQmax-v0"]
+
+
+@pytest.mark.parametrize("algo", ["lac", "sac", "td3"])
+def test_every_sample_is_a_valid_model(algo, make_env, wrapped):
+    sampler, converter = wrapped
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     for _ in range(5):
         trial = study.ask()
-        hyperparams = HYPERPARAMS_SAMPLER["lac"](trial, 2, 1, {"using_her_replay_buffer": False, "her_kwargs": {}})
-        # What is loaded from a finished trial is what was tried
-        assert HYPERPARAMS_CONVERTER["lac"](trial.params) == hyperparams
-        model = LAC("MlpPolicy", make_env(), buffer_size=10, device="cpu", **hyperparams)
-        assert model.alpha3 == trial.params["alpha3"]
-        assert model.lambda_init == model.lambda_max == trial.params["lambda_max"]
-        assert model.critic.output_dim == trial.params["output_dim"]
+        hyperparams = sampler[algo](trial, 2, 1, {"using_her_replay_buffer": False, "her_kwargs": {}})
+        # What is loaded from a finished trial is what was tried, with the noise as a configuration has it
+        loaded = converter[algo](trial.params)
+        if algo == "td3":
+            assert loaded.pop("noise_type") == "normal"
+            np.testing.assert_array_equal(hyperparams.pop("action_noise")._sigma, np.full(2, loaded.pop("noise_std")))
+        assert loaded == hyperparams
+        # Those of the configuration belong together
+        assert not {"train_freq", "gradient_steps", "n_envs"} & set(hyperparams)
+        model = rl_zoo3.ALGOS[algo]("MlpPolicy", make_env(), buffer_size=10, device="cpu", **hyperparams)
+        if algo == "lac":
+            assert model.alpha3 == trial.params["alpha3"]
+            assert model.lambda_init == model.lambda_max == trial.params["lambda_max"]
+            assert model.critic.output_dim == trial.params["output_dim"]
+        if algo != "td3":
+            assert model.log_ent_coef.exp().item() == pytest.approx(trial.params["ent_coef_init"])
+            assert model.target_entropy == trial.params["target_entropy"]
+
+
+@pytest.mark.parametrize("algo", ["lac", "sac", "td3"])
+def test_a_search_can_find_the_tuned_hyperparameters(algo, wrapped):
+    best = tuned(algo)
+    initial_ent_coef = float(best.get("ent_coef", "auto_0.02").removeprefix("auto_"))
+    point = {
+        "one_minus_gamma": 1 - best["gamma"],
+        "learning_rate": 1e-3,
+        "ent_coef_init": initial_ent_coef,
+        "target_entropy": best.get("target_entropy"),
+        "noise_std": best.get("noise_std"),
+        "target_policy_noise": best.get("target_policy_noise"),
+        "batch_size_pow": 8,
+        "net_arch": "large",
+        "activation_fn": "leaky_relu",
+    }
+    trial = optuna.create_study().ask()
+    wrapped[0][algo](trial, 1, 1, {"using_her_replay_buffer": False, "her_kwargs": {}})
+    for name, distribution in trial.distributions.items():
+        if name in point:
+            assert distribution._contains(distribution.to_internal_repr(point[name])), name
+    assert {"one_minus_gamma", "noise_std" if algo == "td3" else "target_entropy"} <= set(trial.distributions)
 
 
 def test_sampler_knows_hindsight_experience_replay():
@@ -97,6 +169,53 @@ def test_sampler_knows_hindsight_experience_replay():
     additional_args = {"using_her_replay_buffer": True, "her_kwargs": {"copy_info_dict": True}}
     hyperparams = HYPERPARAMS_SAMPLER["lac"](trial, 2, 1, additional_args)
     assert set(hyperparams["replay_buffer_kwargs"]) == {"copy_info_dict", "n_sampled_goal", "goal_selection_strategy"}
+
+
+def test_importing_the_wrapper_leaves_the_search_for_other_algorithms_alone():
+    code = "import rl_zoo3.hyperparams_opt as h; before = {**h.HYPERPARAMS_SAMPLER}; import sb3_lac.zoo; "
+    result = run_python(
+        "-c", code + "print({name for name in h.HYPERPARAMS_SAMPLER if h.HYPERPARAMS_SAMPLER[name] != before.get(name)})"
+    )
+    assert result.stdout.strip() == "{'lac'}"
+
+
+def manager_of(env_id, folder, algo="lac", **options):
+    arguments = {"config": "zoo_configs/lac.yml", "eval_freq": -1, "verbose": 0, "seed": 5, **options}
+    return LACExperimentManager(argparse.Namespace(), algo, env_id, str(folder), **arguments)
+
+
+def test_trials_on_batteries_are_scored_on_held_out_discharges(workdir):
+    def discharges(manager, **options):
+        return manager.create_envs(1, no_log=True, **options).get_attr("task")[0].dataset
+
+    manager = manager_of("BatteryRo-v0", workdir, optimize_hyperparameters=True, env_kwargs={"load": "constant"})
+    training, evaluation = discharges(manager), discharges(manager, eval_env=True)
+    assert len(training) and len(evaluation) and not set(training.r_o) & set(evaluation.r_o)
+    assert manager_of(
+        "BatteryRo-v0", workdir, eval_env_kwargs={"split": "all"}, optimize_hyperparameters=True
+    ).eval_env_kwargs == {"split": "all"}
+    assert not manager_of(ENV, workdir, optimize_hyperparameters=True).eval_env_kwargs
+
+
+@pytest.mark.parametrize("command", ["train", "optimize"])
+def test_a_training_without_an_update_is_refused_before_anything_is_written(command, workdir):
+    with pytest.raises(ValueError, match="n_timesteps=40 must be more than learning_starts=40"):
+        main([command, "--env", ENV, "-n", "40", "--eval-freq", "-1"])
+    assert not (workdir / "logs").exists()
+
+
+def test_the_default_of_learning_starts_is_that_of_the_algorithm(workdir):
+    config = {"default": {"policy": "MlpPolicy", "n_timesteps": 100}}
+    (workdir / "zoo_configs" / "lac.yml").write_text(yaml.dump(config))
+    with pytest.raises(ValueError, match="learning_starts=100"):
+        manager_of(ENV, workdir).setup_experiment()
+    # PPO has none
+    manager_of(ENV, workdir, algo="ppo").setup_experiment()
+
+
+def test_the_experiment_manager_knows_the_hyperparameters_of_lac(workdir):
+    assert manager_of(ENV, workdir, config=None).config == str(workdir / "zoo_configs" / "lac.yml")
+    assert "rl_zoo3" in manager_of(ENV, workdir, algo="sac", config=None).config
 
 
 def test_config_of_the_current_folder_comes_first(workdir):
@@ -143,8 +262,7 @@ class TestEnvironments:
         (workdir / "zoo_configs" / "lac.yml").write_text(yaml.dump({"default": {**CONFIG["default"], "n_envs": 3}}))
 
         def set_up(env_id):
-            options = {"config": "zoo_configs/lac.yml", "eval_freq": -1, "verbose": 0, "seed": 5}
-            manager = LACExperimentManager(argparse.Namespace(), "lac", env_id, str(workdir), **options)
+            manager = manager_of(env_id, workdir)
             return manager.setup_experiment()[0], Path(manager.save_path)
 
         return set_up
