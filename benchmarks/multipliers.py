@@ -63,9 +63,9 @@ def run(env_id: str, alpha3: float, lambda_max: float, seed: int, out: Path) -> 
     env.reset(seed=_EVALUATION_SEED)
     returns, lengths = evaluate_policy(model, env, _EPISODES, return_episode_rewards=True)
     assert isinstance(returns, list) and isinstance(lengths, list)
-    report = evaluate_lyapunov(
+    metrics = evaluate_lyapunov(
         model, gym.make(env_id), n_eval_episodes=_EPISODES, deterministic=True, seed=_EVALUATION_SEED
-    ).to_frame()
+    ).metrics
     assert model.log_ent_coef is not None
     return {
         "env": env_id,
@@ -74,12 +74,12 @@ def run(env_id: str, alpha3: float, lambda_max: float, seed: int, out: Path) -> 
         "seed": seed,
         # per step of the whole episode, so that an early death is not cheap
         "cost": -np.sum(returns) / np.sum(lengths),
-        "death_rate": report.loc["death_rate", "value"],
+        "death_rate": metrics["death_rate"].value,
         "lambda": float(model.log_lambda.detach().exp()),
         "ent_coef": float(model.log_ent_coef.detach().exp()),
-        "decrease": report.loc["decrease", "value"],
-        "condition_holds": bool(report.loc["decrease", "high"] < 0),
-        "largest_feasible_alpha3": report.loc["largest_feasible_alpha3", "value"],
+        "decrease": metrics["decrease"].value,
+        "condition_holds": metrics["decrease"].high < 0,
+        "largest_feasible_alpha3": metrics["largest_feasible_alpha3"].value,
     }
 
 

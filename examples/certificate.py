@@ -37,5 +37,5 @@ print(report.summary())
 report.plot().savefig(folder / "certificate.png")
 report.plot_phase(2, 3, names).savefig(folder / "phase.png")
 
-wide = evaluate_lyapunov(model, WideStarts(gym.make("CartPoleCost-v0")), n_eval_episodes=300, deterministic=True, seed=1)
+wide = evaluate_lyapunov(model, WideStarts(gym.make("CartPoleCost-v0")), n_eval_episodes=300, seed=1)
 wide.plot_region_of_attraction(2, 3, names).savefig(folder / "region_of_attraction.png")

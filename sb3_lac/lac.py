@@ -547,7 +547,7 @@ class LAC(OffPolicyAlgorithm):
             self.largest_stored_reward = largest_reward
             self.reward_bound = self.reward_bound.clamp(min=largest_reward)
             self.update_offset(vec_normalize)
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)  # type: ignore[arg-type]
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     def _compute_costs(self, rewards: th.Tensor, n_rewards: th.Tensor | float = 1.0) -> th.Tensor:
         """

@@ -81,13 +81,13 @@ def test_report_has_means_with_intervals_over_seeds():
     results = pd.DataFrame(
         {"env": ENV_ID, "alpha3": 0.1, "lambda_max": 1.0, "seed": [0, 1, 2], "cost": [1.0, 9.0, 2.0], "death_rate": 0.0}
         | {"lambda": [0.25, 0.5, 0.75], "ent_coef": 0.1, "decrease": -3.0, "condition_holds": [True, False, True]}
-        | {"largest_feasible_alpha3": 0.125}
+        | {"largest_feasible_alpha3": [0.1, 0.125, 0.15]}
     )
     _, _, line = multipliers.report(results).strip().splitlines()
     cells = [cell.strip() for cell in line.strip("|").split("|")]
     # 4 -+ t(0.975, 2) sqrt(19 / 3), with t = 4.303
     assert cells == [
-        ENV_ID, "0.1", "1", "4 [-6.83, 14.8]", "0", "0.5", "5", "0.125 [0.125, 0.125]", "2 of 3",
+        ENV_ID, "0.1", "1", "4 [-6.83, 14.8]", "0", "0.5", "5", "0.125 [0.0629, 0.187]", "2 of 3",
     ]  # fmt: skip
 
 
