@@ -58,8 +58,9 @@ from battery_env.kernels import PackedConstants, cell_step, cell_voltage
 _Q, _R, _OFFSET = range(3)
 # What the bank remembers: the current since the last sample (A), the mean of the noise that innovations showed (V^2), the last
 # innovations (of the mixture, normalized), the sum of the products of each with those before it and its variance, both over
-# about so many samples, and how many standard deviations that sum has been above 0 at most.
-_CURRENT, _NOISE, _LAST, _PRODUCTS, _VARIANCE, _TREND = range(6)
+# about so many samples, how many standard deviations that sum has been above 0 at most, and the range that r_o cannot leave
+# if what the filter said about it before was right (q_mobile can: at the knee the error of the model moves it).
+_CURRENT, _NOISE, _LAST, _PRODUCTS, _VARIANCE, _TREND, _LEAST_R, _MOST_R = range(8)
 _TREND_MEMORY, _PRODUCTS_MEMORY = 0.8, 0.999
 # It runs three copies of the model: at its estimate, with this much more q_mobile, and with this much more r_o; their
 # differences are the derivatives of the state.
@@ -86,9 +87,9 @@ _PRIOR_SD_SHARE_Q = 0.25
 _PRIOR_SD_R_OHM = 0.15
 _HOUR_S = 3600.0
 _NOISE_V = 0.005
-# Successive innovations of a filter that follows its cell are uncorrelated; this many standard deviations above that they are
-# not, and the filter does not.
-_TREND_LIMIT_SD = 5.0
+# Successive innovations of a filter that follows its cell are uncorrelated, and its estimates stay where it said that they
+# are. This many standard deviations away from either, the filter does not follow its cell.
+_LIMIT_SD = 5.0
 # The data must have narrowed a prior by this share of its width before a deviation from it says anything.
 _LEAST_NARROWING = 0.2
 # A full cell takes no more charge than this share of its own.
@@ -305,6 +306,12 @@ def _take(
     out[n, 2] = sqrt(qq / total - q * q)
     out[n, 3] = sqrt(rr / total - r * r)
     out[n, 4] = 1.0 if _keep_alive(state, mean, p, best, settings, per_q) else 0.0
+    reach = _LIMIT_SD * out[n, 3]
+    if reach > 0.0:
+        memory[_LEAST_R] = max(memory[_LEAST_R], out[n, 1] - reach)
+        memory[_MOST_R] = min(memory[_MOST_R], out[n, 1] + reach)
+        if not memory[_LEAST_R] <= out[n, 1] <= memory[_MOST_R]:
+            memory[_TREND] = inf
     out[n, 5] = memory[_TREND]
 
 
@@ -363,6 +370,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
       standard deviations above 0, with twice ``mismatch_V`` allowed for. It comes to that where the error of the model or the
       noise is far larger than stated, a sensor fails, or the cell was charged without :meth:`reset`; one wild sample does no
       harm;
+    - ``r_o`` is where it was before, within 5 of the standard deviations stated then;
     - a given prior is within 2.5 standard deviations of what the data say.
 
     Otherwise ``reason`` of the estimate says which of these does not hold. In particular an estimate that rests on a prior is
@@ -474,8 +482,10 @@ class ExtendedKalmanFilter(OnlineEstimator):
         state = np.zeros((_COPIES * filters + 1, STATE_SIZE))
         state[:-1] = initial_state(np.repeat(means, _COPIES), self.cell)
         state[1:-1:_COPIES, QNB:] += _MORE_Q_C * FULL_CHARGE_SHARES
+        memory = np.zeros(8)
+        memory[_LEAST_R:] = [-inf, inf]
         mean = np.column_stack([means, np.full(filters, r_o), np.zeros(filters)])
-        return _Bank(state, mean, covariance, -0.5 * deviations**2, np.zeros(filters), np.zeros(filters), np.zeros(6))
+        return _Bank(state, mean, covariance, -0.5 * deviations**2, np.zeros(filters), np.zeros(filters), memory)
 
     def reset(self) -> None:
         """
@@ -552,7 +562,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
             conditions.append((~inside, AT_BOUND.format(name)))
         if "q_mobile" in self.parameters:
             conditions.append((~is_plausible(q, self.cell), IMPLAUSIBLE))
-        conditions.append((trend > _TREND_LIMIT_SD, MISFIT))
+        conditions.append((trend > _LIMIT_SD, MISFIT))
         for name, (mean, prior_sd) in self._carried.items():
             narrowed = np.maximum(prior_sd**2 - own_sd[name] ** 2, (_LEAST_NARROWING * prior_sd) ** 2)
             contradicted = (values[name] - mean) ** 2 > PRIOR_LIMIT_SD**2 * narrowed
