@@ -203,7 +203,7 @@ class TestOnline:
 
     def test_a_current_of_the_wrong_sign_is_refused(self):
         filter_ = ExtendedKalmanFilter()
-        with pytest.raises(ValueError, match="this record draws -78 C in total"):
+        with pytest.raises(ValueError, match="this record draws -76 C in total"):
             for _ in range(60):
                 filter_.update(4.0, -2.0, 1.0)
         record = measured()
