@@ -215,7 +215,7 @@ def counts(answers: pd.DataFrame) -> pd.DataFrame:
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None, derandomize=True, database=None)
+@settings(max_examples=40, deadline=None, derandomize=True, database=None)
 @given(fault=st.sampled_from([fault for fault in FAULTS if fault not in UNOBSERVABLE]), seed=st.integers(0, 10_000))
 def test_no_calibrator_is_sure_of_a_wrong_answer(fault, seed):
     rng = np.random.default_rng(seed)
