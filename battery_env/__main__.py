@@ -13,6 +13,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -22,6 +23,7 @@ from battery_env.cells import BUNDLED_CELLS, Discharge, load_nasa_discharges, re
 from battery_env.electrochemistry import NEW_CELL, FloatArray
 from battery_env.estimators.base import Estimate
 from battery_env.estimators.least_squares import LeastSquares
+from battery_env.estimators.record_model import ExpectedCurrent, expected_current
 from battery_env.files import replacing
 from battery_env.plotting import COLOURS, new_figure, save_figure
 
@@ -57,7 +59,7 @@ def _parser() -> argparse.ArgumentParser:
         nargs=2,
         type=float,
         metavar=("MEAN", "SD"),
-        help="q_mobile as known from an earlier discharge, C; needed while a discharge is in progress",
+        help="q_mobile as known from an earlier discharge, C; while a discharge is in progress the estimate rests on it",
     )
     calibrate.add_argument(
         "--mismatch",
@@ -65,6 +67,19 @@ def _parser() -> argparse.ArgumentParser:
         default=0.05,
         metavar="V",
         help="error to expect of the model itself, V; 0 for simulated data (default: %(default)s)",
+    )
+    calibrate.add_argument(
+        "--current-gain-sd",
+        type=float,
+        default=0.005,
+        metavar="SHARE",
+        help="standard deviation of the gain of the current sensor, which q_mobile and r_o share (default: %(default)s)",
+    )
+    calibrate.add_argument(
+        "--future-current",
+        type=float,
+        metavar="A",
+        help="current after the end of a record in progress, A (default: its last one, or its mean if it varied)",
     )
     calibrate.add_argument("--isothermal", action="store_true", help="keep the temperature of the model constant")
     calibrate.add_argument("--discharge-is-negative", action="store_true", help="the file counts discharge as negative")
@@ -104,10 +119,17 @@ def _calibrate(options: argparse.Namespace) -> None:
         thermal=not options.isothermal,
         prior_q_mobile_C=tuple(options.prior_q) if options.prior_q else None,
         mismatch_V=options.mismatch,
+        current_gain_sd=options.current_gain_sd,
     )
     estimate = calibrator.estimate(record)
-    row = _summary(calibrator, record, estimate, discharge.eod_time_s(options.cut_off), options.cut_off)
-    _print(name, record, row, options.parameters, options.cut_off)
+    future = expected_current(record.time_s, record.current_A)
+    if options.future_current is not None:
+        future = ExpectedCurrent(options.future_current, varied=False, sd_A=0.0)
+    row = _summary(calibrator, record, estimate, discharge.eod_time_s(options.cut_off), options.cut_off, future)
+    _print(name, record, row, options.parameters, options.cut_off, future)
+    if not options.prior_q and not estimate.settled and np.isnan(row["measured_eod_time_s"]):
+        print("During a discharge give --prior-q with the q_mobile of an earlier one of this cell. Without it the filter in")
+        print("Python, ExtendedKalmanFilter(thermal=True, mismatch_V=0.05), predicts the end better than this fit.")
     if outputs:
         model_V = calibrator.predict_voltage_V(record, estimate)
         with replacing(outputs[0]) as part:
@@ -115,7 +137,8 @@ def _calibrate(options: argparse.Namespace) -> None:
         columns = {"time_s": record.time_s, "voltage_V": record.voltage_V, "current_A": record.current_A, "model_V": model_V}
         with replacing(outputs[1]) as part:
             pd.DataFrame(columns).to_csv(part, index=False)
-        save_figure(_figure(name, record, model_V, calibrator.forecast(record, estimate, options.cut_off)), outputs[2])
+        forecast = calibrator.forecast(record, estimate, options.cut_off, future.mean_A)
+        save_figure(_figure(name, record, model_V, forecast), outputs[2])
         print("\nwritten: " + ", ".join(map(str, outputs)))
 
 
@@ -136,9 +159,15 @@ def _read(record: str, discharge_is_negative: bool) -> tuple[str, Discharge]:
 
 
 def _summary(
-    calibrator: LeastSquares, record: Discharge, estimate: Estimate, measured_eod_s: float, cut_off_V: float
-) -> dict[str, float | bool]:
-    predicted_eod_s = calibrator.predict_eod_time_s(record, estimate, cut_off_V)
+    calibrator: LeastSquares,
+    record: Discharge,
+    estimate: Estimate,
+    measured_eod_s: float,
+    cut_off_V: float,
+    future: ExpectedCurrent,
+) -> dict[str, Any]:
+    predicted_eod_s = calibrator.predict_eod_time_s(record, estimate, cut_off_V, future.mean_A)
+    remaining_s = max(predicted_eod_s - float(record.time_s[-1]), 0.0) if np.isnan(measured_eod_s) else 0.0
     residual_V = calibrator.predict_voltage_V(record, estimate) - record.voltage_V
     return {
         "q_mobile_C": estimate.q_mobile,
@@ -146,17 +175,29 @@ def _summary(
         "r_o_ohm": estimate.r_o,
         "sd_r_o_ohm": estimate.sd_r_o,
         "settled": estimate.settled,
+        "reason": estimate.reason,
+        "drawn_Ah": record.charge_C / 3600.0,
         "state_of_health": estimate.q_mobile / NEW_CELL.q_mobile if "q_mobile" in calibrator.parameters else float("nan"),
         "voltage_rmse_V": float(np.sqrt(np.nanmean(residual_V**2))),
         "predicted_eod_time_s": predicted_eod_s,
-        # the charge still to come moves with q_mobile
-        "sd_predicted_eod_time_s": estimate.sd_q_mobile / float(record.current_A[-1]),
+        "sd_predicted_eod_time_s": _sd_eod_s(estimate, remaining_s, future),
         "measured_eod_time_s": measured_eod_s,
-        "remaining_s": max(predicted_eod_s - float(record.time_s[-1]), 0.0) if np.isnan(measured_eod_s) else 0.0,
+        "remaining_s": remaining_s,
+        "future_current_A": future.mean_A,
     }
 
 
-def _print(name: str, record: Discharge, row: dict[str, float | bool], fitted: Sequence[str], cut_off_V: float) -> None:
+def _sd_eod_s(estimate: Estimate, remaining_s: float, future: ExpectedCurrent) -> float:
+    """The charge still to come moves with q_mobile, and is drawn at a current that may not be the one assumed."""
+    if not future.mean_A > 0.0:
+        return float("nan")
+    return float(np.hypot(estimate.sd_q_mobile, remaining_s * future.sd_A)) / future.mean_A
+
+
+def _print(
+    name: str, record: Discharge, row: dict[str, Any], fitted: Sequence[str], cut_off_V: float, future: ExpectedCurrent
+) -> None:
+    in_progress = np.isnan(row["measured_eod_time_s"])
     lines = {
         "q_mobile": (f"{row['q_mobile_C']:.0f} C", f"{row['sd_q_mobile_C']:.0f} C"),
         "r_o": (f"{row['r_o_ohm']:.4f} ohm", f"{row['sd_r_o_ohm']:.4f} ohm"),
@@ -165,18 +206,19 @@ def _print(name: str, record: Discharge, row: dict[str, float | bool], fitted: S
     for parameter, (value, sd) in lines.items():
         print(f"  {parameter:<22}{value:>12}   {'sd ' + sd if parameter in fitted else 'held'}")
     print(f"  {'settled':<22}{'yes' if row['settled'] else 'no':>12}")
+    print(f"  {'drawn':<22}{row['drawn_Ah']:>9.3f} Ah   {'so far' if in_progress else f'the capacity to {cut_off_V:g} V'}")
     if "q_mobile" in fitted:
         print(f"  {'state of health':<22}{row['state_of_health']:>12.3f}   q_mobile / {NEW_CELL.q_mobile:g} C")
     print(f"  {'voltage RMSE':<22}{1e3 * row['voltage_rmse_V']:>9.1f} mV")
     print(f"  {f'{cut_off_V:g} V, predicted at':<22}{row['predicted_eod_time_s']:>10.0f} s")
-    if np.isnan(row["measured_eod_time_s"]):
+    if in_progress:
         sure = f"sd {row['sd_predicted_eod_time_s']:.0f} s, " if "q_mobile" in fitted else ""
-        print(f"  {'remaining':<22}{row['remaining_s']:>10.0f} s   {sure}at the last current")
+        load = "the mean current so far, an assumption: the load varied" if future.varied else "to go on"
+        print(f"  {'remaining':<22}{row['remaining_s']:>10.0f} s   {sure}{future.mean_A:.3g} A {load}")
     else:
         print(f"  {f'{cut_off_V:g} V, measured at':<22}{row['measured_eod_time_s']:>10.0f} s")
     if not row["settled"]:
-        print("\nNot settled: this record does not determine the parameters. Record to the end of discharge, or give")
-        print("--prior-q with the q_mobile of an earlier discharge of this cell.")
+        print(f"\nNot settled: {row['reason']}")
 
 
 def _figure(name: str, record: Discharge, model_V: FloatArray, forecast: tuple[FloatArray, FloatArray]) -> Figure:

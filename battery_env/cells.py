@@ -45,29 +45,108 @@ _PLAUSIBLE: dict[str, tuple[float, float, str, str]] = {
     "temperature_C": (-60.0, 150.0, "degC", "Give the temperature in degrees Celsius, not in kelvin."),
 }
 _DURATION_LIMITS_S = (10.0, 1e6)
+#: Least and greatest time between two samples of a stream, s. Seconds given in milliseconds or in hours are mostly beyond.
+SAMPLE_INTERVAL_LIMITS_S = (1e-3, 600.0)
 
 
-def _checked(name: str, values: ArrayLike) -> FloatArray:
+def _checked(name: str, values: ArrayLike, least_samples: int) -> FloatArray:
     if values is None or np.ma.is_masked(values) or np.iscomplexobj(values):
         raise TypeError(f"{name} must hold real numbers, none of them masked, got {type(values).__name__}")
     try:
         array = np.array(values, dtype=np.float64)
     except (OverflowError, TypeError, ValueError) as error:
         raise TypeError(f"{name} must hold numbers: {error}") from error
-    if array.ndim != 1 or len(array) < _MIN_SAMPLES:
-        raise ValueError(f"{name} must hold one value a sample, at least {_MIN_SAMPLES} of them; got shape {array.shape}")
+    if array.ndim != 1 or len(array) < least_samples:
+        raise ValueError(
+            f"{name} must hold one value a sample, at least {least_samples} samples in all; got shape {array.shape}"
+        )
     bad = np.flatnonzero(~np.isfinite(array))
     if len(bad):
         raise ValueError(f"{name} must be finite, got {array[bad[0]]} at sample {bad[0]}. Remove or fill such samples.")
     if name in _PLAUSIBLE:
-        low, high, unit, hint = _PLAUSIBLE[name]
+        low, high, _, _ = _PLAUSIBLE[name]
         bad = np.flatnonzero((array < low) | (array > high))
         if len(bad):
-            raise ValueError(
-                f"{name} must lie within {low:g} .. {high:g} {unit}, got {array[bad[0]]:g} at sample {bad[0]}. {hint}"
-            )
+            raise ValueError(_implausible(name, float(array[bad[0]]), f" at sample {bad[0]}"))
     array.setflags(write=False)
     return array
+
+
+def _implausible(name: str, value: float, where: str = "") -> str:
+    low, high, unit, hint = _PLAUSIBLE[name]
+    return f"{name} must lie within {low:g} .. {high:g} {unit}, got {value:g}{where}. {hint}"
+
+
+def check_record(
+    time_s: ArrayLike, voltage_V: ArrayLike, current_A: ArrayLike, least_samples: int = 1
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """
+    Refuse samples that cannot be meant.
+
+    :param time_s: times of the samples, s, shape (T,)
+    :param voltage_V: terminal voltage of one cell, V, shape (T,)
+    :param current_A: current, positive in discharge, A, shape (T,)
+    :param least_samples: how many there must be
+    :return: the same as arrays that cannot be written to
+    :raises TypeError: for what is no real number
+    :raises ValueError: for arrays that do not fit together or hold values that are not finite or implausible for one cell, and
+        for times that do not increase
+    """
+    arrays = {
+        name: _checked(name, values, least_samples)
+        for name, values in (("time_s", time_s), ("voltage_V", voltage_V), ("current_A", current_A))
+    }
+    time = arrays["time_s"]
+    for name, array in arrays.items():
+        if len(array) != len(time):
+            raise ValueError(f"{name} has {len(array)} samples, but time_s has {len(time)}")
+    stalls = np.flatnonzero(np.diff(time) <= 0.0)
+    if len(stalls):
+        n = stalls[0] + 1
+        raise ValueError(
+            f"time_s must increase from sample to sample, but sample {n} is at {time[n]:g} s, after {time[n - 1]:g} s. "
+            "Give one discharge at a time, and each sample once."
+        )
+    return time, arrays["voltage_V"], arrays["current_A"]
+
+
+def check_sample(voltage_V: float, current_A: float, dt_s: float | None) -> None:
+    """
+    Refuse one sample of a stream that :func:`check_record` would refuse in a record.
+
+    :param voltage_V: terminal voltage of one cell, V
+    :param current_A: current, positive in discharge, A
+    :param dt_s: time since the previous sample, s; ``None``: this is the first one
+    :raises ValueError: if it cannot be meant
+    """
+    for name, value in (("voltage_V", voltage_V), ("current_A", current_A)):
+        if not np.isfinite(value):
+            raise ValueError(f"{name} must be finite, got {value!r}. Leave a sample out that is missing.")
+        low, high, _, _ = _PLAUSIBLE[name]
+        if not low <= value <= high:
+            raise ValueError(_implausible(name, value))
+    low, high = SAMPLE_INTERVAL_LIMITS_S
+    if dt_s is not None and not low <= dt_s <= high:
+        raise ValueError(
+            f"dt_s, the time since the previous sample, must lie within {low:g} .. {high:g} s, got {dt_s!r}. Give it in "
+            "seconds, not in hours or milliseconds. After a longer gap, start anew with a full cell."
+        )
+
+
+def check_drawn_charge(charge_C: float, least_C: float = 0.0) -> None:
+    """
+    Refuse a current of the wrong sign.
+
+    :param charge_C: charge drawn from the first sample on, C
+    :param least_C: it must be above this
+    :raises ValueError: if it is not
+    """
+    if not charge_C > least_C:
+        raise ValueError(
+            f"current_A is positive in discharge, but this record draws {charge_C:.6g} C in total. If the tester "
+            "counts discharge as negative, flip the sign (read_discharge_csv: discharge_is_negative=True; command "
+            "line: --discharge-is-negative)."
+        )
 
 
 def _knots(time_s: FloatArray, current_A: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -136,30 +215,20 @@ class Discharge:
     meta: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name in ("time_s", "voltage_V", "current_A", "temperature_C"):
-            if name != "temperature_C" or self.temperature_C is not None:
-                object.__setattr__(self, name, _checked(name, getattr(self, name)))
-                if len(getattr(self, name)) != len(self.time_s):
-                    raise ValueError(f"{name} has {len(getattr(self, name))} samples, but time_s has {len(self.time_s)}")
-        stalls = np.flatnonzero(np.diff(self.time_s) <= 0.0)
-        if len(stalls):
-            n = stalls[0] + 1
-            raise ValueError(
-                f"time_s must increase from sample to sample, but sample {n} is at {self.time_s[n]:g} s, after "
-                f"{self.time_s[n - 1]:g} s. Give one discharge at a time, and each sample once."
-            )
+        arrays = check_record(self.time_s, self.voltage_V, self.current_A, _MIN_SAMPLES)
+        for name, array in zip(_COLUMNS, arrays, strict=True):
+            object.__setattr__(self, name, array)
+        if self.temperature_C is not None:
+            object.__setattr__(self, "temperature_C", _checked("temperature_C", self.temperature_C, _MIN_SAMPLES))
+            if len(self.temperature_C) != len(self.time_s):
+                raise ValueError(f"temperature_C has {len(self.temperature_C)} samples, but time_s has {len(self.time_s)}")
         duration_s = self.time_s[-1] - self.time_s[0]
         if not _DURATION_LIMITS_S[0] <= duration_s <= _DURATION_LIMITS_S[1]:
             raise ValueError(
                 f"time_s must span {_DURATION_LIMITS_S[0]:g} .. {_DURATION_LIMITS_S[1]:g} s, got {duration_s:g} s. "
                 "Give the time in seconds, not in hours or milliseconds."
             )
-        if not self.charge_C > 0.0:
-            raise ValueError(
-                f"current_A is positive in discharge, but this record draws {self.charge_C:.6g} C in total. If the tester "
-                "counts discharge as negative, flip the sign (read_discharge_csv: discharge_is_negative=True; command "
-                "line: --discharge-is-negative)."
-            )
+        check_drawn_charge(self.charge_C)
 
     @property
     def charge_C(self) -> float:

@@ -7,7 +7,7 @@ Calibrate the model to every discharge of two real cells, NASA's B0005 and B0006
 
 Two experiments. *Whole discharges*: (q_mobile, r_o) from the voltage between load-on and 2.7 V, against the measured capacity
 and the measured end of discharge. *Discharges in progress*: the same from the first 25, 50 and 75 % only, with and without
-the q_mobile of the previous discharge as a prior; how far off is the predicted end of discharge?
+the q_mobile of the previous discharge as a prior, and by the Kalman filter; how far off is the predicted end of discharge?
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from tqdm import tqdm
 from battery_env.cells import BUNDLED_CELLS, NASA_CITATION, Discharge, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL
 from battery_env.estimators.base import Estimate
+from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.plotting import COLOURS, LABELS, new_figure, save_figure
 from benchmarks.reporting import write_csv, write_text
@@ -92,9 +93,13 @@ def fit_in_progress(discharge: Discharge, previous_q_mobile_C: float) -> list[di
     rows = []
     for share in SHARES:
         beginning = record.until(start_s + share * (end_s - start_s))
-        for method, fit in (("least squares alone", calibrator()), ("with prior", calibrator(previous_q_mobile_C))):
+        for method, fit in (
+            ("least squares alone", calibrator()),
+            ("Kalman filter alone", ExtendedKalmanFilter(thermal=True, mismatch_V=MISMATCH_V)),
+            ("with prior", calibrator(previous_q_mobile_C)),
+        ):
             estimate = fit.estimate(beginning)
-            eod_time_s = fit.predict_eod_time_s(beginning, estimate, CUT_OFF_V)
+            eod_time_s = calibrator().predict_eod_time_s(beginning, estimate, CUT_OFF_V)
             row = {"cell": discharge.meta["cell"], "cycle": discharge.meta["cycle"], "share": share, "method": method}
             row |= {"q_mobile_C": estimate.q_mobile, "sd_q_mobile_C": estimate.sd_q_mobile, "settled": estimate.settled}
             rows.append(row | {"eod_error_percent": 100.0 * (eod_time_s - end_s) / (end_s - start_s)})

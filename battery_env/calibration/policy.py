@@ -89,12 +89,14 @@ class PolicyEstimator(Estimator):
         independent of each other, the mean.
 
         :param record: one discharge; with the full state a simulated one, as no recording has it
-        :return: the estimate
+        :return: the estimate; never settled, as a policy states no uncertainty
         """
         trace = self.trace([record])[0]
         if self.voltage_only:
-            return Estimate(q_mobile=float(trace.q_mobile[-1]), r_o=float(trace.r_o[-1]))
-        return Estimate(q_mobile=float(trace.q_mobile.mean()), r_o=float(trace.r_o.mean()))
+            q_mobile, r_o = float(trace.q_mobile[-1]), float(trace.r_o[-1])
+        else:
+            q_mobile, r_o = float(trace.q_mobile.mean()), float(trace.r_o.mean())
+        return Estimate(q_mobile, r_o, settled=False, reason="A policy states no uncertainty.")
 
     def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:
         """

@@ -10,13 +10,14 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from battery_env.cells import drawn_charge_C
+from battery_env.cells import check_record, drawn_charge_C
 from battery_env.electrochemistry import FloatArray, check_q_mobile, check_r_o
 
 #: What can be calibrated.
 PARAMETERS: tuple[str, ...] = ("q_mobile", "r_o")
 
 BoolArray = NDArray[np.bool_]
+StringArray = NDArray[np.object_]
 
 
 class Record(Protocol):
@@ -44,7 +45,9 @@ class Estimate:
     :param r_o: ohmic resistance, ohm
     :param sd_q_mobile: its stated standard deviation, C; NaN if the calibrator states none
     :param sd_r_o: likewise, ohm
-    :param settled: whether the data determine the estimate (a fully charged cell says nothing about ``q_mobile``)
+    :param settled: whether the data determine the estimate, and nothing in the record contradicts it: a fully charged cell
+        says nothing about ``q_mobile``, and a prior alone settles nothing
+    :param reason: why it is not settled, in a sentence or two; empty if it is
     """
 
     q_mobile: float
@@ -52,6 +55,7 @@ class Estimate:
     sd_q_mobile: float = float("nan")
     sd_r_o: float = float("nan")
     settled: bool = True
+    reason: str = ""
 
 
 @dataclass(frozen=True)
@@ -65,6 +69,7 @@ class EstimateTrace:
     :param sd_q_mobile: stated standard deviations, C; ``None`` if the calibrator states none
     :param sd_r_o: likewise, ohm
     :param settled: whether the calibrator takes each estimate for settled; ``None`` if it does not say
+    :param reason: why each is not settled, strings, empty for those that are; ``None`` if the calibrator does not say
     """
 
     time_s: FloatArray
@@ -73,6 +78,7 @@ class EstimateTrace:
     sd_q_mobile: FloatArray | None = None
     sd_r_o: FloatArray | None = None
     settled: BoolArray | None = None
+    reason: StringArray | None = None
 
     @classmethod
     def of(cls, time_s: Sequence[float] | FloatArray, estimates: Sequence[Estimate]) -> EstimateTrace:
@@ -84,7 +90,8 @@ class EstimateTrace:
         :return: the trace
         """
         names = ("q_mobile", "r_o", "sd_q_mobile", "sd_r_o", "settled")
-        return cls(np.array(time_s), *(np.array([getattr(estimate, name) for estimate in estimates]) for name in names))
+        columns = {name: np.array([getattr(estimate, name) for estimate in estimates]) for name in names}
+        return cls(np.array(time_s), **columns, reason=np.array([estimate.reason for estimate in estimates], dtype=object))
 
 
 class Estimator(ABC):
@@ -154,15 +161,7 @@ class OnlineEstimator(Estimator):
         :return: the estimate
         :raises ValueError: if the record cannot be used
         """
-        trace = self.trace([record])[0]
-        assert trace.sd_q_mobile is not None and trace.sd_r_o is not None and trace.settled is not None
-        return Estimate(
-            q_mobile=float(trace.q_mobile[-1]),
-            r_o=float(trace.r_o[-1]),
-            sd_q_mobile=float(trace.sd_q_mobile[-1]),
-            sd_r_o=float(trace.sd_r_o[-1]),
-            settled=bool(trace.settled[-1]),
-        )
+        return last_estimate(self.trace([record])[0])
 
     def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:
         """
@@ -179,6 +178,25 @@ class OnlineEstimator(Estimator):
             traces.append(EstimateTrace.of(samples.time_s, [self.update(*sample) for sample in samples.measured()]))
         self.reset()
         return traces
+
+
+def last_estimate(trace: EstimateTrace) -> Estimate:
+    """
+    The last estimate of a trace that states uncertainties and what is settled.
+
+    :param trace: of one discharge
+    :return: its last estimate
+    """
+    assert trace.sd_q_mobile is not None and trace.sd_r_o is not None
+    assert trace.settled is not None and trace.reason is not None
+    return Estimate(
+        q_mobile=float(trace.q_mobile[-1]),
+        r_o=float(trace.r_o[-1]),
+        sd_q_mobile=float(trace.sd_q_mobile[-1]),
+        sd_r_o=float(trace.sd_r_o[-1]),
+        settled=bool(trace.settled[-1]),
+        reason=str(trace.reason[-1]),
+    )
 
 
 class Samples(NamedTuple):
@@ -205,27 +223,10 @@ class Samples(NamedTuple):
         :param record: one discharge
         :param dt_s: in a record whose samples lie this far apart the current is taken as it is, s
         :return: its samples
-        :raises ValueError: if the arrays do not fit together or are not finite, or time does not increase
+        :raises ValueError: as :func:`battery_env.cells.check_record`
         """
-        time_s, voltage_V, current_A = (
-            np.asarray(getattr(record, name), dtype=np.float64) for name in ("time_s", "voltage_V", "current_A")
-        )
-        for name, values in (("time_s", time_s), ("voltage_V", voltage_V), ("current_A", current_A)):
-            if values.ndim != 1 or values.size == 0 or values.shape != time_s.shape:
-                raise ValueError(
-                    f"{name} of a record must hold one value a sample, got shape {values.shape} with time_s of shape "
-                    f"{time_s.shape}"
-                )
-            bad = np.flatnonzero(~np.isfinite(values))
-            if len(bad):
-                raise ValueError(f"{name} of a record must be finite, got {values[bad[0]]} at sample {bad[0]}. Leave it out.")
+        time_s, voltage_V, current_A = check_record(record.time_s, record.voltage_V, record.current_A)
         step_s = np.diff(time_s)
-        stalls = np.flatnonzero(step_s <= 0.0)
-        if len(stalls):
-            n = stalls[0] + 1
-            raise ValueError(
-                f"time_s of a record must increase, but sample {n} is at {time_s[n]:g} s, after {time_s[n - 1]:g} s"
-            )
         if not np.allclose(step_s, dt_s, rtol=1e-6, atol=0.0):
             mean_A = np.diff(drawn_charge_C(time_s, current_A, time_s)) / step_s
             current_A = np.append(mean_A, current_A[-1])
@@ -270,3 +271,16 @@ def check_bounds(
         if limits.shape != (2,) or not limits[0] < limits[1]:
             raise ValueError(f"the bounds of {name} must be (lower, upper) with lower < upper, got {bounds[name]!r}")
     return bounds
+
+
+def check_gain_sd(current_gain_sd: float) -> float:
+    """
+    Refuse an uncertainty of the current sensor that cannot be meant.
+
+    :param current_gain_sd: standard deviation of its gain, as a share of it
+    :return: the same
+    :raises ValueError: unless it is within 0 .. 1
+    """
+    if not 0.0 <= current_gain_sd < 1.0:
+        raise ValueError(f"current_gain_sd is a share within 0 .. 1 (1 %: 0.01), got {current_gain_sd!r}")
+    return float(current_gain_sd)

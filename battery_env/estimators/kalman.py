@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import exp, inf, log, sqrt
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
+from battery_env.cells import check_drawn_charge, check_sample
 from battery_env.electrochemistry import (
     FULL_CHARGE_SHARES,
-    LOAD_LIMITS,
     NEW_CELL,
     Q_MOBILE_LIMITS_C,
     QNB,
@@ -30,14 +30,38 @@ from battery_env.estimators.base import (
     OnlineEstimator,
     Record,
     Samples,
+    StringArray,
     check_bounds,
+    check_gain_sd,
     check_parameters,
+    last_estimate,
 )
-from battery_env.estimators.least_squares import SETTLED_SHARES
+from battery_env.estimators.settling import (
+    AT_BOUND,
+    EMPTY,
+    IMPLAUSIBLE,
+    IMPRECISE,
+    MISFIT,
+    MISMATCH_MARGIN,
+    PRIOR_ALONE,
+    PRIOR_CONTRADICTED,
+    PRIOR_LIMIT_SD,
+    SETTLED_SHARES,
+    START_WINDOW_S,
+    data_sd,
+    is_plausible,
+    start_reason,
+)
 from battery_env.kernels import PackedConstants, cell_step, cell_voltage
 
 # What a filter estimates: q_mobile (C), r_o (ohm) and the offset of the voltage (V).
 _Q, _R, _OFFSET = range(3)
+# What the bank remembers: the current since the last sample (A), the mean of the noise that innovations showed (V^2), the last
+# innovations (of the mixture, normalized), the sum of the products of each with those before it and its variance, both over
+# about so many samples, how many standard deviations that sum has been above 0 at most, and the range that r_o cannot leave
+# if what the filter said about it before was right (q_mobile can: at the knee the error of the model moves it).
+_CURRENT, _NOISE, _LAST, _PRODUCTS, _VARIANCE, _TREND, _LEAST_R, _MOST_R = range(8)
+_TREND_MEMORY, _PRODUCTS_MEMORY = 0.8, 0.999
 # It runs three copies of the model: at its estimate, with this much more q_mobile, and with this much more r_o; their
 # differences are the derivatives of the state.
 _COPIES = 3
@@ -62,6 +86,14 @@ _SHARE_N, _SHARE_P = float(FULL_CHARGE_SHARES[QNS - QNB]), float(FULL_CHARGE_SHA
 _PRIOR_SD_SHARE_Q = 0.25
 _PRIOR_SD_R_OHM = 0.15
 _HOUR_S = 3600.0
+_NOISE_V = 0.005
+# Successive innovations of a filter that follows its cell are uncorrelated, and its estimates stay where it said that they
+# are. This many standard deviations away from either, the filter does not follow its cell.
+_LIMIT_SD = 5.0
+# The data must have narrowed a prior by this share of its width before a deviation from it says anything.
+_LEAST_NARROWING = 0.2
+# A full cell takes no more charge than this share of its own.
+_SURPLUS_SHARE = 0.01
 
 
 class _Bank(NamedTuple):
@@ -72,7 +104,8 @@ class _Bank(NamedTuple):
     covariance: FloatArray  # shape (filters, 3, 3)
     log_weight: FloatArray  # shape (filters,); -inf: given up
     shown: FloatArray  # variance of the noise that the last innovation showed, V^2, shape (filters,)
-    memory: FloatArray  # current since the last sample, A; mean of what innovations showed, V^2
+    innovation: FloatArray  # the last one over its standard deviation, within the gate, shape (filters,)
+    memory: FloatArray  # see _CURRENT and what follows
 
     def copy(self) -> _Bank:
         return _Bank(*(array.copy() for array in self))
@@ -82,6 +115,7 @@ class _Settings(NamedTuple):
     dt_s: float
     thermal: bool
     noise_V2: float  # variance of the voltage noise
+    spare_V2: float  # what innovations may show beyond it before they contradict the stated mismatch
     q_growth: float  # of the variances of what a filter estimates, per s
     r_growth: float
     offset_growth: float
@@ -153,6 +187,7 @@ def _correct(
     mean: FloatArray,
     p: FloatArray,
     log_weight: FloatArray,
+    normalized: FloatArray,
     m: int,
     voltage: float,
     noise: float,
@@ -180,6 +215,7 @@ def _correct(
     innovation = voltage - here - bend - mean[m, _OFFSET]
     variance = explained + noise
     sd = sqrt(variance)
+    normalized[m] = min(max(innovation / sqrt(variance + settings.spare_V2), -_GATE_SD), _GATE_SD)
     beyond = max(abs(innovation) / sd / _GATE_SD, 1.0)
     # Huber's loss: quadratic up to the gate, linear beyond, where a larger variance stands for it
     loss = innovation * innovation / variance if beyond == 1.0 else _GATE_SD**2 * (2.0 * beyond - 1.0)
@@ -232,20 +268,21 @@ def _take(
     out: FloatArray,
     n: int,
 ) -> None:
-    # One sample. Row n of out: q_mobile, r_o, their standard deviations, and whether the model cell has a voltage.
-    state, mean, p, log_weight, shown, memory = bank
+    # One sample. Row n of out: q_mobile, r_o, their standard deviations, whether the model cell has a voltage, and how far
+    # the correlation of successive innovations has been above 0, in standard deviations.
+    state, mean, p, log_weight, shown, innovation, memory = bank
     per_q = packed.constants[0, 0]
-    noise = max(memory[1], settings.noise_V2)
+    noise = max(memory[_NOISE], settings.noise_V2)
     for m in range(log_weight.shape[0]):
         if log_weight[m] > -inf:
             if duration > 0.0:
-                _predict(state, mean, p, m, memory[0], duration, settings, packed.constants)
+                _predict(state, mean, p, m, memory[_CURRENT], duration, settings, packed.constants)
             if _keep_alive(state, mean, p, m, settings, per_q):
-                shown[m] = _correct(state, mean, p, log_weight, m, voltage, noise, settings, packed)
+                shown[m] = _correct(state, mean, p, log_weight, innovation, m, voltage, noise, settings, packed)
                 _keep_alive(state, mean, p, m, settings, per_q)
     best = _reduce(mean, p, log_weight)
     # moments of the mixture, about the heaviest filter
-    total, q, r, qq, rr, square = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    total, q, r, qq, rr, square, normalized = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for m in range(log_weight.shape[0]):
         if log_weight[m] > -inf:
             weight, dq, dr = exp(log_weight[m]), mean[m, _Q] - mean[best, _Q], mean[m, _R] - mean[best, _R]
@@ -255,14 +292,27 @@ def _take(
             qq += weight * (p[m, _Q, _Q] + dq * dq)
             rr += weight * (p[m, _R, _R] + dr * dr)
             square += weight * shown[m]
+            normalized += weight * innovation[m]
     q, r = q / total, r / total
-    memory[0] = current
-    memory[1] = max(memory[1] + (square / total - memory[1]) / _NOISE_MEMORY, 0.0)
+    normalized /= total
+    memory[_CURRENT] = current
+    memory[_NOISE] = max(memory[_NOISE] + (square / total - memory[_NOISE]) / _NOISE_MEMORY, 0.0)
+    memory[_PRODUCTS] = _PRODUCTS_MEMORY * memory[_PRODUCTS] + normalized * memory[_LAST]
+    memory[_VARIANCE] = _PRODUCTS_MEMORY**2 * memory[_VARIANCE] + 1.0
+    memory[_TREND] = max(memory[_TREND], memory[_PRODUCTS] / sqrt(memory[_VARIANCE]))
+    memory[_LAST] = _TREND_MEMORY * memory[_LAST] + sqrt(1.0 - _TREND_MEMORY**2) * normalized
     out[n, 0] = mean[best, _Q] + q
     out[n, 1] = mean[best, _R] + r
     out[n, 2] = sqrt(qq / total - q * q)
     out[n, 3] = sqrt(rr / total - r * r)
     out[n, 4] = 1.0 if _keep_alive(state, mean, p, best, settings, per_q) else 0.0
+    reach = _LIMIT_SD * out[n, 3]
+    if reach > 0.0:
+        memory[_LEAST_R] = max(memory[_LEAST_R], out[n, 1] - reach)
+        memory[_MOST_R] = min(memory[_MOST_R], out[n, 1] + reach)
+        if not memory[_LEAST_R] <= out[n, 1] <= memory[_MOST_R]:
+            memory[_TREND] = inf
+    out[n, 5] = memory[_TREND]
 
 
 @njit(cache=True, error_model="numpy")
@@ -308,12 +358,26 @@ class ExtendedKalmanFilter(OnlineEstimator):
     *Bounds.* Estimates stay within their bounds, and ``q_mobile`` above the least value that has the charge drawn so far: mole
     fractions never leave 0 .. 1. If ``q_mobile`` is held and too small for that, the estimate freezes and is not settled.
 
-    *Settled* means that every parameter searched for has a standard deviation below
-    :data:`~battery_env.estimators.least_squares.SETTLED_SHARES` of its value, and is farther than that from its bounds.
+    The gain of the current sensor scales both parameters and does not show in the voltage: state it as ``current_gain_sd``.
+
+    *Settled* means that the data determine every parameter searched for: its standard deviation, without what a given prior
+    adds to it, is below :data:`~battery_env.estimators.settling.SETTLED_SHARES` of its value; and that nothing contradicts it:
+
+    - the first samples can be those of a full cell (:func:`~battery_env.estimators.settling.start_reason`);
+    - the estimate is farther than its standard deviation from its bounds, ``q_mobile`` is plausible for a cell of this kind,
+      and the model cell is not empty;
+    - innovations have not gone the same way again and again: the sum of the products of successive ones has never been 5
+      standard deviations above 0, with twice ``mismatch_V`` allowed for. It comes to that where the error of the model or the
+      noise is far larger than stated, a sensor fails, or the cell was charged without :meth:`reset`; one wild sample does no
+      harm;
+    - ``r_o`` is where it was before, within 5 of the standard deviations stated then;
+    - a given prior is within 2.5 standard deviations of what the data say.
+
+    Otherwise ``reason`` of the estimate says which of these does not hold. In particular an estimate that rests on a prior is
+    not settled: it is as good as the prior.
 
     For a recorded discharge give :meth:`battery_env.cells.Discharge.loaded_part`, which starts when the load is switched on,
-    and state the error of the model as ``mismatch_V``: 0.05 V, with as much ``voltage_noise_V``, for the cells that come with
-    the package.
+    and state the error of the model as ``mismatch_V``: 0.05 V for the cells that come with the package.
 
     :param parameters: which to search for; the other is held at ``cell``'s value
     :param cell: constants of the model; ``None``: the new cell's
@@ -324,12 +388,15 @@ class ExtendedKalmanFilter(OnlineEstimator):
     :param prior_r_o_ohm: likewise of ``r_o``, ohm; ``None``: ``cell``'s value, and 0.15 ohm
     :param q_mobile_bounds_C: where the estimate stays, C
     :param r_o_bounds_ohm: likewise, ohm
-    :param voltage_noise_V: standard deviation of the noise of one voltage sample, V
-    :param offset_sd_V: standard deviation of a constant offset of the voltage sensor, V. With 0 errors are about half as large
+    :param voltage_noise_V: standard deviation of the noise of one voltage sample, V; ``None``: ``mismatch_V``, and at least
+        0.005 V. A model that wanders by ``mismatch_V`` is not followed more closely from sample to sample
+    :param offset_sd_V: standard deviation of a constant offset of sensor and model, V; ``None``: ``mismatch_V``, and at least
+        0.005 V. With 0 errors are about half as large
         if there is no offset, and several percent if there is one of 10 mV
     :param mismatch_V: how far the error of the model itself wanders in an hour (standard deviation of a random walk), V
     :param drift_per_hour: how far the parameters may wander in an hour, as a share of their prior means. A little keeps the
         filter awake
+    :param current_gain_sd: standard deviation of the gain of the current sensor, as a share of it
     :raises ValueError: for an argument out of range
     """
 
@@ -343,27 +410,42 @@ class ExtendedKalmanFilter(OnlineEstimator):
         prior_r_o_ohm: tuple[float, float] | None = None,
         q_mobile_bounds_C: tuple[float, float] = (Q_MOBILE_LIMITS_C[0], 1e5),
         r_o_bounds_ohm: tuple[float, float] = (0.0, 1.0),
-        voltage_noise_V: float = 0.005,
-        offset_sd_V: float = 0.005,
+        voltage_noise_V: float | None = None,
+        offset_sd_V: float | None = None,
         mismatch_V: float = 0.0,
         drift_per_hour: float = 0.001,
+        current_gain_sd: float = 0.0,
     ) -> None:
         self.parameters = check_parameters(parameters)
         self.cell = cell or NEW_CELL
         self.thermal = thermal
         self.dt_s = check_dt(dt_s, self.cell)
         self.bounds = check_bounds(q_mobile_bounds_C, r_o_bounds_ohm)
-        if not 0.0 < voltage_noise_V < np.inf:
-            raise ValueError(f"voltage_noise_V must be greater than 0 V, got {voltage_noise_V!r}. Exact records: 1e-4.")
+        offset_sd_V = max(_NOISE_V, mismatch_V) if offset_sd_V is None else offset_sd_V
         for name, value in (("offset_sd_V", offset_sd_V), ("mismatch_V", mismatch_V), ("drift_per_hour", drift_per_hour)):
             if not 0.0 <= value < np.inf:
                 raise ValueError(f"{name} must be finite and at least 0, got {value!r}")
+        voltage_noise_V = max(_NOISE_V, mismatch_V) if voltage_noise_V is None else voltage_noise_V
+        if not 0.0 < voltage_noise_V < np.inf:
+            raise ValueError(f"voltage_noise_V must be greater than 0 V, got {voltage_noise_V!r}. Exact records: 1e-4.")
+        if voltage_noise_V < mismatch_V:
+            raise ValueError(
+                f"voltage_noise_V must be at least mismatch_V, {mismatch_V!r} V, got {voltage_noise_V!r} V: the filter would "
+                "take each sample of a model that wanders for exact. Leave voltage_noise_V out to have it follow mismatch_V."
+            )
+        self.current_gain_sd = check_gain_sd(current_gain_sd)
+        self._carried = {
+            name: (float(prior[0]), float(prior[1]))
+            for name, prior in (("q_mobile", prior_q_mobile_C), ("r_o", prior_r_o_ohm))
+            if prior is not None
+        }
         q, q_sd = self._prior("q_mobile", prior_q_mobile_C, _PRIOR_SD_SHARE_Q * self.cell.q_mobile)
         r_o, r_o_sd = self._prior("r_o", prior_r_o_ohm, _PRIOR_SD_R_OHM)
         self._settings = _Settings(
             dt_s=self.dt_s,
             thermal=thermal,
             noise_V2=float(voltage_noise_V) ** 2,
+            spare_V2=(MISMATCH_MARGIN**2 - 1.0) * float(mismatch_V) ** 2,
             q_growth=(drift_per_hour * q) ** 2 / _HOUR_S if q_sd > 0.0 else 0.0,
             r_growth=(drift_per_hour * r_o) ** 2 / _HOUR_S if r_o_sd > 0.0 else 0.0,
             offset_growth=float(mismatch_V) ** 2 / _HOUR_S,
@@ -400,15 +482,19 @@ class ExtendedKalmanFilter(OnlineEstimator):
         state = np.zeros((_COPIES * filters + 1, STATE_SIZE))
         state[:-1] = initial_state(np.repeat(means, _COPIES), self.cell)
         state[1:-1:_COPIES, QNB:] += _MORE_Q_C * FULL_CHARGE_SHARES
+        memory = np.zeros(8)
+        memory[_LEAST_R:] = [-inf, inf]
         mean = np.column_stack([means, np.full(filters, r_o), np.zeros(filters)])
-        return _Bank(state, mean, covariance, -0.5 * deviations**2, np.zeros(filters), np.zeros(2))
+        return _Bank(state, mean, covariance, -0.5 * deviations**2, np.zeros(filters), np.zeros(filters), memory)
 
     def reset(self) -> None:
         """
         Forget all samples: the next one is the first of a discharge, of a fully charged cell at rest.
         """
         self._bank = self._fresh.copy()
-        self._is_first = True
+        self._time_s = self._drawn_C = 0.0
+        self._start: list[tuple[float, float, float]] = []  # the first samples
+        self._start_reason = ""
 
     def update(self, voltage_V: float, current_A: float, dt_s: float) -> Estimate:
         """
@@ -418,22 +504,22 @@ class ExtendedKalmanFilter(OnlineEstimator):
         :param current_A: current that flows from this sample to the next one, positive in discharge, A
         :param dt_s: time since the previous sample, s; without meaning at the first one
         :return: the estimate
-        :raises ValueError: for a voltage that is not finite, a current beyond ``LOAD_LIMITS``, or a time that is not positive
+        :raises ValueError: for what cannot be meant (:func:`battery_env.cells.check_sample`), and for a current that charges a
+            full cell; the filter stays as it was
         """
-        if not abs(voltage_V) < inf:
-            raise ValueError(f"voltage_V must be finite, got {voltage_V!r}. Leave a sample out that is missing.")
-        limit = LOAD_LIMITS["current"]
-        if not abs(current_A) <= limit:
-            raise ValueError(f"current_A must lie within {-limit:g} .. {limit:g} A, got {current_A!r}. Give it in A, not mA.")
-        if not (self._is_first or 0.0 < dt_s < inf):
-            raise ValueError(f"dt_s, the time since the previous sample, must be greater than 0 s, got {dt_s!r}")
-        since_s = 0.0 if self._is_first else dt_s
-        self._is_first = False
-        q, r_o, sd_q, sd_r_o, alive = self._run(self._bank, np.array([[voltage_V], [current_A], [since_s]], dtype=np.float64))[
-            0
-        ].tolist()
-        settled = self._settled({"q_mobile": (q, sd_q), "r_o": (r_o, sd_r_o)}, alive)
-        return Estimate(q, r_o, sd_q or np.nan, sd_r_o or np.nan, bool(settled))
+        is_first = not self._start
+        check_sample(voltage_V, current_A, None if is_first else dt_s)
+        since_s = 0.0 if is_first else dt_s
+        drawn_C = self._drawn_C + since_s * float(self._bank.memory[_CURRENT])
+        self._check_drawn(drawn_C)
+        self._time_s, self._drawn_C = self._time_s + since_s, drawn_C
+        if len(self._start) < 2 or self._time_s <= START_WINDOW_S:
+            self._start.append((self._time_s, voltage_V, current_A))
+            time_s, voltages_V, currents_A = np.array(self._start).T
+            self._start_reason = start_reason(time_s, voltages_V, currents_A, self.cell)
+        out = self._run(self._bank, np.array([[voltage_V], [current_A], [since_s]], dtype=np.float64))
+        trace = self._trace(np.array([self._time_s]), out, np.array([self._start_reason], dtype=object))
+        return last_estimate(trace)
 
     def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:
         """
@@ -446,25 +532,45 @@ class ExtendedKalmanFilter(OnlineEstimator):
         traces = []
         for record in records:
             samples = Samples.of(record, self.dt_s)
-            columns = np.stack([samples.voltage_V, samples.current_A, samples.dt_s])
-            q, r_o, sd_q, sd_r_o, alive = self._run(self._fresh.copy(), columns).T.copy()
-            settled = self._settled({"q_mobile": (q, sd_q), "r_o": (r_o, sd_r_o)}, alive)
-            for sd in (sd_q, sd_r_o):
-                sd[sd == 0.0] = np.nan  # of a parameter that is held
-            traces.append(EstimateTrace(samples.time_s, q, r_o, sd_q, sd_r_o, settled))
+            time_s, voltage_V, current_A, dt_s = samples
+            self._check_drawn(float(np.cumsum(np.append(0.0, current_A[:-1]) * dt_s).min()))
+            starts = max(int(np.searchsorted(time_s, time_s[0] + START_WINDOW_S, side="right")), 2)
+            reasons = [start_reason(time_s[:n], voltage_V[:n], current_A[:n], self.cell) for n in range(1, starts + 1)]
+            start = np.array(reasons[: len(time_s)] + [reasons[-1]] * (len(time_s) - starts), dtype=object)
+            out = self._run(self._fresh.copy(), np.stack([voltage_V, current_A, dt_s]))
+            traces.append(self._trace(time_s, out, start))
         self.reset()
         return traces
 
+    def _check_drawn(self, charge_C: float) -> None:
+        check_drawn_charge(charge_C, -_SURPLUS_SHARE * self.cell.q_mobile)
+
     def _run(self, bank: _Bank, samples: FloatArray) -> FloatArray:
-        out = np.empty((samples.shape[1], 5))
+        out = np.empty((samples.shape[1], 6))
         _follow(bank, samples[0], samples[1], samples[2], self._settings, self.cell.packed, out)
         return out
 
-    def _settled(self, values: dict[str, tuple[Any, Any]], alive: Any) -> Any:
-        # of one estimate or of arrays of them
-        settled = alive == 1.0
+    def _trace(self, time_s: FloatArray, out: FloatArray, start: StringArray) -> EstimateTrace:
+        """What the filter says, from its rows and from why each sample so far is no start of a full cell."""
+        q, r_o, sd_q, sd_r_o, alive, trend = out.T.copy()
+        values, own_sd = {"q_mobile": q, "r_o": r_o}, {"q_mobile": sd_q, "r_o": sd_r_o}
+        sd = {name: np.hypot(own_sd[name], self.current_gain_sd * values[name]) for name in self.parameters}
+        conditions = [(start != "", start), (alive == 0.0, EMPTY)]
         for name in self.parameters:
-            value, sd = values[name]
             low, high = self.bounds[name]
-            settled = settled & (low + sd < value) & (value < high - sd) & (sd < SETTLED_SHARES[name] * value)
-        return settled
+            inside = (low + own_sd[name] < values[name]) & (values[name] < high - own_sd[name])
+            conditions.append((~inside, AT_BOUND.format(name)))
+        if "q_mobile" in self.parameters:
+            conditions.append((~is_plausible(q, self.cell), IMPLAUSIBLE))
+        conditions.append((trend > _LIMIT_SD, MISFIT))
+        for name, (mean, prior_sd) in self._carried.items():
+            narrowed = np.maximum(prior_sd**2 - own_sd[name] ** 2, (_LEAST_NARROWING * prior_sd) ** 2)
+            contradicted = (values[name] - mean) ** 2 > PRIOR_LIMIT_SD**2 * narrowed
+            alone = data_sd(own_sd[name], prior_sd) >= SETTLED_SHARES[name] * values[name]
+            conditions += [(contradicted, PRIOR_CONTRADICTED.format(name)), (alone, PRIOR_ALONE.format(name))]
+        conditions += [(~(sd[name] < SETTLED_SHARES[name] * values[name]), IMPRECISE[name]) for name in self.parameters]
+        reason = np.full(len(time_s), "", dtype=object)
+        for holds, text in reversed(conditions):
+            reason = np.where(holds, text, reason)
+        held = np.full(len(time_s), np.nan)
+        return EstimateTrace(time_s, q, r_o, sd.get("q_mobile", held), sd.get("r_o", held), reason == "", reason)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from math import inf, isnan, sqrt
+from math import hypot, inf, isnan, nan, sqrt
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
-from battery_env.cells import SWITCH_SHARE
+from battery_env.cells import check_drawn_charge, check_record, drawn_charge_C
 from battery_env.electrochemistry import Q_MOBILE_LIMITS_C, CellParameters, FloatArray, check_q_mobile
 from battery_env.estimators.base import (
     PARAMETERS,
@@ -21,13 +21,27 @@ from battery_env.estimators.base import (
     Estimator,
     Record,
     check_bounds,
+    check_gain_sd,
     check_parameters,
 )
-from battery_env.estimators.record_model import RecordModel
-
-#: An estimate counts as settled when its standard deviation is below this share of its value. That of ``r_o`` is wider: on a
-#: real cell the error of the model divided by the current is a quarter of it already.
-SETTLED_SHARES = {"q_mobile": 0.02, "r_o": 0.3}
+from battery_env.estimators.record_model import RecordModel, expected_current
+from battery_env.estimators.settling import (
+    AT_BOUND,
+    EMPTY,
+    IMPLAUSIBLE,
+    IMPRECISE,
+    MISFIT,
+    MISMATCH_MARGIN,
+    PRIOR_ALONE,
+    PRIOR_CONTRADICTED,
+    PRIOR_LIMIT_SD,
+    SETTLED_SHARES,
+    first_reason,
+    is_plausible,
+    sensor_reason,
+    start_reason,
+    white_noise_V,
+)
 
 # Where the search for q_mobile may start: this much above the least value that the record allows. The narrow ones serve whole
 # discharges, the wide ones the first minutes of one.
@@ -45,8 +59,15 @@ _SEARCH_SCALES = {"q_mobile": 1.0, "r_o": 0.1}
 _LOG_LIMIT = 50.0
 # Residuals whose variance is this many of its standard deviations above the one expected are not noise.
 _EXCESS_LIMIT = 5.0
+# If no noise is stated, it is told from differences of residuals, a little less surely.
+_EXCESS_LIMIT_UNSTATED = 10.0
+# Residuals below this are as good as none, V: files are rounded.
+_NEGLIGIBLE_V = 1e-3
+# The end of a record agrees with an estimate within this share of its duration.
+_END_SHARE = 0.02
 # With fewer samples than this beyond the number of parameters, the residuals do not tell how large the noise is.
 _SPARE_SAMPLES = 10
+_FEW = "These are too few samples to tell the noise. Record on, or state voltage_noise_V."
 
 
 class _Samples(NamedTuple):
@@ -84,7 +105,7 @@ class _Fit(NamedTuple):
     jacobian: FloatArray  # of the residuals, V, with respect to the parameters searched for
     residual_V: FloatArray  # at the samples
     square_V2: float  # sum of all squared residuals, that of the prior included
-    at_bound: bool
+    at_bound: tuple[str, ...]  # which parameters are
 
 
 class LeastSquares(Estimator):
@@ -109,10 +130,24 @@ class LeastSquares(Estimator):
     the record, which more samples do not make smaller. Where the noise is known, give it as ``voltage_noise_V``: it then
     takes the place of s, which a few samples cannot tell.
 
-    *Settled* means that every parameter searched for is inside its bounds, with a standard deviation below
-    ``SETTLED_SHARES`` of its value, and that the model lasts as long as the record. If ``voltage_noise_V`` is given, the
-    residuals must also be no larger than it and ``mismatch_V`` explain; they are where the sensor has an offset, or where the
-    parameter that is held is wrong. Otherwise there must be at least 10 samples more than parameters.
+    The gain of the current sensor scales both parameters and does not show in the voltage: state it as ``current_gain_sd``.
+
+    *Settled* means that the record alone determines every parameter searched for, with a standard deviation below
+    :data:`~battery_env.estimators.settling.SETTLED_SHARES` of its value without any prior, and that nothing contradicts it:
+
+    - the record can start with a full cell (:func:`~battery_env.estimators.settling.start_reason`), unless ``initial`` is
+      given;
+    - each parameter is inside its bounds, ``q_mobile`` is plausible for a cell of this kind, and the model lasts as long as
+      the record;
+    - the residuals are no larger than noise and twice ``mismatch_V`` explain. They are where the sensor has an offset, or
+      where the parameter that is held is wrong. The noise is ``voltage_noise_V``, or the white part of the residuals;
+    - the voltage follows the current where the load is switched, and does not rise where it is not;
+    - the model comes down to the lowest voltage of the record when the record did, to 2 % of its duration;
+    - a prior is within 2.5 standard deviations of what the record says;
+    - if no noise is stated, there are at least 10 samples more than parameters.
+
+    Otherwise ``reason`` of the estimate says which of these does not hold. In particular an estimate that rests on a prior is
+    not settled: it is as good as the prior.
 
     *During a discharge*, :meth:`trace` with ``window_every_s`` estimates again and again from all samples so far.
 
@@ -131,6 +166,7 @@ class LeastSquares(Estimator):
     :param mismatch_V: error to expect of the model itself, V, as above
     :param voltage_noise_V: standard deviation of the noise of the voltage sensor, V; ``None``: that of the residuals
     :param window_every_s: time between the estimates of :meth:`trace`, s; ``None``: one estimate, at the end
+    :param current_gain_sd: standard deviation of the gain of the current sensor, as a share of it
     :raises ValueError: for an argument out of range
     """
 
@@ -147,6 +183,7 @@ class LeastSquares(Estimator):
         mismatch_V: float = 0.0,
         voltage_noise_V: float | None = None,
         window_every_s: float | None = None,
+        current_gain_sd: float = 0.0,
     ) -> None:
         self.parameters = check_parameters(parameters)
         self.model = RecordModel(cell, thermal, dt_s, initial)
@@ -161,6 +198,8 @@ class LeastSquares(Estimator):
         if not 0.0 <= mismatch_V < np.inf:
             raise ValueError(f"mismatch_V must be at least 0 V, got {mismatch_V!r}")
         self.mismatch_V = mismatch_V
+        self.current_gain_sd = check_gain_sd(current_gain_sd)
+        self.starts_full = initial is None
         for name, value in (("voltage_noise_V", voltage_noise_V), ("window_every_s", window_every_s)):
             if value is not None and not 0.0 < value < np.inf:
                 raise ValueError(f"{name} must be greater than 0, got {value!r}")
@@ -210,34 +249,81 @@ class LeastSquares(Estimator):
             problem = self._until_empty(problem)
             starts = [self._starts(problem, [self.model.cell.q_mobile])[0].values]
         n = len(problem.time_s)
-        if self.voltage_noise_V is None:
-            fit = self._search(problem, starts)
-            starts, noise_V2 = [fit.values], _square(fit.residual_V) / (n - len(self.parameters))
-        else:
-            noise_V2 = self.voltage_noise_V**2
+        alone = fit = self._search(problem, starts)
+        noise_V2 = self.voltage_noise_V**2 if self.voltage_noise_V else _square(alone.residual_V) / (n - len(self.parameters))
         variance_V2 = noise_V2 + n * self.mismatch_V**2
         if self.prior_q_mobile_C is not None:
             mean_C, sd_C = self.prior_q_mobile_C
             (middle,) = self._starts(problem, [mean_C])
-            prior = _Prior(mean_C, sqrt(variance_V2) / sd_C)
-            fit = self._search(problem, [*starts, middle.values], prior)
-        elif self.voltage_noise_V is not None:
-            fit = self._search(problem, starts)
-        sd = dict.fromkeys(PARAMETERS, float("nan"))
-        for name, root in zip(self.parameters, _root_inverse_diagonal(fit.jacobian), strict=True):
-            sd[name] = sqrt(variance_V2) * float(root)
-        settled = n == len(record.time_s) and not fit.at_bound
-        settled &= all(sd[name] < SETTLED_SHARES[name] * fit.values[name] for name in self.parameters)
-        settled &= self._is_noise_known(fit.residual_V)
-        return Estimate(fit.values["q_mobile"], fit.values["r_o"], sd["q_mobile"], sd["r_o"], settled)
+            fit = self._search(problem, [*starts, alone.values, middle.values], _Prior(mean_C, sqrt(variance_V2) / sd_C))
+        sd = self._sd(fit, variance_V2)
+        if len(problem.time_s) < len(record.time_s):
+            reason = EMPTY
+        else:
+            reason = self._contradiction(record, problem, fit) or self._shortage(fit, alone, variance_V2)
+        return Estimate(fit.values["q_mobile"], fit.values["r_o"], sd["q_mobile"], sd["r_o"], not reason, reason)
 
-    def _is_noise_known(self, residual_V: FloatArray) -> bool:
-        """Whether there are enough residuals to tell the noise, or they agree with what is stated about noise and model."""
-        n = len(residual_V)
+    def _sd(self, fit: _Fit, variance_V2: float) -> dict[str, float]:
+        """The standard deviations, with that of the current sensor's gain, which scales both parameters."""
+        sd = dict.fromkeys(PARAMETERS, nan)
+        for name, root in zip(self.parameters, _root_inverse_diagonal(fit.jacobian), strict=True):
+            sd[name] = hypot(sqrt(variance_V2) * float(root), self.current_gain_sd * fit.values[name])
+        return sd
+
+    def _contradiction(self, record: Record, problem: _Problem, fit: _Fit) -> str:
+        """What in the record contradicts the fit."""
+        cell, n = self.model.cell, len(problem.time_s)
         if self.voltage_noise_V is None:
-            return n >= len(self.parameters) + _SPARE_SAMPLES
-        expected_V2 = self.voltage_noise_V**2 + self.mismatch_V**2
-        return _square(residual_V) < n * expected_V2 * (1.0 + _EXCESS_LIMIT * sqrt(2.0 / n))
+            noise_V, excess = white_noise_V(fit.residual_V), _EXCESS_LIMIT_UNSTATED / sqrt(n)
+        else:
+            noise_V, excess = self.voltage_noise_V, _EXCESS_LIMIT * sqrt(2.0 / n)
+        limit_V2 = noise_V**2 * (1.0 + excess) + (MISMATCH_MARGIN * self.mismatch_V) ** 2 + _NEGLIGIBLE_V**2
+        current_A = np.asarray(record.current_A)
+        start = start_reason(problem.time_s, problem.voltage_V, current_A, cell) if self.starts_full else ""
+        sensors = sensor_reason(problem.time_s, problem.voltage_V, current_A)
+        return first_reason(
+            [
+                (bool(start), start),
+                *((True, AT_BOUND.format(name)) for name in fit.at_bound),
+                ("q_mobile" in self.parameters and not is_plausible(fit.values["q_mobile"], cell), IMPLAUSIBLE),
+                (_square(fit.residual_V) > n * limit_V2, MISFIT),
+                (bool(sensors), sensors),
+            ]
+        ) or self._end_reason(record, fit, max(2.0 * self.mismatch_V, 3.0 * noise_V, _NEGLIGIBLE_V))
+
+    def _end_reason(self, record: Record, fit: _Fit, deviation_V: float) -> str:
+        """Whether the model comes as low as the record did much earlier or later than the record."""
+        time_s, voltage_V, current_A = (np.asarray(array) for array in (record.time_s, record.voltage_V, record.current_A))
+        n = int(voltage_V.argmin())
+        load_A = float(current_A[max(n - 1, 0) : n + 1].max())
+        if n == 0 or load_A <= 0.0:
+            return ""
+        until = _Samples(time_s[: n + 1], voltage_V[: n + 1], current_A[: n + 1])
+        estimate = Estimate(fit.values["q_mobile"], fit.values["r_o"])
+        early_s, late_s = (
+            self.predict_eod_time_s(until, estimate, float(voltage_V[n]) + sign * deviation_V, load_A) for sign in (1.0, -1.0)
+        )
+        allowed_s = _END_SHARE * (time_s[n] - time_s[0]) + 2.0 * self.model.dt_s
+        if early_s - allowed_s <= time_s[n] <= late_s + allowed_s:
+            return ""
+        return (
+            f"The record falls to {voltage_V[n]:.2f} V at {time_s[n]:.0f} s, where this estimate says "
+            f"{early_s if early_s > time_s[n] else late_s:.0f} s."
+        )
+
+    def _shortage(self, fit: _Fit, alone: _Fit, variance_V2: float) -> str:
+        """Why the record alone does not determine the parameters; ``alone``: the fit without the prior."""
+        own = self._sd(alone, variance_V2)
+        unknown = [name for name in self.parameters if not own[name] < SETTLED_SHARES[name] * alone.values[name]]
+        carried = self.prior_q_mobile_C is not None
+        return first_reason(
+            [
+                (fit.square_V2 - alone.square_V2 > PRIOR_LIMIT_SD**2 * variance_V2, PRIOR_CONTRADICTED.format("q_mobile")),
+                (carried and "q_mobile" in unknown, PRIOR_ALONE.format("q_mobile")),
+                *((True, IMPRECISE[name]) for name in unknown),
+                (self.voltage_noise_V is None and len(fit.residual_V) < len(self.parameters) + _SPARE_SAMPLES, _FEW),
+            ]
+        )
 
     def predict_voltage_V(self, record: Record, estimate: Estimate) -> FloatArray:
         """
@@ -251,23 +337,33 @@ class LeastSquares(Estimator):
         simulation = self.model.simulate(current_A, estimate.q_mobile, estimate.r_o)
         return np.interp(time_s, simulation.time_s, simulation.voltage_V, right=np.nan)
 
-    def forecast(self, record: Record, estimate: Estimate, cut_off_V: float | None = None) -> tuple[FloatArray, FloatArray]:
+    def forecast(
+        self, record: Record, estimate: Estimate, cut_off_V: float | None = None, future_current_A: float | None = None
+    ) -> tuple[FloatArray, FloatArray]:
         """
-        The voltage of the model from the first sample of a record down to the cut-off, under the current of the record,
-        which keeps its last value beyond the end.
+        The voltage of the model from the first sample of a record down to the cut-off, under the current of the record, and
+        beyond its end under a constant one.
 
         :param record: one discharge, whole or in progress
         :param estimate: the parameters
         :param cut_off_V: cut-off voltage, V; ``None``: the ``VEOD`` of ``cell``
+        :param future_current_A: current beyond the end of the record, at least 0 A; ``None``: as
+            :func:`~battery_env.estimators.record_model.expected_current` has it, the last current of a constant load and the
+            mean of a load that varied, which is an assumption
         :return: time on the clock of the record, s, and voltage, V. The last point is at the cut-off, interpolated between
             steps; if it is never reached, as the load is off at the end of the record, the last point is above it
+        :raises ValueError: for a negative future current, or a record that cannot be used
         """
         _, current_A = self.model.grid(record)
         cut_off = self.model.cell.VEOD if cut_off_V is None else cut_off_V
-        last_A = float(record.current_A[-1])
-        if last_A > SWITCH_SHARE * np.abs(record.current_A).max():
+        if future_current_A is None:
+            future_current_A = expected_current(record.time_s, record.current_A).mean_A
+        elif not 0.0 <= future_current_A < np.inf:
+            raise ValueError(f"future_current_A must be finite and at least 0 A, got {future_current_A!r}")
+        if future_current_A > 0.0:
             # no cell of this q_mobile lasts longer than this, whatever it had delivered before
-            current_A = np.append(current_A, np.full(int(estimate.q_mobile / (last_A * self.model.dt_s)) + 1, last_A))
+            steps = int(estimate.q_mobile / (future_current_A * self.model.dt_s)) + 1
+            current_A = np.append(current_A[:-1], np.full(steps + 1, future_current_A))
         simulation = self.model.simulate(current_A, estimate.q_mobile, estimate.r_o)
         time_s, voltage_V = float(record.time_s[0]) + simulation.time_s, simulation.voltage_V
         below = np.flatnonzero(voltage_V <= cut_off)
@@ -281,28 +377,30 @@ class LeastSquares(Estimator):
             end_s = float(np.interp(cut_off, voltage_V[around], time_s[around]))
         return np.append(time_s[:n], end_s), np.append(voltage_V[:n], cut_off)
 
-    def predict_eod_time_s(self, record: Record, estimate: Estimate, cut_off_V: float | None = None) -> float:
+    def predict_eod_time_s(
+        self, record: Record, estimate: Estimate, cut_off_V: float | None = None, future_current_A: float | None = None
+    ) -> float:
         """
         When the model reaches the cut-off (:meth:`forecast`).
 
         :param record: one discharge, whole or in progress
         :param estimate: the parameters
         :param cut_off_V: cut-off voltage, V; ``None``: the ``VEOD`` of ``cell``
+        :param future_current_A: as for :meth:`forecast`
         :return: the end of discharge on the clock of the record, s; NaN if it is never reached
         """
         cut_off = self.model.cell.VEOD if cut_off_V is None else cut_off_V
-        time_s, voltage_V = self.forecast(record, estimate, cut_off)
+        time_s, voltage_V = self.forecast(record, estimate, cut_off, future_current_A)
         return float(time_s[-1]) if voltage_V[-1] <= cut_off else float("nan")
 
     def _problem(self, record: Record) -> _Problem:
+        clock_s, voltage_V, measured_A = check_record(
+            record.time_s, record.voltage_V, record.current_A, least_samples=len(self.parameters) + 1
+        )
         time_s, current_A = self.model.grid(record)
-        if len(time_s) <= len(self.parameters):
-            raise ValueError(f"a record needs more than {len(self.parameters)} samples, got {len(time_s)}")
-        voltage_V = np.asarray(record.voltage_V, dtype=np.float64)
-        if voltage_V.shape != time_s.shape or not np.isfinite(voltage_V).all():
-            raise ValueError("voltage_V of the record must hold one finite value a sample")
         if not current_A[:-1].any():
             raise ValueError("no current flows in this record: it says nothing about q_mobile and r_o")
+        check_drawn_charge(float(drawn_charge_C(clock_s, measured_A, clock_s[-1])))
         grid_s = self.model.dt_s * np.arange(len(current_A))
         on_grid = len(grid_s) == len(time_s) and np.allclose(time_s, grid_s, rtol=0.0, atol=1e-6 * self.model.dt_s)
         return _Problem(time_s, voltage_V, current_A, on_grid, self.model.least_q_mobile_C(current_A))
@@ -392,7 +490,7 @@ class LeastSquares(Estimator):
                 break
             free = inside
         residual_V, jacobian = self._residual(problem, values, prior)
-        at_bound = len(inside) < len(self.parameters)
+        at_bound = tuple(name for name in self.parameters if values[name] in bounds[name])
         return _Fit(values, jacobian, residual_V[: len(problem.time_s)], _square(residual_V), at_bound)
 
     def _minimize(self, problem: _Problem, start: dict[str, float], free: list[str], prior: _Prior | None) -> dict[str, float]:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from math import log, sqrt
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike
 
-from battery_env.cells import resample_current
+from battery_env.cells import SWITCH_SHARE, check_record, drawn_charge_C, resample_current
 from battery_env.electrochemistry import (
     FULL_CHARGE_SHARES,
     NEW_CELL,
@@ -23,6 +24,9 @@ from battery_env.electrochemistry import (
 )
 from battery_env.estimators.base import Record
 from battery_env.kernels import FloatArray, cell_step, cell_voltage, mole_fraction, nominal_overpotentials, polynomial
+
+#: A load whose current spreads by more than this share (from the 5th to the 95th percentile) has varied.
+VARIED_SHARE = 0.05
 
 # The total of the four charges is q_mobile / 0.6 at all times.
 _Q_PER_CHARGE = 1.0 / float(FULL_CHARGE_SHARES.sum())
@@ -140,6 +144,43 @@ def _slopes(polynomial: FloatArray) -> FloatArray:
     return np.append(polynomial[1:] * np.arange(1, len(polynomial)), 0.0)
 
 
+class ExpectedCurrent(NamedTuple):
+    """
+    What a record lets expect of the current after its end.
+
+    :param mean_A: current, A; 0 if the load was switched off and not on again
+    :param varied: whether the load varied, so that ``mean_A`` is the mean of the last half of it and an assumption
+    :param sd_A: how far means over quarters of the record lie from each other (standard deviation), A
+    """
+
+    mean_A: float
+    varied: bool
+    sd_A: float
+
+
+def expected_current(time_s: ArrayLike, current_A: ArrayLike) -> ExpectedCurrent:
+    """
+    The current to expect after the end of a record: the last one of a constant load, and the mean over the last half of a load
+    that varied by more than ``VARIED_SHARE``, pulses among them.
+
+    :param time_s: times of the samples, s, shape (T,)
+    :param current_A: positive in discharge, A, shape (T,)
+    :return: the current and how sure it is
+    """
+    time, current = np.asarray(time_s, dtype=np.float64), np.asarray(current_A, dtype=np.float64)
+    loaded = current > SWITCH_SHARE * np.abs(current).max()
+    switches = np.flatnonzero(np.diff(loaded.astype(np.int64)) > 0)
+    if not loaded.any() or not (loaded[-1] or len(switches) + loaded[0] > 1):
+        return ExpectedCurrent(0.0, False, 0.0)
+    first = int(np.flatnonzero(loaded)[0])
+    low, high = np.quantile(current[first:], [0.05, 0.95])
+    if first == len(time) - 1 or high - low <= VARIED_SHARE * high:
+        return ExpectedCurrent(float(current[-1]), False, 0.0)
+    ends_s = np.linspace(time[first], time[-1], 5)
+    quarters_A = np.diff(drawn_charge_C(time, current, ends_s)) / np.diff(ends_s)
+    return ExpectedCurrent(max(float(quarters_A[2:].mean()), 0.0), True, float(quarters_A.std(ddof=1)))
+
+
 class RecordModel:
     """
     The model as it follows the current of a record: what calibration by the voltage of whole records rests on.
@@ -176,13 +217,9 @@ class RecordModel:
         :param record: one discharge
         :return: times of the samples since the first one, s, shape (T,); current over each step, A, shape (K,), such that
             the K points of the grid reach the last sample
-        :raises ValueError: if the samples are not in the order of time, or do not have one current each
+        :raises ValueError: as :func:`battery_env.cells.check_record`
         """
-        time_s, current_A = (np.asarray(values, dtype=np.float64) for values in (record.time_s, record.current_A))
-        if time_s.ndim != 1 or len(time_s) < 2 or not (np.diff(time_s) > 0.0).all():
-            raise ValueError("a record needs at least 2 samples, in the order of time")
-        if current_A.shape != time_s.shape or not np.isfinite(current_A).all():
-            raise ValueError("current_A of the record must hold one finite value a sample")
+        time_s, _, current_A = check_record(record.time_s, record.voltage_V, record.current_A, least_samples=2)
         n_steps = int(np.ceil((time_s[-1] - time_s[0]) / self.dt_s - 1e-6)) + 1
         return time_s - time_s[0], resample_current(time_s, current_A, self.dt_s, n_steps)
 

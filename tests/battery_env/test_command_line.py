@@ -34,6 +34,7 @@ def test_calibrates_a_bundled_discharge_and_writes_what_it_found(tmp_path, capsy
     assert main(["calibrate", "B0005:100", "--out", str(tmp_path / "new" / "folder")]) == 0
     shown = capsys.readouterr().out
     assert "settled" in shown and "yes" in shown and "measured at" in shown and "remaining" not in shown
+    assert "1.486 Ah   the capacity to 2.7 V" in shown
     folder = tmp_path / "new" / "folder"
     assert {path.name for path in folder.iterdir()} == {
         f"B0005_100_{kind}" for kind in ("estimate.csv", "voltage.csv", "voltage.png")
@@ -52,12 +53,23 @@ def test_says_what_remains_of_a_discharge_in_progress_and_that_it_is_not_settled
     path = write(recorded.until(1500.0), tmp_path / "half.csv")
     assert main(["calibrate", path]) == 0
     shown = capsys.readouterr().out
-    assert "remaining" in shown and "Not settled" in shown and "--prior-q" in shown
+    assert "remaining" in shown and "Not settled: q_mobile is not known to 2 % yet" in shown
+    assert "give --prior-q" in shown and "ExtendedKalmanFilter" in shown and "Ah   so far" in shown
     assert main(["calibrate", path, "--prior-q", "5460", "55", "--out", str(tmp_path)]) == 0
-    assert "Not settled" not in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "Not settled: q_mobile rests on its prior" in shown and "give --prior-q" not in shown and "2.01 A to go on" in shown
     (row,) = pd.read_csv(tmp_path / "half_estimate.csv").to_dict(orient="records")
     assert 1500.0 + row["remaining_s"] == pytest.approx(recorded.eod_time_s(2.7), rel=0.02)
     assert np.isnan(row["measured_eod_time_s"])
+
+
+def test_a_load_that_varied_is_forecast_at_its_mean_and_that_is_said(tmp_path, capsys):
+    pulses = simulate(np.where(np.arange(1600) % 200 < 100, 4.0, 0.0), 7000.0, 0.12, load_unit="current", thermal=True)
+    path = write(Discharge(pulses.time_s, pulses.voltage_V, pulses.current_A), tmp_path / "pulses.csv")
+    assert main(["calibrate", path, "--prior-q", "7000", "70"]) == 0
+    assert " A the mean current so far, an assumption: the load varied" in capsys.readouterr().out
+    assert main(["calibrate", path, "--prior-q", "7000", "70", "--future-current", "4"]) == 0
+    assert "4 A to go on" in capsys.readouterr().out
 
 
 def test_one_parameter_can_be_held(capsys):
@@ -101,6 +113,8 @@ def test_negative_discharge_current_is_explained_and_can_be_flipped(recorded, tm
         (["B0005:1", "--prior-q", "1.9", "0.1"], "Ampere-hours"),
         (["B0005:1", "--cut-off", "4.3"], "between load-on at 26.242 s and 4.3 V"),
         (["B0005:1", "--mismatch", "-1"], "mismatch_V"),
+        (["B0005:1", "--current-gain-sd", "2"], "current_gain_sd is a share within 0 .. 1"),
+        (["B0005:1", "--future-current", "-2"], "future_current_A must be finite and at least 0 A, got -2.0"),
     ],
 )
 def test_bad_input_is_one_line_and_no_traceback(arguments, message, capsys):

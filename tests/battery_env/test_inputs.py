@@ -343,7 +343,7 @@ class TestEstimators:
     @pytest.mark.parametrize(
         ("change", "message"),
         [
-            (lambda record: record.part(0, 1), "at least 2 samples"),
+            (lambda record: record.part(0, 1), "at least 3 samples"),
             (lambda record: dataclasses.replace(record, time_s=record.time_s[::-1]), "time"),
             (lambda record: dataclasses.replace(record, voltage_V=record.voltage_V[:-1]), "voltage_V"),
             (lambda record: dataclasses.replace(record, current_A=0.0 * record.current_A), "no current"),

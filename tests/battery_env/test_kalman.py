@@ -103,7 +103,9 @@ class TestUncertainty:
         early, late = (
             ExtendedKalmanFilter(prior_q_mobile_C=(6100.0, 60.0)).estimate(part) for part in (record.part(0, 60), record)
         )
-        assert early.q_mobile == pytest.approx(6100.0, abs=60.0) and early.settled
+        assert early.q_mobile == pytest.approx(6100.0, abs=60.0) and not early.settled
+        assert early.reason == "q_mobile rests on its prior: the record alone does not determine it yet."
+        assert late.settled and late.reason == ""
         assert 50.0 < early.sd_q_mobile <= 60.0
         assert abs(late.q_mobile - 6000.0) < 3.0 * late.sd_q_mobile < 15.0
 
@@ -140,7 +142,7 @@ class TestGuards:
     def test_a_held_charge_that_is_drawn_freezes_the_estimate(self):
         (trace,) = ExtendedKalmanFilter(["r_o"], cell=NEW_CELL.replace(q_mobile=3000.0)).trace([measured()])
         assert not trace.settled[-1]
-        assert (trace.r_o[-500:] == trace.r_o[-1]).all() and trace.settled[300]
+        assert (trace.r_o[-500:] == trace.r_o[-1]).all() and trace.reason[-1].startswith("The model cell is empty")
 
     def test_collapse_of_the_voltage_is_survived(self):
         # 16 W at 0.2 ohm: half a minute
@@ -155,7 +157,7 @@ class TestOnline:
         filter_ = ExtendedKalmanFilter()
         batch, single = filter_.trace(records), OnlineEstimator.trace(filter_, records)
         for one, other in zip(batch, single, strict=True):
-            for name in ("time_s", "q_mobile", "r_o", "sd_q_mobile", "sd_r_o", "settled"):
+            for name in ("time_s", "q_mobile", "r_o", "sd_q_mobile", "sd_r_o", "settled", "reason"):
                 np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
         assert filter_.estimate(records[1]).q_mobile == batch[1].q_mobile[-1]
 
@@ -180,22 +182,41 @@ class TestOnline:
         ("sample", "message"),
         [
             ((np.nan, 2.0, 1.0), "voltage_V must be finite, got nan"),
-            ((3.7, 2000.0, 1.0), "current_A must lie within -60 .. 60 A, got 2000.0. Give it in A"),
-            ((3.7, 2.0, 0.0), "must be greater than 0 s, got 0.0"),
-            ((3.7, 2.0, np.nan), "must be greater than 0 s, got nan"),
+            ((3.7, 2000.0, 1.0), "current_A must lie within -60 .. 60 A, got 2000. .* not in mA"),
+            ((3700.0, 2.0, 1.0), "voltage_V must lie within 0 .. 5.5 V, got 3700. .* not in mV"),
+            ((14.8, 2.0, 1.0), "voltage_V must lie within 0 .. 5.5 V, got 14.8. .* not that of a pack"),
+            ((3.7, np.inf, 1.0), "current_A must be finite, got inf"),
+            ((3.7, 2.0, 0.0), "must lie within 0.001 .. 600 s, got 0.0"),
+            ((3.7, 2.0, np.nan), "must lie within 0.001 .. 600 s, got nan"),
+            ((3.7, 2.0, 1000.0), "got 1000.0. Give it in seconds, not in hours or milliseconds"),
+            ((3.7, 2.0, 1.0 / 3600.0), "Give it in seconds, not in hours or milliseconds"),
         ],
     )
     def test_samples_that_cannot_be_meant_are_refused(self, sample, message):
-        filter_ = ExtendedKalmanFilter()
-        filter_.update(4.1, 2.0, 0.0)
+        filter_, other = ExtendedKalmanFilter(), ExtendedKalmanFilter()
+        filter_.update(4.19, 2.0, 0.0)
         with pytest.raises(ValueError, match=message):
             filter_.update(*sample)
+        # and leave the filter as it was
+        other.update(4.19, 2.0, 0.0)
+        assert filter_.update(4.15, 2.0, 1.0) == other.update(4.15, 2.0, 1.0)
+
+    def test_a_current_of_the_wrong_sign_is_refused(self):
+        filter_ = ExtendedKalmanFilter()
+        with pytest.raises(ValueError, match="this record draws -76 C in total"):
+            for _ in range(60):
+                filter_.update(4.0, -2.0, 1.0)
+        record = measured()
+        with pytest.raises(ValueError, match="current_A is positive in discharge"):
+            filter_.trace([replace(record, current_A=-record.current_A)])
 
     @pytest.mark.parametrize(
         ("arguments", "message"),
         [
             ({"parameters": ["q"]}, "one or both of"),
             ({"voltage_noise_V": 0.0}, "voltage_noise_V must be greater than 0 V, got 0.0"),
+            ({"mismatch_V": 0.05, "voltage_noise_V": 0.005}, "voltage_noise_V must be at least mismatch_V, 0.05 V, got 0.005"),
+            ({"current_gain_sd": -0.1}, "current_gain_sd is a share within 0 .. 1"),
             ({"mismatch_V": -1.0}, "mismatch_V must be finite and at least 0, got -1.0"),
             ({"dt_s": 20.0}, "dt must be greater than 0"),
             ({"r_o_bounds_ohm": (0.2, 0.1)}, "bounds of r_o must be"),
@@ -244,9 +265,12 @@ class TestOnlineInterface:
     @pytest.mark.parametrize(
         ("changes", "message"),
         [
-            ({"voltage_V": np.full(4, np.nan)}, "voltage_V of a record must be finite, got nan at sample 0"),
-            ({"current_A": np.zeros(3)}, "current_A of a record must hold one value a sample"),
-            ({"time_s": np.array([0.0, 2.0, 1.0, 3.0])}, "must increase, but sample 2 is at 1 s, after 2 s"),
+            ({"voltage_V": np.full(4, np.nan)}, "voltage_V must be finite, got nan at sample 0"),
+            ({"current_A": np.zeros(3)}, "current_A has 3 samples, but time_s has 4"),
+            (
+                {"time_s": np.array([0.0, 2.0, 1.0, 3.0])},
+                "must increase from sample to sample, but sample 2 is at 1 s, after 2 s",
+            ),
         ],
     )
     def test_records_that_cannot_be_used_are_refused(self, changes, message):
@@ -259,12 +283,14 @@ class TestRealCells:
     def test_it_finds_the_charge_of_a_real_cell_over_its_life(self):
         discharges = load_nasa_discharges("B0005")[::12]
         records = [discharge.loaded_part(2.7) for discharge in discharges]
-        traces = ExtendedKalmanFilter(thermal=True, voltage_noise_V=0.05, mismatch_V=0.05).trace(records)
+        traces = ExtendedKalmanFilter(thermal=True, mismatch_V=0.05).trace(records)
         final = np.array([trace.q_mobile[-1] for trace in traces])
         capacity_Ah = np.array([discharge.meta["capacity_Ah"] for discharge in discharges])
         assert np.corrcoef(final, capacity_Ah)[0, 1] > 0.999
         np.testing.assert_allclose(final / (3600.0 * capacity_Ah), 1.055, atol=0.03)
+        assert all(trace.settled[-1] for trace in traces)
         # honest half-way, where the voltage determines little
         for trace, q_mobile in zip(traces, final, strict=True):
             middle = len(trace.time_s) // 2
             assert abs(trace.q_mobile[middle] - q_mobile) < 2.0 * trace.sd_q_mobile[middle]
+            assert not trace.settled[middle]

@@ -176,8 +176,8 @@ class TestNoise:
         cell = NEW_CELL.replace(**{"r_o": 0.15, **held})
         sound = not held and offset_V == 0.0
         assert LeastSquares(["q_mobile"], cell=cell, voltage_noise_V=0.005).estimate(record).settled == sound
-        # who states no noise cannot be told
-        assert LeastSquares(["q_mobile"], cell=cell).estimate(record).settled
+        # nor do they look like noise to who states none
+        assert LeastSquares(["q_mobile"], cell=cell).estimate(record).settled == sound
 
     def test_a_few_samples_do_not_tell_the_noise(self):
         fit = LeastSquares(["r_o"], cell=NEW_CELL.replace(q_mobile=6000.0))
@@ -191,12 +191,14 @@ class TestNoise:
         assert estimate.sd_q_mobile > SETTLED_SHARES["q_mobile"] * estimate.q_mobile
         assert not estimate.settled
 
-    def test_a_prior_settles_them_and_a_whole_record_overrules_it(self):
+    def test_a_prior_decides_but_does_not_settle_them_and_a_whole_record_overrules_it(self):
         record = discharged(noise_V=0.005)
         fit = LeastSquares(prior_q_mobile_C=(6100.0, 60.0))
         early, late = fit.estimate(record.part(0, 120)), fit.estimate(record)
         assert early.q_mobile == pytest.approx(6100.0, abs=60.0)
-        assert early.sd_q_mobile <= 60.0 and early.settled
+        assert early.sd_q_mobile <= 60.0
+        assert not early.settled and early.reason == "q_mobile rests on its prior: the record alone does not determine it yet."
+        assert late.settled and late.reason == ""
         assert abs(late.q_mobile - 6000.0) < 4.0 * late.sd_q_mobile < 10.0
 
     def test_prior_and_record_are_weighed_by_their_variances(self):
@@ -338,6 +340,7 @@ class TestBadInput:
             ({"mismatch_V": -0.05}, "mismatch_V"),
             ({"voltage_noise_V": 0.0}, "voltage_noise_V must be greater than 0"),
             ({"window_every_s": -1.0}, "window_every_s must be greater than 0"),
+            ({"current_gain_sd": 1.0}, "current_gain_sd is a share within 0 .. 1"),
         ],
     )
     def test_arguments_are_checked(self, arguments, message):
@@ -352,8 +355,10 @@ class TestBadInput:
         ("changes", "message"),
         [
             ({"voltage_V": np.full(100, np.nan)}, "finite"),
-            ({"voltage_V": np.full(99, 3.0)}, "one finite value a sample"),
-            ({"time_s": np.zeros(100)}, "order of time"),
+            ({"voltage_V": np.full(99, 3.0)}, "voltage_V has 99 samples, but time_s has 100"),
+            ({"time_s": np.zeros(100)}, "time_s must increase from sample to sample, but sample 1 is at 0 s"),
+            ({"voltage_V": np.full(100, 3700.0)}, "not in mV"),
+            ({"current_A": np.full(100, -2.0)}, "flip the sign"),
             ({"current_A": np.zeros(100)}, "no current"),
             ({"current_A": np.where(np.arange(100) < 99, 0.0, 2.0)}, "no current"),
         ],

@@ -77,6 +77,7 @@ def test_recorded_discharges():
     estimator = PolicyEstimator(Constant(-0.1, 0.0), "BatteryVoltageJoint-v0")
     estimate, trace = estimator.estimate(discharge), estimator.trace([discharge])[0]
     assert estimate.q_mobile == trace.q_mobile[-1] < NEW_CELL.q_mobile
+    assert not estimate.settled and estimate.reason == "A policy states no uncertainty."
     assert discharge.time_s[0] + 60.0 == trace.time_s[0]
     assert discharge.time_s[-1] - 10.0 <= trace.time_s[-1] <= discharge.time_s[-1]
 

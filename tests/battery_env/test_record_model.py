@@ -91,9 +91,9 @@ def test_charges_of_the_start_move_along_with_q_mobile():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"time_s": np.zeros(100)}, "order of time"),
-        ({"time_s": np.arange(99.0)}, "current_A .* one finite value a sample"),
-        ({"current_A": np.full(100, np.inf)}, "current_A .* one finite value a sample"),
+        ({"time_s": np.zeros(100)}, "time_s must increase"),
+        ({"time_s": np.arange(99.0)}, "voltage_V has 100 samples, but time_s has 99"),
+        ({"current_A": np.full(100, np.inf)}, "current_A must be finite, got inf at sample 0"),
     ],
 )
 def test_records_are_checked(changes, message):

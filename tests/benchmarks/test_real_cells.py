@@ -23,7 +23,7 @@ def test_the_study_writes_tables_and_figures(few, tmp_path, capsys):
     assert (whole["eod_error_s"].abs() < 0.01 * whole["duration_s"]).all()
     assert (whole["voltage_rmse_V"] < whole["new_cell_voltage_rmse_V"]).all()
     in_progress = pd.read_csv(tmp_path / "in_progress.csv")
-    assert len(in_progress) == 3 * 3 * 2
+    assert len(in_progress) == 3 * 3 * 3
     assert "Saha" in json.loads((tmp_path / "discharges.json").read_text())["configuration"]["data"]
     for name in ("life.png", "voltages.png", "summary.md"):
         assert (tmp_path / name).stat().st_size > 0

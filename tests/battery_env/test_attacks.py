@@ -1,0 +1,238 @@
+"""
+Attacks on the calibrators: discharges with one fault each, and a count of the answers that are confidently wrong.
+
+.. code-block:: bash
+
+  python tests/battery_env/test_attacks.py 2000
+"""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from battery_env.cells import Discharge, load_nasa_discharges
+from battery_env.electrochemistry import simulate
+from battery_env.estimators import Estimate, ExtendedKalmanFilter, LeastSquares
+
+WRONG_SHARE = 0.05
+COVERED_SD = 3.0
+#: Gain of the current sensor as stated to the calibrators: a record whose current is off by up to three of these is covered.
+GAIN_SD = 0.005
+
+FAULTS = (
+    "none",
+    "late start",
+    "wrong unit",
+    "wrong prior",
+    "dropout",
+    "stuck voltage",
+    "stuck current",
+    "current gain, stated",
+    "current gain, unstated",
+    "voltage gain",
+)
+#: A pure error of the current's gain scales both parameters and shows nowhere else: only its accuracy can be stated.
+UNOBSERVABLE = ("current gain, unstated",)
+UNITS = {
+    "mV": (1.0, 1e3, 1.0),
+    "pack of 4": (1.0, 4.0, 1.0),
+    "mA": (1.0, 1.0, 1e3),
+    "mA as A": (1.0, 1.0, 1e-3),
+    "minutes": (1.0 / 60.0, 1.0, 1.0),
+    "hours": (1.0 / 3600.0, 1.0, 1.0),
+    "ms": (1e3, 1.0, 1.0),
+    "flipped": (1.0, 1.0, -1.0),
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    """One record as it is handed in, and what is true of its cell (of a recorded cell: as far as its whole record tells)."""
+
+    time_s: np.ndarray
+    voltage_V: np.ndarray
+    current_A: np.ndarray
+    q_mobile: float
+    r_o: float
+    recorded: bool
+    sd_q_mobile: float = 0.0
+    sd_r_o: float = 0.0
+    cell: str = "simulated"
+    prior_q_mobile_C: tuple[float, float] | None = None
+    gain_sd: float = GAIN_SD
+
+    def part(self, start: int, stop: int) -> Case:
+        """Some of its samples."""
+        arrays = {name: getattr(self, name)[start:stop] for name in ("time_s", "voltage_V", "current_A")}
+        return replace(self, **arrays)
+
+
+def simulated(rng: np.random.Generator) -> Case:
+    """A simulated discharge of an aged cell under a constant, pulsed or wandering current, with noise of the sensor."""
+    q_mobile, r_o = rng.uniform(4000.0, 7600.0), rng.uniform(0.1, 0.3)
+    kind = rng.choice(["constant", "pulsed", "random walk"])
+    level = rng.uniform(0.5, 3.0)
+    current_A = np.full(40_000, level)
+    if kind == "pulsed":
+        period = int(rng.integers(40, 600))
+        current_A[np.arange(len(current_A)) % period >= rng.uniform(0.3, 0.8) * period] = rng.choice([0.0, 0.3 * level])
+    elif kind == "random walk":
+        segment = int(rng.integers(30, 120))
+        walk = level + np.cumsum(rng.normal(0.0, 0.3, len(current_A) // segment + 1))
+        current_A = np.repeat(np.abs(walk - 0.3) % 3.0 + 0.3, segment)[: len(current_A)]
+    record = simulate(current_A, q_mobile, r_o, load_unit="current", thermal=True, cut_off_V=rng.uniform(2.7, 3.1))
+    voltage_V = record.voltage_V + rng.normal(0.0, rng.choice([0.001, 0.005, 0.01]), len(record.voltage_V))
+    return Case(record.time_s, voltage_V, record.current_A, q_mobile, r_o, recorded=False)
+
+
+_WHOLE: dict[tuple[str, int], Case] = {}
+
+
+def recorded(rng: np.random.Generator, cells: tuple[str, ...]) -> Case:
+    """A bundled discharge, with what least squares find in the whole of it as the truth."""
+    cell, n = str(rng.choice(cells)), int(rng.integers(0, 168))
+    if (cell, n) not in _WHOLE:
+        part = discharges(cell)[n].loaded_part(2.7)
+        estimate = LeastSquares(thermal=True, mismatch_V=0.05).estimate(part)
+        sd = {name: getattr(estimate, name) for name in ("sd_q_mobile", "sd_r_o")}
+        _WHOLE[cell, n] = Case(
+            part.time_s, part.voltage_V, part.current_A, estimate.q_mobile, estimate.r_o, recorded=True, cell=cell, **sd
+        )
+    return _WHOLE[cell, n]
+
+
+_CELLS: dict[str, list[Discharge]] = {}
+
+
+def discharges(cell: str) -> list[Discharge]:
+    """Read once."""
+    if cell not in _CELLS:
+        _CELLS[cell] = load_nasa_discharges(cell)
+    return _CELLS[cell]
+
+
+def drawn(rng: np.random.Generator, cells: tuple[str, ...]) -> Case:
+    """A record, whole or in progress."""
+    case = recorded(rng, cells) if cells and rng.random() < 0.3 else simulated(rng)
+    if rng.random() < 0.3:
+        case = case.part(0, max(int(rng.uniform(0.2, 0.95) * len(case.time_s)), 12))
+    return case
+
+
+def broken(case: Case, fault: str, rng: np.random.Generator) -> Case:
+    """The record with one fault."""
+    n = len(case.time_s)
+    if fault == "late start":
+        return case.part(int(np.ceil(rng.uniform(0.05, 0.5) * n)), n)
+    if fault == "wrong unit":
+        time, volts, amperes = UNITS[str(rng.choice(list(UNITS)))]
+        return replace(case, time_s=time * case.time_s, voltage_V=volts * case.voltage_V, current_A=amperes * case.current_A)
+    if fault == "wrong prior":
+        share = rng.uniform(0.06, 0.5) * rng.choice([-1.0, 1.0])
+        mean_C = case.q_mobile * (1.0 + share)
+        return replace(case, prior_q_mobile_C=(mean_C, mean_C * rng.uniform(0.005, 0.02)))
+    voltage_V, current_A = case.voltage_V.copy(), case.current_A.copy()
+    start = int(rng.uniform(0.05, 0.9) * n)
+    if fault == "dropout":
+        values = voltage_V if rng.random() < 0.5 else current_A
+        values[start : start + int(rng.integers(1, max(n // 10, 2)))] = 0.0
+    elif fault == "stuck voltage":
+        voltage_V[start:] = voltage_V[start]
+    elif fault == "stuck current":
+        current_A[start:] = current_A[start]
+    elif fault == "current gain, stated":
+        share = rng.uniform(-0.1, 0.1)
+        return replace(case, current_A=(1.0 + share) * current_A, gain_sd=max(abs(share) / 2.0, GAIN_SD))
+    elif fault == "current gain, unstated":
+        current_A *= 1.0 + rng.uniform(0.02, 0.1) * rng.choice([-1.0, 1.0])
+    elif fault == "voltage gain":
+        voltage_V *= 1.0 + rng.uniform(-0.02, 0.02)
+    return replace(case, voltage_V=voltage_V, current_A=current_A)
+
+
+def calibrators(case: Case) -> dict[str, object]:
+    """As the command line has them, and the filter with its defaults and with the error that real cells need."""
+    more = {"thermal": True, "prior_q_mobile_C": case.prior_q_mobile_C, "current_gain_sd": case.gain_sd}
+    return {
+        "least squares": lambda: LeastSquares(mismatch_V=0.05, **more),
+        "filter": lambda: ExtendedKalmanFilter(**more),
+        "filter, mismatch": lambda: ExtendedKalmanFilter(mismatch_V=0.05, **more),
+    }
+
+
+def outcome(case: Case, make: object) -> tuple[str, Estimate | None]:
+    """``refused``, ``not settled``, ``right``, or ``wrong``: settled, but off by more than 5 % and 3 standard deviations."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            record = case
+            if case.recorded:
+                record = Discharge(case.time_s, case.voltage_V, case.current_A)
+            estimate = make().estimate(record)
+    except (TypeError, ValueError):
+        return "refused", None
+    if not estimate.settled:
+        return "not settled", estimate
+    for name in ("q_mobile", "r_o"):
+        error = abs(getattr(estimate, name) - getattr(case, name))
+        sd = np.hypot(getattr(estimate, f"sd_{name}"), getattr(case, f"sd_{name}"))
+        if not error <= max(WRONG_SHARE * getattr(case, name), COVERED_SD * sd):
+            return "wrong", estimate
+    return "right", estimate
+
+
+def attack(draws: int, cells: tuple[str, ...] = ("B0005", "B0006"), seed: int = 0) -> pd.DataFrame:
+    """One row a draw and calibrator."""
+    rows = []
+    for n in range(draws):
+        rng = np.random.default_rng((seed, n))
+        fault = FAULTS[n % len(FAULTS)]
+        whole = drawn(rng, cells)
+        case = broken(whole, fault, rng)
+        for name, make in calibrators(case).items():
+            found, estimate = outcome(case, make)
+            row = {"draw": n, "fault": fault, "calibrator": name, "cell": case.cell, "outcome": found}
+            if estimate is not None:
+                row |= {
+                    "q": estimate.q_mobile, "true q": case.q_mobile, "sd_q": estimate.sd_q_mobile,
+                    "r": estimate.r_o, "true r": case.r_o, "sd_r": estimate.sd_r_o, "reason": estimate.reason,
+                }  # fmt: skip
+            rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def counts(answers: pd.DataFrame) -> pd.DataFrame:
+    """How many answers of each kind each calibrator gives, by fault."""
+    return pd.crosstab([answers["calibrator"], answers["fault"]], answers["outcome"]).astype(int)
+
+
+@pytest.mark.slow
+@settings(max_examples=40, deadline=None, derandomize=True, database=None)
+@given(fault=st.sampled_from([fault for fault in FAULTS if fault not in UNOBSERVABLE]), seed=st.integers(0, 10_000))
+def test_no_calibrator_is_sure_of_a_wrong_answer(fault, seed):
+    rng = np.random.default_rng(seed)
+    case = broken(drawn(rng, ("B0005", "B0006")), fault, rng)
+    for name, make in calibrators(case).items():
+        found, estimate = outcome(case, make)
+        assert found != "wrong", f"{name}: {estimate}, but q_mobile is {case.q_mobile:.0f} C and r_o {case.r_o:.4f} ohm"
+
+
+def test_attacks_are_counted_by_calibrator_and_fault():
+    table = counts(attack(10, ("B0005",)))
+    assert isinstance(table, pd.DataFrame) and table.to_numpy().sum() == 30
+    assert set(table.index.get_level_values("fault")) == set(FAULTS)
+
+
+if __name__ == "__main__":
+    answers = attack(int(sys.argv[1]), tuple(sys.argv[2:]) or ("B0005", "B0006"))
+    print(counts(answers).to_string())
+    wrong = answers[answers["outcome"] == "wrong"].drop(columns=["outcome", "reason"])
+    print(wrong[~wrong["fault"].isin(UNOBSERVABLE)].round(4).to_string())
