@@ -332,7 +332,7 @@ def _follow(
 class ExtendedKalmanFilter(OnlineEstimator):
     """
     Follows (q_mobile, r_o) along a discharge that starts with a fully charged cell at rest: one estimate a sample, with its
-    standard deviation, in microseconds.
+    standard deviation.
 
     *State.* Given the current, the state of the model is a function of its two parameters; the charges are even linear in
     ``q_mobile``, with slope ``FULL_CHARGE_SHARES``. So the covariance of the augmented state (states and parameters) has the
