@@ -156,7 +156,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--envs", nargs="+", default=list(_TIMESTEPS), choices=list(_TIMESTEPS))
     parser.add_argument("--alpha3", nargs="+", type=float, default=[0.1, 0.3, 1.0])
-    parser.add_argument("--lambda-max", nargs="+", type=float, default=[1.0, 10.0])
+    parser.add_argument("--lambda-max", nargs="+", type=float, default=[1.0])
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
     parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1), help="runs at the same time, one core each")
     parser.add_argument("--out", type=Path, default=Path("results/multipliers"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from math import exp, inf, log, sqrt
 from typing import NamedTuple
 
@@ -50,6 +51,7 @@ from battery_env.estimators.settling import (
     START_WINDOW_S,
     data_sd,
     is_plausible,
+    sensor_reason,
     start_reason,
 )
 from battery_env.kernels import PackedConstants, cell_step, cell_voltage
@@ -520,6 +522,24 @@ class ExtendedKalmanFilter(OnlineEstimator):
         out = self._run(self._bank, np.array([[voltage_V], [current_A], [since_s]], dtype=np.float64))
         trace = self._trace(np.array([self._time_s]), out, np.array([self._start_reason], dtype=object))
         return last_estimate(trace)
+
+    def estimate(self, record: Record) -> Estimate:
+        """
+        The estimate at the last sample of a record. Unlike the stream, a whole record can be asked whether its voltage follows
+        its current everywhere: where a sensor is stuck or gone for a while, the estimate is not settled.
+
+        :param record: one discharge
+        :return: the estimate
+        :raises ValueError: if the record cannot be used
+        """
+        from scipy.ndimage import median_filter  # here, as it takes longer to import than this package
+
+        estimate = super().estimate(record)
+        time_s, voltage_V, current_A = (np.asarray(getattr(record, name)) for name in ("time_s", "voltage_V", "current_A"))
+        # single wild samples are gated
+        smooth_V = median_filter(voltage_V, size=3, mode="nearest")
+        reason = estimate.reason or (sensor_reason(time_s, smooth_V, current_A) if len(time_s) > 1 else "")
+        return replace(estimate, settled=not reason, reason=reason)
 
     def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:
         """

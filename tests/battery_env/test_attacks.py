@@ -225,6 +225,14 @@ def test_no_calibrator_is_sure_of_a_wrong_answer(fault, seed):
         assert found != "wrong", f"{name}: {estimate}, but q_mobile is {case.q_mobile:.0f} C and r_o {case.r_o:.4f} ohm"
 
 
+def test_the_filter_notices_a_current_that_was_gone_for_a_while():
+    """Once answered with r_o = 0.072 ohm for 0.198 ohm, settled."""
+    rng = np.random.default_rng((0, 154))
+    case = broken(drawn(rng, ("B0005", "B0006")), "dropout", rng)
+    found, estimate = outcome(case, calibrators(case)["filter, mismatch"])
+    assert found == "not settled" and "voltage does not follow" in estimate.reason
+
+
 def test_attacks_are_counted_by_calibrator_and_fault():
     table = counts(attack(10, ("B0005",)))
     assert isinstance(table, pd.DataFrame) and table.to_numpy().sum() == 30
