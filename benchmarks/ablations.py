@@ -28,7 +28,7 @@ from battery_env.calibration.policy import PolicyEstimator, Predictor
 from battery_env.evaluation import evaluate
 from battery_env.trajectories import TrajectoryDataset
 from benchmarks.reporting import write_csv, write_text
-from benchmarks.training import Recipe, run_all, train_or_load
+from benchmarks.training import Recipe, run_all, timesteps_of, train_or_load
 
 _ENV_ID = "BatteryQmax-v0"
 _DISCHARGES = 64  # of the test part, evenly spaced
@@ -123,8 +123,7 @@ def run(name: str, seed: int, updates: int, test: TrajectoryDataset, out: Path) 
     hyperparameters = dict(variant.hyperparameters)
     if variant.hidden:
         hyperparameters["env_wrapper"] = [{"benchmarks.ablations.HideColumns": {"hidden": list(variant.hidden)}}]
-    entry = Recipe.of("lac", _ENV_ID, seed).hyperparameters
-    timesteps = entry["learning_starts"] + updates * entry["n_envs"]
+    timesteps = timesteps_of(updates, Recipe.of("lac", _ENV_ID, seed).hyperparameters)
     model = train_or_load("lac", _ENV_ID, seed, timesteps, out / "models" / name, hyperparameters)
     errors = evaluate(PolicyEstimator(_Blinkered(model, variant.hidden), _ENV_ID), test)["q_mobile_mape_percent"]
     return {

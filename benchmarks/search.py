@@ -32,7 +32,7 @@ from battery_env.calibration.policy import PolicyEstimator
 from battery_env.calibration.variants import FullStateEnv
 from battery_env.evaluation import evaluate
 from benchmarks.reporting import write_csv, write_text
-from benchmarks.training import Recipe, run_all, set_up
+from benchmarks.training import Recipe, run_all, set_up, timesteps_of
 
 _DISCHARGES = 64  # whole ones, evenly spaced in the training part
 _WORST_ERROR = 100.0  # %, what a policy is given that does worse
@@ -89,8 +89,9 @@ def score(algo: str, env_id: str, updates: int, folder: Path, trial: Trial) -> f
     :param trial: what chooses the settings, and is told the median and the worst discharge
     :return: error of q_mobile or r_o, mean over whole discharges of the training part, %
     """
-    manager, model = set_up(Recipe.of(algo, env_id, trial.number, hyperparameters=SAMPLERS[algo](trial)), folder)
-    model.learn(model.learning_starts + updates * manager.n_envs // model.gradient_steps)
+    recipe = Recipe.of(algo, env_id, trial.number, hyperparameters=SAMPLERS[algo](trial))
+    _, model = set_up(recipe, folder)
+    model.learn(timesteps_of(updates, recipe.hyperparameters))
     env = PolicyEstimator.environment(env_id)
     assert isinstance(env, FullStateEnv)
     discharges = env.dataset.subset(range(0, len(env.dataset), len(env.dataset) // _DISCHARGES))

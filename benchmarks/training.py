@@ -233,6 +233,18 @@ def train_or_load(
     return ALGOS[algo].load(file, device="cpu")
 
 
+def timesteps_of(updates: int, hyperparameters: dict[str, Any]) -> int:
+    """
+    How long to train for a number of updates, with one call of ``train()`` per step of all environments.
+
+    :param updates: gradient steps
+    :param hyperparameters: as in a file of ``zoo_configs``, with ``learning_starts`` and ``n_envs``
+    :return: environment steps
+    """
+    n_envs, starts = hyperparameters["n_envs"], hyperparameters["learning_starts"]
+    return n_envs * (starts // n_envs + -(-updates // hyperparameters.get("gradient_steps", 1)))
+
+
 def record_file(recipe: Recipe, folder: Path) -> Path:
     """
     Where :func:`train_or_load` says what made a model: ``recipe``, ``training_minutes``, ``versions``.
