@@ -58,7 +58,7 @@ def _sample_td3(trial: Trial) -> dict[str, Any]:
     target_noise = trial.suggest_float("target_policy_noise", 0.01, 0.2, log=True)
     return {
         **_sample_common(trial),
-        "noise_std": float(f"{trial.suggest_float('noise_std', 0.01, 0.3, log=True):.2g}"),
+        "noise_std": float(f"{trial.suggest_float('noise_std', 0.1, 1.0, log=True):.2g}"),
         "target_policy_noise": float(f"{target_noise:.2g}"),
         "target_noise_clip": float(f"{2.0 * target_noise:.2g}"),
     }
@@ -73,7 +73,7 @@ FIRST_TRIAL = {
     "tau": 0.005,
     "ent_coef": 0.02,
     "target_entropy": -4.0,
-    "noise_std": 0.05,
+    "noise_std": 0.5,
     "target_policy_noise": 0.05,
 }
 

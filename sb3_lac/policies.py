@@ -44,6 +44,21 @@ def activate_in_place(network: nn.Module) -> None:
             layer.inplace = True
 
 
+def with_linear_term(last_layer: nn.Linear) -> nn.Linear:
+    """
+    The last layer of a critic with one output more, for its linear term. That starts at zero and takes no random numbers, so
+    that nothing changes until there is an offset.
+
+    :param last_layer: Layer of the terms that are squared
+    :return: The same layer with one output more, the last one
+    """
+    widened = nn.utils.skip_init(nn.Linear, last_layer.in_features, last_layer.out_features + 1)
+    with th.no_grad():
+        widened.weight.copy_(nn.functional.pad(last_layer.weight, (0, 0, 0, 1)))
+        widened.bias.copy_(nn.functional.pad(last_layer.bias, (0, 1)))
+    return widened
+
+
 class LyapunovCritic(BaseModel):
     """
     Lyapunov critic network(s) for LAC.
@@ -55,7 +70,7 @@ class LyapunovCritic(BaseModel):
 
     Where rewards are positive, ``L`` has an ``offset``, the value of states from which nothing is ever paid, and the networks
     only learn the difference to it, ``L(s, a) - offset``. It is negative wherever rewards are collected, so that it takes a
-    linear term beside the sum of squares. Without an offset that term is zero and stays zero.
+    linear term beside the sum of squares, the last output of each network. Without an offset that term is zero and stays zero.
 
     :param observation_space: Observation space
     :param action_space: Action space
@@ -107,21 +122,15 @@ class LyapunovCritic(BaseModel):
         self.output_dim = output_dim
         self.n_critics = n_critics
         self.lyapunov_networks: list[nn.Sequential] = []
-        self.linear_terms: list[nn.Linear] = []
         # What all exact values have in common. Set by the algorithm, saved with the weights
         self.offset: th.Tensor
         self.register_buffer("offset", th.zeros(1))
         for idx in range(n_critics):
             lyapunov_net = nn.Sequential(*create_mlp(features_dim + action_dim, output_dim, net_arch, activation_fn))
+            lyapunov_net[-1] = with_linear_term(lyapunov_net[-1])
             activate_in_place(lyapunov_net)
             self.add_module(f"lf{idx}", lyapunov_net)
             self.lyapunov_networks.append(lyapunov_net)
-            # Starts at zero and takes no random numbers: nothing changes until there is an offset
-            linear_term = nn.utils.skip_init(nn.Linear, lyapunov_net[-1].in_features, 1)
-            nn.init.zeros_(linear_term.weight)
-            nn.init.zeros_(linear_term.bias)
-            self.add_module(f"linear_term{idx}", linear_term)
-            self.linear_terms.append(linear_term)
 
     def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:
         """
@@ -138,12 +147,9 @@ class LyapunovCritic(BaseModel):
         lyapunov_input = th.cat([features, actions], dim=1)
         has_offset = self.offset > 0
         values = []
-        for net, linear_term in zip(self.lyapunov_networks, self.linear_terms, strict=True):
-            latent = lyapunov_input
-            *hidden_layers, last_layer = net
-            for layer in hidden_layers:
-                latent = layer(latent)
-            values.append(last_layer(latent).square().sum(dim=1, keepdim=True) + has_offset * linear_term(latent))
+        for lyapunov_net in self.lyapunov_networks:
+            squared, linear_term = lyapunov_net(lyapunov_input).split([self.output_dim, 1], dim=1)
+            values.append(squared.square().sum(dim=1, keepdim=True) + has_offset * linear_term)
         return tuple(values)
 
     def lyapunov(self, obs: PyTorchObs, actions: th.Tensor) -> th.Tensor:

@@ -107,8 +107,8 @@ class Formulation:
     :param state_scale: what observed states are divided by, shape (7,)
     :param load_scale: what observed loads are divided by, W
     :param error_scale: what state errors are divided by, in the cost and in the innovation, shape (7,)
-    :param innovations: whether the observation holds x_{t+1} minus what a model with a new cell's parameters predicts, once
-        from the model's state x̂_t and once from the measured state x_t
+    :param innovations: whether the observation holds asinh of x_{t+1} minus what a model with a new cell's parameters predicts,
+        in error scales, once from the model's state x̂_t and once from the measured state x_t
     :param literal_cost: the authors' cost: 0.5 times the norm of the error of the voltages plus 0.5 times that of the charges,
         times 50 where it exceeds 1e-4. Otherwise it is the norm of all errors
     :param cost_limit: the largest cost of a distance. Near the end of a discharge distances span four orders of magnitude;
@@ -426,7 +426,7 @@ class FullStateTask(CalibrationTask):
 
     def observation(self) -> NDArray[np.float32]:
         """
-        s_t = [x̂_t, x_{t+1}, u_{t+1}] and, with innovations, x_{t+1} - f(x̂_t, u_{t+1}; new cell) and
+        s_t = [x̂_t, x_{t+1}, u_{t+1}] and, with innovations, asinh of x_{t+1} - f(x̂_t, u_{t+1}; new cell) and of
         x_{t+1} - f(x_t, u_{t+1}; new cell), all scaled; with a price on changes of the action, the action before.
 
         :return: shape (cells, observation_size)

@@ -13,6 +13,7 @@ from battery_env.kernels import (
     BLOCK_SIZE,
     VOLTAGE,
     FloatArray,
+    asinh_ratio,
     fill_block,
     states_of_block,
     step_of_block,
@@ -179,4 +180,5 @@ def observe(
             for j in range(size):
                 n = first + j
                 for k in range(7):
-                    out[n, k + column] = _clipped((measured[n, k + 1] - block[(k + 1) * BLOCK + j]) * per_error[k], limit)
+                    # asinh: they span five orders of magnitude, and must not drown the small ones in a network
+                    out[n, k + column] = asinh_ratio((measured[n, k + 1] - block[(k + 1) * BLOCK + j]) * per_error[k], 1.0)

@@ -75,12 +75,13 @@ class BatteryQmaxEnv(FullStateEnv):
     | 0-6   | x̂_t, the model's state |
     | 7-13  | x_{t+1}, the measured state one step ahead |
     | 14    | u_{t+1}, the power over that step, divided by 16 W |
-    | 15-21 | x_{t+1} minus what the model with a new cell's parameters predicts from x̂_t, in error scales |
-    | 22-28 | x_{t+1} minus what the model with a new cell's parameters predicts from x_t, the state measured before, in error scales |
+    | 15-21 | asinh of the innovation x_{t+1} minus what the model with a new cell's parameters predicts from x̂_t, in error scales |
+    | 22-28 | asinh of the innovation x_{t+1} minus what the model with a new cell's parameters predicts from x_t, the state measured before, in error scales |
 
     Error scales: Vo 0.01 V, Vsn and Vsp 1e-5 V, charges 20 C. The two innovations make the measurements readable: a parameter
     that is off by 1 % moves the next state by 1e-4 of its value. The second one shows what the parameter did in this second.
-    The first one shows besides how far the model has drifted, which is most of the cost.
+    The first one shows besides how far the model has drifted, which is most of the cost. A model that was wrong for a minute
+    is off by hundreds of error scales; asinh keeps what a network sees within about 7, and leaves small innovations as they are.
 
     The observation is Markov for a constant load: cost and next model state depend on it and the action alone, the next
     measured state on the parameter too, which the observation determines. It stays so with ``start``,
@@ -138,7 +139,7 @@ class BatteryQmaxEnv(FullStateEnv):
 
     ## Version history
 
-    * v0: initial version; since 0.2.0 with the second innovation
+    * v0: initial version; since 0.2.0 with the second innovation; since 0.3.0 with asinh of both
     """  # noqa: E501 (rows of a table)
 
     @staticmethod

@@ -111,8 +111,8 @@ def test_the_observation_is_what_the_documentation_says():
             x_hat[OBSERVED] / state_scale,
             x_next[OBSERVED] / state_scale,
             [trajectory.load[t] / 16.0],
-            (x_next - from_model)[OBSERVED] / error_scale,
-            (x_next - from_cell)[OBSERVED] / error_scale,
+            np.arcsinh((x_next - from_model)[OBSERVED] / error_scale),
+            np.arcsinh((x_next - from_cell)[OBSERVED] / error_scale),
         ]
     )
     np.testing.assert_allclose(observation, expected, rtol=1e-5, atol=1e-5)

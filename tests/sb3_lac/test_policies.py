@@ -41,7 +41,8 @@ def test_value_is_the_sum_of_squares_of_the_last_layer(make_model):
     assert len(values) == 2
     for value, net in zip(values, critic.lyapunov_networks, strict=True):
         outputs = net(th.cat([obs, actions], dim=1))
-        assert outputs.shape == (30, 5)
+        # The last one is the linear term, without an offset zero
+        assert outputs.shape == (30, 5 + 1) and not outputs[:, 5].any()
         th.testing.assert_close(value, (outputs**2).sum(dim=1, keepdim=True))
     assert not th.equal(values[0], values[1])
 
@@ -50,7 +51,7 @@ def test_actor_and_critic_can_have_their_own_architecture(make_model):
     model = make_model(n_collect=0, policy_kwargs={"net_arch": {"pi": [8], "qf": [12, 10]}})
     assert [layer.out_features for layer in model.actor.latent_pi if isinstance(layer, nn.Linear)] == [8]
     critic_layers = [layer.out_features for layer in model.critic.lyapunov_networks[0] if isinstance(layer, nn.Linear)]
-    assert critic_layers == [12, 10, 16]
+    assert critic_layers == [12, 10, 16 + 1]
 
 
 def test_targets_start_as_copies_and_stay_in_eval_mode(make_model):

@@ -45,10 +45,9 @@ def lyapunov(weights, obs, actions, n_critics, offset=0.0):
     for i in range(n_critics):
         latent = mlp(weights, f"lf{i}", th.cat([obs, actions], dim=1), 2)
         outputs = latent @ weights[f"lf{i}.4.weight"].T + weights[f"lf{i}.4.bias"]
-        values.append((outputs**2).sum(dim=1))
+        values.append((outputs[:, :-1] ** 2).sum(dim=1))
         if offset > 0:
-            linear_term = latent @ weights[f"linear_term{i}.weight"].T + weights[f"linear_term{i}.bias"]
-            values[-1] = values[-1] + offset + linear_term[:, 0]
+            values[-1] = values[-1] + offset + outputs[:, -1]
     return th.stack(values)
 
 
@@ -129,10 +128,8 @@ def test_train_is_the_published_update(make_model, make_env, n_critics, bound):
         assert logged["train/ent_coef_loss"] == pytest.approx(-log_beta.value * violation, rel=1e-3)
 
         for weights, loss in ((critic, critic_loss), (actor, actor_loss)):
-            # Without an offset there is no linear term
-            used = [name for name in weights if bound > 0 or "linear_term" not in name]
-            gradients = th.autograd.grad(loss, [weights[name] for name in used], retain_graph=True)
-            for name, gradient in zip(used, gradients, strict=True):
+            gradients = th.autograd.grad(loss, list(weights.values()), retain_graph=True)
+            for name, gradient in zip(list(weights), gradients, strict=True):
                 weights[name] = (weights[name] - LEARNING_RATE * gradient).detach().requires_grad_(True)
         log_lambda.step(-d.item(), LAMBDA_LEARNING_RATE)
         log_lambda.value = min(max(log_lambda.value, math.log(LAMBDA_MIN)), math.log(LAMBDA_MAX))
