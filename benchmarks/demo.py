@@ -17,7 +17,7 @@ from pathlib import Path
 from benchmarks import compare, real_cells
 
 RESULTS = Path("results")
-TIMESTEPS = 169_600  # 2400 updates
+TIMESTEPS = 154_560  # 2400 updates
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
