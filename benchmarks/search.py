@@ -7,8 +7,9 @@ each algorithm, starting from the entry in ``zoo_configs``.
   python -m benchmarks.search --env BatteryQmax-v0 --trials 10 --updates 2400
 
 A trial trains with the entry of ``zoo_configs``, changed where the search varies it. Its score is the mean error of the mean
-action on whole discharges of the training part, the model running free; the test part is not touched. Trials lie in a journal
-of Optuna: after an interruption the same command goes on (with other trials than an uninterrupted search would have tried).
+action on whole discharges of the training part, the model running free; the test part is not touched. One seed says little:
+the best three trials are trained twice more, with other seeds, and ranked by the mean of their three scores. Trials lie in a
+journal of Optuna: after an interruption the same command goes on (with other trials than an uninterrupted search would try).
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ import optuna
 import pandas as pd
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
-from optuna.trial import Trial, TrialState
+from optuna.trial import FrozenTrial, Trial, TrialState
 
 from battery_env.calibration.policy import PolicyEstimator
 from battery_env.calibration.variants import FullStateEnv
@@ -36,6 +37,7 @@ from benchmarks.training import Recipe, run_all, set_up, timesteps_of
 
 _DISCHARGES = 64  # whole ones, evenly spaced in the training part
 _WORST_ERROR = 100.0  # %, what a policy is given that does worse
+_FINALISTS, _REPEATS = 3, 2  # the best trials, and how often each is trained again
 
 
 def _sample_common(trial: Trial) -> dict[str, Any]:
@@ -111,7 +113,7 @@ def search(algo: str, env_id: str, trials: int, updates: int, out: Path) -> pd.D
     :param trials: trials in all
     :param updates: gradient steps of each
     :param out: folder of the journal
-    :return: one row per finished trial
+    :return: one row per trial; means over its seeds, the worst discharge of any seed
     """
     out.mkdir(parents=True, exist_ok=True)
     study = optuna.create_study(
@@ -123,27 +125,49 @@ def search(algo: str, env_id: str, trials: int, updates: int, out: Path) -> pd.D
     study.sampler = optuna.samplers.TPESampler(n_startup_trials=trials // 2, multivariate=True, seed=len(study.trials))
     if not study.trials:
         study.enqueue_trial(FIRST_TRIAL)
-    finished = [trial for trial in study.trials if trial.state == TrialState.COMPLETE]
-    study.optimize(partial(score, algo, env_id, updates, out / "zoo"), n_trials=max(trials - len(finished), 0))
-    rows = [
-        {"algo": algo, "trial": trial.number, "mean_percent": trial.value, **trial.user_attrs, **trial.params}
-        for trial in study.get_trials(states=[TrialState.COMPLETE])
-    ]
+    objective = partial(score, algo, env_id, updates, out / "zoo")
+    study.optimize(objective, n_trials=max(trials - len(_first_trials(study)), 0))
+    finalists = sorted(_first_trials(study), key=lambda trial: trial.value)[:_FINALISTS]
+    for finalist in finalists:
+        for _ in range(_REPEATS - len(_repeats(study, finalist))):
+            study.enqueue_trial(finalist.params, user_attrs={"repeats": finalist.number})
+            study.optimize(objective, n_trials=1)
+    rows = []
+    for trial in _first_trials(study):
+        runs = [trial, *_repeats(study, trial)]
+        scores = {
+            "seeds": len(runs),
+            "mean_percent": np.mean([run.value for run in runs]),
+            "median_percent": np.mean([run.user_attrs["median_percent"] for run in runs]),
+            "worst_percent": max(run.user_attrs["worst_percent"] for run in runs),
+            "all_mean_percent": " / ".join(f"{run.value:.2g}" for run in runs),
+        }
+        rows.append({"algo": algo, "trial": trial.number, "updates": updates, **scores, **trial.params})
     return pd.DataFrame(rows)
+
+
+def _first_trials(study: optuna.Study) -> list[FrozenTrial]:
+    complete = study.get_trials(states=[TrialState.COMPLETE])
+    return [trial for trial in complete if "repeats" not in trial.user_attrs]
+
+
+def _repeats(study: optuna.Study, trial: FrozenTrial) -> list[FrozenTrial]:
+    complete = study.get_trials(states=[TrialState.COMPLETE])
+    return [run for run in complete if run.user_attrs.get("repeats") == trial.number]
 
 
 def report(trials: pd.DataFrame) -> str:
     """
-    The three best trials of each algorithm and the first one, as Markdown.
+    The three best trials of each algorithm, with three seeds, and the first one, as Markdown.
 
     :param trials: see ``search()``, of all algorithms
     :return: one table per algorithm
     """
     text = ""
     for algo, of_algo in trials.groupby("algo", sort=False):
-        best = of_algo.sort_values("mean_percent").head(3)
+        best = of_algo[of_algo["seeds"] > 1].sort_values("mean_percent")
         shown = pd.concat([best, of_algo[of_algo["trial"] == 0]]).drop_duplicates().dropna(axis=1, how="all")
-        table = shown.drop(columns=["algo", "updates"]).to_markdown(index=False, floatfmt=".2g")
+        table = shown.drop(columns=["algo", "updates", "mean_percent"]).to_markdown(index=False, floatfmt=".2g")
         text += f"**{str(algo).upper()}**, {len(of_algo)} trials\n\n{table}\n\n"
     return text
 

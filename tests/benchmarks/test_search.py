@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import optuna
 import pandas as pd
 import pytest
@@ -16,8 +17,8 @@ def trials(monkeypatch):
 
     def score(algo, env_id, updates, folder, trial):
         tried.append((algo, search.SAMPLERS[algo](trial)))
-        trial.set_user_attr("updates", updates)
-        trial.set_user_attr("worst_percent", 7.0)
+        trial.set_user_attr("median_percent", 1.0)
+        trial.set_user_attr("worst_percent", 7.0 + trial.number)
         return 100.0 * trial.params["learning_rate"]
 
     monkeypatch.setattr(search, "score", score)
@@ -26,7 +27,8 @@ def trials(monkeypatch):
 
 def test_every_algorithm_gets_the_same_trials_of_as_many_settings(trials, tmp_path, capsys):
     search.main(["--trials", "4", "--updates", "9", "--jobs", "1", "--out", str(tmp_path)])
-    assert [algo for algo, _ in trials] == ["lac"] * 4 + ["sac"] * 4 + ["td3"] * 4
+    # four trials, and the best three of them twice more
+    assert [algo for algo, _ in trials] == ["lac"] * 10 + ["sac"] * 10 + ["td3"] * 10
     assert {len(settings) for algo, settings in trials if algo != "td3"} == {5}
     # the clip of TD3's noise follows the noise
     assert {len(settings) for algo, settings in trials if algo == "td3"} == {6}
@@ -40,13 +42,26 @@ def test_every_algorithm_gets_the_same_trials_of_as_many_settings(trials, tmp_pa
 
 def test_a_search_goes_on_and_is_not_done_twice(trials, tmp_path):
     first = search.search("sac", "BatteryRo-v0", 3, 9, tmp_path)
+    assert len(trials) == 3 + 3 * 2
     longer = search.search("sac", "BatteryRo-v0", 5, 9, tmp_path)
+    newcomers = set(longer.sort_values("mean_percent").head(3).index) - set(first.index)
+    assert len(trials) == 5 + (3 + len(newcomers)) * 2
     again = search.search("sac", "BatteryRo-v0", 5, 9, tmp_path)
-    assert len(trials) == 5
-    pd.testing.assert_frame_equal(longer.head(3), first)
+    assert len(trials) == 5 + (3 + len(newcomers)) * 2
+    pd.testing.assert_frame_equal(longer.head(3)[["learning_rate", "mean_percent"]], first[["learning_rate", "mean_percent"]])
     pd.testing.assert_frame_equal(again, longer)
     # other numbers of updates are another search
     assert len(search.search("sac", "BatteryRo-v0", 1, 10, tmp_path)) == 1
+
+
+def test_the_best_three_are_ranked_by_three_seeds(trials, tmp_path):
+    found = search.search("lac", "BatteryRo-v0", 6, 9, tmp_path)
+    best = found.sort_values("mean_percent").head(3)
+    assert (best["seeds"] == 3).all() and (found.drop(best.index)["seeds"] == 1).all()
+    tried = [settings["learning_rate"] for _, settings in trials]
+    # the same settings again, with the numbers of later trials as seeds
+    assert sorted(tried[6:]) == sorted(np.repeat([f"lin_{rate:.2g}" for rate in best["learning_rate"]], 2))
+    assert set(best["worst_percent"]) == {14.0, 16.0, 18.0} and (found.drop(best.index)["worst_percent"] < 13.0).all()
 
 
 def test_a_trial_is_trained_for_its_updates_and_scored_on_training_discharges(tmp_path):
