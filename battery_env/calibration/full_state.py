@@ -107,8 +107,8 @@ class Formulation:
     :param state_scale: what observed states are divided by, shape (7,)
     :param load_scale: what observed loads are divided by, W
     :param error_scale: what state errors are divided by, in the cost and in the innovation, shape (7,)
-    :param innovations: whether the observation holds asinh of x_{t+1} minus what a model with a new cell's parameters predicts,
-        in error scales, once from the model's state x̂_t and once from the measured state x_t
+    :param innovations: whether the observation holds asinh of x_{t+1} minus what a model with a new cell's parameters
+        predicts, in error scales, once from the model's state x̂_t and once from the measured state x_t
     :param literal_cost: the authors' cost: 0.5 times the norm of the error of the voltages plus 0.5 times that of the charges,
         times 50 where it exceeds 1e-4. Otherwise it is the norm of all errors
     :param cost_limit: the largest cost of a distance. Near the end of a discharge distances span four orders of magnitude;
