@@ -12,7 +12,8 @@ from stable_baselines3.common.callbacks import BaseCallback, EventCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, sync_envs_normalization
 
 from sb3_lac.lac import LAC
-from sb3_lac.stability import LyapunovReport, evaluate_lyapunov, prepare_evaluation, trains_on
+from sb3_lac.stability import LyapunovReport, evaluate_lyapunov
+from sb3_lac.stability.rollout import prepare_evaluation, trains_on
 
 if TYPE_CHECKING:
     import pandas as pd
