@@ -32,18 +32,6 @@ def largest_value(values: Sequence[th.Tensor]) -> th.Tensor:
     return reduce(th.maximum, values)
 
 
-def activate_in_place(network: nn.Module) -> None:
-    """
-    Let the activations of a multilayer perceptron overwrite the outputs of its linear layers, which no gradient needs:
-    less memory is moved.
-
-    :param network: Network of linear layers, each followed by an activation
-    """
-    for layer in network.modules():
-        if isinstance(layer, (nn.ReLU, nn.LeakyReLU)):
-            layer.inplace = True
-
-
 def with_linear_term(last_layer: nn.Linear) -> nn.Linear:
     """
     The last layer of a critic with one output more, for its linear term. That starts at zero and takes no random numbers, so
@@ -128,7 +116,6 @@ class LyapunovCritic(BaseModel):
         for idx in range(n_critics):
             lyapunov_net = nn.Sequential(*create_mlp(features_dim + action_dim, output_dim, net_arch, activation_fn))
             lyapunov_net[-1] = with_linear_term(lyapunov_net[-1])
-            activate_in_place(lyapunov_net)
             self.add_module(f"lf{idx}", lyapunov_net)
             self.lyapunov_networks.append(lyapunov_net)
 
@@ -342,7 +329,6 @@ class LyapunovPolicy(BasePolicy):
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
         actor_kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
         actor = Actor(**actor_kwargs)
-        activate_in_place(actor.latent_pi)
         if not actor.use_sde:
             actor.action_dist = SquashedGaussianDistribution(get_action_dim(self.action_space))  # type: ignore[assignment]
         return actor.to(self.device)
