@@ -523,8 +523,6 @@ class LAC(OffPolicyAlgorithm):
             [parameter for group in optimizer.param_groups for parameter in group["params"] if parameter.requires_grad]
             for optimizer in optimizers[:2]
         )
-        online_parameters: list[th.Tensor] = [*self.actor.parameters(), *self.critic.parameters()]
-        target_parameters: list[th.Tensor] = [*self.actor_target.parameters(), *self.critic_target.parameters()]
         log_lambda_min, log_lambda_max = math.log(self.lambda_min), math.log(self.lambda_max)
         # Kept on the device until the end: reading one value would wait for all pending work
         metrics: dict[str, th.Tensor] = {}
@@ -628,9 +626,8 @@ class LAC(OffPolicyAlgorithm):
 
             # Update target networks
             if gradient_step % self.target_update_interval == 0:
-                with th.no_grad():
-                    # Same as ``polyak_update()``, for all tensors at once
-                    th._foreach_lerp_(target_parameters, online_parameters, self.tau)
+                polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
+                polyak_update(self.actor.parameters(), self.actor_target.parameters(), self.tau)
                 # Copy running stats, see GH issue #996
                 polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
 
