@@ -42,13 +42,13 @@ from tqdm import tqdm
 from battery_env.calibration.policy import PolicyEstimator
 from battery_env.calibration.task import Parameter
 from battery_env.calibration.variants import FullStateEnv
+from battery_env.callbacks import CalibrationCallback
 from battery_env.estimators.closed_form import ClosedForm
 from battery_env.evaluation import evaluate, summarize
 from battery_env.plotting import plot_learning_curves, plot_true_against_inferred, save_figure
 from battery_env.trajectories import TrajectoryDataset
 from benchmarks.reporting import versions, write_csv, write_text
 from benchmarks.training import DEFAULTS_TIMESTEPS, Recipe, run_all, set_up
-from sb3_lac import CalibrationCallback
 
 _EVALUATION_TRAJECTORIES = 64  # of the test part, evenly spaced, while training; all of them at the end
 _EVALUATION_EPISODES = 20

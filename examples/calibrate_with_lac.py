@@ -6,7 +6,8 @@ from stable_baselines3.common.utils import LinearSchedule
 from torch import nn
 
 from battery_env import PolicyEstimator, evaluate
-from sb3_lac import LAC, CalibrationCallback
+from battery_env.callbacks import CalibrationCallback
+from sb3_lac import LAC
 
 ENV_ID = "BatteryRo-v0"
 

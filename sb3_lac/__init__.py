@@ -1,7 +1,7 @@
 from pathlib import Path
 
 import sb3_lac.envs  # noqa: F401  (registers the ids of the cost environments)
-from sb3_lac.callbacks import CalibrationCallback, LyapunovCallback
+from sb3_lac.callbacks import LyapunovCallback
 from sb3_lac.lac import LAC
 from sb3_lac.policies import CnnPolicy, LyapunovPolicy, MlpPolicy, MultiInputPolicy
 from sb3_lac.stability import LyapunovReport, evaluate_lyapunov
@@ -20,7 +20,6 @@ __version__ = Path(__file__).with_name("version.txt").read_text(encoding="utf-8"
 
 __all__ = [
     "LAC",
-    "CalibrationCallback",
     "CnnPolicy",
     "GymnasiumVecEnv",
     "LyapunovCallback",

@@ -29,6 +29,8 @@ class HorizonReplayBuffer(ReplayBuffer):
     After a termination nothing more is paid, so that its sum is complete. The future of a transition close to a time limit,
     or close to the latest step of an episode that still goes on, is unknown: such transitions are not sampled (an unfinished
     episode's become available as it goes on). A sum of fewer steps in their place would be too small.
+    The ``NStepReplayBuffer`` of Stable-Baselines3 cannot express this: it samples all transitions, leaves the unknown rest of
+    a sum to a target network, and returns the last of the next states where the decrease condition needs the first one.
 
     :param buffer_size: Max number of elements in the buffer
     :param observation_space: Observation space

@@ -1,208 +1,16 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import ClassVar
 
 import gymnasium as gym
-import numpy as np
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, EventCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, sync_envs_normalization
 
 from sb3_lac.lac import LAC
-from sb3_lac.stability import LyapunovReport, evaluate_lyapunov, prepare_evaluation, trains_on
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-
-def _read_history(log_path: Path) -> list[dict[str, float]]:
-    """
-    Read the evaluations of a training that is continued, and create the folder for those to come.
-
-    :param log_path: Path of a CSV file
-    :return: One entry per evaluation
-    """
-    import pandas as pd  # slow to import, and only an evaluation needs it
-
-    log_path.parent.mkdir(parents=True, exist_ok=True)
-    if not log_path.exists():
-        return []
-    records = pd.read_csv(log_path).to_dict("records")
-    return [{str(name): value for name, value in record.items()} for record in records]
-
-
-def _add_to_history(history: list[dict[str, float]], entry: dict[str, float], log_path: Path | None) -> list[dict[str, float]]:
-    """
-    Add an evaluation, in place of an older one after as many timesteps (when continuing from a checkpoint).
-
-    :param history: One entry per evaluation
-    :param entry: Timesteps and values of the evaluation
-    :param log_path: Path of a CSV file to save them in, if any
-    :return: All entries, sorted by timesteps
-    """
-    by_timesteps = {int(old["timesteps"]): old for old in history}
-    by_timesteps[int(entry["timesteps"])] = entry
-    history = [by_timesteps[timesteps] for timesteps in sorted(by_timesteps)]
-    if log_path is not None:
-        import pandas as pd
-
-        # Renaming is atomic: an interrupted training never leaves half a file
-        temporary_path = log_path.with_name(f"{log_path.name}.tmp")
-        pd.DataFrame(history).to_csv(temporary_path, index=False)
-        os.replace(temporary_path, log_path)
-    return history
-
-
-class CalibrationCallback(EventCallback):
-    """
-    Callback for evaluating a calibrator on held-out trajectories while it learns.
-    For each metric, it logs the mean over trajectories as ``calibration/<name>``
-    and the worst (largest) value as ``calibration/<name>_worst``: smaller is better.
-
-    .. warning::
-
-      When using multiple environments, each call to  ``env.step()``
-      will effectively correspond to ``n_envs`` steps.
-      To account for that, you can use ``eval_freq = max(eval_freq // n_envs, 1)``
-
-    :param evaluate: Function that evaluates the model and returns a data frame with one row per held-out trajectory
-        and one column per metric, for instance ``lambda model: battery_env.evaluate(PolicyEstimator(model, env_id), test)``.
-        It is also called once before the training, to see that it works and has the columns; those results are not logged.
-    :param eval_freq: Evaluate the agent every ``eval_freq`` call of the callback.
-    :param metrics: Columns to log, or a mapping from columns to the names to log them under.
-        The first one decides which model is the best. By default ``<parameter>_mape_percent`` for each parameter that the
-        training environment finds (its ``task.parameters``), the mean errors in ``battery_env.evaluate()``.
-    :param log_path: Path of a CSV file, updated at each evaluation. If it exists already, its evaluations are kept and
-        count for the best model, so that the history of a continued training is complete.
-    :param best_model_save_path: Path to a folder where the best model (lowest mean of the first metric) will be saved
-        as ``best_model.zip``.
-    :param callback_on_new_best: Callback to trigger when there is a new best model
-    :param callback_after_eval: Callback to trigger after every evaluation
-    :param verbose: Verbosity level: 0 for no output, 1 for indicating information about evaluation results
-    """
-
-    def __init__(
-        self,
-        evaluate: Callable[[BaseAlgorithm], pd.DataFrame],
-        eval_freq: int = 10_000,
-        metrics: Sequence[str] | Mapping[str, str] | None = None,
-        log_path: str | os.PathLike[str] | None = None,
-        best_model_save_path: str | os.PathLike[str] | None = None,
-        callback_on_new_best: BaseCallback | None = None,
-        callback_after_eval: BaseCallback | None = None,
-        verbose: int = 1,
-    ):
-        super().__init__(callback_after_eval, verbose=verbose)
-        if metrics is not None and (isinstance(metrics, str) or len(metrics) == 0):
-            raise ValueError(f"metrics={metrics!r} must be a sequence of at least one column, like ('r_o_mape_percent',).")
-
-        self.callback_on_new_best = callback_on_new_best
-        if self.callback_on_new_best is not None:
-            # Give access to the parent
-            self.callback_on_new_best.parent = self
-
-        self.evaluate = evaluate
-        self.eval_freq = eval_freq
-        # The names to log by column: if none are chosen, they are those of the training environment
-        self.metrics = dict(metrics) if isinstance(metrics, Mapping) else {column: column for column in metrics or ()}
-        self.log_path = None if log_path is None else Path(log_path)
-        self.best_model_save_path = None if best_model_save_path is None else Path(best_model_save_path)
-        self.best_objective = np.inf
-        # One entry per evaluation, sorted by timesteps
-        self.history: list[dict[str, float]] = []
-
-    @property
-    def objective(self) -> str:
-        """Name of the metric that decides which model is the best."""
-        return next(iter(self.metrics.values()))
-
-    def _default_metrics(self) -> dict[str, str]:
-        if not self.training_env.has_attr("task"):
-            raise ValueError(
-                "metrics must be given: the training environment has no task whose parameters name the default ones."
-            )
-        columns = [f"{parameter}_mape_percent" for parameter in self.training_env.get_attr("task", indices=0)[0].parameters]
-        return {column: column for column in columns}
-
-    def _init_callback(self) -> None:
-        if not self.metrics:
-            self.metrics = self._default_metrics()
-        if self.eval_freq > 0:
-            # A mistake is seen before the training, and not at its first evaluation
-            self._summarize(self.evaluate(self.model))
-        if self.best_model_save_path is not None:
-            self.best_model_save_path.mkdir(parents=True, exist_ok=True)
-        if self.log_path is not None:
-            self.history = _read_history(self.log_path)
-            self.best_objective = min((entry.get(self.objective, np.inf) for entry in self.history), default=np.inf)
-
-        # Init callback called on new best model
-        if self.callback_on_new_best is not None:
-            self.callback_on_new_best.init_callback(self.model)
-
-    def _on_step(self) -> bool:
-        if self.eval_freq <= 0 or self.n_calls % self.eval_freq != 0:
-            return True
-
-        continue_training = True
-        entry = self._summarize(self.evaluate(self.model))
-        for name, value in entry.items():
-            self.logger.record(f"calibration/{name}", value)
-        # Dump log so the evaluation results are printed with the correct timestep
-        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
-        self.logger.dump(self.num_timesteps)
-
-        self.history = _add_to_history(self.history, {"timesteps": self.num_timesteps, **entry}, self.log_path)
-
-        objective = entry[self.objective]
-        if self.verbose >= 1:
-            print(f"Eval num_timesteps={self.num_timesteps}, {self.objective}={objective:.4g}")
-        if objective < self.best_objective:
-            if self.verbose >= 1:
-                print(f"New best {self.objective}!")
-            self.best_objective = objective
-            if self.best_model_save_path is not None:
-                temporary_path = self.best_model_save_path / "best_model.tmp.zip"
-                self.model.save(temporary_path)
-                os.replace(temporary_path, self.best_model_save_path / "best_model.zip")
-            # Trigger callback on new best model, if needed
-            if self.callback_on_new_best is not None:
-                continue_training = self.callback_on_new_best.on_step()
-
-        # Trigger callback after every evaluation, if needed
-        return continue_training and self._on_event()
-
-    def _summarize(self, trajectories: pd.DataFrame) -> dict[str, float]:
-        """
-        Mean and worst value of each metric. A trajectory without a result (NaN) is not left out:
-        it makes both of them NaN, and such a model is never the best.
-
-        :param trajectories: One row per held-out trajectory
-        :return: The values under the names to log
-        """
-        missing = [column for column in self.metrics if column not in trajectories.columns]
-        if missing:
-            raise ValueError(
-                f"The evaluation has no column {missing}, its columns are {list(trajectories.columns)}: choose from them."
-            )
-        summary = {}
-        for column, name in self.metrics.items():
-            summary[name] = float(trajectories[column].mean(skipna=False))
-            summary[f"{name}_worst"] = float(trajectories[column].max(skipna=False))
-        return summary
-
-    def update_child_locals(self, locals_: dict[str, Any]) -> None:
-        """
-        Update the references to the local variables.
-
-        :param locals_: the local variables during rollout collection
-        """
-        super().update_child_locals(locals_)
-        if self.callback_on_new_best is not None:
-            self.callback_on_new_best.update_locals(locals_)
+from sb3_lac.stability import LyapunovReport, evaluate_lyapunov
+from sb3_lac.stability.rollout import prepare_evaluation, trains_on
 
 
 class LyapunovCallback(EventCallback):
@@ -277,7 +85,12 @@ class LyapunovCallback(EventCallback):
                 "replay buffer would join them with others. Make a second environment for the evaluation."
             )
         if self.log_path is not None:
-            self.history = _read_history(self.log_path)
+            import pandas as pd  # slow to import, and only an evaluation needs it
+
+            self.log_path.parent.mkdir(parents=True, exist_ok=True)
+            if self.log_path.exists():
+                records = pd.read_csv(self.log_path).to_dict("records")
+                self.history = [{str(name): value for name, value in record.items()} for record in records]
 
     def _on_step(self) -> bool:
         if self.eval_freq <= 0 or self.n_calls % self.eval_freq != 0:
@@ -292,16 +105,32 @@ class LyapunovCallback(EventCallback):
         )
         entry: dict[str, float] = {"timesteps": self.num_timesteps}
         for metric, name in self.METRICS.items():
-            estimate = self.last_report.metrics[metric]
-            self.logger.record(f"lyapunov/{name}", estimate.value)
-            entry.update({name: estimate.value, f"{name}_low": estimate.low, f"{name}_high": estimate.high})
+            value, low, high = self.last_report.metrics[metric]
+            self.logger.record(f"lyapunov/{name}", value)
+            entry.update({name: value, f"{name}_low": low, f"{name}_high": high})
         # Dump log so the evaluation results are printed with the correct timestep
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(self.num_timesteps)
 
-        self.history = _add_to_history(self.history, entry, self.log_path)
+        self._add_to_history(entry)
         if self.verbose >= 1:
             print(f"Eval num_timesteps={self.num_timesteps}, {self.last_report.summary()}")
 
         # Trigger callback after every evaluation, if needed
         return self._on_event()
+
+    def _add_to_history(self, entry: dict[str, float]) -> None:
+        """
+        Keep an evaluation, in place of an older one after as many timesteps (when continuing from a checkpoint).
+
+        :param entry: Timesteps and values of the evaluation
+        """
+        others = [old for old in self.history if old["timesteps"] != entry["timesteps"]]
+        self.history = sorted([*others, entry], key=lambda evaluation: evaluation["timesteps"])
+        if self.log_path is not None:
+            import pandas as pd
+
+            # Renaming is atomic: an interrupted training never leaves half a file
+            temporary_path = self.log_path.with_name(f"{self.log_path.name}.tmp")
+            pd.DataFrame(self.history).to_csv(temporary_path, index=False)
+            os.replace(temporary_path, self.log_path)

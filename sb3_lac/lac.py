@@ -1,7 +1,5 @@
 import math
 import warnings
-from collections.abc import Sequence
-from functools import reduce
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -22,62 +20,6 @@ from sb3_lac.buffers import HorizonReplayBuffer, HorizonReplayBufferSamples
 from sb3_lac.policies import CnnPolicy, LyapunovCritic, LyapunovPolicy, MlpPolicy, MultiInputPolicy, largest_value
 
 SelfLAC = TypeVar("SelfLAC", bound="LAC")
-
-
-def lyapunov_target(costs: th.Tensor, dones: th.Tensor, discounts: th.Tensor | float, next_values: th.Tensor) -> th.Tensor:
-    """
-    Target of the critic (Han et al. 2020, infinite horizon candidate): the discounted sum of costs to come.
-    There is no entropy term in it, unlike in SAC.
-
-    The offset of ``L`` is the same in all states, terminal ones included (there nothing is paid any more), and is left out on
-    both sides: ``y = c + gamma * ((1 - done) * L_bar(s', a') + done * offset)`` with ``c = bound - reward`` and
-    ``offset = bound / (1 - gamma)`` becomes what is returned.
-
-    :param costs: ``-reward``, the cost of the transition below a bound of 0
-    :param dones: Whether the next state is terminal (time limits are not)
-    :param discounts: ``gamma`` (to the power of n for n-step transitions)
-    :param next_values: ``L_bar(s', a') - offset``, the target critic's value of an action of the target actor
-    :return: ``y - offset = -reward + gamma * (1 - done) * (L_bar(s', a') - offset)``
-    """
-    return costs + (1 - dones) * discounts * next_values
-
-
-def lyapunov_critic_loss(values: Sequence[th.Tensor], targets: th.Tensor) -> th.Tensor:
-    """
-    Loss of the critics (Han et al. 2020).
-
-    :param values: ``L(s, a)``, one tensor of values per critic
-    :param targets: See ``lyapunov_target()``
-    :return: ``1/2 * mean (L(s, a) - y)^2``, summed over critics
-    """
-    return 0.5 * reduce(th.add, [F.mse_loss(value, targets) for value in values])
-
-
-def lyapunov_difference(next_values: th.Tensor, values: th.Tensor, costs: th.Tensor, alpha3: float) -> th.Tensor:
-    """
-    Violation of the decrease condition, positive when ``L`` does not decrease by ``alpha3 * c`` on average
-    (Han et al. 2020). Both values must come from the same critic, the gradient flows through ``pi(s')`` only.
-
-    :param next_values: ``L(s', pi(s'))``
-    :param values: ``L(s, a)``
-    :param costs: ``c``, the cost of the transition
-    :param alpha3: Share of the cost by which ``L`` has to decrease
-    :return: ``mean (L(s', pi(s')) - L(s, a) + alpha3 * c)``
-    """
-    return (next_values - values.detach() + alpha3 * costs).mean()
-
-
-def lyapunov_actor_loss(difference: th.Tensor, log_prob: th.Tensor, lambda_coef: th.Tensor, ent_coef: th.Tensor) -> th.Tensor:
-    """
-    Loss of the actor: Lagrangian of the decrease condition and of the entropy constraint (Han et al. 2020).
-
-    :param difference: See ``lyapunov_difference()``
-    :param log_prob: ``log pi(a~|s)`` of actions sampled from the current policy
-    :param lambda_coef: ``lambda``, multiplier of the decrease condition
-    :param ent_coef: ``beta``, multiplier of the entropy constraint
-    :return: ``lambda * d + beta * mean log pi(a~|s)``
-    """
-    return lambda_coef.detach() * difference + ent_coef.detach() * log_prob.mean()
 
 
 def update_multiplier(log_multiplier: th.Tensor, optimizer: th.optim.Optimizer, violation: th.Tensor) -> th.Tensor:
@@ -549,19 +491,20 @@ class LAC(OffPolicyAlgorithm):
             self.update_offset(vec_normalize)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
-    def _compute_costs(self, rewards: th.Tensor, n_rewards: th.Tensor | float = 1.0) -> th.Tensor:
+    def _raise_bound(self, rewards: th.Tensor) -> th.Tensor:
         """
-        Convert sampled rewards to costs (see ``cost_bound()``), after updating the bound with the sample: it stays valid when
+        Let the bound rise to the largest of some rewards, and the offset of the critics with it. So it stays valid when
         rewards are computed at sampling (HER) or were stored elsewhere. Of the latter, sums of n steps only tell their mean.
 
-        :param rewards: Rewards (normalized with ``VecNormalize``), or discounted sums of them
-        :param n_rewards: How often a constant reward counts in each sum, the sum of its discounts
-        :return: Costs, summed like the rewards
+        :param rewards: Rewards of single steps (normalized with ``VecNormalize``)
+        :return: The bound in their units, no smaller than any of them
         """
-        largest_reward = (rewards / n_rewards).max()
+        largest_reward = rewards.max()
         self.reward_bound = th.maximum(self.reward_bound, largest_reward * reward_scale(self._vec_normalize_env))
-        bound = th.maximum(self.cost_bound(self._vec_normalize_env), largest_reward)
-        return bound * n_rewards - rewards
+        # The scale of the rewards may have changed too
+        self.update_offset(self._vec_normalize_env)
+        # Changes of the units round
+        return th.maximum(self.cost_bound(self._vec_normalize_env), largest_reward)
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         # Switch to train mode (this affects batch norm / dropout)
@@ -580,8 +523,6 @@ class LAC(OffPolicyAlgorithm):
             [parameter for group in optimizer.param_groups for parameter in group["params"] if parameter.requires_grad]
             for optimizer in optimizers[:2]
         )
-        online_parameters: list[th.Tensor] = [*self.actor.parameters(), *self.critic.parameters()]
-        target_parameters: list[th.Tensor] = [*self.actor_target.parameters(), *self.critic_target.parameters()]
         log_lambda_min, log_lambda_max = math.log(self.lambda_min), math.log(self.lambda_max)
         # Kept on the device until the end: reading one value would wait for all pending work
         metrics: dict[str, th.Tensor] = {}
@@ -592,10 +533,10 @@ class LAC(OffPolicyAlgorithm):
             replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
             # For n-step replay, discount factor is gamma**n_steps (when no early termination)
             discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
-            rewards = replay_data.rewards
-            costs = self._compute_costs(rewards, weight_of_return(replay_data.discounts, self.gamma))
-            # The bound may have risen, or the scale of the rewards have changed
-            self.update_offset(self._vec_normalize_env)
+            # The largest reward costs nothing, and so no cost is negative
+            n_rewards = weight_of_return(replay_data.discounts, self.gamma)
+            bound = self._raise_bound(replay_data.rewards / n_rewards)
+            costs = bound * n_rewards - replay_data.rewards
 
             # We need to sample because `log_std` may have changed between two gradient steps
             if self.use_sde:
@@ -619,24 +560,30 @@ class LAC(OffPolicyAlgorithm):
                     next_values = largest_value(self.critic_target(replay_data.next_observations, next_actions))
                     # L is never negative
                     next_values = th.maximum(next_values, -self.critic_target.offset)
-                    target_values = lyapunov_target(-rewards, replay_data.dones, discounts, next_values)
+                    # No entropy term, unlike in SAC. In terminal states nothing is paid any more, so that L is the offset:
+                    # y = (bound - reward) + gamma * ((1 - done) * (next_value + offset) + done * offset),
+                    # where bound + gamma * offset = offset is left out on both sides
+                    target_values = -replay_data.rewards + (1 - replay_data.dones) * discounts * next_values
 
             # Get current Lyapunov values for each critic network
             # using action from the replay buffer (all values are relative to the offset)
             current_values = self.critic(replay_data.observations, replay_data.actions)
-            critic_loss = lyapunov_critic_loss(current_values, target_values)
+            critic_loss = 0.5 * sum(F.mse_loss(current_value, target_values) for current_value in current_values)
+            assert isinstance(critic_loss, th.Tensor)  # for type checker
 
-            # Decrease condition: the same critic, before its update, for both values
-            values = largest_value(current_values)
+            # Violation of the decrease condition: the same critic, before its update, for both values,
+            # and a gradient through the next action only
+            values = largest_value(current_values).detach()
             next_values_pi = largest_value(self.critic(replay_data.next_observations, next_actions_pi))
-            difference = lyapunov_difference(next_values_pi, values, costs, self.alpha3)
+            difference = (next_values_pi - values + self.alpha3 * costs).mean()
 
             # Important: detach the multipliers from the graph
             # so we don't change them with other losses
             # see https://github.com/rail-berkeley/softlearning/issues/60
             lambda_coef = th.exp(self.log_lambda.detach())
             ent_coef = self.ent_coef_tensor if self.log_ent_coef is None else th.exp(self.log_ent_coef.detach())
-            actor_loss = lyapunov_actor_loss(difference, log_prob, lambda_coef, ent_coef)
+            # Lagrangian of the decrease condition and of the entropy constraint
+            actor_loss = lambda_coef * difference + ent_coef * log_prob.mean()
 
             # Optimize the critic and the actor, both with the gradient at the current parameters
             self.critic.optimizer.zero_grad()
@@ -679,9 +626,8 @@ class LAC(OffPolicyAlgorithm):
 
             # Update target networks
             if gradient_step % self.target_update_interval == 0:
-                with th.no_grad():
-                    # Same as ``polyak_update()``, for all tensors at once
-                    th._foreach_lerp_(target_parameters, online_parameters, self.tau)
+                polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
+                polyak_update(self.actor.parameters(), self.actor_target.parameters(), self.tau)
                 # Copy running stats, see GH issue #996
                 polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
 

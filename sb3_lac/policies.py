@@ -19,8 +19,6 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import Actor
 from torch import nn
 
-from sb3_lac.distributions import SquashedGaussianDistribution
-
 
 def largest_value(values: Sequence[th.Tensor]) -> th.Tensor:
     """
@@ -30,18 +28,6 @@ def largest_value(values: Sequence[th.Tensor]) -> th.Tensor:
     :return: Element-wise maximum
     """
     return reduce(th.maximum, values)
-
-
-def activate_in_place(network: nn.Module) -> None:
-    """
-    Let the activations of a multilayer perceptron overwrite the outputs of its linear layers, which no gradient needs:
-    less memory is moved.
-
-    :param network: Network of linear layers, each followed by an activation
-    """
-    for layer in network.modules():
-        if isinstance(layer, (nn.ReLU, nn.LeakyReLU)):
-            layer.inplace = True
 
 
 def with_linear_term(last_layer: nn.Linear) -> nn.Linear:
@@ -126,9 +112,9 @@ class LyapunovCritic(BaseModel):
         self.offset: th.Tensor
         self.register_buffer("offset", th.zeros(1))
         for idx in range(n_critics):
-            lyapunov_net = nn.Sequential(*create_mlp(features_dim + action_dim, output_dim, net_arch, activation_fn))
-            lyapunov_net[-1] = with_linear_term(lyapunov_net[-1])
-            activate_in_place(lyapunov_net)
+            *hidden_layers, last_layer = create_mlp(features_dim + action_dim, output_dim, net_arch, activation_fn)
+            assert isinstance(last_layer, nn.Linear)
+            lyapunov_net = nn.Sequential(*hidden_layers, with_linear_term(last_layer))
             self.add_module(f"lf{idx}", lyapunov_net)
             self.lyapunov_networks.append(lyapunov_net)
 
@@ -341,11 +327,7 @@ class LyapunovPolicy(BasePolicy):
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
         actor_kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
-        actor = Actor(**actor_kwargs)
-        activate_in_place(actor.latent_pi)
-        if not actor.use_sde:
-            actor.action_dist = SquashedGaussianDistribution(get_action_dim(self.action_space))  # type: ignore[assignment]
-        return actor.to(self.device)
+        return Actor(**actor_kwargs).to(self.device)
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> LyapunovCritic:
         critic_kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)

@@ -74,6 +74,7 @@ def test_logging_and_progress_bars_need_no_extra():
 
 def test_both_distributions_ask_for_the_same_versions():
     inner = set(read("battery_env/setup.cfg")["options"]["install_requires"].split())
+    inner |= set(read("battery_env/setup.cfg")["options.extras_require"]["sb3"].split())
     assert inner <= set(read("setup.cfg")["options"]["install_requires"].split())
     assert read("battery_env/setup.cfg")["options"]["python_requires"] == read("setup.cfg")["options"]["python_requires"]
 

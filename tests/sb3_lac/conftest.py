@@ -88,6 +88,33 @@ def make_model() -> Callable[..., LAC]:
 
 
 @pytest.fixture
+def make_model_without_env() -> Callable[..., LAC]:
+    def _make_model_without_env(
+        n_states: int = 2, n_actions: int = 2, policy_kwargs: dict[str, Any] | None = None, **kwargs: Any
+    ) -> LAC:
+        """
+        A model that knows the spaces of an environment and has none, to train on batches of any numbers.
+
+        :param n_states: Number of observed states
+        :param n_actions: Number of actions
+        :param policy_kwargs: Merged into those of a small policy
+        :param kwargs: Other arguments of ``LAC``
+        """
+        policy_kwargs = {"net_arch": [16, 16], "activation_fn": nn.LeakyReLU, **(policy_kwargs or {})}
+        kwargs = {"buffer_size": 1, "seed": 0, "device": "cpu", **kwargs}
+        # As in ``LAC.load()``
+        model = LAC("MlpPolicy", None, policy_kwargs=policy_kwargs, _init_setup_model=False, **kwargs)
+        model.observation_space = spaces.Box(-np.inf, np.inf, (n_states,))
+        model.action_space = spaces.Box(-1, 1, (n_actions,))
+        model.n_envs = 1
+        model._setup_model()
+        model.set_logger(Logger(folder=None, output_formats=[]))
+        return model
+
+    return _make_model_without_env
+
+
+@pytest.fixture
 def train_metrics() -> Callable[..., dict[str, float]]:
     def _train_metrics(model: LAC, gradient_steps: int = 1, seed: int = 0) -> dict[str, float]:
         """

@@ -1,14 +1,14 @@
-"""LAC solves what is known exactly, the linear-quadratic regulator: its losses to rounding, its networks nearly."""
+"""LAC solves what is known exactly, the linear-quadratic regulator: its update to rounding, its networks nearly."""
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import nn
 
 from sb3_lac import LAC, evaluate_lyapunov
 from sb3_lac.envs import LinearCostEnv
-from sb3_lac.lac import lyapunov_actor_loss, lyapunov_critic_loss, lyapunov_difference, lyapunov_target
 
 GAMMA = 0.95
 
@@ -42,38 +42,84 @@ def exact_value(env, gain):
     return value
 
 
-def test_exact_value_is_the_fixed_point_of_the_critic(env, transitions):
+class ExactCritic(nn.Module):
+    """A value function in place of the critic's networks, times a factor that is learned."""
+
+    def __init__(self, value, factor=1.0):
+        super().__init__()
+        self.value = value
+        self.factor = nn.Parameter(th.tensor(factor))
+        self.register_buffer("offset", th.zeros(1))
+
+    def forward(self, states, controls):
+        return (self.factor * self.value(states, controls),)
+
+
+class LinearActor(nn.Module):
+    """The policy u = -K s, without noise."""
+
+    def __init__(self, gain):
+        super().__init__()
+        self.gain = nn.Parameter(th.as_tensor(gain))
+
+    def forward(self, states):
+        return -states @ self.gain.T
+
+    def action_log_prob(self, states):
+        return self(states), th.zeros(len(states))
+
+
+@pytest.fixture
+def update_of(make_model_without_env, transitions, train_metrics):
+    """
+    One update with the exact value of a gain as target critic, without a step: what is logged, the gradient of the critic's
+    factor and that of the actor's gain.
+    """
     states, controls, costs, next_states = transitions
+    batch = ReplayBufferSamples(states, controls, next_states, th.zeros_like(costs), -costs)
+    precision = th.get_default_dtype()
+    th.set_default_dtype(th.float64)
+
+    def _update_of(value, gain, factor=1.0, **kwargs):
+        model = make_model_without_env(n_actions=1, learning_rate=0.0, tau=0.0, gamma=GAMMA, ent_coef=1.0, **kwargs)
+        model.replay_buffer.sample = lambda *args, **kwargs: batch
+        model.actor, model.actor_target = LinearActor(gain), LinearActor(gain)
+        model.critic, model.critic_target = ExactCritic(value, factor), ExactCritic(value)
+        for network in (model.actor, model.critic):
+            network.optimizer = th.optim.SGD(network.parameters())
+        metrics = train_metrics(model)
+        return metrics, model.critic.factor.grad, model.actor.gain.grad[0]
+
+    yield _update_of
+    th.set_default_dtype(precision)
+
+
+def test_exact_value_is_the_fixed_point_of_the_critic(env, transitions, update_of):
+    states, controls, _, _ = transitions
     for gain in (np.array([[-0.1, 0.5]]), env.optimal_gain(GAMMA)):
         value = exact_value(env, gain)
         np.testing.assert_allclose(
             value(states, controls)[:, 0], env.cost_to_go(states.numpy(), controls.numpy(), gain, GAMMA), rtol=1e-12
         )
-        next_values = value(next_states, -next_states @ th.as_tensor(gain).T)
-        targets = lyapunov_target(costs, th.zeros_like(costs), GAMMA, next_values)
-        assert lyapunov_critic_loss([value(states, controls)], targets) < 1e-20
-        assert lyapunov_critic_loss([1.01 * value(states, controls)], targets) > 1e-4
+        metrics, gradient, _ = update_of(value, gain)
+        assert metrics["critic_loss"] < 1e-20 and abs(gradient) < 1e-9
+        metrics, gradient, _ = update_of(value, gain, factor=1.01)
+        assert metrics["critic_loss"] > 1e-4 and gradient > 1e-2
 
 
 @pytest.mark.parametrize(("alpha3", "lambda_coef"), [(0.1, 1.0), (1.0, 0.3)])
-def test_critic_and_actor_in_turns_end_at_the_optimal_policy(env, transitions, alpha3, lambda_coef):
-    states, controls, costs, next_states = transitions
+def test_critic_and_actor_in_turns_end_at_the_optimal_policy(env, update_of, alpha3, lambda_coef):
     gain, optimum = np.zeros((1, 2)), env.optimal_gain(GAMMA)
     traces = [np.trace(env.value_matrix(gain, GAMMA))]
     for _ in range(7):
         # The critic as exact as can be, then the actor that is best by its loss, which is quadratic in the gain
         value = exact_value(env, gain)
-
-        def loss(flat_gain, value=value):
-            difference = lyapunov_difference(
-                value(next_states, -next_states @ flat_gain[:, None]), value(states, controls), costs, alpha3
-            )
-            return lyapunov_actor_loss(difference, th.zeros(1), th.tensor(lambda_coef), th.tensor(1.0))
-
-        at = th.as_tensor(gain[0])
-        gradient, curvature = th.autograd.functional.jacobian(loss, at), th.autograd.functional.hessian(loss, at)
+        gradient, *moved = (
+            update_of(value, gain + move, alpha3=alpha3, lambda_init=lambda_coef)[2] for move in (np.zeros(2), *np.eye(2))
+        )
+        curvature = th.stack(moved) - gradient
         assert (th.linalg.eigvalsh(curvature) > 0).all()
-        gain = (at - th.linalg.solve(curvature, gradient))[None].numpy()
+        gain = gain - th.linalg.solve(curvature, gradient).numpy()
         traces.append(np.trace(env.value_matrix(gain, GAMMA)))
     assert traces[0] > 1.5 * traces[-1]
     assert (np.diff(traces) < 1e-9).all()

@@ -22,7 +22,6 @@ def reload_package(monkeypatch):
 def test_exports():
     assert set(sb3_lac.__all__) == {
         "LAC",
-        "CalibrationCallback",
         "CnnPolicy",
         "GymnasiumVecEnv",
         "LyapunovCallback",

@@ -167,26 +167,6 @@ def test_optimizer_is_chosen_by_the_user(make_model):
     assert isinstance(sgd.actor.optimizer, th.optim.SGD)
 
 
-@pytest.mark.parametrize("activation_fn", [nn.ReLU, nn.LeakyReLU])
-def test_activations_in_place_change_no_value_and_no_gradient(make_model, activation_fn):
-    model = make_model(n_collect=0, policy_kwargs={"activation_fn": activation_fn})
-    obs, actions = th.randn(30, 2), th.rand(30, 2).requires_grad_(True)
-    results = []
-    for inplace in (True, False):
-        for network in (model.actor.latent_pi, *model.critic.lyapunov_networks):
-            activations = [layer for layer in network if isinstance(layer, activation_fn)]
-            assert len(activations) == 2
-            # As the policy made them, then as torch does
-            assert inplace is False or all(layer.inplace for layer in activations)
-            for layer in activations:
-                layer.inplace = inplace
-        outputs = (model.critic(obs, actions)[0].sum(), model.actor(obs, deterministic=True).sum())
-        parameters = (actions, *model.critic.parameters(), *model.actor.parameters())
-        results.append([*outputs, *th.autograd.grad(sum(outputs), parameters, allow_unused=True)])
-    for tensor, expected in zip(*results, strict=True):
-        assert (tensor is None and expected is None) or th.equal(tensor, expected)
-
-
 def test_frozen_layers_stay_as_they_are(make_model, train_metrics):
     model = make_model()
     frozen = [model.actor.latent_pi[0], model.critic.lyapunov_networks[0][0]]

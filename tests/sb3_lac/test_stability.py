@@ -20,8 +20,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize, VecTrans
 from torch import nn
 
 from sb3_lac import LAC, LyapunovCallback, evaluate_lyapunov
-from sb3_lac import stability as module
-from sb3_lac.stability import Bootstrap, ratio
+from sb3_lac.stability import rollout
+from sb3_lac.stability.statistics import Bootstrap, decrease_by_cost, ratio
 
 RHO = 0.5
 
@@ -350,7 +350,7 @@ def test_levels_of_cost():
     # Half of the costs are zero
     cost = np.where(np.arange(1000) % 2 == 0, 0.0, rng.permutation(1000) + 1.0)
     frame = pd.DataFrame({"episode": np.arange(1000) // 100, "cost": cost, "difference": 2 - cost, "terminated": False})
-    table = module.decrease_by_cost(frame, 5, Bootstrap(10, 100))
+    table = decrease_by_cost(frame, 5, Bootstrap(10, 100))
     # Two of the five quantiles are zero: the zeros have a level of their own
     assert len(table) == 4
     assert table["cost_low"].iloc[0] == table["cost_high"].iloc[0] == 0 and table["n_transitions"].tolist()[0] == 500
@@ -365,11 +365,8 @@ def test_levels_of_cost():
     assert list(table.columns) == [
         "cost_low", "cost_high", "n_transitions", "decrease", "decrease_low", "decrease_high", "share_decreasing",
     ]  # fmt: skip
-    assert len(module.decrease_by_cost(frame.assign(cost=3.0), 5, Bootstrap(10, 100))) == 1
-    assert (
-        module.decrease_by_cost(frame.assign(cost=rng.random(1000)), 5, Bootstrap(10, 100))["n_transitions"].tolist()
-        == [200] * 5
-    )
+    assert len(decrease_by_cost(frame.assign(cost=3.0), 5, Bootstrap(10, 100))) == 1
+    assert decrease_by_cost(frame.assign(cost=rng.random(1000)), 5, Bootstrap(10, 100))["n_transitions"].tolist() == [200] * 5
 
 
 # Environments
@@ -408,7 +405,7 @@ def test_chunks_do_not_matter(make_model, make_env, monkeypatch):
     monkeypatch.setattr(
         model.policy, "predict_lyapunov", lambda obs, action: (sizes.append(len(action)), predict_lyapunov(obs, action))[1]
     )
-    monkeypatch.setattr(module, "CHUNK_SIZE", 10)
+    monkeypatch.setattr(rollout, "CHUNK_SIZE", 10)
     report = evaluate_lyapunov(model, env, 7, seed=0)
     pd.testing.assert_frame_equal(report.transitions, expected.transitions, rtol=1e-5)
     assert max(sizes[:-1]) <= 12 and sum(sizes[:-1]) == 140 and sizes[-1] == 7

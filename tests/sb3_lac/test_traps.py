@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from torch import nn
 
 from sb3_lac import LAC
-from sb3_lac.lac import lyapunov_difference, lyapunov_target, update_multiplier, weight_of_return
+from sb3_lac.lac import update_multiplier, weight_of_return
 
 
 def flat_parameters(module):
@@ -56,11 +56,16 @@ def test_saturation_is_seen_at_limits_that_float32_rounds(make_model, train_metr
         assert train_metrics(model, gradient_steps=3)["lambda_saturation"] == 1.0
 
 
-def test_condition_is_infeasible_in_stationary_data_from_alpha3_of_one():
-    # Values of states on a cycle: the next values are the same numbers in another order
-    values, costs = th.rand(1000, 1), th.rand(1000, 1)
-    difference = lyapunov_difference(values.roll(1, dims=0), values, costs, alpha3=1.0)
-    assert difference.item() == pytest.approx(costs.mean().item(), abs=1e-5)
+def test_condition_is_infeasible_in_stationary_data_from_alpha3_of_one(make_model, train_metrics):
+    model = make_model(alpha3=1.0)
+    # States on a cycle, and an L of the state alone: the next values are the same numbers in another order
+    batch = model.replay_buffer.sample(16)
+    batch = batch._replace(next_observations=batch.observations.roll(1, dims=0))
+    model.replay_buffer.sample = lambda *args, **kwargs: batch
+    with th.no_grad():
+        model.critic.lyapunov_networks[0][0].weight[:, 2:] = 0.0
+    metrics = train_metrics(model)
+    assert metrics["lyapunov_difference"] == pytest.approx(metrics["cost"], rel=1e-4)
 
 
 def test_default_arguments_do_not_warn(make_env):
@@ -103,12 +108,20 @@ def test_time_limits_bootstrap_and_terminations_do_not(make_model, make_env, tra
     assert train_metrics(model, seed=1)["lyapunov_mean"] == pytest.approx(expected, abs=0.4)
 
 
-def test_terminal_transitions_cost_only_their_own_cost():
-    assert lyapunov_target(th.tensor([3.0]), th.tensor([1.0]), 0.99, th.tensor([50.0])).item() == 3.0
+def test_terminal_transitions_cost_only_their_own_cost(make_model, train_metrics):
+    model = make_model()
+    batch = model.replay_buffer.sample(16)
+    batch = batch._replace(dones=th.ones_like(batch.dones))
+    model.replay_buffer.sample = lambda *args, **kwargs: batch
+    with th.no_grad():
+        model.critic_target.lyapunov_networks[0][-1].bias.fill_(10.0)
+        errors = model.critic(batch.observations, batch.actions)[0] + batch.rewards
+    assert train_metrics(model)["critic_loss"] == pytest.approx(0.5 * errors.square().mean().item(), rel=1e-4)
 
 
 def costs_of(model, rewards):
-    return model._compute_costs(th.tensor(rewards).reshape(-1, 1)).flatten().tolist()
+    rewards = th.tensor(rewards)
+    return (model._raise_bound(rewards) - rewards).tolist()
 
 
 def test_costs_are_the_negated_rewards_unless_rewards_are_positive(make_model):
@@ -138,7 +151,7 @@ def test_costs_of_normalized_rewards_are_not_negative_and_the_bound_follows_the_
     assert costs_of(model, [10.0, -10.0]) == pytest.approx([0.0, 20.0])
     for _ in range(100):
         sample = model.replay_buffer.sample(16, env=model._vec_normalize_env)
-        assert model._compute_costs(sample.rewards).min() >= 0
+        assert (model._raise_bound(sample.rewards) - sample.rewards).min() >= 0
 
 
 def test_bound_does_not_drift_by_rounding(make_model, make_env):
@@ -159,7 +172,8 @@ def test_constant_positive_reward_costs_nothing_over_n_steps(make_model, make_en
     sample = model.replay_buffer.sample(64)
     # Some of the sums are cut by the end of the episode
     assert len(sample.discounts.unique()) == 3
-    costs = model._compute_costs(sample.rewards, weight_of_return(sample.discounts, model.gamma))
+    n_rewards = weight_of_return(sample.discounts, model.gamma)
+    costs = model._raise_bound(sample.rewards / n_rewards) * n_rewards - sample.rewards
     assert model.reward_bound.item() == pytest.approx(5.0, rel=1e-5)
     assert costs.abs().max() < 1e-4
 

@@ -1,10 +1,10 @@
-"""Figures of a ``LyapunovReport``."""
+"""Figures of roll-outs and of the decrease condition along them. ``LyapunovReport`` documents them and its tables."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -14,9 +14,6 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
-
-if TYPE_CHECKING:
-    from sb3_lac.stability import LyapunovReport
 
 #: Colours that colour-blind readers can tell apart (Okabe & Ito)
 BLUE, VERMILION, GREEN, ORANGE, GREY = "#0072b2", "#d55e00", "#009e73", "#e69f00", "#7f7f7f"
@@ -66,26 +63,26 @@ def set_log_scale(axes: Axes, which: Literal["x", "y"], values: pd.Series | np.n
         format_log_axis(axes.xaxis if which == "x" else axes.yaxis)
 
 
-def project(report: LyapunovReport, x: int, y: int, names: Sequence[str] | None) -> tuple[np.ndarray, dict[str, Any]]:
+def project(observations: np.ndarray | None, x: int, y: int, names: Sequence[str] | None) -> tuple[np.ndarray, dict[str, Any]]:
     """
     Two dimensions of the observations, and the labels of their axes.
 
-    :param report: The report
+    :param observations: Those of the transitions, or None if they are no vectors
     :param x: First dimension
     :param y: Second dimension
     :param names: Names of all dimensions
     :return: Array with two columns, and arguments for ``axes.set()``
     """
-    if report.observations is None:
+    if observations is None:
         raise ValueError("This figure needs observations that are vectors (a Box space with at most one dimension).")
-    n_dims = report.observations.shape[1]
+    n_dims = observations.shape[1]
     if not (0 <= x < n_dims and 0 <= y < n_dims):
         raise ValueError(f"x={x} and y={y} must lie between 0 and {n_dims - 1}, the observations have {n_dims} dimensions.")
     if names is None:
         names = [f"observation {k}" for k in range(n_dims)]
     if len(names) != n_dims:
         raise ValueError(f"names={list(names)} must name all {n_dims} dimensions of the observations.")
-    return report.observations[:, [x, y]], {"xlabel": names[x], "ylabel": names[y]}
+    return observations[:, [x, y]], {"xlabel": names[x], "ylabel": names[y]}
 
 
 def scatter_groups(axes: Axes, points: np.ndarray, groups: Sequence[tuple[np.ndarray, str, dict[str, Any]]]) -> None:
@@ -101,58 +98,58 @@ def scatter_groups(axes: Axes, points: np.ndarray, groups: Sequence[tuple[np.nda
     axes.figure.legend(loc="outside lower center", ncols=len(groups), fontsize=8)
 
 
-def draw_episodes(report: LyapunovReport, axes: Axes) -> None:
+def draw_episodes(transitions: pd.DataFrame, axes: Axes) -> None:
     """
     Draw ``L`` along some episodes.
 
-    :param report: The report
+    :param transitions: One row per transition
     :param axes: The panel
     """
     # Few enough that each line can be followed
-    chosen = np.unique(np.linspace(0, len(report.episodes) - 1, 8).astype(int))
-    transitions = report.transitions[report.transitions["episode"].isin(chosen)]
-    for _, episode in transitions.groupby("episode"):
+    chosen = np.unique(np.linspace(0, transitions["episode"].max(), 8).astype(int))
+    shown = transitions[transitions["episode"].isin(chosen)]
+    for _, episode in shown.groupby("episode"):
         axes.plot(episode["step"], episode["lyapunov"], color=BLUE, alpha=0.55, lw=1.1)
-    deaths = transitions[transitions["terminated"]]
+    deaths = shown[shown["terminated"]]
     if not deaths.empty:
         axes.scatter(deaths["step"], deaths["lyapunov"], s=36, color=VERMILION, marker="x", lw=1, zorder=3, label="died")
         axes.legend(fontsize=8)
-    set_log_scale(axes, "y", report.transitions["lyapunov"])
+    set_log_scale(axes, "y", transitions["lyapunov"])
     axes.set(xlabel="step", ylabel="$L(s, a)$", title=f"L along {len(chosen)} episodes")
 
 
-def draw_by_cost(report: LyapunovReport, axes: Axes) -> None:
+def draw_by_cost(by_cost: pd.DataFrame, alpha3: float, axes: Axes) -> None:
     """
     Draw the decrease condition by level of the cost.
 
-    :param report: The report
+    :param by_cost: One row per level
+    :param alpha3: Share of the cost by which ``L`` has to decrease
     :param axes: The panel
     """
-    table = report.by_cost
-    positions = np.arange(len(table))
+    positions = np.arange(len(by_cost))
     axes.axhline(0, color="0.4", lw=1)
-    colours = np.select([table["decrease_high"] < 0, table["decrease_low"] > 0], [GREEN, VERMILION], GREY).tolist()
-    axes.vlines(positions, table["decrease_low"], table["decrease_high"], colors=colours, lw=2)
-    axes.scatter(positions, table["decrease"], c=colours, s=30, zorder=3)
-    labels = [f"{low:.2g}\nto {high:.2g}" for low, high in zip(table["cost_low"], table["cost_high"], strict=True)]
+    colours = np.select([by_cost["decrease_high"] < 0, by_cost["decrease_low"] > 0], [GREEN, VERMILION], GREY).tolist()
+    axes.vlines(positions, by_cost["decrease_low"], by_cost["decrease_high"], colors=colours, lw=2)
+    axes.scatter(positions, by_cost["decrease"], c=colours, s=30, zorder=3)
+    labels = [f"{low:.2g}\nto {high:.2g}" for low, high in zip(by_cost["cost_low"], by_cost["cost_high"], strict=True)]
     axes.set_xticks(positions, labels, fontsize=8)
     axes.margins(x=0.1)
     axes.set(
         xlabel="cost of the transition",
         ylabel=r"mean of $L(s', a') - L(s, a) + \alpha_3 c$",
-        title=f"Decrease condition by cost, alpha3={report.alpha3:g}",
+        title=f"Decrease condition by cost, alpha3={alpha3:g}",
     )
 
 
-def draw_calibration(report: LyapunovReport, axes: Axes) -> None:
+def draw_calibration(transitions: pd.DataFrame, axes: Axes) -> None:
     """
     Draw ``L`` against the cost-to-go.
 
-    :param report: The report
+    :param transitions: One row per transition
     :param axes: The panel
     """
     axes.set(xlabel="$L(s, a)$", ylabel="cost-to-go", title="L against the cost-to-go")
-    known = report.transitions.loc[report.transitions["cost_to_go"].notna(), ["lyapunov", "cost_to_go"]]
+    known = transitions.loc[transitions["cost_to_go"].notna(), ["lyapunov", "cost_to_go"]]
     if known.empty:
         axes.text(0.5, 0.5, "no episode is long enough", transform=axes.transAxes, ha="center", color="0.4")
         return
@@ -168,18 +165,18 @@ def draw_calibration(report: LyapunovReport, axes: Axes) -> None:
     axes.legend(fontsize=8)
 
 
-def draw_costs(report: LyapunovReport, axes: Axes) -> None:
+def draw_costs(transitions: pd.DataFrame, ultimate_bound: float, axes: Axes) -> None:
     """
     Draw the costs over time.
 
-    :param report: The report
+    :param transitions: One row per transition
+    :param ultimate_bound: A cost to mark, NaN if there is none
     :param axes: The panel
     """
-    low, median, high = report.transitions.groupby("step")["cost"].quantile(np.array([0.1, 0.5, 0.9])).unstack().to_numpy().T
+    low, median, high = transitions.groupby("step")["cost"].quantile(np.array([0.1, 0.5, 0.9])).unstack().to_numpy().T
     steps = np.arange(len(median))
     axes.fill_between(steps, low, high, color=BLUE, alpha=0.2, lw=0, label="10 % to 90 % of the episodes")
     axes.plot(steps, median, color=BLUE, lw=1.4, label="median")
-    ultimate_bound = report.metrics["ultimate_bound"].value
     if not math.isnan(ultimate_bound):
         axes.axhline(ultimate_bound, color=ORANGE, ls="--", lw=1.2, label=f"ultimate bound {ultimate_bound:.2g}")
     set_log_scale(axes, "y", low)
@@ -187,34 +184,48 @@ def draw_costs(report: LyapunovReport, axes: Axes) -> None:
     axes.legend(fontsize=8)
 
 
-def plot_report(report: LyapunovReport) -> Figure:
+def plot_report(transitions: pd.DataFrame, by_cost: pd.DataFrame, alpha3: float, ultimate_bound: float) -> Figure:
     """
     See ``LyapunovReport.plot()``.
 
-    :param report: The report
+    :param transitions: One row per transition
+    :param by_cost: One row per level of the cost
+    :param alpha3: Share of the cost by which ``L`` has to decrease
+    :param ultimate_bound: A cost to mark, NaN if there is none
     :return: The figure
     """
     figure = new_figure(9.5, 7.0)
-    panels = figure.subplots(2, 2).flat
-    for draw, axes in zip((draw_episodes, draw_by_cost, draw_calibration, draw_costs), panels, strict=True):
-        draw(report, axes)
+    along_episodes, of_decrease, of_calibration, of_costs = figure.subplots(2, 2).flat
+    draw_episodes(transitions, along_episodes)
+    draw_by_cost(by_cost, alpha3, of_decrease)
+    draw_calibration(transitions, of_calibration)
+    draw_costs(transitions, ultimate_bound, of_costs)
     return figure
 
 
-def plot_phase(report: LyapunovReport, x: int, y: int, names: Sequence[str] | None) -> Figure:
+def plot_phase(
+    transitions: pd.DataFrame,
+    episodes: pd.DataFrame,
+    observations: np.ndarray | None,
+    x: int,
+    y: int,
+    names: Sequence[str] | None,
+) -> Figure:
     """
     See ``LyapunovReport.plot_phase()``.
 
-    :param report: The report
+    :param transitions: One row per transition
+    :param episodes: One row per episode
+    :param observations: Those of the transitions, or None if they are no vectors
     :param x: Dimension of the observation on the horizontal axis
     :param y: Dimension of the observation on the vertical axis
     :param names: Names of all dimensions
     :return: The figure
     """
-    points, labels = project(report, x, y, names)
+    points, labels = project(observations, x, y, names)
     figure = new_figure(6.4, 5.2)
     axes = figure.subplots()
-    lyapunov, episode = report.transitions["lyapunov"].to_numpy(), report.transitions["episode"].to_numpy()
+    lyapunov, episode = transitions["lyapunov"].to_numpy(), transitions["episode"].to_numpy()
     inside = episode[1:] == episode[:-1]
     lines = LineCollection(np.stack([points[:-1], points[1:]], axis=1)[inside], cmap="viridis_r", lw=0.9)
     lines.set_array(lyapunov[:-1][inside])
@@ -224,7 +235,7 @@ def plot_phase(report: LyapunovReport, x: int, y: int, names: Sequence[str] | No
     bar = figure.colorbar(lines, ax=axes, label="$L(s, a)$")
     if is_wide(lyapunov):
         format_log_axis(bar.ax.yaxis)
-    died = report.episodes["terminated"].to_numpy()
+    died = episodes["terminated"].to_numpy()
     scatter_groups(
         axes,
         points[np.append(~inside, True)],
@@ -233,30 +244,36 @@ def plot_phase(report: LyapunovReport, x: int, y: int, names: Sequence[str] | No
             (died, "end, died", {"s": 28, "color": VERMILION, "marker": "x"}),
         ],
     )
-    axes.set(title=f"Trajectories of {len(report.episodes)} episodes", **labels)
+    axes.set(title=f"Trajectories of {len(episodes)} episodes", **labels)
     return figure
 
 
 def plot_region_of_attraction(
-    report: LyapunovReport, x: int, y: int, names: Sequence[str] | None, threshold: float | None
+    transitions: pd.DataFrame,
+    episodes: pd.DataFrame,
+    observations: np.ndarray | None,
+    threshold: float,
+    x: int,
+    y: int,
+    names: Sequence[str] | None,
 ) -> Figure:
     """
     See ``LyapunovReport.plot_region_of_attraction()``.
 
-    :param report: The report
+    :param transitions: One row per transition
+    :param episodes: One row per episode
+    :param observations: Those of the transitions, or None if they are no vectors
+    :param threshold: An episode has settled if no cost in its last fifth is larger
     :param x: Dimension of the observation on the horizontal axis
     :param y: Dimension of the observation on the vertical axis
     :param names: Names of all dimensions
-    :param threshold: An episode has settled if no cost in its last fifth is larger, ``ultimate_bound`` by default
     :return: The figure
     """
-    points, labels = project(report, x, y, names)
-    if threshold is None:
-        threshold = report.metrics["ultimate_bound"].value
-    starts = (report.transitions["step"] == 0).to_numpy()
-    points, lyapunov = points[starts], report.transitions["lyapunov"].to_numpy()[starts]
-    died = report.episodes["terminated"].to_numpy()
-    settled = ~died & (report.episodes["largest_late_cost"].to_numpy() <= threshold)
+    points, labels = project(observations, x, y, names)
+    starts = (transitions["step"] == 0).to_numpy()
+    points, lyapunov = points[starts], transitions["lyapunov"].to_numpy()[starts]
+    died = episodes["terminated"].to_numpy()
+    settled = ~died & (episodes["largest_late_cost"].to_numpy() <= threshold)
 
     figure = new_figure(6.4, 5.2)
     axes = figure.subplots()

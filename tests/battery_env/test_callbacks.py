@@ -1,14 +1,31 @@
+"""Calibrators are evaluated while they learn, by any algorithm of Stable-Baselines3."""
+
 import os
+import subprocess
+import sys
 
 import gymnasium as gym
 import numpy as np
 import pandas as pd
 import pytest
+from stable_baselines3 import TD3
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import Logger
 
 from battery_env import PolicyEstimator, TrajectoryDataset, evaluate
-from sb3_lac import LAC, CalibrationCallback, GymnasiumVecEnv
+from battery_env.callbacks import CalibrationCallback
+from sb3_lac import GymnasiumVecEnv
+
+
+@pytest.fixture
+def make_model():
+    def _make_model(env="Pendulum-v1"):
+        model = TD3("MlpPolicy", env, policy_kwargs={"net_arch": [8]}, buffer_size=500, device="cpu")
+        model.set_logger(Logger(folder=None, output_formats=[]))
+        return model
+
+    return _make_model
 
 
 def callback_of(*args, **kwargs):
@@ -31,7 +48,7 @@ class Evaluation:
 
 def test_mean_and_worst_are_logged_at_their_timesteps(make_model):
     dumps = []
-    model = make_model(n_collect=0)
+    model = make_model()
     original_dump = model.logger.dump
     model.logger.dump = lambda step: (dumps.append((step, dict(model.logger.name_to_value))), original_dump(step))
     evaluation = Evaluation(5.0, 3.0)
@@ -51,15 +68,15 @@ def test_mean_and_worst_are_logged_at_their_timesteps(make_model):
     assert callback.best_objective == 3.0
 
 
-def test_frequency_counts_calls_and_not_timesteps(make_model, make_env):
+def test_frequency_counts_calls_and_not_timesteps(make_model):
     callback = callback_of(Evaluation(1.0, 1.0), eval_freq=5, verbose=0)
-    make_model(make_vec_env(make_env, n_envs=3), n_collect=0).learn(30, callback=callback)
+    make_model(make_vec_env("Pendulum-v1", n_envs=3)).learn(30, callback=callback)
     assert [entry["timesteps"] for entry in callback.history] == [15, 30]
 
 
 def test_no_evaluation_without_frequency(make_model):
     callback = callback_of(Evaluation(), eval_freq=-1)
-    make_model(n_collect=0).learn(10, callback=callback)
+    make_model().learn(10, callback=callback)
     assert callback.history == []
 
 
@@ -76,11 +93,11 @@ def test_history_and_best_model_are_saved_and_continued(make_model, tmp_path, mo
         model.learn(n_steps, callback=callback, reset_num_timesteps=False)
         return callback
 
-    model = make_model(n_collect=0)
+    model = make_model()
     learn(model, 30, 3.0, 2.0, 5.0)
     assert pd.read_csv(log_path)["timesteps"].tolist() == [10, 20, 30]
     assert pd.read_csv(log_path)["mape_percent"].tolist() == [3.0, 2.0, 5.0]
-    assert LAC.load(best_path / "best_model").num_timesteps == 20
+    assert TD3.load(best_path / "best_model").num_timesteps == 20
 
     # From a checkpoint of 20 steps: the evaluation at 30 is replaced, and 2.0 is still the best
     model.num_timesteps = 20
@@ -89,10 +106,10 @@ def test_history_and_best_model_are_saved_and_continued(make_model, tmp_path, mo
     assert frame["timesteps"].tolist() == [10, 20, 30, 40]
     assert frame["mape_percent"].tolist() == [3.0, 2.0, 4.0, 3.0]
     assert callback.best_objective == 2.0
-    assert LAC.load(best_path / "best_model").num_timesteps == 20
+    assert TD3.load(best_path / "best_model").num_timesteps == 20
 
     learn(model, 10, 1.0)
-    assert LAC.load(best_path / "best_model").num_timesteps == 50
+    assert TD3.load(best_path / "best_model").num_timesteps == 50
     # Nothing is left behind, and no file is written in place
     assert sorted(path.name for path in tmp_path.rglob("*.*")) == ["best_model.zip", "calibration.csv"]
     assert len(renames) == 6 + 3
@@ -103,7 +120,7 @@ def test_missing_result_of_a_trajectory_is_not_hidden(make_model):
         return pd.DataFrame({"mape_percent": [1.0, np.nan]})
 
     callback = callback_of(evaluate, eval_freq=5, verbose=0)
-    make_model(n_collect=0).learn(5, callback=callback)
+    make_model().learn(5, callback=callback)
     assert np.isnan(callback.history[0]["mape_percent"]) and np.isnan(callback.history[0]["mape_percent_worst"])
     assert callback.best_objective == np.inf
 
@@ -123,7 +140,7 @@ def test_child_callbacks_are_triggered(make_model, capsys):
     callback = callback_of(
         Evaluation(3.0, 4.0, 2.0), eval_freq=5, callback_on_new_best=on_new_best, callback_after_eval=after_eval
     )
-    make_model(n_collect=0).learn(15, callback=callback)
+    make_model().learn(15, callback=callback)
     assert (on_new_best.n_calls, after_eval.n_calls) == (2, 3)
     assert on_new_best.parent is callback
     assert capsys.readouterr().out.count("New best mape_percent!") == 2
@@ -132,13 +149,13 @@ def test_child_callbacks_are_triggered(make_model, capsys):
 @pytest.mark.parametrize("name", ["callback_on_new_best", "callback_after_eval"])
 def test_child_callback_can_stop_training(make_model, name):
     callback = callback_of(Evaluation(3.0), eval_freq=5, verbose=0, **{name: Count(stop=True)})
-    assert make_model(n_collect=0).learn(100, callback=callback).num_timesteps == 5
+    assert make_model().learn(100, callback=callback).num_timesteps == 5
 
 
 def test_wrong_columns_are_named_before_the_training(make_model, tmp_path):
     with pytest.raises(ValueError, match="at least one column"):
         callback_of(Evaluation(), metrics="mape_percent")
-    model = make_model(n_collect=0)
+    model = make_model()
     callback = callback_of(Evaluation(), metrics=("rmse",), best_model_save_path=tmp_path / "best")
     with pytest.raises(ValueError, match=r"no column \['rmse'\], its columns are \['mape_percent', 'bias', 'label'\]"):
         model.learn(1, callback=callback)
@@ -147,11 +164,11 @@ def test_wrong_columns_are_named_before_the_training(make_model, tmp_path):
 
 @pytest.mark.parametrize("env_id, parameters", [("BatteryRo-v0", ("r_o",)), ("BatteryJoint-v0", ("q_mobile", "r_o"))])
 @pytest.mark.parametrize("batched", [False, True])
-def test_default_metrics_are_those_of_the_parameters_that_the_environment_finds(env_id, parameters, batched):
+def test_default_metrics_are_those_of_the_parameters_that_the_environment_finds(make_model, env_id, parameters, batched):
     env = GymnasiumVecEnv(gym.make_vec(env_id, 2, autoreset_mode="SameStep")) if batched else make_vec_env(env_id)
     discharges = TrajectoryDataset.paper("r_o")[:2]
     callback = CalibrationCallback(lambda model: evaluate(PolicyEstimator(model, env_id), discharges), eval_freq=2, verbose=0)
-    LAC("MlpPolicy", env, buffer_size=10, device="cpu").learn(4, callback=callback)
+    make_model(env).learn(4, callback=callback)
     names = [f"{parameter}_mape_percent{which}" for parameter in parameters for which in ("", "_worst")]
     assert list(callback.history[0]) == ["timesteps", *names]
     assert callback.objective == names[0]
@@ -159,4 +176,11 @@ def test_default_metrics_are_those_of_the_parameters_that_the_environment_finds(
 
 def test_environments_that_do_not_say_what_they_find_need_metrics(make_model):
     with pytest.raises(ValueError, match="metrics must be given"):
-        make_model(n_collect=0).learn(1, callback=CalibrationCallback(Evaluation()))
+        make_model().learn(1, callback=CalibrationCallback(Evaluation()))
+
+
+def test_without_stable_baselines3_the_extra_is_named():
+    code = "import sys; sys.modules['stable_baselines3'] = None; import battery_env.callbacks"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert "ImportError: battery_env.callbacks needs Stable-Baselines3" in result.stderr
+    assert "pip install 'battery_env[sb3]'" in result.stderr

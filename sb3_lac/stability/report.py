@@ -1,0 +1,303 @@
+"""Is the learned ``L`` a certificate? The report of an evaluation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+
+from sb3_lac.lac import LAC, time_limits
+from sb3_lac.stability.rollout import cost_to_go, prepare_evaluation, roll_out, summarize_episodes, trains_on
+from sb3_lac.stability.statistics import Bootstrap, Interval, decrease_by_cost, estimate_metrics
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True, eq=False)
+class LyapunovReport:
+    """
+    How ``L`` behaves along roll-outs of a policy, see ``evaluate_lyapunov()``.
+
+    :param transitions: One row per transition, episodes one after the other: ``episode``, ``step``, ``reward``, ``cost``,
+        ``lyapunov`` (``L(s, a)``), ``next_lyapunov`` (``L(s', a')``, NaN if s' is terminal), ``difference``
+        (``L(s', a') - L(s, a) + alpha3 * c``), ``cost_to_go`` (NaN if too much of it was not seen), ``terminated``
+    :param episodes: One row per episode: ``length``, ``total_cost``, ``final_cost``, ``largest_late_cost`` (in its last
+        fifth), ``terminated``
+    :param observations: The observations of the transitions as the policy saw them, or None if they are no vectors
+    :param metrics: Values with their 95 % intervals, by name
+    :param by_cost: The decrease condition by level of the cost: ``cost_low``, ``cost_high``, ``n_transitions``, ``decrease``,
+        ``decrease_low``, ``decrease_high``, ``share_decreasing``
+    :param alpha3: Share of the cost by which ``L`` has to decrease
+    :param gamma: The discount factor
+    :param horizon: Number of steps whose costs ``L`` estimates, None for all to come
+    :param max_tail_weight: Largest weight of the costs to come after the end of an episode, in ``cost_to_go``
+    :param max_episode_steps: Gymnasium's time limit of the environment, None if it ends its episodes itself
+    """
+
+    transitions: pd.DataFrame
+    episodes: pd.DataFrame
+    observations: np.ndarray | None
+    metrics: dict[str, Interval]
+    by_cost: pd.DataFrame
+    alpha3: float
+    gamma: float
+    horizon: int | None
+    max_tail_weight: float
+    max_episode_steps: int | None
+
+    @property
+    def n_calibrated(self) -> int:
+        """Number of transitions with a known cost-to-go, those that ``L`` is compared with."""
+        return int(self.transitions["cost_to_go"].notna().sum())
+
+    def to_frame(self) -> pd.DataFrame:
+        """
+        The metrics as a table.
+
+        :return: One row per metric, with columns ``value``, ``low`` and ``high``
+        """
+        import pandas as pd
+
+        return pd.DataFrame.from_dict(self.metrics, orient="index", columns=list(Interval._fields)).rename_axis("metric")
+
+    def summary(self) -> str:
+        """
+        The metrics in a readable form, and what they say about the decrease condition.
+
+        :return: A text of several lines
+        """
+        horizon = "infinite horizon" if self.horizon is None else f"horizon of {self.horizon} steps"
+        lines = [
+            f"Lyapunov function along {len(self.episodes)} episodes, {len(self.transitions)} transitions "
+            f"(alpha3={self.alpha3:g}, gamma={self.gamma:g}, {horizon})",
+            f"  {'metric':<24}{'value':>12}   95 % interval",
+        ]
+        missing: dict[str, list[str]] = {}
+        for name, (value, low, high) in self.metrics.items():
+            if math.isnan(value):
+                missing.setdefault(self._why_not_available(name), []).append(name)
+                lines.append(f"  {name:<24}not available")
+            elif math.isnan(low):
+                lines.append(f"  {name:<24}{value:>12.4g}   not available: it takes two episodes with data")
+            else:
+                lines.append(f"  {name:<24}{value:>12.4g}   [{low:.4g}, {high:.4g}]")
+        lines += [f"Not available: {', '.join(names)}. {reason}" for reason, names in missing.items()]
+        lines.append(f"With alpha3={self.alpha3:g} the decrease condition {self._verdict()}.")
+        if self.n_calibrated > 0:
+            lines.append(f"L was compared with the cost-to-go of {self.n_calibrated} transitions.")
+        lines.append(
+            "This is an empirical statement about these roll-outs of this policy in this environment, "
+            "and no proof of stability."
+        )
+        return "\n".join(lines)
+
+    def _verdict(self) -> str:
+        decrease = self.metrics["decrease"]
+        if decrease.high < 0:
+            return "holds on average: the interval of decrease lies below 0"
+        if decrease.low > 0:
+            return "is violated on average: the interval of decrease lies above 0"
+        if math.isnan(decrease.value):
+            return "is undecided: no transition ends in a state that has an L"
+        if math.isnan(decrease.low):
+            return "is undecided: one episode with a decrease gives no interval, use more episodes"
+        return "is undecided: the interval of decrease contains 0"
+
+    def _why_not_available(self, name: str) -> str:
+        if name == "ultimate_bound":
+            return "Every episode terminated: train longer, or start closer to the goal."
+        if name in ("decrease", "share_decreasing") or (
+            name == "largest_feasible_alpha3" and self.metrics["mean_cost"].value > 0
+        ):
+            return "Every episode terminated in its first step, or without a cost before its last one: train longer."
+        if name == "largest_feasible_alpha3":
+            return "Nothing had a cost, so that L has nothing to decrease by: start further away from the goal."
+        if self.n_calibrated > 0:
+            return (
+                f"L or the cost-to-go is the same in all {self.n_calibrated} transitions that can be compared: "
+                "use more episodes, with other start states."
+            )
+        return f"L could not be compared with the cost-to-go: {self._why_not_calibrated()}"
+
+    def _why_not_calibrated(self) -> str:
+        length = int(self.episodes["length"].max())
+        longest = f"the longest episode has {length} steps"
+        if self.horizon is None and self.gamma >= 1:
+            return (
+                "no episode terminated, and with gamma=1 the costs after a time limit weigh as much as those before it; "
+                "max_tail_weight=1 leaves them out."
+            )
+        n_steps = self.horizon or math.ceil(math.log(self.max_tail_weight) / math.log(self.gamma))
+        # As many transitions that can be compared as cannot
+        if self.max_episode_steps is not None and length >= self.max_episode_steps:
+            longer = f"evaluate with longer episodes, gym.make(id, max_episode_steps={2 * n_steps})"
+        else:
+            longer = (
+                f"evaluate with episodes of {2 * n_steps} steps. The environment ends them itself, where max_episode_steps "
+                "changes nothing: use its own argument for their length, like episode_steps"
+            )
+        if self.horizon is not None:
+            return f"no episode terminated or has the {self.horizon} steps of the horizon ({longest}); {longer}."
+        return (
+            f"the costs to come after the time limit weigh more than max_tail_weight={self.max_tail_weight:g} everywhere. "
+            f"It takes {n_steps} steps to forget them, {longest}; {longer}, or set a larger max_tail_weight."
+        )
+
+    def plot(self) -> Figure:
+        """
+        Draw four panels: ``L`` along episodes, the decrease condition by level of the cost, ``L`` against the cost-to-go
+        and costs over time.
+
+        :return: The figure
+        """
+        from sb3_lac.stability import plots  # matplotlib is slow to import, and only a figure needs it
+
+        ultimate_bound = self.metrics["ultimate_bound"].value
+        return plots.plot_report(self.transitions, self.by_cost, self.alpha3, ultimate_bound)
+
+    def plot_phase(self, x: int = 0, y: int = 1, names: Sequence[str] | None = None) -> Figure:
+        """
+        Draw the trajectories in two dimensions of the observation, coloured by ``L``.
+
+        :param x: Dimension of the observation on the horizontal axis
+        :param y: Dimension of the observation on the vertical axis
+        :param names: Names of all dimensions
+        :return: The figure
+        """
+        from sb3_lac.stability import plots
+
+        return plots.plot_phase(self.transitions, self.episodes, self.observations, x, y, names)
+
+    def plot_region_of_attraction(
+        self, x: int = 0, y: int = 1, names: Sequence[str] | None = None, threshold: float | None = None
+    ) -> Figure:
+        """
+        Draw the start states of all episodes in two dimensions of the observation, marked by what became of them, over the
+        level sets of ``L`` interpolated between them (with more than two dimensions these are a projection).
+
+        :param x: Dimension of the observation on the horizontal axis
+        :param y: Dimension of the observation on the vertical axis
+        :param names: Names of all dimensions
+        :param threshold: An episode has settled if no cost in its last fifth is larger, ``ultimate_bound`` by default
+        :return: The figure
+        """
+        from sb3_lac.stability import plots
+
+        if threshold is None:
+            threshold = self.metrics["ultimate_bound"].value
+        return plots.plot_region_of_attraction(self.transitions, self.episodes, self.observations, threshold, x, y, names)
+
+
+def evaluate_lyapunov(
+    model: LAC,
+    env: gym.Env | VecEnv,
+    n_eval_episodes: int = 20,
+    deterministic: bool = True,
+    alpha3: float | None = None,
+    max_tail_weight: float = 0.05,
+    n_cost_levels: int = 5,
+    n_bootstrap: int = 1000,
+    seed: int | None = None,
+) -> LyapunovReport:
+    """
+    Run the policy for ``n_eval_episodes`` episodes and check whether the learned ``L`` is a Lyapunov function along them:
+    whether it decreases by ``alpha3`` times the cost, ``E[L(s', a')] - L(s, a) <= -alpha3 * c``, and whether it is what it
+    should have learned, the discounted sum of costs to come.
+
+    The metrics of the report are
+
+    - ``decrease``: mean of ``L(s', a') - L(s, a) + alpha3 * c``, negative when the decrease condition holds on average
+    - ``share_decreasing``: share of the transitions in which that is not positive
+    - ``largest_feasible_alpha3``: mean of ``L(s, a) - L(s', a')`` divided by the mean of ``c``, the largest ``alpha3`` for
+      which the condition holds on average. A negative value means that there is none.
+    - ``mean_cost``
+    - ``calibration_slope`` and ``calibration_intercept``: line fitted to the cost-to-go as a function of ``L`` (1 and 0 when
+      ``L`` is exact), and ``rank_correlation``, Spearman's
+    - ``ultimate_bound``: 95th percentile, over the episodes that did not terminate, of the largest cost in their last fifth
+    - ``death_rate``: share of the episodes that terminated
+
+    Their intervals are percentiles of a bootstrap that resamples episodes (the transitions of an episode depend on each
+    other), and Wilson's for ``death_rate``. ``a'`` is the action taken next; after a time limit it is an action of the policy.
+    A terminal state has no ``L``: transitions into it do not count for the decrease condition.
+
+    .. note::
+        Costs are those that ``L`` was trained on, of rewards and ends of episodes as they appear with ``env.step`` calls:
+        wrap ``env`` as the training environment. Unlike in ``evaluate_policy()``, a ``Monitor`` makes no difference.
+        With gSDE, the noise matrix of the last roll-out is kept.
+        The training environment (``model.get_env()``) may be used between two calls of ``learn()``: the next one then starts
+        with a reset, and the unfinished episodes in the replay buffer end as by a time limit.
+
+    :param model: The LAC model you want to evaluate
+    :param env: The gym environment or ``VecEnv`` environment. Its normalization statistics are used as they are:
+        call ``sync_envs_normalization()`` before, if it is not the training environment.
+    :param n_eval_episodes: Number of episodes, divided onto the elements of a vector env as in ``evaluate_policy()``
+    :param deterministic: Whether to judge the policy's mean action, as it is used after the training, or sampled actions
+    :param alpha3: Share of the cost by which ``L`` has to decrease, that of the model by default
+    :param max_tail_weight: The costs after a time limit are not seen. A transition is used for the comparison of ``L`` with
+        the cost-to-go if they weigh at most that much in it, ``gamma ** remaining_steps <= max_tail_weight``.
+        With a finite horizon, all of its costs must have been seen instead.
+    :param n_cost_levels: Number of levels of the cost, at its quantiles, for which the decrease is reported separately
+    :param n_bootstrap: Number of bootstrap samples
+    :param seed: Seed for ``env`` and for the actions
+    :return: The report
+    """
+    env = prepare_evaluation(model, env, n_eval_episodes)
+    alpha3 = model.alpha3 if alpha3 is None else alpha3
+    if not alpha3 > 0:
+        raise ValueError(f"alpha3={alpha3} must be greater than 0.")
+    if not 0 < max_tail_weight <= 1:
+        raise ValueError(f"max_tail_weight={max_tail_weight} must be greater than 0, and at most 1.")
+    if n_cost_levels < 1 or n_bootstrap < 1:
+        raise ValueError(f"n_cost_levels={n_cost_levels} and n_bootstrap={n_bootstrap} must be at least 1.")
+
+    vec_normalize = unwrap_vec_normalize(env)
+    # The scale of normalized rewards may have changed since the last update
+    model.update_offset(vec_normalize)
+    if seed is not None:
+        env.seed(seed)
+    # A training goes on as if there had been no evaluation
+    with th.random.fork_rng(devices=[model.device] if model.device.type == "cuda" else []):
+        if seed is not None:
+            th.manual_seed(seed)
+        training = vec_normalize is not None and vec_normalize.training
+        try:
+            # All costs have the same units
+            if vec_normalize is not None:
+                vec_normalize.training = False
+            transitions, observations = roll_out(model, env, n_eval_episodes, deterministic)
+        finally:
+            if trains_on(model, env):
+                model.end_episodes()
+            if vec_normalize is not None:
+                vec_normalize.training = training
+
+    # A reward above all those of the training would have a negative cost, which L cannot learn
+    bound = model.cost_bound(vec_normalize).item()
+    transitions["cost"] = np.maximum(bound - transitions["reward"], 0.0)
+    transitions["difference"] = transitions["next_lyapunov"] - transitions["lyapunov"] + alpha3 * transitions["cost"]
+    transitions["cost_to_go"] = cost_to_go(transitions, model.gamma, model.horizon, max_tail_weight, bound)
+    columns = ["episode", "step", "reward", "cost", "lyapunov", "next_lyapunov", "difference", "cost_to_go", "terminated"]
+    transitions = transitions[columns]
+
+    episodes = summarize_episodes(transitions)
+    bootstrap = Bootstrap(len(episodes), n_bootstrap)
+    return LyapunovReport(
+        transitions=transitions,
+        episodes=episodes,
+        observations=observations,
+        metrics=estimate_metrics(transitions, episodes, bootstrap),
+        by_cost=decrease_by_cost(transitions, n_cost_levels, bootstrap),
+        alpha3=alpha3,
+        gamma=model.gamma,
+        horizon=model.horizon,
+        max_tail_weight=max_tail_weight,
+        max_episode_steps=max((limit for limit in time_limits(env) if limit is not None), default=None),
+    )
