@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import operator
 import os
 import platform
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,27 +20,26 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
+from battery_env.arrays import FloatArray, IntArray
+from battery_env.checks import LoadUnit, check_indices, check_load, check_range, check_whole_number
 from battery_env.electrochemistry import (
     NEW_CELL,
     STATE_NAMES,
     STATE_SIZE,
     UNCERTAIN_CONSTANTS,
     CellParameters,
-    FloatArray,
-    LoadUnit,
+    PackedConstants,
     Trajectory,
     advance_in_place,
+    check_cell,
     check_dt,
-    check_load,
-    check_q_mobile,
-    check_r_o,
     initial_state,
 )
+from battery_env.electrochemistry.kernels import roll_out
 from battery_env.files import replacing
-from battery_env.kernels import PackedConstants, roll_out
-from battery_env.loads import Load, LoadSampler, checked_range, constant
+from battery_env.loads import Load, LoadSampler, constant
+from battery_env.parameters import Q_MOBILE, R_O
 
-IntArray = NDArray[np.int64]
 AgedParameter = Literal["q_mobile", "r_o", "joint"]
 
 #: Ranges of the aged parameters in the paper's data (the authors' code), C and ohm.
@@ -53,7 +51,7 @@ PAPER_TRIM = (0.05, 0.95)
 #: Largest ``mismatch`` of :meth:`TrajectoryDataset.generate`: beyond, the constants would be another cell's.
 MISMATCH_LIMIT = 0.5
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 _CHECKPOINT_EVERY = 64  # steps between stored states: a window starts with 32 steps of re-simulation on average
 _MIN_SAMPLES = 8
 _LEAST_DT_S = 0.01  # of a discharge that may take a day
@@ -76,7 +74,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
     :param q_mobile: C, shape (n,)
     :param r_o: ohm, shape (n,)
     :param factors: what ``UNCERTAIN_CONSTANTS`` (kn, tDiffusion, to, tsn) of each true cell are multiplied by, shape (n, 4);
-        ones where the constants in ``parameters`` are exact
+        ones where the constants of ``cell`` are exact
     :param eod_time_s: end of discharge, s after the first sample of the whole discharge, shape (n,); NaN where unknown
     :param load_values: all load profiles end to end, one value a step
     :param load_start: where in ``load_values`` each trajectory's profile starts, shape (n,); trajectories may share a profile
@@ -88,7 +86,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
     :param load_unit: ``"power"`` or ``"current"``
     :param dt_s: time step, s
     :param thermal: whether the temperature moves
-    :param parameters: constants of the cell, as a calibrator may know them
+    :param cell: constants of the cell, as a calibrator may know them
     :param description: how the data set was made, as JSON may hold it; saved with it
     :raises ValueError: for arrays that do not fit together, or values out of range
     """
@@ -107,7 +105,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
     load_unit: LoadUnit
     dt_s: float
     thermal: bool
-    parameters: CellParameters
+    cell: CellParameters
     description: dict[str, Any]
 
     def __post_init__(self) -> None:
@@ -122,12 +120,13 @@ class TrajectoryDataset(Sequence[Trajectory]):
             if not isinstance(array, np.ndarray) or array.dtype != dtype or array.shape != shape or n == 0:
                 found = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
                 raise ValueError(f"{name} must be an array of {dtype.__name__} of shape {shape}, not empty, got {found}")
-        check_q_mobile(self.q_mobile)
-        check_r_o(self.r_o)
+        Q_MOBILE.check(self.q_mobile)
+        R_O.check(self.r_o)
         check_load(self.load_values, self.load_unit)
         _check_factors(self.factors)
-        _check_cell(self.parameters, self.thermal)
-        _check_dt(self.dt_s, self.parameters, self.factors)
+        object.__setattr__(self, "cell", check_cell(self.cell, self.thermal))
+        object.__setattr__(self, "thermal", bool(self.thermal))
+        _check_dt(self.dt_s, self.cell, self.factors)
         if not np.isfinite(self.checkpoint).all():
             raise ValueError("checkpoint must be finite, got NaN or infinity")
         fits = {
@@ -150,7 +149,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
         trim: tuple[float, float] = (0.0, 1.0),
         dt_s: float = 1.0,
         thermal: bool = False,
-        parameters: CellParameters = NEW_CELL,
+        cell: CellParameters | None = None,
         description: dict[str, Any] | None = None,
         factors: ArrayLike | None = None,
     ) -> TrajectoryDataset:
@@ -164,34 +163,34 @@ class TrajectoryDataset(Sequence[Trajectory]):
         :param trim: the part of each discharge that counts as data, as shares of its length
         :param dt_s: time step, s
         :param thermal: whether the temperature moves
-        :param parameters: constants of the cell, as a calibrator may know them
+        :param cell: constants of the cell, as a calibrator may know them; ``None``: the new cell's
         :param description: how the data set was made, as JSON may hold it
         :param factors: what ``UNCERTAIN_CONSTANTS`` of each cell are multiplied by, shape (n, 4); ``None``: ones
         :return: the data set
         :raises ValueError: for values out of range, or a discharge of fewer than eight samples
         """
-        q, r = np.broadcast_arrays(*np.atleast_1d(check_q_mobile(q_mobile), check_r_o(r_o)))
+        q, r = np.broadcast_arrays(*np.atleast_1d(Q_MOBILE.check(q_mobile), R_O.check(r_o)))
         if q.ndim != 1 or q.size == 0:
             raise ValueError(f"q_mobile and r_o must be 1-D and not empty, got shape {q.shape}")
-        low, high = checked_range("trim", trim)
+        low, high = check_range("trim", trim)
         if not 0.0 <= low < high <= 1.0:
             raise ValueError(f"trim must be two increasing shares within 0 .. 1, got {trim!r}")
         units = {load.unit if isinstance(load, Load) else type(load).__name__ for load in loads}
         if units not in ({"power"}, {"current"}):
             raise ValueError(f"loads must be Loads, all in one unit (power or current), got {sorted(units)}")
         unit = loads[0].unit
-        index = np.broadcast_to(_indices("load_index", load_index, len(loads)), q.shape)
+        index = np.broadcast_to(check_indices("load_index", load_index, len(loads)), q.shape)
         multiples = np.ones((q.size, len(UNCERTAIN_CONSTANTS))) if factors is None else np.array(factors, dtype=np.float64)
         if multiples.shape != (q.size, len(UNCERTAIN_CONSTANTS)):
             raise ValueError(f"factors must hold one value per cell and each of {UNCERTAIN_CONSTANTS}, got {multiples.shape}")
         _check_factors(multiples)
-        _check_cell(parameters, thermal)
-        dt_s = _check_dt(dt_s, parameters, multiples)
+        cell = check_cell(cell, thermal)
+        dt_s = _check_dt(dt_s, cell, multiples)
         if dt_s < _LEAST_DT_S:
             raise ValueError(f"dt_s must be at least {_LEAST_DT_S:g} s (a day of it must fit in memory), got {dt_s!r}")
 
         day = dt_s * np.arange(round(86_400 / dt_s), dtype=np.float64)
-        start = initial_state(q, parameters)
+        start = initial_state(q, cell)
         samples = np.empty(q.size, dtype=np.int64)
         profiles = []
         checkpoints: dict[int, FloatArray] = {}
@@ -202,9 +201,9 @@ class TrajectoryDataset(Sequence[Trajectory]):
             cells = np.flatnonzero(index == k)
             for n in cells:
                 state[0] = start[n]
-                packed = _packed(parameters, multiples[[n]])
-                run = (profile, q[n], r[n], dt_s, parameters.VEOD, unit == "power", thermal)
-                samples[n] = roll_out(*run, *packed, state, voltage, current)
+                packed = _packed(cell, multiples[[n]])
+                run = (profile, q[n], r[n], dt_s, cell.VEOD, unit == "power", thermal)
+                samples[n] = roll_out(*run, packed, state, voltage, current)
                 if samples[n] < _MIN_SAMPLES:
                     raise ValueError(
                         f"trajectory {n} (q_mobile {q[n]:g} C, r_o {r[n]:g} ohm) ends after {samples[n]} samples, at least "
@@ -231,7 +230,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
             load_unit=unit,
             dt_s=dt_s,
             thermal=thermal,
-            parameters=parameters,
+            cell=cell,
             description=description or {},
         )
 
@@ -247,11 +246,11 @@ class TrajectoryDataset(Sequence[Trajectory]):
         trim: tuple[float, float] = (0.0, 1.0),
         dt_s: float = 1.0,
         thermal: bool = False,
-        parameters: CellParameters = NEW_CELL,
+        cell: CellParameters | None = None,
         mismatch: float = 0.0,
     ) -> TrajectoryDataset:
         """
-        Discharges of ``n`` cells whose age is drawn uniformly; the parameter that does not age is the new cell's.
+        Discharges of ``n`` cells whose age is drawn uniformly; the parameter that does not age is the cell's.
 
         :param parameter: what ages: ``"q_mobile"``, ``"r_o"`` or ``"joint"`` (both, independently)
         :param n: number of discharges
@@ -262,7 +261,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
         :param trim: the part of each discharge that counts as data, as shares of its length
         :param dt_s: time step, s
         :param thermal: whether the temperature moves
-        :param parameters: constants of the cell, as a calibrator may know them
+        :param cell: constants of the cell, as a calibrator may know them, and what does not age; ``None``: the new cell's
         :param mismatch: how wrong they are: relative standard deviation of the factors, log-normal with median 1, that each
             of ``UNCERTAIN_CONSTANTS`` of each cell is multiplied by, at most 0.5. Ages and loads do not depend on it
         :return: the data set
@@ -270,7 +269,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
         """
         if parameter not in ("q_mobile", "r_o", "joint"):
             raise ValueError(f"parameter must be 'q_mobile', 'r_o' or 'joint', got {parameter!r}")
-        n, seed = _whole_number("n", n), _whole_number("seed", seed)
+        n, seed = check_whole_number("n", n), check_whole_number("seed", seed)
         if n < 1 or seed < 0:
             raise ValueError(f"n must be at least 1 and seed at least 0, got n = {n} and seed = {seed}")
         if not isinstance(mismatch, Real) or not 0.0 <= mismatch <= MISMATCH_LIMIT:
@@ -279,14 +278,14 @@ class TrajectoryDataset(Sequence[Trajectory]):
             raise TypeError(f"loads must be a list of Loads or a sampler of them, got {type(loads).__name__}")
         if not callable(loads) and len(loads) == 0:
             raise ValueError("loads must not be empty")
-        low, high = checked_range("trim", trim)
-        q_range, r_range = checked_range("q_mobile_range", q_mobile_range), checked_range("r_o_range", r_o_range)
-        check_q_mobile(q_range)
-        check_r_o(r_range)
-        _check_cell(parameters, thermal)
+        low, high = check_range("trim", trim)
+        q_range, r_range = check_range("q_mobile_range", q_mobile_range), check_range("r_o_range", r_o_range)
+        Q_MOBILE.check(q_range)
+        R_O.check(r_range)
+        cell = check_cell(cell, thermal)
         rng = np.random.default_rng(seed)
-        q = np.full(n, parameters.q_mobile) if parameter == "r_o" else rng.uniform(*q_range, size=n)
-        r = np.full(n, parameters.r_o) if parameter == "q_mobile" else rng.uniform(*r_range, size=n)
+        q = np.full(n, cell.q_mobile) if parameter == "r_o" else rng.uniform(*q_range, size=n)
+        r = np.full(n, cell.r_o) if parameter == "q_mobile" else rng.uniform(*r_range, size=n)
         if callable(loads):
             drawn, index = [loads(rng) for _ in range(n)], np.arange(n)
         else:
@@ -294,7 +293,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
         # drawn last, so that all else is the same with and without a mismatch
         factors = np.exp(np.sqrt(np.log1p(mismatch**2)) * rng.standard_normal((n, len(UNCERTAIN_CONSTANTS))))
         asked = {"parameter": parameter, "n": n, "seed": seed, "trim": [low, high], "mismatch": float(mismatch)}
-        return cls.simulated(q, r, drawn, index, trim, dt_s, thermal, parameters, {"made_by": "generate", **asked}, factors)
+        return cls.simulated(q, r, drawn, index, trim, dt_s, thermal, cell, {"made_by": "generate", **asked}, factors)
 
     @classmethod
     def from_trajectories(cls, trajectories: Sequence[Trajectory]) -> TrajectoryDataset:
@@ -334,7 +333,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
             load_unit=units.pop(),
             dt_s=steps.pop(),
             thermal=False,
-            parameters=NEW_CELL,
+            cell=NEW_CELL,
             description={"made_by": "from_trajectories"},
         )
         for n, trajectory in enumerate(trajectories):
@@ -378,7 +377,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
         state[0] = self.checkpoint[self.checkpoint_start[n]]
         # no cut-off: a data set of recorded trajectories may hold samples below it
         run = (load, self.q_mobile[n], self.r_o[n], self.dt_s, -np.inf, self.load_unit == "power", self.thermal)
-        if roll_out(*run, *self.packed(np.array([n])), state, voltage, current) < samples:
+        if roll_out(*run, self.packed(np.array([n])), state, voltage, current) < samples:
             raise ValueError(f"trajectory {n} cannot be simulated again: it was made with another load or other constants")
         return Trajectory(
             time_s=self.dt_s * np.arange(samples, dtype=np.float64),
@@ -400,9 +399,9 @@ class TrajectoryDataset(Sequence[Trajectory]):
         The true constants of some trajectories, for the unchecked functions of :mod:`battery_env.electrochemistry`.
 
         :param index: which trajectories, shape (m,)
-        :return: one row a cell; or the one row that all share, if their constants are those of ``parameters``
+        :return: one row a cell; or the one row that all share, if their constants are those of ``cell``
         """
-        return _packed(self.parameters, self.factors[index])
+        return _packed(self.cell, self.factors[index])
 
     def states_at(self, index: IntArray, sample: IntArray) -> FloatArray:
         """
@@ -435,7 +434,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
         :param index: which, shape (m,), in the order wanted
         :return: a data set of them; the loads are shared with this one
         """
-        chosen = _indices("index", index, len(self))
+        chosen = check_indices("index", index, len(self))
         if chosen.ndim != 1 or chosen.size == 0:
             raise ValueError(f"index must be 1-D and not empty, got shape {chosen.shape}")
         counts = _checkpoints(self.samples[chosen])
@@ -461,7 +460,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
         """
         if not isinstance(test, Real) or not 0.0 < test < 1.0:
             raise ValueError(f"test must be greater than 0 and less than 1, got {test!r}")
-        rng = np.random.default_rng(_whole_number("seed", seed))
+        rng = np.random.default_rng(check_whole_number("seed", seed))
         if by == "trajectory":
             order = rng.permutation(len(self))
             is_test = np.zeros(len(self), dtype=bool)
@@ -516,9 +515,9 @@ class TrajectoryDataset(Sequence[Trajectory]):
             raise ValueError(f"{path} is damaged: its contents do not match their checksum")
         try:
             metadata = json.loads(text)
-            constants: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in metadata["parameters"].items()}
+            constants: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in metadata["cell"].items()}
             settings: dict[str, Any] = {name: metadata[name] for name in _SETTINGS}
-            return cls(**arrays, **settings, parameters=CellParameters(**constants))
+            return cls(**arrays, **settings, cell=CellParameters(**constants))
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{path} holds no valid data set: {error}") from error
 
@@ -601,7 +600,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
     def _metadata(self) -> str:
         versions = {"python": platform.python_version(), "numpy": np.__version__, "numba": version("numba")}
         settings = {name: getattr(self, name) for name in _SETTINGS}
-        return json.dumps({"format": FORMAT_VERSION, **settings, "parameters": asdict(self.parameters), "versions": versions})
+        return json.dumps({"format": FORMAT_VERSION, **settings, "cell": asdict(self.cell), "versions": versions})
 
 
 def _new_file(path: str | os.PathLike[str], suffix: str) -> Path:
@@ -625,8 +624,8 @@ def _read(file: Mapping[str, NDArray[Any]]) -> tuple[str, int, dict[str, Any], s
     return text, found, {name: np.asarray(file[name]) for name in _ARRAYS}, str(file["checksum"])
 
 
-def _packed(parameters: CellParameters, factors: FloatArray) -> PackedConstants:
-    return parameters.packed if (factors == 1.0).all() else parameters.packed_with(factors)
+def _packed(cell: CellParameters, factors: FloatArray) -> PackedConstants:
+    return cell.packed if (factors == 1.0).all() else cell.packed_with(factors)
 
 
 def _check_factors(factors: FloatArray) -> None:
@@ -635,38 +634,10 @@ def _check_factors(factors: FloatArray) -> None:
         raise ValueError(f"factors must be finite and greater than 0, got {factors[~good][0]:g}")
 
 
-def _check_dt(dt_s: float, parameters: CellParameters, factors: FloatArray) -> float:
+def _check_dt(dt_s: float, cell: CellParameters, factors: FloatArray) -> float:
     # explicit Euler must be stable for the cell whose constants are fastest
     fastest = dict(zip(UNCERTAIN_CONSTANTS, factors.min(axis=0), strict=True))
-    return check_dt(dt_s, parameters.replace(to=parameters.to * fastest["to"], tsn=parameters.tsn * fastest["tsn"]))
-
-
-def _whole_number(name: str, value: int) -> int:
-    try:
-        return operator.index(value)
-    except TypeError as error:
-        raise TypeError(f"{name} must be a whole number, got {value!r}") from error
-
-
-def _indices(name: str, values: ArrayLike, size: int) -> IntArray:
-    try:
-        array = np.asarray(values)
-    except ValueError as error:
-        raise TypeError(f"{name} must hold whole numbers, got {values!r}") from error
-    if array.size == 0:
-        return array.astype(np.int64)
-    if array.dtype.kind not in "iu":
-        raise TypeError(f"{name} must hold whole numbers (of a mask, give np.flatnonzero), got {array.dtype} values")
-    if not ((array >= 0) & (array < size)).all():
-        raise ValueError(f"{name} must lie within 0 .. {size - 1}, got {array.min()} .. {array.max()}")
-    return array.astype(np.int64)
-
-
-def _check_cell(parameters: CellParameters, thermal: bool) -> None:
-    if not isinstance(parameters, CellParameters):
-        raise TypeError(f"parameters must be CellParameters, got {parameters!r}")
-    if not isinstance(thermal, bool):
-        raise TypeError(f"thermal must be True or False, got {thermal!r}")
+    return check_dt(dt_s, cell.replace(to=cell.to * fastest["to"], tsn=cell.tsn * fastest["tsn"]))
 
 
 def _starts(lengths: IntArray) -> IntArray:

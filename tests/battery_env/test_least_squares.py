@@ -7,10 +7,11 @@ from hypothesis import strategies as st
 
 from battery_env.cells import Discharge, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, Trajectory, initial_state, simulate
-from battery_env.estimators.base import Estimate
+from battery_env.estimates import Estimate
 from battery_env.estimators.cramer_rao import cramer_rao_bound
-from battery_env.estimators.least_squares import SETTLED_SHARES, LeastSquares
-from battery_env.estimators.record_model import RecordModel
+from battery_env.estimators.least_squares import LeastSquares
+from battery_env.estimators.settling import SETTLED_SHARES
+from battery_env.record_model import RecordModel
 
 
 def discharged(
@@ -252,12 +253,12 @@ class TestEndOfDischarge:
         record = discharged(load=2.0, load_unit="current", cut_off_V=cut_off_V)
         truth = Estimate(6000.0, 0.15)
         for seen in (record, record.part(0, 900)):
-            eod_time_s = LeastSquares().predict_eod_time_s(seen, truth, cut_off_V)
+            eod_time_s = LeastSquares().model.forecast(seen, truth, cut_off_V).eod_time_s
             assert record.eod_time_s - 1.0 <= eod_time_s <= record.eod_time_s
 
     def test_forecast_follows_the_record_and_ends_at_the_cut_off(self):
         record = discharged(load=2.0, load_unit="current")
-        time_s, voltage_V = LeastSquares().forecast(record.part(0, 900), Estimate(6000.0, 0.15))
+        time_s, voltage_V, *_ = LeastSquares().model.forecast(record.part(0, 900), Estimate(6000.0, 0.15))
         np.testing.assert_allclose(voltage_V[: len(record.time_s)], record.voltage_V, atol=1e-12)
         assert voltage_V[-1] == 3.0 and (np.diff(time_s) > 0.0).all()
 
@@ -265,16 +266,17 @@ class TestEndOfDischarge:
         record = discharged(load=2.0, load_unit="current")
         later = replace(record, time_s=record.time_s + 1000.0)
         truth, fit = Estimate(6000.0, 0.15), LeastSquares()
-        assert fit.predict_eod_time_s(later, truth) == pytest.approx(fit.predict_eod_time_s(record, truth) + 1000.0)
+        ends_s = [fit.model.forecast(each, truth).eod_time_s for each in (record, later)]
+        assert ends_s[1] == pytest.approx(ends_s[0] + 1000.0)
 
     def test_it_is_unknown_when_the_load_is_off(self):
         current_A = np.where(np.arange(600) < 300, 2.0, 0.0)
         record = simulate(current_A, 6000.0, 0.15, load_unit="current")
-        assert np.isnan(LeastSquares().predict_eod_time_s(record, Estimate(6000.0, 0.15)))
+        assert np.isnan(LeastSquares().model.forecast(record, Estimate(6000.0, 0.15)).eod_time_s)
 
     def test_predicted_voltage_ends_where_the_cell_is_empty(self):
         record = discharged(6000.0, 0.15)
-        voltage_V = LeastSquares().predict_voltage_V(record, Estimate(4000.0, 0.15))
+        voltage_V = LeastSquares().model.voltage(record, Estimate(4000.0, 0.15))
         assert np.isnan(voltage_V[-1]) and np.isfinite(voltage_V[: len(voltage_V) // 2]).all()
 
 
@@ -286,7 +288,7 @@ class TestRealDischarges:
         assert 1.03 < estimate.q_mobile / (3600.0 * record.meta["capacity_Ah"]) < 1.07
         assert 0.09 < estimate.r_o < 0.17
         assert estimate.settled
-        assert abs(fit.predict_eod_time_s(record, estimate, 2.7) - record.time_s[-1]) < 0.01 * record.time_s[-1]
+        assert abs(fit.model.forecast(record, estimate, 2.7).eod_time_s - record.time_s[-1]) < 0.01 * record.time_s[-1]
 
     @pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
     def test_an_unfinished_one_is_not_settled_and_a_prior_repairs_it(self, b0005, share):
@@ -298,7 +300,7 @@ class TestRealDischarges:
         assert abs(alone.q_mobile - fit.estimate(record).q_mobile) < 2.0 * alone.sd_q_mobile
         before = fit.estimate(previous).q_mobile
         carried = LeastSquares(thermal=True, mismatch_V=0.05, prior_q_mobile_C=(before, 0.01 * before))
-        eod_time_s = carried.predict_eod_time_s(beginning, carried.estimate(beginning), 2.7)
+        eod_time_s = carried.model.forecast(beginning, carried.estimate(beginning), 2.7).eod_time_s
         assert eod_time_s == pytest.approx(record.time_s[-1], rel=0.01)
 
     @pytest.mark.parametrize("cycle", [95, 125])
@@ -308,7 +310,7 @@ class TestRealDischarges:
         half = record.until(record.time_s[0] + 0.5 * (record.time_s[-1] - record.time_s[0]))
 
         def square_V2(estimate):
-            residual_V = LeastSquares(thermal=True).predict_voltage_V(half, estimate) - half.voltage_V
+            residual_V = LeastSquares(thermal=True).model.voltage(half, estimate) - half.voltage_V
             return residual_V @ residual_V
 
         def profile(q_mobile):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from battery_env.electrochemistry import NEW_CELL, QNS, QPS, initial_state, simulate
-from battery_env.estimators.record_model import RecordModel
+from battery_env.record_model import RecordModel
 
 CURRENT_A = np.repeat(np.random.default_rng(0).uniform(0.5, 2.5, 40), 75)
 PARTLY_DISCHARGED = simulate(2.0, 6000.0, 0.15, until=600.0, load_unit="current").state[-1]

@@ -143,7 +143,7 @@ def test_what_is_saved_is_loaded(small, tmp_path):
     again = TrajectoryDataset.load(path)
     for n in range(len(small)):
         np.testing.assert_array_equal(again[n].state, small[n].state)
-    assert again.parameters == small.parameters and again.description == small.description
+    assert again.cell == small.cell and again.description == small.description
     with pytest.raises(FileExistsError, match="exists already"):
         small.save(path)
 
@@ -214,7 +214,7 @@ class TestFiles:
     def test_version_1_had_no_factors_and_is_refused(self, saved, tmp_path):
         metadata = np.array(json.dumps({"format": 1, "sha256": "0"}))
         old = self.rewritten(saved, tmp_path, metadata=metadata, factors=None, eod_time_s=None)
-        with pytest.raises(ValueError, match="has format 1, this version reads 2: generate it again"):
+        with pytest.raises(ValueError, match="has format 1, this version reads 3: generate it again"):
             TrajectoryDataset.load(old)
 
     def test_changed_contents_do_not_match_their_checksum(self, small, saved, tmp_path):
@@ -251,7 +251,7 @@ class TestFiles:
             TrajectoryDataset.load(self.rewritten(saved, tmp_path, **{name: change(getattr(small, name))}))
 
     def test_settings_that_cannot_be_meant_are_refused(self, small, saved, tmp_path):
-        for change, message in (({"load_unit": "kW"}, "load_unit must be"), ({"parameters": {"kN": 1.0}}, "kN")):
+        for change, message in (({"load_unit": "kW"}, "load_unit must be"), ({"cell": {"kN": 1.0}}, "kN")):
             metadata = np.array(json.dumps(json.loads(small._metadata()) | change))
             with pytest.raises(ValueError, match=rf"changed.npz holds no valid data set: .*{message}"):
                 TrajectoryDataset.load(self.rewritten(saved, tmp_path, metadata=metadata))
@@ -275,7 +275,7 @@ class TestMismatch:
             cell = NEW_CELL.replace(
                 kn=NEW_CELL.kn * kn, tDiffusion=NEW_CELL.tDiffusion * t_diffusion, to=NEW_CELL.to * to, tsn=NEW_CELL.tsn * tsn
             )
-            whole = simulate(wrong[n].load[0], wrong.q_mobile[n], wrong.r_o[n], parameters=cell)
+            whole = simulate(wrong[n].load[0], wrong.q_mobile[n], wrong.r_o[n], cell=cell)
             nominal = simulate(wrong[n].load[0], wrong.q_mobile[n], wrong.r_o[n])
             np.testing.assert_allclose(wrong[n].state, whole.state, rtol=1e-9)
             assert wrong[n].eod_time_s == whole.eod_time_s
@@ -288,7 +288,7 @@ class TestMismatch:
                 np.testing.assert_array_equal(states, [wrong[n].state[sample] for n in index])
 
     def test_constants_are_packed_row_by_row_or_shared(self, small, wrong):
-        assert small.packed(np.array([3, 4])) is small.parameters.packed
+        assert small.packed(np.array([3, 4])) is small.cell.packed
         np.testing.assert_array_equal(
             wrong.packed(np.array([3, 4])).constants, NEW_CELL.packed_with(wrong.factors[[3, 4]]).constants
         )
@@ -350,7 +350,7 @@ class TestTables:
         file = parquet.ParquetFile(path)
         assert 1 < file.num_row_groups < len(small)
         metadata = json.loads(file.schema_arrow.metadata[b"battery_env"])
-        assert metadata["description"]["seed"] == 3 and metadata["parameters"]["kn"] == 2120.96
+        assert metadata["description"]["seed"] == 3 and metadata["cell"]["kn"] == 2120.96
         assert set(metadata["versions"]) == {"python", "numpy", "numba"} and len(metadata["checksum"]) == 64
         with pytest.raises(FileExistsError, match="exists already"):
             small.to_parquet(path)
