@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from battery_env.arrays import BoolArray, FloatArray
-from battery_env.electrochemistry import Trajectory, initial_state, simulate
+from battery_env.electrochemistry import Trajectory, simulate
 from battery_env.estimates import EstimateTrace
 from battery_env.estimators.base import Estimator
 from battery_env.estimators.cramer_rao import cramer_rao_bound
@@ -152,10 +152,10 @@ def _since(holds: BoolArray, time_s: FloatArray) -> float:
 
 def _forecasts(dataset: TrajectoryDataset, n: int, record: Trajectory, trace: EstimateTrace) -> dict[str, float]:
     cell = dataset.cell
-    profile = dataset.load_values[dataset.load_start[n] : dataset.load_start[n] + dataset.samples[n]]
+    profile = dataset.load_profile(n)
     # beyond the record its last load goes on, for as long again
     load = np.concatenate([profile, np.full(len(profile), profile[-1])])
-    starts_full = np.array_equal(dataset.checkpoint[dataset.checkpoint_start[n]], initial_state(record.q_mobile, cell))
+    starts_full = dataset.starts_full(n)
 
     def error_s(estimate: int) -> float:
         if not starts_full or estimate < 0:

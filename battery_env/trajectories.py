@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
-import platform
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
-from importlib import import_module
-from importlib.metadata import version
-from itertools import pairwise
 from numbers import Real
 from pathlib import Path
 from typing import Any, Literal, overload
 
 import numpy as np
 import pandas as pd
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from battery_env.arrays import FloatArray, IntArray
 from battery_env.checks import LoadUnit, check_indices, check_load, check_range, check_whole_number
+from battery_env.dataset_files import described, load_npz, save_npz, save_parquet
 from battery_env.electrochemistry import (
     NEW_CELL,
     STATE_NAMES,
@@ -36,9 +31,8 @@ from battery_env.electrochemistry import (
     initial_state,
 )
 from battery_env.electrochemistry.kernels import roll_out
-from battery_env.files import replacing
 from battery_env.loads import Load, LoadSampler, constant
-from battery_env.parameters import Q_MOBILE, R_O
+from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, R_O
 
 AgedParameter = Literal["q_mobile", "r_o", "joint"]
 
@@ -51,7 +45,6 @@ PAPER_TRIM = (0.05, 0.95)
 #: Largest ``mismatch`` of :meth:`TrajectoryDataset.generate`: beyond, the constants would be another cell's.
 MISMATCH_LIMIT = 0.5
 
-FORMAT_VERSION = 3
 _CHECKPOINT_EVERY = 64  # steps between stored states: a window starts with 32 steps of re-simulation on average
 _MIN_SAMPLES = 8
 _LEAST_DT_S = 0.01  # of a discharge that may take a day
@@ -59,7 +52,6 @@ _INDICES = ("load_start", "samples", "first", "stop", "checkpoint_start")
 _PER_TRAJECTORY = ("q_mobile", "r_o", "factors", "eod_time_s", *_INDICES)
 _ARRAYS = (*_PER_TRAJECTORY, "load_values", "checkpoint")
 _SETTINGS = ("load_unit", "dt_s", "thermal", "description")
-_ROWS_PER_GROUP = 1_000_000  # of a Parquet file: a reader that wants some columns holds this many rows at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -298,12 +290,13 @@ class TrajectoryDataset(Sequence[Trajectory]):
     @classmethod
     def from_trajectories(cls, trajectories: Sequence[Trajectory]) -> TrajectoryDataset:
         """
-        A data set of trajectories made one by one with :func:`~battery_env.electrochemistry.simulate`, isothermal, with a new
-        cell's constants.
+        A data set of trajectories made one by one with :func:`~battery_env.electrochemistry.simulate`.
 
-        :param trajectories: simulated discharges or parts of them, in one unit of load and one time step
-        :return: the data set; its clock starts with each trajectory
-        :raises ValueError: if there are none, their units or time steps differ, or they were simulated in another way
+        :param trajectories: simulated discharges or parts of them, of cells that differ in ``q_mobile`` and ``r_o`` alone, in
+            one unit of load and one time step
+        :return: the data set; its clock starts with each trajectory, and its constants are exactly theirs. To keep a
+            ``mismatch`` take a :meth:`subset` instead
+        :raises ValueError: if there are none, or they differ in more than that
         """
         if isinstance(trajectories, Trajectory):
             raise TypeError("trajectories must be a list of them, got one Trajectory")
@@ -312,13 +305,17 @@ class TrajectoryDataset(Sequence[Trajectory]):
                 raise TypeError(f"trajectories must hold Trajectory, got {type(trajectory).__name__}")
             if len(trajectory.time_s) == 0:
                 raise ValueError("trajectories must hold at least one sample each, got an empty one")
-        units = {trajectory.load_unit for trajectory in trajectories}
-        steps = {round(float(dt), 9) for trajectory in trajectories for dt in np.diff(trajectory.time_s[:2])}
-        if len(units) != 1 or len(steps) != 1:
-            raise ValueError(f"trajectories must share one load unit and one time step, got units {units} and steps {steps} s")
+        cells = {trajectory.cell.replace(q_mobile=NEW_CELL.q_mobile, r_o=NEW_CELL.r_o) for trajectory in trajectories}
+        ways = {(trajectory.load_unit, trajectory.dt_s, trajectory.thermal) for trajectory in trajectories}
+        if len(cells) != 1 or len(ways) != 1:
+            raise ValueError(
+                "trajectories must share the constants of the cell but for q_mobile and r_o, one load unit, one time step (s) "
+                f"and whether they are thermal, got {len(cells)} sets of constants and {ways}"
+            )
+        load_unit, dt_s, thermal = ways.pop()
         samples = np.array([len(trajectory.time_s) for trajectory in trajectories], dtype=np.int64)
         checkpoints = [trajectory.state[::_CHECKPOINT_EVERY] for trajectory in trajectories]
-        dataset = cls(
+        return cls(
             q_mobile=np.array([trajectory.q_mobile for trajectory in trajectories]),
             r_o=np.array([trajectory.r_o for trajectory in trajectories]),
             factors=np.ones((len(trajectories), len(UNCERTAIN_CONSTANTS))),
@@ -330,19 +327,12 @@ class TrajectoryDataset(Sequence[Trajectory]):
             stop=samples,
             checkpoint=np.concatenate(checkpoints),
             checkpoint_start=_starts(_checkpoints(samples)),
-            load_unit=units.pop(),
-            dt_s=steps.pop(),
-            thermal=False,
-            cell=NEW_CELL,
+            load_unit=load_unit,
+            dt_s=dt_s,
+            thermal=thermal,
+            cell=cells.pop(),
             description={"made_by": "from_trajectories"},
         )
-        for n, trajectory in enumerate(trajectories):
-            if not np.allclose(dataset[n].state[-1], trajectory.state[-1], rtol=1e-6):
-                raise ValueError(
-                    f"trajectory {n} is not an isothermal simulation with a new cell's constants; make data sets of others "
-                    "with TrajectoryDataset.simulated"
-                )
-        return dataset
 
     @classmethod
     def paper(cls, parameter: Literal["q_mobile", "r_o"]) -> TrajectoryDataset:
@@ -371,8 +361,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
         if isinstance(index, slice):
             return self.subset(np.arange(len(self))[index])
         n = range(len(self))[index]
-        samples = self.samples[n]
-        load = self.load_values[self.load_start[n] : self.load_start[n] + samples]
+        samples, load = self.samples[n], self.load_profile(n)
         state, voltage, current = np.empty((samples + 1, STATE_SIZE)), np.empty(samples), np.empty(samples)
         state[0] = self.checkpoint[self.checkpoint_start[n]]
         # no cut-off: a data set of recorded trajectories may hold samples below it
@@ -386,13 +375,38 @@ class TrajectoryDataset(Sequence[Trajectory]):
             current_A=current,
             load=load.copy(),
             load_unit=self.load_unit,
-            q_mobile=float(self.q_mobile[n]),
-            r_o=float(self.r_o[n]),
+            cell=self._cell(n),
+            dt_s=self.dt_s,
+            thermal=self.thermal,
             eod_time_s=float(self.eod_time_s[n]),
         ).part(self.first[n], self.stop[n])
 
     def __iter__(self) -> Iterator[Trajectory]:
         return (self[n] for n in range(len(self)))
+
+    def load_profile(self, n: int) -> FloatArray:
+        """
+        The load of a whole discharge, before it was trimmed.
+
+        :param n: which trajectory
+        :return: one value a step, W or A, shape (samples,)
+        """
+        return self.load_values[self.load_start[n] : self.load_start[n] + self.samples[n]]
+
+    def starts_full(self, n: int) -> bool:
+        """
+        Whether a whole discharge, before it was trimmed, starts with a fully charged cell at rest.
+
+        :param n: which trajectory
+        :return: whether it does
+        """
+        return np.array_equal(self.checkpoint[self.checkpoint_start[n]], initial_state(self.q_mobile[n], self.cell))
+
+    def _cell(self, n: int) -> CellParameters:
+        """The true constants of a trajectory."""
+        known = {name: getattr(self.cell, name) for name in UNCERTAIN_CONSTANTS}
+        true = {name: factor * known[name] for name, factor in zip(known, self.factors[n].tolist(), strict=True)}
+        return self.cell.replace(q_mobile=float(self.q_mobile[n]), r_o=float(self.r_o[n]), **true)
 
     def packed(self, index: IntArray) -> PackedConstants:
         """
@@ -480,19 +494,13 @@ class TrajectoryDataset(Sequence[Trajectory]):
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """
-        Save as an npz file (no pickle) that holds the arrays and, as JSON, constants, description, versions and a checksum.
-        The file is written beside its place and renamed, so that it is never there in part.
+        Save as an npz file (no pickle) that holds the arrays and, as JSON, constants, description and versions.
 
         :param path: where to; ``.npz`` is added if it is missing
         :return: the file
         :raises FileExistsError: if the file exists already
         """
-        target = _new_file(path, ".npz")
-        arrays, metadata = self._arrays(), self._metadata()
-        checksum = np.array(_checksum(metadata, arrays))
-        with replacing(target) as part:
-            np.savez_compressed(part, allow_pickle=False, metadata=np.array(metadata), checksum=checksum, **arrays)
-        return target
+        return save_npz(path, {name: getattr(self, name) for name in _ARRAYS}, self._settings())
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> TrajectoryDataset:
@@ -503,23 +511,16 @@ class TrajectoryDataset(Sequence[Trajectory]):
         :return: the data set
         :raises ValueError: if the file is damaged, no such data set, or of another format version
         """
-        with Path(path).open("rb") as stream:
-            try:
-                with np.load(stream, allow_pickle=False) as file:
-                    text, found, arrays, checksum = _read(file)
-            except Exception as error:  # numpy and zipfile raise whatever the damage leads them to
-                raise ValueError(f"{path} is damaged, or no data set saved by TrajectoryDataset.save: {error}") from error
-        if found != FORMAT_VERSION:
-            raise ValueError(f"{path} has format {found}, this version reads {FORMAT_VERSION}: generate it again")
-        if _checksum(text, arrays) != checksum:
-            raise ValueError(f"{path} is damaged: its contents do not match their checksum")
+        arrays, settings = load_npz(path, _ARRAYS)
         try:
-            metadata = json.loads(text)
-            constants: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in metadata["cell"].items()}
-            settings: dict[str, Any] = {name: metadata[name] for name in _SETTINGS}
-            return cls(**arrays, **settings, cell=CellParameters(**constants))
+            constants = {name: tuple(value) if isinstance(value, list) else value for name, value in settings["cell"].items()}
+            chosen = {name: settings[name] for name in _SETTINGS}
+            return cls(**arrays, **chosen, cell=CellParameters(**constants))
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{path} holds no valid data set: {error}") from error
+
+    def _settings(self) -> dict[str, Any]:
+        return {**{name: getattr(self, name) for name in _SETTINGS}, "cell": asdict(self.cell)}
 
     def to_frame(self) -> pd.DataFrame:
         """
@@ -527,20 +528,19 @@ class TrajectoryDataset(Sequence[Trajectory]):
         the states under their names (K, V, C), and the true ``q_mobile`` (C) and ``r_o`` (ohm). Every trajectory is
         simulated for it; the paper's 5511 are 7 million rows (0.9 GB).
 
-        :return: one row per sample, in the order of trajectories and time
+        :return: one row per sample, in the order of trajectories and time; its ``attrs`` hold constants, description and
+            versions
         """
-        return self._frame(0, len(self))
-
-    def _frame(self, start: int, stop: int) -> pd.DataFrame:
-        trajectories = [self[n] for n in range(start, stop)]
-        lengths = self.stop[start:stop] - self.first[start:stop]
-        columns = {"trajectory": np.repeat(np.arange(start, stop), lengths)}
+        trajectories, lengths = list(self), self.stop - self.first
+        columns = {"trajectory": np.repeat(np.arange(len(self)), lengths)}
         for name in ("time_s", "voltage_V", "current_A", "load"):
             columns[name] = np.concatenate([getattr(trajectory, name) for trajectory in trajectories])
         state = np.concatenate([trajectory.state for trajectory in trajectories])
         columns |= dict(zip(STATE_NAMES, state.T, strict=True))
-        columns |= {name: np.repeat(getattr(self, name)[start:stop], lengths) for name in ("q_mobile", "r_o")}
-        return pd.DataFrame(columns)
+        columns |= {name: np.repeat(getattr(self, name), lengths) for name in PARAMETER_NAMES}
+        frame = pd.DataFrame(columns)
+        frame.attrs = described(self._settings())
+        return frame
 
     def summary(self) -> pd.DataFrame:
         """
@@ -569,59 +569,18 @@ class TrajectoryDataset(Sequence[Trajectory]):
 
     def to_parquet(self, path: str | os.PathLike[str]) -> Path:
         """
-        Write :meth:`to_frame` to a Parquet file, for programs other than this one; :meth:`save` is far smaller. Its schema
-        holds, as JSON under ``battery_env``, constants, description, versions and the checksum of the data set.
+        Write :meth:`to_frame` to a Parquet file, for programs other than this one; :meth:`save` is far smaller.
 
         :param path: where to; ``.parquet`` is added if it is missing
         :return: the file
         :raises FileExistsError: if the file exists already
         :raises ImportError: without the extra ``parquet``
         """
-        try:
-            pyarrow, parquet = import_module("pyarrow"), import_module("pyarrow.parquet")
-        except ImportError as error:
-            raise ImportError("to_parquet needs pyarrow: pip install 'battery_env[parquet]'") from error
-        target = _new_file(path, ".parquet")
-        text = self._metadata()
-        metadata = {"battery_env": json.dumps({**json.loads(text), "checksum": _checksum(text, self._arrays())})}
-        rows = np.cumsum(self.stop - self.first)
-        group = (rows - 1) // _ROWS_PER_GROUP
-        starts = [0, *(np.flatnonzero(np.diff(group)) + 1), len(self)]
-        schema = pyarrow.Schema.from_pandas(self._frame(0, 1), preserve_index=False).with_metadata(metadata)
-        with replacing(target) as part, parquet.ParquetWriter(part, schema) as writer:
-            for start, stop in pairwise(starts):
-                frame = self._frame(int(start), int(stop))
-                writer.write_table(pyarrow.Table.from_pandas(frame, schema=schema, preserve_index=False))
-        return target
-
-    def _arrays(self) -> dict[str, NDArray[Any]]:
-        return {name: getattr(self, name) for name in _ARRAYS}
-
-    def _metadata(self) -> str:
-        versions = {"python": platform.python_version(), "numpy": np.__version__, "numba": version("numba")}
-        settings = {name: getattr(self, name) for name in _SETTINGS}
-        return json.dumps({"format": FORMAT_VERSION, **settings, "cell": asdict(self.cell), "versions": versions})
-
-
-def _new_file(path: str | os.PathLike[str], suffix: str) -> Path:
-    target = Path(path)
-    target = target if target.suffix == suffix else target.with_name(target.name + suffix)
-    if target.exists():
-        raise FileExistsError(f"{target} exists already; delete it or choose another name")
-    return target
+        return save_parquet(path, self.to_frame())
 
 
 def _checkpoints(samples: IntArray) -> IntArray:
     return (samples - 1) // _CHECKPOINT_EVERY + 1
-
-
-def _read(file: Mapping[str, NDArray[Any]]) -> tuple[str, int, dict[str, Any], str]:
-    """Metadata, format version, and the arrays and checksum of this version; another may have other arrays."""
-    text = str(file["metadata"])
-    found = json.loads(text)["format"]
-    if found != FORMAT_VERSION:
-        return text, found, {}, ""
-    return text, found, {name: np.asarray(file[name]) for name in _ARRAYS}, str(file["checksum"])
 
 
 def _packed(cell: CellParameters, factors: FloatArray) -> PackedConstants:
@@ -642,14 +601,6 @@ def _check_dt(dt_s: float, cell: CellParameters, factors: FloatArray) -> float:
 
 def _starts(lengths: IntArray) -> IntArray:
     return np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.int64)
-
-
-def _checksum(metadata: str, arrays: dict[str, NDArray[Any]]) -> str:
-    digest = hashlib.sha256(metadata.encode())
-    for name in _ARRAYS:
-        digest.update(f"{name} {arrays[name].dtype.str} {arrays[name].shape}".encode())
-        digest.update(np.ascontiguousarray(arrays[name]).tobytes())
-    return digest.hexdigest()
 
 
 @lru_cache(maxsize=2)

@@ -25,6 +25,7 @@ LAYERS = (
     ("battery_env.electrochemistry",),
     ("battery_env.records", "battery_env.estimates"),
     ("battery_env.loads",),
+    ("battery_env.dataset_files",),
     ("battery_env.trajectories", "battery_env.cells", "battery_env.nasa_cells"),
     ("battery_env.sensors",),
     ("battery_env.record_model",),

@@ -231,8 +231,9 @@ class Trajectory:
     :param current_A: current over the step that starts at each sample, shape (T,)
     :param load: load over the step that starts at each sample, W or A, shape (T,)
     :param load_unit: ``"power"`` or ``"current"``
-    :param q_mobile: charge that can move, C
-    :param r_o: ohmic resistance, ohm
+    :param cell: constants of the cell, with its own ``q_mobile`` and ``r_o``
+    :param dt_s: time step, s
+    :param thermal: whether the temperature moved
     :param eod_time_s: time of the first sample below the cut-off (or without a voltage), the end of discharge, on the
         clock of ``time_s``; NaN if the simulation stopped before
     """
@@ -243,9 +244,20 @@ class Trajectory:
     current_A: FloatArray
     load: FloatArray
     load_unit: LoadUnit
-    q_mobile: float
-    r_o: float
+    cell: CellParameters
+    dt_s: float
+    thermal: bool
     eod_time_s: float
+
+    @property
+    def q_mobile(self) -> float:
+        """Charge that can move, C."""
+        return self.cell.q_mobile
+
+    @property
+    def r_o(self) -> float:
+        """Ohmic resistance, ohm."""
+        return self.cell.r_o
 
     def part(self, first: int, stop: int) -> Trajectory:
         """
@@ -352,7 +364,8 @@ def simulate(
         current_A=amperes[:n].copy(),
         load=np.array(loads[:n]),
         load_unit=load_unit,
-        q_mobile=float(q),
-        r_o=float(r),
+        cell=constants.replace(q_mobile=float(q), r_o=float(r)),
+        dt_s=dt,
+        thermal=bool(thermal),
         eod_time_s=n * dt if n < n_samples else float("nan"),
     )

@@ -44,8 +44,8 @@ class ClosedForm(Estimator):
         """
         traces = []
         for record in records:
-            ohmic, dt_s = record.state[:, VO], np.diff(record.time_s)
-            ohmic_nominal = ohmic[:-1] + self.cell.to / dt_s * np.diff(ohmic)
+            ohmic = record.state[:, VO]
+            ohmic_nominal = ohmic[:-1] + self.cell.to / record.dt_s * np.diff(ohmic)
             current = np.where(record.current_A[:-1] == 0.0, np.nan, record.current_A[:-1])
             charge = record.state[1:, QNB:].sum(axis=1)
             traces.append(

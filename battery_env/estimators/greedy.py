@@ -202,7 +202,7 @@ class GreedyOneStep(Estimator):
                 self.parameter == "q_mobile",
                 record.q_mobile,
                 record.r_o,
-                check_dt(float(record.time_s[1] - record.time_s[0]), self.cell),
+                check_dt(record.dt_s, self.cell),
                 record.load_unit == "power",
                 self.thermal,
                 self.cell.packed,

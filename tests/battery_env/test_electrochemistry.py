@@ -290,3 +290,16 @@ def test_constants_are_frozen_and_replaceable():
     assert slower.kn == 100.0 and NEW_CELL.kn == 2120.96
     state = initial_state(7600.0)
     assert step(state, 8.0, 7600.0, 0.1, cell=slower)[2] > step(state, 8.0, 7600.0, 0.1)[2]
+
+
+def test_a_cell_brings_its_own_age():
+    aged = NEW_CELL.replace(q_mobile=6000.0, r_o=0.2)
+    own, given = simulate(8.0, cell=aged), simulate(8.0, 6000.0, 0.2)
+    np.testing.assert_array_equal(own.state, given.state)
+    assert (own.cell, own.q_mobile, own.r_o) == (aged, 6000.0, 0.2) == (given.cell, given.q_mobile, given.r_o)
+    state = initial_state(cell=aged)
+    np.testing.assert_array_equal(state, initial_state(6000.0))
+    np.testing.assert_array_equal(voltage(state, cell=aged), voltage(state, 6000.0))
+    np.testing.assert_array_equal(step(state, 8.0, cell=aged), step(state, 8.0, 6000.0, 0.2))
+    # what is given goes before what the cell brings
+    np.testing.assert_array_equal(simulate(8.0, 7000.0, cell=aged).state, simulate(8.0, 7000.0, 0.2).state)

@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 
 from battery_env.cells import Discharge, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, Trajectory, initial_state, simulate
-from battery_env.estimates import Estimate
 from battery_env.estimators.cramer_rao import cramer_rao_bound
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.settling import SETTLED_SHARES
@@ -245,39 +244,6 @@ class TestBounds:
             discharged(6000.0, 0.15).part(0, 1000)
         )
         assert (estimate.q_mobile, estimate.r_o) == (5500.0, 0.2) and not estimate.settled
-
-
-class TestEndOfDischarge:
-    @pytest.mark.parametrize("cut_off_V", [3.2, 3.0, 2.7])
-    def test_it_is_the_simulated_one_to_within_a_step(self, cut_off_V):
-        record = discharged(load=2.0, load_unit="current", cut_off_V=cut_off_V)
-        truth = Estimate(6000.0, 0.15)
-        for seen in (record, record.part(0, 900)):
-            eod_time_s = LeastSquares().model.forecast(seen, truth, cut_off_V).eod_time_s
-            assert record.eod_time_s - 1.0 <= eod_time_s <= record.eod_time_s
-
-    def test_forecast_follows_the_record_and_ends_at_the_cut_off(self):
-        record = discharged(load=2.0, load_unit="current")
-        time_s, voltage_V, *_ = LeastSquares().model.forecast(record.part(0, 900), Estimate(6000.0, 0.15))
-        np.testing.assert_allclose(voltage_V[: len(record.time_s)], record.voltage_V, atol=1e-12)
-        assert voltage_V[-1] == 3.0 and (np.diff(time_s) > 0.0).all()
-
-    def test_time_counts_on_the_clock_of_the_record(self):
-        record = discharged(load=2.0, load_unit="current")
-        later = replace(record, time_s=record.time_s + 1000.0)
-        truth, fit = Estimate(6000.0, 0.15), LeastSquares()
-        ends_s = [fit.model.forecast(each, truth).eod_time_s for each in (record, later)]
-        assert ends_s[1] == pytest.approx(ends_s[0] + 1000.0)
-
-    def test_it_is_unknown_when_the_load_is_off(self):
-        current_A = np.where(np.arange(600) < 300, 2.0, 0.0)
-        record = simulate(current_A, 6000.0, 0.15, load_unit="current")
-        assert np.isnan(LeastSquares().model.forecast(record, Estimate(6000.0, 0.15)).eod_time_s)
-
-    def test_predicted_voltage_ends_where_the_cell_is_empty(self):
-        record = discharged(6000.0, 0.15)
-        voltage_V = LeastSquares().model.voltage(record, Estimate(4000.0, 0.15))
-        assert np.isnan(voltage_V[-1]) and np.isfinite(voltage_V[: len(voltage_V) // 2]).all()
 
 
 class TestRealDischarges:
