@@ -133,7 +133,7 @@ class RecordModel:
         :param record: one discharge
         :param at: the parameters
         :return: voltage in V, shape (T,); NaN after the model cell is empty
-        :raises ValueError: if the record cannot be used
+        :raises ValueError: for parameters out of range, or a record that cannot be used
         """
         time_s, current_A = self.grid(record)
         return _at(time_s, self.simulate(current_A, at.q_mobile, at.r_o))
@@ -152,8 +152,9 @@ class RecordModel:
             :func:`~battery_env.records.expected_current` has it, the last current of a constant load and the mean of a load
             that varied, which is an assumption
         :return: the voltage, and when the cut-off is reached
-        :raises ValueError: for a negative future current, or a record that cannot be used
+        :raises ValueError: for a negative future current, parameters out of range, or a record that cannot be used
         """
+        Q_MOBILE.check(at.q_mobile)
         samples_s, current_A = self.grid(record)
         cut_off = self.cell.VEOD if cut_off_V is None else cut_off_V
         if future_current_A is None:

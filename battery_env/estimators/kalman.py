@@ -25,7 +25,7 @@ from battery_env.electrochemistry import (
     initial_state,
 )
 from battery_env.electrochemistry.cell import FRACTION_PER_SHARE
-from battery_env.electrochemistry.kernels import cell_step, cell_voltage
+from battery_env.electrochemistry.kernels import MOLE_FRACTION_MARGIN, cell_step, cell_voltage
 from battery_env.estimates import Estimate, EstimateTrace, last_estimate
 from battery_env.estimators.base import OnlineEstimator, check_bounds
 from battery_env.estimators.settling import (
@@ -73,8 +73,6 @@ _SAME_SHARE = 0.25
 _GATE_SD = 5.0
 # The noise that innovations show is averaged over about this many samples.
 _NOISE_MEMORY = 32.0
-# How close to 0 and 1 mole fractions may come in the copies: the voltage is singular there.
-_MOLE_FRACTION_MARGIN = 5e-4
 _SHARE_N, _SHARE_P = float(FULL_CHARGE_SHARES[QNS - QNB]), float(FULL_CHARGE_SHARES[QPS - QNB])
 
 _PRIOR_SD_SHARE_Q = 0.25
@@ -136,7 +134,7 @@ def _least_q(surface_charge: float, share: float, q: float, per_q: float) -> flo
     # The smallest q' whose mole fraction, per_q * (surface_charge + share * (q' - q)) / q', lies inside the margins; that of a
     # full cell, per_q * share, does.
     full, amount = per_q * share, per_q * surface_charge
-    low, high = _MOLE_FRACTION_MARGIN, 1.0 - _MOLE_FRACTION_MARGIN
+    low, high = MOLE_FRACTION_MARGIN, 1.0 - MOLE_FRACTION_MARGIN
     return q + max((low * q - amount) / (full - low), (amount - high * q) / (high - full))
 
 

@@ -157,3 +157,10 @@ class TestForecast:
         record = simulate(2.0, 6000.0, 0.15, load_unit="current")
         eod_time_s = RecordModel().forecast(record, calibrator.estimate(record)).eod_time_s
         assert eod_time_s == pytest.approx(record.eod_time_s, rel=1e-3)
+
+    @pytest.mark.parametrize("at", [Estimate(np.nan, 0.1), Estimate(6000.0, np.nan)])
+    def test_it_needs_both_parameters(self, at):
+        record = simulate(2.0, 6000.0, 0.15, load_unit="current")
+        for of in (RecordModel().forecast, RecordModel().voltage):
+            with pytest.raises(ValueError, match="must lie within .* got nan"):
+                of(record, at)
