@@ -513,9 +513,9 @@ class TrajectoryDataset(Sequence[Trajectory]):
         """
         arrays, settings = load_npz(path, _ARRAYS)
         try:
-            constants = {name: tuple(value) if isinstance(value, list) else value for name, value in settings["cell"].items()}
-            chosen = {name: settings[name] for name in _SETTINGS}
-            return cls(**arrays, **chosen, cell=CellParameters(**constants))
+            constants: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in settings["cell"].items()}
+            fields: dict[str, Any] = {**arrays, **{name: settings[name] for name in _SETTINGS}}
+            return cls(**fields, cell=CellParameters(**constants))
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{path} holds no valid data set: {error}") from error
 

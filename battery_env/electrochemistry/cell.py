@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from math import isfinite
 from numbers import Real
 from typing import Any, NamedTuple
 
@@ -156,7 +157,7 @@ class CellParameters:
             numbers = value if field.name in ("An", "Ap") and isinstance(value, tuple) else (value,)
             if not all(isinstance(number, Real) for number in numbers):
                 raise TypeError(f"CellParameters: {field.name} must be {field.type}, got {value!r}")
-            if not np.all(np.isfinite(np.array(value, dtype=np.float64))):
+            if not all(map(isfinite, numbers)):
                 raise ValueError(f"CellParameters: {field.name} must be finite, got {value!r}")
             if field.name not in ("U0n", "U0p", "An", "Ap", "r_o") and not value > 0.0:
                 raise ValueError(f"CellParameters: {field.name} must be greater than 0, got {value!r}")
