@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     from battery_env.calibration.policy import PolicyEstimator
     from battery_env.cells import Discharge, load_nasa_discharges, read_discharge_csv
     from battery_env.electrochemistry import NEW_CELL, CellParameters, Trajectory, initial_state, simulate, step, voltage
+    from battery_env.estimates import Estimate
     from battery_env.estimators import (
         ClosedForm,
-        Estimate,
         Estimator,
         ExtendedKalmanFilter,
         GreedyOneStep,
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
         cramer_rao_bound,
     )
     from battery_env.evaluation import evaluate
+    from battery_env.record_model import RecordModel
     from battery_env.sensors import RandomSensorErrors, SensorErrors
     from battery_env.trajectories import TrajectoryDataset
 
@@ -33,13 +34,14 @@ _MODULES = {
     "CellParameters": "battery_env.electrochemistry",
     "ClosedForm": "battery_env.estimators",
     "Discharge": "battery_env.cells",
-    "Estimate": "battery_env.estimators",
+    "Estimate": "battery_env.estimates",
     "Estimator": "battery_env.estimators",
     "ExtendedKalmanFilter": "battery_env.estimators",
     "GreedyOneStep": "battery_env.estimators",
     "LeastSquares": "battery_env.estimators",
     "PolicyEstimator": "battery_env.calibration.policy",
     "RandomSensorErrors": "battery_env.sensors",
+    "RecordModel": "battery_env.record_model",
     "SensorErrors": "battery_env.sensors",
     "Trajectory": "battery_env.electrochemistry",
     "TrajectoryDataset": "battery_env.trajectories",
@@ -67,6 +69,7 @@ __all__ = [
     "LeastSquares",
     "PolicyEstimator",
     "RandomSensorErrors",
+    "RecordModel",
     "SensorErrors",
     "Trajectory",
     "TrajectoryDataset",

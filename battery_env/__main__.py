@@ -17,15 +17,16 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 
 from battery_env.cells import BUNDLED_CELLS, Discharge, load_nasa_discharges, read_discharge_csv
-from battery_env.electrochemistry import NEW_CELL, FloatArray
-from battery_env.estimators.base import Estimate
+from battery_env.electrochemistry import NEW_CELL
+from battery_env.estimates import Estimate
 from battery_env.estimators.least_squares import LeastSquares
-from battery_env.estimators.record_model import ExpectedCurrent, expected_current
 from battery_env.files import replacing
-from battery_env.plotting import COLOURS, new_figure, save_figure
+from battery_env.parameters import PARAMETER_NAMES
+from battery_env.plotting import plot_discharge, save_figure
+from battery_env.record_model import Forecast
+from battery_env.records import ExpectedCurrent, expected_current
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -47,8 +48,8 @@ def _parser() -> argparse.ArgumentParser:
     calibrate.add_argument(
         "--parameters",
         nargs="+",
-        choices=("q_mobile", "r_o"),
-        default=["q_mobile", "r_o"],
+        choices=PARAMETER_NAMES,
+        default=PARAMETER_NAMES,
         help="what to fit; the other is held at the new cell's value (default: both)",
     )
     calibrate.add_argument(
@@ -125,20 +126,21 @@ def _calibrate(options: argparse.Namespace) -> None:
     future = expected_current(record.time_s, record.current_A)
     if options.future_current is not None:
         future = ExpectedCurrent(options.future_current, varied=False, sd_A=0.0)
-    row = _summary(calibrator, record, estimate, discharge.eod_time_s(options.cut_off), options.cut_off, future)
+    forecast = calibrator.model.forecast(record, estimate, options.cut_off, future.mean_A)
+    row = _summary(record, estimate, forecast, discharge.eod_time_s(options.cut_off), future)
+    if "q_mobile" not in options.parameters:
+        row["state_of_health"] = float("nan")
     _print(name, record, row, options.parameters, options.cut_off, future)
     if not options.prior_q and not estimate.settled and np.isnan(row["measured_eod_time_s"]):
         print("During a discharge give --prior-q with the q_mobile of an earlier one of this cell. Without it the filter in")
         print("Python, ExtendedKalmanFilter(thermal=True, mismatch_V=0.05), predicts the end better than this fit.")
     if outputs:
-        model_V = calibrator.predict_voltage_V(record, estimate)
         with replacing(outputs[0]) as part:
             pd.DataFrame([{"record": name, **row}]).to_csv(part, index=False)
-        columns = {"time_s": record.time_s, "voltage_V": record.voltage_V, "current_A": record.current_A, "model_V": model_V}
+        columns = {"time_s": record.time_s, "voltage_V": record.voltage_V, "current_A": record.current_A}
         with replacing(outputs[1]) as part:
-            pd.DataFrame(columns).to_csv(part, index=False)
-        forecast = calibrator.forecast(record, estimate, options.cut_off, future.mean_A)
-        save_figure(_figure(name, record, model_V, forecast), outputs[2])
+            pd.DataFrame(columns | {"model_V": forecast.at_samples_V}).to_csv(part, index=False)
+        save_figure(plot_discharge(record, {name: forecast}), outputs[2])
         print("\nwritten: " + ", ".join(map(str, outputs)))
 
 
@@ -159,16 +161,10 @@ def _read(record: str, discharge_is_negative: bool) -> tuple[str, Discharge]:
 
 
 def _summary(
-    calibrator: LeastSquares,
-    record: Discharge,
-    estimate: Estimate,
-    measured_eod_s: float,
-    cut_off_V: float,
-    future: ExpectedCurrent,
+    record: Discharge, estimate: Estimate, forecast: Forecast, measured_eod_s: float, future: ExpectedCurrent
 ) -> dict[str, Any]:
-    predicted_eod_s = calibrator.predict_eod_time_s(record, estimate, cut_off_V, future.mean_A)
-    remaining_s = max(predicted_eod_s - float(record.time_s[-1]), 0.0) if np.isnan(measured_eod_s) else 0.0
-    residual_V = calibrator.predict_voltage_V(record, estimate) - record.voltage_V
+    remaining_s = max(forecast.eod_time_s - float(record.time_s[-1]), 0.0) if np.isnan(measured_eod_s) else 0.0
+    residual_V = forecast.at_samples_V - record.voltage_V
     return {
         "q_mobile_C": estimate.q_mobile,
         "sd_q_mobile_C": estimate.sd_q_mobile,
@@ -177,9 +173,9 @@ def _summary(
         "settled": estimate.settled,
         "reason": estimate.reason,
         "drawn_Ah": record.charge_C / 3600.0,
-        "state_of_health": estimate.q_mobile / NEW_CELL.q_mobile if "q_mobile" in calibrator.parameters else float("nan"),
+        "state_of_health": estimate.q_mobile / NEW_CELL.q_mobile,
         "voltage_rmse_V": float(np.sqrt(np.nanmean(residual_V**2))),
-        "predicted_eod_time_s": predicted_eod_s,
+        "predicted_eod_time_s": forecast.eod_time_s,
         "sd_predicted_eod_time_s": _sd_eod_s(estimate, remaining_s, future),
         "measured_eod_time_s": measured_eod_s,
         "remaining_s": remaining_s,
@@ -219,23 +215,6 @@ def _print(
         print(f"  {f'{cut_off_V:g} V, measured at':<22}{row['measured_eod_time_s']:>10.0f} s")
     if not row["settled"]:
         print(f"\nNot settled: {row['reason']}")
-
-
-def _figure(name: str, record: Discharge, model_V: FloatArray, forecast: tuple[FloatArray, FloatArray]) -> Figure:
-    figure = new_figure(6.4, 4.6)
-    voltage, error = figure.subplots(2, 1, sharex=True, height_ratios=[3, 1])
-    voltage.plot(record.time_s, record.voltage_V, "o", ms=2.5, color="0.45", label="measured")
-    voltage.plot(*forecast, color=COLOURS[0], lw=1.4, label="model")
-    voltage.set(ylabel="voltage (V)")
-    voltage.set_title(name, fontsize=10)
-    voltage.legend(frameon=False)
-    error.axhline(0.0, color="0.6", lw=0.8)
-    error.plot(record.time_s, 1e3 * (model_V - record.voltage_V), color=COLOURS[1], lw=1.2)
-    error.set(xlabel="time (s)", ylabel="error (mV)")
-    for axes in (voltage, error):
-        axes.grid(alpha=0.25)
-    figure.align_ylabels()
-    return figure
 
 
 if __name__ == "__main__":

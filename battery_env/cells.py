@@ -1,5 +1,5 @@
 """
-Recorded discharges of real cells: read them, check them, and put them on the model's time grid.
+Recorded discharges of real cells, and their files.
 
 Two 18650 cells of NASA's battery data set come with the package: ``load_nasa_discharges("B0005")``, ``"B0006"``.
 """
@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import ArrayLike
 from scipy.io import loadmat
 
-from battery_env.electrochemistry import LOAD_LIMITS, FloatArray
+from battery_env.arrays import FloatArray
+from battery_env.records import SWITCH_SHARE, check_column, check_drawn_charge, check_record, drawn
 
 #: How to cite the bundled data.
 NASA_CITATION = (
@@ -30,169 +30,11 @@ NASA_CITATION = (
 #: Cells whose discharges come with the package.
 BUNDLED_CELLS: tuple[str, ...] = ("B0005", "B0006")
 
-#: A change of the current between two samples by more than this share of its largest magnitude is a switch of the load,
-#: not a drift; the current is taken to jump midway between the two samples.
-SWITCH_SHARE = 0.1
-
 _MIN_SAMPLES = 5
 _COLUMNS = ("time_s", "voltage_V", "current_A")
 # what cycles.csv tells about each discharge beyond the samples themselves
 _META_COLUMNS = ("test_id", "start_time", "ambient_temperature_C", "capacity_Ah", "Re_ohm", "Rct_ohm")
-# name: least and largest plausible value, unit, what a value beyond usually is
-_PLAUSIBLE: dict[str, tuple[float, float, str, str]] = {
-    "voltage_V": (0.0, 5.5, "V", "Give the voltage of one cell in V, not in mV, and not that of a pack."),
-    "current_A": (-LOAD_LIMITS["current"], LOAD_LIMITS["current"], "A", "Give the current in A, not in mA."),
-    "temperature_C": (-60.0, 150.0, "degC", "Give the temperature in degrees Celsius, not in kelvin."),
-}
 _DURATION_LIMITS_S = (10.0, 1e6)
-#: Least and greatest time between two samples of a stream, s. Seconds given in milliseconds or in hours are mostly beyond.
-SAMPLE_INTERVAL_LIMITS_S = (1e-3, 600.0)
-
-
-def _checked(name: str, values: ArrayLike, least_samples: int) -> FloatArray:
-    if values is None or np.ma.is_masked(values) or np.iscomplexobj(values):
-        raise TypeError(f"{name} must hold real numbers, none of them masked, got {type(values).__name__}")
-    try:
-        array = np.array(values, dtype=np.float64)
-    except (OverflowError, TypeError, ValueError) as error:
-        raise TypeError(f"{name} must hold numbers: {error}") from error
-    if array.ndim != 1 or len(array) < least_samples:
-        raise ValueError(
-            f"{name} must hold one value a sample, at least {least_samples} samples in all; got shape {array.shape}"
-        )
-    bad = np.flatnonzero(~np.isfinite(array))
-    if len(bad):
-        raise ValueError(f"{name} must be finite, got {array[bad[0]]} at sample {bad[0]}. Remove or fill such samples.")
-    if name in _PLAUSIBLE:
-        low, high, _, _ = _PLAUSIBLE[name]
-        bad = np.flatnonzero((array < low) | (array > high))
-        if len(bad):
-            raise ValueError(_implausible(name, float(array[bad[0]]), f" at sample {bad[0]}"))
-    array.setflags(write=False)
-    return array
-
-
-def _implausible(name: str, value: float, where: str = "") -> str:
-    low, high, unit, hint = _PLAUSIBLE[name]
-    return f"{name} must lie within {low:g} .. {high:g} {unit}, got {value:g}{where}. {hint}"
-
-
-def check_record(
-    time_s: ArrayLike, voltage_V: ArrayLike, current_A: ArrayLike, least_samples: int = 1
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """
-    Refuse samples that cannot be meant.
-
-    :param time_s: times of the samples, s, shape (T,)
-    :param voltage_V: terminal voltage of one cell, V, shape (T,)
-    :param current_A: current, positive in discharge, A, shape (T,)
-    :param least_samples: how many there must be
-    :return: the same as arrays that cannot be written to
-    :raises TypeError: for what is no real number
-    :raises ValueError: for arrays that do not fit together or hold values that are not finite or implausible for one cell, and
-        for times that do not increase
-    """
-    arrays = {
-        name: _checked(name, values, least_samples)
-        for name, values in (("time_s", time_s), ("voltage_V", voltage_V), ("current_A", current_A))
-    }
-    time = arrays["time_s"]
-    for name, array in arrays.items():
-        if len(array) != len(time):
-            raise ValueError(f"{name} has {len(array)} samples, but time_s has {len(time)}")
-    stalls = np.flatnonzero(np.diff(time) <= 0.0)
-    if len(stalls):
-        n = stalls[0] + 1
-        raise ValueError(
-            f"time_s must increase from sample to sample, but sample {n} is at {time[n]:g} s, after {time[n - 1]:g} s. "
-            "Give one discharge at a time, and each sample once."
-        )
-    return time, arrays["voltage_V"], arrays["current_A"]
-
-
-def check_sample(voltage_V: float, current_A: float, dt_s: float | None) -> None:
-    """
-    Refuse one sample of a stream that :func:`check_record` would refuse in a record.
-
-    :param voltage_V: terminal voltage of one cell, V
-    :param current_A: current, positive in discharge, A
-    :param dt_s: time since the previous sample, s; ``None``: this is the first one
-    :raises ValueError: if it cannot be meant
-    """
-    for name, value in (("voltage_V", voltage_V), ("current_A", current_A)):
-        if not np.isfinite(value):
-            raise ValueError(f"{name} must be finite, got {value!r}. Leave a sample out that is missing.")
-        low, high, _, _ = _PLAUSIBLE[name]
-        if not low <= value <= high:
-            raise ValueError(_implausible(name, value))
-    low, high = SAMPLE_INTERVAL_LIMITS_S
-    if dt_s is not None and not low <= dt_s <= high:
-        raise ValueError(
-            f"dt_s, the time since the previous sample, must lie within {low:g} .. {high:g} s, got {dt_s!r}. Give it in "
-            "seconds, not in hours or milliseconds. After a longer gap, start anew with a full cell."
-        )
-
-
-def check_drawn_charge(charge_C: float, least_C: float = 0.0) -> None:
-    """
-    Refuse a current of the wrong sign.
-
-    :param charge_C: charge drawn from the first sample on, C
-    :param least_C: it must be above this
-    :raises ValueError: if it is not
-    """
-    if not charge_C > least_C:
-        raise ValueError(
-            f"current_A is positive in discharge, but this record draws {charge_C:.6g} C in total. If the tester "
-            "counts discharge as negative, flip the sign (read_discharge_csv: discharge_is_negative=True; command "
-            "line: --discharge-is-negative)."
-        )
-
-
-def _knots(time_s: FloatArray, current_A: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The current as a piecewise-linear function of time, whose jumps are two knots at one time."""
-    switches = np.flatnonzero(np.abs(np.diff(current_A)) > SWITCH_SHARE * np.abs(current_A).max())
-    midpoints = 0.5 * (time_s[switches] + time_s[switches + 1])
-    place = np.repeat(switches + 1, 2)
-    sides = np.column_stack([current_A[switches], current_A[switches + 1]]).ravel()
-    return np.insert(time_s, place, np.repeat(midpoints, 2)), np.insert(current_A, place, sides)
-
-
-def drawn_charge_C(time_s: FloatArray, current_A: FloatArray, at_s: ArrayLike) -> FloatArray:
-    """
-    The charge drawn since the first sample. The current is linear between samples, except where the load was switched:
-    there it jumps midway (see ``SWITCH_SHARE``). Beyond the last sample it keeps its last value.
-
-    :param time_s: times of the samples, s, shape (T,)
-    :param current_A: current at the samples, positive in discharge, A, shape (T,)
-    :param at_s: times asked for, none before the first sample, s, any shape
-    :return: charge at these times, C, same shape
-    """
-    t, i = _knots(time_s, current_A)
-    width = np.diff(t)
-    charge = np.concatenate([[0.0], np.cumsum(0.5 * (i[1:] + i[:-1]) * width)])
-    slope = np.append(np.divide(np.diff(i), width, out=np.zeros_like(width), where=width > 0.0), 0.0)
-    n = np.searchsorted(t, at_s, side="right") - 1
-    since = np.asarray(at_s) - t[n]
-    return charge[n] + since * (i[n] + 0.5 * slope[n] * since)
-
-
-def resample_current(time_s: FloatArray, current_A: FloatArray, dt_s: float, n_steps: int) -> FloatArray:
-    """
-    The current on the model's time grid, which starts at the first sample: its mean over each step, so that the charge
-    drawn is kept exactly. A record whose samples lie ``dt_s`` apart, as simulated ones do, is taken as it is: there
-    ``current_A[k]`` is the current over the step that starts at sample k.
-
-    :param time_s: times of the samples, s, shape (T,)
-    :param current_A: current at the samples, positive in discharge, A, shape (T,)
-    :param dt_s: time step of the model, s
-    :param n_steps: number of steps; beyond the last sample the current keeps its last value
-    :return: current over each step, A, shape (n_steps,)
-    """
-    if np.allclose(np.diff(time_s), dt_s, rtol=1e-6, atol=0.0):
-        return current_A[np.minimum(np.arange(n_steps), len(current_A) - 1)]
-    grid_s = time_s[0] + dt_s * np.arange(n_steps + 1)
-    return np.diff(drawn_charge_C(time_s, current_A, grid_s)) / dt_s
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,7 +61,7 @@ class Discharge:
         for name, array in zip(_COLUMNS, arrays, strict=True):
             object.__setattr__(self, name, array)
         if self.temperature_C is not None:
-            object.__setattr__(self, "temperature_C", _checked("temperature_C", self.temperature_C, _MIN_SAMPLES))
+            object.__setattr__(self, "temperature_C", check_column("temperature_C", self.temperature_C, _MIN_SAMPLES))
             if len(self.temperature_C) != len(self.time_s):
                 raise ValueError(f"temperature_C has {len(self.temperature_C)} samples, but time_s has {len(self.time_s)}")
         duration_s = self.time_s[-1] - self.time_s[0]
@@ -233,7 +75,7 @@ class Discharge:
     @property
     def charge_C(self) -> float:
         """The charge drawn from the first sample to the last, C."""
-        return float(drawn_charge_C(self.time_s, self.current_A, self.time_s[-1]))
+        return float(drawn(self.time_s, self.current_A, self.time_s[-1]))
 
     @property
     def load_on_time_s(self) -> float:

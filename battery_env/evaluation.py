@@ -9,17 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from battery_env.electrochemistry import (
-    Q_MOBILE_LIMITS_C,
-    R_O_LIMITS_OHM,
-    FloatArray,
-    Trajectory,
-    initial_state,
-    simulate,
-)
-from battery_env.estimators.base import PARAMETERS, BoolArray, EstimateTrace, Estimator
+from battery_env.arrays import BoolArray, FloatArray
+from battery_env.electrochemistry import Trajectory, simulate
+from battery_env.estimates import EstimateTrace
+from battery_env.estimators.base import Estimator
 from battery_env.estimators.cramer_rao import cramer_rao_bound
-from battery_env.estimators.record_model import RecordModel
+from battery_env.parameters import PARAMETER_NAMES, PARAMETERS
+from battery_env.record_model import RecordModel
 from battery_env.sensors import RandomSensorErrors, SensorErrors
 from battery_env.trajectories import TrajectoryDataset
 
@@ -155,20 +151,20 @@ def _since(holds: BoolArray, time_s: FloatArray) -> float:
 
 
 def _forecasts(dataset: TrajectoryDataset, n: int, record: Trajectory, trace: EstimateTrace) -> dict[str, float]:
-    cell = dataset.parameters
-    profile = dataset.load_values[dataset.load_start[n] : dataset.load_start[n] + dataset.samples[n]]
+    cell = dataset.cell
+    profile = dataset.load_profile(n)
     # beyond the record its last load goes on, for as long again
     load = np.concatenate([profile, np.full(len(profile), profile[-1])])
-    starts_full = np.array_equal(dataset.checkpoint[dataset.checkpoint_start[n]], initial_state(record.q_mobile, cell))
+    starts_full = dataset.starts_full(n)
 
     def error_s(estimate: int) -> float:
         if not starts_full or estimate < 0:
             return np.nan
-        q_mobile, r_o = trace.q_mobile[estimate], trace.r_o[estimate]
-        if not (Q_MOBILE_LIMITS_C[0] <= q_mobile <= Q_MOBILE_LIMITS_C[1] and R_O_LIMITS_OHM[0] <= r_o <= R_O_LIMITS_OHM[1]):
+        values = {name: getattr(trace, name)[estimate] for name in PARAMETERS}
+        if not all(PARAMETERS[name].limits[0] <= value <= PARAMETERS[name].limits[1] for name, value in values.items()):
             return np.nan
         unit, thermal = dataset.load_unit, dataset.thermal
-        forecast = simulate(load, q_mobile, r_o, dt=dataset.dt_s, load_unit=unit, thermal=thermal, parameters=cell)
+        forecast = simulate(load, **values, dt=dataset.dt_s, load_unit=unit, thermal=thermal, cell=cell)
         return forecast.eod_time_s - record.eod_time_s
 
     errors = {"eod_error_s": error_s(len(trace.time_s) - 1)}
@@ -183,8 +179,8 @@ def _bounds(
 ) -> dict[str, float]:
     if sensor_errors is None or sensor_errors.noise_V == 0.0:
         return {f"{name}_bound": np.nan for name in PARAMETERS}
-    model = RecordModel(dataset.parameters, dataset.thermal, dataset.dt_s, initial=record.state[0])
-    unknown = [name for name in PARAMETERS if _states_sd(trace, name)] or PARAMETERS
+    model = RecordModel(dataset.cell, dataset.thermal, dataset.dt_s, initial=record.state[0])
+    unknown = [name for name in PARAMETERS if _states_sd(trace, name)] or PARAMETER_NAMES
     bound = cramer_rao_bound(record, sensor_errors.noise_V, unknown, offset=sensor_errors.offset_V != 0.0, model=model)
     return {f"{name}_bound": getattr(bound, f"sd_{name}")[-1] for name in PARAMETERS}
 

@@ -4,46 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from numbers import Real
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from battery_env.electrochemistry import FloatArray, LoadUnit, check_load
+from battery_env.arrays import FloatArray
+from battery_env.checks import LoadUnit, check_load, check_numbers, check_positive, check_range
+from battery_env.records import Record, drawn
 
 _MOST_SEGMENTS = 1e6  # of a random load; beyond, a time is meant in another unit
-
-
-def checked_range(name: str, ends: tuple[float, float]) -> tuple[float, float]:
-    """
-    Refuse what is not two finite numbers in ascending order.
-
-    :param name: what the range is called, for the message
-    :param ends: lower and upper end
-    :return: the same as floats
-    :raises TypeError: if they are not two numbers
-    :raises ValueError: if they are not finite, or descend
-    """
-    try:
-        low, high = map(float, ends)
-    except (TypeError, ValueError) as error:
-        raise TypeError(f"{name} must be two numbers, lower and upper end, got {ends!r}") from error
-    if not -np.inf < low <= high < np.inf:
-        raise ValueError(f"{name} must be finite and increasing, got {ends!r}")
-    return low, high
-
-
-def _numbers(name: str, values: ArrayLike) -> FloatArray:
-    try:
-        return np.array(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise TypeError(f"{name} must be a number or an array of numbers, got {values!r}") from error
-
-
-def _check_positive(name: str, value: float) -> None:
-    if not isinstance(value, Real) or not 0.0 < value < np.inf:
-        raise ValueError(f"{name} must be a positive, finite number, got {value!r}")
 
 
 def _check_segments(total_s: float, name: str, shortest_s: float) -> None:
@@ -68,8 +37,8 @@ class Load:
     unit: LoadUnit = "power"
 
     def __post_init__(self) -> None:
-        start = _numbers("start_s", self.start_s)
-        value = check_load(_numbers("value", self.value), self.unit)
+        start = check_numbers("start_s", self.start_s).copy()
+        value = check_load(check_numbers("value", self.value), self.unit).copy()
         if start.ndim != 1 or start.size == 0 or start.shape != value.shape:
             raise ValueError(f"start_s and value must be 1-D, alike and not empty, got shapes {start.shape} and {value.shape}")
         if start[0] != 0.0 or not (np.diff(start) > 0.0).all() or not np.isfinite(start).all():
@@ -85,7 +54,7 @@ class Load:
         :return: the load, same shape
         :raises ValueError: for a negative time
         """
-        time = _numbers("time_s", time_s)
+        time = check_numbers("time_s", time_s)
         if not (time >= 0.0).all():
             raise ValueError(f"time_s must be at least 0, got {time[~(time >= 0.0)][0]:g}")
         return np.asarray(self.value[np.searchsorted(self.start_s, time, side="right") - 1])
@@ -113,7 +82,7 @@ def constant(value: float, unit: LoadUnit = "power") -> Load:
     :param unit: ``"power"`` or ``"current"``
     :return: the load
     """
-    return Load(np.zeros(1), _numbers("value", [value]), unit)
+    return Load(np.zeros(1), check_numbers("value", [value]), unit)
 
 
 def piecewise(values: ArrayLike, durations_s: ArrayLike, unit: LoadUnit = "power") -> Load:
@@ -125,51 +94,35 @@ def piecewise(values: ArrayLike, durations_s: ArrayLike, unit: LoadUnit = "power
     :param unit: ``"power"`` or ``"current"``
     :return: the load
     """
-    durations = _numbers("durations_s", durations_s)
+    durations = check_numbers("durations_s", durations_s)
     if durations.ndim != 1 or not (durations > 0.0).all():
         raise ValueError(f"durations_s must be 1-D and positive, got {durations_s!r}")
-    return Load(np.concatenate([[0.0], np.cumsum(durations)[:-1]]), _numbers("values", values), unit)
+    return Load(np.concatenate([[0.0], np.cumsum(durations)[:-1]]), check_numbers("values", values), unit)
 
 
-class Recording(Protocol):
-    """What was measured during one discharge, arrays of shape (T,): a :class:`battery_env.cells.Discharge` is one."""
-
-    @property
-    def time_s(self) -> FloatArray: ...
-
-    @property
-    def voltage_V(self) -> FloatArray: ...
-
-    @property
-    def current_A(self) -> FloatArray: ...
-
-
-def recorded(recording: Recording, unit: LoadUnit = "power", dt_s: float = 1.0) -> Load:
+def recorded(record: Record, unit: LoadUnit = "power", dt_s: float = 1.0) -> Load:
     """
     The load of a recorded discharge, from its first sample on; beyond the last one its last value goes on, so give the part
     under load (:meth:`battery_env.cells.Discharge.loaded_part`).
 
-    Each sample stands for the time nearest to it, so that a switch of the load falls midway between two samples, and the
-    drawn energy (power) or charge (current) is that of the trapezoidal rule. The load is its mean over each time step, which
-    keeps both exactly.
+    Between samples it runs as :func:`battery_env.records.drawn` has it. It is taken as its mean over each time step, which
+    keeps the drawn energy (power) or charge (current).
 
-    :param recording: the discharge
+    :param record: the discharge
     :param unit: ``"power"`` (voltage times current) or ``"current"``
     :param dt_s: time step of the simulation that is to follow it, s
     :return: the load
-    :raises ValueError: for another unit, or a time step that is not positive or longer than the recording
+    :raises ValueError: for another unit, or a time step that is not positive or longer than the record
     """
     if unit not in ("power", "current"):
         raise ValueError(f"unit must be 'power' (W) or 'current' (A), got {unit!r}")
-    time = np.asarray(recording.time_s) - recording.time_s[0]
-    _check_positive("dt_s", dt_s)
-    if dt_s > time[-1]:
-        raise ValueError(f"dt_s must be at most the recording's {time[-1]:g} s, got {dt_s!r}")
-    value = recording.current_A * recording.voltage_V if unit == "power" else recording.current_A
-    edges = np.concatenate([[0.0], 0.5 * (time[1:] + time[:-1]), [time[-1]]])
-    drawn = np.concatenate([[0.0], np.cumsum(value * np.diff(edges))])
-    grid = dt_s * np.arange(int(time[-1] / dt_s + 1e-9) + 1, dtype=np.float64)
-    return Load(grid[:-1], np.diff(np.interp(grid, edges, drawn)) / dt_s, unit)
+    time_s = np.asarray(record.time_s) - record.time_s[0]
+    check_positive("dt_s", dt_s)
+    if dt_s > time_s[-1]:
+        raise ValueError(f"dt_s must be at most the record's {time_s[-1]:g} s, got {dt_s!r}")
+    value = np.asarray(record.current_A * record.voltage_V if unit == "power" else record.current_A)
+    grid_s = dt_s * np.arange(int(time_s[-1] / dt_s + 1e-9) + 1, dtype=np.float64)
+    return Load(grid_s[:-1], np.diff(drawn(time_s, value, grid_s)) / dt_s, unit)
 
 
 @dataclass(frozen=True)
@@ -190,11 +143,11 @@ class RandomPiecewise:
     unit: LoadUnit = "power"
 
     def __post_init__(self) -> None:
-        check_load(checked_range("value_range", self.value_range), self.unit)
-        checked_range("duration_range_s", self.duration_range_s)
+        check_load(check_range("value_range", self.value_range), self.unit)
+        check_range("duration_range_s", self.duration_range_s)
         for name in ("value_range", "duration_range_s"):
-            _check_positive(f"the lower end of {name}", getattr(self, name)[0])
-        _check_positive("total_s", self.total_s)
+            check_positive(f"the lower end of {name}", getattr(self, name)[0])
+        check_positive("total_s", self.total_s)
         _check_segments(self.total_s, "duration_range_s", self.duration_range_s[0])
 
     def __call__(self, rng: np.random.Generator) -> Load:
@@ -231,12 +184,12 @@ class RandomWalk:
     unit: LoadUnit = "power"
 
     def __post_init__(self) -> None:
-        low, high = checked_range("value_range", self.value_range)
+        low, high = check_range("value_range", self.value_range)
         check_load((low, high), self.unit)
-        _check_positive("the lower end of value_range", low)
-        _check_positive("the width of value_range", high - low)
+        check_positive("the lower end of value_range", low)
+        check_positive("the width of value_range", high - low)
         for name in ("largest_step", "segment_s", "total_s"):
-            _check_positive(name, getattr(self, name))
+            check_positive(name, getattr(self, name))
         _check_segments(self.total_s, "segment_s", self.segment_s)
 
     def __call__(self, rng: np.random.Generator) -> Load:

@@ -12,15 +12,19 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from battery_env.electrochemistry import LOAD_UNIT_SYMBOLS, FloatArray, LoadUnit
-from battery_env.estimators.base import Estimate, EstimateTrace, Record
-from battery_env.estimators.cramer_rao import CramerRaoBound, Sensitivities, sensitivities
-from battery_env.estimators.record_model import RecordModel
+from battery_env.arrays import FloatArray
+from battery_env.checks import LOAD_UNIT_SYMBOLS, LoadUnit
+from battery_env.estimates import Estimate, EstimateTrace
+from battery_env.estimators.cramer_rao import CramerRaoBound, Sensitivities
 from battery_env.files import replacing
+from battery_env.parameters import PARAMETER_NAMES, PARAMETERS
+from battery_env.record_model import Forecast
+from battery_env.records import Record
 
 #: Colours that colour-blind readers can tell apart (Okabe & Ito).
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-LABELS = {"q_mobile": "$q^{max}$ (C)", "r_o": r"$R_o$ ($\Omega$)"}
+#: Of the axes of parameters.
+LABELS = {name: parameter.label for name, parameter in PARAMETERS.items()}
 
 # What an axis of estimates shows: all but this share at either end, and some room; the first estimates of a discharge can be
 # anything.
@@ -116,23 +120,21 @@ def plot_learning_curves(curves: Mapping[str, list[pd.DataFrame]], title: str) -
     return figure
 
 
-def plot_discharge(record: Record, estimates: Mapping[str, Estimate], model: RecordModel | None = None) -> Figure:
+def plot_discharge(record: Record, forecasts: Mapping[str, Forecast]) -> Figure:
     """
     The measured voltage of one discharge with that of the model at some estimates, and below it the error of the model.
 
     :param record: one discharge, simulated or recorded
-    :param estimates: parameters of the model, by name for the legend
-    :param model: the model; ``None``: isothermal, in steps of 1 s, of a new cell that is full at the first sample
-    :return: the figure; a line ends where its model cell is empty
+    :param forecasts: what :meth:`battery_env.RecordModel.forecast` made of estimates, by name for the legend
+    :return: the figure; a line ends at the cut-off, and that of its error where the model cell is empty
     """
     figure = new_figure(6.4, 4.6)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[3, 2])
     upper.plot(record.time_s, record.voltage_V, "o", ms=2.2, color="0.6", label="measured")
     lower.axhline(0.0, color="0.6", lw=0.8)
-    for colour, (name, estimate) in zip(COLOURS, estimates.items(), strict=False):
-        model_V = sensitivities(record, estimate, model).voltage_V
-        upper.plot(record.time_s, model_V, color=colour, lw=1.4, label=name)
-        lower.plot(record.time_s, 1e3 * (model_V - record.voltage_V), color=colour, lw=1.0, label=name)
+    for colour, (name, forecast) in zip(COLOURS, forecasts.items(), strict=False):
+        upper.plot(forecast.time_s, forecast.voltage_V, color=colour, lw=1.4, label=name)
+        lower.plot(record.time_s, 1e3 * (forecast.at_samples_V - record.voltage_V), color=colour, lw=1.0, label=name)
     upper.set_ylabel("voltage (V)")
     upper.legend(frameon=False, fontsize=9)
     lower.set(xlabel="time (s)", ylabel="model - measured (mV)")
@@ -143,7 +145,7 @@ def plot_estimates(
     traces: Mapping[str, EstimateTrace],
     true: Estimate | None = None,
     bound: CramerRaoBound | None = None,
-    parameters: Sequence[str] = ("q_mobile", "r_o"),
+    parameters: Sequence[str] = PARAMETER_NAMES,
 ) -> Figure:
     """
     Estimates during one discharge, one panel per parameter and one colour per calibrator, with bands of two stated standard

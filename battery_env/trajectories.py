@@ -2,46 +2,38 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-import operator
 import os
-import platform
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
-from importlib import import_module
-from importlib.metadata import version
-from itertools import pairwise
 from numbers import Real
 from pathlib import Path
 from typing import Any, Literal, overload
 
 import numpy as np
 import pandas as pd
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from battery_env.arrays import FloatArray, IntArray
+from battery_env.checks import LoadUnit, check_indices, check_load, check_range, check_whole_number
+from battery_env.dataset_files import described, load_npz, save_npz, save_parquet
 from battery_env.electrochemistry import (
     NEW_CELL,
     STATE_NAMES,
     STATE_SIZE,
     UNCERTAIN_CONSTANTS,
     CellParameters,
-    FloatArray,
-    LoadUnit,
+    PackedConstants,
     Trajectory,
     advance_in_place,
+    check_cell,
     check_dt,
-    check_load,
-    check_q_mobile,
-    check_r_o,
     initial_state,
 )
-from battery_env.files import replacing
-from battery_env.kernels import PackedConstants, roll_out
-from battery_env.loads import Load, LoadSampler, checked_range, constant
+from battery_env.electrochemistry.kernels import roll_out
+from battery_env.loads import Load, LoadSampler, constant
+from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, R_O
 
-IntArray = NDArray[np.int64]
 AgedParameter = Literal["q_mobile", "r_o", "joint"]
 
 #: Ranges of the aged parameters in the paper's data (the authors' code), C and ohm.
@@ -53,7 +45,6 @@ PAPER_TRIM = (0.05, 0.95)
 #: Largest ``mismatch`` of :meth:`TrajectoryDataset.generate`: beyond, the constants would be another cell's.
 MISMATCH_LIMIT = 0.5
 
-FORMAT_VERSION = 2
 _CHECKPOINT_EVERY = 64  # steps between stored states: a window starts with 32 steps of re-simulation on average
 _MIN_SAMPLES = 8
 _LEAST_DT_S = 0.01  # of a discharge that may take a day
@@ -61,7 +52,6 @@ _INDICES = ("load_start", "samples", "first", "stop", "checkpoint_start")
 _PER_TRAJECTORY = ("q_mobile", "r_o", "factors", "eod_time_s", *_INDICES)
 _ARRAYS = (*_PER_TRAJECTORY, "load_values", "checkpoint")
 _SETTINGS = ("load_unit", "dt_s", "thermal", "description")
-_ROWS_PER_GROUP = 1_000_000  # of a Parquet file: a reader that wants some columns holds this many rows at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +66,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
     :param q_mobile: C, shape (n,)
     :param r_o: ohm, shape (n,)
     :param factors: what ``UNCERTAIN_CONSTANTS`` (kn, tDiffusion, to, tsn) of each true cell are multiplied by, shape (n, 4);
-        ones where the constants in ``parameters`` are exact
+        ones where the constants of ``cell`` are exact
     :param eod_time_s: end of discharge, s after the first sample of the whole discharge, shape (n,); NaN where unknown
     :param load_values: all load profiles end to end, one value a step
     :param load_start: where in ``load_values`` each trajectory's profile starts, shape (n,); trajectories may share a profile
@@ -88,7 +78,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
     :param load_unit: ``"power"`` or ``"current"``
     :param dt_s: time step, s
     :param thermal: whether the temperature moves
-    :param parameters: constants of the cell, as a calibrator may know them
+    :param cell: constants of the cell, as a calibrator may know them
     :param description: how the data set was made, as JSON may hold it; saved with it
     :raises ValueError: for arrays that do not fit together, or values out of range
     """
@@ -107,7 +97,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
     load_unit: LoadUnit
     dt_s: float
     thermal: bool
-    parameters: CellParameters
+    cell: CellParameters
     description: dict[str, Any]
 
     def __post_init__(self) -> None:
@@ -122,12 +112,13 @@ class TrajectoryDataset(Sequence[Trajectory]):
             if not isinstance(array, np.ndarray) or array.dtype != dtype or array.shape != shape or n == 0:
                 found = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
                 raise ValueError(f"{name} must be an array of {dtype.__name__} of shape {shape}, not empty, got {found}")
-        check_q_mobile(self.q_mobile)
-        check_r_o(self.r_o)
+        Q_MOBILE.check(self.q_mobile)
+        R_O.check(self.r_o)
         check_load(self.load_values, self.load_unit)
         _check_factors(self.factors)
-        _check_cell(self.parameters, self.thermal)
-        _check_dt(self.dt_s, self.parameters, self.factors)
+        object.__setattr__(self, "cell", check_cell(self.cell, self.thermal))
+        object.__setattr__(self, "thermal", bool(self.thermal))
+        _check_dt(self.dt_s, self.cell, self.factors)
         if not np.isfinite(self.checkpoint).all():
             raise ValueError("checkpoint must be finite, got NaN or infinity")
         fits = {
@@ -150,7 +141,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
         trim: tuple[float, float] = (0.0, 1.0),
         dt_s: float = 1.0,
         thermal: bool = False,
-        parameters: CellParameters = NEW_CELL,
+        cell: CellParameters | None = None,
         description: dict[str, Any] | None = None,
         factors: ArrayLike | None = None,
     ) -> TrajectoryDataset:
@@ -164,34 +155,34 @@ class TrajectoryDataset(Sequence[Trajectory]):
         :param trim: the part of each discharge that counts as data, as shares of its length
         :param dt_s: time step, s
         :param thermal: whether the temperature moves
-        :param parameters: constants of the cell, as a calibrator may know them
+        :param cell: constants of the cell, as a calibrator may know them; ``None``: the new cell's
         :param description: how the data set was made, as JSON may hold it
         :param factors: what ``UNCERTAIN_CONSTANTS`` of each cell are multiplied by, shape (n, 4); ``None``: ones
         :return: the data set
         :raises ValueError: for values out of range, or a discharge of fewer than eight samples
         """
-        q, r = np.broadcast_arrays(*np.atleast_1d(check_q_mobile(q_mobile), check_r_o(r_o)))
+        q, r = np.broadcast_arrays(*np.atleast_1d(Q_MOBILE.check(q_mobile), R_O.check(r_o)))
         if q.ndim != 1 or q.size == 0:
             raise ValueError(f"q_mobile and r_o must be 1-D and not empty, got shape {q.shape}")
-        low, high = checked_range("trim", trim)
+        low, high = check_range("trim", trim)
         if not 0.0 <= low < high <= 1.0:
             raise ValueError(f"trim must be two increasing shares within 0 .. 1, got {trim!r}")
         units = {load.unit if isinstance(load, Load) else type(load).__name__ for load in loads}
         if units not in ({"power"}, {"current"}):
             raise ValueError(f"loads must be Loads, all in one unit (power or current), got {sorted(units)}")
         unit = loads[0].unit
-        index = np.broadcast_to(_indices("load_index", load_index, len(loads)), q.shape)
+        index = np.broadcast_to(check_indices("load_index", load_index, len(loads)), q.shape)
         multiples = np.ones((q.size, len(UNCERTAIN_CONSTANTS))) if factors is None else np.array(factors, dtype=np.float64)
         if multiples.shape != (q.size, len(UNCERTAIN_CONSTANTS)):
             raise ValueError(f"factors must hold one value per cell and each of {UNCERTAIN_CONSTANTS}, got {multiples.shape}")
         _check_factors(multiples)
-        _check_cell(parameters, thermal)
-        dt_s = _check_dt(dt_s, parameters, multiples)
+        cell = check_cell(cell, thermal)
+        dt_s = _check_dt(dt_s, cell, multiples)
         if dt_s < _LEAST_DT_S:
             raise ValueError(f"dt_s must be at least {_LEAST_DT_S:g} s (a day of it must fit in memory), got {dt_s!r}")
 
         day = dt_s * np.arange(round(86_400 / dt_s), dtype=np.float64)
-        start = initial_state(q, parameters)
+        start = initial_state(q, cell)
         samples = np.empty(q.size, dtype=np.int64)
         profiles = []
         checkpoints: dict[int, FloatArray] = {}
@@ -202,9 +193,9 @@ class TrajectoryDataset(Sequence[Trajectory]):
             cells = np.flatnonzero(index == k)
             for n in cells:
                 state[0] = start[n]
-                packed = _packed(parameters, multiples[[n]])
-                run = (profile, q[n], r[n], dt_s, parameters.VEOD, unit == "power", thermal)
-                samples[n] = roll_out(*run, *packed, state, voltage, current)
+                packed = _packed(cell, multiples[[n]])
+                run = (profile, q[n], r[n], dt_s, cell.VEOD, unit == "power", thermal)
+                samples[n] = roll_out(*run, packed, state, voltage, current)
                 if samples[n] < _MIN_SAMPLES:
                     raise ValueError(
                         f"trajectory {n} (q_mobile {q[n]:g} C, r_o {r[n]:g} ohm) ends after {samples[n]} samples, at least "
@@ -231,7 +222,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
             load_unit=unit,
             dt_s=dt_s,
             thermal=thermal,
-            parameters=parameters,
+            cell=cell,
             description=description or {},
         )
 
@@ -247,11 +238,11 @@ class TrajectoryDataset(Sequence[Trajectory]):
         trim: tuple[float, float] = (0.0, 1.0),
         dt_s: float = 1.0,
         thermal: bool = False,
-        parameters: CellParameters = NEW_CELL,
+        cell: CellParameters | None = None,
         mismatch: float = 0.0,
     ) -> TrajectoryDataset:
         """
-        Discharges of ``n`` cells whose age is drawn uniformly; the parameter that does not age is the new cell's.
+        Discharges of ``n`` cells whose age is drawn uniformly; the parameter that does not age is the cell's.
 
         :param parameter: what ages: ``"q_mobile"``, ``"r_o"`` or ``"joint"`` (both, independently)
         :param n: number of discharges
@@ -262,7 +253,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
         :param trim: the part of each discharge that counts as data, as shares of its length
         :param dt_s: time step, s
         :param thermal: whether the temperature moves
-        :param parameters: constants of the cell, as a calibrator may know them
+        :param cell: constants of the cell, as a calibrator may know them, and what does not age; ``None``: the new cell's
         :param mismatch: how wrong they are: relative standard deviation of the factors, log-normal with median 1, that each
             of ``UNCERTAIN_CONSTANTS`` of each cell is multiplied by, at most 0.5. Ages and loads do not depend on it
         :return: the data set
@@ -270,7 +261,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
         """
         if parameter not in ("q_mobile", "r_o", "joint"):
             raise ValueError(f"parameter must be 'q_mobile', 'r_o' or 'joint', got {parameter!r}")
-        n, seed = _whole_number("n", n), _whole_number("seed", seed)
+        n, seed = check_whole_number("n", n), check_whole_number("seed", seed)
         if n < 1 or seed < 0:
             raise ValueError(f"n must be at least 1 and seed at least 0, got n = {n} and seed = {seed}")
         if not isinstance(mismatch, Real) or not 0.0 <= mismatch <= MISMATCH_LIMIT:
@@ -279,14 +270,14 @@ class TrajectoryDataset(Sequence[Trajectory]):
             raise TypeError(f"loads must be a list of Loads or a sampler of them, got {type(loads).__name__}")
         if not callable(loads) and len(loads) == 0:
             raise ValueError("loads must not be empty")
-        low, high = checked_range("trim", trim)
-        q_range, r_range = checked_range("q_mobile_range", q_mobile_range), checked_range("r_o_range", r_o_range)
-        check_q_mobile(q_range)
-        check_r_o(r_range)
-        _check_cell(parameters, thermal)
+        low, high = check_range("trim", trim)
+        q_range, r_range = check_range("q_mobile_range", q_mobile_range), check_range("r_o_range", r_o_range)
+        Q_MOBILE.check(q_range)
+        R_O.check(r_range)
+        cell = check_cell(cell, thermal)
         rng = np.random.default_rng(seed)
-        q = np.full(n, parameters.q_mobile) if parameter == "r_o" else rng.uniform(*q_range, size=n)
-        r = np.full(n, parameters.r_o) if parameter == "q_mobile" else rng.uniform(*r_range, size=n)
+        q = np.full(n, cell.q_mobile) if parameter == "r_o" else rng.uniform(*q_range, size=n)
+        r = np.full(n, cell.r_o) if parameter == "q_mobile" else rng.uniform(*r_range, size=n)
         if callable(loads):
             drawn, index = [loads(rng) for _ in range(n)], np.arange(n)
         else:
@@ -294,17 +285,18 @@ class TrajectoryDataset(Sequence[Trajectory]):
         # drawn last, so that all else is the same with and without a mismatch
         factors = np.exp(np.sqrt(np.log1p(mismatch**2)) * rng.standard_normal((n, len(UNCERTAIN_CONSTANTS))))
         asked = {"parameter": parameter, "n": n, "seed": seed, "trim": [low, high], "mismatch": float(mismatch)}
-        return cls.simulated(q, r, drawn, index, trim, dt_s, thermal, parameters, {"made_by": "generate", **asked}, factors)
+        return cls.simulated(q, r, drawn, index, trim, dt_s, thermal, cell, {"made_by": "generate", **asked}, factors)
 
     @classmethod
     def from_trajectories(cls, trajectories: Sequence[Trajectory]) -> TrajectoryDataset:
         """
-        A data set of trajectories made one by one with :func:`~battery_env.electrochemistry.simulate`, isothermal, with a new
-        cell's constants.
+        A data set of trajectories made one by one with :func:`~battery_env.electrochemistry.simulate`.
 
-        :param trajectories: simulated discharges or parts of them, in one unit of load and one time step
-        :return: the data set; its clock starts with each trajectory
-        :raises ValueError: if there are none, their units or time steps differ, or they were simulated in another way
+        :param trajectories: simulated discharges or parts of them, of cells that differ in ``q_mobile`` and ``r_o`` alone, in
+            one unit of load and one time step
+        :return: the data set; its clock starts with each trajectory, and its constants are exactly theirs. To keep a
+            ``mismatch`` take a :meth:`subset` instead
+        :raises ValueError: if there are none, or they differ in more than that
         """
         if isinstance(trajectories, Trajectory):
             raise TypeError("trajectories must be a list of them, got one Trajectory")
@@ -313,13 +305,17 @@ class TrajectoryDataset(Sequence[Trajectory]):
                 raise TypeError(f"trajectories must hold Trajectory, got {type(trajectory).__name__}")
             if len(trajectory.time_s) == 0:
                 raise ValueError("trajectories must hold at least one sample each, got an empty one")
-        units = {trajectory.load_unit for trajectory in trajectories}
-        steps = {round(float(dt), 9) for trajectory in trajectories for dt in np.diff(trajectory.time_s[:2])}
-        if len(units) != 1 or len(steps) != 1:
-            raise ValueError(f"trajectories must share one load unit and one time step, got units {units} and steps {steps} s")
+        cells = {trajectory.cell.replace(q_mobile=NEW_CELL.q_mobile, r_o=NEW_CELL.r_o) for trajectory in trajectories}
+        ways = {(trajectory.load_unit, trajectory.dt_s, trajectory.thermal) for trajectory in trajectories}
+        if len(cells) != 1 or len(ways) != 1:
+            raise ValueError(
+                "trajectories must share the constants of the cell but for q_mobile and r_o, one load unit, one time step (s) "
+                f"and whether they are thermal, got {len(cells)} sets of constants and {ways}"
+            )
+        load_unit, dt_s, thermal = ways.pop()
         samples = np.array([len(trajectory.time_s) for trajectory in trajectories], dtype=np.int64)
         checkpoints = [trajectory.state[::_CHECKPOINT_EVERY] for trajectory in trajectories]
-        dataset = cls(
+        return cls(
             q_mobile=np.array([trajectory.q_mobile for trajectory in trajectories]),
             r_o=np.array([trajectory.r_o for trajectory in trajectories]),
             factors=np.ones((len(trajectories), len(UNCERTAIN_CONSTANTS))),
@@ -331,19 +327,12 @@ class TrajectoryDataset(Sequence[Trajectory]):
             stop=samples,
             checkpoint=np.concatenate(checkpoints),
             checkpoint_start=_starts(_checkpoints(samples)),
-            load_unit=units.pop(),
-            dt_s=steps.pop(),
-            thermal=False,
-            parameters=NEW_CELL,
+            load_unit=load_unit,
+            dt_s=dt_s,
+            thermal=thermal,
+            cell=cells.pop(),
             description={"made_by": "from_trajectories"},
         )
-        for n, trajectory in enumerate(trajectories):
-            if not np.allclose(dataset[n].state[-1], trajectory.state[-1], rtol=1e-6):
-                raise ValueError(
-                    f"trajectory {n} is not an isothermal simulation with a new cell's constants; make data sets of others "
-                    "with TrajectoryDataset.simulated"
-                )
-        return dataset
 
     @classmethod
     def paper(cls, parameter: Literal["q_mobile", "r_o"]) -> TrajectoryDataset:
@@ -372,13 +361,12 @@ class TrajectoryDataset(Sequence[Trajectory]):
         if isinstance(index, slice):
             return self.subset(np.arange(len(self))[index])
         n = range(len(self))[index]
-        samples = self.samples[n]
-        load = self.load_values[self.load_start[n] : self.load_start[n] + samples]
+        samples, load = self.samples[n], self.load_profile(n)
         state, voltage, current = np.empty((samples + 1, STATE_SIZE)), np.empty(samples), np.empty(samples)
         state[0] = self.checkpoint[self.checkpoint_start[n]]
         # no cut-off: a data set of recorded trajectories may hold samples below it
         run = (load, self.q_mobile[n], self.r_o[n], self.dt_s, -np.inf, self.load_unit == "power", self.thermal)
-        if roll_out(*run, *self.packed(np.array([n])), state, voltage, current) < samples:
+        if roll_out(*run, self.packed(np.array([n])), state, voltage, current) < samples:
             raise ValueError(f"trajectory {n} cannot be simulated again: it was made with another load or other constants")
         return Trajectory(
             time_s=self.dt_s * np.arange(samples, dtype=np.float64),
@@ -387,22 +375,47 @@ class TrajectoryDataset(Sequence[Trajectory]):
             current_A=current,
             load=load.copy(),
             load_unit=self.load_unit,
-            q_mobile=float(self.q_mobile[n]),
-            r_o=float(self.r_o[n]),
+            cell=self._cell(n),
+            dt_s=self.dt_s,
+            thermal=self.thermal,
             eod_time_s=float(self.eod_time_s[n]),
         ).part(self.first[n], self.stop[n])
 
     def __iter__(self) -> Iterator[Trajectory]:
         return (self[n] for n in range(len(self)))
 
+    def load_profile(self, n: int) -> FloatArray:
+        """
+        The load of a whole discharge, before it was trimmed.
+
+        :param n: which trajectory
+        :return: one value a step, W or A, shape (samples,)
+        """
+        return self.load_values[self.load_start[n] : self.load_start[n] + self.samples[n]]
+
+    def starts_full(self, n: int) -> bool:
+        """
+        Whether a whole discharge, before it was trimmed, starts with a fully charged cell at rest.
+
+        :param n: which trajectory
+        :return: whether it does
+        """
+        return np.array_equal(self.checkpoint[self.checkpoint_start[n]], initial_state(self.q_mobile[n], self.cell))
+
+    def _cell(self, n: int) -> CellParameters:
+        """The true constants of a trajectory."""
+        known = {name: getattr(self.cell, name) for name in UNCERTAIN_CONSTANTS}
+        true = {name: factor * known[name] for name, factor in zip(known, self.factors[n].tolist(), strict=True)}
+        return self.cell.replace(q_mobile=float(self.q_mobile[n]), r_o=float(self.r_o[n]), **true)
+
     def packed(self, index: IntArray) -> PackedConstants:
         """
         The true constants of some trajectories, for the unchecked functions of :mod:`battery_env.electrochemistry`.
 
         :param index: which trajectories, shape (m,)
-        :return: one row a cell; or the one row that all share, if their constants are those of ``parameters``
+        :return: one row a cell; or the one row that all share, if their constants are those of ``cell``
         """
-        return _packed(self.parameters, self.factors[index])
+        return _packed(self.cell, self.factors[index])
 
     def states_at(self, index: IntArray, sample: IntArray) -> FloatArray:
         """
@@ -435,7 +448,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
         :param index: which, shape (m,), in the order wanted
         :return: a data set of them; the loads are shared with this one
         """
-        chosen = _indices("index", index, len(self))
+        chosen = check_indices("index", index, len(self))
         if chosen.ndim != 1 or chosen.size == 0:
             raise ValueError(f"index must be 1-D and not empty, got shape {chosen.shape}")
         counts = _checkpoints(self.samples[chosen])
@@ -461,7 +474,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
         """
         if not isinstance(test, Real) or not 0.0 < test < 1.0:
             raise ValueError(f"test must be greater than 0 and less than 1, got {test!r}")
-        rng = np.random.default_rng(_whole_number("seed", seed))
+        rng = np.random.default_rng(check_whole_number("seed", seed))
         if by == "trajectory":
             order = rng.permutation(len(self))
             is_test = np.zeros(len(self), dtype=bool)
@@ -481,19 +494,13 @@ class TrajectoryDataset(Sequence[Trajectory]):
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """
-        Save as an npz file (no pickle) that holds the arrays and, as JSON, constants, description, versions and a checksum.
-        The file is written beside its place and renamed, so that it is never there in part.
+        Save as an npz file (no pickle) that holds the arrays and, as JSON, constants, description and versions.
 
         :param path: where to; ``.npz`` is added if it is missing
         :return: the file
         :raises FileExistsError: if the file exists already
         """
-        target = _new_file(path, ".npz")
-        arrays, metadata = self._arrays(), self._metadata()
-        checksum = np.array(_checksum(metadata, arrays))
-        with replacing(target) as part:
-            np.savez_compressed(part, allow_pickle=False, metadata=np.array(metadata), checksum=checksum, **arrays)
-        return target
+        return save_npz(path, {name: getattr(self, name) for name in _ARRAYS}, self._settings())
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> TrajectoryDataset:
@@ -504,23 +511,16 @@ class TrajectoryDataset(Sequence[Trajectory]):
         :return: the data set
         :raises ValueError: if the file is damaged, no such data set, or of another format version
         """
-        with Path(path).open("rb") as stream:
-            try:
-                with np.load(stream, allow_pickle=False) as file:
-                    text, found, arrays, checksum = _read(file)
-            except Exception as error:  # numpy and zipfile raise whatever the damage leads them to
-                raise ValueError(f"{path} is damaged, or no data set saved by TrajectoryDataset.save: {error}") from error
-        if found != FORMAT_VERSION:
-            raise ValueError(f"{path} has format {found}, this version reads {FORMAT_VERSION}: generate it again")
-        if _checksum(text, arrays) != checksum:
-            raise ValueError(f"{path} is damaged: its contents do not match their checksum")
+        arrays, settings = load_npz(path, _ARRAYS)
         try:
-            metadata = json.loads(text)
-            constants: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in metadata["parameters"].items()}
-            settings: dict[str, Any] = {name: metadata[name] for name in _SETTINGS}
-            return cls(**arrays, **settings, parameters=CellParameters(**constants))
+            constants: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in settings["cell"].items()}
+            fields: dict[str, Any] = {**arrays, **{name: settings[name] for name in _SETTINGS}}
+            return cls(**fields, cell=CellParameters(**constants))
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{path} holds no valid data set: {error}") from error
+
+    def _settings(self) -> dict[str, Any]:
+        return {**{name: getattr(self, name) for name in _SETTINGS}, "cell": asdict(self.cell)}
 
     def to_frame(self) -> pd.DataFrame:
         """
@@ -528,20 +528,19 @@ class TrajectoryDataset(Sequence[Trajectory]):
         the states under their names (K, V, C), and the true ``q_mobile`` (C) and ``r_o`` (ohm). Every trajectory is
         simulated for it; the paper's 5511 are 7 million rows (0.9 GB).
 
-        :return: one row per sample, in the order of trajectories and time
+        :return: one row per sample, in the order of trajectories and time; its ``attrs`` hold constants, description and
+            versions
         """
-        return self._frame(0, len(self))
-
-    def _frame(self, start: int, stop: int) -> pd.DataFrame:
-        trajectories = [self[n] for n in range(start, stop)]
-        lengths = self.stop[start:stop] - self.first[start:stop]
-        columns = {"trajectory": np.repeat(np.arange(start, stop), lengths)}
+        trajectories, lengths = list(self), self.stop - self.first
+        columns = {"trajectory": np.repeat(np.arange(len(self)), lengths)}
         for name in ("time_s", "voltage_V", "current_A", "load"):
             columns[name] = np.concatenate([getattr(trajectory, name) for trajectory in trajectories])
         state = np.concatenate([trajectory.state for trajectory in trajectories])
         columns |= dict(zip(STATE_NAMES, state.T, strict=True))
-        columns |= {name: np.repeat(getattr(self, name)[start:stop], lengths) for name in ("q_mobile", "r_o")}
-        return pd.DataFrame(columns)
+        columns |= {name: np.repeat(getattr(self, name), lengths) for name in PARAMETER_NAMES}
+        frame = pd.DataFrame(columns)
+        frame.attrs = described(self._settings())
+        return frame
 
     def summary(self) -> pd.DataFrame:
         """
@@ -570,63 +569,22 @@ class TrajectoryDataset(Sequence[Trajectory]):
 
     def to_parquet(self, path: str | os.PathLike[str]) -> Path:
         """
-        Write :meth:`to_frame` to a Parquet file, for programs other than this one; :meth:`save` is far smaller. Its schema
-        holds, as JSON under ``battery_env``, constants, description, versions and the checksum of the data set.
+        Write :meth:`to_frame` to a Parquet file, for programs other than this one; :meth:`save` is far smaller.
 
         :param path: where to; ``.parquet`` is added if it is missing
         :return: the file
         :raises FileExistsError: if the file exists already
         :raises ImportError: without the extra ``parquet``
         """
-        try:
-            pyarrow, parquet = import_module("pyarrow"), import_module("pyarrow.parquet")
-        except ImportError as error:
-            raise ImportError("to_parquet needs pyarrow: pip install 'battery_env[parquet]'") from error
-        target = _new_file(path, ".parquet")
-        text = self._metadata()
-        metadata = {"battery_env": json.dumps({**json.loads(text), "checksum": _checksum(text, self._arrays())})}
-        rows = np.cumsum(self.stop - self.first)
-        group = (rows - 1) // _ROWS_PER_GROUP
-        starts = [0, *(np.flatnonzero(np.diff(group)) + 1), len(self)]
-        schema = pyarrow.Schema.from_pandas(self._frame(0, 1), preserve_index=False).with_metadata(metadata)
-        with replacing(target) as part, parquet.ParquetWriter(part, schema) as writer:
-            for start, stop in pairwise(starts):
-                frame = self._frame(int(start), int(stop))
-                writer.write_table(pyarrow.Table.from_pandas(frame, schema=schema, preserve_index=False))
-        return target
-
-    def _arrays(self) -> dict[str, NDArray[Any]]:
-        return {name: getattr(self, name) for name in _ARRAYS}
-
-    def _metadata(self) -> str:
-        versions = {"python": platform.python_version(), "numpy": np.__version__, "numba": version("numba")}
-        settings = {name: getattr(self, name) for name in _SETTINGS}
-        return json.dumps({"format": FORMAT_VERSION, **settings, "parameters": asdict(self.parameters), "versions": versions})
-
-
-def _new_file(path: str | os.PathLike[str], suffix: str) -> Path:
-    target = Path(path)
-    target = target if target.suffix == suffix else target.with_name(target.name + suffix)
-    if target.exists():
-        raise FileExistsError(f"{target} exists already; delete it or choose another name")
-    return target
+        return save_parquet(path, self.to_frame())
 
 
 def _checkpoints(samples: IntArray) -> IntArray:
     return (samples - 1) // _CHECKPOINT_EVERY + 1
 
 
-def _read(file: Mapping[str, NDArray[Any]]) -> tuple[str, int, dict[str, Any], str]:
-    """Metadata, format version, and the arrays and checksum of this version; another may have other arrays."""
-    text = str(file["metadata"])
-    found = json.loads(text)["format"]
-    if found != FORMAT_VERSION:
-        return text, found, {}, ""
-    return text, found, {name: np.asarray(file[name]) for name in _ARRAYS}, str(file["checksum"])
-
-
-def _packed(parameters: CellParameters, factors: FloatArray) -> PackedConstants:
-    return parameters.packed if (factors == 1.0).all() else parameters.packed_with(factors)
+def _packed(cell: CellParameters, factors: FloatArray) -> PackedConstants:
+    return cell.packed if (factors == 1.0).all() else cell.packed_with(factors)
 
 
 def _check_factors(factors: FloatArray) -> None:
@@ -635,50 +593,14 @@ def _check_factors(factors: FloatArray) -> None:
         raise ValueError(f"factors must be finite and greater than 0, got {factors[~good][0]:g}")
 
 
-def _check_dt(dt_s: float, parameters: CellParameters, factors: FloatArray) -> float:
+def _check_dt(dt_s: float, cell: CellParameters, factors: FloatArray) -> float:
     # explicit Euler must be stable for the cell whose constants are fastest
     fastest = dict(zip(UNCERTAIN_CONSTANTS, factors.min(axis=0), strict=True))
-    return check_dt(dt_s, parameters.replace(to=parameters.to * fastest["to"], tsn=parameters.tsn * fastest["tsn"]))
-
-
-def _whole_number(name: str, value: int) -> int:
-    try:
-        return operator.index(value)
-    except TypeError as error:
-        raise TypeError(f"{name} must be a whole number, got {value!r}") from error
-
-
-def _indices(name: str, values: ArrayLike, size: int) -> IntArray:
-    try:
-        array = np.asarray(values)
-    except ValueError as error:
-        raise TypeError(f"{name} must hold whole numbers, got {values!r}") from error
-    if array.size == 0:
-        return array.astype(np.int64)
-    if array.dtype.kind not in "iu":
-        raise TypeError(f"{name} must hold whole numbers (of a mask, give np.flatnonzero), got {array.dtype} values")
-    if not ((array >= 0) & (array < size)).all():
-        raise ValueError(f"{name} must lie within 0 .. {size - 1}, got {array.min()} .. {array.max()}")
-    return array.astype(np.int64)
-
-
-def _check_cell(parameters: CellParameters, thermal: bool) -> None:
-    if not isinstance(parameters, CellParameters):
-        raise TypeError(f"parameters must be CellParameters, got {parameters!r}")
-    if not isinstance(thermal, bool):
-        raise TypeError(f"thermal must be True or False, got {thermal!r}")
+    return check_dt(dt_s, cell.replace(to=cell.to * fastest["to"], tsn=cell.tsn * fastest["tsn"]))
 
 
 def _starts(lengths: IntArray) -> IntArray:
     return np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.int64)
-
-
-def _checksum(metadata: str, arrays: dict[str, NDArray[Any]]) -> str:
-    digest = hashlib.sha256(metadata.encode())
-    for name in _ARRAYS:
-        digest.update(f"{name} {arrays[name].dtype.str} {arrays[name].shape}".encode())
-        digest.update(np.ascontiguousarray(arrays[name]).tobytes())
-    return digest.hexdigest()
 
 
 @lru_cache(maxsize=2)

@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
 from battery_env.electrochemistry import Trajectory
-from battery_env.estimators import RecordModel
 from battery_env.plotting import COLOURS, LABELS, new_figure
+from battery_env.record_model import RecordModel
 from benchmarks.identifiability_tables import (
     DRIFT_C,
     EPISODE_STEPS,

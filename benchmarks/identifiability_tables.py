@@ -73,7 +73,7 @@ def discharges() -> dict[str, Trajectory]:
 def _discharge(load: Callable[[FloatArray], FloatArray], **changes: float) -> Trajectory:
     # a cell whose other constants are multiplied by `changes`
     cell = NEW_CELL.replace(**{name: factor * getattr(NEW_CELL, name) for name, factor in changes.items()})
-    return simulate(load, TRUE.q_mobile, TRUE.r_o, load_unit="current", parameters=cell)
+    return simulate(load, TRUE.q_mobile, TRUE.r_o, load_unit="current", cell=cell)
 
 
 def beginning(record: Trajectory, share: float) -> Trajectory:

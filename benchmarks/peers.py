@@ -28,13 +28,14 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from battery_env.electrochemistry import NEW_CELL
-from battery_env.estimators.base import PARAMETERS, Estimator
+from battery_env.estimators.base import Estimator
 from battery_env.estimators.closed_form import ClosedForm
 from battery_env.estimators.greedy import GreedyOneStep
 from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.evaluation import evaluate
 from battery_env.loads import RandomPiecewise
+from battery_env.parameters import PARAMETER_NAMES, PARAMETERS
 from battery_env.plotting import COLOURS, LABELS, new_figure, save_figure
 from battery_env.sensors import SensorErrors
 from battery_env.trajectories import AgedParameter, TrajectoryDataset
@@ -157,7 +158,7 @@ def discharges(case: Case, unknown: Sequence[str], n: int) -> TrajectoryDataset:
         seed=SEEDS[kind],
         r_o_range=R_O_RANGE_OHM,
         thermal=True,
-        parameters=WORN_CELL if case.other_worn else NEW_CELL,
+        cell=WORN_CELL if case.other_worn else NEW_CELL,
     )
 
 
@@ -226,7 +227,7 @@ def runs() -> list[tuple[Method, Case, tuple[str, ...]]]:
     for case in CASES:
         for method in METHODS:
             if case is BASE or method.name in TRIED:
-                unknowns = [PARAMETERS] if case.both_unknown else [(name,) for name in PARAMETERS]
+                unknowns = [PARAMETER_NAMES] if case.both_unknown else [(name,) for name in PARAMETERS]
                 parts += [(method, case, unknown) for unknown in unknowns]
     return parts
 

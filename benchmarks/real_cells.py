@@ -25,10 +25,11 @@ from tqdm import tqdm
 
 from battery_env.cells import BUNDLED_CELLS, NASA_CITATION, Discharge, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL
-from battery_env.estimators.base import Estimate
+from battery_env.estimates import Estimate
 from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.plotting import COLOURS, LABELS, new_figure, save_figure
+from battery_env.record_model import RecordModel
 from benchmarks.reporting import write_csv, write_text
 
 CUT_OFF_V = 2.7
@@ -40,6 +41,7 @@ SHARES = (0.25, 0.5, 0.75)
 PRIOR_SD_SHARE = 0.01
 
 _NEW = Estimate(NEW_CELL.q_mobile, NEW_CELL.r_o)
+_MODEL = RecordModel(thermal=True)
 _AGES = {"fresh": 0.0, "middle": 0.5, "aged": 1.0}
 
 
@@ -61,9 +63,9 @@ def fit_whole(discharge: Discharge) -> dict[str, float | str | bool]:
     :param discharge: as recorded
     :return: one row of the table of discharges
     """
-    record, whole = discharge.loaded_part(CUT_OFF_V), calibrator()
+    record = discharge.loaded_part(CUT_OFF_V)
     duration_s = record.time_s[-1] - record.time_s[0]
-    estimate = whole.estimate(record)
+    estimate = calibrator().estimate(record)
     row = {name: discharge.meta[name] for name in ("cell", "cycle", "start_time", "capacity_Ah", "Re_ohm", "Rct_ohm")}
     row |= {
         "q_mobile_C": estimate.q_mobile,
@@ -74,9 +76,10 @@ def fit_whole(discharge: Discharge) -> dict[str, float | str | bool]:
         "duration_s": duration_s,
     }
     for prefix, parameters in (("", estimate), ("new_cell_", _NEW)):
-        residual_V = whole.predict_voltage_V(record, parameters) - record.voltage_V
+        forecast = _MODEL.forecast(record, parameters, CUT_OFF_V)
+        residual_V = forecast.at_samples_V - record.voltage_V
         row[f"{prefix}voltage_rmse_V"] = float(np.sqrt(np.nanmean(residual_V**2)))
-        row[f"{prefix}eod_error_s"] = whole.predict_eod_time_s(record, parameters, CUT_OFF_V) - record.time_s[-1]
+        row[f"{prefix}eod_error_s"] = forecast.eod_time_s - record.time_s[-1]
     return row
 
 
@@ -99,7 +102,7 @@ def fit_in_progress(discharge: Discharge, previous_q_mobile_C: float) -> list[di
             ("with prior", calibrator(previous_q_mobile_C)),
         ):
             estimate = fit.estimate(beginning)
-            eod_time_s = calibrator().predict_eod_time_s(beginning, estimate, CUT_OFF_V)
+            eod_time_s = _MODEL.forecast(beginning, estimate, CUT_OFF_V).eod_time_s
             row = {"cell": discharge.meta["cell"], "cycle": discharge.meta["cycle"], "share": share, "method": method}
             row |= {"q_mobile_C": estimate.q_mobile, "sd_q_mobile_C": estimate.sd_q_mobile, "settled": estimate.settled}
             rows.append(row | {"eod_error_percent": 100.0 * (eod_time_s - end_s) / (end_s - start_s)})
@@ -258,8 +261,8 @@ def plot_voltages(discharges: dict[str, list[Discharge]], whole: pd.DataFrame) -
                 (Estimate(fit["q_mobile_C"], fit["r_o_ohm"]), "-", COLOURS[0], "model, fitted"),
                 (_NEW, "--", COLOURS[1], "model, new cell's parameters"),
             ):
-                time_s, voltage_V = calibrator().forecast(record, estimate, CUT_OFF_V)
-                axes.plot(time_s - start_s, voltage_V, style, color=colour, lw=1.5, label=label)
+                forecast = _MODEL.forecast(record, estimate, CUT_OFF_V)
+                axes.plot(forecast.time_s - start_s, forecast.voltage_V, style, color=colour, lw=1.5, label=label)
             axes.set_title(f"{cell}, {age} (discharge {fit['cycle']}): RMSE {1e3 * fit['voltage_rmse_V']:.0f} mV", fontsize=9)
             axes.grid(alpha=0.25)
     for axes in panels[-1]:

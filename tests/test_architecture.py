@@ -16,11 +16,19 @@ ROOT = Path(__file__).parents[1]
 
 # each layer may import the ones before it, and itself
 LAYERS = (
-    ("battery_env.files", "battery_env.kernels"),
+    ("battery_env.arrays", "battery_env.files"),
+    ("battery_env.checks",),
+    ("battery_env.parameters",),
+    ("battery_env.electrochemistry.cell",),
+    ("battery_env.electrochemistry.kernels",),
+    ("battery_env.electrochemistry.tangents",),
     ("battery_env.electrochemistry",),
+    ("battery_env.records", "battery_env.estimates"),
     ("battery_env.loads",),
+    ("battery_env.dataset_files",),
     ("battery_env.trajectories", "battery_env.cells", "battery_env.nasa_cells"),
     ("battery_env.sensors",),
+    ("battery_env.record_model",),
     ("battery_env.estimators",),
     ("battery_env.calibration",),
     ("battery_env.evaluation",),

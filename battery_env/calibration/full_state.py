@@ -15,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from battery_env.arrays import IntArray
 from battery_env.calibration.full_state_kernels import decide, look_ahead, observe
 from battery_env.calibration.task import OBSERVATION_LIMIT, CalibrationTask, checked_action
 from battery_env.electrochemistry import (
@@ -27,7 +28,7 @@ from battery_env.electrochemistry import (
     initial_state,
     voltage_into,
 )
-from battery_env.trajectories import AgedParameter, IntArray, TrajectoryDataset
+from battery_env.trajectories import AgedParameter, TrajectoryDataset
 
 #: What the action's range [-1, 1] is mapped to (the authors' code), C and ohm.
 ACTION_RANGES: dict[str, tuple[float, float]] = {"q_mobile": (4000.0, 8000.0), "r_o": (0.08, 0.22)}
@@ -231,7 +232,7 @@ class FullStateTask(CalibrationTask):
         columns = (OBSERVED_SIZE if chosen.sensor_noise > 0.0 else 0) + (3 if chosen.process_noise_V > 0.0 else 0)
         self._noise = np.zeros((cells, self.episode_steps + 2, columns))
 
-        self._model_packed = self._true_packed = dataset.parameters.packed
+        self._model_packed = self._true_packed = dataset.cell.packed
         self._has_own_constants = bool((dataset.factors != 1.0).any())
         if self._has_own_constants:
             own = np.repeat(self._model_packed.constants, cells, axis=0)
@@ -311,7 +312,7 @@ class FullStateTask(CalibrationTask):
         r_o_hat = self._nominal_r_o[rows] if "r_o" in self.parameters else r_o
         state = dataset.states_at(trajectory, sample)
         if self.options.start == "new_cell":
-            model_state = initial_state(q_mobile_hat, dataset.parameters)
+            model_state = initial_state(q_mobile_hat, dataset.cell)
             of_step = (dataset.dt_s, dataset.load_unit, dataset.thermal, self._model_packed)
             advance_in_place(
                 model_state, dataset.load_values, load_start, sample, q_mobile_hat, r_o_hat, *of_step, extended=True

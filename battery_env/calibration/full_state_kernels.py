@@ -8,11 +8,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from battery_env.kernels import (
+from battery_env.arrays import FloatArray
+from battery_env.electrochemistry.kernels import (
     BLOCK,
     BLOCK_SIZE,
     VOLTAGE,
-    FloatArray,
     asinh_ratio,
     fill_block,
     states_of_block,

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike
 
-from battery_env.cells import resample_current
+from battery_env.arrays import IntArray
 from battery_env.electrochemistry import (
     NEW_CELL,
     QNB,
@@ -21,9 +21,8 @@ from battery_env.electrochemistry import (
     initial_state,
     simulate,
 )
-from battery_env.estimators.base import Record
-from battery_env.kernels import equilibrium_voltage, mole_fraction, nominal_overpotentials
-from battery_env.trajectories import IntArray
+from battery_env.electrochemistry.kernels import equilibrium_voltage, mole_fraction, nominal_overpotentials
+from battery_env.records import Record, resample_current
 
 # Far more charge and exactly as much resistance as it takes to read the linear part of the model off one simulation
 _PLENTY_C = 1e6
@@ -192,7 +191,7 @@ def _linear_part(
         _ONE_OHM,
         dt=dt_s,
         load_unit="current",
-        parameters=parameters,
+        cell=parameters,
         cut_off_V=-np.inf,
         max_duration_s=len(current_A) * dt_s,
     ).state[steps::steps]

@@ -14,10 +14,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from battery_env.arrays import IntArray
 from battery_env.calibration.readings import Readings, explain
 from battery_env.calibration.task import OBSERVATION_LIMIT, CalibrationTask, Parameter, checked_action
 from battery_env.electrochemistry import NEW_CELL, FloatArray
-from battery_env.trajectories import IntArray
 
 #: Where estimates are kept, C and ohm.
 ESTIMATE_RANGES: dict[str, tuple[float, float]] = {"q_mobile": (3500.0, 8100.0), "r_o": (0.05, 0.35)}

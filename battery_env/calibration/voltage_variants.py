@@ -25,7 +25,7 @@ LIVES = {"train": 70, "test": 30}
 @lru_cache(maxsize=4)
 def _standard_readings(parameter: AgedParameter, reading_s: float, **data: Any) -> Readings:
     dataset = standard_dataset(parameter, **data)
-    return Readings.of(dataset, reading_s, dataset.dt_s, dataset.parameters)
+    return Readings.of(dataset, reading_s, dataset.dt_s, dataset.cell)
 
 
 @lru_cache(maxsize=4)
@@ -35,7 +35,7 @@ def _lives_readings(split: str, cycles: int, reading_s: float) -> Readings:
 
 def _readings_of(records: Sequence[Record], reading_s: float) -> Readings:
     if isinstance(records, TrajectoryDataset):
-        return Readings.of(records, reading_s, records.dt_s, records.parameters)
+        return Readings.of(records, reading_s, records.dt_s, records.cell)
     return Readings.of(records, reading_s)
 
 

@@ -1,12 +1,12 @@
 """Calibration without learning."""
 
-from battery_env.estimators.base import Estimate, EstimateTrace, Estimator, OnlineEstimator, Record
+from battery_env.estimates import Estimate, EstimateTrace
+from battery_env.estimators.base import Estimator, OnlineEstimator
 from battery_env.estimators.closed_form import ClosedForm
 from battery_env.estimators.cramer_rao import CramerRaoBound, Sensitivities, cramer_rao_bound, sensitivities
 from battery_env.estimators.greedy import GreedyOneStep
 from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
-from battery_env.estimators.record_model import RecordModel
 
 __all__ = [
     "ClosedForm",
@@ -18,8 +18,6 @@ __all__ = [
     "GreedyOneStep",
     "LeastSquares",
     "OnlineEstimator",
-    "Record",
-    "RecordModel",
     "Sensitivities",
     "cramer_rao_bound",
     "sensitivities",

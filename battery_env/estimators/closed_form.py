@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from battery_env.electrochemistry import FULL_CHARGE_SHARES, NEW_CELL, QNB, VO, CellParameters, Trajectory
-from battery_env.estimators.base import Estimate, EstimateTrace, Estimator
+from battery_env.estimates import Estimate, EstimateTrace
+from battery_env.estimators.base import Estimator
 
 
 class ClosedForm(Estimator):
@@ -18,11 +19,11 @@ class ClosedForm(Estimator):
     ``q_mobile * (0.9 + 0.1 + 0.6 + 1/15) = q_mobile / 0.6``. And the ohmic voltage drop obeys
     ``Vo' = (i * r_o - Vo) / to``, so that ``r_o = (Vo + to / dt * (Vo_{t+1} - Vo)) / i``.
 
-    :param parameters: constants of the cell
+    :param cell: constants of the cell
     """
 
-    def __init__(self, parameters: CellParameters = NEW_CELL) -> None:
-        self.parameters = parameters
+    def __init__(self, cell: CellParameters = NEW_CELL) -> None:
+        self.cell = cell
 
     def estimate(self, record: Trajectory) -> Estimate:  # type: ignore[override]
         """
@@ -43,8 +44,8 @@ class ClosedForm(Estimator):
         """
         traces = []
         for record in records:
-            ohmic, dt_s = record.state[:, VO], np.diff(record.time_s)
-            ohmic_nominal = ohmic[:-1] + self.parameters.to / dt_s * np.diff(ohmic)
+            ohmic = record.state[:, VO]
+            ohmic_nominal = ohmic[:-1] + self.cell.to / record.dt_s * np.diff(ohmic)
             current = np.where(record.current_A[:-1] == 0.0, np.nan, record.current_A[:-1])
             charge = record.state[1:, QNB:].sum(axis=1)
             traces.append(

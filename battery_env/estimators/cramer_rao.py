@@ -7,9 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from battery_env.electrochemistry import FloatArray, Trajectory
-from battery_env.estimators.base import PARAMETERS, Estimate, Record, check_parameters
-from battery_env.estimators.record_model import RecordModel
+from battery_env.arrays import FloatArray
+from battery_env.electrochemistry import Trajectory
+from battery_env.estimates import Estimate
+from battery_env.parameters import PARAMETER_NAMES, check_parameters
+from battery_env.record_model import RecordModel
+from battery_env.records import Record
 
 # Below this determinant of the normalized information, unknowns cannot be told apart but by rounding errors.
 _LEAST_DETERMINANT = 1e-10
@@ -48,7 +51,7 @@ class CramerRaoBound:
 
     @classmethod
     def of(
-        cls, slopes: Sensitivities, voltage_noise_V: float, parameters: Sequence[str] = PARAMETERS, offset: bool = False
+        cls, slopes: Sensitivities, voltage_noise_V: float, parameters: Sequence[str] = PARAMETER_NAMES, offset: bool = False
     ) -> CramerRaoBound:
         """
         The bound that sensitivities imply.
@@ -69,7 +72,7 @@ class CramerRaoBound:
             columns.append(np.ones(len(slopes.time_s)))
         gradient = np.column_stack(columns) / voltage_noise_V
         variance = _inverse_diagonals(np.cumsum(gradient[:, :, None] * gradient[:, None, :], axis=0))
-        sd = dict.fromkeys(PARAMETERS, np.full(len(slopes.time_s), np.nan))
+        sd = dict.fromkeys(PARAMETER_NAMES, np.full(len(slopes.time_s), np.nan))
         sd |= {name: np.sqrt(variance[:, n]) for n, name in enumerate(names)}
         return cls(slopes.time_s, sd["q_mobile"], sd["r_o"])
 
@@ -98,7 +101,7 @@ def sensitivities(record: Record, at: Estimate | None = None, model: RecordModel
 def cramer_rao_bound(
     record: Record,
     voltage_noise_V: float,
-    parameters: Sequence[str] = PARAMETERS,
+    parameters: Sequence[str] = PARAMETER_NAMES,
     offset: bool = False,
     at: Estimate | None = None,
     model: RecordModel | None = None,

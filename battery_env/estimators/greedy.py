@@ -9,9 +9,12 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from battery_env.electrochemistry import NEW_CELL, VO, CellParameters, Trajectory, check_dt, check_q_mobile, check_r_o
-from battery_env.estimators.base import Estimate, EstimateTrace, Estimator
-from battery_env.kernels import FloatArray, cell_current, cell_step, cell_voltage
+from battery_env.arrays import FloatArray
+from battery_env.electrochemistry import NEW_CELL, VO, CellParameters, PackedConstants, Trajectory, check_dt
+from battery_env.electrochemistry.kernels import cell_current, cell_step, cell_voltage
+from battery_env.estimates import Estimate, EstimateTrace
+from battery_env.estimators.base import Estimator
+from battery_env.parameters import PARAMETERS
 
 #: Where to search, C and ohm: what aged cells may have, with a margin.
 SEARCH_RANGES: dict[str, tuple[float, float]] = {"q_mobile": (3500.0, 8100.0), "r_o": (0.05, 0.4)}
@@ -33,9 +36,7 @@ class _Task(NamedTuple):
     dt: float
     power: bool
     thermal: bool
-    constants: FloatArray
-    polynomial_n: FloatArray
-    polynomial_p: FloatArray
+    packed: PackedConstants
 
 
 @njit(cache=True, error_model="numpy")
@@ -45,9 +46,9 @@ def _cost(value: float, x: FloatArray, load: float, measured: FloatArray, k: int
     r_o = task.r_o if task.search_q else value
     volts = 0.0
     if task.power:
-        volts = cell_voltage(x, 0, q, True, task.constants, 0, task.polynomial_n, task.polynomial_p)
+        volts = cell_voltage(x, 0, q, True, task.packed, 0)
     i = cell_current(load, task.power, volts, True)
-    cell_step(x, 0, i, q, r_o, task.dt, task.thermal, True, task.constants, 0, out, 0)
+    cell_step(x, 0, i, q, r_o, task.dt, task.thermal, True, task.packed.constants, 0, out, 0)
     square = 0.0
     for n in range(VO, out.shape[1]):
         square += (out[0, n] - measured[k, n]) ** 2
@@ -170,10 +171,7 @@ class GreedyOneStep(Estimator):
         if parameter not in SEARCH_RANGES:
             raise ValueError(f"parameter must be one of {tuple(SEARCH_RANGES)}, got {parameter!r}")
         self.parameter = parameter
-        self.search_range = search_range or SEARCH_RANGES[parameter]
-        limits = (check_q_mobile if parameter == "q_mobile" else check_r_o)(self.search_range)
-        if limits.shape != (2,) or not limits[0] < limits[1]:
-            raise ValueError(f"search_range must be (lower, upper) with lower < upper, got {search_range!r}")
+        self.search_range = PARAMETERS[parameter].check_bounds("search_range", search_range or SEARCH_RANGES[parameter])
         self.resync = resync
         self.cell = cell
         self.thermal = thermal
@@ -204,10 +202,10 @@ class GreedyOneStep(Estimator):
                 self.parameter == "q_mobile",
                 record.q_mobile,
                 record.r_o,
-                check_dt(float(record.time_s[1] - record.time_s[0]), self.cell),
+                check_dt(record.dt_s, self.cell),
                 record.load_unit == "power",
                 self.thermal,
-                *self.cell.packed,
+                self.cell.packed,
             )
             _greedy(record.state, record.load, *self.search_range, self.resync, task, values[self.parameter])
             traces.append(EstimateTrace(time_s=record.time_s[1:], **values))

@@ -10,33 +10,24 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from battery_env.cells import check_drawn_charge, check_sample
+from battery_env.arrays import FloatArray, StringArray
+from battery_env.checks import check_gain_sd
 from battery_env.electrochemistry import (
     FULL_CHARGE_SHARES,
-    NEW_CELL,
-    Q_MOBILE_LIMITS_C,
     QNB,
     QNS,
     QPS,
     STATE_SIZE,
     CellParameters,
-    FloatArray,
+    PackedConstants,
+    check_cell,
     check_dt,
     initial_state,
 )
-from battery_env.estimators.base import (
-    PARAMETERS,
-    Estimate,
-    EstimateTrace,
-    OnlineEstimator,
-    Record,
-    Samples,
-    StringArray,
-    check_bounds,
-    check_gain_sd,
-    check_parameters,
-    last_estimate,
-)
+from battery_env.electrochemistry.cell import FRACTION_PER_SHARE
+from battery_env.electrochemistry.kernels import MOLE_FRACTION_MARGIN, cell_step, cell_voltage
+from battery_env.estimates import Estimate, EstimateTrace, last_estimate
+from battery_env.estimators.base import OnlineEstimator, check_bounds
 from battery_env.estimators.settling import (
     AT_BOUND,
     EMPTY,
@@ -54,7 +45,8 @@ from battery_env.estimators.settling import (
     sensor_reason,
     start_reason,
 )
-from battery_env.kernels import PackedConstants, cell_step, cell_voltage
+from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, check_parameters
+from battery_env.records import Record, Stream, check_drawn_charge, check_sample
 
 # What a filter estimates: q_mobile (C), r_o (ohm) and the offset of the voltage (V).
 _Q, _R, _OFFSET = range(3)
@@ -81,8 +73,6 @@ _SAME_SHARE = 0.25
 _GATE_SD = 5.0
 # The noise that innovations show is averaged over about this many samples.
 _NOISE_MEMORY = 32.0
-# How close to 0 and 1 mole fractions may come in the copies: the voltage is singular there.
-_MOLE_FRACTION_MARGIN = 5e-4
 _SHARE_N, _SHARE_P = float(FULL_CHARGE_SHARES[QNS - QNB]), float(FULL_CHARGE_SHARES[QPS - QNB])
 
 _PRIOR_SD_SHARE_Q = 0.25
@@ -144,7 +134,7 @@ def _least_q(surface_charge: float, share: float, q: float, per_q: float) -> flo
     # The smallest q' whose mole fraction, per_q * (surface_charge + share * (q' - q)) / q', lies inside the margins; that of a
     # full cell, per_q * share, does.
     full, amount = per_q * share, per_q * surface_charge
-    low, high = _MOLE_FRACTION_MARGIN, 1.0 - _MOLE_FRACTION_MARGIN
+    low, high = MOLE_FRACTION_MARGIN, 1.0 - MOLE_FRACTION_MARGIN
     return q + max((low * q - amount) / (full - low), (amount - high * q) / (high - full))
 
 
@@ -197,14 +187,13 @@ def _correct(
     packed: PackedConstants,
 ) -> float:
     # One measurement, to second order in q_mobile; returns the variance of the noise that it shows.
-    constants, poly_n, poly_p = packed
     at, spare, q = _COPIES * m, state.shape[0] - 1, mean[m, _Q]
     for j in range(state.shape[1]):
         state[spare, j] = 2.0 * state[at, j] - state[at + 1, j]
-    here = cell_voltage(state, at, q, True, constants, 0, poly_n, poly_p)
-    more_q = cell_voltage(state, at + 1, q + _MORE_Q_C, True, constants, 0, poly_n, poly_p)
-    less_q = cell_voltage(state, spare, q - _MORE_Q_C, True, constants, 0, poly_n, poly_p)
-    more_r = cell_voltage(state, at + 2, q, True, constants, 0, poly_n, poly_p)
+    here = cell_voltage(state, at, q, True, packed, 0)
+    more_q = cell_voltage(state, at + 1, q + _MORE_Q_C, True, packed, 0)
+    less_q = cell_voltage(state, spare, q - _MORE_Q_C, True, packed, 0)
+    more_r = cell_voltage(state, at + 2, q, True, packed, 0)
     h = ((more_q - here) / _MORE_Q_C, (more_r - here) / _MORE_R_OHM, 1.0)
     # over the spread of q_mobile a curved voltage is higher by this in the mean, with twice its square as the variance
     bend = 0.5 * (more_q - 2.0 * here + less_q) / _MORE_Q_C**2 * p[m, _Q, _Q]
@@ -273,7 +262,7 @@ def _take(
     # One sample. Row n of out: q_mobile, r_o, their standard deviations, whether the model cell has a voltage, and how far
     # the correlation of successive innovations has been above 0, in standard deviations.
     state, mean, p, log_weight, shown, innovation, memory = bank
-    per_q = packed.constants[0, 0]
+    per_q = packed.constants[0, FRACTION_PER_SHARE]
     noise = max(memory[_NOISE], settings.noise_V2)
     for m in range(log_weight.shape[0]):
         if log_weight[m] > -inf:
@@ -404,13 +393,13 @@ class ExtendedKalmanFilter(OnlineEstimator):
 
     def __init__(
         self,
-        parameters: Sequence[str] = PARAMETERS,
+        parameters: Sequence[str] = PARAMETER_NAMES,
         cell: CellParameters | None = None,
         thermal: bool = False,
         dt_s: float = 1.0,
         prior_q_mobile_C: tuple[float, float] | None = None,
         prior_r_o_ohm: tuple[float, float] | None = None,
-        q_mobile_bounds_C: tuple[float, float] = (Q_MOBILE_LIMITS_C[0], 1e5),
+        q_mobile_bounds_C: tuple[float, float] = (Q_MOBILE.limits[0], 1e5),
         r_o_bounds_ohm: tuple[float, float] = (0.0, 1.0),
         voltage_noise_V: float | None = None,
         offset_sd_V: float | None = None,
@@ -419,7 +408,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
         current_gain_sd: float = 0.0,
     ) -> None:
         self.parameters = check_parameters(parameters)
-        self.cell = cell or NEW_CELL
+        self.cell = check_cell(cell, thermal)
         self.thermal = thermal
         self.dt_s = check_dt(dt_s, self.cell)
         self.bounds = check_bounds(q_mobile_bounds_C, r_o_bounds_ohm)
@@ -506,8 +495,8 @@ class ExtendedKalmanFilter(OnlineEstimator):
         :param current_A: current that flows from this sample to the next one, positive in discharge, A
         :param dt_s: time since the previous sample, s; without meaning at the first one
         :return: the estimate
-        :raises ValueError: for what cannot be meant (:func:`battery_env.cells.check_sample`), and for a current that charges a
-            full cell; the filter stays as it was
+        :raises ValueError: for what cannot be meant (:func:`battery_env.records.check_sample`), and for a current that charges
+            a full cell; the filter stays as it was
         """
         is_first = not self._start
         check_sample(voltage_V, current_A, None if is_first else dt_s)
@@ -551,8 +540,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
         """
         traces = []
         for record in records:
-            samples = Samples.of(record, self.dt_s)
-            time_s, voltage_V, current_A, dt_s = samples
+            time_s, voltage_V, current_A, dt_s = Stream.of(record, self.dt_s)
             self._check_drawn(float(np.cumsum(np.append(0.0, current_A[:-1]) * dt_s).min()))
             starts = max(int(np.searchsorted(time_s, time_s[0] + START_WINDOW_S, side="right")), 2)
             reasons = [start_reason(time_s[:n], voltage_V[:n], current_A[:n], self.cell) for n in range(1, starts + 1)]

@@ -11,20 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
-from battery_env.cells import check_drawn_charge, check_record, drawn_charge_C
-from battery_env.electrochemistry import Q_MOBILE_LIMITS_C, CellParameters, FloatArray, check_q_mobile
-from battery_env.estimators.base import (
-    PARAMETERS,
-    BoolArray,
-    Estimate,
-    EstimateTrace,
-    Estimator,
-    Record,
-    check_bounds,
-    check_gain_sd,
-    check_parameters,
-)
-from battery_env.estimators.record_model import RecordModel, expected_current
+from battery_env.arrays import BoolArray, FloatArray
+from battery_env.checks import check_gain_sd
+from battery_env.electrochemistry import CellParameters
+from battery_env.estimates import Estimate, EstimateTrace
+from battery_env.estimators.base import Estimator, check_bounds
 from battery_env.estimators.settling import (
     AT_BOUND,
     EMPTY,
@@ -42,6 +33,9 @@ from battery_env.estimators.settling import (
     start_reason,
     white_noise_V,
 )
+from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, check_parameters
+from battery_env.record_model import RecordModel
+from battery_env.records import Record, Samples, check_drawn_charge, check_record, drawn
 
 # Where the search for q_mobile may start: this much above the least value that the record allows. The narrow ones serve whole
 # discharges, the wide ones the first minutes of one.
@@ -68,14 +62,6 @@ _END_SHARE = 0.02
 # With fewer samples than this beyond the number of parameters, the residuals do not tell how large the noise is.
 _SPARE_SAMPLES = 10
 _FEW = "These are too few samples to tell the noise. Record on, or state voltage_noise_V."
-
-
-class _Samples(NamedTuple):
-    """Some samples of a record, which is a record."""
-
-    time_s: FloatArray
-    voltage_V: FloatArray
-    current_A: FloatArray
 
 
 class _Problem(NamedTuple):
@@ -113,7 +99,7 @@ class LeastSquares(Estimator):
     The (q_mobile, r_o) whose simulated voltage is closest to the recorded one, over all samples of the record.
 
     The model starts at the first sample of the record, fully charged and at rest unless ``initial`` says otherwise, and
-    follows the recorded current (:func:`battery_env.cells.resample_current`). For a recorded discharge give
+    follows the recorded current (:func:`battery_env.records.resample_current`). For a recorded discharge give
     :meth:`battery_env.cells.Discharge.loaded_part`, which starts when the load is switched on.
 
     *The search.* At a fixed current the charges of the model are linear in ``q_mobile``; so one simulation gives exactly the
@@ -172,12 +158,12 @@ class LeastSquares(Estimator):
 
     def __init__(
         self,
-        parameters: Sequence[str] = PARAMETERS,
+        parameters: Sequence[str] = PARAMETER_NAMES,
         cell: CellParameters | None = None,
         thermal: bool = False,
         dt_s: float = 1.0,
         initial: ArrayLike | None = None,
-        q_mobile_bounds_C: tuple[float, float] = (Q_MOBILE_LIMITS_C[0], 1e5),
+        q_mobile_bounds_C: tuple[float, float] = (Q_MOBILE.limits[0], 1e5),
         r_o_bounds_ohm: tuple[float, float] = (0.0, 1.0),
         prior_q_mobile_C: tuple[float, float] | None = None,
         mismatch_V: float = 0.0,
@@ -191,7 +177,7 @@ class LeastSquares(Estimator):
         if prior_q_mobile_C is not None:
             if "q_mobile" not in self.parameters:
                 raise ValueError("prior_q_mobile_C needs 'q_mobile' among the parameters to search for")
-            check_q_mobile(prior_q_mobile_C[0])
+            Q_MOBILE.check(prior_q_mobile_C[0])
             if not 0.0 < prior_q_mobile_C[1] < np.inf:
                 raise ValueError(f"prior_q_mobile_C is (mean, sd) with sd > 0, got {prior_q_mobile_C!r}")
         self.prior_q_mobile_C = prior_q_mobile_C
@@ -230,15 +216,15 @@ class LeastSquares(Estimator):
         return [self._growing_trace(record, self.window_every_s) for record in records]
 
     def _growing_trace(self, record: Record, every_s: float) -> EstimateTrace:
-        time_s = np.asarray(record.time_s)
+        whole = Samples(*(np.asarray(column) for column in (record.time_s, record.voltage_V, record.current_A)))
+        time_s = whole.time_s
         samples = np.searchsorted(time_s, np.arange(time_s[0] + every_s, time_s[-1], every_s), side="right")
         # the current of a sample shows at the next one
-        fewest = max(len(self.parameters), *np.flatnonzero(record.current_A)[:1] + 1) + 1
+        fewest = max(len(self.parameters), *np.flatnonzero(whole.current_A)[:1] + 1) + 1
         stops = np.unique(np.append(samples[samples >= fewest], len(time_s)))
         estimates: list[Estimate] = []
         for stop in stops:
-            window = _Samples(time_s[:stop], record.voltage_V[:stop], record.current_A[:stop])
-            estimates.append(self._estimate(window, *estimates[-1:]))
+            estimates.append(self._estimate(whole.first(stop), *estimates[-1:]))
         return EstimateTrace.of(time_s[stops - 1], estimates)
 
     def _estimate(self, record: Record, previous: Estimate | None = None) -> Estimate:
@@ -265,7 +251,7 @@ class LeastSquares(Estimator):
 
     def _sd(self, fit: _Fit, variance_V2: float) -> dict[str, float]:
         """The standard deviations, with that of the current sensor's gain, which scales both parameters."""
-        sd = dict.fromkeys(PARAMETERS, nan)
+        sd = dict.fromkeys(PARAMETER_NAMES, nan)
         for name, root in zip(self.parameters, _root_inverse_diagonal(fit.jacobian), strict=True):
             sd[name] = hypot(sqrt(variance_V2) * float(root), self.current_gain_sd * fit.values[name])
         return sd
@@ -298,10 +284,11 @@ class LeastSquares(Estimator):
         load_A = float(current_A[max(n - 1, 0) : n + 1].max())
         if n == 0 or load_A <= 0.0:
             return ""
-        until = _Samples(time_s[: n + 1], voltage_V[: n + 1], current_A[: n + 1])
+        until = Samples(time_s, voltage_V, current_A).first(n + 1)
         estimate = Estimate(fit.values["q_mobile"], fit.values["r_o"])
         early_s, late_s = (
-            self.predict_eod_time_s(until, estimate, float(voltage_V[n]) + sign * deviation_V, load_A) for sign in (1.0, -1.0)
+            self.model.forecast(until, estimate, float(voltage_V[n]) + sign * deviation_V, load_A).eod_time_s
+            for sign in (1.0, -1.0)
         )
         allowed_s = _END_SHARE * (time_s[n] - time_s[0]) + 2.0 * self.model.dt_s
         if early_s - allowed_s <= time_s[n] <= late_s + allowed_s:
@@ -325,74 +312,6 @@ class LeastSquares(Estimator):
             ]
         )
 
-    def predict_voltage_V(self, record: Record, estimate: Estimate) -> FloatArray:
-        """
-        The voltage that the model shows at the samples of a record, under its current.
-
-        :param record: one discharge
-        :param estimate: the parameters
-        :return: voltage in V, shape (T,); NaN after the model cell is empty
-        """
-        time_s, current_A = self.model.grid(record)
-        simulation = self.model.simulate(current_A, estimate.q_mobile, estimate.r_o)
-        return np.interp(time_s, simulation.time_s, simulation.voltage_V, right=np.nan)
-
-    def forecast(
-        self, record: Record, estimate: Estimate, cut_off_V: float | None = None, future_current_A: float | None = None
-    ) -> tuple[FloatArray, FloatArray]:
-        """
-        The voltage of the model from the first sample of a record down to the cut-off, under the current of the record, and
-        beyond its end under a constant one.
-
-        :param record: one discharge, whole or in progress
-        :param estimate: the parameters
-        :param cut_off_V: cut-off voltage, V; ``None``: the ``VEOD`` of ``cell``
-        :param future_current_A: current beyond the end of the record, at least 0 A; ``None``: as
-            :func:`~battery_env.estimators.record_model.expected_current` has it, the last current of a constant load and the
-            mean of a load that varied, which is an assumption
-        :return: time on the clock of the record, s, and voltage, V. The last point is at the cut-off, interpolated between
-            steps; if it is never reached, as the load is off at the end of the record, the last point is above it
-        :raises ValueError: for a negative future current, or a record that cannot be used
-        """
-        _, current_A = self.model.grid(record)
-        cut_off = self.model.cell.VEOD if cut_off_V is None else cut_off_V
-        if future_current_A is None:
-            future_current_A = expected_current(record.time_s, record.current_A).mean_A
-        elif not 0.0 <= future_current_A < np.inf:
-            raise ValueError(f"future_current_A must be finite and at least 0 A, got {future_current_A!r}")
-        if future_current_A > 0.0:
-            # no cell of this q_mobile lasts longer than this, whatever it had delivered before
-            steps = int(estimate.q_mobile / (future_current_A * self.model.dt_s)) + 1
-            current_A = np.append(current_A[:-1], np.full(steps + 1, future_current_A))
-        simulation = self.model.simulate(current_A, estimate.q_mobile, estimate.r_o)
-        time_s, voltage_V = float(record.time_s[0]) + simulation.time_s, simulation.voltage_V
-        below = np.flatnonzero(voltage_V <= cut_off)
-        if not len(below):
-            if np.isnan(simulation.eod_time_s):
-                return time_s, voltage_V
-            n, end_s = len(time_s), float(record.time_s[0]) + simulation.eod_time_s  # the cell is empty one step later
-        else:
-            n = int(below[0])
-            around = [n, max(n - 1, 0)]
-            end_s = float(np.interp(cut_off, voltage_V[around], time_s[around]))
-        return np.append(time_s[:n], end_s), np.append(voltage_V[:n], cut_off)
-
-    def predict_eod_time_s(
-        self, record: Record, estimate: Estimate, cut_off_V: float | None = None, future_current_A: float | None = None
-    ) -> float:
-        """
-        When the model reaches the cut-off (:meth:`forecast`).
-
-        :param record: one discharge, whole or in progress
-        :param estimate: the parameters
-        :param cut_off_V: cut-off voltage, V; ``None``: the ``VEOD`` of ``cell``
-        :param future_current_A: as for :meth:`forecast`
-        :return: the end of discharge on the clock of the record, s; NaN if it is never reached
-        """
-        cut_off = self.model.cell.VEOD if cut_off_V is None else cut_off_V
-        time_s, voltage_V = self.forecast(record, estimate, cut_off, future_current_A)
-        return float(time_s[-1]) if voltage_V[-1] <= cut_off else float("nan")
-
     def _problem(self, record: Record) -> _Problem:
         clock_s, voltage_V, measured_A = check_record(
             record.time_s, record.voltage_V, record.current_A, least_samples=len(self.parameters) + 1
@@ -400,7 +319,7 @@ class LeastSquares(Estimator):
         time_s, current_A = self.model.grid(record)
         if not current_A[:-1].any():
             raise ValueError("no current flows in this record: it says nothing about q_mobile and r_o")
-        check_drawn_charge(float(drawn_charge_C(clock_s, measured_A, clock_s[-1])))
+        check_drawn_charge(float(drawn(clock_s, measured_A, clock_s[-1])))
         grid_s = self.model.dt_s * np.arange(len(current_A))
         on_grid = len(grid_s) == len(time_s) and np.allclose(time_s, grid_s, rtol=0.0, atol=1e-6 * self.model.dt_s)
         return _Problem(time_s, voltage_V, current_A, on_grid, self.model.least_q_mobile_C(current_A))
@@ -529,7 +448,7 @@ class LeastSquares(Estimator):
     def _residual(self, problem: _Problem, values: dict[str, float], prior: _Prior | None) -> tuple[FloatArray, FloatArray]:
         """The residuals at the samples, V, and if there is a prior one more; and their derivatives by ``parameters``."""
         model_V, *slopes = self.model.sensitivities(problem.current_A, values["q_mobile"], values["r_o"])
-        by_parameter = dict(zip(PARAMETERS, slopes, strict=True))
+        by_parameter = dict(zip(PARAMETER_NAMES, slopes, strict=True))
         columns = [model_V, *(by_parameter[name] for name in self.parameters)]
         if not problem.on_grid:
             grid_s = self.model.dt_s * np.arange(len(model_V))

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from battery_env.cells import SWITCH_SHARE
-from battery_env.electrochemistry import CellParameters, FloatArray, initial_state, voltage
+from battery_env.arrays import BoolArray, FloatArray
+from battery_env.electrochemistry import CellParameters, initial_state, voltage
+from battery_env.records import SWITCH_SHARE
 
 #: An estimate counts as settled when its standard deviation is below this share of its value. That of ``r_o`` is wider: on a
 #: real cell the error of the model divided by the current is a quarter of it already.
@@ -67,7 +68,7 @@ def start_reason(time_s: FloatArray, voltage_V: FloatArray, current_A: FloatArra
     :param cell: constants of the model
     :return: why it cannot, or cannot be told to; empty if it can
     """
-    full_V = float(voltage(initial_state(cell.q_mobile, cell), cell.q_mobile, cell))
+    full_V = float(voltage(initial_state(cell=cell), cell=cell))
     first_V, drop_V = float(voltage_V[0]), LEAST_RESISTANCE_OHM * max(float(current_A[0]), 0.0)
     low_V, high_V = full_V - FULL_REST_V[0], full_V + FULL_REST_V[1]
     if first_V > high_V:
@@ -126,7 +127,7 @@ def sensor_reason(time_s: FloatArray, voltage_V: FloatArray, current_A: FloatArr
     return ""
 
 
-def is_plausible(q_mobile: ArrayLike, cell: CellParameters) -> NDArray[np.bool_]:
+def is_plausible(q_mobile: ArrayLike, cell: CellParameters) -> BoolArray:
     """
     Whether a cell of the kind of the model can have some ``q_mobile``.
 

@@ -12,11 +12,10 @@ from scipy.io import savemat
 from battery_env.cells import (
     BUNDLED_CELLS,
     Discharge,
-    drawn_charge_C,
     load_nasa_discharges,
     read_discharge_csv,
-    resample_current,
 )
+from battery_env.records import drawn, resample_current
 
 
 def recorded(**changes) -> dict:
@@ -133,10 +132,10 @@ class TestResampling:
         current_A = np.random.default_rng(seed).choice([0.0, 0.05, 1.9, 2.0, 2.1], size=len(time_s))
         assume(not np.allclose(np.diff(time_s), dt_s))  # such records are simulated ones, taken as they are
         n_steps = int(np.ceil(time_s[-1] / dt_s)) + 1
-        drawn_C = float(drawn_charge_C(time_s, current_A, n_steps * dt_s))
+        drawn_C = float(drawn(time_s, current_A, n_steps * dt_s))
         assert dt_s * resample_current(time_s, current_A, dt_s, n_steps).sum() == pytest.approx(drawn_C, abs=1e-9)
         # a jump at the midpoint and a ramp carry the same charge between two samples
-        assert drawn_charge_C(time_s, current_A, time_s[-1]) == pytest.approx(trapezoid(current_A, time_s), abs=1e-9)
+        assert drawn(time_s, current_A, time_s[-1]) == pytest.approx(trapezoid(current_A, time_s), abs=1e-9)
 
 
 class TestBundledCells:

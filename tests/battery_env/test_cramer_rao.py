@@ -7,10 +7,10 @@ import pytest
 
 from battery_env.cells import load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, simulate
-from battery_env.estimators.base import Estimate
+from battery_env.estimates import Estimate
 from battery_env.estimators.cramer_rao import CramerRaoBound, Sensitivities, cramer_rao_bound, sensitivities
 from battery_env.estimators.least_squares import LeastSquares
-from battery_env.estimators.record_model import RecordModel
+from battery_env.record_model import RecordModel
 
 NOISE_V = 0.010
 BOTH = ("q_mobile", "r_o")
@@ -105,9 +105,7 @@ def test_recorded_discharges_and_other_models():
     np.testing.assert_array_equal(slopes.time_s, record.time_s)
     # once the load has been on for a while; the heat of the resistance raises the voltage a little
     np.testing.assert_allclose(slopes.by_r_o_A[10:], -record.current_A[10:], rtol=0.1)
-    np.testing.assert_allclose(
-        slopes.voltage_V, LeastSquares(thermal=True).predict_voltage_V(record, at), rtol=0.0, atol=1e-12
-    )
+    np.testing.assert_allclose(slopes.voltage_V, RecordModel(thermal=True).voltage(record, at), rtol=0.0, atol=1e-12)
     assert 0.0 < cramer_rao_bound(record, NOISE_V, at=at, model=model).sd_q_mobile[-1] < 100.0
     with pytest.raises(ValueError, match="give the parameters of a recorded discharge"):
         sensitivities(record)

@@ -22,7 +22,7 @@ from battery_env.electrochemistry import (
     voltage,
     voltage_into,
 )
-from battery_env.kernels import logarithm
+from battery_env.electrochemistry.kernels import logarithm
 
 # Tb, Vo, Vsn, Vsp, qnB, qnS, qpB, qpS, V of a new cell, dt 1 s
 REFERENCE_2A_THERMAL = {
@@ -154,7 +154,7 @@ def test_a_cell_comes_out_the_same_in_a_batch_of_any_size_and_on_its_own_way(loa
         for m in range(0, n, 7):
             one = initial_state(q[m])
             for k in range(steps[m]):
-                one = step(one, loads[first[m] + k], q[m], r[m], load_unit=load_unit, parameters=constants[m])
+                one = step(one, loads[first[m] + k], q[m], r[m], load_unit=load_unit, cell=constants[m])
             rtol = 0.0 if constants[m] is NEW_CELL else 1e-14  # a constant times a factor is rounded twice
             np.testing.assert_allclose(state[m], one, rtol=rtol)
             np.testing.assert_allclose(volts[m], voltage(one, q[m]), rtol=rtol)
@@ -276,7 +276,6 @@ def test_wrong_shapes_are_refused():
         ({"Ap": (np.nan,)}, "Ap must be finite"),
         ({"Ap": (1.0,) * 14}, "1 to 13 coefficients"),
         ({"VolSFraction": 1.5}, "VolSFraction"),
-        ({"alpha": 0.4}, "alpha"),
     ],
 )
 def test_constants_out_of_range_are_refused(changes, message):
@@ -290,4 +289,17 @@ def test_constants_are_frozen_and_replaceable():
     slower = NEW_CELL.replace(kn=100.0)
     assert slower.kn == 100.0 and NEW_CELL.kn == 2120.96
     state = initial_state(7600.0)
-    assert step(state, 8.0, 7600.0, 0.1, parameters=slower)[2] > step(state, 8.0, 7600.0, 0.1)[2]
+    assert step(state, 8.0, 7600.0, 0.1, cell=slower)[2] > step(state, 8.0, 7600.0, 0.1)[2]
+
+
+def test_a_cell_brings_its_own_age():
+    aged = NEW_CELL.replace(q_mobile=6000.0, r_o=0.2)
+    own, given = simulate(8.0, cell=aged), simulate(8.0, 6000.0, 0.2)
+    np.testing.assert_array_equal(own.state, given.state)
+    assert (own.cell, own.q_mobile, own.r_o) == (aged, 6000.0, 0.2) == (given.cell, given.q_mobile, given.r_o)
+    state = initial_state(cell=aged)
+    np.testing.assert_array_equal(state, initial_state(6000.0))
+    np.testing.assert_array_equal(voltage(state, cell=aged), voltage(state, 6000.0))
+    np.testing.assert_array_equal(step(state, 8.0, cell=aged), step(state, 8.0, 6000.0, 0.2))
+    # what is given goes before what the cell brings
+    np.testing.assert_array_equal(simulate(8.0, 7000.0, cell=aged).state, simulate(8.0, 7000.0, 0.2).state)

@@ -210,7 +210,7 @@ def test_constants_may_differ_from_those_of_the_model():
         for row, n in enumerate((1, 4, 1)):
             own = zip(UNCERTAIN_CONSTANTS, data.factors[n], strict=True)
             true = NEW_CELL.replace(**{name: getattr(NEW_CELL, name) * factor for name, factor in own})
-            expected = step(task.state[row], task.load[row], task.q_mobile[row], task.r_o[row], parameters=true)
+            expected = step(task.state[row], task.load[row], task.q_mobile[row], task.r_o[row], cell=true)
             np.testing.assert_allclose(task.next_state[row], expected, rtol=1e-13)
         model, load, q, r = task.model_state.copy(), task.load.copy(), task.q_mobile, task.r_o
         assert (task.advance(true_action(task)) > 0.01).all()

@@ -106,14 +106,14 @@ class TestModel:
     @FAST
     @given(
         change=st.tuples(st.sampled_from(["load", "q_mobile", "r_o", "until", "dt", "initial", "max_duration_s"]), JUNK)
-        | st.tuples(st.sampled_from(["thermal", "parameters", "load_unit", "cut_off_V"]), JUNK | st.just(np.nan))
+        | st.tuples(st.sampled_from(["thermal", "cell", "load_unit", "cut_off_V"]), JUNK | st.just(np.nan))
     )
     def test_arguments_of_another_kind_are_refused(self, change):
         name, value = change
-        assume(value is not None or name not in ("initial", "parameters", "cut_off_V"))
+        assume(value is not None or name not in ("q_mobile", "r_o", "initial", "cell", "cut_off_V"))
         arguments = {"load": 8.0, "q_mobile": 7600.0, "r_o": 0.1} | {name: value}
         assert right_or_refused(lambda: battery_env.simulate(**arguments), "state" if name == "initial" else name) is None
-        if name in ("dt", "thermal", "parameters", "load_unit"):
+        if name in ("dt", "thermal", "cell", "load_unit"):
             state = battery_env.initial_state(7600.0)
             assert right_or_refused(lambda: battery_env.step(state, **arguments), name) is None
 
@@ -178,7 +178,7 @@ class TestDataSets:
             ("trim", JUNK | NUMBERS | st.tuples(st.floats(-0.1, 1.1), st.floats(-0.1, 1.1))),
             ("dt_s", NUMBERS),
             ("thermal", JUNK | NUMBERS | st.booleans()),
-            ("parameters", JUNK | NUMBERS),
+            ("cell", JUNK | NUMBERS),
             ("mismatch", JUNK | NUMBERS | st.floats(0.0, 0.6)),
         ],
     )

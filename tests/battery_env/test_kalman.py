@@ -7,11 +7,13 @@ import pytest
 
 from battery_env.cells import Discharge, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, simulate
-from battery_env.estimators.base import Estimate, OnlineEstimator, Samples
+from battery_env.estimates import Estimate
+from battery_env.estimators.base import OnlineEstimator
 from battery_env.estimators.kalman import ExtendedKalmanFilter
-from battery_env.estimators.least_squares import SETTLED_SHARES
+from battery_env.estimators.settling import SETTLED_SHARES
 from battery_env.evaluation import evaluate, summarize
 from battery_env.loads import RandomPiecewise
+from battery_env.records import Stream
 from battery_env.sensors import SensorErrors
 from battery_env.trajectories import TrajectoryDataset
 
@@ -169,7 +171,7 @@ class TestOnline:
 
     def test_reset_starts_anew(self):
         record, filter_ = measured().part(0, 50), ExtendedKalmanFilter()
-        samples = list(Samples.of(record, 1.0).measured())
+        samples = list(Stream.of(record, 1.0).samples())
         first = [filter_.update(*sample) for sample in samples]
         assert filter_.update(*samples[1]) != first[1]
         filter_.reset()
@@ -258,7 +260,7 @@ class TestOnlineInterface:
     def test_between_recorded_samples_the_current_is_its_mean(self):
         time_s = np.array([0.0, 10.0, 30.0, 60.0, 70.0])
         record = Discharge(time_s, np.full(5, 3.7), np.array([2.0, 2.1, 2.1, 0.0, 0.0]))
-        samples = Samples.of(record, 1.0)
+        samples = Stream.of(record, 1.0)
         np.testing.assert_allclose(samples.current_A, [2.05, 2.1, 1.05, 0.0, 0.0])
         np.testing.assert_array_equal(samples.dt_s, [0.0, 10.0, 20.0, 30.0, 10.0])
 

@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 
 from battery_env.cells import Discharge, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, Trajectory, initial_state, simulate
-from battery_env.estimators.base import Estimate
 from battery_env.estimators.cramer_rao import cramer_rao_bound
-from battery_env.estimators.least_squares import SETTLED_SHARES, LeastSquares
-from battery_env.estimators.record_model import RecordModel
+from battery_env.estimators.least_squares import LeastSquares
+from battery_env.estimators.settling import SETTLED_SHARES
+from battery_env.record_model import RecordModel
 
 
 def discharged(
@@ -246,38 +246,6 @@ class TestBounds:
         assert (estimate.q_mobile, estimate.r_o) == (5500.0, 0.2) and not estimate.settled
 
 
-class TestEndOfDischarge:
-    @pytest.mark.parametrize("cut_off_V", [3.2, 3.0, 2.7])
-    def test_it_is_the_simulated_one_to_within_a_step(self, cut_off_V):
-        record = discharged(load=2.0, load_unit="current", cut_off_V=cut_off_V)
-        truth = Estimate(6000.0, 0.15)
-        for seen in (record, record.part(0, 900)):
-            eod_time_s = LeastSquares().predict_eod_time_s(seen, truth, cut_off_V)
-            assert record.eod_time_s - 1.0 <= eod_time_s <= record.eod_time_s
-
-    def test_forecast_follows_the_record_and_ends_at_the_cut_off(self):
-        record = discharged(load=2.0, load_unit="current")
-        time_s, voltage_V = LeastSquares().forecast(record.part(0, 900), Estimate(6000.0, 0.15))
-        np.testing.assert_allclose(voltage_V[: len(record.time_s)], record.voltage_V, atol=1e-12)
-        assert voltage_V[-1] == 3.0 and (np.diff(time_s) > 0.0).all()
-
-    def test_time_counts_on_the_clock_of_the_record(self):
-        record = discharged(load=2.0, load_unit="current")
-        later = replace(record, time_s=record.time_s + 1000.0)
-        truth, fit = Estimate(6000.0, 0.15), LeastSquares()
-        assert fit.predict_eod_time_s(later, truth) == pytest.approx(fit.predict_eod_time_s(record, truth) + 1000.0)
-
-    def test_it_is_unknown_when_the_load_is_off(self):
-        current_A = np.where(np.arange(600) < 300, 2.0, 0.0)
-        record = simulate(current_A, 6000.0, 0.15, load_unit="current")
-        assert np.isnan(LeastSquares().predict_eod_time_s(record, Estimate(6000.0, 0.15)))
-
-    def test_predicted_voltage_ends_where_the_cell_is_empty(self):
-        record = discharged(6000.0, 0.15)
-        voltage_V = LeastSquares().predict_voltage_V(record, Estimate(4000.0, 0.15))
-        assert np.isnan(voltage_V[-1]) and np.isfinite(voltage_V[: len(voltage_V) // 2]).all()
-
-
 class TestRealDischarges:
     @pytest.mark.parametrize("cycle", [1, 90, 168])
     def test_q_mobile_tracks_the_measured_capacity_and_predicts_the_end(self, b0005, cycle):
@@ -286,7 +254,7 @@ class TestRealDischarges:
         assert 1.03 < estimate.q_mobile / (3600.0 * record.meta["capacity_Ah"]) < 1.07
         assert 0.09 < estimate.r_o < 0.17
         assert estimate.settled
-        assert abs(fit.predict_eod_time_s(record, estimate, 2.7) - record.time_s[-1]) < 0.01 * record.time_s[-1]
+        assert abs(fit.model.forecast(record, estimate, 2.7).eod_time_s - record.time_s[-1]) < 0.01 * record.time_s[-1]
 
     @pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
     def test_an_unfinished_one_is_not_settled_and_a_prior_repairs_it(self, b0005, share):
@@ -298,7 +266,7 @@ class TestRealDischarges:
         assert abs(alone.q_mobile - fit.estimate(record).q_mobile) < 2.0 * alone.sd_q_mobile
         before = fit.estimate(previous).q_mobile
         carried = LeastSquares(thermal=True, mismatch_V=0.05, prior_q_mobile_C=(before, 0.01 * before))
-        eod_time_s = carried.predict_eod_time_s(beginning, carried.estimate(beginning), 2.7)
+        eod_time_s = carried.model.forecast(beginning, carried.estimate(beginning), 2.7).eod_time_s
         assert eod_time_s == pytest.approx(record.time_s[-1], rel=0.01)
 
     @pytest.mark.parametrize("cycle", [95, 125])
@@ -308,7 +276,7 @@ class TestRealDischarges:
         half = record.until(record.time_s[0] + 0.5 * (record.time_s[-1] - record.time_s[0]))
 
         def square_V2(estimate):
-            residual_V = LeastSquares(thermal=True).predict_voltage_V(half, estimate) - half.voltage_V
+            residual_V = LeastSquares(thermal=True).model.voltage(half, estimate) - half.voltage_V
             return residual_V @ residual_V
 
         def profile(q_mobile):

@@ -109,7 +109,7 @@ def test_a_recorded_load_is_switched_midway_between_the_samples():
         (lambda: recorded(load_nasa_discharges("B0005")[0], "energy"), "unit must be 'power'.* got 'energy'"),
         (
             lambda: recorded(load_nasa_discharges("B0005")[0], dt_s=1e5),
-            "dt_s must be at most the recording's 3690.* got 100000",
+            "dt_s must be at most the record's 3690.* got 100000",
         ),
     ],
 )

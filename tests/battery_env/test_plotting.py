@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from battery_env.electrochemistry import simulate
-from battery_env.estimators import CramerRaoBound, Estimate, EstimateTrace, RecordModel, cramer_rao_bound, sensitivities
+from battery_env.estimators import CramerRaoBound, Estimate, EstimateTrace, cramer_rao_bound, sensitivities
 from battery_env.files import replacing
 from battery_env.plotting import (
     COLOURS,
@@ -19,6 +19,7 @@ from battery_env.plotting import (
     plot_true_against_inferred,
     save_figure,
 )
+from battery_env.record_model import RecordModel
 from battery_env.sensors import SensorErrors
 
 
@@ -55,11 +56,14 @@ def record():
 
 def test_discharge_shows_the_measured_voltage_the_model_and_its_error(record):
     offset = SensorErrors(offset_V=0.010).apply(record, np.random.default_rng(0))
-    figure = plot_discharge(offset, {"true": Estimate(6000.0, 0.15), "aged": Estimate(5000.0, 0.15)})
+    forecast = RecordModel().forecast
+    estimates = {"true": Estimate(6000.0, 0.15), "aged": Estimate(5000.0, 0.15)}
+    figure = plot_discharge(offset, {name: forecast(offset, estimate) for name, estimate in estimates.items()})
     voltage, error = figure.axes
     measured, model, _ = voltage.lines
     np.testing.assert_array_equal(measured.get_ydata(), offset.voltage_V)
-    np.testing.assert_allclose(model.get_ydata(), record.voltage_V, atol=1e-9)
+    np.testing.assert_allclose(model.get_ydata()[: len(record.time_s)], record.voltage_V, atol=1e-9)
+    assert model.get_ydata()[-1] == 3.0
     np.testing.assert_allclose(error.lines[1].get_ydata(), -10.0, atol=1e-6)
     # the aged cell is empty before the record ends
     aged = error.lines[2].get_ydata()
@@ -70,7 +74,8 @@ def test_discharge_shows_the_measured_voltage_the_model_and_its_error(record):
 
 
 def test_discharge_follows_the_model_that_is_given(record):
-    figure = plot_discharge(record, {"warm": Estimate(6000.0, 0.15)}, RecordModel(thermal=True))
+    warm = RecordModel(thermal=True).forecast(record, Estimate(6000.0, 0.15))
+    figure = plot_discharge(record, {"warm": warm})
     assert np.abs(figure.axes[1].lines[1].get_ydata()).max() > 1.0
 
 

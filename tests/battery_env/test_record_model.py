@@ -1,4 +1,4 @@
-"""The derivatives of the model are exact, and so is the least q_mobile."""
+"""The derivatives of the model are exact, and so is the least q_mobile; forecasts end at the cut-off."""
 
 from dataclasses import replace
 
@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from battery_env.electrochemistry import NEW_CELL, QNS, QPS, initial_state, simulate
-from battery_env.estimators.record_model import RecordModel
+from battery_env.estimates import Estimate
+from battery_env.estimators import ExtendedKalmanFilter, LeastSquares
+from battery_env.record_model import RecordModel
 
 CURRENT_A = np.repeat(np.random.default_rng(0).uniform(0.5, 2.5, 40), 75)
 PARTLY_DISCHARGED = simulate(2.0, 6000.0, 0.15, until=600.0, load_unit="current").state[-1]
@@ -108,3 +110,57 @@ def test_records_are_checked(changes, message):
 def test_arguments_are_checked(arguments, message):
     with pytest.raises(ValueError, match=message):
         RecordModel(**arguments)
+
+
+class TestForecast:
+    @pytest.mark.parametrize("cut_off_V", [3.2, 3.0, 2.7])
+    def test_it_is_the_simulated_one_to_within_a_step(self, cut_off_V):
+        record = simulate(2.0, 6000.0, 0.15, load_unit="current", cut_off_V=cut_off_V)
+        truth = Estimate(6000.0, 0.15)
+        for seen in (record, record.part(0, 900)):
+            eod_time_s = RecordModel().forecast(seen, truth, cut_off_V).eod_time_s
+            assert record.eod_time_s - 1.0 <= eod_time_s <= record.eod_time_s
+
+    def test_forecast_follows_the_record_and_ends_at_the_cut_off(self):
+        record = simulate(2.0, 6000.0, 0.15, load_unit="current")
+        time_s, voltage_V, *_ = RecordModel().forecast(record.part(0, 900), Estimate(6000.0, 0.15))
+        np.testing.assert_allclose(voltage_V[: len(record.time_s)], record.voltage_V, atol=1e-12)
+        assert voltage_V[-1] == 3.0 and (np.diff(time_s) > 0.0).all()
+
+    def test_time_counts_on_the_clock_of_the_record(self):
+        record = simulate(2.0, 6000.0, 0.15, load_unit="current")
+        later = replace(record, time_s=record.time_s + 1000.0)
+        truth, model = Estimate(6000.0, 0.15), RecordModel()
+        ends_s = [model.forecast(each, truth).eod_time_s for each in (record, later)]
+        assert ends_s[1] == pytest.approx(ends_s[0] + 1000.0)
+
+    def test_it_is_unknown_when_the_load_is_off(self):
+        current_A = np.where(np.arange(600) < 300, 2.0, 0.0)
+        record = simulate(current_A, 6000.0, 0.15, load_unit="current")
+        assert np.isnan(RecordModel().forecast(record, Estimate(6000.0, 0.15)).eod_time_s)
+
+    def test_predicted_voltage_ends_where_the_cell_is_empty(self):
+        record = simulate(8.0, 6000.0, 0.15)
+        voltage_V = RecordModel().voltage(record, Estimate(4000.0, 0.15))
+        assert np.isnan(voltage_V[-1]) and np.isfinite(voltage_V[: len(voltage_V) // 2]).all()
+
+    def test_it_holds_the_voltage_at_the_samples_also_below_the_cut_off(self):
+        record = simulate(2.0, 6000.0, 0.15, load_unit="current")
+        model, estimate = RecordModel(), Estimate(5600.0, 0.15)
+        forecast = model.forecast(record, estimate, cut_off_V=3.5)
+        assert forecast.eod_time_s == forecast.time_s[-1] < record.time_s[-1]
+        np.testing.assert_array_equal(forecast.at_samples_V, model.voltage(record, estimate))
+        assert np.nanmin(forecast.at_samples_V) < 3.4
+
+    @pytest.mark.parametrize("calibrator", [LeastSquares(), ExtendedKalmanFilter()], ids=["least squares", "Kalman filter"])
+    def test_it_takes_the_estimate_of_any_calibrator(self, calibrator):
+        record = simulate(2.0, 6000.0, 0.15, load_unit="current")
+        eod_time_s = RecordModel().forecast(record, calibrator.estimate(record)).eod_time_s
+        assert eod_time_s == pytest.approx(record.eod_time_s, rel=1e-3)
+
+    @pytest.mark.parametrize("at", [Estimate(np.nan, 0.1), Estimate(6000.0, np.nan)])
+    def test_it_needs_both_parameters(self, at):
+        record = simulate(2.0, 6000.0, 0.15, load_unit="current")
+        for of in (RecordModel().forecast, RecordModel().voltage):
+            with pytest.raises(ValueError, match="must lie within .* got nan"):
+                of(record, at)

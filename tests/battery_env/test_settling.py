@@ -8,8 +8,8 @@ import pytest
 from battery_env.cells import Discharge, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, simulate
 from battery_env.estimators import Estimate, ExtendedKalmanFilter, LeastSquares
-from battery_env.estimators.record_model import expected_current
 from battery_env.estimators.settling import sensor_reason, start_reason, white_noise_V
+from battery_env.records import expected_current
 
 CALIBRATORS = {
     "least squares": lambda **more: LeastSquares(thermal=True, mismatch_V=0.05, **more),
@@ -202,20 +202,20 @@ class TestForecasts:
         for stop in range(half, half + period, period // 4):
             seen = cut(record, 0, stop)
             assert expected_current(seen.time_s, seen.current_A).varied
-            errors.append(fit.predict_eod_time_s(seen, self.truth, 2.8) / record.time_s[-1] - 1.0)
+            errors.append(fit.model.forecast(seen, self.truth, 2.8).eod_time_s / record.time_s[-1] - 1.0)
         assert 0.0 < np.mean(errors) < 0.1  # under pulses the cut-off is reached earlier than under their mean
         assert np.max(errors) < 0.15
 
     def test_a_future_current_takes_the_place_of_the_assumption(self):
         record = simulated(np.where(np.arange(40_000) < 1000, 3.0, 1.0), 6500.0, 0.12, noise_V=1e-6)
         seen, fit = cut(record, 0, 900), LeastSquares(thermal=True)
-        assert fit.predict_eod_time_s(seen, self.truth, 2.8) < 0.6 * record.time_s[-1]
+        assert fit.model.forecast(seen, self.truth, 2.8).eod_time_s < 0.6 * record.time_s[-1]
         later = cut(record, 0, 1001)
-        assert fit.predict_eod_time_s(later, self.truth, 2.8, future_current_A=1.0) == pytest.approx(
+        assert fit.model.forecast(later, self.truth, 2.8, future_current_A=1.0).eod_time_s == pytest.approx(
             record.time_s[-1], abs=2.0
         )
         with pytest.raises(ValueError, match="future_current_A must be finite and at least 0 A, got nan"):
-            fit.forecast(seen, self.truth, future_current_A=np.nan)
+            fit.model.forecast(seen, self.truth, future_current_A=np.nan)
 
     def test_a_constant_load_goes_on_and_one_that_was_switched_off_does_not(self):
         time_s = np.arange(100.0)

@@ -13,17 +13,41 @@ out the same alone, in a batch of any size, and on any machine.
 from __future__ import annotations
 
 from math import sqrt
-from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from battery_env.arrays import FloatArray, IntArray
+from battery_env.electrochemistry.cell import (
+    BULK_RATE,
+    CONSTANTS_SIZE,
+    COOLING,
+    FRACTION_PER_SHARE,
+    PER_CURRENT_N,
+    PER_CURRENT_P,
+    QNB,
+    QNS,
+    QPB,
+    QPS,
+    R_OVER_F,
+    STATE_SIZE,
+    SURFACE_RATE,
+    SURROUNDINGS,
+    TB,
+    TO_RATE,
+    TSN_RATE,
+    TSP_RATE,
+    U0,
+    VO,
+    VSN,
+    VSP,
+    WARMING,
+    PackedConstants,
+)
 
-# The extended model holds mole fractions and the voltage that turns power into current inside these bounds, which no
-# discharge reaches above the cut-off
-_MOLE_FRACTION_MARGIN = 1e-3
+#: The extended model holds mole fractions this far inside 0 .. 1, and the voltage that turns power into current above this;
+#: no discharge comes to either above the cut-off.
+MOLE_FRACTION_MARGIN = 1e-3
 _VOLTAGE_FLOOR_V = 1.0
 
 # ln(x) for x = 2^k * m, m within sqrt(1/2) .. sqrt(2): bit patterns of float64, and the polynomial of (ln(1 + f) - 2 s) / s in
@@ -39,28 +63,13 @@ _L5, _L6, _L7 = 1.818357216161805012e-01, 1.531383769920937332e-01, 1.4798198605
 #: A block of cells is one array: rows of this many values, of states, of what else a step needs, and of constants. Rows start
 #: at multiples that the compiler knows, so that it sees that they do not overlap.
 BLOCK = 64
-_LOAD, _Q, _R_O, _XN, _XP, _CONSTANTS = 8, 9, 10, 11, 12, 14
+_LOAD, _Q, _R_O, _XN, _XP, _VOLTAGE, _CONSTANTS = range(STATE_SIZE, STATE_SIZE + 7)
 #: Where the voltages of a block start, and how long a block is.
-VOLTAGE, BLOCK_SIZE = 13 * BLOCK, 28 * BLOCK
+VOLTAGE, BLOCK_SIZE = _VOLTAGE * BLOCK, (_CONSTANTS + CONSTANTS_SIZE) * BLOCK
 
 _compiled = njit(cache=True, error_model="numpy")
 # the compiler makes vector loops only of what is inlined
 _inlined = njit(cache=True, error_model="numpy", forceinline=True)
-
-
-class PackedConstants(NamedTuple):
-    """
-    What the kernels read: constants of the equations, and both equilibrium-potential polynomials in y = 2x - 1.
-
-    :param constants: one row for all cells or one row a cell, shape (1, 14) or (n, 14); ``CellParameters.packed`` says what
-        the columns are
-    :param polynomial_n: of the negative electrode, V, lowest power first, shape (14,)
-    :param polynomial_p: of the positive electrode, V, shape (14,)
-    """
-
-    constants: FloatArray
-    polynomial_n: FloatArray
-    polynomial_p: FloatArray
 
 
 @_inlined
@@ -103,8 +112,8 @@ def _fraction(share: float, charge: float, extended: bool) -> float:
     # comparisons in place of min and max: NaN stays NaN
     fraction = share * charge
     if extended:
-        fraction = _MOLE_FRACTION_MARGIN if fraction < _MOLE_FRACTION_MARGIN else fraction
-        fraction = 1.0 - _MOLE_FRACTION_MARGIN if fraction > 1.0 - _MOLE_FRACTION_MARGIN else fraction
+        fraction = MOLE_FRACTION_MARGIN if fraction < MOLE_FRACTION_MARGIN else fraction
+        fraction = 1.0 - MOLE_FRACTION_MARGIN if fraction > 1.0 - MOLE_FRACTION_MARGIN else fraction
     return fraction
 
 
@@ -115,10 +124,21 @@ def _has_voltage(xn: float, xp: float) -> bool:
 
 
 @_inlined
+def nernst_logarithm(xn: float, xp: float) -> float:
+    # of both Nernst terms at once, which R * Tb / F makes a voltage
+    return logarithm((1.0 - xp) * xn / (xp * (1.0 - xn)))
+
+
+@_inlined
+def diffusion(bulk: float, surface: float, bulk_rate: float, surface_rate: float) -> float:
+    # from the bulk to the surface of an electrode
+    return bulk * bulk_rate - surface * surface_rate
+
+
+@_inlined
 def _equilibrium(xn: float, xp: float, tb: float, gas: float, u0: float, poly_n: FloatArray, poly_p: FloatArray) -> float:
-    # Vep(xp) - Ven(xn); both logarithms of the Nernst terms are taken as one
-    nernst = gas * tb * logarithm((1.0 - xp) * xn / (xp * (1.0 - xn)))
-    return u0 + nernst + (polynomial(poly_p, 2.0 * xp - 1.0) - polynomial(poly_n, 2.0 * xn - 1.0))
+    # Vep(xp) - Ven(xn)
+    return u0 + gas * tb * nernst_logarithm(xn, xp) + (polynomial(poly_p, 2.0 * xp - 1.0) - polynomial(poly_n, 2.0 * xn - 1.0))
 
 
 @_inlined
@@ -130,9 +150,9 @@ def _current(load: float, voltage: float, extended: bool) -> float:
 
 
 @_inlined
-def _overpotential(i: float, x: float, scale: float, area: float) -> float:
-    # what Vsn or Vsp relaxes to: Butler-Volmer with alpha = 1/2, J0 = k * sqrt(x * (1 - x))
-    return scale * asinh_ratio(i * area, (1.0 - x) * x)
+def _overpotential(i: float, x: float, scale: float, per_current: float) -> float:
+    # what Vsn or Vsp relaxes to: Butler-Volmer with alpha = 1/2, J0 = k * sqrt(x * (1 - x)); scale: 2 * R * Tb / F
+    return scale * asinh_ratio(i * per_current, (1.0 - x) * x)
 
 
 @_inlined
@@ -144,17 +164,17 @@ def _euler(
     r_o: float,
     dt: float,
     thermal: bool,
-    k: tuple[float, float, float, float, float, float, float, float, float, float, float, float],
+    k: tuple[float, float, float, float, float, float, float, float, float, float, float],
 ) -> tuple[float, float, float, float, float, float, float, float]:
-    # One step of explicit Euler of the state x under the current i; k: the constants, without those of the voltage
+    # One step of explicit Euler of the state x under the current i; k: the constants that it needs
     tb, vo, vsn, vsp, qnb, qns, qpb, qps = x
-    by_bulk, by_surface, gas, two, area_n, area_p, rate_o, rate_n, rate_p, heat, cooling, surroundings = k
-    scale = gas * tb * two
+    bulk_rate, surface_rate, gas, per_current_n, per_current_p, rate_o, rate_n, rate_p, heat, cooling, surroundings = k
+    scale = 2.0 * gas * tb
     has_voltage = _has_voltage(xn, xp)
-    vsn_nominal = _overpotential(i, xn, scale, area_n) if has_voltage else np.nan
-    vsp_nominal = _overpotential(i, xp, scale, area_p) if has_voltage else np.nan
-    diffusion_n = qnb * by_bulk - qns * by_surface
-    diffusion_p = qpb * by_bulk - qps * by_surface
+    vsn_nominal = _overpotential(i, xn, scale, per_current_n) if has_voltage else np.nan
+    vsp_nominal = _overpotential(i, xp, scale, per_current_p) if has_voltage else np.nan
+    diffusion_n = diffusion(qnb, qns, bulk_rate, surface_rate)
+    diffusion_p = diffusion(qpb, qps, bulk_rate, surface_rate)
     warming = dt * ((vo + vsn + vsp) * i * heat + (surroundings - tb) * cooling)
     return (
         tb + warming if thermal else tb,
@@ -170,7 +190,7 @@ def _euler(
 
 @_compiled
 def mole_fraction(surface_charge: float, q: float, extended: bool, constants: FloatArray, c: int) -> float:
-    return _fraction(constants[c, 0] / q, surface_charge, extended)
+    return _fraction(constants[c, FRACTION_PER_SHARE] / q, surface_charge, extended)
 
 
 @_compiled
@@ -178,14 +198,14 @@ def equilibrium_voltage(
     xn: float, xp: float, tb: float, constants: FloatArray, c: int, poly_n: FloatArray, poly_p: FloatArray
 ) -> float:
     # for mole fractions inside 0 .. 1
-    return _equilibrium(xn, xp, tb, constants[c, 3], constants[c, 10], poly_n, poly_p)
+    return _equilibrium(xn, xp, tb, constants[c, R_OVER_F], constants[c, U0], poly_n, poly_p)
 
 
 @_compiled
 def nominal_overpotentials(i: float, xn: float, xp: float, tb: float, constants: FloatArray, c: int) -> tuple[float, float]:
     # for mole fractions inside 0 .. 1
-    scale = constants[c, 3] * tb * constants[c, 4]
-    return _overpotential(i, xn, scale, constants[c, 5]), _overpotential(i, xp, scale, constants[c, 6])
+    scale = 2.0 * constants[c, R_OVER_F] * tb
+    return _overpotential(i, xn, scale, constants[c, PER_CURRENT_N]), _overpotential(i, xp, scale, constants[c, PER_CURRENT_P])
 
 
 @_inlined
@@ -194,17 +214,17 @@ def cell_voltage(
     n: int,
     q: float,
     extended: bool,
-    constants: FloatArray,
+    packed: PackedConstants,
     c: int,
-    poly_n: FloatArray,
-    poly_p: FloatArray,
 ) -> float:
     # V = Vep(xp) - Ven(xn) - Vo - Vsn - Vsp
-    share = constants[c, 0] / q
-    xn, xp = _fraction(share, x[n, 5], extended), _fraction(share, x[n, 7], extended)
+    constants, poly_n, poly_p = packed
+    share = constants[c, FRACTION_PER_SHARE] / q
+    xn, xp = _fraction(share, x[n, QNS], extended), _fraction(share, x[n, QPS], extended)
     if not _has_voltage(xn, xp):
         return np.nan
-    return _equilibrium(xn, xp, x[n, 0], constants[c, 3], constants[c, 10], poly_n, poly_p) - x[n, 1] - x[n, 2] - x[n, 3]
+    equilibrium = _equilibrium(xn, xp, x[n, TB], constants[c, R_OVER_F], constants[c, U0], poly_n, poly_p)
+    return equilibrium - x[n, VO] - x[n, VSN] - x[n, VSP]
 
 
 @_inlined
@@ -223,26 +243,25 @@ def cell_step(
     m: int,
 ) -> None:
     # One step of row n of x, into row m of out; may work in place
-    share = constants[c, 0] / q
-    xn, xp = _fraction(share, x[n, 5], extended), _fraction(share, x[n, 7], extended)
-    state = (x[n, 0], x[n, 1], x[n, 2], x[n, 3], x[n, 4], x[n, 5], x[n, 6], x[n, 7])
+    share = constants[c, FRACTION_PER_SHARE] / q
+    xn, xp = _fraction(share, x[n, QNS], extended), _fraction(share, x[n, QPS], extended)
+    state = (x[n, TB], x[n, VO], x[n, VSN], x[n, VSP], x[n, QNB], x[n, QNS], x[n, QPB], x[n, QPS])
     k = (
-        constants[c, 1],
-        constants[c, 2],
-        constants[c, 3],
-        constants[c, 4],
-        constants[c, 5],
-        constants[c, 6],
-        constants[c, 7],
-        constants[c, 8],
-        constants[c, 9],
-        constants[c, 11],
-        constants[c, 12],
-        constants[c, 13],
+        constants[c, BULK_RATE],
+        constants[c, SURFACE_RATE],
+        constants[c, R_OVER_F],
+        constants[c, PER_CURRENT_N],
+        constants[c, PER_CURRENT_P],
+        constants[c, TO_RATE],
+        constants[c, TSN_RATE],
+        constants[c, TSP_RATE],
+        constants[c, WARMING],
+        constants[c, COOLING],
+        constants[c, SURROUNDINGS],
     )
     y = _euler(state, i, xn, xp, r_o, dt, thermal, k)
-    out[m, 0], out[m, 1], out[m, 2], out[m, 3] = y[0], y[1], y[2], y[3]
-    out[m, 4], out[m, 5], out[m, 6], out[m, 7] = y[4], y[5], y[6], y[7]
+    out[m, TB], out[m, VO], out[m, VSN], out[m, VSP] = y[0], y[1], y[2], y[3]
+    out[m, QNB], out[m, QNS], out[m, QPB], out[m, QPS] = y[4], y[5], y[6], y[7]
 
 
 @_inlined
@@ -264,17 +283,17 @@ def fill_block(
     # Take ``cells`` cells, from row ``first`` on, into a block of shape (BLOCK_SIZE,); the first block is the largest
     for j in range(cells):
         n = first + j
-        for k in range(8):
+        for k in range(STATE_SIZE):
             block[k * BLOCK + j] = state[n, k]
         block[_LOAD * BLOCK + j] = load[n]
         block[_Q * BLOCK + j] = q[n]
         block[_R_O * BLOCK + j] = r_o[n]
     if constants.shape[0] > 1:
         for j in range(cells):
-            for k in range(14):
+            for k in range(CONSTANTS_SIZE):
                 block[(_CONSTANTS + k) * BLOCK + j] = constants[first + j, k]
     elif first == 0:
-        for k in range(14):
+        for k in range(CONSTANTS_SIZE):
             for j in range(cells):
                 block[(_CONSTANTS + k) * BLOCK + j] = constants[0, k]
 
@@ -285,18 +304,18 @@ def voltage_of_block(block: FloatArray, cells: int, extended: bool, poly_n: Floa
     _fractions_of_block(block, cells, extended)
     for j in range(cells):
         xn, xp = block[_XN * BLOCK + j], block[_XP * BLOCK + j]
-        gas, u0 = block[(_CONSTANTS + 3) * BLOCK + j], block[(_CONSTANTS + 10) * BLOCK + j]
-        equilibrium = _equilibrium(xn, xp, block[j], gas, u0, poly_n, poly_p)
-        volts = equilibrium - block[BLOCK + j] - block[2 * BLOCK + j] - block[3 * BLOCK + j]
+        gas, u0 = block[(_CONSTANTS + R_OVER_F) * BLOCK + j], block[(_CONSTANTS + U0) * BLOCK + j]
+        equilibrium = _equilibrium(xn, xp, block[TB * BLOCK + j], gas, u0, poly_n, poly_p)
+        volts = equilibrium - block[VO * BLOCK + j] - block[VSN * BLOCK + j] - block[VSP * BLOCK + j]
         block[VOLTAGE + j] = volts if _has_voltage(xn, xp) else np.nan
 
 
 @_compiled
 def _fractions_of_block(block: FloatArray, cells: int, extended: bool) -> None:
     for j in range(cells):
-        share = block[_CONSTANTS * BLOCK + j] / block[_Q * BLOCK + j]
-        block[_XN * BLOCK + j] = _fraction(share, block[5 * BLOCK + j], extended)
-        block[_XP * BLOCK + j] = _fraction(share, block[7 * BLOCK + j], extended)
+        share = block[(_CONSTANTS + FRACTION_PER_SHARE) * BLOCK + j] / block[_Q * BLOCK + j]
+        block[_XN * BLOCK + j] = _fraction(share, block[QNS * BLOCK + j], extended)
+        block[_XP * BLOCK + j] = _fraction(share, block[QPS * BLOCK + j], extended)
 
 
 @_compiled
@@ -321,45 +340,44 @@ def step_of_block(
             block[_LOAD * BLOCK + j] = _current(block[_LOAD * BLOCK + j], block[VOLTAGE + j], extended)
     for j in range(cells):
         x = (
-            block[j],
-            block[BLOCK + j],
-            block[2 * BLOCK + j],
-            block[3 * BLOCK + j],
-            block[4 * BLOCK + j],
-            block[5 * BLOCK + j],
-            block[6 * BLOCK + j],
-            block[7 * BLOCK + j],
+            block[TB * BLOCK + j],
+            block[VO * BLOCK + j],
+            block[VSN * BLOCK + j],
+            block[VSP * BLOCK + j],
+            block[QNB * BLOCK + j],
+            block[QNS * BLOCK + j],
+            block[QPB * BLOCK + j],
+            block[QPS * BLOCK + j],
         )
         k = (
-            block[(_CONSTANTS + 1) * BLOCK + j],
-            block[(_CONSTANTS + 2) * BLOCK + j],
-            block[(_CONSTANTS + 3) * BLOCK + j],
-            block[(_CONSTANTS + 4) * BLOCK + j],
-            block[(_CONSTANTS + 5) * BLOCK + j],
-            block[(_CONSTANTS + 6) * BLOCK + j],
-            block[(_CONSTANTS + 7) * BLOCK + j],
-            block[(_CONSTANTS + 8) * BLOCK + j],
-            block[(_CONSTANTS + 9) * BLOCK + j],
-            block[(_CONSTANTS + 11) * BLOCK + j],
-            block[(_CONSTANTS + 12) * BLOCK + j],
-            block[(_CONSTANTS + 13) * BLOCK + j],
+            block[(_CONSTANTS + BULK_RATE) * BLOCK + j],
+            block[(_CONSTANTS + SURFACE_RATE) * BLOCK + j],
+            block[(_CONSTANTS + R_OVER_F) * BLOCK + j],
+            block[(_CONSTANTS + PER_CURRENT_N) * BLOCK + j],
+            block[(_CONSTANTS + PER_CURRENT_P) * BLOCK + j],
+            block[(_CONSTANTS + TO_RATE) * BLOCK + j],
+            block[(_CONSTANTS + TSN_RATE) * BLOCK + j],
+            block[(_CONSTANTS + TSP_RATE) * BLOCK + j],
+            block[(_CONSTANTS + WARMING) * BLOCK + j],
+            block[(_CONSTANTS + COOLING) * BLOCK + j],
+            block[(_CONSTANTS + SURROUNDINGS) * BLOCK + j],
         )
         i, r_o = block[_LOAD * BLOCK + j], block[_R_O * BLOCK + j]
         y = _euler(x, i, block[_XN * BLOCK + j], block[_XP * BLOCK + j], r_o, dt, thermal, k)
-        block[j] = y[0]
-        block[BLOCK + j] = y[1]
-        block[2 * BLOCK + j] = y[2]
-        block[3 * BLOCK + j] = y[3]
-        block[4 * BLOCK + j] = y[4]
-        block[5 * BLOCK + j] = y[5]
-        block[6 * BLOCK + j] = y[6]
-        block[7 * BLOCK + j] = y[7]
+        block[TB * BLOCK + j] = y[0]
+        block[VO * BLOCK + j] = y[1]
+        block[VSN * BLOCK + j] = y[2]
+        block[VSP * BLOCK + j] = y[3]
+        block[QNB * BLOCK + j] = y[4]
+        block[QNS * BLOCK + j] = y[5]
+        block[QPB * BLOCK + j] = y[6]
+        block[QPS * BLOCK + j] = y[7]
 
 
 @_compiled
 def states_of_block(block: FloatArray, first: int, cells: int, out: FloatArray) -> None:
     for j in range(cells):
-        for k in range(8):
+        for k in range(STATE_SIZE):
             out[first + j, k] = block[k * BLOCK + j]
 
 
@@ -368,16 +386,14 @@ def voltage_batch(
     state: FloatArray,
     q: FloatArray,
     extended: bool,
-    constants: FloatArray,
-    poly_n: FloatArray,
-    poly_p: FloatArray,
+    packed: PackedConstants,
     out: FloatArray,
 ) -> None:
     block = np.empty(BLOCK_SIZE)
     for first in range(0, out.shape[0], BLOCK):
         cells = min(BLOCK, out.shape[0] - first)
-        fill_block(block, first, cells, state, q, q, q, constants)  # load and r_o play no part
-        voltage_of_block(block, cells, extended, poly_n, poly_p)
+        fill_block(block, first, cells, state, q, q, q, packed.constants)  # load and r_o play no part
+        voltage_of_block(block, cells, extended, packed.polynomial_n, packed.polynomial_p)
         for j in range(cells):
             out[first + j] = block[VOLTAGE + j]
 
@@ -392,16 +408,14 @@ def step_batch(
     power: bool,
     thermal: bool,
     extended: bool,
-    constants: FloatArray,
-    poly_n: FloatArray,
-    poly_p: FloatArray,
+    packed: PackedConstants,
     out: FloatArray,
 ) -> None:
     block = np.empty(BLOCK_SIZE)
     for first in range(0, out.shape[0], BLOCK):
         cells = min(BLOCK, out.shape[0] - first)
-        fill_block(block, first, cells, state, load, q, r_o, constants)
-        step_of_block(block, cells, dt, power, power, thermal, extended, poly_n, poly_p)
+        fill_block(block, first, cells, state, load, q, r_o, packed.constants)
+        step_of_block(block, cells, dt, power, power, thermal, extended, packed.polynomial_n, packed.polynomial_p)
         states_of_block(block, first, cells, out)
 
 
@@ -409,29 +423,27 @@ def step_batch(
 def advance_batch(
     state: FloatArray,
     load: FloatArray,
-    first: NDArray[np.int64],
-    steps: NDArray[np.int64],
+    first: IntArray,
+    steps: IntArray,
     q: FloatArray,
     r_o: FloatArray,
     dt: float,
     power: bool,
     thermal: bool,
     extended: bool,
-    constants: FloatArray,
-    poly_n: FloatArray,
-    poly_p: FloatArray,
+    packed: PackedConstants,
 ) -> None:
     # the cells with most steps come first, so that those of a block that are still on their way are always its first ones
     block = np.empty(BLOCK_SIZE)
     for start in range(0, state.shape[0], BLOCK):
         cells = running = min(BLOCK, state.shape[0] - start)
-        fill_block(block, start, cells, state, q, q, r_o, constants)  # the load comes below
+        fill_block(block, start, cells, state, q, q, r_o, packed.constants)  # the load comes below
         for k in range(steps[start]):
             while steps[start + running - 1] <= k:
                 running -= 1
             for j in range(running):
                 block[_LOAD * BLOCK + j] = load[first[start + j] + k]
-            step_of_block(block, running, dt, power, power, thermal, extended, poly_n, poly_p)
+            step_of_block(block, running, dt, power, power, thermal, extended, packed.polynomial_n, packed.polynomial_p)
         states_of_block(block, start, cells, state)
 
 
@@ -444,9 +456,7 @@ def roll_out(
     cut_off: float,
     power: bool,
     thermal: bool,
-    constants: FloatArray,
-    poly_n: FloatArray,
-    poly_p: FloatArray,
+    packed: PackedConstants,
     state: FloatArray,
     voltage: FloatArray,
     current: FloatArray,
@@ -455,9 +465,9 @@ def roll_out(
     # voltage is a number and at least the cut-off; returns how many they are. The condition is written so that NaN ends
     # the discharge too: near its end V can fall from 3.3 V to NaN in one step.
     for k in range(load.shape[0]):
-        voltage[k] = cell_voltage(state, k, q, False, constants, 0, poly_n, poly_p)
+        voltage[k] = cell_voltage(state, k, q, False, packed, 0)
         if not voltage[k] >= cut_off:
             return k
         current[k] = cell_current(load[k], power, voltage[k], False)
-        cell_step(state, k, current[k], q, r_o, dt, thermal, False, constants, 0, state, k + 1)
+        cell_step(state, k, current[k], q, r_o, dt, thermal, False, packed.constants, 0, state, k + 1)
     return int(load.shape[0])

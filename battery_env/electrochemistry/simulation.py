@@ -1,0 +1,371 @@
+"""The public functions of the model: voltage, one step, and whole discharges."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from numbers import Real
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from battery_env.arrays import FloatArray, IntArray
+from battery_env.checks import LoadUnit, check_load, check_numbers
+from battery_env.electrochemistry.cell import (
+    FULL_CHARGE_SHARES,
+    QNB,
+    QNS,
+    STATE_NAMES,
+    STATE_SIZE,
+    TB,
+    CellParameters,
+    PackedConstants,
+    check_cell,
+    check_dt,
+)
+from battery_env.electrochemistry.kernels import advance_batch, roll_out, step_batch, voltage_batch
+from battery_env.parameters import Q_MOBILE, R_O
+
+_MAX_STEPS = 1e8  # of one simulation, in memory
+
+
+def _aged(
+    cell: CellParameters | None, q_mobile: ArrayLike | None, r_o: ArrayLike | None = None, thermal: bool = False
+) -> tuple[CellParameters, FloatArray, FloatArray]:
+    """What was given of a cell, checked: its constants, and its age, which is that of the constants where it is not given."""
+    constants = check_cell(cell, thermal)
+    q = constants.q_mobile if q_mobile is None else q_mobile
+    return constants, Q_MOBILE.check(q), R_O.check(constants.r_o if r_o is None else r_o)
+
+
+def initial_state(q_mobile: ArrayLike | None = None, cell: CellParameters | None = None) -> FloatArray:
+    """
+    The state of a fully charged cell at rest: V = 4.191350 V for every ``q_mobile``.
+
+    :param q_mobile: charge that can move, C, shape (...); ``None``: the cell's
+    :param cell: constants of the cell; ``None``: the new cell's
+    :return: state, shape (..., 8)
+    :raises ValueError: if ``q_mobile`` is out of range
+    """
+    constants, q, _ = _aged(cell, q_mobile)
+    state = np.zeros((*q.shape, STATE_SIZE))
+    state[..., TB] = constants.Tb0
+    state[..., QNB:] = q[..., None] * FULL_CHARGE_SHARES
+    return state
+
+
+def _check_state(state: ArrayLike) -> FloatArray:
+    array = check_numbers("state", state)
+    if array.ndim == 0 or array.shape[-1] != STATE_SIZE:
+        raise ValueError(f"state must have shape (..., {STATE_SIZE}) in the order {STATE_NAMES}, got shape {array.shape}")
+    return array
+
+
+def _flat(array: FloatArray, shape: tuple[int, ...], *tail: int) -> FloatArray:
+    return np.array(np.broadcast_to(array, shape + tail), order="C").reshape(-1, *tail)
+
+
+def voltage(state: ArrayLike, q_mobile: ArrayLike | None = None, cell: CellParameters | None = None) -> FloatArray:
+    """
+    The terminal voltage, V = V_e,p(x_p) - V_e,n(x_n) - Vo - Vsn - Vsp.
+
+    :param state: shape (..., 8)
+    :param q_mobile: charge that can move, C, shape (...); ``None``: the cell's
+    :param cell: constants of the cell; ``None``: the new cell's
+    :return: voltage in V, shape (...); NaN where an electrode is empty or overfull
+    :raises ValueError: for a wrong shape, or ``q_mobile`` out of range
+    """
+    constants, q, _ = _aged(cell, q_mobile)
+    x = _check_state(state)
+    shape = np.broadcast_shapes(x.shape[:-1], q.shape)
+    out = np.empty(int(np.prod(shape)))
+    voltage_into(out, _flat(x, shape, STATE_SIZE), _flat(q, shape), constants.packed)
+    return out.reshape(shape)[()]
+
+
+def step(
+    state: ArrayLike,
+    load: ArrayLike,
+    q_mobile: ArrayLike | None = None,
+    r_o: ArrayLike | None = None,
+    dt: float = 1.0,
+    load_unit: LoadUnit = "power",
+    thermal: bool = False,
+    cell: CellParameters | None = None,
+) -> FloatArray:
+    """
+    One step of explicit Euler. All array arguments broadcast over the leading axes of ``state``.
+
+    With power as the load the current is i = P / V(state); where the state has no positive voltage the result is NaN.
+
+    :param state: shape (..., 8)
+    :param load: power in W or current in A over the step (positive discharges), shape (...)
+    :param q_mobile: charge that can move, C, shape (...); ``None``: the cell's
+    :param r_o: ohmic resistance, ohm, shape (...); ``None``: the cell's
+    :param dt: time step, s
+    :param load_unit: ``"power"`` or ``"current"``
+    :param thermal: whether the temperature follows progpy's heat balance; otherwise it stays as it is
+    :param cell: constants of the cell; ``None``: the new cell's
+    :return: the next state, shape (..., 8)
+    :raises ValueError: for a wrong shape, or a value out of range
+    """
+    constants, q, r = _aged(cell, q_mobile, r_o, thermal)
+    x, u = _check_state(state), check_load(load, load_unit)
+    shape = np.broadcast_shapes(x.shape[:-1], u.shape, q.shape, r.shape)
+    out = np.empty((int(np.prod(shape)), STATE_SIZE))
+    step_into(
+        out,
+        _flat(x, shape, STATE_SIZE),
+        _flat(u, shape),
+        _flat(q, shape),
+        _flat(r, shape),
+        check_dt(dt, constants),
+        load_unit,
+        thermal,
+        constants.packed,
+    )
+    return out.reshape((*shape, STATE_SIZE))
+
+
+def step_into(
+    out: FloatArray,
+    state: FloatArray,
+    load: FloatArray,
+    q_mobile: FloatArray,
+    r_o: FloatArray,
+    dt: float,
+    load_unit: LoadUnit,
+    thermal: bool,
+    packed: PackedConstants,
+    extended: bool = False,
+) -> None:
+    """
+    :func:`step` for inner loops: no checks, no broadcasting, no allocation; all arrays contiguous float64.
+
+    :param out: the next state, shape (n, 8); may be ``state`` itself
+    :param state: shape (n, 8)
+    :param load: shape (n,)
+    :param q_mobile: shape (n,)
+    :param r_o: shape (n,)
+    :param dt: time step, s
+    :param load_unit: ``"power"`` or ``"current"``
+    :param thermal: whether the temperature moves
+    :param packed: ``CellParameters.packed``, or with one row a cell ``CellParameters.packed_with``
+    :param extended: continue the model where it is not defined: the same numbers wherever it is, but finite for a
+        ``q_mobile`` that the charges of ``state`` contradict (mole fractions kept within 0.001 .. 0.999), and in voltage
+        collapse (power is turned into current at 1 V or more). For calibrators, which try wrong parameters
+    """
+    step_batch(state, load, q_mobile, r_o, dt, load_unit == "power", thermal, extended, packed, out)
+
+
+def advance_in_place(
+    state: FloatArray,
+    load: FloatArray,
+    first: IntArray,
+    steps: IntArray,
+    q_mobile: FloatArray,
+    r_o: FloatArray,
+    dt: float,
+    load_unit: LoadUnit,
+    thermal: bool,
+    packed: PackedConstants,
+    extended: bool = False,
+) -> None:
+    """
+    Advance every cell by its own number of steps under its own stretch of ``load``; unchecked, like :func:`step_into`.
+
+    :param state: shape (n, 8), overwritten
+    :param load: the load profiles of all cells, end to end
+    :param first: where in ``load`` each cell starts, shape (n,)
+    :param steps: how many steps each cell takes, shape (n,)
+    :param q_mobile: shape (n,)
+    :param r_o: shape (n,)
+    :param dt: time step, s
+    :param load_unit: ``"power"`` or ``"current"``
+    :param thermal: whether the temperature moves
+    :param packed: ``CellParameters.packed``, or with one row a cell ``CellParameters.packed_with``
+    :param extended: as in :func:`step_into`
+    """
+    order = np.argsort(-steps)
+    ordered = packed if len(packed.constants) == 1 else packed._replace(constants=packed.constants[order])
+    ahead, flags = state[order], (load_unit == "power", thermal, extended)
+    advance_batch(ahead, load, first[order], steps[order], q_mobile[order], r_o[order], dt, *flags, ordered)
+    state[order] = ahead
+
+
+def voltage_into(
+    out: FloatArray, state: FloatArray, q_mobile: FloatArray, packed: PackedConstants, extended: bool = False
+) -> None:
+    """
+    :func:`voltage` for inner loops: no checks, no broadcasting, no allocation; all arrays contiguous float64.
+
+    :param out: voltage in V, shape (n,)
+    :param state: shape (n, 8)
+    :param q_mobile: shape (n,)
+    :param packed: ``CellParameters.packed``, or with one row a cell ``CellParameters.packed_with``
+    :param extended: as in :func:`step_into`
+    """
+    voltage_batch(state, q_mobile, extended, packed, out)
+
+
+def state_of_charge(state: FloatArray, q_mobile: FloatArray) -> FloatArray:
+    """
+    The share of ``q_mobile`` that is left in the negative electrode, 1 at full charge (progpy's ``SOC``).
+
+    :param state: shape (..., 8)
+    :param q_mobile: charge that can move, C, shape (...)
+    :return: shape (...)
+    """
+    return np.asarray((state[..., QNB] + state[..., QNS]) / q_mobile)
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """
+    A simulated discharge, or a part of one: consecutive samples, none below the cut-off voltage.
+
+    :param time_s: shape (T,)
+    :param state: shape (T, 8)
+    :param voltage_V: shape (T,)
+    :param current_A: current over the step that starts at each sample, shape (T,)
+    :param load: load over the step that starts at each sample, W or A, shape (T,)
+    :param load_unit: ``"power"`` or ``"current"``
+    :param cell: constants of the cell, with its own ``q_mobile`` and ``r_o``
+    :param dt_s: time step, s
+    :param thermal: whether the temperature moved
+    :param eod_time_s: time of the first sample below the cut-off (or without a voltage), the end of discharge, on the
+        clock of ``time_s``; NaN if the simulation stopped before
+    """
+
+    time_s: FloatArray
+    state: FloatArray
+    voltage_V: FloatArray
+    current_A: FloatArray
+    load: FloatArray
+    load_unit: LoadUnit
+    cell: CellParameters
+    dt_s: float
+    thermal: bool
+    eod_time_s: float
+
+    @property
+    def q_mobile(self) -> float:
+        """Charge that can move, C."""
+        return self.cell.q_mobile
+
+    @property
+    def r_o(self) -> float:
+        """Ohmic resistance, ohm."""
+        return self.cell.r_o
+
+    def part(self, first: int, stop: int) -> Trajectory:
+        """
+        The samples ``first`` .. ``stop - 1``; time keeps its origin.
+
+        :param first: first sample
+        :param stop: one past the last sample
+        :return: the part
+        """
+        window = slice(first, stop)
+        return replace(
+            self,
+            time_s=self.time_s[window],
+            state=self.state[window],
+            voltage_V=self.voltage_V[window],
+            current_A=self.current_A[window],
+            load=self.load[window],
+        )
+
+
+def simulate(
+    load: float | ArrayLike | Callable[[FloatArray], ArrayLike],
+    q_mobile: float | None = None,
+    r_o: float | None = None,
+    until: Literal["eod"] | float = "eod",
+    dt: float = 1.0,
+    load_unit: LoadUnit = "power",
+    thermal: bool = False,
+    cell: CellParameters | None = None,
+    initial: ArrayLike | None = None,
+    cut_off_V: float | None = None,
+    max_duration_s: float = 86_400.0,
+) -> Trajectory:
+    """
+    Discharge one cell under a load, from full charge (or from ``initial``), compiled.
+
+    :param load: a number; an array, one value a step; or a function of time in s (a :class:`battery_env.loads.Load`)
+        that takes an array. Power in W or current in A
+    :param q_mobile: charge that can move, C; ``None``: the cell's
+    :param r_o: ohmic resistance, ohm; ``None``: the cell's
+    :param until: ``"eod"`` (the end of discharge) or a duration in s, whichever of the two comes first
+    :param dt: time step, s
+    :param load_unit: ``"power"`` or ``"current"``
+    :param thermal: whether the temperature moves
+    :param cell: constants of the cell; ``None``: the new cell's
+    :param initial: state at the start, shape (8,); ``None``: full charge at rest
+    :param cut_off_V: voltage at which the discharge ends, V; ``None``: the constants' ``VEOD``
+    :param max_duration_s: where to stop if the discharge does not end by itself (a load of zero), s
+    :return: the samples down to the cut-off, and the time of the end of discharge
+    :raises ValueError: for a value out of range
+    """
+    constants, q, r = _aged(cell, q_mobile, r_o, thermal)
+    dt = check_dt(dt, constants)
+    if q.ndim or r.ndim:
+        raise ValueError(f"q_mobile and r_o must be single numbers, got shapes {q.shape} and {r.shape}")
+    given_unit = getattr(load, "unit", load_unit)
+    if given_unit != load_unit:
+        raise ValueError(f"the load is a {given_unit}, but load_unit is {load_unit!r}: give load_unit={given_unit!r}")
+    if until != "eod" and not (isinstance(until, (int, float)) and 0.0 < until <= max_duration_s):
+        raise ValueError(f"until must be 'eod' or a duration within 0 .. {max_duration_s:g} s, got {until!r}")
+    duration_s = max_duration_s if until == "eod" else float(until)
+    if not isinstance(max_duration_s, Real) or not 0.0 < max_duration_s / dt <= _MAX_STEPS:
+        raise ValueError(
+            f"max_duration_s must be greater than 0 and at most {_MAX_STEPS:g} steps of dt, got {max_duration_s!r}"
+        )
+    n_samples = int(np.floor(duration_s / dt + 1e-9)) + 1
+    if callable(load):
+        loads = check_numbers("load", load(dt * np.arange(n_samples, dtype=np.float64)))
+    else:
+        loads = check_numbers("load", load)
+        if loads.ndim == 1:
+            n_samples = min(n_samples, len(loads))
+    if loads.ndim == 0:
+        loads = np.full(n_samples, check_load(loads, load_unit))
+    else:
+        loads = check_load(loads[..., :n_samples], load_unit)
+    if loads.shape != (n_samples,) or n_samples == 0:
+        raise ValueError(f"load must be a number or one value a step, shape (steps,), got shape {loads.shape}")
+    start = initial_state(q, constants) if initial is None else _check_state(initial)
+    if start.shape != (STATE_SIZE,):
+        raise ValueError(f"initial must have shape ({STATE_SIZE},), got {start.shape}")
+    cut_off = constants.VEOD if cut_off_V is None else cut_off_V
+    if not isinstance(cut_off, Real) or np.isnan(cut_off):
+        raise ValueError(f"cut_off_V must be a number or None, got {cut_off_V!r}")
+    state, volts, amperes = np.empty((n_samples + 1, STATE_SIZE)), np.empty(n_samples), np.empty(n_samples)
+    state[0] = start
+    flags = (load_unit == "power", thermal)
+    n = roll_out(
+        np.require(loads, requirements=["C", "W"]),
+        float(q),
+        float(r),
+        dt,
+        cut_off,
+        *flags,
+        constants.packed,
+        state,
+        volts,
+        amperes,
+    )
+    return Trajectory(
+        time_s=dt * np.arange(n, dtype=np.float64),
+        state=state[:n].copy(),
+        voltage_V=volts[:n].copy(),
+        current_A=amperes[:n].copy(),
+        load=np.array(loads[:n]),
+        load_unit=load_unit,
+        cell=constants.replace(q_mobile=float(q), r_o=float(r)),
+        dt_s=dt,
+        thermal=bool(thermal),
+        eod_time_s=n * dt if n < n_samples else float("nan"),
+    )

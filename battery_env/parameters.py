@@ -1,0 +1,86 @@
+"""What can be calibrated: the two parameters of the model that age."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+
+from numpy.typing import ArrayLike
+
+from battery_env.arrays import FloatArray
+from battery_env.checks import check_within
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """
+    A parameter of the model that can be calibrated.
+
+    :param name: its name in code and in tables
+    :param symbol: its symbol, as TeX
+    :param unit: its unit in code and in messages
+    :param limits: least and largest value; they catch mistakes in the unit, and nonsense
+    :param hint: what a value beyond them usually is, a sentence
+    """
+
+    name: str
+    symbol: str
+    unit: str
+    limits: tuple[float, float]
+    hint: str
+
+    @property
+    def label(self) -> str:
+        """Symbol and unit, for the axis of a figure."""
+        return f"{self.symbol} ({_UNIT_SYMBOLS[self.unit]})"
+
+    def check(self, values: ArrayLike) -> FloatArray:
+        """
+        Refuse values that cannot be meant.
+
+        :param values: in the unit of the parameter, any shape
+        :return: the same as a float64 array
+        :raises TypeError: for what is no number
+        :raises ValueError: outside the limits
+        """
+        return check_within(self.name, values, self.limits, self.unit, self.hint)
+
+    def check_bounds(self, name: str, bounds: tuple[float, float]) -> tuple[float, float]:
+        """
+        Refuse bounds of a search that cannot be meant.
+
+        :param name: what they are called, for the message
+        :param bounds: lower and upper one, in the unit of the parameter
+        :return: the same
+        :raises TypeError: for what is no number
+        :raises ValueError: if they are outside the limits or not in order
+        """
+        ends = self.check(bounds)
+        if ends.shape != (2,) or not ends[0] < ends[1]:
+            raise ValueError(f"{name} must be (lower, upper) with lower < upper, got {bounds!r}")
+        return bounds
+
+
+_UNIT_SYMBOLS = {"C": "C", "ohm": r"$\Omega$"}
+
+Q_MOBILE = Parameter("q_mobile", "$q^{max}$", "C", (100.0, 1e6), "Ampere-hours become coulombs times 3600.")
+R_O = Parameter("r_o", "$R_o$", "ohm", (0.0, 5.0), "Milliohms become ohms divided by 1000.")
+
+#: What can be calibrated, by name.
+PARAMETERS: Mapping[str, Parameter] = MappingProxyType({parameter.name: parameter for parameter in (Q_MOBILE, R_O)})
+PARAMETER_NAMES: tuple[str, ...] = tuple(PARAMETERS)
+
+
+def check_parameters(parameters: Sequence[str]) -> tuple[str, ...]:
+    """
+    Refuse a choice of parameters that cannot be searched for.
+
+    :param parameters: their names
+    :return: the same as a tuple
+    :raises ValueError: unless they are one or both of ``PARAMETER_NAMES``
+    """
+    names = tuple(parameters)
+    if not names or len(set(names)) < len(names) or set(names) - set(PARAMETERS):
+        raise ValueError(f"parameters must be one or both of {PARAMETER_NAMES}, got {parameters!r}")
+    return names

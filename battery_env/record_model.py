@@ -1,0 +1,223 @@
+"""The model under the current of a record: what it shows then and afterwards, and how that depends on both parameters."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from battery_env.arrays import FloatArray
+from battery_env.electrochemistry import (
+    FULL_CHARGE_SHARES,
+    QNB,
+    STATE_SIZE,
+    CellParameters,
+    Trajectory,
+    check_cell,
+    check_dt,
+    initial_state,
+    simulate,
+)
+from battery_env.electrochemistry.tangents import PolynomialSlopes, least_q_mobile, roll_out_with_tangents
+from battery_env.estimates import Estimate
+from battery_env.parameters import Q_MOBILE
+from battery_env.records import Record, check_record, expected_current, resample_current
+
+# The total of the four charges is q_mobile / 0.6 at all times.
+_Q_PER_CHARGE = 1.0 / float(FULL_CHARGE_SHARES.sum())
+
+
+class Forecast(NamedTuple):
+    """
+    The voltage of the model from the first sample of a record on, at some parameters.
+
+    :param time_s: of the steps of the model down to the cut-off, on the clock of the record, s, shape (K,)
+    :param voltage_V: shape (K,). The last point is at the cut-off, interpolated between steps; it is above if the cut-off is
+        never reached, as the load is off at the end of the record
+    :param eod_time_s: when the cut-off is reached, on the clock of the record, s; NaN if it is not
+    :param at_samples_V: at the samples of the record, also below the cut-off, shape (T,); NaN after the model cell is empty
+    """
+
+    time_s: FloatArray
+    voltage_V: FloatArray
+    eod_time_s: float
+    at_samples_V: FloatArray
+
+
+class RecordModel:
+    """
+    The model as it follows the current of a record: what calibration by the voltage of whole records rests on, and what the
+    estimate of any calibrator lets expect.
+
+    .. code-block:: python
+
+      estimate = ExtendedKalmanFilter(thermal=True, mismatch_V=0.05).estimate(record)
+      forecast = RecordModel(thermal=True).forecast(record, estimate, cut_off_V=2.7)
+      print(forecast.eod_time_s)
+
+    :param cell: constants of the model; ``None``: the new cell's
+    :param thermal: whether the temperature of the model moves
+    :param dt_s: time step of the model, s
+    :param initial: state of the model at the first sample, shape (8,). It stands for a history of the current: its charges
+        move along with ``q_mobile``. ``None``: fully charged, at rest
+    :raises ValueError: for an argument out of range
+    """
+
+    def __init__(
+        self,
+        cell: CellParameters | None = None,
+        thermal: bool = False,
+        dt_s: float = 1.0,
+        initial: ArrayLike | None = None,
+    ) -> None:
+        self.cell = check_cell(cell, thermal)
+        self.thermal = thermal
+        self.dt_s = check_dt(dt_s, self.cell)
+        reference_q_C = Q_MOBILE.limits[1]
+        self.initial = initial_state(reference_q_C, self.cell) if initial is None else np.array(initial, dtype=np.float64)
+        if self.initial.shape != (STATE_SIZE,) or not np.isfinite(self.initial).all():
+            raise ValueError(f"initial must hold {STATE_SIZE} finite numbers, got {initial!r}")
+        self._slopes = PolynomialSlopes.of(self.cell.packed)
+
+    def grid(self, record: Record) -> tuple[FloatArray, FloatArray]:
+        """
+        A record on the time grid of the model, which starts at the first sample.
+
+        :param record: one discharge
+        :return: times of the samples since the first one, s, shape (T,); current over each step, A, shape (K,), such that
+            the K points of the grid reach the last sample
+        :raises ValueError: as :func:`battery_env.records.check_record`
+        """
+        time_s, _, current_A = check_record(record.time_s, record.voltage_V, record.current_A, least_samples=2)
+        n_steps = int(np.ceil((time_s[-1] - time_s[0]) / self.dt_s - 1e-6)) + 1
+        return time_s - time_s[0], resample_current(time_s, current_A, self.dt_s, n_steps)
+
+    def start(self, q_mobile: float) -> FloatArray:
+        """
+        The state at the first sample of a cell with the history that ``initial`` stands for.
+
+        :param q_mobile: charge that can move, C
+        :return: shape (8,)
+        """
+        start = self.initial.copy()
+        start[QNB:] += (q_mobile - _Q_PER_CHARGE * start[QNB:].sum()) * FULL_CHARGE_SHARES
+        return start
+
+    def simulate(self, current_A: FloatArray, q_mobile: float, r_o: float) -> Trajectory:
+        """
+        What the model does under a current, with no cut-off.
+
+        :param current_A: current over each step, A, shape (K,)
+        :param q_mobile: charge that can move, C
+        :param r_o: ohmic resistance, ohm
+        :return: the samples down to where the model cell is empty, or all K of them
+        """
+        return simulate(
+            current_A,
+            q_mobile,
+            r_o,
+            dt=self.dt_s,
+            load_unit="current",
+            thermal=self.thermal,
+            cell=self.cell,
+            initial=self.start(q_mobile),
+            cut_off_V=-np.inf,
+            max_duration_s=len(current_A) * self.dt_s,
+        )
+
+    def voltage(self, record: Record, at: Estimate) -> FloatArray:
+        """
+        The voltage of the model at the samples of a record, under its current.
+
+        :param record: one discharge
+        :param at: the parameters
+        :return: voltage in V, shape (T,); NaN after the model cell is empty
+        :raises ValueError: for parameters out of range, or a record that cannot be used
+        """
+        time_s, current_A = self.grid(record)
+        return _at(time_s, self.simulate(current_A, at.q_mobile, at.r_o))
+
+    def forecast(
+        self, record: Record, at: Estimate, cut_off_V: float | None = None, future_current_A: float | None = None
+    ) -> Forecast:
+        """
+        The voltage of the model from the first sample of a record down to the cut-off, under the current of the record, and
+        beyond its end under a constant one.
+
+        :param record: one discharge, whole or in progress
+        :param at: the parameters
+        :param cut_off_V: cut-off voltage, V; ``None``: the ``VEOD`` of ``cell``
+        :param future_current_A: current beyond the end of the record, at least 0 A; ``None``: as
+            :func:`~battery_env.records.expected_current` has it, the last current of a constant load and the mean of a load
+            that varied, which is an assumption
+        :return: the voltage, and when the cut-off is reached
+        :raises ValueError: for a negative future current, parameters out of range, or a record that cannot be used
+        """
+        Q_MOBILE.check(at.q_mobile)
+        samples_s, current_A = self.grid(record)
+        cut_off = self.cell.VEOD if cut_off_V is None else cut_off_V
+        if future_current_A is None:
+            future_current_A = expected_current(record.time_s, record.current_A).mean_A
+        elif not 0.0 <= future_current_A < np.inf:
+            raise ValueError(f"future_current_A must be finite and at least 0 A, got {future_current_A!r}")
+        if future_current_A > 0.0:
+            # no cell of this q_mobile lasts longer than this, whatever it had delivered before
+            steps = int(at.q_mobile / (future_current_A * self.dt_s)) + 1
+            current_A = np.append(current_A[:-1], np.full(steps + 1, future_current_A))
+        simulation = self.simulate(current_A, at.q_mobile, at.r_o)
+        start_s, at_samples_V = float(record.time_s[0]), _at(samples_s, simulation)
+        time_s, voltage_V = start_s + simulation.time_s, simulation.voltage_V
+        below = np.flatnonzero(voltage_V <= cut_off)
+        if len(below):
+            n = int(below[0])
+            around = [n, max(n - 1, 0)]
+            eod_time_s = float(np.interp(cut_off, voltage_V[around], time_s[around]))
+        elif np.isnan(simulation.eod_time_s):
+            return Forecast(time_s, voltage_V, float("nan"), at_samples_V)
+        else:
+            n, eod_time_s = len(time_s), start_s + simulation.eod_time_s  # the cell is empty one step later
+        return Forecast(np.append(time_s[:n], eod_time_s), np.append(voltage_V[:n], cut_off), eod_time_s, at_samples_V)
+
+    def sensitivities(
+        self, current_A: FloatArray, q_mobile: float, r_o: float, stride: int = 1
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """
+        The voltage under a current and its derivatives with respect to both parameters; unchecked.
+
+        :param current_A: current over each step, A, shape (K,)
+        :param q_mobile: charge that can move, C
+        :param r_o: ohmic resistance, ohm
+        :param stride: steps of ``dt_s`` that ``current_A`` holds for: 1, or more for a coarse look
+        :return: voltage, V, dV/dq_mobile, V/C, and dV/dr_o, A, each of shape (K,); NaN after the model cell is empty
+        """
+        columns = np.full((3, len(current_A)), np.nan)
+        roll_out_with_tangents(
+            current_A,
+            q_mobile,
+            r_o,
+            stride * self.dt_s,
+            self.thermal,
+            self.cell.packed,
+            self._slopes,
+            self.start(q_mobile),
+            FULL_CHARGE_SHARES,
+            columns[0],
+            columns[1:],
+        )
+        return columns[0], columns[1], columns[2]
+
+    def least_q_mobile_C(self, current_A: FloatArray) -> float:
+        """
+        The ``q_mobile`` below which the model cell is empty before a current ends. At a fixed current its charges are linear
+        in ``q_mobile``, so that one roll-out gives it exactly.
+
+        :param current_A: current over each step, A, shape (K,)
+        :return: C
+        """
+        q_C = Q_MOBILE.limits[1]
+        return least_q_mobile(current_A, q_C, self.dt_s, self.cell.packed, self.start(q_C))
+
+
+def _at(time_s: FloatArray, simulation: Trajectory) -> FloatArray:
+    return np.interp(time_s, simulation.time_s, simulation.voltage_V, right=np.nan)

@@ -1,0 +1,301 @@
+"""
+A record: time, voltage and current as they were measured during one discharge. What can be meant, how the current runs between
+the samples, and what to expect of it after the last one.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from battery_env.arrays import FloatArray
+from battery_env.checks import LOAD_LIMITS
+
+#: A change of the current between two samples by more than this share of its largest magnitude is a switch of the load,
+#: not a drift; the current is taken to jump midway between the two samples.
+SWITCH_SHARE = 0.1
+#: A load whose current spreads by more than this share (from the 5th to the 95th percentile) has varied.
+VARIED_SHARE = 0.05
+#: Least and greatest time between two samples of a stream, s. Seconds given in milliseconds or in hours are mostly beyond.
+SAMPLE_INTERVAL_LIMITS_S = (1e-3, 600.0)
+
+# name: least and largest plausible value, unit, what a value beyond usually is
+_PLAUSIBLE: dict[str, tuple[float, float, str, str]] = {
+    "voltage_V": (0.0, 5.5, "V", "Give the voltage of one cell in V, not in mV, and not that of a pack."),
+    "current_A": (-LOAD_LIMITS["current"], LOAD_LIMITS["current"], "A", "Give the current in A, not in mA."),
+    "temperature_C": (-60.0, 150.0, "degC", "Give the temperature in degrees Celsius, not in kelvin."),
+}
+
+
+class Record(Protocol):
+    """
+    What was measured during one discharge; a simulated :class:`~battery_env.trajectories.Trajectory` and a recorded
+    :class:`~battery_env.cells.Discharge` are both records. All arrays have shape (T,); the current is positive in discharge.
+    """
+
+    @property
+    def time_s(self) -> FloatArray: ...
+
+    @property
+    def voltage_V(self) -> FloatArray: ...
+
+    @property
+    def current_A(self) -> FloatArray: ...
+
+
+class Samples(NamedTuple):
+    """
+    Samples of a record, which are a record themselves; arrays of shape (T,).
+
+    :param time_s: s
+    :param voltage_V: V
+    :param current_A: positive in discharge, A
+    """
+
+    time_s: FloatArray
+    voltage_V: FloatArray
+    current_A: FloatArray
+
+    def first(self, count: int) -> Samples:
+        """
+        The first ones.
+
+        :param count: how many
+        :return: these
+        """
+        return Samples(*(column[:count] for column in self))
+
+
+def check_column(name: str, values: ArrayLike, least_samples: int) -> FloatArray:
+    """
+    Refuse a column of a record that cannot be meant.
+
+    :param name: its name, with its unit
+    :param values: one value a sample
+    :param least_samples: how many there must be
+    :return: the same as an array that cannot be written to
+    :raises TypeError: for what is no real number
+    :raises ValueError: for a wrong shape, and for values that are not finite or implausible for one cell
+    """
+    if values is None or np.ma.is_masked(values) or np.iscomplexobj(values):
+        raise TypeError(f"{name} must hold real numbers, none of them masked, got {type(values).__name__}")
+    try:
+        array = np.array(values, dtype=np.float64)
+    except (OverflowError, TypeError, ValueError) as error:
+        raise TypeError(f"{name} must hold numbers: {error}") from error
+    if array.ndim != 1 or len(array) < least_samples:
+        raise ValueError(
+            f"{name} must hold one value a sample, at least {least_samples} samples in all; got shape {array.shape}"
+        )
+    bad = np.flatnonzero(~np.isfinite(array))
+    if len(bad):
+        raise ValueError(f"{name} must be finite, got {array[bad[0]]} at sample {bad[0]}. Remove or fill such samples.")
+    if name in _PLAUSIBLE:
+        low, high, _, _ = _PLAUSIBLE[name]
+        bad = np.flatnonzero((array < low) | (array > high))
+        if len(bad):
+            raise ValueError(_implausible(name, float(array[bad[0]]), f" at sample {bad[0]}"))
+    array.setflags(write=False)
+    return array
+
+
+def _implausible(name: str, value: float, where: str = "") -> str:
+    low, high, unit, hint = _PLAUSIBLE[name]
+    return f"{name} must lie within {low:g} .. {high:g} {unit}, got {value:g}{where}. {hint}"
+
+
+def check_record(time_s: ArrayLike, voltage_V: ArrayLike, current_A: ArrayLike, least_samples: int = 1) -> Samples:
+    """
+    Refuse samples that cannot be meant.
+
+    :param time_s: times of the samples, s, shape (T,)
+    :param voltage_V: terminal voltage of one cell, V, shape (T,)
+    :param current_A: current, positive in discharge, A, shape (T,)
+    :param least_samples: how many there must be
+    :return: the same, in arrays that cannot be written to
+    :raises TypeError: for what is no real number
+    :raises ValueError: for arrays that do not fit together or hold values that are not finite or implausible for one cell, and
+        for times that do not increase
+    """
+    arrays = {
+        name: check_column(name, values, least_samples)
+        for name, values in (("time_s", time_s), ("voltage_V", voltage_V), ("current_A", current_A))
+    }
+    time = arrays["time_s"]
+    for name, array in arrays.items():
+        if len(array) != len(time):
+            raise ValueError(f"{name} has {len(array)} samples, but time_s has {len(time)}")
+    stalls = np.flatnonzero(np.diff(time) <= 0.0)
+    if len(stalls):
+        n = stalls[0] + 1
+        raise ValueError(
+            f"time_s must increase from sample to sample, but sample {n} is at {time[n]:g} s, after {time[n - 1]:g} s. "
+            "Give one discharge at a time, and each sample once."
+        )
+    return Samples(**arrays)
+
+
+def check_sample(voltage_V: float, current_A: float, dt_s: float | None) -> None:
+    """
+    Refuse one sample of a stream that :func:`check_record` would refuse in a record.
+
+    :param voltage_V: terminal voltage of one cell, V
+    :param current_A: current, positive in discharge, A
+    :param dt_s: time since the previous sample, s; ``None``: this is the first one
+    :raises ValueError: if it cannot be meant
+    """
+    for name, value in (("voltage_V", voltage_V), ("current_A", current_A)):
+        if not np.isfinite(value):
+            raise ValueError(f"{name} must be finite, got {value!r}. Leave a sample out that is missing.")
+        low, high, _, _ = _PLAUSIBLE[name]
+        if not low <= value <= high:
+            raise ValueError(_implausible(name, value))
+    low, high = SAMPLE_INTERVAL_LIMITS_S
+    if dt_s is not None and not low <= dt_s <= high:
+        raise ValueError(
+            f"dt_s, the time since the previous sample, must lie within {low:g} .. {high:g} s, got {dt_s!r}. Give it in "
+            "seconds, not in hours or milliseconds. After a longer gap, start anew with a full cell."
+        )
+
+
+def check_drawn_charge(charge_C: float, least_C: float = 0.0) -> None:
+    """
+    Refuse a current of the wrong sign.
+
+    :param charge_C: charge drawn from the first sample on, C
+    :param least_C: it must be above this
+    :raises ValueError: if it is not
+    """
+    if not charge_C > least_C:
+        raise ValueError(
+            f"current_A is positive in discharge, but this record draws {charge_C:.6g} C in total. If the tester "
+            "counts discharge as negative, flip the sign (read_discharge_csv: discharge_is_negative=True; command "
+            "line: --discharge-is-negative)."
+        )
+
+
+def _knots(time_s: FloatArray, load: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The load as a piecewise-linear function of time, whose jumps are two knots at one time."""
+    switches = np.flatnonzero(np.abs(np.diff(load)) > SWITCH_SHARE * np.abs(load).max())
+    midpoints = 0.5 * (time_s[switches] + time_s[switches + 1])
+    place = np.repeat(switches + 1, 2)
+    sides = np.column_stack([load[switches], load[switches + 1]]).ravel()
+    return np.insert(time_s, place, np.repeat(midpoints, 2)), np.insert(load, place, sides)
+
+
+def drawn(time_s: FloatArray, load: FloatArray, at_s: ArrayLike) -> FloatArray:
+    """
+    What was drawn since the first sample: of a current the charge, of a power the energy. The load is linear between samples,
+    except where it was switched: there it jumps midway (see ``SWITCH_SHARE``). Beyond the last sample it keeps its last value.
+
+    :param time_s: times of the samples, s, shape (T,)
+    :param load: current or power at the samples, positive in discharge, A or W, shape (T,)
+    :param at_s: times asked for, none before the first sample, s, any shape
+    :return: charge or energy at these times, C or J, same shape
+    """
+    t, i = _knots(time_s, load)
+    width = np.diff(t)
+    total = np.concatenate([[0.0], np.cumsum(0.5 * (i[1:] + i[:-1]) * width)])
+    slope = np.append(np.divide(np.diff(i), width, out=np.zeros_like(width), where=width > 0.0), 0.0)
+    n = np.searchsorted(t, at_s, side="right") - 1
+    since = np.asarray(at_s) - t[n]
+    return total[n] + since * (i[n] + 0.5 * slope[n] * since)
+
+
+def resample_current(time_s: FloatArray, current_A: FloatArray, dt_s: float, n_steps: int) -> FloatArray:
+    """
+    The current on the model's time grid, which starts at the first sample: its mean over each step, so that the charge
+    drawn is kept exactly. A record whose samples lie ``dt_s`` apart, as simulated ones do, is taken as it is: there
+    ``current_A[k]`` is the current over the step that starts at sample k.
+
+    :param time_s: times of the samples, s, shape (T,)
+    :param current_A: current at the samples, positive in discharge, A, shape (T,)
+    :param dt_s: time step of the model, s
+    :param n_steps: number of steps; beyond the last sample the current keeps its last value
+    :return: current over each step, A, shape (n_steps,)
+    """
+    if np.allclose(np.diff(time_s), dt_s, rtol=1e-6, atol=0.0):
+        return current_A[np.minimum(np.arange(n_steps), len(current_A) - 1)]
+    grid_s = time_s[0] + dt_s * np.arange(n_steps + 1)
+    return np.diff(drawn(time_s, current_A, grid_s)) / dt_s
+
+
+class Stream(NamedTuple):
+    """
+    A record as it comes in live, arrays of shape (T,).
+
+    :param time_s: s
+    :param voltage_V: V
+    :param current_A: mean current from each sample to the next, A
+    :param dt_s: time since the previous sample, s; 0 for the first one
+    """
+
+    time_s: FloatArray
+    voltage_V: FloatArray
+    current_A: FloatArray
+    dt_s: FloatArray
+
+    @classmethod
+    def of(cls, record: Record, dt_s: float) -> Stream:
+        """
+        Check a record and convert it. Between samples the current is linear, as
+        :func:`drawn` has it, so that the charge drawn is kept exactly.
+
+        :param record: one discharge
+        :param dt_s: in a record whose samples lie this far apart the current is taken as it is, s
+        :return: the record as a stream
+        :raises ValueError: as :func:`check_record`
+        """
+        time_s, voltage_V, current_A = check_record(record.time_s, record.voltage_V, record.current_A)
+        step_s = np.diff(time_s)
+        if not np.allclose(step_s, dt_s, rtol=1e-6, atol=0.0):
+            mean_A = np.diff(drawn(time_s, current_A, time_s)) / step_s
+            current_A = np.append(mean_A, current_A[-1])
+        return cls(time_s, voltage_V, current_A, np.append(0.0, step_s))
+
+    def samples(self) -> zip[tuple[float, float, float]]:
+        """
+        What :meth:`battery_env.estimators.OnlineEstimator.update` takes, sample by sample.
+
+        :return: voltage, current and time since the previous sample
+        """
+        return zip(self.voltage_V.tolist(), self.current_A.tolist(), self.dt_s.tolist(), strict=True)
+
+
+class ExpectedCurrent(NamedTuple):
+    """
+    What a record lets expect of the current after its end.
+
+    :param mean_A: current, A; 0 if the load was switched off and not on again
+    :param varied: whether the load varied, so that ``mean_A`` is the mean of the last half of it and an assumption
+    :param sd_A: how far means over quarters of the record lie from each other (standard deviation), A
+    """
+
+    mean_A: float
+    varied: bool
+    sd_A: float
+
+
+def expected_current(time_s: ArrayLike, current_A: ArrayLike) -> ExpectedCurrent:
+    """
+    The current to expect after the end of a record: the last one of a constant load, and the mean over the last half of a load
+    that varied by more than ``VARIED_SHARE``, pulses among them.
+
+    :param time_s: times of the samples, s, shape (T,)
+    :param current_A: positive in discharge, A, shape (T,)
+    :return: the current and how sure it is
+    """
+    time, current = np.asarray(time_s, dtype=np.float64), np.asarray(current_A, dtype=np.float64)
+    loaded = current > SWITCH_SHARE * np.abs(current).max()
+    switches = np.flatnonzero(np.diff(loaded.astype(np.int64)) > 0)
+    if not loaded.any() or not (loaded[-1] or len(switches) + loaded[0] > 1):
+        return ExpectedCurrent(0.0, False, 0.0)
+    first = int(np.flatnonzero(loaded)[0])
+    low, high = np.quantile(current[first:], [0.05, 0.95])
+    if first == len(time) - 1 or high - low <= VARIED_SHARE * high:
+        return ExpectedCurrent(float(current[-1]), False, 0.0)
+    ends_s = np.linspace(time[first], time[-1], 5)
+    quarters_A = np.diff(drawn(time, current, ends_s)) / np.diff(ends_s)
+    return ExpectedCurrent(max(float(quarters_A[2:].mean()), 0.0), True, float(quarters_A.std(ddof=1)))
