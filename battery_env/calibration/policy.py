@@ -8,12 +8,11 @@ from typing import Any, Protocol
 import gymnasium as gym
 import numpy as np
 
-from battery_env.calibration.aging import AgingTask
+from battery_env.calibration.aging import BatteryAging
+from battery_env.calibration.env import CalibrationEnv
 from battery_env.calibration.full_state import FullStateTask
 from battery_env.calibration.task import Parameter
-from battery_env.calibration.variants import FullStateEnv
 from battery_env.calibration.voltage import VoltageTask
-from battery_env.calibration.voltage_variants import VoltageEnv
 from battery_env.estimators.base import Estimate, EstimateTrace, Estimator, Record
 from battery_env.trajectories import TrajectoryDataset
 
@@ -56,9 +55,9 @@ class PolicyEstimator(Estimator):
             raise ValueError(f"moves must be at least 1, got {moves!r}")
         self.moves = moves
         env = self.environment(env_id, **options)
-        self.make_task = env.make_task
+        self.make_task: Any = type(env.task)
         self.parameters = env.task.parameters
-        self.voltage_only = isinstance(env, VoltageEnv)
+        self.voltage_only = isinstance(env.task, VoltageTask)
         if self.voltage_only:
             assert isinstance(env.task, VoltageTask)
             interval_s = env.task.readings.interval_s
@@ -69,7 +68,7 @@ class PolicyEstimator(Estimator):
                 )
 
     @staticmethod
-    def environment(env_id: str, **options: Any) -> FullStateEnv | VoltageEnv:
+    def environment(env_id: str, **options: Any) -> CalibrationEnv:
         """
         A calibration environment without its wrappers.
 
@@ -79,7 +78,7 @@ class PolicyEstimator(Estimator):
         :raises ValueError: if it is none
         """
         env = gym.make(env_id, disable_env_checker=True, **options).unwrapped
-        if not isinstance(env, FullStateEnv | VoltageEnv) or isinstance(env.task, AgingTask):
+        if not isinstance(env, CalibrationEnv) or isinstance(env.task, BatteryAging):
             raise ValueError(f"{env_id} is no calibration environment of single discharges")
         return env
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import inspect
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from battery_env.electrochemistry import FloatArray
+from battery_env.estimators.base import Record
 
 Parameter = Literal["q_mobile", "r_o"]
 
@@ -17,17 +19,28 @@ Parameter = Literal["q_mobile", "r_o"]
 OBSERVATION_LIMIT = 100.0
 
 
-def check_options(given: Iterable[str], known: Iterable[str]) -> None:
+def check_counts(**values: int) -> None:
     """
-    Refuse options that a task does not have.
+    Refuse numbers of things that there must be.
 
-    :param given: names of the options that were given
-    :param known: names of those that there are
-    :raises TypeError: if one is not known
+    :param values: options by name
+    :raises ValueError: for a value below 1
     """
-    unknown = set(given) - set(known)
-    if unknown:
-        raise TypeError(f"{', '.join(sorted(unknown))}: no such option. There are {', '.join(sorted(known))}")
+    for name, value in values.items():
+        if not value >= 1:
+            raise ValueError(f"{name} must be at least 1, got {value!r}")
+
+
+def check_not_negative(**values: float) -> None:
+    """
+    Refuse sizes that are negative, or no finite numbers.
+
+    :param values: options by name
+    :raises ValueError: for a value out of range
+    """
+    for name, value in values.items():
+        if not 0.0 <= value < np.inf:
+            raise ValueError(f"{name} must be finite and at least 0, got {value!r}")
 
 
 def checked_action(action: NDArray[np.floating], shape: tuple[int, ...]) -> FloatArray:
@@ -54,21 +67,42 @@ class CalibrationTask(ABC):
     All randomness of an episode is drawn when it starts, from the generator of its cell: the scalar environment is the batch
     of one, and a batch makes the same episodes as that many scalar environments.
 
-    :param cells: size of the batch
-    :param parameters: what the action stands for, in its order
-    :param observation_size: length of an observation
-    :param episode_steps: decisions per episode; fewer where the data end
-    :param decision_s: time between two decisions, s
+    What is registered is a class: its docstring is the page of its environments, and its keyword arguments are their options.
+
+    :ivar parameters: what the action stands for, in its order
+    :ivar cells: size of the batch
+    :ivar dataset: the discharges that episodes are drawn from
+    :ivar observation_size: length of an observation
+    :ivar episode_steps: decisions per episode; fewer where the data end
+    :ivar decision_s: time between two decisions, s
     """
 
     #: what :meth:`report` returns
     REPORTED: ClassVar[tuple[str, ...]] = ("q_mobile", "r_o", "q_mobile_hat", "r_o_hat", "voltage", "voltage_hat", "soc")
 
-    cells: int
     parameters: tuple[Parameter, ...]
+    cells: int
+    dataset: Sequence[Record]
     observation_size: int
     episode_steps: int
     decision_s: float
+
+    @classmethod
+    def options(cls) -> dict[str, Any]:
+        """
+        What the task can be asked for; its page says what each option means.
+
+        :return: default values by name
+        """
+        arguments = inspect.signature(cls).parameters.values()
+        return {argument.name: argument.default for argument in arguments if argument.kind is argument.KEYWORD_ONLY}
+
+    def _refuse_beside_a_dataset(self, **chosen: Any) -> None:
+        """Refuse options that choose discharges, where the discharges are given."""
+        defaults = self.options()
+        others = [name for name, value in chosen.items() if value != defaults.get(name, value)]
+        if others:
+            raise ValueError(f"dataset stands in place of {', '.join(others)}: give one or the other")
 
     @abstractmethod
     def start(
@@ -82,7 +116,7 @@ class CalibrationTask(ABC):
 
         :param rows: which cells of the batch, shape (m,)
         :param generators: one source of randomness for each of them, of length m
-        :param options: choices that replace random draws, the same for all these cells; the task's environment documents them
+        :param options: choices that replace random draws, the same for all these cells; the task's page names them
         :raises ValueError: for an option that is unknown or out of range
         """
 

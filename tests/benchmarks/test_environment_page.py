@@ -6,7 +6,8 @@ import re
 import pytest
 
 from battery_env import ClosedForm, TrajectoryDataset, evaluate, plotting
-from battery_env.calibration.registration import ENTRY_POINTS
+from battery_env.calibration.env import CalibrationEnv
+from battery_env.calibration.registration import TASKS
 from battery_env.loads import constant
 from benchmarks import environment_page
 
@@ -31,8 +32,8 @@ def test_the_page_says_what_the_code_says():
 
 def test_every_environment_has_all_sections_of_its_page():
     wanted = ["Description", "Observation space", "Action space", "Reward", "Starting state", "Episode end", "Arguments"]
-    for env_id in ENTRY_POINTS:
-        page = inspect.getdoc(environment_page.environment_class(env_id))
+    for env_id in TASKS:
+        page = inspect.getdoc(environment_page.task_class(env_id))
         headings = re.findall(r"^## (.*)", page, flags=re.MULTILINE)
         assert [heading for heading in headings if heading in wanted] == wanted, env_id
         assert headings[-1] == "Version history", env_id
@@ -40,9 +41,9 @@ def test_every_environment_has_all_sections_of_its_page():
 
 
 def test_boxes_in_the_docstrings_are_the_spaces(dataset):
-    for env_id in ENTRY_POINTS:
-        env = environment_page.environment_class(env_id)(dataset=dataset)
-        shapes = re.findall(r"Box\(-?\d+, \d+, \((\d+),\), float32\)", inspect.getdoc(type(env)))
+    for env_id in TASKS:
+        env = CalibrationEnv(TASKS[env_id], dataset=dataset)
+        shapes = re.findall(r"Box\(-?\d+, \d+, \((\d+),\), float32\)", inspect.getdoc(env.task))
         found = [str(space.shape[0]) for space in (env.observation_space, env.action_space)]
         # a page may refer to another one for the action
         assert shapes == found[: len(shapes)] and shapes, env_id
@@ -62,12 +63,12 @@ def test_common_options_are_options_of_all(dataset):
         "episode_steps": 4,
     }
     assert set(names) == {*options, "dataset"}
-    for env_id in ENTRY_POINTS:
+    for env_id in TASKS:
         for name, value in options.items():
             if env_id == "BatteryAging-v0" and name in ("load", "mismatch", "dt_s", "episode_steps"):
                 continue
             try:
-                environment_page.environment_class(env_id)(dataset=dataset, **{name: value})
+                CalibrationEnv(TASKS[env_id], dataset=dataset, **{name: value})
             except ValueError as error:
                 # known, but not beside a data set of one's own
                 assert "dataset stands in place of" in str(error), (env_id, name)
