@@ -107,16 +107,12 @@ class BatteryAging(VoltageTask):
         decisions_per_cycle: int = 8,
         reading_s: float = 10.0,
         new_readings: tuple[int, int] = (10, 60),
-        noise_V: tuple[float, float] = (0.001, 0.030),
-        offset_V: float = 0.010,
-        current_gain: float = 0.0,
-        current_offset_A: float = 0.0,
         process_noise_V: float = 0.0,
-        measured: Literal["current", "power"] = "current",
         start: Literal["random", "new_cell", "true"] = "new_cell",
         consistency: float = 0.0,
         split: Literal["train", "test"] = "train",
         dataset: Sequence[Record] | None = None,
+        **sensors: Any,
     ) -> None:
         check_counts(cycles=cycles, decisions_per_cycle=decisions_per_cycle)
         if split not in LIVES:
@@ -130,22 +126,19 @@ class BatteryAging(VoltageTask):
             episode_steps=cycles * decisions_per_cycle,
             reading_s=reading_s,
             new_readings=new_readings,
-            noise_V=noise_V,
-            offset_V=offset_V,
-            current_gain=current_gain,
-            current_offset_A=current_offset_A,
             process_noise_V=process_noise_V,
-            measured=measured,
             start=start,
             consistency=consistency,
             dataset=dataset,
+            **sensors,
         )
         if len(self.readings) % cycles:
             raise ValueError(f"{len(self.readings)} discharges are no whole number of lives of {cycles} cycles")
         self.cycles, self.decisions_per_cycle = cycles, decisions_per_cycle
         self.observation_size += len(self.parameters)
-        self._carried = self.estimate.copy()
-        self._generators: list[np.random.Generator] = [np.random.default_rng(0)] * cells
+        self._carried = self._estimate.copy()
+        # of the episodes; none on whole records, where nothing is drawn
+        self._generators: list[np.random.Generator | None] = [None] * cells
 
     def start(
         self,
@@ -168,23 +161,47 @@ class BatteryAging(VoltageTask):
             # later cycles need randomness when the agent gets there; the generator of the cell is not to be drawn from then
             self._generators[row] = np.random.default_rng(generator.integers(2**63))
         super().start(rows, generators, options)
-        self._carried[rows] = self.estimate[rows]
+        self._carried[rows] = self._estimate[rows]
 
     def _draw_discharge(self, generator: np.random.Generator) -> int:
         return self.cycles * int(generator.integers(len(self.readings) // self.cycles))
 
-    def _draw_count(self, discharge: int, generator: np.random.Generator) -> int:
-        return min(int(generator.integers(*self.new_readings, endpoint=True)), int(self.readings.count[discharge]))
+    @classmethod
+    def follow(cls, records: Sequence[Record], every: int, **options: Any) -> BatteryAging:
+        """
+        Go through whole lives, each with a cell of its own; see :meth:`VoltageTask.follow`.
+
+        :param records: discharges from full charge, life after life, each with ``cycles`` of them
+        :param every: readings between two decisions, and before the first one of each discharge
+        :param options: of the task, but for those of its data
+        :return: the task, at its first observations
+        """
+        task = super().follow(records, every, **options)
+        assert isinstance(task, BatteryAging)
+        task._carried = task._estimate.copy()
+        return task
+
+    @classmethod
+    def _discharges_of_an_episode(cls, options: Mapping[str, Any]) -> int:
+        return int(options.get("cycles", cls.options()["cycles"]))
+
+    @property
+    def _decisions_in_a_discharge(self) -> int:
+        return self.decisions_per_cycle
+
+    def _draw_count(self, length: int, generator: np.random.Generator) -> int:
+        return min(int(generator.integers(*self.new_readings, endpoint=True)), length)
 
     def _arrive(self) -> None:
         """New readings, or after the last decision of a cycle those of the next one."""
         super()._arrive()
-        ended = (self._step_of_episode % self.decisions_per_cycle == 0) & (self._step_of_episode < self.episode_steps)
-        for row in np.flatnonzero(ended).tolist():
+        goes_on = (self._step_of_episode >= self._last_step) & (self.discharge % self.cycles < self.cycles - 1)
+        for row in np.flatnonzero(goes_on).tolist():
             discharge, generator = int(self.discharge[row]) + 1, self._generators[row]
-            self._carried[row] = self.estimate[row]
-            self.place(row, discharge, self._draw_count(discharge, generator), self.estimate[row])
-            self._measure(row, discharge, generator)
+            self._carried[row] = self._estimate[row]
+            self._place(row, discharge, self._first_count(discharge, generator), self._estimate[row])
+            if generator is not None:
+                self._measure(row, discharge, generator)
 
     def _parts(self) -> list[FloatArray]:
         return [*super()._parts(), self._scaled(self._carried)]

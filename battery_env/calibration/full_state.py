@@ -25,6 +25,7 @@ from battery_env.electrochemistry import (
     STATE_SIZE,
     VO,
     FloatArray,
+    Trajectory,
     advance_in_place,
     initial_state,
     voltage_into,
@@ -401,13 +402,60 @@ class FullStateTask(CalibrationTask):
             self._disturb(np.arange(self.cells))
         return cost
 
-    def transitions_left(self) -> IntArray:
+    @classmethod
+    def follow(cls, records: Sequence[Trajectory], every: int, **options: Any) -> FullStateTask:
         """
-        How many more decisions each cell's data allow; after the last one its next observation still lies in the data.
+        Go through whole discharges, each with a cell of its own, with the model's state running free from the first sample.
 
-        :return: shape (cells,)
+        :param records: simulated discharges; no recording has the full state
+        :param every: 1
+        :param options: of the task, but for those of its data
+        :return: the task, at its first observations
         """
-        return self._last_decision - self.sample
+        dataset = records if isinstance(records, TrajectoryDataset) else TrajectoryDataset.from_trajectories(records)
+        longest = int((dataset.stop - dataset.first).max())
+        task = cls(len(dataset), **{**options, "dataset": dataset, "episode_steps": longest})
+        for n in range(len(dataset)):
+            task.start(np.array([n]), [np.random.default_rng(n)], {"trajectory": n, "sample": dataset.first[n]})
+        return task
+
+    def steps_between(self, decision_s: float) -> int:
+        """
+        How many samples arrive between two decisions on a whole record: the policy decides at each of them.
+
+        :param decision_s: ignored
+        :return: 1
+        """
+        return 1
+
+    def seen(self) -> tuple[IntArray, FloatArray]:
+        """
+        Which data the next decision knows, x_{t+1} among them.
+
+        :return: each cell's discharge, and the time of its last sample on the clock of the data set, s, shape (cells,)
+        """
+        return self.trajectory.copy(), (self.sample + 1) * self.dataset.dt_s
+
+    @property
+    def estimate(self) -> FloatArray:
+        """(q_mobile, r_o) of the model, C and ohm, shape (cells, 2)."""
+        return np.stack([self.q_mobile_hat, self.r_o_hat], axis=1)
+
+    @staticmethod
+    def conclude(estimates: FloatArray) -> float:
+        """
+        What is left of the estimates over a record: their mean, for each is made of its own sample.
+
+        :param estimates: of one parameter, shape (K,)
+        :return: one estimate
+        """
+        return float(estimates.mean())
+
+    def drop_ended(self) -> None:
+        """Go on without the cells whose episodes are over."""
+        over = self.truncated()
+        if over.any():
+            self.keep(~over)
 
     def truncated(self) -> NDArray[np.bool_]:
         """

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from battery_env.electrochemistry import FloatArray
 from battery_env.estimators.base import Record
+from battery_env.trajectories import IntArray
 
 Parameter = Literal["q_mobile", "r_o"]
 
@@ -87,6 +88,11 @@ class CalibrationTask(ABC):
     episode_steps: int
     decision_s: float
 
+    @property
+    @abstractmethod
+    def estimate(self) -> FloatArray:
+        """(q_mobile, r_o) of the model, C and ohm, shape (cells, 2); a new array each time."""
+
     @classmethod
     def options(cls) -> dict[str, Any]:
         """
@@ -146,6 +152,50 @@ class CalibrationTask(ABC):
 
         :return: shape (cells,); a new array each time
         """
+
+    @classmethod
+    @abstractmethod
+    def follow(cls, records: Sequence[Any], every: int, **options: Any) -> CalibrationTask:
+        """
+        Go through whole records from their beginning, for evaluation: every episode is as long as its records, and nothing is
+        random but what options ask for.
+
+        :param records: the discharges
+        :param every: what :meth:`steps_between` returned
+        :param options: of the task, but for those of its data and the length of its episodes
+        :return: the task, at its first observations
+        """
+
+    @abstractmethod
+    def steps_between(self, decision_s: float) -> int:
+        """
+        How many samples arrive between two decisions on a whole record.
+
+        :param decision_s: time that is asked for between them, s
+        :return: the samples
+        :raises ValueError: for a time that the task cannot keep
+        """
+
+    @abstractmethod
+    def seen(self) -> tuple[IntArray, FloatArray]:
+        """
+        Which data the next decision knows.
+
+        :return: each cell's discharge, and the time of its last sample, s, shape (cells,); new arrays
+        """
+
+    @staticmethod
+    @abstractmethod
+    def conclude(estimates: FloatArray) -> float:
+        """
+        What is left of the estimates over a record.
+
+        :param estimates: of one parameter, one per decision, shape (K,)
+        :return: one estimate
+        """
+
+    def drop_ended(self) -> None:  # noqa: B027 (a task may go on with all cells)
+        """Go on without the cells whose episodes are over, if that saves time; by default they stay."""
 
     @abstractmethod
     def report(self) -> dict[str, FloatArray]:

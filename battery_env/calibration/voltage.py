@@ -8,6 +8,7 @@ data so far with one (q_mobile, r_o): it holds an estimate, sees what the data s
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
 from functools import lru_cache
 from typing import Any, Literal
 
@@ -19,6 +20,7 @@ from battery_env.calibration.readings import Readings, explain
 from battery_env.calibration.task import OBSERVATION_LIMIT, CalibrationTask, check_counts, check_not_negative, checked_action
 from battery_env.electrochemistry import NEW_CELL, FloatArray
 from battery_env.estimators.base import Record
+from battery_env.sensors import RandomSensorErrors
 from battery_env.trajectories import IntArray, TrajectoryDataset
 
 #: Where estimates are kept, C and ohm.
@@ -30,6 +32,8 @@ LARGEST_STEPS: dict[str, float] = {"q_mobile": 1500.0, "r_o": 0.12}
 STRETCHES = 16
 # An estimate needs more readings than it has parameters
 _FEWEST_READINGS = 3
+#: What the discharges that episodes are made of are read with.
+SENSORS = RandomSensorErrors(noise_V=(0.001, 0.030), offset_V=0.010)
 
 _COST_SCALE_V = 0.002
 # What the parts of an observation are divided by
@@ -59,6 +63,7 @@ class VoltageTask(CalibrationTask):
     :class:`BatteryVoltageJoint`.
 
     :ivar readings: what is read of the discharges
+    :ivar sensors: what they are read with
     :param cells: size of the batch
     :raises ValueError: for values out of range
     """
@@ -70,12 +75,7 @@ class VoltageTask(CalibrationTask):
         episode_steps: int = 8,
         reading_s: float = 10.0,
         new_readings: tuple[int, int] = (0, 29),
-        noise_V: tuple[float, float] = (0.001, 0.030),
-        offset_V: float = 0.010,
-        current_gain: float = 0.0,
-        current_offset_A: float = 0.0,
         process_noise_V: float = 0.0,
-        measured: Literal["current", "power"] = "current",
         start: Literal["random", "new_cell", "true"] = "random",
         consistency: float = 0.0,
         load: LoadKind = "piecewise",
@@ -83,29 +83,14 @@ class VoltageTask(CalibrationTask):
         dt_s: float = 1.0,
         mismatch: float = 0.0,
         dataset: Sequence[Record] | None = None,
+        **sensors: Any,
     ) -> None:
         check_counts(episode_steps=episode_steps)
-        check_not_negative(consistency=consistency)
+        check_not_negative(consistency=consistency, process_noise_V=process_noise_V)
         if not 0 <= new_readings[0] <= new_readings[1]:
             raise ValueError(f"new_readings must be (fewest, most) with 0 <= fewest <= most, got {new_readings!r}")
-        if not (0.0 <= noise_V[0] <= noise_V[1] < 1.0 and (noise_V[0] > 0.0 or noise_V[1] == 0.0)):
-            raise ValueError(
-                f"noise_V must be (least, greatest) in V with 0 < least <= greatest < 1, or (0, 0), got {noise_V!r}"
-            )
-        for name, bound in (
-            ("offset_V", offset_V),
-            ("current_gain", current_gain),
-            ("current_offset_A", current_offset_A),
-            ("process_noise_V", process_noise_V),
-        ):
-            if not 0.0 <= bound < 0.5:
-                raise ValueError(f"{name} must be at least 0 and less than 0.5, got {bound!r}")
-        for name, choice, choices in (
-            ("measured", measured, ("current", "power")),
-            ("start", start, ("random", "new_cell", "true")),
-        ):
-            if choice not in choices:
-                raise ValueError(f"{name} must be one of {choices}, got {choice!r}")
+        if start not in ("random", "new_cell", "true"):
+            raise ValueError(f"start must be one of ('random', 'new_cell', 'true'), got {start!r}")
         data: dict[str, Any] = {"load": load, "split": split, "dt_s": dt_s, "mismatch": mismatch}
         if dataset is None:
             dataset = standard_dataset("joint" if len(self.parameters) == 2 else self.parameters[0], **data)
@@ -118,10 +103,8 @@ class VoltageTask(CalibrationTask):
         parameters = self.parameters
         self.cells, self.dataset, self.readings = cells, dataset, readings
         self.episode_steps, self.new_readings = episode_steps, new_readings
-        self.noise_V, self.offset_V = noise_V, offset_V
-        self.current_gain, self.current_offset_A = current_gain, current_offset_A
-        self.process_noise_V, self.measured = process_noise_V, measured
-        self.first_estimate, self.consistency = start, consistency
+        self.sensors = replace(SENSORS, **sensors)
+        self.process_noise_V, self.first_estimate, self.consistency = process_noise_V, start, consistency
         self.decision_s = readings.interval_s * (sum(new_readings) / 2.0)
         self._previous = len(parameters) if consistency > 0.0 else 0
         self.observation_size = 6 * STRETCHES + 4 + len(parameters) + self._previous
@@ -136,11 +119,23 @@ class VoltageTask(CalibrationTask):
         self.count: IntArray = np.ones(cells, dtype=np.int64)
         self._arrivals: IntArray = np.zeros((cells, self.episode_steps), dtype=np.int64)
         self._step_of_episode: IntArray = np.zeros(cells, dtype=np.int64)
-        self.estimate = np.tile([NEW_CELL.q_mobile, NEW_CELL.r_o], (cells, 1))
+        self._last_step: IntArray = np.zeros(cells, dtype=np.int64)  # of the discharge
+        self._every = 0  # readings between two decisions of a whole record; 0: of an episode they are drawn
+        self._estimate = np.tile([NEW_CELL.q_mobile, NEW_CELL.r_o], (cells, 1))
         self._action = np.zeros((cells, len(parameters)))
         self._voltage_V, self._current_A, self._moved_C, self._ohmic_A = np.zeros((4, cells, longest))
         self._residual_V, self._slope_V_per_C, self._ohmic_means_A = np.zeros((3, cells, STRETCHES, 2))
         self._rms_V, self._last_V, self._offset_V, self._misfit_V = np.zeros((4, cells))
+
+    @classmethod
+    def options(cls) -> dict[str, Any]:
+        """
+        What the task can be asked for; its page says what each option means. Errors of the sensors are those of
+        :class:`~battery_env.sensors.RandomSensorErrors`.
+
+        :return: default values by name
+        """
+        return {**super().options(), **asdict(SENSORS)}
 
     def start(
         self,
@@ -176,48 +171,96 @@ class VoltageTask(CalibrationTask):
         for row, generator in zip(rows, generators, strict=True):
             n = self._draw_discharge(generator) if discharge is None else int(discharge)
             length = int(self.readings.count[n])
-            count = self._draw_count(n, generator) if reading is None else int(reading)
+            count = self._first_count(n, generator) if reading is None else int(reading)
             if not 1 <= count <= length:
                 raise ValueError(f"options['reading'] must lie within 1 .. {length} for discharge {n}, got {count}")
             self._arrivals[row] = generator.integers(fewest, most + 1, size=self.episode_steps)
             estimate = self._first_estimate(n, generator)
             for name, value in first.items():
                 estimate[("q_mobile", "r_o").index(name)] = value
-            self.place(row, n, count, estimate)
+            self._step_of_episode[row] = 0
+            self._place(row, n, count, estimate)
             self._measure(row, n, generator)
         self._action[rows] = 0.0
-        self._step_of_episode[rows] = 0
         self._explain(rows)
 
     def _draw_discharge(self, generator: np.random.Generator) -> int:
         return int(generator.integers(len(self.readings)))
 
-    def _draw_count(self, discharge: int, generator: np.random.Generator) -> int:
-        return int(generator.integers(_FEWEST_READINGS, self.readings.count[discharge], endpoint=True))
+    def _first_count(self, discharge: int, generator: np.random.Generator | None) -> int:
+        """How many readings there are at first: on a whole record as many as arrive between two decisions."""
+        length = int(self.readings.count[discharge])
+        return min(self._every, length) if generator is None else self._draw_count(length, generator)
 
-    def follow(self, every: int) -> None:
+    def _draw_count(self, length: int, generator: np.random.Generator) -> int:
+        return int(generator.integers(_FEWEST_READINGS, length, endpoint=True))
+
+    @classmethod
+    def follow(cls, records: Sequence[Record], every: int, **options: Any) -> VoltageTask:
         """
-        Begin as many discharges as there are cells, each at its first readings, measured as they are; from then on ``every``
-        readings arrive between two decisions. For evaluation: nothing is random, and no episode ends.
+        Go through whole records, each with a cell of its own: from its first readings, measured as they are, and from the
+        estimate of a new cell.
 
+        :param records: discharges from full charge, simulated or recorded
         :param every: readings between two decisions, and before the first one
+        :param options: of the task, but for those of its data
+        :return: the task, at its first observations
         """
-        for n in range(self.cells):
-            self.place(n, n, min(every, int(self.readings.count[n])), self._first_estimate(n, None))
-        self._arrivals[:] = every
-        self._step_of_episode[:] = 0
-        self._action[:] = 0.0
-        self._explain()
+        discharges = cls._discharges_of_an_episode(options)
+        task = cls(len(records) // discharges, **{"start": "new_cell", **options, "dataset": records})
+        task._every = every
+        for row in range(task.cells):
+            n = row * discharges
+            task._place(row, n, task._first_count(n, None), task._first_estimate(n, None))
+        task._explain()
+        return task
 
-    def place(self, row: int, discharge: int, count: int, estimate: FloatArray) -> None:
-        """
-        Put one cell at one point of one discharge, measured without error.
+    @classmethod
+    def _discharges_of_an_episode(cls, options: Mapping[str, Any]) -> int:
+        return 1
 
-        :param row: which cell of the batch
-        :param discharge: which discharge
-        :param count: how many of its readings there are so far
-        :param estimate: (q_mobile, r_o), C and ohm
+    def steps_between(self, decision_s: float) -> int:
         """
+        How many readings arrive between two decisions on a whole record.
+
+        :param decision_s: time between them, s
+        :return: the readings
+        :raises ValueError: if the time is no multiple of that between two readings
+        """
+        interval_s = self.readings.interval_s
+        every = round(decision_s / interval_s)
+        if every < 1 or abs(every * interval_s - decision_s) > 1e-9 * interval_s:
+            raise ValueError(
+                f"decision_s must be a multiple of the interval between readings, {interval_s:g} s, got {decision_s!r}"
+            )
+        return every
+
+    def seen(self) -> tuple[IntArray, FloatArray]:
+        """
+        Which readings the next decision knows.
+
+        :return: each cell's discharge, and the time of its last reading, s, shape (cells,)
+        """
+        readings = self.readings
+        return self.discharge.copy(), readings.start_s[self.discharge] + self.count * readings.interval_s
+
+    @property
+    def estimate(self) -> FloatArray:
+        """(q_mobile, r_o), C and ohm, shape (cells, 2)."""
+        return self._estimate.copy()
+
+    @staticmethod
+    def conclude(estimates: FloatArray) -> float:
+        """
+        What is left of the estimates over a record: the last one, which explains all readings.
+
+        :param estimates: of one parameter, shape (K,)
+        :return: one estimate
+        """
+        return float(estimates[-1])
+
+    def _place(self, row: int, discharge: int, count: int, estimate: FloatArray) -> None:
+        """Put one cell at one point of one discharge, measured without error."""
         data = self.readings
         part, length = data.part(discharge), data.count[discharge]
         self.discharge[row], self.count[row] = discharge, count
@@ -225,20 +268,21 @@ class VoltageTask(CalibrationTask):
         self._current_A[row, :length] = data.current_A[part]
         self._moved_C[row, :length] = data.moved_C[part]
         self._ohmic_A[row, :length] = data.ohmic_A[part]
-        self.estimate[row] = estimate
+        self._estimate[row] = estimate
+        decisions = -(-int(length) // self._every) if self._every else self._decisions_in_a_discharge
+        self._last_step[row] = self._step_of_episode[row] + decisions
 
-    def known(self, discharge: int) -> FloatArray:
-        """
-        The true parameters of a discharge, or the new cell's where they are not known.
+    @property
+    def _decisions_in_a_discharge(self) -> int:
+        return self.episode_steps
 
-        :param discharge: which discharge
-        :return: (q_mobile, r_o), C and ohm
-        """
+    def _known(self, discharge: int) -> FloatArray:
+        """The true parameters of a discharge, or the new cell's where they are not known."""
         true = np.array([self.readings.q_mobile[discharge], self.readings.r_o[discharge]])
         return np.where(np.isnan(true), [NEW_CELL.q_mobile, NEW_CELL.r_o], true)
 
     def _first_estimate(self, discharge: int, generator: np.random.Generator | None) -> FloatArray:
-        estimate = self.known(discharge)
+        estimate = self._known(discharge)
         if self.first_estimate == "random" and generator is not None:
             estimate[self._columns] = generator.uniform(self._low, self._high)
         elif self.first_estimate != "true":
@@ -246,40 +290,20 @@ class VoltageTask(CalibrationTask):
         return estimate
 
     def _measure(self, row: int, discharge: int, generator: np.random.Generator) -> None:
-        """The errors of the sensors, and the noise of the cell, over one discharge."""
-        choice, length = self, int(self.readings.count[discharge])
-        least, greatest = choice.noise_V
+        """The noise of the cell, and the errors of the sensors, over one discharge."""
+        length = int(self.readings.count[discharge])
         voltage_V = self._voltage_V[row, :length]
-        true_V = voltage_V.copy()
-        if choice.process_noise_V > 0.0:
-            voltage_V += self._process_noise_V(generator.standard_normal((3, length)))
-        if greatest > 0.0:
-            sd_V = np.exp(generator.uniform(np.log(least), np.log(greatest)))
-            voltage_V += sd_V * generator.standard_normal(length)
-        offset_V, gain_error, offset_A = (
-            generator.uniform(-bound, bound) if bound > 0.0 else 0.0
-            for bound in (choice.offset_V, choice.current_gain, choice.current_offset_A)
-        )
-        voltage_V += offset_V
-        if choice.measured == "power" or gain_error != 0.0 or offset_A != 0.0:
-            gain = np.full(length, 1.0 + gain_error)
-            if choice.measured == "power":
-                gain *= true_V / voltage_V
-            measured = self.readings.remeasured(discharge, gain, offset_A)
+        if self.process_noise_V > 0.0:
+            voltage_V += self.readings.process_noise_V(self.process_noise_V, generator.standard_normal((3, length)))
+        noise_V = self.sensors.draw_noise_V(generator)
+        noise = generator.standard_normal(length) if noise_V > 0.0 else np.zeros(length)
+        errors = replace(self.sensors.draw_biases(generator), noise_V=noise_V)
+        read_V = errors.read_voltage_V(voltage_V, noise)
+        if errors.change_the_current:
+            measured = self.readings.remeasured(discharge, errors.gain(voltage_V, read_V), errors.current_offset_A)
             for array, values in zip((self._current_A, self._moved_C, self._ohmic_A), measured, strict=True):
                 array[row, :length] = values
-
-    def _process_noise_V(self, draws: FloatArray) -> FloatArray:
-        from scipy.signal import lfilter  # slow to import, and only process noise needs it
-
-        cell, dt_s = self.readings.parameters, self.readings.dt_s
-        total = np.zeros(draws.shape[1])
-        for draw, time_constant_s in zip(draws, (cell.to, cell.tsn, cell.tsp), strict=True):
-            left = float(self.readings.decay(time_constant_s))
-            # the variance of a sum of steps that decay on the way, over one interval
-            variance = dt_s * (1.0 - left**2) / (1.0 - (1.0 - dt_s / time_constant_s) ** 2)
-            total -= lfilter([self.process_noise_V * np.sqrt(variance)], [1.0, -left], draw)
-        return total
+        voltage_V[:] = read_V
 
     def _explain(self, rows: NDArray[np.intp] | None = None) -> None:
         """Compare some cells with their readings, all by default."""
@@ -288,8 +312,8 @@ class VoltageTask(CalibrationTask):
             self._all if rows is None else np.asarray(rows, dtype=np.int64),
             self.count,
             self._first,
-            np.ascontiguousarray(self.estimate[:, 0]),
-            np.ascontiguousarray(self.estimate[:, 1]),
+            np.ascontiguousarray(self._estimate[:, 0]),
+            np.ascontiguousarray(self._estimate[:, 1]),
             self._voltage_V,
             self._current_A,
             self._moved_C,
@@ -304,7 +328,7 @@ class VoltageTask(CalibrationTask):
             self._rms_V,
             self._last_V,
         )
-        self._offset_V = np.clip(self._residual_V.mean(axis=(1, 2)), -self.offset_V, self.offset_V)
+        self._offset_V = np.clip(self._residual_V.mean(axis=(1, 2)), -self.sensors.offset_V, self.sensors.offset_V)
         self._misfit_V = np.sqrt(np.mean((self._residual_V - self._offset_V[:, None, None]) ** 2, axis=(1, 2)))
 
     def observation(self) -> NDArray[np.float32]:
@@ -326,28 +350,26 @@ class VoltageTask(CalibrationTask):
             np.log((np.stack([self._misfit_V, self._rms_V], axis=1) + 0.1 * _MISFIT_FLOOR_V) / _MISFIT_SCALE_V),
             np.arcsinh(self._residual_V.mean(axis=(1, 2)) / _MISFIT_SCALE_V)[:, None],
             (self.count * (self.readings.interval_s / _TIME_SCALE_S))[:, None],
-            self._scaled(self.estimate),
+            self._scaled(self._estimate),
             self._action[:, : self._previous],
         ]
 
     def _scaled(self, estimate: FloatArray) -> FloatArray:
         return np.asarray((2.0 * estimate[:, self._columns] - self._low - self._high) / (self._high - self._low))
 
-    def advance(self, action: NDArray[np.floating], arriving: bool = True) -> FloatArray:
+    def advance(self, action: NDArray[np.floating]) -> FloatArray:
         """
         Move the estimates, let new readings arrive, and compare all data so far with the model.
 
         :param action: in [-1, 1], beyond it is clipped, shape (cells, len(parameters))
-        :param arriving: whether readings arrive
         :return: cost, shape (cells,)
         :raises ValueError: for another shape, NaN, or what is no number
         """
         chosen = checked_action(action, self._action.shape)
         step = np.clip(chosen, -1.0, 1.0)
-        moved = self.estimate[:, self._columns] + np.sign(step) * step**2 * self._step
-        self.estimate[:, self._columns] = np.clip(moved, self._low, self._high)
-        if arriving:
-            self._arrive()
+        moved = self._estimate[:, self._columns] + np.sign(step) * step**2 * self._step
+        self._estimate[:, self._columns] = np.clip(moved, self._low, self._high)
+        self._arrive()
         self._explain()
         cost = np.arcsinh(self._misfit_V / _COST_SCALE_V)
         cost += self.consistency * np.linalg.norm(step - self._action, axis=1)
@@ -355,7 +377,8 @@ class VoltageTask(CalibrationTask):
         return cost
 
     def _arrive(self) -> None:
-        arrived = self._arrivals[np.arange(self.cells), np.minimum(self._step_of_episode, self.episode_steps - 1)]
+        step = np.minimum(self._step_of_episode, self.episode_steps - 1)
+        arrived = self._every or self._arrivals[np.arange(self.cells), step]
         self.count = np.minimum(self.count + arrived, self.readings.count[self.discharge])
         self._step_of_episode += 1
 
@@ -365,7 +388,7 @@ class VoltageTask(CalibrationTask):
 
         :return: shape (cells,)
         """
-        return self._step_of_episode >= self.episode_steps
+        return np.asarray(self._step_of_episode >= self._last_step)
 
     def report(self) -> dict[str, FloatArray]:
         """
@@ -378,8 +401,8 @@ class VoltageTask(CalibrationTask):
         return {
             "q_mobile": true_q_C,
             "r_o": data.r_o[self.discharge],
-            "q_mobile_hat": self.estimate[:, 0].copy(),
-            "r_o_hat": self.estimate[:, 1].copy(),
+            "q_mobile_hat": self._estimate[:, 0].copy(),
+            "r_o_hat": self._estimate[:, 1].copy(),
             "voltage": self._voltage_V[np.arange(self.cells), last],
             "voltage_hat": self._last_V.copy(),
             # a full cell holds q_mobile in its negative electrode

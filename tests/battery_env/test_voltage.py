@@ -22,6 +22,7 @@ from battery_env.calibration.voltage import (
 from battery_env.cells import Discharge, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL
 from battery_env.loads import RandomPiecewise
+from battery_env.sensors import RandomSensorErrors
 from battery_env.trajectories import TrajectoryDataset
 
 BOTH = ("q_mobile", "r_o")
@@ -113,40 +114,45 @@ class TestTask:
         assert np.isnan(other.report()["q_mobile"]).all()
 
     def test_noise_and_offset_are_those_asked_for(self, data, readings):
-        task = started(data, cells=200, noise_V=(0.005, 0.005), offset_V=0.0, start="true")
-        exact = started(data, cells=200, start="true", **EXACT)
-        errors = []
-        for row in range(200):
-            exact.place(row, task.discharge[row], task.count[row], task.estimate[row])
-            length = readings.count[task.discharge[row]]
-            errors.append(task._voltage_V[row, :length] - exact._voltage_V[row, :length])
-        assert np.std(np.concatenate(errors)) == pytest.approx(0.005, rel=0.02)
-        task = started(data, cells=200, noise_V=(0.0, 0.0), offset_V=0.01, start="true")
-        offsets = []
-        for row in range(200):
-            length = readings.count[task.discharge[row]]
-            error = task._voltage_V[row, :length] - readings.voltage_V[readings.part(task.discharge[row])]
-            assert np.ptp(error) < 1e-12
-            offsets.append(error[0])
-        assert np.std(offsets) == pytest.approx(0.01 / np.sqrt(3.0), rel=0.15)
-        assert np.abs(offsets).max() <= 0.01
+        def errors_V(**sensors):
+            """Of the last readings, for each decision of 200 episodes."""
+            task = started(data, cells=200, **sensors)
+            found = []
+            for _ in range(8):
+                true_V = readings.voltage_V[readings.start[task.discharge] + task.count - 1]
+                found.append(task.report()["voltage"] - true_V)
+                task.advance(np.zeros((200, 2)))
+            return np.array(found)
 
-    def test_process_noise_adds_up_as_the_model_decays(self, data):
-        task = started(data, cells=1, noise_V=(0.0, 0.0), offset_V=0.0, process_noise_V=1e-4)
-        draws = np.random.default_rng(0).standard_normal((3, 200_000))
-        noise_V = task._process_noise_V(draws)
+        assert np.std(errors_V(noise_V=(0.005, 0.005), offset_V=0.0)) == pytest.approx(0.005, rel=0.06)
+        offsets_V = errors_V(noise_V=(0.0, 0.0), offset_V=0.01)
+        assert np.ptp(offsets_V, axis=0).max() < 1e-12 and np.abs(offsets_V).max() <= 0.01
+        assert np.std(offsets_V[0]) == pytest.approx(0.01 / np.sqrt(3.0), rel=0.15)
+
+    def test_process_noise_adds_up_as_the_model_decays(self, data, readings):
+        noise_V = readings.process_noise_V(1e-4, np.random.default_rng(0).standard_normal((3, 200_000)))
         variance = sum(1e-8 / (1.0 - (1.0 - 1.0 / tau) ** 2) for tau in (NEW_CELL.to, NEW_CELL.tsn, NEW_CELL.tsp))
         assert np.var(noise_V[1000:]) == pytest.approx(variance, rel=0.1)
+        task, exact = started(data, cells=200, process_noise_V=1e-4, **EXACT), started(data, cells=200, **EXACT)
+        np.testing.assert_array_equal(task.discharge, exact.discharge)
+        shown_V = task.report()["voltage"] - exact.report()["voltage"]
+        assert shown_V.std() == pytest.approx(np.sqrt(variance), rel=0.3)
 
-    def test_measured_power_gives_the_current_of_an_exact_voltage(self, data, readings):
-        one, other = started(data, **EXACT), started(data, measured="power", **EXACT)
-        np.testing.assert_allclose(one.observation(), other.observation(), atol=1e-4)
-        offset = started(data, measured="power", noise_V=(0.0, 0.0), offset_V=0.3, start="true")
-        for row in range(4):
-            part = readings.part(offset.discharge[row])
-            length = readings.count[offset.discharge[row]]
-            measured_W = offset._voltage_V[row, :length] * offset._current_A[row, :length]
-            np.testing.assert_allclose(measured_W, readings.voltage_V[part] * readings.current_A[part], rtol=1e-9)
+    @pytest.mark.parametrize(
+        "fault", [{"current_gain": 0.1}, {"current_offset_A": 0.3}, {"offset_V": 0.3}, {"offset_V": 0.3, "measured": "power"}]
+    )
+    def test_training_sees_what_evaluation_shows(self, data, fault):
+        """An episode looks like a record to which the same errors were applied."""
+        sensors = {**EXACT, **fault}
+        task = BatteryVoltageJoint(1, dataset=data, start="true", **sensors)
+        task.start(np.zeros(1, dtype=int), generators(1, seed=7), {"discharge": 3, "reading": 150})
+        (generator,) = generators(1, seed=7)
+        generator.integers(0, 30, size=8)  # how many readings arrive
+        shown = RandomSensorErrors(**sensors).draw(generator).apply(data[3], generator)
+        evaluated = BatteryVoltageJoint.follow([shown], 150, start="true", **sensors)
+        exact = BatteryVoltageJoint.follow([data[3]], 150, start="true", **sensors)
+        np.testing.assert_allclose(task.observation(), evaluated.observation(), atol=0.05)
+        assert np.abs(exact.observation() - evaluated.observation()).max() > 0.2
 
     def test_consistency_is_charged_and_seen(self, data):
         plain, task = started(data), started(data, consistency=2.0)

@@ -1,5 +1,6 @@
 """The page of the environments: what it takes from the code is what the code says now."""
 
+import ast
 import inspect
 import re
 
@@ -7,7 +8,9 @@ import pytest
 
 from battery_env import ClosedForm, TrajectoryDataset, evaluate, plotting
 from battery_env.calibration.env import CalibrationEnv
+from battery_env.calibration.full_state import BatteryQmax
 from battery_env.calibration.registration import TASKS
+from battery_env.calibration.voltage import BatteryVoltageJoint
 from battery_env.loads import constant
 from benchmarks import environment_page
 
@@ -47,6 +50,18 @@ def test_boxes_in_the_docstrings_are_the_spaces(dataset):
         found = [str(space.shape[0]) for space in (env.observation_space, env.action_space)]
         # a page may refer to another one for the action
         assert shapes == found[: len(shapes)] and shapes, env_id
+
+
+@pytest.mark.parametrize("task", [BatteryQmax, BatteryVoltageJoint])
+def test_the_table_of_arguments_is_that_of_the_options(task):
+    rows = re.findall(r"^\| ``(\w+)`` \| (.*?) \|", inspect.getdoc(task), flags=re.MULTILINE)
+    written = {name: None if default == "none" else ast.literal_eval(default.strip("`")) for name, default in rows}
+    # what the class decides
+    decided = {"episode_steps": BatteryQmax.episode_steps, "cost_limit": BatteryQmax.formulation.cost_limit}
+    expected = {
+        name: decided[name] if default is None and name in decided else default for name, default in task.options().items()
+    }
+    assert written == {**expected, "render_mode": None}
 
 
 def test_common_options_are_options_of_all(dataset):
