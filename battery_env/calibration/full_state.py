@@ -413,10 +413,12 @@ class FullStateTask(CalibrationTask):
         :return: the task, at its first observations
         """
         dataset = records if isinstance(records, TrajectoryDataset) else TrajectoryDataset.from_trajectories(records)
-        longest = int((dataset.stop - dataset.first).max())
-        task = cls(len(dataset), **{**options, "dataset": dataset, "episode_steps": longest})
-        for n in range(len(dataset)):
-            task.start(np.array([n]), [np.random.default_rng(n)], {"trajectory": n, "sample": dataset.first[n]})
+        samples = dataset.stop - dataset.first
+        task = cls(len(dataset), **{**options, "dataset": dataset, "episode_steps": int(samples.max())})
+        # the longest first, so that those that go on are always the first rows
+        for row, n in enumerate(np.argsort(-samples, kind="stable")):
+            point = {"trajectory": n, "sample": dataset.first[n]}
+            task.start(np.array([row]), [np.random.default_rng(n)], point)
         return task
 
     def steps_between(self, decision_s: float) -> int:
