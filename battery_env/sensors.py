@@ -1,12 +1,16 @@
-"""Errors of voltage and current sensors, for simulated discharges."""
+"""Errors of voltage and current sensors: the one simulator of them, for training and evaluation alike."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from typing import Literal, get_args
 
 import numpy as np
 
-from battery_env.electrochemistry import Trajectory
+from battery_env.electrochemistry import FloatArray, Trajectory
+
+#: What is measured beside the voltage: the current, or the power, of which the current is that over the measured voltage.
+Measured = Literal["current", "power"]
 
 
 @dataclass(frozen=True)
@@ -18,6 +22,7 @@ class SensorErrors:
     :param offset_V: constant error of the voltage, V
     :param current_gain: reading of the current sensor per true current; 1.01 reads 1 % too much
     :param current_offset_A: constant error of the current, A
+    :param measured: ``"current"``; or ``"power"``: the current is the power, read exactly, over the measured voltage
     :raises ValueError: for a value that is not finite, or negative noise, or a gain that is not positive
     """
 
@@ -25,15 +30,22 @@ class SensorErrors:
     offset_V: float = 0.0
     current_gain: float = 1.0
     current_offset_A: float = 0.0
+    measured: Measured = "current"
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            if not np.isfinite(getattr(self, field.name)):
-                raise ValueError(f"{field.name} must be finite, got {getattr(self, field.name)!r}")
+        _check_measured(self.measured)
+        for name in (field.name for field in fields(self) if field.name != "measured"):
+            if not np.isfinite(getattr(self, name)):
+                raise ValueError(f"{name} must be finite, got {getattr(self, name)!r}")
         if self.noise_V < 0.0:
             raise ValueError(f"noise_V is a standard deviation and must be at least 0 V, got {self.noise_V!r}")
         if self.current_gain <= 0.0:
             raise ValueError(f"current_gain must be greater than 0 (1: exact), got {self.current_gain!r}")
+
+    @property
+    def change_the_current(self) -> bool:
+        """Whether the current that is read is not the true one."""
+        return (self.current_gain, self.current_offset_A, self.measured) != (1.0, 0.0, "current")
 
     def draw(self, rng: np.random.Generator) -> SensorErrors:
         """
@@ -44,6 +56,27 @@ class SensorErrors:
         """
         return self
 
+    def read_voltage_V(self, voltage_V: FloatArray, noise: FloatArray) -> FloatArray:
+        """
+        The voltage as it is read.
+
+        :param voltage_V: as it is, any shape
+        :param noise: standard normal, same shape
+        :return: same shape
+        """
+        return voltage_V + self.noise_V * noise + self.offset_V
+
+    def gain(self, voltage_V: FloatArray, read_V: FloatArray) -> FloatArray:
+        """
+        What the current is multiplied by before its offset is added.
+
+        :param voltage_V: as it is, V
+        :param read_V: as it is read, V, same shape
+        :return: same shape
+        """
+        gain = np.full_like(voltage_V, self.current_gain)
+        return gain * (voltage_V / read_V) if self.measured == "power" else gain
+
     def apply(self, trajectory: Trajectory, rng: np.random.Generator) -> Trajectory:
         """
         A discharge as the sensors show it.
@@ -52,32 +85,41 @@ class SensorErrors:
         :param rng: source of the noise
         :return: the same with measured voltage and current
         """
-        noise_V = self.noise_V * rng.standard_normal(len(trajectory.voltage_V))
-        return replace(
-            trajectory,
-            voltage_V=trajectory.voltage_V + self.offset_V + noise_V,
-            current_A=self.current_gain * trajectory.current_A + self.current_offset_A,
-        )
+        voltage_V = trajectory.voltage_V
+        read_V = self.read_voltage_V(voltage_V, rng.standard_normal(len(voltage_V)))
+        current_A = self.gain(voltage_V, read_V) * trajectory.current_A + self.current_offset_A
+        return replace(trajectory, voltage_V=read_V, current_A=current_A)
 
 
 @dataclass(frozen=True)
 class RandomSensorErrors:
     """
-    A voltmeter that is another one in each discharge.
+    Sensors that are other ones in each discharge. What they have wrong is constant within it, but for the noise.
 
-    :param noise_V: least and greatest standard deviation of the noise, drawn log-uniformly, V
-    :param offset_V: the offset is drawn uniformly within this to either side, V
-    :raises ValueError: for values that are not finite, negative, or in the wrong order
+    :param noise_V: least and greatest standard deviation of the noise, drawn log-uniformly, V; (0, 0): none
+    :param offset_V: the offset of the voltage is drawn uniformly within this to either side, V
+    :param current_gain: likewise the relative error of the current's gain
+    :param current_offset_A: likewise the offset of the current, A
+    :param measured: as of :class:`SensorErrors`
+    :raises ValueError: for values that are negative, too large for a sensor, or in the wrong order
     """
 
     noise_V: tuple[float, float]
     offset_V: float = 0.0
+    current_gain: float = 0.0
+    current_offset_A: float = 0.0
+    measured: Measured = "current"
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.noise_V[0] <= self.noise_V[1] < np.inf:
-            raise ValueError(f"noise_V must be (least, greatest) in V with 0 < least <= greatest, got {self.noise_V!r}")
-        if not 0.0 <= self.offset_V < np.inf:
-            raise ValueError(f"offset_V must be finite and at least 0 V, got {self.offset_V!r}")
+        _check_measured(self.measured)
+        least, greatest = self.noise_V
+        if not (0.0 < least <= greatest < 1.0 or least == greatest == 0.0):
+            raise ValueError(
+                f"noise_V must be (least, greatest) in V with 0 < least <= greatest < 1, or (0, 0), got {self.noise_V!r}"
+            )
+        for name in ("offset_V", "current_gain", "current_offset_A"):
+            if not 0.0 <= getattr(self, name) < 0.5:
+                raise ValueError(f"{name} must be at least 0 and less than 0.5, got {getattr(self, name)!r}")
 
     def draw(self, rng: np.random.Generator) -> SensorErrors:
         """
@@ -86,5 +128,32 @@ class RandomSensorErrors:
         :param rng: source of randomness
         :return: the errors
         """
-        noise_V = float(np.exp(rng.uniform(*np.log(self.noise_V))))
-        return SensorErrors(noise_V=noise_V, offset_V=float(rng.uniform(-self.offset_V, self.offset_V)))
+        noise_V = self.draw_noise_V(rng)
+        return replace(self.draw_biases(rng), noise_V=noise_V)
+
+    def draw_noise_V(self, rng: np.random.Generator) -> float:
+        """
+        How large the noise of one discharge is.
+
+        :param rng: source of randomness; nothing is drawn where there is no noise
+        :return: its standard deviation, V
+        """
+        return float(np.exp(rng.uniform(*np.log(self.noise_V)))) if self.noise_V[1] > 0.0 else 0.0
+
+    def draw_biases(self, rng: np.random.Generator) -> SensorErrors:
+        """
+        The errors of one discharge but for the noise.
+
+        :param rng: source of randomness; nothing is drawn where a bound is 0
+        :return: errors without noise
+        """
+        offset_V, gain, offset_A = (
+            rng.uniform(-bound, bound) if bound > 0.0 else 0.0
+            for bound in (self.offset_V, self.current_gain, self.current_offset_A)
+        )
+        return SensorErrors(0.0, offset_V, 1.0 + gain, offset_A, self.measured)
+
+
+def _check_measured(measured: str) -> None:
+    if measured not in get_args(Measured):
+        raise ValueError(f"measured must be one of {get_args(Measured)}, got {measured!r}")

@@ -39,9 +39,9 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from tqdm import tqdm
 
+from battery_env.calibration.full_state import FullStateTask
 from battery_env.calibration.policy import PolicyEstimator
 from battery_env.calibration.task import Parameter
-from battery_env.calibration.variants import FullStateEnv
 from battery_env.callbacks import CalibrationCallback
 from battery_env.estimators.closed_form import ClosedForm
 from battery_env.evaluation import evaluate, summarize
@@ -146,7 +146,7 @@ def parameters_of(env_id: str) -> tuple[Parameter, ...]:
     :return: one or both of ``"q_mobile"`` and ``"r_o"``
     :raises ValueError: for another environment
     """
-    return _environment(env_id).task.parameters
+    return _task(env_id).parameters
 
 
 def held_out_trajectories(env_id: str) -> TrajectoryDataset:
@@ -157,14 +157,14 @@ def held_out_trajectories(env_id: str) -> TrajectoryDataset:
     :return: the test part of its data set
     :raises ValueError: for another environment
     """
-    return _environment(env_id, split="test").dataset
+    return _task(env_id, split="test").dataset
 
 
-def _environment(env_id: str, **options: Any) -> FullStateEnv:
-    env = PolicyEstimator.environment(env_id, **options)
-    if not isinstance(env, FullStateEnv):
+def _task(env_id: str, **options: Any) -> FullStateTask:
+    task = PolicyEstimator.environment(env_id, **options).task
+    if not isinstance(task, FullStateTask):
         raise ValueError(f"{env_id} is no full-state environment; voltage-only ones are compared by benchmarks.voltage")
-    return env
+    return task
 
 
 def run(recipe: Recipe, out: Path, position: int = 0) -> None:

@@ -1,5 +1,5 @@
 """
-Write the parts of docs/battery_env.md that stand in the code already: the environments, from the docstrings of their classes,
+Write the parts of docs/battery_env.md that stand in the code already: the environments, from the docstrings of their tasks,
 and the data sets, estimators and columns of the evaluation, from theirs.
 
 .. code-block:: bash
@@ -21,9 +21,9 @@ from pathlib import Path
 
 import battery_env.estimators
 from battery_env.calibration.data import standard_dataset
-from battery_env.calibration.env import CalibrationEnv
-from battery_env.calibration.registration import ENTRY_POINTS
-from battery_env.calibration.variants import FullStateEnv
+from battery_env.calibration.full_state import FullStateTask
+from battery_env.calibration.registration import TASKS
+from battery_env.calibration.task import CalibrationTask
 from battery_env.estimators import Estimator, OnlineEstimator
 from battery_env.evaluation import evaluate
 from battery_env.loads import constant
@@ -33,15 +33,15 @@ from benchmarks.reporting import write_text
 PAGE = Path(__file__).parents[1] / "docs" / "battery_env.md"
 
 
-def environment_class(env_id: str) -> type[CalibrationEnv]:
+def task_class(env_id: str) -> Callable[..., CalibrationTask]:
     """
-    The class of a registered environment for one cell, whose docstring is its page.
+    The task of a registered environment, whose docstring is the page of the environment.
 
     :param env_id: its id
     :return: the class
     """
-    module, name = ENTRY_POINTS[env_id].split(":")
-    found: type[CalibrationEnv] = getattr(import_module(module), name)
+    module, name = TASKS[env_id].split(":")
+    found: Callable[..., CalibrationTask] = getattr(import_module(module), name)
     return found
 
 
@@ -54,16 +54,16 @@ def ids() -> str:
     # spaces and episodes do not depend on the discharges; these are quickly made, and as many as a life has cycles
     dataset = TrajectoryDataset.generate("joint", 20, [constant(8.0)], seed=0)
     rows = []
-    for env_id in ENTRY_POINTS:
-        env = environment_class(env_id)(dataset=dataset)
+    for env_id in TASKS:
+        task = task_class(env_id)(1, dataset=dataset)
         rows.append(
             {
                 "id": f"[`{env_id}`](#{env_id.lower()})",
-                "measured": "the full state" if isinstance(env, FullStateEnv) else "current and voltage",
-                "to be found": " and ".join(f"`{name}`" for name in env.task.parameters),
-                "numbers in an observation": env.task.observation_size,
-                "in an action": len(env.task.parameters),
-                "decisions in an episode": env.task.episode_steps,
+                "measured": "the full state" if isinstance(task, FullStateTask) else "current and voltage",
+                "to be found": " and ".join(f"`{name}`" for name in task.parameters),
+                "numbers in an observation": task.observation_size,
+                "in an action": len(task.parameters),
+                "decisions in an episode": task.episode_steps,
             }
         )
     return _markdown(rows)
@@ -76,8 +76,8 @@ def environments() -> str:
     :return: Markdown
     """
     pages = []
-    for env_id in ENTRY_POINTS:
-        page = inspect.getdoc(environment_class(env_id)) or ""
+    for env_id in TASKS:
+        page = inspect.getdoc(task_class(env_id)) or ""
         pages.append(f"### {env_id}\n\n" + re.sub(r"^## ", "#### ", page, flags=re.MULTILINE))
     return "\n\n".join(pages)
 

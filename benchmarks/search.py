@@ -29,8 +29,8 @@ from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import FrozenTrial, Trial, TrialState
 
+from battery_env.calibration.full_state import FullStateTask
 from battery_env.calibration.policy import PolicyEstimator
-from battery_env.calibration.variants import FullStateEnv
 from battery_env.evaluation import evaluate
 from benchmarks.reporting import write_csv, write_text
 from benchmarks.training import Recipe, run_all, set_up, timesteps_of
@@ -94,10 +94,10 @@ def score(algo: str, env_id: str, updates: int, folder: Path, trial: Trial) -> f
     recipe = Recipe.of(algo, env_id, trial.number, hyperparameters=SAMPLERS[algo](trial))
     _, model = set_up(recipe, folder)
     model.learn(timesteps_of(updates, recipe.hyperparameters))
-    env = PolicyEstimator.environment(env_id)
-    assert isinstance(env, FullStateEnv)
-    discharges = env.dataset.subset(range(0, len(env.dataset), len(env.dataset) // _DISCHARGES))
-    errors = evaluate(PolicyEstimator(model, env_id), discharges)[f"{env.task.parameters[0]}_mape_percent"]
+    task = PolicyEstimator.environment(env_id).task
+    assert isinstance(task, FullStateTask)
+    discharges = task.dataset.subset(range(0, len(task.dataset), len(task.dataset) // _DISCHARGES))
+    errors = evaluate(PolicyEstimator(model, env_id), discharges)[f"{task.parameters[0]}_mape_percent"]
     trial.set_user_attr("updates", model._n_updates)
     trial.set_user_attr("median_percent", float(errors.median()))
     trial.set_user_attr("worst_percent", float(errors.max()))

@@ -167,7 +167,9 @@ def _environment(env_id: str) -> dict[str, Any]:
         raise ValueError(str(error)) from error
     spaces = {"observation_space": str(env.observation_space), "action_space": str(env.action_space)}
     env.close()
-    return {"kwargs": json.loads(json.dumps(spec.kwargs, default=str)), "max_episode_steps": spec.max_episode_steps, **spaces}
+    # which task it is, the id says
+    kwargs = {name: value for name, value in spec.kwargs.items() if name != "task"}
+    return {"kwargs": json.loads(json.dumps(kwargs, default=str)), "max_episode_steps": spec.max_episode_steps, **spaces}
 
 
 def set_up(recipe: Recipe, folder: Path, **options: Any) -> tuple[LACExperimentManager, OffPolicyAlgorithm]:

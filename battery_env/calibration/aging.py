@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from battery_env.calibration.readings import Readings
-from battery_env.calibration.voltage import VoltageOptions, VoltageTask
+from battery_env.calibration.task import check_counts
+from battery_env.calibration.voltage import VoltageTask
 from battery_env.electrochemistry import FloatArray
+from battery_env.estimators.base import Record
 from battery_env.loads import RandomPiecewise
 from battery_env.trajectories import TrajectoryDataset
+
+#: Lives to train on and to test on.
+LIVES = {"train": 70, "test": 30}
 
 
 @lru_cache(maxsize=4)
@@ -50,49 +53,92 @@ def simulated_lives(lives: int, cycles: int, seed: int) -> TrajectoryDataset:
     )
 
 
-@dataclass(frozen=True)
-class AgingOptions(VoltageOptions):
+class BatteryAging(VoltageTask):
     """
-    What ``BatteryAging-v0`` can be asked for, besides what all voltage-only tasks can.
+    ## Description
 
-    :param cycles: cycles of a life; an episode is a life
-    :param decisions_per_cycle: decisions in each of them; ``episode_steps`` follows
-    :raises ValueError: for values out of range
+    The life of a Li-ion cell: 20 cycles, each a discharge from full charge as in ``BatteryVoltageJoint-v0``, with wear
+    between them (``battery_env.calibration.aging.simulated_lives``: q^max falls by 10 to 40 % and R_o rises by 20 to 100 %
+    over a life, in uneven steps). The estimate is carried over from cycle to cycle. Only the readings of the present cycle
+    count in observation and cost, so that early in a discharge, when the data say nothing of q^max, the estimate of the last
+    cycle is the best there is.
+
+    ## Observation space
+
+    ``Box(-100, 100, (104,), float32)``: that of ``BatteryVoltageJoint-v0``, and at 102-103 the estimate that was carried over
+    into this cycle, scaled as at 100-101.
+
+    ## Action space
+
+    That of ``BatteryVoltageJoint-v0``.
+
+    ## Reward
+
+    That of ``BatteryVoltageJoint-v0``.
+
+    ## Starting state
+
+    The first cycle of one of 70 lives, 10 to 60 readings after its start, with the estimate of a new cell. The sensor's noise
+    and offset are drawn anew for each cycle.
+
+    ## Episode end
+
+    Truncated after the last decision of the last cycle: 8 decisions in each of 20 cycles. Never terminated.
+
+    ## Arguments
+
+    ``cycles`` (20), ``decisions_per_cycle`` (8), ``split`` (``"train"``; or ``"test"``: 30 other lives), ``dataset``
+    (discharges, life after life, each with ``cycles`` of them), and those of ``BatteryVoltageJoint-v0`` but for
+    ``episode_steps``, ``load``, ``dt_s`` and ``mismatch``; ``new_readings`` is (10, 60) and ``start`` ``"new_cell"`` here.
+    ``reset(options={"discharge": n})`` takes the first discharge of a life.
+
+    ## Version history
+
+    * v0: initial version
     """
 
-    episode_steps: int = 0
-    new_readings: tuple[int, int] = (10, 60)
-    start: str = "new_cell"  # type: ignore[assignment]
-    cycles: int = 20
-    decisions_per_cycle: int = 8
+    parameters = ("q_mobile", "r_o")
 
-    def __post_init__(self) -> None:
-        for name in ("cycles", "decisions_per_cycle"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)!r}")
-        object.__setattr__(self, "episode_steps", self.cycles * self.decisions_per_cycle)
-        super().__post_init__()
-
-
-class AgingTask(VoltageTask):
-    """
-    Both parameters of cells that wear, through their lives. Each cycle is a discharge from full charge; its data alone count
-    in the misfit, so that early in a cycle little is known of ``q_mobile`` but what the last cycle said: the observation
-    holds the estimate that was carried over beside the one of now.
-
-    :param readings: discharges, life after life
-    :param cells: size of the batch
-    :param options: of the task
-    """
-
-    def __init__(self, readings: Readings, cells: int, options: AgingOptions) -> None:
-        if len(readings) % options.cycles:
-            raise ValueError(f"{len(readings)} discharges are no whole number of lives of {options.cycles} cycles")
-        self.cycles, self.decisions_per_cycle = options.cycles, options.decisions_per_cycle
-        super().__init__(readings, ("q_mobile", "r_o"), cells, options)
+    def __init__(
+        self,
+        cells: int,
+        *,
+        cycles: int = 20,
+        decisions_per_cycle: int = 8,
+        reading_s: float = 10.0,
+        new_readings: tuple[int, int] = (10, 60),
+        process_noise_V: float = 0.0,
+        start: Literal["random", "new_cell", "true"] = "new_cell",
+        consistency: float = 0.0,
+        split: Literal["train", "test"] = "train",
+        dataset: Sequence[Record] | None = None,
+        **sensors: Any,
+    ) -> None:
+        check_counts(cycles=cycles, decisions_per_cycle=decisions_per_cycle)
+        if split not in LIVES:
+            raise ValueError(f"split must be one of {tuple(LIVES)}, got {split!r}")
+        if dataset is None:
+            dataset = simulated_lives(LIVES[split], cycles, seed=list(LIVES).index(split))
+        else:
+            self._refuse_beside_a_dataset(split=split)
+        super().__init__(
+            cells,
+            episode_steps=cycles * decisions_per_cycle,
+            reading_s=reading_s,
+            new_readings=new_readings,
+            process_noise_V=process_noise_V,
+            start=start,
+            consistency=consistency,
+            dataset=dataset,
+            **sensors,
+        )
+        if len(self.readings) % cycles:
+            raise ValueError(f"{len(self.readings)} discharges are no whole number of lives of {cycles} cycles")
+        self.cycles, self.decisions_per_cycle = cycles, decisions_per_cycle
         self.observation_size += len(self.parameters)
-        self._carried = self.estimate.copy()
-        self._generators: list[np.random.Generator] = [np.random.default_rng(0)] * cells
+        self._carried = self._estimate.copy()
+        # of the episodes; none on whole records, where nothing is drawn
+        self._generators: list[np.random.Generator | None] = [None] * cells
 
     def start(
         self,
@@ -115,23 +161,47 @@ class AgingTask(VoltageTask):
             # later cycles need randomness when the agent gets there; the generator of the cell is not to be drawn from then
             self._generators[row] = np.random.default_rng(generator.integers(2**63))
         super().start(rows, generators, options)
-        self._carried[rows] = self.estimate[rows]
+        self._carried[rows] = self._estimate[rows]
 
     def _draw_discharge(self, generator: np.random.Generator) -> int:
         return self.cycles * int(generator.integers(len(self.readings) // self.cycles))
 
-    def _draw_count(self, discharge: int, generator: np.random.Generator) -> int:
-        return min(int(generator.integers(*self.options.new_readings, endpoint=True)), int(self.readings.count[discharge]))
+    @classmethod
+    def follow(cls, records: Sequence[Record], every: int, **options: Any) -> BatteryAging:
+        """
+        Go through whole lives, each with a cell of its own; see :meth:`VoltageTask.follow`.
+
+        :param records: discharges from full charge, life after life, each with ``cycles`` of them
+        :param every: readings between two decisions, and before the first one of each discharge
+        :param options: of the task, but for those of its data
+        :return: the task, at its first observations
+        """
+        task = super().follow(records, every, **options)
+        assert isinstance(task, BatteryAging)
+        task._carried = task._estimate.copy()
+        return task
+
+    @classmethod
+    def _discharges_of_an_episode(cls, options: Mapping[str, Any]) -> int:
+        return int(options.get("cycles", cls.options()["cycles"]))
+
+    @property
+    def _decisions_in_a_discharge(self) -> int:
+        return self.decisions_per_cycle
+
+    def _draw_count(self, length: int, generator: np.random.Generator) -> int:
+        return min(int(generator.integers(*self.new_readings, endpoint=True)), length)
 
     def _arrive(self) -> None:
         """New readings, or after the last decision of a cycle those of the next one."""
         super()._arrive()
-        ended = (self._step_of_episode % self.decisions_per_cycle == 0) & (self._step_of_episode < self.episode_steps)
-        for row in np.flatnonzero(ended).tolist():
+        goes_on = (self._step_of_episode >= self._last_step) & (self.discharge % self.cycles < self.cycles - 1)
+        for row in np.flatnonzero(goes_on).tolist():
             discharge, generator = int(self.discharge[row]) + 1, self._generators[row]
-            self._carried[row] = self.estimate[row]
-            self.place(row, discharge, self._draw_count(discharge, generator), self.estimate[row])
-            self._measure(row, discharge, generator)
+            self._carried[row] = self._estimate[row]
+            self._place(row, discharge, self._first_count(discharge, generator), self._estimate[row])
+            if generator is not None:
+                self._measure(row, discharge, generator)
 
     def _parts(self) -> list[FloatArray]:
         return [*super()._parts(), self._scaled(self._carried)]

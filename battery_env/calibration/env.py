@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections import deque
+from collections.abc import Mapping, Sequence
+from importlib import import_module
 from typing import Any, SupportsFloat
 
 import gymnasium as gym
@@ -11,10 +12,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from battery_env.calibration.task import OBSERVATION_LIMIT, CalibrationTask
+from battery_env.estimators.base import Record
 
 _ROW = np.zeros(1, dtype=np.intp)
 FloatSpace = gym.Space[NDArray[np.float32]]
 _RENDER_MODES = ["rgb_array"]
+
+
+def new_task(task: str | type[CalibrationTask], cells: int, options: Mapping[str, Any]) -> CalibrationTask:
+    """
+    A task for some cells.
+
+    :param task: its class, or where that is, as ``"module:name"``
+    :param cells: size of the batch
+    :param options: of the task
+    :return: the task
+    :raises TypeError: for an option that the task does not have
+    :raises ValueError: for values out of range
+    """
+    if isinstance(task, str):
+        module, _, name = task.partition(":")
+        task = getattr(import_module(module), name)
+    known = task.options()
+    unknown = options.keys() - known.keys()
+    if unknown:
+        raise TypeError(f"{', '.join(sorted(unknown))}: no such option. There are {', '.join(sorted(known))}")
+    return task(cells, **options)
 
 
 def spaces_of(task: CalibrationTask) -> tuple[FloatSpace, FloatSpace]:
@@ -44,11 +67,13 @@ def check_render_mode(render_mode: str | None) -> str | None:
     return render_mode
 
 
-class CalibrationEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]], ABC):
+class CalibrationEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     """
-    A calibration task for one cell; see the registered environments. The reward is minus the cost, and ``info`` holds the cost
-    and what :meth:`~battery_env.calibration.task.CalibrationTask.report` says.
+    A calibration task for one cell. The reward is minus the cost, and ``info`` holds the cost and what
+    :meth:`~battery_env.calibration.task.CalibrationTask.report` says. ``help(env.task)`` describes what is observed, done,
+    paid and can be chosen.
 
+    :param task: the class of the task, or where it is, as ``"module:name"``
     :param render_mode: ``"rgb_array"`` or ``None``
     :param options: of the task
     :raises TypeError: for an option that the task does not have
@@ -57,22 +82,16 @@ class CalibrationEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]], ABC):
 
     metadata: dict[str, Any] = {"render_modes": _RENDER_MODES, "render_fps": 10}  # noqa: RUF012 (as in gym.Env)
 
-    def __init__(self, render_mode: str | None = None, **options: Any) -> None:
+    def __init__(self, task: str | type[CalibrationTask], render_mode: str | None = None, **options: Any) -> None:
         self.render_mode = check_render_mode(render_mode)
-        self.task = self.make_task(1, **options)
+        self.task = new_task(task, 1, options)
         self.observation_space, self.action_space = spaces_of(self.task)
         self._history: deque[dict[str, float]] = deque(maxlen=self.task.episode_steps)
 
-    @staticmethod
-    @abstractmethod
-    def make_task(cells: int, **options: Any) -> CalibrationTask:
-        """
-        The task of this environment, for any number of cells.
-
-        :param cells: size of the batch
-        :param options: of the task
-        :return: the task
-        """
+    @property
+    def dataset(self) -> Sequence[Record]:
+        """The discharges that episodes are drawn from."""
+        return self.task.dataset
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -10,20 +10,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from battery_env.arrays import IntArray
+from battery_env.calibration.data import LoadKind, Split, standard_dataset
 from battery_env.calibration.full_state_kernels import decide, look_ahead, observe
-from battery_env.calibration.task import OBSERVATION_LIMIT, CalibrationTask, checked_action
+from battery_env.calibration.task import OBSERVATION_LIMIT, CalibrationTask, check_counts, check_not_negative, checked_action
 from battery_env.electrochemistry import (
     NEW_CELL,
     QNB,
     STATE_SIZE,
     VO,
     FloatArray,
+    Trajectory,
     advance_in_place,
     initial_state,
     voltage_into,
@@ -45,58 +48,6 @@ ERROR_SCALE: FloatArray = np.array([0.01, 1e-5, 1e-5, 20.0, 20.0, 20.0, 20.0])
 # A model that was wrong for a while has moved too much or too little charge from one electrode to the other; in both, nine
 # tenths of it are in the bulk
 _PERTURBATION = np.array([1.0, 1.0, 1.0, -0.9, -0.1, 0.9, 0.1])
-
-
-@dataclass(frozen=True)
-class FullStateOptions:
-    """
-    What the full-state tasks can be asked for. Error scales are ``ERROR_SCALE``.
-
-    :param episode_steps: decisions per episode; fewer where the data end
-    :param start: the model's first state: ``"true"``, the cell's; or ``"new_cell"``, that of a cell that was full when the
-        discharge began, is new in what is to be found, and has carried the same load since
-    :param initial_perturbation: the first state is off by a uniform draw within this many error scales to either side, in Vo,
-        Vsn, Vsp and in charge that has moved between the electrodes
-    :param resync: after every so many decisions the model is set to the measured state; ``None``: it runs free
-    :param process_noise_V: standard deviation of white noise on Vo, Vsn and Vsp of the cell, V per root of a second
-    :param sensor_noise: standard deviation of white noise on measured states, in error scales
-    :param sensor_offset: constant error of measured states, in error scales
-    :param sensor_gain: measured states are the true ones times this
-    :param consistency: cost of a change of the action, per unit of its Euclidean length; above 0 the observation ends with the
-        action before (at the start the one that stands for a new cell)
-    :param cost_scale: what the distance of the states is multiplied by to give the cost
-    :param cost_limit: largest cost of a distance; ``None``: that of the formulation
-    :raises ValueError: for values out of range
-    """
-
-    episode_steps: int = 64
-    start: Literal["true", "new_cell"] = "true"
-    initial_perturbation: float = 0.0
-    resync: int | None = None
-    process_noise_V: float = 0.0
-    sensor_noise: float = 0.0
-    sensor_offset: float = 0.0
-    sensor_gain: float = 1.0
-    consistency: float = 0.0
-    cost_scale: float = 1.0
-    cost_limit: float | None = None
-
-    def __post_init__(self) -> None:
-        if self.episode_steps < 1:
-            raise ValueError(f"episode_steps must be at least 1, got {self.episode_steps!r}")
-        if self.start not in ("true", "new_cell"):
-            raise ValueError(f"start must be 'true' or 'new_cell', got {self.start!r}")
-        if self.resync is not None and self.resync < 1:
-            raise ValueError(f"resync must be None or at least 1, got {self.resync!r}")
-        for name in ("initial_perturbation", "process_noise_V", "sensor_noise", "consistency"):
-            if not 0.0 <= getattr(self, name) < np.inf:
-                raise ValueError(f"{name} must be finite and at least 0, got {getattr(self, name)!r}")
-        if not np.isfinite(self.sensor_offset):
-            raise ValueError(f"sensor_offset must be finite, got {self.sensor_offset!r}")
-        for name in ("sensor_gain", "cost_scale", "cost_limit"):
-            value = getattr(self, name)
-            if value is not None and not 0.0 < value < np.inf:
-                raise ValueError(f"{name} must be finite and greater than 0, got {value!r}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,26 +75,24 @@ class Formulation:
     cost_limit: float
 
 
-FORMULATIONS: dict[str, Formulation] = {
-    "scaled": Formulation(
-        # what a new cell's states reach under 8 to 16 W
-        state_scale=np.array([0.5, 0.1, 0.01, 6840.0, 760.0, 11400.0, 1266.0]),
-        load_scale=16.0,
-        error_scale=ERROR_SCALE,
-        innovations=True,
-        literal_cost=False,
-        cost_limit=5.0,
-    ),
-    # the authors' code: a new cell's charges, 1 V and 20 W
-    "paper": Formulation(
-        state_scale=np.array([1.0, 1.0, 1.0, 6840.0, 760.0, 4560.0, 506.67]),
-        load_scale=20.0,
-        error_scale=np.ones(OBSERVED_SIZE),
-        innovations=False,
-        literal_cost=True,
-        cost_limit=1e4,
-    ),
-}
+#: Everything divided by what it reaches in a new cell under 8 to 16 W, and measured in error scales.
+SCALED = Formulation(
+    state_scale=np.array([0.5, 0.1, 0.01, 6840.0, 760.0, 11400.0, 1266.0]),
+    load_scale=16.0,
+    error_scale=ERROR_SCALE,
+    innovations=True,
+    literal_cost=False,
+    cost_limit=5.0,
+)
+#: The authors' code: divided by a new cell's charges, 1 V and 20 W.
+LITERAL = Formulation(
+    state_scale=np.array([1.0, 1.0, 1.0, 6840.0, 760.0, 4560.0, 506.67]),
+    load_scale=20.0,
+    error_scale=np.ones(OBSERVED_SIZE),
+    innovations=False,
+    literal_cost=True,
+    cost_limit=1e4,
+)
 
 # What belongs to a cell of the batch
 _PER_CELL = (
@@ -172,43 +121,87 @@ _PER_CELL = (
 )
 
 
+@lru_cache(maxsize=4)
+def _reachable(parameter: AgedParameter, load: LoadKind, split: Split, dt_s: float, mismatch: float) -> TrajectoryDataset:
+    # the discharges of the standard data set whose parameters actions can stand for
+    dataset = standard_dataset(parameter, load, split, dt_s, mismatch)
+    values = {"q_mobile": dataset.q_mobile, "r_o": dataset.r_o}
+    within = np.all([(low <= values[name]) & (values[name] <= high) for name, (low, high) in ACTION_RANGES.items()], axis=0)
+    return dataset if within.all() else dataset.subset(np.flatnonzero(within))
+
+
 class FullStateTask(CalibrationTask):
     """
     The paper's task for ``cells`` cells side by side: the state of the cell is measured; one parameter is to be found and the
-    other one is known, or both are to be found.
+    other one is known, or both are to be found. What differs between the registered ones is data of their classes; their
+    options are described on the page of :class:`BatteryQmax`.
 
     The truth is simulated beside the model, from the data set's parameters and loads. The model is continued where a wrong
     parameter leaves its domain (:func:`battery_env.electrochemistry.step_into`, ``extended``).
 
-    :param dataset: the discharges
-    :param parameter: what the action is: ``"q_mobile"``, ``"r_o"`` or ``"joint"``, both in this order
-    :param formulation: observation and cost: ``"scaled"`` or ``"paper"``
+    :ivar formulation: how states become observations and costs
     :param cells: size of the batch
-    :param options: of the task
-    :raises ValueError: for an unknown parameter or formulation
+    :raises ValueError: for values out of range
     """
+
+    formulation: Formulation = SCALED
+    episode_steps = 64
+    dataset: TrajectoryDataset
 
     def __init__(
         self,
-        dataset: TrajectoryDataset,
-        parameter: AgedParameter,
-        formulation: str,
         cells: int,
-        options: FullStateOptions | None = None,
+        *,
+        episode_steps: int | None = None,
+        start: Literal["true", "new_cell"] = "true",
+        initial_perturbation: float = 0.0,
+        resync: int | None = None,
+        process_noise_V: float = 0.0,
+        sensor_noise: float = 0.0,
+        sensor_offset: float = 0.0,
+        sensor_gain: float = 1.0,
+        consistency: float = 0.0,
+        cost_limit: float | None = None,
+        load: LoadKind = "paper",
+        split: Split = "train",
+        dt_s: float = 1.0,
+        mismatch: float = 0.0,
+        dataset: TrajectoryDataset | None = None,
     ) -> None:
-        if parameter not in (*ACTION_RANGES, "joint"):
-            raise ValueError(f"parameter must be one of {(*ACTION_RANGES, 'joint')}, got {parameter!r}")
-        if formulation not in FORMULATIONS:
-            raise ValueError(f"formulation must be one of {tuple(FORMULATIONS)}, got {formulation!r}")
-        self.dataset = dataset
-        self.parameter: AgedParameter = parameter
-        self.parameters = ("q_mobile", "r_o") if parameter == "joint" else (parameter,)
-        self.formulation = form = FORMULATIONS[formulation]
-        self.options = chosen = options or FullStateOptions()
+        if start not in ("true", "new_cell"):
+            raise ValueError(f"start must be 'true' or 'new_cell', got {start!r}")
+        if resync is not None and resync < 1:
+            raise ValueError(f"resync must be None or at least 1, got {resync!r}")
+        check_not_negative(
+            initial_perturbation=initial_perturbation,
+            process_noise_V=process_noise_V,
+            sensor_noise=sensor_noise,
+            consistency=consistency,
+        )
+        if not np.isfinite(sensor_offset):
+            raise ValueError(f"sensor_offset must be finite, got {sensor_offset!r}")
+        form = self.formulation
+        limit = form.cost_limit if cost_limit is None else cost_limit
+        for name, value in (("sensor_gain", sensor_gain), ("cost_limit", limit)):
+            if not 0.0 < value < np.inf:
+                raise ValueError(f"{name} must be finite and greater than 0, got {value!r}")
         self.cells = cells
-        self.episode_steps = chosen.episode_steps
+        if episode_steps is not None:
+            self.episode_steps = episode_steps
+        check_counts(episode_steps=self.episode_steps)
+        data: dict[str, Any] = {"load": load, "split": split, "dt_s": dt_s, "mismatch": mismatch}
+        if dataset is None:
+            self.dataset = dataset = _reachable("joint" if len(self.parameters) == 2 else self.parameters[0], **data)
+        else:
+            self._refuse_beside_a_dataset(**data)
+            self.dataset = dataset
         self.decision_s = dataset.dt_s
-        shows_action = chosen.consistency > 0.0
+        self.starts_new = start == "new_cell"
+        self.initial_perturbation = initial_perturbation
+        self.resync = resync
+        self.process_noise_V = process_noise_V
+        self.sensor_noise, self.sensor_offset, self.sensor_gain = sensor_noise, sensor_offset, sensor_gain
+        shows_action = consistency > 0.0
         shown = (4 if form.innovations else 2) * OBSERVED_SIZE + 1
         self.observation_size = shown + (len(self.parameters) if shows_action else 0)
         self._action_range = np.array([ACTION_RANGES[name] for name in self.parameters]).T
@@ -225,11 +218,11 @@ class FullStateTask(CalibrationTask):
         self._last_sample, self._last_decision, self._load_start = np.zeros((3, cells), dtype=np.int64)
         self._nominal_q_mobile, self._nominal_r_o = np.full(cells, NEW_CELL.q_mobile), np.full(cells, NEW_CELL.r_o)
 
-        self._has_sensor_errors = (chosen.sensor_noise, chosen.sensor_offset, chosen.sensor_gain) != (0.0, 0.0, 1.0)
-        self._is_disturbed = self._has_sensor_errors or chosen.process_noise_V > 0.0
+        self._has_sensor_errors = (sensor_noise, sensor_offset, sensor_gain) != (0.0, 0.0, 1.0)
+        self._is_disturbed = self._has_sensor_errors or process_noise_V > 0.0
         self._sensed, self._sensed_before = np.zeros((2, cells if self._has_sensor_errors else 0, STATE_SIZE))
         # standard normal, of the process first; one row for each measured state, of which the first is x_t at the start
-        columns = (OBSERVED_SIZE if chosen.sensor_noise > 0.0 else 0) + (3 if chosen.process_noise_V > 0.0 else 0)
+        columns = (OBSERVED_SIZE if sensor_noise > 0.0 else 0) + (3 if process_noise_V > 0.0 else 0)
         self._noise = np.zeros((cells, self.episode_steps + 2, columns))
 
         self._model_packed = self._true_packed = dataset.cell.packed
@@ -239,14 +232,15 @@ class FullStateTask(CalibrationTask):
             self._true_packed = self._model_packed._replace(constants=own)
         # what the kernels read, in their order
         self._of_step = (dataset.dt_s, dataset.load_unit == "power", dataset.thermal)
-        cost = (form.literal_cost, chosen.cost_scale, chosen.cost_limit or form.cost_limit, chosen.consistency)
         finds = ("q_mobile" in self.parameters, "r_o" in self.parameters)
         self._of_decision = (
             self._action_range[0],
             self._action_range[1],
             *finds,
             *self._of_step,
-            *cost,
+            form.literal_cost,
+            limit,
+            consistency,
             1.0 / form.error_scale,
         )
         scales = (1.0 / form.state_scale, 1.0 / form.load_scale, 1.0 / form.error_scale)
@@ -280,7 +274,7 @@ class FullStateTask(CalibrationTask):
         unknown = set(chosen) - {"trajectory", "sample"}
         if unknown:
             raise ValueError(f"options of reset are 'trajectory' and 'sample', got {sorted(unknown)}")
-        bound = self.options.initial_perturbation
+        bound = self.initial_perturbation
         trajectories = len(self.dataset)
         trajectory, sample = np.empty((2, len(rows)), dtype=np.int64)
         perturbation = np.zeros((len(rows), 4))
@@ -311,7 +305,7 @@ class FullStateTask(CalibrationTask):
         q_mobile_hat = self._nominal_q_mobile[rows] if "q_mobile" in self.parameters else q_mobile
         r_o_hat = self._nominal_r_o[rows] if "r_o" in self.parameters else r_o
         state = dataset.states_at(trajectory, sample)
-        if self.options.start == "new_cell":
+        if self.starts_new:
             model_state = initial_state(q_mobile_hat, dataset.cell)
             of_step = (dataset.dt_s, dataset.load_unit, dataset.thermal, self._model_packed)
             advance_in_place(
@@ -319,7 +313,7 @@ class FullStateTask(CalibrationTask):
             )
         else:
             model_state = state.copy()
-        if self.options.initial_perturbation > 0.0:
+        if self.initial_perturbation > 0.0:
             model_state[:, OBSERVED] += perturbation[:, [0, 1, 2, 3, 3, 3, 3]] * _PERTURBATION * ERROR_SCALE
         packed = self._true_packed
         if self._has_own_constants:
@@ -347,17 +341,17 @@ class FullStateTask(CalibrationTask):
     def _disturb(self, rows: NDArray[np.intp]) -> None:
         # the noise of the process on x_{t+1}, then the errors of the sensors
         noise = self._noise[rows, 1 + np.minimum(self.decisions[rows], self.episode_steps)]
-        if self.options.process_noise_V > 0.0:
-            self.next_state[rows, VO:QNB] += self.options.process_noise_V * np.sqrt(self.dataset.dt_s) * noise[:, :3]
+        if self.process_noise_V > 0.0:
+            self.next_state[rows, VO:QNB] += self.process_noise_V * np.sqrt(self.dataset.dt_s) * noise[:, :3]
         if self._has_sensor_errors:
             self._sensed[rows] = self._as_sensed(self.next_state[rows], noise)
 
     def _as_sensed(self, state: FloatArray, noise: FloatArray) -> FloatArray:
-        error = np.full((len(state), OBSERVED_SIZE), self.options.sensor_offset)
-        if self.options.sensor_noise > 0.0:
-            error += self.options.sensor_noise * noise[:, -OBSERVED_SIZE:]
+        error = np.full((len(state), OBSERVED_SIZE), self.sensor_offset)
+        if self.sensor_noise > 0.0:
+            error += self.sensor_noise * noise[:, -OBSERVED_SIZE:]
         sensed = state.copy()
-        sensed[:, OBSERVED] = self.options.sensor_gain * state[:, OBSERVED] + error * ERROR_SCALE
+        sensed[:, OBSERVED] = self.sensor_gain * state[:, OBSERVED] + error * ERROR_SCALE
         return sensed
 
     def advance(self, action: NDArray[np.floating]) -> FloatArray:
@@ -385,8 +379,8 @@ class FullStateTask(CalibrationTask):
             self.sample,
             cost,
         )
-        if self.options.resync is not None:
-            due = self.decisions % self.options.resync == 0
+        if self.resync is not None:
+            due = self.decisions % self.resync == 0
             self.model_state[due] = measured[due]
         self.state, self.next_state = self.next_state, self.state
         self._sensed_before, self._sensed = self._sensed, self._sensed_before
@@ -409,13 +403,62 @@ class FullStateTask(CalibrationTask):
             self._disturb(np.arange(self.cells))
         return cost
 
-    def transitions_left(self) -> IntArray:
+    @classmethod
+    def follow(cls, records: Sequence[Trajectory], every: int, **options: Any) -> FullStateTask:
         """
-        How many more decisions each cell's data allow; after the last one its next observation still lies in the data.
+        Go through whole discharges, each with a cell of its own, with the model's state running free from the first sample.
 
-        :return: shape (cells,)
+        :param records: simulated discharges; no recording has the full state
+        :param every: 1
+        :param options: of the task, but for those of its data
+        :return: the task, at its first observations
         """
-        return self._last_decision - self.sample
+        dataset = records if isinstance(records, TrajectoryDataset) else TrajectoryDataset.from_trajectories(records)
+        samples = dataset.stop - dataset.first
+        task = cls(len(dataset), **{**options, "dataset": dataset, "episode_steps": int(samples.max())})
+        # the longest first, so that those that go on are always the first rows
+        for row, n in enumerate(np.argsort(-samples, kind="stable")):
+            point = {"trajectory": n, "sample": dataset.first[n]}
+            task.start(np.array([row]), [np.random.default_rng(n)], point)
+        return task
+
+    def steps_between(self, decision_s: float) -> int:
+        """
+        How many samples arrive between two decisions on a whole record: the policy decides at each of them.
+
+        :param decision_s: ignored
+        :return: 1
+        """
+        return 1
+
+    def seen(self) -> tuple[IntArray, FloatArray]:
+        """
+        Which data the next decision knows, x_{t+1} among them.
+
+        :return: each cell's discharge, and the time of its last sample on the clock of the data set, s, shape (cells,)
+        """
+        return self.trajectory.copy(), (self.sample + 1) * self.dataset.dt_s
+
+    @property
+    def estimate(self) -> FloatArray:
+        """(q_mobile, r_o) of the model, C and ohm, shape (cells, 2)."""
+        return np.stack([self.q_mobile_hat, self.r_o_hat], axis=1)
+
+    @staticmethod
+    def conclude(estimates: FloatArray) -> float:
+        """
+        What is left of the estimates over a record: their mean, for each is made of its own sample.
+
+        :param estimates: of one parameter, shape (K,)
+        :return: one estimate
+        """
+        return float(estimates.mean())
+
+    def drop_ended(self) -> None:
+        """Go on without the cells whose episodes are over."""
+        over = self.truncated()
+        if over.any():
+            self.keep(~over)
 
     def truncated(self) -> NDArray[np.bool_]:
         """
@@ -501,3 +544,252 @@ class FullStateTask(CalibrationTask):
             "voltage_hat": voltage_hat,
             "soc": self.soc.copy(),
         }
+
+
+class BatteryQmax(FullStateTask):
+    """
+    ## Description
+
+    A Li-ion cell of unknown age is discharged at a constant power of 8 to 16 W, and its whole state is measured once a
+    second. Find q^max (``q_mobile``), the charge that can move, by making NASA's electrochemistry model follow the measured
+    state. Source: Unagar et al. 2020; no label is used, and the reward does not know the true parameter.
+
+    ## Observation space
+
+    ``Box(-100, 100, (29,), float32)``. States are Vo, Vsn, Vsp (divided by 0.5, 0.1, 0.01 V), qnB, qnS, qpB, qpS (divided by
+    6840, 760, 11400, 1266 C).
+
+    | index | content |
+    |-------|---------|
+    | 0-6   | x̂_t, the model's state |
+    | 7-13  | x_{t+1}, the measured state one step ahead |
+    | 14    | u_{t+1}, the power over that step, divided by 16 W |
+    | 15-21 | asinh of the innovation x_{t+1} minus what the model with a new cell's parameters predicts from x̂_t, in error scales |
+    | 22-28 | asinh of the innovation x_{t+1} minus what the model with a new cell's parameters predicts from x_t, the state measured before, in error scales |
+
+    Error scales: Vo 0.01 V, Vsn and Vsp 1e-5 V, charges 20 C. The two innovations make the measurements readable: a parameter
+    that is off by 1 % moves the next state by 1e-4 of its value. The second one shows what the parameter did in this second.
+    The first one shows besides how far the model has drifted, which is most of the cost. A model that was wrong for a minute
+    is off by hundreds of error scales; asinh keeps what a network sees within about 7, and leaves small innovations as they are.
+
+    The observation is Markov for a constant load: cost and next model state depend on it and the action alone, the next
+    measured state on the parameter too, which the observation determines. It stays so with ``start``,
+    ``initial_perturbation``, ``process_noise_V``, ``sensor_offset``, ``sensor_gain``, ``consistency`` (which appends what is
+    needed) and ``resync`` = 1. It is not Markov, though the cost of a decision still depends on observation and action alone,
+    with a load that changes (when, is hidden), ``resync`` > 1 (so is the step in the cycle), ``sensor_noise`` (so is the true
+    state) or ``mismatch`` (so are constants of the cell).
+
+    ## Action space
+
+    ``Box(-1, 1, (1,), float32)``, mapped linearly to q_mobile = 4000 .. 8000 C. R_o is known.
+
+    ## Reward
+
+    Minus the cost, the Euclidean norm of x̂_{t+1} - x_{t+1} in error scales, at most 5.
+
+    ## Starting state
+
+    A random second of a random discharge of the training part (70 %) of the paper's data: eleven loads times 501 values
+    of q_mobile in 4000 .. 7000 C, without the first and last 5 % of each discharge. The model starts in the true state.
+    ``reset(options=...)`` takes ``trajectory`` and ``sample`` (counted from the start of the discharge) in place of random ones.
+
+    ## Episode end
+
+    Truncated after 64 steps, or where the data end. Never terminated.
+
+    ## Arguments
+
+    | argument | default | meaning |
+    |----------|---------|---------|
+    | ``episode_steps`` | 64 | decisions per episode |
+    | ``start`` | ``"true"`` | the model's first state: the cell's; or ``"new_cell"``: that of a cell that was full when the discharge began, is new in what is to be found, and has carried the same load since. No action makes up for the charge that it has too much |
+    | ``initial_perturbation`` | 0 | the first state is off by a uniform draw within this many error scales to either side, in Vo, Vsn, Vsp and in charge that has moved between the electrodes |
+    | ``resync`` | none | the model is set to the measured state after every so many decisions |
+    | ``process_noise_V`` | 0 | standard deviation of white noise on Vo, Vsn and Vsp of the cell, V per root of a second |
+    | ``sensor_noise`` | 0 | standard deviation of white noise on measured states, in error scales. Observation, cost and ``resync`` all use the measured state |
+    | ``sensor_offset`` | 0 | constant error of measured states, in error scales |
+    | ``sensor_gain`` | 1 | measured states are the true ones times this |
+    | ``consistency`` | 0 | cost of a change of the action per unit of its Euclidean length (the paper's consistency penalty); above 0 the action before is appended to the observation, at first the one that stands for a new cell |
+    | ``cost_limit`` | 5 | largest cost, without that of a change |
+    | ``load`` | ``"paper"`` | or ``"constant"``, ``"piecewise"``, ``"random_walk"``, ``"recorded"``: see ``battery_env.calibration.data.standard_dataset``; cells whose parameters no action stands for are left out |
+    | ``split`` | ``"train"`` | or ``"test"``, ``"all"`` |
+    | ``dt_s`` | 1 | time step, s |
+    | ``mismatch`` | 0 | how far kn, tDiffusion, to and tsn of the cell are from the model's (relative standard deviation) |
+    | ``dataset`` | none | a ``TrajectoryDataset`` to draw from, in place of the last four |
+    | ``render_mode`` | none | ``"rgb_array"`` |
+
+    ``gymnasium.make_vec`` takes ``num_envs`` and ``autoreset_mode`` besides.
+
+    ## Info
+
+    ``cost``; ``q_mobile``, ``r_o`` (true), ``q_mobile_hat``, ``r_o_hat`` (the model's), C and ohm; ``voltage`` and
+    ``voltage_hat`` of cell and model, V; ``soc``, the state of charge of the cell.
+
+    ## Version history
+
+    * v0: initial version; since 0.2.0 with the second innovation; since 0.3.0 with asinh of both
+    """  # noqa: E501 (rows of a table)
+
+    parameters = ("q_mobile",)
+
+
+class BatteryRo(FullStateTask):
+    """
+    ## Description
+
+    As ``BatteryQmax-v0``, but R_o (``r_o``), the ohmic resistance, is to be found, and q_mobile is known.
+
+    ## Observation space
+
+    ``Box(-100, 100, (29,), float32)``, laid out and scaled as in ``BatteryQmax-v0``.
+
+    ## Action space
+
+    ``Box(-1, 1, (1,), float32)``, mapped linearly to r_o = 0.08 .. 0.22 ohm.
+
+    ## Reward
+
+    That of ``BatteryQmax-v0``.
+
+    ## Starting state
+
+    As ``BatteryQmax-v0``, with 501 values of r_o in 0.1 .. 0.2 ohm.
+
+    ## Episode end
+
+    Truncated after 64 steps, or where the data end. Never terminated.
+
+    ## Arguments
+
+    Those of ``BatteryQmax-v0``.
+
+    ## Version history
+
+    * v0: initial version
+    """
+
+    parameters = ("r_o",)
+
+
+class BatteryQmaxPaper(FullStateTask):
+    """
+    ## Description
+
+    The q^max task in the literal form of the paper and its code, for comparison with ``BatteryQmax-v0``.
+
+    ## Observation space
+
+    ``Box(-100, 100, (15,), float32)``: x̂_t, x_{t+1} and u_{t+1}, divided by the new cell's charges (6840, 760, 4560, 506.67 C
+    for qnB, qnS, qpB, qpS), 1 V and 20 W.
+
+    ## Action space
+
+    ``Box(-1, 1, (1,), float32)``, mapped linearly to q_mobile = 4000 .. 8000 C. R_o is known.
+
+    ## Reward
+
+    Minus the cost: 0.5 times the norm of the error of the voltages in V plus 0.5 times that of the charges in C, times 50
+    where that exceeds 1e-4; at most 10000.
+
+    ## Starting state
+
+    As ``BatteryQmax-v0``.
+
+    ## Episode end
+
+    Truncated after 16 steps, or where the data end. Never terminated (the authors' code treats the end as terminal; here a
+    time limit is one).
+
+    ## Arguments
+
+    Those of ``BatteryQmax-v0``, with ``episode_steps`` 16 and ``cost_limit`` 10000; error scales are the same.
+
+    ## Version history
+
+    * v0: initial version
+    """
+
+    parameters = ("q_mobile",)
+    formulation = LITERAL
+    episode_steps = 16
+
+
+class BatteryRoPaper(FullStateTask):
+    """
+    ## Description
+
+    The R_o task in the literal form of the paper and its code, for comparison with ``BatteryRo-v0``.
+
+    ## Observation space
+
+    ``Box(-100, 100, (15,), float32)``, laid out and scaled as in ``BatteryQmaxPaper-v0``.
+
+    ## Action space
+
+    ``Box(-1, 1, (1,), float32)``, mapped linearly to r_o = 0.08 .. 0.22 ohm. q_mobile is known.
+
+    ## Reward
+
+    That of ``BatteryQmaxPaper-v0``.
+
+    ## Starting state
+
+    As ``BatteryRo-v0``.
+
+    ## Episode end
+
+    Truncated after 16 steps, or where the data end. Never terminated.
+
+    ## Arguments
+
+    Those of ``BatteryQmax-v0``, with ``episode_steps`` 16 and ``cost_limit`` 10000; error scales are the same.
+
+    ## Version history
+
+    * v0: initial version
+    """
+
+    parameters = ("r_o",)
+    formulation = LITERAL
+    episode_steps = 16
+
+
+class BatteryJoint(FullStateTask):
+    """
+    ## Description
+
+    As ``BatteryQmax-v0``, but q^max and R_o (``r_o``), the ohmic resistance, have both aged and are to be found together.
+
+    ## Observation space
+
+    ``Box(-100, 100, (29,), float32)``, laid out and scaled as in ``BatteryQmax-v0``, and Markov under the same conditions. An
+    R_o that is off shows in Vo alone (0.8 error scales for 10 %), a q_mobile in all three voltages (0.1, 0.1 and 0.2).
+
+    ## Action space
+
+    ``Box(-1, 1, (2,), float32)``, mapped linearly to q_mobile = 4000 .. 8000 C and r_o = 0.08 .. 0.22 ohm.
+
+    ## Reward
+
+    That of ``BatteryQmax-v0``.
+
+    ## Starting state
+
+    A random second of a random discharge of the training part (700 of 1000 discharges), with q_mobile in 4000 .. 7000 C and
+    r_o in 0.1 .. 0.2 ohm drawn independently, eleven loads of 8 to 16 W, without the first and last 5 % of each discharge. The
+    model starts in the true state.
+
+    ## Episode end
+
+    Truncated after 64 steps, or where the data end. Never terminated.
+
+    ## Arguments
+
+    Those of ``BatteryQmax-v0``.
+
+    ## Version history
+
+    * v0: initial version
+    """
+
+    parameters = ("q_mobile", "r_o")

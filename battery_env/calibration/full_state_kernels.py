@@ -55,7 +55,6 @@ def decide(
     power: bool,
     thermal: bool,
     literal_cost: bool,
-    cost_scale: float,
     cost_limit: float,
     consistency: float,
     per_error: FloatArray,
@@ -95,7 +94,7 @@ def decide(
         step_of_block(block, size, dt, power, power, thermal, True, poly_n, poly_p)
         states_of_block(block, first, size, model_state)
         for n in range(first, first + size):
-            distance = cost_scale * state_distance(model_state, measured, n, per_error, literal_cost)
+            distance = state_distance(model_state, measured, n, per_error, literal_cost)
             cost[n] += cost_limit if distance > cost_limit else distance
 
 

@@ -43,6 +43,7 @@ class Readings:
     integrated anew, which takes one step a reading (:func:`explain`). All discharges lie end to end.
 
     :param start: where each discharge starts, shape (n,)
+    :param start_s: time of its first sample, s, shape (n,)
     :param count: how many readings it has, shape (n,)
     :param voltage_V: terminal voltage at the readings, shape (total,)
     :param current_A: mean current since the reading before, shape (total,)
@@ -57,6 +58,7 @@ class Readings:
     """
 
     start: IntArray
+    start_s: FloatArray
     count: IntArray
     voltage_V: FloatArray
     current_A: FloatArray
@@ -88,6 +90,7 @@ class Readings:
         if steps < 1 or abs(steps * dt_s - interval_s) > 1e-9 * interval_s:
             raise ValueError(f"interval_s must be a multiple of the time step, {dt_s:g} s, got {interval_s!r}")
         columns: list[tuple[FloatArray, ...]] = []
+        start_s: list[float] = []
         for n, record in enumerate(records):
             time_s = np.asarray(record.time_s, dtype=np.float64) - record.time_s[0]
             count = int(np.floor(time_s[-1] / interval_s + 1e-9))
@@ -97,6 +100,7 @@ class Readings:
                 )
             current_A = resample_current(time_s, np.asarray(record.current_A), dt_s, count * steps)
             at_s = interval_s * np.arange(1, count + 1)
+            start_s.append(float(record.time_s[0]))
             drawn_C, moved_C, ohmic_A = _linear_part(current_A, steps, dt_s, parameters)
             columns.append(
                 (
@@ -113,6 +117,7 @@ class Readings:
         voltage_V, current_A, drawn_C, moved_C, ohmic_A = (np.concatenate(parts) for parts in zip(*columns, strict=True))
         return cls(
             start=np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64),
+            start_s=np.array(start_s),
             count=counts,
             voltage_V=voltage_V,
             current_A=current_A,
@@ -146,6 +151,25 @@ class Readings:
         :return: shares, same shape
         """
         return (1.0 - self.dt_s / np.asarray(time_constant_s)) ** round(self.interval_s / self.dt_s)
+
+    def process_noise_V(self, deviation: float, draws: FloatArray) -> FloatArray:
+        """
+        What white noise on Vo, Vsn and Vsp of a cell adds to its voltage at the readings of one discharge.
+
+        :param deviation: standard deviation of the noise on each, V per root of a second
+        :param draws: standard normal, one row for each of the three, shape (3, count)
+        :return: V, shape (count,)
+        """
+        from scipy.signal import lfilter  # slow to import, and only process noise needs it
+
+        cell, dt_s = self.parameters, self.dt_s
+        total = np.zeros(draws.shape[1])
+        for draw, time_constant_s in zip(draws, (cell.to, cell.tsn, cell.tsp), strict=True):
+            left = float(self.decay(time_constant_s))
+            # the variance of a sum of steps that decay on the way, over one interval
+            variance = dt_s * (1.0 - left**2) / (1.0 - (1.0 - dt_s / time_constant_s) ** 2)
+            total -= lfilter([deviation * np.sqrt(variance)], [1.0, -left], draw)
+        return total
 
     def remeasured(self, discharge: int, gain: FloatArray, offset_A: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """

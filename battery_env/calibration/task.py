@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import inspect
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from battery_env.electrochemistry import FloatArray
+from battery_env.estimators.base import Record
+from battery_env.trajectories import IntArray
 
 Parameter = Literal["q_mobile", "r_o"]
 
@@ -17,17 +20,28 @@ Parameter = Literal["q_mobile", "r_o"]
 OBSERVATION_LIMIT = 100.0
 
 
-def check_options(given: Iterable[str], known: Iterable[str]) -> None:
+def check_counts(**values: int) -> None:
     """
-    Refuse options that a task does not have.
+    Refuse numbers of things that there must be.
 
-    :param given: names of the options that were given
-    :param known: names of those that there are
-    :raises TypeError: if one is not known
+    :param values: options by name
+    :raises ValueError: for a value below 1
     """
-    unknown = set(given) - set(known)
-    if unknown:
-        raise TypeError(f"{', '.join(sorted(unknown))}: no such option. There are {', '.join(sorted(known))}")
+    for name, value in values.items():
+        if not value >= 1:
+            raise ValueError(f"{name} must be at least 1, got {value!r}")
+
+
+def check_not_negative(**values: float) -> None:
+    """
+    Refuse sizes that are negative, or no finite numbers.
+
+    :param values: options by name
+    :raises ValueError: for a value out of range
+    """
+    for name, value in values.items():
+        if not 0.0 <= value < np.inf:
+            raise ValueError(f"{name} must be finite and at least 0, got {value!r}")
 
 
 def checked_action(action: NDArray[np.floating], shape: tuple[int, ...]) -> FloatArray:
@@ -54,21 +68,47 @@ class CalibrationTask(ABC):
     All randomness of an episode is drawn when it starts, from the generator of its cell: the scalar environment is the batch
     of one, and a batch makes the same episodes as that many scalar environments.
 
-    :param cells: size of the batch
-    :param parameters: what the action stands for, in its order
-    :param observation_size: length of an observation
-    :param episode_steps: decisions per episode; fewer where the data end
-    :param decision_s: time between two decisions, s
+    What is registered is a class: its docstring is the page of its environments, and its keyword arguments are their options.
+
+    :ivar parameters: what the action stands for, in its order
+    :ivar cells: size of the batch
+    :ivar dataset: the discharges that episodes are drawn from
+    :ivar observation_size: length of an observation
+    :ivar episode_steps: decisions per episode; fewer where the data end
+    :ivar decision_s: time between two decisions, s
     """
 
     #: what :meth:`report` returns
     REPORTED: ClassVar[tuple[str, ...]] = ("q_mobile", "r_o", "q_mobile_hat", "r_o_hat", "voltage", "voltage_hat", "soc")
 
-    cells: int
     parameters: tuple[Parameter, ...]
+    cells: int
+    dataset: Sequence[Record]
     observation_size: int
     episode_steps: int
     decision_s: float
+
+    @property
+    @abstractmethod
+    def estimate(self) -> FloatArray:
+        """(q_mobile, r_o) of the model, C and ohm, shape (cells, 2); a new array each time."""
+
+    @classmethod
+    def options(cls) -> dict[str, Any]:
+        """
+        What the task can be asked for; its page says what each option means.
+
+        :return: default values by name
+        """
+        arguments = inspect.signature(cls).parameters.values()
+        return {argument.name: argument.default for argument in arguments if argument.kind is argument.KEYWORD_ONLY}
+
+    def _refuse_beside_a_dataset(self, **chosen: Any) -> None:
+        """Refuse options that choose discharges, where the discharges are given."""
+        defaults = self.options()
+        others = [name for name, value in chosen.items() if value != defaults.get(name, value)]
+        if others:
+            raise ValueError(f"dataset stands in place of {', '.join(others)}: give one or the other")
 
     @abstractmethod
     def start(
@@ -82,7 +122,7 @@ class CalibrationTask(ABC):
 
         :param rows: which cells of the batch, shape (m,)
         :param generators: one source of randomness for each of them, of length m
-        :param options: choices that replace random draws, the same for all these cells; the task's environment documents them
+        :param options: choices that replace random draws, the same for all these cells; the task's page names them
         :raises ValueError: for an option that is unknown or out of range
         """
 
@@ -112,6 +152,50 @@ class CalibrationTask(ABC):
 
         :return: shape (cells,); a new array each time
         """
+
+    @classmethod
+    @abstractmethod
+    def follow(cls, records: Sequence[Any], every: int, **options: Any) -> CalibrationTask:
+        """
+        Go through whole records from their beginning, for evaluation: every episode is as long as its records, and nothing is
+        random but what options ask for.
+
+        :param records: the discharges
+        :param every: what :meth:`steps_between` returned
+        :param options: of the task, but for those of its data and the length of its episodes
+        :return: the task, at its first observations
+        """
+
+    @abstractmethod
+    def steps_between(self, decision_s: float) -> int:
+        """
+        How many samples arrive between two decisions on a whole record.
+
+        :param decision_s: time that is asked for between them, s
+        :return: the samples
+        :raises ValueError: for a time that the task cannot keep
+        """
+
+    @abstractmethod
+    def seen(self) -> tuple[IntArray, FloatArray]:
+        """
+        Which data the next decision knows.
+
+        :return: each cell's discharge, and the time of its last sample, s, shape (cells,); new arrays
+        """
+
+    @staticmethod
+    @abstractmethod
+    def conclude(estimates: FloatArray) -> float:
+        """
+        What is left of the estimates over a record.
+
+        :param estimates: of one parameter, one per decision, shape (K,)
+        :return: one estimate
+        """
+
+    def drop_ended(self) -> None:  # noqa: B027 (a task may go on with all cells)
+        """Go on without the cells whose episodes are over, if that saves time; by default they stay."""
 
     @abstractmethod
     def report(self) -> dict[str, FloatArray]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,20 +13,21 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from battery_env.calibration.env import CalibrationEnv, check_render_mode, spaces_of
+from battery_env.calibration.env import CalibrationEnv, check_render_mode, new_task, spaces_of
 from battery_env.calibration.task import CalibrationTask
 from battery_env.electrochemistry import FloatArray
 
 Mask = NDArray[np.bool_]
 
 
-class CalibrationVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any]], ABC):
+class CalibrationVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any]]):
     """
-    A calibration task for many cells, each in its own episode; see the registered environments.
+    A calibration task for many cells, each in its own episode.
 
     With the same seeds it makes the episodes of as many scalar environments, to the bit. As in Gymnasium, seed s gives cell n
     the seed s + n, and ``info`` holds arrays of shape (num_envs,), with the cells that they are valid for under ``_name``.
 
+    :param task: the class of the task, or where it is, as ``"module:name"``
     :param num_envs: number of cells
     :param autoreset_mode: when a cell whose episode is over is started again: ``NEXT_STEP``: by the step that follows, whose
         action does nothing to it; ``SAME_STEP``: at once, with ``final_obs`` and ``final_info`` in ``info``; ``DISABLED``: by
@@ -42,6 +42,7 @@ class CalibrationVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.
 
     def __init__(
         self,
+        task: str | type[CalibrationTask],
         num_envs: int = 1,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
@@ -53,24 +54,13 @@ class CalibrationVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self.render_mode = check_render_mode(render_mode)
-        self.task = self.make_task(num_envs, **options)
+        self.task = new_task(task, num_envs, options)
         self.single_observation_space, self.single_action_space = spaces_of(self.task)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._generators: list[np.random.Generator] = []
         self._over: Mask = np.zeros(num_envs, dtype=np.bool_)
         self._histories = [deque[dict[str, float]](maxlen=self.task.episode_steps) for _ in range(num_envs)]
-
-    @staticmethod
-    @abstractmethod
-    def make_task(cells: int, **options: Any) -> CalibrationTask:
-        """
-        The task of this environment, for any number of cells.
-
-        :param cells: size of the batch
-        :param options: of the task
-        :return: the task
-        """
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None

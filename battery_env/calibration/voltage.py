@@ -8,16 +8,21 @@ data so far with one (q_mobile, r_o): it holds an estimate, sees what the data s
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, replace
+from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from battery_env.arrays import IntArray
+from battery_env.calibration.data import LoadKind, Split, standard_dataset
 from battery_env.calibration.readings import Readings, explain
-from battery_env.calibration.task import OBSERVATION_LIMIT, CalibrationTask, Parameter, checked_action
+from battery_env.calibration.task import OBSERVATION_LIMIT, CalibrationTask, check_counts, check_not_negative, checked_action
 from battery_env.electrochemistry import NEW_CELL, FloatArray
+from battery_env.records import Record
+from battery_env.sensors import RandomSensorErrors
+from battery_env.trajectories import TrajectoryDataset
 
 #: Where estimates are kept, C and ohm.
 ESTIMATE_RANGES: dict[str, tuple[float, float]] = {"q_mobile": (3500.0, 8100.0), "r_o": (0.05, 0.35)}
@@ -28,7 +33,10 @@ LARGEST_STEPS: dict[str, float] = {"q_mobile": 1500.0, "r_o": 0.12}
 STRETCHES = 16
 # An estimate needs more readings than it has parameters
 _FEWEST_READINGS = 3
+#: What the discharges that episodes are made of are read with.
+SENSORS = RandomSensorErrors(noise_V=(0.001, 0.030), offset_V=0.010)
 
+_COST_SCALE_V = 0.002
 # What the parts of an observation are divided by
 _MISFIT_FLOOR_V = 0.001
 _SLOPE_SCALE_V_PER_C = 5e-5
@@ -37,71 +45,9 @@ _MISFIT_SCALE_V = 0.010
 _TIME_SCALE_S = 3000.0
 
 
-@dataclass(frozen=True)
-class VoltageOptions:
-    """
-    What the voltage-only tasks can be asked for.
-
-    :param episode_steps: decisions per episode
-    :param reading_s: time between two readings of voltage and current, s
-    :param new_readings: fewest and most readings that arrive between two decisions, drawn uniformly
-    :param noise_V: least and greatest standard deviation of the noise of the voltage sensor, V; drawn log-uniformly per
-        episode, white within it
-    :param offset_V: bound of the sensor's offset, V: drawn uniformly to either side per episode, and constant within it. The
-        agent is told the bound, not the offset: a misfit that such an offset explains costs nothing
-    :param current_gain: the relative error of the current sensor's gain, likewise
-    :param current_offset_A: the offset of the current sensor, likewise, A
-    :param process_noise_V: standard deviation of the noise on each of Vo, Vsn and Vsp, V per root of a second
-    :param measured: ``"current"``, or ``"power"``: current is what the power meter says over the measured voltage
-    :param data: which data an estimate has to explain: ``"all"`` so far, or the ``"last"`` reading
-    :param start: the first estimate: ``"random"`` within the range, ``"new_cell"`` or ``"true"``
-    :param consistency: cost of a change of the action, per unit of its Euclidean length; above 0 the observation holds the
-        action before
-    :param cost: ``"logarithmic"``: asinh(misfit / ``cost_scale_V``), which counts a misfit twice as large alike wherever it
-        is above the scale; or ``"linear"``: misfit / ``cost_scale_V``
-    :param cost_scale_V: V
-    :raises ValueError: for values out of range
-    """
-
-    episode_steps: int = 8
-    reading_s: float = 10.0
-    new_readings: tuple[int, int] = (0, 29)
-    noise_V: tuple[float, float] = (0.001, 0.030)
-    offset_V: float = 0.010
-    current_gain: float = 0.0
-    current_offset_A: float = 0.0
-    process_noise_V: float = 0.0
-    measured: Literal["current", "power"] = "current"
-    data: Literal["all", "last"] = "all"
-    start: Literal["random", "new_cell", "true"] = "random"
-    consistency: float = 0.0
-    cost: Literal["logarithmic", "linear"] = "logarithmic"
-    cost_scale_V: float = 0.002
-
-    def __post_init__(self) -> None:
-        if self.episode_steps < 1:
-            raise ValueError(f"episode_steps must be at least 1, got {self.episode_steps!r}")
-        if not 0 <= self.new_readings[0] <= self.new_readings[1]:
-            raise ValueError(f"new_readings must be (fewest, most) with 0 <= fewest <= most, got {self.new_readings!r}")
-        if not (0.0 <= self.noise_V[0] <= self.noise_V[1] < 1.0 and (self.noise_V[0] > 0.0 or self.noise_V[1] == 0.0)):
-            raise ValueError(
-                f"noise_V must be (least, greatest) in V with 0 < least <= greatest < 1, or (0, 0), got {self.noise_V!r}"
-            )
-        for name in ("offset_V", "current_gain", "current_offset_A", "process_noise_V"):
-            if not 0.0 <= getattr(self, name) < 0.5:
-                raise ValueError(f"{name} must be at least 0 and less than 0.5, got {getattr(self, name)!r}")
-        if not 0.0 <= self.consistency < np.inf:
-            raise ValueError(f"consistency must be finite and at least 0, got {self.consistency!r}")
-        if not 0.0 < self.cost_scale_V < np.inf:
-            raise ValueError(f"cost_scale_V must be finite and greater than 0, got {self.cost_scale_V!r}")
-        for name, choices in (
-            ("measured", ("current", "power")),
-            ("data", ("all", "last")),
-            ("start", ("random", "new_cell", "true")),
-            ("cost", ("logarithmic", "linear")),
-        ):
-            if getattr(self, name) not in choices:
-                raise ValueError(f"{name} must be one of {choices}, got {getattr(self, name)!r}")
+@lru_cache(maxsize=4)
+def _readings_of_a_dataset(dataset: TrajectoryDataset, reading_s: float) -> Readings:
+    return Readings.of(dataset, reading_s, dataset.dt_s, dataset.cell)
 
 
 class VoltageTask(CalibrationTask):
@@ -113,40 +59,84 @@ class VoltageTask(CalibrationTask):
     square of the mean residuals of equal stretches of the data, whose noise is smaller than that of single readings, after
     the offset that the sensor may have. It knows no true parameter, so that a task can be made of recorded discharges too.
 
-    :param readings: the discharges
-    :param parameters: what to find: one or both of ``"q_mobile"`` and ``"r_o"``; the other one is known, the true one of a
-        simulated discharge and the new cell's of a recorded one
+    One parameter may be known instead: the true one of a simulated discharge, and the new cell's of a recorded one. What
+    differs between the registered tasks is data of their classes; their options are described on the page of
+    :class:`BatteryVoltageJoint`.
+
+    :ivar readings: what is read of the discharges
+    :ivar sensors: what they are read with
     :param cells: size of the batch
-    :param options: of the task
+    :raises ValueError: for values out of range
     """
 
     def __init__(
-        self, readings: Readings, parameters: tuple[Parameter, ...], cells: int, options: VoltageOptions | None = None
+        self,
+        cells: int,
+        *,
+        episode_steps: int = 8,
+        reading_s: float = 10.0,
+        new_readings: tuple[int, int] = (0, 29),
+        process_noise_V: float = 0.0,
+        start: Literal["random", "new_cell", "true"] = "random",
+        consistency: float = 0.0,
+        load: LoadKind = "piecewise",
+        split: Split = "train",
+        dt_s: float = 1.0,
+        mismatch: float = 0.0,
+        dataset: Sequence[Record] | None = None,
+        **sensors: Any,
     ) -> None:
-        self.readings = readings
-        self.parameters = parameters
-        self.cells = cells
-        self.options = options or VoltageOptions()
-        self.episode_steps = self.options.episode_steps
-        self.decision_s = readings.interval_s * (sum(self.options.new_readings) / 2.0)
-        self._stretches = STRETCHES if self.options.data == "all" else 1
-        self._previous = len(parameters) if self.options.consistency > 0.0 else 0
-        self.observation_size = 6 * self._stretches + 4 + len(parameters) + self._previous
+        check_counts(episode_steps=episode_steps)
+        check_not_negative(consistency=consistency, process_noise_V=process_noise_V)
+        if not 0 <= new_readings[0] <= new_readings[1]:
+            raise ValueError(f"new_readings must be (fewest, most) with 0 <= fewest <= most, got {new_readings!r}")
+        if start not in ("random", "new_cell", "true"):
+            raise ValueError(f"start must be one of ('random', 'new_cell', 'true'), got {start!r}")
+        data: dict[str, Any] = {"load": load, "split": split, "dt_s": dt_s, "mismatch": mismatch}
+        if dataset is None:
+            dataset = standard_dataset("joint" if len(self.parameters) == 2 else self.parameters[0], **data)
+        else:
+            self._refuse_beside_a_dataset(**data)
+        if isinstance(dataset, TrajectoryDataset):
+            readings = _readings_of_a_dataset(dataset, reading_s)
+        else:
+            readings = Readings.of(dataset, reading_s)
+        parameters = self.parameters
+        self.cells, self.dataset, self.readings = cells, dataset, readings
+        self.episode_steps, self.new_readings = episode_steps, new_readings
+        self.sensors = replace(SENSORS, **sensors)
+        self.process_noise_V, self.first_estimate, self.consistency = process_noise_V, start, consistency
+        self.decision_s = readings.interval_s * (sum(new_readings) / 2.0)
+        self._previous = len(parameters) if consistency > 0.0 else 0
+        self.observation_size = 6 * STRETCHES + 4 + len(parameters) + self._previous
         self._columns = [("q_mobile", "r_o").index(name) for name in parameters]
         self._low, self._high = np.array([ESTIMATE_RANGES[name] for name in parameters]).T
         self._step = np.array([LARGEST_STEPS[name] for name in parameters])
 
         longest = int(readings.count.max())
         self._all: IntArray = np.arange(cells)
+        self._first: IntArray = np.zeros(cells, dtype=np.int64)
         self.discharge: IntArray = np.zeros(cells, dtype=np.int64)
         self.count: IntArray = np.ones(cells, dtype=np.int64)
         self._arrivals: IntArray = np.zeros((cells, self.episode_steps), dtype=np.int64)
         self._step_of_episode: IntArray = np.zeros(cells, dtype=np.int64)
-        self.estimate = np.tile([NEW_CELL.q_mobile, NEW_CELL.r_o], (cells, 1))
+        self._last_step: IntArray = np.zeros(cells, dtype=np.int64)  # of the discharge
+        self._every = 0  # readings between two decisions of a whole record; 0: of an episode they are drawn
+        self._estimate = np.tile([NEW_CELL.q_mobile, NEW_CELL.r_o], (cells, 1))
         self._action = np.zeros((cells, len(parameters)))
         self._voltage_V, self._current_A, self._moved_C, self._ohmic_A = np.zeros((4, cells, longest))
-        self._residual_V, self._slope_V_per_C, self._ohmic_means_A = np.zeros((3, cells, self._stretches, 2))
+        self._residual_V, self._slope_V_per_C, self._ohmic_means_A = np.zeros((3, cells, STRETCHES, 2))
         self._rms_V, self._last_V, self._offset_V, self._misfit_V = np.zeros((4, cells))
+
+    @classmethod
+    def options(cls) -> dict[str, Any]:
+        """
+        What the task can be asked for; its page says what each option means. Errors of the sensors are those of
+        :class:`~battery_env.sensors.RandomSensorErrors`.
+
+        :return: default values by name
+        """
+        return {**super().options(), **asdict(SENSORS)}
 
     def start(
         self,
@@ -178,52 +168,100 @@ class VoltageTask(CalibrationTask):
             low, high = ESTIMATE_RANGES[name]
             if not low <= first[name] <= high:
                 raise ValueError(f"options['{name}_hat'] must lie within {low:g} .. {high:g}, got {first[name]!r}")
-        fewest, most = self.options.new_readings
+        fewest, most = self.new_readings
         for row, generator in zip(rows, generators, strict=True):
             n = self._draw_discharge(generator) if discharge is None else int(discharge)
             length = int(self.readings.count[n])
-            count = self._draw_count(n, generator) if reading is None else int(reading)
+            count = self._first_count(n, generator) if reading is None else int(reading)
             if not 1 <= count <= length:
                 raise ValueError(f"options['reading'] must lie within 1 .. {length} for discharge {n}, got {count}")
             self._arrivals[row] = generator.integers(fewest, most + 1, size=self.episode_steps)
             estimate = self._first_estimate(n, generator)
             for name, value in first.items():
                 estimate[("q_mobile", "r_o").index(name)] = value
-            self.place(row, n, count, estimate)
+            self._step_of_episode[row] = 0
+            self._place(row, n, count, estimate)
             self._measure(row, n, generator)
         self._action[rows] = 0.0
-        self._step_of_episode[rows] = 0
         self._explain(rows)
 
     def _draw_discharge(self, generator: np.random.Generator) -> int:
         return int(generator.integers(len(self.readings)))
 
-    def _draw_count(self, discharge: int, generator: np.random.Generator) -> int:
-        return int(generator.integers(_FEWEST_READINGS, self.readings.count[discharge], endpoint=True))
+    def _first_count(self, discharge: int, generator: np.random.Generator | None) -> int:
+        """How many readings there are at first: on a whole record as many as arrive between two decisions."""
+        length = int(self.readings.count[discharge])
+        return min(self._every, length) if generator is None else self._draw_count(length, generator)
 
-    def follow(self, every: int) -> None:
+    def _draw_count(self, length: int, generator: np.random.Generator) -> int:
+        return int(generator.integers(_FEWEST_READINGS, length, endpoint=True))
+
+    @classmethod
+    def follow(cls, records: Sequence[Record], every: int, **options: Any) -> VoltageTask:
         """
-        Begin as many discharges as there are cells, each at its first readings, measured as they are; from then on ``every``
-        readings arrive between two decisions. For evaluation: nothing is random, and no episode ends.
+        Go through whole records, each with a cell of its own: from its first readings, measured as they are, and from the
+        estimate of a new cell.
 
+        :param records: discharges from full charge, simulated or recorded
         :param every: readings between two decisions, and before the first one
+        :param options: of the task, but for those of its data
+        :return: the task, at its first observations
         """
-        for n in range(self.cells):
-            self.place(n, n, min(every, int(self.readings.count[n])), self._first_estimate(n, None))
-        self._arrivals[:] = every
-        self._step_of_episode[:] = 0
-        self._action[:] = 0.0
-        self._explain()
+        discharges = cls._discharges_of_an_episode(options)
+        task = cls(len(records) // discharges, **{"start": "new_cell", **options, "dataset": records})
+        task._every = every
+        for row in range(task.cells):
+            n = row * discharges
+            task._place(row, n, task._first_count(n, None), task._first_estimate(n, None))
+        task._explain()
+        return task
 
-    def place(self, row: int, discharge: int, count: int, estimate: FloatArray) -> None:
-        """
-        Put one cell at one point of one discharge, measured without error.
+    @classmethod
+    def _discharges_of_an_episode(cls, options: Mapping[str, Any]) -> int:
+        return 1
 
-        :param row: which cell of the batch
-        :param discharge: which discharge
-        :param count: how many of its readings there are so far
-        :param estimate: (q_mobile, r_o), C and ohm
+    def steps_between(self, decision_s: float) -> int:
         """
+        How many readings arrive between two decisions on a whole record.
+
+        :param decision_s: time between them, s
+        :return: the readings
+        :raises ValueError: if the time is no multiple of that between two readings
+        """
+        interval_s = self.readings.interval_s
+        every = round(decision_s / interval_s)
+        if every < 1 or abs(every * interval_s - decision_s) > 1e-9 * interval_s:
+            raise ValueError(
+                f"decision_s must be a multiple of the interval between readings, {interval_s:g} s, got {decision_s!r}"
+            )
+        return every
+
+    def seen(self) -> tuple[IntArray, FloatArray]:
+        """
+        Which readings the next decision knows.
+
+        :return: each cell's discharge, and the time of its last reading, s, shape (cells,)
+        """
+        readings = self.readings
+        return self.discharge.copy(), readings.start_s[self.discharge] + self.count * readings.interval_s
+
+    @property
+    def estimate(self) -> FloatArray:
+        """(q_mobile, r_o), C and ohm, shape (cells, 2)."""
+        return self._estimate.copy()
+
+    @staticmethod
+    def conclude(estimates: FloatArray) -> float:
+        """
+        What is left of the estimates over a record: the last one, which explains all readings.
+
+        :param estimates: of one parameter, shape (K,)
+        :return: one estimate
+        """
+        return float(estimates[-1])
+
+    def _place(self, row: int, discharge: int, count: int, estimate: FloatArray) -> None:
+        """Put one cell at one point of one discharge, measured without error."""
         data = self.readings
         part, length = data.part(discharge), data.count[discharge]
         self.discharge[row], self.count[row] = discharge, count
@@ -231,72 +269,52 @@ class VoltageTask(CalibrationTask):
         self._current_A[row, :length] = data.current_A[part]
         self._moved_C[row, :length] = data.moved_C[part]
         self._ohmic_A[row, :length] = data.ohmic_A[part]
-        self.estimate[row] = estimate
+        self._estimate[row] = estimate
+        decisions = -(-int(length) // self._every) if self._every else self._decisions_in_a_discharge
+        self._last_step[row] = self._step_of_episode[row] + decisions
 
-    def known(self, discharge: int) -> FloatArray:
-        """
-        The true parameters of a discharge, or the new cell's where they are not known.
+    @property
+    def _decisions_in_a_discharge(self) -> int:
+        return self.episode_steps
 
-        :param discharge: which discharge
-        :return: (q_mobile, r_o), C and ohm
-        """
+    def _known(self, discharge: int) -> FloatArray:
+        """The true parameters of a discharge, or the new cell's where they are not known."""
         true = np.array([self.readings.q_mobile[discharge], self.readings.r_o[discharge]])
         return np.where(np.isnan(true), [NEW_CELL.q_mobile, NEW_CELL.r_o], true)
 
     def _first_estimate(self, discharge: int, generator: np.random.Generator | None) -> FloatArray:
-        estimate = self.known(discharge)
-        if self.options.start == "random" and generator is not None:
+        estimate = self._known(discharge)
+        if self.first_estimate == "random" and generator is not None:
             estimate[self._columns] = generator.uniform(self._low, self._high)
-        elif self.options.start != "true":
+        elif self.first_estimate != "true":
             estimate[self._columns] = np.array([NEW_CELL.q_mobile, NEW_CELL.r_o])[self._columns]
         return estimate
 
     def _measure(self, row: int, discharge: int, generator: np.random.Generator) -> None:
-        """The errors of the sensors, and the noise of the cell, over one discharge."""
-        choice, length = self.options, int(self.readings.count[discharge])
-        least, greatest = choice.noise_V
+        """The noise of the cell, and the errors of the sensors, over one discharge."""
+        length = int(self.readings.count[discharge])
         voltage_V = self._voltage_V[row, :length]
-        true_V = voltage_V.copy()
-        if choice.process_noise_V > 0.0:
-            voltage_V += self._process_noise_V(generator.standard_normal((3, length)))
-        if greatest > 0.0:
-            sd_V = np.exp(generator.uniform(np.log(least), np.log(greatest)))
-            voltage_V += sd_V * generator.standard_normal(length)
-        offset_V, gain_error, offset_A = (
-            generator.uniform(-bound, bound) if bound > 0.0 else 0.0
-            for bound in (choice.offset_V, choice.current_gain, choice.current_offset_A)
-        )
-        voltage_V += offset_V
-        if choice.measured == "power" or gain_error != 0.0 or offset_A != 0.0:
-            gain = np.full(length, 1.0 + gain_error)
-            if choice.measured == "power":
-                gain *= true_V / voltage_V
-            measured = self.readings.remeasured(discharge, gain, offset_A)
+        if self.process_noise_V > 0.0:
+            voltage_V += self.readings.process_noise_V(self.process_noise_V, generator.standard_normal((3, length)))
+        noise_V = self.sensors.draw_noise_V(generator)
+        noise = generator.standard_normal(length) if noise_V > 0.0 else np.zeros(length)
+        errors = replace(self.sensors.draw_biases(generator), noise_V=noise_V)
+        read_V = errors.read_voltage_V(voltage_V, noise)
+        if errors.change_the_current:
+            measured = self.readings.remeasured(discharge, errors.gain(voltage_V, read_V), errors.current_offset_A)
             for array, values in zip((self._current_A, self._moved_C, self._ohmic_A), measured, strict=True):
                 array[row, :length] = values
-
-    def _process_noise_V(self, draws: FloatArray) -> FloatArray:
-        from scipy.signal import lfilter  # slow to import, and only process noise needs it
-
-        cell, dt_s = self.readings.parameters, self.readings.dt_s
-        total = np.zeros(draws.shape[1])
-        for draw, time_constant_s in zip(draws, (cell.to, cell.tsn, cell.tsp), strict=True):
-            left = float(self.readings.decay(time_constant_s))
-            # the variance of a sum of steps that decay on the way, over one interval
-            variance = dt_s * (1.0 - left**2) / (1.0 - (1.0 - dt_s / time_constant_s) ** 2)
-            total -= lfilter([self.options.process_noise_V * np.sqrt(variance)], [1.0, -left], draw)
-        return total
+        voltage_V[:] = read_V
 
     def _explain(self, rows: NDArray[np.intp] | None = None) -> None:
         """Compare some cells with their readings, all by default."""
         cell = self.readings.parameters
-        first = np.zeros_like(self.count) if self.options.data == "all" else self.count - 1
         explain(
             self._all if rows is None else np.asarray(rows, dtype=np.int64),
             self.count,
-            first,
-            np.ascontiguousarray(self.estimate[:, 0]),
-            np.ascontiguousarray(self.estimate[:, 1]),
+            self._first,
+            np.ascontiguousarray(self._estimate[:, 0]),
+            np.ascontiguousarray(self._estimate[:, 1]),
             self._voltage_V,
             self._current_A,
             self._moved_C,
@@ -311,9 +329,7 @@ class VoltageTask(CalibrationTask):
             self._rms_V,
             self._last_V,
         )
-        # in a single reading nothing tells an offset from a misfit
-        bound_V = self.options.offset_V if self.options.data == "all" else 0.0
-        self._offset_V = np.clip(self._residual_V.mean(axis=(1, 2)), -bound_V, bound_V)
+        self._offset_V = np.clip(self._residual_V.mean(axis=(1, 2)), -self.sensors.offset_V, self.sensors.offset_V)
         self._misfit_V = np.sqrt(np.mean((self._residual_V - self._offset_V[:, None, None]) ** 2, axis=(1, 2)))
 
     def observation(self) -> NDArray[np.float32]:
@@ -335,38 +351,35 @@ class VoltageTask(CalibrationTask):
             np.log((np.stack([self._misfit_V, self._rms_V], axis=1) + 0.1 * _MISFIT_FLOOR_V) / _MISFIT_SCALE_V),
             np.arcsinh(self._residual_V.mean(axis=(1, 2)) / _MISFIT_SCALE_V)[:, None],
             (self.count * (self.readings.interval_s / _TIME_SCALE_S))[:, None],
-            self._scaled(self.estimate),
+            self._scaled(self._estimate),
             self._action[:, : self._previous],
         ]
 
     def _scaled(self, estimate: FloatArray) -> FloatArray:
         return np.asarray((2.0 * estimate[:, self._columns] - self._low - self._high) / (self._high - self._low))
 
-    def advance(self, action: NDArray[np.floating], arriving: bool = True) -> FloatArray:
+    def advance(self, action: NDArray[np.floating]) -> FloatArray:
         """
         Move the estimates, let new readings arrive, and compare all data so far with the model.
 
         :param action: in [-1, 1], beyond it is clipped, shape (cells, len(parameters))
-        :param arriving: whether readings arrive
         :return: cost, shape (cells,)
         :raises ValueError: for another shape, NaN, or what is no number
         """
         chosen = checked_action(action, self._action.shape)
         step = np.clip(chosen, -1.0, 1.0)
-        moved = self.estimate[:, self._columns] + np.sign(step) * step**2 * self._step
-        self.estimate[:, self._columns] = np.clip(moved, self._low, self._high)
-        if arriving:
-            self._arrive()
+        moved = self._estimate[:, self._columns] + np.sign(step) * step**2 * self._step
+        self._estimate[:, self._columns] = np.clip(moved, self._low, self._high)
+        self._arrive()
         self._explain()
-        cost = self._misfit_V / self.options.cost_scale_V
-        if self.options.cost == "logarithmic":
-            cost = np.arcsinh(cost)
-        cost += self.options.consistency * np.linalg.norm(step - self._action, axis=1)
+        cost = np.arcsinh(self._misfit_V / _COST_SCALE_V)
+        cost += self.consistency * np.linalg.norm(step - self._action, axis=1)
         self._action = step
         return cost
 
     def _arrive(self) -> None:
-        arrived = self._arrivals[np.arange(self.cells), np.minimum(self._step_of_episode, self.episode_steps - 1)]
+        step = np.minimum(self._step_of_episode, self.episode_steps - 1)
+        arrived = self._every or self._arrivals[np.arange(self.cells), step]
         self.count = np.minimum(self.count + arrived, self.readings.count[self.discharge])
         self._step_of_episode += 1
 
@@ -376,7 +389,7 @@ class VoltageTask(CalibrationTask):
 
         :return: shape (cells,)
         """
-        return self._step_of_episode >= self.episode_steps
+        return np.asarray(self._step_of_episode >= self._last_step)
 
     def report(self) -> dict[str, FloatArray]:
         """
@@ -389,10 +402,177 @@ class VoltageTask(CalibrationTask):
         return {
             "q_mobile": true_q_C,
             "r_o": data.r_o[self.discharge],
-            "q_mobile_hat": self.estimate[:, 0].copy(),
-            "r_o_hat": self.estimate[:, 1].copy(),
+            "q_mobile_hat": self._estimate[:, 0].copy(),
+            "r_o_hat": self._estimate[:, 1].copy(),
             "voltage": self._voltage_V[np.arange(self.cells), last],
             "voltage_hat": self._last_V.copy(),
             # a full cell holds q_mobile in its negative electrode
             "soc": 1.0 - data.drawn_C[data.start[self.discharge] + last] / true_q_C,
         }
+
+
+class BatteryVoltageJoint(VoltageTask):
+    """
+    ## Description
+
+    A Li-ion cell of unknown age is discharged from full charge under a power that changes every one or two minutes. Current
+    and terminal voltage are read every ten seconds; no state of the cell is measured. Find both parameters that age,
+    q^max (``q_mobile``, the charge that can move) and R_o (``r_o``, the ohmic resistance), by explaining all readings so far
+    with one pair of them. The paper (Unagar et al. 2020) names this as future work. No label is used: the reward knows
+    readings and estimate alone, so that the task can be made of recorded discharges too.
+
+    The voltage of the model for any (q_mobile, r_o) at all readings so far costs no simulation: see
+    ``battery_env.calibration.readings.Readings``.
+
+    ## Observation space
+
+    ``Box(-100, 100, (102,), float32)``. The readings so far are cut into 16 stretches of equal length, each of these into the
+    readings with less and with more current than its mean (pairs in this order below). A residual is the measured minus the
+    modelled voltage at the estimate; the misfit is the root mean square of the 32 mean residuals, less the one offset within
+    ``offset_V`` that explains them best.
+
+    | index | content |
+    |-------|---------|
+    | 0-31  | mean residual of each part less that offset, over the misfit plus 1 mV |
+    | 32-63 | mean sensitivity dV/dq_mobile of each part, asinh of its ratio to 50 microvolts per coulomb |
+    | 64-95 | mean -dV/dr_o of each part (the current that has settled in the ohmic drop), divided by 3 A |
+    | 96    | logarithm of the misfit plus 0.1 mV over 10 mV |
+    | 97    | logarithm of the root mean square of all residuals plus 0.1 mV over 10 mV |
+    | 98    | asinh of the mean residual over 10 mV |
+    | 99    | time since the start of the discharge, divided by 3000 s |
+    | 100-101 | the estimate: q_mobile = 3500 .. 8100 C and r_o = 0.05 .. 0.35 ohm as -1 .. 1 |
+
+    Not Markov in the strict sense: the next cost depends on readings that have not arrived, and on those so far through more
+    than their means. For the estimate of constant parameters the observation is nearly sufficient: residuals and
+    sensitivities are what a Gauss-Newton step is made of. Noise, offset and errors of the current sensor are constant within
+    an episode and not observed.
+
+    ## Action space
+
+    ``Box(-1, 1, (2,), float32)``: the estimate of q_mobile and r_o moves by sign(a) a^2 times 1500 C and 0.12 ohm, and is
+    kept within the ranges above.
+
+    ## Reward
+
+    Minus the cost: asinh of the misfit over 2 mV, at the new estimate and with the new readings.
+
+    ## Starting state
+
+    A random reading of a random discharge of the training part (700 of 1000 discharges, q_mobile = 4000 .. 7600 C,
+    r_o = 0.1 .. 0.3 ohm, 2 to 8 W), a random estimate, and a sensor whose noise has a standard deviation of 1 to 30 mV
+    (log-uniform) and whose offset is within 10 mV to either side. Between two decisions 0 to 29 new readings arrive, as long
+    as there are any.
+
+    ## Episode end
+
+    Truncated after 8 decisions. Never terminated.
+
+    ## Arguments
+
+    | argument | default | meaning |
+    |----------|---------|---------|
+    | ``episode_steps`` | 8 | decisions per episode |
+    | ``reading_s`` | 10 | time between two readings, s |
+    | ``new_readings`` | (0, 29) | fewest and most readings between two decisions |
+    | ``noise_V`` | (0.001, 0.030) | least and greatest standard deviation of the voltage sensor's noise, V |
+    | ``offset_V`` | 0.010 | bound of the voltage sensor's offset, V; known to the agent |
+    | ``current_gain`` | 0 | bound of the relative error of the current sensor's gain |
+    | ``current_offset_A`` | 0 | bound of the current sensor's offset, A |
+    | ``process_noise_V`` | 0 | noise on Vo, Vsn and Vsp of the cell, V per root of a second |
+    | ``measured`` | ``"current"`` | or ``"power"``: the current is the measured power over the measured voltage |
+    | ``start`` | ``"random"`` | first estimate; or ``"new_cell"``, ``"true"`` |
+    | ``consistency`` | 0 | cost of a change of the action per unit of its length (the paper's consistency penalty); above 0 the action before is appended to the observation |
+    | ``load`` | ``"piecewise"`` | or ``"constant"``, ``"random_walk"``, ``"recorded"``, ``"paper"`` |
+    | ``split`` | ``"train"`` | or ``"test"``, ``"all"`` |
+    | ``dt_s`` | 1 | time step of the cell, s |
+    | ``mismatch`` | 0 | how far kn, tDiffusion, to and tsn of the cell are from the model's (relative standard deviation) |
+    | ``dataset`` | none | other discharges from full charge, simulated or recorded, in place of these |
+    | ``render_mode`` | none | ``"rgb_array"`` |
+
+    ``reset(options=...)`` takes ``discharge``, ``reading``, ``q_mobile_hat`` and ``r_o_hat``. As the model has no state of
+    its own that could drift, there is nothing to resynchronise.
+
+    ## Version history
+
+    * v0: initial version
+    """  # noqa: E501 (rows of a table)
+
+    parameters = ("q_mobile", "r_o")
+
+
+class BatteryVoltageQmax(VoltageTask):
+    """
+    ## Description
+
+    As ``BatteryVoltageJoint-v0``, but R_o is known (the new cell's in recorded discharges), and q^max (``q_mobile``) is to be
+    found.
+
+    ## Observation space
+
+    ``Box(-100, 100, (101,), float32)``, laid out as in ``BatteryVoltageJoint-v0``; the estimate is one number.
+
+    ## Action space
+
+    ``Box(-1, 1, (1,), float32)``: the estimate of q_mobile moves by sign(a) a^2 times 1500 C.
+
+    ## Reward
+
+    That of ``BatteryVoltageJoint-v0``.
+
+    ## Starting state
+
+    As ``BatteryVoltageJoint-v0``, with the new cell's r_o.
+
+    ## Episode end
+
+    Truncated after 8 decisions. Never terminated.
+
+    ## Arguments
+
+    Those of ``BatteryVoltageJoint-v0``.
+
+    ## Version history
+
+    * v0: initial version
+    """
+
+    parameters = ("q_mobile",)
+
+
+class BatteryVoltageRo(VoltageTask):
+    """
+    ## Description
+
+    As ``BatteryVoltageJoint-v0``, but q^max is known (the new cell's in recorded discharges), and R_o (``r_o``) is to be
+    found.
+
+    ## Observation space
+
+    ``Box(-100, 100, (101,), float32)``, laid out as in ``BatteryVoltageJoint-v0``; the estimate is one number.
+
+    ## Action space
+
+    ``Box(-1, 1, (1,), float32)``: the estimate of r_o moves by sign(a) a^2 times 0.12 ohm.
+
+    ## Reward
+
+    That of ``BatteryVoltageJoint-v0``.
+
+    ## Starting state
+
+    As ``BatteryVoltageJoint-v0``, with the new cell's q_mobile.
+
+    ## Episode end
+
+    Truncated after 8 decisions. Never terminated.
+
+    ## Arguments
+
+    Those of ``BatteryVoltageJoint-v0``.
+
+    ## Version history
+
+    * v0: initial version
+    """
+
+    parameters = ("r_o",)

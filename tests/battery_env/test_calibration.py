@@ -11,10 +11,9 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 import battery_env
-from battery_env.calibration.data import standard_dataset
-from battery_env.calibration.full_state import FORMULATIONS, OBSERVED, FullStateTask
+from battery_env.calibration.env import CalibrationEnv
+from battery_env.calibration.full_state import LITERAL, OBSERVED, SCALED, BatteryQmax, FullStateTask
 from battery_env.calibration.full_state_kernels import state_distance
-from battery_env.calibration.variants import BatteryQmaxEnv
 from battery_env.electrochemistry import NEW_CELL, QNB, step
 from battery_env.loads import RandomPiecewise
 from battery_env.trajectories import TrajectoryDataset
@@ -129,24 +128,24 @@ def test_the_literal_observation_is_divided_by_the_new_cells_state():
 
 
 def distances(formulation, *errors):
-    form, measured = FORMULATIONS[formulation], np.random.default_rng(0).uniform(0.0, 1e-3, (len(errors), 8))
+    form, measured = formulation, np.random.default_rng(0).uniform(0.0, 1e-3, (len(errors), 8))
     model = measured + np.pad(errors, ((0, 0), (1, 0)))
     return [state_distance(model, measured, n, 1.0 / form.error_scale, form.literal_cost) for n in range(len(errors))]
 
 
 def test_the_literal_cost():
-    found = distances("paper", [3e-5, 0, 4e-5, 0, 0, 0, 0], [0.3, 0.4, 0, 0, 0, 0.6, 0.8])
+    found = distances(LITERAL, [3e-5, 0, 4e-5, 0, 0, 0, 0], [0.3, 0.4, 0, 0, 0, 0.6, 0.8])
     np.testing.assert_allclose(found, [2.5e-5, 50.0 * (0.25 + 0.5)])
 
 
 def test_the_distance_is_a_norm_in_error_scales():
-    found = distances("scaled", [0.003, 0, 0, 8.0, 0, 0, 0], [0, 2e-5, 0, 0, 0, 0, 0])
+    found = distances(SCALED, [0.003, 0, 0, 8.0, 0, 0, 0], [0, 2e-5, 0, 0, 0, 0, 0])
     np.testing.assert_allclose(found, [0.5, 2.0])
 
 
 def test_the_perturbation_stays_in_its_bounds():
     env = gym.make("BatteryQmax-v0", initial_perturbation=10.0)
-    scale = FORMULATIONS["scaled"].error_scale
+    scale = SCALED.error_scale
     draws = []
     for seed in range(20):
         env.reset(seed=seed)
@@ -171,18 +170,19 @@ def test_a_perturbation_conserves_charge():
     assert task.model_state[0, QNB:].sum() == pytest.approx(task.state[0, QNB:].sum(), rel=1e-12)
 
 
-@pytest.mark.parametrize("formulation", ["scaled", "paper"])
-@pytest.mark.parametrize("parameter", ["q_mobile", "r_o", "joint"])
-def test_a_batch_is_its_cells_one_by_one(parameter, formulation):
+@pytest.mark.parametrize("formulation", [SCALED, LITERAL], ids=["scaled", "literal"])
+@pytest.mark.parametrize("parameters", [("q_mobile",), ("r_o",), ("q_mobile", "r_o")])
+def test_a_batch_is_its_cells_one_by_one(parameters, formulation):
+    kind = type("Task", (FullStateTask,), {"parameters": parameters, "formulation": formulation})
     data = TrajectoryDataset.generate("joint", 6, RandomPiecewise(), seed=0)
     rng = np.random.default_rng(0)
-    actions = rng.uniform(-1.0, 1.0, (30, 6, 2 if parameter == "joint" else 1))
+    actions = rng.uniform(-1.0, 1.0, (30, 6, len(parameters)))
     samples = rng.integers(0, 500, 6)
 
     def start(task, row, n):
         task.start(np.array([row]), [np.random.default_rng()], {"trajectory": n, "sample": samples[n]})
 
-    batch = FullStateTask(data, parameter, formulation, 6)
+    batch = kind(6, dataset=data)
     for n in range(6):
         start(batch, n, n)
     costs = []
@@ -191,7 +191,7 @@ def test_a_batch_is_its_cells_one_by_one(parameter, formulation):
             batch.keep(np.arange(6) < 4)
         costs.append(batch.advance(actions[k, : batch.cells])[:4])
     for n in range(4):
-        one = FullStateTask(data, parameter, formulation, 1)
+        one = kind(1, dataset=data)
         start(one, 0, n)
         single = [one.advance(actions[k, [n]])[0] for k in range(30)]
         np.testing.assert_array_equal(single, [c[n] for c in costs])
@@ -265,7 +265,7 @@ def test_nonsense_is_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         gym.make("BatteryQmax-v0", disable_env_checker=True, **arguments)
     with pytest.raises(ValueError, match="render_mode must be None or one of"):
-        BatteryQmaxEnv(render_mode="human")
+        CalibrationEnv(BatteryQmax, render_mode="human")
 
 
 def test_points_outside_the_data_are_refused():
@@ -274,7 +274,3 @@ def test_points_outside_the_data_are_refused():
         env.reset(options={"trajectory": 9999})
     with pytest.raises(ValueError, match=r"options\['sample'\] must lie within"):
         env.reset(options={"trajectory": 0, "sample": 0})
-    with pytest.raises(ValueError, match="parameter must be one of"):
-        FullStateTask(standard_dataset("r_o", "paper", "test"), "capacity", "scaled", 1)
-    with pytest.raises(ValueError, match="formulation must be one of"):
-        FullStateTask(standard_dataset("r_o", "paper", "test"), "r_o", "exact", 1)

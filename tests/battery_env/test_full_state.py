@@ -4,9 +4,16 @@ import numpy as np
 import pytest
 
 from battery_env.calibration.data import standard_dataset
-from battery_env.calibration.full_state import ACTION_RANGES, ERROR_SCALE, OBSERVED, FullStateOptions, FullStateTask
+from battery_env.calibration.full_state import (
+    ACTION_RANGES,
+    ERROR_SCALE,
+    OBSERVED,
+    BatteryJoint,
+    BatteryQmax,
+    BatteryQmaxPaper,
+    BatteryRo,
+)
 from battery_env.calibration.policy import PolicyEstimator
-from battery_env.calibration.variants import BatteryJointEnv, BatteryQmaxEnv, BatteryQmaxPaperEnv, BatteryRoEnv
 from battery_env.electrochemistry import (
     NEW_CELL,
     QNB,
@@ -35,8 +42,8 @@ def started(task, trajectory=2, sample=300):
     return task
 
 
-def make(data, parameter="q_mobile", cells=1, formulation="scaled", **options):
-    return FullStateTask(data, parameter, formulation, cells, FullStateOptions(**options))
+def make(data, kind=BatteryQmax, cells=1, **options):
+    return kind(cells, dataset=data, **options)
 
 
 def true_action(task):
@@ -58,7 +65,7 @@ def test_the_defaults_disturb_nothing(discharges):
 
 @pytest.mark.parametrize("wrong", [0, 1])
 def test_the_joint_task_shows_and_punishes_both_errors(discharges, wrong):
-    task = started(make(discharges, "joint"))
+    task = started(make(discharges, BatteryJoint))
     assert task.parameters == ("q_mobile", "r_o") and task.observation().shape == (1, 29)
     action = true_action(task)
     assert task.advance(action) == pytest.approx(0.0, abs=1e-9)
@@ -72,7 +79,7 @@ def test_the_joint_task_shows_and_punishes_both_errors(discharges, wrong):
 
 
 def test_the_joint_environment_draws_from_cells_whose_parameters_have_both_aged():
-    task = BatteryJointEnv.make_task(1, split="test")
+    task = BatteryJoint(1, split="test")
     assert len(task.dataset) == 300 and abs(np.corrcoef(task.dataset.q_mobile, task.dataset.r_o)[0, 1]) < 0.2
     for name, values in (("q_mobile", task.dataset.q_mobile), ("r_o", task.dataset.r_o)):
         low, high = ACTION_RANGES[name]
@@ -96,7 +103,7 @@ def test_the_model_of_a_new_cell_has_carried_the_same_load(discharges):
     # no action makes up for the charge that a new cell has more
     task.advance(true_action(task))
     assert task.model_state[0, QNB:].sum() == pytest.approx(initial_state(NEW_CELL.q_mobile)[QNB:].sum(), rel=1e-12)
-    both = started(make(discharges, "joint", start="new_cell"), sample=333)
+    both = started(make(discharges, BatteryJoint, start="new_cell"), sample=333)
     new = simulate(trajectory.load[:334], NEW_CELL.q_mobile, NEW_CELL.r_o)
     np.testing.assert_array_equal(both.model_state[0], new.state[333])
 
@@ -175,11 +182,10 @@ def test_both_noises_at_once_do_not_share_draws(discharges):
     assert np.abs(np.corrcoef(process.T, sensor.T)[:3, 3:]).max() < 0.25
 
 
-@pytest.mark.parametrize("parameter", ["q_mobile", "joint"])
-def test_changes_of_the_action_cost_and_the_action_before_is_shown(discharges, parameter):
-    size = 2 if parameter == "joint" else 1
-    plain = started(make(discharges, parameter, cells=2))
-    task = started(make(discharges, parameter, cells=2, consistency=0.7))
+@pytest.mark.parametrize(("kind", "size"), [(BatteryQmax, 1), (BatteryJoint, 2)])
+def test_changes_of_the_action_cost_and_the_action_before_is_shown(discharges, kind, size):
+    plain = started(make(discharges, kind, cells=2))
+    task = started(make(discharges, kind, cells=2, consistency=0.7))
     assert task.observation_size == plain.observation_size + size
     before = np.array([[0.8, 2.0 * (NEW_CELL.r_o - 0.08) / 0.14 - 1.0]])[:, :size].repeat(2, axis=0)
     rng = np.random.default_rng(0)
@@ -192,13 +198,13 @@ def test_changes_of_the_action_cost_and_the_action_before_is_shown(discharges, p
         before = np.clip(action, -1.0, 1.0)
 
 
-def test_the_cost_is_scaled_then_limited(discharges):
-    task = started(make(discharges, cells=2, cost_scale=100.0, cost_limit=20.0))
+def test_the_cost_is_limited(discharges):
+    task = started(make(discharges, cells=2, cost_limit=0.2))
     measured = task.measured.copy()
     cost = task.advance(true_action(task) + np.array([[0.02], [1.0]]))
     distance = scaled_distance(task, task.model_state, measured)
-    np.testing.assert_allclose(cost, np.minimum(100.0 * distance, 20.0), rtol=1e-9)
-    assert cost[0] < 20.0 == cost[1]
+    np.testing.assert_allclose(cost, np.minimum(distance, 0.2), rtol=1e-9)
+    assert cost[0] < 0.2 == cost[1]
 
 
 def test_constants_may_differ_from_those_of_the_model():
@@ -218,7 +224,7 @@ def test_constants_may_differ_from_those_of_the_model():
 
 
 def test_loads_of_other_kinds_and_time_steps():
-    task = BatteryRoEnv.make_task(1, load="piecewise", split="test", dt_s=2.0)
+    task = BatteryRo(1, load="piecewise", split="test", dt_s=2.0)
     whole = standard_dataset("r_o", "piecewise", "test", dt_s=2.0)
     within = whole.r_o <= ACTION_RANGES["r_o"][1]
     np.testing.assert_array_equal(task.dataset.r_o, whole.r_o[within])
@@ -229,18 +235,17 @@ def test_loads_of_other_kinds_and_time_steps():
 
 
 def test_perturbations_of_the_literal_form_are_in_error_scales_too(discharges):
-    task = BatteryQmaxPaperEnv.make_task(50, dataset=discharges, initial_perturbation=10.0)
+    task = BatteryQmaxPaper(50, dataset=discharges, initial_perturbation=10.0)
     started(task)
     off = (task.model_state - task.state)[:, OBSERVED] / ERROR_SCALE
     assert 5.0 < np.abs(off).max() <= 10.0
 
 
-@pytest.mark.parametrize("parameter", ["q_mobile", "joint"])
-def test_going_on_with_some_cells_changes_nothing_for_them(parameter):
+@pytest.mark.parametrize(("kind", "size"), [(BatteryQmax, 1), (BatteryJoint, 2)])
+def test_going_on_with_some_cells_changes_nothing_for_them(kind, size):
     data = TrajectoryDataset.generate("joint", 4, RandomPiecewise(), seed=0, mismatch=0.1)
     options = {"sensor_noise": 1.0, "process_noise_V": 1e-4, "consistency": 0.5, "resync": 4, "start": "new_cell"}
-    size = 2 if parameter == "joint" else 1
-    tasks = [make(data, parameter, cells=4, **options) for _ in range(2)]
+    tasks = [make(data, kind, cells=4, **options) for _ in range(2)]
     for task in tasks:
         for n in range(4):
             task.start(np.array([n]), [np.random.default_rng(n)], {"trajectory": n})
@@ -287,7 +292,6 @@ def test_a_cell_whose_data_have_ended_goes_on_without_failing(discharges):
         ("consistency", -0.1, "consistency"),
         ("sensor_offset", np.inf, "sensor_offset must be finite, got inf"),
         ("sensor_gain", 0.0, "sensor_gain must be finite and greater than 0, got 0.0"),
-        ("cost_scale", -1.0, "cost_scale"),
         ("cost_limit", 0.0, "cost_limit must be finite and greater than 0, got 0.0"),
         ("load", "sine", "load must be one of"),
         ("mismatch", -0.1, "mismatch"),
@@ -296,7 +300,7 @@ def test_a_cell_whose_data_have_ended_goes_on_without_failing(discharges):
 )
 def test_options_out_of_range_are_refused(option, value, message):
     with pytest.raises(ValueError, match=message):
-        BatteryQmaxEnv.make_task(1, **{option: value})
+        BatteryQmax(1, **{option: value})
 
 
 @pytest.mark.parametrize("shape", [(2,), (2, 2), (1, 1), (3, 1)])
@@ -308,4 +312,4 @@ def test_actions_of_another_shape_are_refused(discharges, shape):
 
 def test_a_data_set_stands_in_place_of_what_would_choose_one(discharges):
     with pytest.raises(ValueError, match="dataset stands in place of load, split: give one or the other"):
-        BatteryQmaxEnv.make_task(1, dataset=discharges, load="piecewise", split="test")
+        BatteryQmax(1, dataset=discharges, load="piecewise", split="test")

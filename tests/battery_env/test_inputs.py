@@ -18,7 +18,7 @@ from scipy.io import savemat
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 import battery_env
-from battery_env.calibration.registration import ENTRY_POINTS
+from battery_env.calibration.registration import TASKS
 from battery_env.loads import RandomPiecewise, RandomWalk, constant, piecewise, recorded
 
 NUMBERS = st.floats() | st.integers(-(2**63), 2**63 - 1) | st.floats(0.0, 1e4)
@@ -360,7 +360,7 @@ class TestEstimators:
             battery_env.evaluate(battery_env.ClosedForm(), given)
 
 
-@pytest.mark.parametrize("env_id", ENTRY_POINTS)
+@pytest.mark.parametrize("env_id", TASKS)
 class TestEnvironments:
     @staticmethod
     def run(env, steps=5):

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from battery_env import PolicyEstimator, load_nasa_discharges
+from battery_env.calibration.aging import simulated_lives
 from battery_env.calibration.voltage import LARGEST_STEPS
 from battery_env.electrochemistry import NEW_CELL
 from battery_env.evaluation import evaluate
 from battery_env.loads import RandomPiecewise
-from battery_env.sensors import SensorErrors
+from battery_env.sensors import RandomSensorErrors, SensorErrors
 from battery_env.trajectories import TrajectoryDataset
 
 
@@ -42,14 +43,6 @@ def test_one_estimate_at_each_decision_of_each_discharge(data):
     assert policy.seen[0].shape == (5, 102)
 
 
-def test_several_moves_each_time(data):
-    once, thrice = (
-        PolicyEstimator(Constant(-0.1, 0.1), "BatteryVoltageJoint-v0", moves=moves).trace(data[:1])[0] for moves in (1, 3)
-    )
-    np.testing.assert_array_equal(once.time_s, thrice.time_s)
-    assert thrice.q_mobile[0] - NEW_CELL.q_mobile == pytest.approx(3.0 * (once.q_mobile[0] - NEW_CELL.q_mobile))
-
-
 def test_discharges_do_not_influence_each_other(data):
     policy = Constant(-0.2, 0.1)
     together = PolicyEstimator(policy, "BatteryVoltageJoint-v0").trace(data)
@@ -72,6 +65,33 @@ def test_what_is_not_searched_for_is_known(data):
         assert (trace.q_mobile == q_mobile).all() and trace.r_o[0] < NEW_CELL.r_o
 
 
+def test_a_life_is_followed_with_one_estimate():
+    lives = simulated_lives(2, 3, seed=0)
+    policy = Constant(-0.1, 0.1)
+    estimator = PolicyEstimator(policy, "BatteryAging-v0", decision_s=300.0, cycles=3)
+    traces = estimator.trace(lives)
+    assert len(traces) == 6 and policy.seen[0].shape == (2, 104)
+    for n, (trace, discharge) in enumerate(zip(traces, lives, strict=True)):
+        readings = int(discharge.time_s[-1] // 10)
+        np.testing.assert_array_equal(trace.time_s, np.append(np.arange(300.0, 10.0 * readings, 300.0), 10.0 * readings))
+        before_C = NEW_CELL.q_mobile if n % 3 == 0 else traces[n - 1].q_mobile[-1]
+        moved_C = 0.01 * LARGEST_STEPS["q_mobile"] * np.arange(1, len(trace.time_s) + 1)
+        np.testing.assert_allclose(trace.q_mobile, np.maximum(before_C - moved_C, 3500.0))
+    # the estimate that was carried over stands beside the one of now
+    carried, now = policy.seen[0][:, -2:], policy.seen[0][:, -4:-2]
+    np.testing.assert_array_equal(carried, now)
+    scores = evaluate(estimator, lives, RandomSensorErrors((0.001, 0.030), 0.010))
+    np.testing.assert_array_equal(scores["q_mobile"], lives.q_mobile)
+    assert scores["q_mobile_final"][2] == traces[2].q_mobile[-1]
+
+
+def test_policies_are_scored_with_the_sensors_they_were_trained_with(data):
+    env = PolicyEstimator.environment("BatteryVoltageJoint-v0", dataset=data, current_gain=0.02, measured="power")
+    assert env.task.sensors == RandomSensorErrors((0.001, 0.030), 0.010, 0.02, 0.0, "power")
+    scores = evaluate(PolicyEstimator(Constant(0.0, 0.0), "BatteryVoltageJoint-v0"), data, env.task.sensors)
+    assert (scores["q_mobile_final"] == NEW_CELL.q_mobile).all()
+
+
 def test_recorded_discharges():
     discharge = load_nasa_discharges("B0005")[0].loaded_part(3.0)
     estimator = PolicyEstimator(Constant(-0.1, 0.0), "BatteryVoltageJoint-v0")
@@ -82,12 +102,10 @@ def test_recorded_discharges():
     assert discharge.time_s[-1] - 10.0 <= trace.time_s[-1] <= discharge.time_s[-1]
 
 
-def test_bad_arguments_are_refused():
+def test_bad_arguments_are_refused(data):
     with pytest.raises(ValueError, match=r"decision_s must be a multiple of the interval between readings, 10 s, got 25\.0"):
         PolicyEstimator(Constant(0.0), "BatteryVoltageRo-v0", decision_s=25.0)
-    with pytest.raises(ValueError, match="moves must be at least 1, got 0"):
-        PolicyEstimator(Constant(0.0), "BatteryVoltageRo-v0", moves=0)
-    with pytest.raises(ValueError, match="BatteryAging-v0 is no calibration environment of single discharges"):
-        PolicyEstimator(Constant(0.0), "BatteryAging-v0")
+    with pytest.raises(ValueError, match="3 discharges are no whole number of lives of 20 cycles"):
+        PolicyEstimator(Constant(0.0, 0.0), "BatteryAging-v0").trace(data[:3])
     with pytest.raises(ValueError, match="CartPole-v1 is no calibration environment"):
         PolicyEstimator(Constant(0.0), "CartPole-v1")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from battery_env.calibration.readings import Readings, explain
-from battery_env.calibration.voltage import VoltageOptions, VoltageTask
+from battery_env.calibration.voltage import BatteryVoltageJoint
 from battery_env.cells import load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, QNB, QNS, VO, simulate
 from battery_env.loads import RandomPiecewise
@@ -59,8 +59,8 @@ def test_linear_part_is_that_of_the_simulation(data, readings):
         np.testing.assert_allclose(readings.ohmic_A[part] * trajectory.r_o, trajectory.state[at, VO], atol=1e-9)
 
 
-def test_cells_that_are_not_asked_for_stay_as_they_are(readings):
-    task = VoltageTask(readings, ("q_mobile", "r_o"), 3, VoltageOptions())
+def test_cells_that_are_not_asked_for_stay_as_they_are(data):
+    task = BatteryVoltageJoint(3, dataset=data)
     task.start(np.arange(3), [np.random.default_rng(k) for k in range(3)])
     before = task.observation()
     task.start(np.array([1]), [np.random.default_rng(7)])

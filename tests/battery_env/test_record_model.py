@@ -162,5 +162,5 @@ class TestForecast:
     def test_it_needs_both_parameters(self, at):
         record = simulate(2.0, 6000.0, 0.15, load_unit="current")
         for of in (RecordModel().forecast, RecordModel().voltage):
-            with pytest.raises(ValueError, match="must lie within .* got nan"):
+            with pytest.raises(ValueError, match=r"must lie within .* got nan"):
                 of(record, at)

@@ -7,17 +7,26 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from battery_env.calibration import voltage_variants as variants
-from battery_env.calibration.aging import AgingOptions, AgingTask, simulated_lives
+from battery_env.calibration.aging import BatteryAging, simulated_lives
+from battery_env.calibration.env import CalibrationEnv
 from battery_env.calibration.readings import Readings
 from battery_env.calibration.task import OBSERVATION_LIMIT
-from battery_env.calibration.voltage import ESTIMATE_RANGES, LARGEST_STEPS, VoltageOptions, VoltageTask
-from battery_env.cells import load_nasa_discharges
+from battery_env.calibration.vector_env import CalibrationVectorEnv
+from battery_env.calibration.voltage import (
+    ESTIMATE_RANGES,
+    LARGEST_STEPS,
+    BatteryVoltageJoint,
+    BatteryVoltageQmax,
+    BatteryVoltageRo,
+)
+from battery_env.cells import Discharge, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL
 from battery_env.loads import RandomPiecewise
+from battery_env.sensors import RandomSensorErrors
 from battery_env.trajectories import TrajectoryDataset
 
 BOTH = ("q_mobile", "r_o")
+LOW, HIGH = np.array([ESTIMATE_RANGES[name] for name in BOTH]).T
 EXACT = {"noise_V": (0.0, 0.0), "offset_V": 0.0}
 
 
@@ -35,15 +44,15 @@ def generators(n, seed=0):
     return [np.random.default_rng(seed + k) for k in range(n)]
 
 
-def started(readings, parameters=BOTH, cells=4, seed=0, **options):
-    task = VoltageTask(readings, parameters, cells, VoltageOptions(**options))
+def started(data, kind=BatteryVoltageJoint, cells=4, seed=0, **options):
+    task = kind(cells, dataset=data, **options)
     task.start(np.arange(cells), generators(cells, seed))
     return task
 
 
 class TestTask:
-    def test_the_true_estimate_costs_nothing_and_stays(self, readings):
-        task = started(readings, start="true", **EXACT)
+    def test_the_true_estimate_costs_nothing_and_stays(self, data):
+        task = started(data, start="true", **EXACT)
         for _ in range(8):
             cost = task.advance(np.zeros((4, 2)))
             assert (cost < 0.1).all()  # 0.2 mV of 2
@@ -52,9 +61,9 @@ class TestTask:
             np.testing.assert_array_equal(report[name], report[f"{name}_hat"])
         np.testing.assert_allclose(report["voltage"], report["voltage_hat"], atol=1e-3)
 
-    @pytest.mark.parametrize("parameters", [("q_mobile",), ("r_o",), BOTH])
-    def test_actions_move_the_estimate_within_its_range(self, readings, parameters):
-        task = started(readings, parameters, start="true")
+    @pytest.mark.parametrize("kind", [BatteryVoltageQmax, BatteryVoltageRo, BatteryVoltageJoint])
+    def test_actions_move_the_estimate_within_its_range(self, data, kind):
+        task, parameters = started(data, kind, start="true"), kind.parameters
         before = task.estimate.copy()
         task.advance(np.full((4, len(parameters)), -0.5))
         for column, name in enumerate(BOTH):
@@ -68,91 +77,93 @@ class TestTask:
             np.testing.assert_allclose(task.estimate[:, column], expected)
 
     @pytest.mark.parametrize("offset_V", [0.0, 0.01])
-    def test_cost_is_the_misfit_of_all_data_at_the_new_estimate(self, readings, offset_V):
+    def test_cost_is_the_misfit_of_all_data_at_the_new_estimate(self, data, offset_V):
         options = {"noise_V": (0.0, 0.0), "offset_V": offset_V}
-        task = started(readings, cost="linear", **options)
-        action = np.array([[0.1, 0.2], [-0.3, 0.1], [0.05, -0.1], [0.0, 0.0]])
-        cost = task.advance(action)
-        residual_V = task._residual_V.reshape(4, -1)
-        explained_V = np.clip(residual_V.mean(axis=1), -offset_V, offset_V)
-        misfit_V = np.sqrt(np.mean((residual_V - explained_V[:, None]) ** 2, axis=1))
-        np.testing.assert_allclose(cost, misfit_V / 0.002, rtol=1e-12)
-        logarithmic = started(readings, cost_scale_V=0.005, **options)
-        np.testing.assert_allclose(logarithmic.advance(action), np.arcsinh(misfit_V / 0.005), rtol=1e-12)
-        # residuals are those of the new estimate and of all readings, the new ones too
-        again = VoltageTask(readings, BOTH, 4, VoltageOptions(**options))
+        task = started(data, **options)
+        cost = task.advance(np.array([[0.1, 0.2], [-0.3, 0.1], [0.05, -0.1], [0.0, 0.0]]))
+        # observed are the misfit, and the residuals over it, less the offset that explains them best
+        observed = task.observation().astype(np.float64)
+        misfit_V = 0.01 * np.exp(observed[:, 96]) - 1e-4
+        np.testing.assert_allclose(cost, np.arcsinh(misfit_V / 0.002), rtol=1e-4)
+        residual_V = observed[:, :32] * (misfit_V[:, None] + 1e-3)
+        np.testing.assert_allclose(misfit_V, np.sqrt(np.mean(residual_V**2, axis=1)), rtol=1e-4)
+        explained_V = np.clip(0.01 * np.sinh(observed[:, 98]), -offset_V, offset_V)
+        np.testing.assert_allclose(residual_V.mean(axis=1) + explained_V, 0.01 * np.sinh(observed[:, 98]), atol=1e-6)
+        # they are those of the new estimate and of all readings, the new ones too
+        again = started(data, **options)
         for row in range(4):
-            again.place(row, task.discharge[row], task.count[row], task.estimate[row])
-        again._voltage_V[:] = task._voltage_V
-        again._explain()
-        np.testing.assert_array_equal(again._residual_V, task._residual_V)
+            point = {"discharge": task.discharge[row], "reading": task.count[row]}
+            q_mobile, r_o = task.estimate[row]
+            generator = np.random.default_rng(row)
+            again.start(np.array([row]), [generator], {**point, "q_mobile_hat": q_mobile, "r_o_hat": r_o})
+        if offset_V == 0.0:
+            np.testing.assert_array_equal(again.observation(), task.observation())
 
-    def test_an_offset_within_the_bound_costs_nothing(self, readings):
-        task = started(readings, start="true", **EXACT)
-        shifted = started(readings, start="true", noise_V=(0.0, 0.0), offset_V=0.01)
+    def test_an_offset_within_the_bound_costs_nothing(self, data):
+        task = started(data, start="true", **EXACT)
+        shifted = started(data, start="true", noise_V=(0.0, 0.0), offset_V=0.01)
         np.testing.assert_allclose(shifted.advance(np.zeros((4, 2))), task.advance(np.zeros((4, 2))), atol=0.02)
 
-    def test_the_observation_knows_no_truth(self, readings):
-        """Two sets of readings that differ in their true parameters alone look the same."""
-        unknown = Readings(**{**readings.__dict__, "q_mobile": np.full(8, np.nan), "r_o": np.full(8, np.nan)})
-        one, other = started(readings), started(unknown)
+    def test_the_observation_knows_no_truth(self, data):
+        """The same discharges without their true parameters look the same."""
+        unknown = [Discharge(record.time_s, record.voltage_V, record.current_A) for record in data]
+        one, other = started(data), started(unknown)
         for _ in range(3):
             np.testing.assert_array_equal(one.observation(), other.observation())
             np.testing.assert_array_equal(one.advance(np.full((4, 2), 0.1)), other.advance(np.full((4, 2), 0.1)))
         assert np.isnan(other.report()["q_mobile"]).all()
 
-    def test_noise_and_offset_are_those_asked_for(self, readings):
-        task = started(readings, cells=200, noise_V=(0.005, 0.005), offset_V=0.0, start="true")
-        exact = started(readings, cells=200, start="true", **EXACT)
-        errors = []
-        for row in range(200):
-            exact.place(row, task.discharge[row], task.count[row], task.estimate[row])
-            length = readings.count[task.discharge[row]]
-            errors.append(task._voltage_V[row, :length] - exact._voltage_V[row, :length])
-        assert np.std(np.concatenate(errors)) == pytest.approx(0.005, rel=0.02)
-        task = started(readings, cells=200, noise_V=(0.0, 0.0), offset_V=0.01, start="true")
-        offsets = []
-        for row in range(200):
-            length = readings.count[task.discharge[row]]
-            error = task._voltage_V[row, :length] - readings.voltage_V[readings.part(task.discharge[row])]
-            assert np.ptp(error) < 1e-12
-            offsets.append(error[0])
-        assert np.std(offsets) == pytest.approx(0.01 / np.sqrt(3.0), rel=0.15)
-        assert np.abs(offsets).max() <= 0.01
+    def test_noise_and_offset_are_those_asked_for(self, data, readings):
+        def errors_V(**sensors):
+            """Of the last readings, for each decision of 200 episodes."""
+            task = started(data, cells=200, **sensors)
+            found = []
+            for _ in range(8):
+                true_V = readings.voltage_V[readings.start[task.discharge] + task.count - 1]
+                found.append(task.report()["voltage"] - true_V)
+                task.advance(np.zeros((200, 2)))
+            return np.array(found)
 
-    def test_process_noise_adds_up_as_the_model_decays(self, readings):
-        task = started(readings, cells=1, noise_V=(0.0, 0.0), offset_V=0.0, process_noise_V=1e-4)
-        draws = np.random.default_rng(0).standard_normal((3, 200_000))
-        noise_V = task._process_noise_V(draws)
+        assert np.std(errors_V(noise_V=(0.005, 0.005), offset_V=0.0)) == pytest.approx(0.005, rel=0.06)
+        offsets_V = errors_V(noise_V=(0.0, 0.0), offset_V=0.01)
+        assert np.ptp(offsets_V, axis=0).max() < 1e-12 and np.abs(offsets_V).max() <= 0.01
+        assert np.std(offsets_V[0]) == pytest.approx(0.01 / np.sqrt(3.0), rel=0.15)
+
+    def test_process_noise_adds_up_as_the_model_decays(self, data, readings):
+        noise_V = readings.process_noise_V(1e-4, np.random.default_rng(0).standard_normal((3, 200_000)))
         variance = sum(1e-8 / (1.0 - (1.0 - 1.0 / tau) ** 2) for tau in (NEW_CELL.to, NEW_CELL.tsn, NEW_CELL.tsp))
         assert np.var(noise_V[1000:]) == pytest.approx(variance, rel=0.1)
+        task, exact = started(data, cells=200, process_noise_V=1e-4, **EXACT), started(data, cells=200, **EXACT)
+        np.testing.assert_array_equal(task.discharge, exact.discharge)
+        shown_V = task.report()["voltage"] - exact.report()["voltage"]
+        assert shown_V.std() == pytest.approx(np.sqrt(variance), rel=0.3)
 
-    def test_measured_power_gives_the_current_of_an_exact_voltage(self, readings):
-        one, other = started(readings, **EXACT), started(readings, measured="power", **EXACT)
-        np.testing.assert_allclose(one.observation(), other.observation(), atol=1e-4)
-        offset = started(readings, measured="power", noise_V=(0.0, 0.0), offset_V=0.3, start="true")
-        for row in range(4):
-            part = readings.part(offset.discharge[row])
-            length = readings.count[offset.discharge[row]]
-            measured_W = offset._voltage_V[row, :length] * offset._current_A[row, :length]
-            np.testing.assert_allclose(measured_W, readings.voltage_V[part] * readings.current_A[part], rtol=1e-9)
+    @pytest.mark.parametrize(
+        "fault", [{"current_gain": 0.1}, {"current_offset_A": 0.3}, {"offset_V": 0.3}, {"offset_V": 0.3, "measured": "power"}]
+    )
+    def test_training_sees_what_evaluation_shows(self, data, fault):
+        """An episode looks like a record to which the same errors were applied."""
+        sensors = {**EXACT, **fault}
+        task = BatteryVoltageJoint(1, dataset=data, start="true", **sensors)
+        task.start(np.zeros(1, dtype=int), generators(1, seed=7), {"discharge": 3, "reading": 150})
+        (generator,) = generators(1, seed=7)
+        generator.integers(0, 30, size=8)  # how many readings arrive
+        shown = RandomSensorErrors(**sensors).draw(generator).apply(data[3], generator)
+        evaluated = BatteryVoltageJoint.follow([shown], 150, start="true", **sensors)
+        exact = BatteryVoltageJoint.follow([data[3]], 150, start="true", **sensors)
+        np.testing.assert_allclose(task.observation(), evaluated.observation(), atol=0.05)
+        assert np.abs(exact.observation() - evaluated.observation()).max() > 0.2
 
-    def test_consistency_is_charged_and_seen(self, readings):
-        plain, task = started(readings), started(readings, consistency=2.0)
+    def test_consistency_is_charged_and_seen(self, data):
+        plain, task = started(data), started(data, consistency=2.0)
         assert task.observation_size == plain.observation_size + 2
         np.testing.assert_array_equal(task.observation()[:, -2:], 0.0)
         for action, change in ((np.full((4, 2), 0.3), 0.3 * np.sqrt(2.0)), (np.full((4, 2), -0.1), 0.4 * np.sqrt(2.0))):
             np.testing.assert_allclose(task.advance(action), plain.advance(action) + 2.0 * change)
             np.testing.assert_array_equal(task.observation()[:, -2:], action.astype(np.float32))
 
-    def test_the_last_reading_alone(self, readings):
-        task = started(readings, data="last", **EXACT)
-        assert task.observation_size == 6 + 4 + 2
-        cost, report = task.advance(np.full((4, 2), 0.1)), task.report()
-        np.testing.assert_allclose(cost, np.arcsinh(np.abs(report["voltage"] - report["voltage_hat"]) / 0.002))
-
-    def test_no_new_readings_after_the_last_one(self, readings):
-        task = started(readings, new_readings=(400, 400), episode_steps=3)
+    def test_no_new_readings_after_the_last_one(self, data, readings):
+        task = started(data, new_readings=(400, 400), episode_steps=3)
         counts = []
         for _ in range(3):
             assert not task.truncated().any()
@@ -162,8 +173,8 @@ class TestTask:
         for count in counts[1:]:
             np.testing.assert_array_equal(count, readings.count[task.discharge])
 
-    def test_actions_that_cannot_be_meant_are_refused(self, readings):
-        task = started(readings)
+    def test_actions_that_cannot_be_meant_are_refused(self, data):
+        task = started(data)
         before = task.estimate.copy()
         with pytest.raises(ValueError, match=r"action must hold numbers, shape \(4, 2\), got float64 values of shape \(2,\)"):
             task.advance(np.zeros(2))
@@ -180,32 +191,29 @@ class TestTask:
             ({"noise_V": (5.0, 30.0)}, r"noise_V must be .*, got \(5.0, 30.0\)"),
             ({"offset_V": -0.01}, "offset_V must be at least 0 and less than 0.5, got -0.01"),
             ({"process_noise_V": np.nan}, "process_noise_V must be .*, got nan"),
-            ({"data": "first"}, "data must be one of .*, got 'first'"),
             ({"start": "new"}, "start must be one of .*, got 'new'"),
-            ({"cost_scale_V": 0.0}, "cost_scale_V must be .*, got 0.0"),
-            ({"cost": "square"}, "cost must be one of .*, got 'square'"),
+            ({"measured": "voltage"}, "measured must be one of .*, got 'voltage'"),
             ({"consistency": np.inf}, "consistency must be .*, got inf"),
         ],
     )
-    def test_bad_options_are_refused(self, options, message):
+    def test_bad_options_are_refused(self, data, options, message):
         with pytest.raises(ValueError, match=message):
-            VoltageOptions(**options)
+            BatteryVoltageJoint(1, dataset=data, **options)
 
 
 @pytest.mark.parametrize(
-    ("env_class", "actions"),
-    [(variants.BatteryVoltageJointEnv, 2), (variants.BatteryVoltageQmaxEnv, 1), (variants.BatteryVoltageRoEnv, 1)],
+    ("kind", "actions"),
+    [(BatteryVoltageJoint, 2), (BatteryVoltageQmax, 1), (BatteryVoltageRo, 1)],
 )
 class TestEnvironments:
-    def test_gymnasium_checks_pass(self, env_class, actions, data):
-        env = env_class(dataset=data)
+    def test_gymnasium_checks_pass(self, kind, actions, data):
+        env = CalibrationEnv(kind, dataset=data)
         assert env.action_space.shape == (actions,)
         check_env(env, skip_render_check=True)
 
-    def test_one_cell_and_many_make_the_same_episodes(self, env_class, actions, data):
-        vector_class = getattr(variants, env_class.__name__.removesuffix("Env") + "VectorEnv")
-        many = vector_class(num_envs=3, dataset=data)
-        singles = [env_class(dataset=data) for _ in range(3)]
+    def test_one_cell_and_many_make_the_same_episodes(self, kind, actions, data):
+        many = CalibrationVectorEnv(kind, num_envs=3, dataset=data)
+        singles = [CalibrationEnv(kind, dataset=data) for _ in range(3)]
         observation, _ = many.reset(seed=7)
         for k, env in enumerate(singles):
             np.testing.assert_array_equal(env.reset(seed=7 + k)[0], observation[k])
@@ -220,16 +228,16 @@ class TestEnvironments:
                 for name in ("q_mobile", "r_o_hat", "voltage", "soc"):
                     assert alone_info[name] == info[name][k]
 
-    def test_copies_go_on_alike(self, env_class, actions, data):
-        env = env_class(dataset=data)
+    def test_copies_go_on_alike(self, kind, actions, data):
+        env = CalibrationEnv(kind, dataset=data)
         env.reset(seed=3)
         for twin in (copy.deepcopy(env), pickle.loads(pickle.dumps(env))):
             again = copy.deepcopy(env)
             for _ in range(8):
                 np.testing.assert_array_equal(again.step(np.full(actions, 0.2))[0], twin.step(np.full(actions, 0.2))[0])
 
-    def test_reset_options(self, env_class, actions, data):
-        env = env_class(dataset=data)
+    def test_reset_options(self, kind, actions, data):
+        env = CalibrationEnv(kind, dataset=data)
         name = env.task.parameters[0]
         value = {"q_mobile": 5000.0, "r_o": 0.2}[name]
         _, info = env.reset(seed=0, options={"discharge": 3, "reading": 40, f"{name}_hat": value})
@@ -246,14 +254,14 @@ class TestEnvironments:
 
 
 def test_known_parameter_is_the_true_one(data):
-    env = variants.BatteryVoltageQmaxEnv(dataset=data)
+    env = CalibrationEnv(BatteryVoltageQmax, dataset=data)
     _, info = env.reset(seed=0, options={"discharge": 2})
     assert info["r_o_hat"] == info["r_o"] == data.r_o[2]
 
 
 def test_recorded_discharges_make_a_task():
     discharges = [discharge.loaded_part(3.0) for discharge in load_nasa_discharges("B0005")[:3]]
-    env = variants.BatteryVoltageJointEnv(dataset=discharges, noise_V=(0.0, 0.0), offset_V=0.0)
+    env = CalibrationEnv(BatteryVoltageJoint, dataset=discharges, noise_V=(0.0, 0.0), offset_V=0.0)
     _, info = env.reset(seed=0)
     assert np.isnan(info["q_mobile"]) and np.isfinite(info["q_mobile_hat"])
     observation, reward, *_ = env.step(np.zeros(2, dtype=np.float32))
@@ -262,9 +270,9 @@ def test_recorded_discharges_make_a_task():
 
 def test_unknown_option_is_refused(data):
     with pytest.raises(TypeError, match="resync"):
-        variants.BatteryVoltageJointEnv(resync=3)
+        CalibrationEnv(BatteryVoltageJoint, resync=3)
     with pytest.raises(ValueError, match="dataset stands in place of load"):
-        variants.BatteryVoltageJointEnv(dataset=data, load="constant")
+        CalibrationEnv(BatteryVoltageJoint, dataset=data, load="constant")
 
 
 @pytest.fixture(scope="module")
@@ -275,7 +283,7 @@ def lives():
 class TestAging:
     @pytest.fixture
     def task(self, lives):
-        task = AgingTask(Readings.of(lives), 2, AgingOptions(cycles=4, decisions_per_cycle=3))
+        task = BatteryAging(2, dataset=lives, cycles=4, decisions_per_cycle=3)
         task.start(np.arange(2), generators(2))
         return task
 
@@ -297,12 +305,12 @@ class TestAging:
             estimates.append(task.estimate.copy())
             carried = estimates[step - (step + 1) % 3] if step >= 2 else np.tile([NEW_CELL.q_mobile, NEW_CELL.r_o], (2, 1))
             if step < 11:
-                np.testing.assert_allclose(task._carried, carried)
+                scaled = 2.0 * (carried - LOW) / (HIGH - LOW) - 1.0
+                np.testing.assert_allclose(task.observation()[:, -2:], scaled, atol=1e-6)
         assert task.truncated().all()
 
     def test_same_seed_same_life(self, lives):
-        readings, options = Readings.of(lives), AgingOptions(cycles=4, decisions_per_cycle=3)
-        many, one = AgingTask(readings, 3, options), AgingTask(readings, 1, options)
+        many, one = (BatteryAging(cells, dataset=lives, cycles=4, decisions_per_cycle=3) for cells in (3, 1))
         many.start(np.arange(3), generators(3))
         one.start(np.arange(1), generators(3)[1:2])
         for _ in range(12):
@@ -311,14 +319,14 @@ class TestAging:
             one.advance(np.full((1, 2), 0.1))
 
     def test_environment(self, lives):
-        env = variants.BatteryAgingEnv(dataset=lives, cycles=4, decisions_per_cycle=2)
+        env = CalibrationEnv(BatteryAging, dataset=lives, cycles=4, decisions_per_cycle=2)
         check_env(env, skip_render_check=True)
         with pytest.raises(ValueError, match="first of a life of 4 cycles, got 3"):
             env.reset(options={"discharge": 3})
         with pytest.raises(ValueError, match="12 discharges are no whole number of lives of 5 cycles"):
-            variants.BatteryAgingEnv(dataset=lives, cycles=5)
+            CalibrationEnv(BatteryAging, dataset=lives, cycles=5)
         with pytest.raises(TypeError, match="episode_steps"):
-            variants.BatteryAgingEnv(dataset=lives, episode_steps=3)
+            CalibrationEnv(BatteryAging, dataset=lives, episode_steps=3)
 
     def test_observations_stay_in_bounds(self, task):
         assert (np.abs(task.observation()) <= OBSERVATION_LIMIT).all()

@@ -1,12 +1,16 @@
 """The page of the environments: what it takes from the code is what the code says now."""
 
+import ast
 import inspect
 import re
 
 import pytest
 
 from battery_env import ClosedForm, TrajectoryDataset, evaluate, plotting
-from battery_env.calibration.registration import ENTRY_POINTS
+from battery_env.calibration.env import CalibrationEnv
+from battery_env.calibration.full_state import BatteryQmax
+from battery_env.calibration.registration import TASKS
+from battery_env.calibration.voltage import BatteryVoltageJoint
 from battery_env.loads import constant
 from benchmarks import environment_page
 
@@ -31,8 +35,8 @@ def test_the_page_says_what_the_code_says():
 
 def test_every_environment_has_all_sections_of_its_page():
     wanted = ["Description", "Observation space", "Action space", "Reward", "Starting state", "Episode end", "Arguments"]
-    for env_id in ENTRY_POINTS:
-        page = inspect.getdoc(environment_page.environment_class(env_id))
+    for env_id in TASKS:
+        page = inspect.getdoc(environment_page.task_class(env_id))
         headings = re.findall(r"^## (.*)", page, flags=re.MULTILINE)
         assert [heading for heading in headings if heading in wanted] == wanted, env_id
         assert headings[-1] == "Version history", env_id
@@ -40,12 +44,24 @@ def test_every_environment_has_all_sections_of_its_page():
 
 
 def test_boxes_in_the_docstrings_are_the_spaces(dataset):
-    for env_id in ENTRY_POINTS:
-        env = environment_page.environment_class(env_id)(dataset=dataset)
-        shapes = re.findall(r"Box\(-?\d+, \d+, \((\d+),\), float32\)", inspect.getdoc(type(env)))
+    for env_id in TASKS:
+        env = CalibrationEnv(TASKS[env_id], dataset=dataset)
+        shapes = re.findall(r"Box\(-?\d+, \d+, \((\d+),\), float32\)", inspect.getdoc(env.task))
         found = [str(space.shape[0]) for space in (env.observation_space, env.action_space)]
         # a page may refer to another one for the action
         assert shapes == found[: len(shapes)] and shapes, env_id
+
+
+@pytest.mark.parametrize("task", [BatteryQmax, BatteryVoltageJoint])
+def test_the_table_of_arguments_is_that_of_the_options(task):
+    rows = re.findall(r"^\| ``(\w+)`` \| (.*?) \|", inspect.getdoc(task), flags=re.MULTILINE)
+    written = {name: None if default == "none" else ast.literal_eval(default.strip("`")) for name, default in rows}
+    # what the class decides
+    decided = {"episode_steps": BatteryQmax.episode_steps, "cost_limit": BatteryQmax.formulation.cost_limit}
+    expected = {
+        name: decided[name] if default is None and name in decided else default for name, default in task.options().items()
+    }
+    assert written == {**expected, "render_mode": None}
 
 
 def test_common_options_are_options_of_all(dataset):
@@ -62,12 +78,12 @@ def test_common_options_are_options_of_all(dataset):
         "episode_steps": 4,
     }
     assert set(names) == {*options, "dataset"}
-    for env_id in ENTRY_POINTS:
+    for env_id in TASKS:
         for name, value in options.items():
             if env_id == "BatteryAging-v0" and name in ("load", "mismatch", "dt_s", "episode_steps"):
                 continue
             try:
-                environment_page.environment_class(env_id)(dataset=dataset, **{name: value})
+                CalibrationEnv(TASKS[env_id], dataset=dataset, **{name: value})
             except ValueError as error:
                 # known, but not beside a data set of one's own
                 assert "dataset stands in place of" in str(error), (env_id, name)
