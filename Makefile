@@ -4,7 +4,7 @@ PYTHON ?= python3
 TORCH ?= torch==2.13.0
 VENV := .venv
 BIN := $(VENV)/bin
-SOURCES := sb3_lac battery_env benchmarks tests examples
+SOURCES := sb3_lac battery_env benchmarks tests examples docs
 
 .DEFAULT_GOAL := help
 .PHONY: help install demo test format lint type-check docs commit-checks clean

@@ -5,7 +5,7 @@ import gymnasium as gym
 
 def check_env_id(env_id: str) -> None:
     """
-    Refuse the id of a battery environment where battery_env is not installed: Gymnasium only says that it does not know the id.
+    Refuse the id of a battery environment where battery_env is not installed: Gymnasium only says that it does not know it.
 
     :param env_id: Id of an environment
     :raises gymnasium.error.NameNotFound: If it looks like one of battery_env, is not registered, and battery_env is missing

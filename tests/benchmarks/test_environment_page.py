@@ -1,4 +1,4 @@
-"""The page of the environments: what it takes from the code is what the code says now."""
+"""The pages of the environments: what they take from the code is what the code says now."""
 
 import inspect
 import re
@@ -10,7 +10,7 @@ from battery_env.calibration.registration import ENTRY_POINTS
 from battery_env.loads import constant
 from benchmarks import environment_page
 
-TEXT = environment_page.PAGE.read_text(encoding="utf-8")
+TEXT = (environment_page.DOCS / "battery_env.md").read_text(encoding="utf-8")
 
 
 def first_cells(section):
@@ -25,8 +25,19 @@ def dataset():
     return TrajectoryDataset.generate("joint", 20, [constant(8.0)], seed=0)
 
 
-def test_the_page_says_what_the_code_says():
+def test_the_pages_say_what_the_code_says():
     assert environment_page.render(TEXT) == TEXT, "run python -m benchmarks.environment_page"
+    pages = {path.stem: path.read_text(encoding="utf-8") for path in (environment_page.DOCS / "environments").glob("*.md")}
+    assert pages == {env_id: environment_page.environment_page(env_id) for env_id in environment_page.IDS}
+
+
+def test_every_environment_has_a_page():
+    assert {*ENTRY_POINTS, "CartPoleCost-v0", "LinearCost-v0", "Oscillator-v0"} == set(environment_page.IDS)
+
+
+def test_a_page_leads_to_the_pages_that_it_names():
+    page = environment_page.environment_page("BatteryRo-v0")
+    assert page.startswith("# BatteryRo-v0\n") and "As [`BatteryQmax-v0`](BatteryQmax-v0.md), but R_o" in page
 
 
 def test_every_environment_has_all_sections_of_its_page():
@@ -36,7 +47,7 @@ def test_every_environment_has_all_sections_of_its_page():
         headings = re.findall(r"^## (.*)", page, flags=re.MULTILINE)
         assert [heading for heading in headings if heading in wanted] == wanted, env_id
         assert headings[-1] == "Version history", env_id
-        assert f"### {env_id}\n" in TEXT and f"[`{env_id}`](#{env_id.lower()})" in TEXT
+        assert f"[`{env_id}`](environments/{env_id}.md)" in TEXT
 
 
 def test_boxes_in_the_docstrings_are_the_spaces(dataset):
@@ -113,11 +124,13 @@ def test_tables_of_docstrings_are_read_with_their_continued_lines():
 
 
 def test_only_what_stands_between_markers_is_written(tmp_path, capsys):
-    page = tmp_path / "page.md"
+    page = tmp_path / "battery_env.md"
     stale = re.sub(r"(<!-- begin columns -->).*?(<!-- end columns -->)", r"\1 old \2", TEXT, flags=re.DOTALL)
     page.write_text(stale, encoding="utf-8")
-    environment_page.main(["--page", str(page)])
+    (tmp_path / "environments").mkdir()
+    environment_page.main(["--docs", str(tmp_path)])
     assert page.read_text(encoding="utf-8") == TEXT and str(page) in capsys.readouterr().out
+    assert len(list((tmp_path / "environments").iterdir())) == len(environment_page.IDS)
 
 
 def test_a_page_without_its_markers_is_refused():
