@@ -49,6 +49,7 @@ type-check: install  ## mypy
 	$(BIN)/python -m mypy
 
 docs: install  ## the documentation site, in docs/_build/html
+	rm -rf docs/_api  # pages of names that are gone would stay
 	$(BIN)/python -m sphinx -q -W --keep-going docs docs/_build/html
 
 commit-checks: lint type-check docs test  ## everything that must pass before a commit
