@@ -56,6 +56,15 @@ def test_ids_of_batteries_say_what_to_install(monkeypatch, env_id):
         sb3_lac.LAC("MlpPolicy", env_id)
 
 
+def test_a_folder_without_code_is_no_battery_env(monkeypatch, tmp_path):
+    (tmp_path / "battery_env").mkdir()
+    monkeypatch.setattr(sys, "path", [str(tmp_path)])
+    monkeypatch.delitem(sys.modules, "battery_env")
+    monkeypatch.delitem(gym.registry, "BatteryRo-v0")
+    with pytest.raises(gym.error.NameNotFound, match=r"pip install ./battery_env"):
+        sb3_lac.LAC("MlpPolicy", "BatteryRo-v0")
+
+
 def test_other_missing_ids_are_refused_by_gymnasium():
     with pytest.raises(gym.error.NameNotFound, match="Did you mean: `BatteryQmax`"):
         sb3_lac.LAC("MlpPolicy", "BatteryQmx-v0")
