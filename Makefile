@@ -4,10 +4,10 @@ PYTHON ?= python3
 TORCH ?= torch==2.13.0
 VENV := .venv
 BIN := $(VENV)/bin
-SOURCES := sb3_lac battery_env benchmarks tests examples
+SOURCES := sb3_lac battery_env benchmarks tests examples docs
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test format lint type-check commit-checks clean
+.PHONY: help install demo test format lint type-check docs commit-checks clean
 
 help:  ## list the commands
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -17,7 +17,7 @@ logged = ($(1)) > $(VENV)/install.log 2>&1 || { cat $(VENV)/install.log >&2; exi
 comma := ,
 
 # one stamp per state of the packaging files: made again when they change
-$(VENV)/.installed: setup.cfg pyproject.toml battery_env/setup.cfg
+$(VENV)/.installed: setup.cfg pyproject.toml battery_env/setup.cfg battery_env/pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10) and "Python 3.10 or newer is needed: make PYTHON=...")'
 	@echo "making $(VENV)"
 	@mkdir -p $(VENV)
@@ -25,8 +25,8 @@ $(VENV)/.installed: setup.cfg pyproject.toml battery_env/setup.cfg
 	@$(call logged,$(BIN)/python -m pip install --upgrade pip)
 	@echo "installing $(TORCH)"
 	@$(call logged,$(BIN)/python -m pip install "$(TORCH)")
-	@echo "installing sb3_lac and battery_env, with all extras"
-	@$(call logged,$(BIN)/python -m pip install --editable ".[zoo$(comma)peers$(comma)dev]")
+	@echo "installing battery_env and sb3_lac, with all extras"
+	@$(call logged,$(BIN)/python -m pip install --editable ./battery_env --editable ".[zoo$(comma)peers$(comma)dev$(comma)docs]")
 	@touch $@
 
 install: $(VENV)/.installed  ## make .venv with everything in it
@@ -48,7 +48,11 @@ lint: install  ## what ruff and black find
 type-check: install  ## mypy
 	$(BIN)/python -m mypy
 
-commit-checks: lint type-check test  ## everything that must pass before a commit
+docs: install  ## the documentation site, in docs/_build/html
+	rm -rf docs/_api  # pages of names that are gone would stay
+	$(BIN)/python -m sphinx -q -W --keep-going docs docs/_build/html
+
+commit-checks: lint type-check docs test  ## everything that must pass before a commit
 
 clean:  ## remove what the build left (not .venv, not results)
-	rm -rf build *.egg-info battery_env/build battery_env/*.egg-info .pytest_cache .mypy_cache .ruff_cache
+	rm -rf build docs/_build docs/_api *.egg-info battery_env/build battery_env/*.egg-info .pytest_cache .mypy_cache .ruff_cache

@@ -73,7 +73,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
     :param samples: length of the whole discharge, shape (n,)
     :param first: first sample that counts as data, shape (n,)
     :param stop: one past the last sample that does, shape (n,)
-    :param checkpoint: states after 0, 64, 128, ... steps, all trajectories end to end, shape (*, 8)
+    :param checkpoint: states after 0, 64, 128, ... steps, all trajectories end to end, shape (m, 8)
     :param checkpoint_start: where in ``checkpoint`` each trajectory starts, shape (n,)
     :param load_unit: ``"power"`` or ``"current"``
     :param dt_s: time step, s

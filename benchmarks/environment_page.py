@@ -1,12 +1,13 @@
 """
-Write the parts of docs/battery_env.md that stand in the code already: the environments, from the docstrings of their tasks,
-and the data sets, estimators and columns of the evaluation, from theirs.
+Write what the documentation takes from the code: the page of each environment, docs/environments/ID.md, from the docstring of
+its task or class, and in docs/battery_env.md the tables of environments, data sets, estimators and columns of the evaluation.
 
 .. code-block:: bash
 
   python -m benchmarks.environment_page
 
-The rest of the page is written by hand. What is not stands between ``<!-- begin NAME -->`` and ``<!-- end NAME -->``.
+The rest of docs/battery_env.md is written by hand. What is not stands between ``<!-- begin NAME -->`` and
+``<!-- end NAME -->``.
 """
 
 from __future__ import annotations
@@ -16,33 +17,53 @@ import inspect
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from importlib import import_module
 from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+from gymnasium.envs.registration import load_env_creator
 
 import battery_env.estimators
+import sb3_lac
 from battery_env.calibration.data import standard_dataset
 from battery_env.calibration.full_state import FullStateTask
 from battery_env.calibration.registration import TASKS
-from battery_env.calibration.task import CalibrationTask
 from battery_env.estimators import Estimator, OnlineEstimator
 from battery_env.evaluation import evaluate
 from battery_env.loads import constant
 from battery_env.trajectories import TrajectoryDataset
 from benchmarks.reporting import write_text
 
-PAGE = Path(__file__).parents[1] / "docs" / "battery_env.md"
+DOCS = Path(__file__).parents[1] / "docs"
+
+#: All environments that this project brings.
+IDS = [
+    env_id
+    for env_id, spec in gym.registry.items()
+    if str(spec.entry_point).startswith((f"{battery_env.__name__}.", f"{sb3_lac.__name__}."))
+]
 
 
-def task_class(env_id: str) -> Callable[..., CalibrationTask]:
+def page_class(env_id: str) -> Callable[..., Any]:
     """
-    The task of a registered environment, whose docstring is the page of the environment.
+    The class whose docstring is the page of an environment: its task's for a battery, and its own else.
 
     :param env_id: its id
     :return: the class
     """
-    module, name = TASKS[env_id].split(":")
-    found: Callable[..., CalibrationTask] = getattr(import_module(module), name)
-    return found
+    spec = gym.spec(env_id)
+    return load_env_creator(str(spec.kwargs.get("task", spec.entry_point)))
+
+
+def environment_page(env_id: str) -> str:
+    """
+    The page of an environment, with links to the pages of the others that it names.
+
+    :param env_id: its id
+    :return: Markdown
+    """
+    page = inspect.getdoc(page_class(env_id)) or ""
+    return f"# {env_id}\n\n" + re.sub(rf"``((?!{env_id}\b)\w+-v\d+)``", r"[`\1`](\1.md)", page) + "\n"
 
 
 def ids() -> str:
@@ -55,10 +76,10 @@ def ids() -> str:
     dataset = TrajectoryDataset.generate("joint", 20, [constant(8.0)], seed=0)
     rows = []
     for env_id in TASKS:
-        task = task_class(env_id)(1, dataset=dataset)
+        task = page_class(env_id)(1, dataset=dataset)
         rows.append(
             {
-                "id": f"[`{env_id}`](#{env_id.lower()})",
+                "id": f"[`{env_id}`](environments/{env_id}.md)",
                 "measured": "the full state" if isinstance(task, FullStateTask) else "current and voltage",
                 "to be found": " and ".join(f"`{name}`" for name in task.parameters),
                 "numbers in an observation": task.observation_size,
@@ -67,19 +88,6 @@ def ids() -> str:
             }
         )
     return _markdown(rows)
-
-
-def environments() -> str:
-    """
-    The pages of all environments.
-
-    :return: Markdown
-    """
-    pages = []
-    for env_id in TASKS:
-        page = inspect.getdoc(task_class(env_id)) or ""
-        pages.append(f"### {env_id}\n\n" + re.sub(r"^## ", "#### ", page, flags=re.MULTILINE))
-    return "\n\n".join(pages)
 
 
 def data_sets() -> str:
@@ -126,10 +134,9 @@ def estimators() -> str:
     return _markdown(rows)
 
 
-#: The parts of the page that are not written by hand.
+#: The parts of docs/battery_env.md that are not written by hand.
 PARTS: dict[str, Callable[[], str]] = {
     "ids": ids,
-    "environments": environments,
     "data sets": data_sets,
     "estimators": estimators,
     "columns": columns,
@@ -193,10 +200,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     :param arguments: of the command line by default
     """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--page", type=Path, default=PAGE)
-    chosen = parser.parse_args(arguments)
-    write_text(chosen.page, render(chosen.page.read_text(encoding="utf-8")))
-    sys.stdout.write(f"{chosen.page}\n")
+    parser.add_argument("--docs", type=Path, default=DOCS)
+    docs = parser.parse_args(arguments).docs
+    pages = {docs / "environments" / f"{env_id}.md": environment_page(env_id) for env_id in IDS}
+    pages[docs / "battery_env.md"] = render((docs / "battery_env.md").read_text(encoding="utf-8"))
+    for page, text in pages.items():
+        write_text(page, text)
+        sys.stdout.write(f"{page}\n")
 
 
 if __name__ == "__main__":

@@ -1,3 +1,5 @@
+"""LAC, the Lyapunov Actor-Critic, for Stable-Baselines3, and the evaluation of what it learned."""
+
 from pathlib import Path
 
 import sb3_lac.envs  # noqa: F401  (registers the ids of the cost environments)

@@ -17,6 +17,7 @@ from stable_baselines3.sac.policies import Actor
 from torch.nn import functional as F
 
 from sb3_lac.buffers import HorizonReplayBuffer, HorizonReplayBufferSamples
+from sb3_lac.env_ids import check_env_id
 from sb3_lac.policies import CnnPolicy, LyapunovCritic, LyapunovPolicy, MlpPolicy, MultiInputPolicy, largest_value
 
 SelfLAC = TypeVar("SelfLAC", bound="LAC")
@@ -228,6 +229,8 @@ class LAC(OffPolicyAlgorithm):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ):
+        if isinstance(env, str):
+            check_env_id(env)
         super().__init__(
             policy,
             env,

@@ -49,6 +49,7 @@ except ImportError as error:
     raise ImportError("sb3_lac.zoo needs the RL Zoo, install it with: pip install 'sb3_lac[zoo]'") from error
 
 from sb3_lac import LAC, GymnasiumVecEnv
+from sb3_lac.env_ids import check_env_id
 
 # What a sampler of the RL Zoo returns, and what it gets: see ``HYPERPARAMS_SAMPLER``
 Hyperparams = dict[str, Any]
@@ -321,20 +322,24 @@ def main(args: Sequence[str] | None = None) -> None:
     parsed = parser.parse_args(args)
     trains = parsed.command in ("train", "optimize")
 
-    # Only the options with another default are read here, the RL Zoo reads all of them from sys.argv
+    # Only the options with another default, and the id, are read here, the RL Zoo reads all of them from sys.argv
     options = parsed.options
     if trains or parsed.command in ("enjoy", "record_video"):
         defaults = argparse.ArgumentParser(prog=prog, add_help=False)
         defaults.add_argument("--algo", default="lac")
+        defaults.add_argument("--env")
         if trains:
             defaults.add_argument("-conf", "--conf-file")
         known, options = defaults.parse_known_args(options)
         options += ["--algo", known.algo]
-        if trains:
-            try:
+        try:
+            if known.env is not None:
+                check_env_id(known.env)
+                options = ["--env", known.env, *options]
+            if trains:
                 options += ["--conf-file", known.conf_file or str(find_config(known.algo))]
-            except FileNotFoundError as error:
-                parser.error(str(error))
+        except (gym.error.NameNotFound, FileNotFoundError) as error:
+            parser.error(str(error))
     if parsed.command == "optimize":
         options += ["--optimize-hyperparameters"]
 

@@ -1,7 +1,7 @@
 """
 Run the tests of Stable-Baselines3 and of SB3-Contrib with LAC in place of SAC and of TQC:
 
-    pip install -e .[peers,dev]
+    pip install -e ./battery_env -e .[peers,dev]
     git clone --depth 1 --branch v2.9.0 https://github.com/DLR-RM/stable-baselines3 /tmp/sb3
     git clone --depth 1 --branch v2.9.0 https://github.com/Stable-Baselines-Team/stable-baselines3-contrib /tmp/sb3-contrib
     python tests/conformance.py /tmp/sb3/tests

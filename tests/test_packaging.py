@@ -3,6 +3,7 @@
 import configparser
 import importlib.resources
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -23,48 +24,74 @@ def read(file):
     return config
 
 
-def test_the_list_of_packages_matches_the_tree():
-    found = {
-        package: {str(path.parent.relative_to(ROOT)).replace("/", ".") for path in (ROOT / package).rglob("__init__.py")}
-        for package in ("battery_env", "sb3_lac")
-    }
-    assert set(read("battery_env/setup.cfg")["options"]["packages"].split()) == found["battery_env"]
-    everything = found["battery_env"] | found["sb3_lac"] | {"sb3_lac.zoo_configs"}
-    assert set(read("setup.cfg")["options"]["packages"].split()) == everything
+# what each distribution installs that is no package of its own in the tree
+DISTRIBUTIONS = {"battery_env": ("battery_env/setup.cfg", set()), "sb3_lac": ("setup.cfg", {"sb3_lac.zoo_configs"})}
+
+
+@pytest.mark.parametrize("package", DISTRIBUTIONS)
+def test_the_list_of_packages_matches_the_tree(package):
+    file, more = DISTRIBUTIONS[package]
+    found = {str(path.parent.relative_to(ROOT)).replace("/", ".") for path in (ROOT / package).rglob("__init__.py")}
+    assert set(read(file)["options"]["packages"].split()) == found | more
+
+
+def build_wheel(folder, target):
+    code = f"from setuptools.build_meta import build_wheel; print(build_wheel({str(target)!r}))"
+    result = subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, check=True)
+    return target / result.stdout.split()[-1]
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory):
-    source, target = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
+def wheels(tmp_path_factory):
+    source, target = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheels")
     for folder in ("sb3_lac", "battery_env", "zoo_configs"):
         shutil.copytree(ROOT / folder, source / folder, ignore=shutil.ignore_patterns("__pycache__", "build", "*.egg-info"))
     for file in ("setup.cfg", "pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / file, source)
-    code = f"from setuptools.build_meta import build_wheel; build_wheel({str(target)!r})"
-    subprocess.run([sys.executable, "-c", code], cwd=source, capture_output=True, check=True)
-    (file,) = target.glob("*.whl")
-    return file
+    return {"battery_env": build_wheel(source / "battery_env", target), "sb3_lac": build_wheel(source, target)}
 
 
-def test_the_wheel_brings_the_hyperparameters_and_the_data(wheel):
-    packaged = set(zipfile.ZipFile(wheel).namelist())
-    assert {f"sb3_lac/zoo_configs/{path.name}" for path in (ROOT / "zoo_configs").iterdir()} <= packaged
-    assert {f"battery_env/nasa_cells/{path.name}" for path in (ROOT / "battery_env/nasa_cells").glob("*.*")} <= packaged
+def test_each_wheel_owns_its_files_and_brings_its_data_and_license(wheels):
+    packaged = {package: set(zipfile.ZipFile(wheel).namelist()) for package, wheel in wheels.items()}
+    for package, names in packaged.items():
+        modules = {str(path.relative_to(ROOT)) for path in (ROOT / package).rglob("*.py")}
+        assert modules | {f"{package}/py.typed", f"{package}/version.txt"} <= names
+        assert {name.split("/")[0].split("-")[0] for name in names} == {package}
+        assert any(name.endswith(".dist-info/licenses/LICENSE") for name in names)
+    assert {f"sb3_lac/zoo_configs/{path.name}" for path in (ROOT / "zoo_configs").iterdir()} <= packaged["sb3_lac"]
+    data = {f"battery_env/nasa_cells/{path.name}" for path in (ROOT / "battery_env/nasa_cells").glob("*.*")}
+    assert data <= packaged["battery_env"]
 
 
-def test_what_the_wheel_installs_finds_its_hyperparameters_from_any_folder(wheel, tmp_path):
-    pytest.importorskip("rl_zoo3")
-    zipfile.ZipFile(wheel).extractall(tmp_path / "installed")
-    (tmp_path / "elsewhere").mkdir()
+@pytest.fixture(scope="module")
+def installed(wheels, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("installed")
+    for wheel in wheels.values():
+        zipfile.ZipFile(wheel).extractall(folder)
+    return folder
+
+
+def run_installed(code, installed, folder):
     result = subprocess.run(
-        [sys.executable, "-c", "from sb3_lac.zoo import find_config; print(find_config('td3'))"],
-        cwd=tmp_path / "elsewhere",
-        env={**os.environ, "PYTHONPATH": str(tmp_path / "installed")},
+        [sys.executable, "-c", code],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(installed)},
         capture_output=True,
         text=True,
         check=True,
     )
-    assert result.stdout.strip() == str(tmp_path / "installed" / "sb3_lac" / "zoo_configs" / "td3.yml")
+    return result.stdout.strip()
+
+
+def test_what_the_wheel_installs_finds_its_hyperparameters_from_any_folder(installed, tmp_path):
+    pytest.importorskip("rl_zoo3")
+    found = run_installed("from sb3_lac.zoo import find_config; print(find_config('td3'))", installed, tmp_path)
+    assert found == str(installed / "sb3_lac" / "zoo_configs" / "td3.yml")
+
+
+def test_with_both_wheels_sb3_lac_registers_the_batteries(installed, tmp_path):
+    code = "import sys, sb3_lac, gymnasium; gymnasium.spec('BatteryQmax-v0'); print(sys.modules['battery_env'].__file__)"
+    assert run_installed(code, installed, tmp_path) == str(installed / "battery_env" / "__init__.py")
 
 
 def test_logging_and_progress_bars_need_no_extra():
@@ -73,9 +100,12 @@ def test_logging_and_progress_bars_need_no_extra():
 
 
 def test_both_distributions_ask_for_the_same_versions():
-    inner = set(read("battery_env/setup.cfg")["options"]["install_requires"].split())
-    inner |= set(read("battery_env/setup.cfg")["options.extras_require"]["sb3"].split())
-    assert inner <= set(read("setup.cfg")["options"]["install_requires"].split())
+    requirements = [
+        {re.split("[><=]", line)[0]: line for line in read(file)["options"]["install_requires"].split() if line[0].isalpha()}
+        for file, _ in DISTRIBUTIONS.values()
+    ]
+    shared = set.intersection(*map(set, requirements))
+    assert "gymnasium" in shared and all(requirements[0][name] == requirements[1][name] for name in shared)
     assert read("battery_env/setup.cfg")["options"]["python_requires"] == read("setup.cfg")["options"]["python_requires"]
 
 

@@ -1,4 +1,4 @@
-"""The page of the environments: what it takes from the code is what the code says now."""
+"""The pages of the environments: what they take from the code is what the code says now."""
 
 import ast
 import inspect
@@ -14,7 +14,7 @@ from battery_env.calibration.voltage import BatteryVoltageJoint
 from battery_env.loads import constant
 from benchmarks import environment_page
 
-TEXT = environment_page.PAGE.read_text(encoding="utf-8")
+TEXT = (environment_page.DOCS / "battery_env.md").read_text(encoding="utf-8")
 
 
 def first_cells(section):
@@ -29,18 +29,29 @@ def dataset():
     return TrajectoryDataset.generate("joint", 20, [constant(8.0)], seed=0)
 
 
-def test_the_page_says_what_the_code_says():
+def test_the_pages_say_what_the_code_says():
     assert environment_page.render(TEXT) == TEXT, "run python -m benchmarks.environment_page"
+    pages = {path.stem: path.read_text(encoding="utf-8") for path in (environment_page.DOCS / "environments").glob("*.md")}
+    assert pages == {env_id: environment_page.environment_page(env_id) for env_id in environment_page.IDS}
+
+
+def test_every_environment_has_a_page():
+    assert {*TASKS, "CartPoleCost-v0", "LinearCost-v0", "Oscillator-v0"} == set(environment_page.IDS)
+
+
+def test_a_page_leads_to_the_pages_that_it_names():
+    page = environment_page.environment_page("BatteryRo-v0")
+    assert page.startswith("# BatteryRo-v0\n") and "As [`BatteryQmax-v0`](BatteryQmax-v0.md), but R_o" in page
 
 
 def test_every_environment_has_all_sections_of_its_page():
     wanted = ["Description", "Observation space", "Action space", "Reward", "Starting state", "Episode end", "Arguments"]
     for env_id in TASKS:
-        page = inspect.getdoc(environment_page.task_class(env_id))
+        page = inspect.getdoc(environment_page.page_class(env_id))
         headings = re.findall(r"^## (.*)", page, flags=re.MULTILINE)
         assert [heading for heading in headings if heading in wanted] == wanted, env_id
         assert headings[-1] == "Version history", env_id
-        assert f"### {env_id}\n" in TEXT and f"[`{env_id}`](#{env_id.lower()})" in TEXT
+        assert f"[`{env_id}`](environments/{env_id}.md)" in TEXT
 
 
 def test_boxes_in_the_docstrings_are_the_spaces(dataset):
@@ -129,11 +140,13 @@ def test_tables_of_docstrings_are_read_with_their_continued_lines():
 
 
 def test_only_what_stands_between_markers_is_written(tmp_path, capsys):
-    page = tmp_path / "page.md"
+    page = tmp_path / "battery_env.md"
     stale = re.sub(r"(<!-- begin columns -->).*?(<!-- end columns -->)", r"\1 old \2", TEXT, flags=re.DOTALL)
     page.write_text(stale, encoding="utf-8")
-    environment_page.main(["--page", str(page)])
+    (tmp_path / "environments").mkdir()
+    environment_page.main(["--docs", str(tmp_path)])
     assert page.read_text(encoding="utf-8") == TEXT and str(page) in capsys.readouterr().out
+    assert len(list((tmp_path / "environments").iterdir())) == len(environment_page.IDS)
 
 
 def test_a_page_without_its_markers_is_refused():

@@ -240,6 +240,14 @@ def test_missing_config_is_explained(workdir, capsys):
     assert "No hyperparameters for 'a2c'" in capsys.readouterr().err
 
 
+def test_missing_batteries_are_explained(workdir, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "battery_env", None)
+    monkeypatch.delitem(gym.registry, "BatteryRo-v0")
+    with pytest.raises(SystemExit):
+        main(["train", "--env", "BatteryRo-v0"])
+    assert "pip install ./battery_env" in capsys.readouterr().err
+
+
 def run_python(*args):
     return subprocess.run([sys.executable, *args], capture_output=True, text=True)
 

@@ -1,0 +1,60 @@
+"""The documentation site: ``make docs`` builds it in docs/_build/html."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+from docutils import nodes
+from sphinx import addnodes
+from sphinx.application import Sphinx
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT))  # the packages of this tree, also where others are installed
+
+project = "sb3_lac"
+author = "The sb3_lac contributors"
+release = (ROOT / "sb3_lac" / "version.txt").read_text(encoding="utf-8").strip()
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary"]
+templates_path = ["_templates"]
+exclude_patterns = ["_build"]
+html_theme = "furo"
+html_title = f"sb3_lac {release}"
+
+myst_heading_anchors = 4  # as on GitHub
+autosummary_ignore_module_all = False
+autodoc_typehints = "description"
+autodoc_member_order = "bysource"
+autodoc_type_aliases = {name: name for name in ("BoolArray", "FloatArray", "IntArray")}
+
+
+def entitle_table(app: Sphinx, docname: str, source: list[str]) -> None:
+    """The tables in results have no title of their own."""
+    if docname.startswith("results/"):
+        source[0] = f"# {docname.removeprefix('results/')}\n\n{source[0]}"
+
+
+def lead_to_site(app: Sphinx, doctree: nodes.document) -> None:
+    """The README is the index of the site, and links to what lies in the repository only stay text."""
+    for link in list(doctree.findall(addnodes.pending_xref)):
+        target = link["reftarget"]
+        if target == str(ROOT / "README"):
+            link["reftarget"] = "index"
+        elif link["reftype"] == "myst" and target not in app.env.found_docs:
+            if any((folder / target).exists() for folder in (ROOT, ROOT / "docs")):
+                link.replace_self(link.children)
+
+
+def refer_to_page(app: Sphinx, what: str, name: str, documented: Any, options: Any, lines: list[str]) -> None:
+    """The docstring of an environment is a page, in Markdown."""
+    if what == "class" and lines[:1] == ["## Description"]:
+        ends = f":{documented.__name__}"
+        (spec,) = (spec for spec in gym.registry.values() if str(spec.kwargs.get("task", spec.entry_point)).endswith(ends))
+        lines[:] = [f"See its page, :doc:`/environments/{spec.id}`."]
+
+
+def setup(app: Sphinx) -> None:
+    app.connect("source-read", entitle_table)
+    app.connect("doctree-read", lead_to_site)
+    app.connect("autodoc-process-docstring", refer_to_page)
