@@ -216,7 +216,8 @@ class RecordModel:
         :return: C
         """
         q_C = Q_MOBILE.limits[1]
-        return least_q_mobile(current_A, q_C, self.dt_s, self.cell.packed, self.start(q_C))
+        constants = self.cell.packed.constants
+        return float(least_q_mobile(current_A, q_C, self.dt_s, constants, self.start(q_C), FULL_CHARGE_SHARES))
 
 
 def _at(time_s: FloatArray, simulation: Trajectory) -> FloatArray:

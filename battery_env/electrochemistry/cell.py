@@ -51,8 +51,8 @@ class PackedConstants(NamedTuple):
     """
     What the kernels read: constants of the equations, and both equilibrium-potential polynomials in y = 2x - 1.
 
-    :param constants: one row for all cells or one row a cell, shape (1, 13) or (n, 13); the columns
-        have names, ``FRACTION_PER_SHARE`` and so on
+    :param constants: one row for all cells or one row a cell, shape (1, 13) or (n, 13); its columns have names,
+        ``FRACTION_PER_SHARE`` and so on
     :param polynomial_n: of the negative electrode, V, lowest power first, shape (14,)
     :param polynomial_p: of the positive electrode, V, shape (14,)
     """

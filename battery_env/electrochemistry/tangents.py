@@ -18,7 +18,6 @@ from battery_env.electrochemistry.cell import (
     BULK_RATE,
     COOLING,
     FRACTION_PER_SHARE,
-    FULL_CHARGE_SHARES,
     PER_CURRENT_N,
     PER_CURRENT_P,
     QNB,
@@ -167,11 +166,11 @@ def roll_out_with_tangents(
 
 
 @_compiled
-def _least_q_mobile(
+def least_q_mobile(
     current: FloatArray, q: float, dt: float, constants: FloatArray, start: FloatArray, shares: FloatArray
 ) -> float:
-    # q is large enough for any record. A surface charge that is `charge` at q is charge + slope * (least - q) at least, and
-    # must stay within 0 .. full * least
+    # The q below which the cell is empty before the current ends; the one given is large enough. A surface charge that is
+    # `charge` at q is charge + slope * (least - q) at least, and must stay within 0 .. full * least
     full = 1.0 / constants[0, FRACTION_PER_SHARE]
     x, dx = np.empty((1, STATE_SIZE)), np.zeros((2, STATE_SIZE))
     x[0] = start
@@ -185,18 +184,3 @@ def _least_q_mobile(
         _diffuse(dx, BY_Q, dt, constants, 0)
         cell_step(x, 0, current[k], q, 0.0, dt, False, False, constants, 0, x, 0)
     return least
-
-
-def least_q_mobile(current: FloatArray, q: float, dt: float, packed: PackedConstants, start: FloatArray) -> float:
-    """
-    The ``q_mobile`` below which the model cell is empty before a current ends. At a fixed current its charges are linear in
-    ``q_mobile``, so that one roll-out gives it exactly.
-
-    :param current: over each step, A, shape (K,)
-    :param q: a ``q_mobile`` that is large enough, C
-    :param dt: time step, s
-    :param packed: constants of the cell
-    :param start: state at the start of a cell of this ``q_mobile``, shape (8,)
-    :return: C
-    """
-    return float(_least_q_mobile(current, q, dt, packed.constants, start, FULL_CHARGE_SHARES))
