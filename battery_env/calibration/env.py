@@ -30,14 +30,16 @@ def new_task(task: str | type[CalibrationTask], cells: int, options: Mapping[str
     :raises TypeError: for an option that the task does not have
     :raises ValueError: for values out of range
     """
+    kind: Any = task
     if isinstance(task, str):
         module, _, name = task.partition(":")
-        task = getattr(import_module(module), name)
-    known = task.options()
+        kind = getattr(import_module(module), name)
+    known = kind.options()
     unknown = options.keys() - known.keys()
     if unknown:
         raise TypeError(f"{', '.join(sorted(unknown))}: no such option. There are {', '.join(sorted(known))}")
-    return task(cells, **options)
+    made: CalibrationTask = kind(cells, **options)
+    return made
 
 
 def spaces_of(task: CalibrationTask) -> tuple[FloatSpace, FloatSpace]:

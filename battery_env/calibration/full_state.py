@@ -94,31 +94,89 @@ LITERAL = Formulation(
     cost_limit=1e4,
 )
 
-# What belongs to a cell of the batch
-_PER_CELL = (
-    "trajectory",
-    "sample",
-    "decisions",
-    "state",
-    "next_state",
-    "model_state",
-    "load",
-    "q_mobile",
-    "r_o",
-    "q_mobile_hat",
-    "r_o_hat",
-    "voltage",
-    "soc",
-    "last_action",
-    "_sensed",
-    "_sensed_before",
-    "_last_sample",
-    "_last_decision",
-    "_load_start",
-    "_nominal_q_mobile",
-    "_nominal_r_o",
-    "_noise",
-)
+
+@dataclass(eq=False)
+class Cells:
+    """
+    Where n cells stand at sample t. All arrays have one row a cell; what no option asks for has no columns.
+
+    :param trajectory: number of the discharge
+    :param sample: t
+    :param last_sample: of the discharge
+    :param last_decision: the last sample at which there is a decision
+    :param load_start: where the loads of the discharge start
+    :param decisions: made in this episode
+    :param state: x_t, shape (n, 8)
+    :param next_state: x_{t+1}
+    :param model_state: x̂_t
+    :param sensed_before: x_t as sensors with errors had it
+    :param sensed: x_{t+1} as sensors with errors have it
+    :param load: u_{t+1}, over the step from t to t + 1, W or A
+    :param voltage: of the cell at t, V
+    :param soc: state of charge of the cell at t
+    :param q_mobile: of the cell, C
+    :param r_o: of the cell, ohm
+    :param q_mobile_hat: of the model, C
+    :param r_o_hat: of the model, ohm
+    :param new_q_mobile: a new cell's, C
+    :param new_r_o: a new cell's, ohm
+    :param last_action: shape (n, parameters)
+    :param constants: of the cell, where they are not the model's, shape (n, 14)
+    :param noise: standard normal draws of the episode, of the process first, shape (n, measured states, columns)
+    """
+
+    trajectory: IntArray
+    sample: IntArray
+    last_sample: IntArray
+    last_decision: IntArray
+    load_start: IntArray
+    decisions: IntArray
+    state: FloatArray
+    next_state: FloatArray
+    model_state: FloatArray
+    sensed_before: FloatArray
+    sensed: FloatArray
+    load: FloatArray
+    voltage: FloatArray
+    soc: FloatArray
+    q_mobile: FloatArray
+    r_o: FloatArray
+    q_mobile_hat: FloatArray
+    r_o_hat: FloatArray
+    new_q_mobile: FloatArray
+    new_r_o: FloatArray
+    last_action: FloatArray
+    constants: FloatArray
+    noise: FloatArray
+
+    @property
+    def measured(self) -> FloatArray:
+        """x_{t+1} as the sensors have it, shape (n, 8)."""
+        return self.sensed if self.sensed.size else self.next_state
+
+    @property
+    def measured_before(self) -> FloatArray:
+        """x_t as the sensors had it, shape (n, 8)."""
+        return self.sensed_before if self.sensed_before.size else self.state
+
+    def take(self, rows: NDArray[np.bool_]) -> Cells:
+        """
+        Some of the cells.
+
+        :param rows: which, shape (n,)
+        :return: copies of them
+        """
+        return Cells(**{name: np.ascontiguousarray(values[rows]) for name, values in vars(self).items()})
+
+    def put(self, rows: NDArray[np.intp], others: Cells) -> None:
+        """
+        Overwrite some of the cells.
+
+        :param rows: which, shape (m,)
+        :param others: m cells
+        """
+        for values, theirs in zip(vars(self).values(), vars(others).values(), strict=True):
+            values[rows] = theirs
 
 
 @lru_cache(maxsize=4)
@@ -140,6 +198,7 @@ class FullStateTask(CalibrationTask):
     parameter leaves its domain (:func:`battery_env.electrochemistry.step_into`, ``extended``).
 
     :ivar formulation: how states become observations and costs
+    :ivar now: where the cells stand
     :param cells: size of the batch
     :raises ValueError: for values out of range
     """
@@ -204,57 +263,36 @@ class FullStateTask(CalibrationTask):
         shows_action = consistency > 0.0
         shown = (4 if form.innovations else 2) * OBSERVED_SIZE + 1
         self.observation_size = shown + (len(self.parameters) if shows_action else 0)
-        self._action_range = np.array([ACTION_RANGES[name] for name in self.parameters]).T
+        self._action_range = np.array([ACTION_RANGES[name] for name in self.parameters]).T.copy()
         self._first_action = self.action_of({"q_mobile": NEW_CELL.q_mobile, "r_o": NEW_CELL.r_o})
         # one decision needs the two samples that follow
         self._starts = list(zip(dataset.first.tolist(), (dataset.stop - 2).tolist(), strict=True))
 
-        self.trajectory, self.sample, self.decisions = np.zeros((3, cells), dtype=np.int64)  # the sample is t
-        self.state, self.next_state, self.model_state = np.zeros((3, cells, STATE_SIZE))  # x_t, x_{t+1}, x̂_t
-        self.load = np.zeros(cells)  # u_{t+1}: holds over the step from t to t + 1
-        self.q_mobile, self.r_o, self.q_mobile_hat, self.r_o_hat = np.ones((4, cells))
-        self.voltage, self.soc = np.zeros((2, cells))  # at t
-        self.last_action = np.zeros((cells, len(self.parameters)))
-        self._last_sample, self._last_decision, self._load_start = np.zeros((3, cells), dtype=np.int64)
-        self._nominal_q_mobile, self._nominal_r_o = np.full(cells, NEW_CELL.q_mobile), np.full(cells, NEW_CELL.r_o)
-
         self._has_sensor_errors = (sensor_noise, sensor_offset, sensor_gain) != (0.0, 0.0, 1.0)
         self._is_disturbed = self._has_sensor_errors or process_noise_V > 0.0
-        self._sensed, self._sensed_before = np.zeros((2, cells if self._has_sensor_errors else 0, STATE_SIZE))
-        # standard normal, of the process first; one row for each measured state, of which the first is x_t at the start
-        columns = (OBSERVED_SIZE if sensor_noise > 0.0 else 0) + (3 if process_noise_V > 0.0 else 0)
-        self._noise = np.zeros((cells, self.episode_steps + 2, columns))
-
-        self._model_packed = self._true_packed = dataset.cell.packed
+        # one row of draws for each measured state, of which the first is x_t at the start
+        columns = OBSERVED_SIZE * (sensor_noise > 0.0) + 3 * (process_noise_V > 0.0)
+        self._draws = (self.episode_steps + 2 if self._is_disturbed else 0, columns)
         self._has_own_constants = bool((dataset.factors != 1.0).any())
-        if self._has_own_constants:
-            own = np.repeat(self._model_packed.constants, cells, axis=0)
-            self._true_packed = self._model_packed._replace(constants=own)
-        # what the kernels read, in their order
+        self._model_packed = dataset.cell.packed
+        # what the kernels read, in their order. They take arrays one by one: numba spends 13 us a step on NamedTuples of them,
+        # half of what a whole step of one cell takes
         self._of_step = (dataset.dt_s, dataset.load_unit == "power", dataset.thermal)
-        finds = ("q_mobile" in self.parameters, "r_o" in self.parameters)
         self._of_decision = (
             self._action_range[0],
             self._action_range[1],
-            *finds,
+            "q_mobile" in self.parameters,
+            "r_o" in self.parameters,
             *self._of_step,
             form.literal_cost,
-            limit,
-            consistency,
+            float(limit),
+            float(consistency),
             1.0 / form.error_scale,
         )
         scales = (1.0 / form.state_scale, 1.0 / form.load_scale, 1.0 / form.error_scale)
         self._of_observation = (*scales, form.innovations, shows_action, OBSERVATION_LIMIT, *self._of_step)
-
-    @property
-    def measured(self) -> FloatArray:
-        """x_{t+1} as the sensors have it, shape (cells, 8)."""
-        return self._sensed if self._has_sensor_errors else self.next_state
-
-    @property
-    def measured_before(self) -> FloatArray:
-        """x_t as the sensors had it, shape (cells, 8)."""
-        return self._sensed_before if self._has_sensor_errors else self.state
+        nowhere = np.zeros(cells, dtype=np.int64)
+        self.now = self._begin(nowhere, nowhere + dataset.first[0], np.zeros((cells, 4)), np.zeros((cells, *self._draws)))
 
     def start(
         self,
@@ -277,7 +315,7 @@ class FullStateTask(CalibrationTask):
         bound = self.initial_perturbation
         trajectories = len(self.dataset)
         trajectory, sample = np.empty((2, len(rows)), dtype=np.int64)
-        perturbation = np.zeros((len(rows), 4))
+        perturbation, noise = np.zeros((len(rows), 4)), np.empty((len(rows), *self._draws))
         for k, generator in enumerate(generators):
             n = int(generator.integers(trajectories))
             if "trajectory" in chosen:
@@ -293,17 +331,18 @@ class FullStateTask(CalibrationTask):
             trajectory[k], sample[k] = n, t
             if bound > 0.0:
                 perturbation[k] = generator.uniform(-bound, bound, size=4)
-            if self._noise.size > 0:
-                generator.standard_normal(out=self._noise[rows[k]])
-        self._begin(rows, trajectory, sample, perturbation)
+            if noise.size > 0:
+                generator.standard_normal(out=noise[k])
+        self.now.put(rows, self._begin(trajectory, sample, perturbation, noise))
 
-    def _begin(self, rows: NDArray[np.intp], trajectory: IntArray, sample: IntArray, perturbation: FloatArray) -> None:
-        dataset = self.dataset
-        load_start, last_sample = dataset.load_start[trajectory], dataset.samples[trajectory] - 1
-        q_mobile, r_o = dataset.q_mobile[trajectory], dataset.r_o[trajectory]
+    def _begin(self, trajectory: IntArray, sample: IntArray, perturbation: FloatArray, noise: FloatArray) -> Cells:
+        """Cells at some samples of some discharges."""
+        dataset, n = self.dataset, len(sample)
+        load_start, q_mobile, r_o = dataset.load_start[trajectory], dataset.q_mobile[trajectory], dataset.r_o[trajectory]
+        new_q_mobile, new_r_o = np.full(n, NEW_CELL.q_mobile), np.full(n, NEW_CELL.r_o)
         # before the first action the model is the new cell's; the parameter that is known stays the true one
-        q_mobile_hat = self._nominal_q_mobile[rows] if "q_mobile" in self.parameters else q_mobile
-        r_o_hat = self._nominal_r_o[rows] if "r_o" in self.parameters else r_o
+        q_mobile_hat = (new_q_mobile if "q_mobile" in self.parameters else q_mobile).copy()
+        r_o_hat = (new_r_o if "r_o" in self.parameters else r_o).copy()
         state = dataset.states_at(trajectory, sample)
         if self.starts_new:
             model_state = initial_state(q_mobile_hat, dataset.cell)
@@ -315,36 +354,67 @@ class FullStateTask(CalibrationTask):
             model_state = state.copy()
         if self.initial_perturbation > 0.0:
             model_state[:, OBSERVED] += perturbation[:, [0, 1, 2, 3, 3, 3, 3]] * _PERTURBATION * ERROR_SCALE
-        packed = self._true_packed
-        if self._has_own_constants:
-            packed = dataset.packed(trajectory)
-            self._true_packed.constants[rows] = packed.constants
-        self.trajectory[rows], self.sample[rows], self.decisions[rows] = trajectory, sample, 0
-        self._load_start[rows], self._last_sample[rows] = load_start, last_sample
-        self._last_decision[rows] = dataset.stop[trajectory] - 2
-        self.q_mobile[rows], self.r_o[rows] = q_mobile, r_o
-        self.q_mobile_hat[rows], self.r_o_hat[rows] = q_mobile_hat, r_o_hat
-        self.last_action[rows] = self._first_action
-        self.state[rows], self.model_state[rows] = state, model_state
-
-        next_state = np.empty_like(state)
-        load, voltage, soc = np.empty((3, len(rows)))
-        path = (sample, last_sample, load_start, dataset.load_values)
-        look_ahead(*path, *self._of_step, state, q_mobile, r_o, *packed, load, next_state, voltage, soc)
-        self.next_state[rows] = next_state
-        self.load[rows], self.voltage[rows], self.soc[rows] = load, voltage, soc
-        if self._has_sensor_errors:
-            self._sensed_before[rows] = self._as_sensed(state, self._noise[rows, 0])
+        sensed_before = self._as_sensed(state, noise[:, 0]) if self._has_sensor_errors else np.empty((n, 0))
+        load, voltage, soc = np.empty((3, n))
+        cells = Cells(
+            trajectory=trajectory,
+            sample=sample,
+            last_sample=dataset.samples[trajectory] - 1,
+            last_decision=dataset.stop[trajectory] - 2,
+            load_start=load_start,
+            decisions=np.zeros(n, dtype=np.int64),
+            state=state,
+            next_state=np.empty_like(state),
+            model_state=model_state,
+            sensed_before=sensed_before,
+            sensed=np.empty_like(sensed_before),
+            load=load,
+            voltage=voltage,
+            soc=soc,
+            q_mobile=q_mobile,
+            r_o=r_o,
+            q_mobile_hat=q_mobile_hat,
+            r_o_hat=r_o_hat,
+            new_q_mobile=new_q_mobile,
+            new_r_o=new_r_o,
+            last_action=np.repeat(self._first_action[None], n, axis=0),
+            constants=dataset.packed(trajectory).constants if self._has_own_constants else np.empty((n, 0)),
+            noise=noise,
+        )
+        self._look_ahead(cells)
         if self._is_disturbed:
-            self._disturb(rows)
+            self._disturb(cells)
+        return cells
 
-    def _disturb(self, rows: NDArray[np.intp]) -> None:
-        # the noise of the process on x_{t+1}, then the errors of the sensors
-        noise = self._noise[rows, 1 + np.minimum(self.decisions[rows], self.episode_steps)]
+    def _look_ahead(self, cells: Cells) -> None:
+        """The load of the step from t to t + 1, and where it takes the cells."""
+        packed = self._model_packed
+        look_ahead(
+            cells.sample,
+            cells.last_sample,
+            cells.load_start,
+            self.dataset.load_values,
+            *self._of_step,
+            cells.state,
+            cells.q_mobile,
+            cells.r_o,
+            cells.constants if self._has_own_constants else packed.constants,
+            packed.polynomial_n,
+            packed.polynomial_p,
+            cells.load,
+            cells.next_state,
+            cells.voltage,
+            cells.soc,
+        )
+
+    def _disturb(self, cells: Cells) -> None:
+        """The noise of the process on x_{t+1}, then the errors of the sensors."""
+        draw = 1 + np.minimum(cells.decisions, self.episode_steps)
+        noise = cells.noise[np.arange(len(draw)), draw]
         if self.process_noise_V > 0.0:
-            self.next_state[rows, VO:QNB] += self.process_noise_V * np.sqrt(self.dataset.dt_s) * noise[:, :3]
+            cells.next_state[:, VO:QNB] += self.process_noise_V * np.sqrt(self.dataset.dt_s) * noise[:, :3]
         if self._has_sensor_errors:
-            self._sensed[rows] = self._as_sensed(self.next_state[rows], noise)
+            cells.sensed[:] = self._as_sensed(cells.next_state, noise)
 
     def _as_sensed(self, state: FloatArray, noise: FloatArray) -> FloatArray:
         error = np.full((len(state), OBSERVED_SIZE), self.sensor_offset)
@@ -362,45 +432,32 @@ class FullStateTask(CalibrationTask):
         :return: cost, shape (cells,)
         :raises ValueError: for another shape, NaN, or what is no number
         """
-        chosen = checked_action(action, self.last_action.shape)
+        now = self.now
+        chosen = checked_action(action, now.last_action.shape)
         cost = np.empty(self.cells)
-        measured = self.measured
+        measured = now.measured
         decide(
             chosen,
             *self._of_decision,
             measured,
-            self.load,
+            now.load,
             *self._model_packed,
-            self.last_action,
-            self.model_state,
-            self.q_mobile_hat,
-            self.r_o_hat,
-            self.decisions,
-            self.sample,
+            now.last_action,
+            now.model_state,
+            now.q_mobile_hat,
+            now.r_o_hat,
+            now.decisions,
+            now.sample,
             cost,
         )
         if self.resync is not None:
-            due = self.decisions % self.resync == 0
-            self.model_state[due] = measured[due]
-        self.state, self.next_state = self.next_state, self.state
-        self._sensed_before, self._sensed = self._sensed, self._sensed_before
-        look_ahead(
-            self.sample,
-            self._last_sample,
-            self._load_start,
-            self.dataset.load_values,
-            *self._of_step,
-            self.state,
-            self.q_mobile,
-            self.r_o,
-            *self._true_packed,
-            self.load,
-            self.next_state,
-            self.voltage,
-            self.soc,
-        )
+            due = now.decisions % self.resync == 0
+            now.model_state[due] = measured[due]
+        now.state, now.next_state = now.next_state, now.state
+        now.sensed_before, now.sensed = now.sensed, now.sensed_before
+        self._look_ahead(now)
         if self._is_disturbed:
-            self._disturb(np.arange(self.cells))
+            self._disturb(now)
         return cost
 
     @classmethod
@@ -437,12 +494,12 @@ class FullStateTask(CalibrationTask):
 
         :return: each cell's discharge, and the time of its last sample on the clock of the data set, s, shape (cells,)
         """
-        return self.trajectory.copy(), (self.sample + 1) * self.dataset.dt_s
+        return self.now.trajectory.copy(), np.asarray((self.now.sample + 1) * self.dataset.dt_s, dtype=np.float64)
 
     @property
     def estimate(self) -> FloatArray:
         """(q_mobile, r_o) of the model, C and ohm, shape (cells, 2)."""
-        return np.stack([self.q_mobile_hat, self.r_o_hat], axis=1)
+        return np.stack([self.now.q_mobile_hat, self.now.r_o_hat], axis=1)
 
     @staticmethod
     def conclude(estimates: FloatArray) -> float:
@@ -466,7 +523,8 @@ class FullStateTask(CalibrationTask):
 
         :return: shape (cells,)
         """
-        return (self.decisions >= self.episode_steps) | (self.sample >= self._last_decision)
+        now = self.now
+        return (now.decisions >= self.episode_steps) | (now.sample >= now.last_decision)
 
     def observation(self) -> NDArray[np.float32]:
         """
@@ -476,15 +534,16 @@ class FullStateTask(CalibrationTask):
         :return: shape (cells, observation_size)
         """
         out = np.empty((self.cells, self.observation_size), dtype=np.float32)
+        now = self.now
         observe(
-            self.model_state,
-            self.measured_before,
-            self.measured,
-            self.load,
-            self.last_action,
+            now.model_state,
+            now.measured_before,
+            now.measured,
+            now.load,
+            now.last_action,
             *self._of_observation,
-            self._nominal_q_mobile,
-            self._nominal_r_o,
+            now.new_q_mobile,
+            now.new_r_o,
             *self._model_packed,
             out,
         )
@@ -518,13 +577,8 @@ class FullStateTask(CalibrationTask):
 
         :param rows: which cells to keep, shape (cells,)
         """
-        for name in _PER_CELL:
-            values = getattr(self, name)
-            if len(values) == self.cells:  # what no option asks for is empty
-                setattr(self, name, np.ascontiguousarray(values[rows]))
-        if self._has_own_constants:
-            self._true_packed = self._true_packed._replace(constants=self._true_packed.constants[rows])
-        self.cells = len(self.sample)
+        self.now = self.now.take(rows)
+        self.cells = len(self.now.sample)
 
     def report(self) -> dict[str, FloatArray]:
         """
@@ -533,16 +587,16 @@ class FullStateTask(CalibrationTask):
         :return: arrays of shape (cells,): true and inferred parameters, C and ohm; voltages of cell and model, V; the state
             of charge of the cell
         """
-        voltage_hat = np.empty(self.cells)
-        voltage_into(voltage_hat, self.model_state, self.q_mobile_hat, self._model_packed, extended=True)
+        now, voltage_hat = self.now, np.empty(self.cells)
+        voltage_into(voltage_hat, now.model_state, now.q_mobile_hat, self._model_packed, extended=True)
         return {
-            "q_mobile": self.q_mobile.copy(),
-            "r_o": self.r_o.copy(),
-            "q_mobile_hat": self.q_mobile_hat.copy(),
-            "r_o_hat": self.r_o_hat.copy(),
-            "voltage": self.voltage.copy(),
+            "q_mobile": now.q_mobile.copy(),
+            "r_o": now.r_o.copy(),
+            "q_mobile_hat": now.q_mobile_hat.copy(),
+            "r_o_hat": now.r_o_hat.copy(),
+            "voltage": now.voltage.copy(),
             "voltage_hat": voltage_hat,
-            "soc": self.soc.copy(),
+            "soc": now.soc.copy(),
         }
 
 

@@ -23,7 +23,7 @@ IDS = ("BatteryQmax-v0", "BatteryRo-v0", "BatteryJoint-v0", "BatteryQmaxPaper-v0
 
 def true_action(env):
     task = env.unwrapped.task
-    return task.action_of({"q_mobile": task.q_mobile, "r_o": task.r_o})[0]
+    return task.action_of({"q_mobile": task.now.q_mobile, "r_o": task.now.r_o})[0]
 
 
 @pytest.mark.parametrize("env_id", IDS)
@@ -150,7 +150,7 @@ def test_the_perturbation_stays_in_its_bounds():
     for seed in range(20):
         env.reset(seed=seed)
         task = env.unwrapped.task
-        draws.append((task.model_state - task.state)[0, OBSERVED][:4] / scale[:4])
+        draws.append((task.now.model_state - task.now.state)[0, OBSERVED][:4] / scale[:4])
     assert np.abs(draws).max() <= 10.0 + 1e-6 and np.abs(draws).max(axis=0).min() > 5.0
 
 
@@ -167,7 +167,7 @@ def test_a_perturbation_conserves_charge():
     env = gym.make("BatteryQmax-v0", initial_perturbation=10.0)
     env.reset(seed=0)
     task = env.unwrapped.task
-    assert task.model_state[0, QNB:].sum() == pytest.approx(task.state[0, QNB:].sum(), rel=1e-12)
+    assert task.now.model_state[0, QNB:].sum() == pytest.approx(task.now.state[0, QNB:].sum(), rel=1e-12)
 
 
 @pytest.mark.parametrize("formulation", [SCALED, LITERAL], ids=["scaled", "literal"])
@@ -229,7 +229,7 @@ def test_own_trajectories_can_be_used():
     data = TrajectoryDataset.generate("q_mobile", 3, RandomPiecewise(), seed=0)
     env = gym.make("BatteryQmax-v0", dataset=data)
     env.reset(seed=0)
-    assert env.unwrapped.task.q_mobile[0] in data.q_mobile
+    assert env.unwrapped.task.now.q_mobile[0] in data.q_mobile
 
 
 def test_a_frame_is_a_picture():

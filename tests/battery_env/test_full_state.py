@@ -47,7 +47,7 @@ def make(data, kind=BatteryQmax, cells=1, **options):
 
 
 def true_action(task):
-    return task.action_of({"q_mobile": task.q_mobile, "r_o": task.r_o})
+    return task.action_of({"q_mobile": task.now.q_mobile, "r_o": task.now.r_o})
 
 
 def scaled_distance(task, model_state, measured):
@@ -58,8 +58,8 @@ def test_the_defaults_disturb_nothing(discharges):
     task = started(make(discharges))
     for k in range(5):
         trajectory = discharges[2]
-        np.testing.assert_array_equal(task.state[0], trajectory.state[300 + k])
-        np.testing.assert_array_equal(task.measured[0], trajectory.state[301 + k])
+        np.testing.assert_array_equal(task.now.state[0], trajectory.state[300 + k])
+        np.testing.assert_array_equal(task.now.measured[0], trajectory.state[301 + k])
         task.advance(np.zeros((1, 1)))
 
 
@@ -69,13 +69,13 @@ def test_the_joint_task_shows_and_punishes_both_errors(discharges, wrong):
     assert task.parameters == ("q_mobile", "r_o") and task.observation().shape == (1, 29)
     action = true_action(task)
     assert task.advance(action) == pytest.approx(0.0, abs=1e-9)
-    np.testing.assert_allclose([task.q_mobile_hat, task.r_o_hat], [task.q_mobile, task.r_o])
-    values = {"q_mobile": task.q_mobile, "r_o": task.r_o}
+    np.testing.assert_allclose([task.now.q_mobile_hat, task.now.r_o_hat], [task.now.q_mobile, task.now.r_o])
+    values = {"q_mobile": task.now.q_mobile, "r_o": task.now.r_o}
     name = task.parameters[wrong]
     action = task.action_of({**values, name: 1.05 * values[name]})
     cost = task.advance(action)
     assert 0.02 < cost < 1.0
-    np.testing.assert_allclose({"q_mobile": task.q_mobile_hat, "r_o": task.r_o_hat}[name], 1.05 * values[name])
+    np.testing.assert_allclose({"q_mobile": task.now.q_mobile_hat, "r_o": task.now.r_o_hat}[name], 1.05 * values[name])
 
 
 def test_the_joint_environment_draws_from_cells_whose_parameters_have_both_aged():
@@ -89,23 +89,23 @@ def test_the_joint_environment_draws_from_cells_whose_parameters_have_both_aged(
 def test_resync_sets_the_model_to_the_measured_state(discharges):
     task = started(make(discharges, resync=3, sensor_offset=0.5))
     for decision in range(1, 8):
-        measured = task.measured.copy()
+        measured = task.now.measured.copy()
         task.advance(np.full((1, 1), -1.0))
-        assert (task.model_state == measured).all() == (decision % 3 == 0)
-        np.testing.assert_array_equal(task.report()["voltage_hat"], voltage(task.model_state, task.q_mobile_hat))
+        assert (task.now.model_state == measured).all() == (decision % 3 == 0)
+        np.testing.assert_array_equal(task.report()["voltage_hat"], voltage(task.now.model_state, task.now.q_mobile_hat))
 
 
 def test_the_model_of_a_new_cell_has_carried_the_same_load(discharges):
     task = started(make(discharges, start="new_cell"), sample=333)
     trajectory = discharges[2]
     new = simulate(trajectory.load[:334], NEW_CELL.q_mobile, trajectory.r_o)
-    np.testing.assert_array_equal(task.model_state[0], new.state[333])
+    np.testing.assert_array_equal(task.now.model_state[0], new.state[333])
     # no action makes up for the charge that a new cell has more
     task.advance(true_action(task))
-    assert task.model_state[0, QNB:].sum() == pytest.approx(initial_state(NEW_CELL.q_mobile)[QNB:].sum(), rel=1e-12)
+    assert task.now.model_state[0, QNB:].sum() == pytest.approx(initial_state(NEW_CELL.q_mobile)[QNB:].sum(), rel=1e-12)
     both = started(make(discharges, BatteryJoint, start="new_cell"), sample=333)
     new = simulate(trajectory.load[:334], NEW_CELL.q_mobile, NEW_CELL.r_o)
-    np.testing.assert_array_equal(both.model_state[0], new.state[333])
+    np.testing.assert_array_equal(both.now.model_state[0], new.state[333])
 
 
 def test_process_noise_moves_the_voltages_of_the_cell():
@@ -113,8 +113,8 @@ def test_process_noise_moves_the_voltages_of_the_cell():
     task = started(make(data, cells=500, process_noise_V=1e-3), trajectory=0)
     draws = []
     for _ in range(4):
-        state, q, r = task.state, task.q_mobile, task.r_o
-        noise = task.next_state - step(state, task.load, q, r, dt=0.5)
+        state, q, r = task.now.state, task.now.q_mobile, task.now.r_o
+        noise = task.now.next_state - step(state, task.now.load, q, r, dt=0.5)
         assert not noise[:, [0, 4, 5, 6, 7]].any()
         draws.append(noise[:, VO:QNB])
         task.advance(np.zeros((500, 1)))
@@ -128,27 +128,27 @@ def test_sensor_noise_is_white_and_in_what_is_paid(discharges):
     task = started(make(discharges, cells=500, sensor_noise=2.0))
     draws = []
     for _ in range(3):
-        draws.append(((task.measured - task.next_state) / np.insert(ERROR_SCALE, 0, 1.0)).copy())
-        measured = task.measured.copy()
+        draws.append(((task.now.measured - task.now.next_state) / np.insert(ERROR_SCALE, 0, 1.0)).copy())
+        measured = task.now.measured.copy()
         cost = task.advance(true_action(task))
-        expected = np.minimum(scaled_distance(task, task.model_state, measured), 5.0)
+        expected = np.minimum(scaled_distance(task, task.now.model_state, measured), 5.0)
         np.testing.assert_allclose(cost, expected, rtol=1e-9)
     assert not np.array(draws)[..., 0].any()
     drawn = np.concatenate([d[:, 1:] for d in draws], axis=1) / 2.0
     np.testing.assert_allclose(np.cov(drawn, rowvar=False), np.eye(21), atol=0.25)
     # the cell itself goes its way
-    np.testing.assert_array_equal(task.state[7], discharges[2].state[303])
+    np.testing.assert_array_equal(task.now.state[7], discharges[2].state[303])
 
 
 def test_sensors_may_have_an_offset_and_a_gain(discharges):
     task = started(make(discharges, sensor_offset=-3.0, sensor_gain=1.02))
     before, expected = (1.02 * discharges[2].state[t, OBSERVED] - 3.0 * ERROR_SCALE for t in (300, 301))
-    np.testing.assert_allclose(task.measured_before[0, OBSERVED], before, rtol=1e-12)
-    np.testing.assert_allclose(task.measured[0, OBSERVED], expected, rtol=1e-12)
+    np.testing.assert_allclose(task.now.measured_before[0, OBSERVED], before, rtol=1e-12)
+    np.testing.assert_allclose(task.now.measured[0, OBSERVED], expected, rtol=1e-12)
     observation = task.observation()[0]
     np.testing.assert_allclose(observation[7:14], expected / STATE_SCALE, rtol=1e-6)
-    for origin, columns in ((task.model_state, slice(15, 22)), (task.measured_before, slice(22, 29))):
-        predicted = step(origin[0], task.load[0], NEW_CELL.q_mobile, NEW_CELL.r_o)
+    for origin, columns in ((task.now.model_state, slice(15, 22)), (task.now.measured_before, slice(22, 29))):
+        predicted = step(origin[0], task.now.load[0], NEW_CELL.q_mobile, NEW_CELL.r_o)
         innovation = np.arcsinh((expected - predicted[OBSERVED]) / ERROR_SCALE)
         np.testing.assert_allclose(observation[columns], innovation, rtol=1e-5)
 
@@ -165,20 +165,20 @@ def test_the_second_innovation_does_not_see_the_drift_of_the_model(discharges):
 def test_what_is_measured_becomes_what_was_measured(discharges):
     task = started(make(discharges, cells=3, sensor_noise=2.0))
     for _ in range(3):
-        measured = task.measured.copy()
-        assert (measured[:, OBSERVED] != task.next_state[:, OBSERVED]).all()
+        measured = task.now.measured.copy()
+        assert (measured[:, OBSERVED] != task.now.next_state[:, OBSERVED]).all()
         task.advance(true_action(task))
-        np.testing.assert_array_equal(task.measured_before, measured)
+        np.testing.assert_array_equal(task.now.measured_before, measured)
     task.keep(np.array([True, False, True]))
-    np.testing.assert_array_equal(task.measured_before, measured[[0, 2]])
+    np.testing.assert_array_equal(task.now.measured_before, measured[[0, 2]])
 
 
 def test_both_noises_at_once_do_not_share_draws(discharges):
     task = started(make(discharges, cells=300, sensor_noise=1.0, process_noise_V=1e-3))
-    predicted = np.empty_like(task.state)
-    step_into(predicted, task.state, task.load, task.q_mobile, task.r_o, 1.0, "power", False, NEW_CELL.packed)
-    process = (task.next_state - predicted)[:, VO:QNB]
-    sensor = (task.measured - task.next_state)[:, VO:QNB]
+    predicted = np.empty_like(task.now.state)
+    step_into(predicted, task.now.state, task.now.load, task.now.q_mobile, task.now.r_o, 1.0, "power", False, NEW_CELL.packed)
+    process = (task.now.next_state - predicted)[:, VO:QNB]
+    sensor = (task.now.measured - task.now.next_state)[:, VO:QNB]
     assert np.abs(np.corrcoef(process.T, sensor.T)[:3, 3:]).max() < 0.25
 
 
@@ -200,9 +200,9 @@ def test_changes_of_the_action_cost_and_the_action_before_is_shown(discharges, k
 
 def test_the_cost_is_limited(discharges):
     task = started(make(discharges, cells=2, cost_limit=0.2))
-    measured = task.measured.copy()
+    measured = task.now.measured.copy()
     cost = task.advance(true_action(task) + np.array([[0.02], [1.0]]))
-    distance = scaled_distance(task, task.model_state, measured)
+    distance = scaled_distance(task, task.now.model_state, measured)
     np.testing.assert_allclose(cost, np.minimum(distance, 0.2), rtol=1e-9)
     assert cost[0] < 0.2 == cost[1]
 
@@ -216,11 +216,11 @@ def test_constants_may_differ_from_those_of_the_model():
         for row, n in enumerate((1, 4, 1)):
             own = zip(UNCERTAIN_CONSTANTS, data.factors[n], strict=True)
             true = NEW_CELL.replace(**{name: getattr(NEW_CELL, name) * factor for name, factor in own})
-            expected = step(task.state[row], task.load[row], task.q_mobile[row], task.r_o[row], cell=true)
-            np.testing.assert_allclose(task.next_state[row], expected, rtol=1e-13)
-        model, load, q, r = task.model_state.copy(), task.load.copy(), task.q_mobile, task.r_o
+            expected = step(task.now.state[row], task.now.load[row], task.now.q_mobile[row], task.now.r_o[row], cell=true)
+            np.testing.assert_allclose(task.now.next_state[row], expected, rtol=1e-13)
+        model, load, q, r = task.now.model_state.copy(), task.now.load.copy(), task.now.q_mobile, task.now.r_o
         assert (task.advance(true_action(task)) > 0.01).all()
-        np.testing.assert_allclose(task.model_state, step(model, load, q, r), rtol=1e-13)
+        np.testing.assert_allclose(task.now.model_state, step(model, load, q, r), rtol=1e-13)
 
 
 def test_loads_of_other_kinds_and_time_steps():
@@ -231,13 +231,15 @@ def test_loads_of_other_kinds_and_time_steps():
     assert 100 < len(task.dataset) < len(whole)
     assert task.decision_s == 2.0 and len(np.unique(task.dataset[0].load)) > 5
     task.start(np.zeros(1, dtype=int), [np.random.default_rng(0)])
-    np.testing.assert_array_equal(task.next_state, step(task.state, task.load, task.q_mobile, task.r_o, dt=2.0))
+    np.testing.assert_array_equal(
+        task.now.next_state, step(task.now.state, task.now.load, task.now.q_mobile, task.now.r_o, dt=2.0)
+    )
 
 
 def test_perturbations_of_the_literal_form_are_in_error_scales_too(discharges):
     task = BatteryQmaxPaper(50, dataset=discharges, initial_perturbation=10.0)
     started(task)
-    off = (task.model_state - task.state)[:, OBSERVED] / ERROR_SCALE
+    off = (task.now.model_state - task.now.state)[:, OBSERVED] / ERROR_SCALE
     assert 5.0 < np.abs(off).max() <= 10.0
 
 
@@ -277,7 +279,7 @@ def test_a_cell_whose_data_have_ended_goes_on_without_failing(discharges):
     for _ in range(5):
         task.advance(np.zeros((1, 1)))
         assert task.truncated() and np.isfinite(task.observation()).all()
-    assert task.load == discharges[2].load[-1]
+    assert task.now.load == discharges[2].load[-1]
 
 
 @pytest.mark.parametrize(
