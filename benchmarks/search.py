@@ -127,7 +127,7 @@ def search(algo: str, env_id: str, trials: int, updates: int, out: Path) -> pd.D
         study.enqueue_trial(FIRST_TRIAL)
     objective = partial(score, algo, env_id, updates, out / "zoo")
     study.optimize(objective, n_trials=max(trials - len(_first_trials(study)), 0))
-    finalists = sorted(_first_trials(study), key=lambda trial: trial.value)[:_FINALISTS]
+    finalists = sorted(_first_trials(study), key=lambda trial: trial.values[0])[:_FINALISTS]
     for finalist in finalists:
         for _ in range(_REPEATS - len(_repeats(study, finalist))):
             study.enqueue_trial(finalist.params, user_attrs={"repeats": finalist.number})
