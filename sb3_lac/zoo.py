@@ -72,7 +72,7 @@ def _sample_common_params(trial: optuna.Trial) -> Hyperparams:
 
 def _sample_entropy_params(trial: optuna.Trial, n_actions: int) -> Hyperparams:
     return {
-        "ent_coef_init": trial.suggest_float("ent_coef_init", 0.01, 100.0, log=True),
+        "ent_coef_init": trial.suggest_float("ent_coef_init", 0.001, 100.0, log=True),
         # -n_actions is the default of SAC and LAC
         "target_entropy": trial.suggest_float("target_entropy", -5.0 * n_actions, 0.0),
     }

@@ -34,7 +34,7 @@ def test_a_policy_sees_in_its_test_what_it_saw_in_its_training(trained, tmp_path
     test = standard_dataset("q_mobile", "paper", "test").subset([0, 900])
     row = ablations.run(name, 3, 10, test, tmp_path)
     (call,) = trained
-    assert call["seen"] == seen and call["timesteps"] == 992 + 10 * 16
+    assert call["seen"] == seen and call["timesteps"] == 960 + 10 * 64
     # the middle of the range is 6000 C
     expected = 100.0 * np.abs(6000.0 / test.q_mobile - 1.0)
     np.testing.assert_allclose([row["mean_percent"], row["worst_percent"]], [expected.mean(), expected.max()], rtol=1e-6)
