@@ -11,9 +11,11 @@ from numpy.typing import ArrayLike
 
 from battery_env.arrays import IntArray
 from battery_env.electrochemistry import (
+    FULL_CHARGE_SHARES,
     NEW_CELL,
     QNB,
     QNS,
+    QPS,
     VO,
     CellParameters,
     FloatArray,
@@ -21,14 +23,15 @@ from battery_env.electrochemistry import (
     initial_state,
     simulate,
 )
+from battery_env.electrochemistry.cell import BULK_RATE, SURFACE_RATE
 from battery_env.electrochemistry.kernels import equilibrium_voltage, mole_fraction, nominal_overpotentials
 from battery_env.records import Record, resample_current
 
 # Far more charge and exactly as much resistance as it takes to read the linear part of the model off one simulation
 _PLENTY_C = 1e6
 _ONE_OHM = 1.0
-#: Share of ``q_mobile`` in the surface of each electrode at full charge.
-_SURFACE_SHARES = (0.1, 1.0 / 15.0)
+# Share of q_mobile in the surface of each electrode at full charge
+_SURFACE_SHARE_N, _SURFACE_SHARE_P = (float(FULL_CHARGE_SHARES[column - QNB]) for column in (QNS, QPS))
 #: Step of the difference quotient dV/dq, as a share of q.
 _RELATIVE_STEP = 1e-3
 
@@ -54,7 +57,7 @@ class Readings:
     :param r_o: true value, ohm, NaN where it is not known, shape (n,)
     :param interval_s: time between readings, s; the first lies one interval after the start
     :param dt_s: time step at which the current was followed, s
-    :param parameters: constants of the model
+    :param cell: constants of the model
     """
 
     start: IntArray
@@ -69,11 +72,11 @@ class Readings:
     r_o: FloatArray
     interval_s: float
     dt_s: float
-    parameters: CellParameters
+    cell: CellParameters
 
     @classmethod
     def of(
-        cls, records: Sequence[Record], interval_s: float = 10.0, dt_s: float = 1.0, parameters: CellParameters = NEW_CELL
+        cls, records: Sequence[Record], interval_s: float = 10.0, dt_s: float = 1.0, cell: CellParameters = NEW_CELL
     ) -> Readings:
         """
         Read discharges.
@@ -82,7 +85,7 @@ class Readings:
             :meth:`battery_env.cells.Discharge.loaded_part`
         :param interval_s: time between readings, s, a multiple of ``dt_s``
         :param dt_s: time step at which the current is followed, s
-        :param parameters: constants of the model
+        :param cell: constants of the model
         :return: their readings
         :raises ValueError: for an interval that is no multiple of the time step, or a discharge shorter than two intervals
         """
@@ -101,7 +104,7 @@ class Readings:
             current_A = resample_current(time_s, np.asarray(record.current_A), dt_s, count * steps)
             at_s = interval_s * np.arange(1, count + 1)
             start_s.append(float(record.time_s[0]))
-            drawn_C, moved_C, ohmic_A = _linear_part(current_A, steps, dt_s, parameters)
+            drawn_C, moved_C, ohmic_A = _linear_part(current_A, steps, dt_s, cell)
             columns.append(
                 (
                     np.interp(at_s, time_s, record.voltage_V),
@@ -128,7 +131,7 @@ class Readings:
             r_o=np.array([r.r_o if isinstance(r, Trajectory) else np.nan for r in records]),
             interval_s=interval_s,
             dt_s=dt_s,
-            parameters=parameters,
+            cell=cell,
         )
 
     def __len__(self) -> int:
@@ -162,7 +165,7 @@ class Readings:
         """
         from scipy.signal import lfilter  # slow to import, and only process noise needs it
 
-        cell, dt_s = self.parameters, self.dt_s
+        cell, dt_s = self.cell, self.dt_s
         total = np.zeros(draws.shape[1])
         for draw, time_constant_s in zip(draws, (cell.to, cell.tsn, cell.tsp), strict=True):
             left = float(self.decay(time_constant_s))
@@ -184,11 +187,11 @@ class Readings:
         from scipy.signal import lfilter  # slow to import, and only another current sensor needs it
 
         part = self.part(discharge)
-        constants = self.parameters.packed.constants[0]
-        rate = constants[1] + constants[2]
-        stay, at_rest = float(self.decay(1.0 / rate)), constants[1] / rate
+        constants = self.cell.packed.constants[0]
+        rate = constants[BULK_RATE] + constants[SURFACE_RATE]
+        stay, at_rest = float(self.decay(1.0 / rate)), constants[BULK_RATE] / rate
         steps = round(self.interval_s / self.dt_s)
-        unit = _linear_part(np.ones(steps), steps, self.dt_s, self.parameters)
+        unit = _linear_part(np.ones(steps), steps, self.dt_s, self.cell)
         before = np.concatenate([[0.0], self.drawn_C[part][:-1]])
 
         def refiltered(values: FloatArray, left: float, free: FloatArray, by_unit: float, free_now: FloatArray) -> FloatArray:
@@ -201,21 +204,21 @@ class Readings:
         before_now = np.concatenate([[0.0], drawn_C[:-1]])
         moved_C = refiltered(self.moved_C[part], stay, to_rest * before, unit[1].item(), to_rest * before_now)
         nothing = np.zeros_like(before)
-        ohmic_A = refiltered(self.ohmic_A[part], float(self.decay(self.parameters.to)), nothing, unit[2].item(), nothing)
+        ohmic_A = refiltered(self.ohmic_A[part], float(self.decay(self.cell.to)), nothing, unit[2].item(), nothing)
         return gain * self.current_A[part] + offset_A, moved_C, ohmic_A
 
 
 def _linear_part(
-    current_A: FloatArray, steps: int, dt_s: float, parameters: CellParameters
+    current_A: FloatArray, steps: int, dt_s: float, cell: CellParameters
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    start = initial_state(_PLENTY_C, parameters)
+    start = initial_state(_PLENTY_C, cell)
     state = simulate(
         np.append(current_A, 0.0),
         _PLENTY_C,
         _ONE_OHM,
         dt=dt_s,
         load_unit="current",
-        cell=parameters,
+        cell=cell,
         cut_off_V=-np.inf,
         max_duration_s=len(current_A) * dt_s,
     ).state[steps::steps]
@@ -261,7 +264,7 @@ def explain(
     :param temperature_K: of the cell
     :param relaxed_n: by what share Vsn nears its nominal value in one interval
     :param relaxed_p: likewise for Vsp
-    :param constants: of the model, shape (1, 14)
+    :param constants: of the model, shape (1, 13)
     :param polynomial_n: of the negative electrode
     :param polynomial_p: of the positive electrode
     :param residual_V: measured minus modelled voltage, shape (n, J, 2), overwritten: the readings that count are cut into J
@@ -283,15 +286,15 @@ def explain(
                 # the overpotentials relax towards their value half way between two readings
                 half = 0.5 * (moved_before + moved_C[n, k])
                 moved_before = moved_C[n, k]
-                xn = mole_fraction(_SURFACE_SHARES[0] * q - half, q, True, constants, 0)
-                xp = mole_fraction(_SURFACE_SHARES[1] * q + half, q, True, constants, 0)
+                xn = mole_fraction(_SURFACE_SHARE_N * q - half, q, True, constants, 0)
+                xp = mole_fraction(_SURFACE_SHARE_P * q + half, q, True, constants, 0)
                 vsn_nominal, vsp_nominal = nominal_overpotentials(current_A[n, k], xn, xp, temperature_K, constants, 0)
                 vsn += relaxed_n * (vsn_nominal - vsn)
                 vsp += relaxed_p * (vsp_nominal - vsp)
                 if k < first[n]:
                     continue
-                xn = mole_fraction(_SURFACE_SHARES[0] * q - moved_before, q, True, constants, 0)
-                xp = mole_fraction(_SURFACE_SHARES[1] * q + moved_before, q, True, constants, 0)
+                xn = mole_fraction(_SURFACE_SHARE_N * q - moved_before, q, True, constants, 0)
+                xp = mole_fraction(_SURFACE_SHARE_P * q + moved_before, q, True, constants, 0)
                 equilibrium = equilibrium_voltage(xn, xp, temperature_K, constants, 0, polynomial_n, polynomial_p)
                 values[trial, k] = equilibrium - vsn - vsp - r_o[n] * ohmic_A[n, k]
         span = count[n] - first[n]

@@ -308,7 +308,7 @@ class VoltageTask(CalibrationTask):
 
     def _explain(self, rows: NDArray[np.intp] | None = None) -> None:
         """Compare some cells with their readings, all by default."""
-        cell = self.readings.parameters
+        cell = self.readings.cell
         explain(
             self._all if rows is None else np.asarray(rows, dtype=np.int64),
             self.count,

@@ -31,7 +31,7 @@ def rows(readings, *arrays):
 
 def compare(readings, q_mobile, r_o, count=None, first=None, stretches=12):
     """The outputs of explain, of all discharges."""
-    n, cell = len(readings), readings.parameters
+    n, cell = len(readings), readings.cell
     out = [np.full((n, stretches, 2), np.nan) for _ in range(3)] + [np.full(n, np.nan) for _ in range(2)]
     explain(
         np.arange(n),
@@ -182,4 +182,4 @@ def test_other_intervals_and_time_steps():
         Readings.of([data[0].part(0, 5)], interval_s=10.0, dt_s=0.5)
     with pytest.raises(ValueError, match="at least one discharge"):
         Readings.of([])
-    assert NEW_CELL is readings.parameters
+    assert NEW_CELL is readings.cell
