@@ -177,7 +177,13 @@ def observe(
             fill_block(block, first, size, origin, load, nominal_q, nominal_r_o, constants)
             step_of_block(block, size, dt, power, power, thermal, True, poly_n, poly_p)
             for j in range(size):
-                n = first + j
+                for k in range(1, 8):
+                    block[k * BLOCK + j] = (measured[first + j, k] - block[k * BLOCK + j]) * per_error[k - 1]
+            # asinh: they span five orders of magnitude, and must not drown the small ones in a network. A loop of its own, so
+            # that the compiler uses vector instructions
+            for k in range(1, 8):
+                for j in range(size):
+                    block[k * BLOCK + j] = asinh_ratio(block[k * BLOCK + j], 1.0)
+            for j in range(size):
                 for k in range(7):
-                    # asinh: they span five orders of magnitude, and must not drown the small ones in a network
-                    out[n, k + column] = asinh_ratio((measured[n, k + 1] - block[(k + 1) * BLOCK + j]) * per_error[k], 1.0)
+                    out[first + j, k + column] = block[(k + 1) * BLOCK + j]
