@@ -1,15 +1,13 @@
 """
-The calibration of a battery model as a Markov decision process, for a batch of cells at once.
+Calibration from the full state of a cell as a Markov decision process, for a batch of cells at once.
 
-The agent picks the aged parameter of the model; the model then takes one step from its own state x̂_t under the load; the
-cost is its distance from the measured state x_{t+1} (Unagar et al. 2020). The scalar environment is the batch of one, and
-a policy is evaluated on the batch of all test trajectories: both run this code.
+The agent picks the aged parameter of the model. The model then takes one step from its own state x̂_t under the load. The cost
+is its distance from the measured state x_{t+1} (Unagar et al. 2020).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Literal
 
@@ -17,13 +15,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from battery_env.arrays import IntArray
+from battery_env.calibration.batch import Cells
 from battery_env.calibration.data import LoadKind, Split, standard_dataset
+from battery_env.calibration.formulation import ACTION_RANGES, ERROR_SCALE, OBSERVED, OBSERVED_SIZE, SCALED, Formulation
 from battery_env.calibration.full_state_kernels import decide, look_ahead, observe
 from battery_env.calibration.task import OBSERVATION_LIMIT, CalibrationTask, check_counts, check_not_negative, checked_action
 from battery_env.electrochemistry import (
     NEW_CELL,
     QNB,
-    STATE_SIZE,
     VO,
     FloatArray,
     Trajectory,
@@ -33,150 +32,9 @@ from battery_env.electrochemistry import (
 )
 from battery_env.trajectories import AgedParameter, TrajectoryDataset
 
-#: What the action's range [-1, 1] is mapped to (the authors' code), C and ohm.
-ACTION_RANGES: dict[str, tuple[float, float]] = {"q_mobile": (4000.0, 8000.0), "r_o": (0.08, 0.22)}
-
-#: The state of the isothermal model, without the temperature.
-OBSERVED = slice(VO, STATE_SIZE)
-OBSERVED_SIZE = STATE_SIZE - VO
-
-#: Error scales of Vo, Vsn, Vsp, qnB, qnS, qpB, qpS, V and C: a step with a parameter that is off by 10 % is off by some tenths
-#: in Vo, Vsn and Vsp. Charges count little on purpose: they never forget an error, so that any weight in the cost makes the
-#: agent repay old errors with wrong parameters.
-ERROR_SCALE: FloatArray = np.array([0.01, 1e-5, 1e-5, 20.0, 20.0, 20.0, 20.0])
-
-# A model that was wrong for a while has moved too much or too little charge from one electrode to the other; in both, nine
-# tenths of it are in the bulk
+# A model that was wrong for a while has moved too much or too little charge from one electrode to the other. In both
+# electrodes nine tenths of that charge are in the bulk.
 _PERTURBATION = np.array([1.0, 1.0, 1.0, -0.9, -0.1, 0.9, 0.1])
-
-
-@dataclass(frozen=True, eq=False)
-class Formulation:
-    """
-    How states become observations and costs. All arrays follow the state without temperature: Vo, Vsn, Vsp, qnB, qnS, qpB,
-    qpS, in V and C.
-
-    :param state_scale: what observed states are divided by, shape (7,)
-    :param load_scale: what observed loads are divided by, W
-    :param error_scale: what state errors are divided by, in the cost and in the innovation, shape (7,)
-    :param innovations: whether the observation holds asinh of x_{t+1} minus what a model with a new cell's parameters
-        predicts, in error scales, once from the model's state x̂_t and once from the measured state x_t
-    :param literal_cost: the authors' cost: 0.5 times the norm of the error of the voltages plus 0.5 times that of the charges,
-        times 50 where it exceeds 1e-4. Otherwise it is the norm of all errors
-    :param cost_limit: the largest cost of a distance. Near the end of a discharge distances span four orders of magnitude;
-        costs must not, or the critic does not see the small ones
-    """
-
-    state_scale: FloatArray
-    load_scale: float
-    error_scale: FloatArray
-    innovations: bool
-    literal_cost: bool
-    cost_limit: float
-
-
-#: Everything divided by what it reaches in a new cell under 8 to 16 W, and measured in error scales.
-SCALED = Formulation(
-    state_scale=np.array([0.5, 0.1, 0.01, 6840.0, 760.0, 11400.0, 1266.0]),
-    load_scale=16.0,
-    error_scale=ERROR_SCALE,
-    innovations=True,
-    literal_cost=False,
-    cost_limit=5.0,
-)
-#: The authors' code: divided by a new cell's charges, 1 V and 20 W.
-LITERAL = Formulation(
-    state_scale=np.array([1.0, 1.0, 1.0, 6840.0, 760.0, 4560.0, 506.67]),
-    load_scale=20.0,
-    error_scale=np.ones(OBSERVED_SIZE),
-    innovations=False,
-    literal_cost=True,
-    cost_limit=1e4,
-)
-
-
-@dataclass(eq=False)
-class Cells:
-    """
-    Where n cells stand at sample t. All arrays have one row a cell; what no option asks for has no columns.
-
-    :param trajectory: number of the discharge
-    :param sample: t
-    :param last_sample: of the discharge
-    :param last_decision: the last sample at which there is a decision
-    :param load_start: where the loads of the discharge start
-    :param decisions: made in this episode
-    :param state: x_t, shape (n, 8)
-    :param next_state: x_{t+1}
-    :param model_state: x̂_t
-    :param sensed_before: x_t as sensors with errors had it
-    :param sensed: x_{t+1} as sensors with errors have it
-    :param load: u_{t+1}, over the step from t to t + 1, W or A
-    :param voltage: of the cell at t, V
-    :param soc: state of charge of the cell at t
-    :param q_mobile: of the cell, C
-    :param r_o: of the cell, ohm
-    :param q_mobile_hat: of the model, C
-    :param r_o_hat: of the model, ohm
-    :param new_q_mobile: a new cell's, C
-    :param new_r_o: a new cell's, ohm
-    :param last_action: shape (n, parameters)
-    :param constants: of the cell, where they are not the model's, shape (n, 14)
-    :param noise: standard normal draws of the episode, of the process first, shape (n, measured states, columns)
-    """
-
-    trajectory: IntArray
-    sample: IntArray
-    last_sample: IntArray
-    last_decision: IntArray
-    load_start: IntArray
-    decisions: IntArray
-    state: FloatArray
-    next_state: FloatArray
-    model_state: FloatArray
-    sensed_before: FloatArray
-    sensed: FloatArray
-    load: FloatArray
-    voltage: FloatArray
-    soc: FloatArray
-    q_mobile: FloatArray
-    r_o: FloatArray
-    q_mobile_hat: FloatArray
-    r_o_hat: FloatArray
-    new_q_mobile: FloatArray
-    new_r_o: FloatArray
-    last_action: FloatArray
-    constants: FloatArray
-    noise: FloatArray
-
-    @property
-    def measured(self) -> FloatArray:
-        """x_{t+1} as the sensors have it, shape (n, 8)."""
-        return self.sensed if self.sensed.size else self.next_state
-
-    @property
-    def measured_before(self) -> FloatArray:
-        """x_t as the sensors had it, shape (n, 8)."""
-        return self.sensed_before if self.sensed_before.size else self.state
-
-    def take(self, rows: NDArray[np.bool_]) -> Cells:
-        """
-        Some of the cells.
-
-        :param rows: which, shape (n,)
-        :return: copies of them
-        """
-        return Cells(**{name: np.ascontiguousarray(values[rows]) for name, values in vars(self).items()})
-
-    def put(self, rows: NDArray[np.intp], others: Cells) -> None:
-        """
-        Overwrite some of the cells.
-
-        :param rows: which, shape (m,)
-        :param others: m cells
-        """
-        for values, theirs in zip(vars(self).values(), vars(others).values(), strict=True):
-            values[rows] = theirs
 
 
 @lru_cache(maxsize=4)
@@ -190,15 +48,15 @@ def _reachable(parameter: AgedParameter, load: LoadKind, split: Split, dt_s: flo
 
 class FullStateTask(CalibrationTask):
     """
-    The paper's task for ``cells`` cells side by side: the state of the cell is measured; one parameter is to be found and the
-    other one is known, or both are to be found. What differs between the registered ones is data of their classes; their
-    options are described on the page of :class:`BatteryQmax`.
+    The paper's task for ``cells`` cells side by side. The state of the cell is measured. One parameter is to be found and the
+    other one is known, or both are to be found. The registered tasks differ in attributes of their classes. The page of
+    :class:`~battery_env.calibration.full_state_tasks.BatteryQmax` describes the options.
 
-    The truth is simulated beside the model, from the data set's parameters and loads. The model is continued where a wrong
+    The cell is simulated beside the model, from the parameters and loads of the data set. The model is extended where a wrong
     parameter leaves its domain (:func:`battery_env.electrochemistry.step_into`, ``extended``).
 
     :ivar formulation: how states become observations and costs
-    :ivar now: where the cells stand
+    :ivar now: the cells at their samples
     :param cells: size of the batch
     :raises ValueError: for values out of range
     """
@@ -275,8 +133,9 @@ class FullStateTask(CalibrationTask):
         self._draws = (self.episode_steps + 2 if self._is_disturbed else 0, columns)
         self._has_own_constants = bool((dataset.factors != 1.0).any())
         self._model_packed = dataset.cell.packed
-        # what the kernels read, in their order. They take arrays one by one: numba spends 13 us a step on NamedTuples of them,
-        # half of what a whole step of one cell takes
+        self._new_parameters = np.repeat([[NEW_CELL.q_mobile], [NEW_CELL.r_o]], cells, axis=1)
+        # Arguments of the kernels, in their order. Kernels take arrays one by one: numba spends 13 us a step on NamedTuples of
+        # them, half of what a whole step of one cell takes.
         self._of_step = (dataset.dt_s, dataset.load_unit == "power", dataset.thermal)
         self._of_decision = (
             self._action_range[0],
@@ -336,13 +195,12 @@ class FullStateTask(CalibrationTask):
         self.now.put(rows, self._begin(trajectory, sample, perturbation, noise))
 
     def _begin(self, trajectory: IntArray, sample: IntArray, perturbation: FloatArray, noise: FloatArray) -> Cells:
-        """Cells at some samples of some discharges."""
+        """Cells at samples of discharges."""
         dataset, n = self.dataset, len(sample)
         load_start, q_mobile, r_o = dataset.load_start[trajectory], dataset.q_mobile[trajectory], dataset.r_o[trajectory]
-        new_q_mobile, new_r_o = np.full(n, NEW_CELL.q_mobile), np.full(n, NEW_CELL.r_o)
-        # before the first action the model is the new cell's; the parameter that is known stays the true one
-        q_mobile_hat = (new_q_mobile if "q_mobile" in self.parameters else q_mobile).copy()
-        r_o_hat = (new_r_o if "r_o" in self.parameters else r_o).copy()
+        # before the first action the model is a new cell in what is to be found; what is known is the true value
+        q_mobile_hat = np.full(n, NEW_CELL.q_mobile) if "q_mobile" in self.parameters else q_mobile.copy()
+        r_o_hat = np.full(n, NEW_CELL.r_o) if "r_o" in self.parameters else r_o.copy()
         state = dataset.states_at(trajectory, sample)
         if self.starts_new:
             model_state = initial_state(q_mobile_hat, dataset.cell)
@@ -375,8 +233,6 @@ class FullStateTask(CalibrationTask):
             r_o=r_o,
             q_mobile_hat=q_mobile_hat,
             r_o_hat=r_o_hat,
-            new_q_mobile=new_q_mobile,
-            new_r_o=new_r_o,
             last_action=np.repeat(self._first_action[None], n, axis=0),
             constants=dataset.packed(trajectory).constants if self._has_own_constants else np.empty((n, 0)),
             noise=noise,
@@ -504,7 +360,7 @@ class FullStateTask(CalibrationTask):
     @staticmethod
     def conclude(estimates: FloatArray) -> float:
         """
-        What is left of the estimates over a record: their mean, for each is made of its own sample.
+        The estimate for a whole record: the mean, for each estimate is made of its own sample.
 
         :param estimates: of one parameter, shape (K,)
         :return: one estimate
@@ -535,6 +391,7 @@ class FullStateTask(CalibrationTask):
         """
         out = np.empty((self.cells, self.observation_size), dtype=np.float32)
         now = self.now
+        new_q_mobile, new_r_o = self._new_parameters[:, : self.cells]
         observe(
             now.model_state,
             now.measured_before,
@@ -542,23 +399,12 @@ class FullStateTask(CalibrationTask):
             now.load,
             now.last_action,
             *self._of_observation,
-            now.new_q_mobile,
-            now.new_r_o,
+            new_q_mobile,
+            new_r_o,
             *self._model_packed,
             out,
         )
         return out
-
-    def parameters_of(self, action: NDArray[np.floating]) -> FloatArray:
-        """
-        The parameters that actions stand for.
-
-        :param action: in [-1, 1], shape (..., len(parameters))
-        :return: C and ohm, same shape
-        """
-        share = 0.5 * (np.asarray(action, dtype=np.float64) + 1.0)
-        lowest, highest = self._action_range
-        return lowest + share * (highest - lowest)
 
     def action_of(self, values: Mapping[str, ArrayLike]) -> FloatArray:
         """
@@ -598,252 +444,3 @@ class FullStateTask(CalibrationTask):
             "voltage_hat": voltage_hat,
             "soc": now.soc.copy(),
         }
-
-
-class BatteryQmax(FullStateTask):
-    """
-    ## Description
-
-    A Li-ion cell of unknown age is discharged at a constant power of 8 to 16 W, and its whole state is measured once a
-    second. Find q^max (``q_mobile``), the charge that can move, by making NASA's electrochemistry model follow the measured
-    state. Source: Unagar et al. 2020; no label is used, and the reward does not know the true parameter.
-
-    ## Observation space
-
-    ``Box(-100, 100, (29,), float32)``. States are Vo, Vsn, Vsp (divided by 0.5, 0.1, 0.01 V), qnB, qnS, qpB, qpS (divided by
-    6840, 760, 11400, 1266 C).
-
-    | index | content |
-    |-------|---------|
-    | 0-6   | x̂_t, the model's state |
-    | 7-13  | x_{t+1}, the measured state one step ahead |
-    | 14    | u_{t+1}, the power over that step, divided by 16 W |
-    | 15-21 | asinh of the innovation x_{t+1} minus what the model with a new cell's parameters predicts from x̂_t, in error scales |
-    | 22-28 | asinh of the innovation x_{t+1} minus what the model with a new cell's parameters predicts from x_t, the state measured before, in error scales |
-
-    Error scales: Vo 0.01 V, Vsn and Vsp 1e-5 V, charges 20 C. The two innovations make the measurements readable: a parameter
-    that is off by 1 % moves the next state by 1e-4 of its value. The second one shows what the parameter did in this second.
-    The first one shows besides how far the model has drifted, which is most of the cost. A model that was wrong for a minute
-    is off by hundreds of error scales; asinh keeps what a network sees within about 7, and leaves small innovations as they are.
-
-    The observation is Markov for a constant load: cost and next model state depend on it and the action alone, the next
-    measured state on the parameter too, which the observation determines. It stays so with ``start``,
-    ``initial_perturbation``, ``process_noise_V``, ``sensor_offset``, ``sensor_gain``, ``consistency`` (which appends what is
-    needed) and ``resync`` = 1. It is not Markov, though the cost of a decision still depends on observation and action alone,
-    with a load that changes (when, is hidden), ``resync`` > 1 (so is the step in the cycle), ``sensor_noise`` (so is the true
-    state) or ``mismatch`` (so are constants of the cell).
-
-    ## Action space
-
-    ``Box(-1, 1, (1,), float32)``, mapped linearly to q_mobile = 4000 .. 8000 C. R_o is known.
-
-    ## Reward
-
-    Minus the cost, the Euclidean norm of x̂_{t+1} - x_{t+1} in error scales, at most 5.
-
-    ## Starting state
-
-    A random second of a random discharge of the training part (70 %) of the paper's data: eleven loads times 501 values
-    of q_mobile in 4000 .. 7000 C, without the first and last 5 % of each discharge. The model starts in the true state.
-    ``reset(options=...)`` takes ``trajectory`` and ``sample`` (counted from the start of the discharge) in place of random ones.
-
-    ## Episode end
-
-    Truncated after 64 steps, or where the data end. Never terminated.
-
-    ## Arguments
-
-    | argument | default | meaning |
-    |----------|---------|---------|
-    | ``episode_steps`` | 64 | decisions per episode |
-    | ``start`` | ``"true"`` | the model's first state: the cell's; or ``"new_cell"``: that of a cell that was full when the discharge began, is new in what is to be found, and has carried the same load since. No action makes up for the charge that it has too much |
-    | ``initial_perturbation`` | 0 | the first state is off by a uniform draw within this many error scales to either side, in Vo, Vsn, Vsp and in charge that has moved between the electrodes |
-    | ``resync`` | none | the model is set to the measured state after every so many decisions |
-    | ``process_noise_V`` | 0 | standard deviation of white noise on Vo, Vsn and Vsp of the cell, V per root of a second |
-    | ``sensor_noise`` | 0 | standard deviation of white noise on measured states, in error scales. Observation, cost and ``resync`` all use the measured state |
-    | ``sensor_offset`` | 0 | constant error of measured states, in error scales |
-    | ``sensor_gain`` | 1 | measured states are the true ones times this |
-    | ``consistency`` | 0 | cost of a change of the action per unit of its Euclidean length (the paper's consistency penalty); above 0 the action before is appended to the observation, at first the one that stands for a new cell |
-    | ``cost_limit`` | 5 | largest cost, without that of a change |
-    | ``load`` | ``"paper"`` | or ``"constant"``, ``"piecewise"``, ``"random_walk"``, ``"recorded"``: see ``battery_env.calibration.data.standard_dataset``; cells whose parameters no action stands for are left out |
-    | ``split`` | ``"train"`` | or ``"test"``, ``"all"`` |
-    | ``dt_s`` | 1 | time step, s |
-    | ``mismatch`` | 0 | how far kn, tDiffusion, to and tsn of the cell are from the model's (relative standard deviation) |
-    | ``dataset`` | none | a ``TrajectoryDataset`` to draw from, in place of the last four |
-    | ``render_mode`` | none | ``"rgb_array"`` |
-
-    ``gymnasium.make_vec`` takes ``num_envs`` and ``autoreset_mode`` besides.
-
-    ## Info
-
-    ``cost``; ``q_mobile``, ``r_o`` (true), ``q_mobile_hat``, ``r_o_hat`` (the model's), C and ohm; ``voltage`` and
-    ``voltage_hat`` of cell and model, V; ``soc``, the state of charge of the cell.
-
-    ## Version history
-
-    * v0: initial version; since 0.2.0 with the second innovation; since 0.3.0 with asinh of both
-    """  # noqa: E501 (rows of a table)
-
-    parameters = ("q_mobile",)
-
-
-class BatteryRo(FullStateTask):
-    """
-    ## Description
-
-    As ``BatteryQmax-v0``, but R_o (``r_o``), the ohmic resistance, is to be found, and q_mobile is known.
-
-    ## Observation space
-
-    ``Box(-100, 100, (29,), float32)``, laid out and scaled as in ``BatteryQmax-v0``.
-
-    ## Action space
-
-    ``Box(-1, 1, (1,), float32)``, mapped linearly to r_o = 0.08 .. 0.22 ohm.
-
-    ## Reward
-
-    That of ``BatteryQmax-v0``.
-
-    ## Starting state
-
-    As ``BatteryQmax-v0``, with 501 values of r_o in 0.1 .. 0.2 ohm.
-
-    ## Episode end
-
-    Truncated after 64 steps, or where the data end. Never terminated.
-
-    ## Arguments
-
-    Those of ``BatteryQmax-v0``.
-
-    ## Version history
-
-    * v0: initial version
-    """
-
-    parameters = ("r_o",)
-
-
-class BatteryQmaxPaper(FullStateTask):
-    """
-    ## Description
-
-    The q^max task in the literal form of the paper and its code, for comparison with ``BatteryQmax-v0``.
-
-    ## Observation space
-
-    ``Box(-100, 100, (15,), float32)``: x̂_t, x_{t+1} and u_{t+1}, divided by the new cell's charges (6840, 760, 4560, 506.67 C
-    for qnB, qnS, qpB, qpS), 1 V and 20 W.
-
-    ## Action space
-
-    ``Box(-1, 1, (1,), float32)``, mapped linearly to q_mobile = 4000 .. 8000 C. R_o is known.
-
-    ## Reward
-
-    Minus the cost: 0.5 times the norm of the error of the voltages in V plus 0.5 times that of the charges in C, times 50
-    where that exceeds 1e-4; at most 10000.
-
-    ## Starting state
-
-    As ``BatteryQmax-v0``.
-
-    ## Episode end
-
-    Truncated after 16 steps, or where the data end. Never terminated (the authors' code treats the end as terminal; here a
-    time limit is one).
-
-    ## Arguments
-
-    Those of ``BatteryQmax-v0``, with ``episode_steps`` 16 and ``cost_limit`` 10000; error scales are the same.
-
-    ## Version history
-
-    * v0: initial version
-    """
-
-    parameters = ("q_mobile",)
-    formulation = LITERAL
-    episode_steps = 16
-
-
-class BatteryRoPaper(FullStateTask):
-    """
-    ## Description
-
-    The R_o task in the literal form of the paper and its code, for comparison with ``BatteryRo-v0``.
-
-    ## Observation space
-
-    ``Box(-100, 100, (15,), float32)``, laid out and scaled as in ``BatteryQmaxPaper-v0``.
-
-    ## Action space
-
-    ``Box(-1, 1, (1,), float32)``, mapped linearly to r_o = 0.08 .. 0.22 ohm. q_mobile is known.
-
-    ## Reward
-
-    That of ``BatteryQmaxPaper-v0``.
-
-    ## Starting state
-
-    As ``BatteryRo-v0``.
-
-    ## Episode end
-
-    Truncated after 16 steps, or where the data end. Never terminated.
-
-    ## Arguments
-
-    Those of ``BatteryQmax-v0``, with ``episode_steps`` 16 and ``cost_limit`` 10000; error scales are the same.
-
-    ## Version history
-
-    * v0: initial version
-    """
-
-    parameters = ("r_o",)
-    formulation = LITERAL
-    episode_steps = 16
-
-
-class BatteryJoint(FullStateTask):
-    """
-    ## Description
-
-    As ``BatteryQmax-v0``, but q^max and R_o (``r_o``), the ohmic resistance, have both aged and are to be found together.
-
-    ## Observation space
-
-    ``Box(-100, 100, (29,), float32)``, laid out and scaled as in ``BatteryQmax-v0``, and Markov under the same conditions. An
-    R_o that is off shows in Vo alone (0.8 error scales for 10 %), a q_mobile in all three voltages (0.1, 0.1 and 0.2).
-
-    ## Action space
-
-    ``Box(-1, 1, (2,), float32)``, mapped linearly to q_mobile = 4000 .. 8000 C and r_o = 0.08 .. 0.22 ohm.
-
-    ## Reward
-
-    That of ``BatteryQmax-v0``.
-
-    ## Starting state
-
-    A random second of a random discharge of the training part (700 of 1000 discharges), with q_mobile in 4000 .. 7000 C and
-    r_o in 0.1 .. 0.2 ohm drawn independently, eleven loads of 8 to 16 W, without the first and last 5 % of each discharge. The
-    model starts in the true state.
-
-    ## Episode end
-
-    Truncated after 64 steps, or where the data end. Never terminated.
-
-    ## Arguments
-
-    Those of ``BatteryQmax-v0``.
-
-    ## Version history
-
-    * v0: initial version
-    """
-
-    parameters = ("q_mobile", "r_o")

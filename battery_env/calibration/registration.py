@@ -8,14 +8,14 @@ _PACKAGE = "battery_env.calibration"
 
 #: By id, the task that the environments for one cell and for many run; its docstring is their page.
 TASKS: dict[str, str] = {
-    "BatteryQmax-v0": f"{_PACKAGE}.full_state:BatteryQmax",
-    "BatteryRo-v0": f"{_PACKAGE}.full_state:BatteryRo",
-    "BatteryJoint-v0": f"{_PACKAGE}.full_state:BatteryJoint",
-    "BatteryQmaxPaper-v0": f"{_PACKAGE}.full_state:BatteryQmaxPaper",
-    "BatteryRoPaper-v0": f"{_PACKAGE}.full_state:BatteryRoPaper",
-    "BatteryVoltageQmax-v0": f"{_PACKAGE}.voltage:BatteryVoltageQmax",
-    "BatteryVoltageRo-v0": f"{_PACKAGE}.voltage:BatteryVoltageRo",
-    "BatteryVoltageJoint-v0": f"{_PACKAGE}.voltage:BatteryVoltageJoint",
+    "BatteryQmax-v0": f"{_PACKAGE}.full_state_tasks:BatteryQmax",
+    "BatteryRo-v0": f"{_PACKAGE}.full_state_tasks:BatteryRo",
+    "BatteryJoint-v0": f"{_PACKAGE}.full_state_tasks:BatteryJoint",
+    "BatteryQmaxPaper-v0": f"{_PACKAGE}.full_state_tasks:BatteryQmaxPaper",
+    "BatteryRoPaper-v0": f"{_PACKAGE}.full_state_tasks:BatteryRoPaper",
+    "BatteryVoltageQmax-v0": f"{_PACKAGE}.voltage_tasks:BatteryVoltageQmax",
+    "BatteryVoltageRo-v0": f"{_PACKAGE}.voltage_tasks:BatteryVoltageRo",
+    "BatteryVoltageJoint-v0": f"{_PACKAGE}.voltage_tasks:BatteryVoltageJoint",
     "BatteryAging-v0": f"{_PACKAGE}.aging:BatteryAging",
 }
 

@@ -12,8 +12,10 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 import battery_env
 from battery_env.calibration.env import CalibrationEnv
-from battery_env.calibration.full_state import LITERAL, OBSERVED, SCALED, BatteryQmax, FullStateTask
+from battery_env.calibration.formulation import LITERAL, OBSERVED, SCALED
+from battery_env.calibration.full_state import FullStateTask
 from battery_env.calibration.full_state_kernels import state_distance
+from battery_env.calibration.full_state_tasks import BatteryQmax
 from battery_env.electrochemistry import NEW_CELL, QNB, step
 from battery_env.loads import RandomPiecewise
 from battery_env.trajectories import TrajectoryDataset

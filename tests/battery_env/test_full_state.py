@@ -4,15 +4,8 @@ import numpy as np
 import pytest
 
 from battery_env.calibration.data import standard_dataset
-from battery_env.calibration.full_state import (
-    ACTION_RANGES,
-    ERROR_SCALE,
-    OBSERVED,
-    BatteryJoint,
-    BatteryQmax,
-    BatteryQmaxPaper,
-    BatteryRo,
-)
+from battery_env.calibration.formulation import ACTION_RANGES, ERROR_SCALE, OBSERVED
+from battery_env.calibration.full_state_tasks import BatteryJoint, BatteryQmax, BatteryQmaxPaper, BatteryRo
 from battery_env.calibration.policy import PolicyEstimator
 from battery_env.electrochemistry import (
     NEW_CELL,

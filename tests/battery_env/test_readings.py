@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from battery_env.calibration.readings import Readings, explain
-from battery_env.calibration.voltage import BatteryVoltageJoint
+from battery_env.calibration.voltage_tasks import BatteryVoltageJoint
 from battery_env.cells import load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, QNB, QNS, VO, simulate
 from battery_env.loads import RandomPiecewise

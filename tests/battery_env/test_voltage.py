@@ -12,13 +12,8 @@ from battery_env.calibration.env import CalibrationEnv
 from battery_env.calibration.readings import Readings
 from battery_env.calibration.task import OBSERVATION_LIMIT
 from battery_env.calibration.vector_env import CalibrationVectorEnv
-from battery_env.calibration.voltage import (
-    ESTIMATE_RANGES,
-    LARGEST_STEPS,
-    BatteryVoltageJoint,
-    BatteryVoltageQmax,
-    BatteryVoltageRo,
-)
+from battery_env.calibration.voltage import ESTIMATE_RANGES, LARGEST_STEPS
+from battery_env.calibration.voltage_tasks import BatteryVoltageJoint, BatteryVoltageQmax, BatteryVoltageRo
 from battery_env.cells import Discharge, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL
 from battery_env.loads import RandomPiecewise

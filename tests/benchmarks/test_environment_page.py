@@ -8,9 +8,9 @@ import pytest
 
 from battery_env import ClosedForm, TrajectoryDataset, evaluate, plotting
 from battery_env.calibration.env import CalibrationEnv
-from battery_env.calibration.full_state import BatteryQmax
+from battery_env.calibration.full_state_tasks import BatteryQmax
 from battery_env.calibration.registration import TASKS
-from battery_env.calibration.voltage import BatteryVoltageJoint
+from battery_env.calibration.voltage_tasks import BatteryVoltageJoint
 from battery_env.loads import constant
 from benchmarks import environment_page
 
