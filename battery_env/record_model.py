@@ -19,7 +19,7 @@ from battery_env.electrochemistry import (
     initial_state,
     simulate,
 )
-from battery_env.electrochemistry.tangents import PolynomialSlopes, least_q_mobile, roll_out_with_tangents
+from battery_env.electrochemistry.tangents import PolynomialDerivatives, least_q_mobile, roll_out_with_tangents
 from battery_env.estimates import Estimate
 from battery_env.parameters import Q_MOBILE
 from battery_env.records import Record, check_record, expected_current, resample_current
@@ -78,7 +78,7 @@ class RecordModel:
         self.initial = initial_state(reference_q_C, self.cell) if initial is None else np.array(initial, dtype=np.float64)
         if self.initial.shape != (STATE_SIZE,) or not np.isfinite(self.initial).all():
             raise ValueError(f"initial must hold {STATE_SIZE} finite numbers, got {initial!r}")
-        self._slopes = PolynomialSlopes.of(self.cell.packed)
+        self._derivatives = PolynomialDerivatives.of(self.cell.packed)
 
     def grid(self, record: Record) -> tuple[FloatArray, FloatArray]:
         """
@@ -199,7 +199,7 @@ class RecordModel:
             stride * self.dt_s,
             self.thermal,
             self.cell.packed,
-            self._slopes,
+            self._derivatives,
             self.start(q_mobile),
             FULL_CHARGE_SHARES,
             columns[0],

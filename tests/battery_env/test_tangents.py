@@ -1,0 +1,61 @@
+"""The tangents of the model are the derivatives of its states and of its voltage, up to the second in q_mobile."""
+
+import numpy as np
+import pytest
+
+from battery_env.electrochemistry import FULL_CHARGE_SHARES, NEW_CELL, QNB, QNS, initial_state, voltage
+from battery_env.electrochemistry.kernels import MOLE_FRACTION_MARGIN, mole_fraction
+from battery_env.electrochemistry.tangents import (
+    BY_Q,
+    BY_R,
+    PolynomialDerivatives,
+    least_q,
+    step_with_tangents,
+    voltage_curvature,
+    voltage_tangents,
+)
+
+CELL = NEW_CELL.replace(mC=10.0)
+PACKED = CELL.packed
+DERIVATIVES = PolynomialDerivatives.of(PACKED)
+
+
+def after(steps, q, r_o, thermal, current_A=2.0):
+    """State and tangents of one cell, the second of two."""
+    states, tangents = np.zeros((2, 8)), np.zeros((2, 2, 8))
+    states[1], tangents[1, BY_Q, QNB:] = initial_state(q, CELL), FULL_CHARGE_SHARES
+    for _ in range(steps):
+        step_with_tangents(states, tangents, 1, current_A, q, r_o, 1.0, thermal, True, PACKED.constants)
+    assert not states[0].any() and not tangents[0].any()
+    return states, tangents
+
+
+@pytest.mark.parametrize("thermal", [False, True])
+@pytest.mark.parametrize("steps", [50, 1500, 2800])
+class TestOneCell:
+    def test_tangents_are_the_derivatives_of_the_state(self, steps, thermal):
+        _, tangents = after(steps, 6000.0, 0.15, thermal)
+        for row, dq, dr in ((BY_Q, 0.5, 0.0), (BY_R, 0.0, 1e-4)):
+            more, less = (after(steps, 6000.0 + s * dq, 0.15 + s * dr, thermal)[0] for s in (1.0, -1.0))
+            np.testing.assert_allclose(tangents[1, row], (more - less)[1] / (2.0 * (dq + dr)), rtol=1e-4, atol=1e-10)
+
+    def test_voltage_to_second_order_along_them(self, steps, thermal):
+        states, tangents = after(steps, 6000.0, 0.15, thermal)
+        dq = 0.5
+        more, here, less = (
+            float(voltage(states[1] + s * dq * tangents[1, BY_Q], 6000.0 + s * dq, cell=CELL)) for s in (1.0, 0.0, -1.0)
+        )
+        by_q, by_r_o = voltage_tangents(states, tangents, 1, 6000.0, thermal, PACKED, DERIVATIVES)
+        assert by_q == pytest.approx((more - less) / (2.0 * dq), rel=1e-4)
+        curvature = voltage_curvature(states, tangents, 1, 6000.0, PACKED, DERIVATIVES)
+        assert curvature == pytest.approx((more - 2.0 * here + less) / dq**2, rel=1e-3, abs=1e-13)
+        more, less = (float(voltage(states[1] + s * 1e-4 * tangents[1, BY_R], 6000.0, cell=CELL)) for s in (1.0, -1.0))
+        assert by_r_o == pytest.approx((more - less) / 2e-4, rel=1e-6)
+
+
+def test_at_the_least_q_the_mole_fraction_is_at_the_margin():
+    states, tangents = after(2500, 6000.0, 0.15, False)
+    charge, slope = states[1, QNS], tangents[1, BY_Q, QNS]
+    least = least_q(charge, slope, 6000.0, MOLE_FRACTION_MARGIN, PACKED.constants)
+    fraction = mole_fraction(charge + slope * (least - 6000.0), least, False, PACKED.constants, 0)
+    assert fraction == pytest.approx(MOLE_FRACTION_MARGIN, rel=1e-9) and 5000.0 < least < 6000.0
