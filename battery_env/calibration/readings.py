@@ -278,25 +278,30 @@ def explain(
     """
     stretches = residual_V.shape[1]
     values, sums = np.empty((2, voltage_V.shape[1])), np.empty((2, 4))
+    half_C, vsn, vsp = np.empty((3, voltage_V.shape[1]))
     for n in rows:
+        moved, current, ohmic, last = moved_C[n], current_A[n], ohmic_A[n], count[n]
+        # the overpotentials relax towards their value half way between two readings
+        half_C[0] = 0.5 * moved[0]
+        for k in range(1, last):
+            half_C[k] = 0.5 * (moved[k - 1] + moved[k])
         for trial in range(2):
             q = q_mobile[n] * (1.0 + trial * _RELATIVE_STEP)
-            vsn, vsp, moved_before = 0.0, 0.0, 0.0
-            for k in range(count[n]):
-                # the overpotentials relax towards their value half way between two readings
-                half = 0.5 * (moved_before + moved_C[n, k])
-                moved_before = moved_C[n, k]
-                xn = mole_fraction(_SURFACE_SHARE_N * q - half, q, True, constants, 0)
-                xp = mole_fraction(_SURFACE_SHARE_P * q + half, q, True, constants, 0)
-                vsn_nominal, vsp_nominal = nominal_overpotentials(current_A[n, k], xn, xp, temperature_K, constants, 0)
-                vsn += relaxed_n * (vsn_nominal - vsn)
-                vsp += relaxed_p * (vsp_nominal - vsp)
-                if k < first[n]:
-                    continue
-                xn = mole_fraction(_SURFACE_SHARE_N * q - moved_before, q, True, constants, 0)
-                xp = mole_fraction(_SURFACE_SHARE_P * q + moved_before, q, True, constants, 0)
+            # three loops: the compiler uses vector instructions where no reading waits for the one before
+            for k in range(last):
+                xn = mole_fraction(_SURFACE_SHARE_N * q - half_C[k], q, True, constants, 0)
+                xp = mole_fraction(_SURFACE_SHARE_P * q + half_C[k], q, True, constants, 0)
+                vsn[k], vsp[k] = nominal_overpotentials(current[k], xn, xp, temperature_K, constants, 0)
+            vsn_k, vsp_k = 0.0, 0.0
+            for k in range(last):
+                vsn_k += relaxed_n * (vsn[k] - vsn_k)
+                vsp_k += relaxed_p * (vsp[k] - vsp_k)
+                vsn[k], vsp[k] = vsn_k, vsp_k
+            for k in range(first[n], last):
+                xn = mole_fraction(_SURFACE_SHARE_N * q - moved[k], q, True, constants, 0)
+                xp = mole_fraction(_SURFACE_SHARE_P * q + moved[k], q, True, constants, 0)
                 equilibrium = equilibrium_voltage(xn, xp, temperature_K, constants, 0, polynomial_n, polynomial_p)
-                values[trial, k] = equilibrium - vsn - vsp - r_o[n] * ohmic_A[n, k]
+                values[trial, k] = equilibrium - vsn[k] - vsp[k] - r_o[n] * ohmic[k]
         span = count[n] - first[n]
         square = 0.0
         for k in range(first[n], count[n]):

@@ -75,7 +75,8 @@ _inlined = njit(cache=True, error_model="numpy", forceinline=True)
 @_inlined
 def logarithm(x: float) -> float:
     # ln(x) within 1 ulp for x >= 2.3e-308, in operations that exist as vector instructions; the C library's has branches, and
-    # differs from machine to machine
+    # differs from machine to machine. With that one a step of BatteryQmax takes 1.05 times as long in 16 cells, 1.09 times in
+    # 64 and 1.4 to 1.5 times in 1024
     bits = np.float64(x).view(np.uint64)
     exponent = np.uint64((bits + _ONE_OVER_ROOT_OF_HALF) >> _MANTISSA_BITS)
     k = np.uint64(exponent | _TWO_TO_THE_52).view(np.float64) - (2.0**52 + 1023.0)
@@ -188,12 +189,12 @@ def _euler(
     )
 
 
-@_compiled
+@_inlined
 def mole_fraction(surface_charge: float, q: float, extended: bool, constants: FloatArray, c: int) -> float:
     return _fraction(constants[c, FRACTION_PER_SHARE] / q, surface_charge, extended)
 
 
-@_compiled
+@_inlined
 def equilibrium_voltage(
     xn: float, xp: float, tb: float, constants: FloatArray, c: int, poly_n: FloatArray, poly_p: FloatArray
 ) -> float:
@@ -201,7 +202,7 @@ def equilibrium_voltage(
     return _equilibrium(xn, xp, tb, constants[c, R_OVER_F], constants[c, U0], poly_n, poly_p)
 
 
-@_compiled
+@_inlined
 def nominal_overpotentials(i: float, xn: float, xp: float, tb: float, constants: FloatArray, c: int) -> tuple[float, float]:
     # for mole fractions inside 0 .. 1
     scale = 2.0 * constants[c, R_OVER_F] * tb
