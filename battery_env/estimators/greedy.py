@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 
 from battery_env.arrays import FloatArray
-from battery_env.electrochemistry import NEW_CELL, VO, CellParameters, PackedConstants, Trajectory, check_dt
+from battery_env.electrochemistry import NEW_CELL, STATE_SIZE, VO, CellParameters, PackedConstants, Trajectory, check_dt
 from battery_env.electrochemistry.kernels import cell_current, cell_step, cell_voltage
 from battery_env.estimates import Estimate, EstimateTrace
 from battery_env.estimators.base import Estimator
@@ -27,8 +27,8 @@ _GOLDEN = 0.5 * (sqrt(5.0) - 1.0)
 _TOLERANCE = 1e-14
 
 
-class _Task(NamedTuple):
-    """What is the same for all steps of a discharge."""
+class _Search(NamedTuple):
+    """A discharge, and a model whose parameter is searched for step by step."""
 
     search_q: bool
     q: float
@@ -37,103 +37,80 @@ class _Task(NamedTuple):
     power: bool
     thermal: bool
     packed: PackedConstants
+    load: FloatArray  # over each step
+    measured: FloatArray  # states of the cell, shape (T, 8)
+    start: FloatArray  # state of the model before a step, shape (1, 8)
+    end: FloatArray  # and after it, overwritten
 
 
-@njit(cache=True, error_model="numpy")
-def _cost(value: float, x: FloatArray, load: float, measured: FloatArray, k: int, task: _Task, out: FloatArray) -> float:
-    # distance of the model's step from x, which is left in out, to row k of the measured states; negative if its vo is too low
-    q = value if task.search_q else task.q
-    r_o = task.r_o if task.search_q else value
-    volts = 0.0
-    if task.power:
-        volts = cell_voltage(x, 0, q, True, task.packed, 0)
-    i = cell_current(load, task.power, volts, True)
-    cell_step(x, 0, i, q, r_o, task.dt, task.thermal, True, task.packed.constants, 0, out, 0)
+_compiled = njit(cache=True, error_model="numpy")
+
+
+@_compiled
+def _cost(value: float, k: int, search: _Search) -> float:
+    # distance of the end of step k to the measured state; negative if its vo is too low
+    start, end, measured, packed = search.start, search.end, search.measured, search.packed
+    q, r_o = (value, search.r_o) if search.search_q else (search.q, value)
+    volts = cell_voltage(start, 0, q, True, packed, 0) if search.power else 0.0
+    i = cell_current(search.load[k], search.power, volts, True)
+    cell_step(start, 0, i, q, r_o, search.dt, search.thermal, True, packed.constants, 0, end, 0)
     square = 0.0
-    for n in range(VO, out.shape[1]):
-        square += (out[0, n] - measured[k, n]) ** 2
-    return sqrt(square) if out[0, VO] >= measured[k, VO] else -sqrt(square)
+    for n in range(VO, STATE_SIZE):
+        square += (end[0, n] - measured[k + 1, n]) ** 2
+    return sqrt(square) if end[0, VO] >= measured[k + 1, VO] else -sqrt(square)
 
 
-@njit(cache=True, error_model="numpy")
-def _brackets(
-    low: float,
-    high: float,
-    x: FloatArray,
-    load: float,
-    measured: FloatArray,
-    k: int,
-    task: _Task,
-    out: FloatArray,
-    costs: FloatArray,
-    found: FloatArray,
-) -> int:
+@_compiled
+def _brackets(low: float, high: float, k: int, search: _Search, found: FloatArray) -> int:
     # Intervals of a grid that hold a minimum; returns how many they are. A change of the sign is one, which the magnitudes
     # alone do not show where two minima lie near each other; where there is none, the magnitudes of neighbours tell.
-    intervals = costs.shape[0] - 1
-    width = (high - low) / intervals
-    for n in range(intervals + 1):
-        costs[n] = _cost(low + n * width, x, load, measured, k, task, out)
+    width = (high - low) / _INTERVALS
+    costs = np.array([_cost(low + n * width, k, search) for n in range(_INTERVALS + 1)])
     count = 0
-    for n in range(intervals + 1):
-        left, right = max(n - 1, 0), min(n + 1, intervals)
-        if n < intervals and (costs[n] < 0.0) != (costs[right] < 0.0):
-            found[count, 0], found[count, 1] = low + n * width, low + right * width
+    for n in range(_INTERVALS + 1):
+        left, right = max(n - 1, 0), min(n + 1, _INTERVALS)
+        if n < _INTERVALS and (costs[n] < 0.0) != (costs[right] < 0.0):
+            found[count] = low + n * width, low + right * width
             count += 1
         elif abs(costs[left]) >= abs(costs[n]) <= abs(costs[right]) and (costs[left] < 0.0) == (costs[n] < 0.0):
-            found[count, 0], found[count, 1] = low + left * width, low + right * width
+            found[count] = low + left * width, low + right * width
             count += 1
     return count
 
 
-@njit(cache=True, error_model="numpy")
-def _golden_section(
-    low: float,
-    high: float,
-    tolerance: float,
-    x: FloatArray,
-    load: float,
-    measured: FloatArray,
-    k: int,
-    task: _Task,
-    out: FloatArray,
-) -> float:
+@_compiled
+def _golden_section(low: float, high: float, tolerance: float, k: int, search: _Search) -> float:
     left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
-    cost_left = abs(_cost(left, x, load, measured, k, task, out))
-    cost_right = abs(_cost(right, x, load, measured, k, task, out))
+    cost_left, cost_right = abs(_cost(left, k, search)), abs(_cost(right, k, search))
     while high - low > tolerance and left < right:
         if cost_left < cost_right:
             high, right, cost_right = right, left, cost_left
             left = high - _GOLDEN * (high - low)
-            cost_left = abs(_cost(left, x, load, measured, k, task, out))
+            cost_left = abs(_cost(left, k, search))
         else:
             low, left, cost_left = left, right, cost_right
             right = low + _GOLDEN * (high - low)
-            cost_right = abs(_cost(right, x, load, measured, k, task, out))
+            cost_right = abs(_cost(right, k, search))
     return left if cost_left < cost_right else right
 
 
-@njit(cache=True, error_model="numpy")
-def _greedy(
-    measured: FloatArray, load: FloatArray, low: float, high: float, resync: bool, task: _Task, best: FloatArray
-) -> None:
-    x, out = measured[:1].copy(), np.empty((1, measured.shape[1]))
-    costs = np.empty(_INTERVALS + 1)
-    coarse, fine = np.empty((_INTERVALS + 1, 2)), np.empty((_INTERVALS + 1, 2))
+@_compiled
+def _greedy(low: float, high: float, resync: bool, search: _Search, best: FloatArray) -> None:
+    # Fills best, the value of each step
+    coarse, fine = np.empty((2, _INTERVALS + 1, 2))
     tolerance = _TOLERANCE * (high - low)
     for k in range(best.shape[0]):
         if resync:
-            x[0] = measured[k]
+            search.start[0] = search.measured[k]
         least = np.inf
-        for a in range(_brackets(low, high, x, load[k], measured, k + 1, task, out, costs, coarse)):
-            count = _brackets(coarse[a, 0], coarse[a, 1], x, load[k], measured, k + 1, task, out, costs, fine)
-            for b in range(count):
-                value = _golden_section(fine[b, 0], fine[b, 1], tolerance, x, load[k], measured, k + 1, task, out)
-                cost = abs(_cost(value, x, load[k], measured, k + 1, task, out))
+        for a in range(_brackets(low, high, k, search, coarse)):
+            for b in range(_brackets(coarse[a, 0], coarse[a, 1], k, search, fine)):
+                value = _golden_section(fine[b, 0], fine[b, 1], tolerance, k, search)
+                cost = abs(_cost(value, k, search))
                 if cost < least:
                     least, best[k] = cost, value
-        _cost(best[k], x, load[k], measured, k + 1, task, out)
-        x[0] = out[0]
+        _cost(best[k], k, search)
+        search.start[0] = search.end[0]
 
 
 class GreedyOneStep(Estimator):
@@ -198,7 +175,7 @@ class GreedyOneStep(Estimator):
             steps = len(record.time_s) - 1
             values = {"q_mobile": np.full(steps, record.q_mobile), "r_o": np.full(steps, record.r_o)}
             values[self.parameter] = np.full(steps, np.nan)
-            task = _Task(
+            search = _Search(
                 self.parameter == "q_mobile",
                 record.q_mobile,
                 record.r_o,
@@ -206,7 +183,11 @@ class GreedyOneStep(Estimator):
                 record.load_unit == "power",
                 self.thermal,
                 self.cell.packed,
+                record.load,
+                record.state,
+                record.state[:1].copy(),
+                record.state[:1].copy(),
             )
-            _greedy(record.state, record.load, *self.search_range, self.resync, task, values[self.parameter])
+            _greedy(*self.search_range, self.resync, search, values[self.parameter])
             traces.append(EstimateTrace(time_s=record.time_s[1:], **values))
         return traces
