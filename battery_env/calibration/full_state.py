@@ -133,7 +133,7 @@ class FullStateTask(CalibrationTask):
         self._draws = (self.episode_steps + 2 if self._is_disturbed else 0, columns)
         self._has_own_constants = bool((dataset.factors != 1.0).any())
         self._model_packed = dataset.cell.packed
-        self._new_parameters = np.repeat([[NEW_CELL.q_mobile], [NEW_CELL.r_o]], cells, axis=1)
+        self._new_parameters = np.full(cells, NEW_CELL.q_mobile), np.full(cells, NEW_CELL.r_o)
         # Arguments of the kernels, in their order. Kernels take arrays one by one: numba spends 13 us a step on NamedTuples of
         # them, half of what a whole step of one cell takes.
         self._of_step = (dataset.dt_s, dataset.load_unit == "power", dataset.thermal)
@@ -391,7 +391,6 @@ class FullStateTask(CalibrationTask):
         """
         out = np.empty((self.cells, self.observation_size), dtype=np.float32)
         now = self.now
-        new_q_mobile, new_r_o = self._new_parameters[:, : self.cells]
         observe(
             now.model_state,
             now.measured_before,
@@ -399,8 +398,7 @@ class FullStateTask(CalibrationTask):
             now.load,
             now.last_action,
             *self._of_observation,
-            new_q_mobile,
-            new_r_o,
+            *self._new_parameters,
             *self._model_packed,
             out,
         )
@@ -425,6 +423,8 @@ class FullStateTask(CalibrationTask):
         """
         self.now = self.now.take(rows)
         self.cells = len(self.now.sample)
+        new_q_mobile, new_r_o = self._new_parameters
+        self._new_parameters = new_q_mobile[: self.cells], new_r_o[: self.cells]
 
     def report(self) -> dict[str, FloatArray]:
         """
