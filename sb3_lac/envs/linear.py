@@ -1,7 +1,10 @@
+import math
+from typing import Any
+
 import numpy as np
 from gymnasium import spaces
 
-from sb3_lac.envs.base import CostEnv, check_not_negative, check_positive
+from sb3_lac.envs.base import CostEnv, check_not_negative
 
 
 class LinearCostEnv(CostEnv):
@@ -50,6 +53,9 @@ class LinearCostEnv(CostEnv):
     """
 
     state_names = ("position", "velocity")
+    error_name = "norm of the state"
+    error_tolerance = 0.1
+    control_max: float
 
     A = np.array([[0.96, 0.2], [-0.2, 0.96]])
     B = np.array([[0.0], [0.5]])
@@ -57,24 +63,27 @@ class LinearCostEnv(CostEnv):
     R = np.eye(1)
     STATE_MAX = 100.0
 
-    def __init__(self, noise_std: float = 0.01, control_max: float = 2.0, render_mode: str | None = None) -> None:
+    def __init__(self, noise_std: float = 0.01, control_max: float = 2.0, **options: Any) -> None:
         check_not_negative(noise_std=noise_std)
-        check_positive(control_max=control_max)
         observation_space = spaces.Box(-self.STATE_MAX, self.STATE_MAX, (2,), np.float32)
-        super().__init__(
-            np.full(2, -self.STATE_MAX), np.full(2, self.STATE_MAX), observation_space, n_actions=1, render_mode=render_mode
-        )
+        state_high = np.full(2, self.STATE_MAX)
+        super().__init__({"control_max": control_max}, -state_high, state_high, observation_space, n_actions=1, **options)
         self.noise_std = noise_std
-        self.control_max = control_max
 
     def _initial_state(self) -> np.ndarray:
         return self.np_random.uniform(-1.0, 1.0, 2)
 
-    def _transition(self, state: np.ndarray, action: np.ndarray) -> tuple[np.ndarray, float, bool]:
+    def _next_state(self, state: np.ndarray, action: np.ndarray, push: float) -> np.ndarray:
         control = self.control_max * action
-        cost = float(state @ self.Q @ state + control @ self.R @ control)
-        next_state = self.A @ state + self.B @ control + self.noise_std * self.np_random.standard_normal(2)
-        return next_state, cost, False
+        return self.A @ state + self.B @ (control + push) + self.noise_std * self.np_random.standard_normal(2)
+
+    def _cost(self, state: np.ndarray, action: np.ndarray, next_state: np.ndarray) -> tuple[float, bool]:
+        control = self.control_max * action
+        return float(state @ self.Q @ state + control @ self.R @ control), False
+
+    def _error(self) -> float:
+        assert self.state is not None
+        return math.hypot(*self.state)
 
     def optimal_gain(self, gamma: float = 1.0) -> np.ndarray:
         """
