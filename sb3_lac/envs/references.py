@@ -114,8 +114,8 @@ class LinearController(ReferenceController):
 
 class CartPoleController(ReferenceController):
     """
-    The linear-quadratic regulator of the linearised cart and pole. Its weights are not those of the cost, which has none on the
-    force and little on the position: these bring the cart home within an episode, and drop the pole from no start.
+    The linear-quadratic regulator of the linearised cart and pole. Its weights are not those of the cost, which has none on
+    the force and little on the position: these bring the cart home within an episode, and drop the pole from no start.
     """
 
     def __init__(self, model: CartPoleCostEnv) -> None:
@@ -259,4 +259,5 @@ def reference_controller(env: gym.Env[Any, Any]) -> ReferenceController:
     assert isinstance(problem, CostEnv)
     if env.observation_space != problem.observation_space or env.action_space != problem.action_space:
         raise ValueError(f"env={env} has a wrapper that changes observations or actions, which the controller would not know.")
-    return make_controller(type(problem)(**problem.nominal_parameters))
+    make_problem: Any = type(problem)  # each has arguments of its own
+    return make_controller(make_problem(**problem.nominal_parameters))

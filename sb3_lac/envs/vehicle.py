@@ -30,8 +30,8 @@ class VehicleCostEnv(CostEnv):
         F_f = friction N_f sin(1.5 arctan(10 (delta - arctan((v + l_f r) / V))))
         F_r = friction N_r sin(1.5 arctan(-10 arctan((v - l_r r) / V)))
 
-    integrated by Runge-Kutta steps of fourth order of 0.05 s, in which the command is constant; g = 9.81 m/s^2. The path winds as
-    `kappa(s) = 0.015 sin(2 pi s / 150)`, in 1/m and m: its bends ask for 3.4 m/s^2 at 15 m/s, and friction allows for 8.8.
+    integrated by Runge-Kutta steps of fourth order of 0.05 s, in which the command is constant; g = 9.81 m/s^2. The path winds
+    as `kappa(s) = 0.015 sin(2 pi s / 150)`, in 1/m and m: its bends ask for 3.4 m/s^2 at 15 m/s, and friction allows for 8.8.
 
     ## Action Space
 
@@ -49,22 +49,22 @@ class VehicleCostEnv(CostEnv):
     | 5 | yaw rate of the path here, kappa(s) V | -5 .. 5 | rad/s |
     | 6 | yaw rate of the path 15 m ahead, kappa(s + 15) V | -5 .. 5 | rad/s |
 
-    The last two tell the place on the path, so that the observation is Markov. The state, for `reset(options={"state": ...})`, is
-    the first five and s in 0 .. 150 m.
+    The last two tell the place on the path, so that the observation is Markov. The state, for `reset(options={"state": ...})`,
+    is the first five and s in 0 .. 150 m.
 
     ## Cost
 
-    `0.2 e^2 + 0.1 chi^2 + 0.1 ((a - delta / steering_max_rad) / 2)^2` with offset and course error `chi = psi + arctan(v / V)`, the
-    angle from the path to the velocity, of the next state, the action a, and the steering angle before the step: the last term is
-    for calm steering. It lies in 0 .. 1. A transition that ends the episode costs 300, 1 for each step of an episode, so that
-    leaving the road never is the cheaper way. The reward is minus the cost.
+    `0.2 e^2 + 0.1 chi^2 + 0.1 ((a - delta / steering_max_rad) / 2)^2` with offset e and course error chi of the next state,
+    the action a, and the steering angle before the step. The course error is the angle from the path to the velocity, `psi +
+    arctan(v / V)`; the last term is for calm steering. The cost lies in 0 .. 1. A transition that ends the episode costs 300,
+    1 for each step of an episode, so that leaving the road never is the cheaper way. The reward is minus the cost.
 
     `info["error"]` is the offset from the path, abs(e), in m.
 
     ## Starting State
 
-    e is uniform in -1 .. 1 m, psi in -0.1 .. 0.1 rad, v in -0.5 .. 0.5 m/s, r in -0.1 .. 0.1 rad/s, delta is 0, and s uniform in
-    0 .. 150 m.
+    e is uniform in -1 .. 1 m, psi in -0.1 .. 0.1 rad, v in -0.5 .. 0.5 m/s, r in -0.1 .. 0.1 rad/s, delta is 0, and s uniform
+    in 0 .. 150 m.
 
     ## Episode End
 
@@ -83,8 +83,14 @@ class VehicleCostEnv(CostEnv):
     | `steering_lag_s` | 0.1 | time constant of the steering |
     | `steering_max_rad` | 0.2 | steering angle of action 1, at most 1 |
 
-    and the [disturbances](../cost_environments.md#disturbances) of all cost environments. `impulse` is a lateral force on the centre
-    of gravity (N), a gust.
+    and the [disturbances](../cost_environments.md#disturbances) of all cost environments. `impulse` is a lateral force on the
+    centre of gravity (N), a gust.
+
+    ## Reference Controller
+
+    Output regulation with a linear-quadratic regulator costs 0.0020 per step on average over 100 episodes and never leaves the
+    road. 100 of 100 end with an error below 0.01 m, the largest is 0.0055 m. On a slippery road, which it does not know of, it
+    loses a part of the cars ([results](../cost_environments.md#reference-controllers)).
 
     ## Version History
 
