@@ -74,7 +74,7 @@ class ReferenceController(ABC):
 
     def predict(
         self,
-        observation: np.ndarray,
+        observation: np.ndarray | dict[str, np.ndarray],
         state: tuple[np.ndarray, ...] | None = None,
         episode_start: np.ndarray | None = None,
         deterministic: bool = True,
@@ -89,6 +89,8 @@ class ReferenceController(ABC):
         :return: Actions in [-1, 1], float32, and ``state``
         :raises ValueError: If the observations are none of the environment
         """
+        if isinstance(observation, dict):
+            raise ValueError("observation is a dict, and the cost environments have arrays.")
         observations = np.asarray(observation, dtype=np.float64)
         size = self.observation_space.shape or ()
         if observations.ndim not in (1, 2) or observations.shape[-1:] != size:

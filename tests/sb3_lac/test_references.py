@@ -140,3 +140,5 @@ def test_other_environments_and_observations_are_refused():
     for observation in (np.zeros(2), np.zeros((4, 2)), np.zeros((2, 2, 3)), 0.0):
         with pytest.raises(ValueError, match="observation has shape"):
             controller.predict(observation)
+    with pytest.raises(ValueError, match="observation is a dict"):
+        controller.predict({"theta": np.zeros(3)})
