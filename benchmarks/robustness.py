@@ -24,7 +24,7 @@ import gymnasium as gym
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from battery_env.plotting import COLOURS, new_figure, save_figure
 from benchmarks.reporting import write_csv, write_text
@@ -64,20 +64,23 @@ _LABELS = {
 }
 
 
-def roll_out(model: BaseAlgorithm, make_env: Callable[[], gym.Env[Any, Any]], episodes: int, noise_std: float) -> pd.DataFrame:
+def roll_out(
+    model: PolicyPredictor, make_env: Callable[[], gym.Env[Any, Any]], episodes: int, noise_std: float = 0.0
+) -> pd.DataFrame:
     """
     Run a policy, deterministically, in all episodes at once.
 
-    :param model: the policy
+    :param model: the policy, or a controller
     :param make_env: makes the environment
     :param episodes: how many; the same starts and disturbances for every policy
     :param noise_std: standard deviation of the noise on each observed variable
-    :return: one row per episode: mean cost per step, length, and whether it died
+    :return: one row per episode: mean cost per step, length, distance to the goal at the end, and whether it died
     """
     envs = [make_env() for _ in range(episodes)]
     rngs = [np.random.default_rng((_EVALUATION_SEED, episode)) for episode in range(episodes)]
     observations = np.array([env.reset(seed=_EVALUATION_SEED + episode)[0] for episode, env in enumerate(envs)])
-    costs, lengths, died = np.zeros(episodes), np.zeros(episodes, dtype=int), np.zeros(episodes, dtype=bool)
+    costs, errors = np.zeros(episodes), np.zeros(episodes)
+    lengths, died = np.zeros(episodes, dtype=int), np.zeros(episodes, dtype=bool)
     running = np.arange(episodes)
     while len(running) > 0:
         noisy = observations[running]
@@ -88,12 +91,13 @@ def roll_out(model: BaseAlgorithm, make_env: Callable[[], gym.Env[Any, Any]], ep
         for episode, action in zip(running, actions, strict=True):
             observations[episode], _, terminated, truncated, info = envs[episode].step(action)
             costs[episode] += info["cost"]
+            errors[episode] = info["error"]
             lengths[episode] += 1
             died[episode] = terminated
             if not (terminated or truncated):
                 going_on.append(episode)
         running = np.array(going_on, dtype=int)
-    return pd.DataFrame({"cost": costs / lengths, "length": lengths, "died": died})
+    return pd.DataFrame({"cost": costs / lengths, "length": lengths, "error": errors, "died": died})
 
 
 def conditions(study: str) -> list[tuple[dict[str, Any], float]]:

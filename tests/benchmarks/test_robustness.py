@@ -37,7 +37,8 @@ class CountdownEnv(gym.Env):
     def step(self, action):
         self.n_steps += 1
         observation = np.full(2, self.n_steps, np.float32)
-        return observation, 0.0, self.dies and self.n_steps == 3, self.n_steps == 5, {"cost": float(self.n_steps)}
+        info = {"cost": float(self.n_steps), "error": 10.0 - self.n_steps}
+        return observation, 0.0, self.dies and self.n_steps == 3, self.n_steps == 5, info
 
 
 class RecordingPolicy:
@@ -65,7 +66,7 @@ def test_all_combinations_of_a_study_are_tried():
 def test_costs_lengths_and_deaths_are_those_of_each_episode():
     policy = RecordingPolicy(0.0)
     outcome = robustness.roll_out(policy, CountdownEnv, 4, 0.0)
-    expected = {"cost": [3.0, 2.0] * 2, "length": [5, 3] * 2, "died": [False, True] * 2}
+    expected = {"cost": [3.0, 2.0] * 2, "length": [5, 3] * 2, "error": [5.0, 7.0] * 2, "died": [False, True] * 2}
     pd.testing.assert_frame_equal(outcome, pd.DataFrame(expected))
     # the dead are not asked any more
     assert [len(seen) for seen in policy.seen] == [4, 4, 4, 2, 2]

@@ -10,11 +10,28 @@ import pytest
 from gymnasium.utils.env_checker import check_env as check_gymnasium_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
 from stable_baselines3.common.env_checker import check_env
 
-from sb3_lac.envs import CartPoleCostEnv, LinearCostEnv, OscillatorEnv
+from sb3_lac.envs import (
+    CartPoleCostEnv,
+    LinearCostEnv,
+    OscillatorEnv,
+    PendulumCostEnv,
+    QuadrotorCostEnv,
+    VehicleCostEnv,
+)
 
-IDS = ["CartPoleCost-v0", "LinearCost-v0", "Oscillator-v0"]
+EPISODE_STEPS = {
+    "CartPoleCost-v0": 250,
+    "LinearCost-v0": 100,
+    "Oscillator-v0": 400,
+    "PendulumCost-v0": 200,
+    "QuadrotorCost-v0": 300,
+    "VehicleCost-v0": 300,
+}
+IDS = list(EPISODE_STEPS)
+CLASSES = [CartPoleCostEnv, LinearCostEnv, OscillatorEnv, PendulumCostEnv, QuadrotorCostEnv, VehicleCostEnv]
 GAMMA = 0.95
 
 
@@ -36,7 +53,8 @@ def test_reward_is_minus_the_cost(env_id):
         assert reward == -info["cost"] <= 0
 
 
-@pytest.mark.parametrize("env_id", IDS)
+# A car without steering leaves its road
+@pytest.mark.parametrize("env_id", [env_id for env_id in IDS if env_id != "VehicleCost-v0"])
 def test_episode_ends_by_time_limit(env_id):
     env = gym.make(env_id, **({"noise_std": 0.0} if env_id == "LinearCost-v0" else {}))
     # Balanced, where anything can end before
@@ -46,10 +64,10 @@ def test_episode_ends_by_time_limit(env_id):
         _, _, terminated, truncated, _ = env.step(np.zeros(env.action_space.shape, dtype=np.float32))
         assert not terminated
         n_steps += 1
-    assert n_steps == {"CartPoleCost-v0": 250, "LinearCost-v0": 100, "Oscillator-v0": 400}[env_id]
+    assert n_steps == EPISODE_STEPS[env_id]
 
 
-@pytest.mark.parametrize("make", [CartPoleCostEnv, LinearCostEnv, OscillatorEnv])
+@pytest.mark.parametrize("make", CLASSES)
 def test_same_seed_same_episode_after_pickling_and_copying(make):
     env = make()
     env.reset(seed=3)
@@ -61,7 +79,7 @@ def test_same_seed_same_episode_after_pickling_and_copying(make):
         np.testing.assert_array_equal([twin.step(action)[0] for action in actions], expected)
 
 
-@pytest.mark.parametrize("make", [CartPoleCostEnv, LinearCostEnv, OscillatorEnv])
+@pytest.mark.parametrize("make", CLASSES)
 @settings(max_examples=20)
 @given(seed=st.integers(0, 2**31 - 1), scale=st.floats(0.0, 100.0))
 def test_observations_stay_in_their_space_whatever_the_actions(make, seed, scale):
@@ -138,6 +156,281 @@ def test_oscillator_of_equal_species_rests_where_making_and_decay_balance():
     np.testing.assert_allclose(messengers, 0.06 / 0.16 * p, rtol=1e-4)
 
 
+def after_one_step(env, state, action):
+    """The state to which a step leads."""
+    env.reset(options={"state": state})
+    env.step(np.asarray(action, dtype=np.float64))
+    return env.state
+
+
+def test_pendulum_follows_newtons_law():
+    env = PendulumCostEnv(mass_kg=0.7, length_m=1.3, damping_Nms=0.4)
+
+    def law(_, x):
+        # Torques of gravity, friction and motor about the pivot
+        return [x[1], (0.7 * 9.81 * 1.3 * np.sin(x[0]) - 0.4 * x[1] + 3.0 * 0.6) / (0.7 * 1.3**2)]
+
+    expected = solve_ivp(law, (0.0, 0.05), [2.0, -3.0], rtol=1e-10, atol=1e-12).y[:, -1]
+    np.testing.assert_allclose(after_one_step(env, [2.0, -3.0], [0.6]), expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("theta", [0.5, 1.5, 3.0])
+def test_energy_of_the_free_pendulum_is_conserved(theta):
+    env = PendulumCostEnv()
+    env.reset(options={"state": [theta, 1.0]})
+    energies = []
+    for _ in range(200):
+        angle, speed = env.state
+        energies.append(0.5 * speed**2 + 9.81 * np.cos(angle))
+        env.step(np.zeros(1))
+    np.testing.assert_allclose(energies, energies[0], atol=1e-3 * 9.81)
+
+
+def test_pendulum_goes_round_and_its_speed_ends_at_that_of_the_motor():
+    env = PendulumCostEnv()
+    state = after_one_step(env, [3.1, 4.0], [0.0])
+    assert -np.pi <= state[0] < -2.9
+    assert after_one_step(env, [-2.0, -11.99], [-1.0])[1] == -12.0
+
+
+def test_pendulum_cannot_be_lifted_by_its_motor_at_once():
+    env = PendulumCostEnv()
+    env.reset(options={"state": [np.pi, 0.0]})
+    angles = [env.step(np.ones(1))[4]["error"] for _ in range(200)]
+    assert min(angles) > np.pi / 2
+
+
+def test_quadrotor_falls_and_hovers():
+    env = QuadrotorCostEnv()
+    env.reset(options={"state": [0.0, 1.0, 0.3, 0.5, 0.0, 0.2]})
+    for _ in range(20):
+        env.step(-np.ones(2))
+    expected = [0.5 * 0.4, 1.0 - 0.5 * 9.81 * 0.4**2, 0.3 + 0.2 * 0.4, 0.5, -9.81 * 0.4, 0.2]
+    np.testing.assert_allclose(env.state, expected, rtol=1e-9)
+    np.testing.assert_allclose(after_one_step(env, [0.3, -0.4, 0.0, 0.0, 0.0, 0.0], [0.0, 0.0])[:2], [0.3, -0.4])
+
+
+def test_work_of_the_rotors_is_the_energy_of_the_quadrotor():
+    env = QuadrotorCostEnv(mass_kg=1.2, inertia_kg_m2=0.03, arm_m=0.3)
+    m, inertia, arm = 1.2, 0.03, 0.3
+    left, right = 9.81 * 0.5 * (1 + 0.1), 9.81 * 0.5 * (1 + 0.15)
+
+    def powers(_, x):
+        # Each force acts along the machine's axis at the end of an arm, whose velocity is that of the middle and of the turn
+        axis = np.array([-np.sin(x[2]), np.cos(x[2])])
+        along = axis @ x[3:5]
+        power = left * (along - arm * x[5]) + right * (along + arm * x[5])
+        pull = (left + right) / m * axis
+        return [x[3], x[4], x[5], pull[0], pull[1] - 9.81, arm * (right - left) / inertia, power]
+
+    def energy(x):
+        return 0.5 * m * (x[3] ** 2 + x[4] ** 2) + 0.5 * inertia * x[5] ** 2 + m * 9.81 * x[1]
+
+    start = [0.1, 0.2, 0.3, 0.4, -0.5, 0.6]
+    env.reset(options={"state": start})
+    for _ in range(10):
+        env.step(np.array([0.1, 0.15]))
+    path = solve_ivp(powers, (0.0, 0.2), [*start, 0.0], rtol=1e-10, atol=1e-12).y[:, -1]
+    np.testing.assert_allclose(env.state, path[:6], rtol=1e-6)
+    assert energy(env.state) - energy(start) == pytest.approx(path[6], rel=1e-6)
+
+
+def test_vehicle_is_where_it_would_be_on_a_map():
+    # The same car in coordinates of the ground, and the path beside it
+    env = VehicleCostEnv(mass_kg=1400.0, inertia_kg_m2=2300.0, friction=0.8)
+    start, action = [0.8, 0.05, 0.3, -0.1, 0.01, 20.0], 0.2
+    m, inertia, front, rear, speed = 1400.0, 2300.0, 1.3, 1.4, 15.0
+
+    def tyre(load, slip):
+        return 0.8 * load * np.sin(1.5 * np.arctan(10.0 * slip))
+
+    def car(_, x):
+        _, _, yaw, lateral, rate, steering = x
+        loads = m * 9.81 * np.array([rear, front]) / (front + rear)
+        on_front = tyre(loads[0], steering - np.arctan2(lateral + front * rate, speed))
+        on_rear = tyre(loads[1], -np.arctan2(lateral - rear * rate, speed))
+        return [
+            speed * np.cos(yaw) - lateral * np.sin(yaw),
+            speed * np.sin(yaw) + lateral * np.cos(yaw),
+            rate,
+            (on_front * np.cos(steering) + on_rear) / m - speed * rate,
+            (front * on_front * np.cos(steering) - rear * on_rear) / inertia,
+            (0.2 * action - steering) / 0.1,
+        ]
+
+    def path(s, y):
+        return [np.cos(y[2]), np.sin(y[2]), env.curvature(s)]
+
+    env.reset(options={"state": start})
+    for _ in range(20):
+        env.step(np.array([action]))
+    # The path starts in the origin along the first axis
+    end = solve_ivp(car, (0.0, 1.0), [0.0, start[0], start[1], *start[2:5]], rtol=1e-10, atol=1e-12).y[:, -1]
+    foot = solve_ivp(path, (start[5], env.state[5]), [0.0, 0.0, 0.0], rtol=1e-10, atol=1e-12).y[:, -1]
+    along, across = np.array([np.cos(foot[2]), np.sin(foot[2])]), np.array([-np.sin(foot[2]), np.cos(foot[2])])
+    difference = end[:2] - foot[:2]
+    assert difference @ along == pytest.approx(0.0, abs=1e-3)
+    assert env.state[0] == pytest.approx(difference @ across, abs=1e-3)
+    assert abs(env.state[0] - 0.8) > 0.2
+    np.testing.assert_allclose(env.state[1:5], [end[2] - foot[2], *end[3:]], atol=1e-3)
+
+
+def test_the_observed_path_tells_the_place_on_it():
+    env = VehicleCostEnv()
+    for place in (10.0, 100.0, 149.0):
+        observation, _ = env.reset(options={"state": [0.0] * 5 + [place]})
+        expected = [15.0 * 0.015 * np.sin(2 * np.pi * s / 150) for s in (place, place + 15.0)]
+        np.testing.assert_allclose(observation[5:], expected, rtol=1e-5)
+    # The path goes on where it began
+    assert 0.0 < after_one_step(env, [0.0] * 5 + [149.9], [0.0])[5] < 1.0
+
+
+@pytest.mark.parametrize(
+    ("env", "limits", "leaving"),
+    [
+        (QuadrotorCostEnv(), [1.5, 1.5, np.pi / 2, 0, 0, 0], [([1.49, 0, 0, 5, 0, 0]), ([0, 0, 1.56, 0, 0, 5])]),
+        (VehicleCostEnv(), [2.0, 0.9, 0.1, 0, 0.2, 0], [([1.99, 0.5, 0, 0, 0, 0]), ([0, 0.99, 0, 1, 0, 0])]),
+    ],
+    ids=["quadrotor", "vehicle"],
+)
+def test_leaving_costs_as_much_as_a_whole_episode_at_worst(env, limits, leaving):
+    rng = np.random.default_rng(0)
+    costs = []
+    for _ in range(500):
+        state = np.array(limits) * rng.choice([-1.0, 0.0, 1.0], len(limits))
+        costs.append(env._cost(state, rng.choice([-1.0, 1.0], env.action_space.shape), state))
+    assert not any(terminated for _, terminated in costs)
+    assert 0.9 < max(cost for cost, _ in costs) <= 1.0
+    for state in leaving:
+        env.reset(options={"state": state})
+        _, reward, terminated, _, _ = env.step(np.zeros(env.action_space.shape))
+        assert terminated and reward == -300.0
+    assert env.TERMINAL_COST == EPISODE_STEPS[type(env).__name__.removesuffix("Env") + "-v0"]
+
+
+def test_costs_of_the_new_problems():
+    pendulum, quadrotor, vehicle = PendulumCostEnv(), QuadrotorCostEnv(), VehicleCostEnv()
+    pendulum.reset(options={"state": [1.0, 2.0]})
+    *_, info = pendulum.step(np.array([-0.5]))
+    theta, speed = pendulum.state
+    assert info["cost"] == pytest.approx(theta**2 + 0.1 * speed**2 + 0.01 * 1.5**2)
+    quadrotor.reset(options={"state": [0.5, -0.4, 0.3, 0.0, 0.0, 0.0]})
+    *_, info = quadrotor.step(np.array([-0.5, 0.2]))
+    x, z, phi = quadrotor.state[:3]
+    assert info["cost"] == pytest.approx(0.16 * (x**2 + z**2) + 0.07 * phi**2 + 0.05 * (0.25 + 0.04))
+    vehicle.reset(options={"state": [0.5, 0.1, 0.3, 0.0, 0.04, 0.0]})
+    *_, info = vehicle.step(np.array([-0.5]))
+    offset, heading, lateral = vehicle.state[:3]
+    course = heading + np.arctan(lateral / 15.0)
+    assert info["cost"] == pytest.approx(0.2 * offset**2 + 0.1 * course**2 + 0.1 * ((-0.5 - 0.2) / 2) ** 2)
+
+
+@pytest.mark.parametrize(
+    ("make", "state", "error"),
+    [
+        (CartPoleCostEnv, [0.0] * 4, 0.0),
+        (LinearCostEnv, [0.0] * 2, 0.0),
+        (PendulumCostEnv, [0.0] * 2, 0.0),
+        (QuadrotorCostEnv, [0.0] * 6, 0.0),
+        (VehicleCostEnv, [0.0] * 6, 0.0),
+        # The tip of a pole of 1 m
+        (CartPoleCostEnv, [3.0, 0.0, 0.3, 0.0], np.hypot(3.0 + np.sin(0.3), 1 - np.cos(0.3))),
+        (LinearCostEnv, [3.0, -4.0], 5.0),
+        (OscillatorEnv, [0.0, 0.0, 0.0, 3.0, 0.0, 0.0], 5.0),
+        (PendulumCostEnv, [-3.0, 1.0], 3.0),
+        (QuadrotorCostEnv, [-3.0, 2.0, 1.0, 0.0, 0.0, 0.0], np.sqrt(13.0)),
+        (VehicleCostEnv, [-2.0, 0.5, 0.0, 0.0, 0.0, 7.0], 2.0),
+    ],
+)
+def test_error_is_the_distance_to_the_goal(make, state, error):
+    env = make()
+    env.reset(options={"state": state})
+    assert env._error() == pytest.approx(error)
+
+
+@pytest.mark.parametrize("make", CLASSES)
+class TestDisturbances:
+    """They are the same for every problem."""
+
+    @staticmethod
+    def states(env, actions):
+        """States of an episode from a fixed start in the middle of things."""
+        rng = np.random.default_rng(1)
+        env.reset(seed=0)
+        env.reset(seed=0, options={"state": np.abs(env.state) * rng.uniform(0.1, 0.2, len(env.state))})
+        return np.array([env.step(action) and env.state for action in actions])
+
+    @pytest.fixture
+    def actions(self, make):
+        return np.random.default_rng(0).uniform(-0.3, 0.3, (12, *make().action_space.shape))
+
+    @staticmethod
+    def quiet(make, **disturbances):
+        return make(**({"noise_std": 0.0} if make is LinearCostEnv else {}), **disturbances)
+
+    def test_changed_parameters_change_the_plant_and_not_what_is_known_of_it(self, make, actions):
+        known = self.quiet(make)
+        usual = self.states(known, actions)
+        for name, value in known.nominal_parameters.items():
+            changed = 1.5 * value if value > 0 else 0.5
+            surprised = self.quiet(make, changed_parameters={name: changed})
+            assert surprised.nominal_parameters == known.nominal_parameters
+            assert getattr(surprised, name) == changed and getattr(known, name) == value
+            different = self.states(surprised, actions)
+            assert not np.allclose(usual, different, rtol=1e-6, atol=1e-9), name
+            # As if it had been made so
+            np.testing.assert_array_equal(different, self.states(self.quiet(make, **{name: changed}), actions))
+
+    def test_impulses_come_at_their_interval_in_both_directions(self, make, actions):
+        usual, pushed = self.quiet(make), self.quiet(make, impulse=0.1, impulse_interval=3)
+        signs = set()
+        for seed in range(12):
+            steps = []
+            for env in (usual, pushed):
+                env.reset(seed=seed)
+                steps.append(np.array([env.step(action) and env.state for action in actions[:3]]))
+            difference = steps[1] - steps[0]
+            assert not difference[:2].any() and difference[2].any()
+            signs.add(float(np.sign(difference[2][np.flatnonzero(difference[2])[0]])))
+        assert signs == {-1.0, 1.0}
+
+    def test_process_noise_has_its_size_on_each_variable(self, make, actions):
+        usual = self.quiet(make)
+        n = len(usual.state_high)
+        # Far from any limit
+        start = np.minimum(0.1 * usual.state_high, 0.1)
+        sizes = 1e-4 * np.arange(n)
+        env = self.quiet(make, process_noise=sizes)
+        expected = after_one_step(usual, start, actions[0])
+        noise = np.array([after_one_step(env, start, actions[0]) - expected for _ in range(400)])
+        np.testing.assert_allclose(noise.std(axis=0), sizes, rtol=0.2, atol=1e-12)
+        assert np.all(np.abs(noise.mean(axis=0)) <= 0.25 * sizes + 1e-12)
+
+    def test_observation_noise_is_on_what_is_seen_and_nowhere_else(self, make, actions):
+        usual, noisy = self.quiet(make), self.quiet(make, observation_noise=0.05)
+        first = [usual.reset(seed=2)[0], noisy.reset(seed=2)[0]]
+        steps = [[env.step(action) for action in actions] for env in (usual, noisy)]
+        assert [step[1:] for step in steps[0]] == [step[1:] for step in steps[1]]
+        seen = [np.array([start, *(step[0] for step in taken)]) for start, taken in zip(first, steps, strict=True)]
+        assert seen[1].dtype == np.float32
+        assert all(noisy.observation_space.contains(observation) for observation in seen[1])
+        differences = (seen[1] - seen[0]).ravel()
+        assert 0.02 < differences.std() < 0.08 and np.any(seen[1][0] != seen[0][0])
+
+    def test_delayed_actions_are_those_of_steps_before(self, make, actions):
+        delayed = self.states(self.quiet(make, action_delay=3), actions)
+        shifted = np.concatenate((np.zeros_like(actions[:3]), actions[:-3]))
+        np.testing.assert_array_equal(delayed, self.states(self.quiet(make), shifted))
+
+    def test_starts_do_not_depend_on_the_disturbances(self, make, actions):
+        everything = {"impulse": 1.0, "process_noise": 0.1, "observation_noise": 0.1, "action_delay": 2}
+        plain, disturbed = make(), make(**everything)
+        for env in (plain, disturbed):
+            env.reset(seed=5)
+        np.testing.assert_array_equal(plain.state, disturbed.state)
+        check_env(disturbed)
+
+
 def linear_roll_outs(env, gain, n_episodes, n_steps):
     """States and costs of many roll-outs of the policy u = -K s, without the environment."""
     rng = np.random.default_rng(0)
@@ -207,7 +500,16 @@ def test_value_of_a_gain_that_does_not_stabilise_is_refused():
         (CartPoleCostEnv, {"pole_half_length_m": np.nan}, "pole_half_length_m=nan must be positive"),
         (CartPoleCostEnv, {"impulse_N": -1.0}, "impulse_N=-1.0 must be finite and at least 0"),
         (OscillatorEnv, {"light": np.inf}, "light=inf must be positive and finite"),
-        (OscillatorEnv, {"process_noise": -1.0}, "process_noise=-1.0 must be finite and at least 0"),
+        (OscillatorEnv, {"process_noise": -1.0}, "process_noise=-1.0 must be a number, or 6 of them, finite and at least 0"),
+        (OscillatorEnv, {"observation_noise": [0.1] * 6}, "must be a number, or 8 of them"),
+        (PendulumCostEnv, {"damping_Nms": -0.1}, "damping_Nms=-0.1 must be finite and at least 0"),
+        (PendulumCostEnv, {"changed_parameters": {"length_m": 0.0}}, "length_m=0.0 must be positive"),
+        (PendulumCostEnv, {"changed_parameters": {"length": 2.0}}, r"has \['length'\], which are none of \['damping_Nms', "),
+        (QuadrotorCostEnv, {"action_delay": -1}, "action_delay=-1 must be finite and at least 0"),
+        (QuadrotorCostEnv, {"action_delay": 0.5}, "action_delay=0.5 must be a whole number"),
+        (QuadrotorCostEnv, {"impulse_interval": 2.5}, "impulse_interval=2.5 must be a whole number"),
+        (VehicleCostEnv, {"steering_max_rad": 1.5}, "steering_max_rad=1.5 must be at most 1"),
+        (CartPoleCostEnv, {"impulse_N": 1.0, "impulse": 2.0}, "are the same: give one of them"),
         (LinearCostEnv, {"noise_std": np.nan}, "noise_std=nan must be finite and at least 0"),
         (LinearCostEnv, {"control_max": 0.0}, "control_max=0.0 must be positive"),
         (LinearCostEnv, {"render_mode": "human"}, "render_mode='human' must be one of"),

@@ -1,0 +1,161 @@
+"""
+How well the reference controllers of the cost environments do, without and with disturbances that they do not know of: what a
+policy that was learned is to be compared with.
+
+.. code-block:: bash
+
+  python -m benchmarks.references
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from battery_env.plotting import new_figure, save_figure
+from benchmarks.reporting import write_csv, write_text
+from benchmarks.robustness import roll_out
+from sb3_lac.envs import CostEnv, reference_controller
+
+# each environment: its impulse, parameters that are not as they should be, noise on states, noise on observations, delay
+_DISTURBANCES: dict[str, tuple[float, dict[str, float], float, float, int]] = {
+    "LinearCost-v0": (5.0, {"control_max": 1.0}, 0.03, 0.1, 2),
+    "CartPoleCost-v0": (100.0, {"pole_half_length_m": 1.0}, 0.01, 0.02, 2),
+    "Oscillator-v0": (3.0, {"protein_decay": 0.05}, 0.1, 0.1, 1),
+    "PendulumCost-v0": (10.0, {"mass_kg": 1.4}, 0.01, 0.03, 2),
+    "QuadrotorCost-v0": (50.0, {"mass_kg": 1.2}, 0.01, 0.03, 2),
+    "VehicleCost-v0": (20_000.0, {"friction": 0.5}, 0.01, 0.03, 2),
+}
+# No episode ends within 15 steps after an impulse
+_IMPULSE_INTERVAL = 85
+
+
+def conditions(env_id: str) -> dict[str, dict[str, Any]]:
+    """
+    The disturbances that a controller is tried with, one at a time.
+
+    :param env_id: id of a cost environment
+    :return: arguments of the environment by name of the condition
+    """
+    impulse, changed, process_noise, observation_noise, delay = _DISTURBANCES[env_id]
+    return {
+        "none": {},
+        "impulses": {"impulse": impulse, "impulse_interval": _IMPULSE_INTERVAL},
+        "other parameters": {"changed_parameters": changed},
+        "process noise": {"process_noise": process_noise},
+        "observation noise": {"observation_noise": observation_noise},
+        "action delay": {"action_delay": delay},
+    }
+
+
+def run(env_id: str, episodes: int) -> pd.DataFrame:
+    """
+    Try the reference controller under all conditions.
+
+    :param env_id: id of a cost environment
+    :param episodes: episodes for each condition, with the same starts
+    :return: one row per condition
+    """
+    env = gym.make(env_id)
+    problem = env.unwrapped
+    assert isinstance(problem, CostEnv)
+    controller = reference_controller(env)
+    rows = []
+    for condition, arguments in conditions(env_id).items():
+        outcome = roll_out(controller, partial(gym.make, env_id, **arguments), episodes)
+        rows.append(
+            {
+                "environment": env_id,
+                "disturbance": condition,
+                "arguments": ", ".join(f"{name}={value}" for name, value in arguments.items()),
+                "cost": outcome["cost"].mean(),
+                "cost_worst": outcome["cost"].max(),
+                "error_median": outcome["error"].median(),
+                "error_worst": outcome["error"].max(),
+                "tolerance": problem.error_tolerance,
+                "at_goal": ((outcome["error"] <= problem.error_tolerance) & ~outcome["died"]).mean(),
+                "died": outcome["died"].mean(),
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def report(results: pd.DataFrame) -> str:
+    """
+    One table, as Markdown.
+
+    :param results: see ``run()``, of all environments
+    :return: the table
+    """
+    shown = {
+        "environment": results["environment"],
+        "disturbance": results["disturbance"] + [f" ({text})" if text else "" for text in results["arguments"]],
+        "cost per step, mean (worst episode)": [
+            f"{mean:.2g} ({worst:.2g})" for mean, worst in zip(results["cost"], results["cost_worst"], strict=True)
+        ],
+        "error at the end, median (worst)": [
+            f"{median:.2g} ({worst:.2g})"
+            for median, worst in zip(results["error_median"], results["error_worst"], strict=True)
+        ],
+        "tolerance": results["tolerance"],
+        "at the goal": [f"{share:.0%}" for share in results["at_goal"]],
+        "died": [f"{share:.0%}" for share in results["died"]],
+    }
+    return pd.DataFrame(shown).to_markdown(index=False, disable_numparse=True) + "\n"
+
+
+def plot(results: pd.DataFrame) -> Figure:
+    """
+    The share of episodes that end at the goal, and in brackets of those that die.
+
+    :param results: see ``run()``, of all environments
+    :return: the figure
+    """
+    shares, deaths = (
+        results.pivot_table(index="environment", columns="disturbance", values=column, sort=False)
+        for column in ("at_goal", "died")
+    )
+    figure = new_figure(7.6, 3.2)
+    axes = figure.subplots()
+    axes.imshow(shares, vmin=0.0, vmax=1.0, aspect="auto", cmap="cividis")
+    for i, j in np.ndindex(shares.shape):
+        share, death = shares.iloc[i, j], deaths.iloc[i, j]
+        text = f"{share:.0%}" + (f" ({death:.0%})" if death > 0 else "")
+        axes.text(j, i, text, ha="center", va="center", color="black" if share > 0.5 else "white", size=8)
+    axes.set_xticks(range(shares.shape[1]), [condition.replace(" ", "\n") for condition in shares.columns])
+    axes.set_yticks(range(shares.shape[0]), list(shares.index))
+    axes.set_title("episodes that end at the goal (that die)")
+    return figure
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """
+    The command line.
+
+    :param arguments: of the command line by default
+    """
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--episodes", type=int, default=100, help="episodes for each environment and condition")
+    parser.add_argument("--out", type=Path, default=Path("results/references"))
+    chosen = parser.parse_args(arguments)
+    if chosen.episodes < 1:
+        parser.error("--episodes must be at least 1")
+    results = pd.concat([run(env_id, chosen.episodes) for env_id in _DISTURBANCES], ignore_index=True)
+    write_csv(chosen.out / "references.csv", results, {"episodes": chosen.episodes})
+    save_figure(plot(results), chosen.out / "references.png")
+    text = report(results)
+    write_text(chosen.out / "references.md", text)
+    sys.stdout.write("\n" + text)
+
+
+if __name__ == "__main__":
+    main()
