@@ -26,7 +26,7 @@ $(VENV)/.installed: setup.cfg pyproject.toml battery_env/setup.cfg battery_env/p
 	@echo "installing $(TORCH)"
 	@$(call logged,$(BIN)/python -m pip install "$(TORCH)")
 	@echo "installing battery_env and sb3_lac, with all extras"
-	@$(call logged,$(BIN)/python -m pip install --editable ./battery_env --editable ".[zoo$(comma)peers$(comma)dev$(comma)docs]")
+	@$(call logged,$(BIN)/python -m pip install --editable ./battery_env --editable ".[zoo$(comma)peers$(comma)onnx$(comma)dev$(comma)docs]")
 	@touch $@
 
 install: $(VENV)/.installed  ## make .venv with everything in it

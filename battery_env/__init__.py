@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from battery_env.calibration.registration import register_environments
 
 if TYPE_CHECKING:
+    from battery_env.calibration.onnx_policy import OnnxPolicy
     from battery_env.calibration.policy import PolicyEstimator
     from battery_env.cells import Discharge, load_nasa_discharges, read_discharge_csv
     from battery_env.electrochemistry import NEW_CELL, CellParameters, Trajectory, initial_state, simulate, step, voltage
@@ -39,6 +40,7 @@ _MODULES = {
     "ExtendedKalmanFilter": "battery_env.estimators",
     "GreedyOneStep": "battery_env.estimators",
     "LeastSquares": "battery_env.estimators",
+    "OnnxPolicy": "battery_env.calibration.onnx_policy",
     "PolicyEstimator": "battery_env.calibration.policy",
     "RandomSensorErrors": "battery_env.sensors",
     "RecordModel": "battery_env.record_model",
@@ -67,6 +69,7 @@ __all__ = [
     "ExtendedKalmanFilter",
     "GreedyOneStep",
     "LeastSquares",
+    "OnnxPolicy",
     "PolicyEstimator",
     "RandomSensorErrors",
     "RecordModel",

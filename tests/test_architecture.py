@@ -138,10 +138,10 @@ def declared(distributions, extras):
 @pytest.mark.parametrize(
     ("package", "distributions", "extras"),
     [
-        ("battery_env", ("battery_env",), ("sb3",)),
-        ("sb3_lac", (".",), ("zoo",)),
+        ("battery_env", ("battery_env",), ("sb3", "onnx")),
+        ("sb3_lac", (".",), ("zoo", "onnx")),
         ("benchmarks", ("battery_env", "."), ("zoo", "peers")),
-        ("tests", ("battery_env", "."), ("zoo", "peers", "dev")),
+        ("tests", ("battery_env", "."), ("zoo", "peers", "onnx", "dev")),
     ],
 )
 def test_every_import_is_declared(package, distributions, extras):

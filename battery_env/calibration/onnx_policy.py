@@ -1,0 +1,73 @@
+"""A trained policy from a file, without the package that it was trained with."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+class OnnxPolicy:
+    """
+    A policy as a graph of tensors, run by onnxruntime on one thread: no torch, and no pickle. ``PolicyEstimator`` takes it
+    like any other policy.
+
+    .. code-block:: python
+
+      policy = OnnxPolicy("voltage_joint.onnx")
+      estimator = PolicyEstimator(policy, policy.env_id)
+
+    ``sb3_lac.onnx.export_onnx`` writes such files, of any algorithm of Stable-Baselines3. Needs the extra
+    ``battery_env[onnx]``.
+
+    :param path: an ONNX file with one float32 input of shape (n, ...) and one output of actions of shape (n, ...)
+    :raises FileNotFoundError: if there is no such file
+    :raises ValueError: if it is no ONNX file, or has other inputs and outputs
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        # not a dependency of the package
+        from onnxruntime import InferenceSession, SessionOptions
+        from onnxruntime.capi.onnxruntime_pybind11_state import Fail, InvalidGraph, InvalidProtobuf
+
+        path = Path(path)
+        options = SessionOptions()
+        options.intra_op_num_threads = 1
+        try:
+            self._session = InferenceSession(path.read_bytes(), options, providers=["CPUExecutionProvider"])
+        except (Fail, InvalidGraph, InvalidProtobuf) as error:
+            raise ValueError(f"{path} is no ONNX file: {error}") from error
+        inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
+        if len(inputs) != 1 or len(outputs) != 1:
+            raise ValueError(f"{path} must have one input and one output, it has {len(inputs)} and {len(outputs)}")
+        self._input = inputs[0].name
+        #: What the file says of itself, e.g. ``algorithm`` and ``env_id``
+        self.description: dict[str, str] = self._session.get_modelmeta().custom_metadata_map
+        #: Shape of one observation
+        self.observation_shape: tuple[int, ...] = tuple(inputs[0].shape[1:])
+
+    @property
+    def env_id(self) -> str:
+        """Id of the environment that the policy was trained on; an error if the file does not say it."""
+        try:
+            return self.description["env_id"]
+        except KeyError:
+            raise ValueError("The file does not say which environment its policy is for: state the id yourself.") from None
+
+    def predict(self, observation: Any, /, *, deterministic: bool = True) -> tuple[np.ndarray, None]:
+        """
+        Actions for a batch of observations.
+
+        :param observation: shape (n, ...)
+        :param deterministic: must be true, as the file holds no distribution
+        :return: actions, shape (n, ...), and no state
+        :raises ValueError: for observations of another shape, or if a sample is asked for
+        """
+        if not deterministic:
+            raise ValueError("deterministic must be True: an ONNX file holds the deterministic policy only")
+        observation = np.asarray(observation, dtype=np.float32)
+        if observation.shape[1:] != self.observation_shape:
+            raise ValueError(f"observation must have shape (n, {self.observation_shape}), got {observation.shape}")
+        (action,) = self._session.run(None, {self._input: observation})
+        return action, None

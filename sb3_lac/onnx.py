@@ -1,0 +1,165 @@
+"""Policies of Stable-Baselines3 as ONNX files, which run without torch."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.vec_env import VecNormalize, unwrap_vec_normalize
+from torch.distributions import Distribution
+
+if TYPE_CHECKING:
+    from onnx import ModelProto
+
+#: What torch and onnxruntime may differ by in any action of the check, relative to the range of the actions
+TOLERANCE = 1e-5
+_N_CHECKED = 64
+
+
+class DeterministicPolicy(th.nn.Module):
+    """
+    ``predict(observation, deterministic=True)`` as one graph of tensors, from the environment's observations to its actions.
+
+    :param policy: A policy with ``Box`` observations and actions
+    :param vec_normalize: What normalizes its observations, if anything does
+    """
+
+    low: th.Tensor
+    high: th.Tensor
+    mean: th.Tensor
+    deviation: th.Tensor
+
+    def __init__(self, policy: BasePolicy, vec_normalize: VecNormalize | None = None) -> None:
+        super().__init__()
+        assert isinstance(policy.action_space, spaces.Box)
+        self.policy = policy
+        self.register_buffer("low", th.as_tensor(policy.action_space.low))
+        self.register_buffer("high", th.as_tensor(policy.action_space.high))
+        self.clip_obs: float | None = None
+        if vec_normalize is not None and vec_normalize.norm_obs:
+            assert isinstance(vec_normalize.obs_rms, RunningMeanStd)  # of a Box
+            self.clip_obs = vec_normalize.clip_obs
+            self.register_buffer("mean", th.as_tensor(vec_normalize.obs_rms.mean, dtype=th.float32))
+            variance = vec_normalize.obs_rms.var + vec_normalize.epsilon
+            self.register_buffer("deviation", th.as_tensor(np.sqrt(variance), dtype=th.float32))
+
+    def forward(self, observation: th.Tensor) -> th.Tensor:
+        """
+        :param observation: Shape (n, ...)
+        :return: Actions in the units of the environment, shape (n, ...)
+        """
+        if self.clip_obs is not None:
+            observation = ((observation - self.mean) / self.deviation).clamp(-self.clip_obs, self.clip_obs)
+        action = self.policy._predict(observation, deterministic=True).reshape(-1, *self.low.shape)
+        if self.policy.squash_output:
+            return self.low + 0.5 * (action + 1.0) * (self.high - self.low)
+        return action.clamp(self.low, self.high)
+
+
+def export_onnx(model: BaseAlgorithm | BasePolicy, path: str | Path, env_id: str | None = None) -> Path:
+    """
+    Write the deterministic policy of a model as an ONNX file: input ``observation``, output ``action``, both float32, with the
+    normalization of the observations by ``VecNormalize`` and the scaling of the actions included. The file is checked with
+    onnxruntime before it takes its name.
+
+    Needs the extra ``sb3_lac[onnx]``.
+
+    :param model: LAC, SAC, TD3, TQC, PPO, ... or a policy
+    :param path: Of the file, which must not exist yet; ``.onnx`` is added where it is missing
+    :param env_id: Id of the environment that the policy is for, kept in the file; by default that of the model's environment
+    :return: Path of the file
+    :raises ValueError: If its spaces are not ``Box``, or if the file does not do what the policy does
+    :raises FileExistsError: If the file exists
+    """
+    import onnxruntime
+
+    path = Path(path)
+    if path.suffix != ".onnx":
+        path = path.with_name(path.name + ".onnx")
+    if path.exists():
+        raise FileExistsError(f"{path} exists: move it away, or give another path.")
+    policy = model if isinstance(model, BasePolicy) else model.policy
+    for name, space in (("observation", policy.observation_space), ("action", policy.action_space)):
+        if not isinstance(space, spaces.Box):
+            raise ValueError(f"The {name} space {space} must be a Box: other spaces have no ONNX export.")
+    vec_normalize = None
+    if isinstance(model, BaseAlgorithm) and model.env is not None:
+        vec_normalize = unwrap_vec_normalize(model.env)
+        if env_id is None:
+            spec = model.env.get_attr("spec")[0]
+            env_id = None if spec is None else spec.id
+
+    was_training = policy.training
+    policy.set_training_mode(False)
+    module = DeterministicPolicy(policy, vec_normalize).eval()
+    observations = _observations(policy.observation_space)
+    with th.no_grad():
+        expected = module(th.as_tensor(observations, device=policy.device)).cpu().numpy()
+        content = _graph(module, observations, env_id, type(model).__name__).SerializeToString()
+    policy.set_training_mode(was_training)
+
+    session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
+    (action,) = session.run(None, {"observation": observations})
+    error = float(np.max(np.abs(action - expected) / (module.high - module.low).cpu().numpy()))
+    if not error <= TOLERANCE:
+        raise ValueError(f"The exported policy differs from the original by {error:g} of the range of its actions.")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f"{path.name}.{os.getpid()}.part")
+    part.write_bytes(content)
+    part.rename(path)
+    return path
+
+
+def _observations(space: spaces.Space) -> np.ndarray:
+    """
+    :param space: Space of the observations
+    :return: Observations to trace and check with, shape (n, ...)
+    """
+    assert isinstance(space, spaces.Box)
+    # Bounds like 3e38 are none: no observation comes near
+    low, high = np.maximum(space.low, -10.0), np.minimum(space.high, 10.0)
+    rng = np.random.default_rng(0)
+    return rng.uniform(low, np.maximum(low, high), (_N_CHECKED, *space.shape)).astype(np.float32)
+
+
+def _graph(module: DeterministicPolicy, observations: np.ndarray, env_id: str | None, algorithm: str) -> ModelProto:
+    """
+    :param module: What to write down
+    :param observations: An example, shape (n, ...)
+    :param env_id: See ``export_onnx``
+    :param algorithm: Name of the algorithm
+    :return: The graph, with any number of observations as its input
+    """
+    import onnx
+
+    import sb3_lac
+
+    # Checks of arguments depend on values, which a graph does not know
+    validate_args = Distribution._validate_args
+    Distribution.set_default_validate_args(False)
+    try:
+        program = th.onnx.export(
+            module,
+            (th.as_tensor(observations, device=module.low.device),),
+            input_names=["observation"],
+            output_names=["action"],
+            dynamic_shapes=({0: th.export.Dim("n")},),
+            dynamo=True,
+            verbose=False,
+        )
+    finally:
+        Distribution.set_default_validate_args(validate_args)
+    assert program is not None
+    graph = program.model_proto
+    description = {"algorithm": algorithm, "sb3_lac": sb3_lac.__version__}
+    if env_id is not None:
+        description["env_id"] = env_id
+    onnx.helper.set_model_props(graph, description)
+    return graph

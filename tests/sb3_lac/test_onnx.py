@@ -1,0 +1,94 @@
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from sb3_contrib import TQC
+from stable_baselines3 import PPO, SAC, TD3
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecNormalize
+
+from battery_env import OnnxPolicy, PolicyEstimator, TrajectoryDataset
+from sb3_lac import LAC, onnx
+from sb3_lac.onnx import export_onnx
+
+SMALL = {"net_arch": [16, 16]}  # copied, since Stable-Baselines3 writes into it
+
+
+@pytest.mark.parametrize("algorithm", [LAC, SAC, TD3, TQC, PPO])
+def test_the_file_does_what_the_policy_does(algorithm, tmp_path):
+    model = algorithm("MlpPolicy", "Pendulum-v1", seed=0, device="cpu", policy_kwargs=dict(SMALL))
+    policy = OnnxPolicy(export_onnx(model, tmp_path / "policy"))
+    observations = np.array([model.observation_space.sample() for _ in range(100)])
+    expected, _ = model.predict(observations, deterministic=True)
+    np.testing.assert_allclose(policy.predict(observations)[0], expected, atol=1e-5)
+    np.testing.assert_allclose(policy.predict(observations[:1])[0], expected[:1], atol=1e-5)
+    assert policy.env_id == "Pendulum-v1" and policy.description["algorithm"] == algorithm.__name__
+    assert policy.observation_shape == (3,)
+    # The model is as it was, and nothing else was written
+    assert [file.name for file in tmp_path.iterdir()] == ["policy.onnx"]
+    assert th.distributions.Distribution._validate_args
+
+
+def test_observations_are_normalized_as_in_training(tmp_path):
+    env = VecNormalize(make_vec_env("LinearCost-v0"), clip_obs=2.0)
+    env.obs_rms.mean, env.obs_rms.var = np.array([3.0, -1.0]), np.array([4.0, 0.01])
+    model = LAC("MlpPolicy", env, seed=0, device="cpu", policy_kwargs=dict(SMALL))
+    policy = OnnxPolicy(export_onnx(model, tmp_path / "policy.onnx"))
+    observations = np.random.default_rng(0).uniform(-10, 10, (50, 2)).astype(np.float32)
+    expected, _ = model.predict(env.normalize_obs(observations), deterministic=True)
+    np.testing.assert_allclose(policy.predict(observations)[0], expected, atol=1e-5)
+
+
+def test_gsde_exports_its_mean(tmp_path):
+    model = LAC("MlpPolicy", "Pendulum-v1", use_sde=True, seed=0, device="cpu", policy_kwargs=dict(SMALL))
+    policy = OnnxPolicy(export_onnx(model, tmp_path / "policy"))
+    observations = np.array([model.observation_space.sample() for _ in range(20)])
+    np.testing.assert_allclose(policy.predict(observations)[0], model.predict(observations, deterministic=True)[0], atol=1e-5)
+
+
+def test_a_calibration_policy_runs_without_torch(tmp_path):
+    model = LAC("MlpPolicy", "BatteryRo-v0", seed=0, device="cpu", policy_kwargs=dict(SMALL))
+    policy = OnnxPolicy(export_onnx(model, tmp_path / "policy"))
+    discharge = TrajectoryDataset.paper("r_o")[0]
+    estimate = PolicyEstimator(policy, policy.env_id).estimate(discharge)
+    assert estimate.r_o == pytest.approx(PolicyEstimator(model, "BatteryRo-v0").estimate(discharge).r_o, rel=1e-4)
+
+
+def test_nothing_is_overwritten(tmp_path):
+    model = LAC("MlpPolicy", "Pendulum-v1", device="cpu", policy_kwargs=dict(SMALL))
+    (tmp_path / "policy.onnx").write_text("mine")
+    with pytest.raises(FileExistsError, match=r"policy\.onnx exists"):
+        export_onnx(model, tmp_path / "policy")
+    assert (tmp_path / "policy.onnx").read_text() == "mine"
+
+
+def test_a_file_that_does_something_else_is_not_written(tmp_path, monkeypatch):
+    model = LAC("MlpPolicy", "Pendulum-v1", device="cpu", policy_kwargs=dict(SMALL))
+    monkeypatch.setattr(onnx, "TOLERANCE", -1.0)
+    with pytest.raises(ValueError, match="differs from the original"):
+        export_onnx(model, tmp_path / "policy")
+    assert not list(tmp_path.iterdir())
+
+
+def test_other_spaces_are_refused(tmp_path):
+    model = PPO("MlpPolicy", "CartPole-v1", device="cpu")
+    with pytest.raises(ValueError, match=r"action space Discrete\(2\) must be a Box"):
+        export_onnx(model, tmp_path / "policy")
+
+
+def test_bad_files_and_observations_are_refused(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        OnnxPolicy(tmp_path / "missing.onnx")
+    (tmp_path / "text.onnx").write_text("no graph")
+    with pytest.raises(ValueError, match=r"text.onnx is no ONNX file"):
+        OnnxPolicy(tmp_path / "text.onnx")
+    model = LAC("MlpPolicy", None, device="cpu", policy_kwargs=dict(SMALL), _init_setup_model=False)
+    model.observation_space, model.action_space, model.n_envs = spaces.Box(-1, 1, (2,)), spaces.Box(-1, 1, (1,)), 1
+    model._setup_model()
+    policy = OnnxPolicy(export_onnx(model, tmp_path / "policy"))
+    with pytest.raises(ValueError, match="must have shape"):
+        policy.predict(np.zeros((1, 3)))
+    with pytest.raises(ValueError, match="deterministic"):
+        policy.predict(np.zeros((1, 2)), deterministic=False)
+    with pytest.raises(ValueError, match="which environment"):
+        policy.env_id  # noqa: B018
