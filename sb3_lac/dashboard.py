@@ -139,7 +139,8 @@ class DashboardCallback(BaseCallback):
         writer.flush()
 
     def _on_step(self) -> bool:
-        costs = [info["cost"] for info in self.locals["infos"] if "cost" in info]
+        # not every algorithm hands over what the environment said (ARS does not)
+        costs = [info["cost"] for info in self.locals.get("infos", ()) if "cost" in info]
         if costs:
             self.logger.record_mean("rollout/cost_mean", float(np.mean(costs)))
         return True

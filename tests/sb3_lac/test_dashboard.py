@@ -13,6 +13,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from sb3_contrib import ARS
 from stable_baselines3 import SAC, TD3
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.logger import Logger
@@ -230,9 +231,16 @@ def test_an_environment_without_costs_has_no_entry_for_them(tmp_path):
     assert "rollout/cost_mean" not in model.logger.name_to_value
 
 
-@pytest.mark.parametrize("verbose", [0, 1])
-def test_without_tensorboard_there_is_no_dashboard(verbose):
-    model = make_model(SAC, verbose=verbose)
+def test_algorithms_without_infos_train_too(tmp_path):
+    model = ARS("LinearPolicy", make_env(), n_delta=1, tensorboard_log=str(tmp_path), device="cpu").learn(
+        16, callback=DashboardCallback()
+    )
+    model.logger.close()
+    assert "custom_scalars__config__" in EventAccumulator(str(tmp_path / "ARS_1")).Reload().Tags()["tensors"]
+
+
+def test_without_tensorboard_there_is_no_dashboard():
+    model = make_model(SAC)
     model.set_logger(Logger(folder=None, output_formats=[]))
     with pytest.raises(ValueError, match="no TensorBoard file to write to: create the model with tensorboard_log"):
         model.learn(10, callback=DashboardCallback())
