@@ -11,14 +11,25 @@ import numpy as np
 import pandas as pd
 
 from battery_env.files import replacing
+from battery_env.parameters import PARAMETER_NAMES
+from battery_env.plotting import plot_true_against_inferred
 
 try:
     from stable_baselines3.common.base_class import BaseAlgorithm
     from stable_baselines3.common.callbacks import BaseCallback, EventCallback
+    from stable_baselines3.common.logger import Figure, TensorBoardOutputFormat
 except ImportError as error:
     raise ImportError(
         "battery_env.callbacks needs Stable-Baselines3, install it with: pip install 'battery_env[sb3]'"
     ) from error
+
+#: Charts of the errors for TensorBoard's Custom Scalars tab, as ``SummaryWriter.add_custom_scalars()`` takes them.
+CALIBRATION_CHARTS = {
+    "Calibration": {
+        "MAPE (%)": ["Multiline", ["calibration/(.*_)?mape_percent$"]],
+        "MAPE of the worst discharge (%)": ["Multiline", ["calibration/(.*_)?mape_percent_worst$"]],
+    }
+}
 
 
 class CalibrationCallback(EventCallback):
@@ -26,6 +37,8 @@ class CalibrationCallback(EventCallback):
     Callback for evaluating a calibrator on held-out trajectories while it learns.
     For each metric, it logs the mean over trajectories as ``calibration/<name>``
     and the worst (largest) value as ``calibration/<name>_worst``: smaller is better.
+    TensorBoard also gets a figure for each parameter with a metric, ``calibration/<parameter>_inferred``
+    (:func:`battery_env.plotting.plot_true_against_inferred`), if the data frame is one of :func:`battery_env.evaluate`.
 
     .. warning::
 
@@ -116,9 +129,12 @@ class CalibrationCallback(EventCallback):
             return True
 
         continue_training = True
-        entry = self._summarize(self.evaluate(self.model))
+        trajectories = self.evaluate(self.model)
+        entry = self._summarize(trajectories)
         for name, value in entry.items():
             self.logger.record(f"calibration/{name}", value)
+        if any(isinstance(output, TensorBoardOutputFormat) for output in self.logger.output_formats):
+            self._record_figures(trajectories)
         # Dump log so the evaluation results are printed with the correct timestep
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(self.num_timesteps)
@@ -153,6 +169,17 @@ class CalibrationCallback(EventCallback):
         if self.log_path is not None:
             with replacing(self.log_path) as part:
                 pd.DataFrame(self.history).to_csv(part, index=False)
+
+    def _record_figures(self, trajectories: pd.DataFrame) -> None:
+        for parameter in PARAMETER_NAMES:
+            needed = {parameter, "load", *(f"{parameter}_{column}" for column in ("hat", "spread", "mape_percent"))}
+            if needed <= set(trajectories.columns) and any(column.startswith(f"{parameter}_") for column in self.metrics):
+                figure = plot_true_against_inferred({f"{self.num_timesteps} steps": trajectories}, parameter)
+                self.logger.record(
+                    f"calibration/{parameter}_inferred",
+                    Figure(figure, close=False),
+                    exclude=("stdout", "log", "json", "csv"),
+                )
 
     def _summarize(self, trajectories: pd.DataFrame) -> dict[str, float]:
         """

@@ -13,7 +13,8 @@ Every run has a folder of its own, named by its recipe: algorithm, environment, 
 version of this project. A run that is finished is not run again; with another recipe it is. An interrupted run goes on from
 its last checkpoint when the same command is given again; it does not equal an uninterrupted one then, and the table says so.
 The table and the figures show all finished runs in the folder, so that runs can be added, and name the recipe of each row;
-``compare.json`` spells the recipes out. TensorBoard logs lie in ``<out>/tensorboard/<env>``, so that the algorithms overlay.
+``compare.json`` spells the recipes out. ``tensorboard --logdir <out>/tensorboard`` shows the runs in common charts, with the
+hyperparameters of all of them in one table.
 """
 
 from __future__ import annotations
@@ -47,6 +48,7 @@ from battery_env.estimators.closed_form import ClosedForm
 from battery_env.evaluation import evaluate, summarize
 from battery_env.plotting import plot_learning_curves, plot_true_against_inferred, save_figure
 from battery_env.trajectories import TrajectoryDataset
+from benchmarks.dashboard import dashboard_callbacks
 from benchmarks.reporting import versions, write_csv, write_text
 from benchmarks.training import DEFAULTS_TIMESTEPS, Recipe, run_all, set_up
 
@@ -212,6 +214,7 @@ def run(recipe: Recipe, out: Path, position: int = 0) -> None:
     callbacks: list[BaseCallback] = [
         calibration,
         EvalCallback(evaluation_env, n_eval_episodes=_EVALUATION_EPISODES, eval_freq=every, verbose=0),
+        *dashboard_callbacks(recipe, manager, model, _EVALUATION_EPISODES, every),
         checkpoint,
         ProgressCallback(f"{env_id} {recipe.label} seed {recipe.seed}", timesteps, calibration, position),
     ]

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import sb3_lac.envs  # noqa: F401  (registers the ids of the cost environments)
 from sb3_lac.callbacks import LyapunovCallback
+from sb3_lac.dashboard import DashboardCallback
 from sb3_lac.lac import LAC
 from sb3_lac.policies import CnnPolicy, LyapunovPolicy, MlpPolicy, MultiInputPolicy
 from sb3_lac.stability import LyapunovReport, evaluate_lyapunov
@@ -23,6 +24,7 @@ __version__ = Path(__file__).with_name("version.txt").read_text(encoding="utf-8"
 __all__ = [
     "LAC",
     "CnnPolicy",
+    "DashboardCallback",
     "GymnasiumVecEnv",
     "LyapunovCallback",
     "LyapunovPolicy",

@@ -6,8 +6,10 @@ from typing import ClassVar
 
 import gymnasium as gym
 from stable_baselines3.common.callbacks import BaseCallback, EventCallback
+from stable_baselines3.common.logger import Figure
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, sync_envs_normalization
 
+from sb3_lac.dashboard import NOT_TENSORBOARD, tensorboard_writer
 from sb3_lac.lac import LAC
 from sb3_lac.stability import LyapunovReport, evaluate_lyapunov
 from sb3_lac.stability.rollout import prepare_evaluation, trains_on
@@ -16,7 +18,8 @@ from sb3_lac.stability.rollout import prepare_evaluation, trains_on
 class LyapunovCallback(EventCallback):
     """
     Callback for evaluating the learned Lyapunov function along roll-outs of the policy (see ``evaluate_lyapunov()``).
-    The training is not changed by it.
+    The training is not changed by it. TensorBoard also gets the limits of the confidence intervals (``lyapunov/<name>_low``,
+    ``lyapunov/<name>_high``) and the figure of each report (``lyapunov/report``).
 
     .. warning::
 
@@ -108,6 +111,11 @@ class LyapunovCallback(EventCallback):
             value, low, high = self.last_report.metrics[metric]
             self.logger.record(f"lyapunov/{name}", value)
             entry.update({name: value, f"{name}_low": low, f"{name}_high": high})
+        if tensorboard_writer(self.logger) is not None:
+            for name in self.METRICS.values():
+                for limit in (f"{name}_low", f"{name}_high"):
+                    self.logger.record(f"lyapunov/{limit}", entry[limit], exclude=NOT_TENSORBOARD)
+            self.logger.record("lyapunov/report", Figure(self.last_report.plot(), close=False), exclude=NOT_TENSORBOARD)
         # Dump log so the evaluation results are printed with the correct timestep
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(self.num_timesteps)

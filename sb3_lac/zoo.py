@@ -48,7 +48,7 @@ try:
 except ImportError as error:
     raise ImportError("sb3_lac.zoo needs the RL Zoo, install it with: pip install 'sb3_lac[zoo]'") from error
 
-from sb3_lac import LAC, GymnasiumVecEnv
+from sb3_lac import LAC, DashboardCallback, GymnasiumVecEnv
 from sb3_lac.env_ids import check_env_id
 
 # What a sampler of the RL Zoo returns, and what it gets: see ``HYPERPARAMS_SAMPLER``
@@ -205,8 +205,8 @@ class LACExperimentManager(ExperimentManager):
     """
     Experiment manager that steps all copies of an environment by one call where it can, understands schedules like
     ``lin_5e-5`` for the learning rate of lambda, and refuses trainings without an update. The hyperparameters of LAC are
-    those of ``find_config()`` by default. Trials of a search are scored on held-out discharges where the environment is one
-    of battery_env.
+    those of ``find_config()`` by default. Logs for TensorBoard are a comparison (see ``DashboardCallback``). Trials of a
+    search are scored on held-out discharges where the environment is one of battery_env.
     """
 
     def __init__(self, args: argparse.Namespace, algo: str, env_id: str, *others: Any, **options: Any) -> None:
@@ -229,6 +229,11 @@ class LACExperimentManager(ExperimentManager):
         if self.vec_env_wrapper is not None:
             env = self.vec_env_wrapper(env)
         return self._maybe_normalize(env, eval_env)
+
+    def create_callbacks(self) -> None:
+        super().create_callbacks()
+        if self.tensorboard_log is not None:
+            self.callbacks.append(DashboardCallback(hparams={"env": self.env_name}))
 
     def _preprocess_hyperparams(
         self, hyperparams: dict[str, Any]

@@ -1,6 +1,7 @@
 """Calibrators are evaluated while they learn, by any algorithm of Stable-Baselines3."""
 
 import os
+import re
 import subprocess
 import sys
 
@@ -11,10 +12,12 @@ import pytest
 from stable_baselines3 import TD3
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.logger import Logger, configure
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from battery_env import PolicyEstimator, TrajectoryDataset, evaluate
-from battery_env.callbacks import CalibrationCallback
+from battery_env import ClosedForm, PolicyEstimator, TrajectoryDataset, evaluate
+from battery_env.callbacks import CALIBRATION_CHARTS, CalibrationCallback
+from battery_env.loads import constant
 from sb3_lac import GymnasiumVecEnv
 
 
@@ -184,3 +187,38 @@ def test_without_stable_baselines3_the_extra_is_named():
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert "ImportError: battery_env.callbacks needs Stable-Baselines3" in result.stderr
     assert "pip install 'battery_env[sb3]'" in result.stderr
+
+
+def test_tensorboard_gets_a_figure_of_each_parameter_with_a_metric(make_model, tmp_path):
+    data = TrajectoryDataset.generate("q_mobile", 3, [constant(8.0)], seed=0)
+    scores = evaluate(ClosedForm(), data)
+    for name, metrics in {"both": ("q_mobile_mape_percent", "r_o_mape_percent"), "one": ("r_o_worst",)}.items():
+        model = make_model()
+        model.set_logger(configure(str(tmp_path / name), ["tensorboard", "csv", "json"]))
+        callback = CalibrationCallback(lambda model: scores, eval_freq=5, metrics=metrics, verbose=0)
+        model.learn(10, callback=callback)
+        model.logger.close()
+    events = {name: EventAccumulator(str(tmp_path / name)) for name in ("both", "one")}
+    images = {name: set(accumulator.Reload().Tags()["images"]) for name, accumulator in events.items()}
+    assert images == {
+        "both": {"calibration/q_mobile_inferred", "calibration/r_o_inferred"},
+        "one": {"calibration/r_o_inferred"},
+    }
+    assert [image.step for image in events["one"].Images("calibration/r_o_inferred")] == [5, 10]
+
+
+def test_an_evaluation_of_its_own_has_no_figure(make_model, tmp_path):
+    model = make_model()
+    model.set_logger(configure(str(tmp_path), ["tensorboard"]))
+    model.learn(10, callback=callback_of(Evaluation(1.0), eval_freq=10, verbose=0))
+    model.logger.close()
+    tags = EventAccumulator(str(tmp_path)).Reload().Tags()
+    assert tags["images"] == [] and "calibration/mape_percent" in tags["scalars"]
+
+
+def test_the_charts_find_the_default_metrics_and_their_worst_value_apart():
+    charts = CALIBRATION_CHARTS["Calibration"]
+    (mean,), (worst,) = (tags for _, tags in charts.values())
+    for metric in ("mape_percent", "q_mobile_mape_percent", "r_o_mape_percent"):
+        assert re.match(mean, f"calibration/{metric}") and not re.match(worst, f"calibration/{metric}")
+        assert re.match(worst, f"calibration/{metric}_worst") and not re.match(mean, f"calibration/{metric}_worst")

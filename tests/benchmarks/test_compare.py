@@ -10,6 +10,8 @@ import pytest
 import torch as th
 from rl_zoo3 import ALGOS
 from stable_baselines3.common.callbacks import BaseCallback
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.custom_scalar.layout_pb2 import Layout
 
 from battery_env.estimators.closed_form import ClosedForm
 from battery_env.evaluation import evaluate, summarize
@@ -73,12 +75,34 @@ def test_a_comparison_writes_table_figures_and_logs(tmp_path, capsys):
     assert {path.name for path in (out / ENV_ID).iterdir()} == {recipe(algo).name for algo in ("lac", "sac", "td3")}
     assert not list(out.rglob("checkpoint"))
 
+    for log in (out / "tensorboard" / ENV_ID).iterdir():
+        shows_in_tensorboard(log, lyapunov=log.name.startswith("LAC"))
+
     record = json.loads((out / "compare.json").read_text())
     made_by = record["configuration"]["recipes"][recipe("sac").digest]
     assert (made_by["algo"], made_by["env_id"], made_by["timesteps"], made_by["evaluations"]) == ("sac", ENV_ID, 400, 2)
     assert made_by["hyperparameters"]["batch_size"] == 16 and made_by["arguments"]["tau"] == 0.005
     (run,) = made_by["runs"]
     assert (run["seed"], run["resumed"]) == (0, 0) and {"torch", "sb3_lac"} <= set(run["versions"])
+
+
+def shows_in_tensorboard(log, lyapunov):
+    """Assert that a run has the charts, and data for those of its algorithm."""
+    events = EventAccumulator(str(log))
+    events.Reload()
+    tags = events.Tags()
+    (layout,) = events.Tensors("custom_scalars__config__")
+    charts = {
+        chart.title: list(chart.multiline.tag) or [chart.margin.series[0].value]
+        for category in Layout.FromString(layout.tensor_proto.string_val[0]).category
+        for chart in category.chart
+    }
+    assert next(iter(charts)) == "MAPE (%)"
+    shown = {title for title, (tag,) in charts.items() if any(re.match(tag, scalar) for scalar in tags["scalars"])}
+    assert {"MAPE (%)", "MAPE of the worst discharge (%)", "return of an evaluation", "cost per step of the training"} <= shown
+    assert ({"lambda", "decrease along roll-outs"} <= shown) == lyapunov
+    assert set(tags["images"]) == {"calibration/r_o_inferred"} | ({"lyapunov/report"} if lyapunov else set())
+    assert "_hparams_/session_start_info" in tags["tensors"] or events.SummaryMetadata("_hparams_/session_start_info")
 
 
 @pytest.fixture

@@ -24,6 +24,7 @@ def test_exports():
     assert set(sb3_lac.__all__) == {
         "LAC",
         "CnnPolicy",
+        "DashboardCallback",
         "GymnasiumVecEnv",
         "LyapunovCallback",
         "LyapunovPolicy",

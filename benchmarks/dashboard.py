@@ -1,0 +1,37 @@
+"""What a run of a comparison writes for TensorBoard, beside its evaluations."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+from battery_env.callbacks import CALIBRATION_CHARTS
+from benchmarks.training import Recipe
+from sb3_lac import LAC, DashboardCallback, LyapunovCallback
+from sb3_lac.zoo import LACExperimentManager
+
+
+def dashboard_callbacks(
+    recipe: Recipe, manager: LACExperimentManager, model: OffPolicyAlgorithm, episodes: int, every: int
+) -> list[BaseCallback]:
+    """
+    Callbacks that make a run part of a comparison in TensorBoard. They do not change the training.
+
+    :param recipe: what the run is made by
+    :param manager: makes the environments
+    :param model: to be trained, with a logger for TensorBoard
+    :param episodes: number of them in each evaluation of LAC's Lyapunov function
+    :param every: calls between these evaluations
+    :return: the callbacks
+    """
+    about = {"env": recipe.env_id, "recipe": recipe.digest, "timesteps": recipe.timesteps, "source": recipe.source}
+    callbacks: list[BaseCallback] = [DashboardCallback(CALIBRATION_CHARTS, {**recipe.hyperparameters, **about})]
+    if isinstance(model, LAC):
+        with contextlib.redirect_stdout(io.StringIO()):
+            env = manager.create_envs(n_envs=1, eval_env=True, no_log=True)
+        # from the same start states each time
+        callbacks.append(LyapunovCallback(env, n_eval_episodes=episodes, eval_freq=every, seed=recipe.seed, verbose=0))
+    return callbacks

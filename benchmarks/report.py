@@ -1,0 +1,259 @@
+"""
+One page with the errors of all calibrators on held-out discharges: what is typical, how sure that is, and how the errors are
+spread. It is made from the raw CSV files of ``docs/results`` alone, and holds its figures.
+
+.. code-block:: bash
+
+  python -m benchmarks.report --results docs/results --out results/report.html
+"""
+
+from __future__ import annotations
+
+import argparse
+import base64
+import html
+import io
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from scipy.stats import bootstrap, trim_mean
+
+from battery_env.arrays import FloatArray
+from battery_env.parameters import PARAMETER_NAMES
+from battery_env.plotting import COLOURS, new_figure
+from benchmarks.reporting import write_text
+
+_RESAMPLES = 999
+
+_HEAD = """<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<title>Errors on held-out discharges</title>
+<style>
+body { font-family: sans-serif; max-width: 60em; margin: 2em auto; padding: 0 1em; }
+table { border-collapse: collapse; margin: 1em 0; }
+th, td { padding: 0.3em 0.8em; border-bottom: 1px solid #ccc; text-align: right; }
+th:first-child, td:first-child { text-align: left; }
+img { max-width: 100%; }
+.source { color: #555; font-size: 85%; }
+</style>
+</head>
+<body>
+<h1>Errors on held-out discharges</h1>
+<p>The error of a discharge is the mean absolute error of the estimates during it, or in its second half where the
+title says so, in per cent of the true value; where there is no estimate, it is infinite. Mean: over discharges, then
+over seeds, &plusmn; the standard deviation over seeds. Interquartile mean: of the half in the middle of the errors of
+all seeds and discharges, with the 95 % interval of a bootstrap that resamples the seeds and the discharges of each
+calibrator. With one seed the interval says nothing about another training; with two or three it says little. The
+figures show which share of the discharges has an error below a value; lines are means over seeds, bands reach from
+the least to the largest seed.</p>
+"""
+
+
+def read_errors(results: Path) -> pd.DataFrame:
+    """
+    The errors of single discharges in all CSV files of a folder that hold such.
+
+    :param results: folder with CSV files, searched with the folders in it
+    :return: one row per discharge, seed, calibrator and ``comparison`` (file, parameter and sensor), with ``error_percent``;
+        ``source`` is the file, relative to the folder
+    :raises FileNotFoundError: if no file holds errors of discharges
+    """
+    tables = []
+    for file in sorted(results.rglob("*.csv")):
+        columns = set(pd.read_csv(file, nrows=0).columns)
+        if "trajectory" not in columns or not columns & {"algo", "calibrator"}:
+            continue
+        table = pd.read_csv(file).rename(columns={"algo": "calibrator"})
+        for name in PARAMETER_NAMES:
+            # the estimates of the first half are those of a calibrator that has seen next to nothing
+            measures = {f"{name}_second_half_mape_percent": ", second half", f"{name}_mape_percent": ""}
+            column = next((measure for measure in measures if measure in columns), None)
+            if column is None:
+                continue
+            title = f"{file.stem.rsplit('_', 1)[0]}, {name}{measures[column]}"
+            of_parameter = pd.DataFrame(
+                {
+                    "source": file.relative_to(results).as_posix(),
+                    "comparison": title + (", " + table["sensor"] if "sensor" in columns else ""),
+                    "calibrator": table["calibrator"],
+                    # a calibrator that does not learn has none
+                    "seed": table["seed"].fillna(0).astype(int) if "seed" in columns else 0,
+                    "trajectory": table["trajectory"],
+                    "error_percent": table[column],
+                }
+            )
+            tables.append(of_parameter)
+    if not tables:
+        raise FileNotFoundError(
+            f"{results} has no CSV file with errors of discharges (columns trajectory, algo or calibrator, "
+            "<parameter>_mape_percent): run python -m benchmarks.compare or benchmarks.voltage first"
+        )
+    return pd.concat(tables, ignore_index=True)
+
+
+def interquartile_mean(errors: FloatArray, seed: int = 0) -> tuple[float, float, float]:
+    """
+    Mean of the half in the middle, with a bootstrap interval over seeds and discharges (percentiles). See Agarwal et al. 2021,
+    Deep Reinforcement Learning at the Edge of the Statistical Precipice; there every task has runs of its own, here all
+    discharges of a seed share its policy, so that seeds are resampled as a whole.
+
+    :param errors: shape (seeds, discharges)
+    :param seed: of the resampling
+    :return: the mean, lower and upper limit of its 95 % interval
+    :raises ValueError: for less than two discharges
+    """
+    if errors.ndim != 2 or errors.shape[1] < 2:
+        raise ValueError(f"errors must have the shape (seeds, discharges) with at least two discharges, got {errors.shape}")
+
+    def of_resamples(*chosen: np.ndarray, axis: int = -1) -> np.ndarray:
+        # shape (..., seeds) and (..., discharges); one seed cannot be resampled
+        columns = chosen[-1]
+        rows = chosen[0] if len(chosen) == 2 else np.zeros_like(columns[..., :1])
+        sample = errors[rows[..., :, np.newaxis], columns[..., np.newaxis, :]]
+        return trim_mean(sample.reshape(*sample.shape[:-2], -1), 0.25, axis=axis)
+
+    indices = [np.arange(n) for n in errors.shape if n > 1]
+    # scipy also computes a standard error, which infinite errors have none of
+    with np.errstate(invalid="ignore"):
+        interval = bootstrap(
+            indices,
+            of_resamples,
+            n_resamples=_RESAMPLES,
+            batch=100,
+            vectorized=True,
+            method="percentile",
+            random_state=np.random.default_rng(seed),
+        ).confidence_interval
+    return float(of_resamples(*indices)), float(interval.low), float(interval.high)
+
+
+def summary(errors: pd.DataFrame) -> pd.DataFrame:
+    """
+    What one comparison says.
+
+    :param errors: rows of one comparison of :func:`read_errors`
+    :return: one row per calibrator: ``seeds``, ``discharges``, ``mean``, ``sd`` (over seeds, NaN if unknown), ``worst``,
+        ``interquartile_mean`` with ``low`` and ``high``; all but the counts in per cent
+    """
+    rows = []
+    for calibrator, of_calibrator in errors.groupby("calibrator", sort=False):
+        matrix = _by_seed(of_calibrator)
+        means = matrix.mean(axis=1)
+        typical, low, high = interquartile_mean(matrix)
+        row = {"calibrator": calibrator, "seeds": matrix.shape[0], "discharges": matrix.shape[1], "mean": means.mean()}
+        spread = means.std(ddof=1) if len(means) > 1 and np.isfinite(means).all() else np.nan
+        row |= {"sd": spread, "worst": matrix.max()}
+        rows.append({**row, "interquartile_mean": typical, "low": low, "high": high})
+    return pd.DataFrame(rows)
+
+
+def profile(errors: FloatArray, thresholds: FloatArray) -> FloatArray:
+    """
+    The share of the discharges with an error below each of several values.
+
+    :param errors: shape (seeds, discharges)
+    :param thresholds: shape (n,)
+    :return: for each seed, shape (seeds, n), within 0 .. 1
+    """
+    return (errors[:, :, np.newaxis] < thresholds).mean(axis=1)
+
+
+def plot_profiles(errors: pd.DataFrame, title: str) -> Figure:
+    """
+    Performance profiles: one line per calibrator, with a band from the least to the largest seed.
+
+    :param errors: rows of one comparison of :func:`read_errors`
+    :param title: of the figure
+    :return: the figure
+    """
+    positive = errors["error_percent"][(errors["error_percent"] > 0) & np.isfinite(errors["error_percent"])]
+    thresholds = np.geomspace(positive.min(), 1.05 * positive.max(), 200)
+    figure = new_figure(6.4, 3.4)
+    axes = figure.subplots()
+    for colour, (calibrator, of_calibrator) in zip(COLOURS, errors.groupby("calibrator", sort=False), strict=False):
+        shares = 100.0 * profile(_by_seed(of_calibrator), thresholds)
+        axes.plot(thresholds, shares.mean(axis=0), color=colour, lw=1.5, label=calibrator)
+        axes.fill_between(thresholds, shares.min(axis=0), shares.max(axis=0), color=colour, alpha=0.25, lw=0)
+    axes.set(xscale="log", xlabel="error (%)", ylabel="discharges with less (%)", ylim=(0, 102))
+    axes.set_title(title, fontsize=10)
+    axes.grid(which="both", alpha=0.25)
+    axes.legend(frameon=False, fontsize=9)
+    return figure
+
+
+def _by_seed(errors: pd.DataFrame) -> FloatArray:
+    # shape (seeds, discharges); a discharge without an estimate is not left out
+    table = errors.pivot(index="seed", columns="trajectory", values="error_percent")
+    return table.fillna(np.inf).to_numpy(dtype=np.float64)
+
+
+def page(results: Path) -> str:
+    """
+    The report.
+
+    :param results: folder with CSV files
+    :return: an HTML page that needs no other file
+    :raises FileNotFoundError: if no file holds errors of discharges
+    """
+    parts = [_HEAD]
+    for (source, comparison), errors in read_errors(results).groupby(["source", "comparison"], sort=False):
+        parts.append(f"<h2>{html.escape(str(comparison))}</h2>\n<p class='source'>From {html.escape(str(source))}")
+        record = (results / str(source)).with_suffix(".json")
+        if record.exists():
+            command = json.loads(record.read_text(encoding="utf-8")).get("command", "")
+            parts.append(f", made by <code>{html.escape(command)}</code>")
+        parts.append(f"</p>\n{_table(summary(errors))}\n")
+        buffer = io.BytesIO()
+        plot_profiles(errors, str(comparison)).savefig(buffer, format="png")
+        image = base64.b64encode(buffer.getvalue()).decode("ascii")
+        parts.append(f'<img alt="{html.escape(str(comparison))}" src="data:image/png;base64,{image}">\n')
+    return "".join([*parts, "</body>\n</html>\n"])
+
+
+def _table(table: pd.DataFrame) -> str:
+    lines = []
+    for row in table.to_dict("records"):
+        spread = "" if np.isnan(row["sd"]) else f" ± {row['sd']:.1g}"
+        lines.append(
+            {
+                "calibrator": row["calibrator"],
+                "seeds": row["seeds"],
+                "discharges": row["discharges"],
+                "mean (%)": f"{row['mean']:.2g}{spread}",
+                "worst discharge (%)": f"{row['worst']:.2g}",
+                "interquartile mean (%)": f"{row['interquartile_mean']:.2g}",
+                "95 % interval": f"{row['low']:.2g} to {row['high']:.2g}",
+            }
+        )
+    return pd.DataFrame(lines).to_html(index=False, border=0)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """
+    The command line.
+
+    :param arguments: of the command line by default
+    """
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.report", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--results", type=Path, default=Path("docs/results"), help="folder with the raw CSV files")
+    parser.add_argument("--out", type=Path, default=Path("results/report.html"), help="the page")
+    chosen = parser.parse_args(arguments)
+    try:
+        text = page(chosen.results)
+    except FileNotFoundError as error:
+        parser.error(str(error))
+    write_text(chosen.out, text)
+    sys.stdout.write(f"{chosen.out}\n")
+
+
+if __name__ == "__main__":
+    main()

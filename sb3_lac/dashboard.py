@@ -1,0 +1,146 @@
+"""What TensorBoard needs to show several runs as one comparison: charts that overlay them, and a table of hyperparameters."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
+from stable_baselines3.common.type_aliases import TrainFreq
+from stable_baselines3.common.utils import ConstantSchedule
+from torch.utils.tensorboard import SummaryWriter
+from torch.utils.tensorboard.summary import hparams as hparams_summaries
+
+#: Charts by category and title, as ``SummaryWriter.add_custom_scalars()`` takes them: ``["Multiline", tags]``, of which each
+#: is a regular expression, or ``["Margin", [value, low, high]]``
+Charts = Mapping[str, Mapping[str, list]]
+
+#: What to exclude a figure from: all formats of the logger but TensorBoard
+NOT_TENSORBOARD = ("stdout", "log", "json", "csv")
+
+#: The charts of every run. A run that does not log a tag is left out of its chart.
+CHARTS: Charts = {
+    "Returns and costs": {
+        "return of an evaluation": ["Multiline", ["eval/mean_reward$"]],
+        "return of the training episodes": ["Multiline", ["rollout/ep_rew_mean$"]],
+        "cost per step of the training": ["Multiline", ["rollout/cost_mean$"]],
+        "length of an evaluation episode": ["Multiline", ["eval/mean_ep_length$"]],
+    },
+    "Lyapunov": {
+        "lambda": ["Multiline", ["train/lambda$"]],
+        "decrease along roll-outs": ["Margin", ["lyapunov/decrease", "lyapunov/decrease_low", "lyapunov/decrease_high"]],
+        "decrease in the replay buffer": ["Multiline", ["train/lyapunov_difference$"]],
+        "largest feasible alpha3": [
+            "Margin",
+            ["lyapunov/feasible_alpha3", "lyapunov/feasible_alpha3_low", "lyapunov/feasible_alpha3_high"],
+        ],
+    },
+    "Updates": {
+        "critic loss": ["Multiline", ["train/critic_loss$"]],
+        "actor loss": ["Multiline", ["train/actor_loss$"]],
+        "entropy coefficient": ["Multiline", ["train/ent_coef$"]],
+    },
+}
+
+# Arguments of algorithms that change nothing of what is learned
+_NOT_LEARNING = {"device", "tensorboard_log", "verbose", "stats_window_size"}
+
+
+def tensorboard_writer(logger: Logger) -> SummaryWriter | None:
+    """
+    The writer of TensorBoard files behind a logger.
+
+    :param logger: The logger of a model
+    :return: Its writer, None if it has none
+    """
+    return next((output.writer for output in logger.output_formats if isinstance(output, TensorBoardOutputFormat)), None)
+
+
+def hyperparameters_of(model: BaseAlgorithm) -> dict[str, bool | str | float]:
+    """
+    The hyperparameters of a model that a table can hold: numbers, texts, schedules, and ``net_arch`` of ``policy_kwargs``.
+
+    :param model: The model
+    :return: By name of the argument, with ``algorithm`` and ``n_envs``
+    """
+    values: dict[str, Any] = {"algorithm": type(model).__name__, "n_envs": model.n_envs}
+    values |= {name: getattr(model, name, None) for name in inspect.signature(type(model)).parameters}
+    if "net_arch" in model.policy_kwargs:
+        values["net_arch"] = str(model.policy_kwargs["net_arch"])
+    found: dict[str, bool | str | float] = {}
+    for name, value in values.items():
+        if name in _NOT_LEARNING:
+            continue
+        if isinstance(value, ConstantSchedule):
+            found[name] = value.val
+        elif isinstance(value, TrainFreq):
+            found[name] = f"{value.frequency} {value.unit.value}"
+        elif isinstance(value, (bool, int, float, str)):
+            found[name] = value
+        elif name.endswith("learning_rate") and callable(value):
+            found[name] = getattr(value, "__name__", repr(value))
+    return found
+
+
+class DashboardCallback(BaseCallback):
+    """
+    Callback that makes TensorBoard show this run and others of the same folder as one comparison. The training is not changed
+    by it. It writes
+
+    - the layout of the Custom Scalars tab: one chart per quantity, with all runs in it
+    - the hyperparameters for the HParams tab, where they stand beside the last value of each scalar of the run
+    - ``rollout/cost_mean``, the mean of ``info["cost"]`` over the steps since the last entry, if the environment has costs
+
+    Evaluations are left to ``EvalCallback`` (``eval/``) and ``LyapunovCallback`` (``lyapunov/``).
+
+    .. note::
+        ``HParam`` of Stable-Baselines3 is not used: it declares the columns of the table in each run, of which TensorBoard
+        takes those of one run for all, so that the table would lack what only another algorithm has. Without a declaration
+        TensorBoard puts together what it finds.
+
+    :param charts: More charts, like ``battery_env.callbacks.CALIBRATION_CHARTS``. They come first. All runs should have
+        the same.
+    :param hparams: More hyperparameters, like the id of the environment. They have precedence over those of the model.
+        Values that are neither numbers nor texts are written as text.
+    :param verbose: Verbosity level, without a meaning here
+    """
+
+    def __init__(
+        self,
+        charts: Charts | None = None,
+        hparams: Mapping[str, Any] | None = None,
+        verbose: int = 0,
+    ):
+        super().__init__(verbose)
+        self.charts: Charts = {**(charts or {}), **CHARTS}
+        self.hparams = {
+            name: value if isinstance(value, (bool, int, float, str)) else str(value)
+            for name, value in (hparams or {}).items()
+        }
+
+    def _init_callback(self) -> None:
+        if tensorboard_writer(self.logger) is None:
+            raise ValueError(
+                "DashboardCallback has no TensorBoard file to write to: create the model with tensorboard_log, or use "
+                'model.set_logger(configure(folder, ["tensorboard"])).'
+            )
+
+    def _on_training_start(self) -> None:
+        writer = tensorboard_writer(self.logger)
+        assert writer is not None and writer.file_writer is not None
+        writer.add_custom_scalars(self.charts)
+        _, start, end = hparams_summaries({**hyperparameters_of(self.model), **self.hparams}, metric_dict={})
+        writer.file_writer.add_summary(start)
+        writer.file_writer.add_summary(end)
+        writer.flush()
+
+    def _on_step(self) -> bool:
+        # not every algorithm hands over what the environment said (ARS does not)
+        costs = [info["cost"] for info in self.locals.get("infos", ()) if "cost" in info]
+        if costs:
+            self.logger.record_mean("rollout/cost_mean", float(np.mean(costs)))
+        return True
