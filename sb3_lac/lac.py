@@ -298,7 +298,9 @@ class LAC(OffPolicyAlgorithm):
         self._create_aliases()
         # Running mean and running var
         self.batch_norm_stats = get_parameters_by_name(self.actor, ["running_"])
-        self.batch_norm_stats += get_parameters_by_name(self.critic, ["running_"])
+        critic_batch_norm_stats = get_parameters_by_name(self.critic, ["running_"])
+        self.batch_norm_stats += critic_batch_norm_stats
+        self.critic_has_batch_norm = len(critic_batch_norm_stats) > 0
         self.batch_norm_stats_target = get_parameters_by_name(self.actor_target, ["running_"])
         self.batch_norm_stats_target += get_parameters_by_name(self.critic_target, ["running_"])
         # Target entropy is used when learning the entropy coefficient
@@ -577,8 +579,17 @@ class LAC(OffPolicyAlgorithm):
             # Violation of the decrease condition: the same critic, before its update, for both values,
             # and a gradient through the next action only
             values = largest_value(current_values).detach()
+            if self.critic_has_batch_norm:
+                # Normalized by the statistics of its own batch, neither value would show how much the other one differs
+                self.critic.set_training_mode(False)
+                with th.no_grad():
+                    values = largest_value(self.critic(replay_data.observations, replay_data.actions))
             next_values_pi = largest_value(self.critic(replay_data.next_observations, next_actions_pi))
-            difference = (next_values_pi - values + self.alpha3 * costs).mean()
+            if self.critic_has_batch_norm:
+                self.critic.set_training_mode(True)
+            # Nothing follows a terminal state, where the critic is not trained and no action is taken
+            going_on = 1 - replay_data.dones
+            difference = (going_on * (next_values_pi - values + self.alpha3 * costs)).sum() / going_on.sum().clamp(min=1)
 
             # Important: detach the multipliers from the graph
             # so we don't change them with other losses

@@ -110,7 +110,8 @@ def test_train_is_the_published_update(make_model_without_env, n_critics, bound)
         values = lyapunov(critic, obs, actions, n_critics, offset)
         critic_loss = (0.5 * (values - y) ** 2).mean(dim=1).sum()
         next_values = lyapunov(critic, next_obs, next_actions_pi, n_critics, offset).amax(dim=0)
-        d = (next_values - values.amax(dim=0).detach() + ALPHA3 * costs).mean()
+        # Where the episode goes on
+        d = (next_values - values.amax(dim=0).detach() + ALPHA3 * costs)[dones == 0].mean()
         lambda_, beta = math.exp(log_lambda.value), math.exp(log_beta.value)
         actor_loss = lambda_ * d + beta * log_prob.mean()
         violation = log_prob.mean().item() - 2.0  # target entropy: minus the number of actions
