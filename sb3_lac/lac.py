@@ -9,7 +9,7 @@ from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, polyak_update, update_learning_rate
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.her import HerReplayBuffer
@@ -86,21 +86,6 @@ def time_limits(env: VecEnv) -> list[int | None]:
     return [getattr(spec, "max_episode_steps", None) for spec in env.get_attr("spec")]
 
 
-def concatenate_observations(obs: PyTorchObs, next_obs: PyTorchObs) -> PyTorchObs:
-    """
-    Stack two batches of observations, so that one pass of a network serves both.
-
-    :param obs: First batch
-    :param next_obs: Second batch
-    :return: The first batch followed by the second one
-    """
-    if isinstance(obs, dict):
-        assert isinstance(next_obs, dict)
-        return {key: th.cat((obs[key], next_obs[key])) for key in obs}
-    assert isinstance(next_obs, th.Tensor)
-    return th.cat((obs, next_obs))
-
-
 class LAC(OffPolicyAlgorithm):
     """
     Lyapunov Actor-Critic (LAC)
@@ -147,6 +132,8 @@ class LAC(OffPolicyAlgorithm):
     :param target_update_interval: update the target networks every ``target_update_interval``
         gradient steps.
     :param target_entropy: target entropy when learning ``ent_coef`` (``ent_coef = 'auto'``)
+    :param entropy_states: Where the entropy of the policy counts: in the ``"next"`` states of the sampled transitions, where
+        the decrease condition acts too, or in the ``"current"`` ones, as in the paper, with a second pass of the actor.
     :param alpha3: Share of the cost by which ``L`` has to decrease in each step. From 1 on the condition cannot hold
         in stationary data: ``lambda`` then stays at ``lambda_max`` and LAC minimises the cost with that fixed weight.
     :param lambda_init: Initial value of ``lambda``
@@ -211,6 +198,7 @@ class LAC(OffPolicyAlgorithm):
         ent_coef: str | float = "auto",
         target_update_interval: int = 1,
         target_entropy: str | float = "auto",
+        entropy_states: str = "next",
         alpha3: float = 1.0,
         lambda_init: float = 1.0,
         lambda_min: float = 1e-4,
@@ -266,6 +254,7 @@ class LAC(OffPolicyAlgorithm):
         self.ent_coef = ent_coef
         self.target_update_interval = target_update_interval
         self.ent_coef_optimizer: th.optim.Adam | None = None
+        self.entropy_states = entropy_states
         self.alpha3 = alpha3
         self.lambda_init = lambda_init
         self.lambda_min = lambda_min
@@ -365,6 +354,8 @@ class LAC(OffPolicyAlgorithm):
                 f"lambda_init={self.lambda_init} must lie between lambda_min={self.lambda_min} "
                 f"and lambda_max={self.lambda_max}. Change lambda_init or widen the limits."
             )
+        if self.entropy_states not in ("next", "current"):
+            raise ValueError(f"entropy_states={self.entropy_states!r} must be 'next', or 'current' as in the paper.")
         bound = self.stated_reward_bound
         if bound is not None and not 0 <= bound < math.inf:
             raise ValueError(
@@ -548,12 +539,14 @@ class LAC(OffPolicyAlgorithm):
                 self.actor.reset_noise()
                 self.actor_target.reset_noise()
 
-            # One pass of the actor: action and log prob for the sampled states, then for the next states
-            actions_pi, log_prob = self.actor.action_log_prob(
-                concatenate_observations(replay_data.observations, replay_data.next_observations)
-            )
-            _, next_actions_pi = actions_pi.chunk(2)
-            log_prob, _ = log_prob.chunk(2)
+            # Weights of a mean: nothing follows a terminal state, where the critic is not trained and no action is taken
+            going_on = (1 - replay_data.dones) / (1 - replay_data.dones).sum().clamp(min=1)
+            # Action by the current actor for the next states
+            next_actions_pi, next_log_prob = self.actor.action_log_prob(replay_data.next_observations)
+            if self.entropy_states == "next":
+                log_prob = (going_on.flatten() * next_log_prob).sum()
+            else:
+                log_prob = self.actor.action_log_prob(replay_data.observations)[1].mean()
 
             if isinstance(replay_data, HorizonReplayBufferSamples):
                 target_values = -replay_data.horizon_returns
@@ -587,9 +580,7 @@ class LAC(OffPolicyAlgorithm):
             next_values_pi = largest_value(self.critic(replay_data.next_observations, next_actions_pi))
             if self.critic_has_batch_norm:
                 self.critic.set_training_mode(True)
-            # Nothing follows a terminal state, where the critic is not trained and no action is taken
-            going_on = 1 - replay_data.dones
-            difference = (going_on * (next_values_pi - values + self.alpha3 * costs)).sum() / going_on.sum().clamp(min=1)
+            difference = (going_on * (next_values_pi - values + self.alpha3 * costs)).sum()
 
             # Important: detach the multipliers from the graph
             # so we don't change them with other losses
@@ -597,7 +588,7 @@ class LAC(OffPolicyAlgorithm):
             lambda_coef = th.exp(self.log_lambda.detach())
             ent_coef = self.ent_coef_tensor if self.log_ent_coef is None else th.exp(self.log_ent_coef.detach())
             # Lagrangian of the decrease condition and of the entropy constraint
-            actor_loss = lambda_coef * difference + ent_coef * log_prob.mean()
+            actor_loss = lambda_coef * difference + ent_coef * log_prob
 
             # Optimize the critic and the actor, both with the gradient at the current parameters
             self.critic.optimizer.zero_grad()
@@ -630,9 +621,7 @@ class LAC(OffPolicyAlgorithm):
             # entropy temperature or beta in the paper
             if self.ent_coef_optimizer is not None and self.log_ent_coef is not None:
                 assert isinstance(self.target_entropy, float)
-                ent_coef_loss = update_multiplier(
-                    self.log_ent_coef, self.ent_coef_optimizer, log_prob.mean() + self.target_entropy
-                )
+                ent_coef_loss = update_multiplier(self.log_ent_coef, self.ent_coef_optimizer, log_prob + self.target_entropy)
                 metrics["ent_coef_loss"] = ent_coef_loss
 
             with th.no_grad():

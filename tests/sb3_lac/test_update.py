@@ -7,7 +7,7 @@ import pytest
 import torch as th
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
-from sb3_lac.lac import concatenate_observations, update_multiplier
+from sb3_lac.lac import update_multiplier
 from sb3_lac.policies import largest_value
 
 GAMMA, TAU, LEARNING_RATE, LAMBDA_LEARNING_RATE, ALPHA3 = 0.9, 0.05, 1e-2, 2e-2, 0.3
@@ -59,10 +59,12 @@ class ScalarAdam:
         self.value -= learning_rate * m_hat / (math.sqrt(v_hat) + 1e-8)
 
 
+@pytest.mark.parametrize("entropy_states", ["current", "next"])
 @pytest.mark.parametrize(("n_critics", "bound"), [(1, 0.0), (2, 0.0), (1, 3.0), (2, 3.0)])
-def test_train_is_the_published_update(make_model_without_env, n_critics, bound):
+def test_train_is_the_published_update(make_model_without_env, n_critics, bound, entropy_states):
     model = make_model_without_env(
         reward_bound=bound,
+        entropy_states=entropy_states,
         gamma=GAMMA,
         tau=TAU,
         learning_rate=LEARNING_RATE,
@@ -101,8 +103,9 @@ def test_train_is_the_published_update(make_model_without_env, n_critics, bound)
         logged = model.logger.name_to_value
 
         th.manual_seed(step)
-        sampled_actions, log_prob = policy_sample(actor, th.cat([obs, next_obs]))
-        log_prob, next_actions_pi = log_prob[:16], sampled_actions[16:]
+        # The paper's entropy is that of the policy in the states s; where the episode goes on, "next" takes that in s'
+        next_actions_pi, log_prob = policy_sample(actor, next_obs)
+        log_prob = log_prob[dones == 0] if entropy_states == "next" else policy_sample(actor, obs)[1]
         with th.no_grad():
             lagged_actions, _ = policy_sample(actor_target, next_obs)
             next_values = lyapunov(critic_target, next_obs, lagged_actions, n_critics, offset).amax(dim=0)
@@ -158,14 +161,6 @@ def test_multiplier_grows_by_the_violation_of_its_constraint():
 
 def test_value_of_several_critics_is_the_largest():
     assert largest_value((th.tensor([[1.0], [4.0]]), th.tensor([[3.0], [2.0]]))).tolist() == [[3.0], [4.0]]
-
-
-def test_observations_are_concatenated_per_key():
-    obs = {"a": th.zeros(2, 3), "b": th.zeros(2, 1)}
-    next_obs = {"a": th.ones(2, 3), "b": th.ones(2, 1)}
-    both = concatenate_observations(obs, next_obs)
-    assert {key: tensor.shape for key, tensor in both.items()} == {"a": (4, 3), "b": (4, 1)}
-    assert both["b"].flatten().tolist() == [0, 0, 1, 1]
 
 
 def test_actor_step_leaves_no_gradient_in_the_critic(make_model, train_metrics):
