@@ -9,7 +9,7 @@ from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
 from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, polyak_update, update_learning_rate
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.her import HerReplayBuffer
@@ -86,21 +86,6 @@ def time_limits(env: VecEnv) -> list[int | None]:
     return [getattr(spec, "max_episode_steps", None) for spec in env.get_attr("spec")]
 
 
-def concatenate_observations(obs: PyTorchObs, next_obs: PyTorchObs) -> PyTorchObs:
-    """
-    Stack two batches of observations, so that one pass of a network serves both.
-
-    :param obs: First batch
-    :param next_obs: Second batch
-    :return: The first batch followed by the second one
-    """
-    if isinstance(obs, dict):
-        assert isinstance(next_obs, dict)
-        return {key: th.cat((obs[key], next_obs[key])) for key in obs}
-    assert isinstance(next_obs, th.Tensor)
-    return th.cat((obs, next_obs))
-
-
 class LAC(OffPolicyAlgorithm):
     """
     Lyapunov Actor-Critic (LAC)
@@ -124,7 +109,7 @@ class LAC(OffPolicyAlgorithm):
     :param buffer_size: size of the replay buffer
     :param learning_starts: how many steps of the model to collect transitions for before learning starts
     :param batch_size: Minibatch size for each gradient update
-    :param tau: the soft update coefficient ("Polyak update", between 0 and 1), for the critic and for the actor
+    :param tau: the soft update coefficient ("Polyak update", between 0 and 1)
     :param gamma: the discount factor
     :param train_freq: Update the model every ``train_freq`` steps. Alternatively pass a tuple of frequency and unit
         like ``(5, "step")`` or ``(2, "episode")``.
@@ -147,6 +132,10 @@ class LAC(OffPolicyAlgorithm):
     :param target_update_interval: update the target networks every ``target_update_interval``
         gradient steps.
     :param target_entropy: target entropy when learning ``ent_coef`` (``ent_coef = 'auto'``)
+    :param published_update: Whether to update as the paper and its authors' code do. There the actor lowers ``L`` in the
+        states that the sampled transitions lead to, so that the first states of episodes teach it nothing, and the action of
+        the critic's target is that of a target actor. By default the actor lowers ``L`` in the states that the transitions
+        start from, and there is no target actor.
     :param alpha3: Share of the cost by which ``L`` has to decrease in each step. From 1 on the condition cannot hold
         in stationary data: ``lambda`` then stays at ``lambda_max`` and LAC minimises the cost with that fixed weight.
     :param lambda_init: Initial value of ``lambda``
@@ -187,7 +176,7 @@ class LAC(OffPolicyAlgorithm):
     }
     policy: LyapunovPolicy
     actor: Actor
-    actor_target: Actor
+    actor_target: Actor | None
     critic: LyapunovCritic
     critic_target: LyapunovCritic
 
@@ -211,6 +200,7 @@ class LAC(OffPolicyAlgorithm):
         ent_coef: str | float = "auto",
         target_update_interval: int = 1,
         target_entropy: str | float = "auto",
+        published_update: bool = False,
         alpha3: float = 1.0,
         lambda_init: float = 1.0,
         lambda_min: float = 1e-4,
@@ -266,6 +256,7 @@ class LAC(OffPolicyAlgorithm):
         self.ent_coef = ent_coef
         self.target_update_interval = target_update_interval
         self.ent_coef_optimizer: th.optim.Adam | None = None
+        self.published_update = published_update
         self.alpha3 = alpha3
         self.lambda_init = lambda_init
         self.lambda_min = lambda_min
@@ -297,10 +288,17 @@ class LAC(OffPolicyAlgorithm):
             raise ValueError(f"gamma={self.gamma} must be smaller than 1 with n-step returns, use for instance gamma=0.99.")
         self._create_aliases()
         # Running mean and running var
-        self.batch_norm_stats = get_parameters_by_name(self.actor, ["running_"])
-        self.batch_norm_stats += get_parameters_by_name(self.critic, ["running_"])
-        self.batch_norm_stats_target = get_parameters_by_name(self.actor_target, ["running_"])
-        self.batch_norm_stats_target += get_parameters_by_name(self.critic_target, ["running_"])
+        self.batch_norm_stats = get_parameters_by_name(self.critic, ["running_"])
+        self.batch_norm_stats_target = get_parameters_by_name(self.critic_target, ["running_"])
+        self.critic_has_batch_norm = len(self.batch_norm_stats) > 0
+        self.actor_target = None
+        if self.published_update:
+            self.actor_target = self.policy.make_actor()
+            self.actor_target.load_state_dict(self.actor.state_dict())
+            # Target networks should always be in eval mode
+            self.actor_target.set_training_mode(False)
+            self.batch_norm_stats += get_parameters_by_name(self.actor, ["running_"])
+            self.batch_norm_stats_target += get_parameters_by_name(self.actor_target, ["running_"])
         # Target entropy is used when learning the entropy coefficient
         if self.target_entropy == "auto":
             # automatically set target entropy if needed
@@ -415,7 +413,6 @@ class LAC(OffPolicyAlgorithm):
 
     def _create_aliases(self) -> None:
         self.actor = self.policy.actor
-        self.actor_target = self.policy.actor_target
         self.critic = self.policy.critic
         self.critic_target = self.policy.critic_target
 
@@ -509,6 +506,53 @@ class LAC(OffPolicyAlgorithm):
         # Changes of the units round
         return th.maximum(self.cost_bound(self._vec_normalize_env), largest_reward)
 
+    def _target_values(self, replay_data: ReplayBufferSamples, next_actions: th.Tensor) -> th.Tensor:
+        """
+        What the critic learns.
+
+        :param replay_data: Sampled transitions
+        :param next_actions: Actions in the next states
+        :return: ``y`` relative to the offset, shape (n, 1), without a gradient
+        """
+        if isinstance(replay_data, HorizonReplayBufferSamples):
+            return -replay_data.horizon_returns
+        # For n-step replay, discount factor is gamma**n_steps (when no early termination)
+        discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
+        with th.no_grad():
+            # Compute the next Lyapunov values: max over all target critics
+            next_values = largest_value(self.critic_target(replay_data.next_observations, next_actions))
+            # L is never negative
+            next_values = th.maximum(next_values, -self.critic_target.offset)
+            # No entropy term, unlike in SAC. In terminal states nothing is paid any more, so that L is the offset:
+            # y = (bound - reward) + gamma * ((1 - done) * (next_value + offset) + done * offset),
+            # where bound + gamma * offset = offset is left out on both sides
+            return -replay_data.rewards + (1 - replay_data.dones) * discounts * next_values
+
+    def _violation(
+        self, replay_data: ReplayBufferSamples, next_actions: th.Tensor, values: th.Tensor, costs: th.Tensor
+    ) -> th.Tensor:
+        """
+        Violation of the decrease condition, by the same critic, before its update, for both values.
+
+        :param replay_data: Sampled transitions
+        :param next_actions: Actions in the next states. A gradient through them is that of the violation
+        :param values: ``L(s, a)`` of the transitions, without a gradient, shape (n, 1)
+        :param costs: Of the transitions, shape (n, 1)
+        :return: Mean of ``L(s', a') - L(s, a) + alpha3 * c``, where the episode goes on: nothing follows a terminal state,
+            in which the critic is not trained and no action is taken
+        """
+        if self.critic_has_batch_norm:
+            # Normalized by the statistics of its own batch, neither value would show how much the other one differs
+            self.critic.set_training_mode(False)
+            with th.no_grad():
+                values = largest_value(self.critic(replay_data.observations, replay_data.actions))
+        with th.set_grad_enabled(next_actions.requires_grad):
+            next_values = largest_value(self.critic(replay_data.next_observations, next_actions))
+        if self.critic_has_batch_norm:
+            self.critic.set_training_mode(True)
+        going_on = 1 - replay_data.dones
+        return (going_on * (next_values - values + self.alpha3 * costs)).sum() / going_on.sum().clamp(min=1)
+
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         # Switch to train mode (this affects batch norm / dropout)
         self.policy.set_training_mode(True)
@@ -534,8 +578,6 @@ class LAC(OffPolicyAlgorithm):
         for gradient_step in range(gradient_steps):
             # Sample replay buffer
             replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
-            # For n-step replay, discount factor is gamma**n_steps (when no early termination)
-            discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
             # The largest reward costs nothing, and so no cost is negative
             n_rewards = weight_of_return(replay_data.discounts, self.gamma)
             bound = self._raise_bound(replay_data.rewards / n_rewards)
@@ -544,41 +586,34 @@ class LAC(OffPolicyAlgorithm):
             # We need to sample because `log_std` may have changed between two gradient steps
             if self.use_sde:
                 self.actor.reset_noise()
-                self.actor_target.reset_noise()
+                if self.actor_target is not None:
+                    self.actor_target.reset_noise()
 
-            # One pass of the actor: action and log prob for the sampled states, then for the next states
-            actions_pi, log_prob = self.actor.action_log_prob(
-                concatenate_observations(replay_data.observations, replay_data.next_observations)
-            )
-            _, next_actions_pi = actions_pi.chunk(2)
-            log_prob, _ = log_prob.chunk(2)
+            # Action by the current actor for the sampled states
+            actions_pi, log_prob = self.actor.action_log_prob(replay_data.observations)
 
-            if isinstance(replay_data, HorizonReplayBufferSamples):
-                target_values = -replay_data.horizon_returns
-            else:
-                with th.no_grad():
-                    # Next action by the lagged actor
-                    next_actions = self.actor_target(replay_data.next_observations)
-                    # Compute the next Lyapunov values: max over all target critics
-                    next_values = largest_value(self.critic_target(replay_data.next_observations, next_actions))
-                    # L is never negative
-                    next_values = th.maximum(next_values, -self.critic_target.offset)
-                    # No entropy term, unlike in SAC. In terminal states nothing is paid any more, so that L is the offset:
-                    # y = (bound - reward) + gamma * ((1 - done) * (next_value + offset) + done * offset),
-                    # where bound + gamma * offset = offset is left out on both sides
-                    target_values = -replay_data.rewards + (1 - replay_data.dones) * discounts * next_values
+            with th.no_grad():
+                # Next action by the current actor, or by the lagged one
+                next_actor = self.actor if self.actor_target is None else self.actor_target
+                next_actions = next_actor(replay_data.next_observations)
 
+            target_values = self._target_values(replay_data, next_actions)
             # Get current Lyapunov values for each critic network
             # using action from the replay buffer (all values are relative to the offset)
             current_values = self.critic(replay_data.observations, replay_data.actions)
             critic_loss = 0.5 * sum(F.mse_loss(current_value, target_values) for current_value in current_values)
             assert isinstance(critic_loss, th.Tensor)  # for type checker
 
-            # Violation of the decrease condition: the same critic, before its update, for both values,
-            # and a gradient through the next action only
             values = largest_value(current_values).detach()
-            next_values_pi = largest_value(self.critic(replay_data.next_observations, next_actions_pi))
-            difference = (next_values_pi - values + self.alpha3 * costs).mean()
+            if self.published_update:
+                # A gradient through the next action
+                next_actions = self.actor(replay_data.next_observations)
+            difference = self._violation(replay_data, next_actions, values, costs)
+
+            # What the actor lowers: with the published update the difference itself
+            objective = difference
+            if not self.published_update:
+                objective = largest_value(self.critic(replay_data.observations, actions_pi)).mean()
 
             # Important: detach the multipliers from the graph
             # so we don't change them with other losses
@@ -586,7 +621,7 @@ class LAC(OffPolicyAlgorithm):
             lambda_coef = th.exp(self.log_lambda.detach())
             ent_coef = self.ent_coef_tensor if self.log_ent_coef is None else th.exp(self.log_ent_coef.detach())
             # Lagrangian of the decrease condition and of the entropy constraint
-            actor_loss = lambda_coef * difference + ent_coef * log_prob.mean()
+            actor_loss = lambda_coef * objective + ent_coef * log_prob.mean()
 
             # Optimize the critic and the actor, both with the gradient at the current parameters
             self.critic.optimizer.zero_grad()
@@ -630,9 +665,10 @@ class LAC(OffPolicyAlgorithm):
             # Update target networks
             if gradient_step % self.target_update_interval == 0:
                 polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
-                polyak_update(self.actor.parameters(), self.actor_target.parameters(), self.tau)
                 # Copy running stats, see GH issue #996
                 polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
+                if self.actor_target is not None:
+                    polyak_update(self.actor.parameters(), self.actor_target.parameters(), self.tau)
 
         self._n_updates += gradient_steps
 
@@ -682,4 +718,6 @@ class LAC(OffPolicyAlgorithm):
             state_dicts.append("ent_coef_optimizer")
         else:
             saved_pytorch_variables.append("ent_coef_tensor")
+        if self.actor_target is not None:
+            state_dicts.append("actor_target")
         return state_dicts, saved_pytorch_variables

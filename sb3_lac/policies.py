@@ -181,7 +181,6 @@ class LyapunovPolicy(BasePolicy):
     """
 
     actor: Actor
-    actor_target: Actor
     critic: LyapunovCritic
     critic_target: LyapunovCritic
     action_space: spaces.Box
@@ -284,14 +283,11 @@ class LyapunovPolicy(BasePolicy):
             **self.optimizer_kwargs,
         )
 
-        # The targets share no features extractor, they follow the online networks slowly
-        self.actor_target = self.make_actor()
-        self.actor_target.load_state_dict(self.actor.state_dict())
+        # The target shares no features extractor, it follows the critic slowly
         self.critic_target = self.make_critic(features_extractor=None)
         self.critic_target.load_state_dict(self.critic.state_dict())
 
         # Target networks should always be in eval mode
-        self.actor_target.set_training_mode(False)
         self.critic_target.set_training_mode(False)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:

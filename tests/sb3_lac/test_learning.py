@@ -83,7 +83,7 @@ def update_of(make_model_without_env, transitions, train_metrics):
     def _update_of(value, gain, factor=1.0, **kwargs):
         model = make_model_without_env(n_actions=1, learning_rate=0.0, tau=0.0, gamma=GAMMA, ent_coef=1.0, **kwargs)
         model.replay_buffer.sample = lambda *args, **kwargs: batch
-        model.actor, model.actor_target = LinearActor(gain), LinearActor(gain)
+        model.actor = LinearActor(gain)
         model.critic, model.critic_target = ExactCritic(value, factor), ExactCritic(value)
         for network in (model.actor, model.critic):
             network.optimizer = th.optim.SGD(network.parameters())

@@ -3,6 +3,7 @@ import pytest
 import torch as th
 from stable_baselines3.common.envs import FakeImageEnv
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.utils import get_parameters_by_name
 from torch import nn
 
 from sb3_lac import LAC, CnnPolicy, LyapunovPolicy, MlpPolicy, MultiInputPolicy
@@ -55,18 +56,19 @@ def test_actor_and_critic_can_have_their_own_architecture(make_model):
 
 
 def test_targets_start_as_copies_and_stay_in_eval_mode(make_model):
-    policy = make_model(n_collect=0).policy
-    for online, target in ((policy.actor, policy.actor_target), (policy.critic, policy.critic_target)):
+    model = make_model(n_collect=0, published_update=True)
+    for online, target in ((model.actor, model.actor_target), (model.critic, model.critic_target)):
         assert online is not target
         for parameter, target_parameter in zip(online.parameters(), target.parameters(), strict=True):
             assert parameter is not target_parameter and th.equal(parameter, target_parameter)
-    policy.set_training_mode(True)
-    assert policy.actor.training and policy.critic.training
-    assert not policy.actor_target.training and not policy.critic_target.training
+    model.policy.set_training_mode(True)
+    assert model.actor.training and model.critic.training
+    assert not model.actor_target.training and not model.critic_target.training
+    assert make_model(n_collect=0).actor_target is None
 
 
 def test_batch_norm_statistics_of_both_targets_are_updated(make_model, train_metrics):
-    model = make_model(policy_kwargs={"features_extractor_class": BatchNormExtractor})
+    model = make_model(published_update=True, policy_kwargs={"features_extractor_class": BatchNormExtractor})
     assert len(model.batch_norm_stats) == len(model.batch_norm_stats_target) == 4
     train_metrics(model, gradient_steps=3)
     for online, target in ((model.actor, model.actor_target), (model.critic, model.critic_target)):
@@ -79,15 +81,40 @@ def test_batch_norm_statistics_of_both_targets_are_updated(make_model, train_met
 
 def test_batch_norm_and_dropout_work_in_training_only(make_model, train_metrics):
     model = make_model(n_collect=80, gradient_steps=0, policy_kwargs={"features_extractor_class": BatchNormDropoutExtractor})
-    statistics = [tensor.clone() for tensor in model.batch_norm_stats]
+    batch_norm_stats = get_parameters_by_name(model.policy, ["running_"])
+    statistics = [tensor.clone() for tensor in batch_norm_stats]
     obs = np.ones(2, dtype=np.float32)
     actions = [model.predict(obs, deterministic=True)[0] for _ in range(5)]
     assert all(np.array_equal(action, actions[0]) for action in actions)
     # Neither collecting transitions nor predicting has changed the statistics
     model.learn(10, reset_num_timesteps=False)
-    assert all(th.equal(before, after) for before, after in zip(statistics, model.batch_norm_stats, strict=True))
+    assert all(th.equal(before, after) for before, after in zip(statistics, batch_norm_stats, strict=True))
     train_metrics(model)
-    assert not any(th.equal(before, after) for before, after in zip(statistics, model.batch_norm_stats, strict=True))
+    assert not any(th.equal(before, after) for before, after in zip(statistics, batch_norm_stats, strict=True))
+
+
+def test_batch_norm_does_not_hide_what_the_decrease_condition_measures(make_model, train_metrics):
+    """The statistics of its own batch would centre L(s, a) and L(s', a') alike, however far s' is from s."""
+    model = make_model(
+        learning_rate=1e-12,
+        alpha3=0.1,
+        policy_kwargs={"features_extractor_class": BatchNormExtractor, "optimizer_class": th.optim.SGD},
+    )
+    batch = model.replay_buffer.sample(16)
+    batch = batch._replace(next_observations=10 * batch.observations + 5)
+    model.replay_buffer.sample = lambda *args, **kwargs: batch
+    train_metrics(model, gradient_steps=100)  # the running statistics reach those of the batch
+    violation = train_metrics(model)["lyapunov_difference"]
+
+    model.policy.set_training_mode(False)
+    with th.no_grad():
+        decrease = [
+            model.critic.lyapunov(obs, model.actor(obs, deterministic=True)).mean().item()
+            for obs in (batch.next_observations, batch.observations)
+        ]
+    assert decrease[0] > 10 * decrease[1]
+    assert violation > 0.5 * (decrease[0] - decrease[1])
+    assert model.critic.offset == 0
 
 
 @pytest.mark.parametrize("share_features_extractor", [False, True])
@@ -103,7 +130,7 @@ def test_shared_features_extractor_is_trained_by_the_actor_only(make_model, trai
         policy_kwargs={"share_features_extractor": share_features_extractor, "features_extractor_kwargs": {"features_dim": 8}},
     )
     assert (model.actor.features_extractor is model.critic.features_extractor) == share_features_extractor
-    assert model.critic_target.features_extractor is not model.actor_target.features_extractor
+    assert model.critic_target.features_extractor is not model.actor.features_extractor
     n_optimized = sum(len(group["params"]) for group in model.critic.optimizer.param_groups)
     n_features = len(list(model.critic.features_extractor.parameters()))
     assert n_optimized == len(list(model.critic.parameters())) - (n_features if share_features_extractor else 0)
@@ -152,7 +179,7 @@ def test_custom_policy_class_is_saved_with_the_model(make_model, train_metrics, 
     model.save(tmp_path / "model")
     loaded = LAC.load(tmp_path / "model")
     assert type(model.policy) is type(loaded.policy) is PolicyWithOwnActor
-    assert loaded.actor.own.item() == loaded.actor_target.own.item() == 1.0
+    assert loaded.actor.own.item() == 1.0
 
 
 def test_optimizer_is_chosen_by_the_user(make_model):

@@ -42,10 +42,11 @@ def assert_same_learned_state(model, other):
         {},
         {"ent_coef": 0.1},
         {"use_sde": True},
+        {"published_update": True},
         {"policy_kwargs": {"n_critics": 2, "share_features_extractor": True}},
         {"learning_rate": 1e-3, "lambda_learning_rate": 0.05, "alpha3": 0.2, "lambda_init": 0.5},
     ],
-    ids=["default", "fixed_entropy", "gsde", "twin_critics", "own_arguments"],
+    ids=["default", "fixed_entropy", "gsde", "published_update", "twin_critics", "own_arguments"],
 )
 def test_continued_training_is_the_same_as_uninterrupted_training(make_model, make_env, train_metrics, tmp_path, kwargs):
     # Positive rewards, so that the bound of the cost matters
@@ -59,7 +60,6 @@ def test_continued_training_is_the_same_as_uninterrupted_training(make_model, ma
     loaded.load_replay_buffer(tmp_path / "replay_buffer")
     assert_same_learned_state(model, loaded)
     assert loaded.reward_bound.item() > 0
-    assert loaded.actor_target is loaded.policy.actor_target
 
     metrics = train_metrics(model, gradient_steps=5, seed=1)
     assert_same(metrics, train_metrics(loaded, gradient_steps=5, seed=1))
@@ -168,7 +168,7 @@ def test_bound_is_saved_in_units_of_the_environment(make_model, make_env, train_
 
 def test_saved_data_holds_no_tensor(make_model, train_metrics, tmp_path):
     """Tensors and networks are saved as such, and not a second time as pickled attributes."""
-    model = make_model()
+    model = make_model(published_update=True)
     train_metrics(model)
     model.save(tmp_path / "model")
     data, _, _ = load_from_zip_file(tmp_path / "model")

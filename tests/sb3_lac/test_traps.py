@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3.common.buffers import NStepReplayBuffer
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from torch import nn
 
@@ -119,6 +120,23 @@ def test_terminal_transitions_cost_only_their_own_cost(make_model, train_metrics
     assert train_metrics(model)["critic_loss"] == pytest.approx(0.5 * errors.square().mean().item(), rel=1e-4)
 
 
+def test_episodes_of_one_step_are_learned(make_model_without_env):
+    """The states that they lead to are terminal: an actor that learns there only would learn nothing."""
+    model = make_model_without_env(learning_rate=3e-3, ent_coef=0.01)
+    rng = np.random.default_rng(0)
+
+    def sample(batch_size, env=None):
+        obs, actions = (th.as_tensor(rng.uniform(-1, 1, (batch_size, 2)), dtype=th.float32) for _ in range(2))
+        costs = (actions - 0.5).square().sum(dim=1, keepdim=True)
+        return ReplayBufferSamples(obs, actions, th.zeros_like(obs), th.ones_like(costs), -costs)
+
+    model.replay_buffer.sample = sample
+    model.train(gradient_steps=500, batch_size=64)
+    # Five seeds reached 0.43 to 0.56, and began within 0.1 of 0
+    actions, _ = model.predict(np.zeros(2, dtype=np.float32), deterministic=True)
+    assert np.all(np.abs(actions - 0.5) < 0.25)
+
+
 def costs_of(model, rewards):
     rewards = th.tensor(rewards)
     return (model._raise_bound(rewards) - rewards).tolist()
@@ -189,12 +207,11 @@ def test_log_prob_is_summed_over_actions(make_model, make_env, train_metrics):
     model.replay_buffer.sample = lambda *args, **kwargs: batch
     metrics = train_metrics(model)
     th.manual_seed(0)
-    both = th.cat([batch.observations, batch.next_observations])
-    mean, log_std, _ = model.actor.get_action_dist_params(both)
+    mean, log_std, _ = model.actor.get_action_dist_params(batch.observations)
     normal = th.distributions.Normal(mean, log_std.exp())
     latent = normal.rsample()
     per_action = normal.log_prob(latent) - th.log(1 - th.tanh(latent) ** 2 + 1e-6)
-    violation = per_action[:16].sum(dim=1).mean().item() - 3.0
+    violation = per_action.sum(dim=1).mean().item() - 3.0
     assert metrics["ent_coef_loss"] == pytest.approx(-math.log(0.5) * violation, rel=1e-4)
 
 
