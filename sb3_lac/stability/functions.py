@@ -106,7 +106,7 @@ class CriticLyapunov(LyapunovFunction):
         self.model = model
 
     def _of_the_mean_action(self, observations: Observations) -> np.ndarray:
-        actions, _ = self.model.predict(observations, deterministic=True)  # type: ignore[arg-type]
+        actions, _ = self.model.predict(observations, deterministic=True)
         return self.values_of_actions(observations, actions)
 
     def values_of_actions(self, observations: Observations, actions: np.ndarray) -> np.ndarray:

@@ -296,11 +296,10 @@ def plot_attraction(starts: pd.DataFrame, confidence: float, x: int, y: int, nam
     axes = figure.subplots()
     # The worst of those that differ in other dimensions
     order = np.argsort(-starts["low"].to_numpy(), kind="stable")
-    marks = axes.scatter(
-        *points[order].T, c=starts["low"].to_numpy()[order], s=42, marker="s", cmap="viridis", vmin=0.0, vmax=1.0
-    )
+    shown, low = points[order], starts["low"].to_numpy()[order]
+    marks = axes.scatter(shown[:, 0], shown[:, 1], c=low, s=42, marker="s", cmap="viridis", vmin=0.0, vmax=1.0)
     never = (starts["n_attracted"] == 0).to_numpy()
-    axes.scatter(*points[never].T, s=20, color=VERMILION, marker="x", lw=1, label="never attracted")
+    axes.scatter(points[never, 0], points[never, 1], s=20, color=VERMILION, marker="x", lw=1, label="never attracted")
     figure.colorbar(marks, ax=axes, label=f"probability of attraction, at least ({100 * confidence:g} % interval)")
     if never.any():
         axes.legend(fontsize=8, loc="upper right")

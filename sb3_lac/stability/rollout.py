@@ -42,7 +42,7 @@ def prepare_evaluation(policy: PolicyPredictor, env: gym.Env | VecEnv, n_eval_ep
         raise ValueError(f"n_eval_episodes={n_eval_episodes} must be at least 1.")
     if not isinstance(policy, (BaseAlgorithm, BasePolicy)):
         # A controller that knows nothing of images and their channels
-        return env if isinstance(env, VecEnv) else DummyVecEnv([lambda: env])
+        return env if isinstance(env, VecEnv) else DummyVecEnv([lambda: env])  # type: ignore[list-item, return-value]
     env = BaseAlgorithm._wrap_env(env, monitor_wrapper=False)
     check_for_correct_spaces(env, policy.observation_space, policy.action_space)
     # A model that was loaded without an environment does not know what it was trained with
@@ -209,7 +209,7 @@ class RollOuts:
         done = (transitions["truncated"] | transitions["terminated"]).to_numpy()
         transitions["next_lyapunov"] = transitions["lyapunov"].shift(-1).where(~done, np.nan)
         if self.last_observations is not None:
-            last_actions, _ = policy.predict(self.last_observations, deterministic=deterministic)  # type: ignore[arg-type]
+            last_actions, _ = policy.predict(self.last_observations, deterministic=deterministic)
             last_values = lyapunov.values_of_actions(self.last_observations, last_actions)
             transitions.loc[transitions["truncated"], "next_lyapunov"] = np.asarray(last_values, dtype=np.float64)
 
@@ -276,7 +276,7 @@ def roll_out(
     if not np.isfinite(transitions["reward"]).all():
         raise ValueError("The environment paid a reward that is not finite: its costs cannot be judged.")
     transitions["reward"] = transitions["reward"].astype(np.float64)
-    last_of = transitions.loc[transitions["truncated"], "env"]
+    last_of = transitions.loc[transitions["truncated"], "env"].to_numpy()
     # From the order of time to one episode after the other
     order = np.argsort(transitions["env"], kind="stable")
     transitions = transitions.iloc[order].reset_index(drop=True)

@@ -207,14 +207,15 @@ def tightest_drift(n: np.ndarray, drift: np.ndarray, cost: np.ndarray) -> tuple[
     for index in np.ndindex(shape):
         seen = n[index] > 0
         m, c = drift[index][seen] / n[index][seen], cost[index][seen] / n[index][seen]
-        # With t = 1 / alpha3 it is the largest of straight lines, whose least value is at t = 0 or where two of them meet
+        # With t = 1 / alpha3 it is the largest of straight lines, whose least value is at t = 0, or where
+        # two of them meet, or where the last one reaches 0
         with np.errstate(divide="ignore", invalid="ignore"):
-            meetings = ((c[:, None] - c) / (m - m[:, None])).ravel()
-        t = np.append(0.0, meetings[np.isfinite(meetings) & (meetings > 0)])
-        of_t = (np.outer(t, m) + c).max(axis=1)
+            meetings = np.append((c[:, None] - c) / (m - m[:, None]), -c / m)
+        t = np.sort(np.append(0.0, meetings[np.isfinite(meetings) & (meetings > 0)]))
+        # No negative residual: L cannot fall for ever, and these roll-outs only end before it settles
+        of_t = np.maximum((np.outer(t, m) + c).max(axis=1), 0.0)
         best = np.argmin(of_t)
-        # Not negative, up to rounding: L cannot fall for ever
-        bounds[index], alphas[index] = max(of_t[best], 0.0), 1 / t[best] if t[best] > 0 else np.nan
+        bounds[index], alphas[index] = of_t[best], 1 / t[best] if t[best] > 0 else np.nan
     return bounds, alphas
 
 
