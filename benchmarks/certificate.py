@@ -88,9 +88,11 @@ def policies(chosen: argparse.Namespace, env_id: str) -> list[tuple[str, int | N
     for algo in chosen.algos:
         for fraction in chosen.fractions:
             for seed in chosen.seeds:
-                whole = int(chosen.timesteps) if chosen.timesteps else Recipe.of(algo, env_id, seed).timesteps
-                steps = round(fraction * whole)
-                name = algo.upper() if fraction == 1 else f"{algo.upper()}, {100 * fraction:g} % of the steps"
+                recipe = Recipe.of(algo, env_id, seed, int(chosen.timesteps) if chosen.timesteps else None)
+                given = {**recipe.arguments, **recipe.hyperparameters}
+                # a share of what is learned: nothing is before learning_starts
+                steps = given["learning_starts"] + round(fraction * (recipe.timesteps - given["learning_starts"]))
+                name = algo.upper() if fraction == 1 else f"{algo.upper()}, {100 * fraction:g} % of the updates"
                 found.append((name, seed, train_or_load(algo, env_id, seed, steps, chosen.out / "models")))
     return found
 
@@ -185,10 +187,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--algos", nargs="*", default=[], help="algorithms to train, with an entry in zoo_configs")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
     parser.add_argument("--timesteps", type=float, help="environment steps of each training, those of zoo_configs by default")
-    parser.add_argument("--fractions", nargs="+", type=float, default=[1.0], help="shares of the steps to train for")
+    parser.add_argument("--fractions", nargs="+", type=float, default=[1.0], help="shares of the updates to train for")
     parser.add_argument("--models", nargs="*", default=[], metavar="ALGO=PATH", help="saved models to judge, in all --envs")
     parser.add_argument("--episodes", type=int, default=200, help="to fit, to evaluate and to certify, each")
-    parser.add_argument("--out", type=Path, default=Path("results/certificate"))
+    parser.add_argument("--out", type=Path, default=Path("results/certificates"))
     chosen = parser.parse_args(arguments)
     unknown = [name for name in [*chosen.algos, *(model.partition("=")[0] for model in chosen.models)] if name not in ALGOS]
     if unknown:

@@ -155,12 +155,13 @@ def draw_drift(by_cost: pd.DataFrame, cost_bound: float, cost_bound_alpha3: floa
     axes.axhline(0, color="0.4", lw=1)
     axes.scatter(cost, drift, color=np.where(drift < 0, GREEN, VERMILION).tolist(), s=30, zorder=3)
     if not math.isnan(cost_bound_alpha3):
-        ends = np.array([cost.min(), cost.max()])
-        axes.plot(ends, cost_bound_alpha3 * (cost_bound - ends), color=BLUE, lw=1.2, label=r"$-\alpha_3 c + b$")
+        # Many points, for the axes may be logarithmic
+        along = np.interp(np.linspace(0, len(cost) - 1, 500), np.arange(len(cost)), np.sort(cost))
+        axes.plot(along, cost_bound_alpha3 * (cost_bound - along), color=BLUE, lw=1.2, label=r"$-\alpha_3 c + b$")
     if not math.isnan(cost_bound):
         axes.axvline(cost_bound, color=ORANGE, ls="--", lw=1.2, label=f"$b / \\alpha_3$ = {cost_bound:.2g}")
     axes.axvline(start_cost, color="0.4", ls=":", lw=1.2, label=f"at the start {start_cost:.2g}")
-    # Lines stay lines, but small costs are told apart
+    # The smallest costs are told apart, and the largest are still seen
     largest = float(np.abs(drift).max()) if len(drift) > 0 else 0.0
     if is_wide(cost) and largest > 0:
         smallest = float(cost.min())
@@ -194,20 +195,21 @@ def draw_calibration(transitions: pd.DataFrame, axes: Axes) -> None:
     axes.legend(fontsize=8)
 
 
-def draw_costs(transitions: pd.DataFrame, ultimate_bound: float, axes: Axes) -> None:
+def draw_costs(transitions: pd.DataFrame, bound: float, axes: Axes, name: str = "ultimate bound") -> None:
     """
     Draw the costs over time.
 
     :param transitions: One row per transition
-    :param ultimate_bound: A cost to mark, NaN if there is none
+    :param bound: A cost to mark, NaN if there is none
     :param axes: The panel
+    :param name: Of that cost
     """
     low, median, high = transitions.groupby("step")["cost"].quantile(np.array([0.1, 0.5, 0.9])).unstack().to_numpy().T
     steps = np.arange(len(median))
     axes.fill_between(steps, low, high, color=BLUE, alpha=0.2, lw=0, label="10 % to 90 % of the episodes")
     axes.plot(steps, median, color=BLUE, lw=1.4, label="median")
-    if not math.isnan(ultimate_bound):
-        axes.axhline(ultimate_bound, color=ORANGE, ls="--", lw=1.2, label=f"ultimate bound {ultimate_bound:.2g}")
+    if not math.isnan(bound):
+        axes.axhline(bound, color=ORANGE, ls="--", lw=1.2, label=f"{name} {bound:.2g}")
     set_log_scale(axes, "y", low)
     axes.set(xlabel="step", ylabel="cost", title="Costs over time")
     axes.legend(fontsize=8)
@@ -262,7 +264,7 @@ def plot_certification(
     figure = new_figure(9.5, 3.6)
     of_statements, of_costs = figure.subplots(1, 2)
     positions = np.arange(len(statements))[::-1]
-    of_statements.barh(positions, statements["at_least"], height=0.5, color=GREEN, label="at least")
+    of_statements.barh(positions, statements["at_least"], height=0.4, color=GREEN, label="at least")
     of_statements.scatter(statements["share"], positions, color="black", s=24, zorder=3, label="of these episodes")
     names = [
         f"{str(name).replace('_', ' ')}\n{row['n_true']:.0f} of {row['n_episodes']:.0f}" for name, row in statements.iterrows()
@@ -270,12 +272,12 @@ def plot_certification(
     of_statements.set_yticks(positions, names)
     of_statements.set(
         xlim=(0, 1.02),
-        ylim=(-0.5, len(statements) - 0.5),
+        ylim=(-0.9, len(statements) - 0.5),
         xlabel="probability",
         title=f"With {100 * confidence:g} % confidence",
     )
-    of_statements.legend(fontsize=8, loc="lower left")
-    draw_costs(transitions, math.nan if cost_bound is None else cost_bound, of_costs)
+    of_statements.legend(fontsize=8, loc="lower left", ncols=2)
+    draw_costs(transitions, math.nan if cost_bound is None else cost_bound, of_costs, "cost bound")
     return figure
 
 

@@ -250,7 +250,8 @@ def roll_out(
             # Those of the last round that are too many are started and not looked at
             chosen = np.arange(number * n_envs, (number + 1) * n_envs)
             targets = (chosen < n_eval_episodes).astype(int)
-            env.set_options([{"state": starts[min(i, n_eval_episodes - 1)].tolist()} for i in chosen])
+            of_round = starts[np.minimum(chosen, n_eval_episodes - 1)].tolist()
+            env.set_options([{"state": start} for start in of_round])
         counts = np.zeros(n_envs, dtype=int)
         observations = env.reset()
         state: tuple[np.ndarray, ...] | None = None
