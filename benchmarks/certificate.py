@@ -163,15 +163,19 @@ def plot(table: pd.DataFrame) -> Figure:
         of_env = table[table["env"] == env_id].reset_index(drop=True)
         rows = of_env.index.to_numpy()[::-1]
         colours = np.where(of_env["holds"], COLOURS[2], COLOURS[1]).tolist()
-        axes.hlines(rows, of_env["cost_bound_low"], of_env["cost_bound_high"], colors=colours, lw=3)
-        axes.scatter(
-            of_env["cost_bound"], rows, c=colours, s=24, label="settles below (green: the certificate holds)", zorder=3
-        )
+        bounds = of_env[["cost_bound_low", "cost_bound", "cost_bound_high"]]
+        # a logarithmic axis has no 0, which is shown a decade below all else
+        least = min(of_env["start_cost"].min(), bounds.where(bounds > 1e-9).min(axis=None)) / 10
+        low, bound, high = bounds.clip(lower=least).to_numpy().T
+        axes.hlines(rows, low, high, colors=colours, lw=3)
+        axes.scatter(bound, rows, c=colours, s=24, label="settles below (green: the certificate holds)", zorder=3)
         axes.scatter(of_env["start_cost"], rows, color="black", marker="|", s=80, label="at the start")
         seeds = [f" {seed:.0f}" if pd.notna(seed) else "" for seed in of_env["seed"]]
         functions = np.where(of_env["function"] == "critic", " (critic)", "")
         axes.set_yticks(rows, of_env["policy"] + seeds + functions, fontsize="small")
-        axes.set(xscale="log", xlabel="cost per step", title=env_id)
+        axes.margins(y=0.2)
+        zero = f" (0 at {least:.1g})" if (bounds < 1e-9).any(axis=None) else ""
+        axes.set(xscale="log", xlabel=f"cost per step{zero}", title=env_id)
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize="small")
     return figure
 

@@ -167,6 +167,7 @@ def draw_drift(by_cost: pd.DataFrame, cost_bound: float, cost_bound_alpha3: floa
         smallest = float(cost.min())
         axes.set_xscale("symlog", linthresh=10 * smallest)
         axes.set_yscale("symlog", linthresh=max(10 * smallest, 1e-3 * largest))
+    axes.margins(0.1)
     axes.set(xlabel="cost of the transition", ylabel="mean of $L(s', a') - L(s, a)$", title="Drift by cost")
     axes.legend(fontsize=8)
 
