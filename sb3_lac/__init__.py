@@ -3,11 +3,11 @@
 from pathlib import Path
 
 import sb3_lac.envs  # noqa: F401  (registers the ids of the cost environments)
-from sb3_lac.callbacks import LyapunovCallback
+from sb3_lac.callbacks import CertificateCallback, LyapunovCallback
 from sb3_lac.dashboard import DashboardCallback
 from sb3_lac.lac import LAC
 from sb3_lac.policies import CnnPolicy, LyapunovPolicy, MlpPolicy, MultiInputPolicy
-from sb3_lac.stability import LyapunovReport, evaluate_lyapunov
+from sb3_lac.stability import FittedLyapunov, LyapunovFunction, LyapunovReport, certify, evaluate_lyapunov, fit_lyapunov
 from sb3_lac.vec_env import GymnasiumVecEnv
 
 # Gymnasium does not import third-party environments by itself:
@@ -23,14 +23,19 @@ __version__ = Path(__file__).with_name("version.txt").read_text(encoding="utf-8"
 
 __all__ = [
     "LAC",
+    "CertificateCallback",
     "CnnPolicy",
     "DashboardCallback",
+    "FittedLyapunov",
     "GymnasiumVecEnv",
     "LyapunovCallback",
+    "LyapunovFunction",
     "LyapunovPolicy",
     "LyapunovReport",
     "MlpPolicy",
     "MultiInputPolicy",
     "__version__",
+    "certify",
     "evaluate_lyapunov",
+    "fit_lyapunov",
 ]

@@ -5,13 +5,14 @@ from pathlib import Path
 from typing import ClassVar
 
 import gymnasium as gym
+import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, EventCallback
 from stable_baselines3.common.logger import Figure
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, sync_envs_normalization
 
 from sb3_lac.dashboard import NOT_TENSORBOARD, tensorboard_writer
 from sb3_lac.lac import LAC
-from sb3_lac.stability import LyapunovReport, evaluate_lyapunov
+from sb3_lac.stability import CertificationReport, LyapunovReport, certify, evaluate_lyapunov, fit_lyapunov
 from sb3_lac.stability.rollout import prepare_evaluation, trains_on
 
 
@@ -52,7 +53,8 @@ class LyapunovCallback(EventCallback):
         "ultimate_bound": "ultimate_bound",
         "death_rate": "death_rate",
     }
-    model: LAC
+    #: Whether values of the critic are judged
+    OF_THE_CRITIC: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -81,7 +83,12 @@ class LyapunovCallback(EventCallback):
 
     def _init_callback(self) -> None:
         # A mistake is seen before the training, and not at its first evaluation
-        self.eval_env = prepare_evaluation(self.model, self.eval_env, self.n_eval_episodes)
+        if self.OF_THE_CRITIC and not isinstance(self.model, LAC):
+            raise ValueError(
+                f"The model must be a LAC model, which has a Lyapunov function, and not {self.model!r}. CertificateCallback "
+                "learns one for any other model."
+            )
+        self.eval_env = prepare_evaluation(self.model, self.eval_env, self.n_eval_episodes, self.OF_THE_CRITIC)
         if trains_on(self.model, self.eval_env):
             raise ValueError(
                 "The evaluation environment is the training environment: an evaluation would end its episodes, and the "
@@ -103,10 +110,29 @@ class LyapunovCallback(EventCallback):
         if self.model.get_vec_normalize_env() is not None:
             sync_envs_normalization(self.training_env, self.eval_env)
 
+        entry = {"timesteps": self.num_timesteps, **self._evaluate()}
+        # Dump log so the evaluation results are printed with the correct timestep
+        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+        self.logger.dump(self.num_timesteps)
+
+        self._add_to_history(entry)
+        if self.verbose >= 1:
+            print(f"Eval num_timesteps={self.num_timesteps}, {self._summary()}")
+
+        # Trigger callback after every evaluation, if needed
+        return self._on_event()
+
+    def _evaluate(self) -> dict[str, float]:
+        """
+        Evaluate, and log what was found.
+
+        :return: Values by name, for the history
+        """
+        assert isinstance(self.model, LAC)
         self.last_report = evaluate_lyapunov(
             self.model, self.eval_env, self.n_eval_episodes, deterministic=self.deterministic, seed=self.seed
         )
-        entry: dict[str, float] = {"timesteps": self.num_timesteps}
+        entry: dict[str, float] = {}
         for metric, name in self.METRICS.items():
             value, low, high = self.last_report.metrics[metric]
             self.logger.record(f"lyapunov/{name}", value)
@@ -116,16 +142,11 @@ class LyapunovCallback(EventCallback):
                 for limit in (f"{name}_low", f"{name}_high"):
                     self.logger.record(f"lyapunov/{limit}", entry[limit], exclude=NOT_TENSORBOARD)
             self.logger.record("lyapunov/report", Figure(self.last_report.plot(), close=False), exclude=NOT_TENSORBOARD)
-        # Dump log so the evaluation results are printed with the correct timestep
-        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
-        self.logger.dump(self.num_timesteps)
+        return entry
 
-        self._add_to_history(entry)
-        if self.verbose >= 1:
-            print(f"Eval num_timesteps={self.num_timesteps}, {self.last_report.summary()}")
-
-        # Trigger callback after every evaluation, if needed
-        return self._on_event()
+    def _summary(self) -> str:
+        assert self.last_report is not None
+        return self.last_report.summary()
 
     def _add_to_history(self, entry: dict[str, float]) -> None:
         """
@@ -142,3 +163,74 @@ class LyapunovCallback(EventCallback):
             temporary_path = self.log_path.with_name(f"{self.log_path.name}.tmp")
             pd.DataFrame(self.history).to_csv(temporary_path, index=False)
             os.replace(temporary_path, self.log_path)
+
+
+class CertificateCallback(LyapunovCallback):
+    """
+    Callback for certifying the policy of any algorithm while it trains: a Lyapunov function is fitted to roll-outs of the mean
+    action (see ``fit_lyapunov()``) and judged on others (see ``evaluate_lyapunov()``), about which exact statements are made
+    (see ``certify()``). The training is not changed by it. Each of the three takes its own seed, so that all evaluations have
+    the same start states and none is judged on what it was fitted on.
+
+    :param eval_env: The environment used for evaluation, as for ``LyapunovCallback``
+    :param callback_after_eval: Callback to trigger after every evaluation, which finds the reports in
+        ``self.parent.last_report`` and ``self.parent.last_certification``
+    :param n_eval_episodes: Number of episodes for each of the three
+    :param eval_freq: Evaluate the agent every ``eval_freq`` call of the callback.
+    :param confidence: Of all statements of one evaluation together; it is not corrected for the number of evaluations
+    :param cost_bound: The cost to stay within, the largest late cost of the roll-outs of the fit by default
+    :param seed: Seed of each evaluation
+    :param log_path: Path of a CSV file, as for ``LyapunovCallback``
+    :param verbose: Verbosity level: 0 for no output, 1 for the summary of each evaluation
+    """
+
+    #: Metrics that are logged beside the statements, with their names in the log
+    METRICS: ClassVar[dict[str, str]] = {
+        "largest_feasible_alpha3": "feasible_alpha3",
+        "mean_cost": "mean_cost",
+        "start_cost": "start_cost",
+        "cost_bound": "cost_bound",
+        "ultimate_bound": "ultimate_bound",
+        "death_rate": "death_rate",
+    }
+    OF_THE_CRITIC: ClassVar[bool] = False
+
+    def __init__(
+        self,
+        eval_env: gym.Env | VecEnv,
+        callback_after_eval: BaseCallback | None = None,
+        n_eval_episodes: int = 100,
+        eval_freq: int = 10_000,
+        confidence: float = 0.95,
+        cost_bound: float | None = None,
+        seed: int = 0,
+        log_path: str | os.PathLike[str] | None = None,
+        verbose: int = 1,
+    ):
+        super().__init__(eval_env, callback_after_eval, n_eval_episodes, eval_freq, True, seed, log_path, verbose)
+        self.confidence = confidence
+        self.cost_bound = cost_bound
+        self.last_certification: CertificationReport | None = None
+
+    def _evaluate(self) -> dict[str, float]:
+        assert self.seed is not None
+        first, n_envs, n_episodes = self.seed, self.eval_env.num_envs, self.n_eval_episodes
+        lyapunov = fit_lyapunov(self.model, self.eval_env, n_episodes, seed=first, progress_bar=False)
+        self.last_report = evaluate_lyapunov(self.model, self.eval_env, n_episodes, seed=first + n_envs, lyapunov=lyapunov)
+        self.last_certification = certify(
+            self.model, self.eval_env, lyapunov, n_episodes, self.confidence, self.cost_bound, seed=first + 2 * n_envs
+        )
+        values = {"holds": float(self.last_report.holds)}
+        for metric, name in self.METRICS.items():
+            values[name] = self.last_report.metrics[metric].value
+        for name in ("survives", "stays_within", "decreases"):
+            # A statement that no episode could make
+            bounds = self.last_certification.statements["at_least"]
+            values[f"{name}_at_least"] = float(bounds.get(name, np.nan))
+        for name, value in values.items():
+            self.logger.record(f"certificate/{name}", value)
+        return values
+
+    def _summary(self) -> str:
+        assert self.last_certification is not None
+        return "\n".join([super()._summary(), self.last_certification.summary()])

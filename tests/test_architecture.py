@@ -87,10 +87,19 @@ def test_sb3_lac_knows_nothing_of_batteries(path):
     assert batteries <= ({"battery_env"} if path.name == "__init__.py" else set())
 
 
-@pytest.mark.parametrize(("module", "may_import"), [("plots", set()), ("statistics", set()), ("rollout", {"sb3_lac.lac"})])
-def test_only_the_report_knows_the_other_files_of_stability(module, may_import):
+@pytest.mark.parametrize(
+    ("module", "may_import"),
+    [
+        ("plots", set()),
+        ("statistics", set()),
+        ("functions", {"lac"}),
+        ("rollout", {"lac", "stability.functions"}),
+        ("fitting", {"stability.functions", "stability.rollout"}),
+    ],
+)
+def test_only_reports_know_the_other_files_of_stability(module, may_import):
     own = {name for name in imports(ROOT / f"sb3_lac/stability/{module}.py") if name.startswith("sb3_lac")}
-    assert own == may_import
+    assert own == {f"sb3_lac.{name}" for name in may_import}
 
 
 # each takes a good part of a second to import

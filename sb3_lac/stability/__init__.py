@@ -1,6 +1,19 @@
-"""Is the learned ``L`` a certificate? Statistics of the decrease condition along roll-outs of a policy."""
+"""Stability of the loop that a policy closes: Lyapunov functions learned, judged on other roll-outs, and exact statements."""
 
+from sb3_lac.stability.certification import CertificationReport, certify
+from sb3_lac.stability.fitting import FittedLyapunov, fit_lyapunov
+from sb3_lac.stability.functions import CriticLyapunov, LyapunovFunction
 from sb3_lac.stability.report import LyapunovReport, evaluate_lyapunov
 from sb3_lac.stability.statistics import Interval
 
-__all__ = ["Interval", "LyapunovReport", "evaluate_lyapunov"]
+__all__ = [
+    "CertificationReport",
+    "CriticLyapunov",
+    "FittedLyapunov",
+    "Interval",
+    "LyapunovFunction",
+    "LyapunovReport",
+    "certify",
+    "evaluate_lyapunov",
+    "fit_lyapunov",
+]

@@ -141,6 +141,37 @@ def draw_by_cost(by_cost: pd.DataFrame, alpha3: float, axes: Axes) -> None:
     )
 
 
+def draw_drift(by_cost: pd.DataFrame, cost_bound: float, cost_bound_alpha3: float, start_cost: float, axes: Axes) -> None:
+    """
+    Draw the drift of ``L`` over the cost, below the line that bounds the mean cost in the long run.
+
+    :param by_cost: One row per level
+    :param cost_bound: Where the line is 0
+    :param cost_bound_alpha3: Its slope downwards, NaN if there is no line
+    :param start_cost: A cost to mark
+    :param axes: The panel
+    """
+    cost, drift = by_cost["cost"], by_cost["drift"]
+    axes.axhline(0, color="0.4", lw=1)
+    axes.scatter(cost, drift, color=np.where(drift < 0, GREEN, VERMILION).tolist(), s=30, zorder=3)
+    if not math.isnan(cost_bound_alpha3):
+        # Many points, for the axes may be logarithmic
+        along = np.interp(np.linspace(0, len(cost) - 1, 500), np.arange(len(cost)), np.sort(cost))
+        axes.plot(along, cost_bound_alpha3 * (cost_bound - along), color=BLUE, lw=1.2, label=r"$-\alpha_3 c + b$")
+    if not math.isnan(cost_bound):
+        axes.axvline(cost_bound, color=ORANGE, ls="--", lw=1.2, label=f"$b / \\alpha_3$ = {cost_bound:.2g}")
+    axes.axvline(start_cost, color="0.4", ls=":", lw=1.2, label=f"at the start {start_cost:.2g}")
+    # The smallest costs are told apart, and the largest are still seen
+    largest = float(np.abs(drift).max()) if len(drift) > 0 else 0.0
+    if is_wide(cost) and largest > 0:
+        smallest = float(cost.min())
+        axes.set_xscale("symlog", linthresh=10 * smallest)
+        axes.set_yscale("symlog", linthresh=max(10 * smallest, 1e-3 * largest))
+    axes.margins(0.1)
+    axes.set(xlabel="cost of the transition", ylabel="mean of $L(s', a') - L(s, a)$", title="Drift by cost")
+    axes.legend(fontsize=8)
+
+
 def draw_calibration(transitions: pd.DataFrame, axes: Axes) -> None:
     """
     Draw ``L`` against the cost-to-go.
@@ -165,20 +196,21 @@ def draw_calibration(transitions: pd.DataFrame, axes: Axes) -> None:
     axes.legend(fontsize=8)
 
 
-def draw_costs(transitions: pd.DataFrame, ultimate_bound: float, axes: Axes) -> None:
+def draw_costs(transitions: pd.DataFrame, bound: float, axes: Axes, name: str = "ultimate bound") -> None:
     """
     Draw the costs over time.
 
     :param transitions: One row per transition
-    :param ultimate_bound: A cost to mark, NaN if there is none
+    :param bound: A cost to mark, NaN if there is none
     :param axes: The panel
+    :param name: Of that cost
     """
     low, median, high = transitions.groupby("step")["cost"].quantile(np.array([0.1, 0.5, 0.9])).unstack().to_numpy().T
     steps = np.arange(len(median))
     axes.fill_between(steps, low, high, color=BLUE, alpha=0.2, lw=0, label="10 % to 90 % of the episodes")
     axes.plot(steps, median, color=BLUE, lw=1.4, label="median")
-    if not math.isnan(ultimate_bound):
-        axes.axhline(ultimate_bound, color=ORANGE, ls="--", lw=1.2, label=f"ultimate bound {ultimate_bound:.2g}")
+    if not math.isnan(bound):
+        axes.axhline(bound, color=ORANGE, ls="--", lw=1.2, label=f"{name} {bound:.2g}")
     set_log_scale(axes, "y", low)
     axes.set(xlabel="step", ylabel="cost", title="Costs over time")
     axes.legend(fontsize=8)
@@ -200,6 +232,81 @@ def plot_report(transitions: pd.DataFrame, by_cost: pd.DataFrame, alpha3: float,
     draw_by_cost(by_cost, alpha3, of_decrease)
     draw_calibration(transitions, of_calibration)
     draw_costs(transitions, ultimate_bound, of_costs)
+    return figure
+
+
+def plot_drift(by_cost: pd.DataFrame, cost_bound: float, cost_bound_alpha3: float, start_cost: float) -> Figure:
+    """
+    See ``LyapunovReport.plot_drift()``.
+
+    :param by_cost: One row per level
+    :param cost_bound: Where the line is 0
+    :param cost_bound_alpha3: Its slope downwards, NaN if there is no line
+    :param start_cost: A cost to mark
+    :return: The figure
+    """
+    figure = new_figure(5.6, 4.2)
+    draw_drift(by_cost, cost_bound, cost_bound_alpha3, start_cost, figure.subplots())
+    return figure
+
+
+def plot_certification(
+    statements: pd.DataFrame, transitions: pd.DataFrame, confidence: float, cost_bound: float | None
+) -> Figure:
+    """
+    See ``CertificationReport.plot()``.
+
+    :param statements: One row per statement
+    :param transitions: One row per transition
+    :param confidence: Of all statements together
+    :param cost_bound: A cost to mark, None if there is none
+    :return: The figure
+    """
+    figure = new_figure(9.5, 3.6)
+    of_statements, of_costs = figure.subplots(1, 2)
+    positions = np.arange(len(statements))[::-1]
+    of_statements.barh(positions, statements["at_least"], height=0.4, color=GREEN, label="at least")
+    of_statements.scatter(statements["share"], positions, color="black", s=24, zorder=3, label="of these episodes")
+    names = [
+        f"{str(name).replace('_', ' ')}\n{row['n_true']:.0f} of {row['n_episodes']:.0f}" for name, row in statements.iterrows()
+    ]
+    of_statements.set_yticks(positions, names)
+    of_statements.set(
+        xlim=(0, 1.02),
+        ylim=(-0.9, len(statements) - 0.5),
+        xlabel="probability",
+        title=f"With {100 * confidence:g} % confidence",
+    )
+    of_statements.legend(fontsize=8, loc="lower left", ncols=2)
+    draw_costs(transitions, math.nan if cost_bound is None else cost_bound, of_costs, "cost bound")
+    return figure
+
+
+def plot_attraction(starts: pd.DataFrame, confidence: float, x: int, y: int, names: Sequence[str] | None) -> Figure:
+    """
+    See ``CertificationReport.plot_region_of_attraction()``.
+
+    :param starts: One row per start state
+    :param confidence: Of each interval
+    :param x: Dimension of the start state on the horizontal axis
+    :param y: Dimension of the start state on the vertical axis
+    :param names: Names of all dimensions
+    :return: The figure
+    """
+    states = starts[[column for column in starts if str(column).startswith("state_")]].to_numpy()
+    points, labels = project(states, x, y, names or [f"state {k}" for k in range(states.shape[1])])
+    figure = new_figure(5.8, 4.8)
+    axes = figure.subplots()
+    # The worst of those that differ in other dimensions
+    order = np.argsort(-starts["low"].to_numpy(), kind="stable")
+    shown, low = points[order], starts["low"].to_numpy()[order]
+    marks = axes.scatter(shown[:, 0], shown[:, 1], c=low, s=42, marker="s", cmap="viridis", vmin=0.0, vmax=1.0)
+    never = (starts["n_attracted"] == 0).to_numpy()
+    axes.scatter(points[never, 0], points[never, 1], s=20, color=VERMILION, marker="x", lw=1, label="never attracted")
+    figure.colorbar(marks, ax=axes, label=f"probability of attraction, at least ({100 * confidence:g} % interval)")
+    if never.any():
+        axes.legend(fontsize=8, loc="upper right")
+    axes.set(title=f"{len(points)} start states, {starts['n_episodes'].iloc[0]} episodes each", **labels)
     return figure
 
 

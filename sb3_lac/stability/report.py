@@ -1,4 +1,4 @@
-"""Is the learned ``L`` a certificate? The report of an evaluation."""
+"""Is ``L`` a Lyapunov function of the loop that a policy closes? The report of an evaluation."""
 
 from __future__ import annotations
 
@@ -9,11 +9,20 @@ from typing import TYPE_CHECKING
 
 import gymnasium as gym
 import numpy as np
-import torch as th
+from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_lac.lac import LAC, time_limits
-from sb3_lac.stability.rollout import cost_to_go, prepare_evaluation, roll_out, summarize_episodes, trains_on
+from sb3_lac.stability.functions import CriticLyapunov, LyapunovFunction
+from sb3_lac.stability.rollout import (
+    check_seeds,
+    cost_to_go,
+    prepare_evaluation,
+    relative_cost_to_go,
+    roll_out,
+    summarize_episodes,
+    undisturbed,
+)
 from sb3_lac.stability.statistics import Bootstrap, Interval, decrease_by_cost, estimate_metrics
 
 if TYPE_CHECKING:
@@ -33,8 +42,9 @@ class LyapunovReport:
         fifth), ``terminated``
     :param observations: The observations of the transitions as the policy saw them, or None if they are no vectors
     :param metrics: Values with their 95 % intervals, by name
-    :param by_cost: The decrease condition by level of the cost: ``cost_low``, ``cost_high``, ``n_transitions``, ``decrease``,
-        ``decrease_low``, ``decrease_high``, ``share_decreasing``
+    :param by_cost: The decrease condition by level of the cost: ``cost_low``, ``cost_high``, ``cost`` (mean),
+        ``n_transitions``, ``drift`` (mean of ``L(s', a') - L(s, a)``), ``decrease``, ``decrease_low``, ``decrease_high``,
+        ``share_decreasing``
     :param alpha3: Share of the cost by which ``L`` has to decrease
     :param gamma: The discount factor
     :param horizon: Number of steps whose costs ``L`` estimates, None for all to come
@@ -91,6 +101,10 @@ class LyapunovReport:
                 lines.append(f"  {name:<24}{value:>12.4g}   [{low:.4g}, {high:.4g}]")
         lines += [f"Not available: {', '.join(names)}. {reason}" for reason, names in missing.items()]
         lines.append(f"With alpha3={self.alpha3:g} the decrease condition {self._verdict()}.")
+        lines.append(self._verdict_with_residual())
+        if not self.lyapunov_over_cost.empty:
+            quantiles = ", ".join(f"{value:.3g}" for value in self.lyapunov_over_cost)
+            lines.append(f"L is {quantiles} times the cost (5th, 50th and 95th percentile of the transitions).")
         if self.n_calibrated > 0:
             lines.append(f"L was compared with the cost-to-go of {self.n_calibrated} transitions.")
         lines.append(
@@ -111,10 +125,52 @@ class LyapunovReport:
             return "is undecided: one episode with a decrease gives no interval, use more episodes"
         return "is undecided: the interval of decrease contains 0"
 
+    @property
+    def lyapunov_over_cost(self) -> pd.Series:
+        """``L / c`` of the transitions with a cost, at its 5th, 50th and 95th percentile: how far ``L`` lies above it."""
+        with_cost = self.transitions[self.transitions["cost"] > 0]
+        ratios = with_cost["lyapunov"] / with_cost["cost"]
+        return ratios.quantile([0.05, 0.5, 0.95]) if len(ratios) > 0 else ratios
+
+    @property
+    def holds(self) -> bool:
+        """
+        Whether these roll-outs show a Lyapunov function with a residual: no episode died, ``L`` falls from the starts on (the
+        interval of ``largest_feasible_alpha3`` lies above 0), and it decreases wherever the cost is larger than
+        ``cost_bound``, whose interval lies below the mean cost of the first steps.
+        """
+        return self._why_not() is None
+
+    def _why_not(self) -> str | None:
+        metrics = self.metrics
+        if metrics["death_rate"].value > 0:
+            return f"{self.episodes['terminated'].sum()} of {len(self.episodes)} episodes died"
+        if not metrics["largest_feasible_alpha3"].low > 0:
+            return "L does not fall from the starts on (the interval of largest_feasible_alpha3 is not above 0)"
+        if math.isnan(metrics["cost_bound_alpha3"].value):
+            return "L does not decrease where the cost is largest"
+        if not metrics["cost_bound"].high < metrics["start_cost"].value:
+            return "the interval of cost_bound is not below the cost of the first steps, and so nothing is known to settle"
+        return None
+
+    def _verdict_with_residual(self) -> str:
+        reason = self._why_not()
+        if reason is not None:
+            return f"With a residual it does not hold: {reason}."
+        _, low, high = self.metrics["cost_bound"]
+        return (
+            f"With a residual it holds: L decreases where the cost is larger than cost_bound [{low:.3g}, {high:.3g}], "
+            f"which bounds the mean cost in the long run; the starts cost {self.metrics['start_cost'].value:.3g}."
+        )
+
     def _why_not_available(self, name: str) -> str:
+        if name == "cost_bound_alpha3" and not self.by_cost.empty:
+            return "L does not decrease where the cost is largest: cost_bound is no more than the mean cost there."
         if name == "ultimate_bound":
             return "Every episode terminated: train longer, or start closer to the goal."
-        if name in ("decrease", "share_decreasing") or (
+        if name == "decrease_rate" and not self.by_cost.empty:
+            return "L is 0 everywhere."
+        if name in ("decrease", "share_decreasing", "decrease_rate", "residual", "cost_bound", "cost_bound_alpha3") or (
             name == "largest_feasible_alpha3" and self.metrics["mean_cost"].value > 0
         ):
             return "Every episode terminated in its first step, or without a cost before its last one: train longer."
@@ -130,6 +186,8 @@ class LyapunovReport:
     def _why_not_calibrated(self) -> str:
         length = int(self.episodes["length"].max())
         longest = f"the longest episode has {length} steps"
+        if self.episodes["terminated"].all():
+            return "every episode terminated, and a function of the average cost says nothing of what follows."
         if self.horizon is None and self.gamma >= 1:
             return (
                 "no episode terminated, and with gamma=1 the costs after a time limit weigh as much as those before it; "
@@ -162,6 +220,18 @@ class LyapunovReport:
 
         ultimate_bound = self.metrics["ultimate_bound"].value
         return plots.plot_report(self.transitions, self.by_cost, self.alpha3, ultimate_bound)
+
+    def plot_drift(self) -> Figure:
+        """
+        Draw the decrease condition with a residual: the drift of ``L`` at each level of the cost, and the line
+        ``-alpha3 * c + b`` above it whose zero, ``cost_bound``, bounds the mean cost in the long run.
+
+        :return: The figure
+        """
+        from sb3_lac.stability import plots
+
+        bound, alpha3 = self.metrics["cost_bound"].value, self.metrics["cost_bound_alpha3"].value
+        return plots.plot_drift(self.by_cost, bound, alpha3, self.metrics["start_cost"].value)
 
     def plot_phase(self, x: int = 0, y: int = 1, names: Sequence[str] | None = None) -> Figure:
         """
@@ -197,7 +267,7 @@ class LyapunovReport:
 
 
 def evaluate_lyapunov(
-    model: LAC,
+    policy: PolicyPredictor,
     env: gym.Env | VecEnv,
     n_eval_episodes: int = 20,
     deterministic: bool = True,
@@ -206,11 +276,13 @@ def evaluate_lyapunov(
     n_cost_levels: int = 5,
     n_bootstrap: int = 1000,
     seed: int | None = None,
+    lyapunov: LyapunovFunction | None = None,
 ) -> LyapunovReport:
     """
-    Run the policy for ``n_eval_episodes`` episodes and check whether the learned ``L`` is a Lyapunov function along them:
-    whether it decreases by ``alpha3`` times the cost, ``E[L(s', a')] - L(s, a) <= -alpha3 * c``, and whether it is what it
-    should have learned, the discounted sum of costs to come.
+    Run the policy for ``n_eval_episodes`` episodes and check whether ``L`` is a Lyapunov function along them: whether it
+    decreases by ``alpha3`` times the cost, ``E[L(s', a')] - L(s, a) <= -alpha3 * c``, where it does so up to a residual, and
+    whether it is what it should have learned, the sum of costs to come. ``L`` is the critic of LAC, or for any policy the
+    function ``lyapunov``, like that of ``fit_lyapunov()``.
 
     The metrics of the report are
 
@@ -223,34 +295,52 @@ def evaluate_lyapunov(
       ``L`` is exact), and ``rank_correlation``, Spearman's
     - ``ultimate_bound``: 95th percentile, over the episodes that did not terminate, of the largest cost in their last fifth
     - ``death_rate``: share of the episodes that terminated
+    - ``decrease_rate``: ``1 - E[L(s', a')] / E[L(s, a)]``, per step
+    - ``start_cost``: mean cost of the first steps
+    - ``residual``: the least b with which ``E[L(s', a')] - L(s, a) <= -alpha3 * c + b`` holds at each level of the cost, on
+      average over the transitions of the level. It bounds the mean cost in the long run by ``b / alpha3`` (Foster-Lyapunov).
+    - ``cost_bound``: the least ``b / alpha3`` of all alpha3, and ``cost_bound_alpha3``, where that is. ``L`` decreases at the
+      levels whose cost is larger.
 
     Their intervals are percentiles of a bootstrap that resamples episodes (the transitions of an episode depend on each
     other), and Wilson's for ``death_rate``. ``a'`` is the action taken next; after a time limit it is an action of the policy.
-    A terminal state has no ``L``: transitions into it do not count for the decrease condition.
+    A terminal state has no ``L``: transitions into it do not count for the decrease condition, but as deaths.
 
     .. note::
-        Costs are those that ``L`` was trained on, of rewards and ends of episodes as they appear with ``env.step`` calls:
-        wrap ``env`` as the training environment. Unlike in ``evaluate_policy()``, a ``Monitor`` makes no difference.
-        With gSDE, the noise matrix of the last roll-out is kept.
-        The training environment (``model.get_env()``) may be used between two calls of ``learn()``: the next one then starts
-        with a reset, and the unfinished episodes in the replay buffer end as by a time limit.
+        The critic is judged with the costs that it was trained on, of rewards and ends of episodes as they appear with
+        ``env.step`` calls: wrap ``env`` as the training environment. Any other function is judged with the rewards of the
+        environment itself, whether ``VecNormalize`` normalizes them or not. Unlike in ``evaluate_policy()``, a ``Monitor``
+        makes no difference. With gSDE, the noise matrix of the last roll-out is kept.
+        The training environment (``model.get_env()``) of LAC may be used between two calls of ``learn()``: the next one then
+        starts with a reset, and the unfinished episodes in the replay buffer end as by a time limit.
 
-    :param model: The LAC model you want to evaluate
+    :param policy: The policy: a model of Stable-Baselines3, or anything with ``predict(observation, deterministic=...)``
     :param env: The gym environment or ``VecEnv`` environment. Its normalization statistics are used as they are:
         call ``sync_envs_normalization()`` before, if it is not the training environment.
     :param n_eval_episodes: Number of episodes, divided onto the elements of a vector env as in ``evaluate_policy()``
     :param deterministic: Whether to judge the policy's mean action, as it is used after the training, or sampled actions
-    :param alpha3: Share of the cost by which ``L`` has to decrease, that of the model by default
+    :param alpha3: Share of the cost by which ``L`` has to decrease, that of the model or of ``lyapunov`` by default
     :param max_tail_weight: The costs after a time limit are not seen. A transition is used for the comparison of ``L`` with
         the cost-to-go if they weigh at most that much in it, ``gamma ** remaining_steps <= max_tail_weight``.
-        With a finite horizon, all of its costs must have been seen instead.
+        With a finite horizon, all of its costs must have been seen instead. A function of the average cost is compared in the
+        first half of each episode, with ``L`` at the end of the episode in place of the costs that follow it.
     :param n_cost_levels: Number of levels of the cost, at its quantiles, for which the decrease is reported separately
     :param n_bootstrap: Number of bootstrap samples
     :param seed: Seed for ``env`` and for the actions
+    :param lyapunov: The function to judge, the critic by default. It cannot be judged on roll-outs that it was fitted on.
     :return: The report
+    :raises ValueError: If the arguments cannot be meant, or the policy is not LAC and there is no ``lyapunov``
     """
-    env = prepare_evaluation(model, env, n_eval_episodes)
-    alpha3 = model.alpha3 if alpha3 is None else alpha3
+    if lyapunov is None:
+        if not isinstance(policy, LAC):
+            raise ValueError(
+                f"The model must be a LAC model, which has a Lyapunov function, and not {policy!r}. For any other policy, "
+                "learn one with fit_lyapunov(policy, env), and pass it as lyapunov=..."
+            )
+        lyapunov = CriticLyapunov(policy)
+    env = prepare_evaluation(policy, env, n_eval_episodes, lyapunov.normalized_rewards)
+    check_seeds(lyapunov, seed, env.num_envs)
+    alpha3 = lyapunov.alpha3 if alpha3 is None else alpha3
     if not alpha3 > 0:
         raise ValueError(f"alpha3={alpha3} must be greater than 0.")
     if not 0 < max_tail_weight <= 1:
@@ -258,32 +348,19 @@ def evaluate_lyapunov(
     if n_cost_levels < 1 or n_bootstrap < 1:
         raise ValueError(f"n_cost_levels={n_cost_levels} and n_bootstrap={n_bootstrap} must be at least 1.")
 
-    vec_normalize = unwrap_vec_normalize(env)
-    # The scale of normalized rewards may have changed since the last update
-    model.update_offset(vec_normalize)
-    if seed is not None:
-        env.seed(seed)
-    # A training goes on as if there had been no evaluation
-    with th.random.fork_rng(devices=[model.device] if model.device.type == "cuda" else []):
-        if seed is not None:
-            th.manual_seed(seed)
-        training = vec_normalize is not None and vec_normalize.training
-        try:
-            # All costs have the same units
-            if vec_normalize is not None:
-                vec_normalize.training = False
-            transitions, observations = roll_out(model, env, n_eval_episodes, deterministic)
-        finally:
-            if trains_on(model, env):
-                model.end_episodes()
-            if vec_normalize is not None:
-                vec_normalize.training = training
+    bound = lyapunov.cost_bound(unwrap_vec_normalize(env))
+    with undisturbed(policy, env, seed):
+        roll_outs = roll_out(policy, env, n_eval_episodes, deterministic, lyapunov.normalized_rewards)
+        roll_outs.add_values(policy, lyapunov, deterministic)
 
+    transitions = roll_outs.transitions
     # A reward above all those of the training would have a negative cost, which L cannot learn
-    bound = model.cost_bound(vec_normalize).item()
     transitions["cost"] = np.maximum(bound - transitions["reward"], 0.0)
     transitions["difference"] = transitions["next_lyapunov"] - transitions["lyapunov"] + alpha3 * transitions["cost"]
-    transitions["cost_to_go"] = cost_to_go(transitions, model.gamma, model.horizon, max_tail_weight, bound)
+    if lyapunov.average_cost is None:
+        transitions["cost_to_go"] = cost_to_go(transitions, lyapunov.gamma, lyapunov.horizon, max_tail_weight, bound)
+    else:
+        transitions["cost_to_go"] = relative_cost_to_go(transitions, lyapunov.average_cost)
     columns = ["episode", "step", "reward", "cost", "lyapunov", "next_lyapunov", "difference", "cost_to_go", "terminated"]
     transitions = transitions[columns]
 
@@ -292,12 +369,12 @@ def evaluate_lyapunov(
     return LyapunovReport(
         transitions=transitions,
         episodes=episodes,
-        observations=observations,
-        metrics=estimate_metrics(transitions, episodes, bootstrap),
+        observations=roll_outs.vectors(),
+        metrics=estimate_metrics(transitions, episodes, n_cost_levels, bootstrap),
         by_cost=decrease_by_cost(transitions, n_cost_levels, bootstrap),
         alpha3=alpha3,
-        gamma=model.gamma,
-        horizon=model.horizon,
+        gamma=lyapunov.gamma,
+        horizon=lyapunov.horizon,
         max_tail_weight=max_tail_weight,
         max_episode_steps=max((limit for limit in time_limits(env) if limit is not None), default=None),
     )

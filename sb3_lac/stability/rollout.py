@@ -1,55 +1,87 @@
-"""Roll-outs of a policy as tables: one row per transition with ``L``, one row per episode."""
+"""Roll-outs of any policy as tables: one row per transition with ``L``, one row per episode."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.utils import check_for_correct_spaces
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, unwrap_vec_normalize
 
 from sb3_lac.lac import LAC, sum_of_discounts
+from sb3_lac.stability.functions import LyapunovFunction, Observations
 
 if TYPE_CHECKING:
     import pandas as pd
-
-Observations = np.ndarray | dict[str, np.ndarray]
 
 #: Transitions whose ``L`` is computed at once
 CHUNK_SIZE = 2048
 
 
-def prepare_evaluation(model: LAC, env: gym.Env | VecEnv, n_eval_episodes: int) -> VecEnv:
+def prepare_evaluation(policy: PolicyPredictor, env: gym.Env | VecEnv, n_eval_episodes: int, of_the_critic: bool) -> VecEnv:
     """
-    Wrap an evaluation environment as the model would, and check that they fit together.
+    Wrap an evaluation environment as the policy would, and check that they fit together.
 
-    :param model: The LAC model to evaluate
+    :param policy: What is evaluated
     :param env: The evaluation environment
     :param n_eval_episodes: Number of episodes
+    :param of_the_critic: Whether values of the critic are judged, which belong to the rewards of the training
     :return: The wrapped environment
     """
-    if not isinstance(model, LAC):
-        raise ValueError(f"The model must be a LAC model, which has a Lyapunov function, and not {model!r}.")
+    if not callable(getattr(policy, "predict", None)):
+        raise ValueError(f"{policy!r} has no method predict(observation, deterministic=...), which every policy needs.")
     if n_eval_episodes < 1:
         raise ValueError(f"n_eval_episodes={n_eval_episodes} must be at least 1.")
-    env = model._wrap_env(env, monitor_wrapper=False)
-    check_for_correct_spaces(env, model.observation_space, model.action_space)
+    if not isinstance(policy, (BaseAlgorithm, BasePolicy)):
+        # A controller that knows nothing of images and their channels
+        return env if isinstance(env, VecEnv) else DummyVecEnv([lambda: env])  # type: ignore[list-item, return-value]
+    env = BaseAlgorithm._wrap_env(env, monitor_wrapper=False)
+    check_for_correct_spaces(env, policy.observation_space, policy.action_space)
     # A model that was loaded without an environment does not know what it was trained with
-    if model.get_env() is not None:
-        normalized, expected = normalization(unwrap_vec_normalize(env)), normalization(model.get_vec_normalize_env())
+    if isinstance(policy, BaseAlgorithm) and policy.get_env() is not None:
+        normalized = normalization(unwrap_vec_normalize(env), of_the_critic)
+        expected = normalization(policy.get_vec_normalize_env(), of_the_critic)
         if normalized != expected:
             raise ValueError(
                 f"The evaluation environment has {normalized}, but the training environment has {expected}: "
                 "policy and L would get numbers that they were not trained on. Wrap the evaluation environment "
                 "with VecNormalize in the same way, and synchronize its statistics with sync_envs_normalization()."
             )
+        if not isinstance(policy, LAC) and trains_on(policy, env):
+            raise ValueError(
+                f"The evaluation environment is the training environment: {type(policy).__name__} would go on with an "
+                "observation of before the evaluation. Make a second environment for the evaluation."
+            )
     return env
 
 
-def trains_on(model: LAC, env: VecEnv) -> bool:
+def check_seeds(lyapunov: LyapunovFunction, seed: int | None, n_envs: int) -> None:
+    """
+    Refuse to judge a function on the roll-outs that it was fitted on.
+
+    :param lyapunov: The function
+    :param seed: Seed of the evaluation, None if it is drawn
+    :param n_envs: Number of environments, whose seeds count up from it
+    """
+    if seed is None or lyapunov.seeds is None:
+        return
+    if seed < lyapunov.seeds.stop and lyapunov.seeds.start < seed + n_envs:
+        raise ValueError(
+            f"seed={seed} with {n_envs} environments starts episodes that the Lyapunov function was fitted on (seeds "
+            f"{lyapunov.seeds.start} to {lyapunov.seeds.stop - 1}): it would be judged on its own training data. Use another "
+            f"seed, from {lyapunov.seeds.stop} on."
+        )
+
+
+def trains_on(model: BaseAlgorithm, env: VecEnv) -> bool:
     """
     Whether a model collects its training data in an environment, or in one of those that it consists of.
 
@@ -68,16 +100,47 @@ def trains_on(model: LAC, env: VecEnv) -> bool:
     return not first.isdisjoint(second)
 
 
-def normalization(vec_normalize: VecNormalize | None) -> str:
+def normalization(vec_normalize: VecNormalize | None, with_rewards: bool) -> str:
     """
     What a ``VecNormalize`` wrapper normalizes.
 
     :param vec_normalize: The wrapper, if any
+    :param with_rewards: Whether rewards matter
     :return: Description of it
     """
-    if vec_normalize is None or not (vec_normalize.norm_obs or vec_normalize.norm_reward):
+    if vec_normalize is None or not (vec_normalize.norm_obs or (with_rewards and vec_normalize.norm_reward)):
         return "no normalization"
-    return f"norm_obs={vec_normalize.norm_obs} and norm_reward={vec_normalize.norm_reward}"
+    return f"norm_obs={vec_normalize.norm_obs}" + (f" and norm_reward={vec_normalize.norm_reward}" if with_rewards else "")
+
+
+@contextmanager
+def undisturbed(policy: PolicyPredictor, env: VecEnv, seed: int | None) -> Iterator[None]:
+    """
+    Let a training go on after an evaluation as if there had been none: its random numbers, its normalization and, for LAC, the
+    episodes that it was in.
+
+    :param policy: What is evaluated
+    :param env: The environment
+    :param seed: Seed for the environment and for PyTorch
+    """
+    vec_normalize = unwrap_vec_normalize(env)
+    if seed is not None:
+        env.seed(seed)
+    device = getattr(policy, "device", th.device("cpu"))
+    with th.random.fork_rng(devices=[device] if device.type == "cuda" else []):
+        if seed is not None:
+            th.manual_seed(seed)
+        training = vec_normalize is not None and vec_normalize.training
+        try:
+            # All costs have the same units
+            if vec_normalize is not None:
+                vec_normalize.training = False
+            yield
+        finally:
+            if isinstance(policy, LAC) and trains_on(policy, env):
+                policy.end_episodes()
+            if vec_normalize is not None:
+                vec_normalize.training = training
 
 
 def combine(function: Callable[[list[np.ndarray]], np.ndarray], observations: Sequence[Observations]) -> Observations:
@@ -105,71 +168,145 @@ def take(observations: Observations, rows: np.ndarray | slice) -> Observations:
     return combine(lambda arrays: arrays[0][rows], [observations])
 
 
-def roll_out(model: LAC, env: VecEnv, n_eval_episodes: int, deterministic: bool) -> tuple[pd.DataFrame, np.ndarray | None]:
+@dataclass(frozen=True, eq=False)
+class RollOuts:
     """
-    Run the policy and compute ``L`` along its trajectories.
+    What a policy did, one episode after the other.
 
-    :param model: The model
+    :param transitions: One row per transition with ``episode``, ``step``, ``reward``, ``truncated`` and ``terminated``
+    :param observations: In which the actions were taken
+    :param actions: One per transition
+    :param last_observations: After the time limits, one per episode that was truncated, or None if none was
+    """
+
+    transitions: pd.DataFrame
+    observations: Observations
+    actions: np.ndarray
+    last_observations: Observations | None
+
+    def vectors(self) -> np.ndarray | None:
+        """
+        :return: The observations, shape (n, n_dims), or None if they are no vectors
+        """
+        if isinstance(self.observations, dict) or self.observations.ndim > 2:
+            return None
+        return self.observations.reshape((len(self.observations), -1))
+
+    def add_values(self, policy: PolicyPredictor, lyapunov: LyapunovFunction, deterministic: bool) -> None:
+        """
+        Add the columns ``lyapunov`` and ``next_lyapunov`` to the transitions.
+
+        :param policy: Whose action follows the last observation, which was not taken
+        :param lyapunov: The function
+        :param deterministic: Whether that is the mean action
+        """
+        # Few passes of a network, but not one huge tensor
+        rows = [slice(start, start + CHUNK_SIZE) for start in range(0, len(self.actions), CHUNK_SIZE)]
+        values = [lyapunov.values_of_actions(take(self.observations, chunk), self.actions[chunk]) for chunk in rows]
+        transitions = self.transitions
+        transitions["lyapunov"] = np.concatenate(values, dtype=np.float64)
+        # A terminal state has no value
+        done = (transitions["truncated"] | transitions["terminated"]).to_numpy()
+        transitions["next_lyapunov"] = transitions["lyapunov"].shift(-1).where(~done, np.nan)
+        if self.last_observations is not None:
+            last_actions, _ = policy.predict(self.last_observations, deterministic=deterministic)
+            last_values = lyapunov.values_of_actions(self.last_observations, last_actions)
+            transitions.loc[transitions["truncated"], "next_lyapunov"] = np.asarray(last_values, dtype=np.float64)
+
+
+def roll_out(
+    policy: PolicyPredictor,
+    env: VecEnv,
+    n_eval_episodes: int,
+    deterministic: bool,
+    normalized_rewards: bool = False,
+    starts: np.ndarray | None = None,
+) -> RollOuts:
+    """
+    Run the policy.
+
+    :param policy: The policy
     :param env: The environment
-    :param n_eval_episodes: Number of episodes
+    :param n_eval_episodes: Number of episodes, divided onto the elements of the environment: if the first episodes to end were
+        taken, they would be the short ones
     :param deterministic: Whether to use deterministic or stochastic actions
-    :return: One row per transition with ``episode``, ``step``, ``reward``, ``lyapunov``, ``next_lyapunov`` and ``terminated``,
-        and the observations if they are vectors
+    :param normalized_rewards: Whether rewards are those of ``VecNormalize``, or those of the environment
+    :param starts: Start state of each episode, shape (n_eval_episodes, n_states), for ``reset(options={"state": ...})``
+    :return: All transitions
     """
-    # Slow to import like scipy below, and only an evaluation needs them
-    import pandas as pd
+    import pandas as pd  # slow to import, and only an evaluation needs it
 
-    # As in ``evaluate_policy()``: each environment runs a fixed number of episodes,
-    # if the first episodes to end were taken, they would be the short ones
-    targets = np.array([(n_eval_episodes + i) // env.num_envs for i in range(env.num_envs)])
-    counts = np.zeros(env.num_envs, dtype=int)
+    vec_normalize = None if normalized_rewards else unwrap_vec_normalize(env)
+    n_envs = env.num_envs
+    n_rounds = 1 if starts is None else -(-n_eval_episodes // n_envs)
     batches: list[Observations] = []
-    actions_taken: list[np.ndarray] = []
     steps: list[dict[str, np.ndarray]] = []
     last_observations: list[Observations] = []
+    for number in range(n_rounds):
+        if starts is None:
+            # As in ``evaluate_policy()``
+            targets = np.array([(n_eval_episodes + i) // n_envs for i in range(n_envs)])
+        else:
+            # Those of the last round that are too many are started and not looked at
+            chosen = np.arange(number * n_envs, (number + 1) * n_envs)
+            targets = (chosen < n_eval_episodes).astype(int)
+            of_round = starts[np.minimum(chosen, n_eval_episodes - 1)].tolist()
+            env.set_options([{"state": start} for start in of_round])
+        counts = np.zeros(n_envs, dtype=int)
+        observations = env.reset()
+        state: tuple[np.ndarray, ...] | None = None
+        beginnings = np.ones(n_envs, dtype=bool)
+        while (counts < targets).any():
+            # Those without a memory need not know of it
+            memory = {} if state is None else {"state": state, "episode_start": beginnings}
+            actions, state = policy.predict(observations, deterministic=deterministic, **memory)  # type: ignore[arg-type]
+            new_observations, rewards, dones, infos = env.step(actions)
+            if vec_normalize is not None:
+                rewards = vec_normalize.get_original_reward()
+            active = np.flatnonzero(counts < targets)
+            truncated = dones & np.array([info.get("TimeLimit.truncated", False) for info in infos])
+            batches.append(take(observations, active))  # type: ignore[arg-type]
+            columns = {"action": actions, "reward": rewards, "done": dones, "truncated": truncated}
+            steps.append({"env": number * n_envs + active, **{name: column[active] for name, column in columns.items()}})
+            last_observations += [infos[i]["terminal_observation"] for i in active if truncated[i]]
+            counts += dones
+            beginnings, observations = dones, new_observations
 
-    observations = env.reset()
-    while (counts < targets).any():
-        actions, _ = model.predict(observations, deterministic=deterministic)  # type: ignore[arg-type]
-        new_observations, rewards, dones, infos = env.step(actions)
-        active = np.flatnonzero(counts < targets)
-        truncated = dones & np.array([info.get("TimeLimit.truncated", False) for info in infos])
-        batches.append(take(observations, active))  # type: ignore[arg-type]
-        actions_taken.append(actions[active])
-        columns = {"reward": rewards, "done": dones, "truncated": truncated}
-        steps.append({"env": active, **{name: column[active] for name, column in columns.items()}})
-        last_observations += [infos[i]["terminal_observation"] for i in active if truncated[i]]
-        counts += dones
-        observations = new_observations
-
+    all_actions = np.concatenate([step.pop("action") for step in steps])
     transitions = pd.DataFrame({name: np.concatenate([step[name] for step in steps]) for name in steps[0]})
+    if not np.isfinite(transitions["reward"]).all():
+        raise ValueError("The environment paid a reward that is not finite: its costs cannot be judged.")
     transitions["reward"] = transitions["reward"].astype(np.float64)
-    states, all_actions = combine(np.concatenate, batches), np.concatenate(actions_taken)
-    # Few passes of the critic, but not one huge tensor
-    chunks = [slice(start, start + CHUNK_SIZE) for start in range(0, len(all_actions), CHUNK_SIZE)]
-    values = [model.policy.predict_lyapunov(take(states, chunk), all_actions[chunk]) for chunk in chunks]
-    transitions["lyapunov"] = np.concatenate(values, dtype=np.float64)
-    # The action in the last state of an episode that goes on is not taken
-    transitions["last_lyapunov"] = np.nan
-    if last_observations:
-        last_states = combine(np.stack, last_observations)
-        last_actions, _ = model.predict(last_states, deterministic=deterministic)
-        transitions.loc[transitions["truncated"], "last_lyapunov"] = model.policy.predict_lyapunov(last_states, last_actions)
-
+    last_of = transitions.loc[transitions["truncated"], "env"].to_numpy()
     # From the order of time to one episode after the other
     order = np.argsort(transitions["env"], kind="stable")
     transitions = transitions.iloc[order].reset_index(drop=True)
-    done = transitions["done"].to_numpy()
+    done = transitions.pop("done").to_numpy()
     transitions["episode"] = np.cumsum(done) - done
     transitions["step"] = transitions.groupby("episode").cumcount()
-    transitions["next_lyapunov"] = transitions["lyapunov"].shift(-1).where(~done, transitions["last_lyapunov"])
     transitions["terminated"] = done & ~transitions["truncated"]
+    return RollOuts(
+        transitions,
+        take(combine(np.concatenate, batches), order),
+        all_actions[order],
+        take(combine(np.stack, last_observations), np.argsort(last_of, kind="stable")) if last_observations else None,
+    )
 
-    space = model.observation_space
-    if not isinstance(space, spaces.Box) or len(space.shape) > 1:
-        return transitions, None
-    assert isinstance(states, np.ndarray)
-    return transitions, states[order].reshape((len(order), -1))
+
+def relative_cost_to_go(transitions: pd.DataFrame, average_cost: float) -> np.ndarray:
+    """
+    What a function of the average cost estimates, of one roll-out: the sum of the costs to come beyond the average one. What
+    follows a time limit is the value of the function there, and so only the first half of each episode is looked at.
+
+    :param transitions: One row per transition with ``episode``, ``step``, ``cost``, ``next_lyapunov``, ``terminated``
+    :param average_cost: Of a step
+    :return: The sums, NaN in the second half of an episode, and in all of those that terminated
+    """
+    groups = transitions.groupby("episode")
+    excess = (transitions["cost"] - average_cost)[::-1]
+    to_come = excess.groupby(transitions["episode"][::-1]).cumsum()[::-1]
+    seen = ~groups["terminated"].transform("any") & (2 * transitions["step"] < groups["step"].transform("size"))
+    return (to_come + groups["next_lyapunov"].transform("last")).where(seen, np.nan).to_numpy()
 
 
 def cost_to_go(

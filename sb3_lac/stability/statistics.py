@@ -74,6 +74,26 @@ class Bootstrap:
         samples = statistic(*(sums @ self.counts.T))
         return percentile_interval(float(statistic(*sums.sum(axis=1))), samples, len(np.unique(episode)))
 
+    def estimate_levels(
+        self, statistic: Callable[..., np.ndarray], level: np.ndarray, episode: np.ndarray | pd.Series, *values: np.ndarray
+    ) -> Interval:
+        """
+        Estimate a statistic of several levels.
+
+        :param statistic: Function of the sums of the values, arrays whose last axis are the levels
+        :param level: Level that each value belongs to, 0 and up
+        :param episode: Episode that each value belongs to
+        :param values: What to sum
+        :return: The statistic of all episodes, with its interval
+        """
+        n_levels = int(level.max()) + 1
+        sums = np.zeros((len(values), self.n_episodes, n_levels))
+        for total, value in zip(sums, values, strict=True):
+            np.add.at(total, (np.asarray(episode), level), value)
+        return percentile_interval(
+            float(statistic(*sums.sum(axis=1))), statistic(*(self.counts @ sums)), len(np.unique(episode))
+        )
+
     def percentile(self, values: np.ndarray, percent: float) -> Interval:
         """
         Estimate a percentile over episodes.
@@ -98,7 +118,7 @@ def percentile_interval(value: float, samples: np.ndarray, n_episodes: int) -> I
     :return: The value with its interval
     """
     samples = samples[np.isfinite(samples)]
-    if n_episodes < 2 or len(samples) == 0:
+    if n_episodes < 2 or len(samples) == 0 or math.isnan(value):
         return Interval(value, math.nan, math.nan)
     low, high = np.quantile(samples, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
     return Interval(value, float(low), float(high))
@@ -160,12 +180,117 @@ def correlation(n: np.ndarray, x: np.ndarray, y: np.ndarray, xx: np.ndarray, xy:
     return ratio(n * xy - x * y, np.sqrt(spread(n, x, xx) * spread(n, y, yy)))
 
 
-def estimate_metrics(transitions: pd.DataFrame, episodes: pd.DataFrame, bootstrap: Bootstrap) -> dict[str, Interval]:
+def largest_mean(n: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """
+    The largest mean of all levels.
+
+    :param n: Number of values of each level, shape (..., n_levels)
+    :param x: Sum of the values of each level
+    :return: The mean of the level where it is largest, shape (...)
+    """
+    return np.where(n > 0, ratio(x, n), -np.inf).max(axis=-1)
+
+
+def tightest_drift(n: np.ndarray, drift: np.ndarray, cost: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """
+    The Foster-Lyapunov condition ``E[L' - L] <= -alpha3 * c + b`` at each level of the cost, with the alpha3 and b that say
+    most: those with the least ``b / alpha3``, which bounds the mean cost in the long run.
+
+    :param n: Number of transitions of each level, shape (..., n_levels)
+    :param drift: Sum of ``L' - L`` of each level
+    :param cost: Sum of the costs of each level
+    :return: ``b / alpha3`` and alpha3, both of shape (...); alpha3 is NaN if L does not decrease where the cost is largest,
+        when the largest mean cost of a level is all that can be said
+    """
+    shape = np.shape(n)[:-1]
+    bounds, alphas = np.empty(shape), np.empty(shape)
+    for index in np.ndindex(shape):
+        seen = n[index] > 0
+        m, c = drift[index][seen] / n[index][seen], cost[index][seen] / n[index][seen]
+        # With t = 1 / alpha3 it is the largest of straight lines, whose least value is at t = 0, or where
+        # two of them meet, or where the last one reaches 0
+        with np.errstate(divide="ignore", invalid="ignore"):
+            meetings = np.append((c[:, None] - c) / (m - m[:, None]), -c / m)
+        t = np.sort(np.append(0.0, meetings[np.isfinite(meetings) & (meetings > 0)]))
+        # No negative residual: L cannot fall for ever, and these roll-outs only end before it settles
+        of_t = np.maximum((np.outer(t, m) + c).max(axis=1), 0.0)
+        best = np.argmin(of_t)
+        bounds[index], alphas[index] = of_t[best], 1 / t[best] if t[best] > 0 else np.nan
+    return bounds, alphas
+
+
+def levels_of_cost(known: pd.DataFrame, n_levels: int) -> np.ndarray:
+    """
+    The level of the cost that each transition belongs to.
+
+    :param known: One row per transition
+    :param n_levels: Number of levels, at quantiles of the cost (fewer if many costs are equal)
+    :return: Numbers of levels, 0 and up, each of which has transitions
+    """
+    quantiles = known["cost"].quantile(np.linspace(0, 1, n_levels + 1)[1:-1])
+    return np.unique(np.searchsorted(quantiles, known["cost"]), return_inverse=True)[1]
+
+
+def estimate_drift(known: pd.DataFrame, n_levels: int, bootstrap: Bootstrap) -> dict[str, Interval]:
+    """
+    Estimate the metrics of the decrease condition with a residual.
+
+    :param known: One row per transition that does not end in a terminal state
+    :param n_levels: Number of levels of the cost
+    :param bootstrap: Bootstrap of the episodes
+    :return: Values with their intervals, by name
+    """
+    names = ("residual", "cost_bound", "cost_bound_alpha3")
+    if known.empty:
+        return {name: Interval(math.nan, math.nan, math.nan) for name in names}
+    level, episode, ones = levels_of_cost(known, n_levels), known["episode"], np.ones(len(known))
+    drift, cost = (known["next_lyapunov"] - known["lyapunov"]).to_numpy(), known["cost"].to_numpy()
+    of_drift = (level, episode, ones, drift, cost)
+    return {
+        "residual": bootstrap.estimate_levels(largest_mean, level, episode, ones, known["difference"].to_numpy()),
+        "cost_bound": bootstrap.estimate_levels(lambda *sums: tightest_drift(*sums)[0], *of_drift),
+        "cost_bound_alpha3": bootstrap.estimate_levels(lambda *sums: tightest_drift(*sums)[1], *of_drift),
+    }
+
+
+def exact_lower_bound(n_true: int, n: int, confidence: float) -> float:
+    """
+    Lower bound of a probability, from independent trials (Clopper and Pearson, 1934).
+
+    :param n_true: Number of trials in which it was true
+    :param n: Number of trials
+    :param confidence: Probability with which the bound lies below the true probability
+    :return: The bound
+    """
+    from scipy.stats import binomtest
+
+    return float(binomtest(n_true, n, alternative="greater").proportion_ci(confidence, method="exact").low)
+
+
+def exact_interval(n_true: int, n: int, confidence: float) -> Interval:
+    """
+    Interval of a probability, from independent trials (Clopper and Pearson, 1934).
+
+    :param n_true: Number of trials in which it was true
+    :param n: Number of trials
+    :param confidence: Probability with which the interval contains the true probability
+    :return: The share of the trials with the interval
+    """
+    from scipy.stats import binomtest
+
+    interval = binomtest(n_true, n).proportion_ci(confidence, method="exact")
+    return Interval(n_true / n, float(interval.low), float(interval.high))
+
+
+def estimate_metrics(
+    transitions: pd.DataFrame, episodes: pd.DataFrame, n_levels: int, bootstrap: Bootstrap
+) -> dict[str, Interval]:
     """
     Estimate the metrics that ``evaluate_lyapunov()`` lists.
 
     :param transitions: One row per transition
     :param episodes: One row per episode
+    :param n_levels: Number of levels of the cost
     :param bootstrap: Bootstrap of the episodes
     :return: Values with their intervals, by name
     """
@@ -173,6 +298,7 @@ def estimate_metrics(transitions: pd.DataFrame, episodes: pd.DataFrame, bootstra
 
     # There is no L in a terminal state
     known = transitions[~transitions["terminated"]]
+    starts = transitions[transitions["step"] == 0]
     ones = np.ones(len(known))
     decreases = known["lyapunov"] - known["next_lyapunov"]
 
@@ -196,6 +322,9 @@ def estimate_metrics(transitions: pd.DataFrame, episodes: pd.DataFrame, bootstra
         "rank_correlation": compare(correlation, rankdata(lyapunov), rankdata(costs_to_go)),
         "ultimate_bound": bootstrap.percentile(episodes.loc[~episodes["terminated"], "largest_late_cost"].to_numpy(), 95),
         "death_rate": Interval(n_deaths / len(episodes), float(wilson.low), float(wilson.high)),
+        "decrease_rate": bootstrap.estimate(ratio, known["episode"], decreases, known["lyapunov"]),
+        "start_cost": bootstrap.estimate(ratio, starts["episode"], starts["cost"], np.ones(len(starts))),
+        **estimate_drift(known, n_levels, bootstrap),
     }
 
 
@@ -209,10 +338,10 @@ def decrease_by_cost(transitions: pd.DataFrame, n_levels: int, bootstrap: Bootst
     :return: One row per level
     """
     known = transitions[~transitions["terminated"]]
-    quantiles = known["cost"].quantile(np.linspace(0, 1, n_levels + 1)[1:-1])
-    levels = known.groupby(np.searchsorted(quantiles, known["cost"]))
+    levels = known.groupby(levels_of_cost(known, n_levels))
     decrease = [bootstrap.estimate(ratio, level["episode"], level["difference"], np.ones(len(level))) for _, level in levels]
-    table = levels["cost"].agg(cost_low="min", cost_high="max", n_transitions="size")
+    table = levels["cost"].agg(cost_low="min", cost_high="max", cost="mean", n_transitions="size")
+    table["drift"] = (known["next_lyapunov"] - known["lyapunov"]).groupby(levels.ngroup()).mean().to_numpy()
     table[["decrease", "decrease_low", "decrease_high"]] = np.reshape(decrease, (-1, 3))
     table["share_decreasing"] = (known["difference"] <= 0).groupby(levels.ngroup()).mean().to_numpy()
     return table.reset_index(drop=True)

@@ -142,6 +142,13 @@ def test_exact_lyapunov_function_is_recognized(make_exact_model, gamma, alpha3):
             "rank_correlation": 1.0,
             "ultimate_bound": 0.0,
             "death_rate": 0.0,
+            "decrease_rate": 1 - RHO**2,
+            "start_cost": squares.mean(),
+            # Of the level where it is largest: what alpha3 asks beyond what is feasible is most where the cost is most
+            "residual": (alpha3 - feasible) * report.by_cost["cost"].iloc[-1 if alpha3 > feasible else 0],
+            # The drift is proportional to the cost, so that there is no residual with the feasible alpha3
+            "cost_bound": 0.0,
+            "cost_bound_alpha3": feasible,
         },
         rel=1e-9,
         abs=1e-12,
@@ -157,6 +164,7 @@ def test_exact_lyapunov_function_is_recognized(make_exact_model, gamma, alpha3):
     verdict = "holds on average" if alpha3 <= feasible else "is violated on average"
     assert f"With alpha3={alpha3:g} the decrease condition {verdict}" in report.summary()
     assert "no proof" in report.summary()
+    assert report.holds and "With a residual it holds" in report.summary()
 
 
 def test_scale_of_lyapunov_function_shows_in_calibration_only(make_exact_model):
@@ -313,6 +321,10 @@ def test_metrics_agree_with_scipy_and_numpy(make_model, make_env):
     expected = spearmanr(known["lyapunov"], known["cost_to_go"]).statistic
     assert report.metrics["rank_correlation"].value == pytest.approx(expected)
     for name, (value, low, high) in report.metrics.items():
+        if name == "cost_bound_alpha3":
+            # This policy has not learned anything
+            assert np.isnan([value, low, high]).all() and not report.holds
+            continue
         assert low <= value <= high, name
         if name not in ("death_rate", "ultimate_bound"):
             assert low < value < high, name
@@ -342,7 +354,7 @@ def test_one_episode_has_no_interval(make_exact_model):
         if name != "death_rate":
             assert not np.isnan(value) and np.isnan(low) and np.isnan(high), name
     assert "is undecided: one episode" in report.summary() and "nan" not in report.summary()
-    assert report.summary().count("not available: it takes two episodes") == 8
+    assert report.summary().count("not available: it takes two episodes") == 13
 
 
 def test_levels_of_cost():
@@ -350,6 +362,7 @@ def test_levels_of_cost():
     # Half of the costs are zero
     cost = np.where(np.arange(1000) % 2 == 0, 0.0, rng.permutation(1000) + 1.0)
     frame = pd.DataFrame({"episode": np.arange(1000) // 100, "cost": cost, "difference": 2 - cost, "terminated": False})
+    frame["lyapunov"], frame["next_lyapunov"] = 2 * cost, 2.0
     table = decrease_by_cost(frame, 5, Bootstrap(10, 100))
     # Two of the five quantiles are zero: the zeros have a level of their own
     assert len(table) == 4
@@ -363,7 +376,8 @@ def test_levels_of_cost():
         assert row.share_decreasing == pytest.approx((chosen["difference"] <= 0).mean())
         assert row.decrease_low <= row.decrease <= row.decrease_high
     assert list(table.columns) == [
-        "cost_low", "cost_high", "n_transitions", "decrease", "decrease_low", "decrease_high", "share_decreasing",
+        "cost_low", "cost_high", "cost", "n_transitions", "drift", "decrease", "decrease_low", "decrease_high",
+        "share_decreasing",
     ]  # fmt: skip
     assert len(decrease_by_cost(frame.assign(cost=3.0), 5, Bootstrap(10, 100))) == 1
     assert decrease_by_cost(frame.assign(cost=rng.random(1000)), 5, Bootstrap(10, 100))["n_transitions"].tolist() == [200] * 5

@@ -1,0 +1,222 @@
+"""
+Certificates of reference controllers and of trained policies: a Lyapunov function fitted to roll-outs, judged on others.
+
+.. code-block:: bash
+
+  python -m benchmarks.certificate
+  python -m benchmarks.certificate --algos lac sac td3 --fractions 1 0.1
+  python -m benchmarks.certificate --envs CartPoleCost-v0 --models sac=model.zip
+
+Without algorithms and models only the reference controllers are judged, which takes minutes and trains nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from rl_zoo3 import ALGOS
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.type_aliases import PolicyPredictor
+
+from battery_env.plotting import COLOURS, new_figure, save_figure
+from benchmarks.controllers import reference_controllers
+from benchmarks.reporting import write_csv, write_text
+from benchmarks.training import Recipe, train_or_load
+from sb3_lac import LAC, certify, evaluate_lyapunov, fit_lyapunov
+from sb3_lac.envs import LinearCostEnv
+from sb3_lac.stability import CriticLyapunov
+
+_N_ENVS = 25
+# no training seed comes close; environments count up from each
+_FIT_SEED, _EVALUATION_SEED, _CERTIFICATION_SEED = 10_000, 20_000, 30_000
+_STATEMENTS = ("survives", "stays_within", "decreases")
+
+
+def judge(policy: PolicyPredictor, env_id: str, episodes: int, out: Path, name: str) -> list[dict[str, Any]]:
+    """
+    Fit, evaluate and certify one policy; for LAC, the critic beside the fitted function.
+
+    :param policy: the policy
+    :param env_id: id of the environment
+    :param episodes: number of episodes for each of the three
+    :param out: folder of the figures
+    :param name: of the policy, for its files
+    :return: one row per Lyapunov function
+    """
+    env = make_vec_env(env_id, n_envs=_N_ENVS)
+    fitted = fit_lyapunov(policy, env, episodes, seed=_FIT_SEED)
+    certification = certify(policy, env, fitted, episodes, seed=_CERTIFICATION_SEED)
+    save_figure(certification.plot(), out / f"{name}_statements.png")
+    functions = {"fitted": fitted} | ({"critic": CriticLyapunov(policy)} if isinstance(policy, LAC) else {})
+    rows = []
+    for function, lyapunov in functions.items():
+        report = evaluate_lyapunov(policy, env, episodes, seed=_EVALUATION_SEED, lyapunov=lyapunov)
+        save_figure(report.plot_drift(), out / f"{name}_{function}_drift.png")
+        row: dict[str, Any] = {"function": function, "holds": report.holds}
+        for metric, (value, low, high) in report.metrics.items():
+            row |= {metric: value, f"{metric}_low": low, f"{metric}_high": high}
+        if function == "fitted":
+            bounds = certification.statements["at_least"]
+            row |= {f"{statement}_at_least": bounds.get(statement, np.nan) for statement in _STATEMENTS}
+            row |= {"settles_within": certification.cost_bound, "window_steps": certification.window_steps}
+        rows.append(row)
+    env.close()
+    return rows
+
+
+def policies(chosen: argparse.Namespace, env_id: str) -> list[tuple[str, int | None, PolicyPredictor]]:
+    """
+    What is judged in an environment.
+
+    :param chosen: the command line
+    :param env_id: id of the environment
+    :return: name, seed of the training if there was one, policy
+    """
+    found: list[tuple[str, int | None, PolicyPredictor]] = [
+        (name, None, controller) for name, controller in reference_controllers(env_id).items()
+    ]
+    for model in chosen.models:
+        algo, _, path = model.partition("=")
+        found.append((Path(path).stem, None, ALGOS[algo].load(path, device="cpu")))
+    for algo in chosen.algos:
+        for fraction in chosen.fractions:
+            for seed in chosen.seeds:
+                recipe = Recipe.of(algo, env_id, seed, int(chosen.timesteps) if chosen.timesteps else None)
+                given = {**recipe.arguments, **recipe.hyperparameters}
+                # a share of what is learned: nothing is before learning_starts
+                steps = given["learning_starts"] + round(fraction * (recipe.timesteps - given["learning_starts"]))
+                name = algo.upper() if fraction == 1 else f"{algo.upper()}, {100 * fraction:g} % of the updates"
+                found.append((name, seed, train_or_load(algo, env_id, seed, steps, chosen.out / "models")))
+    return found
+
+
+def feasible_alpha3() -> pd.DataFrame:
+    """
+    The largest alpha3 that holds in every state of ``LinearCost-v0``, exactly and without noise: with
+    ``kappa = sup L / c`` it is ``(1 - (1 - gamma) kappa) / gamma`` for the discounted cost, and 1 for the average cost.
+
+    :return: one row per reference controller that settles
+    """
+    env = LinearCostEnv()
+    rows = []
+    for name, controller in reference_controllers("LinearCost-v0").items():
+        gain = controller.gain
+        radius = float(np.abs(np.linalg.eigvals(env.A - env.B @ gain)).max())
+        if radius >= 1:
+            continue
+        row: dict[str, Any] = {"controller": name, "spectral radius": f"{radius:.3f}"}
+        for gamma in (0.9, 0.95, 0.99):
+            stage = env.Q + gain.T @ env.R @ gain
+            kappa = np.linalg.eigvals(np.linalg.solve(stage, env.value_matrix(gain, gamma))).real.max()
+            row[f"discount {gamma:g}"] = f"{(1 - (1 - gamma) * kappa) / gamma:.2f}"
+        rows.append({**row, "average cost": "1.00"})
+    return pd.DataFrame(rows)
+
+
+def report(table: pd.DataFrame) -> str:
+    """
+    The certificates side by side, as Markdown.
+
+    :param table: one row per Lyapunov function
+    :return: the exact shares that are feasible, and one table per environment
+    """
+    text = "The largest feasible `alpha3` of the exact function:\n\n"
+    text += feasible_alpha3().to_markdown(index=False, disable_numparse=True) + "\n"
+    for env_id, of_env in table.groupby("env", sort=False):
+        rows = []
+        for (policy, function), of_policy in of_env.groupby(["policy", "function"], sort=False):
+            mean = of_policy.select_dtypes("number").mean()
+            row = {
+                "policy": f"{policy}" + (" (critic)" if function == "critic" else ""),
+                "holds": f"{of_policy['holds'].sum()} of {len(of_policy)}",
+                "cost at the start": f"{mean['start_cost']:.3g}",
+                "mean cost settles below": f"{mean['cost_bound']:.3g} [{mean['cost_bound_low']:.3g}, "
+                f"{mean['cost_bound_high']:.3g}]",
+                "its alpha3": "-" if np.isnan(mean["cost_bound_alpha3"]) else f"{mean['cost_bound_alpha3']:.2f}",
+                "alpha3 without residual": f"{mean['largest_feasible_alpha3']:.2f}",
+            }
+            for statement in _STATEMENTS:
+                bound = mean[f"{statement}_at_least"]
+                row[f"{statement.replace('_', ' ')}, at least"] = "-" if np.isnan(bound) else f"{bound:.3f}"
+            rows.append(row)
+        text += f"\n`{env_id}`:\n\n" + pd.DataFrame(rows).to_markdown(index=False, disable_numparse=True) + "\n"
+    return text
+
+
+def plot(table: pd.DataFrame) -> Figure:
+    """
+    Where the mean cost settles against the cost at the start, of each policy.
+
+    :param table: one row per Lyapunov function
+    :return: the figure
+    """
+    envs = table["env"].unique()
+    figure = new_figure(4.6 * len(envs), 0.6 + 0.35 * table.groupby("env").size().max())
+    for axes, env_id in zip(figure.subplots(1, len(envs), squeeze=False)[0], envs, strict=True):
+        of_env = table[table["env"] == env_id].reset_index(drop=True)
+        rows = of_env.index.to_numpy()[::-1]
+        colours = np.where(of_env["holds"], COLOURS[2], COLOURS[1]).tolist()
+        bounds = of_env[["cost_bound_low", "cost_bound", "cost_bound_high"]]
+        # a logarithmic axis has no 0, which is shown a decade below all else
+        least = min(of_env["start_cost"].min(), bounds.where(bounds > 1e-9).min(axis=None)) / 10
+        low, bound, high = bounds.clip(lower=least).to_numpy().T
+        axes.hlines(rows, low, high, colors=colours, lw=3)
+        axes.scatter(bound, rows, c=colours, s=24, label="settles below (green: the certificate holds)", zorder=3)
+        axes.scatter(of_env["start_cost"], rows, color="black", marker="|", s=80, label="at the start")
+        seeds = [f" {seed:.0f}" if pd.notna(seed) else "" for seed in of_env["seed"]]
+        functions = np.where(of_env["function"] == "critic", " (critic)", "")
+        axes.set_yticks(rows, of_env["policy"] + seeds + functions, fontsize="small")
+        axes.margins(y=0.2)
+        zero = f" (0 at {least:.1g})" if (bounds < 1e-9).any(axis=None) else ""
+        axes.set(xscale="log", xlabel=f"cost per step{zero}", title=env_id)
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize="small")
+    return figure
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """
+    The command line.
+
+    :param arguments: of the command line by default
+    """
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--envs", nargs="+", default=["LinearCost-v0", "CartPoleCost-v0"], help="with reference controllers")
+    parser.add_argument("--algos", nargs="*", default=[], help="algorithms to train, with an entry in zoo_configs")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
+    parser.add_argument("--timesteps", type=float, help="environment steps of each training, those of zoo_configs by default")
+    parser.add_argument("--fractions", nargs="+", type=float, default=[1.0], help="shares of the updates to train for")
+    parser.add_argument("--models", nargs="*", default=[], metavar="ALGO=PATH", help="saved models to judge, in all --envs")
+    parser.add_argument("--episodes", type=int, default=200, help="to fit, to evaluate and to certify, each")
+    parser.add_argument("--out", type=Path, default=Path("results/certificates"))
+    chosen = parser.parse_args(arguments)
+    unknown = [name for name in [*chosen.algos, *(model.partition("=")[0] for model in chosen.models)] if name not in ALGOS]
+    if unknown:
+        parser.error(f"unknown algorithms: {', '.join(unknown)}; models are given as ALGO=PATH")
+    if chosen.episodes < _N_ENVS or min(chosen.fractions) <= 0:
+        parser.error(f"--episodes must be at least {_N_ENVS}, and --fractions positive")
+
+    rows = []
+    for env_id in chosen.envs:
+        for policy, seed, predictor in policies(chosen, env_id):
+            name = "_".join(f"{env_id}_{policy}{'' if seed is None else f'_seed{seed}'}".replace("%", "percent").split())
+            described = {"env": env_id, "policy": policy, "seed": seed}
+            of_policy = judge(predictor, env_id, chosen.episodes, chosen.out, name.replace(",", ""))
+            rows += [{**described, **row} for row in of_policy]
+    table = pd.DataFrame(rows)
+    configuration = {name: value for name, value in vars(chosen).items() if name != "out"}
+    write_csv(chosen.out / "certificates.csv", table, configuration)
+    save_figure(plot(table), chosen.out / "certificates.png")
+    text = report(table)
+    write_text(chosen.out / "certificates.md", text)
+    sys.stdout.write("\n" + text)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,118 @@
+"""What a Lyapunov function is to an evaluation: values of observations, and the costs that they belong to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_lac.lac import LAC
+
+Observations = np.ndarray | dict[str, np.ndarray]
+
+
+class LyapunovFunction:
+    """
+    A Lyapunov function of a closed loop, as ``evaluate_lyapunov()`` and ``certify()`` take it. One that is known, for instance
+    from a Riccati equation, is judged like one that was learned:
+
+    .. code-block:: python
+
+      quadratic = LyapunovFunction(lambda states: np.einsum("ni,ij,nj->n", states, P, states))
+      evaluate_lyapunov(controller, env, lyapunov=quadratic)
+
+    Costs are ``c = max(reward_bound - reward, 0)``.
+
+    :param function: Values, an array of shape (n,), of n observations as the policy sees them
+    :param alpha3: Share of the cost by which the function is meant to decrease
+    :param gamma: Discount factor of the costs to come that it estimates
+    :param horizon: Number of steps whose costs it estimates, None for all to come
+    :param average_cost: What is subtracted from the cost of each step in the sum that it estimates, None if it estimates none
+    :param reward_bound: The reward that costs nothing
+    :param seeds: Seeds of the environments that it was learned on, if it was: no evaluation may use them
+    """
+
+    #: Whether costs are those of the training, in the units of ``VecNormalize``
+    normalized_rewards = False
+
+    def __init__(
+        self,
+        function: Callable[[Observations], np.ndarray],
+        alpha3: float = 1.0,
+        gamma: float = 1.0,
+        horizon: int | None = None,
+        average_cost: float | None = None,
+        reward_bound: float = 0.0,
+        seeds: range | None = None,
+    ):
+        self._function = function
+        self.alpha3 = alpha3
+        self.gamma = gamma
+        self.horizon = horizon
+        self.average_cost = average_cost
+        self.reward_bound = reward_bound
+        self.seeds = seeds
+
+    def values(self, observations: Observations) -> np.ndarray:
+        """
+        The values of observations.
+
+        :param observations: n observations as the policy sees them (normalized, if ``VecNormalize`` does so)
+        :return: n values, shape (n,)
+        :raises ValueError: If there is not one finite value for each observation
+        """
+        values = np.asarray(self._function(observations), dtype=np.float64)
+        first = next(iter(observations.values())) if isinstance(observations, dict) else observations
+        if values.shape != (len(first),):
+            raise ValueError(f"The values have shape {values.shape}, and must be one for each of {len(first)} observations.")
+        if not np.isfinite(values).all():
+            raise ValueError(
+                f"{np.sum(~np.isfinite(values))} of {len(values)} values of the Lyapunov function are not finite."
+            )
+        return values
+
+    def values_of_actions(self, observations: Observations, actions: np.ndarray) -> np.ndarray:
+        """
+        The values of observations in which an action was taken.
+
+        :param observations: n observations
+        :param actions: n actions, which only the critic of LAC looks at
+        :return: n values, shape (n,)
+        """
+        return self.values(observations)
+
+    def cost_bound(self, vec_normalize: VecNormalize | None) -> float:
+        """
+        The reward that costs nothing.
+
+        :param vec_normalize: Wrapper that the rewards come from, if any
+        :return: The bound in the units of the rewards that are judged
+        """
+        return self.reward_bound
+
+
+class CriticLyapunov(LyapunovFunction):
+    """
+    The critic of LAC: ``L(s, pi(s))`` with the mean action of the policy.
+
+    :param model: The LAC model
+    """
+
+    normalized_rewards = True
+
+    def __init__(self, model: LAC):
+        super().__init__(self._of_the_mean_action, model.alpha3, model.gamma, model.horizon)
+        self.model = model
+
+    def _of_the_mean_action(self, observations: Observations) -> np.ndarray:
+        actions, _ = self.model.predict(observations, deterministic=True)
+        return self.values_of_actions(observations, actions)
+
+    def values_of_actions(self, observations: Observations, actions: np.ndarray) -> np.ndarray:
+        return self.model.policy.predict_lyapunov(observations, actions)
+
+    def cost_bound(self, vec_normalize: VecNormalize | None) -> float:
+        # The scale of normalized rewards may have changed since the last update
+        self.model.update_offset(vec_normalize)
+        return self.model.cost_bound(vec_normalize).item()
