@@ -186,9 +186,9 @@ def plot_grid(results: pd.DataFrame, study: str, metric: str) -> Figure:
     for algo, of_algo in results.groupby("algo"):
         seeds = of_algo.pivot(index="seed", columns=[row, column], values=metric)
         tables[str(algo)] = pd.Series(over_seeds(seeds)[0], index=seeds.columns).unstack()
-        middle, low, high = (digits(float(value)) for value in over_seeds(*(seeds[condition] for condition in seeds)))
+        overall = [digits(float(value)) for value in over_seeds(*(seeds[condition] for condition in seeds))]
         # most conditions kill nobody, and of all of them together an interquartile mean would say no more
-        titles[str(algo)] = f"{algo}: {middle} [{low}, {high}]" if metric == "cost" else str(algo)
+        titles[str(algo)] = f"{algo}: {overall[0]} [{overall[1]}, {overall[2]}]" if metric == "cost" else str(algo)
     shown = {algo: table.map(np.log10) if metric == "cost" else table for algo, table in tables.items()}
     low, high = min(table.min().min() for table in shown.values()), max(table.max().max() for table in shown.values())
     if metric == "death_rate":

@@ -14,7 +14,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from battery_env.estimators.closed_form import ClosedForm
 from battery_env.evaluation import evaluate, summarize
-from benchmarks import compare
+from benchmarks import compare, contests
 from benchmarks.training import Recipe
 
 ENV_ID = "BatteryRo-v0"
@@ -32,13 +32,13 @@ BatteryRo-v0:
 
 
 def patch_held_out_trajectories(monkeypatch):
-    held_out = compare.held_out_trajectories
+    held_out = contests.held_out_trajectories
 
     def shortest(env_id):
         data = held_out(env_id)
         return data.subset(np.argsort(data.samples)[:6])
 
-    monkeypatch.setattr(compare, "held_out_trajectories", shortest)
+    monkeypatch.setattr(contests, "held_out_trajectories", shortest)
 
 
 @pytest.fixture(autouse=True)
@@ -49,10 +49,11 @@ def small(tmp_path, monkeypatch):
         (tmp_path / "zoo_configs" / f"{algo}.yml").write_text(CONFIG)
     monkeypatch.chdir(tmp_path)
     patch_held_out_trajectories(monkeypatch)
-    monkeypatch.setattr(compare, "_EVALUATION_EPISODES", 2)
-    monkeypatch.setattr(compare, "_SCORED_EPISODES", 3)
-    monkeypatch.setattr(compare, "_VOLTAGE_TRAJECTORIES", 2)
-    monkeypatch.setattr(compare, "_BRIEF_VOLTAGE_TRAJECTORIES", 1)
+    for module in (compare, contests):
+        monkeypatch.setattr(module, "EVALUATION_EPISODES", 2)
+    monkeypatch.setattr(contests, "_SCORED_EPISODES", 3)
+    monkeypatch.setattr(contests, "_VOLTAGE_TRAJECTORIES", 2)
+    monkeypatch.setattr(contests, "_BRIEF_VOLTAGE_TRAJECTORIES", 1)
 
 
 def recipe(algo="lac", timesteps=400, evaluations=2, **others):
@@ -101,7 +102,7 @@ def finished(monkeypatch):
             return
         trained.append(recipe)
         folder.mkdir(parents=True)
-        data = compare.held_out_trajectories(recipe.env_id)
+        data = contests.held_out_trajectories(recipe.env_id)
         evaluate(ClosedForm(), data).to_csv(folder / "scores.csv", index=False)
         history = {"timesteps": [recipe.timesteps], "mape_percent": [1.0], "mape_percent_worst": [2.0]}
         pd.DataFrame(history).to_csv(folder / "calibration.csv", index=False)
@@ -113,7 +114,7 @@ def finished(monkeypatch):
     monkeypatch.setattr(compare, "run", run)
     # drawn by another test
     for name in ("plot_true_against_inferred", "plot_learning_curves", "save_figure"):
-        monkeypatch.setattr(compare, name, lambda *args: None)
+        monkeypatch.setattr(contests, name, lambda *args: None)
     return trained
 
 
@@ -156,7 +157,7 @@ def test_seeds_are_one_row_and_continued_runs_are_named(tmp_path, finished, caps
 def test_defaults_are_the_line_as_typed(algo, tmp_path, monkeypatch):
     captured = []
     monkeypatch.setattr(
-        compare, "evaluate", lambda estimator, data: captured.append(estimator.policy) or evaluate(estimator, data)
+        contests, "evaluate", lambda estimator, data: captured.append(estimator.policy) or evaluate(estimator, data)
     )
     chosen = recipe(algo, timesteps=150, evaluations=1, defaults=True)
     assert chosen.name.startswith(f"{algo}_defaults_seed0_")
@@ -221,7 +222,7 @@ def test_voltage_only_tasks_are_compared_under_sensors_beside_their_peers(tmp_pa
     out = tmp_path / "out"
     table = pd.read_csv(out / "BatteryVoltageRo-v0.csv")
     calibrators = ["LAC", "SAC", "least squares", "Kalman filter"]
-    assert table["sensor"].tolist() == [sensor for sensor in compare.SENSORS for _ in calibrators]
+    assert table["sensor"].tolist() == [sensor for sensor in contests.SENSORS for _ in calibrators]
     assert table["calibrator"].tolist() == 2 * calibrators
     assert table["training_minutes"].notna().tolist() == 2 * [True, True, False, False]
     # untrained policies are bad, least squares are good, and the noisy sensor makes them worse
@@ -271,9 +272,9 @@ def test_algorithms_of_the_zoo_and_ones_own_are_compared_in_any_environment(tmp_
 
 
 def test_every_environment_has_a_contest(monkeypatch):
-    monkeypatch.setattr(compare, "held_out_trajectories", lambda env_id: None)
+    monkeypatch.setattr(contests, "held_out_trajectories", lambda env_id: None)
     kinds = {
-        env_id: type(compare.contest(env_id)).__name__ for env_id in ("BatteryJoint-v0", "BatteryAging-v0", "Pendulum-v1")
+        env_id: type(contests.contest_of(env_id)).__name__ for env_id in ("BatteryJoint-v0", "BatteryAging-v0", "Pendulum-v1")
     }
     assert kinds == {"BatteryJoint-v0": "FullState", "BatteryAging-v0": "VoltageOnly", "Pendulum-v1": "Episodes"}
 
@@ -281,7 +282,7 @@ def test_every_environment_has_a_contest(monkeypatch):
 def test_shares_of_discharges_are_drawn_over_seeds():
     scores = pd.DataFrame({"calibrator": ["LAC"] * 4 + ["filter"] * 2, "seed": [0, 0, 1, 1, np.nan, np.nan]})
     scores = scores.assign(sensor="5 mV noise", r_o_second_half_mape_percent=[1.0, 4.0, 2.0, 4.0, 1.0, 8.0])
-    (axes,) = compare.plot_ranks(scores, ["r_o"]).axes
+    (axes,) = contests.plot_ranks(scores, ["r_o"]).axes
     assert [line.get_label() for line in axes.lines] == ["LAC", "filter"] and len(axes.collections) == 1
     shares = axes.lines[0].get_ydata()
     # at 1 % half of the discharges with one of two seeds, at 8 % all
