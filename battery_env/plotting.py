@@ -5,17 +5,20 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
 
 from battery_env.arrays import FloatArray
 from battery_env.checks import LOAD_UNIT_SYMBOLS, LoadUnit
 from battery_env.estimates import Estimate, EstimateTrace
 from battery_env.estimators.cramer_rao import CramerRaoBound, Sensitivities
+from battery_env.evaluation import over_seeds
 from battery_env.files import replacing
 from battery_env.parameters import PARAMETER_NAMES, PARAMETERS
 from battery_env.record_model import Forecast
@@ -94,26 +97,46 @@ def plot_true_against_inferred(scores: Mapping[str, pd.DataFrame], parameter: st
     return figure
 
 
-def plot_learning_curves(curves: Mapping[str, list[pd.DataFrame]], title: str) -> Figure:
+def draw_over_seeds(axes: Axes, x: ArrayLike, scores: ArrayLike, colour: str, label: str, **style: Any) -> None:
     """
-    Error on held-out discharges during training: one line per seed, one colour per algorithm.
+    Draw the interquartile mean over seeds, with a band of its 95 % interval where there are several
+    (:func:`battery_env.evaluation.over_seeds`).
 
-    :param curves: by algorithm, for each seed a table with ``timesteps``, ``mape_percent`` and ``mape_percent_worst``
+    :param axes: where to
+    :param x: shape (n,)
+    :param scores: one row per seed, shape (seeds, n)
+    :param colour: of line and band
+    :param label: of the line in the legend
+    :param style: of the line, as matplotlib has it
+    """
+    middle, low, high = over_seeds(scores)
+    axes.plot(x, middle, color=colour, label=label, **{"lw": 1.4, **style})
+    if not np.isnan(low).all():
+        axes.fill_between(x, low, high, color=colour, alpha=0.2, lw=0)
+
+
+def plot_learning_curves(
+    curves: Mapping[str, list[pd.DataFrame]], title: str, metric: str = "mape_percent", label: str = "MAPE (%)"
+) -> Figure:
+    """
+    How a policy does on held-out discharges during training, over seeds: one colour per algorithm.
+
+    :param curves: by algorithm, for each seed a table with ``timesteps``, the metric (mean over discharges) and the metric
+        followed by ``_worst``, as :class:`~battery_env.callbacks.CalibrationCallback` writes it
     :param title: title of the figure
+    :param metric: what to show
+    :param label: what readers call it
     :return: the figure
     """
     figure = new_figure(7.2, 3.4)
-    for axes, column, label in zip(
-        figure.subplots(1, 2, sharex=True),
-        ("mape_percent", "mape_percent_worst"),
-        ("mean over trajectories", "worst trajectory"),
-        strict=True,
-    ):
+    panels = {metric: "mean", f"{metric}_worst": "worst"}
+    for axes, (column, panel) in zip(figure.subplots(1, 2, sharex=True), panels.items(), strict=True):
         for colour, (name, tables) in zip(COLOURS, curves.items(), strict=False):
-            for k, table in enumerate(tables):
-                axes.plot(table["timesteps"] / 1e3, table[column], color=colour, lw=1.4, label=name if k == 0 else None)
-        axes.set(yscale="log", xlabel="environment steps (thousands)", ylabel="MAPE (%)")
-        axes.set_title(label, fontsize=10)
+            seeds = pd.concat([table.set_index("timesteps")[column] for table in tables], axis=1).T
+            draw_over_seeds(axes, seeds.columns / 1e3, seeds, colour, name)
+        all_positive = all((table[column] > 0).all() for tables in curves.values() for table in tables)
+        axes.set(yscale="log" if all_positive else "linear", xlabel="environment steps (thousands)", ylabel=label)
+        axes.set_title(panel, fontsize=10)
         axes.grid(which="both", alpha=0.25)
         axes.legend(frameon=False, fontsize=9)
     figure.suptitle(title, fontsize=11)

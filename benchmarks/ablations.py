@@ -10,11 +10,7 @@ Every policy is scored on whole held-out discharges, the model running free. A r
 
 from __future__ import annotations
 
-import argparse
-import os
-import sys
 from collections.abc import Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -26,9 +22,8 @@ import pandas as pd
 from battery_env.calibration.data import standard_dataset
 from battery_env.calibration.policy import PolicyEstimator, Predictor
 from battery_env.evaluation import evaluate
-from battery_env.trajectories import TrajectoryDataset
-from benchmarks.reporting import write_csv, write_text
-from benchmarks.training import Recipe, run_all, timesteps_of, train_or_load
+from benchmarks.study import Study, Tables, command_line, markdown, positive, side_by_side
+from benchmarks.training import Recipe, timesteps_of, train_or_load
 
 _ENV_ID = "BatteryQmax-v0"
 _DISCHARGES = 64  # of the test part, evenly spaced
@@ -108,25 +103,26 @@ class _Blinkered:
         return self.policy.predict(observation[:, columns], deterministic=deterministic)
 
 
-def run(name: str, seed: int, updates: int, test: TrajectoryDataset, out: Path) -> dict[str, Any]:
+def part(name: str, seed: int, updates: int, models: Path) -> Tables:
     """
     Train one policy, unless that has been done, and score it.
 
     :param name: of the variant
     :param seed: seed of everything
     :param updates: gradient steps
-    :param test: discharges
-    :param out: folder of all results
-    :return: what came out
+    :param models: where trained policies are kept
+    :return: ``ablations``, one row: what came out
     """
     variant = VARIANTS[name]
     hyperparameters = dict(variant.hyperparameters)
     if variant.hidden:
         hyperparameters["env_wrapper"] = [{"benchmarks.ablations.HideColumns": {"hidden": list(variant.hidden)}}]
     timesteps = timesteps_of(updates, Recipe.of("lac", _ENV_ID, seed).hyperparameters)
-    model = train_or_load("lac", _ENV_ID, seed, timesteps, out / "models" / name, hyperparameters)
+    model = train_or_load("lac", _ENV_ID, seed, timesteps, models / name, hyperparameters)
+    test = standard_dataset("q_mobile", "paper", "test")
+    test = test.subset(range(0, len(test), len(test) // _DISCHARGES))
     errors = evaluate(PolicyEstimator(_Blinkered(model, variant.hidden), _ENV_ID), test)["q_mobile_mape_percent"]
-    return {
+    row = {
         "variant": name,
         "changed": variant.label,
         "seed": seed,
@@ -134,29 +130,26 @@ def run(name: str, seed: int, updates: int, test: TrajectoryDataset, out: Path) 
         "median_percent": errors.median(),
         "worst_percent": errors.max(),
     }
+    return {"ablations": pd.DataFrame([row])}
 
 
 def report(results: pd.DataFrame) -> str:
     """
     Errors of all seeds side by side, as Markdown.
 
-    :param results: see ``run()``, of all runs
+    :param results: of all parts
     :return: one table
     """
-
-    def digits(values: pd.Series) -> str:
-        return " / ".join(f"{value:.2g}" if value < 99.5 else f"{value:.0f}" for value in values)
-
     rows = [
         {
             "changed": str(label),
-            "mean over discharges (%)": digits(of_variant["mean_percent"]),
-            "median (%)": digits(of_variant["median_percent"]),
-            "worst (%)": digits(of_variant["worst_percent"]),
+            "mean over discharges (%)": side_by_side(of_variant["mean_percent"]),
+            "median (%)": side_by_side(of_variant["median_percent"]),
+            "worst (%)": side_by_side(of_variant["worst_percent"]),
         }
         for label, of_variant in results.groupby("changed", sort=False)
     ]
-    return pd.DataFrame(rows).to_markdown(index=False, disable_numparse=True) + "\n"
+    return markdown(rows)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -165,25 +158,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     :param arguments: of the command line by default
     """
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line("ablations", __doc__)
     parser.add_argument("--variants", nargs="+", default=list(VARIANTS), choices=list(VARIANTS), metavar="NAME")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
-    parser.add_argument("--updates", type=int, default=2400, help="gradient steps of each training")
-    parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1), help="runs at once, one core each")
-    parser.add_argument("--out", type=Path, default=Path("results/ablations"))
-    chosen = parser.parse_args(arguments)
-    if min(chosen.updates, chosen.jobs) < 1:
-        parser.error("--updates and --jobs must be at least 1")
-    test = standard_dataset("q_mobile", "paper", "test")
-    subset = test.subset(range(0, len(test), len(test) // _DISCHARGES))
-    runs = [(name, seed) for name in chosen.variants for seed in chosen.seeds]
-    one_run = partial(run, updates=chosen.updates, test=subset, out=chosen.out)
-    results = pd.DataFrame(run_all(one_run, runs, chosen.jobs))
-    configuration = {name: value for name, value in vars(chosen).items() if name not in ("jobs", "out")}
-    write_csv(chosen.out / "ablations.csv", results, configuration)
-    text = report(results)
-    write_text(chosen.out / "ablations.md", text)
-    sys.stdout.write("\n" + text)
+    parser.add_argument("--updates", type=positive, default=2400, help="gradient steps of each training")
+    study = Study(parser, arguments)
+    chosen = study.chosen
+    parts = [{"name": name, "seed": seed, "updates": chosen.updates} for name in chosen.variants for seed in chosen.seeds]
+    tables = study.run(part, parts, models=study.out / "models")
+    study.write(tables, {}, report(tables["ablations"]))
 
 
 if __name__ == "__main__":

@@ -13,7 +13,6 @@ Without algorithms and models only the reference controllers are judged, which t
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -27,7 +26,7 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from battery_env.plotting import COLOURS, new_figure, save_figure
 from benchmarks.controllers import reference_controllers
-from benchmarks.reporting import write_csv, write_text
+from benchmarks.study import Study, command_line
 from benchmarks.training import Recipe, train_or_load
 from sb3_lac import LAC, certify, evaluate_lyapunov, fit_lyapunov
 from sb3_lac.envs import LinearCostEnv
@@ -186,7 +185,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     :param arguments: of the command line by default
     """
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line("certificate", __doc__, jobs=None)
     parser.add_argument("--envs", nargs="+", default=["LinearCost-v0", "CartPoleCost-v0"], help="with reference controllers")
     parser.add_argument("--algos", nargs="*", default=[], help="algorithms to train, with an entry in zoo_configs")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
@@ -194,8 +193,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--fractions", nargs="+", type=float, default=[1.0], help="shares of the updates to train for")
     parser.add_argument("--models", nargs="*", default=[], metavar="ALGO=PATH", help="saved models to judge, in all --envs")
     parser.add_argument("--episodes", type=int, default=200, help="to fit, to evaluate and to certify, each")
-    parser.add_argument("--out", type=Path, default=Path("results/certificates"))
-    chosen = parser.parse_args(arguments)
+    study = Study(parser, arguments)
+    chosen = study.chosen
     unknown = [name for name in [*chosen.algos, *(model.partition("=")[0] for model in chosen.models)] if name not in ALGOS]
     if unknown:
         parser.error(f"unknown algorithms: {', '.join(unknown)}; models are given as ALGO=PATH")
@@ -210,12 +209,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             of_policy = judge(predictor, env_id, chosen.episodes, chosen.out, name.replace(",", ""))
             rows += [{**described, **row} for row in of_policy]
     table = pd.DataFrame(rows)
-    configuration = {name: value for name, value in vars(chosen).items() if name != "out"}
-    write_csv(chosen.out / "certificates.csv", table, configuration)
-    save_figure(plot(table), chosen.out / "certificates.png")
-    text = report(table)
-    write_text(chosen.out / "certificates.md", text)
-    sys.stdout.write("\n" + text)
+    study.write({"certificates": table}, {"certificates": plot(table)}, report(table), "certificates")
 
 
 if __name__ == "__main__":

@@ -49,7 +49,7 @@ def cart_pole_gain() -> np.ndarray:
     step = 1e-5
 
     def move(state: np.ndarray, action: float) -> np.ndarray:
-        return env._transition(state, np.array([action]))[0]
+        return env._next_state(state, np.array([action]), 0.0)
 
     a = np.stack([(move(step * axis, 0.0) - move(-step * axis, 0.0)) / (2 * step) for axis in np.eye(4)], axis=1)
     b = (move(np.zeros(4), step) - move(np.zeros(4), -step))[:, None] / (2 * step * env.force_max_N)

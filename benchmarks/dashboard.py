@@ -5,8 +5,8 @@ from __future__ import annotations
 import contextlib
 import io
 
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from battery_env.callbacks import CALIBRATION_CHARTS
 from benchmarks.training import Recipe
@@ -15,7 +15,7 @@ from sb3_lac.zoo import LACExperimentManager
 
 
 def dashboard_callbacks(
-    recipe: Recipe, manager: LACExperimentManager, model: OffPolicyAlgorithm, episodes: int, every: int
+    recipe: Recipe, manager: LACExperimentManager, model: BaseAlgorithm, episodes: int, every: int
 ) -> list[BaseCallback]:
     """
     Callbacks that make a run part of a comparison in TensorBoard. They do not change the training.

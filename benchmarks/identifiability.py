@@ -11,19 +11,16 @@ squares makes of records with noise, with errors that do not average out, and wi
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
 from battery_env.estimators import LeastSquares, cramer_rao_bound, sensitivities
-from battery_env.plotting import plot_estimates, plot_sensitivities, save_figure
+from battery_env.plotting import plot_estimates, plot_sensitivities
 from battery_env.sensors import SensorErrors
 from benchmarks import identifiability_report as report
 from benchmarks import identifiability_tables as measure
-from benchmarks.reporting import write_csv, write_text
+from benchmarks.study import Study, command_line, positive
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -32,36 +29,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     :param arguments: of the command line by default
     """
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--draws", type=int, default=100, help="records with noise per case of least squares")
-    parser.add_argument("--out", type=Path, default=Path("results/identifiability"))
-    chosen = parser.parse_args(arguments)
-    if chosen.draws < 1:
-        parser.error("--draws must be at least 1")
-    records, costs = measure.discharges(), measure.one_step_costs()
-    tables = {
-        "conservation": measure.conservation_table(),
-        "response": measure.response_table(records["constant"]),
-        "sensitivity": measure.sensitivity_table(records["constant"]),
-        "bounds": measure.bounds_table(records),
-        "late": measure.late_table(records),
-        "windows": measure.windows_table(records["constant"]),
-        "least_squares": measure.least_squares_table(records, chosen.draws),
-        "faults": measure.faults_table(),
-        "offsets": measure.offsets_table(records),
-        "priors": measure.priors_table(records["constant"]),
-        "minima": measure.minima_table(costs),
-    }
-    configuration = {
-        "draws": chosen.draws,
+    parser = command_line("identifiability", __doc__)
+    parser.add_argument("--draws", type=positive, default=100, help="records with noise per case of least squares")
+    study = Study(parser, arguments)
+    tables = study.run(measure.part, [{"table": name, "draws": study.chosen.draws} for name in measure.TABLES])
+    study.configuration |= {
         "q_mobile_C": measure.TRUE.q_mobile,
         "r_o_ohm": measure.TRUE.r_o,
         "current_A": measure.CURRENT_A,
         "current_range_A": measure.CURRENT_RANGE_A,
         "seed": measure.SEED,
     }
-    for name, table in tables.items():
-        write_csv(chosen.out / f"{name}.csv", table, configuration)
+    records = measure.discharges()
     noisy = SensorErrors(noise_V=measure.NOISE_V).apply(records["constant"], np.random.default_rng(measure.SEED))
     trace = LeastSquares(voltage_noise_V=measure.NOISE_V, window_every_s=60.0).trace([noisy])[0]
     figures = {
@@ -71,13 +50,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "estimates": plot_estimates({"least squares": trace}, measure.TRUE, cramer_rao_bound(noisy, measure.NOISE_V)),
         "faults": report.plot_faults(tables["faults"]),
         "misfits": report.plot_misfits(records),
-        "one_step": report.plot_one_step(costs),
+        "one_step": report.plot_one_step(measure.one_step_costs()),
     }
-    for name, figure in figures.items():
-        save_figure(figure, chosen.out / f"{name}.png")
-    text = report.summary(tables)
-    write_text(chosen.out / "summary.md", text)
-    sys.stdout.write("\n" + text)
+    study.write(tables, figures, report.summary(tables), "summary")
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ from benchmarks.identifiability_tables import (
     beginning,
     bound,
 )
+from benchmarks.study import SYMBOLS, digits, markdown
 
 
 def plot_bounds(records: dict[str, Trajectory]) -> Figure:
@@ -37,7 +38,7 @@ def plot_bounds(records: dict[str, Trajectory]) -> Figure:
     figure = new_figure(7.8, 4.2)
     panels = figure.subplots(2, len(unknowns), sharex=True, sharey="row")
     for column, unknown in enumerate(unknowns):
-        for axes, name, label in zip(panels[:, column], NAMES, ("q^max", "R_o"), strict=True):
+        for axes, name, label in zip(panels[:, column], *zip(*SYMBOLS.items(), strict=True), strict=True):
             for colour, noise_V in zip(COLOURS, NOISES_V, strict=False):
                 least = bound(record, noise_V, f"{label} alone" if unknown == "alone" else unknown)
                 axes.plot(least.time_s, getattr(least, name), color=colour, lw=1.4, label=f"{1e3 * noise_V:.0f} mV")
@@ -189,7 +190,7 @@ def summary(tables: dict[str, pd.DataFrame]) -> str:
         _priors_summary(tables["priors"], seen),
         _minima_summary(tables["minima"]),
     ]
-    return "\n\n".join(table.to_markdown(index=False, disable_numparse=True) for table in readable) + "\n"
+    return "\n".join(markdown(table) for table in readable)
 
 
 def _conservation_summary(table: pd.DataFrame) -> pd.DataFrame:
@@ -230,7 +231,7 @@ def _within_summary(table: pd.DataFrame) -> pd.DataFrame:
     for noise_V, of_noise in part.groupby("noise_V"):
         by_unknown = of_noise.set_index("unknown")
         row = {"noise of a reading": f"{1e3 * float(str(noise_V)):.0f} mV"}
-        for name, label in zip(NAMES, ("q^max", "R_o"), strict=True):
+        for name, label in SYMBOLS.items():
             for unknown in (f"{label} alone", "both", "both and an offset"):
                 time_s = by_unknown.loc[unknown, f"{name}_within_1_percent_s"]
                 title = f"{label}, {'the other known' if unknown.endswith('alone') else unknown + ' unknown'}"
@@ -243,7 +244,7 @@ def _loads_summary(table: pd.DataFrame, seen: str) -> pd.DataFrame:
     rows = []
     for (load, unknown), part in table[table["noise_V"] == NOISE_V].groupby(["load", "unknown"], sort=False):
         row = {"load": load, "unknown": unknown}
-        for name, label in zip(NAMES, ("q^max", "R_o"), strict=True):
+        for name, label in SYMBOLS.items():
             values = [part[f"{name}_sd_percent_at_{share:.0%}"].iloc[0] for share in SHARES]
             known = bool(np.isnan(values).all())
             row[f"sd of {label} (%) at {seen}"] = "known" if known else " / ".join(f"{value:.2g}" for value in values)
@@ -264,7 +265,7 @@ def _late_summary(table: pd.DataFrame) -> pd.DataFrame:
 
 def _windows_summary(table: pd.DataFrame) -> pd.DataFrame:
     def column(name: str) -> list[str]:
-        return [f"{value:.2g}" if value < PERCENT else f"{value:.0f}" for value in table[name]]
+        return [digits(value) for value in table[name]]
 
     return pd.DataFrame(
         {
@@ -281,7 +282,7 @@ def _least_squares_summary(table: pd.DataFrame) -> pd.DataFrame:
     rows = []
     for _, row in table.iterrows():
         shown = {"load": row["load"], "noise": f"{1e3 * row['noise_V']:.0f} mV", "seen": f"{row['seen_percent']:.0f} %"}
-        for name, label in zip(NAMES, ("q^max", "R_o"), strict=True):
+        for name, label in SYMBOLS.items():
             shown[f"{label}: error / bound (%)"] = f"{row[f'{name}_rms_percent']:.2g} / {row[f'{name}_bound_percent']:.2g}"
             shown[f"{label}: within 2 sd (%)"] = f"{row[f'{name}_within_2_sd_percent']:.0f}"
         shown["settled (%)"] = f"{row['settled_percent']:.0f}"
@@ -296,7 +297,7 @@ def _faults_summary(table: pd.DataFrame, seen: str) -> pd.DataFrame:
         row = {f"error at {seen}": fault}
         for load in dict.fromkeys(table["load"]):
             part = table[(table["load"] == load) & (table["fault"] == fault)]
-            for name, label in zip(NAMES, ("q^max", "R_o"), strict=True):
+            for name, label in SYMBOLS.items():
                 row[f"{label} (%), {load} load"] = _at_shares(part, f"{name}_error_percent")
         rows.append(row)
     return pd.DataFrame(rows)

@@ -21,6 +21,7 @@ from battery_env.estimators import (
 from battery_env.loads import RandomPiecewise, constant
 from battery_env.sensors import SensorErrors
 from battery_env.trajectories import TrajectoryDataset
+from benchmarks.study import Tables
 
 #: The aged cell of this study.
 TRUE = Estimate(q_mobile=6000.0, r_o=0.15)
@@ -416,3 +417,30 @@ def minima_table(costs: pd.DataFrame) -> pd.DataFrame:
         for n in 1 + np.flatnonzero((values[1:-1] < values[:-2]) & (values[1:-1] < values[2:])):
             rows.append({"cost": column, "q_mobile_C": costs["q_mobile_C"].iloc[n], "value": values[n]})
     return pd.DataFrame(rows)
+
+
+#: By name, what makes each table, from the discharges and how often noise is drawn.
+TABLES: dict[str, Callable[[dict[str, Trajectory], int], pd.DataFrame]] = {
+    "conservation": lambda records, draws: conservation_table(),
+    "response": lambda records, draws: response_table(records["constant"]),
+    "sensitivity": lambda records, draws: sensitivity_table(records["constant"]),
+    "bounds": lambda records, draws: bounds_table(records),
+    "late": lambda records, draws: late_table(records),
+    "windows": lambda records, draws: windows_table(records["constant"]),
+    "least_squares": lambda records, draws: least_squares_table(records, draws),
+    "faults": lambda records, draws: faults_table(),
+    "offsets": lambda records, draws: offsets_table(records),
+    "priors": lambda records, draws: priors_table(records["constant"]),
+    "minima": lambda records, draws: minima_table(one_step_costs()),
+}
+
+
+def part(table: str, draws: int) -> Tables:
+    """
+    A part of the study.
+
+    :param table: name of one of ``TABLES``
+    :param draws: records with noise per case of least squares
+    :return: that table
+    """
+    return {table: TABLES[table](discharges(), draws)}

@@ -11,11 +11,7 @@ feasible alpha3 that ``evaluate_lyapunov`` measures with the exact one.
 
 from __future__ import annotations
 
-import argparse
-import os
-import sys
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
@@ -23,14 +19,13 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from battery_env.plotting import new_figure, save_figure
-from benchmarks.reporting import write_csv, write_text
-from benchmarks.training import run_all, train_or_load
+from battery_env.plotting import new_figure
+from benchmarks.study import EVALUATION_SEED, Study, Tables, command_line, markdown, positive
+from benchmarks.training import train_or_load
 from sb3_lac import LAC, evaluate_lyapunov
 from sb3_lac.envs import LinearCostEnv
 
 _ENV_ID = "LinearCost-v0"
-_EVALUATION_SEED = 10_000  # no training seed comes close
 
 
 def linear_gain(states: np.ndarray, controls: np.ndarray) -> np.ndarray:
@@ -44,20 +39,20 @@ def linear_gain(states: np.ndarray, controls: np.ndarray) -> np.ndarray:
     return -np.linalg.lstsq(states, controls, rcond=None)[0].T
 
 
-def run(seed: int, timesteps: int, episodes: int, out: Path) -> tuple[dict[str, float], pd.DataFrame]:
+def part(seed: int, timesteps: int, episodes: int, models: Path) -> Tables:
     """
     Train one policy, and compare it with the exact solution.
 
     :param seed: seed of the training
     :param timesteps: environment steps
     :param episodes: episodes of the evaluation
-    :param out: folder of all results
-    :return: what was learned and what is exact; L and the exact cost-to-go of visited states
+    :param models: where trained policies are kept
+    :return: ``linear_cost``: what was learned and what is exact; ``values``: L and the exact cost-to-go of visited states
     """
-    model = train_or_load("lac", _ENV_ID, seed, timesteps, out / "models" / f"seed{seed}")
+    model = train_or_load("lac", _ENV_ID, seed, timesteps, models / f"seed{seed}")
     assert isinstance(model, LAC)
     env = LinearCostEnv()
-    measured = evaluate_lyapunov(model, gym.make(_ENV_ID), n_eval_episodes=episodes, deterministic=True, seed=_EVALUATION_SEED)
+    measured = evaluate_lyapunov(model, gym.make(_ENV_ID), n_eval_episodes=episodes, deterministic=True, seed=EVALUATION_SEED)
     states = measured.observations
     assert states is not None
     actions, _ = model.predict(states.astype(np.float32), deterministic=True)
@@ -83,7 +78,8 @@ def run(seed: int, timesteps: int, episodes: int, out: Path) -> tuple[dict[str, 
         "alpha3_exact": env.largest_feasible_alpha3(gain, model.gamma),
         "alpha3_optimum": env.largest_feasible_alpha3(best, model.gamma),
     }
-    return row, pd.DataFrame({"seed": seed, "exact": exact, "learned": learned})
+    values = pd.DataFrame({"seed": seed, "exact": exact, "learned": learned})
+    return {"linear_cost": pd.DataFrame([row]), "values": values}
 
 
 def plot(values: pd.DataFrame) -> Figure:
@@ -110,7 +106,7 @@ def report(table: pd.DataFrame) -> str:
     """
     Learned and exact values side by side, as Markdown.
 
-    :param table: one row per seed, see ``run()``
+    :param table: one row per seed, see :func:`part`
     :return: one table
     """
     rows = [
@@ -126,7 +122,7 @@ def report(table: pd.DataFrame) -> str:
         }
         for _, row in table.iterrows()
     ]
-    return pd.DataFrame(rows).to_markdown(index=False, disable_numparse=True) + "\n"
+    return markdown(rows)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -135,25 +131,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     :param arguments: of the command line by default
     """
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line("linear_cost", __doc__)
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
-    parser.add_argument("--timesteps", type=float, default=1e4, help="environment steps of each training")
-    parser.add_argument("--episodes", type=int, default=100, help="episodes of the evaluation")
-    parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1), help="runs at the same time, one core each")
-    parser.add_argument("--out", type=Path, default=Path("results/linear_cost"))
-    chosen = parser.parse_args(arguments)
-    if min(chosen.timesteps, chosen.episodes, chosen.jobs) < 1:
-        parser.error("--timesteps, --episodes and --jobs must be at least 1")
-
-    one_run = partial(run, timesteps=int(chosen.timesteps), episodes=chosen.episodes, out=chosen.out)
-    results = run_all(one_run, [(seed,) for seed in chosen.seeds], chosen.jobs)
-    table, values = pd.DataFrame([row for row, _ in results]), pd.concat([points for _, points in results])
-    configuration = {name: value for name, value in vars(chosen).items() if name not in ("jobs", "out")}
-    write_csv(chosen.out / "linear_cost.csv", table, configuration)
-    save_figure(plot(values), chosen.out / "linear_cost.png")
-    text = report(table)
-    write_text(chosen.out / "linear_cost.md", text)
-    sys.stdout.write("\n" + text)
+    parser.add_argument("--timesteps", type=positive, default=10_000, help="environment steps of each training")
+    parser.add_argument("--episodes", type=positive, default=100, help="episodes of the evaluation")
+    study = Study(parser, arguments)
+    chosen = study.chosen
+    parts = [{"seed": seed, "timesteps": chosen.timesteps, "episodes": chosen.episodes} for seed in chosen.seeds]
+    tables = study.run(part, parts, models=study.out / "models")
+    table = tables["linear_cost"]
+    study.write({"linear_cost": table}, {"linear_cost": plot(tables["values"])}, report(table))
 
 
 if __name__ == "__main__":

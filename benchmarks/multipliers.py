@@ -8,38 +8,33 @@ What alpha3 and lambda_max do: LAC with a grid of both, on the three cost enviro
 For each combination: the cost of the policy, where lambda and the entropy coefficient ended, and what ``evaluate_lyapunov``
 says of the decrease condition, all of the mean action. lambda learns at the rate of everything else, its default: with a rate
 of its own, its ratio to the entropy coefficient would say how fast each of them learns, and not what alpha3 does.
-A policy that is trained is not trained again when the command is repeated.
+What is done is not done again when the command is repeated.
 """
 
 from __future__ import annotations
 
-import argparse
-import os
-import sys
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from scipy.stats import ttest_1samp
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 
-from battery_env.plotting import new_figure, save_figure
-from benchmarks.reporting import write_csv, write_text
-from benchmarks.training import run_all, train_or_load
+from battery_env.evaluation import over_seeds
+from battery_env.plotting import new_figure
+from benchmarks.study import EVALUATION_SEED, Study, Tables, command_line, digits, markdown
+from benchmarks.training import train_or_load
 from sb3_lac import LAC, evaluate_lyapunov
 
-_EVALUATION_SEED = 10_000  # no training seed comes close
 _TIMESTEPS = {"LinearCost-v0": 3_000, "CartPoleCost-v0": 10_000, "Oscillator-v0": 8_000}
 _EPISODES = 20
 _LAMBDA_RANGE = 1e-4  # lambda_min / lambda_max as by default: lambda has the same room to fall below each limit
 
 
-def run(env_id: str, alpha3: float, lambda_max: float, seed: int, out: Path) -> dict[str, object]:
+def part(env_id: str, alpha3: float, lambda_max: float, seed: int, timesteps: int, models: Path) -> Tables:
     """
     Train and evaluate one policy.
 
@@ -47,8 +42,9 @@ def run(env_id: str, alpha3: float, lambda_max: float, seed: int, out: Path) -> 
     :param alpha3: see ``LAC``
     :param lambda_max: see ``LAC``, also the start of lambda
     :param seed: seed of the training
-    :param out: folder of all results
-    :return: what came out
+    :param timesteps: environment steps
+    :param models: where trained policies are kept
+    :return: ``multipliers``, one row: what came out
     """
     hyperparameters = {
         "alpha3": alpha3,
@@ -56,18 +52,18 @@ def run(env_id: str, alpha3: float, lambda_max: float, seed: int, out: Path) -> 
         "lambda_max": lambda_max,
         "lambda_init": lambda_max,
     }
-    folder = out / "models" / f"{env_id}_alpha3_{alpha3:g}_lambda_max_{lambda_max:g}_seed{seed}"
-    model = train_or_load("lac", env_id, seed, _TIMESTEPS[env_id], folder, hyperparameters)
+    folder = models / f"{env_id}_alpha3_{alpha3:g}_lambda_max_{lambda_max:g}_seed{seed}"
+    model = train_or_load("lac", env_id, seed, timesteps, folder, hyperparameters)
     assert isinstance(model, LAC)
     env = Monitor(gym.make(env_id))
-    env.reset(seed=_EVALUATION_SEED)
+    env.reset(seed=EVALUATION_SEED)
     returns, lengths = evaluate_policy(model, env, _EPISODES, return_episode_rewards=True)
     assert isinstance(returns, list) and isinstance(lengths, list)
     metrics = evaluate_lyapunov(
-        model, gym.make(env_id), n_eval_episodes=_EPISODES, deterministic=True, seed=_EVALUATION_SEED
+        model, gym.make(env_id), n_eval_episodes=_EPISODES, deterministic=True, seed=EVALUATION_SEED
     ).metrics
     assert model.log_ent_coef is not None
-    return {
+    row = {
         "env": env_id,
         "alpha3": alpha3,
         "lambda_max": lambda_max,
@@ -81,26 +77,15 @@ def run(env_id: str, alpha3: float, lambda_max: float, seed: int, out: Path) -> 
         "condition_holds": metrics["decrease"].high < 0,
         "largest_feasible_alpha3": metrics["largest_feasible_alpha3"].value,
     }
-
-
-def mean_interval(values: pd.Series) -> tuple[float, float, float]:
-    """
-    Mean over seeds with its 95 % interval, of Student's t distribution.
-
-    :param values: one per seed
-    :return: mean, and lower and upper end of the interval (NaN for a single seed)
-    """
-    if len(values) < 2:
-        return float(values.mean()), float("nan"), float("nan")
-    low, high = ttest_1samp(values, 0.0).confidence_interval(0.95)
-    return float(values.mean()), float(low), float(high)
+    return {"multipliers": pd.DataFrame([row])}
 
 
 def plot(results: pd.DataFrame) -> Figure:
     """
-    One column per environment: cost, and where lambda ended relative to its upper limit, over alpha3.
+    One column per environment: cost (interquartile mean over seeds with its 95 % interval), and where lambda ended relative to
+    its upper limit, over alpha3.
 
-    :param results: see ``run()``, of all runs
+    :param results: of all parts
     :return: the figure
     """
     figure = new_figure(3.4 * results["env"].nunique(), 5.0)
@@ -108,12 +93,12 @@ def plot(results: pd.DataFrame) -> Figure:
     for (upper, lower), (env_id, of_env) in zip(panels.T, results.groupby("env", sort=False), strict=True):
         for number, (lambda_max, group) in enumerate(of_env.groupby("lambda_max")):
             style = {"color": f"C{number}", "marker": "o", "ms": 4, "label": f"lambda_max = {lambda_max:g}"}
-            costs = pd.DataFrame({alpha3: mean_interval(values) for alpha3, values in group.groupby("alpha3")["cost"]}).T
-            errors = [costs[0] - costs[1], costs[2] - costs[0]]
+            seeds = group.pivot(index="seed", columns="alpha3", values="cost")
+            cost, low, high = over_seeds(seeds)
             # Side by side, for the intervals overlap
-            upper.errorbar(costs.index * 1.05**number, costs[0], np.nan_to_num(errors), capsize=3, **style)
+            upper.errorbar(seeds.columns * 1.05**number, cost, np.nan_to_num([cost - low, high - cost]), capsize=3, **style)
             lower.plot((group["lambda"] / group["lambda_max"]).groupby(group["alpha3"]).median(), **style)
-        upper.set(title=str(env_id), ylabel="cost per step, mean and 95 %")
+        upper.set(title=str(env_id), ylabel="cost per step, IQM and 95 %")
         lower.set(xlabel="alpha3", ylabel="lambda / lambda_max, median", yscale="log", xscale="log")
         upper.legend(frameon=False, fontsize="small")
     return figure
@@ -121,14 +106,15 @@ def plot(results: pd.DataFrame) -> Figure:
 
 def report(results: pd.DataFrame) -> str:
     """
-    What came out over seeds, as Markdown: means with their 95 % intervals, and medians of the multipliers.
+    What came out over seeds, as Markdown: interquartile means with their 95 % intervals, and medians of the multipliers.
 
-    :param results: see ``run()``, of all runs
+    :param results: of all parts
     :return: one table
     """
 
     def with_interval(values: pd.Series) -> str:
-        return "{:.3g} [{:.3g}, {:.3g}]".format(*mean_interval(values))
+        middle, low, high = (digits(float(value), 3) for value in over_seeds(values))
+        return f"{middle} [{low}, {high}]"
 
     rows = [
         {
@@ -144,7 +130,7 @@ def report(results: pd.DataFrame) -> str:
         }
         for (env_id, alpha3, lambda_max), group in results.groupby(["env", "alpha3", "lambda_max"], sort=False)
     ]
-    return pd.DataFrame(rows).to_markdown(index=False, disable_numparse=True) + "\n"
+    return markdown(rows)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -153,31 +139,27 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     :param arguments: of the command line by default
     """
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line("multipliers", __doc__)
     parser.add_argument("--envs", nargs="+", default=list(_TIMESTEPS), choices=list(_TIMESTEPS))
     parser.add_argument("--alpha3", nargs="+", type=float, default=[0.1, 0.3, 1.0])
     parser.add_argument("--lambda-max", nargs="+", type=float, default=[1.0])
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
-    parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1), help="runs at the same time, one core each")
-    parser.add_argument("--out", type=Path, default=Path("results/multipliers"))
-    chosen = parser.parse_args(arguments)
-    if chosen.jobs < 1 or min(*chosen.alpha3, *chosen.lambda_max) <= 0:
-        parser.error("--jobs must be at least 1, --alpha3 and --lambda-max greater than 0")
-
-    runs = [
-        (env_id, alpha3, lambda_max, seed)
+    study = Study(parser, arguments)
+    chosen = study.chosen
+    if min(*chosen.alpha3, *chosen.lambda_max) <= 0:
+        parser.error("--alpha3 and --lambda-max must be greater than 0")
+    study.configuration["timesteps"] = _TIMESTEPS
+    parts = [
+        {"env_id": env_id, "alpha3": alpha3, "lambda_max": lambda_max, "seed": seed, "timesteps": _TIMESTEPS[env_id]}
         for env_id in chosen.envs
         for seed in chosen.seeds
         for alpha3 in chosen.alpha3
         for lambda_max in chosen.lambda_max
     ]
-    results = pd.DataFrame(run_all(partial(run, out=chosen.out), runs, chosen.jobs))
-    configuration = {name: value for name, value in vars(chosen).items() if name not in ("jobs", "out")}
-    write_csv(chosen.out / "multipliers.csv", results, {**configuration, "timesteps": _TIMESTEPS})
-    save_figure(plot(results), chosen.out / "multipliers.png")
-    text = report(results.sort_values(["env", "alpha3", "lambda_max"]))
-    write_text(chosen.out / "multipliers.md", text)
-    sys.stdout.write("\n" + text)
+    tables = study.run(part, parts, models=study.out / "models")
+    results = tables["multipliers"]
+    in_order = results.sort_values(["env", "alpha3", "lambda_max"])
+    study.write(tables, {"multipliers": plot(results)}, report(in_order))
 
 
 if __name__ == "__main__":

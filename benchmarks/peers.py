@@ -7,25 +7,21 @@ What a user would pick instead of a learned policy, on the same work: calibrator
 
 Simulated discharges under power that changes every 60 to 140 s, 30 of cells with a worn q_mobile and 30 with a worn r_o; then
 30 with both, and the same with worse sensors. The cells are full and at rest when a discharge starts, and every calibrator
-starts from a new cell's parameters. Finished parts are kept in ``<out>/parts`` and not run again.
+starts from a new cell's parameters. Finished parts are not run again. Parts that run at the same time (``--jobs``) may cost
+each other time, which is measured.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any, Literal, cast
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from tqdm import tqdm
 
 from battery_env.electrochemistry import NEW_CELL
 from battery_env.estimators.base import Estimator
@@ -36,11 +32,11 @@ from battery_env.estimators.least_squares import LeastSquares
 from battery_env.evaluation import evaluate
 from battery_env.loads import RandomPiecewise
 from battery_env.parameters import PARAMETER_NAMES, PARAMETERS
-from battery_env.plotting import COLOURS, LABELS, new_figure, save_figure
+from battery_env.plotting import COLOURS, LABELS, new_figure
 from battery_env.sensors import SensorErrors
 from battery_env.trajectories import AgedParameter, TrajectoryDataset
 from benchmarks.progpy_filters import ProgpyFilter
-from benchmarks.reporting import write_csv, write_text
+from benchmarks.study import SYMBOLS, Study, Tables, command_line, digits, markdown, positive
 
 R_O_RANGE_OHM = (0.117, 0.35)
 #: A cell that is a little worn in both parameters: 10 % less q_mobile, 10 % more r_o.
@@ -59,7 +55,6 @@ LOST_PERCENT = 5.0
 
 # The mean magnitude of a normal error is this times its standard deviation
 _MEAN_MAGNITUDE = float(np.sqrt(2.0 / np.pi))
-_SYMBOLS = {"q_mobile": "q^max", "r_o": "R_o"}
 
 
 @dataclass(frozen=True)
@@ -89,7 +84,7 @@ def _progpy(parameter: str, kind: Literal["ukf", "particles"]) -> ProgpyFilter:
     return ProgpyFilter(parameter, kind, PRIOR_SD[parameter], STATED_NOISE_V)
 
 
-METHODS = (
+_METHODS = (
     Method("closed form", "full state", lambda unknown: ClosedForm(), full_state=True),
     Method("greedy one-step cost", "full state", lambda unknown: GreedyOneStep(unknown[0], thermal=True), full_state=True),
     Method(
@@ -108,6 +103,7 @@ METHODS = (
     Method("progpy, unscented Kalman filter", "voltage, prior", lambda unknown: _progpy(unknown[0], "ukf"), slow=True),
     Method("progpy, 100 particles", "voltage, prior", lambda unknown: _progpy(unknown[0], "particles"), slow=True),
 )
+METHODS = {method.name: method for method in _METHODS}
 #: Those that are tried under worse conditions too.
 TRIED = ("least squares, whole discharge", "extended Kalman filter")
 
@@ -131,7 +127,7 @@ class Case:
 
 _NOISE = SensorErrors(noise_V=STATED_NOISE_V)
 BASE = Case("5 mV noise", _NOISE)
-CASES = (
+_CASES = (
     BASE,
     Case("20 mV noise", SensorErrors(noise_V=0.020)),
     Case("+10 mV offset", SensorErrors(noise_V=STATED_NOISE_V, offset_V=0.010)),
@@ -139,9 +135,10 @@ CASES = (
     Case("other one 10 % worn, held new", _NOISE, other_worn=True),
     Case("both unknown", _NOISE, both_unknown=True),
 )
+CASES = {case.name: case for case in _CASES}
 
 
-def discharges(case: Case, unknown: Sequence[str], n: int) -> TrajectoryDataset:
+def work(case: Case, unknown: Sequence[str], n: int) -> TrajectoryDataset:
     """
     The work: discharges as progpy simulates them (the model with a temperature; tests compare both).
 
@@ -184,20 +181,21 @@ def cpu_time_per_estimate_s(estimator: Estimator, data: TrajectoryDataset, slow:
     return spent_s / estimates
 
 
-def run(method: Method, case: Case, unknown: Sequence[str], n: int) -> pd.DataFrame:
+def part(method: str, case: str, unknown: Sequence[str], discharges: int) -> Tables:
     """
     Score one calibrator under one condition.
 
-    :param method: the calibrator
-    :param case: the condition
+    :param method: name of the calibrator
+    :param case: name of the condition
     :param unknown: what it searches for
-    :param n: number of discharges
-    :return: one row per discharge and unknown parameter
+    :param discharges: how many
+    :return: ``peers``, one row per discharge and unknown parameter
     """
-    data = discharges(case, unknown, n)
-    estimator = method.make(unknown)
-    scores = evaluate(estimator, data, None if method.full_state else case.sensors)
-    scores["cpu_time_per_estimate_s"] = cpu_time_per_estimate_s(estimator, data, method.slow)
+    chosen, condition = METHODS[method], CASES[case]
+    data = work(condition, unknown, discharges)
+    estimator = chosen.make(unknown)
+    scores = evaluate(estimator, data, None if chosen.full_state else condition.sensors)
+    scores["cpu_time_per_estimate_s"] = cpu_time_per_estimate_s(estimator, data, chosen.slow)
     columns = {
         "true": "",
         "final_error_percent": "_final_error_percent",
@@ -212,58 +210,34 @@ def run(method: Method, case: Case, unknown: Sequence[str], n: int) -> pd.DataFr
         table.insert(0, "parameter", name)
         tables.append(table.join(scores[["trajectory", "settled_time_s", "updates", "cpu_time_per_estimate_s"]]))
     together = pd.concat(tables)
-    together.insert(0, "case", case.name)
-    together.insert(0, "method", method.name)
-    return together
+    together.insert(0, "case", case)
+    together.insert(0, "method", method)
+    return {"peers": together}
 
 
-def runs() -> list[tuple[Method, Case, tuple[str, ...]]]:
+def parts(n: int, slow_n: int) -> list[dict[str, Any]]:
     """
     All parts of this study.
 
-    :return: calibrator, condition, and what is unknown
+    :param n: discharges
+    :param slow_n: discharges of slow calibrators
+    :return: the arguments of each, see :func:`part`
     """
-    parts = []
-    for case in CASES:
-        for method in METHODS:
+    chosen = []
+    for case in CASES.values():
+        for method in METHODS.values():
             if case is BASE or method.name in TRIED:
                 unknowns = [PARAMETER_NAMES] if case.both_unknown else [(name,) for name in PARAMETERS]
-                parts += [(method, case, unknown) for unknown in unknowns]
-    return parts
-
-
-def run_or_read(part: tuple[Method, Case, tuple[str, ...]], n: int, folder: Path) -> pd.DataFrame:
-    """
-    A part of this study, from its file if it was finished before with the same configuration.
-
-    :param part: see :func:`runs`
-    :param n: number of discharges
-    :param folder: where files of parts are
-    :return: what :func:`run` returned
-    """
-    method, case, unknown = part
-    configuration = {"method": method.name, "case": asdict(case), "unknown": list(unknown), "discharges": n, "seeds": SEEDS}
-    name = "_".join([method.name, case.name, *unknown])
-    path = folder / f"{''.join(c if c.isalnum() else '_' for c in name)}.csv"
-    if path.exists() and path.with_suffix(".json").exists():
-        if json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))["configuration"] == configuration:
-            return pd.read_csv(path)
-    table = run(method, case, unknown, n)
-    write_csv(path, table, configuration)
-    return pd.read_csv(path)
-
-
-def _digits(value: float) -> str:
-    if not np.isfinite(value):
-        return "never" if value == np.inf else "-"
-    return f"{value:.2g}" if abs(value) < 99.5 else f"{value:.0f}"
+                common = {"method": method.name, "case": case.name, "discharges": min(slow_n, n) if method.slow else n}
+                chosen += [{**common, "unknown": list(unknown)} for unknown in unknowns]
+    return chosen
 
 
 def _duration(seconds: float) -> str:
     for unit, size in (("s", 1.0), ("ms", 1e-3)):
         if seconds >= size:
-            return f"{_digits(seconds / size)} {unit}"
-    return f"{_digits(seconds / 1e-6)} µs"
+            return f"{digits(seconds / size)} {unit}"
+    return f"{digits(seconds / 1e-6)} µs"
 
 
 def bound_percent(results: pd.DataFrame, case: Case, parameter: str) -> float:
@@ -288,23 +262,23 @@ def methods_table(results: pd.DataFrame) -> pd.DataFrame:
     """
     base = results[results["case"] == BASE.name]
     rows = []
-    for method in METHODS:
+    for method in METHODS.values():
         of_method = base[base["method"] == method.name]
         row = {"calibrator": method.name, "needs": method.needs}
         for parameter, part in of_method.groupby("parameter", sort=False):
-            symbol = _SYMBOLS[str(parameter)]
+            symbol = SYMBOLS[str(parameter)]
             last, settled_s = part["final_error_percent"], part["settling_time_1_percent_s"]
             many = (part["updates"] > 1).all()
-            half = _digits(part["second_half_mape_percent"].mean()) if many else "-"
-            row[f"{symbol}: last / 2nd half (worst last), %"] = f"{_digits(last.mean())} / {half} ({_digits(last.max())})"
+            half = digits(part["second_half_mape_percent"].mean()) if many else "-"
+            row[f"{symbol}: last / 2nd half (worst last), %"] = f"{digits(last.mean())} / {half} ({digits(last.max())})"
             row[f"{symbol} within 1 % after: median / worst, s"] = (
-                f"{_digits(settled_s.median())} / {_digits(settled_s.max())}" if many else "-"
+                f"{digits(settled_s.median())} / {digits(settled_s.max())}" if many else "-"
             )
         row["discharges"] = str(int(of_method.groupby("parameter").size().sum()))
         row["time per estimate"] = _duration(of_method["cpu_time_per_estimate_s"].mean())
         rows.append(row)
-    bounds = {name: _digits(bound_percent(results, BASE, name)) for name in PARAMETERS}
-    bound_row = {f"{_SYMBOLS[name]}: last / 2nd half (worst last), %": f"{value} / - (-)" for name, value in bounds.items()}
+    bounds = {name: digits(bound_percent(results, BASE, name)) for name in PARAMETERS}
+    bound_row = {f"{SYMBOLS[name]}: last / 2nd half (worst last), %": f"{value} / - (-)" for name, value in bounds.items()}
     rows.append({"calibrator": "Cramér-Rao bound", "needs": "voltage", **bound_row})
     return pd.DataFrame(rows).fillna("-")
 
@@ -317,16 +291,16 @@ def cases_table(results: pd.DataFrame) -> pd.DataFrame:
     :return: one row per condition, as shown to readers
     """
     rows = []
-    for case in CASES:
+    for case in CASES.values():
         row = {"case": case.name}
         for name in TRIED:
             for parameter in PARAMETERS:
                 part = _of(results, name, case, parameter)
                 error, lost = part["final_error_percent"], (part["final_error_percent"] > LOST_PERCENT).sum()
                 settled = np.isfinite(part["settled_time_s"]).sum()
-                row[f"{name}, {_SYMBOLS[parameter]}: last (worst), %"] = f"{_digits(error.mean())} ({_digits(error.max())})"
-                row[f"{name}, {_SYMBOLS[parameter]}: lost / says settled"] = f"{lost} / {settled} of {len(part)}"
-        bounds = " / ".join(_digits(bound_percent(results, case, parameter)) for parameter in PARAMETERS)
+                row[f"{name}, {SYMBOLS[parameter]}: last (worst), %"] = f"{digits(error.mean())} ({digits(error.max())})"
+                row[f"{name}, {SYMBOLS[parameter]}: lost / says settled"] = f"{lost} / {settled} of {len(part)}"
+        bounds = " / ".join(digits(bound_percent(results, case, parameter)) for parameter in PARAMETERS)
         rows.append(row | {"bound, %": bounds})
     return pd.DataFrame(rows)
 
@@ -361,11 +335,11 @@ def plot_methods(results: pd.DataFrame) -> Figure:
     figure = new_figure(9.6, 3.8)
     panels = figure.subplots(1, len(PARAMETERS), sharey=True)
     for axes, parameter in zip(panels, PARAMETERS, strict=True):
-        for row, method in enumerate(METHODS):
+        for row, method in enumerate(METHODS.values()):
             errors = _of(results, method.name, BASE, parameter)["final_error_percent"]
             _draw_errors(axes, row, errors, COLOURS[2 if method.full_state else 4 if method.slow else 0])
         axes.axvline(bound_percent(results, BASE, parameter), color="0.3", lw=1.2, ls="--", label="Cramér-Rao bound")
-    _finish(panels, [method.name for method in METHODS])
+    _finish(panels, list(METHODS))
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower right", frameon=False, fontsize=9)
     return figure
 
@@ -380,7 +354,7 @@ def plot_cases(results: pd.DataFrame) -> Figure:
     figure = new_figure(9.6, 4.0)
     panels = figure.subplots(1, len(PARAMETERS), sharey=True)
     for axes, parameter in zip(panels, PARAMETERS, strict=True):
-        for row, case in enumerate(CASES):
+        for row, case in enumerate(CASES.values()):
             for shift, name, colour in zip((-0.19, 0.19), TRIED, COLOURS, strict=False):
                 errors = _of(results, name, case, parameter)["final_error_percent"]
                 _draw_errors(axes, row + shift, errors, colour, name if row == 0 else None)
@@ -388,7 +362,7 @@ def plot_cases(results: pd.DataFrame) -> Figure:
             axes.plot(
                 [bound] * 2, [row - 0.5, row + 0.5], "--", color="0.3", lw=1.2, label="Cramér-Rao bound" if row == 0 else None
             )
-    _finish(panels, [case.name for case in CASES])
+    _finish(panels, list(CASES))
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=9)
     return figure
 
@@ -403,9 +377,7 @@ def report(results: pd.DataFrame, configuration: dict[str, Any]) -> str:
     """
     n, slow_n = configuration["discharges"], configuration["progpy_discharges"]
     noise_mV, (low_ohm, high_ohm) = 1e3 * STATED_NOISE_V, R_O_RANGE_OHM
-    methods, cases = (
-        table.to_markdown(index=False, disable_numparse=True) for table in (methods_table(results), cases_table(results))
-    )
+    methods, cases = (markdown(table) for table in (methods_table(results), cases_table(results)))
     return f"""Simulated discharges down to {NEW_CELL.VEOD:g} V under 2 to 8 W that change every 60 to 140 s, one sample each
 second: {n} of cells with q^max of 4000 to 7600 C, {n} with R_o of {low_ohm:g} to {high_ohm:g} ohm, the other parameter new
 and known. Voltage with {noise_mV:g} mV of noise, exact current; calibrators with the full state see it exactly. progpy's
@@ -413,13 +385,11 @@ filters: {slow_n} discharges for each parameter. Errors are means over discharge
 half of the discharge. The bound is the least mean error of an unbiased calibrator. Times are CPU times on one core.
 
 {methods}
-
 The same with other sensors or other cells. All calibrators are told {noise_mV:g} mV; the Kalman filter allows for an offset
 of the voltage, least squares do not. Lost: off by more than {LOST_PERCENT:g} % in the end. Says settled: the calibrator takes
 its last estimate for settled. With both unknown, both vary at once over the ranges above.
 
-{cases}
-"""
+{cases}"""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -428,38 +398,24 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     :param arguments: of the command line by default
     """
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--discharges", type=int, default=30, help="for each parameter, and with both worn")
-    parser.add_argument("--progpy-discharges", type=int, default=2, help="for each parameter and estimator of progpy; slow")
-    parser.add_argument("--out", type=Path, default=Path("results/peers"))
-    chosen = parser.parse_args(arguments)
-    if min(chosen.discharges, chosen.progpy_discharges) < 1:
-        parser.error("--discharges and --progpy-discharges must be at least 1")
-
-    tables = []
-    for part in tqdm(runs(), unit="part", file=sys.stderr):
-        n = min(chosen.progpy_discharges, chosen.discharges) if part[0].slow else chosen.discharges
-        tables.append(run_or_read(part, n, chosen.out / "parts"))
-    results = pd.concat(tables)
-    configuration: dict[str, Any] = {
-        "discharges": chosen.discharges,
-        "progpy_discharges": chosen.progpy_discharges,
+    parser = command_line("peers", __doc__, jobs=1)
+    parser.add_argument("--discharges", type=positive, default=30, help="for each parameter, and with both worn")
+    parser.add_argument("--progpy-discharges", type=positive, default=2, help="likewise, for each estimator of progpy; slow")
+    study = Study(parser, arguments)
+    study.configuration |= {
         "seeds": SEEDS,
         "loads": asdict(RandomPiecewise()),
         "r_o_range_ohm": R_O_RANGE_OHM,
         "new_cell": {name: getattr(NEW_CELL, name) for name in PARAMETERS},
-        "cases": [asdict(case) for case in CASES],
+        "cases": [asdict(case) for case in CASES.values()],
         "stated_noise_V": STATED_NOISE_V,
         "prior_sd": PRIOR_SD,
         "window_every_s": WINDOW_EVERY_S,
         "thermal": True,
     }
-    write_csv(chosen.out / "peers.csv", results, configuration)
-    save_figure(plot_methods(results), chosen.out / "peers.png")
-    save_figure(plot_cases(results), chosen.out / "limits.png")
-    text = report(results, configuration)
-    write_text(chosen.out / "peers.md", text)
-    sys.stdout.write("\n" + text)
+    tables = study.run(part, parts(study.chosen.discharges, study.chosen.progpy_discharges))
+    results = tables["peers"]
+    study.write(tables, {"peers": plot_methods(results), "limits": plot_cases(results)}, report(results, study.configuration))
 
 
 if __name__ == "__main__":

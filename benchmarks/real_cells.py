@@ -12,10 +12,8 @@ the q_mobile of the previous discharge as a prior, and by the Kalman filter; how
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -28,9 +26,9 @@ from battery_env.electrochemistry import NEW_CELL
 from battery_env.estimates import Estimate
 from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
-from battery_env.plotting import COLOURS, LABELS, new_figure, save_figure
+from battery_env.plotting import COLOURS, LABELS, new_figure
 from battery_env.record_model import RecordModel
-from benchmarks.reporting import write_csv, write_text
+from benchmarks.study import Study, Tables, command_line, markdown
 
 CUT_OFF_V = 2.7
 #: Error of the model on these cells, V (the residuals of whole discharges, measured here).
@@ -107,6 +105,23 @@ def fit_in_progress(discharge: Discharge, previous_q_mobile_C: float) -> list[di
             row |= {"q_mobile_C": estimate.q_mobile, "sd_q_mobile_C": estimate.sd_q_mobile, "settled": estimate.settled}
             rows.append(row | {"eod_error_percent": 100.0 * (eod_time_s - end_s) / (end_s - start_s)})
     return rows
+
+
+def part(cell: str) -> Tables:
+    """
+    Both experiments with one cell.
+
+    :param cell: its name
+    :return: ``discharges``, one row each, and ``in_progress``, one row per discharge, share of it and method
+    """
+    whole, in_progress = [], []
+    previous_q_mobile_C = None
+    for discharge in tqdm(load_nasa_discharges(cell), desc=cell, unit="discharge", file=sys.stderr):
+        whole.append(fit_whole(discharge))
+        if previous_q_mobile_C is not None:
+            in_progress += fit_in_progress(discharge, previous_q_mobile_C)
+        previous_q_mobile_C = float(whole[-1]["q_mobile_C"])
+    return {"discharges": pd.DataFrame(whole), "in_progress": pd.DataFrame(in_progress)}
 
 
 def whole_table(whole: pd.DataFrame) -> pd.DataFrame:
@@ -279,38 +294,25 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     :param arguments: of the command line by default
     """
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.real_cells", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_line("real_cells", __doc__)
     parser.add_argument("--cells", nargs="+", default=list(BUNDLED_CELLS), choices=BUNDLED_CELLS)
-    parser.add_argument("--out", type=Path, default=Path("results/real_cells"))
-    chosen = parser.parse_args(arguments)
-    configuration = {
-        "cells": chosen.cells,
+    study = Study(parser, arguments)
+    study.configuration |= {
         "cut_off_V": CUT_OFF_V,
         "mismatch_V": MISMATCH_V,
         "prior_sd_share": PRIOR_SD_SHARE,
         "thermal": True,
         "data": NASA_CITATION,
     }
-    discharges = {cell: load_nasa_discharges(cell) for cell in chosen.cells}
-    whole_rows, progress_rows = [], []
-    for cell, records in discharges.items():
-        previous_q_mobile_C = None
-        for discharge in tqdm(records, desc=cell, unit="discharge", file=sys.stderr):
-            whole_rows.append(fit_whole(discharge))
-            if previous_q_mobile_C is not None:
-                progress_rows += fit_in_progress(discharge, previous_q_mobile_C)
-            previous_q_mobile_C = float(whole_rows[-1]["q_mobile_C"])
-    whole, progress = pd.DataFrame(whole_rows), pd.DataFrame(progress_rows)
-    write_csv(chosen.out / "discharges.csv", whole, configuration)
-    write_csv(chosen.out / "in_progress.csv", progress, configuration)
-    save_figure(plot_life(whole), chosen.out / "life.png")
-    save_figure(plot_voltages(discharges, whole), chosen.out / "voltages.png")
-    tables = [whole_table(whole), progress_table(progress, whole), repetition_table(whole)]
-    markdown = "\n\n".join(table.to_markdown(index=False, disable_numparse=True) for table in tables) + "\n"
-    write_text(chosen.out / "summary.md", markdown)
-    print(markdown)
+    cells = list(dict.fromkeys(study.chosen.cells))
+    tables = study.run(part, [{"cell": cell} for cell in cells])
+    whole, progress = tables["discharges"], tables["in_progress"]
+    figures = {
+        "life": plot_life(whole),
+        "voltages": plot_voltages({cell: load_nasa_discharges(cell) for cell in cells}, whole),
+    }
+    shown = [whole_table(whole), progress_table(progress, whole), repetition_table(whole)]
+    study.write(tables, figures, "\n".join(markdown(table) for table in shown), "summary")
 
 
 if __name__ == "__main__":

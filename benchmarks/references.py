@@ -9,11 +9,8 @@ policy that was learned is to be compared with.
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -21,9 +18,9 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from battery_env.plotting import new_figure, save_figure
-from benchmarks.reporting import write_csv, write_text
+from battery_env.plotting import new_figure
 from benchmarks.robustness import roll_out
+from benchmarks.study import Study, Tables, command_line, digits, markdown, positive
 from sb3_lac.envs import CostEnv, reference_controller
 
 # each environment: its impulse, parameters that are not as they should be, noise on states, noise on observations, delay
@@ -57,7 +54,7 @@ def conditions(env_id: str) -> dict[str, dict[str, Any]]:
     }
 
 
-def run(env_id: str, episodes: int) -> pd.DataFrame:
+def part(env_id: str, episodes: int) -> Tables:
     """
     Try the reference controller under all conditions.
 
@@ -86,38 +83,38 @@ def run(env_id: str, episodes: int) -> pd.DataFrame:
                 "died": outcome["died"].mean(),
             }
         )
-    return pd.DataFrame(rows)
+    return {"references": pd.DataFrame(rows)}
 
 
 def report(results: pd.DataFrame) -> str:
     """
     One table, as Markdown.
 
-    :param results: see ``run()``, of all environments
+    :param results: see ``part()``, of all environments
     :return: the table
     """
     shown = {
         "environment": results["environment"],
         "disturbance": results["disturbance"] + [f" ({text})" if text else "" for text in results["arguments"]],
         "cost per step, mean (worst episode)": [
-            f"{mean:.2g} ({worst:.2g})" for mean, worst in zip(results["cost"], results["cost_worst"], strict=True)
+            f"{digits(mean)} ({digits(worst)})" for mean, worst in zip(results["cost"], results["cost_worst"], strict=True)
         ],
         "error at the end, median (worst)": [
-            f"{median:.2g} ({worst:.2g})"
+            f"{digits(median)} ({digits(worst)})"
             for median, worst in zip(results["error_median"], results["error_worst"], strict=True)
         ],
         "tolerance": results["tolerance"],
         "at the goal": [f"{share:.0%}" for share in results["at_goal"]],
         "died": [f"{share:.0%}" for share in results["died"]],
     }
-    return pd.DataFrame(shown).to_markdown(index=False, disable_numparse=True) + "\n"
+    return markdown(pd.DataFrame(shown))
 
 
 def plot(results: pd.DataFrame) -> Figure:
     """
     The share of episodes that end at the goal, and in brackets of those that die.
 
-    :param results: see ``run()``, of all environments
+    :param results: see ``part()``, of all environments
     :return: the figure
     """
     shares, deaths = (
@@ -143,18 +140,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     :param arguments: of the command line by default
     """
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--episodes", type=int, default=100, help="episodes for each environment and condition")
-    parser.add_argument("--out", type=Path, default=Path("results/references"))
-    chosen = parser.parse_args(arguments)
-    if chosen.episodes < 1:
-        parser.error("--episodes must be at least 1")
-    results = pd.concat([run(env_id, chosen.episodes) for env_id in _DISTURBANCES], ignore_index=True)
-    write_csv(chosen.out / "references.csv", results, {"episodes": chosen.episodes})
-    save_figure(plot(results), chosen.out / "references.png")
-    text = report(results)
-    write_text(chosen.out / "references.md", text)
-    sys.stdout.write("\n" + text)
+    parser = command_line("references", __doc__)
+    parser.add_argument("--episodes", type=positive, default=100, help="episodes for each environment and condition")
+    study = Study(parser, arguments)
+    tables = study.run(part, [{"env_id": env_id, "episodes": study.chosen.episodes} for env_id in _DISTURBANCES])
+    study.write(tables, {"references": plot(tables["references"])}, report(tables["references"]))
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ from scipy.stats import bootstrap, trim_mean
 from battery_env.arrays import FloatArray
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.plotting import COLOURS, new_figure
-from benchmarks.reporting import write_text
+from benchmarks.study import write_text
 
 _RESAMPLES = 999
 
@@ -93,7 +93,7 @@ def read_errors(results: Path) -> pd.DataFrame:
     if not tables:
         raise FileNotFoundError(
             f"{results} has no CSV file with errors of discharges (columns trajectory, algo or calibrator, "
-            "<parameter>_mape_percent): run python -m benchmarks.compare or benchmarks.voltage first"
+            "<parameter>_mape_percent): run python -m benchmarks.compare first"
         )
     return pd.concat(tables, ignore_index=True)
 

@@ -6,15 +6,12 @@ How well policies of LAC, SAC and TD3 stand what they were not trained for: impu
   python -m benchmarks.robustness
 
 Policies are trained on ``CartPoleCost-v0`` and ``Oscillator-v0`` as they are, with the hyperparameters of ``zoo_configs``, and
-then run under each condition. A policy that is trained is not trained again when the command is repeated.
+then run under each condition. What is done is not done again when the command is repeated.
 """
 
 from __future__ import annotations
 
-import argparse
 import itertools
-import os
-import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -26,12 +23,12 @@ import pandas as pd
 from matplotlib.figure import Figure
 from stable_baselines3.common.type_aliases import PolicyPredictor
 
-from battery_env.plotting import COLOURS, new_figure, save_figure
-from benchmarks.reporting import write_csv, write_text
-from benchmarks.training import run_all, train_or_load
+from battery_env.evaluation import over_seeds
+from battery_env.plotting import COLOURS, draw_over_seeds, new_figure
+from benchmarks.study import EVALUATION_SEED, Study, Tables, command_line, digits, markdown, positive, with_spread
+from benchmarks.training import train_or_load
 
 _ALGORITHMS = ("lac", "sac", "td3")
-_EVALUATION_SEED = 10_000  # no training seed comes close
 
 # each study: environment, the arguments that vary with their values, and standard deviations of the noise on observations
 _STUDIES: dict[str, tuple[str, dict[str, tuple[float, ...]], tuple[float, ...]]] = {
@@ -77,8 +74,8 @@ def roll_out(
     :return: one row per episode: mean cost per step, length, distance to the goal at the end, and whether it died
     """
     envs = [make_env() for _ in range(episodes)]
-    rngs = [np.random.default_rng((_EVALUATION_SEED, episode)) for episode in range(episodes)]
-    observations = np.array([env.reset(seed=_EVALUATION_SEED + episode)[0] for episode, env in enumerate(envs)])
+    rngs = [np.random.default_rng((EVALUATION_SEED, episode)) for episode in range(episodes)]
+    observations = np.array([env.reset(seed=EVALUATION_SEED + episode)[0] for episode, env in enumerate(envs)])
     costs, errors = np.zeros(episodes), np.zeros(episodes)
     lengths, died = np.zeros(episodes, dtype=int), np.zeros(episodes, dtype=bool)
     running = np.arange(episodes)
@@ -112,7 +109,7 @@ def conditions(study: str) -> list[tuple[dict[str, Any], float]]:
     return [(dict(zip(arguments, values, strict=True)), noise) for values in grid for noise in noises]
 
 
-def run(algo: str, seed: int, timesteps: dict[str, int], episodes: int, out: Path) -> pd.DataFrame:
+def part(algo: str, seed: int, timesteps: dict[str, int], episodes: int, models: Path) -> Tables:
     """
     Train a policy for each environment, and try it under all conditions.
 
@@ -120,12 +117,12 @@ def run(algo: str, seed: int, timesteps: dict[str, int], episodes: int, out: Pat
     :param seed: seed of the training
     :param timesteps: environment steps of the training, by environment
     :param episodes: episodes for each condition
-    :param out: folder of all results
-    :return: one row per condition
+    :param models: where trained policies are kept
+    :return: ``robustness``, one row per condition
     """
     rows = []
     for study, (env_id, _, _) in _STUDIES.items():
-        model = train_or_load(algo, env_id, seed, timesteps[env_id], out / "models" / f"{env_id}_{algo}_seed{seed}")
+        model = train_or_load(algo, env_id, seed, timesteps[env_id], models / f"{env_id}_{algo}_seed{seed}")
         for arguments, noise in conditions(study):
             outcome = roll_out(model, partial(gym.make, env_id, **arguments), episodes, noise)
             rows.append(
@@ -140,7 +137,7 @@ def run(algo: str, seed: int, timesteps: dict[str, int], episodes: int, out: Pat
                     "cost_worst": outcome["cost"].max(),
                 }
             )
-    return pd.DataFrame(rows)
+    return {"robustness": pd.DataFrame(rows)}
 
 
 def varied(study: str) -> list[str]:
@@ -153,27 +150,22 @@ def varied(study: str) -> list[str]:
     return [*_STUDIES[study][1]] or ["observation_noise"]
 
 
-def _draw_lines(results: pd.DataFrame, column: str, metric: str, axes: Any) -> None:
-    # median over seeds, band from the best to the worst one
-    for colour, (algo, of_algo) in zip(COLOURS, results.groupby("algo"), strict=False):
-        by_value = of_algo.groupby(column)[metric]
-        axes.plot(by_value.median(), color=colour, marker="o", ms=4, label=str(algo))
-        axes.fill_between(by_value.median().index, by_value.min(), by_value.max(), color=colour, alpha=0.2, lw=0)
-    axes.set(xlabel=_LABELS[column], ylabel=_LABELS[metric])
-    axes.legend(frameon=False, fontsize="small")
-
-
 def plot_lines(results: pd.DataFrame, studies: Sequence[tuple[str, str]]) -> Figure:
     """
-    One panel per study: a metric over what varies, median and range over seeds.
+    One panel per study: a metric over what varies, interquartile mean over seeds with its 95 % interval.
 
-    :param results: see ``run()``, of all runs
+    :param results: of all parts
     :param studies: names of studies with one varied column, each with the metric to show
     :return: the figure
     """
     figure = new_figure(3.4 * len(studies), 3.0)
     for axes, (study, metric) in zip(figure.subplots(1, len(studies), squeeze=False)[0], studies, strict=True):
-        _draw_lines(results[results["study"] == study], varied(study)[0], metric, axes)
+        column, of_study = varied(study)[0], results[results["study"] == study]
+        for colour, (algo, of_algo) in zip(COLOURS, of_study.groupby("algo"), strict=False):
+            seeds = of_algo.pivot(index="seed", columns=column, values=metric)
+            draw_over_seeds(axes, seeds.columns, seeds, colour, str(algo), marker="o", ms=4)
+        axes.set(xlabel=_LABELS[column], ylabel=_LABELS[metric])
+        axes.legend(frameon=False, fontsize="small")
         axes.set_title(study)
         if metric == "cost":
             axes.set_yscale("log")
@@ -184,19 +176,24 @@ def plot_lines(results: pd.DataFrame, studies: Sequence[tuple[str, str]]) -> Fig
 
 def plot_grid(results: pd.DataFrame, study: str, metric: str) -> Figure:
     """
-    One map per algorithm: the mean over seeds of a metric over two parameters.
+    One map per algorithm: the interquartile mean over seeds of a metric over two parameters; in the titles of costs that over
+    all conditions and seeds, with its 95 % interval.
 
-    :param results: see ``run()``, of all runs
+    :param results: of all parts
     :param study: name of a study with two varied columns
     :param metric: ``"death_rate"`` or ``"cost"``
     :return: the figure
     """
     results = results[results["study"] == study]
     row, column = varied(study)
-    tables = {
-        str(algo): of_algo.pivot_table(index=row, columns=column, values=metric) for algo, of_algo in results.groupby("algo")
-    }
-    shown = {algo: np.log10(table) if metric == "cost" else table for algo, table in tables.items()}
+    tables, titles = {}, {}
+    for algo, of_algo in results.groupby("algo"):
+        seeds = of_algo.pivot(index="seed", columns=[row, column], values=metric)
+        tables[str(algo)] = pd.Series(over_seeds(seeds)[0], index=seeds.columns).unstack()
+        overall = [digits(float(value)) for value in over_seeds(*(seeds[condition] for condition in seeds))]
+        # most conditions kill nobody, and of all of them together an interquartile mean would say no more
+        titles[str(algo)] = f"{algo}: {overall[0]} [{overall[1]}, {overall[2]}]" if metric == "cost" else str(algo)
+    shown = {algo: table.map(np.log10) if metric == "cost" else table for algo, table in tables.items()}
     low, high = min(table.min().min() for table in shown.values()), max(table.max().max() for table in shown.values())
     if metric == "death_rate":
         low, high = 0.0, 1.0
@@ -205,10 +202,11 @@ def plot_grid(results: pd.DataFrame, study: str, metric: str) -> Figure:
         axes.imshow(shown[algo], origin="lower", aspect="auto", vmin=low, vmax=high, cmap="cividis_r")
         for i, j in np.ndindex(table.shape):
             dark = shown[algo].iloc[i, j] > (low + high) / 2
-            axes.text(j, i, f"{table.iloc[i, j]:.2g}", ha="center", va="center", color="white" if dark else "black", size=8)
+            axes.text(j, i, digits(table.iloc[i, j]), ha="center", va="center", color="white" if dark else "black", size=8)
         axes.set_xticks(range(table.shape[1]), [f"{value:g}" for value in table.columns])
         axes.set_yticks(range(table.shape[0]), [f"{value:g}" for value in table.index])
-        axes.set(xlabel=_LABELS[column], ylabel=_LABELS[row], title=f"{algo}: {_LABELS[metric]}")
+        axes.set(xlabel=_LABELS[column], ylabel=_LABELS[row], title=titles[algo])
+    figure.suptitle(_LABELS[metric])
     return figure
 
 
@@ -216,24 +214,18 @@ def report(results: pd.DataFrame) -> str:
     """
     Mean and standard deviation over seeds, as Markdown.
 
-    :param results: see ``run()``, of all runs
+    :param results: of all parts
     :return: one table per study
     """
-
-    def digits(value: float, count: int) -> str:
-        return f"{value:.{count}g}" if abs(value) < 9.5 else f"{value:.0f}"
-
-    def spread(values: pd.Series) -> str:
-        return digits(values.mean(), 2) + (f" ± {digits(values.std(), 1)}" if len(values) > 1 else "")
 
     text = ""
     for study, of_study in results.groupby("study", sort=False):
         columns = varied(str(study))
         metrics = ["death_rate", "cost"] if of_study["death_rate"].any() else ["cost"]
-        table = of_study.pivot_table(index=columns, columns="algo", values=metrics, aggfunc=spread)[metrics]
+        table = of_study.pivot_table(index=columns, columns="algo", values=metrics, aggfunc=with_spread)[metrics]
         table.columns = [f"{algo}, {_LABELS[metric]}" for metric, algo in table.columns]
         text += f"**{study}** ({_STUDIES[str(study)][0]}, {of_study['seed'].nunique()} seeds)\n\n"
-        text += table.reset_index().rename(columns=_LABELS).to_markdown(index=False, disable_numparse=True) + "\n\n"
+        text += markdown(table.reset_index().rename(columns=_LABELS)) + "\n"
     return text
 
 
@@ -243,31 +235,26 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     :param arguments: of the command line by default
     """
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line("robustness", __doc__)
     parser.add_argument("--algos", nargs="+", default=list(_ALGORITHMS), choices=_ALGORITHMS)
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
-    parser.add_argument("--cart-pole-timesteps", type=float, default=2e4, help="environment steps of each training")
-    parser.add_argument("--oscillator-timesteps", type=float, default=2e4, help="environment steps of each training")
-    parser.add_argument("--episodes", type=int, default=100, help="episodes for each policy and condition")
-    parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1), help="runs at the same time, one core each")
-    parser.add_argument("--out", type=Path, default=Path("results/robustness"))
-    chosen = parser.parse_args(arguments)
-    if min(chosen.cart_pole_timesteps, chosen.oscillator_timesteps, chosen.episodes, chosen.jobs) < 1:
-        parser.error("--cart-pole-timesteps, --oscillator-timesteps, --episodes and --jobs must be at least 1")
-
-    timesteps = {"CartPoleCost-v0": int(chosen.cart_pole_timesteps), "Oscillator-v0": int(chosen.oscillator_timesteps)}
-    one_run = partial(run, timesteps=timesteps, episodes=chosen.episodes, out=chosen.out)
-    results = pd.concat(run_all(one_run, [(algo, seed) for seed in chosen.seeds for algo in chosen.algos], chosen.jobs))
-
-    configuration = {name: value for name, value in vars(chosen).items() if name not in ("jobs", "out")}
-    write_csv(chosen.out / "robustness.csv", results, configuration)
+    parser.add_argument("--cart-pole-timesteps", type=positive, default=20_000, help="environment steps of each training")
+    parser.add_argument("--oscillator-timesteps", type=positive, default=20_000, help="environment steps of each training")
+    parser.add_argument("--episodes", type=positive, default=100, help="episodes for each policy and condition")
+    study = Study(parser, arguments)
+    chosen = study.chosen
+    timesteps = {"CartPoleCost-v0": chosen.cart_pole_timesteps, "Oscillator-v0": chosen.oscillator_timesteps}
+    common = {"timesteps": timesteps, "episodes": chosen.episodes}
+    parts = [{"algo": algo, "seed": seed, **common} for seed in chosen.seeds for algo in chosen.algos]
+    tables = study.run(part, parts, models=study.out / "models")
+    results = tables["robustness"]
     lines = [("impulse", "death_rate"), ("measurement noise", "cost"), ("process noise", "cost")]
-    save_figure(plot_lines(results, lines), chosen.out / "disturbances.png")
-    save_figure(plot_grid(results, "cart and pole", "death_rate"), chosen.out / "cart_and_pole.png")
-    save_figure(plot_grid(results, "gene network", "cost"), chosen.out / "gene_network.png")
-    text = report(results)
-    write_text(chosen.out / "robustness.md", text)
-    sys.stdout.write("\n" + text)
+    figures = {
+        "disturbances": plot_lines(results, lines),
+        "cart_and_pole": plot_grid(results, "cart and pole", "death_rate"),
+        "gene_network": plot_grid(results, "gene network", "cost"),
+    }
+    study.write(tables, figures, report(results))
 
 
 if __name__ == "__main__":

@@ -14,9 +14,6 @@ journal of Optuna: after an interruption the same command goes on (with other tr
 
 from __future__ import annotations
 
-import argparse
-import os
-import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -32,8 +29,8 @@ from optuna.trial import FrozenTrial, Trial, TrialState
 from battery_env.calibration.full_state import FullStateTask
 from battery_env.calibration.policy import PolicyEstimator
 from battery_env.evaluation import evaluate
-from benchmarks.reporting import write_csv, write_text
-from benchmarks.training import Recipe, run_all, set_up, timesteps_of
+from benchmarks.study import Study, Tables, command_line, positive, side_by_side
+from benchmarks.training import Recipe, set_up, timesteps_of
 
 _DISCHARGES = 64  # whole ones, evenly spaced in the training part
 _WORST_ERROR = 100.0  # %, what a policy is given that does worse
@@ -104,7 +101,7 @@ def score(algo: str, env_id: str, updates: int, folder: Path, trial: Trial) -> f
     return min(float(np.nan_to_num(errors.mean(), nan=_WORST_ERROR)), _WORST_ERROR)
 
 
-def search(algo: str, env_id: str, trials: int, updates: int, out: Path) -> pd.DataFrame:
+def part(algo: str, env_id: str, trials: int, updates: int, out: Path) -> Tables:
     """
     The search of one algorithm, or what is left of it.
 
@@ -113,7 +110,7 @@ def search(algo: str, env_id: str, trials: int, updates: int, out: Path) -> pd.D
     :param trials: trials in all
     :param updates: gradient steps of each
     :param out: folder of the journal
-    :return: one row per trial; means over its seeds, the worst discharge of any seed
+    :return: ``search``, one row per trial; means over its seeds, the worst discharge of any seed
     """
     out.mkdir(parents=True, exist_ok=True)
     study = optuna.create_study(
@@ -140,10 +137,10 @@ def search(algo: str, env_id: str, trials: int, updates: int, out: Path) -> pd.D
             "mean_percent": np.mean([run.value for run in runs]),
             "median_percent": np.mean([run.user_attrs["median_percent"] for run in runs]),
             "worst_percent": max(run.user_attrs["worst_percent"] for run in runs),
-            "all_mean_percent": " / ".join(f"{run.value:.2g}" for run in runs),
+            "all_mean_percent": side_by_side(run.values[0] for run in runs),
         }
         rows.append({"algo": algo, "trial": trial.number, "updates": updates, **scores, **trial.params})
-    return pd.DataFrame(rows)
+    return {"search": pd.DataFrame(rows)}
 
 
 def _first_trials(study: optuna.Study) -> list[FrozenTrial]:
@@ -160,7 +157,7 @@ def report(trials: pd.DataFrame) -> str:
     """
     The three best trials of each algorithm, with three seeds, and the first one, as Markdown.
 
-    :param trials: see ``search()``, of all algorithms
+    :param trials: of all algorithms
     :return: one table per algorithm
     """
     text = ""
@@ -178,23 +175,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     :param arguments: of the command line by default
     """
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line("search", __doc__)
     parser.add_argument("--env", default="BatteryQmax-v0", choices=["BatteryQmax-v0", "BatteryRo-v0"])
     parser.add_argument("--algos", nargs="+", default=list(SAMPLERS), choices=list(SAMPLERS))
-    parser.add_argument("--trials", type=int, default=10, help="trials of each algorithm")
-    parser.add_argument("--updates", type=int, default=2400, help="gradient steps of each trial")
-    parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1), help="searches at once, one core each")
-    parser.add_argument("--out", type=Path, default=Path("results/search"))
-    chosen = parser.parse_args(arguments)
-    if min(chosen.trials, chosen.updates, chosen.jobs) < 1:
-        parser.error("--trials, --updates and --jobs must be at least 1")
-    one_search = partial(search, env_id=chosen.env, trials=chosen.trials, updates=chosen.updates, out=chosen.out)
-    trials = pd.concat(run_all(one_search, [(algo,) for algo in chosen.algos], chosen.jobs), ignore_index=True)
-    configuration = {name: value for name, value in vars(chosen).items() if name not in ("jobs", "out")}
-    write_csv(chosen.out / "search.csv", trials, configuration)
-    text = report(trials)
-    write_text(chosen.out / "search.md", text)
-    sys.stdout.write("\n" + text)
+    parser.add_argument("--trials", type=positive, default=10, help="trials of each algorithm")
+    parser.add_argument("--updates", type=positive, default=2400, help="gradient steps of each trial")
+    study = Study(parser, arguments)
+    chosen = study.chosen
+    common = {"env_id": chosen.env, "trials": chosen.trials, "updates": chosen.updates}
+    tables = study.run(part, [{"algo": algo, **common} for algo in chosen.algos], out=study.out)
+    study.write(tables, {}, report(tables["search"]))
 
 
 if __name__ == "__main__":

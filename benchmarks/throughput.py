@@ -13,12 +13,9 @@ round, and their median and quartiles are reported. A profile says where the tim
 
 from __future__ import annotations
 
-import argparse
-import sys
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -28,12 +25,11 @@ import torch as th
 from stable_baselines3 import SAC, TD3
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from tabulate import tabulate
 from torch import nn
 from tqdm import trange
 
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate, step_into, voltage_into
-from benchmarks.reporting import write_csv, write_text
+from benchmarks.study import Study, command_line, markdown, positive
 from sb3_lac import LAC
 
 _ALGORITHMS: dict[str, type[LAC] | type[SAC] | type[TD3]] = {"LAC": LAC, "SAC": SAC, "TD3": TD3}
@@ -252,17 +248,16 @@ def report(speeds: pd.DataFrame, parts: pd.DataFrame) -> str:
     :return: two tables
     """
     lac = speeds["LAC"]
-    rows = [[name, _spread(values, 1), _spread(lac / values, 2)] for name, values in speeds.items()]
-    header = ["algorithm", "updates a second, median (quartiles)", "LAC is faster by a factor of"]
-    shares = [
-        [name, *(f"{100 * share:.0f} %" for share in row)] for name, row in zip(parts.index, parts.to_numpy(), strict=True)
+    rows = [
+        {
+            "algorithm": name,
+            "updates a second, median (quartiles)": _spread(values, 1),
+            "LAC is faster by a factor of": _spread(lac / values, 2),
+        }
+        for name, values in speeds.items()
     ]
-    return (
-        tabulate(rows, headers=header, tablefmt="github")
-        + "\n\n"
-        + tabulate(shares, headers=["share of the time", *parts.columns], tablefmt="github")
-        + "\n"
-    )
+    shares = (100.0 * parts).map("{:.0f} %".format).rename_axis("share of the time").reset_index()
+    return markdown(rows) + "\n" + markdown(shares)
 
 
 def report_steps(speeds: pd.DataFrame) -> str:
@@ -277,10 +272,11 @@ def report_steps(speeds: pd.DataFrame) -> str:
         work, _, who = str(name).partition(": ")
         own = next(column for column in speeds if str(column).partition(": ")[0] == work)
         faster = _spread(speeds[own] / values, 0) if who.startswith("progpy") else ""
-        rows.append([name, _spread(values / 1000.0, 1), faster])
-    header = ["", "thousand steps per second of one core, median (quartiles)", "battery_env is faster by a factor of"]
-    columns = 3 if any(row[2] for row in rows) else 2
-    return tabulate([row[:columns] for row in rows], headers=header[:columns], tablefmt="github") + "\n"
+        thousands = _spread(values / 1000.0, 1)
+        row = {"": name, "thousand steps per second of one core, median (quartiles)": thousands}
+        rows.append({**row, "battery_env is faster by a factor of": faster})
+    table = pd.DataFrame(rows)
+    return markdown(table if table.iloc[:, 2].any() else table.iloc[:, :2])
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -289,40 +285,32 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     :param arguments: of the command line by default
     """
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line("throughput", __doc__, jobs=None)
     parser.add_argument("--only", nargs="+", choices=SECTIONS, default=list(SECTIONS), help="what to measure, all by default")
-    parser.add_argument("--rounds", type=int, default=40, help="turns of each contestant")
-    parser.add_argument("--updates", type=int, default=25, help="updates of a turn")
+    parser.add_argument("--rounds", type=positive, default=40, help="turns of each contestant")
+    parser.add_argument("--updates", type=positive, default=25, help="updates of a turn")
     parser.add_argument("--env", default="BatteryQmax-v0", help="id of the environment, for the sizes of the input layers")
-    parser.add_argument("--net-arch", type=int, nargs="+", default=[256, 256, 256], help="widths of the hidden layers")
-    parser.add_argument("--batch-size", type=int, default=256)
-    parser.add_argument("--cells", type=int, default=1024, help="cells of a batch of the model, and of a vector environment")
-    parser.add_argument("--threads", type=int, default=1, help="threads of torch")
-    parser.add_argument("--out", type=Path, default=Path("results/throughput"))
-    chosen = parser.parse_args(arguments)
-    if min(chosen.rounds, chosen.updates, chosen.batch_size, chosen.cells, chosen.threads, *chosen.net_arch) < 1:
-        parser.error("--rounds, --updates, --net-arch, --batch-size, --cells and --threads must be at least 1")
+    parser.add_argument("--net-arch", type=positive, nargs="+", default=[256, 256, 256], help="widths of the hidden layers")
+    parser.add_argument("--batch-size", type=positive, default=256)
+    parser.add_argument(
+        "--cells", type=positive, default=1024, help="cells of a batch of the model and of a vector environment"
+    )
+    parser.add_argument("--threads", type=positive, default=1, help="threads of torch")
+    study = Study(parser, arguments)
+    chosen = study.chosen
 
     th.set_num_threads(chosen.threads)
-    configuration = {name: value for name, value in vars(chosen).items() if name != "out"}
     if "updates" in chosen.only:
         models = {name: filled_model(name, chosen.env, chosen.net_arch, chosen.batch_size) for name in _ALGORITHMS}
         speeds = measure(models, chosen.rounds, chosen.updates, chosen.batch_size)
         parts = pd.DataFrame({name: profile(model, chosen.updates, chosen.batch_size) for name, model in models.items()}).T
-        write_csv(chosen.out / "updates.csv", speeds, configuration)
-        write_csv(chosen.out / "updates_profile.csv", parts.rename_axis("algorithm").reset_index(), configuration)
-        _publish(chosen.out / "updates.md", report(speeds, parts))
+        tables = {"updates": speeds, "updates_profile": parts.rename_axis("algorithm").reset_index()}
+        study.write(tables, {}, report(speeds, parts), "updates")
     for section, contestants in (("model", model_contestants), ("environments", environment_contestants)):
         if section in chosen.only:
             # they run on one core each: its time, other processes not counted
             speeds = race(contestants(chosen.cells), chosen.rounds, time.process_time)
-            write_csv(chosen.out / f"{section}.csv", speeds, configuration)
-            _publish(chosen.out / f"{section}.md", report_steps(speeds))
-
-
-def _publish(path: Path, text: str) -> None:
-    write_text(path, text)
-    sys.stdout.write(text + "\n")
+            study.write({section: speeds}, {}, report_steps(speeds), section)
 
 
 if __name__ == "__main__":

@@ -1,41 +1,36 @@
 """
-Training with the hyperparameters of ``zoo_configs``, or with those of the algorithms themselves, one run after another or
-several at the same time. What a policy depends on is its recipe, and every result is named by it.
+Training with the hyperparameters of ``zoo_configs``, or with those of the algorithms themselves. What a policy depends on is
+its recipe, and every result is named by it.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import importlib
 import inspect
 import io
 import json
-import multiprocessing
+import os
+import shutil
 import time
-from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from functools import cache
-from hashlib import sha256
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import gymnasium as gym
 import torch as th
 import yaml
 from rl_zoo3 import ALGOS
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from tqdm import tqdm
 
-import battery_env
-import sb3_lac
 from battery_env.files import replacing
-from benchmarks.reporting import versions, write_text
+from benchmarks.study import digest_of, own_versions, versions, write_json, write_text
 from sb3_lac.zoo import LACExperimentManager, find_config
-
-Result = TypeVar("Result")
 
 #: Environment steps with the algorithms' own hyperparameters, which name none.
 DEFAULTS_TIMESTEPS = 20_000
@@ -50,15 +45,16 @@ class Recipe:
     recipes are the same training. A change of the code that changes results is known by the version of the package. Versions
     of PyTorch and other packages are left out, as an update would discard every run; results record them beside the recipe.
 
-    :param algo: name of an off-policy algorithm in the RL Zoo, like ``lac``
-    :param env_id: id of the environment
+    :param algo: name of an algorithm in the RL Zoo, like ``lac``, or where the class of another one is,
+        ``package.module:Class``
+    :param env_id: id of the environment, as ``module:id`` if importing that module registers it
     :param seed: seed of everything
     :param timesteps: environment steps
     :param source: where the hyperparameters are from, ``zoo_configs`` or ``defaults``
     :param hyperparameters: as in a file of ``zoo_configs``
     :param arguments: defaults of the algorithm's other arguments
     :param environment: how the environment is registered, and its spaces
-    :param packages: versions of the packages of this project
+    :param packages: versions of the packages of this project; of modules of the user's own, what their source is
     :param evaluations: how often the training is interrupted by an evaluation, if at all
     """
 
@@ -88,8 +84,8 @@ class Recipe:
         """
         The recipe of a training.
 
-        :param algo: name of an off-policy algorithm in the RL Zoo, like ``lac``
-        :param env_id: id of the environment
+        :param algo: see the class
+        :param env_id: see the class
         :param seed: seed of everything
         :param timesteps: environment steps; ``n_timesteps`` of ``zoo_configs`` by default, or ``DEFAULTS_TIMESTEPS``
         :param hyperparameters: what differs from ``zoo_configs``
@@ -100,26 +96,25 @@ class Recipe:
             range, or if so few steps would train nothing
         :raises FileNotFoundError: if ``zoo_configs`` has no file for the algorithm
         """
-        if not (algo in ALGOS and issubclass(ALGOS[algo], OffPolicyAlgorithm)):
-            known = sorted(name for name, kind in ALGOS.items() if issubclass(kind, OffPolicyAlgorithm))
-            raise ValueError(f"{algo} is no off-policy algorithm of the RL Zoo; choose from {', '.join(known)}")
+        kind = algorithm(algo)
         if not 0 <= seed < 2**32:
             raise ValueError(f"a seed must lie within 0 .. 2**32 - 1, got {seed}")
         environment = _environment(env_id)
         if defaults:
             source, entry = "defaults", {"policy": "MlpPolicy"}
         else:
-            source, config = "zoo_configs", find_config(algo)
+            source, config = "zoo_configs", find_config(kind.__name__.lower() if ":" in algo else algo)
             entries = yaml.safe_load(config.read_text(encoding="utf-8"))
-            if env_id not in entries:
-                raise ValueError(f"{config} has no entry for {env_id}: add one, or train with the defaults of the algorithm")
-            entry = entries[env_id]
+            plain_id = registered_id(env_id)
+            if plain_id not in entries:
+                raise ValueError(f"{config} has no entry for {plain_id}: add one, or train with the defaults of the algorithm")
+            entry = entries[plain_id]
         entry = {**entry, **(hyperparameters or {})}
         in_entry = int(float(entry.pop("n_timesteps", DEFAULTS_TIMESTEPS)))
         timesteps = in_entry if timesteps is None else timesteps
         arguments = {
             name: parameter.default
-            for name, parameter in inspect.signature(ALGOS[algo]).parameters.items()
+            for name, parameter in inspect.signature(kind).parameters.items()
             if parameter.default is not parameter.empty and name not in _NOT_LEARNING | set(entry)
         }
         learning_starts = entry.get("learning_starts", arguments.get("learning_starts", 0))
@@ -137,20 +132,20 @@ class Recipe:
             entry,
             json.loads(json.dumps(arguments, default=str)),
             environment,
-            {"sb3_lac": sb3_lac.__version__, "battery_env": battery_env.__version__},
+            own_versions() | _own_modules(algo.partition(":"), env_id.rpartition(":")),
             evaluations,
         )
 
     @property
     def digest(self) -> str:
         """Names the recipe but for its seed."""
-        but_seed = {name: value for name, value in asdict(self).items() if name != "seed"}
-        return sha256(json.dumps(but_seed, sort_keys=True, default=str).encode()).hexdigest()[:8]
+        return digest_of({name: value for name, value in asdict(self).items() if name != "seed"})
 
     @property
     def label(self) -> str:
         """What the policy is called in tables and figures."""
-        return self.algo.upper() if self.source == "zoo_configs" else f"{self.algo.upper()} {self.source}"
+        name = self.algo.rpartition(":")[2] if ":" in self.algo else self.algo.upper()
+        return name if self.source == "zoo_configs" else f"{name} {self.source}"
 
     @property
     def name(self) -> str:
@@ -158,11 +153,59 @@ class Recipe:
         return f"{self.label.replace(' ', '_').lower()}_seed{self.seed}_{self.digest}"
 
 
+def algorithm(algo: str) -> type[BaseAlgorithm]:
+    """
+    Find an algorithm, and let the RL Zoo know one that is not of its own.
+
+    :param algo: see :class:`Recipe`
+    :return: its class
+    :raises ValueError: if there is none
+    """
+    if algo not in ALGOS and ":" in algo:
+        module, _, name = algo.partition(":")
+        try:
+            found = getattr(importlib.import_module(module), name)
+        except (ImportError, AttributeError) as error:
+            raise ValueError(f"{algo} is no algorithm: {error}") from error
+        if not (inspect.isclass(found) and issubclass(found, BaseAlgorithm)):
+            raise ValueError(f"{algo} is no algorithm: it must be a subclass of Stable-Baselines3's BaseAlgorithm")
+        ALGOS[algo] = found
+    if algo not in ALGOS:
+        raise ValueError(
+            f"{algo} is no algorithm of the RL Zoo; choose from {', '.join(sorted(ALGOS))}, or name a class of your own, "
+            "package.module:Class"
+        )
+    return ALGOS[algo]
+
+
+def _own_modules(*named: tuple[str, str, str]) -> dict[str, str]:
+    modules = [importlib.import_module(module) for module, colon, _ in named if colon]
+    return {module.__name__: digest_of({"source": inspect.getsource(module)}) for module in modules}
+
+
+def registered_id(env_id: str) -> str:
+    """
+    Import the module that registers an environment, where one is named.
+
+    :param env_id: see :class:`Recipe`
+    :return: the id without the module
+    :raises ValueError: if there is no such module
+    """
+    module, _, plain_id = env_id.rpartition(":")
+    try:
+        if module:
+            importlib.import_module(module)
+    except ImportError as error:
+        raise ValueError(f"{env_id} is no environment: {error}") from error
+    return plain_id
+
+
 @cache
 def _environment(env_id: str) -> dict[str, Any]:
+    plain_id = registered_id(env_id)
     try:
-        spec = gym.spec(env_id)
-        env = gym.make(env_id, disable_env_checker=True)
+        spec = gym.spec(plain_id)
+        env = gym.make(plain_id, disable_env_checker=True)
     except gym.error.Error as error:
         raise ValueError(str(error)) from error
     spaces = {"observation_space": str(env.observation_space), "action_space": str(env.action_space)}
@@ -172,7 +215,7 @@ def _environment(env_id: str) -> dict[str, Any]:
     return {"kwargs": json.loads(json.dumps(kwargs, default=str)), "max_episode_steps": spec.max_episode_steps, **spaces}
 
 
-def set_up(recipe: Recipe, folder: Path, **options: Any) -> tuple[LACExperimentManager, OffPolicyAlgorithm]:
+def set_up(recipe: Recipe, folder: Path, **options: Any) -> tuple[LACExperimentManager, BaseAlgorithm]:
     """
     A model that is ready to learn, on one thread of the CPU.
 
@@ -182,13 +225,15 @@ def set_up(recipe: Recipe, folder: Path, **options: Any) -> tuple[LACExperimentM
     :return: the manager and the model
     """
     th.set_num_threads(1)
+    algorithm(recipe.algo)
+    plain_id = registered_id(recipe.env_id)
     # not zoo_configs itself, which may have changed since
     config = folder / f"{recipe.name}.yml"
-    write_text(config, yaml.safe_dump({recipe.env_id: {**recipe.hyperparameters, "n_timesteps": recipe.timesteps}}))
+    write_text(config, yaml.safe_dump({plain_id: {**recipe.hyperparameters, "n_timesteps": recipe.timesteps}}))
     manager = LACExperimentManager(
         argparse.Namespace(),
         recipe.algo,
-        recipe.env_id,
+        plain_id,
         log_folder=str(folder),
         n_timesteps=recipe.timesteps,
         eval_freq=-1,
@@ -200,7 +245,6 @@ def set_up(recipe: Recipe, folder: Path, **options: Any) -> tuple[LACExperimentM
     )
     with contextlib.redirect_stdout(io.StringIO()):  # the zoo prints every hyperparameter, and saves them too
         model, _ = manager.setup_experiment()  # type: ignore[misc]
-    assert isinstance(model, OffPolicyAlgorithm)
     return manager, model
 
 
@@ -229,7 +273,7 @@ def train_or_load(
         model.learn(timesteps)
         minutes = (time.perf_counter() - start) / 60.0
         described = {"recipe": asdict(recipe), "training_minutes": minutes, "versions": versions()}
-        write_text(record, json.dumps(described, indent=2, default=str) + "\n")
+        write_json(record, described)
         with replacing(file) as part:
             model.save(part)
     return ALGOS[algo].load(file, device="cpu")
@@ -258,24 +302,58 @@ def record_file(recipe: Recipe, folder: Path) -> Path:
     return folder / f"model_{recipe.name}.json"
 
 
-def run_all(function: Callable[..., Result], runs: Sequence[tuple[Any, ...]], jobs: int) -> list[Result]:
+class CheckpointCallback(BaseCallback):
     """
-    Call a function with each of several arguments, with a progress bar.
+    Saves model and replay buffer in one folder that is replaced as a whole, so that a training can be resumed whenever it is
+    interrupted; and counts interruptions and time.
 
-    :param function: importable, since it is pickled
-    :param runs: positional arguments of each call
-    :param jobs: processes at the same time; with one, everything stays in this process
-    :return: the results, in the order of the runs
+    :param folder: the folder, of an earlier part of the same training if it exists
+    :param save_freq: calls between checkpoints
     """
-    if jobs == 1:
-        return [function(*run) for run in tqdm(runs, desc="runs", disable=None)]
-    # spawn: torch does not survive a fork with threads
-    with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
-        futures = [pool.submit(function, *run) for run in runs]
-        try:
-            for future in tqdm(as_completed(futures), desc="runs", total=len(futures), disable=None):
-                future.result()
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-    return [future.result() for future in futures]
+
+    def __init__(self, folder: Path, save_freq: int) -> None:
+        super().__init__()
+        self.folder = folder
+        self.save_freq = save_freq
+        self.recover(folder)
+        #: How often the training was continued from a checkpoint.
+        self.resumed = 0
+        #: Wall time of the training, evaluations included.
+        self.seconds = 0.0
+        if folder.exists():
+            before = json.loads((folder / "progress.json").read_text(encoding="utf-8"))
+            self.resumed, self.seconds = before["resumed"] + 1, before["seconds"]
+
+    def _on_training_start(self) -> None:
+        self._start = time.perf_counter() - self.seconds
+
+    def _on_training_end(self) -> None:
+        self.seconds = time.perf_counter() - self._start
+
+    @staticmethod
+    def recover(folder: Path) -> None:
+        """
+        Put the previous checkpoint back if an interruption fell between setting it aside and putting the new one in place.
+
+        :param folder: the folder
+        """
+        old = folder.with_suffix(".old")
+        if old.exists() and not folder.exists():
+            os.replace(old, folder)
+
+    def _on_step(self) -> bool:
+        if self.n_calls % self.save_freq == 0:
+            part, old = self.folder.with_suffix(".part"), self.folder.with_suffix(".old")
+            for leftover in (part, old):
+                shutil.rmtree(leftover, ignore_errors=True)
+            part.mkdir(parents=True)
+            self.model.save(part / "model")
+            if isinstance(self.model, OffPolicyAlgorithm):
+                self.model.save_replay_buffer(part / "replay_buffer.pkl")
+            progress = {"resumed": self.resumed, "seconds": time.perf_counter() - self._start}
+            (part / "progress.json").write_text(json.dumps(progress), encoding="utf-8")
+            if self.folder.exists():
+                os.replace(self.folder, old)
+            os.replace(part, self.folder)
+            shutil.rmtree(old, ignore_errors=True)
+        return True

@@ -154,7 +154,7 @@ def declared(distributions, extras):
     ],
 )
 def test_every_import_is_declared(package, distributions, extras):
-    own = {"battery_env", "sb3_lac", "benchmarks", "tests", "examples"}
+    own = {"battery_env", "sb3_lac", "benchmarks", "tests", "examples", "docs"}
     used = {name.split(".")[0] for path in files(package) for name in imports(path)}
     needed = {DISTRIBUTIONS.get(name, name) for name in used - own - STANDARD}
     assert needed <= declared(distributions, extras), f"{package} uses what setup.cfg does not declare"

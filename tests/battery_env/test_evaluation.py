@@ -9,7 +9,7 @@ from battery_env.electrochemistry import simulate
 from battery_env.estimators.base import Estimate, EstimateTrace, Estimator
 from battery_env.estimators.closed_form import ClosedForm
 from battery_env.estimators.cramer_rao import cramer_rao_bound
-from battery_env.evaluation import evaluate, summarize
+from battery_env.evaluation import evaluate, over_seeds, summarize
 from battery_env.loads import RandomPiecewise, constant
 from battery_env.sensors import RandomSensorErrors, SensorErrors
 from battery_env.trajectories import TrajectoryDataset
@@ -259,3 +259,25 @@ def test_a_power_meter_gives_the_current_of_the_voltage_that_is_read():
     shown = SensorErrors(offset_V=0.1, measured="power").apply(whole, np.random.default_rng(0))
     np.testing.assert_allclose(shown.voltage_V * shown.current_A, whole.voltage_V * whole.current_A, rtol=1e-12)
     np.testing.assert_array_equal(shown.load, whole.load)
+
+
+def test_over_seeds_one_failure_of_eight_does_not_move_the_interquartile_mean():
+    scores = np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0])
+    middle, low, high = over_seeds(scores)
+    assert middle == 4.5 and 1.0 < low < 4.5 < high < 8.0
+    failed = np.append(scores[:-1], 1e6)
+    assert over_seeds(failed)[0] == 4.5
+    # each point of a curve by itself
+    for curve, point in zip(over_seeds(np.column_stack([scores, failed])), over_seeds(failed), strict=True):
+        assert curve.shape == (2,) and curve[1] == point
+
+
+def test_over_seeds_the_seeds_of_each_task_are_drawn_by_themselves():
+    # tasks that differ, seeds that do not: nothing is uncertain
+    middle, low, high = over_seeds(np.full(3, 1.0), np.full(3, 5.0))
+    assert (middle, low, high) == (3.0, 3.0, 3.0)
+
+
+def test_over_seeds_a_single_seed_has_no_interval():
+    middle, low, high = over_seeds([[3.0, 4.0]])
+    assert middle.tolist() == [3.0, 4.0] and np.isnan([low, high]).all()

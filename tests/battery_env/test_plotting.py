@@ -41,12 +41,18 @@ def test_true_against_inferred_has_a_panel_for_each_calibrator(scores, tmp_path)
     assert save_figure(figure, tmp_path / "folder" / "figure.png").stat().st_size > 0
 
 
-def test_learning_curves_have_a_line_for_each_seed():
+def test_learning_curves_have_a_line_for_each_algorithm_and_a_band_for_several_seeds():
     table = pd.DataFrame({"timesteps": [1000, 2000], "mape_percent": [5.0, 1.0], "mape_percent_worst": [9.0, 2.0]})
-    figure = plot_learning_curves({"LAC": [table, table], "TD3": [table]}, "BatteryRo-v0")
+    better = table.assign(mape_percent=[3.0, 0.5])
+    figure = plot_learning_curves({"LAC": [table, better], "TD3": [table]}, "BatteryRo-v0")
     for axes in figure.axes:
-        assert len(axes.lines) == 3
+        assert len(axes.lines) == 2 and len(axes.collections) == 1
         assert [text.get_text() for text in axes.get_legend().get_texts()] == ["LAC", "TD3"]
+    lac, td3 = figure.axes[0].lines
+    assert lac.get_xydata().tolist() == [[1.0, 4.0], [2.0, 0.75]] and td3.get_ydata().tolist() == [5.0, 1.0]
+    # two seeds: the interval reaches from the one to the other
+    (band,) = figure.axes[0].collections
+    assert band.get_paths()[0].get_extents().ymin == 0.5 and band.get_paths()[0].get_extents().ymax == 5.0
 
 
 @pytest.fixture

@@ -30,9 +30,11 @@ def trained(monkeypatch):
 @pytest.mark.parametrize(
     ("name", "seen"), [("published", 29), ("from_model", 22), ("from_cell", 22), ("none", 15), ("gamma", 29), ("short", 29)]
 )
-def test_a_policy_sees_in_its_test_what_it_saw_in_its_training(trained, tmp_path, name, seen):
+def test_a_policy_sees_in_its_test_what_it_saw_in_its_training(trained, tmp_path, monkeypatch, name, seen):
     test = standard_dataset("q_mobile", "paper", "test").subset([0, 900])
-    row = ablations.run(name, 3, 10, test, tmp_path)
+    monkeypatch.setattr(ablations, "standard_dataset", lambda *which: test)
+    monkeypatch.setattr(ablations, "_DISCHARGES", 2)
+    row = ablations.part(name, 3, 10, tmp_path)["ablations"].iloc[0]
     (call,) = trained
     assert call["seen"] == seen and call["timesteps"] == 960 + 10 * 64
     # the middle of the range is 6000 C

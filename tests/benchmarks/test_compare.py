@@ -3,6 +3,7 @@
 import json
 import re
 from dataclasses import asdict
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -15,10 +16,11 @@ from tensorboard.plugins.custom_scalar.layout_pb2 import Layout
 
 from battery_env.estimators.closed_form import ClosedForm
 from battery_env.evaluation import evaluate, summarize
-from benchmarks import compare
+from benchmarks import compare, contests
 from benchmarks.training import Recipe
 
 ENV_ID = "BatteryRo-v0"
+ROOT = Path(__file__).parents[2]
 CONFIG = """
 BatteryRo-v0:
   policy: 'MlpPolicy'
@@ -32,9 +34,13 @@ BatteryRo-v0:
 
 
 def patch_held_out_trajectories(monkeypatch):
-    data = compare.held_out_trajectories(ENV_ID)
-    shortest = data.subset(np.argsort(data.samples)[:6])
-    monkeypatch.setattr(compare, "held_out_trajectories", lambda env_id: shortest)
+    held_out = contests.held_out_trajectories
+
+    def shortest(env_id):
+        data = held_out(env_id)
+        return data.subset(np.argsort(data.samples)[:6])
+
+    monkeypatch.setattr(contests, "held_out_trajectories", shortest)
 
 
 @pytest.fixture(autouse=True)
@@ -45,7 +51,11 @@ def small(tmp_path, monkeypatch):
         (tmp_path / "zoo_configs" / f"{algo}.yml").write_text(CONFIG)
     monkeypatch.chdir(tmp_path)
     patch_held_out_trajectories(monkeypatch)
-    monkeypatch.setattr(compare, "_EVALUATION_EPISODES", 2)
+    for module in (compare, contests):
+        monkeypatch.setattr(module, "EVALUATION_EPISODES", 2)
+    monkeypatch.setattr(contests, "_SCORED_EPISODES", 3)
+    monkeypatch.setattr(contests, "_VOLTAGE_TRAJECTORIES", 2)
+    monkeypatch.setattr(contests, "_BRIEF_VOLTAGE_TRAJECTORIES", 1)
 
 
 def recipe(algo="lac", timesteps=400, evaluations=2, **others):
@@ -66,7 +76,7 @@ def test_a_comparison_writes_table_figures_and_logs(tmp_path, capsys):
     assert (table["timesteps"][:3] == 400).all() and table["mape_percent"].iloc[3] < 1e-9
     assert (table["resumed"][:3] == 0).all()
     shown = capsys.readouterr().out
-    assert f"| BatteryRo-v0  | r_o         | LAC          | {recipe().digest} " in shown
+    assert re.search(rf"\| BatteryRo-v0 +\| r_o +\| LAC +\| {recipe().digest} +\| 400 +\| 1 ", shown)
     assert "Interrupted" not in shown
     for name in ("inferred.png", "inferred.csv", "learning.png", "learning.csv", "learning.json"):
         assert (out / f"{ENV_ID}_{name}").stat().st_size > 0
@@ -116,7 +126,7 @@ def finished(monkeypatch):
             return
         trained.append(recipe)
         folder.mkdir(parents=True)
-        data = compare.held_out_trajectories(recipe.env_id)
+        data = contests.held_out_trajectories(recipe.env_id)
         evaluate(ClosedForm(), data).to_csv(folder / "scores.csv", index=False)
         history = {"timesteps": [recipe.timesteps], "mape_percent": [1.0], "mape_percent_worst": [2.0]}
         pd.DataFrame(history).to_csv(folder / "calibration.csv", index=False)
@@ -128,7 +138,7 @@ def finished(monkeypatch):
     monkeypatch.setattr(compare, "run", run)
     # drawn by another test
     for name in ("plot_true_against_inferred", "plot_learning_curves", "save_figure"):
-        monkeypatch.setattr(compare, name, lambda *args: None)
+        monkeypatch.setattr(contests, name, lambda *args: None)
     return trained
 
 
@@ -158,6 +168,7 @@ def test_a_finished_run_stands_for_its_own_recipe_only(tmp_path, finished, capsy
 
 def test_seeds_are_one_row_and_continued_runs_are_named(tmp_path, finished, capsys):
     compare.main(command("--algos", "lac", "sac", "lac", "--seeds", "0", "1", "1"))
+    # two seeds of two algorithms
     assert len(finished) == 4
     shown = capsys.readouterr().out
     assert re.search(r"\| LAC +\| \w{8} +\| 400 +\| 2 ", shown)
@@ -170,7 +181,7 @@ def test_seeds_are_one_row_and_continued_runs_are_named(tmp_path, finished, caps
 def test_defaults_are_the_line_as_typed(algo, tmp_path, monkeypatch):
     captured = []
     monkeypatch.setattr(
-        compare, "evaluate", lambda estimator, data: captured.append(estimator.policy) or evaluate(estimator, data)
+        contests, "evaluate", lambda estimator, data: captured.append(estimator.policy) or evaluate(estimator, data)
     )
     chosen = recipe(algo, timesteps=150, evaluations=1, defaults=True)
     assert chosen.name.startswith(f"{algo}_defaults_seed0_")
@@ -221,15 +232,85 @@ def test_an_interrupted_run_goes_on_from_its_checkpoint_and_says_so(tmp_path, mo
     assert started_at[-1] == 0
 
 
-def test_a_checkpoint_that_was_set_aside_is_put_back(tmp_path):
-    folder, old = tmp_path / "checkpoint", tmp_path / "checkpoint.old"
-    old.mkdir()
-    (old / "model.zip").write_text("previous")
-    compare.CheckpointCallback.recover(folder)
-    assert (folder / "model.zip").read_text() == "previous" and not old.exists()
-    old.mkdir()
-    compare.CheckpointCallback.recover(folder)
-    assert (folder / "model.zip").read_text() == "previous"
+VOLTAGE_CONFIG = """
+BatteryVoltageRo-v0: {policy: MlpPolicy, n_timesteps: 96, n_envs: 16, learning_starts: 32, batch_size: 16, buffer_size: 200}
+"""
+
+
+@pytest.mark.slow
+def test_voltage_only_tasks_are_compared_under_sensors_beside_their_peers(tmp_path, capsys):
+    for algo in ("lac", "sac"):
+        (tmp_path / "zoo_configs" / f"{algo}.yml").write_text(VOLTAGE_CONFIG)
+    chosen = ["--envs", "BatteryVoltageRo-v0", "--algos", "lac", "sac", "--evaluations", "1", "--jobs", "1", "--out", "out"]
+    compare.main(chosen)
+    out = tmp_path / "out"
+    table = pd.read_csv(out / "BatteryVoltageRo-v0.csv")
+    calibrators = ["LAC", "SAC", "least squares", "Kalman filter"]
+    assert table["sensor"].tolist() == [sensor for sensor in contests.SENSORS for _ in calibrators]
+    assert table["calibrator"].tolist() == 2 * calibrators
+    assert table["training_minutes"].notna().tolist() == 2 * [True, True, False, False]
+    # untrained policies are bad, least squares are good, and the noisy sensor makes them worse
+    least_squares = table[table["calibrator"] == "least squares"].set_index("sensor")["r_o_second_half_percent"]
+    assert (least_squares < table.loc[table["calibrator"] == "LAC", "r_o_second_half_percent"].min()).all()
+    assert least_squares.iloc[1] > least_squares.iloc[0]
+    assert re.search(r"\| BatteryVoltageRo-v0 +\| 5 mV noise +\| LAC ", capsys.readouterr().out)
+    published = ROOT / "docs" / "results" / "voltage" / "BatteryVoltageJoint-v0_scores.csv"
+    assert list(pd.read_csv(out / "BatteryVoltageRo-v0_scores.csv")) == list(pd.read_csv(published, nrows=1))
+    assert len(pd.read_csv(out / "BatteryVoltageRo-v0_learning.csv")) == 2
+    assert json.loads((out / "BatteryVoltageRo-v0.json").read_text())["configuration"]["recipes"]
+    for figure in ("", "_learning"):
+        assert (out / f"BatteryVoltageRo-v0{figure}.png").stat().st_size > 0
+    times = {path: path.stat().st_mtime_ns for path in [*out.rglob("model.zip"), *out.rglob("parts/*")]}
+    assert len(times) == 4
+    compare.main(chosen)
+    assert {path: path.stat().st_mtime_ns for path in times} == times
+
+
+def test_algorithms_of_the_zoo_and_ones_own_are_compared_in_any_environment(tmp_path, capsys, monkeypatch):
+    page = (ROOT / "docs" / "own_algorithm.md").read_text(encoding="utf-8")
+    environment, algorithm, _ = re.findall(r"^```python\n(.*?)^```", page, flags=re.MULTILINE | re.DOTALL)
+    (tmp_path / "tank.py").write_text(environment + algorithm)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    common = [
+        "--envs",
+        "tank:Tank-v0",
+        "--defaults",
+        "--timesteps",
+        "130",
+        "--evaluations",
+        "2",
+        "--jobs",
+        "1",
+        "--out",
+        "out",
+    ]
+    compare.main(["--algos", "tqc", *common])
+    compare.main(["--algos", "a2c", "tank:AnnealedSAC", *common])
+    table = pd.read_csv(tmp_path / "out" / "Tank-v0.csv").set_index("algo")
+    assert set(table.index) == {"a2c", "tank:AnnealedSAC", "tqc"} and (table["length"] == 100.0).all()
+    assert (0.0 < table["cost"]).all() and (table["cost"] < table["cost_worst"]).all()
+    curves = pd.read_csv(tmp_path / "out" / "Tank-v0_learning.csv")
+    assert set(curves["algo"]) == {"A2C defaults", "AnnealedSAC defaults", "TQC defaults"}
+    assert (tmp_path / "out" / "Tank-v0_learning.png").stat().st_size > 0
+    assert re.search(r"\| Tank-v0 +\| TQC defaults +\|", capsys.readouterr().out)
+
+
+def test_every_environment_has_a_contest(monkeypatch):
+    monkeypatch.setattr(contests, "held_out_trajectories", lambda env_id: None)
+    kinds = {
+        env_id: type(contests.contest_of(env_id)).__name__ for env_id in ("BatteryJoint-v0", "BatteryAging-v0", "Pendulum-v1")
+    }
+    assert kinds == {"BatteryJoint-v0": "FullState", "BatteryAging-v0": "VoltageOnly", "Pendulum-v1": "Episodes"}
+
+
+def test_shares_of_discharges_are_drawn_over_seeds():
+    scores = pd.DataFrame({"calibrator": ["LAC"] * 4 + ["filter"] * 2, "seed": [0, 0, 1, 1, np.nan, np.nan]})
+    scores = scores.assign(sensor="5 mV noise", r_o_second_half_mape_percent=[1.0, 4.0, 2.0, 4.0, 1.0, 8.0])
+    (axes,) = contests.plot_ranks(scores, ["r_o"]).axes
+    assert [line.get_label() for line in axes.lines] == ["LAC", "filter"] and len(axes.collections) == 1
+    shares = axes.lines[0].get_ydata()
+    # at 1 % half of the discharges with one of two seeds, at 8 % all
+    assert shares[0] == 25.0 and shares[-1] == 100.0
 
 
 @pytest.mark.parametrize(
@@ -237,12 +318,12 @@ def test_a_checkpoint_that_was_set_aside_is_put_back(tmp_path):
     [
         (["--timesteps", "0"], "must be at least 1"),
         (["--jobs", "0"], "must be at least 1"),
-        (["--algos", "ppo"], "ppo is no off-policy algorithm of the RL Zoo; choose from"),
-        (["--algos", "lack"], "lack is no off-policy algorithm"),
+        (["--algos", "lack"], "lack is no algorithm of the RL Zoo; choose from"),
+        (["--algos", "dqn", "--defaults"], "dqn on BatteryRo-v0: The algorithm only supports"),
+        (["--algos", "ppo_lstm", "--defaults"], "policies with a memory cannot be scored here"),
         (["--algos", "tqc"], "tqc.yml"),
         (["--envs", "BatteryR-v0"], "Environment `BatteryR` doesn't exist"),
-        (["--envs", "CartPoleCost-v0"], "CartPoleCost-v0 is no calibration environment"),
-        (["--envs", "BatteryVoltageRo-v0"], "BatteryVoltageRo-v0 is no full-state environment"),
+        (["--envs", "no_such_module:Mine-v0"], "no_such_module:Mine-v0 is no environment: No module named"),
         (["--envs", "BatteryQmax-v0"], "lac.yml has no entry for BatteryQmax-v0"),
         (["--seeds", "-1"], "a seed must lie within 0 .. 2**32 - 1, got -1"),
         (["--timesteps", "40"], "starts to learn after 40 steps (learning_starts): timesteps=40 must be more"),

@@ -45,8 +45,9 @@ def test_gain_of_a_linear_policy_is_found():
 
 
 def test_the_exact_solution_is_recognized(tmp_path, exact_model):
-    row, values = linear_cost.run(4, 123, 20, tmp_path)
-    assert exact_model == [("lac", "LinearCost-v0", 4, 123, tmp_path / "models" / "seed4")]
+    tables = linear_cost.part(4, 123, 20, tmp_path)
+    row, values = tables["linear_cost"].iloc[0], tables["values"]
+    assert exact_model == [("lac", "LinearCost-v0", 4, 123, tmp_path / "seed4")]
     assert row["seed"] == 4 and set(values["seed"]) == {4} and len(values) == 20 * 100
     assert row["gain_position"] == pytest.approx(row["gain_position_exact"], rel=1e-5)
     assert row["gain_velocity"] == pytest.approx(row["gain_velocity_exact"], rel=1e-5)

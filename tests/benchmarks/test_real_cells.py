@@ -16,7 +16,7 @@ def few(monkeypatch):
 
 
 def test_the_study_writes_tables_and_figures(few, tmp_path, capsys):
-    real_cells.main(["--cells", "B0005", "--out", str(tmp_path)])
+    real_cells.main(["--cells", "B0005", "--jobs", "1", "--out", str(tmp_path)])
     whole = pd.read_csv(tmp_path / "discharges.csv")
     assert list(whole["cycle"]) == [1, 61, 121, 168] and whole["settled"].all()
     assert whole["q_mobile_C"].corr(whole["capacity_Ah"]) > 0.999

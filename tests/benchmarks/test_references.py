@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from benchmarks import references
-from benchmarks.environment_page import DOCS, environment_page
+from docs.environment_pages import DOCS, environment_page
 
 IDS = list(references._DISTURBANCES)
 

@@ -40,28 +40,32 @@ def test_every_algorithm_gets_the_same_trials_of_as_many_settings(trials, tmp_pa
     assert json.loads((tmp_path / "search.json").read_text())["configuration"]["trials"] == 4
 
 
+def found(algo, count, updates, out):
+    return search.part(algo, "BatteryRo-v0", count, updates, out)["search"]
+
+
 def test_a_search_goes_on_and_is_not_done_twice(trials, tmp_path):
-    first = search.search("sac", "BatteryRo-v0", 3, 9, tmp_path)
+    first = found("sac", 3, 9, tmp_path)
     assert len(trials) == 3 + 3 * 2
-    longer = search.search("sac", "BatteryRo-v0", 5, 9, tmp_path)
+    longer = found("sac", 5, 9, tmp_path)
     newcomers = set(longer.sort_values("mean_percent").head(3).index) - set(first.index)
     assert len(trials) == 5 + (3 + len(newcomers)) * 2
-    again = search.search("sac", "BatteryRo-v0", 5, 9, tmp_path)
+    again = found("sac", 5, 9, tmp_path)
     assert len(trials) == 5 + (3 + len(newcomers)) * 2
     pd.testing.assert_frame_equal(longer.head(3)[["learning_rate", "mean_percent"]], first[["learning_rate", "mean_percent"]])
     pd.testing.assert_frame_equal(again, longer)
     # other numbers of updates are another search
-    assert len(search.search("sac", "BatteryRo-v0", 1, 10, tmp_path)) == 1
+    assert len(found("sac", 1, 10, tmp_path)) == 1
 
 
 def test_the_best_three_are_ranked_by_three_seeds(trials, tmp_path):
-    found = search.search("lac", "BatteryRo-v0", 6, 9, tmp_path)
-    best = found.sort_values("mean_percent").head(3)
-    assert (best["seeds"] == 3).all() and (found.drop(best.index)["seeds"] == 1).all()
+    trial = found("lac", 6, 9, tmp_path)
+    best = trial.sort_values("mean_percent").head(3)
+    assert (best["seeds"] == 3).all() and (trial.drop(best.index)["seeds"] == 1).all()
     tried = [settings["learning_rate"] for _, settings in trials]
     # the same settings again, with the numbers of later trials as seeds
     assert sorted(tried[6:]) == sorted(np.repeat([f"lin_{rate:.2g}" for rate in best["learning_rate"]], 2))
-    assert set(best["worst_percent"]) == {14.0, 16.0, 18.0} and (found.drop(best.index)["worst_percent"] < 13.0).all()
+    assert set(best["worst_percent"]) == {14.0, 16.0, 18.0} and (trial.drop(best.index)["worst_percent"] < 13.0).all()
 
 
 def test_a_trial_is_trained_for_its_updates_and_scored_on_training_discharges(tmp_path):

@@ -1,8 +1,7 @@
-"""A policy is trained once, with the hyperparameters it should have; runs side by side come back in order."""
+"""A policy is trained once, with the hyperparameters it should have, and known by what it was made from."""
 
 import json
-import operator
-import os
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -13,6 +12,7 @@ from benchmarks import training
 from sb3_lac import LAC
 
 ENV_ID = "LinearCost-v0"
+PUBLISHED = Path(__file__).parents[2] / "docs" / "results"
 CONFIG = """
 LinearCost-v0:
   policy: 'MlpPolicy'
@@ -92,7 +92,7 @@ def test_a_recipe_names_all_that_a_policy_depends_on(tmp_path, monkeypatch):
         patch.setitem(training.ALGOS, "lac", OtherDefault)
         others.append(of())
     with monkeypatch.context() as patch:
-        patch.setattr(training.sb3_lac, "__version__", "99.0.0")
+        patch.setattr(training, "own_versions", lambda: {"sb3_lac": "99.0.0"})
         others.append(of())
     with monkeypatch.context() as patch:
         patch.setitem(gym.registry[ENV_ID].kwargs, "control_max", 1.5)
@@ -136,22 +136,59 @@ def test_an_interrupted_training_leaves_no_model(tmp_path, monkeypatch, training
     assert training.train_or_load("lac", ENV_ID, 0, 40, tmp_path / "run").num_timesteps == 40 and trainings == [0, 0]
 
 
-def test_one_job_stays_in_this_process():
-    # what is defined here could not be pickled
-    assert training.run_all(lambda *run: (os.getpid(), run), [(1, "a"), (2, "b")], 1) == [
-        (os.getpid(), (1, "a")),
-        (os.getpid(), (2, "b")),
-    ]
-    with pytest.raises(ZeroDivisionError):
-        training.run_all(operator.truediv, [(1, 1), (1, 0)], 1)
+@pytest.mark.parametrize("study", ["compare", "compare_defaults"])
+def test_published_runs_keep_their_names(study):
+    recipes = json.loads((PUBLISHED / study / "compare.json").read_text())["configuration"]["recipes"]
+    for digest, recorded in recipes.items():
+        seeds = [run["seed"] for run in recorded.pop("runs")]
+        assert {training.Recipe(seed=seed, **recorded).digest for seed in seeds} == {digest}
 
 
-def test_several_jobs_are_other_processes_whose_results_keep_their_order():
-    # the first takes longest
-    assert training.run_all(sum, [(range(3_000_000),), (range(3),), (range(4),)], 2) == [4_499_998_500_000, 3, 6]
-    assert os.getpid() not in training.run_all(os.getpid, [(), ()], 2)
+def test_an_algorithm_and_an_environment_of_ones_own_are_named_by_their_modules(tmp_path, monkeypatch):
+    source = """
+import gymnasium as gym
+from stable_baselines3 import SAC
+
+class Mine(SAC):
+    pass
+
+if "Mine-v0" not in gym.registry:
+    gym.register("Mine-v0", "sb3_lac.envs.linear:LinearCostEnv", max_episode_steps=9)
+"""
+    (tmp_path / "own_module_a.py").write_text(source)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    recipe = training.Recipe.of("own_module_a:Mine", "own_module_a:Mine-v0", 0, 150, defaults=True)
+    assert recipe.label == "Mine defaults" and recipe.environment["max_episode_steps"] == 9
+    assert recipe.name.startswith("mine_defaults_seed0_")
+    _, model = training.set_up(recipe, tmp_path / "run")
+    assert type(model).__name__ == "Mine" and model.env.get_attr("spec")[0].id == "Mine-v0"
+    # its source is part of the recipe
+    assert set(recipe.packages) == {"sb3_lac", "battery_env", "own_module_a"}
+    (tmp_path / "zoo_configs" / "mine.yml").write_text(CONFIG.replace(ENV_ID, "Mine-v0").replace("alpha3", "gamma"))
+    tuned = training.Recipe.of("own_module_a:Mine", "own_module_a:Mine-v0", 0)
+    assert (tuned.label, tuned.timesteps, tuned.hyperparameters["gamma"]) == ("Mine", 40, 0.7)
 
 
-def test_an_error_in_another_process_is_raised_here():
-    with pytest.raises(ZeroDivisionError):
-        training.run_all(operator.truediv, [(1, 1), (1, 0), (2, 1)], 2)
+@pytest.mark.parametrize(
+    ("algo", "message"),
+    [
+        ("lack", "lack is no algorithm of the RL Zoo; choose from"),
+        ("no_such_module:Mine", "No module named 'no_such_module'"),
+        ("benchmarks.training:Mine", "has no attribute 'Mine'"),
+        ("benchmarks.training:Recipe", "must be a subclass of Stable-Baselines3's BaseAlgorithm"),
+    ],
+)
+def test_what_is_no_algorithm_is_refused(algo, message):
+    with pytest.raises(ValueError, match=message):
+        training.Recipe.of(algo, ENV_ID, 0)
+
+
+def test_a_checkpoint_that_was_set_aside_is_put_back(tmp_path):
+    folder, old = tmp_path / "checkpoint", tmp_path / "checkpoint.old"
+    old.mkdir()
+    (old / "model.zip").write_text("previous")
+    training.CheckpointCallback.recover(folder)
+    assert (folder / "model.zip").read_text() == "previous" and not old.exists()
+    old.mkdir()
+    training.CheckpointCallback.recover(folder)
+    assert (folder / "model.zip").read_text() == "previous"

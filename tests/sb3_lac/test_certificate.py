@@ -309,7 +309,6 @@ def test_death_is_no_decrease():
     assert not report.holds and "5 of 10 episodes died" in report.summary()
 
 
-@pytest.mark.xfail(strict=False, reason="train() still takes L of the critic at terminal states, where it is not trained")
 def test_training_and_evaluation_count_terminal_transitions_alike(make_model, make_env, monkeypatch):
     model = make_model(make_env(terminate=True, episode_length=2), n_collect=64, learning_rate=1e-12, batch_size=64)
     buffer = model.replay_buffer

@@ -4,7 +4,7 @@ its task or class, and in docs/battery_env.md the tables of environments, data s
 
 .. code-block:: bash
 
-  python -m benchmarks.environment_page
+  python -m docs.environment_pages
 
 The rest of docs/battery_env.md is written by hand. What is not stands between ``<!-- begin NAME -->`` and
 ``<!-- end NAME -->``.
@@ -30,11 +30,11 @@ from battery_env.calibration.full_state import FullStateTask
 from battery_env.calibration.registration import TASKS
 from battery_env.estimators import Estimator, OnlineEstimator
 from battery_env.evaluation import evaluate
+from battery_env.files import replacing
 from battery_env.loads import constant
 from battery_env.trajectories import TrajectoryDataset
-from benchmarks.reporting import write_text
 
-DOCS = Path(__file__).parents[1] / "docs"
+DOCS = Path(__file__).parent
 
 #: All environments that this project brings.
 IDS = [
@@ -205,7 +205,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     pages = {docs / "environments" / f"{env_id}.md": environment_page(env_id) for env_id in IDS}
     pages[docs / "battery_env.md"] = render((docs / "battery_env.md").read_text(encoding="utf-8"))
     for page, text in pages.items():
-        write_text(page, text)
+        with replacing(page) as part:
+            part.write_text(text, encoding="utf-8")
         sys.stdout.write(f"{page}\n")
 
 

@@ -12,10 +12,10 @@ from battery_env.calibration.full_state_tasks import BatteryQmax
 from battery_env.calibration.registration import TASKS
 from battery_env.calibration.voltage_tasks import BatteryVoltageJoint
 from battery_env.loads import constant
-from benchmarks import environment_page
 from benchmarks.references import _DISTURBANCES
+from docs import environment_pages
 
-TEXT = (environment_page.DOCS / "battery_env.md").read_text(encoding="utf-8")
+TEXT = (environment_pages.DOCS / "battery_env.md").read_text(encoding="utf-8")
 
 
 def first_cells(section):
@@ -31,24 +31,24 @@ def dataset():
 
 
 def test_the_pages_say_what_the_code_says():
-    assert environment_page.render(TEXT) == TEXT, "run python -m benchmarks.environment_page"
-    pages = {path.stem: path.read_text(encoding="utf-8") for path in (environment_page.DOCS / "environments").glob("*.md")}
-    assert pages == {env_id: environment_page.environment_page(env_id) for env_id in environment_page.IDS}
+    assert environment_pages.render(TEXT) == TEXT, "run python -m docs.environment_pages"
+    pages = {path.stem: path.read_text(encoding="utf-8") for path in (environment_pages.DOCS / "environments").glob("*.md")}
+    assert pages == {env_id: environment_pages.environment_page(env_id) for env_id in environment_pages.IDS}
 
 
 def test_every_environment_has_a_page():
-    assert {*TASKS, *_DISTURBANCES} == set(environment_page.IDS)
+    assert {*TASKS, *_DISTURBANCES} == set(environment_pages.IDS)
 
 
 def test_a_page_leads_to_the_pages_that_it_names():
-    page = environment_page.environment_page("BatteryRo-v0")
+    page = environment_pages.environment_page("BatteryRo-v0")
     assert page.startswith("# BatteryRo-v0\n") and "As [`BatteryQmax-v0`](BatteryQmax-v0.md), but R_o" in page
 
 
 def test_every_environment_has_all_sections_of_its_page():
     wanted = ["Description", "Observation space", "Action space", "Reward", "Starting state", "Episode end", "Arguments"]
     for env_id in TASKS:
-        page = inspect.getdoc(environment_page.page_class(env_id))
+        page = inspect.getdoc(environment_pages.page_class(env_id))
         headings = re.findall(r"^## (.*)", page, flags=re.MULTILINE)
         assert [heading for heading in headings if heading in wanted] == wanted, env_id
         assert headings[-1] == "Version history", env_id
@@ -135,7 +135,7 @@ def documented():
 
 
 def test_tables_of_docstrings_are_read_with_their_continued_lines():
-    one, other = environment_page._tables(documented)
+    one, other = environment_pages._tables(documented)
     assert one == [["name", "meaning"], ["``a``", "the first, going on"], ["``b``, ``c``", "both of them"]]
     assert other == [["``d``", "alone"]]
 
@@ -145,11 +145,11 @@ def test_only_what_stands_between_markers_is_written(tmp_path, capsys):
     stale = re.sub(r"(<!-- begin columns -->).*?(<!-- end columns -->)", r"\1 old \2", TEXT, flags=re.DOTALL)
     page.write_text(stale, encoding="utf-8")
     (tmp_path / "environments").mkdir()
-    environment_page.main(["--docs", str(tmp_path)])
+    environment_pages.main(["--docs", str(tmp_path)])
     assert page.read_text(encoding="utf-8") == TEXT and str(page) in capsys.readouterr().out
-    assert len(list((tmp_path / "environments").iterdir())) == len(environment_page.IDS)
+    assert len(list((tmp_path / "environments").iterdir())) == len(environment_pages.IDS)
 
 
 def test_a_page_without_its_markers_is_refused():
     with pytest.raises(ValueError, match="begin ids"):
-        environment_page.render(TEXT.replace("<!-- begin ids -->", ""))
+        environment_pages.render(TEXT.replace("<!-- begin ids -->", ""))

@@ -1,0 +1,427 @@
+"""
+What algorithms are compared by: the scores of a policy in each kind of environment, what they stand beside, and how tables and
+figures show them.
+"""
+
+from __future__ import annotations
+
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import VecEnv
+
+from battery_env.calibration.full_state import FullStateTask
+from battery_env.calibration.policy import PolicyEstimator
+from battery_env.estimators import ClosedForm, Estimator, ExtendedKalmanFilter, LeastSquares
+from battery_env.evaluation import evaluate, summarize
+from battery_env.plotting import (
+    COLOURS,
+    LABELS,
+    draw_over_seeds,
+    new_figure,
+    plot_learning_curves,
+    plot_true_against_inferred,
+    save_figure,
+)
+from battery_env.sensors import RandomSensorErrors, SensorErrors
+from battery_env.trajectories import TrajectoryDataset
+from benchmarks.study import EVALUATION_SEED, SYMBOLS, Study, Tables, digits, side_by_side, with_spread
+from benchmarks.training import registered_id
+
+#: What the voltmeter does to the test discharges of voltage-only tasks.
+SENSORS: dict[str, SensorErrors | RandomSensorErrors] = {
+    "5 mV noise": SensorErrors(noise_V=0.005),
+    "1-30 mV noise, +-10 mV offset": RandomSensorErrors(noise_V=(0.001, 0.030), offset_V=0.010),
+}
+_EVALUATION_TRAJECTORIES = 64  # of the test part of full-state tasks, evenly spaced, while training; all of them at the end
+_VOLTAGE_TRAJECTORIES, _BRIEF_VOLTAGE_TRAJECTORIES = 100, 20  # the first ones: whole lives of cells that age
+#: Episodes of an evaluation while training.
+EVALUATION_EPISODES = 20
+_SCORED_EPISODES = 100
+
+
+def held_out_trajectories(env_id: str) -> TrajectoryDataset:
+    """
+    The discharges that no policy has seen.
+
+    :param env_id: id of a calibration environment
+    :return: the test part of its data set
+    """
+    data = PolicyEstimator.environment(env_id, split="test").task.dataset
+    assert isinstance(data, TrajectoryDataset)
+    return data
+
+
+class Contest(ABC):
+    """
+    What algorithms are compared by in one kind of environment.
+
+    :param env_id: id of the environment
+    :ivar env_id: the same, without the module that registers it
+    :ivar options: of the environment while evaluating
+    :ivar metrics: which columns of the scores are followed while training, and the name of each; smaller is better
+    :ivar stems: for each of these names, how the names of files of learning curves begin
+    """
+
+    #: The metric that is followed, in files of learning curves and in figures.
+    metric: str
+    label: str
+    options: Mapping[str, Any]
+    metrics: Mapping[str, str]
+    stems: Mapping[str, str]
+
+    def __init__(self, env_id: str) -> None:
+        self.env_id = registered_id(env_id)
+
+    @abstractmethod
+    def scores(self, model: BaseAlgorithm, env: VecEnv, brief: bool = False) -> pd.DataFrame:
+        """
+        Score a policy.
+
+        :param model: the policy
+        :param env: one environment as the policy knows it, with ``options``
+        :param brief: on little work, as while training
+        :return: one row per discharge (and sensor) or episode
+        """
+
+    def summary(self, scores: pd.DataFrame) -> dict[str, Any]:
+        """
+        What is kept of a run beside its scores.
+
+        :param scores: of one policy
+        :return: by name
+        """
+        return {"time_per_update_us": 1e6 * float(scores["time_per_update_s"].iloc[0])}
+
+    @abstractmethod
+    def report(self, runs: pd.DataFrame, study: Study) -> tuple[list[dict[str, str]], pd.DataFrame]:
+        """
+        Write tables and figures of all finished runs in this environment.
+
+        :param runs: see :func:`benchmarks.compare.finished_runs`
+        :param study: where to
+        :return: rows for readers, and what stands of it in compare.csv
+        """
+
+    def write_learning(self, runs: pd.DataFrame, study: Study) -> None:
+        """
+        Draw each metric during training, and write the curves.
+
+        :param runs: see :func:`benchmarks.compare.finished_runs`
+        :param study: where to
+        """
+        for name, stem in self.stems.items():
+            columns = {name: self.metric, f"{name}_worst": f"{self.metric}_worst"}
+            curves: dict[str, list[pd.DataFrame]] = {}
+            tables: dict[tuple[str, int], pd.DataFrame] = {}
+            for label, seed, folder in runs[["label", "seed", "folder"]].itertuples(index=False):
+                history = pd.read_csv(folder / "calibration.csv").rename(columns=columns)
+                tables[label, seed] = history[["timesteps", *columns.values()]]
+                curves.setdefault(label, []).append(tables[label, seed])
+            save_figure(plot_learning_curves(curves, stem, self.metric, self.label), study.out / f"{stem}_learning.png")
+            table = pd.concat(tables, names=["algo", "seed"]).droplevel(-1).reset_index()
+            study.write_table(f"{stem}_learning", table, made_by(runs))
+
+
+class Calibration(Contest):
+    """
+    Calibrators on held-out discharges.
+
+    :param env_id: id of a calibration environment
+    """
+
+    metric = "mape_percent"
+    label = "MAPE (%)"
+    options: Mapping[str, Any] = {"split": "test"}
+
+    def __init__(self, env_id: str) -> None:
+        super().__init__(env_id)
+        self.parameters = PolicyEstimator.environment(self.env_id).task.parameters
+        self.test = held_out_trajectories(self.env_id)
+        # known by its parameter only where there are two
+        if len(self.parameters) == 1:
+            self.metrics, self.stems = {f"{self.parameters[0]}_{self.metric}": self.metric}, {self.metric: self.env_id}
+        else:
+            self.metrics = {f"{name}_{self.metric}": f"{name}_{self.metric}" for name in self.parameters}
+            self.stems = {f"{name}_{self.metric}": f"{self.env_id}_{name}" for name in self.parameters}
+
+
+class FullState(Calibration):
+    """Calibrators that see the full state."""
+
+    def scores(self, model: BaseAlgorithm, env: VecEnv, brief: bool = False) -> pd.DataFrame:
+        step = max(len(self.test) // _EVALUATION_TRAJECTORIES, 1) if brief else 1
+        return evaluate(PolicyEstimator(model, self.env_id), self.test.subset(range(0, len(self.test), step)))
+
+    def summary(self, scores: pd.DataFrame) -> dict[str, Any]:
+        return {**super().summary(scores), "scores": {name: summarize(scores, name) for name in self.parameters}}
+
+    def table(self, runs: pd.DataFrame) -> pd.DataFrame:
+        """
+        The scores of all runs, and of the closed form.
+
+        :param runs: see :func:`benchmarks.compare.finished_runs`
+        :return: one row per run and parameter
+        """
+        exact = evaluate(ClosedForm(), self.test)
+        tables = []
+        for name in self.parameters:
+            of_name = pd.DataFrame([scores[name] for scores in runs["scores"]], index=runs.index)
+            tables.append(runs.drop(columns="scores").assign(parameter=name).join(of_name))
+            row: dict[str, Any] = {"env": self.env_id, "parameter": name, "algo": "closed form", "label": "closed form"}
+            row |= summarize(exact, name)
+            tables.append(pd.DataFrame([{**row, "time_per_update_us": 1e6 * float(exact["time_per_update_s"].iloc[0])}]))
+        return pd.concat(tables, ignore_index=True)
+
+    def report(self, runs: pd.DataFrame, study: Study) -> tuple[list[dict[str, str]], pd.DataFrame]:
+        self.write_learning(runs, study)
+        # the paper's figure, of the first seed
+        first = runs.drop_duplicates("label")
+        folders = zip(first["label"], first["folder"], strict=True)
+        inferred = {label: pd.read_csv(folder / "scores.csv") for label, folder in folders}
+        for name, stem in zip(self.parameters, self.stems.values(), strict=True):
+            save_figure(plot_true_against_inferred(inferred, name), study.out / f"{stem}_inferred.png")
+            columns = ["load", name, f"{name}_hat", f"{name}_spread", f"{name}_mape_percent"]
+            points = pd.concat({label: scores[columns] for label, scores in inferred.items()}, names=["algo", "trajectory"])
+            study.write_table(f"{stem}_inferred", points.reset_index(), made_by(runs))
+        table, lines = self.table(runs), []
+        for (parameter, label), group in table.groupby(["parameter", "label"], sort=False):
+            learned = label != "closed form"
+            lines.append(
+                {
+                    "environment": self.env_id,
+                    "parameter": str(parameter),
+                    **_who(str(label), group, learned),
+                    "MAPE (%)": with_spread(group["mape_percent"]),
+                    "worst discharge (%)": digits(group["mape_worst_percent"].max()),
+                    "bias (%)": with_spread(group["bias_percent"]),
+                    "spread (%)": with_spread(group["spread_percent"]),
+                    "end of discharge (%)": with_spread(group["eod_error_percent"]),
+                    **_times(group, learned),
+                }
+            )
+        return lines, table.drop(columns=["label", "folder"])
+
+
+class VoltageOnly(Calibration):
+    """Calibrators that see voltage and current."""
+
+    metric = "second_half_mape_percent"
+    label = "MAPE of the second half (%)"
+
+    def scores(self, model: BaseAlgorithm, env: VecEnv, brief: bool = False) -> pd.DataFrame:
+        return self.under_sensors(PolicyEstimator(model, self.env_id), brief)
+
+    def under_sensors(self, estimator: Estimator, brief: bool = False) -> pd.DataFrame:
+        """
+        Score any calibrator.
+
+        :param estimator: the calibrator
+        :param brief: on little work, as while training
+        :return: one row per sensor and discharge
+        """
+        data = self.test[: _BRIEF_VOLTAGE_TRAJECTORIES if brief else _VOLTAGE_TRAJECTORIES]
+        sensors = dict(list(SENSORS.items())[: 1 if brief else None])
+        tables = {name: evaluate(estimator, data, errors, seed=1) for name, errors in sensors.items()}
+        return pd.concat(tables, names=["sensor"]).reset_index("sensor")
+
+    def peers(self) -> dict[str, Estimator]:
+        """
+        Calibrators without learning. The filter allows for an offset of the sensor, least squares do not.
+
+        :return: by name
+        """
+        return {
+            "least squares": LeastSquares(self.parameters, window_every_s=60.0),
+            "Kalman filter": ExtendedKalmanFilter(self.parameters),
+        }
+
+    def report(self, runs: pd.DataFrame, study: Study) -> tuple[list[dict[str, str]], pd.DataFrame]:
+        self.write_learning(runs, study)
+        who = ["label", "seed", "training_minutes", "folder"]
+        tables = [
+            pd.read_csv(folder / "scores.csv").assign(calibrator=label, seed=seed, training_minutes=minutes)
+            for label, seed, minutes, folder in runs[who].itertuples(index=False)
+        ]
+        peers = [{"env_id": self.env_id, "calibrator": name} for name in self.peers()]
+        scores = pd.concat([*tables, study.run(peer_scores, peers)["scores"]], ignore_index=True)
+        order = ["calibrator", "seed", "training_minutes"]
+        scores = scores[[*order, *(column for column in scores.columns if column not in order)]]
+        table = self.table(scores)
+        study.write_table(f"{self.env_id}_scores", scores, made_by(runs))
+        study.write_table(self.env_id, table, made_by(runs))
+        save_figure(plot_ranks(scores, self.parameters), study.out / f"{self.env_id}.png")
+        lines = []
+        for (sensor, calibrator), group in table.groupby(["sensor", "calibrator"], sort=False):
+            line = {"environment": self.env_id, "sensor": str(sensor), "calibrator": str(calibrator)}
+            for name in self.parameters:
+                symbol = SYMBOLS[name]
+                line[f"{symbol}, second half (%)"] = side_by_side(group[f"{name}_second_half_percent"])
+                line[f"worst discharge (%) {symbol}"] = side_by_side(group[f"{name}_second_half_worst_percent"])
+                line[f"{symbol}, final (%)"] = side_by_side(group[f"{name}_final_percent"])
+            line["end of discharge, at 50 % (%)"] = side_by_side(group["eod_error_at_50_percent"])
+            lines.append({**line, **_times(group, bool(group["training_minutes"].notna().any()))})
+        return lines, pd.DataFrame()
+
+    def table(self, scores: pd.DataFrame) -> pd.DataFrame:
+        """
+        The scores of all calibrators, over discharges.
+
+        :param scores: of all calibrators
+        :return: one row per sensor, calibrator and seed; errors in per cent
+        """
+        rows = []
+        for (sensor, calibrator, seed), group in scores.groupby(["sensor", "calibrator", "seed"], sort=False, dropna=False):
+            row: dict[str, Any] = {"sensor": sensor, "calibrator": calibrator, "seed": seed}
+            for name in self.parameters:
+                of_parameter = summarize(group, name)
+                row[f"{name}_second_half_percent"] = of_parameter["second_half_mape_percent"]
+                row[f"{name}_second_half_worst_percent"] = group[f"{name}_second_half_mape_percent"].max()
+                row[f"{name}_final_percent"] = of_parameter["final_error_percent"]
+                row[f"{name}_final_worst_percent"] = of_parameter["final_error_worst_percent"]
+                row[f"{name}_bound_percent"] = of_parameter["bound_percent"]
+            for percent in (50, 75):
+                row[f"eod_error_at_{percent}_percent"] = of_parameter[f"eod_error_percent_at_{percent}_percent"]
+            row["time_per_update_us"] = 1e6 * group["time_per_update_s"].iloc[0]
+            row["training_minutes"] = group["training_minutes"].iloc[0]
+            rows.append(row)
+        return pd.DataFrame(rows).sort_values("sensor", key=lambda names: names.map(list(SENSORS).index), kind="stable")
+
+
+def peer_scores(env_id: str, calibrator: str) -> Tables:
+    """
+    A part of this study: a calibrator without learning, under each sensor.
+
+    :param env_id: id of a voltage-only environment
+    :param calibrator: its name
+    :return: ``scores``, one row per sensor and discharge
+    """
+    task = VoltageOnly(env_id)
+    return {"scores": task.under_sensors(task.peers()[calibrator]).assign(calibrator=calibrator)}
+
+
+class Episodes(Contest):
+    """Any other environment: what an episode costs, which is minus its return."""
+
+    metric = label = "cost"
+    options: Mapping[str, Any] = {}
+    metrics: Mapping[str, str] = {"cost": "cost"}
+
+    def __init__(self, env_id: str) -> None:
+        super().__init__(env_id)
+        self.stems = {"cost": self.env_id}
+
+    def scores(self, model: BaseAlgorithm, env: VecEnv, brief: bool = False) -> pd.DataFrame:
+        env.seed(EVALUATION_SEED)  # the same starts for every policy
+        episodes = EVALUATION_EPISODES if brief else _SCORED_EPISODES
+        returns, lengths = evaluate_policy(model, env, episodes, return_episode_rewards=True)
+        return pd.DataFrame({"cost": -np.asarray(returns), "length": lengths})
+
+    def summary(self, scores: pd.DataFrame) -> dict[str, Any]:
+        return {"time_per_update_us": None}
+
+    def report(self, runs: pd.DataFrame, study: Study) -> tuple[list[dict[str, str]], pd.DataFrame]:
+        self.write_learning(runs, study)
+        scores = [pd.read_csv(folder / "scores.csv") for folder in runs["folder"]]
+        table = runs.assign(
+            cost=[of_run["cost"].mean() for of_run in scores],
+            cost_worst=[of_run["cost"].max() for of_run in scores],
+            length=[of_run["length"].mean() for of_run in scores],
+        )
+        study.write_table(self.env_id, table.drop(columns=["scores", "label", "folder", "time_per_update_us"]), made_by(runs))
+        lines = [
+            {
+                "environment": self.env_id,
+                **_who(str(label), group, learned=True),
+                "cost of an episode": with_spread(group["cost"]),
+                "worst episode": digits(group["cost_worst"].max()),
+                "steps of an episode": with_spread(group["length"]),
+                "training (min)": f"{group['training_minutes'].mean():.1f}",
+            }
+            for label, group in table.groupby("label", sort=False)
+        ]
+        return lines, pd.DataFrame()
+
+
+def contest_of(env_id: str) -> Contest:
+    """
+    What algorithms are compared by in an environment.
+
+    :param env_id: its id
+    :return: the contest
+    :raises gymnasium.error.Error: if it does not exist
+    """
+    try:
+        task = PolicyEstimator.environment(registered_id(env_id)).task
+    except ValueError:
+        return Episodes(env_id)
+    return FullState(env_id) if isinstance(task, FullStateTask) else VoltageOnly(env_id)
+
+
+def _who(label: str, group: pd.DataFrame, learned: bool) -> dict[str, str]:
+    return {
+        "calibrator" if "parameter" in group else "algorithm": label,
+        "recipe": group["recipe"].iloc[0] if learned else "",
+        "steps": f"{group['timesteps'].iloc[0]:.0f}" if learned else "",
+        "seeds": str(len(group)) if learned else "",
+    }
+
+
+def _times(group: pd.DataFrame, learned: bool) -> dict[str, str]:
+    return {
+        "time per estimate (us)": f"{group['time_per_update_us'].mean():.2g}",
+        "training (min)": f"{group['training_minutes'].mean():.1f}" if learned else "",
+    }
+
+
+def plot_ranks(scores: pd.DataFrame, parameters: Sequence[str]) -> Figure:
+    """
+    Which share of the discharges has an error in its second half below a value, for each calibrator, over seeds.
+
+    :param scores: of all calibrators
+    :param parameters: what was to be found
+    :return: the figure, one column per parameter, one row per sensor
+    """
+    sensors = list(dict.fromkeys(scores["sensor"]))
+    figure = new_figure(4.0 * len(parameters) + 0.6, 2.7 * len(sensors) + 0.4)
+    panels = figure.subplots(len(sensors), len(parameters), squeeze=False, sharex="col", sharey=True)
+    for row, sensor in zip(panels, sensors, strict=True):
+        for axes, name in zip(row, parameters, strict=True):
+            of_sensor, column = scores[scores["sensor"] == sensor], f"{name}_second_half_mape_percent"
+            limits = np.geomspace(of_sensor[column].min(), of_sensor[column].max(), 200)
+            for colour, (calibrator, group) in zip(COLOURS, of_sensor.groupby("calibrator", sort=False), strict=False):
+                seeds = [errors.to_numpy() for _, errors in group.groupby("seed", dropna=False)[column]]
+                shares = [100.0 * np.mean(errors[:, None] <= limits, axis=0) for errors in seeds]
+                draw_over_seeds(axes, limits, shares, colour, str(calibrator))
+            axes.set(xscale="log", title=f"{LABELS[name].split(' (')[0]}, {sensor}")
+            axes.title.set_fontsize(9)
+            axes.grid(which="both", alpha=0.2)
+    for axes in panels[-1]:
+        axes.set_xlabel("mean error in the second half (%)")
+    for axes in panels[:, 0]:
+        axes.set_ylabel("discharges (%)")
+    panels[0, 0].legend(frameon=False, fontsize=8)
+    return figure
+
+
+def made_by(runs: pd.DataFrame) -> dict[str, Any]:
+    """
+    What made the runs of a table.
+
+    :param runs: see :func:`benchmarks.compare.finished_runs`
+    :return: each recipe once, with the seeds that were run
+    """
+    recipes: dict[str, Any] = {}
+    for recipe_digest, folder in zip(runs["recipe"], runs["folder"], strict=True):
+        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        recipe = summary["recipe"]
+        seed = {"seed": recipe.pop("seed"), "resumed": summary["resumed"], "versions": summary["versions"]}
+        recipes.setdefault(recipe_digest, {**recipe, "runs": []})["runs"].append(seed)
+    return {"recipes": recipes}

@@ -1,0 +1,288 @@
+"""
+What all studies share: a command line, parts that run side by side and are never done twice, files that say what made them,
+and numbers as readers see them. A study itself keeps its configuration, the function that makes one part, and its figures.
+"""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+import json
+import multiprocessing
+import os
+import platform
+import shlex
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from functools import partial
+from hashlib import sha256
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from tqdm import tqdm
+
+import battery_env
+import sb3_lac
+from battery_env.files import replacing
+from battery_env.plotting import save_figure
+
+Result = TypeVar("Result")
+#: What a part makes: tables by name.
+Tables = Mapping[str, pd.DataFrame]
+
+#: How readers know the parameters.
+SYMBOLS = {"q_mobile": "q^max", "r_o": "R_o"}
+#: Seed of evaluations; no training seed comes close.
+EVALUATION_SEED = 10_000
+
+_PACKAGES = ("torch", "stable_baselines3", "gymnasium", "numpy", "numba", "scipy", "pandas", "rl_zoo3", "progpy")
+
+
+def own_versions() -> dict[str, str]:
+    """
+    The versions of the packages of this project.
+
+    :return: by package
+    """
+    return {"sb3_lac": sb3_lac.__version__, "battery_env": battery_env.__version__}
+
+
+def versions() -> dict[str, str]:
+    """
+    The versions that a result depends on.
+
+    :return: by package, with Python and the processor
+    """
+    found = {**own_versions(), "python": platform.python_version(), "processor": platform.machine()}
+    for package in _PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def write_text(path: Path, text: str) -> None:
+    """
+    Write a file beside its place and rename it, so that it is never there in part.
+
+    :param path: where to
+    :param text: its contents
+    """
+    with replacing(path) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """
+    Write a JSON file; what is no JSON is written as text.
+
+    :param path: where to
+    :param content: its contents
+    """
+    write_text(path, json.dumps(content, indent=2, default=_plain) + "\n")
+
+
+def _plain(value: Any) -> Any:
+    return value.item() if isinstance(value, np.generic) else str(value)
+
+
+def digest_of(content: Mapping[str, Any]) -> str:
+    """
+    A short name for what something was made from.
+
+    :param content: everything that it depends on
+    :return: eight hexadecimal digits, the same for equal contents
+    """
+    return sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:8]
+
+
+def digits(value: float, significant: int = 2) -> str:
+    """
+    A number as readers see it: rounded, and never in powers of ten because it is large.
+
+    :param value: the number
+    :param significant: significant digits, if it has no more before the point
+    :return: ``"-"`` for NaN, ``"never"`` for infinity: no time will do
+    """
+    if not np.isfinite(value):
+        return "-" if np.isnan(value) else "never"
+    return f"{value:.{significant}g}" if abs(value) < 10**significant - 0.5 else f"{value:.0f}"
+
+
+def with_spread(values: pd.Series) -> str:
+    """
+    Mean and standard deviation over seeds.
+
+    :param values: one per seed
+    :return: for readers; the mean alone of a single seed
+    """
+    return digits(values.mean()) + (f" ± {digits(values.std(), 1)}" if len(values) > 1 else "")
+
+
+def side_by_side(values: Iterable[float]) -> str:
+    """
+    Each of a few numbers.
+
+    :param values: one per seed
+    :return: for readers
+    """
+    return " / ".join(digits(value) for value in values)
+
+
+def markdown(rows: pd.DataFrame | Sequence[Mapping[str, Any]]) -> str:
+    """
+    A table for readers.
+
+    :param rows: its cells, as they are to be shown
+    :return: Markdown
+    """
+    return pd.DataFrame(rows).to_markdown(index=False, disable_numparse=True) + "\n"
+
+
+def positive(text: str) -> int:
+    """
+    A type of arguments of the command line.
+
+    :param text: like ``20`` or ``2e5``
+    :return: the number
+    :raises argparse.ArgumentTypeError: if it is not at least 1
+    """
+    try:
+        number = int(float(text))
+    except (ValueError, OverflowError):
+        number = 0
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"must be at least 1, got {text}")
+    return number
+
+
+def command_line(name: str, document: str | None, jobs: int | None = 2) -> argparse.ArgumentParser:
+    """
+    What the command lines of all studies have in common: ``--jobs`` and ``--out``.
+
+    :param name: of the study, that of its module
+    :param document: what it says of itself
+    :param jobs: parts at the same time by default, on as many cores; ``None`` for a study that has no parts
+    :return: the parser
+    """
+    parser = argparse.ArgumentParser(
+        prog=f"python -m benchmarks.{name}", description=document, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    if jobs is not None:
+        jobs = min(jobs, os.cpu_count() or 1)
+        parser.add_argument("--jobs", type=positive, default=jobs, help="parts at the same time, one core each")
+    parser.add_argument("--out", type=Path, default=Path("results") / name, help="folder of all results")
+    return parser
+
+
+class Study:
+    """
+    One call of a study: what was chosen, its parts, its files.
+
+    :param parser: see :func:`command_line`
+    :param arguments: of the command line by default
+    :ivar chosen: what was chosen on the command line
+    :ivar configuration: what results depend on, written beside them; all that was chosen but ``--jobs`` and ``--out``
+    """
+
+    def __init__(self, parser: argparse.ArgumentParser, arguments: Sequence[str] | None = None) -> None:
+        words = sys.argv[1:] if arguments is None else list(arguments)
+        self.chosen = parser.parse_args(words)
+        self.command = f"{parser.prog} {shlex.join(words)}".strip()
+        self.name = parser.prog.rpartition(".")[2]
+        self.out: Path = self.chosen.out
+        others = {name: value for name, value in vars(self.chosen).items() if name not in ("jobs", "out")}
+        self.configuration: dict[str, Any] = others
+
+    def run(self, part: Callable[..., Tables], parts: Sequence[Mapping[str, Any]], **places: Any) -> dict[str, pd.DataFrame]:
+        """
+        Make all parts, those that were made before from their files in ``<out>/parts``. Such a file stands for its arguments,
+        the module of the function, and the versions of this project's packages; what the function needs beside them it has
+        to keep itself.
+
+        :param part: makes one part; importable, since it is pickled
+        :param parts: the arguments of each
+        :param places: other arguments, the same for all, that results do not depend on
+        :return: tables by name, with the rows of all parts in their order
+        """
+        module = Path(inspect.getfile(part)).read_text(encoding="utf-8")
+        runs = []
+        for arguments in parts:
+            made_from = {"part": part.__name__, "arguments": arguments, "module": module, "versions": own_versions()}
+            file = self.out / "parts" / f"{part.__name__}_{digest_of(made_from)}.json"
+            runs.append((partial(part, **places), dict(arguments), file))
+        made = self.each(_made_once, runs)
+        names = dict.fromkeys(name for tables in made for name in tables)
+        return {name: pd.concat([tables[name] for tables in made if name in tables], ignore_index=True) for name in names}
+
+    def each(self, function: Callable[..., Result], runs: Sequence[tuple[Any, ...]]) -> list[Result]:
+        """
+        Call a function with each of several arguments, with a progress bar: as many at the same time as was chosen, in
+        processes of their own, or all in this one if one at a time. An interruption ends the program with a word on what is
+        done.
+
+        :param function: importable, since it is pickled
+        :param runs: positional arguments of each call
+        :return: the results, in the order of the runs
+        """
+        jobs = self.chosen.jobs
+        try:
+            if jobs == 1:
+                return [function(*run) for run in tqdm(runs, desc="parts", disable=None)]
+            # spawn: torch does not survive a fork with threads
+            with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
+                futures = [pool.submit(function, *run) for run in runs]
+                try:
+                    for future in tqdm(as_completed(futures), desc="parts", total=len(futures), disable=None):
+                        future.result()
+                except BaseException:
+                    pool.shutdown(wait=False, cancel_futures=True)
+                    raise
+            return [future.result() for future in futures]
+        except KeyboardInterrupt:
+            sys.exit(f"\nInterrupted; what is done lies in {self.out}, and the same command goes on from there.")
+
+    def write_table(self, name: str, table: pd.DataFrame, configuration: Mapping[str, Any] | None = None) -> None:
+        """
+        Write a table as CSV, and beside it as JSON what made it: command, configuration, versions.
+
+        :param name: of the files
+        :param table: the table
+        :param configuration: in place of that of the study
+        """
+        configuration = self.configuration if configuration is None else configuration
+        write_json(
+            self.out / f"{name}.json", {"command": self.command, "configuration": configuration, "versions": versions()}
+        )
+        write_text(self.out / f"{name}.csv", table.to_csv(index=False, float_format="%.6g"))
+
+    def write(self, tables: Tables, figures: Mapping[str, Figure], text: str, name: str | None = None) -> None:
+        """
+        Write what came out, and show the text.
+
+        :param tables: by name of their files
+        :param figures: by name of their files
+        :param text: Markdown
+        :param name: of its file, that of the study by default
+        """
+        for table_name, table in tables.items():
+            self.write_table(table_name, table)
+        for figure_name, figure in figures.items():
+            save_figure(figure, self.out / f"{figure_name}.png")
+        write_text(self.out / f"{name or self.name}.md", text)
+        sys.stdout.write("\n" + text)
+
+
+def _made_once(part: Callable[..., Tables], arguments: dict[str, Any], file: Path) -> dict[str, pd.DataFrame]:
+    if not file.exists():
+        # floats in JSON are exact, and NaN and infinity are themselves
+        tables = {name: table.to_dict("list") for name, table in part(**arguments).items()}
+        write_json(file, {"arguments": arguments, "versions": versions(), "tables": tables})
+    tables = json.loads(file.read_text(encoding="utf-8"))["tables"]
+    return {name: pd.DataFrame(columns) for name, columns in tables.items()}

@@ -1,0 +1,112 @@
+"""Parts are made once and side by side, files say what made them, and numbers read well."""
+
+import json
+import operator
+import os
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from benchmarks import study
+from benchmarks.study import Study, command_line, digits, with_spread
+
+
+def a_study(tmp_path, *arguments, jobs=1):
+    parser = command_line("example", "An example.")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
+    return Study(parser, [*arguments, "--jobs", str(jobs), "--out", str(tmp_path)])
+
+
+MADE = []
+
+
+def part(seed, scale, place=None):
+    MADE.append(seed)
+    values = [scale / 3.0, np.nan, np.inf]
+    table = {"seed": seed, "value": values, "text": ["None", "", "1e5"], "is": np.array([True, False, True])}
+    return {"example": pd.DataFrame(table), "last": pd.DataFrame([{"seed": seed, "array": np.float32(0.1)}])}
+
+
+@pytest.fixture(autouse=True)
+def nothing_made():
+    MADE.clear()
+
+
+def test_parts_are_made_once_and_come_back_in_order_to_the_bit(tmp_path):
+    parts = [{"seed": seed, "scale": 1.0} for seed in (3, 1)]
+    first = a_study(tmp_path).run(part, parts)
+    again = a_study(tmp_path).run(part, parts[::-1], place=tmp_path)
+    assert MADE == [3, 1]
+    assert list(first) == ["example", "last"] and first["last"]["seed"].tolist() == [3, 1]
+    assert again["last"]["seed"].tolist() == [1, 3]
+    pd.testing.assert_frame_equal(first["example"].iloc[:3], part(3, 1.0)["example"], check_exact=True)
+
+
+def test_other_arguments_another_version_or_another_module_are_other_parts(tmp_path, monkeypatch):
+    a_study(tmp_path).run(part, [{"seed": 0, "scale": 1.0}])
+    a_study(tmp_path).run(part, [{"seed": 0, "scale": 2.0}])
+    with monkeypatch.context() as patch:
+        patch.setattr(study, "own_versions", lambda: {"sb3_lac": "99.0.0"})
+        a_study(tmp_path).run(part, [{"seed": 0, "scale": 1.0}])
+    changed = tmp_path / "changed.py"
+    changed.write_text("# another one")
+    monkeypatch.setattr(study.inspect, "getfile", lambda function: str(changed))
+    a_study(tmp_path).run(part, [{"seed": 0, "scale": 1.0}])
+    assert len(MADE) == 4 and len(list((tmp_path / "parts").iterdir())) == 4
+
+
+def test_what_is_done_before_an_interruption_is_kept(tmp_path, monkeypatch):
+    def interrupted(seed, scale):
+        if seed == 1:
+            raise KeyboardInterrupt
+        return part(seed, scale)
+
+    parts = [{"seed": seed, "scale": 1.0} for seed in (0, 1, 2)]
+    with monkeypatch.context() as patch:
+        patch.setattr(interrupted, "__name__", "part")
+        with pytest.raises(SystemExit, match="the same command goes on from there"):
+            a_study(tmp_path).run(interrupted, parts)
+    a_study(tmp_path).run(part, parts)
+    assert MADE == [0, 1, 2]
+
+
+def test_one_job_stays_in_this_process(tmp_path):
+    # what is defined here could not be pickled
+    made = a_study(tmp_path).each(lambda *run: (os.getpid(), run), [(1, "a"), (2, "b")])
+    assert made == [(os.getpid(), (1, "a")), (os.getpid(), (2, "b"))]
+    with pytest.raises(ZeroDivisionError):
+        a_study(tmp_path).each(operator.truediv, [(1, 1), (1, 0)])
+
+
+def test_several_jobs_are_other_processes_whose_results_keep_their_order(tmp_path):
+    two = a_study(tmp_path, jobs=2)
+    # the first takes longest
+    assert two.each(sum, [(range(3_000_000),), (range(3),), (range(4),)]) == [4_499_998_500_000, 3, 6]
+    assert os.getpid() not in two.each(os.getpid, [(), ()])
+    with pytest.raises(ZeroDivisionError):
+        two.each(operator.truediv, [(1, 1), (1, 0), (2, 1)])
+
+
+def test_files_say_what_made_them(tmp_path, capsys):
+    chosen = a_study(tmp_path, "--seeds", "4", "5")
+    chosen.write({"example": pd.DataFrame({"value": [1.0 / 3.0]})}, {}, "text\n")
+    assert (tmp_path / "example.csv").read_text() == "value\n0.333333\n"
+    record = json.loads((tmp_path / "example.json").read_text())
+    assert record["command"].startswith("python -m benchmarks.example --seeds 4 5 ")
+    assert record["configuration"] == {"seeds": [4, 5]} and {"torch", "sb3_lac"} <= set(record["versions"])
+    assert (tmp_path / "example.md").read_text() in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("option", [["--jobs", "0"], ["--jobs", "nan"], ["--jobs", "inf"], ["--jobs", "two"]])
+def test_what_must_be_positive_is(option, capsys):
+    with pytest.raises(SystemExit):
+        Study(command_line("example", None), option)
+    assert f"argument --jobs: must be at least 1, got {option[1]}" in capsys.readouterr().err
+
+
+def test_numbers_read_well():
+    values = [0.123, 1.26, 9.96, 99.4, 99.6, 12345.6, -0.00123, float("nan"), float("inf")]
+    assert [digits(value) for value in values] == ["0.12", "1.3", "10", "99", "100", "12346", "-0.0012", "-", "never"]
+    assert digits(123.4, 3) == "123" and digits(11.0, 1) == "11"
+    assert with_spread(pd.Series([1.0, 2.0])) == "1.5 ± 0.7" and with_spread(pd.Series([2.0])) == "2"
