@@ -36,6 +36,11 @@ class Source(NamedTuple):
     cycle: int | None
     stem: str
 
+    @property
+    def argument(self) -> str:
+        """As on the command line."""
+        return self.path if self.cycle is None else f"{self.path}:{self.cycle}"
+
 
 @dataclass(frozen=True)
 class Reading:
@@ -103,7 +108,7 @@ def _read(source: Source, reading: Reading) -> list[Recording]:
         raise ValueError(f"{path} holds no file whose name ends as that of a record ({endings})")
     elif not Path(path).exists():
         raise FileNotFoundError(
-            f"no file {path!r}; the bundled cells are given as {BUNDLED_CELLS[0]}:1, {BUNDLED_CELLS[0]}:2, ..."
+            f"no file {source.argument!r}; the bundled cells are given as {BUNDLED_CELLS[0]}:1, {BUNDLED_CELLS[0]}:2, ..."
         )
     else:
         recordings = read_recordings(path, reading.columns, reading.units, reading.discharge_is_negative)
@@ -113,7 +118,7 @@ def _read(source: Source, reading: Reading) -> list[Recording]:
     if not chosen:
         known = sorted({recording.meta["cycle"] for recording in recordings if "cycle" in recording.meta})
         has = f"has discharges {path}:{known[0]} .. {path}:{known[-1]}" if known else "has one discharge, without a number"
-        raise ValueError(f"{path} {has}, got {path}:{cycle}")
+        raise ValueError(f"{path} {has}, got {source.argument}")
     return chosen
 
 
@@ -295,8 +300,8 @@ def _title(name: str, row: Mapping[str, Any]) -> str:
         ("$q^{max}$", row["q_mobile_C"], row["sd_q_mobile_C"], 0, "C"),
         ("$R_o$", row["r_o_ohm"], row["sd_r_o_ohm"], 4, "$\\Omega$"),
     ):
-        spread = "held" if np.isnan(sd) else f"± {sd:.{digits}f}"
-        parts.append(f"{symbol} {value:.{digits}f} {spread} {unit}")
+        spread = "held" if np.isnan(sd) else f"sd {sd:.{digits}f}"
+        parts.append(f"{symbol} {value:.{digits}f} {unit} ({spread})")
     state = "settled" if row["settled"] else "not settled"
     drawn = f"{row['drawn_Ah']:.3f} Ah drawn"
     return f"{name}: {state}\n" + ", ".join([*parts, drawn, f"RMSE {1e3 * row['voltage_rmse_V']:.0f} mV"])

@@ -12,6 +12,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 
 from battery_env.arrays import FloatArray
 from battery_env.checks import LOAD_UNIT_SYMBOLS, LoadUnit
@@ -199,8 +200,9 @@ def plot_life(table: pd.DataFrame) -> Figure:
     if not table["settled"].astype(bool).all():
         handles += panels[0].plot([], [], "o", ms=3.2, mfc="white", mec="0.25", mew=0.8)
         labels.append("not settled")
-    if labels:
-        figure.legend(handles, labels, loc="outside upper center", ncols=4, frameon=False, fontsize=9)
+    handles.append(Patch(color="0.5", alpha=0.3, lw=0))
+    labels.append("± 2 sd")
+    figure.legend(handles, labels, loc="outside upper center", ncols=4, frameon=False, fontsize=9)
     return _finished(figure, *panels)
 
 

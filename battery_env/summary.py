@@ -27,6 +27,7 @@ METHODS: tuple[Method, ...] = get_args(Method)
 # A record of more samples than this is averaged over the time step of the model, or longer where it lasts longer than so many
 # steps: what lies between says nothing to the model.
 _MANY_SAMPLES = 100_000
+_MODEL_STEP_S = 1.0
 _ZERO_CELSIUS_K = 273.15
 _AMBIENT_LIMITS_C = (-60.0, 100.0)
 # The model of a cell in air warms by 2 K at 2 A, where the bundled cells warm by 16 K: that alone moves q_mobile by less than
@@ -130,9 +131,10 @@ def summarize(discharge: Discharge, settings: Settings) -> Summary:
     drawn_Ah = record.charge_C / 3600.0
     if not np.isnan(measured_eod_s):
         capacity_Ah = drawn_Ah
-    samples = len(record.time_s)
+    samples, averaged_over_s = len(record.time_s), 0.0
     if samples > _MANY_SAMPLES:
-        record = record.averaged(max(1.0, (record.time_s[-1] - record.time_s[0]) / _MANY_SAMPLES))
+        averaged_over_s = max(_MODEL_STEP_S, float(record.time_s[-1] - record.time_s[0]) / _MANY_SAMPLES)
+        record = record.averaged(averaged_over_s)
 
     ambient_C = _ambient_C(record, settings)
     cell = settings.cell or NEW_CELL
@@ -157,6 +159,7 @@ def summarize(discharge: Discharge, settings: Settings) -> Summary:
         "settled": estimate.settled,
         "reason": estimate.reason,
         "samples": samples,
+        "averaged_over_s": averaged_over_s,
         "load_on_time_s": float(record.time_s[0]),
         "drawn_Ah": drawn_Ah,
         "capacity_Ah": capacity_Ah,
@@ -221,12 +224,13 @@ def text_of(name: str, row: dict[str, Any], settings: Settings) -> str:
     in_progress = np.isnan(row["measured_eod_time_s"])
     fitted: Sequence[str] = settings.parameters
     cut_off = f"{settings.cut_off_V:g} V"
+    averaged = f", averaged over {row['averaged_over_s']:g} s," if row["averaged_over_s"] else ""
     values = {
         "q_mobile": (f"{row['q_mobile_C']:.0f} C", f"{row['sd_q_mobile_C']:.0f} C"),
         "r_o": (f"{row['r_o_ohm']:.4f} ohm", f"{row['sd_r_o_ohm']:.4f} ohm"),
     }
     lines = [
-        f"{name}: {row['samples']} samples from load-on at {row['load_on_time_s']:.1f} s, "
+        f"{name}: {row['samples']} samples{averaged} from load-on at {row['load_on_time_s']:.1f} s, "
         f"{3600.0 * row['drawn_Ah']:.0f} C drawn",
         "",
         *(f"  {key:<22}{value:>12}   {'sd ' + sd if key in fitted else 'held'}" for key, (value, sd) in values.items()),
