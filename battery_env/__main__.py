@@ -15,7 +15,7 @@ import json
 import math
 import re
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +23,8 @@ from battery_env.fleet import Reading, Results, calibrate_all, find_sources
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.summary import METHODS, Settings, text_of
 
-#: What the process returns: all records settled, one or more refused, one or more not settled.
-SETTLED, REFUSED, NOT_SETTLED = 0, 2, 3
+#: What the process returns: all records settled, one or more refused, one or more not settled, stopped by Ctrl-C.
+SETTLED, REFUSED, NOT_SETTLED, INTERRUPTED = 0, 2, 3, 130
 
 _QUANTITY = re.compile(r",\s*(?=\w+=)")
 
@@ -185,6 +185,7 @@ def calibrate(arguments: Sequence[str] | None = None, name: str = "battery-calib
     :return: as :func:`main`
     """
     options = _parser(name).parse_args(arguments)
+    interrupted = False
     try:
         settings = Settings(
             method=options.method,
@@ -201,7 +202,16 @@ def calibrate(arguments: Sequence[str] | None = None, name: str = "battery-calib
         sources = find_sources(options.records)
         results = Results(options.out, sources, not options.table_only, options.force) if options.out else None
         reading = Reading(options.columns, options.units, options.discharge_is_negative)
-        rows = _shown(calibrate_all(sources, reading, settings, results, options.jobs), settings, options.json)
+        rows: list[dict[str, Any]] = []
+        try:
+            for row in calibrate_all(sources, reading, settings, results, options.jobs):
+                rows.append(row)
+                _show(row, rows, options.json)
+        except KeyboardInterrupt:
+            print("interrupted: what is done is kept", file=sys.stderr)
+            interrupted = True
+        if not options.json:
+            _conclude(rows, settings)
         if results and any(not row["error"] for row in rows):
             written = results.write_table(rows)
             if not options.json:
@@ -209,34 +219,33 @@ def calibrate(arguments: Sequence[str] | None = None, name: str = "battery-calib
     except (ValueError, TypeError, OSError, ImportError) as error:
         print(f"error: {error}", file=sys.stderr)
         return REFUSED
+    if interrupted:
+        return INTERRUPTED
     if any(row["error"] for row in rows):
         return REFUSED
     return SETTLED if all(row["settled"] for row in rows) else NOT_SETTLED
 
 
-def _shown(rows: Iterable[dict[str, Any]], settings: Settings, as_json: bool) -> list[dict[str, Any]]:
-    """All rows, printed as they come: a single one in full, and of several a line each."""
-    done: list[dict[str, Any]] = []
-    for row in rows:
-        done.append(row)
-        if as_json:
-            print(json.dumps({key: _plain(value) for key, value in row.items()}), flush=True)
-        if row["notes"]:
-            print(f"warning: {row['record']}: {row['notes']}", file=sys.stderr)
-        if row["error"]:
-            print(f"error: {row['error']}", file=sys.stderr, flush=True)
-        if len(done) > 1 and not as_json:
-            for each in done if len(done) == 2 else done[-1:]:
-                _print_line(each)
-    if as_json or not done:
-        return done
+def _show(row: dict[str, Any], done: Sequence[dict[str, Any]], as_json: bool) -> None:
+    """Prints a row as it comes: a line each, but the first one waits, as it is printed in full if it stays the only one."""
+    if as_json:
+        print(json.dumps({key: _plain(value) for key, value in row.items()}), flush=True)
+    if row["notes"]:
+        print(f"warning: {row['record']}: {row['notes']}", file=sys.stderr)
+    if row["error"]:
+        print(f"error: {row['error']}", file=sys.stderr, flush=True)
+    if len(done) > 1 and not as_json:
+        for each in done if len(done) == 2 else done[-1:]:
+            _print_line(each)
+
+
+def _conclude(done: Sequence[dict[str, Any]], settings: Settings) -> None:
     if len(done) > 1:
         settled = sum(not row["error"] and row["settled"] for row in done)
         refused = sum(bool(row["error"]) for row in done)
         print(f"\n{len(done)} discharges: {settled} settled, {len(done) - settled - refused} not settled, {refused} refused")
-    elif not done[0]["error"]:
+    elif done and not done[0]["error"]:
         print(text_of(done[0]["record"], done[0], settings))
-    return done
 
 
 def _print_line(row: dict[str, Any]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -138,8 +139,11 @@ class Results:
         prefix = f"{_record_name(sources[0].stem, sources[0].cycle)}_" if len(sources) == 1 else ""
         self.table, self.parquet = folder / f"{prefix}estimate.csv", folder / f"{prefix}estimate.parquet"
         self.life = folder / f"{prefix}life.png"
-        if folder.exists() and not folder.is_dir():
-            raise FileExistsError(f"{folder} is a file: choose another --out")
+        there = next(path for path in (folder, *folder.parents) if path.exists())
+        if not there.is_dir():
+            raise FileExistsError(f"{there} is a file: choose another --out")
+        if not os.access(there, os.W_OK):
+            raise PermissionError(f"{there} cannot be written to: choose another --out")
         existing = self._existing(sources)
         if existing and not replace:
             more = f" and {len(existing) - 3} more" if len(existing) > 3 else ""

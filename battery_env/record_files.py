@@ -161,7 +161,7 @@ class _Table:
 
     def recordings(self, source: str, discharge_is_negative: bool | None) -> list[Recording]:
         cycles = self.columns.get("cycle")
-        if cycles is not None and not (np.mod(cycles, 1.0) == 0.0).all():
+        if cycles is not None and not (np.isfinite(cycles).all() and (cycles == np.round(cycles)).all()):
             raise ValueError("the column of the cycle must hold whole numbers")
         self._accumulate_step_times()
         self._drop_repeated()

@@ -138,7 +138,9 @@ def _layout(head: bytes, chosen: Mapping[str, str] | None) -> _Layout:
                 best, found = (number, delimiter), count
     number, delimiter = best
     if found <= 0:
-        number = next(n for n, line in enumerate(lines) if line.strip())
+        number = next((n for n, line in enumerate(lines) if line.strip()), -1)
+        if number < 0:
+            raise ValueError("the file is empty")
         delimiter = max(_DELIMITERS, key=lambda each: len(_fields(lines[number], each)))
     values = [field for line in lines[number + 1 :] for field in _fields(line, delimiter)]
     comma = delimiter != "," and any(map(_DECIMAL_COMMA.match, values)) and not any(map(_DECIMAL_POINT.match, values))

@@ -38,7 +38,7 @@ def test_example_files_run(example, tmp_path, monkeypatch):
 def test_commands_of_the_calibrator_run_and_exit_as_their_page_says(tmp_path, monkeypatch):
     page = ROOT / "docs/command_line.md"
     run_briefly("\n".join(blocks(page, "python")), str(page), tmp_path, monkeypatch)
-    lines = "\n".join(blocks(page, "bash")).splitlines()
+    lines = list(filter(None, "\n".join(blocks(page, "bash")).splitlines()))
     assert len(lines) > 5
     for line in lines:
         name, *arguments = shlex.split(line, comments=True)

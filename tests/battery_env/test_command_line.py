@@ -7,9 +7,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from battery_env import fleet
 from battery_env.__main__ import calibrate, main
 from battery_env.cells import Discharge, load_nasa_discharges
 from battery_env.electrochemistry import simulate
+from battery_env.summary import summarize
 
 
 @pytest.fixture(scope="module")
@@ -222,6 +224,18 @@ def test_existing_results_are_found_before_any_work_is_done(lab, tmp_path, capsy
     assert [path.name for path in tmp_path.iterdir()] == ["life_017_voltage.csv"]
     (tmp_path / "file").write_text("")
     assert "is a file" in fails(["B0005:1", "--out", str(tmp_path / "file")], capsys)
+
+
+def test_what_was_done_before_an_interruption_is_kept(lab, tmp_path, monkeypatch, capsys):
+    def interrupted(discharge, settings):
+        if discharge.meta["cycle"] == 2:
+            raise KeyboardInterrupt
+        return summarize(discharge, settings)
+
+    monkeypatch.setattr(fleet, "summarize", interrupted)
+    assert main(["calibrate", f"{lab}/life.csv", "--out", str(tmp_path), "--table-only"]) == 130
+    assert "interrupted" in capsys.readouterr().err
+    assert list(pd.read_csv(tmp_path / "life_estimate.csv")["record"]) == ["life_001"]
 
 
 def test_a_folder_without_records_says_so(tmp_path, capsys):

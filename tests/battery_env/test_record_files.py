@@ -407,6 +407,31 @@ def test_any_mixture_of_units_signs_and_orders_is_read_the_same(
     check(one(tmp_path / "cell.csv"))
 
 
+CELLS = st.one_of(st.floats(width=32).map(str), st.sampled_from(["", "NaN", "4.1", "2", "-2", "0:10", "x", "1e400", '"']))
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    st.one_of(
+        st.binary(max_size=300),
+        st.text(max_size=300).map(lambda text: text.encode("utf-8", errors="replace")),
+        st.lists(st.lists(CELLS, max_size=7).map(",".join), max_size=12).map(
+            lambda rows: "\n".join(["time_s,voltage_V,current_A,temperature_C,cycle,step,state", *rows]).encode()
+        ),
+    )
+)
+def test_whatever_a_file_holds_it_is_read_or_refused_in_a_line(tmp_path, content):
+    (tmp_path / "any.csv").write_bytes(content)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        try:
+            discharges = read_discharges(tmp_path / "any.csv")
+        except ValueError as error:
+            assert "any.csv: " in str(error) and "\n" not in str(error).strip()
+        else:
+            assert all(discharge.charge_C > 0.0 for discharge in discharges)
+
+
 @settings(max_examples=60)
 @given(st.lists(st.text(max_size=20), max_size=6))
 def test_no_header_breaks_the_search_for_columns(names):
