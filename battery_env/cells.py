@@ -71,7 +71,7 @@ class Discharge:
         if not _DURATION_LIMITS_S[0] <= duration_s <= _DURATION_LIMITS_S[1]:
             raise ValueError(
                 f"time_s must span {_DURATION_LIMITS_S[0]:g} .. {_DURATION_LIMITS_S[1]:g} s, got {duration_s:g} s. "
-                "Give the time in seconds, not in hours or milliseconds."
+                "Give the time in seconds, not in hours or milliseconds (command line: --units time=h)."
             )
         check_drawn_charge(self.charge_C)
 

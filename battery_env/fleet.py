@@ -245,7 +245,9 @@ def _tasks(sources: Sequence[Source], reading: Reading) -> Iterator[_Task]:
                 recordings = _read(source, reading)
             except Exception as error:  # of whatever kind, it must not stop the others
                 name = _unused(_record_name(source.stem, source.cycle), used)
-                yield _Task(_known(name, source, source.cycle, caught, _message(error, source.path)), None)
+                text = _message(error)
+                text = text if source.path in text else f"{source.path}: {text}"
+                yield _Task(_known(name, source, source.cycle, caught, text), None)
                 continue
         for recording in recordings:
             cycle = recording.meta.get("cycle")
@@ -274,11 +276,10 @@ def _unused(name: str, used: set[str]) -> str:
     return unused
 
 
-def _message(error: Exception, name: str) -> str:
+def _message(error: Exception) -> str:
     text = " ".join(str(error).split())
     expected = (ValueError, TypeError, OSError, ImportError)
-    text = text if isinstance(error, expected) and text else f"{type(error).__name__}: {text}"
-    return text if name in text else f"{name}: {text}"
+    return text if isinstance(error, expected) and text else f"{type(error).__name__}: {text}"
 
 
 def _calibrate(task: _Task, settings: Settings, results: Results | None) -> dict[str, Any]:
@@ -293,7 +294,7 @@ def _calibrate(task: _Task, settings: Settings, results: Results | None) -> dict
             if results is not None:
                 results.write_voltages(name, summary, _title(name, summary.row))
         except Exception as error:  # of whatever kind, it must not stop the others
-            return known | {"error": _message(error, name)}
+            return known | {"error": f"{name}: {_message(error)}"}
     notes = "; ".join(filter(None, [known["notes"], *(str(each.message) for each in caught)]))
     return {name: known[name] for name in ("record", "source", "cell", "cycle")} | summary.row | {"notes": notes, "error": ""}
 

@@ -66,10 +66,10 @@ def read_discharges(
     """
     Read the discharges of a file.
 
-    The file is text with a header (commas, semicolons or tabs, decimal points or commas, also packed as .gz, .bz2, .xz or
-    .zip), Parquet, one of NASA's .mat files, or with the extra ``cyclers`` a binary file of Neware (.nda, .ndax) or BioLogic
-    (.mpr). Columns go by the names that testers give them, the Battery Data Format's, Arbin's, Maccor's, Neware's and
-    BioLogic's among them; their units are told from the names.
+    The file is text with a header (commas, semicolons, tabs or blanks, decimal points or commas, also packed as .gz, .bz2,
+    .xz or .zip), Parquet, one of NASA's .mat files, or with the extra ``cyclers`` a binary file of Neware (.nda, .ndax) or
+    BioLogic (.mpr). Columns go by the names that testers give them, the Battery Data Format's, Arbin's, Maccor's, Neware's
+    and BioLogic's among them; their units are told from the names.
 
     A file may hold charges and rests as well, and many cycles. A discharge is what lies between two charges, with the rest
     before the load; it is numbered by the cycle that the file gives, or else counted. If there are several, each has its own
@@ -170,7 +170,7 @@ class _Table:
             bad = np.flatnonzero(~np.isfinite(self.columns[name]))
             if len(bad):
                 raise ValueError(
-                    f"the {name} must be finite, got {self.columns[name][bad[0]]} in row {bad[0] + 1}. Remove it."
+                    f"the {name} must be finite, got {self.columns[name][bad[0]]} in row {bad[0] + 1}. Remove such rows."
                 )
         self._turn_current(discharge_is_negative)
         return self._split(source)

@@ -25,8 +25,10 @@ PACKED_SUFFIXES = (".gz", ".bz2", ".xz", ".zip")
 _OPENERS: dict[str, Callable[[Path], Any]] = {".gz": gzip.open, ".bz2": bz2.open, ".xz": lzma.open}
 # Testers write what they know about a test above the table: so many bytes and lines are searched for its header.
 _HEAD_BYTES, _HEAD_LINES = 1 << 18, 400
-_DELIMITERS = (",", ";", "\t")
+_BLANKS = r"\s+"
+_DELIMITERS = (",", ";", "\t", _BLANKS)
 _DECIMAL_COMMA = re.compile(r"^\s*[-+]?\d+,\d+(?:[eE][-+]?\d+)?\s*$")
+_NUMBER = re.compile(r"^\s*[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?(?:[;\s]|$)")
 _DECIMAL_POINT = re.compile(r"^\s*[-+]?\d*\.\d+(?:[eE][-+]?\d+)?\s*$")
 _EXPORT = {
     ".xls": "save the sheet as CSV",
@@ -141,9 +143,15 @@ def _layout(head: bytes, chosen: Mapping[str, str] | None) -> _Layout:
         number = next((n for n, line in enumerate(lines) if line.strip()), -1)
         if number < 0:
             raise ValueError("the file is empty")
+        if any(map(_NUMBER.match, lines[number].split(","))):
+            raise ValueError("there is no line with the names of the columns above the numbers. Add one")
         delimiter = max(_DELIMITERS, key=lambda each: len(_fields(lines[number], each)))
     values = [field for line in lines[number + 1 :] for field in _fields(line, delimiter)]
-    comma = delimiter != "," and any(map(_DECIMAL_COMMA.match, values)) and not any(map(_DECIMAL_POINT.match, values))
+    comma = (
+        delimiter not in (",", _BLANKS)
+        and any(map(_DECIMAL_COMMA.match, values))
+        and not any(map(_DECIMAL_POINT.match, values))
+    )
     return _Layout(encoding, number, delimiter, "," if comma else ".", _fields(lines[number], delimiter))
 
 
@@ -161,6 +169,10 @@ def _decoded(head: bytes) -> tuple[str, str]:
 
 
 def _fields(line: str, delimiter: str) -> list[str]:
+    # numpy writes a header as a comment
+    line = line.lstrip("# ")
+    if delimiter == _BLANKS:
+        return line.split()
     try:
         return [field.strip() for field in next(csv.reader([line], delimiter=delimiter), [])]
     except csv.Error:

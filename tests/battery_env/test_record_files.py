@@ -125,6 +125,13 @@ def test_delimiters_decimal_marks_and_encodings_are_told(delimiter, decimal, enc
     check(one(tmp_path / "zelle.csv"))
 
 
+@pytest.mark.parametrize("comments", ["# ", ""])
+def test_blanks_separate_columns_as_numpy_writes_them(comments, tmp_path):
+    columns = np.column_stack([TIME_S, VOLTAGE_V, CURRENT_A])
+    np.savetxt(tmp_path / "cell.dat", columns, header="time_s voltage_V current_A", comments=comments, fmt="%10.6f")
+    check(one(tmp_path / "cell.dat"))
+
+
 def test_maccor_says_the_direction_of_the_current_by_a_letter(tmp_path):
     lines = ["Today's Date\t02/28/2026", "Rec#\tCyc#\tStep\tTest (Sec)\tStep (Sec)\tAmp-hr\tAmps\tVolts\tState\tES\t"]
     charge = [(60.0 * n, 1.0, 3.5 + 0.01 * n, "C", 1) for n in range(60)]
@@ -306,6 +313,8 @@ def test_what_is_no_table_is_refused_in_one_line(tmp_path):
     cases = {
         "empty.csv": (b"", "is empty"),
         "header.csv": (b"time_s,voltage_V,current_A\n", "no rows below the header"),
+        "headless.csv": (b"0.0,4.19,0\n1.0,4.18,2\n", "no line with the names of the columns"),
+        "blank.dat": (b"0.0 4.19 0\n1.0 4.18 2\n", "no line with the names of the columns"),
         "text.txt": (b"Dear all,\nplease find the data attached.\n", "no column for the time"),
         "cut.csv.gz": (truncated, "damaged"),
         "no.csv.gz": (b"time_s,voltage_V,current_A\n", "damaged"),
