@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
 
 from battery_env.arrays import FloatArray
 from battery_env.checks import LOAD_UNIT_SYMBOLS, LoadUnit
@@ -191,8 +192,12 @@ def plot_life(table: pd.DataFrame) -> Figure:
             axes.plot(cycle[~settled], values[~settled], "o", ms=3.2, mfc="white", mec=colour, mew=0.8)
     for axes, label in zip(panels, _LIFE_COLUMNS.values(), strict=True):
         axes.set_ylabel(label)
-    panels[0].set_ylim(*_limits([table["q_mobile_C"].to_numpy(dtype=np.float64)]))
-    panels[1].set_ylim(*_limits([table["r_o_ohm"].to_numpy(dtype=np.float64)]))
+    for axes, value, sd in zip(panels, _LIFE_COLUMNS, ("sd_q_mobile_C", "sd_r_o_ohm"), strict=False):
+        values, reach = table[value].to_numpy(dtype=np.float64), 2.0 * table[sd].to_numpy(dtype=np.float64)
+        # the bands of what is not settled may be of any width
+        reach[~table["settled"].to_numpy(dtype=np.bool_) | np.isnan(reach)] = 0.0
+        axes.set_ylim(*_limits([values - reach, values + reach]))
+    panels[-1].xaxis.set_major_locator(MaxNLocator(integer=True))
     panels[-1].set_xlabel("file" if one_each else "discharge")
     handles, labels = panels[0].get_legend_handles_labels()
     kinds = [pair for pair in zip(handles, labels, strict=True) if pair[1]][: len(COLOURS)]
