@@ -25,6 +25,7 @@ if TYPE_CHECKING:
         cramer_rao_bound,
     )
     from battery_env.evaluation import evaluate
+    from battery_env.record_files import read_discharges
     from battery_env.record_model import RecordModel
     from battery_env.sensors import RandomSensorErrors, SensorErrors
     from battery_env.trajectories import TrajectoryDataset
@@ -52,6 +53,7 @@ _MODULES = {
     "initial_state": "battery_env.electrochemistry",
     "load_nasa_discharges": "battery_env.cells",
     "read_discharge_csv": "battery_env.cells",
+    "read_discharges": "battery_env.record_files",
     "simulate": "battery_env.electrochemistry",
     "step": "battery_env.electrochemistry",
     "voltage": "battery_env.electrochemistry",
@@ -81,6 +83,7 @@ __all__ = [
     "initial_state",
     "load_nasa_discharges",
     "read_discharge_csv",
+    "read_discharges",
     "register_environments",
     "simulate",
     "step",

@@ -1,92 +1,163 @@
 """
-The command line: what a record of a discharge says about its cell.
+The command line: what records of discharges say about their cells.
 
 .. code-block:: bash
 
   python -m battery_env calibrate discharge.csv
   python -m battery_env calibrate B0005:12 --out results/B0005
+  battery-calibrate lab/ --out results --jobs 2
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import math
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import pandas as pd
-
-from battery_env.cells import BUNDLED_CELLS, Discharge, load_nasa_discharges, read_discharge_csv
-from battery_env.electrochemistry import NEW_CELL
-from battery_env.estimates import Estimate
-from battery_env.estimators.least_squares import LeastSquares
-from battery_env.files import replacing
+from battery_env.fleet import Reading, Results, calibrate_all, find_sources
 from battery_env.parameters import PARAMETER_NAMES
-from battery_env.plotting import plot_discharge, save_figure
-from battery_env.record_model import Forecast
-from battery_env.records import ExpectedCurrent, expected_current
+from battery_env.summary import METHODS, Settings, text_of
+
+#: What the process returns: all records settled, one or more refused, one or more not settled, stopped by Ctrl-C.
+SETTLED, REFUSED, NOT_SETTLED, INTERRUPTED = 0, 2, 3, 130
+
+_QUANTITY = re.compile(r",\s*(?=\w+=)")
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m battery_env", description="Calibrate a battery model to real cells.")
-    commands = parser.add_subparsers(dest="command", required=True)
-    calibrate = commands.add_parser(
-        "calibrate",
-        help="capacity and resistance of a cell from one discharge",
+def _parser(name: str) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=name,
         description=(
-            "Fit the charge that can move, q_mobile, and the ohmic resistance, r_o, of the model to one discharge that "
-            "starts with a full cell, and predict when the cut-off voltage is reached."
+            "Fit the charge that can move, q_mobile, and the ohmic resistance, r_o, of the model to discharges that each "
+            "start with a full cell, and predict when the cut-off voltage is reached."
         ),
+        epilog="Exit status: 0 if every discharge is settled, 3 if one is not, 2 if one cannot be used.",
+        allow_abbrev=False,
     )
-    calibrate.add_argument(
-        "record",
-        help="file of comma-separated values with columns time_s, voltage_V, current_A (positive = discharge) and, if "
-        "measured, temperature_C; or a bundled cell and its discharge, such as B0005:12",
+    parser.add_argument(
+        "records",
+        nargs="+",
+        metavar="FILE",
+        help="text of any delimiter, Parquet, NASA's .mat, Neware's .nda and .ndax, BioLogic's .mpr; a folder of them; "
+        "FILE:CYCLE for one discharge of a life; or a bundled cell, B0005, and its discharge, B0005:12",
     )
-    calibrate.add_argument(
+    _add_reading(parser.add_argument_group("reading"))
+    _add_calibration(parser.add_argument_group("calibration"))
+    _add_results(parser.add_argument_group("results"))
+    return parser
+
+
+def _add_reading(group: argparse._ArgumentGroup) -> None:
+    group.add_argument(
+        "--columns",
+        type=_assignments,
+        metavar="time=NAME,...",
+        help="names of the columns of time, voltage, current, temperature, ambient, cycle, step and state, where their names "
+        "do not tell",
+    )
+    group.add_argument(
+        "--units",
+        type=_assignments,
+        metavar="time=UNIT,...",
+        help="their units, where the names do not tell: s, ms, min, h; V, mV; A, mA; degC, K",
+    )
+    sign = group.add_mutually_exclusive_group()
+    sign.add_argument(
+        "--discharge-is-negative",
+        action="store_const",
+        const=True,
+        dest="discharge_is_negative",
+        help="the files count discharge as negative (default: told from the voltage)",
+    )
+    sign.add_argument(
+        "--discharge-is-positive", action="store_const", const=False, dest="discharge_is_negative", help="or as positive"
+    )
+
+
+def _add_calibration(group: argparse._ArgumentGroup) -> None:
+    group.add_argument(
+        "--method",
+        choices=METHODS,
+        default=METHODS[0],
+        help="least squares for whole discharges, the filter for one in progress without a prior (default: %(default)s)",
+    )
+    group.add_argument(
         "--parameters",
         nargs="+",
         choices=PARAMETER_NAMES,
         default=PARAMETER_NAMES,
-        help="what to fit; the other is held at the new cell's value (default: both)",
+        help="what to fit; the other is held at the cell's value (default: both). Give it after the files",
     )
-    calibrate.add_argument(
+    group.add_argument(
         "--cut-off", type=float, default=2.7, metavar="V", help="voltage at which the discharge ends, V (default: %(default)s)"
     )
-    calibrate.add_argument(
+    group.add_argument(
+        "--prior",
         "--prior-q",
         nargs=2,
         type=float,
         metavar=("MEAN", "SD"),
         help="q_mobile as known from an earlier discharge, C; while a discharge is in progress the estimate rests on it",
     )
-    calibrate.add_argument(
+    group.add_argument(
         "--mismatch",
         type=float,
         default=0.05,
         metavar="V",
         help="error to expect of the model itself, V; 0 for simulated data (default: %(default)s)",
     )
-    calibrate.add_argument(
+    group.add_argument(
         "--current-gain-sd",
         type=float,
         default=0.005,
         metavar="SHARE",
         help="standard deviation of the gain of the current sensor, which q_mobile and r_o share (default: %(default)s)",
     )
-    calibrate.add_argument(
+    group.add_argument(
         "--future-current",
         type=float,
         metavar="A",
         help="current after the end of a record in progress, A (default: its last one, or its mean if it varied)",
     )
-    calibrate.add_argument("--isothermal", action="store_true", help="keep the temperature of the model constant")
-    calibrate.add_argument("--discharge-is-negative", action="store_true", help="the file counts discharge as negative")
-    calibrate.add_argument("--out", type=Path, metavar="DIR", help="write the estimate, the voltages and a figure there")
-    calibrate.add_argument("--force", action="store_true", help="replace results that are there already")
-    return parser
+    group.add_argument("--nominal", type=float, metavar="AH", help="nominal capacity, Ah, which the state of health refers to")
+    group.add_argument(
+        "--ambient",
+        type=float,
+        metavar="DEGC",
+        help="temperature of the surroundings, degC (default: the first one measured, or the model cell's 19 degC)",
+    )
+    group.add_argument("--isothermal", action="store_true", help="keep the temperature of the model constant")
+
+
+def _add_results(group: argparse._ArgumentGroup) -> None:
+    group.add_argument(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="write the table of estimates (CSV, Parquet), the voltages and figures there",
+    )
+    group.add_argument("--table-only", action="store_true", help="write no voltages of single discharges")
+    group.add_argument("--force", action="store_true", help="replace results that are there already")
+    group.add_argument("--json", action="store_true", help="print one JSON object a discharge and line")
+    group.add_argument(
+        "--jobs",
+        type=int,
+        default=1,
+        metavar="N",
+        help="processes; -1: one a core (default: %(default)s, needs joblib for more)",
+    )
+
+
+def _assignments(text: str) -> dict[str, str]:
+    pairs = [part.partition("=") for part in _QUANTITY.split(text)]
+    if any(not (name.strip() and equals and value.strip()) for name, equals, value in pairs):
+        raise argparse.ArgumentTypeError(f"expected quantity=NAME,quantity=NAME, got {text!r}")
+    return {name.strip(): value.strip() for name, _, value in pairs}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -94,127 +165,104 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Run one command.
 
     :param arguments: of the command line; ``None``: those of this process
-    :return: 0, or 2 if the input cannot be used; then one line on standard error says why
+    :return: 0 if all discharges are settled, 3 if one is not, and 2 if one cannot be used or nothing was done; then a line on
+        standard error says why
     """
-    options = _parser().parse_args(arguments)
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    parser = argparse.ArgumentParser(prog="python -m battery_env", description="Calibrate a battery model to real cells.")
+    commands = parser.add_subparsers(dest="command", required=True)
+    commands.add_parser("calibrate", help="capacity and resistance of cells from their discharges", add_help=False)
+    parser.parse_args(given[:1])
+    return calibrate(given[1:], "python -m battery_env calibrate")
+
+
+def calibrate(arguments: Sequence[str] | None = None, name: str = "battery-calibrate") -> int:
+    """
+    The command ``calibrate``, which is also installed as ``battery-calibrate``.
+
+    :param arguments: as in :func:`main`, without the name of the command
+    :param name: of the program, for its help
+    :return: as :func:`main`
+    """
+    options = _parser(name).parse_args(arguments)
+    interrupted = False
     try:
-        _calibrate(options)
-    except (ValueError, TypeError, OSError) as error:
+        settings = Settings(
+            method=options.method,
+            parameters=tuple(options.parameters),
+            cut_off_V=options.cut_off,
+            prior_q_mobile_C=tuple(options.prior) if options.prior else None,
+            mismatch_V=options.mismatch,
+            current_gain_sd=options.current_gain_sd,
+            future_current_A=options.future_current,
+            thermal=not options.isothermal,
+            ambient_C=options.ambient,
+            nominal_Ah=options.nominal,
+        )
+        sources = find_sources(options.records)
+        results = Results(options.out, sources, not options.table_only, options.force) if options.out else None
+        reading = Reading(options.columns, options.units, options.discharge_is_negative)
+        rows: list[dict[str, Any]] = []
+        try:
+            for row in calibrate_all(sources, reading, settings, results, options.jobs):
+                rows.append(row)
+                _show(row, rows, options.json)
+        except KeyboardInterrupt:
+            print("interrupted: what is done is kept", file=sys.stderr)
+            interrupted = True
+        if not options.json:
+            _conclude(rows, settings)
+        if results and any(not row["error"] for row in rows):
+            written = results.write_table(rows)
+            if not options.json:
+                print("\nwritten: " + ", ".join(map(str, written)))
+    except (ValueError, TypeError, OSError, ImportError) as error:
         print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+        return REFUSED
+    if interrupted:
+        return INTERRUPTED
+    if any(row["error"] for row in rows):
+        return REFUSED
+    return SETTLED if all(row["settled"] for row in rows) else NOT_SETTLED
 
 
-def _calibrate(options: argparse.Namespace) -> None:
-    name, discharge = _read(options.record, options.discharge_is_negative)
-    outputs = (
-        [options.out / f"{name}_{kind}" for kind in ("estimate.csv", "voltage.csv", "voltage.png")] if options.out else []
+def _show(row: dict[str, Any], done: Sequence[dict[str, Any]], as_json: bool) -> None:
+    """Prints a row as it comes: a line each, but the first one waits, as it is printed in full if it stays the only one."""
+    if as_json:
+        print(json.dumps({key: _plain(value) for key, value in row.items()}), flush=True)
+    if row["notes"]:
+        print(f"warning: {row['record']}: {row['notes']}", file=sys.stderr)
+    if row["error"]:
+        print(f"error: {row['error']}", file=sys.stderr, flush=True)
+    if len(done) > 1 and not as_json:
+        for each in done if len(done) == 2 else done[-1:]:
+            _print_line(each)
+
+
+def _conclude(done: Sequence[dict[str, Any]], settings: Settings) -> None:
+    if len(done) > 1:
+        settled = sum(not row["error"] and row["settled"] for row in done)
+        refused = sum(bool(row["error"]) for row in done)
+        print(f"\n{len(done)} discharges: {settled} settled, {len(done) - settled - refused} not settled, {refused} refused")
+    elif done and not done[0]["error"]:
+        print(text_of(done[0]["record"], done[0], settings))
+
+
+def _print_line(row: dict[str, Any]) -> None:
+    if row["error"]:
+        return
+    health = "" if math.isnan(row["state_of_health"]) else f"  health {row['state_of_health']:.3f}"
+    print(
+        f"{row['record']:<18} q_mobile {row['q_mobile_C']:5.0f} C sd {row['sd_q_mobile_C']:3.0f}  r_o {row['r_o_ohm']:.4f} "
+        f"ohm sd {row['sd_r_o_ohm']:.4f}  drawn {row['drawn_Ah']:.3f} Ah{health}  RMSE {1e3 * row['voltage_rmse_V']:3.0f} mV  "
+        f"{'settled' if row['settled'] else 'not settled: ' + row['reason']}",
+        flush=True,
     )
-    existing = [str(path) for path in outputs if path.exists()]
-    if existing and not options.force:
-        raise FileExistsError(f"{', '.join(existing)} would be replaced; choose another --out, or give --force")
-
-    record = discharge.loaded_part(options.cut_off)
-    calibrator = LeastSquares(
-        options.parameters,
-        thermal=not options.isothermal,
-        prior_q_mobile_C=tuple(options.prior_q) if options.prior_q else None,
-        mismatch_V=options.mismatch,
-        current_gain_sd=options.current_gain_sd,
-    )
-    estimate = calibrator.estimate(record)
-    future = expected_current(record.time_s, record.current_A)
-    if options.future_current is not None:
-        future = ExpectedCurrent(options.future_current, varied=False, sd_A=0.0)
-    forecast = calibrator.model.forecast(record, estimate, options.cut_off, future.mean_A)
-    row = _summary(record, estimate, forecast, discharge.eod_time_s(options.cut_off), future)
-    if "q_mobile" not in options.parameters:
-        row["state_of_health"] = float("nan")
-    _print(name, record, row, options.parameters, options.cut_off, future)
-    if not options.prior_q and not estimate.settled and np.isnan(row["measured_eod_time_s"]):
-        print("During a discharge give --prior-q with the q_mobile of an earlier one of this cell. Without it the filter in")
-        print("Python, ExtendedKalmanFilter(thermal=True, mismatch_V=0.05), predicts the end better than this fit.")
-    if outputs:
-        with replacing(outputs[0]) as part:
-            pd.DataFrame([{"record": name, **row}]).to_csv(part, index=False)
-        columns = {"time_s": record.time_s, "voltage_V": record.voltage_V, "current_A": record.current_A}
-        with replacing(outputs[1]) as part:
-            pd.DataFrame(columns | {"model_V": forecast.at_samples_V}).to_csv(part, index=False)
-        save_figure(plot_discharge(record, {name: forecast}), outputs[2])
-        print("\nwritten: " + ", ".join(map(str, outputs)))
 
 
-def _read(record: str, discharge_is_negative: bool) -> tuple[str, Discharge]:
-    """A file, or ``CELL:CYCLE`` of a bundled cell; and what to call its results."""
-    cell, colon, cycle = record.partition(":")
-    if cell not in BUNDLED_CELLS:
-        path = Path(record)
-        if not path.is_file():
-            raise FileNotFoundError(
-                f"no file {record!r}; the bundled cells are given as {BUNDLED_CELLS[0]}:1, {BUNDLED_CELLS[0]}:2, ..."
-            )
-        return path.name.split(".")[0], read_discharge_csv(path, discharge_is_negative)
-    discharges = load_nasa_discharges(cell)
-    if not (colon and cycle.isdecimal() and 1 <= int(cycle) <= len(discharges)):
-        raise ValueError(f"{cell} has discharges {cell}:1 .. {cell}:{len(discharges)}, got {record!r}")
-    return f"{cell}_{int(cycle):03d}", discharges[int(cycle) - 1]
-
-
-def _summary(
-    record: Discharge, estimate: Estimate, forecast: Forecast, measured_eod_s: float, future: ExpectedCurrent
-) -> dict[str, Any]:
-    remaining_s = max(forecast.eod_time_s - float(record.time_s[-1]), 0.0) if np.isnan(measured_eod_s) else 0.0
-    residual_V = forecast.at_samples_V - record.voltage_V
-    return {
-        "q_mobile_C": estimate.q_mobile,
-        "sd_q_mobile_C": estimate.sd_q_mobile,
-        "r_o_ohm": estimate.r_o,
-        "sd_r_o_ohm": estimate.sd_r_o,
-        "settled": estimate.settled,
-        "reason": estimate.reason,
-        "drawn_Ah": record.charge_C / 3600.0,
-        "state_of_health": estimate.q_mobile / NEW_CELL.q_mobile,
-        "voltage_rmse_V": float(np.sqrt(np.nanmean(residual_V**2))),
-        "predicted_eod_time_s": forecast.eod_time_s,
-        "sd_predicted_eod_time_s": _sd_eod_s(estimate, remaining_s, future),
-        "measured_eod_time_s": measured_eod_s,
-        "remaining_s": remaining_s,
-        "future_current_A": future.mean_A,
-    }
-
-
-def _sd_eod_s(estimate: Estimate, remaining_s: float, future: ExpectedCurrent) -> float:
-    """The charge still to come moves with q_mobile, and is drawn at a current that may not be the one assumed."""
-    if not future.mean_A > 0.0:
-        return float("nan")
-    return float(np.hypot(estimate.sd_q_mobile, remaining_s * future.sd_A)) / future.mean_A
-
-
-def _print(
-    name: str, record: Discharge, row: dict[str, Any], fitted: Sequence[str], cut_off_V: float, future: ExpectedCurrent
-) -> None:
-    in_progress = np.isnan(row["measured_eod_time_s"])
-    lines = {
-        "q_mobile": (f"{row['q_mobile_C']:.0f} C", f"{row['sd_q_mobile_C']:.0f} C"),
-        "r_o": (f"{row['r_o_ohm']:.4f} ohm", f"{row['sd_r_o_ohm']:.4f} ohm"),
-    }
-    print(f"{name}: {len(record.time_s)} samples from load-on at {record.time_s[0]:.1f} s, {record.charge_C:.0f} C drawn\n")
-    for parameter, (value, sd) in lines.items():
-        print(f"  {parameter:<22}{value:>12}   {'sd ' + sd if parameter in fitted else 'held'}")
-    print(f"  {'settled':<22}{'yes' if row['settled'] else 'no':>12}")
-    print(f"  {'drawn':<22}{row['drawn_Ah']:>9.3f} Ah   {'so far' if in_progress else f'the capacity to {cut_off_V:g} V'}")
-    if "q_mobile" in fitted:
-        print(f"  {'state of health':<22}{row['state_of_health']:>12.3f}   q_mobile / {NEW_CELL.q_mobile:g} C")
-    print(f"  {'voltage RMSE':<22}{1e3 * row['voltage_rmse_V']:>9.1f} mV")
-    print(f"  {f'{cut_off_V:g} V, predicted at':<22}{row['predicted_eod_time_s']:>10.0f} s")
-    if in_progress:
-        sure = f"sd {row['sd_predicted_eod_time_s']:.0f} s, " if "q_mobile" in fitted else ""
-        load = "the mean current so far, an assumption: the load varied" if future.varied else "to go on"
-        print(f"  {'remaining':<22}{row['remaining_s']:>10.0f} s   {sure}{future.mean_A:.3g} A {load}")
-    else:
-        print(f"  {f'{cut_off_V:g} V, measured at':<22}{row['measured_eod_time_s']:>10.0f} s")
-    if not row["settled"]:
-        print(f"\nNot settled: {row['reason']}")
+def _plain(value: Any) -> Any:
+    """JSON has no NaN and no infinity."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ import pandas as pd
 from scipy.io import loadmat
 
 from battery_env.arrays import FloatArray
+from battery_env.checks import check_positive
 from battery_env.records import SWITCH_SHARE, check_column, check_drawn_charge, check_record, drawn
 
 #: How to cite the bundled data.
@@ -45,7 +46,9 @@ class Discharge:
     :param time_s: times of the samples, strictly increasing, s, shape (T,)
     :param voltage_V: terminal voltage, V, shape (T,)
     :param current_A: current, positive in discharge, A, shape (T,)
-    :param temperature_C: temperature of the cell, degC, shape (T,); ``None`` if it was not measured
+    :param temperature_C: temperature of the cell, degC, shape (T,); ``None`` if it was not measured. Calibrators do not
+        read it: their model makes its own, from the surroundings ``Tb0`` of its cell. The command line takes the first one
+        for these
     :param meta: what else is known, e.g. ``cell``, ``cycle``, ``capacity_Ah``, ``start_time``, ``source``
     :raises ValueError: for arrays that do not fit together, or values that cannot be meant; it says what to do
     """
@@ -68,7 +71,7 @@ class Discharge:
         if not _DURATION_LIMITS_S[0] <= duration_s <= _DURATION_LIMITS_S[1]:
             raise ValueError(
                 f"time_s must span {_DURATION_LIMITS_S[0]:g} .. {_DURATION_LIMITS_S[1]:g} s, got {duration_s:g} s. "
-                "Give the time in seconds, not in hours or milliseconds."
+                "Give the time in seconds, not in hours or milliseconds (command line: --units time=h)."
             )
         check_drawn_charge(self.charge_C)
 
@@ -134,6 +137,33 @@ class Discharge:
         temperature_C = None if self.temperature_C is None else np.interp(time_s, self.time_s, self.temperature_C)
         return Discharge(time_s, **parts, temperature_C=temperature_C, meta=self.meta)
 
+    def averaged(self, dt_s: float) -> Discharge:
+        """
+        The same with one sample for each stretch of time: the means of voltage and temperature over its samples, and the mean
+        current, so that the charge drawn is kept. The first and the last sample stay as they are. A load that is switched
+        within a stretch is switched in two steps.
+
+        :param dt_s: length of a stretch, s
+        :return: at most ``2 + (last time - first time) / dt_s`` samples, rounded up
+        :raises ValueError: for a ``dt_s`` that is not positive, or leaves too few samples
+        """
+        check_positive("dt_s", dt_s)
+        inner = slice(1, len(self.time_s) - 1)
+        stretch = ((self.time_s[inner] - self.time_s[0]) / dt_s).astype(np.int64)
+        firsts = np.flatnonzero(np.diff(stretch, prepend=-1))
+        counts = np.diff(np.append(firsts, len(stretch)))
+
+        def mean(values: FloatArray) -> FloatArray:
+            return np.concatenate([values[:1], np.add.reduceat(values[inner], firsts) / counts, values[-1:]])
+
+        time_s = mean(self.time_s)
+        # from the middle between two means to the next middle, so that nothing is drawn twice or left out
+        edges_s = np.concatenate([time_s[:1], 0.5 * (time_s[1:] + time_s[:-1]), time_s[-1:]])
+        current_A = np.diff(drawn(self.time_s, self.current_A, edges_s)) / np.diff(edges_s)
+        current_A[[0, -1]] = self.current_A[[0, -1]]
+        temperature_C = None if self.temperature_C is None else mean(self.temperature_C)
+        return Discharge(time_s, mean(self.voltage_V), current_A, temperature_C, self.meta)
+
     def until(self, time_s: float) -> Discharge:
         """
         What had been recorded by some moment.
@@ -195,7 +225,7 @@ def load_nasa_discharges(path_or_cell: str | Path) -> list[Discharge]:
     path = Path(path_or_cell)
     if not path.is_file():
         raise FileNotFoundError(f"no file {str(path)!r}; the cells that come with the package are {', '.join(BUNDLED_CELLS)}")
-    return _read_nasa_mat(path) if path.suffix.lower() == ".mat" else _read_nasa_csv(path)
+    return _checked_discharges(path, read_nasa_mat(path)) if path.suffix.lower() == ".mat" else _read_nasa_csv(path)
 
 
 def _read_table(path: Path, columns: Iterable[str]) -> pd.DataFrame:
@@ -235,13 +265,23 @@ def _read_nasa_csv(path: Path) -> list[Discharge]:
     return _checked_discharges(path, samples)
 
 
-def _read_nasa_mat(path: Path) -> list[Discharge]:
+def read_nasa_mat(path: Path) -> list[tuple[dict[str, Any], dict[str, Any]]]:
+    """
+    The discharges of one of NASA's own files before they are checked.
+
+    :param path: the file
+    :return: for each the arrays of a :class:`Discharge`, by name, and its ``meta``
+    :raises FileNotFoundError: if there is no such file
+    :raises ValueError: if the file is damaged, or laid out in another way
+    """
     try:
         content = loadmat(path, simplify_cells=True)
         samples = _samples_of_mat(path, content)
+    except FileNotFoundError:
+        raise
     except Exception as error:  # scipy raises whatever the damage leads it to, and a field may be missing anywhere
         raise ValueError(f"{path} is damaged, or not laid out as NASA's battery files: {error!r}") from error
-    return _checked_discharges(path, samples)
+    return samples
 
 
 def _samples_of_mat(path: Path, content: dict[str, Any]) -> list[tuple[dict[str, Any], dict[str, Any]]]:

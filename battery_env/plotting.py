@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,6 +13,8 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
 from battery_env.arrays import FloatArray
@@ -33,6 +36,9 @@ LABELS = {name: parameter.label for name, parameter in PARAMETERS.items()}
 # anything.
 _OUTLIERS = 0.02
 _ROOM = 0.35
+# Stretches of time whose extremes are drawn of a long record: more than a figure is wide in dots.
+_STRETCHES = 2000
+_LIFE_COLUMNS = {"q_mobile_C": LABELS["q_mobile"], "r_o_ohm": LABELS["r_o"], "drawn_Ah": "charge drawn (Ah)"}
 # Bins of the lines through clouds of points.
 _BINS = 11
 # dV/dq is drawn on a scale that is linear within this, V/C, and logarithmic beyond: it spans three decades, from zero.
@@ -143,25 +149,89 @@ def plot_learning_curves(
     return figure
 
 
-def plot_discharge(record: Record, forecasts: Mapping[str, Forecast]) -> Figure:
+def plot_discharge(record: Record, forecasts: Mapping[str, Forecast], title: str = "") -> Figure:
     """
-    The measured voltage of one discharge with that of the model at some estimates, and below it the error of the model.
+    The measured voltage of one discharge with that of the model at some estimates, and below it the error of the model. Of
+    more points than can be told apart, the least and the greatest in each of 2000 stretches of time are drawn.
 
     :param record: one discharge, simulated or recorded
     :param forecasts: what :meth:`battery_env.RecordModel.forecast` made of estimates, by name for the legend
+    :param title: of the figure
     :return: the figure; a line ends at the cut-off, and that of its error where the model cell is empty
     """
     figure = new_figure(6.4, 4.6)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[3, 2])
-    upper.plot(record.time_s, record.voltage_V, "o", ms=2.2, color="0.6", label="measured")
+    upper.plot(*_drawn_points(record.time_s, record.voltage_V), "o", ms=2.2, color="0.6", label="measured")
     lower.axhline(0.0, color="0.6", lw=0.8)
     for colour, (name, forecast) in zip(COLOURS, forecasts.items(), strict=False):
-        upper.plot(forecast.time_s, forecast.voltage_V, color=colour, lw=1.4, label=name)
-        lower.plot(record.time_s, 1e3 * (forecast.at_samples_V - record.voltage_V), color=colour, lw=1.0, label=name)
+        upper.plot(*_drawn_points(forecast.time_s, forecast.voltage_V), color=colour, lw=1.4, label=name)
+        error_mV = 1e3 * (forecast.at_samples_V - record.voltage_V)
+        lower.plot(*_drawn_points(record.time_s, error_mV), color=colour, lw=1.0, label=name)
+    figure.suptitle(title, fontsize=10)
     upper.set_ylabel("voltage (V)")
     upper.legend(frameon=False, fontsize=9)
     lower.set(xlabel="time (s)", ylabel="model - measured (mV)")
     return _finished(figure, upper, lower)
+
+
+def _drawn_points(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The extremes of each stretch, in their order."""
+    if len(x) <= 2 * _STRETCHES:
+        return x, y
+    edges = np.linspace(0, len(x), _STRETCHES + 1).astype(np.int64)
+    stretches = [y[low:high] for low, high in itertools.pairwise(edges)]
+    # NaN, where the model cell is empty, is neither least nor greatest; a stretch of nothing else stays a gap
+    least = edges[:-1] + np.array([np.where(np.isnan(part), np.inf, part).argmin() for part in stretches])
+    greatest = edges[:-1] + np.array([np.where(np.isnan(part), -np.inf, part).argmax() for part in stretches])
+    kept = np.unique(np.concatenate([least, greatest, [0, len(x) - 1]]))
+    return x[kept], y[kept]
+
+
+def plot_life(table: pd.DataFrame) -> Figure:
+    """
+    What became of cells over their discharges: both parameters with bands of two stated standard deviations, and the charge
+    drawn. Estimates that are not settled are hollow.
+
+    :param table: a row a discharge with ``cell``, ``cycle``, ``q_mobile_C``, ``sd_q_mobile_C``, ``r_o_ohm``, ``sd_r_o_ohm``,
+        ``drawn_Ah`` and ``settled``, as the command line writes it. Where each cell has one discharge in it, the rows are
+        taken for the discharges of one cell in their order
+    :return: the figure
+    """
+    figure = new_figure(6.8, 6.6)
+    panels = figure.subplots(3, 1, sharex=True)
+    one_each = not table["cell"].duplicated().any()
+    cells = [("", table)] if one_each else list(table.groupby("cell", sort=False))
+    for colour, (name, rows) in zip(itertools.cycle(COLOURS), cells, strict=False):
+        counted = one_each or rows["cycle"].isna().any() or rows["cycle"].duplicated().any()
+        cycle = np.arange(1.0, len(rows) + 1.0) if counted else rows["cycle"].to_numpy(dtype=np.float64)
+        settled = rows["settled"].to_numpy(dtype=np.bool_)
+        for axes, value, sd in zip(panels, _LIFE_COLUMNS, ("sd_q_mobile_C", "sd_r_o_ohm", None), strict=True):
+            values = rows[value].to_numpy(dtype=np.float64)
+            if sd is not None:
+                reach = 2.0 * rows[sd].to_numpy(dtype=np.float64)
+                axes.fill_between(cycle, values - reach, values + reach, color=colour, alpha=0.18, lw=0)
+            axes.plot(cycle, values, color=colour, lw=0.8, alpha=0.6)
+            axes.plot(cycle[settled], values[settled], "o", ms=2.6, color=colour, label=name)
+            axes.plot(cycle[~settled], values[~settled], "o", ms=3.2, mfc="white", mec=colour, mew=0.8)
+    for axes, label in zip(panels, _LIFE_COLUMNS.values(), strict=True):
+        axes.set_ylabel(label)
+    for axes, value, sd in zip(panels, _LIFE_COLUMNS, ("sd_q_mobile_C", "sd_r_o_ohm"), strict=False):
+        values, reach = table[value].to_numpy(dtype=np.float64), 2.0 * table[sd].to_numpy(dtype=np.float64)
+        # the bands of what is not settled may be of any width
+        reach[~table["settled"].to_numpy(dtype=np.bool_) | np.isnan(reach)] = 0.0
+        axes.set_ylim(*_limits([values - reach, values + reach]))
+    panels[-1].xaxis.set_major_locator(MaxNLocator(integer=True))
+    panels[-1].set_xlabel("file" if one_each else "discharge")
+    handles, labels = panels[0].get_legend_handles_labels()
+    kinds = [pair for pair in zip(handles, labels, strict=True) if pair[1]][: len(COLOURS)]
+    handles, labels = [handle for handle, _ in kinds], [label for _, label in kinds]
+    if not table["settled"].astype(bool).all():
+        handles += panels[0].plot([], [], "o", ms=3.2, mfc="white", mec="0.25", mew=0.8)
+        labels.append("not settled")
+    handles.append(Patch(color="0.5", alpha=0.3, lw=0))
+    labels.append("± 2 sd")
+    figure.legend(handles, labels, loc="outside upper center", ncols=4, frameon=False, fontsize=9)
+    return _finished(figure, *panels)
 
 
 def plot_estimates(

@@ -21,11 +21,18 @@ VARIED_SHARE = 0.05
 #: Least and greatest time between two samples of a stream, s. Seconds given in milliseconds or in hours are mostly beyond.
 SAMPLE_INTERVAL_LIMITS_S = (1e-3, 600.0)
 
+_MILLIVOLT = "Give the voltage of one cell in V, not in mV (command line: --units voltage=mV), and not that of a pack."
+_KELVIN = "Give the temperature in degrees Celsius, not in kelvin (command line: --units temperature=K)."
 # name: least and largest plausible value, unit, what a value beyond usually is
 _PLAUSIBLE: dict[str, tuple[float, float, str, str]] = {
-    "voltage_V": (0.0, 5.5, "V", "Give the voltage of one cell in V, not in mV, and not that of a pack."),
-    "current_A": (-LOAD_LIMITS["current"], LOAD_LIMITS["current"], "A", "Give the current in A, not in mA."),
-    "temperature_C": (-60.0, 150.0, "degC", "Give the temperature in degrees Celsius, not in kelvin."),
+    "voltage_V": (0.0, 5.5, "V", _MILLIVOLT),
+    "current_A": (
+        -LOAD_LIMITS["current"],
+        LOAD_LIMITS["current"],
+        "A",
+        "Give the current in A, not in mA (command line: --units current=mA).",
+    ),
+    "temperature_C": (-60.0, 150.0, "degC", _KELVIN),
 }
 
 

@@ -17,6 +17,8 @@ ROOT = Path(__file__).parents[1]
 # each layer may import the ones before it, and itself
 LAYERS = (
     ("battery_env.arrays", "battery_env.files"),
+    ("battery_env.columns",),
+    ("battery_env.tables",),
     ("battery_env.checks",),
     ("battery_env.parameters",),
     ("battery_env.electrochemistry.cell",),
@@ -27,6 +29,7 @@ LAYERS = (
     ("battery_env.loads",),
     ("battery_env.dataset_files",),
     ("battery_env.trajectories", "battery_env.cells", "battery_env.nasa_cells"),
+    ("battery_env.record_files",),
     ("battery_env.sensors",),
     ("battery_env.record_model",),
     ("battery_env.estimators",),
@@ -34,6 +37,8 @@ LAYERS = (
     ("battery_env.evaluation",),
     ("battery_env.plotting",),
     ("battery_env.callbacks",),
+    ("battery_env.summary",),
+    ("battery_env.fleet",),
     ("battery_env.__main__",),
 )
 
@@ -147,7 +152,7 @@ def declared(distributions, extras):
 @pytest.mark.parametrize(
     ("package", "distributions", "extras"),
     [
-        ("battery_env", ("battery_env",), ("sb3", "onnx")),
+        ("battery_env", ("battery_env",), ("cyclers", "fleet", "onnx", "parquet", "sb3")),
         ("sb3_lac", (".",), ("zoo", "onnx")),
         ("benchmarks", ("battery_env", "."), ("zoo", "peers")),
         ("tests", ("battery_env", "."), ("zoo", "peers", "onnx", "dev")),

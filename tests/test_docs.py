@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from battery_env.__main__ import calibrate
+
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "docs/environments").glob("*.md"))]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
@@ -31,6 +33,17 @@ def test_examples_in_pages_run(page, tmp_path, monkeypatch):
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda example: example.name)
 def test_example_files_run(example, tmp_path, monkeypatch):
     run_briefly(example.read_text(encoding="utf-8"), str(example), tmp_path, monkeypatch)
+
+
+def test_commands_of_the_calibrator_run_and_exit_as_their_page_says(tmp_path, monkeypatch):
+    page = ROOT / "docs/command_line.md"
+    run_briefly("\n".join(blocks(page, "python")), str(page), tmp_path, monkeypatch)
+    lines = list(filter(None, "\n".join(blocks(page, "bash")).splitlines()))
+    assert len(lines) > 5
+    for line in lines:
+        name, *arguments = shlex.split(line, comments=True)
+        status = re.search(r"# exits (\d)", line)
+        assert name == "battery-calibrate" and calibrate(arguments) == int(status[1] if status else 0), line
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

@@ -63,6 +63,12 @@ def test_each_wheel_owns_its_files_and_brings_its_data_and_license(wheels):
     assert data <= packaged["battery_env"]
 
 
+def test_the_calibrator_is_a_command(wheels):
+    with zipfile.ZipFile(wheels["battery_env"]) as wheel:
+        (name,) = (name for name in wheel.namelist() if name.endswith("entry_points.txt"))
+        assert "battery-calibrate = battery_env.__main__:calibrate" in wheel.read(name).decode()
+
+
 @pytest.fixture(scope="module")
 def installed(wheels, tmp_path_factory):
     folder = tmp_path_factory.mktemp("installed")

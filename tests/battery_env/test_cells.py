@@ -95,6 +95,28 @@ class TestDischarge:
     def test_loaded_part_of_an_unfinished_discharge_ends_with_its_last_sample_under_load(self):
         assert Discharge(**recorded()).loaded_part(2.0).time_s[-1] == 50.0
 
+    @settings(max_examples=40)
+    @given(st.integers(0, 1000), st.floats(0.5, 40.0), st.integers(8, 200))
+    def test_averaging_keeps_the_ends_and_the_charge(self, seed, dt_s, samples):
+        random = np.random.default_rng(seed)
+        time_s = 5.0 + np.cumsum(random.uniform(0.5, 3.0, samples))
+        assume(time_s[-1] - time_s[0] > 10.0 + 4.0 * dt_s)
+        current_A = np.repeat(random.uniform(1.0, 3.0, samples // 8 + 1), 8)[:samples]
+        discharge = Discharge(time_s, np.linspace(4.2, 3.0, samples), current_A, np.linspace(24.0, 30.0, samples))
+        mean = discharge.averaged(dt_s)
+        assert len(mean.time_s) <= (time_s[-1] - time_s[0]) / dt_s + 3
+        for name in ("time_s", "voltage_V", "current_A", "temperature_C"):
+            np.testing.assert_array_equal(getattr(mean, name)[[0, -1]], getattr(discharge, name)[[0, -1]])
+        # half a stretch at either end has the current of its sample
+        assert mean.charge_C == pytest.approx(discharge.charge_C, abs=4.0 * (dt_s + 3.0))
+
+    def test_averaging_changes_nothing_where_samples_are_farther_apart(self):
+        discharge = Discharge(**recorded(current_A=np.full(7, 2.0)))
+        np.testing.assert_allclose(discharge.averaged(5.0).time_s, discharge.time_s)
+        np.testing.assert_allclose(discharge.averaged(5.0).current_A, discharge.current_A)
+        with pytest.raises(ValueError, match="dt_s must be a positive"):
+            discharge.averaged(0.0)
+
     def test_until_keeps_what_was_known_then(self):
         np.testing.assert_array_equal(Discharge(**recorded()).until(45.0).time_s, [0.0, 10.0, 20.0, 30.0, 40.0])
         with pytest.raises(ValueError, match="at least 5"):

@@ -1,3 +1,4 @@
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -6,9 +7,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from battery_env.__main__ import main
+from battery_env import fleet
+from battery_env.__main__ import calibrate, main
 from battery_env.cells import Discharge, load_nasa_discharges
 from battery_env.electrochemistry import simulate
+from battery_env.summary import summarize
 
 
 @pytest.fixture(scope="module")
@@ -34,14 +37,17 @@ def test_calibrates_a_bundled_discharge_and_writes_what_it_found(tmp_path, capsy
     assert main(["calibrate", "B0005:100", "--out", str(tmp_path / "new" / "folder")]) == 0
     shown = capsys.readouterr().out
     assert "settled" in shown and "yes" in shown and "measured at" in shown and "remaining" not in shown
-    assert "1.486 Ah   the capacity to 2.7 V" in shown
+    assert "1.486 Ah   the capacity to 2.7 V" in shown and "state of health" not in shown
+    assert "40.3 degC   from 24.3 degC; the model ends at 26.2 degC" in shown
     folder = tmp_path / "new" / "folder"
     assert {path.name for path in folder.iterdir()} == {
-        f"B0005_100_{kind}" for kind in ("estimate.csv", "voltage.csv", "voltage.png")
+        f"B0005_100_{kind}" for kind in ("estimate.csv", "estimate.parquet", "voltage.csv", "voltage.png")
     }
     (row,) = pd.read_csv(folder / "B0005_100_estimate.csv").to_dict(orient="records")
     assert row["q_mobile_C"] == pytest.approx(5631.0, abs=5.0)
-    assert row["state_of_health"] == pytest.approx(row["q_mobile_C"] / 7600.0)
+    assert row["capacity_Ah"] == row["drawn_Ah"] == pytest.approx(1.4857, abs=1e-4) and np.isnan(row["state_of_health"])
+    (same,) = pd.read_parquet(folder / "B0005_100_estimate.parquet").to_dict(orient="records")
+    assert same["q_mobile_C"] == row["q_mobile_C"] and same["settled"] and same["cycle"] == 100
     assert row["predicted_eod_time_s"] == pytest.approx(row["measured_eod_time_s"], rel=0.01)
     voltages = pd.read_csv(folder / "B0005_100_voltage.csv")
     error_V = voltages["model_V"] - voltages["voltage_V"]
@@ -51,31 +57,43 @@ def test_calibrates_a_bundled_discharge_and_writes_what_it_found(tmp_path, capsy
 
 def test_says_what_remains_of_a_discharge_in_progress_and_that_it_is_not_settled(recorded, tmp_path, capsys):
     path = write(recorded.until(1500.0), tmp_path / "half.csv")
-    assert main(["calibrate", path]) == 0
+    assert main(["calibrate", path]) == 3
     shown = capsys.readouterr().out
     assert "remaining" in shown and "Not settled: q_mobile is not known to 2 % yet" in shown
-    assert "give --prior-q" in shown and "ExtendedKalmanFilter" in shown and "Ah   so far" in shown
-    assert main(["calibrate", path, "--prior-q", "5460", "55", "--out", str(tmp_path)]) == 0
+    assert "give --prior" in shown and "--method kalman" in shown and "Ah   so far" in shown
+    assert main(["calibrate", path, "--prior", "5460", "55", "--nominal", "2", "--out", str(tmp_path)]) == 3
     shown = capsys.readouterr().out
-    assert "Not settled: q_mobile rests on its prior" in shown and "give --prior-q" not in shown and "2.01 A to go on" in shown
+    assert "Not settled: q_mobile rests on its prior" in shown and "give --prior" not in shown and "2.01 A to go on" in shown
     (row,) = pd.read_csv(tmp_path / "half_estimate.csv").to_dict(orient="records")
     assert 1500.0 + row["remaining_s"] == pytest.approx(recorded.eod_time_s(2.7), rel=0.02)
-    assert np.isnan(row["measured_eod_time_s"])
+    assert np.isnan(row["measured_eod_time_s"]) and np.isnan(row["capacity_Ah"])
+    whole_Ah = recorded.loaded_part(2.7).charge_C / 3600.0
+    assert row["predicted_capacity_Ah"] == pytest.approx(whole_Ah, rel=0.02)
+    assert row["state_of_health"] == row["predicted_capacity_Ah"] / 2.0
+    assert "Ah, predicted, of 2 Ah" in shown
+
+
+def test_the_filter_predicts_a_discharge_in_progress_without_a_prior(recorded, tmp_path, capsys):
+    path = write(recorded.until(1500.0), tmp_path / "half.csv")
+    assert main(["calibrate", path, "--method", "kalman", "--json"]) == 3
+    row = json.loads(capsys.readouterr().out)
+    assert row["method"] == "kalman" and row["settled"] is False and row["measured_eod_time_s"] is None
+    assert 1500.0 + row["remaining_s"] == pytest.approx(recorded.eod_time_s(2.7), rel=0.2)
 
 
 def test_a_load_that_varied_is_forecast_at_its_mean_and_that_is_said(tmp_path, capsys):
     pulses = simulate(np.where(np.arange(1600) % 200 < 100, 4.0, 0.0), 7000.0, 0.12, load_unit="current", thermal=True)
     path = write(Discharge(pulses.time_s, pulses.voltage_V, pulses.current_A), tmp_path / "pulses.csv")
-    assert main(["calibrate", path, "--prior-q", "7000", "70"]) == 0
+    assert main(["calibrate", path, "--prior-q", "7000", "70"]) == 3
     assert " A the mean current so far, an assumption: the load varied" in capsys.readouterr().out
-    assert main(["calibrate", path, "--prior-q", "7000", "70", "--future-current", "4"]) == 0
+    assert main(["calibrate", path, "--prior-q", "7000", "70", "--future-current", "4"]) == 3
     assert "4 A to go on" in capsys.readouterr().out
 
 
 def test_one_parameter_can_be_held(capsys):
-    assert main(["calibrate", "B0005:1", "--parameters", "r_o", "--isothermal"]) == 0
+    assert main(["calibrate", "B0005:1", "--parameters", "r_o", "--isothermal"]) == 3
     shown = capsys.readouterr().out
-    assert "held" in shown and "state of health" not in shown
+    assert "held" in shown
 
 
 def test_simulated_data_without_mismatch_are_recovered_exactly(tmp_path):
@@ -96,17 +114,19 @@ def test_results_are_only_replaced_when_asked(recorded, tmp_path, capsys):
     assert (tmp_path / "cell_estimate.csv").read_text() != "precious"
 
 
-def test_negative_discharge_current_is_explained_and_can_be_flipped(recorded, tmp_path, capsys):
+def test_the_sign_of_the_current_is_told_and_may_be_stated(recorded, tmp_path, capsys):
     path = write(recorded, tmp_path / "cell.csv", sign=-1.0)
-    assert "--discharge-is-negative" in fails([path], capsys)
+    assert main(["calibrate", path]) == 0
+    told = capsys.readouterr().out
     assert main(["calibrate", path, "--discharge-is-negative"]) == 0
+    assert capsys.readouterr().out == told
+    assert "--discharge-is-negative" in fails([path, "--discharge-is-positive"], capsys)
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["missing.csv"], "no file 'missing.csv'"),
-        (["B0005"], "B0005:1 .. B0005:168"),
         (["B0005:0"], "B0005:1 .. B0005:168"),
         (["B0006:169"], "B0006:1 .. B0006:168"),
         (["B0018:1"], "no file 'B0018:1'"),
@@ -115,15 +135,144 @@ def test_negative_discharge_current_is_explained_and_can_be_flipped(recorded, tm
         (["B0005:1", "--mismatch", "-1"], "mismatch_V"),
         (["B0005:1", "--current-gain-sd", "2"], "current_gain_sd is a share within 0 .. 1"),
         (["B0005:1", "--future-current", "-2"], "future_current_A must be finite and at least 0 A, got -2.0"),
+        (["B0005:1", "--nominal", "0"], "the nominal capacity in Ah must be a positive, finite number, got 0.0"),
+        (["B0005:1", "--ambient", "297"], "the ambient temperature must lie within -60 .. 100 degC, got 297.0"),
+        (["B0005:1", "--cut-off", "nan"], "the cut-off must be a voltage above 0 V, got nan"),
     ],
 )
 def test_bad_input_is_one_line_and_no_traceback(arguments, message, capsys):
     assert message in fails(arguments, capsys)
 
 
-def test_a_file_with_other_columns_lists_them(tmp_path, capsys):
-    (tmp_path / "cell.csv").write_text("Test_Time(s),Voltage(V),Current(A)\n0,4.1,2\n")
-    assert "Test_Time(s), Voltage(V), Current(A)" in fails([str(tmp_path / "cell.csv")], capsys)
+def test_a_file_with_unknown_columns_lists_them_and_takes_them_from_the_command_line(recorded, tmp_path, capsys):
+    path = tmp_path / "cell.csv"
+    columns = {"t_min": recorded.time_s / 60.0, "a": 1e3 * recorded.voltage_V, "b": recorded.current_A}
+    pd.DataFrame(columns).to_csv(path, index=False)
+    assert "t_min, a, b" in fails([str(path)], capsys)
+    given = ["--columns", "time=t_min,voltage=a,current=b", "--units", "voltage=mV,time=min"]
+    assert calibrate([str(path), *given]) == 0
+    assert "2.7 V, measured at" in capsys.readouterr().out
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory, recorded) -> Path:
+    """A folder as it grows in a laboratory: a life, a single discharge, two of one name, and what cannot be used."""
+    folder = tmp_path_factory.mktemp("lab")
+    life = [
+        pd.DataFrame({"cycle": n, "Time(s)": each.time_s, "Voltage(V)": each.voltage_V, "Current(A)": -each.current_A})
+        for n, each in enumerate(load_nasa_discharges("B0005")[::60], start=1)
+    ]
+    pd.concat(life).to_csv(folder / "life.csv", index=False)
+    write(recorded, folder / "cell.csv")
+    write(recorded.until(1500.0), folder / "cell.csv.gz")
+    (folder / "notes.txt").write_text("Dear all,\nplease find the data attached.\n")
+    (folder / "broken.parquet").write_bytes(b"PAR1")
+    (folder / "picture.png").write_bytes(b"PNG")
+    pd.DataFrame({"battery_id": ["life"]}).to_csv(folder / "cycles.csv", index=False)
+    return folder
+
+
+RECORDS = ["broken", "cell", "cell_2", "life_001", "life_002", "life_003", "notes"]
+
+
+def test_a_folder_becomes_one_table_and_what_cannot_be_used_stops_nothing(lab, tmp_path, capsys):
+    assert main(["calibrate", str(lab), "--out", str(tmp_path / "out"), "--nominal", "1.9"]) == 2
+    captured = capsys.readouterr()
+    assert captured.err.count("error: ") == 2 and "broken.parquet" in captured.err and "notes.txt" in captured.err
+    assert "7 discharges: 4 settled, 1 not settled, 2 refused" in captured.out
+    table = pd.read_csv(tmp_path / "out" / "estimate.csv")
+    assert list(table["record"]) == RECORDS
+    assert list(table["error"].notna()) == [True, False, False, False, False, False, True]
+    assert (table["q_mobile_C"].notna() == table["error"].isna()).all()
+    lives = table[table["cell"] == "life"]
+    assert list(lives["cycle"]) == [1, 2, 3] and (np.diff(lives["state_of_health"]) < -0.05).all()
+    pd.testing.assert_frame_equal(
+        pd.read_parquet(tmp_path / "out" / "estimate.parquet")[["record", "q_mobile_C"]],
+        table[["record", "q_mobile_C"]],
+        check_dtype=False,
+    )
+    kinds = [f"{name}_voltage.{kind}" for name in RECORDS[1:6] for kind in ("csv", "png")]
+    found = {path.name for path in (tmp_path / "out").iterdir()}
+    assert found == {*kinds, "estimate.csv", "estimate.parquet", "life.png"}
+
+
+def test_the_cycle_of_a_life_is_picked_by_its_number(lab, tmp_path, capsys):
+    assert main(["calibrate", f"{lab}/life.csv:2", "--out", str(tmp_path), "--table-only"]) == 0
+    assert "life_002: " in capsys.readouterr().out
+    assert {path.name for path in tmp_path.iterdir()} == {"life_002_estimate.csv", "life_002_estimate.parquet"}
+    assert main(["calibrate", f"{lab}/life.csv:3", "--out", str(tmp_path), "--table-only"]) == 0
+    capsys.readouterr()
+    assert "life.csv:1 .. " in fails([f"{lab}/life.csv:4"], capsys)
+    assert "has one discharge, without a number" in fails([f"{lab}/cell.csv:4"], capsys)
+
+
+def test_a_fleet_in_processes_is_the_same_as_one_after_the_other(lab, tmp_path, capsys):
+    pytest.importorskip("joblib")
+    assert main(["calibrate", str(lab), "--json"]) == main(["calibrate", str(lab), "--json", "--jobs", "2"]) == 2
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 2 * len(RECORDS) and lines[: len(RECORDS)] == lines[len(RECORDS) :]
+
+
+def test_processes_need_an_extra(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "joblib", None)
+    assert "battery_env[fleet]" in fails(["B0005:1", "--jobs", "2"], capsys)
+
+
+def test_existing_results_are_found_before_any_work_is_done(lab, tmp_path, capsys):
+    (tmp_path / "life_017_voltage.csv").write_text("precious")
+    assert "life_017_voltage.csv would be replaced" in fails([str(lab / "life.csv"), "--out", str(tmp_path)], capsys)
+    assert [path.name for path in tmp_path.iterdir()] == ["life_017_voltage.csv"]
+    (tmp_path / "file").write_text("")
+    assert "is a file" in fails(["B0005:1", "--out", str(tmp_path / "file")], capsys)
+
+
+def test_what_was_done_before_an_interruption_is_kept(lab, tmp_path, monkeypatch, capsys):
+    def interrupted(discharge, settings):
+        if discharge.meta["cycle"] == 2:
+            raise KeyboardInterrupt
+        return summarize(discharge, settings)
+
+    monkeypatch.setattr(fleet, "summarize", interrupted)
+    assert main(["calibrate", f"{lab}/life.csv", "--out", str(tmp_path), "--table-only"]) == 130
+    assert "interrupted" in capsys.readouterr().err
+    assert list(pd.read_csv(tmp_path / "life_estimate.csv")["record"]) == ["life_001"]
+
+
+def test_a_folder_without_records_says_so(tmp_path, capsys):
+    (tmp_path / "picture.png").write_bytes(b"PNG")
+    assert "holds no file whose name ends as that of a record (.csv" in fails([str(tmp_path)], capsys)
+
+
+def test_the_temperature_is_that_of_the_record_or_the_one_given(recorded, tmp_path, capsys):
+    columns = {"time_s": recorded.time_s, "voltage_V": recorded.voltage_V, "current_A": recorded.current_A}
+    temperature_C = np.interp(recorded.time_s, recorded.time_s[[0, -1]], [20.0, 60.0])
+    pd.DataFrame(columns | {"temperature_C": temperature_C}).to_csv(tmp_path / "hot.csv", index=False)
+    pd.DataFrame(columns | {"Ambient Temperature / degC": 40.0}).to_csv(tmp_path / "chamber.csv", index=False)
+    rows = []
+    for arguments in (["hot.csv"], ["hot.csv", "--ambient", "50"], ["chamber.csv"], ["chamber.csv", "--ambient", "10"]):
+        assert main(["calibrate", str(tmp_path / arguments[0]), *arguments[1:], "--json"]) == 0
+        captured = capsys.readouterr()
+        rows.append(json.loads(captured.out))
+        assert ("its temperature does not hold" in captured.err) == (len(rows) in (1, 2)) == ("does not" in rows[-1]["notes"])
+    assert [round(row["ambient_C"]) for row in rows] == [20, 50, 40, 10]
+    assert rows[0]["r_o_ohm"] > rows[2]["r_o_ohm"] + 0.001 > rows[1]["r_o_ohm"]
+
+
+def test_many_samples_are_averaged_and_say_the_same(recorded, tmp_path, capsys):
+    whole = recorded.loaded_part(2.7)
+    time_s = np.linspace(whole.time_s[0], whole.time_s[-1], 120_001)
+    columns = {"time_s": time_s} | {
+        name: np.interp(time_s, whole.time_s, getattr(whole, name)) for name in ("voltage_V", "current_A", "temperature_C")
+    }
+    pd.DataFrame(columns).to_parquet(tmp_path / "dense.parquet")
+    pd.DataFrame(columns).iloc[::40].to_parquet(tmp_path / "sparse.parquet")
+    rows = []
+    for name in ("dense", "sparse"):
+        assert main(["calibrate", str(tmp_path / f"{name}.parquet"), "--json"]) == 0
+        rows.append(json.loads(capsys.readouterr().out))
+    assert rows[0]["averaged_over_s"] == 1.0 and rows[1]["averaged_over_s"] == 0.0
+    assert rows[0]["q_mobile_C"] == pytest.approx(rows[1]["q_mobile_C"], rel=5e-4)
+    assert rows[0]["r_o_ohm"] == pytest.approx(rows[1]["r_o_ohm"], rel=1e-3)
 
 
 def test_runs_as_a_module():

@@ -15,11 +15,13 @@ from battery_env.plotting import (
     plot_errors,
     plot_estimates,
     plot_learning_curves,
+    plot_life,
     plot_sensitivities,
     plot_true_against_inferred,
     save_figure,
 )
 from battery_env.record_model import RecordModel
+from battery_env.records import Samples
 from battery_env.sensors import SensorErrors
 
 
@@ -173,3 +175,49 @@ def test_a_failed_write_leaves_what_was_there(tmp_path):
         part.write_text("half")
         raise RuntimeError
     assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
+
+
+def life(cells, settled=True):
+    rows = [
+        {
+            "cell": cell,
+            "cycle": cycle,
+            "q_mobile_C": 7000.0 - 100.0 * cycle,
+            "sd_q_mobile_C": 50.0,
+            "r_o_ohm": 0.1,
+            "sd_r_o_ohm": 0.02,
+        }
+        for cell in cells
+        for cycle in (2, 5, 9)
+    ]
+    return pd.DataFrame(rows).assign(drawn_Ah=1.8, settled=settled)
+
+
+def test_a_life_is_drawn_over_the_numbers_of_its_discharges_with_a_colour_a_cell(tmp_path):
+    figure = plot_life(life(["A", "B"]))
+    points = [line for line in figure.axes[0].lines if line.get_marker() == "o" and len(line.get_xdata())]
+    assert [line.get_xdata().tolist() for line in points] == [[2.0, 5.0, 9.0]] * 2
+    assert [line.get_color() for line in points] == list(COLOURS[:2])
+    assert [text.get_text() for text in figure.legends[0].texts] == ["A", "B", "± 2 sd"]
+    assert save_figure(figure, tmp_path / "life.png").stat().st_size > 10_000
+
+
+def test_files_of_one_discharge_each_are_a_life_in_their_order_and_unsettled_ones_are_hollow():
+    table = life(["A"], settled=[True, False, True]).assign(cell=["a", "b", "c"], cycle=pd.array([None] * 3, dtype="Int64"))
+    figure = plot_life(table)
+    settled, hollow = [line for line in figure.axes[0].lines if line.get_marker() == "o" and len(line.get_xdata())]
+    assert settled.get_xdata().tolist() == [1.0, 3.0] and hollow.get_xdata().tolist() == [2.0]
+    assert figure.axes[-1].get_xlabel() == "file" and hollow.get_markerfacecolor() == "white"
+
+
+def test_of_many_points_the_extremes_are_drawn():
+    trajectory = simulate(2.0, 7000.0, 0.12, load_unit="current")
+    time_s = np.linspace(0.0, trajectory.time_s[-1], 100_000)
+    voltage_V = np.interp(time_s, trajectory.time_s, trajectory.voltage_V)
+    voltage_V[[12_345, 67_890]] = 4.5, 2.0
+    record = Samples(time_s, voltage_V, np.full(100_000, 2.0))
+    figure = plot_discharge(record, {"model": RecordModel().forecast(record, Estimate(5000.0, 0.12))}, "title")
+    measured = figure.axes[0].lines[0]
+    assert len(measured.get_xdata()) <= 4002 and (np.diff(measured.get_xdata()) > 0.0).all()
+    assert {time_s[0], time_s[12_345], time_s[67_890], time_s[-1]} <= set(measured.get_xdata())
+    assert np.isnan(figure.axes[1].lines[-1].get_ydata()).any() and figure.get_suptitle() == "title"

@@ -1,0 +1,362 @@
+"""
+Recorded discharges from files as testers write them: which columns, which unit, which sign, and which of the rows are a
+discharge.
+"""
+
+from __future__ import annotations
+
+import itertools
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from battery_env.arrays import BoolArray, FloatArray
+from battery_env.cells import Discharge, read_nasa_mat
+from battery_env.columns import Column
+from battery_env.records import SWITCH_SHARE
+from battery_env.tables import read_columns
+
+# The voltage falls with the charge drawn: their correlation over the samples under load must be this clear to tell the sign of
+# the current. In the discharges that come with the package it is -0.87 or clearer.
+_CLEAR_CORRELATION = 0.5
+# A stretch of charging ends a discharge if it returns more than this share of the charge drawn until then; less is braking.
+_RETURNED_SHARE = 0.2
+# Charging before the load, of more than this share of what the load draws, is no part of the discharge; less is an offset.
+_CHARGED_SHARE = 0.02
+# What returns less than this share of the charge that passes in all is not looked at.
+_NOTHING_SHARE = 1e-3
+# What draws less than this share of the largest discharge of its file is a pulse between two charges, and left aside.
+_LEAST_SHARE = 0.01
+# Two rows of different steps may have the same time; the second counts as so much later, s.
+_STEP_S = 1e-3
+
+
+class Recording(NamedTuple):
+    """
+    What a file holds of one discharge, not checked yet.
+
+    :param arrays: arguments of :class:`~battery_env.cells.Discharge`, by name
+    :param meta: what else is known; ``cycle`` is missing if the file holds one discharge and does not number it
+    """
+
+    arrays: dict[str, Any]
+    meta: dict[str, Any]
+
+    def discharge(self) -> Discharge:
+        """
+        Check it.
+
+        :return: the discharge
+        :raises ValueError: for values that cannot be meant
+        :raises TypeError: for what is no number
+        """
+        return Discharge(**self.arrays, meta=self.meta)
+
+
+def read_discharges(
+    path: str | Path,
+    columns: Mapping[str, str] | None = None,
+    units: Mapping[str, str] | None = None,
+    discharge_is_negative: bool | None = None,
+) -> list[Discharge]:
+    """
+    Read the discharges of a file.
+
+    The file is text with a header (commas, semicolons, tabs or blanks, decimal points or commas, also packed as .gz, .bz2,
+    .xz or .zip), Parquet, one of NASA's .mat files, or with the extra ``cyclers`` a binary file of Neware (.nda, .ndax) or
+    BioLogic (.mpr). Columns go by the names that testers give them, the Battery Data Format's, Arbin's, Maccor's, Neware's
+    and BioLogic's among them; their units are told from the names.
+
+    A file may hold charges and rests as well, and many cycles. A discharge is what lies between two charges, with the rest
+    before the load; it is numbered by the cycle that the file gives, or else counted. If there are several, each has its own
+    clock, which starts at its first sample. Rows that are repeated are dropped with a warning.
+
+    :param path: the file
+    :param columns: by quantity (``time``, ``voltage``, ``current``, ``temperature``, ``ambient``, ``cycle``, ``step``,
+        ``state``), the name of its column, where the names do not tell
+    :param units: by quantity, its unit, where the name does not tell: ``s``, ``ms``, ``min``, ``h``; ``V``, ``mV``; ``A``,
+        ``mA``; ``degC``, ``K``
+    :param discharge_is_negative: how the file counts the current of a discharge; ``None``: told from the voltage, which falls
+        as charge is drawn
+    :return: the discharges; their ``meta`` holds ``source`` and, if there are several or the file numbers them, ``cycle``. One
+        that fails the checks of :class:`~battery_env.cells.Discharge` is left out with a warning
+    :raises ValueError: if there is none, the file is damaged, or it does not tell what is asked for
+    :raises ImportError: if the file needs an extra that is not installed
+    """
+    discharges = []
+    reasons = []
+    for recording in read_recordings(path, columns, units, discharge_is_negative):
+        try:
+            discharges.append(recording.discharge())
+        except (TypeError, ValueError) as error:
+            reasons.append(f"{path}: {_numbered(recording)}{error}")
+    if not discharges:
+        raise ValueError(reasons[0])
+    for reason in reasons:
+        warnings.warn(f"{reason} It is left out.", stacklevel=2)
+    return discharges
+
+
+def _numbered(recording: Recording) -> str:
+    return f"discharge {recording.meta['cycle']}: " if "cycle" in recording.meta else ""
+
+
+def read_recordings(
+    path: str | Path,
+    columns: Mapping[str, str] | None = None,
+    units: Mapping[str, str] | None = None,
+    discharge_is_negative: bool | None = None,
+) -> list[Recording]:
+    """
+    The discharges of a file before they are checked, so that one that cannot be used does not lose the others.
+
+    :param path: as in :func:`read_discharges`, as are the others
+    :param columns: by quantity, the name of its column
+    :param units: by quantity, its unit
+    :param discharge_is_negative: how the file counts the current of a discharge
+    :return: one or more
+    :raises ValueError: if there is none, the file is damaged, or it does not tell what is asked for
+    :raises ImportError: if the file needs an extra that is not installed
+    """
+    path = Path(path)
+    if path.suffix.lower() == ".mat":
+        return [Recording(arrays, meta) for arrays, meta in read_nasa_mat(path)]
+    try:
+        table = _Table.of(*read_columns(path, columns, units))
+        return table.recordings(str(path), discharge_is_negative)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+class _Table:
+    """The columns of a file in SI units, arrays of shape (T,)."""
+
+    def __init__(self, columns: dict[str, FloatArray], labels: dict[str, Any]) -> None:
+        self.columns = columns  # numbers, by quantity
+        self.labels = labels  # numbers of steps and states, by quantity
+
+    @classmethod
+    def of(cls, table: pd.DataFrame, scales: dict[str, Column]) -> _Table:
+        blank = table[["time", "voltage", "current"]].isna().all(axis=1).to_numpy()
+        if blank.any():
+            table = table[~blank]
+        if not len(table):
+            raise ValueError("there are no rows below the header")
+        columns, labels = {}, {}
+        for quantity, scale in scales.items():
+            values = table[quantity]
+            if quantity in ("step", "state"):
+                labels[quantity] = pd.factorize(values)
+            elif quantity == "time":
+                columns[quantity] = scale.factor * _seconds(values, scale)
+            elif quantity in ("temperature", "ambient") and values.isna().all():
+                continue  # a sensor that was not connected
+            else:
+                columns[quantity] = scale.factor * _numbers(values, scale) + scale.offset
+        return cls(columns, labels)
+
+    def recordings(self, source: str, discharge_is_negative: bool | None) -> list[Recording]:
+        cycles = self.columns.get("cycle")
+        if cycles is not None and not (np.isfinite(cycles).all() and (cycles == np.round(cycles)).all()):
+            raise ValueError("the column of the cycle must hold whole numbers")
+        self._accumulate_step_times()
+        self._drop_repeated()
+        self._separate_steps()
+        for name in ("time", "voltage", "current"):
+            bad = np.flatnonzero(~np.isfinite(self.columns[name]))
+            if len(bad):
+                raise ValueError(
+                    f"the {name} must be finite, got {self.columns[name][bad[0]]} in row {bad[0] + 1}. Remove such rows."
+                )
+        self._turn_current(discharge_is_negative)
+        return self._split(source)
+
+    def _select(self, keep: BoolArray) -> None:
+        self.columns = {name: column[keep] for name, column in self.columns.items()}
+        self.labels = {name: (codes[keep], values) for name, (codes, values) in self.labels.items()}
+
+    def _accumulate_step_times(self) -> None:
+        """Times that start anew with each step become times since the start of the test."""
+        if "step" not in self.labels:
+            return
+        time_s, steps = self.columns["time"], self.labels["step"][0]
+        back = np.flatnonzero(np.diff(time_s) < 0.0) + 1
+        if len(back) and (steps[back] != steps[back - 1]).all() and not self._restarts_with_cycle(back):
+            offsets_s = np.zeros(len(time_s))
+            offsets_s[back] = time_s[back - 1]
+            self.columns["time"] = time_s + np.cumsum(offsets_s)
+
+    def _restarts_with_cycle(self, back: Any) -> bool:
+        cycles = self.columns.get("cycle")
+        return cycles is not None and bool((cycles[back] != cycles[back - 1]).all())
+
+    def _drop_repeated(self) -> None:
+        """The clock of a file stands still where a row is repeated; nowhere else rows are compared, which takes time."""
+        if (np.diff(self.columns["time"]) > 0.0).all():
+            return
+        names = [name for name in ("cycle", "time", "voltage", "current") if name in self.columns]
+        keys = {name: self.columns[name] for name in names} | {name: codes for name, (codes, _) in self.labels.items()}
+        repeated = pd.DataFrame(keys).duplicated().to_numpy()
+        if repeated.any():
+            warnings.warn(f"{repeated.sum()} of {len(repeated)} rows are repeated, and dropped", stacklevel=2)
+            self._select(~repeated)
+
+    def _separate_steps(self) -> None:
+        if "step" not in self.labels:
+            return
+        time_s, steps = self.columns["time"], self.labels["step"][0]
+        same = np.flatnonzero((np.diff(time_s) == 0.0) & (np.diff(steps) != 0)) + 1
+        same = same[(same + 1 == len(time_s)) | (time_s[np.minimum(same + 1, len(time_s) - 1)] > time_s[same] + _STEP_S)]
+        if len(same):
+            self.columns["time"] = time_s.copy()
+            self.columns["time"][same] += _STEP_S
+
+    def _turn_current(self, discharge_is_negative: bool | None) -> None:
+        """Makes the current of a discharge positive."""
+        current_A = self.columns["current"]
+        if not current_A.any():
+            raise ValueError("no current flows in this file")
+        signs = self._signs_of_states()
+        if signs is not None and (current_A >= 0.0).all():
+            self.columns["current"] = current_A * signs
+            return
+        if discharge_is_negative is None:
+            correlation = self._correlation()
+            if not abs(correlation) > _CLEAR_CORRELATION:
+                raise ValueError(
+                    "whether the current of a discharge is positive or negative cannot be told, as the voltage neither falls "
+                    f"nor rises clearly with the charge (correlation {correlation:.2f}). State it: --discharge-is-negative or "
+                    "--discharge-is-positive (Python: discharge_is_negative)"
+                )
+            discharge_is_negative = correlation > 0.0
+        if discharge_is_negative:
+            self.columns["current"] = -current_A
+
+    def _signs_of_states(self) -> FloatArray | None:
+        """1 in discharge and -1 in charge, if the states of the tester say so of both."""
+        if "state" not in self.labels:
+            return None
+        codes, states = self.labels["state"]
+        names = [str(state).strip().lower() for state in states]
+        discharging = np.array([name == "d" or "dch" in name or "disch" in name for name in names])
+        charging = np.array([name == "c" or "ch" in name for name in names]) & ~discharging
+        if not (discharging.any() and charging.any()):
+            return None
+        return np.where(np.append(charging, False)[codes], -1.0, 1.0)
+
+    def _correlation(self) -> float:
+        """Of the voltage with the charge that has passed, within each cycle, over the samples under load."""
+        time_s, voltage_V, current_A = (self.columns[name] for name in ("time", "voltage", "current"))
+        step_s = np.diff(time_s)
+        charge_C = np.append(0.0, np.cumsum(0.5 * (current_A[1:] + current_A[:-1]) * np.maximum(step_s, 0.0)))
+        new = step_s <= 0.0
+        if "cycle" in self.columns:
+            new |= np.diff(self.columns["cycle"]) != 0.0
+        group = np.append(0, np.cumsum(new))
+        loaded = np.abs(current_A) > SWITCH_SHARE * np.abs(current_A).max()
+        group = group[loaded]
+        samples = np.maximum(np.bincount(group), 1)
+        charge_C, voltage_V = (
+            values - (np.bincount(group, values) / samples)[group] for values in (charge_C[loaded], voltage_V[loaded])
+        )
+        norm = float(np.sqrt((charge_C @ charge_C) * (voltage_V @ voltage_V)))
+        return float(charge_C @ voltage_V) / norm if norm > 0.0 else float("nan")
+
+    def _split(self, source: str) -> list[Recording]:
+        cycles = self.columns.get("cycle")
+        bounds = [0, len(self.columns["time"])]
+        if cycles is not None:
+            bounds = [0, *(np.flatnonzero(np.diff(cycles)) + 1).tolist(), bounds[1]]
+        parts = [part for low, high in itertools.pairwise(bounds) for part in self._discharges(low, high)]
+        if not parts:
+            raise ValueError("the file holds no discharge: no charge is drawn. Check the sign of the current")
+        least_C = _LEAST_SHARE * max(drawn_C for _, drawn_C in parts)
+        stretches = [stretch for stretch, drawn_C in parts if drawn_C > least_C]
+        return [self._recording(stretch, n, len(stretches), source) for n, stretch in enumerate(stretches, start=1)]
+
+    def _discharges(self, low: int, high: int) -> list[tuple[slice, float]]:
+        """The discharges among some rows, and the charge that each draws, C."""
+        time_s, current_A = self.columns["time"][low:high], self.columns["current"][low:high]
+        passed_C = np.append(0.0, np.cumsum(0.5 * (current_A[1:] + current_A[:-1]) * np.diff(time_s)))
+        charges = _charges(current_A, passed_C)
+        found, begin, lowest_C = [], 0, passed_C[0]
+        for start, end in charges:
+            drawn_C = passed_C[start] - lowest_C
+            if drawn_C > 0.0 and passed_C[start] - passed_C[end - 1] > _RETURNED_SHARE * drawn_C:
+                found.append((begin, start))
+                begin, lowest_C = start, passed_C[start]
+            lowest_C = min(lowest_C, passed_C[end - 1])
+        found.append((begin, high - low))
+        parts = []
+        for begin, end in found:
+            peak_A = current_A[begin:end].max()
+            if not peak_A > 0.0:
+                continue
+            first = begin + int(np.argmax(current_A[begin:end] > SWITCH_SHARE * peak_A))
+            drawn_C = float(passed_C[first:end].max() - passed_C[first])
+            for start, stop in charges:
+                if begin <= start and stop <= first and passed_C[start] - passed_C[stop - 1] > _CHARGED_SHARE * drawn_C:
+                    begin = stop
+            parts.append((slice(low + begin, low + end), drawn_C))
+        return parts
+
+    def _recording(self, stretch: slice, number: int, count: int, source: str) -> Recording:
+        meta: dict[str, Any] = {"source": source}
+        if "cycle" in self.columns:
+            meta["cycle"] = int(self.columns["cycle"][stretch.start])
+        elif count > 1:
+            meta["cycle"] = number
+        if "ambient" in self.columns:
+            meta["ambient_temperature_C"] = float(np.nanmedian(self.columns["ambient"][stretch]))
+        time_s = self.columns["time"][stretch]
+        arrays = {
+            "time_s": time_s - time_s[0] if count > 1 else time_s,
+            "voltage_V": self.columns["voltage"][stretch],
+            "current_A": self.columns["current"][stretch],
+        }
+        if "temperature" in self.columns:
+            arrays["temperature_C"] = self.columns["temperature"][stretch]
+        return Recording(arrays, meta)
+
+
+def _charges(current_A: FloatArray, passed_C: FloatArray) -> list[tuple[int, int]]:
+    """Where the cell is charged, noise at rest left aside: the first sample, and the one after the last."""
+    charging = np.concatenate([[False], current_A < 0.0, [False]])
+    starts, ends = np.flatnonzero(~charging[:-1] & charging[1:]), np.flatnonzero(charging[:-1] & ~charging[1:])
+    counts = passed_C[starts] - passed_C[ends - 1] > _NOTHING_SHARE * float(np.ptp(passed_C))
+    return list(zip(starts[counts].tolist(), ends[counts].tolist(), strict=True))
+
+
+def _numbers(values: pd.Series, column: Column) -> FloatArray:
+    if pd.api.types.is_numeric_dtype(values.dtype):
+        return values.to_numpy(dtype=np.float64, na_value=np.nan)
+    numbers = pd.to_numeric(values, errors="coerce")
+    bad = values[numbers.isna() & values.notna()]
+    if len(bad):
+        raise ValueError(f"the column {column.name!r} must hold numbers, got {str(bad.iloc[0])!r} in row {bad.index[0] + 1}")
+    return numbers.to_numpy(dtype=np.float64)
+
+
+def _seconds(values: pd.Series, column: Column) -> FloatArray:
+    """Numbers as they are; a clock, hours:minutes:seconds, in seconds; dates in seconds since the first one."""
+    if pd.api.types.is_numeric_dtype(values.dtype):
+        return _numbers(values, column)
+    if pd.api.types.is_datetime64_any_dtype(values.dtype):
+        return (values - values.iloc[0]).dt.total_seconds().to_numpy(dtype=np.float64)
+    if pd.api.types.is_timedelta64_dtype(values.dtype):
+        return values.dt.total_seconds().to_numpy(dtype=np.float64)
+    if not values.dropna().astype(str).str.contains(":").all():
+        return _numbers(values, column)
+    text = values.astype(str).str.strip().str.replace(",", ".")
+    for convert in (pd.to_timedelta, pd.to_datetime):
+        try:
+            return _seconds(pd.Series(convert(text), index=values.index), column)
+        except ValueError:
+            continue
+    raise ValueError(
+        f"the column {column.name!r} must hold times: numbers, hours:minutes:seconds, or dates; got {str(values.iloc[0])!r}"
+    )

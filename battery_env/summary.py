@@ -1,0 +1,261 @@
+"""What a record of one discharge says about its cell: estimate, capacity and end of discharge, as one row of a table."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, get_args
+
+import numpy as np
+
+from battery_env.cells import Discharge
+from battery_env.checks import check_positive
+from battery_env.electrochemistry import NEW_CELL, CellParameters
+from battery_env.electrochemistry.cell import TB
+from battery_env.estimates import Estimate
+from battery_env.estimators.base import Estimator
+from battery_env.estimators.kalman import ExtendedKalmanFilter
+from battery_env.estimators.least_squares import LeastSquares
+from battery_env.parameters import PARAMETER_NAMES
+from battery_env.record_model import Forecast, RecordModel
+from battery_env.records import ExpectedCurrent, expected_current
+
+Method = Literal["least-squares", "kalman"]
+METHODS: tuple[Method, ...] = get_args(Method)
+
+# A record of more samples than this is averaged over the time step of the model, or longer where it lasts longer than so many
+# steps: what lies between says nothing to the model.
+_MANY_SAMPLES = 100_000
+_MODEL_STEP_S = 1.0
+_ZERO_CELSIUS_K = 273.15
+_AMBIENT_LIMITS_C = (-60.0, 100.0)
+# The model of a cell in air warms by 2 K at 2 A, where the bundled cells warm by 16 K: that alone moves q_mobile by less than
+# 0.1 %. What is farther off than this is another cell, load or chamber than these.
+_WARMTH_LIMIT_K = 20.0
+
+
+@dataclass(frozen=True)
+class Settings:
+    """
+    How a discharge is looked at.
+
+    :param method: of calibration
+    :param parameters: which to search for; the other is held at the cell's value
+    :param cut_off_V: voltage at which the discharge ends, V
+    :param prior_q_mobile_C: mean and standard deviation of ``q_mobile`` before the discharge, C; ``None``: nothing is known
+    :param mismatch_V: error to expect of the model itself, V
+    :param current_gain_sd: standard deviation of the gain of the current sensor, as a share of it
+    :param future_current_A: current beyond the end of a record, A; ``None``: as
+        :func:`battery_env.records.expected_current` has it
+    :param thermal: whether the temperature of the model moves
+    :param ambient_C: temperature at the start and of the surroundings, degC; ``None``: the first one measured, or what
+        else the record says of its surroundings, or the cell's
+    :param nominal_Ah: nominal capacity, which the state of health refers to, Ah; ``None``: not known
+    :param cell: constants of the model; ``None``: the new cell's
+    :raises ValueError: for an argument out of range
+    """
+
+    method: Method = "least-squares"
+    parameters: tuple[str, ...] = PARAMETER_NAMES
+    cut_off_V: float = 2.7
+    prior_q_mobile_C: tuple[float, float] | None = None
+    mismatch_V: float = 0.05
+    current_gain_sd: float = 0.005
+    future_current_A: float | None = None
+    thermal: bool = True
+    ambient_C: float | None = None
+    nominal_Ah: float | None = None
+    cell: CellParameters | None = None
+
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise ValueError(f"the method is {' or '.join(METHODS)}, got {self.method!r}")
+        if self.nominal_Ah is not None:
+            check_positive("the nominal capacity in Ah", self.nominal_Ah)
+        low, high = _AMBIENT_LIMITS_C
+        if self.ambient_C is not None and not low <= self.ambient_C <= high:
+            raise ValueError(f"the ambient temperature must lie within {low:g} .. {high:g} degC, got {self.ambient_C!r}")
+        if not 0.0 < self.cut_off_V < np.inf:
+            raise ValueError(f"the cut-off must be a voltage above 0 V, got {self.cut_off_V!r}")
+        if self.future_current_A is not None and not 0.0 <= self.future_current_A < np.inf:
+            raise ValueError(f"future_current_A must be finite and at least 0 A, got {self.future_current_A!r}")
+        self.calibrator(self.cell or NEW_CELL)
+
+    def calibrator(self, cell: CellParameters) -> Estimator:
+        """
+        The calibrator that is asked for.
+
+        :param cell: constants of the model
+        :return: a new one
+        :raises ValueError: for an argument out of range
+        """
+        calibrator = LeastSquares if self.method == "least-squares" else ExtendedKalmanFilter
+        return calibrator(
+            self.parameters,
+            cell,
+            thermal=self.thermal,
+            prior_q_mobile_C=self.prior_q_mobile_C,
+            mismatch_V=self.mismatch_V,
+            current_gain_sd=self.current_gain_sd,
+        )
+
+
+class Summary(NamedTuple):
+    """
+    What a discharge says.
+
+    :param row: by column of a table
+    :param record: what was looked at
+    :param forecast: the voltage of the model at the estimate
+    """
+
+    row: dict[str, Any]
+    record: Discharge
+    forecast: Forecast
+
+
+def summarize(discharge: Discharge, settings: Settings) -> Summary:
+    """
+    Calibrate the model to one discharge. Its surroundings, and its temperature at the start, are those measured at load-on; a
+    model that departs far from the temperatures measured later is warned of.
+
+    :param discharge: of a cell that is full at its start
+    :param settings: how to look at it
+    :return: what it says
+    :raises ValueError: if the record cannot be used
+    """
+    record = discharge.loaded_part(settings.cut_off_V)
+    capacity_Ah = float("nan")
+    measured_eod_s = discharge.eod_time_s(settings.cut_off_V)
+    drawn_Ah = record.charge_C / 3600.0
+    if not np.isnan(measured_eod_s):
+        capacity_Ah = drawn_Ah
+    samples, averaged_over_s = len(record.time_s), 0.0
+    if samples > _MANY_SAMPLES:
+        averaged_over_s = max(_MODEL_STEP_S, float(record.time_s[-1] - record.time_s[0]) / _MANY_SAMPLES)
+        record = record.averaged(averaged_over_s)
+
+    ambient_C = _ambient_C(record, settings)
+    cell = settings.cell or NEW_CELL
+    if ambient_C is not None:
+        cell = cell.replace(Tb0=ambient_C + _ZERO_CELSIUS_K)
+    estimate = settings.calibrator(cell).estimate(record)
+    model = RecordModel(cell, settings.thermal)
+    future = expected_current(record.time_s, record.current_A)
+    if settings.future_current_A is not None:
+        future = ExpectedCurrent(settings.future_current_A, varied=False, sd_A=0.0)
+    forecast = model.forecast(record, estimate, settings.cut_off_V, future.mean_A)
+    in_progress = np.isnan(measured_eod_s)
+    remaining_s = max(forecast.eod_time_s - float(record.time_s[-1]), 0.0) if in_progress else 0.0
+    whole_Ah = drawn_Ah + remaining_s * future.mean_A / 3600.0 if in_progress else capacity_Ah
+    residual_V = forecast.at_samples_V - record.voltage_V
+    row = {
+        "method": settings.method,
+        "q_mobile_C": estimate.q_mobile,
+        "sd_q_mobile_C": estimate.sd_q_mobile,
+        "r_o_ohm": estimate.r_o,
+        "sd_r_o_ohm": estimate.sd_r_o,
+        "settled": estimate.settled,
+        "reason": estimate.reason,
+        "samples": samples,
+        "averaged_over_s": averaged_over_s,
+        "load_on_time_s": float(record.time_s[0]),
+        "drawn_Ah": drawn_Ah,
+        "capacity_Ah": capacity_Ah,
+        "predicted_capacity_Ah": whole_Ah,
+        "state_of_health": whole_Ah / settings.nominal_Ah if settings.nominal_Ah else float("nan"),
+        "voltage_rmse_V": float(np.sqrt(np.nanmean(residual_V**2))),
+        "predicted_eod_time_s": forecast.eod_time_s,
+        "sd_predicted_eod_time_s": _sd_eod_s(estimate, remaining_s, future),
+        "measured_eod_time_s": measured_eod_s,
+        "remaining_s": remaining_s,
+        "future_current_A": future.mean_A,
+        "load_varied": future.varied,
+        "ambient_C": cell.Tb0 - _ZERO_CELSIUS_K,
+        **_end_temperatures(record, estimate, model),
+    }
+    return Summary(row, record, forecast)
+
+
+def _ambient_C(record: Discharge, settings: Settings) -> float | None:
+    if settings.ambient_C is not None:
+        return settings.ambient_C
+    if record.temperature_C is not None:
+        return float(record.temperature_C[0])
+    known = record.meta.get("ambient_temperature_C")
+    return None if known is None else float(known)
+
+
+def _end_temperatures(record: Discharge, estimate: Estimate, model: RecordModel) -> dict[str, float]:
+    """The last temperature measured, and the model's then."""
+    if record.temperature_C is None:
+        return {"end_temperature_C": float("nan"), "model_end_temperature_C": float("nan")}
+    since_s, current_A = model.grid(record)
+    simulation = model.simulate(current_A, estimate.q_mobile, estimate.r_o)
+    model_C = np.interp(since_s, simulation.time_s, simulation.state[:, TB]) - _ZERO_CELSIUS_K
+    departure_K = record.temperature_C - model_C
+    worst = int(np.abs(departure_K).argmax())
+    if abs(departure_K[worst]) > _WARMTH_LIMIT_K:
+        warnings.warn(
+            f"the cell is at {record.temperature_C[worst]:.0f} degC at {record.time_s[worst]:.0f} s, where the model is at "
+            f"{model_C[worst]:.0f} degC: its temperature does not hold for this cell or chamber",
+            stacklevel=3,
+        )
+    return {"end_temperature_C": float(record.temperature_C[-1]), "model_end_temperature_C": float(model_C[-1])}
+
+
+def _sd_eod_s(estimate: Estimate, remaining_s: float, future: ExpectedCurrent) -> float:
+    """The charge still to come moves with q_mobile, and is drawn at a current that may not be the one assumed."""
+    if not future.mean_A > 0.0:
+        return float("nan")
+    return float(np.hypot(estimate.sd_q_mobile, remaining_s * future.sd_A)) / future.mean_A
+
+
+def text_of(name: str, row: dict[str, Any], settings: Settings) -> str:
+    """
+    A row for reading.
+
+    :param name: of the record
+    :param row: as :func:`summarize` returns it
+    :param settings: how the discharge was looked at
+    :return: lines
+    """
+    in_progress = np.isnan(row["measured_eod_time_s"])
+    fitted: Sequence[str] = settings.parameters
+    cut_off = f"{settings.cut_off_V:g} V"
+    averaged = f", averaged over {row['averaged_over_s']:g} s," if row["averaged_over_s"] else ""
+    values = {
+        "q_mobile": (f"{row['q_mobile_C']:.0f} C", f"{row['sd_q_mobile_C']:.0f} C"),
+        "r_o": (f"{row['r_o_ohm']:.4f} ohm", f"{row['sd_r_o_ohm']:.4f} ohm"),
+    }
+    lines = [
+        f"{name}: {row['samples']} samples{averaged} from load-on at {row['load_on_time_s']:.1f} s, "
+        f"{3600.0 * row['drawn_Ah']:.0f} C drawn",
+        "",
+        *(f"  {key:<22}{value:>12}   {'sd ' + sd if key in fitted else 'held'}" for key, (value, sd) in values.items()),
+        f"  {'settled':<22}{'yes' if row['settled'] else 'no':>12}",
+        f"  {'drawn':<22}{row['drawn_Ah']:>9.3f} Ah   {'so far' if in_progress else f'the capacity to {cut_off}'}",
+    ]
+    if settings.nominal_Ah:
+        of = f"{row['predicted_capacity_Ah']:.3f} Ah, {'predicted' if in_progress else 'drawn'}, of {settings.nominal_Ah:g} Ah"
+        lines.append(f"  {'state of health':<22}{row['state_of_health']:>12.3f}   {of}")
+    lines.append(f"  {'voltage RMSE':<22}{1e3 * row['voltage_rmse_V']:>9.1f} mV")
+    if not np.isnan(row["end_temperature_C"]):
+        ends = f"from {row['ambient_C']:.1f} degC; the model ends at {row['model_end_temperature_C']:.1f} degC"
+        lines.append(f"  {'temperature at the end':<22}{row['end_temperature_C']:>7.1f} degC   {ends}")
+    lines.append(f"  {f'{cut_off}, predicted at':<22}{row['predicted_eod_time_s']:>10.0f} s")
+    if in_progress:
+        sure = f"sd {row['sd_predicted_eod_time_s']:.0f} s, " if "q_mobile" in fitted else ""
+        load = "the mean current so far, an assumption: the load varied" if row["load_varied"] else "to go on"
+        lines.append(f"  {'remaining':<22}{row['remaining_s']:>10.0f} s   {sure}{row['future_current_A']:.3g} A {load}")
+    else:
+        lines.append(f"  {f'{cut_off}, measured at':<22}{row['measured_eod_time_s']:>10.0f} s")
+    if not row["settled"]:
+        lines += ["", f"Not settled: {row['reason']}"]
+        if in_progress and settings.method == "least-squares" and settings.prior_q_mobile_C is None:
+            lines += [
+                "During a discharge give --prior with the q_mobile of an earlier one of this cell. Without it",
+                "--method kalman (in Python ExtendedKalmanFilter) predicts the end better than this fit.",
+            ]
+    return "\n".join(lines)

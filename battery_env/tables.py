@@ -1,0 +1,237 @@
+"""Files of measurements as tables: text of any delimiter, Parquet, and the binary files of testers."""
+
+from __future__ import annotations
+
+import bz2
+import csv
+import gzip
+import io
+import lzma
+import re
+import zipfile
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import IO, Any, NamedTuple
+
+import pandas as pd
+
+from battery_env.columns import Column, count_required, find_columns
+
+#: Endings of the names of files that can be read, besides those of NASA (.mat); of text also packed (.gz, .bz2, .xz, .zip).
+TEXT_SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".mpt", ".bdf")
+BINARY_SUFFIXES = (".parquet", ".nda", ".ndax", ".mpr")
+PACKED_SUFFIXES = (".gz", ".bz2", ".xz", ".zip")
+
+_OPENERS: dict[str, Callable[[Path], Any]] = {".gz": gzip.open, ".bz2": bz2.open, ".xz": lzma.open}
+# Testers write what they know about a test above the table: so many bytes and lines are searched for its header.
+_HEAD_BYTES, _HEAD_LINES = 1 << 18, 400
+_BLANKS = r"\s+"
+_DELIMITERS = (",", ";", "\t", _BLANKS)
+_DECIMAL_COMMA = re.compile(r"^\s*[-+]?\d+,\d+(?:[eE][-+]?\d+)?\s*$")
+_NUMBER = re.compile(r"^\s*[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?(?:[;\s]|$)")
+_DECIMAL_POINT = re.compile(r"^\s*[-+]?\d*\.\d+(?:[eE][-+]?\d+)?\s*$")
+_EXPORT = {
+    ".xls": "save the sheet as CSV",
+    ".xlsx": "save the sheet as CSV",
+    ".res": "export the channel as CSV in MITS Pro",
+}
+
+
+class _Layout(NamedTuple):
+    """How a text file is laid out."""
+
+    encoding: str
+    header_line: int
+    delimiter: str
+    decimal: str
+    names: list[str]
+
+
+def read_columns(
+    path: Path, chosen: Mapping[str, str] | None = None, units: Mapping[str, str] | None = None
+) -> tuple[pd.DataFrame, dict[str, Column]]:
+    """
+    Read the columns of a record, and no others.
+
+    :param path: of a file whose name ends as in ``TEXT_SUFFIXES`` or ``BINARY_SUFFIXES``; any other ending is read as text
+    :param chosen: as in :func:`battery_env.columns.find_columns`
+    :param units: likewise
+    :return: the columns as they are in the file, by quantity; and how they are scaled
+    :raises ValueError: if the file is empty, damaged or no table, or a column is missing
+    :raises ImportError: if the file needs an extra that is not installed
+    """
+    suffix = path.suffix.lower()
+    if suffix in _EXPORT:
+        raise ValueError(f"{suffix} files cannot be read: {_EXPORT[suffix]}")
+    if suffix == ".parquet":
+        return _read_parquet(path, chosen, units)
+    if suffix in (".nda", ".ndax"):
+        return _selected(_read_neware(path), chosen, units)
+    if suffix == ".mpr":
+        return _selected(_read_biologic(path), chosen, units)
+    return _read_text(path, chosen, units)
+
+
+def _selected(
+    table: pd.DataFrame, chosen: Mapping[str, str] | None, units: Mapping[str, str] | None
+) -> tuple[pd.DataFrame, dict[str, Column]]:
+    columns = find_columns([str(name) for name in table.columns], chosen, units)
+    return pd.DataFrame({quantity: table.iloc[:, column.position] for quantity, column in columns.items()}), columns
+
+
+def _read_text(
+    path: Path, chosen: Mapping[str, str] | None, units: Mapping[str, str] | None
+) -> tuple[pd.DataFrame, dict[str, Column]]:
+    layout = _layout(_head(path), chosen)
+    columns = find_columns(layout.names, chosen, units)
+    # one column may serve as two quantities
+    positions = sorted({column.position for column in columns.values()})
+    try:
+        table = pd.read_csv(
+            path,
+            sep=layout.delimiter,
+            decimal=layout.decimal,
+            encoding=layout.encoding,
+            header=None,
+            skiprows=layout.header_line + 1,
+            usecols=positions,
+            index_col=False,
+            low_memory=False,
+        )
+    except pd.errors.EmptyDataError as error:
+        raise ValueError("there are no rows below the header") from error
+    except Exception as error:  # pandas and the unpackers raise whatever the damage leads them to
+        raise ValueError(f"the file is damaged, or no table: {str(error).strip()}") from error
+    return pd.DataFrame({quantity: table[column.position] for quantity, column in columns.items()}), columns
+
+
+def _head(path: Path) -> bytes:
+    """The beginning of a file, unpacked."""
+    try:
+        with _open(path) as stream:
+            head = stream.read(_HEAD_BYTES)
+    except (FileNotFoundError, IsADirectoryError, PermissionError):
+        raise
+    except Exception as error:
+        raise ValueError(f"the file is damaged: {str(error).strip() or type(error).__name__}") from error
+    if not head.strip():
+        raise ValueError("the file is empty")
+    return head
+
+
+def _open(path: Path) -> IO[bytes]:
+    suffix = path.suffix.lower()
+    if suffix == ".zip":
+        archive = zipfile.ZipFile(path)
+        names = archive.namelist()
+        if len(names) != 1:
+            raise ValueError(f"the archive must hold one file, got {len(names)}")
+        return archive.open(names[0])
+    return _OPENERS[suffix](path) if suffix in _OPENERS else path.open("rb")
+
+
+def _layout(head: bytes, chosen: Mapping[str, str] | None) -> _Layout:
+    encoding, text = _decoded(head)
+    lines = io.StringIO(text, newline=None).read().split("\n")[:_HEAD_LINES]
+    best, found = (0, ","), -1
+    for number, line in enumerate(lines):
+        for delimiter in _DELIMITERS:
+            if (count := count_required(_fields(line, delimiter), chosen)) > found:
+                best, found = (number, delimiter), count
+    number, delimiter = best
+    if found <= 0:
+        number = next((n for n, line in enumerate(lines) if line.strip()), -1)
+        if number < 0:
+            raise ValueError("the file is empty")
+        if any(map(_NUMBER.match, lines[number].split(","))):
+            raise ValueError("there is no line with the names of the columns above the numbers. Add one")
+        delimiter = max(_DELIMITERS, key=lambda each: len(_fields(lines[number], each)))
+    values = [field for line in lines[number + 1 :] for field in _fields(line, delimiter)]
+    comma = (
+        delimiter not in (",", _BLANKS)
+        and any(map(_DECIMAL_COMMA.match, values))
+        and not any(map(_DECIMAL_POINT.match, values))
+    )
+    return _Layout(encoding, number, delimiter, "," if comma else ".", _fields(lines[number], delimiter))
+
+
+def _decoded(head: bytes) -> tuple[str, str]:
+    for mark, encoding in ((b"\xef\xbb\xbf", "utf-8-sig"), (b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16")):
+        if head.startswith(mark):
+            return encoding, head.decode(encoding, errors="ignore")
+    if b"\0" in head:
+        raise ValueError("the file is binary, and its ending is none of those that can be read")
+    try:
+        # the head may end within a character
+        return "utf-8", head.decode("utf-8", errors="strict" if len(head) < _HEAD_BYTES else "ignore")
+    except UnicodeDecodeError:
+        return "latin-1", head.decode("latin-1")
+
+
+def _fields(line: str, delimiter: str) -> list[str]:
+    # numpy writes a header as a comment
+    line = line.lstrip("# ")
+    if delimiter == _BLANKS:
+        return line.split()
+    try:
+        return [field.strip() for field in next(csv.reader([line], delimiter=delimiter), [])]
+    except csv.Error:
+        return []
+
+
+def _read_parquet(
+    path: Path, chosen: Mapping[str, str] | None, units: Mapping[str, str] | None
+) -> tuple[pd.DataFrame, dict[str, Column]]:
+    try:
+        from pyarrow import parquet
+    except ImportError as error:
+        raise ImportError("Parquet files need pyarrow: pip install 'battery_env[parquet]'") from error
+    try:
+        file = parquet.ParquetFile(path)
+    except FileNotFoundError:
+        raise
+    except Exception as error:
+        raise ValueError(f"the file is damaged, or no Parquet: {str(error).strip()}") from error
+    with file:
+        columns = find_columns(file.schema_arrow.names, chosen, units)
+        table = file.read(columns=sorted({column.name for column in columns.values()})).to_pandas()
+    return pd.DataFrame({quantity: table[column.name] for quantity, column in columns.items()}), columns
+
+
+def _read_neware(path: Path) -> pd.DataFrame:
+    try:
+        import NewareNDA
+    except ImportError as error:
+        raise ImportError("Neware's files need NewareNDA: pip install 'battery_env[cyclers]'") from error
+    with path.open("rb"):  # a missing file is that, not a damaged one
+        pass
+    try:
+        return NewareNDA.read(str(path), log_level="ERROR")
+    except Exception as error:
+        raise ValueError(f"the file is damaged, or none of Neware's: {str(error).strip()}") from error
+
+
+def _read_biologic(path: Path) -> pd.DataFrame:
+    try:
+        from galvani.BioLogic import MPRfile
+    except ImportError as error:
+        raise ImportError("BioLogic's files need galvani: pip install 'battery_env[cyclers]'") from error
+    with path.open("rb") as stream:
+        try:
+            return pd.DataFrame(MPRfile(stream).data)
+        except Exception as error:
+            raise ValueError(f"the file is damaged, or none of BioLogic's: {str(error).strip()}") from error
+
+
+def is_readable(path: Path, more: Sequence[str] = ()) -> bool:
+    """
+    Whether the name of a file ends as that of a record may.
+
+    :param path: the file
+    :param more: further endings
+    :return: whether it does
+    """
+    suffixes = [suffix.lower() for suffix in path.suffixes]
+    if suffixes and suffixes[-1] in PACKED_SUFFIXES:
+        return len(suffixes) > 1 and suffixes[-2] in TEXT_SUFFIXES
+    return bool(suffixes) and suffixes[-1] in (*TEXT_SUFFIXES, *BINARY_SUFFIXES, *more)

@@ -1,0 +1,452 @@
+"""Files as testers and people write them, and as a new user would get them wrong."""
+
+import gzip
+import sys
+import types
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from scipy.io import savemat
+
+from battery_env.cells import BUNDLED_CELLS, load_nasa_discharges
+from battery_env.columns import find_columns
+from battery_env.record_files import read_discharges
+
+# two samples at rest, a load of 2 A, and a rest
+TIME_S = np.concatenate([[0.0, 5.0], np.arange(10.0, 1810.0, 30.0), [1815.0, 1830.0]])
+LOADED = (TIME_S > 7.0) & (TIME_S < 1812.0)
+CURRENT_A = np.where(LOADED, 2.0, 0.0)
+VOLTAGE_V = np.round(np.where(LOADED, 4.0 - 0.8 * TIME_S / 1800.0, [4.19] * 2 + [3.4] * (len(TIME_S) - 2)), 6)
+TEMPERATURE_C = np.round(24.0 + TIME_S / 200.0, 4)
+
+
+def clock(seconds: float) -> str:
+    minutes, rest = divmod(seconds, 60.0)
+    return f"{int(minutes // 60):02d}:{int(minutes % 60):02d}:{rest:06.3f}"
+
+
+def check(discharge, temperature: bool = False) -> None:
+    np.testing.assert_allclose(discharge.time_s, TIME_S, atol=1e-6)
+    np.testing.assert_allclose(discharge.voltage_V, VOLTAGE_V, atol=1e-6)
+    np.testing.assert_allclose(discharge.current_A, CURRENT_A, atol=1e-6)
+    if temperature:
+        np.testing.assert_allclose(discharge.temperature_C, TEMPERATURE_C, atol=1e-3)
+    else:
+        assert discharge.temperature_C is None
+
+
+def one(path: Path, **options):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        (discharge,) = read_discharges(path, **options)
+    return discharge
+
+
+COLUMNS = {
+    "the own names": {"time_s": TIME_S, "voltage_V": VOLTAGE_V, "current_A": CURRENT_A, "temperature_C": TEMPERATURE_C},
+    "Battery Data Format": {
+        "Test Time / s": TIME_S,
+        "Voltage / V": VOLTAGE_V,
+        "Current / A": -CURRENT_A,
+        "Surface Temperature T1 / degC": TEMPERATURE_C,
+        "Ambient Temperature / degC": np.full(len(TIME_S), 23.0),
+    },
+    "Battery Data Format for machines": {
+        "test_time_second": TIME_S,
+        "voltage_volt": VOLTAGE_V,
+        "current_ampere": -CURRENT_A,
+        "temperature_t1_celsius": TEMPERATURE_C,
+    },
+    "Arbin": {
+        "Data_Point": np.arange(len(TIME_S)),
+        "Test_Time(s)": TIME_S,
+        "Step_Time(s)": np.mod(TIME_S, 100.0),
+        "Current(A)": -CURRENT_A,
+        "Voltage(V)": VOLTAGE_V,
+        "Aux_Temperature_1 (C)": TEMPERATURE_C,
+        "Charge_Capacity(Ah)": np.zeros(len(TIME_S)),
+    },
+    "NASA": {
+        "Time": TIME_S,
+        "Voltage_measured": VOLTAGE_V,
+        "Current_measured": -CURRENT_A,
+        "Temperature_measured": TEMPERATURE_C,
+    },
+    "thousandths, minutes and kelvin": {
+        "elapsed time [min]": TIME_S / 60.0,
+        "U (mV)": 1e3 * VOLTAGE_V,
+        "I [mA]": 1e3 * CURRENT_A,
+        "Temp (K)": TEMPERATURE_C + 273.15,
+    },
+    "hours": {"Time (h)": TIME_S / 3600.0, "Volts": VOLTAGE_V, "Amps": CURRENT_A, "temperature": TEMPERATURE_C},
+    "a clock": {
+        "Time": list(map(clock, TIME_S)),
+        "voltage_mv": 1e3 * VOLTAGE_V,
+        "current_ma": -1e3 * CURRENT_A,
+        "T1": TEMPERATURE_C,
+    },
+    "dates": {
+        "Date_Time": pd.Timestamp("2026-02-28 23:50") + pd.to_timedelta(TIME_S, unit="s"),
+        "Voltage": VOLTAGE_V,
+        "Current": CURRENT_A,
+        "Cell Temperature": TEMPERATURE_C,
+    },
+}
+
+
+@pytest.mark.parametrize("columns", COLUMNS.values(), ids=COLUMNS)
+@pytest.mark.parametrize("name", ["cell.csv", "cell.parquet", "cell.txt.gz"])
+def test_columns_go_by_the_names_of_testers_and_units_are_told_from_them(columns, name, tmp_path):
+    table = pd.DataFrame(columns)
+    path = tmp_path / name
+    table.to_parquet(path) if name.endswith("parquet") else table.to_csv(path, index=False, sep="\t" if "txt" in name else ",")
+    check(one(path), temperature=True)
+
+
+def test_the_temperature_of_the_surroundings_is_kept_apart(tmp_path):
+    pd.DataFrame(COLUMNS["Battery Data Format"]).to_csv(tmp_path / "cell.bdf.csv", index=False)
+    assert one(tmp_path / "cell.bdf.csv").meta["ambient_temperature_C"] == 23.0
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "latin-1"])
+@pytest.mark.parametrize(("delimiter", "decimal"), [(",", "."), (";", "."), (";", ","), ("\t", "."), ("\t", ",")])
+def test_delimiters_decimal_marks_and_encodings_are_told(delimiter, decimal, encoding, tmp_path):
+    header = ["Zeit (°C?)", "time (s)", "voltage (V)", "current (A)"]
+    rows = [header] + [
+        ["1", *(f"{x:.6f}".replace(".", decimal) for x in row)] for row in zip(TIME_S, VOLTAGE_V, CURRENT_A, strict=True)
+    ]
+    text = "Prüfling: Zelle 7\nBemerkung, mit Komma; und Strichpunkt\n\n" + "\n".join(map(delimiter.join, rows)) + "\n"
+    (tmp_path / "zelle.csv").write_text(text, encoding=encoding)
+    check(one(tmp_path / "zelle.csv"))
+
+
+@pytest.mark.parametrize("comments", ["# ", ""])
+def test_blanks_separate_columns_as_numpy_writes_them(comments, tmp_path):
+    columns = np.column_stack([TIME_S, VOLTAGE_V, CURRENT_A])
+    np.savetxt(tmp_path / "cell.dat", columns, header="time_s voltage_V current_A", comments=comments, fmt="%10.6f")
+    check(one(tmp_path / "cell.dat"))
+
+
+def test_maccor_says_the_direction_of_the_current_by_a_letter(tmp_path):
+    lines = ["Today's Date\t02/28/2026", "Rec#\tCyc#\tStep\tTest (Sec)\tStep (Sec)\tAmp-hr\tAmps\tVolts\tState\tES\t"]
+    charge = [(60.0 * n, 1.0, 3.5 + 0.01 * n, "C", 1) for n in range(60)]
+    steps = np.where(LOADED, 3, np.where(TIME_S < 7.0, 2, 4))
+    discharge = [
+        (4000.0 + t, abs(i), v, "D" if i else "R", step)
+        for t, i, v, step in zip(TIME_S, CURRENT_A, VOLTAGE_V, steps, strict=True)
+    ]
+    for n, (time_s, current_A, voltage_V, state, step) in enumerate([*charge, *discharge]):
+        lines.append(f"{n}\t1\t{step}\t{time_s}\t0.0\t0.0\t{current_A}\t{voltage_V:.6f}\t{state}\t1\t")
+    (tmp_path / "cell.txt").write_text("\n".join(lines))
+    discharge = one(tmp_path / "cell.txt")
+    np.testing.assert_allclose(discharge.time_s - 4000.0, TIME_S)
+    np.testing.assert_allclose(discharge.current_A, CURRENT_A)
+    assert discharge.meta["cycle"] == 1
+
+
+def test_biologic_text_has_lines_above_its_table(tmp_path):
+    head = "EC-Lab ASCII FILE\nNb header lines : 5\n\nTechnique : GCPL\n"
+    rows = [
+        f"{t:.3f}\t{1e3 * -i:.3f}\t{v:.6f}".replace(".", ",") for t, i, v in zip(TIME_S, CURRENT_A, VOLTAGE_V, strict=True)
+    ]
+    text = head + "\n".join(["time/s\tI/mA\tEcell/V", *rows])
+    (tmp_path / "cell.mpt").write_text(text, encoding="latin-1")
+    check(one(tmp_path / "cell.mpt"))
+
+
+def test_neware_counts_time_within_each_step(tmp_path):
+    step_start_s = np.where(TIME_S < 10.0, 0.0, np.where(LOADED, 10.0, 1815.0))
+    # the last row of a step has the time of the first one of the next
+    table = pd.DataFrame(
+        {
+            "Cycle": 1,
+            "Steps": np.where(TIME_S < 10.0, 1, np.where(LOADED, 2, 3)),
+            "Relative Time(h:min:s.ms)": list(map(clock, TIME_S - step_start_s)),
+            "Current(mA)": -1e3 * CURRENT_A,
+            "Voltage(V)": VOLTAGE_V,
+        }
+    )
+    table.to_csv(tmp_path / "cell.csv", index=False)
+    discharge = one(tmp_path / "cell.csv")
+    assert (np.diff(discharge.time_s) > 0.0).all()
+    # what passes between the last row of a step and the first one of the next is not in such a file
+    np.testing.assert_allclose(np.diff(discharge.time_s[2:-2]), 30.0, atol=2e-3)
+    np.testing.assert_allclose(discharge.current_A, CURRENT_A)
+
+
+def life(sign: float = -1.0) -> pd.DataFrame:
+    """Three cycles of charge, rest, discharge and rest on one clock; the cell fades."""
+    parts = []
+    for cycle in range(3):
+        fade = 1.0 - 0.1 * cycle
+        parts.append(pd.DataFrame({"t": np.arange(0.0, 3600.0, 60.0), "v": np.linspace(3.4, 4.2, 60), "i": -1.0 * fade}))
+        parts.append(pd.DataFrame({"t": 3700.0 + fade * TIME_S, "v": VOLTAGE_V, "i": CURRENT_A}))
+        for part in parts[-2:]:
+            part["cycle"], part["t"] = cycle + 1, part["t"] + 6000.0 * cycle
+    table = pd.concat(parts, ignore_index=True)
+    return pd.DataFrame(
+        {"time_s": table["t"], "voltage_V": table["v"], "current_A": -sign * table["i"], "cycle": table["cycle"]}
+    )
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@pytest.mark.parametrize("numbered", [True, False])
+def test_the_discharges_of_a_life_are_found_between_the_charges(sign, numbered, tmp_path):
+    table = life(sign)
+    (table if numbered else table.drop(columns="cycle")).to_csv(tmp_path / "life.csv", index=False)
+    discharges = read_discharges(tmp_path / "life.csv")
+    assert [discharge.meta["cycle"] for discharge in discharges] == [1, 2, 3]
+    for cycle, discharge in enumerate(discharges):
+        np.testing.assert_allclose(discharge.time_s, (1.0 - 0.1 * cycle) * TIME_S, atol=1e-9)
+        np.testing.assert_allclose(discharge.current_A, CURRENT_A)
+
+
+def test_braking_does_not_end_a_discharge_and_an_offset_at_rest_does_not_begin_it(tmp_path):
+    current_A = CURRENT_A.copy()
+    current_A[[20, 30, 31]] = -1.5
+    current_A[:2] = -0.02
+    pd.DataFrame({"time_s": TIME_S, "voltage_V": VOLTAGE_V, "current_A": current_A}).to_csv(
+        tmp_path / "drive.csv", index=False
+    )
+    np.testing.assert_allclose(one(tmp_path / "drive.csv").current_A, current_A)
+
+
+@pytest.mark.parametrize("cell", BUNDLED_CELLS)
+def test_bundled_discharges_read_the_same_by_either_way_and_with_either_sign(cell, tmp_path):
+    known = load_nasa_discharges(cell)[::40]
+    names = ("time_s", "voltage_V", "current_A", "temperature_C")
+    for sign in (1.0, -1.0):
+        tables = [
+            pd.DataFrame({name: getattr(each, name) for name in names}).assign(cycle=each.meta["cycle"]) for each in known
+        ]
+        table = pd.concat(tables, ignore_index=True)
+        table["current_A"] *= sign
+        table.to_csv(tmp_path / "cell.csv", index=False)
+        for discharge, expected in zip(read_discharges(tmp_path / "cell.csv"), known, strict=True):
+            np.testing.assert_allclose(discharge.current_A, expected.current_A, atol=1e-12)
+            np.testing.assert_allclose(discharge.time_s, expected.time_s - expected.time_s[0], atol=1e-9)
+
+
+def own(path: Path, **changes) -> Path:
+    table = pd.DataFrame({"time_s": TIME_S, "voltage_V": VOLTAGE_V, "current_A": CURRENT_A} | changes)
+    table.to_csv(path, index=False)
+    return path
+
+
+def test_repeated_rows_are_dropped_with_a_word_and_other_values_at_one_time_are_refused(tmp_path):
+    lines = own(tmp_path / "cell.csv").read_text().splitlines()
+    (tmp_path / "cell.csv").write_text("\n".join([*lines[:9], lines[8], *lines[9:]]))
+    with pytest.warns(UserWarning, match=f"1 of {len(TIME_S) + 1} rows are repeated, and dropped"):
+        (discharge,) = read_discharges(tmp_path / "cell.csv")
+    check(discharge)
+    other = lines[8].split(",")
+    other[1] = "3.0"
+    (tmp_path / "cell.csv").write_text("\n".join([*lines[:9], ",".join(other), *lines[9:]]))
+    with pytest.raises(ValueError, match=r"time_s must increase from sample to sample.*each sample once"):
+        read_discharges(tmp_path / "cell.csv")
+
+
+def test_a_row_at_the_end_of_one_step_and_one_at_the_start_of_the_next_may_have_one_time(tmp_path):
+    steps = np.where(TIME_S < 7.0, 1, 2)
+    time_s = TIME_S.copy()
+    time_s[2] = time_s[1]
+    discharge = one(own(tmp_path / "cell.csv", time_s=time_s, step=steps))
+    assert discharge.time_s[2] - discharge.time_s[1] == pytest.approx(1e-3)
+
+
+def test_columns_and_units_can_be_stated(tmp_path):
+    path = tmp_path / "cell.csv"
+    pd.DataFrame({"x": TIME_S / 60.0, "Voltage 1": 1e3 * VOLTAGE_V, "Voltage 2": 0.0, "I, mean": CURRENT_A}).to_csv(
+        path, index=False
+    )
+    with pytest.raises(
+        ValueError, match=r"no column for the time, the voltage, the current among x, Voltage 1, .*--columns time=NAME"
+    ):
+        read_discharges(path)
+    columns = {"time": "x", "voltage": "Voltage 1", "current": "I, mean"}
+    check(one(path, columns=columns, units={"time": "min", "voltage": "mV"}))
+    with pytest.raises(ValueError, match="there is no column 'y' for the time among x, Voltage 1"):
+        read_discharges(path, columns=columns | {"time": "y"})
+    with pytest.raises(ValueError, match="the unit 'furlong' of the column 'x' is not known for the time"):
+        read_discharges(path, columns=columns, units={"time": "furlong"})
+    with pytest.raises(ValueError, match=r"columns knows time, voltage, .*, got power"):
+        read_discharges(path, columns={"power": "x"})
+
+
+def test_a_sensor_that_was_not_connected_is_no_temperature(tmp_path):
+    assert one(own(tmp_path / "cell.csv", temperature_C=np.nan)).temperature_C is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"voltage_V": 1e3 * VOLTAGE_V}, r"voltage_V must lie within 0 \.\. 5.5 V, got 4190.*not in mV"),
+        ({"current_A": 1e3 * CURRENT_A}, r"current_A must lie within .*not in mA"),
+        ({"time_s": TIME_S / 3600.0}, "Give the time in seconds, not in hours"),
+        ({"voltage_V": np.where(TIME_S == 40.0, np.nan, VOLTAGE_V)}, "the voltage must be finite, got nan in row 4"),
+        (
+            {"voltage_V": ["4.1", "OVERLOAD", *map(str, VOLTAGE_V[2:])]},
+            "'voltage_V' must hold numbers, got 'OVERLOAD' in row 2",
+        ),
+        ({"current_A": 0.0}, "no current flows"),
+        ({"voltage_V": 3.7}, "whether the current of a discharge is positive or negative cannot be told"),
+        ({"time_s": TIME_S[::-1]}, "the file holds no discharge|must increase|cannot be told"),
+        ({"Voltage(V)": VOLTAGE_V}, "both 'voltage_V' and 'Voltage.V.' may be the voltage"),
+        ({"current_A": np.abs(np.sin(TIME_S)), "voltage_V": 3.7 + 0.3 * np.cos(TIME_S)}, "cannot be told"),
+        ({"cycle": 1.5}, "the column of the cycle must hold whole numbers"),
+        ({"temperature_C": np.where(TIME_S == 40.0, np.nan, 24.0)}, "temperature_C must be finite"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused_with_the_name_of_the_file(changes, message, tmp_path):
+    with pytest.raises(ValueError, match=rf"cell.csv: .*(?:{message})") as caught:
+        read_discharges(own(tmp_path / "cell.csv", **changes))
+    assert "\n" not in str(caught.value)
+
+
+def test_what_is_no_table_is_refused_in_one_line(tmp_path):
+    truncated = gzip.compress("\n".join(["time_s,voltage_V,current_A", *["1,4.1,2"] * 200_000]).encode(), mtime=0)[:-100]
+    cases = {
+        "empty.csv": (b"", "is empty"),
+        "header.csv": (b"time_s,voltage_V,current_A\n", "no rows below the header"),
+        "headless.csv": (b"0.0,4.19,0\n1.0,4.18,2\n", "no line with the names of the columns"),
+        "blank.dat": (b"0.0 4.19 0\n1.0 4.18 2\n", "no line with the names of the columns"),
+        "text.txt": (b"Dear all,\nplease find the data attached.\n", "no column for the time"),
+        "cut.csv.gz": (truncated, "damaged"),
+        "no.csv.gz": (b"time_s,voltage_V,current_A\n", "damaged"),
+        "picture.csv": (b"\x89PNG\x00\x00", "binary"),
+        "cell.parquet": (b"PAR1", "damaged, or no Parquet"),
+        "cell.mat": (b"MATLAB", "damaged"),
+        "cell.xlsx": (b"PK", "save the sheet as CSV"),
+    }
+    for name, (content, message) in cases.items():
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(ValueError, match=rf"{name}.*{message}") as caught:
+            read_discharges(tmp_path / name)
+        assert "\n" not in str(caught.value)
+    with pytest.raises(FileNotFoundError):
+        read_discharges(tmp_path / "missing.csv")
+
+
+def test_the_sign_can_be_stated_and_then_is_not_told(tmp_path):
+    path = own(tmp_path / "cell.csv", current_A=-CURRENT_A)
+    check(one(path, discharge_is_negative=True))
+    with pytest.raises(ValueError, match=r"holds no discharge.*sign of the current"):
+        read_discharges(path, discharge_is_negative=False)
+
+
+def test_one_bad_discharge_does_not_lose_the_others(tmp_path):
+    table = life()
+    table.loc[70, "voltage_V"] = 9.0
+    table.to_csv(tmp_path / "life.csv", index=False)
+    with pytest.warns(UserWarning, match=r"discharge 1: voltage_V must lie within .* It is left out"):
+        discharges = read_discharges(tmp_path / "life.csv")
+    assert [discharge.meta["cycle"] for discharge in discharges] == [2, 3]
+
+
+def test_mat_files_are_nasas(tmp_path):
+    data = {
+        "Voltage_measured": VOLTAGE_V,
+        "Current_measured": -CURRENT_A,
+        "Temperature_measured": TEMPERATURE_C,
+        "Time": TIME_S,
+    }
+    test = {
+        "type": "discharge",
+        "ambient_temperature": 24,
+        "time": np.array([2008.0, 4.0, 2.0, 15.0, 25.0, 41.6]),
+        "data": data,
+    }
+    savemat(tmp_path / "B0018.mat", {"B0018": {"cycle": np.array([test], dtype=object)}})
+    check(one(tmp_path / "B0018.mat"), temperature=True)
+
+
+def test_binary_files_of_neware_and_biologic_need_an_extra_and_go_by_the_names_of_its_readers(tmp_path, monkeypatch):
+    for name, module, message in (("c.nda", "NewareNDA", "Neware"), ("c.mpr", "galvani.BioLogic", "BioLogic")):
+        monkeypatch.setitem(sys.modules, module, None)
+        (tmp_path / name).write_bytes(b"x")
+        with pytest.raises(ImportError, match=rf"{message}.*battery_env\[cyclers\]"):
+            read_discharges(tmp_path / name)
+    neware, biologic = types.ModuleType("NewareNDA"), types.ModuleType("galvani.BioLogic")
+    table = pd.DataFrame(
+        {
+            "Cycle": 1,
+            "Step": np.where(LOADED, 2, 1),
+            "Status": np.where(LOADED, "CC_DChg", "Rest"),
+            "Time": TIME_S,
+            "Voltage": VOLTAGE_V,
+            "Current(mA)": -1e3 * CURRENT_A,
+            "Timestamp": pd.Timestamp("2026-02-28"),
+        }
+    )
+    neware.read = lambda path, log_level: table
+    records = np.rec.fromarrays([TIME_S, -1e3 * CURRENT_A, VOLTAGE_V], names="time/s,I/mA,Ewe/V")
+    biologic.MPRfile = lambda stream: types.SimpleNamespace(data=records)
+    monkeypatch.setitem(sys.modules, "NewareNDA", neware)
+    monkeypatch.setitem(sys.modules, "galvani", types.ModuleType("galvani"))
+    monkeypatch.setitem(sys.modules, "galvani.BioLogic", biologic)
+    check(one(tmp_path / "c.nda"))
+    check(one(tmp_path / "c.mpr"))
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    time_unit=st.sampled_from([("s", 1.0), ("min", 60.0), ("h", 3600.0), ("ms", 1e-3)]),
+    voltage_unit=st.sampled_from([("V", 1.0), ("mV", 1e-3)]),
+    current_unit=st.sampled_from([("A", 1.0), ("mA", 1e-3)]),
+    form=st.sampled_from(["{}({})", "{} [{}]", "{} / {}", "{}/{}", "{}_{}"]),
+    delimiter=st.sampled_from([",", ";", "\t"]),
+    sign=st.sampled_from([1.0, -1.0]),
+    order=st.permutations(range(4)),
+)
+def test_any_mixture_of_units_signs_and_orders_is_read_the_same(
+    time_unit, voltage_unit, current_unit, form, delimiter, sign, order, tmp_path
+):
+    columns = [
+        (form.format("Test Time", time_unit[0]), TIME_S / time_unit[1]),
+        (form.format("Voltage", voltage_unit[0]), VOLTAGE_V / voltage_unit[1]),
+        (form.format("Current", current_unit[0]), sign * CURRENT_A / current_unit[1]),
+        ("Remark, with; marks", ["x"] * len(TIME_S)),
+    ]
+    pd.DataFrame(dict(columns[n] for n in order)).to_csv(tmp_path / "cell.csv", index=False, sep=delimiter)
+    check(one(tmp_path / "cell.csv"))
+
+
+CELLS = st.one_of(st.floats(width=32).map(str), st.sampled_from(["", "NaN", "4.1", "2", "-2", "0:10", "x", "1e400", '"']))
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    st.one_of(
+        st.binary(max_size=300),
+        st.text(max_size=300).map(lambda text: text.encode("utf-8", errors="replace")),
+        st.lists(st.lists(CELLS, max_size=7).map(",".join), max_size=12).map(
+            lambda rows: "\n".join(["time_s,voltage_V,current_A,temperature_C,cycle,step,state", *rows]).encode()
+        ),
+    )
+)
+def test_whatever_a_file_holds_it_is_read_or_refused_in_a_line(tmp_path, content):
+    (tmp_path / "any.csv").write_bytes(content)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        try:
+            discharges = read_discharges(tmp_path / "any.csv")
+        except ValueError as error:
+            assert "any.csv: " in str(error) and "\n" not in str(error).strip()
+        else:
+            assert all(discharge.charge_C > 0.0 for discharge in discharges)
+
+
+@settings(max_examples=60)
+@given(st.lists(st.text(max_size=20), max_size=6))
+def test_no_header_breaks_the_search_for_columns(names):
+    try:
+        found = find_columns(names)
+    except ValueError as error:
+        assert str(error)
+    else:
+        assert {"time", "voltage", "current"} <= set(found)
