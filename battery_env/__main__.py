@@ -25,7 +25,7 @@ from battery_env.estimators.least_squares import LeastSquares
 from battery_env.files import replacing
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.plotting import plot_discharge, save_figure
-from battery_env.record_model import Forecast
+from battery_env.record_model import VoltageForecast
 from battery_env.records import ExpectedCurrent, expected_current
 
 
@@ -161,7 +161,7 @@ def _read(record: str, discharge_is_negative: bool) -> tuple[str, Discharge]:
 
 
 def _summary(
-    record: Discharge, estimate: Estimate, forecast: Forecast, measured_eod_s: float, future: ExpectedCurrent
+    record: Discharge, estimate: Estimate, forecast: VoltageForecast, measured_eod_s: float, future: ExpectedCurrent
 ) -> dict[str, Any]:
     remaining_s = max(forecast.eod_time_s - float(record.time_s[-1]), 0.0) if np.isnan(measured_eod_s) else 0.0
     residual_V = forecast.at_samples_V - record.voltage_V

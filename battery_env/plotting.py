@@ -18,7 +18,7 @@ from battery_env.estimates import Estimate, EstimateTrace
 from battery_env.estimators.cramer_rao import CramerRaoBound, Sensitivities
 from battery_env.files import replacing
 from battery_env.parameters import PARAMETER_NAMES, PARAMETERS
-from battery_env.record_model import Forecast
+from battery_env.record_model import VoltageForecast
 from battery_env.records import Record
 
 #: Colours that colour-blind readers can tell apart (Okabe & Ito).
@@ -120,7 +120,7 @@ def plot_learning_curves(curves: Mapping[str, list[pd.DataFrame]], title: str) -
     return figure
 
 
-def plot_discharge(record: Record, forecasts: Mapping[str, Forecast]) -> Figure:
+def plot_discharge(record: Record, forecasts: Mapping[str, VoltageForecast]) -> Figure:
     """
     The measured voltage of one discharge with that of the model at some estimates, and below it the error of the model.
 
