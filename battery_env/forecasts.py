@@ -31,11 +31,13 @@ BAND = (0.05, 0.5, 0.95)
 #: The error of the model shortly before the end of a record is the mean over this share of the record.
 _RECENT_SHARE = 0.1
 #: It is forgotten with this decay constant, as a share of ``q_mobile``: the model is wrong in another way at another charge.
-_MEMORY_SHARE = 0.1
+_MEMORY_SHARE = 0.15
 # Loads are laid out, and cells that have ended are left out, after so many steps.
 _CHUNK_STEPS = 256
 # The course of the voltage is kept about this often, s.
 _COURSE_S = 10.0
+# The last voltage of a record may be the cut-off but for rounding, V.
+_ROUNDING_V = 1e-6
 # An estimate this many standard deviations below what the record takes out of the cell contradicts the record.
 _CONTRADICTION_SD = 5.0
 
@@ -220,7 +222,7 @@ def forecast(
     cells = _Cells(model, q_mobile, r_o)
     recent = _follow(cells, seen, current_A[:-1])
     error = _ModelError.drawn(recent, seen, mismatch_V, rng)
-    over = seen.voltage_V[-1] <= cut_off and seen.current_A[-1] > 0.0
+    over = seen.voltage_V[-1] <= cut_off + _ROUNDING_V and seen.current_A[-1] > 0.0
     if not over:
         alive = np.flatnonzero(cells.voltage() + error.now_V > cut_off)
         if len(alive) == 0:
@@ -238,8 +240,9 @@ def forecast(
         nominal_Ah = _nominal_Ah(model, _draw(to_come, rng), cut_off, max_duration_s)
     if over:
         ends = _Ends(np.zeros(samples), soc, np.zeros(1), np.full((len(BAND), 1), cut_off))
-        after = np.flatnonzero(seen.voltage_V > cut_off)
-        now_s = float(seen.time_s[after[-1] + 1 if len(after) else 0])
+        above = np.flatnonzero(seen.voltage_V > cut_off + _ROUNDING_V)
+        around = [above[-1] + 1, above[-1]] if len(above) else [0]
+        now_s = float(np.interp(cut_off, seen.voltage_V[around], seen.time_s[around]))
     else:
         loads = [_draw(to_come, rng) for _ in range(samples)] if isinstance(to_come, RandomLoad) else [to_come]
         ends, now_s = _discharge(cells, error, loads, cut_off, max_duration_s), float(seen.time_s[-1])
@@ -453,8 +456,9 @@ def _discharge(cells: _Cells, error: _ModelError, loads: list[_Known], cut_off_V
             time_s[index[ended]] = dt_s * (k - 1 + share) if k else 0.0
             end_soc[index[ended]] = last_soc[ended] + share * (soc[ended] - last_soc[ended])
             going[ended] = False
-        shown_V[index] = np.where(going, voltage_V, cut_off_V)
         if k % every == 0 or not going.any():
+            shown_V[:] = cut_off_V
+            shown_V[index[going]] = voltage_V[going]
             course.append((dt_s * k, _quantile(shown_V, BAND)))
         if not going.any():
             break

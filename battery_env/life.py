@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from numba import njit
 from numpy.typing import ArrayLike
 from scipy.optimize import minimize
+from scipy.stats import truncnorm
 
 from battery_env.arrays import BoolArray, FloatArray
 from battery_env.cells import Discharge
@@ -34,7 +35,7 @@ class Life:
     The logarithm of ``q_mobile`` is a random walk with drift over the discharges, of which each estimate is one reading.
 
     :param table: one row per discharge: ``cycle`` (its number, or its position), ``q_mobile_C``, ``sd_q_mobile_C``,
-        ``r_o_ohm``, ``settled``, ``capacity_Ah`` (charge to the cut-off), and what the discharges before let expect of
+        ``r_o_ohm``, ``settled``, ``reason``, ``capacity_Ah`` (charge to the cut-off), and what the discharges before let expect of
         ``q_mobile``, ``expected_q_mobile_C`` and ``expected_sd_C`` (NaN for the first)
     :param step_share: standard deviation of the step from one discharge to the next, as a share of ``q_mobile``
     :param noise_share: standard deviation of an estimate beside the others, likewise
@@ -56,6 +57,18 @@ class Life:
         mean, variance = self.state.sum(), self.covariance.sum() + self.step_share**2
         return exp(mean), exp(mean) * sqrt(variance)
 
+    def after(self, count: int) -> Life:
+        """
+        The life as it was known after its first discharges.
+
+        :param count: how many
+        :return: that part of the life, with the sizes of step and noise that it shows
+        :raises ValueError: for fewer discharges than one or more than there are, or if none of them determines ``q_mobile``
+        """
+        if not 1 <= check_whole_number("count", count) <= len(self.table):
+            raise ValueError(f"count must lie within 1 .. {len(self.table)}, got {count}")
+        return _life(self.table.iloc[:count])
+
     def remaining_discharges(
         self,
         threshold_Ah: float,
@@ -66,7 +79,8 @@ class Life:
     ) -> FloatArray:
         """
         The remaining useful life: how many discharges are still to come, the one included that first has less capacity than
-        the threshold. The cell is used as before; its capacity is in proportion to ``q_mobile``, as in the last discharge.
+        the threshold. The cell is used as before; its capacity is in proportion to ``q_mobile``, as in the last discharge, and
+        does not grow in the long run.
 
         :param threshold_Ah: capacity at which the life ends, Ah
         :param probability: of the quantiles, within 0 .. 1, any shape
@@ -82,7 +96,11 @@ class Life:
         last = self.table[self.table["settled"]].iloc[-1]
         end = log(threshold_Ah * last["q_mobile_C"] / last["capacity_Ah"])
         rng = np.random.default_rng(check_whole_number("seed", seed))
-        level, drift = rng.multivariate_normal(self.state, self.covariance, size=samples).T
+        (level_mean, drift_mean), ((p_level, p_both), (_, p_drift)) = self.state, self.covariance
+        drift_sd = sqrt(p_drift)
+        drift = drift_mean + drift_sd * truncnorm.rvs(-np.inf, -drift_mean / drift_sd, size=samples, random_state=rng)
+        level = level_mean + p_both / p_drift * (drift - drift_mean)
+        level += sqrt(max(p_level - p_both**2 / p_drift, 0.0)) * rng.standard_normal(samples)
         left = np.full(samples, np.inf)
         for n in range(1, most + 1):
             level = level + drift + self.step_share * rng.standard_normal(samples)
@@ -150,14 +168,13 @@ def track_life(discharges: Sequence[Discharge], cut_off_V: float, calibrator: Le
                 "reason": estimate.reason,
             }
         )
-    table = pd.DataFrame(rows)
+    return _life(pd.DataFrame(rows))
+
+
+def _life(table: pd.DataFrame) -> Life:
     settled = table["settled"].to_numpy()
     if not settled.any():
-        raise ValueError(f"no discharge determines q_mobile. Of the first one: {rows[0]['reason']}")
-    return _life(table.drop(columns="reason"), settled)
-
-
-def _life(table: pd.DataFrame, settled: BoolArray) -> Life:
+        raise ValueError(f"no discharge determines q_mobile. Of the first one: {table['reason'].iloc[0]}")
     readings = np.log(table["q_mobile_C"].to_numpy())
     first = int(np.flatnonzero(settled)[0])
     centre = np.log([PRIOR_STEP_SHARE, PRIOR_NOISE_SHARE])
