@@ -16,7 +16,7 @@ from battery_env.checks import LOAD_UNIT_SYMBOLS, LoadUnit, check_load, check_nu
 from battery_env.electrochemistry import simulate, state_of_charge, step_into, voltage_into
 from battery_env.estimates import Estimate
 from battery_env.estimators.settling import white_noise_V
-from battery_env.loads import BlockBootstrap, Cycle, Load, RandomLoad, Spliced, constant
+from battery_env.loads import BlockBootstrap, Cycle, Load, RandomLoad, Spliced, constant, steadier_unit
 from battery_env.parameters import Q_MOBILE, R_O
 from battery_env.plotting import COLOURS, new_figure
 from battery_env.record_model import RecordModel
@@ -30,7 +30,8 @@ BAND = (0.05, 0.5, 0.95)
 
 #: The error of the model shortly before the end of a record is the mean over this share of the record.
 _RECENT_SHARE = 0.1
-#: It is forgotten with this decay constant, as a share of ``q_mobile``: the model is wrong in another way at another charge.
+#: It drifts with this constant, as a share of ``q_mobile``: the model is wrong in another way at another charge. That is how
+#: fast the residuals of whole discharges of B0005 lose their correlation.
 _MEMORY_SHARE = 0.15
 # Loads are laid out, and cells that have ended are left out, after so many steps.
 _CHUNK_STEPS = 256
@@ -173,11 +174,12 @@ def forecast(
 
     *The error of the model* has the standard deviation ``mismatch_V``. Shortly before the end of the record it is the mean
     difference between measured voltage and that of the sample, so that samples of any resistance agree with what was
-    measured. From there it forgets with the charge that is drawn. Samples that would have reached the cut-off within the
+    measured. From there it drifts with the charge that is drawn. Samples that would have reached the cut-off within the
     record are replaced by others.
 
     *The load.* Without ``load`` the discharge goes on as before: at its last current if that was constant (none, if it was
-    switched off), and otherwise in blocks of the record (:class:`battery_env.loads.BlockBootstrap`).
+    switched off), and otherwise in blocks of the record (:class:`battery_env.loads.BlockBootstrap`), of its current or of its
+    power, whichever is steadier between the switches of the load.
 
     :param record: one discharge from its first sample to now, of a cell that was full unless ``model`` says otherwise
     :param estimate: of any calibrator, best with its standard deviations
@@ -289,7 +291,7 @@ def _to_come(load: FutureLoad | None, unit: LoadUnit, record: Samples, model: Re
     if load is None:
         expected = expected_current(record.time_s, record.current_A)
         if expected.varied:
-            return BlockBootstrap(record, "current", dt_s=model.dt_s), "a load as so far"
+            return BlockBootstrap(record, steadier_unit(record), dt_s=model.dt_s), "a load as so far"
         load, unit = expected.mean_A, "current"
     if isinstance(load, (Load, Cycle, Spliced, RandomLoad)):
         return load, {Load: "a given load", Cycle: "a cycle"}.get(type(load), "a random load")
@@ -371,9 +373,7 @@ class _Cells:
 
     def step(self, load: FloatArray, unit: LoadUnit) -> None:
         model = self.model
-        step_into(
-            self.state, self.state, load, self.q_mobile, self.r_o, model.dt_s, unit, model.thermal, model.cell.packed
-        )
+        step_into(self.state, self.state, load, self.q_mobile, self.r_o, model.dt_s, unit, model.thermal, model.cell.packed)
 
     def soc(self) -> FloatArray:
         return state_of_charge(self.state, self.q_mobile)
@@ -394,11 +394,11 @@ def _follow(cells: _Cells, record: Samples, current_A: FloatArray) -> FloatArray
 
 @dataclass(frozen=True)
 class _ModelError:
-    """What is added to the voltage of each cell: known at the end of the record, and less and less known from there."""
+    """What is added to the voltage of each cell: known at the end of the record, and less and less from there."""
 
     now_V: FloatArray
     mismatch_V: float
-    other: FloatArray  # standard normal: the error far from here
+    other: FloatArray  # standard normal: how it drifts
 
     @classmethod
     def drawn(cls, recent_V: FloatArray, record: Samples, mismatch_V: float, rng: np.random.Generator) -> _ModelError:
@@ -415,8 +415,9 @@ class _ModelError:
         return _ModelError(self.now_V[chosen], self.mismatch_V, self.other[chosen])
 
     def after(self, drawn_share: FloatArray) -> FloatArray:
+        # what the last voltages showed stays, as an error of r_o would; what the error is beside that changes
         memory = np.exp(-np.maximum(drawn_share, 0.0) / _MEMORY_SHARE)
-        return memory * self.now_V + self.mismatch_V * np.sqrt(1.0 - memory**2) * self.other
+        return self.now_V + self.mismatch_V * np.sqrt(1.0 - memory**2) * self.other
 
 
 class _Ends(NamedTuple):

@@ -22,8 +22,8 @@ from battery_env.forecasts import BAND
 from battery_env.plotting import COLOURS, LABELS, new_figure
 from battery_env.records import drawn
 
-#: What is believed of a cell before its discharges tell, as shares of q_mobile: the step from one to the next, the error of one
-#: estimate beside the others (both known to a factor of e, one standard deviation), and the standard deviation of the drift.
+#: What is believed of a cell before its discharges tell, as shares of q_mobile: the step from one to the next, the error of
+#: one estimate beside the others (both known to a factor of e, one standard deviation), and the sd of the drift.
 PRIOR_STEP_SHARE, PRIOR_NOISE_SHARE, PRIOR_DRIFT_SD_SHARE = 0.01, 0.003, 0.003
 
 
@@ -35,8 +35,8 @@ class Life:
     The logarithm of ``q_mobile`` is a random walk with drift over the discharges, of which each estimate is one reading.
 
     :param table: one row per discharge: ``cycle`` (its number, or its position), ``q_mobile_C``, ``sd_q_mobile_C``,
-        ``r_o_ohm``, ``settled``, ``reason``, ``capacity_Ah`` (charge to the cut-off), and what the discharges before let expect of
-        ``q_mobile``, ``expected_q_mobile_C`` and ``expected_sd_C`` (NaN for the first)
+        ``r_o_ohm``, ``settled``, ``reason``, ``capacity_Ah`` (charge to the cut-off), and what the discharges before let
+        expect of ``q_mobile``, ``expected_q_mobile_C`` and ``expected_sd_C`` (NaN for the first)
     :param step_share: standard deviation of the step from one discharge to the next, as a share of ``q_mobile``
     :param noise_share: standard deviation of an estimate beside the others, likewise
     :param drift_share: mean step
@@ -130,9 +130,9 @@ def track_life(discharges: Sequence[Discharge], cut_off_V: float, calibrator: Le
     """
     Follow ``q_mobile`` of one cell from discharge to discharge.
 
-    Each discharge is calibrated alone. Over the discharges the logarithm of ``q_mobile`` is a random walk with drift (the local
-    level model of Durbin and Koopman, *Time Series Analysis by State Space Methods*, 2012, with a constant slope), filtered by
-    Kalman's recursions. The sizes of step and noise are those that make the series most probable, under weak priors
+    Each discharge is calibrated alone. Over the discharges the logarithm of ``q_mobile`` is a random walk with drift (the
+    local level model of Durbin and Koopman, *Time Series Analysis by State Space Methods*, 2012, with a constant slope),
+    filtered by Kalman's recursions. The sizes of step and noise are those that make the series most probable, under weak priors
     (:data:`PRIOR_STEP_SHARE`). Estimates that are not settled, as of discharges that were cut short, are left aside.
 
     .. code-block:: python
@@ -206,8 +206,8 @@ def _filtered(
     state: FloatArray,
     covariance: FloatArray,
 ) -> float:
-    # Kalman's recursions. Returns minus the log likelihood; fills what was expected of each reading (mean, variance of the level)
-    # and the state after the last one
+    # Kalman's recursions. Returns minus the log likelihood; fills what was expected of each reading (mean and variance of the
+    # level) and the state after the last one
     level, drift = readings[first], 0.0
     p_level, p_both, p_drift = noise**2, 0.0, drift_sd**2
     surprise = 0.0

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from battery_env.arrays import FloatArray, IntArray
 from battery_env.checks import LoadUnit, check_load, check_numbers, check_positive, check_range
-from battery_env.records import SWITCH_SHARE, Record, drawn
+from battery_env.records import SWITCH_SHARE, Record, drawn, resample_current
 
 _MOST_SEGMENTS = 1e6  # of a random load; beyond, a time is meant in another unit
 #: The blocks of :class:`BlockBootstrap`, as a share of the record.
@@ -293,6 +293,28 @@ class RandomWalk(RandomLoad):
         return Load(self.segment_s * np.arange(segments, dtype=np.float64), low + folded, self.unit)
 
 
+def steadier_unit(record: Record) -> LoadUnit:
+    """
+    Whether a consumer draws its current or its power, by which of the two drifts less between the switches of the load while
+    the voltage falls.
+
+    :param record: one discharge
+    :return: ``"power"`` or ``"current"``
+    """
+    current_A = np.asarray(record.current_A)
+    switch_A = SWITCH_SHARE * np.abs(current_A).max()
+    parts = np.split(np.arange(len(current_A)), np.flatnonzero(np.abs(np.diff(current_A)) > switch_A) + 1)
+    drift = {"current": 0.0, "power": 0.0}
+    for part in parts:
+        # the first sample after a switch may show a part of it only
+        third = (len(part) - 1) // 3
+        if third < 1 or current_A[part].min() <= switch_A:
+            continue
+        for unit, load in (("current", current_A), ("power", current_A * np.asarray(record.voltage_V))):
+            drift[unit] += float(np.log(load[part[-third:]].mean() / load[part[1 : 1 + third]].mean()) ** 2)
+    return "power" if drift["power"] < drift["current"] else "current"
+
+
 @dataclass(frozen=True, eq=False)
 class BlockBootstrap(RandomLoad):
     """
@@ -334,9 +356,10 @@ class BlockBootstrap(RandomLoad):
         loaded = np.flatnonzero(current_A > SWITCH_SHARE * np.abs(current_A).max())
         if not len(loaded):
             raise ValueError("no current flows in this record, which says nothing about its load. Give the load.")
-        whole = recorded(self.record, self.unit, self.dt_s).value
-        first = int((self.record.time_s[loaded[0]] - self.record.time_s[0]) / self.dt_s)
-        return check_load(whole[min(first, len(whole) - 2) :], self.unit)
+        time_s = np.asarray(self.record.time_s)
+        load = current_A * np.asarray(self.record.voltage_V) if self.unit == "power" else current_A
+        first, last = (int((time_s[n] - time_s[0]) / self.dt_s + 1e-9) for n in (loaded[0], -1))
+        return check_load(resample_current(time_s, load, self.dt_s, last)[first:], self.unit)
 
     @cached_property
     def _length(self) -> int:

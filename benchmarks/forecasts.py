@@ -3,7 +3,7 @@ Forecast the end of discharges in progress, and the end of life of two real cell
 
 .. code-block:: bash
 
-  python -m benchmarks.forecasts --every 4 --simulated 40 --out results/forecasts
+  python -m benchmarks.forecasts --every 12 --simulated 6 --out results/forecasts
 
 *Real cells*: NASA's B0005 and B0006, cut off after 25, 50 and 75 % of the time. Calibrated without a prior, and with what the
 discharges before let expect (:func:`battery_env.track_life`). *Simulated cells* under a power that jumps at random, whose
@@ -46,8 +46,9 @@ MISMATCH_V = {"real": 0.05, "simulated": 0.02}
 SHARES = (0.25, 0.5, 0.75)
 #: Capacity at which the life of these 2 Ah cells ends, Ah.
 END_OF_LIFE_Ah = 1.4
-#: The simulated cells: relative standard deviation of their constants, noise, and the priors they are calibrated with.
-MISMATCH, NOISE_V, PRIOR_SD_SHARE = 0.2, 0.005, 0.02
+#: The simulated cells: relative standard deviation of their constants, noise, the priors they are calibrated
+#: with, and the time step, s.
+MISMATCH, NOISE_V, PRIOR_SD_SHARE, DT_S = 0.2, 0.005, 0.02, 2.0
 #: Seeds of the simulated cells: the first was looked at while the method was made.
 SEEDS = (0, 1)
 #: The kinds of load of the simulated cells.
@@ -133,9 +134,9 @@ def simulated_rows(kind: str, seed: int, count: int, samples: int) -> list[dict[
     :param samples: of each forecast
     :return: one row per discharge, share, calibrator and load to come
     """
-    data = TrajectoryDataset.generate("joint", count, LOADS[kind], seed=seed, mismatch=MISMATCH)
+    data = TrajectoryDataset.generate("joint", count, LOADS[kind], seed=seed, mismatch=MISMATCH, dt_s=DT_S)
     rng = np.random.default_rng(seed)
-    model, rows = RecordModel(), []
+    model, rows = RecordModel(dt_s=DT_S), []
     for n in tqdm(range(count), desc=f"{kind}, seed {seed}", unit="discharge", file=sys.stderr):
         whole = data[n]
         read = SensorErrors(noise_V=NOISE_V).apply(whole, rng)
@@ -145,7 +146,7 @@ def simulated_rows(kind: str, seed: int, count: int, samples: int) -> list[dict[
             seen = Samples(read.time_s, read.voltage_V, read.current_A).first(stop + 1)
             rest = Load(data.dt_s * np.arange(len(whole.load) - stop), whole.load[stop:], whole.load_unit)
             for name, prior in (("no prior", None), ("prior", (prior_C, PRIOR_SD_SHARE * prior_C))):
-                fit = LeastSquares(mismatch_V=MISMATCH_V["simulated"], voltage_noise_V=NOISE_V, prior_q_mobile_C=prior)
+                fit = LeastSquares(dt_s=DT_S, mismatch_V=MISMATCH_V["simulated"], voltage_noise_V=NOISE_V, prior_q_mobile_C=prior)
                 estimate = fit.estimate(seen)
                 for load_name, load in (("known", rest), ("as so far", None)):
                     row = {"data": f"{kind}, seed {seed}", "discharge": n, "share": share}
@@ -250,10 +251,18 @@ def plot(rows: pd.DataFrame, remaining: pd.DataFrame) -> Figure:
                 inside = 100.0 * by_data.groupby("share")["covered"].mean()
                 label = method[0] if title == "real cells" else f"{method[0].split(', ')[1]}, load {method[1]}"
                 axes.plot(
-                    100.0 * inside.index, inside, marker=marker, ms=4, lw=1.1, color=colour, label=label if marker == "o" else None
+                    100.0 * inside.index,
+                    inside,
+                    marker=marker,
+                    ms=4,
+                    lw=1.1,
+                    color=colour,
+                    label=label if marker == "o" else None,
                 )
         axes.axhline(100.0 * (BAND[2] - BAND[0]), color="0.4", lw=0.8)
-        axes.set(title=title, xlabel="seen of the discharge (%)", ylabel="ends inside the 90 % interval (%)", ylim=(0.0, 105.0))
+        axes.set(
+            title=title, xlabel="seen of the discharge (%)", ylabel="ends inside the 90 % interval (%)", ylim=(0.0, 105.0)
+        )
         axes.grid(alpha=0.25)
         axes.legend(frameon=False, fontsize=8, loc="lower center")
     for axes, (cell, part) in zip(below, remaining.groupby("cell"), strict=False):
@@ -277,10 +286,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         prog="python -m benchmarks.forecasts", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--cells", nargs="*", default=list(BUNDLED_CELLS), choices=BUNDLED_CELLS)
-    parser.add_argument("--every", type=int, default=4, help="each how many-th real discharge is forecast")
+    parser.add_argument("--every", type=int, default=12, help="each how many-th real discharge is forecast")
     parser.add_argument("--discharges", type=int, default=None, help="how many of each real cell are read")
-    parser.add_argument("--simulated", type=int, default=40, help="simulated discharges of each kind and seed")
-    parser.add_argument("--samples", type=int, default=300, help="of each forecast")
+    parser.add_argument("--simulated", type=int, default=6, help="simulated discharges of each kind and seed")
+    parser.add_argument("--samples", type=int, default=200, help="of each forecast")
     parser.add_argument("--out", type=Path, default=Path("results/forecasts"))
     chosen = parser.parse_args(arguments)
     configuration = vars(chosen) | {
@@ -289,6 +298,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "mismatch": MISMATCH,
         "noise_V": NOISE_V,
         "prior_sd_share": PRIOR_SD_SHARE,
+        "dt_s": DT_S,
         "end_of_life_Ah": END_OF_LIFE_Ah,
         "data": NASA_CITATION,
     }

@@ -65,9 +65,9 @@ class TestSeries:
         life = life_of(walk(2, 10))
         with pytest.raises(ValueError, match="threshold_Ah must be a positive"):
             life.remaining_discharges(0.0)
-        with pytest.raises(ValueError, match="count must lie within 1 .. 10, got 11"):
+        with pytest.raises(ValueError, match=r"count must lie within 1 \.\. 10, got 11"):
             life.after(11)
-        with pytest.raises(ValueError, match="no discharge determines q_mobile. Of the first one: Too short."):
+        with pytest.raises(ValueError, match=r"no discharge determines q_mobile\. Of the first one: Too short\."):
             life_of(walk(2, 3), settled=False, reason="Too short.")
 
 
