@@ -132,8 +132,8 @@ def track_life(discharges: Sequence[Discharge], cut_off_V: float, calibrator: Le
 
     Each discharge is calibrated alone. Over the discharges the logarithm of ``q_mobile`` is a random walk with drift (the
     local level model of Durbin and Koopman, *Time Series Analysis by State Space Methods*, 2012, with a constant slope),
-    filtered by Kalman's recursions. The sizes of step and noise are those that make the series most probable, under weak priors
-    (:data:`PRIOR_STEP_SHARE`). Estimates that are not settled, as of discharges that were cut short, are left aside.
+    filtered by Kalman's recursions. The sizes of step and noise are those that make the series most probable, under weak
+    priors (:data:`PRIOR_STEP_SHARE`). Estimates that are not settled, as of discharges that were cut short, are left aside.
 
     .. code-block:: python
 
