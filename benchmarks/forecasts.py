@@ -6,10 +6,10 @@ Forecast the end of discharges in progress, and the end of life of two real cell
   python -m benchmarks.forecasts --every 24 --simulated 4 --out results/forecasts
 
 *Real cells*: NASA's B0005 and B0006, cut off after 25, 50 and 75 % of the time. Calibrated by the Kalman filter without a
-prior, and by least squares with what the discharges before let expect (:func:`battery_env.track_life`). *Simulated cells* under a power that jumps at random, whose
-constants differ from the model's, with a prior of 2 %: with the load to come known and unknown. *Life*: what was expected
-of each discharge, and of the life that remains. Constants of the method were chosen with B0005 and the simulated cells of seed
-0; the table shows B0006 and seed 1 beside them.
+prior, and by least squares with what the discharges before let expect (:func:`battery_env.track_life`). *Simulated cells* with
+power that jumps at random, whose constants differ from the model's, with a prior of 2 %: with the load to come known and
+unknown. *Life*: what was expected of each discharge, and of the life that remains. Constants of the method were chosen with
+B0005 and the simulated cells of seed 0; B0006 and seed 1 were not looked at for it.
 """
 
 from __future__ import annotations
