@@ -267,7 +267,7 @@ def forecast(
 
 def _quantile(values: FloatArray, probability: ArrayLike) -> FloatArray:
     # of the samples themselves: between two of them there is no number if one is infinite
-    return np.asarray(np.quantile(values, probability, method="inverted_cdf"))
+    return np.asarray(np.quantile(values, np.asarray(probability, dtype=np.float64), method="inverted_cdf"))
 
 
 class _Function:

@@ -105,7 +105,7 @@ class Life:
         for n in range(1, most + 1):
             level = level + drift + self.step_share * rng.standard_normal(samples)
             left[np.isinf(left) & (level < end)] = n
-        return np.asarray(np.quantile(left, probability, method="inverted_cdf"))
+        return np.asarray(np.quantile(left, np.asarray(probability, dtype=np.float64), method="inverted_cdf"))
 
     def plot(self) -> Figure:
         """

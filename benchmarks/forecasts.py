@@ -31,7 +31,7 @@ from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.forecasts import BAND, FutureLoad, forecast
 from battery_env.life import Life, track_life
-from battery_env.loads import Load, RandomLoad, RandomPiecewise, RandomWalk
+from battery_env.loads import Load, RandomPiecewise, RandomWalk
 from battery_env.plotting import COLOURS, new_figure, save_figure
 from battery_env.record_model import RecordModel
 from battery_env.records import Record, Samples
@@ -52,7 +52,7 @@ MISMATCH, NOISE_V, PRIOR_SD_SHARE, DT_S = 0.2, 0.005, 0.02, 2.0
 #: Seeds of the simulated cells: the first was looked at while the method was made.
 SEEDS = (0, 1)
 #: The kinds of load of the simulated cells.
-LOADS: dict[str, RandomLoad] = {"piecewise": RandomPiecewise(), "random walk": RandomWalk()}
+LOADS: dict[str, RandomPiecewise | RandomWalk] = {"piecewise": RandomPiecewise(), "random walk": RandomWalk()}
 
 
 def score(
@@ -104,7 +104,8 @@ def real_rows(cell: str, discharges: list[Discharge], life: Life, every: int, sa
     :param samples: of each forecast
     :return: one row per discharge, share and calibrator
     """
-    settings = {"thermal": True, "mismatch_V": MISMATCH_V["real"]}
+    mismatch_V = MISMATCH_V["real"]
+    kalman = ExtendedKalmanFilter(thermal=True, mismatch_V=mismatch_V, voltage_noise_V=mismatch_V)
     rows: list[dict[str, object]] = []
     for n in tqdm(range(1, len(discharges), every), desc=cell, unit="discharge", file=sys.stderr):
         record = discharges[n].loaded_part(CUT_OFF_V)
@@ -113,12 +114,15 @@ def real_rows(cell: str, discharges: list[Discharge], life: Life, every: int, sa
         for share in SHARES:
             seen = record.until(start_s + share * (end_s - start_s))
             for name, calibrator in (
-                ("Kalman filter, no prior", ExtendedKalmanFilter(**settings, voltage_noise_V=0.05)),
-                ("least squares, prior carried on", LeastSquares(**settings, prior_q_mobile_C=carried)),
+                ("Kalman filter, no prior", kalman),
+                (
+                    "least squares, prior carried on",
+                    LeastSquares(thermal=True, mismatch_V=mismatch_V, prior_q_mobile_C=carried),
+                ),
             ):
                 row = {"data": cell, "discharge": n + 1, "share": share, "calibrator": name, "load": "as so far"}
                 fit = calibrator.estimate(seen)
-                measured = (end_s, start_s, MISMATCH_V["real"], RecordModel(thermal=True), CUT_OFF_V, samples)
+                measured = (end_s, start_s, mismatch_V, RecordModel(thermal=True), CUT_OFF_V, samples)
                 rows.append(row | score(seen, fit, None, *measured))
     return rows
 
@@ -135,7 +139,8 @@ def simulated_rows(kind: str, seed: int, count: int, samples: int) -> list[dict[
     """
     data = TrajectoryDataset.generate("joint", count, LOADS[kind], seed=seed, mismatch=MISMATCH, dt_s=DT_S)
     rng = np.random.default_rng(seed)
-    model, rows = RecordModel(dt_s=DT_S), []
+    model, mismatch_V = RecordModel(dt_s=DT_S), MISMATCH_V["simulated"]
+    rows: list[dict[str, object]] = []
     for n in tqdm(range(count), desc=f"{kind}, seed {seed}", unit="discharge", file=sys.stderr):
         whole = data[n]
         read = SensorErrors(noise_V=NOISE_V).apply(whole, rng)
@@ -143,13 +148,14 @@ def simulated_rows(kind: str, seed: int, count: int, samples: int) -> list[dict[
         for share in SHARES:
             stop = int(share * whole.eod_time_s / data.dt_s)
             seen = Samples(read.time_s, read.voltage_V, read.current_A).first(stop + 1)
-            rest = Load(data.dt_s * np.arange(len(whole.load) - stop), whole.load[stop:], whole.load_unit)
-            settings = {"dt_s": DT_S, "mismatch_V": MISMATCH_V["simulated"], "voltage_noise_V": NOISE_V}
-            estimate = LeastSquares(**settings, prior_q_mobile_C=(prior_C, PRIOR_SD_SHARE * prior_C)).estimate(seen)
+            rest = Load(data.dt_s * np.arange(len(whole.load) - stop, dtype=np.float64), whole.load[stop:], whole.load_unit)
+            prior = (prior_C, PRIOR_SD_SHARE * prior_C)
+            fit = LeastSquares(dt_s=DT_S, mismatch_V=mismatch_V, voltage_noise_V=NOISE_V, prior_q_mobile_C=prior)
+            estimate = fit.estimate(seen)
             for load_name, load in (("known", rest), ("as so far", None)):
                 row = {"data": f"{kind}, seed {seed}", "discharge": n, "share": share}
                 row |= {"calibrator": "least squares, prior", "load": load_name}
-                measured = (whole.eod_time_s, 0.0, MISMATCH_V["simulated"], model, model.cell.VEOD, samples)
+                measured = (whole.eod_time_s, 0.0, mismatch_V, model, model.cell.VEOD, samples)
                 rows.append(row | score(seen, estimate, load, *measured))
     return rows
 
@@ -163,14 +169,14 @@ def end_of_discharge_table(rows: pd.DataFrame) -> pd.DataFrame:
     """
     table = []
     keys = ["data", "calibrator", "load", "share"]
-    for (data, calibrator, load, share), part in rows.groupby(keys, sort=False):
+    for (data, calibrator, load, _), part in rows.groupby(keys, sort=False):
         error = part["error_percent"].abs()
         table.append(
             {
                 "data": data,
                 "calibrator": calibrator,
                 "load to come": load,
-                "seen (%)": f"{100 * share:.0f}",
+                "seen (%)": f"{100 * part['share'].iloc[0]:.0f}",
                 "forecasts": len(part),
                 "error, mean / worst (%)": f"{error.mean():.1f} / {error.max():.1f}",
                 "width of the 90 % interval, median (%)": f"{part['width_percent'].median():.1f}",
