@@ -216,6 +216,12 @@ def forecast(
     notes = []
     if not np.isfinite([estimate.sd_q_mobile, estimate.sd_r_o]).all():
         notes.append("The estimate states no standard deviation of all its parameters: the interval leaves theirs out.")
+    if load is None and isinstance(to_come, RandomLoad):
+        expected = expected_current(seen.time_s, seen.current_A)
+        notes.append(
+            f"The load varied: its means over quarters of the record lie {expected.sd_A:.2g} A apart (standard deviation). The "
+            "interval is that of a load that goes on so, not of one that drifts elsewhere. Give the load if it is known."
+        )
     if not estimate.settled:
         notes.append(f"The estimate is not settled. {estimate.reason}".strip())
 

@@ -3,7 +3,7 @@ Forecast the end of discharges in progress, and the end of life of two real cell
 
 .. code-block:: bash
 
-  python -m benchmarks.forecasts --every 24 --simulated 4 --out results/forecasts
+  python -m benchmarks.forecasts --every 12 --simulated 8 --out results/forecasts
 
 *Real cells*: NASA's B0005 and B0006, cut off after 25, 50 and 75 % of the time. Calibrated by the Kalman filter without a
 prior, and by least squares with what the discharges before let expect (:func:`battery_env.track_life`). *Simulated cells* with
@@ -270,7 +270,8 @@ def plot(rows: pd.DataFrame, remaining: pd.DataFrame) -> Figure:
         axes.grid(alpha=0.25)
         axes.legend(frameon=False, fontsize=8, loc="lower center")
     for axes, (cell, part) in zip(below, remaining.groupby("cell"), strict=False):
-        axes.fill_between(part["seen"], part["low"], part["high"], color=COLOURS[0], alpha=0.25, lw=0, label="90 %")
+        high = part["high"].clip(upper=1e4)  # what is beyond the forecast is infinite
+        axes.fill_between(part["seen"], part["low"], high, color=COLOURS[0], alpha=0.25, lw=0, label="90 %")
         axes.plot(part["seen"], part["median"], color=COLOURS[0], lw=1.4, label="median")
         axes.plot(part["seen"], part["remaining"], color=COLOURS[1], lw=1.2, label="measured")
         axes.set(title=cell, xlabel="discharges seen", ylabel=f"discharges to {END_OF_LIFE_Ah:g} Ah")
@@ -290,9 +291,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         prog="python -m benchmarks.forecasts", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--cells", nargs="*", default=list(BUNDLED_CELLS), choices=BUNDLED_CELLS)
-    parser.add_argument("--every", type=int, default=24, help="each how many-th real discharge is forecast")
+    parser.add_argument("--every", type=int, default=12, help="each how many-th real discharge is forecast")
     parser.add_argument("--discharges", type=int, default=None, help="how many of each real cell are read")
-    parser.add_argument("--simulated", type=int, default=4, help="simulated discharges of each kind and seed")
+    parser.add_argument("--simulated", type=int, default=8, help="simulated discharges of each kind and seed")
     parser.add_argument("--samples", type=int, default=200, help="of each forecast")
     parser.add_argument("--out", type=Path, default=Path("results/forecasts"))
     chosen = parser.parse_args(arguments)
