@@ -219,8 +219,8 @@ def forecast(
     if load is None and isinstance(to_come, RandomLoad):
         expected = expected_current(seen.time_s, seen.current_A)
         notes.append(
-            f"The load varied: its means over quarters of the record lie {expected.sd_A:.2g} A apart (standard deviation). The "
-            "interval is that of a load that goes on so, not of one that drifts elsewhere. Give the load if it is known."
+            f"The load varied: its means over quarters of the record lie {expected.sd_A:.2g} A apart (root mean square). "
+            "The interval is that of a load that goes on so, not of one that drifts elsewhere. Give the load if it is known."
         )
     if not estimate.settled:
         notes.append(f"The estimate is not settled. {estimate.reason}".strip())
