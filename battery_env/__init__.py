@@ -25,6 +25,8 @@ if TYPE_CHECKING:
         cramer_rao_bound,
     )
     from battery_env.evaluation import evaluate
+    from battery_env.forecasts import Forecast, forecast
+    from battery_env.life import Life, track_life
     from battery_env.record_files import read_discharges
     from battery_env.record_model import RecordModel
     from battery_env.sensors import RandomSensorErrors, SensorErrors
@@ -39,8 +41,10 @@ _MODULES = {
     "Estimate": "battery_env.estimates",
     "Estimator": "battery_env.estimators",
     "ExtendedKalmanFilter": "battery_env.estimators",
+    "Forecast": "battery_env.forecasts",
     "GreedyOneStep": "battery_env.estimators",
     "LeastSquares": "battery_env.estimators",
+    "Life": "battery_env.life",
     "OnnxPolicy": "battery_env.calibration.onnx_policy",
     "PolicyEstimator": "battery_env.calibration.policy",
     "RandomSensorErrors": "battery_env.sensors",
@@ -50,12 +54,14 @@ _MODULES = {
     "TrajectoryDataset": "battery_env.trajectories",
     "cramer_rao_bound": "battery_env.estimators",
     "evaluate": "battery_env.evaluation",
+    "forecast": "battery_env.forecasts",
     "initial_state": "battery_env.electrochemistry",
     "load_nasa_discharges": "battery_env.cells",
     "read_discharge_csv": "battery_env.cells",
     "read_discharges": "battery_env.record_files",
     "simulate": "battery_env.electrochemistry",
     "step": "battery_env.electrochemistry",
+    "track_life": "battery_env.life",
     "voltage": "battery_env.electrochemistry",
 }
 
@@ -69,8 +75,10 @@ __all__ = [
     "Estimate",
     "Estimator",
     "ExtendedKalmanFilter",
+    "Forecast",
     "GreedyOneStep",
     "LeastSquares",
+    "Life",
     "OnnxPolicy",
     "PolicyEstimator",
     "RandomSensorErrors",
@@ -80,6 +88,7 @@ __all__ = [
     "TrajectoryDataset",
     "cramer_rao_bound",
     "evaluate",
+    "forecast",
     "initial_state",
     "load_nasa_discharges",
     "read_discharge_csv",
@@ -87,6 +96,7 @@ __all__ = [
     "register_environments",
     "simulate",
     "step",
+    "track_life",
     "voltage",
 ]
 

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from battery_env.arrays import FloatArray
+from battery_env.arrays import FloatArray, IntArray
 from battery_env.checks import LoadUnit, check_load, check_numbers, check_positive, check_range
-from battery_env.records import Record, drawn
+from battery_env.records import SWITCH_SHARE, Record, drawn, resample_current
 
 _MOST_SEGMENTS = 1e6  # of a random load; beyond, a time is meant in another unit
+#: The blocks of :class:`BlockBootstrap`, as a share of the record.
+BLOCK_SHARE = 0.1
 
 
 def _check_segments(total_s: float, name: str, shortest_s: float) -> None:
@@ -70,8 +74,88 @@ class Load:
         return np.repeat(self.value, np.diff(bounds))
 
 
+@dataclass(frozen=True, eq=False)
+class Cycle:
+    """
+    A load that starts again and again: a mission, a drive cycle, a pulse.
+
+    :param load: one cycle
+    :param period_s: after which it starts again, s
+    :raises ValueError: for a period that is not positive
+    """
+
+    load: Load
+    period_s: float
+
+    def __post_init__(self) -> None:
+        check_positive("period_s", self.period_s)
+
+    @property
+    def unit(self) -> LoadUnit:
+        """``"power"`` or ``"current"``."""
+        return self.load.unit
+
+    def __call__(self, time_s: ArrayLike) -> FloatArray:
+        """
+        The load at some times.
+
+        :param time_s: s, at least 0, any shape
+        :return: the load, same shape
+        :raises ValueError: for a negative time
+        """
+        time = check_numbers("time_s", time_s)
+        # a time that is a whole number of periods but for rounding belongs to the cycle that starts there
+        within = time - self.period_s * np.floor(time / self.period_s + 1e-9)
+        return self.load(np.where(time < 0.0, time, np.maximum(within, 0.0)))
+
+
+@dataclass(frozen=True, eq=False)
+class Spliced:
+    """
+    Stretches of one series of values, one after the other, and the same again after the last: what
+    :class:`BlockBootstrap` draws.
+
+    :param value: the series, one value for each ``dt_s``, power in W or current in A, shape (K,)
+    :param start: where in the series each stretch starts, shape (B,); a stretch that reaches its end goes on at its start
+    :param length: of each stretch, in values
+    :param dt_s: for how long a value holds, s
+    :param unit: ``"power"`` or ``"current"``
+    """
+
+    value: FloatArray
+    start: IntArray
+    length: int
+    dt_s: float
+    unit: LoadUnit
+
+    def __call__(self, time_s: ArrayLike) -> FloatArray:
+        """
+        The load at some times.
+
+        :param time_s: s, at least 0, any shape
+        :return: the load, same shape
+        """
+        block, within = np.divmod((np.asarray(time_s) / self.dt_s + 1e-9).astype(np.int64), self.length)
+        return np.asarray(self.value[(self.start[block % len(self.start)] + within) % len(self.value)])
+
+
 #: Draws a load at random: what :meth:`battery_env.trajectories.TrajectoryDataset.generate` takes for random loads.
 LoadSampler = Callable[[np.random.Generator], Load]
+
+
+class RandomLoad(ABC):
+    """
+    A load that is known by its distribution: what :func:`battery_env.forecast` draws from, once a sample.
+    """
+
+    @abstractmethod
+    def __call__(self, rng: np.random.Generator) -> Load | Cycle | Spliced:
+        """
+        Draw one load.
+
+        :param rng: source of randomness
+        :return: the load
+        """
 
 
 def constant(value: float, unit: LoadUnit = "power") -> Load:
@@ -126,7 +210,7 @@ def recorded(record: Record, unit: LoadUnit = "power", dt_s: float = 1.0) -> Loa
 
 
 @dataclass(frozen=True)
-class RandomPiecewise:
+class RandomPiecewise(RandomLoad):
     """
     A sampler of piecewise-constant loads: values and durations uniform at random.
 
@@ -164,7 +248,7 @@ class RandomPiecewise:
 
 
 @dataclass(frozen=True)
-class RandomWalk:
+class RandomWalk(RandomLoad):
     """
     A sampler of piecewise-constant loads that remember: each value is the last one plus a step, uniform at random, reflected
     at the bounds; the first one is uniform between the bounds, and so is then every other.
@@ -207,3 +291,89 @@ class RandomWalk:
         # a walk between two mirrors is a free walk, folded
         folded = width - np.abs(free % (2.0 * width) - width)
         return Load(self.segment_s * np.arange(segments, dtype=np.float64), low + folded, self.unit)
+
+
+def steadier_unit(record: Record) -> LoadUnit:
+    """
+    Whether a consumer draws its current or its power, by which of the two drifts less between the switches of the load while
+    the voltage falls.
+
+    :param record: one discharge
+    :return: ``"power"`` or ``"current"``
+    """
+    current_A = np.asarray(record.current_A)
+    switch_A = SWITCH_SHARE * np.abs(current_A).max()
+    parts = np.split(np.arange(len(current_A)), np.flatnonzero(np.abs(np.diff(current_A)) > switch_A) + 1)
+    drift = {"current": 0.0, "power": 0.0}
+    for part in parts:
+        # the first sample after a switch may show a part of it only
+        third = (len(part) - 1) // 3
+        if third < 1 or current_A[part].min() <= switch_A:
+            continue
+        for unit, load in (("current", current_A), ("power", current_A * np.asarray(record.voltage_V))):
+            drift[unit] += float(np.log(load[part[-third:]].mean() / load[part[1 : 1 + third]].mean()) ** 2)
+    return "power" if drift["power"] < drift["current"] else "current"
+
+
+@dataclass(frozen=True, eq=False)
+class BlockBootstrap(RandomLoad):
+    """
+    A sampler of loads that go on as a record went so far: blocks of it, from random places, one after the other. Within a
+    block the order is kept, so that pulses remain pulses.
+
+    The record is one draw of the load itself, and its mean is not known better than its length allows. So the blocks are
+    drawn twice: as many as the record has make another record that might have been, from which those of the future are
+    drawn. Blocks may run over the end of the record to its start (the circular block bootstrap of Politis and Romano, 1992).
+
+    :param record: one discharge, from load-on, or in progress; a rest before its load is left out
+    :param unit: ``"power"`` (voltage times current) or ``"current"``
+    :param block_s: length of a block, s; ``None``: a tenth of the record
+    :param dt_s: values are means over this time, s
+    :param total_s: for how long blocks are drawn; beyond, they come again
+    :raises ValueError: for a record without load, or of less than two blocks, or other values that are not positive
+    """
+
+    record: Record
+    unit: LoadUnit = "current"
+    block_s: float | None = None
+    dt_s: float = 1.0
+    total_s: float = 86_400.0
+
+    def __post_init__(self) -> None:
+        for name in ("dt_s", "total_s"):
+            check_positive(name, getattr(self, name))
+        if self.block_s is not None:
+            check_positive("block_s", self.block_s)
+        if 2 * self._length > len(self._values):
+            raise ValueError(
+                f"block_s must be at most half of the {self.dt_s * len(self._values):g} s under load, got {self.block_s!r}"
+            )
+        _check_segments(self.total_s, "block_s", self._length * self.dt_s)
+
+    @cached_property
+    def _values(self) -> FloatArray:
+        current_A = np.asarray(self.record.current_A)
+        loaded = np.flatnonzero(current_A > SWITCH_SHARE * np.abs(current_A).max())
+        if not len(loaded):
+            raise ValueError("no current flows in this record, which says nothing about its load. Give the load.")
+        time_s = np.asarray(self.record.time_s)
+        load = current_A * np.asarray(self.record.voltage_V) if self.unit == "power" else current_A
+        first, last = (int((time_s[n] - time_s[0]) / self.dt_s + 1e-9) for n in (loaded[0], -1))
+        return check_load(resample_current(time_s, load, self.dt_s, last)[first:], self.unit)
+
+    @cached_property
+    def _length(self) -> int:
+        block_s = self.block_s or BLOCK_SHARE * self.dt_s * len(self._values)
+        return max(round(block_s / self.dt_s), 1)
+
+    def __call__(self, rng: np.random.Generator) -> Spliced:
+        """
+        Draw one load.
+
+        :param rng: source of randomness
+        :return: the load
+        """
+        count = len(self._values)
+        seen = rng.integers(count, size=-(-count // self._length))
+        blocks = int(np.ceil(self.total_s / (self._length * self.dt_s)))
+        return Spliced(self._values, rng.choice(seen, size=blocks), self._length, self.dt_s, self.unit)

@@ -24,7 +24,7 @@ from battery_env.estimators.cramer_rao import CramerRaoBound, Sensitivities
 from battery_env.evaluation import over_seeds
 from battery_env.files import replacing
 from battery_env.parameters import PARAMETER_NAMES, PARAMETERS
-from battery_env.record_model import Forecast
+from battery_env.record_model import VoltageForecast
 from battery_env.records import Record
 
 #: Colours that colour-blind readers can tell apart (Okabe & Ito).
@@ -149,7 +149,7 @@ def plot_learning_curves(
     return figure
 
 
-def plot_discharge(record: Record, forecasts: Mapping[str, Forecast], title: str = "") -> Figure:
+def plot_discharge(record: Record, forecasts: Mapping[str, VoltageForecast], title: str = "") -> Figure:
     """
     The measured voltage of one discharge with that of the model at some estimates, and below it the error of the model. Of
     more points than can be told apart, the least and the greatest in each of 2000 stretches of time are drawn.

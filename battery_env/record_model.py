@@ -28,7 +28,7 @@ from battery_env.records import Record, check_record, expected_current, resample
 _Q_PER_CHARGE = 1.0 / float(FULL_CHARGE_SHARES.sum())
 
 
-class Forecast(NamedTuple):
+class VoltageForecast(NamedTuple):
     """
     The voltage of the model from the first sample of a record on, at some parameters.
 
@@ -93,15 +93,16 @@ class RecordModel:
         n_steps = int(np.ceil((time_s[-1] - time_s[0]) / self.dt_s - 1e-6)) + 1
         return time_s - time_s[0], resample_current(time_s, current_A, self.dt_s, n_steps)
 
-    def start(self, q_mobile: float) -> FloatArray:
+    def start(self, q_mobile: float | FloatArray) -> FloatArray:
         """
         The state at the first sample of a cell with the history that ``initial`` stands for.
 
-        :param q_mobile: charge that can move, C
-        :return: shape (8,)
+        :param q_mobile: charge that can move, C, shape (...)
+        :return: shape (..., 8)
         """
-        start = self.initial.copy()
-        start[QNB:] += (q_mobile - _Q_PER_CHARGE * start[QNB:].sum()) * FULL_CHARGE_SHARES
+        missing_C = np.asarray(q_mobile - _Q_PER_CHARGE * self.initial[QNB:].sum())
+        start = np.broadcast_to(self.initial, (*missing_C.shape, STATE_SIZE)).copy()
+        start[..., QNB:] += missing_C[..., None] * FULL_CHARGE_SHARES
         return start
 
     def simulate(self, current_A: FloatArray, q_mobile: float, r_o: float) -> Trajectory:
@@ -140,7 +141,7 @@ class RecordModel:
 
     def forecast(
         self, record: Record, at: Estimate, cut_off_V: float | None = None, future_current_A: float | None = None
-    ) -> Forecast:
+    ) -> VoltageForecast:
         """
         The voltage of the model from the first sample of a record down to the cut-off, under the current of the record, and
         beyond its end under a constant one.
@@ -174,10 +175,10 @@ class RecordModel:
             around = [n, max(n - 1, 0)]
             eod_time_s = float(np.interp(cut_off, voltage_V[around], time_s[around]))
         elif np.isnan(simulation.eod_time_s):
-            return Forecast(time_s, voltage_V, float("nan"), at_samples_V)
+            return VoltageForecast(time_s, voltage_V, float("nan"), at_samples_V)
         else:
             n, eod_time_s = len(time_s), start_s + simulation.eod_time_s  # the cell is empty one step later
-        return Forecast(np.append(time_s[:n], eod_time_s), np.append(voltage_V[:n], cut_off), eod_time_s, at_samples_V)
+        return VoltageForecast(np.append(time_s[:n], eod_time_s), np.append(voltage_V[:n], cut_off), eod_time_s, at_samples_V)
 
     def sensitivities(
         self, current_A: FloatArray, q_mobile: float, r_o: float, stride: int = 1

@@ -18,7 +18,7 @@ from battery_env.estimators.base import Estimator
 from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.parameters import PARAMETER_NAMES
-from battery_env.record_model import Forecast, RecordModel
+from battery_env.record_model import RecordModel, VoltageForecast
 from battery_env.records import ExpectedCurrent, expected_current
 
 Method = Literal["least-squares", "kalman"]
@@ -112,7 +112,7 @@ class Summary(NamedTuple):
 
     row: dict[str, Any]
     record: Discharge
-    forecast: Forecast
+    forecast: VoltageForecast
 
 
 def summarize(discharge: Discharge, settings: Settings) -> Summary:

@@ -36,6 +36,8 @@ LAYERS = (
     ("battery_env.calibration",),
     ("battery_env.evaluation",),
     ("battery_env.plotting",),
+    ("battery_env.forecasts",),
+    ("battery_env.life",),
     ("battery_env.callbacks",),
     ("battery_env.summary",),
     ("battery_env.fleet",),

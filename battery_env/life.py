@@ -1,0 +1,230 @@
+"""A cell over its discharges: what each lets expect of the next one, and when the capacity will be used up."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import exp, log, sqrt
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from numba import njit
+from numpy.typing import ArrayLike
+from scipy.optimize import minimize
+from scipy.stats import truncnorm
+
+from battery_env.arrays import BoolArray, FloatArray
+from battery_env.cells import Discharge
+from battery_env.checks import check_positive, check_whole_number
+from battery_env.estimators.least_squares import LeastSquares
+from battery_env.forecasts import BAND
+from battery_env.plotting import COLOURS, LABELS, new_figure
+from battery_env.records import drawn
+
+#: What is believed of a cell before its discharges tell, as shares of q_mobile: the step from one to the next, the error of
+#: one estimate beside the others (both known to a factor of e, one standard deviation), and the sd of the drift.
+PRIOR_STEP_SHARE, PRIOR_NOISE_SHARE, PRIOR_DRIFT_SD_SHARE = 0.01, 0.003, 0.003
+
+
+@dataclass(frozen=True, eq=False)
+class Life:
+    """
+    What :func:`track_life` found.
+
+    The logarithm of ``q_mobile`` is a random walk with drift over the discharges, of which each estimate is one reading.
+
+    :param table: one row per discharge: ``cycle`` (its number, or its position), ``q_mobile_C``, ``sd_q_mobile_C``,
+        ``r_o_ohm``, ``settled``, ``reason``, ``capacity_Ah`` (charge to the cut-off), and what the discharges before let
+        expect of ``q_mobile``, ``expected_q_mobile_C`` and ``expected_sd_C`` (NaN for the first)
+    :param step_share: standard deviation of the step from one discharge to the next, as a share of ``q_mobile``
+    :param noise_share: standard deviation of an estimate beside the others, likewise
+    :param drift_share: mean step
+    :param state: mean of (ln ``q_mobile`` after the last discharge, drift), shape (2,)
+    :param covariance: theirs, shape (2, 2)
+    """
+
+    table: pd.DataFrame
+    step_share: float
+    noise_share: float
+    drift_share: float
+    state: FloatArray
+    covariance: FloatArray
+
+    @property
+    def prior_q_mobile_C(self) -> tuple[float, float]:
+        """Mean and standard deviation of ``q_mobile`` in the next discharge, C: a prior for its calibration."""
+        mean, variance = self.state.sum(), self.covariance.sum() + self.step_share**2
+        return exp(mean), exp(mean) * sqrt(variance)
+
+    def after(self, count: int) -> Life:
+        """
+        The life as it was known after its first discharges.
+
+        :param count: how many
+        :return: that part of the life, with the sizes of step and noise that it shows
+        :raises ValueError: for fewer discharges than one or more than there are, or if none of them determines ``q_mobile``
+        """
+        if not 1 <= check_whole_number("count", count) <= len(self.table):
+            raise ValueError(f"count must lie within 1 .. {len(self.table)}, got {count}")
+        return _life(self.table.iloc[:count])
+
+    def remaining_discharges(
+        self,
+        threshold_Ah: float,
+        probability: ArrayLike = BAND,
+        samples: int = 2000,
+        seed: int = 0,
+        most: int = 2000,
+    ) -> FloatArray:
+        """
+        The remaining useful life: how many discharges are still to come, the one included that first has less capacity than
+        the threshold. The cell is used as before; its capacity is in proportion to ``q_mobile``, as in the last discharge, and
+        does not grow in the long run.
+
+        :param threshold_Ah: capacity at which the life ends, Ah
+        :param probability: of the quantiles, within 0 .. 1, any shape
+        :param samples: how many lives are simulated
+        :param seed: of these
+        :param most: discharges to look ahead
+        :return: quantiles, same shape as ``probability``; infinite beyond ``most``
+        :raises ValueError: for an argument out of range
+        """
+        check_positive("threshold_Ah", threshold_Ah)
+        if min(check_whole_number("samples", samples), check_whole_number("most", most)) < 1:
+            raise ValueError(f"samples and most must be at least 1, got {samples!r} and {most!r}")
+        last = self.table[self.table["settled"]].iloc[-1]
+        end = log(threshold_Ah * last["q_mobile_C"] / last["capacity_Ah"])
+        rng = np.random.default_rng(check_whole_number("seed", seed))
+        (level_mean, drift_mean), ((p_level, p_both), (_, p_drift)) = self.state, self.covariance
+        drift_sd = sqrt(p_drift)
+        drift = drift_mean + drift_sd * truncnorm.rvs(-np.inf, -drift_mean / drift_sd, size=samples, random_state=rng)
+        level = level_mean + p_both / p_drift * (drift - drift_mean)
+        level += sqrt(max(p_level - p_both**2 / p_drift, 0.0)) * rng.standard_normal(samples)
+        left = np.full(samples, np.inf)
+        for n in range(1, most + 1):
+            level = level + drift + self.step_share * rng.standard_normal(samples)
+            left[np.isinf(left) & (level < end)] = n
+        return np.asarray(np.quantile(left, np.asarray(probability, dtype=np.float64), method="inverted_cdf"))
+
+    def plot(self) -> Figure:
+        """
+        The estimates of ``q_mobile``, and what the discharges before let expect of each.
+
+        :return: the figure
+        """
+        figure = new_figure(6.4, 3.4)
+        axes = figure.subplots()
+        cycle, mean, sd = (self.table[name] for name in ("cycle", "expected_q_mobile_C", "expected_sd_C"))
+        axes.fill_between(
+            cycle, mean - 1.645 * sd, mean + 1.645 * sd, color=COLOURS[0], alpha=0.25, lw=0, label="expected, 90 %"
+        )
+        axes.plot(cycle, self.table["q_mobile_C"], ".", ms=4, color=COLOURS[1], label="estimate")
+        axes.set(xlabel="discharge", ylabel=LABELS["q_mobile"])
+        axes.grid(alpha=0.25)
+        axes.legend(frameon=False, fontsize=9)
+        return figure
+
+
+def track_life(discharges: Sequence[Discharge], cut_off_V: float, calibrator: LeastSquares | None = None) -> Life:
+    """
+    Follow ``q_mobile`` of one cell from discharge to discharge.
+
+    Each discharge is calibrated alone. Over the discharges the logarithm of ``q_mobile`` is a random walk with drift (the
+    local level model of Durbin and Koopman, *Time Series Analysis by State Space Methods*, 2012, with a constant slope),
+    filtered by Kalman's recursions. The sizes of step and noise are those that make the series most probable, under weak
+    priors (:data:`PRIOR_STEP_SHARE`). Estimates that are not settled, as of discharges that were cut short, are left aside.
+
+    .. code-block:: python
+
+      life = track_life(load_nasa_discharges("B0005")[:60], cut_off_V=2.7)
+      next_fit = LeastSquares(thermal=True, mismatch_V=0.05, prior_q_mobile_C=life.prior_q_mobile_C)
+      print(life.remaining_discharges(threshold_Ah=1.4))
+
+    :param discharges: of one cell, in their order
+    :param cut_off_V: where they end, V
+    :param calibrator: without a prior; ``None``: ``LeastSquares(thermal=True, mismatch_V=0.05)``
+    :return: the cell's life so far
+    :raises ValueError: if no discharge determines ``q_mobile``, or the calibrator has a prior
+    """
+    calibrator = LeastSquares(thermal=True, mismatch_V=0.05) if calibrator is None else calibrator
+    if calibrator.prior_q_mobile_C is not None:
+        raise ValueError("the calibrator must have no prior of q_mobile: each discharge has to speak for itself")
+    if not len(discharges):
+        raise ValueError("discharges must hold at least one discharge")
+    rows = []
+    for position, discharge in enumerate(discharges):
+        record = discharge.loaded_part(cut_off_V)
+        estimate = calibrator.estimate(record)
+        end_s = calibrator.model.forecast(record, estimate, cut_off_V).eod_time_s
+        rows.append(
+            {
+                "cycle": discharge.meta.get("cycle", position + 1),
+                "q_mobile_C": estimate.q_mobile,
+                "sd_q_mobile_C": estimate.sd_q_mobile,
+                "r_o_ohm": estimate.r_o,
+                "settled": estimate.settled,
+                "capacity_Ah": float(drawn(record.time_s, record.current_A, end_s)) / 3600.0,
+                "reason": estimate.reason,
+            }
+        )
+    return _life(pd.DataFrame(rows))
+
+
+def _life(table: pd.DataFrame) -> Life:
+    settled = table["settled"].to_numpy()
+    if not settled.any():
+        raise ValueError(f"no discharge determines q_mobile. Of the first one: {table['reason'].iloc[0]}")
+    readings = np.log(table["q_mobile_C"].to_numpy())
+    first = int(np.flatnonzero(settled)[0])
+    centre = np.log([PRIOR_STEP_SHARE, PRIOR_NOISE_SHARE])
+    expected = np.full((len(readings), 2), np.nan)
+    state, covariance = np.zeros(2), np.zeros((2, 2))
+
+    def surprise(logarithms: FloatArray) -> float:
+        step, noise = np.exp(np.clip(logarithms, -15.0, 0.0))
+        out = _filtered(readings, settled, first, step, noise, PRIOR_DRIFT_SD_SHARE, expected, state, covariance)
+        return float(out + 0.5 * ((logarithms - centre) ** 2).sum())
+
+    best = minimize(surprise, centre, method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-4}).x
+    surprise(best)
+    step, noise = np.exp(best)
+    mean_C = np.exp(expected[:, 0])
+    table = table.assign(expected_q_mobile_C=mean_C, expected_sd_C=mean_C * np.sqrt(expected[:, 1]))
+    return Life(table, float(step), float(noise), float(state[1]), state, covariance)
+
+
+@njit(cache=True, error_model="numpy")
+def _filtered(
+    readings: FloatArray,
+    settled: BoolArray,
+    first: int,
+    step: float,
+    noise: float,
+    drift_sd: float,
+    expected: FloatArray,
+    state: FloatArray,
+    covariance: FloatArray,
+) -> float:
+    # Kalman's recursions. Returns minus the log likelihood; fills what was expected of each reading (mean and variance of the
+    # level) and the state after the last one
+    level, drift = readings[first], 0.0
+    p_level, p_both, p_drift = noise**2, 0.0, drift_sd**2
+    surprise = 0.0
+    for n in range(first + 1, len(readings)):
+        level += drift
+        p_level += 2.0 * p_both + p_drift + step**2
+        p_both += p_drift
+        expected[n, 0], expected[n, 1] = level, p_level
+        if settled[n]:
+            variance, innovation = p_level + noise**2, readings[n] - level
+            surprise += 0.5 * (np.log(variance) + innovation**2 / variance)
+            gain_level, gain_drift = p_level / variance, p_both / variance
+            level += gain_level * innovation
+            drift += gain_drift * innovation
+            p_drift -= gain_drift * p_both
+            p_both -= gain_level * p_both
+            p_level -= gain_level * p_level
+    state[0], state[1] = level, drift
+    covariance[0, 0], covariance[0, 1], covariance[1, 0], covariance[1, 1] = p_level, p_both, p_both, p_drift
+    return surprise

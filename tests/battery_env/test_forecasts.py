@@ -1,0 +1,238 @@
+"""Forecasts are the model's where everything is known, and as wide as what is not known where it is not."""
+
+import numpy as np
+import pytest
+
+from battery_env import Estimate, RecordModel, forecast, simulate
+from battery_env.loads import BlockBootstrap, Cycle, Load, RandomPiecewise, constant, steadier_unit
+from battery_env.records import Samples, resample_current
+
+TRUTH = Estimate(6000.0, 0.15)
+# short discharges of few steps
+MODEL = RecordModel(dt_s=4.0)
+
+
+def discharged(load, q_mobile=6000.0, r_o=0.15, **keywords):
+    return simulate(load, q_mobile, r_o, dt=4.0, **keywords)
+
+
+def half(record):
+    return record.part(0, len(record.time_s) // 2)
+
+
+def rest_of(record):
+    """The load from the last sample of the half on."""
+    first = len(record.time_s) // 2 - 1
+    return Load(record.time_s[first:] - record.time_s[first], record.load[first:], record.load_unit)
+
+
+def certain(record, load=None, **keywords):
+    return forecast(record, TRUTH, load, model=MODEL, mismatch_V=0.0, samples=3, **keywords)
+
+
+class TestLoads:
+    @pytest.mark.parametrize("cut_off_V", [3.2, 2.7])
+    def test_a_constant_current_is_the_forecast_of_the_model(self, cut_off_V):
+        record = half(discharged(4.0, load_unit="current"))
+        found = certain(record, cut_off_V=cut_off_V)
+        assert found.load_name == "4 A"
+        np.testing.assert_allclose(found.eod_time_s, MODEL.forecast(record, TRUTH, cut_off_V).eod_time_s, atol=1e-6)
+
+    def test_a_known_profile_ends_when_the_cell_does(self):
+        record = discharged(RandomPiecewise((4.0, 12.0))(np.random.default_rng(3)))
+        found = certain(half(record), rest_of(record))
+        assert (np.abs(found.eod_time_s - record.eod_time_s) <= 8.0).all()
+
+    def test_function_cycle_and_profile_are_the_same_load(self):
+        record = half(discharged(8.0))
+        cycle = Cycle(Load([0.0, 40.0], [12.0, 4.0]), 80.0)
+        starts_s = 40.0 * np.arange(200)
+        profile = Load(starts_s, np.where(np.arange(200) % 2 == 0, 12.0, 4.0))
+        ends_s = [certain(record, load, load_unit="power").eod_time_s[0] for load in (cycle, profile, cycle.__call__)]
+        assert len(set(ends_s)) == 1
+        number_s = certain(record, 8.0, load_unit="power").eod_time_s[0]
+        assert number_s == certain(record, constant(8.0)).eod_time_s[0] != ends_s[0]
+
+    def test_pulses_go_on_as_pulses(self):
+        pulses_A = np.where(np.arange(4000) % 30 < 15, 4.0, 0.0)
+        record = discharged(pulses_A, load_unit="current")
+        found = forecast(half(record), TRUTH, model=MODEL, mismatch_V=0.0, samples=60)
+        median_s = found.eod_quantile_s(0.5)
+        # where blocks meet, a pulse may be longer than it was
+        assert median_s == pytest.approx(record.eod_time_s, rel=0.05)
+        assert "The load varied" in found.summary()
+        # the last current for ever, or the mean of the pulses, misses by more
+        last_s = MODEL.forecast(half(record), TRUTH, None, 4.0).eod_time_s
+        assert abs(last_s - record.eod_time_s) > 5.0 * abs(median_s - record.eod_time_s)
+
+    def test_a_consumer_of_power_draws_more_current_at_the_end(self):
+        record = discharged(8.0)
+        assert np.abs(certain(half(record)).eod_time_s - record.eod_time_s).max() <= 8.0
+
+    def test_each_sample_draws_its_own_load(self):
+        record = half(discharged(8.0))
+        found = certain(record, RandomPiecewise((4.0, 12.0)))
+        assert len(set(found.eod_time_s)) == 3
+
+    def test_without_a_load_there_is_no_end(self):
+        current_A = np.where(np.arange(300) < 60, 4.0, 0.0)
+        record = discharged(current_A, load_unit="current")
+        for found in (certain(record), certain(record, lambda time_s: 0.0 * time_s, max_duration_s=2000.0)):
+            assert np.isinf(found.eod_quantile_s()).all() and np.isinf(found.remaining_s).all()
+            assert np.isnan(found.state_of_health).all() and "inf" in found.summary()
+            found.plot()
+
+
+class TestUncertainty:
+    record = half(discharged(4.0, load_unit="current"))
+
+    def width(self, estimate, load=None, **keywords):
+        low_s, _, high_s = forecast(self.record, estimate, load, model=MODEL, samples=400, **keywords).eod_quantile_s()
+        return high_s - low_s
+
+    def test_the_interval_is_as_wide_as_what_is_not_known(self):
+        narrow, wide = (self.width(Estimate(6000.0, 0.15, sd, 0.0), mismatch_V=0.0) for sd in (60.0, 120.0))
+        # the end of discharge is nearly in proportion to q_mobile: 3.3 sd of 1 % of it
+        assert narrow == pytest.approx(3.29 * 0.01 * discharged(4.0, load_unit="current").eod_time_s, rel=0.2)
+        assert wide == pytest.approx(2.0 * narrow, rel=0.1)
+        assert self.width(Estimate(6000.0, 0.15, 60.0, 0.0), mismatch_V=0.1) > 1.2 * narrow
+        assert self.width(Estimate(6000.0, 0.15, 60.0, 0.0), RandomPiecewise((4.0, 16.0)), mismatch_V=0.0) > 1.2 * narrow
+
+    def test_a_resistance_that_is_not_known_counts_under_another_load_only(self):
+        unknown, known = Estimate(6000.0, 0.15, 60.0, 0.03), Estimate(6000.0, 0.15, 60.0, 0.0)
+        assert self.width(unknown) < 1.2 * self.width(known)
+        assert self.width(unknown, 8.0) > 1.5 * self.width(known, 8.0)
+
+    def test_nine_of_ten_truths_lie_inside(self):
+        rng, inside, n = np.random.default_rng(0), 0, 60
+        for q_C in 6000.0 * np.exp(0.03 * rng.standard_normal(n)):
+            whole = discharged(4.0, q_C, load_unit="current")
+            seen = whole.part(0, len(self.record.time_s))
+            low_s, _, high_s = forecast(
+                seen, Estimate(6000.0, 0.15, 180.0, 0.0), model=MODEL, mismatch_V=0.0, samples=200
+            ).eod_quantile_s()
+            inside += low_s <= whole.eod_time_s <= high_s
+        assert 0.8 * n <= inside <= 0.98 * n
+
+    def test_samples_agree_with_the_record(self):
+        whole = discharged(4.0, load_unit="current")
+        late = whole.part(0, int(0.97 * len(whole.time_s)))
+        found = forecast(late, Estimate(5600.0, 0.15, 200.0, 0.0), model=MODEL, mismatch_V=0.0, samples=200)
+        assert (found.eod_time_s >= late.time_s[-1]).all()
+        assert found.q_mobile.min() > 5750.0  # those below would have reached the cut-off
+        assert "contradicts" in found.notes[-1]
+
+    def test_the_same_seed_draws_the_same(self):
+        estimate = Estimate(6000.0, 0.15, 60.0, 0.03)
+        one, same, other = (forecast(self.record, estimate, model=MODEL, samples=50, seed=seed) for seed in (1, 1, 2))
+        np.testing.assert_array_equal(one.eod_time_s, same.eod_time_s)
+        assert (one.eod_time_s != other.eod_time_s).any()
+
+    def test_what_is_left_out_is_said(self):
+        assert ["leaves theirs out" in note for note in certain(self.record).notes] == [True]
+        unsettled = Estimate(6000.0, 0.15, 60.0, 0.03, False, "It rests on its prior.")
+        assert "It rests on its prior." in forecast(self.record, unsettled, model=MODEL, samples=5).summary()
+
+
+class TestHealth:
+    def test_a_new_cell_is_in_full_health(self):
+        whole = simulate(4.0, dt=4.0, load_unit="current")
+        truth = Estimate(7600.0, whole.r_o)
+        found = forecast(half(whole), truth, model=MODEL, mismatch_V=0.0, samples=3)
+        np.testing.assert_allclose(found.state_of_health, 1.0, rtol=5e-3)
+        np.testing.assert_allclose(found.capacity_Ah, 4.0 * whole.eod_time_s / 3600.0, rtol=5e-3)
+        given = forecast(half(whole), truth, model=MODEL, mismatch_V=0.0, samples=3, nominal_Ah=2.0)
+        np.testing.assert_allclose(given.state_of_health, given.capacity_Ah / 2.0)
+
+    def test_charge_that_is_left_is_what_was_not_drawn(self):
+        seen = half(discharged(4.0, load_unit="current"))
+        found = certain(seen)
+        np.testing.assert_allclose(found.soc, 1.0 - 4.0 * seen.time_s[-1] / 6000.0, rtol=1e-9)
+        np.testing.assert_allclose(found.remaining_s, found.eod_time_s - seen.time_s[-1])
+
+
+class TestBounds:
+    def test_a_record_at_the_cut_off_is_over(self):
+        record = discharged(4.0, load_unit="current", cut_off_V=2.9)
+        found = certain(record, cut_off_V=3.0)
+        np.testing.assert_allclose(found.eod_time_s, MODEL.forecast(record, TRUTH, 3.0).eod_time_s)
+        assert (found.remaining_s == 0.0).all()
+        found.plot()
+
+    @pytest.mark.parametrize(
+        ("keywords", "error", "message"),
+        [
+            ({"estimate": Estimate(2000.0, 0.15, 10.0, 0.0)}, ValueError, "contradicts the record, which takes"),
+            ({"estimate": Estimate(2890.0, 0.15, 0.0, 0.0), "mismatch_V": 0.0}, ValueError, "contradicts the record: no cell"),
+            ({"estimate": Estimate(6000.0, 0.15, np.inf, 0.0)}, ValueError, "determines nothing"),
+            ({"estimate": Estimate(6000.0, 0.15, -1.0, 0.0)}, ValueError, "standard deviations must be at least 0"),
+            ({"estimate": Estimate(np.nan, 0.15)}, ValueError, "q_mobile must lie within"),
+            ({"load": [1.0, 2.0]}, TypeError, r"Load\(time_s, value, unit\)"),
+            ({"load": "as before"}, TypeError, "load must be a number"),
+            ({"load": 2000.0}, ValueError, "load must lie within"),
+            ({"load": lambda time_s: np.ones(3)}, ValueError, "one value for each time"),
+            ({"mismatch_V": -0.1}, ValueError, "mismatch_V must"),
+            ({"cut_off_V": np.nan}, ValueError, "cut_off_V must"),
+            ({"samples": 0}, ValueError, "samples must be at least 1"),
+            ({"seed": -1}, ValueError, "seed at least 0"),
+            ({"nominal_Ah": 0.0}, ValueError, "nominal_Ah must"),
+            ({"max_duration_s": np.inf}, ValueError, "max_duration_s must"),
+        ],
+    )
+    def test_what_cannot_be_meant_is_refused(self, keywords, error, message):
+        record = half(discharged(4.0, load_unit="current"))
+        with pytest.raises(error, match=message):
+            forecast(**({"record": record, "estimate": TRUTH, "model": MODEL, "samples": 3} | keywords))
+
+
+@pytest.mark.parametrize("unit", ["current", "power"])
+def test_the_steadier_unit_is_the_one_of_the_consumer(unit):
+    value_range = {"current": (1.0, 4.0), "power": (4.0, 12.0)}[unit]
+    record = discharged(RandomPiecewise(value_range, unit=unit)(np.random.default_rng(0)), load_unit=unit)
+    noise_V = 0.005 * np.random.default_rng(1).standard_normal(len(record.time_s))
+    assert steadier_unit(Samples(record.time_s, record.voltage_V + noise_V, record.current_A)) == unit
+
+
+class TestCycle:
+    def test_it_starts_again_at_every_period(self):
+        cycle = Cycle(Load([0.0, 0.1], [3.0, 1.0], "current"), 0.3)
+        assert cycle.unit == "current"
+        np.testing.assert_array_equal(cycle(0.3 * np.arange(1000)), 3.0)
+        np.testing.assert_array_equal(cycle(0.3 * np.arange(1000) + 0.2), 1.0)
+        with pytest.raises(ValueError, match="time_s must be at least 0"):
+            cycle([-1.0])
+        with pytest.raises(ValueError, match="period_s must be a positive"):
+            Cycle(constant(1.0), 0.0)
+
+
+class TestBlockBootstrap:
+    time_s = np.arange(601.0)
+    # rest first; every value occurs once
+    current_A = np.where(time_s < 100.0, 0.0, time_s / 100.0)
+    record = Samples(time_s, np.full(601, 3.7), current_A)
+
+    def test_blocks_of_the_record_follow_each_other(self):
+        drawn = BlockBootstrap(self.record, block_s=50.0)(np.random.default_rng(0))
+        values = drawn(np.arange(2000.0)).reshape(-1, 50)
+        recorded = resample_current(self.time_s, self.current_A, 1.0, 600)[100:]
+        assert np.isclose(values[:, :, None], recorded, atol=0.011).any(axis=2).all()
+        steps = np.diff(values, axis=1)
+        # a block runs through the record, and over its end to its start
+        assert (np.isclose(steps, 0.01, atol=1e-3) | (steps < -4.0)).all()
+        assert len(set(values[:, 0])) <= 10  # as many as fit into the record
+        np.testing.assert_array_equal(drawn(np.arange(2000.0)[::-1]), values.ravel()[::-1])
+
+    def test_its_mean_is_as_unsure_as_the_record_makes_it(self):
+        rng = np.random.default_rng(1)
+        noisy = self.record._replace(current_A=2.0 + np.repeat(rng.standard_normal(61), 10)[:601] * 0.5)
+        sampler = BlockBootstrap(noisy, block_s=10.0)
+        means_A = [sampler(rng)(np.arange(600.0)).mean() for _ in range(400)]
+        assert np.mean(means_A) == pytest.approx(noisy.current_A.mean(), abs=0.02)
+        # of the record that was seen and of the one to come, both 60 blocks long
+        assert np.std(means_A) == pytest.approx(np.sqrt(2.0 / 60.0) * noisy.current_A.std(), rel=0.2)
+
+    def test_a_record_without_load_is_refused(self):
+        with pytest.raises(ValueError, match="no current flows"):
+            BlockBootstrap(self.record._replace(current_A=np.zeros(601)))
+        with pytest.raises(ValueError, match="block_s must be at most half of the"):
+            BlockBootstrap(self.record, block_s=400.0)
