@@ -14,10 +14,8 @@ B0005 and the simulated cells of seed 0; B0006 and seed 1 were not looked at for
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from time import perf_counter
 
 import numpy as np
@@ -32,12 +30,12 @@ from battery_env.estimators.least_squares import LeastSquares
 from battery_env.forecasts import BAND, FutureLoad, forecast
 from battery_env.life import Life, track_life
 from battery_env.loads import Load, RandomPiecewise, RandomWalk
-from battery_env.plotting import COLOURS, new_figure, save_figure
+from battery_env.plotting import COLOURS, new_figure
 from battery_env.record_model import RecordModel
 from battery_env.records import Record, Samples
 from battery_env.sensors import SensorErrors
 from battery_env.trajectories import TrajectoryDataset
-from benchmarks.reporting import write_csv, write_text
+from benchmarks.study import Study, command_line, markdown
 
 CUT_OFF_V = 2.7
 #: Error of the model on the real cells, and on the simulated ones, V.
@@ -287,17 +285,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     :param arguments: of the command line by default
     """
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.forecasts", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_line("forecasts", __doc__, jobs=None)
     parser.add_argument("--cells", nargs="*", default=list(BUNDLED_CELLS), choices=BUNDLED_CELLS)
     parser.add_argument("--every", type=int, default=12, help="each how many-th real discharge is forecast")
     parser.add_argument("--discharges", type=int, default=None, help="how many of each real cell are read")
     parser.add_argument("--simulated", type=int, default=8, help="simulated discharges of each kind and seed")
     parser.add_argument("--samples", type=int, default=200, help="of each forecast")
-    parser.add_argument("--out", type=Path, default=Path("results/forecasts"))
-    chosen = parser.parse_args(arguments)
-    configuration = vars(chosen) | {
+    study = Study(parser, arguments)
+    chosen = study.chosen
+    study.configuration |= {
         "cut_off_V": CUT_OFF_V,
         "mismatch_V": MISMATCH_V,
         "mismatch": MISMATCH,
@@ -317,14 +313,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for seed in SEEDS:
             rows += simulated_rows(kind, seed, chosen.simulated, chosen.samples) if chosen.simulated else []
     forecasts, left = pd.DataFrame(rows), pd.DataFrame(remaining)
-    write_csv(chosen.out / "discharges.csv", forecasts, configuration)
-    write_csv(chosen.out / "life.csv", left, configuration)
-    tables = [end_of_discharge_table(forecasts)] + ([life_table(lives, left)] if len(left) else [])
+    text, figures = markdown(end_of_discharge_table(forecasts)), {}
     if len(left):
-        save_figure(plot(forecasts, left), chosen.out / "forecasts.png")
-    markdown = "\n\n".join(table.to_markdown(index=False, disable_numparse=True) for table in tables) + "\n"
-    write_text(chosen.out / "summary.md", markdown)
-    print(markdown)
+        text += "\n" + markdown(life_table(lives, left))
+        figures = {"forecasts": plot(forecasts, left)}
+    study.write({"discharges": forecasts, "life": left}, figures, text, "summary")
 
 
 if __name__ == "__main__":
