@@ -144,7 +144,7 @@ def test_published_runs_keep_their_names(study):
         assert {training.Recipe(seed=seed, **recorded).digest for seed in seeds} == {digest}
 
 
-def test_an_algorithm_and_an_environment_of_ones_own_are_named_by_their_modules(tmp_path, monkeypatch):
+def test_an_algorithm_and_an_environment_of_ones_own_are_named_by_their_modules(tmp_path, monkeypatch, request):
     source = """
 import gymnasium as gym
 from stable_baselines3 import SAC
@@ -157,6 +157,7 @@ if "Mine-v0" not in gym.registry:
 """
     (tmp_path / "own_module_a.py").write_text(source)
     monkeypatch.syspath_prepend(str(tmp_path))
+    request.addfinalizer(lambda: gym.registry.pop("Mine-v0"))
     recipe = training.Recipe.of("own_module_a:Mine", "own_module_a:Mine-v0", 0, 150, defaults=True)
     assert recipe.label == "Mine defaults" and recipe.environment["max_episode_steps"] == 9
     assert recipe.name.startswith("mine_defaults_seed0_")

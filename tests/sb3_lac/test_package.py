@@ -23,16 +23,21 @@ def reload_package(monkeypatch):
 def test_exports():
     assert set(sb3_lac.__all__) == {
         "LAC",
+        "CertificateCallback",
         "CnnPolicy",
         "DashboardCallback",
+        "FittedLyapunov",
         "GymnasiumVecEnv",
         "LyapunovCallback",
+        "LyapunovFunction",
         "LyapunovPolicy",
         "LyapunovReport",
         "MlpPolicy",
         "MultiInputPolicy",
         "__version__",
+        "certify",
         "evaluate_lyapunov",
+        "fit_lyapunov",
     }
     assert all(hasattr(sb3_lac, name) for name in sb3_lac.__all__)
 
