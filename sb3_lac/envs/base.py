@@ -183,6 +183,11 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
         return np.clip(observation + noise, space.low, space.high).astype(np.float32)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        """
+        :param seed: Seed of all that is random from here on
+        :param options: ``{"state": ...}`` to start from a given state
+        :return: Observation, and an empty ``info``
+        """
         super().reset(seed=seed)
         start = self._initial_state()
         if options is not None and "state" in options:
@@ -199,6 +204,10 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
         return self._noisy_observation(), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """
+        :param action: Action in [-1, 1]
+        :return: Observation, reward (minus the cost), whether the episode terminates, False, and ``info``
+        """
         if self.state is None:
             raise gym.error.ResetNeeded("Call reset() before step().")
         action = np.asarray(action, dtype=np.float64)
