@@ -16,12 +16,14 @@ if TYPE_CHECKING:
     from battery_env.electrochemistry import NEW_CELL, CellParameters, Trajectory, initial_state, simulate, step, voltage
     from battery_env.estimates import Estimate
     from battery_env.estimators import (
+        CellFit,
         ClosedForm,
         Estimator,
         ExtendedKalmanFilter,
         GreedyOneStep,
         LeastSquares,
         cramer_rao_bound,
+        fit_cell,
     )
     from battery_env.evaluation import evaluate
     from battery_env.record_model import RecordModel
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
 # Where each name comes from: numba, pandas and scipy take seconds to import, and an environment by its id needs none of them
 _MODULES = {
     "NEW_CELL": "battery_env.electrochemistry",
+    "CellFit": "battery_env.estimators",
     "CellParameters": "battery_env.electrochemistry",
     "ClosedForm": "battery_env.estimators",
     "Discharge": "battery_env.cells",
@@ -47,6 +50,7 @@ _MODULES = {
     "TrajectoryDataset": "battery_env.trajectories",
     "cramer_rao_bound": "battery_env.estimators",
     "evaluate": "battery_env.evaluation",
+    "fit_cell": "battery_env.estimators",
     "initial_state": "battery_env.electrochemistry",
     "load_nasa_discharges": "battery_env.cells",
     "read_discharge_csv": "battery_env.cells",
@@ -59,6 +63,7 @@ __version__ = files("battery_env").joinpath("version.txt").read_text(encoding="u
 
 __all__ = [
     "NEW_CELL",
+    "CellFit",
     "CellParameters",
     "ClosedForm",
     "Discharge",
@@ -75,6 +80,7 @@ __all__ = [
     "TrajectoryDataset",
     "cramer_rao_bound",
     "evaluate",
+    "fit_cell",
     "initial_state",
     "load_nasa_discharges",
     "read_discharge_csv",
