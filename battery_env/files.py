@@ -10,6 +10,10 @@ from pathlib import Path
 from typing import Any
 
 
+class WrongFormatError(ValueError):
+    """A file holds something else than what was asked for."""
+
+
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
@@ -56,7 +60,8 @@ def read_json(path: str | os.PathLike[str], file_format: str, version: int) -> d
     :param file_format: what it has to hold
     :param version: the one that is understood
     :return: its content
-    :raises ValueError: if the file is damaged, or holds something else, or is of another version
+    :raises WrongFormatError: if the file holds something else
+    :raises ValueError: if it is damaged, or of another version
     """
     try:
         content = json.loads(Path(path).read_text(encoding="utf-8"))
@@ -64,7 +69,7 @@ def read_json(path: str | os.PathLike[str], file_format: str, version: int) -> d
         raise ValueError(f"{path} is no file in JSON: {error}") from error
     found = content.pop("format", None) if isinstance(content, dict) else None
     if found != file_format:
-        raise ValueError(f"{path} holds no {file_format}" + (f" but {found}" if found else ""))
+        raise WrongFormatError(f"{path} holds no {file_format}" + (f" but {found}" if found else ""))
     if (number := content.pop("version", None)) != version:
         raise ValueError(f"{path} is {file_format} of version {number!r}; this program reads version {version}")
     return dict(content)

@@ -21,7 +21,7 @@ from battery_env.checks import check_numbers, check_positive
 from battery_env.electrochemistry import NEW_CELL, CellParameters, check_cell, check_dt
 from battery_env.electrochemistry.tangents import BY_Q, BY_R, BY_T_DIFFUSION, RATE_CONSTANTS
 from battery_env.estimators.least_squares import LeastSquares
-from battery_env.files import read_json, write_json
+from battery_env.files import WrongFormatError, read_json, write_json
 from battery_env.parameters import Q_MOBILE, R_O
 from battery_env.record_model import RecordModel
 from battery_env.records import SWITCH_SHARE, Record, check_drawn_charge, check_record, drawn
@@ -96,7 +96,7 @@ class FittedConstant(NamedTuple):
 
     @property
     def identified(self) -> bool:
-        """Whether the discharges determine it; otherwise it stays near its prior."""
+        """Whether the discharges leave less than half of the uncertainty of its prior."""
         return self.sd < IDENTIFIED_SHARE * self.prior_sd
 
 
@@ -258,6 +258,21 @@ class CellFit:
             return cls(**content)
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{path} is damaged, or no fit saved by CellFit.to_json: {error}") from error
+
+
+def calibrator_from_json(path: str | os.PathLike[str], **arguments: Any) -> LeastSquares:
+    """
+    Least squares with constants from a file.
+
+    :param path: what :meth:`CellFit.to_json` wrote, with the error to expect; or :meth:`battery_env.CellParameters.to_json`
+    :param arguments: others of :class:`~battery_env.LeastSquares`; they replace those of the fit
+    :return: the calibrator
+    :raises ValueError: if the file is damaged, was not written so, or is of another format version
+    """
+    try:
+        return CellFit.from_json(path).calibrator(**arguments)
+    except WrongFormatError:
+        return LeastSquares(cell=CellParameters.from_json(path), **arguments)
 
 
 def fit_cell(

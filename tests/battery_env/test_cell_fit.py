@@ -10,7 +10,13 @@ from battery_env import CellFit, CellParameters, LeastSquares, fit_cell, load_na
 from battery_env.cells import Discharge
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate, voltage
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
-from battery_env.estimators.cell_fit import EQUILIBRIUM_PRIOR_SD_V, RATE_PRIOR_SD, _JointFit, with_equilibrium
+from battery_env.estimators.cell_fit import (
+    EQUILIBRIUM_PRIOR_SD_V,
+    RATE_PRIOR_SD,
+    _JointFit,
+    calibrator_from_json,
+    with_equilibrium,
+)
 from battery_env.plotting import plot_cell_fit
 
 OTHER = with_equilibrium(NEW_CELL, [0.02, -0.03, 0.02]).replace(kn=1000.0, tDiffusion=9e6, to=10.0, tsn=600.0, VEOD=2.7)
@@ -154,6 +160,16 @@ class TestFiles:
 
     def test_constants_survive_their_file(self, tmp_path):
         assert CellParameters.from_json(OTHER.to_json(tmp_path / "constants.json")) == OTHER
+
+    def test_a_calibrator_has_the_constants_of_its_file(self, fit, tmp_path):
+        own = calibrator_from_json(fit.to_json(tmp_path / "fit.json"), current_gain_sd=0.01)
+        assert (own.model.cell, own.mismatch_V, own.current_gain_sd) == (fit.cell, fit.mismatch_V, 0.01)
+        assert calibrator_from_json(tmp_path / "fit.json", mismatch_V=0.1).mismatch_V == 0.1
+        constants = calibrator_from_json(OTHER.to_json(tmp_path / "constants.json"), mismatch_V=0.1)
+        assert (constants.model.cell, constants.mismatch_V) == (OTHER, 0.1)
+        (tmp_path / "other.json").write_text("{}")
+        with pytest.raises(ValueError, match=r"other\.json holds no"):
+            calibrator_from_json(tmp_path / "other.json")
 
     @pytest.mark.parametrize("kind", [CellFit, CellParameters])
     def test_nothing_is_overwritten(self, kind, fit, tmp_path):
