@@ -36,6 +36,8 @@ EQUILIBRIUM_PRIOR_SD_V: tuple[float, ...] = (0.3, 0.2, 0.1, 0.1, 0.1, 0.1, 0.05,
 IDENTIFIED_SHARE = 0.5
 #: A fit that is farther from the measured voltages than this (root mean square), V, is refused.
 LIMIT_V = 0.05
+#: Error to expect on a real cell of constants that were not fitted to it, V.
+UNFITTED_MISMATCH_V = 0.05
 
 _FORMAT, _FORMAT_VERSION = "battery_env.CellFit", 1
 
@@ -162,7 +164,8 @@ class CellFit:
             check_cell(getattr(self, name), self.thermal)
         for name in ("mismatch_V", "rmse_V"):
             check_positive(name, getattr(self, name))
-        for row in (*self.constants, *self.discharges):
+        rows: tuple[FittedConstant | FittedDischarge, ...] = (*self.constants, *self.discharges)
+        for row in rows:
             if not isinstance(row.name, str) or not np.isfinite(check_numbers(row.name, row[1:])).all():
                 raise ValueError(f"constants and discharges have names and finite numbers, got {row!r}")
 
@@ -264,7 +267,8 @@ def calibrator_from_json(path: str | os.PathLike[str], **arguments: Any) -> Leas
     """
     Least squares with constants from a file.
 
-    :param path: what :meth:`CellFit.to_json` wrote, with the error to expect; or :meth:`battery_env.CellParameters.to_json`
+    :param path: what :meth:`CellFit.to_json` wrote, with the error to expect; or
+        :meth:`battery_env.CellParameters.to_json`, for which that is ``UNFITTED_MISMATCH_V``
     :param arguments: others of :class:`~battery_env.LeastSquares`; they replace those of the fit
     :return: the calibrator
     :raises ValueError: if the file is damaged, was not written so, or is of another format version
@@ -272,7 +276,7 @@ def calibrator_from_json(path: str | os.PathLike[str], **arguments: Any) -> Leas
     try:
         return CellFit.from_json(path).calibrator(**arguments)
     except WrongFormatError:
-        return LeastSquares(cell=CellParameters.from_json(path), **arguments)
+        return LeastSquares(**{"cell": CellParameters.from_json(path), "mismatch_V": UNFITTED_MISMATCH_V, **arguments})
 
 
 def fit_cell(

@@ -165,8 +165,8 @@ class TestFiles:
         own = calibrator_from_json(fit.to_json(tmp_path / "fit.json"), current_gain_sd=0.01)
         assert (own.model.cell, own.mismatch_V, own.current_gain_sd) == (fit.cell, fit.mismatch_V, 0.01)
         assert calibrator_from_json(tmp_path / "fit.json", mismatch_V=0.1).mismatch_V == 0.1
-        constants = calibrator_from_json(OTHER.to_json(tmp_path / "constants.json"), mismatch_V=0.1)
-        assert (constants.model.cell, constants.mismatch_V) == (OTHER, 0.1)
+        constants = calibrator_from_json(OTHER.to_json(tmp_path / "constants.json"))
+        assert (constants.model.cell, constants.mismatch_V) == (OTHER, 0.05)
         (tmp_path / "other.json").write_text("{}")
         with pytest.raises(ValueError, match=r"other\.json holds no"):
             calibrator_from_json(tmp_path / "other.json")
