@@ -19,8 +19,8 @@ import numpy as np
 import pandas as pd
 
 from battery_env.cells import BUNDLED_CELLS, Discharge, load_nasa_discharges, read_discharge_csv
-from battery_env.electrochemistry import NEW_CELL
 from battery_env.estimates import Estimate
+from battery_env.estimators.cell_fit import UNFITTED_MISMATCH_V, calibrator_from_json
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.files import replacing
 from battery_env.parameters import PARAMETER_NAMES
@@ -65,9 +65,8 @@ def _parser() -> argparse.ArgumentParser:
     calibrate.add_argument(
         "--mismatch",
         type=float,
-        default=0.05,
         metavar="V",
-        help="error to expect of the model itself, V; 0 for simulated data (default: %(default)s)",
+        help="error to expect of the model itself, V; 0 for simulated data (default: 0.05, or that of the fit of --cell)",
     )
     calibrate.add_argument(
         "--current-gain-sd",
@@ -81,6 +80,12 @@ def _parser() -> argparse.ArgumentParser:
         type=float,
         metavar="A",
         help="current after the end of a record in progress, A (default: its last one, or its mean if it varied)",
+    )
+    calibrate.add_argument(
+        "--cell",
+        type=Path,
+        metavar="FILE",
+        help="constants of the cell, as battery_env.fit_cell(...).to_json saves them (default: the new cell's)",
     )
     calibrate.add_argument("--isothermal", action="store_true", help="keep the temperature of the model constant")
     calibrate.add_argument("--discharge-is-negative", action="store_true", help="the file counts discharge as negative")
@@ -115,22 +120,18 @@ def _calibrate(options: argparse.Namespace) -> None:
         raise FileExistsError(f"{', '.join(existing)} would be replaced; choose another --out, or give --force")
 
     record = discharge.loaded_part(options.cut_off)
-    calibrator = LeastSquares(
-        options.parameters,
-        thermal=not options.isothermal,
-        prior_q_mobile_C=tuple(options.prior_q) if options.prior_q else None,
-        mismatch_V=options.mismatch,
-        current_gain_sd=options.current_gain_sd,
-    )
+    calibrator = _calibrator(options)
+    new_q_mobile_C = calibrator.model.cell.q_mobile
     estimate = calibrator.estimate(record)
     future = expected_current(record.time_s, record.current_A)
     if options.future_current is not None:
         future = ExpectedCurrent(options.future_current, varied=False, sd_A=0.0)
     forecast = calibrator.model.forecast(record, estimate, options.cut_off, future.mean_A)
     row = _summary(record, estimate, forecast, discharge.eod_time_s(options.cut_off), future)
+    row["state_of_health"] = estimate.q_mobile / new_q_mobile_C
     if "q_mobile" not in options.parameters:
         row["state_of_health"] = float("nan")
-    _print(name, record, row, options.parameters, options.cut_off, future)
+    _print(name, record, row, options.parameters, options.cut_off, future, new_q_mobile_C)
     if not options.prior_q and not estimate.settled and np.isnan(row["measured_eod_time_s"]):
         print("During a discharge give --prior-q with the q_mobile of an earlier one of this cell. Without it the filter in")
         print("Python, ExtendedKalmanFilter(thermal=True, mismatch_V=0.05), predicts the end better than this fit.")
@@ -142,6 +143,20 @@ def _calibrate(options: argparse.Namespace) -> None:
             pd.DataFrame(columns | {"model_V": forecast.at_samples_V}).to_csv(part, index=False)
         save_figure(plot_discharge(record, {name: forecast}), outputs[2])
         print("\nwritten: " + ", ".join(map(str, outputs)))
+
+
+def _calibrator(options: argparse.Namespace) -> LeastSquares:
+    arguments: dict[str, Any] = {
+        "parameters": options.parameters,
+        "thermal": not options.isothermal,
+        "prior_q_mobile_C": tuple(options.prior_q) if options.prior_q else None,
+        "current_gain_sd": options.current_gain_sd,
+    }
+    if options.mismatch is not None:
+        arguments["mismatch_V"] = options.mismatch
+    if options.cell is None:
+        return LeastSquares(**{"mismatch_V": UNFITTED_MISMATCH_V, **arguments})
+    return calibrator_from_json(options.cell, **arguments)
 
 
 def _read(record: str, discharge_is_negative: bool) -> tuple[str, Discharge]:
@@ -173,7 +188,7 @@ def _summary(
         "settled": estimate.settled,
         "reason": estimate.reason,
         "drawn_Ah": record.charge_C / 3600.0,
-        "state_of_health": estimate.q_mobile / NEW_CELL.q_mobile,
+        "state_of_health": float("nan"),
         "voltage_rmse_V": float(np.sqrt(np.nanmean(residual_V**2))),
         "predicted_eod_time_s": forecast.eod_time_s,
         "sd_predicted_eod_time_s": _sd_eod_s(estimate, remaining_s, future),
@@ -191,7 +206,13 @@ def _sd_eod_s(estimate: Estimate, remaining_s: float, future: ExpectedCurrent) -
 
 
 def _print(
-    name: str, record: Discharge, row: dict[str, Any], fitted: Sequence[str], cut_off_V: float, future: ExpectedCurrent
+    name: str,
+    record: Discharge,
+    row: dict[str, Any],
+    fitted: Sequence[str],
+    cut_off_V: float,
+    future: ExpectedCurrent,
+    new_q_mobile_C: float,
 ) -> None:
     in_progress = np.isnan(row["measured_eod_time_s"])
     lines = {
@@ -204,7 +225,7 @@ def _print(
     print(f"  {'settled':<22}{'yes' if row['settled'] else 'no':>12}")
     print(f"  {'drawn':<22}{row['drawn_Ah']:>9.3f} Ah   {'so far' if in_progress else f'the capacity to {cut_off_V:g} V'}")
     if "q_mobile" in fitted:
-        print(f"  {'state of health':<22}{row['state_of_health']:>12.3f}   q_mobile / {NEW_CELL.q_mobile:g} C")
+        print(f"  {'state of health':<22}{row['state_of_health']:>12.3f}   q_mobile / {new_q_mobile_C:.0f} C")
     print(f"  {'voltage RMSE':<22}{1e3 * row['voltage_rmse_V']:>9.1f} mV")
     print(f"  {f'{cut_off_V:g} V, predicted at':<22}{row['predicted_eod_time_s']:>10.0f} s")
     if in_progress:
