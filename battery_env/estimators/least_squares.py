@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from math import hypot, inf, isnan, nan, sqrt
 from typing import NamedTuple
@@ -445,17 +445,16 @@ class LeastSquares(Estimator):
         unknown = [*self.parameters, *self.nuisance]
         columns = [unknown.index(name) for name in free]
 
-        def values_at(x: FloatArray) -> dict[str, float]:
+        def values_at(x: Iterable[float]) -> tuple[dict[str, float], float, float]:
             values = start | {name: float(value) for name, value in zip(free, x, strict=True)}
+            least_C, least_by_log_C = self._least_q_C(problem, values)
             if "q_mobile" in free:
-                least_C, _ = self._least_q_C(problem, values)
                 values["q_mobile"] = least_C + float(np.exp(min(values["q_mobile"], _LOG_LIMIT)))
-            return values
+            return values, least_C, least_by_log_C
 
         @lru_cache(maxsize=1)
         def evaluated(x: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
-            values = values_at(np.array(x))
-            least_C, least_by_log_C = self._least_q_C(problem, values)
+            values, least_C, least_by_log_C = values_at(x)
             residual_V, by_parameter = self._residual(problem, values, priors)
             slopes = [values[name] - least_C if name == "q_mobile" else 1.0 for name in free]
             by_x = by_parameter[:, columns] * slopes
@@ -479,7 +478,7 @@ class LeastSquares(Estimator):
             x_scale=[(_SEARCH_SCALES | self.nuisance)[name] for name in free],
             gtol=1e-10,
         )
-        return values_at(result.x)
+        return values_at(result.x)[0]
 
     def _model(self, values: Mapping[str, float]) -> RecordModel:
         """The model with the nuisance constants at some values."""
