@@ -19,7 +19,7 @@ from battery_env.arrays import FloatArray
 from battery_env.cells import Discharge
 from battery_env.checks import check_numbers, check_positive
 from battery_env.electrochemistry import NEW_CELL, CellParameters, check_cell, check_dt
-from battery_env.electrochemistry.tangents import BY_Q, BY_R, BY_T_DIFFUSION, RATE_CONSTANTS
+from battery_env.electrochemistry.tangents import BY_Q, BY_R, RATE_CONSTANTS
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.files import WrongFormatError, read_json, write_json
 from battery_env.parameters import Q_MOBILE, R_O
@@ -410,6 +410,14 @@ def _name(record: Record, number: int) -> str:
     return f"{meta['cell']}:{meta['cycle']}" if {"cell", "cycle"} <= set(meta) else str(number)
 
 
+class _Aged(NamedTuple):
+    """The parameters of one discharge at an x."""
+
+    q_mobile: float
+    r_o: float
+    q_gradient_C: FloatArray  # of q_mobile by x
+
+
 class _Weights(NamedTuple):
     """How much the residuals of each discharge count."""
 
@@ -525,8 +533,8 @@ class _JointFit:
             derivatives.append(scale[:, None] * jacobian)
         return np.concatenate([*residuals, x[:n]]), np.concatenate([*derivatives, np.eye(n, len(x))])
 
-    def _evaluate(self, x: tuple[float, ...]) -> tuple[list[FloatArray], list[FloatArray], list[tuple[float, float]]]:
-        """Of each discharge the residuals, V, their derivatives by x, and (q_mobile, r_o)."""
+    def _evaluate(self, x: tuple[float, ...]) -> tuple[list[FloatArray], list[FloatArray], list[_Aged]]:
+        """Of each discharge the residuals, V, their derivatives by x, and its parameters."""
         values = np.array(x)
         model = RecordModel(self.cell(values), self.thermal, self.dt_s)
         n, rates = len(self.sd), len(RATE_CONSTANTS)
@@ -537,19 +545,20 @@ class _JointFit:
             distance_C = float(np.exp(values[u]))
             q_mobile, r_o = (1.0 + _MARGIN) * least_C + distance_C, _R_O_SCALE_OHM * float(values[r])
             voltage_V, by_parameter, fraction_p = model.tangents(data.current_A, q_mobile, r_o)
-            columns = np.zeros((len(voltage_V), len(values)))
-            columns[:, :rates] = by_parameter[BY_R + 1 :].T
-            columns[:, BY_T_DIFFUSION - BY_R - 1] += (1.0 + _MARGIN) * least_by_log_C * by_parameter[BY_Q]
-            columns[:, rates:n] = legvander(_on_unit_range(fraction_p), n - rates - 1)
-            columns[:, :n] *= self.sd
-            columns[:, u] = distance_C * by_parameter[BY_Q]
+            q_gradient_C = np.zeros(len(values))
+            q_gradient_C[u] = distance_C
+            t_diffusion = RATE_CONSTANTS.index("tDiffusion")
+            q_gradient_C[t_diffusion] = (1.0 + _MARGIN) * least_by_log_C * self.sd[t_diffusion]
+            columns = by_parameter[BY_Q][:, None] * q_gradient_C
+            columns[:, :rates] += self.sd[:rates] * by_parameter[BY_R + 1 :].T
+            columns[:, rates:n] = self.sd[rates:] * legvander(_on_unit_range(fraction_p), n - rates - 1)
             columns[:, r] = _R_O_SCALE_OHM * by_parameter[BY_R]
             grid_s = self.dt_s * np.arange(len(voltage_V))
             at = np.minimum(np.searchsorted(grid_s, data.time_s, side="right"), len(grid_s) - 1)
             share = (data.time_s - grid_s[at - 1]) / self.dt_s
             residuals.append(np.interp(data.time_s, grid_s, voltage_V) - data.voltage_V)
             jacobians.append(columns[at - 1] + share[:, None] * (columns[at] - columns[at - 1]))
-            aged.append((q_mobile, r_o))
+            aged.append(_Aged(q_mobile, r_o, q_gradient_C))
         return residuals, jacobians, aged
 
     def _covariance(self, x: FloatArray, weights: _Weights) -> FloatArray:
@@ -571,7 +580,8 @@ class _JointFit:
         """What was found."""
         residuals_V, _, aged = self._evaluated(tuple(x))
         n, discharges = len(self.sd), len(self.data)
-        sds = np.sqrt(np.diag(self._covariance(x, weights)))
+        covariance = self._covariance(x, weights)
+        sds = np.sqrt(np.diag(covariance))
         names = [*RATE_CONSTANTS, *(f"equilibrium {k}" for k in range(len(EQUILIBRIUM_PRIOR_SD_V)))]
         cell = self.cell(x)
         constants = []
@@ -581,7 +591,7 @@ class _JointFit:
             constants.append(FittedConstant(name, before, float(self.sd[k]), float(after), float(self.sd[k] * sds[k])))
         model = RecordModel(self.start, self.thermal, self.dt_s)
         rows = []
-        for d, (residual_V, (q_mobile, r_o)) in enumerate(zip(residuals_V, aged, strict=True)):
+        for d, (residual_V, age) in enumerate(zip(residuals_V, aged, strict=True)):
             before = self.before[d]
             tangents = model.tangents(self.data[d].current_A, before.q_mobile, before.r_o)
             grid_s = self.dt_s * np.arange(len(tangents.voltage_V))
@@ -589,19 +599,19 @@ class _JointFit:
             rows.append(
                 FittedDischarge(
                     self.names[d],
-                    q_mobile,
-                    r_o,
-                    float(np.exp(x[n + d]) * sds[n + d]),
+                    age.q_mobile,
+                    age.r_o,
+                    float(np.sqrt(age.q_gradient_C @ covariance @ age.q_gradient_C)),
                     float(_R_O_SCALE_OHM * sds[n + discharges + d]),
                     _rms(residual_V),
                     _rms(before_V),
                 )
             )
         largest = max(rows, key=lambda row: row.q_mobile)
-        age = {"q_mobile": largest.q_mobile, "r_o": largest.r_o}
+        new = {"q_mobile": largest.q_mobile, "r_o": largest.r_o}
         return CellFit(
-            cell.replace(**age),
-            self.start.replace(**age),
+            cell.replace(**new),
+            self.start.replace(**new),
             weights.mismatch_V,
             _rms(np.concatenate(residuals_V)),
             self.thermal,

@@ -69,7 +69,12 @@ def test_derivatives_of_the_search_are_exact(simulated):
         more, less = (np.concatenate(problem._evaluate(tuple(x + sign * change))[0]) for sign in (1.0, -1.0))
         column = np.concatenate([jacobian[:, k] for jacobian in jacobians])
         np.testing.assert_allclose(column, (more - less) / 2e-5, rtol=1e-4, atol=1e-6)
-    assert all(q > 5000.0 for q, _ in aged)
+    for d, age in enumerate(aged):
+        for k in np.flatnonzero(age.q_gradient_C):
+            change = np.zeros(len(x))
+            change[k] = 1e-5
+            more_C, less_C = (problem._evaluate(tuple(x + sign * change))[2][d].q_mobile for sign in (1.0, -1.0))
+            assert age.q_gradient_C[k] == pytest.approx((more_C - less_C) / 2e-5, rel=1e-5)
 
 
 class TestSimulated:
