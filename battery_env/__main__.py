@@ -19,6 +19,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from battery_env.estimators.cell_fit import read_cell
 from battery_env.fleet import Reading, Results, calibrate_all, find_sources
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.summary import METHODS, Settings, text_of
@@ -39,6 +40,13 @@ def _parser(name: str) -> argparse.ArgumentParser:
         epilog="Exit status: 0 if every discharge is settled, 3 if one is not, 2 if one cannot be used.",
         allow_abbrev=False,
     )
+    _add_reading(parser)
+    _add_calibration(parser.add_argument_group("calibration"))
+    _add_results(parser.add_argument_group("results"))
+    return parser
+
+
+def _add_reading(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "records",
         nargs="+",
@@ -46,13 +54,7 @@ def _parser(name: str) -> argparse.ArgumentParser:
         help="text of any delimiter, Parquet, NASA's .mat, Neware's .nda and .ndax, BioLogic's .mpr; a folder of them; "
         "FILE:CYCLE for one discharge of a life; or a bundled cell, B0005, and its discharge, B0005:12",
     )
-    _add_reading(parser.add_argument_group("reading"))
-    _add_calibration(parser.add_argument_group("calibration"))
-    _add_results(parser.add_argument_group("results"))
-    return parser
-
-
-def _add_reading(group: argparse._ArgumentGroup) -> None:
+    group = parser.add_argument_group("reading")
     group.add_argument(
         "--columns",
         type=_assignments,
@@ -94,7 +96,10 @@ def _add_calibration(group: argparse._ArgumentGroup) -> None:
         help="what to fit; the other is held at the cell's value (default: both). Give it after the files",
     )
     group.add_argument(
-        "--cut-off", type=float, default=2.7, metavar="V", help="voltage at which the discharge ends, V (default: %(default)s)"
+        "--cut-off",
+        type=float,
+        metavar="V",
+        help="voltage at which the discharge ends, V (default: 2.7, or that of the fit of --cell)",
     )
     group.add_argument(
         "--prior",
@@ -107,9 +112,8 @@ def _add_calibration(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--mismatch",
         type=float,
-        default=0.05,
         metavar="V",
-        help="error to expect of the model itself, V; 0 for simulated data (default: %(default)s)",
+        help="error to expect of the model itself, V; 0 for simulated data (default: 0.05, or that of the fit of --cell)",
     )
     group.add_argument(
         "--current-gain-sd",
@@ -124,14 +128,30 @@ def _add_calibration(group: argparse._ArgumentGroup) -> None:
         metavar="A",
         help="current after the end of a record in progress, A (default: its last one, or its mean if it varied)",
     )
-    group.add_argument("--nominal", type=float, metavar="AH", help="nominal capacity, Ah, which the state of health refers to")
+    group.add_argument(
+        "--cell",
+        type=Path,
+        metavar="FILE",
+        help="constants of the cell, as CellFit.to_json or CellParameters.to_json saves them (default: those of a new 18650)",
+    )
+    group.add_argument(
+        "--nominal",
+        type=float,
+        metavar="AH",
+        help="nominal capacity, Ah, which the state of health refers to (default: what the cell of --cell gives at this load)",
+    )
     group.add_argument(
         "--ambient",
         type=float,
         metavar="DEGC",
         help="temperature of the surroundings, degC (default: the first one measured, or the model cell's 19 degC)",
     )
-    group.add_argument("--isothermal", action="store_true", help="keep the temperature of the model constant")
+    group.add_argument(
+        "--isothermal",
+        action="store_true",
+        default=None,
+        help="keep the temperature of the model constant (default: it moves, or as in the fit of --cell)",
+    )
 
 
 def _add_results(group: argparse._ArgumentGroup) -> None:
@@ -187,18 +207,7 @@ def calibrate(arguments: Sequence[str] | None = None, name: str = "battery-calib
     options = _parser(name).parse_args(arguments)
     interrupted = False
     try:
-        settings = Settings(
-            method=options.method,
-            parameters=tuple(options.parameters),
-            cut_off_V=options.cut_off,
-            prior_q_mobile_C=tuple(options.prior) if options.prior else None,
-            mismatch_V=options.mismatch,
-            current_gain_sd=options.current_gain_sd,
-            future_current_A=options.future_current,
-            thermal=not options.isothermal,
-            ambient_C=options.ambient,
-            nominal_Ah=options.nominal,
-        )
+        settings = _settings(options)
         sources = find_sources(options.records)
         results = Results(options.out, sources, not options.table_only, options.force) if options.out else None
         reading = Reading(options.columns, options.units, options.discharge_is_negative)
@@ -224,6 +233,23 @@ def calibrate(arguments: Sequence[str] | None = None, name: str = "battery-calib
     if any(row["error"] for row in rows):
         return REFUSED
     return SETTLED if all(row["settled"] for row in rows) else NOT_SETTLED
+
+
+def _settings(options: argparse.Namespace) -> Settings:
+    given = {
+        "method": options.method,
+        "parameters": tuple(options.parameters),
+        "cut_off_V": options.cut_off,
+        "prior_q_mobile_C": tuple(options.prior) if options.prior else None,
+        "mismatch_V": options.mismatch,
+        "current_gain_sd": options.current_gain_sd,
+        "future_current_A": options.future_current,
+        "thermal": False if options.isothermal else None,
+        "ambient_C": options.ambient,
+        "nominal_Ah": options.nominal,
+    }
+    given = {name: value for name, value in given.items() if value is not None}
+    return Settings.for_cell(read_cell(options.cell), **given) if options.cell else Settings(**given)
 
 
 def _show(row: dict[str, Any], done: Sequence[dict[str, Any]], as_json: bool) -> None:

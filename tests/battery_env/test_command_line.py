@@ -10,7 +10,8 @@ import pytest
 from battery_env import fleet
 from battery_env.__main__ import calibrate, main
 from battery_env.cells import Discharge, load_nasa_discharges
-from battery_env.electrochemistry import simulate
+from battery_env.electrochemistry import NEW_CELL, CellParameters, simulate
+from battery_env.estimators.least_squares import LeastSquares
 from battery_env.summary import summarize
 
 
@@ -53,6 +54,25 @@ def test_calibrates_a_bundled_discharge_and_writes_what_it_found(tmp_path, capsy
     error_V = voltages["model_V"] - voltages["voltage_V"]
     assert np.sqrt((error_V**2).mean()) == pytest.approx(row["voltage_rmse_V"])
     assert (folder / "B0005_100_voltage.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_file_of_constants_takes_the_place_of_the_new_cell(recorded, tmp_path, capsys):
+    path = write(recorded, tmp_path / "record.csv")
+    cell = NEW_CELL.replace(q_mobile=7000.0, kn=500.0).to_json(tmp_path / "cell.json")
+    assert main(["calibrate", path, "--cell", str(cell)]) == 0
+    shown = capsys.readouterr().out
+    fit = LeastSquares(cell=CellParameters.from_json(cell), thermal=True, mismatch_V=0.05, current_gain_sd=0.005)
+    record = recorded.loaded_part(2.7)
+    q_mobile = fit.estimate(record).q_mobile
+    given_Ah = fit.model.capacity_Ah(record.current_A[-1], "current", 2.7, 7000.0)
+    health = record.charge_C / 3600.0 / given_Ah
+    assert f"{q_mobile:.0f} C" in shown
+    assert (
+        f"{health:.3f}   {record.charge_C / 3600.0:.3f} Ah, drawn, of {given_Ah:.4g} Ah, what the given cell yields" in shown
+    )
+    cell.write_text("{}")
+    assert "cell.json holds no battery_env.CellParameters" in fails([path, "--cell", str(cell)], capsys)
+    assert "missing.json" in fails([path, "--cell", str(tmp_path / "missing.json")], capsys)
 
 
 def test_says_what_remains_of_a_discharge_in_progress_and_that_it_is_not_settled(recorded, tmp_path, capsys):
