@@ -32,6 +32,21 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         part.unlink(missing_ok=True)
 
 
+def check_folder(folder: Path) -> None:
+    """
+    Refuse a folder that results cannot be written to, before they are there to be lost.
+
+    :param folder: need not exist yet
+    :raises FileExistsError: if it is a file, or would be in one
+    :raises PermissionError: if it is not to be written to
+    """
+    there = next(path for path in (folder, *folder.parents) if path.exists())
+    if not there.is_dir():
+        raise FileExistsError(f"{there} is a file: choose another --out")
+    if not os.access(there, os.W_OK):
+        raise PermissionError(f"{there} cannot be written to: choose another --out")
+
+
 def write_json(path: str | os.PathLike[str], file_format: str, version: int, content: Mapping[str, Any]) -> Path:
     """
     Write a new file in JSON that says what it holds.

@@ -18,7 +18,7 @@ from battery_env.estimators.base import Estimator
 from battery_env.estimators.cell_fit import UNFITTED_MISMATCH_V, CellFit
 from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
-from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE
+from battery_env.parameters import PARAMETER_NAMES
 from battery_env.record_model import RecordModel, VoltageForecast
 from battery_env.records import ExpectedCurrent, expected_current
 
@@ -54,8 +54,8 @@ class Settings:
         else the record says of its surroundings, or the cell's
     :param nominal_Ah: nominal capacity, which the state of health refers to, Ah; ``None``: the charge that ``cell``, with its
         own ``q_mobile`` and ``r_o``, gives from full at the current of the discharge, or not known if there is no ``cell``
-    :param cell: constants of the model; ``None``: the new cell's, which is another one than that of the record
-    :param q_mobile_bounds_C: where to search for ``q_mobile``, C
+    :param cell: constants of the model; ``None``: those of a new 18650
+    :param q_mobile_bounds_C: where to search for ``q_mobile``, C; ``None``: where the calibrator does by default
     :raises ValueError: for an argument out of range
     """
 
@@ -70,7 +70,7 @@ class Settings:
     ambient_C: float | None = None
     nominal_Ah: float | None = None
     cell: CellParameters | None = None
-    q_mobile_bounds_C: tuple[float, float] = Q_MOBILE.limits
+    q_mobile_bounds_C: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
@@ -116,14 +116,15 @@ class Settings:
         :raises ValueError: for an argument out of range
         """
         calibrator = LeastSquares if self.method == "least-squares" else ExtendedKalmanFilter
+        bounds = {} if self.q_mobile_bounds_C is None else {"q_mobile_bounds_C": self.q_mobile_bounds_C}
         return calibrator(
             self.parameters,
             cell,
             thermal=self.thermal,
             prior_q_mobile_C=self.prior_q_mobile_C,
-            q_mobile_bounds_C=self.q_mobile_bounds_C,
             mismatch_V=self.mismatch_V,
             current_gain_sd=self.current_gain_sd,
+            **bounds,
         )
 
 

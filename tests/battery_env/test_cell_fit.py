@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.polynomial import Legendre
 
-from battery_env import CellFit, CellParameters, LeastSquares, fit_cell, load_nasa_discharges
+from battery_env import CellFit, CellParameters, ExtendedKalmanFilter, LeastSquares, fit_cell, forecast, load_nasa_discharges
 from battery_env.cells import Discharge
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate, voltage
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
@@ -145,6 +145,20 @@ class TestRealCells:
         assert np.sum(rmse_V[1::2]) < 0.5 * np.sum(rmse_V[::2])
         assert np.mean(late[1::2]) < 0.5 * np.mean(late[::2])
 
+    def test_a_forecast_takes_the_model_of_a_fit(self, b0005_fit):
+        calibrator = b0005_fit.calibrator()
+        discharge = load_nasa_discharges("B0006")[60]
+        end_s = discharge.eod_time_s(2.7)
+        record = discharge.loaded_part(2.7).until(0.75 * end_s)
+        estimate = calibrator.estimate(record)
+        found = forecast(record, estimate, model=calibrator.model, mismatch_V=b0005_fit.mismatch_V)
+        new = forecast(record, LeastSquares(thermal=True, mismatch_V=0.05).estimate(record), cut_off_V=2.7)
+        assert found.cut_off_V == 2.7  # that of the fit
+        low_s, median_s, high_s = found.eod_quantile_s()
+        assert low_s < end_s < high_s and abs(median_s - end_s) < 0.5 * abs(new.eod_quantile_s(0.5) - end_s)
+        assert 1.7 < found.nominal_Ah < 1.95  # the first discharge that was fitted gave 1.86 Ah
+        assert found.nominal_Ah == pytest.approx(calibrator.model.capacity_Ah(record.current_A[-1], "current", 2.7, 8e4))
+
     def test_temperature_is_the_measured_one(self, b0005_fit):
         assert 295.0 < b0005_fit.cell.Tb0 < 300.0
 
@@ -183,6 +197,7 @@ class TestFiles:
         assert estimator.bounds == own.bounds and estimator.bounds["q_mobile"][1] == pytest.approx(1.2 * fit.cell.q_mobile)
         assert Settings.for_cell(fit, mismatch_V=0.1).mismatch_V == 0.1
         assert Settings.for_cell(OTHER) == Settings(cell=OTHER)
+        assert Settings(method=method).calibrator(NEW_CELL).bounds == LeastSquares().bounds == ExtendedKalmanFilter().bounds
         assert not Settings.for_cell(dataclasses.replace(fit, thermal=False)).thermal
 
     @pytest.mark.parametrize("kind", [CellFit, CellParameters])
