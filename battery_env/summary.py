@@ -116,7 +116,7 @@ class Settings:
         :raises ValueError: for an argument out of range
         """
         calibrator = LeastSquares if self.method == "least-squares" else ExtendedKalmanFilter
-        bounds = {} if self.q_mobile_bounds_C is None else {"q_mobile_bounds_C": self.q_mobile_bounds_C}
+        bounds: dict[str, Any] = {} if self.q_mobile_bounds_C is None else {"q_mobile_bounds_C": self.q_mobile_bounds_C}
         return calibrator(
             self.parameters,
             cell,
