@@ -17,12 +17,14 @@ if TYPE_CHECKING:
     from battery_env.electrochemistry import NEW_CELL, CellParameters, Trajectory, initial_state, simulate, step, voltage
     from battery_env.estimates import Estimate
     from battery_env.estimators import (
+        CellFit,
         ClosedForm,
         Estimator,
         ExtendedKalmanFilter,
         GreedyOneStep,
         LeastSquares,
         cramer_rao_bound,
+        fit_cell,
     )
     from battery_env.evaluation import evaluate
     from battery_env.forecasts import Forecast, forecast
@@ -35,6 +37,7 @@ if TYPE_CHECKING:
 # Where each name comes from: numba, pandas and scipy take seconds to import, and an environment by its id needs none of them
 _MODULES = {
     "NEW_CELL": "battery_env.electrochemistry",
+    "CellFit": "battery_env.estimators",
     "CellParameters": "battery_env.electrochemistry",
     "ClosedForm": "battery_env.estimators",
     "Discharge": "battery_env.cells",
@@ -54,6 +57,7 @@ _MODULES = {
     "TrajectoryDataset": "battery_env.trajectories",
     "cramer_rao_bound": "battery_env.estimators",
     "evaluate": "battery_env.evaluation",
+    "fit_cell": "battery_env.estimators",
     "forecast": "battery_env.forecasts",
     "initial_state": "battery_env.electrochemistry",
     "load_nasa_discharges": "battery_env.cells",
@@ -69,6 +73,7 @@ __version__ = files("battery_env").joinpath("version.txt").read_text(encoding="u
 
 __all__ = [
     "NEW_CELL",
+    "CellFit",
     "CellParameters",
     "ClosedForm",
     "Discharge",
@@ -88,6 +93,7 @@ __all__ = [
     "TrajectoryDataset",
     "cramer_rao_bound",
     "evaluate",
+    "fit_cell",
     "forecast",
     "initial_state",
     "load_nasa_discharges",

@@ -1,11 +1,12 @@
 """
-The command line: what records of discharges say about their cells.
+The command line: what records of discharges say about their cells, and how their constants are found.
 
 .. code-block:: bash
 
   python -m battery_env calibrate discharge.csv
   python -m battery_env calibrate B0005:12 --out results/B0005
   battery-calibrate lab/ --out results --jobs 2
+  python -m battery_env fit B0005:1 B0005:84 B0005:168 --out my_cell.json
 """
 
 from __future__ import annotations
@@ -15,16 +16,25 @@ import json
 import math
 import re
 import sys
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from battery_env.fleet import Reading, Results, calibrate_all, find_sources
+import numpy as np
+
+from battery_env.cells import Discharge
+from battery_env.estimators.cell_fit import fit_cell, read_cell
+from battery_env.files import check_folder
+from battery_env.fleet import Reading, Results, calibrate_all, find_sources, read_source
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.summary import METHODS, Settings, text_of
 
 #: What the process returns: all records settled, one or more refused, one or more not settled, stopped by Ctrl-C.
 SETTLED, REFUSED, NOT_SETTLED, INTERRUPTED = 0, 2, 3, 130
+
+# So many discharges fit beside each other in the figure of a fit.
+_MOST_SHOWN = 4
 
 _QUANTITY = re.compile(r",\s*(?=\w+=)")
 
@@ -39,6 +49,39 @@ def _parser(name: str) -> argparse.ArgumentParser:
         epilog="Exit status: 0 if every discharge is settled, 3 if one is not, 2 if one cannot be used.",
         allow_abbrev=False,
     )
+    _add_reading(parser)
+    _add_calibration(parser.add_argument_group("calibration"))
+    _add_results(parser.add_argument_group("results"))
+    return parser
+
+
+def _fit_parser(name: str) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=name,
+        description=(
+            "Fit the constants of the model to a few discharges of one cell, each from full charge to its knee, and save them "
+            "for --cell of calibrate. Take three or more, of all ages and loads that they are to hold for."
+        ),
+        epilog="Exit status: 0, or 2 if a discharge cannot be used, or the equations do not describe the cell.",
+        allow_abbrev=False,
+    )
+    _add_reading(parser)
+    group = parser.add_argument_group("fit")
+    group.add_argument(
+        "--cut-off", type=float, default=2.7, metavar="V", help="voltage at which the discharge ends, V (default: %(default)s)"
+    )
+    group.add_argument("--isothermal", action="store_true", help="keep the temperature of the model constant")
+    group.add_argument(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="FILE.json",
+        help="write the fit there, and beside it a figure, FILE.png; neither may exist",
+    )
+    return parser
+
+
+def _add_reading(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "records",
         nargs="+",
@@ -46,13 +89,7 @@ def _parser(name: str) -> argparse.ArgumentParser:
         help="text of any delimiter, Parquet, NASA's .mat, Neware's .nda and .ndax, BioLogic's .mpr; a folder of them; "
         "FILE:CYCLE for one discharge of a life; or a bundled cell, B0005, and its discharge, B0005:12",
     )
-    _add_reading(parser.add_argument_group("reading"))
-    _add_calibration(parser.add_argument_group("calibration"))
-    _add_results(parser.add_argument_group("results"))
-    return parser
-
-
-def _add_reading(group: argparse._ArgumentGroup) -> None:
+    group = parser.add_argument_group("reading")
     group.add_argument(
         "--columns",
         type=_assignments,
@@ -94,7 +131,10 @@ def _add_calibration(group: argparse._ArgumentGroup) -> None:
         help="what to fit; the other is held at the cell's value (default: both). Give it after the files",
     )
     group.add_argument(
-        "--cut-off", type=float, default=2.7, metavar="V", help="voltage at which the discharge ends, V (default: %(default)s)"
+        "--cut-off",
+        type=float,
+        metavar="V",
+        help="voltage at which the discharge ends, V (default: 2.7, or that of the fit of --cell)",
     )
     group.add_argument(
         "--prior",
@@ -107,9 +147,8 @@ def _add_calibration(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--mismatch",
         type=float,
-        default=0.05,
         metavar="V",
-        help="error to expect of the model itself, V; 0 for simulated data (default: %(default)s)",
+        help="error to expect of the model itself, V; 0 for simulated data (default: 0.05, or that of the fit of --cell)",
     )
     group.add_argument(
         "--current-gain-sd",
@@ -124,14 +163,30 @@ def _add_calibration(group: argparse._ArgumentGroup) -> None:
         metavar="A",
         help="current after the end of a record in progress, A (default: its last one, or its mean if it varied)",
     )
-    group.add_argument("--nominal", type=float, metavar="AH", help="nominal capacity, Ah, which the state of health refers to")
+    group.add_argument(
+        "--cell",
+        type=Path,
+        metavar="FILE",
+        help="constants of the cell, as the command fit saves them, or CellParameters.to_json (default: those of a new 18650)",
+    )
+    group.add_argument(
+        "--nominal",
+        type=float,
+        metavar="AH",
+        help="nominal capacity, Ah, which the state of health refers to (default: what the cell of --cell gives at this load)",
+    )
     group.add_argument(
         "--ambient",
         type=float,
         metavar="DEGC",
         help="temperature of the surroundings, degC (default: the first one measured, or the model cell's 19 degC)",
     )
-    group.add_argument("--isothermal", action="store_true", help="keep the temperature of the model constant")
+    group.add_argument(
+        "--isothermal",
+        action="store_true",
+        default=None,
+        help="keep the temperature of the model constant (default: it moves, or as in the fit of --cell)",
+    )
 
 
 def _add_results(group: argparse._ArgumentGroup) -> None:
@@ -172,8 +227,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m battery_env", description="Calibrate a battery model to real cells.")
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("calibrate", help="capacity and resistance of cells from their discharges", add_help=False)
-    parser.parse_args(given[:1])
-    return calibrate(given[1:], "python -m battery_env calibrate")
+    commands.add_parser("fit", help="the constants of a cell from a few of its discharges", add_help=False)
+    command = {"calibrate": calibrate, "fit": fit}[parser.parse_args(given[:1]).command]
+    return command(given[1:], f"{parser.prog} {given[0]}")
 
 
 def calibrate(arguments: Sequence[str] | None = None, name: str = "battery-calibrate") -> int:
@@ -187,18 +243,7 @@ def calibrate(arguments: Sequence[str] | None = None, name: str = "battery-calib
     options = _parser(name).parse_args(arguments)
     interrupted = False
     try:
-        settings = Settings(
-            method=options.method,
-            parameters=tuple(options.parameters),
-            cut_off_V=options.cut_off,
-            prior_q_mobile_C=tuple(options.prior) if options.prior else None,
-            mismatch_V=options.mismatch,
-            current_gain_sd=options.current_gain_sd,
-            future_current_A=options.future_current,
-            thermal=not options.isothermal,
-            ambient_C=options.ambient,
-            nominal_Ah=options.nominal,
-        )
+        settings = _settings(options)
         sources = find_sources(options.records)
         results = Results(options.out, sources, not options.table_only, options.force) if options.out else None
         reading = Reading(options.columns, options.units, options.discharge_is_negative)
@@ -224,6 +269,81 @@ def calibrate(arguments: Sequence[str] | None = None, name: str = "battery-calib
     if any(row["error"] for row in rows):
         return REFUSED
     return SETTLED if all(row["settled"] for row in rows) else NOT_SETTLED
+
+
+def _settings(options: argparse.Namespace) -> Settings:
+    given = {
+        "method": options.method,
+        "parameters": tuple(options.parameters),
+        "cut_off_V": options.cut_off,
+        "prior_q_mobile_C": tuple(options.prior) if options.prior else None,
+        "mismatch_V": options.mismatch,
+        "current_gain_sd": options.current_gain_sd,
+        "future_current_A": options.future_current,
+        "thermal": False if options.isothermal else None,
+        "ambient_C": options.ambient,
+        "nominal_Ah": options.nominal,
+    }
+    given = {name: value for name, value in given.items() if value is not None}
+    return Settings.for_cell(read_cell(options.cell), **given) if options.cell else Settings(**given)
+
+
+def fit(arguments: Sequence[str] | None = None, name: str = "python -m battery_env fit") -> int:
+    """
+    The command ``fit``.
+
+    :param arguments: as in :func:`main`, without the name of the command
+    :param name: of the program, for its help
+    :return: 0, or 2 if nothing was fitted; then a line on standard error says why
+    """
+    options = _fit_parser(name).parse_args(arguments)
+    out: Path = options.out
+    picture = out.with_suffix(".png")
+    try:
+        if out.suffix != ".json":
+            raise ValueError(f"the fit is written as JSON: --out {out.name}.json instead of {out.name}")
+        check_folder(out.parent)
+        existing = [str(path) for path in (out, picture) if path.exists()]
+        if existing:
+            raise FileExistsError(f"{', '.join(existing)} would be replaced; choose another --out, or delete what is there")
+        reading = Reading(options.columns, options.units, options.discharge_is_negative)
+        discharges = _discharges(options.records, reading)
+        print(f"fitting {len(discharges)} discharges", file=sys.stderr, flush=True)
+        found = fit_cell(discharges, options.cut_off, thermal=not options.isothermal)
+        print(found.summary())
+        found.to_json(out)
+
+        from battery_env.plotting import plot_cell_fit, save_figure  # here, as matplotlib takes long to import
+
+        shown = np.unique(np.linspace(0, len(discharges) - 1, _MOST_SHOWN).round().astype(np.int64))
+        save_figure(plot_cell_fit(found, [discharges[n] for n in shown]), picture)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except (ValueError, TypeError, OSError, ImportError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return REFUSED
+    print(f"\nwritten: {out}, {picture}")
+    return SETTLED
+
+
+def _discharges(records: Sequence[str], reading: Reading) -> list[Discharge]:
+    """All that the arguments name, each with the cell and the number that it is shown by."""
+    discharges = []
+    for source in find_sources(records):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            try:
+                recordings = read_source(source, reading)
+                for number, recording in enumerate(recordings, start=1):
+                    meta = {"cycle": number, **recording.meta, "cell": source.stem}
+                    discharges.append(recording._replace(meta=meta).discharge())
+            except Exception as error:  # readers of files raise what they like
+                text = " ".join(str(error).split())
+                raise ValueError(text if source.path in text else f"{source.argument}: {text}") from error
+        for each in caught:
+            print(f"warning: {source.argument}: {each.message}", file=sys.stderr)
+    return discharges
 
 
 def _show(row: dict[str, Any], done: Sequence[dict[str, Any]], as_json: bool) -> None:

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+
+
+class WrongFormatError(ValueError):
+    """A file holds something else than what was asked for."""
 
 
 @contextmanager
@@ -24,3 +30,61 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         os.replace(part, target)
     finally:
         part.unlink(missing_ok=True)
+
+
+def check_folder(folder: Path) -> None:
+    """
+    Refuse a folder that results cannot be written to, before they are there to be lost.
+
+    :param folder: need not exist yet
+    :raises FileExistsError: if it is a file, or would be in one
+    :raises PermissionError: if it is not to be written to
+    """
+    there = next(path for path in (folder, *folder.parents) if path.exists())
+    if not there.is_dir():
+        raise FileExistsError(f"{there} is a file: choose another --out")
+    if not os.access(there, os.W_OK):
+        raise PermissionError(f"{there} cannot be written to: choose another --out")
+
+
+def write_json(path: str | os.PathLike[str], file_format: str, version: int, content: Mapping[str, Any]) -> Path:
+    """
+    Write a new file in JSON that says what it holds.
+
+    :param path: where to
+    :param file_format: what it holds
+    :param version: of that format
+    :param content: as JSON may hold it
+    :return: the file
+    :raises FileExistsError: if the file exists already
+    """
+    target = Path(path)
+    if target.exists():
+        raise FileExistsError(f"{target} exists already; delete it or choose another name")
+    with replacing(target) as part:
+        described = {"format": file_format, "version": version, **content}
+        part.write_text(json.dumps(described, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    return target
+
+
+def read_json(path: str | os.PathLike[str], file_format: str, version: int) -> dict[str, Any]:
+    """
+    Read what :func:`write_json` wrote.
+
+    :param path: the file
+    :param file_format: what it has to hold
+    :param version: the one that is understood
+    :return: its content
+    :raises WrongFormatError: if the file holds something else
+    :raises ValueError: if it is damaged, or of another version
+    """
+    try:
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
+    except ValueError as error:  # of the encoding, or of JSON
+        raise ValueError(f"{path} is no file in JSON: {error}") from error
+    found = content.pop("format", None) if isinstance(content, dict) else None
+    if found != file_format:
+        raise WrongFormatError(f"{path} holds no {file_format}" + (f" but {found}" if found else ""))
+    if (number := content.pop("version", None)) != version:
+        raise ValueError(f"{path} is {file_format} of version {number!r}; this program reads version {version}")
+    return dict(content)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -14,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from battery_env.cells import BUNDLED_CELLS, load_nasa_discharges
-from battery_env.files import replacing
+from battery_env.files import check_folder, replacing
 from battery_env.record_files import Recording, read_recordings
 from battery_env.summary import Settings, Summary, summarize
 from battery_env.tables import BINARY_SUFFIXES, PACKED_SUFFIXES, TEXT_SUFFIXES, is_readable
@@ -97,7 +96,15 @@ def _stem(path: Path) -> str:
     return name
 
 
-def _read(source: Source, reading: Reading) -> list[Recording]:
+def read_source(source: Source, reading: Reading) -> list[Recording]:
+    """
+    Read what a source names.
+
+    :param source: a file or a bundled cell, and perhaps which discharge
+    :param reading: how files are read
+    :return: its discharges
+    :raises ValueError: if it cannot be read, or there are none
+    """
     path, cycle = source.path, source.cycle
     if path in BUNDLED_CELLS and not Path(path).exists():
         columns = ("time_s", "voltage_V", "current_A", "temperature_C")
@@ -136,14 +143,10 @@ class Results:
 
     def __init__(self, folder: Path, sources: Sequence[Source], with_voltages: bool, replace: bool) -> None:
         self.folder, self.with_voltages = folder, with_voltages
-        prefix = f"{_record_name(sources[0].stem, sources[0].cycle)}_" if len(sources) == 1 else ""
+        prefix = f"{record_name(sources[0].stem, sources[0].cycle)}_" if len(sources) == 1 else ""
         self.table, self.parquet = folder / f"{prefix}estimate.csv", folder / f"{prefix}estimate.parquet"
         self.life = folder / f"{prefix}life.png"
-        there = next(path for path in (folder, *folder.parents) if path.exists())
-        if not there.is_dir():
-            raise FileExistsError(f"{there} is a file: choose another --out")
-        if not os.access(there, os.W_OK):
-            raise PermissionError(f"{there} cannot be written to: choose another --out")
+        check_folder(folder)
         existing = self._existing(sources)
         if existing and not replace:
             more = f" and {len(existing) - 3} more" if len(existing) > 3 else ""
@@ -154,7 +157,7 @@ class Results:
         if not self.folder.is_dir():
             return []
         # the numbers of the discharges are not known before their files are read
-        stems = "|".join(re.escape(_record_name(source.stem, source.cycle)) for source in sources)
+        stems = "|".join(re.escape(record_name(source.stem, source.cycle)) for source in sources)
         voltages = re.compile(rf"(?:{stems})(?:_\d+)*_voltage\.(?:csv|png)", flags=re.IGNORECASE)
         tables = {path.name for path in (self.table, self.parquet, self.life)}
         return [
@@ -242,16 +245,16 @@ def _tasks(sources: Sequence[Source], reading: Reading) -> Iterator[_Task]:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             try:
-                recordings = _read(source, reading)
+                recordings = read_source(source, reading)
             except Exception as error:  # of whatever kind, it must not stop the others
-                name = _unused(_record_name(source.stem, source.cycle), used)
+                name = _unused(record_name(source.stem, source.cycle), used)
                 text = _message(error)
                 text = text if source.path in text else f"{source.path}: {text}"
                 yield _Task(_known(name, source, source.cycle, caught, text), None)
                 continue
         for recording in recordings:
             cycle = recording.meta.get("cycle")
-            name = _unused(_record_name(source.stem, cycle), used)
+            name = _unused(record_name(source.stem, cycle), used)
             yield _Task(_known(name, source, cycle, caught, ""), recording)
 
 
@@ -262,7 +265,14 @@ def _known(
     return {"record": name, "source": source.path, "cell": source.stem, "cycle": cycle, "notes": notes, "error": error}
 
 
-def _record_name(stem: str, cycle: int | None) -> str:
+def record_name(stem: str, cycle: int | None) -> str:
+    """
+    How one discharge is called in results.
+
+    :param stem: of its source
+    :param cycle: its number, if it has one
+    :return: its name
+    """
     return stem if cycle is None else f"{stem}_{cycle:03d}"
 
 

@@ -13,7 +13,7 @@ from scipy.stats import truncnorm
 
 from battery_env.arrays import BoolArray, FloatArray, IntArray
 from battery_env.checks import LOAD_UNIT_SYMBOLS, LoadUnit, check_load, check_numbers, check_positive, check_whole_number
-from battery_env.electrochemistry import simulate, state_of_charge, step_into, voltage_into
+from battery_env.electrochemistry import state_of_charge, step_into, voltage_into
 from battery_env.estimates import Estimate
 from battery_env.estimators.settling import white_noise_V
 from battery_env.loads import BlockBootstrap, Cycle, Load, RandomLoad, Spliced, constant, steadier_unit
@@ -245,7 +245,8 @@ def forecast(
         cells, error = cells.part(chosen), error.part(chosen)
     soc = cells.soc()
     if nominal_Ah is None:
-        nominal_Ah = _nominal_Ah(model, _draw(to_come, rng), cut_off, max_duration_s)
+        new = _draw(to_come, rng)
+        nominal_Ah = model.capacity_Ah(new, new.unit, cut_off, max_duration_s)
     if over:
         ends = _Ends(np.zeros(samples), soc, np.zeros(1), np.full((len(BAND), 1), cut_off))
         above = np.flatnonzero(seen.voltage_V > cut_off + _ROUNDING_V)
@@ -314,20 +315,6 @@ def _to_come(load: FutureLoad | None, unit: LoadUnit, record: Samples, model: Re
 
 def _draw(load: _Known | RandomLoad, rng: np.random.Generator) -> _Known:
     return load(rng) if isinstance(load, RandomLoad) else load
-
-
-def _nominal_Ah(model: RecordModel, load: _Known, cut_off_V: float, max_duration_s: float) -> float:
-    """What the model's cell gives from full under a load, Ah; NaN if it does not come to the cut-off."""
-    new = simulate(
-        load,
-        dt=model.dt_s,
-        load_unit=load.unit,
-        thermal=model.thermal,
-        cell=model.cell,
-        cut_off_V=cut_off_V,
-        max_duration_s=max_duration_s,
-    )
-    return float(new.current_A.sum() * model.dt_s / 3600.0) if np.isfinite(new.eod_time_s) else float("nan")
 
 
 def _draw_parameters(

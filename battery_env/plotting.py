@@ -18,9 +18,12 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
 from battery_env.arrays import FloatArray
+from battery_env.cells import Discharge
 from battery_env.checks import LOAD_UNIT_SYMBOLS, LoadUnit
 from battery_env.estimates import Estimate, EstimateTrace
+from battery_env.estimators.cell_fit import CellFit
 from battery_env.estimators.cramer_rao import CramerRaoBound, Sensitivities
+from battery_env.estimators.least_squares import LeastSquares
 from battery_env.evaluation import over_seeds
 from battery_env.files import replacing
 from battery_env.parameters import PARAMETER_NAMES, PARAMETERS
@@ -172,6 +175,42 @@ def plot_discharge(record: Record, forecasts: Mapping[str, VoltageForecast], tit
     upper.legend(frameon=False, fontsize=9)
     lower.set(xlabel="time (s)", ylabel="model - measured (mV)")
     return _finished(figure, upper, lower)
+
+
+def plot_cell_fit(fit: CellFit, discharges: Sequence[Record]) -> Figure:
+    """
+    Measured and model voltage with the constants before and after a fit, and below them the errors: one column a discharge.
+    ``q_mobile`` and ``r_o`` are fitted to each, with either constants.
+
+    :param fit: what :func:`battery_env.fit_cell` returned
+    :param discharges: those it was fitted to, or others; of a :class:`~battery_env.Discharge` the part from load-on to the
+        cut-off is taken
+    :return: the figure
+    """
+    figure = new_figure(3.2 * len(discharges) + 0.9, 4.8)
+    panels = figure.subplots(2, len(discharges), sharey="row", sharex="col", height_ratios=[3, 2], squeeze=False)
+    cells = {"before": (fit.start, "--", COLOURS[1]), "after": (fit.cell, "-", COLOURS[0])}
+    for (upper, lower), discharge in zip(panels.T, discharges, strict=True):
+        record = discharge.loaded_part(fit.cell.VEOD) if isinstance(discharge, Discharge) else discharge
+        since_s = record.time_s - record.time_s[0]
+        upper.plot(*_drawn_points(since_s, record.voltage_V), "o", ms=2.2, color="0.6", label="measured")
+        lower.axhline(0.0, color="0.6", lw=0.8)
+        errors_mV = []
+        for name, (cell, style, colour) in cells.items():
+            calibrator = LeastSquares(cell=cell, thermal=fit.thermal)
+            model_V = calibrator.model.voltage(record, calibrator.estimate(record))
+            error_mV = 1e3 * (model_V - record.voltage_V)
+            errors_mV.append(float(np.sqrt(np.nanmean(error_mV**2))))
+            upper.plot(*_drawn_points(since_s, model_V), style, color=colour, lw=1.3, label=f"model, constants {name} the fit")
+            lower.plot(*_drawn_points(since_s, error_mV), style, color=colour, lw=1.1)
+        meta = getattr(record, "meta", {})
+        name = f"{meta['cell']}:{meta['cycle']}, " if {"cell", "cycle"} <= set(meta) else ""
+        upper.set_title(f"{name}RMSE {errors_mV[0]:.0f} → {errors_mV[1]:.0f} mV", fontsize=9)
+        lower.set_xlabel("time (s)")
+    panels[0, 0].set_ylabel("voltage (V)")
+    panels[1, 0].set_ylabel("model - measured (mV)")
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=3, frameon=False, fontsize=9)
+    return _finished(figure, *panels.ravel())
 
 
 def _drawn_points(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:

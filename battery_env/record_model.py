@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from battery_env.arrays import FloatArray
+from battery_env.checks import LoadUnit
 from battery_env.electrochemistry import (
     FULL_CHARGE_SHARES,
     QNB,
@@ -19,7 +21,12 @@ from battery_env.electrochemistry import (
     initial_state,
     simulate,
 )
-from battery_env.electrochemistry.tangents import PolynomialDerivatives, least_q_mobile, roll_out_with_tangents
+from battery_env.electrochemistry.tangents import (
+    TANGENT_NAMES,
+    PolynomialDerivatives,
+    least_q_mobile,
+    roll_out_with_tangents,
+)
 from battery_env.estimates import Estimate
 from battery_env.parameters import Q_MOBILE
 from battery_env.records import Record, check_record, expected_current, resample_current
@@ -43,6 +50,22 @@ class VoltageForecast(NamedTuple):
     voltage_V: FloatArray
     eod_time_s: float
     at_samples_V: FloatArray
+
+
+class Tangents(NamedTuple):
+    """
+    The voltage of the model and its derivatives, at the points of its grid; NaN after the model cell is empty.
+
+    :param voltage_V: shape (K,)
+    :param by_parameter: in the order of :data:`~battery_env.electrochemistry.tangents.TANGENT_NAMES`: with respect to
+        ``q_mobile``, V/C, ``r_o``, A, and the logarithms of constants, V, shape (8, K)
+    :param fraction_p: mole fraction at the surface of the positive electrode, on which the equilibrium voltage depends,
+        shape (K,)
+    """
+
+    voltage_V: FloatArray
+    by_parameter: FloatArray
+    fraction_p: FloatArray
 
 
 class RecordModel:
@@ -180,6 +203,29 @@ class RecordModel:
             n, eod_time_s = len(time_s), start_s + simulation.eod_time_s  # the cell is empty one step later
         return VoltageForecast(np.append(time_s[:n], eod_time_s), np.append(voltage_V[:n], cut_off), eod_time_s, at_samples_V)
 
+    def capacity_Ah(
+        self, load: float | Callable[[FloatArray], FloatArray], load_unit: LoadUnit, cut_off_V: float, max_duration_s: float
+    ) -> float:
+        """
+        The charge that the model's cell, with its own ``q_mobile`` and ``r_o``, gives from full down to the cut-off.
+
+        :param load: a number, or a function of time in s that takes an array
+        :param load_unit: of the load, ``"power"`` in W or ``"current"`` in A
+        :param cut_off_V: cut-off voltage, V
+        :param max_duration_s: where to stop if the cut-off is not reached, s
+        :return: Ah; NaN if the cut-off is not reached
+        """
+        new = simulate(
+            load,
+            dt=self.dt_s,
+            load_unit=load_unit,
+            thermal=self.thermal,
+            cell=self.cell,
+            cut_off_V=cut_off_V,
+            max_duration_s=max_duration_s,
+        )
+        return float(new.current_A.sum() * self.dt_s / 3600.0) if np.isfinite(new.eod_time_s) else float("nan")
+
     def sensitivities(
         self, current_A: FloatArray, q_mobile: float, r_o: float, stride: int = 1
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -193,6 +239,34 @@ class RecordModel:
         :return: voltage, V, dV/dq_mobile, V/C, and dV/dr_o, A, each of shape (K,); NaN after the model cell is empty
         """
         columns = np.full((3, len(current_A)), np.nan)
+        self._roll_out(current_A, q_mobile, r_o, stride, columns[0], columns[1:], np.empty(0))
+        return columns[0], columns[1], columns[2]
+
+    def tangents(self, current_A: FloatArray, q_mobile: float, r_o: float) -> Tangents:
+        """
+        The voltage under a current and its derivatives with respect to both parameters and the constants that say how fast the
+        cell follows its load; unchecked.
+
+        :param current_A: current over each step, A, shape (K,)
+        :param q_mobile: charge that can move, C
+        :param r_o: ohmic resistance, ohm
+        :return: voltage and derivatives
+        """
+        columns = np.full((len(TANGENT_NAMES) + 2, len(current_A)), np.nan)
+        tangents = Tangents(columns[0], columns[2:], columns[1])
+        self._roll_out(current_A, q_mobile, r_o, 1, *tangents)
+        return tangents
+
+    def _roll_out(
+        self,
+        current_A: FloatArray,
+        q_mobile: float,
+        r_o: float,
+        stride: int,
+        voltage_V: FloatArray,
+        by_parameter: FloatArray,
+        fraction_p: FloatArray,
+    ) -> None:
         roll_out_with_tangents(
             current_A,
             q_mobile,
@@ -203,10 +277,10 @@ class RecordModel:
             self._derivatives,
             self.start(q_mobile),
             FULL_CHARGE_SHARES,
-            columns[0],
-            columns[1:],
+            voltage_V,
+            by_parameter,
+            fraction_p,
         )
-        return columns[0], columns[1], columns[2]
 
     def least_q_mobile_C(self, current_A: FloatArray) -> float:
         """
@@ -216,9 +290,19 @@ class RecordModel:
         :param current_A: current over each step, A, shape (K,)
         :return: C
         """
+        return self.least_q_mobile_tangent_C(current_A)[0]
+
+    def least_q_mobile_tangent_C(self, current_A: FloatArray) -> tuple[float, float]:
+        """
+        The same and its derivative with respect to the logarithm of ``tDiffusion``, the only other constant it depends on.
+
+        :param current_A: current over each step, A, shape (K,)
+        :return: both, C
+        """
         q_C = Q_MOBILE.limits[1]
         constants = self.cell.packed.constants
-        return float(least_q_mobile(current_A, q_C, self.dt_s, constants, self.start(q_C), FULL_CHARGE_SHARES))
+        least_C, by_t_C = least_q_mobile(current_A, q_C, self.dt_s, constants, self.start(q_C), FULL_CHARGE_SHARES)
+        return float(least_C), float(by_t_C)
 
 
 def _at(time_s: FloatArray, simulation: Trajectory) -> FloatArray:

@@ -15,6 +15,7 @@ from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.electrochemistry.cell import TB
 from battery_env.estimates import Estimate
 from battery_env.estimators.base import Estimator
+from battery_env.estimators.cell_fit import UNFITTED_MISMATCH_V, CellFit
 from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.parameters import PARAMETER_NAMES
@@ -51,8 +52,10 @@ class Settings:
     :param thermal: whether the temperature of the model moves
     :param ambient_C: temperature at the start and of the surroundings, degC; ``None``: the first one measured, or what
         else the record says of its surroundings, or the cell's
-    :param nominal_Ah: nominal capacity, which the state of health refers to, Ah; ``None``: not known
-    :param cell: constants of the model; ``None``: the new cell's
+    :param nominal_Ah: nominal capacity, which the state of health refers to, Ah; ``None``: the charge that ``cell``, with its
+        own ``q_mobile`` and ``r_o``, gives from full at the current of the discharge, or not known if there is no ``cell``
+    :param cell: constants of the model; ``None``: those of a new 18650
+    :param q_mobile_bounds_C: where to search for ``q_mobile``, C; ``None``: where the calibrator does by default
     :raises ValueError: for an argument out of range
     """
 
@@ -60,13 +63,14 @@ class Settings:
     parameters: tuple[str, ...] = PARAMETER_NAMES
     cut_off_V: float = 2.7
     prior_q_mobile_C: tuple[float, float] | None = None
-    mismatch_V: float = 0.05
+    mismatch_V: float = UNFITTED_MISMATCH_V
     current_gain_sd: float = 0.005
     future_current_A: float | None = None
     thermal: bool = True
     ambient_C: float | None = None
     nominal_Ah: float | None = None
     cell: CellParameters | None = None
+    q_mobile_bounds_C: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
@@ -82,6 +86,27 @@ class Settings:
             raise ValueError(f"future_current_A must be finite and at least 0 A, got {self.future_current_A!r}")
         self.calibrator(self.cell or NEW_CELL)
 
+    @classmethod
+    def for_cell(cls, cell: CellFit | CellParameters, **others: Any) -> Settings:
+        """
+        Settings that use all that is known of a cell.
+
+        :param cell: its constants; or a fit of them, which also knows the cut-off, the error to expect, whether the
+            temperature moves, and how large ``q_mobile`` can be
+        :param others: other settings; they replace those of the fit
+        :return: the settings
+        """
+        if isinstance(cell, CellFit):
+            others = {
+                "cut_off_V": cell.cell.VEOD,
+                "mismatch_V": cell.mismatch_V,
+                "thermal": cell.thermal,
+                "q_mobile_bounds_C": cell.q_mobile_bounds_C,
+                **others,
+            }
+            cell = cell.cell
+        return cls(**{"cell": cell, **others})
+
     def calibrator(self, cell: CellParameters) -> Estimator:
         """
         The calibrator that is asked for.
@@ -91,6 +116,7 @@ class Settings:
         :raises ValueError: for an argument out of range
         """
         calibrator = LeastSquares if self.method == "least-squares" else ExtendedKalmanFilter
+        bounds: dict[str, Any] = {} if self.q_mobile_bounds_C is None else {"q_mobile_bounds_C": self.q_mobile_bounds_C}
         return calibrator(
             self.parameters,
             cell,
@@ -98,6 +124,7 @@ class Settings:
             prior_q_mobile_C=self.prior_q_mobile_C,
             mismatch_V=self.mismatch_V,
             current_gain_sd=self.current_gain_sd,
+            **bounds,
         )
 
 
@@ -148,6 +175,7 @@ def summarize(discharge: Discharge, settings: Settings) -> Summary:
     forecast = model.forecast(record, estimate, settings.cut_off_V, future.mean_A)
     in_progress = np.isnan(measured_eod_s)
     remaining_s = max(forecast.eod_time_s - float(record.time_s[-1]), 0.0) if in_progress else 0.0
+    nominal_Ah = _nominal_Ah(model, settings, future.mean_A)
     whole_Ah = drawn_Ah + remaining_s * future.mean_A / 3600.0 if in_progress else capacity_Ah
     residual_V = forecast.at_samples_V - record.voltage_V
     row = {
@@ -164,7 +192,8 @@ def summarize(discharge: Discharge, settings: Settings) -> Summary:
         "drawn_Ah": drawn_Ah,
         "capacity_Ah": capacity_Ah,
         "predicted_capacity_Ah": whole_Ah,
-        "state_of_health": whole_Ah / settings.nominal_Ah if settings.nominal_Ah else float("nan"),
+        "nominal_Ah": nominal_Ah,
+        "state_of_health": whole_Ah / nominal_Ah,
         "voltage_rmse_V": float(np.sqrt(np.nanmean(residual_V**2))),
         "predicted_eod_time_s": forecast.eod_time_s,
         "sd_predicted_eod_time_s": _sd_eod_s(estimate, remaining_s, future),
@@ -176,6 +205,15 @@ def summarize(discharge: Discharge, settings: Settings) -> Summary:
         **_end_temperatures(record, estimate, model),
     }
     return Summary(row, record, forecast)
+
+
+def _nominal_Ah(model: RecordModel, settings: Settings, load_A: float) -> float:
+    if settings.nominal_Ah is not None:
+        return settings.nominal_Ah
+    if settings.cell is None or not load_A > 0.0:
+        return float("nan")
+    # the cell is empty by then
+    return model.capacity_Ah(load_A, "current", settings.cut_off_V, model.cell.q_mobile / load_A + model.dt_s)
 
 
 def _ambient_C(record: Discharge, settings: Settings) -> float | None:
@@ -237,8 +275,10 @@ def text_of(name: str, row: dict[str, Any], settings: Settings) -> str:
         f"  {'settled':<22}{'yes' if row['settled'] else 'no':>12}",
         f"  {'drawn':<22}{row['drawn_Ah']:>9.3f} Ah   {'so far' if in_progress else f'the capacity to {cut_off}'}",
     ]
-    if settings.nominal_Ah:
-        of = f"{row['predicted_capacity_Ah']:.3f} Ah, {'predicted' if in_progress else 'drawn'}, of {settings.nominal_Ah:g} Ah"
+    if not np.isnan(row["state_of_health"]):
+        of = f"{row['predicted_capacity_Ah']:.3f} Ah, {'predicted' if in_progress else 'drawn'}, of {row['nominal_Ah']:.4g} Ah"
+        if settings.nominal_Ah is None:
+            of += ", what the given cell yields at this load"
         lines.append(f"  {'state of health':<22}{row['state_of_health']:>12.3f}   {of}")
     lines.append(f"  {'voltage RMSE':<22}{1e3 * row['voltage_rmse_V']:>9.1f} mV")
     if not np.isnan(row["end_temperature_C"]):

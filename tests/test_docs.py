@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from battery_env.__main__ import calibrate
+from battery_env.__main__ import calibrate, main
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "docs/environments").glob("*.md"))]
@@ -41,9 +41,11 @@ def test_commands_of_the_calibrator_run_and_exit_as_their_page_says(tmp_path, mo
     lines = list(filter(None, "\n".join(blocks(page, "bash")).splitlines()))
     assert len(lines) > 5
     for line in lines:
-        name, *arguments = shlex.split(line, comments=True)
+        words = shlex.split(line, comments=True)
         status = re.search(r"# exits (\d)", line)
-        assert name == "battery-calibrate" and calibrate(arguments) == int(status[1] if status else 0), line
+        command, arguments = (calibrate, words[1:]) if words[0] == "battery-calibrate" else (main, words[3:])
+        assert words[0] == "battery-calibrate" or words[:3] == ["python", "-m", "battery_env"], line
+        assert command(arguments) == int(status[1] if status else 0), line
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

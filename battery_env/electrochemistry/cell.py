@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
 from math import isfinite
 from numbers import Real
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from battery_env.arrays import FloatArray
+from battery_env.files import read_json, write_json
 from battery_env.parameters import Q_MOBILE, R_O
 
 STATE_NAMES: tuple[str, ...] = ("Tb", "Vo", "Vsn", "Vsp", "qnB", "qnS", "qpB", "qpS")
@@ -43,6 +47,7 @@ CONSTANTS_SIZE = 13
 #: Constants that nobody can measure well, as they lie in :meth:`CellParameters.packed_with`.
 UNCERTAIN_CONSTANTS: tuple[str, ...] = ("kn", "tDiffusion", "to", "tsn")
 
+_FORMAT, _FORMAT_VERSION = "battery_env.CellParameters", 1
 _SIX_TENTHS = 0.6  # xnMax - xnMin: the share of all lithium sites that a full discharge uses
 _POLYNOMIAL_SIZE = 14
 
@@ -177,6 +182,49 @@ class CellParameters:
         :return: the changed copy
         """
         return replace(self, **changes)
+
+    def to_json(self, path: str | os.PathLike[str]) -> Path:
+        """
+        Save the constants.
+
+        :param path: where to
+        :return: the file
+        :raises FileExistsError: if the file exists already
+        """
+        return write_json(path, _FORMAT, _FORMAT_VERSION, {"constants": asdict(self)})
+
+    @classmethod
+    def from_json(cls, path: str | os.PathLike[str]) -> CellParameters:
+        """
+        Load constants.
+
+        :param path: what :meth:`to_json` wrote
+        :return: the constants
+        :raises ValueError: if the file is damaged, was not written so, or is of another format version
+        """
+        content = read_json(path, _FORMAT, _FORMAT_VERSION)
+        try:
+            return cls.of_mapping(content["constants"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"{path} is damaged, or was not saved by CellParameters.to_json: {error}") from error
+
+    @classmethod
+    def of_mapping(cls, constants: Mapping[str, Any]) -> CellParameters:
+        """
+        Constants by name, as JSON holds them.
+
+        :param constants: every one of them
+        :return: the cell
+        :raises TypeError: for what is no mapping, or a value of another kind
+        :raises ValueError: for a constant that is missing, unknown or out of range
+        """
+        if not isinstance(constants, Mapping):
+            raise TypeError(f"constants must be given by name, got {type(constants).__name__}")
+        wrong = {field.name for field in fields(cls)} ^ set(constants)
+        if wrong:
+            raise ValueError(f"constants that are missing or unknown: {', '.join(sorted(map(str, wrong)))}")
+        lists = {name: tuple(constants[name]) for name in ("An", "Ap")}
+        return cls(**{**constants, **lists})
 
     @cached_property
     def packed(self) -> PackedConstants:

@@ -1,9 +1,10 @@
 """
-The derivatives of the model with respect to ``q_mobile`` and ``r_o`` at a given current: its equations, differentiated.
+The derivatives of the model with respect to its parameters at a given current: its equations, differentiated.
 
-A tangent is the derivative of a state. The tangents of n cells have the shape (n, 2, 8); each cell has the rows ``BY_Q`` and
-``BY_R``. The charges are linear in ``q_mobile``, so that their tangents hold at any distance. All cells share one row of
-constants.
+A tangent is the derivative of a state. The tangents of n cells have the shape (n, 2, 8) or (n, 8, 8): each cell has rows in
+the order of ``TANGENT_NAMES``, with respect to ``q_mobile`` and ``r_o`` and, if asked for, to the logarithms of the constants
+that say how fast the cell follows its load. The charges are linear in ``q_mobile``, so that their tangents hold at any
+distance. All cells share one row of constants.
 """
 
 from __future__ import annotations
@@ -48,8 +49,11 @@ from battery_env.electrochemistry.kernels import (
     polynomial,
 )
 
+#: Constants that say how fast the cell follows its load; derivatives are with respect to their logarithms.
+RATE_CONSTANTS: tuple[str, ...] = ("kn", "kp", "tDiffusion", "to", "tsn", "tsp")
 #: Rows of the tangents.
-BY_Q, BY_R = range(2)
+TANGENT_NAMES: tuple[str, ...] = ("q_mobile", "r_o", *RATE_CONSTANTS)
+BY_Q, BY_R, BY_KN, BY_KP, BY_T_DIFFUSION, BY_TO, BY_TSN, BY_TSP = range(len(TANGENT_NAMES))
 
 _compiled = njit(cache=True, error_model="numpy")
 _inlined = njit(cache=True, error_model="numpy", forceinline=True)
@@ -127,6 +131,30 @@ def _fraction_tangents(dx: FloatArray, n: int, xn: float, xp: float, q: float, c
 
 
 @_inlined
+def _rate_fraction_tangents(dx: FloatArray, n: int, row: int, q: float, constants: FloatArray) -> tuple[float, float]:
+    # of xn and xp with respect to the logarithm of a rate constant; only tDiffusion moves them
+    dxn = mole_fraction(dx[n, row, QNS], q, False, constants, 0)
+    return dxn, mole_fraction(dx[n, row, QPS], q, False, constants, 0)
+
+
+@_inlined
+def _voltage_slopes(
+    x: FloatArray, n: int, q: float, thermal: bool, packed: PackedConstants, derivatives: PolynomialDerivatives
+) -> tuple[float, float, float, float, float]:
+    # The mole fractions at the surfaces of row n of x, and the slopes of its voltage by them and by the temperature
+    constants, tb = packed.constants, x[n, TB]
+    xn, xp = mole_fraction(x[n, QNS], q, False, constants, 0), mole_fraction(x[n, QPS], q, False, constants, 0)
+    v_xn, v_xp = equilibrium_slopes(xn, xp, tb, constants, 0, derivatives)
+    return xn, xp, v_xn, v_xp, constants[0, R_OVER_F] * nernst_logarithm(xn, xp) if thermal else 0.0
+
+
+@_inlined
+def _voltage_tangent(dx: FloatArray, n: int, row: int, by_fractions: float, v_tb: float) -> float:
+    # by_fractions: what the voltage changes by as the mole fractions do
+    return by_fractions - dx[n, row, VO] - dx[n, row, VSN] - dx[n, row, VSP] + v_tb * dx[n, row, TB]
+
+
+@_inlined
 def voltage_tangents(
     x: FloatArray,
     dx: FloatArray,
@@ -137,14 +165,28 @@ def voltage_tangents(
     derivatives: PolynomialDerivatives,
 ) -> tuple[float, float]:
     # The derivatives of the voltage of row n of x with respect to q and r_o; the cell has a voltage
-    constants, tb = packed.constants, x[n, TB]
-    xn, xp = mole_fraction(x[n, QNS], q, False, constants, 0), mole_fraction(x[n, QPS], q, False, constants, 0)
-    v_xn, v_xp = equilibrium_slopes(xn, xp, tb, constants, 0, derivatives)
-    v_tb = constants[0, R_OVER_F] * nernst_logarithm(xn, xp) if thermal else 0.0
-    dxn, dxp = _fraction_tangents(dx, n, xn, xp, q, constants)
-    by_q = v_xn * dxn + v_xp * dxp - dx[n, BY_Q, VO] - dx[n, BY_Q, VSN] - dx[n, BY_Q, VSP] + v_tb * dx[n, BY_Q, TB]
-    by_r_o = -dx[n, BY_R, VO] - dx[n, BY_R, VSN] - dx[n, BY_R, VSP] + v_tb * dx[n, BY_R, TB]
-    return by_q, by_r_o
+    xn, xp, v_xn, v_xp, v_tb = _voltage_slopes(x, n, q, thermal, packed, derivatives)
+    dxn, dxp = _fraction_tangents(dx, n, xn, xp, q, packed.constants)
+    return _voltage_tangent(dx, n, BY_Q, v_xn * dxn + v_xp * dxp, v_tb), _voltage_tangent(dx, n, BY_R, 0.0, v_tb)
+
+
+@_compiled
+def _voltage_rate_tangents(
+    x: FloatArray,
+    dx: FloatArray,
+    n: int,
+    q: float,
+    thermal: bool,
+    packed: PackedConstants,
+    derivatives: PolynomialDerivatives,
+    by_parameter: FloatArray,
+    k: int,
+) -> None:
+    # Likewise with respect to the logarithms of RATE_CONSTANTS, into column k of by_parameter
+    _, _, v_xn, v_xp, v_tb = _voltage_slopes(x, n, q, thermal, packed, derivatives)
+    for row in range(BY_KN, dx.shape[1]):
+        dxn, dxp = _rate_fraction_tangents(dx, n, row, q, packed.constants)
+        by_parameter[row, k] = _voltage_tangent(dx, n, row, v_xn * dxn + v_xp * dxp, v_tb)
 
 
 @_inlined
@@ -164,12 +206,41 @@ def voltage_curvature(
 
 
 @_inlined
-def _diffuse(dx: FloatArray, n: int, dt: float, constants: FloatArray) -> None:
-    # the derivatives of the charges with respect to q over a step; the current does not depend on parameters
+def _diffuse(dx: FloatArray, n: int, row: int, dt: float, constants: FloatArray) -> None:
+    # one row of the tangents of the charges over a step; the current does not depend on parameters
     for bulk, surface in ((QNB, QNS), (QPB, QPS)):
-        moved = dt * diffusion(dx[n, BY_Q, bulk], dx[n, BY_Q, surface], constants[0, BULK_RATE], constants[0, SURFACE_RATE])
-        dx[n, BY_Q, bulk] -= moved
-        dx[n, BY_Q, surface] += moved
+        moved = dt * diffusion(dx[n, row, bulk], dx[n, row, surface], constants[0, BULK_RATE], constants[0, SURFACE_RATE])
+        dx[n, row, bulk] -= moved
+        dx[n, row, surface] += moved
+
+
+@_inlined
+def _diffuse_slower(dx: FloatArray, n: int, row: int, charges: FloatArray, dt: float, constants: FloatArray) -> None:
+    # what is moved of these charges over a step, differentiated by the logarithm of tDiffusion: its rate falls
+    for bulk, surface in ((QNB, QNS), (QPB, QPS)):
+        moved = dt * diffusion(charges[bulk], charges[surface], constants[0, BULK_RATE], constants[0, SURFACE_RATE])
+        dx[n, row, bulk] += moved
+        dx[n, row, surface] -= moved
+
+
+@_inlined
+def _follow(
+    dx: FloatArray,
+    n: int,
+    row: int,
+    i: float,
+    nominal: tuple[float, float, float],
+    dt: float,
+    thermal: bool,
+    constants: FloatArray,
+) -> None:
+    # one row of the tangents of the voltage drops and of the temperature over a step; nominal: of what the drops tend to
+    dvo, dvsn, dvsp = dx[n, row, VO], dx[n, row, VSN], dx[n, row, VSP]
+    dx[n, row, VO] += dt * (nominal[0] - dvo) * constants[0, TO_RATE]
+    dx[n, row, VSN] += dt * (nominal[1] - dvsn) * constants[0, TSN_RATE]
+    dx[n, row, VSP] += dt * (nominal[2] - dvsp) * constants[0, TSP_RATE]
+    if thermal:
+        dx[n, row, TB] += dt * ((dvo + dvsn + dvsp) * i * constants[0, WARMING] - dx[n, row, TB] * constants[0, COOLING])
 
 
 @_inlined
@@ -185,7 +256,7 @@ def step_with_tangents(
     extended: bool,
     constants: FloatArray,
 ) -> None:
-    # One step of row n of x and of its tangents, in place
+    # One step of row n of x and of its tangents with respect to q and r_o, in place
     tb = x[n, TB]
     xn, xp = mole_fraction(x[n, QNS], q, extended, constants, 0), mole_fraction(x[n, QPS], q, extended, constants, 0)
     vsn_xn, vsp_xp = overpotential_slopes(i, xn, xp, tb, constants, 0)
@@ -196,14 +267,36 @@ def step_with_tangents(
     dxn, dxp = _fraction_tangents(dx, n, xn, xp, q, constants)
     # what a parameter does at a given state: to the mole fractions, and to the ohmic drop
     for row, by_xn, by_xp, dvo_nominal in ((BY_Q, vsn_xn * dxn, vsp_xp * dxp, 0.0), (BY_R, 0.0, 0.0, i)):
-        dtb, dvo, dvsn, dvsp = dx[n, row, TB], dx[n, row, VO], dx[n, row, VSN], dx[n, row, VSP]
-        dx[n, row, VO] += dt * (dvo_nominal - dvo) * constants[0, TO_RATE]
-        dx[n, row, VSN] += dt * (by_xn + vsn_tb * dtb - dvsn) * constants[0, TSN_RATE]
-        dx[n, row, VSP] += dt * (by_xp + vsp_tb * dtb - dvsp) * constants[0, TSP_RATE]
-        if thermal:
-            dx[n, row, TB] += dt * ((dvo + dvsn + dvsp) * i * constants[0, WARMING] - dtb * constants[0, COOLING])
-    _diffuse(dx, n, dt, constants)
+        dtb = dx[n, row, TB]
+        _follow(dx, n, row, i, (dvo_nominal, by_xn + vsn_tb * dtb, by_xp + vsp_tb * dtb), dt, thermal, constants)
+    _diffuse(dx, n, BY_Q, dt, constants)
     cell_step(x, n, i, q, r_o, dt, thermal, extended, constants, 0, x, n)
+
+
+@_compiled
+def _step_rate_tangents(
+    x: FloatArray, dx: FloatArray, n: int, i: float, q: float, r_o: float, dt: float, thermal: bool, constants: FloatArray
+) -> None:
+    # One step of the tangents with respect to the logarithms of RATE_CONSTANTS, in place; row n of x stays as it is
+    tb = x[n, TB]
+    xn, xp = mole_fraction(x[n, QNS], q, False, constants, 0), mole_fraction(x[n, QPS], q, False, constants, 0)
+    vsn_xn, vsp_xp = overpotential_slopes(i, xn, xp, tb, constants, 0)
+    vsn, vsp = nominal_overpotentials(i, xn, xp, tb, constants, 0)
+    vsn_tb, vsp_tb = (vsn / tb, vsp / tb) if thermal else (0.0, 0.0)
+    for row in range(BY_KN, dx.shape[1]):
+        dxn, dxp = _rate_fraction_tangents(dx, n, row, q, constants)
+        dtb = dx[n, row, TB]
+        _follow(dx, n, row, i, (0.0, vsn_xn * dxn + vsn_tb * dtb, vsp_xp * dxp + vsp_tb * dtb), dt, thermal, constants)
+    _diffuse(dx, n, BY_T_DIFFUSION, dt, constants)
+    # what a constant does at a given state
+    an, ap = i * constants[0, PER_CURRENT_N], i * constants[0, PER_CURRENT_P]
+    scale = 2.0 * constants[0, R_OVER_F] * tb
+    dx[n, BY_KN, VSN] -= dt * scale * an / sqrt((1.0 - xn) * xn + an * an) * constants[0, TSN_RATE]
+    dx[n, BY_KP, VSP] -= dt * scale * ap / sqrt((1.0 - xp) * xp + ap * ap) * constants[0, TSP_RATE]
+    _diffuse_slower(dx, n, BY_T_DIFFUSION, x[n], dt, constants)
+    dx[n, BY_TO, VO] -= dt * (i * r_o - x[n, VO]) * constants[0, TO_RATE]
+    dx[n, BY_TSN, VSN] -= dt * (vsn - x[n, VSN]) * constants[0, TSN_RATE]
+    dx[n, BY_TSP, VSP] -= dt * (vsp - x[n, VSP]) * constants[0, TSP_RATE]
 
 
 @_compiled
@@ -228,10 +321,13 @@ def roll_out_with_tangents(
     shares: FloatArray,
     voltage: FloatArray,
     by_parameter: FloatArray,
+    fraction_p: FloatArray,
 ) -> None:
-    # Fills voltage and the rows of by_parameter, its derivatives, up to the last sample at which the model has a voltage. The
-    # charges of the first state, start, have the derivatives shares with respect to q
-    x, dx = np.empty((1, STATE_SIZE)), np.zeros((1, 2, STATE_SIZE))
+    # Fills voltage, the rows of by_parameter, its derivatives (the first two or all), and the mole fraction at the surface of
+    # the positive electrode (if there is room for it), up to the last sample at which the model has a voltage. The charges of
+    # the first state, start, have the derivatives shares with respect to q
+    rows, constants = by_parameter.shape[0], packed.constants
+    x, dx = np.empty((1, STATE_SIZE)), np.zeros((1, rows, STATE_SIZE))
     x[0] = start
     dx[0, BY_Q, QNB:] = shares
     for k in range(current.shape[0]):
@@ -239,22 +335,40 @@ def roll_out_with_tangents(
         if np.isnan(voltage_k):
             return
         voltage[k] = voltage_k
+        if fraction_p.shape[0] > 0:
+            fraction_p[k] = mole_fraction(x[0, QPS], q, False, constants, 0)
         by_parameter[BY_Q, k], by_parameter[BY_R, k] = voltage_tangents(x, dx, 0, q, thermal, packed, derivatives)
-        step_with_tangents(x, dx, 0, current[k], q, r_o, dt, thermal, False, packed.constants)
+        if rows > BY_KN:
+            _voltage_rate_tangents(x, dx, 0, q, thermal, packed, derivatives, by_parameter, k)
+            _step_rate_tangents(x, dx, 0, current[k], q, r_o, dt, thermal, constants)
+        step_with_tangents(x, dx, 0, current[k], q, r_o, dt, thermal, False, constants)
 
 
 @_compiled
 def least_q_mobile(
     current: FloatArray, q: float, dt: float, constants: FloatArray, start: FloatArray, shares: FloatArray
-) -> float:
-    # The q below which the cell is empty before the current ends; the one given is large enough
-    x, dx = np.empty((1, STATE_SIZE)), np.zeros((1, 2, STATE_SIZE))
+) -> tuple[float, float]:
+    # The q below which the cell is empty before the current ends, and its derivative with respect to the logarithm of
+    # tDiffusion; the q given is large enough
+    full = 1.0 / constants[0, FRACTION_PER_SHARE]
+    by_t, slope_by_t = 1, 2  # rows: the charges by tDiffusion, and so their slopes by q
+    x, dx = np.empty((1, STATE_SIZE)), np.zeros((1, 3, STATE_SIZE))
     x[0] = start
     dx[0, BY_Q, QNB:] = shares
-    least = 0.0
+    least, least_by_t = 0.0, 0.0
     for k in range(current.shape[0]):
         for surface in (QNS, QPS):
-            least = max(least, least_q(x[0, surface], dx[0, BY_Q, surface], q, 0.0, constants))
-        _diffuse(dx, 0, dt, constants)
+            charge, slope = x[0, surface], dx[0, BY_Q, surface]
+            enough = least_q(charge, slope, q, 0.0, constants)
+            if enough > least:
+                least = enough
+                # at this q the surface is empty, or full; it must stay so as tDiffusion moves its charge
+                charge_by_t = dx[0, by_t, surface] + dx[0, slope_by_t, surface] * (least - q)
+                least_by_t = charge_by_t / (full - slope) if charge > slope * q else -charge_by_t / slope
+        _diffuse(dx, 0, slope_by_t, dt, constants)
+        _diffuse_slower(dx, 0, slope_by_t, dx[0, BY_Q], dt, constants)
+        _diffuse(dx, 0, by_t, dt, constants)
+        _diffuse_slower(dx, 0, by_t, x[0], dt, constants)
+        _diffuse(dx, 0, BY_Q, dt, constants)
         cell_step(x, 0, current[k], q, 0.0, dt, False, False, constants, 0, x, 0)
-    return least
+    return least, least_by_t

@@ -2,6 +2,7 @@
 
 from battery_env.estimates import Estimate, EstimateTrace
 from battery_env.estimators.base import Estimator, OnlineEstimator
+from battery_env.estimators.cell_fit import CellFit, fit_cell
 from battery_env.estimators.closed_form import ClosedForm
 from battery_env.estimators.cramer_rao import CramerRaoBound, Sensitivities, cramer_rao_bound, sensitivities
 from battery_env.estimators.greedy import GreedyOneStep
@@ -9,6 +10,7 @@ from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
 
 __all__ = [
+    "CellFit",
     "ClosedForm",
     "CramerRaoBound",
     "Estimate",
@@ -20,5 +22,6 @@ __all__ = [
     "OnlineEstimator",
     "Sensitivities",
     "cramer_rao_bound",
+    "fit_cell",
     "sensitivities",
 ]

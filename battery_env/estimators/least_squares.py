@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from math import hypot, inf, isnan, nan, sqrt
 from typing import NamedTuple
@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
 from battery_env.arrays import BoolArray, FloatArray
-from battery_env.checks import check_gain_sd
+from battery_env.checks import check_gain_sd, check_positive
 from battery_env.electrochemistry import CellParameters
+from battery_env.electrochemistry.tangents import RATE_CONSTANTS, TANGENT_NAMES
 from battery_env.estimates import Estimate, EstimateTrace
 from battery_env.estimators.base import Estimator, check_bounds
 from battery_env.estimators.settling import (
@@ -51,12 +52,16 @@ _MARGIN = 1e-6
 _SEARCH_SCALES = {"q_mobile": 1.0, "r_o": 0.1}
 # The distance of q_mobile to its least value is below exp of this, so that no step of the search overflows.
 _LOG_LIMIT = 50.0
+# Logarithms of nuisance constants are held within this.
+_REACH = 5.0
 # Residuals whose variance is this many of its standard deviations above the one expected are not noise.
 _EXCESS_LIMIT = 5.0
 # If no noise is stated, it is told from differences of residuals, a little less surely.
 _EXCESS_LIMIT_UNSTATED = 10.0
 # Residuals below this are as good as none, V: files are rounded.
 _NEGLIGIBLE_V = 1e-3
+# Noise told from residuals is not below the resolution of a voltmeter, V.
+_LEAST_NOISE_V = 1e-4
 # The end of a record agrees with an estimate within this share of its duration.
 _END_SHARE = 0.02
 # With fewer samples than this beyond the number of parameters, the residuals do not tell how large the noise is.
@@ -75,10 +80,11 @@ class _Problem(NamedTuple):
 
 
 class _Prior(NamedTuple):
-    """What is known of q_mobile, as one more residual."""
+    """What is known of one unknown, as one more residual."""
 
-    mean_C: float
-    V_per_C: float
+    name: str
+    mean: float
+    weight_V: float  # per unit of the unknown
 
 
 class _Start(NamedTuple):
@@ -90,7 +96,7 @@ class _Fit(NamedTuple):
     values: dict[str, float]
     jacobian: FloatArray  # of the residuals, V, with respect to the parameters searched for
     residual_V: FloatArray  # at the samples
-    square_V2: float  # sum of all squared residuals, that of the prior included
+    square_V2: float  # sum of all squared residuals, those of priors included
     at_bound: tuple[str, ...]  # which parameters are
 
 
@@ -135,6 +141,11 @@ class LeastSquares(Estimator):
     Otherwise ``reason`` of the estimate says which of these does not hold. In particular an estimate that rests on a prior is
     not settled: it is as good as the prior.
 
+    *Nuisance constants.* Constants that are not known exactly can be estimated along with the parameters, each under a prior
+    of its own, and so can an offset of the voltage sensor: where the model is wrong in a known way, that is better than to
+    let the parameters take the blame. Their uncertainty is in the standard deviations of the parameters. The priors are
+    weighed against the noise; if none is stated, it is told from the white part of the residuals.
+
     *During a discharge*, :meth:`trace` with ``window_every_s`` estimates again and again from all samples so far.
 
     *Prior.* Before its knee a discharge says little about ``q_mobile``. To calibrate during a discharge, carry
@@ -153,6 +164,9 @@ class LeastSquares(Estimator):
     :param voltage_noise_V: standard deviation of the noise of the voltage sensor, V; ``None``: that of the residuals
     :param window_every_s: time between the estimates of :meth:`trace`, s; ``None``: one estimate, at the end
     :param current_gain_sd: standard deviation of the gain of the current sensor, as a share of it
+    :param nuisance: what else is not known: standard deviations of the logarithms of constants, by name, e.g.
+        ``{"kn": 0.2, "tDiffusion": 0.2}`` for two that are known to 20 %; and of the offset of the sensor in V, as
+        ``"offset_V"``
     :raises ValueError: for an argument out of range
     """
 
@@ -170,8 +184,10 @@ class LeastSquares(Estimator):
         voltage_noise_V: float | None = None,
         window_every_s: float | None = None,
         current_gain_sd: float = 0.0,
+        nuisance: Mapping[str, float] | None = None,
     ) -> None:
         self.parameters = check_parameters(parameters)
+        self.nuisance = _check_nuisance({} if nuisance is None else nuisance, self.parameters)
         self.model = RecordModel(cell, thermal, dt_s, initial)
         self.bounds = check_bounds(q_mobile_bounds_C, r_o_bounds_ohm)
         if prior_q_mobile_C is not None:
@@ -235,13 +251,17 @@ class LeastSquares(Estimator):
             problem = self._until_empty(problem)
             starts = [self._starts(problem, [self.model.cell.q_mobile])[0].values]
         n = len(problem.time_s)
-        alone = fit = self._search(problem, starts)
-        noise_V2 = self.voltage_noise_V**2 if self.voltage_noise_V else _square(alone.residual_V) / (n - len(self.parameters))
+        noise_V = self._noise_V(problem, starts)
+        weight_V = hypot(noise_V or 0.0, sqrt(n) * self.mismatch_V)
+        priors = tuple(_Prior(name, 0.0, weight_V / sd) for name, sd in self.nuisance.items())
+        alone = fit = self._search(problem, starts, priors)
+        noise_V2 = noise_V**2 if noise_V else _square(alone.residual_V) / (n - len(self.parameters))
         variance_V2 = noise_V2 + n * self.mismatch_V**2
         if self.prior_q_mobile_C is not None:
             mean_C, sd_C = self.prior_q_mobile_C
             (middle,) = self._starts(problem, [mean_C])
-            fit = self._search(problem, [*starts, alone.values, middle.values], _Prior(mean_C, sqrt(variance_V2) / sd_C))
+            carried = _Prior("q_mobile", mean_C, sqrt(variance_V2) / sd_C)
+            fit = self._search(problem, [*starts, alone.values, middle.values], (*priors, carried))
         sd = self._sd(fit, variance_V2)
         if len(problem.time_s) < len(record.time_s):
             reason = EMPTY
@@ -249,10 +269,17 @@ class LeastSquares(Estimator):
             reason = self._contradiction(record, problem, fit) or self._shortage(fit, alone, variance_V2)
         return Estimate(fit.values["q_mobile"], fit.values["r_o"], sd["q_mobile"], sd["r_o"], not reason, reason)
 
+    def _noise_V(self, problem: _Problem, starts: Sequence[dict[str, float]]) -> float | None:
+        """The noise that is stated or, where priors of constants are weighed against it, the white part of residuals."""
+        if self.voltage_noise_V is not None or not self.nuisance:
+            return self.voltage_noise_V
+        residual_V, _ = self._residual(problem, dict.fromkeys(self.nuisance, 0.0) | starts[0], ())
+        return max(white_noise_V(residual_V), _LEAST_NOISE_V)
+
     def _sd(self, fit: _Fit, variance_V2: float) -> dict[str, float]:
         """The standard deviations, with that of the current sensor's gain, which scales both parameters."""
         sd = dict.fromkeys(PARAMETER_NAMES, nan)
-        for name, root in zip(self.parameters, _root_inverse_diagonal(fit.jacobian), strict=True):
+        for name, root in zip(self.parameters, _root_inverse_diagonal(fit.jacobian), strict=False):
             sd[name] = hypot(sqrt(variance_V2) * float(root), self.current_gain_sd * fit.values[name])
         return sd
 
@@ -286,9 +313,9 @@ class LeastSquares(Estimator):
             return ""
         until = Samples(time_s, voltage_V, current_A).first(n + 1)
         estimate = Estimate(fit.values["q_mobile"], fit.values["r_o"])
+        model, lowest_V = self._model(fit.values), float(voltage_V[n]) - fit.values.get("offset_V", 0.0)
         early_s, late_s = (
-            self.model.forecast(until, estimate, float(voltage_V[n]) + sign * deviation_V, load_A).eod_time_s
-            for sign in (1.0, -1.0)
+            model.forecast(until, estimate, lowest_V + sign * deviation_V, load_A).eod_time_s for sign in (1.0, -1.0)
         )
         allowed_s = _END_SHARE * (time_s[n] - time_s[0]) + 2.0 * self.model.dt_s
         if early_s - allowed_s <= time_s[n] <= late_s + allowed_s:
@@ -386,7 +413,7 @@ class LeastSquares(Estimator):
         minima = (squares_V2[1:-1] <= squares_V2[:-2]) & (squares_V2[1:-1] < squares_V2[2:]) & _is_near_best(starts)
         return [starts[n].values for n in np.union1d(np.flatnonzero(minima), squares_V2[1:-1].argmin())]
 
-    def _search(self, problem: _Problem, starts: Sequence[dict[str, float]], prior: _Prior | None = None) -> _Fit:
+    def _search(self, problem: _Problem, starts: Sequence[dict[str, float]], priors: Sequence[_Prior]) -> _Fit:
         """The best fit that is found from any of the starts."""
         bounds = self.bounds | {"q_mobile": self._q_bounds_C(problem)}
         if "q_mobile" in self.parameters and not bounds["q_mobile"][0] < bounds["q_mobile"][1]:
@@ -394,39 +421,46 @@ class LeastSquares(Estimator):
                 "this record takes a q_mobile of at least {:g} C, which is beyond the upper bound, {:g} C. Raise "
                 "q_mobile_bounds_C, or check that time is in s and current in A.".format(*bounds["q_mobile"])
             )
-        return min((self._fit(problem, start, bounds, prior) for start in starts), key=lambda fit: fit.square_V2)
+        return min((self._fit(problem, start, bounds, priors) for start in starts), key=lambda fit: fit.square_V2)
 
     def _fit(
-        self, problem: _Problem, start: dict[str, float], bounds: dict[str, tuple[float, float]], prior: _Prior | None
+        self, problem: _Problem, start: dict[str, float], bounds: dict[str, tuple[float, float]], priors: Sequence[_Prior]
     ) -> _Fit:
-        free, values = list(self.parameters), start
+        free, values = [*self.parameters, *self.nuisance], dict.fromkeys(self.nuisance, 0.0) | start
         while True:
-            values = self._minimize(problem, values, free, prior)
-            clipped = {name: min(max(values[name], bounds[name][0]), bounds[name][1]) for name in free}
-            inside = [name for name in free if clipped[name] == values[name]]
+            values = self._minimize(problem, values, free, priors)
+            clipped = {name: min(max(values[name], bounds[name][0]), bounds[name][1]) for name in free if name in bounds}
+            inside = [name for name in free if name not in bounds or clipped[name] == values[name]]
             values = values | clipped
             if len(inside) in (0, len(free)):
                 break
             free = inside
-        residual_V, jacobian = self._residual(problem, values, prior)
+        residual_V, jacobian = self._residual(problem, values, priors)
         at_bound = tuple(name for name in self.parameters if values[name] in bounds[name])
         return _Fit(values, jacobian, residual_V[: len(problem.time_s)], _square(residual_V), at_bound)
 
-    def _minimize(self, problem: _Problem, start: dict[str, float], free: list[str], prior: _Prior | None) -> dict[str, float]:
-        columns = [self.parameters.index(name) for name in free]
+    def _minimize(
+        self, problem: _Problem, start: dict[str, float], free: list[str], priors: Sequence[_Prior]
+    ) -> dict[str, float]:
+        unknown = [*self.parameters, *self.nuisance]
+        columns = [unknown.index(name) for name in free]
 
-        def values_at(x: FloatArray) -> dict[str, float]:
+        def values_at(x: Iterable[float]) -> tuple[dict[str, float], float, float]:
             values = start | {name: float(value) for name, value in zip(free, x, strict=True)}
+            least_C, least_by_log_C = self._least_q_C(problem, values)
             if "q_mobile" in free:
-                values["q_mobile"] = problem.least_q_C + float(np.exp(min(values["q_mobile"], _LOG_LIMIT)))
-            return values
+                values["q_mobile"] = least_C + float(np.exp(min(values["q_mobile"], _LOG_LIMIT)))
+            return values, least_C, least_by_log_C
 
         @lru_cache(maxsize=1)
         def evaluated(x: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
-            values = values_at(np.array(x))
-            residual_V, by_parameter = self._residual(problem, values, prior)
-            slopes = [values[name] - problem.least_q_C if name == "q_mobile" else 1.0 for name in free]
-            return residual_V, by_parameter[:, columns] * slopes
+            values, least_C, least_by_log_C = values_at(x)
+            residual_V, by_parameter = self._residual(problem, values, priors)
+            slopes = [values[name] - least_C if name == "q_mobile" else 1.0 for name in free]
+            by_x = by_parameter[:, columns] * slopes
+            if "q_mobile" in free and "tDiffusion" in free:  # which moves q_mobile along with its least value
+                by_x[:, free.index("tDiffusion")] += least_by_log_C * by_parameter[:, unknown.index("q_mobile")]
+            return residual_V, by_x
 
         # scipy asks for them one after the other; one roll-out gives both
         def residual(x: FloatArray) -> FloatArray:
@@ -435,29 +469,73 @@ class LeastSquares(Estimator):
         def jacobian(x: FloatArray) -> FloatArray:
             return evaluated(tuple(x))[1]
 
+        least_C, _ = self._least_q_C(problem, start)
         result = least_squares(
             residual,
-            [np.log(start[name] - problem.least_q_C) if name == "q_mobile" else start[name] for name in free],
+            [np.log(start[name] - least_C) if name == "q_mobile" else start[name] for name in free],
             jac=jacobian,
             method="lm",
-            x_scale=[_SEARCH_SCALES[name] for name in free],
+            x_scale=[(_SEARCH_SCALES | self.nuisance)[name] for name in free],
             gtol=1e-10,
         )
-        return values_at(result.x)
+        return values_at(result.x)[0]
 
-    def _residual(self, problem: _Problem, values: dict[str, float], prior: _Prior | None) -> tuple[FloatArray, FloatArray]:
-        """The residuals at the samples, V, and if there is a prior one more; and their derivatives by ``parameters``."""
-        model_V, *slopes = self.model.sensitivities(problem.current_A, values["q_mobile"], values["r_o"])
-        by_parameter = dict(zip(PARAMETER_NAMES, slopes, strict=True))
-        columns = [model_V, *(by_parameter[name] for name in self.parameters)]
+    def _model(self, values: Mapping[str, float]) -> RecordModel:
+        """The model with the nuisance constants at some values."""
+        constants = self._constants(values)
+        if not constants:
+            return self.model
+        return RecordModel(self.model.cell.replace(**constants), self.model.thermal, self.model.dt_s, self.model.initial)
+
+    def _constants(self, values: Mapping[str, float]) -> dict[str, float]:
+        constants = {}
+        for name in self.nuisance.keys() & set(RATE_CONSTANTS):
+            # a step of the search may go far; no time constant is below a step of the model, at which it is stable
+            constant = getattr(self.model.cell, name) * float(np.exp(max(min(values[name], _REACH), -_REACH)))
+            constants[name] = max(constant, self.model.dt_s) if name in ("to", "tsn", "tsp") else constant
+        return constants
+
+    def _least_q_C(self, problem: _Problem, values: Mapping[str, float]) -> tuple[float, float]:
+        """The least q_mobile that the record allows, and its derivative by the logarithm of ``tDiffusion``."""
+        if "tDiffusion" not in self.nuisance:
+            return problem.least_q_C, 0.0
+        return self._model(values).least_q_mobile_tangent_C(problem.current_A)
+
+    def _residual(
+        self, problem: _Problem, values: dict[str, float], priors: Sequence[_Prior]
+    ) -> tuple[FloatArray, FloatArray]:
+        """The residuals at the samples, V, and one more for each prior; and their derivatives by all that is unknown."""
+        q_mobile, r_o = values["q_mobile"], values["r_o"]
+        if self.nuisance:
+            model_V, slopes, _ = self._model(values).tangents(problem.current_A, q_mobile, r_o)
+            by_unknown = dict(zip(TANGENT_NAMES, slopes, strict=True)) | {"offset_V": np.ones(len(model_V))}
+            model_V = model_V + values.get("offset_V", 0.0)
+        else:
+            model_V, *both = self.model.sensitivities(problem.current_A, q_mobile, r_o)
+            by_unknown = dict(zip(PARAMETER_NAMES, both, strict=True))
+        unknown = (*self.parameters, *self.nuisance)
+        columns = [model_V, *(by_unknown[name] for name in unknown)]
         if not problem.on_grid:
             grid_s = self.model.dt_s * np.arange(len(model_V))
             columns = [np.interp(problem.time_s, grid_s, column) for column in columns]
         residual_V, jacobian = columns[0] - problem.voltage_V, np.column_stack(columns[1:])
-        if prior is None:
-            return residual_V, jacobian
-        row = [prior.V_per_C if name == "q_mobile" else 0.0 for name in self.parameters]
-        return np.append(residual_V, prior.V_per_C * (values["q_mobile"] - prior.mean_C)), np.vstack([jacobian, row])
+        for prior in priors:
+            row = [prior.weight_V if name == prior.name else 0.0 for name in unknown]
+            residual_V = np.append(residual_V, prior.weight_V * (values[prior.name] - prior.mean))
+            jacobian = np.vstack([jacobian, row])
+        return residual_V, jacobian
+
+
+def _check_nuisance(nuisance: Mapping[str, float], parameters: tuple[str, ...]) -> dict[str, float]:
+    if not isinstance(nuisance, Mapping):
+        raise TypeError(f"nuisance must hold standard deviations by name, got {nuisance!r}")
+    for name, sd in nuisance.items():
+        if name not in (*RATE_CONSTANTS, "offset_V"):
+            raise ValueError(f"nuisance constants are {', '.join(RATE_CONSTANTS)} and offset_V, got {name!r}")
+        check_positive(f"nuisance {name}", sd)
+    if "tDiffusion" in nuisance and "q_mobile" not in parameters:
+        raise ValueError("tDiffusion can be a nuisance only beside q_mobile: without it the model cell may be empty too early")
+    return dict(nuisance)
 
 
 def _is_near_best(starts: Sequence[_Start]) -> BoolArray:

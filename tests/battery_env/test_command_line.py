@@ -10,7 +10,9 @@ import pytest
 from battery_env import fleet
 from battery_env.__main__ import calibrate, main
 from battery_env.cells import Discharge, load_nasa_discharges
-from battery_env.electrochemistry import simulate
+from battery_env.electrochemistry import NEW_CELL, CellParameters, simulate
+from battery_env.estimators.cell_fit import fit_cell, read_cell
+from battery_env.estimators.least_squares import LeastSquares
 from battery_env.summary import summarize
 
 
@@ -53,6 +55,63 @@ def test_calibrates_a_bundled_discharge_and_writes_what_it_found(tmp_path, capsy
     error_V = voltages["model_V"] - voltages["voltage_V"]
     assert np.sqrt((error_V**2).mean()) == pytest.approx(row["voltage_rmse_V"])
     assert (folder / "B0005_100_voltage.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_file_of_constants_takes_the_place_of_the_new_cell(recorded, tmp_path, capsys):
+    path = write(recorded, tmp_path / "record.csv")
+    cell = NEW_CELL.replace(q_mobile=7000.0, kn=500.0).to_json(tmp_path / "cell.json")
+    assert main(["calibrate", path, "--cell", str(cell)]) == 0
+    shown = capsys.readouterr().out
+    fit = LeastSquares(cell=CellParameters.from_json(cell), thermal=True, mismatch_V=0.05, current_gain_sd=0.005)
+    record = recorded.loaded_part(2.7)
+    q_mobile = fit.estimate(record).q_mobile
+    given_Ah = fit.model.capacity_Ah(record.current_A[-1], "current", 2.7, 7000.0)
+    health = record.charge_C / 3600.0 / given_Ah
+    assert f"{q_mobile:.0f} C" in shown
+    assert (
+        f"{health:.3f}   {record.charge_C / 3600.0:.3f} Ah, drawn, of {given_Ah:.4g} Ah, what the given cell yields" in shown
+    )
+    cell.write_text("{}")
+    assert "cell.json holds no battery_env.CellParameters" in fails([path, "--cell", str(cell)], capsys)
+    assert "missing.json" in fails([path, "--cell", str(tmp_path / "missing.json")], capsys)
+
+
+def test_constants_are_fitted_saved_and_used(tmp_path, capsys):
+    out = tmp_path / "new" / "cell.json"
+    fitted = ["B0005:1", "B0005:84", "B0005:168"]
+    assert main(["fit", *fitted, "--out", str(out)]) == 0
+    shown = capsys.readouterr().out
+    known = load_nasa_discharges("B0005")
+    fit = fit_cell([known[0], known[83], known[167]])
+    assert read_cell(out) == fit and shown.startswith(fit.summary()) and "B0005:168" in shown
+    assert out.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
+    assert main(["calibrate", "B0006:100", "--cell", str(out), "--json"]) == 0
+    row = json.loads(capsys.readouterr().out)
+    assert row["voltage_rmse_V"] < 0.02 and 0.7 < row["state_of_health"] < 0.9
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["B0005:1", "--out", "cell.txt"], "cell.txt.json instead of cell.txt"),
+        (["B0005:1", "--out", "old.json"], "old.json, old.png would be replaced"),
+        (["B0005:1", "--out", "old.png/cell.json"], "old.png is a file"),
+        (["B0005:1", "missing.csv", "--out", "cell.json"], "no file 'missing.csv'"),
+        (["B0005:1", "notes.txt", "--out", "cell.json"], "notes.txt"),
+        (["B0005", "--out", "cell.json"], "fit_cell takes 1 to 30 discharges, got 168"),
+        (["B0005:1", "--cut-off", "4.3", "--out", "cell.json"], "discharge 1 of 1"),
+    ],
+)
+def test_nothing_is_fitted_to_bad_input_and_nothing_is_overwritten(arguments, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for name in ("old.json", "old.png"):
+        Path(name).write_text("precious")
+    Path("notes.txt").write_text("Dear all,\nplease find the data attached.\n")
+    assert main(["fit", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert message in error.splitlines()[-1] and error.splitlines()[-1].startswith("error: ")
+    assert {path.name for path in tmp_path.iterdir()} == {"old.json", "old.png", "notes.txt"}
+    assert Path("old.json").read_text() == Path("old.png").read_text() == "precious"
 
 
 def test_says_what_remains_of_a_discharge_in_progress_and_that_it_is_not_settled(recorded, tmp_path, capsys):

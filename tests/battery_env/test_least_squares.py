@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 
 from battery_env.cells import Discharge, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, Trajectory, initial_state, simulate
+from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimators.cramer_rao import cramer_rao_bound
-from battery_env.estimators.least_squares import LeastSquares
+from battery_env.estimators.least_squares import LeastSquares, _Prior
 from battery_env.estimators.settling import SETTLED_SHARES
 from battery_env.record_model import RecordModel
 
@@ -244,6 +245,107 @@ class TestBounds:
             discharged(6000.0, 0.15).part(0, 1000)
         )
         assert (estimate.q_mobile, estimate.r_o) == (5500.0, 0.2) and not estimate.settled
+
+
+# what the model does not know of this cell: factors of two standard deviations and less
+OFF = {"kn": 0.7, "tDiffusion": 1.3, "to": 0.8, "tsn": 1.2}
+NUISANCE = dict.fromkeys(OFF, 0.2)
+
+
+def discharged_otherwise(noise_V=0.005, seed=0, factors=OFF, thermal=False):
+    """A discharge of a cell whose constants are others than the model's."""
+    cell = NEW_CELL.replace(**{name: factor * getattr(NEW_CELL, name) for name, factor in factors.items()})
+    record = simulate(steps(seed), 6000.0, 0.15, cell=cell, thermal=thermal)
+    noise = np.random.default_rng(seed).normal(0.0, noise_V, len(record.time_s))
+    return replace(record, voltage_V=record.voltage_V + noise)
+
+
+class TestNuisanceConstants:
+    def test_they_take_the_blame(self):
+        record = discharged_otherwise()
+        alone = LeastSquares().estimate(record)
+        beside = LeastSquares(nuisance=NUISANCE).estimate(record)
+        assert abs(alone.r_o - 0.15) > 0.002 and abs(beside.r_o - 0.15) < 0.0005
+        assert abs(alone.q_mobile - 6000.0) > 20.0 and abs(beside.q_mobile - 6000.0) < 10.0
+        assert beside.settled and not alone.settled
+
+    @pytest.mark.parametrize("share", [0.3, 0.6, 1.0])
+    def test_errors_are_as_large_as_stated(self, share):
+        scores = []
+        for seed in range(8):
+            draw = np.random.default_rng(seed)
+            record = discharged_otherwise(seed=seed, factors={name: np.exp(0.2 * draw.standard_normal()) for name in OFF})
+            estimate = LeastSquares(nuisance=NUISANCE).estimate(record.part(0, int(share * len(record.time_s))))
+            scores += [(estimate.q_mobile - 6000.0) / estimate.sd_q_mobile, (estimate.r_o - 0.15) / estimate.sd_r_o]
+        assert np.abs(scores).max() < 4.0 and 0.4 < np.sqrt(np.mean(np.square(scores))) < 1.7
+
+    def test_an_offset_of_the_sensor_is_one_of_them(self):
+        record = discharged(6000.0, 0.15, steps(0), noise_V=0.005)
+        shifted = replace(record, voltage_V=record.voltage_V + 0.02)
+        estimate = LeastSquares(nuisance={"offset_V": 0.01}).estimate(shifted)
+        assert estimate.q_mobile == pytest.approx(6000.0, rel=0.002) and estimate.r_o == pytest.approx(0.15, rel=0.01)
+        assert estimate.settled and not LeastSquares(voltage_noise_V=0.005).estimate(shifted).settled
+
+    @pytest.mark.parametrize("thermal", [False, True])
+    def test_derivatives_are_exact(self, thermal):
+        record = discharged_otherwise(thermal=thermal)
+        record = Discharge(record.time_s[::7], record.voltage_V[::7], record.current_A[::7])
+        nuisance = {**dict.fromkeys(RATE_CONSTANTS, 0.2), "offset_V": 0.01}
+        fit = LeastSquares(nuisance=nuisance, thermal=thermal)
+        problem, priors = fit._problem(record), (_Prior("q_mobile", 6000.0, 1e-4), _Prior("to", 0.0, 0.05))
+        values = {"q_mobile": 6100.0, "r_o": 0.14, **dict.fromkeys(nuisance, 0.1), "offset_V": 0.003}
+        residual_V, jacobian = fit._residual(problem, values, priors)
+        assert jacobian.shape == (len(residual_V), 9) and len(residual_V) == len(record.time_s) + 2
+        for column, name in zip(jacobian.T, values, strict=True):
+            step = 0.05 if name == "q_mobile" else 1e-5
+            more, less = (fit._residual(problem, values | {name: values[name] + sign * step}, priors)[0] for sign in (1, -1))
+            np.testing.assert_allclose(column, (more - less) / (2.0 * step), rtol=1e-4, atol=1e-8)
+
+    def test_constants_that_are_known_are_not_moved(self):
+        record = discharged_otherwise()
+        known = LeastSquares(nuisance=dict.fromkeys(OFF, 1e-6), voltage_noise_V=0.005).estimate(record)
+        alone = LeastSquares(voltage_noise_V=0.005).estimate(record)
+        for name in ("q_mobile", "r_o", "sd_q_mobile", "sd_r_o"):
+            assert getattr(known, name) == pytest.approx(getattr(alone, name), rel=1e-4)
+
+    def test_what_is_less_known_tells_less(self):
+        record = discharged_otherwise().part(0, 1500)
+        sds = [
+            LeastSquares(nuisance=dict.fromkeys(OFF, sd), voltage_noise_V=0.005).estimate(record).sd_q_mobile
+            for sd in (0.001, 0.1, 0.3)
+        ]
+        assert sds[0] < sds[1] < sds[2]
+
+    def test_the_noise_is_told_from_the_record(self):
+        record = discharged_otherwise(noise_V=0.01)
+        told, stated = (LeastSquares(nuisance=NUISANCE, voltage_noise_V=noise_V).estimate(record) for noise_V in (None, 0.01))
+        assert told.q_mobile == pytest.approx(stated.q_mobile, rel=1e-3)
+        assert told.sd_q_mobile == pytest.approx(stated.sd_q_mobile, rel=0.1)
+
+    def test_a_prior_of_q_mobile_joins_them(self):
+        record = discharged_otherwise().part(0, 1200)
+        estimate = LeastSquares(nuisance=NUISANCE, prior_q_mobile_C=(6000.0, 30.0)).estimate(record)
+        assert estimate.q_mobile == pytest.approx(6000.0, abs=60.0) and estimate.sd_q_mobile <= 30.0
+        assert not estimate.settled
+
+    def test_it_follows_a_growing_window(self):
+        record = discharged_otherwise()
+        (trace,) = LeastSquares(nuisance=NUISANCE, window_every_s=600.0).trace([record])
+        assert abs(trace.q_mobile[-1] - 6000.0) < 10.0 and (np.diff(trace.sd_q_mobile) < 0.0).all()
+
+    @pytest.mark.parametrize(
+        ("arguments", "error", "message"),
+        [
+            ({"nuisance": {"kn": 0.0}}, ValueError, "nuisance kn must be a positive"),
+            ({"nuisance": {"kn": "0.2"}}, ValueError, "nuisance kn must be a positive"),
+            ({"nuisance": {"knn": 0.2}}, ValueError, r"nuisance constants are kn, kp, .* and offset_V, got 'knn'"),
+            ({"nuisance": ["kn"]}, TypeError, "standard deviations by name"),
+            ({"nuisance": {"tDiffusion": 0.2}, "parameters": ["r_o"]}, ValueError, "only beside q_mobile"),
+        ],
+    )
+    def test_arguments_are_checked(self, arguments, error, message):
+        with pytest.raises(error, match=message):
+            LeastSquares(**arguments)
 
 
 class TestRealDischarges:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from battery_env.electrochemistry import NEW_CELL, QNS, QPS, initial_state, simulate
+from battery_env.electrochemistry.tangents import RATE_CONSTANTS, TANGENT_NAMES
 from battery_env.estimates import Estimate
 from battery_env.estimators import ExtendedKalmanFilter, LeastSquares
 from battery_env.record_model import RecordModel
@@ -14,18 +15,18 @@ CURRENT_A = np.repeat(np.random.default_rng(0).uniform(0.5, 2.5, 40), 75)
 PARTLY_DISCHARGED = simulate(2.0, 6000.0, 0.15, until=600.0, load_unit="current").state[-1]
 
 
-@pytest.mark.parametrize(
-    "model",
-    [
-        RecordModel(),
-        RecordModel(thermal=True),
-        RecordModel(thermal=True, dt_s=2.0),
-        RecordModel(initial=PARTLY_DISCHARGED),
-        RecordModel(cell=NEW_CELL.replace(VolSFraction=0.2, kn=1000.0)),
-        RecordModel(cell=NEW_CELL.replace(mC=2.0, kn=20.0, kp=20.0), thermal=True),
-    ],
-    ids=["isothermal", "thermal", "2 s", "partly discharged", "another cell", "a hot cell"],
-)
+MODELS = [
+    RecordModel(),
+    RecordModel(thermal=True),
+    RecordModel(thermal=True, dt_s=2.0),
+    RecordModel(initial=PARTLY_DISCHARGED),
+    RecordModel(cell=NEW_CELL.replace(VolSFraction=0.2, kn=1000.0)),
+    RecordModel(cell=NEW_CELL.replace(mC=2.0, kn=20.0, kp=20.0), thermal=True),
+]
+MODEL_IDS = ["isothermal", "thermal", "2 s", "partly discharged", "another cell", "a hot cell"]
+
+
+@pytest.mark.parametrize("model", MODELS, ids=MODEL_IDS)
 def test_derivatives_are_those_of_the_simulated_voltage(model):
     current_A, q, r_o, dq, dr = CURRENT_A[:1200], 6000.0, 0.15, 0.03, 1e-5
     voltage_V, by_q, by_r = model.sensitivities(current_A, q, r_o)
@@ -34,6 +35,43 @@ def test_derivatives_are_those_of_the_simulated_voltage(model):
     np.testing.assert_allclose(by_q, (more - less) / (2.0 * dq), rtol=1e-5, atol=1e-11)
     more, less = (model.simulate(current_A, q, r_o + change).voltage_V for change in (dr, -dr))
     np.testing.assert_allclose(by_r, (more - less) / (2.0 * dr), rtol=1e-5, atol=1e-9)
+
+
+def with_factor(model, name, factor):
+    """The same model with one constant multiplied."""
+    cell = model.cell.replace(**{name: factor * getattr(model.cell, name)})
+    return RecordModel(cell, model.thermal, model.dt_s, model.initial)
+
+
+@pytest.mark.parametrize("name", RATE_CONSTANTS)
+@pytest.mark.parametrize("model", MODELS, ids=MODEL_IDS)
+def test_derivatives_by_constants_are_those_of_the_simulated_voltage(model, name):
+    current_A, q, r_o, change = CURRENT_A[:1200], 6000.0, 0.15, 1e-4
+    tangents = model.tangents(current_A, q, r_o)
+    voltage_V, by_q, by_r = model.sensitivities(current_A, q, r_o)
+    for found, expected in zip((tangents.voltage_V, *tangents.by_parameter), (voltage_V, by_q, by_r), strict=False):
+        np.testing.assert_array_equal(found, expected)
+    more, less = (with_factor(model, name, np.exp(log)).simulate(current_A, q, r_o).voltage_V for log in (change, -change))
+    slope = tangents.by_parameter[TANGENT_NAMES.index(name)]
+    np.testing.assert_allclose(slope, (more - less) / (2.0 * change), rtol=1e-5, atol=2e-9)
+    assert np.abs(slope).max() > 1e-5
+
+
+def test_the_equilibrium_voltage_depends_on_the_mole_fraction_that_is_given():
+    tangents = RecordModel(thermal=True).tangents(CURRENT_A, 6000.0, 0.15)
+    shifted = RecordModel(NEW_CELL.replace(U0p=4.04, Ap=(0.0, *NEW_CELL.Ap[1:])), thermal=True)
+    difference_V = shifted.simulate(CURRENT_A, 6000.0, 0.15).voltage_V - tangents.voltage_V
+    y = 2.0 * tangents.fraction_p - 1.0
+    np.testing.assert_allclose(difference_V, 0.01 - y * NEW_CELL.Ap[0] / NEW_CELL.F, rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "model", [RecordModel(), RecordModel(initial=PARTLY_DISCHARGED), RecordModel(NEW_CELL.replace(VolSFraction=0.2))]
+)
+def test_the_least_q_mobile_follows_the_time_of_diffusion(model):
+    _, by_log_C = model.least_q_mobile_tangent_C(CURRENT_A)
+    more_C, less_C = (with_factor(model, "tDiffusion", np.exp(log)).least_q_mobile_C(CURRENT_A) for log in (1e-4, -1e-4))
+    assert by_log_C == pytest.approx((more_C - less_C) / 2e-4, rel=1e-5) and by_log_C > 1.0
 
 
 @pytest.mark.parametrize("model", [RecordModel(), RecordModel(initial=PARTLY_DISCHARGED), RecordModel(dt_s=2.0)])

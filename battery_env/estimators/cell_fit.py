@@ -1,0 +1,631 @@
+"""The constants of your own cell, from a few of its discharges."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from numpy.polynomial import Legendre, Polynomial
+from numpy.polynomial.legendre import legvander
+from scipy.optimize import least_squares
+
+from battery_env.arrays import FloatArray
+from battery_env.cells import Discharge
+from battery_env.checks import check_numbers, check_positive
+from battery_env.electrochemistry import NEW_CELL, CellParameters, check_cell, check_dt
+from battery_env.electrochemistry.tangents import BY_Q, BY_R, RATE_CONSTANTS
+from battery_env.estimators.least_squares import LeastSquares
+from battery_env.files import WrongFormatError, read_json, write_json
+from battery_env.parameters import Q_MOBILE, R_O
+from battery_env.record_model import RecordModel
+from battery_env.records import SWITCH_SHARE, Record, check_drawn_charge, check_record, drawn
+
+#: How well the constants that say how fast a cell follows its load are known before any data: standard deviations of their
+#: logarithms. The overpotential of kn stands for whatever slows a worn cell down, so that it may differ most.
+RATE_PRIOR_SD: Mapping[str, float] = {"kn": 1.5, "kp": 0.5, "tDiffusion": 0.5, "to": 0.5, "tsn": 0.5, "tsp": 0.5}
+#: How far the equilibrium voltage may be another one: standard deviations of the coefficients of Legendre polynomials 0, 1,
+#: ... over the mole fractions of the positive electrode that a discharge passes through, V.
+EQUILIBRIUM_PRIOR_SD_V: tuple[float, ...] = (0.3, 0.2, 0.1, 0.1, 0.1, 0.1, 0.05, 0.05)
+#: A constant is identified if the discharges leave less than this share of the standard deviation of its prior.
+IDENTIFIED_SHARE = 0.5
+#: A fit that is farther from the measured voltages than this (root mean square), V, is refused.
+LIMIT_V = 0.05
+#: Error to expect on a real cell of constants that were not fitted to it, V.
+UNFITTED_MISMATCH_V = 0.05
+
+_FORMAT, _FORMAT_VERSION = "battery_env.CellFit", 1
+
+# Mole fractions of the positive electrode at full charge and at none.
+_FRACTIONS_P = (0.4, 1.0)
+_MOST_DISCHARGES = 30
+_FEWEST_SAMPLES = 20
+# Longer records are thinned: what the constants shape is slower.
+_MOST_SAMPLES = 2000
+# A cell that holds less or more than the new one by this factor is one of another size.
+_OTHER_SIZE = 2.0
+# The charge that can move is about this much more than what a discharge delivers.
+_UNDELIVERED = 1.05
+# Rounds of weighing the residuals by how large they turn out, and how large they are taken for in the first one, V.
+_ROUNDS = 3
+_FIRST_MISMATCH_V, _LEAST_MISMATCH_V = 0.02, 1e-3
+# The error of the model drifts slowly: a discharge shows so many independent ones, unless its residuals change sign more
+# often.
+_INDEPENDENT_ERRORS = 50.0
+# The search: how many standard deviations of its prior a constant may move, the logarithm of the distance of q_mobile to its
+# least value, C, the least distance as a share of it, and the scale of r_o, ohm.
+_REACH_SD = 6.0
+_LOG_DISTANCE_LIMITS = (-30.0, 16.0)
+_MARGIN = 1e-6
+# A cell is not expected to hold more than this times the largest q_mobile that was fitted.
+_GROWTH = 1.2
+_R_O_SCALE_OHM = 0.1
+# Where the search for q_mobile starts beside the fit with the constants known before: this much above its least value.
+_START_EXCESS = 0.02
+
+
+class _Data(NamedTuple):
+    """One discharge as it is fitted."""
+
+    time_s: FloatArray  # of the samples, since the first one
+    voltage_V: FloatArray
+    current_A: FloatArray  # over each step of the model
+    at_rest: bool  # whether the first sample is the voltage of a full cell at rest
+
+
+class FittedConstant(NamedTuple):
+    """
+    What the discharges say about one constant.
+
+    :param name: a constant of :class:`~battery_env.CellParameters`; or ``equilibrium 0``, ``equilibrium 1``, ...: the
+        coefficient of that Legendre polynomial in what is added to the equilibrium voltage
+    :param prior: its value before the data; 0 V for what is added
+    :param prior_sd: how sure that was: standard deviation of its logarithm; of what is added, in V
+    :param value: its value now
+    :param sd: how sure that is, as ``prior_sd``
+    """
+
+    name: str
+    prior: float
+    prior_sd: float
+    value: float
+    sd: float
+
+    @property
+    def identified(self) -> bool:
+        """Whether the discharges leave less than half of the uncertainty of its prior."""
+        return self.sd < IDENTIFIED_SHARE * self.prior_sd
+
+
+class FittedDischarge(NamedTuple):
+    """
+    One of the discharges that constants were fitted to.
+
+    :param name: of the cell and the discharge, if the record tells; otherwise its number
+    :param q_mobile: charge that can move, C
+    :param r_o: ohmic resistance, ohm
+    :param sd_q_mobile: its standard deviation, with that of the constants, C
+    :param sd_r_o: likewise, ohm
+    :param rmse_V: root mean square of the voltage error, V
+    :param rmse_before_V: likewise with the constants known before and the ``q_mobile`` and ``r_o`` that fit best to them
+    """
+
+    name: str
+    q_mobile: float
+    r_o: float
+    sd_q_mobile: float
+    sd_r_o: float
+    rmse_V: float
+    rmse_before_V: float
+
+
+@dataclass(frozen=True)
+class CellFit:
+    """
+    The constants of a cell as :func:`fit_cell` found them, for any calibrator:
+
+    .. code-block:: python
+
+      fit = fit_cell(discharges)
+      print(fit.summary())
+      estimate = fit.calibrator().estimate(record)
+      fit.to_json("my_cell.json")
+
+    :param cell: the constants, with ``q_mobile`` and ``r_o`` of the discharge with the largest ``q_mobile``, and the cut-off
+        voltage as ``VEOD``
+    :param start: the constants before, with the same ``q_mobile``, ``r_o`` and ``VEOD``
+    :param mismatch_V: error to expect of the model with these constants, V: the root mean square of the residuals, corrected
+        for what was fitted
+    :param rmse_V: root mean square of the residuals, V
+    :param thermal: whether the temperature of the model moves
+    :param constants: what the discharges say about each constant
+    :param discharges: the discharges
+    :raises TypeError: for a value of another kind
+    :raises ValueError: for errors that are not positive, and numbers that are not finite
+    """
+
+    cell: CellParameters
+    start: CellParameters
+    mismatch_V: float
+    rmse_V: float
+    thermal: bool
+    constants: tuple[FittedConstant, ...]
+    discharges: tuple[FittedDischarge, ...]
+
+    def __post_init__(self) -> None:
+        for name in ("cell", "start"):
+            if getattr(self, name) is None:
+                raise TypeError(f"{name} must be CellParameters, got None")
+            check_cell(getattr(self, name), self.thermal)
+        for name in ("mismatch_V", "rmse_V"):
+            check_positive(name, getattr(self, name))
+        rows: tuple[FittedConstant | FittedDischarge, ...] = (*self.constants, *self.discharges)
+        for row in rows:
+            if not isinstance(row.name, str) or not np.isfinite(check_numbers(row.name, row[1:])).all():
+                raise ValueError(f"constants and discharges have names and finite numbers, got {row!r}")
+
+    def calibrator(self, **arguments: Any) -> LeastSquares:
+        """
+        Least squares with these constants and the error to expect of them, for a ``q_mobile`` of up to 1.2 times the largest
+        that was fitted: a cell does not grow. Without that bound the first quarter of a discharge allows for far larger ones.
+
+        :param arguments: others of :class:`~battery_env.LeastSquares`; they replace these
+        :return: the calibrator
+        """
+        own = {
+            "cell": self.cell,
+            "thermal": self.thermal,
+            "mismatch_V": self.mismatch_V,
+            "q_mobile_bounds_C": self.q_mobile_bounds_C,
+        }
+        return LeastSquares(**{**own, **arguments})
+
+    @property
+    def q_mobile_bounds_C(self) -> tuple[float, float]:
+        """Where to search for ``q_mobile``, C: a cell does not grow."""
+        return Q_MOBILE.limits[0], min(_GROWTH * self.cell.q_mobile, Q_MOBILE.limits[1])
+
+    def constants_table(self) -> pd.DataFrame:
+        """
+        The constants before and after, and how sure they are.
+
+        :return: one row a constant, the fields of :class:`FittedConstant` and ``identified``
+        """
+        table = pd.DataFrame(self.constants)
+        return table.assign(identified=[constant.identified for constant in self.constants])
+
+    def discharges_table(self) -> pd.DataFrame:
+        """
+        The discharges that were fitted.
+
+        :return: one row a discharge, the fields of :class:`FittedDischarge`
+        """
+        return pd.DataFrame(self.discharges)
+
+    def summary(self) -> str:
+        """
+        The fit in a few lines.
+
+        :return: text for a terminal
+        """
+        before_V = np.sqrt(np.mean([discharge.rmse_before_V**2 for discharge in self.discharges]))
+        lines = [
+            f"{len(self.discharges)} discharges, voltage RMSE {1e3 * before_V:.1f} mV before, {1e3 * self.rmse_V:.1f} mV "
+            f"after; expect an error of {1e3 * self.mismatch_V:.1f} mV (mismatch_V)",
+            "",
+            f"{'constant':<16}{'before':>12}{'after':>12}{'sd before':>12}{'after':>10}",
+        ]
+        for constant in self.constants:
+            added = constant.name not in RATE_PRIOR_SD
+            unit, factor = ("mV", 1e3) if added else ("%", 1e2)
+            value, prior = (f"{1e3 * x:.1f} mV" if added else f"{x:.5g}" for x in (constant.value, constant.prior))
+            sds = (f"{factor * x:.3g} {unit}" for x in (constant.prior_sd, constant.sd))
+            lines.append(
+                f"{constant.name:<16}{prior:>12}{value:>12}{next(sds):>12}{next(sds):>10}"
+                + ("" if constant.identified else "   not identified")
+            )
+        lines += ["", f"{'discharge':<16}{'q_mobile':>10}{'sd':>8}{'r_o':>12}{'sd':>12}{'RMSE before':>14}{'after':>10}"]
+        for discharge in self.discharges:
+            lines.append(
+                f"{discharge.name:<16}{discharge.q_mobile:>8.0f} C{discharge.sd_q_mobile:>6.0f} C"
+                f"{discharge.r_o:>8.4f} ohm{discharge.sd_r_o:>8.4f} ohm"
+                f"{1e3 * discharge.rmse_before_V:>11.1f} mV{1e3 * discharge.rmse_V:>7.1f} mV"
+            )
+        return "\n".join(lines)
+
+    def to_json(self, path: str | os.PathLike[str]) -> Path:
+        """
+        Save the fit.
+
+        :param path: where to
+        :return: the file
+        :raises FileExistsError: if the file exists already
+        """
+        content = asdict(self) | {
+            "constants": [constant._asdict() for constant in self.constants],
+            "discharges": [discharge._asdict() for discharge in self.discharges],
+        }
+        return write_json(path, _FORMAT, _FORMAT_VERSION, content)
+
+    @classmethod
+    def from_json(cls, path: str | os.PathLike[str]) -> CellFit:
+        """
+        Load a fit.
+
+        :param path: what :meth:`to_json` wrote
+        :return: the fit
+        :raises ValueError: if the file is damaged, was not written so, or is of another format version
+        """
+        content = read_json(path, _FORMAT, _FORMAT_VERSION)
+        try:
+            for name in ("cell", "start"):
+                content[name] = CellParameters.of_mapping(content[name])
+            for name, row in (("constants", FittedConstant), ("discharges", FittedDischarge)):
+                content[name] = tuple(row(**fields) for fields in content[name])
+            return cls(**content)
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"{path} is damaged, or no fit saved by CellFit.to_json: {error}") from error
+
+
+def read_cell(path: str | os.PathLike[str]) -> CellFit | CellParameters:
+    """
+    Read the constants of a cell.
+
+    :param path: what :meth:`CellFit.to_json` or :meth:`battery_env.CellParameters.to_json` wrote
+    :return: the fit, or the constants
+    :raises ValueError: if the file is damaged, was not written so, or is of another format version
+    """
+    try:
+        return CellFit.from_json(path)
+    except WrongFormatError:
+        return CellParameters.from_json(path)
+
+
+def fit_cell(
+    discharges: Sequence[Record],
+    cut_off_V: float = 2.7,
+    start: CellParameters | None = None,
+    thermal: bool = True,
+    dt_s: float = 1.0,
+    limit_V: float = LIMIT_V,
+) -> CellFit:
+    """
+    Fit the constants of the model to a cell of your own: how fast it follows its load (``kn``, ``kp``, ``tDiffusion``,
+    ``to``, ``tsn``, ``tsp``) and its equilibrium voltage (``U0p``, ``Ap``), to a few of its discharges at once, each with a
+    ``q_mobile`` and ``r_o`` of its own. Three discharges suffice; take them from all ages, and at all loads, that the
+    constants are to hold for. Each must start with a full cell, and reach its knee.
+
+    *What is minimized* is the sum of squares of the residuals of the voltage and of the distances to the priors: logarithms
+    of the rate constants have ``RATE_PRIOR_SD``, and the change of the equilibrium voltage is a polynomial in the mole
+    fraction of the positive electrode with ``EQUILIBRIUM_PRIOR_SD_V``, which ``U0p`` and ``Ap`` can make exactly. So constants
+    that the discharges do not determine stay near what they were. The voltage at rest of a full cell counts as much as all
+    that follows within a fiftieth of the discharge. The search is scipy's trust region with exact derivatives.
+
+    *How sure it is.* The residuals are the error of the model, and drift slowly: those of a discharge count as 50 independent
+    ones, however many samples there are, or as many as they change their sign. Their variance is found along with the
+    constants. The usual formula, for white noise, would state a fraction of these standard deviations.
+
+    *Other cells.* A cell of another capacity starts with electrodes of another size. Another chemistry works as far as the
+    equations bend; where they do not, the residuals stay large and the fit is refused.
+
+    :param discharges: of one cell, each from full charge. Of a :class:`~battery_env.Discharge` the part from load-on to the
+        cut-off is taken; other records are taken whole
+    :param cut_off_V: cut-off voltage, V
+    :param start: what is thought of the constants before; ``None``: the new cell's, at the size of this one
+    :param thermal: whether the temperature of the model moves. It starts at the measured one, if that is known
+    :param dt_s: time step of the model, s
+    :param limit_V: the largest root mean square of the residuals, V
+    :return: the fit
+    :raises TypeError: for what is no sequence of records
+    :raises ValueError: for an argument out of range, records that cannot be used, or a cell that the equations cannot describe
+    """
+    records = _records(discharges, cut_off_V)
+    check_positive("limit_V", limit_V)
+    prior = _prior(records, start, thermal, cut_off_V)
+    check_dt(dt_s, prior)
+    # a simulated record is at rest before its first current acts
+    at_rest = [not isinstance(whole, Discharge) or _starts_at_rest(whole) for whole in discharges]
+    problem = _JointFit(records, at_rest, prior, thermal, dt_s)
+    fit = problem.result(*problem.solve())
+    if not fit.rmse_V <= limit_V:
+        raise ValueError(
+            f"the equations do not describe this cell: with all constants fitted the voltage is still {1e3 * fit.rmse_V:.0f} "
+            f"mV off (limit_V: {1e3 * limit_V:.0f} mV). Check units, sign and cut_off_V, that all discharges are of one cell "
+            "and start full, and leave out odd ones; or raise limit_V and take the fit for what it is."
+        )
+    return fit
+
+
+def _records(discharges: Sequence[Record], cut_off_V: float) -> list[Record]:
+    if isinstance(discharges, Discharge) or not isinstance(discharges, Sequence):
+        raise TypeError(f"discharges must be a list of discharges, got {type(discharges).__name__}")
+    check_positive("cut_off_V", cut_off_V)
+    if not 1 <= len(discharges) <= _MOST_DISCHARGES:
+        raise ValueError(
+            f"fit_cell takes 1 to {_MOST_DISCHARGES} discharges, got {len(discharges)}. A few of all ages tell as much."
+        )
+    records: list[Record] = []
+    for number, discharge in enumerate(discharges, start=1):
+        try:
+            record = discharge.loaded_part(cut_off_V) if isinstance(discharge, Discharge) else discharge
+            samples = check_record(record.time_s, record.voltage_V, record.current_A, _FEWEST_SAMPLES)
+            check_drawn_charge(float(drawn(samples.time_s, samples.current_A, samples.time_s[-1])))
+        except AttributeError as error:
+            raise TypeError(f"discharge {number} of {len(discharges)} is no record: {error}") from error
+        except (TypeError, ValueError) as error:
+            raise type(error)(f"discharge {number} of {len(discharges)}: {error}") from error
+        records.append(record)
+    return records
+
+
+def _starts_at_rest(discharge: Discharge) -> bool:
+    return bool(discharge.current_A[0] <= SWITCH_SHARE * discharge.current_A.max())
+
+
+def _prior(records: Sequence[Record], start: CellParameters | None, thermal: bool, cut_off_V: float) -> CellParameters:
+    """What is thought of the constants before the data, but for what is measured."""
+    check_cell(start, thermal)
+    charges_C = [float(drawn(record.time_s, record.current_A, record.time_s[-1])) for record in records]
+    q_mobile = float(Q_MOBILE.check(_UNDELIVERED * max(charges_C)))
+    if start is None:
+        size = q_mobile / NEW_CELL.q_mobile
+        start = NEW_CELL
+        if not 1.0 / _OTHER_SIZE < size < _OTHER_SIZE:
+            surfaces = {name: size * getattr(NEW_CELL, name) for name in ("Sn", "Sp", "mC")}
+            start = NEW_CELL.replace(q_mobile=q_mobile, r_o=NEW_CELL.r_o / size, **surfaces)
+    known = [getattr(record, "temperature_C", None) for record in records]
+    temperatures_C = [column[0] for column in known if column is not None]
+    measured = {"Tb0": 273.15 + float(np.mean(temperatures_C))} if temperatures_C else {}
+    return start.replace(VEOD=float(cut_off_V), **measured)
+
+
+def with_equilibrium(cell: CellParameters, coefficients_V: Sequence[float] | FloatArray) -> CellParameters:
+    """
+    A cell with something added to its equilibrium voltage.
+
+    :param cell: its constants
+    :param coefficients_V: of Legendre polynomials 0, 1, ... over the mole fractions of the positive electrode that a discharge
+        passes through, V, at most 14
+    :return: the cell with the ``U0p`` and ``Ap`` that make it so, exactly
+    """
+    # as a polynomial in y = 2x - 1, from the highest power down: term k of the Redlich-Kister sum is
+    # A_k / F * ((1 + k / 2) * y^(k + 1) - (k / 2) * y^(k - 1))
+    x = Polynomial([0.5, 0.5])
+    powers = Legendre(coefficients_V).convert(kind=Polynomial)(_on_unit_range(x)).coef
+    terms = np.zeros(max(len(cell.Ap), len(powers) - 1))
+    for k in range(len(powers) - 2, -1, -1):
+        terms[k] = powers[k + 1] / (1.0 + k / 2.0)
+        if k > 0:
+            powers[k - 1] += k / 2.0 * terms[k]
+    terms[: len(cell.Ap)] += np.array(cell.Ap) / cell.F
+    return cell.replace(U0p=cell.U0p + float(powers[0]), Ap=tuple((cell.F * terms).tolist()))
+
+
+def _on_unit_range(fraction: Any) -> Any:
+    # numbers, arrays and polynomials alike
+    low, high = _FRACTIONS_P
+    return (fraction - 0.5 * (high + low)) * (2.0 / (high - low))
+
+
+def _name(record: Record, number: int) -> str:
+    meta = getattr(record, "meta", {})
+    return f"{meta['cell']}:{meta['cycle']}" if {"cell", "cycle"} <= set(meta) else str(number)
+
+
+class _Aged(NamedTuple):
+    """The parameters of one discharge at an x."""
+
+    q_mobile: float
+    r_o: float
+    q_gradient_C: FloatArray  # of q_mobile by x
+
+
+class _Weights(NamedTuple):
+    """How much the residuals of each discharge count."""
+
+    mismatch_V: float
+    independent: FloatArray  # errors in each discharge, shape (D,)
+
+
+class _JointFit:
+    """
+    The search over the constants and, for each discharge, ``q_mobile`` and ``r_o``. An x holds, in this order: of each
+    constant how many standard deviations of its prior it has moved; of each discharge the logarithm of the distance of
+    ``q_mobile`` to its least value; of each discharge ``r_o`` in units of ``_R_O_SCALE_OHM``.
+    """
+
+    def __init__(
+        self, records: Sequence[Record], at_rest: Sequence[bool], start: CellParameters, thermal: bool, dt_s: float
+    ) -> None:
+        self.start, self.thermal, self.dt_s = start, thermal, dt_s
+        self.names = [_name(record, number) for number, record in enumerate(records, start=1)]
+        self.sd = np.array([*(RATE_PRIOR_SD[name] for name in RATE_CONSTANTS), *EQUILIBRIUM_PRIOR_SD_V])
+        model = RecordModel(start, thermal, dt_s)
+        self.data: list[_Data] = []
+        for record, rests in zip(records, at_rest, strict=True):
+            time_s, current_A = model.grid(record)
+            kept = np.unique(np.linspace(0, len(time_s) - 1, min(len(time_s), _MOST_SAMPLES)).round().astype(np.int64))
+            self.data.append(_Data(time_s[kept], np.asarray(record.voltage_V)[kept], current_A, rests))
+        calibrator = LeastSquares(
+            cell=start, thermal=thermal, dt_s=dt_s, q_mobile_bounds_C=Q_MOBILE.limits, r_o_bounds_ohm=R_O.limits
+        )
+        self.before = [calibrator.estimate(record) for record in records]
+        self._evaluated = lru_cache(maxsize=1)(self._evaluate)  # scipy asks for residuals and derivatives one after the other
+
+    def cell(self, x: FloatArray) -> CellParameters:
+        """The constants of an x."""
+        moved = x[: len(self.sd)] * self.sd
+        rates = {
+            name: getattr(self.start, name) * float(np.exp(log))
+            for name, log in zip(RATE_CONSTANTS, moved[: len(RATE_CONSTANTS)], strict=True)
+        }
+        return with_equilibrium(self.start.replace(**rates), moved[len(RATE_CONSTANTS) :])
+
+    def solve(self) -> tuple[FloatArray, _Weights]:
+        """The best x that is found from any start, and the weights that its residuals imply."""
+        n = len(self.data)
+        weights = _Weights(_FIRST_MISMATCH_V, np.full(n, _INDEPENDENT_ERRORS))
+        best = min((self._search(x, weights) for x in self._starts()), key=lambda x: self._square(x, weights))
+        for _ in range(_ROUNDS):
+            weights = self._weights(best, weights)
+            best = self._search(best, weights)
+        return best, self._weights(best, weights)
+
+    def _starts(self) -> list[FloatArray]:
+        model = RecordModel(self.start, self.thermal, self.dt_s)
+        least_C = [model.least_q_mobile_C(data.current_A) for data in self.data]
+        fitted = [estimate.q_mobile - least for estimate, least in zip(self.before, least_C, strict=True)]
+        r_o = [estimate.r_o / _R_O_SCALE_OHM for estimate in self.before]
+        starts = []
+        for distance_C in (fitted, _START_EXCESS * np.array(least_C)):
+            logs = np.log(np.maximum(distance_C, 1e-4 * np.array(least_C)))
+            starts.append(np.concatenate([np.zeros(len(self.sd)), logs, r_o]))
+        return starts
+
+    def _bounds(self) -> tuple[FloatArray, FloatArray]:
+        n = len(self.data)
+        low, high = np.full(len(self.sd), -_REACH_SD), np.full(len(self.sd), _REACH_SD)
+        for k, name in enumerate(RATE_CONSTANTS):
+            if name in ("to", "tsn", "tsp"):  # the model is stable at twice this step
+                low[k] = max(low[k], np.log(self.dt_s / getattr(self.start, name)) / self.sd[k])
+        ends = [
+            np.concatenate([constants, np.full(n, log), np.full(n, r_o / _R_O_SCALE_OHM)])
+            for constants, log, r_o in zip((low, high), _LOG_DISTANCE_LIMITS, R_O.limits, strict=True)
+        ]
+        return ends[0], ends[1]
+
+    def _search(self, x: FloatArray, weights: _Weights) -> FloatArray:
+        low, high = self._bounds()
+        room = 1e-6 * (high - low)
+
+        def residual(x: FloatArray) -> FloatArray:
+            return self._objective(x, weights)[0]
+
+        def jacobian(x: FloatArray) -> FloatArray:
+            return self._objective(x, weights)[1]
+
+        result = least_squares(
+            residual,
+            np.clip(x, low + room, high - room),
+            jac=jacobian,
+            bounds=(low, high),
+            x_scale=1.0,
+            ftol=1e-7,
+            xtol=1e-7,
+            gtol=1e-7,
+            max_nfev=200,
+        )
+        return np.asarray(result.x)
+
+    def _square(self, x: FloatArray, weights: _Weights) -> float:
+        residual = self._objective(x, weights)[0]
+        return float(residual @ residual)
+
+    def _objective(self, x: FloatArray, weights: _Weights) -> tuple[FloatArray, FloatArray]:
+        """Weighted residuals and distances to the priors, and their derivatives."""
+        residuals_V, jacobians, _ = self._evaluated(tuple(x))
+        n = len(self.sd)
+        residuals, derivatives = [], []
+        for data, count, residual_V, jacobian in zip(self.data, weights.independent, residuals_V, jacobians, strict=True):
+            scale = np.full(len(residual_V), np.sqrt(count / len(residual_V)))
+            if data.at_rest:
+                scale[0] = 1.0  # one sample alone says what a full cell shows, however many follow
+            scale /= weights.mismatch_V
+            residuals.append(scale * residual_V)
+            derivatives.append(scale[:, None] * jacobian)
+        return np.concatenate([*residuals, x[:n]]), np.concatenate([*derivatives, np.eye(n, len(x))])
+
+    def _evaluate(self, x: tuple[float, ...]) -> tuple[list[FloatArray], list[FloatArray], list[_Aged]]:
+        """Of each discharge the residuals, V, their derivatives by x, and its parameters."""
+        values = np.array(x)
+        model = RecordModel(self.cell(values), self.thermal, self.dt_s)
+        n, rates = len(self.sd), len(RATE_CONSTANTS)
+        residuals, jacobians, aged = [], [], []
+        for d, data in enumerate(self.data):
+            u, r = n + d, n + len(self.data) + d
+            least_C, least_by_log_C = model.least_q_mobile_tangent_C(data.current_A)
+            distance_C = float(np.exp(values[u]))
+            q_mobile, r_o = (1.0 + _MARGIN) * least_C + distance_C, _R_O_SCALE_OHM * float(values[r])
+            voltage_V, by_parameter, fraction_p = model.tangents(data.current_A, q_mobile, r_o)
+            q_gradient_C = np.zeros(len(values))
+            q_gradient_C[u] = distance_C
+            t_diffusion = RATE_CONSTANTS.index("tDiffusion")
+            q_gradient_C[t_diffusion] = (1.0 + _MARGIN) * least_by_log_C * self.sd[t_diffusion]
+            columns = by_parameter[BY_Q][:, None] * q_gradient_C
+            columns[:, :rates] += self.sd[:rates] * by_parameter[BY_R + 1 :].T
+            columns[:, rates:n] = self.sd[rates:] * legvander(_on_unit_range(fraction_p), n - rates - 1)
+            columns[:, r] = _R_O_SCALE_OHM * by_parameter[BY_R]
+            grid_s = self.dt_s * np.arange(len(voltage_V))
+            at = np.minimum(np.searchsorted(grid_s, data.time_s, side="right"), len(grid_s) - 1)
+            share = (data.time_s - grid_s[at - 1]) / self.dt_s
+            residuals.append(np.interp(data.time_s, grid_s, voltage_V) - data.voltage_V)
+            jacobians.append(columns[at - 1] + share[:, None] * (columns[at] - columns[at - 1]))
+            aged.append(_Aged(q_mobile, r_o, q_gradient_C))
+        return residuals, jacobians, aged
+
+    def _covariance(self, x: FloatArray, weights: _Weights) -> FloatArray:
+        jacobian = self._objective(x, weights)[1]
+        return np.asarray(np.linalg.pinv(jacobian.T @ jacobian))
+
+    def _weights(self, x: FloatArray, weights: _Weights) -> _Weights:
+        """What the residuals say about their own size, and how many of them are independent."""
+        residuals_V = self._evaluated(tuple(x))[0]
+        changes = [float(np.count_nonzero(np.diff(np.signbit(residual)))) for residual in residuals_V]
+        independent = np.maximum(changes, _INDEPENDENT_ERRORS)
+        # what was fitted makes residuals smaller than errors, by as much as the data determine
+        left = np.diag(self._covariance(x, weights))[: len(self.sd)]
+        fitted = float(np.sum(1.0 - left)) + 2.0 * len(residuals_V)
+        square_V2 = sum(count * _rms(residual) ** 2 for count, residual in zip(independent, residuals_V, strict=True))
+        return _Weights(max(float(np.sqrt(square_V2 / (independent.sum() - fitted))), _LEAST_MISMATCH_V), independent)
+
+    def result(self, x: FloatArray, weights: _Weights) -> CellFit:
+        """What was found."""
+        residuals_V, _, aged = self._evaluated(tuple(x))
+        n, discharges = len(self.sd), len(self.data)
+        covariance = self._covariance(x, weights)
+        sds = np.sqrt(np.diag(covariance))
+        names = [*RATE_CONSTANTS, *(f"equilibrium {k}" for k in range(len(EQUILIBRIUM_PRIOR_SD_V)))]
+        cell = self.cell(x)
+        constants = []
+        for k, name in enumerate(names):
+            rate = name in RATE_PRIOR_SD
+            before, after = (getattr(self.start, name), getattr(cell, name)) if rate else (0.0, self.sd[k] * x[k])
+            constants.append(FittedConstant(name, before, float(self.sd[k]), float(after), float(self.sd[k] * sds[k])))
+        model = RecordModel(self.start, self.thermal, self.dt_s)
+        rows = []
+        for d, (residual_V, age) in enumerate(zip(residuals_V, aged, strict=True)):
+            before = self.before[d]
+            tangents = model.tangents(self.data[d].current_A, before.q_mobile, before.r_o)
+            grid_s = self.dt_s * np.arange(len(tangents.voltage_V))
+            before_V = np.interp(self.data[d].time_s, grid_s, tangents.voltage_V) - self.data[d].voltage_V
+            rows.append(
+                FittedDischarge(
+                    self.names[d],
+                    age.q_mobile,
+                    age.r_o,
+                    float(np.sqrt(age.q_gradient_C @ covariance @ age.q_gradient_C)),
+                    float(_R_O_SCALE_OHM * sds[n + discharges + d]),
+                    _rms(residual_V),
+                    _rms(before_V),
+                )
+            )
+        largest = max(rows, key=lambda row: row.q_mobile)
+        new = {"q_mobile": largest.q_mobile, "r_o": largest.r_o}
+        return CellFit(
+            cell.replace(**new),
+            self.start.replace(**new),
+            weights.mismatch_V,
+            _rms(np.concatenate(residuals_V)),
+            self.thermal,
+            tuple(constants),
+            tuple(rows),
+        )
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))

@@ -1,0 +1,275 @@
+"""Constants of a cell are found, or stay where they were, and come with an honest uncertainty."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from numpy.polynomial import Legendre
+
+from battery_env import CellFit, CellParameters, ExtendedKalmanFilter, LeastSquares, fit_cell, forecast, load_nasa_discharges
+from battery_env.cells import Discharge
+from battery_env.electrochemistry import NEW_CELL, initial_state, simulate, voltage
+from battery_env.electrochemistry.tangents import RATE_CONSTANTS
+from battery_env.estimators.cell_fit import (
+    EQUILIBRIUM_PRIOR_SD_V,
+    RATE_PRIOR_SD,
+    _JointFit,
+    read_cell,
+    with_equilibrium,
+)
+from battery_env.plotting import plot_cell_fit
+from battery_env.summary import METHODS, Settings
+
+OTHER = with_equilibrium(NEW_CELL, [0.02, -0.03, 0.02]).replace(kn=1000.0, tDiffusion=9e6, to=10.0, tsn=600.0, VEOD=2.7)
+
+
+def discharged(cell, q_mobile, r_o, load, noise_V=0.002, seed=0):
+    """A simulated record in the shape of a recorded one."""
+    trajectory = simulate(load, q_mobile, r_o, load_unit="current", thermal=True, cell=cell)
+    noise = np.random.default_rng(seed).normal(0.0, noise_V, len(trajectory.time_s))
+    return Discharge(trajectory.time_s, trajectory.voltage_V + noise, trajectory.current_A)
+
+
+def pulses(seed, size=1.0):
+    """Currents that change every minute."""
+    return size * np.repeat(np.random.default_rng(seed).uniform(0.5, 4.0, 300), 60)
+
+
+@pytest.fixture(scope="module")
+def simulated():
+    ages = ((7400.0, 0.12), (6500.0, 0.15), (5500.0, 0.2))
+    return [discharged(OTHER, q, r, pulses(n), seed=n) for n, (q, r) in enumerate(ages)]
+
+
+@pytest.fixture(scope="module")
+def fit(simulated):
+    return fit_cell(simulated)
+
+
+@pytest.fixture(scope="module")
+def b0005_fit():
+    discharges = load_nasa_discharges("B0005")
+    return fit_cell([discharges[0], discharges[84], discharges[-1]])
+
+
+@pytest.mark.parametrize("coefficients_V", [[0.1], [0.0, 0.1], [0.1, 0.0, -0.2, 0.05, 0.01], list(np.full(14, 0.01))])
+def test_what_is_added_to_the_equilibrium_voltage_is_added_exactly(coefficients_V):
+    state = simulate(2.0, 7600.0, 0.1, load_unit="current").state[::200]
+    fraction_p = state[:, 7] * 6.0 / 7600.0
+    added_V = voltage(state, 7600.0, with_equilibrium(NEW_CELL, coefficients_V)) - voltage(state, 7600.0)
+    np.testing.assert_allclose(added_V, Legendre(coefficients_V, domain=[0.4, 1.0])(fraction_p), rtol=0.0, atol=1e-9)
+
+
+def test_derivatives_of_the_search_are_exact(simulated):
+    problem = _JointFit(simulated, [True] * 3, NEW_CELL, True, 1.0)
+    x = problem._starts()[0] + 0.1 * np.random.default_rng(0).standard_normal(len(problem.sd) + 6)
+    _, jacobians, aged = problem._evaluate(tuple(x))
+    for k in range(len(x)):
+        change = np.zeros(len(x))
+        change[k] = 1e-5
+        more, less = (np.concatenate(problem._evaluate(tuple(x + sign * change))[0]) for sign in (1.0, -1.0))
+        column = np.concatenate([jacobian[:, k] for jacobian in jacobians])
+        np.testing.assert_allclose(column, (more - less) / 2e-5, rtol=1e-4, atol=1e-6)
+    for d, age in enumerate(aged):
+        for k in np.flatnonzero(age.q_gradient_C):
+            change = np.zeros(len(x))
+            change[k] = 1e-5
+            more_C, less_C = (problem._evaluate(tuple(x + sign * change))[2][d].q_mobile for sign in (1.0, -1.0))
+            assert age.q_gradient_C[k] == pytest.approx((more_C - less_C) / 2e-5, rel=1e-5)
+
+
+class TestSimulated:
+    def test_the_voltage_is_explained_to_the_noise(self, fit):
+        assert fit.rmse_V == pytest.approx(0.002, rel=0.05)
+        assert fit.rmse_V <= fit.mismatch_V < 1.1 * fit.rmse_V
+        assert all(discharge.rmse_before_V > 2.0 * discharge.rmse_V for discharge in fit.discharges)
+
+    def test_constants_and_ages_are_within_their_deviations(self, fit):
+        for constant in fit.constants[: len(RATE_CONSTANTS)]:
+            true = getattr(OTHER, constant.name)
+            assert abs(np.log(constant.value / true)) < 4.0 * constant.sd
+        for discharge, (q, r) in zip(fit.discharges, ((7400.0, 0.12), (6500.0, 0.15), (5500.0, 0.2)), strict=True):
+            assert abs(discharge.q_mobile - q) < 4.0 * discharge.sd_q_mobile < 0.02 * q
+            assert abs(discharge.r_o - r) < 4.0 * discharge.sd_r_o < 0.2 * r
+        identified = {constant.name for constant in fit.constants if constant.identified}
+        assert {"tDiffusion", "to", "tsn", "equilibrium 0"} <= identified
+
+    def test_the_cell_is_the_youngest_one(self, fit):
+        assert (fit.cell.q_mobile, fit.cell.r_o) == (fit.discharges[0].q_mobile, fit.discharges[0].r_o)
+        assert fit.cell.VEOD == 2.7
+
+    def test_what_the_discharges_do_not_show_stays_at_its_prior(self):
+        fit = fit_cell([discharged(NEW_CELL, 7000.0, 0.12, 2.0)])
+        kp = next(constant for constant in fit.constants if constant.name == "kp")
+        assert kp.value == pytest.approx(NEW_CELL.kp, rel=0.2) and kp.sd > 0.9 * kp.prior_sd and not kp.identified
+        assert "kp" in fit.summary() and "not identified" in fit.summary()
+
+    def test_a_cell_of_another_size(self):
+        size = 20.0
+        surfaces = {name: size * getattr(NEW_CELL, name) for name in ("Sn", "Sp", "mC")}
+        large = OTHER.replace(**surfaces)
+        fit = fit_cell([discharged(large, q * size, 0.1 / size, pulses(0, size / 2.0)) for q in (7000.0, 6000.0)])
+        assert fit.rmse_V < 0.003
+        assert fit.cell.q_mobile == pytest.approx(7000.0 * size, rel=0.02)
+
+    def test_another_chemistry(self):
+        # flat at 3.3 V, as with iron phosphate
+        flat = with_equilibrium(NEW_CELL, [-0.35, 0.33, -0.05, 0.05])
+        fit = fit_cell([discharged(flat, q, 0.12, pulses(n)) for n, q in enumerate((7400.0, 6000.0))], cut_off_V=2.5)
+        assert fit.rmse_V < 0.003
+        assert voltage(initial_state(cell=fit.cell), cell=fit.cell) == pytest.approx(
+            voltage(initial_state(cell=flat), cell=flat), abs=0.01
+        )
+
+    def test_what_no_constants_can_describe_is_refused(self, simulated):
+        record = simulated[0]
+        wild = record.voltage_V - 0.3 * (np.sin(record.time_s / 100.0) > 0.0)
+        with pytest.raises(ValueError, match=r"the equations do not describe this cell: .* mV off"):
+            fit_cell([Discharge(record.time_s, np.maximum(wild, 2.8), record.current_A)])
+
+
+class TestRealCells:
+    def test_the_constants_hold_for_another_cell(self, b0005_fit):
+        new = LeastSquares(thermal=True, mismatch_V=0.05)
+        own = b0005_fit.calibrator()
+        rmse_V, late = [], []
+        for discharge in load_nasa_discharges("B0006")[40:141:50]:
+            record = discharge.loaded_part(2.7)
+            for fit in (new, own):
+                error_V = fit.model.voltage(record, fit.estimate(record)) - record.voltage_V
+                half = record.until(0.5 * (record.time_s[0] + record.time_s[-1]))
+                eod_time_s = fit.model.forecast(half, fit.estimate(half), 2.7).eod_time_s
+                rmse_V.append(np.sqrt(np.mean(error_V**2)))
+                late.append(abs(eod_time_s / record.time_s[-1] - 1.0))
+        assert np.sum(rmse_V[1::2]) < 0.5 * np.sum(rmse_V[::2])
+        assert np.mean(late[1::2]) < 0.5 * np.mean(late[::2])
+
+    def test_a_forecast_takes_the_model_of_a_fit(self, b0005_fit):
+        calibrator = b0005_fit.calibrator()
+        discharge = load_nasa_discharges("B0006")[60]
+        end_s = discharge.eod_time_s(2.7)
+        record = discharge.loaded_part(2.7).until(0.75 * end_s)
+        estimate = calibrator.estimate(record)
+        found = forecast(record, estimate, model=calibrator.model, mismatch_V=b0005_fit.mismatch_V)
+        new = forecast(record, LeastSquares(thermal=True, mismatch_V=0.05).estimate(record), cut_off_V=2.7)
+        assert found.cut_off_V == 2.7  # that of the fit
+        low_s, median_s, high_s = found.eod_quantile_s()
+        assert low_s < end_s < high_s and abs(median_s - end_s) < 0.5 * abs(new.eod_quantile_s(0.5) - end_s)
+        assert 1.7 < found.nominal_Ah < 1.95  # the first discharge that was fitted gave 1.86 Ah
+        assert found.nominal_Ah == pytest.approx(calibrator.model.capacity_Ah(record.current_A[-1], "current", 2.7, 8e4))
+
+    def test_temperature_is_the_measured_one(self, b0005_fit):
+        assert 295.0 < b0005_fit.cell.Tb0 < 300.0
+
+    def test_discharges_have_names(self, b0005_fit):
+        assert [discharge.name for discharge in b0005_fit.discharges] == ["B0005:1", "B0005:85", "B0005:168"]
+        assert "B0005:85" in b0005_fit.summary()
+
+    def test_tables_and_figure(self, b0005_fit):
+        assert len(b0005_fit.constants_table()) == len(RATE_PRIOR_SD) + len(EQUILIBRIUM_PRIOR_SD_V)
+        assert list(b0005_fit.discharges_table()["name"]) == ["B0005:1", "B0005:85", "B0005:168"]
+        figure = plot_cell_fit(b0005_fit, load_nasa_discharges("B0006")[99:101])
+        assert len(figure.axes) == 4
+        before, after = (np.abs(line.get_ydata()).mean() for line in figure.axes[2].lines[1:])
+        assert before > after > 0.0
+
+
+class TestFiles:
+    def test_a_fit_survives_its_file(self, fit, tmp_path):
+        assert CellFit.from_json(fit.to_json(tmp_path / "cell.json")) == fit
+
+    def test_constants_survive_their_file(self, tmp_path):
+        assert CellParameters.from_json(OTHER.to_json(tmp_path / "constants.json")) == OTHER
+
+    def test_either_file_is_read_for_what_it_is(self, fit, tmp_path):
+        assert read_cell(fit.to_json(tmp_path / "fit.json")) == fit
+        assert read_cell(OTHER.to_json(tmp_path / "constants.json")) == OTHER
+        (tmp_path / "other.json").write_text("{}")
+        with pytest.raises(ValueError, match=r"other\.json holds no"):
+            read_cell(tmp_path / "other.json")
+
+    @pytest.mark.parametrize("method", METHODS)
+    def test_settings_use_all_that_a_fit_knows(self, method, fit):
+        settings = Settings.for_cell(fit, method=method)
+        assert (settings.cell, settings.mismatch_V, settings.cut_off_V) == (fit.cell, fit.mismatch_V, fit.cell.VEOD)
+        estimator, own = settings.calibrator(fit.cell), fit.calibrator()
+        assert estimator.bounds == own.bounds and estimator.bounds["q_mobile"][1] == pytest.approx(1.2 * fit.cell.q_mobile)
+        assert Settings.for_cell(fit, mismatch_V=0.1).mismatch_V == 0.1
+        assert Settings.for_cell(OTHER) == Settings(cell=OTHER)
+        assert Settings(method=method).calibrator(NEW_CELL).bounds == LeastSquares().bounds == ExtendedKalmanFilter().bounds
+        assert not Settings.for_cell(dataclasses.replace(fit, thermal=False)).thermal
+
+    @pytest.mark.parametrize("kind", [CellFit, CellParameters])
+    def test_nothing_is_overwritten(self, kind, fit, tmp_path):
+        value = fit if kind is CellFit else OTHER
+        value.to_json(tmp_path / "cell.json")
+        with pytest.raises(FileExistsError, match="exists already"):
+            value.to_json(tmp_path / "cell.json")
+
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            (lambda content: content.update(version=99), "of version 99"),
+            (lambda content: content.update(format="something"), "holds no battery_env.CellParameters but something"),
+            (lambda content: content["constants"].pop("kn"), "missing or unknown: kn"),
+            (lambda content: content["constants"].update(knn=1.0), "missing or unknown: knn"),
+            (lambda content: content["constants"].update(kn=-1.0), "kn must be greater than 0"),
+            (lambda content: content["constants"].update(kn="fast"), "kn must be float"),
+            (lambda content: content["constants"].update(Ap=1.0), "damaged"),
+            (lambda content: content.update(constants=[1.0]), "given by name"),
+            (lambda content: content.pop("constants"), "damaged"),
+        ],
+    )
+    def test_a_damaged_file_of_constants_is_refused(self, change, message, tmp_path):
+        path = OTHER.to_json(tmp_path / "constants.json")
+        content = json.loads(path.read_text())
+        change(content)
+        path.write_text(json.dumps(content))
+        with pytest.raises(ValueError, match=message):
+            CellParameters.from_json(path)
+
+    @pytest.mark.parametrize("text", ["", "{", "[]", "null", '"text"', "\udcff", "{}"])
+    @pytest.mark.parametrize("kind", [CellFit, CellParameters])
+    def test_what_is_no_such_file_is_refused(self, kind, text, tmp_path):
+        path = tmp_path / "cell.json"
+        path.write_bytes(text.encode("utf-8", "surrogateescape"))
+        with pytest.raises(ValueError, match=r"cell\.json"):
+            kind.from_json(path)
+
+    @pytest.mark.parametrize("name", ["cell", "constants", "discharges", "mismatch_V", "thermal"])
+    def test_a_damaged_fit_is_refused(self, name, fit, tmp_path):
+        path = fit.to_json(tmp_path / "fit.json")
+        content = json.loads(path.read_text())
+        for wrong in (None, [{"name": "kn"}]):
+            path.write_text(json.dumps({**content, name: wrong}))
+            with pytest.raises(ValueError, match="damaged"):
+                CellFit.from_json(path)
+        del content[name]
+        path.write_text(json.dumps(content))
+        with pytest.raises(ValueError, match="damaged"):
+            CellFit.from_json(path)
+
+
+class TestBadInput:
+    @pytest.mark.parametrize(
+        ("arguments", "error", "message"),
+        [
+            ({"discharges": []}, ValueError, "takes 1 to 30 discharges, got 0"),
+            ({"discharges": 5}, TypeError, "must be a list of discharges"),
+            ({"discharges": [1.0]}, TypeError, "discharge 1 of 1"),
+            ({"cut_off_V": -1.0}, ValueError, "cut_off_V"),
+            ({"cut_off_V": "low"}, ValueError, "cut_off_V"),
+            ({"limit_V": 0.0}, ValueError, "limit_V"),
+            ({"start": 5}, TypeError, "cell must be"),
+            ({"thermal": "yes"}, TypeError, "thermal must be"),
+            ({"dt_s": 100.0}, ValueError, "dt must"),
+        ],
+    )
+    def test_arguments_are_checked(self, arguments, error, message, simulated):
+        with pytest.raises(error, match=message):
+            fit_cell(**{"discharges": simulated, **arguments})
+
+    def test_a_single_discharge_is_no_list(self, simulated):
+        with pytest.raises(TypeError, match="must be a list of discharges, got Discharge"):
+            fit_cell(simulated[0])
