@@ -37,6 +37,7 @@ _FEWEST_READINGS = 3
 SENSORS = RandomSensorErrors(noise_V=(0.001, 0.030), offset_V=0.010)
 
 _COST_SCALE_V = 0.002
+_NEW: FloatArray = np.array([NEW_CELL.q_mobile, NEW_CELL.r_o])
 # What the parts of an observation are divided by
 _MISFIT_FLOOR_V = 0.001
 _SLOPE_SCALE_V_PER_C = 5e-5
@@ -111,8 +112,12 @@ class VoltageTask(CalibrationTask):
         self.observation_size = 6 * STRETCHES + 4 + len(parameters) + self._previous
         self._columns = [("q_mobile", "r_o").index(name) for name in parameters]
         self._low, self._high = np.array([ESTIMATE_RANGES[name] for name in parameters]).T
+        self._width = self._high - self._low
         self._step = np.array([LARGEST_STEPS[name] for name in parameters])
 
+        # the true parameters of the discharges, or the new cell's where they are not known
+        true = np.column_stack([readings.q_mobile, readings.r_o])
+        self._known = np.where(np.isnan(true), _NEW, true)
         longest = int(readings.count.max())
         self._all: IntArray = np.arange(cells)
         self._first: IntArray = np.zeros(cells, dtype=np.int64)
@@ -122,7 +127,7 @@ class VoltageTask(CalibrationTask):
         self._step_of_episode: IntArray = np.zeros(cells, dtype=np.int64)
         self._last_step: IntArray = np.zeros(cells, dtype=np.int64)  # of the discharge
         self._every = 0  # readings between two decisions of a whole record; 0: of an episode they are drawn
-        self._estimate = np.tile([NEW_CELL.q_mobile, NEW_CELL.r_o], (cells, 1))
+        self._estimate = np.tile(_NEW, (cells, 1))
         self._action = np.zeros((cells, len(parameters)))
         self._voltage_V, self._current_A, self._moved_C, self._ohmic_A = np.zeros((4, cells, longest))
         self._residual_V, self._slope_V_per_C, self._ohmic_means_A = np.zeros((3, cells, STRETCHES, 2))
@@ -277,17 +282,12 @@ class VoltageTask(CalibrationTask):
     def _decisions_in_a_discharge(self) -> int:
         return self.episode_steps
 
-    def _known(self, discharge: int) -> FloatArray:
-        """The true parameters of a discharge, or the new cell's where they are not known."""
-        true = np.array([self.readings.q_mobile[discharge], self.readings.r_o[discharge]])
-        return np.where(np.isnan(true), [NEW_CELL.q_mobile, NEW_CELL.r_o], true)
-
     def _first_estimate(self, discharge: int, generator: np.random.Generator | None) -> FloatArray:
-        estimate = self._known(discharge)
+        estimate = self._known[discharge].copy()
         if self.first_estimate == "random" and generator is not None:
-            estimate[self._columns] = generator.uniform(self._low, self._high)
+            estimate[self._columns] = self._low + self._width * generator.random(len(self._width))
         elif self.first_estimate != "true":
-            estimate[self._columns] = np.array([NEW_CELL.q_mobile, NEW_CELL.r_o])[self._columns]
+            estimate[self._columns] = _NEW[self._columns]
         return estimate
 
     def _measure(self, row: int, discharge: int, generator: np.random.Generator) -> None:
@@ -298,7 +298,7 @@ class VoltageTask(CalibrationTask):
             voltage_V += self.readings.process_noise_V(self.process_noise_V, generator.standard_normal((3, length)))
         noise_V = self.sensors.draw_noise_V(generator)
         noise = generator.standard_normal(length) if noise_V > 0.0 else np.zeros(length)
-        errors = replace(self.sensors.draw_biases(generator), noise_V=noise_V)
+        errors = self.sensors.draw_biases(generator, noise_V)
         read_V = errors.read_voltage_V(voltage_V, noise)
         if errors.change_the_current:
             measured = self.readings.remeasured(discharge, errors.gain(voltage_V, read_V), errors.current_offset_A)
