@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal, get_args
 
 import numpy as np
@@ -11,6 +13,7 @@ from battery_env.electrochemistry import FloatArray, Trajectory
 
 #: What is measured beside the voltage: the current, or the power, of which the current is that over the measured voltage.
 Measured = Literal["current", "power"]
+_MEASURED = get_args(Measured)
 
 
 @dataclass(frozen=True)
@@ -34,8 +37,8 @@ class SensorErrors:
 
     def __post_init__(self) -> None:
         _check_measured(self.measured)
-        for name in (field.name for field in fields(self) if field.name != "measured"):
-            if not np.isfinite(getattr(self, name)):
+        for name in ("noise_V", "offset_V", "current_gain", "current_offset_A"):
+            if not math.isfinite(getattr(self, name)):
                 raise ValueError(f"{name} must be finite, got {getattr(self, name)!r}")
         if self.noise_V < 0.0:
             raise ValueError(f"noise_V is a standard deviation and must be at least 0 V, got {self.noise_V!r}")
@@ -128,8 +131,7 @@ class RandomSensorErrors:
         :param rng: source of randomness
         :return: the errors
         """
-        noise_V = self.draw_noise_V(rng)
-        return replace(self.draw_biases(rng), noise_V=noise_V)
+        return self.draw_biases(rng, self.draw_noise_V(rng))
 
     def draw_noise_V(self, rng: np.random.Generator) -> float:
         """
@@ -138,22 +140,28 @@ class RandomSensorErrors:
         :param rng: source of randomness; nothing is drawn where there is no noise
         :return: its standard deviation, V
         """
-        return float(np.exp(rng.uniform(*np.log(self.noise_V)))) if self.noise_V[1] > 0.0 else 0.0
+        return float(np.exp(rng.uniform(*self._log_noise))) if self.noise_V[1] > 0.0 else 0.0
 
-    def draw_biases(self, rng: np.random.Generator) -> SensorErrors:
+    @cached_property
+    def _log_noise(self) -> tuple[float, float]:
+        least, greatest = np.log(self.noise_V).tolist()
+        return least, greatest
+
+    def draw_biases(self, rng: np.random.Generator, noise_V: float) -> SensorErrors:
         """
-        The errors of one discharge but for the noise.
+        The errors of one discharge whose noise is known.
 
         :param rng: source of randomness; nothing is drawn where a bound is 0
-        :return: errors without noise
+        :param noise_V: standard deviation of the noise, V
+        :return: the errors
         """
         offset_V, gain, offset_A = (
             rng.uniform(-bound, bound) if bound > 0.0 else 0.0
             for bound in (self.offset_V, self.current_gain, self.current_offset_A)
         )
-        return SensorErrors(0.0, offset_V, 1.0 + gain, offset_A, self.measured)
+        return SensorErrors(noise_V, offset_V, 1.0 + gain, offset_A, self.measured)
 
 
 def _check_measured(measured: str) -> None:
-    if measured not in get_args(Measured):
-        raise ValueError(f"measured must be one of {get_args(Measured)}, got {measured!r}")
+    if measured not in _MEASURED:
+        raise ValueError(f"measured must be one of {_MEASURED}, got {measured!r}")

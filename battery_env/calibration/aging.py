@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from battery_env.calibration.task import check_counts
-from battery_env.calibration.voltage import VoltageTask
+from battery_env.calibration.voltage import Cost, VoltageTask
 from battery_env.electrochemistry import FloatArray
 from battery_env.estimators.base import Record
 from battery_env.loads import RandomPiecewise
@@ -110,6 +110,7 @@ class BatteryAging(VoltageTask):
         process_noise_V: float = 0.0,
         start: Literal["random", "new_cell", "true"] = "new_cell",
         consistency: float = 0.0,
+        cost: Cost = "misfit",
         split: Literal["train", "test"] = "train",
         dataset: Sequence[Record] | None = None,
         **sensors: Any,
@@ -129,6 +130,7 @@ class BatteryAging(VoltageTask):
             process_noise_V=process_noise_V,
             start=start,
             consistency=consistency,
+            cost=cost,
             dataset=dataset,
             **sensors,
         )

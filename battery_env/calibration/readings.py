@@ -24,7 +24,7 @@ from battery_env.electrochemistry import (
     simulate,
 )
 from battery_env.electrochemistry.cell import BULK_RATE, SURFACE_RATE
-from battery_env.electrochemistry.kernels import equilibrium_voltage, mole_fraction, nominal_overpotentials
+from battery_env.electrochemistry.kernels import BLOCK, equilibrium_voltage, mole_fraction, nominal_overpotentials
 from battery_env.records import Record, resample_current
 
 # Far more charge and exactly as much resistance as it takes to read the linear part of the model off one simulation
@@ -34,6 +34,16 @@ _ONE_OHM = 1.0
 _SURFACE_SHARE_N, _SURFACE_SHARE_P = (float(FULL_CHARGE_SHARES[column - QNB]) for column in (QNS, QPS))
 #: Step of the difference quotient dV/dq, as a share of q.
 _RELATIVE_STEP = 1e-3
+
+# Readings are compared in blocks: one array, in rows that start at multiples that the compiler knows. It uses vector
+# instructions where it sees that rows do not overlap, and where no reading waits for the one before
+_MEASURED, _CURRENT, _MOVED, _OHMIC, _HALF, _VSN, _VSP, _FURTHER_VSN, _FURTHER_VSP, _MODELLED, _RESIDUAL, _SLOPE = range(12)
+_BLOCK_SIZE = 12 * BLOCK
+# the most numbers that an instruction takes at once (AVX-512)
+_LANES = 8
+
+_compiled = njit(cache=True, error_model="numpy")
+_inlined = njit(cache=True, error_model="numpy", forceinline=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,7 +236,71 @@ def _linear_part(
     return moved_C + start[QNB] - state[:, QNB], moved_C, state[:, VO] / _ONE_OHM
 
 
-@njit(cache=True, error_model="numpy")
+@_compiled
+def _fill_block(block: FloatArray, arrays: tuple[FloatArray, ...], n: int, low: int, size: int, moved_before: float) -> int:
+    # Take some readings of a cell into a block, and repeat the last one up to the length that is returned, which vector
+    # instructions divide without a rest
+    padded = (size + _LANES - 1) // _LANES * _LANES
+    for row in range(len(arrays)):
+        values = arrays[row][n, low : low + size]
+        for k in range(size):
+            block[row * BLOCK + k] = values[k]
+        for k in range(size, padded):
+            block[row * BLOCK + k] = values[size - 1]
+    # the overpotentials relax towards their value half way between two readings
+    block[_HALF * BLOCK] = 0.5 * (moved_before + block[_MOVED * BLOCK])
+    for k in range(1, padded):
+        block[_HALF * BLOCK + k] = 0.5 * (block[_MOVED * BLOCK + k - 1] + block[_MOVED * BLOCK + k])
+    return padded
+
+
+@_inlined
+def _fractions(moved: float, q: float, constants: FloatArray) -> tuple[float, float]:
+    xn = mole_fraction(_SURFACE_SHARE_N * q - moved, q, True, constants, 0)
+    return xn, mole_fraction(_SURFACE_SHARE_P * q + moved, q, True, constants, 0)
+
+
+@_compiled
+def _nominal_overpotentials_of_block(
+    block: FloatArray, size: int, q: float, further_q: float, temperature_K: float, constants: FloatArray
+) -> None:
+    for k in range(size):
+        current, half = block[_CURRENT * BLOCK + k], block[_HALF * BLOCK + k]
+        xn, xp = _fractions(half, q, constants)
+        vsn, vsp = nominal_overpotentials(current, xn, xp, temperature_K, constants, 0)
+        block[_VSN * BLOCK + k], block[_VSP * BLOCK + k] = vsn, vsp
+        xn, xp = _fractions(half, further_q, constants)
+        vsn, vsp = nominal_overpotentials(current, xn, xp, temperature_K, constants, 0)
+        block[_FURTHER_VSN * BLOCK + k], block[_FURTHER_VSP * BLOCK + k] = vsn, vsp
+
+
+@_compiled
+def _voltages_of_block(
+    block: FloatArray,
+    size: int,
+    q: float,
+    further_q: float,
+    r_o: float,
+    temperature_K: float,
+    constants: FloatArray,
+    polynomial_n: FloatArray,
+    polynomial_p: FloatArray,
+) -> None:
+    step_C = q * _RELATIVE_STEP
+    for k in range(size):
+        moved, ohmic_V = block[_MOVED * BLOCK + k], r_o * block[_OHMIC * BLOCK + k]
+        xn, xp = _fractions(moved, q, constants)
+        equilibrium = equilibrium_voltage(xn, xp, temperature_K, constants, 0, polynomial_n, polynomial_p)
+        modelled = equilibrium - block[_VSN * BLOCK + k] - block[_VSP * BLOCK + k] - ohmic_V
+        xn, xp = _fractions(moved, further_q, constants)
+        equilibrium = equilibrium_voltage(xn, xp, temperature_K, constants, 0, polynomial_n, polynomial_p)
+        further = equilibrium - block[_FURTHER_VSN * BLOCK + k] - block[_FURTHER_VSP * BLOCK + k] - ohmic_V
+        block[_MODELLED * BLOCK + k] = modelled
+        block[_RESIDUAL * BLOCK + k] = block[_MEASURED * BLOCK + k] - modelled
+        block[_SLOPE * BLOCK + k] = (further - modelled) / step_C
+
+
+@_compiled
 def explain(
     rows: IntArray,
     count: IntArray,
@@ -276,56 +350,60 @@ def explain(
     :param rms_V: root mean square of all residuals that count, shape (n,), overwritten
     :param last_V: voltage of the model at the last reading, shape (n,), overwritten
     """
-    stretches = residual_V.shape[1]
-    values, sums = np.empty((2, voltage_V.shape[1])), np.empty((2, 4))
-    half_C, vsn, vsp = np.empty((3, voltage_V.shape[1]))
+    stretches, block = residual_V.shape[1], np.empty(_BLOCK_SIZE)
+    # of all readings of one cell: measured minus modelled voltage, and dV/dq
+    residual, slope = np.empty((2, voltage_V.shape[1]))
+    arrays = (voltage_V, current_A, moved_C, ohmic_A)
     for n in rows:
-        moved, current, ohmic, last = moved_C[n], current_A[n], ohmic_A[n], count[n]
-        # the overpotentials relax towards their value half way between two readings
-        half_C[0] = 0.5 * moved[0]
-        for k in range(1, last):
-            half_C[k] = 0.5 * (moved[k - 1] + moved[k])
-        for trial in range(2):
-            q = q_mobile[n] * (1.0 + trial * _RELATIVE_STEP)
-            # three loops: the compiler uses vector instructions where no reading waits for the one before
-            for k in range(last):
-                xn = mole_fraction(_SURFACE_SHARE_N * q - half_C[k], q, True, constants, 0)
-                xp = mole_fraction(_SURFACE_SHARE_P * q + half_C[k], q, True, constants, 0)
-                vsn[k], vsp[k] = nominal_overpotentials(current[k], xn, xp, temperature_K, constants, 0)
-            vsn_k, vsp_k = 0.0, 0.0
-            for k in range(last):
-                vsn_k += relaxed_n * (vsn[k] - vsn_k)
-                vsp_k += relaxed_p * (vsp[k] - vsp_k)
-                vsn[k], vsp[k] = vsn_k, vsp_k
-            for k in range(first[n], last):
-                xn = mole_fraction(_SURFACE_SHARE_N * q - moved[k], q, True, constants, 0)
-                xp = mole_fraction(_SURFACE_SHARE_P * q + moved[k], q, True, constants, 0)
-                equilibrium = equilibrium_voltage(xn, xp, temperature_K, constants, 0, polynomial_n, polynomial_p)
-                values[trial, k] = equilibrium - vsn[k] - vsp[k] - r_o[n] * ohmic[k]
-        span = count[n] - first[n]
+        begin, end, q, r = first[n], count[n], q_mobile[n], r_o[n]
+        further_q = q * (1.0 + _RELATIVE_STEP)
+        moved_before = vsn = vsp = further_vsn = further_vsp = 0.0
+        for low in range(0, end, BLOCK):
+            size = min(BLOCK, end - low)
+            padded = _fill_block(block, arrays, n, low, size, moved_before)
+            moved_before = block[_MOVED * BLOCK + size - 1]
+            _nominal_overpotentials_of_block(block, padded, q, further_q, temperature_K, constants)
+            for k in range(size):
+                vsn += relaxed_n * (block[_VSN * BLOCK + k] - vsn)
+                vsp += relaxed_p * (block[_VSP * BLOCK + k] - vsp)
+                further_vsn += relaxed_n * (block[_FURTHER_VSN * BLOCK + k] - further_vsn)
+                further_vsp += relaxed_p * (block[_FURTHER_VSP * BLOCK + k] - further_vsp)
+                block[_VSN * BLOCK + k], block[_VSP * BLOCK + k] = vsn, vsp
+                block[_FURTHER_VSN * BLOCK + k], block[_FURTHER_VSP * BLOCK + k] = further_vsn, further_vsp
+            _voltages_of_block(block, padded, q, further_q, r, temperature_K, constants, polynomial_n, polynomial_p)
+            for k in range(size):
+                residual[low + k] = block[_RESIDUAL * BLOCK + k]
+                slope[low + k] = block[_SLOPE * BLOCK + k]
+            last_V[n] = block[_MODELLED * BLOCK + size - 1]
+        span = end - begin
         square = 0.0
-        for k in range(first[n], count[n]):
-            square += (voltage_V[n, k] - values[0, k]) ** 2
+        for k in range(begin, end):
+            square += residual[k] ** 2
         rms_V[n] = np.sqrt(square / span)
-        last_V[n] = values[0, count[n] - 1]
-        step_C = q_mobile[n] * _RELATIVE_STEP
         for j in range(stretches):
-            low = first[n] + j * span // stretches
-            high = max(low + 1, first[n] + (j + 1) * span // stretches)
+            low = begin + j * span // stretches
+            high = max(low + 1, begin + (j + 1) * span // stretches)
             middle_A = 0.0
             for k in range(low, high):
                 middle_A += ohmic_A[n, k]
             middle_A /= high - low
-            sums[:] = 0.0
+            # of the readings with less and with more than that; a sum of zeros costs less than a branch that nobody foresees
+            residual_0 = residual_1 = slope_0 = slope_1 = ohmic_0 = ohmic_1 = 0.0
+            count_1 = 0
             for k in range(low, high):
-                half = 1 if ohmic_A[n, k] > middle_A else 0
-                sums[half, 0] += voltage_V[n, k] - values[0, k]
-                sums[half, 1] += (values[1, k] - values[0, k]) / step_C
-                sums[half, 2] += ohmic_A[n, k]
-                sums[half, 3] += 1.0
-            for half in range(2):
+                r, s, o = residual[k], slope[k], ohmic_A[n, k]
+                more = o > middle_A
+                residual_0 += 0.0 if more else r
+                residual_1 += r if more else 0.0
+                slope_0 += 0.0 if more else s
+                slope_1 += s if more else 0.0
+                ohmic_0 += 0.0 if more else o
+                ohmic_1 += o if more else 0.0
+                count_1 += 1 if more else 0
+            count_0 = high - low - count_1
+            if count_1 == 0:
                 # under a constant current there is one half only
-                source = half if sums[half, 3] > 0.0 else 1 - half
-                residual_V[n, j, half] = sums[source, 0] / sums[source, 3]
-                slope_V_per_C[n, j, half] = sums[source, 1] / sums[source, 3]
-                ohmic_means_A[n, j, half] = sums[source, 2] / sums[source, 3]
+                residual_1, slope_1, ohmic_1, count_1 = residual_0, slope_0, ohmic_0, count_0
+            residual_V[n, j, 0], residual_V[n, j, 1] = residual_0 / count_0, residual_1 / count_1
+            slope_V_per_C[n, j, 0], slope_V_per_C[n, j, 1] = slope_0 / count_0, slope_1 / count_1
+            ohmic_means_A[n, j, 0], ohmic_means_A[n, j, 1] = ohmic_0 / count_0, ohmic_1 / count_1

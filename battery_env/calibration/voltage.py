@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import lru_cache
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +36,11 @@ _FEWEST_READINGS = 3
 #: What the discharges that episodes are made of are read with.
 SENSORS = RandomSensorErrors(noise_V=(0.001, 0.030), offset_V=0.010)
 
+#: What a decision costs: what the readings say against the estimate, or the error of the model's hidden state.
+Cost = Literal["misfit", "state"]
 _COST_SCALE_V = 0.002
+_STATE_COST_SCALE = 0.01
+_NEW: FloatArray = np.array([NEW_CELL.q_mobile, NEW_CELL.r_o])
 # What the parts of an observation are divided by
 _MISFIT_FLOOR_V = 0.001
 _SLOPE_SCALE_V_PER_C = 5e-5
@@ -58,6 +62,7 @@ class VoltageTask(CalibrationTask):
     optimum. Then new readings arrive, and the cost grows with the misfit to all data so far at the new estimate: the root mean
     square of the mean residuals of equal stretches of the data, whose noise is smaller than that of single readings, after
     the offset that the sensor may have. It knows no true parameter, so that a task can be made of recorded discharges too.
+    Of simulated ones the cost may be the error of the model's hidden state instead, as in the paper.
 
     One parameter may be known instead: the true one of a simulated discharge, and the new cell's of a recorded one. What
     differs between the registered tasks is data of their classes; their options are described on the page of
@@ -79,6 +84,7 @@ class VoltageTask(CalibrationTask):
         process_noise_V: float = 0.0,
         start: Literal["random", "new_cell", "true"] = "random",
         consistency: float = 0.0,
+        cost: Cost = "misfit",
         load: LoadKind = "piecewise",
         split: Split = "train",
         dt_s: float = 1.0,
@@ -92,6 +98,8 @@ class VoltageTask(CalibrationTask):
             raise ValueError(f"new_readings must be (fewest, most) with 0 <= fewest <= most, got {new_readings!r}")
         if start not in ("random", "new_cell", "true"):
             raise ValueError(f"start must be one of ('random', 'new_cell', 'true'), got {start!r}")
+        if cost not in get_args(Cost):
+            raise ValueError(f"cost must be one of {get_args(Cost)}, got {cost!r}")
         data: dict[str, Any] = {"load": load, "split": split, "dt_s": dt_s, "mismatch": mismatch}
         if dataset is None:
             dataset = standard_dataset("joint" if len(self.parameters) == 2 else self.parameters[0], **data)
@@ -111,8 +119,20 @@ class VoltageTask(CalibrationTask):
         self.observation_size = 6 * STRETCHES + 4 + len(parameters) + self._previous
         self._columns = [("q_mobile", "r_o").index(name) for name in parameters]
         self._low, self._high = np.array([ESTIMATE_RANGES[name] for name in parameters]).T
+        self._width = self._high - self._low
         self._step = np.array([LARGEST_STEPS[name] for name in parameters])
 
+        # the true parameters of the discharges, or the new cell's where they are not known
+        true = np.column_stack([readings.q_mobile, readings.r_o])
+        is_unknown = np.isnan(true)
+        self._known = np.where(is_unknown, _NEW, true)
+        if cost == "state" and is_unknown.any():
+            unknown = int(is_unknown.any(axis=1).sum())
+            raise ValueError(
+                f"cost='state' is the error of a state that only a simulation knows, and {unknown} of {len(true)} "
+                "discharges are not simulated: take cost='misfit' for recorded ones"
+            )
+        self._cost = cost
         longest = int(readings.count.max())
         self._all: IntArray = np.arange(cells)
         self._first: IntArray = np.zeros(cells, dtype=np.int64)
@@ -122,7 +142,7 @@ class VoltageTask(CalibrationTask):
         self._step_of_episode: IntArray = np.zeros(cells, dtype=np.int64)
         self._last_step: IntArray = np.zeros(cells, dtype=np.int64)  # of the discharge
         self._every = 0  # readings between two decisions of a whole record; 0: of an episode they are drawn
-        self._estimate = np.tile([NEW_CELL.q_mobile, NEW_CELL.r_o], (cells, 1))
+        self._estimate = np.tile(_NEW, (cells, 1))
         self._action = np.zeros((cells, len(parameters)))
         self._voltage_V, self._current_A, self._moved_C, self._ohmic_A = np.zeros((4, cells, longest))
         self._residual_V, self._slope_V_per_C, self._ohmic_means_A = np.zeros((3, cells, STRETCHES, 2))
@@ -200,7 +220,7 @@ class VoltageTask(CalibrationTask):
     def follow(cls, records: Sequence[Record], every: int, **options: Any) -> VoltageTask:
         """
         Go through whole records, each with a cell of its own: from its first readings, measured as they are, and from the
-        estimate of a new cell.
+        estimate of a new cell. The cost is the misfit, so that a policy of any cost can be asked about recorded discharges.
 
         :param records: discharges from full charge, simulated or recorded
         :param every: readings between two decisions, and before the first one
@@ -208,7 +228,7 @@ class VoltageTask(CalibrationTask):
         :return: the task, at its first observations
         """
         discharges = cls._discharges_of_an_episode(options)
-        task = cls(len(records) // discharges, **{"start": "new_cell", **options, "dataset": records})
+        task = cls(len(records) // discharges, **{"start": "new_cell", **options, "dataset": records, "cost": "misfit"})
         task._every = every
         for row in range(task.cells):
             n = row * discharges
@@ -277,17 +297,12 @@ class VoltageTask(CalibrationTask):
     def _decisions_in_a_discharge(self) -> int:
         return self.episode_steps
 
-    def _known(self, discharge: int) -> FloatArray:
-        """The true parameters of a discharge, or the new cell's where they are not known."""
-        true = np.array([self.readings.q_mobile[discharge], self.readings.r_o[discharge]])
-        return np.where(np.isnan(true), [NEW_CELL.q_mobile, NEW_CELL.r_o], true)
-
     def _first_estimate(self, discharge: int, generator: np.random.Generator | None) -> FloatArray:
-        estimate = self._known(discharge)
+        estimate = self._known[discharge].copy()
         if self.first_estimate == "random" and generator is not None:
-            estimate[self._columns] = generator.uniform(self._low, self._high)
+            estimate[self._columns] = self._low + self._width * generator.random(len(self._width))
         elif self.first_estimate != "true":
-            estimate[self._columns] = np.array([NEW_CELL.q_mobile, NEW_CELL.r_o])[self._columns]
+            estimate[self._columns] = _NEW[self._columns]
         return estimate
 
     def _measure(self, row: int, discharge: int, generator: np.random.Generator) -> None:
@@ -298,7 +313,7 @@ class VoltageTask(CalibrationTask):
             voltage_V += self.readings.process_noise_V(self.process_noise_V, generator.standard_normal((3, length)))
         noise_V = self.sensors.draw_noise_V(generator)
         noise = generator.standard_normal(length) if noise_V > 0.0 else np.zeros(length)
-        errors = replace(self.sensors.draw_biases(generator), noise_V=noise_V)
+        errors = self.sensors.draw_biases(generator, noise_V)
         read_V = errors.read_voltage_V(voltage_V, noise)
         if errors.change_the_current:
             measured = self.readings.remeasured(discharge, errors.gain(voltage_V, read_V), errors.current_offset_A)
@@ -372,10 +387,14 @@ class VoltageTask(CalibrationTask):
         self._estimate[:, self._columns] = np.clip(moved, self._low, self._high)
         self._arrive()
         self._explain()
-        cost = np.arcsinh(self._misfit_V / _COST_SCALE_V)
+        cost = np.arcsinh(self._state_error() / _STATE_COST_SCALE if self._cost == "state" else self._misfit_V / _COST_SCALE_V)
         cost += self.consistency * np.linalg.norm(step - self._action, axis=1)
         self._action = step
         return cost
+
+    def _state_error(self) -> FloatArray:
+        # relative: at a given current the charges are linear in q_mobile, and the ohmic drop is linear in r_o
+        return np.asarray(np.linalg.norm(self._estimate / self._known[self.discharge] - 1.0, axis=1))
 
     def _arrive(self) -> None:
         step = np.minimum(self._step_of_episode, self.episode_steps - 1)

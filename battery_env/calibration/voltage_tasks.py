@@ -12,8 +12,8 @@ class BatteryVoltageJoint(VoltageTask):
     A Li-ion cell of unknown age is discharged from full charge under a power that changes every one or two minutes. Current
     and terminal voltage are read every ten seconds; no state of the cell is measured. Find both parameters that age,
     q^max (``q_mobile``, the charge that can move) and R_o (``r_o``, the ohmic resistance), by explaining all readings so far
-    with one pair of them. The paper (Unagar et al. 2020) names this as future work. No label is used: the reward knows
-    readings and estimate alone, so that the task can be made of recorded discharges too.
+    with one pair of them. The paper (Unagar et al. 2020) names this as future work. By default no label is used: the reward
+    knows readings and estimate alone, so that the task can be made of recorded discharges too.
 
     The voltage of the model for any (q_mobile, r_o) at all readings so far costs no simulation: see
     ``battery_env.calibration.readings.Readings``.
@@ -50,6 +50,12 @@ class BatteryVoltageJoint(VoltageTask):
 
     Minus the cost: asinh of the misfit over 2 mV, at the new estimate and with the new readings.
 
+    With ``cost="state"`` the cost is the error of the model's hidden state, as in the paper. The charges are linear in
+    q_mobile, and the ohmic drop is linear in r_o, so that it comes down to the relative errors of the estimate: asinh of
+    the root of their sum of squares over 1 %. The simulator knows it while the policy is trained. The policy does not see
+    it, and does not need it at run time. It matters where the model is wrong (``mismatch``): there the pair of parameters
+    with the least misfit is not the true one.
+
     ## Starting state
 
     A random reading of a random discharge of the training part (700 of 1000 discharges, q_mobile = 4000 .. 7600 C,
@@ -76,6 +82,7 @@ class BatteryVoltageJoint(VoltageTask):
     | ``measured`` | ``"current"`` | or ``"power"``: the current is the measured power over the measured voltage |
     | ``start`` | ``"random"`` | first estimate; or ``"new_cell"``, ``"true"`` |
     | ``consistency`` | 0 | cost of a change of the action per unit of its length (the paper's consistency penalty); above 0 the action before is appended to the observation |
+    | ``cost`` | ``"misfit"`` | or ``"state"``: the error of the model's hidden state, for simulated discharges |
     | ``load`` | ``"piecewise"`` | or ``"constant"``, ``"random_walk"``, ``"recorded"``, ``"paper"`` |
     | ``split`` | ``"train"`` | or ``"test"``, ``"all"`` |
     | ``dt_s`` | 1 | time step of the cell, s |

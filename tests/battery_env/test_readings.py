@@ -116,6 +116,18 @@ def test_fewer_readings_than_stretches_share_them(readings):
     np.testing.assert_array_equal(shared, np.repeat(fine, 4, axis=1))
 
 
+@pytest.mark.parametrize("readings_so_far", [1, 7, 8, 9, 63, 64, 65, 127, 128, 129])
+def test_later_readings_and_the_blocks_they_come_in_change_nothing(readings, readings_so_far):
+    whole, part = (
+        compare(readings, readings.q_mobile * 0.95, readings.r_o, np.full(len(readings), count), stretches=count)
+        for count in (130, readings_so_far)
+    )
+    for k in range(3):
+        np.testing.assert_array_equal(part[k], whole[k][:, :readings_so_far])
+    one_more = compare(readings, readings.q_mobile * 0.95, readings.r_o, np.full(len(readings), readings_so_far + 1))
+    assert (one_more[4] != part[4]).all()
+
+
 def test_only_what_counts_counts(readings):
     count = np.full(len(readings), 30)
     whole = compare(readings, readings.q_mobile * 1.05, readings.r_o, count, stretches=30)

@@ -157,6 +157,43 @@ class TestTask:
             np.testing.assert_allclose(task.advance(action), plain.advance(action) + 2.0 * change)
             np.testing.assert_array_equal(task.observation()[:, -2:], action.astype(np.float32))
 
+    @pytest.mark.parametrize("kind", [BatteryVoltageQmax, BatteryVoltageRo, BatteryVoltageJoint])
+    def test_the_error_of_the_state_is_that_of_the_parameters(self, data, kind):
+        task, by_misfit = (started(data, kind, cost=cost) for cost in ("state", "misfit"))
+        np.testing.assert_array_equal(task.observation(), by_misfit.observation())
+        for _ in range(8):
+            action = np.random.default_rng(0).uniform(-1.0, 1.0, (4, len(task.parameters)))
+            cost, misfit = task.advance(action), by_misfit.advance(action)
+            report = task.report()
+            percent = [100.0 * (report[f"{name}_hat"] - report[name]) / report[name] for name in task.parameters]
+            np.testing.assert_allclose(cost, np.arcsinh(np.sqrt(np.sum(np.square(percent), axis=0))), rtol=1e-12)
+            assert (cost != misfit).all()
+            # nothing else knows of it
+            np.testing.assert_array_equal(task.observation(), by_misfit.observation())
+
+    def test_the_error_of_the_state_is_zero_at_the_truth_however_wrong_the_model(self):
+        wrong = TrajectoryDataset.generate("joint", 4, RandomPiecewise(), seed=5, r_o_range=(0.1, 0.3), mismatch=0.2)
+        task = started(wrong, start="true", cost="state")
+        np.testing.assert_array_equal(task.advance(np.zeros((4, 2))), 0.0)
+        assert (started(wrong, start="true").advance(np.zeros((4, 2))) > 0.5).all()
+
+    def test_no_estimate_within_the_ranges_costs_more_than_its_corners(self):
+        farthest = [(high - low) / low for low, high in ((4000.0, 8100.0), (0.1, 0.35))]
+        task = BatteryVoltageJoint(64, cost="state", split="test")
+        task.start(np.arange(64), generators(64))
+        rng = np.random.default_rng(0)
+        for _ in range(8):
+            cost = task.advance(np.sign(rng.uniform(-1.0, 1.0, (64, 2))))
+            assert (cost > 0.0).all() and (cost <= np.arcsinh(100.0 * np.hypot(*farthest))).all()
+
+    def test_a_recording_does_not_know_its_state(self, data):
+        recorded = [discharge.loaded_part(3.0) for discharge in load_nasa_discharges("B0005")[:2]]
+        with pytest.raises(ValueError, match="and 2 of 10 discharges are not simulated: take cost='misfit'"):
+            BatteryVoltageJoint(1, dataset=[*data, *recorded], cost="state")
+        # a policy that was trained with it can be asked about one
+        task = BatteryVoltageJoint.follow(recorded, 30, cost="state")
+        assert np.isfinite(task.advance(np.zeros((2, 2)))).all()
+
     def test_no_new_readings_after_the_last_one(self, data, readings):
         task = started(data, new_readings=(400, 400), episode_steps=3)
         counts = []
@@ -189,6 +226,7 @@ class TestTask:
             ({"start": "new"}, "start must be one of .*, got 'new'"),
             ({"measured": "voltage"}, "measured must be one of .*, got 'voltage'"),
             ({"consistency": np.inf}, "consistency must be .*, got inf"),
+            ({"cost": "label"}, "cost must be one of .*, got 'label'"),
         ],
     )
     def test_bad_options_are_refused(self, data, options, message):
@@ -303,6 +341,15 @@ class TestAging:
                 scaled = 2.0 * (carried - LOW) / (HIGH - LOW) - 1.0
                 np.testing.assert_allclose(task.observation()[:, -2:], scaled, atol=1e-6)
         assert task.truncated().all()
+
+    def test_the_error_of_the_state_is_that_of_the_cycle(self, lives):
+        task = BatteryAging(2, dataset=lives, cycles=4, decisions_per_cycle=3, cost="state")
+        task.start(np.arange(2), generators(2))
+        for _ in range(12):
+            cost = task.advance(np.full((2, 2), 0.1))
+            true = np.column_stack([lives.q_mobile[task.discharge], lives.r_o[task.discharge]])
+            percent = 100.0 * (task.estimate - true) / true
+            np.testing.assert_allclose(cost, np.arcsinh(np.hypot(*percent.T)), rtol=1e-12)
 
     def test_same_seed_same_life(self, lives):
         many, one = (BatteryAging(cells, dataset=lives, cycles=4, decisions_per_cycle=3) for cells in (3, 1))
