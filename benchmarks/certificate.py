@@ -1,5 +1,6 @@
 """
-Certificates of reference controllers and of trained policies: a Lyapunov function fitted to roll-outs, judged on others.
+Certificates of reference controllers, of the same with too little gain or the wrong sign, and of trained policies: a Lyapunov
+function fitted to roll-outs, judged on others.
 
 .. code-block:: bash
 
@@ -7,7 +8,7 @@ Certificates of reference controllers and of trained policies: a Lyapunov functi
   python -m benchmarks.certificate --algos lac sac td3 --fractions 1 0.1
   python -m benchmarks.certificate --envs CartPoleCost-v0 --models sac=model.zip
 
-Without algorithms and models only the reference controllers are judged, which takes minutes and trains nothing.
+Without algorithms and models only controllers are judged, which takes minutes and trains nothing.
 """
 
 from __future__ import annotations
@@ -21,11 +22,14 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 from rl_zoo3 import ALGOS
+from scipy.linalg import eigh
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.type_aliases import PolicyPredictor
+from tqdm import tqdm
 
 from battery_env.plotting import COLOURS, new_figure, save_figure
-from benchmarks.controllers import reference_controllers
+from benchmarks.controllers import controllers, factors
+from benchmarks.references import DISTURBANCES
 from benchmarks.study import Study, command_line
 from benchmarks.training import Recipe, train_or_load
 from sb3_lac import LAC, certify, evaluate_lyapunov, fit_lyapunov
@@ -38,26 +42,27 @@ _FIT_SEED, _EVALUATION_SEED, _CERTIFICATION_SEED = 10_000, 20_000, 30_000
 _STATEMENTS = ("survives", "stays_within", "decreases")
 
 
-def judge(policy: PolicyPredictor, env_id: str, episodes: int, out: Path, name: str) -> list[dict[str, Any]]:
+def judge(policy: PolicyPredictor, env_id: str, episodes: int, figures: Path | None = None) -> list[dict[str, Any]]:
     """
     Fit, evaluate and certify one policy; for LAC, the critic beside the fitted function.
 
     :param policy: the policy
     :param env_id: id of the environment
     :param episodes: number of episodes for each of the three
-    :param out: folder of the figures
-    :param name: of the policy, for its files
+    :param figures: how the names of the figures' files begin; none are drawn without
     :return: one row per Lyapunov function
     """
     env = make_vec_env(env_id, n_envs=_N_ENVS)
-    fitted = fit_lyapunov(policy, env, episodes, seed=_FIT_SEED)
+    fitted = fit_lyapunov(policy, env, episodes, seed=_FIT_SEED, progress_bar=False)
     certification = certify(policy, env, fitted, episodes, seed=_CERTIFICATION_SEED)
-    save_figure(certification.plot(), out / f"{name}_statements.png")
+    if figures is not None:
+        save_figure(certification.plot(), figures.with_name(f"{figures.name}_statements.png"))
     functions = {"fitted": fitted} | ({"critic": CriticLyapunov(policy)} if isinstance(policy, LAC) else {})
     rows = []
     for function, lyapunov in functions.items():
         report = evaluate_lyapunov(policy, env, episodes, seed=_EVALUATION_SEED, lyapunov=lyapunov)
-        save_figure(report.plot_drift(), out / f"{name}_{function}_drift.png")
+        if figures is not None:
+            save_figure(report.plot_drift(), figures.with_name(f"{figures.name}_{function}_drift.png"))
         row: dict[str, Any] = {"function": function, "holds": report.holds}
         for metric, (value, low, high) in report.metrics.items():
             row |= {metric: value, f"{metric}_low": low, f"{metric}_high": high}
@@ -79,7 +84,7 @@ def policies(chosen: argparse.Namespace, env_id: str) -> list[tuple[str, int | N
     :return: name, seed of the training if there was one, policy
     """
     found: list[tuple[str, int | None, PolicyPredictor]] = [
-        (name, None, controller) for name, controller in reference_controllers(env_id).items()
+        (name, None, controller) for name, controller in controllers(env_id).items()
     ]
     for model in chosen.models:
         algo, _, path = model.partition("=")
@@ -99,22 +104,21 @@ def policies(chosen: argparse.Namespace, env_id: str) -> list[tuple[str, int | N
 def feasible_alpha3() -> pd.DataFrame:
     """
     The largest alpha3 that holds in every state of ``LinearCost-v0``, exactly and without noise: with
-    ``kappa = sup L / c`` it is ``(1 - (1 - gamma) kappa) / gamma`` for the discounted cost, and 1 for the average cost.
+    ``kappa = sup L / c`` it is ``(1 - (1 - gamma) kappa) / gamma`` for the cost discounted by gamma, and 1 for the average
+    cost. kappa is the largest eigenvalue of ``P x = kappa C x``, for the quadratic forms of L and of the cost.
 
-    :return: one row per reference controller that settles
+    :return: one row per controller that settles: the gain that is optimal for that discount, and a share of it
     """
     env = LinearCostEnv()
     rows = []
-    for name, controller in reference_controllers("LinearCost-v0").items():
-        gain = controller.gain
-        radius = float(np.abs(np.linalg.eigvals(env.A - env.B @ gain)).max())
-        if radius >= 1:
+    for name, factor in factors("LinearCost-v0").items():
+        if factor <= 0:
             continue
-        row: dict[str, Any] = {"controller": name, "spectral radius": f"{radius:.3f}"}
-        for gamma in (0.9, 0.95, 0.99):
-            stage = env.Q + gain.T @ env.R @ gain
-            kappa = np.linalg.eigvals(np.linalg.solve(stage, env.value_matrix(gain, gamma))).real.max()
-            row[f"discount {gamma:g}"] = f"{(1 - (1 - gamma) * kappa) / gamma:.2f}"
+        row: dict[str, Any] = {"controller": name}
+        for gamma in (0.6, 0.9, 0.95, 0.99):
+            gain = factor * env.optimal_gain(gamma)
+            kappa = eigh(env.value_matrix(gain, gamma), env.Q + gain.T @ env.R @ gain, eigvals_only=True).max()
+            row[f"discount {gamma:g}"] = f"{(1 - (1 - gamma) * kappa) / gamma:.2f} ({kappa:.2f})"
         rows.append({**row, "average cost": "1.00"})
     return pd.DataFrame(rows)
 
@@ -126,7 +130,7 @@ def report(table: pd.DataFrame) -> str:
     :param table: one row per Lyapunov function
     :return: the exact shares that are feasible, and one table per environment
     """
-    text = "The largest feasible `alpha3` of the exact function:\n\n"
+    text = "The largest feasible `alpha3` of the exact function, and in brackets the largest L / c:\n\n"
     text += feasible_alpha3().to_markdown(index=False, disable_numparse=True) + "\n"
     for env_id, of_env in table.groupby("env", sort=False):
         rows = []
@@ -157,8 +161,13 @@ def plot(table: pd.DataFrame) -> Figure:
     :return: the figure
     """
     envs = table["env"].unique()
-    figure = new_figure(4.6 * len(envs), 0.6 + 0.35 * table.groupby("env").size().max())
-    for axes, env_id in zip(figure.subplots(1, len(envs), squeeze=False)[0], envs, strict=True):
+    n_columns = min(len(envs), 3)
+    n_rows = -(-len(envs) // n_columns)
+    figure = new_figure(4.6 * n_columns, 0.6 + n_rows * (0.8 + 0.25 * table.groupby("env").size().max()))
+    panels = figure.subplots(n_rows, n_columns, squeeze=False).ravel()
+    for axes in panels[len(envs) :]:
+        axes.remove()
+    for axes, env_id in zip(panels, envs, strict=False):
         of_env = table[table["env"] == env_id].reset_index(drop=True)
         rows = of_env.index.to_numpy()[::-1]
         colours = np.where(of_env["holds"], COLOURS[2], COLOURS[1]).tolist()
@@ -186,7 +195,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     :param arguments: of the command line by default
     """
     parser = command_line("certificate", __doc__, jobs=None)
-    parser.add_argument("--envs", nargs="+", default=["LinearCost-v0", "CartPoleCost-v0"], help="with reference controllers")
+    parser.add_argument("--envs", nargs="+", default=list(DISTURBANCES), help="cost environments")
     parser.add_argument("--algos", nargs="*", default=[], help="algorithms to train, with an entry in zoo_configs")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
     parser.add_argument("--timesteps", type=float, help="environment steps of each training, those of zoo_configs by default")
@@ -203,10 +212,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     rows = []
     for env_id in chosen.envs:
-        for policy, seed, predictor in policies(chosen, env_id):
+        for policy, seed, predictor in tqdm(policies(chosen, env_id), desc=env_id, disable=None):
             name = "_".join(f"{env_id}_{policy}{'' if seed is None else f'_seed{seed}'}".replace("%", "percent").split())
             described = {"env": env_id, "policy": policy, "seed": seed}
-            of_policy = judge(predictor, env_id, chosen.episodes, chosen.out, name.replace(",", ""))
+            of_policy = judge(predictor, env_id, chosen.episodes, chosen.out / name.replace(",", ""))
             rows += [{**described, **row} for row in of_policy]
     table = pd.DataFrame(rows)
     study.write({"certificates": table}, {"certificates": plot(table)}, report(table), "certificates")

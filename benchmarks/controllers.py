@@ -1,81 +1,70 @@
-"""Reference controllers of the cost environments: linear feedback, from Riccati equations."""
+"""
+Loops that settle and loops that do not, to try a certificate on: the reference controllers of the cost environments, and the
+same ones with too little gain or with the wrong sign.
+"""
 
 from __future__ import annotations
 
+import gymnasium as gym
 import numpy as np
-from scipy.linalg import solve_discrete_are
+from stable_baselines3.common.type_aliases import PolicyPredictor
 
-from sb3_lac.envs import CartPoleCostEnv, LinearCostEnv
+from sb3_lac.envs import reference_controller
+
+# by what the actions of a reference controller are multiplied, by name of the loop.
+_FACTORS = {"reference": 1.0, "weak": 0.5, "too weak": 0.15, "wrong sign": -1.0}
+# the linear problem is stable by itself: with 15 % of the gain it settles, and with the wrong sign of -14 % hardly leaves
+_FACTORS_OF = {"LinearCost-v0": {"reference": 1.0, "weak": 0.15, "hardly unstable": -0.14, "wrong sign": -1.0}}
 
 
-class LinearController:
+class ScaledController:
     """
-    Linear feedback ``u = -K s`` within the limits of the control.
+    A controller whose actions are multiplied by a factor.
 
-    :param gain: K, shape (n_controls, n_states)
-    :param control_max: control of action 1
+    :param controller: the controller
+    :param factor: -1 .. 1
     """
 
-    def __init__(self, gain: np.ndarray, control_max: float) -> None:
-        self.gain, self.control_max = np.atleast_2d(gain), control_max
+    def __init__(self, controller: PolicyPredictor, factor: float) -> None:
+        self.controller, self.factor = controller, factor
 
     def predict(
         self,
         observation: np.ndarray | dict[str, np.ndarray],
         state: tuple[np.ndarray, ...] | None = None,
         episode_start: np.ndarray | None = None,
-        deterministic: bool = True,
+        deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """
-        The control, as Stable-Baselines3 predicts actions.
+        Actions, as Stable-Baselines3 predicts them.
 
-        :param observation: states, shape (n, n_states)
-        :param state: not used
-        :param episode_start: not used
-        :param deterministic: not used
-        :return: actions of shape (n, n_controls) in units of the largest control, and no state
+        :param observation: see the controller
+        :param state: see the controller
+        :param episode_start: see the controller
+        :param deterministic: see the controller
+        :return: actions, and the state of the controller
         """
-        actions = np.clip(-np.asarray(observation) @ self.gain.T / self.control_max, -1.0, 1.0)
-        return actions.astype(np.float32), None
+        actions, state = self.controller.predict(observation, state, episode_start, deterministic)
+        return self.factor * actions, state
 
 
-def cart_pole_gain() -> np.ndarray:
+def factors(env_id: str) -> dict[str, float]:
     """
-    Gain of the linear-quadratic regulator of the cart and pole, linearised at the upright pole by central differences.
+    The loops of an environment.
 
-    :return: K of ``force_N = -K s``, shape (1, 4)
+    :param env_id: id of a cost environment
+    :return: by name, what the actions of its reference controller are multiplied by
     """
-    env = CartPoleCostEnv()
-    step = 1e-5
-
-    def move(state: np.ndarray, action: float) -> np.ndarray:
-        return env._next_state(state, np.array([action]), 0.0)
-
-    a = np.stack([(move(step * axis, 0.0) - move(-step * axis, 0.0)) / (2 * step) for axis in np.eye(4)], axis=1)
-    b = (move(np.zeros(4), step) - move(np.zeros(4), -step))[:, None] / (2 * step * env.force_max_N)
-    # the weights of the cost, with a little on the velocities and on the force, which cost nothing
-    q, r = np.diag([1 / env.X_MAX_M**2, 0.01, 20 / env.THETA_MAX_RAD**2, 0.1]), np.array([[1e-3]])
-    p = solve_discrete_are(a, b, q, r)
-    return np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a)
+    return _FACTORS_OF.get(env_id, _FACTORS)
 
 
-def reference_controllers(env_id: str) -> dict[str, LinearController]:
+def controllers(env_id: str) -> dict[str, PolicyPredictor]:
     """
     Controllers that settle, and controllers that do not.
 
-    :param env_id: ``LinearCost-v0`` or ``CartPoleCost-v0``
-    :return: by name
+    :param env_id: id of a cost environment
+    :return: by name, the reference controller first
     :raises ValueError: for any other environment
     """
-    if env_id == "LinearCost-v0":
-        env = LinearCostEnv()
-        best = env.optimal_gain()
-        gains = {"optimal": best, "weak": 0.15 * best, "hardly unstable": -0.14 * best, "wrong sign": -best}
-        return {name: LinearController(gain, env.control_max) for name, gain in gains.items()}
-    if env_id == "CartPoleCost-v0":
-        best, force_max_N = cart_pole_gain(), CartPoleCostEnv().force_max_N
-        return {
-            name: LinearController(share * best, force_max_N)
-            for name, share in {"regulator": 1.0, "too weak": 0.05, "none": 0.0}.items()
-        }
-    raise ValueError(f"{env_id} has no reference controllers: choose LinearCost-v0 or CartPoleCost-v0")
+    reference = reference_controller(gym.make(env_id))
+    return {name: ScaledController(reference, factor) for name, factor in factors(env_id).items()}

@@ -17,14 +17,15 @@ import gymnasium as gym
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from battery_env.plotting import new_figure
 from benchmarks.robustness import roll_out
 from benchmarks.study import Study, Tables, command_line, digits, markdown, positive
 from sb3_lac.envs import CostEnv, reference_controller
 
-# each environment: its impulse, parameters that are not as they should be, noise on states, noise on observations, delay
-_DISTURBANCES: dict[str, tuple[float, dict[str, float], float, float, int]] = {
+#: By environment: its impulse, parameters that are not as they should be, noise on states, noise on observations, delay.
+DISTURBANCES: dict[str, tuple[float, dict[str, float], float, float, int]] = {
     "LinearCost-v0": (5.0, {"control_max": 1.0}, 0.03, 0.1, 2),
     "CartPoleCost-v0": (100.0, {"pole_half_length_m": 1.0}, 0.01, 0.02, 2),
     "Oscillator-v0": (3.0, {"protein_decay": 0.05}, 0.1, 0.1, 1),
@@ -43,7 +44,7 @@ def conditions(env_id: str) -> dict[str, dict[str, Any]]:
     :param env_id: id of a cost environment
     :return: arguments of the environment by name of the condition
     """
-    impulse, changed, process_noise, observation_noise, delay = _DISTURBANCES[env_id]
+    impulse, changed, process_noise, observation_noise, delay = DISTURBANCES[env_id]
     return {
         "none": {},
         "impulses": {"impulse": impulse, "impulse_interval": _IMPULSE_INTERVAL},
@@ -54,21 +55,20 @@ def conditions(env_id: str) -> dict[str, dict[str, Any]]:
     }
 
 
-def part(env_id: str, episodes: int) -> Tables:
+def tried(policy: PolicyPredictor, env_id: str, episodes: int) -> pd.DataFrame:
     """
-    Try the reference controller under all conditions.
+    Try a policy under all conditions.
 
-    :param env_id: id of a cost environment
-    :param episodes: episodes for each condition, with the same starts
+    :param policy: the policy, or a controller
+    :param env_id: id of the environment
+    :param episodes: episodes for each condition, with the same starts for every policy
     :return: one row per condition
     """
-    env = gym.make(env_id)
-    problem = env.unwrapped
+    problem = gym.make(env_id).unwrapped
     assert isinstance(problem, CostEnv)
-    controller = reference_controller(env)
     rows = []
     for condition, arguments in conditions(env_id).items():
-        outcome = roll_out(controller, partial(gym.make, env_id, **arguments), episodes)
+        outcome = roll_out(policy, partial(gym.make, env_id, **arguments), episodes)
         rows.append(
             {
                 "environment": env_id,
@@ -83,7 +83,18 @@ def part(env_id: str, episodes: int) -> Tables:
                 "died": outcome["died"].mean(),
             }
         )
-    return {"references": pd.DataFrame(rows)}
+    return pd.DataFrame(rows)
+
+
+def part(env_id: str, episodes: int) -> Tables:
+    """
+    Try the reference controller under all conditions.
+
+    :param env_id: id of a cost environment
+    :param episodes: episodes for each condition
+    :return: ``references``, one row per condition
+    """
+    return {"references": tried(reference_controller(gym.make(env_id)), env_id, episodes)}
 
 
 def report(results: pd.DataFrame) -> str:
@@ -143,7 +154,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = command_line("references", __doc__)
     parser.add_argument("--episodes", type=positive, default=100, help="episodes for each environment and condition")
     study = Study(parser, arguments)
-    tables = study.run(part, [{"env_id": env_id, "episodes": study.chosen.episodes} for env_id in _DISTURBANCES])
+    tables = study.run(part, [{"env_id": env_id, "episodes": study.chosen.episodes} for env_id in DISTURBANCES])
     study.write(tables, {"references": plot(tables["references"])}, report(tables["references"]))
 
 

@@ -39,6 +39,11 @@ CHARTS: Charts = {
             ["lyapunov/feasible_alpha3", "lyapunov/feasible_alpha3_low", "lyapunov/feasible_alpha3_high"],
         ],
     },
+    "Certificates of any algorithm": {
+        "mean cost settles below": ["Multiline", ["certificate/cost_bound$"]],
+        "largest feasible alpha3, fitted function": ["Multiline", ["certificate/feasible_alpha3$"]],
+        "share that survives, at least": ["Multiline", ["certificate/survives_at_least$"]],
+    },
     "Updates": {
         "critic loss": ["Multiline", ["train/critic_loss$"]],
         "actor loss": ["Multiline", ["train/actor_loss$"]],
@@ -95,7 +100,8 @@ class DashboardCallback(BaseCallback):
     - the hyperparameters for the HParams tab, where they stand beside the last value of each scalar of the run
     - ``rollout/cost_mean``, the mean of ``info["cost"]`` over the steps since the last entry, if the environment has costs
 
-    Evaluations are left to ``EvalCallback`` (``eval/``) and ``LyapunovCallback`` (``lyapunov/``).
+    Evaluations are left to ``EvalCallback`` (``eval/``), ``LyapunovCallback`` (``lyapunov/``, of LAC's critic) and
+    ``CertificateCallback`` (``certificate/``, of any algorithm).
 
     .. note::
         ``HParam`` of Stable-Baselines3 is not used: it declares the columns of the table in each run, of which TensorBoard

@@ -9,8 +9,9 @@ import pytest
 pytest.importorskip("rl_zoo3")
 
 from benchmarks import certificate
-from benchmarks.controllers import reference_controllers
+from benchmarks.controllers import controllers
 from sb3_lac import LAC, fit_lyapunov
+from sb3_lac.envs import LinearCostEnv
 
 
 @pytest.fixture
@@ -24,8 +25,8 @@ def quick(monkeypatch):
 
     monkeypatch.setattr(certificate, "train_or_load", train_or_load)
     monkeypatch.setattr(certificate, "fit_lyapunov", partial(fit_lyapunov, n_iterations=3, progress_bar=False))
-    optimal = {"optimal": reference_controllers("LinearCost-v0")["optimal"]}
-    monkeypatch.setattr(certificate, "reference_controllers", lambda env_id: optimal)
+    reference = {"reference": controllers("LinearCost-v0")["reference"]}
+    monkeypatch.setattr(certificate, "controllers", lambda env_id: reference)
     return asked
 
 
@@ -35,7 +36,7 @@ def test_tables_and_figures_are_written(tmp_path, quick, capsys):
     # A tenth of the updates that follow the first thousand steps
     assert quick == [("lac", "LinearCost-v0", 3, 1900)]
     table = pd.read_csv(tmp_path / "certificates.csv")
-    assert table["policy"].tolist() == ["optimal"] + 2 * ["LAC, 10 % of the updates"]
+    assert table["policy"].tolist() == ["reference"] + 2 * ["LAC, 10 % of the updates"]
     assert table["function"].tolist() == ["fitted", "fitted", "critic"]
     # Statements are made once for each policy
     assert table["survives_at_least"].notna().tolist() == [True, True, False]
@@ -46,12 +47,24 @@ def test_tables_and_figures_are_written(tmp_path, quick, capsys):
     assert text in capsys.readouterr().out and "| LAC, 10 % of the updates (critic)" in text and "nan" not in text
 
 
-def test_slow_loops_leave_little_of_a_discounted_cost():
+def test_slow_loops_and_short_horizons_leave_little_of_a_discounted_cost():
     table = certificate.feasible_alpha3().set_index("controller")
-    assert table.index.tolist() == ["optimal", "weak"]
-    shares = table[["discount 0.9", "discount 0.95", "discount 0.99", "average cost"]].astype(float)
-    np.testing.assert_allclose(shares.loc["optimal"], [0.60, 0.78, 0.95, 1.0], atol=0.03)
-    assert (shares.loc["weak"] <= shares.loc["optimal"]).all() and (np.diff(shares, axis=1) > 0).all()
+    assert table.index.tolist() == ["reference", "weak"]
+    columns = ["discount 0.6", "discount 0.9", "discount 0.95", "discount 0.99", "average cost"]
+    shares = table[columns].map(lambda cell: float(cell.split()[0]))
+    np.testing.assert_allclose(shares.loc["reference"], [0.14, 0.60, 0.78, 0.95, 1.0], atol=0.005)
+    assert (shares.loc["weak"] <= shares.loc["reference"]).all() and (np.diff(shares, axis=1) > 0).all()
+
+
+def test_exact_function_decreases_by_that_share_and_by_no_more():
+    env, gamma = LinearCostEnv(), 0.9
+    gain = env.optimal_gain(gamma)
+    p, closed_loop = env.value_matrix(gain, gamma), env.A - env.B @ gain
+    share = float(certificate.feasible_alpha3().set_index("controller").loc["reference", "discount 0.9"].split()[0])
+    states = np.random.default_rng(0).normal(size=(10_000, 2))
+    costs = np.einsum("ni,ij,nj->n", states, env.Q + gain.T @ env.R @ gain, states)
+    drift = np.einsum("ni,ij,nj->n", states, closed_loop.T @ p @ closed_loop - p, states)
+    assert (-drift / costs).min() == pytest.approx(share, abs=0.006)
 
 
 @pytest.mark.parametrize(
@@ -61,8 +74,3 @@ def test_nonsense_on_the_command_line_is_refused(command, quick):
     with pytest.raises(SystemExit):
         certificate.main(command)
     assert not quick
-
-
-def test_other_environments_have_no_reference():
-    with pytest.raises(ValueError, match="Oscillator-v0 has no reference controllers"):
-        reference_controllers("Oscillator-v0")

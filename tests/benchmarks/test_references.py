@@ -11,7 +11,7 @@ import pytest
 from benchmarks import references
 from docs.environment_pages import DOCS, environment_page
 
-IDS = list(references._DISTURBANCES)
+IDS = list(references.DISTURBANCES)
 
 
 @pytest.mark.parametrize("env_id", IDS)
@@ -25,8 +25,8 @@ def test_conditions_are_disturbances_of_the_environment(env_id):
 
 
 def test_table_and_picture_say_what_was_measured(tmp_path, monkeypatch, capsys):
-    two = {env_id: references._DISTURBANCES[env_id] for env_id in ("LinearCost-v0", "PendulumCost-v0")}
-    monkeypatch.setattr(references, "_DISTURBANCES", two)
+    two = {env_id: references.DISTURBANCES[env_id] for env_id in ("LinearCost-v0", "PendulumCost-v0")}
+    monkeypatch.setattr(references, "DISTURBANCES", two)
     references.main(["--episodes", "3", "--out", str(tmp_path)])
     table = pd.read_csv(tmp_path / "references.csv")
     assert len(table) == 12 and json.loads((tmp_path / "references.json").read_text())["configuration"] == {"episodes": 3}

@@ -16,7 +16,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from benchmarks.controllers import LinearController, cart_pole_gain
+from benchmarks.controllers import ScaledController
 from sb3_lac import (
     CertificateCallback,
     FittedLyapunov,
@@ -26,7 +26,7 @@ from sb3_lac import (
     evaluate_lyapunov,
     fit_lyapunov,
 )
-from sb3_lac.envs import LinearCostEnv
+from sb3_lac.envs import LinearCostEnv, reference_controller
 from sb3_lac.stability import CriticLyapunov
 from sb3_lac.stability.fitting import shortest_window, traced_returns
 from sb3_lac.stability.statistics import exact_interval, exact_lower_bound, tightest_drift
@@ -42,7 +42,7 @@ def linear_env():
 @pytest.fixture(scope="module")
 def optimal(linear_env):
     th.set_num_threads(1)
-    controller = LinearController(LinearCostEnv().optimal_gain(), 2.0)
+    controller = reference_controller(gym.make("LinearCost-v0"))
     return controller, fit_lyapunov(controller, linear_env, 50, seed=0, **FIT)
 
 
@@ -53,7 +53,7 @@ def test_function_of_the_optimal_loop_is_the_exact_one(optimal, linear_env):
     controller, lyapunov = optimal
     report = evaluate_lyapunov(controller, linear_env, 50, seed=100, lyapunov=lyapunov)
     env = LinearCostEnv()
-    p = env.value_matrix(controller.gain, gamma=1.0)
+    p = env.value_matrix(env.optimal_gain(), gamma=1.0)
     exact = np.einsum("ni,ij,nj->n", report.observations, p, report.observations)
     learned = report.transitions["lyapunov"].to_numpy()
     assert np.corrcoef(exact, learned)[0, 1] > 0.998
@@ -70,11 +70,10 @@ def test_function_of_the_optimal_loop_is_the_exact_one(optimal, linear_env):
 
 
 @pytest.mark.parametrize("factor", [-1.0, -0.14], ids=["wrong sign", "hardly unstable"])
-def test_destabilised_loop_fails(linear_env, factor):
+def test_destabilised_loop_fails(linear_env, optimal, factor):
     env = LinearCostEnv()
-    gain = factor * env.optimal_gain()
-    assert np.abs(np.linalg.eigvals(env.A - env.B @ gain)).max() > 1.005
-    controller = LinearController(gain, 2.0)
+    assert np.abs(np.linalg.eigvals(env.A - factor * env.B @ env.optimal_gain())).max() > 1.005
+    controller = ScaledController(optimal[0], factor)
     lyapunov = fit_lyapunov(controller, linear_env, 30, seed=0, **FIT)
     report = evaluate_lyapunov(controller, linear_env, 30, seed=100, lyapunov=lyapunov)
     assert not report.holds and report.metrics["largest_feasible_alpha3"].high < 0
@@ -88,15 +87,14 @@ def test_destabilised_loop_fails(linear_env, factor):
 def test_cart_and_pole_with_a_regulator_with_too_little_and_with_none():
     env = make_vec_env("CartPoleCost-v0", n_envs=30)
     verdicts, survive = [], []
-    for share in (1.0, 0.05, 0.0):
-        controller = LinearController(share * cart_pole_gain(), 20.0)
+    for share in (1.0, 0.15, 0.0):
+        controller = ScaledController(reference_controller(gym.make("CartPoleCost-v0")), share)
         lyapunov = fit_lyapunov(controller, env, 30, seed=0, **FIT)
         report = evaluate_lyapunov(controller, env, 30, seed=100, lyapunov=lyapunov)
         certification = certify(controller, env, lyapunov, 30, seed=200)
         assert "nan" not in report.summary() + certification.summary()
         verdicts.append(report.holds)
         survive.append(certification.statements.loc["survives", "share"])
-    # Most episodes of the weak one end before the pole falls
     assert verdicts == [True, False, False] and survive[0] == 1.0 and survive[2] == 0.0
 
 
@@ -105,7 +103,7 @@ def test_known_function_is_judged_like_a_learned_one(linear_env):
     gain = env.optimal_gain()
     p = env.value_matrix(gain, gamma=1.0)
     exact = LyapunovFunction(lambda states: np.einsum("ni,ij,nj->n", states, p, states))
-    controller = LinearController(gain, 2.0)
+    controller = reference_controller(gym.make("LinearCost-v0"))
     report = evaluate_lyapunov(controller, linear_env, 100, seed=0, lyapunov=exact)
     average_cost = env.noise_std**2 * np.trace(p)
     assert report.holds and report.alpha3 == 1.0
@@ -136,8 +134,8 @@ def test_function_is_not_judged_on_its_own_roll_outs(optimal, linear_env):
     evaluate_lyapunov(controller, linear_env, 10, seed=10, lyapunov=lyapunov)
 
 
-def test_fit_is_reproducible_and_leaves_random_numbers_alone(linear_env):
-    controller = LinearController(LinearCostEnv().optimal_gain(), 2.0)
+def test_fit_is_reproducible_and_leaves_random_numbers_alone(linear_env, optimal):
+    controller = optimal[0]
     points = np.random.default_rng(0).uniform(-1, 1, (20, 2))
     values = []
     for seed in (3, 3, 30):
@@ -278,7 +276,7 @@ def test_region_of_attraction_on_a_grid():
     starts = np.stack([np.zeros(4), np.zeros(4), angles, np.array([0, 0, 0, 3.0])], axis=1)
     # Three environments do not divide the twenty episodes
     env = make_vec_env("CartPoleCost-v0", n_envs=3)
-    controller = LinearController(cart_pole_gain(), 20.0)
+    controller = reference_controller(gym.make("CartPoleCost-v0"))
     report = certify(controller, env, n_episodes=3, cost_bound=0.05, starts=starts, n_episodes_per_start=5, seed=0)
     frame = report.starts
     np.testing.assert_array_equal(frame[[f"state_{k}" for k in range(4)]], starts)

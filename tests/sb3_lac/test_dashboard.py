@@ -22,7 +22,7 @@ from stable_baselines3.common.utils import ConstantSchedule
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import nn
 
-from sb3_lac import LAC, DashboardCallback, LyapunovCallback
+from sb3_lac import LAC, CertificateCallback, DashboardCallback, LyapunovCallback
 from sb3_lac.dashboard import CHARTS, hyperparameters_of
 
 READY_WITHIN_S = 120
@@ -49,6 +49,7 @@ def runs(tmp_path_factory):
         callbacks = [
             EvalCallback(make_env(), n_eval_episodes=1, eval_freq=12, verbose=0),
             DashboardCallback(CALIBRATION, {"env": "LinearCost-v0", "own": [1, 2]}),
+            CertificateCallback(make_env(), n_eval_episodes=2, eval_freq=12, verbose=0),
         ]
         if algorithm is LAC:
             callbacks.append(LyapunovCallback(make_env(), n_eval_episodes=2, eval_freq=12, verbose=0))
@@ -156,6 +157,9 @@ def test_the_layout_is_that_of_the_callback_and_has_all_runs_in_one_chart(tensor
         assert shown("Returns and costs", title) == {run: {tag} for run in RUNS}
     # and not lambda_loss
     assert shown("Lyapunov", "lambda") == {"LAC_1": {"train/lambda"}}
+    assert shown("Certificates of any algorithm", "mean cost settles below") == {
+        run: {"certificate/cost_bound"} for run in RUNS
+    }
     assert shown("Updates", "entropy coefficient") == {run: {"train/ent_coef"} for run in ("LAC_1", "SAC_1")}
 
 

@@ -1,0 +1,306 @@
+"""
+LAC, SAC, TD3 and TQC on the six cost environments, beside their reference controllers: what a policy costs, whether it ends at
+the goal, what disturbances that it was not trained for do to it, and what a certificate says of it.
+
+.. code-block:: bash
+
+  python -m benchmarks.stabilisation --timesteps 16000 --seeds 0 1 2
+  python -m benchmarks.stabilisation --algos lac sac td3 tqc
+
+Policies are trained without disturbances, with the hyperparameters of ``zoo_configs``, and judged by their mean action. All of
+them have the same starts and disturbances. What is done is not done again when the command is repeated, so that seeds can be
+added.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from stable_baselines3.common.type_aliases import PolicyPredictor
+
+from battery_env.evaluation import over_seeds
+from battery_env.plotting import COLOURS, new_figure
+from benchmarks.certificate import judge
+from benchmarks.references import DISTURBANCES, conditions, tried
+from benchmarks.study import Study, Tables, command_line, digits, markdown, positive
+from benchmarks.training import Recipe, train_or_load
+from sb3_lac.envs import reference_controller
+
+_REFERENCE = "reference"
+# how they are drawn
+_STYLES = {
+    "LAC": (COLOURS[0], "o"),
+    "SAC": (COLOURS[1], "s"),
+    "TD3": (COLOURS[2], "^"),
+    "TQC": (COLOURS[3], "D"),
+    _REFERENCE: ("black", "|"),
+}
+_ALGORITHMS = [name.lower() for name in _STYLES if name != _REFERENCE]
+
+
+def part(
+    policy: str,
+    env_id: str,
+    seed: int | None,
+    timesteps: int | None,
+    recipe: str | None,
+    episodes: int,
+    certificate_episodes: int,
+    models: Path,
+) -> Tables:
+    """
+    Train a policy, or take the reference controller, and judge it.
+
+    :param policy: name of an algorithm, or ``reference``
+    :param env_id: id of the environment
+    :param seed: seed of the training, ``None`` for the reference controller
+    :param timesteps: environment steps of the training
+    :param recipe: digest of the training's recipe, which names the part: with other hyperparameters it is another one
+    :param episodes: episodes for each disturbance
+    :param certificate_episodes: episodes to fit a Lyapunov function, to judge it and to certify, each
+    :param models: where trained policies are kept
+    :return: ``stabilisation``, one row per disturbance; ``certificates``, one row per Lyapunov function
+    """
+    predictor: PolicyPredictor
+    if policy == _REFERENCE:
+        predictor, updates = reference_controller(gym.make(env_id)), None
+    else:
+        assert seed is not None and timesteps is not None
+        model = train_or_load(policy, env_id, seed, timesteps, models / f"{env_id}_{policy}_seed{seed}")
+        # of all algorithms that learn from a replay buffer
+        predictor, updates = model, getattr(model, "_n_updates", None)
+    described: dict[str, Any] = {
+        "environment": env_id,
+        "policy": policy if policy == _REFERENCE else policy.upper(),
+        "seed": seed,
+        "timesteps": timesteps,
+        "updates": updates,
+        "recipe": recipe,
+    }
+    outcomes = tried(predictor, env_id, episodes).drop(columns="environment")
+    certificates = pd.DataFrame(judge(predictor, env_id, certificate_episodes))
+    return {"stabilisation": _beside(described, outcomes), "certificates": _beside(described, certificates)}
+
+
+def _beside(described: dict[str, Any], rows: pd.DataFrame) -> pd.DataFrame:
+    return pd.concat([pd.DataFrame([described] * len(rows)), rows], axis=1)
+
+
+def _in_order(names: pd.Series) -> pd.Series:
+    order = [*DISTURBANCES, *_STYLES]
+    return names.map(order.index)
+
+
+def _with_interval(values: pd.Series, significant: int = 2) -> str:
+    middle, low, high = (digits(float(value), significant) for value in over_seeds(values))
+    return middle if len(values) == 1 else f"{middle} [{low}, {high}]"
+
+
+def _share(values: pd.Series) -> str:
+    percent = 100 * values
+    spread = f" ({percent.min():.0f} to {percent.max():.0f})" if len(values) > 1 else ""
+    return f"{percent.mean():.0f} %{spread}"
+
+
+def undisturbed_table(results: pd.DataFrame) -> pd.DataFrame:
+    """
+    What policies cost and where they end, without disturbances.
+
+    :param results: ``stabilisation`` of all parts
+    :return: cells as they are shown, one row per environment and policy
+    """
+    rows = []
+    undisturbed = results[results["disturbance"] == "none"]
+    for (env_id, policy), group in undisturbed.groupby(["environment", "policy"], sort=False):
+        rows.append(
+            {
+                "environment": env_id,
+                "policy": policy,
+                "seeds": "" if policy == _REFERENCE else str(len(group)),
+                "updates": "" if policy == _REFERENCE else f"{group['updates'].max():.0f}",
+                "cost per step": _with_interval(group["cost"]),
+                "error at the end, median": _with_interval(group["error_median"]),
+                "at the goal": _share(group["at_goal"]),
+                "died": _share(group["died"]),
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def disturbed_table(results: pd.DataFrame) -> pd.DataFrame:
+    """
+    What each disturbance does.
+
+    :param results: ``stabilisation`` of all parts
+    :return: cells as they are shown, one row per environment and policy: mean over seeds of the share that ends at the goal,
+        and in brackets of the share that dies
+    """
+    rows = []
+    for (env_id, policy), group in results.groupby(["environment", "policy"], sort=False):
+        row: dict[str, Any] = {"environment": env_id, "policy": policy}
+        for condition, tries in group.groupby("disturbance", sort=False):
+            row[str(condition)] = f"{100 * tries['at_goal'].mean():.0f} % ({100 * tries['died'].mean():.0f} %)"
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def certificate_table(certificates: pd.DataFrame) -> pd.DataFrame:
+    """
+    What the certificates say.
+
+    :param certificates: of all parts
+    :return: cells as they are shown, one row per environment, policy and Lyapunov function
+    """
+    rows = []
+    for (env_id, policy, function), group in certificates.groupby(["environment", "policy", "function"], sort=False):
+        settles = group[group["holds"]]
+        rows.append(
+            {
+                "environment": env_id,
+                "policy": f"{policy} (critic)" if function == "critic" else policy,
+                "holds": f"{group['holds'].sum()} of {len(group)}",
+                "cost at the start": digits(group["start_cost"].mean()),
+                "where it holds: mean cost settles below": _with_interval(settles["cost_bound"]) if len(settles) else "-",
+                "its alpha3": _with_interval(settles["cost_bound_alpha3"]) if len(settles) else "-",
+                "alpha3 without residual": _with_interval(group["largest_feasible_alpha3"]),
+                "survives, at least": "-" if function == "critic" else digits(group["survives_at_least"].mean()),
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def report(tables: Tables) -> str:
+    """
+    All tables, as Markdown.
+
+    :param tables: of all parts
+    :return: three tables
+    """
+    results = tables["stabilisation"]
+    return "\n".join(
+        [
+            "Without disturbances. Costs and errors are interquartile means over seeds with 95 % intervals, shares of "
+            "episodes are means (least to most of a seed):\n",
+            markdown(undisturbed_table(results)),
+            "Share of the episodes that end at the goal, and in brackets of those that die:\n",
+            markdown(disturbed_table(results)),
+            "Certificates, of a function that is fitted to the policy's roll-outs, and of LAC's critic:\n",
+            markdown(certificate_table(tables["certificates"])),
+        ]
+    )
+
+
+def plot_costs(results: pd.DataFrame) -> Figure:
+    """
+    The cost of each policy and the share that ends at the goal: each seed, and the interquartile mean with its 95 % interval.
+
+    :param results: ``stabilisation`` of all parts
+    :return: the figure
+    """
+    undisturbed = results[results["disturbance"] == "none"]
+    envs, names = list(undisturbed["environment"].unique()), [name for name in _STYLES if name in set(undisturbed["policy"])]
+    figure = new_figure(8.6, 1.0 + 0.75 * len(envs))
+    costs, goals = figure.subplots(1, 2, sharey=True)
+    yardsticks = undisturbed[undisturbed["policy"] == _REFERENCE].set_index("environment")["cost"]
+    for row, env_id in enumerate(envs):
+        for number, name in enumerate(names):
+            of_policy = undisturbed[(undisturbed["environment"] == env_id) & (undisturbed["policy"] == name)]
+            if of_policy.empty:
+                continue
+            colour, marker = _STYLES[name]
+            height = row + 0.7 * ((number + 0.5) / len(names) - 0.5)
+            for axes, values in ((costs, of_policy["cost"] / yardsticks[env_id]), (goals, of_policy["at_goal"])):
+                middle, low, high = (float(value) for value in over_seeds(values))
+                axes.scatter(values, np.full(len(values), height), s=8, color=colour, alpha=0.35, lw=0)
+                axes.plot([low, high], [height, height], color=colour, lw=1.5)
+                axes.plot(middle, height, marker, color=colour, ms=6, label=name if row == 0 else None)
+    costs.set(xscale="log", xlabel="cost per step over that of the reference controller")
+    costs.set_yticks(range(len(envs)), envs)
+    costs.invert_yaxis()
+    goals.set(xlabel="share of episodes that end at the goal", xlim=(-0.03, 1.03))
+    figure.legend(*costs.get_legend_handles_labels(), loc="outside lower center", ncols=len(names), fontsize="small")
+    return figure
+
+
+def plot_disturbances(results: pd.DataFrame) -> Figure:
+    """
+    One map per environment: the share of episodes at the goal, and in brackets of those that die, by policy and disturbance.
+
+    :param results: ``stabilisation`` of all parts
+    :return: the figure
+    """
+    envs = list(results["environment"].unique())
+    n_columns = min(2, len(envs))
+    n_rows = -(-len(envs) // n_columns)
+    figure = new_figure(5.6 * n_columns, 0.5 + 2.1 * n_rows)
+    panels = figure.subplots(n_rows, n_columns, squeeze=False).ravel()
+    for axes in panels[len(envs) :]:
+        axes.remove()
+    for axes, env_id in zip(panels, envs, strict=False):
+        of_env = results[results["environment"] == env_id]
+        shares, deaths = (
+            of_env.pivot_table(index="policy", columns="disturbance", values=column, sort=False)
+            for column in ("at_goal", "died")
+        )
+        order = [name for name in _STYLES if name in shares.index]
+        shares, deaths = shares.loc[order], deaths.loc[order]
+        axes.imshow(shares, vmin=0.0, vmax=1.0, aspect="auto", cmap="cividis")
+        for i, j in np.ndindex(shares.shape):
+            share, death = shares.iloc[i, j], deaths.iloc[i, j]
+            text = f"{share:.0%}" + (f" ({death:.0%})" if death > 0 else "")
+            axes.text(j, i, text, ha="center", va="center", color="black" if share > 0.5 else "white", size=7)
+        axes.set_xticks(range(shares.shape[1]), [name.replace(" ", "\n") for name in shares.columns], fontsize="small")
+        axes.set_yticks(range(len(order)), order)
+        axes.set_title(env_id)
+    figure.suptitle("episodes that end at the goal (that die)")
+    return figure
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """
+    The command line.
+
+    :param arguments: of the command line by default
+    """
+    parser = command_line("stabilisation", __doc__)
+    parser.add_argument("--algos", nargs="+", default=["lac", "sac", "td3"], choices=_ALGORITHMS)
+    parser.add_argument("--envs", nargs="+", default=list(DISTURBANCES), choices=list(DISTURBANCES))
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
+    parser.add_argument("--timesteps", type=positive, help="environment steps at most; those of zoo_configs by default")
+    parser.add_argument("--episodes", type=positive, default=100, help="episodes for each policy and disturbance")
+    parser.add_argument("--certificate-episodes", type=positive, default=50, help="to fit, to judge and to certify, each")
+    study = Study(parser, arguments)
+    chosen = study.chosen
+    judged = {"episodes": chosen.episodes, "certificate_episodes": chosen.certificate_episodes}
+    parts = [
+        {"policy": _REFERENCE, "env_id": env_id, "seed": None, "timesteps": None, "recipe": None, **judged}
+        for env_id in chosen.envs
+    ]
+    # seed by seed, so that an interrupted study has whole seeds
+    for seed in chosen.seeds:
+        for env_id in chosen.envs:
+            for algo in chosen.algos:
+                timesteps = Recipe.of(algo, env_id, seed).timesteps
+                timesteps = min(timesteps, chosen.timesteps or timesteps)
+                recipe = Recipe.of(algo, env_id, seed, timesteps).digest
+                parts.append(
+                    {"policy": algo, "env_id": env_id, "seed": seed, "timesteps": timesteps, "recipe": recipe, **judged}
+                )
+    study.configuration["disturbances"] = {env_id: conditions(env_id) for env_id in chosen.envs}
+    tables = {
+        name: table.sort_values(["environment", "policy"], key=_in_order, kind="stable", ignore_index=True)
+        for name, table in study.run(part, parts, models=study.out / "models").items()
+    }
+    results = tables["stabilisation"]
+    figures = {"costs": plot_costs(results), "disturbances": plot_disturbances(results)}
+    study.write(tables, figures, report(tables))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,87 @@
+"""Policies and reference controllers are judged alike, and the tables and figures say what came out."""
+
+import json
+from functools import partial
+
+import pandas as pd
+import pytest
+import yaml
+
+pytest.importorskip("rl_zoo3")
+
+from benchmarks import certificate, stabilisation
+from benchmarks.references import DISTURBANCES
+from sb3_lac import LAC, fit_lyapunov
+from sb3_lac.zoo import find_config
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Few passes over the data, and a model that is not trained; returns what was asked for."""
+    asked = []
+
+    def train_or_load(algo, env_id, seed, timesteps, folder):
+        asked.append((algo, env_id, seed, timesteps))
+        return LAC("MlpPolicy", env_id, device="cpu", buffer_size=10, seed=seed, policy_kwargs={"net_arch": [8]})
+
+    monkeypatch.setattr(stabilisation, "train_or_load", train_or_load)
+    monkeypatch.setattr(certificate, "fit_lyapunov", partial(fit_lyapunov, n_iterations=3))
+    return asked
+
+
+def test_tables_and_figures_are_written_and_seeds_can_be_added(tmp_path, quick, capsys):
+    command = ["--envs", "LinearCost-v0", "--algos", "lac", "--timesteps", "20000", "--episodes", "3"]
+    command += ["--certificate-episodes", "25", "--jobs", "1", "--out", str(tmp_path)]
+    stabilisation.main([*command, "--seeds", "0"])
+    stabilisation.main([*command, "--seeds", "0", "1"])
+    # No more than zoo_configs has, and nothing twice
+    assert quick == [("lac", "LinearCost-v0", 0, 10_000), ("lac", "LinearCost-v0", 1, 10_000)]
+    results, certificates = (pd.read_csv(tmp_path / f"{name}.csv") for name in ("stabilisation", "certificates"))
+    assert results["policy"].tolist() == 12 * ["LAC"] + 6 * ["reference"]
+    assert certificates["function"].tolist() == ["fitted", "critic", "fitted", "critic", "fitted"]
+    reference = results[(results["policy"] == "reference") & (results["disturbance"] == "none")].iloc[0]
+    assert reference["at_goal"] == 1.0 and reference["died"] == 0.0
+    # An untrained policy is no match for the optimum, whose starts it has
+    assert results.loc[(results["policy"] == "LAC") & (results["disturbance"] == "none"), "cost"].gt(reference["cost"]).all()
+    record = json.loads((tmp_path / "stabilisation.json").read_text())
+    assert record["configuration"]["disturbances"]["LinearCost-v0"]["action delay"] == {"action_delay": 2}
+    text = (tmp_path / "stabilisation.md").read_text(encoding="utf-8")
+    assert text in capsys.readouterr().out and "| LAC (critic)" in text and "nan" not in text
+    for name in ("costs.png", "disturbances.png"):
+        assert (tmp_path / name).stat().st_size > 1000
+
+
+def test_tables_count_episodes_and_seeds():
+    rows = [
+        {
+            "environment": "LinearCost-v0",
+            "policy": "SAC",
+            "seed": seed,
+            "updates": 10.0,
+            "disturbance": disturbance,
+            "cost": cost,
+            "error_median": 0.1,
+            "at_goal": at_goal,
+            "died": 1.0 - at_goal,
+        }
+        for seed, cost, at_goal in ((0, 1.0, 0.0), (1, 3.0, 0.5))
+        for disturbance in ("none", "impulses")
+    ]
+    row = stabilisation.undisturbed_table(pd.DataFrame(rows)).iloc[0]
+    assert (row["cost per step"], row["at the goal"], row["died"]) == ("2 [1, 3]", "25 % (0 to 50)", "75 % (50 to 100)")
+    assert row["seeds"] == "2" and row["updates"] == "10"
+    disturbed = stabilisation.disturbed_table(pd.DataFrame(rows)).iloc[0]
+    assert disturbed["none"] == disturbed["impulses"] == "25 % (75 %)"
+
+
+def test_tqc_has_the_hyperparameters_of_sac():
+    sac, tqc = (yaml.safe_load(find_config(algo).read_text(encoding="utf-8")) for algo in ("sac", "tqc"))
+    assert set(tqc) == {"default", *DISTURBANCES}
+    assert tqc == {name: sac[name] for name in tqc}
+
+
+@pytest.mark.parametrize("command", [["--algos", "ppo"], ["--envs", "Pendulum-v1"], ["--timesteps", "0"], ["--episodes", "0"]])
+def test_nonsense_on_the_command_line_is_refused(command, quick):
+    with pytest.raises(SystemExit):
+        stabilisation.main(command)
+    assert not quick
