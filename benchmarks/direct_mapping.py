@@ -136,22 +136,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     ]
     made = [study.run(mapping_part, mappings), study.run(policy_part, policies, models=study.out / "models")]
     made.append(study.run(exact_part, places))
-    results = pd.concat([tables["direct_mapping"] for tables in made if tables], ignore_index=True)
-    results = _in_order(results)
+    results = _in_order(pd.concat([tables["direct_mapping"] for tables in made if tables], ignore_index=True))
     text = report(results, study.configuration)
     study.write({"direct_mapping": results}, {"direct_mapping": plot_errors(results)}, text)
 
 
 def _in_order(results: pd.DataFrame) -> pd.DataFrame:
-    methods = [*(mapping.label for mapping in MAPPINGS.values()), *sorted(set(results["method"]))]
-    ranks = {
-        "parameter": list(ENV_IDS),
-        "division": list(DIVISIONS),
-        "method": list(dict.fromkeys(methods)),
-    }
-    keys = [results[name].map(names.index) for name, names in ranks.items()]
-    order = np.lexsort([results["seed"], *reversed(keys)])
-    return results.iloc[order].reset_index(drop=True)
+    # as they were made, but parameter by parameter and division by division; what has no seed is the closed form
+    numbered = results.assign(seed=results["seed"].astype(float))
+    places = [numbered[name].map(list(names).index) for name, names in (("division", DIVISIONS), ("parameter", ENV_IDS))]
+    methods = numbered["method"].map(list(dict.fromkeys(numbered["method"])).index)
+    return numbered.iloc[np.lexsort([numbered["seed"], methods, *places])].reset_index(drop=True)
 
 
 if __name__ == "__main__":
