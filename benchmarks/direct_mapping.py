@@ -15,7 +15,7 @@ training part; a policy trains on the same part with the settings of ``zoo_confi
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pandas as pd
@@ -27,6 +27,7 @@ from benchmarks.generalization import (
     ENV_IDS,
     HEAVY_LOAD_W,
     MAPPINGS,
+    Parameter,
     divided,
     exact_part,
     mapping_part,
@@ -83,7 +84,7 @@ def plot_errors(results: pd.DataFrame) -> Figure:
     methods = list(dict.fromkeys(learned["method"]))
     figure = new_figure(10.4, 5.8)
     panels = figure.subplots(len(ENV_IDS), len(DIVISIONS), sharex="row", sharey="row", squeeze=False)
-    for row, parameter in zip(panels, ENV_IDS, strict=True):
+    for row, parameter in zip(panels, get_args(Parameter), strict=True):
         for axes, division in zip(row, DIVISIONS, strict=True):
             values = getattr(divided(parameter, division)[0], parameter)
             axes.axvspan(values.min(), values.max(), color="0.93", zorder=0, label="values trained on")

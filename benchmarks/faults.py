@@ -133,9 +133,15 @@ def work(fault: Fault, unknown: Sequence[str], n: int) -> TrajectoryDataset:
     :return: the discharges
     """
     if fault.other_worn:
-        kind = cast(AgedParameter, unknown[0])
-        ranges = {"q_mobile_range": Q_MOBILE_RANGE_C, "r_o_range": R_O_RANGE_OHM}
-        return TrajectoryDataset.generate(kind, n, RandomPiecewise(), SEEDS[kind], **ranges, cell=WORN_CELL)
+        return TrajectoryDataset.generate(
+            cast(AgedParameter, unknown[0]),
+            n,
+            RandomPiecewise(),
+            SEEDS[unknown[0]],
+            q_mobile_range=Q_MOBILE_RANGE_C,
+            r_o_range=R_O_RANGE_OHM,
+            cell=WORN_CELL,
+        )
     return held_out_trajectories(ENV_ID, mismatch=fault.mismatch)[:n]
 
 
