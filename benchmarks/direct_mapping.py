@@ -6,7 +6,7 @@ loads heavier than those of the training, and on cells more aged than those of t
 .. code-block:: bash
 
   python -m benchmarks.direct_mapping
-  python -m benchmarks.direct_mapping --algos lac sac td3 --policy-divisions trajectory load parameter
+  python -m benchmarks.direct_mapping --algos lac sac td3 --policies-on q_mobile/trajectory q_mobile/parameter
 
 Everything sees the full state of the paper's discharges. A mapping learns from random pairs of random discharges of the
 training part; a policy trains on the same part with the settings of ``zoo_configs``. Finished parts are not run again.
@@ -115,7 +115,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--algos", nargs="*", default=["lac"], choices=["lac", "sac", "td3"], metavar="ALGO", help="policies")
     parser.add_argument("--policy-seeds", nargs="+", type=int, default=[0])
     parser.add_argument(
-        "--policy-divisions", nargs="+", default=["trajectory", "parameter"], choices=list(DIVISIONS), metavar="DIVISION"
+        "--policies-on",
+        nargs="+",
+        default=[f"{parameter}/{division}" for parameter in ENV_IDS for division in ("trajectory", "parameter")],
+        choices=[f"{parameter}/{division}" for parameter in ENV_IDS for division in DIVISIONS],
+        metavar="PARAMETER/DIVISION",
     )
     parser.add_argument("--updates", type=positive, help="gradient steps of policies; those of zoo_configs by default")
     study = Study(parser, arguments)
@@ -133,7 +137,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for seed in dict.fromkeys(chosen.policy_seeds)
         for algo in chosen.algos
         for place in places
-        if place["division"] in chosen.policy_divisions
+        if f"{place['parameter']}/{place['division']}" in chosen.policies_on
     ]
     made = [study.run(mapping_part, mappings), study.run(policy_part, policies, models=study.out / "models")]
     made.append(study.run(exact_part, places))

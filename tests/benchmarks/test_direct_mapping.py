@@ -121,7 +121,7 @@ def test_the_study_compares_all_on_each_division(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize(
-    "command", [["--pairs", "0"], ["--algos", "ppo"], ["--mappings", "all"], ["--policy-divisions", "age"]]
+    "command", [["--pairs", "0"], ["--algos", "ppo"], ["--mappings", "all"], ["--policies-on", "q_mobile/age"]]
 )
 def test_nonsense_on_the_command_line_is_refused(command):
     with pytest.raises(SystemExit):
