@@ -47,14 +47,15 @@ EVALUATION_EPISODES = 20
 _SCORED_EPISODES = 100
 
 
-def held_out_trajectories(env_id: str) -> TrajectoryDataset:
+def held_out_trajectories(env_id: str, **options: Any) -> TrajectoryDataset:
     """
     The discharges that no policy has seen.
 
     :param env_id: id of a calibration environment
+    :param options: of the environment
     :return: the test part of its data set
     """
-    data = PolicyEstimator.environment(env_id, split="test").task.dataset
+    data = PolicyEstimator.environment(env_id, split="test", **options).task.dataset
     assert isinstance(data, TrajectoryDataset)
     return data
 

@@ -36,7 +36,7 @@ from battery_env.plotting import COLOURS, LABELS, new_figure
 from battery_env.sensors import SensorErrors
 from battery_env.trajectories import AgedParameter, TrajectoryDataset
 from benchmarks.progpy_filters import ProgpyFilter
-from benchmarks.study import SYMBOLS, Study, Tables, command_line, digits, markdown, positive
+from benchmarks.study import SYMBOLS, Study, Tables, command_line, digits, duration, markdown, positive
 
 R_O_RANGE_OHM = (0.117, 0.35)
 #: A cell that is a little worn in both parameters: 10 % less q_mobile, 10 % more r_o.
@@ -233,13 +233,6 @@ def parts(n: int, slow_n: int) -> list[dict[str, Any]]:
     return chosen
 
 
-def _duration(seconds: float) -> str:
-    for unit, size in (("s", 1.0), ("ms", 1e-3)):
-        if seconds >= size:
-            return f"{digits(seconds / size)} {unit}"
-    return f"{digits(seconds / 1e-6)} µs"
-
-
 def bound_percent(results: pd.DataFrame, case: Case, parameter: str) -> float:
     """
     What the mean error of an unbiased calibrator is at least, at the end of the discharges.
@@ -275,7 +268,7 @@ def methods_table(results: pd.DataFrame) -> pd.DataFrame:
                 f"{digits(settled_s.median())} / {digits(settled_s.max())}" if many else "-"
             )
         row["discharges"] = str(int(of_method.groupby("parameter").size().sum()))
-        row["time per estimate"] = _duration(of_method["cpu_time_per_estimate_s"].mean())
+        row["time per estimate"] = duration(of_method["cpu_time_per_estimate_s"].mean())
         rows.append(row)
     bounds = {name: digits(bound_percent(results, BASE, name)) for name in PARAMETERS}
     bound_row = {f"{SYMBOLS[name]}: last / 2nd half (worst last), %": f"{value} / - (-)" for name, value in bounds.items()}

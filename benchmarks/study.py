@@ -115,6 +115,19 @@ def digits(value: float, significant: int = 2) -> str:
     return f"{value:.{significant}g}" if abs(value) < 10**significant - 0.5 else f"{value:.0f}"
 
 
+def duration(seconds: float) -> str:
+    """
+    A short time as readers see it.
+
+    :param seconds: the time
+    :return: in s, ms or µs
+    """
+    for unit, size in (("s", 1.0), ("ms", 1e-3)):
+        if seconds >= size:
+            return f"{digits(seconds / size)} {unit}"
+    return f"{digits(seconds / 1e-6)} µs"
+
+
 def with_spread(values: pd.Series) -> str:
     """
     Mean and standard deviation over seeds.
