@@ -1,7 +1,7 @@
 """Calibration without learning."""
 
 from battery_env.estimates import Estimate, EstimateTrace
-from battery_env.estimators.base import Estimator, OnlineEstimator
+from battery_env.estimators.base import Estimator, OnlineBatch, OnlineEstimator, Remaining
 from battery_env.estimators.closed_form import ClosedForm
 from battery_env.estimators.cramer_rao import CramerRaoBound, Sensitivities, cramer_rao_bound, sensitivities
 from battery_env.estimators.greedy import GreedyOneStep
@@ -17,7 +17,9 @@ __all__ = [
     "ExtendedKalmanFilter",
     "GreedyOneStep",
     "LeastSquares",
+    "OnlineBatch",
     "OnlineEstimator",
+    "Remaining",
     "Sensitivities",
     "cramer_rao_bound",
     "sensitivities",
