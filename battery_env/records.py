@@ -5,6 +5,7 @@ the samples, and what to expect of it after the last one.
 
 from __future__ import annotations
 
+from math import isfinite, isnan
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -20,8 +21,16 @@ SWITCH_SHARE = 0.1
 VARIED_SHARE = 0.05
 #: Least and greatest time between two samples of a stream, s. Seconds given in milliseconds or in hours are mostly beyond.
 SAMPLE_INTERVAL_LIMITS_S = (1e-3, 600.0)
+#: A cell whose current is below this rests, A; then the next sample may come after as long as a week, s.
+REST_CURRENT_A, REST_LIMIT_S = 0.02, 604_800.0
 
 _MILLIVOLT = "Give the voltage of one cell in V, not in mV (command line: --units voltage=mV), and not that of a pack."
+# What to do about a value that is missing in a stream
+_MISSING = {
+    "voltage_V": "A voltage may be missing (NaN), but for the first one, which tells whether the cell is full.",
+    "current_A": "The charge that was drawn cannot do without it: give the mean current since it was last known.",
+    "temperature_C": "Leave it out (None) where it is missing.",
+}
 _KELVIN = "Give the temperature in degrees Celsius, not in kelvin (command line: --units temperature=K)."
 # name: least and largest plausible value, unit, what a value beyond usually is
 _PLAUSIBLE: dict[str, tuple[float, float, str, str]] = {
@@ -144,23 +153,40 @@ def check_record(time_s: ArrayLike, voltage_V: ArrayLike, current_A: ArrayLike, 
     return Samples(**arrays)
 
 
-def check_sample(voltage_V: float, current_A: float, dt_s: float | None) -> None:
+def check_sample(
+    voltage_V: float,
+    current_A: float,
+    dt_s: float | None,
+    temperature_C: float | None = None,
+    previous_A: float = np.inf,
+) -> None:
     """
-    Refuse one sample of a stream that :func:`check_record` would refuse in a record.
+    Refuse one sample of a stream that :func:`check_record` would refuse in a record. A voltage may be missing (NaN), but for
+    the first one.
 
     :param voltage_V: terminal voltage of one cell, V
     :param current_A: current, positive in discharge, A
     :param dt_s: time since the previous sample, s; ``None``: this is the first one
+    :param temperature_C: of the cell, degC; ``None``: not measured
+    :param previous_A: current since the previous sample, A: where there was none, the time may be long
     :raises ValueError: if it cannot be meant
     """
-    for name, value in (("voltage_V", voltage_V), ("current_A", current_A)):
-        if not np.isfinite(value):
-            raise ValueError(f"{name} must be finite, got {value!r}. Leave a sample out that is missing.")
+    measured = {"voltage_V": voltage_V, "current_A": current_A}
+    if temperature_C is not None:
+        measured["temperature_C"] = temperature_C
+    for name, value in measured.items():
         low, high, _, _ = _PLAUSIBLE[name]
-        if not low <= value <= high:
+        if low <= value <= high or (name == "voltage_V" and dt_s is not None and isnan(value)):
+            continue
+        if isfinite(value):
             raise ValueError(_implausible(name, value))
+        raise ValueError(f"{name} must be finite, got {value!r}. {_MISSING[name]}")
+    if dt_s is None:
+        return
     low, high = SAMPLE_INTERVAL_LIMITS_S
-    if dt_s is not None and not low <= dt_s <= high:
+    if abs(previous_A) <= REST_CURRENT_A:
+        high = REST_LIMIT_S
+    if not low <= dt_s <= high:
         raise ValueError(
             f"dt_s, the time since the previous sample, must lie within {low:g} .. {high:g} s, got {dt_s!r}. Give it in "
             "seconds, not in hours or milliseconds. After a longer gap, start anew with a full cell."

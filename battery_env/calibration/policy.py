@@ -7,9 +7,22 @@ from typing import Any, Protocol
 
 import gymnasium as gym
 import numpy as np
+from numpy.typing import NDArray
 
+from battery_env.calibration.aging import BatteryAging
 from battery_env.calibration.env import CalibrationEnv
-from battery_env.estimators.base import Estimate, EstimateTrace, Estimator, Record
+from battery_env.calibration.streaming import ReadingsSoFar, resume
+from battery_env.calibration.voltage import VoltageTask
+from battery_env.electrochemistry import NEW_CELL, STATE_SIZE
+from battery_env.estimators.base import Estimate, EstimateTrace, ModelNow, OnlineEstimator, Record
+from battery_env.record_model import RecordModel
+from battery_env.records import check_drawn_charge, check_sample
+
+_UNSURE = "A policy states no uncertainty."
+# A full cell takes no more charge than this, C.
+_SURPLUS_C = 0.01 * NEW_CELL.q_mobile
+# Steps in which a stream is followed, s
+_STEP_S = 1.0
 
 
 class Predictor(Protocol):
@@ -26,7 +39,7 @@ class Predictor(Protocol):
         ...
 
 
-class PolicyEstimator(Estimator):
+class PolicyEstimator(OnlineEstimator):
     """
     A policy, in closed loop with the model over whole discharges; all discharges run as one batch.
 
@@ -34,6 +47,9 @@ class PolicyEstimator(Estimator):
     first sample. One of a voltage-only environment starts with the estimate of a new cell and moves it at a fixed interval;
     it takes any record that starts fully charged, simulated or recorded. One of ``BatteryAging-v0`` takes such records life
     after life, ``cycles`` of them each, and carries its estimate over from one to the next.
+
+    One of a voltage-only environment of single discharges also follows a stream (:meth:`update`): its estimate is the new
+    cell's until ``decision_s`` are over, and moves every ``decision_s`` from then on.
 
     :param policy: what to ask for actions, deterministically
     :param env_id: id of the environment that the policy was trained on
@@ -50,6 +66,9 @@ class PolicyEstimator(Estimator):
         self.task_class = type(task)
         self.parameters = task.parameters
         self._every = task.steps_between(decision_s)
+        self.decision_s = decision_s
+        self.dt_s = _STEP_S
+        self.reset()
 
     @staticmethod
     def environment(env_id: str, **options: Any) -> CalibrationEnv:
@@ -66,6 +85,92 @@ class PolicyEstimator(Estimator):
             raise ValueError(f"{env_id} is no calibration environment")
         return env
 
+    def reset(self) -> None:
+        """
+        Forget all samples: the next one is the first of a discharge, of a fully charged cell at rest.
+        """
+        self._readings = ReadingsSoFar()
+        self._drawn_C = 0.0
+        self._decisions = 0
+        self._now = np.array([NEW_CELL.q_mobile, NEW_CELL.r_o])
+        self._action = np.zeros(len(self.parameters))
+
+    def check(self, voltage_V: float, current_A: float, dt_s: float, temperature_C: float | None = None) -> None:
+        """
+        Refuse a sample that :meth:`update` would refuse, and change nothing.
+
+        :param voltage_V: as of :meth:`update`
+        :param current_A: likewise
+        :param dt_s: likewise
+        :param temperature_C: likewise
+        :raises ValueError: likewise
+        """
+        if not issubclass(self.task_class, VoltageTask) or issubclass(self.task_class, BatteryAging):
+            raise ValueError(f"a policy of {self.env_id} takes no stream: it needs the full state, or a whole life")
+        if temperature_C is not None:
+            raise ValueError("a policy takes no temperature: its model is isothermal. Leave temperature_C out.")
+        if not self._readings.time_s:
+            check_sample(voltage_V, current_A, None)
+            return
+        before_A = self._readings.current_A[-1]
+        check_sample(voltage_V, current_A, dt_s, previous_A=before_A)
+        check_drawn_charge(self._drawn_C + dt_s * before_A, -_SURPLUS_C)
+
+    def update(self, voltage_V: float, current_A: float, dt_s: float, temperature_C: float | None = None) -> Estimate:
+        """
+        Take in one sample. The policy decides when ``decision_s`` are over, as it would on the record so far.
+
+        :param voltage_V: terminal voltage, V; NaN where it is missing, but for the first sample
+        :param current_A: current that flows from this sample to the next one, positive in discharge, A
+        :param dt_s: time since the previous sample, s; without meaning at the first one
+        :param temperature_C: must be ``None``: the model of the environments is isothermal
+        :return: the estimate; never settled, as a policy states no uncertainty
+        :raises ValueError: for what cannot be meant, a temperature, or a policy that takes no stream
+        """
+        self.check(voltage_V, current_A, dt_s, temperature_C)
+        readings = self._readings
+        if readings.time_s:
+            self._drawn_C += dt_s * readings.current_A[-1]
+        readings.add(voltage_V, current_A, dt_s)
+        due = int(readings.time_s[-1] / self.decision_s + 1e-9)
+        if due > self._decisions and due * self._every > 1:
+            self._decide(due)
+        q_mobile, r_o = self._now.tolist()
+        return Estimate(q_mobile, r_o, settled=False, reason=_UNSURE)
+
+    def _decide(self, due: int) -> None:
+        """One decision, on all readings up to the time when it was due."""
+        task = self.task_class.follow([self._readings.record(self.dt_s)], due * self._every, **self.options)
+        resume(task, self._now, self._action)
+        action, _ = self.policy.predict(task.observation(), deterministic=True)
+        task.advance(np.asarray(action))
+        self._decisions, self._now, self._action = due, task.estimate[0], np.clip(np.asarray(action)[0], -1.0, 1.0)
+
+    def now(self) -> ModelNow:
+        """
+        The model at the last sample, with the estimate as its parameters.
+
+        :return: where it stands
+        """
+        model, (q_mobile, r_o) = RecordModel(dt_s=self.dt_s), self._now.tolist()
+        state = model.start(q_mobile)
+        if self._readings.time_s and self._readings.time_s[-1] > 0.0:
+            state = model.simulate(self._readings.record(self.dt_s).current_A, q_mobile, r_o).state[-1]
+        return ModelNow(model.cell, False, self.dt_s, state, np.append(self._now, 0.0), np.zeros((0, STATE_SIZE + 3)))
+
+    def _made_with(self) -> dict[str, Any]:
+        options = {name: repr(value) for name, value in self.options.items()}
+        return {"estimator": type(self).__name__, "env_id": self.env_id, "decision_s": self.decision_s, "options": options}
+
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        progress = np.array([self._drawn_C, self._decisions, *self._now])
+        return {"samples": self._readings.columns(), "progress": progress, "action": self._action}
+
+    def _restore(self, arrays: dict[str, NDArray[Any]]) -> None:
+        self._readings = ReadingsSoFar.of(arrays["samples"])
+        self._drawn_C, self._decisions = float(arrays["progress"][0]), int(arrays["progress"][1])
+        self._now, self._action = arrays["progress"][2:].copy(), arrays["action"].copy()
+
     def estimate(self, record: Record) -> Estimate:
         """
         The estimate after one discharge: of a voltage-only policy the last one, of a full-state one, whose estimates are
@@ -76,7 +181,7 @@ class PolicyEstimator(Estimator):
         """
         trace = self.trace([record])[0]
         q_mobile, r_o = (self.task_class.conclude(values) for values in (trace.q_mobile, trace.r_o))
-        return Estimate(q_mobile, r_o, settled=False, reason="A policy states no uncertainty.")
+        return Estimate(q_mobile, r_o, settled=False, reason=_UNSURE)
 
     def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:
         """

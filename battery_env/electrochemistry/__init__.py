@@ -46,6 +46,7 @@ from battery_env.electrochemistry.cell import (
     PackedConstants,
     check_cell,
     check_dt,
+    rest_shares,
 )
 from battery_env.electrochemistry.simulation import (
     Trajectory,
@@ -85,6 +86,7 @@ __all__ = [
     "check_dt",
     "check_load",
     "initial_state",
+    "rest_shares",
     "simulate",
     "state_of_charge",
     "step",

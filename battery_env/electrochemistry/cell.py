@@ -25,6 +25,8 @@ TB, VO, VSN, VSP, QNB, QNS, QPB, QPS = range(STATE_SIZE)
 #: Charges at full charge and rest, as shares of ``q_mobile``, in the order of the state (qnB, qnS, qpB, qpS). At a
 #: fixed history of the current the charges are linear in ``q_mobile`` with this slope, at all times.
 FULL_CHARGE_SHARES: FloatArray = np.array([0.9, 0.1, 0.6, 1.0 / 15.0])
+# What leaves them for each share of q_mobile that is drawn, once the cell rests
+_DRAWN_SHARES: FloatArray = np.array([0.9, 0.1, -0.9, -0.1])
 
 CONSTANTS_SIZE = 13
 # Columns of ``PackedConstants.constants``, in SI units
@@ -271,6 +273,19 @@ class CellParameters:
 
 #: The new cell: every constant at its default.
 NEW_CELL = CellParameters()
+
+
+def rest_shares(soc: float = 1.0) -> FloatArray:
+    """
+    The charges of a cell at rest, as shares of ``q_mobile``.
+
+    :param soc: state of charge, within 0 .. 1
+    :return: of qnB, qnS, qpB and qpS, shape (4,)
+    :raises ValueError: if the state of charge is out of range
+    """
+    if not isinstance(soc, Real) or not 0.0 <= soc <= 1.0:
+        raise ValueError(f"a state of charge must lie within 0 .. 1, got {soc!r}")
+    return FULL_CHARGE_SHARES - (1.0 - float(soc)) * _DRAWN_SHARES
 
 
 def check_cell(cell: CellParameters | None, thermal: bool = False) -> CellParameters:

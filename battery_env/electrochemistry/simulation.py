@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 from battery_env.arrays import FloatArray, IntArray
 from battery_env.checks import LoadUnit, check_load, check_numbers
 from battery_env.electrochemistry.cell import (
-    FULL_CHARGE_SHARES,
     QNB,
     QNS,
     STATE_NAMES,
@@ -23,6 +22,7 @@ from battery_env.electrochemistry.cell import (
     PackedConstants,
     check_cell,
     check_dt,
+    rest_shares,
 )
 from battery_env.electrochemistry.kernels import advance_batch, roll_out, step_batch, voltage_batch
 from battery_env.parameters import Q_MOBILE, R_O
@@ -39,19 +39,20 @@ def _aged(
     return constants, Q_MOBILE.check(q), R_O.check(constants.r_o if r_o is None else r_o)
 
 
-def initial_state(q_mobile: ArrayLike | None = None, cell: CellParameters | None = None) -> FloatArray:
+def initial_state(q_mobile: ArrayLike | None = None, cell: CellParameters | None = None, soc: float = 1.0) -> FloatArray:
     """
-    The state of a fully charged cell at rest: V = 4.191350 V for every ``q_mobile``.
+    The state of a cell at rest. If it is fully charged, V = 4.191350 V for every ``q_mobile``.
 
     :param q_mobile: charge that can move, C, shape (...); ``None``: the cell's
     :param cell: constants of the cell; ``None``: the new cell's
+    :param soc: state of charge: the share of ``q_mobile`` in the negative electrode
     :return: state, shape (..., 8)
-    :raises ValueError: if ``q_mobile`` is out of range
+    :raises ValueError: if ``q_mobile`` or ``soc`` is out of range
     """
     constants, q, _ = _aged(cell, q_mobile)
     state = np.zeros((*q.shape, STATE_SIZE))
     state[..., TB] = constants.Tb0
-    state[..., QNB:] = q[..., None] * FULL_CHARGE_SHARES
+    state[..., QNB:] = q[..., None] * rest_shares(soc)
     return state
 
 

@@ -1,7 +1,7 @@
 """Calibration without learning."""
 
 from battery_env.estimates import Estimate, EstimateTrace
-from battery_env.estimators.base import Estimator, OnlineEstimator
+from battery_env.estimators.base import Estimator, OnlineBatch, OnlineEstimator, Remaining
 from battery_env.estimators.cell_fit import CellFit, fit_cell
 from battery_env.estimators.closed_form import ClosedForm
 from battery_env.estimators.cramer_rao import CramerRaoBound, Sensitivities, cramer_rao_bound, sensitivities
@@ -19,7 +19,9 @@ __all__ = [
     "ExtendedKalmanFilter",
     "GreedyOneStep",
     "LeastSquares",
+    "OnlineBatch",
     "OnlineEstimator",
+    "Remaining",
     "Sensitivities",
     "cramer_rao_bound",
     "fit_cell",

@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
+import os
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
+from copy import copy
+from pathlib import Path
+from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from battery_env.arrays import FloatArray
+from battery_env.checks import check_whole_number
+from battery_env.electrochemistry import STATE_SIZE, CellParameters, LoadUnit, simulate, state_of_charge, voltage
 from battery_env.estimates import Estimate, EstimateTrace, last_estimate
+from battery_env.estimators.state_files import load_state, save_state
 from battery_env.parameters import PARAMETERS
 from battery_env.records import Record, Stream
 
@@ -34,6 +45,39 @@ class Estimator(ABC):
         return [EstimateTrace.of([record.time_s[-1]], [self.estimate(record)]) for record in records]
 
 
+class Remaining(NamedTuple):
+    """
+    How long a discharge will go on.
+
+    :param time_s: until the cut-off, s; infinite if it is not reached within a day
+    :param sd_s: its standard deviation, from what is not known of the model at hand, s; NaN if the estimator states none
+    """
+
+    time_s: float
+    sd_s: float
+
+
+class ModelNow(NamedTuple):
+    """
+    Where the model of an estimator stands in the middle of a discharge.
+
+    :param cell: its constants
+    :param thermal: whether its temperature moves
+    :param dt_s: its time step, s
+    :param state: shape (8,)
+    :param parameters: ``q_mobile``, C, ``r_o``, ohm, and the offset of the measured voltage, V, shape (3,)
+    :param deviations: what is not known of state and parameters: independent deviations of one standard deviation each, shape
+        (k, 11)
+    """
+
+    cell: CellParameters
+    thermal: bool
+    dt_s: float
+    state: FloatArray
+    parameters: FloatArray
+    deviations: FloatArray
+
+
 class OnlineEstimator(Estimator):
     """
     A calibrator that runs along with a discharge: one estimate a sample, from what was measured until then.
@@ -58,16 +102,133 @@ class OnlineEstimator(Estimator):
         """
 
     @abstractmethod
-    def update(self, voltage_V: float, current_A: float, dt_s: float) -> Estimate:
+    def update(self, voltage_V: float, current_A: float, dt_s: float, temperature_C: float | None = None) -> Estimate:
         """
         Take in one sample.
 
-        :param voltage_V: terminal voltage, V
+        :param voltage_V: terminal voltage, V; NaN where it is missing, but for the first sample
         :param current_A: current that flows from this sample to the next one, positive in discharge, A
-        :param dt_s: time since the previous sample, s; without meaning at the first one
+        :param dt_s: time since the previous sample, s; without meaning at the first one. The current of the previous sample
+            has flowed all the time
+        :param temperature_C: of the cell, degC; ``None``: not measured
         :return: the estimate
-        :raises ValueError: for values that cannot be meant
+        :raises ValueError: for values that cannot be meant; the estimator stays as it was
         """
+
+    def check(self, voltage_V: float, current_A: float, dt_s: float, temperature_C: float | None = None) -> None:
+        """
+        Refuse a sample that :meth:`update` would refuse, and change nothing.
+
+        :param voltage_V: as of :meth:`update`
+        :param current_A: likewise
+        :param dt_s: likewise
+        :param temperature_C: likewise
+        :raises ValueError: likewise
+        """
+
+    def batch(self, cells: int) -> OnlineBatch:
+        """
+        Estimators like this one, each for a cell of its own.
+
+        :param cells: how many
+        :return: these, before their first samples
+        :raises ValueError: for no cells
+        """
+        return OnlineBatch(self, cells)
+
+    def now(self) -> ModelNow:
+        """
+        The model at the last sample; what ``soc``, ``voltage_V`` and :meth:`remaining` are told from.
+
+        :return: where it stands
+        :raises NotImplementedError: of an estimator that has none
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no model that follows the discharge")
+
+    def _made_with(self) -> dict[str, Any]:
+        """What the estimator was made with, as JSON may hold it."""
+        raise NotImplementedError(f"{type(self).__name__} cannot be saved")
+
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        """What it knows of the discharge, by name."""
+        raise NotImplementedError(f"{type(self).__name__} cannot be saved")
+
+    def _restore(self, arrays: dict[str, NDArray[Any]]) -> None:
+        """Take :meth:`_arrays` for its own."""
+        raise NotImplementedError(f"{type(self).__name__} cannot be saved")
+
+    @property
+    def soc(self) -> float:
+        """State of charge at the last sample: the share of ``q_mobile`` in the negative electrode."""
+        now = self.now()
+        return float(state_of_charge(now.state, now.parameters[0]))
+
+    @property
+    def voltage_V(self) -> float:
+        """Voltage of the model at the last sample, with the offset that the estimator found, V."""
+        now = self.now()
+        return float(voltage(now.state, now.parameters[0], now.cell)) + float(now.parameters[2])
+
+    def remaining(
+        self,
+        load: float | ArrayLike | Callable[[FloatArray], ArrayLike],
+        cut_off_V: float | None = None,
+        load_unit: LoadUnit = "current",
+    ) -> Remaining:
+        """
+        The time to the cut-off under a load, from the last sample on. Its standard deviation is that of parameters, state and
+        offset. :func:`battery_env.forecast` counts more, and takes random loads; it needs the record.
+
+        :param load: as in :func:`battery_env.simulate`: a number, an array of one value a step, or a function of time in s,
+            such as a :class:`battery_env.loads.Load`
+        :param cut_off_V: V; ``None``: the ``VEOD`` of the cell
+        :param load_unit: ``"current"`` in A or ``"power"`` in W
+        :return: time and standard deviation
+        :raises ValueError: for a load that cannot be meant
+        """
+        now = self.now()
+        middle = np.concatenate([now.state, now.parameters])
+        end_V = now.cell.VEOD if cut_off_V is None else cut_off_V
+
+        def time_s(point: FloatArray) -> float:
+            end_s = simulate(
+                load,
+                float(point[STATE_SIZE]),
+                float(point[STATE_SIZE + 1]),
+                dt=now.dt_s,
+                load_unit=load_unit,
+                thermal=now.thermal,
+                cell=now.cell,
+                initial=point[:STATE_SIZE],
+                cut_off_V=end_V - float(point[-1]),
+            ).eod_time_s
+            return float("inf") if np.isnan(end_s) else end_s
+
+        expected_s = time_s(middle)
+        if not (len(now.deviations) and np.isfinite(expected_s)):
+            return Remaining(expected_s, float("nan"))
+        differences_s = [0.5 * (time_s(middle + each) - time_s(middle - each)) for each in now.deviations]
+        return Remaining(expected_s, float(np.linalg.norm(differences_s)))
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """
+        Write what the estimator knows of the discharge to a file, from which another one with the same arguments goes on.
+
+        :param path: where to; ``.npz`` is added if it is missing. An older state there is replaced, any other file is not
+        :return: the file
+        :raises FileExistsError: if there is another file
+        """
+        return save_state(path, self._made_with(), self._arrays())
+
+    def load(self, path: str | os.PathLike[str]) -> None:
+        """
+        Go on from what :meth:`save` wrote.
+
+        :param path: the file
+        :raises FileNotFoundError: if there is no such file
+        :raises ValueError: if it is damaged, of another version, or of an estimator with other arguments
+        """
+        self._restore(load_state(path, self._made_with()))
 
     def estimate(self, record: Record) -> Estimate:
         """
@@ -94,6 +255,83 @@ class OnlineEstimator(Estimator):
             traces.append(EstimateTrace.of(stream.time_s, [self.update(*sample) for sample in stream.samples()]))
         self.reset()
         return traces
+
+
+class OnlineBatch:
+    """
+    Cells side by side, each followed by an estimator of its own with the same arguments.
+
+    :ivar estimators: these
+    :param estimator: what to copy; it stays as it is
+    :param cells: how many
+    :raises ValueError: for no cells
+    """
+
+    def __init__(self, estimator: OnlineEstimator, cells: int) -> None:
+        if check_whole_number("cells", cells) < 1:
+            raise ValueError(f"cells must be at least 1, got {cells!r}")
+        self.estimators = [copy(estimator) for _ in range(cells)]
+        self.reset()
+
+    def reset(self, cells: Iterable[int] | None = None) -> None:
+        """
+        Let discharges begin.
+
+        :param cells: of which cells; ``None``: of all
+        """
+        for n in range(len(self.estimators)) if cells is None else cells:
+            self.estimators[n].reset()
+
+    def update(
+        self, voltage_V: ArrayLike, current_A: ArrayLike, dt_s: ArrayLike, temperature_C: ArrayLike | None = None
+    ) -> list[Estimate]:
+        """
+        Take in one sample of each cell: of all, or of none if one is refused.
+
+        :param voltage_V: as of :meth:`OnlineEstimator.update`, one for all or shape (cells,)
+        :param current_A: likewise
+        :param dt_s: likewise
+        :param temperature_C: likewise
+        :return: one estimate a cell
+        :raises ValueError: for a sample that is refused; it says of which cell
+        """
+        cells = len(self.estimators)
+        columns = [np.broadcast_to(column, cells).tolist() for column in (voltage_V, current_A, dt_s)]
+        columns.append([None] * cells if temperature_C is None else np.broadcast_to(temperature_C, cells).tolist())
+        samples = list(zip(*columns, strict=True))
+        for n, (estimator, sample) in enumerate(zip(self.estimators, samples, strict=True)):
+            try:
+                estimator.check(*sample)
+            except ValueError as error:
+                raise ValueError(f"cell {n}: {error}") from error
+        return [estimator.update(*sample) for estimator, sample in zip(self.estimators, samples, strict=True)]
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """
+        Write what is known of all cells, as :meth:`OnlineEstimator.save`.
+
+        :param path: where to
+        :return: the file
+        :raises FileExistsError: if there is another file
+        """
+        arrays = {f"{n}/{name}": array for n, each in enumerate(self.estimators) for name, array in each._arrays().items()}
+        return save_state(path, self._made_with(), arrays)
+
+    def load(self, path: str | os.PathLike[str]) -> None:
+        """
+        Go on from what :meth:`save` wrote.
+
+        :param path: the file
+        :raises FileNotFoundError: if there is no such file
+        :raises ValueError: if it is damaged, of another version, or of other estimators
+        """
+        arrays = load_state(path, self._made_with())
+        for n, estimator in enumerate(self.estimators):
+            mark = f"{n}/"
+            estimator._restore({name[len(mark) :]: array for name, array in arrays.items() if name.startswith(mark)})
+
+    def _made_with(self) -> dict[str, Any]:
+        return {"cells": len(self.estimators), **self.estimators[0]._made_with()}
 
 
 def check_bounds(

@@ -6,9 +6,18 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from battery_env.electrochemistry import FULL_CHARGE_SHARES, NEW_CELL, QNB, VO, CellParameters, Trajectory
+from battery_env.electrochemistry import FULL_CHARGE_SHARES, NEW_CELL, QNB, QNS, VO, CellParameters, Trajectory
 from battery_env.estimates import Estimate, EstimateTrace
 from battery_env.estimators.base import Estimator
+from battery_env.estimators.settling import IMPLAUSIBLE, first_reason, is_plausible
+
+# The charges of the state agree with the current within this share.
+_CHARGE_SHARE = 0.02
+_NO_CURRENT = "No current flows in the last step, so that r_o does not show."
+_CONTRADICTED = (
+    "The charge that moves in the last step, {:.4g} C, is not that of the current, {:.4g} C: check time, current and their "
+    "units."
+)
 
 
 class ClosedForm(Estimator):
@@ -30,10 +39,21 @@ class ClosedForm(Estimator):
         The estimate at the end of a discharge.
 
         :param record: a simulated discharge (no recording has the full state) of at least two samples
-        :return: the estimate; ``r_o`` is NaN where no current flows
+        :return: the estimate; ``r_o`` is NaN where no current flows. It is settled if the charge that moved in the last step
+            is that of the current, and the cell is one of this kind
         """
         trace = self.trace([record])[0]
-        return Estimate(q_mobile=float(trace.q_mobile[-1]), r_o=float(trace.r_o[-1]))
+        q_mobile, r_o = float(trace.q_mobile[-1]), float(trace.r_o[-1])
+        negative_C = record.state[-2:, [QNB, QNS]].sum(axis=1)
+        moved_C, drawn_C = float(negative_C[0] - negative_C[1]), float(record.current_A[-2]) * record.dt_s
+        reason = first_reason(
+            [
+                (np.isnan(r_o), _NO_CURRENT),
+                (abs(moved_C - drawn_C) > _CHARGE_SHARE * abs(moved_C), _CONTRADICTED.format(moved_C, drawn_C)),
+                (not is_plausible(q_mobile, self.cell), IMPLAUSIBLE),
+            ]
+        )
+        return Estimate(q_mobile, r_o, settled=not reason, reason=reason)
 
     def trace(self, records: Sequence[Trajectory]) -> list[EstimateTrace]:  # type: ignore[override]
         """

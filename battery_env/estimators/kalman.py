@@ -3,51 +3,50 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from battery_env.arrays import FloatArray, StringArray
+from battery_env.arrays import FloatArray
 from battery_env.checks import check_gain_sd
-from battery_env.electrochemistry import CellParameters, check_cell, check_dt
+from battery_env.electrochemistry import STATE_SIZE, CellParameters, check_cell, check_dt, initial_state, voltage
 from battery_env.electrochemistry.tangents import PolynomialDerivatives
-from battery_env.estimates import Estimate, EstimateTrace, last_estimate
-from battery_env.estimators.base import OnlineEstimator, check_bounds
-from battery_env.estimators.kalman_bank import LIMIT_SD, Bank, Settings, follow
-from battery_env.estimators.settling import (
-    AT_BOUND,
-    EMPTY,
-    IMPLAUSIBLE,
-    IMPRECISE,
-    MISFIT,
-    MISMATCH_MARGIN,
-    PRIOR_ALONE,
-    PRIOR_CONTRADICTED,
-    PRIOR_LIMIT_SD,
-    SETTLED_SHARES,
-    START_WINDOW_S,
-    data_sd,
-    is_plausible,
-    sensor_reason,
-    start_reason,
-)
+from battery_env.estimates import Estimate, EstimateTrace
+from battery_env.estimators.base import ModelNow, OnlineEstimator, check_bounds
+from battery_env.estimators.kalman_bank import Bank, Settings, follow
+from battery_env.estimators.monitor import Limits, Monitor, watch
+from battery_env.estimators.settling import MISMATCH_MARGIN, PLAUSIBLE_Q_SHARES
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, check_parameters
-from battery_env.records import Record, Stream, check_drawn_charge, check_sample
+from battery_env.records import REST_CURRENT_A, Record, Stream, check_drawn_charge, check_sample
 
 _PRIOR_SD_SHARE_Q = 0.25
 _PRIOR_SD_R_OHM = 0.15
 _HOUR_S = 3600.0
 _NOISE_V = 0.005
-# The data must have narrowed a prior by this share of its width before a deviation from it says anything.
-_LEAST_NARROWING = 0.2
+_ZERO_CELSIUS_K = 273.15
 # A full cell takes no more charge than this share of its own.
 _SURPLUS_SHARE = 0.01
+# The charge of a cell is told from its voltage after so long a rest, s. The voltage is averaged over about the first of these
+# times; how far that mean is from the one over the second shows how much is still to come, this many times their difference.
+_LEAST_REST_S = 60.0
+_REST_MEMORIES_S = (20.0, 60.0)
+_STILL_TO_COME = 10.0
+# States of charge to choose from, where it is told from a voltage.
+_SOC_GRID = np.linspace(0.02, 1.0, 1961)
+# The slope of that voltage is taken over so much to each side.
+_SLOPE_SPAN = 0.01
+# What the filter remembers of a discharge beside its bank: how many samples, how long (s), the charge drawn (C), whether a
+# load was on, how long the cell rested before it (s), both means of its voltage then (V); the state of charge at the first
+# sample, its standard deviation; and the temperature of the surroundings (K).
+_SAMPLES, _TIME, _DRAWN, _LOADED, _REST, _FAST_V, _SLOW_V, _SOC, _SD_SOC, _AMBIENT = range(10)
 
 
 class ExtendedKalmanFilter(OnlineEstimator):
     """
-    Follows (q_mobile, r_o) along a discharge that starts with a fully charged cell at rest: one estimate a sample, with its
-    standard deviation.
+    Follows (q_mobile, r_o) along a discharge that starts with a cell at rest, fully charged unless ``initial_soc`` says
+    otherwise: one estimate a sample, with its standard deviation.
 
     *State.* Given the current, the state of the model is a function of its two parameters; the charges are even linear in
     ``q_mobile``, with slope ``FULL_CHARGE_SHARES``. So the covariance of the augmented state (states and parameters) has the
@@ -75,16 +74,25 @@ class ExtendedKalmanFilter(OnlineEstimator):
 
     The gain of the current sensor scales both parameters and does not show in the voltage: state it as ``current_gain_sd``.
 
+    *A stream.* :meth:`update` takes sample after sample, at any intervals. Between two samples the current of the first one
+    flows; a cell at rest may be left alone for a week. A voltage that is missing (NaN) corrects nothing. Charge may flow back,
+    as far as the cell has room for it: the model charges by the same equations. A measured temperature is that of the model
+    then; the first one is also that of its surroundings.
+
     *Settled* means that the data determine every parameter searched for: its standard deviation, without what a given prior
     adds to it, is below :data:`~battery_env.estimators.settling.SETTLED_SHARES` of its value; and that nothing contradicts it:
 
-    - the first samples can be those of a full cell (:func:`~battery_env.estimators.settling.start_reason`);
+    - the first samples can be those of a full cell (:func:`~battery_env.estimators.settling.start_reason`), or of one with
+      ``initial_soc``;
+    - the voltage follows the current where the load is switched, does not rise where it is not, and does not come back to
+      where it started from without a charge (:mod:`~battery_env.estimators.monitor`);
     - the estimate is farther than its standard deviation from its bounds, ``q_mobile`` is plausible for a cell of this kind,
       and the model cell is not empty;
     - innovations have not gone the same way again and again: the sum of the products of successive ones has never been 5
       standard deviations above 0, with twice ``mismatch_V`` allowed for. It comes to that where the error of the model or the
       noise is far larger than stated, a sensor fails, or the cell was charged without :meth:`reset`; one wild sample does no
       harm;
+    - the offset that is found is within 5 standard deviations of ``offset_sd_V`` and what ``mismatch_V`` adds to it;
     - ``r_o`` is where it was before, within 5 of the standard deviations stated then;
     - a given prior is within 2.5 standard deviations of what the data say.
 
@@ -112,6 +120,9 @@ class ExtendedKalmanFilter(OnlineEstimator):
     :param drift_per_hour: how far the parameters may wander in an hour, as a share of their prior means. A little keeps the
         filter awake
     :param current_gain_sd: standard deviation of the gain of the current sensor, as a share of it
+    :param initial_soc: state of charge at the first sample, after a rest: a number; (mean, standard deviation), which adds to
+        that of ``q_mobile``; or ``"rest"``: it is told from the voltage of the rest before the load, of a minute at least, by
+        the open-circuit voltage of the model, with ``voltage_noise_V`` and ``offset_sd_V`` as its errors
     :raises ValueError: for an argument out of range
     """
 
@@ -130,6 +141,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
         mismatch_V: float = 0.0,
         drift_per_hour: float = 0.001,
         current_gain_sd: float = 0.0,
+        initial_soc: float | tuple[float, float] | Literal["rest"] = 1.0,
     ) -> None:
         self.parameters = check_parameters(parameters)
         self.cell = check_cell(cell, thermal)
@@ -149,6 +161,8 @@ class ExtendedKalmanFilter(OnlineEstimator):
                 "take each sample of a model that wanders for exact. Leave voltage_noise_V out to have it follow mismatch_V."
             )
         self.current_gain_sd = check_gain_sd(current_gain_sd)
+        self.initial_soc = _check_soc(initial_soc)
+        self._told_from_rest = isinstance(initial_soc, str)
         self._carried = {
             name: (float(prior[0]), float(prior[1]))
             for name, prior in (("q_mobile", prior_q_mobile_C), ("r_o", prior_r_o_ohm))
@@ -170,7 +184,8 @@ class ExtendedKalmanFilter(OnlineEstimator):
             most_r=float(r_o_bounds_ohm[1]),
         )
         self._derivatives = PolynomialDerivatives.of(self.cell.packed)
-        self._fresh = Bank.of((q, r_o), (q_sd, r_o_sd, offset_sd_V), self._settings, self.cell)
+        self._means, self._sds = (q, r_o), (q_sd, r_o_sd, float(offset_sd_V))
+        self._rest_sd_V = float(np.hypot(voltage_noise_V, offset_sd_V))
         self.reset()
 
     def _prior(self, name: str, prior: tuple[float, float] | None, default_sd: float) -> tuple[float, float]:
@@ -186,55 +201,112 @@ class ExtendedKalmanFilter(OnlineEstimator):
 
     def reset(self) -> None:
         """
-        Forget all samples: the next one is the first of a discharge, of a fully charged cell at rest.
+        Forget all samples: the next one is the first of a discharge, of a cell at rest with ``initial_soc``.
         """
-        self._bank = self._fresh.copy()
-        self._time_s = self._drawn_C = 0.0
-        self._start: list[tuple[float, float, float]] = []  # the first samples
-        self._start_reason = ""
+        self._numbers = np.zeros(_AMBIENT + 1)
+        self._numbers[_SOC], self._numbers[_SD_SOC] = self.initial_soc
+        self._numbers[_AMBIENT] = self.cell.Tb0
+        self._monitor = Monitor.new()
+        self._model_cell = self.cell
+        self._begin()
 
-    def update(self, voltage_V: float, current_A: float, dt_s: float) -> Estimate:
+    def _begin(self) -> None:
+        """The filters at the start, as far as it is known, and what their samples are compared with."""
+        soc, sd_soc = float(self._numbers[_SOC]), float(self._numbers[_SD_SOC])
+        self._bank = Bank.of(self._means, self._sds, self._settings, self._model_cell, soc)
+        self._last = np.array([*self._means, *self._sds[:2], 1.0, 0.0])
+        self._set_limits(soc, sd_soc)
+
+    def _set_limits(self, soc: float, sd_soc: float) -> None:
+        nothing = (np.nan, np.nan)
+        self._limits = Limits(
+            start_V=float(voltage(initial_state(cell=self._model_cell, soc=soc), cell=self._model_cell)),
+            needs_rest=self._told_from_rest,
+            rested=bool(self._numbers[_REST] >= _LEAST_REST_S),
+            searched=np.array([float(name in self.parameters) for name in PARAMETER_NAMES]),
+            bounds=np.array([self.bounds[name] for name in PARAMETER_NAMES]),
+            prior=np.array([self._carried.get(name, nothing) for name in PARAMETER_NAMES]),
+            scale_sd=np.array([np.hypot(self.current_gain_sd, sd_soc / soc), self.current_gain_sd]),
+            plausible_C=np.multiply(PLAUSIBLE_Q_SHARES, self.cell.q_mobile),
+            cell_q_mobile=self.cell.q_mobile,
+        )
+
+    def check(self, voltage_V: float, current_A: float, dt_s: float, temperature_C: float | None = None) -> None:
+        """
+        Refuse a sample that :meth:`update` would refuse, and change nothing.
+
+        :param voltage_V: as of :meth:`update`
+        :param current_A: likewise
+        :param dt_s: likewise
+        :param temperature_C: likewise
+        :raises ValueError: as :meth:`update`
+        """
+        is_first, before_A = not self._numbers[_SAMPLES], self._bank.current_A
+        check_sample(voltage_V, current_A, None if is_first else dt_s, temperature_C, np.inf if is_first else before_A)
+        self._check_drawn(self._numbers[_DRAWN] + (0.0 if is_first else dt_s * before_A))
+
+    def update(self, voltage_V: float, current_A: float, dt_s: float, temperature_C: float | None = None) -> Estimate:
         """
         Take in one sample.
 
-        :param voltage_V: terminal voltage, V
+        :param voltage_V: terminal voltage, V; NaN where it is missing, but for the first sample
         :param current_A: current that flows from this sample to the next one, positive in discharge, A
-        :param dt_s: time since the previous sample, s; without meaning at the first one
+        :param dt_s: time since the previous sample, s; without meaning at the first one. The current of the previous sample
+            has flowed all the time
+        :param temperature_C: of the cell, degC; ``None``: not measured
         :return: the estimate
         :raises ValueError: for what cannot be meant (:func:`battery_env.records.check_sample`), and for a current that charges
             a full cell; the filter stays as it was
         """
-        is_first = not self._start
-        check_sample(voltage_V, current_A, None if is_first else dt_s)
-        since_s = 0.0 if is_first else dt_s
-        drawn_C = self._drawn_C + since_s * self._bank.current_A
-        self._check_drawn(drawn_C)
-        self._time_s, self._drawn_C = self._time_s + since_s, drawn_C
-        if len(self._start) < 2 or self._time_s <= START_WINDOW_S:
-            self._start.append((self._time_s, voltage_V, current_A))
-            time_s, voltages_V, currents_A = np.array(self._start).T
-            self._start_reason = start_reason(time_s, voltages_V, currents_A, self.cell)
-        out = self._run(self._bank, np.array([[voltage_V], [current_A], [since_s]], dtype=np.float64))
-        trace = self._trace(np.array([self._time_s]), out, np.array([self._start_reason], dtype=object))
-        return last_estimate(trace)
+        self.check(voltage_V, current_A, dt_s, temperature_C)
+        since_s = dt_s if self._numbers[_SAMPLES] else 0.0
+        temperature_K = np.nan if temperature_C is None else temperature_C + _ZERO_CELSIUS_K
+        if not self._numbers[_SAMPLES] and temperature_C is not None:
+            self._surround(temperature_K)
+        if self._told_from_rest and not self._numbers[_LOADED]:
+            self._rest(voltage_V, current_A, since_s)
+        samples = np.array([[voltage_V], [current_A], [since_s], [temperature_K]], dtype=np.float64)
+        out, codes = self._run(samples)
+        code = int(codes[0])
+        reason = self._texts()[code] if code else ""
+        q, r_o, sd_q, sd_r_o = out[0, :4].tolist()
+        searched = self._limits.searched
+        return Estimate(
+            q, r_o, sd_q if searched[0] else float("nan"), sd_r_o if searched[1] else float("nan"), not code, reason
+        )
 
-    def estimate(self, record: Record) -> Estimate:
-        """
-        The estimate at the last sample of a record. Unlike the stream, a whole record can be asked whether its voltage follows
-        its current everywhere: where a sensor is stuck or gone for a while, the estimate is not settled.
+    def _surround(self, temperature_K: float) -> None:
+        """The model starts at this temperature, and in surroundings of it."""
+        self._numbers[_AMBIENT] = temperature_K
+        self._model_cell = self.cell.replace(Tb0=temperature_K)
+        self._begin()
 
-        :param record: one discharge
-        :return: the estimate
-        :raises ValueError: if the record cannot be used
-        """
-        from scipy.ndimage import median_filter  # here, as it takes longer to import than this package
+    def _rest(self, voltage_V: float, current_A: float, since_s: float) -> None:
+        """Tell the state of charge from the voltage, as long as no load is on."""
+        numbers = self._numbers
+        if abs(current_A) > REST_CURRENT_A:
+            numbers[_LOADED] = 1.0
+            return
+        if np.isnan(voltage_V):
+            return
+        if not numbers[_SAMPLES]:
+            numbers[[_FAST_V, _SLOW_V]] = voltage_V
+        for mean, memory_s in zip((_FAST_V, _SLOW_V), _REST_MEMORIES_S, strict=True):
+            numbers[mean] += -np.expm1(-since_s / memory_s) * (voltage_V - numbers[mean])
+        numbers[_REST] += since_s
+        rest_V = self._rest_voltages_V()
+        soc = float(np.interp(numbers[_FAST_V], rest_V, _SOC_GRID))
+        around = np.clip([soc - _SLOPE_SPAN, soc + _SLOPE_SPAN], _SOC_GRID[0], _SOC_GRID[-1])
+        slope_V = float(np.diff(np.interp(around, _SOC_GRID, rest_V))[0] / np.diff(around)[0])
+        numbers[_SOC] = soc
+        numbers[_SD_SOC] = np.hypot(self._rest_sd_V, _STILL_TO_COME * (numbers[_FAST_V] - numbers[_SLOW_V])) / slope_V
+        self._begin()
 
-        estimate = super().estimate(record)
-        time_s, voltage_V, current_A = (np.asarray(getattr(record, name)) for name in ("time_s", "voltage_V", "current_A"))
-        # single wild samples are gated
-        smooth_V = median_filter(voltage_V, size=3, mode="nearest")
-        reason = estimate.reason or (sensor_reason(time_s, smooth_V, current_A) if len(time_s) > 1 else "")
-        return replace(estimate, settled=not reason, reason=reason)
+    def _rest_voltages_V(self) -> FloatArray:
+        """The voltage of the cell at rest at each state of charge of the grid."""
+        full, empty = (initial_state(cell=self._model_cell, soc=soc) for soc in (1.0, 0.0))
+        states = empty + _SOC_GRID[:, None] * (full - empty)
+        return np.asarray(voltage(states, cell=self._model_cell))
 
     def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:
         """
@@ -244,47 +316,107 @@ class ExtendedKalmanFilter(OnlineEstimator):
         :return: one trace per discharge, in the same order
         :raises ValueError: if a record cannot be used
         """
+        if self._told_from_rest:
+            return super().trace(records)
         traces = []
         for record in records:
             time_s, voltage_V, current_A, dt_s = Stream.of(record, self.dt_s)
+            self.reset()
             self._check_drawn(float(np.cumsum(np.append(0.0, current_A[:-1]) * dt_s).min()))
-            starts = max(int(np.searchsorted(time_s, time_s[0] + START_WINDOW_S, side="right")), 2)
-            reasons = [start_reason(time_s[:n], voltage_V[:n], current_A[:n], self.cell) for n in range(1, starts + 1)]
-            start = np.array(reasons[: len(time_s)] + [reasons[-1]] * (len(time_s) - starts), dtype=object)
-            out = self._run(self._fresh.copy(), np.stack([voltage_V, current_A, dt_s]))
-            traces.append(self._trace(time_s, out, start))
+            out, codes = self._run(np.stack([voltage_V, current_A, dt_s, np.full(len(time_s), np.nan)]))
+            q, r_o, sd_q, sd_r_o = out[:, :4].T.copy()
+            for name, sd in (("q_mobile", sd_q), ("r_o", sd_r_o)):
+                if name not in self.parameters:
+                    sd[:] = np.nan
+            reason = np.array(self._texts(), dtype=object)[codes]
+            traces.append(EstimateTrace(time_s, q, r_o, sd_q, sd_r_o, codes == 0, reason))
         self.reset()
         return traces
 
     def _check_drawn(self, charge_C: float) -> None:
-        check_drawn_charge(charge_C, -_SURPLUS_SHARE * self.cell.q_mobile)
+        room = _SURPLUS_SHARE + (1.0 - float(self._numbers[_SOC]))
+        check_drawn_charge(charge_C, -room * self.cell.q_mobile)
 
-    def _run(self, bank: Bank, samples: FloatArray) -> FloatArray:
-        out = np.empty((samples.shape[1], 6))
-        follow(bank, samples[0], samples[1], samples[2], self._settings, self.cell.packed, self._derivatives, out)
-        return out
+    def _run(self, samples: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
+        """
+        Take in samples.
 
-    def _trace(self, time_s: FloatArray, out: FloatArray, start: StringArray) -> EstimateTrace:
-        """What the filter says, from its rows and from why each sample so far is no start of a full cell."""
-        q, r_o, sd_q, sd_r_o, alive, trend = out.T.copy()
-        values, own_sd = {"q_mobile": q, "r_o": r_o}, {"q_mobile": sd_q, "r_o": sd_r_o}
-        sd = {name: np.hypot(own_sd[name], self.current_gain_sd * values[name]) for name in self.parameters}
-        conditions = [(start != "", start), (alive == 0.0, EMPTY)]
-        for name in self.parameters:
-            low, high = self.bounds[name]
-            inside = (low + own_sd[name] < values[name]) & (values[name] < high - own_sd[name])
-            conditions.append((~inside, AT_BOUND.format(name)))
-        if "q_mobile" in self.parameters:
-            conditions.append((~is_plausible(q, self.cell), IMPLAUSIBLE))
-        conditions.append((trend > LIMIT_SD, MISFIT))
-        for name, (mean, prior_sd) in self._carried.items():
-            narrowed = np.maximum(prior_sd**2 - own_sd[name] ** 2, (_LEAST_NARROWING * prior_sd) ** 2)
-            contradicted = (values[name] - mean) ** 2 > PRIOR_LIMIT_SD**2 * narrowed
-            alone = data_sd(own_sd[name], prior_sd) >= SETTLED_SHARES[name] * values[name]
-            conditions += [(contradicted, PRIOR_CONTRADICTED.format(name)), (alone, PRIOR_ALONE.format(name))]
-        conditions += [(~(sd[name] < SETTLED_SHARES[name] * values[name]), IMPRECISE[name]) for name in self.parameters]
-        reason = np.full(len(time_s), "", dtype=object)
-        for holds, text in reversed(conditions):
-            reason = np.where(holds, text, reason)
-        held = np.full(len(time_s), np.nan)
-        return EstimateTrace(time_s, q, r_o, sd.get("q_mobile", held), sd.get("r_o", held), reason == "", reason)
+        :param samples: voltage (V), current (A), time since the previous sample (s) and temperature (K), shape (4, T)
+        :return: rows of the bank (:func:`~.kalman_bank.follow`), shape (T, 6), and codes of what contradicts, shape (T,)
+        """
+        voltage_V, current_A, dt_s, temperature_K = samples
+        numbers, count = self._numbers, samples.shape[1]
+        out, codes = np.empty((count, 6)), np.empty(count, dtype=np.int64)
+        before_A = np.append(self._bank.current_A, current_A[:-1])
+        drawn_C = numbers[_DRAWN] + np.cumsum(before_A * dt_s)
+        settings, packed = self._settings, self._model_cell.packed
+        follow(self._bank, voltage_V, current_A, dt_s, temperature_K, settings, packed, self._derivatives, out)
+        watch(self._monitor, voltage_V, current_A, dt_s, drawn_C, self._limits, out, codes)
+        numbers[_SAMPLES] += count
+        numbers[_TIME] += dt_s.sum()
+        numbers[_DRAWN] = drawn_C[-1]
+        self._last = out[-1].copy()
+        return out, codes
+
+    def _texts(self) -> list[str]:
+        return self._monitor.texts(self._limits.start_V, float(self._numbers[_SOC]))
+
+    def now(self) -> ModelNow:
+        """
+        The model at the last sample, at the mean of all filters.
+
+        :return: where it stands
+        """
+        bank = self._bank
+        weight = np.exp(bank.log_weight - bank.log_weight.max())
+        weight /= weight.sum()
+        best, alive = int(weight.argmax()), weight > 0.0
+        mean = weight[alive] @ bank.mean[alive]
+        apart = bank.mean[alive] - mean
+        covariance = np.tensordot(weight[alive], bank.covariance[alive] + apart[:, :, None] * apart[:, None, :], axes=1)
+        # the state goes along with the parameters, by its tangents
+        by_parameters = np.vstack([np.hstack([bank.tangents[best], np.eye(2, 3)]), np.eye(1, STATE_SIZE + 3, STATE_SIZE + 2)])
+        variances, directions = np.linalg.eigh(covariance)
+        deviations = (directions * np.sqrt(np.maximum(variances, 0.0))).T @ by_parameters
+        state = bank.state[best] + (mean - bank.mean[best]) @ by_parameters[:, :STATE_SIZE]
+        return ModelNow(self._model_cell, self.thermal, self.dt_s, state, mean, deviations)
+
+    def _made_with(self) -> dict[str, Any]:
+        return {
+            "estimator": type(self).__name__,
+            "parameters": list(self.parameters),
+            "cell": asdict(self.cell),
+            "means": list(self._means),
+            "standard deviations": list(self._sds),
+            "settings": self._settings._asdict(),
+            "priors": self._carried,
+            "current_gain_sd": self.current_gain_sd,
+            "initial_soc": "rest" if self._told_from_rest else list(self.initial_soc),
+        }
+
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        arrays = {f"bank/{name}": array for name, array in self._bank._asdict().items()}
+        arrays |= {f"monitor/{name}": array for name, array in self._monitor._asdict().items()}
+        return {**arrays, "numbers": self._numbers, "last": self._last}
+
+    def _restore(self, arrays: dict[str, NDArray[Any]]) -> None:
+        self._numbers, self._last = arrays["numbers"].copy(), arrays["last"].copy()
+        self._model_cell = self.cell.replace(Tb0=float(self._numbers[_AMBIENT]))
+        self._bank = Bank(*(arrays[f"bank/{name}"].copy() for name in Bank._fields))
+        self._monitor = Monitor(*(arrays[f"monitor/{name}"].copy() for name in Monitor._fields))
+        self._set_limits(float(self._numbers[_SOC]), float(self._numbers[_SD_SOC]))
+
+
+def _check_soc(initial_soc: float | tuple[float, float] | str) -> tuple[float, float]:
+    """Mean and standard deviation of the state of charge at the start."""
+    if initial_soc == "rest":
+        return 1.0, 0.0
+    try:
+        mean, sd = (float(initial_soc), 0.0) if np.ndim(initial_soc) == 0 else map(float, initial_soc)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        mean = sd = np.nan
+    if not (0.02 <= mean <= 1.0 and 0.0 <= sd < 1.0):
+        raise ValueError(
+            f"initial_soc is a state of charge within 0.02 .. 1, (mean, standard deviation), or 'rest', got {initial_soc!r}"
+        )
+    return mean, sd

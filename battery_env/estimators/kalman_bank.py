@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import exp, inf, log, sqrt
+from math import exp, inf, isnan, log, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -10,14 +10,15 @@ from numba import njit
 
 from battery_env.arrays import FloatArray
 from battery_env.electrochemistry import (
-    FULL_CHARGE_SHARES,
     QNB,
     QNS,
     QPS,
     STATE_SIZE,
+    TB,
     CellParameters,
     PackedConstants,
     initial_state,
+    rest_shares,
 )
 from battery_env.electrochemistry.kernels import MOLE_FRACTION_MARGIN, cell_voltage
 from battery_env.electrochemistry.tangents import (
@@ -30,8 +31,9 @@ from battery_env.electrochemistry.tangents import (
     voltage_tangents,
 )
 
-#: Standard deviations. Innovations count in full within the gate. A filter whose successive innovations are correlated, or
-#: whose estimate leaves the range that it stated, by more than the limit does not follow its cell.
+#: Standard deviations. Innovations count in full within the gate. A filter whose successive innovations are correlated, whose
+#: estimate leaves the range that it stated, or whose offset is beyond the stated one, by more than the limit does not follow
+#: its cell.
 GATE_SD, LIMIT_SD = 5.0, 5.0
 
 # What a filter estimates: q_mobile (C), r_o (ohm) and the offset of the voltage (V).
@@ -39,8 +41,9 @@ _Q, _R, _OFFSET = range(3)
 # What the bank remembers: the current since the last sample (A), the mean of the noise that innovations showed (V^2), the last
 # innovations (of the mixture, normalized), the sum of the products of each with those before it and its variance, both over
 # about so many samples, how many standard deviations that sum has been above 0 at most, and the range that r_o cannot leave
-# if what the filter said about it before was right (q_mobile can: at the knee the error of the model moves it).
-_CURRENT, _NOISE, _LAST, _PRODUCTS, _VARIANCE, _TREND, _LEAST_R, _MOST_R = range(8)
+# if what the filter said about it before was right (q_mobile can: at the knee the error of the model moves it), and the
+# variance that the offset may have by now (V^2).
+_CURRENT, _NOISE, _LAST, _PRODUCTS, _VARIANCE, _TREND, _LEAST_R, _MOST_R, _OFFSET_V2 = range(9)
 _TREND_MEMORY, _PRODUCTS_MEMORY = 0.8, 0.999
 # A filter is linear over its standard deviation of q_mobile: a wider prior is divided among filters this far apart (as a
 # share of its mean), over so many standard deviations to each side.
@@ -99,7 +102,7 @@ class Bank(NamedTuple):
     :param log_weight: logarithm of the weight, -inf for a filter that is given up, shape (filters,)
     :param shown: variance of the noise that the last innovation showed, V^2, shape (filters,)
     :param innovation: the last one over its standard deviation, within the gate, shape (filters,)
-    :param memory: what the bank remembers, shape (8,)
+    :param memory: what the bank remembers, shape (9,)
     """
 
     state: FloatArray
@@ -112,14 +115,22 @@ class Bank(NamedTuple):
     memory: FloatArray
 
     @classmethod
-    def of(cls, means: tuple[float, float], sds: tuple[float, float, float], settings: Settings, cell: CellParameters) -> Bank:
+    def of(
+        cls,
+        means: tuple[float, float],
+        sds: tuple[float, float, float],
+        settings: Settings,
+        cell: CellParameters,
+        soc: float = 1.0,
+    ) -> Bank:
         """
-        The filters that a prior takes, before the first sample of a full cell at rest.
+        The filters that a prior takes, before the first sample of a cell at rest.
 
         :param means: of ``q_mobile``, C, and ``r_o``, ohm
         :param sds: standard deviations of both, and of an offset of the voltage, whose mean is 0, V
         :param settings: the bounds of ``q_mobile`` are among them
         :param cell: constants of the model
+        :param soc: state of charge, 1 if it is full
         :return: the bank
         """
         (q, r_o), sd_q = means, sds[_Q]
@@ -130,12 +141,12 @@ class Bank(NamedTuple):
         q_mobile, deviations = q_mobile[inside], deviations[inside]
         filters = len(q_mobile)
         tangents = np.zeros((filters, 2, STATE_SIZE))
-        tangents[:, BY_Q, QNB:] = FULL_CHARGE_SHARES
+        tangents[:, BY_Q, QNB:] = rest_shares(soc)
         own_sds = [_REACH_SD / half * sd_q if half else sd_q, *sds[1:]]
-        memory = np.zeros(8)
-        memory[_LEAST_R:] = [-inf, inf]
+        memory = np.zeros(9)
+        memory[_LEAST_R:] = [-inf, inf, sds[_OFFSET] ** 2]
         return cls(
-            state=initial_state(q_mobile, cell),
+            state=initial_state(q_mobile, cell, soc),
             tangents=tangents,
             mean=np.column_stack([q_mobile, np.full(filters, r_o), np.zeros(filters)]),
             covariance=np.tile(np.diag(np.square(own_sds)), (filters, 1, 1)),
@@ -269,6 +280,7 @@ def _take(
     voltage: float,
     current: float,
     duration: float,
+    temperature: float,
     settings: Settings,
     packed: PackedConstants,
     derivatives: PolynomialDerivatives,
@@ -282,9 +294,14 @@ def _take(
         if log_weight[m] > -inf:
             if duration > 0.0:
                 _predict(bank, m, duration, settings, constants)
+            if not isnan(temperature):
+                # measured, it is no function of the parameters any more
+                bank.state[m, TB] = temperature
+                bank.tangents[m, BY_Q, TB] = bank.tangents[m, BY_R, TB] = 0.0
             if _keep_alive(bank, m, settings, constants):
-                _correct(bank, m, voltage, noise, settings, packed, derivatives)
-                _keep_alive(bank, m, settings, constants)
+                if not isnan(voltage):
+                    _correct(bank, m, voltage, noise, settings, packed, derivatives)
+                    _keep_alive(bank, m, settings, constants)
     best = _reduce(bank)
     # moments of the mixture, about the heaviest filter
     total, q, r, qq, rr, square, normalized = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -301,16 +318,20 @@ def _take(
     q, r = q / total, r / total
     normalized /= total
     memory[_CURRENT] = current
-    memory[_NOISE] = max(memory[_NOISE] + (square / total - memory[_NOISE]) / _NOISE_MEMORY, 0.0)
-    memory[_PRODUCTS] = _PRODUCTS_MEMORY * memory[_PRODUCTS] + normalized * memory[_LAST]
-    memory[_VARIANCE] = _PRODUCTS_MEMORY**2 * memory[_VARIANCE] + 1.0
-    memory[_TREND] = max(memory[_TREND], memory[_PRODUCTS] / sqrt(memory[_VARIANCE]))
-    memory[_LAST] = _TREND_MEMORY * memory[_LAST] + sqrt(1.0 - _TREND_MEMORY**2) * normalized
+    if not isnan(voltage):
+        memory[_NOISE] = max(memory[_NOISE] + (square / total - memory[_NOISE]) / _NOISE_MEMORY, 0.0)
+        memory[_PRODUCTS] = _PRODUCTS_MEMORY * memory[_PRODUCTS] + normalized * memory[_LAST]
+        memory[_VARIANCE] = _PRODUCTS_MEMORY**2 * memory[_VARIANCE] + 1.0
+        memory[_TREND] = max(memory[_TREND], memory[_PRODUCTS] / sqrt(memory[_VARIANCE]))
+        memory[_LAST] = _TREND_MEMORY * memory[_LAST] + sqrt(1.0 - _TREND_MEMORY**2) * normalized
     out[n, 0] = mean[best, _Q] + q
     out[n, 1] = mean[best, _R] + r
     out[n, 2] = sqrt(qq / total - q * q)
     out[n, 3] = sqrt(rr / total - r * r)
     out[n, 4] = 1.0 if _keep_alive(bank, best, settings, constants) else 0.0
+    memory[_OFFSET_V2] += settings.offset_growth * duration
+    if mean[best, _OFFSET] ** 2 > LIMIT_SD**2 * memory[_OFFSET_V2]:
+        memory[_TREND] = inf
     reach = LIMIT_SD * out[n, 3]
     if reach > 0.0:
         memory[_LEAST_R] = max(memory[_LEAST_R], out[n, 1] - reach)
@@ -326,6 +347,7 @@ def follow(
     voltage: FloatArray,
     current: FloatArray,
     duration: FloatArray,
+    temperature: FloatArray,
     settings: Settings,
     packed: PackedConstants,
     derivatives: PolynomialDerivatives,
@@ -335,9 +357,10 @@ def follow(
     Take in samples; unchecked.
 
     :param bank: the filters, which go on from where they are
-    :param voltage: V, shape (T,)
+    :param voltage: V, shape (T,); where it is NaN the model goes on without a correction
     :param current: from each sample to the next one, A, shape (T,)
     :param duration: since the sample before, s, shape (T,)
+    :param temperature: of the cells, K, shape (T,); where it is NaN the model has its own
     :param settings: of the bank
     :param packed: constants of the model
     :param derivatives: of its polynomials
@@ -346,4 +369,4 @@ def follow(
         0, in standard deviations
     """
     for n in range(voltage.shape[0]):
-        _take(bank, voltage[n], current[n], duration[n], settings, packed, derivatives, out, n)
+        _take(bank, voltage[n], current[n], duration[n], temperature[n], settings, packed, derivatives, out, n)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike
 
 from battery_env.arrays import BoolArray, FloatArray
@@ -25,10 +26,10 @@ LEAST_RESISTANCE_OHM = 0.1
 #: The voltage of a cell that was at rest at the first sample falls by at least half of its ohmic drop within this time, s.
 START_WINDOW_S = 20.0
 
-# Under a current that has been steady for this long, s, the voltage of a cell does not rise by this much, V.
-_STEADY_S, _RISE_V = 60.0, 0.05
-# What is more than this many standard deviations of the noise is not noise.
-_NOISES = 8.0
+#: Under a current that has been steady for this long, s, the voltage of a cell does not rise by this much, V.
+STEADY_S, RISE_V = 60.0, 0.05
+#: What is more than this many standard deviations of the noise is not noise.
+NOISES = 8.0
 
 #: A ``q_mobile`` is plausible within these multiples of the model cell's: its electrodes are those of a 2 Ah cell.
 PLAUSIBLE_Q_SHARES = (0.2, 5.0)
@@ -53,6 +54,8 @@ MISFIT = (
     "The voltage of the model is farther off than noise and mismatch_V explain: state a larger mismatch_V, or check the "
     "sensors and that this is one discharge."
 )
+NOT_FOLLOWED = "The current changes by {:.2f} A at {:.0f} s, and the voltage does not follow."
+RISES = "The voltage rises by {:.2f} V at {:.0f} s, where the current stays as it was."
 PRIOR_CONTRADICTED = "The prior of {} contradicts what the record says."
 PRIOR_ALONE = "{} rests on its prior: the record alone does not determine it yet."
 
@@ -69,26 +72,60 @@ def start_reason(time_s: FloatArray, voltage_V: FloatArray, current_A: FloatArra
     :return: why it cannot, or cannot be told to; empty if it can
     """
     full_V = float(voltage(initial_state(cell=cell), cell=cell))
-    first_V, drop_V = float(voltage_V[0]), LEAST_RESISTANCE_OHM * max(float(current_A[0]), 0.0)
-    low_V, high_V = full_V - FULL_REST_V[0], full_V + FULL_REST_V[1]
-    if first_V > high_V:
-        return (
-            f"The record starts at {first_V:.2f} V, above the {full_V:.2f} V of a full cell: another kind of cell or sensor."
-        )
-    if first_V >= low_V:
-        return ""
-    advice = "Give the whole discharge of a full cell, with the rest before it."
     soon = time_s <= time_s[0] + START_WINDOW_S
     soon[1:2] = True
-    at_rest = current_A[0] <= SWITCH_SHARE * current_A[soon].max() or first_V - voltage_V[soon].min() >= 0.5 * drop_V
-    if at_rest:
-        return f"The record starts at rest at {first_V:.2f} V, where a full cell shows {full_V:.2f} V. {advice}"
-    if first_V + drop_V < low_V:
-        return (
-            f"The record starts under load at {first_V:.2f} V, at which a cell need not be full: it rests at {full_V:.2f} V "
-            f"then. {advice}"
-        )
-    return ""
+    first_V, first_A = float(voltage_V[0]), float(current_A[0])
+    code = start_code(first_V, first_A, float(current_A[soon].max()), float(voltage_V[soon].min()), full_V)
+    return start_text(code, first_V, full_V)
+
+
+@njit(cache=True, error_model="numpy")
+def start_code(first_V: float, first_A: float, most_A: float, least_V: float, rest_V: float) -> int:
+    """
+    Whether the first samples of a record can be those of a cell that rested, compiled.
+
+    :param first_V: first voltage, V
+    :param first_A: first current, A
+    :param most_A: largest current of the first 20 s, A
+    :param least_V: least voltage of the first 20 s, V
+    :param rest_V: voltage of the cell at rest, V
+    :return: 0 if they can, 1 if the voltage is too high, 2 if it is too low at rest, and 3 if it is under load
+    """
+    drop_V = LEAST_RESISTANCE_OHM * max(first_A, 0.0)
+    low_V, high_V = rest_V - FULL_REST_V[0], rest_V + FULL_REST_V[1]
+    if first_V > high_V:
+        return 1
+    if first_V >= low_V:
+        return 0
+    if first_A <= SWITCH_SHARE * most_A or first_V - least_V >= 0.5 * drop_V:
+        return 2
+    return 3 if first_V + drop_V < low_V else 0
+
+
+def start_text(code: int, first_V: float, rest_V: float, initial_soc: float = 1.0) -> str:
+    """
+    The reason that a code of :func:`start_code` stands for.
+
+    :param code: 0 .. 3, or 4 where the charge was to be told from a rest, and there was none
+    :param first_V: first voltage, V
+    :param rest_V: voltage of the cell at rest, V
+    :param initial_soc: state of charge that the cell is said to start with
+    :return: why the record cannot start so, or cannot be told to; empty if it can
+    """
+    if initial_soc == 1.0:
+        what, advice = "a full cell", "Give the whole discharge of a full cell, with the rest before it."
+    else:
+        what, advice = f"a cell with {initial_soc:.0%} of its charge", "State another initial_soc."
+    return (
+        "",
+        f"The record starts at {first_V:.2f} V, above the {rest_V:.2f} V of {what}: another kind of cell or sensor.",
+        f"The record starts at rest at {first_V:.2f} V, where {what} shows {rest_V:.2f} V. {advice}",
+        f"The record starts under load at {first_V:.2f} V, at which a cell need not be "
+        + ("full" if initial_soc == 1.0 else what)
+        + f": it rests at {rest_V:.2f} V then. {advice}",
+        "The record does not start with a minute at rest, whose voltage would tell the charge. Give the rest before the load, "
+        "or state initial_soc.",
+    )[code]
 
 
 def sensor_reason(time_s: FloatArray, voltage_V: FloatArray, current_A: FloatArray) -> str:
@@ -102,7 +139,7 @@ def sensor_reason(time_s: FloatArray, voltage_V: FloatArray, current_A: FloatArr
     :return: where they do not; empty if they do
     """
     last = len(time_s) - 1
-    noise_V = _NOISES * white_noise_V(voltage_V)
+    noise_V = NOISES * white_noise_V(voltage_V)
     switched_A = np.diff(current_A)
     switches = np.flatnonzero(np.abs(switched_A) > SWITCH_SHARE * np.abs(current_A).max()) + 1
     until = np.minimum(
@@ -114,16 +151,14 @@ def sensor_reason(time_s: FloatArray, voltage_V: FloatArray, current_A: FloatArr
         if until[n] <= min(following, last - 1) and abs(drop_V) > noise_V:
             followed_V = voltage_V[n - 1] - (after_V.min() if drop_V > 0.0 else after_V.max())
             if followed_V / drop_V < 1.0:
-                return (
-                    f"The current changes by {switched_A[n - 1]:.2f} A at {time_s[n]:.0f} s, and the voltage does not follow."
-                )
+                return NOT_FOLLOWED.format(switched_A[n - 1], time_s[n])
     since_s = np.full(last + 1, time_s[0])
     since_s[switches] = time_s[switches]
-    steady = np.maximum.accumulate(since_s)[until[:-1]] <= time_s[:-1] - _STEADY_S
+    steady = np.maximum.accumulate(since_s)[until[:-1]] <= time_s[:-1] - STEADY_S
     rise_V = np.where(steady, voltage_V[until[:-1]] - voltage_V[:-1], 0.0)
     highest = int(rise_V.argmax())
-    if rise_V[highest] > max(_RISE_V, noise_V):
-        return f"The voltage rises by {rise_V[highest]:.2f} V at {time_s[highest]:.0f} s, where the current stays as it was."
+    if rise_V[highest] > max(RISE_V, noise_V):
+        return RISES.format(rise_V[highest], time_s[highest])
     return ""
 
 
@@ -149,19 +184,6 @@ def white_noise_V(residual_V: FloatArray) -> float:
     :return: V
     """
     return float(np.median(np.abs(np.diff(residual_V))) / (0.6745 * np.sqrt(2.0)))
-
-
-def data_sd(sd: ArrayLike, prior_sd: float) -> FloatArray:
-    """
-    The standard deviation that the data alone give: precisions add up.
-
-    :param sd: of prior and data together, any shape
-    :param prior_sd: of the prior
-    :return: same shape; infinite where the data add nothing
-    """
-    more = np.asarray(sd, dtype=np.float64) ** -2.0 - prior_sd**-2.0
-    with np.errstate(divide="ignore"):
-        return np.asarray(np.maximum(more, 0.0) ** -0.5)
 
 
 def first_reason(conditions: Sequence[tuple[bool, str]]) -> str:

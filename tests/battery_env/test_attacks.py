@@ -19,8 +19,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from battery_env.cells import Discharge, load_nasa_discharges
-from battery_env.electrochemistry import simulate
-from battery_env.estimators import Estimate, ExtendedKalmanFilter, LeastSquares
+from battery_env.electrochemistry import initial_state, simulate
+from battery_env.estimators import ClosedForm, Estimate, ExtendedKalmanFilter, LeastSquares
+from battery_env.estimators.base import OnlineEstimator
+from battery_env.records import Stream
 
 WRONG_SHARE = 0.05
 COVERED_SD = 3.0
@@ -29,10 +31,13 @@ GAIN_SD = 0.005
 
 FAULTS = (
     "none",
+    "not full",
     "late start",
+    "forgotten reset",
     "wrong unit",
     "wrong prior",
     "dropout",
+    "30 samples without current",
     "stuck voltage",
     "stuck current",
     "current gain, stated",
@@ -75,7 +80,7 @@ class Case:
         return replace(self, **arrays)
 
 
-def simulated(rng: np.random.Generator) -> Case:
+def simulated(rng: np.random.Generator, soc: float = 1.0) -> Case:
     """A simulated discharge of an aged cell under a constant, pulsed or wandering current, with noise of the sensor."""
     q_mobile, r_o = rng.uniform(4000.0, 7600.0), rng.uniform(0.1, 0.3)
     kind = rng.choice(["constant", "pulsed", "random walk"])
@@ -88,7 +93,10 @@ def simulated(rng: np.random.Generator) -> Case:
         segment = int(rng.integers(30, 120))
         walk = level + np.cumsum(rng.normal(0.0, 0.3, len(current_A) // segment + 1))
         current_A = np.repeat(np.abs(walk - 0.3) % 3.0 + 0.3, segment)[: len(current_A)]
-    record = simulate(current_A, q_mobile, r_o, load_unit="current", thermal=True, cut_off_V=rng.uniform(2.7, 3.1))
+    start = initial_state(q_mobile, soc=soc)
+    record = simulate(
+        current_A, q_mobile, r_o, load_unit="current", thermal=True, cut_off_V=rng.uniform(2.7, 3.1), initial=start
+    )
     voltage_V = record.voltage_V + rng.normal(0.0, rng.choice([0.001, 0.005, 0.01]), len(record.voltage_V))
     return Case(record.time_s, voltage_V, record.current_A, q_mobile, r_o, recorded=False)
 
@@ -130,6 +138,13 @@ def drawn(rng: np.random.Generator, cells: tuple[str, ...]) -> Case:
 def broken(case: Case, fault: str, rng: np.random.Generator) -> Case:
     """The record with one fault."""
     n = len(case.time_s)
+    if fault == "not full":
+        return simulated(rng, rng.uniform(0.4, 0.94))
+    if fault == "forgotten reset":
+        first = case.part(0, max(int(rng.uniform(0.2, 1.0) * n), 2))
+        after_s = first.time_s[-1] - case.time_s[0] + rng.choice([1.0, 60.0, 600.0])
+        arrays = {name: np.append(getattr(first, name), getattr(case, name)) for name in ("voltage_V", "current_A")}
+        return replace(case, time_s=np.append(first.time_s, case.time_s + after_s), **arrays)
     if fault == "late start":
         return case.part(int(np.ceil(rng.uniform(0.05, 0.5) * n)), n)
     if fault == "wrong unit":
@@ -144,6 +159,8 @@ def broken(case: Case, fault: str, rng: np.random.Generator) -> Case:
     if fault == "dropout":
         values = voltage_V if rng.random() < 0.5 else current_A
         values[start : start + int(rng.integers(1, max(n // 10, 2)))] = 0.0
+    elif fault == "30 samples without current":
+        current_A[start : start + 30] = 0.0
     elif fault == "stuck voltage":
         voltage_V[start:] = voltage_V[start]
     elif fault == "stuck current":
@@ -168,7 +185,25 @@ def calibrators(case: Case) -> dict[str, object]:
     }
 
 
-def outcome(case: Case, make: object) -> tuple[str, Estimate | None]:
+def paths(estimator: object) -> dict[str, object]:
+    """The ways from a record to an estimate: whole, as a trace, and sample by sample."""
+
+    def stream(record: Discharge | Case) -> Estimate:
+        estimator.reset()
+        for sample in Stream.of(record, estimator.dt_s).samples():
+            estimate = estimator.update(*sample)
+        return estimate
+
+    def trace(record: Discharge | Case) -> Estimate:
+        found = estimator.trace([record])[0]
+        names = ("q_mobile", "r_o", "sd_q_mobile", "sd_r_o", "settled", "reason")
+        return Estimate(*(getattr(found, name)[-1] for name in names))
+
+    known = {"whole": estimator.estimate, "trace": trace, "stream": stream}
+    return known if isinstance(estimator, OnlineEstimator) else {"whole": estimator.estimate}
+
+
+def outcome(case: Case, make: object, path: str = "whole") -> tuple[str, Estimate | None]:
     """``refused``, ``not settled``, ``right``, or ``wrong``: settled, but off by more than 5 % and 3 standard deviations."""
     try:
         with warnings.catch_warnings():
@@ -176,7 +211,7 @@ def outcome(case: Case, make: object) -> tuple[str, Estimate | None]:
             record = case
             if case.recorded:
                 record = Discharge(case.time_s, case.voltage_V, case.current_A)
-            estimate = make().estimate(record)
+            estimate = paths(make())[path](record)
     except (TypeError, ValueError):
         return "refused", None
     if not estimate.settled:
@@ -233,9 +268,39 @@ def test_the_filter_notices_a_current_that_was_gone_for_a_while():
     assert found == "not settled" and "voltage does not follow" in estimate.reason
 
 
+@pytest.mark.parametrize("fault", [fault for fault in FAULTS if fault not in UNOBSERVABLE])
+def test_a_stream_and_a_trace_say_what_the_whole_record_says(fault):
+    rng = np.random.default_rng((3, FAULTS.index(fault)))
+    case = broken(drawn(rng, ()), fault, rng)
+    make = calibrators(case)["filter, mismatch"]
+    (found, estimate), *others = (outcome(case, make, path) for path in ("whole", "trace", "stream"))
+    assert found != "wrong" and others == [(found, estimate)] * 2
+
+
+@pytest.mark.parametrize(
+    ("changes", "settled"),
+    [
+        ({}, True),
+        ({"dt_s": 1.0 / 60.0}, False),  # minutes
+        ({"gain": 1e3}, False),  # mA
+        ({"gain": -1.0}, False),  # flipped
+        ({"gain": 1.05}, False),
+        ({"gain": 0.0}, False),  # a current that was not logged
+    ],
+)
+def test_the_closed_form_is_not_sure_of_what_its_state_contradicts(changes, settled):
+    record = simulate(2.0, 6000.0, 0.15, load_unit="current").part(500, 700)
+    gain = changes.get("gain", 1.0)
+    seen = replace(record, current_A=gain * record.current_A, dt_s=changes.get("dt_s", 1.0))
+    estimate = ClosedForm().estimate(seen)
+    assert estimate.settled == settled == (estimate.reason == "")
+    if settled:
+        assert (estimate.q_mobile, estimate.r_o) == pytest.approx((6000.0, 0.15))
+
+
 def test_attacks_are_counted_by_calibrator_and_fault():
-    table = counts(attack(10, ("B0005",)))
-    assert isinstance(table, pd.DataFrame) and table.to_numpy().sum() == 30
+    table = counts(attack(len(FAULTS), ("B0005",)))
+    assert isinstance(table, pd.DataFrame) and table.to_numpy().sum() == 3 * len(FAULTS)
     assert set(table.index.get_level_values("fault")) == set(FAULTS)
 
 

@@ -71,6 +71,12 @@ class TestAccuracy:
         assert abs(default.q_mobile - 5000.0) < 3.0 * default.sd_q_mobile < 20.0
         assert abs(exact.r_o - 0.2) > 0.001
 
+    def test_an_offset_far_beyond_the_stated_one_is_not_settled(self):
+        for offset_V, settled in ((0.01, True), (0.035, False)):
+            record = SensorErrors(NOISE_V, offset_V).apply(simulate(steps(0), 5000.0, 0.2), np.random.default_rng(0))
+            estimate = ExtendedKalmanFilter().estimate(record)
+            assert estimate.settled == settled == ("mismatch_V" not in estimate.reason)
+
     @pytest.mark.parametrize("thermal", [False, True])
     @pytest.mark.parametrize("dt_s", [0.5, 2.0])
     def test_thermal_model_and_other_time_steps(self, thermal, dt_s):
@@ -183,11 +189,11 @@ class TestOnline:
     @pytest.mark.parametrize(
         ("sample", "message"),
         [
-            ((np.nan, 2.0, 1.0), "voltage_V must be finite, got nan"),
+            ((np.inf, 2.0, 1.0), "voltage_V must be finite, got inf"),
             ((3.7, 2000.0, 1.0), "current_A must lie within -60 .. 60 A, got 2000. .* not in mA"),
             ((3700.0, 2.0, 1.0), "voltage_V must lie within 0 .. 5.5 V, got 3700. .* not in mV"),
             ((14.8, 2.0, 1.0), "voltage_V must lie within 0 .. 5.5 V, got 14.8. .* not that of a pack"),
-            ((3.7, np.inf, 1.0), "current_A must be finite, got inf"),
+            ((3.7, np.nan, 1.0), "current_A must be finite, got nan. .* give the mean current"),
             ((3.7, 2.0, 0.0), "must lie within 0.001 .. 600 s, got 0.0"),
             ((3.7, 2.0, np.nan), "must lie within 0.001 .. 600 s, got nan"),
             ((3.7, 2.0, 1000.0), "got 1000.0. Give it in seconds, not in hours or milliseconds"),

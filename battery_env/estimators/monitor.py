@@ -1,0 +1,358 @@
+"""What speaks against the estimates of a filter: its samples are watched as they come in, compiled (numba)."""
+
+from __future__ import annotations
+
+from math import hypot, inf, isnan, sqrt
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from battery_env.arrays import FloatArray, IntArray
+from battery_env.estimators.kalman_bank import LIMIT_SD
+from battery_env.estimators.settling import (
+    AT_BOUND,
+    EMPTY,
+    FULL_REST_V,
+    IMPLAUSIBLE,
+    IMPRECISE,
+    LEAST_RESISTANCE_OHM,
+    MISFIT,
+    NOISES,
+    NOT_FOLLOWED,
+    PRIOR_ALONE,
+    PRIOR_CONTRADICTED,
+    PRIOR_LIMIT_SD,
+    RISE_V,
+    RISES,
+    SETTLED_SHARES,
+    START_WINDOW_S,
+    STEADY_S,
+    start_code,
+    start_text,
+)
+from battery_env.records import SWITCH_SHARE
+
+# The data must have narrowed a prior by this share of its width before a deviation from it says anything.
+_LEAST_NARROWING = 0.2
+# A cell from which this share of its charge was drawn does not come back to the voltage of its first sample without a charge.
+_RECOVERY_SHARE = 0.2
+# A load that was switched for at least this long, s, and this many samples shows in the voltage: the ohmic drop of the model
+# comes to 80 % in 10 s.
+_LEAST_PULSE_S, _LEAST_PULSE_SAMPLES = 10.0, 3
+# The middle one of three samples has this share of their noise.
+_SMOOTHED_SHARE = 0.67
+# A smaller change of the current hardly shows in the voltage, A. Of a load that falls in such changes a rise of the voltage by
+# this resistance, ohm, with what follows more slowly, says nothing.
+_LEAST_JUMP_A, _MOST_RESISTANCE_OHM = 0.05, 0.6
+# Voltages are kept about this far apart, s; as many of them as below cover the window in which a voltage may not rise.
+_KEPT_EVERY_S = 0.9
+_KEPT = 32
+
+# What a monitor remembers: number and time of the samples (s); voltage and current of the first one; the largest current and
+# the least voltage within the start window; the two voltages before the one at hand, and time and current of the last of them;
+# how many samples were examined, and the last one; the largest magnitude of the current; of the last switch of the load its
+# time, its size (A), the voltage before it, the least and greatest one since, and how many samples; how many voltages were
+# kept; the time of the last jump of the current; how many changes of the voltage were kept; the fault that was found, its time
+# and its size.
+(
+    _SAMPLES,
+    _TIME,
+    _FIRST_V,
+    _FIRST_A,
+    _MOST_A,
+    _LEAST_V,
+    _VOLTAGE_2,
+    _VOLTAGE_1,
+    _TIME_1,
+    _CURRENT_1,
+    _EXAMINED,
+    _LAST_V,
+    _LAST_A,
+    _LARGEST_A,
+    _SWITCH_S,
+    _SWITCHED_A,
+    _BEFORE_V,
+    _LOW_V,
+    _HIGH_V,
+    _SINCE,
+    _N_KEPT,
+    _JUMP_S,
+    _N_CHANGES,
+    _FAULT,
+    _FAULT_S,
+    _FAULT_SIZE,
+    _SIZE,
+) = range(27)
+
+#: Codes of what was found, in the order in which they count. 1 .. 4 are those of :func:`~.settling.start_code`.
+(
+    SETTLED,
+    _START_ABOVE,
+    _START_BELOW,
+    _START_LOADED,
+    _START_UNKNOWN,
+    _RECOVERED,
+    _NOT_FOLLOWED,
+    _RISES,
+    _EMPTY,
+    _Q_AT_BOUND,
+    _R_AT_BOUND,
+    _IMPLAUSIBLE,
+    _MISFIT,
+    _Q_PRIOR_WRONG,
+    _Q_PRIOR_ALONE,
+    _R_PRIOR_WRONG,
+    _R_PRIOR_ALONE,
+    _Q_IMPRECISE,
+    _R_IMPRECISE,
+) = range(19)
+
+_Q_SHARE, _R_SHARE = SETTLED_SHARES["q_mobile"], SETTLED_SHARES["r_o"]
+
+_compiled = njit(cache=True, error_model="numpy")
+
+
+class Limits(NamedTuple):
+    """
+    What the monitor of a filter is told.
+
+    :param start_V: voltage that the first sample is to have at rest, V
+    :param needs_rest: whether the charge at the start was told from a rest, so that the record has to begin with one
+    :param rested: whether it did
+    :param searched: whether ``q_mobile`` and ``r_o`` are searched for, 1 or 0, shape (2,)
+    :param bounds: of both, shape (2, 2)
+    :param prior: means and standard deviations of what was carried over from an earlier discharge, NaN where nothing was,
+        shape (2, 2)
+    :param scale_sd: standard deviations of what scales both and does not show in the voltage, as shares, shape (2,)
+    :param plausible_C: between which ``q_mobile`` can lie, shape (2,)
+    :param cell_q_mobile: of the model's cell, C
+    """
+
+    start_V: float
+    needs_rest: bool
+    rested: bool
+    searched: FloatArray
+    bounds: FloatArray
+    prior: FloatArray
+    scale_sd: FloatArray
+    plausible_C: FloatArray
+    cell_q_mobile: float
+
+
+class Monitor(NamedTuple):
+    """
+    What the samples so far showed.
+
+    :param memory: shape (26,)
+    :param kept: times, s, voltages, V, and currents, A, of some samples, the last ones, in a ring, shape (3, 32)
+    :param changes: magnitudes of the last changes of the voltage from sample to sample, in a ring, V, shape (32,)
+    """
+
+    memory: FloatArray
+    kept: FloatArray
+    changes: FloatArray
+
+    @classmethod
+    def new(cls) -> Monitor:
+        """
+        Before the first sample.
+
+        :return: the monitor
+        """
+        return cls(np.zeros(_SIZE), np.zeros((3, _KEPT)), np.zeros(_KEPT))
+
+    def texts(self, start_V: float, initial_soc: float) -> list[str]:
+        """
+        The reasons that the codes stand for.
+
+        :param start_V: as of :class:`Limits`
+        :param initial_soc: state of charge at the first sample
+        :return: by code
+        """
+        memory = self.memory
+        first_V, fault_s, size = float(memory[_FIRST_V]), float(memory[_FAULT_S]), float(memory[_FAULT_SIZE])
+        return [
+            "",
+            *(start_text(code, first_V, start_V, initial_soc) for code in range(1, 5)),
+            f"The voltage comes back to that of the start at {fault_s:.0f} s, though {size:.0f} C were drawn: the cell was "
+            "charged. Reset the filter when a discharge begins.",
+            NOT_FOLLOWED.format(size, fault_s),
+            RISES.format(size, fault_s),
+            EMPTY,
+            AT_BOUND.format("q_mobile"),
+            AT_BOUND.format("r_o"),
+            IMPLAUSIBLE,
+            MISFIT,
+            PRIOR_CONTRADICTED.format("q_mobile"),
+            PRIOR_ALONE.format("q_mobile"),
+            PRIOR_CONTRADICTED.format("r_o"),
+            PRIOR_ALONE.format("r_o"),
+            IMPRECISE["q_mobile"],
+            IMPRECISE["r_o"],
+        ]
+
+
+@_compiled
+def _noise_V(monitor: Monitor) -> float:
+    # what is more than noise; infinite as long as there are too few samples to tell
+    n = min(int(monitor.memory[_N_CHANGES]), _KEPT)
+    if n < _KEPT // 4:
+        return inf
+    return NOISES * _SMOOTHED_SHARE * float(np.median(monitor.changes[:n])) / (0.6745 * sqrt(2.0))
+
+
+@_compiled
+def _find(monitor: Monitor, fault: int, time_s: float, size: float) -> None:
+    # the first one is kept
+    if monitor.memory[_FAULT] == 0.0:
+        monitor.memory[_FAULT], monitor.memory[_FAULT_S], monitor.memory[_FAULT_SIZE] = fault, time_s, size
+
+
+@_compiled
+def _conclude_switch(monitor: Monitor) -> None:
+    # whether the voltage followed the last switch of the load by half of the least ohmic drop
+    m = monitor.memory
+    drop_V = 0.5 * LEAST_RESISTANCE_OHM * m[_SWITCHED_A]
+    if abs(drop_V) > _noise_V(monitor):
+        followed_V = m[_BEFORE_V] - (m[_LOW_V] if drop_V > 0.0 else m[_HIGH_V])
+        if followed_V / drop_V < 1.0:
+            _find(monitor, _NOT_FOLLOWED, m[_SWITCH_S], m[_SWITCHED_A])
+    m[_SWITCHED_A] = 0.0
+
+
+@_compiled
+def _examine(
+    monitor: Monitor, time_s: float, voltage: float, current: float, drawn_C: float, q: float, limits: Limits
+) -> None:
+    # One sample whose voltage is no single wild one
+    m, kept = monitor.memory, monitor.kept
+    switched_A = current - m[_LAST_A]
+    m[_LARGEST_A] = max(m[_LARGEST_A], abs(current))
+    if m[_EXAMINED] > 0.0:
+        if abs(switched_A) > min(SWITCH_SHARE * m[_LARGEST_A], _LEAST_JUMP_A):
+            m[_JUMP_S] = time_s
+        if abs(switched_A) > SWITCH_SHARE * m[_LARGEST_A]:
+            if m[_SWITCHED_A] != 0.0 and time_s - m[_SWITCH_S] >= _LEAST_PULSE_S and m[_SINCE] >= _LEAST_PULSE_SAMPLES:
+                _conclude_switch(monitor)
+            m[_SWITCH_S], m[_SWITCHED_A], m[_BEFORE_V] = time_s, switched_A, m[_LAST_V]
+            m[_LOW_V], m[_HIGH_V], m[_SINCE] = inf, -inf, 0.0
+    else:
+        m[_SWITCH_S] = m[_JUMP_S] = time_s
+    if m[_SWITCHED_A] != 0.0:
+        m[_LOW_V], m[_HIGH_V] = min(m[_LOW_V], voltage), max(m[_HIGH_V], voltage)
+        m[_SINCE] += 1.0
+        if time_s - m[_SWITCH_S] > START_WINDOW_S and m[_SINCE] >= _LEAST_PULSE_SAMPLES:
+            _conclude_switch(monitor)
+    # the voltage a little more than the window ago, under a current that has been steady since long before
+    n_kept = int(m[_N_KEPT])
+    for back in range(2, min(n_kept, _KEPT) + 1):
+        since_s = time_s - kept[0, (n_kept - back) % _KEPT]
+        if since_s > START_WINDOW_S:
+            rise_V = voltage - kept[1, (n_kept - back) % _KEPT]
+            rise_V -= _MOST_RESISTANCE_OHM * max(kept[2, (n_kept - back) % _KEPT] - current, 0.0)
+            if rise_V > RISE_V and time_s - since_s - m[_JUMP_S] >= STEADY_S and rise_V > _noise_V(monitor):
+                _find(monitor, _RISES, time_s - since_s, rise_V)
+            break
+    if n_kept == 0 or time_s - kept[0, (n_kept - 1) % _KEPT] >= _KEPT_EVERY_S:
+        kept[0, n_kept % _KEPT], kept[1, n_kept % _KEPT], kept[2, n_kept % _KEPT] = time_s, voltage, current
+        m[_N_KEPT] += 1.0
+    # under a steady load the voltage at rest is higher by the ohmic drop at least
+    drop_V = LEAST_RESISTANCE_OHM * max(current, 0.0) if time_s - m[_SWITCH_S] > START_WINDOW_S else 0.0
+    if drawn_C > _RECOVERY_SHARE * max(q, limits.cell_q_mobile) and voltage + drop_V > limits.start_V - FULL_REST_V[0]:
+        _find(monitor, _RECOVERED, time_s, drawn_C)
+    m[_EXAMINED] += 1.0
+    m[_LAST_V], m[_LAST_A] = voltage, current
+
+
+@_compiled
+def _start(monitor: Monitor, voltage: float, current: float, limits: Limits) -> int:
+    m = monitor.memory
+    if m[_SAMPLES] == 1.0:
+        m[_FIRST_V], m[_FIRST_A], m[_MOST_A], m[_LEAST_V] = voltage, current, current, voltage
+    elif m[_SAMPLES] == 2.0 or m[_TIME] <= START_WINDOW_S:
+        m[_MOST_A] = max(m[_MOST_A], current)
+        if not isnan(voltage):
+            m[_LEAST_V] = min(m[_LEAST_V], voltage)
+    if limits.needs_rest and not limits.rested:
+        return _START_UNKNOWN
+    return int(start_code(m[_FIRST_V], m[_FIRST_A], m[_MOST_A], m[_LEAST_V], limits.start_V))
+
+
+@_compiled
+def _verdict(row: FloatArray, own_sd: tuple[float, float], limits: Limits) -> int:
+    # why the estimate of a row is not settled
+    if row[4] == 0.0:
+        return _EMPTY
+    for k in range(2):
+        low, high = limits.bounds[k]
+        if limits.searched[k] and not low + own_sd[k] < row[k] < high - own_sd[k]:
+            return _Q_AT_BOUND + k
+    if limits.searched[0] and not limits.plausible_C[0] < row[0] < limits.plausible_C[1]:
+        return _IMPLAUSIBLE
+    if row[5] > LIMIT_SD:
+        return _MISFIT
+    shares = (_Q_SHARE, _R_SHARE)
+    for k in range(2):
+        mean, prior_sd = limits.prior[k]
+        if not isnan(mean):
+            narrowed = max(prior_sd**2 - own_sd[k] ** 2, (_LEAST_NARROWING * prior_sd) ** 2)
+            if (row[k] - mean) ** 2 > PRIOR_LIMIT_SD**2 * narrowed:
+                return _Q_PRIOR_WRONG + 2 * k
+            # precisions add up
+            of_data = max(own_sd[k] ** -2.0 - prior_sd**-2.0, 0.0) ** -0.5
+            if of_data >= shares[k] * row[k]:
+                return _Q_PRIOR_ALONE + 2 * k
+    for k in range(2):
+        if limits.searched[k] and not row[2 + k] < shares[k] * row[k]:
+            return _Q_IMPRECISE + k
+    return SETTLED
+
+
+@_compiled
+def watch(
+    monitor: Monitor,
+    voltage: FloatArray,
+    current: FloatArray,
+    duration: FloatArray,
+    drawn_C: FloatArray,
+    limits: Limits,
+    out: FloatArray,
+    codes: IntArray,
+) -> None:
+    """
+    Judge estimates by the samples that they come from; unchecked.
+
+    :param monitor: goes on from where it is
+    :param voltage: V, NaN where it was not measured, shape (T,)
+    :param current: from each sample to the next one, A, shape (T,)
+    :param duration: since the sample before, s, shape (T,)
+    :param drawn_C: charge drawn since the first sample, C, shape (T,)
+    :param limits: what to compare with
+    :param out: as :func:`~battery_env.estimators.kalman_bank.follow` fills it, shape (T, 6); what does not show in the
+        voltage is added to the standard deviations
+    :param codes: what was found, overwritten, shape (T,)
+    """
+    m = monitor.memory
+    for n in range(voltage.shape[0]):
+        m[_SAMPLES] += 1.0
+        m[_TIME] += duration[n]
+        if m[_SAMPLES] > 1.0 and not isnan(voltage[n]):
+            # the middle one of three leaves single wild samples aside
+            monitor.changes[int(m[_N_CHANGES]) % _KEPT] = abs(voltage[n] - m[_VOLTAGE_1])
+            m[_N_CHANGES] += 1.0
+            low, high = min(m[_VOLTAGE_2], m[_VOLTAGE_1]), max(m[_VOLTAGE_2], m[_VOLTAGE_1])
+            _examine(monitor, m[_TIME_1], max(low, min(high, voltage[n])), m[_CURRENT_1], drawn_C[n], out[n, 0], limits)
+        start = _start(monitor, voltage[n], current[n], limits)
+        if not isnan(voltage[n]):
+            m[_VOLTAGE_2] = m[_VOLTAGE_1] if m[_SAMPLES] > 1.0 else voltage[n]
+            m[_VOLTAGE_1], m[_TIME_1], m[_CURRENT_1] = voltage[n], m[_TIME], current[n]
+        own_sd = (out[n, 2], out[n, 3])
+        for k in range(2):
+            out[n, 2 + k] = hypot(own_sd[k], limits.scale_sd[k] * out[n, k])
+        if start != 0:
+            codes[n] = start
+        elif m[_FAULT] != 0.0:
+            codes[n] = int(m[_FAULT])
+        else:
+            codes[n] = _verdict(out[n], own_sd, limits)

@@ -1,0 +1,80 @@
+"""Files of what an estimator knows in the middle of a discharge, so that a program can stop and go on: npz without pickle."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from battery_env.files import replacing
+
+FORMAT_VERSION = 1
+_KIND = "state of an estimator"
+
+
+def save_state(path: str | os.PathLike[str], settings: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Path:
+    """
+    Write a state. It takes the place of an older one, and of no other file.
+
+    :param path: where to; ``.npz`` is added if it is missing
+    :param settings: of the estimator, as JSON may hold them
+    :param arrays: what it knows, by name
+    :return: the file
+    :raises FileExistsError: if there is a file that is no state of an estimator
+    """
+    target = Path(path)
+    target = target if target.suffix == ".npz" else target.with_name(target.name + ".npz")
+    if target.exists():
+        try:
+            _read(target)
+        except ValueError as error:
+            raise FileExistsError(f"{target} exists, and is no state of an estimator: choose another name") from error
+    metadata = json.dumps({"kind": _KIND, "format": FORMAT_VERSION, "settings": settings})
+    with replacing(target) as part:
+        np.savez(part, allow_pickle=False, metadata=np.array(metadata), **arrays)
+    return target
+
+
+def load_state(path: str | os.PathLike[str], settings: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+    """
+    Read what :func:`save_state` wrote.
+
+    :param path: the file
+    :param settings: of the estimator that is to go on, which have to be those of the one that was saved
+    :return: what it knew, by name
+    :raises FileNotFoundError: if there is no such file
+    :raises ValueError: if the file is damaged, none of these, of another format version, or of another estimator
+    """
+    metadata, arrays = _read(Path(path))
+    if metadata["format"] != FORMAT_VERSION:
+        raise ValueError(
+            f"{path} has format {metadata['format']}, this version reads {FORMAT_VERSION}: begin a discharge anew"
+        )
+    saved, own = metadata["settings"], json.loads(json.dumps(settings))
+    different = sorted(name for name in saved.keys() | own.keys() if saved.get(name) != own.get(name))
+    if different:
+        name = different[0]
+        raise ValueError(
+            f"{path} is of an estimator with {name} = {saved.get(name)!r}, this one has {own.get(name)!r}: make one with the "
+            f"same arguments (different: {', '.join(different)})"
+        )
+    return arrays
+
+
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    with path.open("rb") as stream:
+        try:
+            with np.load(stream, allow_pickle=False) as file:
+                if damaged := file.zip.testzip():
+                    raise ValueError(f"the checksum of {damaged} is wrong")
+                metadata = json.loads(str(file["metadata"]))
+                if metadata["kind"] != _KIND:
+                    raise ValueError(f"it is a {metadata['kind']}")
+                return metadata, {name: np.asarray(file[name]) for name in file.files if name != "metadata"}
+        except Exception as error:  # numpy and zipfile raise whatever the damage leads them to
+            raise ValueError(f"{path} is damaged, or no state of an estimator: {error}") from error

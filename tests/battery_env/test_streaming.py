@@ -1,0 +1,313 @@
+"""Streams: sample by sample, with gaps and rests, stopped and resumed, one cell and many, of filters and policies."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from battery_env import ExtendedKalmanFilter, PolicyEstimator
+from battery_env.cells import Discharge, load_nasa_discharges
+from battery_env.electrochemistry import NEW_CELL, initial_state, rest_shares, simulate, voltage
+from battery_env.estimators.base import OnlineEstimator
+from battery_env.records import Stream
+
+NOISE_V = 0.005
+
+
+def measured(load_A=2.0, q_mobile=6000.0, r_o=0.15, thermal=True, seed=0, noise_V=NOISE_V, **more):
+    record = simulate(load_A, q_mobile, r_o, load_unit="current", thermal=thermal, **more)
+    return replace(record, voltage_V=record.voltage_V + np.random.default_rng(seed).normal(0.0, noise_V, len(record.time_s)))
+
+
+def follow(estimator, record, dt_s=1.0, temperature_C=None):
+    for voltage_V, current_A in zip(record.voltage_V.tolist(), record.current_A.tolist(), strict=True):
+        estimate = estimator.update(voltage_V, current_A, dt_s, temperature_C)
+    return estimate
+
+
+class Nudge:
+    """A policy that goes down, and remembers what it saw."""
+
+    def __init__(self, *action):
+        self.action, self.seen = np.array(action), []
+
+    def predict(self, observation, deterministic=False):
+        self.seen.append(observation)
+        return np.tile(self.action, (len(observation), 1)), None
+
+
+def policy_estimator(**more):
+    return PolicyEstimator(Nudge(-0.2, 0.1), "BatteryVoltageJoint-v0", **more)
+
+
+@pytest.fixture(params=[lambda: ExtendedKalmanFilter(thermal=True), policy_estimator], ids=["filter", "policy"])
+def make(request):
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def whole():
+    return measured()
+
+
+class TestSamples:
+    def test_voltages_that_are_missing_leave_the_answer_right(self, whole):
+        gone = whole.voltage_V.copy()
+        gone[np.random.default_rng(1).random(len(gone)) < 0.5] = np.nan
+        gone[0], gone[1000:1300] = whole.voltage_V[0], np.nan
+        estimate = follow(ExtendedKalmanFilter(thermal=True), replace(whole, voltage_V=gone))
+        assert estimate.settled and abs(estimate.q_mobile - 6000.0) < 3.0 * estimate.sd_q_mobile
+        assert abs(estimate.r_o - 0.15) < 3.0 * estimate.sd_r_o
+
+    def test_without_voltages_nothing_is_learned(self):
+        filter_ = ExtendedKalmanFilter(thermal=True)
+        first = filter_.update(4.19, 2.0, 0.0)
+        for _ in range(600):
+            last = filter_.update(np.nan, 2.0, 1.0)
+        assert last.q_mobile == pytest.approx(first.q_mobile, rel=0.01) and last.sd_q_mobile >= first.sd_q_mobile
+        assert not last.settled and filter_.soc == pytest.approx(1.0 - 1200.0 / last.q_mobile, abs=1e-6)
+
+    def test_the_first_voltage_may_not_be_missing(self, make):
+        with pytest.raises(ValueError, match=r"voltage_V must be finite, got nan. .*tells whether the cell is full"):
+            make().update(np.nan, 2.0, 0.0)
+
+    @settings(max_examples=8, deadline=None, derandomize=True, database=None)
+    @given(st.integers(0, 1000))
+    def test_irregular_samples_give_the_same_answer(self, seed):
+        rng = np.random.default_rng(seed)
+        whole = measured(np.repeat(rng.uniform(1.0, 3.0, 400), 60), seed=seed)
+        kept = np.unique(np.append(0, np.cumsum(rng.integers(1, 20, len(whole.time_s)))))
+        kept = kept[kept < len(whole.time_s)]
+        drawn_C = np.append(0.0, np.cumsum(whole.current_A))[kept]
+        dt_s = np.diff(whole.time_s[kept])
+        filter_ = ExtendedKalmanFilter(thermal=True, current_gain_sd=0.001)
+        current_A = np.append(np.diff(drawn_C) / dt_s, whole.current_A[-1])
+        for sample in zip(whole.voltage_V[kept], current_A, np.append(0.0, dt_s), strict=True):
+            estimate = filter_.update(*sample)
+        assert not estimate.settled or abs(estimate.q_mobile - 6000.0) < max(3.0 * estimate.sd_q_mobile, 30.0)
+
+    def test_a_week_of_rest_is_one_sample_and_a_gap_under_load_is_refused(self, make):
+        estimator = make()
+        estimator.update(4.19, 2.0, 0.0)
+        estimator.update(4.0, 2.0, 600.0)
+        with pytest.raises(ValueError, match=r"within 0.001 .. 600 s, got 3600"):
+            estimator.update(3.9, 2.0, 3600.0)
+        estimator.update(3.9, 0.0, 60.0)
+        estimator.update(np.nan, 0.0, 604_800.0)
+        assert (1.0 - estimator.soc) * estimator.now().parameters[0] == pytest.approx(2.0 * 660.0)
+        with pytest.raises(ValueError, match=r"within 0.001 .. 604800 s"):
+            estimator.update(4.0, 0.0, 700_000.0)
+
+    def test_a_rest_within_a_discharge_is_modelled(self):
+        load_A = np.full(20_000, 2.0)
+        load_A[900:2700] = 0.0
+        estimate = follow(ExtendedKalmanFilter(thermal=True), measured(load_A))
+        assert estimate.settled and abs(estimate.q_mobile - 6000.0) < 3.0 * estimate.sd_q_mobile
+
+    def test_charge_that_flows_back_is_modelled_and_an_overcharge_is_refused(self):
+        load_A = np.where(np.arange(20_000) % 300 < 200, 2.5, -1.0)
+        estimate = follow(ExtendedKalmanFilter(thermal=True), measured(load_A))
+        assert estimate.settled and abs(estimate.q_mobile - 6000.0) < 3.0 * estimate.sd_q_mobile
+        filter_ = ExtendedKalmanFilter()
+        filter_.update(4.19, 2.0, 0.0)
+        filter_.update(4.1, -2.0, 100.0)
+        with pytest.raises(ValueError, match="current_A is positive in discharge, but this record draws -"):
+            filter_.update(4.19, -2.0, 200.0)
+
+
+class TestTemperature:
+    def test_it_is_that_of_the_model(self):
+        cold = replace(NEW_CELL, Tb0=NEW_CELL.Tb0 - 15.0)
+        record = measured(cell=cold, thermal=False, noise_V=0.001)
+        told = follow(ExtendedKalmanFilter(voltage_noise_V=0.001), record, temperature_C=cold.Tb0 - 273.15)
+        known = follow(ExtendedKalmanFilter(voltage_noise_V=0.001, cell=cold), record)
+        blind = follow(ExtendedKalmanFilter(voltage_noise_V=0.001), record)
+        assert (told.q_mobile, told.r_o) == pytest.approx((known.q_mobile, known.r_o), rel=1e-9)
+        assert abs(told.r_o - 0.15) < abs(blind.r_o - 0.15)
+
+    def test_later_ones_move_it(self):
+        filter_ = ExtendedKalmanFilter(thermal=True)
+        filter_.update(4.19, 2.0, 0.0, 20.0)
+        assert filter_.now().state[0] == pytest.approx(293.15)
+        filter_.update(4.0, 2.0, 10.0, 31.0)
+        assert filter_.now().state[0] == pytest.approx(304.15)
+        filter_.update(3.99, 0.0, 1.0)
+        assert 303.0 < filter_.now().state[0] < 304.2
+        assert filter_.now().cell.Tb0 == pytest.approx(293.15)
+
+    def test_kelvin_is_refused_and_a_policy_takes_none(self):
+        with pytest.raises(ValueError, match=r"temperature_C must lie within .* not in kelvin"):
+            ExtendedKalmanFilter().update(4.19, 2.0, 0.0, 293.0)
+        with pytest.raises(ValueError, match="a policy takes no temperature"):
+            policy_estimator().update(4.19, 2.0, 0.0, 20.0)
+
+
+class TestStart:
+    def test_a_state_of_charge_is_one_of_the_model_at_rest(self):
+        for soc in (0.2, 0.6, 1.0):
+            shares = rest_shares(soc)
+            assert shares.sum() == pytest.approx(1.0 / 0.6) and shares[:2].sum() == pytest.approx(soc)
+            state = initial_state(6000.0, soc=soc)
+            later = simulate(0.0, 6000.0, 0.1, initial=state, until=600.0).state[-1]
+            np.testing.assert_allclose(later, state, rtol=1e-9, atol=1e-9)
+
+    @pytest.mark.parametrize("soc", [0.7, 0.9])
+    def test_a_start_that_is_known_or_told_from_the_rest_finds_the_charge(self, soc):
+        load_A = np.append(np.zeros(200), np.full(20_000, 2.0))
+        record = measured(load_A, initial=initial_state(6000.0, soc=soc))
+        known, told, full = (
+            follow(ExtendedKalmanFilter(thermal=True, initial_soc=start), record) for start in (soc, "rest", 1.0)
+        )
+        for estimate in (known, told):
+            assert abs(estimate.q_mobile - 6000.0) < 3.0 * estimate.sd_q_mobile < 400.0
+            assert abs(estimate.r_o - 0.15) < 3.0 * estimate.sd_r_o
+        assert known.settled and known.sd_q_mobile < told.sd_q_mobile
+        assert not full.settled and full.reason.startswith("The record starts at rest at")
+
+    def test_a_start_that_is_stated_wrongly_is_noticed(self):
+        record = measured(initial=initial_state(6000.0, soc=0.7))
+        estimate = ExtendedKalmanFilter(thermal=True, initial_soc=0.85).estimate(record)
+        assert not estimate.settled and "where a cell with 85% of its charge shows" in estimate.reason
+
+    def test_without_a_rest_nothing_tells_the_charge(self):
+        record = measured(initial=initial_state(6000.0, soc=0.7))
+        estimate = ExtendedKalmanFilter(thermal=True, initial_soc="rest").estimate(record)
+        assert not estimate.settled and "does not start with a minute at rest" in estimate.reason
+
+    def test_a_stated_doubt_widens_the_estimate(self, whole):
+        sure, doubtful = (ExtendedKalmanFilter(thermal=True, initial_soc=soc).estimate(whole) for soc in (1.0, (1.0, 0.01)))
+        assert doubtful.q_mobile == sure.q_mobile
+        assert doubtful.sd_q_mobile == pytest.approx(np.hypot(sure.sd_q_mobile, 0.01 * sure.q_mobile))
+
+    @pytest.mark.parametrize("soc", [0.0, 1.1, np.nan, "full", (0.5, -0.1)])
+    def test_what_is_none_is_refused(self, soc):
+        with pytest.raises(ValueError, match="initial_soc is a state of charge within"):
+            ExtendedKalmanFilter(initial_soc=soc)
+
+
+class TestModel:
+    def test_state_of_charge_voltage_and_time_left(self, whole):
+        filter_, half = ExtendedKalmanFilter(thermal=True, prior_q_mobile_C=(6050.0, 60.0)), len(whole.time_s) // 2
+        follow(filter_, whole.part(0, half))
+        true = whole.state[half - 1, 4:6].sum() / 6000.0
+        assert filter_.soc == pytest.approx(true, abs=0.01)
+        assert filter_.voltage_V == pytest.approx(whole.voltage_V[half - 1], abs=0.02)
+        left = filter_.remaining(2.0)
+        assert 5.0 < left.sd_s < 60.0 and abs(left.time_s - (len(whole.time_s) - half)) < 3.0 * left.sd_s
+        assert filter_.remaining(1.0).time_s > 1.9 * left.time_s
+        assert filter_.remaining(8.0, load_unit="power").time_s < left.time_s
+        assert filter_.remaining(0.0).time_s == np.inf
+
+    def test_of_a_policy(self, whole):
+        estimator, half = policy_estimator(), len(whole.time_s) // 2
+        estimate = follow(estimator, whole.part(0, half))
+        assert estimator.soc == pytest.approx(1.0 - 2.0 * (half - 1) / estimate.q_mobile)
+        assert 0.0 < estimator.remaining(2.0).time_s < np.inf and np.isnan(estimator.remaining(2.0).sd_s)
+
+    def test_who_has_none_says_so(self):
+        class Bare(OnlineEstimator):
+            def reset(self): ...
+
+            def update(self, voltage_V, current_A, dt_s, temperature_C=None): ...
+
+        with pytest.raises(NotImplementedError, match="Bare has no model"):
+            Bare().soc  # noqa: B018
+        with pytest.raises(NotImplementedError, match="Bare cannot be saved"):
+            Bare().save("nowhere")
+
+
+class TestPolicies:
+    def test_a_stream_shows_a_policy_what_a_record_does(self, whole):
+        estimator = policy_estimator()
+        trace = estimator.trace([whole])[0]
+        from_record = [seen[0] for seen in estimator.policy.seen]
+        estimator.policy.seen.clear()
+        last = follow(estimator, whole)
+        from_stream = [seen[0] for seen in estimator.policy.seen]
+        assert len(from_stream) == int(whole.time_s[-1] // 60.0) > 30
+        np.testing.assert_array_equal(from_stream, from_record[: len(from_stream)])
+        assert last.q_mobile == trace.q_mobile[len(from_stream) - 1] and not last.settled
+
+    def test_one_with_the_full_state_or_a_whole_life_takes_none(self):
+        for id_, action in (("BatteryQmax-v0", [0.0]), ("BatteryAging-v0", [0.0, 0.0])):
+            with pytest.raises(ValueError, match=f"a policy of {id_} takes no stream"):
+                PolicyEstimator(Nudge(*action), id_).update(4.19, 2.0, 0.0)
+
+
+class TestFiles:
+    def test_stopping_and_going_on_changes_nothing(self, make, whole, tmp_path):
+        one, other = make(), make()
+        record = whole.part(0, 800)
+        follow(one, record.part(0, 500))
+        file = one.save(tmp_path / "state")
+        assert file.name == "state.npz" and one.save(file) == file  # an older state is replaced
+        other.load(file)
+        assert follow(one, record.part(500, 800)) == follow(other, record.part(500, 800))
+        assert one.soc == other.soc and list(tmp_path.iterdir()) == [file]
+
+    def test_in_a_rest_too(self, tmp_path):
+        record = measured(np.append(np.zeros(200), np.full(500, 2.0)), initial=initial_state(6000.0, soc=0.8))
+        one, other = (ExtendedKalmanFilter(thermal=True, initial_soc="rest") for _ in range(2))
+        follow(one, record.part(0, 100), temperature_C=25.0)
+        other.load(one.save(tmp_path / "state.npz"))
+        assert follow(one, record.part(100, 600)) == follow(other, record.part(100, 600))
+
+    def test_what_does_not_fit_is_refused(self, make, tmp_path):
+        file = make().save(tmp_path / "state.npz")
+        other = ExtendedKalmanFilter(thermal=True, mismatch_V=0.05)
+        with pytest.raises(ValueError, match="make one with the same arguments"):
+            other.load(file)
+        file.write_bytes(file.read_bytes()[:-50])
+        with pytest.raises(ValueError, match="is damaged, or no state of an estimator"):
+            make().load(file)
+        np.savez(tmp_path / "data.npz", a=np.zeros(3))
+        with pytest.raises(FileExistsError, match="is no state of an estimator"):
+            make().save(tmp_path / "data.npz")
+
+
+class TestBatch:
+    def test_cells_do_not_know_of_each_other(self, make, whole, tmp_path):
+        records = [whole, measured(1.5, 5000.0, 0.2)]
+        batch, alone = make().batch(2), [make(), make()]
+        for n in range(300):
+            found = batch.update([record.voltage_V[n] for record in records], [record.current_A[n] for record in records], 1.0)
+        assert found == [follow(each, record.part(0, 300)) for each, record in zip(alone, records, strict=True)]
+        other = make().batch(2)
+        other.load(batch.save(tmp_path / "cells"))
+        assert other.update(3.9, 1.0, 1.0) == batch.update(3.9, 1.0, 1.0)
+        batch.reset([1])
+        assert batch.estimators[1].soc == 1.0 and batch.estimators[0].soc < 1.0
+
+    def test_one_sample_that_is_refused_moves_none(self, make):
+        batch = make().batch(3)
+        batch.update(4.19, 2.0, 0.0)
+        before = batch.estimators[0].soc
+        with pytest.raises(ValueError, match=r"^cell 2: voltage_V must lie within"):
+            batch.update([4.1, 4.1, 4100.0], 2.0, 10.0)
+        assert batch.estimators[0].soc == before
+        with pytest.raises(ValueError, match="cells must be at least 1"):
+            make().batch(0)
+
+
+class TestRecordedCells:
+    def test_the_rest_of_a_recorded_cell_tells_that_it_was_full(self):
+        discharge = load_nasa_discharges("B0005")[40]
+        record = Discharge(discharge.time_s, discharge.voltage_V, discharge.current_A)
+        rest = np.insert(record.time_s + 70.0, 0, np.arange(0.0, 70.0, 10.0))
+        record = Discharge(
+            rest, np.insert(record.voltage_V, 0, np.full(7, record.voltage_V[0])), np.insert(record.current_A, 0, np.zeros(7))
+        )
+        told = ExtendedKalmanFilter(thermal=True, mismatch_V=0.02, initial_soc="rest")
+        stream = Stream.of(record.until(300.0), 1.0)
+        for sample in stream.samples():
+            estimate = told.update(*sample)
+        drawn_C = float(stream.current_A[:-1] @ np.diff(stream.time_s))
+        assert told.soc + drawn_C / estimate.q_mobile == pytest.approx(1.0, abs=0.03) and not estimate.settled
+
+    def test_rests_of_the_model_at_all_charges(self):
+        filter_ = ExtendedKalmanFilter(initial_soc="rest")
+        rest_V = filter_._rest_voltages_V()
+        assert (np.diff(rest_V) > 0.0).all()
+        assert rest_V[-1] == pytest.approx(float(voltage(initial_state())))
