@@ -12,7 +12,7 @@ from battery_env.calibration.full_state_tasks import BatteryQmax
 from battery_env.calibration.registration import TASKS
 from battery_env.calibration.voltage_tasks import BatteryVoltageJoint
 from battery_env.loads import constant
-from benchmarks.references import _DISTURBANCES
+from benchmarks.references import DISTURBANCES
 from docs import environment_pages
 
 TEXT = (environment_pages.DOCS / "battery_env.md").read_text(encoding="utf-8")
@@ -37,7 +37,7 @@ def test_the_pages_say_what_the_code_says():
 
 
 def test_every_environment_has_a_page():
-    assert {*TASKS, *_DISTURBANCES} == set(environment_pages.IDS)
+    assert {*TASKS, *DISTURBANCES} == set(environment_pages.IDS)
 
 
 def test_a_page_leads_to_the_pages_that_it_names():
