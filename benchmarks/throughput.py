@@ -234,7 +234,14 @@ def environment_contestants(cells: int) -> dict[str, Callable[[], int]]:
     return contestants
 
 
-def _spread(values: pd.Series, digits: int) -> str:
+def spread(values: pd.Series, digits: int) -> str:
+    """
+    What was measured in many rounds, as readers see it.
+
+    :param values: one per round
+    :param digits: after the point
+    :return: median and quartiles
+    """
     low, median, high = np.quantile(values, [0.25, 0.5, 0.75])
     return f"{median:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
 
@@ -251,8 +258,8 @@ def report(speeds: pd.DataFrame, parts: pd.DataFrame) -> str:
     rows = [
         {
             "algorithm": name,
-            "updates a second, median (quartiles)": _spread(values, 1),
-            "LAC is faster by a factor of": _spread(lac / values, 2),
+            "updates a second, median (quartiles)": spread(values, 1),
+            "LAC is faster by a factor of": spread(lac / values, 2),
         }
         for name, values in speeds.items()
     ]
@@ -271,8 +278,8 @@ def report_steps(speeds: pd.DataFrame) -> str:
     for name, values in speeds.items():
         work, _, who = str(name).partition(": ")
         own = next(column for column in speeds if str(column).partition(": ")[0] == work)
-        faster = _spread(speeds[own] / values, 0) if who.startswith("progpy") else ""
-        thousands = _spread(values / 1000.0, 1)
+        faster = spread(speeds[own] / values, 0) if who.startswith("progpy") else ""
+        thousands = spread(values / 1000.0, 1)
         row = {"": name, "thousand steps per second of one core, median (quartiles)": thousands}
         rows.append({**row, "battery_env is faster by a factor of": faster})
     table = pd.DataFrame(rows)

@@ -1,0 +1,473 @@
+"""
+Where the time of LAC goes: updates beside those of Stable-Baselines3's SAC and beside what their arithmetic takes, ``learn()``
+with many cells at once, growth with cells, batches and widths, and the memory of a million transitions.
+
+.. code-block:: bash
+
+  python -m benchmarks.performance
+  python -m benchmarks.performance --only updates learn
+
+Contestants take turns, as in ``benchmarks.throughput``, and ratios are taken within each round. What runs on one thread is
+measured by the time of the processor, which other processes do not count in.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+import tracemalloc
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from typing import Any
+from unittest.mock import patch
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+import torch as th
+from gymnasium import spaces
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter
+from stable_baselines3 import SAC
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+from torch import nn
+from torch.utils.flop_counter import FlopCounterMode
+
+from battery_env.plotting import new_figure
+from benchmarks.study import Study, command_line, markdown, positive
+from benchmarks.throughput import race, spread
+from sb3_lac import LAC, GymnasiumVecEnv
+
+SECTIONS = ("updates", "learn", "growth", "memory")
+
+_ENV_ID = "BatteryQmax-v0"
+_TRANSITIONS = 1_024
+_WARM_UP_UPDATES = 5
+_LARGE = [256, 256, 256]
+_SMALL = [64, 64]
+_CELLS = (1, 4, 16, 64, 256)
+_BATCH_SIZES = (64, 256, 1024)
+_WIDTHS = (32, 64, 128, 256, 512)
+# bytes that Adam and the target networks move, for each parameter in fp32: weight, gradient and two moments are read, all but
+# the gradient are written; the critic's target reads the weight again, and is read and written itself
+_ADAM_BYTES, _TARGET_BYTES = 7 * 4, 3 * 4
+_COPIED_NUMBERS = 2**24
+
+
+def many_cells(cells: int) -> VecEnv:
+    """
+    The environment as one that computes all cells at once.
+
+    :param cells: how many
+    :return: for Stable-Baselines3
+    """
+    return GymnasiumVecEnv(gym.make_vec(_ENV_ID, num_envs=cells, autoreset_mode="SameStep"))
+
+
+def ready_model(algorithm: type[LAC] | type[SAC], net_arch: list[int], env: VecEnv, batch_size: int = 256) -> LAC | SAC:
+    """
+    A model that has transitions in its replay buffer and has made its first updates.
+
+    :param algorithm: its class
+    :param net_arch: widths of the hidden layers, of all networks
+    :param env: vectorized environment
+    :param batch_size: batch size
+    :return: the model; ``learn()`` makes one update per step of all cells
+    """
+    model = algorithm(
+        "MlpPolicy",
+        env,
+        learning_starts=_TRANSITIONS,
+        buffer_size=100 * _TRANSITIONS,
+        batch_size=batch_size,
+        policy_kwargs={"net_arch": net_arch, "activation_fn": nn.LeakyReLU},
+        device="cpu",
+        seed=0,
+    )
+    model.set_logger(Logger(folder=None, output_formats=[]))
+    model.learn(_TRANSITIONS)
+    model.train(gradient_steps=_WARM_UP_UPDATES, batch_size=batch_size)
+    return model
+
+
+def update_flops(model: OffPolicyAlgorithm) -> int:
+    """
+    Floating-point operations of the matrix products of one update, as PyTorch counts them.
+
+    :param model: the model
+    :return: their number
+    """
+    counter = FlopCounterMode(display=False)
+    with counter:
+        model.train(gradient_steps=1, batch_size=model.batch_size)
+    return counter.get_total_flops()
+
+
+def moved_bytes(model: LAC) -> int:
+    """
+    The fewest bytes that optimizers and target network move in one update.
+
+    :param model: the model
+    :return: their number
+    """
+    actor, critic = (sum(weight.numel() for weight in net.parameters()) for net in (model.actor, model.critic))
+    return (actor + critic) * _ADAM_BYTES + critic * _TARGET_BYTES
+
+
+def updates_of(model: OffPolicyAlgorithm, updates: int, threads: int = 1) -> int:
+    """
+    A turn of updates.
+
+    :param model: the model
+    :param updates: how many
+    :param threads: threads of torch
+    :return: how many
+    """
+    th.set_num_threads(threads)
+    model.train(gradient_steps=updates, batch_size=model.batch_size)
+    return updates
+
+
+def steps_of(model: OffPolicyAlgorithm, steps: int) -> int:
+    """
+    A turn of ``learn()``.
+
+    :param model: the model
+    :param steps: steps of all its cells
+    :return: steps of single cells
+    """
+    model.learn(steps * model.n_envs, reset_num_timesteps=False)
+    return steps * model.n_envs
+
+
+def matrix_products(width: int, threads: int) -> int:
+    """
+    A turn of matrix products as they are in a hidden layer, on a batch as large as the layer is wide.
+
+    :param width: of the layer
+    :param threads: threads of torch
+    :return: floating-point operations
+    """
+    th.set_num_threads(threads)
+    # as long a turn for all widths
+    number = max(1, 2**28 // width**3)
+    left, right, product = th.ones(width, width), th.ones(width, width), th.empty(width, width)
+    for _ in range(number):
+        th.mm(left, right.t(), out=product)
+    return number * 2 * width**3
+
+
+def copies(source: th.Tensor, target: th.Tensor, threads: int) -> int:
+    """
+    A turn of copies of memory that no cache holds.
+
+    :param source: a large tensor
+    :param target: another one
+    :param threads: threads of torch
+    :return: bytes read and written
+    """
+    th.set_num_threads(threads)
+    target.copy_(source)
+    return 2 * source.nbytes
+
+
+def clock_of(threads: int) -> Callable[[], float]:
+    """
+    The clock for contestants on some threads.
+
+    :param threads: their number
+    :return: the time of the processor, so that other processes do not count, where there is one thread; else that on the wall
+    """
+    return time.process_time if threads == 1 else time.perf_counter
+
+
+def measure_updates(rounds: int, updates: int, threads: Sequence[int]) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """
+    Updates a second of LAC and SAC with large and small networks, and how long their arithmetic takes at least.
+
+    :param rounds: how often each has its turn
+    :param updates: of a turn
+    :param threads: numbers of threads
+    :return: what each contestant did in each round, and the table for readers
+    """
+    contestants: dict[int, dict[str, Callable[[], int]]] = {count: {} for count in threads}
+    work: dict[str, tuple[int, int, int]] = {}
+    source, target = th.ones(2, _COPIED_NUMBERS)
+    for net_arch in (_LARGE, _SMALL):
+        layers = "-".join(map(str, net_arch))
+        lac, sac = (ready_model(algorithm, net_arch, many_cells(64)) for algorithm in (LAC, SAC))
+        assert isinstance(lac, LAC)
+        work[layers] = update_flops(lac), update_flops(sac), moved_bytes(lac)
+        for count, turns in contestants.items():
+            turns[f"LAC, {layers}, {count}"] = partial(updates_of, lac, updates, count)
+            turns[f"SAC, {layers}, {count}"] = partial(updates_of, sac, updates, count)
+            turns[f"products, {layers}, {count}"] = partial(matrix_products, net_arch[0], count)
+            turns[f"copies, {layers}, {count}"] = partial(copies, source, target, count)
+    races = (race(turns, rounds, clock_of(count)) for count, turns in contestants.items())
+    speeds = pd.concat(races, axis="columns")
+    rows = []
+    for layers, (flops, sac_flops, moved) in work.items():
+        for count in threads:
+            lac_speed, sac_speed, rate, bandwidth = (
+                speeds[f"{name}, {layers}, {count}"] for name in ("LAC", "SAC", "products", "copies")
+            )
+            floor_s = flops / rate + moved / bandwidth
+            rows.append(
+                {
+                    "networks": layers,
+                    "threads": count,
+                    "LAC, updates a second": spread(lac_speed, 0),
+                    "SAC": spread(sac_speed, 0),
+                    "LAC is faster by a factor of": spread(lac_speed / sac_speed, 2),
+                    "MFLOP of an update, LAC / SAC": f"{flops / 1e6:.0f} / {sac_flops / 1e6:.0f}",
+                    "GFLOP/s of matrix products": spread(rate / 1e9, 0),
+                    "MB of optimizers and target": f"{moved / 1e6:.1f}",
+                    "LAC's time over the floor": spread(1 / (lac_speed * floor_s), 1),
+                }
+            )
+    return speeds, pd.DataFrame(rows)
+
+
+class Stopwatch:
+    """
+    The time of parts of a program, each without those that it calls.
+
+    :param clock: seconds
+    :ivar seconds: by part
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.process_time) -> None:
+        self.clock = clock
+        self.seconds: dict[str, float] = {}
+        self._running: list[str] = []
+        self._since = 0.0
+
+    def _turn(self) -> None:
+        now = self.clock()
+        if self._running:
+            self.seconds[self._running[-1]] = self.seconds.get(self._running[-1], 0.0) + now - self._since
+        self._since = now
+
+    @contextmanager
+    def part(self, name: str) -> Iterator[None]:
+        """
+        :param name: of what follows
+        """
+        self._turn()
+        self._running.append(name)
+        try:
+            yield
+        finally:
+            self._turn()
+            self._running.pop()
+
+    def watched(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        """
+        :param name: of the part
+        :param function: what it consists of
+        :return: the same function, its time taken
+        """
+
+        def call(*arguments: Any, **keywords: Any) -> Any:
+            with self.part(name):
+                return function(*arguments, **keywords)
+
+        return call
+
+
+def profile_learn(model: LAC | SAC, steps: int) -> dict[str, float]:
+    """
+    Where the time of ``learn()`` goes.
+
+    :param model: the model
+    :param steps: steps of all its cells
+    :return: seconds by part; the last one is what none of the others accounts for
+    """
+    watch = Stopwatch()
+    assert model.replay_buffer is not None and model.env is not None
+    parts = [
+        ("environment", model.env, "step_wait"),
+        ("actions", model, "_sample_action"),
+        ("storing", model, "_store_transition"),
+        ("sampling", model.replay_buffer, "sample"),
+        ("losses", model, "train"),
+        ("gradients", th.Tensor, "backward"),
+        ("optimizers", model.actor.optimizer, "step"),
+        ("optimizers", model.critic.optimizer, "step"),
+        ("multipliers", sys.modules[type(model).__module__], "update_multiplier"),
+        ("target network", sys.modules[type(model).__module__], "polyak_update"),
+        ("logging", model.logger, "record"),
+        ("logging", model, "dump_logs"),
+    ]
+    with ExitStack() as stack:
+        for name, owner, method in parts:
+            if hasattr(owner, method):
+                stack.enter_context(patch.object(owner, method, watch.watched(name, getattr(owner, method))))
+        with watch.part("loop"):
+            steps_of(model, steps)
+    return {name: watch.seconds.get(name, 0.0) for name in [*dict.fromkeys(name for name, _, _ in parts), "loop"]}
+
+
+def measure_learn(cells: int, rounds: int, steps: int) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]:
+    """
+    Environment steps a second of ``learn()`` with one update per step of all cells.
+
+    :param cells: how many
+    :param rounds: how often each has its turn
+    :param steps: steps of all cells in a turn
+    :return: what each contestant did in each round, the table for readers, and the shares of LAC's time
+    """
+    models = {
+        "LAC, all cells at once": ready_model(LAC, _LARGE, many_cells(cells)),
+        "SAC, all cells at once": ready_model(SAC, _LARGE, many_cells(cells)),
+        "SAC, one after another": ready_model(SAC, _LARGE, make_vec_env(_ENV_ID, cells)),
+    }
+    th.set_num_threads(1)
+    speeds = race({name: partial(steps_of, model, steps) for name, model in models.items()}, rounds, clock_of(1))
+    lac = speeds.iloc[:, 0]
+    rows = [
+        {"": name, "steps a second": spread(values, 0), "LAC is faster by a factor of": spread(lac / values, 2)}
+        for name, values in speeds.items()
+    ]
+    seconds = pd.Series(profile_learn(models["LAC, all cells at once"], 10 * steps), name="seconds")
+    shares = (seconds / seconds.sum()).rename_axis("part").rename("share").reset_index()
+    return speeds, pd.DataFrame(rows), shares
+
+
+def measure_growth(rounds: int, updates: int) -> pd.DataFrame:
+    """
+    How LAC's speed changes with cells, batch size and width.
+
+    :param rounds: how often each has its turn
+    :param updates: updates of a turn, and steps of all cells
+    :return: one row per point and round: ``over``, ``value``, ``speed`` (steps of cells a second, or updates a second)
+    """
+    contestants: dict[str, Callable[[], int]] = {}
+    for cells in _CELLS:
+        contestants[f"cells {cells}"] = partial(steps_of, ready_model(LAC, _LARGE, many_cells(cells)), updates)
+    for batch_size in _BATCH_SIZES:
+        model = ready_model(LAC, _LARGE, many_cells(64), batch_size)
+        contestants[f"batch {batch_size}"] = partial(updates_of, model, updates)
+    for width in _WIDTHS:
+        contestants[f"width {width}"] = partial(updates_of, ready_model(LAC, [width] * 3, many_cells(64)), updates)
+    th.set_num_threads(1)
+    table = race(contestants, rounds, clock_of(1)).melt(var_name="name", value_name="speed")
+    names = table.pop("name").str.split(expand=True)
+    return table.assign(over=names[0], value=names[1].astype(int))[["over", "value", "speed"]]
+
+
+def plot_growth(table: pd.DataFrame) -> Figure:
+    """
+    :param table: see :func:`measure_growth`
+    :return: medians, and bands from quartile to quartile
+    """
+    figure = new_figure(10.0, 3.2)
+    panels = {
+        "cells": ("cells, one update per step of all", "cell steps a second"),
+        "batch": ("batch size", "updates a second"),
+        "width": ("width of three hidden layers", "updates a second"),
+    }
+    for position, (over, (x_label, y_label)) in enumerate(panels.items(), start=1):
+        axes = figure.add_subplot(1, 3, position)
+        speeds = table[table["over"] == over].groupby("value")["speed"].quantile([0.25, 0.5, 0.75]).unstack()
+        axes.fill_between(speeds.index, speeds[0.25], speeds[0.75], alpha=0.3)
+        axes.plot(speeds.index, speeds[0.5], marker="o")
+        axes.set_xscale("log", base=2)
+        axes.set_yscale("log")
+        axes.set_xticks(speeds.index, [str(value) for value in speeds.index])
+        for of_axis in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
+            of_axis(LogFormatter(labelOnlyBase=False, minor_thresholds=(2.0, 0.5)))
+        axes.set(xlabel=x_label, ylabel=y_label)
+        axes.grid(alpha=0.3)
+    return figure
+
+
+def own_env_ids() -> list[str]:
+    """
+    :return: ids of the environments of this project
+    """
+    packages = ("battery_env", "sb3_lac")
+    return sorted(name for name, spec in gym.registry.items() if str(spec.entry_point).startswith(packages))
+
+
+def transition_bytes(observation_space: spaces.Box, action_space: spaces.Box) -> int:
+    """
+    Memory of one transition: two observations, the action, and reward, end and time limit in fp32.
+
+    :param observation_space: of the environment
+    :param action_space: of the environment
+    :return: bytes
+    """
+    numbers = 2 * int(np.prod(observation_space.shape)) + int(np.prod(action_space.shape)) + 3
+    return 4 * numbers
+
+
+def measure_memory(transitions: int) -> pd.DataFrame:
+    """
+    :param transitions: that the replay buffer holds
+    :return: one row per environment: bytes of a transition, and of the buffer as computed and as allocated
+    """
+    rows = []
+    for env_id in own_env_ids():
+        env = gym.make(env_id)
+        observation_space, action_space = env.observation_space, env.action_space
+        assert isinstance(observation_space, spaces.Box) and isinstance(action_space, spaces.Box)
+        tracemalloc.start()
+        buffer = ReplayBuffer(transitions, observation_space, action_space, device="cpu")
+        allocated = tracemalloc.get_traced_memory()[0]
+        tracemalloc.stop()
+        del buffer
+        env.close()
+        each = transition_bytes(observation_space, action_space)
+        rows.append(
+            {
+                "environment": env_id,
+                "observation": int(np.prod(observation_space.shape)),
+                "action": int(np.prod(action_space.shape)),
+                "bytes of a transition": each,
+                "MB computed": f"{transitions * each / 1e6:.1f}",
+                "MB allocated": f"{allocated / 1e6:.1f}",
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """
+    The command line.
+
+    :param arguments: of the command line by default
+    """
+    parser = command_line("performance", __doc__, jobs=None)
+    parser.add_argument("--only", nargs="+", choices=SECTIONS, default=list(SECTIONS), help="what to measure, all by default")
+    parser.add_argument("--rounds", type=positive, default=20, help="turns of each contestant")
+    parser.add_argument("--updates", type=positive, default=6, help="updates of a turn, and steps of all cells")
+    parser.add_argument("--cells", type=positive, default=64, help="cells of learn()")
+    parser.add_argument("--threads", type=positive, nargs="+", default=[1, 2], help="threads of torch")
+    parser.add_argument("--transitions", type=positive, default=1_000_000, help="that a replay buffer holds")
+    study = Study(parser, arguments)
+    chosen = study.chosen
+
+    if "updates" in chosen.only:
+        speeds, table = measure_updates(chosen.rounds, chosen.updates, chosen.threads)
+        study.write({"updates": speeds}, {}, markdown(table), "updates")
+    if "learn" in chosen.only:
+        speeds, table, shares = measure_learn(chosen.cells, chosen.rounds, chosen.updates)
+        readable = shares.assign(share=(100 * shares["share"]).map("{:.1f} %".format))
+        study.write({"learn": speeds, "learn_profile": shares}, {}, markdown(table) + "\n" + markdown(readable), "learn")
+    if "growth" in chosen.only:
+        growth = measure_growth(max(1, chosen.rounds // 2), chosen.updates)
+        medians = growth.groupby(["over", "value"], sort=False)["speed"].apply(spread, digits=0).reset_index()
+        study.write({"growth": growth}, {"growth": plot_growth(growth)}, markdown(medians), "growth")
+    if "memory" in chosen.only:
+        memory = measure_memory(chosen.transitions)
+        study.write({"memory": memory}, {}, markdown(memory), "memory")
+
+
+if __name__ == "__main__":
+    main()
