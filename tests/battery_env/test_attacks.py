@@ -18,6 +18,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from battery_env.__main__ import NOT_SETTLED, REFUSED, SETTLED, calibrate
 from battery_env.cells import Discharge, load_nasa_discharges
 from battery_env.electrochemistry import initial_state, simulate
 from battery_env.estimators import ClosedForm, Estimate, ExtendedKalmanFilter, LeastSquares
@@ -275,6 +276,27 @@ def test_a_stream_and_a_trace_say_what_the_whole_record_says(fault):
     make = calibrators(case)["filter, mismatch"]
     (found, estimate), *others = (outcome(case, make, path) for path in ("whole", "trace", "stream"))
     assert found != "wrong" and others == [(found, estimate)] * 2
+
+
+@pytest.mark.parametrize("method", ["least-squares", "kalman"])
+@pytest.mark.parametrize("fault", ["none", "not full", "late start", "minutes", "flipped", "30 samples without current"])
+def test_nor_is_the_command_line(fault, method, tmp_path, capsys):
+    rng = np.random.default_rng(5)
+    start = initial_state(6000.0, soc=0.85 if fault == "not full" else 1.0)
+    record = simulate(2.0, 6000.0, 0.15, load_unit="current", thermal=True, cut_off_V=2.4, initial=start)
+    voltage_V = record.voltage_V + rng.normal(0.0, 0.005, len(record.voltage_V))
+    case = Case(record.time_s, voltage_V, record.current_A, 6000.0, 0.15, recorded=False)
+    if fault in UNITS:
+        time, volts, amperes = UNITS[fault]
+        case = replace(case, time_s=time * case.time_s, voltage_V=volts * case.voltage_V, current_A=amperes * case.current_A)
+        options = ["--discharge-is-positive"]
+    else:
+        case, options = case if fault == "not full" else broken(case, fault, rng), []
+    columns = {"time_s": case.time_s, "voltage_V": case.voltage_V, "current_A": case.current_A}
+    pd.DataFrame(columns).to_csv(tmp_path / "record.csv", index=False)
+    status = calibrate([str(tmp_path / "record.csv"), "--method", method, *options])
+    assert status == SETTLED if fault == "none" else status in (REFUSED, NOT_SETTLED)
+    capsys.readouterr()
 
 
 @pytest.mark.parametrize(
