@@ -22,6 +22,7 @@ import gymnasium as gym
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter
 from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from battery_env.evaluation import over_seeds
@@ -221,6 +222,9 @@ def plot_costs(results: pd.DataFrame) -> Figure:
                 axes.plot([low, high], [height, height], color=colour, lw=1.5)
                 axes.plot(middle, height, marker, color=colour, ms=6, label=name if row == 0 else None)
     costs.set(xscale="log", xlabel="cost per step over that of the reference controller")
+    # numbers, which are shorter than powers of ten: there may be several of them within a decade
+    costs.xaxis.set_major_formatter(LogFormatter())
+    costs.xaxis.set_minor_formatter(LogFormatter())
     costs.set_yticks(range(len(envs)), envs)
     costs.invert_yaxis()
     goals.set(xlabel="share of episodes that end at the goal", xlim=(-0.03, 1.03))
