@@ -31,7 +31,7 @@ from benchmarks.training import Recipe, timesteps_of, train_or_load
 Parameter = Literal["q_mobile", "r_o"]
 Parts = tuple[TrajectoryDataset, TrajectoryDataset]
 
-#: Of the eleven loads of the paper, 8 to 16 W, those above are tested in the division by load: three.
+#: Of the eleven loads of the paper, 8 to 16 W, those above are tested in the division by load: four.
 HEAVY_LOAD_W = 13.0
 #: About how many discharges of a test part are scored, evenly spaced.
 TEST_DISCHARGES = 128
