@@ -16,8 +16,10 @@ from battery_env.estimators.settling import (
     FULL_REST_V,
     IMPLAUSIBLE,
     IMPRECISE,
+    LEAST_JUMP_A,
     LEAST_RESISTANCE_OHM,
     MISFIT,
+    MOST_RESISTANCE_OHM,
     NOISES,
     NOT_FOLLOWED,
     PRIOR_ALONE,
@@ -42,9 +44,6 @@ _RECOVERY_SHARE = 0.2
 _LEAST_PULSE_S, _LEAST_PULSE_SAMPLES = 10.0, 3
 # The middle one of three samples has this share of their noise.
 _SMOOTHED_SHARE = 0.67
-# A smaller change of the current hardly shows in the voltage, A. Of a load that falls in such changes a rise of the voltage by
-# this resistance, ohm, with what follows more slowly, says nothing.
-_LEAST_JUMP_A, _MOST_RESISTANCE_OHM = 0.05, 0.6
 # Voltages are kept about this far apart, s; as many of them as below cover the window in which a voltage may not rise.
 _KEPT_EVERY_S = 0.9
 _KEPT = 32
@@ -230,7 +229,7 @@ def _examine(
     switched_A = current - m[_LAST_A]
     m[_LARGEST_A] = max(m[_LARGEST_A], abs(current))
     if m[_EXAMINED] > 0.0:
-        if abs(switched_A) > min(SWITCH_SHARE * m[_LARGEST_A], _LEAST_JUMP_A):
+        if abs(switched_A) > min(SWITCH_SHARE * m[_LARGEST_A], LEAST_JUMP_A):
             m[_JUMP_S] = time_s
         if abs(switched_A) > SWITCH_SHARE * m[_LARGEST_A]:
             if m[_SWITCHED_A] != 0.0 and time_s - m[_SWITCH_S] >= _LEAST_PULSE_S and m[_SINCE] >= _LEAST_PULSE_SAMPLES:
@@ -250,7 +249,7 @@ def _examine(
         since_s = time_s - kept[0, (n_kept - back) % _KEPT]
         if since_s > START_WINDOW_S:
             rise_V = voltage - kept[1, (n_kept - back) % _KEPT]
-            rise_V -= _MOST_RESISTANCE_OHM * max(kept[2, (n_kept - back) % _KEPT] - current, 0.0)
+            rise_V -= MOST_RESISTANCE_OHM * max(kept[2, (n_kept - back) % _KEPT] - current, 0.0)
             if rise_V > RISE_V and time_s - since_s - m[_JUMP_S] >= STEADY_S and rise_V > _noise_V(monitor):
                 _find(monitor, _RISES, time_s - since_s, rise_V)
             break

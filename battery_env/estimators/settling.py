@@ -28,6 +28,9 @@ START_WINDOW_S = 20.0
 
 #: Under a current that has been steady for this long, s, the voltage of a cell does not rise by this much, V.
 STEADY_S, RISE_V = 60.0, 0.05
+#: A smaller change of the current hardly shows in the voltage, A. Of a load that falls in such changes a rise of the voltage
+#: by this resistance, ohm, with what follows more slowly, says nothing.
+LEAST_JUMP_A, MOST_RESISTANCE_OHM = 0.05, 0.6
 #: What is more than this many standard deviations of the noise is not noise.
 NOISES = 8.0
 
@@ -153,9 +156,12 @@ def sensor_reason(time_s: FloatArray, voltage_V: FloatArray, current_A: FloatArr
             if followed_V / drop_V < 1.0:
                 return NOT_FOLLOWED.format(switched_A[n - 1], time_s[n])
     since_s = np.full(last + 1, time_s[0])
-    since_s[switches] = time_s[switches]
+    jumps = np.flatnonzero(np.abs(switched_A) > min(SWITCH_SHARE * np.abs(current_A).max(), LEAST_JUMP_A)) + 1
+    since_s[jumps] = time_s[jumps]
     steady = np.maximum.accumulate(since_s)[until[:-1]] <= time_s[:-1] - STEADY_S
-    rise_V = np.where(steady, voltage_V[until[:-1]] - voltage_V[:-1], 0.0)
+    # what a current that falls slowly explains
+    explained_V = MOST_RESISTANCE_OHM * np.maximum(current_A[:-1] - current_A[until[:-1]], 0.0)
+    rise_V = np.where(steady, voltage_V[until[:-1]] - voltage_V[:-1] - explained_V, 0.0)
     highest = int(rise_V.argmax())
     if rise_V[highest] > max(RISE_V, noise_V):
         return RISES.format(rise_V[highest], time_s[highest])
