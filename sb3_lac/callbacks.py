@@ -11,6 +11,7 @@ from stable_baselines3.common.logger import Figure
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, sync_envs_normalization
 
 from sb3_lac.dashboard import NOT_TENSORBOARD, tensorboard_writer
+from sb3_lac.files import replacing
 from sb3_lac.lac import LAC
 from sb3_lac.stability import CertificationReport, LyapunovReport, certify, evaluate_lyapunov, fit_lyapunov
 from sb3_lac.stability.rollout import prepare_evaluation, trains_on
@@ -159,10 +160,8 @@ class LyapunovCallback(EventCallback):
         if self.log_path is not None:
             import pandas as pd
 
-            # Renaming is atomic: an interrupted training never leaves half a file
-            temporary_path = self.log_path.with_name(f"{self.log_path.name}.tmp")
-            pd.DataFrame(self.history).to_csv(temporary_path, index=False)
-            os.replace(temporary_path, self.log_path)
+            with replacing(self.log_path) as part:
+                pd.DataFrame(self.history).to_csv(part, index=False)
 
 
 class CertificateCallback(LyapunovCallback):

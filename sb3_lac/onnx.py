@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +13,8 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecNormalize, unwrap_vec_normalize
 from torch.distributions import Distribution
+
+from sb3_lac.files import replacing
 
 if TYPE_CHECKING:
     from onnx import ModelProto
@@ -77,8 +78,13 @@ def export_onnx(model: BaseAlgorithm | BasePolicy, path: str | Path, env_id: str
     :return: Path of the file
     :raises ValueError: If its spaces are not ``Box``, or if the file does not do what the policy does
     :raises FileExistsError: If the file exists
+    :raises ImportError: Without the extra
     """
-    import onnxruntime
+    try:
+        import onnxruntime
+        import onnxscript  # noqa: F401  (torch's exporter needs it)
+    except ImportError as missing:
+        raise ImportError(f"{missing}: export_onnx needs pip install 'sb3_lac[onnx]'.") from missing
 
     path = Path(path)
     if path.suffix != ".onnx":
@@ -100,20 +106,20 @@ def export_onnx(model: BaseAlgorithm | BasePolicy, path: str | Path, env_id: str
     policy.set_training_mode(False)
     module = DeterministicPolicy(policy, vec_normalize).eval()
     observations = _observations(policy.observation_space)
-    with th.no_grad():
-        expected = module(th.as_tensor(observations, device=policy.device)).cpu().numpy()
-        content = _graph(module, observations, env_id, type(model).__name__).SerializeToString()
-    policy.set_training_mode(was_training)
+    try:
+        with th.no_grad():
+            expected = module(th.as_tensor(observations, device=policy.device)).cpu().numpy()
+            content = _graph(module, observations, env_id, type(model).__name__).SerializeToString()
+    finally:
+        policy.set_training_mode(was_training)
 
     session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
     (action,) = session.run(None, {"observation": observations})
     error = float(np.max(np.abs(action - expected) / (module.high - module.low).cpu().numpy()))
     if not error <= TOLERANCE:
         raise ValueError(f"The exported policy differs from the original by {error:g} of the range of its actions.")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f"{path.name}.{os.getpid()}.part")
-    part.write_bytes(content)
-    part.rename(path)
+    with replacing(path) as part:
+        part.write_bytes(content)
     return path
 
 

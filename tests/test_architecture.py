@@ -101,7 +101,7 @@ def test_sb3_lac_knows_nothing_of_batteries(path):
         ("statistics", set()),
         ("functions", {"lac"}),
         ("rollout", {"lac", "stability.functions"}),
-        ("fitting", {"stability.functions", "stability.rollout"}),
+        ("fitting", {"files", "stability.functions", "stability.rollout"}),
     ],
 )
 def test_only_reports_know_the_other_files_of_stability(module, may_import):

@@ -23,13 +23,17 @@ class OnnxPolicy:
 
     :param path: an ONNX file with one float32 input of shape (n, ...) and one output of actions of shape (n, ...)
     :raises FileNotFoundError: if there is no such file
+    :raises ImportError: without the extra
     :raises ValueError: if it is no ONNX file, or has other inputs and outputs
     """
 
     def __init__(self, path: str | Path) -> None:
         # not a dependency of the package
-        from onnxruntime import InferenceSession, SessionOptions
-        from onnxruntime.capi.onnxruntime_pybind11_state import Fail, InvalidGraph, InvalidProtobuf
+        try:
+            from onnxruntime import InferenceSession, SessionOptions
+            from onnxruntime.capi.onnxruntime_pybind11_state import Fail, InvalidGraph, InvalidProtobuf
+        except ImportError as error:
+            raise ImportError(f"{error}: OnnxPolicy needs pip install 'battery_env[onnx]'") from error
 
         path = Path(path)
         options = SessionOptions()

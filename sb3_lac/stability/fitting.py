@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -15,6 +14,7 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
+from sb3_lac.files import replacing
 from sb3_lac.stability.functions import LyapunovFunction, Observations
 from sb3_lac.stability.rollout import RollOuts, prepare_evaluation, roll_out, summarize_episodes, undisturbed
 
@@ -106,18 +106,12 @@ class FittedLyapunov(LyapunovFunction):
 
         :param path: Name of the file
         """
-        path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
         numbers = ("unit", "floor", "ultimate_cost", "level", "window_steps", "average_cost", "reward_bound")
         content: dict[str, Any] = {name: getattr(self, name) for name in numbers}
         content |= {"seeds": None if self.seeds is None else (self.seeds.start, self.seeds.stop)}
         content |= {"mean": th.as_tensor(self.mean), "scale": th.as_tensor(self.scale), "network": self.network.state_dict()}
-        temporary_path = path.with_name(f"{path.name}.tmp")
-        try:
-            th.save(content, temporary_path)
-            os.replace(temporary_path, path)
-        finally:
-            temporary_path.unlink(missing_ok=True)
+        with replacing(path) as part:
+            th.save(content, part)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> FittedLyapunov:

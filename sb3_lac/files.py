@@ -1,0 +1,24 @@
+"""Files that are never there in part."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+@contextmanager
+def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """
+    A place to write a file to, beside where it is to be. It is renamed when the block ends, and removed if it fails.
+
+    :param path: Where the file is to be; missing folders are made
+    :return: Where to write it
+    """
+    target = Path(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    part = target.with_name(f".{target.name}.{os.getpid()}.part")
+    try:
+        yield part
+        os.replace(part, target)
+    finally:
+        part.unlink(missing_ok=True)
