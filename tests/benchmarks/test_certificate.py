@@ -10,20 +10,14 @@ pytest.importorskip("rl_zoo3")
 
 from benchmarks import certificate
 from benchmarks.controllers import controllers
-from sb3_lac import LAC, fit_lyapunov
+from sb3_lac import fit_lyapunov
 from sb3_lac.envs import LinearCostEnv
 
 
 @pytest.fixture
-def quick(monkeypatch):
+def quick(monkeypatch, train_nothing):
     """One controller instead of all, few passes over the data, and a model that is not trained; returns what was asked for."""
-    asked = []
-
-    def train_or_load(algo, env_id, seed, timesteps, folder):
-        asked.append((algo, env_id, seed, timesteps))
-        return LAC("MlpPolicy", env_id, device="cpu", buffer_size=10, seed=seed, policy_kwargs={"net_arch": [8]})
-
-    monkeypatch.setattr(certificate, "train_or_load", train_or_load)
+    asked = train_nothing(certificate)
     monkeypatch.setattr(certificate, "fit_lyapunov", partial(fit_lyapunov, n_iterations=3, progress_bar=False))
     reference = {"reference": controllers("LinearCost-v0")["reference"]}
     monkeypatch.setattr(certificate, "controllers", lambda env_id: reference)

@@ -1,0 +1,27 @@
+from collections.abc import Callable
+from types import ModuleType
+
+import pytest
+
+from sb3_lac import LAC
+
+
+@pytest.fixture
+def train_nothing(monkeypatch) -> Callable[[ModuleType], list[tuple]]:
+    def _train_nothing(benchmark: ModuleType) -> list[tuple]:
+        """
+        Let a benchmark judge models that are not trained.
+
+        :param benchmark: Its module
+        :return: What it asks for: algorithm, environment, seed and steps of each model
+        """
+        asked = []
+
+        def train_or_load(algo, env_id, seed, timesteps, folder):
+            asked.append((algo, env_id, seed, timesteps))
+            return LAC("MlpPolicy", env_id, device="cpu", buffer_size=10, seed=seed, policy_kwargs={"net_arch": [8]})
+
+        monkeypatch.setattr(benchmark, "train_or_load", train_or_load)
+        return asked
+
+    return _train_nothing
