@@ -62,7 +62,11 @@ _LABELS = {
 
 
 def roll_out(
-    model: PolicyPredictor, make_env: Callable[[], gym.Env[Any, Any]], episodes: int, noise_std: float = 0.0
+    model: PolicyPredictor,
+    make_env: Callable[[], gym.Env[Any, Any]],
+    episodes: int,
+    noise_std: float = 0.0,
+    seed: int = EVALUATION_SEED,
 ) -> pd.DataFrame:
     """
     Run a policy, deterministically, in all episodes at once.
@@ -71,11 +75,12 @@ def roll_out(
     :param make_env: makes the environment
     :param episodes: how many; the same starts and disturbances for every policy
     :param noise_std: standard deviation of the noise on each observed variable
+    :param seed: seed of the first episode, those of the others follow
     :return: one row per episode: mean cost per step, length, distance to the goal at the end, and whether it died
     """
     envs = [make_env() for _ in range(episodes)]
-    rngs = [np.random.default_rng((EVALUATION_SEED, episode)) for episode in range(episodes)]
-    observations = np.array([env.reset(seed=EVALUATION_SEED + episode)[0] for episode, env in enumerate(envs)])
+    rngs = [np.random.default_rng((seed, episode)) for episode in range(episodes)]
+    observations = np.array([env.reset(seed=seed + episode)[0] for episode, env in enumerate(envs)])
     costs, errors = np.zeros(episodes), np.zeros(episodes)
     lengths, died = np.zeros(episodes, dtype=int), np.zeros(episodes, dtype=bool)
     running = np.arange(episodes)

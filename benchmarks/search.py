@@ -1,114 +1,195 @@
 """
-Search the hyperparameters of LAC, SAC and TD3 on a full-state task: the same number of trials, updates and varied settings for
-each algorithm, starting from the entry in ``zoo_configs``.
+Search the hyperparameters of LAC, SAC, TD3 and TQC on a full-state task or a cost environment: the same number of trials,
+updates and varied settings for each algorithm, starting from the entry in ``zoo_configs``.
 
 .. code-block:: bash
 
   python -m benchmarks.search --env BatteryQmax-v0 --trials 10 --updates 2400
+  python -m benchmarks.search --env PendulumCost-v0 --trials 8 --updates 4000 --finalists 2 --repeats 1
 
-A trial trains with the entry of ``zoo_configs``, changed where the search varies it. Its score is the mean error of the mean
-action on whole discharges of the training part, the model running free; the test part is not touched. One seed says little:
-the best three trials are trained twice more, with other seeds, and ranked by the mean of their three scores. Trials lie in a
-journal of Optuna: after an interruption the same command goes on (with other trials than an uninterrupted search would try).
+A trial trains with the entry of ``zoo_configs``, changed where the search varies it, and is scored by its mean action. On a
+full-state task that is its mean error on whole discharges of the training part, the model running free; the test part is not
+touched. On a cost environment it is the cost per step, from other starts than those of the studies. One seed says little: the
+best trials, three by default, are trained again, twice by default, with other seeds, and ranked by the mean of their scores.
+Trials lie in a journal of Optuna: after an interruption the same command goes on (with other trials than an uninterrupted
+search would try).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import optuna
 import pandas as pd
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import FrozenTrial, Trial, TrialState
+from stable_baselines3.common.base_class import BaseAlgorithm
 
 from battery_env.calibration.full_state import FullStateTask
 from battery_env.calibration.policy import PolicyEstimator
 from battery_env.evaluation import evaluate
+from benchmarks.references import DISTURBANCES
+from benchmarks.robustness import roll_out
 from benchmarks.study import Study, Tables, command_line, positive, side_by_side
 from benchmarks.training import Recipe, set_up, timesteps_of
 
 _DISCHARGES = 64  # whole ones, evenly spaced in the training part
-_WORST_ERROR = 100.0  # %, what a policy is given that does worse
-_FINALISTS, _REPEATS = 3, 2  # the best trials, and how often each is trained again
+_EPISODES, _SEED = 50, 20_000  # on a cost environment
 
 
-def _sample_common(trial: Trial) -> dict[str, Any]:
-    return {
-        "learning_rate": f"lin_{trial.suggest_float('learning_rate', 3e-4, 3e-3, log=True):.2g}",
-        "gamma": trial.suggest_categorical("gamma", [0.3, 0.6, 0.8, 0.9]),
-        "tau": trial.suggest_categorical("tau", [0.005, 0.01, 0.02]),
-    }
+@dataclass(frozen=True)
+class Family:
+    """
+    Tasks that are searched alike.
+
+    :param unit: of the scores, ends the names of their columns
+    :param worst: what a policy is given that does worse
+    :param scores: of a policy on a task, by id: one number for each discharge or episode, less is better
+    :param ranges: of the settings that are varied: choices, or limits of a number that is drawn on a logarithmic scale
+    :param learning_rate: how a learning rate is written
+    :param first_trial: the settings of the first trial
+    """
+
+    unit: str
+    worst: float
+    scores: Callable[[BaseAlgorithm, str], pd.Series]
+    ranges: dict[str, list[float] | tuple[float, float]]
+    learning_rate: str
+    first_trial: dict[str, float]
 
 
-def _sample_soft(trial: Trial) -> dict[str, Any]:
-    return {
-        **_sample_common(trial),
-        "ent_coef": f"auto_{trial.suggest_float('ent_coef', 0.005, 0.2, log=True):.2g}",
-        "target_entropy": trial.suggest_categorical("target_entropy", [-2.0, -3.0, -4.0, -6.0]),
-    }
+def _errors(model: BaseAlgorithm, env_id: str) -> pd.Series:
+    task = PolicyEstimator.environment(env_id).task
+    assert isinstance(task, FullStateTask)
+    discharges = task.dataset.subset(range(0, len(task.dataset), len(task.dataset) // _DISCHARGES))
+    return evaluate(PolicyEstimator(model, env_id), discharges)[f"{task.parameters[0]}_mape_percent"]
 
 
-def _sample_td3(trial: Trial) -> dict[str, Any]:
-    target_noise = trial.suggest_float("target_policy_noise", 0.01, 0.2, log=True)
-    return {
-        **_sample_common(trial),
-        "noise_std": float(f"{trial.suggest_float('noise_std', 0.1, 1.0, log=True):.2g}"),
-        "target_policy_noise": float(f"{target_noise:.2g}"),
-        "target_noise_clip": float(f"{2.0 * target_noise:.2g}"),
-    }
+def _costs(model: BaseAlgorithm, env_id: str) -> pd.Series:
+    return roll_out(model, partial(gym.make, env_id), _EPISODES, seed=_SEED)["cost"]
 
 
+_FULL_STATE = Family(
+    "percent",
+    100.0,
+    _errors,
+    {
+        "learning_rate": (3e-4, 3e-3),
+        "gamma": [0.3, 0.6, 0.8, 0.9],
+        "tau": [0.005, 0.01, 0.02],
+        "ent_coef": (0.005, 0.2),
+        "target_entropy": [-2.0, -3.0, -4.0, -6.0],
+        "noise_std": (0.1, 1.0),
+        "target_policy_noise": (0.01, 0.2),
+    },
+    "lin_{:.2g}",
+    {
+        "learning_rate": 1e-3,
+        "gamma": 0.6,
+        "tau": 0.005,
+        "ent_coef": 0.02,
+        "target_entropy": -4.0,
+        "noise_std": 0.5,
+        "target_policy_noise": 0.05,
+    },
+)
+_COST = Family(
+    "cost",
+    1e6,
+    _costs,
+    {
+        "learning_rate": (2e-4, 3e-3),
+        "gamma": [0.9, 0.95, 0.98, 0.99],
+        "tau": [0.005, 0.01, 0.02],
+        "ent_coef": (0.01, 10.0),
+        "target_entropy": [-1.0, -2.0, -4.0, -6.0],
+        "noise_std": (0.05, 0.5),
+        "target_policy_noise": (0.05, 0.5),
+    },
+    "{:.2g}",
+    {
+        "learning_rate": 5e-4,
+        "gamma": 0.99,
+        "tau": 0.005,
+        "ent_coef": 0.1,
+        "target_entropy": -2.0,
+        "noise_std": 0.1,
+        "target_policy_noise": 0.2,
+    },
+)
+#: By environment.
+FAMILIES = {"BatteryQmax-v0": _FULL_STATE, "BatteryRo-v0": _FULL_STATE, **dict.fromkeys(DISTURBANCES, _COST)}
+_COMMON = ["learning_rate", "gamma", "tau"]
+_SOFT = [*_COMMON, "ent_coef", "target_entropy"]
 #: What is varied, five settings for each algorithm.
-SAMPLERS: dict[str, Callable[[Trial], dict[str, Any]]] = {"lac": _sample_soft, "sac": _sample_soft, "td3": _sample_td3}
-#: The first trial of each, whatever it varies of this.
-FIRST_TRIAL = {
-    "learning_rate": 1e-3,
-    "gamma": 0.6,
-    "tau": 0.005,
-    "ent_coef": 0.02,
-    "target_entropy": -4.0,
-    "noise_std": 0.5,
-    "target_policy_noise": 0.05,
-}
+VARIED = {"lac": _SOFT, "sac": _SOFT, "td3": [*_COMMON, "noise_std", "target_policy_noise"], "tqc": _SOFT}
+
+
+def sampled(algo: str, env_id: str, trial: Trial) -> dict[str, Any]:
+    """
+    The settings of a trial.
+
+    :param algo: one of ``VARIED``
+    :param env_id: one of ``FAMILIES``
+    :param trial: what chooses
+    :return: as in a file of ``zoo_configs``
+    """
+    family = FAMILIES[env_id]
+    settings: dict[str, Any] = {}
+    for name in VARIED[algo]:
+        of_name = family.ranges[name]
+        if isinstance(of_name, tuple):
+            settings[name] = float(f"{trial.suggest_float(name, *of_name, log=True):.2g}")
+        else:
+            settings[name] = trial.suggest_categorical(name, of_name)
+    text = family.learning_rate.format(settings["learning_rate"])
+    settings["learning_rate"] = text if text.startswith("lin_") else float(text)
+    if "ent_coef" in settings:
+        settings["ent_coef"] = f"auto_{settings['ent_coef']:.2g}"
+    if "target_policy_noise" in settings:
+        settings["target_noise_clip"] = 2.0 * settings["target_policy_noise"]
+    return settings
 
 
 def score(algo: str, env_id: str, updates: int, folder: Path, trial: Trial) -> float:
     """
     Train one policy and score it.
 
-    :param algo: ``lac``, ``sac`` or ``td3``
-    :param env_id: id of a full-state environment with one parameter
+    :param algo: one of ``VARIED``
+    :param env_id: one of ``FAMILIES``
     :param updates: gradient steps
     :param folder: where the zoo writes what it does
-    :param trial: what chooses the settings, and is told the median and the worst discharge
-    :return: error of q_mobile or r_o, mean over whole discharges of the training part, %
+    :param trial: what chooses the settings, and is told the median and the worst score
+    :return: mean score
     """
-    recipe = Recipe.of(algo, env_id, trial.number, hyperparameters=SAMPLERS[algo](trial))
+    family = FAMILIES[env_id]
+    recipe = Recipe.of(algo, env_id, trial.number, hyperparameters=sampled(algo, env_id, trial))
     _, model = set_up(recipe, folder)
     model.learn(timesteps_of(updates, recipe.hyperparameters))
-    task = PolicyEstimator.environment(env_id).task
-    assert isinstance(task, FullStateTask)
-    discharges = task.dataset.subset(range(0, len(task.dataset), len(task.dataset) // _DISCHARGES))
-    errors = evaluate(PolicyEstimator(model, env_id), discharges)[f"{task.parameters[0]}_mape_percent"]
+    scores = family.scores(model, env_id)
     trial.set_user_attr("updates", model._n_updates)
-    trial.set_user_attr("median_percent", float(errors.median()))
-    trial.set_user_attr("worst_percent", float(errors.max()))
-    return min(float(np.nan_to_num(errors.mean(), nan=_WORST_ERROR)), _WORST_ERROR)
+    trial.set_user_attr("median", float(scores.median()))
+    trial.set_user_attr("worst", float(scores.max()))
+    return min(float(np.nan_to_num(scores.mean(), nan=family.worst)), family.worst)
 
 
-def part(algo: str, env_id: str, trials: int, updates: int, out: Path) -> Tables:
+def part(algo: str, env_id: str, trials: int, updates: int, finalists: int, repeats: int, out: Path) -> Tables:
     """
     The search of one algorithm, or what is left of it.
 
-    :param algo: ``lac``, ``sac`` or ``td3``
-    :param env_id: id of a full-state environment with one parameter
+    :param algo: one of ``VARIED``
+    :param env_id: one of ``FAMILIES``
     :param trials: trials in all
     :param updates: gradient steps of each
+    :param finalists: how many of the best are trained again
+    :param repeats: how often
     :param out: folder of the journal
     :return: ``search``, one row per trial; means over its seeds, the worst discharge of any seed
     """
@@ -121,23 +202,23 @@ def part(algo: str, env_id: str, trials: int, updates: int, out: Path) -> Tables
     # another seed after an interruption, or the first draws would come again
     study.sampler = optuna.samplers.TPESampler(n_startup_trials=trials // 2, multivariate=True, seed=len(study.trials))
     if not study.trials:
-        study.enqueue_trial(FIRST_TRIAL)
+        study.enqueue_trial(FAMILIES[env_id].first_trial)
     objective = partial(score, algo, env_id, updates, out / "zoo")
     study.optimize(objective, n_trials=max(trials - len(_first_trials(study)), 0))
-    finalists = sorted(_first_trials(study), key=lambda trial: trial.values[0])[:_FINALISTS]
-    for finalist in finalists:
-        for _ in range(_REPEATS - len(_repeats(study, finalist))):
+    best = sorted(_first_trials(study), key=lambda trial: trial.values[0])[:finalists]
+    for finalist in best:
+        for _ in range(repeats - len(_repeats(study, finalist))):
             study.enqueue_trial(finalist.params, user_attrs={"repeats": finalist.number})
             study.optimize(objective, n_trials=1)
-    rows = []
+    rows, unit = [], FAMILIES[env_id].unit
     for trial in _first_trials(study):
         runs = [trial, *_repeats(study, trial)]
         scores = {
             "seeds": len(runs),
-            "mean_percent": np.mean([run.value for run in runs]),
-            "median_percent": np.mean([run.user_attrs["median_percent"] for run in runs]),
-            "worst_percent": max(run.user_attrs["worst_percent"] for run in runs),
-            "all_mean_percent": side_by_side(run.values[0] for run in runs),
+            f"mean_{unit}": np.mean([run.value for run in runs]),
+            f"median_{unit}": np.mean([run.user_attrs["median"] for run in runs]),
+            f"worst_{unit}": max(run.user_attrs["worst"] for run in runs),
+            f"all_mean_{unit}": side_by_side(run.values[0] for run in runs),
         }
         rows.append({"algo": algo, "trial": trial.number, "updates": updates, **scores, **trial.params})
     return {"search": pd.DataFrame(rows)}
@@ -155,16 +236,17 @@ def _repeats(study: optuna.Study, trial: FrozenTrial) -> list[FrozenTrial]:
 
 def report(trials: pd.DataFrame) -> str:
     """
-    The three best trials of each algorithm, with three seeds, and the first one, as Markdown.
+    The best trials of each algorithm, trained with several seeds, and the first one, as Markdown.
 
     :param trials: of all algorithms
     :return: one table per algorithm
     """
     text = ""
+    mean = next(name for name in trials.columns if name.startswith("mean_"))
     for algo, of_algo in trials.groupby("algo", sort=False):
-        best = of_algo[of_algo["seeds"] > 1].sort_values("mean_percent")
+        best = of_algo[of_algo["seeds"] > 1].sort_values(mean)
         shown = pd.concat([best, of_algo[of_algo["trial"] == 0]]).drop_duplicates().dropna(axis=1, how="all")
-        table = shown.drop(columns=["algo", "updates", "mean_percent"]).to_markdown(index=False, floatfmt=".2g")
+        table = shown.drop(columns=["algo", "updates", mean]).to_markdown(index=False, floatfmt=".2g")
         text += f"**{str(algo).upper()}**, {len(of_algo)} trials\n\n{table}\n\n"
     return text
 
@@ -176,13 +258,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
     :param arguments: of the command line by default
     """
     parser = command_line("search", __doc__)
-    parser.add_argument("--env", default="BatteryQmax-v0", choices=["BatteryQmax-v0", "BatteryRo-v0"])
-    parser.add_argument("--algos", nargs="+", default=list(SAMPLERS), choices=list(SAMPLERS))
+    parser.add_argument("--env", default="BatteryQmax-v0", choices=list(FAMILIES))
+    parser.add_argument("--algos", nargs="+", default=["lac", "sac", "td3"], choices=list(VARIED))
     parser.add_argument("--trials", type=positive, default=10, help="trials of each algorithm")
     parser.add_argument("--updates", type=positive, default=2400, help="gradient steps of each trial")
+    parser.add_argument("--finalists", type=positive, default=3, help="how many of the best trials are trained again")
+    parser.add_argument("--repeats", type=positive, default=2, help="how often they are trained again")
     study = Study(parser, arguments)
     chosen = study.chosen
-    common = {"env_id": chosen.env, "trials": chosen.trials, "updates": chosen.updates}
+    common = {
+        "env_id": chosen.env,
+        "trials": chosen.trials,
+        "updates": chosen.updates,
+        "finalists": chosen.finalists,
+        "repeats": chosen.repeats,
+    }
     tables = study.run(part, [{"algo": algo, **common} for algo in chosen.algos], out=study.out)
     study.write(tables, {}, report(tables["search"]))
 

@@ -16,9 +16,9 @@ def trials(monkeypatch):
     tried = []
 
     def score(algo, env_id, updates, folder, trial):
-        tried.append((algo, search.SAMPLERS[algo](trial)))
-        trial.set_user_attr("median_percent", 1.0)
-        trial.set_user_attr("worst_percent", 7.0 + trial.number)
+        tried.append((algo, search.sampled(algo, env_id, trial)))
+        trial.set_user_attr("median", 1.0)
+        trial.set_user_attr("worst", 7.0 + trial.number)
         return 100.0 * trial.params["learning_rate"]
 
     monkeypatch.setattr(search, "score", score)
@@ -41,7 +41,7 @@ def test_every_algorithm_gets_the_same_trials_of_as_many_settings(trials, tmp_pa
 
 
 def found(algo, count, updates, out):
-    return search.part(algo, "BatteryRo-v0", count, updates, out)["search"]
+    return search.part(algo, "BatteryRo-v0", count, updates, 3, 2, out)["search"]
 
 
 def test_a_search_goes_on_and_is_not_done_twice(trials, tmp_path):
@@ -68,17 +68,33 @@ def test_the_best_three_are_ranked_by_three_seeds(trials, tmp_path):
     assert set(best["worst_percent"]) == {14.0, 16.0, 18.0} and (trial.drop(best.index)["worst_percent"] < 13.0).all()
 
 
-def test_a_trial_is_trained_for_its_updates_and_scored_on_training_discharges(tmp_path):
+@pytest.mark.parametrize("algo, env_id", [("td3", "BatteryRo-v0"), ("lac", "LinearCost-v0"), ("tqc", "VehicleCost-v0")])
+def test_a_trial_is_trained_for_its_updates_and_scored_on_what_no_study_judges(algo, env_id, tmp_path):
     study = optuna.create_study()
-    study.enqueue_trial(search.FIRST_TRIAL)
-    study.optimize(lambda trial: search.score("td3", "BatteryRo-v0", 3, tmp_path, trial), n_trials=1)
+    study.enqueue_trial(search.FAMILIES[env_id].first_trial)
+    study.optimize(lambda trial: search.score(algo, env_id, 3, tmp_path, trial), n_trials=1)
     (trial,) = study.trials
-    assert trial.user_attrs["updates"] == 3
-    assert 0.0 < trial.user_attrs["median_percent"] < trial.user_attrs["worst_percent"] <= 100.0
-    assert 0.0 < trial.value < trial.user_attrs["worst_percent"]
+    assert 3 <= trial.user_attrs["updates"] <= 4
+    assert 0.0 < trial.user_attrs["median"] < trial.user_attrs["worst"]
+    assert 0.0 < trial.value < trial.user_attrs["worst"]
+    if env_id.startswith("Battery"):
+        assert trial.user_attrs["worst"] <= 100.0
 
 
-@pytest.mark.parametrize("command", [["--trials", "0"], ["--updates", "0"], ["--jobs", "0"], ["--env", "CartPoleCost-v0"]])
+def test_a_cost_environment_is_searched_by_its_cost(trials, tmp_path, capsys):
+    command = ["--env", "PendulumCost-v0", "--algos", "lac", "tqc", "--trials", "3", "--finalists", "1", "--repeats", "1"]
+    search.main([*command, "--jobs", "1", "--out", str(tmp_path)])
+    assert [algo for algo, _ in trials] == ["lac"] * 4 + ["tqc"] * 4
+    first = trials[0][1]
+    assert first == {
+        "learning_rate": 5e-4, "gamma": 0.99, "tau": 0.005, "ent_coef": "auto_0.1", "target_entropy": -2.0
+    }  # fmt: skip
+    table = pd.read_csv(tmp_path / "search.csv")
+    assert "mean_cost" in table and (table["seeds"] == 2).sum() == 2
+    assert "worst_cost" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", [["--trials", "0"], ["--updates", "0"], ["--jobs", "0"], ["--env", "Pendulum-v1"]])
 def test_nonsense_on_the_command_line_is_refused(command, trials):
     with pytest.raises(SystemExit):
         search.main(command)
