@@ -44,6 +44,12 @@ _DISCHARGES = 64  # whole ones, evenly spaced in the training part
 _EPISODES, _SEED = 50, 20_000  # on a cost environment
 
 
+_COMMON = ["learning_rate", "gamma", "tau"]
+_SOFT = [*_COMMON, "ent_coef", "target_entropy"]
+_TD3 = [*_COMMON, "noise_std", "target_policy_noise"]
+_COST_NETWORKS = "net_arch=[64, 64], activation_fn=nn.LeakyReLU"  # as in zoo_configs
+
+
 @dataclass(frozen=True)
 class Family:
     """
@@ -53,6 +59,7 @@ class Family:
     :param worst: what a policy is given that does worse
     :param scores: of a policy on a task, by id: one number for each discharge or episode, less is better
     :param ranges: of the settings that are varied: choices, or limits of a number that is drawn on a logarithmic scale
+    :param varied: which of them, by algorithm, five for each
     :param learning_rate: how a learning rate is written
     :param first_trial: the settings of the first trial
     """
@@ -61,6 +68,7 @@ class Family:
     worst: float
     scores: Callable[[BaseAlgorithm, str], pd.Series]
     ranges: dict[str, list[float] | tuple[float, float]]
+    varied: dict[str, list[str]]
     learning_rate: str
     first_trial: dict[str, float]
 
@@ -89,6 +97,7 @@ _FULL_STATE = Family(
         "noise_std": (0.1, 1.0),
         "target_policy_noise": (0.01, 0.2),
     },
+    {"lac": _SOFT, "sac": _SOFT, "td3": _TD3},
     "lin_{:.2g}",
     {
         "learning_rate": 1e-3,
@@ -110,9 +119,13 @@ _COST = Family(
         "tau": [0.005, 0.01, 0.02],
         "ent_coef": (0.01, 10.0),
         "target_entropy": [-1.0, -2.0, -4.0, -6.0],
+        "output_dim": [0, 16],
+        "n_critics": [1, 2],
         "noise_std": (0.05, 0.5),
         "target_policy_noise": (0.05, 0.5),
     },
+    # LAC has a choice of critics that the others do not have
+    {"lac": ["learning_rate", "gamma", "ent_coef", "output_dim", "n_critics"], "sac": _SOFT, "td3": _TD3, "tqc": _SOFT},
     "{:.2g}",
     {
         "learning_rate": 5e-4,
@@ -120,30 +133,28 @@ _COST = Family(
         "tau": 0.005,
         "ent_coef": 0.1,
         "target_entropy": -2.0,
+        "output_dim": 16,
+        "n_critics": 1,
         "noise_std": 0.1,
         "target_policy_noise": 0.2,
     },
 )
 #: By environment.
 FAMILIES = {"BatteryQmax-v0": _FULL_STATE, "BatteryRo-v0": _FULL_STATE, **dict.fromkeys(DISTURBANCES, _COST)}
-_COMMON = ["learning_rate", "gamma", "tau"]
-_SOFT = [*_COMMON, "ent_coef", "target_entropy"]
-#: What is varied, five settings for each algorithm.
-VARIED = {"lac": _SOFT, "sac": _SOFT, "td3": [*_COMMON, "noise_std", "target_policy_noise"], "tqc": _SOFT}
 
 
 def sampled(algo: str, env_id: str, trial: Trial) -> dict[str, Any]:
     """
     The settings of a trial.
 
-    :param algo: one of ``VARIED``
+    :param algo: one that the family of the environment varies
     :param env_id: one of ``FAMILIES``
     :param trial: what chooses
     :return: as in a file of ``zoo_configs``
     """
     family = FAMILIES[env_id]
     settings: dict[str, Any] = {}
-    for name in VARIED[algo]:
+    for name in family.varied[algo]:
         of_name = family.ranges[name]
         if isinstance(of_name, tuple):
             settings[name] = float(f"{trial.suggest_float(name, *of_name, log=True):.2g}")
@@ -155,6 +166,9 @@ def sampled(algo: str, env_id: str, trial: Trial) -> dict[str, Any]:
         settings["ent_coef"] = f"auto_{settings['ent_coef']:.2g}"
     if "target_policy_noise" in settings:
         settings["target_noise_clip"] = 2.0 * settings["target_policy_noise"]
+    if "output_dim" in settings:
+        critics = f"output_dim={settings.pop('output_dim')}, n_critics={settings.pop('n_critics')}"
+        settings["policy_kwargs"] = f"dict({_COST_NETWORKS}, {critics})"
     return settings
 
 
@@ -162,7 +176,7 @@ def score(algo: str, env_id: str, updates: int, folder: Path, trial: Trial) -> f
     """
     Train one policy and score it.
 
-    :param algo: one of ``VARIED``
+    :param algo: one that the family of the environment varies
     :param env_id: one of ``FAMILIES``
     :param updates: gradient steps
     :param folder: where the zoo writes what it does
@@ -184,7 +198,7 @@ def part(algo: str, env_id: str, trials: int, updates: int, finalists: int, repe
     """
     The search of one algorithm, or what is left of it.
 
-    :param algo: one of ``VARIED``
+    :param algo: one that the family of the environment varies
     :param env_id: one of ``FAMILIES``
     :param trials: trials in all
     :param updates: gradient steps of each
@@ -259,13 +273,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """
     parser = command_line("search", __doc__)
     parser.add_argument("--env", default="BatteryQmax-v0", choices=list(FAMILIES))
-    parser.add_argument("--algos", nargs="+", default=["lac", "sac", "td3"], choices=list(VARIED))
+    parser.add_argument("--algos", nargs="+", default=["lac", "sac", "td3"], choices=list(_COST.varied))
     parser.add_argument("--trials", type=positive, default=10, help="trials of each algorithm")
     parser.add_argument("--updates", type=positive, default=2400, help="gradient steps of each trial")
     parser.add_argument("--finalists", type=positive, default=3, help="how many of the best trials are trained again")
     parser.add_argument("--repeats", type=positive, default=2, help="how often they are trained again")
     study = Study(parser, arguments)
     chosen = study.chosen
+    if unknown := set(chosen.algos) - set(FAMILIES[chosen.env].varied):
+        parser.error(f"{', '.join(sorted(unknown))} cannot be searched on {chosen.env}")
     common = {
         "env_id": chosen.env,
         "trials": chosen.trials,

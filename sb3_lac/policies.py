@@ -58,6 +58,10 @@ class LyapunovCritic(BaseModel):
     only learn the difference to it, ``L(s, a) - offset``. It is negative wherever rewards are collected, so that it takes a
     linear term beside the sum of squares, the last output of each network. Without an offset that term is zero and stays zero.
 
+    With ``output_dim=0`` there are no squares, and the value is that linear term alone, as in other actor-critics. It is not
+    bound to be positive, but what it learns is. A sum of squares learns small costs more exactly. Single costs that are large,
+    as those of a crash, make it jump, since its gradient grows with its value.
+
     :param observation_space: Observation space
     :param action_space: Action space
     :param net_arch: Sizes of the hidden layers
@@ -67,7 +71,7 @@ class LyapunovCritic(BaseModel):
     :param activation_fn: Activation function of the hidden layers
     :param normalize_images: Whether to normalize images or not,
          dividing by 255.0 (True by default)
-    :param output_dim: Width of the last layer, the number of squares in the sum
+    :param output_dim: Width of the last layer, the number of squares in the sum; 0 for a linear critic
     :param n_critics: Number of critic networks to create
     :param share_features_extractor: Whether the features extractor is shared with the actor
         (it is then trained by the loss of the actor only)
@@ -96,9 +100,10 @@ class LyapunovCritic(BaseModel):
             normalize_images=normalize_images,
         )
 
-        # Without this check, ``create_mlp()`` would silently leave out the last layer
-        if output_dim < 1:
-            raise ValueError(f"output_dim={output_dim} must be at least 1, it is the width of the critic's last layer.")
+        if output_dim < 0:
+            raise ValueError(
+                f"output_dim={output_dim} must not be negative, it is the number of squares (0: a linear critic)."
+            )
         if n_critics < 1:
             raise ValueError(f"n_critics={n_critics} must be at least 1.")
 
@@ -112,9 +117,9 @@ class LyapunovCritic(BaseModel):
         self.offset: th.Tensor
         self.register_buffer("offset", th.zeros(1))
         for idx in range(n_critics):
-            *hidden_layers, last_layer = create_mlp(features_dim + action_dim, output_dim, net_arch, activation_fn)
+            *hidden_layers, last_layer = create_mlp(features_dim + action_dim, max(output_dim, 1), net_arch, activation_fn)
             assert isinstance(last_layer, nn.Linear)
-            lyapunov_net = nn.Sequential(*hidden_layers, with_linear_term(last_layer))
+            lyapunov_net = nn.Sequential(*hidden_layers, with_linear_term(last_layer) if output_dim > 0 else last_layer)
             self.add_module(f"lf{idx}", lyapunov_net)
             self.lyapunov_networks.append(lyapunov_net)
 
@@ -131,6 +136,8 @@ class LyapunovCritic(BaseModel):
         with th.set_grad_enabled(th.is_grad_enabled() and not self.share_features_extractor):
             features = self.extract_features(obs, self.features_extractor)
         lyapunov_input = th.cat([features, actions], dim=1)
+        if self.output_dim == 0:
+            return tuple(lyapunov_net(lyapunov_input) for lyapunov_net in self.lyapunov_networks)
         has_offset = self.offset > 0
         values = []
         for lyapunov_net in self.lyapunov_networks:
@@ -174,7 +181,8 @@ class LyapunovPolicy(BasePolicy):
     :param optimizer_kwargs: Additional keyword arguments,
         excluding the learning rate, to pass to the optimizer
         (the fused implementation of ``th.optim.Adam`` is used, unless ``fused``, ``foreach`` or ``differentiable`` is given)
-    :param output_dim: Width of the last layer of the Lyapunov critic, the number of squares that are summed
+    :param output_dim: Width of the last layer of the Lyapunov critic, the number of squares that are summed; 0 for a linear
+        critic, which learns better where single costs are large (see ``LyapunovCritic``)
     :param n_critics: Number of Lyapunov critic networks to create, the largest of their values is used.
     :param share_features_extractor: Whether to share or not the features extractor
         between the actor and the critic (this saves computation time)

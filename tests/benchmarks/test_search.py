@@ -86,15 +86,16 @@ def test_a_cost_environment_is_searched_by_its_cost(trials, tmp_path, capsys):
     search.main([*command, "--jobs", "1", "--out", str(tmp_path)])
     assert [algo for algo, _ in trials] == ["lac"] * 4 + ["tqc"] * 4
     first = trials[0][1]
-    assert first == {
-        "learning_rate": 5e-4, "gamma": 0.99, "tau": 0.005, "ent_coef": "auto_0.1", "target_entropy": -2.0
-    }  # fmt: skip
+    networks = "dict(net_arch=[64, 64], activation_fn=nn.LeakyReLU, output_dim=16, n_critics=1)"
+    assert first == {"learning_rate": 5e-4, "gamma": 0.99, "ent_coef": "auto_0.1", "policy_kwargs": networks}
     table = pd.read_csv(tmp_path / "search.csv")
     assert "mean_cost" in table and (table["seeds"] == 2).sum() == 2
     assert "worst_cost" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("command", [["--trials", "0"], ["--updates", "0"], ["--jobs", "0"], ["--env", "Pendulum-v1"]])
+@pytest.mark.parametrize(
+    "command", [["--trials", "0"], ["--updates", "0"], ["--jobs", "0"], ["--env", "Pendulum-v1"], ["--algos", "tqc"]]
+)
 def test_nonsense_on_the_command_line_is_refused(command, trials):
     with pytest.raises(SystemExit):
         search.main(command)

@@ -48,6 +48,27 @@ def test_value_is_the_sum_of_squares_of_the_last_layer(make_model):
     assert not th.equal(values[0], values[1])
 
 
+def test_a_critic_without_squares_is_linear_in_its_last_layer_and_reports_no_negative_value(make_model):
+    model = make_model(n_collect=16, policy_kwargs={"output_dim": 0, "n_critics": 2})
+    critic = model.critic
+    obs, actions = th.randn(200, 2), th.rand(200, 2)
+    with th.no_grad():
+        for value, net in zip(critic(obs, actions), critic.lyapunov_networks, strict=True):
+            net[-1].bias -= value.mean()
+    values = critic(obs, actions)
+    for value, net in zip(values, critic.lyapunov_networks, strict=True):
+        assert net[-1].out_features == 1
+        th.testing.assert_close(value, net(th.cat([obs, actions], dim=1)))
+        assert value.min() < 0 < value.max()
+    conservative = critic.lyapunov(obs, actions)
+    assert conservative.min() == 0
+    th.testing.assert_close(conservative, th.maximum(*values).clamp(min=0))
+    # and it learns: the gradient reaches every parameter
+    before = [parameter.clone() for parameter in critic.parameters()]
+    model.train(gradient_steps=1, batch_size=8)
+    assert not any(th.equal(old, new) for old, new in zip(before, critic.parameters(), strict=True))
+
+
 def test_actor_and_critic_can_have_their_own_architecture(make_model):
     model = make_model(n_collect=0, policy_kwargs={"net_arch": {"pi": [8], "qf": [12, 10]}})
     assert [layer.out_features for layer in model.actor.latent_pi if isinstance(layer, nn.Linear)] == [8]

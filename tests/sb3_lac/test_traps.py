@@ -268,7 +268,7 @@ def test_multipliers_learn_in_log_space():
         ({"lambda_init": 0.0}, "lambda_init=0.0 must lie between"),
         ({"ent_coef": "auto_0"}, "ent_coef='auto_0' must be greater than 0"),
         ({"n_steps": 3, "gamma": 1.0}, "gamma=1.0 must be smaller than 1 with n-step returns"),
-        ({"policy_kwargs": {"output_dim": 0}}, "output_dim=0 must be at least 1"),
+        ({"policy_kwargs": {"output_dim": -1}}, "output_dim=-1 must not be negative"),
         ({"policy_kwargs": {"n_critics": 0}}, "n_critics=0 must be at least 1"),
     ],
 )
