@@ -61,7 +61,7 @@ class Family:
     :param ranges: of the settings that are varied: choices, or limits of a number that is drawn on a logarithmic scale
     :param varied: which of them, by algorithm, five for each
     :param learning_rate: how a learning rate is written
-    :param first_trial: the settings of the first trial
+    :param first_trials: the settings of the first trials, chosen by hand
     """
 
     unit: str
@@ -70,7 +70,7 @@ class Family:
     ranges: dict[str, list[float] | tuple[float, float]]
     varied: dict[str, list[str]]
     learning_rate: str
-    first_trial: dict[str, float]
+    first_trials: list[dict[str, float]]
 
 
 def _errors(model: BaseAlgorithm, env_id: str) -> pd.Series:
@@ -99,15 +99,17 @@ _FULL_STATE = Family(
     },
     {"lac": _SOFT, "sac": _SOFT, "td3": _TD3},
     "lin_{:.2g}",
-    {
-        "learning_rate": 1e-3,
-        "gamma": 0.6,
-        "tau": 0.005,
-        "ent_coef": 0.02,
-        "target_entropy": -4.0,
-        "noise_std": 0.5,
-        "target_policy_noise": 0.05,
-    },
+    [
+        {
+            "learning_rate": 1e-3,
+            "gamma": 0.6,
+            "tau": 0.005,
+            "ent_coef": 0.02,
+            "target_entropy": -4.0,
+            "noise_std": 0.5,
+            "target_policy_noise": 0.05,
+        },
+    ],
 )
 _COST = Family(
     "cost",
@@ -127,17 +129,30 @@ _COST = Family(
     # LAC has a choice of critics that the others do not have
     {"lac": ["learning_rate", "gamma", "ent_coef", "output_dim", "n_critics"], "sac": _SOFT, "td3": _TD3, "tqc": _SOFT},
     "{:.2g}",
-    {
-        "learning_rate": 5e-4,
-        "gamma": 0.99,
-        "tau": 0.005,
-        "ent_coef": 0.1,
-        "target_entropy": -2.0,
-        "output_dim": 16,
-        "n_critics": 1,
-        "noise_std": 0.1,
-        "target_policy_noise": 0.2,
-    },
+    [
+        {
+            "learning_rate": 5e-4,
+            "gamma": 0.99,
+            "tau": 0.005,
+            "ent_coef": 0.1,
+            "target_entropy": -2.0,
+            "output_dim": 16,
+            "n_critics": 1,
+            "noise_std": 0.1,
+            "target_policy_noise": 0.2,
+        },
+        {
+            "learning_rate": 2.5e-3,
+            "gamma": 0.99,
+            "tau": 0.01,
+            "ent_coef": 0.7,
+            "target_entropy": -1.0,
+            "output_dim": 0,
+            "n_critics": 2,
+            "noise_std": 0.3,
+            "target_policy_noise": 0.3,
+        },
+    ],
 )
 #: By environment.
 FAMILIES = {"BatteryQmax-v0": _FULL_STATE, "BatteryRo-v0": _FULL_STATE, **dict.fromkeys(DISTURBANCES, _COST)}
@@ -216,7 +231,8 @@ def part(algo: str, env_id: str, trials: int, updates: int, finalists: int, repe
     # another seed after an interruption, or the first draws would come again
     study.sampler = optuna.samplers.TPESampler(n_startup_trials=trials // 2, multivariate=True, seed=len(study.trials))
     if not study.trials:
-        study.enqueue_trial(FAMILIES[env_id].first_trial)
+        for first_trial in FAMILIES[env_id].first_trials:
+            study.enqueue_trial(first_trial)
     objective = partial(score, algo, env_id, updates, out / "zoo")
     study.optimize(objective, n_trials=max(trials - len(_first_trials(study)), 0))
     best = sorted(_first_trials(study), key=lambda trial: trial.values[0])[:finalists]
