@@ -5,7 +5,7 @@ updates and varied settings for each algorithm, starting from the entry in ``zoo
 .. code-block:: bash
 
   python -m benchmarks.search --env BatteryQmax-v0 --trials 10 --updates 2400
-  python -m benchmarks.search --env PendulumCost-v0 --trials 8 --updates 4000 --finalists 2 --repeats 1
+  python -m benchmarks.search --env PendulumCost-v0 --trials 6 --updates 4000 --finalists 2 --repeats 1
 
 A trial trains with the entry of ``zoo_configs``, changed where the search varies it, and is scored by its mean action. On a
 full-state task that is its mean error on whole discharges of the training part, the model running free; the test part is not
@@ -42,8 +42,6 @@ from benchmarks.training import Recipe, set_up, timesteps_of
 
 _DISCHARGES = 64  # whole ones, evenly spaced in the training part
 _EPISODES, _SEED = 50, 20_000  # on a cost environment
-
-
 _COMMON = ["learning_rate", "gamma", "tau"]
 _SOFT = [*_COMMON, "ent_coef", "target_entropy"]
 _TD3 = [*_COMMON, "noise_std", "target_policy_noise"]
