@@ -7,6 +7,7 @@ import importlib
 import multiprocessing
 import pickle
 import tempfile
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
@@ -72,7 +73,10 @@ def cluster(scheduler: str, packages: Sequence[str], shared: Path | None = None)
         if shared is not None:
             shared.mkdir(parents=True, exist_ok=True)
             probe = Path(stack.enter_context(tempfile.NamedTemporaryFile(dir=shared, prefix=".shared")).name)
-        for worker, fault in client.run(_fault, code, probe, on_error="return").items():
+        faults = client.run(_fault, code, probe, on_error="return")
+        if not faults:
+            warnings.warn(f"{scheduler} has no worker yet; waiting for one", stacklevel=4)
+        for worker, fault in faults.items():
             if fault is not None:
                 raise RuntimeError(f"Dask's worker {worker}: {fault}")
         executor = client.get_executor(pure=False)

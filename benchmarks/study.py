@@ -6,6 +6,7 @@ and numbers as readers see them. A study itself keeps its configuration, the fun
 from __future__ import annotations
 
 import argparse
+import importlib
 import inspect
 import json
 import os
@@ -242,9 +243,9 @@ class Study:
             made_from = {"part": part.__name__, "arguments": arguments, "module": module, "versions": own_versions()}
             files.append(self.out / "parts" / f"{part.__name__}_{digest_of(made_from)}.json")
         missing = {file: dict(arguments) for file, arguments in zip(files, parts, strict=True) if not file.exists()}
-        places_for = list(missing)
-        runs = [(partial(part, **places), arguments) for arguments in missing.values()]
-        self.each(_make, runs, lambda number, content: write_json(places_for[number], content))
+        where = list(missing)
+        runs = [(partial(_importable(part), **places), arguments) for arguments in missing.values()]
+        self.each(_make, runs, lambda number, content: write_json(where[number], content))
         made = [json.loads(file.read_text(encoding="utf-8"))["tables"] for file in files]
         names = dict.fromkeys(name for tables in made for name in tables)
         return {
@@ -300,7 +301,7 @@ class Study:
                 else cluster(self.scheduler, _CODE, self.out if shared else None)
             )
             with workers as submit:
-                numbers = {submit(function, *run): number for number, run in enumerate(runs)}
+                numbers = {submit(_importable(function), *run): number for number, run in enumerate(runs)}
                 for future in as_completed(numbers):
                     yield numbers[future], future.result
 
@@ -333,6 +334,14 @@ class Study:
             save_figure(figure, self.out / f"{figure_name}.png")
         write_text(self.out / f"{name or self.name}.md", text)
         sys.stdout.write("\n" + text)
+
+
+def _importable(function: Callable[..., Result]) -> Callable[..., Result]:
+    """The function of its module instead of that of the program, which is all that ``python -m`` makes of the module."""
+    program = sys.modules["__main__"].__spec__
+    if function.__module__ != "__main__" or program is None:
+        return function
+    return getattr(importlib.import_module(program.name), function.__name__)
 
 
 def _make(part: Callable[..., Tables], arguments: dict[str, Any]) -> dict[str, Any]:

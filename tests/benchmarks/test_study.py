@@ -3,12 +3,15 @@
 import json
 import operator
 import os
+import sys
+from importlib.util import find_spec
+from types import FunctionType, ModuleType
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from benchmarks import study
+from benchmarks import nuisance, study
 from benchmarks.study import Study, command_line, digits, with_spread
 
 
@@ -119,6 +122,15 @@ def test_on_a_cluster_a_lost_part_is_made_again_and_one_that_fails_stops_no_othe
     assert table["seed"].tolist() == [0, 1, 2, 3] and os.getpid() not in table["process"].tolist()
     assert {path: path.read_text() for path in kept} == kept
     assert len(list((tmp_path / "out" / "parts").iterdir())) == 4
+
+
+def test_parts_of_a_program_are_those_of_its_module(monkeypatch):
+    program = ModuleType("__main__")
+    program.__spec__ = find_spec("benchmarks.nuisance")
+    monkeypatch.setitem(sys.modules, "__main__", program)
+    copy = FunctionType(nuisance.part.__code__, {}, "part")
+    copy.__module__ = "__main__"
+    assert study._importable(copy) is nuisance.part and study._importable(part) is part
 
 
 def test_a_scheduler_that_is_not_there_is_an_error_of_the_command_line(tmp_path, capsys):
