@@ -22,5 +22,5 @@ def dask_cluster(tmp_path_factory):
     """Two workers on this machine, which import the tests as this process does."""
     distributed = pytest.importorskip("distributed", reason="the extra cluster is not installed")
     folder = str(tmp_path_factory.mktemp("dask"))
-    with distributed.LocalCluster(2, threads_per_worker=1, dashboard_address=None, local_directory=folder) as started:
+    with distributed.LocalCluster(2, threads_per_worker=1, dashboard_address=":0", local_directory=folder) as started:
         yield started
