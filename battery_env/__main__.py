@@ -204,7 +204,12 @@ def _add_results(group: argparse._ArgumentGroup) -> None:
         type=int,
         default=1,
         metavar="N",
-        help="processes; -1: one a core (default: %(default)s, needs joblib for more)",
+        help="processes; -1: one a core (default: %(default)s)",
+    )
+    group.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="of a Dask cluster, tcp://host:port, whose workers read and calibrate; they must see the files by the same names",
     )
 
 
@@ -249,7 +254,7 @@ def calibrate(arguments: Sequence[str] | None = None, name: str = "battery-calib
         reading = Reading(options.columns, options.units, options.discharge_is_negative)
         rows: list[dict[str, Any]] = []
         try:
-            for row in calibrate_all(sources, reading, settings, results, options.jobs):
+            for row in calibrate_all(sources, reading, settings, results, options.jobs, options.scheduler):
                 rows.append(row)
                 _show(row, rows, options.json)
         except KeyboardInterrupt:
@@ -261,7 +266,7 @@ def calibrate(arguments: Sequence[str] | None = None, name: str = "battery-calib
             written = results.write_table(rows)
             if not options.json:
                 print("\nwritten: " + ", ".join(map(str, written)))
-    except (ValueError, TypeError, OSError, ImportError) as error:
+    except (ValueError, TypeError, OSError, ImportError, RuntimeError) as error:
         print(f"error: {error}", file=sys.stderr)
         return REFUSED
     if interrupted:

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import io
+import os
 import re
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future
+from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,11 +20,14 @@ import pandas as pd
 
 from battery_env.cells import BUNDLED_CELLS, load_nasa_discharges
 from battery_env.files import check_folder, replacing
+from battery_env.parallel import Submit, cluster, processes
 from battery_env.record_files import Recording, read_recordings
 from battery_env.summary import Settings, Summary, summarize
 from battery_env.tables import BINARY_SUFFIXES, PACKED_SUFFIXES, TEXT_SUFFIXES, is_readable
 
 _NASA_SUFFIX = ".mat"
+# Calls under way at the same time on a cluster, whose workers come and go.
+_ON_A_CLUSTER = 64
 # What NASA's discharges have beside them, in the layout of the bundled ones, is a table of tests and no record.
 _NO_RECORDS = ("cycles.csv",)
 
@@ -166,21 +175,16 @@ class Results:
             if path.name in tables or (self.with_voltages and voltages.fullmatch(path.name))
         ]
 
-    def write_voltages(self, name: str, summary: Summary, title: str) -> None:
+    def write_voltages(self, name: str, files: Mapping[str, bytes]) -> None:
         """
         Write what one discharge showed, beside the model.
 
         :param name: what the names of its files start with
-        :param summary: of the discharge
-        :param title: of the figure
+        :param files: by ending of the name, what it holds
         """
-        from battery_env.plotting import plot_discharge, save_figure  # here, as matplotlib takes long to import
-
-        record, forecast = summary.record, summary.forecast
-        columns = {"time_s": record.time_s, "voltage_V": record.voltage_V, "current_A": record.current_A}
-        with replacing(self.folder / f"{name}_voltage.csv") as part:
-            pd.DataFrame(columns | {"model_V": forecast.at_samples_V}).to_csv(part, index=False)
-        save_figure(plot_discharge(record, {"model": forecast}, title), self.folder / f"{name}_voltage.png")
+        for suffix, content in files.items():
+            with replacing(self.folder / f"{name}_voltage.{suffix}") as part:
+                part.write_bytes(content)
 
     def write_table(self, rows: Sequence[Mapping[str, Any]]) -> list[Path]:
         """
@@ -208,7 +212,12 @@ class Results:
 
 
 def calibrate_all(
-    sources: Sequence[Source], reading: Reading, settings: Settings, results: Results | None = None, jobs: int = 1
+    sources: Sequence[Source],
+    reading: Reading,
+    settings: Settings,
+    results: Results | None = None,
+    jobs: int = 1,
+    scheduler: str | None = None,
 ) -> Iterator[dict[str, Any]]:
     """
     Calibrate the model to the discharges of many files, one after the other or side by side.
@@ -218,51 +227,93 @@ def calibrate_all(
     :param settings: how each discharge is looked at
     :param results: where to write what each discharge showed; ``None``: nowhere
     :param jobs: processes; -1: as many as there are cores
+    :param scheduler: address of a Dask cluster whose workers read and calibrate, in place of processes here
     :return: one row a discharge in their order, as they are finished: ``record`` (its name, which no other has), ``source``,
         ``cell``, ``cycle``, what :func:`battery_env.summary.summarize` tells, ``notes`` (warnings), and ``error`` where a file
         or a discharge cannot be used; it is empty otherwise
-    :raises ImportError: for several processes without the extra ``fleet``
+    :raises ImportError: for a cluster without the extra ``cluster``
+    :raises OSError: if no scheduler answers there
+    :raises RuntimeError: if the workers of the cluster could not be relied on
     """
-    folder = results if results is not None and results.with_voltages else None
-    tasks = ((task, settings, folder) for task in _tasks(sources, reading))
-    if jobs == 1:
-        return (_calibrate(*task) for task in tasks)
+    with ExitStack() as stack:
+        each: _Each = _one_by_one
+        if scheduler is not None:
+            each = partial(_side_by_side, stack.enter_context(cluster(scheduler, ("battery_env",))), _ON_A_CLUSTER)
+        elif jobs != 1:
+            jobs = (os.cpu_count() or 1) if jobs == -1 else jobs
+            each = partial(_side_by_side, stack.enter_context(processes(jobs)), 2 * jobs)
+        read = each(read_source, ((source, reading) for source in sources))
+        with_voltages = results is not None and results.with_voltages
+        calls = ((known, recording, settings, with_voltages) for known, recording in _recordings(read))
+        for (known, *_), (calibrated, notes, error) in each(_calibrate, calls):
+            name = known["record"]
+            if results is not None and calibrated is not None:
+                error = _outcome(results.write_voltages, name, calibrated[1]).error
+            if known["error"] or error:
+                yield known | {"error": known["error"] or f"{name}: {error}"}
+            else:
+                told = {column: known[column] for column in ("record", "source", "cell", "cycle")}
+                yield told | calibrated[0] | {"notes": "; ".join(filter(None, [known["notes"], *notes])), "error": ""}
+
+
+class _Outcome(NamedTuple):
+    result: Any  # None if there is an error
+    notes: list[str]
+    error: str
+
+
+#: Calls a function with each of many arguments; in their order, the arguments and what became of them.
+_Each = Callable[[Callable[..., Any], Iterable[tuple[Any, ...]]], Iterator[tuple[tuple[Any, ...], _Outcome]]]
+
+
+def _outcome(function: Callable[..., Any], *arguments: Any) -> _Outcome:
+    result, error = None, ""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            result = function(*arguments)
+        except Exception as problem:  # of whatever kind, it must not stop the others
+            error = _message(problem)
+    return _Outcome(result, [str(each.message) for each in caught], error)
+
+
+def _one_by_one(function: Callable[..., Any], calls: Iterable[tuple[Any, ...]]) -> Iterator[tuple[tuple[Any, ...], _Outcome]]:
+    return ((call, _outcome(function, *call)) for call in calls)
+
+
+def _side_by_side(
+    submit: Submit, ahead: int, function: Callable[..., Any], calls: Iterable[tuple[Any, ...]]
+) -> Iterator[tuple[tuple[Any, ...], _Outcome]]:
+    """As many calls ahead as keep all workers busy, and no more, as each holds its data."""
+    started: deque[tuple[tuple[Any, ...], Future[_Outcome]]] = deque()
+    for call in calls:
+        started.append((call, submit(_outcome, function, *call)))
+        while started and (len(started) > ahead or started[0][1].done()):
+            yield _finished(*started.popleft())
+    while started:
+        yield _finished(*started.popleft())
+
+
+def _finished(call: tuple[Any, ...], future: Future[_Outcome]) -> tuple[tuple[Any, ...], _Outcome]:
     try:
-        from joblib import Parallel, delayed
-    except ImportError as error:
-        raise ImportError("--jobs needs joblib: pip install 'battery_env[fleet]'") from error
-    return iter(Parallel(n_jobs=jobs, return_as="generator")(delayed(_calibrate)(*task) for task in tasks))
+        return call, future.result()
+    except Exception as error:  # of the worker
+        return call, _Outcome(None, [], _message(error))
 
 
-class _Task(NamedTuple):
-    row: dict[str, Any]  # what is known before: record, source, cell, cycle, notes, error
-    recording: Recording | None
-
-
-def _tasks(sources: Sequence[Source], reading: Reading) -> Iterator[_Task]:
+def _recordings(
+    read: Iterable[tuple[tuple[Any, ...], _Outcome]],
+) -> Iterator[tuple[dict[str, Any], Recording | None]]:
+    """What was read, with what is known of it before it is calibrated: record, source, cell, cycle, notes, error."""
     used: set[str] = set()
-    for source in sources:
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            try:
-                recordings = read_source(source, reading)
-            except Exception as error:  # of whatever kind, it must not stop the others
-                name = _unused(record_name(source.stem, source.cycle), used)
-                text = _message(error)
-                text = text if source.path in text else f"{source.path}: {text}"
-                yield _Task(_known(name, source, source.cycle, caught, text), None)
-                continue
-        for recording in recordings:
-            cycle = recording.meta.get("cycle")
+    for (source, _), (recordings, notes, error) in read:
+        if error and source.path not in error:
+            error = f"{source.path}: {error}"
+        for recording in [None] if error else recordings:
+            cycle = source.cycle if recording is None else recording.meta.get("cycle")
             name = _unused(record_name(source.stem, cycle), used)
-            yield _Task(_known(name, source, cycle, caught, ""), recording)
-
-
-def _known(
-    name: str, source: Source, cycle: int | None, caught: Sequence[warnings.WarningMessage], error: str
-) -> dict[str, Any]:
-    notes = "; ".join(str(each.message) for each in caught)
-    return {"record": name, "source": source.path, "cell": source.stem, "cycle": cycle, "notes": notes, "error": error}
+            known = {"record": name, "source": source.path, "cell": source.stem, "cycle": cycle}
+            yield known | {"notes": "; ".join(notes), "error": error}, recording
 
 
 def record_name(stem: str, cycle: int | None) -> str:
@@ -292,21 +343,25 @@ def _message(error: Exception) -> str:
     return text if isinstance(error, expected) and text else f"{type(error).__name__}: {text}"
 
 
-def _calibrate(task: _Task, settings: Settings, results: Results | None) -> dict[str, Any]:
-    known, recording = task
+def _calibrate(
+    known: Mapping[str, Any], recording: Recording | None, settings: Settings, with_voltages: bool
+) -> tuple[dict[str, Any], dict[str, bytes]] | None:
+    """What the discharge says, and its voltages as files; nothing of a source that could not be read."""
     if recording is None:
-        return known
-    name = known["record"]
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        try:
-            summary = summarize(recording.discharge(), settings)
-            if results is not None:
-                results.write_voltages(name, summary, _title(name, summary.row))
-        except Exception as error:  # of whatever kind, it must not stop the others
-            return known | {"error": f"{name}: {_message(error)}"}
-    notes = "; ".join(filter(None, [known["notes"], *(str(each.message) for each in caught)]))
-    return {name: known[name] for name in ("record", "source", "cell", "cycle")} | summary.row | {"notes": notes, "error": ""}
+        return None
+    summary = summarize(recording.discharge(), settings)
+    return summary.row, _voltages(summary, _title(known["record"], summary.row)) if with_voltages else {}
+
+
+def _voltages(summary: Summary, title: str) -> dict[str, bytes]:
+    from battery_env.plotting import plot_discharge  # here, as matplotlib takes long to import
+
+    record, forecast = summary.record, summary.forecast
+    columns = {"time_s": record.time_s, "voltage_V": record.voltage_V, "current_A": record.current_A}
+    table = pd.DataFrame(columns | {"model_V": forecast.at_samples_V}).to_csv(index=False)
+    picture = io.BytesIO()
+    plot_discharge(record, {"model": forecast}, title).savefig(picture)
+    return {"csv": table.encode(), "png": picture.getvalue()}
 
 
 def _title(name: str, row: Mapping[str, Any]) -> str:

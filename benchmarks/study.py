@@ -6,15 +6,16 @@ and numbers as readers see them. A study itself keeps its configuration, the fun
 from __future__ import annotations
 
 import argparse
+import importlib
 import inspect
 import json
-import multiprocessing
 import os
 import platform
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from concurrent.futures import as_completed
+from contextlib import closing
 from functools import partial
 from hashlib import sha256
 from importlib.metadata import PackageNotFoundError, version
@@ -29,6 +30,7 @@ from tqdm import tqdm
 import battery_env
 import sb3_lac
 from battery_env.files import replacing
+from battery_env.parallel import cluster, processes
 from battery_env.plotting import save_figure
 
 Result = TypeVar("Result")
@@ -40,6 +42,8 @@ SYMBOLS = {"q_mobile": "q^max", "r_o": "R_o"}
 #: Seed of evaluations; no training seed comes close.
 EVALUATION_SEED = 10_000
 
+# what parts are made by
+_CODE = ("battery_env", "sb3_lac", "benchmarks")
 _PACKAGES = ("torch", "stable_baselines3", "gymnasium", "numpy", "numba", "scipy", "pandas", "rl_zoo3", "progpy")
 
 
@@ -177,7 +181,7 @@ def positive(text: str) -> int:
 
 def command_line(name: str, document: str | None, jobs: int | None = 2) -> argparse.ArgumentParser:
     """
-    What the command lines of all studies have in common: ``--jobs`` and ``--out``.
+    What the command lines of all studies have in common: ``--jobs``, ``--scheduler`` and ``--out``.
 
     :param name: of the study, that of its module
     :param document: what it says of itself
@@ -190,6 +194,7 @@ def command_line(name: str, document: str | None, jobs: int | None = 2) -> argpa
     if jobs is not None:
         jobs = min(jobs, os.cpu_count() or 1)
         parser.add_argument("--jobs", type=positive, default=jobs, help="parts at the same time, one core each")
+        parser.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster that makes the parts, tcp://host:port")
     parser.add_argument("--out", type=Path, default=Path("results") / name, help="folder of all results")
     return parser
 
@@ -201,7 +206,7 @@ class Study:
     :param parser: see :func:`command_line`
     :param arguments: of the command line by default
     :ivar chosen: what was chosen on the command line
-    :ivar configuration: what results depend on, written beside them; all that was chosen but ``--jobs`` and ``--out``
+    :ivar configuration: what results depend on, written beside them; all that was chosen but where and how parts are made
     """
 
     def __init__(self, parser: argparse.ArgumentParser, arguments: Sequence[str] | None = None) -> None:
@@ -210,8 +215,16 @@ class Study:
         self.command = f"{parser.prog} {shlex.join(words)}".strip()
         self.name = parser.prog.rpartition(".")[2]
         self.out: Path = self.chosen.out
-        others = {name: value for name, value in vars(self.chosen).items() if name not in ("jobs", "out")}
+        self.scheduler: str | None = vars(self.chosen).get("scheduler")
+        others = {name: value for name, value in vars(self.chosen).items() if name not in ("jobs", "scheduler", "out")}
         self.configuration: dict[str, Any] = others
+        if self.scheduler is not None:
+            self.out = self.out.absolute()  # workers are elsewhere
+            try:
+                with cluster(self.scheduler, _CODE):
+                    pass
+            except (ImportError, OSError, RuntimeError) as error:
+                parser.error(str(error))
 
     def run(self, part: Callable[..., Tables], parts: Sequence[Mapping[str, Any]], **places: Any) -> dict[str, pd.DataFrame]:
         """
@@ -225,41 +238,72 @@ class Study:
         :return: tables by name, with the rows of all parts in their order
         """
         module = Path(inspect.getfile(part)).read_text(encoding="utf-8")
-        runs = []
+        files = []
         for arguments in parts:
             made_from = {"part": part.__name__, "arguments": arguments, "module": module, "versions": own_versions()}
-            file = self.out / "parts" / f"{part.__name__}_{digest_of(made_from)}.json"
-            runs.append((partial(part, **places), dict(arguments), file))
-        made = self.each(_made_once, runs)
+            files.append(self.out / "parts" / f"{part.__name__}_{digest_of(made_from)}.json")
+        missing = {file: dict(arguments) for file, arguments in zip(files, parts, strict=True) if not file.exists()}
+        where = list(missing)
+        runs = [(partial(_importable(part), **places), arguments) for arguments in missing.values()]
+        self.each(_make, runs, lambda number, content: write_json(where[number], content))
+        made = [json.loads(file.read_text(encoding="utf-8"))["tables"] for file in files]
         names = dict.fromkeys(name for tables in made for name in tables)
-        return {name: pd.concat([tables[name] for tables in made if name in tables], ignore_index=True) for name in names}
+        return {
+            name: pd.concat([pd.DataFrame(tables[name]) for tables in made if name in tables], ignore_index=True)
+            for name in names
+        }
 
-    def each(self, function: Callable[..., Result], runs: Sequence[tuple[Any, ...]]) -> list[Result]:
+    def each(
+        self,
+        function: Callable[..., Result],
+        runs: Sequence[tuple[Any, ...]],
+        keep: Callable[[int, Result], None] | None = None,
+    ) -> list[Result]:
         """
-        Call a function with each of several arguments, with a progress bar: as many at the same time as was chosen, in
-        processes of their own, or all in this one if one at a time. An interruption ends the program with a word on what is
-        done.
+        Call a function with each of several arguments, with a progress bar: on the cluster, or as many at the same time as
+        was chosen, in processes of their own, or all in this one if one at a time. A call that fails stops no other; its
+        error is raised when all are done. An interruption ends the program with a word on what is done.
 
         :param function: importable, since it is pickled
         :param runs: positional arguments of each call
+        :param keep: called here with the number of each call and its result, as soon as there is one; ``None``: the function
+            keeps it in ``out`` itself, a folder that all machines of a cluster must share
         :return: the results, in the order of the runs
         """
-        jobs = self.chosen.jobs
+        results: dict[int, Result] = {}
+        errors = []
         try:
-            if jobs == 1:
-                return [function(*run) for run in tqdm(runs, desc="parts", disable=None)]
-            # spawn: torch does not survive a fork with threads
-            with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
-                futures = [pool.submit(function, *run) for run in runs]
-                try:
-                    for future in tqdm(as_completed(futures), desc="parts", total=len(futures), disable=None):
-                        future.result()
-                except BaseException:
-                    pool.shutdown(wait=False, cancel_futures=True)
-                    raise
-            return [future.result() for future in futures]
+            with closing(self._calls(function, runs, shared=keep is None)) as calls:
+                for number, result in tqdm(calls, desc="parts", total=len(runs), disable=None):
+                    try:
+                        results[number] = result()
+                        if keep is not None:
+                            keep(number, results[number])
+                    except Exception as error:
+                        tqdm.write(f"part {number + 1} of {len(runs)} failed: {error!r}", file=sys.stderr)
+                        errors.append(error)
         except KeyboardInterrupt:
             sys.exit(f"\nInterrupted; what is done lies in {self.out}, and the same command goes on from there.")
+        if errors:
+            raise errors[0]
+        return [results[number] for number in range(len(runs))]
+
+    def _calls(
+        self, function: Callable[..., Result], runs: Sequence[tuple[Any, ...]], shared: bool
+    ) -> Generator[tuple[int, Callable[[], Result]]]:
+        """The number of each run with what gives its result: as they are done elsewhere, or as they are to be done here."""
+        if self.scheduler is None and self.chosen.jobs == 1:
+            yield from ((number, partial(function, *run)) for number, run in enumerate(runs))
+        elif runs:
+            workers = (
+                processes(self.chosen.jobs)
+                if self.scheduler is None
+                else cluster(self.scheduler, _CODE, self.out if shared else None)
+            )
+            with workers as submit:
+                numbers = {submit(_importable(function), *run): number for number, run in enumerate(runs)}
+                for future in as_completed(numbers):
+                    yield numbers[future], future.result
 
     def write_table(self, name: str, table: pd.DataFrame, configuration: Mapping[str, Any] | None = None) -> None:
         """
@@ -292,10 +336,15 @@ class Study:
         sys.stdout.write("\n" + text)
 
 
-def _made_once(part: Callable[..., Tables], arguments: dict[str, Any], file: Path) -> dict[str, pd.DataFrame]:
-    if not file.exists():
-        # floats in JSON are exact, and NaN and infinity are themselves
-        tables = {name: table.to_dict("list") for name, table in part(**arguments).items()}
-        write_json(file, {"arguments": arguments, "versions": versions(), "tables": tables})
-    tables = json.loads(file.read_text(encoding="utf-8"))["tables"]
-    return {name: pd.DataFrame(columns) for name, columns in tables.items()}
+def _importable(function: Callable[..., Result]) -> Callable[..., Result]:
+    """The function of its module instead of that of the program, which is all that ``python -m`` makes of the module."""
+    program = sys.modules["__main__"].__spec__
+    if function.__module__ != "__main__" or program is None:
+        return function
+    return getattr(importlib.import_module(program.name), function.__name__)
+
+
+def _make(part: Callable[..., Tables], arguments: dict[str, Any]) -> dict[str, Any]:
+    # floats in JSON are exact, and NaN and infinity are themselves
+    tables = {name: table.to_dict("list") for name, table in part(**arguments).items()}
+    return {"arguments": arguments, "versions": versions(), "tables": tables}

@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[1]
 
 # each layer may import the ones before it, and itself
 LAYERS = (
-    ("battery_env.arrays", "battery_env.files"),
+    ("battery_env.arrays", "battery_env.files", "battery_env.parallel"),
     ("battery_env.columns",),
     ("battery_env.tables",),
     ("battery_env.checks",),
@@ -154,7 +154,7 @@ def declared(distributions, extras):
 @pytest.mark.parametrize(
     ("package", "distributions", "extras"),
     [
-        ("battery_env", ("battery_env",), ("cyclers", "fleet", "onnx", "parquet", "sb3")),
+        ("battery_env", ("battery_env",), ("cluster", "cyclers", "onnx", "parquet", "sb3")),
         ("sb3_lac", (".",), ("zoo", "onnx")),
         ("benchmarks", ("battery_env", "."), ("zoo", "peers")),
         ("tests", ("battery_env", "."), ("zoo", "peers", "onnx", "dev")),

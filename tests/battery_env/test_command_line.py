@@ -1,6 +1,7 @@
 import json
 import subprocess
 import sys
+from concurrent.futures import BrokenExecutor, Future
 from pathlib import Path
 
 import numpy as np
@@ -265,16 +266,56 @@ def test_the_cycle_of_a_life_is_picked_by_its_number(lab, tmp_path, capsys):
     assert "has one discharge, without a number" in fails([f"{lab}/cell.csv:4"], capsys)
 
 
-def test_a_fleet_in_processes_is_the_same_as_one_after_the_other(lab, tmp_path, capsys):
-    pytest.importorskip("joblib")
-    assert main(["calibrate", str(lab), "--json"]) == main(["calibrate", str(lab), "--json", "--jobs", "2"]) == 2
+@pytest.mark.parametrize("where", ["processes", "cluster"])
+def test_a_fleet_side_by_side_is_the_same_as_one_after_the_other(where, lab, tmp_path, request, capsys):
+    chosen = ["--jobs", "2"]
+    if where == "cluster":
+        chosen = ["--scheduler", request.getfixturevalue("dask_cluster").scheduler_address]
+    one, many = tmp_path / "one", tmp_path / "many"
+    records = [str(lab / name) for name in ("notes.txt", "cell.csv.gz", "life.csv:2", "cell.csv")]
+    assert main(["calibrate", *records, "--json", "--out", str(one)]) == 2
+    assert main(["calibrate", *records, "--json", "--out", str(many), *chosen]) == 2
     lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 2 * len(RECORDS) and lines[: len(RECORDS)] == lines[len(RECORDS) :]
+    assert len(lines) == 2 * len(records) and lines[: len(records)] == lines[len(records) :]
+    written = {path.name: path.read_bytes() for path in one.iterdir()}
+    assert written == {path.name: path.read_bytes() for path in many.iterdir()} and "cell_2_voltage.png" in written
 
 
-def test_processes_need_an_extra(monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "joblib", None)
-    assert "battery_env[fleet]" in fails(["B0005:1", "--jobs", "2"], capsys)
+def test_a_file_whose_worker_is_lost_is_refused_and_stops_nothing():
+    def submit(function, *arguments):
+        future = Future()
+        if arguments[1] == "bad":
+            future.set_exception(BrokenExecutor("the worker died"))
+        else:
+            future.set_result(function(*arguments))
+        return future
+
+    calls = [("good",), ("bad",), ("better",)]
+    found = list(fleet._side_by_side(submit, 2, str.upper, calls))
+    assert [call for call, _ in found] == calls
+    assert [outcome.result for _, outcome in found] == ["GOOD", None, "BETTER"]
+    assert [outcome.error for _, outcome in found] == ["", "BrokenExecutor: the worker died", ""]
+
+
+def test_results_keep_their_order_whatever_finishes_first():
+    futures = []
+
+    def submit(*call):
+        futures.append(Future())
+        if len(futures) == 4:  # the first one is what the others wait for
+            for number, future in reversed(list(enumerate(futures))):
+                future.set_result(fleet._Outcome(number, [], ""))
+        return futures[-1]
+
+    found = fleet._side_by_side(submit, 3, str, [(number,) for number in range(4)])
+    assert [(call[0], outcome.result) for call, outcome in found] == [(number, number) for number in range(4)]
+
+
+def test_a_cluster_needs_an_extra_and_a_scheduler(monkeypatch, capsys):
+    pytest.importorskip("distributed", reason="the extra cluster is not installed")
+    assert "no Dask scheduler at 'nonsense'" in fails(["B0005:1", "--scheduler", "nonsense"], capsys)
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    assert "battery_env[cluster]" in fails(["B0005:1", "--scheduler", "tcp://127.0.0.1:1"], capsys)
 
 
 def test_existing_results_are_found_before_any_work_is_done(lab, tmp_path, capsys):

@@ -3,12 +3,15 @@
 import json
 import operator
 import os
+import sys
+from importlib.util import find_spec
+from types import FunctionType, ModuleType
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from benchmarks import study
+from benchmarks import nuisance, study
 from benchmarks.study import Study, command_line, digits, with_spread
 
 
@@ -86,6 +89,55 @@ def test_several_jobs_are_other_processes_whose_results_keep_their_order(tmp_pat
     assert os.getpid() not in two.each(os.getpid, [(), ()])
     with pytest.raises(ZeroDivisionError):
         two.each(operator.truediv, [(1, 1), (1, 0), (2, 1)])
+
+
+def test_a_call_that_fails_stops_no_other(tmp_path, capsys):
+    kept = {}
+    with pytest.raises(ZeroDivisionError):
+        a_study(tmp_path).each(operator.truediv, [(1, 0), (1, 1)], kept.__setitem__)
+    assert kept == {1: 1.0} and "part 1 of 2 failed: ZeroDivisionError" in capsys.readouterr().err
+
+
+def fragile_part(seed, place):
+    with (place / f"tries_{seed}").open("a") as tries:
+        tries.write("x")
+    if seed == 1 and (place / "tries_1").stat().st_size == 1:
+        os._exit(1)
+    if seed == 2 and not (place / "mended").exists():
+        raise ValueError("not yet")
+    return {"example": pd.DataFrame([{"seed": seed, "process": os.getpid()}])}
+
+
+def test_on_a_cluster_a_lost_part_is_made_again_and_one_that_fails_stops_no_other(tmp_path, dask_cluster):
+    def run():
+        chosen = a_study(tmp_path / "out", "--scheduler", dask_cluster.scheduler_address)
+        return chosen.run(fragile_part, [{"seed": seed} for seed in range(4)], place=tmp_path)["example"]
+
+    with pytest.raises(ValueError, match="not yet"):
+        run()
+    kept = {path: path.read_text() for path in (tmp_path / "out" / "parts").iterdir()}
+    assert len(kept) == 3 and (tmp_path / "tries_1").read_text() == "xx"
+    (tmp_path / "mended").touch()
+    table = run()
+    assert table["seed"].tolist() == [0, 1, 2, 3] and os.getpid() not in table["process"].tolist()
+    assert {path: path.read_text() for path in kept} == kept
+    assert len(list((tmp_path / "out" / "parts").iterdir())) == 4
+
+
+def test_parts_of_a_program_are_those_of_its_module(monkeypatch):
+    program = ModuleType("__main__")
+    program.__spec__ = find_spec("benchmarks.nuisance")
+    monkeypatch.setitem(sys.modules, "__main__", program)
+    copy = FunctionType(nuisance.part.__code__, {}, "part")
+    copy.__module__ = "__main__"
+    assert study._importable(copy) is nuisance.part and study._importable(part) is part
+
+
+def test_a_scheduler_that_is_not_there_is_an_error_of_the_command_line(tmp_path, capsys):
+    pytest.importorskip("distributed", reason="the extra cluster is not installed")
+    with pytest.raises(SystemExit):
+        a_study(tmp_path, "--scheduler", "nonsense")
+    assert "no Dask scheduler at 'nonsense'" in capsys.readouterr().err
 
 
 def test_files_say_what_made_them(tmp_path, capsys):
