@@ -11,6 +11,7 @@ from battery_env import ExtendedKalmanFilter, PolicyEstimator
 from battery_env.cells import Discharge, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, initial_state, rest_shares, simulate, voltage
 from battery_env.estimators.base import OnlineEstimator
+from battery_env.estimators.rest import rest_voltages_V
 from battery_env.records import Stream
 
 NOISE_V = 0.005
@@ -307,7 +308,6 @@ class TestRecordedCells:
         assert told.soc + drawn_C / estimate.q_mobile == pytest.approx(1.0, abs=0.03) and not estimate.settled
 
     def test_rests_of_the_model_at_all_charges(self):
-        filter_ = ExtendedKalmanFilter(initial_soc="rest")
-        rest_V = filter_._rest_voltages_V()
+        rest_V = rest_voltages_V(NEW_CELL)
         assert (np.diff(rest_V) > 0.0).all()
         assert rest_V[-1] == pytest.approx(float(voltage(initial_state())))
