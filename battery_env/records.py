@@ -263,12 +263,14 @@ class Stream(NamedTuple):
     :param voltage_V: V
     :param current_A: mean current from each sample to the next, A
     :param dt_s: time since the previous sample, s; 0 for the first one
+    :param temperature_C: of the cell, degC; ``None``: not measured
     """
 
     time_s: FloatArray
     voltage_V: FloatArray
     current_A: FloatArray
     dt_s: FloatArray
+    temperature_C: FloatArray | None = None
 
     @classmethod
     def of(cls, record: Record, dt_s: float) -> Stream:
@@ -286,7 +288,10 @@ class Stream(NamedTuple):
         if not np.allclose(step_s, dt_s, rtol=1e-6, atol=0.0):
             mean_A = np.diff(drawn(time_s, current_A, time_s)) / step_s
             current_A = np.append(mean_A, current_A[-1])
-        return cls(time_s, voltage_V, current_A, np.append(0.0, step_s))
+        temperature_C = getattr(record, "temperature_C", None)
+        if temperature_C is not None:
+            temperature_C = check_column("temperature_C", temperature_C, len(time_s))
+        return cls(time_s, voltage_V, current_A, np.append(0.0, step_s), temperature_C)
 
     def samples(self) -> zip[tuple[float, float, float]]:
         """

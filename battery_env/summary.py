@@ -169,8 +169,12 @@ def summarize(discharge: Discharge, settings: Settings) -> Summary:
     cell = settings.cell or NEW_CELL
     if ambient_C is not None:
         cell = cell.replace(Tb0=ambient_C + _ZERO_CELSIUS_K)
+    seen = record
+    if settings.ambient_C is not None or not settings.thermal:
+        # a temperature that is stated, or held, counts more than one that was measured
+        discharge, seen = replace(discharge, temperature_C=None), replace(record, temperature_C=None)
     start = settings.calibrator(cell).start_of(discharge)
-    estimate = settings.calibrator(cell, start).estimate(record)
+    estimate = settings.calibrator(cell, start).estimate(seen)
     if start.reason:
         estimate = replace(estimate, settled=False, reason=start.reason)
     # what a full cell would have given more, as its end comes at the same charge

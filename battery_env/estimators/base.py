@@ -242,7 +242,7 @@ class OnlineEstimator(Estimator):
 
     def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:
         """
-        One estimate for every sample of many discharges.
+        One estimate for every sample of many discharges. A temperature that was measured is taken in with each sample.
 
         :param records: discharges
         :return: one trace per discharge, in the same order
@@ -252,7 +252,10 @@ class OnlineEstimator(Estimator):
         for record in records:
             stream = Stream.of(record, self.dt_s)
             self.reset()
-            traces.append(EstimateTrace.of(stream.time_s, [self.update(*sample) for sample in stream.samples()]))
+            measured: Iterable[tuple[float, ...]] = stream.samples()
+            if stream.temperature_C is not None:
+                measured = ((*sample, t_C) for sample, t_C in zip(measured, stream.temperature_C.tolist(), strict=True))
+            traces.append(EstimateTrace.of(stream.time_s, [self.update(*sample) for sample in measured]))
         self.reset()
         return traces
 

@@ -306,12 +306,15 @@ class ExtendedKalmanFilter(OnlineEstimator):
         :raises ValueError: if the record cannot be used
         """
         if self.told_from_rest:
-            return told_at_rest(record, self.cell, self._rest_sd_V, self.dt_s)
+            measured_C = getattr(record, "temperature_C", None)
+            cell = self.cell if measured_C is None else self.cell.replace(Tb0=float(measured_C[0]) + _ZERO_CELSIUS_K)
+            return told_at_rest(record, cell, self._rest_sd_V, self.dt_s)
         return Start(*self.initial_soc)
 
     def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:
         """
-        One estimate for every sample of many discharges, in one compiled call each.
+        One estimate for every sample of many discharges, in one compiled call each. A temperature that was measured is that of
+        the model, as in a stream.
 
         :param records: discharges; a :class:`~battery_env.trajectories.TrajectoryDataset` is one
         :return: one trace per discharge, in the same order
@@ -321,10 +324,14 @@ class ExtendedKalmanFilter(OnlineEstimator):
             return super().trace(records)
         traces = []
         for record in records:
-            time_s, voltage_V, current_A, dt_s = Stream.of(record, self.dt_s)
+            time_s, voltage_V, current_A, dt_s, temperature_C = Stream.of(record, self.dt_s)
             self.reset()
+            temperature_K = np.full(len(time_s), np.nan)
+            if temperature_C is not None:
+                temperature_K = temperature_C + _ZERO_CELSIUS_K
+                self._surround(float(temperature_K[0]))
             self._check_drawn(float(np.cumsum(np.append(0.0, current_A[:-1]) * dt_s).min()))
-            out, codes = self._run(np.stack([voltage_V, current_A, dt_s, np.full(len(time_s), np.nan)]))
+            out, codes = self._run(np.stack([voltage_V, current_A, dt_s, temperature_K]))
             q, r_o, sd_q, sd_r_o = out[:, :4].T.copy()
             for name, sd in (("q_mobile", sd_q), ("r_o", sd_r_o)):
                 if name not in self.parameters:

@@ -138,6 +138,35 @@ class TestTemperature:
         assert 303.0 < filter_.now().state[0] < 304.2
         assert filter_.now().cell.Tb0 == pytest.approx(293.15)
 
+    @pytest.mark.parametrize("initial_soc", [1.0, "rest"])
+    def test_a_record_is_taken_with_its_temperature(self, initial_soc, whole):
+        part = whole.part(0, 900)
+        samples = np.arange(len(part.time_s))
+        warm_C = 30.0 + 0.01 * samples
+        record = Discharge(part.time_s, part.voltage_V, part.current_A, warm_C)
+        filter_ = ExtendedKalmanFilter(thermal=True, initial_soc=initial_soc)
+        for sample, temperature_C in zip(Stream.of(record, 1.0).samples(), warm_C.tolist(), strict=True):
+            last = filter_.update(*sample, temperature_C)
+        (trace,) = filter_.trace([record])
+        assert filter_.estimate(record) == last and trace.q_mobile[-1] == last.q_mobile and trace.r_o[-1] == last.r_o
+        blind = filter_.estimate(Discharge(part.time_s, part.voltage_V, part.current_A))
+        assert abs(blind.r_o / last.r_o - 1.0) > 1e-3
+
+    def test_a_trace_of_an_estimator_that_takes_none_refuses_it_as_its_update_does(self):
+        class Isothermal(ExtendedKalmanFilter):
+            def trace(self, records):
+                return super(ExtendedKalmanFilter, self).trace(records)
+
+            def update(self, voltage_V, current_A, dt_s, temperature_C=None):
+                if temperature_C is not None:
+                    raise ValueError("takes no temperature")
+                return super().update(voltage_V, current_A, dt_s)
+
+        record = load_nasa_discharges("B0005")[0].until(400.0)
+        with pytest.raises(ValueError, match="takes no temperature"):
+            Isothermal().trace([record])
+        assert Isothermal().estimate(replace(record, temperature_C=None)).r_o > 0.0
+
     def test_kelvin_is_refused_and_a_policy_takes_none(self):
         with pytest.raises(ValueError, match=r"temperature_C must lie within .* not in kelvin"):
             ExtendedKalmanFilter().update(4.19, 2.0, 0.0, 293.0)
