@@ -273,7 +273,7 @@ class OnlineBatch:
     def __init__(self, estimator: OnlineEstimator, cells: int) -> None:
         if check_whole_number("cells", cells) < 1:
             raise ValueError(f"cells must be at least 1, got {cells!r}")
-        self.estimators = [copy(estimator) for _ in range(cells)]
+        self.estimators: Sequence[OnlineEstimator] = [copy(estimator) for _ in range(cells)]
         self.reset()
 
     def reset(self, cells: Iterable[int] | None = None) -> None:
@@ -287,7 +287,7 @@ class OnlineBatch:
 
     def update(
         self, voltage_V: ArrayLike, current_A: ArrayLike, dt_s: ArrayLike, temperature_C: ArrayLike | None = None
-    ) -> list[Estimate]:
+    ) -> Sequence[Estimate]:
         """
         Take in one sample of each cell: of all, or of none if one is refused.
 

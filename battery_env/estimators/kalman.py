@@ -14,7 +14,7 @@ from battery_env.checks import check_gain_sd
 from battery_env.electrochemistry import STATE_SIZE, CellParameters, check_cell, check_dt, initial_state, voltage
 from battery_env.electrochemistry.tangents import PolynomialDerivatives
 from battery_env.estimates import Estimate, EstimateTrace
-from battery_env.estimators.base import ModelNow, OnlineEstimator, check_bounds
+from battery_env.estimators.base import ModelNow, OnlineBatch, OnlineEstimator, check_bounds
 from battery_env.estimators.kalman_bank import Bank, Settings, follow
 from battery_env.estimators.monitor import Limits, Monitor, watch
 from battery_env.estimators.rest import (
@@ -34,13 +34,13 @@ _PRIOR_SD_SHARE_Q = 0.25
 _PRIOR_SD_R_OHM = 0.15
 _HOUR_S = 3600.0
 _NOISE_V = 0.005
-_ZERO_CELSIUS_K = 273.15
+ZERO_CELSIUS_K = 273.15
 # A full cell takes no more charge than this share of its own.
 _SURPLUS_SHARE = 0.01
-# What the filter remembers of a discharge beside its bank: how many samples, how long (s), the charge drawn (C), whether a
+#: What the filter remembers of a discharge beside its bank: how many samples, how long (s), the charge drawn (C), whether a
 # load was on, how long the cell rested before it (s), both means of its voltage then (V); the state of charge at the first
 # sample, its standard deviation; and the temperature of the surroundings (K).
-_SAMPLES, _TIME, _DRAWN, _LOADED, _REST, _FAST_V, _SLOW_V, _SOC, _SD_SOC, _AMBIENT = range(10)
+SAMPLES, TIME, DRAWN, _LOADED, _REST, _FAST_V, _SLOW_V, _SOC, _SD_SOC, _AMBIENT = range(10)
 
 
 class ExtendedKalmanFilter(OnlineEstimator):
@@ -214,7 +214,6 @@ class ExtendedKalmanFilter(OnlineEstimator):
         """The filters at the start, as far as it is known, and what their samples are compared with."""
         soc, sd_soc = float(self._numbers[_SOC]), float(self._numbers[_SD_SOC])
         self._bank = Bank.of(self._means, self._sds, self._settings, self._model_cell, soc)
-        self._last = np.array([*self._means, *self._sds[:2], 1.0, 0.0])
         self._set_limits(soc, sd_soc)
 
     def _set_limits(self, soc: float, sd_soc: float) -> None:
@@ -241,9 +240,9 @@ class ExtendedKalmanFilter(OnlineEstimator):
         :param temperature_C: likewise
         :raises ValueError: as :meth:`update`
         """
-        is_first, before_A = not self._numbers[_SAMPLES], self._bank.current_A
+        is_first, before_A = not self._numbers[SAMPLES], self._bank.current_A
         check_sample(voltage_V, current_A, None if is_first else dt_s, temperature_C, np.inf if is_first else before_A)
-        self._check_drawn(self._numbers[_DRAWN] + (0.0 if is_first else dt_s * before_A))
+        self._check_drawn(self._numbers[DRAWN] + (0.0 if is_first else dt_s * before_A))
 
     def update(self, voltage_V: float, current_A: float, dt_s: float, temperature_C: float | None = None) -> Estimate:
         """
@@ -259,9 +258,9 @@ class ExtendedKalmanFilter(OnlineEstimator):
             a full cell; the filter stays as it was
         """
         self.check(voltage_V, current_A, dt_s, temperature_C)
-        since_s = dt_s if self._numbers[_SAMPLES] else 0.0
-        temperature_K = np.nan if temperature_C is None else temperature_C + _ZERO_CELSIUS_K
-        if not self._numbers[_SAMPLES] and temperature_C is not None:
+        since_s = dt_s if self._numbers[SAMPLES] else 0.0
+        temperature_K = np.nan if temperature_C is None else temperature_C + ZERO_CELSIUS_K
+        if not self._numbers[SAMPLES] and temperature_C is not None:
             self._surround(temperature_K)
         if self.told_from_rest and not self._numbers[_LOADED]:
             self._rest(voltage_V, current_A, since_s)
@@ -290,7 +289,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
         if np.isnan(voltage_V):
             return
         means_V = numbers[_FAST_V : _SLOW_V + 1]
-        if not numbers[_SAMPLES]:
+        if not numbers[SAMPLES]:
             means_V[:] = voltage_V
         follow_rest(means_V, voltage_V, since_s)
         numbers[_REST] += since_s
@@ -307,7 +306,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
         """
         if self.told_from_rest:
             measured_C = getattr(record, "temperature_C", None)
-            cell = self.cell if measured_C is None else self.cell.replace(Tb0=float(measured_C[0]) + _ZERO_CELSIUS_K)
+            cell = self.cell if measured_C is None else self.cell.replace(Tb0=float(measured_C[0]) + ZERO_CELSIUS_K)
             return told_at_rest(record, cell, self._rest_sd_V, self.dt_s)
         return Start(*self.initial_soc)
 
@@ -328,7 +327,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
             self.reset()
             temperature_K = np.full(len(time_s), np.nan)
             if temperature_C is not None:
-                temperature_K = temperature_C + _ZERO_CELSIUS_K
+                temperature_K = temperature_C + ZERO_CELSIUS_K
                 self._surround(float(temperature_K[0]))
             self._check_drawn(float(np.cumsum(np.append(0.0, current_A[:-1]) * dt_s).min()))
             out, codes = self._run(np.stack([voltage_V, current_A, dt_s, temperature_K]))
@@ -341,9 +340,25 @@ class ExtendedKalmanFilter(OnlineEstimator):
         self.reset()
         return traces
 
+    @property
+    def least_drawn_C(self) -> float:
+        """The charge drawn stays above this: a cell takes no more than it has room for, C."""
+        return -(_SURPLUS_SHARE + (1.0 - float(self._numbers[_SOC]))) * self.cell.q_mobile
+
     def _check_drawn(self, charge_C: float) -> None:
-        room = _SURPLUS_SHARE + (1.0 - float(self._numbers[_SOC]))
-        check_drawn_charge(charge_C, -room * self.cell.q_mobile)
+        check_drawn_charge(charge_C, self.least_drawn_C)
+
+    def batch(self, cells: int) -> OnlineBatch:
+        """
+        Filters like this one, each for a cell of its own, which take their samples in one compiled call.
+
+        :param cells: how many
+        :return: these, before their first samples
+        :raises ValueError: for no cells
+        """
+        from battery_env.estimators.kalman_batch import KalmanBatch  # here, as it imports this module
+
+        return KalmanBatch(self, cells)
 
     def _run(self, samples: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
         """
@@ -356,14 +371,13 @@ class ExtendedKalmanFilter(OnlineEstimator):
         numbers, count = self._numbers, samples.shape[1]
         out, codes = np.empty((count, 6)), np.empty(count, dtype=np.int64)
         before_A = np.append(self._bank.current_A, current_A[:-1])
-        drawn_C = numbers[_DRAWN] + np.cumsum(before_A * dt_s)
+        drawn_C = numbers[DRAWN] + np.cumsum(before_A * dt_s)
         settings, packed = self._settings, self._model_cell.packed
         follow(self._bank, voltage_V, current_A, dt_s, temperature_K, settings, packed, self._derivatives, out)
         watch(self._monitor, voltage_V, current_A, dt_s, drawn_C, self._limits, out, codes)
-        numbers[_SAMPLES] += count
-        numbers[_TIME] += dt_s.sum()
-        numbers[_DRAWN] = drawn_C[-1]
-        self._last = out[-1].copy()
+        numbers[SAMPLES] += count
+        numbers[TIME] += dt_s.sum()
+        numbers[DRAWN] = drawn_C[-1]
         return out, codes
 
     def _texts(self) -> list[str]:
@@ -405,10 +419,10 @@ class ExtendedKalmanFilter(OnlineEstimator):
     def _arrays(self) -> dict[str, NDArray[Any]]:
         arrays = {f"bank/{name}": array for name, array in self._bank._asdict().items()}
         arrays |= {f"monitor/{name}": array for name, array in self._monitor._asdict().items()}
-        return {**arrays, "numbers": self._numbers, "last": self._last}
+        return {**arrays, "numbers": self._numbers}
 
     def _restore(self, arrays: dict[str, NDArray[Any]]) -> None:
-        self._numbers, self._last = arrays["numbers"].copy(), arrays["last"].copy()
+        self._numbers = arrays["numbers"].copy()
         self._model_cell = self.cell.replace(Tb0=float(self._numbers[_AMBIENT]))
         self._bank = Bank(*(arrays[f"bank/{name}"].copy() for name in Bank._fields))
         self._monitor = Monitor(*(arrays[f"monitor/{name}"].copy() for name in Monitor._fields))
