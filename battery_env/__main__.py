@@ -25,6 +25,7 @@ import numpy as np
 
 from battery_env.cells import Discharge
 from battery_env.estimators.cell_fit import fit_cell, read_cell
+from battery_env.estimators.rest import InitialSoc
 from battery_env.files import check_folder
 from battery_env.fleet import Reading, Results, calibrate_all, find_sources, read_source
 from battery_env.parameters import PARAMETER_NAMES
@@ -44,7 +45,7 @@ def _parser(name: str) -> argparse.ArgumentParser:
         prog=name,
         description=(
             "Fit the charge that can move, q_mobile, and the ohmic resistance, r_o, of the model to discharges that each "
-            "start with a full cell, and predict when the cut-off voltage is reached."
+            "start with a full cell, or with --initial-soc, and predict when the cut-off voltage is reached."
         ),
         epilog="Exit status: 0 if every discharge is settled, 3 if one is not, 2 if one cannot be used.",
         allow_abbrev=False,
@@ -145,6 +146,14 @@ def _add_calibration(group: argparse._ArgumentGroup) -> None:
         help="q_mobile as known from an earlier discharge, C; while a discharge is in progress the estimate rests on it",
     )
     group.add_argument(
+        "--initial-soc",
+        type=_initial_soc,
+        default=1.0,
+        metavar="SOC",
+        help="state of charge when the load is switched on, after a rest: 0.8; with its standard deviation 0.8,0.02; or rest: "
+        "told from the voltage of a minute or more at rest before the load (default: 1, a full cell)",
+    )
+    group.add_argument(
         "--mismatch",
         type=float,
         metavar="V",
@@ -220,6 +229,18 @@ def _assignments(text: str) -> dict[str, str]:
     return {name.strip(): value.strip() for name, _, value in pairs}
 
 
+def _initial_soc(text: str) -> InitialSoc:
+    if text == "rest":
+        return "rest"
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (1, 2):
+        raise argparse.ArgumentTypeError(f"expected SOC, SOC,SD or rest, got {text!r}")
+    return numbers[0] if len(numbers) == 1 else (numbers[0], numbers[1])
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """
     Run one command.
@@ -285,6 +306,7 @@ def _settings(options: argparse.Namespace) -> Settings:
         "mismatch_V": options.mismatch,
         "current_gain_sd": options.current_gain_sd,
         "future_current_A": options.future_current,
+        "initial_soc": options.initial_soc,
         "thermal": False if options.isothermal else None,
         "ambient_C": options.ambient,
         "nominal_Ah": options.nominal,

@@ -46,9 +46,10 @@ class Discharge:
     :param time_s: times of the samples, strictly increasing, s, shape (T,)
     :param voltage_V: terminal voltage, V, shape (T,)
     :param current_A: current, positive in discharge, A, shape (T,)
-    :param temperature_C: temperature of the cell, degC, shape (T,); ``None`` if it was not measured. Calibrators do not
-        read it: their model makes its own, from the surroundings ``Tb0`` of its cell. The command line takes the first one
-        for these
+    :param temperature_C: temperature of the cell, degC, shape (T,); ``None`` if it was not measured. The model of
+        ``ExtendedKalmanFilter`` follows it. ``LeastSquares`` does not read it: its model makes its own, from the surroundings
+        ``Tb0`` of its cell, for which the command line takes the first one. Nor does ``PolicyEstimator``, whose model is
+        isothermal
     :param meta: what else is known, e.g. ``cell``, ``cycle``, ``capacity_Ah``, ``start_time``, ``source``
     :raises ValueError: for arrays that do not fit together, or values that cannot be meant; it says what to do
     """

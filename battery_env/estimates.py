@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import overload
 
 import numpy as np
 
@@ -30,6 +31,71 @@ class Estimate:
     sd_r_o: float = float("nan")
     settled: bool = True
     reason: str = ""
+
+
+_COLUMNS = ("q_mobile", "r_o", "sd_q_mobile", "sd_r_o", "settled")
+
+
+class Estimates(Sequence[Estimate]):
+    """
+    What was estimated of many cells at once: a sequence of estimates, and arrays of shape (cells,).
+
+    :ivar q_mobile: C
+    :ivar r_o: ohm
+    :ivar sd_q_mobile: standard deviations, C
+    :ivar sd_r_o: likewise, ohm
+    :ivar settled: whether each is settled
+    :param q_mobile: as above
+    :param r_o: likewise
+    :param sd_q_mobile: likewise
+    :param sd_r_o: likewise
+    :param settled: likewise
+    :param reason: of a cell by its number, why its estimate is not settled
+    """
+
+    def __init__(
+        self,
+        q_mobile: FloatArray,
+        r_o: FloatArray,
+        sd_q_mobile: FloatArray,
+        sd_r_o: FloatArray,
+        settled: BoolArray,
+        reason: Callable[[int], str],
+    ) -> None:
+        self.q_mobile, self.r_o, self.sd_q_mobile, self.sd_r_o, self.settled = q_mobile, r_o, sd_q_mobile, sd_r_o, settled
+        self._reason = reason
+
+    @classmethod
+    def of(cls, estimates: Sequence[Estimate]) -> Estimates:
+        """
+        Single ones together.
+
+        :param estimates: one a cell
+        :return: the same
+        """
+        columns = {name: np.array([getattr(each, name) for each in estimates]) for name in _COLUMNS}
+        return cls(**columns, reason=lambda n: estimates[n].reason)
+
+    def __len__(self) -> int:
+        return len(self.q_mobile)
+
+    @overload
+    def __getitem__(self, index: int) -> Estimate: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[Estimate]: ...
+
+    def __getitem__(self, index: int | slice) -> Estimate | list[Estimate]:
+        if isinstance(index, slice):
+            return [self[n] for n in range(*index.indices(len(self)))]
+        n = range(len(self))[index]
+        q_mobile, r_o, sd_q_mobile, sd_r_o = (float(getattr(self, name)[n]) for name in _COLUMNS[:4])
+        return Estimate(q_mobile, r_o, sd_q_mobile, sd_r_o, bool(self.settled[n]), self._reason(n))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Sequence) and list(self) == list(other)
+
+    __hash__ = None  # type: ignore[assignment]
 
 
 @dataclass(frozen=True)
@@ -63,8 +129,7 @@ class EstimateTrace:
         :param estimates: as many
         :return: the trace
         """
-        names = ("q_mobile", "r_o", "sd_q_mobile", "sd_r_o", "settled")
-        columns = {name: np.array([getattr(estimate, name) for estimate in estimates]) for name in names}
+        columns = {name: np.array([getattr(estimate, name) for estimate in estimates]) for name in _COLUMNS}
         return cls(np.array(time_s), **columns, reason=np.array([estimate.reason for estimate in estimates], dtype=object))
 
 

@@ -145,11 +145,13 @@ def track_life(discharges: Sequence[Discharge], cut_off_V: float, calibrator: Le
     :param cut_off_V: where they end, V
     :param calibrator: without a prior; ``None``: ``LeastSquares(thermal=True, mismatch_V=0.05)``
     :return: the cell's life so far
-    :raises ValueError: if no discharge determines ``q_mobile``, or the calibrator has a prior
+    :raises ValueError: if no discharge determines ``q_mobile``, or the calibrator has a prior or no full cell at the start
     """
     calibrator = LeastSquares(thermal=True, mismatch_V=0.05) if calibrator is None else calibrator
     if calibrator.prior_q_mobile_C is not None:
         raise ValueError("the calibrator must have no prior of q_mobile: each discharge has to speak for itself")
+    if calibrator.initial_soc != (1.0, 0.0) or calibrator.told_from_rest:
+        raise ValueError("the calibrator must take discharges to start full: the charge to the cut-off is no capacity else")
     if not len(discharges):
         raise ValueError("discharges must hold at least one discharge")
     rows = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +20,7 @@ from battery_env.electrochemistry import (
     check_cell,
     check_dt,
     initial_state,
+    rest_shares,
     simulate,
 )
 from battery_env.electrochemistry.tangents import (
@@ -83,8 +85,9 @@ class RecordModel:
     :param thermal: whether the temperature of the model moves
     :param dt_s: time step of the model, s
     :param initial: state of the model at the first sample, shape (8,). It stands for a history of the current: its charges
-        move along with ``q_mobile``. ``None``: fully charged, at rest
-    :raises ValueError: for an argument out of range
+        move along with ``q_mobile``. ``None``: at rest, with ``initial_soc``
+    :param initial_soc: state of charge at the first sample, within 0 .. 1; 1: fully charged
+    :raises ValueError: for an argument out of range, or both ``initial`` and an ``initial_soc``
     """
 
     def __init__(
@@ -93,15 +96,35 @@ class RecordModel:
         thermal: bool = False,
         dt_s: float = 1.0,
         initial: ArrayLike | None = None,
+        initial_soc: float = 1.0,
     ) -> None:
         self.cell = check_cell(cell, thermal)
         self.thermal = thermal
         self.dt_s = check_dt(dt_s, self.cell)
         reference_q_C = Q_MOBILE.limits[1]
-        self.initial = initial_state(reference_q_C, self.cell) if initial is None else np.array(initial, dtype=np.float64)
+        self._shares = rest_shares(initial_soc)
+        if initial is None:
+            self.initial = initial_state(reference_q_C, self.cell, initial_soc)
+        elif initial_soc == 1.0:
+            self.initial = np.array(initial, dtype=np.float64)
+        else:
+            raise ValueError(f"initial is a whole state: give it or initial_soc, got both, initial_soc = {initial_soc!r}")
+        self.initial_soc = float(initial_soc)
         if self.initial.shape != (STATE_SIZE,) or not np.isfinite(self.initial).all():
             raise ValueError(f"initial must hold {STATE_SIZE} finite numbers, got {initial!r}")
         self._derivatives = PolynomialDerivatives.of(self.cell.packed)
+
+    def of_cell(self, cell: CellParameters) -> RecordModel:
+        """
+        The same with other constants.
+
+        :param cell: constants of the model, at the temperature of these
+        :return: the model, with the same start
+        """
+        model = copy(self)
+        model.cell, model._derivatives = check_cell(cell, self.thermal), PolynomialDerivatives.of(cell.packed)
+        check_dt(self.dt_s, cell)
+        return model
 
     def grid(self, record: Record) -> tuple[FloatArray, FloatArray]:
         """
@@ -118,14 +141,14 @@ class RecordModel:
 
     def start(self, q_mobile: float | FloatArray) -> FloatArray:
         """
-        The state at the first sample of a cell with the history that ``initial`` stands for.
+        The state at the first sample of a cell with the history that ``initial`` stands for, or at rest with ``initial_soc``.
 
         :param q_mobile: charge that can move, C, shape (...)
         :return: shape (..., 8)
         """
         missing_C = np.asarray(q_mobile - _Q_PER_CHARGE * self.initial[QNB:].sum())
         start = np.broadcast_to(self.initial, (*missing_C.shape, STATE_SIZE)).copy()
-        start[..., QNB:] += missing_C[..., None] * FULL_CHARGE_SHARES
+        start[..., QNB:] += missing_C[..., None] * self._shares
         return start
 
     def simulate(self, current_A: FloatArray, q_mobile: float, r_o: float) -> Trajectory:
@@ -276,7 +299,7 @@ class RecordModel:
             self.cell.packed,
             self._derivatives,
             self.start(q_mobile),
-            FULL_CHARGE_SHARES,
+            self._shares,
             voltage_V,
             by_parameter,
             fraction_p,
@@ -301,7 +324,7 @@ class RecordModel:
         """
         q_C = Q_MOBILE.limits[1]
         constants = self.cell.packed.constants
-        least_C, by_t_C = least_q_mobile(current_A, q_C, self.dt_s, constants, self.start(q_C), FULL_CHARGE_SHARES)
+        least_C, by_t_C = least_q_mobile(current_A, q_C, self.dt_s, constants, self.start(q_C), self._shares)
         return float(least_C), float(by_t_C)
 
 

@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from battery_env.arrays import FloatArray
+from battery_env.arrays import BoolArray, FloatArray
 from battery_env.checks import LOAD_LIMITS
 
 #: A change of the current between two samples by more than this share of its largest magnitude is a switch of the load,
@@ -193,6 +193,34 @@ def check_sample(
         )
 
 
+def are_plausible(
+    voltage_V: FloatArray,
+    current_A: FloatArray,
+    dt_s: FloatArray,
+    temperature_C: FloatArray | None,
+    previous_A: FloatArray,
+) -> BoolArray:
+    """
+    Which samples of many streams, none of them the first, :func:`check_sample` takes.
+
+    :param voltage_V: V, shape (n,)
+    :param current_A: A, shape (n,)
+    :param dt_s: s, shape (n,)
+    :param temperature_C: degC, shape (n,); ``None``: not measured
+    :param previous_A: A, shape (n,)
+    :return: shape (n,)
+    """
+    low, high, _, _ = _PLAUSIBLE["voltage_V"]
+    good = np.isnan(voltage_V) | ((voltage_V >= low) & (voltage_V <= high))
+    for name, values in (("current_A", current_A), ("temperature_C", temperature_C)):
+        if values is not None:
+            low, high, _, _ = _PLAUSIBLE[name]
+            good &= (values >= low) & (values <= high)
+    low, high = SAMPLE_INTERVAL_LIMITS_S
+    longest_s = np.where(np.abs(previous_A) <= REST_CURRENT_A, REST_LIMIT_S, high)
+    return np.asarray(good & (dt_s >= low) & (dt_s <= longest_s))
+
+
 def check_drawn_charge(charge_C: float, least_C: float = 0.0) -> None:
     """
     Refuse a current of the wrong sign.
@@ -263,12 +291,14 @@ class Stream(NamedTuple):
     :param voltage_V: V
     :param current_A: mean current from each sample to the next, A
     :param dt_s: time since the previous sample, s; 0 for the first one
+    :param temperature_C: of the cell, degC; ``None``: not measured
     """
 
     time_s: FloatArray
     voltage_V: FloatArray
     current_A: FloatArray
     dt_s: FloatArray
+    temperature_C: FloatArray | None = None
 
     @classmethod
     def of(cls, record: Record, dt_s: float) -> Stream:
@@ -286,7 +316,10 @@ class Stream(NamedTuple):
         if not np.allclose(step_s, dt_s, rtol=1e-6, atol=0.0):
             mean_A = np.diff(drawn(time_s, current_A, time_s)) / step_s
             current_A = np.append(mean_A, current_A[-1])
-        return cls(time_s, voltage_V, current_A, np.append(0.0, step_s))
+        temperature_C = getattr(record, "temperature_C", None)
+        if temperature_C is not None:
+            temperature_C = check_column("temperature_C", temperature_C, len(time_s))
+        return cls(time_s, voltage_V, current_A, np.append(0.0, step_s), temperature_C)
 
     def samples(self) -> zip[tuple[float, float, float]]:
         """

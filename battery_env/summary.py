@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -14,10 +14,10 @@ from battery_env.checks import check_positive
 from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.electrochemistry.cell import TB
 from battery_env.estimates import Estimate
-from battery_env.estimators.base import Estimator
 from battery_env.estimators.cell_fit import UNFITTED_MISMATCH_V, CellFit
 from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
+from battery_env.estimators.rest import InitialSoc, Start
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.record_model import RecordModel, VoltageForecast
 from battery_env.records import ExpectedCurrent, expected_current
@@ -56,6 +56,8 @@ class Settings:
         own ``q_mobile`` and ``r_o``, gives from full at the current of the discharge, or not known if there is no ``cell``
     :param cell: constants of the model; ``None``: those of a new 18650
     :param q_mobile_bounds_C: where to search for ``q_mobile``, C; ``None``: where the calibrator does by default
+    :param initial_soc: state of charge when the load is switched on, after a rest: a number, (mean, standard deviation), or
+        ``"rest"``: told from the voltage of the rest before the load, of a minute at least
     :raises ValueError: for an argument out of range
     """
 
@@ -71,6 +73,7 @@ class Settings:
     nominal_Ah: float | None = None
     cell: CellParameters | None = None
     q_mobile_bounds_C: tuple[float, float] | None = None
+    initial_soc: InitialSoc = 1.0
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
@@ -107,11 +110,12 @@ class Settings:
             cell = cell.cell
         return cls(**{"cell": cell, **others})
 
-    def calibrator(self, cell: CellParameters) -> Estimator:
+    def calibrator(self, cell: CellParameters, start: Start | None = None) -> LeastSquares | ExtendedKalmanFilter:
         """
         The calibrator that is asked for.
 
         :param cell: constants of the model
+        :param start: what is known of the charge at the start; ``None``: as ``initial_soc`` has it
         :return: a new one
         :raises ValueError: for an argument out of range
         """
@@ -124,6 +128,7 @@ class Settings:
             prior_q_mobile_C=self.prior_q_mobile_C,
             mismatch_V=self.mismatch_V,
             current_gain_sd=self.current_gain_sd,
+            initial_soc=self.initial_soc if start is None else (start.soc, start.sd_soc),
             **bounds,
         )
 
@@ -147,17 +152,14 @@ def summarize(discharge: Discharge, settings: Settings) -> Summary:
     Calibrate the model to one discharge. Its surroundings, and its temperature at the start, are those measured at load-on; a
     model that departs far from the temperatures measured later is warned of.
 
-    :param discharge: of a cell that is full at its start
+    :param discharge: of a cell that starts full, or with the ``initial_soc`` of the settings
     :param settings: how to look at it
     :return: what it says
     :raises ValueError: if the record cannot be used
     """
     record = discharge.loaded_part(settings.cut_off_V)
-    capacity_Ah = float("nan")
     measured_eod_s = discharge.eod_time_s(settings.cut_off_V)
     drawn_Ah = record.charge_C / 3600.0
-    if not np.isnan(measured_eod_s):
-        capacity_Ah = drawn_Ah
     samples, averaged_over_s = len(record.time_s), 0.0
     if samples > _MANY_SAMPLES:
         averaged_over_s = max(_MODEL_STEP_S, float(record.time_s[-1] - record.time_s[0]) / _MANY_SAMPLES)
@@ -167,8 +169,17 @@ def summarize(discharge: Discharge, settings: Settings) -> Summary:
     cell = settings.cell or NEW_CELL
     if ambient_C is not None:
         cell = cell.replace(Tb0=ambient_C + _ZERO_CELSIUS_K)
-    estimate = settings.calibrator(cell).estimate(record)
-    model = RecordModel(cell, settings.thermal)
+    seen = record
+    if settings.ambient_C is not None or not settings.thermal:
+        # a temperature that is stated, or held, counts more than one that was measured
+        discharge, seen = replace(discharge, temperature_C=None), replace(record, temperature_C=None)
+    start = settings.calibrator(cell).start_of(discharge)
+    estimate = settings.calibrator(cell, start).estimate(seen)
+    if start.reason:
+        estimate = replace(estimate, settled=False, reason=start.reason)
+    # what a full cell would have given more, as its end comes at the same charge
+    missing_Ah = (1.0 - start.soc) * estimate.q_mobile / 3600.0
+    model = RecordModel(cell, settings.thermal, initial_soc=start.soc)
     future = expected_current(record.time_s, record.current_A)
     if settings.future_current_A is not None:
         future = ExpectedCurrent(settings.future_current_A, varied=False, sd_A=0.0)
@@ -176,7 +187,7 @@ def summarize(discharge: Discharge, settings: Settings) -> Summary:
     in_progress = np.isnan(measured_eod_s)
     remaining_s = max(forecast.eod_time_s - float(record.time_s[-1]), 0.0) if in_progress else 0.0
     nominal_Ah = _nominal_Ah(model, settings, future.mean_A)
-    whole_Ah = drawn_Ah + remaining_s * future.mean_A / 3600.0 if in_progress else capacity_Ah
+    whole_Ah = missing_Ah + drawn_Ah + remaining_s * future.mean_A / 3600.0
     residual_V = forecast.at_samples_V - record.voltage_V
     row = {
         "method": settings.method,
@@ -186,11 +197,13 @@ def summarize(discharge: Discharge, settings: Settings) -> Summary:
         "sd_r_o_ohm": estimate.sd_r_o,
         "settled": estimate.settled,
         "reason": estimate.reason,
+        "initial_soc": start.soc,
+        "sd_initial_soc": start.sd_soc,
         "samples": samples,
         "averaged_over_s": averaged_over_s,
         "load_on_time_s": float(record.time_s[0]),
         "drawn_Ah": drawn_Ah,
-        "capacity_Ah": capacity_Ah,
+        "capacity_Ah": float("nan") if in_progress or start.soc < 1.0 else drawn_Ah,
         "predicted_capacity_Ah": whole_Ah,
         "nominal_Ah": nominal_Ah,
         "state_of_health": whole_Ah / nominal_Ah,
@@ -267,16 +280,23 @@ def text_of(name: str, row: dict[str, Any], settings: Settings) -> str:
         "q_mobile": (f"{row['q_mobile_C']:.0f} C", f"{row['sd_q_mobile_C']:.0f} C"),
         "r_o": (f"{row['r_o_ohm']:.4f} ohm", f"{row['sd_r_o_ohm']:.4f} ohm"),
     }
+    drawn = "so far" if in_progress else f"the capacity to {cut_off}"
+    if row["initial_soc"] < 1.0 and not in_progress:
+        drawn = f"to {cut_off}; from full it would have been {row['predicted_capacity_Ah']:.3f} Ah"
     lines = [
         f"{name}: {row['samples']} samples{averaged} from load-on at {row['load_on_time_s']:.1f} s, "
         f"{3600.0 * row['drawn_Ah']:.0f} C drawn",
         "",
         *(f"  {key:<22}{value:>12}   {'sd ' + sd if key in fitted else 'held'}" for key, (value, sd) in values.items()),
         f"  {'settled':<22}{'yes' if row['settled'] else 'no':>12}",
-        f"  {'drawn':<22}{row['drawn_Ah']:>9.3f} Ah   {'so far' if in_progress else f'the capacity to {cut_off}'}",
+        f"  {'drawn':<22}{row['drawn_Ah']:>9.3f} Ah   {drawn}",
     ]
+    if row["initial_soc"] < 1.0 or row["sd_initial_soc"]:
+        charge = f"{100.0 * row['initial_soc']:>10.1f} %   sd {100.0 * row['sd_initial_soc']:.1f} %"
+        lines.insert(2, f"  {'charge at the start':<22}{charge}")
     if not np.isnan(row["state_of_health"]):
-        of = f"{row['predicted_capacity_Ah']:.3f} Ah, {'predicted' if in_progress else 'drawn'}, of {row['nominal_Ah']:.4g} Ah"
+        how = "predicted" if in_progress or row["initial_soc"] < 1.0 else "drawn"
+        of = f"{row['predicted_capacity_Ah']:.3f} Ah, {how}, of {row['nominal_Ah']:.4g} Ah"
         if settings.nominal_Ah is None:
             of += ", what the given cell yields at this load"
         lines.append(f"  {'state of health':<22}{row['state_of_health']:>12.3f}   {of}")

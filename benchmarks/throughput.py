@@ -1,11 +1,12 @@
 """
 How many updates a second LAC makes on the CPU, beside Stable-Baselines3's SAC and TD3 at equal networks; how many steps a
-second the model makes, beside NASA's progpy; and how many the environments make, for one cell and for many.
+second the model makes, beside NASA's progpy; how many the environments make, for one cell and for many; and how long an update
+of a filter and of a policy takes, beside progpy's filters.
 
 .. code-block:: bash
 
   python -m benchmarks.throughput
-  python -m benchmarks.throughput --only model environments
+  python -m benchmarks.throughput --only model environments filters
 
 Contestants take turns in short blocks, so that whatever else the machine does hits all of them; ratios are taken within each
 round, and their median and quartiles are reported. A profile says where the time of an update goes.
@@ -14,8 +15,12 @@ round, and their median and quartiles are reported. A profile says where the tim
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
+from itertools import cycle, islice
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import gymnasium as gym
@@ -28,20 +33,27 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from torch import nn
 from tqdm import trange
 
+from battery_env import ExtendedKalmanFilter, OnnxPolicy, PolicyEstimator
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate, step_into, voltage_into
+from battery_env.estimators.base import OnlineBatch, OnlineEstimator
+from battery_env.records import Stream
 from benchmarks.study import Study, command_line, markdown, positive
 from sb3_lac import LAC
 
 _ALGORITHMS: dict[str, type[LAC] | type[SAC] | type[TD3]] = {"LAC": LAC, "SAC": SAC, "TD3": TD3}
 _TRANSITIONS = 5_000
+_POLICY_ENV = "BatteryVoltageJoint-v0"
 _WARM_UP_UPDATES = 10
 
-SECTIONS = ("updates", "model", "environments")
+SECTIONS = ("updates", "model", "environments", "filters")
 # of one turn
 _SIMULATED_STEPS = 1500
 _SIMULATIONS = 20
 _BATCHED_STEPS = 100
 _ENV_STEPS = 512
+# samples, 1 s apart, of a turn of those that take microseconds and milliseconds each, and of a batch of so many cells
+_SAMPLES, _PROGPY_SAMPLES, _PARTICLES_SAMPLES, _BATCH_SAMPLES = 600, 20, 4, 3
+_FILTERED_CELLS = 10_000
 # and how often all cells of each decide in one turn: whole episodes
 _ENVIRONMENTS = {"BatteryQmax-v0": 128, "BatteryVoltageJoint-v0": 8}
 
@@ -234,6 +246,80 @@ def environment_contestants(cells: int) -> dict[str, Callable[[], int]]:
     return contestants
 
 
+def filter_contestants(cells: int, folder: Path) -> dict[str, Callable[[], int]]:
+    """
+    Calibrators that follow a stream of one sample a second, here and in progpy: both parameters unknown here, and ``q_mobile``
+    alone in progpy. A policy decides once a minute, on all readings so far; the networks are untrained, which takes as long.
+
+    :param cells: of the batches, which go on along one discharge from turn to turn
+    :param folder: where the policy is written as an ONNX file
+    :return: by name, what makes a turn of updates and returns how many
+    """
+    from benchmarks.progpy_filters import ProgpyFilter  # heavy, and needed here only
+    from sb3_lac.onnx import export_onnx
+
+    whole = simulate(2.0, 6000.0, 0.15, load_unit="current", thermal=True)
+    record = replace(whole, voltage_V=whole.voltage_V + np.random.default_rng(0).normal(0.0, 0.005, len(whole.time_s)))
+    samples = list(Stream.of(record.part(0, _SAMPLES), 1.0).samples())
+    model = LAC("MlpPolicy", _POLICY_ENV, buffer_size=1, policy_kwargs={"net_arch": [256, 256, 256]}, device="cpu", seed=0)
+
+    def stream(estimator: OnlineEstimator) -> int:
+        estimator.reset()
+        for sample in samples:
+            estimator.update(*sample)
+        return len(samples)
+
+    def peer(kind: Any, count: int) -> int:
+        ProgpyFilter("q_mobile", kind, 0.25 * NEW_CELL.q_mobile, 0.005).trace([record.part(0, count + 1)])
+        return count
+
+    def batch(filters: OnlineBatch, at: Iterator[int]) -> int:
+        for n in islice(at, _BATCH_SAMPLES):
+            filters.update(record.voltage_V[n], 2.0, 1.0)
+        return _BATCH_SAMPLES * cells
+
+    carried = (6050.0, 60.0)
+    contestants: dict[str, Callable[[], int]] = {
+        "ExtendedKalmanFilter": partial(stream, ExtendedKalmanFilter(thermal=True)),
+        "ExtendedKalmanFilter, prior of an earlier discharge": partial(
+            stream, ExtendedKalmanFilter(thermal=True, prior_q_mobile_C=carried)
+        ),
+        "PolicyEstimator": partial(stream, PolicyEstimator(model, _POLICY_ENV)),
+        "PolicyEstimator, ONNX": partial(
+            stream, PolicyEstimator(OnnxPolicy(export_onnx(model, folder / "p.onnx")), _POLICY_ENV)
+        ),
+        "progpy, unscented Kalman filter": partial(peer, "ukf", _PROGPY_SAMPLES),
+        "progpy, 100 particles": partial(peer, "particles", _PARTICLES_SAMPLES),
+    }
+    for name, prior in (("", None), (", prior of an earlier discharge", carried)):
+        filters, at = ExtendedKalmanFilter(thermal=True, prior_q_mobile_C=prior).batch(cells), cycle(range(1, _SAMPLES))
+        filters.update(record.voltage_V[0], 2.0, 1.0)
+        contestants[f"batch of {cells} cells{name}"] = partial(batch, filters, at)
+    return contestants
+
+
+def report_filters(speeds: pd.DataFrame) -> str:
+    """
+    What was measured of filters, as Markdown.
+
+    :param speeds: updates a second, see ``race()``
+    :return: a table
+    """
+    rows = []
+    for name, values in speeds.items():
+        ratio = speeds["progpy, unscented Kalman filter"].rdiv(values)
+        rows.append(
+            {
+                "": name,
+                "microseconds of one core for an update, median (quartiles)": spread(1e6 / values, 1),
+                "faster than progpy's unscented Kalman filter by a factor of": spread(
+                    ratio, 0 if ratio.median() > 10.0 else 2
+                ),
+            }
+        )
+    return markdown(rows)
+
+
 def spread(values: pd.Series, digits: int) -> str:
     """
     What was measured in many rounds, as readers see it.
@@ -302,6 +388,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--cells", type=positive, default=1024, help="cells of a batch of the model and of a vector environment"
     )
+    parser.add_argument("--filtered-cells", type=positive, default=_FILTERED_CELLS, help="cells of a batch of filters")
     parser.add_argument("--threads", type=positive, default=1, help="threads of torch")
     study = Study(parser, arguments)
     chosen = study.chosen
@@ -313,6 +400,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         parts = pd.DataFrame({name: profile(model, chosen.updates, chosen.batch_size) for name, model in models.items()}).T
         tables = {"updates": speeds, "updates_profile": parts.rename_axis("algorithm").reset_index()}
         study.write(tables, {}, report(speeds, parts), "updates")
+    if "filters" in chosen.only:
+        with TemporaryDirectory() as folder:
+            speeds = race(filter_contestants(chosen.filtered_cells, Path(folder)), chosen.rounds, time.process_time)
+        study.write({"filters": speeds}, {}, report_filters(speeds), "filters")
     for section, contestants in (("model", model_contestants), ("environments", environment_contestants)):
         if section in chosen.only:
             # they run on one core each: its time, other processes not counted

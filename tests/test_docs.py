@@ -11,6 +11,8 @@ from battery_env.__main__ import calibrate, main
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "docs/environments").glob("*.md"))]
+# What an example needs that no installation for the tests has: it is skipped there.
+OPTIONAL = {"compare_with_pybop.py": ("pybop",)}
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 
 
@@ -32,6 +34,8 @@ def test_examples_in_pages_run(page, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda example: example.name)
 def test_example_files_run(example, tmp_path, monkeypatch):
+    for package in OPTIONAL.get(example.name, ()):
+        pytest.importorskip(package)
     run_briefly(example.read_text(encoding="utf-8"), str(example), tmp_path, monkeypatch)
 
 

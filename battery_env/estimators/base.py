@@ -242,7 +242,7 @@ class OnlineEstimator(Estimator):
 
     def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:
         """
-        One estimate for every sample of many discharges.
+        One estimate for every sample of many discharges. A temperature that was measured is taken in with each sample.
 
         :param records: discharges
         :return: one trace per discharge, in the same order
@@ -252,7 +252,10 @@ class OnlineEstimator(Estimator):
         for record in records:
             stream = Stream.of(record, self.dt_s)
             self.reset()
-            traces.append(EstimateTrace.of(stream.time_s, [self.update(*sample) for sample in stream.samples()]))
+            measured: Iterable[tuple[float, ...]] = stream.samples()
+            if stream.temperature_C is not None:
+                measured = ((*sample, t_C) for sample, t_C in zip(measured, stream.temperature_C.tolist(), strict=True))
+            traces.append(EstimateTrace.of(stream.time_s, [self.update(*sample) for sample in measured]))
         self.reset()
         return traces
 
@@ -270,7 +273,7 @@ class OnlineBatch:
     def __init__(self, estimator: OnlineEstimator, cells: int) -> None:
         if check_whole_number("cells", cells) < 1:
             raise ValueError(f"cells must be at least 1, got {cells!r}")
-        self.estimators = [copy(estimator) for _ in range(cells)]
+        self.estimators: Sequence[OnlineEstimator] = [copy(estimator) for _ in range(cells)]
         self.reset()
 
     def reset(self, cells: Iterable[int] | None = None) -> None:
@@ -284,7 +287,7 @@ class OnlineBatch:
 
     def update(
         self, voltage_V: ArrayLike, current_A: ArrayLike, dt_s: ArrayLike, temperature_C: ArrayLike | None = None
-    ) -> list[Estimate]:
+    ) -> Sequence[Estimate]:
         """
         Take in one sample of each cell: of all, or of none if one is refused.
 

@@ -21,6 +21,7 @@ from battery_env.checks import check_numbers, check_positive
 from battery_env.electrochemistry import NEW_CELL, CellParameters, check_cell, check_dt
 from battery_env.electrochemistry.tangents import BY_Q, BY_R, RATE_CONSTANTS
 from battery_env.estimators.least_squares import LeastSquares
+from battery_env.estimators.settling import FULL_REST_V
 from battery_env.files import WrongFormatError, read_json, write_json
 from battery_env.parameters import Q_MOBILE, R_O
 from battery_env.record_model import RecordModel
@@ -330,6 +331,7 @@ def fit_cell(
     check_dt(dt_s, prior)
     # a simulated record is at rest before its first current acts
     at_rest = [not isinstance(whole, Discharge) or _starts_at_rest(whole) for whole in discharges]
+    _check_starts_alike(records, at_rest)
     problem = _JointFit(records, at_rest, prior, thermal, dt_s)
     fit = problem.result(*problem.solve())
     if not fit.rmse_V <= limit_V:
@@ -361,6 +363,17 @@ def _records(discharges: Sequence[Record], cut_off_V: float) -> list[Record]:
             raise type(error)(f"discharge {number} of {len(discharges)}: {error}") from error
         records.append(record)
     return records
+
+
+def _check_starts_alike(records: Sequence[Record], at_rest: Sequence[bool]) -> None:
+    """A full cell, of whatever kind, always rests at about the same voltage."""
+    rests = [(float(each.voltage_V[0]), n) for n, (each, rested) in enumerate(zip(records, at_rest, strict=True), 1) if rested]
+    (low_V, low), (high_V, high) = min(rests, default=(0.0, 0)), max(rests, default=(0.0, 0))
+    if high_V - low_V > sum(FULL_REST_V):
+        raise ValueError(
+            f"discharge {low} of {len(records)} starts at rest at {low_V:.2f} V, discharge {high} at {high_V:.2f} V: they "
+            "cannot both be of a full cell. Leave out those that do not start full."
+        )
 
 
 def _starts_at_rest(discharge: Discharge) -> bool:

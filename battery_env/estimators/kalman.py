@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +14,18 @@ from battery_env.checks import check_gain_sd
 from battery_env.electrochemistry import STATE_SIZE, CellParameters, check_cell, check_dt, initial_state, voltage
 from battery_env.electrochemistry.tangents import PolynomialDerivatives
 from battery_env.estimates import Estimate, EstimateTrace
-from battery_env.estimators.base import ModelNow, OnlineEstimator, check_bounds
+from battery_env.estimators.base import ModelNow, OnlineBatch, OnlineEstimator, check_bounds
 from battery_env.estimators.kalman_bank import Bank, Settings, follow
 from battery_env.estimators.monitor import Limits, Monitor, watch
+from battery_env.estimators.rest import (
+    LEAST_REST_S,
+    InitialSoc,
+    Start,
+    check_initial_soc,
+    follow_rest,
+    soc_at_rest,
+    told_at_rest,
+)
 from battery_env.estimators.settling import MISMATCH_MARGIN, PLAUSIBLE_Q_SHARES
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, check_parameters
 from battery_env.records import REST_CURRENT_A, Record, Stream, check_drawn_charge, check_sample
@@ -25,22 +34,13 @@ _PRIOR_SD_SHARE_Q = 0.25
 _PRIOR_SD_R_OHM = 0.15
 _HOUR_S = 3600.0
 _NOISE_V = 0.005
-_ZERO_CELSIUS_K = 273.15
+ZERO_CELSIUS_K = 273.15
 # A full cell takes no more charge than this share of its own.
 _SURPLUS_SHARE = 0.01
-# The charge of a cell is told from its voltage after so long a rest, s. The voltage is averaged over about the first of these
-# times; how far that mean is from the one over the second shows how much is still to come, this many times their difference.
-_LEAST_REST_S = 60.0
-_REST_MEMORIES_S = (20.0, 60.0)
-_STILL_TO_COME = 10.0
-# States of charge to choose from, where it is told from a voltage.
-_SOC_GRID = np.linspace(0.02, 1.0, 1961)
-# The slope of that voltage is taken over so much to each side.
-_SLOPE_SPAN = 0.01
-# What the filter remembers of a discharge beside its bank: how many samples, how long (s), the charge drawn (C), whether a
+#: What the filter remembers of a discharge beside its bank: how many samples, how long (s), the charge drawn (C), whether a
 # load was on, how long the cell rested before it (s), both means of its voltage then (V); the state of charge at the first
 # sample, its standard deviation; and the temperature of the surroundings (K).
-_SAMPLES, _TIME, _DRAWN, _LOADED, _REST, _FAST_V, _SLOW_V, _SOC, _SD_SOC, _AMBIENT = range(10)
+SAMPLES, TIME, DRAWN, _LOADED, _REST, _FAST_V, _SLOW_V, _SOC, _SD_SOC, _AMBIENT = range(10)
 
 
 class ExtendedKalmanFilter(OnlineEstimator):
@@ -141,7 +141,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
         mismatch_V: float = 0.0,
         drift_per_hour: float = 0.001,
         current_gain_sd: float = 0.0,
-        initial_soc: float | tuple[float, float] | Literal["rest"] = 1.0,
+        initial_soc: InitialSoc = 1.0,
     ) -> None:
         self.parameters = check_parameters(parameters)
         self.cell = check_cell(cell, thermal)
@@ -161,8 +161,8 @@ class ExtendedKalmanFilter(OnlineEstimator):
                 "take each sample of a model that wanders for exact. Leave voltage_noise_V out to have it follow mismatch_V."
             )
         self.current_gain_sd = check_gain_sd(current_gain_sd)
-        self.initial_soc = _check_soc(initial_soc)
-        self._told_from_rest = isinstance(initial_soc, str)
+        self.initial_soc = check_initial_soc(initial_soc)
+        self.told_from_rest = isinstance(initial_soc, str)
         self._carried = {
             name: (float(prior[0]), float(prior[1]))
             for name, prior in (("q_mobile", prior_q_mobile_C), ("r_o", prior_r_o_ohm))
@@ -214,15 +214,14 @@ class ExtendedKalmanFilter(OnlineEstimator):
         """The filters at the start, as far as it is known, and what their samples are compared with."""
         soc, sd_soc = float(self._numbers[_SOC]), float(self._numbers[_SD_SOC])
         self._bank = Bank.of(self._means, self._sds, self._settings, self._model_cell, soc)
-        self._last = np.array([*self._means, *self._sds[:2], 1.0, 0.0])
         self._set_limits(soc, sd_soc)
 
     def _set_limits(self, soc: float, sd_soc: float) -> None:
         nothing = (np.nan, np.nan)
         self._limits = Limits(
             start_V=float(voltage(initial_state(cell=self._model_cell, soc=soc), cell=self._model_cell)),
-            needs_rest=self._told_from_rest,
-            rested=bool(self._numbers[_REST] >= _LEAST_REST_S),
+            needs_rest=self.told_from_rest,
+            rested=bool(self._numbers[_REST] >= LEAST_REST_S),
             searched=np.array([float(name in self.parameters) for name in PARAMETER_NAMES]),
             bounds=np.array([self.bounds[name] for name in PARAMETER_NAMES]),
             prior=np.array([self._carried.get(name, nothing) for name in PARAMETER_NAMES]),
@@ -241,9 +240,9 @@ class ExtendedKalmanFilter(OnlineEstimator):
         :param temperature_C: likewise
         :raises ValueError: as :meth:`update`
         """
-        is_first, before_A = not self._numbers[_SAMPLES], self._bank.current_A
+        is_first, before_A = not self._numbers[SAMPLES], self._bank.current_A
         check_sample(voltage_V, current_A, None if is_first else dt_s, temperature_C, np.inf if is_first else before_A)
-        self._check_drawn(self._numbers[_DRAWN] + (0.0 if is_first else dt_s * before_A))
+        self._check_drawn(self._numbers[DRAWN] + (0.0 if is_first else dt_s * before_A))
 
     def update(self, voltage_V: float, current_A: float, dt_s: float, temperature_C: float | None = None) -> Estimate:
         """
@@ -259,11 +258,11 @@ class ExtendedKalmanFilter(OnlineEstimator):
             a full cell; the filter stays as it was
         """
         self.check(voltage_V, current_A, dt_s, temperature_C)
-        since_s = dt_s if self._numbers[_SAMPLES] else 0.0
-        temperature_K = np.nan if temperature_C is None else temperature_C + _ZERO_CELSIUS_K
-        if not self._numbers[_SAMPLES] and temperature_C is not None:
+        since_s = dt_s if self._numbers[SAMPLES] else 0.0
+        temperature_K = np.nan if temperature_C is None else temperature_C + ZERO_CELSIUS_K
+        if not self._numbers[SAMPLES] and temperature_C is not None:
             self._surround(temperature_K)
-        if self._told_from_rest and not self._numbers[_LOADED]:
+        if self.told_from_rest and not self._numbers[_LOADED]:
             self._rest(voltage_V, current_A, since_s)
         samples = np.array([[voltage_V], [current_A], [since_s], [temperature_K]], dtype=np.float64)
         out, codes = self._run(samples)
@@ -289,41 +288,49 @@ class ExtendedKalmanFilter(OnlineEstimator):
             return
         if np.isnan(voltage_V):
             return
-        if not numbers[_SAMPLES]:
-            numbers[[_FAST_V, _SLOW_V]] = voltage_V
-        for mean, memory_s in zip((_FAST_V, _SLOW_V), _REST_MEMORIES_S, strict=True):
-            numbers[mean] += -np.expm1(-since_s / memory_s) * (voltage_V - numbers[mean])
+        means_V = numbers[_FAST_V : _SLOW_V + 1]
+        if not numbers[SAMPLES]:
+            means_V[:] = voltage_V
+        follow_rest(means_V, voltage_V, since_s)
         numbers[_REST] += since_s
-        rest_V = self._rest_voltages_V()
-        soc = float(np.interp(numbers[_FAST_V], rest_V, _SOC_GRID))
-        around = np.clip([soc - _SLOPE_SPAN, soc + _SLOPE_SPAN], _SOC_GRID[0], _SOC_GRID[-1])
-        slope_V = float(np.diff(np.interp(around, _SOC_GRID, rest_V))[0] / np.diff(around)[0])
-        numbers[_SOC] = soc
-        numbers[_SD_SOC] = np.hypot(self._rest_sd_V, _STILL_TO_COME * (numbers[_FAST_V] - numbers[_SLOW_V])) / slope_V
+        numbers[_SOC], numbers[_SD_SOC] = soc_at_rest(means_V, self._rest_sd_V, self._model_cell)
         self._begin()
 
-    def _rest_voltages_V(self) -> FloatArray:
-        """The voltage of the cell at rest at each state of charge of the grid."""
-        full, empty = (initial_state(cell=self._model_cell, soc=soc) for soc in (1.0, 0.0))
-        states = empty + _SOC_GRID[:, None] * (full - empty)
-        return np.asarray(voltage(states, cell=self._model_cell))
+    def start_of(self, record: Record) -> Start:
+        """
+        The state of charge that a record starts with: the one that is stated, or what its rest tells.
+
+        :param record: one discharge
+        :return: as far as it can be told
+        :raises ValueError: if the record cannot be used
+        """
+        if self.told_from_rest:
+            measured_C = getattr(record, "temperature_C", None)
+            cell = self.cell if measured_C is None else self.cell.replace(Tb0=float(measured_C[0]) + ZERO_CELSIUS_K)
+            return told_at_rest(record, cell, self._rest_sd_V, self.dt_s)
+        return Start(*self.initial_soc)
 
     def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:
         """
-        One estimate for every sample of many discharges, in one compiled call each.
+        One estimate for every sample of many discharges, in one compiled call each. A temperature that was measured is that of
+        the model, as in a stream.
 
         :param records: discharges; a :class:`~battery_env.trajectories.TrajectoryDataset` is one
         :return: one trace per discharge, in the same order
         :raises ValueError: if a record cannot be used
         """
-        if self._told_from_rest:
+        if self.told_from_rest:
             return super().trace(records)
         traces = []
         for record in records:
-            time_s, voltage_V, current_A, dt_s = Stream.of(record, self.dt_s)
+            time_s, voltage_V, current_A, dt_s, temperature_C = Stream.of(record, self.dt_s)
             self.reset()
+            temperature_K = np.full(len(time_s), np.nan)
+            if temperature_C is not None:
+                temperature_K = temperature_C + ZERO_CELSIUS_K
+                self._surround(float(temperature_K[0]))
             self._check_drawn(float(np.cumsum(np.append(0.0, current_A[:-1]) * dt_s).min()))
-            out, codes = self._run(np.stack([voltage_V, current_A, dt_s, np.full(len(time_s), np.nan)]))
+            out, codes = self._run(np.stack([voltage_V, current_A, dt_s, temperature_K]))
             q, r_o, sd_q, sd_r_o = out[:, :4].T.copy()
             for name, sd in (("q_mobile", sd_q), ("r_o", sd_r_o)):
                 if name not in self.parameters:
@@ -333,9 +340,25 @@ class ExtendedKalmanFilter(OnlineEstimator):
         self.reset()
         return traces
 
+    @property
+    def least_drawn_C(self) -> float:
+        """The charge drawn stays above this: a cell takes no more than it has room for, C."""
+        return -(_SURPLUS_SHARE + (1.0 - float(self._numbers[_SOC]))) * self.cell.q_mobile
+
     def _check_drawn(self, charge_C: float) -> None:
-        room = _SURPLUS_SHARE + (1.0 - float(self._numbers[_SOC]))
-        check_drawn_charge(charge_C, -room * self.cell.q_mobile)
+        check_drawn_charge(charge_C, self.least_drawn_C)
+
+    def batch(self, cells: int) -> OnlineBatch:
+        """
+        Filters like this one, each for a cell of its own, which take their samples in one compiled call.
+
+        :param cells: how many
+        :return: these, before their first samples
+        :raises ValueError: for no cells
+        """
+        from battery_env.estimators.kalman_batch import KalmanBatch  # here, as it imports this module
+
+        return KalmanBatch(self, cells)
 
     def _run(self, samples: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
         """
@@ -348,14 +371,13 @@ class ExtendedKalmanFilter(OnlineEstimator):
         numbers, count = self._numbers, samples.shape[1]
         out, codes = np.empty((count, 6)), np.empty(count, dtype=np.int64)
         before_A = np.append(self._bank.current_A, current_A[:-1])
-        drawn_C = numbers[_DRAWN] + np.cumsum(before_A * dt_s)
+        drawn_C = numbers[DRAWN] + np.cumsum(before_A * dt_s)
         settings, packed = self._settings, self._model_cell.packed
         follow(self._bank, voltage_V, current_A, dt_s, temperature_K, settings, packed, self._derivatives, out)
         watch(self._monitor, voltage_V, current_A, dt_s, drawn_C, self._limits, out, codes)
-        numbers[_SAMPLES] += count
-        numbers[_TIME] += dt_s.sum()
-        numbers[_DRAWN] = drawn_C[-1]
-        self._last = out[-1].copy()
+        numbers[SAMPLES] += count
+        numbers[TIME] += dt_s.sum()
+        numbers[DRAWN] = drawn_C[-1]
         return out, codes
 
     def _texts(self) -> list[str]:
@@ -391,32 +413,17 @@ class ExtendedKalmanFilter(OnlineEstimator):
             "settings": self._settings._asdict(),
             "priors": self._carried,
             "current_gain_sd": self.current_gain_sd,
-            "initial_soc": "rest" if self._told_from_rest else list(self.initial_soc),
+            "initial_soc": "rest" if self.told_from_rest else list(self.initial_soc),
         }
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         arrays = {f"bank/{name}": array for name, array in self._bank._asdict().items()}
         arrays |= {f"monitor/{name}": array for name, array in self._monitor._asdict().items()}
-        return {**arrays, "numbers": self._numbers, "last": self._last}
+        return {**arrays, "numbers": self._numbers}
 
     def _restore(self, arrays: dict[str, NDArray[Any]]) -> None:
-        self._numbers, self._last = arrays["numbers"].copy(), arrays["last"].copy()
+        self._numbers = arrays["numbers"].copy()
         self._model_cell = self.cell.replace(Tb0=float(self._numbers[_AMBIENT]))
         self._bank = Bank(*(arrays[f"bank/{name}"].copy() for name in Bank._fields))
         self._monitor = Monitor(*(arrays[f"monitor/{name}"].copy() for name in Monitor._fields))
         self._set_limits(float(self._numbers[_SOC]), float(self._numbers[_SD_SOC]))
-
-
-def _check_soc(initial_soc: float | tuple[float, float] | str) -> tuple[float, float]:
-    """Mean and standard deviation of the state of charge at the start."""
-    if initial_soc == "rest":
-        return 1.0, 0.0
-    try:
-        mean, sd = (float(initial_soc), 0.0) if np.ndim(initial_soc) == 0 else map(float, initial_soc)  # type: ignore[arg-type]
-    except (TypeError, ValueError):
-        mean = sd = np.nan
-    if not (0.02 <= mean <= 1.0 and 0.0 <= sd < 1.0):
-        raise ValueError(
-            f"initial_soc is a state of charge within 0.02 .. 1, (mean, standard deviation), or 'rest', got {initial_soc!r}"
-        )
-    return mean, sd

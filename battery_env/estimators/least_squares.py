@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from copy import copy
 from functools import lru_cache
 from math import hypot, inf, isnan, nan, sqrt
 from typing import NamedTuple
@@ -17,6 +18,7 @@ from battery_env.electrochemistry import CellParameters
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS, TANGENT_NAMES
 from battery_env.estimates import Estimate, EstimateTrace
 from battery_env.estimators.base import Estimator, check_bounds
+from battery_env.estimators.rest import InitialSoc, Start, check_initial_soc, told_at_rest
 from battery_env.estimators.settling import (
     AT_BOUND,
     EMPTY,
@@ -27,6 +29,7 @@ from battery_env.estimators.settling import (
     PRIOR_ALONE,
     PRIOR_CONTRADICTED,
     PRIOR_LIMIT_SD,
+    SCALE_UNKNOWN,
     SETTLED_SHARES,
     first_reason,
     is_plausible,
@@ -60,6 +63,10 @@ _EXCESS_LIMIT = 5.0
 _EXCESS_LIMIT_UNSTATED = 10.0
 # Residuals below this are as good as none, V: files are rounded.
 _NEGLIGIBLE_V = 1e-3
+# The effect of the charge at the start is taken over this step.
+_SOC_STEP = 1e-3
+# Sensors are not taken to be better than this where no noise is stated, V.
+_NOISE_V = 0.005
 # Noise told from residuals is not below the resolution of a voltmeter, V.
 _LEAST_NOISE_V = 1e-4
 # The end of a record agrees with an estimate within this share of its duration.
@@ -104,8 +111,8 @@ class LeastSquares(Estimator):
     """
     The (q_mobile, r_o) whose simulated voltage is closest to the recorded one, over all samples of the record.
 
-    The model starts at the first sample of the record, fully charged and at rest unless ``initial`` says otherwise, and
-    follows the recorded current (:func:`battery_env.records.resample_current`). For a recorded discharge give
+    The model starts at the first sample of the record, fully charged and at rest unless ``initial_soc`` or ``initial`` say
+    otherwise, and follows the recorded current (:func:`battery_env.records.resample_current`). For a recorded discharge give
     :meth:`battery_env.cells.Discharge.loaded_part`, which starts when the load is switched on.
 
     *The search.* At a fixed current the charges of the model are linear in ``q_mobile``; so one simulation gives exactly the
@@ -127,8 +134,8 @@ class LeastSquares(Estimator):
     *Settled* means that the record alone determines every parameter searched for, with a standard deviation below
     :data:`~battery_env.estimators.settling.SETTLED_SHARES` of its value without any prior, and that nothing contradicts it:
 
-    - the record can start with a full cell (:func:`~battery_env.estimators.settling.start_reason`), unless ``initial`` is
-      given;
+    - the record can start with a full cell (:func:`~battery_env.estimators.settling.start_reason`), or with one of
+      ``initial_soc``, unless ``initial`` is given;
     - each parameter is inside its bounds, ``q_mobile`` is plausible for a cell of this kind, and the model lasts as long as
       the record;
     - the residuals are no larger than noise and twice ``mismatch_V`` explain. They are where the sensor has an offset, or
@@ -156,7 +163,7 @@ class LeastSquares(Estimator):
     :param thermal: whether the temperature of the model moves
     :param dt_s: time step of the model, s; that of simulated records if these are to be reproduced exactly
     :param initial: state of the model at the first sample, shape (8,), e.g. from a simulation. It stands for a history
-        of the current: its charges move along with ``q_mobile``. ``None``: fully charged, at rest
+        of the current: its charges move along with ``q_mobile``. ``None``: at rest, with ``initial_soc``
     :param q_mobile_bounds_C: where to search, C; the lower one is raised to the least value that the record allows
     :param r_o_bounds_ohm: where to search, ohm
     :param prior_q_mobile_C: mean and standard deviation of ``q_mobile`` before this record, C; ``None``: nothing is known
@@ -167,6 +174,10 @@ class LeastSquares(Estimator):
     :param nuisance: what else is not known: standard deviations of the logarithms of constants, by name, e.g.
         ``{"kn": 0.2, "tDiffusion": 0.2}`` for two that are known to 20 %; and of the offset of the sensor in V, as
         ``"offset_V"``
+    :param initial_soc: state of charge at the first sample, after a rest: a number; (mean, standard deviation), which adds to
+        those of the parameters; or ``"rest"``: it is told from the voltage of the rest before the load, of a minute at least,
+        by the open-circuit voltage of the model, with ``voltage_noise_V`` and ``mismatch_V``, at least 5 mV, as its errors.
+        The fit then starts with the last sample of the rest, and the model of a record is :meth:`model_for`
     :raises ValueError: for an argument out of range
     """
 
@@ -185,10 +196,15 @@ class LeastSquares(Estimator):
         window_every_s: float | None = None,
         current_gain_sd: float = 0.0,
         nuisance: Mapping[str, float] | None = None,
+        initial_soc: InitialSoc = 1.0,
     ) -> None:
         self.parameters = check_parameters(parameters)
         self.nuisance = _check_nuisance({} if nuisance is None else nuisance, self.parameters)
-        self.model = RecordModel(cell, thermal, dt_s, initial)
+        self.initial_soc = check_initial_soc(initial_soc)
+        self.told_from_rest = isinstance(initial_soc, str)
+        if self.told_from_rest and initial is not None:
+            raise ValueError("initial is a whole state: give it or initial_soc, got both, initial_soc = 'rest'")
+        self._model_at_start = RecordModel(cell, thermal, dt_s, initial, self.initial_soc[0])
         self.bounds = check_bounds(q_mobile_bounds_C, r_o_bounds_ohm)
         if prior_q_mobile_C is not None:
             if "q_mobile" not in self.parameters:
@@ -201,7 +217,7 @@ class LeastSquares(Estimator):
             raise ValueError(f"mismatch_V must be at least 0 V, got {mismatch_V!r}")
         self.mismatch_V = mismatch_V
         self.current_gain_sd = check_gain_sd(current_gain_sd)
-        self.starts_full = initial is None
+        self._at_rest = initial is None
         for name, value in (("voltage_noise_V", voltage_noise_V), ("window_every_s", window_every_s)):
             if value is not None and not 0.0 < value < np.inf:
                 raise ValueError(f"{name} must be greater than 0, got {value!r}")
@@ -216,7 +232,55 @@ class LeastSquares(Estimator):
         :return: the estimate
         :raises ValueError: if the record cannot be used, or the least ``q_mobile`` it allows is outside the bounds
         """
-        return self._estimate(record)
+        known, part, start = self._begun(record)
+        return known._estimate(part, start)
+
+    @property
+    def model(self) -> RecordModel:
+        """
+        The model, which starts as ``initial_soc`` or ``initial`` say.
+
+        :return: the model
+        :raises ValueError: where the start is told from each record; :meth:`model_for` has its model
+        """
+        if self.told_from_rest:
+            raise ValueError("the charge at the start is told from each record: model_for(record) is the model of one")
+        return self._model_at_start
+
+    def model_for(self, record: Record) -> RecordModel:
+        """
+        The model of one record, whose forecasts belong to its estimate.
+
+        :param record: one discharge, with its rest where the start is told from that
+        :return: the model as it starts with this record
+        :raises ValueError: if the record cannot be used
+        """
+        return self._begun(record)[0].model
+
+    def start_of(self, record: Record) -> Start:
+        """
+        The state of charge that a record starts with: the one that is stated, or what its rest tells.
+
+        :param record: one discharge
+        :return: as far as it can be told
+        :raises ValueError: if the record cannot be used
+        """
+        if not self.told_from_rest:
+            return Start(*self.initial_soc)
+        offset_sd_V = max(_NOISE_V, self.mismatch_V)
+        error_V = hypot(self.voltage_noise_V or offset_sd_V, offset_sd_V)
+        return told_at_rest(record, self._model_at_start.cell, error_V, self._model_at_start.dt_s)
+
+    def _begun(self, record: Record) -> tuple[LeastSquares, Record, Start]:
+        """One that knows how a record starts, the record from the end of the rest on that tells it, and that start."""
+        start = self.start_of(record)
+        if not self.told_from_rest:
+            return self, record, start
+        known, own = copy(self), self._model_at_start
+        known.initial_soc, known.told_from_rest = (start.soc, start.sd_soc), False
+        known._model_at_start = RecordModel(own.cell, own.thermal, own.dt_s, initial_soc=start.soc)
+        columns = (np.asarray(column) for column in (record.time_s, record.voltage_V, record.current_A))
+        return known, Samples(*(column[max(start.samples - 1, 0) :] for column in columns)), start
 
     def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:
         """
@@ -232,7 +296,8 @@ class LeastSquares(Estimator):
         return [self._growing_trace(record, self.window_every_s) for record in records]
 
     def _growing_trace(self, record: Record, every_s: float) -> EstimateTrace:
-        whole = Samples(*(np.asarray(column) for column in (record.time_s, record.voltage_V, record.current_A)))
+        known, part, start = self._begun(record)
+        whole = Samples(*(np.asarray(column) for column in (part.time_s, part.voltage_V, part.current_A)))
         time_s = whole.time_s
         samples = np.searchsorted(time_s, np.arange(time_s[0] + every_s, time_s[-1], every_s), side="right")
         # the current of a sample shows at the next one
@@ -240,10 +305,10 @@ class LeastSquares(Estimator):
         stops = np.unique(np.append(samples[samples >= fewest], len(time_s)))
         estimates: list[Estimate] = []
         for stop in stops:
-            estimates.append(self._estimate(whole.first(stop), *estimates[-1:]))
+            estimates.append(known._estimate(whole.first(stop), start, *estimates[-1:]))
         return EstimateTrace.of(time_s[stops - 1], estimates)
 
-    def _estimate(self, record: Record, previous: Estimate | None = None) -> Estimate:
+    def _estimate(self, record: Record, start: Start, previous: Estimate | None = None) -> Estimate:
         problem = self._problem(record)
         if "q_mobile" in self.parameters:
             starts = self._best_starts(problem, [] if previous is None else [previous.q_mobile])
@@ -262,11 +327,14 @@ class LeastSquares(Estimator):
             (middle,) = self._starts(problem, [mean_C])
             carried = _Prior("q_mobile", mean_C, sqrt(variance_V2) / sd_C)
             fit = self._search(problem, [*starts, alone.values, middle.values], (*priors, carried))
-        sd = self._sd(fit, variance_V2)
+        hidden = self._hidden_sd(problem, fit)
+        sd = self._sd(fit, variance_V2, hidden)
         if len(problem.time_s) < len(record.time_s):
             reason = EMPTY
         else:
-            reason = self._contradiction(record, problem, fit) or self._shortage(fit, alone, variance_V2)
+            reason = (
+                start.reason or self._contradiction(record, problem, fit) or self._shortage(fit, alone, variance_V2, hidden)
+            )
         return Estimate(fit.values["q_mobile"], fit.values["r_o"], sd["q_mobile"], sd["r_o"], not reason, reason)
 
     def _noise_V(self, problem: _Problem, starts: Sequence[dict[str, float]]) -> float | None:
@@ -276,12 +344,35 @@ class LeastSquares(Estimator):
         residual_V, _ = self._residual(problem, dict.fromkeys(self.nuisance, 0.0) | starts[0], ())
         return max(white_noise_V(residual_V), _LEAST_NOISE_V)
 
-    def _sd(self, fit: _Fit, variance_V2: float) -> dict[str, float]:
-        """The standard deviations, with that of the current sensor's gain, which scales both parameters."""
+    def _sd(self, fit: _Fit, variance_V2: float, hidden: Mapping[str, float]) -> dict[str, float]:
+        """The standard deviations, with those of what does not show in the voltage."""
         sd = dict.fromkeys(PARAMETER_NAMES, nan)
         for name, root in zip(self.parameters, _root_inverse_diagonal(fit.jacobian), strict=False):
-            sd[name] = hypot(sqrt(variance_V2) * float(root), self.current_gain_sd * fit.values[name])
+            sd[name] = hypot(sqrt(variance_V2) * float(root), hidden[name])
         return sd
+
+    def _hidden_sd(self, problem: _Problem, fit: _Fit) -> dict[str, float]:
+        """
+        The standard deviations of what does not show in the voltage: the gain of the current sensor, which scales both
+        parameters, and the charge at the start, which the fit makes up for.
+        """
+        (soc, sd_soc), values = self.initial_soc, fit.values
+        by_soc = np.zeros(len(self.parameters) + len(self.nuisance))
+        if sd_soc:
+            step, nearby = _SOC_STEP if soc < 0.5 else -_SOC_STEP, copy(self)
+            own = self.model
+            nearby._model_at_start = RecordModel(own.cell, own.thermal, own.dt_s, initial_soc=soc + step)
+            moved = dict(values)
+            if "q_mobile" in self.parameters:  # along with it, so that the cell ends as full as before
+                moved["q_mobile"] *= soc / (soc + step)
+                by_soc[self.parameters.index("q_mobile")] = (moved["q_mobile"] - values["q_mobile"]) / step
+            change_V = (nearby._residual(problem, moved, ())[0] - self._residual(problem, values, ())[0]) / step
+            rows = np.nan_to_num(np.append(change_V, np.zeros(len(fit.jacobian) - len(change_V))))
+            by_soc -= np.linalg.lstsq(fit.jacobian, rows, rcond=None)[0]
+        return {
+            name: hypot(self.current_gain_sd * values[name], sd_soc * float(by_soc[n]))
+            for n, name in enumerate(self.parameters)
+        }
 
     def _contradiction(self, record: Record, problem: _Problem, fit: _Fit) -> str:
         """What in the record contradicts the fit."""
@@ -292,8 +383,9 @@ class LeastSquares(Estimator):
             noise_V, excess = self.voltage_noise_V, _EXCESS_LIMIT * sqrt(2.0 / n)
         limit_V2 = noise_V**2 * (1.0 + excess) + (MISMATCH_MARGIN * self.mismatch_V) ** 2 + _NEGLIGIBLE_V**2
         current_A = np.asarray(record.current_A)
-        start = start_reason(problem.time_s, problem.voltage_V, current_A, cell) if self.starts_full else ""
-        sensors = sensor_reason(problem.time_s, problem.voltage_V, current_A)
+        samples = (problem.time_s, problem.voltage_V, current_A)
+        start = start_reason(*samples, cell, self.initial_soc[0]) if self._at_rest else ""
+        sensors = sensor_reason(*samples)
         return first_reason(
             [
                 (bool(start), start),
@@ -325,15 +417,16 @@ class LeastSquares(Estimator):
             f"{early_s if early_s > time_s[n] else late_s:.0f} s."
         )
 
-    def _shortage(self, fit: _Fit, alone: _Fit, variance_V2: float) -> str:
+    def _shortage(self, fit: _Fit, alone: _Fit, variance_V2: float, hidden: Mapping[str, float]) -> str:
         """Why the record alone does not determine the parameters; ``alone``: the fit without the prior."""
-        own = self._sd(alone, variance_V2)
+        own = self._sd(alone, variance_V2, hidden)
         unknown = [name for name in self.parameters if not own[name] < SETTLED_SHARES[name] * alone.values[name]]
         carried = self.prior_q_mobile_C is not None
         return first_reason(
             [
                 (fit.square_V2 - alone.square_V2 > PRIOR_LIMIT_SD**2 * variance_V2, PRIOR_CONTRADICTED.format("q_mobile")),
                 (carried and "q_mobile" in unknown, PRIOR_ALONE.format("q_mobile")),
+                *((hidden[name] >= SETTLED_SHARES[name] * fit.values[name], SCALE_UNKNOWN.format(name)) for name in unknown),
                 *((True, IMPRECISE[name]) for name in unknown),
                 (self.voltage_noise_V is None and len(fit.residual_V) < len(self.parameters) + _SPARE_SAMPLES, _FEW),
             ]
@@ -485,7 +578,7 @@ class LeastSquares(Estimator):
         constants = self._constants(values)
         if not constants:
             return self.model
-        return RecordModel(self.model.cell.replace(**constants), self.model.thermal, self.model.dt_s, self.model.initial)
+        return self.model.of_cell(self.model.cell.replace(**constants))
 
     def _constants(self, values: Mapping[str, float]) -> dict[str, float]:
         constants = {}

@@ -27,6 +27,7 @@ from battery_env.estimators.settling import (
     PRIOR_LIMIT_SD,
     RISE_V,
     RISES,
+    SCALE_UNKNOWN,
     SETTLED_SHARES,
     START_WINDOW_S,
     STEADY_S,
@@ -105,7 +106,9 @@ _KEPT = 32
     _R_PRIOR_ALONE,
     _Q_IMPRECISE,
     _R_IMPRECISE,
-) = range(19)
+    _Q_SCALE_UNKNOWN,
+    _R_SCALE_UNKNOWN,
+) = range(21)
 
 _Q_SHARE, _R_SHARE = SETTLED_SHARES["q_mobile"], SETTLED_SHARES["r_o"]
 
@@ -189,6 +192,8 @@ class Monitor(NamedTuple):
             PRIOR_ALONE.format("r_o"),
             IMPRECISE["q_mobile"],
             IMPRECISE["r_o"],
+            SCALE_UNKNOWN.format("q_mobile"),
+            SCALE_UNKNOWN.format("r_o"),
         ]
 
 
@@ -304,7 +309,7 @@ def _verdict(row: FloatArray, own_sd: tuple[float, float], limits: Limits) -> in
                 return _Q_PRIOR_ALONE + 2 * k
     for k in range(2):
         if limits.searched[k] and not row[2 + k] < shares[k] * row[k]:
-            return _Q_IMPRECISE + k
+            return (_Q_IMPRECISE if limits.scale_sd[k] < shares[k] else _Q_SCALE_UNKNOWN) + k
     return SETTLED
 
 

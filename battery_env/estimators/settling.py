@@ -60,26 +60,38 @@ MISFIT = (
 NOT_FOLLOWED = "The current changes by {:.2f} A at {:.0f} s, and the voltage does not follow."
 RISES = "The voltage rises by {:.2f} V at {:.0f} s, where the current stays as it was."
 PRIOR_CONTRADICTED = "The prior of {} contradicts what the record says."
+START_UNKNOWN = (
+    "The record does not start with a minute at rest, whose voltage would tell the charge. Give the rest before the load, or "
+    "state initial_soc."
+)
+SCALE_UNKNOWN = (
+    "{} is known no better than what scales it and shows nowhere in the voltage: the gain of the current sensor "
+    "(current_gain_sd) and the charge at the start (initial_soc)."
+)
 PRIOR_ALONE = "{} rests on its prior: the record alone does not determine it yet."
 
 
-def start_reason(time_s: FloatArray, voltage_V: FloatArray, current_A: FloatArray, cell: CellParameters) -> str:
+def start_reason(
+    time_s: FloatArray, voltage_V: FloatArray, current_A: FloatArray, cell: CellParameters, initial_soc: float = 1.0
+) -> str:
     """
-    Whether a record can start with a full cell. At rest its voltage tells. A first sample under load is corrected by the least
-    ohmic drop that a cell can have: a full cell of a larger resistance cannot be told from one that lacks some charge.
+    Whether a record can start with a full cell, or with one of another charge. At rest its voltage tells. A first sample under
+    load is corrected by the least ohmic drop that a cell can have: a full cell of a larger resistance cannot be told from one
+    that lacks some charge.
 
     :param time_s: times of the samples, s, shape (T,), T >= 1; those of the first 20 s suffice
     :param voltage_V: V, shape (T,)
     :param current_A: positive in discharge, A, shape (T,)
     :param cell: constants of the model
+    :param initial_soc: state of charge that it is said to start with
     :return: why it cannot, or cannot be told to; empty if it can
     """
-    full_V = float(voltage(initial_state(cell=cell), cell=cell))
+    rest_V = float(voltage(initial_state(cell=cell, soc=initial_soc), cell=cell))
     soon = time_s <= time_s[0] + START_WINDOW_S
     soon[1:2] = True
     first_V, first_A = float(voltage_V[0]), float(current_A[0])
-    code = start_code(first_V, first_A, float(current_A[soon].max()), float(voltage_V[soon].min()), full_V)
-    return start_text(code, first_V, full_V)
+    code = start_code(first_V, first_A, float(current_A[soon].max()), float(voltage_V[soon].min()), rest_V)
+    return start_text(code, first_V, rest_V, initial_soc)
 
 
 @njit(cache=True, error_model="numpy")
@@ -116,9 +128,10 @@ def start_text(code: int, first_V: float, rest_V: float, initial_soc: float = 1.
     :return: why the record cannot start so, or cannot be told to; empty if it can
     """
     if initial_soc == 1.0:
-        what, advice = "a full cell", "Give the whole discharge of a full cell, with the rest before it."
+        what = "a full cell"
+        advice = "Give the whole discharge of a full cell, with the rest before it, or state initial_soc (--initial-soc)."
     else:
-        what, advice = f"a cell with {initial_soc:.0%} of its charge", "State another initial_soc."
+        what, advice = f"a cell with {initial_soc:.0%} of its charge", "State another initial_soc (--initial-soc)."
     return (
         "",
         f"The record starts at {first_V:.2f} V, above the {rest_V:.2f} V of {what}: another kind of cell or sensor.",
@@ -126,8 +139,7 @@ def start_text(code: int, first_V: float, rest_V: float, initial_soc: float = 1.
         f"The record starts under load at {first_V:.2f} V, at which a cell need not be "
         + ("full" if initial_soc == 1.0 else what)
         + f": it rests at {rest_V:.2f} V then. {advice}",
-        "The record does not start with a minute at rest, whose voltage would tell the charge. Give the rest before the load, "
-        "or state initial_soc.",
+        START_UNKNOWN,
     )[code]
 
 

@@ -20,8 +20,9 @@ from hypothesis import strategies as st
 
 from battery_env.__main__ import NOT_SETTLED, REFUSED, SETTLED, calibrate
 from battery_env.cells import Discharge, load_nasa_discharges
-from battery_env.electrochemistry import initial_state, simulate
-from battery_env.estimators import ClosedForm, Estimate, ExtendedKalmanFilter, LeastSquares
+from battery_env.electrochemistry import NEW_CELL, initial_state, simulate
+from battery_env.estimates import last_estimate
+from battery_env.estimators import ClosedForm, Estimate, ExtendedKalmanFilter, GreedyOneStep, LeastSquares
 from battery_env.estimators.base import OnlineEstimator
 from battery_env.records import Stream
 
@@ -44,6 +45,8 @@ FAULTS = (
     "current gain, stated",
     "current gain, unstated",
     "voltage gain",
+    "not full, stated",
+    "not full, at rest",
 )
 #: A pure error of the current's gain scales both parameters and shows nowhere else: only its accuracy can be stated.
 UNOBSERVABLE = ("current gain, unstated",)
@@ -74,6 +77,7 @@ class Case:
     cell: str = "simulated"
     prior_q_mobile_C: tuple[float, float] | None = None
     gain_sd: float = GAIN_SD
+    initial_soc: float | tuple[float, float] | str = 1.0
 
     def part(self, start: int, stop: int) -> Case:
         """Some of its samples."""
@@ -81,8 +85,11 @@ class Case:
         return replace(self, **arrays)
 
 
-def simulated(rng: np.random.Generator, soc: float = 1.0) -> Case:
-    """A simulated discharge of an aged cell under a constant, pulsed or wandering current, with noise of the sensor."""
+def simulated(rng: np.random.Generator, soc: float = 1.0, rest_s: int = 0) -> Case:
+    """
+    A simulated discharge of an aged cell under a constant, pulsed or wandering current, with noise of the sensor, after a
+    rest.
+    """
     q_mobile, r_o = rng.uniform(4000.0, 7600.0), rng.uniform(0.1, 0.3)
     kind = rng.choice(["constant", "pulsed", "random walk"])
     level = rng.uniform(0.5, 3.0)
@@ -95,6 +102,7 @@ def simulated(rng: np.random.Generator, soc: float = 1.0) -> Case:
         walk = level + np.cumsum(rng.normal(0.0, 0.3, len(current_A) // segment + 1))
         current_A = np.repeat(np.abs(walk - 0.3) % 3.0 + 0.3, segment)[: len(current_A)]
     start = initial_state(q_mobile, soc=soc)
+    current_A = np.append(np.zeros(rest_s), current_A)
     record = simulate(
         current_A, q_mobile, r_o, load_unit="current", thermal=True, cut_off_V=rng.uniform(2.7, 3.1), initial=start
     )
@@ -141,6 +149,12 @@ def broken(case: Case, fault: str, rng: np.random.Generator) -> Case:
     n = len(case.time_s)
     if fault == "not full":
         return simulated(rng, rng.uniform(0.4, 0.94))
+    if fault == "not full, stated":
+        soc, sd_soc = rng.uniform(0.4, 0.94), rng.uniform(0.005, 0.03)
+        stated = soc + sd_soc * rng.uniform(-2.0, 2.0)
+        return replace(simulated(rng, soc), initial_soc=(min(stated, 1.0), sd_soc))
+    if fault == "not full, at rest":
+        return replace(simulated(rng, rng.uniform(0.4, 1.0), int(rng.integers(0, 600))), initial_soc="rest")
     if fault == "forgotten reset":
         first = case.part(0, max(int(rng.uniform(0.2, 1.0) * n), 2))
         after_s = first.time_s[-1] - case.time_s[0] + rng.choice([1.0, 60.0, 600.0])
@@ -179,6 +193,7 @@ def broken(case: Case, fault: str, rng: np.random.Generator) -> Case:
 def calibrators(case: Case) -> dict[str, object]:
     """As the command line has them, and the filter with its defaults and with the error that real cells need."""
     more = {"thermal": True, "prior_q_mobile_C": case.prior_q_mobile_C, "current_gain_sd": case.gain_sd}
+    more["initial_soc"] = case.initial_soc
     return {
         "least squares": lambda: LeastSquares(mismatch_V=0.05, **more),
         "filter": lambda: ExtendedKalmanFilter(**more),
@@ -276,6 +291,59 @@ def test_a_stream_and_a_trace_say_what_the_whole_record_says(fault):
     make = calibrators(case)["filter, mismatch"]
     (found, estimate), *others = (outcome(case, make, path) for path in ("whole", "trace", "stream"))
     assert found != "wrong" and others == [(found, estimate)] * 2
+
+
+def window_trace(record: Case) -> Estimate:
+    return last_estimate(LeastSquares(thermal=True, mismatch_V=0.02, window_every_s=600.0).trace([record])[0])
+
+
+def of_a_batch(record: Case) -> Estimate:
+    cells = ExtendedKalmanFilter(thermal=True).batch(2)
+    for sample in Stream.of(record, 1.0).samples():
+        estimates = cells.update(*sample)
+    return estimates[1]
+
+
+def held(name: str, record: Case) -> dict[str, object]:
+    """Arguments of a calibrator that is told the other parameter."""
+    other = {"q_mobile": "r_o", "r_o": "q_mobile"}[name]
+    return {"parameters": [name], "cell": NEW_CELL.replace(**{other: getattr(record, other)}), "thermal": True}
+
+
+EVERY_ESTIMATOR = {
+    "least squares, defaults": lambda record: LeastSquares(thermal=True).estimate(record),
+    "least squares, noise": lambda record: LeastSquares(thermal=True, voltage_noise_V=0.01).estimate(record),
+    "least squares, mismatch": lambda record: LeastSquares(thermal=True, mismatch_V=0.02).estimate(record),
+    "least squares, nuisance": lambda record: LeastSquares(thermal=True, nuisance={"kn": 0.2, "offset_V": 0.01}).estimate(
+        record
+    ),
+    "least squares, another cell": lambda record: LeastSquares(cell=NEW_CELL.replace(kn=1500.0), mismatch_V=0.02).estimate(
+        record
+    ),
+    "least squares, trace": window_trace,
+    "least squares, q_mobile": lambda record: LeastSquares(**held("q_mobile", record)).estimate(record),
+    "least squares, r_o": lambda record: LeastSquares(**held("r_o", record)).estimate(record),
+    "filter, q_mobile": lambda record: ExtendedKalmanFilter(**held("q_mobile", record)).estimate(record),
+    "filter, r_o": lambda record: ExtendedKalmanFilter(**held("r_o", record)).estimate(record),
+    "filter, batch": of_a_batch,
+}
+
+
+@pytest.mark.parametrize("make", EVERY_ESTIMATOR.values(), ids=list(EVERY_ESTIMATOR))
+@pytest.mark.parametrize("soc", [0.4, 0.8, 0.93])
+def test_no_estimator_settles_on_a_start_that_is_not_full_and_that_nobody_told(make, soc):
+    case = simulated(np.random.default_rng(int(100 * soc)), soc, rest_s=120)
+    for record in (case, case.part(119, len(case.time_s))):
+        estimate = make(record)
+        assert not estimate.settled and estimate.reason.startswith("The record starts at rest at")
+    late = case.part(130, len(case.time_s))
+    assert not make(late).settled
+
+
+def test_the_full_state_needs_no_full_start():
+    record = simulate(8.0, 6000.0, 0.15, initial=initial_state(6000.0, soc=0.6)).part(0, 300)
+    for calibrator, name, true in ((ClosedForm(), "q_mobile", 6000.0), (GreedyOneStep("r_o"), "r_o", 0.15)):
+        assert getattr(calibrator.estimate(record), name) == pytest.approx(true, rel=1e-6)
 
 
 @pytest.mark.parametrize("method", ["least-squares", "kalman"])

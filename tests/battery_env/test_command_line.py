@@ -14,7 +14,7 @@ from battery_env.cells import Discharge, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, CellParameters, simulate
 from battery_env.estimators.cell_fit import fit_cell, read_cell
 from battery_env.estimators.least_squares import LeastSquares
-from battery_env.summary import summarize
+from battery_env.summary import Settings, summarize
 
 
 @pytest.fixture(scope="module")
@@ -378,3 +378,14 @@ def test_many_samples_are_averaged_and_say_the_same(recorded, tmp_path, capsys):
 def test_runs_as_a_module():
     done = subprocess.run([sys.executable, "-m", "battery_env", "calibrate", "B0005:1"], capture_output=True, text=True)
     assert done.returncode == 0 and "q_mobile" in done.stdout and done.stderr == ""
+
+
+def test_the_filter_follows_the_measured_temperature_unless_another_one_is_stated(recorded):
+    def r_o(temperature_C, **more):
+        record = Discharge(recorded.time_s, recorded.voltage_V, recorded.current_A, temperature_C)
+        return summarize(record, Settings(method="kalman", **more)).row["r_o_ohm"]
+
+    warming_C = np.linspace(20.0, 40.0, len(recorded.time_s))
+    measured, stated, held = (r_o(warming_C, **more) for more in ({}, {"ambient_C": 20.0}, {"thermal": False}))
+    assert measured < stated and measured < held
+    assert stated == r_o(None, ambient_C=20.0) and held == pytest.approx(r_o(None, ambient_C=20.0, thermal=False), rel=2e-3)

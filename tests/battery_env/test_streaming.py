@@ -11,7 +11,8 @@ from battery_env import ExtendedKalmanFilter, PolicyEstimator
 from battery_env.cells import Discharge, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, initial_state, rest_shares, simulate, voltage
 from battery_env.estimators.base import OnlineEstimator
-from battery_env.records import Stream
+from battery_env.estimators.rest import rest_voltages_V
+from battery_env.records import Stream, are_plausible, check_sample
 
 NOISE_V = 0.005
 
@@ -136,6 +137,35 @@ class TestTemperature:
         filter_.update(3.99, 0.0, 1.0)
         assert 303.0 < filter_.now().state[0] < 304.2
         assert filter_.now().cell.Tb0 == pytest.approx(293.15)
+
+    @pytest.mark.parametrize("initial_soc", [1.0, "rest"])
+    def test_a_record_is_taken_with_its_temperature(self, initial_soc, whole):
+        part = whole.part(0, 900)
+        samples = np.arange(len(part.time_s))
+        warm_C = 30.0 + 0.01 * samples
+        record = Discharge(part.time_s, part.voltage_V, part.current_A, warm_C)
+        filter_ = ExtendedKalmanFilter(thermal=True, initial_soc=initial_soc)
+        for sample, temperature_C in zip(Stream.of(record, 1.0).samples(), warm_C.tolist(), strict=True):
+            last = filter_.update(*sample, temperature_C)
+        (trace,) = filter_.trace([record])
+        assert filter_.estimate(record) == last and trace.q_mobile[-1] == last.q_mobile and trace.r_o[-1] == last.r_o
+        blind = filter_.estimate(Discharge(part.time_s, part.voltage_V, part.current_A))
+        assert abs(blind.r_o / last.r_o - 1.0) > 1e-3
+
+    def test_a_trace_of_an_estimator_that_takes_none_refuses_it_as_its_update_does(self):
+        class Isothermal(ExtendedKalmanFilter):
+            def trace(self, records):
+                return super(ExtendedKalmanFilter, self).trace(records)
+
+            def update(self, voltage_V, current_A, dt_s, temperature_C=None):
+                if temperature_C is not None:
+                    raise ValueError("takes no temperature")
+                return super().update(voltage_V, current_A, dt_s)
+
+        record = load_nasa_discharges("B0005")[0].until(400.0)
+        with pytest.raises(ValueError, match="takes no temperature"):
+            Isothermal().trace([record])
+        assert Isothermal().estimate(replace(record, temperature_C=None)).r_o > 0.0
 
     def test_kelvin_is_refused_and_a_policy_takes_none(self):
         with pytest.raises(ValueError, match=r"temperature_C must lie within .* not in kelvin"):
@@ -290,6 +320,52 @@ class TestBatch:
         with pytest.raises(ValueError, match="cells must be at least 1"):
             make().batch(0)
 
+    @pytest.mark.parametrize(
+        "arguments", [{}, {"mismatch_V": 0.02, "parameters": ["q_mobile"]}, {"initial_soc": (0.95, 0.01)}]
+    )
+    def test_filters_say_the_same_to_the_bit_side_by_side(self, arguments, whole):
+        rng = np.random.default_rng(0)
+        filter_ = ExtendedKalmanFilter(thermal=True, **arguments)
+        batch, alone = filter_.batch(3), [ExtendedKalmanFilter(thermal=True, **arguments) for _ in range(3)]
+        for n in range(260):
+            volts = whole.voltage_V[n] - [0.0, 0.002, 0.004] + rng.normal(0.0, 0.002, 3)
+            volts[rng.random(3) < 0.1 * (n > 0)] = np.nan
+            amperes, dt_s = rng.uniform(0.0, 3.0, 3), rng.uniform(0.5, 3.0, 3)
+            degrees_C = None if 40 < n < 60 else np.array([20.0, 25.0, 30.0])
+            if n == 100:
+                batch.reset([1])
+                alone[1].reset()
+                volts[1] = 4.19
+            if n == 150:  # whoever holds one of them may use it
+                batch.estimators[2].reset()
+                alone[2].reset()
+                volts[2] = 4.18
+            found = batch.update(volts, amperes, dt_s, degrees_C)
+            kelvin = [None] * 3 if degrees_C is None else degrees_C.tolist()
+            expected = [one.update(*sample) for one, *sample in zip(alone, volts, amperes, dt_s, kelvin, strict=True)]
+            assert [repr(each) for each in found] == [repr(each) for each in expected]
+        np.testing.assert_array_equal(found.q_mobile, [each.q_mobile for each in expected])
+        assert [each.soc for each in batch.estimators] == [each.soc for each in alone]
+        assert [repr(each) for each in found[:2]] == [repr(each) for each in expected[:2]]
+
+    @settings(max_examples=60, deadline=None, derandomize=True, database=None)
+    @given(
+        st.sampled_from([-0.1, 0.0, 3.9, 5.5, 5.6, np.nan, np.inf]),
+        st.sampled_from([-60.0, 0.0, 0.01, 2.0, 60.0, np.nan]),
+        st.sampled_from([0.0, 1e-4, 1.0, 600.0, 601.0, 604_800.0, 604_801.0, np.nan]),
+        st.sampled_from([None, -70.0, 25.0, 290.0, np.nan]),
+        st.sampled_from([0.0, 0.01, 2.0]),
+    )
+    def test_a_batch_refuses_what_a_filter_refuses(self, voltage_V, current_A, dt_s, temperature_C, before_A):
+        try:
+            check_sample(voltage_V, current_A, dt_s, temperature_C, before_A)
+            good = True
+        except ValueError:
+            good = False
+        known = None if temperature_C is None else np.array([temperature_C])
+        columns = (np.array([each]) for each in (voltage_V, current_A, dt_s))
+        assert are_plausible(*columns, known, np.array([before_A])).tolist() == [good]
+
 
 class TestRecordedCells:
     def test_the_rest_of_a_recorded_cell_tells_that_it_was_full(self):
@@ -307,7 +383,6 @@ class TestRecordedCells:
         assert told.soc + drawn_C / estimate.q_mobile == pytest.approx(1.0, abs=0.03) and not estimate.settled
 
     def test_rests_of_the_model_at_all_charges(self):
-        filter_ = ExtendedKalmanFilter(initial_soc="rest")
-        rest_V = filter_._rest_voltages_V()
+        rest_V = rest_voltages_V(NEW_CELL)
         assert (np.diff(rest_V) > 0.0).all()
         assert rest_V[-1] == pytest.approx(float(voltage(initial_state())))

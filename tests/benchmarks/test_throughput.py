@@ -164,3 +164,15 @@ def test_nonsense_on_the_command_line_is_refused(option, capsys):
     with pytest.raises(SystemExit):
         throughput.main([option, "0"])
     assert "must be at least 1" in capsys.readouterr().err
+
+
+def test_filters_take_their_turns(short, monkeypatch, tmp_path, capsys):
+    pytest.importorskip("progpy")
+    pytest.importorskip("onnxruntime")
+    for name, count in (("_SAMPLES", 130), ("_PROGPY_SAMPLES", 2), ("_PARTICLES_SAMPLES", 2), ("_BATCH_SAMPLES", 2)):
+        monkeypatch.setattr(throughput, name, count)
+    throughput.main(["--only", "filters", "--rounds", "2", "--filtered-cells", "3", "--out", str(tmp_path)])
+    speeds = pd.read_csv(tmp_path / "filters.csv")
+    assert len(speeds) == 2 and (speeds > 0).all(axis=None) and "batch of 3 cells" in speeds
+    shown = capsys.readouterr().out
+    assert "| progpy, unscented Kalman filter" in shown and "1.00 (1.00 to 1.00)" in shown

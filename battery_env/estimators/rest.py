@@ -1,0 +1,126 @@
+"""The state of charge that a discharge starts with: stated, or told from the voltage of the rest before the load."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from battery_env.arrays import FloatArray
+from battery_env.electrochemistry import CellParameters, initial_state, voltage
+from battery_env.estimators.settling import START_UNKNOWN
+from battery_env.records import REST_CURRENT_A, Record, Stream
+
+#: What a state of charge can be given as: a number, (mean, standard deviation), or told from the rest before the load.
+InitialSoc = float | tuple[float, float] | Literal["rest"]
+
+#: The charge of a cell is told from its voltage after so long a rest, s.
+LEAST_REST_S = 60.0
+# The voltage is averaged over about the first of these times; how far that mean is from the one over the second shows how much
+# is still to come, this many times their difference.
+_REST_MEMORIES_S = (20.0, 60.0)
+_STILL_TO_COME = 10.0
+# States of charge to choose from, where it is told from a voltage.
+_SOC_GRID = np.linspace(0.02, 1.0, 1961)
+# The slope of that voltage is taken over so much to each side.
+_SLOPE_SPAN = 0.01
+
+
+class Start(NamedTuple):
+    """
+    How a discharge starts.
+
+    :param soc: state of charge
+    :param sd_soc: its standard deviation
+    :param samples: how many samples at rest it was told from; 0 where it was stated
+    :param reason: why it could not be told, empty if it could
+    """
+
+    soc: float
+    sd_soc: float
+    samples: int = 0
+    reason: str = ""
+
+
+def check_initial_soc(initial_soc: InitialSoc) -> tuple[float, float]:
+    """
+    Refuse what is no state of charge.
+
+    :param initial_soc: a number, (mean, standard deviation), or ``"rest"``
+    :return: mean and standard deviation; those of a full cell for ``"rest"``
+    :raises ValueError: for anything else, and beyond 0.02 .. 1
+    """
+    if isinstance(initial_soc, str) and initial_soc == "rest":
+        return 1.0, 0.0
+    try:
+        mean, sd = (float(initial_soc), 0.0) if np.ndim(initial_soc) == 0 else map(float, initial_soc)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        mean = sd = np.nan
+    if not (_SOC_GRID[0] <= mean <= 1.0 and 0.0 <= sd < 1.0):
+        raise ValueError(
+            f"initial_soc is a state of charge within 0.02 .. 1, (mean, standard deviation), or 'rest', got {initial_soc!r}"
+        )
+    return mean, sd
+
+
+def follow_rest(means_V: FloatArray, voltage_V: float, since_s: float) -> None:
+    """
+    Take in one sample of a rest.
+
+    :param means_V: of the voltage over a short and a longer time, V, shape (2,); changed in place
+    :param voltage_V: V
+    :param since_s: time since the sample before, s
+    """
+    for n, memory_s in enumerate(_REST_MEMORIES_S):
+        means_V[n] += -np.expm1(-since_s / memory_s) * (voltage_V - means_V[n])
+
+
+def soc_at_rest(means_V: FloatArray, error_V: float, cell: CellParameters) -> tuple[float, float]:
+    """
+    The state of charge at which the open-circuit voltage of the model is that of a rest.
+
+    :param means_V: as :func:`follow_rest` has them, V, shape (2,)
+    :param error_V: standard deviation of the voltage, that of sensor and model, V
+    :param cell: constants of the model
+    :return: state of charge and its standard deviation, to which a voltage that still relaxes adds
+    """
+    rest_V = rest_voltages_V(cell)
+    soc = float(np.interp(means_V[0], rest_V, _SOC_GRID))
+    around = np.clip([soc - _SLOPE_SPAN, soc + _SLOPE_SPAN], _SOC_GRID[0], _SOC_GRID[-1])
+    slope_V = float(np.diff(np.interp(around, _SOC_GRID, rest_V))[0] / np.diff(around)[0])
+    return soc, float(np.hypot(error_V, _STILL_TO_COME * (means_V[0] - means_V[1])) / slope_V)
+
+
+def rest_voltages_V(cell: CellParameters) -> FloatArray:
+    """
+    The voltage of a cell at rest at each state of charge of a grid.
+
+    :param cell: constants of the model
+    :return: V, from 2 % to full
+    """
+    full, empty = (initial_state(cell=cell, soc=soc) for soc in (1.0, 0.0))
+    states = empty + _SOC_GRID[:, None] * (full - empty)
+    return np.asarray(voltage(states, cell=cell))
+
+
+def told_at_rest(record: Record, cell: CellParameters, error_V: float, dt_s: float) -> Start:
+    """
+    The state of charge that a record starts with, from the voltage of the rest before its load.
+
+    :param record: one discharge
+    :param cell: constants of the model
+    :param error_V: as of :func:`soc_at_rest`, V
+    :param dt_s: in a record whose samples lie this far apart the current is taken as it is, s
+    :return: as far as it can be told; a record that starts under load is taken for that of a full cell, with a reason
+    :raises ValueError: if the record cannot be used
+    """
+    stream = Stream.of(record, dt_s)
+    loaded = np.flatnonzero(np.abs(stream.current_A) > REST_CURRENT_A)
+    count = int(loaded[0]) if len(loaded) else len(stream.time_s)
+    if not count:
+        return Start(1.0, 0.0, 0, START_UNKNOWN)
+    means_V = np.full(2, stream.voltage_V[0])
+    for voltage_V, since_s in zip(stream.voltage_V[:count].tolist(), stream.dt_s[:count].tolist(), strict=True):
+        follow_rest(means_V, voltage_V, since_s)
+    rest_s = float(stream.time_s[count - 1] - stream.time_s[0])
+    return Start(*soc_at_rest(means_V, error_V, cell), count, "" if rest_s >= LEAST_REST_S else START_UNKNOWN)

@@ -1,0 +1,203 @@
+"""Discharges that do not start full: the charge is stated, or told from the rest before the load."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from battery_env import ExtendedKalmanFilter, LeastSquares, fit_cell, load_nasa_discharges
+from battery_env.__main__ import NOT_SETTLED, SETTLED, calibrate
+from battery_env.cells import Discharge
+from battery_env.electrochemistry import NEW_CELL, initial_state, simulate
+from battery_env.estimators.rest import rest_voltages_V, told_at_rest
+from battery_env.forecasts import forecast
+from battery_env.life import track_life
+from battery_env.record_model import RecordModel
+
+REST_S = 200
+
+
+def partly_charged(soc: float, noise_V: float = 0.002, load_A: float = 2.0, cut_off_V: float = 2.8):
+    current_A = np.append(np.zeros(REST_S), np.full(20_000, load_A))
+    start = initial_state(6000.0, soc=soc)
+    record = simulate(current_A, 6000.0, 0.15, load_unit="current", thermal=True, initial=start, cut_off_V=cut_off_V)
+    noise = np.random.default_rng(0).normal(0.0, noise_V, len(record.time_s))
+    return replace(record, voltage_V=record.voltage_V + noise)
+
+
+@pytest.fixture(scope="module")
+def record():
+    return partly_charged(0.8)
+
+
+class TestStart:
+    @pytest.mark.parametrize("soc", [0.3, 0.8, 1.0])
+    def test_the_state_of_charge_stays_where_q_mobile_moves(self, soc):
+        model = RecordModel(initial_soc=soc)
+        for q_mobile in (4000.0, 7600.0):
+            np.testing.assert_allclose(model.start(q_mobile), initial_state(q_mobile, soc=soc), rtol=1e-12, atol=1e-9)
+
+    def test_tangents_know_of_it(self):
+        model, load_A = RecordModel(initial_soc=0.6), np.full(600, 2.0)
+        _, by_q, _ = model.sensitivities(load_A, 6000.0, 0.15)
+        above, below = (model.sensitivities(load_A, 6000.0 + step, 0.15)[0] for step in (1.0, -1.0))
+        np.testing.assert_allclose(by_q, 0.5 * (above - below), rtol=1e-4, atol=1e-9)
+
+    def test_the_least_q_mobile_is_one_that_just_lasts(self):
+        model, load_A = RecordModel(initial_soc=0.5), np.full(1000, 2.0)
+        least_C = model.least_q_mobile_C(load_A)
+        assert least_C > 2.0 * 2000.0
+        assert len(model.simulate(load_A, 1.0001 * least_C, 0.0).time_s) == 1000
+        assert len(model.simulate(load_A, 0.999 * least_C, 0.0).time_s) < 1000
+
+    def test_a_state_and_a_charge_are_too_much(self):
+        for soc in (0.8, "rest"):
+            with pytest.raises(ValueError, match="initial is a whole state: give it or initial_soc, got both"):
+                LeastSquares(initial=initial_state(), initial_soc=soc)
+
+    @pytest.mark.parametrize("make", [LeastSquares, ExtendedKalmanFilter])
+    @pytest.mark.parametrize("soc", [0.0, 1.1, np.nan, "full", (0.5, -0.1), (0.5, 0.1, 0.1), None])
+    def test_what_is_no_charge_is_refused(self, make, soc):
+        with pytest.raises(ValueError, match="initial_soc is a state of charge within"):
+            make(initial_soc=soc)
+
+    @pytest.mark.parametrize("soc", [0.15, 0.5, 0.97])
+    def test_a_rest_tells_it_within_its_error(self, soc):
+        found = told_at_rest(partly_charged(soc, noise_V=0.005), NEW_CELL, 0.007, 1.0)
+        assert found.samples == REST_S and found.reason == ""
+        assert abs(found.soc - soc) < 2.0 * found.sd_soc < 0.3
+
+    def test_a_voltage_that_still_relaxes_says_less(self, record):
+        relaxing = replace(record, voltage_V=record.voltage_V - 0.05 * np.exp(-record.time_s / 100.0))
+        steady, moving = (told_at_rest(each, NEW_CELL, 0.007, 1.0) for each in (record, relaxing))
+        assert abs(moving.soc - 0.8) < 2.0 * moving.sd_soc and moving.sd_soc > 2.0 * steady.sd_soc
+
+    def test_it_is_told_from_what_the_filter_sees(self, record):
+        filter_, fit = ExtendedKalmanFilter(thermal=True, initial_soc="rest"), LeastSquares(thermal=True, initial_soc="rest")
+        for voltage_V in record.voltage_V[:REST_S].tolist():
+            filter_.update(voltage_V, 0.0, 1.0)
+        assert fit.start_of(record) == filter_.start_of(record) and fit.start_of(record).soc == pytest.approx(filter_.soc)
+        assert (np.diff(rest_voltages_V(NEW_CELL)) > 0.0).all()
+
+
+class TestLeastSquares:
+    def test_a_full_start_is_what_it_was(self):
+        part = load_nasa_discharges("B0005")[40].loaded_part(2.7)
+        plain, stated = (
+            LeastSquares(thermal=True, mismatch_V=0.05, **more).estimate(part) for more in ({}, {"initial_soc": 1})
+        )
+        assert plain == stated and plain.settled
+
+    @pytest.mark.parametrize("soc", [0.3, 0.7, 0.95])
+    def test_a_charge_that_is_known_gives_both_parameters(self, soc):
+        estimate = LeastSquares(thermal=True, initial_soc=soc).estimate(partly_charged(soc, noise_V=0.0))
+        assert (estimate.q_mobile, estimate.r_o) == pytest.approx((6000.0, 0.15), rel=1e-6) and estimate.settled
+
+    @pytest.mark.parametrize("more", [{}, {"nuisance": {"tDiffusion": 0.1, "kn": 0.1}}, {"parameters": ["r_o"]}])
+    def test_with_other_unknowns_too(self, more, record):
+        cell = NEW_CELL.replace(q_mobile=6000.0)
+        estimate = LeastSquares(thermal=True, voltage_noise_V=0.002, initial_soc=0.8, cell=cell, **more).estimate(record)
+        assert abs(estimate.r_o - 0.15) < 4.0 * estimate.sd_r_o < 0.05
+        if "parameters" not in more:
+            assert abs(estimate.q_mobile - 6000.0) < 4.0 * estimate.sd_q_mobile < 600.0
+
+    def test_nobody_told(self, record):
+        estimate = LeastSquares(thermal=True).estimate(record)
+        assert not estimate.settled and "where a full cell shows 4.19 V" in estimate.reason
+        assert "or state initial_soc (--initial-soc)" in estimate.reason
+
+    def test_told_wrongly(self, record):
+        estimate = LeastSquares(thermal=True, initial_soc=0.95).estimate(record)
+        assert not estimate.settled and "where a cell with 95% of its charge shows" in estimate.reason
+
+    def test_a_doubt_moves_the_parameters_as_far_as_it_says(self, record):
+        stated, off = (
+            LeastSquares(thermal=True, voltage_noise_V=0.002, initial_soc=soc).estimate(record)
+            for soc in ((0.8, 0.005), (0.805, 0.005))
+        )
+        assert off.q_mobile - 6000.0 == pytest.approx(-stated.sd_q_mobile, rel=0.1)
+        assert abs(off.r_o - 0.15) == pytest.approx(stated.sd_r_o, rel=0.25)
+        assert stated.settled
+        doubtful = LeastSquares(thermal=True, voltage_noise_V=0.002, initial_soc=(0.8, 0.05)).estimate(record)
+        assert not doubtful.settled and "the charge at the start" in doubtful.reason
+
+    def test_a_rest_tells_the_charge(self, record):
+        fit = LeastSquares(thermal=True, voltage_noise_V=0.002, initial_soc="rest")
+        estimate = fit.estimate(record)
+        assert abs(estimate.q_mobile - 6000.0) < 3.0 * estimate.sd_q_mobile < 400.0
+        trace = LeastSquares(thermal=True, voltage_noise_V=0.002, window_every_s=900.0, initial_soc="rest").trace([record])[0]
+        assert trace.q_mobile[-1] == pytest.approx(estimate.q_mobile, rel=1e-5) and trace.settled[-1] == estimate.settled
+        model = fit.model_for(record)
+        assert model.forecast(record, estimate, 2.8).eod_time_s == pytest.approx(record.time_s[-1], rel=0.005)
+        seen = record.part(0, 1000)
+        ends = forecast(seen, fit.estimate(record), 2.0, 2.8, model=model, mismatch_V=0.01, samples=100)
+        assert ends.eod_quantile_s(0.5) == pytest.approx(record.time_s[-1], rel=0.03)
+        assert np.median(ends.soc) == pytest.approx(0.8 - 2.0 * (999 - REST_S) / 6000.0, abs=0.02)
+        with pytest.raises(ValueError, match=r"model_for\(record\)"):
+            fit.model  # noqa: B018
+
+    def test_without_a_rest_it_is_not_settled(self, record):
+        for part in (record.part(REST_S, len(record.time_s)), record.part(REST_S - 30, len(record.time_s))):
+            estimate = LeastSquares(thermal=True, initial_soc="rest").estimate(part)
+            assert not estimate.settled and estimate.reason.startswith("The record does not start with a minute at rest")
+
+
+class TestCommandLine:
+    def row(self, record, folder, capsys, *options):
+        columns = {"time_s": record.time_s, "voltage_V": record.voltage_V, "current_A": record.current_A}
+        pd.DataFrame(columns).to_csv(folder / "record.csv", index=False)
+        status = calibrate([str(folder / "record.csv"), "--json", *options])
+        return status, json.loads(capsys.readouterr().out)
+
+    @pytest.mark.parametrize("method", ["least-squares", "kalman"])
+    def test_a_stated_charge(self, method, record, tmp_path, capsys):
+        options = ["--method", method, "--mismatch", "0.02", "--nominal", "2"]
+        status, row = self.row(record, tmp_path, capsys, *options, "--initial-soc", "0.8")
+        assert status == SETTLED and row["initial_soc"] == 0.8 and row["q_mobile_C"] == pytest.approx(6000.0, rel=0.02)
+        # the capacity is that of a full cell
+        full = RecordModel(NEW_CELL.replace(q_mobile=6000.0, r_o=0.15), thermal=True).capacity_Ah(2.0, "current", 2.8, 9000.0)
+        assert row["capacity_Ah"] is None and row["predicted_capacity_Ah"] == pytest.approx(full, rel=0.03)
+        assert row["state_of_health"] == pytest.approx(full / 2.0, rel=0.03)
+        status, row = self.row(record, tmp_path, capsys, *options)
+        assert status == NOT_SETTLED and "state initial_soc (--initial-soc)" in row["reason"]
+        status, row = self.row(record, tmp_path, capsys, *options, "--initial-soc", "0.8,0.05")
+        assert status == NOT_SETTLED and row["sd_initial_soc"] == 0.05
+
+    @pytest.mark.parametrize("method", ["least-squares", "kalman"])
+    def test_a_rest(self, method, record, tmp_path, capsys):
+        options = ["--method", method, "--mismatch", "0.001", "--initial-soc", "rest"]
+        _, row = self.row(record, tmp_path, capsys, *options)
+        assert row["initial_soc"] == pytest.approx(0.8, abs=0.02) and 0.0 < row["sd_initial_soc"] < 0.02
+        assert abs(row["q_mobile_C"] - 6000.0) < 3.0 * row["sd_q_mobile_C"] < 500.0
+        status, row = self.row(record.part(REST_S - 20, len(record.time_s)), tmp_path, capsys, *options)
+        assert status == NOT_SETTLED and row["reason"].startswith("The record does not start with a minute at rest")
+
+    def test_in_words(self, record, tmp_path, capsys):
+        columns = {"time_s": record.time_s, "voltage_V": record.voltage_V, "current_A": record.current_A}
+        pd.DataFrame(columns).to_csv(tmp_path / "record.csv", index=False)
+        calibrate([str(tmp_path / "record.csv"), "--initial-soc", "0.8,0.01", "--cut-off", "2.9"])
+        shown = capsys.readouterr().out
+        assert "charge at the start         80.0 %   sd 1.0 %" in shown and "from full it would have been 1.5" in shown
+
+    @pytest.mark.parametrize("given", ["half", "0.8,0.1,0.1", ""])
+    def test_what_is_none(self, given, capsys):
+        with pytest.raises(SystemExit):
+            calibrate(["B0005:1", "--initial-soc", given])
+        assert "expected SOC, SOC,SD or rest" in capsys.readouterr().err
+        assert calibrate(["B0005:1", "--initial-soc", "1.5"]) == 2
+        assert "initial_soc is a state of charge within" in capsys.readouterr().err
+
+
+class TestOthers:
+    def test_constants_are_not_fitted_to_full_cells_and_others(self):
+        record = load_nasa_discharges("B0005")[0]
+        low = Discharge(record.time_s, record.voltage_V - 0.2, record.current_A)
+        with pytest.raises(ValueError, match=r"discharge 2 of 2 starts at rest at 3.99 V, discharge 1 at 4.19 V"):
+            fit_cell([record, low])
+
+    def test_a_life_is_of_full_cells(self):
+        for soc in (0.8, "rest"):
+            with pytest.raises(ValueError, match="must take discharges to start full"):
+                track_life(load_nasa_discharges("B0005")[:2], 2.7, LeastSquares(initial_soc=soc))
