@@ -160,9 +160,7 @@ def test_saved_models_go_on_compiled_or_not(make_model, tmp_path):
 
 def test_any_replay_buffer_and_vec_normalize(make_model):
     env = VecNormalize(DummyVecEnv([lambda: BitFlippingEnv(n_bits=3, continuous=True)]), norm_obs=False)
-    model = make_model(
-        env, policy="MultiInputPolicy", replay_buffer_class=HerReplayBuffer, n_collect=39, compile_update=True
-    )
+    model = make_model(env, policy="MultiInputPolicy", replay_buffer_class=HerReplayBuffer, n_collect=39, compile_update=True)
     model.learn(7, reset_num_timesteps=False)
     assert model._n_updates == 6 and th.isfinite(model.log_lambda).all()
 
