@@ -1,6 +1,6 @@
 """
-Where the time of LAC goes: updates beside those of Stable-Baselines3's SAC and beside what their arithmetic takes, ``learn()``
-with many cells at once, growth with cells, batches and widths, and the memory of a million transitions.
+Where the time of LAC goes: updates beside those of Stable-Baselines3's SAC, beside what their arithmetic takes, and compiled
+beside not; ``learn()`` with many cells at once, growth with cells, batches and widths; memory of a million transitions.
 
 .. code-block:: bash
 
@@ -43,7 +43,7 @@ from benchmarks.study import Study, command_line, markdown, positive
 from benchmarks.throughput import race, spread
 from sb3_lac import LAC, GymnasiumVecEnv
 
-SECTIONS = ("updates", "learn", "growth", "memory")
+SECTIONS = ("updates", "compiled", "learn", "growth", "memory")
 
 _ENV_ID = "BatteryQmax-v0"
 _TRANSITIONS = 1_024
@@ -69,7 +69,9 @@ def many_cells(cells: int) -> VecEnv:
     return GymnasiumVecEnv(gym.make_vec(_ENV_ID, num_envs=cells, autoreset_mode="SameStep"))
 
 
-def ready_model(algorithm: type[LAC] | type[SAC], net_arch: list[int], env: VecEnv, batch_size: int = 256) -> LAC | SAC:
+def ready_model(
+    algorithm: type[LAC] | type[SAC], net_arch: list[int], env: VecEnv, batch_size: int = 256, **kwargs: Any
+) -> LAC | SAC:
     """
     A model that has transitions in its replay buffer and has made its first updates.
 
@@ -77,6 +79,7 @@ def ready_model(algorithm: type[LAC] | type[SAC], net_arch: list[int], env: VecE
     :param net_arch: widths of the hidden layers, of all networks
     :param env: vectorized environment
     :param batch_size: batch size
+    :param kwargs: other arguments of the algorithm
     :return: the model; ``learn()`` makes one update per step of all cells
     """
     model = algorithm(
@@ -88,6 +91,7 @@ def ready_model(algorithm: type[LAC] | type[SAC], net_arch: list[int], env: VecE
         policy_kwargs={"net_arch": net_arch, "activation_fn": nn.LeakyReLU},
         device="cpu",
         seed=0,
+        **kwargs,
     )
     model.set_logger(Logger(folder=None, output_formats=[]))
     model.learn(_TRANSITIONS)
@@ -230,6 +234,37 @@ def measure_updates(rounds: int, updates: int, threads: Sequence[int]) -> tuple[
                     "LAC's time over the floor": spread(1 / (lac_speed * floor_s), 1),
                 }
             )
+    return speeds, pd.DataFrame(rows)
+
+
+def measure_compiled(rounds: int, updates: int) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """
+    Updates a second of LAC on one thread, compiled and not, with large and small networks.
+
+    :param rounds: how often each has its turn
+    :param updates: of a turn
+    :return: what each contestant did in each round, and the table for readers
+    """
+    # code is compiled for a number of threads
+    th.set_num_threads(1)
+    contestants: dict[str, Callable[[], int]] = {}
+    networks = ["-".join(map(str, net_arch)) for net_arch in (_LARGE, _SMALL)]
+    for layers, net_arch in zip(networks, (_LARGE, _SMALL), strict=True):
+        for name, compile_update in (("eager", False), ("compiled", True)):
+            model = ready_model(LAC, net_arch, many_cells(64), compile_update=compile_update)
+            contestants[f"{name}, {layers}"] = partial(updates_of, model, updates)
+    speeds = race(contestants, rounds, clock_of(1))
+    rows = []
+    for layers in networks:
+        eager, compiled = (speeds[f"{name}, {layers}"] for name in ("eager", "compiled"))
+        rows.append(
+            {
+                "networks": layers,
+                "LAC, updates a second": spread(eager, 0),
+                "compiled": spread(compiled, 0),
+                "compiled is faster by a factor of": spread(compiled / eager, 2),
+            }
+        )
     return speeds, pd.DataFrame(rows)
 
 
@@ -456,6 +491,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if "updates" in chosen.only:
         speeds, table = measure_updates(chosen.rounds, chosen.updates, chosen.threads)
         study.write({"updates": speeds}, {}, markdown(table), "updates")
+    if "compiled" in chosen.only:
+        speeds, table = measure_compiled(chosen.rounds, chosen.updates)
+        study.write({"compiled": speeds}, {}, markdown(table), "compiled")
     if "learn" in chosen.only:
         speeds, table, shares = measure_learn(chosen.cells, chosen.rounds, chosen.updates)
         readable = shares.assign(share=(100 * shares["share"]).map("{:.1f} %".format))

@@ -1,6 +1,8 @@
 import math
 import warnings
-from typing import Any, ClassVar, TypeVar
+from collections.abc import Sequence
+from contextlib import nullcontext
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 import torch as th
@@ -17,6 +19,7 @@ from stable_baselines3.sac.policies import Actor
 from torch.nn import functional as F
 
 from sb3_lac.buffers import HorizonReplayBuffer, HorizonReplayBufferSamples
+from sb3_lac.compiled import CompiledUpdate, Metrics, check_compiler, set_gradient, set_gradients, step
 from sb3_lac.env_ids import check_env_id
 from sb3_lac.policies import CnnPolicy, LyapunovCritic, LyapunovPolicy, MlpPolicy, MultiInputPolicy, largest_value
 
@@ -37,8 +40,8 @@ def update_multiplier(log_multiplier: th.Tensor, optimizer: th.optim.Optimizer, 
     violation = violation.detach()
     loss = -log_multiplier.detach() * violation
     # The loss is linear in the logarithm: autograd would only find the same number again
-    log_multiplier.grad = -violation.reshape(1)
-    optimizer.step()
+    set_gradient(log_multiplier, -violation.reshape(1))
+    step(optimizer)
     return loss
 
 
@@ -84,6 +87,15 @@ def time_limits(env: VecEnv) -> list[int | None]:
     :return: ``max_episode_steps`` of each environment, None where it has none
     """
     return [getattr(spec, "max_episode_steps", None) for spec in env.get_attr("spec")]
+
+
+class Weights(NamedTuple):
+    """What an update changes: the parameters of both optimizers, and all of the critic and of its target."""
+
+    actor_optimized: Sequence[th.Tensor]
+    critic_optimized: Sequence[th.Tensor]
+    critic: Sequence[th.Tensor]
+    critic_target: Sequence[th.Tensor]
 
 
 class LAC(OffPolicyAlgorithm):
@@ -150,6 +162,10 @@ class LAC(OffPolicyAlgorithm):
         then the same from the start. If a larger reward is seen, a warning says so and the bound rises to it.
         If ``None``, the bound is the largest reward seen, at least 0. A rise shifts all values of ``L`` alike and
         changes no gradient. ``gamma`` must be below 1 with a bound above 0, or a ``horizon`` be given.
+    :param compile_update: Whether to compile each update to one graph (``torch.compile``), on a GPU a CUDA graph. That takes
+        minutes at the first update, and again when one of its constants has changed (``batch_size``, ``tau``, ...;
+        not so a scheduled learning rate). It needs torch 2.11, a C++ compiler on a CPU and triton on a GPU, and networks
+        that ``torch.compile`` can trace.
     :param use_sde: Whether to use generalized State Dependent Exploration (gSDE)
         instead of action noise exploration (default: False)
     :param sde_sample_freq: Sample a new noise matrix every n steps when using gSDE
@@ -208,6 +224,7 @@ class LAC(OffPolicyAlgorithm):
         lambda_learning_rate: float | Schedule | None = None,
         horizon: int | None = None,
         reward_bound: float | None = None,
+        compile_update: bool = False,
         use_sde: bool = False,
         sde_sample_freq: int = -1,
         use_sde_at_warmup: bool = False,
@@ -264,6 +281,8 @@ class LAC(OffPolicyAlgorithm):
         self.lambda_learning_rate = lambda_learning_rate
         self.horizon = horizon
         self.stated_reward_bound = reward_bound
+        self.compile_update = compile_update
+        self._compiled: CompiledUpdate | None = None
         self.largest_stored_reward = 0.0
         if horizon is None and replay_buffer_class is HorizonReplayBuffer:
             raise ValueError("The HorizonReplayBuffer is used with a horizon, and chosen by it: set for instance horizon=5.")
@@ -334,6 +353,9 @@ class LAC(OffPolicyAlgorithm):
             self.lambda_lr_schedule = FloatSchedule(self.lambda_learning_rate)
         self.log_lambda = th.log(th.ones(1, device=self.device) * self.lambda_init).requires_grad_(True)
         self.lambda_optimizer = th.optim.Adam([self.log_lambda], lr=self.lambda_lr_schedule(1), fused=True)
+
+        if self.compile_update:
+            self._compiled = CompiledUpdate(self.device)
 
         # Largest reward seen, before any normalization, see ``cost_bound()``
         self.reward_bound = th.zeros(1, device=self.device)
@@ -553,6 +575,102 @@ class LAC(OffPolicyAlgorithm):
         going_on = 1 - replay_data.dones
         return (going_on * (next_values - values + self.alpha3 * costs)).sum() / going_on.sum().clamp(min=1)
 
+    def _update(self, replay_data: ReplayBufferSamples, costs: th.Tensor, weights: Weights, update_targets: bool) -> Metrics:
+        """
+        One update of all that is learned.
+
+        :param replay_data: Sampled transitions
+        :param costs: Of these transitions
+        :param weights: Parameters of the networks
+        :param update_targets: Whether the target networks follow
+        :return: Names and values of what is logged
+        """
+        # We need to sample because `log_std` may have changed between two gradient steps
+        if self.use_sde:
+            self.actor.reset_noise()
+            if self.actor_target is not None:
+                self.actor_target.reset_noise()
+
+        # Action by the current actor for the sampled states
+        actions_pi, log_prob = self.actor.action_log_prob(replay_data.observations)
+
+        with th.no_grad():
+            # Next action by the current actor, or by the lagged one
+            next_actor = self.actor if self.actor_target is None else self.actor_target
+            next_actions = next_actor(replay_data.next_observations)
+
+        target_values = self._target_values(replay_data, next_actions)
+        # Get current Lyapunov values for each critic network
+        # using action from the replay buffer (all values are relative to the offset)
+        current_values = self.critic(replay_data.observations, replay_data.actions)
+        critic_loss = 0.5 * sum(F.mse_loss(current_value, target_values) for current_value in current_values)
+        assert isinstance(critic_loss, th.Tensor)  # for type checker
+
+        values = largest_value(current_values).detach()
+        if self.published_update:
+            # A gradient through the next action
+            next_actions = self.actor(replay_data.next_observations)
+        difference = self._violation(replay_data, next_actions, values, costs)
+
+        # What the actor lowers: with the published update the difference itself
+        objective = difference
+        if not self.published_update:
+            objective = largest_value(self.critic(replay_data.observations, actions_pi)).mean()
+
+        # Important: detach the multipliers from the graph
+        # so we don't change them with other losses
+        # see https://github.com/rail-berkeley/softlearning/issues/60
+        lambda_coef = th.exp(self.log_lambda.detach())
+        ent_coef = self.ent_coef_tensor if self.log_ent_coef is None else th.exp(self.log_ent_coef.detach())
+        # Lagrangian of the decrease condition and of the entropy constraint
+        actor_loss = lambda_coef * objective + ent_coef * log_prob.mean()
+
+        # Optimize the critic and the actor, both with the gradient at the current parameters
+        set_gradients(critic_loss, weights.critic_optimized)
+        # Without the gradient of the critic's weights, which the loss of the actor depends on too
+        set_gradients(actor_loss, weights.actor_optimized)
+        step(self.critic.optimizer)
+        step(self.actor.optimizer)
+
+        # Optimize the multiplier of the decrease condition
+        lambda_loss = update_multiplier(self.log_lambda, self.lambda_optimizer, difference)
+        log_lambda_max = math.log(self.lambda_max)
+        # Project it: a logarithm beyond its limits would need as many steps to come back (wind-up)
+        with th.no_grad():
+            self.log_lambda.clamp_(math.log(self.lambda_min), log_lambda_max)
+
+        metrics = {
+            "actor_loss": actor_loss,
+            "critic_loss": critic_loss,
+            "ent_coef": ent_coef,
+            "lambda": lambda_coef,
+            "lambda_saturation": self.log_lambda >= log_lambda_max,
+            "lambda_loss": lambda_loss,
+            "lyapunov_difference": difference,
+            "lyapunov_mean": values.mean() + self.critic.offset,
+            "cost": costs.mean(),
+        }
+
+        # Optimize entropy coefficient, also called
+        # entropy temperature or beta in the paper
+        if self.ent_coef_optimizer is not None and self.log_ent_coef is not None:
+            assert isinstance(self.target_entropy, float)
+            ent_coef_loss = update_multiplier(
+                self.log_ent_coef, self.ent_coef_optimizer, log_prob.mean() + self.target_entropy
+            )
+            metrics["ent_coef_loss"] = ent_coef_loss
+
+        # Update target networks
+        if update_targets:
+            polyak_update(weights.critic, weights.critic_target, self.tau)
+            # Copy running stats, see GH issue #996
+            polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
+            if self.actor_target is not None:
+                polyak_update(self.actor.parameters(), self.actor_target.parameters(), self.tau)
+
+        with th.no_grad():
+            return tuple(metrics), th.hstack(tuple(metrics.values()))
+
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         # Switch to train mode (this affects batch norm / dropout)
         self.policy.set_training_mode(True)
@@ -564,124 +682,34 @@ class LAC(OffPolicyAlgorithm):
         # Update learning rate according to lr schedule
         self._update_learning_rate(optimizers)
         update_learning_rate(self.lambda_optimizer, self.lambda_lr_schedule(self._current_progress_remaining))
+        optimizers.append(self.lambda_optimizer)
 
         # Lists, because going through the modules takes as long as a Polyak update of small networks
-        critic_weights, critic_target_weights = list(self.critic.parameters()), list(self.critic_target.parameters())
         actor_parameters, critic_parameters = (
             [parameter for group in optimizer.param_groups for parameter in group["params"]] for optimizer in optimizers[:2]
         )
-        # Those that are optimized, without layers that were frozen
-        trained_actor_parameters, trained_critic_parameters = (
-            [parameter for parameter in parameters if parameter.requires_grad]
-            for parameters in (actor_parameters, critic_parameters)
-        )
-        log_lambda_min, log_lambda_max = math.log(self.lambda_min), math.log(self.lambda_max)
+        critic_weights, critic_target_weights = list(self.critic.parameters()), list(self.critic_target.parameters())
+        weights = Weights(actor_parameters, critic_parameters, critic_weights, critic_target_weights)
         # Kept on the device until the end: reading one value would wait for all pending work
-        metrics: dict[str, th.Tensor] = {}
+        names: tuple[str, ...] = ()
         metrics_per_step: list[th.Tensor] = []
 
-        for gradient_step in range(gradient_steps):
-            # Sample replay buffer
-            replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
-            # The largest reward costs nothing, and so no cost is negative
-            n_rewards = weight_of_return(replay_data.discounts, self.gamma)
-            bound = self._raise_bound(replay_data.rewards / n_rewards)
-            costs = bound * n_rewards - replay_data.rewards
-
-            # We need to sample because `log_std` may have changed between two gradient steps
-            if self.use_sde:
-                self.actor.reset_noise()
-                if self.actor_target is not None:
-                    self.actor_target.reset_noise()
-
-            # Action by the current actor for the sampled states
-            actions_pi, log_prob = self.actor.action_log_prob(replay_data.observations)
-
-            with th.no_grad():
-                # Next action by the current actor, or by the lagged one
-                next_actor = self.actor if self.actor_target is None else self.actor_target
-                next_actions = next_actor(replay_data.next_observations)
-
-            target_values = self._target_values(replay_data, next_actions)
-            # Get current Lyapunov values for each critic network
-            # using action from the replay buffer (all values are relative to the offset)
-            current_values = self.critic(replay_data.observations, replay_data.actions)
-            critic_loss = 0.5 * sum(F.mse_loss(current_value, target_values) for current_value in current_values)
-            assert isinstance(critic_loss, th.Tensor)  # for type checker
-
-            values = largest_value(current_values).detach()
-            if self.published_update:
-                # A gradient through the next action
-                next_actions = self.actor(replay_data.next_observations)
-            difference = self._violation(replay_data, next_actions, values, costs)
-
-            # What the actor lowers: with the published update the difference itself
-            objective = difference
-            if not self.published_update:
-                objective = largest_value(self.critic(replay_data.observations, actions_pi)).mean()
-
-            # Important: detach the multipliers from the graph
-            # so we don't change them with other losses
-            # see https://github.com/rail-berkeley/softlearning/issues/60
-            lambda_coef = th.exp(self.log_lambda.detach())
-            ent_coef = self.ent_coef_tensor if self.log_ent_coef is None else th.exp(self.log_ent_coef.detach())
-            # Lagrangian of the decrease condition and of the entropy constraint
-            actor_loss = lambda_coef * objective + ent_coef * log_prob.mean()
-
-            # Optimize the critic and the actor, both with the gradient at the current parameters
-            # Without ``zero_grad()``, whose records for the profiler take longer than its work
-            for parameter in (*critic_parameters, *actor_parameters):
-                parameter.grad = None
-            critic_loss.backward(inputs=trained_critic_parameters)
-            # Without the gradient of the critic's weights, which the loss of the actor depends on too
-            actor_loss.backward(inputs=trained_actor_parameters)
-            self.critic.optimizer.step()
-            self.actor.optimizer.step()
-
-            # Optimize the multiplier of the decrease condition
-            lambda_loss = update_multiplier(self.log_lambda, self.lambda_optimizer, difference)
-            # Project it: a logarithm beyond its limits would need as many steps to come back (wind-up)
-            with th.no_grad():
-                self.log_lambda.clamp_(log_lambda_min, log_lambda_max)
-
-            metrics = {
-                "actor_loss": actor_loss,
-                "critic_loss": critic_loss,
-                "ent_coef": ent_coef,
-                "lambda": lambda_coef,
-                "lambda_saturation": self.log_lambda >= log_lambda_max,
-                "lambda_loss": lambda_loss,
-                "lyapunov_difference": difference,
-                "lyapunov_mean": values.mean() + self.critic.offset,
-                "cost": costs.mean(),
-            }
-
-            # Optimize entropy coefficient, also called
-            # entropy temperature or beta in the paper
-            if self.ent_coef_optimizer is not None and self.log_ent_coef is not None:
-                assert isinstance(self.target_entropy, float)
-                ent_coef_loss = update_multiplier(
-                    self.log_ent_coef, self.ent_coef_optimizer, log_prob.mean() + self.target_entropy
-                )
-                metrics["ent_coef_loss"] = ent_coef_loss
-
-            with th.no_grad():
-                metrics_per_step.append(th.hstack(tuple(metrics.values())))
-
-            # Update target networks
-            if gradient_step % self.target_update_interval == 0:
-                polyak_update(critic_weights, critic_target_weights, self.tau)
-                # Copy running stats, see GH issue #996
-                polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
-                if self.actor_target is not None:
-                    polyak_update(self.actor.parameters(), self.actor_target.parameters(), self.tau)
+        with nullcontext(self._update) if self._compiled is None else self._compiled.ready(self, optimizers) as update:
+            for gradient_step in range(gradient_steps):
+                # Sample replay buffer
+                replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
+                # The largest reward costs nothing, and so no cost is negative
+                n_rewards = weight_of_return(replay_data.discounts, self.gamma)
+                costs = self._raise_bound(replay_data.rewards / n_rewards) * n_rewards - replay_data.rewards
+                names, metrics = update(replay_data, costs, weights, gradient_step % self.target_update_interval == 0)
+                metrics_per_step.append(metrics)
 
         self._n_updates += gradient_steps
 
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         if metrics_per_step:
             # One transfer from the device for all metrics of all gradient steps
-            for name, value in zip(metrics, th.stack(metrics_per_step).mean(dim=0).tolist(), strict=True):
+            for name, value in zip(names, th.stack(metrics_per_step).mean(dim=0).tolist(), strict=True):
                 self.logger.record(f"train/{name}", value)
         if self.gamma >= 1:
             # Positive rewards that were computed at sampling (HER) have not been seen before
@@ -696,6 +724,8 @@ class LAC(OffPolicyAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfLAC:
+        if self.compile_update:
+            check_compiler(self.device)
         return super().learn(
             total_timesteps=total_timesteps,
             callback=callback,
@@ -714,6 +744,7 @@ class LAC(OffPolicyAlgorithm):
             "critic_target",
             "batch_norm_stats",
             "batch_norm_stats_target",
+            "_compiled",
         ]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

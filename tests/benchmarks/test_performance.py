@@ -11,7 +11,7 @@ import torch as th
 from stable_baselines3 import SAC
 
 from benchmarks import performance
-from sb3_lac import LAC
+from sb3_lac import LAC, compiled
 
 
 @pytest.fixture(autouse=True)
@@ -28,6 +28,7 @@ def small(monkeypatch):
         "_COPIED_NUMBERS": 64,
     }.items():
         monkeypatch.setattr(performance, name, value)
+    monkeypatch.setattr(compiled, "_BACKEND", "eager")
     yield
     th.set_num_threads(threads)
 

@@ -1,0 +1,179 @@
+"""The update of LAC as one compiled graph. What an update is stands in ``lac.py``, here is only how it is compiled."""
+
+import inspect
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.sac.policies import Actor
+
+# The first version that traces gradients within a graph
+_OLDEST_TORCH = "2.11"
+# Of ``torch.compile``. Tests have a quicker one
+_BACKEND = "inductor"
+# What sampling leaves behind in an action distribution. The graphs that it belongs to are gone after an update
+_LEFT_BEHIND = ("distribution", "gaussian_actions", "weights_dist", "exploration_mat", "exploration_matrices", "_latent_sde")
+
+# Names and values of what is logged
+Metrics = tuple[tuple[str, ...], th.Tensor]
+
+
+def set_gradients(loss: th.Tensor, parameters: Sequence[th.Tensor]) -> None:
+    """
+    Let parameters have the gradient of a loss, for the next step of their optimizer.
+
+    :param loss: The loss
+    :param parameters: All parameters of the optimizer. Those of frozen layers get no gradient
+    """
+    trained = [parameter for parameter in parameters if parameter.requires_grad]
+    if th.compiler.is_compiling():
+        gradients = th.autograd.grad(loss, trained, materialize_grads=True)
+        for parameter, gradient in zip(trained, gradients, strict=True):
+            set_gradient(parameter, gradient)
+    else:
+        # Without ``zero_grad()``, whose records for the profiler take longer than its work
+        for parameter in parameters:
+            parameter.grad = None
+        loss.backward(inputs=trained)
+
+
+def set_gradient(parameter: th.Tensor, gradient: th.Tensor) -> None:
+    """
+    :param parameter: Parameter of an optimizer
+    :param gradient: For its next step
+    """
+    if th.compiler.is_compiling():
+        # A compiled step reads the tensors that it was compiled with
+        assert parameter.grad is not None
+        parameter.grad.copy_(gradient)
+    else:
+        parameter.grad = gradient
+
+
+def step(optimizer: th.optim.Optimizer) -> None:
+    """
+    :param optimizer: Takes a step with the gradients of its parameters
+    """
+    if th.compiler.is_compiling():
+        # Without the wrappers for hooks and profiler, which no graph goes through
+        with th.no_grad():
+            inspect.unwrap(type(optimizer).step)(optimizer)
+    else:
+        optimizer.step()
+
+
+def actors_of(model: Any) -> list[Actor]:
+    """
+    :param model: A LAC model
+    :return: Its actor, and its target actor if there is one
+    """
+    return [model.actor] if model.actor_target is None else [model.actor, model.actor_target]
+
+
+def check_torch() -> None:
+    """
+    :raises RuntimeError: If this PyTorch cannot compile an update
+    """
+    if th.__version__ < _OLDEST_TORCH:
+        raise RuntimeError(
+            f"compile_update=True needs torch>={_OLDEST_TORCH}, and this is torch {th.__version__}: "
+            "older versions cannot have gradients within a compiled graph. Upgrade torch, or use compile_update=False."
+        )
+
+
+def check_compiler(device: th.device) -> None:
+    """
+    :param device: Device of the model
+    :raises RuntimeError: If nothing can be compiled for that device
+    """
+    try:
+        th.compile(th.neg, backend=_BACKEND)(th.zeros(8, device=device))
+    except Exception as error:
+        raise RuntimeError(
+            f"compile_update=True needs a working torch.compile, which fails on device={device}: {error}\n"
+            "Install a C++ compiler (for a CPU) or triton (for a GPU), or use compile_update=False."
+        ) from error
+
+
+class CompiledUpdate:
+    """
+    The update of a model as one graph without breaks, which a GPU replays at one launch (CUDA graph). It is compiled at its
+    first call, and again when something has changed that it took for constant.
+
+    :param device: Device of the model
+    """
+
+    def __init__(self, device: th.device) -> None:
+        check_torch()
+
+        def run(model: Any, *args: Any) -> Metrics:
+            with th.enable_grad():
+                metrics = model._update(*args)
+            for actor in actors_of(model):
+                for name in _LEFT_BEHIND:
+                    if name in vars(actor.action_dist):
+                        setattr(actor.action_dist, name, None)
+            return metrics
+
+        # PyTorch limits how often a code object is compiled: each model has its own
+        run.__code__ = run.__code__.replace()
+        self._on_gpu = device.type == "cuda"
+        mode = "reduce-overhead" if self._on_gpu else None
+        self._run = th.compile(run, fullgraph=True, dynamic=False, backend=_BACKEND, mode=mode)
+        # One per group of parameters. A number would be a constant of the graph
+        self._learning_rates: list[th.Tensor] = []
+
+    @contextmanager
+    def ready(self, model: Any, optimizers: Sequence[th.optim.Optimizer]) -> Iterator[Callable[..., Metrics]]:
+        """
+        Have optimizers in a form that can be compiled and, on a GPU, transitions sampled without waiting for it. All is as it
+        was afterwards, so that models are saved as without compilation.
+
+        :param model: A LAC model
+        :param optimizers: All of its optimizers
+        :return: What to call in place of ``model._update``
+        """
+        from torch import _dynamo as dynamo  # Takes seconds
+
+        groups = [group for optimizer in optimizers for group in optimizer.param_groups]
+        changed: list[dict[str, Any]] = [*groups, *(vars(actor.action_dist) for actor in actors_of(model))]
+        before = [values.copy() for values in changed]
+        if not self._learning_rates:
+            self._learning_rates = [th.zeros((), device=model.device) for _ in groups]
+            # CUDA graphs read and write them where they are
+            for tensor in (*self._learning_rates, *(parameter for group in groups for parameter in group["params"])):
+                dynamo.mark_static_address(tensor)
+        for group, learning_rate in zip(groups, self._learning_rates, strict=True):
+            learning_rate.fill_(group["lr"])
+            # The compiler fuses the operations of a step by itself
+            form = {"lr": learning_rate, "capturable": self._on_gpu, "foreach": None, "fused": None}
+            group.update({name: value for name, value in form.items() if name in group})
+            for parameter in group["params"]:
+                if not parameter.requires_grad:
+                    parameter.grad = None
+                elif parameter.grad is None:
+                    parameter.grad = th.zeros_like(parameter)
+                    dynamo.mark_static_address(parameter.grad)
+
+        def update(*args: Any) -> Metrics:
+            # A replay of a CUDA graph overwrites what the one before returned
+            th.compiler.cudagraph_mark_step_begin()
+            names, values = self._run(model, *args)
+            return names, values.clone()
+
+        def to_gpu(array: np.ndarray, copy: bool = True) -> th.Tensor:
+            return th.as_tensor(array).pin_memory().to(model.device, non_blocking=True)
+
+        if self._on_gpu:
+            # Hides the method, whose copies wait for the GPU
+            model.replay_buffer.to_torch = to_gpu
+        try:
+            with th.no_grad(), dynamo.config.patch(trace_autograd_ops=True):
+                yield update
+        finally:
+            for values, old in zip(changed, before, strict=True):
+                values.update(old)
+            if self._on_gpu:
+                del model.replay_buffer.to_torch

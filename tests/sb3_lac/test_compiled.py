@@ -1,0 +1,229 @@
+"""An update as one compiled graph makes the numbers of the update that it was compiled from."""
+
+import json
+import shutil
+import zipfile
+
+import numpy as np
+import pytest
+import torch as th
+import torch._dynamo as dynamo
+from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.envs import BitFlippingEnv
+from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from torch._dynamo.backends.common import aot_autograd
+from torch._functorch.aot_autograd import make_boxed_func
+from torch.torch_version import TorchVersion
+
+from sb3_lac import LAC, compiled
+
+
+@pytest.fixture(autouse=True)
+def _quick_backend(monkeypatch):
+    """The graph as it was traced, without minutes for making code of it."""
+    monkeypatch.setattr(compiled, "_BACKEND", "eager")
+    yield
+    th.compiler.reset()
+
+
+def trained(model, calls=3, gradient_steps=2):
+    """The model after updates on the same batches whatever the model, and what it logged."""
+    np.random.seed(0)
+    th.manual_seed(0)
+    logged = []
+    for call in range(calls):
+        model._update_current_progress_remaining(call, calls)
+        model.train(gradient_steps, model.batch_size)
+        logged.append(dict(model.logger.name_to_value))
+    return model, logged
+
+
+def tensors_of(model):
+    state_dicts, names = model._get_torch_save_params()
+    tensors = {name: getattr(model, name).detach() for name in names}
+    for name in state_dicts:
+        if "optimizer" not in name:
+            tensors |= {f"{name}.{key}": tensor for key, tensor in getattr(model, name).state_dict().items()}
+    return tensors
+
+
+def assert_close(model, other):
+    th.testing.assert_close(tensors_of(model), tensors_of(other), rtol=1e-4, atol=1e-6)
+
+
+SCHEDULES = {"learning_rate": LinearSchedule(1e-2, 1e-4, 1.0), "lambda_learning_rate": LinearSchedule(1e-3, 1e-2, 1.0)}
+
+
+@pytest.mark.parametrize(
+    "kwargs",
+    [
+        SCHEDULES,
+        {"published_update": True, "ent_coef": 0.2, "reward_bound": 3.0, "n_steps": 3},
+        {"horizon": 5, "policy_kwargs": {"n_critics": 2, "optimizer_class": th.optim.SGD, "share_features_extractor": True}},
+    ],
+    ids=["schedules", "published", "horizon"],
+)
+def test_compiled_and_eager_updates_are_the_same(make_model, kwargs):
+    eager, eager_logged = trained(make_model(**kwargs))
+    model = make_model(compile_update=True, **kwargs)
+    dynamo.utils.counters.clear()
+    # Neither a schedule nor the next call of ``train()`` is a reason to compile again
+    with dynamo.config.patch(error_on_recompile=True):
+        _, logged = trained(model)
+    assert dynamo.utils.counters["stats"]["unique_graphs"] == 1
+    for values, eager_values in zip(logged, eager_logged, strict=True):
+        assert values == pytest.approx(eager_values, rel=1e-4, abs=1e-5)
+    assert_close(model, eager)
+
+
+def test_constants_may_change(make_model):
+    models = [make_model(compile_update=compile_update, target_update_interval=2) for compile_update in (False, True)]
+    for model in models:
+        trained(model, calls=1)
+        model.alpha3, model.lambda_min = 0.2, 0.5
+        model.actor.latent_pi[0].requires_grad_(False)
+        frozen = model.actor.latent_pi[0].weight.clone()
+        trained(model, calls=1)
+        assert th.equal(model.actor.latent_pi[0].weight, frozen)
+    assert_close(*models)
+
+
+def test_graph_is_one_that_a_gpu_can_replay(make_model, monkeypatch):
+    """CUDA graphs take tensors that are changed where they are, need no value on the CPU, and have outputs of their own."""
+    graphs = []
+
+    def compiler(graph, inputs):
+        static = th._guards.TracingContext.get().fw_metadata.static_input_indices
+        graphs.append((graph.graph, static))
+        return make_boxed_func(graph.forward)
+
+    backend = aot_autograd(fw_compiler=compiler, keep_inference_input_mutations=True)
+    monkeypatch.setattr(compiled, "_BACKEND", backend)
+    model = make_model(compile_update=True, use_sde=True, published_update=True)
+    graphs.clear()
+    trained(model, calls=2)
+    ((graph, static),) = graphs
+    inputs = graph.find_nodes(op="placeholder")
+    copies = graph.find_nodes(op="call_function", target=th.ops.aten.copy_.default)
+    changed = {inputs.index(node.args[0]) for node in copies}
+    n_learned = sum(len(list(module.parameters())) for module in (model.actor, model.critic)) + 2
+    n_targets = sum(len(list(module.parameters())) for module in (model.actor_target, model.critic_target))
+    # Weight, gradient, both moments and number of steps
+    assert len(changed) == 5 * n_learned + n_targets
+    assert changed <= set(static)
+    # Sampled: observations, actions, next observations, ends and rewards; and their costs
+    assert len(inputs) - len(static) == 6
+    assert len(graph.find_nodes(op="output")[0].args[0]) == 1
+    assert not graph.find_nodes(op="call_function", target=th.ops.aten._local_scalar_dense.default)
+
+
+def test_every_model_may_be_compiled(make_model):
+    with dynamo.config.patch(recompile_limit=1):
+        for _ in range(2):
+            trained(make_model(compile_update=True), calls=1)
+
+
+def test_training_leaves_optimizers_and_exploration_as_they_were(make_model):
+    model = make_model(compile_update=True, use_sde=True)
+    optimizers = [model.actor.optimizer, model.critic.optimizer, model.lambda_optimizer, model.ent_coef_optimizer]
+    options = [
+        {name: value for name, value in optimizer.param_groups[0].items() if name != "params"} for optimizer in optimizers
+    ]
+    matrix = model.actor.action_dist.exploration_mat
+    trained(model, calls=1)
+    for optimizer, before in zip(optimizers, options, strict=True):
+        assert {name: value for name, value in optimizer.param_groups[0].items() if name != "params"} == before
+        assert isinstance(optimizer.param_groups[0]["lr"], float)
+    assert model.actor.action_dist.exploration_mat is matrix
+    assert np.isfinite(model.predict(np.zeros(2, dtype=np.float32))[0]).all()
+
+
+def test_saved_models_go_on_compiled_or_not(make_model, tmp_path):
+    model, _ = trained(make_model(compile_update=True, **SCHEDULES), calls=1)
+    model.save(tmp_path / "compiled")
+    with zipfile.ZipFile(tmp_path / "compiled.zip") as file:
+        data = json.loads(file.read("data"))
+    assert data["compile_update"] is True and "_compiled" not in data
+    going_on = [model]
+    for compile_update in (False, True):
+        loaded = LAC.load(tmp_path / "compiled", compile_update=compile_update)
+        assert loaded.critic.optimizer.param_groups[0]["fused"] is True
+        loaded.set_logger(model.logger)
+        loaded.replay_buffer = model.replay_buffer
+        going_on.append(loaded)
+    for each in going_on:
+        trained(each)
+        assert_close(each, model)
+    assert LAC.load(tmp_path / "compiled").compile_update
+
+
+def test_any_replay_buffer_and_vec_normalize(make_model):
+    env = VecNormalize(DummyVecEnv([lambda: BitFlippingEnv(n_bits=3, continuous=True)]), norm_obs=False)
+    model = make_model(env, policy="MultiInputPolicy", replay_buffer_class=HerReplayBuffer, n_collect=39, compile_update=True)
+    model.learn(7, reset_num_timesteps=False)
+    assert model._n_updates == 6 and th.isfinite(model.log_lambda).all()
+
+
+def test_transitions_for_a_gpu_are_sampled_into_pinned_memory(make_model, monkeypatch):
+    model = make_model(compile_update=True)
+    pinned = []
+    monkeypatch.setattr(th.Tensor, "pin_memory", lambda tensor: pinned.append(tensor) or tensor)
+    model._compiled._on_gpu = True
+    eager, _ = trained(make_model(), calls=1)
+    trained(model, calls=1)
+    assert len(pinned) == 2 * 5
+    assert "to_torch" not in vars(model.replay_buffer)
+    assert_close(model, eager)
+
+
+def test_old_torch_is_refused(make_model, monkeypatch):
+    monkeypatch.setattr(th, "__version__", TorchVersion("2.10.1+cpu"))
+    with pytest.raises(RuntimeError, match=r"needs torch>=2.11, and this is torch 2.10.1\+cpu"):
+        make_model(compile_update=True)
+
+
+def test_missing_compiler_is_noticed_before_the_first_step(make_model, monkeypatch):
+    def no_compiler(graph, inputs):
+        raise OSError("no compiler here")
+
+    model = make_model(n_collect=0, compile_update=True)
+    monkeypatch.setattr(compiled, "_BACKEND", no_compiler)
+    with pytest.raises(RuntimeError, match=r"fails on device=cpu: (.|\n)*no compiler here(.|\n)*compile_update=False"):
+        model.learn(10)
+    assert model.num_timesteps == 0
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")
+def test_compiled_code_makes_the_same_updates(make_model, monkeypatch):
+    kwargs = {"policy_kwargs": {"net_arch": [4], "optimizer_class": th.optim.SGD}}
+    monkeypatch.setattr(compiled, "_BACKEND", "inductor")
+    eager, _ = trained(make_model(**kwargs))
+    # Otherwise compiled code has random numbers of its own
+    with th._inductor.config.patch(fallback_random=True):
+        model, _ = trained(make_model(compile_update=True, **kwargs))
+    assert_close(model, eager)
+
+
+@pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
+def test_updates_do_not_wait_for_the_gpu(make_model, monkeypatch):
+    monkeypatch.setattr(compiled, "_BACKEND", "inductor")
+    model, _ = trained(make_model(compile_update=True, device="cuda"))
+    sample, record = model.replay_buffer.sample, model.logger.record
+
+    def first_sample(*args, **kwargs):
+        th.cuda.set_sync_debug_mode("error")
+        return sample(*args, **kwargs)
+
+    def last_record(*args, **kwargs):
+        # The one transfer of what is logged comes after it
+        th.cuda.set_sync_debug_mode("default")
+        record(*args, **kwargs)
+
+    monkeypatch.setattr(model.replay_buffer, "sample", first_sample)
+    monkeypatch.setattr(model.logger, "record", last_record)
+    try:
+        trained(model, gradient_steps=20)
+    finally:
+        th.cuda.set_sync_debug_mode("default")
