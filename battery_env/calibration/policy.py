@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from battery_env.calibration.aging import BatteryAging
 from battery_env.calibration.env import CalibrationEnv
+from battery_env.calibration.pretrained import pretrained_policy
 from battery_env.calibration.streaming import ReadingsSoFar, resume
 from battery_env.calibration.voltage import VoltageTask
-from battery_env.electrochemistry import NEW_CELL, STATE_SIZE
+from battery_env.electrochemistry import NEW_CELL, STATE_SIZE, UNCERTAIN_CONSTANTS
 from battery_env.estimators.base import Estimate, EstimateTrace, ModelNow, OnlineEstimator, Record
 from battery_env.record_model import RecordModel
 from battery_env.records import check_drawn_charge, check_sample
@@ -70,6 +71,21 @@ class PolicyEstimator(OnlineEstimator):
         self.dt_s = _STEP_S
         self.reset()
 
+    @classmethod
+    def pretrained(cls, env_id: str = "BatteryVoltageJoint-v0", decision_s: float = 60.0) -> PolicyEstimator:
+        """
+        A policy of LAC that comes with the package, with the options of the task that it was trained on. What made it and what
+        it is worth says :func:`~battery_env.calibration.pretrained.pretrained_card`.
+
+        :param env_id: id of a voltage-only environment of single discharges
+        :param decision_s: time between two estimates, s, a multiple of the interval between its readings
+        :return: the estimator
+        :raises ValueError: for another id, or a time out of range
+        :raises ImportError: without the extra ``battery_env[onnx]``
+        """
+        policy, options = pretrained_policy(env_id)
+        return cls(policy, env_id, decision_s, **options)
+
     @staticmethod
     def environment(env_id: str, **options: Any) -> CalibrationEnv:
         """
@@ -94,6 +110,7 @@ class PolicyEstimator(OnlineEstimator):
         self._decisions = 0
         self._now = np.array([NEW_CELL.q_mobile, NEW_CELL.r_o])
         self._action = np.zeros(len(self.parameters))
+        self._logarithms = np.zeros(len(UNCERTAIN_CONSTANTS))
 
     def check(self, voltage_V: float, current_A: float, dt_s: float, temperature_C: float | None = None) -> None:
         """
@@ -141,7 +158,7 @@ class PolicyEstimator(OnlineEstimator):
     def _decide(self, due: int) -> None:
         """One decision, on all readings up to the time when it was due."""
         task = self.task_class.follow([self._readings.record(self.dt_s)], due * self._every, **self.options)
-        resume(task, self._now, self._action)
+        self._logarithms = resume(task, self._now, self._action, self._logarithms)
         action, _ = self.policy.predict(task.observation(), deterministic=True)
         task.advance(np.asarray(action))
         self._decisions, self._now, self._action = due, task.estimate[0], np.clip(np.asarray(action)[0], -1.0, 1.0)
@@ -164,12 +181,18 @@ class PolicyEstimator(OnlineEstimator):
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         progress = np.array([self._drawn_C, self._decisions, *self._now])
-        return {"samples": self._readings.columns(), "progress": progress, "action": self._action}
+        return {
+            "samples": self._readings.columns(),
+            "progress": progress,
+            "action": self._action,
+            "logarithms": self._logarithms,
+        }
 
     def _restore(self, arrays: dict[str, NDArray[Any]]) -> None:
         self._readings = ReadingsSoFar.of(arrays["samples"])
         self._drawn_C, self._decisions = float(arrays["progress"][0]), int(arrays["progress"][1])
         self._now, self._action = arrays["progress"][2:].copy(), arrays["action"].copy()
+        self._logarithms = arrays["logarithms"].copy()
 
     def estimate(self, record: Record) -> Estimate:
         """
