@@ -17,6 +17,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -140,6 +141,7 @@ def card_of(recipe: Recipe, scores: pd.DataFrame, command: str, folder: Path) ->
     return {
         "env_id": recipe.env_id,
         "options": OPTIONS,
+        "sha256": sha256((folder / f"{recipe.env_id}.onnx").read_bytes()).hexdigest(),
         "algorithm": "LAC",
         "command": command,
         "recipe": asdict(recipe),
@@ -186,8 +188,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = command_line("pretrained", __doc__, jobs=1)
     parser.add_argument("--envs", nargs="+", choices=FOUND, default=list(FOUND), metavar="ID")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--updates", type=positive, default=16_000, help="gradient steps")
-    parser.add_argument("--discharges", type=positive, default=100, help="test discharges of the evaluation, up to 300")
+    parser.add_argument("--updates", type=positive, default=5000, help="gradient steps")
+    parser.add_argument("--discharges", type=positive, default=60, help="test discharges of the evaluation, up to 300")
     study = Study(parser, arguments)
     chosen = study.chosen
     if chosen.discharges > 300:

@@ -93,7 +93,12 @@ class NuisanceFit:
         self.observation_size = 2 * len(self._columns) + 2 + len(constants)
 
     def step(
-        self, rows: IntArray, count: IntArray, first: IntArray, estimate: FloatArray, measured: tuple[FloatArray, ...]
+        self,
+        rows: IntArray,
+        count: IntArray,
+        first: IntArray,
+        estimate: FloatArray,
+        measured: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
     ) -> None:
         """
         Take one step.

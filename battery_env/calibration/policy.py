@@ -17,7 +17,7 @@ from battery_env.calibration.voltage import VoltageTask
 from battery_env.electrochemistry import NEW_CELL, STATE_SIZE, UNCERTAIN_CONSTANTS
 from battery_env.estimators.base import Estimate, EstimateTrace, ModelNow, OnlineEstimator, Record
 from battery_env.record_model import RecordModel
-from battery_env.records import check_drawn_charge, check_sample
+from battery_env.records import check_drawn_charge, check_record, check_sample, drawn
 
 _UNSURE = "A policy states no uncertainty."
 # A full cell takes no more charge than this, C.
@@ -201,7 +201,10 @@ class PolicyEstimator(OnlineEstimator):
 
         :param record: one discharge; with the full state a simulated one, as no recording has it
         :return: the estimate; never settled, as a policy states no uncertainty
+        :raises ValueError: for a record that cannot be meant
         """
+        time_s, _, current_A = check_record(record.time_s, record.voltage_V, record.current_A)
+        check_drawn_charge(float(drawn(time_s, current_A, time_s[-1])))
         trace = self.trace([record])[0]
         q_mobile, r_o = (self.task_class.conclude(values) for values in (trace.q_mobile, trace.r_o))
         return Estimate(q_mobile, r_o, settled=False, reason=_UNSURE)

@@ -25,7 +25,7 @@ from battery_env.electrochemistry import (
 )
 from battery_env.electrochemistry.cell import BULK_RATE, SURFACE_RATE
 from battery_env.electrochemistry.kernels import BLOCK, equilibrium_voltage, mole_fraction, nominal_overpotentials
-from battery_env.records import Record, resample_current
+from battery_env.records import Record, check_record, resample_current
 
 # Far more charge and exactly as much resistance as it takes to read the linear part of the model off one simulation
 _PLENTY_C = 1e6
@@ -97,7 +97,8 @@ class Readings:
         :param dt_s: time step at which the current is followed, s
         :param cell: constants of the model
         :return: their readings
-        :raises ValueError: for an interval that is no multiple of the time step, or a discharge shorter than two intervals
+        :raises ValueError: for an interval that is no multiple of the time step, a discharge shorter than two intervals, or
+            samples that cannot be meant
         """
         steps = round(interval_s / dt_s)
         if steps < 1 or abs(steps * dt_s - interval_s) > 1e-9 * interval_s:
@@ -105,19 +106,20 @@ class Readings:
         columns: list[tuple[FloatArray, ...]] = []
         start_s: list[float] = []
         for n, record in enumerate(records):
-            time_s = np.asarray(record.time_s, dtype=np.float64) - record.time_s[0]
+            samples = check_record(record.time_s, record.voltage_V, record.current_A, least_samples=2)
+            time_s = samples.time_s - samples.time_s[0]
             count = int(np.floor(time_s[-1] / interval_s + 1e-9))
             if count < 2:
                 raise ValueError(
                     f"discharge {n} lasts {time_s[-1]:g} s, at least two intervals of {interval_s:g} s are needed"
                 )
-            current_A = resample_current(time_s, np.asarray(record.current_A), dt_s, count * steps)
+            current_A = resample_current(time_s, samples.current_A, dt_s, count * steps)
             at_s = interval_s * np.arange(1, count + 1)
             start_s.append(float(record.time_s[0]))
             drawn_C, moved_C, ohmic_A = _linear_part(current_A, steps, dt_s, cell)
             columns.append(
                 (
-                    np.interp(at_s, time_s, record.voltage_V),
+                    np.interp(at_s, time_s, samples.voltage_V),
                     current_A.reshape(count, steps).mean(axis=1),
                     drawn_C,
                     moved_C,
