@@ -108,7 +108,8 @@ def summary(scores: pd.DataFrame) -> pd.DataFrame:
     """
     rows = []
     for (env_id, mismatch, sensor), group in scores.groupby(["env_id", "mismatch", "sensor"], sort=False):
-        for name in SYMBOLS if FOUND[env_id] == "joint" else (FOUND[env_id],):
+        found = FOUND[str(env_id)]
+        for name in SYMBOLS if found == "joint" else (found,):
             error = group[f"{name}_second_half_mape_percent"]
             rows.append(
                 {
@@ -168,7 +169,7 @@ def shown(table: pd.DataFrame) -> str:
                 "environment": row.env_id,
                 "constants off by": f"{row.mismatch:g}",
                 "sensor": row.sensor,
-                "parameter": SYMBOLS[row.parameter],
+                "parameter": SYMBOLS[str(row.parameter)],
                 "mean ± sd (worst) error, second half (%)": (
                     f"{row.mean_percent:.2f} ± {row.sd_percent:.2f} ({row.worst_percent:.1f})"
                 ),
