@@ -5,11 +5,12 @@ files with a card each that says what made them and what they are worth.
 .. code-block:: bash
 
   python -m benchmarks.pretrained
-  cp results/pretrained/Battery*.onnx results/pretrained/Battery*-v0.json battery_env/pretrained_policies/
+  python -m benchmarks.pretrained --envs BatteryVoltageJoint-v0 --updates 16000 --out results/pretrained_joint
 
-The settings are those of ``zoo_configs``, with the options of the task below. Scores are of held-out discharges of the same
-environments (mean error over the second half of each), with the constants of the model right and wrong. Training
-is not repeated, nor is a part of the evaluation.
+Files and cards are shipped from ``battery_env/pretrained_policies``, Joint from the second command. The settings are those
+of ``zoo_configs``, with the options of the task below. Scores are of held-out discharges of the same environments (mean error
+over the second half of each), with the constants of the model right and wrong. Training is not repeated, nor is a part of the
+evaluation.
 """
 
 from __future__ import annotations
