@@ -122,7 +122,14 @@ def _add_calibration(group: argparse._ArgumentGroup) -> None:
         "--method",
         choices=METHODS,
         default=METHODS[0],
-        help="least squares for whole discharges, the filter for one in progress without a prior (default: %(default)s)",
+        help="least squares for whole discharges, the filter for one in progress without a prior, or a policy trained on "
+        "simulated cells (default: %(default)s)",
+    )
+    group.add_argument(
+        "--policy",
+        type=Path,
+        metavar="FILE.onnx",
+        help="what --method policy follows (default: the policy that comes with the package)",
     )
     group.add_argument(
         "--parameters",
@@ -310,6 +317,7 @@ def _settings(options: argparse.Namespace) -> Settings:
         "thermal": False if options.isothermal else None,
         "ambient_C": options.ambient,
         "nominal_Ah": options.nominal,
+        "policy": options.policy,
     }
     given = {name: value for name, value in given.items() if value is not None}
     return Settings.for_cell(read_cell(options.cell), **given) if options.cell else Settings(**given)
@@ -391,6 +399,8 @@ def _conclude(done: Sequence[dict[str, Any]], settings: Settings) -> None:
         settled = sum(not row["error"] and row["settled"] for row in done)
         refused = sum(bool(row["error"]) for row in done)
         print(f"\n{len(done)} discharges: {settled} settled, {len(done) - settled - refused} not settled, {refused} refused")
+        if settings.method == "policy":
+            print(f"calibrated by {settings.calibrated_by}, which states no uncertainty")
     elif done and not done[0]["error"]:
         print(text_of(done[0]["record"], done[0], settings))
 
@@ -399,9 +409,11 @@ def _print_line(row: dict[str, Any]) -> None:
     if row["error"]:
         return
     health = "" if math.isnan(row["state_of_health"]) else f"  health {row['state_of_health']:.3f}"
+    has_sd = row["method"] != "policy"
+    sd_q_mobile, sd_r_o = (f" sd {row['sd_q_mobile_C']:3.0f}", f" sd {row['sd_r_o_ohm']:.4f}") if has_sd else ("", "")
     print(
-        f"{row['record']:<18} q_mobile {row['q_mobile_C']:5.0f} C sd {row['sd_q_mobile_C']:3.0f}  r_o {row['r_o_ohm']:.4f} "
-        f"ohm sd {row['sd_r_o_ohm']:.4f}  drawn {row['drawn_Ah']:.3f} Ah{health}  RMSE {1e3 * row['voltage_rmse_V']:3.0f} mV  "
+        f"{row['record']:<18} q_mobile {row['q_mobile_C']:5.0f} C{sd_q_mobile}  r_o {row['r_o_ohm']:.4f} "
+        f"ohm{sd_r_o}  drawn {row['drawn_Ah']:.3f} Ah{health}  RMSE {1e3 * row['voltage_rmse_V']:3.0f} mV  "
         f"{'settled' if row['settled'] else 'not settled: ' + row['reason']}",
         flush=True,
     )

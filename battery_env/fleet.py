@@ -370,8 +370,9 @@ def _title(name: str, row: Mapping[str, Any]) -> str:
         ("$q^{max}$", row["q_mobile_C"], row["sd_q_mobile_C"], 0, "C"),
         ("$R_o$", row["r_o_ohm"], row["sd_r_o_ohm"], 4, "$\\Omega$"),
     ):
-        spread = "held" if np.isnan(sd) else f"sd {sd:.{digits}f}"
-        parts.append(f"{symbol} {value:.{digits}f} {unit} ({spread})")
+        spread = " (held)" if np.isnan(sd) else f" (sd {sd:.{digits}f})"
+        # a policy states none
+        parts.append(f"{symbol} {value:.{digits}f} {unit}" + ("" if row["method"] == "policy" else spread))
     state = "settled" if row["settled"] else "not settled"
     drawn = f"{row['drawn_Ah']:.3f} Ah drawn"
     return f"{name}: {state}\n" + ", ".join([*parts, drawn, f"RMSE {1e3 * row['voltage_rmse_V']:.0f} mV"])

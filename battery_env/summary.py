@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
+from battery_env.calibration.policy import PolicyEstimator
+from battery_env.calibration.pretrained import policy_of_file, pretrained_policy
 from battery_env.cells import Discharge
 from battery_env.checks import check_positive
 from battery_env.electrochemistry import NEW_CELL, CellParameters
@@ -18,11 +21,11 @@ from battery_env.estimators.cell_fit import UNFITTED_MISMATCH_V, CellFit
 from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.rest import InitialSoc, Start
-from battery_env.parameters import PARAMETER_NAMES
+from battery_env.parameters import PARAMETER_NAMES, check_parameters
 from battery_env.record_model import RecordModel, VoltageForecast
 from battery_env.records import ExpectedCurrent, expected_current
 
-Method = Literal["least-squares", "kalman"]
+Method = Literal["least-squares", "kalman", "policy"]
 METHODS: tuple[Method, ...] = get_args(Method)
 
 # A record of more samples than this is averaged over the time step of the model, or longer where it lasts longer than so many
@@ -34,6 +37,22 @@ _AMBIENT_LIMITS_C = (-60.0, 100.0)
 # The model of a cell in air warms by 2 K at 2 A, where the bundled cells warm by 16 K: that alone moves q_mobile by less than
 # 0.1 %. What is farther off than this is another cell, load or chamber than these.
 _WARMTH_LIMIT_K = 20.0
+# Policies that come with the package, by what they find.
+_PRETRAINED = {
+    frozenset({"q_mobile"}): "BatteryVoltageQmax-v0",
+    frozenset({"r_o"}): "BatteryVoltageRo-v0",
+    frozenset(PARAMETER_NAMES): "BatteryVoltageJoint-v0",
+}
+# What a policy cannot be told: it has learned on one model, and states no uncertainty.
+_NOT_FOR_POLICIES = (
+    "prior_q_mobile_C",
+    "mismatch_V",
+    "current_gain_sd",
+    "ambient_C",
+    "cell",
+    "q_mobile_bounds_C",
+    "initial_soc",
+)
 
 
 @dataclass(frozen=True)
@@ -58,6 +77,8 @@ class Settings:
     :param q_mobile_bounds_C: where to search for ``q_mobile``, C; ``None``: where the calibrator does by default
     :param initial_soc: state of charge when the load is switched on, after a rest: a number, (mean, standard deviation), or
         ``"rest"``: told from the voltage of the rest before the load, of a minute at least
+    :param policy: ONNX file of the policy that the method ``"policy"`` follows; ``None``: the one that comes with the package.
+        Its model is the new cell's at constant temperature, and it takes no prior
     :raises ValueError: for an argument out of range
     """
 
@@ -74,6 +95,7 @@ class Settings:
     cell: CellParameters | None = None
     q_mobile_bounds_C: tuple[float, float] | None = None
     initial_soc: InitialSoc = 1.0
+    policy: Path | None = None
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
@@ -87,6 +109,13 @@ class Settings:
             raise ValueError(f"the cut-off must be a voltage above 0 V, got {self.cut_off_V!r}")
         if self.future_current_A is not None and not 0.0 <= self.future_current_A < np.inf:
             raise ValueError(f"future_current_A must be finite and at least 0 A, got {self.future_current_A!r}")
+        if self.method == "policy":
+            defaults = {field.name: field.default for field in fields(self)}
+            for name in _NOT_FOR_POLICIES:
+                if getattr(self, name) != defaults[name]:
+                    raise ValueError(f"a policy takes no {name}: leave it out, or take another method")
+        elif self.policy is not None:
+            raise ValueError(f"a policy is for the method policy, got {self.method!r}")
         self.calibrator(self.cell or NEW_CELL)
 
     @classmethod
@@ -110,7 +139,9 @@ class Settings:
             cell = cell.cell
         return cls(**{"cell": cell, **others})
 
-    def calibrator(self, cell: CellParameters, start: Start | None = None) -> LeastSquares | ExtendedKalmanFilter:
+    def calibrator(
+        self, cell: CellParameters, start: Start | None = None
+    ) -> LeastSquares | ExtendedKalmanFilter | PolicyEstimator:
         """
         The calibrator that is asked for.
 
@@ -119,6 +150,8 @@ class Settings:
         :return: a new one
         :raises ValueError: for an argument out of range
         """
+        if self.method == "policy":
+            return self._policy()
         calibrator = LeastSquares if self.method == "least-squares" else ExtendedKalmanFilter
         bounds: dict[str, Any] = {} if self.q_mobile_bounds_C is None else {"q_mobile_bounds_C": self.q_mobile_bounds_C}
         return calibrator(
@@ -131,6 +164,26 @@ class Settings:
             initial_soc=self.initial_soc if start is None else (start.soc, start.sd_soc),
             **bounds,
         )
+
+    def _policy(self) -> PolicyEstimator:
+        if self.policy is None:
+            env_id = _PRETRAINED[frozenset(check_parameters(self.parameters))]
+            policy, options = pretrained_policy(env_id)
+        else:
+            policy, options = policy_of_file(self.policy)
+            env_id = policy.env_id
+        estimator = PolicyEstimator(policy, env_id, **options)
+        if set(estimator.parameters) != set(self.parameters):
+            asked, found = " and ".join(self.parameters), " and ".join(estimator.parameters)
+            raise ValueError(f"{self.policy} is a policy of {env_id}, which finds {found}, not {asked}")
+        return estimator
+
+    @property
+    def calibrated_by(self) -> str:
+        """The calibrator, for readers."""
+        if self.method != "policy":
+            return self.method
+        return "the policy that comes with the package" if self.policy is None else f"the policy of {self.policy}"
 
 
 class Summary(NamedTuple):
@@ -167,19 +220,21 @@ def summarize(discharge: Discharge, settings: Settings) -> Summary:
 
     ambient_C = _ambient_C(record, settings)
     cell = settings.cell or NEW_CELL
-    if ambient_C is not None:
+    is_policy = settings.method == "policy"
+    if ambient_C is not None and not is_policy:
         cell = cell.replace(Tb0=ambient_C + _ZERO_CELSIUS_K)
     seen = record
     if settings.ambient_C is not None or not settings.thermal:
         # a temperature that is stated, or held, counts more than one that was measured
         discharge, seen = replace(discharge, temperature_C=None), replace(record, temperature_C=None)
-    start = settings.calibrator(cell).start_of(discharge)
+    calibrator = settings.calibrator(cell)
+    start = Start(1.0, 0.0) if isinstance(calibrator, PolicyEstimator) else calibrator.start_of(discharge)
     estimate = settings.calibrator(cell, start).estimate(seen)
     if start.reason:
         estimate = replace(estimate, settled=False, reason=start.reason)
     # what a full cell would have given more, as its end comes at the same charge
     missing_Ah = (1.0 - start.soc) * estimate.q_mobile / 3600.0
-    model = RecordModel(cell, settings.thermal, initial_soc=start.soc)
+    model = RecordModel(cell, settings.thermal and not is_policy, initial_soc=start.soc)
     future = expected_current(record.time_s, record.current_A)
     if settings.future_current_A is not None:
         future = ExpectedCurrent(settings.future_current_A, varied=False, sd_A=0.0)
@@ -276,9 +331,10 @@ def text_of(name: str, row: dict[str, Any], settings: Settings) -> str:
     fitted: Sequence[str] = settings.parameters
     cut_off = f"{settings.cut_off_V:g} V"
     averaged = f", averaged over {row['averaged_over_s']:g} s," if row["averaged_over_s"] else ""
+    is_policy = settings.method == "policy"
     values = {
-        "q_mobile": (f"{row['q_mobile_C']:.0f} C", f"{row['sd_q_mobile_C']:.0f} C"),
-        "r_o": (f"{row['r_o_ohm']:.4f} ohm", f"{row['sd_r_o_ohm']:.4f} ohm"),
+        "q_mobile": (f"{row['q_mobile_C']:.0f} C", f"sd {row['sd_q_mobile_C']:.0f} C"),
+        "r_o": (f"{row['r_o_ohm']:.4f} ohm", f"sd {row['sd_r_o_ohm']:.4f} ohm"),
     }
     drawn = "so far" if in_progress else f"the capacity to {cut_off}"
     if row["initial_soc"] < 1.0 and not in_progress:
@@ -286,8 +342,12 @@ def text_of(name: str, row: dict[str, Any], settings: Settings) -> str:
     lines = [
         f"{name}: {row['samples']} samples{averaged} from load-on at {row['load_on_time_s']:.1f} s, "
         f"{3600.0 * row['drawn_Ah']:.0f} C drawn",
+        *([f"calibrated by {settings.calibrated_by}"] if is_policy else []),
         "",
-        *(f"  {key:<22}{value:>12}   {'sd ' + sd if key in fitted else 'held'}" for key, (value, sd) in values.items()),
+        *(
+            f"  {key:<22}{value:>12}   {('no sd stated' if is_policy else sd) if key in fitted else 'held'}"
+            for key, (value, sd) in values.items()
+        ),
         f"  {'settled':<22}{'yes' if row['settled'] else 'no':>12}",
         f"  {'drawn':<22}{row['drawn_Ah']:>9.3f} Ah   {drawn}",
     ]
@@ -306,7 +366,7 @@ def text_of(name: str, row: dict[str, Any], settings: Settings) -> str:
         lines.append(f"  {'temperature at the end':<22}{row['end_temperature_C']:>7.1f} degC   {ends}")
     lines.append(f"  {f'{cut_off}, predicted at':<22}{row['predicted_eod_time_s']:>10.0f} s")
     if in_progress:
-        sure = f"sd {row['sd_predicted_eod_time_s']:.0f} s, " if "q_mobile" in fitted else ""
+        sure = f"sd {row['sd_predicted_eod_time_s']:.0f} s, " if "q_mobile" in fitted and not is_policy else ""
         load = "the mean current so far, an assumption: the load varied" if row["load_varied"] else "to go on"
         lines.append(f"  {'remaining':<22}{row['remaining_s']:>10.0f} s   {sure}{row['future_current_A']:.3g} A {load}")
     else:

@@ -33,7 +33,7 @@ LAYERS = (
     ("battery_env.sensors",),
     ("battery_env.record_model",),
     ("battery_env.estimators",),
-    ("battery_env.calibration",),
+    ("battery_env.calibration", "battery_env.pretrained_policies"),
     ("battery_env.evaluation",),
     ("battery_env.plotting",),
     ("battery_env.forecasts",),

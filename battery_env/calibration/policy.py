@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 from battery_env.calibration.aging import BatteryAging
 from battery_env.calibration.env import CalibrationEnv
+from battery_env.calibration.pretrained import pretrained_policy
 from battery_env.calibration.streaming import ReadingsSoFar, resume
 from battery_env.calibration.voltage import VoltageTask
-from battery_env.electrochemistry import NEW_CELL, STATE_SIZE
+from battery_env.electrochemistry import NEW_CELL, STATE_SIZE, UNCERTAIN_CONSTANTS
 from battery_env.estimators.base import Estimate, EstimateTrace, ModelNow, OnlineEstimator, Record
 from battery_env.record_model import RecordModel
-from battery_env.records import check_drawn_charge, check_sample
+from battery_env.records import check_drawn_charge, check_record, check_sample, drawn
 
 _UNSURE = "A policy states no uncertainty."
 # A full cell takes no more charge than this, C.
@@ -70,6 +71,21 @@ class PolicyEstimator(OnlineEstimator):
         self.dt_s = _STEP_S
         self.reset()
 
+    @classmethod
+    def pretrained(cls, env_id: str = "BatteryVoltageJoint-v0", decision_s: float = 60.0) -> PolicyEstimator:
+        """
+        A policy of LAC that comes with the package, with the options of the task that it was trained on. What made it and what
+        it is worth says :func:`~battery_env.calibration.pretrained.pretrained_card`.
+
+        :param env_id: id of a voltage-only environment of single discharges
+        :param decision_s: time between two estimates, s, a multiple of the interval between its readings
+        :return: the estimator
+        :raises ValueError: for another id, or a time out of range
+        :raises ImportError: without the extra ``battery_env[onnx]``
+        """
+        policy, options = pretrained_policy(env_id)
+        return cls(policy, env_id, decision_s, **options)
+
     @staticmethod
     def environment(env_id: str, **options: Any) -> CalibrationEnv:
         """
@@ -94,6 +110,7 @@ class PolicyEstimator(OnlineEstimator):
         self._decisions = 0
         self._now = np.array([NEW_CELL.q_mobile, NEW_CELL.r_o])
         self._action = np.zeros(len(self.parameters))
+        self._logarithms = np.zeros(len(UNCERTAIN_CONSTANTS))
 
     def check(self, voltage_V: float, current_A: float, dt_s: float, temperature_C: float | None = None) -> None:
         """
@@ -141,7 +158,7 @@ class PolicyEstimator(OnlineEstimator):
     def _decide(self, due: int) -> None:
         """One decision, on all readings up to the time when it was due."""
         task = self.task_class.follow([self._readings.record(self.dt_s)], due * self._every, **self.options)
-        resume(task, self._now, self._action)
+        self._logarithms = resume(task, self._now, self._action, self._logarithms)
         action, _ = self.policy.predict(task.observation(), deterministic=True)
         task.advance(np.asarray(action))
         self._decisions, self._now, self._action = due, task.estimate[0], np.clip(np.asarray(action)[0], -1.0, 1.0)
@@ -164,12 +181,18 @@ class PolicyEstimator(OnlineEstimator):
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         progress = np.array([self._drawn_C, self._decisions, *self._now])
-        return {"samples": self._readings.columns(), "progress": progress, "action": self._action}
+        return {
+            "samples": self._readings.columns(),
+            "progress": progress,
+            "action": self._action,
+            "logarithms": self._logarithms,
+        }
 
     def _restore(self, arrays: dict[str, NDArray[Any]]) -> None:
         self._readings = ReadingsSoFar.of(arrays["samples"])
         self._drawn_C, self._decisions = float(arrays["progress"][0]), int(arrays["progress"][1])
         self._now, self._action = arrays["progress"][2:].copy(), arrays["action"].copy()
+        self._logarithms = arrays["logarithms"].copy()
 
     def estimate(self, record: Record) -> Estimate:
         """
@@ -178,7 +201,10 @@ class PolicyEstimator(OnlineEstimator):
 
         :param record: one discharge; with the full state a simulated one, as no recording has it
         :return: the estimate; never settled, as a policy states no uncertainty
+        :raises ValueError: for a record that cannot be meant
         """
+        time_s, _, current_A = check_record(record.time_s, record.voltage_V, record.current_A)
+        check_drawn_charge(float(drawn(time_s, current_A, time_s[-1])))
         trace = self.trace([record])[0]
         q_mobile, r_o = (self.task_class.conclude(values) for values in (trace.q_mobile, trace.r_o))
         return Estimate(q_mobile, r_o, settled=False, reason=_UNSURE)

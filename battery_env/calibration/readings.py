@@ -25,7 +25,7 @@ from battery_env.electrochemistry import (
 )
 from battery_env.electrochemistry.cell import BULK_RATE, SURFACE_RATE
 from battery_env.electrochemistry.kernels import BLOCK, equilibrium_voltage, mole_fraction, nominal_overpotentials
-from battery_env.records import Record, resample_current
+from battery_env.records import Record, check_record, resample_current
 
 # Far more charge and exactly as much resistance as it takes to read the linear part of the model off one simulation
 _PLENTY_C = 1e6
@@ -33,14 +33,14 @@ _ONE_OHM = 1.0
 # Share of q_mobile in the surface of each electrode at full charge
 _SURFACE_SHARE_N, _SURFACE_SHARE_P = (float(FULL_CHARGE_SHARES[column - QNB]) for column in (QNS, QPS))
 #: Step of the difference quotient dV/dq, as a share of q.
-_RELATIVE_STEP = 1e-3
+RELATIVE_STEP = 1e-3
 
 # Readings are compared in blocks: one array, in rows that start at multiples that the compiler knows. It uses vector
 # instructions where it sees that rows do not overlap, and where no reading waits for the one before
-_MEASURED, _CURRENT, _MOVED, _OHMIC, _HALF, _VSN, _VSP, _FURTHER_VSN, _FURTHER_VSP, _MODELLED, _RESIDUAL, _SLOPE = range(12)
-_BLOCK_SIZE = 12 * BLOCK
+MEASURED, CURRENT, MOVED, OHMIC, HALF, VSN, VSP, FURTHER_VSN, FURTHER_VSP, MODELLED, RESIDUAL, SLOPE = range(12)
+BLOCK_SIZE = 12 * BLOCK
 # the most numbers that an instruction takes at once (AVX-512)
-_LANES = 8
+LANES = 8
 
 _compiled = njit(cache=True, error_model="numpy")
 _inlined = njit(cache=True, error_model="numpy", forceinline=True)
@@ -97,7 +97,8 @@ class Readings:
         :param dt_s: time step at which the current is followed, s
         :param cell: constants of the model
         :return: their readings
-        :raises ValueError: for an interval that is no multiple of the time step, or a discharge shorter than two intervals
+        :raises ValueError: for an interval that is no multiple of the time step, a discharge shorter than two intervals, or
+            samples that cannot be meant
         """
         steps = round(interval_s / dt_s)
         if steps < 1 or abs(steps * dt_s - interval_s) > 1e-9 * interval_s:
@@ -105,19 +106,20 @@ class Readings:
         columns: list[tuple[FloatArray, ...]] = []
         start_s: list[float] = []
         for n, record in enumerate(records):
-            time_s = np.asarray(record.time_s, dtype=np.float64) - record.time_s[0]
+            samples = check_record(record.time_s, record.voltage_V, record.current_A, least_samples=2)
+            time_s = samples.time_s - samples.time_s[0]
             count = int(np.floor(time_s[-1] / interval_s + 1e-9))
             if count < 2:
                 raise ValueError(
                     f"discharge {n} lasts {time_s[-1]:g} s, at least two intervals of {interval_s:g} s are needed"
                 )
-            current_A = resample_current(time_s, np.asarray(record.current_A), dt_s, count * steps)
+            current_A = resample_current(time_s, samples.current_A, dt_s, count * steps)
             at_s = interval_s * np.arange(1, count + 1)
             start_s.append(float(record.time_s[0]))
             drawn_C, moved_C, ohmic_A = _linear_part(current_A, steps, dt_s, cell)
             columns.append(
                 (
-                    np.interp(at_s, time_s, record.voltage_V),
+                    np.interp(at_s, time_s, samples.voltage_V),
                     current_A.reshape(count, steps).mean(axis=1),
                     drawn_C,
                     moved_C,
@@ -240,7 +242,7 @@ def _linear_part(
 def _fill_block(block: FloatArray, arrays: tuple[FloatArray, ...], n: int, low: int, size: int, moved_before: float) -> int:
     # Take some readings of a cell into a block, and repeat the last one up to the length that is returned, which vector
     # instructions divide without a rest
-    padded = (size + _LANES - 1) // _LANES * _LANES
+    padded = (size + LANES - 1) // LANES * LANES
     for row in range(len(arrays)):
         values = arrays[row][n, low : low + size]
         for k in range(size):
@@ -248,34 +250,34 @@ def _fill_block(block: FloatArray, arrays: tuple[FloatArray, ...], n: int, low: 
         for k in range(size, padded):
             block[row * BLOCK + k] = values[size - 1]
     # the overpotentials relax towards their value half way between two readings
-    block[_HALF * BLOCK] = 0.5 * (moved_before + block[_MOVED * BLOCK])
+    block[HALF * BLOCK] = 0.5 * (moved_before + block[MOVED * BLOCK])
     for k in range(1, padded):
-        block[_HALF * BLOCK + k] = 0.5 * (block[_MOVED * BLOCK + k - 1] + block[_MOVED * BLOCK + k])
+        block[HALF * BLOCK + k] = 0.5 * (block[MOVED * BLOCK + k - 1] + block[MOVED * BLOCK + k])
     return padded
 
 
 @_inlined
-def _fractions(moved: float, q: float, constants: FloatArray) -> tuple[float, float]:
+def surface_fractions(moved: float, q: float, constants: FloatArray) -> tuple[float, float]:
     xn = mole_fraction(_SURFACE_SHARE_N * q - moved, q, True, constants, 0)
     return xn, mole_fraction(_SURFACE_SHARE_P * q + moved, q, True, constants, 0)
 
 
 @_compiled
-def _nominal_overpotentials_of_block(
+def nominal_overpotentials_of_block(
     block: FloatArray, size: int, q: float, further_q: float, temperature_K: float, constants: FloatArray
 ) -> None:
     for k in range(size):
-        current, half = block[_CURRENT * BLOCK + k], block[_HALF * BLOCK + k]
-        xn, xp = _fractions(half, q, constants)
+        current, half = block[CURRENT * BLOCK + k], block[HALF * BLOCK + k]
+        xn, xp = surface_fractions(half, q, constants)
         vsn, vsp = nominal_overpotentials(current, xn, xp, temperature_K, constants, 0)
-        block[_VSN * BLOCK + k], block[_VSP * BLOCK + k] = vsn, vsp
-        xn, xp = _fractions(half, further_q, constants)
+        block[VSN * BLOCK + k], block[VSP * BLOCK + k] = vsn, vsp
+        xn, xp = surface_fractions(half, further_q, constants)
         vsn, vsp = nominal_overpotentials(current, xn, xp, temperature_K, constants, 0)
-        block[_FURTHER_VSN * BLOCK + k], block[_FURTHER_VSP * BLOCK + k] = vsn, vsp
+        block[FURTHER_VSN * BLOCK + k], block[FURTHER_VSP * BLOCK + k] = vsn, vsp
 
 
 @_compiled
-def _voltages_of_block(
+def voltages_of_block(
     block: FloatArray,
     size: int,
     q: float,
@@ -286,18 +288,18 @@ def _voltages_of_block(
     polynomial_n: FloatArray,
     polynomial_p: FloatArray,
 ) -> None:
-    step_C = q * _RELATIVE_STEP
+    step_C = q * RELATIVE_STEP
     for k in range(size):
-        moved, ohmic_V = block[_MOVED * BLOCK + k], r_o * block[_OHMIC * BLOCK + k]
-        xn, xp = _fractions(moved, q, constants)
+        moved, ohmic_V = block[MOVED * BLOCK + k], r_o * block[OHMIC * BLOCK + k]
+        xn, xp = surface_fractions(moved, q, constants)
         equilibrium = equilibrium_voltage(xn, xp, temperature_K, constants, 0, polynomial_n, polynomial_p)
-        modelled = equilibrium - block[_VSN * BLOCK + k] - block[_VSP * BLOCK + k] - ohmic_V
-        xn, xp = _fractions(moved, further_q, constants)
+        modelled = equilibrium - block[VSN * BLOCK + k] - block[VSP * BLOCK + k] - ohmic_V
+        xn, xp = surface_fractions(moved, further_q, constants)
         equilibrium = equilibrium_voltage(xn, xp, temperature_K, constants, 0, polynomial_n, polynomial_p)
-        further = equilibrium - block[_FURTHER_VSN * BLOCK + k] - block[_FURTHER_VSP * BLOCK + k] - ohmic_V
-        block[_MODELLED * BLOCK + k] = modelled
-        block[_RESIDUAL * BLOCK + k] = block[_MEASURED * BLOCK + k] - modelled
-        block[_SLOPE * BLOCK + k] = (further - modelled) / step_C
+        further = equilibrium - block[FURTHER_VSN * BLOCK + k] - block[FURTHER_VSP * BLOCK + k] - ohmic_V
+        block[MODELLED * BLOCK + k] = modelled
+        block[RESIDUAL * BLOCK + k] = block[MEASURED * BLOCK + k] - modelled
+        block[SLOPE * BLOCK + k] = (further - modelled) / step_C
 
 
 @_compiled
@@ -350,31 +352,31 @@ def explain(
     :param rms_V: root mean square of all residuals that count, shape (n,), overwritten
     :param last_V: voltage of the model at the last reading, shape (n,), overwritten
     """
-    stretches, block = residual_V.shape[1], np.empty(_BLOCK_SIZE)
+    stretches, block = residual_V.shape[1], np.empty(BLOCK_SIZE)
     # of all readings of one cell: measured minus modelled voltage, and dV/dq
     residual, slope = np.empty((2, voltage_V.shape[1]))
     arrays = (voltage_V, current_A, moved_C, ohmic_A)
     for n in rows:
         begin, end, q, r = first[n], count[n], q_mobile[n], r_o[n]
-        further_q = q * (1.0 + _RELATIVE_STEP)
+        further_q = q * (1.0 + RELATIVE_STEP)
         moved_before = vsn = vsp = further_vsn = further_vsp = 0.0
         for low in range(0, end, BLOCK):
             size = min(BLOCK, end - low)
             padded = _fill_block(block, arrays, n, low, size, moved_before)
-            moved_before = block[_MOVED * BLOCK + size - 1]
-            _nominal_overpotentials_of_block(block, padded, q, further_q, temperature_K, constants)
+            moved_before = block[MOVED * BLOCK + size - 1]
+            nominal_overpotentials_of_block(block, padded, q, further_q, temperature_K, constants)
             for k in range(size):
-                vsn += relaxed_n * (block[_VSN * BLOCK + k] - vsn)
-                vsp += relaxed_p * (block[_VSP * BLOCK + k] - vsp)
-                further_vsn += relaxed_n * (block[_FURTHER_VSN * BLOCK + k] - further_vsn)
-                further_vsp += relaxed_p * (block[_FURTHER_VSP * BLOCK + k] - further_vsp)
-                block[_VSN * BLOCK + k], block[_VSP * BLOCK + k] = vsn, vsp
-                block[_FURTHER_VSN * BLOCK + k], block[_FURTHER_VSP * BLOCK + k] = further_vsn, further_vsp
-            _voltages_of_block(block, padded, q, further_q, r, temperature_K, constants, polynomial_n, polynomial_p)
+                vsn += relaxed_n * (block[VSN * BLOCK + k] - vsn)
+                vsp += relaxed_p * (block[VSP * BLOCK + k] - vsp)
+                further_vsn += relaxed_n * (block[FURTHER_VSN * BLOCK + k] - further_vsn)
+                further_vsp += relaxed_p * (block[FURTHER_VSP * BLOCK + k] - further_vsp)
+                block[VSN * BLOCK + k], block[VSP * BLOCK + k] = vsn, vsp
+                block[FURTHER_VSN * BLOCK + k], block[FURTHER_VSP * BLOCK + k] = further_vsn, further_vsp
+            voltages_of_block(block, padded, q, further_q, r, temperature_K, constants, polynomial_n, polynomial_p)
             for k in range(size):
-                residual[low + k] = block[_RESIDUAL * BLOCK + k]
-                slope[low + k] = block[_SLOPE * BLOCK + k]
-            last_V[n] = block[_MODELLED * BLOCK + size - 1]
+                residual[low + k] = block[RESIDUAL * BLOCK + k]
+                slope[low + k] = block[SLOPE * BLOCK + k]
+            last_V[n] = block[MODELLED * BLOCK + size - 1]
         span = end - begin
         square = 0.0
         for k in range(begin, end):

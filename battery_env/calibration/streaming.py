@@ -73,15 +73,20 @@ class ReadingsSoFar:
         return readings
 
 
-def resume(task: CalibrationTask, estimate: FloatArray, action: FloatArray) -> None:
+def resume(task: CalibrationTask, estimate: FloatArray, action: FloatArray, logarithms: FloatArray) -> FloatArray:
     """
     Let a task of one cell stand where its policy left off.
 
     :param task: a voltage-only task, at its first observation
     :param estimate: (q_mobile, r_o), C and ohm, shape (2,)
     :param action: the last one, shape (len(parameters),)
+    :param logarithms: of the factors of the constants as of the last decision, shape (4,)
+    :return: the same as of the next one
     """
     assert isinstance(task, VoltageTask)
     task._estimate[0] = estimate
     task._action[0] = action
+    if task._fit is not None:
+        task._fit.logarithms[0] = logarithms
     task._explain()
+    return logarithms if task._fit is None else task._fit.logarithms[0].copy()

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from battery_env.arrays import IntArray
 from battery_env.calibration.data import LoadKind, Split, standard_dataset
+from battery_env.calibration.nuisance import NuisanceFit
 from battery_env.calibration.readings import Readings, explain
 from battery_env.calibration.task import OBSERVATION_LIMIT, CalibrationTask, check_counts, check_not_negative, checked_action
 from battery_env.electrochemistry import NEW_CELL, FloatArray
@@ -89,11 +90,12 @@ class VoltageTask(CalibrationTask):
         split: Split = "train",
         dt_s: float = 1.0,
         mismatch: float = 0.0,
+        nuisance: float = 0.0,
         dataset: Sequence[Record] | None = None,
         **sensors: Any,
     ) -> None:
         check_counts(episode_steps=episode_steps)
-        check_not_negative(consistency=consistency, process_noise_V=process_noise_V)
+        check_not_negative(consistency=consistency, process_noise_V=process_noise_V, nuisance=nuisance)
         if not 0 <= new_readings[0] <= new_readings[1]:
             raise ValueError(f"new_readings must be (fewest, most) with 0 <= fewest <= most, got {new_readings!r}")
         if start not in ("random", "new_cell", "true"):
@@ -147,6 +149,10 @@ class VoltageTask(CalibrationTask):
         self._voltage_V, self._current_A, self._moved_C, self._ohmic_A = np.zeros((4, cells, longest))
         self._residual_V, self._slope_V_per_C, self._ohmic_means_A = np.zeros((3, cells, STRETCHES, 2))
         self._rms_V, self._last_V, self._offset_V, self._misfit_V = np.zeros((4, cells))
+        self._fit: NuisanceFit | None = None
+        if nuisance > 0.0:
+            self._fit = NuisanceFit(cells, readings, parameters, ESTIMATE_RANGES, self.sensors.offset_V, nuisance)
+            self.observation_size += self._fit.observation_size
 
     @classmethod
     def options(cls) -> dict[str, Any]:
@@ -290,6 +296,8 @@ class VoltageTask(CalibrationTask):
         self._moved_C[row, :length] = data.moved_C[part]
         self._ohmic_A[row, :length] = data.ohmic_A[part]
         self._estimate[row] = estimate
+        if self._fit is not None:
+            self._fit.logarithms[row] = 0.0
         decisions = -(-int(length) // self._every) if self._every else self._decisions_in_a_discharge
         self._last_step[row] = self._step_of_episode[row] + decisions
 
@@ -344,6 +352,10 @@ class VoltageTask(CalibrationTask):
             self._rms_V,
             self._last_V,
         )
+        if self._fit is not None:
+            chosen = self._all if rows is None else np.asarray(rows, dtype=np.int64)
+            measured = (self._voltage_V, self._current_A, self._moved_C, self._ohmic_A)
+            self._fit.step(chosen, self.count, self._first, self._estimate, measured)
         self._offset_V = np.clip(self._residual_V.mean(axis=(1, 2)), -self.sensors.offset_V, self.sensors.offset_V)
         self._misfit_V = np.sqrt(np.mean((self._residual_V - self._offset_V[:, None, None]) ** 2, axis=(1, 2)))
 
@@ -368,6 +380,7 @@ class VoltageTask(CalibrationTask):
             (self.count * (self.readings.interval_s / _TIME_SCALE_S))[:, None],
             self._scaled(self._estimate),
             self._action[:, : self._previous],
+            *([] if self._fit is None else self._fit.parts(self._step, self._width)),
         ]
 
     def _scaled(self, estimate: FloatArray) -> FloatArray:

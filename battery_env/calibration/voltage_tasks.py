@@ -36,6 +36,20 @@ class BatteryVoltageJoint(VoltageTask):
     | 99    | time since the start of the discharge, divided by 3000 s |
     | 100-101 | the estimate: q_mobile = 3500 .. 8100 C and r_o = 0.05 .. 0.35 ohm as -1 .. 1 |
 
+    With ``nuisance`` above 0 ten more numbers follow, of one Gauss-Newton step of a fit of everything that is not known: both
+    parameters, the offset of the sensor, and the logarithms of the factors by which kn, tDiffusion, to and tsn of the cell differ
+    from the model's. Each has a prior: normal, with the mean and the standard deviation of the ranges above, of the bounds of the
+    offset, and with ``nuisance`` for the factors. The noise is what the step leaves of the residuals. The factors are kept from
+    one decision to the next, as the estimate is.
+
+    | index | content |
+    |-------|---------|
+    | 102-103 | the action that would make this step of q_mobile and r_o |
+    | 104-105 | logarithm of the standard deviation that the fit states of each, over 1 % of the range of the estimate |
+    | 106   | logarithm of the noise over 10 mV |
+    | 107   | asinh of the offset over 10 mV |
+    | 108-111 | logarithms of the four factors, over ``nuisance`` |
+
     Not Markov in the strict sense: the next cost depends on readings that have not arrived, and on those so far through more
     than their means. For the estimate of constant parameters the observation is nearly sufficient: residuals and
     sensitivities are what a Gauss-Newton step is made of. Noise, offset and errors of the current sensor are constant within
@@ -87,6 +101,7 @@ class BatteryVoltageJoint(VoltageTask):
     | ``split`` | ``"train"`` | or ``"test"``, ``"all"`` |
     | ``dt_s`` | 1 | time step of the cell, s |
     | ``mismatch`` | 0 | how far kn, tDiffusion, to and tsn of the cell are from the model's (relative standard deviation) |
+    | ``nuisance`` | 0 | how far the agent is to take them to be; above 0 the observation has a fit that allows for it |
     | ``dataset`` | none | other discharges from full charge, simulated or recorded, in place of these |
     | ``render_mode`` | none | ``"rgb_array"`` |
 

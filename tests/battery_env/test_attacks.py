@@ -19,6 +19,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from battery_env.__main__ import NOT_SETTLED, REFUSED, SETTLED, calibrate
+from battery_env.calibration.policy import PolicyEstimator
+from battery_env.calibration.pretrained import pretrained_ids
+from battery_env.calibration.voltage import ESTIMATE_RANGES
 from battery_env.cells import Discharge, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate
 from battery_env.estimates import last_estimate
@@ -346,7 +349,23 @@ def test_the_full_state_needs_no_full_start():
         assert getattr(calibrator.estimate(record), name) == pytest.approx(true, rel=1e-6)
 
 
-@pytest.mark.parametrize("method", ["least-squares", "kalman"])
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_policy_is_never_sure_and_answers_within_its_range(fault):
+    rng = np.random.default_rng((4, FAULTS.index(fault)))
+    case = broken(drawn(rng, ("B0005",)), fault, rng)
+    for env_id in pretrained_ids():
+        found, estimate = outcome(case, lambda env_id=env_id: PolicyEstimator.pretrained(env_id))
+        assert found in ("refused", "not settled")
+        if estimate is not None:
+            assert (
+                estimate.reason == "A policy states no uncertainty."
+                and np.isnan([estimate.sd_q_mobile, estimate.sd_r_o]).all()
+            )
+            for name, (low, high) in ESTIMATE_RANGES.items():
+                assert low <= getattr(estimate, name) <= high
+
+
+@pytest.mark.parametrize("method", ["least-squares", "kalman", "policy"])
 @pytest.mark.parametrize("fault", ["none", "not full", "late start", "minutes", "flipped", "30 samples without current"])
 def test_nor_is_the_command_line(fault, method, tmp_path, capsys):
     rng = np.random.default_rng(5)
@@ -363,7 +382,8 @@ def test_nor_is_the_command_line(fault, method, tmp_path, capsys):
     columns = {"time_s": case.time_s, "voltage_V": case.voltage_V, "current_A": case.current_A}
     pd.DataFrame(columns).to_csv(tmp_path / "record.csv", index=False)
     status = calibrate([str(tmp_path / "record.csv"), "--method", method, *options])
-    assert status == SETTLED if fault == "none" else status in (REFUSED, NOT_SETTLED)
+    is_sure = fault == "none" and method != "policy"
+    assert status == SETTLED if is_sure else status in (REFUSED, NOT_SETTLED)
     capsys.readouterr()
 
 

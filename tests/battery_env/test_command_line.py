@@ -2,6 +2,7 @@ import json
 import subprocess
 import sys
 from concurrent.futures import BrokenExecutor, Future
+from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 from battery_env import fleet
 from battery_env.__main__ import calibrate, main
+from battery_env.calibration.policy import PolicyEstimator
 from battery_env.cells import Discharge, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, CellParameters, simulate
 from battery_env.estimators.cell_fit import fit_cell, read_cell
@@ -389,3 +391,50 @@ def test_the_filter_follows_the_measured_temperature_unless_another_one_is_state
     measured, stated, held = (r_o(warming_C, **more) for more in ({}, {"ambient_C": 20.0}, {"thermal": False}))
     assert measured < stated and measured < held
     assert stated == r_o(None, ambient_C=20.0) and held == pytest.approx(r_o(None, ambient_C=20.0, thermal=False), rel=2e-3)
+
+
+class TestPolicies:
+    def test_the_one_that_comes_with_the_package_is_followed_and_named(self, tmp_path, capsys):
+        assert main(["calibrate", "B0005:100", "--method", "policy", "--out", str(tmp_path)]) == 3
+        shown = capsys.readouterr().out
+        assert "calibrated by the policy that comes with the package" in shown and "nan" not in shown
+        assert shown.count("no sd stated") == 2 and "Not settled: A policy states no uncertainty." in shown
+        (row,) = pd.read_csv(tmp_path / "B0005_100_estimate.csv").to_dict(orient="records")
+        record = load_nasa_discharges("B0005")[99].loaded_part(2.7)
+        assert row["q_mobile_C"] == pytest.approx(PolicyEstimator.pretrained().estimate(record).q_mobile)
+        assert row["method"] == "policy" and np.isnan(row["sd_q_mobile_C"]) and not row["settled"]
+
+    def test_one_parameter_has_its_own(self, capsys):
+        assert main(["calibrate", "B0005:100", "B0005:101", "--method", "policy", "--parameters", "r_o"]) == 3
+        shown = capsys.readouterr().out
+        assert shown.count(f"q_mobile {NEW_CELL.q_mobile:5.0f} C  r_o") == 2 and " sd " not in shown
+        assert "calibrated by the policy that comes with the package, which states no uncertainty" in shown
+
+    def test_one_of_a_file_takes_its_place(self, tmp_path, capsys):
+        file = tmp_path / "mine.onnx"
+        for suffix in (".onnx", ".json"):
+            content = files("battery_env.pretrained_policies").joinpath(f"BatteryVoltageQmax-v0{suffix}").read_bytes()
+            file.with_suffix(suffix).write_bytes(content)
+        arguments = ["B0005:100", "--method", "policy", "--policy", str(file)]
+        assert main(["calibrate", *arguments, "--parameters", "q_mobile"]) == 3
+        assert f"calibrated by the policy of {file}" in capsys.readouterr().out
+        error = fails(arguments, capsys)
+        assert "a policy of BatteryVoltageQmax-v0, which finds q_mobile, not q_mobile and r_o" in error
+
+    @pytest.mark.parametrize(
+        ("more", "message"),
+        [
+            (["--prior", "5000", "50"], "a policy takes no prior_q_mobile_C"),
+            (["--ambient", "30"], "a policy takes no ambient_C"),
+            (["--mismatch", "0.01"], "a policy takes no mismatch_V"),
+            (["--initial-soc", "0.8"], "a policy takes no initial_soc"),
+            (["--policy", "none.onnx"], "none.onnx"),
+        ],
+    )
+    def test_what_a_policy_cannot_use_is_refused(self, more, message, capsys):
+        assert message in fails(["B0005:100", "--method", "policy", *more], capsys)
+
+    def test_a_policy_is_for_its_method(self, capsys):
+        assert "a policy is for the method policy, got 'kalman'" in fails(
+            ["B0005:100", "--method", "kalman", "--policy", "mine.onnx"], capsys
+        )

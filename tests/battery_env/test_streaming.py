@@ -249,8 +249,9 @@ class TestModel:
 
 
 class TestPolicies:
-    def test_a_stream_shows_a_policy_what_a_record_does(self, whole):
-        estimator = policy_estimator()
+    @pytest.mark.parametrize("options", [{}, {"nuisance": 0.2, "reading_s": 5.0}])
+    def test_a_stream_shows_a_policy_what_a_record_does(self, whole, options):
+        estimator = policy_estimator(**options)
         trace = estimator.trace([whole])[0]
         from_record = [seen[0] for seen in estimator.policy.seen]
         estimator.policy.seen.clear()

@@ -1,0 +1,76 @@
+"""The trained policies that come with the package."""
+
+from __future__ import annotations
+
+import json
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import Any
+
+from battery_env.calibration.onnx_policy import OnnxPolicy
+
+_PACKAGE = "battery_env.pretrained_policies"
+
+
+def pretrained_ids() -> tuple[str, ...]:
+    """
+    Which environments a policy comes with the package for.
+
+    :return: their ids
+    """
+    names = sorted(entry.name for entry in files(_PACKAGE).iterdir() if entry.name.endswith(".onnx"))
+    return tuple(name.removesuffix(".onnx") for name in names)
+
+
+def pretrained_card(env_id: str) -> dict[str, Any]:
+    """
+    What made a policy, and what it is worth: ``command``, ``recipe`` (seed, hyperparameters, data), ``options`` (of the task,
+    which it needs when it is used), ``scores`` and ``versions``.
+
+    :param env_id: id of an environment
+    :return: the JSON file beside the policy
+    :raises ValueError: if none comes with the package
+    """
+    _check(env_id)
+    card: dict[str, Any] = json.loads(files(_PACKAGE).joinpath(f"{env_id}.json").read_text(encoding="utf-8"))
+    return card
+
+
+def pretrained_policy(env_id: str) -> tuple[OnnxPolicy, dict[str, Any]]:
+    """
+    A policy that comes with the package, run by onnxruntime: no torch, and no pickle.
+
+    :param env_id: id of an environment
+    :return: the policy, and the options of the task that it needs
+    :raises ValueError: if none comes with the package
+    :raises ImportError: without the extra ``battery_env[onnx]``
+    """
+    _check(env_id)
+    with as_file(files(_PACKAGE)) as folder:
+        return policy_of_file(folder / f"{env_id}.onnx")
+
+
+def policy_of_file(path: Path) -> tuple[OnnxPolicy, dict[str, Any]]:
+    """
+    A policy from a file, with the options of its task from ``options`` of a JSON file of the same name beside it, if there is
+    one.
+
+    :param path: ONNX file
+    :return: the policy, and the options
+    :raises FileNotFoundError: if there is no such file
+    :raises ValueError: if one of the files is not what it should be
+    :raises ImportError: without the extra ``battery_env[onnx]``
+    """
+    policy, card = OnnxPolicy(path), path.with_suffix(".json")
+    if not card.exists():
+        return policy, {}
+    try:
+        options = dict(json.loads(card.read_text(encoding="utf-8"))["options"])
+    except (ValueError, TypeError, KeyError) as error:
+        raise ValueError(f"{card} has to be an object in JSON with the options of the task as 'options': {error!r}") from error
+    return policy, options
+
+
+def _check(env_id: str) -> None:
+    if env_id not in pretrained_ids():
+        raise ValueError(f"no policy for {env_id!r} comes with the package: there are {', '.join(pretrained_ids()) or 'none'}")

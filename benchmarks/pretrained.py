@@ -1,0 +1,222 @@
+"""
+Make the policies that come with ``battery_env``: LAC, trained on simulated cells whose constants are not the model's, as ONNX
+files with a card each that says what made them and what they are worth.
+
+.. code-block:: bash
+
+  python -m benchmarks.pretrained
+  python -m benchmarks.pretrained --envs BatteryVoltageJoint-v0 --updates 16000 --out results/pretrained_joint
+
+Files and cards are shipped from ``battery_env/pretrained_policies``, Joint from the second command. The settings are those
+of ``zoo_configs``, with the options of the task below. Scores are of held-out discharges of the same environments (mean error
+over the second half of each), with the constants of the model right and wrong. Training is not repeated, nor is a part of the
+evaluation.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from battery_env.calibration.data import standard_dataset
+from battery_env.calibration.policy import PolicyEstimator
+from battery_env.calibration.pretrained import policy_of_file
+from battery_env.evaluation import evaluate
+from battery_env.trajectories import AgedParameter
+from benchmarks.contests import SENSORS
+from benchmarks.study import SYMBOLS, Study, Tables, command_line, markdown, positive, versions, write_json
+from benchmarks.training import Recipe, record_file, timesteps_of, train_or_load
+from sb3_lac.onnx import export_onnx
+
+#: What each policy finds, as data sets name it.
+FOUND: dict[str, AgedParameter] = {
+    "BatteryVoltageJoint-v0": "joint",
+    "BatteryVoltageQmax-v0": "q_mobile",
+    "BatteryVoltageRo-v0": "r_o",
+}
+#: How far kn, tDiffusion, to and tsn of the cells are from the model's, in training and as the observation takes them to be.
+MISMATCH = 0.2
+#: Options of the task that a policy needs when it is used.
+OPTIONS: dict[str, Any] = {"nuisance": MISMATCH, "reading_s": 2.0}
+#: And those of its training: up to 290 s between two decisions, as by default.
+TRAINED_WITH: dict[str, Any] = {**OPTIONS, "new_readings": [0, 145], "mismatch": MISMATCH, "cost": "state"}
+#: How wrong the constants are in the evaluation.
+MISMATCHES = (0.0, 0.1, 0.2)
+
+
+def recipe_of(env_id: str, seed: int, updates: int) -> Recipe:
+    """
+    What a policy depends on.
+
+    :param env_id: a key of ``FOUND``
+    :param seed: seed of everything
+    :param updates: gradient steps
+    :return: the recipe
+    """
+    timesteps = timesteps_of(updates, Recipe.of("lac", env_id, seed).hyperparameters)
+    return Recipe.of("lac", env_id, seed, timesteps, hyperparameters={"env_kwargs": TRAINED_WITH})
+
+
+def make(env_id: str, seed: int, updates: int, folder: Path) -> Recipe:
+    """
+    Train a policy, unless that has been done, and write it as ONNX, with the options that it needs beside it.
+
+    :param env_id: a key of ``FOUND``
+    :param seed: seed of everything
+    :param updates: gradient steps
+    :param folder: where to
+    :return: the recipe
+    """
+    recipe = recipe_of(env_id, seed, updates)
+    model = train_or_load("lac", env_id, seed, recipe.timesteps, folder / "models", {"env_kwargs": TRAINED_WITH})
+    file = folder / f"{env_id}.onnx"
+    file.unlink(missing_ok=True)
+    export_onnx(model, file, env_id)
+    write_json(file.with_suffix(".json"), {"env_id": env_id, "options": OPTIONS})
+    return recipe
+
+
+def part(env_id: str, recipe: str, mismatch: float, sensor: str, discharges: int, folder: Path) -> Tables:
+    """
+    Score a policy.
+
+    :param env_id: a key of ``FOUND``
+    :param recipe: digest of what it was made by
+    :param mismatch: how wrong the constants are
+    :param sensor: a name of :data:`benchmarks.contests.SENSORS`
+    :param discharges: how many of the test part
+    :param folder: where the policy is
+    :return: one row per discharge
+    """
+    policy, options = policy_of_file(folder / f"{env_id}.onnx")
+    data = standard_dataset(FOUND[env_id], "piecewise", "test", mismatch=mismatch)[:discharges]
+    scores = evaluate(PolicyEstimator(policy, env_id, **options), data, SENSORS[sensor], seed=1)
+    return {"pretrained": scores.assign(env_id=env_id, recipe=recipe, mismatch=mismatch, sensor=sensor)}
+
+
+def summary(scores: pd.DataFrame) -> pd.DataFrame:
+    """
+    The scores over discharges.
+
+    :param scores: one row per environment, mismatch, sensor and discharge
+    :return: one row per environment, mismatch, sensor and parameter that is to be found; errors of the second half in per cent
+    """
+    rows = []
+    for (env_id, mismatch, sensor), group in scores.groupby(["env_id", "mismatch", "sensor"], sort=False):
+        found = FOUND[str(env_id)]
+        for name in SYMBOLS if found == "joint" else (found,):
+            error = group[f"{name}_second_half_mape_percent"]
+            rows.append(
+                {
+                    "env_id": env_id,
+                    "mismatch": mismatch,
+                    "sensor": sensor,
+                    "parameter": name,
+                    "discharges": len(group),
+                    "mean_percent": error.mean(),
+                    "sd_percent": error.std(),
+                    "worst_percent": error.max(),
+                    "final_percent": group[f"{name}_final_error_percent"].mean(),
+                    "time_per_estimate_ms": 1e3 * group["time_per_update_s"].iloc[0],
+                }
+            )
+    return pd.DataFrame(rows)
+
+
+def card_of(recipe: Recipe, scores: pd.DataFrame, command: str, folder: Path) -> dict[str, Any]:
+    """
+    What a policy says of itself.
+
+    :param recipe: what made it
+    :param scores: its rows of :func:`summary`
+    :param command: the one that made it
+    :param folder: where its model is
+    :return: for JSON
+    """
+    record = json.loads(record_file(recipe, folder / "models").read_text(encoding="utf-8"))
+    return {
+        "env_id": recipe.env_id,
+        "options": OPTIONS,
+        "sha256": sha256((folder / f"{recipe.env_id}.onnx").read_bytes()).hexdigest(),
+        "algorithm": "LAC",
+        "command": command,
+        "recipe": asdict(recipe),
+        "training_data": (
+            f"the training part of {recipe.env_id}: 700 simulated discharges whose kn, tDiffusion, to and tsn are off by "
+            f"factors with a relative standard deviation of {MISMATCH:g}, 1 to 30 mV of noise and an offset within 10 mV"
+        ),
+        "training_minutes": record["training_minutes"],
+        "scores": scores.drop(columns="env_id").round(4).to_dict("records"),
+        "versions": versions(),
+    }
+
+
+def shown(table: pd.DataFrame) -> str:
+    """
+    The summary for readers.
+
+    :param table: of :func:`summary`
+    :return: Markdown
+    """
+    return markdown(
+        [
+            {
+                "environment": row.env_id,
+                "constants off by": f"{row.mismatch:g}",
+                "sensor": row.sensor,
+                "parameter": SYMBOLS[str(row.parameter)],
+                "mean ± sd (worst) error, second half (%)": (
+                    f"{row.mean_percent:.2f} ± {row.sd_percent:.2f} ({row.worst_percent:.1f})"
+                ),
+                "last estimate (%)": f"{row.final_percent:.2f}",
+            }
+            for row in table.itertuples(index=False)
+        ]
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """
+    The command line.
+
+    :param arguments: of the command line by default
+    """
+    parser = command_line("pretrained", __doc__, jobs=1)
+    parser.add_argument("--envs", nargs="+", choices=FOUND, default=list(FOUND), metavar="ID")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--updates", type=positive, default=5000, help="gradient steps")
+    parser.add_argument("--discharges", type=positive, default=60, help="test discharges of the evaluation, up to 300")
+    study = Study(parser, arguments)
+    chosen = study.chosen
+    if chosen.discharges > 300:
+        parser.error("--discharges must lie within 1 .. 300")
+    study.configuration |= {"trained_with": TRAINED_WITH, "options": OPTIONS}
+    recipes = {env_id: make(env_id, chosen.seed, chosen.updates, study.out) for env_id in chosen.envs}
+    parts = [
+        {
+            "env_id": env_id,
+            "recipe": f"{recipe.digest}_{recipe.seed}",
+            "mismatch": mismatch,
+            "sensor": sensor,
+            "discharges": chosen.discharges,
+        }
+        for env_id, recipe in recipes.items()
+        for mismatch in MISMATCHES
+        for sensor in SENSORS
+    ]
+    scores = study.run(part, parts, folder=study.out)["pretrained"]
+    table = summary(scores)
+    for env_id, recipe in recipes.items():
+        own = table[table["env_id"] == env_id]
+        write_json(study.out / f"{env_id}.json", card_of(recipe, own, study.command, study.out))
+    study.write({"pretrained": scores, "pretrained_summary": table}, {}, shown(table))
+
+
+if __name__ == "__main__":
+    main()

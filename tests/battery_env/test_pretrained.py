@@ -1,0 +1,112 @@
+"""The policies that come with the package."""
+
+import hashlib
+import json
+import subprocess
+import sys
+from importlib.resources import files
+
+import numpy as np
+import pytest
+
+from battery_env import PolicyEstimator, evaluate
+from battery_env.calibration.data import standard_dataset
+from battery_env.calibration.pretrained import policy_of_file, pretrained_card, pretrained_ids, pretrained_policy
+from battery_env.calibration.voltage import ESTIMATE_RANGES
+from battery_env.sensors import SensorErrors
+
+FOLDER = files("battery_env.pretrained_policies")
+IDS = {"BatteryVoltageJoint-v0": "joint", "BatteryVoltageQmax-v0": "q_mobile", "BatteryVoltageRo-v0": "r_o"}
+
+
+def test_there_is_one_for_each_voltage_only_task():
+    assert pretrained_ids() == tuple(IDS)
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_the_card_is_that_of_the_file(env_id):
+    content, card = FOLDER.joinpath(f"{env_id}.onnx").read_bytes(), pretrained_card(env_id)
+    assert len(content) < 1_000_000
+    assert hashlib.sha256(content).hexdigest() == card["sha256"]
+    policy, options = pretrained_policy(env_id)
+    assert policy.env_id == card["env_id"] == card["recipe"]["env_id"] == env_id
+    assert policy.description["algorithm"] == card["algorithm"] == "LAC"
+    assert options == card["options"]
+    trained_with = card["recipe"]["hyperparameters"]["env_kwargs"]
+    assert options.items() <= trained_with.items() and trained_with["cost"] == "state"
+    assert card["command"].startswith("python -m benchmarks.pretrained") and "seed" in card["recipe"]
+    assert {row["mismatch"] for row in card["scores"]} == {0.0, 0.1, 0.2}
+    env = PolicyEstimator.environment(env_id, **options)
+    assert policy.observation_shape == env.observation_space.shape
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_it_does_what_its_card_says(env_id):
+    """On a tenth of the discharges, with 5 mV of noise and constants that are off by 20 %."""
+    data = standard_dataset(IDS[env_id], "piecewise", "test", mismatch=0.2)[:10]
+    estimator = PolicyEstimator.pretrained(env_id)
+    scores = evaluate(estimator, data, SensorErrors(noise_V=0.005), seed=1)
+    for name in estimator.parameters:
+        (row,) = (
+            row
+            for row in pretrained_card(env_id)["scores"]
+            if (row["mismatch"], row["sensor"], row["parameter"]) == (0.2, "5 mV noise", name)
+        )
+        assert scores[f"{name}_second_half_mape_percent"].max() <= row["worst_percent"] + 1e-3
+        assert scores[f"{name}_second_half_mape_percent"].mean() < 2.0 * row["mean_percent"]
+
+
+def test_it_is_never_sure_and_stays_in_its_range():
+    estimator = PolicyEstimator.pretrained()
+    data = standard_dataset("joint", "piecewise", "test", mismatch=0.2)[:2]
+    for record in data:
+        estimate = estimator.estimate(record)
+        assert not estimate.settled and np.isnan([estimate.sd_q_mobile, estimate.sd_r_o]).all()
+    for trace in estimator.trace(data):
+        assert trace.settled is None and trace.sd_q_mobile is None
+        for name, (low, high) in ESTIMATE_RANGES.items():
+            assert (getattr(trace, name) >= low).all() and (getattr(trace, name) <= high).all()
+
+
+def test_it_needs_no_torch():
+    code = (
+        "import sys; sys.modules['torch'] = None; sys.modules['stable_baselines3'] = None\n"
+        "from battery_env import PolicyEstimator, load_nasa_discharges\n"
+        "print(PolicyEstimator.pretrained().estimate(load_nasa_discharges('B0005')[0].loaded_part(2.7)).q_mobile)\n"
+    )
+    q_mobile = float(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout)
+    assert 6000.0 < q_mobile < 8000.0
+
+
+@pytest.mark.parametrize("env_id", ["BatteryAging-v0", "BatteryRo-v0", "../secrets"])
+def test_where_there_is_none_the_error_names_those_there_are(env_id):
+    with pytest.raises(ValueError, match=r"no policy for '.*' comes with the package: there are BatteryVoltageJoint-v0, B"):
+        PolicyEstimator.pretrained(env_id)
+
+
+def test_without_onnxruntime_the_error_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(ImportError, match=r"needs pip install 'battery_env\[onnx\]'"):
+        PolicyEstimator.pretrained()
+
+
+class TestFiles:
+    @pytest.fixture
+    def copy(self, tmp_path):
+        path = tmp_path / "mine.onnx"
+        path.write_bytes(FOLDER.joinpath("BatteryVoltageRo-v0.onnx").read_bytes())
+        return path
+
+    def test_one_without_a_card_has_no_options(self, copy):
+        policy, options = policy_of_file(copy)
+        assert options == {} and policy.env_id == "BatteryVoltageRo-v0"
+
+    def test_a_card_says_the_options(self, copy):
+        copy.with_suffix(".json").write_text(json.dumps({"options": {"reading_s": 5.0}}))
+        assert policy_of_file(copy)[1] == {"reading_s": 5.0}
+
+    @pytest.mark.parametrize("text", ["{", "[]", "{}", '{"options": 3}'])
+    def test_a_card_that_is_none_is_refused(self, copy, text):
+        copy.with_suffix(".json").write_text(text)
+        with pytest.raises(ValueError, match="has to be an object in JSON with the options of the task"):
+            policy_of_file(copy)

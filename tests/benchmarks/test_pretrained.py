@@ -1,0 +1,68 @@
+"""The policies that come with the package are made by one command, and compared by another."""
+
+import json
+
+import pandas as pd
+import pytest
+
+from battery_env.calibration.pretrained import policy_of_file
+from benchmarks import mismatch, pretrained
+from benchmarks.training import record_file
+from sb3_lac import LAC
+
+
+@pytest.fixture
+def train_briefly(monkeypatch):
+    """A model that has learned nothing, of the right task."""
+
+    def train_or_load(algo, env_id, seed, timesteps, folder, hyperparameters):
+        recipe = pretrained.recipe_of(env_id, seed, 100)
+        assert (algo, timesteps, hyperparameters) == ("lac", recipe.timesteps, {"env_kwargs": pretrained.TRAINED_WITH})
+        record = record_file(recipe, folder)
+        record.parent.mkdir(parents=True, exist_ok=True)
+        record.write_text(json.dumps({"training_minutes": 1.0}))
+        env = pretrained.PolicyEstimator.environment(env_id, **pretrained.OPTIONS)
+        return LAC("MlpPolicy", env, device="cpu", buffer_size=10, seed=seed, policy_kwargs={"net_arch": [8]})
+
+    monkeypatch.setattr(pretrained, "train_or_load", train_or_load)
+
+
+def test_it_writes_policies_with_their_cards(train_briefly, tmp_path, capsys):
+    pretrained.main(["--envs", "BatteryVoltageRo-v0", "--updates", "100", "--discharges", "2", "--out", str(tmp_path)])
+    policy, options = policy_of_file(tmp_path / "BatteryVoltageRo-v0.onnx")
+    assert policy.env_id == "BatteryVoltageRo-v0" and options == pretrained.OPTIONS
+    card = json.loads((tmp_path / "BatteryVoltageRo-v0.json").read_text())
+    assert card["recipe"]["hyperparameters"]["env_kwargs"] == pretrained.TRAINED_WITH and card["recipe"]["seed"] == 0
+    assert len(card["scores"]) == 3 * 2 and {row["parameter"] for row in card["scores"]} == {"r_o"}
+    assert len(pd.read_csv(tmp_path / "pretrained.csv")) == 3 * 2 * 2
+    assert "| BatteryVoltageRo-v0 |" in capsys.readouterr().out
+
+
+def test_the_comparison_runs(tmp_path, monkeypatch, capsys):
+    few = ("LAC, pretrained", "the fit that LAC sees, no policy", "Kalman filter")
+    monkeypatch.setattr(mismatch, "CALIBRATORS", {name: mismatch.CALIBRATORS[name] for name in few})
+    monkeypatch.setattr(mismatch, "MISMATCHES", (0.2,))
+    mismatch.main(["--discharges", "2", "--cells", "--out", str(tmp_path)])
+    scores = pd.read_csv(tmp_path / "mismatch.csv")
+    assert len(scores) == 2 * len(few) * 2
+    assert set(scores["policy"].dropna()) == {mismatch.pretrained_card(mismatch.ENV_ID)["sha256"][:8]}
+    assert (tmp_path / "mismatch.png").exists()
+    assert "| LAC, pretrained" in capsys.readouterr().out
+
+
+def test_recorded_cells_are_compared_with_the_fit_of_whole_discharges(monkeypatch):
+    monkeypatch.setattr(mismatch, "_EVERY", 80)
+    found = pd.concat(
+        [mismatch.recorded_part(name, "B0005", "")["mismatch_cells"] for name in ("least squares", "LAC, pretrained")]
+    )
+    assert len(found) == 2 * 3 * 4
+    rows = mismatch.recorded_table(found).set_index("calibrator")
+    column = "q^max, whole: mean (worst) departure from least squares (%)"
+    assert rows.loc["least squares", column] == "0.0 (0.0)" != rows.loc["LAC, pretrained", column]
+
+
+@pytest.mark.parametrize("benchmark", [pretrained, mismatch])
+def test_more_discharges_than_there_are_are_refused(benchmark, tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        benchmark.main(["--discharges", "301", "--out", str(tmp_path)])
+    assert "--discharges must lie within 1 .. 300" in capsys.readouterr().err
