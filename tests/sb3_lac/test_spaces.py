@@ -55,6 +55,7 @@ def test_arguments_are_those_of_sac_and_the_own_ones_follow_target_entropy():
         "lambda_learning_rate",
         "horizon",
         "reward_bound",
+        "compile_update",
     ]
     start = names.index("target_entropy") + 1
     assert names[start : start + len(own)] == own
