@@ -360,7 +360,7 @@ def _voltages(summary: Summary, title: str) -> dict[str, bytes]:
     columns = {"time_s": record.time_s, "voltage_V": record.voltage_V, "current_A": record.current_A}
     table = pd.DataFrame(columns | {"model_V": forecast.at_samples_V}).to_csv(index=False)
     picture = io.BytesIO()
-    plot_discharge(record, {"model": forecast}, title).savefig(picture)
+    plot_discharge(record, {"model": forecast}, title).savefig(picture, dpi="figure")
     return {"csv": table.encode(), "png": picture.getvalue()}
 
 

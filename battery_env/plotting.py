@@ -70,7 +70,8 @@ def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
     :return: the file
     """
     with replacing(path) as part:
-        figure.savefig(part)
+        # not the resolution of matplotlib's settings, which other libraries change
+        figure.savefig(part, dpi="figure")
     return Path(path)
 
 

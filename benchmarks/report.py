@@ -211,7 +211,7 @@ def page(results: Path) -> str:
             parts.append(f", made by <code>{html.escape(command)}</code>")
         parts.append(f"</p>\n{_table(summary(errors))}\n")
         buffer = io.BytesIO()
-        plot_profiles(errors, str(comparison)).savefig(buffer, format="png")
+        plot_profiles(errors, str(comparison)).savefig(buffer, format="png", dpi="figure")
         image = base64.b64encode(buffer.getvalue()).decode("ascii")
         parts.append(f'<img alt="{html.escape(str(comparison))}" src="data:image/png;base64,{image}">\n')
     return "".join([*parts, "</body>\n</html>\n"])

@@ -189,7 +189,11 @@ class TestFiles:
         with pytest.raises(ValueError, match=r"other\.json holds no"):
             read_cell(tmp_path / "other.json")
 
-    @pytest.mark.parametrize("method", METHODS)
+    def test_a_policy_has_no_place_for_a_fit(self, fit):
+        with pytest.raises(ValueError, match="a policy takes no"):
+            Settings.for_cell(fit, method="policy")
+
+    @pytest.mark.parametrize("method", [method for method in METHODS if method != "policy"])
     def test_settings_use_all_that_a_fit_knows(self, method, fit):
         settings = Settings.for_cell(fit, method=method)
         assert (settings.cell, settings.mismatch_V, settings.cut_off_V) == (fit.cell, fit.mismatch_V, fit.cell.VEOD)

@@ -1,5 +1,7 @@
 """Figures, and the files they go to."""
 
+import matplotlib
+import matplotlib.image
 import numpy as np
 import pandas as pd
 import pytest
@@ -41,6 +43,15 @@ def test_true_against_inferred_has_a_panel_for_each_calibrator(scores, tmp_path)
     assert points[:, 0].tolist() == scores["r_o"].tolist() and points[:, 1].tolist() == scores["r_o_hat"].tolist()
     assert errors[0].collections[-1].get_offsets()[:, 1].tolist() == scores["r_o_mape_percent"].tolist()
     assert save_figure(figure, tmp_path / "folder" / "figure.png").stat().st_size > 0
+
+
+def test_the_size_of_a_picture_is_not_for_other_libraries_to_choose(scores, tmp_path):
+    figure = plot_true_against_inferred({"LAC": scores}, "r_o")
+    sizes = []
+    for dpi in ("figure", 300):
+        with matplotlib.rc_context({"savefig.dpi": dpi}):
+            sizes.append(matplotlib.image.imread(save_figure(figure, tmp_path / f"{dpi}.png")).shape)
+    assert sizes[0] == sizes[1]
 
 
 def test_learning_curves_have_a_line_for_each_algorithm_and_a_band_for_several_seeds():
