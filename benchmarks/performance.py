@@ -239,7 +239,7 @@ def measure_updates(rounds: int, updates: int, threads: Sequence[int]) -> tuple[
 
 def measure_compiled(rounds: int, updates: int) -> tuple[pd.DataFrame, pd.DataFrame]:
     """
-    Updates a second of LAC on one thread, compiled and not, with large and small networks.
+    Updates a second of LAC on one thread, compiled and not, beside those of SAC, with large and small networks.
 
     :param rounds: how often each has its turn
     :param updates: of a turn
@@ -250,19 +250,24 @@ def measure_compiled(rounds: int, updates: int) -> tuple[pd.DataFrame, pd.DataFr
     contestants: dict[str, Callable[[], int]] = {}
     networks = ["-".join(map(str, net_arch)) for net_arch in (_LARGE, _SMALL)]
     for layers, net_arch in zip(networks, (_LARGE, _SMALL), strict=True):
-        for name, compile_update in (("eager", False), ("compiled", True)):
-            model = ready_model(LAC, net_arch, many_cells(64), compile_update=compile_update)
+        models = {
+            "SAC": ready_model(SAC, net_arch, many_cells(64)),
+            "eager": ready_model(LAC, net_arch, many_cells(64)),
+            "compiled": ready_model(LAC, net_arch, many_cells(64), compile_update=True),
+        }
+        for name, model in models.items():
             contestants[f"{name}, {layers}"] = partial(updates_of, model, updates)
     speeds = race(contestants, rounds, clock_of(1))
     rows = []
     for layers in networks:
-        eager, compiled = (speeds[f"{name}, {layers}"] for name in ("eager", "compiled"))
+        sac, eager, compiled = (speeds[f"{name}, {layers}"] for name in ("SAC", "eager", "compiled"))
         rows.append(
             {
                 "networks": layers,
                 "LAC, updates a second": spread(eager, 0),
                 "compiled": spread(compiled, 0),
                 "compiled is faster by a factor of": spread(compiled / eager, 2),
+                "and than SAC by": spread(compiled / sac, 2),
             }
         )
     return speeds, pd.DataFrame(rows)
