@@ -28,6 +28,7 @@ from battery_env.calibration.data import standard_dataset
 from battery_env.calibration.policy import PolicyEstimator
 from battery_env.calibration.pretrained import policy_of_file
 from battery_env.evaluation import evaluate
+from battery_env.files import replacing
 from battery_env.trajectories import AgedParameter
 from benchmarks.contests import SENSORS
 from benchmarks.study import SYMBOLS, Study, Tables, command_line, markdown, positive, versions, write_json
@@ -76,8 +77,8 @@ def make(env_id: str, seed: int, updates: int, folder: Path) -> Recipe:
     recipe = recipe_of(env_id, seed, updates)
     model = train_or_load("lac", env_id, seed, recipe.timesteps, folder / "models", {"env_kwargs": TRAINED_WITH})
     file = folder / f"{env_id}.onnx"
-    file.unlink(missing_ok=True)
-    export_onnx(model, file, env_id)
+    with replacing(file) as part:
+        export_onnx(model, part, env_id)
     write_json(file.with_suffix(".json"), {"env_id": env_id, "options": OPTIONS})
     return recipe
 

@@ -16,6 +16,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from stable_baselines3.common.type_aliases import PolicyPredictor
 
@@ -121,6 +122,28 @@ def report(results: pd.DataFrame) -> str:
     return markdown(pd.DataFrame(shown))
 
 
+def draw_shares(axes: Axes, results: pd.DataFrame, by: str, order: list[str]) -> None:
+    """
+    A map of the share of episodes that end at the goal, and in brackets of those that die, by disturbance.
+
+    :param axes: to draw on
+    :param results: rows of :func:`tried`
+    :param by: column that has a row of the map for each of its values
+    :param order: of these rows
+    """
+    shares, deaths = (
+        results.pivot_table(index=by, columns="disturbance", values=column, sort=False).loc[order]
+        for column in ("at_goal", "died")
+    )
+    axes.imshow(shares, vmin=0.0, vmax=1.0, aspect="auto", cmap="cividis")
+    for i, j in np.ndindex(shares.shape):
+        share, death = shares.iloc[i, j], deaths.iloc[i, j]
+        text = f"{share:.0%}" + (f" ({death:.0%})" if death > 0 else "")
+        axes.text(j, i, text, ha="center", va="center", color="black" if share > 0.5 else "white", size=8)
+    axes.set_xticks(range(shares.shape[1]), [name.replace(" ", "\n") for name in shares.columns], fontsize="small")
+    axes.set_yticks(range(len(order)), order)
+
+
 def plot(results: pd.DataFrame) -> Figure:
     """
     The share of episodes that end at the goal, and in brackets of those that die.
@@ -128,19 +151,9 @@ def plot(results: pd.DataFrame) -> Figure:
     :param results: see ``part()``, of all environments
     :return: the figure
     """
-    shares, deaths = (
-        results.pivot_table(index="environment", columns="disturbance", values=column, sort=False)
-        for column in ("at_goal", "died")
-    )
     figure = new_figure(7.6, 3.2)
     axes = figure.subplots()
-    axes.imshow(shares, vmin=0.0, vmax=1.0, aspect="auto", cmap="cividis")
-    for i, j in np.ndindex(shares.shape):
-        share, death = shares.iloc[i, j], deaths.iloc[i, j]
-        text = f"{share:.0%}" + (f" ({death:.0%})" if death > 0 else "")
-        axes.text(j, i, text, ha="center", va="center", color="black" if share > 0.5 else "white", size=8)
-    axes.set_xticks(range(shares.shape[1]), [condition.replace(" ", "\n") for condition in shares.columns])
-    axes.set_yticks(range(shares.shape[0]), list(shares.index))
+    draw_shares(axes, results, "environment", list(results["environment"].unique()))
     axes.set_title("episodes that end at the goal (that die)")
     return figure
 

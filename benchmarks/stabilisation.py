@@ -28,7 +28,7 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 from battery_env.evaluation import over_seeds
 from battery_env.plotting import COLOURS, new_figure
 from benchmarks.certificate import judge
-from benchmarks.references import DISTURBANCES, conditions, tried
+from benchmarks.references import DISTURBANCES, conditions, draw_shares, tried
 from benchmarks.study import Study, Tables, command_line, digits, markdown, positive
 from benchmarks.training import Recipe, train_or_load
 from sb3_lac.envs import reference_controller
@@ -248,19 +248,7 @@ def plot_disturbances(results: pd.DataFrame) -> Figure:
         axes.remove()
     for axes, env_id in zip(panels, envs, strict=False):
         of_env = results[results["environment"] == env_id]
-        shares, deaths = (
-            of_env.pivot_table(index="policy", columns="disturbance", values=column, sort=False)
-            for column in ("at_goal", "died")
-        )
-        order = [name for name in _STYLES if name in shares.index]
-        shares, deaths = shares.loc[order], deaths.loc[order]
-        axes.imshow(shares, vmin=0.0, vmax=1.0, aspect="auto", cmap="cividis")
-        for i, j in np.ndindex(shares.shape):
-            share, death = shares.iloc[i, j], deaths.iloc[i, j]
-            text = f"{share:.0%}" + (f" ({death:.0%})" if death > 0 else "")
-            axes.text(j, i, text, ha="center", va="center", color="black" if share > 0.5 else "white", size=7)
-        axes.set_xticks(range(shares.shape[1]), [name.replace(" ", "\n") for name in shares.columns], fontsize="small")
-        axes.set_yticks(range(len(order)), order)
+        draw_shares(axes, of_env, "policy", [name for name in _STYLES if name in set(of_env["policy"])])
         axes.set_title(env_id)
     figure.suptitle("episodes that end at the goal (that die)")
     return figure

@@ -21,15 +21,17 @@ from functools import partial
 from itertools import cycle, islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, TypeVar
 
 import gymnasium as gym
 import numpy as np
 import pandas as pd
 import torch as th
+from matplotlib import rc_context
 from stable_baselines3 import SAC, TD3
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.type_aliases import GymEnv
 from torch import nn
 from tqdm import trange
 
@@ -39,6 +41,8 @@ from battery_env.estimators.base import OnlineBatch, OnlineEstimator
 from battery_env.records import Stream
 from benchmarks.study import Study, command_line, markdown, positive
 from sb3_lac import LAC
+
+Algorithm = TypeVar("Algorithm", bound=OffPolicyAlgorithm)
 
 _ALGORITHMS: dict[str, type[LAC] | type[SAC] | type[TD3]] = {"LAC": LAC, "SAC": SAC, "TD3": TD3}
 _TRANSITIONS = 5_000
@@ -67,28 +71,36 @@ _PARTS = {
 }
 
 
-def filled_model(algo: str, env_id: str, net_arch: list[int], batch_size: int) -> OffPolicyAlgorithm:
+def filled_model(
+    algorithm: type[Algorithm],
+    env: GymEnv | str,
+    net_arch: list[int],
+    batch_size: int,
+    transitions: int,
+    **arguments: Any,
+) -> Algorithm:
     """
-    A model with transitions in its replay buffer, ready for updates.
+    A model with transitions in its replay buffer, which has made its first updates.
 
-    :param algo: ``LAC``, ``SAC`` or ``TD3``
-    :param env_id: id of the environment
+    :param algorithm: its class
+    :param env: the environment, or its id
     :param net_arch: widths of the hidden layers, of all networks
     :param batch_size: batch size
+    :param transitions: how many; the size of the replay buffer, too, unless ``arguments`` say otherwise
+    :param arguments: other arguments of the algorithm
     :return: the model
     """
-    model = _ALGORITHMS[algo](
-        "MlpPolicy",
-        env_id,
-        learning_starts=_TRANSITIONS,
-        buffer_size=_TRANSITIONS,
-        batch_size=batch_size,
-        policy_kwargs={"net_arch": net_arch, "activation_fn": nn.LeakyReLU},
-        device="cpu",
-        seed=0,
-    )
+    kwargs: dict[str, Any] = {
+        "learning_starts": transitions,
+        "buffer_size": transitions,
+        "batch_size": batch_size,
+        "policy_kwargs": {"net_arch": net_arch, "activation_fn": nn.LeakyReLU},
+        "device": "cpu",
+        "seed": 0,
+    }
+    model = algorithm("MlpPolicy", env, **{**kwargs, **arguments})
     model.set_logger(Logger(folder=None, output_formats=[]))
-    model.learn(_TRANSITIONS)
+    model.learn(transitions)
     model.train(gradient_steps=_WARM_UP_UPDATES, batch_size=batch_size)
     return model
 
@@ -160,7 +172,8 @@ def model_contestants(cells: int) -> dict[str, Callable[[], int]]:
     :param cells: how many are many
     :return: by name, what makes a turn of steps and returns how many
     """
-    from progpy.models import BatteryElectroChemEOD  # heavy, and needed here only
+    with rc_context():  # progpy changes the defaults of matplotlib
+        from progpy.models import BatteryElectroChemEOD  # heavy, and needed here only
 
     peer = BatteryElectroChemEOD()
     load = peer.InputContainer({"i": 2.0})
@@ -395,7 +408,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     th.set_num_threads(chosen.threads)
     if "updates" in chosen.only:
-        models = {name: filled_model(name, chosen.env, chosen.net_arch, chosen.batch_size) for name in _ALGORITHMS}
+        models: dict[str, OffPolicyAlgorithm] = {
+            name: filled_model(kind, chosen.env, chosen.net_arch, chosen.batch_size, _TRANSITIONS)
+            for name, kind in _ALGORITHMS.items()
+        }
         speeds = measure(models, chosen.rounds, chosen.updates, chosen.batch_size)
         parts = pd.DataFrame({name: profile(model, chosen.updates, chosen.batch_size) for name, model in models.items()}).T
         tables = {"updates": speeds, "updates_profile": parts.rename_axis("algorithm").reset_index()}

@@ -9,6 +9,7 @@ import pytest
 import torch as th
 
 from benchmarks import throughput
+from sb3_lac import LAC
 
 ENV_ID = "LinearCost-v0"
 
@@ -46,7 +47,7 @@ def test_models_take_turns_in_alternating_order(monkeypatch):
 
 @pytest.mark.parametrize("algo", list(throughput._ALGORITHMS))
 def test_models_are_ready_for_updates_and_equal_in_size(algo):
-    model = throughput.filled_model(algo, ENV_ID, [8, 4], 16)
+    model = throughput.filled_model(throughput._ALGORITHMS[algo], ENV_ID, [8, 4], 16, 40)
     assert type(model).__name__ == algo and model.replay_buffer.full and model._n_updates == 1
     for network in (model.actor, model.critic):
         # the first layer of each network
@@ -54,7 +55,7 @@ def test_models_are_ready_for_updates_and_equal_in_size(algo):
 
 
 def test_shares_of_the_time_are_complete():
-    model = throughput.filled_model("LAC", ENV_ID, [8], 16)
+    model = throughput.filled_model(LAC, ENV_ID, [8], 16, 40)
     shares = throughput.profile(model, 2, 16)
     assert list(shares) == [*throughput._PARTS, "Python"]
     assert sum(shares.values()) == pytest.approx(1.0)
