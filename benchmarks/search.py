@@ -5,12 +5,14 @@ updates and varied settings for each algorithm, starting from the entry in ``zoo
 .. code-block:: bash
 
   python -m benchmarks.search --env BatteryQmax-v0 --trials 10 --updates 2400
-  python -m benchmarks.search --env PendulumCost-v0 --trials 6 --updates 4000 --finalists 2 --repeats 1
+  python -m benchmarks.search --env PendulumCost-v0 --trials 6 --updates 4000 --finalists 2 --repeats 1 --exchange
 
 A trial trains with the entry of ``zoo_configs``, changed where the search varies it, and is scored by its mean action. On a
 full-state task that is its mean error on whole discharges of the training part, the model running free; the test part is not
 touched. On a cost environment it is the cost per step, from other starts than those of the studies. One seed says little: the
 best trials, three by default, are trained again, twice by default, with other seeds, and ranked by the mean of their scores.
+With ``--exchange`` each algorithm also tries what the others found: its own best trial with the settings that it shares with
+the best of another one, as often. A few trials find a good learning rate or not, and that is no merit of an algorithm.
 Trials lie in a journal of Optuna: after an interruption the same command goes on (with other trials than an uninterrupted
 search would try).
 """
@@ -167,7 +169,8 @@ def sampled(algo: str, env_id: str, trial: Trial) -> dict[str, Any]:
     """
     family = FAMILIES[env_id]
     settings: dict[str, Any] = {}
-    for name in family.varied[algo]:
+    varied = family.varied[algo]
+    for name in [*varied, *(name for name in trial.user_attrs.get("settings", {}) if name not in varied)]:
         of_name = family.ranges[name]
         if isinstance(of_name, tuple):
             settings[name] = float(f"{trial.suggest_float(name, *of_name, log=True):.2g}")
@@ -207,7 +210,16 @@ def score(algo: str, env_id: str, updates: int, folder: Path, trial: Trial) -> f
     return min(float(np.nan_to_num(scores.mean(), nan=family.worst)), family.worst)
 
 
-def part(algo: str, env_id: str, trials: int, updates: int, finalists: int, repeats: int, out: Path) -> Tables:
+def part(
+    algo: str,
+    env_id: str,
+    trials: int,
+    updates: int,
+    finalists: int,
+    repeats: int,
+    others: dict[str, dict[str, Any]],
+    out: Path,
+) -> Tables:
     """
     The search of one algorithm, or what is left of it.
 
@@ -217,6 +229,7 @@ def part(algo: str, env_id: str, trials: int, updates: int, finalists: int, repe
     :param updates: gradient steps of each
     :param finalists: how many of the best are trained again
     :param repeats: how often
+    :param others: settings that other algorithms found, by algorithm; each is one more trial, and trained again as often
     :param out: folder of the journal
     :return: ``search``, one row per trial; means over its seeds, the worst discharge of any seed
     """
@@ -232,15 +245,20 @@ def part(algo: str, env_id: str, trials: int, updates: int, finalists: int, repe
         for first_trial in FAMILIES[env_id].first_trials:
             study.enqueue_trial(first_trial)
     objective = partial(score, algo, env_id, updates, out / "zoo")
-    study.optimize(objective, n_trials=max(trials - len(_first_trials(study)), 0))
-    best = sorted(_first_trials(study), key=lambda trial: trial.values[0])[:finalists]
-    for finalist in best:
-        for _ in range(repeats - len(_repeats(study, finalist))):
-            study.enqueue_trial(finalist.params, user_attrs={"repeats": finalist.number})
+    study.optimize(objective, n_trials=max(trials - len(_own_trials(study)), 0))
+    best = sorted(_own_trials(study), key=lambda trial: trial.values[0])[:finalists]
+    _train_again(study, objective, best, repeats)
+    start = min(best, key=lambda trial: np.mean([run.value for run in _runs(study, trial)]))
+    for other, settings in others.items():
+        shared = {name: value for name, value in settings.items() if name in _taken_by(algo)}
+        of_other = {"settings_of": other, "settings": shared}
+        if not _adopted(study, of_other):
+            study.enqueue_trial(start.params | shared, user_attrs=of_other)
             study.optimize(objective, n_trials=1)
+        _train_again(study, objective, _adopted(study, of_other), repeats)
     rows, unit = [], FAMILIES[env_id].unit
     for trial in _first_trials(study):
-        runs = [trial, *_repeats(study, trial)]
+        runs = _runs(study, trial)
         scores = {
             "seeds": len(runs),
             f"mean_{unit}": np.mean([run.value for run in runs]),
@@ -248,7 +266,9 @@ def part(algo: str, env_id: str, trials: int, updates: int, finalists: int, repe
             f"worst_{unit}": max(run.user_attrs["worst"] for run in runs),
             f"all_mean_{unit}": side_by_side(run.values[0] for run in runs),
         }
-        rows.append({"algo": algo, "trial": trial.number, "updates": updates, **scores, **trial.params})
+        origin = trial.user_attrs.get("settings_of", algo)
+        described = {"algo": algo, "trial": trial.number, "settings_of": origin, "updates": updates}
+        rows.append({**described, **scores, **trial.params})
     return {"search": pd.DataFrame(rows)}
 
 
@@ -257,9 +277,32 @@ def _first_trials(study: optuna.Study) -> list[FrozenTrial]:
     return [trial for trial in complete if "repeats" not in trial.user_attrs]
 
 
-def _repeats(study: optuna.Study, trial: FrozenTrial) -> list[FrozenTrial]:
+def _own_trials(study: optuna.Study) -> list[FrozenTrial]:
+    return [trial for trial in _first_trials(study) if "settings_of" not in trial.user_attrs]
+
+
+def _adopted(study: optuna.Study, of_other: dict[str, Any]) -> list[FrozenTrial]:
+    return [trial for trial in _first_trials(study) if of_other.items() <= trial.user_attrs.items()]
+
+
+def _runs(study: optuna.Study, trial: FrozenTrial) -> list[FrozenTrial]:
+    # the trial and its repeats
     complete = study.get_trials(states=[TrialState.COMPLETE])
-    return [run for run in complete if run.user_attrs.get("repeats") == trial.number]
+    return [trial, *(run for run in complete if run.user_attrs.get("repeats") == trial.number)]
+
+
+def _train_again(
+    study: optuna.Study, objective: Callable[[Trial], float], trials: Sequence[FrozenTrial], repeats: int
+) -> None:
+    for trial in trials:
+        for _ in range(repeats + 1 - len(_runs(study, trial))):
+            study.enqueue_trial(trial.params, user_attrs={**trial.user_attrs, "repeats": trial.number})
+            study.optimize(objective, n_trials=1)
+
+
+def _taken_by(algo: str) -> set[str]:
+    # settings of other algorithms that this one has too
+    return set(_COMMON if algo == "td3" else _SOFT)
 
 
 def report(trials: pd.DataFrame) -> str:
@@ -292,6 +335,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--updates", type=positive, default=2400, help="gradient steps of each trial")
     parser.add_argument("--finalists", type=positive, default=3, help="how many of the best trials are trained again")
     parser.add_argument("--repeats", type=positive, default=2, help="how often they are trained again")
+    parser.add_argument("--exchange", action="store_true", help="try the best settings of the other algorithms too")
     study = Study(parser, arguments)
     chosen = study.chosen
     if unknown := set(chosen.algos) - set(FAMILIES[chosen.env].varied):
@@ -303,8 +347,24 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "finalists": chosen.finalists,
         "repeats": chosen.repeats,
     }
-    tables = study.run(part, [{"algo": algo, **common} for algo in chosen.algos], out=study.out)
-    study.write(tables, {}, report(tables["search"]))
+    others: dict[str, dict[str, dict[str, Any]]] = {algo: {} for algo in chosen.algos}
+    if chosen.exchange:
+        found = _search(study, others, common)
+        best = {algo: _best_settings(found[found["algo"] == algo], FAMILIES[chosen.env]) for algo in chosen.algos}
+        others = {algo: {other: best[other] for other in chosen.algos if other != algo} for algo in chosen.algos}
+    trials = _search(study, others, common)
+    study.write({"search": trials}, {}, report(trials))
+
+
+def _search(study: Study, others: dict[str, dict[str, dict[str, Any]]], common: dict[str, Any]) -> pd.DataFrame:
+    parts = [{"algo": algo, **common, "others": of_others} for algo, of_others in others.items()]
+    return study.run(part, parts, out=study.out)["search"]
+
+
+def _best_settings(trials: pd.DataFrame, family: Family) -> dict[str, Any]:
+    repeated = trials[trials["seeds"] > 1] if (trials["seeds"] > 1).any() else trials
+    best = repeated.sort_values(f"mean_{family.unit}").iloc[0]
+    return {name: float(best[name]) for name in family.ranges if name in best and not pd.isna(best[name])}
 
 
 if __name__ == "__main__":

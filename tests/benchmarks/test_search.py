@@ -41,7 +41,7 @@ def test_every_algorithm_gets_the_same_trials_of_as_many_settings(trials, tmp_pa
 
 
 def found(algo, count, updates, out):
-    return search.part(algo, "BatteryRo-v0", count, updates, 3, 2, out)["search"]
+    return search.part(algo, "BatteryRo-v0", count, updates, 3, 2, {}, out)["search"]
 
 
 def test_a_search_goes_on_and_is_not_done_twice(trials, tmp_path):
@@ -91,6 +91,30 @@ def test_a_cost_environment_is_searched_by_its_cost(trials, tmp_path, capsys):
     table = pd.read_csv(tmp_path / "search.csv")
     assert "mean_cost" in table and (table["seeds"] == 2).sum() == 2
     assert "worst_cost" in capsys.readouterr().out
+
+
+def test_each_algorithm_tries_what_the_others_found_as_often(trials, tmp_path):
+    command = ["--env", "QuadrotorCost-v0", "--trials", "4", "--finalists", "2", "--repeats", "1", "--exchange"]
+    search.main([*command, "--jobs", "1", "--out", str(tmp_path)])
+    own = trials[: 3 * 6]
+    assert [algo for algo, _ in own] == ["lac"] * 6 + ["sac"] * 6 + ["td3"] * 6
+    adopted = trials[3 * 6 :]
+    # two others each, twice
+    assert [algo for algo, _ in adopted] == ["lac"] * 4 + ["sac"] * 4 + ["td3"] * 4
+    table = pd.read_csv(tmp_path / "search.csv")
+    assert (table["settings_of"] != table["algo"]).sum() == 6 and (table["seeds"] == 2).sum() == 3 * 2 + 6
+    best = {algo: rows[rows["settings_of"] == algo].sort_values("mean_cost").iloc[0] for algo, rows in table.groupby("algo")}
+    for algo, other in [("lac", "sac"), ("sac", "lac"), ("td3", "lac"), ("lac", "td3")]:
+        (row,) = table[(table["algo"] == algo) & (table["settings_of"] == other)].to_dict("records")
+        shared = ["learning_rate", "gamma"] + ([] if "td3" in (algo, other) else ["ent_coef"])
+        assert [row[name] for name in shared] == best[other][shared].tolist()
+    # LAC has a target entropy, though its own search does not vary it
+    first, again = (settings for _, settings in adopted[:2])
+    assert first == again and {name: first[name] for name in ("target_entropy", "tau")} == dict(
+        best["sac"][["target_entropy", "tau"]]
+    )
+    search.main([*command, "--jobs", "1", "--out", str(tmp_path)])
+    assert len(trials) == 3 * 6 + 3 * 4
 
 
 @pytest.mark.parametrize(
