@@ -34,8 +34,8 @@ from sb3_lac.zoo import LACExperimentManager, find_config
 
 #: Environment steps with the algorithms' own hyperparameters, which name none.
 DEFAULTS_TIMESTEPS = 20_000
-# arguments of algorithms that the recipe states elsewhere, or that change nothing
-_NOT_LEARNING = {"seed", "verbose", "device", "tensorboard_log", "stats_window_size", "_init_setup_model"}
+# arguments of algorithms that the recipe states elsewhere, or that change nothing but rounding
+_NOT_LEARNING = {"seed", "verbose", "device", "tensorboard_log", "stats_window_size", "compile_update", "_init_setup_model"}
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,8 @@ def trained(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("name", "seen"), [("published", 29), ("from_model", 22), ("from_cell", 22), ("none", 15), ("gamma", 29), ("short", 29)]
+    ("name", "seen"),
+    [("published", 29), ("from_model", 22), ("from_cell", 22), ("none", 15), ("gamma", 29), ("consistency", 30)],
 )
 def test_a_policy_sees_in_its_test_what_it_saw_in_its_training(trained, tmp_path, monkeypatch, name, seen):
     test = standard_dataset("q_mobile", "paper", "test").subset([0, 900])
@@ -40,8 +41,9 @@ def test_a_policy_sees_in_its_test_what_it_saw_in_its_training(trained, tmp_path
     # the middle of the range is 6000 C
     expected = 100.0 * np.abs(6000.0 / test.q_mobile - 1.0)
     np.testing.assert_allclose([row["mean_percent"], row["worst_percent"]], [expected.mean(), expected.max()], rtol=1e-6)
+    assert row["spread_percent"] == pytest.approx(0.0, abs=1e-9)
     wrappers = call.get("env_wrapper", [])
-    env = gym.make("BatteryQmax-v0")
+    env = gym.make("BatteryQmax-v0", **call.get("env_kwargs", {}))
     for wrapper in wrappers:
         env = ablations.HideColumns(env, **wrapper["benchmarks.ablations.HideColumns"])
     assert env.observation_space.shape == (seen,) == env.reset(seed=0)[0].shape
@@ -63,7 +65,7 @@ def test_tables_name_what_was_changed_with_all_seeds(trained, tmp_path, capsys):
     table = pd.read_csv(tmp_path / "ablations.csv")
     assert table["changed"].tolist() == ["discount 0.9"] * 2 + ["episodes of 16 steps, the paper's"] * 2
     text = (tmp_path / "ablations.md").read_text()
-    assert text in capsys.readouterr().out and len(text.splitlines()) == 4 and text.count(" / ") == 6
+    assert text in capsys.readouterr().out and len(text.splitlines()) == 4 and text.count(" / ") == 8
 
 
 @pytest.mark.parametrize("command", [["--updates", "0"], ["--jobs", "0"], ["--variants", "all"]])
