@@ -77,7 +77,8 @@ def read_errors(results: Path) -> pd.DataFrame:
             column = next((measure for measure in measures if measure in columns), None)
             if column is None:
                 continue
-            title = f"{file.stem.rsplit('_', 1)[0]}, {name}{measures[column]}"
+            # a task with two parameters has a file for each
+            title = f"{file.stem.rsplit('_', 1)[0].removesuffix(f'_{name}')}, {name}{measures[column]}"
             of_parameter = pd.DataFrame(
                 {
                     "source": file.relative_to(results).as_posix(),

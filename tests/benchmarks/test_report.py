@@ -76,10 +76,10 @@ def test_numbers_with_the_full_state_are_those_of_their_table(folder):
     errors = report.read_errors(RESULTS / folder)
     table = pd.read_csv(RESULTS / folder / "compare.csv")
     # points are published of the first seed
-    table = table[table["seed"] == 0].set_index(["env", "algo"])
+    table = table[table["seed"] == 0].set_index(["env", "parameter", "algo"])
     for comparison, group in errors.groupby("comparison"):
         for row in report.summary(group).itertuples():
-            expected = table.loc[(comparison.split(",")[0], row.calibrator.split()[0].lower())]
+            expected = table.loc[(*comparison.split(", "), row.calibrator.split()[0].lower())]
             assert row.mean == pytest.approx(expected["mape_percent"], rel=1e-4)
             assert row.worst == pytest.approx(expected["mape_worst_percent"], rel=1e-4)
 
