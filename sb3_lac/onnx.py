@@ -164,6 +164,9 @@ def _graph(module: DeterministicPolicy, observations: np.ndarray, env_id: str | 
         Distribution.set_default_validate_args(validate_args)
     assert program is not None
     graph = program.model_proto
+    # Where the code lies on this machine, for whoever gets the file
+    for part in (graph.graph, *graph.graph.node, *(node for function in graph.functions for node in function.node)):
+        part.ClearField("metadata_props")
     description = {"algorithm": algorithm, "sb3_lac": sb3_lac.__version__}
     if env_id is not None:
         description["env_id"] = env_id

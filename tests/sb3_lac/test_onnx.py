@@ -1,3 +1,5 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch as th
@@ -28,6 +30,9 @@ def test_the_file_does_what_the_policy_does(algorithm, tmp_path):
     assert policy.observation_shape == (3,)
     # The model is as it was, and nothing else was written
     assert [file.name for file in tmp_path.iterdir()] == ["policy.onnx"]
+    # Nor does the file say where the code lies
+    content = (tmp_path / "policy.onnx").read_bytes()
+    assert str(Path(onnx.__file__).parent).encode() not in content and b"site-packages" not in content
     assert th.distributions.Distribution._validate_args == validates
 
 
