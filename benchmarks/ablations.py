@@ -126,10 +126,9 @@ def part(name: str, seed: int, updates: int, models: Path) -> Tables:
     model = train_or_load("lac", _ENV_ID, seed, timesteps, models / name, hyperparameters)
     test = standard_dataset("q_mobile", "paper", "test")
     test = test.subset(range(0, len(test), len(test) // _DISCHARGES))
-    in_training = hyperparameters.get("env_kwargs", {})
     # of the arguments of the environment the only one that the observation depends on
-    shown = {name: in_training[name] for name in ("consistency",) if name in in_training}
-    scores = evaluate(PolicyEstimator(_Blinkered(model, variant.hidden), _ENV_ID, **shown), test)
+    consistency = hyperparameters.get("env_kwargs", {}).get("consistency", 0.0)
+    scores = evaluate(PolicyEstimator(_Blinkered(model, variant.hidden), _ENV_ID, consistency=consistency), test)
     errors = scores["q_mobile_mape_percent"]
     row = {
         "variant": name,

@@ -340,6 +340,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     chosen = study.chosen
     if unknown := set(chosen.algos) - set(FAMILIES[chosen.env].varied):
         parser.error(f"{', '.join(sorted(unknown))} cannot be searched on {chosen.env}")
+    if chosen.exchange and len(set(chosen.algos)) < 2:
+        parser.error("--exchange takes two algorithms or more: there is nobody to exchange settings with")
     common = {
         "env_id": chosen.env,
         "trials": chosen.trials,
