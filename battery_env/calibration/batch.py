@@ -20,7 +20,8 @@ class Cells:
     :param last_sample: last sample of the discharge
     :param last_decision: last sample at which there is a decision
     :param load_start: index of the first load of the discharge
-    :param decisions: number of decisions made in this episode
+    :param steps: decisions of this episode, fewer where the data end
+    :param decisions: number of those made
     :param state: x_t, shape (n, 8)
     :param next_state: x_{t+1}
     :param model_state: x̂_t
@@ -43,6 +44,7 @@ class Cells:
     last_sample: IntArray
     last_decision: IntArray
     load_start: IntArray
+    steps: IntArray
     decisions: IntArray
     state: FloatArray
     next_state: FloatArray

@@ -70,6 +70,8 @@ class FullStateTask(CalibrationTask):
         cells: int,
         *,
         episode_steps: int | None = None,
+        continue_probability: float = 0.0,
+        first_sample_probability: float = 0.0,
         start: Literal["true", "new_cell"] = "true",
         initial_perturbation: float = 0.0,
         resync: int | None = None,
@@ -90,11 +92,22 @@ class FullStateTask(CalibrationTask):
         if resync is not None and resync < 1:
             raise ValueError(f"resync must be None or at least 1, got {resync!r}")
         check_not_negative(
+            continue_probability=continue_probability,
+            first_sample_probability=first_sample_probability,
             initial_perturbation=initial_perturbation,
             process_noise_V=process_noise_V,
             sensor_noise=sensor_noise,
             consistency=consistency,
         )
+        if continue_probability >= 1.0:
+            raise ValueError(f"continue_probability must be less than 1, or episodes never end, got {continue_probability!r}")
+        if first_sample_probability > 1.0:
+            raise ValueError(f"first_sample_probability must be at most 1, got {first_sample_probability!r}")
+        if continue_probability > 0.0 and (sensor_noise > 0.0 or process_noise_V > 0.0):
+            raise ValueError(
+                "continue_probability does not go with sensor_noise or process_noise_V, which are drawn for episode_steps: "
+                "set it to 0, and episode_steps to the length that episodes shall have"
+            )
         if not np.isfinite(sensor_offset):
             raise ValueError(f"sensor_offset must be finite, got {sensor_offset!r}")
         form = self.formulation
@@ -114,6 +127,7 @@ class FullStateTask(CalibrationTask):
             self.dataset = dataset
         self.decision_s = dataset.dt_s
         self.starts_new = start == "new_cell"
+        self.continue_probability, self.first_sample_probability = continue_probability, first_sample_probability
         self.initial_perturbation = initial_perturbation
         self.resync = resync
         self.process_noise_V = process_noise_V
@@ -151,7 +165,8 @@ class FullStateTask(CalibrationTask):
         scales = (1.0 / form.state_scale, 1.0 / form.load_scale, 1.0 / form.error_scale)
         self._of_observation = (*scales, form.innovations, shows_action, OBSERVATION_LIMIT, *self._of_step)
         nowhere = np.zeros(cells, dtype=np.int64)
-        self.now = self._begin(nowhere, nowhere + dataset.first[0], np.zeros((cells, 4)), np.zeros((cells, *self._draws)))
+        perturbation, noise = np.zeros((cells, 4)), np.zeros((cells, *self._draws))
+        self.now = self._begin(nowhere, nowhere + dataset.first[0], nowhere + self.episode_steps, perturbation, noise)
 
     def start(
         self,
@@ -173,7 +188,7 @@ class FullStateTask(CalibrationTask):
             raise ValueError(f"options of reset are 'trajectory' and 'sample', got {sorted(unknown)}")
         bound = self.initial_perturbation
         trajectories = len(self.dataset)
-        trajectory, sample = np.empty((2, len(rows)), dtype=np.int64)
+        trajectory, sample, steps = np.empty((3, len(rows)), dtype=np.int64)
         perturbation, noise = np.zeros((len(rows), 4)), np.empty((len(rows), *self._draws))
         for k, generator in enumerate(generators):
             n = int(generator.integers(trajectories))
@@ -183,18 +198,24 @@ class FullStateTask(CalibrationTask):
                     raise ValueError(f"options['trajectory'] must lie within 0 .. {trajectories - 1}, got {n}")
             first, stop = self._starts[n]
             t = int(generator.integers(first, stop))
+            if self.first_sample_probability > 0.0 and generator.random() < self.first_sample_probability:
+                t = first
             if "sample" in chosen:
                 t = int(chosen["sample"])
                 if not first <= t < stop:
                     raise ValueError(f"options['sample'] must lie within {first} .. {stop - 1} for trajectory {n}, got {t}")
-            trajectory[k], sample[k] = n, t
+            trajectory[k], sample[k], steps[k] = n, t, self.episode_steps
+            if self.continue_probability > 0.0:
+                steps[k] *= generator.geometric(1.0 - self.continue_probability)
             if bound > 0.0:
                 perturbation[k] = generator.uniform(-bound, bound, size=4)
             if noise.size > 0:
                 generator.standard_normal(out=noise[k])
-        self.now.put(rows, self._begin(trajectory, sample, perturbation, noise))
+        self.now.put(rows, self._begin(trajectory, sample, steps, perturbation, noise))
 
-    def _begin(self, trajectory: IntArray, sample: IntArray, perturbation: FloatArray, noise: FloatArray) -> Cells:
+    def _begin(
+        self, trajectory: IntArray, sample: IntArray, steps: IntArray, perturbation: FloatArray, noise: FloatArray
+    ) -> Cells:
         """Cells at samples of discharges."""
         dataset, n = self.dataset, len(sample)
         load_start, q_mobile, r_o = dataset.load_start[trajectory], dataset.q_mobile[trajectory], dataset.r_o[trajectory]
@@ -220,6 +241,7 @@ class FullStateTask(CalibrationTask):
             last_sample=dataset.samples[trajectory] - 1,
             last_decision=dataset.stop[trajectory] - 2,
             load_start=load_start,
+            steps=steps,
             decisions=np.zeros(n, dtype=np.int64),
             state=state,
             next_state=np.empty_like(state),
@@ -380,7 +402,7 @@ class FullStateTask(CalibrationTask):
         :return: shape (cells,)
         """
         now = self.now
-        return (now.decisions >= self.episode_steps) | (now.sample >= now.last_decision)
+        return (now.decisions >= now.steps) | (now.sample >= now.last_decision)
 
     def observation(self) -> NDArray[np.float32]:
         """

@@ -275,10 +275,40 @@ def test_a_cell_whose_data_have_ended_goes_on_without_failing(discharges):
     assert task.now.load == discharges[2].load[-1]
 
 
+def test_episodes_go_on_with_a_probability(discharges):
+    cells, probability = 2000, 0.5
+    task = make(discharges, cells=cells, episode_steps=3, continue_probability=probability)
+    task.start(np.arange(cells), [np.random.default_rng(n) for n in range(cells)])
+    lengths = task.now.steps // 3
+    assert (task.now.steps % 3 == 0).all() and lengths.min() == 1
+    # geometric: 4 standard errors around the mean of 1 / (1 - p)
+    assert abs(lengths.mean() - 2.0) < 4.0 * np.sqrt(2.0 / cells)
+    task.keep(lengths == 2)
+    data_last = task.now.sample + 6 < task.now.last_decision
+    for k in range(1, 7):
+        task.advance(np.zeros((task.cells, 1)))
+        assert (task.truncated()[data_last] == (k == 6)).all()
+
+
+def test_a_share_of_the_episodes_starts_at_the_first_sample(discharges):
+    cells = 400
+    for probability, low, high in ((0.0, 0, 4), (0.25, 60, 140), (1.0, cells, cells)):
+        task = make(discharges, cells=cells, first_sample_probability=probability)
+        task.start(np.arange(cells), [np.random.default_rng(n) for n in range(cells)])
+        at_first = task.now.sample == discharges.first[task.now.trajectory]
+        assert low <= at_first.sum() <= high
+    chosen = started(make(discharges, first_sample_probability=1.0))
+    assert chosen.now.sample == 300  # what is asked for comes first
+
+
 @pytest.mark.parametrize(
     ("option", "value", "message"),
     [
         ("episode_steps", 0, "episode_steps must be at least 1, got 0"),
+        ("continue_probability", 1.0, "continue_probability must be less than 1, or episodes never end, got 1.0"),
+        ("continue_probability", -0.1, "continue_probability must be finite and at least 0, got -0.1"),
+        ("first_sample_probability", 1.5, "first_sample_probability must be at most 1, got 1.5"),
+        ("first_sample_probability", np.nan, "first_sample_probability must be finite"),
         ("start", "old_cell", "start must be 'true' or 'new_cell', got 'old_cell'"),
         ("resync", 0, "resync must be None or at least 1, got 0"),
         ("initial_perturbation", -1.0, "initial_perturbation must be finite and at least 0, got -1.0"),
@@ -296,6 +326,12 @@ def test_a_cell_whose_data_have_ended_goes_on_without_failing(discharges):
 def test_options_out_of_range_are_refused(option, value, message):
     with pytest.raises(ValueError, match=message):
         BatteryQmax(1, **{option: value})
+
+
+@pytest.mark.parametrize("noise", ["sensor_noise", "process_noise_V"])
+def test_noise_is_not_repeated_in_episodes_that_go_on(noise):
+    with pytest.raises(ValueError, match="continue_probability does not go with sensor_noise or process_noise_V"):
+        BatteryQmax(1, continue_probability=0.5, **{noise: 0.01})
 
 
 @pytest.mark.parametrize("shape", [(2,), (2, 2), (1, 1), (3, 1)])
