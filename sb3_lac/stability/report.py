@@ -17,6 +17,7 @@ from sb3_lac.stability.functions import CriticLyapunov, LyapunovFunction
 from sb3_lac.stability.rollout import (
     check_seeds,
     cost_to_go,
+    known_seed,
     prepare_evaluation,
     relative_cost_to_go,
     roll_out,
@@ -50,6 +51,7 @@ class LyapunovReport:
     :param horizon: Number of steps whose costs ``L`` estimates, None for all to come
     :param max_tail_weight: Largest weight of the costs to come after the end of an episode, in ``cost_to_go``
     :param max_episode_steps: Gymnasium's time limit of the environment, None if it ends its episodes itself
+    :param seed: Seed of the roll-outs
     """
 
     transitions: pd.DataFrame
@@ -62,6 +64,7 @@ class LyapunovReport:
     horizon: int | None
     max_tail_weight: float
     max_episode_steps: int | None
+    seed: int
 
     @property
     def n_calibrated(self) -> int:
@@ -326,7 +329,7 @@ def evaluate_lyapunov(
         first half of each episode, with ``L`` at the end of the episode in place of the costs that follow it.
     :param n_cost_levels: Number of levels of the cost, at its quantiles, for which the decrease is reported separately
     :param n_bootstrap: Number of bootstrap samples
-    :param seed: Seed for ``env`` and for the actions
+    :param seed: Seed for ``env`` and for the actions; drawn if it is None, and kept in the report
     :param lyapunov: The function to judge, the critic by default. It cannot be judged on roll-outs that it was fitted on.
     :return: The report
     :raises ValueError: If the arguments cannot be meant, or the policy is not LAC and there is no ``lyapunov``
@@ -339,6 +342,7 @@ def evaluate_lyapunov(
             )
         lyapunov = CriticLyapunov(policy)
     env = prepare_evaluation(policy, env, n_eval_episodes, lyapunov.normalized_rewards)
+    seed = known_seed(seed)
     check_seeds(lyapunov, seed, env.num_envs)
     alpha3 = lyapunov.alpha3 if alpha3 is None else alpha3
     if not alpha3 > 0:
@@ -348,8 +352,11 @@ def evaluate_lyapunov(
     if n_cost_levels < 1 or n_bootstrap < 1:
         raise ValueError(f"n_cost_levels={n_cost_levels} and n_bootstrap={n_bootstrap} must be at least 1.")
 
-    bound = lyapunov.cost_bound(unwrap_vec_normalize(env))
-    with undisturbed(policy, env, seed):
+    vec_normalize = unwrap_vec_normalize(env)
+    # Asked for before the work: not every environment answers
+    limits = time_limits(env)
+    bound = lyapunov.cost_bound(vec_normalize)
+    with undisturbed(policy, env, seed), lyapunov.in_units_of(vec_normalize):
         roll_outs = roll_out(policy, env, n_eval_episodes, deterministic, lyapunov.normalized_rewards)
         roll_outs.add_values(policy, lyapunov, deterministic)
 
@@ -376,5 +383,6 @@ def evaluate_lyapunov(
         gamma=lyapunov.gamma,
         horizon=lyapunov.horizon,
         max_tail_weight=max_tail_weight,
-        max_episode_steps=max((limit for limit in time_limits(env) if limit is not None), default=None),
+        max_episode_steps=max((limit for limit in limits if limit is not None), default=None),
+        seed=seed,
     )

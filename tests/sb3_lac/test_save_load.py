@@ -66,8 +66,6 @@ def test_continued_training_is_the_same_as_uninterrupted_training(make_model, ma
     assert_same_learned_state(model, loaded)
 
 
-# Loading says that the saved class of the replay buffer makes n_steps void, it has however been set up for n_steps
-@pytest.mark.filterwarnings("ignore:`n_steps=3` is ignored")
 @pytest.mark.parametrize(
     ("n_envs", "norm_reward", "kwargs"),
     [
