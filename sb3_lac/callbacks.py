@@ -40,7 +40,8 @@ class LyapunovCallback(EventCallback):
     :param deterministic: Whether the evaluation should use stochastic or deterministic actions
     :param seed: Seed of each evaluation, so that all of them have the same start states; if it is None, each draws its own
     :param log_path: Path of a CSV file with the metrics and their confidence intervals, updated at each evaluation.
-        If it exists already, its evaluations are kept, so that the history of a continued training is complete.
+        If it exists already, its evaluations are kept, so that the history of a continued training is complete
+        (``learn(..., reset_num_timesteps=False)``). A training that starts anew is refused, whose evaluations it would mix in.
     :param verbose: Verbosity level: 0 for no output, 1 for the summary of each evaluation
     """
 
@@ -99,8 +100,15 @@ class LyapunovCallback(EventCallback):
         if self.log_path is not None:
             import pandas as pd  # slow to import, and only an evaluation needs it
 
+            if self.log_path.is_dir():
+                raise ValueError(f"log_path={self.log_path} is a folder: give the path of a CSV file.")
             self.log_path.parent.mkdir(parents=True, exist_ok=True)
-            if self.log_path.exists():
+            if self.log_path.exists() and self.log_path.stat().st_size > 0:
+                if self.model.num_timesteps == 0:
+                    raise ValueError(
+                        f"log_path={self.log_path} holds the evaluations of another training, and this one starts anew: move "
+                        "the file away, give another path, or continue with learn(..., reset_num_timesteps=False)."
+                    )
                 records = pd.read_csv(self.log_path).to_dict("records")
                 self.history = [{str(name): value for name, value in record.items()} for record in records]
 

@@ -2,6 +2,7 @@ import math
 import warnings
 from collections.abc import Sequence
 from contextlib import nullcontext, suppress
+from types import NoneType
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
@@ -385,6 +386,9 @@ class LAC(OffPolicyAlgorithm):
 
     def _check_arguments(self) -> None:
         """Check the arguments that SAC does not have."""
+        for name in ("alpha3", "lambda_init", "lambda_min", "lambda_max"):
+            if not isinstance(getattr(self, name), (float, int, np.number)):
+                raise ValueError(f"{name}={getattr(self, name)!r} must be a number.")
         if not self.alpha3 > 0:
             raise ValueError(
                 f"alpha3={self.alpha3} must be greater than 0: the Lyapunov value has to decrease by alpha3 times the cost. "
@@ -406,6 +410,8 @@ class LAC(OffPolicyAlgorithm):
                 f"and lambda_max={self.lambda_max}. Change lambda_init or widen the limits."
             )
         bound = self.stated_reward_bound
+        if not isinstance(bound, (float, int, np.number, NoneType)):
+            raise ValueError(f"reward_bound={bound!r} must be a number, or None for the largest reward seen.")
         if bound is not None and not 0 <= bound < math.inf:
             raise ValueError(
                 f"reward_bound={bound} must be finite and at least 0, because nothing is paid after a termination. "
@@ -786,8 +792,17 @@ class LAC(OffPolicyAlgorithm):
         :param args: Those of ``BaseAlgorithm.load()``
         :param kwargs: Those of ``BaseAlgorithm.load()``, and arguments of the model to change
         :return: The model
+        :raises ValueError: If arguments cannot be meant, or ``published_update`` is another one than the saved one
         """
-        model = super().load(*args, **kwargs)
+        try:
+            model = super().load(*args, **kwargs)
+        except (AttributeError, KeyError) as error:
+            if "published_update" not in kwargs:
+                raise
+            raise ValueError(
+                f"published_update={kwargs['published_update']} is not what the model was saved with: only one of the two "
+                "updates has a target actor, and it cannot be changed on loading."
+            ) from error
         if "reward_bound" in kwargs:
             model.reward_bound.fill_(max(model.stated_reward_bound or 0.0, model.largest_stored_reward))
             model.update_offset(model._vec_normalize_env)

@@ -15,8 +15,9 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_lac.lac import env_specs
 from sb3_lac.stability.fitting import FittedLyapunov
-from sb3_lac.stability.functions import LyapunovFunction
+from sb3_lac.stability.functions import LyapunovFunction, check_function
 from sb3_lac.stability.rollout import (
+    check_number,
     check_seeds,
     known_seed,
     prepare_evaluation,
@@ -206,13 +207,9 @@ def certify(
     :return: The report
     :raises ValueError: If the arguments cannot be meant
     """
+    _check_questions(lyapunov, confidence, cost_bound, level, window_steps)
     env = prepare_evaluation(policy, env, n_episodes, lyapunov is not None and lyapunov.normalized_rewards)
-    if not 0 < confidence < 1:
-        raise ValueError(f"confidence={confidence} must lie between 0 and 1.")
-    if n_episodes_per_start < 1:
-        raise ValueError(f"n_episodes_per_start={n_episodes_per_start} must be at least 1.")
-    if window_steps is not None and window_steps < 1:
-        raise ValueError(f"window_steps={window_steps} must be at least 1.")
+    check_number("n_episodes_per_start", n_episodes_per_start)
     if starts is not None:
         starts = np.asarray(starts, dtype=np.float64)
         if starts.ndim != 2 or len(starts) == 0 or not np.isfinite(starts).all():
@@ -286,6 +283,25 @@ def certify(
         window_steps=window_steps,
         description=description,
     )
+
+
+def _check_questions(
+    lyapunov: LyapunovFunction | None,
+    confidence: float,
+    cost_bound: float | None,
+    level: float | None,
+    window_steps: int | None,
+) -> None:
+    """Check what is asked of the episodes, see ``certify()``."""
+    if lyapunov is not None:
+        check_function(lyapunov)
+    if not 0 < confidence < 1:
+        raise ValueError(f"confidence={confidence} must lie between 0 and 1.")
+    for name, value in {"cost_bound": cost_bound, "level": level}.items():
+        if value is not None and math.isnan(value):
+            raise ValueError(f"{name}={value} must be a number, or None for that of a fitted function.")
+    if window_steps is not None:
+        check_number("window_steps", window_steps)
 
 
 def _chosen(given: float | None, of_the_fit: float) -> float | None:

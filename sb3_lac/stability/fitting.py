@@ -19,6 +19,7 @@ from sb3_lac.files import replacing
 from sb3_lac.stability.functions import LyapunovFunction, Observations
 from sb3_lac.stability.rollout import (
     RollOuts,
+    check_number,
     known_seed,
     prepare_evaluation,
     roll_out,
@@ -267,8 +268,7 @@ def fit_lyapunov(
     :raises NoCostError: If nothing had a cost on the roll-outs, which say nothing about decrease then
     """
     for name, value in {"n_iterations": n_iterations, "batch_size": batch_size}.items():
-        if value < 1:
-            raise ValueError(f"{name}={value} must be at least 1.")
+        check_number(name, value)
     if not learning_rate > 0:
         raise ValueError(f"learning_rate={learning_rate} must be greater than 0.")
     if not 0 <= trace_decay <= 1:

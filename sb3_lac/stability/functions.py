@@ -102,6 +102,18 @@ class LyapunovFunction:
         yield
 
 
+def check_function(lyapunov: object) -> None:
+    """
+    :param lyapunov: What is judged
+    :raises ValueError: If that is no Lyapunov function
+    """
+    if not isinstance(lyapunov, LyapunovFunction):
+        raise ValueError(
+            f"lyapunov={lyapunov!r} must be a LyapunovFunction: that of fit_lyapunov(policy, env), or "
+            "LyapunovFunction(function) for a function of observations."
+        )
+
+
 class CriticLyapunov(LyapunovFunction):
     """
     The critic of LAC: ``L(s, pi(s))`` with the mean action of the policy.

@@ -13,8 +13,9 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_lac.lac import LAC, time_limits
-from sb3_lac.stability.functions import CriticLyapunov, LyapunovFunction
+from sb3_lac.stability.functions import CriticLyapunov, LyapunovFunction, check_function
 from sb3_lac.stability.rollout import (
+    check_number,
     check_seeds,
     cost_to_go,
     known_seed,
@@ -341,6 +342,7 @@ def evaluate_lyapunov(
                 "learn one with fit_lyapunov(policy, env), and pass it as lyapunov=..."
             )
         lyapunov = CriticLyapunov(policy)
+    check_function(lyapunov)
     env = prepare_evaluation(policy, env, n_eval_episodes, lyapunov.normalized_rewards)
     seed = known_seed(seed)
     check_seeds(lyapunov, seed, env.num_envs)
@@ -349,8 +351,8 @@ def evaluate_lyapunov(
         raise ValueError(f"alpha3={alpha3} must be greater than 0.")
     if not 0 < max_tail_weight <= 1:
         raise ValueError(f"max_tail_weight={max_tail_weight} must be greater than 0, and at most 1.")
-    if n_cost_levels < 1 or n_bootstrap < 1:
-        raise ValueError(f"n_cost_levels={n_cost_levels} and n_bootstrap={n_bootstrap} must be at least 1.")
+    check_number("n_cost_levels", n_cost_levels)
+    check_number("n_bootstrap", n_bootstrap)
 
     vec_normalize = unwrap_vec_normalize(env)
     # Asked for before the work: not every environment answers

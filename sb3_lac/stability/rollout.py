@@ -41,8 +41,7 @@ def prepare_evaluation(policy: PolicyPredictor, env: gym.Env | VecEnv, n_eval_ep
     """
     if not callable(getattr(policy, "predict", None)):
         raise ValueError(f"{policy!r} has no method predict(observation, deterministic=...), which every policy needs.")
-    if n_eval_episodes < 1:
-        raise ValueError(f"n_eval_episodes={n_eval_episodes} must be at least 1.")
+    check_number("n_eval_episodes", n_eval_episodes)
     if not isinstance(policy, (BaseAlgorithm, BasePolicy)):
         # A controller that knows nothing of images and their channels
         return env if isinstance(env, VecEnv) else DummyVecEnv([lambda: env])  # type: ignore[list-item, return-value]
@@ -64,6 +63,16 @@ def prepare_evaluation(policy: PolicyPredictor, env: gym.Env | VecEnv, n_eval_ep
                 "observation of before the evaluation. Make a second environment for the evaluation."
             )
     return env
+
+
+def check_number(name: str, value: int) -> None:
+    """
+    :param name: Of an argument
+    :param value: Of the argument
+    :raises ValueError: If it is not how many there are of something
+    """
+    if not isinstance(value, (int, np.integer)) or value < 1:
+        raise ValueError(f"{name}={value!r} must be at least 1, and a whole number.")
 
 
 def known_seed(seed: int | None) -> int:

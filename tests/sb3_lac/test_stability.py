@@ -648,7 +648,9 @@ def test_episode_without_an_end_is_noticed(make_model, make_env, monkeypatch):
         ({"alpha3": float("nan")}, "alpha3=nan must be greater than 0"),
         ({"max_tail_weight": 0.0}, "max_tail_weight=0.0 must be greater than 0"),
         ({"max_tail_weight": 1.5}, "max_tail_weight=1.5 .* at most 1"),
+        ({"n_eval_episodes": 2.5}, "n_eval_episodes=2.5 must be at least 1, and a whole number"),
         ({"n_cost_levels": 0}, "n_cost_levels=0"),
+        ({"lyapunov": np.sum}, r"lyapunov=<function sum.* must be a LyapunovFunction.*LyapunovFunction\(function\)"),
         ({"n_bootstrap": 0}, "n_bootstrap=0"),
     ],
 )
@@ -783,6 +785,23 @@ def test_callback_logs_the_metrics(make_model, make_env, tmp_path, capsys):
     model.learn(20, callback=callback, reset_num_timesteps=False)
     assert pd.read_csv(log_path)["timesteps"].tolist() == [10, 20, 30]
     assert [entry["timesteps"] for entry in callback.history] == [10, 20, 30]
+
+
+def test_callback_does_not_mix_two_trainings(make_model, make_env, tmp_path):
+    def train(log_path, **kwargs):
+        callback = LyapunovCallback(make_env(), n_eval_episodes=1, eval_freq=10, log_path=log_path, verbose=0)
+        return make_model(n_collect=0).learn(10, callback=callback, **kwargs)
+
+    path = tmp_path / "log.csv"
+    # An empty file has no evaluations
+    path.touch()
+    train(path)
+    content = path.read_bytes()
+    with pytest.raises(ValueError, match=r"log\.csv holds the evaluations of another training, and this one starts anew"):
+        train(path)
+    assert path.read_bytes() == content
+    with pytest.raises(ValueError, match="is a folder"):
+        train(tmp_path)
 
 
 def test_callback_synchronizes_normalization(make_model, make_env):

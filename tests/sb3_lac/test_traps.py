@@ -270,6 +270,9 @@ def test_multipliers_learn_in_log_space():
         ({"n_steps": 3, "gamma": 1.0}, "gamma=1.0 must be smaller than 1 with n-step returns"),
         ({"policy_kwargs": {"output_dim": -1}}, "output_dim=-1 must not be negative"),
         ({"policy_kwargs": {"n_critics": 0}}, "n_critics=0 must be at least 1"),
+        ({"alpha3": "0.1"}, "alpha3='0.1' must be a number"),
+        ({"lambda_max": None}, "lambda_max=None must be a number"),
+        ({"reward_bound": "auto"}, "reward_bound='auto' must be a number, or None"),
     ],
 )
 def test_bad_arguments_are_named(make_model, kwargs, message):
