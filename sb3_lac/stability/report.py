@@ -316,7 +316,8 @@ def evaluate_lyapunov(
         environment itself, whether ``VecNormalize`` normalizes them or not. Unlike in ``evaluate_policy()``, a ``Monitor``
         makes no difference. With gSDE, the noise matrix of the last roll-out is kept.
         The training environment (``model.get_env()``) of LAC may be used between two calls of ``learn()``: the next one then
-        starts with a reset, and the unfinished episodes in the replay buffer end as by a time limit.
+        starts with a reset, and the unfinished episodes in the replay buffer end as by a time limit. Its random numbers go on
+        from the seed of the evaluation.
 
     :param policy: The policy: a model of Stable-Baselines3, or anything with ``predict(observation, deterministic=...)``
     :param env: The gym environment or ``VecEnv`` environment. Its normalization statistics are used as they are:
