@@ -22,7 +22,7 @@ import pandas as pd
 from battery_env.calibration.data import standard_dataset
 from battery_env.calibration.policy import PolicyEstimator, Predictor
 from battery_env.evaluation import evaluate
-from benchmarks.study import Study, Tables, command_line, markdown, positive, side_by_side
+from benchmarks.study import Study, Tables, command_line, markdown, natural, positive, side_by_side
 from benchmarks.training import Recipe, timesteps_of, train_or_load
 
 _ENV_ID = "BatteryQmax-v0"
@@ -170,7 +170,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """
     parser = command_line("ablations", __doc__)
     parser.add_argument("--variants", nargs="+", default=list(VARIANTS), choices=list(VARIANTS), metavar="NAME")
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--seeds", nargs="+", type=natural, default=[0, 1, 2])
     parser.add_argument("--updates", type=positive, default=2400, help="gradient steps of each training")
     study = Study(parser, arguments)
     chosen = study.chosen

@@ -30,7 +30,7 @@ from tqdm import tqdm
 from battery_env.plotting import COLOURS, new_figure, save_figure
 from benchmarks.controllers import controllers, factors
 from benchmarks.references import DISTURBANCES
-from benchmarks.study import Study, command_line
+from benchmarks.study import Study, command_line, natural
 from benchmarks.training import Recipe, train_or_load
 from sb3_lac import LAC, certify, evaluate_lyapunov, fit_lyapunov
 from sb3_lac.envs import LinearCostEnv
@@ -197,7 +197,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = command_line("certificate", __doc__, jobs=None)
     parser.add_argument("--envs", nargs="+", default=list(DISTURBANCES), help="cost environments")
     parser.add_argument("--algos", nargs="*", default=[], help="algorithms to train, with an entry in zoo_configs")
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
+    parser.add_argument("--seeds", nargs="+", type=natural, default=[0, 1, 2, 3, 4])
     parser.add_argument("--timesteps", type=float, help="environment steps of each training, those of zoo_configs by default")
     parser.add_argument("--fractions", nargs="+", type=float, default=[1.0], help="shares of the updates to train for")
     parser.add_argument("--models", nargs="*", default=[], metavar="ALGO=PATH", help="saved models to judge, in all --envs")
@@ -207,6 +207,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     unknown = [name for name in [*chosen.algos, *(model.partition("=")[0] for model in chosen.models)] if name not in ALGOS]
     if unknown:
         parser.error(f"unknown algorithms: {', '.join(unknown)}; models are given as ALGO=PATH")
+    paths = [model.partition("=")[2] for model in chosen.models]
+    missing = [path for path in paths if not (Path(path).is_file() or Path(f"{path}.zip").is_file())]
+    if missing:
+        parser.error(f"there is no file {', '.join(missing)}")
     if chosen.episodes < _N_ENVS or min(chosen.fractions) <= 0:
         parser.error(f"--episodes must be at least {_N_ENVS}, and --fractions positive")
 

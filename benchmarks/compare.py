@@ -46,7 +46,7 @@ from tqdm import tqdm
 from battery_env.callbacks import CalibrationCallback
 from benchmarks.contests import EVALUATION_EPISODES, contest_of, made_by
 from benchmarks.dashboard import dashboard_callbacks
-from benchmarks.study import Study, command_line, digits, markdown, positive, versions, write_json, write_text
+from benchmarks.study import Study, command_line, digits, markdown, natural, positive, versions, write_json, write_text
 from benchmarks.training import DEFAULTS_TIMESTEPS, CheckpointCallback, Recipe, registered_id, set_up
 
 
@@ -226,7 +226,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--algos", nargs="+", default=["lac", "sac", "td3"], help="of the RL Zoo, or package.module:Class of your own"
     )
     parser.add_argument("--envs", nargs="+", default=["BatteryRo-v0", "BatteryQmax-v0"], help="ids, or module:id")
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
+    parser.add_argument("--seeds", nargs="+", type=natural, default=[0])
     parser.add_argument(
         "--timesteps",
         type=positive,

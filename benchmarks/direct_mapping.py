@@ -33,7 +33,7 @@ from benchmarks.generalization import (
     mapping_part,
     policy_part,
 )
-from benchmarks.study import SYMBOLS, Study, command_line, digits, markdown, positive, with_spread
+from benchmarks.study import SYMBOLS, Study, command_line, digits, markdown, natural, positive, with_spread
 
 _TESTED = {"trajectory": "other discharges", "load": "heavier loads", "parameter": "more aged cells"}
 
@@ -109,11 +109,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """
     parser = command_line("direct_mapping", __doc__, jobs=1)
     parser.add_argument("--mappings", nargs="*", default=list(MAPPINGS), choices=list(MAPPINGS), metavar="NAME")
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2], help="of the mappings")
+    parser.add_argument("--seeds", nargs="+", type=natural, default=[0, 1, 2], help="of the mappings")
     parser.add_argument("--pairs", type=positive, default=12_800, help="labelled pairs that a mapping learns from")
     parser.add_argument("--epochs", type=positive, default=30)
     parser.add_argument("--algos", nargs="*", default=["lac"], choices=["lac", "sac", "td3"], metavar="ALGO", help="policies")
-    parser.add_argument("--policy-seeds", nargs="+", type=int, default=[0])
+    parser.add_argument("--policy-seeds", nargs="+", type=natural, default=[0])
     parser.add_argument(
         "--policies-on",
         nargs="+",

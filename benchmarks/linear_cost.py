@@ -20,7 +20,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from battery_env.plotting import new_figure
-from benchmarks.study import EVALUATION_SEED, Study, Tables, command_line, markdown, positive
+from benchmarks.study import EVALUATION_SEED, Study, Tables, command_line, markdown, natural, positive
 from benchmarks.training import train_or_load
 from sb3_lac import LAC, evaluate_lyapunov
 from sb3_lac.envs import LinearCostEnv
@@ -132,7 +132,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     :param arguments: of the command line by default
     """
     parser = command_line("linear_cost", __doc__)
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
+    parser.add_argument("--seeds", nargs="+", type=natural, default=[0, 1, 2, 3, 4])
     parser.add_argument("--timesteps", type=positive, default=10_000, help="environment steps of each training")
     parser.add_argument("--episodes", type=positive, default=100, help="episodes of the evaluation")
     study = Study(parser, arguments)

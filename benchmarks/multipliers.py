@@ -25,7 +25,7 @@ from stable_baselines3.common.monitor import Monitor
 
 from battery_env.evaluation import over_seeds
 from battery_env.plotting import new_figure
-from benchmarks.study import EVALUATION_SEED, Study, Tables, command_line, digits, markdown
+from benchmarks.study import EVALUATION_SEED, Study, Tables, command_line, digits, markdown, natural
 from benchmarks.training import train_or_load
 from sb3_lac import LAC, evaluate_lyapunov
 
@@ -143,7 +143,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--envs", nargs="+", default=list(_TIMESTEPS), choices=list(_TIMESTEPS))
     parser.add_argument("--alpha3", nargs="+", type=float, default=[0.1, 0.3, 1.0])
     parser.add_argument("--lambda-max", nargs="+", type=float, default=[1.0])
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
+    parser.add_argument("--seeds", nargs="+", type=natural, default=[0, 1, 2, 3, 4])
     study = Study(parser, arguments)
     chosen = study.chosen
     if min(*chosen.alpha3, *chosen.lambda_max) <= 0:

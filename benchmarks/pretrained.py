@@ -31,7 +31,7 @@ from battery_env.evaluation import evaluate
 from battery_env.files import replacing
 from battery_env.trajectories import AgedParameter
 from benchmarks.contests import SENSORS
-from benchmarks.study import SYMBOLS, Study, Tables, command_line, markdown, positive, versions, write_json
+from benchmarks.study import SYMBOLS, Study, Tables, command_line, markdown, natural, positive, versions, write_json
 from benchmarks.training import Recipe, record_file, timesteps_of, train_or_load
 from sb3_lac.onnx import export_onnx
 
@@ -190,7 +190,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """
     parser = command_line("pretrained", __doc__, jobs=1)
     parser.add_argument("--envs", nargs="+", choices=FOUND, default=list(FOUND), metavar="ID")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=natural, default=0)
     parser.add_argument("--updates", type=positive, default=5000, help="gradient steps")
     parser.add_argument("--discharges", type=positive, default=60, help="test discharges of the evaluation, up to 300")
     study = Study(parser, arguments)

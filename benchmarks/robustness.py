@@ -25,7 +25,7 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from battery_env.evaluation import over_seeds
 from battery_env.plotting import COLOURS, draw_over_seeds, new_figure
-from benchmarks.study import EVALUATION_SEED, Study, Tables, command_line, digits, markdown, positive, with_spread
+from benchmarks.study import EVALUATION_SEED, Study, Tables, command_line, digits, markdown, natural, positive, with_spread
 from benchmarks.training import train_or_load
 
 _ALGORITHMS = ("lac", "sac", "td3")
@@ -242,7 +242,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """
     parser = command_line("robustness", __doc__)
     parser.add_argument("--algos", nargs="+", default=list(_ALGORITHMS), choices=_ALGORITHMS)
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
+    parser.add_argument("--seeds", nargs="+", type=natural, default=[0, 1, 2, 3, 4])
     parser.add_argument("--cart-pole-timesteps", type=positive, default=20_000, help="environment steps of each training")
     parser.add_argument("--oscillator-timesteps", type=positive, default=20_000, help="environment steps of each training")
     parser.add_argument("--episodes", type=positive, default=100, help="episodes for each policy and condition")

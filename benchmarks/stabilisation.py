@@ -29,7 +29,7 @@ from battery_env.evaluation import over_seeds
 from battery_env.plotting import COLOURS, new_figure
 from benchmarks.certificate import judge
 from benchmarks.references import DISTURBANCES, conditions, draw_shares, tried
-from benchmarks.study import Study, Tables, command_line, digits, markdown, positive
+from benchmarks.study import Study, Tables, command_line, digits, markdown, natural, positive
 from benchmarks.training import Recipe, train_or_load
 from sb3_lac.envs import reference_controller
 
@@ -263,7 +263,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = command_line("stabilisation", __doc__)
     parser.add_argument("--algos", nargs="+", default=["lac", "sac", "td3"], choices=_ALGORITHMS)
     parser.add_argument("--envs", nargs="+", default=list(DISTURBANCES), choices=list(DISTURBANCES))
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
+    parser.add_argument("--seeds", nargs="+", type=natural, default=[0, 1, 2, 3, 4])
     parser.add_argument("--timesteps", type=positive, help="environment steps at most; those of zoo_configs by default")
     parser.add_argument("--episodes", type=positive, default=100, help="episodes for each policy and disturbance")
     parser.add_argument("--certificate-episodes", type=positive, default=50, help="to fit, to judge and to certify, each")

@@ -162,6 +162,19 @@ def markdown(rows: pd.DataFrame | Sequence[Mapping[str, Any]]) -> str:
     return pd.DataFrame(rows).to_markdown(index=False, disable_numparse=True) + "\n"
 
 
+def natural(text: str) -> int:
+    """
+    A type of arguments of the command line, as of seeds.
+
+    :param text: like ``0``
+    :return: the number
+    :raises argparse.ArgumentTypeError: if it is not a whole number of at least 0
+    """
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"must be a whole number of at least 0, got {text}")
+    return int(text)
+
+
 def positive(text: str) -> int:
     """
     A type of arguments of the command line.

@@ -14,7 +14,8 @@ from sb3_lac.dashboard import NOT_TENSORBOARD, tensorboard_writer
 from sb3_lac.files import replacing
 from sb3_lac.lac import LAC
 from sb3_lac.stability import CertificationReport, LyapunovReport, certify, evaluate_lyapunov, fit_lyapunov
-from sb3_lac.stability.rollout import prepare_evaluation, trains_on
+from sb3_lac.stability.fitting import NoCostError
+from sb3_lac.stability.rollout import known_seed, prepare_evaluation, trains_on
 
 
 class LyapunovCallback(EventCallback):
@@ -37,9 +38,10 @@ class LyapunovCallback(EventCallback):
     :param n_eval_episodes: The number of episodes to test the agent
     :param eval_freq: Evaluate the agent every ``eval_freq`` call of the callback.
     :param deterministic: Whether the evaluation should use stochastic or deterministic actions
-    :param seed: Seed of each evaluation, so that all of them have the same start states
+    :param seed: Seed of each evaluation, so that all of them have the same start states; if it is None, each draws its own
     :param log_path: Path of a CSV file with the metrics and their confidence intervals, updated at each evaluation.
-        If it exists already, its evaluations are kept, so that the history of a continued training is complete.
+        If it exists already, its evaluations are kept, so that the history of a continued training is complete
+        (``learn(..., reset_num_timesteps=False)``). A training that starts anew is refused, whose evaluations it would mix in.
     :param verbose: Verbosity level: 0 for no output, 1 for the summary of each evaluation
     """
 
@@ -98,8 +100,15 @@ class LyapunovCallback(EventCallback):
         if self.log_path is not None:
             import pandas as pd  # slow to import, and only an evaluation needs it
 
+            if self.log_path.is_dir():
+                raise ValueError(f"log_path={self.log_path} is a folder: give the path of a CSV file.")
             self.log_path.parent.mkdir(parents=True, exist_ok=True)
-            if self.log_path.exists():
+            if self.log_path.exists() and self.log_path.stat().st_size > 0:
+                if self.model.num_timesteps == 0:
+                    raise ValueError(
+                        f"log_path={self.log_path} holds the evaluations of another training, and this one starts anew: move "
+                        "the file away, give another path, or continue with learn(..., reset_num_timesteps=False)."
+                    )
                 records = pd.read_csv(self.log_path).to_dict("records")
                 self.history = [{str(name): value for name, value in record.items()} for record in records]
 
@@ -169,7 +178,8 @@ class CertificateCallback(LyapunovCallback):
     Callback for certifying the policy of any algorithm while it trains: a Lyapunov function is fitted to roll-outs of the mean
     action (see ``fit_lyapunov()``) and judged on others (see ``evaluate_lyapunov()``), about which exact statements are made
     (see ``certify()``). The training is not changed by it. Each of the three takes its own seed, so that all evaluations have
-    the same start states and none is judged on what it was fitted on.
+    the same start states and none is judged on what it was fitted on. Where nothing has a cost there is nothing to certify:
+    all values are then NaN.
 
     :param eval_env: The environment used for evaluation, as for ``LyapunovCallback``
     :param callback_after_eval: Callback to trigger after every evaluation, which finds the reports in
@@ -178,7 +188,7 @@ class CertificateCallback(LyapunovCallback):
     :param eval_freq: Evaluate the agent every ``eval_freq`` call of the callback.
     :param confidence: Of all statements of one evaluation together; it is not corrected for the number of evaluations
     :param cost_bound: The cost to stay within, the largest late cost of the roll-outs of the fit by default
-    :param seed: Seed of each evaluation
+    :param seed: Seed of each evaluation; if it is None, each draws its own
     :param log_path: Path of a CSV file, as for ``LyapunovCallback``
     :param verbose: Verbosity level: 0 for no output, 1 for the summary of each evaluation
     """
@@ -192,6 +202,12 @@ class CertificateCallback(LyapunovCallback):
         "ultimate_bound": "ultimate_bound",
         "death_rate": "death_rate",
     }
+    #: Bounds of the statements that are logged, with their names in the log
+    BOUNDS: ClassVar[dict[str, str]] = {
+        "survives": "survives_at_least",
+        "stays_within": "stays_within_at_least",
+        "decreases": "decreases_at_least",
+    }
     OF_THE_CRITIC: ClassVar[bool] = False
 
     def __init__(
@@ -202,7 +218,7 @@ class CertificateCallback(LyapunovCallback):
         eval_freq: int = 10_000,
         confidence: float = 0.95,
         cost_bound: float | None = None,
-        seed: int = 0,
+        seed: int | None = 0,
         log_path: str | os.PathLike[str] | None = None,
         verbose: int = 1,
     ):
@@ -212,9 +228,12 @@ class CertificateCallback(LyapunovCallback):
         self.last_certification: CertificationReport | None = None
 
     def _evaluate(self) -> dict[str, float]:
-        assert self.seed is not None
-        first, n_envs, n_episodes = self.seed, self.eval_env.num_envs, self.n_eval_episodes
-        lyapunov = fit_lyapunov(self.model, self.eval_env, n_episodes, seed=first, progress_bar=False)
+        first, n_envs, n_episodes = known_seed(self.seed), self.eval_env.num_envs, self.n_eval_episodes
+        self.last_report = self.last_certification = None
+        try:
+            lyapunov = fit_lyapunov(self.model, self.eval_env, n_episodes, seed=first, progress_bar=False)
+        except NoCostError:
+            return self._log({name: np.nan for name in ("holds", *self.METRICS.values(), *self.BOUNDS.values())})
         self.last_report = evaluate_lyapunov(self.model, self.eval_env, n_episodes, seed=first + n_envs, lyapunov=lyapunov)
         self.last_certification = certify(
             self.model, self.eval_env, lyapunov, n_episodes, self.confidence, self.cost_bound, seed=first + 2 * n_envs
@@ -222,14 +241,17 @@ class CertificateCallback(LyapunovCallback):
         values = {"holds": float(self.last_report.holds)}
         for metric, name in self.METRICS.items():
             values[name] = self.last_report.metrics[metric].value
-        for name in ("survives", "stays_within", "decreases"):
+        for statement, name in self.BOUNDS.items():
             # A statement that no episode could make
-            bounds = self.last_certification.statements["at_least"]
-            values[f"{name}_at_least"] = float(bounds.get(name, np.nan))
+            values[name] = float(self.last_certification.statements["at_least"].get(statement, np.nan))
+        return self._log(values)
+
+    def _log(self, values: dict[str, float]) -> dict[str, float]:
         for name, value in values.items():
             self.logger.record(f"certificate/{name}", value)
         return values
 
     def _summary(self) -> str:
-        assert self.last_certification is not None
+        if self.last_certification is None:
+            return "nothing had a cost, and so there is nothing to certify"
         return "\n".join([super()._summary(), self.last_certification.summary()])

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
@@ -84,6 +85,9 @@ def hyperparameters_of(model: BaseAlgorithm) -> dict[str, bool | str | float]:
             found[name] = value.val
         elif isinstance(value, TrainFreq):
             found[name] = f"{value.frequency} {value.unit.value}"
+        elif isinstance(value, th.Tensor) and value.numel() == 1:
+            # Kept on the device of the model, like LAC's ``reward_bound``
+            found[name] = value.item()
         elif isinstance(value, (bool, int, float, str)):
             found[name] = value
         elif name.endswith("learning_rate") and callable(value):

@@ -1,19 +1,21 @@
 import math
 import warnings
 from collections.abc import Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
+from types import NoneType
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
 from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, polyak_update, update_learning_rate
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecNormalize
 from stable_baselines3.her import HerReplayBuffer
 from stable_baselines3.sac.policies import Actor
 from torch.nn import functional as F
@@ -79,14 +81,32 @@ def weight_of_return(discounts: th.Tensor | None, gamma: float) -> th.Tensor | f
     return 1.0 if discounts is None else (1 - discounts) / (1 - gamma)
 
 
+def env_specs(env: VecEnv) -> list[EnvSpec | None]:
+    """
+    Gymnasium's specifications.
+
+    :param env: Vectorized environment
+    :return: One per environment, None where it is not known
+    """
+    # One that cannot be pickled, as with a lambda as entry point, would end the process of its environment
+    if not isinstance(env.unwrapped, SubprocVecEnv):
+        # A vector environment of somebody else may have no attributes
+        with suppress(AttributeError, NotImplementedError):
+            return env.get_attr("spec")
+    return [None] * env.num_envs
+
+
 def time_limits(env: VecEnv) -> list[int | None]:
     """
     Gymnasium's time limits.
 
     :param env: Vectorized environment
-    :return: ``max_episode_steps`` of each environment, None where it has none
+    :return: ``max_episode_steps`` of each environment, None where it has none or is not known
     """
-    return [getattr(spec, "max_episode_steps", None) for spec in env.get_attr("spec")]
+    if isinstance(env.unwrapped, SubprocVecEnv):
+        limit = "_max_episode_steps"  # of Gymnasium's wrapper TimeLimit, for there is no specification to ask
+        return env.get_attr(limit) if env.has_attr(limit) else [None] * env.num_envs
+    return [getattr(spec, "max_episode_steps", None) for spec in env_specs(env)]
 
 
 class Weights(NamedTuple):
@@ -138,7 +158,8 @@ class LAC(OffPolicyAlgorithm):
         See https://github.com/DLR-RM/stable-baselines3/issues/37#issuecomment-637501195
     :param n_steps: When larger than 1, use n-step returns (with the ``NStepReplayBuffer``): the target of the critic
         and the decrease condition then span n steps, whose discounted costs are summed.
-        Not supported for Dict observation spaces, and ignored with a custom ``replay_buffer_class``.
+        Not supported for Dict observation spaces, and ignored with a custom ``replay_buffer_class``. The discount of the
+        returns is always ``gamma``.
     :param ent_coef: Entropy regularization coefficient (``beta`` in the paper).
         Set it to 'auto' to learn it automatically (and 'auto_0.1' for using 0.1 as initial value)
     :param target_update_interval: update the target networks every ``target_update_interval``
@@ -284,6 +305,9 @@ class LAC(OffPolicyAlgorithm):
         self.compile_update = compile_update
         self._compiled: CompiledUpdate | None = None
         self.largest_stored_reward = 0.0
+        if replay_buffer_class is NStepReplayBuffer:
+            # An argument of the model, with which a loaded model sets it up anew
+            self.n_steps = self.replay_buffer_kwargs.get("n_steps", n_steps if n_steps > 1 else 3)
         if horizon is None and replay_buffer_class is HorizonReplayBuffer:
             raise ValueError("The HorizonReplayBuffer is used with a horizon, and chosen by it: set for instance horizon=5.")
 
@@ -294,11 +318,11 @@ class LAC(OffPolicyAlgorithm):
         # ``LAC.load()`` sets an argument under its own name
         self.stated_reward_bound = vars(self).pop("reward_bound", self.stated_reward_bound)
         self._check_arguments()
-        if self.replay_buffer_class is HorizonReplayBuffer:
-            # Of a loaded model, whose horizon may be another one by now
+        if self.replay_buffer_class in (HorizonReplayBuffer, NStepReplayBuffer):
+            # Of a loaded model, whose arguments may be others by now
             self.replay_buffer_class = None
             self.replay_buffer_kwargs = {
-                name: value for name, value in self.replay_buffer_kwargs.items() if name not in ("horizon", "gamma")
+                name: value for name, value in self.replay_buffer_kwargs.items() if name not in ("horizon", "n_steps", "gamma")
             }
         if self.horizon is not None:
             self._setup_horizon()
@@ -357,12 +381,14 @@ class LAC(OffPolicyAlgorithm):
         if self.compile_update:
             self._compiled = CompiledUpdate(self.device)
 
-        # Largest reward seen, before any normalization, see ``cost_bound()``
-        self.reward_bound = th.zeros(1, device=self.device)
+        self.reward_bound.fill_(self.stated_reward_bound or 0.0)
         self.update_offset(self._vec_normalize_env)
 
     def _check_arguments(self) -> None:
         """Check the arguments that SAC does not have."""
+        for name in ("alpha3", "lambda_init", "lambda_min", "lambda_max"):
+            if not isinstance(getattr(self, name), (float, int, np.number)):
+                raise ValueError(f"{name}={getattr(self, name)!r} must be a number.")
         if not self.alpha3 > 0:
             raise ValueError(
                 f"alpha3={self.alpha3} must be greater than 0: the Lyapunov value has to decrease by alpha3 times the cost. "
@@ -384,6 +410,8 @@ class LAC(OffPolicyAlgorithm):
                 f"and lambda_max={self.lambda_max}. Change lambda_init or widen the limits."
             )
         bound = self.stated_reward_bound
+        if not isinstance(bound, (float, int, np.number, NoneType)):
+            raise ValueError(f"reward_bound={bound!r} must be a number, or None for the largest reward seen.")
         if bound is not None and not 0 <= bound < math.inf:
             raise ValueError(
                 f"reward_bound={bound} must be finite and at least 0, because nothing is paid after a termination. "
@@ -432,6 +460,15 @@ class LAC(OffPolicyAlgorithm):
             )
         self.replay_buffer_class = HorizonReplayBuffer
         self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "horizon": horizon, "gamma": self.gamma}
+
+    @property
+    def reward_bound(self) -> th.Tensor:
+        """The largest reward stated or seen, before any normalization, shape (1,). It is part of the policy, as ``L`` is."""
+        return self.policy.reward_bound
+
+    @reward_bound.setter
+    def reward_bound(self, bound: th.Tensor) -> None:
+        self.policy.reward_bound.copy_(bound)
 
     def _create_aliases(self) -> None:
         self.actor = self.policy.actor
@@ -684,6 +721,17 @@ class LAC(OffPolicyAlgorithm):
         update_learning_rate(self.lambda_optimizer, self.lambda_lr_schedule(self._current_progress_remaining))
         optimizers.append(self.lambda_optimizer)
 
+        if isinstance(self.replay_buffer, NStepReplayBuffer):
+            # One discount for returns and values, also of a buffer that was loaded
+            self.replay_buffer.gamma = self.gamma
+        elif isinstance(self.replay_buffer, HorizonReplayBuffer) and self.replay_buffer.n_complete == 0:
+            warnings.warn(
+                f"No stored episode is as long as horizon={self.horizon} steps yet, and nothing is learned until one is. "
+                "After loading a model, call load_replay_buffer() before learn().",
+                stacklevel=2,
+            )
+            return
+
         # Lists, because going through the modules takes as long as a Polyak update of small networks
         actor_parameters, critic_parameters = (
             [parameter for group in optimizer.param_groups for parameter in group["params"]] for optimizer in optimizers[:2]
@@ -735,6 +783,31 @@ class LAC(OffPolicyAlgorithm):
             progress_bar=progress_bar,
         )
 
+    @classmethod
+    def load(cls: type[SelfLAC], *args: Any, **kwargs: Any) -> SelfLAC:
+        """
+        Load a model, see ``BaseAlgorithm.load()``. A ``reward_bound`` takes the place of the saved one, and ``L`` is shifted
+        with it.
+
+        :param args: Those of ``BaseAlgorithm.load()``
+        :param kwargs: Those of ``BaseAlgorithm.load()``, and arguments of the model to change
+        :return: The model
+        :raises ValueError: If arguments cannot be meant, or ``published_update`` is another one than the saved one
+        """
+        try:
+            model = super().load(*args, **kwargs)
+        except (AttributeError, KeyError) as error:
+            if "published_update" not in kwargs:
+                raise
+            raise ValueError(
+                f"published_update={kwargs['published_update']} is not what the model was saved with: only one of the two "
+                "updates has a target actor, and it cannot be changed on loading."
+            ) from error
+        if "reward_bound" in kwargs:
+            model.reward_bound.fill_(max(model.stated_reward_bound or 0.0, model.largest_stored_reward))
+            model.update_offset(model._vec_normalize_env)
+        return model
+
     def _excluded_save_params(self) -> list[str]:
         # Exclude aliases, and statistics that are part of the policy
         return super()._excluded_save_params() + [  # noqa: RUF005
@@ -749,7 +822,7 @@ class LAC(OffPolicyAlgorithm):
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts = ["policy", "actor.optimizer", "critic.optimizer", "lambda_optimizer"]
-        saved_pytorch_variables = ["log_lambda", "reward_bound"]
+        saved_pytorch_variables = ["log_lambda"]
         if self.ent_coef_optimizer is not None:
             saved_pytorch_variables.append("log_ent_coef")
             state_dicts.append("ent_coef_optimizer")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +17,7 @@ from stable_baselines3.common.vec_env import VecNormalize, unwrap_vec_normalize
 from torch.distributions import Distribution
 
 from sb3_lac.files import replacing
+from sb3_lac.lac import env_specs
 
 if TYPE_CHECKING:
     from onnx import ModelProto
@@ -41,8 +44,8 @@ class DeterministicPolicy(th.nn.Module):
         super().__init__()
         assert isinstance(policy.action_space, spaces.Box)
         self.policy = policy
-        self.register_buffer("low", th.as_tensor(policy.action_space.low))
-        self.register_buffer("high", th.as_tensor(policy.action_space.high))
+        self.register_buffer("low", th.as_tensor(policy.action_space.low, dtype=th.float32))
+        self.register_buffer("high", th.as_tensor(policy.action_space.high, dtype=th.float32))
         self.clip_obs: float | None = None
         if vec_normalize is not None and vec_normalize.norm_obs:
             assert isinstance(vec_normalize.obs_rms, RunningMeanStd)  # of a Box
@@ -64,19 +67,27 @@ class DeterministicPolicy(th.nn.Module):
         return action.clamp(self.low, self.high)
 
 
-def export_onnx(model: BaseAlgorithm | BasePolicy, path: str | Path, env_id: str | None = None) -> Path:
+def export_onnx(
+    model: BaseAlgorithm | BasePolicy,
+    path: str | Path,
+    env_id: str | None = None,
+    vec_normalize: VecNormalize | None = None,
+) -> Path:
     """
     Write the deterministic policy of a model as an ONNX file: input ``observation``, output ``action``, both float32, with the
-    normalization of the observations by ``VecNormalize`` and the scaling of the actions included. The file is checked with
-    onnxruntime before it takes its name.
+    normalization of the observations by ``VecNormalize`` and the scaling of the actions included. Images are those of the
+    policy, with the channels first. The file is checked with onnxruntime before it takes its name.
 
     Needs the extra ``sb3_lac[onnx]``.
 
     :param model: LAC, SAC, TD3, TQC, PPO, ... or a policy
     :param path: Of the file, which must not exist yet; ``.onnx`` is added where it is missing
-    :param env_id: Id of the environment that the policy is for, kept in the file; by default that of the model's environment
+    :param env_id: Id of the environment that the policy is for, kept in the file; by default that of the model's environment,
+        where it is known
+    :param vec_normalize: What normalizes the observations; by default the wrapper of the model's environment, if it has one. A
+        warning says so where there is no environment, as in a policy or in a model that was loaded without one.
     :return: Path of the file
-    :raises ValueError: If its spaces are not ``Box``, or if the file does not do what the policy does
+    :raises ValueError: If its spaces are not ``Box``, if it has a memory, or if the file does not do what the policy does
     :raises FileExistsError: If the file exists
     :raises ImportError: Without the extra
     """
@@ -95,12 +106,18 @@ def export_onnx(model: BaseAlgorithm | BasePolicy, path: str | Path, env_id: str
     for name, space in (("observation", policy.observation_space), ("action", policy.action_space)):
         if not isinstance(space, spaces.Box):
             raise ValueError(f"The {name} space {space} must be a Box: other spaces have no ONNX export.")
-    vec_normalize = None
-    if isinstance(model, BaseAlgorithm) and model.env is not None:
-        vec_normalize = unwrap_vec_normalize(model.env)
-        if env_id is None:
-            spec = model.env.get_attr("spec")[0]
-            env_id = None if spec is None else spec.id
+    if "lstm_states" in inspect.signature(policy._predict).parameters:
+        raise ValueError(f"{type(policy).__name__} has a memory: only policies of the observation alone have an ONNX export.")
+    env = model.env if isinstance(model, BaseAlgorithm) else None
+    if env is not None:
+        vec_normalize = vec_normalize or unwrap_vec_normalize(env)
+        env_id = env_id or getattr(env_specs(env)[0], "id", None)
+    elif vec_normalize is None:
+        warnings.warn(
+            f"{type(model).__name__} has no environment that says whether observations were normalized, and is exported "
+            "without. If they were, pass vec_normalize=VecNormalize.load(...), or load the model with its environment.",
+            stacklevel=2,
+        )
 
     was_training = policy.training
     policy.set_training_mode(False)

@@ -192,6 +192,7 @@ class LyapunovPolicy(BasePolicy):
     critic: LyapunovCritic
     critic_target: LyapunovCritic
     action_space: spaces.Box
+    reward_bound: th.Tensor
 
     def __init__(
         self,
@@ -263,6 +264,8 @@ class LyapunovPolicy(BasePolicy):
         )
 
         self.share_features_extractor = share_features_extractor
+        # The reward that costs nothing, which the critics' offset belongs to. Set by the algorithm, saved with the weights
+        self.register_buffer("reward_bound", th.zeros(1))
 
         self._build(lr_schedule)
 
@@ -320,6 +323,11 @@ class LyapunovPolicy(BasePolicy):
             )
         )
         return data
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        # Earlier versions kept the bound outside of the policy
+        state_dict.setdefault(f"{prefix}reward_bound", self.reward_bound)
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     def reset_noise(self, batch_size: int = 1) -> None:
         """

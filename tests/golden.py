@@ -116,6 +116,9 @@ def trainings() -> Numbers:
         policy = algo("MlpPolicy", id_, seed=5, learning_starts=50, device="cpu")
         policy.learn(300)
         for name, weights in policy.policy.state_dict().items():
+            if name == "reward_bound":
+                # Compared files are older than its place in the policy, and the offset says the same
+                continue
             yield f"training/{algo.__name__}/{id_}/{name}", weights.numpy()
         if id_.startswith("Battery"):
             aged, load = ("q_mobile", "paper") if id_ == "BatteryQmax-v0" else ("joint", "piecewise")

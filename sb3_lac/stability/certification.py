@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -12,9 +13,18 @@ import numpy as np
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
+from sb3_lac.lac import env_specs
 from sb3_lac.stability.fitting import FittedLyapunov
-from sb3_lac.stability.functions import LyapunovFunction
-from sb3_lac.stability.rollout import check_seeds, prepare_evaluation, roll_out, summarize_episodes, undisturbed
+from sb3_lac.stability.functions import LyapunovFunction, check_function
+from sb3_lac.stability.rollout import (
+    check_number,
+    check_seeds,
+    known_seed,
+    prepare_evaluation,
+    roll_out,
+    summarize_episodes,
+    undisturbed,
+)
 from sb3_lac.stability.statistics import exact_interval, exact_lower_bound
 
 if TYPE_CHECKING:
@@ -192,17 +202,14 @@ def certify(
     :param starts: Start states on a grid, shape (n, n_states), each handed to ``env.reset(options={"state": ...})``
     :param n_episodes_per_start: Number of episodes from each of them
     :param deterministic: Whether to certify the mean action or sampled actions
-    :param seed: Seed of the episodes, which cannot be one that ``lyapunov`` was fitted on
+    :param seed: Seed of the episodes, which cannot be one that ``lyapunov`` was fitted on; drawn if it is None, and named in
+        the description of the report
     :return: The report
     :raises ValueError: If the arguments cannot be meant
     """
+    _check_questions(lyapunov, confidence, cost_bound, level, window_steps)
     env = prepare_evaluation(policy, env, n_episodes, lyapunov is not None and lyapunov.normalized_rewards)
-    if not 0 < confidence < 1:
-        raise ValueError(f"confidence={confidence} must lie between 0 and 1.")
-    if n_episodes_per_start < 1:
-        raise ValueError(f"n_episodes_per_start={n_episodes_per_start} must be at least 1.")
-    if window_steps is not None and window_steps < 1:
-        raise ValueError(f"window_steps={window_steps} must be at least 1.")
+    check_number("n_episodes_per_start", n_episodes_per_start)
     if starts is not None:
         starts = np.asarray(starts, dtype=np.float64)
         if starts.ndim != 2 or len(starts) == 0 or not np.isfinite(starts).all():
@@ -212,13 +219,17 @@ def certify(
         level, window_steps = _chosen(level, lyapunov.level), window_steps or lyapunov.window_steps
     if starts is not None and cost_bound is None:
         raise ValueError("A start state is attracted if its episode ends within cost_bound: give one, or a fitted lyapunov.")
+    seed = known_seed(seed)
     if lyapunov is not None:
         check_seeds(lyapunov, seed, env.num_envs)
+    # Asked for before the work: not every environment answers
+    description = _description(policy, env, seed, deterministic)
 
     normalized = lyapunov is not None and lyapunov.normalized_rewards
-    bound = 0.0 if lyapunov is None else lyapunov.cost_bound(unwrap_vec_normalize(env))
+    vec_normalize = unwrap_vec_normalize(env)
+    bound = 0.0 if lyapunov is None else lyapunov.cost_bound(vec_normalize)
     of_starts = None
-    with undisturbed(policy, env, seed):
+    with undisturbed(policy, env, seed), nullcontext() if lyapunov is None else lyapunov.in_units_of(vec_normalize):
         roll_outs = roll_out(policy, env, n_episodes, deterministic, normalized)
         if lyapunov is not None:
             roll_outs.add_values(policy, lyapunov, deterministic)
@@ -270,8 +281,27 @@ def certify(
         cost_bound=cost_bound,
         level=level,
         window_steps=window_steps,
-        description=_description(policy, env, seed, deterministic),
+        description=description,
     )
+
+
+def _check_questions(
+    lyapunov: LyapunovFunction | None,
+    confidence: float,
+    cost_bound: float | None,
+    level: float | None,
+    window_steps: int | None,
+) -> None:
+    """Check what is asked of the episodes, see ``certify()``."""
+    if lyapunov is not None:
+        check_function(lyapunov)
+    if not 0 < confidence < 1:
+        raise ValueError(f"confidence={confidence} must lie between 0 and 1.")
+    for name, value in {"cost_bound": cost_bound, "level": level}.items():
+        if value is not None and math.isnan(value):
+            raise ValueError(f"{name}={value} must be a number, or None for that of a fitted function.")
+    if window_steps is not None:
+        check_number("window_steps", window_steps)
 
 
 def _chosen(given: float | None, of_the_fit: float) -> float | None:
@@ -280,12 +310,11 @@ def _chosen(given: float | None, of_the_fit: float) -> float | None:
     return None if math.isnan(of_the_fit) else of_the_fit
 
 
-def _description(policy: PolicyPredictor, env: VecEnv, seed: int | None, deterministic: bool) -> str:
-    specs = {getattr(spec, "id", None) for spec in env.get_attr("spec")}
-    name = specs.pop() if len(specs) == 1 else None
-    where = "an environment that is not registered" if name is None else name
-    seeded = "not seeded" if seed is None else f"seed {seed}"
-    return f"{type(policy).__name__} ({'mean' if deterministic else 'sampled'} actions) in {where}, {seeded}"
+def _description(policy: PolicyPredictor, env: VecEnv, seed: int, deterministic: bool) -> str:
+    ids = {getattr(spec, "id", None) for spec in env_specs(env)}
+    name = ids.pop() if len(ids) == 1 else None
+    where = "an environment without a known id" if name is None else name
+    return f"{type(policy).__name__} ({'mean' if deterministic else 'sampled'} actions) in {where}, seed {seed}"
 
 
 def _check_starts(env: VecEnv, starts: np.ndarray) -> None:
@@ -295,19 +324,19 @@ def _check_starts(env: VecEnv, starts: np.ndarray) -> None:
     :param env: The environment
     :param starts: Start states, shape (n_starts, n_states)
     """
-    if len(np.unique(starts, axis=0)) < 2:
-        return
+    first = {"state": starts[0].tolist()}
+    others = starts[(starts != starts[0]).any(axis=1)]
+    # With the same random numbers: two that differ, or the only one and what the environment does by itself
     seen = []
-    # Two that differ, with the same random numbers
-    for start in (starts[0], starts[np.flatnonzero((starts != starts[0]).any(axis=1))[0]]):
+    for options in (first, {"state": others[0].tolist()} if len(others) > 0 else None):
         env.seed(0)
-        env.set_options({"state": start.tolist()})
+        env.set_options(options)
         observations = env.reset()
         seen.append([observations[key] for key in sorted(observations)] if isinstance(observations, dict) else [observations])
     if all(np.array_equal(first, second) for first, second in zip(*seen, strict=True)):
         raise ValueError(
             "The environment starts in the same state whatever reset(options={'state': ...}) says: it needs a wrapper that "
-            "puts it into the state that it is given."
+            "puts it into the state that it is given. (If it starts in the only one of starts anyway, leave starts out.)"
         )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -16,7 +17,15 @@ from torch import nn
 
 from sb3_lac.files import replacing
 from sb3_lac.stability.functions import LyapunovFunction, Observations
-from sb3_lac.stability.rollout import RollOuts, prepare_evaluation, roll_out, summarize_episodes, undisturbed
+from sb3_lac.stability.rollout import (
+    RollOuts,
+    check_number,
+    known_seed,
+    prepare_evaluation,
+    roll_out,
+    summarize_episodes,
+    undisturbed,
+)
 
 #: Outputs whose squares are summed, as in the critic of LAC
 N_FEATURES = 16
@@ -52,13 +61,17 @@ def flatten(observations: Observations) -> np.ndarray:
     return np.concatenate([np.asarray(part, dtype=np.float64).reshape(len(part), -1) for part in parts], axis=1)
 
 
+class NoCostError(ValueError):
+    """Nothing had a cost on the roll-outs, so that there is nothing that a Lyapunov function could decrease by."""
+
+
 class FittedLyapunov(LyapunovFunction):
     """
     A Lyapunov function that ``fit_lyapunov()`` learned: a network, and what its roll-outs say about the loop.
 
     :param network: Sum of squares of the scaled observations
     :param mean: Subtracted from each input, shape (n_inputs,)
-    :param scale: Divides each input, shape (n_inputs,)
+    :param scale: Divides each input, shape (n_inputs,); infinite for one that never changed, which nothing is known of
     :param unit: Costs per output of the network
     :param floor: The least value on the roll-outs, which is subtracted: values below it are 0
     :param ultimate_cost: Largest cost in the last fifth of those episodes that did not terminate, NaN if there are none
@@ -67,7 +80,9 @@ class FittedLyapunov(LyapunovFunction):
         those episodes; None if there is none
     :param average_cost: Cost per step where the loop settles
     :param reward_bound: The reward that costs nothing
-    :param seeds: Seeds of the environments of the roll-outs, None if they were not seeded
+    :param seeds: Seeds of the environments of the roll-outs, None if they are not known (of an earlier version)
+    :param low: Least value of each input on the roll-outs, shape (n_inputs,), None if it is not known (of an earlier version)
+    :param high: Largest value of each input
     """
 
     def __init__(
@@ -83,6 +98,8 @@ class FittedLyapunov(LyapunovFunction):
         average_cost: float,
         reward_bound: float,
         seeds: range | None,
+        low: np.ndarray | None = None,
+        high: np.ndarray | None = None,
     ):
         super().__init__(self._of_network, average_cost=average_cost, reward_bound=reward_bound, seeds=seeds)
         self.network = network
@@ -93,11 +110,24 @@ class FittedLyapunov(LyapunovFunction):
         self.ultimate_cost = ultimate_cost
         self.level = level
         self.window_steps = window_steps
+        self.low = np.full(len(mean), -np.inf) if low is None else low
+        self.high = np.full(len(mean), np.inf) if high is None else high
 
     def _of_network(self, observations: Observations) -> np.ndarray:
         inputs = flatten(observations)
         if inputs.shape[1] != len(self.mean):
             raise ValueError(f"The observations have {inputs.shape[1]} numbers, the Lyapunov function takes {len(self.mean)}.")
+        # And what rounding makes of one that never changed
+        margin = self.high - self.low + 1e-6 * np.maximum(np.abs(self.low), np.abs(self.high))
+        far = ((inputs < self.low - margin) | (inputs > self.high + margin)).any(axis=0)
+        if far.any():
+            numbers = np.flatnonzero(far)
+            warnings.warn(
+                f"Observations lie far from those that the Lyapunov function was fitted on: number {numbers.tolist()} of them "
+                f"was within {self.low[numbers].tolist()} and {self.high[numbers].tolist()}, and is further outside than that "
+                "is wide. Values there are made up: fit on roll-outs that go there.",
+                stacklevel=2,
+            )
         return np.maximum(network_values(self.network, (inputs - self.mean) / self.scale, self.unit) - self.floor, 0.0)
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -109,7 +139,8 @@ class FittedLyapunov(LyapunovFunction):
         numbers = ("unit", "floor", "ultimate_cost", "level", "window_steps", "average_cost", "reward_bound")
         content: dict[str, Any] = {name: getattr(self, name) for name in numbers}
         content |= {"seeds": None if self.seeds is None else (self.seeds.start, self.seeds.stop)}
-        content |= {"mean": th.as_tensor(self.mean), "scale": th.as_tensor(self.scale), "network": self.network.state_dict()}
+        content |= {name: th.as_tensor(getattr(self, name)) for name in ("mean", "scale", "low", "high")}
+        content |= {"network": self.network.state_dict()}
         with replacing(path) as part:
             th.save(content, part)
 
@@ -126,8 +157,9 @@ class FittedLyapunov(LyapunovFunction):
         widths = [weight.shape for name, weight in weights.items() if name.endswith("weight")]
         network = SumOfSquares(widths[0][1], [n_outputs for n_outputs, _ in widths[:-1]])
         network.load_state_dict(weights)
-        mean, scale, seeds = content.pop("mean").numpy(), content.pop("scale").numpy(), content.pop("seeds")
-        return cls(network, mean, scale, seeds=None if seeds is None else range(*seeds), **content)
+        seeds = content.pop("seeds")
+        content = {name: value.numpy() if isinstance(value, th.Tensor) else value for name, value in content.items()}
+        return cls(network, seeds=None if seeds is None else range(*seeds), **content)
 
 
 def network_values(network: SumOfSquares, inputs: np.ndarray, unit: float) -> np.ndarray:
@@ -228,14 +260,15 @@ def fit_lyapunov(
     :param learning_rate: Of Adam at the start, falling to zero
     :param batch_size: Transitions of each gradient step
     :param trace_decay: lambda of the returns: 0 looks one step ahead, 1 to the end of the episode
-    :param seed: Seed of the roll-outs and of the network
+    :param seed: Seed of the roll-outs and of the network; drawn if it is None
     :param progress_bar: Whether to show the progress, in a terminal
-    :return: The function. It is to be judged on other roll-outs: ``evaluate_lyapunov()`` and ``certify()`` refuse the seed.
-    :raises ValueError: If the arguments cannot be meant, or the roll-outs say nothing about decrease
+    :return: The function. It is to be judged on other roll-outs: ``evaluate_lyapunov()`` and ``certify()`` refuse its seeds,
+        which it keeps in ``seeds``.
+    :raises ValueError: If the arguments cannot be meant
+    :raises NoCostError: If nothing had a cost on the roll-outs, which say nothing about decrease then
     """
     for name, value in {"n_iterations": n_iterations, "batch_size": batch_size}.items():
-        if value < 1:
-            raise ValueError(f"{name}={value} must be at least 1.")
+        check_number(name, value)
     if not learning_rate > 0:
         raise ValueError(f"learning_rate={learning_rate} must be greater than 0.")
     if not 0 <= trace_decay <= 1:
@@ -243,12 +276,13 @@ def fit_lyapunov(
     if reward_bound is not None and not 0 <= reward_bound < np.inf:
         raise ValueError(f"reward_bound={reward_bound} must be finite and at least 0.")
     env = prepare_evaluation(policy, env, n_episodes, of_the_critic=False)
+    seed = known_seed(seed)
     with undisturbed(policy, env, seed):
         roll_outs = roll_out(policy, env, n_episodes, deterministic)
         if reward_bound is None:
             reward_bound = max(float(roll_outs.transitions["reward"].max()), 0.0)
         roll_outs.transitions["cost"] = np.maximum(reward_bound - roll_outs.transitions["reward"], 0.0)
-        seeds = None if seed is None else range(seed, seed + env.num_envs)
+        seeds = range(seed, seed + env.num_envs)
         return _fit(
             roll_outs, reward_bound, seeds, net_arch, n_iterations, learning_rate, batch_size, trace_decay, seed, progress_bar
         )
@@ -257,26 +291,31 @@ def fit_lyapunov(
 def _fit(
     roll_outs: RollOuts,
     reward_bound: float,
-    seeds: range | None,
+    seeds: range,
     net_arch: Sequence[int],
     n_iterations: int,
     learning_rate: float,
     batch_size: int,
     trace_decay: float,
-    seed: int | None,
+    seed: int,
     progress_bar: bool,
 ) -> FittedLyapunov:
     from tqdm import tqdm  # only a fit needs it
 
     transitions = roll_outs.transitions
     costs = transitions["cost"].to_numpy().copy()
-    # Not the largest cost, which may be that of a death
-    unit = float(np.quantile(costs, 0.9)) or float(costs.max())
-    if not unit > 0:
-        raise ValueError("Nothing had a cost on the roll-outs, so that L has nothing to decrease by: start further away.")
     episode, step = transitions["episode"].to_numpy(), transitions["step"].to_numpy()
     died, truncated = transitions["terminated"].to_numpy(), transitions["truncated"].to_numpy()
     lengths = np.bincount(episode)
+    # Steps that a survivor could still have had
+    n_lost = np.where(died, lengths.max() - lengths[episode], 0)
+    # Not the largest cost, which may be that of a death, unless there is no other
+    unit = float(np.quantile(costs, 0.9)) or float(costs.max()) or reward_bound * float(n_lost.max())
+    if not unit > 0:
+        raise NoCostError(
+            "Nothing had a cost on the roll-outs, and no episode died early, so that L has nothing to decrease by: start "
+            "further away."
+        )
     rows = np.full((len(lengths), lengths.max()), -1)
     rows[episode, step] = np.arange(len(costs))
 
@@ -285,6 +324,8 @@ def _fit(
     mean, scale = inputs.mean(axis=0), np.maximum(inputs.std(axis=0), 1e-6)
     if roll_outs.last_observations is not None:
         inputs = np.concatenate([inputs, flatten(roll_outs.last_observations)])
+    low, high = inputs.min(axis=0), inputs.max(axis=0)
+    scale[low == high] = np.inf
     inputs = (inputs - mean) / scale
     following = np.arange(1, len(costs) + 1)
     following[truncated] = len(costs) + np.arange(truncated.sum())
@@ -303,8 +344,7 @@ def _fit(
             average_cost = float(np.mean((costs + next_values - values[: len(costs)])[~died]))
             # What diverges has no average, and one that runs away would take the values with it
             average_cost = min(max(average_cost, 0.0), float(costs[~died].max()))
-        # What a survivor could still have had
-        lost = np.where(died, max(reward_bound - average_cost, 0.0) * (lengths.max() - lengths[episode]), 0.0)
+        lost = max(reward_bound - average_cost, 0.0) * n_lost
         returns = traced_returns(costs + lost, next_values, rows, average_cost, trace_decay)
         # The relative value is known up to a constant
         targets = th.as_tensor((returns - returns.min()) / unit, dtype=th.float32)
@@ -327,5 +367,5 @@ def _fit(
     window_steps = shortest_window(transitions["lyapunov"].to_numpy(), rows[survivors], level) if late.any() else None
     ultimate_cost = float(episodes["largest_late_cost"][survivors].max()) if late.any() else np.nan
     return FittedLyapunov(
-        network, mean, scale, unit, floor, ultimate_cost, level, window_steps, average_cost, reward_bound, seeds
+        network, mean, scale, unit, floor, ultimate_cost, level, window_steps, average_cost, reward_bound, seeds, low, high
     )

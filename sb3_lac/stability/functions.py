@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import numpy as np
 from stable_baselines3.common.vec_env import VecNormalize
@@ -91,6 +92,27 @@ class LyapunovFunction:
         """
         return self.reward_bound
 
+    @contextmanager
+    def in_units_of(self, vec_normalize: VecNormalize | None) -> Iterator[None]:
+        """
+        Let the values belong to the rewards that are judged.
+
+        :param vec_normalize: Wrapper that these rewards come from, if any
+        """
+        yield
+
+
+def check_function(lyapunov: object) -> None:
+    """
+    :param lyapunov: What is judged
+    :raises ValueError: If that is no Lyapunov function
+    """
+    if not isinstance(lyapunov, LyapunovFunction):
+        raise ValueError(
+            f"lyapunov={lyapunov!r} must be a LyapunovFunction: that of fit_lyapunov(policy, env), or "
+            "LyapunovFunction(function) for a function of observations."
+        )
+
 
 class CriticLyapunov(LyapunovFunction):
     """
@@ -113,6 +135,16 @@ class CriticLyapunov(LyapunovFunction):
         return self.model.policy.predict_lyapunov(observations, actions)
 
     def cost_bound(self, vec_normalize: VecNormalize | None) -> float:
+        return self.model.cost_bound(vec_normalize).item()
+
+    @contextmanager
+    def in_units_of(self, vec_normalize: VecNormalize | None) -> Iterator[None]:
+        offset = self.model.critic.offset.clone()
         # The scale of normalized rewards may have changed since the last update
         self.model.update_offset(vec_normalize)
-        return self.model.cost_bound(vec_normalize).item()
+        try:
+            yield
+        finally:
+            # A report changes nothing of the model
+            for critic in (self.model.critic, self.model.critic_target):
+                critic.offset.copy_(offset)

@@ -13,10 +13,12 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_lac.lac import LAC, time_limits
-from sb3_lac.stability.functions import CriticLyapunov, LyapunovFunction
+from sb3_lac.stability.functions import CriticLyapunov, LyapunovFunction, check_function
 from sb3_lac.stability.rollout import (
+    check_number,
     check_seeds,
     cost_to_go,
+    known_seed,
     prepare_evaluation,
     relative_cost_to_go,
     roll_out,
@@ -50,6 +52,7 @@ class LyapunovReport:
     :param horizon: Number of steps whose costs ``L`` estimates, None for all to come
     :param max_tail_weight: Largest weight of the costs to come after the end of an episode, in ``cost_to_go``
     :param max_episode_steps: Gymnasium's time limit of the environment, None if it ends its episodes itself
+    :param seed: Seed of the roll-outs
     """
 
     transitions: pd.DataFrame
@@ -62,6 +65,7 @@ class LyapunovReport:
     horizon: int | None
     max_tail_weight: float
     max_episode_steps: int | None
+    seed: int
 
     @property
     def n_calibrated(self) -> int:
@@ -312,7 +316,8 @@ def evaluate_lyapunov(
         environment itself, whether ``VecNormalize`` normalizes them or not. Unlike in ``evaluate_policy()``, a ``Monitor``
         makes no difference. With gSDE, the noise matrix of the last roll-out is kept.
         The training environment (``model.get_env()``) of LAC may be used between two calls of ``learn()``: the next one then
-        starts with a reset, and the unfinished episodes in the replay buffer end as by a time limit.
+        starts with a reset, and the unfinished episodes in the replay buffer end as by a time limit. Its random numbers go on
+        from the seed of the evaluation.
 
     :param policy: The policy: a model of Stable-Baselines3, or anything with ``predict(observation, deterministic=...)``
     :param env: The gym environment or ``VecEnv`` environment. Its normalization statistics are used as they are:
@@ -326,7 +331,7 @@ def evaluate_lyapunov(
         first half of each episode, with ``L`` at the end of the episode in place of the costs that follow it.
     :param n_cost_levels: Number of levels of the cost, at its quantiles, for which the decrease is reported separately
     :param n_bootstrap: Number of bootstrap samples
-    :param seed: Seed for ``env`` and for the actions
+    :param seed: Seed for ``env`` and for the actions; drawn if it is None, and kept in the report
     :param lyapunov: The function to judge, the critic by default. It cannot be judged on roll-outs that it was fitted on.
     :return: The report
     :raises ValueError: If the arguments cannot be meant, or the policy is not LAC and there is no ``lyapunov``
@@ -338,18 +343,23 @@ def evaluate_lyapunov(
                 "learn one with fit_lyapunov(policy, env), and pass it as lyapunov=..."
             )
         lyapunov = CriticLyapunov(policy)
+    check_function(lyapunov)
     env = prepare_evaluation(policy, env, n_eval_episodes, lyapunov.normalized_rewards)
+    seed = known_seed(seed)
     check_seeds(lyapunov, seed, env.num_envs)
     alpha3 = lyapunov.alpha3 if alpha3 is None else alpha3
     if not alpha3 > 0:
         raise ValueError(f"alpha3={alpha3} must be greater than 0.")
     if not 0 < max_tail_weight <= 1:
         raise ValueError(f"max_tail_weight={max_tail_weight} must be greater than 0, and at most 1.")
-    if n_cost_levels < 1 or n_bootstrap < 1:
-        raise ValueError(f"n_cost_levels={n_cost_levels} and n_bootstrap={n_bootstrap} must be at least 1.")
+    check_number("n_cost_levels", n_cost_levels)
+    check_number("n_bootstrap", n_bootstrap)
 
-    bound = lyapunov.cost_bound(unwrap_vec_normalize(env))
-    with undisturbed(policy, env, seed):
+    vec_normalize = unwrap_vec_normalize(env)
+    # Asked for before the work: not every environment answers
+    limits = time_limits(env)
+    bound = lyapunov.cost_bound(vec_normalize)
+    with undisturbed(policy, env, seed), lyapunov.in_units_of(vec_normalize):
         roll_outs = roll_out(policy, env, n_eval_episodes, deterministic, lyapunov.normalized_rewards)
         roll_outs.add_values(policy, lyapunov, deterministic)
 
@@ -376,5 +386,6 @@ def evaluate_lyapunov(
         gamma=lyapunov.gamma,
         horizon=lyapunov.horizon,
         max_tail_weight=max_tail_weight,
-        max_episode_steps=max((limit for limit in time_limits(env) if limit is not None), default=None),
+        max_episode_steps=max((limit for limit in limits if limit is not None), default=None),
+        seed=seed,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
 
 #: Transitions whose ``L`` is computed at once
 CHUNK_SIZE = 2048
+#: Steps after which an episode is suspected to have no end
+MANY_STEPS = 10_000
 
 
 def prepare_evaluation(policy: PolicyPredictor, env: gym.Env | VecEnv, n_eval_episodes: int, of_the_critic: bool) -> VecEnv:
@@ -38,8 +41,7 @@ def prepare_evaluation(policy: PolicyPredictor, env: gym.Env | VecEnv, n_eval_ep
     """
     if not callable(getattr(policy, "predict", None)):
         raise ValueError(f"{policy!r} has no method predict(observation, deterministic=...), which every policy needs.")
-    if n_eval_episodes < 1:
-        raise ValueError(f"n_eval_episodes={n_eval_episodes} must be at least 1.")
+    check_number("n_eval_episodes", n_eval_episodes)
     if not isinstance(policy, (BaseAlgorithm, BasePolicy)):
         # A controller that knows nothing of images and their channels
         return env if isinstance(env, VecEnv) else DummyVecEnv([lambda: env])  # type: ignore[list-item, return-value]
@@ -63,15 +65,35 @@ def prepare_evaluation(policy: PolicyPredictor, env: gym.Env | VecEnv, n_eval_ep
     return env
 
 
-def check_seeds(lyapunov: LyapunovFunction, seed: int | None, n_envs: int) -> None:
+def check_number(name: str, value: int) -> None:
+    """
+    :param name: Of an argument
+    :param value: Of the argument
+    :raises ValueError: If it is not how many there are of something
+    """
+    if not isinstance(value, (int, np.integer)) or value < 1:
+        raise ValueError(f"{name}={value!r} must be at least 1, and a whole number.")
+
+
+def known_seed(seed: int | None) -> int:
+    """
+    The seed of roll-outs, so that others can be told from them, and so that they can be made again.
+
+    :param seed: Seed that was asked for, if any
+    :return: That one, or a random one of 31 bits, whatever the state of numpy and PyTorch
+    """
+    return int(np.random.SeedSequence().generate_state(1)[0] // 2) if seed is None else seed
+
+
+def check_seeds(lyapunov: LyapunovFunction, seed: int, n_envs: int) -> None:
     """
     Refuse to judge a function on the roll-outs that it was fitted on.
 
     :param lyapunov: The function
-    :param seed: Seed of the evaluation, None if it is drawn
+    :param seed: Seed of the evaluation
     :param n_envs: Number of environments, whose seeds count up from it
     """
-    if seed is None or lyapunov.seeds is None:
+    if lyapunov.seeds is None:
         return
     if seed < lyapunov.seeds.stop and lyapunov.seeds.start < seed + n_envs:
         raise ValueError(
@@ -114,22 +136,20 @@ def normalization(vec_normalize: VecNormalize | None, with_rewards: bool) -> str
 
 
 @contextmanager
-def undisturbed(policy: PolicyPredictor, env: VecEnv, seed: int | None) -> Iterator[None]:
+def undisturbed(policy: PolicyPredictor, env: VecEnv, seed: int) -> Iterator[None]:
     """
     Let a training go on after an evaluation as if there had been none: its random numbers, its normalization and, for LAC, the
     episodes that it was in.
 
     :param policy: What is evaluated
     :param env: The environment
-    :param seed: Seed for the environment and for PyTorch
+    :param seed: Seed for the environment, in place of one that it was given before, and for PyTorch
     """
     vec_normalize = unwrap_vec_normalize(env)
-    if seed is not None:
-        env.seed(seed)
+    env.seed(seed)
     device = getattr(policy, "device", th.device("cpu"))
     with th.random.fork_rng(devices=[device] if device.type == "cuda" else []):
-        if seed is not None:
-            th.manual_seed(seed)
+        th.manual_seed(seed)
         training = vec_normalize is not None and vec_normalize.training
         try:
             # All costs have the same units
@@ -256,6 +276,7 @@ def roll_out(
         observations = env.reset()
         state: tuple[np.ndarray, ...] | None = None
         beginnings = np.ones(n_envs, dtype=bool)
+        lengths = np.zeros(n_envs, dtype=int)
         while (counts < targets).any():
             # Those without a memory need not know of it
             memory = {} if state is None else {"state": state, "episode_start": beginnings}
@@ -270,6 +291,13 @@ def roll_out(
             steps.append({"env": number * n_envs + active, **{name: column[active] for name, column in columns.items()}})
             last_observations += [infos[i]["terminal_observation"] for i in active if truncated[i]]
             counts += dones
+            lengths = np.where(dones, 0, lengths + 1)
+            if lengths.max() == MANY_STEPS:
+                warnings.warn(
+                    f"An episode has gone on for {MANY_STEPS} steps. If it never ends, neither does this: give the "
+                    "environment a time limit, gym.wrappers.TimeLimit(env, max_episode_steps=...).",
+                    stacklevel=2,
+                )
             beginnings, observations = dones, new_observations
 
     all_actions = np.concatenate([step.pop("action") for step in steps])

@@ -62,7 +62,15 @@ def test_exact_function_decreases_by_that_share_and_by_no_more():
 
 
 @pytest.mark.parametrize(
-    "command", [["--algos", "llac"], ["--models", "model.zip"], ["--episodes", "1"], ["--fractions", "0"]]
+    "command",
+    [
+        ["--algos", "llac"],
+        ["--models", "model.zip"],
+        ["--models", "lac=/no/model.zip"],
+        ["--seeds", "-1"],
+        ["--episodes", "1"],
+        ["--fractions", "0"],
+    ],
 )
 def test_nonsense_on_the_command_line_is_refused(command, quick):
     with pytest.raises(SystemExit):

@@ -1,5 +1,6 @@
 """Parts are made once and side by side, files say what made them, and numbers read well."""
 
+import argparse
 import json
 import operator
 import os
@@ -12,7 +13,7 @@ import pandas as pd
 import pytest
 
 from benchmarks import nuisance, study
-from benchmarks.study import Study, command_line, digits, with_spread
+from benchmarks.study import Study, command_line, digits, natural, with_spread
 
 
 def a_study(tmp_path, *arguments, jobs=1):
@@ -155,6 +156,13 @@ def test_what_must_be_positive_is(option, capsys):
     with pytest.raises(SystemExit):
         Study(command_line("example", None), option)
     assert f"argument --jobs: must be at least 1, got {option[1]}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("seed", ["-1", "0.5", "first"])
+def test_seeds_are_natural_numbers(seed):
+    assert natural("0") == 0
+    with pytest.raises(argparse.ArgumentTypeError, match=f"at least 0, got {seed}"):
+        natural(seed)
 
 
 def test_numbers_read_well():

@@ -8,6 +8,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.envs import SimpleMultiObsEnv
+from stable_baselines3.her import HerReplayBuffer
 from torch.nn import functional as F
 
 from sb3_lac import LAC
@@ -191,7 +192,8 @@ def test_model_with_a_horizon_is_saved_loaded_and_continued(make_model, make_env
         ({"horizon": 2.5}, "horizon=2.5 must be an integer"),
         ({"horizon": True}, "horizon=True must be an integer"),
         ({"horizon": 5, "n_steps": 3}, "horizon=5 and n_steps=3 are two Lyapunov candidates"),
-        ({"horizon": 5, "replay_buffer_class": NStepReplayBuffer}, "replay_buffer_class=NStepReplayBuffer"),
+        ({"horizon": 5, "replay_buffer_class": NStepReplayBuffer}, "horizon=5 and n_steps=3 are two Lyapunov candidates"),
+        ({"horizon": 5, "replay_buffer_class": HerReplayBuffer}, "replay_buffer_class=HerReplayBuffer"),
         ({"replay_buffer_class": HorizonReplayBuffer}, "set for instance horizon=5"),
         ({"horizon": 600}, "horizon=600 must not be larger than the 500 steps"),
         (
@@ -203,6 +205,51 @@ def test_model_with_a_horizon_is_saved_loaded_and_continued(make_model, make_env
 def test_bad_horizons_are_named(make_model, kwargs, message):
     with pytest.raises(ValueError, match=message):
         make_model(n_collect=0, **kwargs)
+
+
+def test_loaded_model_with_a_horizon_waits_for_a_complete_sum(make_model, make_env, tmp_path):
+    make_model(horizon=4).save(tmp_path / "model")
+    loaded = LAC.load(tmp_path / "model", env=make_env(), device="cpu")
+    with pytest.warns(UserWarning, match=r"horizon=4 steps yet.*load_replay_buffer\(\) before learn"):
+        loaded.learn(10, reset_num_timesteps=False)
+    # The first three of ten steps leave no sum of four
+    assert loaded._n_updates == 7
+
+
+# n-step returns
+
+
+def test_returns_and_values_have_one_discount(make_model, make_env, tmp_path):
+    model = make_model(make_env(offset=1.0), n_steps=3, gamma=0.99)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    loaded = LAC.load(tmp_path / "model", env=make_env(offset=1.0), gamma=0.5, device="cpu")
+    assert loaded.replay_buffer.gamma == 0.5
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    loaded.learn(10, reset_num_timesteps=False)
+    assert loaded._n_updates > 0 and loaded.replay_buffer.gamma == 0.5
+    # Sums of n rewards are no rewards
+    assert loaded.reward_bound.item() == loaded.largest_stored_reward < 1.0
+    chosen = make_model(make_env(offset=1.0), gamma=0.5, replay_buffer_class=NStepReplayBuffer)
+    chosen.learn(10, reset_num_timesteps=False)
+    assert chosen.replay_buffer.gamma == 0.5 and chosen.reward_bound.item() == chosen.largest_stored_reward
+
+
+def test_number_of_steps_is_an_argument_of_the_model(make_model, make_env, tmp_path):
+    for kwargs, n_steps in (
+        ({"n_steps": 4}, 4),
+        ({"replay_buffer_class": NStepReplayBuffer}, 3),
+        ({"replay_buffer_class": NStepReplayBuffer, "replay_buffer_kwargs": {"n_steps": 5}}, 5),
+    ):
+        model = make_model(n_collect=0, **kwargs)
+        assert model.n_steps == model.replay_buffer.n_steps == n_steps
+        model.save(tmp_path / "model")
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            assert LAC.load(tmp_path / "model", env=make_env(), device="cpu").replay_buffer.n_steps == n_steps
+            assert LAC.load(tmp_path / "model", env=make_env(), n_steps=2, device="cpu").replay_buffer.n_steps == 2
+            loaded = LAC.load(tmp_path / "model", env=make_env(), n_steps=1, device="cpu")
+        assert type(loaded.replay_buffer) is ReplayBuffer
 
 
 def test_memory_cannot_be_optimized(make_model):

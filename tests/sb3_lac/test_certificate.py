@@ -1,6 +1,7 @@
 """A certificate tells a loop that settles from one that does not, and its statements are exact."""
 
 import itertools
+import warnings
 
 import gymnasium as gym
 import numpy as np
@@ -134,6 +135,41 @@ def test_function_is_not_judged_on_its_own_roll_outs(optimal, linear_env):
     evaluate_lyapunov(controller, linear_env, 10, seed=10, lyapunov=lyapunov)
 
 
+class NoisyController:
+    """Samples its actions from PyTorch's random numbers, as the policies of Stable-Baselines3 do."""
+
+    def __init__(self):
+        self.actions = []
+
+    def predict(self, observation, deterministic=True):
+        self.actions.append(th.randn(len(observation), 2).numpy())
+        return self.actions[-1], None
+
+
+# The function was fitted on two episodes only
+@pytest.mark.filterwarnings("ignore:Observations lie far")
+@pytest.mark.parametrize("env_seed", [None, 0])
+def test_roll_outs_without_a_seed_are_new_ones(make_env, env_seed):
+    # Whatever seed the environment was given before
+    env, policy = make_vec_env(make_env, n_envs=2, seed=env_seed), NoisyController()
+    lyapunov = fit_lyapunov(policy, env, 2, n_iterations=1, progress_bar=False)
+    assert lyapunov.seeds == range(lyapunov.seeds.start, lyapunov.seeds.start + 2)
+    with pytest.raises(ValueError, match="that the Lyapunov function was fitted on"):
+        certify(policy, env, lyapunov, 2, seed=lyapunov.seeds.start)
+    reports = []
+    for judge, n_episodes in ((certify, "n_episodes"), (certify, "n_episodes"), (evaluate_lyapunov, "n_eval_episodes")):
+        env = make_vec_env(make_env, n_envs=2, seed=env_seed)
+        reports.append(judge(policy, env, lyapunov=lyapunov, **{n_episodes: 2}))
+    firsts = [report.transitions["reward"].iloc[0] for report in reports]
+    assert len(set(firsts)) == 3
+    # Each draws other actions, too
+    assert len({actions[0, 0] for actions in policy.actions}) == len(policy.actions)
+    # And can be made again
+    again = evaluate_lyapunov(policy, env, 2, lyapunov=lyapunov, seed=reports[2].seed)
+    assert again.transitions.equals(reports[2].transitions)
+    assert int(reports[0].description.split("seed ")[1]) != int(reports[1].description.split("seed ")[1])
+
+
 def test_fit_is_reproducible_and_leaves_random_numbers_alone(linear_env, optimal):
     controller = optimal[0]
     points = np.random.default_rng(0).uniform(-1, 1, (20, 2))
@@ -155,10 +191,49 @@ def test_function_is_saved_and_loaded(optimal, tmp_path):
     loaded = FittedLyapunov.load(path)
     points = np.random.default_rng(0).uniform(-1, 1, (20, 2))
     np.testing.assert_array_equal(loaded.values(points), lyapunov.values(points))
+    np.testing.assert_array_equal([loaded.low, loaded.high], [lyapunov.low, lyapunov.high])
     for name in ("average_cost", "level", "window_steps", "ultimate_cost", "reward_bound", "seeds", "alpha3", "gamma"):
         assert getattr(loaded, name) == getattr(lyapunov, name), name
     with pytest.raises(ValueError, match="have 3 numbers, the Lyapunov function takes 2"):
         loaded.values(np.ones((1, 3)))
+    # A file of an earlier version does not know where it was fitted
+    content = th.load(path, weights_only=True)
+    th.save({name: value for name, value in content.items() if name not in ("low", "high")}, path)
+    old = FittedLyapunov.load(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert (old.values(points) == lyapunov.values(points)).all() and old.values(np.full((1, 2), 99.0)) >= 0
+
+
+class ObservedGoal(gym.ObservationWrapper):
+    """The same observation with a number that does not change."""
+
+    def __init__(self, env, goal):
+        super().__init__(env)
+        self.goal = goal
+        self.observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float32)
+
+    def observation(self, observation):
+        return np.append(observation, np.float32(self.goal))
+
+
+class Integrator:
+    def predict(self, observation, deterministic=True):
+        return np.clip(-observation[:, :2], -1, 1), None
+
+
+def test_function_does_not_depend_on_what_never_changed(make_env):
+    lyapunov = fit_lyapunov(Integrator(), ObservedGoal(make_env(), 0.1), 10, seed=0, **FIT)
+    points = np.array([[1.0, 0.5, 0.1], [0.0, -1.0, 0.1]])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        values = lyapunov.values(points)
+        evaluate_lyapunov(Integrator(), ObservedGoal(make_env(), 0.1), 10, seed=100, lyapunov=lyapunov)
+    with pytest.warns(UserWarning, match=r"number \[2\] of them was within \[0.1"):
+        moved = lyapunov.values(points + np.array([0.0, 0.0, 0.05]))
+    np.testing.assert_array_equal(moved, values)
+    with pytest.warns(UserWarning, match=r"number \[0, 1\] of them was within"):
+        lyapunov.values(np.array([[50.0, -50.0, 0.1]]))
 
 
 # Statistics
@@ -292,6 +367,12 @@ def test_region_of_attraction_on_a_grid():
 def test_env_that_ignores_starts_is_refused():
     with pytest.raises(ValueError, match="the same state whatever reset"):
         certify(NoController(), PlannedEnv([[1, 1]]), n_episodes=2, cost_bound=1.0, starts=np.array([[1.0], [2.0]]))
+    # Also if there is only one
+    with pytest.raises(ValueError, match="the same state whatever reset"):
+        certify(NoController(), PlannedEnv([[1, 1]]), n_episodes=2, cost_bound=1.0, starts=[[5.0]])
+    controller = reference_controller(gym.make("LinearCost-v0"))
+    report = certify(controller, gym.make("LinearCost-v0"), n_episodes=2, cost_bound=1.0, starts=[[0.5, 0.5]], seed=0)
+    assert report.starts["n_attracted"].tolist() == [10]
 
 
 # Deaths
@@ -333,6 +414,15 @@ def test_states_that_die_have_a_large_value():
     lyapunov = fit_lyapunov(NoController(), env, 60, seed=0, n_iterations=60, batch_size=64, progress_bar=False)
     dying, settling = lyapunov.values(np.array([[3.0], [4.0]]))
     assert dying > 3 * settling
+
+
+def test_living_on_is_what_a_constant_reward_is_worth():
+    # As on CartPole-v1: every step pays 1 and costs nothing, until one that is the last
+    env = PlannedEnv([[-1, -1, np.inf], [-1, -1, -1, -1, -1, -1, -1, -1]])
+    lyapunov = fit_lyapunov(NoController(), env, 20, seed=0, **FIT)
+    assert lyapunov.unit == 6.0 and lyapunov.reward_bound == 1.0
+    report = evaluate_lyapunov(NoController(), env, 4, seed=100, lyapunov=lyapunov)
+    assert not report.holds and "2 of 4 episodes died" in report.summary()
 
 
 # Policies and environments
@@ -391,6 +481,10 @@ def test_critic_is_a_function_of_the_observation(make_model, make_env):
         (certify, {"confidence": 1.0}, "confidence=1.0 must lie between 0 and 1"),
         (certify, {"n_episodes": 0}, "n_eval_episodes=0 must be at least 1"),
         (certify, {"window_steps": 0}, "window_steps=0"),
+        (certify, {"window_steps": 2.5}, "window_steps=2.5 must be at least 1, and a whole number"),
+        (certify, {"cost_bound": np.nan}, "cost_bound=nan must be a number"),
+        (certify, {"level": np.nan}, "level=nan must be a number"),
+        (certify, {"lyapunov": np.sum}, "must be a LyapunovFunction"),
         (certify, {"n_episodes_per_start": 0}, "n_episodes_per_start=0"),
         (certify, {"starts": np.ones(3), "cost_bound": 1.0}, r"starts of shape \(3,\)"),
         (certify, {"starts": np.ones((3, 1))}, "give one, or a fitted lyapunov"),
@@ -420,6 +514,27 @@ def test_what_says_nothing_is_refused():
 
 
 # Callback
+
+
+@pytest.mark.filterwarnings("ignore:Observations lie far")
+def test_callback_goes_on_where_nothing_has_a_cost(make_env, tmp_path, capsys):
+    class Free(gym.RewardWrapper):
+        def reward(self, reward):
+            return 0.0
+
+    model = SAC("MlpPolicy", make_env(), learning_starts=100, policy_kwargs={"net_arch": [8]}, buffer_size=100, seed=0)
+    log_path = tmp_path / "log.csv"
+    callback = CertificateCallback(Free(make_env()), n_eval_episodes=2, eval_freq=10, log_path=log_path)
+    assert model.learn(20, callback=callback).num_timesteps == 20
+    assert capsys.readouterr().out.count("nothing had a cost") == 2
+    assert callback.last_report is None and callback.last_certification is None
+    # The columns of the other evaluations
+    other = CertificateCallback(make_env(), n_eval_episodes=2, eval_freq=10, seed=None, verbose=0)
+    model.learn(20, callback=other)
+    assert callback.history[0].keys() == other.history[0].keys()
+    assert all(np.isnan(value) for name, value in callback.history[0].items() if name != "timesteps")
+    # Without a seed, each evaluation has episodes of its own
+    assert other.history[0]["start_cost"] != other.history[1]["start_cost"]
 
 
 def test_callback_certifies_any_algorithm_and_changes_nothing(make_env, tmp_path):

@@ -259,3 +259,4 @@ def test_schedules_are_named():
     model.policy_kwargs = {"activation_fn": nn.ReLU}
     found = hyperparameters_of(model)
     assert (found["learning_rate"], found["train_freq"]) == (1e-3, "2 step") and "net_arch" not in found
+    assert hyperparameters_of(make_model(LAC, reward_bound=5.0))["reward_bound"] == 5.0

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from sb3_contrib import TQC
+from sb3_contrib import TQC, RecurrentPPO
 from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
@@ -46,6 +46,37 @@ def test_observations_are_normalized_as_in_training(tmp_path):
     np.testing.assert_allclose(policy.predict(observations)[0], expected, atol=1e-5)
 
 
+def test_a_model_without_its_environment_needs_to_be_told_of_the_normalization(tmp_path):
+    env = VecNormalize(make_vec_env("LinearCost-v0"))
+    env.obs_rms.mean, env.obs_rms.var = np.array([3.0, -1.0]), np.array([4.0, 0.01])
+    LAC("MlpPolicy", env, seed=0, device="cpu", policy_kwargs=dict(SMALL)).save(tmp_path / "model")
+    model = LAC.load(tmp_path / "model", device="cpu")
+    for exported in (model, model.policy):
+        with pytest.warns(UserWarning, match="has no environment that says whether observations were normalized"):
+            export_onnx(exported, tmp_path / f"{type(exported).__name__}.onnx")
+    policy = OnnxPolicy(export_onnx(model, tmp_path / "policy.onnx", vec_normalize=env))
+    observations = np.random.default_rng(0).uniform(-10, 10, (50, 2)).astype(np.float32)
+    expected, _ = model.predict(env.normalize_obs(observations), deterministic=True)
+    np.testing.assert_allclose(policy.predict(observations)[0], expected, atol=1e-5)
+
+
+def test_actions_are_float32(tmp_path):
+    model = SAC("MlpPolicy", "Pendulum-v1", seed=0, device="cpu", policy_kwargs=dict(SMALL), _init_setup_model=False)
+    model.action_space = spaces.Box(-1.0, 3.0, (1,), np.float64)
+    model._setup_model()
+    policy = OnnxPolicy(export_onnx(model, tmp_path / "policy"))
+    observations = np.array([model.observation_space.sample() for _ in range(5)])
+    actions, _ = policy.predict(observations)
+    assert actions.dtype == np.float32
+    np.testing.assert_allclose(actions, model.predict(observations, deterministic=True)[0], atol=1e-5)
+
+
+def test_policies_with_a_memory_are_refused(tmp_path):
+    model = RecurrentPPO("MlpLstmPolicy", "Pendulum-v1", device="cpu", n_steps=8, policy_kwargs={"lstm_hidden_size": 4})
+    with pytest.raises(ValueError, match="RecurrentActorCriticPolicy has a memory"):
+        export_onnx(model, tmp_path / "policy")
+
+
 def test_gsde_exports_its_mean(tmp_path):
     model = LAC("MlpPolicy", "Pendulum-v1", use_sde=True, seed=0, device="cpu", policy_kwargs=dict(SMALL))
     policy = OnnxPolicy(export_onnx(model, tmp_path / "policy"))
@@ -83,6 +114,7 @@ def test_other_spaces_are_refused(tmp_path):
         export_onnx(model, tmp_path / "policy")
 
 
+@pytest.mark.filterwarnings("ignore:LAC has no environment")
 def test_bad_files_and_observations_are_refused(tmp_path):
     with pytest.raises(FileNotFoundError):
         OnnxPolicy(tmp_path / "missing.onnx")

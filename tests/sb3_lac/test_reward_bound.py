@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.save_util import load_from_zip_file, save_to_zip_file
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from torch.nn import functional as F
 
@@ -33,9 +34,9 @@ class BalanceEnv(gym.Env):
         return np.array([self.state], np.float32), reward, abs(self.state) > 1, self.n_steps >= 100, {}
 
 
-def predictions(model):
-    """L of all stored transitions."""
-    buffer = model.replay_buffer
+def predictions(model, buffer=None):
+    """L of all transitions in its replay buffer, or in another one."""
+    buffer = buffer or model.replay_buffer
     return model.policy.predict_lyapunov(buffer.observations[: buffer.pos, 0], buffer.actions[: buffer.pos, 0])
 
 
@@ -206,12 +207,61 @@ def test_bound_and_offset_are_saved_and_a_bound_can_be_stated_on_loading(make_mo
     np.testing.assert_array_equal(loaded.policy.predict_lyapunov(observations, actions), values)
     changed = LAC.load(tmp_path / "model", reward_bound=7.0, device="cpu")
     assert changed.cost_bound().item() == 7.0
-    # The certificate is that of the new bound
-    evaluate_lyapunov(changed, make_env(), 1)
+    # L is that of the new bound
     np.testing.assert_allclose(changed.policy.predict_lyapunov(observations, actions), values + 8.0, rtol=1e-5)
     # Without an argument, the bound that was stated first is kept
     changed.save(tmp_path / "changed")
     assert LAC.load(tmp_path / "changed", device="cpu").cost_bound().item() == 7.0
+    # Not below what was seen
+    lower = LAC.load(tmp_path / "changed", reward_bound=0.0, device="cpu")
+    assert 0 < lower.cost_bound().item() == model.largest_stored_reward < 4.0
+
+
+@pytest.mark.parametrize("stated", [None, 5.0])
+def test_bound_is_one_of_the_parameters(make_model, make_env, train_metrics, tmp_path, stated):
+    model = make_model(make_env(offset=4.0), gamma=0.75, reward_bound=stated)
+    train_metrics(model, gradient_steps=5)
+    model.save(tmp_path / "model")
+    expected = predictions(model)
+    for parameters in (model.get_parameters(), tmp_path / "model.zip"):
+        other = make_model(make_env(offset=4.0), n_collect=0, gamma=0.75, seed=1)
+        other.set_parameters(parameters, device="cpu")
+        np.testing.assert_array_equal(predictions(other, model.replay_buffer), expected)
+        reports = [evaluate_lyapunov(judged, make_env(offset=4.0), 3, seed=1) for judged in (model, other)]
+        assert reports[0].transitions.equals(reports[1].transitions)
+        np.testing.assert_array_equal(predictions(other, model.replay_buffer), expected)
+        assert other.cost_bound().item() == model.cost_bound().item() > 3.0
+
+
+def test_report_does_not_change_the_critic(make_model, make_env, train_metrics):
+    env = VecNormalize(DummyVecEnv([lambda: make_env(offset=3.0)]), gamma=0.75)
+    model = make_model(env, gamma=0.75, reward_bound=3.0)
+    train_metrics(model)
+    state = {name: tensor.clone() for name, tensor in model.policy.state_dict().items()}
+    eval_env = VecNormalize(DummyVecEnv([lambda: make_env(offset=3.0)]), gamma=0.75)
+    eval_env.ret_rms.var = 4.0 - eval_env.epsilon
+    report = evaluate_lyapunov(model, eval_env, 2, seed=0)
+    assert all(th.equal(state[name], tensor) for name, tensor in model.policy.state_dict().items())
+    # Its values have the units of its rewards: with an offset of 4 * 3 / 2
+    actions, _ = model.predict(report.observations, deterministic=True)
+    of_the_training = model.policy.predict_lyapunov(report.observations, actions)
+    shift = 6.0 - model.critic.offset.item()
+    np.testing.assert_allclose(report.transitions["lyapunov"], of_the_training + shift, rtol=1e-3, atol=1e-3)
+
+
+def test_models_of_earlier_versions_keep_their_bound(make_model, make_env, train_metrics, tmp_path):
+    model = make_model(make_env(offset=4.0), gamma=0.75)
+    train_metrics(model, gradient_steps=5)
+    model.save(tmp_path / "model")
+    data, parameters, tensors = load_from_zip_file(tmp_path / "model")
+    # It was a tensor of the algorithm, and not of the policy
+    tensors["reward_bound"] = parameters["policy"].pop("reward_bound")
+    save_to_zip_file(tmp_path / "old", data=data, params=parameters, pytorch_variables=tensors)
+    loaded = LAC.load(tmp_path / "old", device="cpu")
+    assert loaded.cost_bound().item() == model.cost_bound().item() > 3.0
+    np.testing.assert_array_equal(predictions(loaded, model.replay_buffer), predictions(model))
+    loaded.save(tmp_path / "new")
+    assert LAC.load(tmp_path / "new", device="cpu").cost_bound().item() == model.cost_bound().item()
 
 
 @pytest.mark.parametrize("bound", [-1.0, math.inf, math.nan])

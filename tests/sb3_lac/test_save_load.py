@@ -66,8 +66,6 @@ def test_continued_training_is_the_same_as_uninterrupted_training(make_model, ma
     assert_same_learned_state(model, loaded)
 
 
-# Loading says that the saved class of the replay buffer makes n_steps void, it has however been set up for n_steps
-@pytest.mark.filterwarnings("ignore:`n_steps=3` is ignored")
 @pytest.mark.parametrize(
     ("n_envs", "norm_reward", "kwargs"),
     [
@@ -135,6 +133,10 @@ def test_loaded_arguments_are_checked_and_can_be_changed(make_model, tmp_path):
     assert LAC.load(tmp_path / "model", alpha3=0.5).alpha3 == 0.5
     with pytest.raises(ValueError, match="alpha3=-1 must be greater than 0"):
         LAC.load(tmp_path / "model", alpha3=-1)
+    make_model(n_collect=0, published_update=True).save(tmp_path / "published")
+    for name, published in (("model", True), ("published", False)):
+        with pytest.raises(ValueError, match=f"published_update={published} is not what the model was saved with"):
+            LAC.load(tmp_path / name, published_update=published)
 
 
 def test_loaded_model_continues_to_learn(make_model, make_env, tmp_path):

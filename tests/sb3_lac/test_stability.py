@@ -1,6 +1,7 @@
 """The statistics of the learned Lyapunov function are right, known cases are recognized, and nothing is changed by them."""
 
 import itertools
+import warnings
 
 import gymnasium as gym
 import numpy as np
@@ -16,10 +17,16 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import FakeImageEnv, SimpleMultiObsEnv
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize, VecTransposeImage, sync_envs_normalization
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    SubprocVecEnv,
+    VecNormalize,
+    VecTransposeImage,
+    sync_envs_normalization,
+)
 from torch import nn
 
-from sb3_lac import LAC, LyapunovCallback, evaluate_lyapunov
+from sb3_lac import LAC, LyapunovCallback, certify, evaluate_lyapunov
 from sb3_lac.stability import rollout
 from sb3_lac.stability.statistics import Bootstrap, decrease_by_cost, ratio
 
@@ -584,6 +591,52 @@ def test_callback_refuses_the_training_env(make_model, make_env, of_the_model):
     assert model.num_timesteps == 0
 
 
+# Environments that say nothing of themselves
+
+
+class ForeignVecEnv(DummyVecEnv):
+    """As the adapters of simulators that have no single environments."""
+
+    def get_attr(self, attr_name, indices=None):
+        if attr_name == "render_mode":
+            return super().get_attr(attr_name, indices)
+        raise NotImplementedError
+
+
+def test_env_without_attributes_is_evaluated(make_model, make_env, tmp_path):
+    env = ForeignVecEnv([make_env])
+    model = make_model(env, horizon=3)
+    assert evaluate_lyapunov(model, env, 2).max_episode_steps is None
+    assert "without a known id" in certify(model, env, n_episodes=2).description
+
+
+def test_specification_stays_in_its_process(make_model):
+    # It cannot be pickled
+    gym.register("Unpicklable-v0", entry_point=lambda: ContractionEnv(), max_episode_steps=7)
+    try:
+        env = make_vec_env("Unpicklable-v0", n_envs=2, vec_env_cls=SubprocVecEnv, vec_env_kwargs={"start_method": "fork"})
+        with pytest.raises(ValueError, match="horizon=8 is longer than the episodes, which max_episode_steps=7 cuts"):
+            make_model(env, n_collect=0, horizon=8)
+        report = evaluate_lyapunov(make_model(env, n_collect=0), env, 2)
+        assert report.max_episode_steps == 7 and report.episodes["length"].tolist() == [7, 7]
+        env.close()
+    finally:
+        del gym.registry["Unpicklable-v0"]
+    env = SubprocVecEnv([ContractionEnv], start_method="fork")
+    assert evaluate_lyapunov(make_model(env, n_collect=0), env, 1).max_episode_steps is None
+    env.close()
+
+
+def test_episode_without_an_end_is_noticed(make_model, make_env, monkeypatch):
+    monkeypatch.setattr(rollout, "MANY_STEPS", 19)
+    with pytest.warns(UserWarning, match="gone on for 19 steps. If it never ends") as caught:
+        evaluate_lyapunov(make_model(n_collect=0), make_env(episode_length=25), 1)
+    assert len(caught) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        evaluate_lyapunov(make_model(n_collect=0), make_env(episode_length=19), 3)
+
+
 # Mistakes
 
 
@@ -595,7 +648,9 @@ def test_callback_refuses_the_training_env(make_model, make_env, of_the_model):
         ({"alpha3": float("nan")}, "alpha3=nan must be greater than 0"),
         ({"max_tail_weight": 0.0}, "max_tail_weight=0.0 must be greater than 0"),
         ({"max_tail_weight": 1.5}, "max_tail_weight=1.5 .* at most 1"),
+        ({"n_eval_episodes": 2.5}, "n_eval_episodes=2.5 must be at least 1, and a whole number"),
         ({"n_cost_levels": 0}, "n_cost_levels=0"),
+        ({"lyapunov": np.sum}, r"lyapunov=<function sum.* must be a LyapunovFunction.*LyapunovFunction\(function\)"),
         ({"n_bootstrap": 0}, "n_bootstrap=0"),
     ],
 )
@@ -730,6 +785,23 @@ def test_callback_logs_the_metrics(make_model, make_env, tmp_path, capsys):
     model.learn(20, callback=callback, reset_num_timesteps=False)
     assert pd.read_csv(log_path)["timesteps"].tolist() == [10, 20, 30]
     assert [entry["timesteps"] for entry in callback.history] == [10, 20, 30]
+
+
+def test_callback_does_not_mix_two_trainings(make_model, make_env, tmp_path):
+    def train(log_path, **kwargs):
+        callback = LyapunovCallback(make_env(), n_eval_episodes=1, eval_freq=10, log_path=log_path, verbose=0)
+        return make_model(n_collect=0).learn(10, callback=callback, **kwargs)
+
+    path = tmp_path / "log.csv"
+    # An empty file has no evaluations
+    path.touch()
+    train(path)
+    content = path.read_bytes()
+    with pytest.raises(ValueError, match=r"log\.csv holds the evaluations of another training, and this one starts anew"):
+        train(path)
+    assert path.read_bytes() == content
+    with pytest.raises(ValueError, match="is a folder"):
+        train(tmp_path)
 
 
 def test_callback_synchronizes_normalization(make_model, make_env):

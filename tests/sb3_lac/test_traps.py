@@ -219,7 +219,7 @@ def test_everything_that_is_learned_is_saved(make_model, train_metrics):
     model = make_model()
     state_dicts, tensors = model._get_torch_save_params()
     own_tensors = {name for name, value in vars(model).items() if isinstance(value, th.Tensor)}
-    assert own_tensors == {"log_lambda", "log_ent_coef", "reward_bound"}
+    assert own_tensors == {"log_lambda", "log_ent_coef"}
     assert set(tensors) == own_tensors
     own_optimizers = {name for name, value in vars(model).items() if isinstance(value, th.optim.Optimizer)}
     assert own_optimizers == {"lambda_optimizer", "ent_coef_optimizer"}
@@ -234,7 +234,7 @@ def test_everything_that_is_learned_is_saved(make_model, train_metrics):
     train_metrics(model)
     unchanged = {name for name, tensor in model.policy.state_dict().items() if th.equal(before[name], tensor)}
     # It waits for positive rewards
-    assert unchanged == {"critic.offset", "critic_target.offset"}
+    assert unchanged == {"critic.offset", "critic_target.offset", "reward_bound"}
 
 
 def test_both_values_of_the_difference_are_from_the_online_critic(make_model, train_metrics):
@@ -270,6 +270,9 @@ def test_multipliers_learn_in_log_space():
         ({"n_steps": 3, "gamma": 1.0}, "gamma=1.0 must be smaller than 1 with n-step returns"),
         ({"policy_kwargs": {"output_dim": -1}}, "output_dim=-1 must not be negative"),
         ({"policy_kwargs": {"n_critics": 0}}, "n_critics=0 must be at least 1"),
+        ({"alpha3": "0.1"}, "alpha3='0.1' must be a number"),
+        ({"lambda_max": None}, "lambda_max=None must be a number"),
+        ({"reward_bound": "auto"}, "reward_bound='auto' must be a number, or None"),
     ],
 )
 def test_bad_arguments_are_named(make_model, kwargs, message):
