@@ -42,6 +42,8 @@ PRIOR_LIMIT_SD = 2.5
 #: The error of the model may be this much larger than stated before the residuals contradict it.
 MISMATCH_MARGIN = 2.0
 
+#: No Li-ion cell is to be discharged below this, V: it is no use to advise it.
+LEAST_CUT_OFF_V = 2.0
 #: Why a precision does not suffice, and what would help.
 IMPRECISE = {
     "q_mobile": "q_mobile is not known to 2 % yet: the voltage shows it at the knee of the discharge, the more the lower the "
@@ -49,8 +51,6 @@ IMPRECISE = {
     "r_o": "r_o is not known to 30 %: the error expected of noise and model, divided by the current, is larger. A larger "
     "current, or a smaller mismatch_V if the model is that good, tells more.",
 }
-#: No Li-ion cell is to be discharged below this, V: it is no use to advise it.
-LEAST_CUT_OFF_V = 2.0
 AT_BOUND = "{} is at a bound of its search, where the record does not determine it."
 EMPTY = "The model cell is empty before the record ends: its q_mobile is too small for this record."
 IMPLAUSIBLE = (
@@ -220,7 +220,7 @@ def imprecise_text(share: float, depth_V: float, enough_V: float | None, rmse_V:
     reached = f", but to {np.ceil(1e4 * share) / 1e2:.3g} %" if share < 1.0 else ""
     text = f"q_mobile is not known to 2 % yet{reached}: the voltage shows it at the knee of the discharge."
     if depth_V >= LEAST_CUT_OFF_V:
-        text += f" Under this load the record has to go down to about {np.floor(1e2 * depth_V) / 1e2:.2f} V."
+        text += f" Under this load the record has to go down to about {np.floor(1e2 * depth_V) / 1e2:.2f} V, if the cell may."
     elif not np.isnan(depth_V):
         text += f" Under this load no record down to {LEAST_CUT_OFF_V:g} V would tell it."
     if enough_V is None:

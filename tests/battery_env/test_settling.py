@@ -42,7 +42,7 @@ def imprecise(estimate: Estimate) -> tuple[float, float]:
     assert not estimate.settled
     said = re.match(
         r"q_mobile is not known to 2 % yet, but to ([\d.]+) %: the voltage shows it at the knee of the discharge. "
-        r"Under this load the record has to go down to about ([\d.]+) V\. To the same cut-off, a smaller load ",
+        r"Under this load the record has to go down to about ([\d.]+) V, if the cell may\. To the same cut-off, a smaller ",
         estimate.reason,
     )
     assert said, estimate.reason
