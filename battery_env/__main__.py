@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from battery_env.cells import Discharge
-from battery_env.estimators.cell_fit import fit_cell, read_cell
+from battery_env.estimators.cell_fit import CellFit, fit_cell, read_cell
 from battery_env.estimators.rest import InitialSoc
 from battery_env.files import check_folder
 from battery_env.fleet import Reading, Results, calibrate_all, find_sources, read_source
@@ -63,7 +63,8 @@ def _fit_parser(name: str) -> argparse.ArgumentParser:
             "Fit the constants of the model to a few discharges of one cell, each from full charge to its knee, and save them "
             "for --cell of calibrate. Take three or more, of all ages and loads that they are to hold for."
         ),
-        epilog="Exit status: 0, or 2 if a discharge cannot be used, or the equations do not describe the cell.",
+        epilog="Exit status: 0, 3 if the discharges may not have started full, or 2 if one cannot be used or the equations do "
+        "not describe the cell.",
         allow_abbrev=False,
     )
     _add_reading(parser)
@@ -320,7 +321,12 @@ def _settings(options: argparse.Namespace) -> Settings:
         "policy": options.policy,
     }
     given = {name: value for name, value in given.items() if value is not None}
-    return Settings.for_cell(read_cell(options.cell), **given) if options.cell else Settings(**given)
+    if not options.cell:
+        return Settings(**given)
+    cell = read_cell(options.cell)
+    if isinstance(cell, CellFit) and cell.doubt:
+        print(f"warning: {options.cell}: {cell.doubt}", file=sys.stderr)
+    return Settings.for_cell(cell, **given)
 
 
 def fit(arguments: Sequence[str] | None = None, name: str = "python -m battery_env fit") -> int:
@@ -329,7 +335,7 @@ def fit(arguments: Sequence[str] | None = None, name: str = "python -m battery_e
 
     :param arguments: as in :func:`main`, without the name of the command
     :param name: of the program, for its help
-    :return: 0, or 2 if nothing was fitted; then a line on standard error says why
+    :return: 0, 3 if the discharges may not have started full, or 2 if nothing was fitted; a line on standard error says why
     """
     options = _fit_parser(name).parse_args(arguments)
     out: Path = options.out
@@ -344,8 +350,12 @@ def fit(arguments: Sequence[str] | None = None, name: str = "python -m battery_e
         reading = Reading(options.columns, options.units, options.discharge_is_negative)
         discharges = _discharges(options.records, reading)
         print(f"fitting {len(discharges)} discharges", file=sys.stderr, flush=True)
-        found = fit_cell(discharges, options.cut_off, thermal=not options.isothermal)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of the doubt, which is printed
+            found = fit_cell(discharges, options.cut_off, thermal=not options.isothermal)
         print(found.summary())
+        if found.doubt:
+            print(f"warning: {found.doubt}", file=sys.stderr)
         found.to_json(out)
 
         from battery_env.plotting import plot_cell_fit, save_figure  # here, as matplotlib takes long to import
@@ -359,7 +369,7 @@ def fit(arguments: Sequence[str] | None = None, name: str = "python -m battery_e
         print(f"error: {error}", file=sys.stderr)
         return REFUSED
     print(f"\nwritten: {out}, {picture}")
-    return SETTLED
+    return NOT_SETTLED if found.doubt else SETTLED
 
 
 def _discharges(records: Sequence[str], reading: Reading) -> list[Discharge]:

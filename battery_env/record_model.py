@@ -36,6 +36,10 @@ from battery_env.records import Record, check_record, expected_current, resample
 # The total of the four charges is q_mobile / 0.6 at all times.
 _Q_PER_CHARGE = 1.0 / float(FULL_CHARGE_SHARES.sum())
 
+#: No discharge is followed longer than this into the future, s: a current that takes more than a week to empty the cell is
+#: that of a cell at rest.
+LONGEST_FORECAST_S = 604_800.0
+
 
 class VoltageForecast(NamedTuple):
     """
@@ -44,7 +48,8 @@ class VoltageForecast(NamedTuple):
     :param time_s: of the steps of the model down to the cut-off, on the clock of the record, s, shape (K,)
     :param voltage_V: shape (K,). The last point is at the cut-off, interpolated between steps; it is above if the cut-off is
         never reached, as the load is off at the end of the record
-    :param eod_time_s: when the cut-off is reached, on the clock of the record, s; NaN if it is not
+    :param eod_time_s: when the cut-off is reached, on the clock of the record, s; NaN if it is not, or under a current so
+        small that it would take more than a week
     :param at_samples_V: at the samples of the record, also below the cut-off, shape (T,); NaN after the model cell is empty
     """
 
@@ -208,7 +213,7 @@ class RecordModel:
             future_current_A = expected_current(record.time_s, record.current_A).mean_A
         elif not 0.0 <= future_current_A < np.inf:
             raise ValueError(f"future_current_A must be finite and at least 0 A, got {future_current_A!r}")
-        if future_current_A > 0.0:
+        if future_current_A * LONGEST_FORECAST_S > at.q_mobile:
             # no cell of this q_mobile lasts longer than this, whatever it had delivered before
             steps = int(at.q_mobile / (future_current_A * self.dt_s)) + 1
             current_A = np.append(current_A[:-1], np.full(steps + 1, future_current_A))
@@ -235,7 +240,7 @@ class RecordModel:
         :param load: a number, or a function of time in s that takes an array
         :param load_unit: of the load, ``"power"`` in W or ``"current"`` in A
         :param cut_off_V: cut-off voltage, V
-        :param max_duration_s: where to stop if the cut-off is not reached, s
+        :param max_duration_s: where to stop if the cut-off is not reached, s; at most a week is followed
         :return: Ah; NaN if the cut-off is not reached
         """
         new = simulate(
@@ -245,7 +250,7 @@ class RecordModel:
             thermal=self.thermal,
             cell=self.cell,
             cut_off_V=cut_off_V,
-            max_duration_s=max_duration_s,
+            max_duration_s=min(max_duration_s, LONGEST_FORECAST_S),
         )
         return float(new.current_A.sum() * self.dt_s / 3600.0) if np.isfinite(new.eod_time_s) else float("nan")
 

@@ -156,9 +156,9 @@ def check_record(time_s: ArrayLike, voltage_V: ArrayLike, current_A: ArrayLike, 
 def check_sample(
     voltage_V: float,
     current_A: float,
-    dt_s: float | None,
+    dt_s: float,
     temperature_C: float | None = None,
-    previous_A: float = np.inf,
+    previous_A: float | None = None,
 ) -> None:
     """
     Refuse one sample of a stream that :func:`check_record` would refuse in a record. A voltage may be missing (NaN), but for
@@ -166,9 +166,11 @@ def check_sample(
 
     :param voltage_V: terminal voltage of one cell, V
     :param current_A: current, positive in discharge, A
-    :param dt_s: time since the previous sample, s; ``None``: this is the first one
+    :param dt_s: time since the previous sample, s; without meaning at the first one
     :param temperature_C: of the cell, degC; ``None``: not measured
-    :param previous_A: current since the previous sample, A: where there was none, the time may be long
+    :param previous_A: current since the previous sample, A: where there was none, the time may be long. ``None``: this is the
+        first sample
+    :raises TypeError: for what is no number
     :raises ValueError: if it cannot be meant
     """
     measured = {"voltage_V": voltage_V, "current_A": current_A}
@@ -176,21 +178,28 @@ def check_sample(
         measured["temperature_C"] = temperature_C
     for name, value in measured.items():
         low, high, _, _ = _PLAUSIBLE[name]
-        if low <= value <= high or (name == "voltage_V" and dt_s is not None and isnan(value)):
+        if _is_within(name, value, low, high) or (name == "voltage_V" and previous_A is not None and isnan(value)):
             continue
         if isfinite(value):
             raise ValueError(_implausible(name, value))
         raise ValueError(f"{name} must be finite, got {value!r}. {_MISSING[name]}")
-    if dt_s is None:
+    if previous_A is None:
         return
     low, high = SAMPLE_INTERVAL_LIMITS_S
     if abs(previous_A) <= REST_CURRENT_A:
         high = REST_LIMIT_S
-    if not low <= dt_s <= high:
+    if not _is_within("dt_s", dt_s, low, high):
         raise ValueError(
             f"dt_s, the time since the previous sample, must lie within {low:g} .. {high:g} s, got {dt_s!r}. Give it in "
             "seconds, not in hours or milliseconds. After a longer gap, start anew with a full cell."
         )
+
+
+def _is_within(name: str, value: float, low: float, high: float) -> bool:
+    try:
+        return low <= value <= high
+    except TypeError as error:
+        raise TypeError(f"{name} must be a number, got {value!r}. {_MISSING.get(name, '')}".strip()) from error
 
 
 def are_plausible(

@@ -127,7 +127,7 @@ class PolicyEstimator(OnlineEstimator):
         if temperature_C is not None:
             raise ValueError("a policy takes no temperature: its model is isothermal. Leave temperature_C out.")
         if not self._readings.time_s:
-            check_sample(voltage_V, current_A, None)
+            check_sample(voltage_V, current_A, dt_s)
             return
         before_A = self._readings.current_A[-1]
         check_sample(voltage_V, current_A, dt_s, previous_A=before_A)

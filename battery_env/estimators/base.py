@@ -14,11 +14,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from battery_env.arrays import FloatArray
 from battery_env.checks import check_whole_number
-from battery_env.electrochemistry import STATE_SIZE, CellParameters, LoadUnit, simulate, state_of_charge, voltage
+from battery_env.electrochemistry import STATE_SIZE, CellParameters, LoadUnit, Trajectory, simulate, state_of_charge, voltage
 from battery_env.estimates import Estimate, EstimateTrace, last_estimate
 from battery_env.estimators.state_files import load_state, save_state
 from battery_env.parameters import PARAMETERS
 from battery_env.records import Record, Stream
+
+#: A full cell takes no more charge than this share of its own.
+SURPLUS_SHARE = 0.01
+# Points between limits keep this far from them, as a share of their distance, so that rounding leaves them within.
+_ROUNDING = 1e-9
 
 
 class Estimator(ABC):
@@ -112,7 +117,8 @@ class OnlineEstimator(Estimator):
             has flowed all the time
         :param temperature_C: of the cell, degC; ``None``: not measured
         :return: the estimate
-        :raises ValueError: for values that cannot be meant; the estimator stays as it was
+        :raises TypeError: for what is no number
+        :raises ValueError: for values that cannot be meant; after either error the estimator is as it was
         """
 
     def check(self, voltage_V: float, current_A: float, dt_s: float, temperature_C: float | None = None) -> None:
@@ -177,21 +183,22 @@ class OnlineEstimator(Estimator):
     ) -> Remaining:
         """
         The time to the cut-off under a load, from the last sample on. Its standard deviation is that of parameters, state and
-        offset. :func:`battery_env.forecast` counts more, and takes random loads; it needs the record.
+        offset: the change of the time over one standard deviation of each to both sides, or to one where the other one leaves
+        what a cell can be. :func:`battery_env.forecast` counts more, and takes random loads; it needs the record.
 
         :param load: as in :func:`battery_env.simulate`: a number, an array of one value a step, or a function of time in s,
-            such as a :class:`battery_env.loads.Load`
+            such as a :class:`battery_env.loads.Load`. Under a negative number, a charge, the cut-off is never reached
         :param cut_off_V: V; ``None``: the ``VEOD`` of the cell
         :param load_unit: ``"current"`` in A or ``"power"`` in W
         :return: time and standard deviation
-        :raises ValueError: for a load that cannot be meant
+        :raises ValueError: for a load that cannot be meant, also for one that varies and charges the cell beyond full
         """
         now = self.now()
         middle = np.concatenate([now.state, now.parameters])
         end_V = now.cell.VEOD if cut_off_V is None else cut_off_V
 
-        def time_s(point: FloatArray) -> float:
-            end_s = simulate(
+        def discharge(point: FloatArray) -> Trajectory:
+            return simulate(
                 load,
                 float(point[STATE_SIZE]),
                 float(point[STATE_SIZE + 1]),
@@ -201,14 +208,30 @@ class OnlineEstimator(Estimator):
                 cell=now.cell,
                 initial=point[:STATE_SIZE],
                 cut_off_V=end_V - float(point[-1]),
-            ).eod_time_s
-            return float("inf") if np.isnan(end_s) else end_s
+            )
 
-        expected_s = time_s(middle)
-        if not (len(now.deviations) and np.isfinite(expected_s)):
-            return Remaining(expected_s, float("nan"))
-        differences_s = [0.5 * (time_s(middle + each) - time_s(middle - each)) for each in now.deviations]
-        return Remaining(expected_s, float(np.linalg.norm(differences_s)))
+        expected = discharge(middle)
+        soc = state_of_charge(expected.state, middle[STATE_SIZE])
+        full = np.flatnonzero(soc > np.append(soc[:1], 1.0).max() + SURPLUS_SHARE)
+        if len(full) and (callable(load) or np.ndim(load)):
+            raise ValueError(
+                f"load charges the cell beyond full, by more than {SURPLUS_SHARE:.0%} of its charge, after "
+                f"{expected.time_s[full[0]]:g} s. Positive loads discharge: check its sign, or begin with the discharge."
+            )
+        if len(full) or np.isnan(expected.eod_time_s):
+            return Remaining(float("inf"), float("nan"))
+        if not len(now.deviations):
+            return Remaining(expected.eod_time_s, float("nan"))
+
+        def change_s(deviation: FloatArray) -> float:
+            shares = np.array([-_room(middle, -deviation), 0.0, _room(middle, deviation)])
+            below_s, above_s = (discharge(middle + share * deviation).eod_time_s for share in shares[::2])
+            ends_s = np.array([below_s, expected.eod_time_s, above_s])
+            reached = np.isfinite(ends_s)
+            (first, last), (first_s, last_s) = shares[reached][[0, -1]], ends_s[reached][[0, -1]]
+            return float((last_s - first_s) / (last - first)) if last > first else float("nan")
+
+        return Remaining(expected.eod_time_s, float(np.linalg.norm([change_s(each) for each in now.deviations])))
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """
@@ -299,14 +322,14 @@ class OnlineBatch:
         :raises ValueError: for a sample that is refused; it says of which cell
         """
         cells = len(self.estimators)
-        columns = [np.broadcast_to(column, cells).tolist() for column in (voltage_V, current_A, dt_s)]
-        columns.append([None] * cells if temperature_C is None else np.broadcast_to(temperature_C, cells).tolist())
-        samples = list(zip(*columns, strict=True))
+        # as objects, so that what is no number turns no other one into a text
+        columns = (np.asarray(column, dtype=object) for column in (voltage_V, current_A, dt_s, temperature_C))
+        samples = list(zip(*(np.broadcast_to(column, cells).tolist() for column in columns), strict=True))
         for n, (estimator, sample) in enumerate(zip(self.estimators, samples, strict=True)):
             try:
                 estimator.check(*sample)
-            except ValueError as error:
-                raise ValueError(f"cell {n}: {error}") from error
+            except (TypeError, ValueError) as error:
+                raise type(error)(f"cell {n}: {error}") from error
         return [estimator.update(*sample) for estimator, sample in zip(self.estimators, samples, strict=True)]
 
     def save(self, path: str | os.PathLike[str]) -> Path:
@@ -350,3 +373,13 @@ def check_bounds(
     """
     given = zip(PARAMETERS.values(), (q_mobile_bounds_C, r_o_bounds_ohm), strict=True)
     return {parameter.name: parameter.check_bounds(f"the bounds of {parameter.name}", bounds) for parameter, bounds in given}
+
+
+def _room(point: FloatArray, deviation: FloatArray) -> float:
+    """The share of a deviation, at most 1, that leaves the parameters of a point within their limits."""
+    room = 1.0
+    for n, parameter in enumerate(PARAMETERS.values(), start=STATE_SIZE):
+        to_limit = parameter.limits[int(deviation[n] > 0.0)] - point[n]
+        if abs(deviation[n]) > abs(to_limit):
+            room = min(room, (1.0 - _ROUNDING) * float(to_limit / deviation[n]))
+    return room

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
@@ -18,7 +19,7 @@ from scipy.optimize import least_squares
 from battery_env.arrays import FloatArray
 from battery_env.cells import Discharge
 from battery_env.checks import check_numbers, check_positive
-from battery_env.electrochemistry import NEW_CELL, CellParameters, check_cell, check_dt
+from battery_env.electrochemistry import NEW_CELL, CellParameters, check_cell, check_dt, initial_state, voltage
 from battery_env.electrochemistry.tangents import BY_Q, BY_R, RATE_CONSTANTS
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.settling import FULL_REST_V
@@ -170,6 +171,23 @@ class CellFit:
             if not isinstance(row.name, str) or not np.isfinite(check_numbers(row.name, row[1:])).all():
                 raise ValueError(f"constants and discharges have names and finite numbers, got {row!r}")
 
+    @property
+    def full_V(self) -> float:
+        """The voltage at which a full cell rests with these constants, V."""
+        return _full_V(self.cell)
+
+    @property
+    def doubt(self) -> str:
+        """Why the discharges that were fitted may not have shown a full cell at rest; empty if nothing speaks against it."""
+        before_V = _full_V(self.start)
+        if self.full_V >= before_V - FULL_REST_V[0]:
+            return ""
+        return (
+            f"A full cell rests at {self.full_V:.2f} V with these constants, at {before_V:.2f} V with those before. If the "
+            "discharges that were fitted did not start full, or lack the rest before the load, the constants are wrong, and "
+            "so is every q_mobile found with them: fit others. If a full cell of this kind rests there, all is well."
+        )
+
     def calibrator(self, **arguments: Any) -> LeastSquares:
         """
         Least squares with these constants and the error to expect of them, for a ``q_mobile`` of up to 1.2 times the largest
@@ -218,6 +236,7 @@ class CellFit:
         lines = [
             f"{len(self.discharges)} discharges, voltage RMSE {1e3 * before_V:.1f} mV before, {1e3 * self.rmse_V:.1f} mV "
             f"after; expect an error of {1e3 * self.mismatch_V:.1f} mV (mismatch_V)",
+            f"a full cell rests at {_full_V(self.start):.2f} V before, at {self.full_V:.2f} V after",
             "",
             f"{'constant':<16}{'before':>12}{'after':>12}{'sd before':>12}{'after':>10}",
         ]
@@ -311,6 +330,9 @@ def fit_cell(
     ones, however many samples there are, or as many as they change their sign. Their variance is found along with the
     constants. The usual formula, for white noise, would state a fraction of these standard deviations.
 
+    *A start that is not full* is taken for that of another kind of cell. A fit whose full cell rests more than 0.04 V below
+    that of ``start`` warns of it, and its ``doubt`` keeps the warning.
+
     *Other cells.* A cell of another capacity starts with electrodes of another size. Another chemistry works as far as the
     equations bend; where they do not, the residuals stay large and the fit is refused.
 
@@ -340,7 +362,13 @@ def fit_cell(
             f"mV off (limit_V: {1e3 * limit_V:.0f} mV). Check units, sign and cut_off_V, that all discharges are of one cell "
             "and start full, and leave out odd ones; or raise limit_V and take the fit for what it is."
         )
+    if fit.doubt:
+        warnings.warn(fit.doubt, stacklevel=2)
     return fit
+
+
+def _full_V(cell: CellParameters) -> float:
+    return float(voltage(initial_state(cell=cell), cell=cell))
 
 
 def _records(discharges: Sequence[Record], cut_off_V: float) -> list[Record]:

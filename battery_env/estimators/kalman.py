@@ -14,7 +14,7 @@ from battery_env.checks import check_gain_sd
 from battery_env.electrochemistry import STATE_SIZE, CellParameters, check_cell, check_dt, initial_state, voltage
 from battery_env.electrochemistry.tangents import PolynomialDerivatives
 from battery_env.estimates import Estimate, EstimateTrace
-from battery_env.estimators.base import ModelNow, OnlineBatch, OnlineEstimator, check_bounds
+from battery_env.estimators.base import SURPLUS_SHARE, ModelNow, OnlineBatch, OnlineEstimator, check_bounds
 from battery_env.estimators.kalman_bank import Bank, Settings, follow
 from battery_env.estimators.monitor import Limits, Monitor, watch
 from battery_env.estimators.rest import (
@@ -35,8 +35,6 @@ _PRIOR_SD_R_OHM = 0.15
 _HOUR_S = 3600.0
 _NOISE_V = 0.005
 ZERO_CELSIUS_K = 273.15
-# A full cell takes no more charge than this share of its own.
-_SURPLUS_SHARE = 0.01
 #: What the filter remembers of a discharge beside its bank: how many samples, how long (s), the charge drawn (C), whether a
 # load was on, how long the cell rested before it (s), both means of its voltage then (V); the state of charge at the first
 # sample, its standard deviation; and the temperature of the surroundings (K).
@@ -241,7 +239,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
         :raises ValueError: as :meth:`update`
         """
         is_first, before_A = not self._numbers[SAMPLES], self._bank.current_A
-        check_sample(voltage_V, current_A, None if is_first else dt_s, temperature_C, np.inf if is_first else before_A)
+        check_sample(voltage_V, current_A, dt_s, temperature_C, None if is_first else before_A)
         self._check_drawn(self._numbers[DRAWN] + (0.0 if is_first else dt_s * before_A))
 
     def update(self, voltage_V: float, current_A: float, dt_s: float, temperature_C: float | None = None) -> Estimate:
@@ -254,6 +252,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
             has flowed all the time
         :param temperature_C: of the cell, degC; ``None``: not measured
         :return: the estimate
+        :raises TypeError: for what is no number
         :raises ValueError: for what cannot be meant (:func:`battery_env.records.check_sample`), and for a current that charges
             a full cell; the filter stays as it was
         """
@@ -343,7 +342,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
     @property
     def least_drawn_C(self) -> float:
         """The charge drawn stays above this: a cell takes no more than it has room for, C."""
-        return -(_SURPLUS_SHARE + (1.0 - float(self._numbers[_SOC]))) * self.cell.q_mobile
+        return -(SURPLUS_SHARE + (1.0 - float(self._numbers[_SOC]))) * self.cell.q_mobile
 
     def _check_drawn(self, charge_C: float) -> None:
         check_drawn_charge(charge_C, self.least_drawn_C)

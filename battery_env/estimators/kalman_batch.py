@@ -10,6 +10,7 @@ from numba import njit
 from numpy.typing import ArrayLike
 
 from battery_env.arrays import FloatArray, IntArray
+from battery_env.checks import check_numbers
 from battery_env.electrochemistry import PackedConstants
 from battery_env.electrochemistry.tangents import PolynomialDerivatives
 from battery_env.estimates import Estimates
@@ -81,6 +82,7 @@ class KalmanBatch(OnlineBatch):
         :param dt_s: likewise
         :param temperature_C: likewise
         :return: one estimate a cell, as a sequence that also has them as arrays
+        :raises TypeError: for what is no number
         :raises ValueError: for a sample that is refused; it says of which cell
         """
         cells, one = len(self.estimators), self.estimators[0]
@@ -91,7 +93,8 @@ class KalmanBatch(OnlineBatch):
                 self._adopt(n)
         if (self._stack.numbers[:, SAMPLES] == 0.0).any():
             return Estimates.of(super().update(voltage_V, current_A, dt_s, temperature_C))
-        volts, amperes, since_s = (np.broadcast_to(np.asarray(each, float), cells) for each in (voltage_V, current_A, dt_s))
+        columns = {"voltage_V": voltage_V, "current_A": current_A, "dt_s": dt_s}
+        volts, amperes, since_s = (np.broadcast_to(check_numbers(name, each), cells) for name, each in columns.items())
         degrees_C = np.full(cells, np.nan)
         if temperature_C is not None:
             degrees_C = np.broadcast_to(np.asarray(temperature_C, dtype=np.float64), cells)

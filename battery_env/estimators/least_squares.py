@@ -32,13 +32,14 @@ from battery_env.estimators.settling import (
     SCALE_UNKNOWN,
     SETTLED_SHARES,
     first_reason,
+    imprecise_text,
     is_plausible,
     sensor_reason,
     start_reason,
     white_noise_V,
 )
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, check_parameters
-from battery_env.record_model import RecordModel
+from battery_env.record_model import LONGEST_FORECAST_S, RecordModel
 from battery_env.records import Record, Samples, check_drawn_charge, check_record, drawn
 
 # Where the search for q_mobile may start: this much above the least value that the record allows. The narrow ones serve whole
@@ -73,7 +74,9 @@ _LEAST_NOISE_V = 1e-4
 _END_SHARE = 0.02
 # With fewer samples than this beyond the number of parameters, the residuals do not tell how large the noise is.
 _SPARE_SAMPLES = 10
-_FEW = "These are too few samples to tell the noise. Record on, or state voltage_noise_V."
+_FEW = "These are too few samples to tell the noise. Record on or more often, or state voltage_noise_V."
+# At so many points of what is still to come it is told how well q_mobile would be known by then.
+_DEPTHS = 500
 
 
 class _Problem(NamedTuple):
@@ -333,7 +336,9 @@ class LeastSquares(Estimator):
             reason = EMPTY
         else:
             reason = (
-                start.reason or self._contradiction(record, problem, fit) or self._shortage(fit, alone, variance_V2, hidden)
+                start.reason
+                or self._contradiction(record, problem, fit)
+                or self._shortage(problem, fit, alone, variance_V2, hidden)
             )
         return Estimate(fit.values["q_mobile"], fit.values["r_o"], sd["q_mobile"], sd["r_o"], not reason, reason)
 
@@ -401,7 +406,8 @@ class LeastSquares(Estimator):
         time_s, voltage_V, current_A = (np.asarray(array) for array in (record.time_s, record.voltage_V, record.current_A))
         n = int(voltage_V.argmin())
         load_A = float(current_A[max(n - 1, 0) : n + 1].max())
-        if n == 0 or load_A <= 0.0:
+        # at rest, with whatever current a sensor shows then, no voltage is reached
+        if n == 0 or load_A * LONGEST_FORECAST_S <= fit.values["q_mobile"]:
             return ""
         until = Samples(time_s, voltage_V, current_A).first(n + 1)
         estimate = Estimate(fit.values["q_mobile"], fit.values["r_o"])
@@ -417,20 +423,67 @@ class LeastSquares(Estimator):
             f"{early_s if early_s > time_s[n] else late_s:.0f} s."
         )
 
-    def _shortage(self, fit: _Fit, alone: _Fit, variance_V2: float, hidden: Mapping[str, float]) -> str:
+    def _shortage(self, problem: _Problem, fit: _Fit, alone: _Fit, variance_V2: float, hidden: Mapping[str, float]) -> str:
         """Why the record alone does not determine the parameters; ``alone``: the fit without the prior."""
         own = self._sd(alone, variance_V2, hidden)
         unknown = [name for name in self.parameters if not own[name] < SETTLED_SHARES[name] * alone.values[name]]
         carried = self.prior_q_mobile_C is not None
+        imprecise = dict(IMPRECISE)
+        if "q_mobile" in unknown:
+            imprecise["q_mobile"] = self._imprecise_q_mobile(problem, alone, variance_V2, own["q_mobile"], hidden)
         return first_reason(
             [
                 (fit.square_V2 - alone.square_V2 > PRIOR_LIMIT_SD**2 * variance_V2, PRIOR_CONTRADICTED.format("q_mobile")),
-                (carried and "q_mobile" in unknown, PRIOR_ALONE.format("q_mobile")),
+                (carried and "q_mobile" in unknown, f"{PRIOR_ALONE.format('q_mobile')} Without it {imprecise['q_mobile']}"),
                 *((hidden[name] >= SETTLED_SHARES[name] * fit.values[name], SCALE_UNKNOWN.format(name)) for name in unknown),
-                *((True, IMPRECISE[name]) for name in unknown),
+                *((True, imprecise[name]) for name in unknown),
                 (self.voltage_noise_V is None and len(fit.residual_V) < len(self.parameters) + _SPARE_SAMPLES, _FEW),
             ]
         )
+
+    def _imprecise_q_mobile(
+        self, problem: _Problem, fit: _Fit, variance_V2: float, sd_C: float, hidden: Mapping[str, float]
+    ) -> str:
+        """What limits ``q_mobile``, and what would help, by the same formula as its standard deviation."""
+        n, q_C, hidden_C = len(problem.time_s), fit.values["q_mobile"], hidden["q_mobile"]
+        if not np.isfinite(sd_C):
+            return IMPRECISE["q_mobile"]
+        noise_V2, target_C2 = variance_V2 - n * self.mismatch_V**2, (SETTLED_SHARES["q_mobile"] * q_C) ** 2 - hidden_C**2
+        enough_V2 = (target_C2 * variance_V2 / (sd_C**2 - hidden_C**2) - noise_V2) / n
+        # the priors of nuisance constants are weighed against the mismatch as well
+        enough_V = nan if self.nuisance or enough_V2 <= 0.0 else sqrt(enough_V2)
+        return imprecise_text(
+            sd_C / q_C,
+            self._depth_V(problem, fit, noise_V2, target_C2),
+            enough_V if self.mismatch_V else None,
+            sqrt(_square(fit.residual_V) / n),
+        )
+
+    def _depth_V(self, problem: _Problem, fit: _Fit, noise_V2: float, target_C2: float) -> float:
+        """
+        The voltage down to which the record has to go on, with the load of its last half again and again, to tell ``q_mobile``
+        with a variance of ``target_C2``, if the cell is the one of the fit; -inf if it is empty before, NaN without a load.
+        """
+        n, seen, q_C, dt_s = len(problem.time_s), len(problem.current_A), fit.values["q_mobile"], self.model.dt_s
+        load_A = problem.current_A[(seen - 1) // 2 : -1]
+        if load_A.mean() * LONGEST_FORECAST_S <= q_C:
+            return nan
+        current_A = np.append(problem.current_A[:-1], np.resize(load_A, int(q_C / (load_A.mean() * dt_s)) + len(load_A)))
+        grid_s = dt_s * np.arange(len(current_A), dtype=np.float64)
+        longer = problem._replace(time_s=grid_s, voltage_V=np.zeros(len(grid_s)), current_A=current_A, on_grid=True)
+        voltage_V, jacobian = (rows[seen:] for rows in self._residual(longer, fit.values, ()))
+        steps = int(np.count_nonzero(~np.isnan(voltage_V)))
+        stride = max(steps // _DEPTHS, 1)
+        blocks = steps // stride
+        in_block = jacobian[: blocks * stride].reshape(blocks, stride, jacobian.shape[1])
+        # samples follow each other as they did
+        share = n / seen
+        information = share * np.cumsum(np.einsum("bsi,bsj->bij", in_block, in_block), axis=0)
+        covariance = np.linalg.inv(fit.jacobian.T @ fit.jacobian + information)
+        variance_V2 = noise_V2 + (n + share * stride * np.arange(1, blocks + 1)) * self.mismatch_V**2
+        k = self.parameters.index("q_mobile")
+        told = np.flatnonzero(variance_V2 * covariance[:, k, k] < target_C2)
+        return float(voltage_V[: (told[0] + 1) * stride].min() - fit.residual_V[-1]) if len(told) else -inf
 
     def _problem(self, record: Record) -> _Problem:
         clock_s, voltage_V, measured_A = check_record(

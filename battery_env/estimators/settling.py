@@ -42,9 +42,12 @@ PRIOR_LIMIT_SD = 2.5
 #: The error of the model may be this much larger than stated before the residuals contradict it.
 MISMATCH_MARGIN = 2.0
 
+#: No Li-ion cell is to be discharged below this, V: it is no use to advise it.
+LEAST_CUT_OFF_V = 2.0
 #: Why a precision does not suffice, and what would help.
 IMPRECISE = {
-    "q_mobile": "q_mobile is not known to 2 % yet: the voltage shows it at the knee of the discharge. Record on.",
+    "q_mobile": "q_mobile is not known to 2 % yet: the voltage shows it at the knee of the discharge, the more the lower the "
+    "record goes. To the same cut-off, a smaller load or constants of the cell itself (fit_cell, --cell) tell more.",
     "r_o": "r_o is not known to 30 %: the error expected of noise and model, divided by the current, is larger. A larger "
     "current, or a smaller mismatch_V if the model is that good, tells more.",
 }
@@ -202,6 +205,33 @@ def white_noise_V(residual_V: FloatArray) -> float:
     :return: V
     """
     return float(np.median(np.abs(np.diff(residual_V))) / (0.6745 * np.sqrt(2.0)))
+
+
+def imprecise_text(share: float, depth_V: float, enough_V: float | None, rmse_V: float) -> str:
+    """
+    Why ``q_mobile`` is not precise enough, and what would make it so.
+
+    :param share: its standard deviation as a share of it
+    :param depth_V: voltage down to which the record would have to go, V; -inf: it would not help; NaN: no load goes on
+    :param enough_V: the ``mismatch_V`` with which this record would tell it, V; NaN: none would; ``None``: it is 0 already
+    :param rmse_V: how far the model is off in this record, V
+    :return: sentences
+    """
+    reached = f", but to {np.ceil(1e4 * share) / 1e2:.3g} %" if share < 1.0 else ""
+    text = f"q_mobile is not known to 2 % yet{reached}: the voltage shows it at the knee of the discharge."
+    if depth_V >= LEAST_CUT_OFF_V:
+        text += f" Under this load the record has to go down to about {np.floor(1e2 * depth_V) / 1e2:.2f} V, if the cell may."
+    elif not np.isnan(depth_V):
+        text += f" Under this load no record down to {LEAST_CUT_OFF_V:g} V would tell it."
+    if enough_V is None:
+        return f"{text} To the same cut-off, a smaller load tells more."
+    text += " To the same cut-off, a smaller load or constants of the cell itself (fit_cell, --cell) tell more"
+    if not max(rmse_V, 1e-3) <= enough_V:
+        return f"{text}."
+    return (
+        f"{text}; so does a mismatch_V of {np.floor(1e3 * enough_V) / 1e3:.3f} V, if the model follows whole discharges of "
+        f"this cell that closely (this record: {rmse_V:.3f} V)."
+    )
 
 
 def first_reason(conditions: Sequence[tuple[bool, str]]) -> str:

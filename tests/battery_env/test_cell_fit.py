@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import warnings
 
 import numpy as np
 import pytest
@@ -116,11 +117,39 @@ class TestSimulated:
     def test_another_chemistry(self):
         # flat at 3.3 V, as with iron phosphate
         flat = with_equilibrium(NEW_CELL, [-0.35, 0.33, -0.05, 0.05])
-        fit = fit_cell([discharged(flat, q, 0.12, pulses(n)) for n, q in enumerate((7400.0, 6000.0))], cut_off_V=2.5)
+        records = [discharged(flat, q, 0.12, pulses(n)) for n, q in enumerate((7400.0, 6000.0))]
+        with pytest.warns(
+            UserWarning, match="at 3.4. V with these constants.* If a full cell of this kind rests there, all is"
+        ):
+            fit = fit_cell(records, cut_off_V=2.5)
         assert fit.rmse_V < 0.003
         assert voltage(initial_state(cell=fit.cell), cell=fit.cell) == pytest.approx(
             voltage(initial_state(cell=flat), cell=flat), abs=0.01
         )
+
+    @pytest.mark.parametrize("soc", [0.9, 0.8])
+    def test_a_start_that_is_not_full_is_doubted(self, soc, tmp_path):
+        current_A = np.append(np.zeros(120), np.full(20_000, 2.0))
+        low = [
+            simulate(current_A, q, 0.15, load_unit="current", thermal=True, initial=initial_state(q, soc=soc), cut_off_V=2.7)
+            for q in (7000.0, 6000.0)
+        ]
+        rest_V = low[0].voltage_V[0]
+        with pytest.warns(UserWarning, match=f"A full cell rests at {rest_V:.2f} V .* at 4.19 V .* did not start full"):
+            fit = fit_cell(low)
+        assert fit.full_V == pytest.approx(rest_V, abs=0.005) and f"at {rest_V:.2f} V after" in fit.summary()
+        assert CellFit.from_json(fit.to_json(tmp_path / "cell.json")).doubt == fit.doubt != ""
+        # who knows such a cell, and says so, is not asked
+        known = NEW_CELL.replace(U0p=NEW_CELL.U0p + rest_V - 4.19)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            assert fit_cell(low, start=known).doubt == ""
+
+    def test_so_is_one_whose_rest_was_cut_off(self):
+        record = load_nasa_discharges("B0006")[84]
+        loaded = Discharge(*(column[3:] for column in (record.time_s, record.voltage_V, record.current_A)))
+        with pytest.warns(UserWarning, match="or lack the rest before the load"):
+            assert fit_cell([loaded]).full_V < 4.1
 
     def test_what_no_constants_can_describe_is_refused(self, simulated):
         record = simulated[0]
@@ -161,6 +190,10 @@ class TestRealCells:
 
     def test_temperature_is_the_measured_one(self, b0005_fit):
         assert 295.0 < b0005_fit.cell.Tb0 < 300.0
+
+    def test_a_full_cell_rests_where_it_did(self, b0005_fit):
+        assert b0005_fit.full_V == pytest.approx(load_nasa_discharges("B0005")[84].voltage_V[0], abs=0.02)
+        assert b0005_fit.doubt == "" and "a full cell rests at 4.19 V before, at 4.20 V after" in b0005_fit.summary()
 
     def test_discharges_have_names(self, b0005_fit):
         assert [discharge.name for discharge in b0005_fit.discharges] == ["B0005:1", "B0005:85", "B0005:168"]

@@ -14,7 +14,7 @@ from battery_env import fleet
 from battery_env.__main__ import calibrate, main
 from battery_env.calibration.policy import PolicyEstimator
 from battery_env.cells import Discharge, load_nasa_discharges
-from battery_env.electrochemistry import NEW_CELL, CellParameters, simulate
+from battery_env.electrochemistry import NEW_CELL, CellParameters, initial_state, simulate
 from battery_env.estimators.cell_fit import fit_cell, read_cell
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.summary import Settings, summarize
@@ -92,6 +92,18 @@ def test_constants_are_fitted_saved_and_used(tmp_path, capsys):
     assert main(["calibrate", "B0006:100", "--cell", str(out), "--json"]) == 0
     row = json.loads(capsys.readouterr().out)
     assert row["voltage_rmse_V"] < 0.02 and 0.7 < row["state_of_health"] < 0.9
+
+
+def test_constants_of_cells_that_did_not_start_full_are_warned_of_whenever_they_are_used(tmp_path, capsys):
+    out, record = tmp_path / "cell.json", tmp_path / "low.csv"
+    low = initial_state(6000.0, soc=0.8)
+    current_A = np.append(np.zeros(120), np.full(20_000, 2.0))
+    write(simulate(current_A, 6000.0, 0.15, load_unit="current", thermal=True, initial=low, cut_off_V=2.6), record)
+    assert main(["fit", str(record), "--out", str(out)]) == 3
+    shown = capsys.readouterr()
+    assert f"warning: {read_cell(out).doubt}" in shown.err.splitlines() and "at 4.00 V after" in shown.out
+    assert main(["calibrate", str(record), "--cell", str(out)]) == 0
+    assert f"warning: {out}: A full cell rests at 4.00 V" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -198,7 +198,7 @@ class TestNoise:
         early, late = fit.estimate(record.part(0, 120)), fit.estimate(record)
         assert early.q_mobile == pytest.approx(6100.0, abs=60.0)
         assert early.sd_q_mobile <= 60.0
-        assert not early.settled and early.reason == "q_mobile rests on its prior: the record alone does not determine it yet."
+        assert not early.settled and early.reason.startswith("q_mobile rests on its prior: the record alone does not")
         assert late.settled and late.reason == ""
         assert abs(late.q_mobile - 6000.0) < 4.0 * late.sd_q_mobile < 10.0
 

@@ -177,6 +177,18 @@ class TestForecast:
         record = simulate(current_A, 6000.0, 0.15, load_unit="current")
         assert np.isnan(RecordModel().forecast(record, Estimate(6000.0, 0.15)).eod_time_s)
 
+    def test_it_is_unknown_under_the_current_that_a_sensor_shows_at_rest(self):
+        record, at = simulate(2.0, 6000.0, 0.15, load_unit="current").part(0, 900), Estimate(6000.0, 0.15)
+        for current_A in (1e-9, 1e-6, 1e-3):  # steps down to the cut-off would not fit in memory, or take minutes
+            forecast = RecordModel().forecast(record, at, future_current_A=current_A)
+            assert np.isnan(forecast.eod_time_s) and len(forecast.time_s) == 900
+            assert np.isnan(RecordModel().capacity_Ah(current_A, "current", 3.0, 6000.0 / current_A))
+
+    def test_it_follows_a_slow_discharge_for_days(self):
+        record, at = simulate(2.0, 6000.0, 0.15, load_unit="current").part(0, 900), Estimate(6000.0, 0.15)
+        eod_time_s = RecordModel(dt_s=2.0).forecast(record, at, future_current_A=0.02).eod_time_s
+        assert eod_time_s == pytest.approx(4200.0 / 0.02, rel=0.1)
+
     def test_predicted_voltage_ends_where_the_cell_is_empty(self):
         record = simulate(8.0, 6000.0, 0.15)
         voltage_V = RecordModel().voltage(record, Estimate(4000.0, 0.15))

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from battery_env import ExtendedKalmanFilter, PolicyEstimator
 from battery_env.cells import Discharge, load_nasa_discharges
-from battery_env.electrochemistry import NEW_CELL, initial_state, rest_shares, simulate, voltage
-from battery_env.estimators.base import OnlineEstimator
+from battery_env.electrochemistry import NEW_CELL, STATE_SIZE, initial_state, rest_shares, simulate, voltage
+from battery_env.estimators.base import ModelNow, OnlineEstimator
 from battery_env.estimators.rest import rest_voltages_V
 from battery_env.records import Stream, are_plausible, check_sample
 
@@ -41,6 +41,14 @@ class Nudge:
 
 def policy_estimator(**more):
     return PolicyEstimator(Nudge(-0.2, 0.1), "BatteryVoltageJoint-v0", **more)
+
+
+class Bare(OnlineEstimator):
+    """An estimator that has no model."""
+
+    def reset(self): ...
+
+    def update(self, voltage_V, current_A, dt_s, temperature_C=None): ...
 
 
 @pytest.fixture(params=[lambda: ExtendedKalmanFilter(thermal=True), policy_estimator], ids=["filter", "policy"])
@@ -116,6 +124,42 @@ class TestSamples:
         filter_.update(4.1, -2.0, 100.0)
         with pytest.raises(ValueError, match="current_A is positive in discharge, but this record draws -"):
             filter_.update(4.19, -2.0, 200.0)
+
+    @pytest.mark.parametrize(
+        ("sample", "message"),
+        [
+            (("x", 2.0, 1.0), "voltage_V must be a number, got 'x'"),
+            ((None, 2.0, 1.0), r"voltage_V must be a number, got None\. A voltage may be missing \(NaN\)"),
+            ((4.1, None, 1.0), "current_A must be a number, got None"),
+            ((4.1, 2.0, None), "dt_s must be a number, got None"),
+            ((4.1, 2.0, "1"), "dt_s must be a number, got '1'"),
+        ],
+    )
+    def test_what_is_no_number_is_refused_and_named(self, make, sample, message):
+        estimator = make()
+        if "dt_s" not in message:  # which the first sample does not need
+            with pytest.raises(TypeError, match=f"^{message}"):
+                estimator.update(*sample)
+        estimator.update(4.19, 2.0, None)
+        with pytest.raises(TypeError, match=f"^{message}"):
+            estimator.update(*sample)
+        batch = make().batch(2)
+        if "dt_s" not in message:
+            with pytest.raises(TypeError, match=f"^cell 1: {message}"):
+                batch.update([4.19, sample[0]], [2.0, sample[1]], 0.0)
+        untouched = make()
+        untouched.update(4.19, 2.0, None)
+        assert estimator.update(4.1, 2.0, 1.0) == untouched.update(4.1, 2.0, 1.0)
+
+    def test_a_temperature_that_is_none_is_refused(self):
+        with pytest.raises(TypeError, match="temperature_C must be a number, got 'warm'"):
+            ExtendedKalmanFilter(thermal=True).update(4.19, 2.0, 0.0, "warm")
+
+    def test_a_batch_names_what_is_no_number(self, make):
+        batch = make().batch(2)
+        batch.update(4.19, 2.0, 0.0)
+        with pytest.raises(TypeError, match="voltage_V must be a number"):
+            batch.update(["x", 4.1], 2.0, 1.0)
 
 
 class TestTemperature:
@@ -230,6 +274,55 @@ class TestModel:
         assert filter_.remaining(8.0, load_unit="power").time_s < left.time_s
         assert filter_.remaining(0.0).time_s == np.inf
 
+    def test_the_time_left_is_told_before_the_load_has_shown_the_resistance(self):
+        for rest_s, load_A in ((0, 2.0), (60, 2.0)):
+            filter_ = ExtendedKalmanFilter(thermal=True, mismatch_V=0.05)
+            record = measured(np.append(np.zeros(rest_s), np.full(60, load_A)), noise_V=0.0)
+            unsure = 0
+            for voltage_V, current_A in zip(record.voltage_V.tolist(), record.current_A.tolist(), strict=True):
+                estimate = filter_.update(voltage_V, current_A, 1.0)
+                unsure += estimate.sd_r_o > estimate.r_o
+                left = filter_.remaining(2.0, cut_off_V=2.7)
+                assert 2000.0 < left.time_s < 5000.0 and 500.0 < left.sd_s < 2000.0
+            assert unsure
+
+    @pytest.mark.parametrize("sd_ohm", [0.02, 0.15, 0.5])
+    def test_a_deviation_beyond_what_a_cell_can_be_counts_as_far_as_it_can(self, sd_ohm):
+        class AtHand(Bare):
+            def now(self):
+                by_r_o = np.zeros((1, STATE_SIZE + 3))
+                by_r_o[0, STATE_SIZE + 1] = sd_ohm
+                return ModelNow(NEW_CELL, True, 1.0, initial_state(6000.0), np.array([6000.0, 0.1, 0.0]), by_r_o)
+
+        ends_ohm = max(0.1 - sd_ohm, 0.0), 0.1 + sd_ohm
+        late_s, early_s = (measured(1.0, r_o=r_o).eod_time_s for r_o in ends_ohm)
+        assert AtHand().remaining(1.0).sd_s == pytest.approx(
+            sd_ohm * (late_s - early_s) / (ends_ohm[1] - ends_ohm[0]), abs=2.0
+        )
+
+    def test_a_side_that_lasts_beyond_a_day_counts_from_the_other_one(self):
+        class AtHand(Bare):
+            def now(self):
+                by_q = np.zeros((1, STATE_SIZE + 3))
+                by_q[0, 4:8], by_q[0, STATE_SIZE] = 1200.0 * rest_shares(1.0), 1200.0
+                return ModelNow(NEW_CELL, True, 1.0, initial_state(6000.0), np.array([6000.0, 0.1, 0.0]), by_q)
+
+        left = AtHand().remaining(0.07)
+        assert left.time_s < 86_400.0 < 1.2 * left.time_s and left.sd_s == pytest.approx(0.2 * left.time_s, rel=0.05)
+
+    def test_a_charge_never_ends_at_the_cut_off(self, whole):
+        filter_ = ExtendedKalmanFilter(thermal=True)
+        follow(filter_, whole.part(0, 600))
+        for left in (filter_.remaining(-2.0), filter_.remaining(-8.0, load_unit="power"), filter_.remaining(-0.01)):
+            assert left.time_s == np.inf and np.isnan(left.sd_s)
+        # as much as was drawn can come back, and more cannot
+        back = filter_.remaining(np.append(np.full(600, -2.0), np.full(9000, 2.0)))
+        assert back.time_s == pytest.approx(filter_.remaining(2.0).time_s + 1200.0, rel=0.01)
+        with pytest.raises(ValueError, match=r"charges the cell beyond full, by more than 1% of its charge, after 6\d\d s"):
+            filter_.remaining(np.append(np.full(900, -2.0), np.full(9000, 2.0)))
+        with pytest.raises(ValueError, match="beyond full"):
+            filter_.remaining(lambda time_s: np.where(time_s < 900.0, -2.0, 2.0))
+
     def test_of_a_policy(self, whole):
         estimator, half = policy_estimator(), len(whole.time_s) // 2
         estimate = follow(estimator, whole.part(0, half))
@@ -237,11 +330,6 @@ class TestModel:
         assert 0.0 < estimator.remaining(2.0).time_s < np.inf and np.isnan(estimator.remaining(2.0).sd_s)
 
     def test_who_has_none_says_so(self):
-        class Bare(OnlineEstimator):
-            def reset(self): ...
-
-            def update(self, voltage_V, current_A, dt_s, temperature_C=None): ...
-
         with pytest.raises(NotImplementedError, match="Bare has no model"):
             Bare().soc  # noqa: B018
         with pytest.raises(NotImplementedError, match="Bare cannot be saved"):
