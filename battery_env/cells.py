@@ -21,7 +21,7 @@ from scipy.io import loadmat
 
 from battery_env.arrays import FloatArray
 from battery_env.checks import check_positive
-from battery_env.records import SWITCH_SHARE, check_column, check_drawn_charge, check_record, drawn
+from battery_env.records import REST_CURRENT_A, SWITCH_SHARE, check_column, check_drawn_charge, check_record, drawn
 
 #: How to cite the bundled data.
 NASA_CITATION = (
@@ -51,6 +51,8 @@ class Discharge:
         ``Tb0`` of its cell, for which the command line takes the first one. Nor does ``PolicyEstimator``, whose model is
         isothermal
     :param meta: what else is known, e.g. ``cell``, ``cycle``, ``capacity_Ah``, ``start_time``, ``source``
+    :param starts_at_rest: whether the first voltage is that of the cell at rest, and the first current that of the load
+        that is switched on then, as in a :meth:`loaded_part`. Calibrators judge by it whether the cell was full
     :raises ValueError: for arrays that do not fit together, or values that cannot be meant; it says what to do
     """
 
@@ -59,6 +61,7 @@ class Discharge:
     current_A: FloatArray
     temperature_C: FloatArray | None = None
     meta: dict[str, Any] = field(default_factory=dict)
+    starts_at_rest: bool = False
 
     def __post_init__(self) -> None:
         arrays = check_record(self.time_s, self.voltage_V, self.current_A, _MIN_SAMPLES)
@@ -136,7 +139,8 @@ class Discharge:
         parts = {name: np.interp(time_s, self.time_s, getattr(self, name)) for name in ("voltage_V", "current_A")}
         parts["voltage_V"][0], parts["current_A"][0] = self.voltage_V[max(first - 1, 0)], self.current_A[first]
         temperature_C = None if self.temperature_C is None else np.interp(time_s, self.time_s, self.temperature_C)
-        return Discharge(time_s, **parts, temperature_C=temperature_C, meta=self.meta)
+        starts_at_rest = self.starts_at_rest if first == 0 else abs(self.current_A[first - 1]) <= REST_CURRENT_A
+        return Discharge(time_s, **parts, temperature_C=temperature_C, meta=self.meta, starts_at_rest=bool(starts_at_rest))
 
     def averaged(self, dt_s: float) -> Discharge:
         """
@@ -163,7 +167,7 @@ class Discharge:
         current_A = np.diff(drawn(self.time_s, self.current_A, edges_s)) / np.diff(edges_s)
         current_A[[0, -1]] = self.current_A[[0, -1]]
         temperature_C = None if self.temperature_C is None else mean(self.temperature_C)
-        return Discharge(time_s, mean(self.voltage_V), current_A, temperature_C, self.meta)
+        return Discharge(time_s, mean(self.voltage_V), current_A, temperature_C, self.meta, self.starts_at_rest)
 
     def until(self, time_s: float) -> Discharge:
         """
@@ -177,7 +181,8 @@ class Discharge:
             raise ValueError(f"time_s must be a time in s, got {time_s!r}")
         n = int(np.searchsorted(self.time_s, time_s, side="right"))
         temperature_C = None if self.temperature_C is None else self.temperature_C[:n]
-        return Discharge(self.time_s[:n], self.voltage_V[:n], self.current_A[:n], temperature_C, self.meta)
+        columns = (self.time_s[:n], self.voltage_V[:n], self.current_A[:n], temperature_C)
+        return Discharge(*columns, self.meta, self.starts_at_rest)
 
 
 def read_discharge_csv(path: str | Path, discharge_is_negative: bool = False) -> Discharge:

@@ -16,7 +16,7 @@ from battery_env.electrochemistry.tangents import PolynomialDerivatives
 from battery_env.estimates import Estimates
 from battery_env.estimators.base import OnlineBatch
 from battery_env.estimators.kalman import DRAWN, SAMPLES, TIME, ZERO_CELSIUS_K, ExtendedKalmanFilter
-from battery_env.estimators.kalman_bank import Bank, Settings, follow
+from battery_env.estimators.kalman_bank import OUT_SIZE, Bank, Settings, follow
 from battery_env.estimators.monitor import Limits, Monitor, watch
 from battery_env.records import are_plausible
 
@@ -109,7 +109,7 @@ class KalmanBatch(OnlineBatch):
                 self.estimators[n].check(*sample, None if temperature_C is None else float(degrees_C[n]))
             except ValueError as error:
                 raise ValueError(f"cell {n}: {error}") from error
-        out, codes = np.empty((cells, 6)), np.empty(cells, dtype=np.int64)
+        out, codes = np.empty((cells, OUT_SIZE)), np.empty(cells, dtype=np.int64)
         packed = one.cell.packed
         _follow_all(
             self._stack.bank,
@@ -177,6 +177,8 @@ def _follow_all(
             banks.log_weight[n],
             banks.shown[n],
             banks.innovation[n],
+            banks.expected_V[n],
+            banks.seen[n],
             banks.memory[n],
         )
         of_cell = PackedConstants(constants[n], packed.polynomial_n, packed.polynomial_p)

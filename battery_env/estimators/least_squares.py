@@ -18,6 +18,7 @@ from battery_env.electrochemistry import CellParameters
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS, TANGENT_NAMES
 from battery_env.estimates import Estimate, EstimateTrace
 from battery_env.estimators.base import Estimator, check_bounds
+from battery_env.estimators.gaps import DRAWN, NOT_DRAWN, UNSURE, Gap, find_gaps
 from battery_env.estimators.rest import InitialSoc, Start, check_initial_soc, told_at_rest
 from battery_env.estimators.settling import (
     AT_BOUND,
@@ -32,8 +33,10 @@ from battery_env.estimators.settling import (
     SCALE_UNKNOWN,
     SETTLED_SHARES,
     first_reason,
+    gap_reason,
     imprecise_text,
     is_plausible,
+    least_resistance_ohm,
     sensor_reason,
     start_reason,
     white_noise_V,
@@ -139,6 +142,8 @@ class LeastSquares(Estimator):
 
     - the record can start with a full cell (:func:`~battery_env.estimators.settling.start_reason`), or with one of
       ``initial_soc``, unless ``initial`` is given;
+    - where it was not logged for a while under load (:mod:`~battery_env.estimators.gaps`), the voltage falls by what was drawn
+      meanwhile. If noise hides that, the charge in doubt is in the standard deviation of ``q_mobile``;
     - each parameter is inside its bounds, ``q_mobile`` is plausible for a cell of this kind, and the model lasts as long as
       the record;
     - the residuals are no larger than noise and twice ``mismatch_V`` explain. They are where the sensor has an offset, or
@@ -236,7 +241,7 @@ class LeastSquares(Estimator):
         :raises ValueError: if the record cannot be used, or the least ``q_mobile`` it allows is outside the bounds
         """
         known, part, start = self._begun(record)
-        return known._estimate(part, start)
+        return known._estimate(part, start, _rested(record))
 
     @property
     def model(self) -> RecordModel:
@@ -308,10 +313,10 @@ class LeastSquares(Estimator):
         stops = np.unique(np.append(samples[samples >= fewest], len(time_s)))
         estimates: list[Estimate] = []
         for stop in stops:
-            estimates.append(known._estimate(whole.first(stop), start, *estimates[-1:]))
+            estimates.append(known._estimate(whole.first(stop), start, _rested(record), *estimates[-1:]))
         return EstimateTrace.of(time_s[stops - 1], estimates)
 
-    def _estimate(self, record: Record, start: Start, previous: Estimate | None = None) -> Estimate:
+    def _estimate(self, record: Record, start: Start, rested: bool, previous: Estimate | None = None) -> Estimate:
         problem = self._problem(record)
         if "q_mobile" in self.parameters:
             starts = self._best_starts(problem, [] if previous is None else [previous.q_mobile])
@@ -330,15 +335,16 @@ class LeastSquares(Estimator):
             (middle,) = self._starts(problem, [mean_C])
             carried = _Prior("q_mobile", mean_C, sqrt(variance_V2) / sd_C)
             fit = self._search(problem, [*starts, alone.values, middle.values], (*priors, carried))
+        gaps = self._gaps(record, problem, fit)
         hidden = self._hidden_sd(problem, fit)
-        sd = self._sd(fit, variance_V2, hidden)
+        sd = self._sd(fit, variance_V2, hidden, gaps)
         if len(problem.time_s) < len(record.time_s):
             reason = EMPTY
         else:
             reason = (
                 start.reason
-                or self._contradiction(record, problem, fit)
-                or self._shortage(problem, fit, alone, variance_V2, hidden)
+                or self._contradiction(record, problem, fit, rested, gaps)
+                or self._shortage(problem, fit, alone, variance_V2, hidden, gaps)
             )
         return Estimate(fit.values["q_mobile"], fit.values["r_o"], sd["q_mobile"], sd["r_o"], not reason, reason)
 
@@ -349,12 +355,20 @@ class LeastSquares(Estimator):
         residual_V, _ = self._residual(problem, dict.fromkeys(self.nuisance, 0.0) | starts[0], ())
         return max(white_noise_V(residual_V), _LEAST_NOISE_V)
 
-    def _sd(self, fit: _Fit, variance_V2: float, hidden: Mapping[str, float]) -> dict[str, float]:
-        """The standard deviations, with those of what does not show in the voltage."""
+    def _sd(self, fit: _Fit, variance_V2: float, hidden: Mapping[str, float], gaps: Sequence[Gap] = ()) -> dict[str, float]:
+        """The standard deviations, with those of what does not show in the voltage, and with charges that nobody saw."""
         sd = dict.fromkeys(PARAMETER_NAMES, nan)
         for name, root in zip(self.parameters, _root_inverse_diagonal(fit.jacobian), strict=False):
             sd[name] = hypot(sqrt(variance_V2) * float(root), hidden[name])
+        sd["q_mobile"] = hypot(sd["q_mobile"], sum(gap.charge_C for gap in gaps if gap.verdict != DRAWN))
         return sd
+
+    def _gaps(self, record: Record, problem: _Problem, fit: _Fit) -> list[Gap]:
+        """Where the record was not written under load, and what its voltage says of that."""
+        model_V = problem.voltage_V + fit.residual_V - fit.values.get("offset_V", 0.0)
+        current_A = np.asarray(record.current_A)[: len(problem.time_s)]
+        clock_s = np.asarray(record.time_s)[: len(problem.time_s)]
+        return find_gaps(clock_s, problem.voltage_V, current_A, model_V, fit.values["q_mobile"])
 
     def _hidden_sd(self, problem: _Problem, fit: _Fit) -> dict[str, float]:
         """
@@ -379,7 +393,7 @@ class LeastSquares(Estimator):
             for n, name in enumerate(self.parameters)
         }
 
-    def _contradiction(self, record: Record, problem: _Problem, fit: _Fit) -> str:
+    def _contradiction(self, record: Record, problem: _Problem, fit: _Fit, rested: bool, gaps: Sequence[Gap]) -> str:
         """What in the record contradicts the fit."""
         cell, n = self.model.cell, len(problem.time_s)
         if self.voltage_noise_V is None:
@@ -389,11 +403,14 @@ class LeastSquares(Estimator):
         limit_V2 = noise_V**2 * (1.0 + excess) + (MISMATCH_MARGIN * self.mismatch_V) ** 2 + _NEGLIGIBLE_V**2
         current_A = np.asarray(record.current_A)
         samples = (problem.time_s, problem.voltage_V, current_A)
-        start = start_reason(*samples, cell, self.initial_soc[0]) if self._at_rest else ""
-        sensors = sensor_reason(*samples)
+        resistance_ohm, start = least_resistance_ohm(fit.values["q_mobile"], fit.values["r_o"]), ""
+        if self._at_rest:
+            start = start_reason(*samples, cell, self.initial_soc[0], resistance_ohm, rested)
+        not_drawn, sensors = gap_reason(gaps, NOT_DRAWN), sensor_reason(*samples, resistance_ohm)
         return first_reason(
             [
                 (bool(start), start),
+                (bool(not_drawn), not_drawn),
                 *((True, AT_BOUND.format(name)) for name in fit.at_bound),
                 ("q_mobile" in self.parameters and not is_plausible(fit.values["q_mobile"], cell), IMPLAUSIBLE),
                 (_square(fit.residual_V) > n * limit_V2, MISFIT),
@@ -423,9 +440,17 @@ class LeastSquares(Estimator):
             f"{early_s if early_s > time_s[n] else late_s:.0f} s."
         )
 
-    def _shortage(self, problem: _Problem, fit: _Fit, alone: _Fit, variance_V2: float, hidden: Mapping[str, float]) -> str:
+    def _shortage(
+        self,
+        problem: _Problem,
+        fit: _Fit,
+        alone: _Fit,
+        variance_V2: float,
+        hidden: Mapping[str, float],
+        gaps: Sequence[Gap],
+    ) -> str:
         """Why the record alone does not determine the parameters; ``alone``: the fit without the prior."""
-        own = self._sd(alone, variance_V2, hidden)
+        own, unsure = self._sd(alone, variance_V2, hidden, gaps), gap_reason(gaps, UNSURE)
         unknown = [name for name in self.parameters if not own[name] < SETTLED_SHARES[name] * alone.values[name]]
         carried = self.prior_q_mobile_C is not None
         imprecise = dict(IMPRECISE)
@@ -434,6 +459,7 @@ class LeastSquares(Estimator):
         return first_reason(
             [
                 (fit.square_V2 - alone.square_V2 > PRIOR_LIMIT_SD**2 * variance_V2, PRIOR_CONTRADICTED.format("q_mobile")),
+                (bool(unsure) and "q_mobile" in unknown, unsure),
                 (carried and "q_mobile" in unknown, f"{PRIOR_ALONE.format('q_mobile')} Without it {imprecise['q_mobile']}"),
                 *((hidden[name] >= SETTLED_SHARES[name] * fit.values[name], SCALE_UNKNOWN.format(name)) for name in unknown),
                 *((True, imprecise[name]) for name in unknown),
@@ -682,6 +708,11 @@ def _check_nuisance(nuisance: Mapping[str, float], parameters: tuple[str, ...]) 
     if "tDiffusion" in nuisance and "q_mobile" not in parameters:
         raise ValueError("tDiffusion can be a nuisance only beside q_mobile: without it the model cell may be empty too early")
     return dict(nuisance)
+
+
+def _rested(record: Record) -> bool:
+    """Whether the first voltage is known to be that of the cell at rest, with the current of the load that was switched on."""
+    return bool(getattr(record, "starts_at_rest", False))
 
 
 def _is_near_best(starts: Sequence[_Start]) -> BoolArray:

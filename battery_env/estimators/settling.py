@@ -9,7 +9,8 @@ from numba import njit
 from numpy.typing import ArrayLike
 
 from battery_env.arrays import BoolArray, FloatArray
-from battery_env.electrochemistry import CellParameters, initial_state, voltage
+from battery_env.electrochemistry import NEW_CELL, CellParameters, initial_state, voltage
+from battery_env.estimators.gaps import NOT_DRAWN, UNSURE, Gap
 from battery_env.records import SWITCH_SHARE
 
 #: An estimate counts as settled when its standard deviation is below this share of its value. That of ``r_o`` is wider: on a
@@ -20,9 +21,11 @@ SETTLED_SHARES = {"q_mobile": 0.02, "r_o": 0.3}
 #: 4.23 V, the model's at 4.19 V; at rest it falls by 11 mV with each percent of the charge, so that a cell that lacks 4 % or
 #: more is noticed.
 FULL_REST_V = (0.04, 0.06)
-#: A cell has at least this resistance, ohm: the bundled ones show 0.105 ohm and more when the load is switched on, and those
-#: of the tasks have 0.1 ohm and more. A first voltage under load is corrected by no more than that.
-LEAST_RESISTANCE_OHM = 0.1
+# A cell has at least this resistance, ohm: the bundled ones show 0.105 ohm and more when the load is switched on, and those of
+# the tasks have 0.1 ohm and more.
+_LEAST_RESISTANCE_OHM = 0.1
+# That is for cells of this q_mobile at most, C. Of the same electrodes, larger ones have a smaller resistance.
+_NEW_Q_C = NEW_CELL.q_mobile
 #: The voltage of a cell that was at rest at the first sample falls by at least half of its ohmic drop within this time, s.
 START_WINDOW_S = 20.0
 
@@ -62,6 +65,14 @@ MISFIT = (
 )
 NOT_FOLLOWED = "The current changes by {:.2f} A at {:.0f} s, and the voltage does not follow."
 RISES = "The voltage rises by {:.2f} V at {:.0f} s, where the current stays as it was."
+NOT_DRAWN_TEXT = (
+    "No sample lies between {:.0f} s and {:.0f} s, and the voltage does not fall by what the {:.0f} C of that time would make "
+    "it: the clock jumped, or the load was off. Mend the times, or give the rest as samples of no current."
+)
+UNSURE_TEXT = (
+    "No sample lies between {:.0f} s and {:.0f} s, and the voltage does not tell whether the load was on: {:.0f} C are "
+    "in doubt."
+)
 PRIOR_CONTRADICTED = "The prior of {} contradicts what the record says."
 START_UNKNOWN = (
     "The record does not start with a minute at rest, whose voltage would tell the charge. Give the rest before the load, or "
@@ -74,42 +85,66 @@ SCALE_UNKNOWN = (
 PRIOR_ALONE = "{} rests on its prior: the record alone does not determine it yet."
 
 
+@njit(cache=True, error_model="numpy")
+def least_resistance_ohm(q_mobile: float, r_o: float) -> float:
+    """
+    The least resistance that a cell shows when its load is switched, compiled. An estimate of it may be too large, as may
+    what is known of other cells, so that the least of all counts.
+
+    :param q_mobile: estimate, C
+    :param r_o: estimate, ohm
+    :return: ohm
+    """
+    return max(min(_LEAST_RESISTANCE_OHM, _LEAST_RESISTANCE_OHM * _NEW_Q_C / q_mobile, r_o), 0.0)
+
+
 def start_reason(
-    time_s: FloatArray, voltage_V: FloatArray, current_A: FloatArray, cell: CellParameters, initial_soc: float = 1.0
+    time_s: FloatArray,
+    voltage_V: FloatArray,
+    current_A: FloatArray,
+    cell: CellParameters,
+    initial_soc: float = 1.0,
+    resistance_ohm: float = _LEAST_RESISTANCE_OHM,
+    rested: bool = False,
 ) -> str:
     """
     Whether a record can start with a full cell, or with one of another charge. At rest its voltage tells. A first sample under
-    load is corrected by the least ohmic drop that a cell can have: a full cell of a larger resistance cannot be told from one
-    that lacks some charge.
+    load is corrected by the least ohmic drop that the cell can have: a full cell of a larger resistance cannot be told from
+    one that lacks some charge.
 
     :param time_s: times of the samples, s, shape (T,), T >= 1; those of the first 20 s suffice
     :param voltage_V: V, shape (T,)
     :param current_A: positive in discharge, A, shape (T,)
     :param cell: constants of the model
     :param initial_soc: state of charge that it is said to start with
+    :param resistance_ohm: the least that the cell can have, ohm
+    :param rested: whether the first voltage is known to be that of the cell at rest, though the first current is that of the
+        load, as in :meth:`battery_env.cells.Discharge.loaded_part`
     :return: why it cannot, or cannot be told to; empty if it can
     """
     rest_V = float(voltage(initial_state(cell=cell, soc=initial_soc), cell=cell))
     soon = time_s <= time_s[0] + START_WINDOW_S
     soon[1:2] = True
-    first_V, first_A = float(voltage_V[0]), float(current_A[0])
-    code = start_code(first_V, first_A, float(current_A[soon].max()), float(voltage_V[soon].min()), rest_V)
+    first_V, first_A = float(voltage_V[0]), 0.0 if rested else float(current_A[0])
+    most_A, least_V = float(current_A[soon].max()), float(voltage_V[soon].min())
+    code = start_code(first_V, first_A, most_A, least_V, rest_V, resistance_ohm)
     return start_text(code, first_V, rest_V, initial_soc)
 
 
 @njit(cache=True, error_model="numpy")
-def start_code(first_V: float, first_A: float, most_A: float, least_V: float, rest_V: float) -> int:
+def start_code(first_V: float, first_A: float, most_A: float, least_V: float, rest_V: float, resistance_ohm: float) -> int:
     """
     Whether the first samples of a record can be those of a cell that rested, compiled.
 
     :param first_V: first voltage, V
-    :param first_A: first current, A
+    :param first_A: first current, 0 where the cell is known to have rested, A
     :param most_A: largest current of the first 20 s, A
     :param least_V: least voltage of the first 20 s, V
     :param rest_V: voltage of the cell at rest, V
+    :param resistance_ohm: the least that the cell can have, ohm
     :return: 0 if they can, 1 if the voltage is too high, 2 if it is too low at rest, and 3 if it is under load
     """
-    drop_V = LEAST_RESISTANCE_OHM * max(first_A, 0.0)
+    drop_V = resistance_ohm * max(first_A, 0.0)
     low_V, high_V = rest_V - FULL_REST_V[0], rest_V + FULL_REST_V[1]
     if first_V > high_V:
         return 1
@@ -146,7 +181,9 @@ def start_text(code: int, first_V: float, rest_V: float, initial_soc: float = 1.
     )[code]
 
 
-def sensor_reason(time_s: FloatArray, voltage_V: FloatArray, current_A: FloatArray) -> str:
+def sensor_reason(
+    time_s: FloatArray, voltage_V: FloatArray, current_A: FloatArray, resistance_ohm: float = _LEAST_RESISTANCE_OHM
+) -> str:
     """
     Whether voltage and current belong to each other. Where the load is switched and stays so, the voltage follows by at least
     half of the least ohmic drop; and it does not rise while the current stays as it was.
@@ -154,6 +191,7 @@ def sensor_reason(time_s: FloatArray, voltage_V: FloatArray, current_A: FloatArr
     :param time_s: times of the samples, s, shape (T,), T >= 2
     :param voltage_V: V, shape (T,)
     :param current_A: positive in discharge, A, shape (T,)
+    :param resistance_ohm: the least that the cell can have, ohm
     :return: where they do not; empty if they do
     """
     last = len(time_s) - 1
@@ -164,7 +202,7 @@ def sensor_reason(time_s: FloatArray, voltage_V: FloatArray, current_A: FloatArr
         np.maximum(np.searchsorted(time_s, time_s + START_WINDOW_S, side="right"), np.arange(last + 1) + 2), last
     )
     for n, following in zip(switches, np.append(switches, last)[1:], strict=True):
-        drop_V = 0.5 * LEAST_RESISTANCE_OHM * switched_A[n - 1]
+        drop_V = 0.5 * resistance_ohm * switched_A[n - 1]
         after_V = voltage_V[n : until[n] + 1]
         if until[n] <= min(following, last - 1) and abs(drop_V) > noise_V:
             followed_V = voltage_V[n - 1] - (after_V.min() if drop_V > 0.0 else after_V.max())
@@ -181,6 +219,18 @@ def sensor_reason(time_s: FloatArray, voltage_V: FloatArray, current_A: FloatArr
     if rise_V[highest] > max(RISE_V, noise_V):
         return RISES.format(rise_V[highest], time_s[highest])
     return ""
+
+
+def gap_reason(gaps: Sequence[Gap], verdict: int) -> str:
+    """
+    What gaps in a record leave open.
+
+    :param gaps: of the record
+    :param verdict: ``NOT_DRAWN`` or ``UNSURE``, see :mod:`~battery_env.estimators.gaps`
+    :return: of the first one with that verdict; empty if there is none
+    """
+    text = {NOT_DRAWN: NOT_DRAWN_TEXT, UNSURE: UNSURE_TEXT}[verdict]
+    return next((text.format(*gap[:3]) for gap in gaps if gap.verdict == verdict), "")
 
 
 def is_plausible(q_mobile: ArrayLike, cell: CellParameters) -> BoolArray:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from battery_env.cells import Discharge, load_nasa_discharges
-from battery_env.electrochemistry import NEW_CELL, simulate
+from battery_env.electrochemistry import NEW_CELL, initial_state, simulate
 from battery_env.estimators import Estimate, ExtendedKalmanFilter, LeastSquares
 from battery_env.estimators.settling import sensor_reason, start_reason, white_noise_V
 from battery_env.records import expected_current
@@ -79,6 +79,32 @@ class TestStart:
             part = discharge.loaded_part(2.7)
             for record in (discharge, part) if n else (discharge, part, cut(part, 1)):
                 assert start_reason(record.time_s, record.voltage_V, record.current_A, NEW_CELL) == ""
+
+    @pytest.mark.parametrize("soc", [0.9, 0.7, 0.5])
+    def test_nor_is_a_large_cell_that_rested_with_less_charge(self, calibrator, soc):
+        rest_and_load_A = np.append(np.zeros(300), np.full(40_000, 5.0))
+        raw = simulated(rest_and_load_A, 18_000.0, 0.03, initial=initial_state(18_000.0, soc=soc))
+        part = raw.loaded_part(2.8)
+        for record in (raw, part, part.averaged(5.0), part.until(part.time_s[-2])):
+            estimate = calibrator().estimate(record)
+            assert not estimate.settled and estimate.reason.startswith("The record starts at rest at ")
+
+    @pytest.mark.parametrize("times", [4.0, 5.0])
+    @pytest.mark.parametrize("share", [0.05, 0.3])
+    def test_nor_is_one_that_starts_late(self, calibrator, times, share):
+        real = load_nasa_discharges("B0006")[100].loaded_part(2.7)
+        late = cut(real, round(share * len(real.time_s)))
+        estimate = calibrator().estimate(replace(late, current_A=times * late.current_A))
+        assert not estimate.settled and estimate.reason.startswith("The record starts ")
+
+    def test_a_loaded_part_knows_whether_the_cell_rested_before_it(self):
+        raw = load_nasa_discharges("B0005")[60]
+        part = raw.loaded_part(2.7)
+        assert not raw.starts_at_rest and part.starts_at_rest
+        assert part.until(1000.0).starts_at_rest and part.averaged(30.0).starts_at_rest
+        assert part.loaded_part(2.8).starts_at_rest and not cut(part, 5).starts_at_rest
+        trickle_A = np.where(raw.current_A < 0.1, 0.1, raw.current_A)
+        assert not replace(raw, current_A=trickle_A).loaded_part(2.7).starts_at_rest
 
     def test_a_voltage_above_that_of_a_full_cell_is_not_one(self):
         assert "above the 4.19 V of a full cell" in start_reason(np.zeros(1), np.array([4.35]), np.zeros(1), NEW_CELL)
@@ -159,6 +185,29 @@ class TestContradictions:
         assert np.isclose(pulses.current_A[pulses.voltage_V.argmin()], rest_A, rtol=0.0, atol=1e-5)
         estimate = LeastSquares(thermal=True, mismatch_V=0.02).estimate(pulses)
         assert estimate.settled and estimate.q_mobile == pytest.approx(6000.0, rel=0.01)
+
+    @pytest.mark.parametrize(("q_mobile", "r_o", "load_A"), [(18_900.0, 0.02, 5.0), (6000.0, 0.04, 2.0)])
+    def test_a_small_resistance_is_no_voltage_that_does_not_follow(self, q_mobile, r_o, load_A):
+        pulses_A = np.where(np.arange(60_000) % 120 < 60, load_A, 0.2 * load_A)
+        record = simulated(pulses_A, q_mobile, r_o)
+        estimate = LeastSquares(thermal=True, mismatch_V=0.01).estimate(record)
+        assert estimate.settled and estimate.q_mobile == pytest.approx(q_mobile, rel=0.01)
+        cell = NEW_CELL.replace(q_mobile=q_mobile, r_o=r_o)
+        estimate = ExtendedKalmanFilter(cell=cell, thermal=True, mismatch_V=0.01).estimate(record)
+        assert estimate.settled and estimate.q_mobile == pytest.approx(q_mobile, rel=0.01)
+
+    @pytest.mark.parametrize("load_A", [5.0, 10.0])
+    def test_nor_is_its_constant_discharge_a_charge(self, load_A):
+        cell = NEW_CELL.replace(q_mobile=18_000.0, r_o=0.03)
+        estimate = ExtendedKalmanFilter(cell=cell, thermal=True, mismatch_V=0.01).estimate(simulated(load_A, 18_900.0, 0.02))
+        assert estimate.settled and estimate.q_mobile == pytest.approx(18_900.0, rel=0.01)
+
+    def test_a_sensor_of_a_cell_of_small_resistance_is_still_watched(self):
+        record = simulated(np.where(np.arange(60_000) % 120 < 60, 5.0, 1.0), 18_900.0, 0.02)
+        stuck_V = np.where(record.time_s < 1800.0, record.voltage_V, record.voltage_V[1800])
+        part = replace(record, voltage_V=stuck_V).until(2400.0)
+        estimate = LeastSquares(thermal=True, mismatch_V=0.01).estimate(part)
+        assert not estimate.settled
 
     def test_a_stuck_current_shows_in_a_voltage_that_rises(self):
         record = simulated(np.where(np.arange(20_000) % 400 < 200, 2.0, 0.2))
@@ -256,6 +305,21 @@ class TestPrecision:
         drift_V = 0.1 * np.sin(np.linspace(0.0, 6.0, 2000))
         residual_V = drift_V + np.random.default_rng(0).normal(0.0, 0.004, 2000)
         assert white_noise_V(residual_V) == pytest.approx(0.004, rel=0.1)
+
+    @pytest.mark.parametrize(("cell", "index"), [("B0005", 80), ("B0006", 85), ("B0006", 160)])
+    def test_the_filter_states_what_the_error_of_its_model_leaves_open(self, cell, index):
+        record = load_nasa_discharges(cell)[index].loaded_part(2.7)
+        filtered, fitted = (CALIBRATORS[name]().estimate(record) for name in ("filter, mismatch", "least squares"))
+        assert abs(filtered.q_mobile - fitted.q_mobile) < 1.5 * filtered.sd_q_mobile
+        assert filtered.settled and 0.005 < filtered.sd_q_mobile / filtered.q_mobile < 0.011
+
+    @pytest.mark.parametrize("factor", [0.8, 1.2])
+    @pytest.mark.parametrize("every", [1, 10])
+    def test_so_does_it_where_a_constant_is_wrong_however_many_samples_there_are(self, factor, every):
+        record = simulated(cell=NEW_CELL.replace(tDiffusion=factor * NEW_CELL.tDiffusion))
+        seen = Discharge(*(column[::every] for column in (record.time_s, record.voltage_V, record.current_A)))
+        estimate = CALIBRATORS["filter, mismatch"]().estimate(seen)
+        assert 0.0 < abs(estimate.q_mobile - 6000.0) < 2.0 * estimate.sd_q_mobile < 0.03 * 6000.0
 
     def test_one_setting_tells_the_filter_of_the_error_of_its_model(self):
         record = simulated()

@@ -1,0 +1,137 @@
+"""Stretches of a load that were not logged: whether the voltage says that their charge was drawn."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from battery_env.arrays import FloatArray
+from battery_env.records import REST_CURRENT_A, SWITCH_SHARE
+
+#: An interval between two samples is a gap where it is this many times longer than those before and after it, and the charge
+#: that it would be without, were it as long as these, is above this share of ``q_mobile``.
+GAP_RATIO, GAP_SHARE = 2.5, 0.005
+#: What the voltage says of a gap: that its charge was drawn, that it was not, or nothing.
+DRAWN, NOT_DRAWN, UNSURE = range(3)
+
+# The voltage beside a gap is looked at over as long as the gap, within these limits (s), and over so many samples at least.
+_WINDOW_S, _SAMPLES = (60.0, 300.0), 5
+# A drift of the model counts up to this share of its fall: a fit to a record whose clock jumped drifts beside the jump.
+_MOST_DRIFT = 0.3
+# Where the charge was drawn, cell and model part across the gap by less than this share of the fall of the model. It is more
+# in the middle of a discharge, where the model knows less of the cell and nothing of what follows.
+MOST_SHARE, MOST_SHARE_SO_FAR = 0.5, 0.7
+# With so many standard deviations to spare it is a verdict.
+_SURE_SD = 1.5
+
+
+class Gap(NamedTuple):
+    """
+    A stretch of a load that was not logged.
+
+    :param start_s: time of the last sample before it, s
+    :param end_s: time of the first sample after it, s
+    :param charge_C: the charge that is in doubt, C
+    :param verdict: ``DRAWN``, ``NOT_DRAWN`` or ``UNSURE``
+    """
+
+    start_s: float
+    end_s: float
+    charge_C: float
+    verdict: int
+
+
+@njit(cache=True, error_model="numpy")
+def doubtful_charge_C(before_s: float, duration_s: float, after_s: float, load_A: float, q_mobile: float) -> float:
+    """
+    The charge of an interval between two samples that is in doubt, compiled.
+
+    :param before_s: length of the interval before it, 0 if there is none, s
+    :param duration_s: its own length, s
+    :param after_s: length of the one after it, 0 if there is none, s
+    :param load_A: largest magnitude of the current beside it, A
+    :param q_mobile: of the cell, C
+    :return: charge, C; 0 if the interval is no gap
+    """
+    usual_s = max(before_s, after_s)
+    charge_C = load_A * (duration_s - usual_s)
+    is_gap = duration_s > GAP_RATIO * usual_s and load_A > REST_CURRENT_A and charge_C > GAP_SHARE * q_mobile
+    return charge_C if is_gap else 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def verdict(missing_V: float, fall_V: float, sd_V: float, most_share: float) -> int:
+    """
+    What the voltage says of a gap, compiled. The model falls across the gap by the charge that its current draws. A cell that
+    was not loaded meanwhile, or whose clock jumped, does not.
+
+    :param missing_V: by how much less the cell fell than the model, V
+    :param fall_V: by how much the model fell, V
+    :param sd_V: standard deviation of ``missing_V``, V; NaN if it is not known
+    :param most_share: share of ``fall_V`` that ``missing_V`` may be where the charge was drawn
+    :return: ``DRAWN``, ``NOT_DRAWN`` or ``UNSURE``
+    """
+    if not fall_V > 0.0:
+        return UNSURE
+    if missing_V + _SURE_SD * sd_V < most_share * fall_V:
+        return DRAWN
+    if missing_V - _SURE_SD * sd_V > most_share * fall_V:
+        return NOT_DRAWN
+    return UNSURE
+
+
+def find_gaps(
+    time_s: FloatArray, voltage_V: FloatArray, current_A: FloatArray, model_V: FloatArray, q_mobile: float
+) -> list[Gap]:
+    """
+    The gaps of a record. The model errs too: what it drifts from the cell beside a gap it may drift within it.
+
+    :param time_s: times of the samples, s, shape (T,), T >= 2
+    :param voltage_V: V, shape (T,)
+    :param current_A: positive in discharge, A, shape (T,)
+    :param model_V: voltage of the model under the current that is taken to flow, V, shape (T,)
+    :param q_mobile: of the model, C
+    :return: these, in their order
+    """
+    step_s, gaps = np.diff(time_s), []
+    beside_s = np.pad(step_s, 1)
+    for n in np.flatnonzero(step_s > GAP_RATIO * np.maximum(beside_s[:-2], beside_s[2:])):
+        load_A = float(np.abs(current_A[n : n + 2]).max())
+        charge_C = doubtful_charge_C(beside_s[n], step_s[n], beside_s[n + 2], load_A, q_mobile)
+        if not charge_C:
+            continue
+        window_s = max(float(np.clip(step_s[n], *_WINDOW_S)), 2.0 * _SAMPLES * max(beside_s[n], beside_s[n + 2]))
+        # the first voltage may be that of the rest before the load
+        first = max(int(np.searchsorted(time_s, time_s[n] - window_s)), 1)
+        last = int(np.searchsorted(time_s, time_s[n + 1] + window_s, side="right"))
+        parted_V = voltage_V - model_V
+        before_V, before_slope, before_sd_V = _edge(time_s[first : n + 1], parted_V[first : n + 1], time_s[n])
+        after_V, after_slope, after_sd_V = _edge(time_s[n + 1 : last], parted_V[n + 1 : last], time_s[n + 1])
+        parted = after_V - before_V
+        fall_V = float(model_V[n] - model_V[n + 1])
+        # by what they drift on both sides alike they may drift in between
+        slope = min(before_slope, after_slope, key=abs) if before_slope * after_slope > 0.0 else 0.0
+        drift_V = slope * step_s[n]
+        allowed_V = min(max(drift_V, 0.0), _MOST_DRIFT * max(fall_V, 0.0))
+        missing_V = parted - float(np.clip(parted, min(drift_V, 0.0), allowed_V))
+        said = verdict(missing_V, fall_V, float(np.hypot(before_sd_V, after_sd_V)), MOST_SHARE)
+        if abs(current_A[n + 1] - current_A[n]) > SWITCH_SHARE * load_A:
+            said = UNSURE  # the load was switched, nobody knows when
+        gaps.append(Gap(float(time_s[n]), float(time_s[n + 1]), float(charge_C), said))
+    return gaps
+
+
+def _edge(time_s: FloatArray, voltage_V: FloatArray, edge_s: float) -> tuple[float, float, float]:
+    """Of a straight line through some samples: value at a time, slope, and standard deviation of the value."""
+    n = len(time_s)
+    if n < _SAMPLES:
+        return 0.0, 0.0, np.nan
+    since_s = time_s - time_s.mean()
+    square_s2 = float(since_s @ since_s)
+    slope = float(since_s @ voltage_V) / square_s2
+    rest_V = voltage_V - voltage_V.mean() - slope * since_s
+    distance_s = edge_s - float(time_s.mean())
+    sd_V = np.sqrt(float(rest_V @ rest_V) / (n - 2) * (1.0 / n + distance_s**2 / square_s2))
+    return float(voltage_V.mean()) + slope * distance_s, slope, float(sd_V)
