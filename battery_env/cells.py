@@ -120,15 +120,18 @@ class Discharge:
         """
         Standard deviation of ``load_on_time_s`` where samples are missing, s; 0 where none are. None are where the gap
         between the last sample at rest and the first one under load is at most twice the interval before or the one after
-        it. Otherwise the load may have been on for any part of the gap.
+        it. Otherwise the load may have been switched on at any time in the gap, and this is the root of the mean square of
+        how far from ``load_on_time_s``.
         """
         first, _ = self._loaded
         intervals_s = np.diff(self.time_s[max(first - 2, 0) : first + 2])
         if not first or first + 1 == len(self.time_s):
             return 0.0
         gap_s = intervals_s[-2]
-        missing = gap_s > 2.0 * max(intervals_s[:-2].max(initial=0.0), intervals_s[-1])
-        return float(gap_s / np.sqrt(12.0)) if missing else 0.0
+        if gap_s <= 2.0 * max(intervals_s[:-2].max(initial=0.0), intervals_s[-1]):
+            return 0.0
+        from_middle_s = self.load_on_time_s - float(self.time_s[first - 1 : first + 1].mean())
+        return float(np.hypot(gap_s / np.sqrt(12.0), from_middle_s))
 
     @cached_property
     def _loaded(self) -> tuple[int, int]:

@@ -84,7 +84,9 @@ def read_discharges(
 
     A file may hold charges and rests as well, and many cycles. A discharge is what lies between two charges, with the rest
     before the load; it is numbered by the cycle that the file gives, or else counted. If there are several, each has its own
-    clock, which starts at its first sample. Rows that are repeated are dropped with a warning.
+    clock, which starts at its first sample. Where the charges are not logged, a discharge ends where the voltage has come down
+    and is that of a full cell after a gap; a warning says so. Rows that are repeated, and lines below the table, are dropped
+    with a warning. A temperature that is missing in some rows is interpolated.
 
     :param path: the file
     :param columns: by quantity (``time``, ``voltage``, ``current``, ``temperature``, ``ambient``, ``cycle``, ``step``,

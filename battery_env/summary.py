@@ -209,7 +209,8 @@ class Summary(NamedTuple):
 
 def summarize(discharge: Discharge, settings: Settings) -> Summary:
     """
-    Calibrate the model to one discharge. Its surroundings, and its temperature at the start, are those measured at load-on; a
+    Calibrate the model to one discharge. Where its start is not known, or the voltage before the load contradicts it, its
+    capacity is not known either. Its surroundings, and its temperature at the start, are those measured at load-on; a
     model that departs far from the temperatures measured later is warned of.
 
     :param discharge: of a cell that starts full, or with the ``initial_soc`` of the settings

@@ -110,7 +110,8 @@ class TestDischarge:
         time_s = np.append(rest_s, 10.0 * np.arange(20))
         current_A = np.repeat([0.0, 2.0], [len(rest_s), 20])
         discharge = Discharge(time_s, np.linspace(4.2, 3.0, len(time_s)), current_A)
-        assert discharge.sd_load_on_time_s == pytest.approx(600.0 / np.sqrt(12.0))
+        possible_s = np.linspace(-600.0, 0.0, 100_001)
+        assert discharge.sd_load_on_time_s == pytest.approx(np.sqrt(((possible_s - -10.0) ** 2).mean()), rel=1e-4)
         with pytest.warns(UserWarning, match="samples are missing from -600 s, at rest, to 0 s, under load.*on from -10 s"):
             part = discharge.loaded_part(2.0)
         assert part.sd_load_on_time_s == 0.0
