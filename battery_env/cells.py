@@ -24,6 +24,7 @@ from battery_env.arrays import FloatArray, IntArray
 from battery_env.checks import check_positive
 from battery_env.parameters import Q_MOBILE
 from battery_env.records import (
+    MILLIAMPERE,
     SWITCH_SHARE,
     check_column,
     check_drawn_charge,
@@ -93,9 +94,8 @@ class Discharge:
         check_drawn_charge(self.charge_C)
         if self.charge_C > Q_MOBILE.limits[1]:
             raise ValueError(
-                f"this record draws {self.charge_C:.3g} C, and no cell that can be meant holds more than "
-                f"{Q_MOBILE.limits[1]:g} C. Give the current of one cell in A, not in mA (command line: --units current=mA), "
-                "and the time in s."
+                f"this record draws {self.charge_C:.3g} C, more than the {Q_MOBILE.limits[1]:g} C that a cell may hold. "
+                f"{MILLIAMPERE}"
             )
 
     @property

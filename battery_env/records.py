@@ -27,6 +27,8 @@ REST_CURRENT_A, REST_LIMIT_S = 0.02, 604_800.0
 LEAST_LOAD_SHARE = 0.01
 
 _MILLIVOLT = "Give the voltage of one cell in V, not in mV (command line: --units voltage=mV), and not that of a pack."
+#: What a current that cannot be meant usually is.
+MILLIAMPERE = "Give the current in A, not in mA (command line: --units current=mA), and that of one cell."
 # What to do about a value that is missing in a stream
 _MISSING = {
     "voltage_V": "A voltage may be missing (NaN), but for the first one, which tells whether the cell is full.",
@@ -41,7 +43,7 @@ _PLAUSIBLE: dict[str, tuple[float, float, str, str]] = {
         -LOAD_LIMITS["current"],
         LOAD_LIMITS["current"],
         "A",
-        "Give the current of one cell, in A, not in mA (command line: --units current=mA).",
+        MILLIAMPERE,
     ),
     "temperature_C": (-60.0, 150.0, "degC", _KELVIN),
 }
