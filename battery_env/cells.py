@@ -48,7 +48,7 @@ _COLUMNS = ("time_s", "voltage_V", "current_A")
 _META_COLUMNS = ("test_id", "start_time", "ambient_temperature_C", "capacity_Ah", "Re_ohm", "Rct_ohm")
 _DURATION_LIMITS_S = (10.0, 1e6)
 # What draws no more than this share of the charge before or after the main load is noise, or an offset.
-_LITTLE_SHARE = 2e-3
+_LITTLE_SHARE = 5e-3
 # No cell changes its voltage by this much from one sample to the next, and back, but for its load, V.
 _JUMP_V = 0.05
 # Where the load varies no more samples than these are left out, with the charge that they alone tell.
@@ -142,9 +142,9 @@ class Discharge:
         most_A = self.current_A.max()
         loaded = np.flatnonzero(self.current_A > SWITCH_SHARE * most_A)
         first, last = int(loaded[0]), int(loaded[-1])
-        drawn_C = drawn(self.time_s, self.current_A, self.time_s)
-        little_C = _LITTLE_SHARE * drawn_C[-1]
-        small = np.flatnonzero(self.current_A > least_load_A(np.maximum(self.current_A, 0.0)))
+        small_A = np.where(self.current_A > least_load_A(np.maximum(self.current_A, 0.0)), self.current_A, 0.0)
+        drawn_C = drawn(self.time_s, small_A, self.time_s)
+        little_C, small = _LITTLE_SHARE * drawn_C[-1], np.flatnonzero(small_A)
         if drawn_C[max(first - 1, 0)] > little_C:
             first = int(small[0])
         if drawn_C[-1] - drawn_C[min(last + 1, len(drawn_C) - 1)] > little_C:

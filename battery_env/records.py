@@ -24,7 +24,7 @@ SAMPLE_INTERVAL_LIMITS_S = (1e-3, 600.0)
 #: A cell whose current is below this rests, A; then the next sample may come after as long as a week, s.
 REST_CURRENT_A, REST_LIMIT_S = 0.02, 604_800.0
 #: As a share of the largest one, a current that may be noise, or an offset of the sensor.
-LEAST_LOAD_SHARE = 0.01
+LEAST_LOAD_SHARE = 0.03
 
 _MILLIVOLT = "Give the voltage of one cell in V, not in mV (command line: --units voltage=mV), and not that of a pack."
 #: What a current that cannot be meant usually is.
@@ -243,8 +243,8 @@ def check_drawn_charge(charge_C: float, least_C: float = 0.0) -> None:
 
 def least_load_A(current_A: FloatArray) -> float:
     """
-    What is more than noise and offset of a sensor: the current of a cell at rest, or a hundredth of the largest one, but no
-    more than makes a switch.
+    What is more than noise and offset of a sensor: the current of a cell at rest, or a share of the largest one, but no more
+    than makes a switch.
 
     :param current_A: shape (T,)
     :return: A

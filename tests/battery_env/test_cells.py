@@ -127,13 +127,14 @@ class TestDischarge:
         after = Discharge(time_s, voltage_V, current_A[::-1])
         assert after.loaded_part(2.0).time_s[-1] == time_s[-11]
 
-    @pytest.mark.parametrize("offset_A", [0.0, 0.01])
-    def test_noise_and_offset_at_rest_are_no_load(self, offset_A):
+    @pytest.mark.parametrize(("offset_A", "noise_A"), [(0.0, 0.03), (0.01, 0.03), (0.05, 0.0), (0.03, 0.01)])
+    def test_noise_and_offset_at_rest_are_no_load(self, offset_A, noise_A):
         random = np.random.default_rng(0)
-        time_s = np.arange(0.0, 3000.0, 10.0)
-        current_A = np.where(time_s < 100.0, 0.0, 2.0) + offset_A + 0.03 * random.standard_normal(300)
-        discharge = Discharge(time_s, np.linspace(4.19, 3.0, 300), current_A)
-        assert discharge.load_on_time_s == 95.0
+        time_s = np.arange(0.0, 9000.0, 10.0)
+        on = (time_s >= 3600.0) & (time_s < 6600.0)
+        current_A = np.where(on, 2.0, 0.0) + offset_A + noise_A * random.standard_normal(900)
+        discharge = Discharge(time_s, np.linspace(4.19, 3.0, 900), current_A)
+        assert discharge.load_on_time_s == 3595.0 and discharge.loaded_part(2.0).time_s[-1] == 6590.0
 
     def test_a_wild_current_does_not_make_all_other_currents_small(self):
         current_A = np.repeat([0.0, 2.0], [10, 290])
