@@ -218,7 +218,7 @@ def _add_results(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--json", action="store_true", help="print one JSON object a discharge and line")
     group.add_argument(
         "--jobs",
-        type=int,
+        type=_jobs,
         default=1,
         metavar="N",
         help="processes; -1: one a core (default: %(default)s)",
@@ -235,6 +235,16 @@ def _assignments(text: str) -> dict[str, str]:
     if any(not (name.strip() and equals and value.strip()) for name, equals, value in pairs):
         raise argparse.ArgumentTypeError(f"expected quantity=NAME,quantity=NAME, got {text!r}")
     return {name.strip(): value.strip() for name, _, value in pairs}
+
+
+def _jobs(text: str) -> int:
+    try:
+        jobs = int(text)
+    except ValueError:
+        jobs = 0
+    if jobs != -1 and jobs < 1:
+        raise argparse.ArgumentTypeError(f"expected a number of processes, 1 or more, or -1 for one a core, got {text!r}")
+    return jobs
 
 
 def _initial_soc(text: str) -> InitialSoc:
@@ -323,6 +333,10 @@ def _settings(options: argparse.Namespace) -> Settings:
     given = {name: value for name, value in given.items() if value is not None}
     if not options.cell:
         return Settings(**given)
+    if not options.cell.is_file():
+        raise FileNotFoundError(
+            f"no file {str(options.cell)!r} for --cell: give what the command fit, or CellParameters.to_json, wrote"
+        )
     cell = read_cell(options.cell)
     if isinstance(cell, CellFit) and cell.doubt:
         print(f"warning: {options.cell}: {cell.doubt}", file=sys.stderr)

@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
+from functools import cached_property
 from importlib.resources import as_file, files
 from numbers import Real
 from pathlib import Path
@@ -19,9 +20,20 @@ import numpy as np
 import pandas as pd
 from scipy.io import loadmat
 
-from battery_env.arrays import FloatArray
+from battery_env.arrays import FloatArray, IntArray
 from battery_env.checks import check_positive
-from battery_env.records import REST_CURRENT_A, SWITCH_SHARE, check_column, check_drawn_charge, check_record, drawn
+from battery_env.parameters import Q_MOBILE
+from battery_env.records import (
+    MILLIAMPERE,
+    REST_CURRENT_A,
+    SWITCH_SHARE,
+    check_column,
+    check_drawn_charge,
+    check_record,
+    drawn,
+    least_load_A,
+    switch_times_s,
+)
 
 #: How to cite the bundled data.
 NASA_CITATION = (
@@ -36,6 +48,12 @@ _COLUMNS = ("time_s", "voltage_V", "current_A")
 # what cycles.csv tells about each discharge beyond the samples themselves
 _META_COLUMNS = ("test_id", "start_time", "ambient_temperature_C", "capacity_Ah", "Re_ohm", "Rct_ohm")
 _DURATION_LIMITS_S = (10.0, 1e6)
+# What draws no more than this share of the charge before or after the main load is noise, or an offset.
+_LITTLE_SHARE = 5e-3
+# No cell changes its voltage by this much from one sample to the next, and back, but for its load, V.
+_JUMP_V = 0.05
+# Where the load varies no more samples than these are left out, with the charge that they alone tell.
+_FEW_SAMPLES = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +96,11 @@ class Discharge:
                 "Give the time in seconds, not in hours or milliseconds (command line: --units time=h)."
             )
         check_drawn_charge(self.charge_C)
+        if self.charge_C > Q_MOBILE.limits[1]:
+            raise ValueError(
+                f"this record draws {self.charge_C:.3g} C, more than the {Q_MOBILE.limits[1]:g} C that a cell may hold. "
+                f"{MILLIAMPERE}"
+            )
 
     @property
     def charge_C(self) -> float:
@@ -87,31 +110,98 @@ class Discharge:
     @property
     def load_on_time_s(self) -> float:
         """
-        When the load was switched on, s: midway between the last sample at rest and the first one under load, as the
-        switch falls between the two.
+        When the load was switched on, s: midway between the last sample at rest and the first one under load, as the switch
+        falls between the two, but at most one interval of the samples under load before these. A rest is often logged more
+        seldom than a load.
         """
-        first, _ = self._loaded_samples()
-        return float(self.time_s[max(first - 1, 0) : first + 1].mean())
+        first, _ = self._loaded
+        if not first:
+            return float(self.time_s[0])
+        return float(switch_times_s(self.time_s, self.current_A, np.array([first - 1]))[0])
 
-    def _loaded_samples(self) -> tuple[int, int]:
-        loaded = np.flatnonzero(self.current_A > SWITCH_SHARE * self.current_A.max())
-        return int(loaded[0]), int(loaded[-1])
+    @property
+    def sd_load_on_time_s(self) -> float:
+        """
+        Standard deviation of ``load_on_time_s`` where samples are missing, s; 0 where none are. None are where the gap
+        between the last sample at rest and the first one under load is at most twice the interval before or the one after
+        it. Otherwise the load may have been switched on at any time in the gap, and this is the root of the mean square of
+        how far from ``load_on_time_s``.
+        """
+        first, _ = self._loaded
+        intervals_s = np.diff(self.time_s[max(first - 2, 0) : first + 2])
+        if not first or first + 1 == len(self.time_s):
+            return 0.0
+        gap_s = intervals_s[-2]
+        if gap_s <= 2.0 * max(intervals_s[:-2].max(initial=0.0), intervals_s[-1]):
+            return 0.0
+        from_middle_s = self.load_on_time_s - float(self.time_s[first - 1 : first + 1].mean())
+        return float(np.hypot(gap_s / np.sqrt(12.0), from_middle_s))
+
+    @cached_property
+    def _loaded(self) -> tuple[int, int]:
+        """
+        The first sample under load and the last one. A load that is small beside a later or earlier one is one where it draws
+        what counts; what else flows before the first switch and after the last one is noise, or an offset.
+        """
+        most_A = self.current_A.max()
+        loaded = np.flatnonzero(self.current_A > SWITCH_SHARE * most_A)
+        first, last = int(loaded[0]), int(loaded[-1])
+        small_A = np.where(self.current_A > least_load_A(np.maximum(self.current_A, 0.0)), self.current_A, 0.0)
+        drawn_C = drawn(self.time_s, small_A, self.time_s)
+        little_C, small = _LITTLE_SHARE * drawn_C[-1], np.flatnonzero(small_A)
+        if drawn_C[max(first - 1, 0)] > little_C:
+            first = int(small[0])
+        if drawn_C[-1] - drawn_C[min(last + 1, len(drawn_C) - 1)] > little_C:
+            last = int(small[-1])
+        return first, last
+
+    def _below(self, cut_off_V: float) -> tuple[int | None, IntArray]:
+        """The first sample of the loaded part that is at the cut-off or below, and those before it that only seem to be."""
+        if not isinstance(cut_off_V, Real) or np.isnan(cut_off_V):
+            raise ValueError(f"cut_off_V must be a voltage in V, got {cut_off_V!r}")
+        first, last = self._loaded
+        below = np.flatnonzero(self.voltage_V[first : last + 1] <= cut_off_V) + first
+        runs = np.split(below, np.flatnonzero(np.diff(below) > 1) + 1) if len(below) else []
+        wild: list[int] = []
+        for run in runs:
+            if run[0] == 0 or run[-1] == last or not self._seems(int(run[0]), int(run[-1]), cut_off_V):
+                return int(run[0]), np.array(wild, dtype=np.int64)
+            wild += run.tolist()
+        return None, np.array(wild, dtype=np.int64)
+
+    def _seems(self, begin: int, end: int, cut_off_V: float) -> bool:
+        """
+        Whether some samples are below the cut-off by a fault of the sensor: the voltage falls to them in one step and comes
+        back in another, to no more than it was, and the load explains neither. An ohmic drop takes no more than all of the
+        voltage at the largest current.
+        """
+        voltage_V, current_A = self.voltage_V, self.current_A
+        most_A = current_A.max()
+        most_ohm = max(float(voltage_V.max()) - cut_off_V, 0.0) / most_A
+        ranges = np.ptp(current_A[begin - 1 : end + 2])
+        if end - begin >= _FEW_SAMPLES and ranges > SWITCH_SHARE * most_A:
+            return False
+
+        def unexplained_V(higher: int, lower: int) -> float:
+            explained_V = most_ohm * max(float(current_A[lower] - current_A[higher]), 0.0)
+            return float(voltage_V[higher] - voltage_V[lower]) - explained_V
+
+        falls, returns = unexplained_V(begin - 1, begin), unexplained_V(end + 1, end)
+        return min(falls, returns) > _JUMP_V and unexplained_V(end + 1, begin - 1) < _JUMP_V
 
     def eod_time_s(self, cut_off_V: float) -> float:
         """
-        When the voltage under load first fell to the cut-off, interpolated between the two samples around it.
+        When the voltage under load first fell to the cut-off, interpolated between the two samples around it. Samples that are
+        lower by a fault of the sensor are left aside: the voltage falls to them in one step and comes back in another, which
+        the load does not explain.
 
         :param cut_off_V: cut-off voltage, V
         :return: the end of discharge on the clock of ``time_s``, s; NaN if the record does not reach it
         """
-        if not isinstance(cut_off_V, Real) or np.isnan(cut_off_V):
-            raise ValueError(f"cut_off_V must be a voltage in V, got {cut_off_V!r}")
-        first, last = self._loaded_samples()
-        below = np.flatnonzero(self.voltage_V[first : last + 1] <= cut_off_V)
-        if not len(below):
+        n, _ = self._below(cut_off_V)
+        if n is None:
             return float("nan")
-        n = int(first + below[0])
-        if n == first:
+        if n == self._loaded[0]:
             return float(self.time_s[n])
         share = (self.voltage_V[n - 1] - cut_off_V) / (self.voltage_V[n - 1] - self.voltage_V[n])
         return float(self.time_s[n - 1] + share * (self.time_s[n] - self.time_s[n - 1]))
@@ -120,27 +210,48 @@ class Discharge:
         """
         The part that a model of the discharge can be compared with: from load-on to the cut-off, or to the last sample
         under load if the cut-off is not reached. Its first sample is the moment of switching, with the voltage at rest
-        and the current under load; its last one, at the cut-off, is interpolated.
+        and the current under load; its last one, at the cut-off, is interpolated. Samples that are below the cut-off before
+        by a fault of the sensor are left out with a warning; another one says where samples are missing at load-on.
 
         :param cut_off_V: cut-off voltage, V
         :return: that part, on the same clock
         :raises ValueError: if it has too few samples
         """
-        first, last = self._loaded_samples()
+        first, last = self._loaded
         start_s, end_s = self.load_on_time_s, self.eod_time_s(cut_off_V)
         if np.isnan(end_s):
             end_s = float(self.time_s[last])
-        time_s = np.concatenate([[start_s], self.time_s[(self.time_s > start_s) & (self.time_s < end_s)], [end_s]])
+        _, wild = self._below(cut_off_V)
+        inside = (self.time_s > start_s) & (self.time_s < end_s)
+        inside[wild] = False
+        time_s = np.concatenate([[start_s], self.time_s[inside], [end_s]])
         if len(time_s) < _MIN_SAMPLES:
             raise ValueError(
                 f"only {len(time_s)} samples lie between load-on at {start_s:g} s and {cut_off_V:g} V or the end of the load; "
                 f"at least {_MIN_SAMPLES} are needed"
             )
+        self._warn(first, wild)
         parts = {name: np.interp(time_s, self.time_s, getattr(self, name)) for name in ("voltage_V", "current_A")}
         parts["voltage_V"][0], parts["current_A"][0] = self.voltage_V[max(first - 1, 0)], self.current_A[first]
         temperature_C = None if self.temperature_C is None else np.interp(time_s, self.time_s, self.temperature_C)
         starts_at_rest = self.starts_at_rest if first == 0 else abs(self.current_A[first - 1]) <= REST_CURRENT_A
         return Discharge(time_s, **parts, temperature_C=temperature_C, meta=self.meta, starts_at_rest=bool(starts_at_rest))
+
+    def _warn(self, first: int, wild: IntArray) -> None:
+        """Of what :meth:`loaded_part` had to assume."""
+        if self.sd_load_on_time_s:
+            before_s, after_s = self.time_s[first - 1 : first + 1]
+            warnings.warn(
+                f"samples are missing from {before_s:g} s, at rest, to {after_s:g} s, under load: the load is taken to be on "
+                f"from {self.load_on_time_s:g} s",
+                stacklevel=3,
+            )
+        if len(wild):
+            warnings.warn(
+                f"the voltage falls to {self.voltage_V[wild[0]]:.2f} V at {self.time_s[wild[0]]:g} s and comes back, and the "
+                f"load explains neither: a fault of the sensor; samples left out: {len(wild)}",
+                stacklevel=3,
+            )
 
     def averaged(self, dt_s: float) -> Discharge:
         """

@@ -13,8 +13,8 @@ from battery_env.arrays import FloatArray, IntArray
 
 LoadUnit = Literal["power", "current"]
 
-#: Largest magnitude of a load, per unit. Beyond it a value is taken for a mistake in the unit (mA for A, kW for W).
-LOAD_LIMITS: dict[str, float] = {"power": 200.0, "current": 60.0}
+#: Largest magnitude of the load of one cell, per unit. Beyond it a value is taken for a mistake in the unit (mA for A).
+LOAD_LIMITS: dict[str, float] = {"power": 5000.0, "current": 1000.0}
 LOAD_UNIT_SYMBOLS: dict[str, str] = {"power": "W", "current": "A"}
 
 

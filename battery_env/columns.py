@@ -104,6 +104,25 @@ def find_columns(
     return found
 
 
+def units_below(columns: Mapping[str, Column], fields: Sequence[str]) -> dict[str, str] | None:
+    """
+    The units in the line below a header, where some testers write them.
+
+    :param columns: as :func:`find_columns` has them
+    :param fields: of the line below
+    :return: by quantity, the units that the names do not tell already; ``None`` if the line is none of units, as time, voltage
+        or current have none there
+    """
+    found = {}
+    for quantity, column in columns.items():
+        unit = fields[column.position].strip("[]() ").lower() if column.position < len(fields) else ""
+        if unit in _UNITS.get(quantity, {}):
+            found[quantity] = unit
+        elif quantity in REQUIRED:
+            return None
+    return {quantity: unit for quantity, unit in found.items() if not _split(columns[quantity].name, quantity)[1]}
+
+
 def count_required(names: Sequence[str], chosen: Mapping[str, str] | None = None) -> int:
     """
     How much a line looks like the header of a record.

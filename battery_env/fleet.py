@@ -231,6 +231,7 @@ def calibrate_all(
     :return: one row a discharge in their order, as they are finished: ``record`` (its name, which no other has), ``source``,
         ``cell``, ``cycle``, what :func:`battery_env.summary.summarize` tells, ``notes`` (warnings), and ``error`` where a file
         or a discharge cannot be used; it is empty otherwise
+    :raises ValueError: for another number of processes
     :raises ImportError: for a cluster without the extra ``cluster``
     :raises OSError: if no scheduler answers there
     :raises RuntimeError: if the workers of the cluster could not be relied on
@@ -239,6 +240,8 @@ def calibrate_all(
         each: _Each = _one_by_one
         if scheduler is not None:
             each = partial(_side_by_side, stack.enter_context(cluster(scheduler, ("battery_env",))), _ON_A_CLUSTER)
+        elif jobs != -1 and jobs < 1:
+            raise ValueError(f"jobs must be at least 1, or -1 for as many as there are cores, got {jobs!r}")
         elif jobs != 1:
             jobs = (os.cpu_count() or 1) if jobs == -1 else jobs
             each = partial(_side_by_side, stack.enter_context(processes(jobs)), 2 * jobs)

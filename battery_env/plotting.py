@@ -26,7 +26,7 @@ from battery_env.estimators.cramer_rao import CramerRaoBound, Sensitivities
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.evaluation import over_seeds
 from battery_env.files import replacing
-from battery_env.parameters import PARAMETER_NAMES, PARAMETERS
+from battery_env.parameters import PARAMETER_NAMES, PARAMETERS, Q_MOBILE, R_O
 from battery_env.record_model import VoltageForecast
 from battery_env.records import Record
 
@@ -198,7 +198,9 @@ def plot_cell_fit(fit: CellFit, discharges: Sequence[Record]) -> Figure:
         lower.axhline(0.0, color="0.6", lw=0.8)
         errors_mV = []
         for name, (cell, style, colour) in cells.items():
-            calibrator = LeastSquares(cell=cell, thermal=fit.thermal)
+            calibrator = LeastSquares(
+                cell=cell, thermal=fit.thermal, q_mobile_bounds_C=Q_MOBILE.limits, r_o_bounds_ohm=R_O.limits
+            )
             model_V = calibrator.model.voltage(record, calibrator.estimate(record))
             error_mV = 1e3 * (model_V - record.voltage_V)
             errors_mV.append(float(np.sqrt(np.nanmean(error_mV**2))))

@@ -6,18 +6,19 @@ discharge.
 from __future__ import annotations
 
 import itertools
+import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
-from battery_env.arrays import BoolArray, FloatArray
+from battery_env.arrays import BoolArray, FloatArray, IntArray
 from battery_env.cells import Discharge, read_nasa_mat
 from battery_env.columns import Column
-from battery_env.records import SWITCH_SHARE
+from battery_env.records import SWITCH_SHARE, drawn, least_load_A
 from battery_env.tables import read_columns
 
 # The voltage falls with the charge drawn: their correlation over the samples under load must be this clear to tell the sign of
@@ -31,8 +32,18 @@ _CHARGED_SHARE = 0.02
 _NOTHING_SHARE = 1e-3
 # What draws less than this share of the largest discharge of its file is a pulse between two charges, and left aside.
 _LEAST_SHARE = 0.01
+# A cell may be empty, and is as good as full, where its voltage is within these shares of its range from the ends; where the
+# range is smaller than this, V, it is neither.
+_EMPTY_SHARE, _FULL_SHARE, _LEAST_RANGE_V = 0.25, 0.1, 0.6
+# No cell is charged in less than this, nor is it discharged in less than this at its largest current, s.
+_LEAST_CHARGE_S, _LEAST_DISCHARGE_S = 600.0, 300.0
+# In an unlogged charge the voltage rises by more than this share of its range.
+_RISE_SHARE = 0.3
+# Over longer gaps than this a temperature that is missing is a guess, s.
+_TEMPERATURE_GAP_S = 600.0
 # Two rows of different steps may have the same time; the second counts as so much later, s.
 _STEP_S = 1e-3
+_THOUSANDS = re.compile(r"^\s*[-+]?\d{1,3}(?:[,.' ]\d{3})+(?:[.,]\d+)?\s*$")
 
 
 class Recording(NamedTuple):
@@ -73,7 +84,9 @@ def read_discharges(
 
     A file may hold charges and rests as well, and many cycles. A discharge is what lies between two charges, with the rest
     before the load; it is numbered by the cycle that the file gives, or else counted. If there are several, each has its own
-    clock, which starts at its first sample. Rows that are repeated are dropped with a warning.
+    clock, which starts at its first sample. Where the charges are not logged, a discharge ends where the voltage has come down
+    and is that of a full cell after a gap; a warning says so. Rows that are repeated, and lines below the table, are dropped
+    with a warning. A temperature that is missing in some rows is interpolated.
 
     :param path: the file
     :param columns: by quantity (``time``, ``voltage``, ``current``, ``temperature``, ``ambient``, ``cycle``, ``step``,
@@ -152,7 +165,7 @@ class _Table:
             if quantity in ("step", "state"):
                 labels[quantity] = pd.factorize(values)
             elif quantity == "time":
-                columns[quantity] = scale.factor * _seconds(values, scale)
+                columns[quantity] = _seconds(values, scale)
             elif quantity in ("temperature", "ambient") and values.isna().all():
                 continue  # a sensor that was not connected
             else:
@@ -249,39 +262,44 @@ class _Table:
         return np.where(np.append(charging, False)[codes], -1.0, 1.0)
 
     def _correlation(self) -> float:
-        """Of the voltage with the charge that has passed, within each cycle, over the samples under load."""
+        """
+        Of the voltage with the charge that has passed, within each cycle, over the samples under load. Where that is not
+        clear, as of discharges whose charges are not logged, within each run of the load, which must all say the same.
+        """
         time_s, voltage_V, current_A = (self.columns[name] for name in ("time", "voltage", "current"))
         step_s = np.diff(time_s)
         charge_C = np.append(0.0, np.cumsum(0.5 * (current_A[1:] + current_A[:-1]) * np.maximum(step_s, 0.0)))
         new = step_s <= 0.0
         if "cycle" in self.columns:
             new |= np.diff(self.columns["cycle"]) != 0.0
-        group = np.append(0, np.cumsum(new))
         loaded = np.abs(current_A) > SWITCH_SHARE * np.abs(current_A).max()
-        group = group[loaded]
-        samples = np.maximum(np.bincount(group), 1)
-        charge_C, voltage_V = (
-            values - (np.bincount(group, values) / samples)[group] for values in (charge_C[loaded], voltage_V[loaded])
-        )
-        norm = float(np.sqrt((charge_C @ charge_C) * (voltage_V @ voltage_V)))
-        return float(charge_C @ voltage_V) / norm if norm > 0.0 else float("nan")
+        whole = _correlations(np.append(0, np.cumsum(new))[loaded], charge_C[loaded], voltage_V[loaded])[1]
+        if abs(whole) > _CLEAR_CORRELATION:
+            return whole
+        direction = np.where(np.abs(current_A) > least_load_A(current_A), np.sign(current_A), 0.0)
+        new |= (np.diff(direction) != 0.0) | (np.abs(np.diff(voltage_V)) > _RISE_SHARE * np.ptp(voltage_V))
+        loaded = direction != 0.0
+        each, together = _correlations(np.append(0, np.cumsum(new))[loaded], charge_C[loaded], voltage_V[loaded])
+        return together if len(each) and (np.sign(each) == np.sign(together)).all() else whole
 
     def _split(self, source: str) -> list[Recording]:
         cycles = self.columns.get("cycle")
         bounds = [0, len(self.columns["time"])]
+        charged = _charged_again(*(self.columns[name] for name in ("time", "voltage", "current")))
         if cycles is not None:
             bounds = [0, *(np.flatnonzero(np.diff(cycles)) + 1).tolist(), bounds[1]]
-        parts = [part for low, high in itertools.pairwise(bounds) for part in self._discharges(low, high)]
+        parts = [part for low, high in itertools.pairwise(bounds) for part in self._discharges(low, high, charged)]
         if not parts:
             raise ValueError("the file holds no discharge: no charge is drawn. Check the sign of the current")
         least_C = _LEAST_SHARE * max(drawn_C for _, drawn_C in parts)
         stretches = [stretch for stretch, drawn_C in parts if drawn_C > least_C]
         return [self._recording(stretch, n, len(stretches), source) for n, stretch in enumerate(stretches, start=1)]
 
-    def _discharges(self, low: int, high: int) -> list[tuple[slice, float]]:
-        """The discharges among some rows, and the charge that each draws, C."""
+    def _discharges(self, low: int, high: int, charged: IntArray) -> list[tuple[slice, float]]:
+        """The discharges among some rows, and the charge that each draws, C; ``charged``: where unlogged ones have ended."""
         time_s, current_A = self.columns["time"][low:high], self.columns["current"][low:high]
-        passed_C = np.append(0.0, np.cumsum(0.5 * (current_A[1:] + current_A[:-1]) * np.diff(time_s)))
+        clock_s = np.append(0.0, np.cumsum(np.maximum(np.diff(time_s), 0.0)))  # which does not go back
+        passed_C = drawn(clock_s, current_A, clock_s)
         charges = _charges(current_A, passed_C)
         found, begin, lowest_C = [], 0, passed_C[0]
         for start, end in charges:
@@ -292,7 +310,8 @@ class _Table:
             lowest_C = min(lowest_C, passed_C[end - 1])
         found.append((begin, high - low))
         parts = []
-        for begin, end in found:
+        ends = charged[(charged > low) & (charged < high)] - low
+        for begin, end in [part for each in found for part in _parted(*each, ends, passed_C, current_A)]:
             peak_A = current_A[begin:end].max()
             if not peak_A > 0.0:
                 continue
@@ -310,7 +329,7 @@ class _Table:
             meta["cycle"] = int(self.columns["cycle"][stretch.start])
         elif count > 1:
             meta["cycle"] = number
-        if "ambient" in self.columns:
+        if "ambient" in self.columns and not np.isnan(self.columns["ambient"][stretch]).all():
             meta["ambient_temperature_C"] = float(np.nanmedian(self.columns["ambient"][stretch]))
         time_s = self.columns["time"][stretch]
         arrays = {
@@ -319,7 +338,9 @@ class _Table:
             "current_A": self.columns["current"][stretch],
         }
         if "temperature" in self.columns:
-            arrays["temperature_C"] = self.columns["temperature"][stretch]
+            temperature_C = _filled(time_s, self.columns["temperature"][stretch])
+            if temperature_C is not None:
+                arrays["temperature_C"] = temperature_C
         return Recording(arrays, meta)
 
 
@@ -331,32 +352,124 @@ def _charges(current_A: FloatArray, passed_C: FloatArray) -> list[tuple[int, int
     return list(zip(starts[counts].tolist(), ends[counts].tolist(), strict=True))
 
 
+def _correlations(group: IntArray, charge_C: FloatArray, voltage_V: FloatArray) -> tuple[FloatArray, float]:
+    """Of both columns, within each group through which as much passes as counts, and over all of them; NaN where none is."""
+    if not len(group):
+        return np.empty(0), float("nan")
+    group = np.unique(group, return_inverse=True)[1]
+    samples = np.bincount(group)
+    charge_C, voltage_V = (values - (np.bincount(group, values) / samples)[group] for values in (charge_C, voltage_V))
+    with np.errstate(over="ignore", invalid="ignore"):  # of columns that are no measurements
+        both, charges, voltages = (
+            np.bincount(group, product) for product in (charge_C * voltage_V, charge_C * charge_C, voltage_V * voltage_V)
+        )
+    norm = float(np.sqrt(charges.sum() * voltages.sum()))
+    counts = (charges > _RETURNED_SHARE**2 * charges.max()) & (voltages > 0.0)
+    each = both[counts] / np.sqrt(charges[counts] * voltages[counts])
+    return each, float(both.sum()) / norm if norm > 0.0 else float("nan")
+
+
+def _charged_again(time_s: FloatArray, voltage_V: FloatArray, current_A: FloatArray) -> IntArray:
+    """
+    Where a cell that may have been empty is as good as full, after a gap in which it may have been charged: each time the
+    first sample.
+    """
+    smooth_V = voltage_V.copy()
+    before_V, after_V = voltage_V[:-2], voltage_V[2:]
+    least_V, most_V = np.minimum(before_V, after_V), np.maximum(before_V, after_V)
+    smooth_V[1:-1] = np.clip(voltage_V[1:-1], least_V, most_V)  # the median of three
+    range_V = float(np.ptp(smooth_V))
+    if range_V < _LEAST_RANGE_V:
+        return np.empty(0, dtype=np.int64)
+    empty = smooth_V <= smooth_V.min() + _EMPTY_SHARE * range_V
+    full = (voltage_V >= smooth_V.max() - _FULL_SHARE * range_V) & (current_A >= -least_load_A(current_A))
+    marked = np.flatnonzero(empty | full)
+    turns = np.flatnonzero(empty[marked[:-1]] & full[marked[1:]])
+    step_s = np.append(0.0, np.diff(time_s))
+    # a clock that goes back is another one
+    gaps = np.cumsum((step_s >= _LEAST_CHARGE_S) | (step_s < 0.0))
+    lowest, begins = marked[turns], marked[turns + 1]
+    return begins[gaps[begins] > gaps[lowest]]
+
+
+def _parted(begin: int, end: int, charged: IntArray, passed_C: FloatArray, current_A: FloatArray) -> list[tuple[int, int]]:
+    """
+    The discharges among some rows between two logged charges, which end where the cell was charged without a row of it. What
+    is short, or draws less than a fifth of the largest one, empties no cell: there a heavy load brought the voltage down.
+    """
+    charged = charged[(charged > begin) & (charged < end)]
+    drawn_C = np.diff(passed_C[[begin, *charged, end - 1]])
+    least_C = max(_RETURNED_SHARE * drawn_C.max(), _LEAST_DISCHARGE_S * current_A[begin:end].max())
+    bounds = [begin]
+    for position in charged.tolist():
+        if passed_C[position] - passed_C[bounds[-1]] > least_C:
+            bounds.append(position)
+    if len(bounds) > 1:
+        warnings.warn(
+            f"the voltage comes back to that of a full cell, and no charge is logged: taken for {len(bounds)} discharges",
+            stacklevel=2,
+        )
+    return list(itertools.pairwise([*bounds, end]))
+
+
+def _filled(time_s: FloatArray, temperature_C: FloatArray) -> FloatArray | None:
+    """The temperature at all samples, where some of them have none; nothing where all have none."""
+    known = ~np.isnan(temperature_C)
+    if known.all():
+        return temperature_C
+    if not known.any():
+        return None
+    gap_s = float(np.diff([time_s[0], *time_s[known], time_s[-1]]).max())
+    if gap_s > _TEMPERATURE_GAP_S:
+        warnings.warn(f"the temperature is missing for up to {gap_s:.0f} s, and interpolated", stacklevel=2)
+    return np.interp(time_s, time_s[known], temperature_C[known])
+
+
 def _numbers(values: pd.Series, column: Column) -> FloatArray:
     if pd.api.types.is_numeric_dtype(values.dtype):
         return values.to_numpy(dtype=np.float64, na_value=np.nan)
     numbers = pd.to_numeric(values, errors="coerce")
     bad = values[numbers.isna() & values.notna()]
     if len(bad):
-        raise ValueError(f"the column {column.name!r} must hold numbers, got {str(bad.iloc[0])!r} in row {bad.index[0] + 1}")
+        text, advice = str(bad.iloc[0]), ""
+        if _THOUSANDS.match(text):
+            advice = ". Write numbers without separators of thousands"
+        raise ValueError(f"the column {column.name!r} must hold numbers, got {text!r} in row {bad.index[0] + 1}{advice}")
     return numbers.to_numpy(dtype=np.float64)
 
 
 def _seconds(values: pd.Series, column: Column) -> FloatArray:
-    """Numbers as they are; a clock, hours:minutes:seconds, in seconds; dates in seconds since the first one."""
+    """Numbers in their unit; a clock, hours:minutes:seconds, in seconds; dates in seconds since the first one."""
     if pd.api.types.is_numeric_dtype(values.dtype):
-        return _numbers(values, column)
+        return column.factor * _numbers(values, column)
     if pd.api.types.is_datetime64_any_dtype(values.dtype):
         return (values - values.iloc[0]).dt.total_seconds().to_numpy(dtype=np.float64)
     if pd.api.types.is_timedelta64_dtype(values.dtype):
         return values.dt.total_seconds().to_numpy(dtype=np.float64)
     if not values.dropna().astype(str).str.contains(":").all():
-        return _numbers(values, column)
+        return column.factor * _numbers(values, column)
     text = values.astype(str).str.strip().str.replace(",", ".")
-    for convert in (pd.to_timedelta, pd.to_datetime):
+    # UTC, as the clocks of a time zone are put forward and back
+    readings: tuple[tuple[Callable[..., Any], dict[str, Any]], ...] = (
+        (pd.to_timedelta, {}),
+        (pd.to_datetime, {"format": "ISO8601", "utc": True}),
+        (pd.to_datetime, {"utc": True}),
+        (pd.to_datetime, {"utc": True, "dayfirst": True}),
+    )
+    found: list[FloatArray] = []
+    for convert, options in readings:
         try:
-            return _seconds(pd.Series(convert(text), index=values.index), column)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # of a day that is no month
+                found.append(_seconds(pd.Series(convert(text, **options), index=values.index), column))
         except ValueError:
             continue
-    raise ValueError(
-        f"the column {column.name!r} must hold times: numbers, hours:minutes:seconds, or dates; got {str(values.iloc[0])!r}"
-    )
+        if "utc" not in options or "format" in options:
+            break
+    if not found:
+        raise ValueError(
+            f"the column {column.name!r} must hold times: numbers, hours:minutes:seconds, or dates; got "
+            f"{str(values.iloc[0])!r}"
+        )
+    # a day taken for a month makes a month of midnight
+    return min(found, key=lambda time_s: float(np.abs(np.nan_to_num(np.diff(time_s))).max(initial=0.0)))

@@ -11,11 +11,11 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from battery_env.arrays import BoolArray, FloatArray
+from battery_env.arrays import BoolArray, FloatArray, IntArray
 from battery_env.checks import LOAD_LIMITS
 
 #: A change of the current between two samples by more than this share of its largest magnitude is a switch of the load,
-#: not a drift; the current is taken to jump midway between the two samples.
+#: not a drift; the current is taken to jump between the two samples (:func:`switch_times_s`).
 SWITCH_SHARE = 0.1
 #: A load whose current spreads by more than this share (from the 5th to the 95th percentile) has varied.
 VARIED_SHARE = 0.05
@@ -23,8 +23,12 @@ VARIED_SHARE = 0.05
 SAMPLE_INTERVAL_LIMITS_S = (1e-3, 600.0)
 #: A cell whose current is below this rests, A; then the next sample may come after as long as a week, s.
 REST_CURRENT_A, REST_LIMIT_S = 0.02, 604_800.0
+#: As a share of the largest one, a current that may be noise, or an offset of the sensor.
+LEAST_LOAD_SHARE = 0.03
 
 _MILLIVOLT = "Give the voltage of one cell in V, not in mV (command line: --units voltage=mV), and not that of a pack."
+#: What a current that cannot be meant usually is.
+MILLIAMPERE = "Give the current in A, not in mA (command line: --units current=mA), and that of one cell."
 # What to do about a value that is missing in a stream
 _MISSING = {
     "voltage_V": "A voltage may be missing (NaN), but for the first one, which tells whether the cell is full.",
@@ -39,7 +43,7 @@ _PLAUSIBLE: dict[str, tuple[float, float, str, str]] = {
         -LOAD_LIMITS["current"],
         LOAD_LIMITS["current"],
         "A",
-        "Give the current in A, not in mA (command line: --units current=mA).",
+        MILLIAMPERE,
     ),
     "temperature_C": (-60.0, 150.0, "degC", _KELVIN),
 }
@@ -246,19 +250,54 @@ def check_drawn_charge(charge_C: float, least_C: float = 0.0) -> None:
         )
 
 
+def least_load_A(current_A: FloatArray) -> float:
+    """
+    What is more than noise and offset of a sensor: the current of a cell at rest, or a share of the largest one, but no more
+    than makes a switch.
+
+    :param current_A: shape (T,)
+    :return: A
+    """
+    most_A = float(np.abs(current_A).max())
+    return min(max(REST_CURRENT_A, LEAST_LOAD_SHARE * most_A), SWITCH_SHARE * most_A)
+
+
+def switch_times_s(time_s: FloatArray, load: FloatArray, before: IntArray) -> FloatArray:
+    """
+    When a load was switched between two samples: midway. A rest is often logged more seldom than a load, so next to a rest
+    the switch is at most one interval of the samples under load away from these.
+
+    :param time_s: times of the samples, s, shape (T,)
+    :param load: current or power at the samples, A or W, shape (T,)
+    :param before: the samples before the switches, shape (n,)
+    :return: s, shape (n,)
+    """
+    middle_s = 0.5 * (time_s[before] + time_s[before + 1])
+    size = np.abs(load)
+    # of the samples at the ends no further interval is known
+    interval_s = np.concatenate([[np.inf], np.diff(time_s), [np.inf]])
+    at_rest = np.minimum(size[before], size[before + 1]) <= SWITCH_SHARE * size.max()
+    nearest_s = np.where(
+        size[before + 1] > size[before],
+        np.maximum(middle_s, time_s[before + 1] - interval_s[before + 2]),
+        np.minimum(middle_s, time_s[before] + interval_s[before]),
+    )
+    return np.where(at_rest, nearest_s, middle_s)
+
+
 def _knots(time_s: FloatArray, load: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The load as a piecewise-linear function of time, whose jumps are two knots at one time."""
     switches = np.flatnonzero(np.abs(np.diff(load)) > SWITCH_SHARE * np.abs(load).max())
-    midpoints = 0.5 * (time_s[switches] + time_s[switches + 1])
     place = np.repeat(switches + 1, 2)
     sides = np.column_stack([load[switches], load[switches + 1]]).ravel()
-    return np.insert(time_s, place, np.repeat(midpoints, 2)), np.insert(load, place, sides)
+    return np.insert(time_s, place, np.repeat(switch_times_s(time_s, load, switches), 2)), np.insert(load, place, sides)
 
 
 def drawn(time_s: FloatArray, load: FloatArray, at_s: ArrayLike) -> FloatArray:
     """
     What was drawn since the first sample: of a current the charge, of a power the energy. The load is linear between samples,
-    except where it was switched: there it jumps midway (see ``SWITCH_SHARE``). Beyond the last sample it keeps its last value.
+    except where it was switched (see ``SWITCH_SHARE``): there it jumps, as :func:`switch_times_s` has it. Beyond the last
+    sample it keeps its last value.
 
     :param time_s: times of the samples, s, shape (T,)
     :param load: current or power at the samples, positive in discharge, A or W, shape (T,)

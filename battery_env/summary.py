@@ -14,16 +14,17 @@ from battery_env.calibration.policy import PolicyEstimator
 from battery_env.calibration.pretrained import policy_of_file, pretrained_policy
 from battery_env.cells import Discharge
 from battery_env.checks import check_positive
-from battery_env.electrochemistry import NEW_CELL, CellParameters
+from battery_env.electrochemistry import NEW_CELL, CellParameters, initial_state, voltage
 from battery_env.electrochemistry.cell import TB
 from battery_env.estimates import Estimate
 from battery_env.estimators.cell_fit import UNFITTED_MISMATCH_V, CellFit
 from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.rest import InitialSoc, Start
+from battery_env.estimators.settling import SETTLED_SHARES, start_reason
 from battery_env.parameters import PARAMETER_NAMES, check_parameters
 from battery_env.record_model import RecordModel, VoltageForecast
-from battery_env.records import ExpectedCurrent, expected_current
+from battery_env.records import ExpectedCurrent, drawn, expected_current
 
 Method = Literal["least-squares", "kalman", "policy"]
 METHODS: tuple[Method, ...] = get_args(Method)
@@ -33,6 +34,12 @@ METHODS: tuple[Method, ...] = get_args(Method)
 _MANY_SAMPLES = 100_000
 _MODEL_STEP_S = 1.0
 _ZERO_CELSIUS_K = 273.15
+# What is drawn after the cut-off is worth a word if it is more than this share of what was drawn before.
+_MORE_SHARE = 0.2
+_MISSING_SAMPLES = (
+    "Samples are missing when the load is switched on: what was drawn then is not known. Give the last ones at rest, or the "
+    "first ones under load."
+)
 _AMBIENT_LIMITS_C = (-60.0, 100.0)
 # The model of a cell in air warms by 2 K at 2 A, where the bundled cells warm by 16 K: that alone moves q_mobile by less than
 # 0.1 %. What is farther off than this is another cell, load or chamber than these.
@@ -202,7 +209,8 @@ class Summary(NamedTuple):
 
 def summarize(discharge: Discharge, settings: Settings) -> Summary:
     """
-    Calibrate the model to one discharge. Its surroundings, and its temperature at the start, are those measured at load-on; a
+    Calibrate the model to one discharge. Where its start is not known, or the voltage before the load contradicts it, its
+    capacity is not known either. Its surroundings, and its temperature at the start, are those measured at load-on; a
     model that departs far from the temperatures measured later is warned of.
 
     :param discharge: of a cell that starts full, or with the ``initial_soc`` of the settings
@@ -213,6 +221,7 @@ def summarize(discharge: Discharge, settings: Settings) -> Summary:
     record = discharge.loaded_part(settings.cut_off_V)
     measured_eod_s = discharge.eod_time_s(settings.cut_off_V)
     drawn_Ah = record.charge_C / 3600.0
+    _warn_of_more(discharge, measured_eod_s)
     samples, averaged_over_s = len(record.time_s), 0.0
     if samples > _MANY_SAMPLES:
         averaged_over_s = max(_MODEL_STEP_S, float(record.time_s[-1] - record.time_s[0]) / _MANY_SAMPLES)
@@ -232,8 +241,10 @@ def summarize(discharge: Discharge, settings: Settings) -> Summary:
     estimate = settings.calibrator(cell, start).estimate(seen)
     if start.reason:
         estimate = replace(estimate, settled=False, reason=start.reason)
-    # what a full cell would have given more, as its end comes at the same charge
-    missing_Ah = (1.0 - start.soc) * estimate.q_mobile / 3600.0
+    estimate = _with_missing_samples(estimate, discharge, record)
+    # what a full cell would have given more, as its end comes at the same charge; not known where the start is not
+    is_known = not start.reason and not _starts_lower(discharge, cell, start.soc)
+    missing_Ah = (1.0 - start.soc) * estimate.q_mobile / 3600.0 if is_known else float("nan")
     model = RecordModel(cell, settings.thermal and not is_policy, initial_soc=start.soc)
     future = expected_current(record.time_s, record.current_A)
     if settings.future_current_A is not None:
@@ -258,7 +269,7 @@ def summarize(discharge: Discharge, settings: Settings) -> Summary:
         "averaged_over_s": averaged_over_s,
         "load_on_time_s": float(record.time_s[0]),
         "drawn_Ah": drawn_Ah,
-        "capacity_Ah": float("nan") if in_progress or start.soc < 1.0 else drawn_Ah,
+        "capacity_Ah": float("nan") if in_progress or start.soc < 1.0 or not is_known else drawn_Ah,
         "predicted_capacity_Ah": whole_Ah,
         "nominal_Ah": nominal_Ah,
         "state_of_health": whole_Ah / nominal_Ah,
@@ -273,6 +284,38 @@ def summarize(discharge: Discharge, settings: Settings) -> Summary:
         **_end_temperatures(record, estimate, model),
     }
     return Summary(row, record, forecast)
+
+
+def _warn_of_more(discharge: Discharge, eod_time_s: float) -> None:
+    if np.isnan(eod_time_s):
+        return
+    until_C = float(drawn(discharge.time_s, discharge.current_A, eod_time_s))
+    more_C = discharge.charge_C - until_C
+    if more_C > _MORE_SHARE * until_C:
+        warnings.warn(
+            f"{more_C / 3600.0:.3f} Ah more are drawn after the cut-off at {eod_time_s:.0f} s, and left aside. If that is "
+            "another discharge, give each alone, or number them in a column of the cycle",
+            stacklevel=3,
+        )
+
+
+def _with_missing_samples(estimate: Estimate, discharge: Discharge, record: Discharge) -> Estimate:
+    """What may have been drawn while samples are missing at load-on is not known of ``q_mobile`` either."""
+    share = discharge.sd_load_on_time_s * float(record.current_A[0]) / record.charge_C
+    if not share or np.isnan(estimate.sd_q_mobile):
+        return estimate
+    estimate = replace(estimate, sd_q_mobile=float(np.hypot(estimate.sd_q_mobile, share * estimate.q_mobile)))
+    if estimate.settled and estimate.sd_q_mobile >= SETTLED_SHARES["q_mobile"] * estimate.q_mobile:
+        return replace(estimate, settled=False, reason=_MISSING_SAMPLES)
+    return estimate
+
+
+def _starts_lower(discharge: Discharge, cell: CellParameters, soc: float) -> bool:
+    """Whether the voltage before the load, or the first one under it, is below that of a cell with this charge."""
+    begin = int(np.searchsorted(discharge.time_s, discharge.load_on_time_s, side="right")) - 1
+    time_s, voltage_V, current_A = (column[begin:] for column in (discharge.time_s, discharge.voltage_V, discharge.current_A))
+    rest_V = float(voltage(initial_state(cell=cell, soc=soc), cell=cell))
+    return bool(voltage_V[0] < rest_V and start_reason(time_s, voltage_V, current_A, cell, soc))
 
 
 def _nominal_Ah(model: RecordModel, settings: Settings, load_A: float) -> float:
@@ -336,9 +379,11 @@ def text_of(name: str, row: dict[str, Any], settings: Settings) -> str:
         "q_mobile": (f"{row['q_mobile_C']:.0f} C", f"sd {row['sd_q_mobile_C']:.0f} C"),
         "r_o": (f"{row['r_o_ohm']:.4f} ohm", f"sd {row['sd_r_o_ohm']:.4f} ohm"),
     }
-    drawn = "so far" if in_progress else f"the capacity to {cut_off}"
-    if row["initial_soc"] < 1.0 and not in_progress:
-        drawn = f"to {cut_off}; from full it would have been {row['predicted_capacity_Ah']:.3f} Ah"
+    what = "so far" if in_progress else f"the capacity to {cut_off}"
+    if not in_progress and np.isnan(row["predicted_capacity_Ah"]):
+        what = f"to {cut_off}; not the capacity, as the charge at the start is not known"
+    elif row["initial_soc"] < 1.0 and not in_progress:
+        what = f"to {cut_off}; from full it would have been {row['predicted_capacity_Ah']:.3f} Ah"
     lines = [
         f"{name}: {row['samples']} samples{averaged} from load-on at {row['load_on_time_s']:.1f} s, "
         f"{3600.0 * row['drawn_Ah']:.0f} C drawn",
@@ -349,7 +394,7 @@ def text_of(name: str, row: dict[str, Any], settings: Settings) -> str:
             for key, (value, sd) in values.items()
         ),
         f"  {'settled':<22}{'yes' if row['settled'] else 'no':>12}",
-        f"  {'drawn':<22}{row['drawn_Ah']:>9.3f} Ah   {drawn}",
+        f"  {'drawn':<22}{row['drawn_Ah']:>9.3f} Ah   {what}",
     ]
     if row["initial_soc"] < 1.0 or row["sd_initial_soc"]:
         charge = f"{100.0 * row['initial_soc']:>10.1f} %   sd {100.0 * row['sd_initial_soc']:.1f} %"
@@ -360,6 +405,8 @@ def text_of(name: str, row: dict[str, Any], settings: Settings) -> str:
         if settings.nominal_Ah is None:
             of += ", what the given cell yields at this load"
         lines.append(f"  {'state of health':<22}{row['state_of_health']:>12.3f}   {of}")
+    elif not np.isnan(row["nominal_Ah"]):
+        lines.append(f"  {'state of health':<22}{'not known':>12}   as the capacity is not")
     lines.append(f"  {'voltage RMSE':<22}{1e3 * row['voltage_rmse_V']:>9.1f} mV")
     if not np.isnan(row["end_temperature_C"]):
         ends = f"from {row['ambient_C']:.1f} degC; the model ends at {row['model_end_temperature_C']:.1f} degC"

@@ -8,14 +8,16 @@ import gzip
 import io
 import lzma
 import re
+import warnings
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
+import numpy as np
 import pandas as pd
 
-from battery_env.columns import Column, count_required, find_columns
+from battery_env.columns import Column, count_required, find_columns, units_below
 
 #: Endings of the names of files that can be read, besides those of NASA (.mat); of text also packed (.gz, .bz2, .xz, .zip).
 TEXT_SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".mpt", ".bdf")
@@ -30,6 +32,10 @@ _DELIMITERS = (",", ";", "\t", _BLANKS)
 _DECIMAL_COMMA = re.compile(r"^\s*[-+]?\d+,\d+(?:[eE][-+]?\d+)?\s*$")
 _NUMBER = re.compile(r"^\s*[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?(?:[;\s]|$)")
 _DECIMAL_POINT = re.compile(r"^\s*[-+]?\d*\.\d+(?:[eE][-+]?\d+)?\s*$")
+# What Excel reads in the first line of a file: the delimiter.
+_DELIMITER_LINE = re.compile(r"^\s*sep=([,;\t|])\s*$", flags=re.IGNORECASE)
+# So many lines below a table may be no part of it.
+_FOOT_LINES = 50
 _EXPORT = {
     ".xls": "save the sheet as CSV",
     ".xlsx": "save the sheet as CSV",
@@ -45,6 +51,7 @@ class _Layout(NamedTuple):
     delimiter: str
     decimal: str
     names: list[str]
+    below: list[str]  # fields of the line below the header
 
 
 def read_columns(
@@ -83,26 +90,49 @@ def _read_text(
     path: Path, chosen: Mapping[str, str] | None, units: Mapping[str, str] | None
 ) -> tuple[pd.DataFrame, dict[str, Column]]:
     layout = _layout(_head(path), chosen)
-    columns = find_columns(layout.names, chosen, units)
+    columns, header_lines = find_columns(layout.names, chosen, units), layout.header_line + 1
+    below = units_below(columns, layout.below)
+    if below is not None:
+        columns, header_lines = find_columns(layout.names, chosen, {**below, **(units or {})}), header_lines + 1
     # one column may serve as two quantities
     positions = sorted({column.position for column in columns.values()})
-    try:
-        table = pd.read_csv(
-            path,
-            sep=layout.delimiter,
-            decimal=layout.decimal,
-            encoding=layout.encoding,
-            header=None,
-            skiprows=layout.header_line + 1,
-            usecols=positions,
-            index_col=False,
-            low_memory=False,
+
+    def read(rows: int | None = None) -> pd.DataFrame:
+        try:
+            return pd.read_csv(
+                path,
+                sep=layout.delimiter,
+                decimal=layout.decimal,
+                encoding=layout.encoding,
+                header=None,
+                skiprows=header_lines,
+                nrows=rows,
+                usecols=positions,
+                index_col=False,
+                low_memory=False,
+            )
+        except pd.errors.EmptyDataError as error:
+            raise ValueError("there are no rows below the header") from error
+        except Exception as error:  # pandas and the unpackers raise whatever the damage leads them to
+            raise ValueError(f"the file is damaged, or no table: {str(error).strip()}") from error
+
+    table = read()
+    foot = _foot_lines(table[[columns[quantity].position for quantity in ("voltage", "current")]], layout.decimal)
+    text = table[columns["time"].position].tail(foot).dropna().astype(str).str.strip()
+    if len(text):
+        warnings.warn(
+            f"lines below the table, which hold neither voltage nor current, are left out: {text.iloc[0]!r}", stacklevel=2
         )
-    except pd.errors.EmptyDataError as error:
-        raise ValueError("there are no rows below the header") from error
-    except Exception as error:  # pandas and the unpackers raise whatever the damage leads them to
-        raise ValueError(f"the file is damaged, or no table: {str(error).strip()}") from error
+        # once more, as text below a column makes text of it
+        table = read(len(table) - foot)
     return pd.DataFrame({quantity: table[column.position] for quantity, column in columns.items()}), columns
+
+
+def _foot_lines(measured: pd.DataFrame, decimal: str) -> int:
+    """How many of the last rows hold neither voltage nor current."""
+    tail = measured.tail(_FOOT_LINES).apply(lambda column: column.astype(str).str.strip().str.replace(decimal, "."))
+    nothing = tail.apply(pd.to_numeric, errors="coerce").isna().all(axis=1).to_numpy()
+    return int(np.argmin(nothing[::-1])) if len(nothing) else 0
 
 
 def _head(path: Path) -> bytes:
@@ -133,9 +163,12 @@ def _open(path: Path) -> IO[bytes]:
 def _layout(head: bytes, chosen: Mapping[str, str] | None) -> _Layout:
     encoding, text = _decoded(head)
     lines = io.StringIO(text, newline=None).read().split("\n")[:_HEAD_LINES]
-    best, found = (0, ","), -1
+    delimiters: tuple[str, ...] = _DELIMITERS
+    if stated := _DELIMITER_LINE.match(lines[0]):
+        lines[0], delimiters = "", (stated[1],)
+    best, found = (0, delimiters[0]), -1
     for number, line in enumerate(lines):
-        for delimiter in _DELIMITERS:
+        for delimiter in delimiters:
             if (count := count_required(_fields(line, delimiter), chosen)) > found:
                 best, found = (number, delimiter), count
     number, delimiter = best
@@ -145,14 +178,15 @@ def _layout(head: bytes, chosen: Mapping[str, str] | None) -> _Layout:
             raise ValueError("the file is empty")
         if any(map(_NUMBER.match, lines[number].split(","))):
             raise ValueError("there is no line with the names of the columns above the numbers. Add one")
-        delimiter = max(_DELIMITERS, key=lambda each: len(_fields(lines[number], each)))
+        delimiter = max(delimiters, key=lambda each: len(_fields(lines[number], each)))
     values = [field for line in lines[number + 1 :] for field in _fields(line, delimiter)]
     comma = (
         delimiter not in (",", _BLANKS)
         and any(map(_DECIMAL_COMMA.match, values))
         and not any(map(_DECIMAL_POINT.match, values))
     )
-    return _Layout(encoding, number, delimiter, "," if comma else ".", _fields(lines[number], delimiter))
+    below = _fields(lines[number + 1], delimiter) if number + 1 < len(lines) else []
+    return _Layout(encoding, number, delimiter, "," if comma else ".", _fields(lines[number], delimiter), below)
 
 
 def _decoded(head: bytes) -> tuple[str, str]:

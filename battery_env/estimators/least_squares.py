@@ -591,7 +591,8 @@ class LeastSquares(Estimator):
         if "q_mobile" in self.parameters and not bounds["q_mobile"][0] < bounds["q_mobile"][1]:
             raise ValueError(
                 "this record takes a q_mobile of at least {:g} C, which is beyond the upper bound, {:g} C. Raise "
-                "q_mobile_bounds_C, or check that time is in s and current in A.".format(*bounds["q_mobile"])
+                "q_mobile_bounds_C (command line: --cell, with a fit of such a cell), or check that time is in s and current "
+                "in A.".format(*bounds["q_mobile"])
             )
         return min((self._fit(problem, start, bounds, priors) for start in starts), key=lambda fit: fit.square_V2)
 

@@ -57,7 +57,8 @@ class TestDischarge:
             ({"time_s": np.arange(7) / 3600.0}, "seconds, not in hours"),
             ({"time_s": np.arange(7) * 1e6}, "milliseconds"),
             ({"voltage_V": np.full(7, 3900.0)}, "voltage_V must lie within 0 .. 5.5 V, got 3900 at sample 0.*not in mV"),
-            ({"current_A": np.full(7, 2000.0)}, "current_A must lie within -60 .. 60 A, got 2000.*not in mA"),
+            ({"current_A": np.full(7, 2000.0)}, "current_A must lie within -1000 .. 1000 A, got 2000.*not in mA"),
+            ({"time_s": 1e4 * np.arange(7), "current_A": np.full(7, 500.0)}, "draws 3e.07 C.*not in mA"),
             ({"temperature_C": np.full(7, 297.0)}, "got 297.*not in kelvin"),
             ({"current_A": np.full(7, -2.0)}, "draws -120 C.*flip the sign.*discharge_is_negative"),
         ],
@@ -77,11 +78,110 @@ class TestDischarge:
     def test_a_record_that_starts_under_load_is_on_from_its_first_sample(self):
         assert Discharge(**recorded(current_A=np.full(7, 2.0))).load_on_time_s == 0.0
 
+    @pytest.mark.parametrize(("rest_every_s", "gap_s"), [(600.0, 600.0), (600.0, 20.0), (120.0, 200.0)])
+    def test_a_rest_that_is_seldom_logged_does_not_switch_the_load_on_before_its_samples(self, rest_every_s, gap_s):
+        rest_s = rest_every_s * np.arange(4)
+        loaded_s = rest_s[-1] + gap_s + 10.0 * np.arange(60)
+        current_A = np.repeat([0.0, 2.0], [4, 60])
+        voltage_V = np.append(np.full(4, 4.19), np.linspace(3.9, 2.6, 60))
+        discharge = Discharge(np.append(rest_s, loaded_s), voltage_V, current_A)
+        assert discharge.load_on_time_s == loaded_s[0] - 10.0
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            part = discharge.loaded_part(2.0)
+        assert part.charge_C == pytest.approx(2.0 * 600.0)
+        assert discharge.sd_load_on_time_s == 0.0
+        # likewise where a rest follows
+        turned = drawn(-discharge.time_s[::-1], current_A[::-1], -discharge.time_s[0])
+        assert turned == pytest.approx(discharge.charge_C)
+
+    @settings(max_examples=40)
+    @given(st.floats(0.5, 1000.0), st.floats(1.0, 2.0), st.integers(0, 3))
+    def test_of_samples_at_about_the_same_pace_the_switch_is_midway(self, step_s, ratio, place):
+        intervals_s = np.full(8, step_s)
+        intervals_s[place] *= ratio
+        time_s = 20.0 * np.append(0.0, np.cumsum(intervals_s))
+        discharge = Discharge(time_s, np.linspace(4.2, 3.0, 9), np.repeat([0.0, 2.0], [2, 7]))
+        assert discharge.load_on_time_s == pytest.approx(time_s[1:3].mean(), rel=1e-12)
+        assert discharge.sd_load_on_time_s == 0.0
+
+    @pytest.mark.parametrize("rest_s", [[-600.0], [-620.0, -600.0]])
+    def test_samples_that_are_missing_at_load_on_are_told(self, rest_s):
+        time_s = np.append(rest_s, 10.0 * np.arange(20))
+        current_A = np.repeat([0.0, 2.0], [len(rest_s), 20])
+        discharge = Discharge(time_s, np.linspace(4.2, 3.0, len(time_s)), current_A)
+        possible_s = np.linspace(-600.0, 0.0, 100_001)
+        assert discharge.sd_load_on_time_s == pytest.approx(np.sqrt(((possible_s - -10.0) ** 2).mean()), rel=1e-4)
+        with pytest.warns(UserWarning, match="samples are missing from -600 s, at rest, to 0 s, under load.*on from -10 s"):
+            part = discharge.loaded_part(2.0)
+        assert part.sd_load_on_time_s == 0.0
+
+    def test_a_small_load_before_a_larger_one_belongs_to_the_discharge(self):
+        time_s = 10.0 * np.arange(400)
+        current_A = np.where(time_s < 100.0, 0.004, np.where(time_s < 2000.0, 0.15, 2.0))
+        voltage_V = np.linspace(4.19, 3.0, 400)
+        discharge = Discharge(time_s, voltage_V, current_A)
+        assert discharge.load_on_time_s == 95.0
+        assert discharge.loaded_part(2.0).charge_C == pytest.approx(0.15 * 1900.0 + 2.0 * 1995.0, rel=1e-3)
+        # and after it
+        after = Discharge(time_s, voltage_V, current_A[::-1])
+        assert after.loaded_part(2.0).time_s[-1] == time_s[-11]
+
+    @pytest.mark.parametrize(("offset_A", "noise_A"), [(0.0, 0.03), (0.01, 0.03), (0.05, 0.0), (0.03, 0.01)])
+    def test_noise_and_offset_at_rest_are_no_load(self, offset_A, noise_A):
+        random = np.random.default_rng(0)
+        time_s = np.arange(0.0, 9000.0, 10.0)
+        on = (time_s >= 3600.0) & (time_s < 6600.0)
+        current_A = np.where(on, 2.0, 0.0) + offset_A + noise_A * random.standard_normal(900)
+        discharge = Discharge(time_s, np.linspace(4.19, 3.0, 900), current_A)
+        assert discharge.load_on_time_s == 3595.0 and discharge.loaded_part(2.0).time_s[-1] == 6590.0
+
+    def test_a_wild_current_does_not_make_all_other_currents_small(self):
+        current_A = np.repeat([0.0, 2.0], [10, 290])
+        current_A[150] = 50.0
+        discharge = Discharge(10.0 * np.arange(300), np.linspace(4.19, 2.6, 300), current_A)
+        assert discharge.load_on_time_s == 95.0 and discharge.eod_time_s(2.7) > 2500.0
+
     def test_end_of_discharge_is_interpolated(self):
         discharge = Discharge(**recorded())
         assert discharge.eod_time_s(2.7) == pytest.approx(47.5)
         assert discharge.eod_time_s(3.0) == 40.0
         assert np.isnan(discharge.eod_time_s(2.5))
+
+    @settings(max_examples=60)
+    @given(
+        position=st.integers(12, 280),
+        wild_V=st.floats(0.0, 2.69),
+        count=st.integers(1, 3),
+        period=st.sampled_from([1000, 20, 7]),
+    )
+    def test_a_wild_voltage_does_not_end_a_discharge(self, position, wild_V, count, period):
+        time_s = 10.0 * np.arange(300)
+        current_A = np.where(np.arange(300) < 10, 0.0, np.where(np.arange(300) % period < 5, 1.5, 2.0))
+        voltage_V = np.where(np.arange(300) < 10, 4.19, np.linspace(4.2, 2.6, 300) - 0.1 * current_A)
+        clean = Discharge(time_s, voltage_V, current_A)
+        wild = slice(position, position + count)
+        assume(voltage_V[position + count] > 2.75)
+        # a step that the load may explain is left to those who look at all of the voltage
+        assume(wild_V < 2.0 or np.ptp(current_A[position - 1 : position + count + 1]) == 0.0)
+        voltage_V = voltage_V.copy()
+        voltage_V[wild] = wild_V
+        discharge = Discharge(time_s, voltage_V, current_A)
+        assert discharge.eod_time_s(2.7) == clean.eod_time_s(2.7)
+        with pytest.warns(UserWarning, match=rf"the voltage falls to .* and comes back.*samples left out: {count}$"):
+            part = discharge.loaded_part(2.7)
+        np.testing.assert_array_equal(part.time_s, np.delete(clean.loaded_part(2.7).time_s, np.r_[wild] - 9))
+        assert part.charge_C == pytest.approx(clean.loaded_part(2.7).charge_C, abs=10.0)
+
+    def test_the_end_under_a_heavy_load_is_an_end_though_the_voltage_comes_back(self):
+        time_s = 10.0 * np.arange(40)
+        current_A = np.where(np.arange(40) < 2, 0.0, np.where(np.arange(40) % 10 == 9, 6.0, 1.0))
+        voltage_V = np.linspace(4.2, 3.2, 40) - 0.12 * current_A
+        discharge = Discharge(time_s, voltage_V, current_A)
+        assert discharge.eod_time_s(2.8) == pytest.approx(288.0, abs=10.0)
+        # and so is one after which the cell was charged, or rested
+        spliced = np.append(np.linspace(3.9, 2.65, 20), np.linspace(3.9, 2.65, 20))
+        assert Discharge(time_s, spliced, np.full(40, 2.0)).eod_time_s(2.7) == pytest.approx(182.4, abs=0.1)
 
     def test_loaded_part_runs_from_the_switch_to_the_cut_off(self):
         part = Discharge(**recorded(), meta={"cell": "X"}).loaded_part(2.7)
@@ -156,8 +256,20 @@ class TestResampling:
         n_steps = int(np.ceil(time_s[-1] / dt_s)) + 1
         drawn_C = float(drawn(time_s, current_A, n_steps * dt_s))
         assert dt_s * resample_current(time_s, current_A, dt_s, n_steps).sum() == pytest.approx(drawn_C, abs=1e-9)
-        # a jump at the midpoint and a ramp carry the same charge between two samples
+
+    @settings(max_examples=60)
+    @given(gaps=st.lists(st.floats(10.0, 20.0), min_size=4, max_size=40), seed=st.integers(0, 1000))
+    def test_a_jump_at_the_midpoint_and_a_ramp_carry_the_same_charge(self, gaps, seed):
+        time_s = np.concatenate([[0.0], np.cumsum(gaps)])
+        current_A = np.random.default_rng(seed).choice([0.0, 0.05, 1.9, 2.0, 2.1], size=len(time_s))
         assert drawn(time_s, current_A, time_s[-1]) == pytest.approx(trapezoid(current_A, time_s), abs=1e-9)
+
+    def test_pulses_between_rests_that_are_seldom_logged_draw_what_their_own_samples_say(self):
+        time_s = np.concatenate([[n * 1000.0, *(n * 1000.0 + 600.0 + 10.0 * np.arange(6))] for n in range(5)])
+        current_A = np.tile([0.0, *[2.0] * 6], 5)
+        charge_C = float(drawn(time_s, current_A, time_s[-1]))
+        # at most one interval more at either end of a pulse
+        assert 5 * 2.0 * 50.0 <= charge_C <= 5 * 2.0 * 70.0
 
 
 class TestBundledCells:

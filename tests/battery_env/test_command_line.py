@@ -77,7 +77,9 @@ def test_a_file_of_constants_takes_the_place_of_the_new_cell(recorded, tmp_path,
     )
     cell.write_text("{}")
     assert "cell.json holds no battery_env.CellParameters" in fails([path, "--cell", str(cell)], capsys)
-    assert "missing.json" in fails([path, "--cell", str(tmp_path / "missing.json")], capsys)
+    assert f"no file '{tmp_path / 'missing.json'}' for --cell" in fails(
+        [path, "--cell", str(tmp_path / "missing.json")], capsys
+    )
 
 
 def test_constants_are_fitted_saved_and_used(tmp_path, capsys):
@@ -217,6 +219,106 @@ def test_the_sign_of_the_current_is_told_and_may_be_stated(recorded, tmp_path, c
 )
 def test_bad_input_is_one_line_and_no_traceback(arguments, message, capsys):
     assert message in fails(arguments, capsys)
+
+
+@pytest.mark.parametrize("jobs", ["0", "-2", "many"])
+def test_a_number_of_processes_that_cannot_be_is_refused(jobs, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(["calibrate", "B0005:1", f"--jobs={jobs}"])
+    assert stopped.value.code == 2
+    assert f"--jobs: expected a number of processes, 1 or more, or -1 for one a core, got '{jobs}'" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="jobs must be at least 1, or -1"):
+        next(fleet.calibrate_all([], fleet.Reading(), Settings(), jobs=0))
+
+
+def test_a_wild_voltage_changes_nothing_but_for_a_note(recorded, tmp_path, capsys):
+    columns = (recorded.time_s, recorded.voltage_V.copy(), recorded.current_A)
+    columns[1][100] = 0.0
+    rows = []
+    for record in (recorded, Discharge(*columns)):
+        assert main(["calibrate", write(record, tmp_path / "cell.csv"), "--nominal", "2", "--json"]) == 0
+        rows.append(json.loads(capsys.readouterr().out))
+    clean, wild = rows
+    for name in ("capacity_Ah", "state_of_health", "q_mobile_C", "measured_eod_time_s"):
+        assert wild[name] == pytest.approx(clean[name], rel=1e-3)
+    assert not clean["notes"] and "falls to 0.00 V at" in wild["notes"]
+
+
+@pytest.mark.parametrize("method", ["least-squares", "kalman"])
+def test_no_capacity_is_stated_where_the_cell_did_not_start_full(method, tmp_path, capsys):
+    load_A = np.append(np.zeros(120), np.full(3000, 2.0))
+    start = initial_state(6000.0, soc=0.7)
+    low = simulate(load_A, 6000.0, 0.15, load_unit="current", thermal=True, initial=start, cut_off_V=2.65)
+    rest = Discharge(low.time_s, low.voltage_V, low.current_A)
+    loaded = Discharge(low.time_s[400:], low.voltage_V[400:], low.current_A[400:])
+    for record, more, word in (
+        (rest, [], "starts at rest at 3.94 V"),
+        (loaded, [], "starts under load at"),
+        (rest, ["--initial-soc", "0.9"], "starts at rest at 3.94 V"),
+        (loaded, ["--initial-soc", "rest"], "does not start with a minute at rest"),
+    ):
+        path = write(record, tmp_path / "cell.csv")
+        arguments = ["calibrate", path, "--nominal", "2", "--method", method, *more]
+        assert main([*arguments, "--json"]) == 3
+        row = json.loads(capsys.readouterr().out)
+        assert row["drawn_Ah"] > 0.9 and word in row["reason"]
+        assert row["capacity_Ah"] is row["predicted_capacity_Ah"] is row["state_of_health"] is None
+        assert main(arguments) == 3
+        shown = capsys.readouterr().out
+        assert "Ah   to 2.7 V; not the capacity, as the charge at the start is not known" in shown
+        assert "state of health          not known" in shown
+
+
+@pytest.mark.parametrize("method", ["least-squares", "kalman"])
+def test_a_rest_that_is_seldom_logged_moves_nothing_and_missing_samples_make_it_unsure(method, recorded, tmp_path, capsys):
+    plain = summarize(recorded, Settings(method=method)).row
+
+    def with_rest(rest_s: list[float]) -> dict:
+        n = len(rest_s)
+        columns = [
+            np.append(values, column[2:])
+            for values, column in (
+                (rest_s, recorded.time_s),
+                ([recorded.voltage_V[1]] * n, recorded.voltage_V),
+                ([0.0] * n, recorded.current_A),
+            )
+        ]
+        code = main(["calibrate", write(Discharge(*columns), tmp_path / "cell.csv"), "--method", method, "--json"])
+        row = json.loads(capsys.readouterr().out)
+        assert code == (0 if row["settled"] else 3)
+        return row
+
+    seldom = with_rest([-1800.0, -1200.0, -600.0])
+    assert seldom["settled"] and not seldom["notes"]
+    assert seldom["q_mobile_C"] == pytest.approx(plain["q_mobile_C"], rel=0.005)
+    assert seldom["sd_q_mobile_C"] == pytest.approx(plain["sd_q_mobile_C"], rel=0.1)
+    missing = with_rest([-600.0])
+    assert not missing["settled"] and "Samples are missing when the load is switched on" in missing["reason"]
+    assert "samples are missing from -600 s" in missing["notes"]
+    # what a load of 2 A for all of the gap would have drawn is within two deviations
+    assert missing["sd_q_mobile_C"] > 600.0 * 2.0 / 2.0
+    assert missing["q_mobile_C"] == pytest.approx(plain["q_mobile_C"], rel=0.005)
+
+
+def test_what_is_drawn_after_the_cut_off_is_told(recorded, tmp_path, capsys):
+    time_s = np.append(recorded.time_s, recorded.time_s + recorded.time_s[-1] + 100.0)  # too soon for a charge between
+    columns = (np.append(column, column) for column in (recorded.voltage_V, recorded.current_A))
+    path = write(Discharge(time_s, *columns), tmp_path / "two.csv")
+    assert main(["calibrate", path, "--discharge-is-positive", "--json"]) == 0
+    assert "Ah more are drawn after the cut-off at" in json.loads(capsys.readouterr().out)["notes"]
+
+
+def test_large_cells_are_fitted_and_calibrated(tmp_path, capsys):
+    load_A = np.append(np.zeros(60), np.full(4000, 2.0))
+    small = simulate(load_A, 6000.0, 0.15, load_unit="current", thermal=True, cut_off_V=2.65)
+    large = Discharge(small.time_s[::10], small.voltage_V[::10], 50.0 * small.current_A[::10])
+    path = write(large, tmp_path / "large.csv")
+    assert "at least 29" in (said := fails([path], capsys)) and "--cell" in said
+    cell = tmp_path / "cell.json"
+    assert main(["fit", path, "--out", str(cell)]) == 0
+    capsys.readouterr()
+    assert main(["calibrate", path, "--cell", str(cell), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["q_mobile_C"] == pytest.approx(300_000.0, rel=0.01)
 
 
 def test_a_file_with_unknown_columns_lists_them_and_takes_them_from_the_command_line(recorded, tmp_path, capsys):

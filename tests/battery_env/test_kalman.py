@@ -190,7 +190,7 @@ class TestOnline:
         ("sample", "message"),
         [
             ((np.inf, 2.0, 1.0), "voltage_V must be finite, got inf"),
-            ((3.7, 2000.0, 1.0), "current_A must lie within -60 .. 60 A, got 2000. .* not in mA"),
+            ((3.7, 2000.0, 1.0), "current_A must lie within -1000 .. 1000 A, got 2000. .* not in mA"),
             ((3700.0, 2.0, 1.0), "voltage_V must lie within 0 .. 5.5 V, got 3700. .* not in mV"),
             ((14.8, 2.0, 1.0), "voltage_V must lie within 0 .. 5.5 V, got 14.8. .* not that of a pack"),
             ((3.7, np.nan, 1.0), "current_A must be finite, got nan. .* give the mean current"),

@@ -282,6 +282,130 @@ def test_a_sensor_that_was_not_connected_is_no_temperature(tmp_path):
     assert one(own(tmp_path / "cell.csv", temperature_C=np.nan)).temperature_C is None
 
 
+def test_a_temperature_that_is_logged_more_seldom_is_interpolated(tmp_path):
+    seldom_C = np.where(np.arange(len(TIME_S)) % 5 == 1, TEMPERATURE_C, np.nan)
+    discharge = one(own(tmp_path / "cell.csv", temperature_C=seldom_C))
+    np.testing.assert_allclose(discharge.temperature_C[1:-2], TEMPERATURE_C[1:-2], atol=1e-3)
+    np.testing.assert_allclose(discharge.temperature_C[[0, -1]], [TEMPERATURE_C[1], TEMPERATURE_C[-3]])
+    path = own(tmp_path / "cell.csv", temperature_C=np.where(TIME_S == 10.0, 24.0, np.nan), ambient_temperature=np.nan)
+    with pytest.warns(UserWarning, match="the temperature is missing for up to 1820 s, and interpolated"):
+        (discharge,) = read_discharges(path)
+    assert (discharge.temperature_C == 24.0).all() and "ambient_temperature_C" not in discharge.meta
+
+
+def test_dates_are_read_as_they_are_written(tmp_path):
+    begin = pd.Timestamp("2026-02-01 23:50")
+    times = [begin + pd.Timedelta(seconds=float(time_s)) for time_s in TIME_S + 0.25 * (TIME_S > 100.0)]
+    expected_s = TIME_S + 0.25 * (TIME_S > 100.0)
+    zones = [time.tz_localize("UTC") for time in times]
+    berlin = [time.tz_convert("Europe/Berlin") for time in zones]
+    summer = [
+        (pd.Timestamp("2026-03-29 00:50", tz="UTC") + (time - begin)).tz_convert("Europe/Berlin").isoformat() for time in times
+    ]
+    written = {
+        # of which those of whole seconds have no fraction
+        "ISO": [time.isoformat() for time in times],
+        "ISO with a zone": [time.isoformat() for time in berlin],
+        "the clock is put forward": summer,
+        "day first": [time.strftime("%d/%m/%Y %H:%M:%S.%f") for time in times],
+        "day first, points": [time.strftime("%d.%m.%Y %H:%M:%S.%f") for time in times],
+        "month first": [time.strftime("%m/%d/%Y %I:%M:%S.%f %p") for time in times],
+        "a clock, where hours are thought of": [clock(time_s) for time_s in expected_s],
+    }
+    for name, column in written.items():
+        table = pd.DataFrame({"Time (h)": column, "voltage_V": VOLTAGE_V, "current_A": CURRENT_A})
+        table.to_csv(tmp_path / "cell.csv", index=False)
+        np.testing.assert_allclose(one(tmp_path / "cell.csv").time_s, expected_s, atol=1e-6, err_msg=name)
+
+
+@pytest.mark.parametrize("units", ["s,V,A,°C", "[min],[mV],[mA],[K]", '"(ms)","(mV)","(A)",""', ",,,"])
+def test_units_may_stand_below_the_names(units, tmp_path):
+    factors = {"s,V,A,°C": (1, 1, 1, 0.0), "[min],[mV],[mA],[K]": (1 / 60, 1e3, 1e3, 273.15)}.get(units, (1e3, 1e3, 1, 0.0))
+    if units == ",,,":
+        factors = (1, 1, 1, 0.0)
+    columns = [TIME_S * factors[0], VOLTAGE_V * factors[1], CURRENT_A * factors[2], TEMPERATURE_C + factors[3]]
+    rows = [",".join(f"{value:.9g}" for value in row) for row in zip(*columns, strict=True)]
+    (tmp_path / "cell.csv").write_text("\n".join(["Time,Voltage,Current,Temperature", units, *rows]))
+    check(one(tmp_path / "cell.csv"), temperature=True)
+
+
+def test_a_unit_in_a_name_counts_more_than_one_below_it_and_a_stated_one_most(tmp_path):
+    rows = [f"{t / 60:.9g};{1e3 * v:.9g};{i:.9g}" for t, v, i in zip(TIME_S, VOLTAGE_V, CURRENT_A, strict=True)]
+    (tmp_path / "cell.csv").write_text("\n".join(["Time;Voltage (mV);Current", "h;V;A", *rows]))
+    check(one(tmp_path / "cell.csv", units={"time": "min"}))
+
+
+@pytest.mark.parametrize("decimal", [".", ","])
+@pytest.mark.parametrize("foot", ["End of test", "End of test;;;\n\nChecked by;;\n", "Total capacity;;"])
+def test_lines_below_the_table_are_left_out_with_a_word(foot, decimal, tmp_path):
+    rows = [f"{t};{v};{i}".replace(".", decimal) for t, v, i in zip(TIME_S, VOLTAGE_V, CURRENT_A, strict=True)]
+    (tmp_path / "cell.csv").write_text("\n".join(["sep=;", "Zeit;U/V;I/A", *rows, foot]))
+    with pytest.warns(UserWarning, match=f"lines below the table.*are left out: '{foot[:6]}"):
+        (discharge,) = read_discharges(tmp_path / "cell.csv", columns={"time": "Zeit"})
+    check(discharge)
+    with pytest.raises(ValueError, match=r"no column for the time among Zeit, U/V, I/A"):
+        read_discharges(tmp_path / "cell.csv")
+
+
+def without_charges(count: int = 3, rest: bool = True, pause_s: float = 7200.0) -> pd.DataFrame:
+    """Discharges on one clock, between which the cell was charged; the cell fades."""
+    parts = []
+    for n in range(count):
+        voltage_V = VOLTAGE_V - np.where(LOADED, 0.6 * (TIME_S / 1800.0) ** 8 + 0.02 * n, 0.001 * n)
+        time_s = (1.0 - 0.1 * n) * TIME_S + n * (1830.0 + pause_s)
+        part = pd.DataFrame({"time_s": time_s, "voltage_V": voltage_V, "current_A": CURRENT_A})
+        parts.append(part if rest else part[LOADED])
+    return pd.concat(parts, ignore_index=True)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("rest", [True, False])
+@pytest.mark.parametrize("restarts", [True, False])
+def test_discharges_whose_charges_are_not_logged_are_found(sign, rest, restarts, tmp_path):
+    table = without_charges(rest=rest)
+    if restarts:
+        table["time_s"] %= 9030.0
+    table["current_A"] *= sign
+    table.to_csv(tmp_path / "life.csv", index=False)
+    with pytest.warns(UserWarning, match="no charge is logged: taken for 3 discharges"):
+        discharges = read_discharges(tmp_path / "life.csv")
+    assert [discharge.meta["cycle"] for discharge in discharges] == [1, 2, 3]
+    for n, discharge in enumerate(discharges):
+        expected_s = (1.0 - 0.1 * n) * (TIME_S if rest else TIME_S[LOADED])
+        np.testing.assert_allclose(discharge.time_s, expected_s - expected_s[0], atol=1e-9)
+        assert discharge.current_A.max() == 2.0
+
+
+def test_a_rest_after_heavy_pulses_is_no_charge(tmp_path):
+    random = np.random.default_rng(0)
+    for period, share in ((60, 0.5), (400, 0.2), (4000, 0.05), (4000, 0.5)):
+        time_s = np.arange(0.0, 40_000.0, 20.0)
+        current_A = np.where(np.mod(time_s, period) < share * period, 6.0, 0.0) * (time_s > 100.0)
+        soc = 1.0 - np.append(0.0, np.cumsum(20.0 * current_A[:-1])) / 14_000.0
+        voltage_V = 3.3 + 0.9 * soc - 0.14 * current_A - 0.6 * np.exp(-40.0 * soc)
+        logged = (current_A > 0.0) | (np.mod(time_s, 1000.0) == 0.0) | (time_s < 100.0)  # rests of some kind hardly at all
+        for part in (logged & (voltage_V > 2.5), logged & (time_s < 9000.0) & (voltage_V > 2.5)):
+            noisy_V = voltage_V[part] + 0.003 * random.standard_normal(part.sum())
+            path = own(tmp_path / "cell.csv", time_s=time_s[part], voltage_V=noisy_V, current_A=current_A[part])
+            assert len(one(path, discharge_is_negative=False).time_s) == part.sum()
+
+
+def test_the_sign_is_not_told_where_charges_and_discharges_would_have_to_be_one(tmp_path):
+    table = life()
+    table["current_A"] = table["current_A"].abs()
+    table.drop(columns="cycle").to_csv(tmp_path / "life.csv", index=False)
+    with pytest.raises(ValueError, match="cannot be told"):
+        read_discharges(tmp_path / "life.csv")
+
+
+def test_a_wild_current_does_not_hide_the_sign(tmp_path):
+    current_A = -CURRENT_A
+    for wild_A in (50.0, -50.0):
+        current_A[30] = wild_A
+        discharge = one(own(tmp_path / "cell.csv", current_A=current_A))
+        np.testing.assert_array_equal(discharge.current_A, -current_A)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -299,7 +423,11 @@ def test_a_sensor_that_was_not_connected_is_no_temperature(tmp_path):
         ({"Voltage(V)": VOLTAGE_V}, "both 'voltage_V' and 'Voltage.V.' may be the voltage"),
         ({"current_A": np.abs(np.sin(TIME_S)), "voltage_V": 3.7 + 0.3 * np.cos(TIME_S)}, "cannot be told"),
         ({"cycle": 1.5}, "the column of the cycle must hold whole numbers"),
-        ({"temperature_C": np.where(TIME_S == 40.0, np.nan, 24.0)}, "temperature_C must be finite"),
+        ({"temperature_C": np.where(TIME_S == 40.0, np.inf, 24.0)}, "temperature_C must be finite"),
+        (
+            {"time_s": [f"{1e3 * time_s:,.1f}" for time_s in TIME_S]},
+            "'time_s' must hold numbers, got '5,000.0' in row 2. Write numbers without separators of thousands",
+        ),
     ],
 )
 def test_what_cannot_be_meant_is_refused_with_the_name_of_the_file(changes, message, tmp_path):
