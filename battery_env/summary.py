@@ -21,7 +21,7 @@ from battery_env.estimators.cell_fit import UNFITTED_MISMATCH_V, CellFit
 from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.rest import InitialSoc, Start
-from battery_env.estimators.settling import SETTLED_SHARES, start_reason
+from battery_env.estimators.settling import SETTLED_SHARES, least_resistance_ohm, start_reason
 from battery_env.parameters import PARAMETER_NAMES, check_parameters
 from battery_env.record_model import RecordModel, VoltageForecast
 from battery_env.records import ExpectedCurrent, drawn, expected_current
@@ -243,7 +243,7 @@ def summarize(discharge: Discharge, settings: Settings) -> Summary:
         estimate = replace(estimate, settled=False, reason=start.reason)
     estimate = _with_missing_samples(estimate, discharge, record)
     # what a full cell would have given more, as its end comes at the same charge; not known where the start is not
-    is_known = not start.reason and not _starts_lower(discharge, cell, start.soc)
+    is_known = not start.reason and not _starts_lower(discharge, cell, start.soc, estimate)
     missing_Ah = (1.0 - start.soc) * estimate.q_mobile / 3600.0 if is_known else float("nan")
     model = RecordModel(cell, settings.thermal and not is_policy, initial_soc=start.soc)
     future = expected_current(record.time_s, record.current_A)
@@ -310,12 +310,13 @@ def _with_missing_samples(estimate: Estimate, discharge: Discharge, record: Disc
     return estimate
 
 
-def _starts_lower(discharge: Discharge, cell: CellParameters, soc: float) -> bool:
+def _starts_lower(discharge: Discharge, cell: CellParameters, soc: float, estimate: Estimate) -> bool:
     """Whether the voltage before the load, or the first one under it, is below that of a cell with this charge."""
     begin = int(np.searchsorted(discharge.time_s, discharge.load_on_time_s, side="right")) - 1
     time_s, voltage_V, current_A = (column[begin:] for column in (discharge.time_s, discharge.voltage_V, discharge.current_A))
     rest_V = float(voltage(initial_state(cell=cell, soc=soc), cell=cell))
-    return bool(voltage_V[0] < rest_V and start_reason(time_s, voltage_V, current_A, cell, soc))
+    resistance_ohm = least_resistance_ohm(estimate.q_mobile, estimate.r_o)
+    return bool(voltage_V[0] < rest_V and start_reason(time_s, voltage_V, current_A, cell, soc, resistance_ohm))
 
 
 def _nominal_Ah(model: RecordModel, settings: Settings, load_A: float) -> float:

@@ -325,7 +325,8 @@ def test_shares_of_discharges_are_drawn_over_seeds():
         (["--envs", "BatteryR-v0"], "Environment `BatteryR` doesn't exist"),
         (["--envs", "no_such_module:Mine-v0"], "no_such_module:Mine-v0 is no environment: No module named"),
         (["--envs", "BatteryQmax-v0"], "lac.yml has no entry for BatteryQmax-v0"),
-        (["--seeds", "-1"], "a seed must lie within 0 .. 2**32 - 1, got -1"),
+        (["--seeds", "-1"], "must be a whole number of at least 0, got -1"),
+        (["--seeds", str(2**32)], "a seed must lie within 0 .. 2**32 - 1, got 4294967296"),
         (["--timesteps", "40"], "starts to learn after 40 steps (learning_starts): timesteps=40 must be more"),
     ],
 )

@@ -77,6 +77,7 @@ def test_transitions_are_those_of_single_environments(problems, name, mode):
 def test_time_limits_are_told_from_terminations(problems):
     for name, expected in (("battery", True), ("time limit", True), ("termination", False)):
         env = GymnasiumVecEnv(problems[name][0]("SameStep"))
+        env.seed(0)  # a start near the end of the data ends an episode early
         env.reset()
         for _ in range(5):
             observations, _, dones, infos = env.step(np.zeros((N_ENVS, *env.action_space.shape)))
