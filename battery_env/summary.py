@@ -18,6 +18,7 @@ from battery_env.electrochemistry import NEW_CELL, CellParameters, initial_state
 from battery_env.electrochemistry.cell import TB
 from battery_env.estimates import Estimate
 from battery_env.estimators.cell_fit import UNFITTED_MISMATCH_V, CellFit
+from battery_env.estimators.gaps import NOT_DRAWN, find_gaps
 from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.rest import InitialSoc, Start
@@ -209,9 +210,9 @@ class Summary(NamedTuple):
 
 def summarize(discharge: Discharge, settings: Settings) -> Summary:
     """
-    Calibrate the model to one discharge. Where its start is not known, or the voltage before the load contradicts it, its
-    capacity is not known either. Its surroundings, and its temperature at the start, are those measured at load-on; a
-    model that departs far from the temperatures measured later is warned of.
+    Calibrate the model to one discharge. Where its start is not known, or the voltage before the load contradicts it, or where
+    nothing was drawn though the samples beside say so, its capacity is not known either. Its surroundings, and its temperature
+    at the start, are those measured at load-on; a model that departs far from the temperatures measured later is warned of.
 
     :param discharge: of a cell that starts full, or with the ``initial_soc`` of the settings
     :param settings: how to look at it
@@ -242,14 +243,17 @@ def summarize(discharge: Discharge, settings: Settings) -> Summary:
     if start.reason:
         estimate = replace(estimate, settled=False, reason=start.reason)
     estimate = _with_missing_samples(estimate, discharge, record)
-    # what a full cell would have given more, as its end comes at the same charge; not known where the start is not
-    is_known = not start.reason and not _starts_lower(discharge, cell, start.soc, estimate)
-    missing_Ah = (1.0 - start.soc) * estimate.q_mobile / 3600.0 if is_known else float("nan")
     model = RecordModel(cell, settings.thermal and not is_policy, initial_soc=start.soc)
     future = expected_current(record.time_s, record.current_A)
     if settings.future_current_A is not None:
         future = ExpectedCurrent(settings.future_current_A, varied=False, sd_A=0.0)
     forecast = model.forecast(record, estimate, settings.cut_off_V, future.mean_A)
+    columns = (record.time_s, record.voltage_V, record.current_A, forecast.at_samples_V)
+    is_logged = all(gap.verdict != NOT_DRAWN for gap in find_gaps(*columns, estimate.q_mobile))
+    # what a full cell would have given more, as its end comes at the same charge; not known where the start is not, nor where
+    # part of what was drawn is not
+    is_known = is_logged and not start.reason and not _starts_lower(discharge, cell, start.soc, estimate)
+    missing_Ah = (1.0 - start.soc) * estimate.q_mobile / 3600.0 if is_known else float("nan")
     in_progress = np.isnan(measured_eod_s)
     remaining_s = max(forecast.eod_time_s - float(record.time_s[-1]), 0.0) if in_progress else 0.0
     nominal_Ah = _nominal_Ah(model, settings, future.mean_A)
@@ -382,7 +386,7 @@ def text_of(name: str, row: dict[str, Any], settings: Settings) -> str:
     }
     what = "so far" if in_progress else f"the capacity to {cut_off}"
     if not in_progress and np.isnan(row["predicted_capacity_Ah"]):
-        what = f"to {cut_off}; not the capacity, as the charge at the start is not known"
+        what = f"to {cut_off}; not the capacity, as not all of the charge is known"
     elif row["initial_soc"] < 1.0 and not in_progress:
         what = f"to {cut_off}; from full it would have been {row['predicted_capacity_Ah']:.3f} Ah"
     lines = [

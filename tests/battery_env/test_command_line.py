@@ -2,6 +2,7 @@ import json
 import subprocess
 import sys
 from concurrent.futures import BrokenExecutor, Future
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 
@@ -265,8 +266,24 @@ def test_no_capacity_is_stated_where_the_cell_did_not_start_full(method, tmp_pat
         assert row["capacity_Ah"] is row["predicted_capacity_Ah"] is row["state_of_health"] is None
         assert main(arguments) == 3
         shown = capsys.readouterr().out
-        assert "Ah   to 2.7 V; not the capacity, as the charge at the start is not known" in shown
+        assert "Ah   to 2.7 V; not the capacity, as not all of the charge is known" in shown
         assert "state of health          not known" in shown
+
+
+@pytest.mark.parametrize("method", ["least-squares", "kalman"])
+def test_nor_where_the_clock_jumps_under_load(method, recorded):
+    after = recorded.time_s > recorded.load_on_time_s + 1200.0
+    jumped = replace(recorded, time_s=recorded.time_s + 600.0 * after)
+    lost = replace(
+        recorded,
+        **{
+            name: np.delete(getattr(recorded, name), np.flatnonzero(after)[:20])
+            for name in ("time_s", "voltage_V", "current_A", "temperature_C")
+        },
+    )
+    plain, jumped_row, lost_row = (summarize(each, Settings(method=method)).row for each in (recorded, jumped, lost))
+    assert np.isnan(jumped_row["capacity_Ah"]) and np.isnan(jumped_row["state_of_health"]) and not jumped_row["settled"]
+    assert lost_row["settled"] and lost_row["capacity_Ah"] == pytest.approx(plain["capacity_Ah"], rel=1e-3)
 
 
 @pytest.mark.parametrize("method", ["least-squares", "kalman"])
