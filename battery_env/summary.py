@@ -51,7 +51,8 @@ _PRETRAINED = {
     frozenset({"r_o"}): "BatteryVoltageRo-v0",
     frozenset(PARAMETER_NAMES): "BatteryVoltageJoint-v0",
 }
-# What a policy cannot be told: it has learned on one model, and states no uncertainty.
+# What a policy cannot be told: it has learned on one model, and states no uncertainty. One of the user's own may have learned
+# on the model of a cell of the user's own.
 _NOT_FOR_POLICIES = (
     "prior_q_mobile_C",
     "mismatch_V",
@@ -61,6 +62,7 @@ _NOT_FOR_POLICIES = (
     "q_mobile_bounds_C",
     "initial_soc",
 )
+_OWN = {"cell": ", or a policy of your own that was trained with these constants"}
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,7 @@ class Settings:
     :param initial_soc: state of charge when the load is switched on, after a rest: a number, (mean, standard deviation), or
         ``"rest"``: told from the voltage of the rest before the load, of a minute at least
     :param policy: ONNX file of the policy that the method ``"policy"`` follows; ``None``: the one that comes with the package.
-        Its model is the new cell's at constant temperature, and it takes no prior
+        Its model is at constant temperature, the new cell's or, of a policy of the user's own, ``cell``; and it takes no prior
     :raises ValueError: for an argument out of range
     """
 
@@ -120,8 +122,8 @@ class Settings:
         if self.method == "policy":
             defaults = {field.name: field.default for field in fields(self)}
             for name in _NOT_FOR_POLICIES:
-                if getattr(self, name) != defaults[name]:
-                    raise ValueError(f"a policy takes no {name}: leave it out, or take another method")
+                if getattr(self, name) != defaults[name] and not (name == "cell" and self.policy is not None):
+                    raise ValueError(f"a policy takes no {name}: leave it out, or take another method{_OWN.get(name, '')}")
         elif self.policy is not None:
             raise ValueError(f"a policy is for the method policy, got {self.method!r}")
         self.calibrator(self.cell or NEW_CELL)
@@ -137,14 +139,14 @@ class Settings:
         :return: the settings
         """
         if isinstance(cell, CellFit):
-            others = {
-                "cut_off_V": cell.cell.VEOD,
-                "mismatch_V": cell.mismatch_V,
-                "thermal": cell.thermal,
-                "q_mobile_bounds_C": cell.q_mobile_bounds_C,
-                **others,
-            }
-            cell = cell.cell
+            known: dict[str, Any] = {"cut_off_V": cell.cell.VEOD}
+            if others.get("method") != "policy":
+                known |= {
+                    "mismatch_V": cell.mismatch_V,
+                    "thermal": cell.thermal,
+                    "q_mobile_bounds_C": cell.q_mobile_bounds_C,
+                }
+            others, cell = {**known, **others}, cell.cell
         return cls(**{"cell": cell, **others})
 
     def calibrator(
@@ -159,7 +161,7 @@ class Settings:
         :raises ValueError: for an argument out of range
         """
         if self.method == "policy":
-            return self._policy()
+            return self._policy(cell)
         calibrator = LeastSquares if self.method == "least-squares" else ExtendedKalmanFilter
         bounds: dict[str, Any] = {} if self.q_mobile_bounds_C is None else {"q_mobile_bounds_C": self.q_mobile_bounds_C}
         return calibrator(
@@ -173,13 +175,15 @@ class Settings:
             **bounds,
         )
 
-    def _policy(self) -> PolicyEstimator:
+    def _policy(self, cell: CellParameters) -> PolicyEstimator:
         if self.policy is None:
             env_id = _PRETRAINED[frozenset(check_parameters(self.parameters))]
             policy, options = pretrained_policy(env_id)
         else:
             policy, options = policy_of_file(self.policy)
             env_id = policy.env_id
+            if self.cell is not None:
+                options["cell"] = cell
         estimator = PolicyEstimator(policy, env_id, **options)
         if set(estimator.parameters) != set(self.parameters):
             asked, found = " and ".join(self.parameters), " and ".join(estimator.parameters)

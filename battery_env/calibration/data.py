@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import os
 from functools import lru_cache
-from typing import Literal, get_args
+from typing import Literal, TypeVar, get_args
 
 import numpy as np
 
 from battery_env.cells import BUNDLED_CELLS, load_nasa_discharges
-from battery_env.electrochemistry import NEW_CELL
+from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.loads import Load, LoadSampler, RandomPiecewise, RandomWalk, constant, recorded
 from battery_env.trajectories import PAPER_LOADS_W, PAPER_RANGES, PAPER_TRIM, AgedParameter, TrajectoryDataset
+
+_Discharges = TypeVar("_Discharges")
 
 LoadKind = Literal["paper", "constant", "piecewise", "random_walk", "recorded"]
 Split = Literal["train", "test", "all"]
@@ -28,7 +31,12 @@ CONSTANT_LOADS_W: tuple[float, ...] = tuple(np.linspace(2.0, 8.0, 13))
 
 
 def standard_dataset(
-    parameter: AgedParameter, load: LoadKind, split: Split, dt_s: float = 1.0, mismatch: float = 0.0
+    parameter: AgedParameter,
+    load: LoadKind,
+    split: Split,
+    dt_s: float = 1.0,
+    mismatch: float = 0.0,
+    cell: CellParameters = NEW_CELL,
 ) -> TrajectoryDataset:
     """
     A data set, or one side of its 70/30 split by trajectory, made once per process. All are at power, isothermal, and
@@ -45,7 +53,7 @@ def standard_dataset(
     =============== ============================================================== ============ ============== ==========
 
     ``paper`` is trimmed to 5 .. 95 % of each discharge and, for one parameter at 1 s without mismatch, the paper's own grid
-    of 5511; the others run from full charge to the end of discharge. A parameter that does not age is the new cell's.
+    of 5511; the others run from full charge to the end of discharge. A parameter that does not age is that of ``cell``.
 
     :param parameter: what ages: ``"q_mobile"``, ``"r_o"`` or ``"joint"``
     :param load: kind of load
@@ -53,6 +61,7 @@ def standard_dataset(
     :param dt_s: time step, s
     :param mismatch: how wrong the constants are that nobody can measure well, see
         :meth:`~battery_env.trajectories.TrajectoryDataset.generate`; ages and loads do not depend on it
+    :param cell: constants of the cell, as a calibrator may know them
     :return: the trajectories
     :raises ValueError: for another parameter, load or split, or values out of range
     """
@@ -60,18 +69,40 @@ def standard_dataset(
         raise ValueError(f"load must be one of {get_args(LoadKind)}, got {load!r}")
     if split not in get_args(Split):
         raise ValueError(f"split must be 'train', 'test' or 'all', got {split!r}")
-    return _splits(parameter, load, dt_s, mismatch)[split]
+    return _splits(parameter, load, dt_s, mismatch, cell)[split]
+
+
+def opened(dataset: _Discharges | str | os.PathLike[str]) -> _Discharges | TrajectoryDataset:
+    """
+    Discharges that are given in place of a standard data set.
+
+    :param dataset: the discharges themselves, or the file of a :meth:`~battery_env.trajectories.TrajectoryDataset.save`, which
+        a YAML file of hyperparameters can name. It is read once per process, and again when it has changed
+    :return: the discharges
+    :raises FileNotFoundError: if there is no such file
+    :raises ValueError: if it holds no data set
+    """
+    if isinstance(dataset, (str, os.PathLike)):
+        return _loaded(os.fspath(dataset), os.stat(dataset).st_mtime_ns)
+    return dataset
 
 
 @lru_cache(maxsize=6)
-def _splits(parameter: AgedParameter, load: LoadKind, dt_s: float, mismatch: float) -> dict[Split, TrajectoryDataset]:
-    whole = _whole(parameter, load, dt_s, mismatch)
+def _loaded(path: str, modified_ns: int) -> TrajectoryDataset:
+    return TrajectoryDataset.load(path)
+
+
+@lru_cache(maxsize=6)
+def _splits(
+    parameter: AgedParameter, load: LoadKind, dt_s: float, mismatch: float, cell: CellParameters
+) -> dict[Split, TrajectoryDataset]:
+    whole = _whole(parameter, load, dt_s, mismatch, cell)
     train, test = whole.split(test=TEST_SHARE, by="trajectory", seed=SEED)
     return {"train": train, "test": test, "all": whole}
 
 
-def _whole(parameter: AgedParameter, load: LoadKind, dt_s: float, mismatch: float) -> TrajectoryDataset:
-    if load == "paper" and parameter != "joint" and dt_s == 1.0 and mismatch == 0.0:
+def _whole(parameter: AgedParameter, load: LoadKind, dt_s: float, mismatch: float, cell: CellParameters) -> TrajectoryDataset:
+    if load == "paper" and parameter != "joint" and dt_s == 1.0 and mismatch == 0.0 and cell == NEW_CELL:
         return TrajectoryDataset.paper(parameter)
     paper = load == "paper"
     return TrajectoryDataset.generate(
@@ -83,6 +114,7 @@ def _whole(parameter: AgedParameter, load: LoadKind, dt_s: float, mismatch: floa
         r_o_range=PAPER_RANGES["r_o"] if paper else R_O_RANGE_OHM,
         trim=PAPER_TRIM if paper else (0.0, 1.0),
         dt_s=dt_s,
+        cell=cell,
         mismatch=mismatch,
     )
 

@@ -7,6 +7,7 @@ is its distance from the measured state x_{t+1} (Unagar et al. 2020).
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Any, Literal
@@ -16,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from battery_env.arrays import IntArray
 from battery_env.calibration.batch import Cells
-from battery_env.calibration.data import LoadKind, Split, standard_dataset
+from battery_env.calibration.data import LoadKind, Split, opened, standard_dataset
 from battery_env.calibration.formulation import ACTION_RANGES, ERROR_SCALE, OBSERVED, OBSERVED_SIZE, SCALED, Formulation
 from battery_env.calibration.full_state_kernels import decide, look_ahead, observe
 from battery_env.calibration.task import OBSERVATION_LIMIT, CalibrationTask, check_counts, check_not_negative, checked_action
@@ -85,7 +86,7 @@ class FullStateTask(CalibrationTask):
         split: Split = "train",
         dt_s: float = 1.0,
         mismatch: float = 0.0,
-        dataset: TrajectoryDataset | None = None,
+        dataset: TrajectoryDataset | str | os.PathLike[str] | None = None,
     ) -> None:
         if start not in ("true", "new_cell"):
             raise ValueError(f"start must be 'true' or 'new_cell', got {start!r}")
@@ -124,7 +125,7 @@ class FullStateTask(CalibrationTask):
             self.dataset = dataset = _reachable("joint" if len(self.parameters) == 2 else self.parameters[0], **data)
         else:
             self._refuse_beside_a_dataset(**data)
-            self.dataset = dataset
+            self.dataset = dataset = opened(dataset)
         self.decision_s = dataset.dt_s
         self.starts_new = start == "new_cell"
         self.continue_probability, self.first_sample_probability = continue_probability, first_sample_probability

@@ -78,7 +78,7 @@ class BatteryQmax(FullStateTask):
     | ``split`` | ``"train"`` | or ``"test"``, ``"all"`` |
     | ``dt_s`` | 1 | time step, s |
     | ``mismatch`` | 0 | how far kn, tDiffusion, to and tsn of the cell are from the model's (relative standard deviation) |
-    | ``dataset`` | none | a ``TrajectoryDataset`` to draw from, in place of the last four |
+    | ``dataset`` | none | a ``TrajectoryDataset`` to draw from, or the file of a saved one, in place of the last four |
     | ``render_mode`` | none | ``"rgb_array"`` |
 
     ``gymnasium.make_vec`` takes ``num_envs`` and ``autoreset_mode`` besides.

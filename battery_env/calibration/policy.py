@@ -20,8 +20,8 @@ from battery_env.record_model import RecordModel
 from battery_env.records import check_drawn_charge, check_record, check_sample, drawn
 
 _UNSURE = "A policy states no uncertainty."
-# A full cell takes no more charge than this, C.
-_SURPLUS_C = 0.01 * NEW_CELL.q_mobile
+# A full cell takes no more charge than this share of that of a new one.
+_SURPLUS = 0.01
 # Steps in which a stream is followed, s
 _STEP_S = 1.0
 
@@ -55,7 +55,8 @@ class PolicyEstimator(OnlineEstimator):
     :param policy: what to ask for actions, deterministically
     :param env_id: id of the environment that the policy was trained on
     :param decision_s: time between two estimates of a voltage-only policy, s, a multiple of the interval between its readings
-    :param options: of its task, but for its data and the length of its episodes
+    :param options: of its task, but for its data and the length of its episodes; ``cell`` among them, the constants that a
+        voltage-only policy was trained with, if not the new cell's
     :raises ValueError: if the id is not one of a calibration environment
     """
 
@@ -66,6 +67,7 @@ class PolicyEstimator(OnlineEstimator):
         task = self.environment(env_id, **options).task
         self.task_class = type(task)
         self.parameters = task.parameters
+        self.cell = task.readings.cell if isinstance(task, VoltageTask) else NEW_CELL
         self._every = task.steps_between(decision_s)
         self.decision_s = decision_s
         self.dt_s = _STEP_S
@@ -108,7 +110,7 @@ class PolicyEstimator(OnlineEstimator):
         self._readings = ReadingsSoFar()
         self._drawn_C = 0.0
         self._decisions = 0
-        self._now = np.array([NEW_CELL.q_mobile, NEW_CELL.r_o])
+        self._now = np.array([self.cell.q_mobile, self.cell.r_o])
         self._action = np.zeros(len(self.parameters))
         self._logarithms = np.zeros(len(UNCERTAIN_CONSTANTS))
 
@@ -131,7 +133,7 @@ class PolicyEstimator(OnlineEstimator):
             return
         before_A = self._readings.current_A[-1]
         check_sample(voltage_V, current_A, dt_s, previous_A=before_A)
-        check_drawn_charge(self._drawn_C + dt_s * before_A, -_SURPLUS_C)
+        check_drawn_charge(self._drawn_C + dt_s * before_A, -_SURPLUS * self.cell.q_mobile)
 
     def update(self, voltage_V: float, current_A: float, dt_s: float, temperature_C: float | None = None) -> Estimate:
         """
@@ -169,7 +171,7 @@ class PolicyEstimator(OnlineEstimator):
 
         :return: where it stands
         """
-        model, (q_mobile, r_o) = RecordModel(dt_s=self.dt_s), self._now.tolist()
+        model, (q_mobile, r_o) = RecordModel(self.cell, dt_s=self.dt_s), self._now.tolist()
         state = model.start(q_mobile)
         if self._readings.time_s and self._readings.time_s[-1] > 0.0:
             state = model.simulate(self._readings.record(self.dt_s).current_A, q_mobile, r_o).state[-1]

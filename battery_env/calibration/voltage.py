@@ -7,6 +7,7 @@ data so far with one (q_mobile, r_o): it holds an estimate, sees what the data s
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import lru_cache
@@ -16,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from battery_env.arrays import IntArray
-from battery_env.calibration.data import LoadKind, Split, standard_dataset
+from battery_env.calibration.data import LoadKind, Split, opened, standard_dataset
 from battery_env.calibration.nuisance import NuisanceFit
 from battery_env.calibration.readings import Readings, explain
 from battery_env.calibration.task import OBSERVATION_LIMIT, CalibrationTask, check_counts, check_not_negative, checked_action
-from battery_env.electrochemistry import NEW_CELL, FloatArray
+from battery_env.electrochemistry import NEW_CELL, CellParameters, FloatArray
 from battery_env.records import Record
 from battery_env.sensors import RandomSensorErrors
 from battery_env.trajectories import TrajectoryDataset
@@ -41,7 +42,6 @@ SENSORS = RandomSensorErrors(noise_V=(0.001, 0.030), offset_V=0.010)
 Cost = Literal["misfit", "state"]
 _COST_SCALE_V = 0.002
 _STATE_COST_SCALE = 0.01
-_NEW: FloatArray = np.array([NEW_CELL.q_mobile, NEW_CELL.r_o])
 # What the parts of an observation are divided by
 _MISFIT_FLOOR_V = 0.001
 _SLOPE_SCALE_V_PER_C = 5e-5
@@ -51,8 +51,18 @@ _TIME_SCALE_S = 3000.0
 
 
 @lru_cache(maxsize=4)
-def _readings_of_a_dataset(dataset: TrajectoryDataset, reading_s: float) -> Readings:
-    return Readings.of(dataset, reading_s, dataset.dt_s, dataset.cell)
+def _readings_of_a_dataset(dataset: TrajectoryDataset, reading_s: float, cell: CellParameters) -> Readings:
+    return Readings.of(dataset, reading_s, dataset.dt_s, cell)
+
+
+def _check_size(cell: CellParameters) -> None:
+    # the ranges of estimates and actions, and the scales of observations, are those of an 18650
+    for (name, (low, high)), value in zip(ESTIMATE_RANGES.items(), (cell.q_mobile, cell.r_o), strict=True):
+        if not low <= value <= high:
+            raise ValueError(
+                f"{name} of cell must lie within {low:g} .. {high:g}, where the task looks for estimates, got {value:g}: "
+                "it is made for cells of the size of an 18650. Take least squares or the filter for others."
+            )
 
 
 class VoltageTask(CalibrationTask):
@@ -91,7 +101,8 @@ class VoltageTask(CalibrationTask):
         dt_s: float = 1.0,
         mismatch: float = 0.0,
         nuisance: float = 0.0,
-        dataset: Sequence[Record] | None = None,
+        cell: CellParameters | None = None,
+        dataset: Sequence[Record] | str | os.PathLike[str] | None = None,
         **sensors: Any,
     ) -> None:
         check_counts(episode_steps=episode_steps)
@@ -103,14 +114,18 @@ class VoltageTask(CalibrationTask):
         if cost not in get_args(Cost):
             raise ValueError(f"cost must be one of {get_args(Cost)}, got {cost!r}")
         data: dict[str, Any] = {"load": load, "split": split, "dt_s": dt_s, "mismatch": mismatch}
+        dataset = opened(dataset)
+        if cell is None:
+            cell = dataset.cell if isinstance(dataset, TrajectoryDataset) else NEW_CELL
+        _check_size(cell)
         if dataset is None:
-            dataset = standard_dataset("joint" if len(self.parameters) == 2 else self.parameters[0], **data)
+            dataset = standard_dataset("joint" if len(self.parameters) == 2 else self.parameters[0], **data, cell=cell)
         else:
             self._refuse_beside_a_dataset(**data)
         if isinstance(dataset, TrajectoryDataset):
-            readings = _readings_of_a_dataset(dataset, reading_s)
+            readings = _readings_of_a_dataset(dataset, reading_s, cell)
         else:
-            readings = Readings.of(dataset, reading_s)
+            readings = Readings.of(dataset, reading_s, cell=cell)
         parameters = self.parameters
         self.cells, self.dataset, self.readings = cells, dataset, readings
         self.episode_steps, self.new_readings = episode_steps, new_readings
@@ -124,10 +139,11 @@ class VoltageTask(CalibrationTask):
         self._width = self._high - self._low
         self._step = np.array([LARGEST_STEPS[name] for name in parameters])
 
+        self._new: FloatArray = np.array([cell.q_mobile, cell.r_o])
         # the true parameters of the discharges, or the new cell's where they are not known
         true = np.column_stack([readings.q_mobile, readings.r_o])
         is_unknown = np.isnan(true)
-        self._known = np.where(is_unknown, _NEW, true)
+        self._known = np.where(is_unknown, self._new, true)
         if cost == "state" and is_unknown.any():
             unknown = int(is_unknown.any(axis=1).sum())
             raise ValueError(
@@ -144,7 +160,7 @@ class VoltageTask(CalibrationTask):
         self._step_of_episode: IntArray = np.zeros(cells, dtype=np.int64)
         self._last_step: IntArray = np.zeros(cells, dtype=np.int64)  # of the discharge
         self._every = 0  # readings between two decisions of a whole record; 0: of an episode they are drawn
-        self._estimate = np.tile(_NEW, (cells, 1))
+        self._estimate = np.tile(self._new, (cells, 1))
         self._action = np.zeros((cells, len(parameters)))
         self._voltage_V, self._current_A, self._moved_C, self._ohmic_A = np.zeros((4, cells, longest))
         self._residual_V, self._slope_V_per_C, self._ohmic_means_A = np.zeros((3, cells, STRETCHES, 2))
@@ -310,7 +326,7 @@ class VoltageTask(CalibrationTask):
         if self.first_estimate == "random" and generator is not None:
             estimate[self._columns] = self._low + self._width * generator.random(len(self._width))
         elif self.first_estimate != "true":
-            estimate[self._columns] = _NEW[self._columns]
+            estimate[self._columns] = self._new[self._columns]
         return estimate
 
     def _measure(self, row: int, discharge: int, generator: np.random.Generator) -> None:

@@ -102,7 +102,8 @@ class BatteryVoltageJoint(VoltageTask):
     | ``dt_s`` | 1 | time step of the cell, s |
     | ``mismatch`` | 0 | how far kn, tDiffusion, to and tsn of the cell are from the model's (relative standard deviation) |
     | ``nuisance`` | 0 | how far the agent is to take them to be; above 0 the observation has a fit that allows for it |
-    | ``dataset`` | none | other discharges from full charge, simulated or recorded, in place of these |
+    | ``cell`` | none | constants of the model, an 18650's, as of ``fit_cell``: of the data set, or of a new cell by default |
+    | ``dataset`` | none | other discharges from full charge, simulated (or the file of a saved ``TrajectoryDataset``) or recorded, in place of these |
     | ``render_mode`` | none | ``"rgb_array"`` |
 
     ``reset(options=...)`` takes ``discharge``, ``reading``, ``q_mobile_hat`` and ``r_o_hat``. As the model has no state of

@@ -3,12 +3,24 @@
 import dataclasses
 import json
 import warnings
+from importlib.resources import files
 
 import numpy as np
 import pytest
 from numpy.polynomial import Legendre
 
-from battery_env import CellFit, CellParameters, ExtendedKalmanFilter, LeastSquares, fit_cell, forecast, load_nasa_discharges
+from battery_env import (
+    CellFit,
+    CellParameters,
+    ExtendedKalmanFilter,
+    LeastSquares,
+    OnnxPolicy,
+    PolicyEstimator,
+    fit_cell,
+    forecast,
+    load_nasa_discharges,
+)
+from battery_env.calibration.pretrained import pretrained_card
 from battery_env.cells import Discharge
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate, voltage
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
@@ -20,7 +32,7 @@ from battery_env.estimators.cell_fit import (
     with_equilibrium,
 )
 from battery_env.plotting import plot_cell_fit
-from battery_env.summary import METHODS, Settings
+from battery_env.summary import METHODS, Settings, summarize
 
 OTHER = with_equilibrium(NEW_CELL, [0.02, -0.03, 0.02]).replace(kn=1000.0, tDiffusion=9e6, to=10.0, tsn=600.0, VEOD=2.7)
 
@@ -222,9 +234,21 @@ class TestFiles:
         with pytest.raises(ValueError, match=r"other\.json holds no"):
             read_cell(tmp_path / "other.json")
 
-    def test_a_policy_has_no_place_for_a_fit(self, fit):
-        with pytest.raises(ValueError, match="a policy takes no"):
+    def test_the_policy_that_comes_with_the_package_has_no_place_for_a_fit(self, fit):
+        with pytest.raises(ValueError, match="a policy takes no cell: .* policy of your own that was trained with these"):
             Settings.for_cell(fit, method="policy")
+
+    def test_a_policy_of_ones_own_takes_the_constants_and_the_cut_off_of_a_fit(self, fit, tmp_path):
+        policy, card = tmp_path / "mine.onnx", pretrained_card("BatteryVoltageJoint-v0")
+        policy.write_bytes(files("battery_env.pretrained_policies").joinpath("BatteryVoltageJoint-v0.onnx").read_bytes())
+        policy.with_suffix(".json").write_text(json.dumps({"options": card["options"]}))
+        settings = Settings.for_cell(fit, method="policy", policy=policy)
+        record = discharged(fit.cell, 6000.0, 0.15, pulses(7)).loaded_part(fit.cell.VEOD)
+        row = summarize(record, settings).row
+        own = PolicyEstimator(OnnxPolicy(policy), "BatteryVoltageJoint-v0", cell=fit.cell, **card["options"])
+        assert settings.cut_off_V == fit.cell.VEOD
+        assert row["q_mobile_C"] == own.estimate(record).q_mobile != PolicyEstimator.pretrained().estimate(record).q_mobile
+        assert row["q_mobile_C"] == pytest.approx(6000.0, rel=0.05)
 
     @pytest.mark.parametrize("method", [method for method in METHODS if method != "policy"])
     def test_settings_use_all_that_a_fit_knows(self, method, fit):

@@ -109,3 +109,25 @@ def test_bad_arguments_are_refused(data):
         PolicyEstimator(Constant(0.0, 0.0), "BatteryAging-v0").trace(data[:3])
     with pytest.raises(ValueError, match="CartPole-v1 is no calibration environment"):
         PolicyEstimator(Constant(0.0), "CartPole-v1")
+
+
+def test_a_stream_is_followed_with_the_constants_of_a_cell_of_ones_own(tmp_path):
+    cell = NEW_CELL.replace(to=1.5 * NEW_CELL.to, U0p=NEW_CELL.U0p + 0.03, q_mobile=7000.0, r_o=0.14)
+    (trajectory,) = TrajectoryDataset.generate("joint", 1, RandomPiecewise(), seed=3, cell=cell)
+
+    def estimator():
+        return PolicyEstimator(Constant(-0.1, 0.1), "BatteryVoltageJoint-v0", cell=cell)
+
+    stream = estimator()
+    assert stream.cell == cell
+    before = stream.now()
+    np.testing.assert_array_equal(before.parameters[:2], [cell.q_mobile, cell.r_o])
+    for sample in zip(trajectory.voltage_V[:90].tolist(), trajectory.current_A[:90].tolist(), strict=True):
+        estimate = stream.update(*sample, 1.0)
+    assert estimate.q_mobile == pytest.approx(7000.0 - 0.01 * LARGEST_STEPS["q_mobile"]) and stream.now().cell == cell
+    saved = stream.save(tmp_path / "stream.npz")
+    again = estimator()
+    again.load(saved)
+    assert again.now().state.tolist() == stream.now().state.tolist()
+    with pytest.raises(ValueError, match="options"):
+        PolicyEstimator(Constant(-0.1, 0.1), "BatteryVoltageJoint-v0").load(saved)

@@ -1,6 +1,7 @@
 """The voltage-only tasks and the aging one."""
 
 import copy
+import os
 import pickle
 
 import numpy as np
@@ -9,6 +10,7 @@ from gymnasium.utils.env_checker import check_env
 
 from battery_env.calibration.aging import BatteryAging, simulated_lives
 from battery_env.calibration.env import CalibrationEnv
+from battery_env.calibration.full_state_tasks import BatteryQmax
 from battery_env.calibration.readings import Readings
 from battery_env.calibration.task import OBSERVATION_LIMIT
 from battery_env.calibration.vector_env import CalibrationVectorEnv
@@ -299,6 +301,61 @@ def test_recorded_discharges_make_a_task():
     assert np.isnan(info["q_mobile"]) and np.isfinite(info["q_mobile_hat"])
     observation, reward, *_ = env.step(np.zeros(2, dtype=np.float32))
     assert np.isfinite(observation).all() and np.isfinite(reward)
+
+
+@pytest.fixture(scope="module")
+def own():
+    cell = TestOwnCell.CELL
+    return TrajectoryDataset.generate("joint", 4, RandomPiecewise(), seed=5, r_o_range=(0.1, 0.3), cell=cell)
+
+
+class TestOwnCell:
+    CELL = NEW_CELL.replace(kn=0.5 * NEW_CELL.kn, to=1.2 * NEW_CELL.to, U0p=NEW_CELL.U0p + 0.02, q_mobile=7000.0, r_o=0.15)
+
+    def test_its_constants_are_those_of_its_data_or_those_that_are_given(self, own, data):
+        assert started(own).readings.cell == self.CELL
+        as_recorded = [
+            Discharge(trajectory.time_s, trajectory.voltage_V, trajectory.current_A, starts_at_rest=True) for trajectory in own
+        ]
+        for discharges, cell in ((as_recorded, self.CELL), (as_recorded, None), (own, NEW_CELL), (data, None)):
+            task = started(discharges, start="new_cell", cell=cell, **EXACT)
+            model = NEW_CELL if cell is None else cell
+            assert task.readings.cell == model
+            np.testing.assert_array_equal(task.estimate, [[model.q_mobile, model.r_o]] * 4)
+
+    def test_with_them_the_truth_explains_a_recording_and_with_others_it_does_not(self, own):
+        as_recorded = [Discharge(trajectory.time_s, trajectory.voltage_V, trajectory.current_A) for trajectory in own]
+        for cell, explained in ((self.CELL, True), (None, False)):
+            task = BatteryVoltageJoint(1, dataset=as_recorded, cell=cell, **EXACT)
+            for discharge, trajectory in enumerate(own):
+                true = {"q_mobile_hat": trajectory.q_mobile, "r_o_hat": trajectory.r_o}
+                task.start(np.array([0]), generators(1), {"discharge": discharge, "reading": 20, **true})
+                cost = task.advance(np.zeros((1, 2)))[0]
+                assert (cost < 0.2) == explained  # asinh of 0.4 mV over 2 mV
+
+    def test_its_standard_discharges_are_of_that_cell(self):
+        task = BatteryVoltageQmax(2, cell=self.CELL, split="test")
+        assert task.dataset.cell == self.CELL and set(task.dataset.r_o) == {self.CELL.r_o}
+
+    @pytest.mark.parametrize("changed", [{"q_mobile": 20_000.0}, {"r_o": 0.01}])
+    def test_cells_of_another_size_are_refused(self, changed):
+        (name,) = changed
+        with pytest.raises(ValueError, match=f"{name} of cell must lie within .* size of an 18650. Take least squares"):
+            BatteryVoltageJoint(1, cell=self.CELL.replace(**changed))
+
+    def test_a_saved_data_set_is_named_by_its_file_and_read_anew_when_it_has_changed(self, own, data, tmp_path):
+        file = tmp_path / "own.npz"
+        own.save(file)
+        task = BatteryVoltageJoint(2, dataset=str(file))
+        assert task.readings.cell == self.CELL and task.dataset is BatteryVoltageJoint(1, dataset=file).dataset
+        np.testing.assert_array_equal(task.dataset.q_mobile, own.q_mobile)
+        file.unlink()
+        data.save(file)
+        os.utime(file, ns=(0, 0))
+        assert BatteryVoltageJoint(2, dataset=str(file)).readings.cell == NEW_CELL
+        np.testing.assert_array_equal(BatteryQmax(1, dataset=file).dataset.q_mobile, data.q_mobile)
+        with pytest.raises(FileNotFoundError, match=r"none\.npz"):
+            BatteryVoltageJoint(1, dataset=tmp_path / "none.npz")
 
 
 def test_unknown_option_is_refused(data):
