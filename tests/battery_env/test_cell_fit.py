@@ -235,7 +235,7 @@ class TestFiles:
             read_cell(tmp_path / "other.json")
 
     def test_the_policy_that_comes_with_the_package_has_no_place_for_a_fit(self, fit):
-        with pytest.raises(ValueError, match="a policy takes no cell: .* policy of your own that was trained with these"):
+        with pytest.raises(ValueError, match=r"a policy takes no cell: .* policy of your own that was trained with these"):
             Settings.for_cell(fit, method="policy")
 
     def test_a_policy_of_ones_own_takes_the_constants_and_the_cut_off_of_a_fit(self, fit, tmp_path):
