@@ -81,6 +81,7 @@ class FullStateTask(CalibrationTask):
         sensor_offset: float = 0.0,
         sensor_gain: float = 1.0,
         consistency: float = 0.0,
+        charge_weight: float = 1.0,
         cost_limit: float | None = None,
         load: LoadKind = "paper",
         split: Split = "train",
@@ -99,6 +100,7 @@ class FullStateTask(CalibrationTask):
             process_noise_V=process_noise_V,
             sensor_noise=sensor_noise,
             consistency=consistency,
+            charge_weight=charge_weight,
         )
         if continue_probability >= 1.0:
             raise ValueError(f"continue_probability must be less than 1, or episodes never end, got {continue_probability!r}")
@@ -149,6 +151,8 @@ class FullStateTask(CalibrationTask):
         self._has_own_constants = bool((dataset.factors != 1.0).any())
         self._model_packed = dataset.cell.packed
         self._new_parameters = np.full(cells, NEW_CELL.q_mobile), np.full(cells, NEW_CELL.r_o)
+        per_error = 1.0 / form.error_scale
+        per_error[QNB - VO :] *= charge_weight
         # Arguments of the kernels, in their order. Kernels take arrays one by one: numba spends 13 us a step on NamedTuples of
         # them, half of what a whole step of one cell takes.
         self._of_step = (dataset.dt_s, dataset.load_unit == "power", dataset.thermal)
@@ -161,7 +165,7 @@ class FullStateTask(CalibrationTask):
             form.literal_cost,
             float(limit),
             float(consistency),
-            1.0 / form.error_scale,
+            per_error,
         )
         scales = (1.0 / form.state_scale, 1.0 / form.load_scale, 1.0 / form.error_scale)
         self._of_observation = (*scales, form.innovations, shows_action, OBSERVATION_LIMIT, *self._of_step)

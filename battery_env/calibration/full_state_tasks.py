@@ -73,6 +73,7 @@ class BatteryQmax(FullStateTask):
     | ``sensor_offset`` | 0 | constant error of measured states, in error scales |
     | ``sensor_gain`` | 1 | measured states are the true ones times this |
     | ``consistency`` | 0 | cost of a change of the action per unit of its Euclidean length (the paper's consistency penalty); above 0 the action before is appended to the observation, at first the one that stands for a new cell |
+    | ``charge_weight`` | 1 | what the errors of the four charges are multiplied by in the cost: how much old errors count |
     | ``cost_limit`` | 5 | largest cost, without that of a change |
     | ``load`` | ``"paper"`` | or ``"constant"``, ``"piecewise"``, ``"random_walk"``, ``"recorded"``: see ``battery_env.calibration.data.standard_dataset``; cells whose parameters no action stands for are left out |
     | ``split`` | ``"train"`` | or ``"test"``, ``"all"`` |

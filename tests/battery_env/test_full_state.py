@@ -191,6 +191,30 @@ def test_changes_of_the_action_cost_and_the_action_before_is_shown(discharges, k
         before = np.clip(action, -1.0, 1.0)
 
 
+@pytest.mark.parametrize("kind", [BatteryQmax, BatteryQmaxPaper])
+def test_charges_count_as_much_as_is_asked_for(discharges, kind):
+    costs = {}
+    for weight in (0.0, 0.5, 1.0):
+        task = started(make(discharges, kind, cells=2, initial_perturbation=3.0, charge_weight=weight))
+        measured = task.now.measured.copy()
+        observation = task.observation()
+        costs[weight] = task.advance(true_action(task))
+    voltages, charges = (
+        np.linalg.norm(((task.now.model_state - measured)[:, 1:] / kind.formulation.error_scale)[:, part], axis=1)
+        for part in (slice(3), slice(3, None))
+    )
+    for weight, cost in costs.items():
+        if kind is BatteryQmax:
+            np.testing.assert_allclose(cost, np.minimum(np.hypot(voltages, weight * charges), 5.0), rtol=1e-9)
+        else:
+            half = 0.5 * (voltages + weight * charges)
+            np.testing.assert_allclose(cost, half * np.where(half > 1e-4, 50.0, 1.0), rtol=1e-9)
+    assert (costs[0.0] < costs[0.5]).all() and (costs[0.5] < costs[1.0]).all()
+    np.testing.assert_array_equal(  # what is seen does not depend on it
+        observation, started(make(discharges, kind, cells=2, initial_perturbation=3.0)).observation()
+    )
+
+
 def test_the_cost_is_limited(discharges):
     task = started(make(discharges, cells=2, cost_limit=0.2))
     measured = task.now.measured.copy()
@@ -317,6 +341,7 @@ def test_a_share_of_the_episodes_starts_at_the_first_sample(discharges):
         ("consistency", -0.1, "consistency"),
         ("sensor_offset", np.inf, "sensor_offset must be finite, got inf"),
         ("sensor_gain", 0.0, "sensor_gain must be finite and greater than 0, got 0.0"),
+        ("charge_weight", -0.1, "charge_weight must be finite and at least 0, got -0.1"),
         ("cost_limit", 0.0, "cost_limit must be finite and greater than 0, got 0.0"),
         ("load", "sine", "load must be one of"),
         ("mismatch", -0.1, "mismatch"),
