@@ -15,6 +15,7 @@ from scipy.optimize import least_squares
 from battery_env.arrays import BoolArray, FloatArray
 from battery_env.checks import check_gain_sd, check_positive
 from battery_env.electrochemistry import CellParameters
+from battery_env.electrochemistry.cell import BULK_RATE, SURFACE_RATE
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS, TANGENT_NAMES
 from battery_env.estimates import Estimate, EstimateTrace
 from battery_env.estimators.base import Estimator, check_bounds
@@ -663,10 +664,17 @@ class LeastSquares(Estimator):
     def _constants(self, values: Mapping[str, float]) -> dict[str, float]:
         constants = {}
         for name in self.nuisance.keys() & set(RATE_CONSTANTS):
-            # a step of the search may go far; no time constant is below a step of the model, at which it is stable
+            # a step of the search may go far, but the model is stable: nothing in it changes by more than all in one step
             constant = getattr(self.model.cell, name) * float(np.exp(max(min(values[name], _REACH), -_REACH)))
-            constants[name] = max(constant, self.model.dt_s) if name in ("to", "tsn", "tsp") else constant
+            constants[name] = max(constant, self._least_stable(name))
         return constants
+
+    def _least_stable(self, name: str) -> float:
+        cell, dt_s = self.model.cell, self.model.dt_s
+        if name == "tDiffusion":
+            rates = cell.packed.constants[0, [BULK_RATE, SURFACE_RATE]]
+            return float(cell.tDiffusion * dt_s * rates.sum())
+        return dt_s if name in ("to", "tsn", "tsp") else 0.0
 
     def _least_q_C(self, problem: _Problem, values: Mapping[str, float]) -> tuple[float, float]:
         """The least q_mobile that the record allows, and its derivative by the logarithm of ``tDiffusion``."""

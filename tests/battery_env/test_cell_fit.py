@@ -186,6 +186,17 @@ class TestRealCells:
         assert np.sum(rmse_V[1::2]) < 0.5 * np.sum(rmse_V[::2])
         assert np.mean(late[1::2]) < 0.5 * np.mean(late[::2])
 
+    def test_a_search_for_nuisance_constants_never_leaves_what_is_stable(self, b0005_fit):
+        # told of no error of the model, the search for a quarter of this discharge tries diffusion of less than a second
+        record = load_nasa_discharges("B0006")[104].loaded_part(2.7)
+        start_s, end_s = record.time_s[[0, -1]]
+        nuisance = {"kn": 0.4, "tDiffusion": 0.4, "to": 0.4, "tsn": 0.4, "offset_V": 0.006}
+        calibrator = LeastSquares(cell=b0005_fit.cell, thermal=True, nuisance=nuisance, prior_q_mobile_C=(6000.0, 1155.0))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            estimate = calibrator.estimate(record.until(start_s + 0.25 * (end_s - start_s)))
+        assert np.isfinite(estimate.q_mobile) and not estimate.settled
+
     def test_a_forecast_takes_the_model_of_a_fit(self, b0005_fit):
         calibrator = b0005_fit.calibrator()
         discharge = load_nasa_discharges("B0006")[60]
