@@ -130,7 +130,8 @@ def _add_calibration(group: argparse._ArgumentGroup) -> None:
         "--policy",
         type=Path,
         metavar="FILE.onnx",
-        help="what --method policy follows (default: the policy that comes with the package)",
+        help="what --method policy follows, with the constants of --cell if it was trained with them (default: the "
+        "policy that comes with the package, which has learned on a new 18650)",
     )
     group.add_argument(
         "--parameters",
