@@ -66,15 +66,12 @@ def _check_size(cell: CellParameters) -> None:
 
 
 def _checked_range(process_noise_V: float | Sequence[float]) -> tuple[float, float]:
-    if not isinstance(process_noise_V, Sequence):
-        check_not_negative(process_noise_V=process_noise_V)
-        return process_noise_V, process_noise_V
-    if len(process_noise_V) != 2 or not 0.0 < process_noise_V[0] <= process_noise_V[1] < np.inf:
-        raise ValueError(
-            "process_noise_V must be one value, or (least, greatest) in V per root of a second with 0 < least <= greatest, "
-            f"got {process_noise_V!r}"
-        )
-    return process_noise_V[0], process_noise_V[1]
+    limits = process_noise_V if isinstance(process_noise_V, Sequence) else (process_noise_V, process_noise_V)
+    if len(limits) != 2 or limits[0] > limits[1]:
+        raise ValueError(f"process_noise_V must be one value or (least, greatest), got {process_noise_V!r}")
+    for limit in limits:
+        check_not_negative(process_noise_V=limit)
+    return limits[0], limits[1]
 
 
 class VoltageTask(CalibrationTask):
@@ -347,10 +344,8 @@ class VoltageTask(CalibrationTask):
         voltage_V = self._voltage_V[row, :length]
         least_V, greatest_V = self.process_noise_V
         if greatest_V > 0.0:
-            drawn_V = greatest_V
-            if least_V < greatest_V:
-                drawn_V = float(np.exp(generator.uniform(np.log(least_V), np.log(greatest_V))))
-            voltage_V += self.readings.process_noise_V(drawn_V, generator.standard_normal((3, length)))
+            process_noise_V = greatest_V if least_V == greatest_V else generator.uniform(least_V, greatest_V)
+            voltage_V += self.readings.process_noise_V(process_noise_V, generator.standard_normal((3, length)))
         noise_V = self.sensors.draw_noise_V(generator)
         noise = generator.standard_normal(length) if noise_V > 0.0 else np.zeros(length)
         errors = self.sensors.draw_biases(generator, noise_V)
