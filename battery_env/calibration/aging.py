@@ -107,7 +107,7 @@ class BatteryAging(VoltageTask):
         decisions_per_cycle: int = 8,
         reading_s: float = 10.0,
         new_readings: tuple[int, int] = (10, 60),
-        process_noise_V: float | tuple[float, float] = 0.0,
+        process_noise_V: float = 0.0,
         start: Literal["random", "new_cell", "true"] = "new_cell",
         consistency: float = 0.0,
         cost: Cost = "misfit",

@@ -65,15 +65,6 @@ def _check_size(cell: CellParameters) -> None:
             )
 
 
-def _checked_range(process_noise_V: float | Sequence[float]) -> tuple[float, float]:
-    limits = process_noise_V if isinstance(process_noise_V, Sequence) else (process_noise_V, process_noise_V)
-    if len(limits) != 2 or limits[0] > limits[1]:
-        raise ValueError(f"process_noise_V must be one value or (least, greatest), got {process_noise_V!r}")
-    for limit in limits:
-        check_not_negative(process_noise_V=limit)
-    return limits[0], limits[1]
-
-
 class VoltageTask(CalibrationTask):
     """
     Find ``parameters`` from voltage and current, in ``cells`` episodes side by side.
@@ -101,7 +92,7 @@ class VoltageTask(CalibrationTask):
         episode_steps: int = 8,
         reading_s: float = 10.0,
         new_readings: tuple[int, int] = (0, 29),
-        process_noise_V: float | tuple[float, float] = 0.0,
+        process_noise_V: float = 0.0,
         start: Literal["random", "new_cell", "true"] = "random",
         consistency: float = 0.0,
         cost: Cost = "misfit",
@@ -115,7 +106,7 @@ class VoltageTask(CalibrationTask):
         **sensors: Any,
     ) -> None:
         check_counts(episode_steps=episode_steps)
-        check_not_negative(consistency=consistency, nuisance=nuisance)
+        check_not_negative(consistency=consistency, process_noise_V=process_noise_V, nuisance=nuisance)
         if not 0 <= new_readings[0] <= new_readings[1]:
             raise ValueError(f"new_readings must be (fewest, most) with 0 <= fewest <= most, got {new_readings!r}")
         if start not in ("random", "new_cell", "true"):
@@ -139,7 +130,7 @@ class VoltageTask(CalibrationTask):
         self.cells, self.dataset, self.readings = cells, dataset, readings
         self.episode_steps, self.new_readings = episode_steps, new_readings
         self.sensors = replace(SENSORS, **sensors)
-        self.process_noise_V, self.first_estimate, self.consistency = _checked_range(process_noise_V), start, consistency
+        self.process_noise_V, self.first_estimate, self.consistency = process_noise_V, start, consistency
         self.decision_s = readings.interval_s * (sum(new_readings) / 2.0)
         self._previous = len(parameters) if consistency > 0.0 else 0
         self.observation_size = 6 * STRETCHES + 4 + len(parameters) + self._previous
@@ -342,10 +333,8 @@ class VoltageTask(CalibrationTask):
         """The noise of the cell, and the errors of the sensors, over one discharge."""
         length = int(self.readings.count[discharge])
         voltage_V = self._voltage_V[row, :length]
-        least_V, greatest_V = self.process_noise_V
-        if greatest_V > 0.0:
-            process_noise_V = greatest_V if least_V == greatest_V else generator.uniform(least_V, greatest_V)
-            voltage_V += self.readings.process_noise_V(process_noise_V, generator.standard_normal((3, length)))
+        if self.process_noise_V > 0.0:
+            voltage_V += self.readings.process_noise_V(self.process_noise_V, generator.standard_normal((3, length)))
         noise_V = self.sensors.draw_noise_V(generator)
         noise = generator.standard_normal(length) if noise_V > 0.0 else np.zeros(length)
         errors = self.sensors.draw_biases(generator, noise_V)

@@ -92,7 +92,7 @@ class BatteryVoltageJoint(VoltageTask):
     | ``offset_V`` | 0.010 | bound of the voltage sensor's offset, V; known to the agent |
     | ``current_gain`` | 0 | bound of the relative error of the current sensor's gain |
     | ``current_offset_A`` | 0 | bound of the current sensor's offset, A |
-    | ``process_noise_V`` | 0 | noise on Vo, Vsn and Vsp of the cell, V per root of a second; of two values, least and greatest, one between is drawn for each discharge |
+    | ``process_noise_V`` | 0 | noise on Vo, Vsn and Vsp of the cell, V per root of a second |
     | ``measured`` | ``"current"`` | or ``"power"``: the current is the measured power over the measured voltage |
     | ``start`` | ``"random"`` | first estimate; or ``"new_cell"``, ``"true"`` |
     | ``consistency`` | 0 | cost of a change of the action per unit of its length (the paper's consistency penalty); above 0 the action before is appended to the observation |
