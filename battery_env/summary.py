@@ -51,18 +51,15 @@ _PRETRAINED = {
     frozenset({"r_o"}): "BatteryVoltageRo-v0",
     frozenset(PARAMETER_NAMES): "BatteryVoltageJoint-v0",
 }
-# What a policy cannot be told: it has learned on one model, and states no uncertainty. One of the user's own may have learned
-# on the model of a cell of the user's own.
+# What a policy cannot be told: it has learned on one model, and states no uncertainty.
 _NOT_FOR_POLICIES = (
     "prior_q_mobile_C",
     "mismatch_V",
     "current_gain_sd",
     "ambient_C",
-    "cell",
     "q_mobile_bounds_C",
     "initial_soc",
 )
-_OWN = {"cell": ", or a policy of your own that was trained with these constants"}
 
 
 @dataclass(frozen=True)
@@ -122,8 +119,13 @@ class Settings:
         if self.method == "policy":
             defaults = {field.name: field.default for field in fields(self)}
             for name in _NOT_FOR_POLICIES:
-                if getattr(self, name) != defaults[name] and not (name == "cell" and self.policy is not None):
-                    raise ValueError(f"a policy takes no {name}: leave it out, or take another method{_OWN.get(name, '')}")
+                if getattr(self, name) != defaults[name]:
+                    raise ValueError(f"a policy takes no {name}: leave it out, or take another method")
+            if self.cell is not None and self.policy is None:
+                raise ValueError(
+                    "the policy that comes with the package takes no cell: it has learned on a new 18650. Take another "
+                    "method, or a policy of your own that was trained with these constants"
+                )
         elif self.policy is not None:
             raise ValueError(f"a policy is for the method policy, got {self.method!r}")
         self.calibrator(self.cell or NEW_CELL)
@@ -161,7 +163,7 @@ class Settings:
         :raises ValueError: for an argument out of range
         """
         if self.method == "policy":
-            return self._policy(cell)
+            return self._policy()
         calibrator = LeastSquares if self.method == "least-squares" else ExtendedKalmanFilter
         bounds: dict[str, Any] = {} if self.q_mobile_bounds_C is None else {"q_mobile_bounds_C": self.q_mobile_bounds_C}
         return calibrator(
@@ -175,15 +177,22 @@ class Settings:
             **bounds,
         )
 
-    def _policy(self, cell: CellParameters) -> PolicyEstimator:
+    def _policy(self) -> PolicyEstimator:
         if self.policy is None:
             env_id = _PRETRAINED[frozenset(check_parameters(self.parameters))]
-            policy, options = pretrained_policy(env_id)
+            policy, options = pretrained_policy(env_id, recorded=True)
         else:
             policy, options = policy_of_file(self.policy)
             env_id = policy.env_id
-            if self.cell is not None:
-                options["cell"] = cell
+            if options.get("cell") != self.cell:
+                raise ValueError(
+                    f"{self.policy} has learned on "
+                    + (
+                        "the constants of a cell, which are others: give its cell (--cell)"
+                        if "cell" in options
+                        else "a new 18650, or the file beside it does not say on which constants ('cell' of its 'options')"
+                    )
+                )
         estimator = PolicyEstimator(policy, env_id, **options)
         if set(estimator.parameters) != set(self.parameters):
             asked, found = " and ".join(self.parameters), " and ".join(estimator.parameters)

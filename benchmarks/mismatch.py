@@ -1,6 +1,6 @@
 """
-Who calibrates best from voltage and current if the model is a little wrong: the policy that comes with ``battery_env``, the
-fit that it is shown without any policy, least squares, and Kalman filters; on simulated cells and on both recorded ones.
+Who calibrates best from voltage and current if the model is a little wrong: the policies that come with ``battery_env``, the
+fit that they are shown without any policy, least squares, and Kalman filters; on simulated cells and on both recorded ones.
 
 .. code-block:: bash
 
@@ -76,6 +76,7 @@ def _least_squares(**more: Any) -> LeastSquares:
 #: By name, what is compared. Least squares with nuisances are told the truth: which constants are wrong, and how much.
 CALIBRATORS: dict[str, Callable[[], Estimator]] = {
     "LAC, pretrained": lambda: PolicyEstimator.pretrained(ENV_ID),
+    "LAC, pretrained for recorded cells": lambda: PolicyEstimator.pretrained(ENV_ID, recorded=True),
     "the fit that LAC sees, no policy": _fit_alone,
     "least squares, two parameters": lambda: _least_squares(mismatch_V=MISMATCH_V),
     "least squares, nuisances, offset": lambda: _least_squares(
@@ -86,7 +87,7 @@ CALIBRATORS: dict[str, Callable[[], Estimator]] = {
 }
 #: Those that are run on recorded cells too.
 ON_CELLS: dict[str, Callable[[], Estimator]] = {
-    "LAC, pretrained": CALIBRATORS["LAC, pretrained"],
+    **{name: CALIBRATORS[name] for name in ("LAC, pretrained", "LAC, pretrained for recorded cells")},
     "the fit that LAC sees, no policy": _fit_alone,
     "least squares": real_calibrator,
     "Kalman filter": lambda: ExtendedKalmanFilter(thermal=True, mismatch_V=0.05),
@@ -231,11 +232,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     study = Study(parser, arguments)
     if study.chosen.discharges > 300:
         parser.error("--discharges must lie within 1 .. 300")
-    policy = pretrained_card(ENV_ID)["sha256"][:8]
-    study.configuration |= {"policy": policy, "window_every_s": WINDOW_EVERY_S, "every_recorded_discharge": _EVERY}
+    policies = [pretrained_card(ENV_ID, recorded)["sha256"][:8] for recorded in (False, True)]
+    study.configuration |= {"policies": policies, "window_every_s": WINDOW_EVERY_S, "every_recorded_discharge": _EVERY}
 
     def made(calibrator: str) -> str:
-        return policy if calibrator.startswith("LAC") else ""
+        return policies["recorded" in calibrator] if calibrator.startswith("LAC") else ""
 
     parts = [
         {

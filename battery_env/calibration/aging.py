@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Any, Literal
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from battery_env.calibration.task import check_counts
 from battery_env.calibration.voltage import Cost, VoltageTask
-from battery_env.electrochemistry import FloatArray
+from battery_env.electrochemistry import CellParameters, FloatArray
 from battery_env.estimators.base import Record
 from battery_env.loads import RandomPiecewise
 from battery_env.trajectories import TrajectoryDataset
@@ -21,7 +22,7 @@ LIVES = {"train": 70, "test": 30}
 
 
 @lru_cache(maxsize=4)
-def simulated_lives(lives: int, cycles: int, seed: int) -> TrajectoryDataset:
+def simulated_lives(lives: int, cycles: int, seed: int, cell: CellParameters | None = None) -> TrajectoryDataset:
     """
     Lives of cells, each a discharge a cycle under a piecewise-constant power of 2 to 8 W of its own.
 
@@ -32,6 +33,7 @@ def simulated_lives(lives: int, cycles: int, seed: int) -> TrajectoryDataset:
     :param lives: number of cells
     :param cycles: discharges of each
     :param seed: of ages, wear and loads
+    :param cell: constants of the cells; ``None``: the new cell's
     :return: the discharges, life after life, each in the order of its cycles
     """
     rng = np.random.default_rng(seed)
@@ -49,6 +51,7 @@ def simulated_lives(lives: int, cycles: int, seed: int) -> TrajectoryDataset:
         r_o.ravel(),
         [sampler(rng) for _ in range(lives * cycles)],
         np.arange(lives * cycles),
+        cell=cell,
         description={"made_by": "simulated_lives", "lives": lives, "cycles": cycles, "seed": seed},
     )
 
@@ -112,14 +115,15 @@ class BatteryAging(VoltageTask):
         consistency: float = 0.0,
         cost: Cost = "misfit",
         split: Literal["train", "test"] = "train",
-        dataset: Sequence[Record] | None = None,
+        cell: CellParameters | None = None,
+        dataset: Sequence[Record] | str | os.PathLike[str] | None = None,
         **sensors: Any,
     ) -> None:
         check_counts(cycles=cycles, decisions_per_cycle=decisions_per_cycle)
         if split not in LIVES:
             raise ValueError(f"split must be one of {tuple(LIVES)}, got {split!r}")
         if dataset is None:
-            dataset = simulated_lives(LIVES[split], cycles, seed=list(LIVES).index(split))
+            dataset = simulated_lives(LIVES[split], cycles, seed=list(LIVES).index(split), cell=cell)
         else:
             self._refuse_beside_a_dataset(split=split)
         super().__init__(
@@ -131,6 +135,7 @@ class BatteryAging(VoltageTask):
             start=start,
             consistency=consistency,
             cost=cost,
+            cell=cell,
             dataset=dataset,
             **sensors,
         )
@@ -184,7 +189,13 @@ class BatteryAging(VoltageTask):
         return task
 
     @classmethod
-    def _discharges_of_an_episode(cls, options: Mapping[str, Any]) -> int:
+    def discharges_of_an_episode(cls, options: Mapping[str, Any]) -> int:
+        """
+        How many discharges an episode goes through.
+
+        :param options: of the task
+        :return: the cycles of a life
+        """
         return int(options.get("cycles", cls.options()["cycles"]))
 
     @property

@@ -52,8 +52,9 @@ def standard_dataset(
     ``recorded``    the power of the 336 discharges of the bundled cells, 5 to 9 W 4000-7600 C  0.1-0.3 ohm    1000
     =============== ============================================================== ============ ============== ==========
 
-    ``paper`` is trimmed to 5 .. 95 % of each discharge and, for one parameter at 1 s without mismatch, the paper's own grid
-    of 5511; the others run from full charge to the end of discharge. A parameter that does not age is that of ``cell``.
+    ``paper`` is trimmed to 5 .. 95 % of each discharge and, for one parameter of the new cell at 1 s without mismatch, the
+    paper's own grid of 5511; the others run from full charge to the end of discharge. A parameter that does not age is that
+    of ``cell``.
 
     :param parameter: what ages: ``"q_mobile"``, ``"r_o"`` or ``"joint"``
     :param load: kind of load

@@ -19,6 +19,20 @@ FloatSpace = gym.Space[NDArray[np.float32]]
 _RENDER_MODES = ["rgb_array"]
 
 
+def task_class(task: str | type[CalibrationTask]) -> type[CalibrationTask]:
+    """
+    The class of a task.
+
+    :param task: itself, or where it is, as ``"module:name"``
+    :return: the class
+    """
+    if not isinstance(task, str):
+        return task
+    module, _, name = task.partition(":")
+    found: type[CalibrationTask] = getattr(import_module(module), name)
+    return found
+
+
 def new_task(task: str | type[CalibrationTask], cells: int, options: Mapping[str, Any]) -> CalibrationTask:
     """
     A task for some cells.
@@ -30,10 +44,7 @@ def new_task(task: str | type[CalibrationTask], cells: int, options: Mapping[str
     :raises TypeError: for an option that the task does not have
     :raises ValueError: for values out of range
     """
-    kind: Any = task
-    if isinstance(task, str):
-        module, _, name = task.partition(":")
-        kind = getattr(import_module(module), name)
+    kind: Any = task_class(task)  # of a class of its own, not of the base
     known = kind.options()
     unknown = options.keys() - known.keys()
     if unknown:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any, Protocol
 
 import gymnasium as gym
@@ -10,14 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from battery_env.calibration.aging import BatteryAging
-from battery_env.calibration.env import CalibrationEnv
+from battery_env.calibration.env import CalibrationEnv, task_class
 from battery_env.calibration.pretrained import pretrained_policy
 from battery_env.calibration.streaming import ReadingsSoFar, resume
+from battery_env.calibration.task import CalibrationTask
 from battery_env.calibration.voltage import VoltageTask
 from battery_env.electrochemistry import NEW_CELL, STATE_SIZE, UNCERTAIN_CONSTANTS
 from battery_env.estimators.base import Estimate, EstimateTrace, ModelNow, OnlineEstimator, Record
 from battery_env.record_model import RecordModel
-from battery_env.records import check_drawn_charge, check_record, check_sample, drawn
+from battery_env.records import Samples, check_drawn_charge, check_record, check_sample, drawn
 
 _UNSURE = "A policy states no uncertainty."
 # A full cell takes no more charge than this share of that of a new one.
@@ -38,6 +40,18 @@ class Predictor(Protocol):
         :return: actions, shape (n, action_size), and a state that is not used
         """
         ...
+
+
+def _without_data(env_id: str, options: dict[str, Any]) -> dict[str, Any]:
+    """Options of an environment that simulates nothing, where it needs no simulation: only its task is asked for."""
+    task = gym.spec(env_id).kwargs.get("task")
+    kind = None if task is None else task_class(task)
+    if kind is None or not issubclass(kind, VoltageTask):
+        return options
+    reading_s = float({**kind.options(), **options}["reading_s"])
+    time_s = np.array([0.0, 1.0, 2.0, 3.0]) * reading_s
+    blank = Samples(time_s, np.full(4, NEW_CELL.VEOD), np.zeros(4))
+    return {**options, "cost": "misfit", "dataset": [blank] * kind.discharges_of_an_episode(options)}
 
 
 class PolicyEstimator(OnlineEstimator):
@@ -64,7 +78,7 @@ class PolicyEstimator(OnlineEstimator):
         self.policy = policy
         self.env_id = env_id
         self.options = options
-        task = self.environment(env_id, **options).task
+        task = self.environment(env_id, **_without_data(env_id, options)).task
         self.task_class = type(task)
         self.parameters = task.parameters
         self.cell = task.readings.cell if isinstance(task, VoltageTask) else NEW_CELL
@@ -74,18 +88,22 @@ class PolicyEstimator(OnlineEstimator):
         self.reset()
 
     @classmethod
-    def pretrained(cls, env_id: str = "BatteryVoltageJoint-v0", decision_s: float = 60.0) -> PolicyEstimator:
+    def pretrained(
+        cls, env_id: str = "BatteryVoltageJoint-v0", decision_s: float = 60.0, *, recorded: bool = False
+    ) -> PolicyEstimator:
         """
         A policy of LAC that comes with the package, with the options of the task that it was trained on. What made it and what
         it is worth says :func:`~battery_env.calibration.pretrained.pretrained_card`.
 
         :param env_id: id of a voltage-only environment of single discharges
         :param decision_s: time between two estimates, s, a multiple of the interval between its readings
+        :param recorded: whether for recorded cells: one that has learned on a model whose error wanders. By default one that
+            has learned on a model with wrong constants, as simulated cells have
         :return: the estimator
         :raises ValueError: for another id, or a time out of range
         :raises ImportError: without the extra ``battery_env[onnx]``
         """
-        policy, options = pretrained_policy(env_id)
+        policy, options = pretrained_policy(env_id, recorded)
         return cls(policy, env_id, decision_s, **options)
 
     @staticmethod
@@ -157,9 +175,14 @@ class PolicyEstimator(OnlineEstimator):
         q_mobile, r_o = self._now.tolist()
         return Estimate(q_mobile, r_o, settled=False, reason=_UNSURE)
 
+    def _follow(self, records: Sequence[Record], every: int) -> CalibrationTask:
+        # a data set may know its own constants, of which the policy must not learn
+        cell = {"cell": self.cell} if issubclass(self.task_class, VoltageTask) else {}
+        return self.task_class.follow(records, every, **{**self.options, **cell})
+
     def _decide(self, due: int) -> None:
         """One decision, on all readings up to the time when it was due."""
-        task = self.task_class.follow([self._readings.record(self.dt_s)], due * self._every, **self.options)
+        task = self._follow([self._readings.record(self.dt_s)], due * self._every)
         self._logarithms = resume(task, self._now, self._action, self._logarithms)
         action, _ = self.policy.predict(task.observation(), deterministic=True)
         task.advance(np.asarray(action))
@@ -178,8 +201,13 @@ class PolicyEstimator(OnlineEstimator):
         return ModelNow(model.cell, False, self.dt_s, state, np.append(self._now, 0.0), np.zeros((0, STATE_SIZE + 3)))
 
     def _made_with(self) -> dict[str, Any]:
-        options = {name: repr(value) for name, value in self.options.items()}
-        return {"estimator": type(self).__name__, "env_id": self.env_id, "decision_s": self.decision_s, "options": options}
+        return {
+            "estimator": type(self).__name__,
+            "env_id": self.env_id,
+            "decision_s": self.decision_s,
+            "cell": asdict(self.cell),
+            "options": {name: repr(value) for name, value in self.options.items() if name != "cell"},
+        }
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         progress = np.array([self._drawn_C, self._decisions, *self._now])
@@ -218,7 +246,7 @@ class PolicyEstimator(OnlineEstimator):
         :param records: discharges; a :class:`~battery_env.trajectories.TrajectoryDataset` is such a sequence
         :return: one trace per discharge, in the same order
         """
-        task = self.task_class.follow(records, self._every, **self.options)
+        task = self._follow(records, self._every)
         made = []
         while (running := ~task.truncated()).any():
             discharge, time_s = task.seen()

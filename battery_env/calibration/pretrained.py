@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from battery_env.calibration.onnx_policy import OnnxPolicy
+from battery_env.electrochemistry import CellParameters
 
 _PACKAGE = "battery_env.pretrained_policies"
+_RECORDED = "_recorded"
 
 
 def pretrained_ids() -> tuple[str, ...]:
@@ -18,42 +20,58 @@ def pretrained_ids() -> tuple[str, ...]:
 
     :return: their ids
     """
-    names = sorted(entry.name for entry in files(_PACKAGE).iterdir() if entry.name.endswith(".onnx"))
-    return tuple(name.removesuffix(".onnx") for name in names)
+    names = (entry.name for entry in files(_PACKAGE).iterdir() if entry.name.endswith(".onnx"))
+    return tuple(sorted({name.removesuffix(".onnx").removesuffix(_RECORDED) for name in names}))
 
 
-def pretrained_card(env_id: str) -> dict[str, Any]:
+def file_stem(env_id: str, recorded: bool) -> str:
+    """
+    What the files of a policy are called.
+
+    :param env_id: id of an environment
+    :param recorded: whether it is the one for recorded cells
+    :return: the name without its suffix
+    """
+    return env_id + (_RECORDED if recorded else "")
+
+
+def pretrained_card(env_id: str, recorded: bool = False) -> dict[str, Any]:
     """
     What made a policy, and what it is worth: ``command``, ``recipe`` (seed, hyperparameters, data), ``options`` (of the task,
     which it needs when it is used), ``scores`` and ``versions``.
 
     :param env_id: id of an environment
+    :param recorded: as of :func:`pretrained_policy`
     :return: the JSON file beside the policy
     :raises ValueError: if none comes with the package
     """
     _check(env_id)
-    card: dict[str, Any] = json.loads(files(_PACKAGE).joinpath(f"{env_id}.json").read_text(encoding="utf-8"))
+    card: dict[str, Any] = json.loads(
+        files(_PACKAGE).joinpath(f"{file_stem(env_id, recorded)}.json").read_text(encoding="utf-8")
+    )
     return card
 
 
-def pretrained_policy(env_id: str) -> tuple[OnnxPolicy, dict[str, Any]]:
+def pretrained_policy(env_id: str, recorded: bool = False) -> tuple[OnnxPolicy, dict[str, Any]]:
     """
     A policy that comes with the package, run by onnxruntime: no torch, and no pickle.
 
     :param env_id: id of an environment
+    :param recorded: whether for recorded cells: one that has learned on a model whose error wanders. By default one that has
+        learned on a model with wrong constants, as simulated cells have
     :return: the policy, and the options of the task that it needs
     :raises ValueError: if none comes with the package
     :raises ImportError: without the extra ``battery_env[onnx]``
     """
     _check(env_id)
     with as_file(files(_PACKAGE)) as folder:
-        return policy_of_file(folder / f"{env_id}.onnx")
+        return policy_of_file(folder / f"{file_stem(env_id, recorded)}.onnx")
 
 
 def policy_of_file(path: Path) -> tuple[OnnxPolicy, dict[str, Any]]:
     """
     A policy from a file, with the options of its task from ``options`` of a JSON file of the same name beside it, if there is
-    one.
+    one. The constants of a cell (``cell``) are written there by name.
 
     :param path: ONNX file
     :return: the policy, and the options
@@ -66,6 +84,8 @@ def policy_of_file(path: Path) -> tuple[OnnxPolicy, dict[str, Any]]:
         return policy, {}
     try:
         options = dict(json.loads(card.read_text(encoding="utf-8"))["options"])
+        if "cell" in options:
+            options["cell"] = CellParameters.of_mapping(options["cell"])
     except (ValueError, TypeError, KeyError) as error:
         raise ValueError(f"{card} has to be an object in JSON with the options of the task as 'options': {error!r}") from error
     return policy, options

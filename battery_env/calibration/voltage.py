@@ -21,7 +21,7 @@ from battery_env.calibration.data import LoadKind, Split, opened, standard_datas
 from battery_env.calibration.nuisance import NuisanceFit
 from battery_env.calibration.readings import Readings, explain
 from battery_env.calibration.task import OBSERVATION_LIMIT, CalibrationTask, check_counts, check_not_negative, checked_action
-from battery_env.electrochemistry import NEW_CELL, CellParameters, FloatArray
+from battery_env.electrochemistry import CellParameters, FloatArray, check_cell
 from battery_env.records import Record
 from battery_env.sensors import RandomSensorErrors
 from battery_env.trajectories import TrajectoryDataset
@@ -53,16 +53,6 @@ _TIME_SCALE_S = 3000.0
 @lru_cache(maxsize=4)
 def _readings_of_a_dataset(dataset: TrajectoryDataset, reading_s: float, cell: CellParameters) -> Readings:
     return Readings.of(dataset, reading_s, dataset.dt_s, cell)
-
-
-def _check_size(cell: CellParameters) -> None:
-    # the ranges of estimates and actions, and the scales of observations, are those of an 18650
-    for (name, (low, high)), value in zip(ESTIMATE_RANGES.items(), (cell.q_mobile, cell.r_o), strict=True):
-        if not low <= value <= high:
-            raise ValueError(
-                f"{name} of cell must lie within {low:g} .. {high:g}, where the task looks for estimates, got {value:g}: "
-                "it is made for cells of the size of an 18650. Take least squares or the filter for others."
-            )
 
 
 class VoltageTask(CalibrationTask):
@@ -115,9 +105,11 @@ class VoltageTask(CalibrationTask):
             raise ValueError(f"cost must be one of {get_args(Cost)}, got {cost!r}")
         data: dict[str, Any] = {"load": load, "split": split, "dt_s": dt_s, "mismatch": mismatch}
         dataset = opened(dataset)
-        if cell is None:
-            cell = dataset.cell if isinstance(dataset, TrajectoryDataset) else NEW_CELL
-        _check_size(cell)
+        if cell is not None:
+            self._check_reach(check_cell(cell))
+        elif isinstance(dataset, TrajectoryDataset):
+            cell = dataset.cell
+        cell = check_cell(cell)
         if dataset is None:
             dataset = standard_dataset("joint" if len(self.parameters) == 2 else self.parameters[0], **data, cell=cell)
         else:
@@ -140,6 +132,7 @@ class VoltageTask(CalibrationTask):
         self._step = np.array([LARGEST_STEPS[name] for name in parameters])
 
         self._new: FloatArray = np.array([cell.q_mobile, cell.r_o])
+        self._new[self._columns] = np.clip(self._new[self._columns], self._low, self._high)
         # the true parameters of the discharges, or the new cell's where they are not known
         true = np.column_stack([readings.q_mobile, readings.r_o])
         is_unknown = np.isnan(true)
@@ -169,6 +162,15 @@ class VoltageTask(CalibrationTask):
         if nuisance > 0.0:
             self._fit = NuisanceFit(cells, readings, parameters, ESTIMATE_RANGES, self.sensors.offset_V, nuisance)
             self.observation_size += self._fit.observation_size
+
+    def _check_reach(self, cell: CellParameters) -> None:
+        for name in self.parameters:
+            (low, high), value = ESTIMATE_RANGES[name], getattr(cell, name)
+            if not low <= value <= high:
+                raise ValueError(
+                    f"{name} of cell must lie within {low:g} .. {high:g}, where the task looks for it, got {value:g}. "
+                    "Take least squares or the filter for such cells."
+                )
 
     @classmethod
     def options(cls) -> dict[str, Any]:
@@ -249,7 +251,7 @@ class VoltageTask(CalibrationTask):
         :param options: of the task, but for those of its data
         :return: the task, at its first observations
         """
-        discharges = cls._discharges_of_an_episode(options)
+        discharges = cls.discharges_of_an_episode(options)
         task = cls(len(records) // discharges, **{"start": "new_cell", **options, "dataset": records, "cost": "misfit"})
         task._every = every
         for row in range(task.cells):
@@ -259,7 +261,13 @@ class VoltageTask(CalibrationTask):
         return task
 
     @classmethod
-    def _discharges_of_an_episode(cls, options: Mapping[str, Any]) -> int:
+    def discharges_of_an_episode(cls, options: Mapping[str, Any]) -> int:
+        """
+        How many discharges an episode goes through.
+
+        :param options: of the task
+        :return: their number
+        """
         return 1
 
     def steps_between(self, decision_s: float) -> int:

@@ -664,7 +664,7 @@ class LeastSquares(Estimator):
     def _constants(self, values: Mapping[str, float]) -> dict[str, float]:
         constants = {}
         for name in self.nuisance.keys() & set(RATE_CONSTANTS):
-            # a step of the search may go far, but the model is stable: nothing in it changes by more than all in one step
+            # a step of the search may go far, but explicit Euler is stable only for rates below 2 / dt
             constant = getattr(self.model.cell, name) * float(np.exp(max(min(values[name], _REACH), -_REACH)))
             constants[name] = max(constant, self._least_stable(name))
         return constants
@@ -673,8 +673,8 @@ class LeastSquares(Estimator):
         cell, dt_s = self.model.cell, self.model.dt_s
         if name == "tDiffusion":
             rates = cell.packed.constants[0, [BULK_RATE, SURFACE_RATE]]
-            return float(cell.tDiffusion * dt_s * rates.sum())
-        return dt_s if name in ("to", "tsn", "tsp") else 0.0
+            return float(0.5 * cell.tDiffusion * dt_s * rates.sum())
+        return 0.5 * dt_s if name in ("to", "tsn", "tsp") else 0.0
 
     def _least_q_C(self, problem: _Problem, values: Mapping[str, float]) -> tuple[float, float]:
         """The least q_mobile that the record allows, and its derivative by the logarithm of ``tDiffusion``."""

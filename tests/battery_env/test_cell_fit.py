@@ -197,6 +197,13 @@ class TestRealCells:
             estimate = calibrator.estimate(record.until(start_s + 0.25 * (end_s - start_s)))
         assert np.isfinite(estimate.q_mobile) and not estimate.settled
 
+    @pytest.mark.parametrize("dt_s", [1.0, 10.0])
+    def test_and_finds_all_that_is(self, dt_s):
+        cell = NEW_CELL.replace(tDiffusion=0.6 * NEW_CELL.tDiffusion)  # at 10 s half of what one step can follow
+        record = simulate(8.0, 6000.0, 0.15, dt=dt_s, cell=cell)
+        estimate = LeastSquares(dt_s=dt_s, mismatch_V=0.0, nuisance={"tDiffusion": 0.4}).estimate(record)
+        assert estimate.q_mobile == pytest.approx(6000.0, abs=1.0) and estimate.settled
+
     def test_a_forecast_takes_the_model_of_a_fit(self, b0005_fit):
         calibrator = b0005_fit.calibrator()
         discharge = load_nasa_discharges("B0006")[60]
@@ -246,13 +253,20 @@ class TestFiles:
             read_cell(tmp_path / "other.json")
 
     def test_the_policy_that_comes_with_the_package_has_no_place_for_a_fit(self, fit):
-        with pytest.raises(ValueError, match=r"a policy takes no cell: .* policy of your own that was trained with these"):
+        with pytest.raises(ValueError, match=r"the package takes no cell: .* policy of your own that was trained with these"):
             Settings.for_cell(fit, method="policy")
 
     def test_a_policy_of_ones_own_takes_the_constants_and_the_cut_off_of_a_fit(self, fit, tmp_path):
         policy, card = tmp_path / "mine.onnx", pretrained_card("BatteryVoltageJoint-v0")
         policy.write_bytes(files("battery_env.pretrained_policies").joinpath("BatteryVoltageJoint-v0.onnx").read_bytes())
         policy.with_suffix(".json").write_text(json.dumps({"options": card["options"]}))
+        with pytest.raises(ValueError, match=r"mine\.onnx has learned on a new 18650, or the file beside it does not say"):
+            Settings.for_cell(fit, method="policy", policy=policy)
+        options = {**card["options"], "cell": dataclasses.asdict(fit.cell)}
+        policy.with_suffix(".json").write_text(json.dumps({"options": options}))
+        for cell in ({}, {"cell": OTHER}):
+            with pytest.raises(ValueError, match=r"mine\.onnx has learned on the constants of a cell, which are others"):
+                Settings(method="policy", policy=policy, **cell)
         settings = Settings.for_cell(fit, method="policy", policy=policy)
         record = discharged(fit.cell, 6000.0, 0.15, pulses(7)).loaded_part(fit.cell.VEOD)
         row = summarize(record, settings).row

@@ -1,14 +1,17 @@
 """Voltage-only policies as estimators."""
 
+from dataclasses import asdict
+
 import numpy as np
 import pytest
 
 from battery_env import PolicyEstimator, load_nasa_discharges
 from battery_env.calibration.aging import simulated_lives
 from battery_env.calibration.voltage import LARGEST_STEPS
-from battery_env.electrochemistry import NEW_CELL
+from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.evaluation import evaluate
 from battery_env.loads import RandomPiecewise
+from battery_env.records import Samples
 from battery_env.sensors import RandomSensorErrors, SensorErrors
 from battery_env.trajectories import TrajectoryDataset
 
@@ -111,23 +114,46 @@ def test_bad_arguments_are_refused(data):
         PolicyEstimator(Constant(0.0), "CartPole-v1")
 
 
-def test_a_stream_is_followed_with_the_constants_of_a_cell_of_ones_own(tmp_path):
-    cell = NEW_CELL.replace(to=1.5 * NEW_CELL.to, U0p=NEW_CELL.U0p + 0.03, q_mobile=7000.0, r_o=0.14)
-    (trajectory,) = TrajectoryDataset.generate("joint", 1, RandomPiecewise(), seed=3, cell=cell)
+class Last:
+    """A policy whose action depends on the residuals that it sees."""
 
-    def estimator():
-        return PolicyEstimator(Constant(-0.1, 0.1), "BatteryVoltageJoint-v0", cell=cell)
+    def predict(self, observation, deterministic=False):
+        return np.clip(0.1 * observation[:, [98, 31]].astype(np.float64), -1.0, 1.0), None
 
-    stream = estimator()
-    assert stream.cell == cell
-    before = stream.now()
-    np.testing.assert_array_equal(before.parameters[:2], [cell.q_mobile, cell.r_o])
-    for sample in zip(trajectory.voltage_V[:90].tolist(), trajectory.current_A[:90].tolist(), strict=True):
-        estimate = stream.update(*sample, 1.0)
-    assert estimate.q_mobile == pytest.approx(7000.0 - 0.01 * LARGEST_STEPS["q_mobile"]) and stream.now().cell == cell
-    saved = stream.save(tmp_path / "stream.npz")
-    again = estimator()
-    again.load(saved)
-    assert again.now().state.tolist() == stream.now().state.tolist()
-    with pytest.raises(ValueError, match="options"):
-        PolicyEstimator(Constant(-0.1, 0.1), "BatteryVoltageJoint-v0").load(saved)
+
+@pytest.fixture(scope="module")
+def own():
+    return TrajectoryDataset.generate("joint", 2, RandomPiecewise(), seed=3, cell=TestOwnCell.CELL)
+
+
+class TestOwnCell:
+    CELL = NEW_CELL.replace(to=1.5 * NEW_CELL.to, U0p=NEW_CELL.U0p + 0.03, q_mobile=7000.0, r_o=0.14)
+
+    def estimator(self, **cell):
+        return PolicyEstimator(Last(), "BatteryVoltageJoint-v0", **cell)
+
+    def test_a_stream_is_followed_with_its_constants(self, own, tmp_path):
+        (trajectory, _), stream = own, self.estimator(cell=self.CELL)
+        np.testing.assert_array_equal(stream.now().parameters[:2], [self.CELL.q_mobile, self.CELL.r_o])
+        for sample in zip(trajectory.voltage_V[:181].tolist(), trajectory.current_A[:181].tolist(), strict=True):
+            estimate = stream.update(*sample, 1.0)
+        part = Samples(*(column[:181] for column in (trajectory.time_s, trajectory.voltage_V, trajectory.current_A)))
+        assert estimate.q_mobile == pytest.approx(self.estimator(cell=self.CELL).estimate(part).q_mobile, rel=1e-9)
+        assert estimate.q_mobile != pytest.approx(self.estimator().estimate(part).q_mobile, rel=1e-3)
+        saved, again = stream.save(tmp_path / "stream.npz"), self.estimator(cell=CellParameters.of_mapping(asdict(self.CELL)))
+        again.load(saved)
+        assert again.now().cell == self.CELL and again.now().state.tolist() == stream.now().state.tolist()
+        with pytest.raises(ValueError, match="cell"):
+            self.estimator().load(saved)
+
+    def test_it_knows_no_constants_but_its_own_however_the_records_come(self, own):
+        for cell in ({}, {"cell": self.CELL}):
+            of_set, of_list = (self.estimator(**cell).trace(records) for records in (own, list(own)))
+            for one, other in zip(of_set, of_list, strict=True):
+                np.testing.assert_array_equal(one.q_mobile, other.q_mobile)
+
+    def test_to_make_one_simulates_nothing(self, monkeypatch):
+        monkeypatch.setattr(TrajectoryDataset, "generate", None)
+        odd = self.CELL.replace(VEOD=3.7)  # a data set of which would end at once
+        assert self.estimator(cell=odd).cell == odd
+        assert PolicyEstimator(Last(), "BatteryAging-v0", cell=self.CELL, cycles=3).cell == self.CELL

@@ -4,15 +4,18 @@ import hashlib
 import json
 import subprocess
 import sys
+from dataclasses import asdict
 from importlib.resources import files
 
 import numpy as np
 import pytest
 
-from battery_env import PolicyEstimator, evaluate
+from battery_env import LeastSquares, PolicyEstimator, evaluate, load_nasa_discharges
 from battery_env.calibration.data import standard_dataset
-from battery_env.calibration.pretrained import policy_of_file, pretrained_card, pretrained_ids, pretrained_policy
+from battery_env.calibration.pretrained import file_stem, policy_of_file, pretrained_card, pretrained_ids, pretrained_policy
 from battery_env.calibration.voltage import ESTIMATE_RANGES
+from battery_env.cells import BUNDLED_CELLS
+from battery_env.electrochemistry import NEW_CELL
 from battery_env.sensors import SensorErrors
 
 FOLDER = files("battery_env.pretrained_policies")
@@ -23,37 +26,52 @@ def test_there_is_one_for_each_voltage_only_task():
     assert pretrained_ids() == tuple(IDS)
 
 
+@pytest.mark.parametrize("recorded", [False, True])
 @pytest.mark.parametrize("env_id", IDS)
-def test_the_card_is_that_of_the_file(env_id):
-    content, card = FOLDER.joinpath(f"{env_id}.onnx").read_bytes(), pretrained_card(env_id)
+def test_the_card_is_that_of_the_file(env_id, recorded):
+    content, card = FOLDER.joinpath(f"{file_stem(env_id, recorded)}.onnx").read_bytes(), pretrained_card(env_id, recorded)
     assert len(content) < 1_000_000
     assert hashlib.sha256(content).hexdigest() == card["sha256"]
-    policy, options = pretrained_policy(env_id)
+    policy, options = pretrained_policy(env_id, recorded)
     assert policy.env_id == card["env_id"] == card["recipe"]["env_id"] == env_id
     assert policy.description["algorithm"] == card["algorithm"] == "LAC"
     assert options == card["options"]
     trained_with = card["recipe"]["hyperparameters"]["env_kwargs"]
     assert options.items() <= trained_with.items() and trained_with["cost"] == "state"
+    assert ("process_noise_V" in trained_with) == recorded
     assert card["command"].startswith("python -m benchmarks.pretrained") and "seed" in card["recipe"]
     assert {row["mismatch"] for row in card["scores"]} == {0.0, 0.1, 0.2}
     env = PolicyEstimator.environment(env_id, **options)
     assert policy.observation_shape == env.observation_space.shape
 
 
+@pytest.mark.parametrize("recorded", [False, True])
 @pytest.mark.parametrize("env_id", IDS)
-def test_it_does_what_its_card_says(env_id):
+def test_it_does_what_its_card_says(env_id, recorded):
     """On a tenth of the discharges, with 5 mV of noise and constants that are off by 20 %."""
     data = standard_dataset(IDS[env_id], "piecewise", "test", mismatch=0.2)[:10]
-    estimator = PolicyEstimator.pretrained(env_id)
+    estimator = PolicyEstimator.pretrained(env_id, recorded=recorded)
     scores = evaluate(estimator, data, SensorErrors(noise_V=0.005), seed=1)
     for name in estimator.parameters:
         (row,) = (
             row
-            for row in pretrained_card(env_id)["scores"]
+            for row in pretrained_card(env_id, recorded)["scores"]
             if (row["mismatch"], row["sensor"], row["parameter"]) == (0.2, "5 mV noise", name)
         )
         assert scores[f"{name}_second_half_mape_percent"].max() <= row["worst_percent"] + 1e-3
         assert scores[f"{name}_second_half_mape_percent"].mean() < 2.0 * row["mean_percent"]
+
+
+@pytest.mark.parametrize("cell", BUNDLED_CELLS)
+def test_on_recorded_cells_the_one_for_them_agrees_with_least_squares(cell):
+    records = [discharge.loaded_part(2.7) for discharge in load_nasa_discharges(cell)[::40]]
+    truth = [LeastSquares(thermal=True, mismatch_V=0.05).estimate(record).q_mobile for record in records]
+    off = {}
+    for recorded in (False, True):
+        estimator = PolicyEstimator.pretrained(recorded=recorded)
+        estimates = np.array([estimator.estimate(record).q_mobile for record in records])
+        off[recorded] = np.abs(estimates / truth - 1.0)
+    assert off[True].max() < 0.04 and off[True].mean() < 0.6 * off[False].mean()
 
 
 def test_it_is_never_sure_and_stays_in_its_range():
@@ -105,7 +123,12 @@ class TestFiles:
         copy.with_suffix(".json").write_text(json.dumps({"options": {"reading_s": 5.0}}))
         assert policy_of_file(copy)[1] == {"reading_s": 5.0}
 
-    @pytest.mark.parametrize("text", ["{", "[]", "{}", '{"options": 3}'])
+    def test_a_card_says_the_constants(self, copy):
+        cell = NEW_CELL.replace(kn=1000.0)
+        copy.with_suffix(".json").write_text(json.dumps({"options": {"cell": asdict(cell)}}))
+        assert policy_of_file(copy)[1] == {"cell": cell}
+
+    @pytest.mark.parametrize("text", ["{", "[]", "{}", '{"options": 3}', '{"options": {"cell": {"kn": 1000.0}}}'])
     def test_a_card_that_is_none_is_refused(self, copy, text):
         copy.with_suffix(".json").write_text(text)
         with pytest.raises(ValueError, match="has to be an object in JSON with the options of the task"):

@@ -337,11 +337,28 @@ class TestOwnCell:
         task = BatteryVoltageQmax(2, cell=self.CELL, split="test")
         assert task.dataset.cell == self.CELL and set(task.dataset.r_o) == {self.CELL.r_o}
 
-    @pytest.mark.parametrize("changed", [{"q_mobile": 20_000.0}, {"r_o": 0.01}])
-    def test_cells_of_another_size_are_refused(self, changed):
+    @pytest.mark.parametrize(
+        ("kind", "changed"),
+        [(BatteryVoltageJoint, {"q_mobile": 20_000.0}), (BatteryVoltageJoint, {"r_o": 0.01}), (BatteryAging, {"r_o": 0.01})],
+    )
+    def test_cells_that_no_estimate_reaches_are_refused(self, kind, changed):
         (name,) = changed
-        with pytest.raises(ValueError, match=f"{name} of cell must lie within .* size of an 18650. Take least squares"):
-            BatteryVoltageJoint(1, cell=self.CELL.replace(**changed))
+        with pytest.raises(ValueError, match=f"{name} of cell must lie within .*, where the task looks for it, got"):
+            kind(1, cell=self.CELL.replace(**changed))
+
+    def test_what_is_not_looked_for_may_be_anything(self, own):
+        task = BatteryVoltageQmax(1, dataset=own, cell=self.CELL.replace(r_o=0.02))
+        assert task.readings.cell.r_o == 0.02
+        beyond = TrajectoryDataset.generate("joint", 2, RandomPiecewise(), seed=5, cell=self.CELL.replace(q_mobile=9000.0))
+        assert started(beyond, cells=2, start="new_cell").estimate[0, 0] == ESTIMATE_RANGES["q_mobile"][1]
+
+    def test_what_is_no_cell_is_refused(self, own):
+        with pytest.raises(TypeError, match="cell must be CellParameters or None"):
+            BatteryVoltageJoint(1, dataset=own, cell={"kn": 1.0})
+
+    def test_a_life_is_that_of_the_cell(self):
+        task = BatteryAging(1, cell=self.CELL, cycles=2)
+        assert task.dataset.cell == task.readings.cell == self.CELL
 
     def test_a_saved_data_set_is_named_by_its_file_and_read_anew_when_it_has_changed(self, own, data, tmp_path):
         file = tmp_path / "own.npz"

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from battery_env import TrajectoryDataset
+from battery_env import PolicyEstimator, TrajectoryDataset
 from benchmarks import own_cell
 
 
@@ -29,12 +29,22 @@ def test_every_calibrator_is_tested_on_the_other_cell(results):
     assert json.loads((results / "own_cell.json").read_text())["configuration"]["trained_with"]["process_noise_V"] == 0.002
 
 
-def test_policies_learn_on_the_cell_that_was_fitted_and_never_see_the_other(results):
-    for file in (results / "data").iterdir():
-        dataset, fitted = TrajectoryDataset.load(file), file.name[:5]
-        assert dataset.cell == own_cell.fitted_to(fitted).cell
-        model = json.loads(next((results / "models").glob("model_*.json")).read_text())
-        assert model["recipe"]["hyperparameters"]["env_kwargs"]["dataset"].startswith(str(results / "data"))
+def test_policies_learn_on_the_cell_that_was_fitted_and_never_see_the_other(results, monkeypatch):
+    learned_on = []
+
+    def trained(algo, seed, updates, dataset, folder):
+        learned_on.append(TrajectoryDataset.load(dataset))
+        return own_cell.Follow()
+
+    monkeypatch.setattr(own_cell, "trained", trained)
+    for fitted, tested in own_cell.PAIRS:
+        (table,) = own_cell.part("LAC", [0], 8, fitted, tested, 120, results).values()
+        fit, records = own_cell.fitted_to(fitted), own_cell.load_nasa_discharges(tested)
+        assert learned_on[-1].cell == fit.cell
+        assert set(table["cycle"]) == {record.meta["cycle"] for record in records[::120]}
+        whole = table[table["share"] == 1.0].iloc[0]
+        expected = PolicyEstimator(own_cell.Follow(), own_cell.ENV_ID, cell=fit.cell, **own_cell.OPTIONS)
+        assert whole["q_mobile_C"] == expected.estimate(records[0].loaded_part(2.7)).q_mobile
 
 
 def test_policies_act_together_by_their_mean(results):

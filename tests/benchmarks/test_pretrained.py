@@ -16,8 +16,10 @@ def train_briefly(monkeypatch):
     """A model that has learned nothing, of the right task."""
 
     def train_or_load(algo, env_id, seed, timesteps, folder, hyperparameters):
-        recipe = pretrained.recipe_of(env_id, seed, 100)
-        assert (algo, timesteps, hyperparameters) == ("lac", recipe.timesteps, {"env_kwargs": pretrained.TRAINED_WITH})
+        recorded = "process_noise_V" in hyperparameters["env_kwargs"]
+        recipe = pretrained.recipe_of(env_id, seed, 100, recorded)
+        options = {**pretrained.TRAINED_WITH, **({"process_noise_V": 0.002} if recorded else {})}
+        assert (algo, timesteps, hyperparameters) == ("lac", recipe.timesteps, {"env_kwargs": options})
         record = record_file(recipe, folder)
         record.parent.mkdir(parents=True, exist_ok=True)
         record.write_text(json.dumps({"training_minutes": 1.0}))
@@ -38,14 +40,27 @@ def test_it_writes_policies_with_their_cards(train_briefly, tmp_path, capsys):
     assert "| BatteryVoltageRo-v0 |" in capsys.readouterr().out
 
 
+def test_those_for_recorded_cells_learn_on_a_model_that_wanders_and_take_their_own_place(train_briefly, tmp_path):
+    arguments = ["--envs", "BatteryVoltageRo-v0", "--updates", "100", "--discharges", "2", "--out", str(tmp_path)]
+    pretrained.main(arguments)
+    before = (tmp_path / "BatteryVoltageRo-v0.json").read_bytes()
+    pretrained.main(["--recorded", *arguments])
+    card = json.loads((tmp_path / "BatteryVoltageRo-v0_recorded.json").read_text())
+    assert card["recipe"]["hyperparameters"]["env_kwargs"] == pretrained.TRAINED_WITH | pretrained.RECORDED
+    assert card["training_data"].endswith("noise of 2 mV per root of a second on Vo, Vsn and Vsp")
+    assert policy_of_file(tmp_path / "BatteryVoltageRo-v0_recorded.onnx")[1] == pretrained.OPTIONS
+    assert (tmp_path / "BatteryVoltageRo-v0.json").read_bytes() == before and b"Vo, Vsn" not in before
+
+
 def test_the_comparison_runs(tmp_path, monkeypatch, capsys):
-    few = ("LAC, pretrained", "the fit that LAC sees, no policy", "Kalman filter")
+    few = ("LAC, pretrained", "LAC, pretrained for recorded cells", "Kalman filter")
     monkeypatch.setattr(mismatch, "CALIBRATORS", {name: mismatch.CALIBRATORS[name] for name in few})
     monkeypatch.setattr(mismatch, "MISMATCHES", (0.2,))
     mismatch.main(["--discharges", "2", "--cells", "--out", str(tmp_path)])
     scores = pd.read_csv(tmp_path / "mismatch.csv")
     assert len(scores) == 2 * len(few) * 2
-    assert set(scores["policy"].dropna()) == {mismatch.pretrained_card(mismatch.ENV_ID)["sha256"][:8]}
+    digests = [mismatch.pretrained_card(mismatch.ENV_ID, recorded)["sha256"][:8] for recorded in (False, True)]
+    assert scores.groupby("calibrator")["policy"].first().dropna().tolist() == digests
     assert (tmp_path / "mismatch.png").exists()
     assert "| LAC, pretrained" in capsys.readouterr().out
 
