@@ -217,29 +217,32 @@ def summary(found: pd.DataFrame) -> pd.DataFrame:
 
 def plot(found: pd.DataFrame) -> Figure:
     """
-    What each calibrator says over the life of a cell, and how far off the end of discharge is that it predicts.
+    How far ``q_mobile`` of whole discharges is from that of least squares over the life of a cell, and how far off the end of
+    discharge is that is predicted on the way.
 
     :param found: one row per cell, calibrator, seed, discharge and share of it
     :return: the figure, a column per tested cell
     """
+    names = [name for name in found["calibrator"].unique() if "together" not in name and not name.startswith("the fit")]
+    families = list(dict.fromkeys(name.partition(",")[0] for name in names))
     figure = new_figure(10.4, 6.6)
     panels = figure.subplots(2, found["tested"].nunique(), sharey="row", squeeze=False)
-    names = [name for name in found["calibrator"].unique() if name != "the fit that policies see"]
-    for (upper, lower), (tested, of_cell) in zip(panels.T, found.groupby("tested", sort=False), strict=True):
-        for n, name in enumerate(names):
-            of_name, style = of_cell[of_cell["calibrator"] == name], {"color": COLOURS[n % len(COLOURS)]}
-            style |= {"ls": "-" if n < len(COLOURS) else "--"}
-            whole = of_name[of_name["share"] == 1.0].groupby("cycle")["q_mobile_C"].mean()
-            upper.plot(whole.index, whole, lw=1.2, **style)
+    for (upper, lower), (tested, of_cell) in zip(panels.T, with_departure(found).groupby("tested", sort=False), strict=True):
+        for name in names:
+            family = name.partition(",")[0]
+            of_name, colour = of_cell[of_cell["calibrator"] == name], COLOURS[families.index(family)]
+            style = "-" if name == family else "--"
+            whole = of_name[of_name["share"] == 1.0].groupby("cycle")["departure_percent"].mean()
+            upper.plot(whole.index, whole, ls=style, lw=1.2, color=colour)
             in_progress = of_name[of_name["share"] < 1.0]
             errors = in_progress["eod_error_percent"].abs().groupby(in_progress["share"]).mean()
-            lower.plot(100.0 * errors.index, errors, "o", ls=style["ls"], color=style["color"], label=name)
-        fitted = of_cell["fitted"].iloc[0]
-        upper.set(title=f"{tested}, with the constants of {fitted}", xlabel="cycle", ylabel=LABELS["q_mobile"])
+            lower.plot(100.0 * errors.index, errors, "o", ls=style, color=colour, label=name)
+        title = f"{tested}, with the constants of {of_cell['fitted'].iloc[0]}"
+        upper.set(title=title, xlabel="cycle", ylabel=f"{LABELS['q_mobile'].split(' (')[0]}, from least squares (%)")
         lower.set(yscale="log", xlabel="seen of the discharge (%)", ylabel="mean error of its end (%)", xticks=(25, 50, 75))
         for axes in (upper, lower):
             axes.grid(alpha=0.25)
-    panels[1, -1].legend(fontsize=7)
+    figure.legend(*panels[1, 0].get_legend_handles_labels(), loc="outside lower center", ncols=len(names), fontsize=8)
     return figure
 
 
