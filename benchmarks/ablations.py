@@ -1,6 +1,5 @@
 """
-What each choice of the q^max task is worth: LAC with the settings of ``zoo_configs``, but for the starts of its episodes, and
-with one thing changed at a time.
+What each choice of the q^max task is worth: LAC with the settings of ``zoo_configs``, and with one thing changed at a time.
 
 .. code-block:: bash
 
@@ -60,7 +59,7 @@ VARIANTS: dict[str, Variant] = {
     "short": Variant("episodes of 16 steps, the paper's", {"env_kwargs": {"episode_steps": 16}}),
     "long": Variant("episodes of 256 steps", {"env_kwargs": {"episode_steps": 256}}),
     "starts": Variant(
-        "starts and lengths of zoo_configs",
+        "starts and lengths as with both parameters",
         {"env_kwargs": {"continue_probability": 0.5, "first_sample_probability": 0.2}},
     ),
     "perturbed": Variant("starts up to 2 error scales off", {"env_kwargs": {"initial_perturbation": 2.0}}),
@@ -126,7 +125,7 @@ def part(name: str, seed: int, updates: int, models: Path) -> Tables:
     :return: ``ablations``, one row: what came out
     """
     variant = VARIANTS[name]
-    hyperparameters: dict[str, Any] = {"env_kwargs": {}, **variant.hyperparameters}
+    hyperparameters = dict(variant.hyperparameters)
     if variant.hidden:
         hyperparameters["env_wrapper"] = [{"benchmarks.ablations.HideColumns": {"hidden": list(variant.hidden)}}]
     timesteps = timesteps_of(updates, Recipe.of("lac", _ENV_ID, seed).hyperparameters)
@@ -134,7 +133,7 @@ def part(name: str, seed: int, updates: int, models: Path) -> Tables:
     test = standard_dataset("q_mobile", "paper", "test")
     test = test.subset(range(0, len(test), len(test) // _DISCHARGES))
     # of the arguments of the environment the only one that the observation depends on
-    consistency = hyperparameters["env_kwargs"].get("consistency", 0.0)
+    consistency = hyperparameters.get("env_kwargs", {}).get("consistency", 0.0)
     scores = evaluate(PolicyEstimator(_Blinkered(model, variant.hidden), _ENV_ID, consistency=consistency), test)
     errors = scores["q_mobile_mape_percent"]
     row = {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict
+from importlib import import_module
 from typing import Any, Protocol
 
 import gymnasium as gym
@@ -44,7 +45,10 @@ class Predictor(Protocol):
 
 def _without_data(env_id: str, options: dict[str, Any]) -> dict[str, Any]:
     """Options of an environment that simulates nothing, where it needs no simulation: only its task is asked for."""
-    task = gym.spec(env_id).kwargs.get("task")
+    module, _, plain_id = env_id.rpartition(":")
+    if module:  # as gym.make has it
+        import_module(module)
+    task = gym.spec(plain_id).kwargs.get("task")
     kind = None if task is None else task_class(task)
     if kind is None or not issubclass(kind, VoltageTask):
         return options

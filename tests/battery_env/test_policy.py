@@ -152,6 +152,12 @@ class TestOwnCell:
             for one, other in zip(of_set, of_list, strict=True):
                 np.testing.assert_array_equal(one.q_mobile, other.q_mobile)
 
+    def test_an_id_may_name_the_module_that_registers_it(self):
+        for env_id in ("BatteryVoltageJoint-v0", "BatteryQmax-v0"):
+            assert PolicyEstimator(Last(), f"battery_env:{env_id}").parameters == PolicyEstimator(Last(), env_id).parameters
+        with pytest.raises(ModuleNotFoundError, match="no_such_module"):
+            PolicyEstimator(Last(), "no_such_module:BatteryQmax-v0")
+
     def test_to_make_one_simulates_nothing(self, monkeypatch):
         monkeypatch.setattr(TrajectoryDataset, "generate", None)
         odd = self.CELL.replace(VEOD=3.7)  # a data set of which would end at once
