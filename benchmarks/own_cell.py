@@ -33,22 +33,20 @@ from battery_env.plotting import COLOURS, LABELS, new_figure
 from battery_env.record_model import RecordModel
 from battery_env.trajectories import TrajectoryDataset
 from benchmarks.fit_cell import CUT_OFF_V, PAIRS, SHARES, fitted_to
-from benchmarks.mismatch import Follow
+from benchmarks.mismatch import ENV_ID, Follow
+from benchmarks.pretrained import MISMATCH, OPTIONS, RECORDED
+from benchmarks.pretrained import TRAINED_WITH as PRETRAINED_WITH
 from benchmarks.study import Study, Tables, command_line, digest_of, markdown, natural, positive
 from benchmarks.training import Recipe, timesteps_of, train_or_load
 
-ENV_ID = "BatteryVoltageJoint-v0"
 #: Of the cells that policies learn on, C and ohm.
 Q_MOBILE_RANGE_C = (4000.0, 8000.0)
 R_O_RANGE_OHM = (0.06, 0.3)
 #: What rivals with a prior know of ``q_mobile``: mean and standard deviation of that range, C.
 PRIOR_C = (sum(Q_MOBILE_RANGE_C) / 2.0, float(np.ptp(Q_MOBILE_RANGE_C) / np.sqrt(12.0)))
-#: How far kn, tDiffusion, to and tsn of these cells are from the fitted ones.
-MISMATCH = 0.2
-#: Options of the task that a policy needs when it is used.
-OPTIONS: dict[str, Any] = {"nuisance": MISMATCH, "reading_s": 2.0}
-#: And those of its training. The noise makes the voltage wander by 29 mV, twice the error that the fits leave.
-TRAINED_WITH: dict[str, Any] = {**OPTIONS, "new_readings": [0, 145], "cost": "state", "process_noise_V": 0.002}
+#: Options of the task in training: as of the policies for recorded cells, but for the mismatch, which is in the data. With
+#: these constants the noise makes the voltage wander by 29 mV, twice the error that the fits leave.
+TRAINED_WITH = {name: value for name, value in (PRETRAINED_WITH | RECORDED).items() if name != "mismatch"}
 
 _CELLS = 1000
 

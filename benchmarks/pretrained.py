@@ -49,7 +49,7 @@ MISMATCH = 0.2
 OPTIONS: dict[str, Any] = {"nuisance": MISMATCH, "reading_s": 2.0}
 #: And those of its training: up to 290 s between two decisions, as by default.
 TRAINED_WITH: dict[str, Any] = {**OPTIONS, "new_readings": [0, 145], "mismatch": MISMATCH, "cost": "state"}
-#: What those for recorded cells learn with besides: a model whose voltage wanders by 29 mV, in V per root of a second.
+#: What those for recorded cells learn with besides: a model whose voltage wanders by 46 mV, in V per root of a second.
 RECORDED: dict[str, Any] = {"process_noise_V": 0.002}
 #: How wrong the constants are in the evaluation.
 MISMATCHES = (0.0, 0.1, 0.2)
