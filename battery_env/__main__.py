@@ -425,7 +425,7 @@ def _conclude(done: Sequence[dict[str, Any]], settings: Settings) -> None:
         refused = sum(bool(row["error"]) for row in done)
         print(f"\n{len(done)} discharges: {settled} settled, {len(done) - settled - refused} not settled, {refused} refused")
         if settings.method == "policy":
-            print(f"calibrated by {settings.calibrated_by}, which states no uncertainty")
+            print(f"calibrated by {settings.calibrated_by}")
     elif done and not done[0]["error"]:
         print(text_of(done[0]["record"], done[0], settings))
 
@@ -434,8 +434,8 @@ def _print_line(row: dict[str, Any]) -> None:
     if row["error"]:
         return
     health = "" if math.isnan(row["state_of_health"]) else f"  health {row['state_of_health']:.3f}"
-    has_sd = row["method"] != "policy"
-    sd_q_mobile, sd_r_o = (f" sd {row['sd_q_mobile_C']:3.0f}", f" sd {row['sd_r_o_ohm']:.4f}") if has_sd else ("", "")
+    sd_q_mobile = "" if math.isnan(row["sd_q_mobile_C"]) else f" sd {row['sd_q_mobile_C']:3.0f}"
+    sd_r_o = "" if math.isnan(row["sd_r_o_ohm"]) else f" sd {row['sd_r_o_ohm']:.4f}"
     print(
         f"{row['record']:<18} q_mobile {row['q_mobile_C']:5.0f} C{sd_q_mobile}  r_o {row['r_o_ohm']:.4f} "
         f"ohm{sd_r_o}  drawn {row['drawn_Ah']:.3f} Ah{health}  RMSE {1e3 * row['voltage_rmse_V']:3.0f} mV  "

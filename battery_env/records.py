@@ -78,6 +78,16 @@ class Samples(NamedTuple):
     voltage_V: FloatArray
     current_A: FloatArray
 
+    @classmethod
+    def of(cls, record: Record) -> Samples:
+        """
+        Those of any record.
+
+        :param record: one discharge
+        :return: its columns
+        """
+        return cls(*(np.asarray(column) for column in (record.time_s, record.voltage_V, record.current_A)))
+
     def first(self, count: int) -> Samples:
         """
         The first ones.
@@ -86,6 +96,17 @@ class Samples(NamedTuple):
         :return: these
         """
         return Samples(*(column[:count] for column in self))
+
+
+def starts_at_rest(record: Record) -> bool:
+    """
+    Whether the first voltage of a record is known to be that of the cell at rest, though the first current may be that of the
+    load that was switched on then.
+
+    :param record: one discharge; :meth:`battery_env.cells.Discharge.loaded_part` makes such
+    :return: whether it is
+    """
+    return bool(getattr(record, "starts_at_rest", False))
 
 
 def check_column(name: str, values: ArrayLike, least_samples: int) -> FloatArray:

@@ -51,7 +51,7 @@ _PRETRAINED = {
     frozenset({"r_o"}): "BatteryVoltageRo-v0",
     frozenset(PARAMETER_NAMES): "BatteryVoltageJoint-v0",
 }
-# What a policy cannot be told: it has learned on one model, and states no uncertainty.
+# What a policy cannot be told: it has learned on one model.
 _NOT_FOR_POLICIES = (
     "prior_q_mobile_C",
     "mismatch_V",
@@ -392,10 +392,9 @@ def text_of(name: str, row: dict[str, Any], settings: Settings) -> str:
     fitted: Sequence[str] = settings.parameters
     cut_off = f"{settings.cut_off_V:g} V"
     averaged = f", averaged over {row['averaged_over_s']:g} s," if row["averaged_over_s"] else ""
-    is_policy = settings.method == "policy"
     values = {
-        "q_mobile": (f"{row['q_mobile_C']:.0f} C", f"sd {row['sd_q_mobile_C']:.0f} C"),
-        "r_o": (f"{row['r_o_ohm']:.4f} ohm", f"sd {row['sd_r_o_ohm']:.4f} ohm"),
+        "q_mobile": (f"{row['q_mobile_C']:.0f} C", row["sd_q_mobile_C"], f"sd {row['sd_q_mobile_C']:.0f} C"),
+        "r_o": (f"{row['r_o_ohm']:.4f} ohm", row["sd_r_o_ohm"], f"sd {row['sd_r_o_ohm']:.4f} ohm"),
     }
     what = "so far" if in_progress else f"the capacity to {cut_off}"
     if not in_progress and np.isnan(row["predicted_capacity_Ah"]):
@@ -405,11 +404,11 @@ def text_of(name: str, row: dict[str, Any], settings: Settings) -> str:
     lines = [
         f"{name}: {row['samples']} samples{averaged} from load-on at {row['load_on_time_s']:.1f} s, "
         f"{3600.0 * row['drawn_Ah']:.0f} C drawn",
-        *([f"calibrated by {settings.calibrated_by}"] if is_policy else []),
+        *([f"calibrated by {settings.calibrated_by}"] if settings.method == "policy" else []),
         "",
         *(
-            f"  {key:<22}{value:>12}   {('no sd stated' if is_policy else sd) if key in fitted else 'held'}"
-            for key, (value, sd) in values.items()
+            f"  {key:<22}{value:>12}   {('no sd stated' if np.isnan(sd) else text) if key in fitted else 'held'}"
+            for key, (value, sd, text) in values.items()
         ),
         f"  {'settled':<22}{'yes' if row['settled'] else 'no':>12}",
         f"  {'drawn':<22}{row['drawn_Ah']:>9.3f} Ah   {what}",
@@ -431,7 +430,8 @@ def text_of(name: str, row: dict[str, Any], settings: Settings) -> str:
         lines.append(f"  {'temperature at the end':<22}{row['end_temperature_C']:>7.1f} degC   {ends}")
     lines.append(f"  {f'{cut_off}, predicted at':<22}{row['predicted_eod_time_s']:>10.0f} s")
     if in_progress:
-        sure = f"sd {row['sd_predicted_eod_time_s']:.0f} s, " if "q_mobile" in fitted and not is_policy else ""
+        sd_s = row["sd_predicted_eod_time_s"]
+        sure = "" if "q_mobile" not in fitted or np.isnan(sd_s) else f"sd {sd_s:.0f} s, "
         load = "the mean current so far, an assumption: the load varied" if row["load_varied"] else "to go on"
         lines.append(f"  {'remaining':<22}{row['remaining_s']:>10.0f} s   {sure}{row['future_current_A']:.3g} A {load}")
     else:

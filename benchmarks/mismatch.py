@@ -39,7 +39,7 @@ from benchmarks.nuisance import MISMATCH_V, OFFSET_SD_V
 from benchmarks.peers import cpu_time_per_estimate_s
 from benchmarks.real_cells import CUT_OFF_V, SHARES
 from benchmarks.real_cells import calibrator as real_calibrator
-from benchmarks.study import SYMBOLS, Study, Tables, command_line, duration, markdown, positive
+from benchmarks.study import SYMBOLS, Study, Tables, command_line, digits, duration, markdown, positive
 
 ENV_ID = "BatteryVoltageJoint-v0"
 #: Relative standard deviation of the constants.
@@ -163,6 +163,8 @@ def simulated_table(scores: pd.DataFrame) -> pd.DataFrame:
             error = group[f"{name}_second_half_mape_percent"]
             row[f"{symbol}: mean (worst) error (%)"] = f"{error.mean():.2f} ({error.max():.2g})"
             row[f"{symbol}, last estimate (%)"] = f"{group[f'{name}_final_error_percent'].mean():.2f}"
+            row[f"{symbol}, within two stated sd (%)"] = digits(group[f"{name}_coverage_percent"].mean())
+        row["settled in the end (%)"] = f"{100.0 * np.isfinite(group['settled_time_s']).mean():.0f}"
         row["CPU time per estimate"] = duration(group["cpu_time_per_estimate_s"].iloc[0])
         rows.append(row)
     return pd.DataFrame(rows)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -38,8 +39,8 @@ _CONSTANTS = slice(_KN, _UNKNOWNS)
 #: What :func:`nuisance_step` finds: a step and a standard deviation of every unknown, and at last the noise.
 FOUND_SIZE = 2 * _UNKNOWNS + 1
 _NOISE = 2 * _UNKNOWNS
-# Logarithms of constants are held within this many of their standard deviations
-_REACH_SD = 3.0
+#: Logarithms of constants are held within this many of their standard deviations.
+REACH_SD = 3.0
 # What the parts of an observation are divided by; standard deviations by this share of the range of the estimate
 _VOLTAGE_SCALE_V = 0.010
 _SD_SCALE = 0.01
@@ -52,6 +53,29 @@ _compiled = njit(cache=True, error_model="numpy")
 # sums in any order, which vector instructions need
 _reassociating = njit(cache=True, error_model="numpy", fastmath={"reassoc"})
 assert UNCERTAIN_CONSTANTS == ("kn", "tDiffusion", "to", "tsn")
+
+
+class Fitted(NamedTuple):
+    """
+    What a fit says of each cell of a batch.
+
+    :param estimate: (q_mobile, r_o) after its step, C and ohm, shape (cells, 2)
+    :param sd: their standard deviations under the priors, 0 where one is known, same shape
+    :param noise_V: root mean square of the residuals that it leaves, V, shape (cells,)
+    :param offset_V: of the voltage sensor, V, shape (cells,)
+    :param constants_sd: how far the constant lies from the model's that is the farthest, as a multiple of its standard
+        deviation, shape (cells,)
+    :param readings: to how many it is a fit, shape (cells,)
+    :param white_V: white part of their noise, which no model can explain, V, shape (cells,)
+    """
+
+    estimate: FloatArray
+    sd: FloatArray
+    noise_V: FloatArray
+    offset_V: FloatArray
+    constants_sd: FloatArray
+    readings: IntArray
+    white_V: FloatArray
 
 
 class NuisanceFit:
@@ -126,8 +150,22 @@ class NuisanceFit:
             self._prior_sd,
             self._found,
         )
-        limit = _REACH_SD * self._prior_sd[_CONSTANTS]
+        limit = REACH_SD * self._prior_sd[_CONSTANTS]
         self.logarithms[rows] = np.clip(self.logarithms[rows] + self._found[rows, _CONSTANTS], -limit, limit)
+
+    def found(self, estimate: FloatArray, readings: IntArray, white_V: FloatArray) -> Fitted:
+        """
+        What the last step found.
+
+        :param estimate: (q_mobile, r_o) that it was taken from, C and ohm, shape (cells, 2)
+        :param readings: as of :class:`Fitted`
+        :param white_V: likewise
+        :return: of each cell
+        """
+        found = self._found.copy()
+        step, sd = (found[:, start : start + 2] for start in (0, _UNKNOWNS))
+        constants_sd = np.abs(self.logarithms / self._prior_sd[_CONSTANTS]).max(axis=1)
+        return Fitted(estimate + step, sd, found[:, _NOISE], found[:, _OFFSET], constants_sd, readings, white_V)
 
     def parts(self, largest_step: FloatArray, width: FloatArray) -> list[FloatArray]:
         """

@@ -5,24 +5,29 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict
 from importlib import import_module
+from math import isnan, nan
 from typing import Any, Protocol
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from battery_env.arrays import FloatArray
 from battery_env.calibration.aging import BatteryAging
+from battery_env.calibration.confidence import NO_FIT, Confidence
 from battery_env.calibration.env import CalibrationEnv, task_class
+from battery_env.calibration.nuisance import Fitted
 from battery_env.calibration.pretrained import pretrained_policy
 from battery_env.calibration.streaming import ReadingsSoFar, resume
 from battery_env.calibration.task import CalibrationTask
 from battery_env.calibration.voltage import VoltageTask
 from battery_env.electrochemistry import NEW_CELL, STATE_SIZE, UNCERTAIN_CONSTANTS
+from battery_env.estimates import last_estimate
 from battery_env.estimators.base import Estimate, EstimateTrace, ModelNow, OnlineEstimator, Record
 from battery_env.record_model import RecordModel
-from battery_env.records import Samples, check_drawn_charge, check_record, check_sample, drawn
+from battery_env.records import Samples, check_drawn_charge, check_record, check_sample, drawn, starts_at_rest
 
-_UNSURE = "A policy states no uncertainty."
+_NOT_YET = "The policy has not decided yet."
 # A full cell takes no more charge than this share of that of a new one.
 _SURPLUS = 0.01
 # Steps in which a stream is followed, s
@@ -70,6 +75,11 @@ class PolicyEstimator(OnlineEstimator):
     One of a voltage-only environment of single discharges also follows a stream (:meth:`update`): its estimate is the new
     cell's until ``decision_s`` are over, and moves every ``decision_s`` from then on.
 
+    A policy whose observation has a fit (option ``nuisance``) states standard deviations: those of the fit under its priors,
+    with the distance of the estimate from it. It has settled under the conditions of least squares, if the residuals of
+    the fit are noise, and its offset and constants are such as the policy has learned of. Other policies state nothing, and
+    never settle.
+
     :param policy: what to ask for actions, deterministically
     :param env_id: id of the environment that the policy was trained on
     :param decision_s: time between two estimates of a voltage-only policy, s, a multiple of the interval between its readings
@@ -89,6 +99,9 @@ class PolicyEstimator(OnlineEstimator):
         self._every = task.steps_between(decision_s)
         self.decision_s = decision_s
         self.dt_s = _STEP_S
+        self._confidence: Confidence | None = None
+        if isinstance(task, VoltageTask) and task.fitted() is not None:
+            self._confidence = Confidence(task, self.cell, self.dt_s)
         self.reset()
 
     @classmethod
@@ -135,6 +148,18 @@ class PolicyEstimator(OnlineEstimator):
         self._now = np.array([self.cell.q_mobile, self.cell.r_o])
         self._action = np.zeros(len(self.parameters))
         self._logarithms = np.zeros(len(UNCERTAIN_CONSTANTS))
+        self._fitted: Fitted | None = None
+        self._judge()
+
+    def _judge(self) -> None:
+        """Tell how sure the estimate is, of the samples up to the last decision."""
+        self._sd, self._reason = [nan, nan], NO_FIT if self._confidence is None else _NOT_YET
+        if self._confidence is not None and self._fitted is not None:
+            samples = self._readings.known(self._decisions * self.decision_s)
+            (sd,) = self._confidence.standard_deviations(self._fitted, self._now[None])
+            self._reason = self._confidence.reason(self._fitted, 0, self._now, sd, samples, rested=False)
+            # the same NaN always, so that equal estimates are equal
+            self._sd = [nan if isnan(each) else each for each in sd.tolist()]
 
     def check(self, voltage_V: float, current_A: float, dt_s: float, temperature_C: float | None = None) -> None:
         """
@@ -165,7 +190,7 @@ class PolicyEstimator(OnlineEstimator):
         :param current_A: current that flows from this sample to the next one, positive in discharge, A
         :param dt_s: time since the previous sample, s; without meaning at the first one
         :param temperature_C: must be ``None``: the model of the environments is isothermal
-        :return: the estimate; never settled, as a policy states no uncertainty
+        :return: the estimate, as of the last decision
         :raises ValueError: for what cannot be meant, a temperature, or a policy that takes no stream
         """
         self.check(voltage_V, current_A, dt_s, temperature_C)
@@ -176,8 +201,8 @@ class PolicyEstimator(OnlineEstimator):
         due = int(readings.time_s[-1] / self.decision_s + 1e-9)
         if due > self._decisions and due * self._every > 1:
             self._decide(due)
-        q_mobile, r_o = self._now.tolist()
-        return Estimate(q_mobile, r_o, settled=False, reason=_UNSURE)
+        (q_mobile, r_o), (sd_q_mobile, sd_r_o) = self._now.tolist(), self._sd
+        return Estimate(q_mobile, r_o, sd_q_mobile, sd_r_o, not self._reason, self._reason)
 
     def _follow(self, records: Sequence[Record], every: int) -> CalibrationTask:
         # a data set may know its own constants, of which the policy must not learn
@@ -188,9 +213,11 @@ class PolicyEstimator(OnlineEstimator):
         """One decision, on all readings up to the time when it was due."""
         task = self._follow([self._readings.record(self.dt_s)], due * self._every)
         self._logarithms = resume(task, self._now, self._action, self._logarithms)
+        self._fitted = _fitted(task)
         action, _ = self.policy.predict(task.observation(), deterministic=True)
         task.advance(np.asarray(action))
         self._decisions, self._now, self._action = due, task.estimate[0], np.clip(np.asarray(action)[0], -1.0, 1.0)
+        self._judge()
 
     def now(self) -> ModelNow:
         """
@@ -215,7 +242,8 @@ class PolicyEstimator(OnlineEstimator):
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         progress = np.array([self._drawn_C, self._decisions, *self._now])
-        return {
+        fitted = {} if self._fitted is None else {f"fitted_{name}": each for name, each in self._fitted._asdict().items()}
+        return fitted | {
             "samples": self._readings.columns(),
             "progress": progress,
             "action": self._action,
@@ -227,6 +255,9 @@ class PolicyEstimator(OnlineEstimator):
         self._drawn_C, self._decisions = float(arrays["progress"][0]), int(arrays["progress"][1])
         self._now, self._action = arrays["progress"][2:].copy(), arrays["action"].copy()
         self._logarithms = arrays["logarithms"].copy()
+        names = [f"fitted_{name}" for name in Fitted._fields]
+        self._fitted = Fitted(*(arrays[name] for name in names)) if set(names) <= arrays.keys() else None
+        self._judge()
 
     def estimate(self, record: Record) -> Estimate:
         """
@@ -234,14 +265,16 @@ class PolicyEstimator(OnlineEstimator):
         independent of each other, the mean.
 
         :param record: one discharge; with the full state a simulated one, as no recording has it
-        :return: the estimate; never settled, as a policy states no uncertainty
+        :return: the estimate
         :raises ValueError: for a record that cannot be meant
         """
         time_s, _, current_A = check_record(record.time_s, record.voltage_V, record.current_A)
         check_drawn_charge(float(drawn(time_s, current_A, time_s[-1])))
         trace = self.trace([record])[0]
+        if trace.sd_q_mobile is not None:
+            return last_estimate(trace)
         q_mobile, r_o = (self.task_class.conclude(values) for values in (trace.q_mobile, trace.r_o))
-        return Estimate(q_mobile, r_o, settled=False, reason=_UNSURE)
+        return Estimate(q_mobile, r_o, settled=False, reason=NO_FIT)
 
     def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:
         """
@@ -251,14 +284,34 @@ class PolicyEstimator(OnlineEstimator):
         :return: one trace per discharge, in the same order
         """
         task = self._follow(records, self._every)
-        made = []
+        samples = [] if self._confidence is None else [(Samples.of(record), starts_at_rest(record)) for record in records]
+        made: list[FloatArray] = []
+        reasons: list[str] = []
         while (running := ~task.truncated()).any():
-            discharge, time_s = task.seen()
+            (discharge, time_s), fitted = task.seen(), _fitted(task)
             action, _ = self.policy.predict(task.observation(), deterministic=True)
             task.advance(np.asarray(action))
-            made.append((discharge[running], time_s[running], task.estimate[running]))
+            estimate = task.estimate
+            columns = [discharge[:, None], time_s[:, None], estimate]
+            if self._confidence is not None and fitted is not None:
+                sd = self._confidence.standard_deviations(fitted, estimate)
+                columns.append(sd)
+                for n in np.flatnonzero(running).tolist():
+                    record, rested = samples[discharge[n]]
+                    so_far = record.first(int(np.searchsorted(record.time_s, time_s[n], side="right")))
+                    reasons.append(self._confidence.reason(fitted, n, estimate[n], sd[n], so_far, rested))
+            made.append(np.concatenate(columns, axis=1)[running])
             task.drop_ended()
-        discharge, time_s, estimate = (np.concatenate(parts) for parts in zip(*made, strict=True))
-        in_order = np.argsort(discharge, kind="stable")
-        of_each = np.split(in_order, np.searchsorted(discharge[in_order], np.arange(1, len(records))))
-        return [EstimateTrace(time_s=time_s[n], q_mobile=estimate[n, 0], r_o=estimate[n, 1]) for n in of_each]
+        rows, texts = np.concatenate(made), np.array(reasons, dtype=object)
+        in_order = np.argsort(rows[:, 0], kind="stable")
+        of_each = np.split(in_order, np.searchsorted(rows[in_order, 0], np.arange(1, len(records))))
+        if self._confidence is None:
+            return [EstimateTrace(rows[n, 1], rows[n, 2], rows[n, 3]) for n in of_each]
+        return [
+            EstimateTrace(rows[n, 1], rows[n, 2], rows[n, 3], rows[n, 4], rows[n, 5], texts[n] == "", texts[n])
+            for n in of_each
+        ]
+
+
+def _fitted(task: CalibrationTask) -> Fitted | None:
+    return task.fitted() if isinstance(task, VoltageTask) else None

@@ -34,6 +34,8 @@ _ONE_OHM = 1.0
 _SURFACE_SHARE_N, _SURFACE_SHARE_P = (float(FULL_CHARGE_SHARES[column - QNB]) for column in (QNS, QPS))
 #: Step of the difference quotient dV/dq, as a share of q.
 RELATIVE_STEP = 1e-3
+# A current this much above a mean is equal to it but for rounding, A
+_EQUAL_A = 1e-9
 
 # Readings are compared in blocks: one array, in rows that start at multiples that the compiler knows. It uses vector
 # instructions where it sees that rows do not overlap, and where no reading waits for the one before
@@ -388,7 +390,7 @@ def explain(
             middle_A = 0.0
             for k in range(low, high):
                 middle_A += ohmic_A[n, k]
-            middle_A /= high - low
+            middle_A = middle_A / (high - low) + _EQUAL_A
             # of the readings with less and with more than that; a sum of zeros costs less than a branch that nobody foresees
             residual_0 = residual_1 = slope_0 = slope_1 = ohmic_0 = ohmic_1 = 0.0
             count_1 = 0

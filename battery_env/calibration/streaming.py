@@ -52,6 +52,17 @@ class ReadingsSoFar:
         known = ~np.isnan(voltage_V)
         return Samples(grid_s, np.interp(grid_s, time_s[known], voltage_V[known]), mean_A)
 
+    def known(self, until_s: float) -> Samples:
+        """
+        The samples that have a voltage.
+
+        :param until_s: up to this time, s
+        :return: these, as they came in
+        """
+        time_s, voltage_V, current_A = self.columns()
+        known = ~np.isnan(voltage_V) & (time_s <= until_s + 1e-9)
+        return Samples(time_s[known], voltage_V[known], current_A[known])
+
     def columns(self) -> FloatArray:
         """
         All samples.

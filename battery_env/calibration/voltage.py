@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 
 from battery_env.arrays import IntArray
 from battery_env.calibration.data import LoadKind, Split, opened, standard_dataset
-from battery_env.calibration.nuisance import NuisanceFit
+from battery_env.calibration.nuisance import Fitted, NuisanceFit
 from battery_env.calibration.readings import Readings, explain
 from battery_env.calibration.task import OBSERVATION_LIMIT, CalibrationTask, check_counts, check_not_negative, checked_action
 from battery_env.electrochemistry import CellParameters, FloatArray, check_cell
+from battery_env.estimators.settling import white_noise_V
 from battery_env.records import Record
 from battery_env.sensors import RandomSensorErrors
 from battery_env.trajectories import TrajectoryDataset
@@ -299,6 +300,20 @@ class VoltageTask(CalibrationTask):
     def estimate(self) -> FloatArray:
         """(q_mobile, r_o), C and ohm, shape (cells, 2)."""
         return self._estimate.copy()
+
+    def fitted(self) -> Fitted | None:
+        """
+        What the fit in the observation says (option ``nuisance``).
+
+        :return: of each cell; ``None`` if there is none
+        """
+        if self._fit is None:
+            return None
+        # without the ohmic drops, which jump where the load is switched
+        at_rest_V = self._voltage_V + self._estimate[:, 1:] * self._ohmic_A
+        parts = zip(at_rest_V, self._first, self.count, strict=True)
+        white_V = [white_noise_V(each[begin:end]) if end - begin > 1 else np.inf for each, begin, end in parts]
+        return self._fit.found(self._estimate, self.count - self._first, np.array(white_V))
 
     @staticmethod
     def conclude(estimates: FloatArray) -> float:

@@ -28,7 +28,7 @@ from battery_env.estimators.rest import (
 )
 from battery_env.estimators.settling import MISMATCH_MARGIN, PLAUSIBLE_Q_SHARES
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, check_parameters
-from battery_env.records import REST_CURRENT_A, Record, Stream, check_drawn_charge, check_sample
+from battery_env.records import REST_CURRENT_A, Record, Stream, check_drawn_charge, check_sample, starts_at_rest
 
 _PRIOR_SD_SHARE_Q = 0.25
 _PRIOR_SD_R_OHM = 0.15
@@ -338,7 +338,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
             if temperature_C is not None:
                 temperature_K = temperature_C + ZERO_CELSIUS_K
                 self._surround(float(temperature_K[0]))
-            self._monitor.memory[AT_REST] = float(getattr(record, "starts_at_rest", False))
+            self._monitor.memory[AT_REST] = float(starts_at_rest(record))
             self._check_drawn(float(np.cumsum(np.append(0.0, current_A[:-1]) * dt_s).min()))
             out, codes = self._run(np.stack([voltage_V, current_A, dt_s, temperature_K]))
             q, r_o, sd_q, sd_r_o = out[:, :4].T.copy()

@@ -44,7 +44,7 @@ from battery_env.estimators.settling import (
 )
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, check_parameters
 from battery_env.record_model import LONGEST_FORECAST_S, RecordModel
-from battery_env.records import Record, Samples, check_drawn_charge, check_record, drawn
+from battery_env.records import Record, Samples, check_drawn_charge, check_record, drawn, starts_at_rest
 
 # Where the search for q_mobile may start: this much above the least value that the record allows. The narrow ones serve whole
 # discharges, the wide ones the first minutes of one.
@@ -242,7 +242,7 @@ class LeastSquares(Estimator):
         :raises ValueError: if the record cannot be used, or the least ``q_mobile`` it allows is outside the bounds
         """
         known, part, start = self._begun(record)
-        return known._estimate(part, start, _rested(record))
+        return known._estimate(part, start, starts_at_rest(record))
 
     @property
     def model(self) -> RecordModel:
@@ -288,8 +288,7 @@ class LeastSquares(Estimator):
         known, own = copy(self), self._model_at_start
         known.initial_soc, known.told_from_rest = (start.soc, start.sd_soc), False
         known._model_at_start = RecordModel(own.cell, own.thermal, own.dt_s, initial_soc=start.soc)
-        columns = (np.asarray(column) for column in (record.time_s, record.voltage_V, record.current_A))
-        return known, Samples(*(column[max(start.samples - 1, 0) :] for column in columns)), start
+        return known, Samples(*(column[max(start.samples - 1, 0) :] for column in Samples.of(record))), start
 
     def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:
         """
@@ -306,7 +305,7 @@ class LeastSquares(Estimator):
 
     def _growing_trace(self, record: Record, every_s: float) -> EstimateTrace:
         known, part, start = self._begun(record)
-        whole = Samples(*(np.asarray(column) for column in (part.time_s, part.voltage_V, part.current_A)))
+        whole = Samples.of(part)
         time_s = whole.time_s
         samples = np.searchsorted(time_s, np.arange(time_s[0] + every_s, time_s[-1], every_s), side="right")
         # the current of a sample shows at the next one
@@ -314,7 +313,7 @@ class LeastSquares(Estimator):
         stops = np.unique(np.append(samples[samples >= fewest], len(time_s)))
         estimates: list[Estimate] = []
         for stop in stops:
-            estimates.append(known._estimate(whole.first(stop), start, _rested(record), *estimates[-1:]))
+            estimates.append(known._estimate(whole.first(stop), start, starts_at_rest(record), *estimates[-1:]))
         return EstimateTrace.of(time_s[stops - 1], estimates)
 
     def _estimate(self, record: Record, start: Start, rested: bool, previous: Estimate | None = None) -> Estimate:
@@ -717,11 +716,6 @@ def _check_nuisance(nuisance: Mapping[str, float], parameters: tuple[str, ...]) 
     if "tDiffusion" in nuisance and "q_mobile" not in parameters:
         raise ValueError("tDiffusion can be a nuisance only beside q_mobile: without it the model cell may be empty too early")
     return dict(nuisance)
-
-
-def _rested(record: Record) -> bool:
-    """Whether the first voltage is known to be that of the cell at rest, with the current of the load that was switched on."""
-    return bool(getattr(record, "starts_at_rest", False))
 
 
 def _is_near_best(starts: Sequence[_Start]) -> BoolArray:

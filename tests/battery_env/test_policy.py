@@ -7,6 +7,7 @@ import pytest
 
 from battery_env import PolicyEstimator, load_nasa_discharges
 from battery_env.calibration.aging import simulated_lives
+from battery_env.calibration.confidence import NO_FIT
 from battery_env.calibration.voltage import LARGEST_STEPS
 from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.evaluation import evaluate
@@ -100,7 +101,7 @@ def test_recorded_discharges():
     estimator = PolicyEstimator(Constant(-0.1, 0.0), "BatteryVoltageJoint-v0")
     estimate, trace = estimator.estimate(discharge), estimator.trace([discharge])[0]
     assert estimate.q_mobile == trace.q_mobile[-1] < NEW_CELL.q_mobile
-    assert not estimate.settled and estimate.reason == "A policy states no uncertainty."
+    assert not estimate.settled and estimate.reason == NO_FIT
     assert discharge.time_s[0] + 60.0 == trace.time_s[0]
     assert discharge.time_s[-1] - 10.0 <= trace.time_s[-1] <= discharge.time_s[-1]
 

@@ -74,14 +74,10 @@ def test_on_recorded_cells_the_one_for_them_agrees_with_least_squares(cell):
     assert off[True].max() < 0.04 and off[True].mean() < 0.6 * off[False].mean()
 
 
-def test_it_is_never_sure_and_stays_in_its_range():
+def test_it_stays_in_its_range_and_says_how_sure_it_is():
     estimator = PolicyEstimator.pretrained()
-    data = standard_dataset("joint", "piecewise", "test", mismatch=0.2)[:2]
-    for record in data:
-        estimate = estimator.estimate(record)
-        assert not estimate.settled and np.isnan([estimate.sd_q_mobile, estimate.sd_r_o]).all()
-    for trace in estimator.trace(data):
-        assert trace.settled is None and trace.sd_q_mobile is None
+    for trace in estimator.trace(standard_dataset("joint", "piecewise", "test", mismatch=0.2)[:2]):
+        assert trace.settled[-1] and not trace.settled[0] and (trace.sd_q_mobile > 0.0).all()
         for name, (low, high) in ESTIMATE_RANGES.items():
             assert (getattr(trace, name) >= low).all() and (getattr(trace, name) <= high).all()
 

@@ -103,10 +103,22 @@ def test_stretches_are_averaged_in_halves_of_less_and_of_more_current(readings):
                 np.testing.assert_allclose(coarse[k][n, stretch], [values[~more].mean(), values[more].mean()], rtol=1e-9)
 
 
-def test_under_a_constant_current_both_halves_are_the_whole(data, readings):
-    constant = Readings(**{**readings.__dict__, "ohmic_A": np.ones_like(readings.ohmic_A)})
+# The mean of several numbers like the third is below them, as it rounds
+@pytest.mark.parametrize("current_A", [1.0, 0.0, 1.7320508075688772, 0.1])
+def test_under_a_constant_current_both_halves_are_the_whole(data, readings, current_A):
+    constant = Readings(**{**readings.__dict__, "ohmic_A": np.full_like(readings.ohmic_A, current_A)})
     for values in compare(constant, readings.q_mobile * 1.05, readings.r_o)[:3]:
         np.testing.assert_array_equal(values[:, :, 0], values[:, :, 1])
+
+
+def test_rounding_of_a_constant_current_tells_no_halves_apart(readings):
+    nearly = 1.7 * (1.0 + 1e-15 * np.random.default_rng(0).standard_normal(len(readings.ohmic_A)))
+    rounded, constant = (
+        compare(Readings(**{**readings.__dict__, "ohmic_A": each}), readings.q_mobile * 1.05, readings.r_o)
+        for each in (nearly, np.full_like(nearly, 1.7))
+    )
+    for one, other in zip(rounded, constant, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
 
 
 def test_fewer_readings_than_stretches_share_them(readings):

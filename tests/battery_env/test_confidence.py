@@ -1,0 +1,146 @@
+"""What policies state of their estimates: standard deviations that hold, and why they are not sure."""
+
+import re
+
+import numpy as np
+import pytest
+
+from battery_env import PolicyEstimator, evaluate, load_nasa_discharges
+from battery_env.calibration.confidence import NO_FIT, Confidence
+from battery_env.calibration.data import standard_dataset
+from battery_env.calibration.voltage_tasks import BatteryVoltageJoint
+from battery_env.electrochemistry import NEW_CELL, simulate
+from battery_env.records import Samples
+from battery_env.sensors import RandomSensorErrors, SensorErrors
+
+ENV_ID = "BatteryVoltageJoint-v0"
+OPTIONS = {"nuisance": 0.2, "reading_s": 2.0}
+
+
+class Step:
+    """A policy that makes a share of the step that the fit in its observation says, and goes some way beyond."""
+
+    def __init__(self, share=1.0, beyond=0.0, columns=slice(102, 104)):
+        self.share, self.beyond, self.columns = share, beyond, columns
+
+    def predict(self, observation, deterministic=False):
+        step = observation[:, self.columns].astype(np.float64)
+        moved = self.share * np.sign(step) * step**2 + self.beyond
+        return np.sign(moved) * np.sqrt(np.abs(moved)), None
+
+
+def whole_discharge(q_mobile=6000.0, r_o=0.15, load_A=1.5, noise_V=0.002, **more):
+    rng = np.random.default_rng(0)
+    current_A = load_A * (1.0 + 0.5 * (np.arange(30_000) // 90 % 2))
+    record = simulate(current_A, q_mobile, r_o, load_unit="current", cut_off_V=2.8, **more)
+    voltage_V = record.voltage_V + rng.normal(0.0, noise_V, len(record.voltage_V))
+    return Samples(record.time_s, voltage_V, record.current_A)
+
+
+WHOLE = whole_discharge()
+
+
+def estimator(policy=None, **options):
+    return PolicyEstimator(policy or Step(), ENV_ID, **{**OPTIONS, **options})
+
+
+@pytest.mark.parametrize("mismatch", [0.0, 0.2])
+@pytest.mark.parametrize(
+    "sensor", [SensorErrors(0.005), RandomSensorErrors((0.001, 0.030), 0.010)], ids=["5 mV", "1-30 mV and an offset"]
+)
+def test_two_standard_deviations_cover_nineteen_of_twenty_estimates(mismatch, sensor):
+    data = standard_dataset("joint", "piecewise", "test", mismatch=mismatch)[:60]
+    scores = evaluate(PolicyEstimator.pretrained(), data, sensor, seed=1)
+    for name in ("q_mobile", "r_o"):
+        # 100 discharges had 95 to 98 %
+        assert 90.0 < scores[f"{name}_coverage_percent"].mean() < 99.9
+    assert np.isfinite(scores["settled_time_s"]).mean() > 0.9
+
+
+def test_they_are_those_of_the_fit_and_the_distance_from_it():
+    task = BatteryVoltageJoint.follow([WHOLE], 300, **OPTIONS)
+    fitted, confidence = task.fitted(), Confidence(task, NEW_CELL, 1.0)
+    assert (fitted.sd > 0.0).all() and fitted.readings == 300 and fitted.white_V == pytest.approx(0.002, rel=0.2)
+    np.testing.assert_array_equal(confidence.standard_deviations(fitted, fitted.estimate), fitted.sd)
+    away = np.array([[300.0, -0.02]])
+    expected = np.hypot(fitted.sd, away)
+    np.testing.assert_allclose(confidence.standard_deviations(fitted, fitted.estimate + away), expected)
+
+
+def test_they_shrink_until_the_estimate_settles():
+    trace = estimator().trace([WHOLE])[0]
+    assert trace.sd_q_mobile[-1] < 0.05 * trace.sd_q_mobile[0]
+    assert trace.settled[-1] and not trace.settled[0]
+    assert (trace.settled == (trace.reason == "")).all()
+
+
+def test_the_last_of_a_trace_is_the_estimate():
+    estimate, trace = estimator().estimate(WHOLE), estimator().trace([WHOLE])[0]
+    assert estimate.settled and estimate.q_mobile == pytest.approx(6000.0, rel=0.01)
+    for name in ("q_mobile", "r_o", "sd_q_mobile", "sd_r_o", "settled", "reason"):
+        assert getattr(estimate, name) == getattr(trace, name)[-1]
+
+
+def test_what_is_known_has_none():
+    policy = PolicyEstimator(Step(columns=slice(101, 102)), "BatteryVoltageRo-v0", **OPTIONS)
+    estimate = policy.estimate(whole_discharge(q_mobile=NEW_CELL.q_mobile))
+    assert estimate.settled and np.isnan(estimate.sd_q_mobile)
+    assert abs(estimate.r_o - 0.15) < 3.0 * estimate.sd_r_o < 0.02
+
+
+def test_a_policy_that_sees_no_fit_states_nothing_and_is_never_sure():
+    estimate = PolicyEstimator(Step(columns=slice(0, 2)), ENV_ID).estimate(WHOLE)
+    assert not estimate.settled and estimate.reason == NO_FIT
+    assert np.isnan([estimate.sd_q_mobile, estimate.sd_r_o]).all()
+
+
+@pytest.mark.parametrize(
+    ("record", "options", "message"),
+    [
+        (whole_discharge(q_mobile=9500.0), {}, "q_mobile is at a bound of its search"),
+        (WHOLE._replace(voltage_V=WHOLE.voltage_V + 0.035), {}, "The record starts at 4.2. V, above the 4.19 V"),
+        (WHOLE._replace(voltage_V=WHOLE.voltage_V - 0.035), {}, "takes the voltage for 3. mV off"),
+        (whole_discharge(cell=NEW_CELL.replace(kn=6.0 * NEW_CELL.kn)), {}, "A constant of the cell is farther"),
+        (whole_discharge(cell=NEW_CELL.replace(U0p=NEW_CELL.U0p + 0.1)), {}, "The record starts at .* another kind of cell"),
+        (WHOLE._replace(voltage_V=WHOLE.voltage_V + 0.02 * np.sin(WHOLE.time_s / 300.0)), {}, "farther off than noise"),
+        (WHOLE.first(500), {}, "q_mobile is not known to 2 % yet"),
+        (WHOLE, {"policy": Step(beyond=0.15)}, "The policy and the fit in its observation differ by .* in q_mobile"),
+        (Samples(*(column[900:] for column in WHOLE)), {}, "The record starts under load|The record starts at rest"),
+    ],
+    ids=["range", "sensor", "offset", "constant", "another cell", "misfit", "in progress", "distrust", "late start"],
+)
+def test_what_it_is_not_sure_of_is_said(record, options, message):
+    estimate = estimator(**options).estimate(record)
+    assert not estimate.settled
+    assert re.search(message, estimate.reason), estimate.reason
+
+
+def test_a_jump_of_the_clock_and_a_dropout_are_noticed():
+    time_s, voltage_V, current_A = WHOLE
+    later_s = np.where(time_s > 1000.0, time_s + 400.0, time_s)
+    gone_A = current_A.copy()
+    gone_A[1000:1300] = 0.0
+    for record in (Samples(later_s, voltage_V, current_A), Samples(time_s, voltage_V, gone_A)):
+        estimate = estimator().estimate(record)
+        assert not estimate.settled and estimate.reason
+
+
+def test_a_stream_goes_on_as_sure_as_it_was_saved(tmp_path):
+    policy, again = estimator(), estimator()
+    assert policy.update(4.19, 1.5, 1.0).reason == "The policy has not decided yet."
+    policy.reset()
+    samples = list(zip(WHOLE.voltage_V.tolist(), WHOLE.current_A.tolist(), strict=True))
+    for voltage_V, current_A in samples[:600]:
+        before = policy.update(voltage_V, current_A, 1.0)
+    assert before.sd_q_mobile > 0.0 and not before.settled
+    again.load(policy.save(tmp_path / "state.npz"))
+    voltage_V, current_A = samples[600]
+    assert again.update(float("nan"), current_A, 1.0) == policy.update(float("nan"), current_A, 1.0)
+    for voltage_V, current_A in samples[601:]:
+        one, other = policy.update(voltage_V, current_A, 1.0), again.update(voltage_V, current_A, 1.0)
+    assert one == other and one.settled and one.sd_q_mobile < before.sd_q_mobile
+
+
+def test_a_real_cell_is_explained_by_no_constants_that_were_learned():
+    estimate = PolicyEstimator.pretrained().estimate(load_nasa_discharges("B0005")[0].loaded_part(2.7))
+    assert "farther off than noise, an offset and the constants" in estimate.reason
