@@ -14,7 +14,7 @@ from battery_env.calibration.policy import PolicyEstimator
 from battery_env.calibration.pretrained import policy_of_file, pretrained_policy
 from battery_env.cells import Discharge
 from battery_env.checks import check_positive
-from battery_env.electrochemistry import NEW_CELL, CellParameters, initial_state, voltage
+from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.electrochemistry.cell import TB
 from battery_env.estimates import Estimate
 from battery_env.estimators.cell_fit import UNFITTED_MISMATCH_V, CellFit
@@ -22,7 +22,7 @@ from battery_env.estimators.gaps import NOT_DRAWN, find_gaps
 from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.rest import InitialSoc, Start
-from battery_env.estimators.settling import SETTLED_SHARES, least_resistance_ohm, start_reason
+from battery_env.estimators.settling import SETTLED_SHARES, least_resistance_ohm, rest_voltage_V, start_reason
 from battery_env.parameters import PARAMETER_NAMES, check_parameters
 from battery_env.record_model import RecordModel, VoltageForecast
 from battery_env.records import ExpectedCurrent, drawn, expected_current
@@ -331,7 +331,7 @@ def _starts_lower(discharge: Discharge, cell: CellParameters, soc: float, estima
     """Whether the voltage before the load, or the first one under it, is below that of a cell with this charge."""
     begin = int(np.searchsorted(discharge.time_s, discharge.load_on_time_s, side="right")) - 1
     time_s, voltage_V, current_A = (column[begin:] for column in (discharge.time_s, discharge.voltage_V, discharge.current_A))
-    rest_V = float(voltage(initial_state(cell=cell, soc=soc), cell=cell))
+    rest_V = rest_voltage_V(cell, soc)
     resistance_ohm = least_resistance_ohm(estimate.q_mobile, estimate.r_o)
     return bool(voltage_V[0] < rest_V and start_reason(time_s, voltage_V, current_A, cell, soc, resistance_ohm))
 

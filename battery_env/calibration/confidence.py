@@ -9,17 +9,17 @@ import numpy as np
 from battery_env.arrays import FloatArray
 from battery_env.calibration.nuisance import REACH_SD, Fitted
 from battery_env.calibration.voltage import ESTIMATE_RANGES, VoltageTask
-from battery_env.electrochemistry import CellParameters, initial_state, voltage
+from battery_env.electrochemistry import CellParameters
 from battery_env.estimates import Estimate
-from battery_env.estimators.gaps import DRAWN, find_gaps
+from battery_env.estimators.gaps import DRAWN, find_gaps, long_intervals
 from battery_env.estimators.settling import (
     AT_BOUND,
-    EMPTY,
     IMPRECISE,
     SETTLED_SHARES,
     first_reason,
     gap_reason,
     least_resistance_ohm,
+    rest_voltage_V,
     sensor_reason,
     start_reason,
     start_text,
@@ -60,7 +60,6 @@ class Confidence:
         self._parameters = task.parameters
         self._offset_V = task.sensors.offset_V
         self._model = RecordModel(cell, dt_s=dt_s)
-        self._rest_V = float(voltage(initial_state(cell=cell), cell=cell))
 
     def standard_deviations(self, fitted: Fitted, estimate: FloatArray) -> FloatArray:
         """
@@ -108,16 +107,17 @@ class Confidence:
 
     def _start_reason(self, record: Samples, white_V: float, rested: bool) -> str:
         """Whether the sensors that the policy has learned of can show the first voltage of a full cell."""
-        beyond_V = float(record.voltage_V[0]) - self._rest_V
+        first_V, rest_V = float(record.voltage_V[0]), rest_voltage_V(self._model.cell)
         limit_V = self._offset_V + _NOISES * white_V
-        if beyond_V > limit_V:
-            return start_text(1, float(record.voltage_V[0]), self._rest_V)
+        if first_V > rest_V + limit_V:
+            return start_text(1, first_V, rest_V)
         at_rest = rested or abs(float(record.current_A[0])) <= REST_CURRENT_A
-        return start_text(2, float(record.voltage_V[0]), self._rest_V) if at_rest and beyond_V < -limit_V else ""
+        return start_text(2, first_V, rest_V) if at_rest and first_V < rest_V - limit_V else ""
 
     def _reason_of_samples(self, record: Samples, estimate: Estimate, resistance_ohm: float) -> str:
-        model_V = self._model.voltage(record, estimate)
-        if np.isnan(model_V[-1]):
-            return EMPTY
-        gaps = [gap for gap in find_gaps(*record, model_V, estimate.q_mobile) if gap.verdict != DRAWN]
-        return (gap_reason(gaps, gaps[0].verdict) if gaps else "") or sensor_reason(*record, resistance_ohm)
+        if len(long_intervals(record.time_s)):
+            model_V = self._model.voltage(record, estimate)
+            gaps = [gap for gap in find_gaps(*record, model_V, estimate.q_mobile) if gap.verdict != DRAWN]
+            if gaps:
+                return gap_reason(gaps, gaps[0].verdict)
+        return sensor_reason(*record, resistance_ohm)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from battery_env.arrays import FloatArray
+from battery_env.arrays import FloatArray, IntArray
 from battery_env.records import REST_CURRENT_A, SWITCH_SHARE
 
 #: An interval between two samples is a gap where it is this many times longer than those before and after it, and the charge
@@ -82,6 +82,18 @@ def verdict(missing_V: float, fall_V: float, sd_V: float, most_share: float) -> 
     return UNSURE
 
 
+def long_intervals(time_s: FloatArray) -> IntArray:
+    """
+    The intervals between samples that are so much longer than those beside them that they may be gaps.
+
+    :param time_s: times of the samples, s, shape (T,), T >= 2
+    :return: their numbers
+    """
+    step_s = np.diff(time_s)
+    beside_s = np.pad(step_s, 1)
+    return np.flatnonzero(step_s > GAP_RATIO * np.maximum(beside_s[:-2], beside_s[2:]))
+
+
 def find_gaps(
     time_s: FloatArray, voltage_V: FloatArray, current_A: FloatArray, model_V: FloatArray, q_mobile: float
 ) -> list[Gap]:
@@ -97,7 +109,7 @@ def find_gaps(
     """
     step_s, gaps = np.diff(time_s), []
     beside_s = np.pad(step_s, 1)
-    for n in np.flatnonzero(step_s > GAP_RATIO * np.maximum(beside_s[:-2], beside_s[2:])):
+    for n in long_intervals(time_s):
         load_A = float(np.abs(current_A[n : n + 2]).max())
         charge_C = doubtful_charge_C(beside_s[n], step_s[n], beside_s[n + 2], load_A, q_mobile)
         if not charge_C:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 from numba import njit
@@ -85,6 +86,18 @@ SCALE_UNKNOWN = (
 PRIOR_ALONE = "{} rests on its prior: the record alone does not determine it yet."
 
 
+@lru_cache(maxsize=64)
+def rest_voltage_V(cell: CellParameters, soc: float = 1.0) -> float:
+    """
+    The voltage of a cell at rest.
+
+    :param cell: constants of the model
+    :param soc: its state of charge
+    :return: V
+    """
+    return float(voltage(initial_state(cell=cell, soc=soc), cell=cell))
+
+
 @njit(cache=True, error_model="numpy")
 def least_resistance_ohm(q_mobile: float, r_o: float) -> float:
     """
@@ -122,7 +135,7 @@ def start_reason(
         load, as in :meth:`battery_env.cells.Discharge.loaded_part`
     :return: why it cannot, or cannot be told to; empty if it can
     """
-    rest_V = float(voltage(initial_state(cell=cell, soc=initial_soc), cell=cell))
+    rest_V = rest_voltage_V(cell, initial_soc)
     soon = time_s <= time_s[0] + START_WINDOW_S
     soon[1:2] = True
     first_V, first_A = float(voltage_V[0]), 0.0 if rested else float(current_A[0])
