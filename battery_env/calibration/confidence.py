@@ -16,6 +16,7 @@ from battery_env.estimators.settling import (
     AT_BOUND,
     IMPRECISE,
     SETTLED_SHARES,
+    SPARE_SAMPLES,
     first_reason,
     gap_reason,
     least_resistance_ohm,
@@ -26,13 +27,17 @@ from battery_env.estimators.settling import (
 )
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.record_model import RecordModel
-from battery_env.records import REST_CURRENT_A, Samples
+from battery_env.records import Samples
 
 #: Why a policy is sure of nothing whose observation has no fit.
 NO_FIT = "A policy whose observation has no fit (option nuisance) states no uncertainty."
 # Residuals are more than noise if their variance is above that of the noise by this over the root of the number of readings,
 # and by this, V, for what a linear step leaves
 _EXCESS_LIMIT, _NEGLIGIBLE_V = 10.0, 2e-3
+# That a constant is at its limit is a matter of rounding
+_NEARLY = 1.0 - 1e-9
+# Samples may be this many times farther apart than readings for this share of them, and of the time
+_LONGER, _SPARSE_SHARE = 1.25, 0.05
 # The first voltage may be this many standard deviations of the noise, and the largest offset, beyond that of a full cell
 _NOISES = 3.0
 # An offset may be this many times the bound that it was trained with
@@ -44,6 +49,11 @@ _UNEXPLAINED = (
 _OFFSET = "The fit in the observation takes the voltage for {:.0f} mV off, where the policy has learned of {:.0f} mV at most."
 _CONSTANTS = "A constant of the cell is farther from the model's than the policy has learned of (option nuisance)."
 _DIFFERS = "The policy and the fit in its observation differ by {:.1%} in {}: it does not trust the fit."
+_FEW = "These are too few readings to tell the noise yet."
+_SPARSE = (
+    "Samples lie farther apart than the {:g} s between the readings of the policy, or are missing at the start: it reads a "
+    "straight line between them, which misleads it. Least squares and the filter take such records."
+)
 _IMPRECISE = IMPRECISE | {"r_o": "r_o is not known to 30 % yet: a larger current tells more."}
 
 
@@ -59,6 +69,7 @@ class Confidence:
     def __init__(self, task: VoltageTask, cell: CellParameters, dt_s: float) -> None:
         self._parameters = task.parameters
         self._offset_V = task.sensors.offset_V
+        self._interval_s = task.readings.interval_s
         self._model = RecordModel(cell, dt_s=dt_s)
 
     def standard_deviations(self, fitted: Fitted, estimate: FloatArray) -> FloatArray:
@@ -80,39 +91,49 @@ class Confidence:
         :param n: of which cell
         :param estimate: (q_mobile, r_o) that it has made of it, C and ohm, shape (2,)
         :param sd: their standard deviations, same shape
-        :param record: all samples so far, at least two
+        :param record: all samples so far
         :param rested: whether the first voltage is known to be that of a cell at rest
         :return: a sentence or two, empty if it is settled
         """
         q_mobile, r_o = estimate.tolist()
         resistance_ohm = least_resistance_ohm(q_mobile, r_o)
+        readings, white_V = int(fitted.readings[n]), float(fitted.white_V[n])
         start = start_reason(*record, self._model.cell, resistance_ohm=resistance_ohm, rested=rested)
-        start = start or self._start_reason(record, float(fitted.white_V[n]), rested)
-        excess = 1.0 + _EXCESS_LIMIT / sqrt(fitted.readings[n])
-        limit_V2 = excess * float(fitted.white_V[n]) ** 2 + _NEGLIGIBLE_V**2
+        limit_V2 = (1.0 + _EXCESS_LIMIT / sqrt(readings)) * white_V**2 + _NEGLIGIBLE_V**2
         offset_V = abs(float(fitted.offset_V[n]))
+        first_V, full_V = float(record.voltage_V[0]), rest_voltage_V(self._model.cell)
+        often, share = self._without_samples(record.time_s, readings)
+        sparse = _SPARSE.format(self._interval_s)
         columns = [(name, PARAMETER_NAMES.index(name)) for name in self._parameters]
         differs = np.abs(fitted.estimate[n] / estimate - 1.0)
-        return first_reason(
-            [
-                (bool(start), start),
-                *((estimate[k] in ESTIMATE_RANGES[name], AT_BOUND.format(name)) for name, k in columns),
-                (not fitted.noise_V[n] ** 2 <= limit_V2, _UNEXPLAINED),
-                (offset_V > _OFFSET_MARGIN * self._offset_V, _OFFSET.format(1e3 * offset_V, 1e3 * self._offset_V)),
-                (not fitted.constants_sd[n] < REACH_SD, _CONSTANTS),
-                *((not differs[k] < SETTLED_SHARES[name], _DIFFERS.format(differs[k], name)) for name, k in columns),
-                *((not sd[k] < SETTLED_SHARES[name] * estimate[k], _IMPRECISE[name]) for name, k in columns),
-            ]
-        ) or self._reason_of_samples(record, Estimate(q_mobile, r_o), resistance_ohm)
+        return (
+            first_reason(
+                [
+                    (bool(start), start),
+                    (often, sparse),
+                    (readings < len(columns) + SPARE_SAMPLES, _FEW),
+                    *((estimate[k] in ESTIMATE_RANGES[name], AT_BOUND.format(name)) for name, k in columns),
+                    (not fitted.noise_V[n] ** 2 <= limit_V2, _UNEXPLAINED),
+                    (first_V > full_V + self._offset_V + _NOISES * white_V, start_text(1, first_V, full_V)),
+                    (offset_V > _OFFSET_MARGIN * self._offset_V, _OFFSET.format(1e3 * offset_V, 1e3 * self._offset_V)),
+                    (fitted.constants_sd[n] > _NEARLY * REACH_SD, _CONSTANTS),
+                    *((not differs[k] < SETTLED_SHARES[name], _DIFFERS.format(differs[k], name)) for name, k in columns),
+                    *((not sd[k] < SETTLED_SHARES[name] * estimate[k], _IMPRECISE[name]) for name, k in columns),
+                ]
+            )
+            or self._reason_of_samples(record, Estimate(q_mobile, r_o), resistance_ohm)
+            or (sparse if share > _SPARSE_SHARE else "")
+        )
 
-    def _start_reason(self, record: Samples, white_V: float, rested: bool) -> str:
-        """Whether the sensors that the policy has learned of can show the first voltage of a full cell."""
-        first_V, rest_V = float(record.voltage_V[0]), rest_voltage_V(self._model.cell)
-        limit_V = self._offset_V + _NOISES * white_V
-        if first_V > rest_V + limit_V:
-            return start_text(1, first_V, rest_V)
-        at_rest = rested or abs(float(record.current_A[0])) <= REST_CURRENT_A
-        return start_text(2, first_V, rest_V) if at_rest and first_V < rest_V - limit_V else ""
+    def _without_samples(self, time_s: FloatArray, readings: int) -> tuple[bool, float]:
+        """
+        Whether readings lie between samples at the start or again and again, and for which share of the time. There they lie
+        on a straight line, which no cell follows, least of all when the load is switched on.
+        """
+        step_s = np.diff(np.append(time_s, max(time_s[-1], time_s[0] + readings * self._interval_s)))
+        is_long = step_s > _LONGER * self._interval_s
+        often = len(time_s) < 2 or bool(is_long[0]) or float(is_long.mean()) > _SPARSE_SHARE
+        return often, float(step_s[is_long].sum() / step_s.sum())
 
     def _reason_of_samples(self, record: Samples, estimate: Estimate, resistance_ohm: float) -> str:
         if len(long_intervals(record.time_s)):

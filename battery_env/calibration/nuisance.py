@@ -66,7 +66,7 @@ class Fitted(NamedTuple):
     :param constants_sd: how far the constant lies from the model's that is the farthest, as a multiple of its standard
         deviation, shape (cells,)
     :param readings: to how many it is a fit, shape (cells,)
-    :param white_V: white part of their noise, which no model can explain, V, shape (cells,)
+    :param white_V: white part of their noise, which no model can explain, V, shape (cells,); infinite where they are too few
     """
 
     estimate: FloatArray

@@ -27,7 +27,7 @@ from battery_env.estimators.base import Estimate, EstimateTrace, ModelNow, Onlin
 from battery_env.record_model import RecordModel
 from battery_env.records import Samples, check_drawn_charge, check_record, check_sample, drawn, starts_at_rest
 
-_NOT_YET = "The policy has not decided yet."
+_NOT_YET = "The policy states nothing before its next decision."
 # A full cell takes no more charge than this share of that of a new one.
 _SURPLUS = 0.01
 # Steps in which a stream is followed, s
@@ -76,9 +76,9 @@ class PolicyEstimator(OnlineEstimator):
     cell's until ``decision_s`` are over, and moves every ``decision_s`` from then on.
 
     A policy whose observation has a fit (option ``nuisance``) states standard deviations: those of the fit under its priors,
-    with the distance of the estimate from it. It has settled under the conditions of least squares, if the residuals of
-    the fit are noise, and its offset and constants are such as the policy has learned of. Other policies state nothing, and
-    never settle.
+    with the distance of the estimate from it. It has settled where these are as small as least squares ask for, the residuals
+    of the fit are noise, its offset and constants are such as the policy has learned of, and nothing in the record
+    contradicts it. They hold for records with a sample for each reading. Other policies state nothing, and never settle.
 
     :param policy: what to ask for actions, deterministically
     :param env_id: id of the environment that the policy was trained on

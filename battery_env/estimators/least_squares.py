@@ -33,6 +33,7 @@ from battery_env.estimators.settling import (
     PRIOR_LIMIT_SD,
     SCALE_UNKNOWN,
     SETTLED_SHARES,
+    SPARE_SAMPLES,
     first_reason,
     gap_reason,
     imprecise_text,
@@ -76,8 +77,6 @@ _NOISE_V = 0.005
 _LEAST_NOISE_V = 1e-4
 # The end of a record agrees with an estimate within this share of its duration.
 _END_SHARE = 0.02
-# With fewer samples than this beyond the number of parameters, the residuals do not tell how large the noise is.
-_SPARE_SAMPLES = 10
 _FEW = "These are too few samples to tell the noise. Record on or more often, or state voltage_noise_V."
 # At so many points of what is still to come it is told how well q_mobile would be known by then.
 _DEPTHS = 500
@@ -463,7 +462,7 @@ class LeastSquares(Estimator):
                 (carried and "q_mobile" in unknown, f"{PRIOR_ALONE.format('q_mobile')} Without it {imprecise['q_mobile']}"),
                 *((hidden[name] >= SETTLED_SHARES[name] * fit.values[name], SCALE_UNKNOWN.format(name)) for name in unknown),
                 *((True, imprecise[name]) for name in unknown),
-                (self.voltage_noise_V is None and len(fit.residual_V) < len(self.parameters) + _SPARE_SAMPLES, _FEW),
+                (self.voltage_noise_V is None and len(fit.residual_V) < len(self.parameters) + SPARE_SAMPLES, _FEW),
             ]
         )
 

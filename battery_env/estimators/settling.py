@@ -38,6 +38,8 @@ LEAST_JUMP_A, MOST_RESISTANCE_OHM = 0.05, 0.6
 #: What is more than this many standard deviations of the noise is not noise.
 NOISES = 8.0
 
+#: With fewer samples than this beyond the number of parameters, the residuals do not tell how large the noise is.
+SPARE_SAMPLES = 10
 #: A ``q_mobile`` is plausible within these multiples of the model cell's: its electrodes are those of a 2 Ah cell.
 PLAUSIBLE_Q_SHARES = (0.2, 5.0)
 #: A prior farther from what the record says than this many standard deviations of their difference contradicts it. Within it,

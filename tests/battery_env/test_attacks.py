@@ -370,7 +370,7 @@ def test_no_policy_is_sure_of_a_wrong_answer_and_each_answers_within_its_range(f
 
 @pytest.mark.parametrize("cell", ["B0005", "B0006"])
 def test_no_policy_is_sure_of_a_real_cell(cell):
-    """None of them has learned of all that is wrong with the model of one."""
+    """They are sampled every 18 s, and none of them has learned of all that is wrong with the model of one."""
     for recorded in (False, True):
         estimator = PolicyEstimator.pretrained(recorded=recorded)
         for discharge in discharges(cell)[::24]:

@@ -533,7 +533,7 @@ class TestPolicies:
         assert main(["calibrate", "B0005:100", "--method", "policy", "--out", str(tmp_path)]) == 3
         shown = capsys.readouterr().out
         assert "calibrated by the policy that comes with the package" in shown and "nan" not in shown
-        assert shown.count("   sd ") == 2 and "Not settled: The voltage is farther off than noise, an offset" in shown
+        assert shown.count("   sd ") == 2 and "Not settled: Samples lie farther apart than the 2 s" in shown
         (row,) = pd.read_csv(tmp_path / "B0005_100_estimate.csv").to_dict(orient="records")
         record = load_nasa_discharges("B0005")[99].loaded_part(2.7)
         assert row["q_mobile_C"] == pytest.approx(PolicyEstimator.pretrained(recorded=True).estimate(record).q_mobile)
