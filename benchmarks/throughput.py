@@ -301,6 +301,7 @@ def filter_contestants(cells: int, folder: Path) -> dict[str, Callable[[], int]]
         "PolicyEstimator, ONNX": partial(
             stream, PolicyEstimator(OnnxPolicy(export_onnx(model, folder / "p.onnx")), _POLICY_ENV)
         ),
+        "PolicyEstimator.pretrained()": partial(stream, PolicyEstimator.pretrained()),
         "progpy, unscented Kalman filter": partial(peer, "ukf", _PROGPY_SAMPLES),
         "progpy, 100 particles": partial(peer, "particles", _PARTICLES_SAMPLES),
     }
