@@ -7,8 +7,8 @@ What each fault of what a calibrator was told, of a sensor, or of the model does
   python -m benchmarks.faults --policies lac:results/voltage/BatteryVoltageJoint-v0/lac_seed0_0123abcd/model.zip
 
 The work is that of ``BatteryVoltageJoint-v0``: held-out discharges under power that changes every 60 to 140 s, both
-parameters unknown, 5 mV of noise, calibrators start from a new cell. One thing is wrong at a time. Policies that were trained
-on that task stand beside the others if their files are given. Finished parts are not run again.
+parameters unknown, 5 mV of noise, calibrators start from a new cell. One thing is wrong at a time. The policy that comes with
+``battery_env`` is among the calibrators; others stand beside it if their files are given. Finished parts are not run again.
 """
 
 from __future__ import annotations
@@ -96,6 +96,8 @@ class Calibrator:
     make: Callable[[Sequence[str], float], Estimator]
 
 
+_POLICY_NEEDS = "training on simulated discharges, model"
+_PRETRAINED = "LAC, pretrained"
 _CALIBRATORS = (
     Calibrator("closed form", "full state, model", lambda unknown, noise_V: ClosedForm()),
     Calibrator(
@@ -115,11 +117,11 @@ _CALIBRATORS = (
             unknown, voltage_noise_V=max(noise_V, STATED_MISMATCH_V), mismatch_V=STATED_MISMATCH_V
         ),
     ),
+    Calibrator(_PRETRAINED, _POLICY_NEEDS, lambda unknown, noise_V: PolicyEstimator.pretrained(ENV_ID)),
 )
 CALIBRATORS = {calibrator.name: calibrator for calibrator in _CALIBRATORS}
 # Exact estimates are drawn here
 _FLOOR_PERCENT = 1e-3
-_POLICY_NEEDS = "training on simulated discharges, model"
 
 
 def work(fault: Fault, unknown: Sequence[str], n: int) -> TrajectoryDataset:
@@ -191,7 +193,7 @@ def parts(n: int, policies: Sequence[str]) -> list[dict[str, Any]]:
     All parts of this study.
 
     :param n: discharges
-    :param policies: see :func:`part`; they search for both parameters, and miss the fault where one is known
+    :param policies: see :func:`part`. Policies search for both parameters, and miss the fault where one is known
     :return: the arguments of each
     """
     chosen = []
@@ -199,7 +201,8 @@ def parts(n: int, policies: Sequence[str]) -> list[dict[str, Any]]:
         unknowns = [(name,) for name in PARAMETERS] if fault.other_worn else [PARAMETER_NAMES]
         for unknown in unknowns:
             common = {"fault": fault.name, "unknown": list(unknown), "discharges": -(-n // len(unknowns))}
-            chosen += [{**common, "calibrator": name, "policy": None, "digest": None} for name in CALIBRATORS]
+            names = [name for name in CALIBRATORS if not (fault.other_worn and name == _PRETRAINED)]
+            chosen += [{**common, "calibrator": name, "policy": None, "digest": None} for name in names]
             if not fault.other_worn:
                 chosen += [
                     {**common, "calibrator": _policy_name(policy), "policy": policy, "digest": _digest(policy)}
@@ -303,7 +306,7 @@ def report(results: pd.DataFrame, configuration: Mapping[str, Any]) -> str:
 parameters unknown, from the estimate of a new cell; one thing wrong at a time. Where one parameter is unknown, {-(-n // 2)}
 discharges for each. Constants of the model: kn, tDiffusion, to and tsn of each cell are multiplied by log-normal factors. The
 closed form sees the exact state and the current of the sensor. Least squares estimate every {WINDOW_EVERY_S:g} s, the filters
-every second. Times are CPU times on one core.
+every second, the policy every minute. Times are CPU times on one core.
 
 {needs}
 Error in the second half of a discharge: mean over discharges (worst discharge), %.
