@@ -267,7 +267,7 @@ def honesty_table(results: pd.DataFrame) -> pd.DataFrame:
                 )
                 row[f"{name}: says settled in the end (%)"] = f"{100.0 * settled:.0f}"
         rows.append(row)
-    return pd.DataFrame(rows)
+    return pd.DataFrame(rows).fillna("-")
 
 
 def needs_table(results: pd.DataFrame) -> pd.DataFrame:
