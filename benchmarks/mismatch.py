@@ -34,7 +34,7 @@ from battery_env.evaluation import evaluate
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.plotting import COLOURS, LABELS, new_figure
 from battery_env.record_model import RecordModel
-from benchmarks.contests import SENSORS
+from benchmarks.contests import SENSORS, check_discharges
 from benchmarks.nuisance import MISMATCH_V, OFFSET_SD_V
 from benchmarks.peers import cpu_time_per_estimate_s
 from benchmarks.real_cells import CUT_OFF_V, SHARES
@@ -233,8 +233,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--discharges", type=positive, default=60, help="simulated test discharges, up to 300")
     parser.add_argument("--cells", nargs="*", choices=BUNDLED_CELLS, default=list(BUNDLED_CELLS))
     study = Study(parser, arguments)
-    if study.chosen.discharges > 300:
-        parser.error("--discharges must lie within 1 .. 300")
+    check_discharges(parser, study.chosen.discharges)
     policies = [pretrained_card(ENV_ID, recorded)["sha256"][:8] for recorded in (False, True)]
     study.configuration |= {"policies": policies, "window_every_s": WINDOW_EVERY_S, "every_recorded_discharge": _EVERY}
 

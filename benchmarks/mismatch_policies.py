@@ -21,7 +21,7 @@ import pandas as pd
 from battery_env.calibration.data import standard_dataset
 from battery_env.calibration.policy import PolicyEstimator
 from battery_env.evaluation import evaluate
-from benchmarks.contests import SENSORS
+from benchmarks.contests import SENSORS, check_discharges
 from benchmarks.mismatch import ENV_ID, MISMATCHES, plot_scores
 from benchmarks.pretrained import OPTIONS, TRAINED_WITH
 from benchmarks.study import SYMBOLS, Study, Tables, command_line, digits, markdown, natural, positive
@@ -86,8 +86,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--discharges", type=positive, default=60, help="simulated test discharges, up to 300")
     study = Study(parser, arguments)
     chosen = study.chosen
-    if chosen.discharges > 300:
-        parser.error("--discharges must lie within 1 .. 300")
+    check_discharges(parser, chosen.discharges)
     study.configuration |= {"trained_with": TRAINED_WITH}
     parts = [
         {"algo": algo, "seed": seed, "updates": chosen.updates, "discharges": chosen.discharges}

@@ -32,7 +32,7 @@ from battery_env.calibration.pretrained import file_stem, policy_of_file
 from battery_env.evaluation import evaluate
 from battery_env.files import replacing
 from battery_env.trajectories import AgedParameter
-from benchmarks.contests import SENSORS
+from benchmarks.contests import SENSORS, check_discharges
 from benchmarks.study import SYMBOLS, Study, Tables, command_line, markdown, natural, positive, versions, write_json
 from benchmarks.training import Recipe, record_file, timesteps_of, train_or_load
 from sb3_lac.onnx import export_onnx
@@ -207,8 +207,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--discharges", type=positive, default=60, help="test discharges of the evaluation, up to 300")
     study = Study(parser, arguments)
     chosen = study.chosen
-    if chosen.discharges > 300:
-        parser.error("--discharges must lie within 1 .. 300")
+    check_discharges(parser, chosen.discharges)
     trained_with = TRAINED_WITH | (RECORDED if chosen.recorded else {})
     study.configuration |= {"trained_with": trained_with, "options": OPTIONS}
     recipes = {env_id: make(env_id, chosen.seed, chosen.updates, chosen.recorded, study.out) for env_id in chosen.envs}

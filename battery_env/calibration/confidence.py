@@ -14,6 +14,7 @@ from battery_env.estimates import Estimate
 from battery_env.estimators.gaps import DRAWN, find_gaps, long_intervals
 from battery_env.estimators.settling import (
     AT_BOUND,
+    EXCESS_LIMIT_UNSTATED,
     IMPRECISE,
     SETTLED_SHARES,
     SPARE_SAMPLES,
@@ -31,9 +32,8 @@ from battery_env.records import Samples
 
 #: Why a policy is sure of nothing whose observation has no fit.
 NO_FIT = "A policy whose observation has no fit (option nuisance) states no uncertainty."
-# Residuals are more than noise if their variance is above that of the noise by this over the root of the number of readings,
-# and by this, V, for what a linear step leaves
-_EXCESS_LIMIT, _NEGLIGIBLE_V = 10.0, 2e-3
+# Residuals below this may be what a linear step leaves, V
+_NEGLIGIBLE_V = 2e-3
 # That a constant is at its limit is a matter of rounding
 _NEARLY = 1.0 - 1e-9
 # Samples may be this many times farther apart than readings for this share of them, and of the time
@@ -99,7 +99,7 @@ class Confidence:
         resistance_ohm = least_resistance_ohm(q_mobile, r_o)
         readings, white_V = int(fitted.readings[n]), float(fitted.white_V[n])
         start = start_reason(*record, self._model.cell, resistance_ohm=resistance_ohm, rested=rested)
-        limit_V2 = (1.0 + _EXCESS_LIMIT / sqrt(readings)) * white_V**2 + _NEGLIGIBLE_V**2
+        limit_V2 = (1.0 + EXCESS_LIMIT_UNSTATED / sqrt(readings)) * white_V**2 + _NEGLIGIBLE_V**2
         offset_V = abs(float(fitted.offset_V[n]))
         first_V, full_V = float(record.voltage_V[0]), rest_voltage_V(self._model.cell)
         often, share = self._without_samples(record.time_s, readings)

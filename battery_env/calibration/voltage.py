@@ -22,6 +22,7 @@ from battery_env.calibration.nuisance import Fitted, NuisanceFit
 from battery_env.calibration.readings import Readings, explain
 from battery_env.calibration.task import OBSERVATION_LIMIT, CalibrationTask, check_counts, check_not_negative, checked_action
 from battery_env.electrochemistry import CellParameters, FloatArray, check_cell
+from battery_env.estimators.settling import white_noise_V
 from battery_env.records import Record
 from battery_env.sensors import RandomSensorErrors
 from battery_env.trajectories import TrajectoryDataset
@@ -48,13 +49,6 @@ _SLOPE_SCALE_V_PER_C = 5e-5
 _CURRENT_SCALE_A = 3.0
 _MISFIT_SCALE_V = 0.010
 _TIME_SCALE_S = 3000.0
-
-
-def _white_noise_V(voltage_V: FloatArray) -> float:
-    # second differences, which hold nothing of what falls steadily; the median leaves those at a switch aside
-    if len(voltage_V) < 3:
-        return np.inf
-    return float(np.median(np.abs(np.diff(voltage_V, 2)))) / (0.6745 * np.sqrt(6.0))
 
 
 @lru_cache(maxsize=4)
@@ -317,7 +311,8 @@ class VoltageTask(CalibrationTask):
             return None
         # without the ohmic drops, which jump where the load is switched
         at_rest_V = self._voltage_V + self._estimate[:, 1:] * self._ohmic_A
-        white_V = [_white_noise_V(each[:end]) for each, end in zip(at_rest_V, self.count, strict=True)]
+        parts = zip(at_rest_V, self.count, strict=True)
+        white_V = [white_noise_V(each[:end], order=2) if end > 2 else np.inf for each, end in parts]
         return self._fit.found(self._estimate, self.count.copy(), np.array(white_V))
 
     @staticmethod

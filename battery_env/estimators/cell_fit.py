@@ -19,10 +19,10 @@ from scipy.optimize import least_squares
 from battery_env.arrays import FloatArray
 from battery_env.cells import Discharge
 from battery_env.checks import check_numbers, check_positive
-from battery_env.electrochemistry import NEW_CELL, CellParameters, check_cell, check_dt, initial_state, voltage
+from battery_env.electrochemistry import NEW_CELL, CellParameters, check_cell, check_dt
 from battery_env.electrochemistry.tangents import BY_Q, BY_R, RATE_CONSTANTS
 from battery_env.estimators.least_squares import LeastSquares
-from battery_env.estimators.settling import FULL_REST_V
+from battery_env.estimators.settling import FULL_REST_V, rest_voltage_V
 from battery_env.files import WrongFormatError, read_json, write_json
 from battery_env.parameters import Q_MOBILE, R_O
 from battery_env.record_model import RecordModel
@@ -174,12 +174,12 @@ class CellFit:
     @property
     def full_V(self) -> float:
         """The voltage at which a full cell rests with these constants, V."""
-        return _full_V(self.cell)
+        return rest_voltage_V(self.cell)
 
     @property
     def doubt(self) -> str:
         """Why the discharges that were fitted may not have shown a full cell at rest; empty if nothing speaks against it."""
-        before_V = _full_V(self.start)
+        before_V = rest_voltage_V(self.start)
         if self.full_V >= before_V - FULL_REST_V[0]:
             return ""
         return (
@@ -236,7 +236,7 @@ class CellFit:
         lines = [
             f"{len(self.discharges)} discharges, voltage RMSE {1e3 * before_V:.1f} mV before, {1e3 * self.rmse_V:.1f} mV "
             f"after; expect an error of {1e3 * self.mismatch_V:.1f} mV (mismatch_V)",
-            f"a full cell rests at {_full_V(self.start):.2f} V before, at {self.full_V:.2f} V after",
+            f"a full cell rests at {rest_voltage_V(self.start):.2f} V before, at {self.full_V:.2f} V after",
             "",
             f"{'constant':<16}{'before':>12}{'after':>12}{'sd before':>12}{'after':>10}",
         ]
@@ -365,10 +365,6 @@ def fit_cell(
     if fit.doubt:
         warnings.warn(fit.doubt, stacklevel=2)
     return fit
-
-
-def _full_V(cell: CellParameters) -> float:
-    return float(voltage(initial_state(cell=cell), cell=cell))
 
 
 def _records(discharges: Sequence[Record], cut_off_V: float) -> list[Record]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from battery_env.arrays import FloatArray
 from battery_env.checks import check_gain_sd
-from battery_env.electrochemistry import STATE_SIZE, CellParameters, check_cell, check_dt, initial_state, voltage
+from battery_env.electrochemistry import STATE_SIZE, CellParameters, check_cell, check_dt
 from battery_env.electrochemistry.tangents import PolynomialDerivatives
 from battery_env.estimates import Estimate, EstimateTrace
 from battery_env.estimators.base import SURPLUS_SHARE, ModelNow, OnlineBatch, OnlineEstimator, check_bounds
@@ -26,7 +26,7 @@ from battery_env.estimators.rest import (
     soc_at_rest,
     told_at_rest,
 )
-from battery_env.estimators.settling import MISMATCH_MARGIN, PLAUSIBLE_Q_SHARES
+from battery_env.estimators.settling import MISMATCH_MARGIN, PLAUSIBLE_Q_SHARES, rest_voltage_V
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, check_parameters
 from battery_env.records import REST_CURRENT_A, Record, Stream, check_drawn_charge, check_sample, starts_at_rest
 
@@ -227,7 +227,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
     def _set_limits(self, soc: float, sd_soc: float) -> None:
         nothing = (np.nan, np.nan)
         self._limits = Limits(
-            start_V=float(voltage(initial_state(cell=self._model_cell, soc=soc), cell=self._model_cell)),
+            start_V=rest_voltage_V(self._model_cell, soc),
             needs_rest=self.told_from_rest,
             rested=bool(self._numbers[_REST] >= LEAST_REST_S),
             searched=np.array([float(name in self.parameters) for name in PARAMETER_NAMES]),

@@ -24,6 +24,7 @@ from battery_env.estimators.rest import InitialSoc, Start, check_initial_soc, to
 from battery_env.estimators.settling import (
     AT_BOUND,
     EMPTY,
+    EXCESS_LIMIT_UNSTATED,
     IMPLAUSIBLE,
     IMPRECISE,
     MISFIT,
@@ -65,8 +66,6 @@ _LOG_LIMIT = 50.0
 _REACH = 5.0
 # Residuals whose variance is this many of its standard deviations above the one expected are not noise.
 _EXCESS_LIMIT = 5.0
-# If no noise is stated, it is told from differences of residuals, a little less surely.
-_EXCESS_LIMIT_UNSTATED = 10.0
 # Residuals below this are as good as none, V: files are rounded.
 _NEGLIGIBLE_V = 1e-3
 # The effect of the charge at the start is taken over this step.
@@ -396,7 +395,7 @@ class LeastSquares(Estimator):
         """What in the record contradicts the fit."""
         cell, n = self.model.cell, len(problem.time_s)
         if self.voltage_noise_V is None:
-            noise_V, excess = white_noise_V(fit.residual_V), _EXCESS_LIMIT_UNSTATED / sqrt(n)
+            noise_V, excess = white_noise_V(fit.residual_V), EXCESS_LIMIT_UNSTATED / sqrt(n)
         else:
             noise_V, excess = self.voltage_noise_V, _EXCESS_LIMIT * sqrt(2.0 / n)
         limit_V2 = noise_V**2 * (1.0 + excess) + (MISMATCH_MARGIN * self.mismatch_V) ** 2 + _NEGLIGIBLE_V**2
@@ -419,7 +418,7 @@ class LeastSquares(Estimator):
 
     def _end_reason(self, record: Record, fit: _Fit, deviation_V: float) -> str:
         """Whether the model comes as low as the record did much earlier or later than the record."""
-        time_s, voltage_V, current_A = (np.asarray(array) for array in (record.time_s, record.voltage_V, record.current_A))
+        time_s, voltage_V, current_A = Samples.of(record)
         n = int(voltage_V.argmin())
         load_A = float(current_A[max(n - 1, 0) : n + 1].max())
         # at rest, with whatever current a sensor shows then, no voltage is reached

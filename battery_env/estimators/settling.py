@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
+from math import comb
 
 import numpy as np
 from numba import njit
@@ -38,6 +39,9 @@ LEAST_JUMP_A, MOST_RESISTANCE_OHM = 0.05, 0.6
 #: What is more than this many standard deviations of the noise is not noise.
 NOISES = 8.0
 
+#: Residuals whose variance is above that of the noise by this share, over the root of their number, are not noise, where the
+#: noise is told from their differences.
+EXCESS_LIMIT_UNSTATED = 10.0
 #: With fewer samples than this beyond the number of parameters, the residuals do not tell how large the noise is.
 SPARE_SAMPLES = 10
 #: A ``q_mobile`` is plausible within these multiples of the model cell's: its electrodes are those of a 2 Ah cell.
@@ -261,15 +265,16 @@ def is_plausible(q_mobile: ArrayLike, cell: CellParameters) -> BoolArray:
     return np.asarray((share > low) & (share < high))
 
 
-def white_noise_V(residual_V: FloatArray) -> float:
+def white_noise_V(residual_V: FloatArray, order: int = 1) -> float:
     """
     The standard deviation of the white part of residuals, from their differences from sample to sample, which hardly hold
     what drifts. The median leaves single wild samples aside.
 
-    :param residual_V: V, shape (T,), T >= 2
+    :param residual_V: V, shape (T,), T > order
+    :param order: of the differences; those of the second order hold nothing of what falls steadily either
     :return: V
     """
-    return float(np.median(np.abs(np.diff(residual_V))) / (0.6745 * np.sqrt(2.0)))
+    return float(np.median(np.abs(np.diff(residual_V, order))) / (0.6745 * np.sqrt(comb(2 * order, order))))
 
 
 def imprecise_text(share: float, depth_V: float, enough_V: float | None, rmse_V: float) -> str:
