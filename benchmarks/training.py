@@ -30,6 +30,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from battery_env.files import replacing
 from benchmarks.study import digest_of, own_versions, versions, write_json, write_text
+from sb3_lac.discounts import stated_discount
 from sb3_lac.zoo import LACExperimentManager, find_config
 
 #: Environment steps with the algorithms' own hyperparameters, which name none.
@@ -99,7 +100,7 @@ class Recipe:
         kind = algorithm(algo)
         if not 0 <= seed < 2**32:
             raise ValueError(f"a seed must lie within 0 .. 2**32 - 1, got {seed}")
-        environment = _environment(env_id)
+        environment, metadata = _environment(env_id)
         if defaults:
             source, entry = "defaults", {"policy": "MlpPolicy"}
         else:
@@ -117,6 +118,8 @@ class Recipe:
             for name, parameter in inspect.signature(kind).parameters.items()
             if parameter.default is not parameter.empty and name not in _NOT_LEARNING | set(entry)
         }
+        if arguments.get("gamma") == "auto":
+            arguments["gamma"] = stated_discount([metadata])
         learning_starts = entry.get("learning_starts", arguments.get("learning_starts", 0))
         if timesteps <= learning_starts:
             raise ValueError(
@@ -201,7 +204,7 @@ def registered_id(env_id: str) -> str:
 
 
 @cache
-def _environment(env_id: str) -> dict[str, Any]:
+def _environment(env_id: str) -> tuple[dict[str, Any], dict[str, Any]]:
     plain_id = registered_id(env_id)
     try:
         spec = gym.spec(plain_id)
@@ -212,7 +215,8 @@ def _environment(env_id: str) -> dict[str, Any]:
     env.close()
     # which task it is, the id says
     kwargs = {name: value for name, value in spec.kwargs.items() if name != "task"}
-    return {"kwargs": json.loads(json.dumps(kwargs, default=str)), "max_episode_steps": spec.max_episode_steps, **spaces}
+    kwargs = json.loads(json.dumps(kwargs, default=str))
+    return {"kwargs": kwargs, "max_episode_steps": spec.max_episode_steps, **spaces}, env.metadata
 
 
 def set_up(recipe: Recipe, folder: Path, **options: Any) -> tuple[LACExperimentManager, BaseAlgorithm]:

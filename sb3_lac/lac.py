@@ -22,6 +22,7 @@ from torch.nn import functional as F
 
 from sb3_lac.buffers import HorizonReplayBuffer, HorizonReplayBufferSamples
 from sb3_lac.compiled import CompiledUpdate, Metrics, check_compiler, set_gradient, set_gradients, step
+from sb3_lac.discounts import stated_discount, sum_of_discounts, weight_of_return
 from sb3_lac.env_ids import check_env_id
 from sb3_lac.policies import CnnPolicy, LyapunovCritic, LyapunovPolicy, MlpPolicy, MultiInputPolicy, largest_value
 
@@ -57,28 +58,6 @@ def reward_scale(vec_normalize: VecNormalize | None) -> float:
     if vec_normalize is None or not vec_normalize.norm_reward:
         return 1.0
     return math.sqrt(vec_normalize.ret_rms.var + vec_normalize.epsilon)
-
-
-def sum_of_discounts(gamma: float, horizon: int | None) -> float:
-    """
-    How often a constant cost counts in ``L``.
-
-    :param gamma: The discount factor, below 1 with an infinite horizon
-    :param horizon: Number of steps, None for all to come
-    :return: ``1 + gamma + gamma^2 + ...``
-    """
-    return 1 / (1 - gamma) if horizon is None else math.fsum(gamma**k for k in range(horizon))
-
-
-def weight_of_return(discounts: th.Tensor | None, gamma: float) -> th.Tensor | float:
-    """
-    How often a constant reward counts in the return of k steps: ``1 + gamma + ... + gamma^(k-1)``.
-
-    :param discounts: ``gamma^k``, None if all returns are of one step
-    :param gamma: The discount factor, below 1 with more than one step
-    :return: Sum of the discounts in each return
-    """
-    return 1.0 if discounts is None else (1 - discounts) / (1 - gamma)
 
 
 def env_specs(env: VecEnv) -> list[EnvSpec | None]:
@@ -142,7 +121,8 @@ class LAC(OffPolicyAlgorithm):
     :param learning_starts: how many steps of the model to collect transitions for before learning starts
     :param batch_size: Minibatch size for each gradient update
     :param tau: the soft update coefficient ("Polyak update", between 0 and 1)
-    :param gamma: the discount factor
+    :param gamma: the discount factor. 'auto' is the one that the environment states as ``metadata["discount"]``, as those of
+        battery_env do, and 0.99 for an environment that states none
     :param train_freq: Update the model every ``train_freq`` steps. Alternatively pass a tuple of frequency and unit
         like ``(5, "step")`` or ``(2, "episode")``.
     :param gradient_steps: How many gradient steps to do after each rollout (see ``train_freq``)
@@ -226,7 +206,7 @@ class LAC(OffPolicyAlgorithm):
         learning_starts: int = 100,
         batch_size: int = 256,
         tau: float = 0.005,
-        gamma: float = 0.99,
+        gamma: float | str = "auto",
         train_freq: int | tuple[int, str] = 1,
         gradient_steps: int = 1,
         action_noise: ActionNoise | None = None,
@@ -267,7 +247,7 @@ class LAC(OffPolicyAlgorithm):
             learning_starts,
             batch_size,
             tau,
-            gamma,
+            gamma,  # type: ignore[arg-type]  # a number from _setup_model() on
             train_freq,
             gradient_steps,
             action_noise,
@@ -317,6 +297,7 @@ class LAC(OffPolicyAlgorithm):
     def _setup_model(self) -> None:
         # ``LAC.load()`` sets an argument under its own name
         self.stated_reward_bound = vars(self).pop("reward_bound", self.stated_reward_bound)
+        self._setup_discount()
         self._check_arguments()
         if self.replay_buffer_class in (HorizonReplayBuffer, NStepReplayBuffer):
             # Of a loaded model, whose arguments may be others by now
@@ -383,6 +364,18 @@ class LAC(OffPolicyAlgorithm):
 
         self.reward_bound.fill_(self.stated_reward_bound or 0.0)
         self.update_offset(self._vec_normalize_env)
+
+    def _setup_discount(self) -> None:
+        """Ask the environment for its discount factor, if it is to state it."""
+        gamma: Any = self.gamma
+        if gamma == "auto":
+            metadata: list[dict[str, Any] | None] = []
+            # There may be no environment, and a vector environment of somebody else may have no attributes
+            with suppress(AttributeError, NotImplementedError):
+                metadata = self.env.get_attr("metadata")  # type: ignore[union-attr]
+            self.gamma = stated_discount(metadata)
+        elif not isinstance(gamma, (float, int, np.number)):
+            raise ValueError(f"gamma={gamma!r} must be a number, or 'auto' for the discount that the environment states.")
 
     def _check_arguments(self) -> None:
         """Check the arguments that SAC does not have."""

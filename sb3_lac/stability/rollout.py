@@ -17,7 +17,8 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, unwrap_vec_normalize
 
-from sb3_lac.lac import LAC, sum_of_discounts
+from sb3_lac.discounts import sum_of_discounts
+from sb3_lac.lac import LAC
 from sb3_lac.stability.functions import LyapunovFunction, Observations
 
 if TYPE_CHECKING:

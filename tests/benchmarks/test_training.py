@@ -110,6 +110,13 @@ def test_a_recipe_names_all_that_a_policy_depends_on(tmp_path, monkeypatch):
     assert seeds[0] == recipe and seeds[0].digest == seeds[1].digest and seeds[0].name != seeds[1].name
 
 
+def test_recipe_holds_the_discount_that_the_environment_states():
+    recipe = training.Recipe.of("lac", "BatteryQmax-v0", 0, 200, defaults=True)
+    assert recipe.arguments["gamma"] == gym.spec("BatteryQmax-v0").make().metadata["discount"] == 0.6
+    assert training.Recipe.of("lac", "Pendulum-v1", 0, 200, defaults=True).arguments["gamma"] == 0.99
+    assert training.Recipe.of("sac", "BatteryQmax-v0", 0, 200, defaults=True).arguments["gamma"] == 0.99
+
+
 def test_training_follows_the_recipe_even_if_the_file_has_changed_since(tmp_path):
     recipe = training.Recipe.of("lac", ENV_ID, 0)
     (tmp_path / "zoo_configs" / "lac.yml").write_text(CONFIG.replace("alpha3: 0.7", "alpha3: 0.8"))

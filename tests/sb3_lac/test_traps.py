@@ -12,7 +12,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from torch import nn
 
 from sb3_lac import LAC
-from sb3_lac.lac import update_multiplier, weight_of_return
+from sb3_lac.discounts import weight_of_return
+from sb3_lac.lac import update_multiplier
 
 
 def flat_parameters(module):

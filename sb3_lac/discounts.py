@@ -1,0 +1,51 @@
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch as th
+
+#: The discount factor of an environment that states none.
+DEFAULT_DISCOUNT = 0.99
+
+
+def stated_discount(metadata: Sequence[dict[str, Any] | None]) -> float:
+    """
+    The discount factor that environments state as ``metadata["discount"]``, for how far to look ahead is part of a task.
+
+    :param metadata: Of each environment, None where it is not known
+    :return: ``DEFAULT_DISCOUNT`` where none is stated
+    :raises ValueError: If it is out of range, or if they differ
+    """
+    stated = [(of_env or {}).get("discount", DEFAULT_DISCOUNT) for of_env in metadata]
+    for discount in stated:
+        if not isinstance(discount, (float, int, np.number)) or not 0 <= discount <= 1:
+            raise ValueError(
+                f"The environment states metadata['discount']={discount!r}, which must be a number within 0 .. 1: mend it, or "
+                f"set gamma, for instance gamma={DEFAULT_DISCOUNT}."
+            )
+        if discount != stated[0]:
+            raise ValueError(f"The environments state different discounts, {stated[0]} and {discount}: set gamma to one.")
+    return float(stated[0]) if stated else DEFAULT_DISCOUNT
+
+
+def sum_of_discounts(gamma: float, horizon: int | None) -> float:
+    """
+    How often a constant cost counts in ``L``.
+
+    :param gamma: The discount factor, below 1 with an infinite horizon
+    :param horizon: Number of steps, None for all to come
+    :return: ``1 + gamma + gamma^2 + ...``
+    """
+    return 1 / (1 - gamma) if horizon is None else math.fsum(gamma**k for k in range(horizon))
+
+
+def weight_of_return(discounts: th.Tensor | None, gamma: float) -> th.Tensor | float:
+    """
+    How often a constant reward counts in the return of k steps: ``1 + gamma + ... + gamma^(k-1)``.
+
+    :param discounts: ``gamma^k``, None if all returns are of one step
+    :param gamma: The discount factor, below 1 with more than one step
+    :return: Sum of the discounts in each return
+    """
+    return 1.0 if discounts is None else (1 - discounts) / (1 - gamma)
