@@ -382,10 +382,10 @@ class LAC(OffPolicyAlgorithm):
         for name in ("alpha3", "lambda_init", "lambda_min", "lambda_max"):
             if not isinstance(getattr(self, name), (float, int, np.number)):
                 raise ValueError(f"{name}={getattr(self, name)!r} must be a number.")
-        if not self.alpha3 > 0:
+        if not 0 < self.alpha3 < math.inf:
             raise ValueError(
-                f"alpha3={self.alpha3} must be greater than 0: the Lyapunov value has to decrease by alpha3 times the cost. "
-                "Use for instance alpha3=0.1, or alpha3=1.0 to minimise the cost."
+                f"alpha3={self.alpha3} must be greater than 0, and finite: the Lyapunov value has to decrease by alpha3 times "
+                "the cost. Use for instance alpha3=0.1, or alpha3=1.0 to minimise the cost."
             )
         if not self.lambda_min > 0:
             raise ValueError(

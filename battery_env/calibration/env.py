@@ -95,7 +95,11 @@ class CalibrationEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         default: a wrong parameter shows within a second or a decision, and what lies further ahead only blurs it
     """
 
-    metadata: dict[str, Any] = {"render_modes": _RENDER_MODES, "render_fps": 10, "discount": 0.6}  # noqa: RUF012 (as in gym.Env)
+    metadata: dict[str, Any] = {  # noqa: RUF012 (as in gym.Env)
+        "render_modes": _RENDER_MODES,
+        "render_fps": 10,
+        "discount": 0.6,
+    }
 
     def __init__(self, task: str | type[CalibrationTask], render_mode: str | None = None, **options: Any) -> None:
         self.render_mode = check_render_mode(render_mode)

@@ -1,7 +1,7 @@
 """Stability of the loop that a policy closes: Lyapunov functions learned, judged on other roll-outs, and exact statements."""
 
 from sb3_lac.stability.certification import CertificationReport, certify
-from sb3_lac.stability.fitting import FittedLyapunov, fit_lyapunov
+from sb3_lac.stability.fitting import FittedLyapunov, NoCostError, fit_lyapunov
 from sb3_lac.stability.functions import CriticLyapunov, LyapunovFunction
 from sb3_lac.stability.report import LyapunovReport, evaluate_lyapunov
 from sb3_lac.stability.statistics import Interval
@@ -13,6 +13,7 @@ __all__ = [
     "Interval",
     "LyapunovFunction",
     "LyapunovReport",
+    "NoCostError",
     "certify",
     "evaluate_lyapunov",
     "fit_lyapunov",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import numbers
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_lac.lac import env_specs
-from sb3_lac.stability.fitting import FittedLyapunov
+from sb3_lac.stability.fitting import FittedLyapunov, flatten
 from sb3_lac.stability.functions import LyapunovFunction, check_function
 from sb3_lac.stability.rollout import (
     check_number,
@@ -295,11 +296,11 @@ def _check_questions(
     """Check what is asked of the episodes, see ``certify()``."""
     if lyapunov is not None:
         check_function(lyapunov)
-    if not 0 < confidence < 1:
-        raise ValueError(f"confidence={confidence} must lie between 0 and 1.")
+    if not isinstance(confidence, numbers.Real) or not 0 < confidence < 1:
+        raise ValueError(f"confidence={confidence!r} must be a number between 0 and 1.")
     for name, value in {"cost_bound": cost_bound, "level": level}.items():
-        if value is not None and math.isnan(value):
-            raise ValueError(f"{name}={value} must be a number, or None for that of a fitted function.")
+        if value is not None and (not isinstance(value, numbers.Real) or math.isnan(value)):
+            raise ValueError(f"{name}={value!r} must be a number, or None for that of a fitted function.")
     if window_steps is not None:
         check_number("window_steps", window_steps)
 
@@ -331,9 +332,9 @@ def _check_starts(env: VecEnv, starts: np.ndarray) -> None:
     for options in (first, {"state": others[0].tolist()} if len(others) > 0 else None):
         env.seed(0)
         env.set_options(options)
-        observations = env.reset()
-        seen.append([observations[key] for key in sorted(observations)] if isinstance(observations, dict) else [observations])
-    if all(np.array_equal(first, second) for first, second in zip(*seen, strict=True)):
+        # Copied, for wrappers that stack frames return the same array again
+        seen.append(flatten(env.reset()))
+    if np.array_equal(*seen):
         raise ValueError(
             "The environment starts in the same state whatever reset(options={'state': ...}) says: it needs a wrapper that "
             "puts it into the state that it is given. (If it starts in the only one of starts anyway, leave starts out.)"

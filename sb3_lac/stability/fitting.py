@@ -269,8 +269,8 @@ def fit_lyapunov(
     """
     for name, value in {"n_iterations": n_iterations, "batch_size": batch_size}.items():
         check_number(name, value)
-    if not learning_rate > 0:
-        raise ValueError(f"learning_rate={learning_rate} must be greater than 0.")
+    if not 0 < learning_rate < np.inf:
+        raise ValueError(f"learning_rate={learning_rate} must be finite and greater than 0.")
     if not 0 <= trace_decay <= 1:
         raise ValueError(f"trace_decay={trace_decay} must lie between 0 and 1.")
     if reward_bound is not None and not 0 <= reward_bound < np.inf:
@@ -279,8 +279,8 @@ def fit_lyapunov(
     seed = known_seed(seed)
     with undisturbed(policy, env, seed):
         roll_outs = roll_out(policy, env, n_episodes, deterministic)
-        if reward_bound is None:
-            reward_bound = max(float(roll_outs.transitions["reward"].max()), 0.0)
+        # A float, for a scalar of numpy in the file would keep it from being loaded
+        reward_bound = float(max(roll_outs.transitions["reward"].max(), 0.0) if reward_bound is None else reward_bound)
         roll_outs.transitions["cost"] = np.maximum(reward_bound - roll_outs.transitions["reward"], 0.0)
         seeds = range(seed, seed + env.num_envs)
         return _fit(
@@ -357,6 +357,8 @@ def _fit(
             schedule.step()
 
     values = network_values(network, inputs, unit)[: len(costs)]
+    if not np.isfinite(values).all():
+        raise ValueError(f"The fit diverged: its values are not finite. Lower learning_rate={learning_rate}.")
     floor = float(values.min())
     transitions["lyapunov"] = values - floor
     episodes = summarize_episodes(transitions)

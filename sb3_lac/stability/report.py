@@ -53,6 +53,7 @@ class LyapunovReport:
     :param max_tail_weight: Largest weight of the costs to come after the end of an episode, in ``cost_to_go``
     :param max_episode_steps: Gymnasium's time limit of the environment, None if it ends its episodes itself
     :param seed: Seed of the roll-outs
+    :param settled_share: Share of the cost of the first steps that ``cost_bound`` has to lie below
     """
 
     transitions: pd.DataFrame
@@ -66,6 +67,7 @@ class LyapunovReport:
     max_tail_weight: float
     max_episode_steps: int | None
     seed: int
+    settled_share: float = 1.0
 
     @property
     def n_calibrated(self) -> int:
@@ -141,7 +143,7 @@ class LyapunovReport:
         """
         Whether these roll-outs show a Lyapunov function with a residual: no episode died, ``L`` falls from the starts on (the
         interval of ``largest_feasible_alpha3`` lies above 0), and it decreases wherever the cost is larger than
-        ``cost_bound``, whose interval lies below the mean cost of the first steps.
+        ``cost_bound``, whose interval lies below ``settled_share`` of the mean cost of the first steps.
         """
         return self._why_not() is None
 
@@ -149,12 +151,17 @@ class LyapunovReport:
         metrics = self.metrics
         if metrics["death_rate"].value > 0:
             return f"{self.episodes['terminated'].sum()} of {len(self.episodes)} episodes died"
+        if math.isnan(metrics["largest_feasible_alpha3"].low) and metrics["largest_feasible_alpha3"].value > 0:
+            return "one episode gives no interval, use more episodes"
         if not metrics["largest_feasible_alpha3"].low > 0:
             return "L does not fall from the starts on (the interval of largest_feasible_alpha3 is not above 0)"
         if math.isnan(metrics["cost_bound_alpha3"].value):
             return "L does not decrease where the cost is largest"
-        if not metrics["cost_bound"].high < metrics["start_cost"].value:
-            return "the interval of cost_bound is not below the cost of the first steps, and so nothing is known to settle"
+        if not metrics["cost_bound"].high < self.settled_share * metrics["start_cost"].value:
+            share = "" if self.settled_share == 1 else f"{self.settled_share:g} of "
+            return (
+                f"the interval of cost_bound is not below {share}the cost of the first steps: it is not known to settle there"
+            )
         return None
 
     def _verdict_with_residual(self) -> str:
@@ -281,6 +288,7 @@ def evaluate_lyapunov(
     n_bootstrap: int = 1000,
     seed: int | None = None,
     lyapunov: LyapunovFunction | None = None,
+    settled_share: float = 1.0,
 ) -> LyapunovReport:
     """
     Run the policy for ``n_eval_episodes`` episodes and check whether ``L`` is a Lyapunov function along them: whether it
@@ -304,7 +312,8 @@ def evaluate_lyapunov(
     - ``residual``: the least b with which ``E[L(s', a')] - L(s, a) <= -alpha3 * c + b`` holds at each level of the cost, on
       average over the transitions of the level. It bounds the mean cost in the long run by ``b / alpha3`` (Foster-Lyapunov).
     - ``cost_bound``: the least ``b / alpha3`` of all alpha3, and ``cost_bound_alpha3``, where that is. ``L`` decreases at the
-      levels whose cost is larger.
+      levels whose cost is larger. It is never less than the mean cost of the lowest level: roll-outs that have not settled do
+      not say where they will.
 
     Their intervals are percentiles of a bootstrap that resamples episodes (the transitions of an episode depend on each
     other), and Wilson's for ``death_rate``. ``a'`` is the action taken next; after a time limit it is an action of the policy.
@@ -333,6 +342,8 @@ def evaluate_lyapunov(
     :param n_bootstrap: Number of bootstrap samples
     :param seed: Seed for ``env`` and for the actions; drawn if it is None, and kept in the report
     :param lyapunov: The function to judge, the critic by default. It cannot be judged on roll-outs that it was fitted on.
+    :param settled_share: What the report calls settled: the mean cost in the long run is known to lie below this share of the
+        mean cost of the first steps. 1 only asks that costs fall, 0.01 that they nearly vanish
     :return: The report
     :raises ValueError: If the arguments cannot be meant, or the policy is not LAC and there is no ``lyapunov``
     """
@@ -354,6 +365,8 @@ def evaluate_lyapunov(
         raise ValueError(f"max_tail_weight={max_tail_weight} must be greater than 0, and at most 1.")
     check_number("n_cost_levels", n_cost_levels)
     check_number("n_bootstrap", n_bootstrap)
+    if not 0 < settled_share <= 1:
+        raise ValueError(f"settled_share={settled_share} must be greater than 0, and at most 1.")
 
     vec_normalize = unwrap_vec_normalize(env)
     # Asked for before the work: not every environment answers
@@ -388,4 +401,5 @@ def evaluate_lyapunov(
         max_tail_weight=max_tail_weight,
         max_episode_steps=max((limit for limit in limits if limit is not None), default=None),
         seed=seed,
+        settled_share=settled_share,
     )

@@ -40,8 +40,12 @@ def prepare_evaluation(policy: PolicyPredictor, env: gym.Env | VecEnv, n_eval_ep
     :param of_the_critic: Whether values of the critic are judged, which belong to the rewards of the training
     :return: The wrapped environment
     """
-    if not callable(getattr(policy, "predict", None)):
+    if isinstance(policy, type) or not callable(getattr(policy, "predict", None)):
         raise ValueError(f"{policy!r} has no method predict(observation, deterministic=...), which every policy needs.")
+    if isinstance(env, gym.vector.VectorEnv):
+        raise ValueError(f"{env} is a vector environment of Gymnasium: pass sb3_lac.GymnasiumVecEnv(env).")
+    if not isinstance(env, (gym.Env, VecEnv)):
+        raise ValueError(f"env={env!r} is no environment: pass that of gym.make(id), or a VecEnv.")
     check_number("n_eval_episodes", n_eval_episodes)
     if not isinstance(policy, (BaseAlgorithm, BasePolicy)):
         # A controller that knows nothing of images and their channels
@@ -82,8 +86,13 @@ def known_seed(seed: int | None) -> int:
 
     :param seed: Seed that was asked for, if any
     :return: That one, or a random one of 31 bits, whatever the state of numpy and PyTorch
+    :raises ValueError: If it cannot seed an environment
     """
-    return int(np.random.SeedSequence().generate_state(1)[0] // 2) if seed is None else seed
+    if seed is None:
+        return int(np.random.SeedSequence().generate_state(1)[0] // 2)
+    if not isinstance(seed, (int, np.integer)) or not 0 <= seed < 2**32:
+        raise ValueError(f"seed={seed!r} must be a whole number within 0 .. 2**32 - 1, or None for a random one.")
+    return int(seed)
 
 
 def check_seeds(lyapunov: LyapunovFunction, seed: int, n_envs: int) -> None:
@@ -148,8 +157,8 @@ def undisturbed(policy: PolicyPredictor, env: VecEnv, seed: int) -> Iterator[Non
     """
     vec_normalize = unwrap_vec_normalize(env)
     env.seed(seed)
-    device = getattr(policy, "device", th.device("cpu"))
-    with th.random.fork_rng(devices=[device] if device.type == "cuda" else []):
+    device = str(getattr(policy, "device", "cpu"))
+    with th.random.fork_rng(devices=[device] if device.startswith("cuda") else []):
         th.manual_seed(seed)
         training = vec_normalize is not None and vec_normalize.training
         try:
@@ -306,6 +315,9 @@ def roll_out(
     if not np.isfinite(transitions["reward"]).all():
         raise ValueError("The environment paid a reward that is not finite: its costs cannot be judged.")
     transitions["reward"] = transitions["reward"].astype(np.float64)
+    seen = combine(np.concatenate, batches)
+    if not all(np.isfinite(array).all() for array in (seen.values() if isinstance(seen, dict) else [seen])):
+        raise ValueError("The environment showed an observation that is not finite: nothing can be said of what follows it.")
     last_of = transitions.loc[transitions["truncated"], "env"].to_numpy()
     # From the order of time to one episode after the other
     order = np.argsort(transitions["env"], kind="stable")
@@ -316,7 +328,7 @@ def roll_out(
     transitions["terminated"] = done & ~transitions["truncated"]
     return RollOuts(
         transitions,
-        take(combine(np.concatenate, batches), order),
+        take(seen, order),
         all_actions[order],
         take(combine(np.stack, last_observations), np.argsort(last_of, kind="stable")) if last_observations else None,
     )

@@ -200,21 +200,26 @@ def tightest_drift(n: np.ndarray, drift: np.ndarray, cost: np.ndarray) -> tuple[
     :param drift: Sum of ``L' - L`` of each level
     :param cost: Sum of the costs of each level
     :return: ``b / alpha3`` and alpha3, both of shape (...); alpha3 is NaN if L does not decrease where the cost is largest,
-        when the largest mean cost of a level is all that can be said
+        when the largest mean cost of a level is all that can be said. Both are NaN where there are no transitions. The bound
+        is never less than the mean cost of the lowest level: what happens below is not known.
     """
     shape = np.shape(n)[:-1]
     bounds, alphas = np.empty(shape), np.empty(shape)
     for index in np.ndindex(shape):
         seen = n[index] > 0
+        if not seen.any():
+            bounds[index] = alphas[index] = np.nan
+            continue
         m, c = drift[index][seen] / n[index][seen], cost[index][seen] / n[index][seen]
         # With t = 1 / alpha3 it is the largest of straight lines, whose least value is at t = 0, or where
         # two of them meet, or where the last one reaches 0
         with np.errstate(divide="ignore", invalid="ignore"):
             meetings = np.append((c[:, None] - c) / (m - m[:, None]), -c / m)
         t = np.sort(np.append(0.0, meetings[np.isfinite(meetings) & (meetings > 0)]))
-        # No negative residual: L cannot fall for ever, and these roll-outs only end before it settles
-        of_t = np.maximum((np.outer(t, m) + c).max(axis=1), 0.0)
-        best = np.argmin(of_t)
+        # Where L falls at all levels, these roll-outs end before it settles: at no cost that they have not come to
+        of_t = np.maximum((np.outer(t, m) + c).max(axis=1), c.min())
+        # Of those that say as much the largest alpha3, but not an infinite one
+        best = 1 + np.argmin(of_t[1:]) if len(t) > 1 and of_t[1:].min() <= of_t[0] else 0
         bounds[index], alphas[index] = of_t[best], 1 / t[best] if t[best] > 0 else np.nan
     return bounds, alphas
 

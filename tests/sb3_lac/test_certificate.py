@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 from scipy.stats import binom
-from stable_baselines3 import SAC
+from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
 from benchmarks.controllers import ScaledController
 from sb3_lac import (
@@ -183,6 +183,12 @@ def test_fit_is_reproducible_and_leaves_random_numbers_alone(linear_env, optimal
     assert (values[0] != values[2]).any() and (values[0] >= 0).all()
 
 
+def test_function_of_a_numpy_bound_is_saved_and_loaded(linear_env, optimal, tmp_path):
+    fit_lyapunov(optimal[0], linear_env, 2, reward_bound=np.float64(1), seed=np.int64(3), **FIT).save(tmp_path / "l.pt")
+    loaded = FittedLyapunov.load(tmp_path / "l.pt")
+    assert loaded.reward_bound == 1.0 and loaded.seeds == range(3, 13)
+
+
 def test_function_is_saved_and_loaded(optimal, tmp_path):
     _, lyapunov = optimal
     path = tmp_path / "new" / "lyapunov.pt"
@@ -246,11 +252,50 @@ def test_bound_on_the_mean_cost_is_the_tightest(levels):
     # Differences that rounding decides about are no matter of this
     m, c = np.round(m, 2), np.round(c, 2)
     bound, alpha3 = tightest_drift(n, n * m, n * c)
-    # min v, t * m + c <= v, v >= 0, t = 1 / alpha3 >= 0
-    expected = linprog([1, 0], A_ub=np.column_stack([-np.ones(len(m)), m]), b_ub=-c, bounds=[(0, None), (0, None)])
+    # min v, t * m + c <= v, v >= min c, t = 1 / alpha3 >= 0
+    expected = linprog([1, 0], A_ub=np.column_stack([-np.ones(len(m)), m]), b_ub=-c, bounds=[(c.min(), None), (0, None)])
     assert expected.status == 0 and bound == pytest.approx(expected.fun, rel=1e-6, abs=1e-6)
     if not np.isnan(alpha3):
         assert (m <= -alpha3 * c + alpha3 * bound + 1e-9 * (1 + alpha3 * c.max())).all()
+
+
+class FallsToAHalf(gym.Env):
+    """x falls from 1 .. 2 to 0.5, where it costs 0.25 for ever; episodes end long before."""
+
+    observation_space, action_space = spaces.Box(-10, 10, (1,), np.float32), spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, n_steps=60):
+        self.n_steps = n_steps
+
+    def reset(self, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x, self.step_number = self.np_random.uniform(1.0, 2.0), 0
+        return np.array([self.x], np.float32), {}
+
+    def step(self, action):
+        self.x = 0.5 + 0.98 * (self.x - 0.5)
+        self.step_number += 1
+        return np.array([self.x], np.float32), -(self.x**2), False, self.step_number == self.n_steps, {}
+
+
+@pytest.mark.parametrize("n_cost_levels", [1, 5])
+def test_nothing_is_said_of_costs_below_those_that_were_seen(n_cost_levels):
+    square = LyapunovFunction(lambda observations: observations[:, 0].astype(float) ** 2)
+    report = evaluate_lyapunov(NoController(), FallsToAHalf(), 20, seed=0, lyapunov=square, n_cost_levels=n_cost_levels)
+    assert report.metrics["cost_bound"].low >= report.by_cost["cost"].min() * 0.8 > 0.25
+    assert report.metrics["cost_bound"].value == report.by_cost["cost"].min()
+    assert report.holds and report.metrics["cost_bound_alpha3"].value > 0
+
+
+def test_how_far_costs_must_fall_can_be_said():
+    square = LyapunovFunction(lambda observations: observations[:, 0].astype(float) ** 2)
+    asked = {"lyapunov": square, "seed": 0}
+    assert evaluate_lyapunov(NoController(), FallsToAHalf(), 20, **asked, settled_share=0.4).holds
+    report = evaluate_lyapunov(NoController(), FallsToAHalf(), 20, **asked, settled_share=0.1)
+    assert not report.holds and "is not below 0.1 of the cost of the first steps" in report.summary()
+    for share in (0.0, 1.5, np.nan):
+        with pytest.raises(ValueError, match=r"settled_share=.* must be greater than 0, and at most 1"):
+            evaluate_lyapunov(NoController(), FallsToAHalf(), 20, **asked, settled_share=share)
 
 
 @pytest.mark.parametrize("n", [1, 2, 10, 60])
@@ -375,7 +420,21 @@ def test_env_that_ignores_starts_is_refused():
     assert report.starts["n_attracted"].tolist() == [10]
 
 
+def test_starts_of_wrappers_that_reuse_their_arrays():
+    training, env = (VecFrameStack(make_vec_env("LinearCost-v0", n_envs=2), 2) for _ in range(2))
+    model = PPO("MlpPolicy", training, n_steps=8, batch_size=16, device="cpu")
+    report = certify(model, env, n_episodes=2, cost_bound=9.0, starts=[[1.0, 0.0], [0.0, 1.0]])
+    assert len(report.starts) == 2
+
+
 # Deaths
+
+
+def test_deaths_in_the_first_step_leave_bootstrap_samples_without_transitions():
+    env = PlannedEnv([[5, np.inf]] * 9 + [[8, 4, 2, 1]])
+    report = evaluate_lyapunov(NoController(), env, 10, lyapunov=IDENTITY, seed=0)
+    assert report.metrics["death_rate"].value == 0.9 and not report.holds
+    assert np.isfinite(report.metrics["cost_bound"].value)
 
 
 def test_death_is_no_decrease():
@@ -478,7 +537,7 @@ def test_critic_is_a_function_of_the_observation(make_model, make_env):
 @pytest.mark.parametrize(
     ("call", "arguments", "message"),
     [
-        (certify, {"confidence": 1.0}, "confidence=1.0 must lie between 0 and 1"),
+        (certify, {"confidence": 1.0}, "confidence=1.0 must be a number between 0 and 1"),
         (certify, {"n_episodes": 0}, "n_eval_episodes=0 must be at least 1"),
         (certify, {"window_steps": 0}, "window_steps=0"),
         (certify, {"window_steps": 2.5}, "window_steps=2.5 must be at least 1, and a whole number"),
@@ -505,12 +564,32 @@ def test_wrong_arguments_are_named_before_any_work(call, arguments, message):
 def test_what_says_nothing_is_refused():
     with pytest.raises(ValueError, match="has no method predict"):
         certify(None, PlannedEnv([[1, 1]]))
+    with pytest.raises(ValueError, match="has no method predict"):
+        certify(NoController, PlannedEnv([[1, 1]]))
+    with pytest.raises(ValueError, match=r"pass sb3_lac.GymnasiumVecEnv\(env\)"):
+        certify(NoController(), gym.make_vec("LinearCost-v0", num_envs=2))
+    with pytest.raises(ValueError, match=r"env='LinearCost-v0' is no environment: pass that of gym.make"):
+        certify(NoController(), "LinearCost-v0")
+    with pytest.raises(ValueError, match="observation that is not finite"):
+        certify(NoController(), gym.wrappers.TransformObservation(PlannedEnv([[1, 1]]), lambda _: np.full(1, np.nan), None))
     with pytest.raises(ValueError, match="Nothing had a cost"):
         fit_lyapunov(NoController(), PlannedEnv([[0, 0]]), 3, progress_bar=False)
     with pytest.raises(ValueError, match="reward that is not finite"):
         fit_lyapunov(NoController(), PlannedEnv([[np.nan, 0]]), 3, progress_bar=False)
     with pytest.raises(ValueError, match="A reward of 2 is positive"):
         certify(NoController(), PlannedEnv([[-2, 1]]), n_episodes=2, cost_bound=1.0)
+
+
+def test_fit_that_diverges_is_refused(linear_env, optimal):
+    with pytest.raises(ValueError, match="The fit diverged"):
+        fit_lyapunov(optimal[0], linear_env, 5, learning_rate=1e30, progress_bar=False)
+
+
+def test_device_of_a_controller_may_be_a_name():
+    class OnTheCPU(NoController):
+        device = "cpu"
+
+    assert certify(OnTheCPU(), PlannedEnv([[1, 1]]), n_episodes=2).statements.loc["survives", "n_true"] == 2
 
 
 # Callback
