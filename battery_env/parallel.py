@@ -5,8 +5,10 @@ from __future__ import annotations
 import asyncio
 import importlib
 import multiprocessing
+import os
 import pickle
 import tempfile
+import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -26,18 +28,31 @@ _PATIENCE_S = 5.0
 @contextmanager
 def processes(jobs: int) -> Iterator[Submit]:
     """
-    Processes of this machine. When the block fails, what has not begun is not begun any more.
+    Processes of this machine. When the block fails, what has not begun is not begun any more; when this process ends, however
+    it does, so do they. If one of them is lost, all calls that are not done raise ``BrokenExecutor``.
 
     :param jobs: how many
     :yields: what starts a call
     """
     # spawn: torch does not survive a fork with threads
-    with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
+    with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn"), initializer=_end_with_parent) as pool:
         try:
             yield pool.submit
         except BaseException:  # also of a generator that is closed
             pool.shutdown(wait=False, cancel_futures=True)
             raise
+
+
+def _end_with_parent() -> None:
+    # one that is killed cannot tell its workers, which would compute on, and then wait for ever
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=_exit_after, args=(parent,), daemon=True).start()
+
+
+def _exit_after(parent: Any) -> None:
+    parent.join()
+    os._exit(1)
 
 
 @contextmanager

@@ -39,6 +39,7 @@ from typing import Any
 
 import gymnasium as gym
 import pandas as pd
+from filelock import FileLock, Timeout
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.logger import configure
 from tqdm import tqdm
@@ -87,10 +88,19 @@ def run(recipe: Recipe, out: Path, position: int = 0) -> None:
     :param out: folder of all results
     :param position: line of the terminal for the progress bar
     """
-    assert recipe.evaluations is not None
     folder = _folder(recipe, out)
-    if (folder / "summary.json").exists():
-        return
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        # freed when its process ends, however it does
+        with FileLock(folder / ".lock", timeout=0):
+            if not (folder / "summary.json").exists():
+                _train(recipe, folder, out, position)
+    except Timeout as error:
+        raise RuntimeError(f"another process is busy with {folder}: wait for it, or choose another --out") from error
+
+
+def _train(recipe: Recipe, folder: Path, out: Path, position: int) -> None:
+    assert recipe.evaluations is not None
     of_env = contest_of(recipe.env_id)
     every = max(recipe.timesteps // (recipe.evaluations * recipe.hyperparameters.get("n_envs", 1)), 1)
     checkpoint = CheckpointCallback(folder / "checkpoint", every)
@@ -125,7 +135,7 @@ def run(recipe: Recipe, out: Path, position: int = 0) -> None:
     scores = of_env.scores(model, scored_env)
     write_text(folder / "scores.csv", scores.to_csv(index=False, float_format="%.6g"))
     summary = {"recipe": asdict(recipe), "versions": versions(), "resumed": checkpoint.resumed, "updates": model._n_updates}
-    summary |= {"training_minutes": checkpoint.seconds / 60.0, **of_env.summary(scores)}
+    summary |= {"timesteps": model.num_timesteps, "training_minutes": checkpoint.seconds / 60.0, **of_env.summary(scores)}
     write_json(folder / "summary.json", summary)
     shutil.rmtree(checkpoint.folder, ignore_errors=True)
 
@@ -144,8 +154,12 @@ def finished_runs(out: Path) -> pd.DataFrame:
     """
     rows = []
     for file in sorted(out.glob("*/*/summary.json")):
-        summary = json.loads(file.read_text(encoding="utf-8"))
-        if set(summary.get("recipe", ())) != {field.name for field in fields(Recipe)}:
+        try:
+            summary = json.loads(file.read_text(encoding="utf-8"))
+            recipe_of = summary.get("recipe", ())
+        except (json.JSONDecodeError, AttributeError) as error:
+            raise ValueError(f"{file} is damaged: delete {file.parent}, and it is trained anew") from error
+        if set(recipe_of) != {field.name for field in fields(Recipe)}:
             raise ValueError(f"{file} was written by an earlier version: choose another --out")
         recipe = Recipe(**summary["recipe"])
         of_run: dict[str, Any] = {
@@ -154,7 +168,8 @@ def finished_runs(out: Path) -> pd.DataFrame:
             "hyperparameters": recipe.source,
             "recipe": recipe.digest,
             "seed": recipe.seed,
-            "timesteps": recipe.timesteps,
+            # an algorithm with roll-outs of fixed length makes more than it is asked for
+            "timesteps": summary.get("timesteps", recipe.timesteps),
             "label": recipe.label,
             "folder": file.parent,
             "scores": summary.get("scores"),
@@ -177,6 +192,8 @@ def report(study: Study) -> None:
     :param study: the folder
     """
     runs = finished_runs(study.out)
+    if runs.empty:
+        return
     rows: dict[tuple[str, ...], list[dict[str, str]]] = {}  # a table for readers for each set of columns
     tables = []
     for _, of_env in runs.groupby("env"):
@@ -251,8 +268,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except (ValueError, FileNotFoundError, gym.error.Error) as error:
         parser.error(str(error))
     jobs = [recipe for of_seed in recipes for recipe in of_seed]
-    study.each(run, [(recipe, study.out, 1 + k % chosen.jobs) for k, recipe in enumerate(jobs)])
-    report(study)
+    try:
+        study.each(run, [(recipe, study.out, 1 + k % chosen.jobs) for k, recipe in enumerate(jobs)])
+    finally:
+        # of those that finished, also if others failed
+        report(study)
 
 
 if __name__ == "__main__":

@@ -79,10 +79,16 @@ def read_errors(results: Path) -> pd.DataFrame:
                 continue
             # a task with two parameters has a file for each
             title = f"{file.stem.rsplit('_', 1)[0].removesuffix(f'_{name}')}, {name}{measures[column]}"
+            # the same discharges under several conditions
+            conditions = pd.Series("", index=table.index)
+            if "mismatch" in columns:
+                conditions += table["mismatch"].map(lambda share: f", constants off by {100 * share:g} %" if share else "")
+            if "sensor" in columns:
+                conditions += ", " + table["sensor"]
             of_parameter = pd.DataFrame(
                 {
                     "source": file.relative_to(results).as_posix(),
-                    "comparison": title + (", " + table["sensor"] if "sensor" in columns else ""),
+                    "comparison": title + conditions,
                     "calibrator": table["calibrator"],
                     # a calibrator that does not learn has none
                     "seed": table["seed"].fillna(0).astype(int) if "seed" in columns else 0,

@@ -182,8 +182,14 @@ def algorithm(algo: str) -> type[BaseAlgorithm]:
 
 
 def _own_modules(*named: tuple[str, str, str]) -> dict[str, str]:
-    modules = [importlib.import_module(module) for module, colon, _ in named if colon]
-    return {module.__name__: digest_of({"source": inspect.getsource(module)}) for module in modules}
+    found = {}
+    for module in (module for module, colon, _ in named if colon):
+        # of a package all files, for the module that is named may only pass on what others define
+        top = importlib.import_module(module.partition(".")[0])
+        file = Path(inspect.getfile(top if top.__file__ else importlib.import_module(module)))
+        files = sorted(file.parent.rglob("*.py")) if file.name == "__init__.py" else [file]
+        found[module] = digest_of({str(path.relative_to(file.parent)): path.read_text("utf-8") for path in files})
+    return found
 
 
 def registered_id(env_id: str) -> str:

@@ -333,8 +333,8 @@ def _check_starts(env: VecEnv, starts: np.ndarray) -> None:
         env.seed(0)
         env.set_options(options)
         # Copied, for wrappers that stack frames return the same array again
-        seen.append(flatten(env.reset()))
-    if np.array_equal(*seen):
+        seen.append(flatten(env.reset()))  # type: ignore[arg-type]
+    if np.array_equal(seen[0], seen[1]):
         raise ValueError(
             "The environment starts in the same state whatever reset(options={'state': ...}) says: it needs a wrapper that "
             "puts it into the state that it is given. (If it starts in the only one of starts anyway, leave starts out.)"

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch as th
+from filelock import FileLock
 from rl_zoo3 import ALGOS
 from stable_baselines3.common.callbacks import BaseCallback
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -276,7 +277,7 @@ def test_algorithms_of_the_zoo_and_ones_own_are_compared_in_any_environment(tmp_
         "tank:Tank-v0",
         "--defaults",
         "--timesteps",
-        "130",
+        "132",
         "--evaluations",
         "2",
         "--jobs",
@@ -289,6 +290,8 @@ def test_algorithms_of_the_zoo_and_ones_own_are_compared_in_any_environment(tmp_
     table = pd.read_csv(tmp_path / "out" / "Tank-v0.csv").set_index("algo")
     assert set(table.index) == {"a2c", "tank:AnnealedSAC", "tqc"} and (table["length"] == 100.0).all()
     assert (0.0 < table["cost"]).all() and (table["cost"] < table["cost_worst"]).all()
+    # A2C makes five at a time
+    assert table["timesteps"].to_dict() == {"a2c": 135, "tank:AnnealedSAC": 132, "tqc": 132}
     curves = pd.read_csv(tmp_path / "out" / "Tank-v0_learning.csv")
     assert set(curves["algo"]) == {"A2C defaults", "AnnealedSAC defaults", "TQC defaults"}
     assert (tmp_path / "out" / "Tank-v0_learning.png").stat().st_size > 0
@@ -346,3 +349,39 @@ def test_results_that_do_not_say_what_made_them_are_refused_before_any_training(
         compare.main(command())
     assert "lac_seed0/summary.json was written by an earlier version: choose another --out" in capsys.readouterr().err
     assert finished == []
+
+
+@pytest.mark.parametrize("damaged", ["", "[]", '{"recipe": '])
+def test_a_damaged_summary_is_named(tmp_path, capsys, finished, damaged):
+    compare.main(command("--algos", "lac"))
+    (file,) = (tmp_path / "out").glob("*/*/summary.json")
+    file.write_text(damaged)
+    with pytest.raises(SystemExit):
+        compare.main(command("--algos", "lac"))
+    assert f"{file.name} is damaged: delete" in capsys.readouterr().err
+
+
+def test_one_that_fails_costs_the_others_no_table(tmp_path, finished, monkeypatch):
+    finish = compare.run
+
+    def run(recipe, out, position):
+        if recipe.algo == "sac":
+            raise ZeroDivisionError
+        finish(recipe, out, position)
+
+    monkeypatch.setattr(compare, "run", run)
+    with pytest.raises(ZeroDivisionError):
+        compare.main(command("--algos", "sac"))
+    assert not (tmp_path / "out" / "compare.csv").exists()
+    with pytest.raises(ZeroDivisionError):
+        compare.main(command("--algos", "sac", "td3"))
+    assert list(pd.read_csv(tmp_path / "out" / "compare.csv")["algo"]) == ["td3", "closed form"]
+
+
+def test_two_processes_do_not_train_the_same_run(tmp_path):
+    chosen = recipe()
+    folder = tmp_path / ENV_ID / chosen.name
+    folder.mkdir(parents=True)
+    with FileLock(folder / ".lock"), pytest.raises(RuntimeError, match="another process is busy with"):
+        compare.run(chosen, tmp_path)
+    assert not (folder / "zoo").exists()

@@ -55,6 +55,14 @@ def test_the_page_holds_tables_figures_and_commands(small, capsys):
     assert not re.search(r"(src|href)=.(?!data:)", text) and "http" not in text
 
 
+def test_all_that_is_published_is_on_the_page():
+    errors = report.read_errors(RESULTS)
+    assert "mismatch, q_mobile, second half, constants off by 20 %, 5 mV noise" in set(errors["comparison"])
+    for _, of_calibrator in errors.groupby(["source", "comparison", "calibrator"]):
+        assert len(of_calibrator) == of_calibrator["seed"].nunique() * of_calibrator["trajectory"].nunique()
+        assert len(report.summary(of_calibrator)) == 1
+
+
 def test_numbers_of_the_voltage_only_tasks_are_those_of_their_table():
     errors = report.read_errors(RESULTS / "voltage")
     table = pd.read_csv(RESULTS / "voltage/BatteryVoltageJoint-v0.csv")

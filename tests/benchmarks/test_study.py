@@ -4,8 +4,13 @@ import argparse
 import json
 import operator
 import os
+import signal
+import subprocess
 import sys
+import time
+from concurrent.futures import BrokenExecutor
 from importlib.util import find_spec
+from pathlib import Path
 from types import FunctionType, ModuleType
 
 import numpy as np
@@ -97,6 +102,63 @@ def test_a_call_that_fails_stops_no_other(tmp_path, capsys):
     with pytest.raises(ZeroDivisionError):
         a_study(tmp_path).each(operator.truediv, [(1, 0), (1, 1)], kept.__setitem__)
     assert kept == {1: 1.0} and "part 1 of 2 failed: ZeroDivisionError" in capsys.readouterr().err
+
+
+def dies_once(number, place):
+    with (place / f"tries_{number}").open("a") as tries:
+        tries.write("x")
+    if number == 1 and (place / "tries_1").stat().st_size == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+def test_calls_of_a_lost_process_are_made_again(tmp_path):
+    assert a_study(tmp_path / "out", jobs=2).each(dies_once, [(number, tmp_path) for number in range(4)]) == [0, 1, 2, 3]
+    assert (tmp_path / "tries_1").stat().st_size == 2
+
+
+def dies_always():
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_call_that_always_loses_its_process_is_given_up(tmp_path):
+    with pytest.raises(BrokenExecutor):
+        a_study(tmp_path, jobs=2).each(dies_always, [()])
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="asks Linux who is running")
+def test_processes_end_with_the_one_that_started_them(tmp_path):
+    program = (
+        "import os, signal, sys, time\n"
+        "from battery_env.parallel import processes\n"
+        "if __name__ == '__main__':\n"
+        "    with processes(1) as submit:\n"
+        "        print(submit(os.getpid).result(), flush=True)\n"
+        "        submit(time.sleep, 60)\n"
+        "        os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    (tmp_path / "program.py").write_text(program)
+    done = subprocess.run([sys.executable, tmp_path / "program.py"], stdout=subprocess.PIPE, text=True, check=False)
+    worker = int(done.stdout)
+    deadline = time.monotonic() + 10
+    while time.monotonic() < deadline and _is_running(worker):
+        time.sleep(0.05)
+    assert not _is_running(worker)
+
+
+def _is_running(process):
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+@pytest.mark.parametrize("out", ["file", "file/below"])
+def test_a_folder_that_cannot_be_is_an_error_of_the_command_line(tmp_path, capsys, out):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SystemExit):
+        a_study(tmp_path / out)
+    assert "is no folder that can be written to" in capsys.readouterr().err
 
 
 def fragile_part(seed, place):

@@ -177,6 +177,16 @@ if "Mine-v0" not in gym.registry:
     assert (tuned.label, tuned.timesteps, tuned.hyperparameters["gamma"]) == ("Mine", 40, 0.7)
 
 
+def test_all_files_of_a_package_are_part_of_the_recipe(tmp_path, monkeypatch):
+    (package := tmp_path / "own_package_a").mkdir()
+    (package / "__init__.py").write_text("from own_package_a.algorithm import Mine")
+    (package / "algorithm.py").write_text("from stable_baselines3 import SAC\n\nclass Mine(SAC):\n    pass\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    before = training.Recipe.of("own_package_a:Mine", "LinearCost-v0", 0, 150, defaults=True)
+    (package / "algorithm.py").write_text("from stable_baselines3 import SAC\n\nclass Mine(SAC):\n    changed = True\n")
+    assert training.Recipe.of("own_package_a:Mine", "LinearCost-v0", 0, 150, defaults=True).digest != before.digest
+
+
 @pytest.mark.parametrize(
     ("algo", "message"),
     [
