@@ -33,7 +33,7 @@ from battery_env.plotting import (
 )
 from battery_env.sensors import RandomSensorErrors, SensorErrors
 from battery_env.trajectories import TrajectoryDataset
-from benchmarks.study import EVALUATION_SEED, SYMBOLS, Study, Tables, digits, side_by_side, with_spread
+from benchmarks.study import EVALUATION_SEED, SYMBOLS, Study, Tables, digits, side_by_side, with_interval, with_spread
 from benchmarks.training import registered_id
 
 #: What the voltmeter does to the test discharges of voltage-only tasks.
@@ -217,6 +217,7 @@ class FullState(Calibration):
                     "parameter": str(parameter),
                     **_who(str(label), group, learned),
                     "MAPE (%)": with_spread(group["mape_percent"]),
+                    "interquartile mean (%)": with_interval(group["mape_percent"]) if len(group) > 1 else "",
                     "worst discharge (%)": digits(group["mape_worst_percent"].max()),
                     "bias (%)": with_spread(group["bias_percent"]),
                     "spread (%)": with_spread(group["spread_percent"]),

@@ -29,7 +29,7 @@ from battery_env.evaluation import over_seeds
 from battery_env.plotting import COLOURS, new_figure
 from benchmarks.certificate import judge
 from benchmarks.references import DISTURBANCES, conditions, draw_shares, tried
-from benchmarks.study import Study, Tables, command_line, digits, markdown, natural, positive
+from benchmarks.study import Study, Tables, command_line, digits, markdown, natural, positive, with_interval
 from benchmarks.training import Recipe, train_or_load
 from sb3_lac.envs import reference_controller
 
@@ -98,11 +98,6 @@ def _in_order(names: pd.Series) -> pd.Series:
     return names.map(order.index)
 
 
-def _with_interval(values: pd.Series, significant: int = 2) -> str:
-    middle, low, high = (digits(float(value), significant) for value in over_seeds(values))
-    return middle if len(values) == 1 else f"{middle} [{low}, {high}]"
-
-
 def _share(values: pd.Series) -> str:
     percent = 100 * values
     spread = f" ({percent.min():.0f} to {percent.max():.0f})" if len(values) > 1 else ""
@@ -125,8 +120,8 @@ def undisturbed_table(results: pd.DataFrame) -> pd.DataFrame:
                 "policy": policy,
                 "seeds": "" if policy == _REFERENCE else str(len(group)),
                 "updates": "" if policy == _REFERENCE else f"{group['updates'].max():.0f}",
-                "cost per step": _with_interval(group["cost"]),
-                "error at the end, median": _with_interval(group["error_median"]),
+                "cost per step": with_interval(group["cost"]),
+                "error at the end, median": with_interval(group["error_median"]),
                 "at the goal": _share(group["at_goal"]),
                 "died": _share(group["died"]),
             }
@@ -167,9 +162,9 @@ def certificate_table(certificates: pd.DataFrame) -> pd.DataFrame:
                 "policy": f"{policy} (critic)" if function == "critic" else policy,
                 "holds": f"{group['holds'].sum()} of {len(group)}",
                 "cost at the start": digits(group["start_cost"].mean()),
-                "where it holds: mean cost settles below": _with_interval(settles["cost_bound"]) if len(settles) else "-",
-                "its alpha3": _with_interval(settles["cost_bound_alpha3"]) if len(settles) else "-",
-                "alpha3 without residual": _with_interval(group["largest_feasible_alpha3"]),
+                "where it holds: mean cost settles below": with_interval(settles["cost_bound"]) if len(settles) else "-",
+                "its alpha3": with_interval(settles["cost_bound_alpha3"]) if len(settles) else "-",
+                "alpha3 without residual": with_interval(group["largest_feasible_alpha3"]),
                 "survives, at least": "-" if function == "critic" else digits(group["survives_at_least"].mean()),
             }
         )

@@ -29,6 +29,7 @@ from tqdm import tqdm
 
 import battery_env
 import sb3_lac
+from battery_env.evaluation import over_seeds
 from battery_env.files import replacing
 from battery_env.parallel import cluster, processes
 from battery_env.plotting import save_figure
@@ -142,6 +143,17 @@ def with_spread(values: pd.Series) -> str:
     :return: for readers; the mean alone of a single seed
     """
     return digits(values.mean()) + (f" ± {digits(values.std(), 1)}" if len(values) > 1 else "")
+
+
+def with_interval(values: pd.Series) -> str:
+    """
+    Interquartile mean over seeds, with the 95 % interval of a bootstrap.
+
+    :param values: one per seed
+    :return: for readers; the value alone of a single seed
+    """
+    middle, low, high = (digits(float(value)) for value in over_seeds(values))
+    return middle if len(values) == 1 else f"{middle} [{low}, {high}]"
 
 
 def side_by_side(values: Iterable[float]) -> str:
