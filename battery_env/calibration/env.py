@@ -98,7 +98,7 @@ class CalibrationEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     metadata: dict[str, Any] = {  # noqa: RUF012 (as in gym.Env)
         "render_modes": _RENDER_MODES,
         "render_fps": 10,
-        "discount": 0.6,
+        "discount": 0.8,
     }
 
     def __init__(self, task: str | type[CalibrationTask], render_mode: str | None = None, **options: Any) -> None:

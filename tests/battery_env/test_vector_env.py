@@ -55,7 +55,7 @@ def assert_same_infos(found, expected, mask=None):
 def test_a_batch_makes_the_episodes_of_scalar_environments_to_the_bit(env_id, options, mode, discharges):
     batch, sync = make_pair(env_id, mode, episode_steps=4, dataset=discharges, **options)
     assert (batch.observation_space, batch.action_space) == (sync.observation_space, sync.action_space)
-    assert batch.metadata["autoreset_mode"] is mode and batch.metadata["discount"] == 0.6
+    assert batch.metadata["autoreset_mode"] is mode and batch.metadata["discount"] == 0.8
     sync.action_space.seed(0)
     for seed in (3, [7, 1, 5], None):
         found, expected = batch.reset(seed=seed), sync.reset(seed=seed)

@@ -112,7 +112,7 @@ def test_a_recipe_names_all_that_a_policy_depends_on(tmp_path, monkeypatch):
 
 def test_recipe_holds_the_discount_that_the_environment_states():
     recipe = training.Recipe.of("lac", "BatteryQmax-v0", 0, 200, defaults=True)
-    assert recipe.arguments["gamma"] == gym.spec("BatteryQmax-v0").make().metadata["discount"] == 0.6
+    assert recipe.arguments["gamma"] == gym.spec("BatteryQmax-v0").make().metadata["discount"] == 0.8
     assert training.Recipe.of("lac", "Pendulum-v1", 0, 200, defaults=True).arguments["gamma"] == 0.99
     assert training.Recipe.of("sac", "BatteryQmax-v0", 0, 200, defaults=True).arguments["gamma"] == 0.99
 
