@@ -32,6 +32,7 @@ from gymnasium.envs.registration import EnvSpec, load_env_creator
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 
 try:
@@ -62,7 +63,9 @@ def _sample_common_params(trial: optuna.Trial) -> Hyperparams:
         "one_minus_gamma": trial.suggest_float("one_minus_gamma", 0.0001, 0.5, log=True),
         # From 2**5=32 to 2**10=1024
         "batch_size_pow": trial.suggest_int("batch_size_pow", 5, 10),
-        "learning_rate": trial.suggest_float("learning_rate", 1e-5, 0.002, log=True),
+        "learning_rate": trial.suggest_float("learning_rate", 1e-5, 0.005, log=True),
+        # Linearly to zero, or not at all
+        "learning_rate_falls": trial.suggest_categorical("learning_rate_falls", [False, True]),
         # Polyak coeff
         "tau": trial.suggest_float("tau", 0.001, 0.08, log=True),
         "net_arch": trial.suggest_categorical("net_arch", ["small", "medium", "large"]),
@@ -87,6 +90,21 @@ def _finish_sample(trial: optuna.Trial, sampled_params: Hyperparams, additional_
     return sampled_params
 
 
+def _convert_common_params(sampled_params: Hyperparams) -> Hyperparams:
+    hyperparams = convert_offpolicy_params(sampled_params)
+    if hyperparams.pop("learning_rate_falls"):
+        hyperparams["learning_rate"] = f"lin_{hyperparams['learning_rate']}"
+    return hyperparams
+
+
+def _as_arguments(hyperparams: Hyperparams) -> Hyperparams:
+    # The RL Zoo reads schedules from configurations only
+    rate = hyperparams["learning_rate"]
+    if isinstance(rate, str):
+        hyperparams["learning_rate"] = LinearSchedule(float(rate.removeprefix("lin_")), 0.0, 1.0)
+    return hyperparams
+
+
 def convert_sac_params(sampled_params: Hyperparams) -> Hyperparams:
     """
     Convert sampled values to the hyperparameters of SAC.
@@ -94,7 +112,7 @@ def convert_sac_params(sampled_params: Hyperparams) -> Hyperparams:
     :param sampled_params: See ``sample_sac_params()``
     :return: Keyword arguments of ``SAC``
     """
-    hyperparams = convert_offpolicy_params(sampled_params)
+    hyperparams = _convert_common_params(sampled_params)
     hyperparams["ent_coef"] = f"auto_{hyperparams.pop('ent_coef_init')}"
     return hyperparams
 
@@ -120,7 +138,7 @@ def convert_td3_params(sampled_params: Hyperparams) -> Hyperparams:
     :param sampled_params: See ``sample_td3_params()``
     :return: Hyperparameters of ``TD3``
     """
-    hyperparams = convert_offpolicy_params(sampled_params)
+    hyperparams = _convert_common_params(sampled_params)
     hyperparams["noise_type"] = "normal"
     # The ratio of the defaults is 0.5 to 0.2
     hyperparams["target_noise_clip"] = 2.5 * hyperparams["target_policy_noise"]
@@ -147,7 +165,7 @@ def sample_lac_params(trial: optuna.Trial, n_actions: int, n_envs: int, addition
         "lambda_max": trial.suggest_float("lambda_max", 0.1, 10.0, log=True),
         "output_dim": trial.suggest_categorical("output_dim", [8, 16, 32, 64]),
     }
-    return convert_lac_params(_finish_sample(trial, sampled_params, additional_args))
+    return _as_arguments(convert_lac_params(_finish_sample(trial, sampled_params, additional_args)))
 
 
 def sample_sac_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> Hyperparams:
@@ -161,7 +179,7 @@ def sample_sac_params(trial: optuna.Trial, n_actions: int, n_envs: int, addition
     :return: Keyword arguments of ``SAC``
     """
     sampled_params = {**_sample_common_params(trial), **_sample_entropy_params(trial, n_actions)}
-    return convert_sac_params(_finish_sample(trial, sampled_params, additional_args))
+    return _as_arguments(convert_sac_params(_finish_sample(trial, sampled_params, additional_args)))
 
 
 def sample_td3_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> Hyperparams:
@@ -179,7 +197,7 @@ def sample_td3_params(trial: optuna.Trial, n_actions: int, n_envs: int, addition
         "noise_std": trial.suggest_float("noise_std", 0.01, 0.5, log=True),
         "target_policy_noise": trial.suggest_float("target_policy_noise", 0.01, 0.5, log=True),
     }
-    hyperparams = convert_td3_params(_finish_sample(trial, sampled_params, additional_args))
+    hyperparams = _as_arguments(convert_td3_params(_finish_sample(trial, sampled_params, additional_args)))
     # The RL Zoo reads the type of noise from configurations only
     del hyperparams["noise_type"]
     sigma = np.full(n_actions, hyperparams.pop("noise_std"))

@@ -135,8 +135,13 @@ def test_every_sample_is_a_valid_model(algo, make_env, wrapped):
     for _ in range(5):
         trial = study.ask()
         hyperparams = sampler[algo](trial, 2, 1, {"using_her_replay_buffer": False, "her_kwargs": {}})
-        # What is loaded from a finished trial is what was tried, with the noise as a configuration has it
+        # What is loaded from a finished trial is what was tried, with noise and schedules as a configuration has them
         loaded = converter[algo](trial.params)
+        if trial.params["learning_rate_falls"]:
+            schedule, rate = hyperparams["learning_rate"], trial.params["learning_rate"]
+            assert loaded.pop("learning_rate") == f"lin_{rate}"
+            assert (schedule(1.0), schedule(0.5), schedule(0.0)) == pytest.approx((rate, rate / 2, 0.0))
+            loaded["learning_rate"] = schedule
         if algo == "td3":
             assert loaded.pop("noise_type") == "normal"
             np.testing.assert_array_equal(hyperparams.pop("action_noise")._sigma, np.full(2, loaded.pop("noise_std")))
@@ -159,7 +164,8 @@ def test_a_search_can_find_the_tuned_hyperparameters(algo, wrapped):
     initial_ent_coef = float(best.get("ent_coef", "auto_0.02").removeprefix("auto_"))
     point = {
         "one_minus_gamma": 1 - best["gamma"],
-        "learning_rate": 1e-3,
+        "learning_rate": float(str(best["learning_rate"]).removeprefix("lin_")),
+        "learning_rate_falls": str(best["learning_rate"]).startswith("lin_"),
         "ent_coef_init": initial_ent_coef,
         "target_entropy": best.get("target_entropy"),
         "noise_std": best.get("noise_std"),
