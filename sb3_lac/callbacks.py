@@ -1,8 +1,9 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -13,9 +14,19 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, sync_envs_norm
 from sb3_lac.dashboard import NOT_TENSORBOARD, tensorboard_writer
 from sb3_lac.files import replacing
 from sb3_lac.lac import LAC
-from sb3_lac.stability import CertificationReport, LyapunovReport, certify, evaluate_lyapunov, fit_lyapunov
-from sb3_lac.stability.fitting import NoCostError
+from sb3_lac.stability import (
+    CertificationReport,
+    Interval,
+    LyapunovReport,
+    NoCostError,
+    certify,
+    evaluate_lyapunov,
+    fit_lyapunov,
+)
 from sb3_lac.stability.rollout import known_seed, prepare_evaluation, trains_on
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as MatplotlibFigure
 
 
 class LyapunovCallback(EventCallback):
@@ -142,17 +153,42 @@ class LyapunovCallback(EventCallback):
         self.last_report = evaluate_lyapunov(
             self.model, self.eval_env, self.n_eval_episodes, deterministic=self.deterministic, seed=self.seed
         )
-        entry: dict[str, float] = {}
+        return self._log("lyapunov", self._metrics(self.last_report), {"report": self.last_report.plot})
+
+    def _metrics(self, report: LyapunovReport | None) -> dict[str, float]:
+        """
+        The metrics that are logged.
+
+        :param report: Of an evaluation, or None if there was nothing to judge
+        :return: Values and the limits of their intervals, by name
+        """
+        values: dict[str, float] = {}
         for metric, name in self.METRICS.items():
-            value, low, high = self.last_report.metrics[metric]
-            self.logger.record(f"lyapunov/{name}", value)
-            entry.update({name: value, f"{name}_low": low, f"{name}_high": high})
-        if tensorboard_writer(self.logger) is not None:
-            for name in self.METRICS.values():
-                for limit in (f"{name}_low", f"{name}_high"):
-                    self.logger.record(f"lyapunov/{limit}", entry[limit], exclude=NOT_TENSORBOARD)
-            self.logger.record("lyapunov/report", Figure(self.last_report.plot(), close=False), exclude=NOT_TENSORBOARD)
-        return entry
+            found = Interval(np.nan, np.nan, np.nan) if report is None else report.metrics[metric]
+            values.update({name: found.value, f"{name}_low": found.low, f"{name}_high": found.high})
+        return values
+
+    def _log(
+        self, folder: str, values: dict[str, float], figures: dict[str, Callable[[], MatplotlibFigure]]
+    ) -> dict[str, float]:
+        """
+        Log values everywhere; the limits of their intervals, and figures, in TensorBoard only.
+
+        :param folder: What all names begin with
+        :param values: By name
+        :param figures: What draws each, by name
+        :return: The values
+        """
+        in_tensorboard = tensorboard_writer(self.logger) is not None
+        for name, value in values.items():
+            if not name.endswith(("_low", "_high")):
+                self.logger.record(f"{folder}/{name}", value)
+            elif in_tensorboard:
+                self.logger.record(f"{folder}/{name}", value, exclude=NOT_TENSORBOARD)
+        if in_tensorboard:
+            for name, draw in figures.items():
+                self.logger.record(f"{folder}/{name}", Figure(draw(), close=False), exclude=NOT_TENSORBOARD)
+        return values
 
     def _summary(self) -> str:
         assert self.last_report is not None
@@ -179,7 +215,8 @@ class CertificateCallback(LyapunovCallback):
     action (see ``fit_lyapunov()``) and judged on others (see ``evaluate_lyapunov()``), about which exact statements are made
     (see ``certify()``). The training is not changed by it. Each of the three takes its own seed, so that all evaluations have
     the same start states and none is judged on what it was fitted on. Where nothing has a cost there is nothing to certify:
-    all values are then NaN.
+    all values are then NaN. TensorBoard also gets the limits of the confidence intervals (``certificate/<name>_low``,
+    ``certificate/<name>_high``) and two figures, ``certificate/drift`` and ``certificate/statements``.
 
     :param eval_env: The environment used for evaluation, as for ``LyapunovCallback``
     :param callback_after_eval: Callback to trigger after every evaluation, which finds the reports in
@@ -233,23 +270,18 @@ class CertificateCallback(LyapunovCallback):
         try:
             lyapunov = fit_lyapunov(self.model, self.eval_env, n_episodes, seed=first, progress_bar=False)
         except NoCostError:
-            return self._log({name: np.nan for name in ("holds", *self.METRICS.values(), *self.BOUNDS.values())})
+            nothing = dict.fromkeys(("holds", *self.BOUNDS.values()), np.nan)
+            return self._log("certificate", {**nothing, **self._metrics(None)}, {})
         self.last_report = evaluate_lyapunov(self.model, self.eval_env, n_episodes, seed=first + n_envs, lyapunov=lyapunov)
         self.last_certification = certify(
             self.model, self.eval_env, lyapunov, n_episodes, self.confidence, self.cost_bound, seed=first + 2 * n_envs
         )
         values = {"holds": float(self.last_report.holds)}
-        for metric, name in self.METRICS.items():
-            values[name] = self.last_report.metrics[metric].value
         for statement, name in self.BOUNDS.items():
             # A statement that no episode could make
             values[name] = float(self.last_certification.statements["at_least"].get(statement, np.nan))
-        return self._log(values)
-
-    def _log(self, values: dict[str, float]) -> dict[str, float]:
-        for name, value in values.items():
-            self.logger.record(f"certificate/{name}", value)
-        return values
+        figures = {"drift": self.last_report.plot_drift, "statements": self.last_certification.plot}
+        return self._log("certificate", {**values, **self._metrics(self.last_report)}, figures)
 
     def _summary(self) -> str:
         if self.last_certification is None:

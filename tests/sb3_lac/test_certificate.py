@@ -14,8 +14,9 @@ from scipy.optimize import linprog
 from scipy.stats import binom
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.logger import Logger, configure
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from benchmarks.controllers import ScaledController
 from sb3_lac import (
@@ -616,6 +617,16 @@ def test_callback_goes_on_where_nothing_has_a_cost(make_env, tmp_path, capsys):
     assert other.history[0]["start_cost"] != other.history[1]["start_cost"]
 
 
+def test_callback_shows_intervals_and_figures_in_tensorboard(make_env, tmp_path):
+    model = SAC("MlpPolicy", make_env(), learning_starts=100, policy_kwargs={"net_arch": [8]}, buffer_size=100, seed=0)
+    model.set_logger(configure(str(tmp_path), ["tensorboard"]))
+    model.learn(10, callback=CertificateCallback(make_env(), n_eval_episodes=2, eval_freq=10, verbose=0))
+    events = EventAccumulator(str(tmp_path)).Reload()
+    assert set(events.Tags()["images"]) == {"certificate/drift", "certificate/statements"}
+    low, value, high = (events.Scalars(f"certificate/mean_cost{end}")[0].value for end in ("_low", "", "_high"))
+    assert low <= value <= high
+
+
 def test_callback_certifies_any_algorithm_and_changes_nothing(make_env, tmp_path):
     def train(callback):
         model = SAC("MlpPolicy", make_env(), learning_starts=20, batch_size=16, policy_kwargs={"net_arch": [8]}, seed=0)
@@ -634,6 +645,7 @@ def test_callback_certifies_any_algorithm_and_changes_nothing(make_env, tmp_path
     for name, tensor in expected.policy.state_dict().items():
         assert th.equal(tensor, model.policy.state_dict()[name]), name
     assert len(logged) == 2 and all(len(name) <= 36 for name in logged[0])
+    assert callback.history[-1]["cost_bound_high"] == callback.last_report.metrics["cost_bound"].high
     assert logged[-1]["certificate/survives_at_least"] == callback.last_certification.statements.loc["survives", "at_least"]
     assert len(callback.history) == 2 and (tmp_path / "log.csv").exists()
     assert len(callback.last_report.episodes) == len(callback.last_certification.episodes) == 4

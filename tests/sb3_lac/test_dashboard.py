@@ -129,7 +129,10 @@ def test_every_tab_has_the_runs(tensorboard):
     assert all(common <= tags[run] for run in tags)
     assert {"lyapunov/decrease", "lyapunov/decrease_low", "lyapunov/decrease_high", "train/lambda"} <= tags["LAC_1"]
     images = tensorboard.get("plugin/images/tags")
-    assert {run: set(tags) for run, tags in images.items()} == {"LAC_1": {"lyapunov/report"}}
+    certificates = {"certificate/drift", "certificate/statements"}
+    of_lac = {run for run in RUNS if run.startswith("LAC")}
+    expected = {run: certificates | ({"lyapunov/report"} if run in of_lac else set()) for run in RUNS}
+    assert {run: set(tags) for run, tags in images.items()} == expected
 
 
 def test_the_layout_is_that_of_the_callback_and_has_all_runs_in_one_chart(tensorboard):
