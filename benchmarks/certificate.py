@@ -42,6 +42,10 @@ _N_ENVS = 25
 _FIT_SEED, _EVALUATION_SEED, _CERTIFICATION_SEED = 10_000, 20_000, 30_000
 #: Share of the cost at the start below which a loop counts as settled.
 SETTLED_SHARE = 0.1
+_MEANING = (
+    f"mean cost settles below (green: known to be below {SETTLED_SHARE:g} of the cost at the start; blue: below it; "
+    "orange: not)"
+)
 _STATEMENTS = ("survives", "stays_within", "decreases")
 
 
@@ -175,18 +179,18 @@ def plot(table: pd.DataFrame) -> Figure:
     for axes, env_id in zip(panels, envs, strict=False):
         of_env = table[table["env"] == env_id].reset_index(drop=True)
         rows = of_env.index.to_numpy()[::-1]
-        colours = np.where(of_env["holds"], COLOURS[2], COLOURS[1]).tolist()
+        colours = np.where(of_env["settles"], COLOURS[2], np.where(of_env["holds"], COLOURS[0], COLOURS[1])).tolist()
         bounds = of_env[["cost_bound_low", "cost_bound", "cost_bound_high"]]
         # a logarithmic axis has no 0, which is shown a decade below all else
         least = min(of_env["start_cost"].min(), bounds.where(bounds > 1e-9).min(axis=None)) / 10
         low, bound, high = bounds.clip(lower=least).to_numpy().T
         axes.hlines(rows, low, high, colors=colours, lw=3)
-        axes.scatter(bound, rows, c=colours, s=24, label="settles below (green: the certificate holds)", zorder=3)
+        axes.scatter(bound, rows, c=colours, s=24, label=_MEANING, zorder=3)
         axes.scatter(of_env["start_cost"], rows, color="black", marker="|", s=80, label="at the start")
         seeds = [f" {seed:.0f}" if pd.notna(seed) else "" for seed in of_env["seed"]]
         functions = np.where(of_env["function"] == "critic", " (critic)", "")
         axes.set_yticks(rows, of_env["policy"] + seeds + functions, fontsize="small")
-        axes.margins(y=0.2)
+        axes.set_ylim(-0.7, len(rows) - 0.3)
         zero = f" (0 at {least:.1g})" if (bounds < 1e-9).any(axis=None) else ""
         axes.set(xscale="log", xlabel=f"cost per step{zero}", title=env_id)
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize="small")
