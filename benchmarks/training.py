@@ -90,7 +90,8 @@ class Recipe:
         :param seed: seed of everything
         :param timesteps: environment steps; ``n_timesteps`` of ``zoo_configs`` by default, or ``DEFAULTS_TIMESTEPS``
         :param hyperparameters: what differs from ``zoo_configs``
-        :param defaults: the hyperparameters of ``ALGO("MlpPolicy", env_id)`` instead of those of ``zoo_configs``
+        :param defaults: the hyperparameters of ``ALGO("MlpPolicy", env_id)`` instead of those of ``zoo_configs``;
+            ``"MultiInputPolicy"`` where observations are dicts
         :param evaluations: how often the training is interrupted by an evaluation, if at all
         :return: the recipe
         :raises ValueError: if the algorithm, the environment or its entry in ``zoo_configs`` does not exist, for a seed out of
@@ -102,7 +103,8 @@ class Recipe:
             raise ValueError(f"a seed must lie within 0 .. 2**32 - 1, got {seed}")
         environment, metadata = _environment(env_id)
         if defaults:
-            source, entry = "defaults", {"policy": "MlpPolicy"}
+            of_dicts = environment["observation_space"].startswith("Dict(")
+            source, entry = "defaults", {"policy": "MultiInputPolicy" if of_dicts else "MlpPolicy"}
         else:
             source, config = "zoo_configs", find_config(kind.__name__.lower() if ":" in algo else algo)
             entries = yaml.safe_load(config.read_text(encoding="utf-8"))

@@ -177,6 +177,30 @@ if "Mine-v0" not in gym.registry:
     assert (tuned.label, tuned.timesteps, tuned.hyperparameters["gamma"]) == ("Mine", 40, 0.7)
 
 
+def test_defaults_are_for_dicts_too(tmp_path, monkeypatch, request):
+    source = """
+import gymnasium as gym
+import numpy as np
+
+class Named(gym.ObservationWrapper):
+    def __init__(self):
+        super().__init__(gym.make("LinearCost-v0"))
+        self.observation_space = gym.spaces.Dict({"state": self.env.observation_space})
+
+    def observation(self, observation):
+        return {"state": observation}
+
+if "Named-v0" not in gym.registry:
+    gym.register("Named-v0", Named)
+"""
+    (tmp_path / "own_module_b.py").write_text(source)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    request.addfinalizer(lambda: gym.registry.pop("Named-v0"))
+    recipe = training.Recipe.of("lac", "own_module_b:Named-v0", 0, 150, defaults=True)
+    _, model = training.set_up(recipe, tmp_path / "run")
+    assert set(model.observation_space.spaces) == {"state"}
+
+
 def test_all_files_of_a_package_are_part_of_the_recipe(tmp_path, monkeypatch):
     (package := tmp_path / "own_package_a").mkdir()
     (package / "__init__.py").write_text("from own_package_a.algorithm import Mine")
