@@ -11,16 +11,19 @@ import tempfile
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 #: Starts a call: a function that can be imported, and its arguments.
 Submit = Callable[..., "Future[Any]"]
 
+# how often a call is made whose process was lost
+_TRIES = 3
 # a scheduler that is there answers within milliseconds
 _PATIENCE_S = 5.0
 
@@ -28,19 +31,75 @@ _PATIENCE_S = 5.0
 @contextmanager
 def processes(jobs: int) -> Iterator[Submit]:
     """
-    Processes of this machine. When the block fails, what has not begun is not begun any more; when this process ends, however
-    it does, so do they. If one of them is lost, all calls that are not done raise ``BrokenExecutor``.
+    Processes of this machine. A call whose process is lost, as for want of memory, is made again, three times in all. When the
+    block fails, what has not begun is not begun any more; when this process is killed, so are they.
 
     :param jobs: how many
     :yields: what starts a call
     """
-    # spawn: torch does not survive a fork with threads
-    with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn"), initializer=_end_with_parent) as pool:
+    workers = [_Worker() for _ in range(jobs)]
+    idle: SimpleQueue[_Worker] = SimpleQueue()
+    for worker in workers:
+        idle.put(worker)
+
+    def call(function: Callable[..., Any], *arguments: Any) -> Any:
+        worker = idle.get()
         try:
-            yield pool.submit
-        except BaseException:  # also of a generator that is closed
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+            return worker.call(function, *arguments)
+        finally:
+            idle.put(worker)
+
+    threads = ThreadPoolExecutor(jobs)
+
+    def submit(function: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        return threads.submit(call, function, *arguments)
+
+    try:
+        yield submit
+        threads.shutdown()
+    finally:  # at once, if the block has failed, also of a generator that is closed
+        for worker in workers:
+            worker.close()
+        threads.shutdown(wait=False, cancel_futures=True)
+
+
+class _Worker:
+    """A process of its own, so that one that is lost takes one call with it."""
+
+    def __init__(self) -> None:
+        self._closed = False
+        self._pool = self._new_pool()
+
+    @staticmethod
+    def _new_pool() -> ProcessPoolExecutor:
+        # spawn: torch does not survive a fork with threads
+        return ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"), initializer=_end_with_parent)
+
+    def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Make a call, again if the process is lost."""
+        for tries_left in reversed(range(_TRIES)):
+            try:
+                return self._pool.submit(function, *arguments).result()
+            except BrokenExecutor:
+                if self._closed or not self._is_lost():
+                    raise  # an error of the call itself
+                self._pool = self._new_pool()
+                if tries_left == 0:
+                    raise
+                warnings.warn("The process of a call was lost; the call is made again.", stacklevel=2)
+        raise AssertionError
+
+    def _is_lost(self) -> bool:
+        try:
+            self._pool.submit(int).result()
+        except BrokenExecutor:
+            return True
+        return False
+
+    def close(self) -> None:
+        """Begin no other call."""
+        self._closed = True
+        self._pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _end_with_parent() -> None:

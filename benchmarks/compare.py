@@ -31,6 +31,7 @@ import contextlib
 import io
 import json
 import shutil
+import sys
 import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, fields
@@ -156,10 +157,10 @@ def finished_runs(out: Path) -> pd.DataFrame:
     for file in sorted(out.glob("*/*/summary.json")):
         try:
             summary = json.loads(file.read_text(encoding="utf-8"))
-            recipe_of = summary.get("recipe", ())
-        except (json.JSONDecodeError, AttributeError) as error:
+            known = set(summary.get("recipe", ()))
+        except (ValueError, TypeError, AttributeError) as error:
             raise ValueError(f"{file} is damaged: delete {file.parent}, and it is trained anew") from error
-        if set(recipe_of) != {field.name for field in fields(Recipe)}:
+        if known != {field.name for field in fields(Recipe)}:
             raise ValueError(f"{file} was written by an earlier version: choose another --out")
         recipe = Recipe(**summary["recipe"])
         of_run: dict[str, Any] = {
@@ -270,9 +271,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     jobs = [recipe for of_seed in recipes for recipe in of_seed]
     try:
         study.each(run, [(recipe, study.out, 1 + k % chosen.jobs) for k, recipe in enumerate(jobs)])
-    finally:
-        # of those that finished, also if others failed
-        report(study)
+    except Exception:
+        try:
+            report(study)  # of those that finished
+        except Exception as error:
+            sys.stderr.write(f"and the tables of what finished failed: {error!r}\n")
+        raise
+    report(study)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ import platform
 import shlex
 import sys
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
-from concurrent.futures import BrokenExecutor, as_completed
+from concurrent.futures import as_completed
 from contextlib import closing
 from functools import partial
 from hashlib import sha256
@@ -43,8 +43,6 @@ SYMBOLS = {"q_mobile": "q^max", "r_o": "R_o"}
 #: Seed of evaluations; no training seed comes close.
 EVALUATION_SEED = 10_000
 
-# how often a call is made whose process was lost; a cluster's own count
-_TRIES = 3
 # what parts are made by
 _CODE = ("battery_env", "sb3_lac", "benchmarks")
 _PACKAGES = ("torch", "stable_baselines3", "gymnasium", "numpy", "numba", "scipy", "pandas", "rl_zoo3", "progpy")
@@ -242,10 +240,9 @@ class Study:
         self.command = f"{parser.prog} {shlex.join(words)}".strip()
         self.name = parser.prog.rpartition(".")[2]
         self.out: Path = self.chosen.out
-        try:
-            self.out.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            parser.error(f"--out {self.out} is no folder that can be written to: {error}")
+        there = next(folder for folder in (self.out.absolute(), *self.out.absolute().parents) if folder.exists())
+        if not (there.is_dir() and os.access(there, os.W_OK)):
+            parser.error(f"--out {self.out}: {there} is no folder that can be written to")
         self.scheduler: str | None = vars(self.chosen).get("scheduler")
         others = {name: value for name, value in vars(self.chosen).items() if name not in ("jobs", "scheduler", "out")}
         self.configuration: dict[str, Any] = others
@@ -293,8 +290,8 @@ class Study:
         """
         Call a function with each of several arguments, with a progress bar: on the cluster, or as many at the same time as
         was chosen, in processes of their own, or all in this one if one at a time. A call that fails stops no other; its
-        error is raised when all are done. The calls of a process that is lost, as for want of memory, are made again, three
-        times at most. An interruption ends the program with a word on what is done.
+        error is raised when all are done. A call whose process is lost is made again. An interruption ends the program with
+        a word on what is done.
 
         :param function: importable, since it is pickled
         :param runs: positional arguments of each call
@@ -326,23 +323,15 @@ class Study:
         """The number of each run with what gives its result: as they are done elsewhere, or as they are to be done here."""
         if self.scheduler is None and self.chosen.jobs == 1:
             yield from ((number, partial(function, *run)) for number, run in enumerate(runs))
-            return
-        left = dict(enumerate(runs))
-        for tries_left in reversed(range(_TRIES)):
-            if not left:
-                return
+        elif runs:
             workers = (
                 processes(self.chosen.jobs)
                 if self.scheduler is None
                 else cluster(self.scheduler, _CODE, self.out if shared else None)
             )
             with workers as submit:
-                numbers = {submit(_importable(function), *run): number for number, run in left.items()}
+                numbers = {submit(_importable(function), *run): number for number, run in enumerate(runs)}
                 for future in as_completed(numbers):
-                    # a process that is lost takes all calls with it that are not done
-                    if tries_left > 0 and isinstance(future.exception(), BrokenExecutor):
-                        continue
-                    del left[numbers[future]]
                     yield numbers[future], future.result
 
     def write_table(self, name: str, table: pd.DataFrame, configuration: Mapping[str, Any] | None = None) -> None:

@@ -16,6 +16,7 @@ import shutil
 import time
 from dataclasses import asdict, dataclass
 from functools import cache
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -184,14 +185,22 @@ def algorithm(algo: str) -> type[BaseAlgorithm]:
 
 
 def _own_modules(*named: tuple[str, str, str]) -> dict[str, str]:
-    found = {}
-    for module in (module for module, colon, _ in named if colon):
-        # of a package all files, for the module that is named may only pass on what others define
-        top = importlib.import_module(module.partition(".")[0])
-        file = Path(inspect.getfile(top if top.__file__ else importlib.import_module(module)))
-        files = sorted(file.parent.rglob("*.py")) if file.name == "__init__.py" else [file]
-        found[module] = digest_of({str(path.relative_to(file.parent)): path.read_text("utf-8") for path in files})
-    return found
+    return {module: _digest_of_source(module) for module, colon, _ in named if colon}
+
+
+def _digest_of_source(module: str) -> str:
+    try:
+        file = Path(inspect.getfile(importlib.import_module(module)))
+    except TypeError as error:
+        raise ValueError(f"{module} has no file of its own: name the module that defines what you mean") from error
+    top = file.parent
+    if not (top / "__init__.py").exists():
+        return digest_of({file.name: sha256(file.read_bytes()).hexdigest()})
+    # of a package all files, for the module that is named may only pass on what others define
+    while (top.parent / "__init__.py").exists():
+        top = top.parent
+    files = [path for path in sorted(top.rglob("*.py")) if (path.parent / "__init__.py").exists()]
+    return digest_of({path.relative_to(top).as_posix(): sha256(path.read_bytes()).hexdigest() for path in files})
 
 
 def registered_id(env_id: str) -> str:

@@ -23,7 +23,7 @@ from sb3_lac.stability import (
     evaluate_lyapunov,
     fit_lyapunov,
 )
-from sb3_lac.stability.rollout import known_seed, prepare_evaluation, trains_on
+from sb3_lac.stability.rollout import check_environment, known_seed, prepare_evaluation, trains_on
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
@@ -82,6 +82,7 @@ class LyapunovCallback(EventCallback):
         verbose: int = 1,
     ):
         super().__init__(callback_after_eval, verbose=verbose)
+        check_environment(eval_env)
         # Convert to VecEnv for consistency
         if not isinstance(eval_env, VecEnv):
             eval_env = DummyVecEnv([lambda: eval_env])  # type: ignore[list-item, return-value]
@@ -102,6 +103,7 @@ class LyapunovCallback(EventCallback):
                 f"The model must be a LAC model, which has a Lyapunov function, and not {self.model!r}. CertificateCallback "
                 "learns one for any other model."
             )
+        known_seed(self.seed)
         self.eval_env = prepare_evaluation(self.model, self.eval_env, self.n_eval_episodes, self.OF_THE_CRITIC)
         if trains_on(self.model, self.eval_env):
             raise ValueError(

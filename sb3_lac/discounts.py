@@ -1,5 +1,5 @@
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -9,7 +9,7 @@ import torch as th
 DEFAULT_DISCOUNT = 0.99
 
 
-def stated_discount(metadata: Sequence[dict[str, Any] | None]) -> float:
+def stated_discount(metadata: Sequence[Any]) -> float:
     """
     The discount factor that environments state as ``metadata["discount"]``, for how far to look ahead is part of a task.
 
@@ -17,7 +17,8 @@ def stated_discount(metadata: Sequence[dict[str, Any] | None]) -> float:
     :return: ``DEFAULT_DISCOUNT`` where none is stated
     :raises ValueError: If it is out of range, or if they differ
     """
-    stated = [(of_env or {}).get("discount", DEFAULT_DISCOUNT) for of_env in metadata]
+    known = [of_env if isinstance(of_env, Mapping) else {} for of_env in metadata]
+    stated = [of_env.get("discount", DEFAULT_DISCOUNT) for of_env in known]
     for discount in stated:
         if not isinstance(discount, (float, int, np.number)) or not 0 <= discount <= 1:
             raise ValueError(
@@ -25,7 +26,8 @@ def stated_discount(metadata: Sequence[dict[str, Any] | None]) -> float:
                 f"set gamma, for instance gamma={DEFAULT_DISCOUNT}."
             )
         if discount != stated[0]:
-            raise ValueError(f"The environments state different discounts, {stated[0]} and {discount}: set gamma to one.")
+            different = [of_env.get("discount", "none") for of_env in known]
+            raise ValueError(f"The environments state different discounts, {different}: set gamma.")
     return float(stated[0]) if stated else DEFAULT_DISCOUNT
 
 

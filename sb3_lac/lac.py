@@ -369,10 +369,16 @@ class LAC(OffPolicyAlgorithm):
         """Ask the environment for its discount factor, if it is to state it."""
         gamma: Any = self.gamma
         if gamma == "auto":
-            metadata: list[dict[str, Any] | None] = []
+            metadata: list[Any] = []
             # There may be no environment, and a vector environment of somebody else may have no attributes
             with suppress(AttributeError, NotImplementedError):
-                metadata = self.env.get_attr("metadata")  # type: ignore[union-attr]
+                try:
+                    metadata = self.env.get_attr("metadata")  # type: ignore[union-attr]
+                except (EOFError, ConnectionError) as error:
+                    raise ValueError(
+                        "The environments' metadata cannot be sent between processes, which have ended by that: set gamma, "
+                        "for instance gamma=0.99, and nobody asks for it."
+                    ) from error
             self.gamma = stated_discount(metadata)
         elif not isinstance(gamma, (float, int, np.number)):
             raise ValueError(f"gamma={gamma!r} must be a number, or 'auto' for the discount that the environment states.")

@@ -92,7 +92,8 @@ def _finish_sample(trial: optuna.Trial, sampled_params: Hyperparams, additional_
 
 def _convert_common_params(sampled_params: Hyperparams) -> Hyperparams:
     hyperparams = convert_offpolicy_params(sampled_params)
-    if hyperparams.pop("learning_rate_falls"):
+    # Trials of a study of an earlier version do not say
+    if hyperparams.pop("learning_rate_falls", False):
         hyperparams["learning_rate"] = f"lin_{hyperparams['learning_rate']}"
     return hyperparams
 

@@ -324,6 +324,8 @@ def _fit(
     mean, scale = inputs.mean(axis=0), np.maximum(inputs.std(axis=0), 1e-6)
     if roll_outs.last_observations is not None:
         inputs = np.concatenate([inputs, flatten(roll_outs.last_observations)])
+    if not np.isfinite(inputs).all():
+        raise ValueError("The environment showed an infinite observation, which no network can learn from: bound it.")
     low, high = inputs.min(axis=0), inputs.max(axis=0)
     scale[low == high] = np.inf
     inputs = (inputs - mean) / scale

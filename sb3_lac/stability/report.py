@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import numbers
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -159,9 +160,8 @@ class LyapunovReport:
             return "L does not decrease where the cost is largest"
         if not metrics["cost_bound"].high < self.settled_share * metrics["start_cost"].value:
             share = "" if self.settled_share == 1 else f"{self.settled_share:g} of "
-            return (
-                f"the interval of cost_bound is not below {share}the cost of the first steps: it is not known to settle there"
-            )
+            below = f"below {share}the cost of the first steps"
+            return f"the interval of cost_bound is not {below}, and so the loop is not known to settle there"
         return None
 
     def _verdict_with_residual(self) -> str:
@@ -365,8 +365,8 @@ def evaluate_lyapunov(
         raise ValueError(f"max_tail_weight={max_tail_weight} must be greater than 0, and at most 1.")
     check_number("n_cost_levels", n_cost_levels)
     check_number("n_bootstrap", n_bootstrap)
-    if not 0 < settled_share <= 1:
-        raise ValueError(f"settled_share={settled_share} must be greater than 0, and at most 1.")
+    if not isinstance(settled_share, numbers.Real) or not 0 < settled_share <= 1:
+        raise ValueError(f"settled_share={settled_share!r} must be greater than 0, and at most 1.")
 
     vec_normalize = unwrap_vec_normalize(env)
     # Asked for before the work: not every environment answers

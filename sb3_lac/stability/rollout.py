@@ -42,10 +42,7 @@ def prepare_evaluation(policy: PolicyPredictor, env: gym.Env | VecEnv, n_eval_ep
     """
     if isinstance(policy, type) or not callable(getattr(policy, "predict", None)):
         raise ValueError(f"{policy!r} has no method predict(observation, deterministic=...), which every policy needs.")
-    if isinstance(env, gym.vector.VectorEnv):
-        raise ValueError(f"{env} is a vector environment of Gymnasium: pass sb3_lac.GymnasiumVecEnv(env).")
-    if not isinstance(env, (gym.Env, VecEnv)):
-        raise ValueError(f"env={env!r} is no environment: pass that of gym.make(id), or a VecEnv.")
+    check_environment(env)
     check_number("n_eval_episodes", n_eval_episodes)
     if not isinstance(policy, (BaseAlgorithm, BasePolicy)):
         # A controller that knows nothing of images and their channels
@@ -70,6 +67,17 @@ def prepare_evaluation(policy: PolicyPredictor, env: gym.Env | VecEnv, n_eval_ep
     return env
 
 
+def check_environment(env: object) -> None:
+    """
+    :param env: What is to be an environment
+    :raises ValueError: If it is none that Stable-Baselines3 can step
+    """
+    if isinstance(env, gym.vector.VectorEnv):
+        raise ValueError(f"{env} is a vector environment of Gymnasium: pass sb3_lac.GymnasiumVecEnv(env).")
+    if not isinstance(env, (gym.Env, VecEnv)):
+        raise ValueError(f"env={env!r} is no environment: pass that of gym.make(id), or a VecEnv.")
+
+
 def check_number(name: str, value: int) -> None:
     """
     :param name: Of an argument
@@ -90,8 +98,8 @@ def known_seed(seed: int | None) -> int:
     """
     if seed is None:
         return int(np.random.SeedSequence().generate_state(1)[0] // 2)
-    if not isinstance(seed, (int, np.integer)) or not 0 <= seed < 2**32:
-        raise ValueError(f"seed={seed!r} must be a whole number within 0 .. 2**32 - 1, or None for a random one.")
+    if not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise ValueError(f"seed={seed!r} must be a whole number of at least 0, or None for a random one.")
     return int(seed)
 
 
@@ -316,8 +324,9 @@ def roll_out(
         raise ValueError("The environment paid a reward that is not finite: its costs cannot be judged.")
     transitions["reward"] = transitions["reward"].astype(np.float64)
     seen = combine(np.concatenate, batches)
-    if not all(np.isfinite(array).all() for array in (seen.values() if isinstance(seen, dict) else [seen])):
-        raise ValueError("The environment showed an observation that is not finite: nothing can be said of what follows it.")
+    for observed in [seen, *last_observations]:
+        if any(np.isnan(array).any() for array in (observed.values() if isinstance(observed, dict) else [observed])):
+            raise ValueError("The environment showed an observation that is NaN: nothing can be said of what follows it.")
     last_of = transitions.loc[transitions["truncated"], "env"].to_numpy()
     # From the order of time to one episode after the other
     order = np.argsort(transitions["env"], kind="stable")

@@ -211,15 +211,18 @@ def tightest_drift(n: np.ndarray, drift: np.ndarray, cost: np.ndarray) -> tuple[
             bounds[index] = alphas[index] = np.nan
             continue
         m, c = drift[index][seen] / n[index][seen], cost[index][seen] / n[index][seen]
-        # With t = 1 / alpha3 it is the largest of straight lines, whose least value is at t = 0, or where
-        # two of them meet, or where the last one reaches 0
-        with np.errstate(divide="ignore", invalid="ignore"):
-            meetings = np.append((c[:, None] - c) / (m - m[:, None]), -c / m)
-        t = np.sort(np.append(0.0, meetings[np.isfinite(meetings) & (meetings > 0)]))
         # Where L falls at all levels, these roll-outs end before it settles: at no cost that they have not come to
-        of_t = np.maximum((np.outer(t, m) + c).max(axis=1), c.min())
-        # Of those that say as much the largest alpha3, but not an infinite one
-        best = 1 + np.argmin(of_t[1:]) if len(t) > 1 and of_t[1:].min() <= of_t[0] else 0
+        least = c.min()
+        # With t = 1 / alpha3 it is the largest of straight lines, whose least value is at t = 0, or where
+        # two of them meet, or where the last one reaches that cost, or 0
+        with np.errstate(divide="ignore", invalid="ignore"):
+            meetings = np.concatenate([((c[:, None] - c) / (m - m[:, None])).ravel(), (least - c) / m, -c / m])
+        t = np.sort(np.append(0.0, meetings[np.isfinite(meetings) & (meetings > 0)]))
+        if (m[c == c.max()] < 0).all() and len(t) > 1:
+            t = t[1:]  # where L falls at the largest cost, an infinite alpha3 says no more than others
+        of_t = np.maximum((np.outer(t, m) + c).max(axis=1), least)
+        # The largest alpha3 of those that say as much
+        best = np.argmax(of_t <= of_t.min() * (1 + 1e-12))
         bounds[index], alphas[index] = of_t[best], 1 / t[best] if t[best] > 0 else np.nan
     return bounds, alphas
 

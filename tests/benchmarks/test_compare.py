@@ -351,7 +351,7 @@ def test_results_that_do_not_say_what_made_them_are_refused_before_any_training(
     assert finished == []
 
 
-@pytest.mark.parametrize("damaged", ["", "[]", '{"recipe": '])
+@pytest.mark.parametrize("damaged", ["", "[]", '{"recipe": ', '{"recipe": 5}'])
 def test_a_damaged_summary_is_named(tmp_path, capsys, finished, damaged):
     compare.main(command("--algos", "lac"))
     (file,) = (tmp_path / "out").glob("*/*/summary.json")
@@ -361,7 +361,7 @@ def test_a_damaged_summary_is_named(tmp_path, capsys, finished, damaged):
     assert f"{file.name} is damaged: delete" in capsys.readouterr().err
 
 
-def test_one_that_fails_costs_the_others_no_table(tmp_path, finished, monkeypatch):
+def test_one_that_fails_costs_the_others_no_table(tmp_path, finished, monkeypatch, capsys):
     finish = compare.run
 
     def run(recipe, out, position):
@@ -376,6 +376,14 @@ def test_one_that_fails_costs_the_others_no_table(tmp_path, finished, monkeypatc
     with pytest.raises(ZeroDivisionError):
         compare.main(command("--algos", "sac", "td3"))
     assert list(pd.read_csv(tmp_path / "out" / "compare.csv")["algo"]) == ["td3", "closed form"]
+
+    def fails(study):
+        raise ValueError("no tables")
+
+    monkeypatch.setattr(compare, "report", fails)
+    with pytest.raises(ZeroDivisionError):
+        compare.main(command("--algos", "sac", "td3"))
+    assert "the tables of what finished failed: ValueError('no tables')" in capsys.readouterr().err
 
 
 def test_two_processes_do_not_train_the_same_run(tmp_path):

@@ -177,6 +177,11 @@ if "Mine-v0" not in gym.registry:
     assert (tuned.label, tuned.timesteps, tuned.hyperparameters["gamma"]) == ("Mine", 40, 0.7)
 
 
+def test_a_module_without_a_file_is_named():
+    with pytest.raises(ValueError, match="sys has no file of its own"):
+        training.Recipe.of("sac", "sys:LinearCost-v0", 0, 150, defaults=True)
+
+
 def test_defaults_are_for_dicts_too(tmp_path, monkeypatch, request):
     source = """
 import gymnasium as gym

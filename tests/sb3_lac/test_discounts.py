@@ -62,9 +62,20 @@ def test_discount_out_of_range_is_refused(make_model, stating, discount):
     assert make_model(stating(discount), n_collect=0, gamma=0.9).gamma == 0.9
 
 
-def test_different_discounts_are_refused(make_model, stating):
-    env = DummyVecEnv([lambda: stating(0.5), lambda: stating(0.6)])
-    with pytest.raises(ValueError, match=r"0\.5 and 0\.6: set gamma"):
+def test_different_discounts_are_refused(make_model, make_env, stating):
+    env = DummyVecEnv([lambda: stating(0.5), make_env])
+    with pytest.raises(ValueError, match=r"\[0\.5, 'none'\]: set gamma"):
+        make_model(env, n_collect=0)
+
+
+def test_metadata_that_cannot_be_sent_is_named(make_model, make_env):
+    def make():
+        env = make_env()
+        env.metadata = {"render_modes": [], "callback": lambda: 0}
+        return env
+
+    env = SubprocVecEnv([make], start_method="fork")
+    with pytest.raises(ValueError, match="cannot be sent between processes"):
         make_model(env, n_collect=0)
 
 
@@ -74,4 +85,4 @@ def test_gamma_is_a_number_or_auto(make_model):
 
 
 def test_nothing_known_is_the_default():
-    assert stated_discount([]) == stated_discount([None]) == stated_discount([{}]) == DEFAULT_DISCOUNT
+    assert stated_discount([]) == stated_discount([None, {}, []]) == DEFAULT_DISCOUNT

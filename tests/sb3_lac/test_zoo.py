@@ -146,6 +146,8 @@ def test_every_sample_is_a_valid_model(algo, make_env, wrapped):
             assert loaded.pop("noise_type") == "normal"
             np.testing.assert_array_equal(hyperparams.pop("action_noise")._sigma, np.full(2, loaded.pop("noise_std")))
         assert loaded == hyperparams
+        of_before = {name: value for name, value in trial.params.items() if name != "learning_rate_falls"}
+        assert converter[algo](of_before)["learning_rate"] == trial.params["learning_rate"]
         # Those of the configuration belong together
         assert not {"train_freq", "gradient_steps", "n_envs"} & set(hyperparams)
         model = rl_zoo3.ALGOS[algo]("MlpPolicy", make_env(), buffer_size=10, device="cpu", **hyperparams)
