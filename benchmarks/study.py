@@ -30,7 +30,7 @@ from tqdm import tqdm
 import battery_env
 import sb3_lac
 from battery_env.evaluation import over_seeds
-from battery_env.files import replacing
+from battery_env.files import check_folder, replacing
 from battery_env.parallel import cluster, processes
 from battery_env.plotting import save_figure
 
@@ -240,9 +240,10 @@ class Study:
         self.command = f"{parser.prog} {shlex.join(words)}".strip()
         self.name = parser.prog.rpartition(".")[2]
         self.out: Path = self.chosen.out
-        there = next(folder for folder in (self.out.absolute(), *self.out.absolute().parents) if folder.exists())
-        if not (there.is_dir() and os.access(there, os.W_OK)):
-            parser.error(f"--out {self.out}: {there} is no folder that can be written to")
+        try:
+            check_folder(self.out)
+        except OSError as error:
+            parser.error(str(error))
         self.scheduler: str | None = vars(self.chosen).get("scheduler")
         others = {name: value for name, value in vars(self.chosen).items() if name not in ("jobs", "scheduler", "out")}
         self.configuration: dict[str, Any] = others

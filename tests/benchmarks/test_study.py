@@ -182,7 +182,20 @@ def test_a_folder_that_cannot_be_is_an_error_of_the_command_line(tmp_path, capsy
     (tmp_path / "file").write_text("")
     with pytest.raises(SystemExit):
         a_study(tmp_path / out)
-    assert "is no folder that can be written to" in capsys.readouterr().err
+    assert "is a file: choose another --out" in capsys.readouterr().err
+
+
+def written(path, text):
+    with study.replacing(path) as part:
+        part.write_text(text)
+        time.sleep(0.2)
+    return path.read_text()
+
+
+def test_two_processes_may_write_the_same_file(tmp_path):
+    file = tmp_path / "table.csv"
+    a_study(tmp_path, jobs=2).each(written, [(file, str(number)) for number in range(6)])
+    assert [path.name for path in tmp_path.iterdir()] == ["table.csv"]
 
 
 def fragile_part(seed, place):
