@@ -34,6 +34,13 @@ DISTURBANCES: dict[str, tuple[float, dict[str, float], float, float, int]] = {
     "QuadrotorCost-v0": (50.0, {"mass_kg": 1.2}, 0.01, 0.03, 2),
     "VehicleCost-v0": (20_000.0, {"friction": 0.5}, 0.01, 0.03, 2),
 }
+#: Shares of episodes, with their titles in tables: the error at the end is within the tolerance, or within a part of that at
+#: the start.
+SHARES = {
+    "at_goal": "at the goal",
+    "within_1_percent": "within 1 % of the start",
+    "within_0.1_percent": "within 0.1 %",
+}
 # No episode ends within 15 steps after an impulse
 _IMPULSE_INTERVAL = 85
 
@@ -70,6 +77,7 @@ def tried(policy: PolicyPredictor, env_id: str, episodes: int) -> pd.DataFrame:
     rows = []
     for condition, arguments in conditions(env_id).items():
         outcome = roll_out(policy, partial(gym.make, env_id, **arguments), episodes)
+        left = (outcome["error"] / outcome["error_at_start"]).where(~outcome["died"], np.inf)
         rows.append(
             {
                 "environment": env_id,
@@ -81,6 +89,8 @@ def tried(policy: PolicyPredictor, env_id: str, episodes: int) -> pd.DataFrame:
                 "error_worst": outcome["error"].max(),
                 "tolerance": problem.error_tolerance,
                 "at_goal": ((outcome["error"] <= problem.error_tolerance) & ~outcome["died"]).mean(),
+                "within_1_percent": (left <= 0.01).mean(),
+                "within_0.1_percent": (left <= 0.001).mean(),
                 "died": outcome["died"].mean(),
             }
         )
@@ -116,7 +126,7 @@ def report(results: pd.DataFrame) -> str:
             for median, worst in zip(results["error_median"], results["error_worst"], strict=True)
         ],
         "tolerance": results["tolerance"],
-        "at the goal": [f"{share:.0%}" for share in results["at_goal"]],
+        **{title: [f"{share:.0%}" for share in results[column]] for column, title in SHARES.items()},
         "died": [f"{share:.0%}" for share in results["died"]],
     }
     return markdown(pd.DataFrame(shown))

@@ -76,11 +76,14 @@ def roll_out(
     :param episodes: how many; the same starts and disturbances for every policy
     :param noise_std: standard deviation of the noise on each observed variable
     :param seed: seed of the first episode, those of the others follow
-    :return: one row per episode: mean cost per step, length, distance to the goal at the end, and whether it died
+    :return: one row per episode: mean cost per step, length, distance to the goal at the start and at the end, and whether it
+        died
     """
     envs = [make_env() for _ in range(episodes)]
     rngs = [np.random.default_rng((seed, episode)) for episode in range(episodes)]
-    observations = np.array([env.reset(seed=seed + episode)[0] for episode, env in enumerate(envs)])
+    starts = [env.reset(seed=seed + episode) for episode, env in enumerate(envs)]
+    observations = np.array([observation for observation, _ in starts])
+    errors_at_start = [info["error"] for _, info in starts]
     costs, errors = np.zeros(episodes), np.zeros(episodes)
     lengths, died = np.zeros(episodes, dtype=int), np.zeros(episodes, dtype=bool)
     running = np.arange(episodes)
@@ -99,7 +102,9 @@ def roll_out(
             if not (terminated or truncated):
                 going_on.append(episode)
         running = np.array(going_on, dtype=int)
-    return pd.DataFrame({"cost": costs / lengths, "length": lengths, "error": errors, "died": died})
+    return pd.DataFrame(
+        {"cost": costs / lengths, "length": lengths, "error_at_start": errors_at_start, "error": errors, "died": died}
+    )
 
 
 def conditions(study: str) -> list[tuple[dict[str, Any], float]]:

@@ -28,7 +28,7 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 from battery_env.evaluation import over_seeds
 from battery_env.plotting import COLOURS, new_figure
 from benchmarks.certificate import judge
-from benchmarks.references import DISTURBANCES, conditions, draw_shares, tried
+from benchmarks.references import DISTURBANCES, SHARES, conditions, draw_shares, tried
 from benchmarks.study import Study, Tables, command_line, digits, markdown, natural, positive, with_interval
 from benchmarks.training import Recipe, train_or_load
 from sb3_lac.envs import reference_controller
@@ -122,7 +122,7 @@ def undisturbed_table(results: pd.DataFrame) -> pd.DataFrame:
                 "updates": "" if policy == _REFERENCE else f"{group['updates'].max():.0f}",
                 "cost per step": with_interval(group["cost"]),
                 "error at the end, median": with_interval(group["error_median"]),
-                "at the goal": _share(group["at_goal"]),
+                **{title: _share(group[column]) for column, title in SHARES.items()},
                 "died": _share(group["died"]),
             }
         )

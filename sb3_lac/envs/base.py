@@ -49,7 +49,8 @@ def _noise_std(name: str, std: float | Sequence[float], n: int) -> np.ndarray | 
 class CostEnv(gym.Env[np.ndarray, np.ndarray]):
     """
     A control problem with a cost: the reward is ``-cost``. ``info`` holds ``"cost"``, and ``"error"``, the distance to the
-    goal after the step (``error_name`` says which, and its unit), as it is and not as noise shows it.
+    goal after the step (``error_name`` says which, and its unit), as it is and not as noise shows it; that of ``reset()``
+    holds the error of the start.
 
     Actions lie in [-1, 1]; each problem scales them. ``reset(options={"state": ...})`` starts from a given state.
 
@@ -186,7 +187,7 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
         """
         :param seed: Seed of all that is random from here on
         :param options: ``{"state": ...}`` to start from a given state
-        :return: Observation, and an empty ``info``
+        :return: Observation, and ``info`` with ``"error"``
         """
         super().reset(seed=seed)
         start = self._initial_state()
@@ -201,7 +202,7 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
         self.n_steps = 0
         self._history = [(start, np.nan)]
         self._delayed_actions = deque([self._zero_action] * self.action_delay)
-        return self._noisy_observation(), {}
+        return self._noisy_observation(), {"error": self._error()}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """

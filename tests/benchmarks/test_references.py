@@ -39,6 +39,14 @@ def test_table_and_picture_say_what_was_measured(tmp_path, monkeypatch, capsys):
     assert (tmp_path / "references.png").stat().st_size > 1000
 
 
+def test_shares_are_of_the_way_that_is_left_and_the_dead_have_not_arrived(monkeypatch):
+    outcome = {"cost": [1.0] * 4, "error_at_start": [10.0, 2.0, 0.1, 10.0], "error": [0.1, 0.002, 0.09, 0.0]}
+    died = [False, False, False, True]
+    monkeypatch.setattr(references, "roll_out", lambda *_: pd.DataFrame(outcome | {"died": died}))
+    shares = references.tried(None, "LinearCost-v0", 4)[list(references.SHARES)]
+    assert shares.drop_duplicates().values.tolist() == [[0.75, 0.5, 0.25]]
+
+
 def test_zero_episodes_are_refused():
     with pytest.raises(SystemExit):
         references.main(["--episodes", "0"])

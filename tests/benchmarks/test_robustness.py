@@ -32,7 +32,7 @@ class CountdownEnv(gym.Env):
     def reset(self, seed=None, options=None):
         super().reset(seed=seed)
         self.dies, self.n_steps = seed % 2 == 1, 0
-        return self.np_random.normal(size=2).astype(np.float32), {}
+        return self.np_random.normal(size=2).astype(np.float32), {"error": 10.0}
 
     def step(self, action):
         self.n_steps += 1
@@ -66,7 +66,13 @@ def test_all_combinations_of_a_study_are_tried():
 def test_costs_lengths_and_deaths_are_those_of_each_episode():
     policy = RecordingPolicy(0.0)
     outcome = robustness.roll_out(policy, CountdownEnv, 4, 0.0)
-    expected = {"cost": [3.0, 2.0] * 2, "length": [5, 3] * 2, "error": [5.0, 7.0] * 2, "died": [False, True] * 2}
+    expected = {
+        "cost": [3.0, 2.0] * 2,
+        "length": [5, 3] * 2,
+        "error_at_start": [10.0] * 4,
+        "error": [5.0, 7.0] * 2,
+        "died": [False, True] * 2,
+    }
     pd.testing.assert_frame_equal(outcome, pd.DataFrame(expected))
     # the dead are not asked any more
     assert [len(seen) for seen in policy.seen] == [4, 4, 4, 2, 2]

@@ -56,6 +56,8 @@ def test_tables_count_episodes_and_seeds():
             "cost": cost,
             "error_median": 0.1,
             "at_goal": at_goal,
+            "within_1_percent": at_goal / 2,
+            "within_0.1_percent": 0.0,
             "died": 1.0 - at_goal,
         }
         for seed, cost, at_goal in ((0, 1.0, 0.0), (1, 3.0, 0.5))
@@ -63,6 +65,7 @@ def test_tables_count_episodes_and_seeds():
     ]
     row = stabilisation.undisturbed_table(pd.DataFrame(rows)).iloc[0]
     assert (row["cost per step"], row["at the goal"], row["died"]) == ("2 [1, 3]", "25 % (0 to 50)", "75 % (50 to 100)")
+    assert (row["within 1 % of the start"], row["within 0.1 %"]) == ("12 % (0 to 25)", "0 % (0 to 0)")
     assert row["seeds"] == "2" and row["updates"] == "10"
     disturbed = stabilisation.disturbed_table(pd.DataFrame(rows)).iloc[0]
     assert disturbed["none"] == disturbed["impulses"] == "25 % (75 %)"

@@ -343,9 +343,8 @@ def test_costs_of_the_new_problems():
     ],
 )
 def test_error_is_the_distance_to_the_goal(make, state, error):
-    env = make()
-    env.reset(options={"state": state})
-    assert env._error() == pytest.approx(error)
+    _, info = make().reset(options={"state": state})
+    assert info["error"] == pytest.approx(error)
 
 
 @pytest.mark.parametrize("make", CLASSES)
