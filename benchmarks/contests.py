@@ -199,13 +199,20 @@ class FullState(Calibration):
 
     def report(self, runs: pd.DataFrame, study: Study) -> tuple[list[dict[str, str]], pd.DataFrame]:
         self.write_learning(runs, study)
+        errors = [f"{name}_{self.metric}" for name in self.parameters]
+        of_runs = {
+            (label, seed): pd.read_csv(folder / "scores.csv", usecols=errors)[errors]
+            for label, seed, folder in runs[["label", "seed", "folder"]].itertuples(index=False)
+        }
+        scores = pd.concat(of_runs, names=["calibrator", "seed", "trajectory"]).reset_index()
+        study.write_table(f"{self.env_id}_scores", scores, made_by(runs))
         # the paper's figure, of the first seed
         first = runs.drop_duplicates("label")
         folders = zip(first["label"], first["folder"], strict=True)
         inferred = {label: pd.read_csv(folder / "scores.csv") for label, folder in folders}
         for name, stem in zip(self.parameters, self.stems.values(), strict=True):
             save_figure(plot_true_against_inferred(inferred, name), study.out / f"{stem}_inferred.png")
-            columns = ["load", name, f"{name}_hat", f"{name}_spread", f"{name}_mape_percent"]
+            columns = ["load", name, f"{name}_hat", f"{name}_spread"]
             points = pd.concat({label: scores[columns] for label, scores in inferred.items()}, names=["algo", "trajectory"])
             study.write_table(f"{stem}_inferred", points.reset_index(), made_by(runs))
         table, lines = self.table(runs), []

@@ -1,6 +1,7 @@
 """
 One page with the errors of all calibrators on held-out discharges: what is typical, how sure that is, and how the errors are
-spread. It is made from the raw CSV files of ``docs/results`` alone, and holds its figures.
+spread. It is made from the raw CSV files of ``docs/results`` alone, and holds its figures; its tables also stand beside it as
+Markdown.
 
 .. code-block:: bash
 
@@ -26,26 +27,27 @@ from scipy.stats import bootstrap, trim_mean
 from battery_env.arrays import FloatArray
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.plotting import COLOURS, new_figure
-from benchmarks.study import write_text
+from benchmarks.study import markdown, write_text
 
 _RESAMPLES = 999
 
-_HEAD = """<!DOCTYPE html>
+_TITLE = "Errors on held-out discharges"
+_HEAD = f"""<!DOCTYPE html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
-<title>Errors on held-out discharges</title>
+<title>{_TITLE}</title>
 <style>
-body { font-family: sans-serif; max-width: 60em; margin: 2em auto; padding: 0 1em; }
-table { border-collapse: collapse; margin: 1em 0; }
-th, td { padding: 0.3em 0.8em; border-bottom: 1px solid #ccc; text-align: right; }
-th:first-child, td:first-child { text-align: left; }
-img { max-width: 100%; }
-.source { color: #555; font-size: 85%; }
+body {{ font-family: sans-serif; max-width: 60em; margin: 2em auto; padding: 0 1em; }}
+table {{ border-collapse: collapse; margin: 1em 0; }}
+th, td {{ padding: 0.3em 0.8em; border-bottom: 1px solid #ccc; text-align: right; }}
+th:first-child, td:first-child {{ text-align: left; }}
+img {{ max-width: 100%; }}
+.source {{ color: #555; font-size: 85%; }}
 </style>
 </head>
 <body>
-<h1>Errors on held-out discharges</h1>
+<h1>{_TITLE}</h1>
 <p>The error of a discharge is the mean absolute error of the estimates during it, or in its second half where the
 title says so, in per cent of the true value; where there is no estimate, it is infinite. Mean: over discharges, then
 over seeds, &plusmn; the standard deviation over seeds. Interquartile mean: of the half in the middle of the errors of
@@ -201,30 +203,34 @@ def _by_seed(errors: pd.DataFrame) -> FloatArray:
     return table.fillna(np.inf).to_numpy(dtype=np.float64)
 
 
-def page(results: Path) -> str:
+def pages(results: Path) -> tuple[str, str]:
     """
     The report.
 
     :param results: folder with CSV files
-    :return: an HTML page that needs no other file
+    :return: an HTML page that needs no other file, and its tables as Markdown
     :raises FileNotFoundError: if no file holds errors of discharges
     """
-    parts = [_HEAD]
+    page, tables = [_HEAD], [f"# {_TITLE}\n"]
     for (source, comparison), errors in read_errors(results).groupby(["source", "comparison"], sort=False):
-        parts.append(f"<h2>{html.escape(str(comparison))}</h2>\n<p class='source'>From {html.escape(str(source))}")
+        title, table = html.escape(str(comparison)), _shown(summary(errors))
+        page.append(f"<h2>{title}</h2>\n<p class='source'>From {html.escape(str(source))}")
+        tables.append(f"## {comparison}\n\nFrom {source}")
         record = (results / str(source)).with_suffix(".json")
         if record.exists():
             command = json.loads(record.read_text(encoding="utf-8")).get("command", "")
-            parts.append(f", made by <code>{html.escape(command)}</code>")
-        parts.append(f"</p>\n{_table(summary(errors))}\n")
+            page.append(f", made by <code>{html.escape(command)}</code>")
+            tables[-1] += f", made by `{command}`"
+        page.append(f"</p>\n{table.to_html(index=False, border=0)}\n")
+        tables[-1] += f"\n\n{markdown(table)}"
         buffer = io.BytesIO()
         plot_profiles(errors, str(comparison)).savefig(buffer, format="png", dpi="figure")
         image = base64.b64encode(buffer.getvalue()).decode("ascii")
-        parts.append(f'<img alt="{html.escape(str(comparison))}" src="data:image/png;base64,{image}">\n')
-    return "".join([*parts, "</body>\n</html>\n"])
+        page.append(f'<img alt="{title}" src="data:image/png;base64,{image}">\n')
+    return "".join([*page, "</body>\n</html>\n"]), "\n".join(tables)
 
 
-def _table(table: pd.DataFrame) -> str:
+def _shown(table: pd.DataFrame) -> pd.DataFrame:
     lines = []
     for row in table.to_dict("records"):
         spread = "" if np.isnan(row["sd"]) else f" ± {row['sd']:.1g}"
@@ -239,7 +245,7 @@ def _table(table: pd.DataFrame) -> str:
                 "95 % interval": f"{row['low']:.2g} to {row['high']:.2g}",
             }
         )
-    return pd.DataFrame(lines).to_html(index=False, border=0)
+    return pd.DataFrame(lines)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -252,14 +258,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
         prog="python -m benchmarks.report", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--results", type=Path, default=Path("docs/results"), help="folder with the raw CSV files")
-    parser.add_argument("--out", type=Path, default=Path("results/report.html"), help="the page")
+    parser.add_argument("--out", type=Path, default=Path("results/report.html"), help="the page; its tables stand beside it")
     chosen = parser.parse_args(arguments)
     try:
-        text = page(chosen.results)
+        page, tables = pages(chosen.results)
     except FileNotFoundError as error:
         parser.error(str(error))
-    write_text(chosen.out, text)
-    sys.stdout.write(f"{chosen.out}\n")
+    beside = chosen.out.with_suffix(".md")
+    write_text(chosen.out, page)
+    write_text(beside, tables)
+    sys.stdout.write(f"{chosen.out}\n{beside}\n")
 
 
 if __name__ == "__main__":

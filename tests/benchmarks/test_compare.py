@@ -18,6 +18,7 @@ from tensorboard.plugins.custom_scalar.layout_pb2 import Layout
 from battery_env.estimators.closed_form import ClosedForm
 from battery_env.evaluation import evaluate, summarize
 from benchmarks import compare, contests
+from benchmarks.report import read_errors
 from benchmarks.training import Recipe
 
 ENV_ID = "BatteryRo-v0"
@@ -79,7 +80,7 @@ def test_a_comparison_writes_table_figures_and_logs(tmp_path, capsys):
     shown = capsys.readouterr().out
     assert re.search(rf"\| BatteryRo-v0 +\| r_o +\| LAC +\| {recipe().digest} +\| 400 +\| 1 ", shown)
     assert "Interrupted" not in shown
-    for name in ("inferred.png", "inferred.csv", "learning.png", "learning.csv", "learning.json"):
+    for name in ("inferred.png", "inferred.csv", "scores.csv", "learning.png", "learning.csv", "learning.json"):
         assert (out / f"{ENV_ID}_{name}").stat().st_size > 0
     logs = {path.parent.name for path in (out / "tensorboard" / ENV_ID).rglob("events*")}
     assert logs == {f"{algo.upper()}_seed0_{recipe(algo).digest}" for algo in ("lac", "sac", "td3")}
@@ -176,6 +177,9 @@ def test_seeds_are_one_row_and_continued_runs_are_named(tmp_path, finished, caps
     assert "- LAC on BatteryRo-v0, seed 1: 2 times\n- SAC on BatteryRo-v0, seed 1: 2 times\n" in shown
     assert (tmp_path / "out" / "compare.md").read_text(encoding="utf-8") in shown
     assert list(pd.read_csv(tmp_path / "out" / "compare.csv")["resumed"][:4]) == [0, 2, 0, 2]
+    # errors of all discharges of all seeds, for the report
+    errors = read_errors(tmp_path / "out")
+    assert errors.groupby(["calibrator", "seed"]).size().to_dict() == {(who, seed): 6 for who in ("LAC", "SAC") for seed in (0, 1)}
 
 
 @pytest.mark.parametrize("algo", ["lac", "td3"])
