@@ -77,6 +77,7 @@ def filled_model(
     net_arch: list[int],
     batch_size: int,
     transitions: int,
+    policy_kwargs: dict[str, Any] | None = None,
     **arguments: Any,
 ) -> Algorithm:
     """
@@ -87,6 +88,7 @@ def filled_model(
     :param net_arch: widths of the hidden layers, of all networks
     :param batch_size: batch size
     :param transitions: how many; the size of the replay buffer, too, unless ``arguments`` say otherwise
+    :param policy_kwargs: of the algorithm, beside networks and activation
     :param arguments: other arguments of the algorithm
     :return: the model
     """
@@ -94,7 +96,7 @@ def filled_model(
         "learning_starts": transitions,
         "buffer_size": transitions,
         "batch_size": batch_size,
-        "policy_kwargs": {"net_arch": net_arch, "activation_fn": nn.LeakyReLU},
+        "policy_kwargs": {"net_arch": net_arch, "activation_fn": nn.LeakyReLU, **(policy_kwargs or {})},
         "device": "cpu",
         "seed": 0,
     }

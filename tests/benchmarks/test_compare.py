@@ -179,7 +179,9 @@ def test_seeds_are_one_row_and_continued_runs_are_named(tmp_path, finished, caps
     assert list(pd.read_csv(tmp_path / "out" / "compare.csv")["resumed"][:4]) == [0, 2, 0, 2]
     # errors of all discharges of all seeds, for the report
     errors = read_errors(tmp_path / "out")
-    assert errors.groupby(["calibrator", "seed"]).size().to_dict() == {(who, seed): 6 for who in ("LAC", "SAC") for seed in (0, 1)}
+    assert errors.groupby(["calibrator", "seed"]).size().to_dict() == {
+        (who, seed): 6 for who in ("LAC", "SAC") for seed in (0, 1)
+    }
 
 
 @pytest.mark.parametrize("algo", ["lac", "td3"])

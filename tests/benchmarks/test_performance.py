@@ -103,7 +103,7 @@ def test_sections_are_written(monkeypatch, tmp_path, capsys):
         "learn_profile.csv",
         "learn_profile.json",
     }
-    assert pd.read_csv(tmp_path / "updates.csv").shape == (2, 8)
+    assert pd.read_csv(tmp_path / "updates.csv").shape == (2, 10)
     assert pd.read_csv(tmp_path / "learn_profile.csv")["share"].sum() == pytest.approx(1.0, abs=1e-4)
     growth = pd.read_csv(tmp_path / "growth.csv")
     assert growth.groupby(["over", "value"]).size().to_dict() == dict.fromkeys(
