@@ -611,6 +611,28 @@ class LAC(OffPolicyAlgorithm):
         going_on = 1 - replay_data.dones
         return (going_on * (next_values - values + self.alpha3 * costs)).sum() / going_on.sum().clamp(min=1)
 
+    def _objective(
+        self,
+        replay_data: ReplayBufferSamples,
+        actions: th.Tensor,
+        values: th.Tensor,
+        costs: th.Tensor,
+        difference: th.Tensor,
+    ) -> th.Tensor:
+        """
+        What the actor lowers, besides its negative entropy.
+
+        :param replay_data: Sampled transitions
+        :param actions: Of the present actor in their states
+        :param values: ``L(s, a)`` of the transitions, without a gradient, shape (n, 1)
+        :param costs: Of the transitions, shape (n, 1)
+        :param difference: See ``_violation()``
+        :return: Mean of ``L``, or with the published update the difference itself
+        """
+        if self.published_update:
+            return difference
+        return largest_value(self.critic(replay_data.observations, actions)).mean()
+
     def _update(self, replay_data: ReplayBufferSamples, costs: th.Tensor, weights: Weights, update_targets: bool) -> Metrics:
         """
         One update of all that is learned.
@@ -648,10 +670,7 @@ class LAC(OffPolicyAlgorithm):
             next_actions = self.actor(replay_data.next_observations)
         difference = self._violation(replay_data, next_actions, values, costs)
 
-        # What the actor lowers: with the published update the difference itself
-        objective = difference
-        if not self.published_update:
-            objective = largest_value(self.critic(replay_data.observations, actions_pi)).mean()
+        objective = self._objective(replay_data, actions_pi, values, costs, difference)
 
         # Important: detach the multipliers from the graph
         # so we don't change them with other losses
