@@ -71,10 +71,15 @@ def test_tables_count_episodes_and_seeds():
     assert disturbed["none"] == disturbed["impulses"] == "25 % (75 %)"
 
 
-def test_tqc_has_the_hyperparameters_of_sac():
-    sac, tqc = (yaml.safe_load(find_config(algo).read_text(encoding="utf-8")) for algo in ("sac", "tqc"))
-    assert set(tqc) >= set(DISTURBANCES)
-    assert all(tqc[name] == sac[name] for name in DISTURBANCES)
+def test_all_algorithms_have_the_same_budget():
+    configs = [yaml.safe_load(find_config(algo).read_text(encoding="utf-8")) for algo in stabilisation._ALGORITHMS]
+    for env_id in DISTURBANCES:
+        budgets = [
+            {name: config[env_id][name] for name in ("n_timesteps", "n_envs", "gradient_steps", "learning_starts")}
+            for config in configs
+        ]
+        assert budgets.count(budgets[0]) == 4
+        assert all("net_arch=[64, 64]" in config[env_id]["policy_kwargs"] for config in configs)
 
 
 @pytest.mark.parametrize("command", [["--algos", "ppo"], ["--envs", "Pendulum-v1"], ["--timesteps", "0"], ["--episodes", "0"]])
