@@ -37,7 +37,18 @@ from torch.nn import functional as F
 from battery_env.evaluation import over_seeds
 from battery_env.plotting import COLOURS, new_figure
 from benchmarks.references import DISTURBANCES, tried
-from benchmarks.study import EVALUATION_SEED, Study, Tables, command_line, digits, markdown, natural, positive, with_interval
+from benchmarks.study import (
+    EVALUATION_SEED,
+    Study,
+    Tables,
+    command_line,
+    digits,
+    markdown,
+    natural,
+    positive,
+    share_with_range,
+    with_interval,
+)
 from benchmarks.training import Recipe, set_up
 from sb3_lac import LAC, evaluate_lyapunov
 from sb3_lac.policies import largest_value
@@ -237,10 +248,10 @@ def report(results: pd.DataFrame) -> str:
                 "design": DESIGNS[str(design)].label,
                 "seeds": str(len(undisturbed)),
                 "cost per step": with_interval(undisturbed["cost"]),
-                "at the goal": f"{undisturbed['at_goal'].mean():.0%}",
-                "die": _share(undisturbed["died"]),
-                "die, impulses": _share(by_disturbance["impulses"]["died"]),
-                "die, other parameters": _share(by_disturbance["other parameters"]["died"]),
+                "at the goal": share_with_range(undisturbed["at_goal"]),
+                "die": share_with_range(undisturbed["died"]),
+                "die, impulses": share_with_range(by_disturbance["impulses"]["died"]),
+                "die, other parameters": share_with_range(by_disturbance["other parameters"]["died"]),
                 "largest feasible alpha3, median": digits(undisturbed["largest_feasible_alpha3"].median()),
                 "at least 0.1": f"{(undisturbed['largest_feasible_alpha3_low'] >= _ALPHA3).sum()} of {len(undisturbed)}",
                 "holds with a residual": f"{undisturbed['holds'].sum()} of {len(undisturbed)}",
@@ -249,14 +260,9 @@ def report(results: pd.DataFrame) -> str:
     return markdown(rows)
 
 
-def _share(died: pd.Series) -> str:
-    percent = 100 * died
-    return f"{percent.mean():.0f} %" + (f" ({percent.min():.0f} to {percent.max():.0f})" if percent.max() > 0 else "")
-
-
 def plot(results: pd.DataFrame) -> Figure:
     """
-    The cost of each design over that of LAC, one panel per environment: each seed, and the interquartile mean with its 95 %
+    The cost of each design, one panel per environment: each seed, and the interquartile mean with its 95 %
     interval.
 
     :param results: of all parts

@@ -29,7 +29,7 @@ from battery_env.evaluation import over_seeds
 from battery_env.plotting import COLOURS, new_figure
 from benchmarks.certificate import judge
 from benchmarks.references import DISTURBANCES, SHARES, conditions, draw_shares, tried
-from benchmarks.study import Study, Tables, command_line, digits, markdown, natural, positive, with_interval
+from benchmarks.study import Study, Tables, command_line, digits, markdown, natural, positive, share_with_range, with_interval
 from benchmarks.training import Recipe, train_or_load
 from sb3_lac.envs import reference_controller
 
@@ -98,12 +98,6 @@ def _in_order(names: pd.Series) -> pd.Series:
     return names.map(order.index)
 
 
-def _share(values: pd.Series) -> str:
-    percent = 100 * values
-    spread = f" ({percent.min():.0f} to {percent.max():.0f})" if len(values) > 1 else ""
-    return f"{percent.mean():.0f} %{spread}"
-
-
 def undisturbed_table(results: pd.DataFrame) -> pd.DataFrame:
     """
     What policies cost and where they end, without disturbances.
@@ -122,8 +116,8 @@ def undisturbed_table(results: pd.DataFrame) -> pd.DataFrame:
                 "updates": "" if policy == _REFERENCE else f"{group['updates'].max():.0f}",
                 "cost per step": with_interval(group["cost"]),
                 "error at the end, median": with_interval(group["error_median"]),
-                **{title: _share(group[column]) for column, title in SHARES.items()},
-                "died": _share(group["died"]),
+                **{title: share_with_range(group[column]) for column, title in SHARES.items()},
+                "died": share_with_range(group["died"]),
             }
         )
     return pd.DataFrame(rows)

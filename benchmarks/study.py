@@ -154,6 +154,18 @@ def with_interval(values: pd.Series) -> str:
     return middle if len(values) == 1 else f"{middle} [{low}, {high}]"
 
 
+def share_with_range(values: pd.Series) -> str:
+    """
+    Mean over seeds of a share, with the least and the most of a seed.
+
+    :param values: one per seed, within 0 .. 1
+    :return: for readers, in per cent; the value alone of a single seed
+    """
+    percent = 100 * values
+    spread = f" ({percent.min():.0f} to {percent.max():.0f})" if len(values) > 1 else ""
+    return f"{percent.mean():.0f} %{spread}"
+
+
 def side_by_side(values: Iterable[float]) -> str:
     """
     Each of a few numbers.
