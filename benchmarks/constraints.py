@@ -308,7 +308,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for seed in chosen.seeds:
         for env_id in chosen.envs:
             for design in chosen.designs:
-                recipe = recipe_of(design, env_id, seed, chosen.timesteps)
+                try:
+                    recipe = recipe_of(design, env_id, seed, chosen.timesteps)
+                except ValueError as error:
+                    parser.error(str(error))
                 of_recipe = {"timesteps": recipe.timesteps, "settings": recipe.hyperparameters}
                 parts.append({"design": design, "env_id": env_id, "seed": seed, **of_recipe, "episodes": chosen.episodes})
     results = study.run(part, parts)["constraints"]

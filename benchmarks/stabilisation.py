@@ -269,7 +269,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
             for algo in chosen.algos:
                 timesteps = Recipe.of(algo, env_id, seed).timesteps
                 timesteps = min(timesteps, chosen.timesteps or timesteps)
-                recipe = Recipe.of(algo, env_id, seed, timesteps).digest
+                try:
+                    recipe = Recipe.of(algo, env_id, seed, timesteps).digest
+                except ValueError as error:
+                    parser.error(str(error))
                 parts.append(
                     {"policy": algo, "env_id": env_id, "seed": seed, "timesteps": timesteps, "recipe": recipe, **judged}
                 )

@@ -122,7 +122,9 @@ def test_designs_are_judged_alike(tmp_path, capsys):
     assert (tmp_path / "constraints.png").stat().st_size > 1000
 
 
-@pytest.mark.parametrize("command", [["--designs", "sac"], ["--envs", "Pendulum-v1"], ["--timesteps", "0"]])
+@pytest.mark.parametrize(
+    "command", [["--designs", "sac"], ["--envs", "Pendulum-v1"], ["--timesteps", "0"], ["--timesteps", "900"]]
+)
 def test_nonsense_on_the_command_line_is_refused(command):
     with pytest.raises(SystemExit):
         constraints.main(command)

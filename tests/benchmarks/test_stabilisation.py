@@ -82,7 +82,10 @@ def test_all_algorithms_have_the_same_budget():
         assert all("net_arch=[64, 64]" in config[env_id]["policy_kwargs"] for config in configs)
 
 
-@pytest.mark.parametrize("command", [["--algos", "ppo"], ["--envs", "Pendulum-v1"], ["--timesteps", "0"], ["--episodes", "0"]])
+@pytest.mark.parametrize(
+    "command",
+    [["--algos", "ppo"], ["--envs", "Pendulum-v1"], ["--timesteps", "0"], ["--timesteps", "900"], ["--episodes", "0"]],
+)
 def test_nonsense_on_the_command_line_is_refused(command, quick):
     with pytest.raises(SystemExit):
         stabilisation.main(command)
