@@ -1,5 +1,6 @@
 """
-What each choice of the q^max task is worth: LAC with the settings of ``zoo_configs``, and with one thing changed at a time.
+What each choice of the q^max task is worth: LAC with the hyperparameters of ``zoo_configs`` on the task as it is registered, and
+with one thing changed at a time, the starts and lengths of episodes of ``zoo_configs`` among them.
 
 .. code-block:: bash
 
@@ -35,7 +36,8 @@ class Variant(NamedTuple):
     One thing that is changed.
 
     :param label: what, for the table
-    :param hyperparameters: in place of those of ``zoo_configs``, arguments of the environment (``env_kwargs``) among them
+    :param hyperparameters: in place of those of ``zoo_configs``, arguments of the environment (``env_kwargs``, none by default)
+        among them
     :param hidden: columns of the observation that the agent does not see
     """
 
@@ -59,8 +61,8 @@ VARIANTS: dict[str, Variant] = {
     "short": Variant("episodes of 16 steps, the paper's", {"env_kwargs": {"episode_steps": 16}}),
     "long": Variant("episodes of 256 steps", {"env_kwargs": {"episode_steps": 256}}),
     "starts": Variant(
-        "starts and lengths as with both parameters",
-        {"env_kwargs": {"continue_probability": 0.5, "first_sample_probability": 0.2}},
+        "starts and lengths of zoo_configs",
+        {"env_kwargs": {"continue_probability": 0.5, "first_sample_probability": 0.3}},
     ),
     "perturbed": Variant("starts up to 2 error scales off", {"env_kwargs": {"initial_perturbation": 2.0}}),
     "resync": Variant("model set to the measured state every 16 steps", {"env_kwargs": {"resync": 16}}),
@@ -125,7 +127,7 @@ def part(name: str, seed: int, updates: int, models: Path) -> Tables:
     :return: ``ablations``, one row: what came out
     """
     variant = VARIANTS[name]
-    hyperparameters = dict(variant.hyperparameters)
+    hyperparameters = {"env_kwargs": {}, **variant.hyperparameters}
     if variant.hidden:
         hyperparameters["env_wrapper"] = [{"benchmarks.ablations.HideColumns": {"hidden": list(variant.hidden)}}]
     timesteps = timesteps_of(updates, Recipe.of("lac", _ENV_ID, seed).hyperparameters)
@@ -133,7 +135,7 @@ def part(name: str, seed: int, updates: int, models: Path) -> Tables:
     test = standard_dataset("q_mobile", "paper", "test")
     test = test.subset(range(0, len(test), len(test) // _DISCHARGES))
     # of the arguments of the environment the only one that the observation depends on
-    consistency = hyperparameters.get("env_kwargs", {}).get("consistency", 0.0)
+    consistency = hyperparameters["env_kwargs"].get("consistency", 0.0)
     scores = evaluate(PolicyEstimator(_Blinkered(model, variant.hidden), _ENV_ID, consistency=consistency), test)
     errors = scores["q_mobile_mape_percent"]
     row = {

@@ -130,7 +130,8 @@ def train_policy(algo: str, parameter: Parameter, division: str, seed: int, upda
     changed = None
     if (parameter, division) in _TASKS:
         task = _TASKS[parameter, division]
-        changed = {"env_kwargs": {"task": f"benchmarks.generalization:{task.__name__}"}}
+        tuned = recipe.hyperparameters.get("env_kwargs", {})
+        changed = {"env_kwargs": {**tuned, "task": f"benchmarks.generalization:{task.__name__}"}}
     return train_or_load(algo, env_id, seed, timesteps, models / f"{env_id}_{division}", changed)
 
 

@@ -204,7 +204,7 @@ class FullStateTask(CalibrationTask):
             first, stop = self._starts[n]
             t = int(generator.integers(first, stop))
             if self.first_sample_probability > 0.0 and generator.random() < self.first_sample_probability:
-                t = first
+                t = 0  # of the whole discharge, before what the data leave out
             if "sample" in chosen:
                 t = int(chosen["sample"])
                 if not first <= t < stop:

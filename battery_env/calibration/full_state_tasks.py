@@ -64,7 +64,7 @@ class BatteryQmax(FullStateTask):
     |----------|---------|---------|
     | ``episode_steps`` | 64 | decisions per episode |
     | ``continue_probability`` | 0 | probability that an episode goes on for another ``episode_steps``, and after these again; drawn at its start. Takes the model where the policy's own errors do in a whole discharge; goes with neither noise |
-    | ``first_sample_probability`` | 0 | probability that an episode starts at the first sample of its discharge in place of a random one |
+    | ``first_sample_probability`` | 0 | probability that an episode starts at the first sample of the whole discharge, at rest, in place of a random one. The data have little of the seconds after it: they leave out the first 5 % of each discharge |
     | ``start`` | ``"true"`` | the model's first state: the cell's; or ``"new_cell"``: that of a cell that was full when the discharge began, is new in what is to be found, and has carried the same load since. No action makes up for the charge that it has too much |
     | ``initial_perturbation`` | 0 | the first state is off by a uniform draw within this many error scales to either side, in Vo, Vsn, Vsp and in charge that has moved between the electrodes |
     | ``resync`` | none | the model is set to the measured state after every so many decisions |

@@ -7,6 +7,7 @@ import pytest
 
 from battery_env.calibration.data import standard_dataset
 from benchmarks import ablations
+from benchmarks.training import Recipe
 
 
 @pytest.fixture
@@ -43,10 +44,21 @@ def test_a_policy_sees_in_its_test_what_it_saw_in_its_training(trained, tmp_path
     np.testing.assert_allclose([row["mean_percent"], row["worst_percent"]], [expected.mean(), expected.max()], rtol=1e-6)
     assert row["spread_percent"] == pytest.approx(0.0, abs=1e-9)
     wrappers = call.get("env_wrapper", [])
-    env = gym.make("BatteryQmax-v0", **call.get("env_kwargs", {}))
+    env = gym.make("BatteryQmax-v0", **call["env_kwargs"])
     for wrapper in wrappers:
         env = ablations.HideColumns(env, **wrapper["benchmarks.ablations.HideColumns"])
     assert env.observation_space.shape == (seen,) == env.reset(seed=0)[0].shape
+
+
+def test_starts_and_lengths_of_episodes_are_one_of_the_choices(trained, tmp_path, monkeypatch):
+    test = standard_dataset("q_mobile", "paper", "test").subset([0, 900])
+    monkeypatch.setattr(ablations, "standard_dataset", lambda *which: test)
+    monkeypatch.setattr(ablations, "_DISCHARGES", 2)
+    tuned = Recipe.of("lac", "BatteryQmax-v0", 0).hyperparameters["env_kwargs"]
+    assert tuned
+    for name, expected in (("published", {}), ("gamma", {}), ("starts", tuned)):
+        ablations.part(name, 0, 10, tmp_path)
+        assert trained[-1]["env_kwargs"] == expected
 
 
 def test_hidden_columns_are_the_innovations():

@@ -11,6 +11,7 @@ from battery_env.calibration.env import CalibrationEnv
 from battery_env.trajectories import TrajectoryDataset
 from benchmarks import direct_mapping, generalization
 from benchmarks.generalization import DirectMapping, draw_pairs
+from benchmarks.training import Recipe
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -106,7 +107,8 @@ def test_the_study_compares_all_on_each_division(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(generalization, "TEST_DISCHARGES", 4)
     command = ["--pairs", "64", "--epochs", "1", "--seeds", "0", "1", "--mappings", "raw", "--updates", "10"]
     direct_mapping.main([*command, "--out", str(tmp_path)])
-    task = {"env_kwargs": {"task": "benchmarks.generalization:QmaxByParameter"}}
+    tuned = Recipe.of("lac", "BatteryQmax-v0", 0).hyperparameters["env_kwargs"]
+    task = {"env_kwargs": {**tuned, "task": "benchmarks.generalization:QmaxByParameter"}}
     assert asked[:2] == [("lac", "BatteryQmax-v0", 0, 1600, None), ("lac", "BatteryQmax-v0", 0, 1600, task)]
     results = pd.read_csv(tmp_path / "direct_mapping.csv")
     policy = results[(results["method"] == "LAC") & (results["parameter"] == "q_mobile")]
