@@ -29,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     argparse.ArgumentParser(
         prog="python -m benchmarks.demo", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     ).parse_args(arguments)
-    print("1/2  LAC, SAC and TD3 calibrate simulated cells (2400 updates each; the full runs take 6000)\n", flush=True)
+    print("1/2  LAC, SAC and TD3 calibrate simulated cells (2400 updates each; the full runs take 12 000)\n", flush=True)
     envs = ["--envs", "BatteryRo-v0", "BatteryQmax-v0"]
     compare.main([*envs, "--timesteps", str(TIMESTEPS), "--evaluations", "6", "--out", str(RESULTS / "demo_compare")])
     print("\n2/2  q^max and R_o of NASA's cell B0005, from its recorded discharges\n", flush=True)
