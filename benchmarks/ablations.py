@@ -1,6 +1,6 @@
 """
-What each choice of the q^max task is worth: LAC with the hyperparameters of ``zoo_configs`` on the task as it is registered, and
-with one thing changed at a time, the starts and lengths of episodes of ``zoo_configs`` among them.
+What each choice of the q^max task is worth: LAC with the hyperparameters of ``zoo_configs`` on the task as it is registered,
+and with one thing changed at a time, the starts and lengths of episodes of ``zoo_configs`` among them.
 
 .. code-block:: bash
 
@@ -36,8 +36,8 @@ class Variant(NamedTuple):
     One thing that is changed.
 
     :param label: what, for the table
-    :param hyperparameters: in place of those of ``zoo_configs``, arguments of the environment (``env_kwargs``, none by default)
-        among them
+    :param hyperparameters: in place of those of ``zoo_configs``, arguments of the environment (``env_kwargs``; none by
+        default) among them
     :param hidden: columns of the observation that the agent does not see
     """
 
