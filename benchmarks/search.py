@@ -8,9 +8,10 @@ updates and varied settings for each algorithm, starting from the entry in ``zoo
   python -m benchmarks.search --env PendulumCost-v0 --trials 6 --updates 4000 --finalists 2 --repeats 1 --exchange
 
 A trial trains with the entry of ``zoo_configs``, changed where the search varies it, and is scored by its mean action. On a
-full-state task that is its mean error on whole discharges of the training part, the model running free; the test part is not
-touched. On a cost environment it is the cost per step, from other starts than those of the studies. One seed says little: the
-best trials, three by default, are trained again, twice by default, with other seeds, and ranked by the mean of their scores.
+full-state task that is its mean error on whole discharges of the training part, the model running free, and over both
+parameters where there are two; the test part is not touched. On a cost environment it is the cost per step, from other starts
+than those of the studies. One seed says little: the best trials, three by default, are trained again, twice by default, with
+other seeds, and ranked by the mean of their scores.
 With ``--exchange`` each algorithm also tries what the others found: its own best trial with the settings that it shares with
 the best of another one, as often. A few trials find a good learning rate or not, and that is no merit of an algorithm.
 Trials lie in a journal of Optuna: after an interruption the same command goes on (with other trials than an uninterrupted
@@ -20,7 +21,7 @@ search would try).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -62,6 +63,7 @@ class Family:
     :param varied: which of them, by algorithm, five for each
     :param learning_rate: how a learning rate is written
     :param first_trials: the settings of the first trials, chosen by hand
+    :param of_easier: what an easier task needed, by algorithm, tried before these
     """
 
     unit: str
@@ -71,13 +73,15 @@ class Family:
     varied: dict[str, list[str]]
     learning_rate: str
     first_trials: list[dict[str, float]]
+    of_easier: dict[str, dict[str, float]] = field(default_factory=dict)
 
 
 def _errors(model: BaseAlgorithm, env_id: str) -> pd.Series:
     task = PolicyEstimator.environment(env_id).task
     assert isinstance(task, FullStateTask)
     discharges = task.dataset.subset(range(0, len(task.dataset), len(task.dataset) // _DISCHARGES))
-    return evaluate(PolicyEstimator(model, env_id), discharges)[f"{task.parameters[0]}_mape_percent"]
+    errors = evaluate(PolicyEstimator(model, env_id), discharges)
+    return errors[[f"{name}_mape_percent" for name in task.parameters]].mean(axis=1)
 
 
 def _costs(model: BaseAlgorithm, env_id: str) -> pd.Series:
@@ -110,6 +114,16 @@ _FULL_STATE = Family(
             "target_policy_noise": 0.05,
         },
     ],
+)
+# As much entropy for each of two parameters; what q^max needed, LAC with the rate that it has had since.
+_BOTH = replace(
+    _FULL_STATE,
+    ranges=_FULL_STATE.ranges | {"target_entropy": [-4.0, -6.0, -8.0, -12.0]},
+    of_easier={
+        "lac": {"learning_rate": 1e-3, "gamma": 0.6, "tau": 0.01, "ent_coef": 0.043, "target_entropy": -8.0},
+        "sac": {"learning_rate": 2.8e-3, "gamma": 0.9, "tau": 0.005, "ent_coef": 0.0054, "target_entropy": -6.0},
+        "td3": {"learning_rate": 1.9e-3, "gamma": 0.6, "tau": 0.01, "noise_std": 0.26, "target_policy_noise": 0.19},
+    },
 )
 _COST = Family(
     "cost",
@@ -155,7 +169,12 @@ _COST = Family(
     ],
 )
 #: By environment.
-FAMILIES = {"BatteryQmax-v0": _FULL_STATE, "BatteryRo-v0": _FULL_STATE, **dict.fromkeys(DISTURBANCES, _COST)}
+FAMILIES = {
+    "BatteryQmax-v0": _FULL_STATE,
+    "BatteryRo-v0": _FULL_STATE,
+    "BatteryJoint-v0": _BOTH,
+    **dict.fromkeys(DISTURBANCES, _COST),
+}
 
 
 def sampled(algo: str, env_id: str, trial: Trial) -> dict[str, Any]:
@@ -242,7 +261,8 @@ def part(
     # another seed after an interruption, or the first draws would come again
     study.sampler = optuna.samplers.TPESampler(n_startup_trials=trials // 2, multivariate=True, seed=len(study.trials))
     if not study.trials:
-        for first_trial in FAMILIES[env_id].first_trials:
+        family = FAMILIES[env_id]
+        for first_trial in [*filter(None, [family.of_easier.get(algo)]), *family.first_trials]:
             study.enqueue_trial(first_trial)
     objective = partial(score, algo, env_id, updates, out / "zoo")
     study.optimize(objective, n_trials=max(trials - len(_own_trials(study)), 0))

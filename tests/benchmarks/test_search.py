@@ -6,8 +6,12 @@ import numpy as np
 import optuna
 import pandas as pd
 import pytest
+from stable_baselines3 import SAC
 
+from battery_env.calibration.policy import PolicyEstimator
+from battery_env.evaluation import evaluate
 from benchmarks import search
+from benchmarks.training import Recipe
 
 
 @pytest.fixture
@@ -66,6 +70,29 @@ def test_the_best_three_are_ranked_by_three_seeds(trials, tmp_path):
     # the same settings again, with the numbers of later trials as seeds
     assert sorted(tried[6:]) == sorted(np.repeat([f"lin_{rate:.2g}" for rate in best["learning_rate"]], 2))
     assert set(best["worst_percent"]) == {14.0, 16.0, 18.0} and (trial.drop(best.index)["worst_percent"] < 13.0).all()
+
+
+def test_with_both_parameters_a_search_begins_with_what_one_needed(trials, tmp_path):
+    command = ["--env", "BatteryJoint-v0", "--trials", "2", "--finalists", "1", "--repeats", "1"]
+    search.main([*command, "--jobs", "1", "--out", str(tmp_path)])
+    begun = dict(reversed(trials))
+    assert set(begun) == {"lac", "sac", "td3"}
+    for algo, settings in begun.items():
+        of_one = Recipe.of(algo, "BatteryQmax-v0", 0).hyperparameters
+        rates = [float(each["learning_rate"].removeprefix("lin_")) for each in (settings, of_one)]
+        assert rates[0] == rates[1]
+        for name in set(settings) - {"learning_rate"}:
+            assert settings[name] == (2.0 * of_one[name] if name == "target_entropy" else of_one[name])
+
+
+def test_with_both_parameters_both_errors_count():
+    env_id = "BatteryJoint-v0"
+    model = SAC("MlpPolicy", env_id, policy_kwargs={"net_arch": [8]})
+    data = PolicyEstimator.environment(env_id).task.dataset
+    discharges = data.subset(range(0, len(data), len(data) // 64))
+    errors = evaluate(PolicyEstimator(model, env_id), discharges)
+    mean = (errors["q_mobile_mape_percent"] + errors["r_o_mape_percent"]) / 2.0
+    np.testing.assert_allclose(search.FAMILIES[env_id].scores(model, env_id), mean)
 
 
 @pytest.mark.parametrize("algo, env_id", [("td3", "BatteryRo-v0"), ("lac", "LinearCost-v0"), ("tqc", "VehicleCost-v0")])
