@@ -22,7 +22,7 @@ from torch.nn import functional as F
 
 from sb3_lac.buffers import HorizonReplayBuffer, HorizonReplayBufferSamples
 from sb3_lac.compiled import CompiledUpdate, Metrics, check_compiler, set_gradient, set_gradients, step
-from sb3_lac.discounts import stated_discount, sum_of_discounts, weight_of_return
+from sb3_lac.discounts import DEFAULT_DISCOUNT, stated_discount, sum_of_discounts, weight_of_return
 from sb3_lac.env_ids import check_env_id
 from sb3_lac.policies import CnnPolicy, LyapunovCritic, LyapunovPolicy, MlpPolicy, MultiInputPolicy, largest_value
 
@@ -369,11 +369,16 @@ class LAC(OffPolicyAlgorithm):
         """Ask the environment for its discount factor, if it is to state it."""
         gamma: Any = self.gamma
         if gamma == "auto":
+            if self.env is None:
+                raise ValueError(
+                    "gamma='auto' is the discount that the environment states, and there is none: load with env=..., or set "
+                    f"gamma, for instance gamma={DEFAULT_DISCOUNT}."
+                )
             metadata: list[Any] = []
-            # There may be no environment, and a vector environment of somebody else may have no attributes
+            # A vector environment of somebody else may have no attributes
             with suppress(AttributeError, NotImplementedError):
                 try:
-                    metadata = self.env.get_attr("metadata")  # type: ignore[union-attr]
+                    metadata = self.env.get_attr("metadata")
                 except (EOFError, ConnectionError) as error:
                     raise ValueError(
                         "The environments' metadata cannot be sent between processes, which have ended by that: set gamma, "

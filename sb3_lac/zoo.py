@@ -269,6 +269,13 @@ class LACExperimentManager(ExperimentManager):
                 )
         return processed
 
+    def _preprocess_normalization(self, hyperparams: dict[str, Any]) -> dict[str, Any]:
+        hyperparams = super()._preprocess_normalization(hyperparams)
+        # The environment knows the discount and VecNormalize cannot ask it: it takes its default, as where no gamma is given
+        if self.normalize_kwargs.get("gamma") == "auto":
+            del self.normalize_kwargs["gamma"]
+        return hyperparams
+
     @staticmethod
     def _preprocess_schedules(hyperparams: dict[str, Any]) -> dict[str, Any]:
         hyperparams = ExperimentManager._preprocess_schedules(hyperparams)

@@ -53,6 +53,8 @@ def test_model_keeps_the_discount_that_it_learned_with(make_model, make_env, sta
     assert LAC.load(tmp_path / "model").gamma == 0.5
     assert LAC.load(tmp_path / "model", env=make_env()).gamma == 0.5
     assert LAC.load(tmp_path / "model", env=make_env(), gamma="auto").gamma == DEFAULT_DISCOUNT
+    with pytest.raises(ValueError, match=r"gamma='auto' is the discount that the environment states, and there is none"):
+        LAC.load(tmp_path / "model", gamma="auto")
 
 
 @pytest.mark.parametrize("discount", ["high", 1.1, -0.1, float("nan"), [0.5], None])

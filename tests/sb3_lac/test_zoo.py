@@ -217,6 +217,15 @@ def test_trials_on_batteries_are_scored_on_held_out_discharges(workdir):
     assert not manager_of(ENV, workdir, optimize_hyperparameters=True).eval_env_kwargs
 
 
+@pytest.mark.parametrize(("gamma", "of_normalization"), [("auto", 0.99), (0.5, 0.5)])
+def test_discount_of_normalized_rewards(gamma, of_normalization, workdir):
+    config = {"default": {**CONFIG["default"], "gamma": gamma}}
+    (workdir / "zoo_configs" / "lac.yml").write_text(yaml.dump(config))
+    model, _ = manager_of(ENV, workdir).setup_experiment()
+    assert model.get_vec_normalize_env().gamma == of_normalization
+    model.learn(10)
+
+
 @pytest.mark.parametrize("command", ["train", "optimize"])
 def test_a_training_without_an_update_is_refused_before_anything_is_written(command, workdir):
     with pytest.raises(ValueError, match="n_timesteps=40 must be more than learning_starts=40"):
