@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -30,8 +30,10 @@ from battery_env.parameters import PARAMETER_NAMES, PARAMETERS, Q_MOBILE, R_O
 from battery_env.record_model import VoltageForecast
 from battery_env.records import Record
 
-#: Colours that colour-blind readers can tell apart (Okabe & Ito).
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+Thing = TypeVar("Thing")
+
+#: Colours that colour-blind readers can tell apart (the first six of Okabe & Ito, the others of Tol).
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#882255", "#777777", "#999933", "#332288")
 #: Of the axes of parameters.
 LABELS = {name: parameter.label for name, parameter in PARAMETERS.items()}
 
@@ -107,6 +109,16 @@ def plot_true_against_inferred(scores: Mapping[str, pd.DataFrame], parameter: st
     return figure
 
 
+def coloured(things: Iterable[Thing]) -> Iterator[tuple[str, Thing]]:
+    """
+    Things to draw side by side.
+
+    :param things: any number of them; from the eleventh on colours come again
+    :return: each after its colour
+    """
+    return zip(itertools.cycle(COLOURS), things, strict=False)
+
+
 def draw_over_seeds(axes: Axes, x: ArrayLike, scores: ArrayLike, colour: str, label: str, **style: Any) -> None:
     """
     Draw the interquartile mean over seeds, with a band of its 95 % interval where there are several
@@ -141,7 +153,7 @@ def plot_learning_curves(
     figure = new_figure(7.2, 3.4)
     panels = {metric: "mean", f"{metric}_worst": "worst"}
     for axes, (column, panel) in zip(figure.subplots(1, 2, sharex=True), panels.items(), strict=True):
-        for colour, (name, tables) in zip(COLOURS, curves.items(), strict=False):
+        for colour, (name, tables) in coloured(curves.items()):
             seeds = pd.concat([table.set_index("timesteps")[column] for table in tables], axis=1).T
             draw_over_seeds(axes, seeds.columns / 1e3, seeds, colour, name)
         all_positive = all((table[column] > 0).all() for tables in curves.values() for table in tables)
@@ -167,7 +179,7 @@ def plot_discharge(record: Record, forecasts: Mapping[str, VoltageForecast], tit
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[3, 2])
     upper.plot(*_drawn_points(record.time_s, record.voltage_V), "o", ms=2.2, color="0.6", label="measured")
     lower.axhline(0.0, color="0.6", lw=0.8)
-    for colour, (name, forecast) in zip(COLOURS, forecasts.items(), strict=False):
+    for colour, (name, forecast) in coloured(forecasts.items()):
         upper.plot(*_drawn_points(forecast.time_s, forecast.voltage_V), color=colour, lw=1.4, label=name)
         error_mV = 1e3 * (forecast.at_samples_V - record.voltage_V)
         lower.plot(*_drawn_points(record.time_s, error_mV), color=colour, lw=1.0, label=name)
@@ -243,7 +255,7 @@ def plot_life(table: pd.DataFrame) -> Figure:
     panels = figure.subplots(3, 1, sharex=True)
     one_each = not table["cell"].duplicated().any()
     cells = [("", table)] if one_each else list(table.groupby("cell", sort=False))
-    for colour, (name, rows) in zip(itertools.cycle(COLOURS), cells, strict=False):
+    for colour, (name, rows) in coloured(cells):
         counted = one_each or rows["cycle"].isna().any() or rows["cycle"].duplicated().any()
         cycle = np.arange(1.0, len(rows) + 1.0) if counted else rows["cycle"].to_numpy(dtype=np.float64)
         settled = rows["settled"].to_numpy(dtype=np.bool_)
@@ -304,7 +316,7 @@ def plot_estimates(
             axes.axhline(getattr(true, parameter), color="0.25", lw=1.0, label="true")
             if bound is not None:
                 _band(axes, bound.time_s, shown[-1], getattr(bound, f"sd_{parameter}"), "0.5", "Cramér-Rao bound, ± 2 sd")
-        for colour, (name, trace) in zip(COLOURS, traces.items(), strict=False):
+        for colour, (name, trace) in coloured(traces.items()):
             _trace_line(axes, trace, parameter, colour, name)
         axes.set(ylabel=LABELS[parameter], ylim=_limits(shown))
         axes.ticklabel_format(useOffset=False)
@@ -358,7 +370,7 @@ def plot_errors(scores: Mapping[str, pd.DataFrame], parameter: str, load_unit: L
     panels = figure.subplots(1, 2, sharey=True)
     columns = {"load": f"mean load ({LOAD_UNIT_SYMBOLS[load_unit]})", parameter: f"true {LABELS[parameter]}"}
     for axes, (column, label) in zip(panels, columns.items(), strict=True):
-        for colour, (name, table) in zip(COLOURS, scores.items(), strict=False):
+        for colour, (name, table) in coloured(scores.items()):
             mape = table[f"{parameter}_mape_percent"]
             axes.scatter(table[column], mape, s=5, color=colour, alpha=0.35, lw=0, rasterized=True)
             bins = pd.cut(table[column], _BINS) if table[column].nunique() > _BINS else table[column]
@@ -379,7 +391,7 @@ def plot_sensitivities(slopes: Mapping[str, Sensitivities]) -> Figure:
     """
     figure = new_figure(6.4, 4.6)
     upper, lower = figure.subplots(2, 1, sharex=True)
-    for colour, (name, slope) in zip(COLOURS, slopes.items(), strict=False):
+    for colour, (name, slope) in coloured(slopes.items()):
         upper.plot(slope.time_s, 1e6 * slope.by_q_mobile_V_per_C, color=colour, lw=1.3, label=name)
         lower.plot(slope.time_s, slope.by_r_o_A, color=colour, lw=1.3, label=name)
     upper.set_yscale("symlog", linthresh=1e6 * _LINEAR_SLOPE_V_PER_C, linscale=0.5)

@@ -29,6 +29,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import itertools
 import json
 import shutil
 import sys
@@ -221,8 +222,6 @@ def _checked(recipe: Recipe, out: Path) -> Recipe:
     """Refuse what could not be trained or scored, before anything is."""
     if recipe.algo == "ppo_lstm":
         raise ValueError("ppo_lstm: policies with a memory cannot be scored here")
-    if recipe.hyperparameters.get("normalize"):
-        raise ValueError(f"{recipe.algo} on {recipe.env_id}: policies with `normalize` cannot be scored here")
     contest_of(recipe.env_id)
     if not (_folder(recipe, out) / "summary.json").exists():
         try:
@@ -260,9 +259,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         finished_runs(study.out)
         recipes = [
-            [Recipe.of(algo, env_id, seed, **given) for algo in dict.fromkeys(chosen.algos)]
-            for env_id in dict.fromkeys(chosen.envs)
-            for seed in dict.fromkeys(chosen.seeds)
+            [Recipe.of(algo, env_id, seed, **given) for algo in chosen.algos]
+            for env_id, seed in itertools.product(chosen.envs, chosen.seeds)
         ]
         for recipe in {recipe.digest: recipe for of_seed in recipes for recipe in of_seed}.values():
             _checked(recipe, study.out)

@@ -35,7 +35,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from battery_env.evaluation import over_seeds
-from battery_env.plotting import COLOURS, new_figure
+from battery_env.plotting import coloured, new_figure
 from benchmarks.references import DISTURBANCES, tried
 from benchmarks.study import (
     EVALUATION_SEED,
@@ -273,7 +273,7 @@ def plot(results: pd.DataFrame) -> Figure:
     figure = new_figure(2.6 + 2.0 * len(envs), 0.9 + 0.36 * len(designs))
     panels = figure.subplots(1, len(envs), sharey=True, squeeze=False)[0]
     for axes, env_id in zip(panels, envs, strict=True):
-        for height, (design, colour) in enumerate(zip(designs, COLOURS, strict=False)):
+        for height, (colour, design) in enumerate(coloured(designs)):
             costs = undisturbed.loc[(undisturbed["environment"] == env_id) & (undisturbed["design"] == design), "cost"]
             if costs.empty:
                 continue

@@ -23,8 +23,8 @@ from battery_env.calibration.policy import PolicyEstimator
 from battery_env.estimators import ClosedForm, Estimator, ExtendedKalmanFilter, LeastSquares
 from battery_env.evaluation import evaluate, summarize
 from battery_env.plotting import (
-    COLOURS,
     LABELS,
+    coloured,
     draw_over_seeds,
     new_figure,
     plot_learning_curves,
@@ -421,7 +421,7 @@ def plot_ranks(scores: pd.DataFrame, parameters: Sequence[str]) -> Figure:
         for axes, name in zip(row, parameters, strict=True):
             of_sensor, column = scores[scores["sensor"] == sensor], f"{name}_second_half_mape_percent"
             limits = np.geomspace(of_sensor[column].min(), of_sensor[column].max(), 200)
-            for colour, (calibrator, group) in zip(COLOURS, of_sensor.groupby("calibrator", sort=False), strict=False):
+            for colour, (calibrator, group) in coloured(of_sensor.groupby("calibrator", sort=False)):
                 seeds = [errors.to_numpy() for _, errors in group.groupby("seed", dropna=False)[column]]
                 shares = [100.0 * np.mean(errors[:, None] <= limits, axis=0) for errors in seeds]
                 draw_over_seeds(axes, limits, shares, colour, str(calibrator))

@@ -21,7 +21,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from battery_env.plotting import COLOURS, LABELS, new_figure
+from battery_env.plotting import LABELS, coloured, new_figure
 from benchmarks.generalization import (
     DIVISIONS,
     ENV_IDS,
@@ -89,7 +89,7 @@ def plot_errors(results: pd.DataFrame) -> Figure:
             values = getattr(divided(parameter, division)[0], parameter)
             axes.axvspan(values.min(), values.max(), color="0.93", zorder=0, label="values trained on")
             of_panel = learned[(learned["parameter"] == parameter) & (learned["division"] == division)]
-            for colour, method in zip(COLOURS, methods, strict=False):
+            for colour, method in coloured(methods):
                 group = of_panel[of_panel["method"] == method]
                 axes.plot(group["true"], group["mape_percent"], "o", ms=2.5, mew=0, alpha=0.5, color=colour, label=method)
             axes.set(yscale="log", title=f"{LABELS[parameter].split(' (')[0]}: {_TESTED[division]}")
@@ -128,13 +128,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     # all of the first seed come first, so that an interrupted study has something of everything
     mappings = [
         {"kind": kind, **place, "seed": seed, "pairs": chosen.pairs, "epochs": chosen.epochs}
-        for seed in dict.fromkeys(chosen.seeds)
+        for seed in chosen.seeds
         for kind in chosen.mappings
         for place in places
     ]
     policies = [
         {"algo": algo, **place, "seed": seed, "updates": chosen.updates}
-        for seed in dict.fromkeys(chosen.policy_seeds)
+        for seed in chosen.policy_seeds
         for algo in chosen.algos
         for place in places
         if f"{place['parameter']}/{place['division']}" in chosen.policies_on

@@ -33,7 +33,7 @@ from battery_env.estimators.least_squares import LeastSquares
 from battery_env.evaluation import evaluate
 from battery_env.loads import RandomPiecewise
 from battery_env.parameters import PARAMETER_NAMES, PARAMETERS
-from battery_env.plotting import COLOURS, LABELS, new_figure
+from battery_env.plotting import LABELS, coloured, new_figure
 from battery_env.sensors import SensorErrors
 from battery_env.trajectories import AgedParameter, TrajectoryDataset
 from benchmarks.contests import held_out_trajectories
@@ -332,7 +332,7 @@ def plot_faults(results: pd.DataFrame) -> Figure:
     shifts = np.linspace(-0.32, 0.32, len(names))
     for axes, parameter in zip(panels, PARAMETERS, strict=True):
         for row, fault in enumerate(FAULTS):
-            for shift, colour, name in zip(shifts, COLOURS, names, strict=False):
+            for shift, (colour, name) in zip(shifts, coloured(names), strict=False):
                 errors = _of(results, name, fault, parameter)["second_half_mape_percent"].to_numpy()
                 visible = np.maximum(errors, _FLOOR_PERCENT)
                 axes.plot(visible, np.full(len(visible), row + shift), "o", ms=3, mew=0, alpha=0.35, color=colour)

@@ -30,7 +30,7 @@ from battery_env.estimators.least_squares import LeastSquares
 from battery_env.forecasts import BAND, FutureLoad, forecast
 from battery_env.life import Life, track_life
 from battery_env.loads import Load, RandomPiecewise, RandomWalk
-from battery_env.plotting import COLOURS, new_figure
+from battery_env.plotting import COLOURS, coloured, new_figure
 from battery_env.record_model import RecordModel
 from battery_env.records import Record, Samples
 from battery_env.sensors import SensorErrors
@@ -248,7 +248,7 @@ def plot(rows: pd.DataFrame, remaining: pd.DataFrame) -> Figure:
     above, below = figure.subplots(2, 2)
     real = rows["data"].isin(BUNDLED_CELLS)
     for axes, title, part in ((above[0], "real cells", rows[real]), (above[1], "simulated cells", rows[~real])):
-        for colour, (method, each) in zip(COLOURS, part.groupby(["calibrator", "load"], sort=False), strict=False):
+        for colour, (method, each) in coloured(part.groupby(["calibrator", "load"], sort=False)):
             for marker, (_, by_data) in zip("os^v", each.groupby("data", sort=False), strict=False):
                 inside = 100.0 * by_data.groupby("share")["covered"].mean()
                 label = method[0] if title == "real cells" else f"load {method[1]}"

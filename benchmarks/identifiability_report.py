@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
 from battery_env.electrochemistry import Trajectory
-from battery_env.plotting import COLOURS, LABELS, new_figure
+from battery_env.plotting import COLOURS, LABELS, coloured, new_figure
 from battery_env.record_model import RecordModel
 from benchmarks.identifiability_tables import (
     DRIFT_C,
@@ -39,7 +39,7 @@ def plot_bounds(records: dict[str, Trajectory]) -> Figure:
     panels = figure.subplots(2, len(unknowns), sharex=True, sharey="row")
     for column, unknown in enumerate(unknowns):
         for axes, name, label in zip(panels[:, column], *zip(*SYMBOLS.items(), strict=True), strict=True):
-            for colour, noise_V in zip(COLOURS, NOISES_V, strict=False):
+            for colour, noise_V in coloured(NOISES_V):
                 least = bound(record, noise_V, f"{label} alone" if unknown == "alone" else unknown)
                 axes.plot(least.time_s, getattr(least, name), color=colour, lw=1.4, label=f"{1e3 * noise_V:.0f} mV")
             axes.axhline(1.0, color="0.5", lw=0.8, ls="--")
@@ -66,7 +66,7 @@ def plot_loads(records: dict[str, Trajectory]) -> Figure:
     """
     figure = new_figure(7.6, 3.3)
     panels = figure.subplots(1, 2, sharex=True)
-    for colour, (load, record) in zip(COLOURS, records.items(), strict=False):
+    for colour, (load, record) in coloured(records.items()):
         for unknown, style, words in (("both", "--", "offset known"), ("both and an offset", "-", "offset unknown")):
             least = bound(record, NOISE_V, unknown)
             for axes, name in zip(panels, NAMES, strict=True):
@@ -127,7 +127,7 @@ def plot_one_step(costs: pd.DataFrame) -> Figure:
     titles = {"si": "in V and C", "scaled": "in error scales of the tasks"}
     starts = {"true": "from the true state", "drifted": f"{1e3 * DRIFT_C:.0f} mC off in $q_{{nS}}$"}
     for axes, (kind, title) in zip(panels, titles.items(), strict=True):
-        for colour, (start, label) in zip(COLOURS, starts.items(), strict=False):
+        for colour, (start, label) in coloured(starts.items()):
             axes.plot(costs["q_mobile_C"], costs[f"cost_{start}_{kind}"], color=colour, lw=1.4, label=label)
         axes.axvline(TRUE.q_mobile, color="0.5", lw=0.8, ls="--")
         axes.set(yscale="log", xlabel=LABELS["q_mobile"], ylabel="one-step cost")
@@ -147,7 +147,7 @@ def plot_faults(faults: pd.DataFrame) -> Figure:
     figure = new_figure(7.2, 3.4)
     axes = figure.subplots()
     shown = [name for name, fault in FAULTS.items() if name != "nothing" and "q_mobile" not in fault.held]
-    for colour, marker, name in zip((*COLOURS, "0.4"), "osD^v<>", shown, strict=False):
+    for colour, marker, name in zip(COLOURS, "osD^v<>", shown, strict=False):
         part = faults[(faults["load"] == "constant") & (faults["fault"] == name)]
         axes.plot(
             part["seen_percent"], part["q_mobile_error_percent"], marker=marker, ms=3.5, lw=1.2, color=colour, label=name

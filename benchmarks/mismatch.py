@@ -15,7 +15,6 @@ every second, the others every two.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -32,7 +31,7 @@ from battery_env.estimates import Estimate
 from battery_env.estimators import Estimator, ExtendedKalmanFilter, LeastSquares
 from battery_env.evaluation import evaluate
 from battery_env.parameters import PARAMETER_NAMES
-from battery_env.plotting import COLOURS, LABELS, new_figure
+from battery_env.plotting import LABELS, coloured, new_figure
 from battery_env.record_model import RecordModel
 from benchmarks.contests import SENSORS, check_discharges
 from benchmarks.nuisance import MISMATCH_V, OFFSET_SD_V
@@ -209,7 +208,7 @@ def plot_scores(scores: pd.DataFrame) -> Figure:
     for row, (mismatch, sensor) in zip(panels, conditions, strict=True):
         of_row = scores[(scores["mismatch"] == mismatch) & (scores["sensor"] == sensor)]
         for axes, parameter in zip(row, PARAMETER_NAMES, strict=True):
-            for n, (name, colour) in enumerate(zip(names, cycle(COLOURS), strict=False)):
+            for n, (colour, name) in enumerate(coloured(names)):
                 errors = of_row[of_row["calibrator"] == name][f"{parameter}_second_half_mape_percent"].to_numpy()
                 axes.plot(errors, np.full(len(errors), n), "o", ms=3, mew=0, alpha=0.35, color=colour)
                 axes.plot([errors.mean()] * 2, [n - 0.35, n + 0.35], color=colour, lw=2.2)

@@ -304,7 +304,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "thermal": True,
         "data": NASA_CITATION,
     }
-    cells = list(dict.fromkeys(study.chosen.cells))
+    cells = study.chosen.cells
     tables = study.run(part, [{"cell": cell} for cell in cells])
     whole, progress = tables["discharges"], tables["in_progress"]
     figures = {

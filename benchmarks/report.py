@@ -26,7 +26,7 @@ from scipy.stats import bootstrap, trim_mean
 
 from battery_env.arrays import FloatArray
 from battery_env.parameters import PARAMETER_NAMES
-from battery_env.plotting import COLOURS, new_figure
+from battery_env.plotting import coloured, new_figure
 from benchmarks.study import markdown, write_text
 
 _RESAMPLES = 999
@@ -186,7 +186,7 @@ def plot_profiles(errors: pd.DataFrame, title: str) -> Figure:
     thresholds = np.geomspace(positive.min(), 1.05 * positive.max(), 200)
     figure = new_figure(6.4, 3.4)
     axes = figure.subplots()
-    for colour, (calibrator, of_calibrator) in zip(COLOURS, errors.groupby("calibrator", sort=False), strict=False):
+    for colour, (calibrator, of_calibrator) in coloured(errors.groupby("calibrator", sort=False)):
         shares = 100.0 * profile(_by_seed(of_calibrator), thresholds)
         axes.plot(thresholds, shares.mean(axis=0), color=colour, lw=1.5, label=calibrator)
         axes.fill_between(thresholds, shares.min(axis=0), shares.max(axis=0), color=colour, alpha=0.25, lw=0)

@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from battery_env.evaluation import over_seeds
-from battery_env.plotting import COLOURS, draw_over_seeds, new_figure
+from battery_env.plotting import coloured, draw_over_seeds, new_figure
 from benchmarks.study import EVALUATION_SEED, Study, Tables, command_line, digits, markdown, natural, positive, with_spread
 from benchmarks.training import train_or_load
 
@@ -171,7 +171,7 @@ def plot_lines(results: pd.DataFrame, studies: Sequence[tuple[str, str]]) -> Fig
     figure = new_figure(3.4 * len(studies), 3.0)
     for axes, (study, metric) in zip(figure.subplots(1, len(studies), squeeze=False)[0], studies, strict=True):
         column, of_study = varied(study)[0], results[results["study"] == study]
-        for colour, (algo, of_algo) in zip(COLOURS, of_study.groupby("algo"), strict=False):
+        for colour, (algo, of_algo) in coloured(of_study.groupby("algo")):
             seeds = of_algo.pivot(index="seed", columns=column, values=metric)
             draw_over_seeds(axes, seeds.columns, seeds, colour, str(algo), marker="o", ms=4)
         axes.set(xlabel=_LABELS[column], ylabel=_LABELS[metric])

@@ -48,6 +48,7 @@ _EPISODES, _SEED = 50, 20_000  # on a cost environment
 _COMMON = ["learning_rate", "gamma", "tau"]
 _SOFT = [*_COMMON, "ent_coef", "target_entropy"]
 _TD3 = [*_COMMON, "noise_std", "target_policy_noise"]
+_DONE_OR_TO_DO = [TrialState.COMPLETE, TrialState.WAITING]
 _COST_NETWORKS = "net_arch=[64, 64], activation_fn=nn.LeakyReLU"  # as in zoo_configs
 
 
@@ -260,9 +261,12 @@ def part(
     )
     # another seed after an interruption, or the first draws would come again
     study.sampler = optuna.samplers.TPESampler(n_startup_trials=trials // 2, multivariate=True, seed=len(study.trials))
-    if not study.trials:
-        family = FAMILIES[env_id]
-        for first_trial in [*filter(None, [family.of_easier.get(algo)]), *family.first_trials]:
+    family = FAMILIES[env_id]
+    first_trials = [family.of_easier[algo], *family.first_trials] if algo in family.of_easier else family.first_trials
+    # Those that an interruption took among them
+    begun = [trial.system_attrs.get("fixed_params") for trial in study.get_trials(states=_DONE_OR_TO_DO)]
+    for first_trial in first_trials[:trials]:
+        if first_trial not in begun:
             study.enqueue_trial(first_trial)
     objective = partial(score, algo, env_id, updates, out / "zoo")
     study.optimize(objective, n_trials=max(trials - len(_own_trials(study)), 0))
@@ -276,7 +280,7 @@ def part(
             study.enqueue_trial(start.params | shared, user_attrs=of_other)
             study.optimize(objective, n_trials=1)
         _train_again(study, objective, _adopted(study, of_other), repeats)
-    rows, unit = [], FAMILIES[env_id].unit
+    rows, unit = [], family.unit
     for trial in _first_trials(study):
         runs = _runs(study, trial)
         scores = {

@@ -249,6 +249,9 @@ class Study:
     def __init__(self, parser: argparse.ArgumentParser, arguments: Sequence[str] | None = None) -> None:
         words = sys.argv[1:] if arguments is None else list(arguments)
         self.chosen = parser.parse_args(words)
+        for name, value in vars(self.chosen).items():
+            if isinstance(value, list):  # a seed that is named twice is one seed
+                setattr(self.chosen, name, list(dict.fromkeys(value)))
         self.command = f"{parser.prog} {shlex.join(words)}".strip()
         self.name = parser.prog.rpartition(".")[2]
         self.out: Path = self.chosen.out

@@ -244,7 +244,10 @@ def set_up(recipe: Recipe, folder: Path, **options: Any) -> tuple[LACExperimentM
     :param folder: where the zoo writes what it does
     :param options: other arguments of the zoo's experiment manager
     :return: the manager and the model
+    :raises ValueError: if it needs more than its model to be scored
     """
+    if recipe.hyperparameters.get("normalize"):
+        raise ValueError("policies with `normalize` cannot be scored here: their models do not hold the statistics")
     th.set_num_threads(1)
     algorithm(recipe.algo)
     plain_id = registered_id(recipe.env_id)

@@ -50,7 +50,7 @@ class HorizonReplayBuffer(ReplayBuffer):
         if horizon > self.buffer_size:
             raise ValueError(f"horizon={horizon} must not be larger than the {self.buffer_size} steps of buffer_size per env.")
         self.horizon = horizon
-        self.discounts = gamma ** np.arange(horizon, dtype=np.float32)
+        self.gamma = gamma
         # Whether the sum of each stored transition is known, and how many steps the running episodes have
         self.complete = np.zeros((self.buffer_size, self.n_envs), dtype=bool)
         self.n_complete = 0
@@ -134,7 +134,7 @@ class HorizonReplayBuffer(ReplayBuffer):
         rewards = self._normalize_reward(self.rewards[future, envs[:, None]], env)
         # Steps after a termination belong to the next episode
         done = self.dones[future, envs[:, None]]
-        weights = self.discounts * (np.cumsum(done, axis=1) - done == 0)
+        weights = self.gamma ** np.arange(self.horizon, dtype=np.float32) * (np.cumsum(done, axis=1) - done == 0)
         return HorizonReplayBufferSamples(
             observations=self.to_torch(self._normalize_obs(self.observations[rows, envs], env)),  # type: ignore[arg-type]
             actions=self.to_torch(self.actions[rows, envs]),

@@ -23,6 +23,7 @@ from sb3_lac.stability import (
     evaluate_lyapunov,
     fit_lyapunov,
 )
+from sb3_lac.stability.certification import check_questions
 from sb3_lac.stability.rollout import check_environment, known_seed, prepare_evaluation, trains_on
 
 if TYPE_CHECKING:
@@ -265,6 +266,10 @@ class CertificateCallback(LyapunovCallback):
         self.confidence = confidence
         self.cost_bound = cost_bound
         self.last_certification: CertificationReport | None = None
+
+    def _init_callback(self) -> None:
+        check_questions(None, self.confidence, self.cost_bound, None, None)
+        super()._init_callback()
 
     def _evaluate(self) -> dict[str, float]:
         first, n_envs, n_episodes = known_seed(self.seed), self.eval_env.num_envs, self.n_eval_episodes

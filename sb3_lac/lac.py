@@ -1,7 +1,9 @@
+import io
 import math
 import warnings
 from collections.abc import Sequence
 from contextlib import nullcontext, suppress
+from pathlib import Path
 from types import NoneType
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
@@ -299,7 +301,7 @@ class LAC(OffPolicyAlgorithm):
         self.stated_reward_bound = vars(self).pop("reward_bound", self.stated_reward_bound)
         self._setup_discount()
         self._check_arguments()
-        if self.replay_buffer_class in (HorizonReplayBuffer, NStepReplayBuffer):
+        if self.replay_buffer_class in (ReplayBuffer, HorizonReplayBuffer, NStepReplayBuffer):
             # Of a loaded model, whose arguments may be others by now
             self.replay_buffer_class = None
             self.replay_buffer_kwargs = {
@@ -369,16 +371,11 @@ class LAC(OffPolicyAlgorithm):
         """Ask the environment for its discount factor, if it is to state it."""
         gamma: Any = self.gamma
         if gamma == "auto":
-            if self.env is None:
-                raise ValueError(
-                    "gamma='auto' is the discount that the environment states, and there is none: load with env=..., or set "
-                    f"gamma, for instance gamma={DEFAULT_DISCOUNT}."
-                )
             metadata: list[Any] = []
-            # A vector environment of somebody else may have no attributes
+            # There may be no environment, and a vector environment of somebody else may have no attributes
             with suppress(AttributeError, NotImplementedError):
                 try:
-                    metadata = self.env.get_attr("metadata")
+                    metadata = self.env.get_attr("metadata")  # type: ignore[union-attr]
                 except (EOFError, ConnectionError) as error:
                     raise ValueError(
                         "The environments' metadata cannot be sent between processes, which have ended by that: set gamma, "
@@ -744,10 +741,10 @@ class LAC(OffPolicyAlgorithm):
         update_learning_rate(self.lambda_optimizer, self.lambda_lr_schedule(self._current_progress_remaining))
         optimizers.append(self.lambda_optimizer)
 
-        if isinstance(self.replay_buffer, NStepReplayBuffer):
+        if isinstance(self.replay_buffer, (HorizonReplayBuffer, NStepReplayBuffer)):
             # One discount for returns and values, also of a buffer that was loaded
             self.replay_buffer.gamma = self.gamma
-        elif isinstance(self.replay_buffer, HorizonReplayBuffer) and self.replay_buffer.n_complete == 0:
+        if isinstance(self.replay_buffer, HorizonReplayBuffer) and self.replay_buffer.n_complete == 0:
             warnings.warn(
                 f"No stored episode is as long as horizon={self.horizon} steps yet, and nothing is learned until one is. "
                 "After loading a model, call load_replay_buffer() before learn().",
@@ -826,10 +823,34 @@ class LAC(OffPolicyAlgorithm):
                 f"published_update={kwargs['published_update']} is not what the model was saved with: only one of the two "
                 "updates has a target actor, and it cannot be changed on loading."
             ) from error
+        if kwargs.get("gamma") == "auto" and model.env is None:
+            raise ValueError(
+                "gamma='auto' is the discount that the environment states, and there is none: load with env=..., or set "
+                f"gamma, for instance gamma={DEFAULT_DISCOUNT}."
+            )
         if "reward_bound" in kwargs:
             model.reward_bound.fill_(max(model.stated_reward_bound or 0.0, model.largest_stored_reward))
             model.update_offset(model._vec_normalize_env)
         return model
+
+    def load_replay_buffer(self, path: str | Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        """
+        Load a replay buffer, see ``OffPolicyAlgorithm.load_replay_buffer()``.
+
+        :param path: Path to the pickled replay buffer
+        :param truncate_last_traj: See ``OffPolicyAlgorithm.load_replay_buffer()``
+        :raises ValueError: If it sums rewards over another number of steps than this model
+        """
+        own = self.replay_buffer
+        super().load_replay_buffer(path, truncate_last_traj)
+        for name, none in (("horizon", None), ("n_steps", 1)):
+            stored, needed = getattr(self.replay_buffer, name, none), getattr(own, name, none)
+            if stored != needed:
+                self.replay_buffer = own
+                raise ValueError(
+                    f"The replay buffer in {path} has {name}={stored} and the model {name}={needed}: load the model with the "
+                    "arguments that the buffer was filled with, or continue without it."
+                )
 
     def _excluded_save_params(self) -> list[str]:
         # Exclude aliases, and statistics that are part of the policy

@@ -53,6 +53,7 @@ class DeterministicPolicy(th.nn.Module):
             self.register_buffer("mean", th.as_tensor(vec_normalize.obs_rms.mean, dtype=th.float32))
             variance = vec_normalize.obs_rms.var + vec_normalize.epsilon
             self.register_buffer("deviation", th.as_tensor(np.sqrt(variance), dtype=th.float32))
+        self.to(policy.device)
 
     def forward(self, observation: th.Tensor) -> th.Tensor:
         """

@@ -64,14 +64,15 @@ class GymnasiumVecEnv(VecEnv):
         if dones.any():
             ended = np.flatnonzero(dones)
             if self.autoreset_mode is AutoresetMode.SAME_STEP:
-                last_observations, last_infos = batch["final_obs"], _unbatched(batch.get("final_info", {}), ended)
+                last_observations, last_infos = _copied(batch["final_obs"]), _unbatched(batch.get("final_info", {}), ended)
                 started = [infos[n] for n in ended]
             else:
-                # Copied, for the environment may reuse its arrays
                 last_observations, last_infos = _copied(observations), [infos[n] for n in ended]
                 observations, batch = self.env.reset(options={"reset_mask": dones.copy()})
                 started = _unbatched(batch, ended)
             for n, last, start in zip(ended.tolist(), last_infos, started, strict=True):
+                if "episode" in start:  # of Gymnasium's RecordEpisodeStatistics
+                    last["episode"] = start.pop("episode")
                 self.reset_infos[n] = {key: value for key, value in start.items() if key != "TimeLimit.truncated"}
                 last["TimeLimit.truncated"] = bool(time_limits[n])
                 last["terminal_observation"] = _of_one(last_observations, n)
@@ -93,11 +94,14 @@ class GymnasiumVecEnv(VecEnv):
         :param indices: Which environments, all by default
         :return: One value per environment
         """
+        chosen = self._get_indices(indices)
+        if isinstance(self._single_envs, gym.vector.SyncVectorEnv):
+            return [self._single_envs.envs[n].get_wrapper_attr(attr_name) for n in chosen]
         if self._single_envs is not None:
             values = self._single_envs.get_attr(attr_name)
         else:
             values = (getattr(self.env, attr_name),) * self.num_envs
-        return [values[n] for n in self._get_indices(indices)]
+        return [values[n] for n in chosen]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """
@@ -123,19 +127,24 @@ class GymnasiumVecEnv(VecEnv):
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
         """
-        Call a method of every environment; if the vector environment is not made of single ones its own method, once.
+        Call a method of the environments, also of those that are not chosen where they run in processes of their own, as
+        Gymnasium does; if the vector environment is not made of single ones its own method, once.
 
         :param method_name: Name of the method
         :param method_args: Its positional arguments
-        :param indices: Whose results to return, all by default
+        :param indices: Which environments, all by default
         :param method_kwargs: Its keyword arguments
         :return: One result per environment, or for each of them the result of the one call
         """
+        chosen = self._get_indices(indices)
+        if isinstance(self._single_envs, gym.vector.SyncVectorEnv):
+            methods = [self._single_envs.envs[n].get_wrapper_attr(method_name) for n in chosen]
+            return [method(*method_args, **method_kwargs) for method in methods]
         if self._single_envs is not None:
             results = self._single_envs.call(method_name, *method_args, **method_kwargs)
         else:
             results = (getattr(self.env, method_name)(*method_args, **method_kwargs),) * self.num_envs
-        return [results[n] for n in self._get_indices(indices)]
+        return [results[n] for n in chosen]
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
         """

@@ -22,18 +22,19 @@ from sb3_lac.envs.quadrotor import QuadrotorCostEnv
 from sb3_lac.envs.vehicle import VehicleCostEnv
 
 
-def _linearised(model: CostEnv) -> tuple[np.ndarray, np.ndarray]:
+def _linearised(model: CostEnv, at_rest: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """
-    Matrices of ``s' = A s + B a`` about state and action zero, by central differences.
+    Matrices of ``s' = A s + B (a - at_rest)`` about state zero, by central differences.
 
-    :param model: A problem without noise, at rest there
+    :param model: A problem without noise
+    :param at_rest: Value of all actions with which it stays there
     :return: A, shape (n, n), and B, shape (n, m)
     """
     n, m = len(model.state_high), len(model.action_space.low)  # type: ignore[attr-defined]
     step = 1e-5
 
     def next_state(state_and_action: np.ndarray) -> np.ndarray:
-        return model._next_state(state_and_action[:n], state_and_action[n:], 0.0)
+        return model._next_state(state_and_action[:n], at_rest + state_and_action[n:], 0.0)
 
     columns = [(next_state(step * unit) - next_state(-step * unit)) / (2.0 * step) for unit in np.eye(n + m)]
     return np.array(columns[:n]).T, np.array(columns[n:]).T
@@ -186,7 +187,7 @@ class QuadrotorController(ReferenceController):
     def __init__(self, model: QuadrotorCostEnv) -> None:
         super().__init__(model)
         self.hover = 2.0 * model.mass_kg * model.GRAVITY_M_S2 / (2.0 * model.rotor_force_max_N) - 1.0
-        a, b = _linearised(model)
+        a, b = _linearised(model, self.hover)
         position, pitch, effort = model.WEIGHTS
         self.gain = _riccati(a, b, np.diag([position, position, pitch, 0.0, 0.0, 0.0]), effort * np.eye(2))
 

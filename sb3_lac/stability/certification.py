@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_lac.lac import env_specs
 from sb3_lac.stability.fitting import FittedLyapunov, flatten
-from sb3_lac.stability.functions import LyapunovFunction, check_function
+from sb3_lac.stability.functions import LyapunovFunction, check_function, check_rewards
 from sb3_lac.stability.rollout import (
     check_number,
     check_seeds,
@@ -181,7 +181,8 @@ def certify(
     """
     State what finitely many episodes say about the loop that a policy closes. Each statement is a question that an episode
     answers with yes or no, so that the exact bound of Clopper and Pearson (1934) holds for its probability, without any
-    assumption but that episodes are independent: 300 of 300 means at least 99 % with 95 % confidence. The statements are
+    assumption but that episodes are independent: 300 of 300 means at least 99 % with 95 % confidence, of one statement, and
+    98.6 % of each of three. The statements are
 
     - ``survives``: no termination
     - ``stays_within``: survives, and no cost in the last fifth of the episode is above ``cost_bound``
@@ -208,7 +209,7 @@ def certify(
     :return: The report
     :raises ValueError: If the arguments cannot be meant
     """
-    _check_questions(lyapunov, confidence, cost_bound, level, window_steps)
+    check_questions(lyapunov, confidence, cost_bound, level, window_steps)
     env = prepare_evaluation(policy, env, n_episodes, lyapunov is not None and lyapunov.normalized_rewards)
     check_number("n_episodes_per_start", n_episodes_per_start)
     if starts is not None:
@@ -242,11 +243,8 @@ def certify(
             of_starts = roll_out(policy, env, len(repeated), deterministic, normalized, repeated).transitions
 
     transitions = roll_outs.transitions
-    if lyapunov is None and cost_bound is not None and transitions["reward"].max() > 0:
-        raise ValueError(
-            f"A reward of {transitions['reward'].max():g} is positive, and without a Lyapunov function it is not known which "
-            "reward costs nothing: pass LyapunovFunction(..., reward_bound=...) or that of fit_lyapunov(policy, env)."
-        )
+    if cost_bound is not None:
+        check_rewards(lyapunov, transitions["reward"])
     transitions["cost"] = np.maximum(bound - transitions["reward"], 0.0)
     episodes = summarize_episodes(transitions)
     alive = ~episodes["terminated"]
@@ -286,14 +284,23 @@ def certify(
     )
 
 
-def _check_questions(
+def check_questions(
     lyapunov: LyapunovFunction | None,
     confidence: float,
     cost_bound: float | None,
     level: float | None,
     window_steps: int | None,
 ) -> None:
-    """Check what is asked of the episodes, see ``certify()``."""
+    """
+    Check what is asked of the episodes, see ``certify()``.
+
+    :param lyapunov: The function, if there is one
+    :param confidence: Of all statements together
+    :param cost_bound: The cost to stay within, if it is given
+    :param level: Value above which the function has to decrease, if it is given
+    :param window_steps: Over how many steps, if it is given
+    :raises ValueError: If one of them cannot be meant
+    """
     if lyapunov is not None:
         check_function(lyapunov)
     if not isinstance(confidence, numbers.Real) or not 0 < confidence < 1:

@@ -121,11 +121,12 @@ class FittedLyapunov(LyapunovFunction):
         margin = self.high - self.low + 1e-6 * np.maximum(np.abs(self.low), np.abs(self.high))
         far = ((inputs < self.low - margin) | (inputs > self.high + margin)).any(axis=0)
         if far.any():
-            numbers = np.flatnonzero(far)
+            shown = np.flatnonzero(far)[:5]
             warnings.warn(
-                f"Observations lie far from those that the Lyapunov function was fitted on: number {numbers.tolist()} of them "
-                f"was within {self.low[numbers].tolist()} and {self.high[numbers].tolist()}, and is further outside than that "
-                "is wide. Values there are made up: fit on roll-outs that go there.",
+                f"Observations lie far from those that the Lyapunov function was fitted on: {far.sum()} of their {len(far)} "
+                f"numbers, number {shown.tolist()} among them, which was within {self.low[shown].tolist()} and "
+                f"{self.high[shown].tolist()}, and is further outside than that is wide. Values there are made up: fit on "
+                "roll-outs that go there.",
                 stacklevel=2,
             )
         return np.maximum(network_values(self.network, (inputs - self.mean) / self.scale, self.unit) - self.floor, 0.0)

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 import numpy as np
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_lac.lac import LAC
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Observations = np.ndarray | dict[str, np.ndarray]
 
@@ -23,14 +27,14 @@ class LyapunovFunction:
       quadratic = LyapunovFunction(lambda states: np.einsum("ni,ij,nj->n", states, P, states))
       evaluate_lyapunov(controller, env, lyapunov=quadratic)
 
-    Costs are ``c = max(reward_bound - reward, 0)``.
+    Costs are ``c = max(reward_bound - reward, 0)``, or ``c = -reward`` if no bound is given and no reward is positive.
 
     :param function: Values, an array of shape (n,), of n observations as the policy sees them
     :param alpha3: Share of the cost by which the function is meant to decrease
     :param gamma: Discount factor of the costs to come that it estimates
     :param horizon: Number of steps whose costs it estimates, None for all to come
     :param average_cost: What is subtracted from the cost of each step in the sum that it estimates, None if it estimates none
-    :param reward_bound: The reward that costs nothing
+    :param reward_bound: The reward that costs nothing, needed where rewards are positive
     :param seeds: Seeds of the environments that it was learned on, if it was: no evaluation may use them
     """
 
@@ -44,7 +48,7 @@ class LyapunovFunction:
         gamma: float = 1.0,
         horizon: int | None = None,
         average_cost: float | None = None,
-        reward_bound: float = 0.0,
+        reward_bound: float | None = None,
         seeds: range | None = None,
     ):
         self._function = function
@@ -90,7 +94,7 @@ class LyapunovFunction:
         :param vec_normalize: Wrapper that the rewards come from, if any
         :return: The bound in the units of the rewards that are judged
         """
-        return self.reward_bound
+        return self.reward_bound or 0.0
 
     @contextmanager
     def in_units_of(self, vec_normalize: VecNormalize | None) -> Iterator[None]:
@@ -114,6 +118,19 @@ def check_function(lyapunov: object) -> None:
         )
 
 
+def check_rewards(lyapunov: LyapunovFunction | None, rewards: pd.Series) -> None:
+    """
+    :param lyapunov: What is judged, if anything
+    :param rewards: Those that are to become costs
+    :raises ValueError: If it is not known which reward costs nothing
+    """
+    if rewards.max() > 0 and (lyapunov is None or lyapunov.reward_bound is None):
+        raise ValueError(
+            f"A reward of {rewards.max():g} is positive, and it is not known which reward costs nothing: pass "
+            "LyapunovFunction(..., reward_bound=...) or that of fit_lyapunov(policy, env)."
+        )
+
+
 class CriticLyapunov(LyapunovFunction):
     """
     The critic of LAC: ``L(s, pi(s))`` with the mean action of the policy.
@@ -124,7 +141,8 @@ class CriticLyapunov(LyapunovFunction):
     normalized_rewards = True
 
     def __init__(self, model: LAC):
-        super().__init__(self._of_the_mean_action, model.alpha3, model.gamma, model.horizon)
+        bound = model.reward_bound.item()
+        super().__init__(self._of_the_mean_action, model.alpha3, model.gamma, model.horizon, reward_bound=bound)
         self.model = model
 
     def _of_the_mean_action(self, observations: Observations) -> np.ndarray:

@@ -14,7 +14,7 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_lac.lac import LAC, time_limits
-from sb3_lac.stability.functions import CriticLyapunov, LyapunovFunction, check_function
+from sb3_lac.stability.functions import CriticLyapunov, LyapunovFunction, check_function, check_rewards
 from sb3_lac.stability.rollout import (
     check_number,
     check_seeds,
@@ -198,11 +198,11 @@ class LyapunovReport:
         length = int(self.episodes["length"].max())
         longest = f"the longest episode has {length} steps"
         if self.episodes["terminated"].all():
-            return "every episode terminated, and a function of the average cost says nothing of what follows."
+            return "every episode terminated, and without a discount it is not known what follows."
         if self.horizon is None and self.gamma >= 1:
             return (
-                "no episode terminated, and with gamma=1 the costs after a time limit weigh as much as those before it; "
-                "max_tail_weight=1 leaves them out."
+                "with gamma=1 the costs after a time limit weigh as much as those before it (max_tail_weight=1 leaves them "
+                "out), and those after a termination have no sum."
             )
         n_steps = self.horizon or math.ceil(math.log(self.max_tail_weight) / math.log(self.gamma))
         # As many transitions that can be compared as cannot
@@ -316,7 +316,10 @@ def evaluate_lyapunov(
       not say where they will.
 
     Their intervals are percentiles of a bootstrap that resamples episodes (the transitions of an episode depend on each
-    other), and Wilson's for ``death_rate``. ``a'`` is the action taken next; after a time limit it is an action of the policy.
+    other). With few episodes such intervals are too narrow: those of a mean of normal numbers contain the true one in 85 % of
+    all cases with five, in 90 % with ten, and in 93 % with twenty. The interval of ``death_rate`` is Wilson's, and that of
+    ``ultimate_bound`` lies between order statistics, with no upper end if there are less than 72 episodes. ``a'`` is the
+    action taken next; after a time limit it is an action of the policy.
     A terminal state has no ``L``: transitions into it do not count for the decrease condition, but as deaths.
 
     .. note::
@@ -377,6 +380,7 @@ def evaluate_lyapunov(
         roll_outs.add_values(policy, lyapunov, deterministic)
 
     transitions = roll_outs.transitions
+    check_rewards(lyapunov, transitions["reward"])
     # A reward above all those of the training would have a negative cost, which L cannot learn
     transitions["cost"] = np.maximum(bound - transitions["reward"], 0.0)
     transitions["difference"] = transitions["next_lyapunov"] - transitions["lyapunov"] + alpha3 * transitions["cost"]

@@ -370,8 +370,8 @@ def cost_to_go(
     :param gamma: The discount factor
     :param horizon: Number of steps, None for all
     :param max_tail_weight: Largest weight of costs that are not seen, with an infinite horizon
-    :param bound: Cost of each step after a termination, 0 with an infinite horizon that is not discounted
-    :return: The sums, NaN where too much is not seen
+    :param bound: Cost of each step after a termination
+    :return: The sums, NaN where too much is not seen, and where costs without discount never end
     """
     episode, step = transitions["episode"].to_numpy(), transitions["step"].to_numpy()
     lengths = np.bincount(episode)
@@ -388,10 +388,12 @@ def cost_to_go(
     remaining = lengths[episode] - step
     seen = gamma**remaining <= max_tail_weight if horizon is None else remaining >= horizon
     terminated = transitions.groupby("episode")["terminated"].transform("any").to_numpy()
+    if bound > 0 and horizon is None and gamma >= 1:
+        return np.where(seen & ~terminated, sums, np.nan)
     if bound > 0:
         # Of the steps from now on, those after the termination
         passed = remaining if horizon is None else np.minimum(remaining, horizon)
-        weights = np.array([sum_of_discounts(gamma, int(steps)) for steps in range(lengths.max() + 1)])
+        weights = np.append(0.0, np.cumsum(gamma ** np.arange(lengths.max())))
         sums = sums + terminated * bound * (sum_of_discounts(gamma, horizon) - weights[passed])
     return np.where(seen | terminated, sums, np.nan)
 

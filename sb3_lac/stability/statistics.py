@@ -16,7 +16,7 @@ CONFIDENCE = 0.95
 
 class Interval(NamedTuple):
     """
-    A statistic and its 95 % confidence interval, NaN where there is none.
+    A statistic and its 95 % confidence interval, NaN where there is none, infinite on a side that is not limited.
 
     :param value: Of all roll-outs
     :param low: Lower end of the interval
@@ -53,11 +53,8 @@ class Bootstrap:
 
     def __init__(self, n_episodes: int, n_samples: int):
         self.n_episodes = n_episodes
-        self.n_samples = n_samples
-        # The same roll-outs always have the same intervals
-        self.rng = np.random.default_rng(0)
-        # How often each episode is in each sample
-        self.counts = self.rng.multinomial(n_episodes, np.full(n_episodes, 1 / n_episodes), size=n_samples)
+        # How often each episode is in each sample. The same roll-outs always have the same intervals.
+        self.counts = np.random.default_rng(0).multinomial(n_episodes, np.full(n_episodes, 1 / n_episodes), size=n_samples)
 
     def estimate(
         self, statistic: Callable[..., np.ndarray], episode: np.ndarray | pd.Series, *values: np.ndarray | pd.Series
@@ -93,19 +90,6 @@ class Bootstrap:
         return percentile_interval(
             float(statistic(*sums.sum(axis=1))), statistic(*(self.counts @ sums)), len(np.unique(episode))
         )
-
-    def percentile(self, values: np.ndarray, percent: float) -> Interval:
-        """
-        Estimate a percentile over episodes.
-
-        :param values: One value per episode
-        :param percent: Which percentile
-        :return: The percentile of all episodes, with its interval
-        """
-        if len(values) == 0:
-            return Interval(math.nan, math.nan, math.nan)
-        samples = np.percentile(self.rng.choice(values, size=(self.n_samples, len(values))), percent, axis=1)
-        return percentile_interval(float(np.percentile(values, percent)), samples, len(values))
 
 
 def percentile_interval(value: float, samples: np.ndarray, n_episodes: int) -> Interval:
@@ -290,6 +274,30 @@ def exact_interval(n_true: int, n: int, confidence: float) -> Interval:
     return Interval(n_true / n, float(interval.low), float(interval.high))
 
 
+def exact_percentile(values: np.ndarray, percent: float) -> Interval:
+    """
+    A percentile with its interval between order statistics, which needs no assumption of how the values are distributed
+    (Conover, 1999, Practical Nonparametric Statistics, section 3.2). A bootstrap has no sample above the largest value.
+
+    :param values: Independent values
+    :param percent: Which percentile
+    :return: The percentile of the values; the interval is infinite on a side on which they are too few to limit it
+    """
+    from scipy.stats import binom
+
+    value = float(np.percentile(values, percent)) if len(values) > 0 else math.nan
+    if len(values) < 2:
+        return Interval(value, math.nan, math.nan)
+    # How many of them lie below the true percentile: at least ``below``, at most ``above``
+    below, above = (
+        int(binom.ppf(share, len(values), percent / 100)) for share in ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2)
+    )
+    ordered = np.sort(values)
+    low = ordered[below - 1] if below > 0 else -math.inf
+    high = ordered[above] if above < len(values) else math.inf
+    return Interval(value, float(low), float(high))
+
+
 def estimate_metrics(
     transitions: pd.DataFrame, episodes: pd.DataFrame, n_levels: int, bootstrap: Bootstrap
 ) -> dict[str, Interval]:
@@ -328,7 +336,7 @@ def estimate_metrics(
         "calibration_intercept": compare(intercept, lyapunov, costs_to_go),
         # Spearman's correlation is Pearson's of the ranks, the bootstrap keeps the ranks among all transitions
         "rank_correlation": compare(correlation, rankdata(lyapunov), rankdata(costs_to_go)),
-        "ultimate_bound": bootstrap.percentile(episodes.loc[~episodes["terminated"], "largest_late_cost"].to_numpy(), 95),
+        "ultimate_bound": exact_percentile(episodes.loc[~episodes["terminated"], "largest_late_cost"].to_numpy(), 95),
         "death_rate": Interval(n_deaths / len(episodes), float(wilson.low), float(wilson.high)),
         "decrease_rate": bootstrap.estimate(ratio, known["episode"], decreases, known["lyapunov"]),
         "start_cost": bootstrap.estimate(ratio, starts["episode"], starts["cost"], np.ones(len(starts))),

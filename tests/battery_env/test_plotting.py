@@ -27,6 +27,12 @@ from battery_env.records import Samples
 from battery_env.sensors import SensorErrors
 
 
+def test_more_algorithms_than_colours_all_have_a_line():
+    table = pd.DataFrame({"timesteps": [1000, 2000], "mape_percent": [5.0, 1.0], "mape_percent_worst": [9.0, 2.0]})
+    figure = plot_learning_curves({f"variant {n}": [table] for n in range(len(COLOURS) + 1)}, "BatteryRo-v0")
+    assert [line.get_color() for line in figure.axes[0].lines] == [*COLOURS, COLOURS[0]]
+
+
 @pytest.fixture
 def scores():
     true = pd.Series([0.1, 0.15, 0.2])

@@ -62,6 +62,25 @@ def test_a_search_goes_on_and_is_not_done_twice(trials, tmp_path):
     assert len(found("sac", 1, 10, tmp_path)) == 1
 
 
+def test_a_trial_that_was_interrupted_is_made_again(trials, tmp_path, monkeypatch):
+    score = search.score
+
+    def interrupted(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(search, "score", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        search.part("sac", "BatteryJoint-v0", 3, 9, 1, 1, {}, tmp_path)
+    monkeypatch.setattr(search, "score", score)
+    rates = search.part("sac", "BatteryJoint-v0", 3, 9, 1, 1, {}, tmp_path)["search"]["learning_rate"].tolist()
+    assert len(rates) == 3 and sorted(rates[:2]) == [1e-3, 2.8e-3]
+
+
+def test_trials_by_hand_are_no_more_than_all(trials, tmp_path):
+    search.part("sac", "BatteryJoint-v0", 1, 9, 1, 2, {}, tmp_path)
+    assert [settings["learning_rate"] for _, settings in trials] == ["lin_0.0028"] * 3
+
+
 def test_the_best_three_are_ranked_by_three_seeds(trials, tmp_path):
     trial = found("lac", 6, 9, tmp_path)
     best = trial.sort_values("mean_percent").head(3)

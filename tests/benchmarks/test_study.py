@@ -264,6 +264,11 @@ def test_seeds_are_natural_numbers(seed):
         natural(seed)
 
 
+def test_what_is_named_twice_is_there_once(tmp_path):
+    study = a_study(tmp_path, "--seeds", "0", "3", "0")
+    assert study.chosen.seeds == study.configuration["seeds"] == [0, 3]
+
+
 def test_numbers_read_well():
     values = [0.123, 1.26, 9.96, 99.4, 99.6, 12345.6, -0.00123, float("nan"), float("inf")]
     assert [digits(value) for value in values] == ["0.12", "1.3", "10", "99", "100", "12346", "-0.0012", "-", "never"]

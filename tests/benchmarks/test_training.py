@@ -59,6 +59,12 @@ def test_a_policy_is_trained_once(tmp_path, trainings):
     assert trainings == [0, 0]
 
 
+def test_a_policy_that_would_lose_its_normalization_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="policies with `normalize` cannot be scored here"):
+        training.train_or_load("lac", "LinearCost-v0", 0, 2000, tmp_path / "models", {"normalize": True})
+    assert not (tmp_path / "models").exists()
+
+
 def test_the_seed_decides_everything(tmp_path):
     models = []
     for number, seed in enumerate((3, 3, 4)):

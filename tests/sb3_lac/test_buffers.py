@@ -216,6 +216,45 @@ def test_loaded_model_with_a_horizon_waits_for_a_complete_sum(make_model, make_e
     assert loaded._n_updates == 7
 
 
+def test_sums_of_a_loaded_buffer_have_the_discount_of_the_model(make_model, make_env, tmp_path):
+    make_model(horizon=4, gamma=1.0).save(tmp_path / "model")
+    filled = make_model(horizon=4, gamma=1.0)
+    filled.save_replay_buffer(tmp_path / "buffer")
+    loaded = LAC.load(tmp_path / "model", env=make_env(), gamma=0.5, device="cpu")
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    loaded.learn(5, reset_num_timesteps=False)
+    # All steps of the future count, but less
+    buffer = loaded.replay_buffer
+    rows, envs = np.array([0]), np.array([0])
+    (found,) = buffer._get_horizon_samples(rows, envs, None).horizon_returns.tolist()[0]
+    assert found == pytest.approx((buffer.rewards[:4, 0] * 0.5 ** np.arange(4)).sum(), rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("stored", "needed", "message"),
+    [
+        ({"horizon": 4}, {"horizon": 6}, "has horizon=4 and the model horizon=6"),
+        ({"horizon": 4}, {}, "has horizon=4 and the model horizon=None"),
+        ({}, {"horizon": 6}, "has horizon=None and the model horizon=6"),
+        ({"n_steps": 3}, {"n_steps": 5}, "has n_steps=3 and the model n_steps=5"),
+        ({}, {"n_steps": 5}, "has n_steps=1 and the model n_steps=5"),
+    ],
+)
+def test_a_buffer_that_sums_other_steps_is_refused(make_model, stored, needed, message, tmp_path):
+    make_model(**stored).save_replay_buffer(tmp_path / "buffer")
+    model = make_model(**needed, n_collect=0)
+    own = model.replay_buffer
+    with pytest.raises(ValueError, match=message):
+        model.load_replay_buffer(tmp_path / "buffer")
+    assert model.replay_buffer is own
+
+
+def test_n_steps_of_a_loaded_model_can_be_changed(make_model, make_env, tmp_path):
+    make_model(n_collect=0).save(tmp_path / "model")
+    loaded = LAC.load(tmp_path / "model", env=make_env(), n_steps=8, device="cpu")
+    assert isinstance(loaded.replay_buffer, NStepReplayBuffer) and loaded.replay_buffer.n_steps == 8
+
+
 # n-step returns
 
 

@@ -236,10 +236,10 @@ def test_function_does_not_depend_on_what_never_changed(make_env):
         warnings.simplefilter("error")
         values = lyapunov.values(points)
         evaluate_lyapunov(Integrator(), ObservedGoal(make_env(), 0.1), 10, seed=100, lyapunov=lyapunov)
-    with pytest.warns(UserWarning, match=r"number \[2\] of them was within \[0.1"):
+    with pytest.warns(UserWarning, match=r"1 of their 3 numbers, number \[2\] among them, which was within \[0.1"):
         moved = lyapunov.values(points + np.array([0.0, 0.0, 0.05]))
     np.testing.assert_array_equal(moved, values)
-    with pytest.warns(UserWarning, match=r"number \[0, 1\] of them was within"):
+    with pytest.warns(UserWarning, match=r"2 of their 3 numbers, number \[0, 1\] among them"):
         lyapunov.values(np.array([[50.0, -50.0, 0.1]]))
 
 
@@ -633,6 +633,15 @@ def test_callback_goes_on_where_nothing_has_a_cost(make_env, tmp_path, capsys):
     assert all(np.isnan(value) for name, value in callback.history[0].items() if name != "timesteps")
     # Without a seed, each evaluation has episodes of its own
     assert other.history[0]["start_cost"] != other.history[1]["start_cost"]
+
+
+@pytest.mark.parametrize("question", [{"confidence": 95}, {"cost_bound": "small"}])
+def test_callback_refuses_questions_before_the_training(make_env, question):
+    model = SAC("MlpPolicy", make_env(), policy_kwargs={"net_arch": [8]}, buffer_size=100)
+    (name,) = question
+    with pytest.raises(ValueError, match=f"{name}={question[name]!r} must be a number"):
+        model.learn(20, callback=CertificateCallback(make_env(), eval_freq=10, **question))
+    assert model.num_timesteps == 0
 
 
 def test_callback_shows_intervals_and_figures_in_tensorboard(make_env, tmp_path):

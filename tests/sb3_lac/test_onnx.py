@@ -71,6 +71,13 @@ def test_actions_are_float32(tmp_path):
     np.testing.assert_allclose(actions, model.predict(observations, deterministic=True)[0], atol=1e-5)
 
 
+def test_all_of_it_is_on_the_device_of_the_policy():
+    model = PPO("MlpPolicy", VecNormalize(make_vec_env("LinearCost-v0")), device="cpu", policy_kwargs=dict(SMALL))
+    # A device that every machine has
+    module = onnx.DeterministicPolicy(model.policy.to("meta"), model.get_vec_normalize_env())
+    assert {tensor.device.type for tensor in (*module.parameters(), *module.buffers())} == {"meta"}
+
+
 def test_policies_with_a_memory_are_refused(tmp_path):
     model = RecurrentPPO("MlpLstmPolicy", "Pendulum-v1", device="cpu", n_steps=8, policy_kwargs={"lstm_hidden_size": 4})
     with pytest.raises(ValueError, match="RecurrentActorCriticPolicy has a memory"):

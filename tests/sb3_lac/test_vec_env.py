@@ -1,5 +1,7 @@
 """A vector environment of Gymnasium does in Stable-Baselines3 what as many single environments do."""
 
+from typing import Any, ClassVar
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -113,6 +115,45 @@ def test_arrays_that_the_environment_reuses_stay_as_they_were(make_env, mode):
         assert_same(info, other_info)
 
 
+class ReusesItsLastObservations(gym.vector.VectorEnv):
+    """Counts steps, and tells of the last of two in an array that it uses again."""
+
+    metadata: ClassVar[dict[str, Any]] = {"autoreset_mode": AutoresetMode.SAME_STEP}
+
+    def __init__(self):
+        self.num_envs = 2
+        self.single_observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
+        self.single_action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+        self.n_steps, self.last = 0, np.zeros((2, 1), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros((2, 1), np.float32), {}
+
+    def step(self, actions):
+        self.n_steps += 1
+        self.last[:] = self.n_steps
+        ends = np.full(2, self.n_steps % 2 == 0)
+        infos = {"final_obs": self.last, "final_info": {}} if ends.all() else {}
+        return np.zeros((2, 1), np.float32), np.zeros(2), np.zeros(2, bool), ends, infos
+
+
+def test_last_observations_that_the_environment_reuses_stay_as_they_were():
+    env = GymnasiumVecEnv(ReusesItsLastObservations())
+    env.reset()
+    seen = [env.step(np.zeros((2, 1)))[3] for _ in range(4)]
+    assert [infos[0]["terminal_observation"].item() for infos in seen[1::2]] == [2.0, 4.0]
+
+
+def test_statistics_of_gymnasium_belong_to_the_episode_that_ended(make_env):
+    makes = [lambda length=length: make_env(episode_length=length) for length in (2, 3)]
+    env = GymnasiumVecEnv(gym.wrappers.vector.RecordEpisodeStatistics(SyncVectorEnv(makes, autoreset_mode="SameStep")))
+    env.reset()
+    lengths = [
+        [info["episode"]["l"] if "episode" in info else None for info in env.step(np.zeros((2, 2)))[3]] for _ in range(3)
+    ]
+    assert lengths == [[None, None], [2, None], [None, 3]] and "episode" not in env.reset_infos[0]
+
+
 class Events(gym.Wrapper):
     """Tells of every third step only, and ends in a termination at its time limit."""
 
@@ -209,6 +250,13 @@ def test_attributes_and_methods_of_single_environments(problems):
     assert env.get_attr("g") == [9.81] * N_ENVS
     env.reset()
     assert len(env.env_method("_get_obs", indices=[2])) == 1
+    # Of the chosen ones only, and a method is an attribute too
+    single_envs = env.env.unwrapped.envs
+    for single_env in single_envs:
+        single_env.unwrapped.seen = []
+        single_env.unwrapped.see = single_env.unwrapped.seen.append
+    env.env_method("see", 5, indices=[1])
+    assert [single_env.unwrapped.seen for single_env in single_envs] == [[], [5], []] and env.has_attr("see")
     assert env.env_is_wrapped(gym.wrappers.TimeLimit) == [True] * N_ENVS and not any(env.env_is_wrapped(Monitor))
 
 
