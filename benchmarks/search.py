@@ -263,10 +263,10 @@ def part(
     study.sampler = optuna.samplers.TPESampler(n_startup_trials=trials // 2, multivariate=True, seed=len(study.trials))
     family = FAMILIES[env_id]
     first_trials = [family.of_easier[algo], *family.first_trials] if algo in family.of_easier else family.first_trials
-    # Those that an interruption took among them
-    begun = [trial.system_attrs.get("fixed_params") for trial in study.get_trials(states=_DONE_OR_TO_DO)]
+    # An interruption may have taken some of them
+    kept = [trial.system_attrs.get("fixed_params") for trial in study.get_trials(states=_DONE_OR_TO_DO)]
     for first_trial in first_trials[:trials]:
-        if first_trial not in begun:
+        if first_trial not in kept:
             study.enqueue_trial(first_trial)
     objective = partial(score, algo, env_id, updates, out / "zoo")
     study.optimize(objective, n_trials=max(trials - len(_own_trials(study)), 0))
