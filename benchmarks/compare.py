@@ -7,11 +7,12 @@ on the battery tasks, with calibrators that do not learn.
   python -m benchmarks.compare --envs BatteryQmax-v0 BatteryRo-v0 --seeds 0 1 2
   python -m benchmarks.compare --envs BatteryVoltageJoint-v0 --seeds 0 1 --out results/voltage
   python -m benchmarks.compare --defaults --out results/compare_defaults
+  python -m benchmarks.compare --envs BatteryQmaxPaper-v0 --algos lac --hyperparams n_envs:1
   python -m benchmarks.compare --defaults --algos tqc my_package.my_module:MyAlgorithm --envs my_package.my_envs:MyEnv-v0
 
 Algorithms are those of the RL Zoo, LAC, and classes of your own; environments are all that are registered, or that importing
 the module before the colon registers. Hyperparameters and numbers of steps are those of ``zoo_configs``; with ``--defaults``,
-those of ``ALGO("MlpPolicy", env_id)``.
+those of ``ALGO("MlpPolicy", env_id)``. What ``--hyperparams`` names differs from them.
 
 Policies of full-state tasks are scored on all held-out discharges, beside the closed form; those of voltage-only tasks on the
 first 100, under two sensors, beside least squares and a Kalman filter that read every second; and in all other environments by
@@ -27,6 +28,7 @@ with the hyperparameters of all of them in one table.
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import io
 import itertools
@@ -232,6 +234,20 @@ def _checked(recipe: Recipe, out: Path) -> Recipe:
     return recipe
 
 
+def _differing(settings: Sequence[str]) -> dict[str, Any]:
+    """Hyperparameters by name; what is no literal of Python is text, like ``lin_1e-3``."""
+    hyperparameters: dict[str, Any] = {}
+    for setting in settings:
+        name, _, value = setting.partition(":")
+        if not name or not value:
+            raise ValueError(f"--hyperparams takes NAME:VALUE, like n_envs:1, got {setting}")
+        try:
+            hyperparameters[name] = ast.literal_eval(value)
+        except (ValueError, SyntaxError):
+            hyperparameters[name] = value
+    return hyperparameters
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """
     The command line.
@@ -252,11 +268,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--defaults", action="store_true", help="the algorithms' own hyperparameters and one environment, not zoo_configs"
     )
+    parser.add_argument(
+        "--hyperparams", nargs="+", metavar="NAME:VALUE", default=[], help="what differs, like learning_rate:lin_1e-3"
+    )
     parser.add_argument("--evaluations", type=positive, default=10, help="evaluations and checkpoints during each run")
     study = Study(parser, arguments)
     chosen = study.chosen
     given = {"timesteps": chosen.timesteps, "defaults": chosen.defaults, "evaluations": chosen.evaluations}
     try:
+        given["hyperparameters"] = _differing(chosen.hyperparams)
         finished_runs(study.out)
         recipes = [
             [Recipe.of(algo, env_id, seed, **given) for algo in chosen.algos]

@@ -384,6 +384,8 @@ class LAC(OffPolicyAlgorithm):
             self.gamma = stated_discount(metadata)
         elif not isinstance(gamma, (float, int, np.number)):
             raise ValueError(f"gamma={gamma!r} must be a number, or 'auto' for the discount that the environment states.")
+        elif not 0 <= gamma <= 1:
+            raise ValueError(f"gamma={gamma} must lie within 0 .. 1; 'auto' is the discount that the environment states.")
 
     def _check_arguments(self) -> None:
         """Check the arguments that SAC does not have."""

@@ -150,20 +150,23 @@ def test_a_finished_run_stands_for_its_own_recipe_only(tmp_path, finished, capsy
     assert len(finished) == 1
     before = recipe().digest
     (tmp_path / "zoo_configs" / "lac.yml").write_text(CONFIG.replace("batch_size: 16", "batch_size: 32"))
-    for changed in ([], ["--timesteps", "500"], ["--defaults", "--timesteps", "300"], ["--evaluations", "1"]):
+    differing = ["--hyperparams", "learning_rate:lin_1e-3", "n_envs:2"]
+    for changed in ([], differing, ["--timesteps", "500"], ["--defaults", "--timesteps", "300"], ["--evaluations", "1"]):
         compare.main([*command("--algos", "lac"), *changed])
-    assert len(finished) == 5
+    assert len(finished) == 6
+    expected = {**finished[1].hyperparameters, "learning_rate": "lin_1e-3", "n_envs": 2}
+    assert expected == finished[2].hyperparameters
     table = pd.read_csv(tmp_path / "out" / "compare.csv", dtype={"recipe": str})[:-1]
     assert table["recipe"].is_unique and before in set(table["recipe"])
-    assert sorted(table["timesteps"]) == [300, 400, 400, 400, 500]
-    assert list(table["hyperparameters"]) == ["zoo_configs"] * 4 + ["defaults"]
+    assert sorted(table["timesteps"]) == [300, 400, 400, 400, 400, 500]
+    assert list(table["hyperparameters"]) == ["zoo_configs"] * 5 + ["defaults"]
     recipes = json.loads((tmp_path / "out" / "compare.json").read_text())["configuration"]["recipes"]
     assert [recipes[digest]["timesteps"] for digest in table["recipe"]] == list(table["timesteps"])
     assert recipes[before]["hyperparameters"]["batch_size"] == 16
     assert recipes[recipe().digest]["hyperparameters"]["batch_size"] == 32
     # in tables and figures each has a name of its own
     names = set(pd.read_csv(tmp_path / "out" / f"{ENV_ID}_learning.csv")["algo"])
-    assert names == {"LAC defaults", *(f"LAC {digest}" for digest in table["recipe"][:4])}
+    assert names == {"LAC defaults", *(f"LAC {digest}" for digest in table["recipe"][:5])}
     shown = capsys.readouterr().out
     assert all(name in shown for name in names)
 
@@ -336,6 +339,9 @@ def test_shares_of_discharges_are_drawn_over_seeds():
         (["--envs", "BatteryQmax-v0"], "lac.yml has no entry for BatteryQmax-v0"),
         (["--seeds", "-1"], "must be a whole number of at least 0, got -1"),
         (["--seeds", str(2**32)], "a seed must lie within 0 .. 2**32 - 1, got 4294967296"),
+        (["--hyperparams", "n_envs=1"], "--hyperparams takes NAME:VALUE, like n_envs:1, got n_envs=1"),
+        (["--hyperparams", "n_env:1"], "lac on BatteryRo-v0: LAC.__init__() got an unexpected keyword argument 'n_env'"),
+        (["--hyperparams", "gamma:2"], "lac on BatteryRo-v0: gamma=2 must lie within 0 .. 1"),
         (["--timesteps", "40"], "starts to learn after 40 steps (learning_starts): timesteps=40 must be more"),
     ],
 )

@@ -80,9 +80,18 @@ def test_metadata_that_cannot_be_sent_is_named(make_model, make_env):
         make_model(env, n_collect=0)
 
 
-def test_gamma_is_a_number_or_auto(make_model):
-    with pytest.raises(ValueError, match="gamma='high' must be a number, or 'auto'"):
-        make_model(n_collect=0, gamma="high")
+@pytest.mark.parametrize(
+    ("gamma", "message"),
+    [
+        ("high", "gamma='high' must be a number, or 'auto'"),
+        (1.1, "gamma=1.1 must lie within 0 .. 1"),
+        (-0.1, "gamma=-0.1 must lie within 0 .. 1"),
+        (float("nan"), "gamma=nan must lie within 0 .. 1"),
+    ],
+)
+def test_gamma_is_a_discount_or_auto(make_model, gamma, message):
+    with pytest.raises(ValueError, match=message):
+        make_model(n_collect=0, gamma=gamma)
 
 
 def test_nothing_known_is_the_default():
