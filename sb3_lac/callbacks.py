@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from copy import deepcopy
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -9,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, EventCallback
 from stable_baselines3.common.logger import Figure
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, sync_envs_normalization
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
 
 from sb3_lac.dashboard import NOT_TENSORBOARD, tensorboard_writer
 from sb3_lac.files import replacing
@@ -24,7 +25,7 @@ from sb3_lac.stability import (
     fit_lyapunov,
 )
 from sb3_lac.stability.certification import check_questions
-from sb3_lac.stability.rollout import check_environment, known_seed, prepare_evaluation, trains_on
+from sb3_lac.stability.rollout import check_environment, check_training_seeds, known_seed, prepare_evaluation, trains_on
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
@@ -130,9 +131,12 @@ class LyapunovCallback(EventCallback):
         if self.eval_freq <= 0 or self.n_calls % self.eval_freq != 0:
             return True
 
-        # Sync training and eval env if there is VecNormalize
-        if self.model.get_vec_normalize_env() is not None:
-            sync_envs_normalization(self.training_env, self.eval_env)
+        # As sync_envs_normalization(), for environments that are not wrapped alike otherwise
+        training, evaluation = self.model.get_vec_normalize_env(), unwrap_vec_normalize(self.eval_env)
+        if training is not None and evaluation is not None:
+            evaluation.ret_rms = deepcopy(training.ret_rms)
+            if training.norm_obs:
+                evaluation.obs_rms = deepcopy(training.obs_rms)
 
         entry = {"timesteps": self.num_timesteps, **self._evaluate()}
         # Dump log so the evaluation results are printed with the correct timestep
@@ -228,7 +232,7 @@ class CertificateCallback(LyapunovCallback):
     :param eval_freq: Evaluate the agent every ``eval_freq`` call of the callback.
     :param confidence: Of all statements of one evaluation together; it is not corrected for the number of evaluations
     :param cost_bound: The cost to stay within, the largest late cost of the roll-outs of the fit by default
-    :param seed: Seed of each evaluation; if it is None, each draws its own
+    :param seed: Seed of each evaluation, far from those of the training; if it is None, each draws its own
     :param log_path: Path of a CSV file, as for ``LyapunovCallback``
     :param verbose: Verbosity level: 0 for no output, 1 for the summary of each evaluation
     """
@@ -258,7 +262,7 @@ class CertificateCallback(LyapunovCallback):
         eval_freq: int = 10_000,
         confidence: float = 0.95,
         cost_bound: float | None = None,
-        seed: int | None = 0,
+        seed: int | None = 10_000,
         log_path: str | os.PathLike[str] | None = None,
         verbose: int = 1,
     ):
@@ -270,6 +274,8 @@ class CertificateCallback(LyapunovCallback):
     def _init_callback(self) -> None:
         check_questions(None, self.confidence, self.cost_bound, None, None)
         super()._init_callback()
+        if self.seed is not None:
+            check_training_seeds(self.model, self.seed, 3 * self.eval_env.num_envs)
 
     def _evaluate(self) -> dict[str, float]:
         first, n_envs, n_episodes = known_seed(self.seed), self.eval_env.num_envs, self.n_eval_episodes

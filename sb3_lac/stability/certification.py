@@ -20,13 +20,14 @@ from sb3_lac.stability.functions import LyapunovFunction, check_function, check_
 from sb3_lac.stability.rollout import (
     check_number,
     check_seeds,
+    check_training_seeds,
     known_seed,
     prepare_evaluation,
     roll_out,
     summarize_episodes,
     undisturbed,
 )
-from sb3_lac.stability.statistics import exact_interval, exact_lower_bound
+from sb3_lac.stability.statistics import exact_interval, exact_lower_bound, percent
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -89,21 +90,22 @@ class CertificationReport:
         ]
         for name, row in self.statements.iterrows():
             counts = f"{row['n_true']:.0f} of {row['n_episodes']:.0f}"
-            lines.append(f"  {name:<14}{counts:>14}   {row['at_least']:.4f}   {self._meaning(str(name))}")
+            at_least = math.floor(1e4 * row["at_least"]) / 1e4  # a lower bound is not rounded up
+            lines.append(f"  {name:<14}{counts:>14}   {at_least:.4f}   {self._meaning(str(name))}")
         for name, reason in self._not_made().items():
             lines.append(f"  {name:<14}{'not made':>14}   {reason}")
         n_statements = len(self.statements)
         lines.append(
-            f"All {n_statements} hold together with {100 * self.confidence:g} % confidence: each bound is that of Clopper and "
-            f"Pearson with {100 * self.confidence_of_each:.4g} % (Bonferroni)."
+            f"All {n_statements} hold together with {percent(self.confidence)} % confidence: each bound is that of Clopper "
+            f"and Pearson with {percent(self.confidence_of_each)} % (Bonferroni)."
             if n_statements > 1
-            else f"The bound is that of Clopper and Pearson with {100 * self.confidence:g} % confidence."
+            else f"The bound is that of Clopper and Pearson with {percent(self.confidence)} % confidence."
         )
         if self.starts is not None:
             attracted = (self.starts["low"] >= 0.5).sum()
             lines.append(
                 f"Region of attraction: {attracted} of {len(self.starts)} start states are attracted with a probability of at "
-                f"least one half, each by its own {100 * self.confidence:g} % interval of "
+                f"least one half, each by its own {percent(self.confidence)} % interval of "
                 f"{self.starts['n_episodes'].iloc[0]} episodes."
             )
         lines.append(
@@ -204,8 +206,8 @@ def certify(
     :param starts: Start states on a grid, shape (n, n_states), each handed to ``env.reset(options={"state": ...})``
     :param n_episodes_per_start: Number of episodes from each of them
     :param deterministic: Whether to certify the mean action or sampled actions
-    :param seed: Seed of the episodes, which cannot be one that ``lyapunov`` was fitted on; drawn if it is None, and named in
-        the description of the report
+    :param seed: Seed of the episodes, which cannot be one that ``lyapunov`` was fitted on, or the policy trained; drawn if it
+        is None, and named in the description of the report
     :return: The report
     :raises ValueError: If the arguments cannot be meant
     """
@@ -222,6 +224,7 @@ def certify(
     if starts is not None and cost_bound is None:
         raise ValueError("A start state is attracted if its episode ends within cost_bound: give one, or a fitted lyapunov.")
     seed = known_seed(seed)
+    check_training_seeds(policy, seed, env.num_envs)
     if lyapunov is not None:
         check_seeds(lyapunov, seed, env.num_envs)
     # Asked for before the work: not every environment answers
@@ -232,11 +235,13 @@ def certify(
     bound = 0.0 if lyapunov is None else lyapunov.cost_bound(vec_normalize)
     of_starts = None
     with undisturbed(policy, env, seed), nullcontext() if lyapunov is None else lyapunov.in_units_of(vec_normalize):
+        if starts is not None:
+            _check_starts(env, starts)
+            env.seed(seed)
         roll_outs = roll_out(policy, env, n_episodes, deterministic, normalized)
         if lyapunov is not None:
             roll_outs.add_values(policy, lyapunov, deterministic)
         if starts is not None:
-            _check_starts(env, starts)
             # Other episodes than those above
             env.seed(int(np.random.SeedSequence(seed).generate_state(1)[0] // 2))
             repeated = np.repeat(starts, n_episodes_per_start, axis=0)
@@ -332,16 +337,24 @@ def _check_starts(env: VecEnv, starts: np.ndarray) -> None:
     :param env: The environment
     :param starts: Start states, shape (n_starts, n_states)
     """
-    first = {"state": starts[0].tolist()}
-    others = starts[(starts != starts[0]).any(axis=1)]
-    # With the same random numbers: two that differ, or the only one and what the environment does by itself
-    seen = []
-    for options in (first, {"state": others[0].tolist()} if len(others) > 0 else None):
+    if len(starts) > 1:
+        # Not every vector environment takes options for each of its elements
+        env.set_options([{"state": starts[k % len(starts)].tolist()} for k in range(env.num_envs)])
+        env.reset()
+    distinct = np.unique(starts, axis=0)
+    # With the same random numbers: one that differs, or from the only one what the environment does by itself. The
+    # observation need not show all of the state.
+    asked = [{"state": start.tolist()} for start in distinct] if len(distinct) > 1 else [{"state": starts[0].tolist()}, None]
+    first = None
+    for options in asked:
         env.seed(0)
         env.set_options(options)
         # Copied, for wrappers that stack frames return the same array again
-        seen.append(flatten(env.reset()))  # type: ignore[arg-type]
-    if np.array_equal(seen[0], seen[1]):
+        seen = flatten(env.reset())  # type: ignore[arg-type]
+        first = seen if first is None else first
+        if not np.array_equal(seen, first):
+            break
+    else:
         raise ValueError(
             "The environment starts in the same state whatever reset(options={'state': ...}) says: it needs a wrapper that "
             "puts it into the state that it is given. (If it starts in the only one of starts anyway, leave starts out.)"

@@ -40,6 +40,8 @@ class LyapunovFunction:
 
     #: Whether costs are those of the training, in the units of ``VecNormalize``
     normalized_rewards = False
+    #: Whether values depend on actions, and not on observations alone
+    of_actions = False
 
     def __init__(
         self,
@@ -139,6 +141,7 @@ class CriticLyapunov(LyapunovFunction):
     """
 
     normalized_rewards = True
+    of_actions = True
 
     def __init__(self, model: LAC):
         bound = model.reward_bound.item()

@@ -11,9 +11,11 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.collections import LineCollection
-from matplotlib.colors import LogNorm
+from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
+
+from sb3_lac.stability.statistics import percent
 
 #: Colours that colour-blind readers can tell apart (Okabe & Ito)
 BLUE, VERMILION, GREEN, ORANGE, GREY = "#0072b2", "#d55e00", "#009e73", "#e69f00", "#7f7f7f"
@@ -275,7 +277,7 @@ def plot_certification(
         xlim=(0, 1.02),
         ylim=(-0.9, len(statements) - 0.5),
         xlabel="probability",
-        title=f"With {100 * confidence:g} % confidence",
+        title=f"With {percent(confidence)} % confidence",
     )
     of_statements.legend(fontsize=8, loc="lower left", ncols=2)
     draw_costs(transitions, math.nan if cost_bound is None else cost_bound, of_costs, "cost bound")
@@ -303,7 +305,7 @@ def plot_attraction(starts: pd.DataFrame, confidence: float, x: int, y: int, nam
     marks = axes.scatter(shown[:, 0], shown[:, 1], c=low, s=42, marker="s", cmap="viridis", vmin=0.0, vmax=1.0)
     never = (starts["n_attracted"] == 0).to_numpy()
     axes.scatter(points[never, 0], points[never, 1], s=20, color=VERMILION, marker="x", lw=1, label="never attracted")
-    figure.colorbar(marks, ax=axes, label=f"probability of attraction, at least ({100 * confidence:g} % interval)")
+    figure.colorbar(marks, ax=axes, label=f"probability of attraction, at least ({percent(confidence)} % interval)")
     if never.any():
         axes.legend(fontsize=8, loc="upper right")
     axes.set(title=f"{len(points)} start states, {starts['n_episodes'].iloc[0]} episodes each", **labels)
@@ -336,8 +338,8 @@ def plot_phase(
     inside = episode[1:] == episode[:-1]
     lines = LineCollection(np.stack([points[:-1], points[1:]], axis=1)[inside], cmap="viridis_r", lw=0.9)
     lines.set_array(lyapunov[:-1][inside])
-    if is_wide(lyapunov):
-        lines.set_norm(LogNorm())
+    # Also where no episode has a second step
+    lines.set_norm((LogNorm if is_wide(lyapunov) else Normalize)(lyapunov.min(), lyapunov.max()))
     axes.add_collection(lines)
     bar = figure.colorbar(lines, ax=axes, label="$L(s, a)$")
     if is_wide(lyapunov):

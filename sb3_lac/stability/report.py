@@ -103,7 +103,7 @@ class LyapunovReport:
                 missing.setdefault(self._why_not_available(name), []).append(name)
                 lines.append(f"  {name:<24}not available")
             elif math.isnan(low):
-                lines.append(f"  {name:<24}{value:>12.4g}   not available: it takes two episodes with data")
+                lines.append(f"  {name:<24}{value:>12.4g}   not available: too few episodes have data")
             else:
                 lines.append(f"  {name:<24}{value:>12.4g}   [{low:.4g}, {high:.4g}]")
         lines += [f"Not available: {', '.join(names)}. {reason}" for reason, names in missing.items()]
@@ -129,7 +129,7 @@ class LyapunovReport:
         if math.isnan(decrease.value):
             return "is undecided: no transition ends in a state that has an L"
         if math.isnan(decrease.low):
-            return "is undecided: one episode with a decrease gives no interval, use more episodes"
+            return "is undecided: too few episodes have a decrease for an interval, use more"
         return "is undecided: the interval of decrease contains 0"
 
     @property
@@ -144,7 +144,8 @@ class LyapunovReport:
         """
         Whether these roll-outs show a Lyapunov function with a residual: no episode died, ``L`` falls from the starts on (the
         interval of ``largest_feasible_alpha3`` lies above 0), and it decreases wherever the cost is larger than
-        ``cost_bound``, whose interval lies below ``settled_share`` of the mean cost of the first steps.
+        ``cost_bound``, whose interval lies below ``settled_share`` of the mean cost of the first steps. Where the roll-outs
+        end, the cost must not rise (the interval of ``late_rise`` lies above 0) so that one more such rise exceeds the bound.
         """
         return self._why_not() is None
 
@@ -153,11 +154,17 @@ class LyapunovReport:
         if metrics["death_rate"].value > 0:
             return f"{self.episodes['terminated'].sum()} of {len(self.episodes)} episodes died"
         if math.isnan(metrics["largest_feasible_alpha3"].low) and metrics["largest_feasible_alpha3"].value > 0:
-            return "one episode gives no interval, use more episodes"
+            return "too few episodes have a cost for an interval, use more"
         if not metrics["largest_feasible_alpha3"].low > 0:
             return "L does not fall from the starts on (the interval of largest_feasible_alpha3 is not above 0)"
         if math.isnan(metrics["cost_bound_alpha3"].value):
             return "L does not decrease where the cost is largest"
+        late_cost, late_rise = metrics["late_cost"].value, metrics["late_rise"].value
+        if metrics["late_rise"].low > 0 and late_cost + late_rise > metrics["cost_bound"].value:
+            return (
+                f"the cost rises where the roll-outs end, by {late_rise:.3g} from one fifth of their steps to the last, to "
+                f"{late_cost:.3g}: it would soon be above cost_bound"
+            )
         if not metrics["cost_bound"].high < self.settled_share * metrics["start_cost"].value:
             share = "" if self.settled_share == 1 else f"{self.settled_share:g} of "
             below = f"below {share}the cost of the first steps"
@@ -312,8 +319,10 @@ def evaluate_lyapunov(
     - ``residual``: the least b with which ``E[L(s', a')] - L(s, a) <= -alpha3 * c + b`` holds at each level of the cost, on
       average over the transitions of the level. It bounds the mean cost in the long run by ``b / alpha3`` (Foster-Lyapunov).
     - ``cost_bound``: the least ``b / alpha3`` of all alpha3, and ``cost_bound_alpha3``, where that is. ``L`` decreases at the
-      levels whose cost is larger. It is never less than the mean cost of the lowest level: roll-outs that have not settled do
-      not say where they will.
+      levels whose cost is larger. It is never less than ``late_cost``: roll-outs that have not settled do not say where they
+      will.
+    - ``late_cost``: mean cost in the last fifth of the episodes that did not terminate, and ``late_rise``, by how much it is
+      larger than that of the fifth before
 
     Their intervals are percentiles of a bootstrap that resamples episodes (the transitions of an episode depend on each
     other). With few episodes such intervals are too narrow: those of a mean of normal numbers contain the true one in 85 % of

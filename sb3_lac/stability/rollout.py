@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import inspect
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from copy import deepcopy
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -121,6 +123,24 @@ def check_seeds(lyapunov: LyapunovFunction, seed: int, n_envs: int) -> None:
         )
 
 
+def check_training_seeds(policy: PolicyPredictor, seed: int, n_envs: int) -> None:
+    """
+    Refuse exact statements of the episodes that a policy was trained on: those of equal seeds begin alike.
+
+    :param policy: The policy
+    :param seed: Seed of the episodes
+    :param n_envs: Number of environments, whose seeds count up from it
+    """
+    if not isinstance(policy, BaseAlgorithm) or policy.seed is None:
+        return
+    if seed < policy.seed + policy.n_envs and policy.seed < seed + n_envs:
+        raise ValueError(
+            f"seed={seed} with {n_envs} environments starts episodes that {type(policy).__name__} was trained on (seeds "
+            f"{policy.seed} to {policy.seed + policy.n_envs - 1}): they say nothing about others. Use another seed, from "
+            f"{policy.seed + policy.n_envs} on."
+        )
+
+
 def trains_on(model: BaseAlgorithm, env: VecEnv) -> bool:
     """
     Whether a model collects its training data in an environment, or in one of those that it consists of.
@@ -161,13 +181,20 @@ def undisturbed(policy: PolicyPredictor, env: VecEnv, seed: int) -> Iterator[Non
 
     :param policy: What is evaluated
     :param env: The environment
-    :param seed: Seed for the environment, in place of one that it was given before, and for PyTorch
+    :param seed: Seed for the environment, in place of one that it was given before, for PyTorch, numpy and the action space
     """
     vec_normalize = unwrap_vec_normalize(env)
     env.seed(seed)
     device = str(getattr(policy, "device", "cpu"))
     with th.random.fork_rng(devices=[device] if device.startswith("cuda") else []):
         th.manual_seed(seed)
+        # DQN explores with these two
+        numpy_state = np.random.get_state()
+        np.random.seed(seed % 2**32)
+        action_space: Any = getattr(policy, "action_space", None)
+        if isinstance(policy, (BaseAlgorithm, BasePolicy)):
+            policy.action_space = deepcopy(action_space)
+            policy.action_space.seed(seed)
         training = vec_normalize is not None and vec_normalize.training
         try:
             # All costs have the same units
@@ -179,6 +206,9 @@ def undisturbed(policy: PolicyPredictor, env: VecEnv, seed: int) -> Iterator[Non
                 policy.end_episodes()
             if vec_normalize is not None:
                 vec_normalize.training = training
+            if isinstance(policy, (BaseAlgorithm, BasePolicy)):
+                policy.action_space = action_space
+            np.random.set_state(numpy_state)
 
 
 def combine(function: Callable[[list[np.ndarray]], np.ndarray], observations: Sequence[Observations]) -> Observations:
@@ -247,9 +277,26 @@ class RollOuts:
         done = (transitions["truncated"] | transitions["terminated"]).to_numpy()
         transitions["next_lyapunov"] = transitions["lyapunov"].shift(-1).where(~done, np.nan)
         if self.last_observations is not None:
-            last_actions, _ = policy.predict(self.last_observations, deterministic=deterministic)
-            last_values = lyapunov.values_of_actions(self.last_observations, last_actions)
+            if lyapunov.of_actions:
+                last_actions, _ = policy.predict(self.last_observations, deterministic=deterministic)
+                last_values = lyapunov.values_of_actions(self.last_observations, last_actions)
+            else:  # a policy with a memory cannot be asked for actions of other times
+                last_values = lyapunov.values(self.last_observations)
             transitions.loc[transitions["truncated"], "next_lyapunov"] = np.asarray(last_values, dtype=np.float64)
+
+
+def _what_it_asks_for(policy: PolicyPredictor, env: VecEnv) -> list[str]:
+    """
+    What ``predict`` takes beside observations: controllers without a memory need not know of episodes.
+
+    :param policy: The policy
+    :param env: The environment
+    :return: Of ``state``, ``episode_start`` and the ``action_masks`` of MaskablePPO those that there are
+    """
+    parameters = inspect.signature(policy.predict).parameters
+    takes_all = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
+    asked = [name for name in ("state", "episode_start") if takes_all or name in parameters]
+    return [*asked, "action_masks"] if "action_masks" in parameters and env.has_attr("action_masks") else asked
 
 
 def roll_out(
@@ -275,6 +322,7 @@ def roll_out(
     import pandas as pd  # slow to import, and only an evaluation needs it
 
     vec_normalize = None if normalized_rewards else unwrap_vec_normalize(env)
+    asks_for = _what_it_asks_for(policy, env)
     n_envs = env.num_envs
     n_rounds = 1 if starts is None else -(-n_eval_episodes // n_envs)
     batches: list[Observations] = []
@@ -296,9 +344,11 @@ def roll_out(
         beginnings = np.ones(n_envs, dtype=bool)
         lengths = np.zeros(n_envs, dtype=int)
         while (counts < targets).any():
-            # Those without a memory need not know of it
-            memory = {} if state is None else {"state": state, "episode_start": beginnings}
-            actions, state = policy.predict(observations, deterministic=deterministic, **memory)  # type: ignore[arg-type]
+            known = {"state": state, "episode_start": beginnings}
+            if "action_masks" in asks_for:
+                known["action_masks"] = np.stack(env.env_method("action_masks"))
+            given = {name: known[name] for name in asks_for}
+            actions, state = policy.predict(observations, deterministic=deterministic, **given)  # type: ignore[arg-type]
             new_observations, rewards, dones, infos = env.step(actions)
             if vec_normalize is not None:
                 rewards = vec_normalize.get_original_reward()
@@ -403,19 +453,27 @@ def summarize_episodes(transitions: pd.DataFrame) -> pd.DataFrame:
     Summarize each episode.
 
     :param transitions: One row per transition
-    :return: One row per episode with ``length``, ``total_cost``, ``final_cost``, ``largest_late_cost`` and ``terminated``
+    :return: One row per episode with ``length``, ``total_cost``, ``final_cost``, ``largest_late_cost`` and ``late_cost``, the
+        largest and the mean one of the last fifth, ``late_rise``, by how much that mean is larger than the one of the fifth
+        before (NaN after a single step), and ``terminated``
     """
     import pandas as pd
 
     groups = transitions.groupby("episode")
     length = groups["step"].transform("size")
-    late = length - transitions["step"] <= np.maximum(length // 5, 1)
+    left, n_late = length - transitions["step"], np.maximum(length // 5, 1)
+    late, before = (
+        transitions["cost"].where(chosen).groupby(transitions["episode"])
+        for chosen in (left <= n_late, (left > n_late) & (left <= 2 * n_late))
+    )
     return pd.DataFrame(
         {
             "length": groups.size(),
             "total_cost": groups["cost"].sum(),
             "final_cost": groups["cost"].last(),
-            "largest_late_cost": transitions["cost"].where(late).groupby(transitions["episode"]).max(),
+            "largest_late_cost": late.max(),
+            "late_cost": late.mean(),
+            "late_rise": late.mean() - before.mean(),
             "terminated": groups["terminated"].any(),
         }
     )

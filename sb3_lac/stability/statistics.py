@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -44,8 +44,9 @@ class Bootstrap:
     """
     Bootstrap that resamples episodes, for statistics that are functions of sums over all episodes.
 
-    Samples in which a statistic is not defined, as a ratio to a cost of 0, are left out. ``scipy.stats.bootstrap`` would give
-    no interval at all.
+    Samples in which a statistic is not defined, as a ratio to a cost of 0, are left out, and if they are more than the 2.5 %
+    beyond an end of the interval, there is none: it takes some four episodes with data. ``scipy.stats.bootstrap`` would give
+    no interval wherever one sample is not defined.
 
     :param n_episodes: Number of episodes
     :param n_samples: Number of bootstrap samples
@@ -69,43 +70,42 @@ class Bootstrap:
         """
         sums = np.stack([np.bincount(episode, value, minlength=self.n_episodes) for value in values])
         samples = statistic(*(sums @ self.counts.T))
-        return percentile_interval(float(statistic(*sums.sum(axis=1))), samples, len(np.unique(episode)))
+        return self._interval(float(statistic(*sums.sum(axis=1))), samples)
 
     def estimate_levels(
-        self, statistic: Callable[..., np.ndarray], level: np.ndarray, episode: np.ndarray | pd.Series, *values: np.ndarray
+        self,
+        statistic: Callable[..., np.ndarray],
+        level: np.ndarray,
+        episode: np.ndarray | pd.Series,
+        *values: np.ndarray,
+        of_episodes: Sequence[np.ndarray] = (),
     ) -> Interval:
         """
         Estimate a statistic of several levels.
 
-        :param statistic: Function of the sums of the values, arrays whose last axis are the levels
+        :param statistic: Function of the sums of the values, arrays whose last axis are the levels, and of those of episodes
         :param level: Level that each value belongs to, 0 and up
         :param episode: Episode that each value belongs to
         :param values: What to sum
+        :param of_episodes: What else to sum, one value per episode
         :return: The statistic of all episodes, with its interval
         """
         n_levels = int(level.max()) + 1
         sums = np.zeros((len(values), self.n_episodes, n_levels))
         for total, value in zip(sums, values, strict=True):
             np.add.at(total, (np.asarray(episode), level), value)
-        return percentile_interval(
-            float(statistic(*sums.sum(axis=1))), statistic(*(self.counts @ sums)), len(np.unique(episode))
-        )
+        whole = statistic(*sums.sum(axis=1), *(np.sum(values) for values in of_episodes))
+        return self._interval(float(whole), statistic(*(self.counts @ sums), *(self.counts @ value for value in of_episodes)))
 
-
-def percentile_interval(value: float, samples: np.ndarray, n_episodes: int) -> Interval:
-    """
-    Percentile interval of a bootstrap.
-
-    :param value: Of all episodes
-    :param samples: Values of the bootstrap samples
-    :param n_episodes: Number of episodes with data: one says nothing about the spread between episodes
-    :return: The value with its interval
-    """
-    samples = samples[np.isfinite(samples)]
-    if n_episodes < 2 or len(samples) == 0 or math.isnan(value):
-        return Interval(value, math.nan, math.nan)
-    low, high = np.quantile(samples, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
-    return Interval(value, float(low), float(high))
+    def _interval(self, value: float, samples: np.ndarray) -> Interval:
+        defined = samples[np.isfinite(samples)]
+        # With few episodes that have data, a sample often has none of them, and the others are more alike than episodes are:
+        # with a single one, all of them are equal
+        too_few = self.n_episodes < 2 or len(defined) < (1 + CONFIDENCE) / 2 * len(samples)
+        if too_few or math.isnan(value):
+            return Interval(value, math.nan, math.nan)
+        low, high = np.quantile(defined, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+        return Interval(value, float(low), float(high))
 
 
 def spread(n: np.ndarray, x: np.ndarray, xx: np.ndarray) -> np.ndarray:
@@ -175,7 +175,7 @@ def largest_mean(n: np.ndarray, x: np.ndarray) -> np.ndarray:
     return np.where(n > 0, ratio(x, n), -np.inf).max(axis=-1)
 
 
-def tightest_drift(n: np.ndarray, drift: np.ndarray, cost: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def tightest_drift(n: np.ndarray, drift: np.ndarray, cost: np.ndarray, late_cost: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     The Foster-Lyapunov condition ``E[L' - L] <= -alpha3 * c + b`` at each level of the cost, with the alpha3 and b that say
     most: those with the least ``b / alpha3``, which bounds the mean cost in the long run.
@@ -183,9 +183,11 @@ def tightest_drift(n: np.ndarray, drift: np.ndarray, cost: np.ndarray) -> tuple[
     :param n: Number of transitions of each level, shape (..., n_levels)
     :param drift: Sum of ``L' - L`` of each level
     :param cost: Sum of the costs of each level
+    :param late_cost: Mean cost of the ends of the roll-outs, shape (...), NaN if all died
     :return: ``b / alpha3`` and alpha3, both of shape (...); alpha3 is NaN if L does not decrease where the cost is largest,
         when the largest mean cost of a level is all that can be said. Both are NaN where there are no transitions. The bound
-        is never less than the mean cost of the lowest level: what happens below is not known.
+        is never less than ``late_cost``, or the mean cost of the lowest level if there is none: over finite roll-outs the
+        value of the starts can pay for any costs, and below those that they came to nothing is known.
     """
     shape = np.shape(n)[:-1]
     bounds, alphas = np.empty(shape), np.empty(shape)
@@ -195,8 +197,8 @@ def tightest_drift(n: np.ndarray, drift: np.ndarray, cost: np.ndarray) -> tuple[
             bounds[index] = alphas[index] = np.nan
             continue
         m, c = drift[index][seen] / n[index][seen], cost[index][seen] / n[index][seen]
-        # Where L falls at all levels, these roll-outs end before it settles: at no cost that they have not come to
-        least = c.min()
+        late = np.asarray(late_cost)[index]
+        least = c.min() if np.isnan(late) else late
         # With t = 1 / alpha3 it is the largest of straight lines, whose least value is at t = 0, or where
         # two of them meet, or where the last one reaches that cost, or 0
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -223,11 +225,12 @@ def levels_of_cost(known: pd.DataFrame, n_levels: int) -> np.ndarray:
     return np.unique(np.searchsorted(quantiles, known["cost"]), return_inverse=True)[1]
 
 
-def estimate_drift(known: pd.DataFrame, n_levels: int, bootstrap: Bootstrap) -> dict[str, Interval]:
+def estimate_drift(known: pd.DataFrame, episodes: pd.DataFrame, n_levels: int, bootstrap: Bootstrap) -> dict[str, Interval]:
     """
     Estimate the metrics of the decrease condition with a residual.
 
     :param known: One row per transition that does not end in a terminal state
+    :param episodes: One row per episode
     :param n_levels: Number of levels of the cost
     :param bootstrap: Bootstrap of the episodes
     :return: Values with their intervals, by name
@@ -237,12 +240,33 @@ def estimate_drift(known: pd.DataFrame, n_levels: int, bootstrap: Bootstrap) -> 
         return {name: Interval(math.nan, math.nan, math.nan) for name in names}
     level, episode, ones = levels_of_cost(known, n_levels), known["episode"], np.ones(len(known))
     drift, cost = (known["next_lyapunov"] - known["lyapunov"]).to_numpy(), known["cost"].to_numpy()
-    of_drift = (level, episode, ones, drift, cost)
+    survived = (~episodes["terminated"]).to_numpy(dtype=np.float64)
+    late = (survived * episodes["late_cost"].to_numpy(), survived)
+
+    def estimate(which: int) -> Interval:
+        def statistic(*sums: np.ndarray) -> np.ndarray:
+            n, of_drift, of_cost, of_late, n_late = sums
+            return tightest_drift(n, of_drift, of_cost, ratio(of_late, n_late))[which]
+
+        return bootstrap.estimate_levels(statistic, level, episode, ones, drift, cost, of_episodes=late)
+
     return {
         "residual": bootstrap.estimate_levels(largest_mean, level, episode, ones, known["difference"].to_numpy()),
-        "cost_bound": bootstrap.estimate_levels(lambda *sums: tightest_drift(*sums)[0], *of_drift),
-        "cost_bound_alpha3": bootstrap.estimate_levels(lambda *sums: tightest_drift(*sums)[1], *of_drift),
+        "cost_bound": estimate(0),
+        "cost_bound_alpha3": estimate(1),
     }
+
+
+def percent(confidence: float) -> str:
+    """
+    A confidence in per cent as readers see it: never 100.
+
+    :param confidence: Between 0 and 1
+    :return: Without the sign, with two digits after the point or as many as it takes to tell it from 100
+    """
+    missing = 100 * (1 - confidence)
+    decimals = max(2, -math.floor(math.log10(missing)))
+    return f"{100 - missing:.{decimals}f}".rstrip("0").rstrip(".")
 
 
 def exact_lower_bound(n_true: int, n: int, confidence: float) -> float:
@@ -315,6 +339,8 @@ def estimate_metrics(
     # There is no L in a terminal state
     known = transitions[~transitions["terminated"]]
     starts = transitions[transitions["step"] == 0]
+    survivors = episodes[~episodes["terminated"]]
+    long = survivors[survivors["late_rise"].notna()]
     ones = np.ones(len(known))
     decreases = known["lyapunov"] - known["next_lyapunov"]
 
@@ -340,7 +366,9 @@ def estimate_metrics(
         "death_rate": Interval(n_deaths / len(episodes), float(wilson.low), float(wilson.high)),
         "decrease_rate": bootstrap.estimate(ratio, known["episode"], decreases, known["lyapunov"]),
         "start_cost": bootstrap.estimate(ratio, starts["episode"], starts["cost"], np.ones(len(starts))),
-        **estimate_drift(known, n_levels, bootstrap),
+        "late_cost": bootstrap.estimate(ratio, survivors.index, survivors["late_cost"], np.ones(len(survivors))),
+        "late_rise": bootstrap.estimate(ratio, long.index, long["late_rise"], np.ones(len(long))),
+        **estimate_drift(known, episodes, n_levels, bootstrap),
     }
 
 

@@ -1,5 +1,6 @@
 """A certificate tells a loop that settles from one that does not, and its statements are exact."""
 
+import dataclasses
 import itertools
 import warnings
 
@@ -12,16 +13,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 from scipy.stats import binom
-from stable_baselines3 import PPO, SAC
+from stable_baselines3 import DQN, PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import Logger, configure
-from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecMonitor, VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from benchmarks.controllers import ScaledController
 from sb3_lac import (
     CertificateCallback,
     FittedLyapunov,
+    GymnasiumVecEnv,
     LyapunovCallback,
     LyapunovFunction,
     certify,
@@ -31,7 +33,7 @@ from sb3_lac import (
 from sb3_lac.envs import LinearCostEnv, reference_controller
 from sb3_lac.stability import CriticLyapunov
 from sb3_lac.stability.fitting import shortest_window, traced_returns
-from sb3_lac.stability.statistics import exact_interval, exact_lower_bound, tightest_drift
+from sb3_lac.stability.statistics import exact_interval, exact_lower_bound, percent, tightest_drift
 
 FIT = {"n_iterations": 20, "progress_bar": False}
 
@@ -247,14 +249,18 @@ def test_function_does_not_depend_on_what_never_changed(make_env):
 
 
 @settings(max_examples=50, deadline=None)
-@given(st.lists(st.tuples(st.integers(1, 50), st.floats(-5, 5), st.floats(0, 10)), min_size=1, max_size=6))
-def test_bound_on_the_mean_cost_is_the_tightest(levels):
+@given(
+    st.lists(st.tuples(st.integers(1, 50), st.floats(-5, 5), st.floats(0, 10)), min_size=1, max_size=6),
+    st.floats(0, 15) | st.just(np.nan),
+)
+def test_bound_on_the_mean_cost_is_the_tightest(levels, late_cost):
     n, m, c = (np.array(column, dtype=float) for column in zip(*levels, strict=True))
     # Differences that rounding decides about are no matter of this
-    m, c = np.round(m, 2), np.round(c, 2)
-    bound, alpha3 = tightest_drift(n, n * m, n * c)
-    # min v, t * m + c <= v, v >= min c, t = 1 / alpha3 >= 0
-    expected = linprog([1, 0], A_ub=np.column_stack([-np.ones(len(m)), m]), b_ub=-c, bounds=[(c.min(), None), (0, None)])
+    m, c, late_cost = np.round(m, 2), np.round(c, 2), np.round(late_cost, 2)
+    bound, alpha3 = tightest_drift(n, n * m, n * c, late_cost)
+    # min v, t * m + c <= v, v >= the late cost, t = 1 / alpha3 >= 0
+    least = c.min() if np.isnan(late_cost) else late_cost
+    expected = linprog([1, 0], A_ub=np.column_stack([-np.ones(len(m)), m]), b_ub=-c, bounds=[(least, None), (0, None)])
     assert expected.status == 0 and bound == pytest.approx(expected.fun, rel=1e-6, abs=1e-6)
     assert np.isnan(alpha3) == (m[c == c.max()].max() >= 0 or c.max() == 0)
     if not np.isnan(alpha3):
@@ -285,8 +291,53 @@ def test_nothing_is_said_of_costs_below_those_that_were_seen(n_cost_levels):
     square = LyapunovFunction(lambda observations: observations[:, 0].astype(float) ** 2)
     report = evaluate_lyapunov(NoController(), FallsToAHalf(), 20, seed=0, lyapunov=square, n_cost_levels=n_cost_levels)
     assert report.metrics["cost_bound"].low >= report.by_cost["cost_low"].min() > 0.25
-    assert report.metrics["cost_bound"].value == report.by_cost["cost"].min()
+    assert report.metrics["cost_bound"] == pytest.approx(report.metrics["late_cost"])
     assert report.holds and report.metrics["cost_bound_alpha3"].value > 0
+
+
+class OfTheState:
+    """A controller of the linear problem that does not look at the time."""
+
+    def __init__(self, factor):
+        self.controller = ScaledController(reference_controller(gym.make("LinearCost-v0")), factor)
+
+    def predict(self, observation, deterministic=True):
+        return self.controller.predict(observation[:, :2].astype(np.float32), deterministic=deterministic)
+
+
+@pytest.mark.parametrize(("factor", "holds"), [(1.0, True), (-0.14, False), (-0.2, False)])
+def test_loop_whose_cost_rises_in_the_end_does_not_hold(factor, holds):
+    """The time decreases wherever the loop goes."""
+    clock = LyapunovFunction(lambda observations: 200.0 - observations[:, 2])
+    env = gym.wrappers.TimeAwareObservation(gym.make("LinearCost-v0"), normalize_time=False)
+    report = evaluate_lyapunov(OfTheState(factor), env, 30, seed=0, lyapunov=clock)
+    assert report.holds == holds and ("rises where the roll-outs end" in report.summary()) != holds
+    assert report.metrics["cost_bound"].value >= report.metrics["late_cost"].value
+
+
+def test_bound_of_the_cost_errs_on_the_safe_side(linear_env):
+    """With the exact function of the average cost both are the mean cost in the long run."""
+    env = LinearCostEnv()
+    gain = env.optimal_gain()
+    p = env.value_matrix(gain, gamma=1.0)
+    exact = env.noise_std**2 * np.trace(p)
+    lyapunov = LyapunovFunction(lambda states: np.einsum("ni,ij,nj->n", states.astype(float), p, states.astype(float)))
+    controller = reference_controller(gym.make("LinearCost-v0"))
+    for seed in range(1000, 9000, 1000):
+        metrics = evaluate_lyapunov(controller, linear_env, 20, seed=seed, n_bootstrap=200, lyapunov=lyapunov).metrics
+        assert metrics["residual"].high > exact and metrics["cost_bound"].high > exact
+        assert metrics["cost_bound"].value < 1.5 * exact
+
+
+def test_interval_of_few_episodes_with_a_cost_is_none():
+    at_rest, settles = [0.0, 0.0, 0.0], [4.0, 2.0, 1.0]
+    lyapunov = LyapunovFunction(lambda observations: np.where(observations[:, 0] < 99, observations[:, 0], 0.0))
+    for n, enough in ((1, False), (3, False), (6, True)):
+        env = PlannedEnv([at_rest] * (20 - n) + [settles] * n)
+        report = evaluate_lyapunov(NoController(), env, 20, seed=0, lyapunov=lyapunov)
+        assert report.metrics["largest_feasible_alpha3"].value > 0
+        assert np.isfinite(report.metrics["largest_feasible_alpha3"].low) == enough
+        assert ("too few episodes have a cost" in report.summary()) != enough
 
 
 def test_how_far_costs_must_fall_can_be_said():
@@ -386,6 +437,22 @@ def test_statements_count_what_they_say():
     assert wide.statements.loc["decreases", "n_true"] == 3
 
 
+def test_confidence_is_never_all():
+    assert [percent(share) for share in (0.5, 0.95, 1 - 0.05 / 3, 0.9999, 0.9999999)] == [
+        "50", "95", "98.33", "99.99", "99.99999"
+    ]  # fmt: skip
+    report = certify(NoController(), PlannedEnv([[1, 1]]), n_episodes=4, confidence=0.9999999, cost_bound=2.0)
+    assert "100 %" not in report.summary() and "99.99999 %" in report.summary()
+    # 0.05 ** (1 / n) of n episodes is 0.99998
+    many = dataclasses.replace(report, statements=report.statements.assign(at_least=0.99998))
+    assert "0.9999 " in many.summary() and "1.0000" not in many.summary()
+
+
+def test_phases_of_single_steps_are_drawn(tmp_path):
+    report = evaluate_lyapunov(NoController(), PlannedEnv([[1], [20]]), 4, lyapunov=IDENTITY)
+    report.plot_phase(0, 0).savefig(tmp_path / "phase.png")
+
+
 def test_all_of_300_means_at_least_99_percent():
     report = certify(NoController(), PlannedEnv([[1, 1]]), n_episodes=300)
     assert report.statements.loc["survives", "at_least"] == pytest.approx(0.05 ** (1 / 300))
@@ -420,6 +487,31 @@ def test_env_that_ignores_starts_is_refused():
     controller = reference_controller(gym.make("LinearCost-v0"))
     report = certify(controller, gym.make("LinearCost-v0"), n_episodes=2, cost_bound=1.0, starts=[[0.5, 0.5]], seed=0)
     assert report.starts["n_attracted"].tolist() == [10]
+
+
+def test_starts_need_not_be_seen():
+    """On a grid the state that differs first may be one that is not observed."""
+    env = gym.wrappers.TransformObservation(
+        gym.make("LinearCost-v0"), lambda observation: observation[:1], spaces.Box(-np.inf, np.inf, (1,), np.float32)
+    )
+    starts = [[x, y] for x in (-0.5, 0.5) for y in (-0.5, 0.0, 0.5)]
+    assert len(certify(NoController(), env, n_episodes=1, cost_bound=1.0, starts=starts).starts) == 6
+
+
+def test_env_that_takes_one_start_for_all_is_refused_before_the_episodes():
+    class Counting(NoController):
+        calls = 0
+
+        def predict(self, observation, deterministic=True):
+            self.calls += 1
+            return super().predict(observation, deterministic)
+
+    controller, env = Counting(), GymnasiumVecEnv(
+        gym.make_vec("LinearCost-v0", num_envs=2, vector_kwargs={"autoreset_mode": "SameStep"})
+    )
+    with pytest.raises(ValueError, match="takes the same options for all"):
+        certify(controller, env, n_episodes=2, cost_bound=1.0, starts=[[0.5, 0.5], [0.5, 0.0]])
+    assert controller.calls == 0
 
 
 def test_starts_of_wrappers_that_reuse_their_arrays():
@@ -507,6 +599,68 @@ def test_memory_of_a_policy_is_kept_within_an_episode():
     assert np.concatenate(policy.calls).tolist() == [0, 1, 2, 0, 1, 2]
 
 
+class Scheduled:
+    """Acts by a count of its own, that begins anew where an episode does."""
+
+    def __init__(self):
+        self.starts = []
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        self.starts += episode_start.tolist()
+        return np.zeros((len(observation), 1), np.float32), None
+
+
+def test_controllers_know_where_episodes_start():
+    """As in ``evaluate_policy()``; and they are asked for no action that is not taken."""
+    policy = Scheduled()
+    evaluate_lyapunov(policy, PlannedEnv([[3, 2, 1]]), 2, lyapunov=IDENTITY)
+    assert policy.starts == [True, False, False] * 2
+
+
+class Masked:
+    def __init__(self):
+        self.masks = []
+
+    def predict(self, observation, deterministic=False, action_masks=None):
+        self.masks.append(action_masks)
+        return np.zeros((len(observation), 1), np.float32), None
+
+
+def test_masks_of_actions_are_handed_over():
+    class WithMasks(PlannedEnv):
+        def action_masks(self):
+            return np.array([True, len(self.costs) > 1])
+
+    policy = Masked()
+    certify(policy, DummyVecEnv([lambda: WithMasks([[1, 1]]) for _ in range(2)]), n_episodes=2)
+    np.testing.assert_array_equal(policy.masks, [[[True, True]] * 2, [[True, False]] * 2])
+    without = Masked()
+    certify(without, PlannedEnv([[1, 1]]), n_episodes=1)
+    assert without.masks == [None, None]
+
+
+def test_random_actions_of_dqn_are_those_of_the_seed():
+    model = DQN("MlpPolicy", "CartPole-v1", policy_kwargs={"net_arch": [8]}, buffer_size=10, seed=0)
+    before = np.random.get_state()[1].copy(), model.action_space.np_random.bit_generator.state
+    first, second = (
+        certify(model, gym.make("CartPole-v1"), n_episodes=5, deterministic=False, seed=7).episodes["length"] for _ in range(2)
+    )
+    assert first.tolist() == second.tolist() and first.nunique() > 1
+    np.testing.assert_array_equal(np.random.get_state()[1], before[0])
+    assert model.action_space.np_random.bit_generator.state == before[1]
+
+
+def test_episodes_of_the_training_say_nothing_of_others(make_env):
+    model = SAC("MlpPolicy", make_vec_env(make_env, n_envs=4), policy_kwargs={"net_arch": [8]}, buffer_size=100, seed=5)
+    for seed in (3, 8):
+        with pytest.raises(ValueError, match=rf"seed={seed} with 3 environments .* SAC was trained on .seeds 5 to 8."):
+            certify(model, make_vec_env(make_env, n_envs=3), n_episodes=3, seed=seed)
+    certify(model, make_vec_env(make_env, n_envs=3), n_episodes=3, seed=9)
+    with pytest.raises(ValueError, match=r"seed=0 with 9 environments .* was trained on"):
+        model.learn(10, callback=CertificateCallback(make_vec_env(make_env, n_envs=3), seed=0))
+    assert model.num_timesteps == 0
+
+
 def test_costs_of_other_functions_are_those_of_the_env(make_env):
     env = VecNormalize(make_vec_env(make_env, n_envs=2), gamma=0.9)
     model = SAC("MlpPolicy", env, buffer_size=100, learning_starts=1000, policy_kwargs={"net_arch": [8]}, seed=0)
@@ -532,7 +686,7 @@ def test_critic_is_a_function_of_the_observation(make_model, make_env):
     observations = np.random.default_rng(0).normal(size=(5, 2)).astype(np.float32)
     actions, _ = model.predict(observations, deterministic=True)
     np.testing.assert_array_equal(lyapunov.values(observations), model.policy.predict_lyapunov(observations, actions))
-    report = certify(model, make_env(), lyapunov, 3, level=0.0, window_steps=2, cost_bound=1.0, seed=0)
+    report = certify(model, make_env(), lyapunov, 3, level=0.0, window_steps=2, cost_bound=1.0, seed=10)
     assert "lyapunov" in report.transitions and len(report.episodes) == 3
 
 
@@ -633,6 +787,19 @@ def test_callback_goes_on_where_nothing_has_a_cost(make_env, tmp_path, capsys):
     assert all(np.isnan(value) for name, value in callback.history[0].items() if name != "timesteps")
     # Without a seed, each evaluation has episodes of its own
     assert other.history[0]["start_cost"] != other.history[1]["start_cost"]
+
+
+@pytest.mark.parametrize("norm_obs", [True, False])
+def test_callback_needs_no_more_alike_than_the_normalization(make_env, norm_obs):
+    training = VecNormalize(VecMonitor(DummyVecEnv([make_env] * 2)), norm_obs=norm_obs)
+    env = VecNormalize(DummyVecEnv([make_env])) if norm_obs else make_env()
+    model = SAC("MlpPolicy", training, learning_starts=100, policy_kwargs={"net_arch": [8]}, buffer_size=100, seed=0)
+    callback = CertificateCallback(env, n_eval_episodes=2, eval_freq=10, verbose=0)
+    model.learn(20, callback=callback)
+    assert callback.last_report is not None
+    if norm_obs:
+        np.testing.assert_array_equal(env.obs_rms.mean, training.obs_rms.mean)
+        assert env.ret_rms.var == training.ret_rms.var
 
 
 @pytest.mark.parametrize("question", [{"confidence": 95}, {"cost_bound": "small"}])

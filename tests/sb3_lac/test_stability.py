@@ -151,6 +151,8 @@ def test_exact_lyapunov_function_is_recognized(make_exact_model, gamma, alpha3):
             "death_rate": 0.0,
             "decrease_rate": 1 - RHO**2,
             "start_cost": squares.mean(),
+            "late_cost": 0.0,
+            "late_rise": 0.0,
             # Of the level where it is largest: what alpha3 asks beyond what is feasible is most where the cost is most
             "residual": (alpha3 - feasible) * report.by_cost["cost"].iloc[-1 if alpha3 > feasible else 0],
             # The drift is proportional to the cost, so that there is no residual with the feasible alpha3
@@ -404,8 +406,8 @@ def test_one_episode_has_no_interval(make_exact_model):
     for name, (value, low, high) in report.metrics.items():
         if name != "death_rate":
             assert not np.isnan(value) and np.isnan(low) and np.isnan(high), name
-    assert "is undecided: one episode" in report.summary() and "nan" not in report.summary()
-    assert report.summary().count("not available: it takes two episodes") == 13
+    assert "is undecided: too few episodes" in report.summary() and "nan" not in report.summary()
+    assert report.summary().count("not available: too few episodes") == 15
 
 
 def test_levels_of_cost():
