@@ -16,7 +16,7 @@ from battery_env.checks import LOAD_UNIT_SYMBOLS, LoadUnit, check_load, check_nu
 from battery_env.electrochemistry import state_of_charge, step_into, voltage_into
 from battery_env.estimates import Estimate
 from battery_env.estimators.settling import white_noise_V
-from battery_env.loads import BlockBootstrap, Cycle, Load, RandomLoad, Spliced, constant, steadier_unit
+from battery_env.loads import BlockBootstrap, Cycle, Load, RandomLoad, Spliced, constant, in_steps, steadier_unit
 from battery_env.parameters import Q_MOBILE, R_O
 from battery_env.plotting import COLOURS, new_figure
 from battery_env.record_model import RecordModel
@@ -184,7 +184,8 @@ def forecast(
     :param record: one discharge from its first sample to now, of a cell that was full unless ``model`` says otherwise
     :param estimate: of any calibrator, best with its standard deviations
     :param load: from the end of the record on: a number; a profile, ``Load(time_s, value, unit)``; a ``Cycle``; a function
-        of time in s that takes an array; or a ``RandomLoad``, of which each sample draws its own. ``None``: as above
+        of time in s that takes an array; or a ``RandomLoad``, of which each sample draws its own. ``None``: as above. Over
+        each time step of the model the mean of the load flows, and of a function its value at the start of the step
     :param cut_off_V: voltage at which the discharge ends, V; ``None``: the ``VEOD`` of the model's cell
     :param load_unit: of a number or a function: ``"power"`` in W or ``"current"`` in A. Other loads have their own
     :param model: the model that the estimate belongs to, ``LeastSquares(...).model``; ``None``: ``RecordModel()``
@@ -246,7 +247,7 @@ def forecast(
     soc = cells.soc()
     if nominal_Ah is None:
         new = _draw(to_come, rng)
-        nominal_Ah = model.capacity_Ah(new, new.unit, cut_off, max_duration_s)
+        nominal_Ah = model.capacity_Ah(in_steps(new, model.dt_s), new.unit, cut_off, max_duration_s)
     if over:
         ends = _Ends(np.zeros(samples), soc, np.zeros(1), np.full((len(BAND), 1), cut_off))
         above = np.flatnonzero(seen.voltage_V > cut_off + _ROUNDING_V)
@@ -439,7 +440,7 @@ def _discharge(cells: _Cells, error: _ModelError, loads: list[_Known], cut_off_V
                 loads = [loads[n] for n in np.flatnonzero(going)]
             going = np.ones(len(index), dtype=np.bool_)
             times_s = dt_s * np.arange(k, k + _CHUNK_STEPS, dtype=np.float64)
-            profiles = np.array([load.on_grid(times_s) if isinstance(load, Load) else load(times_s) for load in loads])
+            profiles = np.array([in_steps(load, dt_s)(times_s) for load in loads])
         soc = cells.soc()
         voltage_V = cells.voltage() + error.after(first_soc - soc)
         ended = np.flatnonzero(going & ~(voltage_V > cut_off_V))

@@ -17,6 +17,7 @@ from battery_env.checks import check_whole_number
 from battery_env.electrochemistry import STATE_SIZE, CellParameters, LoadUnit, Trajectory, simulate, state_of_charge, voltage
 from battery_env.estimates import Estimate, EstimateTrace, last_estimate
 from battery_env.estimators.state_files import load_state, save_state
+from battery_env.loads import in_steps
 from battery_env.parameters import PARAMETERS
 from battery_env.records import Record, Stream
 
@@ -186,8 +187,9 @@ class OnlineEstimator(Estimator):
         offset: the change of the time over one standard deviation of each to both sides, or to one where the other one leaves
         what a cell can be. :func:`battery_env.forecast` counts more, and takes random loads; it needs the record.
 
-        :param load: as in :func:`battery_env.simulate`: a number, an array of one value a step, or a function of time in s,
-            such as a :class:`battery_env.loads.Load`. Under a negative number, a charge, the cut-off is never reached
+        :param load: a number; an array of one value a step of ``dt_s``; a :class:`battery_env.loads.Load` or a ``Cycle``, of
+            which the mean over each step counts; or any function of time in s, of which its value at the start of each step
+            does. Under a negative number, a charge, the cut-off is never reached
         :param cut_off_V: V; ``None``: the ``VEOD`` of the cell
         :param load_unit: ``"current"`` in A or ``"power"`` in W
         :return: time and standard deviation
@@ -196,6 +198,7 @@ class OnlineEstimator(Estimator):
         now = self.now()
         middle = np.concatenate([now.state, now.parameters])
         end_V = now.cell.VEOD if cut_off_V is None else cut_off_V
+        load = in_steps(load, now.dt_s)
 
         def discharge(point: FloatArray) -> Trajectory:
             return simulate(

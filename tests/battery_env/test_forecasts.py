@@ -53,6 +53,13 @@ class TestLoads:
         number_s = certain(record, 8.0, load_unit="power").eod_time_s[0]
         assert number_s == certain(record, constant(8.0)).eod_time_s[0] != ends_s[0]
 
+    @pytest.mark.parametrize(("starts_s", "values_A"), [([0.0, 1.0], [10.0, 2.0]), ([0.0, 1.5, 2.5], [2.0, 10.0, 2.0])])
+    def test_pulses_shorter_than_a_step_draw_what_they_do(self, starts_s, values_A):
+        record = half(discharged(3.0, load_unit="current"))
+        pulses, mean = (certain(record, load) for load in (Cycle(Load(starts_s, values_A, "current"), 8.0), 3.0))
+        np.testing.assert_allclose(pulses.remaining_s, mean.remaining_s, rtol=0.05)
+        assert pulses.nominal_Ah == pytest.approx(mean.nominal_Ah, rel=0.02)
+
     def test_pulses_go_on_as_pulses(self):
         pulses_A = np.where(np.arange(4000) % 30 < 15, 4.0, 0.0)
         record = discharged(pulses_A, load_unit="current")

@@ -12,6 +12,7 @@ from battery_env.cells import Discharge, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, STATE_SIZE, initial_state, rest_shares, simulate, voltage
 from battery_env.estimators.base import ModelNow, OnlineEstimator
 from battery_env.estimators.rest import rest_voltages_V
+from battery_env.loads import Cycle, Load
 from battery_env.records import Stream, are_plausible, check_sample
 
 NOISE_V = 0.005
@@ -322,6 +323,12 @@ class TestModel:
             filter_.remaining(np.append(np.full(900, -2.0), np.full(9000, 2.0)))
         with pytest.raises(ValueError, match="beyond full"):
             filter_.remaining(lambda time_s: np.where(time_s < 900.0, -2.0, 2.0))
+
+    def test_pulses_shorter_than_a_step_draw_what_they_do(self, whole):
+        filter_ = ExtendedKalmanFilter(thermal=True)
+        follow(filter_, whole.part(0, 600))
+        pulses = Cycle(Load([0.0, 0.25, 0.75], [1.0, 10.0, 1.0], "current"), 5.0)
+        assert filter_.remaining(pulses).time_s == pytest.approx(filter_.remaining(1.9).time_s, rel=0.02)
 
     def test_of_a_policy(self, whole):
         estimator, half = policy_estimator(), len(whole.time_s) // 2
