@@ -15,6 +15,7 @@ from battery_env.arrays import BoolArray, FloatArray, IntArray
 from battery_env.checks import LOAD_UNIT_SYMBOLS, LoadUnit, check_load, check_numbers, check_positive, check_whole_number
 from battery_env.electrochemistry import state_of_charge, step_into, voltage_into
 from battery_env.estimates import Estimate
+from battery_env.estimators.base import is_overfull, overfull_error
 from battery_env.estimators.settling import white_noise_V
 from battery_env.loads import BlockBootstrap, Cycle, Load, RandomLoad, Spliced, constant, in_steps, steadier_unit
 from battery_env.parameters import Q_MOBILE, R_O
@@ -197,7 +198,8 @@ def forecast(
     :param max_duration_s: where to stop if the discharge does not end by itself, s
     :return: the samples, with quantiles, a summary and a plot
     :raises TypeError: for a load of another type
-    :raises ValueError: for an argument out of range, or an estimate that the record contradicts
+    :raises ValueError: for an argument out of range, an estimate that the record contradicts, or a load that charges the cell
+        beyond full
     """
     model = RecordModel() if model is None else model
     cell = model.cell
@@ -248,6 +250,7 @@ def forecast(
     if nominal_Ah is None:
         new = _draw(to_come, rng)
         nominal_Ah = model.capacity_Ah(in_steps(new, model.dt_s), new.unit, cut_off, max_duration_s)
+        nominal_Ah = nominal_Ah if nominal_Ah > 0.0 else float("nan")  # a charge takes no full cell to its end
     if over:
         ends = _Ends(np.zeros(samples), soc, np.zeros(1), np.full((len(BAND), 1), cut_off))
         above = np.flatnonzero(seen.voltage_V > cut_off + _ROUNDING_V)
@@ -442,6 +445,8 @@ def _discharge(cells: _Cells, error: _ModelError, loads: list[_Known], cut_off_V
             times_s = dt_s * np.arange(k, k + _CHUNK_STEPS, dtype=np.float64)
             profiles = np.array([in_steps(load, dt_s)(times_s) for load in loads])
         soc = cells.soc()
+        if (going & is_overfull(soc, first_soc)).any():
+            raise overfull_error(dt_s * k)
         voltage_V = cells.voltage() + error.after(first_soc - soc)
         ended = np.flatnonzero(going & ~(voltage_V > cut_off_V))
         if len(ended):

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from battery_env.arrays import FloatArray
+from battery_env.arrays import BoolArray, FloatArray
 from battery_env.checks import check_whole_number
 from battery_env.electrochemistry import STATE_SIZE, CellParameters, LoadUnit, Trajectory, simulate, state_of_charge, voltage
 from battery_env.estimates import Estimate, EstimateTrace, last_estimate
@@ -49,6 +49,30 @@ class Estimator(ABC):
         :return: one trace per discharge, in the same order
         """
         return [EstimateTrace.of([record.time_s[-1]], [self.estimate(record)]) for record in records]
+
+
+def is_overfull(soc: FloatArray, first_soc: FloatArray) -> BoolArray:
+    """
+    Whether a load has charged a cell by more than it takes.
+
+    :param soc: state of charge, shape (...)
+    :param first_soc: when the load began, of the same shape or one that broadcasts to it
+    :return: shape (...)
+    """
+    return np.asarray(soc > np.maximum(first_soc, 1.0) + SURPLUS_SHARE)
+
+
+def overfull_error(after_s: float) -> ValueError:
+    """
+    What to say of such a load.
+
+    :param after_s: when that was, s after the load began
+    :return: to be raised
+    """
+    return ValueError(
+        f"load charges the cell beyond full, by more than {SURPLUS_SHARE:.0%} of its charge, after {after_s:g} s. Positive "
+        "loads discharge: check its sign, or begin with the discharge."
+    )
 
 
 class Remaining(NamedTuple):
@@ -215,12 +239,9 @@ class OnlineEstimator(Estimator):
 
         expected = discharge(middle)
         soc = state_of_charge(expected.state, middle[STATE_SIZE])
-        full = np.flatnonzero(soc > np.append(soc[:1], 1.0).max() + SURPLUS_SHARE)
+        full = np.flatnonzero(is_overfull(soc, soc[:1]))
         if len(full) and (callable(load) or np.ndim(load)):
-            raise ValueError(
-                f"load charges the cell beyond full, by more than {SURPLUS_SHARE:.0%} of its charge, after "
-                f"{expected.time_s[full[0]]:g} s. Positive loads discharge: check its sign, or begin with the discharge."
-            )
+            raise overfull_error(expected.time_s[full[0]])
         if len(full) or np.isnan(expected.eod_time_s):
             return Remaining(float("inf"), float("nan"))
         if not len(now.deviations):

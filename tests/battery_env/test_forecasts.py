@@ -1,5 +1,7 @@
 """Forecasts are the model's where everything is known, and as wide as what is not known where it is not."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -80,6 +82,22 @@ class TestLoads:
         record = half(discharged(8.0))
         found = certain(record, RandomPiecewise((4.0, 12.0)))
         assert len(set(found.eod_time_s)) == 3
+
+    def test_a_charge_on_the_way_comes_on_top_and_one_beyond_full_is_refused(self):
+        record = half(discharged(4.0, load_unit="current"))
+        back = Load([0.0, 300.0], [-1.0, 4.0], "current")
+        whole = discharged(np.append(record.load[:-1], back(4.0 * np.arange(400))), load_unit="current")
+        assert (np.abs(certain(record, back).eod_time_s - whole.eod_time_s) <= 4.0).all()
+        beyond = Load([0.0, 3600.0], [-2.0, 4.0], "current")
+        # 2 A bring back what 4 A took in twice the time
+        after_s = 2.0 * record.time_s[-1] + 0.01 * 6000.0 / 2.0
+        with pytest.raises(ValueError, match="beyond full, by more than 1% of its charge, after") as refused:
+            certain(record, beyond)
+        assert float(re.search(r"after (\d+) s", str(refused.value))[1]) == pytest.approx(after_s, abs=8.0)
+
+    def test_under_a_charge_there_is_neither_end_nor_health(self):
+        found = certain(half(discharged(4.0, load_unit="current")), -2.0)
+        assert np.isinf(found.eod_time_s).all() and np.isnan(found.nominal_Ah)
 
     def test_without_a_load_there_is_no_end(self):
         current_A = np.where(np.arange(300) < 60, 4.0, 0.0)
