@@ -58,8 +58,9 @@ class Forecast:
     :param soc: state of charge at the end of the record: the share of ``q_mobile`` left in the negative electrode, shape (n,)
     :param q_mobile: charge that can move, C, shape (n,)
     :param r_o: ohmic resistance, ohm, shape (n,)
-    :param capacity_Ah: charge given from the first sample of the record to the end of discharge, which is the capacity at this
-        load of a cell that started full, Ah, shape (n,); NaN where the end is not reached
+    :param capacity_Ah: charge given from full to the end of discharge, which is the capacity at this load, Ah, shape (n,): where
+        the record starts partly charged (``initial_soc`` of the model), what was missing then is added. NaN where the end is
+        not reached
     :param nominal_Ah: capacity of the cell when new, Ah
     :param time_s: from the end of the record on, on its clock, s, shape (K,)
     :param voltage_V: quantiles :data:`BAND` of the voltage then, V, shape (3, K); a discharge that has ended counts as at
@@ -260,7 +261,6 @@ def forecast(
         now_s = float(np.interp(cut_off, seen.voltage_V[around], seen.time_s[around]))
     else:
         ends, now_s = _discharge(cells, error, draws[-samples:], cut_off, max_duration_s), float(seen.time_s[-1])
-    full_soc = state_of_charge(model.start(cells.q_mobile), cells.q_mobile)
     return Forecast(
         record=seen,
         load_name=load_name,
@@ -269,7 +269,7 @@ def forecast(
         soc=soc,
         q_mobile=cells.q_mobile,
         r_o=cells.r_o,
-        capacity_Ah=(full_soc - ends.soc) * cells.q_mobile / 3600.0,
+        capacity_Ah=(1.0 - ends.soc) * cells.q_mobile / 3600.0,
         nominal_Ah=float(nominal_Ah),
         time_s=now_s + ends.course_s,
         voltage_V=ends.course_V,
