@@ -58,9 +58,9 @@ class Forecast:
     :param soc: state of charge at the end of the record: the share of ``q_mobile`` left in the negative electrode, shape (n,)
     :param q_mobile: charge that can move, C, shape (n,)
     :param r_o: ohmic resistance, ohm, shape (n,)
-    :param capacity_Ah: charge given from full to the end of discharge, which is the capacity at this load, Ah, shape (n,): where
-        the record starts partly charged (``initial_soc`` of the model), what was missing then is added. NaN where the end is
-        not reached
+    :param capacity_Ah: charge given from full to the end of discharge, which is the capacity at this load, Ah, shape (n,).
+        Where the record starts partly charged (``initial_soc`` of the model), what was missing then is added; NaN where the
+        end is not reached
     :param nominal_Ah: capacity of the cell when new, Ah
     :param time_s: from the end of the record on, on its clock, s, shape (K,)
     :param voltage_V: quantiles :data:`BAND` of the voltage then, V, shape (3, K); a discharge that has ended counts as at

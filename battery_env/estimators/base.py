@@ -23,6 +23,8 @@ from battery_env.records import Record, Stream
 
 #: A full cell takes no more charge than this share of its own.
 SURPLUS_SHARE = 0.01
+# A discharge is followed for no longer than a day, s.
+_LONGEST_S = 86_400.0
 # Points between limits keep this far from them, as a share of their distance, so that rounding leaves them within.
 _ROUNDING = 1e-9
 
@@ -217,7 +219,8 @@ class OnlineEstimator(Estimator):
         :param cut_off_V: V; ``None``: the ``VEOD`` of the cell
         :param load_unit: ``"current"`` in A or ``"power"`` in W
         :return: time and standard deviation
-        :raises ValueError: for a load that cannot be meant, also for one that varies and charges the cell beyond full
+        :raises ValueError: for a load that cannot be meant, also for one that varies and charges the cell beyond full, and for
+            an array that ends before the discharge does
         """
         now = self.now()
         middle = np.concatenate([now.state, now.parameters])
@@ -235,6 +238,7 @@ class OnlineEstimator(Estimator):
                 cell=now.cell,
                 initial=point[:STATE_SIZE],
                 cut_off_V=end_V - float(point[-1]),
+                max_duration_s=_LONGEST_S,
             )
 
         expected = discharge(middle)
@@ -242,6 +246,12 @@ class OnlineEstimator(Estimator):
         full = np.flatnonzero(is_overfull(soc, soc[:1]))
         if len(full) and (callable(load) or np.ndim(load)):
             raise overfull_error(expected.time_s[full[0]])
+        followed_s = len(expected.time_s) * now.dt_s
+        if np.isnan(expected.eod_time_s) and followed_s <= _LONGEST_S:  # of an array alone
+            raise ValueError(
+                f"load ends after {followed_s:g} s, before the discharge does. Append what is to come, or "
+                "give a Load of battery_env.loads, whose last value goes on."
+            )
         if len(full) or np.isnan(expected.eod_time_s):
             return Remaining(float("inf"), float("nan"))
         if not len(now.deviations):

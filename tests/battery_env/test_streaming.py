@@ -324,6 +324,16 @@ class TestModel:
         with pytest.raises(ValueError, match="beyond full"):
             filter_.remaining(lambda time_s: np.where(time_s < 900.0, -2.0, 2.0))
 
+    def test_an_array_that_ends_before_the_discharge_is_refused(self, whole):
+        filter_ = ExtendedKalmanFilter(thermal=True)
+        follow(filter_, whole.part(0, 600))
+        left_s = filter_.remaining(2.0).time_s
+        assert filter_.remaining(np.full(int(left_s) + 100, 2.0)).time_s == left_s
+        with pytest.raises(ValueError, match=r"load ends after 600 s, before .* a Load of battery_env\.loads"):
+            filter_.remaining(np.full(600, 2.0))
+        # a day of rest is none
+        assert filter_.remaining(np.zeros(86_401)).time_s == np.inf
+
     def test_pulses_shorter_than_a_step_draw_what_they_do(self, whole):
         filter_ = ExtendedKalmanFilter(thermal=True)
         follow(filter_, whole.part(0, 600))
