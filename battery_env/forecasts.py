@@ -15,8 +15,9 @@ from battery_env.arrays import BoolArray, FloatArray, IntArray
 from battery_env.checks import LOAD_UNIT_SYMBOLS, LoadUnit, check_load, check_numbers, check_positive, check_whole_number
 from battery_env.electrochemistry import state_of_charge, step_into, voltage_into
 from battery_env.estimates import Estimate
+from battery_env.estimators.base import is_overfull, overfull_error
 from battery_env.estimators.settling import white_noise_V
-from battery_env.loads import BlockBootstrap, Cycle, Load, RandomLoad, Spliced, constant, steadier_unit
+from battery_env.loads import BlockBootstrap, Cycle, Load, RandomLoad, Spliced, constant, in_steps, steadier_unit
 from battery_env.parameters import Q_MOBILE, R_O
 from battery_env.plotting import COLOURS, new_figure
 from battery_env.record_model import RecordModel
@@ -39,6 +40,8 @@ _CHUNK_STEPS = 256
 _COURSE_S = 10.0
 # The last voltage of a record may be the cut-off but for rounding, V.
 _ROUNDING_V = 1e-6
+# The capacity of a new cell under a random load is the mean of so many draws, which makes it sure to 1 %.
+_NOMINAL_DRAWS = 100
 # An estimate this many standard deviations below what the record takes out of the cell contradicts the record.
 _CONTRADICTION_SD = 5.0
 
@@ -55,8 +58,9 @@ class Forecast:
     :param soc: state of charge at the end of the record: the share of ``q_mobile`` left in the negative electrode, shape (n,)
     :param q_mobile: charge that can move, C, shape (n,)
     :param r_o: ohmic resistance, ohm, shape (n,)
-    :param capacity_Ah: charge given from the first sample of the record to the end of discharge, which is the capacity at this
-        load of a cell that started full, Ah, shape (n,); NaN where the end is not reached
+    :param capacity_Ah: charge given from full to the end of discharge, which is the capacity at this load, Ah, shape (n,).
+        Where the record starts partly charged (``initial_soc`` of the model), what was missing then is added; NaN where the
+        end is not reached
     :param nominal_Ah: capacity of the cell when new, Ah
     :param time_s: from the end of the record on, on its clock, s, shape (K,)
     :param voltage_V: quantiles :data:`BAND` of the voltage then, V, shape (3, K); a discharge that has ended counts as at
@@ -184,19 +188,21 @@ def forecast(
     :param record: one discharge from its first sample to now, of a cell that was full unless ``model`` says otherwise
     :param estimate: of any calibrator, best with its standard deviations
     :param load: from the end of the record on: a number; a profile, ``Load(time_s, value, unit)``; a ``Cycle``; a function
-        of time in s that takes an array; or a ``RandomLoad``, of which each sample draws its own. ``None``: as above
+        of time in s that takes an array; or a ``RandomLoad``, of which each sample draws its own. ``None``: as above. Over
+        each time step of the model the mean of the load flows, and of a function its value at the start of the step
     :param cut_off_V: voltage at which the discharge ends, V; ``None``: the ``VEOD`` of the model's cell
     :param load_unit: of a number or a function: ``"power"`` in W or ``"current"`` in A. Other loads have their own
     :param model: the model that the estimate belongs to, ``LeastSquares(...).model``; ``None``: ``RecordModel()``
     :param mismatch_V: error to expect of the model, V; 0.05 V suits the bundled real cells, 0 simulated ones without mismatch
     :param nominal_Ah: capacity that counts as a state of health of 1, Ah; ``None``: the charge that the model's cell, with
-        its own ``q_mobile`` and ``r_o``, gives from full under the load to come
+        its own ``q_mobile`` and ``r_o``, gives from full under the load to come, on average where that is random
     :param samples: how many
     :param seed: seed of all that is drawn
     :param max_duration_s: where to stop if the discharge does not end by itself, s
     :return: the samples, with quantiles, a summary and a plot
     :raises TypeError: for a load of another type
-    :raises ValueError: for an argument out of range, or an estimate that the record contradicts
+    :raises ValueError: for an argument out of range, an estimate that the record contradicts, or a load that charges the cell
+        beyond full
     """
     model = RecordModel() if model is None else model
     cell = model.cell
@@ -244,18 +250,17 @@ def forecast(
         chosen = np.where(np.isin(chosen, alive), chosen, rng.choice(alive, size=samples))
         cells, error = cells.part(chosen), error.part(chosen)
     soc = cells.soc()
+    # the first draw is that of the new cell alone
+    draws = _draws(to_come, samples + 1, rng) if isinstance(to_come, RandomLoad) else [to_come]
     if nominal_Ah is None:
-        new = _draw(to_come, rng)
-        nominal_Ah = model.capacity_Ah(new, new.unit, cut_off, max_duration_s)
+        nominal_Ah = _nominal_Ah(model, draws[:_NOMINAL_DRAWS], cut_off, max_duration_s)
     if over:
         ends = _Ends(np.zeros(samples), soc, np.zeros(1), np.full((len(BAND), 1), cut_off))
         above = np.flatnonzero(seen.voltage_V > cut_off + _ROUNDING_V)
         around = [above[-1] + 1, above[-1]] if len(above) else [0]
         now_s = float(np.interp(cut_off, seen.voltage_V[around], seen.time_s[around]))
     else:
-        loads = [_draw(to_come, rng) for _ in range(samples)] if isinstance(to_come, RandomLoad) else [to_come]
-        ends, now_s = _discharge(cells, error, loads, cut_off, max_duration_s), float(seen.time_s[-1])
-    full_soc = state_of_charge(model.start(cells.q_mobile), cells.q_mobile)
+        ends, now_s = _discharge(cells, error, draws[-samples:], cut_off, max_duration_s), float(seen.time_s[-1])
     return Forecast(
         record=seen,
         load_name=load_name,
@@ -264,7 +269,7 @@ def forecast(
         soc=soc,
         q_mobile=cells.q_mobile,
         r_o=cells.r_o,
-        capacity_Ah=(full_soc - ends.soc) * cells.q_mobile / 3600.0,
+        capacity_Ah=(1.0 - ends.soc) * cells.q_mobile / 3600.0,
         nominal_Ah=float(nominal_Ah),
         time_s=now_s + ends.course_s,
         voltage_V=ends.course_V,
@@ -313,8 +318,25 @@ def _to_come(load: FutureLoad | None, unit: LoadUnit, record: Samples, model: Re
     return constant(float(value), unit), f"{value:g} {LOAD_UNIT_SYMBOLS[unit]}"
 
 
-def _draw(load: _Known | RandomLoad, rng: np.random.Generator) -> _Known:
-    return load(rng) if isinstance(load, RandomLoad) else load
+def _draws(load: RandomLoad, count: int, rng: np.random.Generator) -> list[_Known]:
+    name, draws = type(load).__name__, [load(rng) for _ in range(count)]
+    others = [drawn for drawn in draws if not isinstance(drawn, (Load, Cycle, Spliced))]
+    if others:
+        raise TypeError(
+            f"a draw of {name} must be a load of battery_env.loads, such as a Load or a Cycle, got {others[0]!r}. Lay a "
+            "function of time out: Load(time_s, function(time_s), unit)."
+        )
+    units = sorted({drawn.unit for drawn in draws})
+    if len(units) > 1:
+        raise ValueError(f"the draws of {name} must all have the same unit, got {' and '.join(units)}")
+    return list(draws)
+
+
+def _nominal_Ah(model: RecordModel, loads: list[_Known], cut_off_V: float, max_duration_s: float) -> float:
+    """The capacity of the model's cell, its mean over loads: under a single draw, health would be a matter of that draw."""
+    given = [model.capacity_Ah(in_steps(load, model.dt_s), load.unit, cut_off_V, max_duration_s) for load in loads]
+    reached = [each_Ah for each_Ah in given if each_Ah > 0.0]  # no charge takes a full cell to its end
+    return float(np.mean(reached)) if reached else float("nan")
 
 
 def _draw_parameters(
@@ -424,8 +446,8 @@ def _discharge(cells: _Cells, error: _ModelError, loads: list[_Known], cut_off_V
     """Take cells down to the cut-off; ``loads``: one for all, or one a cell."""
     dt_s, unit, count = cells.model.dt_s, loads[0].unit, len(cells.q_mobile)
     steps, every = int(max_duration_s / dt_s + 1e-9), max(round(_COURSE_S / dt_s), 1)
-    if isinstance(loads[0], Load) and not any((load.value > 0.0).any() for load in loads if isinstance(load, Load)):
-        steps = 0  # it is off for ever
+    # cells whose load is off for ever are followed no longer than the others
+    off = np.broadcast_to([isinstance(load, Load) and not (load.value > 0.0).any() for load in loads], count)
     time_s, end_soc, shown_V = np.full(count, np.inf), np.full(count, np.nan), np.empty(count)
     course: list[tuple[float, FloatArray]] = []
     index, going = np.arange(count), np.ones(count, dtype=np.bool_)
@@ -434,13 +456,15 @@ def _discharge(cells: _Cells, error: _ModelError, loads: list[_Known], cut_off_V
     for k in range(steps + 1):
         if k % _CHUNK_STEPS == 0:
             cells, error, index = cells.part(going), error.part(going), index[going]
-            first_soc, last_soc, last_V = first_soc[going], last_soc[going], last_V[going]
+            first_soc, last_soc, last_V, off = first_soc[going], last_soc[going], last_V[going], off[going]
             if len(loads) > 1:
                 loads = [loads[n] for n in np.flatnonzero(going)]
             going = np.ones(len(index), dtype=np.bool_)
             times_s = dt_s * np.arange(k, k + _CHUNK_STEPS, dtype=np.float64)
-            profiles = np.array([load.on_grid(times_s) if isinstance(load, Load) else load(times_s) for load in loads])
+            profiles = np.array([in_steps(load, dt_s)(times_s) for load in loads])
         soc = cells.soc()
+        if (going & is_overfull(soc, first_soc)).any():
+            raise overfull_error(dt_s * k)
         voltage_V = cells.voltage() + error.after(first_soc - soc)
         ended = np.flatnonzero(going & ~(voltage_V > cut_off_V))
         if len(ended):
@@ -450,11 +474,12 @@ def _discharge(cells: _Cells, error: _ModelError, loads: list[_Known], cut_off_V
             time_s[index[ended]] = dt_s * (k - 1 + share) if k else 0.0
             end_soc[index[ended]] = last_soc[ended] + share * (soc[ended] - last_soc[ended])
             going[ended] = False
-        if k % every == 0 or not going.any():
+        is_over = not (going & ~off).any()
+        if k % every == 0 or is_over:
             shown_V[:] = cut_off_V
             shown_V[index[going]] = voltage_V[going]
             course.append((dt_s * k, _quantile(shown_V, BAND)))
-        if not going.any():
+        if is_over:
             break
         last_V, last_soc = voltage_V, soc
         load = profiles[:, k % _CHUNK_STEPS]

@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,6 +18,8 @@ from battery_env.records import SWITCH_SHARE, Record, drawn, resample_current
 _MOST_SEGMENTS = 1e6  # of a random load; beyond, a time is meant in another unit
 #: The blocks of :class:`BlockBootstrap`, as a share of the record.
 BLOCK_SHARE = 0.1
+
+_AnyLoad = TypeVar("_AnyLoad")
 
 
 def _check_segments(total_s: float, name: str, shortest_s: float) -> None:
@@ -73,6 +76,26 @@ class Load:
         bounds = np.append(np.searchsorted(time_s, self.start_s), len(time_s))
         return np.repeat(self.value, np.diff(bounds))
 
+    @cached_property
+    def _totals(self) -> FloatArray:
+        return np.append(0.0, np.cumsum(self.value[:-1] * np.diff(self.start_s)))
+
+    def _drawn(self, time_s: FloatArray) -> FloatArray:
+        """Until some times, charge of a current, C, or energy of a power, J."""
+        # the last value goes on
+        beyond_s = np.maximum(time_s - self.start_s[-1], 0.0)
+        return np.asarray(np.interp(time_s, self.start_s, self._totals) + self.value[-1] * beyond_s)
+
+    def mean(self, time_s: FloatArray, dt_s: float) -> FloatArray:
+        """
+        The mean of the load over steps: what a simulation in such steps has to take, so that it draws what the load does.
+
+        :param time_s: starts of the steps, s, at least 0, any shape
+        :param dt_s: length of the steps, s
+        :return: the load, same shape
+        """
+        return (self._drawn(time_s + dt_s) - self._drawn(time_s)) / dt_s
+
 
 @dataclass(frozen=True, eq=False)
 class Cycle:
@@ -108,6 +131,20 @@ class Cycle:
         within = time - self.period_s * np.floor(time / self.period_s + 1e-9)
         return self.load(np.where(time < 0.0, time, np.maximum(within, 0.0)))
 
+    def _drawn(self, time_s: FloatArray) -> FloatArray:
+        cycles, within_s = np.divmod(time_s, self.period_s)
+        return cycles * self.load._drawn(np.asarray(self.period_s)) + self.load._drawn(within_s)
+
+    def mean(self, time_s: FloatArray, dt_s: float) -> FloatArray:
+        """
+        The mean of the load over steps, as :meth:`Load.mean`.
+
+        :param time_s: starts of the steps, s, at least 0, any shape
+        :param dt_s: length of the steps, s
+        :return: the load, same shape
+        """
+        return (self._drawn(time_s + dt_s) - self._drawn(time_s)) / dt_s
+
 
 @dataclass(frozen=True, eq=False)
 class Spliced:
@@ -138,6 +175,20 @@ class Spliced:
         block, within = np.divmod((np.asarray(time_s) / self.dt_s + 1e-9).astype(np.int64), self.length)
         return np.asarray(self.value[(self.start[block % len(self.start)] + within) % len(self.value)])
 
+    def mean(self, time_s: FloatArray, dt_s: float) -> FloatArray:
+        """
+        The mean of the load over steps, as :meth:`Load.mean`.
+
+        :param time_s: starts of the steps, s, at least 0, any shape
+        :param dt_s: length of the steps, s
+        :return: the load, same shape
+        """
+        # no more of the values than the steps are in: a draw is as long as a day
+        start, length = time_s / self.dt_s, dt_s / self.dt_s
+        places = np.arange(int(start.min()), int(np.ceil(start.max() + length)) + 1, dtype=np.float64)
+        totals = np.append(0.0, np.cumsum(self(self.dt_s * places[:-1])))
+        return (np.interp(start + length, places, totals) - np.interp(start, places, totals)) / length
+
 
 #: Draws a load at random: what :meth:`battery_env.trajectories.TrajectoryDataset.generate` takes for random loads.
 LoadSampler = Callable[[np.random.Generator], Load]
@@ -156,6 +207,45 @@ class RandomLoad(ABC):
         :param rng: source of randomness
         :return: the load
         """
+
+
+@dataclass(frozen=True, eq=False)
+class InSteps:
+    """
+    A load for a simulation in steps, whose load over each step is the mean of this one: pulses that are shorter than a step,
+    or not in step, draw what they do.
+
+    :param load: the load
+    :param dt_s: length of the steps, s
+    """
+
+    load: Load | Cycle | Spliced
+    dt_s: float
+
+    @property
+    def unit(self) -> LoadUnit:
+        """``"power"`` or ``"current"``."""
+        return self.load.unit
+
+    def __call__(self, time_s: FloatArray) -> FloatArray:
+        """
+        The load over some steps.
+
+        :param time_s: where they start, s, at least 0, any shape
+        :return: the load, same shape
+        """
+        return self.load.mean(time_s, self.dt_s)
+
+
+def in_steps(load: _AnyLoad, dt_s: float) -> InSteps | _AnyLoad:
+    """
+    A load for a simulation in steps.
+
+    :param load: any that a simulation takes
+    :param dt_s: length of the steps, s
+    :return: the mean over each step of a load that knows it; others, such as functions of time, as they are
+    """
+    return InSteps(load, dt_s) if isinstance(load, (Load, Cycle, Spliced)) else load
 
 
 def constant(value: float, unit: LoadUnit = "power") -> Load:

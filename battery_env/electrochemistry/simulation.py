@@ -296,7 +296,7 @@ def simulate(
     Discharge one cell under a load, from full charge (or from ``initial``), compiled.
 
     :param load: a number; an array, one value a step; or a function of time in s (a :class:`battery_env.loads.Load`)
-        that takes an array. Power in W or current in A
+        that takes an array, and whose value at the start of each step holds for the step. Power in W or current in A
     :param q_mobile: charge that can move, C; ``None``: the cell's
     :param r_o: ohmic resistance, ohm; ``None``: the cell's
     :param until: ``"eod"`` (the end of discharge) or a duration in s, whichever of the two comes first

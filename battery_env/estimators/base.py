@@ -12,16 +12,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from battery_env.arrays import FloatArray
+from battery_env.arrays import BoolArray, FloatArray
 from battery_env.checks import check_whole_number
 from battery_env.electrochemistry import STATE_SIZE, CellParameters, LoadUnit, Trajectory, simulate, state_of_charge, voltage
 from battery_env.estimates import Estimate, EstimateTrace, last_estimate
 from battery_env.estimators.state_files import load_state, save_state
+from battery_env.loads import in_steps
 from battery_env.parameters import PARAMETERS
 from battery_env.records import Record, Stream
 
 #: A full cell takes no more charge than this share of its own.
 SURPLUS_SHARE = 0.01
+# A discharge is followed for no longer than a day, s.
+_LONGEST_S = 86_400.0
 # Points between limits keep this far from them, as a share of their distance, so that rounding leaves them within.
 _ROUNDING = 1e-9
 
@@ -48,6 +51,30 @@ class Estimator(ABC):
         :return: one trace per discharge, in the same order
         """
         return [EstimateTrace.of([record.time_s[-1]], [self.estimate(record)]) for record in records]
+
+
+def is_overfull(soc: FloatArray, first_soc: FloatArray) -> BoolArray:
+    """
+    Whether a load has charged a cell by more than it takes.
+
+    :param soc: state of charge, shape (...)
+    :param first_soc: when the load began, of the same shape or one that broadcasts to it
+    :return: shape (...)
+    """
+    return np.asarray(soc > np.maximum(first_soc, 1.0) + SURPLUS_SHARE)
+
+
+def overfull_error(after_s: float) -> ValueError:
+    """
+    What to say of such a load.
+
+    :param after_s: when that was, s after the load began
+    :return: to be raised
+    """
+    return ValueError(
+        f"load charges the cell beyond full, by more than {SURPLUS_SHARE:.0%} of its charge, after {after_s:g} s. Positive "
+        "loads discharge: check its sign, or begin with the discharge."
+    )
 
 
 class Remaining(NamedTuple):
@@ -186,16 +213,19 @@ class OnlineEstimator(Estimator):
         offset: the change of the time over one standard deviation of each to both sides, or to one where the other one leaves
         what a cell can be. :func:`battery_env.forecast` counts more, and takes random loads; it needs the record.
 
-        :param load: as in :func:`battery_env.simulate`: a number, an array of one value a step, or a function of time in s,
-            such as a :class:`battery_env.loads.Load`. Under a negative number, a charge, the cut-off is never reached
+        :param load: a number; an array of one value a step of ``dt_s``; a :class:`battery_env.loads.Load` or a ``Cycle``, of
+            which the mean over each step counts; or any function of time in s, of which its value at the start of each step
+            does. Under a negative number, a charge, the cut-off is never reached
         :param cut_off_V: V; ``None``: the ``VEOD`` of the cell
         :param load_unit: ``"current"`` in A or ``"power"`` in W
         :return: time and standard deviation
-        :raises ValueError: for a load that cannot be meant, also for one that varies and charges the cell beyond full
+        :raises ValueError: for a load that cannot be meant, also for one that varies and charges the cell beyond full, and for
+            an array that ends before the discharge does
         """
         now = self.now()
         middle = np.concatenate([now.state, now.parameters])
         end_V = now.cell.VEOD if cut_off_V is None else cut_off_V
+        load = in_steps(load, now.dt_s)
 
         def discharge(point: FloatArray) -> Trajectory:
             return simulate(
@@ -208,15 +238,19 @@ class OnlineEstimator(Estimator):
                 cell=now.cell,
                 initial=point[:STATE_SIZE],
                 cut_off_V=end_V - float(point[-1]),
+                max_duration_s=_LONGEST_S,
             )
 
         expected = discharge(middle)
         soc = state_of_charge(expected.state, middle[STATE_SIZE])
-        full = np.flatnonzero(soc > np.append(soc[:1], 1.0).max() + SURPLUS_SHARE)
+        full = np.flatnonzero(is_overfull(soc, soc[:1]))
         if len(full) and (callable(load) or np.ndim(load)):
+            raise overfull_error(expected.time_s[full[0]])
+        followed_s = len(expected.time_s) * now.dt_s
+        if np.isnan(expected.eod_time_s) and followed_s <= _LONGEST_S:  # of an array alone
             raise ValueError(
-                f"load charges the cell beyond full, by more than {SURPLUS_SHARE:.0%} of its charge, after "
-                f"{expected.time_s[full[0]]:g} s. Positive loads discharge: check its sign, or begin with the discharge."
+                f"load ends after {followed_s:g} s, before the discharge does. Append what is to come, or "
+                "give a Load of battery_env.loads, whose last value goes on."
             )
         if len(full) or np.isnan(expected.eod_time_s):
             return Remaining(float("inf"), float("nan"))

@@ -1,10 +1,13 @@
 """Forecasts are the model's where everything is known, and as wide as what is not known where it is not."""
 
+import itertools
+import re
+
 import numpy as np
 import pytest
 
-from battery_env import Estimate, RecordModel, forecast, simulate
-from battery_env.loads import BlockBootstrap, Cycle, Load, RandomPiecewise, constant, steadier_unit
+from battery_env import Estimate, RecordModel, forecast, initial_state, simulate
+from battery_env.loads import BlockBootstrap, Cycle, Load, RandomLoad, RandomPiecewise, constant, steadier_unit
 from battery_env.records import Samples, resample_current
 
 TRUTH = Estimate(6000.0, 0.15)
@@ -53,6 +56,13 @@ class TestLoads:
         number_s = certain(record, 8.0, load_unit="power").eod_time_s[0]
         assert number_s == certain(record, constant(8.0)).eod_time_s[0] != ends_s[0]
 
+    @pytest.mark.parametrize(("starts_s", "values_A"), [([0.0, 1.0], [10.0, 2.0]), ([0.0, 1.5, 2.5], [2.0, 10.0, 2.0])])
+    def test_pulses_shorter_than_a_step_draw_what_they_do(self, starts_s, values_A):
+        record = half(discharged(3.0, load_unit="current"))
+        pulses, mean = (certain(record, load) for load in (Cycle(Load(starts_s, values_A, "current"), 8.0), 3.0))
+        np.testing.assert_allclose(pulses.remaining_s, mean.remaining_s, rtol=0.05)
+        assert pulses.nominal_Ah == pytest.approx(mean.nominal_Ah, rel=0.02)
+
     def test_pulses_go_on_as_pulses(self):
         pulses_A = np.where(np.arange(4000) % 30 < 15, 4.0, 0.0)
         record = discharged(pulses_A, load_unit="current")
@@ -74,6 +84,22 @@ class TestLoads:
         found = certain(record, RandomPiecewise((4.0, 12.0)))
         assert len(set(found.eod_time_s)) == 3
 
+    def test_a_charge_on_the_way_comes_on_top_and_one_beyond_full_is_refused(self):
+        record = half(discharged(4.0, load_unit="current"))
+        back = Load([0.0, 300.0], [-1.0, 4.0], "current")
+        whole = discharged(np.append(record.load[:-1], back(4.0 * np.arange(400))), load_unit="current")
+        assert (np.abs(certain(record, back).eod_time_s - whole.eod_time_s) <= 4.0).all()
+        beyond = Load([0.0, 3600.0], [-2.0, 4.0], "current")
+        # 2 A bring back what 4 A took in twice the time
+        after_s = 2.0 * record.time_s[-1] + 0.01 * 6000.0 / 2.0
+        with pytest.raises(ValueError, match="beyond full, by more than 1% of its charge, after") as refused:
+            certain(record, beyond)
+        assert float(re.search(r"after (\d+) s", str(refused.value))[1]) == pytest.approx(after_s, abs=8.0)
+
+    def test_under_a_charge_there_is_neither_end_nor_health(self):
+        found = certain(half(discharged(4.0, load_unit="current")), -2.0)
+        assert np.isinf(found.eod_time_s).all() and np.isnan(found.nominal_Ah)
+
     def test_without_a_load_there_is_no_end(self):
         current_A = np.where(np.arange(300) < 60, 4.0, 0.0)
         record = discharged(current_A, load_unit="current")
@@ -81,6 +107,52 @@ class TestLoads:
             assert np.isinf(found.eod_quantile_s()).all() and np.isinf(found.remaining_s).all()
             assert np.isnan(found.state_of_health).all() and "inf" in found.summary()
             found.plot()
+
+
+class Draws(RandomLoad):
+    """One given load after the other."""
+
+    def __init__(self, *loads):
+        self.loads = itertools.cycle(loads)
+
+    def __call__(self, rng):
+        return next(self.loads)
+
+
+class TestDraws:
+    record = half(discharged(4.0, load_unit="current"))
+
+    def test_health_is_not_that_of_a_single_draw(self):
+        load = RandomPiecewise((1.0, 6.0), (600.0, 2400.0), unit="current")
+        settings = {"model": MODEL, "mismatch_V": 0.0, "samples": 100}
+        nominal_Ah = [forecast(self.record, TRUTH, load, seed=seed, **settings).nominal_Ah for seed in range(5)]
+        assert np.ptp(nominal_Ah) < 0.06 * np.mean(nominal_Ah)  # of single draws a third
+
+    def test_the_first_draw_decides_for_no_other(self):
+        off, on = constant(0.0, "current"), constant(4.0, "current")
+        found = certain(self.record, Draws(off, on, off, on))
+        known_s = certain(self.record, 4.0).eod_time_s[0]
+        # the first one is the new cell's
+        np.testing.assert_array_equal(found.eod_time_s, [known_s, np.inf, known_s])
+        assert found.nominal_Ah == certain(self.record, 4.0).nominal_Ah
+        # the cell that is left rests, and nothing is to be seen of it after the others have ended
+        assert found.time_s[-1] == pytest.approx(known_s, abs=12.0) and found.voltage_V[2, -1] > 3.2
+
+    @pytest.mark.parametrize(
+        ("loads", "error", "message"),
+        [
+            (
+                (constant(4.0, "current"), constant(8.0)),
+                ValueError,
+                "of Draws must all have the same unit, got current and power",
+            ),
+            ((np.sin,), TypeError, "draw of Draws must be a load of battery_env.loads, such as a Load or a Cycle, got <ufunc"),
+            ((4.0,), TypeError, "must be a load of battery_env.loads, such as a Load or a Cycle, got 4.0"),
+        ],
+    )
+    def test_draws_that_cannot_be_meant_are_refused(self, loads, error, message):
+        with pytest.raises(error, match=message):
+            certain(self.record, Draws(*loads))
 
 
 class TestUncertainty:
@@ -143,6 +215,16 @@ class TestHealth:
         np.testing.assert_allclose(found.capacity_Ah, 4.0 * whole.eod_time_s / 3600.0, rtol=5e-3)
         given = forecast(half(whole), truth, model=MODEL, mismatch_V=0.0, samples=3, nominal_Ah=2.0)
         np.testing.assert_allclose(given.state_of_health, given.capacity_Ah / 2.0)
+
+    @pytest.mark.parametrize("soc", [0.9, 0.5])
+    def test_a_cell_that_starts_partly_charged_is_as_healthy(self, soc):
+        full, partly = (
+            half(discharged(4.0, load_unit="current", initial=initial_state(6000.0, soc=start))) for start in (1.0, soc)
+        )
+        model = RecordModel(dt_s=4.0, initial_soc=soc)
+        found = forecast(partly, TRUTH, model=model, mismatch_V=0.0, samples=3)
+        # not the same, as at 4 A a shorter discharge leaves less behind by diffusion
+        np.testing.assert_allclose(found.state_of_health, certain(full).state_of_health, rtol=0.04)
 
     def test_charge_that_is_left_is_what_was_not_drawn(self):
         seen = half(discharged(4.0, load_unit="current"))

@@ -8,7 +8,7 @@ from scipy.integrate import trapezoid
 
 from battery_env.cells import Discharge, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL
-from battery_env.loads import Load, RandomPiecewise, RandomWalk, constant, piecewise, recorded
+from battery_env.loads import Cycle, Load, RandomPiecewise, RandomWalk, Spliced, constant, piecewise, recorded
 
 
 def test_a_segment_holds_from_its_start_to_the_next():
@@ -45,6 +45,30 @@ def test_a_load_on_a_grid_is_the_load_at_its_times(durations, dt_s, steps, seed)
     grid = dt_s * np.arange(steps)
     np.testing.assert_array_equal(load.on_grid(grid), load(grid))
     np.testing.assert_array_equal(load.on_grid(load.start_s), load.value)
+
+
+@pytest.mark.parametrize(
+    "load",
+    [
+        piecewise([3.0, -1.0, 8.0, 2.0], [0.37, 0.2, 7.0, 1.0]),
+        Cycle(piecewise([3.0, -1.0, 8.0], [0.37, 0.2, 7.0]), 1.1),
+        Spliced(np.random.default_rng(0).uniform(-1.0, 9.0, 11), np.array([4, 9, 0]), 5, 0.7, "power"),
+    ],
+)
+@pytest.mark.parametrize("dt_s", [0.25, 1.0, 4.0])
+def test_the_mean_over_steps_draws_what_the_load_does(load, dt_s):
+    starts_s, parts = dt_s * np.arange(5, 25), 4000
+    middles_s = starts_s[:, None] + dt_s * (np.arange(parts) + 0.5) / parts
+    # a switch within a part counts for all of it
+    error = 8.0 * np.ceil(dt_s / 0.2) / parts
+    np.testing.assert_allclose(load.mean(starts_s, dt_s), load(middles_s).mean(axis=1), atol=error)
+
+
+def test_the_mean_of_a_load_that_keeps_step_is_its_value():
+    grid_s = 2.0 * np.arange(40_000)
+    walk = RandomWalk(segment_s=60.0)(np.random.default_rng(0))
+    for load in (constant(1.45), walk, Cycle(walk, 1200.0), Spliced(walk.value, np.arange(0, 300, 7), 30, 2.0, "power")):
+        np.testing.assert_allclose(load.mean(grid_s, 2.0), load(grid_s), rtol=1e-9)
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.1, 30.0))

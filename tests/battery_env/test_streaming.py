@@ -12,6 +12,7 @@ from battery_env.cells import Discharge, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, STATE_SIZE, initial_state, rest_shares, simulate, voltage
 from battery_env.estimators.base import ModelNow, OnlineEstimator
 from battery_env.estimators.rest import rest_voltages_V
+from battery_env.loads import Cycle, Load
 from battery_env.records import Stream, are_plausible, check_sample
 
 NOISE_V = 0.005
@@ -322,6 +323,22 @@ class TestModel:
             filter_.remaining(np.append(np.full(900, -2.0), np.full(9000, 2.0)))
         with pytest.raises(ValueError, match="beyond full"):
             filter_.remaining(lambda time_s: np.where(time_s < 900.0, -2.0, 2.0))
+
+    def test_an_array_that_ends_before_the_discharge_is_refused(self, whole):
+        filter_ = ExtendedKalmanFilter(thermal=True)
+        follow(filter_, whole.part(0, 600))
+        left_s = filter_.remaining(2.0).time_s
+        assert filter_.remaining(np.full(int(left_s) + 100, 2.0)).time_s == left_s
+        with pytest.raises(ValueError, match=r"load ends after 600 s, before .* a Load of battery_env\.loads"):
+            filter_.remaining(np.full(600, 2.0))
+        # a day of rest is none
+        assert filter_.remaining(np.zeros(86_401)).time_s == np.inf
+
+    def test_pulses_shorter_than_a_step_draw_what_they_do(self, whole):
+        filter_ = ExtendedKalmanFilter(thermal=True)
+        follow(filter_, whole.part(0, 600))
+        pulses = Cycle(Load([0.0, 0.25, 0.75], [1.0, 10.0, 1.0], "current"), 5.0)
+        assert filter_.remaining(pulses).time_s == pytest.approx(filter_.remaining(1.9).time_s, rel=0.02)
 
     def test_of_a_policy(self, whole):
         estimator, half = policy_estimator(), len(whole.time_s) // 2
