@@ -216,6 +216,19 @@ def test_braking_does_not_end_a_discharge_and_an_offset_at_rest_does_not_begin_i
     np.testing.assert_allclose(one(tmp_path / "drive.csv").current_A, current_A)
 
 
+def test_braking_at_once_does_not_end_a_discharge_and_a_charge_in_small_steps_does(tmp_path):
+    minute_s = np.mod(np.arange(0.0, 6000.0, 5.0), 60.0)
+    drive_A = np.where(minute_s < 15.0, 6.0, np.where(minute_s < 25.0, -4.0, 0.0))
+    steps_A = np.where(minute_s < 25.0, -2.0, 0.0)  # each returns 1 % of what is drawn in all
+    rest_A = np.zeros(100)
+    current_A = np.concatenate([np.full(500, -2.0), rest_A, drive_A, rest_A, steps_A, rest_A, drive_A, rest_A])
+    own(tmp_path / "cell.csv", time_s=5.0 * np.arange(len(current_A)), voltage_V=3.7 - 0.02 * current_A, current_A=current_A)
+    discharges = read_discharges(tmp_path / "cell.csv", discharge_is_negative=False)
+    assert len(discharges) == 2
+    for discharge in discharges:
+        assert np.count_nonzero(discharge.current_A == 6.0) == np.count_nonzero(drive_A == 6.0)
+
+
 @pytest.mark.parametrize("cell", BUNDLED_CELLS)
 def test_bundled_discharges_read_the_same_by_either_way_and_with_either_sign(cell, tmp_path):
     known = load_nasa_discharges(cell)[::40]
