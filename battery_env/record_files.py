@@ -210,11 +210,19 @@ class _Table:
 
     def _drop_repeated(self) -> None:
         """The clock of a file stands still where a row is repeated; nowhere else rows are compared, which takes time."""
-        if (np.diff(self.columns["time"]) > 0.0).all():
+        time_s = self.columns["time"]
+        if (np.diff(time_s) > 0.0).all():
             return
         names = [name for name in ("cycle", "time", "voltage", "current") if name in self.columns]
         keys = {name: self.columns[name] for name in names} | {name: codes for name, (codes, _) in self.labels.items()}
-        repeated = pd.DataFrame(keys).duplicated().to_numpy()
+        rows = pd.DataFrame(keys)
+        # where the clock goes back all rows come once more, or another discharge begins, of which some are as before by chance
+        goes_back = np.diff(time_s) < 0.0
+        run = np.append(0, np.cumsum(goes_back))
+        latest_s = np.append(-np.inf, np.maximum.accumulate(time_s)[:-1][goes_back])[run]
+        repeated = rows.duplicated()
+        once_more = (repeated | (time_s > latest_s)).groupby(run).transform("all")
+        repeated = (repeated & (once_more | rows.assign(run=run).duplicated())).to_numpy()
         if repeated.any():
             warnings.warn(f"{repeated.sum()} of {len(repeated)} rows are repeated, and dropped", stacklevel=2)
             self._select(~repeated)

@@ -264,6 +264,27 @@ def test_repeated_rows_are_dropped_with_a_word_and_other_values_at_one_time_are_
         read_discharges(tmp_path / "cell.csv")
 
 
+@pytest.mark.parametrize("overlap", [1, 20, len(TIME_S)])
+def test_rows_that_a_logger_writes_once_more_are_dropped(overlap, tmp_path):
+    lines = own(tmp_path / "cell.csv").read_text().splitlines()
+    (tmp_path / "cell.csv").write_text("\n".join([*lines, *lines[-overlap:]]))
+    with pytest.warns(UserWarning, match=f"{overlap} of {len(TIME_S) + overlap} rows are repeated, and dropped"):
+        (discharge,) = read_discharges(tmp_path / "cell.csv")
+    check(discharge)
+
+
+def test_rows_of_another_discharge_may_be_as_those_of_the_one_before(tmp_path):
+    first = without_charges(count=1)
+    second = first.assign(voltage_V=first["voltage_V"] - np.where(np.arange(len(first)) % 3 == 0, 0.01, 0.0))
+    pd.concat([first, second, second[20:]]).to_csv(tmp_path / "cell.csv", index=False)
+    with pytest.warns(UserWarning, match="taken for 2 discharges"):
+        with pytest.warns(UserWarning, match=f"{len(first) - 20} of .* rows are repeated, and dropped"):
+            discharges = read_discharges(tmp_path / "cell.csv")
+    for discharge, table in zip(discharges, (first, second), strict=True):
+        np.testing.assert_allclose(discharge.time_s, table["time_s"])
+        np.testing.assert_allclose(discharge.voltage_V, table["voltage_V"])
+
+
 def test_a_row_at_the_end_of_one_step_and_one_at_the_start_of_the_next_may_have_one_time(tmp_path):
     steps = np.where(TIME_S < 7.0, 1, 2)
     time_s = TIME_S.copy()
