@@ -108,6 +108,13 @@ def test_columns_go_by_the_names_of_testers_and_units_are_told_from_them(columns
     check(one(path), temperature=True)
 
 
+@pytest.mark.parametrize("index", ["time_s", ["time_s", "current_A"]])
+def test_an_index_of_a_parquet_file_is_columns_too(index, tmp_path):
+    table = pd.DataFrame({"time_s": TIME_S, "voltage_V": VOLTAGE_V, "current_A": CURRENT_A, "other": "text"})
+    table.set_index(index).to_parquet(tmp_path / "cell.parquet")
+    check(one(tmp_path / "cell.parquet"))
+
+
 def test_the_temperature_of_the_surroundings_is_kept_apart(tmp_path):
     pd.DataFrame(COLUMNS["Battery Data Format"]).to_csv(tmp_path / "cell.bdf.csv", index=False)
     assert one(tmp_path / "cell.bdf.csv").meta["ambient_temperature_C"] == 23.0
