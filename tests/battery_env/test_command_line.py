@@ -463,6 +463,18 @@ def test_existing_results_are_found_before_any_work_is_done(lab, tmp_path, capsy
     assert "is a file" in fails(["B0005:1", "--out", str(tmp_path / "file")], capsys)
 
 
+def test_results_among_the_records_are_no_records(recorded, tmp_path, capsys):
+    write(recorded, tmp_path / "cell.csv")
+    write(recorded, tmp_path / "own_voltage.csv")  # a record of this name has no figure beside it
+    for results in ([], ["--out", str(tmp_path)], ["--force", "--out", str(tmp_path)], []):
+        assert main(["calibrate", str(tmp_path), "--json", *results]) == 0
+        lines = capsys.readouterr().out.splitlines()
+        assert [json.loads(line)["record"] for line in lines] == ["cell", "own_voltage"]
+    assert main(["calibrate", f"{tmp_path}/cell.csv", "--json", "--table-only", "--out", str(tmp_path)]) == 0
+    assert (tmp_path / "cell_estimate.csv").exists() and (tmp_path / "own_voltage_voltage.csv").exists()
+    assert [Path(source.path).stem for source in fleet.find_sources([str(tmp_path)])] == ["cell", "own_voltage"]
+
+
 def test_what_was_done_before_an_interruption_is_kept(lab, tmp_path, monkeypatch, capsys):
     def interrupted(discharge, settings):
         if discharge.meta["cycle"] == 2:
