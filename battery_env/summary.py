@@ -257,19 +257,20 @@ def summarize(discharge: Discharge, settings: Settings) -> Summary:
         estimate = replace(estimate, settled=False, reason=start.reason)
     estimate = _with_missing_samples(estimate, discharge, record)
     model = RecordModel(cell, settings.thermal and not is_policy, initial_soc=start.soc)
-    future = expected_current(record.time_s, record.current_A)
+    future = load = expected_current(record.time_s, record.current_A)
     if settings.future_current_A is not None:
         future = ExpectedCurrent(settings.future_current_A, varied=False, sd_A=0.0)
-    forecast = model.forecast(record, estimate, settings.cut_off_V, future.mean_A)
+    in_progress = bool(np.isnan(measured_eod_s))
+    forecast = model.forecast(record, estimate, settings.cut_off_V, future.mean_A, in_progress)
     columns = (record.time_s, record.voltage_V, record.current_A, forecast.at_samples_V)
     is_logged = all(gap.verdict != NOT_DRAWN for gap in find_gaps(*columns, estimate.q_mobile))
     # what a full cell would have given more, as its end comes at the same charge; not known where the start is not, nor where
     # part of what was drawn is not
     is_known = is_logged and not start.reason and not _starts_lower(discharge, cell, start.soc, estimate)
     missing_Ah = (1.0 - start.soc) * estimate.q_mobile / 3600.0 if is_known else float("nan")
-    in_progress = np.isnan(measured_eod_s)
-    remaining_s = max(forecast.eod_time_s - float(record.time_s[-1]), 0.0) if in_progress else 0.0
-    nominal_Ah = _nominal_Ah(model, settings, future.mean_A)
+    remaining_s = forecast.eod_time_s - float(record.time_s[-1]) if in_progress else 0.0
+    # what comes after the end of a discharge is no part of it
+    nominal_Ah = _nominal_Ah(model, settings, future.mean_A if in_progress else load.mean_A)
     whole_Ah = missing_Ah + drawn_Ah + remaining_s * future.mean_A / 3600.0
     residual_V = forecast.at_samples_V - record.voltage_V
     row = {
