@@ -178,6 +178,21 @@ def test_a_load_that_varied_is_forecast_at_its_mean_and_that_is_said(tmp_path, c
     assert "4 A to go on" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("parameters", [("q_mobile",), ("q_mobile", "r_o")])
+def test_the_end_is_as_unsure_as_the_voltage_at_the_cut_off(parameters):
+    true = simulate(2.0, 6000.0, NEW_CELL.r_o, load_unit="current", thermal=True, cut_off_V=2.7)
+    record = Discharge(true.time_s[:1200], true.voltage_V[:1200], true.current_A[:1200])
+    settings = Settings(parameters=parameters, cut_off_V=3.5, prior_q_mobile_C=(6000.0, 20.0))
+    row = summarize(record, settings).row
+    assert row["q_mobile_C"] == pytest.approx(6000.0, rel=1e-3)
+    off_V = np.hypot(0.05, 2.0 * row["sd_r_o_ohm"]) if "r_o" in parameters else 0.05
+    early_s, late_s = np.interp([-3.5 - off_V, -3.5 + off_V], -true.voltage_V, true.time_s)
+    expected_s = np.hypot(row["sd_q_mobile_C"] / 2.0, 0.5 * (late_s - early_s))
+    assert row["sd_predicted_eod_time_s"] == pytest.approx(expected_s, rel=0.02)
+    assert expected_s > 5.0 * row["sd_q_mobile_C"] / 2.0
+    assert summarize(record, replace(settings, cut_off_V=2.7)).row["sd_predicted_eod_time_s"] < 0.3 * expected_s
+
+
 def test_a_discharge_in_progress_has_not_ended_in_a_pulse_before():
     current_A = np.where(np.arange(10_000) % 120 < 10, 6.0, 1.0)
     true = simulate(current_A, 6000.0, NEW_CELL.r_o - 0.03, load_unit="current", cut_off_V=3.0)
