@@ -30,6 +30,8 @@ _NASA_SUFFIX = ".mat"
 _ON_A_CLUSTER = 64
 # What NASA's discharges have beside them, in the layout of the bundled ones, is a table of tests and no record.
 _NO_RECORDS = ("cycles.csv",)
+# Results that an earlier command wrote among the records: tables, and voltages, which have their figure beside them.
+_TABLES, _VOLTAGE = ("estimate.csv", "estimate.parquet"), "_voltage"
 
 
 class Source(NamedTuple):
@@ -70,8 +72,8 @@ def find_sources(arguments: Iterable[str]) -> list[Source]:
     """
     What the arguments of a command line name.
 
-    :param arguments: files; folders, for all files in them whose names end as those of records; ``FILE:CYCLE``; bundled cells
-        and ``CELL:CYCLE``
+    :param arguments: files; folders, for all files in them whose names end as those of records, but for results of this
+        package; ``FILE:CYCLE``; bundled cells and ``CELL:CYCLE``
     :return: as many sources or more; a file that does not exist is one too, and fails when it is read
     """
     sources = []
@@ -92,7 +94,12 @@ def find_sources(arguments: Iterable[str]) -> list[Source]:
 
 def _is_record(path: Path) -> bool:
     hidden = path.name.startswith(".") or path.name in _NO_RECORDS
-    return path.is_file() and not hidden and is_readable(path, (_NASA_SUFFIX,))
+    return path.is_file() and not hidden and not _is_result(path) and is_readable(path, (_NASA_SUFFIX,))
+
+
+def _is_result(path: Path) -> bool:
+    is_table = path.name in _TABLES or path.name.endswith(tuple(f"_{name}" for name in _TABLES))
+    return is_table or (path.name.endswith(f"{_VOLTAGE}.csv") and path.with_suffix(".png").exists())
 
 
 def _stem(path: Path) -> str:
@@ -153,7 +160,7 @@ class Results:
     def __init__(self, folder: Path, sources: Sequence[Source], with_voltages: bool, replace: bool) -> None:
         self.folder, self.with_voltages = folder, with_voltages
         prefix = f"{record_name(sources[0].stem, sources[0].cycle)}_" if len(sources) == 1 else ""
-        self.table, self.parquet = folder / f"{prefix}estimate.csv", folder / f"{prefix}estimate.parquet"
+        self.table, self.parquet = (folder / f"{prefix}{name}" for name in _TABLES)
         self.life = folder / f"{prefix}life.png"
         check_folder(folder)
         existing = self._existing(sources)
@@ -167,7 +174,7 @@ class Results:
             return []
         # the numbers of the discharges are not known before their files are read
         stems = "|".join(re.escape(record_name(source.stem, source.cycle)) for source in sources)
-        voltages = re.compile(rf"(?:{stems})(?:_\d+)*_voltage\.(?:csv|png)", flags=re.IGNORECASE)
+        voltages = re.compile(rf"(?:{stems})(?:_\d+)*{_VOLTAGE}\.(?:csv|png)", flags=re.IGNORECASE)
         tables = {path.name for path in (self.table, self.parquet, self.life)}
         return [
             path
@@ -183,7 +190,7 @@ class Results:
         :param files: by ending of the name, what it holds
         """
         for suffix, content in files.items():
-            with replacing(self.folder / f"{name}_voltage.{suffix}") as part:
+            with replacing(self.folder / f"{name}{_VOLTAGE}.{suffix}") as part:
                 part.write_bytes(content)
 
     def write_table(self, rows: Sequence[Mapping[str, Any]]) -> list[Path]:

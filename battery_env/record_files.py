@@ -26,7 +26,8 @@ from battery_env.tables import read_columns
 _CLEAR_CORRELATION = 0.5
 # A stretch of charging ends a discharge if it returns more than this share of the charge drawn until then; less is braking.
 _RETURNED_SHARE = 0.2
-# Charging before the load, of more than this share of what the load draws, is no part of the discharge; less is an offset.
+# Charging before the load, of more than this share of what the load draws, is no part of the discharge; less is an offset. Nor
+# does a charge end a discharge that returns less of the most that is drawn: early pulses return much of the little drawn yet.
 _CHARGED_SHARE = 0.02
 # What returns less than this share of the charge that passes in all is not looked at.
 _NOTHING_SHARE = 1e-3
@@ -209,11 +210,19 @@ class _Table:
 
     def _drop_repeated(self) -> None:
         """The clock of a file stands still where a row is repeated; nowhere else rows are compared, which takes time."""
-        if (np.diff(self.columns["time"]) > 0.0).all():
+        time_s = self.columns["time"]
+        if (np.diff(time_s) > 0.0).all():
             return
         names = [name for name in ("cycle", "time", "voltage", "current") if name in self.columns]
         keys = {name: self.columns[name] for name in names} | {name: codes for name, (codes, _) in self.labels.items()}
-        repeated = pd.DataFrame(keys).duplicated().to_numpy()
+        rows = pd.DataFrame(keys)
+        # where the clock goes back all rows come once more, or another discharge begins, of which some are as before by chance
+        goes_back = np.diff(time_s) < 0.0
+        run = np.append(0, np.cumsum(goes_back))
+        latest_s = np.append(-np.inf, np.maximum.accumulate(time_s)[:-1][goes_back])[run]
+        repeated = rows.duplicated()
+        once_more = (repeated | (time_s > latest_s)).groupby(run).transform("all")
+        repeated = (repeated & (once_more | rows.assign(run=run).duplicated())).to_numpy()
         if repeated.any():
             warnings.warn(f"{repeated.sum()} of {len(repeated)} rows are repeated, and dropped", stacklevel=2)
             self._select(~repeated)
@@ -301,13 +310,17 @@ class _Table:
         clock_s = np.append(0.0, np.cumsum(np.maximum(np.diff(time_s), 0.0)))  # which does not go back
         passed_C = drawn(clock_s, current_A, clock_s)
         charges = _charges(current_A, passed_C)
-        found, begin, lowest_C = [], 0, passed_C[0]
+        least_C = _CHARGED_SHARE * float((passed_C - np.minimum.accumulate(passed_C)).max())
+        found, begin, lowest_C, highest_C = [], 0, passed_C[0], passed_C[0]
         for start, end in charges:
-            drawn_C = passed_C[start] - lowest_C
-            if drawn_C > 0.0 and passed_C[start] - passed_C[end - 1] > _RETURNED_SHARE * drawn_C:
+            drawn_C, highest_C = passed_C[start] - lowest_C, max(highest_C, passed_C[start])
+            returned_C = passed_C[start] - passed_C[end - 1]
+            # a charge may be logged in many steps, of which each returns little
+            if drawn_C > 0.0 and returned_C > _RETURNED_SHARE * drawn_C and highest_C - passed_C[end - 1] > least_C:
                 found.append((begin, start))
                 begin, lowest_C = start, passed_C[start]
-            lowest_C = min(lowest_C, passed_C[end - 1])
+            if passed_C[end - 1] < lowest_C:
+                lowest_C = highest_C = passed_C[end - 1]
         found.append((begin, high - low))
         parts = []
         ends = charged[(charged > low) & (charged < high)] - low

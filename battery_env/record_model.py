@@ -191,7 +191,12 @@ class RecordModel:
         return _at(time_s, self.simulate(current_A, at.q_mobile, at.r_o))
 
     def forecast(
-        self, record: Record, at: Estimate, cut_off_V: float | None = None, future_current_A: float | None = None
+        self,
+        record: Record,
+        at: Estimate,
+        cut_off_V: float | None = None,
+        future_current_A: float | None = None,
+        in_progress: bool = False,
     ) -> VoltageForecast:
         """
         The voltage of the model from the first sample of a record down to the cut-off, under the current of the record, and
@@ -203,6 +208,8 @@ class RecordModel:
         :param future_current_A: current beyond the end of the record, at least 0 A; ``None``: as
             :func:`~battery_env.records.expected_current` has it, the last current of a constant load and the mean of a load
             that varied, which is an assumption
+        :param in_progress: whether the record is known not to have reached the cut-off: then the model does so after its end
+            only, and at its last sample at the earliest, however low it comes in the pulses before
         :return: the voltage, and when the cut-off is reached
         :raises ValueError: for a negative future current, parameters out of range, or a record that cannot be used
         """
@@ -220,15 +227,20 @@ class RecordModel:
         simulation = self.simulate(current_A, at.q_mobile, at.r_o)
         start_s, at_samples_V = float(record.time_s[0]), _at(samples_s, simulation)
         time_s, voltage_V = start_s + simulation.time_s, simulation.voltage_V
-        below = np.flatnonzero(voltage_V <= cut_off)
+        earliest_s = float(record.time_s[-1]) if in_progress else start_s
+        is_below = voltage_V <= cut_off
+        if in_progress:  # a constant current has no pulses: the voltage falls below for good
+            is_below = np.logical_and.accumulate(is_below[::-1])[::-1]
+        below = np.flatnonzero(is_below)
         if len(below):
             n = int(below[0])
             around = [n, max(n - 1, 0)]
-            eod_time_s = float(np.interp(cut_off, voltage_V[around], time_s[around]))
+            eod_time_s = max(float(np.interp(cut_off, voltage_V[around], time_s[around])), earliest_s)
         elif np.isnan(simulation.eod_time_s):
             return VoltageForecast(time_s, voltage_V, float("nan"), at_samples_V)
         else:
-            n, eod_time_s = len(time_s), start_s + simulation.eod_time_s  # the cell is empty one step later
+            # the cell is empty one step later
+            n, eod_time_s = len(time_s), max(start_s + simulation.eod_time_s, earliest_s)
         return VoltageForecast(np.append(time_s[:n], eod_time_s), np.append(voltage_V[:n], cut_off), eod_time_s, at_samples_V)
 
     def capacity_Ah(

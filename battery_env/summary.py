@@ -257,20 +257,27 @@ def summarize(discharge: Discharge, settings: Settings) -> Summary:
         estimate = replace(estimate, settled=False, reason=start.reason)
     estimate = _with_missing_samples(estimate, discharge, record)
     model = RecordModel(cell, settings.thermal and not is_policy, initial_soc=start.soc)
-    future = expected_current(record.time_s, record.current_A)
+    future = load = expected_current(record.time_s, record.current_A)
     if settings.future_current_A is not None:
         future = ExpectedCurrent(settings.future_current_A, varied=False, sd_A=0.0)
-    forecast = model.forecast(record, estimate, settings.cut_off_V, future.mean_A)
+    in_progress = bool(np.isnan(measured_eod_s))
+    forecast = model.forecast(record, estimate, settings.cut_off_V, future.mean_A, in_progress)
     columns = (record.time_s, record.voltage_V, record.current_A, forecast.at_samples_V)
     is_logged = all(gap.verdict != NOT_DRAWN for gap in find_gaps(*columns, estimate.q_mobile))
     # what a full cell would have given more, as its end comes at the same charge; not known where the start is not, nor where
     # part of what was drawn is not
     is_known = is_logged and not start.reason and not _starts_lower(discharge, cell, start.soc, estimate)
     missing_Ah = (1.0 - start.soc) * estimate.q_mobile / 3600.0 if is_known else float("nan")
-    in_progress = np.isnan(measured_eod_s)
-    remaining_s = max(forecast.eod_time_s - float(record.time_s[-1]), 0.0) if in_progress else 0.0
-    nominal_Ah = _nominal_Ah(model, settings, future.mean_A)
+    remaining_s = forecast.eod_time_s - float(record.time_s[-1]) if in_progress else 0.0
+    # what comes after the end of a discharge is no part of it
+    nominal_Ah = _nominal_Ah(model, settings, future.mean_A if in_progress else load.mean_A)
     whole_Ah = missing_Ah + drawn_Ah + remaining_s * future.mean_A / 3600.0
+    sd_eod_s = float(
+        np.hypot(
+            _sd_charge_s(estimate, remaining_s, future),
+            _sd_cut_off_s(model, record, estimate, future.mean_A, settings, in_progress),
+        )
+    )
     residual_V = forecast.at_samples_V - record.voltage_V
     row = {
         "method": settings.method,
@@ -292,7 +299,7 @@ def summarize(discharge: Discharge, settings: Settings) -> Summary:
         "state_of_health": whole_Ah / nominal_Ah,
         "voltage_rmse_V": float(np.sqrt(np.nanmean(residual_V**2))),
         "predicted_eod_time_s": forecast.eod_time_s,
-        "sd_predicted_eod_time_s": _sd_eod_s(estimate, remaining_s, future),
+        "sd_predicted_eod_time_s": sd_eod_s,
         "measured_eod_time_s": measured_eod_s,
         "remaining_s": remaining_s,
         "future_current_A": future.mean_A,
@@ -372,11 +379,24 @@ def _end_temperatures(record: Discharge, estimate: Estimate, model: RecordModel)
     return {"end_temperature_C": float(record.temperature_C[-1]), "model_end_temperature_C": float(model_C[-1])}
 
 
-def _sd_eod_s(estimate: Estimate, remaining_s: float, future: ExpectedCurrent) -> float:
+def _sd_charge_s(estimate: Estimate, remaining_s: float, future: ExpectedCurrent) -> float:
     """The charge still to come moves with q_mobile, and is drawn at a current that may not be the one assumed."""
     if not future.mean_A > 0.0:
         return float("nan")
     return float(np.hypot(estimate.sd_q_mobile, remaining_s * future.sd_A)) / future.mean_A
+
+
+def _sd_cut_off_s(
+    model: RecordModel, record: Discharge, estimate: Estimate, load_A: float, settings: Settings, in_progress: bool
+) -> float:
+    """Where the model is at the cut-off the cell may be higher or lower, by the error of the model and of the ohmic drop."""
+    # a resistance that is held has no standard deviation
+    deviation_V = float(np.hypot(settings.mismatch_V, load_A * np.nan_to_num(estimate.sd_r_o)))
+    early_s, late_s = (
+        model.forecast(record, estimate, settings.cut_off_V + each_V, load_A, in_progress).eod_time_s
+        for each_V in (deviation_V, -deviation_V)
+    )
+    return 0.5 * (late_s - early_s)
 
 
 def text_of(name: str, row: dict[str, Any], settings: Settings) -> str:

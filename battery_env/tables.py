@@ -228,7 +228,8 @@ def _read_parquet(
         raise ValueError(f"the file is damaged, or no Parquet: {str(error).strip()}") from error
     with file:
         columns = find_columns(file.schema_arrow.names, chosen, units)
-        table = file.read(columns=sorted({column.name for column in columns.values()})).to_pandas()
+        # the metadata of pandas would make an index of a column
+        table = file.read(columns=sorted({column.name for column in columns.values()})).to_pandas(ignore_metadata=True)
     return pd.DataFrame({quantity: table[column.name] for quantity, column in columns.items()}), columns
 
 

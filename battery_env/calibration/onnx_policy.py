@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -38,14 +39,17 @@ class OnnxPolicy:
         path = Path(path)
         options = SessionOptions()
         options.intra_op_num_threads = 1
+        content = path.read_bytes()
         try:
-            self._session = InferenceSession(path.read_bytes(), options, providers=["CPUExecutionProvider"])
+            self._session = InferenceSession(content, options, providers=["CPUExecutionProvider"])
         except (Fail, InvalidGraph, InvalidProtobuf) as error:
             raise ValueError(f"{path} is no ONNX file: {error}") from error
         inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
         if len(inputs) != 1 or len(outputs) != 1:
             raise ValueError(f"{path} must have one input and one output, it has {len(inputs)} and {len(outputs)}")
         self._input = inputs[0].name
+        #: Of the file, which no other policy has
+        self.sha256: str = sha256(content).hexdigest()
         #: What the file says of itself, e.g. ``algorithm`` and ``env_id``
         self.description: dict[str, str] = self._session.get_modelmeta().custom_metadata_map
         #: Shape of one observation

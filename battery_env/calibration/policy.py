@@ -73,7 +73,8 @@ class PolicyEstimator(OnlineEstimator):
     after life, ``cycles`` of them each, and carries its estimate over from one to the next.
 
     One of a voltage-only environment of single discharges also follows a stream (:meth:`update`): its estimate is the new
-    cell's until ``decision_s`` are over, and moves every ``decision_s`` from then on.
+    cell's until ``decision_s`` are over, and moves every ``decision_s`` from then on. What :meth:`save` wrote is refused with
+    another :class:`~battery_env.calibration.onnx_policy.OnnxPolicy`; models of Stable-Baselines3 are not told from each other.
 
     A policy whose observation has a fit (option ``nuisance``) states standard deviations: those of the fit under its priors,
     with the distance of the estimate from it. It has settled where these are as small as least squares ask for, the residuals
@@ -235,6 +236,7 @@ class PolicyEstimator(OnlineEstimator):
         return {
             "estimator": type(self).__name__,
             "env_id": self.env_id,
+            "policy": getattr(self.policy, "sha256", None),
             "decision_s": self.decision_s,
             "cell": asdict(self.cell),
             "options": {name: repr(value) for name, value in self.options.items() if name != "cell"},

@@ -103,12 +103,14 @@ class KalmanBatch(OnlineBatch):
         numbers = self._stack.numbers
         drawn_C = numbers[:, DRAWN] + before_A * since_s
         doubtful |= ~(drawn_C > one.least_drawn_C)
-        for n in np.flatnonzero(doubtful).tolist():
-            sample = (float(volts[n]), float(amperes[n]), float(since_s[n]))
-            try:
-                self.estimators[n].check(*sample, None if temperature_C is None else float(degrees_C[n]))
-            except ValueError as error:
-                raise ValueError(f"cell {n}: {error}") from error
+        if doubtful.any():
+            # as objects, as a temperature may be missing (None) but not be NaN
+            given_C = np.broadcast_to(np.asarray(temperature_C, dtype=object), cells).tolist()
+            for n in np.flatnonzero(doubtful).tolist():
+                try:
+                    self.estimators[n].check(float(volts[n]), float(amperes[n]), float(since_s[n]), given_C[n])
+                except ValueError as error:
+                    raise ValueError(f"cell {n}: {error}") from error
         out, codes = np.empty((cells, OUT_SIZE)), np.empty(cells, dtype=np.int64)
         packed = one.cell.packed
         _follow_all(

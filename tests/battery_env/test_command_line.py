@@ -83,6 +83,16 @@ def test_a_file_of_constants_takes_the_place_of_the_new_cell(recorded, tmp_path,
     )
 
 
+def test_a_future_current_is_that_of_a_discharge_in_progress_only(recorded):
+    records = (recorded, recorded.until(2000.0))
+    plain, slow = (
+        [summarize(each, Settings(cell=NEW_CELL, future_current_A=current_A)).row for each in records]
+        for current_A in (None, 0.5)
+    )
+    assert slow[0]["state_of_health"] == plain[0]["state_of_health"] and slow[0]["nominal_Ah"] == plain[0]["nominal_Ah"]
+    assert slow[1]["nominal_Ah"] > 1.02 * plain[1]["nominal_Ah"]
+
+
 def test_constants_are_fitted_saved_and_used(tmp_path, capsys):
     out = tmp_path / "new" / "cell.json"
     fitted = ["B0005:1", "B0005:84", "B0005:168"]
@@ -166,6 +176,33 @@ def test_a_load_that_varied_is_forecast_at_its_mean_and_that_is_said(tmp_path, c
     assert " A the mean current so far, an assumption: the load varied" in capsys.readouterr().out
     assert main(["calibrate", path, "--prior-q", "7000", "70", "--future-current", "4"]) == 3
     assert "4 A to go on" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("parameters", [("q_mobile",), ("q_mobile", "r_o")])
+def test_the_end_is_as_unsure_as_the_voltage_at_the_cut_off(parameters):
+    true = simulate(2.0, 6000.0, NEW_CELL.r_o, load_unit="current", thermal=True, cut_off_V=2.7)
+    record = Discharge(true.time_s[:1200], true.voltage_V[:1200], true.current_A[:1200])
+    settings = Settings(parameters=parameters, cut_off_V=3.5, prior_q_mobile_C=(6000.0, 20.0))
+    row = summarize(record, settings).row
+    assert row["q_mobile_C"] == pytest.approx(6000.0, rel=1e-3)
+    off_V = np.hypot(0.05, 2.0 * row["sd_r_o_ohm"]) if "r_o" in parameters else 0.05
+    early_s, late_s = np.interp([-3.5 - off_V, -3.5 + off_V], -true.voltage_V, true.time_s)
+    expected_s = np.hypot(row["sd_q_mobile_C"] / 2.0, 0.5 * (late_s - early_s))
+    assert row["sd_predicted_eod_time_s"] == pytest.approx(expected_s, rel=0.02)
+    assert expected_s > 5.0 * row["sd_q_mobile_C"] / 2.0
+    assert summarize(record, replace(settings, cut_off_V=2.7)).row["sd_predicted_eod_time_s"] < 0.3 * expected_s
+
+
+def test_a_discharge_in_progress_has_not_ended_in_a_pulse_before():
+    current_A = np.where(np.arange(10_000) % 120 < 10, 6.0, 1.0)
+    true = simulate(current_A, 6000.0, NEW_CELL.r_o - 0.03, load_unit="current", cut_off_V=3.0)
+    for count in (3500, 3726):  # in a pause, in a pulse
+        record = Discharge(true.time_s[:count], true.voltage_V[:count], true.current_A[:count])
+        # the resistance of the new cell is too large, so that the model comes below the cut-off where the record does not
+        row = summarize(record, Settings(parameters=("q_mobile",), cut_off_V=3.0, prior_q_mobile_C=(6000.0, 10.0))).row
+        assert record.voltage_V.min() > 3.02 and np.isnan(row["measured_eod_time_s"])
+        assert row["remaining_s"] == row["predicted_eod_time_s"] - record.time_s[-1] > 100.0
+        assert row["predicted_capacity_Ah"] > row["drawn_Ah"] + 0.03
 
 
 def test_one_parameter_can_be_held(capsys):
@@ -461,6 +498,18 @@ def test_existing_results_are_found_before_any_work_is_done(lab, tmp_path, capsy
     assert [path.name for path in tmp_path.iterdir()] == ["life_017_voltage.csv"]
     (tmp_path / "file").write_text("")
     assert "is a file" in fails(["B0005:1", "--out", str(tmp_path / "file")], capsys)
+
+
+def test_results_among_the_records_are_no_records(recorded, tmp_path, capsys):
+    write(recorded, tmp_path / "cell.csv")
+    write(recorded, tmp_path / "own_voltage.csv")  # a record of this name has no figure beside it
+    for results in ([], ["--out", str(tmp_path)], ["--force", "--out", str(tmp_path)], []):
+        assert main(["calibrate", str(tmp_path), "--json", *results]) == 0
+        lines = capsys.readouterr().out.splitlines()
+        assert [json.loads(line)["record"] for line in lines] == ["cell", "own_voltage"]
+    assert main(["calibrate", f"{tmp_path}/cell.csv", "--json", "--table-only", "--out", str(tmp_path)]) == 0
+    assert (tmp_path / "cell_estimate.csv").exists() and (tmp_path / "own_voltage_voltage.csv").exists()
+    assert [Path(source.path).stem for source in fleet.find_sources([str(tmp_path)])] == ["cell", "own_voltage"]
 
 
 def test_what_was_done_before_an_interruption_is_kept(lab, tmp_path, monkeypatch, capsys):

@@ -108,6 +108,13 @@ def test_columns_go_by_the_names_of_testers_and_units_are_told_from_them(columns
     check(one(path), temperature=True)
 
 
+@pytest.mark.parametrize("index", ["time_s", ["time_s", "current_A"]])
+def test_an_index_of_a_parquet_file_is_columns_too(index, tmp_path):
+    table = pd.DataFrame({"time_s": TIME_S, "voltage_V": VOLTAGE_V, "current_A": CURRENT_A, "other": "text"})
+    table.set_index(index).to_parquet(tmp_path / "cell.parquet")
+    check(one(tmp_path / "cell.parquet"))
+
+
 def test_the_temperature_of_the_surroundings_is_kept_apart(tmp_path):
     pd.DataFrame(COLUMNS["Battery Data Format"]).to_csv(tmp_path / "cell.bdf.csv", index=False)
     assert one(tmp_path / "cell.bdf.csv").meta["ambient_temperature_C"] == 23.0
@@ -216,6 +223,19 @@ def test_braking_does_not_end_a_discharge_and_an_offset_at_rest_does_not_begin_i
     np.testing.assert_allclose(one(tmp_path / "drive.csv").current_A, current_A)
 
 
+def test_braking_at_once_does_not_end_a_discharge_and_a_charge_in_small_steps_does(tmp_path):
+    minute_s = np.mod(np.arange(0.0, 6000.0, 5.0), 60.0)
+    drive_A = np.where(minute_s < 15.0, 6.0, np.where(minute_s < 25.0, -4.0, 0.0))
+    steps_A = np.where(minute_s < 25.0, -2.0, 0.0)  # each returns 1 % of what is drawn in all
+    rest_A = np.zeros(100)
+    current_A = np.concatenate([np.full(500, -2.0), rest_A, drive_A, rest_A, steps_A, rest_A, drive_A, rest_A])
+    own(tmp_path / "cell.csv", time_s=5.0 * np.arange(len(current_A)), voltage_V=3.7 - 0.02 * current_A, current_A=current_A)
+    discharges = read_discharges(tmp_path / "cell.csv", discharge_is_negative=False)
+    assert len(discharges) == 2
+    for discharge in discharges:
+        assert np.count_nonzero(discharge.current_A == 6.0) == np.count_nonzero(drive_A == 6.0)
+
+
 @pytest.mark.parametrize("cell", BUNDLED_CELLS)
 def test_bundled_discharges_read_the_same_by_either_way_and_with_either_sign(cell, tmp_path):
     known = load_nasa_discharges(cell)[::40]
@@ -249,6 +269,27 @@ def test_repeated_rows_are_dropped_with_a_word_and_other_values_at_one_time_are_
     (tmp_path / "cell.csv").write_text("\n".join([*lines[:9], ",".join(other), *lines[9:]]))
     with pytest.raises(ValueError, match=r"time_s must increase from sample to sample.*each sample once"):
         read_discharges(tmp_path / "cell.csv")
+
+
+@pytest.mark.parametrize("overlap", [1, 20, len(TIME_S)])
+def test_rows_that_a_logger_writes_once_more_are_dropped(overlap, tmp_path):
+    lines = own(tmp_path / "cell.csv").read_text().splitlines()
+    (tmp_path / "cell.csv").write_text("\n".join([*lines, *lines[-overlap:]]))
+    with pytest.warns(UserWarning, match=f"{overlap} of {len(TIME_S) + overlap} rows are repeated, and dropped"):
+        (discharge,) = read_discharges(tmp_path / "cell.csv")
+    check(discharge)
+
+
+def test_rows_of_another_discharge_may_be_as_those_of_the_one_before(tmp_path):
+    first = without_charges(count=1)
+    second = first.assign(voltage_V=first["voltage_V"] - np.where(np.arange(len(first)) % 3 == 0, 0.01, 0.0))
+    pd.concat([first, second, second[20:]]).to_csv(tmp_path / "cell.csv", index=False)
+    with pytest.warns(UserWarning, match="taken for 2 discharges"):
+        with pytest.warns(UserWarning, match=f"{len(first) - 20} of .* rows are repeated, and dropped"):
+            discharges = read_discharges(tmp_path / "cell.csv")
+    for discharge, table in zip(discharges, (first, second), strict=True):
+        np.testing.assert_allclose(discharge.time_s, table["time_s"])
+        np.testing.assert_allclose(discharge.voltage_V, table["voltage_V"])
 
 
 def test_a_row_at_the_end_of_one_step_and_one_at_the_start_of_the_next_may_have_one_time(tmp_path):

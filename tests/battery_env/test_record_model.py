@@ -172,6 +172,20 @@ class TestForecast:
         ends_s = [model.forecast(each, truth).eod_time_s for each in (record, later)]
         assert ends_s[1] == pytest.approx(ends_s[0] + 1000.0)
 
+    def test_a_record_in_progress_ends_after_its_last_sample(self):
+        current_A = np.where(np.arange(3000) % 100 < 10, 6.0, 1.0)
+        record = simulate(current_A, 6000.0, 0.10, load_unit="current", cut_off_V=3.0)
+        model, at = RecordModel(), Estimate(6000.0, 0.15)
+        first, later = (model.forecast(record, at, 3.2, 1.0, in_progress) for in_progress in (False, True))
+        assert first.eod_time_s < 2900.0 and later.eod_time_s > 3500.0
+        assert later.voltage_V[:2900].min() < 3.2 == later.voltage_V[-1]
+        assert (np.diff(later.time_s) > 0.0).all()
+        # from 4 V on it is lower for good; at 1000 C it is empty
+        for estimate, cut_off_V in ((at, 4.0), (Estimate(1000.0, 0.15), 0.0)):
+            assert model.forecast(record, estimate, cut_off_V, 1.0).eod_time_s < 1000.0
+            forecast = model.forecast(record, estimate, cut_off_V, 1.0, in_progress=True)
+            assert forecast.eod_time_s == forecast.time_s[-1] == record.time_s[-1]
+
     def test_it_is_unknown_when_the_load_is_off(self):
         current_A = np.where(np.arange(600) < 300, 2.0, 0.0)
         record = simulate(current_A, 6000.0, 0.15, load_unit="current")

@@ -454,6 +454,18 @@ class TestBatch:
         assert [each.soc for each in batch.estimators] == [each.soc for each in alone]
         assert [repr(each) for each in found[:2]] == [repr(each) for each in expected[:2]]
 
+    def test_the_temperature_may_be_missing_of_some_cells_of_a_batch(self):
+        filter_ = ExtendedKalmanFilter(thermal=True)
+        batch, alone = filter_.batch(3), [ExtendedKalmanFilter(thermal=True) for _ in range(3)]
+        for degrees_C in ([25.0, None, 26.0], [25.1, None, None], [None, 24.0, 26.2]):
+            found = batch.update(4.15, 2.0, 1.0, degrees_C)
+            expected = [one.update(4.15, 2.0, 1.0, each) for one, each in zip(alone, degrees_C, strict=True)]
+            assert [repr(each) for each in found] == [repr(each) for each in expected]
+        with pytest.raises(ValueError, match=r"^cell 1: temperature_C must be finite, got nan"):
+            batch.update(4.15, 2.0, 1.0, [None, np.nan, 26.0])
+        with pytest.raises(ValueError, match=r"^cell 0: current_A must lie within"):
+            batch.update(4.15, [2000.0, 2.0, 2.0], 1.0, [None, 24.0, 26.0])
+
     @settings(max_examples=60, deadline=None, derandomize=True, database=None)
     @given(
         st.sampled_from([-0.1, 0.0, 3.9, 5.5, 5.6, np.nan, np.inf]),
