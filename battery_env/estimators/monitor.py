@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 
 from battery_env.arrays import FloatArray, IntArray
-from battery_env.estimators.gaps import DRAWN, GAP_RATIO, MOST_SHARE_SO_FAR, NOT_DRAWN, doubtful_charge_C, verdict
+from battery_env.estimators.gaps import DRAWN, GAP_RATIO, HABIT, MOST_SHARE_SO_FAR, NOT_DRAWN, doubtful_charge_C, verdict
 from battery_env.estimators.kalman_bank import LIMIT_SD
 from battery_env.estimators.settling import (
     AT_BOUND,
@@ -37,7 +37,7 @@ from battery_env.estimators.settling import (
     start_code,
     start_text,
 )
-from battery_env.records import SWITCH_SHARE
+from battery_env.records import REST_CURRENT_A, SWITCH_SHARE
 
 # The data must have narrowed a prior by this share of its width before a deviation from it says anything.
 _LEAST_NARROWING = 0.2
@@ -68,7 +68,8 @@ _PARTED_NOISE_SHARE = 0.72
 # and its size, and since when; whether the first sample is known to be of a cell at rest. Of gaps: the last interval (s), the
 # current since (A), the voltage that was expected last, by how much cell and model part (V) and how fast the voltage falls
 # (V/s), in the mean; of the last gap its length (s), the time after it, its charge (C), the fall of the model, the voltage of
-# the model after it, the first two voltages then (V), and how many were seen; the charge in doubt (C).
+# the model after it, the first two voltages then (V), and how many were seen; the charge in doubt (C); and the longest
+# intervals under load that were not in doubt, in their order (s).
 (
     _SAMPLES,
     _TIME,
@@ -112,8 +113,9 @@ _PARTED_NOISE_SHARE = 0.72
     _GAP_NEXT_V,
     _GAP_COUNT,
     _DOUBT_C,
-    _SIZE,
+    _LONGEST_S,
 ) = range(43)
+_SIZE = _LONGEST_S + HABIT
 
 #: Codes of what was found, in the order in which they count. 1 .. 4 are those of :func:`~.settling.start_code`.
 (
@@ -178,7 +180,7 @@ class Monitor(NamedTuple):
     """
     What the samples so far showed.
 
-    :param memory: shape (42,)
+    :param memory: shape (45,)
     :param kept: times, s, voltages, V, and currents, A, of some samples, the last ones, in a ring, shape (3, 32)
     :param changes: magnitudes of the last changes of the voltage from sample to sample, in a ring, V, shape (32,)
     """
@@ -327,15 +329,26 @@ def _middle(a: float, b: float, c: float) -> float:
 
 
 @_compiled
+def _note_interval(monitor: Monitor, interval_s: float, load_A: float) -> None:
+    # one that was no gap, or whose charge was drawn
+    longest_s = monitor.memory[_LONGEST_S:]
+    if interval_s > longest_s[0] and load_A > REST_CURRENT_A:
+        longest_s[0] = interval_s
+        longest_s.sort()
+
+
+@_compiled
 def _follow_gaps(monitor: Monitor, voltage: float, expected: float, current: float, duration: float, q: float) -> None:
     # One sample that is not the first. A gap is pending from its end until the voltages after it were seen.
     m = monitor.memory
     load_A = max(abs(m[_LOAD_A]), abs(current))
-    if duration <= 0.0:
-        return
     if m[_GAP_COUNT] > 0.0 and m[_GAP_S] <= GAP_RATIO * duration and m[_TIME] - duration == m[_GAP_END_S]:
         m[_GAP_COUNT] = 0.0  # the samples are as far apart from now on
-    charge_C = doubtful_charge_C(m[_INTERVAL_S], duration, 0.0, load_A, q)
+    charge_C = 0.0
+    if duration > GAP_RATIO * m[_LONGEST_S]:  # else the logger has a habit of it
+        charge_C = doubtful_charge_C(m[_INTERVAL_S], duration, 0.0, load_A, q)
+    if charge_C == 0.0:
+        _note_interval(monitor, duration, min(abs(m[_LOAD_A]), abs(current)))
     if charge_C > 0.0:
         if m[_GAP_COUNT] > 0.0:
             m[_DOUBT_C] += m[_GAP_C]
@@ -359,7 +372,9 @@ def _follow_gaps(monitor: Monitor, voltage: float, expected: float, current: flo
             after_V = _middle(m[_GAP_AFTER_V], m[_GAP_NEXT_V], voltage)
             sd_V = _PARTED_NOISE_SHARE * _noise_V(monitor) / (NOISES * _SMOOTHED_SHARE)
             said = verdict(after_V - m[_GAP_MODEL_V], m[_GAP_FALL_V], sd_V, MOST_SHARE_SO_FAR)
-            if said != DRAWN:
+            if said == DRAWN:
+                _note_interval(monitor, m[_GAP_S], load_A)
+            else:
                 m[_DOUBT_C] += m[_GAP_C]
             if said == NOT_DRAWN and m[_FAULT] == 0.0:
                 m[_FAULT_SINCE_S] = m[_GAP_END_S] - m[_GAP_S]
@@ -441,7 +456,7 @@ def watch(
             low, high = min(m[_VOLTAGE_2], m[_VOLTAGE_1]), max(m[_VOLTAGE_2], m[_VOLTAGE_1])
             middle_V = max(low, min(high, voltage[n]))
             _examine(monitor, m[_TIME_1], middle_V, m[_CURRENT_1], drawn_C[n], out[n, 0], out[n, 1], limits)
-        if m[_SAMPLES] > 1.0:
+        if m[_SAMPLES] > 1.0 and duration[n] > 0.0:
             _follow_gaps(monitor, voltage[n], out[n, 6], current[n], duration[n], out[n, 0])
         m[_LOAD_A] = current[n]
         start = _start(monitor, voltage[n], current[n], least_resistance_ohm(out[n, 0], out[n, 1]), limits)
