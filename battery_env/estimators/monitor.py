@@ -33,6 +33,8 @@ from battery_env.estimators.settling import (
     START_WINDOW_S,
     STEADY_S,
     UNSURE_TEXT,
+    change_to_follow_A,
+    lagging_current_A,
     least_resistance_ohm,
     start_code,
     start_text,
@@ -62,8 +64,9 @@ _PARTED_NOISE_SHARE = 0.72
 
 # What a monitor remembers: number and time of the samples (s); voltage and current of the first one; the largest current and
 # the least voltage within the start window; the two voltages before the one at hand, and time and current of the last of them;
-# how many samples were examined, and the last one; the largest magnitude of the current; of the last switch of the load its
-# time, its size (A), the voltage before it, the least and greatest one since, and how many samples; how many voltages were
+# how many samples were examined, and the last one; the current that the ohmic drop stands for then; the largest magnitude of
+# the current; of the last switch of the load its time, its size (A), the part of it that the voltage has to follow, the
+# voltage before it, the least and greatest one since, and how many samples; how many voltages were
 # kept; the time of the last jump of the current; how many changes of the voltage were kept; the fault that was found, its time
 # and its size, and since when; whether the first sample is known to be of a cell at rest. Of gaps: the last interval (s), the
 # current since (A), the voltage that was expected last, by how much cell and model part (V) and how fast the voltage falls
@@ -82,11 +85,14 @@ _PARTED_NOISE_SHARE = 0.72
     _TIME_1,
     _CURRENT_1,
     _EXAMINED,
+    _LAST_S,
     _LAST_V,
     _LAST_A,
+    _LAGGING_A,
     _LARGEST_A,
     _SWITCH_S,
     _SWITCHED_A,
+    _TO_FOLLOW_A,
     _BEFORE_V,
     _LOW_V,
     _HIGH_V,
@@ -114,7 +120,7 @@ _PARTED_NOISE_SHARE = 0.72
     _GAP_COUNT,
     _DOUBT_C,
     _LONGEST_S,
-) = range(43)
+) = range(46)
 _SIZE = _LONGEST_S + HABIT
 
 #: Codes of what was found, in the order in which they count. 1 .. 4 are those of :func:`~.settling.start_code`.
@@ -180,7 +186,7 @@ class Monitor(NamedTuple):
     """
     What the samples so far showed.
 
-    :param memory: shape (45,)
+    :param memory: shape (48,)
     :param kept: times, s, voltages, V, and currents, A, of some samples, the last ones, in a ring, shape (3, 32)
     :param changes: magnitudes of the last changes of the voltage from sample to sample, in a ring, V, shape (32,)
     """
@@ -254,7 +260,7 @@ def _find(monitor: Monitor, fault: int, time_s: float, size: float) -> None:
 def _conclude_switch(monitor: Monitor, resistance_ohm: float) -> None:
     # whether the voltage followed the last switch of the load by half of the least ohmic drop
     m = monitor.memory
-    drop_V = 0.5 * resistance_ohm * m[_SWITCHED_A]
+    drop_V = 0.5 * resistance_ohm * m[_TO_FOLLOW_A]
     if abs(drop_V) > _noise_V(monitor):
         followed_V = m[_BEFORE_V] - (m[_LOW_V] if drop_V > 0.0 else m[_HIGH_V])
         if followed_V / drop_V < 1.0:
@@ -278,7 +284,9 @@ def _examine(
             if m[_SWITCHED_A] != 0.0 and time_s - m[_SWITCH_S] >= _LEAST_PULSE_S and m[_SINCE] >= _LEAST_PULSE_SAMPLES:
                 _conclude_switch(monitor, resistance_ohm)
             m[_SWITCH_S], m[_SWITCHED_A], m[_BEFORE_V] = time_s, switched_A, m[_LAST_V]
+            m[_TO_FOLLOW_A] = change_to_follow_A(switched_A, current, m[_LAGGING_A])
             m[_LOW_V], m[_HIGH_V], m[_SINCE] = inf, -inf, 0.0
+        m[_LAGGING_A] = lagging_current_A(m[_LAGGING_A], m[_LAST_A], time_s - m[_LAST_S])
     else:
         m[_SWITCH_S] = m[_JUMP_S] = time_s
     if m[_SWITCHED_A] != 0.0:
@@ -299,12 +307,13 @@ def _examine(
     if n_kept == 0 or time_s - kept[0, (n_kept - 1) % _KEPT] >= _KEPT_EVERY_S:
         kept[0, n_kept % _KEPT], kept[1, n_kept % _KEPT], kept[2, n_kept % _KEPT] = time_s, voltage, current
         m[_N_KEPT] += 1.0
-    # under a steady load the voltage at rest is higher by the ohmic drop at least
+    # under a steady load the voltage at rest is higher by the ohmic drop at least; a charge that is seen raises it
     drop_V = resistance_ohm * max(current, 0.0) if time_s - m[_SWITCH_S] > START_WINDOW_S else 0.0
-    if drawn_C > _RECOVERY_SHARE * max(q, limits.cell_q_mobile) and voltage + drop_V > limits.start_V - FULL_REST_V[0]:
+    is_high = voltage + drop_V > limits.start_V - FULL_REST_V[0] and min(current, m[_LAGGING_A]) >= -REST_CURRENT_A
+    if is_high and drawn_C > _RECOVERY_SHARE * max(q, limits.cell_q_mobile):
         _find(monitor, _RECOVERED, time_s, drawn_C)
     m[_EXAMINED] += 1.0
-    m[_LAST_V], m[_LAST_A] = voltage, current
+    m[_LAST_S], m[_LAST_V], m[_LAST_A] = time_s, voltage, current
 
 
 @_compiled
