@@ -204,17 +204,18 @@ class Monitor(NamedTuple):
         """
         return cls(np.zeros(_SIZE), np.zeros((3, _KEPT)), np.zeros(_KEPT))
 
-    def texts(self, start_V: float, initial_soc: float) -> list[str]:
+    def texts(self, start_V: float, initial_soc: float, clock_s: float = 0.0) -> list[str]:
         """
         The reasons that the codes stand for.
 
         :param start_V: as of :class:`Limits`
         :param initial_soc: state of charge at the first sample
+        :param clock_s: time of the first sample, s; 0 of a stream, which has no clock
         :return: by code
         """
         memory = self.memory
-        gap_end_s = float(memory[_GAP_END_S])
-        first_V, fault_s, size = float(memory[_FIRST_V]), float(memory[_FAULT_S]), float(memory[_FAULT_SIZE])
+        since_s, fault_s, gap_end_s = (clock_s + float(memory[n]) for n in (_FAULT_SINCE_S, _FAULT_S, _GAP_END_S))
+        first_V, size = float(memory[_FIRST_V]), float(memory[_FAULT_SIZE])
         return [
             "",
             *(start_text(code, first_V, start_V, initial_soc) for code in range(1, 5)),
@@ -222,7 +223,7 @@ class Monitor(NamedTuple):
             "charged. Reset the filter when a discharge begins.",
             NOT_FOLLOWED.format(size, fault_s),
             RISES.format(size, fault_s),
-            NOT_DRAWN_TEXT.format(float(memory[_FAULT_SINCE_S]), fault_s, size),
+            NOT_DRAWN_TEXT.format(since_s, fault_s, size),
             EMPTY,
             AT_BOUND.format("q_mobile"),
             AT_BOUND.format("r_o"),

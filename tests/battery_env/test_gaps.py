@@ -62,6 +62,11 @@ class TestRealCells:
         estimate, right = calibrator.estimate(lost(whole, from_s, from_s + length_s)), calibrator.estimate(whole)
         assert estimate.settled and estimate.q_mobile == pytest.approx(right.q_mobile, rel=0.01)
 
+    def test_its_times_are_those_of_the_record(self, whole, calibrator):
+        late = jumped(changed(whole, late_s=5e4), 51_200.0, 600.0)
+        start_s = late.time_s[late.time_s <= 51_200.0][-1]
+        assert calibrator.estimate(late).reason.startswith(f"No sample lies between {start_s:.0f} s and ")
+
     def test_no_recorded_discharge_has_a_gap(self, whole):
         columns = whole.time_s, whole.voltage_V, whole.current_A
         assert find_gaps(*columns, whole.voltage_V, 7600.0) == []

@@ -243,6 +243,21 @@ class TestContradictions:
             estimate = calibrator.estimate(record)
             assert estimate.settled and estimate.q_mobile == pytest.approx(6000.0, rel=0.005)
 
+    @pytest.mark.parametrize("initial_soc", [1.0, "rest"])
+    def test_times_are_those_of_the_clock_of_the_record(self, initial_soc):
+        whole = simulated(np.where(np.arange(60_000) < 100, 0.0, np.where(np.arange(60_000) % 200 < 100, 1.0, 3.0)))
+        stuck_V = np.where(abs(whole.time_s - 1230.0) > 40.0, whole.voltage_V, whole.voltage_V[1190])
+        record = replace(whole, time_s=whole.time_s + 50_000.0, voltage_V=stuck_V)
+        for make in (LeastSquares, ExtendedKalmanFilter):
+            reason = make(thermal=True, initial_soc=initial_soc, mismatch_V=0.05).estimate(record).reason
+            assert reason == "The current changes by -2.00 A at 51200 s, and the voltage does not follow."
+        # a stream has no clock but that of its samples
+        filter_ = ExtendedKalmanFilter(thermal=True, initial_soc=initial_soc, mismatch_V=0.05)
+        filter_.estimate(record)
+        for voltage_V, current_A in zip(record.voltage_V[:1400], record.current_A[:1400], strict=True):
+            estimate = filter_.update(voltage_V, current_A, dt_s=1.0)
+        assert estimate.reason == "The current changes by -2.00 A at 1200 s, and the voltage does not follow."
+
 
 class TestPrecision:
     def test_half_a_discharge_does_not_tell_the_charge(self, whole):
