@@ -13,6 +13,9 @@ from battery_env.records import REST_CURRENT_A, SWITCH_SHARE
 #: An interval between two samples is a gap where it is this many times longer than those before and after it, and the charge
 #: that it would be without, were it as long as these, is above this share of ``q_mobile``.
 GAP_RATIO, GAP_SHARE = 2.5, 0.005
+#: It is none where the logger has a habit of it: one that writes a row when the voltage has changed has intervals of all
+#: lengths. Put in order, each is at most ``GAP_RATIO`` times longer than the one so many places before it.
+HABIT = 3
 #: What the voltage says of a gap: that its charge was drawn, that it was not, or nothing.
 DRAWN, NOT_DRAWN, UNSURE = range(3)
 
@@ -107,14 +110,20 @@ def find_gaps(
     :param q_mobile: of the model, C
     :return: these, in their order
     """
-    step_s, gaps = np.diff(time_s), []
-    beside_s = np.pad(step_s, 1)
-    for n in long_intervals(time_s):
+    gaps: list[Gap] = []
+    step_s, long = np.diff(time_s), long_intervals(time_s)
+    if not len(long):
+        return gaps
+    beside_s, unusual_s = np.pad(step_s, 1), _unusual_s(step_s, current_A)
+    for n in long:
+        usual_s = max(beside_s[n], beside_s[n + 2])
+        if not ((unusual_s > usual_s) & (unusual_s <= step_s[n])).any():
+            continue
         load_A = float(np.abs(current_A[n : n + 2]).max())
         charge_C = doubtful_charge_C(beside_s[n], step_s[n], beside_s[n + 2], load_A, q_mobile)
         if not charge_C:
             continue
-        window_s = max(float(np.clip(step_s[n], *_WINDOW_S)), 2.0 * _SAMPLES * max(beside_s[n], beside_s[n + 2]))
+        window_s = max(float(np.clip(step_s[n], *_WINDOW_S)), 2.0 * _SAMPLES * usual_s)
         # the first voltage may be that of the rest before the load
         first = max(int(np.searchsorted(time_s, time_s[n] - window_s)), 1)
         last = int(np.searchsorted(time_s, time_s[n + 1] + window_s, side="right"))
@@ -133,6 +142,14 @@ def find_gaps(
             said = UNSURE  # the load was switched, nobody knows when
         gaps.append(Gap(float(time_s[n]), float(time_s[n + 1]), float(charge_C), said))
     return gaps
+
+
+def _unusual_s(step_s: FloatArray, current_A: FloatArray) -> FloatArray:
+    """Lengths of intervals under load that no shorter ones lead up to, in their order, s."""
+    loaded = np.maximum(np.abs(current_A[:-1]), np.abs(current_A[1:])) > REST_CURRENT_A
+    length_s = np.sort(step_s[loaded])
+    shorter_s = np.pad(length_s, (HABIT, 0))[: len(length_s)]
+    return np.asarray(length_s[length_s > GAP_RATIO * shorter_s])
 
 
 def _edge(time_s: FloatArray, voltage_V: FloatArray, edge_s: float) -> tuple[float, float, float]:

@@ -214,7 +214,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
         self._numbers = np.zeros(_AMBIENT + 1)
         self._numbers[_SOC], self._numbers[_SD_SOC] = self.initial_soc
         self._numbers[_AMBIENT] = self.cell.Tb0
-        self._monitor = Monitor.new()
+        self._monitor, self._clock_s = Monitor.new(), 0.0
         self._model_cell = self.cell
         self._begin()
 
@@ -328,12 +328,17 @@ class ExtendedKalmanFilter(OnlineEstimator):
         :return: one trace per discharge, in the same order
         :raises ValueError: if a record cannot be used
         """
-        if self.told_from_rest:
-            return super().trace(records)
         traces = []
         for record in records:
-            time_s, voltage_V, current_A, dt_s, temperature_C = Stream.of(record, self.dt_s)
+            stream = Stream.of(record, self.dt_s)
             self.reset()
+            time_s, voltage_V, current_A, dt_s, temperature_C = stream
+            self._clock_s = float(time_s[0])
+            if self.told_from_rest:  # filters begin anew with each sample of a rest
+                measured_C = [None] * len(time_s) if temperature_C is None else temperature_C.tolist()
+                samples = zip(stream.samples(), measured_C, strict=True)
+                traces.append(EstimateTrace.of(time_s, [self.update(*sample, t_C) for sample, t_C in samples]))
+                continue
             temperature_K = np.full(len(time_s), np.nan)
             if temperature_C is not None:
                 temperature_K = temperature_C + ZERO_CELSIUS_K
@@ -391,7 +396,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
         return out, codes
 
     def _texts(self) -> list[str]:
-        return self._monitor.texts(self._limits.start_V, float(self._numbers[_SOC]))
+        return self._monitor.texts(self._limits.start_V, float(self._numbers[_SOC]), self._clock_s)
 
     def now(self) -> ModelNow:
         """

@@ -399,8 +399,7 @@ class LeastSquares(Estimator):
         else:
             noise_V, excess = self.voltage_noise_V, _EXCESS_LIMIT * sqrt(2.0 / n)
         limit_V2 = noise_V**2 * (1.0 + excess) + (MISMATCH_MARGIN * self.mismatch_V) ** 2 + _NEGLIGIBLE_V**2
-        current_A = np.asarray(record.current_A)
-        samples = (problem.time_s, problem.voltage_V, current_A)
+        samples = Samples.of(record)
         resistance_ohm, start = least_resistance_ohm(fit.values["q_mobile"], fit.values["r_o"]), ""
         if self._at_rest:
             start = start_reason(*samples, cell, self.initial_soc[0], resistance_ohm, rested)

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 
 from battery_env.arrays import FloatArray, IntArray
-from battery_env.estimators.gaps import DRAWN, GAP_RATIO, MOST_SHARE_SO_FAR, NOT_DRAWN, doubtful_charge_C, verdict
+from battery_env.estimators.gaps import DRAWN, GAP_RATIO, HABIT, MOST_SHARE_SO_FAR, NOT_DRAWN, doubtful_charge_C, verdict
 from battery_env.estimators.kalman_bank import LIMIT_SD
 from battery_env.estimators.settling import (
     AT_BOUND,
@@ -33,11 +33,13 @@ from battery_env.estimators.settling import (
     START_WINDOW_S,
     STEADY_S,
     UNSURE_TEXT,
+    change_to_follow_A,
+    lagging_current_A,
     least_resistance_ohm,
     start_code,
     start_text,
 )
-from battery_env.records import SWITCH_SHARE
+from battery_env.records import REST_CURRENT_A, SWITCH_SHARE
 
 # The data must have narrowed a prior by this share of its width before a deviation from it says anything.
 _LEAST_NARROWING = 0.2
@@ -62,13 +64,15 @@ _PARTED_NOISE_SHARE = 0.72
 
 # What a monitor remembers: number and time of the samples (s); voltage and current of the first one; the largest current and
 # the least voltage within the start window; the two voltages before the one at hand, and time and current of the last of them;
-# how many samples were examined, and the last one; the largest magnitude of the current; of the last switch of the load its
-# time, its size (A), the voltage before it, the least and greatest one since, and how many samples; how many voltages were
+# how many samples were examined, and the last one; the current that the ohmic drop stands for then; the largest magnitude of
+# the current; of the last switch of the load its time, its size (A), the part of it that the voltage has to follow, the
+# voltage before it, the least and greatest one since, and how many samples; how many voltages were
 # kept; the time of the last jump of the current; how many changes of the voltage were kept; the fault that was found, its time
 # and its size, and since when; whether the first sample is known to be of a cell at rest. Of gaps: the last interval (s), the
 # current since (A), the voltage that was expected last, by how much cell and model part (V) and how fast the voltage falls
 # (V/s), in the mean; of the last gap its length (s), the time after it, its charge (C), the fall of the model, the voltage of
-# the model after it, the first two voltages then (V), and how many were seen; the charge in doubt (C).
+# the model after it, the first two voltages then (V), and how many were seen; the charge in doubt (C); and the longest
+# intervals under load that were not in doubt, in their order (s).
 (
     _SAMPLES,
     _TIME,
@@ -81,11 +85,14 @@ _PARTED_NOISE_SHARE = 0.72
     _TIME_1,
     _CURRENT_1,
     _EXAMINED,
+    _LAST_S,
     _LAST_V,
     _LAST_A,
+    _LAGGING_A,
     _LARGEST_A,
     _SWITCH_S,
     _SWITCHED_A,
+    _TO_FOLLOW_A,
     _BEFORE_V,
     _LOW_V,
     _HIGH_V,
@@ -112,8 +119,9 @@ _PARTED_NOISE_SHARE = 0.72
     _GAP_NEXT_V,
     _GAP_COUNT,
     _DOUBT_C,
-    _SIZE,
-) = range(43)
+    _LONGEST_S,
+) = range(46)
+_SIZE = _LONGEST_S + HABIT
 
 #: Codes of what was found, in the order in which they count. 1 .. 4 are those of :func:`~.settling.start_code`.
 (
@@ -178,7 +186,7 @@ class Monitor(NamedTuple):
     """
     What the samples so far showed.
 
-    :param memory: shape (42,)
+    :param memory: shape (48,)
     :param kept: times, s, voltages, V, and currents, A, of some samples, the last ones, in a ring, shape (3, 32)
     :param changes: magnitudes of the last changes of the voltage from sample to sample, in a ring, V, shape (32,)
     """
@@ -196,17 +204,18 @@ class Monitor(NamedTuple):
         """
         return cls(np.zeros(_SIZE), np.zeros((3, _KEPT)), np.zeros(_KEPT))
 
-    def texts(self, start_V: float, initial_soc: float) -> list[str]:
+    def texts(self, start_V: float, initial_soc: float, clock_s: float = 0.0) -> list[str]:
         """
         The reasons that the codes stand for.
 
         :param start_V: as of :class:`Limits`
         :param initial_soc: state of charge at the first sample
+        :param clock_s: time of the first sample, s; 0 of a stream, which has no clock
         :return: by code
         """
         memory = self.memory
-        gap_end_s = float(memory[_GAP_END_S])
-        first_V, fault_s, size = float(memory[_FIRST_V]), float(memory[_FAULT_S]), float(memory[_FAULT_SIZE])
+        since_s, fault_s, gap_end_s = (clock_s + float(memory[n]) for n in (_FAULT_SINCE_S, _FAULT_S, _GAP_END_S))
+        first_V, size = float(memory[_FIRST_V]), float(memory[_FAULT_SIZE])
         return [
             "",
             *(start_text(code, first_V, start_V, initial_soc) for code in range(1, 5)),
@@ -214,7 +223,7 @@ class Monitor(NamedTuple):
             "charged. Reset the filter when a discharge begins.",
             NOT_FOLLOWED.format(size, fault_s),
             RISES.format(size, fault_s),
-            NOT_DRAWN_TEXT.format(float(memory[_FAULT_SINCE_S]), fault_s, size),
+            NOT_DRAWN_TEXT.format(since_s, fault_s, size),
             EMPTY,
             AT_BOUND.format("q_mobile"),
             AT_BOUND.format("r_o"),
@@ -252,7 +261,7 @@ def _find(monitor: Monitor, fault: int, time_s: float, size: float) -> None:
 def _conclude_switch(monitor: Monitor, resistance_ohm: float) -> None:
     # whether the voltage followed the last switch of the load by half of the least ohmic drop
     m = monitor.memory
-    drop_V = 0.5 * resistance_ohm * m[_SWITCHED_A]
+    drop_V = 0.5 * resistance_ohm * m[_TO_FOLLOW_A]
     if abs(drop_V) > _noise_V(monitor):
         followed_V = m[_BEFORE_V] - (m[_LOW_V] if drop_V > 0.0 else m[_HIGH_V])
         if followed_V / drop_V < 1.0:
@@ -276,7 +285,9 @@ def _examine(
             if m[_SWITCHED_A] != 0.0 and time_s - m[_SWITCH_S] >= _LEAST_PULSE_S and m[_SINCE] >= _LEAST_PULSE_SAMPLES:
                 _conclude_switch(monitor, resistance_ohm)
             m[_SWITCH_S], m[_SWITCHED_A], m[_BEFORE_V] = time_s, switched_A, m[_LAST_V]
+            m[_TO_FOLLOW_A] = change_to_follow_A(switched_A, current, m[_LAGGING_A])
             m[_LOW_V], m[_HIGH_V], m[_SINCE] = inf, -inf, 0.0
+        m[_LAGGING_A] = lagging_current_A(m[_LAGGING_A], m[_LAST_A], time_s - m[_LAST_S])
     else:
         m[_SWITCH_S] = m[_JUMP_S] = time_s
     if m[_SWITCHED_A] != 0.0:
@@ -297,12 +308,13 @@ def _examine(
     if n_kept == 0 or time_s - kept[0, (n_kept - 1) % _KEPT] >= _KEPT_EVERY_S:
         kept[0, n_kept % _KEPT], kept[1, n_kept % _KEPT], kept[2, n_kept % _KEPT] = time_s, voltage, current
         m[_N_KEPT] += 1.0
-    # under a steady load the voltage at rest is higher by the ohmic drop at least
+    # under a steady load the voltage at rest is higher by the ohmic drop at least; a charge that is seen raises it
     drop_V = resistance_ohm * max(current, 0.0) if time_s - m[_SWITCH_S] > START_WINDOW_S else 0.0
-    if drawn_C > _RECOVERY_SHARE * max(q, limits.cell_q_mobile) and voltage + drop_V > limits.start_V - FULL_REST_V[0]:
+    is_high = voltage + drop_V > limits.start_V - FULL_REST_V[0] and min(current, m[_LAGGING_A]) >= -REST_CURRENT_A
+    if is_high and drawn_C > _RECOVERY_SHARE * max(q, limits.cell_q_mobile):
         _find(monitor, _RECOVERED, time_s, drawn_C)
     m[_EXAMINED] += 1.0
-    m[_LAST_V], m[_LAST_A] = voltage, current
+    m[_LAST_S], m[_LAST_V], m[_LAST_A] = time_s, voltage, current
 
 
 @_compiled
@@ -327,15 +339,26 @@ def _middle(a: float, b: float, c: float) -> float:
 
 
 @_compiled
+def _note_interval(monitor: Monitor, interval_s: float, load_A: float) -> None:
+    # one that was no gap, or whose charge was drawn
+    longest_s = monitor.memory[_LONGEST_S:]
+    if interval_s > longest_s[0] and load_A > REST_CURRENT_A:
+        longest_s[0] = interval_s
+        longest_s.sort()
+
+
+@_compiled
 def _follow_gaps(monitor: Monitor, voltage: float, expected: float, current: float, duration: float, q: float) -> None:
     # One sample that is not the first. A gap is pending from its end until the voltages after it were seen.
     m = monitor.memory
     load_A = max(abs(m[_LOAD_A]), abs(current))
-    if duration <= 0.0:
-        return
     if m[_GAP_COUNT] > 0.0 and m[_GAP_S] <= GAP_RATIO * duration and m[_TIME] - duration == m[_GAP_END_S]:
         m[_GAP_COUNT] = 0.0  # the samples are as far apart from now on
-    charge_C = doubtful_charge_C(m[_INTERVAL_S], duration, 0.0, load_A, q)
+    charge_C = 0.0
+    if duration > GAP_RATIO * m[_LONGEST_S]:  # else the logger has a habit of it
+        charge_C = doubtful_charge_C(m[_INTERVAL_S], duration, 0.0, load_A, q)
+    if charge_C == 0.0:
+        _note_interval(monitor, duration, min(abs(m[_LOAD_A]), abs(current)))
     if charge_C > 0.0:
         if m[_GAP_COUNT] > 0.0:
             m[_DOUBT_C] += m[_GAP_C]
@@ -359,7 +382,9 @@ def _follow_gaps(monitor: Monitor, voltage: float, expected: float, current: flo
             after_V = _middle(m[_GAP_AFTER_V], m[_GAP_NEXT_V], voltage)
             sd_V = _PARTED_NOISE_SHARE * _noise_V(monitor) / (NOISES * _SMOOTHED_SHARE)
             said = verdict(after_V - m[_GAP_MODEL_V], m[_GAP_FALL_V], sd_V, MOST_SHARE_SO_FAR)
-            if said != DRAWN:
+            if said == DRAWN:
+                _note_interval(monitor, m[_GAP_S], load_A)
+            else:
                 m[_DOUBT_C] += m[_GAP_C]
             if said == NOT_DRAWN and m[_FAULT] == 0.0:
                 m[_FAULT_SINCE_S] = m[_GAP_END_S] - m[_GAP_S]
@@ -441,7 +466,7 @@ def watch(
             low, high = min(m[_VOLTAGE_2], m[_VOLTAGE_1]), max(m[_VOLTAGE_2], m[_VOLTAGE_1])
             middle_V = max(low, min(high, voltage[n]))
             _examine(monitor, m[_TIME_1], middle_V, m[_CURRENT_1], drawn_C[n], out[n, 0], out[n, 1], limits)
-        if m[_SAMPLES] > 1.0:
+        if m[_SAMPLES] > 1.0 and duration[n] > 0.0:
             _follow_gaps(monitor, voltage[n], out[n, 6], current[n], duration[n], out[n, 0])
         m[_LOAD_A] = current[n]
         start = _start(monitor, voltage[n], current[n], least_resistance_ohm(out[n, 0], out[n, 1]), limits)

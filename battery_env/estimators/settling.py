@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from math import comb
+from math import comb, expm1
 
 import numpy as np
 from numba import njit
@@ -30,6 +30,9 @@ _LEAST_RESISTANCE_OHM = 0.1
 _NEW_Q_C = NEW_CELL.q_mobile
 #: The voltage of a cell that was at rest at the first sample falls by at least half of its ohmic drop within this time, s.
 START_WINDOW_S = 20.0
+
+# The ohmic drop follows the current with this time constant at most, s: cells may be twice as slow as the model's.
+_FOLLOWS_S = 2.0 * NEW_CELL.to
 
 #: Under a current that has been steady for this long, s, the voltage of a cell does not rise by this much, V.
 STEADY_S, RISE_V = 60.0, 0.05
@@ -115,6 +118,43 @@ def least_resistance_ohm(q_mobile: float, r_o: float) -> float:
     :return: ohm
     """
     return max(min(_LEAST_RESISTANCE_OHM, _LEAST_RESISTANCE_OHM * _NEW_Q_C / q_mobile, r_o), 0.0)
+
+
+@njit(cache=True, error_model="numpy")
+def lagging_current_A(before_A: float, current_A: float, duration_s: float) -> float:
+    """
+    The current that the ohmic drop stands for, which follows slowly, compiled.
+
+    :param before_A: the same a while ago, A
+    :param current_A: current since then, A
+    :param duration_s: length of the while, s
+    :return: A
+    """
+    return before_A + (before_A - current_A) * expm1(-duration_s / _FOLLOWS_S)
+
+
+@njit(cache=True, error_model="numpy")
+def change_to_follow_A(switched_A: float, current_A: float, lagging_A: float) -> float:
+    """
+    The part of a switch of the load that the ohmic drop has to follow, compiled: after a pulse that was over before the drop
+    had built up it has little to take back.
+
+    :param switched_A: by how much the current was switched, A
+    :param current_A: current after it, A
+    :param lagging_A: :func:`lagging_current_A` before it, A
+    :return: of the same sign and no larger than ``switched_A``, or 0, A
+    """
+    return max(min(current_A - lagging_A, max(switched_A, 0.0)), min(switched_A, 0.0))
+
+
+@njit(cache=True, error_model="numpy")
+def _changes_to_follow_A(time_s: FloatArray, current_A: FloatArray) -> FloatArray:
+    # from each sample to the next one
+    change_A, lagging_A = np.empty(len(time_s) - 1), 0.0
+    for n in range(len(time_s) - 1):
+        change_A[n] = change_to_follow_A(current_A[n + 1] - current_A[n], current_A[n + 1], lagging_A)
+        lagging_A = lagging_current_A(lagging_A, current_A[n], time_s[n + 1] - time_s[n])
+    return change_A
 
 
 def start_reason(
@@ -205,7 +245,8 @@ def sensor_reason(
 ) -> str:
     """
     Whether voltage and current belong to each other. Where the load is switched and stays so, the voltage follows by at least
-    half of the least ohmic drop; and it does not rise while the current stays as it was.
+    half of the least ohmic drop, as far as that had followed the load before; and it does not rise while the current stays as
+    it was.
 
     :param time_s: times of the samples, s, shape (T,), T >= 2
     :param voltage_V: V, shape (T,)
@@ -220,8 +261,9 @@ def sensor_reason(
     until = np.minimum(
         np.maximum(np.searchsorted(time_s, time_s + START_WINDOW_S, side="right"), np.arange(last + 1) + 2), last
     )
+    to_follow_A = _changes_to_follow_A(time_s, current_A)
     for n, following in zip(switches, np.append(switches, last)[1:], strict=True):
-        drop_V = 0.5 * resistance_ohm * switched_A[n - 1]
+        drop_V = 0.5 * resistance_ohm * to_follow_A[n - 1]
         after_V = voltage_V[n : until[n] + 1]
         if until[n] <= min(following, last - 1) and abs(drop_V) > noise_V:
             followed_V = voltage_V[n - 1] - (after_V.min() if drop_V > 0.0 else after_V.max())

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from battery_env.files import replacing
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 _KIND = "state of an estimator"
 
 

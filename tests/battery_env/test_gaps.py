@@ -62,6 +62,11 @@ class TestRealCells:
         estimate, right = calibrator.estimate(lost(whole, from_s, from_s + length_s)), calibrator.estimate(whole)
         assert estimate.settled and estimate.q_mobile == pytest.approx(right.q_mobile, rel=0.01)
 
+    def test_its_times_are_those_of_the_record(self, whole, calibrator):
+        late = jumped(changed(whole, late_s=5e4), 51_200.0, 600.0)
+        start_s = late.time_s[late.time_s <= 51_200.0][-1]
+        assert calibrator.estimate(late).reason.startswith(f"No sample lies between {start_s:.0f} s and ")
+
     def test_no_recorded_discharge_has_a_gap(self, whole):
         columns = whole.time_s, whole.voltage_V, whole.current_A
         assert find_gaps(*columns, whole.voltage_V, 7600.0) == []
@@ -96,8 +101,9 @@ class TestSimulated:
         estimate = calibrator.estimate(changed(record, (record.time_s < 1520.0) | (record.time_s > 5480.0)))
         assert estimate.settled and estimate.q_mobile == pytest.approx(6000.0, rel=0.01)
 
-    def test_a_load_that_was_switched_meanwhile_is_in_doubt(self):
-        record = simulated(np.where(np.arange(40_000) < 1500, 2.0, 1.0))
+    @pytest.mark.parametrize("later_A", [0.0, 1.0])
+    def test_a_load_that_was_switched_meanwhile_is_in_doubt(self, later_A):
+        record = simulated(np.where(np.arange(5000) < 1500, 2.0, later_A))
         seen = lost(record, 1400.0, 1700.0)
         gap, *others = find_gaps(seen.time_s, seen.voltage_V, seen.current_A, seen.voltage_V, 6000.0)
         assert not others and gap.verdict == UNSURE and (gap.start_s, gap.end_s) == (1400.0, 1701.0)
@@ -113,6 +119,53 @@ class TestSimulated:
             whole = through.update(*sample)
             part = resumed.update(*sample) if n >= at else whole
         assert part == whole and not whole.settled and NEITHER in whole.reason
+
+
+def by_voltage(load_A, step_V: float, longest_s: float, noise_V: float) -> Discharge:
+    """A record as cyclers write it: a row where the voltage has changed, a time is over, or the load is switched."""
+    record = simulated(load_A, noise_V)
+    time_s, voltage_V, current_A = record.time_s, record.voltage_V, record.current_A
+    kept = [0]
+    switches = np.flatnonzero(np.diff(current_A))
+    is_switch = np.isin(np.arange(len(time_s)), np.append(switches, switches + 1))
+    for n in range(1, len(time_s)):
+        late = time_s[n] - time_s[kept[-1]] >= longest_s
+        if late or is_switch[n] or abs(voltage_V[n] - voltage_V[kept[-1]]) >= step_V:
+            kept.append(n)
+    return changed(record, kept)
+
+
+LOADS_A = {"2 A": 2.0, "1..3 A": np.repeat(np.random.default_rng(0).uniform(1.0, 3.0, 200), 120)}
+
+
+class TestIrregularLoggers:
+    @pytest.mark.parametrize("load_A", LOADS_A.values(), ids=list(LOADS_A))
+    @pytest.mark.parametrize(
+        ("step_V", "longest_s", "noise_V"),
+        [(0.005, 60.0, 0.001), (0.005, 60.0, 0.0015), (0.005, 60.0, 0.002), (0.01, 120.0, 0.003), (0.005, 30.0, 0.002)],
+    )
+    def test_one_that_writes_where_the_voltage_changes_leaves_no_gaps(self, calibrator, load_A, step_V, longest_s, noise_V):
+        record = by_voltage(load_A, step_V, longest_s, noise_V)
+        step_s = np.diff(record.time_s)
+        assert step_s.min() == 1.0 and step_s.max() > 0.7 * longest_s
+        estimate = calibrator.estimate(record)
+        assert estimate.settled and estimate.q_mobile == pytest.approx(6000.0, rel=0.005)
+        assert estimate.sd_q_mobile < 0.018 * 6000.0
+
+    @pytest.mark.parametrize("load_A", LOADS_A.values(), ids=list(LOADS_A))
+    def test_its_clock_may_jump_all_the_same(self, calibrator, load_A):
+        estimate = calibrator.estimate(jumped(by_voltage(load_A, 0.005, 60.0, 0.001), 1500.0, 300.0))
+        assert not estimate.settled and estimate.reason.startswith("No sample lies between 1")
+        assert estimate.sd_q_mobile > 0.9 * (estimate.q_mobile - 6000.0)
+
+    @pytest.mark.parametrize("every_s", [1, 10])
+    def test_pauses_that_are_never_logged_are_no_habit_of_a_logger(self, calibrator, every_s):
+        load_A = np.where(np.arange(40_000) % 600 < 300, 2.0, 0.0)
+        record = simulated(load_A, 0.001)
+        # the first row after a pause has not seen the load yet
+        logged = (record.current_A > 0.0) & ((record.time_s % 600 > 0.0) | (record.time_s == 0.0))
+        estimate = calibrator.estimate(changed(record, logged & (record.time_s % every_s == 0)))
+        assert not estimate.settled and estimate.sd_q_mobile > 0.9 * (estimate.q_mobile - 6000.0) > 4000.0
 
 
 def test_the_voltage_says_whether_the_charge_was_drawn():

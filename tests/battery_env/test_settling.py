@@ -216,6 +216,48 @@ class TestContradictions:
         stuck_A = np.where(record.time_s > 1300.0, 2.0, record.current_A)
         assert sensor_reason(*arrays, stuck_A).startswith("The voltage rises by 0.30 V at 45")
 
+    @pytest.mark.parametrize("r_o", [0.1, 0.15])
+    @pytest.mark.parametrize("length", [1, 2, 3, 4, 8])
+    def test_a_pulse_that_ends_before_the_voltage_has_followed_is_no_failed_sensor(self, length, r_o):
+        since = np.arange(60_000) - 100
+        record = simulated(np.where((since >= 0) & (since % 60 < length), 5.0, 1.0), r_o=r_o, noise_V=0.002)
+        for calibrator in (LeastSquares(thermal=True), ExtendedKalmanFilter(thermal=True)):
+            estimate = calibrator.estimate(record)
+            assert estimate.settled and estimate.q_mobile == pytest.approx(6000.0, rel=0.005)
+
+    @pytest.mark.parametrize("length", [20, 30])
+    def test_a_voltage_that_is_stuck_under_longer_ones_still_is(self, length):
+        record = simulated(np.where(np.arange(60_000) % 60 < length, 5.0, 1.0), noise_V=0.002)
+        stuck_V = np.where(record.time_s < 605.0, record.voltage_V, record.voltage_V[605])
+        part = replace(record, voltage_V=stuck_V).until(900.0)
+        assert sensor_reason(part.time_s, part.voltage_V, part.current_A).startswith("The current changes by -4.00 A at 6")
+        filtered = ExtendedKalmanFilter(thermal=True).estimate(part)
+        assert filtered.reason.startswith("The current changes by -4.00 A at 6")
+
+    @pytest.mark.parametrize("rest_s", [0, 40])
+    def test_a_pulse_of_charge_in_a_discharge_is_no_forgotten_reset(self, rest_s):
+        rest_A = np.zeros(rest_s)
+        cycle_A = np.concatenate([np.full(10, 4.0), rest_A, np.full(10, -3.0), rest_A, np.full(280, 2.0), np.zeros(300)])
+        record = simulated(np.tile(cycle_A, 40), noise_V=1e-6)
+        for calibrator in (LeastSquares(thermal=True), ExtendedKalmanFilter(thermal=True)):
+            estimate = calibrator.estimate(record)
+            assert estimate.settled and estimate.q_mobile == pytest.approx(6000.0, rel=0.005)
+
+    @pytest.mark.parametrize("initial_soc", [1.0, "rest"])
+    def test_times_are_those_of_the_clock_of_the_record(self, initial_soc):
+        whole = simulated(np.where(np.arange(60_000) < 100, 0.0, np.where(np.arange(60_000) % 200 < 100, 1.0, 3.0)))
+        stuck_V = np.where(abs(whole.time_s - 1230.0) > 40.0, whole.voltage_V, whole.voltage_V[1190])
+        record = replace(whole, time_s=whole.time_s + 50_000.0, voltage_V=stuck_V)
+        for make in (LeastSquares, ExtendedKalmanFilter):
+            reason = make(thermal=True, initial_soc=initial_soc, mismatch_V=0.05).estimate(record).reason
+            assert reason == "The current changes by -2.00 A at 51200 s, and the voltage does not follow."
+        # a stream has no clock but that of its samples
+        filter_ = ExtendedKalmanFilter(thermal=True, initial_soc=initial_soc, mismatch_V=0.05)
+        filter_.estimate(record)
+        for voltage_V, current_A in zip(record.voltage_V[:1400], record.current_A[:1400], strict=True):
+            estimate = filter_.update(voltage_V, current_A, dt_s=1.0)
+        assert estimate.reason == "The current changes by -2.00 A at 1200 s, and the voltage does not follow."
+
 
 class TestPrecision:
     def test_half_a_discharge_does_not_tell_the_charge(self, whole):
