@@ -148,7 +148,7 @@ class CertificationReport:
         """
         from sb3_lac.stability import plots  # matplotlib is slow to import, and only a figure needs it
 
-        return plots.plot_certification(self.statements, self.transitions, self.confidence, self.cost_bound)
+        return plots.plot_certification(self.statements, self.transitions, percent(self.confidence), self.cost_bound)
 
     def plot_region_of_attraction(self, x: int = 0, y: int = 1, names: Sequence[str] | None = None) -> Figure:
         """
@@ -163,7 +163,7 @@ class CertificationReport:
 
         if self.starts is None:
             raise ValueError("There are no start states: certify(..., starts=...) tries those of an array.")
-        return plots.plot_attraction(self.starts, self.confidence, x, y, names)
+        return plots.plot_attraction(self.starts, percent(self.confidence), x, y, names)
 
 
 def certify(

@@ -15,8 +15,6 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
 
-from sb3_lac.stability.statistics import percent
-
 #: Colours that colour-blind readers can tell apart (Okabe & Ito)
 BLUE, VERMILION, GREEN, ORANGE, GREY = "#0072b2", "#d55e00", "#009e73", "#e69f00", "#7f7f7f"
 
@@ -253,14 +251,14 @@ def plot_drift(by_cost: pd.DataFrame, cost_bound: float, cost_bound_alpha3: floa
 
 
 def plot_certification(
-    statements: pd.DataFrame, transitions: pd.DataFrame, confidence: float, cost_bound: float | None
+    statements: pd.DataFrame, transitions: pd.DataFrame, confidence: str, cost_bound: float | None
 ) -> Figure:
     """
     See ``CertificationReport.plot()``.
 
     :param statements: One row per statement
     :param transitions: One row per transition
-    :param confidence: Of all statements together
+    :param confidence: Of all statements together, in per cent
     :param cost_bound: A cost to mark, None if there is none
     :return: The figure
     """
@@ -277,19 +275,19 @@ def plot_certification(
         xlim=(0, 1.02),
         ylim=(-0.9, len(statements) - 0.5),
         xlabel="probability",
-        title=f"With {percent(confidence)} % confidence",
+        title=f"With {confidence} % confidence",
     )
     of_statements.legend(fontsize=8, loc="lower left", ncols=2)
     draw_costs(transitions, math.nan if cost_bound is None else cost_bound, of_costs, "cost bound")
     return figure
 
 
-def plot_attraction(starts: pd.DataFrame, confidence: float, x: int, y: int, names: Sequence[str] | None) -> Figure:
+def plot_attraction(starts: pd.DataFrame, confidence: str, x: int, y: int, names: Sequence[str] | None) -> Figure:
     """
     See ``CertificationReport.plot_region_of_attraction()``.
 
     :param starts: One row per start state
-    :param confidence: Of each interval
+    :param confidence: Of each interval, in per cent
     :param x: Dimension of the start state on the horizontal axis
     :param y: Dimension of the start state on the vertical axis
     :param names: Names of all dimensions
@@ -305,7 +303,7 @@ def plot_attraction(starts: pd.DataFrame, confidence: float, x: int, y: int, nam
     marks = axes.scatter(shown[:, 0], shown[:, 1], c=low, s=42, marker="s", cmap="viridis", vmin=0.0, vmax=1.0)
     never = (starts["n_attracted"] == 0).to_numpy()
     axes.scatter(points[never, 0], points[never, 1], s=20, color=VERMILION, marker="x", lw=1, label="never attracted")
-    figure.colorbar(marks, ax=axes, label=f"probability of attraction, at least ({percent(confidence)} % interval)")
+    figure.colorbar(marks, ax=axes, label=f"probability of attraction, at least ({confidence} % interval)")
     if never.any():
         axes.legend(fontsize=8, loc="upper right")
     axes.set(title=f"{len(points)} start states, {starts['n_episodes'].iloc[0]} episodes each", **labels)
