@@ -162,7 +162,7 @@ class LyapunovReport:
         late_cost, late_rise = metrics["late_cost"].value, metrics["late_rise"].value
         if metrics["late_rise"].low > 0 and late_cost + late_rise > metrics["cost_bound"].value:
             return (
-                f"the cost rises where the roll-outs end, by {late_rise:.3g} from one fifth of their steps to the last, to "
+                f"the cost rises where the roll-outs end, in the last fifth by {late_rise:.3g} above the three before, to "
                 f"{late_cost:.3g}: it would soon be above cost_bound"
             )
         if not metrics["cost_bound"].high < self.settled_share * metrics["start_cost"].value:
@@ -322,7 +322,7 @@ def evaluate_lyapunov(
       levels whose cost is larger. It is never less than ``late_cost``: roll-outs that have not settled do not say where they
       will.
     - ``late_cost``: mean cost in the last fifth of the episodes that did not terminate, and ``late_rise``, by how much it is
-      larger than that of the fifth before
+      larger than those of the three fifths before
 
     Their intervals are percentiles of a bootstrap that resamples episodes (the transitions of an episode depend on each
     other). With few episodes such intervals are too narrow: those of a mean of normal numbers contain the true one in 85 % of

@@ -315,6 +315,17 @@ def test_loop_whose_cost_rises_in_the_end_does_not_hold(factor, holds):
     assert report.metrics["cost_bound"].value >= report.metrics["late_cost"].value
 
 
+def test_cost_that_goes_up_and_down_does_not_rise():
+    """As that of a goal that moves: in the last fifth it is higher than in the one before, and not than ever before."""
+    costs = [8.0, 8.0, *(1.0 + np.sin(2 * np.pi * np.arange(2, 20) / 10 - 2.5))]
+    falls = LyapunovFunction(lambda observations: np.where(observations[:, 0] < 99, observations[:, 0], 0.0))
+    report = evaluate_lyapunov(NoController(), PlannedEnv([costs]), 10, seed=0, lyapunov=falls)
+    fifths = np.reshape(costs, (5, 4)).mean(axis=1)
+    assert fifths[4] > fifths[3] + 0.5 and report.metrics["late_cost"].value == pytest.approx(fifths[4])
+    assert report.metrics["late_rise"].value == pytest.approx(fifths[4] - fifths[1:4].max())
+    assert report.metrics["late_rise"].value < 0
+
+
 def test_bound_of_the_cost_errs_on_the_safe_side(linear_env):
     """With the exact function of the average cost both are the mean cost in the long run."""
     env = LinearCostEnv()
