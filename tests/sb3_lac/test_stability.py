@@ -152,7 +152,8 @@ def test_exact_lyapunov_function_is_recognized(make_exact_model, gamma, alpha3):
             "decrease_rate": 1 - RHO**2,
             "start_cost": squares.mean(),
             "late_cost": 0.0,
-            "late_rise": 0.0,
+            # It falls, from the second fifth on
+            "late_rise": -squares.mean() * RHO**20 * (1 - RHO**20) * series / 10,
             # Of the level where it is largest: what alpha3 asks beyond what is feasible is most where the cost is most
             "residual": (alpha3 - feasible) * report.by_cost["cost"].iloc[-1 if alpha3 > feasible else 0],
             # The drift is proportional to the cost, so that there is no residual with the feasible alpha3
