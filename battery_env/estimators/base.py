@@ -309,12 +309,16 @@ class OnlineEstimator(Estimator):
         for record in records:
             stream = Stream.of(record, self.dt_s)
             self.reset()
-            measured: Iterable[tuple[float, ...]] = stream.samples()
-            if stream.temperature_C is not None:
-                measured = ((*sample, t_C) for sample, t_C in zip(measured, stream.temperature_C.tolist(), strict=True))
-            traces.append(EstimateTrace.of(stream.time_s, [self.update(*sample) for sample in measured]))
+            traces.append(self._follow_samples(stream))
         self.reset()
         return traces
+
+    def _follow_samples(self, stream: Stream) -> EstimateTrace:
+        """One update per sample of a stream, after a reset."""
+        measured: Iterable[tuple[float, ...]] = stream.samples()
+        if stream.temperature_C is not None:
+            measured = ((*sample, t_C) for sample, t_C in zip(measured, stream.temperature_C.tolist(), strict=True))
+        return EstimateTrace.of(stream.time_s, [self.update(*sample) for sample in measured])
 
 
 class OnlineBatch:

@@ -335,9 +335,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
             time_s, voltage_V, current_A, dt_s, temperature_C = stream
             self._clock_s = float(time_s[0])
             if self.told_from_rest:  # filters begin anew with each sample of a rest
-                measured_C = [None] * len(time_s) if temperature_C is None else temperature_C.tolist()
-                samples = zip(stream.samples(), measured_C, strict=True)
-                traces.append(EstimateTrace.of(time_s, [self.update(*sample, t_C) for sample, t_C in samples]))
+                traces.append(self._follow_samples(stream))
                 continue
             temperature_K = np.full(len(time_s), np.nan)
             if temperature_C is not None:
