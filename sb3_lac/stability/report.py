@@ -41,8 +41,9 @@ class LyapunovReport:
     :param transitions: One row per transition, episodes one after the other: ``episode``, ``step``, ``reward``, ``cost``,
         ``lyapunov`` (``L(s, a)``), ``next_lyapunov`` (``L(s', a')``, NaN if s' is terminal), ``difference``
         (``L(s', a') - L(s, a) + alpha3 * c``), ``cost_to_go`` (NaN if too much of it was not seen), ``terminated``
-    :param episodes: One row per episode: ``length``, ``total_cost``, ``final_cost``, ``largest_late_cost`` (in its last
-        fifth), ``terminated``
+    :param episodes: One row per episode: ``length``, ``total_cost``, ``final_cost``, ``largest_late_cost`` and
+        ``late_cost`` (the largest and the mean one of its last fifth), ``late_rise`` (by how much that mean is larger than
+        those of the three fifths before), ``terminated``
     :param observations: The observations of the transitions as the policy saw them, or None if they are no vectors
     :param metrics: Values with their 95 % intervals, by name
     :param by_cost: The decrease condition by level of the cost: ``cost_low``, ``cost_high``, ``cost`` (mean),

@@ -423,12 +423,12 @@ def cost_to_go(
     :param bound: Cost of each step after a termination
     :return: The sums, NaN where too much is not seen, and where costs without discount never end
     """
+    from scipy.signal import lfilter  # slow to import, and only an evaluation needs it
+
     episode, step = transitions["episode"].to_numpy(), transitions["step"].to_numpy()
     lengths = np.bincount(episode)
     costs = np.zeros((len(lengths), lengths.max()))
     costs[episode, step] = transitions["cost"]
-    from scipy.signal import lfilter
-
     # G = c + gamma * G' as a filter that runs back in time
     if horizon is None:
         numerator, denominator = np.ones(1), np.array([1.0, -gamma])
