@@ -31,7 +31,7 @@ from tqdm import tqdm
 from battery_env.plotting import COLOURS, new_figure, save_figure
 from benchmarks.controllers import controllers, factors
 from benchmarks.references import DISTURBANCES
-from benchmarks.study import Study, command_line, natural
+from benchmarks.study import Study, command_line, digits, natural
 from benchmarks.training import Recipe, train_or_load
 from sb3_lac import LAC, certify, evaluate_lyapunov, fit_lyapunov
 from sb3_lac.envs import LinearCostEnv
@@ -100,10 +100,11 @@ def policies(chosen: argparse.Namespace, env_id: str) -> list[tuple[str, int | N
     for algo in chosen.algos:
         for fraction in chosen.fractions:
             for seed in chosen.seeds:
-                recipe = Recipe.of(algo, env_id, seed, int(chosen.timesteps) if chosen.timesteps else None)
+                recipe = Recipe.of(algo, env_id, seed)
                 given = {**recipe.arguments, **recipe.hyperparameters}
+                whole = min(recipe.timesteps, int(chosen.timesteps or recipe.timesteps))
                 # a share of what is learned: nothing is before learning_starts
-                steps = given["learning_starts"] + round(fraction * (recipe.timesteps - given["learning_starts"]))
+                steps = given["learning_starts"] + round(fraction * (whole - given["learning_starts"]))
                 name = algo.upper() if fraction == 1 else f"{algo.upper()}, {100 * fraction:g} % of the updates"
                 found.append((name, seed, train_or_load(algo, env_id, seed, steps, chosen.out / "models")))
     return found
@@ -131,9 +132,16 @@ def feasible_alpha3() -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
+def _over_policies(values: pd.Series) -> str:
+    known = values.dropna()
+    middle, least, most = (digits(value, 3) for value in (known.median(), known.min(), known.max()))
+    text = middle if least == most else f"{middle} ({least} to {most})"
+    return text if len(known) in (0, len(values)) else f"{text}, of {len(known)}"
+
+
 def report(table: pd.DataFrame) -> str:
     """
-    The certificates side by side, as Markdown.
+    The certificates side by side, as Markdown. Numbers of several seeds are their median (least to most of a seed).
 
     :param table: one row per Lyapunov function
     :return: the exact shares that are feasible, and one table per environment
@@ -143,20 +151,19 @@ def report(table: pd.DataFrame) -> str:
     for env_id, of_env in table.groupby("env", sort=False):
         rows = []
         for (policy, function), of_policy in of_env.groupby(["policy", "function"], sort=False):
-            mean = of_policy.select_dtypes("number").mean()
+            bound, low, high = (of_policy[f"cost_bound{end}"] for end in ("", "_low", "_high"))
             row = {
                 "policy": f"{policy}" + (" (critic)" if function == "critic" else ""),
                 "holds": f"{of_policy['holds'].sum()} of {len(of_policy)}",
                 f"settles at {SETTLED_SHARE:g} of the start": f"{of_policy['settles'].sum()} of {len(of_policy)}",
-                "cost at the start": f"{mean['start_cost']:.3g}",
-                "mean cost settles below": f"{mean['cost_bound']:.3g} [{mean['cost_bound_low']:.3g}, "
-                f"{mean['cost_bound_high']:.3g}]",
-                "its alpha3": "-" if np.isnan(mean["cost_bound_alpha3"]) else f"{mean['cost_bound_alpha3']:.2f}",
-                "alpha3 without residual": f"{mean['largest_feasible_alpha3']:.2f}",
+                "cost at the start": _over_policies(of_policy["start_cost"]),
+                "mean cost settles below": _over_policies(bound)
+                + (f" [{digits(low.item(), 3)}, {digits(high.item(), 3)}]" if len(of_policy) == 1 else ""),
+                "its alpha3": _over_policies(of_policy["cost_bound_alpha3"]),
+                "alpha3 without residual": _over_policies(of_policy["largest_feasible_alpha3"]),
             }
             for statement in _STATEMENTS:
-                bound = mean[f"{statement}_at_least"]
-                row[f"{statement.replace('_', ' ')}, at least"] = "-" if np.isnan(bound) else f"{bound:.3f}"
+                row[f"{statement.replace('_', ' ')}, at least"] = _over_policies(of_policy[f"{statement}_at_least"])
             rows.append(row)
         text += f"\n`{env_id}`:\n\n" + pd.DataFrame(rows).to_markdown(index=False, disable_numparse=True) + "\n"
     return text
@@ -207,7 +214,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--envs", nargs="+", default=list(DISTURBANCES), help="cost environments")
     parser.add_argument("--algos", nargs="*", default=[], help="algorithms to train, with an entry in zoo_configs")
     parser.add_argument("--seeds", nargs="+", type=natural, default=[0, 1, 2, 3, 4])
-    parser.add_argument("--timesteps", type=float, help="environment steps of each training, those of zoo_configs by default")
+    parser.add_argument("--timesteps", type=float, help="environment steps at most; those of zoo_configs by default")
     parser.add_argument("--fractions", nargs="+", type=float, default=[1.0], help="shares of the updates to train for")
     parser.add_argument("--models", nargs="*", default=[], metavar="ALGO=PATH", help="saved models to judge, in all --envs")
     parser.add_argument("--episodes", type=int, default=200, help="to fit, to evaluate and to certify, each")

@@ -5,19 +5,23 @@ Is the learned L right, and is the certificate honest? LAC on ``LinearCost-v0``,
 
   python -m benchmarks.linear_cost
 
-The policy is compared with the Riccati solution; L with the exact cost-to-go of the policy that was learned; and the largest
-feasible alpha3 that ``evaluate_lyapunov`` measures with the exact one.
+The policy is compared with the Riccati solution, in roll-outs that both share, and by the linear policy closest to it; L is
+compared with the exact cost-to-go of that linear policy, and the largest feasible alpha3 that ``evaluate_lyapunov`` measures
+with the exact one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from scipy.stats import bootstrap
+from stable_baselines3.common.env_util import make_vec_env
 
 from battery_env.plotting import new_figure
 from benchmarks.study import EVALUATION_SEED, Study, Tables, command_line, markdown, natural, positive
@@ -37,6 +41,47 @@ def linear_gain(states: np.ndarray, controls: np.ndarray) -> np.ndarray:
     :return: K of ``u = -K s`` by least squares, shape (1, 2)
     """
     return -np.linalg.lstsq(states, controls, rcond=None)[0].T
+
+
+def _linear_actions(gain: np.ndarray, observations: np.ndarray) -> np.ndarray:
+    return -observations @ gain.T
+
+
+def episode_costs(act: Callable[[np.ndarray], np.ndarray], episodes: int) -> np.ndarray:
+    """
+    The costs of a policy, with the same starts and noise for each.
+
+    :param act: actions of observations, shape (episodes, 1) of (episodes, 2)
+    :param episodes: how many, at the same time: none ends before its time limit
+    :return: shape (steps, episodes)
+    """
+    env = make_vec_env(_ENV_ID, n_envs=episodes, seed=EVALUATION_SEED)
+    observations, dones, costs = env.reset(), np.zeros(episodes, dtype=bool), []
+    while not dones.any():
+        assert isinstance(observations, np.ndarray)
+        observations, rewards, dones, _ = env.step(act(observations))
+        costs.append(-rewards)
+    return np.array(costs)
+
+
+def over_optimum(costs: np.ndarray, optimal: np.ndarray, gamma: float) -> tuple[float, float, float]:
+    """
+    What a policy costs over what the best one does.
+
+    :param costs: of the policy, shape (steps, episodes)
+    :param optimal: of the best one in the same episodes
+    :param gamma: the discount factor
+    :return: ratio of the mean discounted sums, and the limits of its 95 % interval: a bootstrap of episodes
+    """
+    weights = gamma ** np.arange(len(costs))
+
+    def ratio(policy: np.ndarray, best: np.ndarray, axis: int = -1) -> np.ndarray:
+        return np.mean(policy, axis=axis) / np.mean(best, axis=axis)
+
+    sums = (weights @ costs, weights @ optimal)
+    rng = np.random.default_rng(0)
+    resampled = bootstrap(sums, ratio, paired=True, vectorized=True, method="percentile", rng=rng).confidence_interval
+    return float(ratio(*sums)), float(resampled.low), float(resampled.high)
 
 
 def part(seed: int, timesteps: int, episodes: int, models: Path) -> Tables:
@@ -60,14 +105,22 @@ def part(seed: int, timesteps: int, episodes: int, models: Path) -> Tables:
     exact = env.cost_to_go(states, env.control_max * actions, gain, model.gamma)
     learned = measured.transitions["lyapunov"].to_numpy()
     slope, intercept = np.polyfit(exact, learned, 1)
+    rolled_out = episode_costs(lambda observed: model.predict(observed, deterministic=True)[0], episodes)
+    ratios: dict[str, float] = {}
+    for name, gamma in (("discounted", model.gamma), ("per_step", 1.0)):
+        optimal = episode_costs(partial(_linear_actions, env.optimal_gain(gamma) / env.control_max), episodes)
+        ratio, low, high = over_optimum(rolled_out, optimal, gamma)
+        ratios |= {f"{name}_over_optimum": ratio, f"{name}_over_optimum_low": low, f"{name}_over_optimum_high": high}
     row = {
         "seed": seed,
+        # of the policies as they are, in roll-outs
+        **ratios,
         "gain_position": gain[0, 0],
         "gain_velocity": gain[0, 1],
         "gain_position_exact": best[0, 0],
         "gain_velocity_exact": best[0, 1],
-        # of the policies themselves, from the start distribution of the environment
-        "cost_over_optimum": np.trace(env.value_matrix(gain, model.gamma)) / np.trace(env.value_matrix(best, model.gamma)),
+        # of the linear policies closest to them, exactly, from the start distribution of the environment
+        "linear_over_optimum": np.trace(env.value_matrix(gain, model.gamma)) / np.trace(env.value_matrix(best, model.gamma)),
         "value_slope": slope,
         "value_intercept": intercept,
         "value_correlation": np.corrcoef(exact, learned)[0, 1],
@@ -84,21 +137,25 @@ def part(seed: int, timesteps: int, episodes: int, models: Path) -> Tables:
 
 def plot(values: pd.DataFrame) -> Figure:
     """
-    Learned against exact values, one panel per seed.
+    Learned against exact values, one panel per seed, five in a row.
 
     :param values: columns seed, exact, learned
     :return: the figure
     """
     seeds = values["seed"].unique()
-    figure = new_figure(2.8 * len(seeds), 2.9)
+    n_columns = min(len(seeds), 5)
+    n_rows = -(-len(seeds) // n_columns)
+    figure = new_figure(2.8 * n_columns, 2.9 * n_rows)
+    panels = figure.subplots(n_rows, n_columns, squeeze=False, sharex=True, sharey=True)
     top = values[["exact", "learned"]].to_numpy().max()
-    for axes, (seed, of_seed) in zip(
-        figure.subplots(1, len(seeds), squeeze=False, sharey=True)[0], values.groupby("seed"), strict=True
-    ):
+    for axes, (seed, of_seed) in zip(panels.ravel(), values.groupby("seed"), strict=False):
         axes.plot([0, top], [0, top], color="0.6", lw=1)
         axes.scatter(of_seed["exact"], of_seed["learned"], s=5, alpha=0.3, lw=0, rasterized=True)
-        axes.set(title=f"seed {seed}", xlabel="exact cost-to-go")
-    figure.axes[0].set_ylabel("learned L(s, a)")
+        axes.set_title(f"seed {seed}")
+    for axes in panels.ravel()[len(seeds) :]:
+        axes.remove()
+    figure.supxlabel("exact cost-to-go")
+    figure.supylabel("learned L(s, a)")
     return figure
 
 
@@ -114,7 +171,10 @@ def report(table: pd.DataFrame) -> str:
             "seed": f"{row['seed']:.0f}",
             "gain K (exact)": f"{row['gain_position']:.3f}, {row['gain_velocity']:.3f} "
             f"({row['gain_position_exact']:.3f}, {row['gain_velocity_exact']:.3f})",
-            "cost / optimum": f"{row['cost_over_optimum']:.4f}",
+            "discounted cost / optimum, 95 % interval": f"{row['discounted_over_optimum']:.3f}, "
+            f"{row['discounted_over_optimum_low']:.3f} to {row['discounted_over_optimum_high']:.3f}",
+            "cost per step / optimum": f"{row['per_step_over_optimum']:.3f}",
+            "of the closest linear policy, exactly": f"{row['linear_over_optimum']:.4f}",
             "L against exact: slope, intercept, correlation": f"{row['value_slope']:.3f}, {row['value_intercept']:.3f}, "
             f"{row['value_correlation']:.4f}",
             "largest feasible alpha3, 95 % interval (exact)": f"{row['alpha3']:.3f}, {row['alpha3_low']:.3f} to "

@@ -27,7 +27,7 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from battery_env.evaluation import over_seeds
 from battery_env.plotting import COLOURS, new_figure
-from benchmarks.certificate import judge
+from benchmarks.certificate import SETTLED_SHARE, judge
 from benchmarks.references import DISTURBANCES, SHARES, conditions, draw_shares, tried
 from benchmarks.study import Study, Tables, command_line, digits, markdown, natural, positive, share_with_range, with_interval
 from benchmarks.training import Recipe, train_or_load
@@ -149,16 +149,18 @@ def certificate_table(certificates: pd.DataFrame) -> pd.DataFrame:
     """
     rows = []
     for (env_id, policy, function), group in certificates.groupby(["environment", "policy", "function"], sort=False):
-        settles = group[group["holds"]]
+        held, calibrated = group[group["holds"]], group["calibration_slope"].dropna()
         rows.append(
             {
                 "environment": env_id,
                 "policy": f"{policy} (critic)" if function == "critic" else policy,
                 "holds": f"{group['holds'].sum()} of {len(group)}",
+                f"settles at {SETTLED_SHARE:g} of the start": f"{group['settles'].sum()} of {len(group)}",
                 "cost at the start": digits(group["start_cost"].mean()),
-                "where it holds: mean cost settles below": with_interval(settles["cost_bound"]) if len(settles) else "-",
-                "its alpha3": with_interval(settles["cost_bound_alpha3"]) if len(settles) else "-",
+                "where it holds: mean cost settles below": with_interval(held["cost_bound"]) if len(held) else "-",
+                "its alpha3": with_interval(held["cost_bound_alpha3"]) if len(held) else "-",
                 "alpha3 without residual": with_interval(group["largest_feasible_alpha3"]),
+                "cost-to-go by L, slope": with_interval(calibrated) if len(calibrated) else "-",
                 "survives, at least": "-" if function == "critic" else digits(group["survives_at_least"].mean()),
             }
         )

@@ -41,6 +41,30 @@ def test_tables_and_figures_are_written(tmp_path, quick, capsys):
     assert text in capsys.readouterr().out and "| LAC, 10 % of the updates (critic)" in text and "nan" not in text
 
 
+def test_longer_trainings_than_asked_for_are_cut_and_shorter_ones_are_not(tmp_path, quick):
+    command = ["--envs", "LinearCost-v0", "--algos", "lac", "--seeds", "3", "--episodes", "25", "--out", str(tmp_path)]
+    for timesteps in ("5000", "50000"):
+        certificate.main([*command, "--timesteps", timesteps])
+    assert [call[-1] for call in quick] == [5000, 10000]
+
+
+def test_several_seeds_are_shown_from_least_to_most():
+    rows = [
+        {"env": "LinearCost-v0", "policy": "LAC", "seed": seed, "function": "fitted", "holds": seed > 0, "settles": False}
+        | {"start_cost": 2.0, "cost_bound": bound, "cost_bound_low": bound / 2, "cost_bound_high": 2 * bound}
+        | {"cost_bound_alpha3": alpha3, "largest_feasible_alpha3": 0.5, "survives_at_least": 0.9}
+        | {"stays_within_at_least": np.nan, "decreases_at_least": 0.1 * seed}
+        for seed, bound, alpha3 in ((0, 3.0, np.nan), (1, 1.0, 0.25), (2, 1.5, 0.75))
+    ]
+    of_seeds = certificate.report(pd.DataFrame(rows)).splitlines()[-1]
+    cells = [cell.strip() for cell in of_seeds.strip("|").split("|")]
+    assert cells[:4] == ["LAC", "2 of 3", "0 of 3", "2"]
+    assert cells[4:7] == ["1.5 (1 to 3)", "0.5 (0.25 to 0.75), of 2", "0.5"]
+    assert cells[7:] == ["0.9", "-", "0.1 (0 to 0.2)"]
+    (single,) = [line for line in certificate.report(pd.DataFrame(rows[1:2])).splitlines() if "LAC" in line]
+    assert "| 1 [0.5, 2] " in single
+
+
 def test_slow_loops_and_short_horizons_leave_little_of_a_discounted_cost():
     table = certificate.feasible_alpha3().set_index("controller")
     assert table.index.tolist() == ["reference", "weak"]

@@ -51,12 +51,31 @@ def test_the_exact_solution_is_recognized(tmp_path, exact_model):
     assert row["seed"] == 4 and set(values["seed"]) == {4} and len(values) == 20 * 100
     assert row["gain_position"] == pytest.approx(row["gain_position_exact"], rel=1e-5)
     assert row["gain_velocity"] == pytest.approx(row["gain_velocity_exact"], rel=1e-5)
-    assert row["cost_over_optimum"] == pytest.approx(1.0, abs=1e-9)
+    assert row["linear_over_optimum"] == pytest.approx(1.0, abs=1e-9)
+    for end in ("", "_low", "_high"):
+        assert row[f"discounted_over_optimum{end}"] == pytest.approx(1.0, abs=1e-6)
+    # the best gain of the discounted cost is not that of the mean over an episode
+    assert 1.0 < row["per_step_over_optimum"] < 1.05
     assert (row["value_slope"], row["value_intercept"], row["value_correlation"]) == pytest.approx((1, 0, 1), abs=1e-4)
     assert row["calibration_slope"] == pytest.approx(1.0, abs=0.02)
     assert row["alpha3_exact"] == pytest.approx(row["alpha3_optimum"], rel=1e-5)
     assert row["alpha3_low"] < row["alpha3_exact"] < row["alpha3_high"]
     np.testing.assert_allclose(values["learned"], values["exact"], rtol=1e-3)
+
+
+def test_what_a_policy_costs_too_much_is_seen_in_roll_outs():
+    env = LinearCostEnv()
+    gain = env.optimal_gain(0.95) / env.control_max
+    # an action that is off by a constant: no linear policy close to it shows that
+    optimal = linear_cost.episode_costs(lambda observed: -observed @ gain.T, 40)
+    biased = linear_cost.episode_costs(lambda observed: -observed @ gain.T + 0.1, 40)
+    assert optimal.shape == (100, 40)
+    discounted, per_step = (linear_cost.over_optimum(biased, optimal, gamma) for gamma in (0.95, 1.0))
+    for ratio, low, high in (discounted, per_step):
+        assert 1.0 < low < ratio < high < 10.0
+    assert discounted[0] < per_step[0]
+    # the same episodes are paired: their starts do not widen the interval
+    assert linear_cost.over_optimum(2 * optimal, optimal, 0.95) == pytest.approx((2.0, 2.0, 2.0))
 
 
 def test_tables_and_figure_are_written(tmp_path, exact_model, capsys):
@@ -69,7 +88,7 @@ def test_tables_and_figure_are_written(tmp_path, exact_model, capsys):
     assert (tmp_path / "linear_cost.png").stat().st_size > 0
     text = (tmp_path / "linear_cost.md").read_text(encoding="utf-8")
     assert text in capsys.readouterr().out and len(text.splitlines()) == 4
-    assert "| 1.0000 " in text and "1.000, " in text
+    assert "| 1.000, 1.000 to 1.000 " in text and "| 1.0000 " in text
 
 
 def test_figure_has_one_panel_per_seed():
