@@ -63,6 +63,10 @@ class HorizonReplayBuffer(ReplayBuffer):
         self.n_complete = 0
         self.episode_lengths[:] = 0
 
+    def end_episodes(self) -> None:
+        """Let no episode go on: the next transitions are the first ones of others."""
+        self.episode_lengths[:] = 0
+
     def add(
         self,
         obs: np.ndarray,
@@ -77,7 +81,7 @@ class HorizonReplayBuffer(ReplayBuffer):
         self.complete[pos] = False
         super().add(obs, next_obs, action, reward, done, infos)
 
-        # An episode that was cut by a new start of the training does not go on
+        # Nor does the episode of a buffer that was filled elsewhere go on
         is_next = (self.next_observations[pos - 1] == self.observations[pos]).reshape(self.n_envs, -1).all(axis=1)
         self.episode_lengths = np.where(is_next, self.episode_lengths, 0) + 1
         # The oldest step whose sum may end here, and with a termination all steps after it too

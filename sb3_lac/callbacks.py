@@ -25,7 +25,14 @@ from sb3_lac.stability import (
     fit_lyapunov,
 )
 from sb3_lac.stability.certification import check_questions
-from sb3_lac.stability.rollout import check_environment, check_training_seeds, known_seed, prepare_evaluation, trains_on
+from sb3_lac.stability.rollout import (
+    check_environment,
+    check_number,
+    check_training_seeds,
+    known_seed,
+    prepare_evaluation,
+    trains_on,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
@@ -106,12 +113,16 @@ class LyapunovCallback(EventCallback):
                 "learns one for any other model."
             )
         known_seed(self.seed)
-        self.eval_env = prepare_evaluation(self.model, self.eval_env, self.n_eval_episodes, self.OF_THE_CRITIC)
+        check_number("n_eval_episodes", self.n_eval_episodes)
+        self.eval_env = prepare_evaluation(self.model, self.eval_env, self.OF_THE_CRITIC)
         if trains_on(self.model, self.eval_env):
             raise ValueError(
                 "The evaluation environment is the training environment: an evaluation would end its episodes, and the "
                 "replay buffer would join them with others. Make a second environment for the evaluation."
             )
+        if self.model.num_timesteps == 0:
+            # Of another training
+            self.history = []
         if self.log_path is not None:
             import pandas as pd  # slow to import, and only an evaluation needs it
 

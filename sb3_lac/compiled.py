@@ -28,14 +28,18 @@ def set_gradients(loss: th.Tensor, parameters: Sequence[th.Tensor]) -> None:
     :param parameters: All parameters of the optimizer. Those of frozen layers get no gradient
     """
     trained = [parameter for parameter in parameters if parameter.requires_grad]
+    if not th.compiler.is_compiling():
+        # Without ``zero_grad()``, whose records for the profiler take longer than its work
+        for parameter in parameters:
+            parameter.grad = None
+    if not trained:
+        # The whole network is frozen, as an actor whose values are to be learned
+        return
     if th.compiler.is_compiling():
         gradients = th.autograd.grad(loss, trained, materialize_grads=True)
         for parameter, gradient in zip(trained, gradients, strict=True):
             set_gradient(parameter, gradient)
     else:
-        # Without ``zero_grad()``, whose records for the profiler take longer than its work
-        for parameter in parameters:
-            parameter.grad = None
         loss.backward(inputs=trained)
 
 

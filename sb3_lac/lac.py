@@ -12,12 +12,13 @@ import torch as th
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
 from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, polyak_update, update_learning_rate
-from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.her import HerReplayBuffer
 from stable_baselines3.sac.policies import Actor
 from torch.nn import functional as F
@@ -27,6 +28,7 @@ from sb3_lac.compiled import CompiledUpdate, Metrics, check_compiler, set_gradie
 from sb3_lac.discounts import DEFAULT_DISCOUNT, stated_discount, sum_of_discounts, weight_of_return
 from sb3_lac.env_ids import check_env_id
 from sb3_lac.policies import CnnPolicy, LyapunovCritic, LyapunovPolicy, MlpPolicy, MultiInputPolicy, largest_value
+from sb3_lac.vec_env import in_processes
 
 SelfLAC = TypeVar("SelfLAC", bound="LAC")
 
@@ -70,7 +72,7 @@ def env_specs(env: VecEnv) -> list[EnvSpec | None]:
     :return: One per environment, None where it is not known
     """
     # One that cannot be pickled, as with a lambda as entry point, would end the process of its environment
-    if not isinstance(env.unwrapped, SubprocVecEnv):
+    if not in_processes(env):
         # A vector environment of somebody else may have no attributes
         with suppress(AttributeError, NotImplementedError):
             return env.get_attr("spec")
@@ -84,7 +86,7 @@ def time_limits(env: VecEnv) -> list[int | None]:
     :param env: Vectorized environment
     :return: ``max_episode_steps`` of each environment, None where it has none or is not known
     """
-    if isinstance(env.unwrapped, SubprocVecEnv):
+    if in_processes(env):
         limit = "_max_episode_steps"  # of Gymnasium's wrapper TimeLimit, for there is no specification to ask
         return env.get_attr(limit) if env.has_attr(limit) else [None] * env.num_envs
     return [getattr(spec, "max_episode_steps", None) for spec in env_specs(env)]
@@ -287,6 +289,13 @@ class LAC(OffPolicyAlgorithm):
         self.compile_update = compile_update
         self._compiled: CompiledUpdate | None = None
         self.largest_stored_reward = 0.0
+        if replay_buffer_class is ReplayBuffer and n_steps > 1:
+            warnings.warn(
+                f"n_steps={n_steps} is ignored, because replay_buffer_class=ReplayBuffer was passed, which holds single "
+                "steps: leave replay_buffer_class out for n-step returns.",
+                stacklevel=2,
+            )
+            self.n_steps = 1
         if replay_buffer_class is NStepReplayBuffer:
             # An argument of the model, with which a loaded model sets it up anew
             self.n_steps = self.replay_buffer_kwargs.get("n_steps", n_steps if n_steps > 1 else 3)
@@ -386,6 +395,8 @@ class LAC(OffPolicyAlgorithm):
             raise ValueError(f"gamma={gamma!r} must be a number, or 'auto' for the discount that the environment states.")
         elif not 0 <= gamma <= 1:
             raise ValueError(f"gamma={gamma} must lie within 0 .. 1; 'auto' is the discount that the environment states.")
+        # One of numpy would make returns of n steps double precision
+        self.gamma = float(self.gamma)
 
     def _check_arguments(self) -> None:
         """Check the arguments that SAC does not have."""
@@ -542,7 +553,8 @@ class LAC(OffPolicyAlgorithm):
         if largest_reward > self.largest_stored_reward:
             self._check_discount(largest_reward)
             stated = self.stated_reward_bound
-            if stated is not None and self.largest_stored_reward <= stated < largest_reward:
+            # Vector environments hold rewards in single precision, where 0.1 is a little more
+            if stated is not None and self.largest_stored_reward <= np.float32(stated) < np.float32(largest_reward):
                 warnings.warn(
                     f"A reward of {largest_reward:g} is larger than reward_bound={stated:g}. The bound follows the largest "
                     "reward from here on, and L is shifted with it. A larger reward_bound keeps costs and L comparable.",
@@ -771,7 +783,8 @@ class LAC(OffPolicyAlgorithm):
                 # The largest reward costs nothing, and so no cost is negative
                 n_rewards = weight_of_return(replay_data.discounts, self.gamma)
                 costs = self._raise_bound(replay_data.rewards / n_rewards) * n_rewards - replay_data.rewards
-                names, metrics = update(replay_data, costs, weights, gradient_step % self.target_update_interval == 0)
+                update_targets = (self._n_updates + gradient_step) % self.target_update_interval == 0
+                names, metrics = update(replay_data, costs, weights, update_targets)
                 metrics_per_step.append(metrics)
 
         self._n_updates += gradient_steps
@@ -784,6 +797,19 @@ class LAC(OffPolicyAlgorithm):
         if self.gamma >= 1:
             # Positive rewards that were computed at sampling (HER) have not been seen before
             self._check_discount(self.reward_bound.item())
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        if isinstance(self.replay_buffer, HorizonReplayBuffer) and (reset_num_timesteps or self._last_obs is None):
+            # The environment is about to be reset
+            self.replay_buffer.end_episodes()
+        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
 
     def learn(
         self: SelfLAC,
@@ -819,20 +845,34 @@ class LAC(OffPolicyAlgorithm):
         try:
             model = super().load(*args, **kwargs)
         except (AttributeError, KeyError) as error:
-            if "published_update" not in kwargs:
-                raise
-            raise ValueError(
-                f"published_update={kwargs['published_update']} is not what the model was saved with: only one of the two "
-                "updates has a target actor, and it cannot be changed on loading."
-            ) from error
+            if "published_update" in kwargs:
+                raise ValueError(
+                    f"published_update={kwargs['published_update']} is not what the model was saved with: only one of the two "
+                    "updates has a target actor, and it cannot be changed on loading."
+                ) from error
+            if "ent_coef" in kwargs:
+                raise ValueError(
+                    f"ent_coef={kwargs['ent_coef']!r} is not what the model was saved with: a coefficient that is learned has "
+                    "an optimizer and one that is fixed has none, and that cannot be changed on loading."
+                ) from error
+            raise
         if kwargs.get("gamma") == "auto" and model.env is None:
             raise ValueError(
                 "gamma='auto' is the discount that the environment states, and there is none: load with env=..., or set "
                 f"gamma, for instance gamma={DEFAULT_DISCOUNT}."
             )
+        if isinstance(kwargs.get("ent_coef"), (float, int, np.number)):
+            # A parameter of the saved model, too
+            model.ent_coef_tensor.fill_(kwargs["ent_coef"])
         if "reward_bound" in kwargs:
+            saved = model.reward_bound.item()
             model.reward_bound.fill_(max(model.stated_reward_bound or 0.0, model.largest_stored_reward))
-            model.update_offset(model._vec_normalize_env)
+            if model.env is None and saved > 0 and not {"gamma", "horizon"} & kwargs.keys():
+                # How rewards were normalized is not known without the environment, but part of the saved offset
+                for critic in (model.critic, model.critic_target):
+                    critic.offset.mul_(model.reward_bound.to(critic.offset.device) / saved)
+            else:
+                model.update_offset(model._vec_normalize_env)
         return model
 
     def load_replay_buffer(self, path: str | Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 #: What torch and onnxruntime may differ by in any action of the check, relative to the range of the actions
 TOLERANCE = 1e-5
 _N_CHECKED = 64
+_FAR = 1e6
 
 
 class DeterministicPolicy(th.nn.Module):
@@ -38,6 +39,7 @@ class DeterministicPolicy(th.nn.Module):
     low: th.Tensor
     high: th.Tensor
     mean: th.Tensor
+    rest_of_mean: th.Tensor
     deviation: th.Tensor
 
     def __init__(self, policy: BasePolicy, vec_normalize: VecNormalize | None = None) -> None:
@@ -47,10 +49,13 @@ class DeterministicPolicy(th.nn.Module):
         self.register_buffer("low", th.as_tensor(policy.action_space.low, dtype=th.float32))
         self.register_buffer("high", th.as_tensor(policy.action_space.high, dtype=th.float32))
         self.clip_obs: float | None = None
-        if vec_normalize is not None and vec_normalize.norm_obs:
+        if vec_normalize is not None:
             assert isinstance(vec_normalize.obs_rms, RunningMeanStd)  # of a Box
             self.clip_obs = vec_normalize.clip_obs
-            self.register_buffer("mean", th.as_tensor(vec_normalize.obs_rms.mean, dtype=th.float32))
+            mean = th.as_tensor(vec_normalize.obs_rms.mean, dtype=th.float64)
+            self.register_buffer("mean", mean.float())
+            # ``VecNormalize`` subtracts in double precision, which matters where the mean is far larger than the deviation
+            self.register_buffer("rest_of_mean", (mean - mean.float()).float())
             variance = vec_normalize.obs_rms.var + vec_normalize.epsilon
             self.register_buffer("deviation", th.as_tensor(np.sqrt(variance), dtype=th.float32))
         self.to(policy.device)
@@ -61,7 +66,8 @@ class DeterministicPolicy(th.nn.Module):
         :return: Actions in the units of the environment, shape (n, ...)
         """
         if self.clip_obs is not None:
-            observation = ((observation - self.mean) / self.deviation).clamp(-self.clip_obs, self.clip_obs)
+            observation = (observation - self.mean - self.rest_of_mean) / self.deviation
+            observation = observation.clamp(-self.clip_obs, self.clip_obs)
         action = self.policy._predict(observation, deterministic=True).reshape(-1, *self.low.shape)
         if self.policy.squash_output:
             return self.low + 0.5 * (action + 1.0) * (self.high - self.low)
@@ -120,20 +126,30 @@ def export_onnx(
             stacklevel=2,
         )
 
+    if vec_normalize is not None and not vec_normalize.norm_obs:
+        vec_normalize = None
+    if vec_normalize is not None and vec_normalize.observation_space.shape != policy.observation_space.shape:
+        raise ValueError(
+            f"VecNormalize normalizes observations of shape {vec_normalize.observation_space.shape}, and those of the policy "
+            f"have {policy.observation_space.shape}: a wrapper around it, like VecFrameStack, has no ONNX export."
+        )
+
     was_training = policy.training
     policy.set_training_mode(False)
     module = DeterministicPolicy(policy, vec_normalize).eval()
-    observations = _observations(policy.observation_space)
+    observations = _observations(policy.observation_space, vec_normalize)
     try:
+        seen = observations if vec_normalize is None else vec_normalize.normalize_obs(observations)
+        expected, _ = policy.predict(seen, deterministic=True)
         with th.no_grad():
-            expected = module(th.as_tensor(observations, device=policy.device)).cpu().numpy()
             content = _graph(module, observations, env_id, type(model).__name__).SerializeToString()
     finally:
         policy.set_training_mode(was_training)
 
     session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
     (action,) = session.run(None, {"observation": observations})
-    error = float(np.max(np.abs(action - expected) / (module.high - module.low).cpu().numpy()))
+    ranges = (module.high - module.low).cpu().numpy()
+    error = float(np.max(np.abs(action - expected) / np.where(ranges > 0, ranges, 1.0)))
     if not error <= TOLERANCE:
         raise ValueError(f"The exported policy differs from the original by {error:g} of the range of its actions.")
     with replacing(path) as part:
@@ -141,14 +157,25 @@ def export_onnx(
     return path
 
 
-def _observations(space: spaces.Space) -> np.ndarray:
+def _observations(space: spaces.Space, vec_normalize: VecNormalize | None) -> np.ndarray:
     """
     :param space: Space of the observations
+    :param vec_normalize: What knows where in it they lie, if anything does
     :return: Observations to trace and check with, shape (n, ...)
     """
     assert isinstance(space, spaces.Box)
-    # Bounds like 3e38 are none: no observation comes near
-    low, high = np.maximum(space.low, -10.0), np.minimum(space.high, 10.0)
+    low, high = space.low.astype(np.float64), space.high.astype(np.float64)
+    if vec_normalize is None:
+        # Bounds like 3e38 are none: no observation comes near
+        far_below, far_above = low < -_FAR, high > _FAR
+        low, high = (
+            np.where(far_below, np.where(far_above, -10.0, high - 20.0), low),
+            np.where(far_above, np.where(far_below, 10.0, low + 20.0), high),
+        )
+    else:
+        assert isinstance(vec_normalize.obs_rms, RunningMeanStd)  # of a Box
+        mean, spread = vec_normalize.obs_rms.mean, 3.0 * np.sqrt(vec_normalize.obs_rms.var)
+        low, high = np.maximum(low, mean - spread), np.minimum(high, mean + spread)
     rng = np.random.default_rng(0)
     return rng.uniform(low, np.maximum(low, high), (_N_CHECKED, *space.shape)).astype(np.float32)
 

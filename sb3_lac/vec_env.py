@@ -5,6 +5,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.env_util import is_wrapped
+from stable_baselines3.common.vec_env import SubprocVecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 
@@ -98,6 +99,9 @@ class GymnasiumVecEnv(VecEnv):
         if isinstance(self._single_envs, gym.vector.SyncVectorEnv):
             return [self._single_envs.envs[n].get_wrapper_attr(attr_name) for n in chosen]
         if self._single_envs is not None:
+            # Asked for one that is missing, the processes of the environments would end
+            if not all(self._single_envs.call("has_wrapper_attr", attr_name)):
+                raise AttributeError(f"{self._single_envs} has environments without {attr_name!r}.")
             values = self._single_envs.get_attr(attr_name)
         else:
             values = (getattr(self.env, attr_name),) * self.num_envs
@@ -156,6 +160,19 @@ class GymnasiumVecEnv(VecEnv):
         """
         envs = getattr(self.env.unwrapped, "envs", None)
         return [envs is not None and is_wrapped(envs[n], wrapper_class) for n in self._get_indices(indices)]
+
+
+def in_processes(env: VecEnv) -> bool:
+    """
+    Whether single environments run in processes of their own, which end if asked for what cannot be pickled.
+
+    :param env: A vectorized environment, wrapped or not
+    :return: True for ``SubprocVecEnv``, and for Gymnasium's ``AsyncVectorEnv``
+    """
+    inner = env.unwrapped
+    if isinstance(inner, GymnasiumVecEnv):
+        return isinstance(inner.env.unwrapped, gym.vector.AsyncVectorEnv)
+    return isinstance(inner, SubprocVecEnv)
 
 
 def _unbatched(batch: dict[str, Any], rows: np.ndarray) -> list[dict[str, Any]]:

@@ -24,6 +24,7 @@ from sb3_lac.stability.rollout import (
     known_seed,
     prepare_evaluation,
     roll_out,
+    stay_within,
     summarize_episodes,
     undisturbed,
 )
@@ -212,7 +213,8 @@ def certify(
     :raises ValueError: If the arguments cannot be meant
     """
     check_questions(lyapunov, confidence, cost_bound, level, window_steps)
-    env = prepare_evaluation(policy, env, n_episodes, lyapunov is not None and lyapunov.normalized_rewards)
+    check_number("n_episodes", n_episodes)
+    env = prepare_evaluation(policy, env, lyapunov is not None and lyapunov.normalized_rewards)
     check_number("n_episodes_per_start", n_episodes_per_start)
     if starts is not None:
         starts = np.asarray(starts, dtype=np.float64)
@@ -249,13 +251,14 @@ def certify(
 
     transitions = roll_outs.transitions
     if cost_bound is not None:
-        check_rewards(lyapunov, transitions["reward"])
+        for rewards in [transitions["reward"]] + ([] if of_starts is None else [of_starts["reward"]]):
+            check_rewards(lyapunov, rewards)
     transitions["cost"] = np.maximum(bound - transitions["reward"], 0.0)
     episodes = summarize_episodes(transitions)
     alive = ~episodes["terminated"]
     episodes["survives"] = alive.astype(float)
     if cost_bound is not None:
-        episodes["stays_within"] = (alive & (episodes["largest_late_cost"] <= cost_bound)).astype(float)
+        episodes["stays_within"] = (alive & stay_within(episodes, cost_bound)).astype(float)
     if lyapunov is not None and level is not None and window_steps is not None:
         later = transitions.groupby("episode")["lyapunov"].shift(-window_steps)
         windows = (transitions["lyapunov"] > level) & later.notna()
@@ -386,7 +389,7 @@ def _attraction(
     transitions["cost"] = np.maximum(reward_bound - transitions["reward"], 0.0)
     # Environment by environment in the order of the starts: each episode had a number of its own
     episodes = summarize_episodes(transitions)
-    attracted = (~episodes["terminated"] & (episodes["largest_late_cost"] <= cost_bound)).to_numpy()
+    attracted = (~episodes["terminated"] & stay_within(episodes, cost_bound)).to_numpy()
     counts = attracted.reshape(len(starts), n_episodes).sum(axis=1)
     table = pd.DataFrame(starts, columns=[f"state_{k}" for k in range(starts.shape[1])])
     table["n_episodes"], table["n_attracted"] = n_episodes, counts

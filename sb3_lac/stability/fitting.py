@@ -268,7 +268,7 @@ def fit_lyapunov(
     :raises ValueError: If the arguments cannot be meant
     :raises NoCostError: If nothing had a cost on the roll-outs, which say nothing about decrease then
     """
-    for name, value in {"n_iterations": n_iterations, "batch_size": batch_size}.items():
+    for name, value in {"n_episodes": n_episodes, "n_iterations": n_iterations, "batch_size": batch_size}.items():
         check_number(name, value)
     if not 0 < learning_rate < np.inf:
         raise ValueError(f"learning_rate={learning_rate} must be finite and greater than 0.")
@@ -276,7 +276,7 @@ def fit_lyapunov(
         raise ValueError(f"trace_decay={trace_decay} must lie between 0 and 1.")
     if reward_bound is not None and not 0 <= reward_bound < np.inf:
         raise ValueError(f"reward_bound={reward_bound} must be finite and at least 0.")
-    env = prepare_evaluation(policy, env, n_episodes, of_the_critic=False)
+    env = prepare_evaluation(policy, env, of_the_critic=False)
     seed = known_seed(seed)
     with undisturbed(policy, env, seed):
         roll_outs = roll_out(policy, env, n_episodes, deterministic)

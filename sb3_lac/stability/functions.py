@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
@@ -36,6 +37,7 @@ class LyapunovFunction:
     :param average_cost: What is subtracted from the cost of each step in the sum that it estimates, None if it estimates none
     :param reward_bound: The reward that costs nothing, needed where rewards are positive
     :param seeds: Seeds of the environments that it was learned on, if it was: no evaluation may use them
+    :raises ValueError: If one of these numbers cannot be meant
     """
 
     #: Whether costs are those of the training, in the units of ``VecNormalize``
@@ -53,6 +55,25 @@ class LyapunovFunction:
         reward_bound: float | None = None,
         seeds: range | None = None,
     ):
+        if not isinstance(alpha3, (float, int, np.number)) or not 0 < alpha3 < math.inf:
+            raise ValueError(f"alpha3={alpha3!r} must be greater than 0, and finite.")
+        if not isinstance(gamma, (float, int, np.number)) or not 0 <= gamma <= 1:
+            raise ValueError(f"gamma={gamma!r} must lie within 0 .. 1.")
+        if horizon is not None and (not isinstance(horizon, (int, np.integer)) or horizon < 1):
+            raise ValueError(f"horizon={horizon!r} must be a whole number of at least 1, or None for all costs to come.")
+        if average_cost is not None and not (
+            isinstance(average_cost, (float, int, np.number)) and math.isfinite(average_cost)
+        ):
+            raise ValueError(
+                f"average_cost={average_cost!r} must be finite, or None if the function estimates no sum of costs."
+            )
+        if reward_bound is not None and not (
+            isinstance(reward_bound, (float, int, np.number)) and 0 <= reward_bound < math.inf
+        ):
+            raise ValueError(
+                f"reward_bound={reward_bound!r} must be finite and at least 0, because nothing is paid after a termination, "
+                "or None if no reward is positive."
+            )
         self._function = function
         self.alpha3 = alpha3
         self.gamma = gamma

@@ -359,7 +359,7 @@ def plot_region_of_attraction(
     transitions: pd.DataFrame,
     episodes: pd.DataFrame,
     observations: np.ndarray | None,
-    threshold: float,
+    settled: np.ndarray,
     x: int,
     y: int,
     names: Sequence[str] | None,
@@ -370,7 +370,7 @@ def plot_region_of_attraction(
     :param transitions: One row per transition
     :param episodes: One row per episode
     :param observations: Those of the transitions, or None if they are no vectors
-    :param threshold: An episode has settled if no cost in its last fifth is larger
+    :param settled: Whether each episode has
     :param x: Dimension of the observation on the horizontal axis
     :param y: Dimension of the observation on the vertical axis
     :param names: Names of all dimensions
@@ -380,7 +380,7 @@ def plot_region_of_attraction(
     starts = (transitions["step"] == 0).to_numpy()
     points, lyapunov = points[starts], transitions["lyapunov"].to_numpy()[starts]
     died = episodes["terminated"].to_numpy()
-    settled = ~died & (episodes["largest_late_cost"].to_numpy() <= threshold)
+    settled = settled & ~died
 
     figure = new_figure(6.4, 5.2)
     axes = figure.subplots()

@@ -23,6 +23,7 @@ from sb3_lac.stability.rollout import (
     prepare_evaluation,
     relative_cost_to_go,
     roll_out,
+    stay_within,
     summarize_episodes,
     undisturbed,
 )
@@ -282,7 +283,8 @@ class LyapunovReport:
 
         if threshold is None:
             threshold = self.metrics["ultimate_bound"].value
-        return plots.plot_region_of_attraction(self.transitions, self.episodes, self.observations, threshold, x, y, names)
+        settled = stay_within(self.episodes, threshold).to_numpy()
+        return plots.plot_region_of_attraction(self.transitions, self.episodes, self.observations, settled, x, y, names)
 
 
 def evaluate_lyapunov(
@@ -368,7 +370,8 @@ def evaluate_lyapunov(
             )
         lyapunov = CriticLyapunov(policy)
     check_function(lyapunov)
-    env = prepare_evaluation(policy, env, n_eval_episodes, lyapunov.normalized_rewards)
+    check_number("n_eval_episodes", n_eval_episodes)
+    env = prepare_evaluation(policy, env, lyapunov.normalized_rewards)
     seed = known_seed(seed)
     check_seeds(lyapunov, seed, env.num_envs)
     alpha3 = lyapunov.alpha3 if alpha3 is None else alpha3

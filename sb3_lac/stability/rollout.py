@@ -32,20 +32,18 @@ CHUNK_SIZE = 2048
 MANY_STEPS = 10_000
 
 
-def prepare_evaluation(policy: PolicyPredictor, env: gym.Env | VecEnv, n_eval_episodes: int, of_the_critic: bool) -> VecEnv:
+def prepare_evaluation(policy: PolicyPredictor, env: gym.Env | VecEnv, of_the_critic: bool) -> VecEnv:
     """
     Wrap an evaluation environment as the policy would, and check that they fit together.
 
     :param policy: What is evaluated
     :param env: The evaluation environment
-    :param n_eval_episodes: Number of episodes
     :param of_the_critic: Whether values of the critic are judged, which belong to the rewards of the training
     :return: The wrapped environment
     """
     if isinstance(policy, type) or not callable(getattr(policy, "predict", None)):
         raise ValueError(f"{policy!r} has no method predict(observation, deterministic=...), which every policy needs.")
     check_environment(env)
-    check_number("n_eval_episodes", n_eval_episodes)
     if not isinstance(policy, (BaseAlgorithm, BasePolicy)):
         # A controller that knows nothing of images and their channels
         return env if isinstance(env, VecEnv) else DummyVecEnv([lambda: env])  # type: ignore[list-item, return-value]
@@ -348,7 +346,18 @@ def roll_out(
             if "action_masks" in asks_for:
                 known["action_masks"] = np.stack(env.env_method("action_masks"))
             given = {name: known[name] for name in asks_for}
-            actions, state = policy.predict(observations, deterministic=deterministic, **given)  # type: ignore[arg-type]
+            predicted = policy.predict(observations, deterministic=deterministic, **given)  # type: ignore[arg-type]
+            if not isinstance(predicted, tuple) or len(predicted) != 2:
+                raise ValueError(
+                    f"predict() of {type(policy).__name__} returned {type(predicted).__name__}, and must return two things: "
+                    "the actions, and the state of the policy or None."
+                )
+            actions, state = np.asarray(predicted[0]), predicted[1]
+            if actions.shape[:1] != (n_envs,):
+                raise ValueError(
+                    f"predict() of {type(policy).__name__} returned actions of shape {actions.shape}, and must return one for "
+                    f"each of {n_envs} environments."
+                )
             new_observations, rewards, dones, infos = env.step(actions)
             if vec_normalize is not None:
                 rewards = vec_normalize.get_original_reward()
@@ -476,3 +485,15 @@ def summarize_episodes(transitions: pd.DataFrame) -> pd.DataFrame:
             "terminated": groups["terminated"].any(),
         }
     )
+
+
+def stay_within(episodes: pd.DataFrame, cost_bound: float) -> pd.Series:
+    """
+    Whether the last fifth of each episode costs no more than a bound. It is a comparison in single precision, in which some
+    vector environments hold rewards: there a cost of 0.1 is a little more than 0.1.
+
+    :param episodes: See ``summarize_episodes()``
+    :param cost_bound: The bound
+    :return: One answer per episode
+    """
+    return episodes["largest_late_cost"].astype(np.float32) <= np.float32(cost_bound)

@@ -2,6 +2,7 @@
 
 import warnings
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -11,7 +12,7 @@ from stable_baselines3.common.envs import SimpleMultiObsEnv
 from stable_baselines3.her import HerReplayBuffer
 from torch.nn import functional as F
 
-from sb3_lac import LAC
+from sb3_lac import LAC, evaluate_lyapunov
 from sb3_lac.buffers import HorizonReplayBuffer
 
 SPACE = spaces.Box(-np.inf, np.inf, (1,))
@@ -296,3 +297,47 @@ def test_memory_cannot_be_optimized(make_model):
         make_model(
             n_collect=0, horizon=5, optimize_memory_usage=True, replay_buffer_kwargs={"handle_timeout_termination": False}
         )
+
+
+class CorridorEnv(gym.Env):
+    """All places look the same, and each step costs 1."""
+
+    observation_space = spaces.Box(0, 1, (1,), np.float32)
+    action_space = spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.n_steps = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.n_steps += 1
+        return np.zeros(1, np.float32), -1.0, False, self.n_steps >= 20, {}
+
+
+@pytest.mark.parametrize("between", ["another call of learn", "an evaluation"])
+def test_no_sum_goes_on_where_the_environment_was_reset(between):
+    options = {"learning_starts": 100, "policy_kwargs": {"net_arch": [4]}}
+    model = LAC("MlpPolicy", CorridorEnv(), horizon=5, gamma=1.0, seed=0, **options)
+    model.learn(13)
+    if between == "an evaluation":
+        evaluate_lyapunov(model, model.get_env(), 2, seed=5)
+    model.learn(13, reset_num_timesteps=between != "an evaluation")
+    buffer = model.replay_buffer
+    assert buffer.episode_lengths.tolist() == [13]
+    complete = np.flatnonzero(buffer.complete[: buffer.pos, 0])
+    assert complete.tolist() == [*range(9), *range(13, 22)]
+    sums = buffer._get_horizon_samples(complete, np.zeros(len(complete), int), None).horizon_returns
+    assert (sums == -5).all()
+
+
+def test_a_buffer_of_single_steps_is_not_replaced_by_one_of_n_steps():
+    with pytest.warns(UserWarning, match=r"n_steps=3 is ignored, because replay_buffer_class=ReplayBuffer"):
+        model = LAC("MlpPolicy", "Pendulum-v1", replay_buffer_class=ReplayBuffer, n_steps=3, buffer_size=10)
+    assert type(model.replay_buffer) is ReplayBuffer and model.n_steps == 1
+
+
+def test_a_discount_of_numpy_trains_on_returns_of_n_steps():
+    options = {"learning_starts": 10, "batch_size": 8, "policy_kwargs": {"net_arch": [4]}}
+    model = LAC("MlpPolicy", "Pendulum-v1", gamma=np.float64(0.9), n_steps=3, **options).learn(15)
+    assert model.gamma == 0.9 and type(model.gamma) is float

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import math
 import warnings
 
 import gymnasium as gym
@@ -16,7 +17,7 @@ from scipy.stats import binom
 from stable_baselines3 import DQN, PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import Logger, configure
-from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecMonitor, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecMonitor, VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from benchmarks.controllers import ScaledController
@@ -705,7 +706,7 @@ def test_critic_is_a_function_of_the_observation(make_model, make_env):
     ("call", "arguments", "message"),
     [
         (certify, {"confidence": 1.0}, "confidence=1.0 must be a number between 0 and 1"),
-        (certify, {"n_episodes": 0}, "n_eval_episodes=0 must be at least 1"),
+        (certify, {"n_episodes": 0}, "^n_episodes=0 must be at least 1"),
         (certify, {"window_steps": 0}, "window_steps=0"),
         (certify, {"window_steps": 2.5}, "window_steps=2.5 must be at least 1, and a whole number"),
         (certify, {"cost_bound": np.nan}, "cost_bound=nan must be a number"),
@@ -714,7 +715,7 @@ def test_critic_is_a_function_of_the_observation(make_model, make_env):
         (certify, {"n_episodes_per_start": 0}, "n_episodes_per_start=0"),
         (certify, {"starts": np.ones(3), "cost_bound": 1.0}, r"starts of shape \(3,\)"),
         (certify, {"starts": np.ones((3, 1))}, "give one, or a fitted lyapunov"),
-        (fit_lyapunov, {"n_episodes": 0}, "n_eval_episodes=0"),
+        (fit_lyapunov, {"n_episodes": 0}, "^n_episodes=0"),
         (fit_lyapunov, {"n_iterations": 0}, "n_iterations=0"),
         (fit_lyapunov, {"learning_rate": 0.0}, "learning_rate=0.0"),
         (fit_lyapunov, {"trace_decay": 1.5}, "trace_decay=1.5"),
@@ -856,3 +857,83 @@ def test_callback_certifies_any_algorithm_and_changes_nothing(make_env, tmp_path
     assert len(callback.last_report.episodes) == len(callback.last_certification.episodes) == 4
     with pytest.raises(ValueError, match=r"must be a LAC model.*CertificateCallback"):
         model.learn(10, callback=LyapunovCallback(make_env()))
+
+
+class ConstantEnv(gym.Env):
+    """A place that stays as it is, and pays a reward of its own in each step."""
+
+    observation_space = spaces.Box(-99, 99, (1,), np.float32)
+    action_space = spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, rewards):
+        self.rewards = rewards
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.place, self.n_steps = (options or {"state": [0.0]})["state"][0], 0
+        return np.array([self.place], np.float32), {}
+
+    def step(self, action):
+        self.n_steps += 1
+        return np.array([self.place], np.float32), self.rewards(self.place), False, self.n_steps >= 10, {}
+
+
+class Resting:
+    """
+    A controller that does nothing.
+
+    :param answer: Makes of its actions what ``predict`` returns
+    """
+
+    def __init__(self, answer=lambda actions: (actions, None)):
+        self.answer = answer
+
+    def predict(self, observation, deterministic=True):
+        return self.answer(np.zeros((len(observation), 1), np.float32))
+
+
+@pytest.mark.parametrize("make_vec", [DummyVecEnv, SubprocVecEnv])
+def test_a_cost_of_the_bound_is_within_the_bound_in_all_vector_environments(make_vec):
+    # Some hold rewards in single precision, where 0.1 is a little more than 0.1
+    env = make_vec([lambda: ConstantEnv(lambda place: -0.1)] * 2)
+    report = certify(Resting(), env, n_episodes=4, cost_bound=0.1, starts=[[0.0], [1.0]], seed=0)
+    assert report.statements.loc["stays_within", "n_true"] == 4 and (report.starts["share"] == 1).all()
+    assert certify(Resting(), env, n_episodes=4, cost_bound=0.0999, seed=0).statements.loc["stays_within", "n_true"] == 0
+    env.close()
+
+
+def test_positive_rewards_of_the_start_grid_need_a_bound_too():
+    env = ConstantEnv(lambda place: 1.0 if place > 5 else -0.1)
+    with pytest.raises(ValueError, match="reward of 1 is positive, and it is not known which reward costs nothing"):
+        certify(Resting(), env, n_episodes=2, cost_bound=0.5, starts=[[0.0], [10.0]], seed=0)
+    known = LyapunovFunction(lambda states: states[:, 0] ** 2, reward_bound=1.0)
+    starts = certify(Resting(), env, known, n_episodes=2, cost_bound=0.5, starts=[[0.0], [10.0]], seed=0).starts
+    assert starts["share"].tolist() == [0.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("argument", "value"),
+    [
+        *(("reward_bound", value) for value in (-1.0, math.nan, math.inf, "1")),
+        *(("gamma", value) for value in (2.0, -0.1, math.nan, None)),
+        *(("horizon", value) for value in (0, 2.5)),
+        *(("alpha3", value) for value in (0.0, -1.0, math.inf, "1")),
+        ("average_cost", math.nan),
+    ],
+)
+def test_numbers_that_no_function_can_have_are_refused(argument, value):
+    with pytest.raises(ValueError, match=f"^{argument}={value!r} must"):
+        LyapunovFunction(lambda states: states[:, 0] ** 2, **{argument: value})
+
+
+def test_a_controller_that_returns_something_else_is_told_what_is_expected():
+    env = DummyVecEnv([lambda: ConstantEnv(lambda place: -0.1)] * 2)
+    for answer, match in (
+        (lambda actions: actions, r"Resting returned ndarray, and must return two things"),
+        (lambda actions: actions.tolist(), r"Resting returned list, and must return two things"),
+        (lambda actions: (actions[0], None), r"actions of shape \(1,\), and must return one for each of 2 environments"),
+    ):
+        with pytest.raises(ValueError, match=match):
+            certify(Resting(answer), env, n_episodes=2, seed=0)
+    # A list of actions is as good as an array
+    assert len(certify(Resting(lambda actions: (actions.tolist(), None)), env, n_episodes=2, seed=0).episodes) == 2

@@ -7,7 +7,7 @@ from gymnasium import spaces
 from sb3_contrib import TQC, RecurrentPPO
 from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
 from battery_env import OnnxPolicy, PolicyEstimator, TrajectoryDataset
 from sb3_lac import LAC, onnx
@@ -138,3 +138,65 @@ def test_bad_files_and_observations_are_refused(tmp_path):
         policy.predict(np.zeros((1, 2)), deterministic=False)
     with pytest.raises(ValueError, match="which environment"):
         policy.env_id  # noqa: B018
+
+
+ROOMS = spaces.Box(np.array([90e3, 250.0], np.float32), np.array([110e3, 350.0], np.float32))
+IMAGES = spaces.Box(0, 255, (3, 4, 4), np.uint8)
+HALF = spaces.Box(np.array([5.0, -np.inf], np.float32), np.array([np.inf, -50.0], np.float32))
+
+
+@pytest.mark.parametrize(("space", "least"), [(ROOMS, 80.0), (IMAGES, 200.0), (HALF, 15.0)])
+def test_observations_of_the_check_fill_the_space(space, least):
+    observations = onnx._observations(space, None)
+    assert all(space.contains(observation.astype(space.dtype)) for observation in observations)
+    assert (np.ptp(observations, axis=0) > least).all()
+
+
+def test_a_graph_of_a_constant_action_is_refused_where_observations_are_normalized(tmp_path, monkeypatch):
+    env = VecNormalize(make_vec_env("LinearCost-v0"))
+    env.obs_rms.mean, env.obs_rms.var = np.array([93.0, -93.0]), np.array([0.01, 0.01])
+    model = LAC("MlpPolicy", env, seed=0, device="cpu", policy_kwargs=dict(SMALL))
+    export = onnx._graph
+
+    class Constant(th.nn.Module):
+        def __init__(self, module, action):
+            super().__init__()
+            self.low, self.always = module.low, th.as_tensor(action)
+
+        def forward(self, observation):
+            return 0.0 * observation[:, :1] + self.always
+
+    def constant(module, observations, *args):
+        action, _ = model.predict(env.normalize_obs(observations[:1]), deterministic=True)
+        return export(Constant(module, action).eval(), observations, *args)
+
+    monkeypatch.setattr(onnx, "_graph", constant)
+    with pytest.raises(ValueError, match="differs from the original"):
+        export_onnx(model, tmp_path / "policy")
+
+
+def test_a_mean_far_larger_than_the_deviation_loses_no_digits(tmp_path):
+    env = VecNormalize(make_vec_env("Pendulum-v1"), clip_obs=10.0)
+    env.obs_rms.mean, env.obs_rms.var = np.full(3, 29_315.123_456_7), np.full(3, 0.01)
+    model = PPO("MlpPolicy", env, seed=0, device="cpu", policy_kwargs=dict(SMALL))
+    module = onnx.DeterministicPolicy(model.policy, env)
+    observations = (29_315.0 + np.random.default_rng(0).uniform(-0.5, 0.5, (200, 3))).astype(np.float32)
+    expected, _ = model.predict(env.normalize_obs(observations), deterministic=True)
+    with th.no_grad():
+        actions = module(th.as_tensor(observations)).numpy()
+    np.testing.assert_allclose(actions, expected, atol=1e-6)
+
+
+def test_wrappers_around_the_normalization_are_refused(tmp_path):
+    env = VecFrameStack(VecNormalize(make_vec_env("LinearCost-v0")), 2)
+    model = PPO("MlpPolicy", env, device="cpu", policy_kwargs=dict(SMALL))
+    with pytest.raises(ValueError, match=r"normalizes observations of shape \(2,\), and those of the policy have \(4,\)"):
+        export_onnx(model, tmp_path / "policy")
+
+
+def test_an_action_that_has_no_choice_is_exported(tmp_path):
+    model = PPO("MlpPolicy", "Pendulum-v1", seed=0, device="cpu", policy_kwargs=dict(SMALL), _init_setup_model=False)
+    model.action_space = spaces.Box(np.array([-1.0, 0.5], np.float32), np.array([1.0, 0.5], np.float32))
+    model._setup_model()
+    actions, _ = OnnxPolicy(export_onnx(model, tmp_path / "policy")).predict(np.ones((3, 3), np.float32))
+    assert (actions[:, 1] == 0.5).all()

@@ -229,6 +229,19 @@ def test_frozen_layers_stay_as_they_are(make_model, train_metrics):
     assert unchanged == [True, True, False, False]
 
 
+@pytest.mark.parametrize("name", ["actor", "critic"])
+def test_a_frozen_network_stays_as_it_is(name, make_model, train_metrics):
+    model = make_model()
+    # It has gradients of an earlier update
+    train_metrics(model)
+    frozen, free = (model.actor, model.critic) if name == "actor" else (model.critic, model.actor)
+    frozen.requires_grad_(False)
+    before = [[parameter.clone() for parameter in network.parameters()] for network in (frozen, free)]
+    train_metrics(model, gradient_steps=2)
+    assert all(th.equal(*pair) for pair in zip(before[0], frozen.parameters(), strict=True))
+    assert not any(th.equal(*pair) for pair in zip(before[1], free.parameters(), strict=True))
+
+
 class Einsum(BaseFeaturesExtractor):
     """A layer whose gradient has the layout of the transposed weight, and a parameter that nothing depends on."""
 

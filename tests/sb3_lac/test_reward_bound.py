@@ -283,3 +283,25 @@ def test_positive_rewards_need_a_discount_or_a_horizon(make_model, make_env, tra
     with pytest.raises(ValueError, match=message):
         train_metrics(model)
     assert make_model(make_env(offset=4.0), gamma=1.0, horizon=3).critic.offset.item() > 0
+
+
+@pytest.mark.parametrize("reward", [0.1, 0.3, 1.0])
+def test_a_reward_of_the_stated_bound_is_not_above_it(reward, make_env):
+    env = make_env(offset=reward)
+    env.step = lambda action: (np.zeros(2, np.float32), reward, False, False, {})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        LAC("MlpPolicy", env, reward_bound=reward, learning_starts=100, policy_kwargs={"net_arch": [4]}).learn(5)
+
+
+def test_a_bound_given_on_loading_keeps_the_units_of_normalized_rewards(tmp_path):
+    env = VecNormalize(DummyVecEnv([BalanceEnv]), norm_obs=False)
+    model = LAC("MlpPolicy", env, seed=0, reward_bound=1.0, learning_starts=20, batch_size=16, policy_kwargs={"net_arch": [8]})
+    model.learn(100)
+    model.save(tmp_path / "model")
+    expected = model.critic.offset.item()
+    assert expected != pytest.approx(100.0, rel=0.1)  # that of rewards as they are
+    for bound in (1.0, 2.5):
+        loaded = LAC.load(tmp_path / "model", reward_bound=bound)
+        assert loaded.critic.offset.item() == pytest.approx(bound * expected, rel=1e-5)
+        assert loaded.critic_target.offset.item() == loaded.critic.offset.item()

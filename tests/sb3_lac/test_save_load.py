@@ -177,3 +177,14 @@ def test_saved_data_holds_no_tensor(make_model, train_metrics, tmp_path):
     for name in ("actor", "actor_target", "critic", "critic_target", "batch_norm_stats", "batch_norm_stats_target"):
         assert name not in data
     assert not any(isinstance(value, (th.Tensor, th.nn.Module, th.optim.Optimizer)) for value in data.values())
+
+
+def test_a_fixed_entropy_coefficient_can_be_changed_on_loading(tmp_path):
+    LAC("MlpPolicy", "Pendulum-v1", ent_coef=0.1, buffer_size=10, policy_kwargs={"net_arch": [4]}).save(tmp_path / "fixed")
+    assert LAC.load(tmp_path / "fixed").ent_coef_tensor.item() == pytest.approx(0.1)
+    model = LAC.load(tmp_path / "fixed", ent_coef=0.5)
+    assert model.ent_coef == 0.5 and model.ent_coef_tensor.item() == 0.5
+    LAC("MlpPolicy", "Pendulum-v1", buffer_size=10, policy_kwargs={"net_arch": [4]}).save(tmp_path / "learned")
+    for name, ent_coef in (("fixed", "auto"), ("learned", 0.5)):
+        with pytest.raises(ValueError, match=f"ent_coef={ent_coef!r} is not what the model was saved with"):
+            LAC.load(tmp_path / name, ent_coef=ent_coef)

@@ -585,6 +585,16 @@ def test_training_with_callback_is_the_same_to_the_bit(make_model, make_env, nor
         assert th.equal(tensor, states[1][name]), name
 
 
+def test_a_callback_forgets_another_training(make_model, make_env):
+    callback = LyapunovCallback(make_env(), n_eval_episodes=2, eval_freq=50, verbose=0)
+    first, second = (make_model(make_vec_env(make_env), n_collect=0) for _ in range(2))
+    first.learn(100, callback=callback)
+    first.learn(50, callback=callback, reset_num_timesteps=False)
+    assert [entry["timesteps"] for entry in callback.history] == [50, 100, 150]
+    second.learn(70, callback=callback)
+    assert [entry["timesteps"] for entry in callback.history][:1] == [callback.history[-1]["timesteps"]]
+
+
 def assert_no_transition_joins_two_episodes(model, step=0.5):
     """``LinearCostEnv`` moves by half of the action."""
     buffer = model.replay_buffer

@@ -271,3 +271,13 @@ def test_lac_learns_to_control(make_model, make_env):
     # Doing nothing costs 1.15 per step, the best controller 0.09
     assert before > 0.6
     assert mean_cost(model) < 0.2
+
+
+def test_target_update_interval_counts_the_updates_of_all_calls(make_model):
+    model = make_model(target_update_interval=3, tau=1.0)
+    followed = []
+    for _ in range(7):
+        model.train(gradient_steps=1, batch_size=16)
+        pairs = zip(model.critic.parameters(), model.critic_target.parameters(), strict=True)
+        followed.append(all(th.equal(*pair) for pair in pairs))
+    assert followed == [True, False, False, True, False, False, True]

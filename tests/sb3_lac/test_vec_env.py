@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from stable_baselines3 import SAC, TD3
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormali
 from battery_env.loads import constant
 from battery_env.trajectories import TrajectoryDataset
 from sb3_lac import LAC, GymnasiumVecEnv
+from sb3_lac.lac import time_limits
 
 N_ENVS = 3
 
@@ -280,3 +281,21 @@ def test_pictures(discharges):
     assert env.render_mode == "rgb_array" and env.render("rgb_array").shape == (800, 600, 3)
     env.close()
     assert vector.closed
+
+
+def unpicklable_env():
+    env = gym.make("Pendulum-v1", max_episode_steps=7)
+    env.unwrapped.spec.entry_point = lambda: None
+    return env
+
+
+@pytest.mark.parametrize("make_vec", [SyncVectorEnv, AsyncVectorEnv])
+def test_environments_survive_being_asked_for_what_they_do_not_have(make_vec):
+    env = GymnasiumVecEnv(make_vec([unpicklable_env] * 2, autoreset_mode=AutoresetMode.SAME_STEP))
+    assert not env.has_attr("action_masks") and env.has_attr("max_torque")
+    # Nor has a specification that cannot be pickled to be sent
+    assert time_limits(env) == [7, 7]
+    with pytest.raises(ValueError, match=r"horizon=8 is longer than the episodes, which max_episode_steps=7 cuts"):
+        LAC("MlpPolicy", env, horizon=8)
+    assert env.reset().shape == (2, 3)
+    env.close()
