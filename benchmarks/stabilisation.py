@@ -9,11 +9,12 @@ the goal, what disturbances that it was not trained for do to it, and what a cer
 
 Policies are trained without disturbances, with the hyperparameters of ``zoo_configs``, and judged by their mean action. All of
 them have the same starts and disturbances. What is done is not done again when the command is repeated, so that seeds can be
-added.
+added. ``tensorboard --logdir results/stabilisation/models`` overlays the curves of all trainings.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -30,7 +31,7 @@ from battery_env.plotting import COLOURS, new_figure
 from benchmarks.certificate import SETTLED_SHARE, judge
 from benchmarks.references import DISTURBANCES, SHARES, conditions, draw_shares, tried
 from benchmarks.study import Study, Tables, command_line, digits, markdown, natural, positive, share_with_range, with_interval
-from benchmarks.training import Recipe, train_or_load
+from benchmarks.training import Recipe, record_file, train_or_load
 from sb3_lac.envs import reference_controller
 
 _REFERENCE = "reference"
@@ -70,18 +71,22 @@ def part(
     """
     predictor: PolicyPredictor
     if policy == _REFERENCE:
-        predictor, updates = reference_controller(gym.make(env_id)), None
+        predictor, updates, minutes = reference_controller(gym.make(env_id)), None, None
     else:
         assert seed is not None and timesteps is not None
-        model = train_or_load(policy, env_id, seed, timesteps, models / f"{env_id}_{policy}_seed{seed}")
+        folder = models / f"{env_id}_{policy}_seed{seed}"
+        model = train_or_load(policy, env_id, seed, timesteps, folder)
         # of all algorithms that learn from a replay buffer
         predictor, updates = model, getattr(model, "_n_updates", None)
+        made = json.loads(record_file(Recipe.of(policy, env_id, seed, timesteps), folder).read_text(encoding="utf-8"))
+        minutes = made["training_minutes"]
     described: dict[str, Any] = {
         "environment": env_id,
         "policy": policy if policy == _REFERENCE else policy.upper(),
         "seed": seed,
         "timesteps": timesteps,
         "updates": updates,
+        "training_minutes": minutes,
         "recipe": recipe,
     }
     outcomes = tried(predictor, env_id, episodes).drop(columns="environment")
@@ -114,6 +119,7 @@ def undisturbed_table(results: pd.DataFrame) -> pd.DataFrame:
                 "policy": policy,
                 "seeds": "" if policy == _REFERENCE else str(len(group)),
                 "updates": "" if policy == _REFERENCE else f"{group['updates'].max():.0f}",
+                "training (min)": "" if policy == _REFERENCE else digits(group["training_minutes"].mean()),
                 "cost per step": with_interval(group["cost"]),
                 "error at the end, median": with_interval(group["error_median"]),
                 **{title: share_with_range(group[column]) for column, title in SHARES.items()},

@@ -293,7 +293,7 @@ def train_or_load(
     if not file.exists():
         start = time.perf_counter()
         _, model = set_up(recipe, folder / "zoo")
-        model.set_logger(configure(str(folder), ["csv"]))
+        model.set_logger(configure(str(folder), ["csv", "tensorboard"]))
         model.learn(timesteps)
         minutes = (time.perf_counter() - start) / 60.0
         described = {"recipe": asdict(recipe), "training_minutes": minutes, "versions": versions()}

@@ -5,9 +5,10 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from stable_baselines3.common.env_util import make_vec_env
 from torch import nn
 
-from sb3_lac import LAC, evaluate_lyapunov
+from sb3_lac import LAC, certify, evaluate_lyapunov
 
 model = LAC(
     "MlpPolicy",
@@ -39,3 +40,11 @@ report.plot_phase(2, 3, names).savefig(folder / "phase.png")
 
 wide = evaluate_lyapunov(model, WideStarts(gym.make("CartPoleCost-v0")), n_eval_episodes=300, seed=1)
 wide.plot_region_of_attraction(2, 3, names).savefig(folder / "region_of_attraction.png")
+
+# On a grid, with some noise so that no two episodes are alike: an exact interval for each start
+angles, rates = np.meshgrid(np.linspace(-0.3, 0.3, 13), np.linspace(-3.0, 3.0, 13))
+starts = np.column_stack([np.zeros((angles.size, 2)), angles.ravel(), rates.ravel()])
+noisy = make_vec_env("CartPoleCost-v0", n_envs=len(starts), env_kwargs={"process_noise": 0.01})
+grid = certify(model, noisy, n_episodes=300, cost_bound=1.0, starts=starts, n_episodes_per_start=20, seed=1)
+print(grid.summary())
+grid.plot_region_of_attraction(2, 3, names).savefig(folder / "attraction.png")

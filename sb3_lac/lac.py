@@ -883,8 +883,11 @@ class LAC(OffPolicyAlgorithm):
         :param truncate_last_traj: See ``OffPolicyAlgorithm.load_replay_buffer()``
         :raises ValueError: If it sums rewards over another number of steps than this model
         """
-        own = self.replay_buffer
+        own = getattr(self, "replay_buffer", None)
         super().load_replay_buffer(path, truncate_last_traj)
+        if own is None:
+            # Deleted to make room for this one
+            return
         for name, none in (("horizon", None), ("n_steps", 1)):
             stored, needed = getattr(self.replay_buffer, name, none), getattr(own, name, none)
             if stored != needed:

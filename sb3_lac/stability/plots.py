@@ -305,7 +305,8 @@ def plot_attraction(starts: pd.DataFrame, confidence: str, x: int, y: int, names
     axes.scatter(points[never, 0], points[never, 1], s=20, color=VERMILION, marker="x", lw=1, label="never attracted")
     figure.colorbar(marks, ax=axes, label=f"probability of attraction, at least ({confidence} % interval)")
     if never.any():
-        axes.legend(fontsize=8, loc="upper right")
+        # Beside the axes: a grid of starts leaves no room in a corner
+        figure.legend(fontsize=8, loc="outside lower center")
     axes.set(title=f"{len(points)} start states, {starts['n_episodes'].iloc[0]} episodes each", **labels)
     return figure
 

@@ -33,6 +33,7 @@ def test_tables_and_figures_are_written_and_seeds_can_be_added(tmp_path, quick, 
     results, certificates = (pd.read_csv(tmp_path / f"{name}.csv") for name in ("stabilisation", "certificates"))
     assert results["policy"].tolist() == 12 * ["LAC"] + 6 * ["reference"]
     assert certificates["function"].tolist() == ["fitted", "critic", "fitted", "critic", "fitted"]
+    assert results["training_minutes"].tolist()[:12] == 12 * [1.5]
     reference = results[(results["policy"] == "reference") & (results["disturbance"] == "none")].iloc[0]
     assert reference["at_goal"] == 1.0 and reference["died"] == 0.0
     # An untrained policy is no match for the optimum, whose starts it has
@@ -52,6 +53,7 @@ def test_tables_count_episodes_and_seeds():
             "policy": "SAC",
             "seed": seed,
             "updates": 10.0,
+            "training_minutes": 0.5,
             "disturbance": disturbance,
             "cost": cost,
             "error_median": 0.1,

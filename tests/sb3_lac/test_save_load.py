@@ -188,3 +188,11 @@ def test_a_fixed_entropy_coefficient_can_be_changed_on_loading(tmp_path):
     for name, ent_coef in (("fixed", "auto"), ("learned", 0.5)):
         with pytest.raises(ValueError, match=f"ent_coef={ent_coef!r} is not what the model was saved with"):
             LAC.load(tmp_path / name, ent_coef=ent_coef)
+
+
+def test_a_buffer_is_loaded_in_place_of_a_deleted_one(tmp_path, make_model):
+    model = make_model(n_collect=20)
+    model.save_replay_buffer(tmp_path / "buffer")
+    del model.replay_buffer
+    model.load_replay_buffer(tmp_path / "buffer")
+    assert model.replay_buffer.size() == 20
