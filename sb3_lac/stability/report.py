@@ -114,6 +114,9 @@ class LyapunovReport:
         if not self.lyapunov_over_cost.empty:
             quantiles = ", ".join(f"{value:.3g}" for value in self.lyapunov_over_cost)
             lines.append(f"L is {quantiles} times the cost (5th, 50th and 95th percentile of the transitions).")
+        if not math.isnan(self.alpha3_by_discount):
+            share = "no share" if self.alpha3_by_discount <= 0 else f"at most {self.alpha3_by_discount:.3g}"
+            lines.append(f"If L is exact, gamma={self.gamma:g} lets it decrease by {share} of the cost in 95 % of them.")
         if self.n_calibrated > 0:
             lines.append(f"L was compared with the cost-to-go of {self.n_calibrated} transitions.")
         lines.append(
@@ -140,6 +143,17 @@ class LyapunovReport:
         with_cost = self.transitions[self.transitions["cost"] > 0]
         ratios = with_cost["lyapunov"] / with_cost["cost"]
         return ratios.quantile([0.05, 0.5, 0.95]) if len(ratios) > 0 else ratios
+
+    @property
+    def alpha3_by_discount(self) -> float:
+        """
+        The largest ``alpha3`` for which an exact ``L`` decreases in 95 % of the transitions with a cost: what follows from the
+        discount and from how slowly costs fade, ``(1 - (1 - gamma) * kappa) / gamma`` with ``kappa`` the 95th percentile of
+        ``L / c``. Not positive where no ``alpha3`` is feasible; NaN where ``L`` is no discounted sum of all costs to come.
+        """
+        if self.horizon is not None or not 0 < self.gamma < 1 or self.lyapunov_over_cost.empty:
+            return math.nan
+        return float((1 - (1 - self.gamma) * self.lyapunov_over_cost.iloc[-1]) / self.gamma)
 
     @property
     def holds(self) -> bool:

@@ -127,6 +127,31 @@ def test_known_function_is_judged_like_a_learned_one(linear_env):
         LyapunovFunction(lambda states: np.array([np.nan, 1.0])).values(np.ones((2, 3)))
 
 
+@pytest.mark.parametrize("gamma", [0.6, 0.95])
+def test_discount_and_ratio_tell_the_alpha3_of_an_exact_function(gamma):
+    env = LinearCostEnv()
+    p = env.value_matrix(env.optimal_gain(), gamma)
+    exact = LyapunovFunction(lambda states: np.einsum("ni,ij,nj->n", states, p, states), gamma=gamma)
+    judged = (
+        reference_controller(gym.make("LinearCost-v0")),
+        make_vec_env("LinearCost-v0", 10, env_kwargs={"noise_std": 0.0}),
+    )
+    alpha3 = evaluate_lyapunov(*judged, 10, seed=0, lyapunov=exact).alpha3_by_discount
+    assert 0 < alpha3 < 1
+    # It decreases by that share of the cost in 95 % of the transitions (to which rounding of observations adds little)
+    report = evaluate_lyapunov(*judged, 10, seed=0, lyapunov=exact, alpha3=alpha3)
+    with_cost = report.transitions[report.transitions["cost"] > 1e-6]
+    assert (with_cost["difference"] <= 1e-9).mean() == pytest.approx(0.95, abs=0.03)
+    assert f"If L is exact, gamma={gamma:g} lets it decrease by at most {alpha3:.3g} of the cost" in report.summary()
+    # Slower than the discount forgets: an L of forty times the cost
+    slow = LyapunovFunction(lambda states: 40 * (states**2).sum(axis=1), gamma=gamma)
+    report = evaluate_lyapunov(*judged, 10, seed=0, lyapunov=slow)
+    assert report.alpha3_by_discount < 0 and "decrease by no share of the cost" in report.summary()
+    for arguments in ({"gamma": 1.0}, {"gamma": gamma, "horizon": 5}):
+        other = LyapunovFunction(lambda states: (states**2).sum(axis=1), **arguments)
+        assert math.isnan(evaluate_lyapunov(*judged, 10, seed=0, lyapunov=other).alpha3_by_discount)
+
+
 # Other roll-outs
 
 
