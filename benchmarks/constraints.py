@@ -262,7 +262,7 @@ def report(results: pd.DataFrame) -> str:
 
 def plot(results: pd.DataFrame) -> Figure:
     """
-    The cost of each design, one panel per environment: each seed, and the interquartile mean with its 95 %
+    The cost of each design, one panel per environment, three in a row: each seed, and the interquartile mean with its 95 %
     interval.
 
     :param results: of all parts
@@ -270,9 +270,16 @@ def plot(results: pd.DataFrame) -> Figure:
     """
     undisturbed = results[results["disturbance"] == "none"]
     envs, designs = list(undisturbed["environment"].unique()), list(undisturbed["design"].unique())
-    figure = new_figure(2.6 + 2.0 * len(envs), 0.9 + 0.36 * len(designs))
-    panels = figure.subplots(1, len(envs), sharey=True, squeeze=False)[0]
-    for axes, env_id in zip(panels, envs, strict=True):
+    n_columns = min(len(envs), 3)
+    n_rows = -(-len(envs) // n_columns)
+    figure = new_figure(2.6 + 2.4 * n_columns, n_rows * (0.9 + 0.3 * len(designs)))
+    panels = figure.subplots(n_rows, n_columns, sharey=True, squeeze=False).ravel()
+    for axes in panels[len(envs) :]:
+        axes.remove()
+    for axes, env_id in zip(panels, envs, strict=False):
+        of_env = undisturbed.loc[undisturbed["environment"] == env_id, "cost"]
+        # only over decades: within one, labels of a logarithmic axis overlap
+        axes.set(xscale="log" if of_env.max() > 10 * of_env.min() else "linear", xlabel="cost per step")
         for height, (colour, design) in enumerate(coloured(designs)):
             costs = undisturbed.loc[(undisturbed["environment"] == env_id) & (undisturbed["design"] == design), "cost"]
             if costs.empty:
@@ -281,9 +288,8 @@ def plot(results: pd.DataFrame) -> Figure:
             axes.scatter(costs, np.full(len(costs), height), s=10, color=colour, alpha=0.4, lw=0)
             axes.plot([low, high], [height, height], color=colour, lw=1.5)
             axes.plot(middle, height, "o", color=colour, ms=6)
-        axes.set(xscale="log", xlabel="cost per step")
         axes.set_title(env_id, fontsize=9)
-        axes.grid(which="both", axis="x", alpha=0.25)
+        axes.grid(axis="x", alpha=0.25)
     panels[0].set_yticks(range(len(designs)), [DESIGNS[design].label for design in designs])
     panels[0].invert_yaxis()
     return figure
