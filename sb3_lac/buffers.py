@@ -81,7 +81,7 @@ class HorizonReplayBuffer(ReplayBuffer):
         self.complete[pos] = False
         super().add(obs, next_obs, action, reward, done, infos)
 
-        # Nor does the episode of a buffer that was filled elsewhere go on
+        # The last episode of a buffer that was filled elsewhere does not go on here
         is_next = (self.next_observations[pos - 1] == self.observations[pos]).reshape(self.n_envs, -1).all(axis=1)
         self.episode_lengths = np.where(is_next, self.episode_lengths, 0) + 1
         # The oldest step whose sum may end here, and with a termination all steps after it too

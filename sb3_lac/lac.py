@@ -10,7 +10,6 @@ from typing import Any, ClassVar, NamedTuple, TypeVar
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
@@ -18,7 +17,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
 from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, polyak_update, update_learning_rate
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her import HerReplayBuffer
 from stable_baselines3.sac.policies import Actor
 from torch.nn import functional as F
@@ -28,7 +27,7 @@ from sb3_lac.compiled import CompiledUpdate, Metrics, check_compiler, set_gradie
 from sb3_lac.discounts import DEFAULT_DISCOUNT, stated_discount, sum_of_discounts, weight_of_return
 from sb3_lac.env_ids import check_env_id
 from sb3_lac.policies import CnnPolicy, LyapunovCritic, LyapunovPolicy, MlpPolicy, MultiInputPolicy, largest_value
-from sb3_lac.vec_env import in_processes
+from sb3_lac.vec_env import time_limits
 
 SelfLAC = TypeVar("SelfLAC", bound="LAC")
 
@@ -62,34 +61,6 @@ def reward_scale(vec_normalize: VecNormalize | None) -> float:
     if vec_normalize is None or not vec_normalize.norm_reward:
         return 1.0
     return math.sqrt(vec_normalize.ret_rms.var + vec_normalize.epsilon)
-
-
-def env_specs(env: VecEnv) -> list[EnvSpec | None]:
-    """
-    Gymnasium's specifications.
-
-    :param env: Vectorized environment
-    :return: One per environment, None where it is not known
-    """
-    # One that cannot be pickled, as with a lambda as entry point, would end the process of its environment
-    if not in_processes(env):
-        # A vector environment of somebody else may have no attributes
-        with suppress(AttributeError, NotImplementedError):
-            return env.get_attr("spec")
-    return [None] * env.num_envs
-
-
-def time_limits(env: VecEnv) -> list[int | None]:
-    """
-    Gymnasium's time limits.
-
-    :param env: Vectorized environment
-    :return: ``max_episode_steps`` of each environment, None where it has none or is not known
-    """
-    if in_processes(env):
-        limit = "_max_episode_steps"  # of Gymnasium's wrapper TimeLimit, for there is no specification to ask
-        return env.get_attr(limit) if env.has_attr(limit) else [None] * env.num_envs
-    return [getattr(spec, "max_episode_steps", None) for spec in env_specs(env)]
 
 
 class Weights(NamedTuple):

@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import VecNormalize, unwrap_vec_normalize
 from torch.distributions import Distribution
 
 from sb3_lac.files import replacing
-from sb3_lac.lac import env_specs
+from sb3_lac.vec_env import env_specs
 
 if TYPE_CHECKING:
     from onnx import ModelProto

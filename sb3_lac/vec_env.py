@@ -1,8 +1,10 @@
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.vec_env import SubprocVecEnv
@@ -99,9 +101,7 @@ class GymnasiumVecEnv(VecEnv):
         if isinstance(self._single_envs, gym.vector.SyncVectorEnv):
             return [self._single_envs.envs[n].get_wrapper_attr(attr_name) for n in chosen]
         if self._single_envs is not None:
-            # Asked for one that is missing, the processes of the environments would end
-            if not all(self._single_envs.call("has_wrapper_attr", attr_name)):
-                raise AttributeError(f"{self._single_envs} has environments without {attr_name!r}.")
+            self._check_attr(attr_name)
             values = self._single_envs.get_attr(attr_name)
         else:
             values = (getattr(self.env, attr_name),) * self.num_envs
@@ -118,7 +118,7 @@ class GymnasiumVecEnv(VecEnv):
         """
         chosen = set(self._get_indices(indices))
         if self._single_envs is not None:
-            old = self._single_envs.get_attr(attr_name) if len(chosen) < self.num_envs else (value,) * self.num_envs
+            old = self.get_attr(attr_name) if len(chosen) < self.num_envs else [value] * self.num_envs
             self._single_envs.set_attr(attr_name, [value if n in chosen else old[n] for n in range(self.num_envs)])
         elif len(chosen) < self.num_envs:
             raise ValueError(
@@ -145,10 +145,17 @@ class GymnasiumVecEnv(VecEnv):
             methods = [self._single_envs.envs[n].get_wrapper_attr(method_name) for n in chosen]
             return [method(*method_args, **method_kwargs) for method in methods]
         if self._single_envs is not None:
+            self._check_attr(method_name)
             results = self._single_envs.call(method_name, *method_args, **method_kwargs)
         else:
             results = (getattr(self.env, method_name)(*method_args, **method_kwargs),) * self.num_envs
         return [results[n] for n in chosen]
+
+    def _check_attr(self, name: str) -> None:
+        """Asked for what is missing, the processes of single environments would end."""
+        assert self._single_envs is not None
+        if not all(self._single_envs.call("has_wrapper_attr", name)):
+            raise AttributeError(f"{self._single_envs} has environments without {name!r}.")
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
         """
@@ -173,6 +180,34 @@ def in_processes(env: VecEnv) -> bool:
     if isinstance(inner, GymnasiumVecEnv):
         return isinstance(inner.env.unwrapped, gym.vector.AsyncVectorEnv)
     return isinstance(inner, SubprocVecEnv)
+
+
+def env_specs(env: VecEnv) -> list[EnvSpec | None]:
+    """
+    Gymnasium's specifications.
+
+    :param env: Vectorized environment
+    :return: One per environment, None where it is not known
+    """
+    # One that cannot be pickled, as with a lambda as entry point, would end the process of its environment
+    if not in_processes(env):
+        # A vector environment of somebody else may have no attributes
+        with suppress(AttributeError, NotImplementedError):
+            return env.get_attr("spec")
+    return [None] * env.num_envs
+
+
+def time_limits(env: VecEnv) -> list[int | None]:
+    """
+    Gymnasium's time limits.
+
+    :param env: Vectorized environment
+    :return: ``max_episode_steps`` of each environment, None where it has none or is not known
+    """
+    if in_processes(env):
+        limit = "_max_episode_steps"  # of Gymnasium's wrapper TimeLimit, for there is no specification to ask
+        return env.get_attr(limit) if env.has_attr(limit) else [None] * env.num_envs
+    return [getattr(spec, "max_episode_steps", None) for spec in env_specs(env)]
 
 
 def _unbatched(batch: dict[str, Any], rows: np.ndarray) -> list[dict[str, Any]]:

@@ -14,7 +14,6 @@ import numpy as np
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_lac.lac import env_specs
 from sb3_lac.stability.fitting import FittedLyapunov, flatten
 from sb3_lac.stability.functions import LyapunovFunction, check_function, check_rewards
 from sb3_lac.stability.rollout import (
@@ -29,6 +28,7 @@ from sb3_lac.stability.rollout import (
     undisturbed,
 )
 from sb3_lac.stability.statistics import exact_interval, exact_lower_bound, percent
+from sb3_lac.vec_env import env_specs
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -13,7 +13,7 @@ import numpy as np
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_lac.lac import LAC, time_limits
+from sb3_lac.lac import LAC
 from sb3_lac.stability.functions import CriticLyapunov, LyapunovFunction, check_function, check_rewards
 from sb3_lac.stability.rollout import (
     check_number,
@@ -28,6 +28,7 @@ from sb3_lac.stability.rollout import (
     undisturbed,
 )
 from sb3_lac.stability.statistics import Bootstrap, Interval, decrease_by_cost, estimate_metrics
+from sb3_lac.vec_env import time_limits
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormali
 from battery_env.loads import constant
 from battery_env.trajectories import TrajectoryDataset
 from sb3_lac import LAC, GymnasiumVecEnv
-from sb3_lac.lac import time_limits
+from sb3_lac.vec_env import time_limits
 
 N_ENVS = 3
 
@@ -293,6 +293,10 @@ def unpicklable_env():
 def test_environments_survive_being_asked_for_what_they_do_not_have(make_vec):
     env = GymnasiumVecEnv(make_vec([unpicklable_env] * 2, autoreset_mode=AutoresetMode.SAME_STEP))
     assert not env.has_attr("action_masks") and env.has_attr("max_torque")
+    with pytest.raises(AttributeError, match="no_such_method"):
+        env.env_method("no_such_method")
+    with pytest.raises(AttributeError, match="no_such_thing"):
+        env.set_attr("no_such_thing", 1, indices=0)
     # Nor has a specification that cannot be pickled to be sent
     assert time_limits(env) == [7, 7]
     with pytest.raises(ValueError, match=r"horizon=8 is longer than the episodes, which max_episode_steps=7 cuts"):
