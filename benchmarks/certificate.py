@@ -28,10 +28,10 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from tqdm import tqdm
 
-from battery_env.plotting import COLOURS, new_figure, save_figure
+from battery_env.plotting import COLOURS, save_figure
 from benchmarks.controllers import controllers, factors
 from benchmarks.references import DISTURBANCES
-from benchmarks.study import Study, command_line, digits, natural
+from benchmarks.study import Study, command_line, digits, natural, new_panels
 from benchmarks.training import Recipe, train_or_load
 from sb3_lac import LAC, certify, evaluate_lyapunov, fit_lyapunov
 from sb3_lac.envs import LinearCostEnv
@@ -177,13 +177,9 @@ def plot(table: pd.DataFrame) -> Figure:
     :return: the figure
     """
     envs = table["env"].unique()
-    n_columns = min(len(envs), 3)
-    n_rows = -(-len(envs) // n_columns)
-    figure = new_figure(4.6 * n_columns, 0.6 + n_rows * (0.8 + 0.25 * table.groupby("env").size().max()))
-    panels = figure.subplots(n_rows, n_columns, squeeze=False).ravel()
-    for axes in panels[len(envs) :]:
-        axes.remove()
-    for axes, env_id in zip(panels, envs, strict=False):
+    height = 0.8 + 0.25 * table.groupby("env").size().max()
+    figure, panels = new_panels(len(envs), 3, (4.6, height), margin=(0.0, 0.6))
+    for axes, env_id in zip(panels, envs, strict=True):
         of_env = table[table["env"] == env_id].reset_index(drop=True)
         rows = of_env.index.to_numpy()[::-1]
         colours = np.where(of_env["settles"], COLOURS[2], np.where(of_env["holds"], COLOURS[0], COLOURS[1])).tolist()

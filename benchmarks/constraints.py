@@ -35,7 +35,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from battery_env.evaluation import over_seeds
-from battery_env.plotting import coloured, new_figure
+from battery_env.plotting import coloured
 from benchmarks.references import DISTURBANCES, tried
 from benchmarks.study import (
     EVALUATION_SEED,
@@ -45,6 +45,7 @@ from benchmarks.study import (
     digits,
     markdown,
     natural,
+    new_panels,
     positive,
     share_with_range,
     with_interval,
@@ -270,13 +271,8 @@ def plot(results: pd.DataFrame) -> Figure:
     """
     undisturbed = results[results["disturbance"] == "none"]
     envs, designs = list(undisturbed["environment"].unique()), list(undisturbed["design"].unique())
-    n_columns = min(len(envs), 3)
-    n_rows = -(-len(envs) // n_columns)
-    figure = new_figure(2.6 + 2.4 * n_columns, n_rows * (0.9 + 0.3 * len(designs)))
-    panels = figure.subplots(n_rows, n_columns, sharey=True, squeeze=False).ravel()
-    for axes in panels[len(envs) :]:
-        axes.remove()
-    for axes, env_id in zip(panels, envs, strict=False):
+    figure, panels = new_panels(len(envs), 3, (2.4, 0.9 + 0.3 * len(designs)), margin=(2.6, 0.0), sharey=True)
+    for axes, env_id in zip(panels, envs, strict=True):
         of_env = undisturbed.loc[undisturbed["environment"] == env_id, "cost"]
         # only over decades: within one, labels of a logarithmic axis overlap
         axes.set(xscale="log" if of_env.max() > 10 * of_env.min() else "linear", xlabel="cost per step")

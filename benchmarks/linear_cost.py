@@ -23,8 +23,7 @@ from matplotlib.figure import Figure
 from scipy.stats import bootstrap
 from stable_baselines3.common.env_util import make_vec_env
 
-from battery_env.plotting import new_figure
-from benchmarks.study import EVALUATION_SEED, Study, Tables, command_line, markdown, natural, positive
+from benchmarks.study import EVALUATION_SEED, Study, Tables, command_line, markdown, natural, new_panels, positive
 from benchmarks.training import train_or_load
 from sb3_lac import LAC, evaluate_lyapunov
 from sb3_lac.envs import LinearCostEnv
@@ -79,8 +78,9 @@ def over_optimum(costs: np.ndarray, optimal: np.ndarray, gamma: float) -> tuple[
         return np.mean(policy, axis=axis) / np.mean(best, axis=axis)
 
     sums = (weights @ costs, weights @ optimal)
-    rng = np.random.default_rng(0)
-    resampled = bootstrap(sums, ratio, paired=True, vectorized=True, method="percentile", rng=rng).confidence_interval
+    resampled = bootstrap(
+        sums, ratio, paired=True, vectorized=True, method="percentile", random_state=np.random.default_rng(0)
+    ).confidence_interval
     return float(ratio(*sums)), float(resampled.low), float(resampled.high)
 
 
@@ -143,17 +143,12 @@ def plot(values: pd.DataFrame) -> Figure:
     :return: the figure
     """
     seeds = values["seed"].unique()
-    n_columns = min(len(seeds), 5)
-    n_rows = -(-len(seeds) // n_columns)
-    figure = new_figure(2.8 * n_columns, 2.9 * n_rows)
-    panels = figure.subplots(n_rows, n_columns, squeeze=False, sharex=True, sharey=True)
+    figure, panels = new_panels(len(seeds), 5, (2.8, 2.9), sharex=True, sharey=True)
     top = values[["exact", "learned"]].to_numpy().max()
-    for axes, (seed, of_seed) in zip(panels.ravel(), values.groupby("seed"), strict=False):
+    for axes, (seed, of_seed) in zip(panels, values.groupby("seed"), strict=True):
         axes.plot([0, top], [0, top], color="0.6", lw=1)
         axes.scatter(of_seed["exact"], of_seed["learned"], s=5, alpha=0.3, lw=0, rasterized=True)
         axes.set_title(f"seed {seed}")
-    for axes in panels.ravel()[len(seeds) :]:
-        axes.remove()
     figure.supxlabel("exact cost-to-go")
     figure.supylabel("learned L(s, a)")
     return figure

@@ -17,7 +17,6 @@ evaluation.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from hashlib import sha256
@@ -34,7 +33,7 @@ from battery_env.files import replacing
 from battery_env.trajectories import AgedParameter
 from benchmarks.contests import SENSORS, check_discharges
 from benchmarks.study import SYMBOLS, Study, Tables, command_line, markdown, natural, positive, versions, write_json
-from benchmarks.training import Recipe, record_file, timesteps_of, train_or_load
+from benchmarks.training import Recipe, timesteps_of, train_or_load, training_minutes
 from sb3_lac.onnx import export_onnx
 
 #: What each policy finds, as data sets name it.
@@ -150,7 +149,6 @@ def card_of(recipe: Recipe, scores: pd.DataFrame, command: str, file: Path) -> d
     :return: for JSON
     """
     wander_V = recipe.hyperparameters["env_kwargs"].get("process_noise_V", 0.0)
-    record = json.loads(record_file(recipe, file.parent / "models").read_text(encoding="utf-8"))
     return {
         "env_id": recipe.env_id,
         "options": OPTIONS,
@@ -163,7 +161,7 @@ def card_of(recipe: Recipe, scores: pd.DataFrame, command: str, file: Path) -> d
             f"factors with a relative standard deviation of {MISMATCH:g}, 1 to 30 mV of noise and an offset within 10 mV"
             + (f", and noise of {1e3 * wander_V:g} mV per root of a second on Vo, Vsn and Vsp" if wander_V else "")
         ),
-        "training_minutes": record["training_minutes"],
+        "training_minutes": training_minutes(recipe, file.parent / "models"),
         "scores": scores.drop(columns="env_id").round(4).to_dict("records"),
         "versions": versions(),
     }

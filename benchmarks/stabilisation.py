@@ -14,7 +14,6 @@ added. ``tensorboard --logdir results/stabilisation/models`` overlays the curves
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -30,8 +29,19 @@ from battery_env.evaluation import over_seeds
 from battery_env.plotting import COLOURS, new_figure
 from benchmarks.certificate import SETTLED_SHARE, judge
 from benchmarks.references import DISTURBANCES, SHARES, conditions, draw_shares, tried
-from benchmarks.study import Study, Tables, command_line, digits, markdown, natural, positive, share_with_range, with_interval
-from benchmarks.training import Recipe, record_file, train_or_load
+from benchmarks.study import (
+    Study,
+    Tables,
+    command_line,
+    digits,
+    markdown,
+    natural,
+    new_panels,
+    positive,
+    share_with_range,
+    with_interval,
+)
+from benchmarks.training import Recipe, train_or_load, training_minutes
 from sb3_lac.envs import reference_controller
 
 _REFERENCE = "reference"
@@ -78,8 +88,7 @@ def part(
         model = train_or_load(policy, env_id, seed, timesteps, folder)
         # of all algorithms that learn from a replay buffer
         predictor, updates = model, getattr(model, "_n_updates", None)
-        made = json.loads(record_file(Recipe.of(policy, env_id, seed, timesteps), folder).read_text(encoding="utf-8"))
-        minutes = made["training_minutes"]
+        minutes = training_minutes(Recipe.of(policy, env_id, seed, timesteps), folder)
     described: dict[str, Any] = {
         "environment": env_id,
         "policy": policy if policy == _REFERENCE else policy.upper(),
@@ -237,13 +246,8 @@ def plot_disturbances(results: pd.DataFrame) -> Figure:
     :return: the figure
     """
     envs = list(results["environment"].unique())
-    n_columns = min(2, len(envs))
-    n_rows = -(-len(envs) // n_columns)
-    figure = new_figure(5.6 * n_columns, 0.5 + 2.1 * n_rows)
-    panels = figure.subplots(n_rows, n_columns, squeeze=False).ravel()
-    for axes in panels[len(envs) :]:
-        axes.remove()
-    for axes, env_id in zip(panels, envs, strict=False):
+    figure, panels = new_panels(len(envs), 2, (5.6, 2.1), margin=(0.0, 0.5))
+    for axes, env_id in zip(panels, envs, strict=True):
         of_env = results[results["environment"] == env_id]
         draw_shares(axes, of_env, "policy", [name for name in _STYLES if name in set(of_env["policy"])])
         axes.set_title(env_id)

@@ -24,6 +24,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
@@ -32,7 +33,7 @@ import sb3_lac
 from battery_env.evaluation import over_seeds
 from battery_env.files import check_folder, replacing
 from battery_env.parallel import cluster, processes
-from battery_env.plotting import save_figure
+from battery_env.plotting import new_figure, save_figure
 
 Result = TypeVar("Result")
 #: What a part makes: tables by name.
@@ -105,6 +106,34 @@ def digest_of(content: Mapping[str, Any]) -> str:
     :return: eight hexadecimal digits, the same for equal contents
     """
     return sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:8]
+
+
+def new_panels(
+    n: int,
+    most_columns: int,
+    panel: tuple[float, float],
+    margin: tuple[float, float] = (0.0, 0.0),
+    sharex: bool = False,
+    sharey: bool = False,
+) -> tuple[Figure, list[Axes]]:
+    """
+    A figure of panels in rows.
+
+    :param n: number of panels
+    :param most_columns: panels in a row
+    :param panel: width and height of each, inches
+    :param margin: of all together, inches
+    :param sharex: see matplotlib
+    :param sharey: see matplotlib
+    :return: the figure, and its panels row by row
+    """
+    n_columns = min(n, most_columns)
+    n_rows = -(-n // n_columns)
+    figure = new_figure(margin[0] + panel[0] * n_columns, margin[1] + panel[1] * n_rows)
+    panels = figure.subplots(n_rows, n_columns, squeeze=False, sharex=sharex, sharey=sharey).ravel().tolist()
+    for axes in panels[n:]:
+        axes.remove()
+    return figure, panels[:n]
 
 
 def digits(value: float, significant: int = 2) -> str:

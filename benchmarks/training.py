@@ -303,6 +303,17 @@ def train_or_load(
     return ALGOS[algo].load(file, device="cpu")
 
 
+def training_minutes(recipe: Recipe, folder: Path) -> float:
+    """
+    How long :func:`train_or_load` took to train a model.
+
+    :param recipe: of the training
+    :param folder: where the model is kept
+    :return: minutes
+    """
+    return float(json.loads(record_file(recipe, folder).read_text(encoding="utf-8"))["training_minutes"])
+
+
 def timesteps_of(updates: int, hyperparameters: dict[str, Any]) -> int:
     """
     How long to train for a number of updates, with one call of ``train()`` per step of all environments.
