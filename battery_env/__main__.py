@@ -261,13 +261,7 @@ def _initial_soc(text: str) -> InitialSoc:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """
-    Run one command.
-
-    :param arguments: of the command line; ``None``: those of this process
-    :return: 0 if all discharges are settled, 3 if one is not, and 2 if one cannot be used or nothing was done; then a line on
-        standard error says why
-    """
+    """Run one command."""
     given = sys.argv[1:] if arguments is None else list(arguments)
     parser = argparse.ArgumentParser(prog="python -m battery_env", description="Calibrate a battery model to real cells.")
     commands = parser.add_subparsers(dest="command", required=True)
@@ -278,13 +272,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def calibrate(arguments: Sequence[str] | None = None, name: str = "battery-calibrate") -> int:
-    """
-    The command ``calibrate``, which is also installed as ``battery-calibrate``.
-
-    :param arguments: as in :func:`main`, without the name of the command
-    :param name: of the program, for its help
-    :return: as :func:`main`
-    """
+    """The command ``calibrate``, which is also installed as ``battery-calibrate``."""
     options = _parser(name).parse_args(arguments)
     interrupted = False
     try:

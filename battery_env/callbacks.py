@@ -159,11 +159,7 @@ class CalibrationCallback(EventCallback):
         return continue_training and self._on_event()
 
     def _add_to_history(self, entry: dict[str, float]) -> None:
-        """
-        Keep an evaluation, in place of an older one after as many timesteps (when continuing from a checkpoint).
-
-        :param entry: Timesteps and values of the evaluation
-        """
+        """Keep an evaluation, in place of an older one after as many timesteps (when continuing from a checkpoint)."""
         others = [old for old in self.history if old["timesteps"] != entry["timesteps"]]
         self.history = sorted([*others, entry], key=lambda evaluation: evaluation["timesteps"])
         if self.log_path is not None:
@@ -185,9 +181,6 @@ class CalibrationCallback(EventCallback):
         """
         Mean and worst value of each metric. A trajectory without a result (NaN) is not left out:
         it makes both of them NaN, and such a model is never the best.
-
-        :param trajectories: One row per held-out trajectory
-        :return: The values under the names to log
         """
         missing = [column for column in self.metrics if column not in trajectories.columns]
         if missing:
@@ -201,11 +194,7 @@ class CalibrationCallback(EventCallback):
         return summary
 
     def update_child_locals(self, locals_: dict[str, Any]) -> None:
-        """
-        Update the references to the local variables.
-
-        :param locals_: the local variables during rollout collection
-        """
+        """Update the references to the local variables."""
         super().update_child_locals(locals_)
         if self.callback_on_new_best is not None:
             self.callback_on_new_best.update_locals(locals_)

@@ -383,14 +383,7 @@ def _read_nasa_csv(path: Path) -> list[Discharge]:
 
 
 def read_nasa_mat(path: Path) -> list[tuple[dict[str, Any], dict[str, Any]]]:
-    """
-    The discharges of one of NASA's own files before they are checked.
-
-    :param path: the file
-    :return: for each the arrays of a :class:`Discharge`, by name, and its ``meta``
-    :raises FileNotFoundError: if there is no such file
-    :raises ValueError: if the file is damaged, or laid out in another way
-    """
+    """The discharges of one of NASA's own files before they are checked."""
     try:
         content = loadmat(path, simplify_cells=True)
         samples = _samples_of_mat(path, content)

@@ -19,15 +19,7 @@ LOAD_UNIT_SYMBOLS: dict[str, str] = {"power": "W", "current": "A"}
 
 
 def check_numbers(name: str, values: ArrayLike, unit: str = "") -> FloatArray:
-    """
-    Refuse what is no number.
-
-    :param name: what the values are called, for the message
-    :param values: any shape
-    :param unit: theirs, for the message
-    :return: the same as a float64 array
-    :raises TypeError: if one of them is no number
-    """
+    """Refuse what is no number."""
     try:
         return np.asarray(values, dtype=np.float64)
     except (OverflowError, TypeError, ValueError) as error:
@@ -36,18 +28,7 @@ def check_numbers(name: str, values: ArrayLike, unit: str = "") -> FloatArray:
 
 
 def check_within(name: str, values: ArrayLike, limits: tuple[float, float], unit: str, hint: str) -> FloatArray:
-    """
-    Refuse values beyond their limits.
-
-    :param name: what the values are called, for the message
-    :param values: any shape
-    :param limits: least and largest value
-    :param unit: theirs, for the message
-    :param hint: what a value beyond usually is, a sentence
-    :return: the same as a float64 array
-    :raises TypeError: if one of them is no number
-    :raises ValueError: if one of them is beyond the limits
-    """
+    """Refuse values beyond their limits."""
     array = check_numbers(name, values, unit)
     inside = (array >= limits[0]) & (array <= limits[1])
     if not inside.all():
@@ -57,15 +38,7 @@ def check_within(name: str, values: ArrayLike, limits: tuple[float, float], unit
 
 
 def check_range(name: str, ends: tuple[float, float]) -> tuple[float, float]:
-    """
-    Refuse what is not two finite numbers in ascending order.
-
-    :param name: what the range is called, for the message
-    :param ends: lower and upper end
-    :return: the same as floats
-    :raises TypeError: if they are not two numbers
-    :raises ValueError: if they are not finite, or descend
-    """
+    """Refuse what is not two finite numbers in ascending order."""
     try:
         low, high = map(float, ends)
     except (TypeError, ValueError) as error:
@@ -76,28 +49,14 @@ def check_range(name: str, ends: tuple[float, float]) -> tuple[float, float]:
 
 
 def check_positive(name: str, value: float) -> float:
-    """
-    Refuse what is not a positive number.
-
-    :param name: what it is called, for the message
-    :param value: the number
-    :return: the same
-    :raises ValueError: if it is none, not finite, or not above 0
-    """
+    """Refuse what is not a positive number."""
     if not isinstance(value, Real) or not 0.0 < value < np.inf:
         raise ValueError(f"{name} must be a positive, finite number, got {value!r}")
     return float(value)
 
 
 def check_whole_number(name: str, value: int) -> int:
-    """
-    Refuse what is no whole number.
-
-    :param name: what it is called, for the message
-    :param value: the number
-    :return: the same as an int
-    :raises TypeError: if it is none
-    """
+    """Refuse what is no whole number."""
     try:
         return operator.index(value)
     except TypeError as error:
@@ -105,16 +64,7 @@ def check_whole_number(name: str, value: int) -> int:
 
 
 def check_indices(name: str, values: ArrayLike, size: int) -> IntArray:
-    """
-    Refuse what does not index a sequence.
-
-    :param name: what the indices are called, for the message
-    :param values: any shape
-    :param size: length of the sequence
-    :return: the same as an int64 array
-    :raises TypeError: if they are no whole numbers
-    :raises ValueError: if one of them is outside 0 .. size - 1
-    """
+    """Refuse what does not index a sequence."""
     try:
         array = np.asarray(values)
     except ValueError as error:
@@ -129,14 +79,7 @@ def check_indices(name: str, values: ArrayLike, size: int) -> IntArray:
 
 
 def check_load(load: ArrayLike, load_unit: LoadUnit) -> FloatArray:
-    """
-    Refuse loads that cannot be meant. Negative loads charge the cell.
-
-    :param load: power in W or current in A, any shape
-    :param load_unit: ``"power"`` or ``"current"``
-    :return: the load as a float64 array
-    :raises ValueError: for another unit, or beyond ``LOAD_LIMITS``
-    """
+    """Refuse loads that cannot be meant. Negative loads charge the cell."""
     if not isinstance(load_unit, str) or load_unit not in LOAD_LIMITS:
         raise ValueError(f"load_unit must be 'power' (W) or 'current' (A), got {load_unit!r}")
     limit = LOAD_LIMITS[load_unit]
@@ -144,13 +87,7 @@ def check_load(load: ArrayLike, load_unit: LoadUnit) -> FloatArray:
 
 
 def check_gain_sd(current_gain_sd: float) -> float:
-    """
-    Refuse an uncertainty of the current sensor that cannot be meant.
-
-    :param current_gain_sd: standard deviation of its gain, as a share of it
-    :return: the same
-    :raises ValueError: unless it is within 0 .. 1
-    """
+    """Refuse an uncertainty of the current sensor that cannot be meant."""
     if not 0.0 <= current_gain_sd < 1.0:
         raise ValueError(f"current_gain_sd is a share within 0 .. 1 (1 %: 0.01), got {current_gain_sd!r}")
     return float(current_gain_sd)

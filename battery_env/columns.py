@@ -75,14 +75,6 @@ def find_columns(
     """
     The columns of a record. A unit is told from the name, as in ``Current(mA)``, ``Voltage / V``, ``time[min]`` or
     ``test_time_second``; a name without one is in s, V, A or degC.
-
-    :param names: of all columns of a table
-    :param chosen: by quantity (``time``, ``voltage``, ``current``, ``temperature``, ``ambient``, ``cycle``, ``step``,
-        ``state``), the name of its column, where the names do not tell
-    :param units: by quantity, the unit, where the name does not tell
-    :return: by quantity, the columns that were found
-    :raises ValueError: if the time, the voltage or the current is missing, two columns might be the same one, a chosen column
-        is not there, or a unit is not known
     """
     chosen, units = dict(chosen or {}), dict(units or {})
     for option, given in (("columns", chosen), ("units", units)):
@@ -105,14 +97,7 @@ def find_columns(
 
 
 def units_below(columns: Mapping[str, Column], fields: Sequence[str]) -> dict[str, str] | None:
-    """
-    The units in the line below a header, where some testers write them.
-
-    :param columns: as :func:`find_columns` has them
-    :param fields: of the line below
-    :return: by quantity, the units that the names do not tell already; ``None`` if the line is none of units, as time, voltage
-        or current have none there
-    """
+    """The units in the line below a header, where some testers write them."""
     found = {}
     for quantity, column in columns.items():
         unit = fields[column.position].strip("[]() ").lower() if column.position < len(fields) else ""
@@ -124,13 +109,7 @@ def units_below(columns: Mapping[str, Column], fields: Sequence[str]) -> dict[st
 
 
 def count_required(names: Sequence[str], chosen: Mapping[str, str] | None = None) -> int:
-    """
-    How much a line looks like the header of a record.
-
-    :param names: its fields
-    :param chosen: as in :func:`find_columns`
-    :return: how many of ``REQUIRED`` it names
-    """
+    """How much a line looks like the header of a record."""
     chosen = chosen or {}
     return sum(
         (

@@ -23,26 +23,13 @@ FORMAT_VERSION = 3
 
 
 def described(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """
-    What goes with the numbers of a data set.
-
-    :param settings: its settings, as JSON may hold them
-    :return: the same with the versions of what made it
-    """
+    """What goes with the numbers of a data set."""
     versions = {"python": platform.python_version(), "numpy": np.__version__, "numba": version("numba")}
     return {"format": FORMAT_VERSION, **settings, "versions": versions}
 
 
 def save_npz(path: str | os.PathLike[str], arrays: Mapping[str, NDArray[Any]], settings: Mapping[str, Any]) -> Path:
-    """
-    Write arrays and settings.
-
-    :param path: where to; ``.npz`` is added if it is missing
-    :param arrays: by name
-    :param settings: as JSON may hold them
-    :return: the file
-    :raises FileExistsError: if the file exists already
-    """
+    """Write arrays and settings."""
     target = _new_file(path, ".npz")
     with replacing(target) as part:
         np.savez_compressed(part, allow_pickle=False, metadata=np.array(json.dumps(described(settings))), **arrays)
@@ -50,14 +37,7 @@ def save_npz(path: str | os.PathLike[str], arrays: Mapping[str, NDArray[Any]], s
 
 
 def load_npz(path: str | os.PathLike[str], names: Iterable[str]) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """
-    Read what :func:`save_npz` wrote.
-
-    :param path: the file
-    :param names: of the arrays
-    :return: arrays and settings, by name
-    :raises ValueError: if the file is damaged, was not written so, or is of another format version
-    """
+    """Read what :func:`save_npz` wrote."""
     with Path(path).open("rb") as stream:
         try:
             with np.load(stream, allow_pickle=False) as file:
@@ -74,15 +54,7 @@ def load_npz(path: str | os.PathLike[str], names: Iterable[str]) -> tuple[dict[s
 
 
 def save_parquet(path: str | os.PathLike[str], frame: pd.DataFrame) -> Path:
-    """
-    Write a table.
-
-    :param path: where to; ``.parquet`` is added if it is missing
-    :param frame: the table
-    :return: the file
-    :raises FileExistsError: if the file exists already
-    :raises ImportError: without the extra ``parquet``
-    """
+    """Write a table."""
     target = _new_file(path, ".parquet")
     with replacing(target) as part:
         try:

@@ -67,12 +67,7 @@ class Estimates(Sequence[Estimate]):
 
     @classmethod
     def of(cls, estimates: Sequence[Estimate]) -> Estimates:
-        """
-        Single ones together.
-
-        :param estimates: one a cell
-        :return: the same
-        """
+        """Single ones together."""
         columns = {name: np.array([getattr(each, name) for each in estimates]) for name in _COLUMNS}
         return cls(**columns, reason=lambda n: estimates[n].reason)
 
@@ -134,12 +129,7 @@ class EstimateTrace:
 
 
 def last_estimate(trace: EstimateTrace) -> Estimate:
-    """
-    The last estimate of a trace that states uncertainties and what is settled.
-
-    :param trace: of one discharge
-    :return: its last estimate
-    """
+    """The last estimate of a trace that states uncertainties and what is settled."""
     assert trace.sd_q_mobile is not None and trace.sd_r_o is not None
     assert trace.settled is not None and trace.reason is not None
     return Estimate(

@@ -139,13 +139,7 @@ def _errors(name: str, record: Trajectory, trace: EstimateTrace) -> dict[str, fl
 
 
 def _since(holds: BoolArray, time_s: FloatArray) -> float:
-    """
-    The time of the first estimate from which on something holds.
-
-    :param holds: whether it does at each estimate, shape (K,)
-    :param time_s: of the estimates, shape (K,)
-    :return: s; infinite if it does not hold at the last one
-    """
+    """The time of the first estimate from which on something holds."""
     fails = np.flatnonzero(~holds)
     first = fails[-1] + 1 if len(fails) else 0
     return float(time_s[first]) if first < len(time_s) else np.inf
@@ -192,15 +186,7 @@ def _states_sd(trace: EstimateTrace, name: str) -> bool:
 
 
 def summarize(scores: pd.DataFrame, parameter: str) -> dict[str, float]:
-    """
-    The scores of one parameter over all discharges.
-
-    :param scores: what :func:`evaluate` returned
-    :param parameter: ``"q_mobile"`` or ``"r_o"``
-    :return: mean, median and worst MAPE (%), RMSE (% of the truth); mean MAPE of the second halves (%), mean and worst error
-        of the last estimates (%); mean bias and spread (% of the truth); median settling times (s); mean coverage (%); mean
-        bound (% of the truth); mean absolute errors of the end of discharge (% of its time). NaN as in :func:`evaluate`
-    """
+    """The scores of one parameter over all discharges."""
     true, mape = scores[parameter], scores[f"{parameter}_mape_percent"]
     summary = {
         "mape_percent": mape.mean(),
@@ -227,9 +213,6 @@ def over_seeds(*tasks: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
     What several trainings reached: the interquartile mean of their scores, and its 95 % interval by a stratified bootstrap, in
     which the trainings of each task are drawn anew by themselves (Agarwal et al. 2021, Deep Reinforcement Learning at the Edge
     of the Statistical Precipice). Of fewer than four scores the interquartile mean is the mean.
-
-    :param tasks: the scores of each task, shape (seeds, ...): the first axis may differ between them, the others may not
-    :return: mean, lower and upper end, shape (...); the ends are NaN where there is a single seed
     """
     from scipy.stats import bootstrap, trim_mean  # slow to import, and nothing else here needs it
 

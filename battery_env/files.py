@@ -16,12 +16,7 @@ class WrongFormatError(ValueError):
 
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """
-    A place to write a file to, beside where it is to be; it is renamed when the block ends, and removed if it fails.
-
-    :param path: where the file is to be; missing folders are made
-    :return: where to write it
-    """
+    """A place to write a file to, beside where it is to be; it is renamed when the block ends, and removed if it fails."""
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
     # Of this process, for another one may write the same file; libraries go by the suffix
@@ -34,13 +29,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def check_folder(folder: Path) -> None:
-    """
-    Refuse a folder that results cannot be written to, before they are there to be lost.
-
-    :param folder: need not exist yet
-    :raises FileExistsError: if it is a file, or would be in one
-    :raises PermissionError: if it is not to be written to
-    """
+    """Refuse a folder that results cannot be written to, before they are there to be lost."""
     there = next(path for path in (folder, *folder.parents) if path.exists())
     if not there.is_dir():
         raise FileExistsError(f"{there} is a file: choose another --out")
@@ -49,16 +38,7 @@ def check_folder(folder: Path) -> None:
 
 
 def write_json(path: str | os.PathLike[str], file_format: str, version: int, content: Mapping[str, Any]) -> Path:
-    """
-    Write a new file in JSON that says what it holds.
-
-    :param path: where to
-    :param file_format: what it holds
-    :param version: of that format
-    :param content: as JSON may hold it
-    :return: the file
-    :raises FileExistsError: if the file exists already
-    """
+    """Write a new file in JSON that says what it holds."""
     target = Path(path)
     if target.exists():
         raise FileExistsError(f"{target} exists already; delete it or choose another name")
@@ -69,16 +49,7 @@ def write_json(path: str | os.PathLike[str], file_format: str, version: int, con
 
 
 def read_json(path: str | os.PathLike[str], file_format: str, version: int) -> dict[str, Any]:
-    """
-    Read what :func:`write_json` wrote.
-
-    :param path: the file
-    :param file_format: what it has to hold
-    :param version: the one that is understood
-    :return: its content
-    :raises WrongFormatError: if the file holds something else
-    :raises ValueError: if it is damaged, or of another version
-    """
+    """Read what :func:`write_json` wrote."""
     try:
         content = json.loads(Path(path).read_text(encoding="utf-8"))
     except ValueError as error:  # of the encoding, or of JSON

@@ -69,13 +69,7 @@ class Reading:
 
 
 def find_sources(arguments: Iterable[str]) -> list[Source]:
-    """
-    What the arguments of a command line name.
-
-    :param arguments: files; folders, for all files in them whose names end as those of records, but for results of this
-        package; ``FILE:CYCLE``; bundled cells and ``CELL:CYCLE``
-    :return: as many sources or more; a file that does not exist is one too, and fails when it is read
-    """
+    """What the arguments of a command line name."""
     sources = []
     for argument in arguments:
         path = Path(argument)
@@ -113,14 +107,7 @@ def _stem(path: Path) -> str:
 
 
 def read_source(source: Source, reading: Reading) -> list[Recording]:
-    """
-    Read what a source names.
-
-    :param source: a file or a bundled cell, and perhaps which discharge
-    :param reading: how files are read
-    :return: its discharges
-    :raises ValueError: if it cannot be read, or there are none
-    """
+    """Read what a source names."""
     path, cycle = source.path, source.cycle
     if path in BUNDLED_CELLS and not Path(path).exists():
         columns = ("time_s", "voltage_V", "current_A", "temperature_C")
@@ -183,23 +170,13 @@ class Results:
         ]
 
     def write_voltages(self, name: str, files: Mapping[str, bytes]) -> None:
-        """
-        Write what one discharge showed, beside the model.
-
-        :param name: what the names of its files start with
-        :param files: by ending of the name, what it holds
-        """
+        """Write what one discharge showed, beside the model."""
         for suffix, content in files.items():
             with replacing(self.folder / f"{name}{_VOLTAGE}.{suffix}") as part:
                 part.write_bytes(content)
 
     def write_table(self, rows: Sequence[Mapping[str, Any]]) -> list[Path]:
-        """
-        Write the table of all discharges and, if there are several, the figure of their parameters over them.
-
-        :param rows: one a discharge
-        :return: the files that were written. Parquet is written if pyarrow is installed
-        """
+        """Write the table of all discharges and, if there are several, the figure of their parameters over them."""
         table = pd.DataFrame(rows).astype({"cycle": "Int64"})
         table["settled"] = table["settled"].astype("boolean")
         with replacing(self.table) as part:
@@ -226,23 +203,7 @@ def calibrate_all(
     jobs: int = 1,
     scheduler: str | None = None,
 ) -> Iterator[dict[str, Any]]:
-    """
-    Calibrate the model to the discharges of many files, one after the other or side by side.
-
-    :param sources: where they are
-    :param reading: how files are read
-    :param settings: how each discharge is looked at
-    :param results: where to write what each discharge showed; ``None``: nowhere
-    :param jobs: processes; -1: as many as there are cores
-    :param scheduler: address of a Dask cluster whose workers read and calibrate, in place of processes here
-    :return: one row a discharge in their order, as they are finished: ``record`` (its name, which no other has), ``source``,
-        ``cell``, ``cycle``, what :func:`battery_env.summary.summarize` tells, ``notes`` (warnings), and ``error`` where a file
-        or a discharge cannot be used; it is empty otherwise
-    :raises ValueError: for another number of processes
-    :raises ImportError: for a cluster without the extra ``cluster``
-    :raises OSError: if no scheduler answers there
-    :raises RuntimeError: if the workers of the cluster could not be relied on
-    """
+    """Calibrate the model to the discharges of many files, one after the other or side by side."""
     with ExitStack() as stack:
         each: _Each = _one_by_one
         if scheduler is not None:
@@ -327,13 +288,7 @@ def _recordings(
 
 
 def record_name(stem: str, cycle: int | None) -> str:
-    """
-    How one discharge is called in results.
-
-    :param stem: of its source
-    :param cycle: its number, if it has one
-    :return: its name
-    """
+    """How one discharge is called in results."""
     return stem if cycle is None else f"{stem}_{cycle:03d}"
 
 

@@ -54,13 +54,7 @@ class Load:
         object.__setattr__(self, "value", value)
 
     def __call__(self, time_s: ArrayLike) -> FloatArray:
-        """
-        The load at some times.
-
-        :param time_s: s, at least 0, any shape
-        :return: the load, same shape
-        :raises ValueError: for a negative time
-        """
+        """The load at some times."""
         time = check_numbers("time_s", time_s)
         if not (time >= 0.0).all():
             raise ValueError(f"time_s must be at least 0, got {time[~(time >= 0.0)][0]:g}")
@@ -119,13 +113,7 @@ class Cycle:
         return self.load.unit
 
     def __call__(self, time_s: ArrayLike) -> FloatArray:
-        """
-        The load at some times.
-
-        :param time_s: s, at least 0, any shape
-        :return: the load, same shape
-        :raises ValueError: for a negative time
-        """
+        """The load at some times."""
         time = check_numbers("time_s", time_s)
         # a time that is a whole number of periods but for rounding belongs to the cycle that starts there
         within = time - self.period_s * np.floor(time / self.period_s + 1e-9)
@@ -166,12 +154,7 @@ class Spliced:
     unit: LoadUnit
 
     def __call__(self, time_s: ArrayLike) -> FloatArray:
-        """
-        The load at some times.
-
-        :param time_s: s, at least 0, any shape
-        :return: the load, same shape
-        """
+        """The load at some times."""
         block, within = np.divmod((np.asarray(time_s) / self.dt_s + 1e-9).astype(np.int64), self.length)
         return np.asarray(self.value[(self.start[block % len(self.start)] + within) % len(self.value)])
 
@@ -201,12 +184,7 @@ class RandomLoad(ABC):
 
     @abstractmethod
     def __call__(self, rng: np.random.Generator) -> Load | Cycle | Spliced:
-        """
-        Draw one load.
-
-        :param rng: source of randomness
-        :return: the load
-        """
+        """Draw one load."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,12 +206,7 @@ class InSteps:
         return self.load.unit
 
     def __call__(self, time_s: FloatArray) -> FloatArray:
-        """
-        The load over some steps.
-
-        :param time_s: where they start, s, at least 0, any shape
-        :return: the load, same shape
-        """
+        """The load over some steps."""
         return self.load.mean(time_s, self.dt_s)
 
 
@@ -325,12 +298,7 @@ class RandomPiecewise(RandomLoad):
         _check_segments(self.total_s, "duration_range_s", self.duration_range_s[0])
 
     def __call__(self, rng: np.random.Generator) -> Load:
-        """
-        Draw one load.
-
-        :param rng: source of randomness
-        :return: the load
-        """
+        """Draw one load."""
         segments = int(np.ceil(self.total_s / self.duration_range_s[0]))
         durations = rng.uniform(*self.duration_range_s, size=segments)
         count = int(np.searchsorted(np.cumsum(durations), self.total_s)) + 1
@@ -367,12 +335,7 @@ class RandomWalk(RandomLoad):
         _check_segments(self.total_s, "segment_s", self.segment_s)
 
     def __call__(self, rng: np.random.Generator) -> Load:
-        """
-        Draw one load.
-
-        :param rng: source of randomness
-        :return: the load
-        """
+        """Draw one load."""
         low, high = self.value_range
         width = high - low
         segments = int(np.ceil(self.total_s / self.segment_s))
@@ -457,12 +420,7 @@ class BlockBootstrap(RandomLoad):
         return max(round(block_s / self.dt_s), 1)
 
     def __call__(self, rng: np.random.Generator) -> Spliced:
-        """
-        Draw one load.
-
-        :param rng: source of randomness
-        :return: the load
-        """
+        """Draw one load."""
         count = len(self._values)
         seen = rng.integers(count, size=-(-count // self._length))
         blocks = int(np.ceil(self.total_s / (self._length * self.dt_s)))

@@ -34,7 +34,6 @@ def processes(jobs: int) -> Iterator[Submit]:
     Processes of this machine. A call whose process is lost, as for want of memory, is made again, three times in all. When the
     block fails, what has not begun is not begun any more; when this process is killed, so are they.
 
-    :param jobs: how many
     :yields: what starts a call
     """
     workers = [_Worker() for _ in range(jobs)]
@@ -120,13 +119,7 @@ def cluster(scheduler: str, packages: Sequence[str], shared: Path | None = None)
     The workers of a Dask cluster. The call of a worker that is lost is made again by another one, three times at most. When
     the block is left, what has not begun is not begun any more.
 
-    :param scheduler: its address, ``tcp://host:port``
-    :param packages: what the calls import, and the workers must have in the same state
-    :param shared: a folder that calls write to, and that all machines must see
     :yields: what starts a call
-    :raises ImportError: without the extra ``cluster``
-    :raises OSError: if no scheduler answers
-    :raises RuntimeError: if there is a worker that could not be relied on; of one that comes later, its calls raise this
     """
     try:
         import dask

@@ -36,26 +36,11 @@ class Parameter:
         return f"{self.symbol} ({_UNIT_SYMBOLS[self.unit]})"
 
     def check(self, values: ArrayLike) -> FloatArray:
-        """
-        Refuse values that cannot be meant.
-
-        :param values: in the unit of the parameter, any shape
-        :return: the same as a float64 array
-        :raises TypeError: for what is no number
-        :raises ValueError: outside the limits
-        """
+        """Refuse values that cannot be meant."""
         return check_within(self.name, values, self.limits, self.unit, self.hint)
 
     def check_bounds(self, name: str, bounds: tuple[float, float]) -> tuple[float, float]:
-        """
-        Refuse bounds of a search that cannot be meant.
-
-        :param name: what they are called, for the message
-        :param bounds: lower and upper one, in the unit of the parameter
-        :return: the same
-        :raises TypeError: for what is no number
-        :raises ValueError: if they are outside the limits or not in order
-        """
+        """Refuse bounds of a search that cannot be meant."""
         ends = self.check(bounds)
         if ends.shape != (2,) or not ends[0] < ends[1]:
             raise ValueError(f"{name} must be (lower, upper) with lower < upper, got {bounds!r}")
@@ -73,13 +58,7 @@ PARAMETER_NAMES: tuple[str, ...] = tuple(PARAMETERS)
 
 
 def check_parameters(parameters: Sequence[str]) -> tuple[str, ...]:
-    """
-    Refuse a choice of parameters that cannot be searched for.
-
-    :param parameters: their names
-    :return: the same as a tuple
-    :raises ValueError: unless they are one or both of ``PARAMETER_NAMES``
-    """
+    """Refuse a choice of parameters that cannot be searched for."""
     names = tuple(parameters)
     if not names or len(set(names)) < len(names) or set(names) - set(PARAMETERS):
         raise ValueError(f"parameters must be one or both of {PARAMETER_NAMES}, got {parameters!r}")

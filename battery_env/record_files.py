@@ -59,13 +59,7 @@ class Recording(NamedTuple):
     meta: dict[str, Any]
 
     def discharge(self) -> Discharge:
-        """
-        Check it.
-
-        :return: the discharge
-        :raises ValueError: for values that cannot be meant
-        :raises TypeError: for what is no number
-        """
+        """Check it."""
         return Discharge(**self.arrays, meta=self.meta)
 
 
@@ -125,17 +119,7 @@ def read_recordings(
     units: Mapping[str, str] | None = None,
     discharge_is_negative: bool | None = None,
 ) -> list[Recording]:
-    """
-    The discharges of a file before they are checked, so that one that cannot be used does not lose the others.
-
-    :param path: as in :func:`read_discharges`, as are the others
-    :param columns: by quantity, the name of its column
-    :param units: by quantity, its unit
-    :param discharge_is_negative: how the file counts the current of a discharge
-    :return: one or more
-    :raises ValueError: if there is none, the file is damaged, or it does not tell what is asked for
-    :raises ImportError: if the file needs an extra that is not installed
-    """
+    """The discharges of a file before they are checked, so that one that cannot be used does not lose the others."""
     path = Path(path)
     if path.suffix.lower() == ".mat":
         return [Recording(arrays, meta) for arrays, meta in read_nasa_mat(path)]

@@ -80,21 +80,11 @@ class Samples(NamedTuple):
 
     @classmethod
     def of(cls, record: Record) -> Samples:
-        """
-        Those of any record.
-
-        :param record: one discharge
-        :return: its columns
-        """
+        """Those of any record."""
         return cls(*(np.asarray(column) for column in (record.time_s, record.voltage_V, record.current_A)))
 
     def first(self, count: int) -> Samples:
-        """
-        The first ones.
-
-        :param count: how many
-        :return: these
-        """
+        """The first ones."""
         return Samples(*(column[:count] for column in self))
 
 
@@ -102,24 +92,12 @@ def starts_at_rest(record: Record) -> bool:
     """
     Whether the first voltage of a record is known to be that of the cell at rest, though the first current may be that of the
     load that was switched on then.
-
-    :param record: one discharge; :meth:`battery_env.cells.Discharge.loaded_part` makes such
-    :return: whether it is
     """
     return bool(getattr(record, "starts_at_rest", False))
 
 
 def check_column(name: str, values: ArrayLike, least_samples: int) -> FloatArray:
-    """
-    Refuse a column of a record that cannot be meant.
-
-    :param name: its name, with its unit
-    :param values: one value a sample
-    :param least_samples: how many there must be
-    :return: the same as an array that cannot be written to
-    :raises TypeError: for what is no real number
-    :raises ValueError: for a wrong shape, and for values that are not finite or implausible for one cell
-    """
+    """Refuse a column of a record that cannot be meant."""
     if values is None or np.ma.is_masked(values) or np.iscomplexobj(values):
         raise TypeError(f"{name} must hold real numbers, none of them masked, got {type(values).__name__}")
     try:
@@ -148,18 +126,7 @@ def _implausible(name: str, value: float, where: str = "") -> str:
 
 
 def check_record(time_s: ArrayLike, voltage_V: ArrayLike, current_A: ArrayLike, least_samples: int = 1) -> Samples:
-    """
-    Refuse samples that cannot be meant.
-
-    :param time_s: times of the samples, s, shape (T,)
-    :param voltage_V: terminal voltage of one cell, V, shape (T,)
-    :param current_A: current, positive in discharge, A, shape (T,)
-    :param least_samples: how many there must be
-    :return: the same, in arrays that cannot be written to
-    :raises TypeError: for what is no real number
-    :raises ValueError: for arrays that do not fit together or hold values that are not finite or implausible for one cell, and
-        for times that do not increase
-    """
+    """Refuse samples that cannot be meant."""
     arrays = {
         name: check_column(name, values, least_samples)
         for name, values in (("time_s", time_s), ("voltage_V", voltage_V), ("current_A", current_A))
@@ -188,15 +155,6 @@ def check_sample(
     """
     Refuse one sample of a stream that :func:`check_record` would refuse in a record. A voltage may be missing (NaN), but for
     the first one.
-
-    :param voltage_V: terminal voltage of one cell, V
-    :param current_A: current, positive in discharge, A
-    :param dt_s: time since the previous sample, s; without meaning at the first one
-    :param temperature_C: of the cell, degC; ``None``: not measured
-    :param previous_A: current since the previous sample, A: where there was none, the time may be long. ``None``: this is the
-        first sample
-    :raises TypeError: for what is no number
-    :raises ValueError: if it cannot be meant
     """
     measured = {"voltage_V": voltage_V, "current_A": current_A}
     if temperature_C is not None:
@@ -234,16 +192,7 @@ def are_plausible(
     temperature_C: FloatArray | None,
     previous_A: FloatArray,
 ) -> BoolArray:
-    """
-    Which samples of many streams, none of them the first, :func:`check_sample` takes.
-
-    :param voltage_V: V, shape (n,)
-    :param current_A: A, shape (n,)
-    :param dt_s: s, shape (n,)
-    :param temperature_C: degC, shape (n,); ``None``: not measured
-    :param previous_A: A, shape (n,)
-    :return: shape (n,)
-    """
+    """Which samples of many streams, none of them the first, :func:`check_sample` takes."""
     low, high, _, _ = _PLAUSIBLE["voltage_V"]
     good = np.isnan(voltage_V) | ((voltage_V >= low) & (voltage_V <= high))
     for name, values in (("current_A", current_A), ("temperature_C", temperature_C)):
@@ -256,13 +205,7 @@ def are_plausible(
 
 
 def check_drawn_charge(charge_C: float, least_C: float = 0.0) -> None:
-    """
-    Refuse a current of the wrong sign.
-
-    :param charge_C: charge drawn from the first sample on, C
-    :param least_C: it must be above this
-    :raises ValueError: if it is not
-    """
+    """Refuse a current of the wrong sign."""
     if not charge_C > least_C:
         raise ValueError(
             f"current_A is positive in discharge, but this record draws {charge_C:.6g} C in total. If the tester "
@@ -275,9 +218,6 @@ def least_load_A(current_A: FloatArray) -> float:
     """
     What is more than noise and offset of a sensor: the current of a cell at rest, or a share of the largest one, but no more
     than makes a switch.
-
-    :param current_A: shape (T,)
-    :return: A
     """
     most_A = float(np.abs(current_A).max())
     return min(max(REST_CURRENT_A, LEAST_LOAD_SHARE * most_A), SWITCH_SHARE * most_A)
@@ -287,11 +227,6 @@ def switch_times_s(time_s: FloatArray, load: FloatArray, before: IntArray) -> Fl
     """
     When a load was switched between two samples: midway. A rest is often logged more seldom than a load, so next to a rest
     the switch is at most one interval of the samples under load away from these.
-
-    :param time_s: times of the samples, s, shape (T,)
-    :param load: current or power at the samples, A or W, shape (T,)
-    :param before: the samples before the switches, shape (n,)
-    :return: s, shape (n,)
     """
     middle_s = 0.5 * (time_s[before] + time_s[before + 1])
     size = np.abs(load)
@@ -319,11 +254,6 @@ def drawn(time_s: FloatArray, load: FloatArray, at_s: ArrayLike) -> FloatArray:
     What was drawn since the first sample: of a current the charge, of a power the energy. The load is linear between samples,
     except where it was switched (see ``SWITCH_SHARE``): there it jumps, as :func:`switch_times_s` has it. Beyond the last
     sample it keeps its last value.
-
-    :param time_s: times of the samples, s, shape (T,)
-    :param load: current or power at the samples, positive in discharge, A or W, shape (T,)
-    :param at_s: times asked for, none before the first sample, s, any shape
-    :return: charge or energy at these times, C or J, same shape
     """
     t, i = _knots(time_s, load)
     width = np.diff(t)
@@ -339,12 +269,6 @@ def resample_current(time_s: FloatArray, current_A: FloatArray, dt_s: float, n_s
     The current on the model's time grid, which starts at the first sample: its mean over each step, so that the charge
     drawn is kept exactly. A record whose samples lie ``dt_s`` apart, as simulated ones do, is taken as it is: there
     ``current_A[k]`` is the current over the step that starts at sample k.
-
-    :param time_s: times of the samples, s, shape (T,)
-    :param current_A: current at the samples, positive in discharge, A, shape (T,)
-    :param dt_s: time step of the model, s
-    :param n_steps: number of steps; beyond the last sample the current keeps its last value
-    :return: current over each step, A, shape (n_steps,)
     """
     if np.allclose(np.diff(time_s), dt_s, rtol=1e-6, atol=0.0):
         return current_A[np.minimum(np.arange(n_steps), len(current_A) - 1)]
@@ -374,11 +298,6 @@ class Stream(NamedTuple):
         """
         Check a record and convert it. Between samples the current is linear, as
         :func:`drawn` has it, so that the charge drawn is kept exactly.
-
-        :param record: one discharge
-        :param dt_s: in a record whose samples lie this far apart the current is taken as it is, s
-        :return: the record as a stream
-        :raises ValueError: as :func:`check_record`
         """
         time_s, voltage_V, current_A = check_record(record.time_s, record.voltage_V, record.current_A)
         step_s = np.diff(time_s)
@@ -391,11 +310,7 @@ class Stream(NamedTuple):
         return cls(time_s, voltage_V, current_A, np.append(0.0, step_s), temperature_C)
 
     def samples(self) -> zip[tuple[float, float, float]]:
-        """
-        What :meth:`battery_env.estimators.OnlineEstimator.update` takes, sample by sample.
-
-        :return: voltage, current and time since the previous sample
-        """
+        """What :meth:`battery_env.estimators.OnlineEstimator.update` takes, sample by sample."""
         return zip(self.voltage_V.tolist(), self.current_A.tolist(), self.dt_s.tolist(), strict=True)
 
 
@@ -417,10 +332,6 @@ def expected_current(time_s: ArrayLike, current_A: ArrayLike) -> ExpectedCurrent
     """
     The current to expect after the end of a record: the last one of a constant load, and the mean over the last half of a load
     that varied by more than ``VARIED_SHARE``, pulses among them.
-
-    :param time_s: times of the samples, s, shape (T,)
-    :param current_A: positive in discharge, A, shape (T,)
-    :return: the current and how sure it is
     """
     time, current = np.asarray(time_s, dtype=np.float64), np.asarray(current_A, dtype=np.float64)
     loaded = current > SWITCH_SHARE * np.abs(current).max()

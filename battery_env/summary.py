@@ -132,14 +132,7 @@ class Settings:
 
     @classmethod
     def for_cell(cls, cell: CellFit | CellParameters, **others: Any) -> Settings:
-        """
-        Settings that use all that is known of a cell.
-
-        :param cell: its constants; or a fit of them, which also knows the cut-off, the error to expect, whether the
-            temperature moves, and how large ``q_mobile`` can be
-        :param others: other settings; they replace those of the fit
-        :return: the settings
-        """
+        """Settings that use all that is known of a cell."""
         if isinstance(cell, CellFit):
             known: dict[str, Any] = {"cut_off_V": cell.cell.VEOD}
             if others.get("method") != "policy":
@@ -154,14 +147,7 @@ class Settings:
     def calibrator(
         self, cell: CellParameters, start: Start | None = None
     ) -> LeastSquares | ExtendedKalmanFilter | PolicyEstimator:
-        """
-        The calibrator that is asked for.
-
-        :param cell: constants of the model
-        :param start: what is known of the charge at the start; ``None``: as ``initial_soc`` has it
-        :return: a new one
-        :raises ValueError: for an argument out of range
-        """
+        """The calibrator that is asked for."""
         if self.method == "policy":
             return self._policy()
         calibrator = LeastSquares if self.method == "least-squares" else ExtendedKalmanFilter
@@ -226,11 +212,6 @@ def summarize(discharge: Discharge, settings: Settings) -> Summary:
     Calibrate the model to one discharge. Where its start is not known, or the voltage before the load contradicts it, or where
     nothing was drawn though the samples beside say so, its capacity is not known either. Its surroundings, and its temperature
     at the start, are those measured at load-on; a model that departs far from the temperatures measured later is warned of.
-
-    :param discharge: of a cell that starts full, or with the ``initial_soc`` of the settings
-    :param settings: how to look at it
-    :return: what it says
-    :raises ValueError: if the record cannot be used
     """
     record = discharge.loaded_part(settings.cut_off_V)
     measured_eod_s = discharge.eod_time_s(settings.cut_off_V)
@@ -400,14 +381,7 @@ def _sd_cut_off_s(
 
 
 def text_of(name: str, row: dict[str, Any], settings: Settings) -> str:
-    """
-    A row for reading.
-
-    :param name: of the record
-    :param row: as :func:`summarize` returns it
-    :param settings: how the discharge was looked at
-    :return: lines
-    """
+    """A row for reading."""
     in_progress = np.isnan(row["measured_eod_time_s"])
     fitted: Sequence[str] = settings.parameters
     cut_off = f"{settings.cut_off_V:g} V"

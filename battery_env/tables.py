@@ -57,16 +57,7 @@ class _Layout(NamedTuple):
 def read_columns(
     path: Path, chosen: Mapping[str, str] | None = None, units: Mapping[str, str] | None = None
 ) -> tuple[pd.DataFrame, dict[str, Column]]:
-    """
-    Read the columns of a record, and no others.
-
-    :param path: of a file whose name ends as in ``TEXT_SUFFIXES`` or ``BINARY_SUFFIXES``; any other ending is read as text
-    :param chosen: as in :func:`battery_env.columns.find_columns`
-    :param units: likewise
-    :return: the columns as they are in the file, by quantity; and how they are scaled
-    :raises ValueError: if the file is empty, damaged or no table, or a column is missing
-    :raises ImportError: if the file needs an extra that is not installed
-    """
+    """Read the columns of a record, and no others."""
     suffix = path.suffix.lower()
     if suffix in _EXPORT:
         raise ValueError(f"{suffix} files cannot be read: {_EXPORT[suffix]}")
@@ -259,13 +250,7 @@ def _read_biologic(path: Path) -> pd.DataFrame:
 
 
 def is_readable(path: Path, more: Sequence[str] = ()) -> bool:
-    """
-    Whether the name of a file ends as that of a record may.
-
-    :param path: the file
-    :param more: further endings
-    :return: whether it does
-    """
+    """Whether the name of a file ends as that of a record may."""
     suffixes = [suffix.lower() for suffix in path.suffixes]
     if suffixes and suffixes[-1] in PACKED_SUFFIXES:
         return len(suffixes) > 1 and suffixes[-2] in TEXT_SUFFIXES

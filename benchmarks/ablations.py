@@ -71,13 +71,7 @@ VARIANTS: dict[str, Variant] = {
 
 
 def shown_columns(size: int, hidden: Sequence[int]) -> np.ndarray:
-    """
-    What is left of an observation.
-
-    :param size: numbers in it
-    :param hidden: columns that are left out
-    :return: the others, in order
-    """
+    """What is left of an observation."""
     return np.setdiff1d(np.arange(size), hidden)
 
 
@@ -97,12 +91,7 @@ class HideColumns(gym.ObservationWrapper):
         self.observation_space = gym.spaces.Box(low, high, dtype=np.float32)
 
     def observation(self, observation: np.ndarray) -> np.ndarray:
-        """
-        The rest of an observation.
-
-        :param observation: shape (size,)
-        :return: shape (size - hidden,)
-        """
+        """The rest of an observation."""
         return observation[self.columns]
 
 
@@ -117,15 +106,7 @@ class _Blinkered:
 
 
 def part(name: str, seed: int, updates: int, models: Path) -> Tables:
-    """
-    Train one policy, unless that has been done, and score it.
-
-    :param name: of the variant
-    :param seed: seed of everything
-    :param updates: gradient steps
-    :param models: where trained policies are kept
-    :return: ``ablations``, one row: what came out
-    """
+    """Train one policy, unless that has been done, and score it."""
     variant = VARIANTS[name]
     hyperparameters = {"env_kwargs": {}, **variant.hyperparameters}
     if variant.hidden:
@@ -151,12 +132,7 @@ def part(name: str, seed: int, updates: int, models: Path) -> Tables:
 
 
 def report(results: pd.DataFrame) -> str:
-    """
-    Errors of all seeds side by side, as Markdown.
-
-    :param results: of all parts
-    :return: one table
-    """
+    """Errors of all seeds side by side, as Markdown."""
     rows = [
         {
             "changed": str(label),
@@ -171,11 +147,7 @@ def report(results: pd.DataFrame) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """
-    The command line.
-
-    :param arguments: of the command line by default
-    """
+    """The command line."""
     parser = command_line("ablations", __doc__)
     parser.add_argument("--variants", nargs="+", default=list(VARIANTS), choices=list(VARIANTS), metavar="NAME")
     parser.add_argument("--seeds", nargs="+", type=natural, default=[0, 1, 2])

@@ -50,15 +50,7 @@ _STATEMENTS = ("survives", "stays_within", "decreases")
 
 
 def judge(policy: PolicyPredictor, env_id: str, episodes: int, figures: Path | None = None) -> list[dict[str, Any]]:
-    """
-    Fit, evaluate and certify one policy; for LAC, the critic beside the fitted function.
-
-    :param policy: the policy
-    :param env_id: id of the environment
-    :param episodes: number of episodes for each of the three
-    :param figures: how the names of the figures' files begin; none are drawn without
-    :return: one row per Lyapunov function
-    """
+    """Fit, evaluate and certify one policy; for LAC, the critic beside the fitted function."""
     env = make_vec_env(env_id, n_envs=_N_ENVS)
     fitted = fit_lyapunov(policy, env, episodes, seed=_FIT_SEED, progress_bar=False)
     certification = certify(policy, env, fitted, episodes, seed=_CERTIFICATION_SEED)
@@ -84,13 +76,7 @@ def judge(policy: PolicyPredictor, env_id: str, episodes: int, figures: Path | N
 
 
 def policies(chosen: argparse.Namespace, env_id: str) -> list[tuple[str, int | None, PolicyPredictor]]:
-    """
-    What is judged in an environment.
-
-    :param chosen: the command line
-    :param env_id: id of the environment
-    :return: name, seed of the training if there was one, policy
-    """
+    """What is judged in an environment."""
     found: list[tuple[str, int | None, PolicyPredictor]] = [
         (name, None, controller) for name, controller in controllers(env_id).items()
     ]
@@ -115,8 +101,6 @@ def feasible_alpha3() -> pd.DataFrame:
     The largest alpha3 that holds in every state of ``LinearCost-v0``, exactly and without noise: with
     ``kappa = sup L / c`` it is ``(1 - (1 - gamma) kappa) / gamma`` for the cost discounted by gamma, and 1 for the average
     cost. kappa is the largest eigenvalue of ``P x = kappa C x``, for the quadratic forms of L and of the cost.
-
-    :return: one row per controller that settles: the gain that is optimal for that discount, and a share of it
     """
     env = LinearCostEnv()
     rows = []
@@ -140,12 +124,7 @@ def _over_policies(values: pd.Series) -> str:
 
 
 def report(table: pd.DataFrame) -> str:
-    """
-    The certificates side by side, as Markdown. Numbers of several seeds are their median (least to most of a seed).
-
-    :param table: one row per Lyapunov function
-    :return: the exact shares that are feasible, and one table per environment
-    """
+    """The certificates side by side, as Markdown. Numbers of several seeds are their median (least to most of a seed)."""
     text = "The largest feasible `alpha3` of the exact function, and in brackets the largest L / c:\n\n"
     text += feasible_alpha3().to_markdown(index=False, disable_numparse=True) + "\n"
     for env_id, of_env in table.groupby("env", sort=False):
@@ -170,12 +149,7 @@ def report(table: pd.DataFrame) -> str:
 
 
 def plot(table: pd.DataFrame) -> Figure:
-    """
-    Where the mean cost settles against the cost at the start, of each policy.
-
-    :param table: one row per Lyapunov function
-    :return: the figure
-    """
+    """Where the mean cost settles against the cost at the start, of each policy."""
     envs = table["env"].unique()
     height = 0.8 + 0.25 * table.groupby("env").size().max()
     figure, panels = new_panels(len(envs), 3, (4.6, height), margin=(0.0, 0.6))
@@ -201,11 +175,7 @@ def plot(table: pd.DataFrame) -> Figure:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """
-    The command line.
-
-    :param arguments: of the command line by default
-    """
+    """The command line."""
     parser = command_line("certificate", __doc__, jobs=None)
     parser.add_argument("--envs", nargs="+", default=list(DISTURBANCES), help="cost environments")
     parser.add_argument("--algos", nargs="*", default=[], help="algorithms to train, with an entry in zoo_configs")

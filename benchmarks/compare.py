@@ -87,10 +87,6 @@ def run(recipe: Recipe, out: Path, position: int = 0) -> None:
     """
     Train one policy and score it. Does nothing if that has been done, and goes on from the last checkpoint if it was
     interrupted.
-
-    :param recipe: of the training, with how often to evaluate, and to save a checkpoint, in between
-    :param out: folder of all results
-    :param position: line of the terminal for the progress bar
     """
     folder = _folder(recipe, out)
     folder.mkdir(parents=True, exist_ok=True)
@@ -149,13 +145,7 @@ def _folder(recipe: Recipe, out: Path) -> Path:
 
 
 def finished_runs(out: Path) -> pd.DataFrame:
-    """
-    What the finished runs in a folder say, one row per run.
-
-    :param out: folder of all results
-    :return: what was learned, with the ``folder`` of the run, its ``recipe``, its ``label`` in tables, and its ``scores``
-    :raises ValueError: if there is one that does not say what made it
-    """
+    """What the finished runs in a folder say, one row per run."""
     rows = []
     for file in sorted(out.glob("*/*/summary.json")):
         try:
@@ -190,11 +180,7 @@ def finished_runs(out: Path) -> pd.DataFrame:
 
 
 def report(study: Study) -> None:
-    """
-    Write and show the tables of all finished runs in a folder and, for each environment, its figures with their data.
-
-    :param study: the folder
-    """
+    """Write and show the tables of all finished runs in a folder and, for each environment, its figures with their data."""
     runs = finished_runs(study.out)
     if runs.empty:
         return
@@ -249,11 +235,7 @@ def _differing(settings: Sequence[str]) -> dict[str, Any]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """
-    The command line.
-
-    :param arguments: of the command line by default
-    """
+    """The command line."""
     parser = command_line("compare", __doc__)
     parser.add_argument(
         "--algos", nargs="+", default=["lac", "sac", "td3"], help="of the RL Zoo, or package.module:Class of your own"

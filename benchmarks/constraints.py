@@ -179,15 +179,7 @@ DESIGNS: dict[str, Design] = {
 
 
 def recipe_of(design: str, env_id: str, seed: int, timesteps: int | None) -> Recipe:
-    """
-    What a policy is trained with: LAC's settings, but for those of the design.
-
-    :param design: one of ``DESIGNS``
-    :param env_id: id of a cost environment
-    :param seed: seed of the training
-    :param timesteps: environment steps at most; those of ``zoo_configs`` by default
-    :return: the recipe
-    """
+    """What a policy is trained with: LAC's settings, but for those of the design."""
     of_lac = Recipe.of("lac", env_id, seed)
     steps = min(of_lac.timesteps, timesteps or of_lac.timesteps)
     chosen = DESIGNS[design]
@@ -198,17 +190,7 @@ def recipe_of(design: str, env_id: str, seed: int, timesteps: int | None) -> Rec
 
 
 def part(design: str, env_id: str, seed: int, timesteps: int, settings: dict[str, Any], episodes: int) -> Tables:
-    """
-    Train one policy, and judge it.
-
-    :param design: one of ``DESIGNS``
-    :param env_id: id of a cost environment
-    :param seed: seed of the training
-    :param timesteps: environment steps
-    :param settings: of the training, which name the part
-    :param episodes: episodes for each disturbance, and to judge the critic
-    :return: ``constraints``, one row per disturbance
-    """
+    """Train one policy, and judge it."""
     recipe = recipe_of(design, env_id, seed, timesteps)
     assert recipe.hyperparameters == settings
     with tempfile.TemporaryDirectory() as folder:
@@ -235,9 +217,6 @@ def report(results: pd.DataFrame) -> str:
     """
     One row for each environment and design, as Markdown: costs are interquartile means over seeds with their 95 % intervals,
     shares of episodes that die are means (least to most of a seed).
-
-    :param results: of all parts
-    :return: one table
     """
     rows = []
     for (env_id, design), group in results.groupby(["environment", "design"], sort=False):
@@ -265,9 +244,6 @@ def plot(results: pd.DataFrame) -> Figure:
     """
     The cost of each design, one panel per environment, three in a row: each seed, and the interquartile mean with its 95 %
     interval.
-
-    :param results: of all parts
-    :return: the figure
     """
     undisturbed = results[results["disturbance"] == "none"]
     envs, designs = list(undisturbed["environment"].unique()), list(undisturbed["design"].unique())
@@ -292,11 +268,7 @@ def plot(results: pd.DataFrame) -> Figure:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """
-    The command line.
-
-    :param arguments: of the command line by default
-    """
+    """The command line."""
     parser = command_line("constraints", __doc__)
     parser.add_argument("--designs", nargs="+", default=list(DESIGNS), choices=list(DESIGNS))
     parser.add_argument("--envs", nargs="+", default=list(DISTURBANCES), choices=list(DISTURBANCES))

@@ -53,24 +53,13 @@ HELD_OUT = 300
 
 
 def check_discharges(parser: argparse.ArgumentParser, discharges: int) -> None:
-    """
-    Refuse more discharges than are held out, with an error of the command line.
-
-    :param parser: of the command line
-    :param discharges: how many are asked for, at least 1
-    """
+    """Refuse more discharges than are held out, with an error of the command line."""
     if discharges > HELD_OUT:
         parser.error(f"--discharges must lie within 1 .. {HELD_OUT}")
 
 
 def held_out_trajectories(env_id: str, **options: Any) -> TrajectoryDataset:
-    """
-    The discharges that no policy has seen.
-
-    :param env_id: id of a calibration environment
-    :param options: of the environment
-    :return: the test part of its data set
-    """
+    """The discharges that no policy has seen."""
     data = PolicyEstimator.environment(env_id, split="test", **options).task.dataset
     assert isinstance(data, TrajectoryDataset)
     return data
@@ -99,41 +88,18 @@ class Contest(ABC):
 
     @abstractmethod
     def scores(self, model: BaseAlgorithm, env: VecEnv, brief: bool = False) -> pd.DataFrame:
-        """
-        Score a policy.
-
-        :param model: the policy
-        :param env: one environment as the policy knows it, with ``options``
-        :param brief: on little work, as while training
-        :return: one row per discharge (and sensor) or episode
-        """
+        """Score a policy."""
 
     def summary(self, scores: pd.DataFrame) -> dict[str, Any]:
-        """
-        What is kept of a run beside its scores.
-
-        :param scores: of one policy
-        :return: by name
-        """
+        """What is kept of a run beside its scores."""
         return {"time_per_update_us": 1e6 * float(scores["time_per_update_s"].iloc[0])}
 
     @abstractmethod
     def report(self, runs: pd.DataFrame, study: Study) -> tuple[list[dict[str, str]], pd.DataFrame]:
-        """
-        Write tables and figures of all finished runs in this environment.
-
-        :param runs: see :func:`benchmarks.compare.finished_runs`
-        :param study: where to
-        :return: rows for readers, and what stands of it in compare.csv
-        """
+        """Write tables and figures of all finished runs in this environment."""
 
     def write_learning(self, runs: pd.DataFrame, study: Study) -> None:
-        """
-        Draw each metric during training, and write the curves.
-
-        :param runs: see :func:`benchmarks.compare.finished_runs`
-        :param study: where to
-        """
+        """Draw each metric during training, and write the curves."""
         for name, stem in self.stems.items():
             columns = {name: self.metric, f"{name}_worst": f"{self.metric}_worst"}
             curves: dict[str, list[pd.DataFrame]] = {}
@@ -181,12 +147,7 @@ class FullState(Calibration):
         return {**super().summary(scores), "scores": {name: summarize(scores, name) for name in self.parameters}}
 
     def table(self, runs: pd.DataFrame) -> pd.DataFrame:
-        """
-        The scores of all runs, and of the closed form.
-
-        :param runs: see :func:`benchmarks.compare.finished_runs`
-        :return: one row per run and parameter
-        """
+        """The scores of all runs, and of the closed form."""
         exact = evaluate(ClosedForm(), self.test)
         tables = []
         for name in self.parameters:
@@ -245,24 +206,14 @@ class VoltageOnly(Calibration):
         return self.under_sensors(PolicyEstimator(model, self.env_id), brief)
 
     def under_sensors(self, estimator: Estimator, brief: bool = False) -> pd.DataFrame:
-        """
-        Score any calibrator.
-
-        :param estimator: the calibrator
-        :param brief: on little work, as while training
-        :return: one row per sensor and discharge
-        """
+        """Score any calibrator."""
         data = self.test[: _BRIEF_VOLTAGE_TRAJECTORIES if brief else _VOLTAGE_TRAJECTORIES]
         sensors = dict(list(SENSORS.items())[: 1 if brief else None])
         tables = {name: evaluate(estimator, data, errors, seed=1) for name, errors in sensors.items()}
         return pd.concat(tables, names=["sensor"]).reset_index("sensor")
 
     def peers(self) -> dict[str, Estimator]:
-        """
-        Calibrators without learning. The filter allows for an offset of the sensor, least squares do not.
-
-        :return: by name
-        """
+        """Calibrators without learning. The filter allows for an offset of the sensor, least squares do not."""
         return {
             "least squares": LeastSquares(self.parameters, window_every_s=60.0),
             "Kalman filter": ExtendedKalmanFilter(self.parameters),
@@ -296,12 +247,7 @@ class VoltageOnly(Calibration):
         return lines, pd.DataFrame()
 
     def table(self, scores: pd.DataFrame) -> pd.DataFrame:
-        """
-        The scores of all calibrators, over discharges.
-
-        :param scores: of all calibrators
-        :return: one row per sensor, calibrator and seed; errors in per cent
-        """
+        """The scores of all calibrators, over discharges."""
         rows = []
         for (sensor, calibrator, seed), group in scores.groupby(["sensor", "calibrator", "seed"], sort=False, dropna=False):
             row: dict[str, Any] = {"sensor": sensor, "calibrator": calibrator, "seed": seed}
@@ -321,13 +267,7 @@ class VoltageOnly(Calibration):
 
 
 def peer_scores(env_id: str, calibrator: str) -> Tables:
-    """
-    A part of this study: a calibrator without learning, under each sensor.
-
-    :param env_id: id of a voltage-only environment
-    :param calibrator: its name
-    :return: ``scores``, one row per sensor and discharge
-    """
+    """A part of this study: a calibrator without learning, under each sensor."""
     task = VoltageOnly(env_id)
     return {"scores": task.under_sensors(task.peers()[calibrator]).assign(calibrator=calibrator)}
 
@@ -376,13 +316,7 @@ class Episodes(Contest):
 
 
 def contest_of(env_id: str) -> Contest:
-    """
-    What algorithms are compared by in an environment.
-
-    :param env_id: its id
-    :return: the contest
-    :raises gymnasium.error.Error: if it does not exist
-    """
+    """What algorithms are compared by in an environment."""
     try:
         task = PolicyEstimator.environment(registered_id(env_id)).task
     except ValueError:
@@ -407,13 +341,7 @@ def _times(group: pd.DataFrame, learned: bool) -> dict[str, str]:
 
 
 def plot_ranks(scores: pd.DataFrame, parameters: Sequence[str]) -> Figure:
-    """
-    Which share of the discharges has an error in its second half below a value, for each calibrator, over seeds.
-
-    :param scores: of all calibrators
-    :param parameters: what was to be found
-    :return: the figure, one column per parameter, one row per sensor
-    """
+    """Which share of the discharges has an error in its second half below a value, for each calibrator, over seeds."""
     sensors = list(dict.fromkeys(scores["sensor"]))
     figure = new_figure(4.0 * len(parameters) + 0.6, 2.7 * len(sensors) + 0.4)
     panels = figure.subplots(len(sensors), len(parameters), squeeze=False, sharex="col", sharey=True)
@@ -437,12 +365,7 @@ def plot_ranks(scores: pd.DataFrame, parameters: Sequence[str]) -> Figure:
 
 
 def made_by(runs: pd.DataFrame) -> dict[str, Any]:
-    """
-    What made the runs of a table.
-
-    :param runs: see :func:`benchmarks.compare.finished_runs`
-    :return: each recipe once, with the seeds that were run
-    """
+    """What made the runs of a table."""
     recipes: dict[str, Any] = {}
     for recipe_digest, folder in zip(runs["recipe"], runs["folder"], strict=True):
         summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))

@@ -35,36 +35,17 @@ class ScaledController:
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """
-        Actions, as Stable-Baselines3 predicts them.
-
-        :param observation: see the controller
-        :param state: see the controller
-        :param episode_start: see the controller
-        :param deterministic: see the controller
-        :return: actions, and the state of the controller
-        """
+        """Actions, as Stable-Baselines3 predicts them."""
         actions, state = self.controller.predict(observation, state, episode_start, deterministic)
         return self.factor * actions, state
 
 
 def factors(env_id: str) -> dict[str, float]:
-    """
-    The loops of an environment.
-
-    :param env_id: id of a cost environment
-    :return: by name, what the actions of its reference controller are multiplied by
-    """
+    """The loops of an environment."""
     return _FACTORS_OF.get(env_id, _FACTORS)
 
 
 def controllers(env_id: str) -> dict[str, PolicyPredictor]:
-    """
-    Controllers that settle, and controllers that do not.
-
-    :param env_id: id of a cost environment
-    :return: by name, the reference controller first
-    :raises ValueError: for any other environment
-    """
+    """Controllers that settle, and controllers that do not."""
     reference = reference_controller(gym.make(env_id))
     return {name: ScaledController(reference, factor) for name, factor in factors(env_id).items()}

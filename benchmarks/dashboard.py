@@ -17,16 +17,7 @@ from sb3_lac.zoo import LACExperimentManager
 def dashboard_callbacks(
     recipe: Recipe, manager: LACExperimentManager, model: BaseAlgorithm, episodes: int, every: int
 ) -> list[BaseCallback]:
-    """
-    Callbacks that make a run part of a comparison in TensorBoard. They do not change the training.
-
-    :param recipe: what the run is made by
-    :param manager: makes the environments
-    :param model: to be trained, with a logger for TensorBoard
-    :param episodes: number of them in each evaluation of LAC's Lyapunov function
-    :param every: calls between these evaluations
-    :return: the callbacks
-    """
+    """Callbacks that make a run part of a comparison in TensorBoard. They do not change the training."""
     about = {"env": recipe.env_id, "recipe": recipe.digest, "timesteps": recipe.timesteps, "source": recipe.source}
     callbacks: list[BaseCallback] = [DashboardCallback(CALIBRATION_CHARTS, {**recipe.hyperparameters, **about})]
     if isinstance(model, LAC):

@@ -21,11 +21,7 @@ TIMESTEPS = 154_560  # 2400 updates
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """
-    Run both parts.
-
-    :param arguments: of the command line by default; there are none but ``--help``
-    """
+    """Run both parts."""
     argparse.ArgumentParser(
         prog="python -m benchmarks.demo", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     ).parse_args(arguments)

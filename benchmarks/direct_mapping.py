@@ -39,13 +39,7 @@ _TESTED = {"trajectory": "other discharges", "load": "heavier loads", "parameter
 
 
 def report(results: pd.DataFrame, configuration: Mapping[str, Any]) -> str:
-    """
-    What is compared, and the table.
-
-    :param results: of all parts
-    :param configuration: of the study
-    :return: Markdown
-    """
+    """What is compared, and the table."""
     rows = []
     for (parameter, division, method), group in results.groupby(["parameter", "division", "method"], sort=False):
         seeds = [of_seed for _, of_seed in group.groupby("seed", dropna=False)]
@@ -74,12 +68,7 @@ worst: of any seed; spread: standard deviation within a discharge.
 
 
 def plot_errors(results: pd.DataFrame) -> Figure:
-    """
-    The error of every test discharge.
-
-    :param results: of all parts
-    :return: the figure, one row per parameter and one column per division
-    """
+    """The error of every test discharge."""
     learned = results[results["seed"].notna()]
     methods = list(dict.fromkeys(learned["method"]))
     figure = new_figure(10.4, 5.8)
@@ -102,11 +91,7 @@ def plot_errors(results: pd.DataFrame) -> Figure:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """
-    The command line.
-
-    :param arguments: of the command line by default
-    """
+    """The command line."""
     parser = command_line("direct_mapping", __doc__, jobs=1)
     parser.add_argument("--mappings", nargs="*", default=list(MAPPINGS), choices=list(MAPPINGS), metavar="NAME")
     parser.add_argument("--seeds", nargs="+", type=natural, default=[0, 1, 2], help="of the mappings")

@@ -128,11 +128,6 @@ def work(fault: Fault, unknown: Sequence[str], n: int) -> TrajectoryDataset:
     """
     The discharges: the first held-out ones of the environment, with the same ages and loads whatever the fault, but where one
     parameter alone is unknown.
-
-    :param fault: what is wrong
-    :param unknown: what is searched for
-    :param n: how many
-    :return: the discharges
     """
     if fault.other_worn:
         return TrajectoryDataset.generate(
@@ -150,17 +145,7 @@ def work(fault: Fault, unknown: Sequence[str], n: int) -> TrajectoryDataset:
 def part(
     calibrator: str, fault: str, unknown: Sequence[str], discharges: int, policy: str | None, digest: str | None
 ) -> Tables:
-    """
-    Score one calibrator under one fault.
-
-    :param calibrator: its name
-    :param fault: its name
-    :param unknown: what it searches for
-    :param discharges: how many
-    :param policy: where the calibrator is a policy: algorithm and file, ``lac:model.zip``
-    :param digest: what is in that file
-    :return: ``faults``, one row per discharge and unknown parameter
-    """
+    """Score one calibrator under one fault."""
     wrong = FAULTS[fault]
     data = work(wrong, unknown, discharges)
     if policy is None:
@@ -189,13 +174,7 @@ def part(
 
 
 def parts(n: int, policies: Sequence[str]) -> list[dict[str, Any]]:
-    """
-    All parts of this study.
-
-    :param n: discharges
-    :param policies: see :func:`part`. Policies search for both parameters, and miss the fault where one is known
-    :return: the arguments of each
-    """
+    """All parts of this study."""
     chosen = []
     for fault in FAULTS.values():
         unknowns = [(name,) for name in PARAMETERS] if fault.other_worn else [PARAMETER_NAMES]
@@ -221,23 +200,12 @@ def _digest(policy: str) -> str:
 
 
 def calibrators_of(results: pd.DataFrame) -> list[str]:
-    """
-    Who was compared.
-
-    :param results: of all parts
-    :return: names, in their order
-    """
+    """Who was compared."""
     return list(dict.fromkeys([*CALIBRATORS, *results["calibrator"]]))
 
 
 def faults_table(results: pd.DataFrame, parameter: str) -> pd.DataFrame:
-    """
-    Errors of the second half of the discharges.
-
-    :param results: of all parts
-    :param parameter: of which
-    :return: one row per fault and one column per calibrator, as shown to readers
-    """
+    """Errors of the second half of the discharges."""
     rows = []
     for fault in FAULTS:
         row = {f"{SYMBOLS[parameter]}: what is wrong": fault}
@@ -249,12 +217,7 @@ def faults_table(results: pd.DataFrame, parameter: str) -> pd.DataFrame:
 
 
 def honesty_table(results: pd.DataFrame) -> pd.DataFrame:
-    """
-    What calibrators state beside their estimates.
-
-    :param results: of all parts
-    :return: one row per fault, as shown to readers
-    """
+    """What calibrators state beside their estimates."""
     rows = []
     for fault in FAULTS:
         row = {"what is wrong": fault}
@@ -271,12 +234,7 @@ def honesty_table(results: pd.DataFrame) -> pd.DataFrame:
 
 
 def needs_table(results: pd.DataFrame) -> pd.DataFrame:
-    """
-    What each calibrator needs to know, and what an estimate costs.
-
-    :param results: of all parts
-    :return: one row per calibrator, as shown to readers
-    """
+    """What each calibrator needs to know, and what an estimate costs."""
     rows = []
     for name in calibrators_of(results):
         spent_s = results[results["calibrator"] == name]["cpu_time_per_estimate_s"].mean()
@@ -291,13 +249,7 @@ def _of(results: pd.DataFrame, calibrator: str, fault: str, parameter: str) -> p
 
 
 def report(results: pd.DataFrame, configuration: Mapping[str, Any]) -> str:
-    """
-    All tables.
-
-    :param results: of all parts
-    :param configuration: of the study
-    :return: Markdown
-    """
+    """All tables."""
     n = configuration["discharges"]
     tables = [needs_table(results), *(faults_table(results, name) for name in PARAMETERS), honesty_table(results)]
     needs, q_mobile, r_o, honesty = (markdown(table) for table in tables)
@@ -320,12 +272,7 @@ estimate the calibrator takes for settled. Where one parameter is unknown, settl
 
 
 def plot_faults(results: pd.DataFrame) -> Figure:
-    """
-    The errors of all discharges.
-
-    :param results: of all parts
-    :return: the figure, one column per parameter
-    """
+    """The errors of all discharges."""
     names = calibrators_of(results)
     figure = new_figure(10.4, 1.2 + 0.7 * len(FAULTS))
     panels = figure.subplots(1, len(PARAMETERS), sharey=True)
@@ -350,11 +297,7 @@ def plot_faults(results: pd.DataFrame) -> Figure:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """
-    The command line.
-
-    :param arguments: of the command line by default
-    """
+    """The command line."""
     parser = command_line("faults", __doc__, jobs=1)
     parser.add_argument("--discharges", type=positive, default=60)
     parser.add_argument(

@@ -36,23 +36,12 @@ PAIRS = (("B0005", "B0006"), ("B0006", "B0005"))
 
 
 def training_discharges(discharges: Sequence[Discharge]) -> list[Discharge]:
-    """
-    What the constants are fitted to.
-
-    :param discharges: all of a cell
-    :return: the first, the middle and the last one
-    """
+    """What the constants are fitted to."""
     return [discharges[0], discharges[len(discharges) // 2], discharges[-1]]
 
 
 def score(discharge: Discharge, calibrator: LeastSquares) -> dict[str, float | str | bool]:
-    """
-    Calibrate to one discharge and to its beginnings.
-
-    :param discharge: as recorded
-    :param calibrator: with the constants to test
-    :return: a row of the table
-    """
+    """Calibrate to one discharge and to its beginnings."""
     record = discharge.loaded_part(CUT_OFF_V)
     start_s, end_s = record.time_s[[0, -1]]
     whole = calibrator.estimate(record)
@@ -77,12 +66,7 @@ def score(discharge: Discharge, calibrator: LeastSquares) -> dict[str, float | s
 
 
 def summary(scores: pd.DataFrame) -> pd.DataFrame:
-    """
-    The table for people.
-
-    :param scores: one row per discharge, cell and set of constants
-    :return: one row per cell and set of constants
-    """
+    """The table for people."""
     rows = []
     for (cell, constants), part in scores.groupby(["cell", "constants"], sort=False):
         rmse_mV = 1e3 * part["voltage_rmse_V"]
@@ -104,24 +88,12 @@ def summary(scores: pd.DataFrame) -> pd.DataFrame:
 
 
 def fitted_to(cell: str) -> CellFit:
-    """
-    The fit that is tested.
-
-    :param cell: a bundled cell
-    :return: its constants, from three of its discharges
-    """
+    """The fit that is tested."""
     return fit_cell(training_discharges(load_nasa_discharges(cell)), CUT_OFF_V)
 
 
 def part(trained: str, tested: str, every: int) -> Tables:
-    """
-    Fit one cell, and test the constants on the other.
-
-    :param trained: a bundled cell
-    :param tested: another one
-    :param every: which of its discharges: every so manieth
-    :return: one row per discharge and set of constants, and one per constant
-    """
+    """Fit one cell, and test the constants on the other."""
     fit = fitted_to(trained)
     calibrators = {
         "of the new cell": LeastSquares(thermal=True, mismatch_V=UNFITTED_MISMATCH_V),
@@ -136,11 +108,7 @@ def part(trained: str, tested: str, every: int) -> Tables:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """
-    The command line.
-
-    :param arguments: of the command line by default
-    """
+    """The command line."""
     parser = command_line("fit_cell", __doc__)
     parser.add_argument("--every", type=positive, default=1, help="test on every so manieth discharge (default: all)")
     study = Study(parser, arguments)

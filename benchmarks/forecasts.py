@@ -64,20 +64,7 @@ def score(
     cut_off_V: float,
     samples: int,
 ) -> dict[str, float | bool]:
-    """
-    One forecast against what happened.
-
-    :param record: the discharge so far
-    :param estimate: from it
-    :param load: to come
-    :param end_s: measured end of discharge, s
-    :param start_s: start of the discharge, s
-    :param mismatch_V: error to expect of the model, V
-    :param model: the model
-    :param cut_off_V: V
-    :param samples: of the forecast
-    :return: columns of the table
-    """
+    """One forecast against what happened."""
     began_s = perf_counter()
     found = forecast(record, estimate, load, cut_off_V, model=model, mismatch_V=mismatch_V, samples=samples)
     low_s, median_s, high_s = found.eod_quantile_s(BAND)
@@ -92,16 +79,7 @@ def score(
 
 
 def real_rows(cell: str, discharges: list[Discharge], life: Life, every: int, samples: int) -> list[dict[str, object]]:
-    """
-    The discharges of one cell.
-
-    :param cell: its name
-    :param discharges: all of them
-    :param life: all of it
-    :param every: each how many-th discharge is forecast
-    :param samples: of each forecast
-    :return: one row per discharge, share and calibrator
-    """
+    """The discharges of one cell."""
     mismatch_V = MISMATCH_V["real"]
     kalman = ExtendedKalmanFilter(thermal=True, mismatch_V=mismatch_V, voltage_noise_V=mismatch_V)
     rows: list[dict[str, object]] = []
@@ -126,15 +104,7 @@ def real_rows(cell: str, discharges: list[Discharge], life: Life, every: int, sa
 
 
 def simulated_rows(kind: str, seed: int, count: int, samples: int) -> list[dict[str, object]]:
-    """
-    Simulated discharges under a random load.
-
-    :param kind: of load
-    :param seed: of everything
-    :param count: how many discharges
-    :param samples: of each forecast
-    :return: one row per discharge, share, calibrator and load to come
-    """
+    """Simulated discharges under a random load."""
     data = TrajectoryDataset.generate("joint", count, LOADS[kind], seed=seed, mismatch=MISMATCH, dt_s=DT_S)
     rng = np.random.default_rng(seed)
     model, mismatch_V = RecordModel(dt_s=DT_S), MISMATCH_V["simulated"]
@@ -159,12 +129,7 @@ def simulated_rows(kind: str, seed: int, count: int, samples: int) -> list[dict[
 
 
 def end_of_discharge_table(rows: pd.DataFrame) -> pd.DataFrame:
-    """
-    The summary of all forecasts of discharges.
-
-    :param rows: one per forecast
-    :return: one per data, calibrator, load and share, as shown to readers
-    """
+    """The summary of all forecasts of discharges."""
     table = []
     keys = ["data", "calibrator", "load", "share"]
     for (data, calibrator, load, _), part in rows.groupby(keys, sort=False):
@@ -186,14 +151,7 @@ def end_of_discharge_table(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def life_rows(cell: str, life: Life, seed: int = 0) -> list[dict[str, object]]:
-    """
-    What was expected of the life that remained.
-
-    :param cell: its name
-    :param life: all of it
-    :param seed: of the forecasts
-    :return: one row per discharge before the end of life, from the tenth on
-    """
+    """What was expected of the life that remained."""
     ended = np.flatnonzero(life.table["capacity_Ah"] < END_OF_LIFE_Ah)
     rows: list[dict[str, object]] = []
     for n in range(10, int(ended[0]) + 1 if len(ended) else 0):
@@ -204,13 +162,7 @@ def life_rows(cell: str, life: Life, seed: int = 0) -> list[dict[str, object]]:
 
 
 def life_table(lives: dict[str, Life], remaining: pd.DataFrame) -> pd.DataFrame:
-    """
-    The summary over cycles.
-
-    :param lives: by cell
-    :param remaining: rows of :func:`life_rows`
-    :return: one row per cell, as shown to readers
-    """
+    """The summary over cycles."""
     table = []
     for cell, life in lives.items():
         expected = [life.after(n).prior_q_mobile_C for n in range(1, len(life.table))]
@@ -237,13 +189,7 @@ def life_table(lives: dict[str, Life], remaining: pd.DataFrame) -> pd.DataFrame:
 
 
 def plot(rows: pd.DataFrame, remaining: pd.DataFrame) -> Figure:
-    """
-    How often the intervals of the forecasts hold, by method (colours) and data (markers), and the life that remained.
-
-    :param rows: one per forecast of a discharge
-    :param remaining: rows of :func:`life_rows`
-    :return: the figure
-    """
+    """How often the intervals of the forecasts hold, by method (colours) and data (markers), and the life that remained."""
     figure = new_figure(9.6, 7.2)
     above, below = figure.subplots(2, 2)
     real = rows["data"].isin(BUNDLED_CELLS)
@@ -280,11 +226,7 @@ def plot(rows: pd.DataFrame, remaining: pd.DataFrame) -> Figure:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """
-    The command line.
-
-    :param arguments: of the command line by default
-    """
+    """The command line."""
     parser = command_line("forecasts", __doc__, jobs=None)
     parser.add_argument("--cells", nargs="*", default=list(BUNDLED_CELLS), choices=BUNDLED_CELLS)
     parser.add_argument("--every", type=int, default=12, help="each how many-th real discharge is forecast")

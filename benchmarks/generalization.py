@@ -60,13 +60,7 @@ DIVISIONS: dict[str, Callable[[TrajectoryDataset], Parts]] = {
 
 
 def divided(parameter: Parameter, division: str) -> Parts:
-    """
-    The paper's data, divided.
-
-    :param parameter: what ages
-    :param division: one of ``DIVISIONS``
-    :return: training part, test part
-    """
+    """The paper's data, divided."""
     return DIVISIONS[division](TrajectoryDataset.paper(parameter))
 
 
@@ -115,14 +109,6 @@ _TASKS: dict[tuple[str, str], type[_Divided]] = {
 def train_policy(algo: str, parameter: Parameter, division: str, seed: int, updates: int | None, models: Path) -> Any:
     """
     Train a policy on the training part of a division with the settings of ``zoo_configs``, or load it if that has been done.
-
-    :param algo: ``lac``, ``sac`` or ``td3``
-    :param parameter: what it is to find
-    :param division: one of ``DIVISIONS``
-    :param seed: seed of everything
-    :param updates: gradient steps; ``None``: those of ``zoo_configs``
-    :param models: where trained policies are kept
-    :return: the model
     """
     env_id = ENV_IDS[parameter]
     recipe = Recipe.of(algo, env_id, seed)
@@ -152,15 +138,7 @@ class Pairs(NamedTuple):
 
 
 def draw_pairs(data: TrajectoryDataset, parameter: Parameter, n: int, seed: int) -> Pairs:
-    """
-    Labelled pairs from random seconds of random discharges, as episodes of the environments start.
-
-    :param data: discharges
-    :param parameter: the label
-    :param n: how many
-    :param seed: of the draws
-    :return: the pairs
-    """
+    """Labelled pairs from random seconds of random discharges, as episodes of the environments start."""
     rng = np.random.default_rng(seed)
     discharge = rng.integers(len(data), size=n)
     sample = rng.integers(data.first[discharge], data.stop[discharge] - 1)
@@ -255,24 +233,14 @@ class DirectMapping(Estimator):
                 optimizer.step()
 
     def infer(self, pairs: Pairs) -> FloatArray:
-        """
-        The parameter of each pair.
-
-        :param pairs: their labels are not looked at
-        :return: C or ohm, shape (n,)
-        """
+        """The parameter of each pair."""
         with th.no_grad():
             told = [self.network(chunk) for chunk in self._inputs.to_tensor(self.mapping.inputs(pairs)).split(_CHUNK)]
         scaled = th.cat(told).numpy().astype(np.float64)
         return (self._labels.mean + self._labels.spread * scaled)[:, 0]
 
     def trace(self, records: Sequence[Trajectory]) -> list[EstimateTrace]:  # type: ignore[override]
-        """
-        One estimate for every step of many discharges.
-
-        :param records: simulated discharges of at least two samples
-        :return: one trace per discharge, in the same order
-        """
+        """One estimate for every step of many discharges."""
         whole = list(records)
         pairs = Pairs(
             np.concatenate([record.state[:-1, OBSERVED] for record in whole]),
@@ -288,27 +256,13 @@ class DirectMapping(Estimator):
         return traces
 
     def estimate(self, record: Trajectory) -> Estimate:  # type: ignore[override]
-        """
-        The estimate from the last two samples of a discharge.
-
-        :param record: a simulated discharge of at least two samples
-        :return: the estimate
-        """
+        """The estimate from the last two samples of a discharge."""
         trace = self.trace([record])[0]
         return Estimate(q_mobile=float(trace.q_mobile[-1]), r_o=float(trace.r_o[-1]))
 
 
 def scores(estimator: Estimator, parameter: Parameter, division: str, method: str, seed: int | None) -> Tables:
-    """
-    Score a calibrator on the test part of a division.
-
-    :param estimator: the calibrator
-    :param parameter: what it is to find
-    :param division: one of ``DIVISIONS``
-    :param method: what it is called in tables
-    :param seed: of its training
-    :return: ``direct_mapping``, one row per discharge
-    """
+    """Score a calibrator on the test part of a division."""
     test = divided(parameter, division)[1]
     found = evaluate(estimator, test.subset(range(0, len(test), max(len(test) // TEST_DISCHARGES, 1))))
     columns = {
@@ -329,17 +283,7 @@ def scores(estimator: Estimator, parameter: Parameter, division: str, method: st
 
 
 def mapping_part(kind: str, parameter: Parameter, division: str, seed: int, pairs: int, epochs: int) -> Tables:
-    """
-    Teach one direct mapping, and score it.
-
-    :param kind: one of ``MAPPINGS``
-    :param parameter: what it tells
-    :param division: one of ``DIVISIONS``
-    :param seed: of pairs, first weights and order
-    :param pairs: how many it learns from
-    :param epochs: how often each is shown
-    :return: see :func:`scores`
-    """
+    """Teach one direct mapping, and score it."""
     th.set_num_threads(1)
     drawn = draw_pairs(divided(parameter, division)[0], parameter, pairs, seed)
     mapping = DirectMapping(kind, parameter, drawn, epochs, seed)
@@ -347,28 +291,12 @@ def mapping_part(kind: str, parameter: Parameter, division: str, seed: int, pair
 
 
 def policy_part(algo: str, parameter: Parameter, division: str, seed: int, updates: int | None, models: Path) -> Tables:
-    """
-    Train one policy, unless that has been done, and score it; the model runs free over whole discharges.
-
-    :param algo: see :func:`train_policy`
-    :param parameter: what it is to find
-    :param division: one of ``DIVISIONS``
-    :param seed: seed of everything
-    :param updates: see :func:`train_policy`
-    :param models: where trained policies are kept
-    :return: see :func:`scores`
-    """
+    """Train one policy, unless that has been done, and score it; the model runs free over whole discharges."""
     policy = train_policy(algo, parameter, division, seed, updates, models)
     estimator = PolicyEstimator(policy, ENV_IDS[parameter])
     return scores(estimator, parameter, division, algo.upper(), seed)
 
 
 def exact_part(parameter: Parameter, division: str) -> Tables:
-    """
-    Score the closed form.
-
-    :param parameter: what it finds
-    :param division: one of ``DIVISIONS``
-    :return: see :func:`scores`
-    """
+    """Score the closed form."""
     return scores(ClosedForm(), parameter, division, "closed form", None)

@@ -24,11 +24,7 @@ from benchmarks.study import Study, command_line, positive
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """
-    The command line.
-
-    :param arguments: of the command line by default
-    """
+    """The command line."""
     parser = command_line("identifiability", __doc__)
     parser.add_argument("--draws", type=positive, default=100, help="records with noise per case of least squares")
     study = Study(parser, arguments)

@@ -28,12 +28,7 @@ from benchmarks.study import SYMBOLS, digits, markdown
 
 
 def plot_bounds(records: dict[str, Trajectory]) -> Figure:
-    """
-    The bounds over the constant discharge, for several noises and unknowns.
-
-    :param records: by name of the load
-    :return: the figure
-    """
+    """The bounds over the constant discharge, for several noises and unknowns."""
     record, unknowns = records["constant"], ("alone", "both", "both and an offset")
     figure = new_figure(7.8, 4.2)
     panels = figure.subplots(2, len(unknowns), sharex=True, sharey="row")
@@ -58,12 +53,7 @@ def plot_bounds(records: dict[str, Trajectory]) -> Figure:
 
 
 def plot_loads(records: dict[str, Trajectory]) -> Figure:
-    """
-    What an unknown offset costs under a constant and under a varying load.
-
-    :param records: by name of the load
-    :return: the figure
-    """
+    """What an unknown offset costs under a constant and under a varying load."""
     figure = new_figure(7.6, 3.3)
     panels = figure.subplots(1, 2, sharex=True)
     for colour, (load, record) in coloured(records.items()):
@@ -80,12 +70,7 @@ def plot_loads(records: dict[str, Trajectory]) -> Figure:
 
 
 def plot_misfits(records: dict[str, Trajectory]) -> Figure:
-    """
-    The misfit of the voltage over both parameters, without noise: of one reading, and of all readings so far.
-
-    :param records: by name of the load
-    :return: the figure
-    """
+    """The misfit of the voltage over both parameters, without noise: of one reading, and of all readings so far."""
     figure = new_figure(8.6, 3.1)
     cases = (
         ("one reading\nat half time", "constant", 0.5, True),
@@ -116,12 +101,7 @@ def plot_misfits(records: dict[str, Trajectory]) -> Figure:
 
 
 def plot_one_step(costs: pd.DataFrame) -> Figure:
-    """
-    The one-step cost over q_mobile.
-
-    :param costs: what :func:`one_step_costs` returned
-    :return: the figure
-    """
+    """The one-step cost over q_mobile."""
     figure = new_figure(7.6, 3.3)
     panels = figure.subplots(1, 2, sharex=True)
     titles = {"si": "in V and C", "scaled": "in error scales of the tasks"}
@@ -138,12 +118,7 @@ def plot_one_step(costs: pd.DataFrame) -> Figure:
 
 
 def plot_faults(faults: pd.DataFrame) -> Figure:
-    """
-    The error of q_mobile over the constant discharge, for several faults.
-
-    :param faults: what :func:`faults_table` returned
-    :return: the figure
-    """
+    """The error of q_mobile over the constant discharge, for several faults."""
     figure = new_figure(7.2, 3.4)
     axes = figure.subplots()
     shown = [name for name, fault in FAULTS.items() if name != "nothing" and "q_mobile" not in fault.held]
@@ -169,12 +144,7 @@ def _at_shares(table: pd.DataFrame, column: str, digits: int = 1, sign: str = "+
 
 
 def summary(tables: dict[str, pd.DataFrame]) -> str:
-    """
-    The tables as readers see them, as Markdown.
-
-    :param tables: by name, as they are written
-    :return: the tables, one after the other
-    """
+    """The tables as readers see them, as Markdown."""
     seen = " / ".join(f"{share:.0%}" for share in SHARES).replace("%", "") + " %"
     readable = [
         _conservation_summary(tables["conservation"]),

@@ -61,11 +61,7 @@ PERCENT = 100.0
 
 
 def discharges() -> dict[str, Trajectory]:
-    """
-    The discharges of this study: the same cell at a constant and at a varying current, sampled once a second.
-
-    :return: by name of the load
-    """
+    """The discharges of this study: the same cell at a constant and at a varying current, sampled once a second."""
     varying = RandomPiecewise(CURRENT_RANGE_A, unit="current")(np.random.default_rng(SEED))
     loads = {"constant": constant(CURRENT_A, "current"), "varying": varying}
     return {name: _discharge(load) for name, load in loads.items()}
@@ -78,22 +74,12 @@ def _discharge(load: Callable[[FloatArray], FloatArray], **changes: float) -> Tr
 
 
 def beginning(record: Trajectory, share: float) -> Trajectory:
-    """
-    What has been seen of a discharge.
-
-    :param record: the discharge
-    :param share: of its time
-    :return: that part
-    """
+    """What has been seen of a discharge."""
     return record.part(0, round(share * len(record.time_s)))
 
 
 def conservation_table() -> pd.DataFrame:
-    """
-    How exactly the full state tells both parameters, over discharges of cells of many ages under varying power.
-
-    :return: one row: discharges, samples, and the largest relative errors of the closed form
-    """
+    """How exactly the full state tells both parameters, over discharges of cells of many ages under varying power."""
     data = TrajectoryDataset.generate("joint", 50, RandomPiecewise(), SEED, r_o_range=(0.1, 0.3))
     worst = dict.fromkeys(NAMES, 0.0)
     samples = 0
@@ -107,25 +93,14 @@ def conservation_table() -> pd.DataFrame:
 
 
 def response_table(record: Trajectory) -> pd.DataFrame:
-    """
-    How soon r_o shows after the load is switched on.
-
-    :param record: a discharge at constant current
-    :return: one row per time: dV/dr_o as a share of its final value
-    """
+    """How soon r_o shows after the load is switched on."""
     slope_A = sensitivities(record).by_r_o_A
     times_s = np.array([1, 3, 6, 12, 18, 30, 60])
     return pd.DataFrame({"time_s": times_s, "share_of_final_percent": PERCENT * slope_A[times_s] / slope_A[-1]})
 
 
 def sensitivity_table(record: Trajectory) -> pd.DataFrame:
-    """
-    How much the voltage says about either parameter at several points of a discharge.
-
-    :param record: one discharge
-    :return: one row per point: the change of the voltage per percent of each parameter, and how much of each parameter a
-        single reading that is off by 10 mV is worth
-    """
+    """How much the voltage says about either parameter at several points of a discharge."""
     slopes = sensitivities(record)
     shares = np.array([0.01, 0.05, 0.1, 0.25, 0.5, 0.65, 0.75, 0.9, 0.95, 0.98, 1.0])
     at = np.minimum((shares * len(record.time_s)).astype(int), len(record.time_s) - 1)
@@ -153,26 +128,14 @@ class Bound(NamedTuple):
 
 
 def bound(record: Trajectory, noise_V: float, unknown: str) -> Bound:
-    """
-    The least standard deviations over a discharge.
-
-    :param record: one discharge
-    :param noise_V: standard deviation of the voltage sensor's noise, V
-    :param unknown: one of ``UNKNOWNS``
-    :return: the bound
-    """
+    """The least standard deviations over a discharge."""
     parameters, offset = UNKNOWNS[unknown]
     least = cramer_rao_bound(record, noise_V, parameters, offset)
     return Bound(least.time_s, PERCENT * least.sd_q_mobile / TRUE.q_mobile, PERCENT * least.sd_r_o / TRUE.r_o)
 
 
 def bounds_table(records: dict[str, Trajectory]) -> pd.DataFrame:
-    """
-    The bounds at several points of both discharges, and from when on they are below 1 %.
-
-    :param records: by name of the load
-    :return: one row per load, unknowns and noise
-    """
+    """The bounds at several points of both discharges, and from when on they are below 1 %."""
     rows = []
     for load, record in records.items():
         for unknown, (parameters, _) in UNKNOWNS.items():
@@ -189,12 +152,7 @@ def bounds_table(records: dict[str, Trajectory]) -> pd.DataFrame:
 
 
 def late_table(records: dict[str, Trajectory]) -> pd.DataFrame:
-    """
-    What a logger loses that starts late, if the sensor has an unknown offset.
-
-    :param records: by name of the load
-    :return: one row per load and start: standard deviations from the rest of the discharge, %
-    """
+    """What a logger loses that starts late, if the sensor has an unknown offset."""
     rows = []
     for load, record in records.items():
         slopes = sensitivities(record)
@@ -208,12 +166,7 @@ def late_table(records: dict[str, Trajectory]) -> pd.DataFrame:
 
 
 def windows_table(record: Trajectory) -> pd.DataFrame:
-    """
-    What the readings of one short episode say, if the charge drawn before it is known, against all readings so far.
-
-    :param record: one discharge
-    :return: one row per end of the episode: standard deviations of q_mobile, % of it, alone and with r_o unknown
-    """
+    """What the readings of one short episode say, if the charge drawn before it is known, against all readings so far."""
     slopes = sensitivities(record)
     gradient = np.column_stack([slopes.by_q_mobile_V_per_C * TRUE.q_mobile, slopes.by_r_o_A * TRUE.r_o]) / NOISE_V
     rows = []
@@ -233,14 +186,7 @@ def windows_table(record: Trajectory) -> pd.DataFrame:
 
 
 def least_squares_table(records: dict[str, Trajectory], draws: int) -> pd.DataFrame:
-    """
-    Least squares on records with white noise, against the bound.
-
-    :param records: by name of the load
-    :param draws: records with noise, each
-    :return: one row per load, noise and share of the discharge: root mean square of the errors, the bound, how often the error
-        is within two stated standard deviations, how often the estimate counts as settled, and the worst error of those
-    """
+    """Least squares on records with white noise, against the bound."""
     rng = np.random.default_rng(SEED)
     rows = []
     for load, record in records.items():
@@ -286,11 +232,7 @@ FAULTS = {
 
 
 def faults_table() -> pd.DataFrame:
-    """
-    What errors that do not average out do to estimates by least squares, without noise.
-
-    :return: one row per load, fault and share of the discharge: errors of both parameters, %; NaN for one that is held
-    """
+    """What errors that do not average out do to estimates by least squares, without noise."""
     rng = np.random.default_rng(SEED)
     rows = []
     for load, sound in discharges().items():
@@ -314,9 +256,6 @@ def faults_table() -> pd.DataFrame:
 def offsets_table(records: dict[str, Trajectory]) -> pd.DataFrame:
     """
     What a voltage sensor with noise and an offset does to a Kalman filter that does not and that does know of the offset.
-
-    :param records: by name of the load
-    :return: one row per load, known offset and share of the discharge: errors of both parameters, %
     """
     rows = []
     for load, record in records.items():
@@ -348,13 +287,7 @@ PRIOR_MISMATCHES_V = (0.0, 0.010)
 
 
 def priors_table(record: Trajectory) -> pd.DataFrame:
-    """
-    What a prior on q_mobile does to least squares on a noisy record of a cell that differs from the model.
-
-    :param record: a discharge of a cell that is as the model has it
-    :return: one row per prior, expected error of the model, and share of the discharge: the error of q_mobile, and its stated
-        standard deviation, %
-    """
+    """What a prior on q_mobile does to least squares on a noisy record of a cell that differs from the model."""
     other = _discharge(_going_on(record.load), kn=PRIOR_KN_FACTOR)
     noisy = SensorErrors(noise_V=NOISE_V).apply(other, np.random.default_rng(SEED))
     rows = []
@@ -381,8 +314,6 @@ def one_step_costs() -> pd.DataFrame:
     """
     The distance between the model's next state and the cell's, over q_mobile, with the full state measured: in volts and
     coulombs as they are and in the error scales of the tasks, from the true state and from one that has drifted.
-
-    :return: one row per q_mobile
     """
     record = simulate(ONE_STEP_POWER_W, TRUE.q_mobile, NEW_CELL.r_o)
     now, following = record.state[ONE_STEP_TIME_S], record.state[ONE_STEP_TIME_S + 1]
@@ -405,12 +336,7 @@ def one_step_costs() -> pd.DataFrame:
 
 
 def minima_table(costs: pd.DataFrame) -> pd.DataFrame:
-    """
-    The local minima of the one-step cost.
-
-    :param costs: what :func:`one_step_costs` returned
-    :return: one row per minimum, by cost
-    """
+    """The local minima of the one-step cost."""
     rows = []
     for column in costs.columns[1:]:
         values = costs[column].to_numpy()
@@ -436,11 +362,5 @@ TABLES: dict[str, Callable[[dict[str, Trajectory], int], pd.DataFrame]] = {
 
 
 def part(table: str, draws: int) -> Tables:
-    """
-    A part of the study.
-
-    :param table: name of one of ``TABLES``
-    :param draws: records with noise per case of least squares
-    :return: that table
-    """
+    """A part of the study."""
     return {table: TABLES[table](discharges(), draws)}

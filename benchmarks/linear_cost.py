@@ -32,13 +32,7 @@ _ENV_ID = "LinearCost-v0"
 
 
 def linear_gain(states: np.ndarray, controls: np.ndarray) -> np.ndarray:
-    """
-    The linear policy closest to what was done.
-
-    :param states: shape (n, 2)
-    :param controls: shape (n, 1)
-    :return: K of ``u = -K s`` by least squares, shape (1, 2)
-    """
+    """The linear policy closest to what was done."""
     return -np.linalg.lstsq(states, controls, rcond=None)[0].T
 
 
@@ -47,13 +41,7 @@ def _linear_actions(gain: np.ndarray, observations: np.ndarray) -> np.ndarray:
 
 
 def episode_costs(act: Callable[[np.ndarray], np.ndarray], episodes: int) -> np.ndarray:
-    """
-    The costs of a policy, with the same starts and noise for each.
-
-    :param act: actions of observations, shape (episodes, 1) of (episodes, 2)
-    :param episodes: how many, at the same time: none ends before its time limit
-    :return: shape (steps, episodes)
-    """
+    """The costs of a policy, with the same starts and noise for each."""
     env = make_vec_env(_ENV_ID, n_envs=episodes, seed=EVALUATION_SEED)
     observations, dones, costs = env.reset(), np.zeros(episodes, dtype=bool), []
     while not dones.any():
@@ -64,14 +52,7 @@ def episode_costs(act: Callable[[np.ndarray], np.ndarray], episodes: int) -> np.
 
 
 def over_optimum(costs: np.ndarray, optimal: np.ndarray, gamma: float) -> tuple[float, float, float]:
-    """
-    What a policy costs over what the best one does.
-
-    :param costs: of the policy, shape (steps, episodes)
-    :param optimal: of the best one in the same episodes
-    :param gamma: the discount factor
-    :return: ratio of the mean discounted sums, and the limits of its 95 % interval: a bootstrap of episodes
-    """
+    """What a policy costs over what the best one does."""
     weights = gamma ** np.arange(len(costs))
 
     def ratio(policy: np.ndarray, best: np.ndarray, axis: int = -1) -> np.ndarray:
@@ -85,15 +66,7 @@ def over_optimum(costs: np.ndarray, optimal: np.ndarray, gamma: float) -> tuple[
 
 
 def part(seed: int, timesteps: int, episodes: int, models: Path) -> Tables:
-    """
-    Train one policy, and compare it with the exact solution.
-
-    :param seed: seed of the training
-    :param timesteps: environment steps
-    :param episodes: episodes of the evaluation
-    :param models: where trained policies are kept
-    :return: ``linear_cost``: what was learned and what is exact; ``values``: L and the exact cost-to-go of visited states
-    """
+    """Train one policy, and compare it with the exact solution."""
     model = train_or_load("lac", _ENV_ID, seed, timesteps, models / f"seed{seed}")
     assert isinstance(model, LAC)
     env = LinearCostEnv()
@@ -136,12 +109,7 @@ def part(seed: int, timesteps: int, episodes: int, models: Path) -> Tables:
 
 
 def plot(values: pd.DataFrame) -> Figure:
-    """
-    Learned against exact values, one panel per seed, five in a row.
-
-    :param values: columns seed, exact, learned
-    :return: the figure
-    """
+    """Learned against exact values, one panel per seed, five in a row."""
     seeds = values["seed"].unique()
     figure, panels = new_panels(len(seeds), 5, (2.8, 2.9), sharex=True, sharey=True)
     top = values[["exact", "learned"]].to_numpy().max()
@@ -155,12 +123,7 @@ def plot(values: pd.DataFrame) -> Figure:
 
 
 def report(table: pd.DataFrame) -> str:
-    """
-    Learned and exact values side by side, as Markdown.
-
-    :param table: one row per seed, see :func:`part`
-    :return: one table
-    """
+    """Learned and exact values side by side, as Markdown."""
     rows = [
         {
             "seed": f"{row['seed']:.0f}",
@@ -181,11 +144,7 @@ def report(table: pd.DataFrame) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """
-    The command line.
-
-    :param arguments: of the command line by default
-    """
+    """The command line."""
     parser = command_line("linear_cost", __doc__)
     parser.add_argument("--seeds", nargs="+", type=natural, default=[0, 1, 2, 3, 4])
     parser.add_argument("--timesteps", type=positive, default=10_000, help="environment steps of each training")

@@ -55,13 +55,7 @@ class Follow:
     """No policy: it makes the step of the fit that the observation holds."""
 
     def predict(self, observation: FloatArray, /, *, deterministic: bool = False) -> tuple[FloatArray, None]:
-        """
-        The step.
-
-        :param observation: shape (n, observation_size)
-        :param deterministic: without meaning
-        :return: actions, shape (n, 2), and no state
-        """
+        """The step."""
         return observation[:, _STEP], None
 
 
@@ -95,16 +89,7 @@ ON_CELLS: dict[str, Callable[[], Estimator]] = {
 
 
 def simulated_part(calibrator: str, mismatch: float, sensor: str, discharges: int, made: str) -> Tables:
-    """
-    Score one calibrator on simulated cells.
-
-    :param calibrator: a key of ``CALIBRATORS``
-    :param mismatch: relative standard deviation of the constants
-    :param sensor: a name of :data:`benchmarks.contests.SENSORS`
-    :param discharges: how many of the test part
-    :param made: checksum of the policy
-    :return: ``mismatch``, one row per discharge
-    """
+    """Score one calibrator on simulated cells."""
     estimator = CALIBRATORS[calibrator]()
     data = standard_dataset("joint", "piecewise", "test", mismatch=mismatch)[:discharges]
     scores = evaluate(estimator, data, SENSORS[sensor], seed=1)
@@ -113,14 +98,7 @@ def simulated_part(calibrator: str, mismatch: float, sensor: str, discharges: in
 
 
 def recorded_part(calibrator: str, cell: str, made: str) -> Tables:
-    """
-    Let one calibrator estimate a recorded cell, after whole discharges and after parts of them.
-
-    :param calibrator: a key of ``ON_CELLS``
-    :param cell: its name
-    :param made: checksum of the policy
-    :return: ``mismatch_cells``, one row per discharge and share of it
-    """
+    """Let one calibrator estimate a recorded cell, after whole discharges and after parts of them."""
     rows = []
     is_thermal = calibrator in ("least squares", "Kalman filter")
     model = RecordModel(thermal=is_thermal)
@@ -149,12 +127,7 @@ def recorded_part(calibrator: str, cell: str, made: str) -> Tables:
 
 
 def simulated_table(scores: pd.DataFrame) -> pd.DataFrame:
-    """
-    The table of simulated cells.
-
-    :param scores: one row per mismatch, sensor, calibrator and discharge
-    :return: one row per mismatch, sensor and calibrator, as shown to readers
-    """
+    """The table of simulated cells."""
     rows = []
     for (mismatch, sensor, calibrator), group in scores.groupby(["mismatch", "sensor", "calibrator"], sort=False):
         row = {"constants off by": f"{mismatch:g}", "sensor": sensor, "calibrator": calibrator}
@@ -170,12 +143,7 @@ def simulated_table(scores: pd.DataFrame) -> pd.DataFrame:
 
 
 def recorded_table(found: pd.DataFrame) -> pd.DataFrame:
-    """
-    The table of recorded cells. Least squares on the whole discharge stand for the truth.
-
-    :param found: one row per calibrator, cell, discharge and share of it
-    :return: one row per cell and calibrator, as shown to readers
-    """
+    """The table of recorded cells. Least squares on the whole discharge stand for the truth."""
     rows = []
     truth = found[(found["calibrator"] == "least squares") & (found["share"] == 1.0)].set_index(["cell", "cycle"])[
         "q_mobile_C"
@@ -195,12 +163,7 @@ def recorded_table(found: pd.DataFrame) -> pd.DataFrame:
 
 
 def plot_scores(scores: pd.DataFrame) -> Figure:
-    """
-    Errors of all simulated discharges.
-
-    :param scores: one row per mismatch, sensor, calibrator and discharge
-    :return: the figure, a row per mismatch and sensor, a column per parameter
-    """
+    """Errors of all simulated discharges."""
     conditions = list(dict.fromkeys(zip(scores["mismatch"], scores["sensor"], strict=True)))
     figure = new_figure(10.4, 1.9 * len(conditions) + 0.4)
     panels = figure.subplots(len(conditions), len(PARAMETER_NAMES), sharex="col", sharey=True, squeeze=False)
@@ -223,11 +186,7 @@ def plot_scores(scores: pd.DataFrame) -> Figure:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """
-    The command line.
-
-    :param arguments: of the command line by default
-    """
+    """The command line."""
     parser = command_line("mismatch", __doc__, jobs=1)
     parser.add_argument("--discharges", type=positive, default=60, help="simulated test discharges, up to 300")
     parser.add_argument("--cells", nargs="*", choices=BUNDLED_CELLS, default=list(BUNDLED_CELLS))

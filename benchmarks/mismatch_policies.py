@@ -29,16 +29,7 @@ from benchmarks.training import Recipe, timesteps_of, train_or_load
 
 
 def part(algo: str, seed: int, updates: int, discharges: int, folder: Path) -> Tables:
-    """
-    Train a policy, unless that has been done, and score it under all conditions.
-
-    :param algo: ``lac``, ``sac`` or ``td3``
-    :param seed: seed of everything
-    :param updates: gradient steps
-    :param discharges: how many of the test part
-    :param folder: where policies are kept
-    :return: ``mismatch_policies``, one row per condition and discharge
-    """
+    """Train a policy, unless that has been done, and score it under all conditions."""
     timesteps = timesteps_of(updates, Recipe.of(algo, ENV_ID, seed).hyperparameters)
     model = train_or_load(algo, ENV_ID, seed, timesteps, folder / "models", {"env_kwargs": TRAINED_WITH})
     estimator, scores = PolicyEstimator(model, ENV_ID, **OPTIONS), []
@@ -51,12 +42,7 @@ def part(algo: str, seed: int, updates: int, discharges: int, folder: Path) -> T
 
 
 def summary(scores: pd.DataFrame) -> pd.DataFrame:
-    """
-    The table for readers.
-
-    :param scores: one row per condition, policy and discharge
-    :return: one row per condition and algorithm, the means of its seeds side by side
-    """
+    """The table for readers."""
     rows = []
     groups = dict(list(scores.groupby(["mismatch", "sensor", "calibrator"])))
     for mismatch, sensor, algo in product(MISMATCHES, SENSORS, scores["calibrator"].unique()):
@@ -74,11 +60,7 @@ def summary(scores: pd.DataFrame) -> pd.DataFrame:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """
-    The command line.
-
-    :param arguments: of the command line by default
-    """
+    """The command line."""
     parser = command_line("mismatch_policies", __doc__)
     parser.add_argument("--algos", nargs="+", choices=("lac", "sac", "td3"), default=["lac", "sac", "td3"])
     parser.add_argument("--seeds", nargs="+", type=natural, default=[0, 1, 2])

@@ -35,17 +35,7 @@ _LAMBDA_RANGE = 1e-4  # lambda_min / lambda_max as by default: lambda has the sa
 
 
 def part(env_id: str, alpha3: float, lambda_max: float, seed: int, timesteps: int, models: Path) -> Tables:
-    """
-    Train and evaluate one policy.
-
-    :param env_id: id of the environment
-    :param alpha3: see ``LAC``
-    :param lambda_max: see ``LAC``, also the start of lambda
-    :param seed: seed of the training
-    :param timesteps: environment steps
-    :param models: where trained policies are kept
-    :return: ``multipliers``, one row: what came out
-    """
+    """Train and evaluate one policy."""
     hyperparameters = {
         "alpha3": alpha3,
         "lambda_min": _LAMBDA_RANGE * lambda_max,
@@ -84,9 +74,6 @@ def plot(results: pd.DataFrame) -> Figure:
     """
     One column per environment: cost (interquartile mean over seeds with its 95 % interval), and where lambda ended relative to
     its upper limit, over alpha3.
-
-    :param results: of all parts
-    :return: the figure
     """
     figure = new_figure(3.4 * results["env"].nunique(), 5.0)
     panels = figure.subplots(2, results["env"].nunique(), sharex=True, squeeze=False)
@@ -105,12 +92,7 @@ def plot(results: pd.DataFrame) -> Figure:
 
 
 def report(results: pd.DataFrame) -> str:
-    """
-    What came out over seeds, as Markdown: interquartile means with their 95 % intervals, and medians of the multipliers.
-
-    :param results: of all parts
-    :return: one table
-    """
+    """What came out over seeds, as Markdown: interquartile means with their 95 % intervals, and medians of the multipliers."""
 
     def with_interval(values: pd.Series) -> str:
         middle, low, high = (digits(float(value), 3) for value in over_seeds(values))
@@ -134,11 +116,7 @@ def report(results: pd.DataFrame) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """
-    The command line.
-
-    :param arguments: of the command line by default
-    """
+    """The command line."""
     parser = command_line("multipliers", __doc__)
     parser.add_argument("--envs", nargs="+", default=list(_TIMESTEPS), choices=list(_TIMESTEPS))
     parser.add_argument("--alpha3", nargs="+", type=float, default=[0.1, 0.3, 1.0])

@@ -32,13 +32,7 @@ OFFSET_SD_V = 0.01 / np.sqrt(3.0)
 
 
 def calibrators(mismatch: float, every_s: float) -> dict[str, Estimator]:
-    """
-    What is compared.
-
-    :param mismatch: relative standard deviation of the constants
-    :param every_s: time between two estimates, s
-    :return: by name
-    """
+    """What is compared."""
     constants = dict.fromkeys(UNCERTAIN_CONSTANTS, mismatch)
     return {
         "two parameters": LeastSquares(mismatch_V=MISMATCH_V, window_every_s=every_s),
@@ -50,12 +44,7 @@ def calibrators(mismatch: float, every_s: float) -> dict[str, Estimator]:
 
 
 def summary(scores: pd.DataFrame) -> pd.DataFrame:
-    """
-    The table for people.
-
-    :param scores: one row per mismatch, sensor, calibrator and discharge
-    :return: one row per mismatch, sensor and calibrator
-    """
+    """The table for people."""
     rows = []
     for (mismatch, sensor, calibrator), part in scores.groupby(["mismatch", "sensor", "calibrator"], sort=False):
         row = {"mismatch": f"{mismatch:g}", "sensor": sensor, "least squares": calibrator}
@@ -70,27 +59,14 @@ def summary(scores: pd.DataFrame) -> pd.DataFrame:
 
 
 def part(mismatch: float, sensor: str, calibrator: str, discharges: int, every_s: float) -> Tables:
-    """
-    Score one calibrator.
-
-    :param mismatch: relative standard deviation of the constants
-    :param sensor: a name of :data:`benchmarks.contests.SENSORS`
-    :param calibrator: a name of :func:`calibrators`
-    :param discharges: how many of the test part
-    :param every_s: time between two estimates, s
-    :return: one row per discharge
-    """
+    """Score one calibrator."""
     data = standard_dataset("joint", "piecewise", "test", mismatch=mismatch)[:discharges]
     scores = evaluate(calibrators(mismatch, every_s)[calibrator], data, SENSORS[sensor], seed=1)
     return {"nuisance": scores.assign(mismatch=mismatch, sensor=sensor, calibrator=calibrator)}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """
-    The command line.
-
-    :param arguments: of the command line by default
-    """
+    """The command line."""
     parser = command_line("nuisance", __doc__)
     parser.add_argument(
         "--mismatch", nargs="+", type=float, default=[0.2], help="relative standard deviations of the constants"

@@ -52,14 +52,7 @@ _CELLS = 1000
 
 
 def simulated(fit: CellFit, cell: str, folder: Path) -> Path:
-    """
-    The discharges that policies learn on, unless the file is there.
-
-    :param fit: of the cell
-    :param cell: its name, that of the recorded loads
-    :param folder: where to
-    :return: a file of :class:`~battery_env.trajectories.TrajectoryDataset`, named by all that it is made from
-    """
+    """The discharges that policies learn on, unless the file is there."""
     made_from = {"cell": asdict(fit.cell), "q": Q_MOBILE_RANGE_C, "r": R_O_RANGE_OHM, "mismatch": MISMATCH, "n": _CELLS}
     file = folder / f"{cell}_{digest_of(made_from)}.npz"
     if not file.exists():
@@ -81,13 +74,7 @@ class Together:
         self.policies = policies
 
     def predict(self, observation: FloatArray, /, *, deterministic: bool = False) -> tuple[FloatArray, None]:
-        """
-        The mean action.
-
-        :param observation: shape (n, observation_size)
-        :param deterministic: the mean instead of a sample, for each
-        :return: actions, shape (n, 2), and no state
-        """
+        """The mean action."""
         actions = [policy.predict(observation, deterministic=deterministic)[0] for policy in self.policies]
         return np.mean(actions, axis=0), None
 
@@ -108,16 +95,7 @@ def _filter(fit: CellFit, **arguments: Any) -> ExtendedKalmanFilter:
 
 
 def trained(algo: str, seed: int, updates: int, dataset: Path, folder: Path) -> Predictor:
-    """
-    A policy for a cell, trained unless that has been done.
-
-    :param algo: ``lac``, ``sac`` or ``td3``
-    :param seed: seed of everything
-    :param updates: gradient steps
-    :param dataset: of :func:`simulated`
-    :param folder: where it is kept
-    :return: the policy
-    """
+    """A policy for a cell, trained unless that has been done."""
     chosen = {"env_kwargs": {**TRAINED_WITH, "dataset": str(dataset)}}
     timesteps = timesteps_of(updates, Recipe.of(algo, ENV_ID, seed).hyperparameters)
     return train_or_load(algo, ENV_ID, seed, timesteps, folder, chosen)
@@ -126,15 +104,6 @@ def trained(algo: str, seed: int, updates: int, dataset: Path, folder: Path) -> 
 def part(calibrator: str, seeds: list[int], updates: int, fitted: str, tested: str, every: int, folder: Path) -> Tables:
     """
     Fit a cell, make a calibrator with its constants, and let it estimate discharges of the other cell, whole and in progress.
-
-    :param calibrator: a key of ``CLASSICAL``, or the name of an algorithm
-    :param seeds: of its policies; of several the mean action counts
-    :param updates: gradient steps of each
-    :param fitted: a bundled cell
-    :param tested: another one
-    :param every: which of its discharges: every so manieth
-    :param folder: where data and policies are kept
-    :return: ``own_cell``, one row per discharge and part of it
     """
     fit = fitted_to(fitted)
     if calibrator in CLASSICAL:
@@ -172,9 +141,6 @@ def part(calibrator: str, seeds: list[int], updates: int, fitted: str, tested: s
 def with_departure(found: pd.DataFrame) -> pd.DataFrame:
     """
     How far each estimate of ``q_mobile`` is from that of least squares for the whole discharge, which stand for the truth.
-
-    :param found: one row per cell, calibrator, seed, discharge and share of it
-    :return: the same with ``departure_percent``
     """
     key = ["tested", "cycle"]
     whole = found[(found["calibrator"] == "least squares") & (found["share"] == 1.0)]
@@ -190,12 +156,7 @@ def _over_seeds(rows: pd.DataFrame, column: str, decimals: int) -> str:
 
 
 def summary(found: pd.DataFrame) -> pd.DataFrame:
-    """
-    The table for readers.
-
-    :param found: one row per cell, calibrator, seed, discharge and share of it
-    :return: one row per cell and calibrator
-    """
+    """The table for readers."""
     rows = []
     for (tested, calibrator), of_both in with_departure(found).groupby(["tested", "calibrator"], sort=False):
         whole = of_both[of_both["share"] == 1.0]
@@ -217,9 +178,6 @@ def plot(found: pd.DataFrame) -> Figure:
     """
     How far ``q_mobile`` of whole discharges is from that of least squares over the life of a cell, and how far off the end of
     discharge is that is predicted on the way.
-
-    :param found: one row per cell, calibrator, seed, discharge and share of it
-    :return: the figure, a column per tested cell
     """
     names = [name for name in found["calibrator"].unique() if "together" not in name and not name.startswith("the fit")]
     families = list(dict.fromkeys(name.partition(",")[0] for name in names))
@@ -245,11 +203,7 @@ def plot(found: pd.DataFrame) -> Figure:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """
-    The command line.
-
-    :param arguments: of the command line by default
-    """
+    """The command line."""
     parser = command_line("own_cell", __doc__)
     parser.add_argument("--algos", nargs="+", choices=("lac", "sac", "td3"), default=["lac", "sac", "td3"])
     parser.add_argument("--seeds", nargs="+", type=natural, default=[0, 1, 2])

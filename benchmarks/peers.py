@@ -139,14 +139,7 @@ CASES = {case.name: case for case in _CASES}
 
 
 def work(case: Case, unknown: Sequence[str], n: int) -> TrajectoryDataset:
-    """
-    The work: discharges as progpy simulates them (the model with a temperature; tests compare both).
-
-    :param case: the condition
-    :param unknown: what is worn, from a little to much
-    :param n: how many
-    :return: the discharges
-    """
+    """The work: discharges as progpy simulates them (the model with a temperature; tests compare both)."""
     kind = "joint" if case.both_unknown else unknown[0]
     return TrajectoryDataset.generate(
         cast(AgedParameter, kind),
@@ -160,14 +153,7 @@ def work(case: Case, unknown: Sequence[str], n: int) -> TrajectoryDataset:
 
 
 def cpu_time_per_estimate_s(estimator: Estimator, data: TrajectoryDataset, slow: bool) -> float:
-    """
-    What an estimate costs on one core, on a few discharges; the least of several times, as others may use the machine.
-
-    :param estimator: the calibrator
-    :param data: discharges
-    :param slow: whether to take the beginning of one of them only
-    :return: CPU time, s
-    """
+    """What an estimate costs on one core, on a few discharges; the least of several times, as others may use the machine."""
     records = [data[0].part(0, 200)] if slow else [data[n] for n in range(min(len(data), TIMED_DISCHARGES))]
     spent_s, estimates = 0.0, 0
     for record in records:
@@ -182,15 +168,7 @@ def cpu_time_per_estimate_s(estimator: Estimator, data: TrajectoryDataset, slow:
 
 
 def part(method: str, case: str, unknown: Sequence[str], discharges: int) -> Tables:
-    """
-    Score one calibrator under one condition.
-
-    :param method: name of the calibrator
-    :param case: name of the condition
-    :param unknown: what it searches for
-    :param discharges: how many
-    :return: ``peers``, one row per discharge and unknown parameter
-    """
+    """Score one calibrator under one condition."""
     chosen, condition = METHODS[method], CASES[case]
     data = work(condition, unknown, discharges)
     estimator = chosen.make(unknown)
@@ -216,13 +194,7 @@ def part(method: str, case: str, unknown: Sequence[str], discharges: int) -> Tab
 
 
 def parts(n: int, slow_n: int) -> list[dict[str, Any]]:
-    """
-    All parts of this study.
-
-    :param n: discharges
-    :param slow_n: discharges of slow calibrators
-    :return: the arguments of each, see :func:`part`
-    """
+    """All parts of this study."""
     chosen = []
     for case in CASES.values():
         for method in METHODS.values():
@@ -234,25 +206,13 @@ def parts(n: int, slow_n: int) -> list[dict[str, Any]]:
 
 
 def bound_percent(results: pd.DataFrame, case: Case, parameter: str) -> float:
-    """
-    What the mean error of an unbiased calibrator is at least, at the end of the discharges.
-
-    :param results: of all parts
-    :param case: the condition
-    :param parameter: what is unknown
-    :return: % of the truth
-    """
+    """What the mean error of an unbiased calibrator is at least, at the end of the discharges."""
     rows = results[(results["method"] == TRIED[0]) & (results["case"] == case.name) & (results["parameter"] == parameter)]
     return float(_MEAN_MAGNITUDE * 100.0 * (rows["bound"] / rows["true"]).mean())
 
 
 def methods_table(results: pd.DataFrame) -> pd.DataFrame:
-    """
-    All calibrators under the first condition.
-
-    :param results: of all parts
-    :return: one row per calibrator, as shown to readers
-    """
+    """All calibrators under the first condition."""
     base = results[results["case"] == BASE.name]
     rows = []
     for method in METHODS.values():
@@ -277,12 +237,7 @@ def methods_table(results: pd.DataFrame) -> pd.DataFrame:
 
 
 def cases_table(results: pd.DataFrame) -> pd.DataFrame:
-    """
-    Those that were tried under all conditions.
-
-    :param results: of all parts
-    :return: one row per condition, as shown to readers
-    """
+    """Those that were tried under all conditions."""
     rows = []
     for case in CASES.values():
         row = {"case": case.name}
@@ -319,12 +274,7 @@ def _finish(panels: Sequence[Axes], labels: Sequence[str]) -> None:
 
 
 def plot_methods(results: pd.DataFrame) -> Figure:
-    """
-    The errors of all calibrators under the first condition.
-
-    :param results: of all parts
-    :return: the figure
-    """
+    """The errors of all calibrators under the first condition."""
     figure = new_figure(9.6, 3.8)
     panels = figure.subplots(1, len(PARAMETERS), sharey=True)
     for axes, parameter in zip(panels, PARAMETERS, strict=True):
@@ -338,12 +288,7 @@ def plot_methods(results: pd.DataFrame) -> Figure:
 
 
 def plot_cases(results: pd.DataFrame) -> Figure:
-    """
-    The errors of those that were tried under all conditions.
-
-    :param results: of all parts
-    :return: the figure
-    """
+    """The errors of those that were tried under all conditions."""
     figure = new_figure(9.6, 4.0)
     panels = figure.subplots(1, len(PARAMETERS), sharey=True)
     for axes, parameter in zip(panels, PARAMETERS, strict=True):
@@ -361,13 +306,7 @@ def plot_cases(results: pd.DataFrame) -> Figure:
 
 
 def report(results: pd.DataFrame, configuration: dict[str, Any]) -> str:
-    """
-    Both tables, with what they show.
-
-    :param results: of all parts
-    :param configuration: of this study
-    :return: Markdown
-    """
+    """Both tables, with what they show."""
     n, slow_n = configuration["discharges"], configuration["progpy_discharges"]
     noise_mV, (low_ohm, high_ohm) = 1e3 * STATED_NOISE_V, R_O_RANGE_OHM
     methods, cases = (markdown(table) for table in (methods_table(results), cases_table(results)))
@@ -386,11 +325,7 @@ its last estimate for settled. With both unknown, both vary at once over the ran
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """
-    The command line.
-
-    :param arguments: of the command line by default
-    """
+    """The command line."""
     parser = command_line("peers", __doc__, jobs=1)
     parser.add_argument("--discharges", type=positive, default=30, help="for each parameter, and with both worn")
     parser.add_argument("--progpy-discharges", type=positive, default=2, help="likewise, for each estimator of progpy; slow")

@@ -57,38 +57,19 @@ _COPIED_NUMBERS = 2**24
 
 
 def many_cells(cells: int) -> VecEnv:
-    """
-    The environment as one that computes all cells at once.
-
-    :param cells: how many
-    :return: for Stable-Baselines3
-    """
+    """The environment as one that computes all cells at once."""
     return GymnasiumVecEnv(gym.make_vec(_ENV_ID, num_envs=cells, autoreset_mode="SameStep"))
 
 
 def ready_model(
     algorithm: type[LAC] | type[SAC], net_arch: list[int], env: VecEnv, batch_size: int = 256, **kwargs: Any
 ) -> LAC | SAC:
-    """
-    A model that has transitions in its replay buffer and has made its first updates.
-
-    :param algorithm: its class
-    :param net_arch: widths of the hidden layers, of all networks
-    :param env: vectorized environment
-    :param batch_size: batch size
-    :param kwargs: other arguments of the algorithm
-    :return: the model; ``learn()`` makes one update per step of all cells
-    """
+    """A model that has transitions in its replay buffer and has made its first updates."""
     return filled_model(algorithm, env, net_arch, batch_size, _TRANSITIONS, buffer_size=100 * _TRANSITIONS, **kwargs)
 
 
 def update_flops(model: OffPolicyAlgorithm) -> int:
-    """
-    Floating-point operations of the matrix products of one update, as PyTorch counts them.
-
-    :param model: the model
-    :return: their number
-    """
+    """Floating-point operations of the matrix products of one update, as PyTorch counts them."""
     counter = FlopCounterMode(display=False)
     with counter:
         model.train(gradient_steps=1, batch_size=model.batch_size)
@@ -96,50 +77,26 @@ def update_flops(model: OffPolicyAlgorithm) -> int:
 
 
 def moved_bytes(model: LAC) -> int:
-    """
-    The fewest bytes that optimizers and target network move in one update.
-
-    :param model: the model
-    :return: their number
-    """
+    """The fewest bytes that optimizers and target network move in one update."""
     actor, critic = (sum(weight.numel() for weight in net.parameters()) for net in (model.actor, model.critic))
     return (actor + critic) * _ADAM_BYTES + critic * _TARGET_BYTES
 
 
 def updates_of(model: OffPolicyAlgorithm, updates: int, threads: int = 1) -> int:
-    """
-    A turn of updates.
-
-    :param model: the model
-    :param updates: how many
-    :param threads: threads of torch
-    :return: how many
-    """
+    """A turn of updates."""
     th.set_num_threads(threads)
     model.train(gradient_steps=updates, batch_size=model.batch_size)
     return updates
 
 
 def steps_of(model: OffPolicyAlgorithm, steps: int) -> int:
-    """
-    A turn of ``learn()``.
-
-    :param model: the model
-    :param steps: steps of all its cells
-    :return: steps of single cells
-    """
+    """A turn of ``learn()``."""
     model.learn(steps * model.n_envs, reset_num_timesteps=False)
     return steps * model.n_envs
 
 
 def matrix_products(width: int, threads: int) -> int:
-    """
-    A turn of matrix products as they are in a hidden layer, on a batch as large as the layer is wide.
-
-    :param width: of the layer
-    :param threads: threads of torch
-    :return: floating-point operations
-    """
+    """A turn of matrix products as they are in a hidden layer, on a batch as large as the layer is wide."""
     th.set_num_threads(threads)
     # as long a turn for all widths
     number = max(1, 2**28 // width**3)
@@ -150,26 +107,14 @@ def matrix_products(width: int, threads: int) -> int:
 
 
 def copies(source: th.Tensor, target: th.Tensor, threads: int) -> int:
-    """
-    A turn of copies of memory that no cache holds.
-
-    :param source: a large tensor
-    :param target: another one
-    :param threads: threads of torch
-    :return: bytes read and written
-    """
+    """A turn of copies of memory that no cache holds."""
     th.set_num_threads(threads)
     target.copy_(source)
     return 2 * source.nbytes
 
 
 def clock_of(threads: int) -> Callable[[], float]:
-    """
-    The clock for contestants on some threads.
-
-    :param threads: their number
-    :return: the time of the processor, so that other processes do not count, where there is one thread; else that on the wall
-    """
+    """The clock for contestants on some threads."""
     return time.process_time if threads == 1 else time.perf_counter
 
 
@@ -177,11 +122,6 @@ def measure_updates(rounds: int, updates: int, threads: Sequence[int]) -> tuple[
     """
     Updates a second of LAC and SAC with large and small networks, and how long their arithmetic takes at least; beside them
     LAC with two linear critics, as it is where episodes can end at a cost.
-
-    :param rounds: how often each has its turn
-    :param updates: of a turn
-    :param threads: numbers of threads
-    :return: what each contestant did in each round, and the table for readers
     """
     contestants: dict[int, dict[str, Callable[[], int]]] = {count: {} for count in threads}
     work: dict[str, tuple[int, int, int]] = {}
@@ -228,10 +168,6 @@ def measure_compiled(rounds: int, updates: int) -> tuple[pd.DataFrame, pd.DataFr
     """
     Updates a second of LAC on one thread, compiled and not, beside those of SAC, with large and small networks; and steps of
     64 cells a second of ``learn()`` with one update per step of all cells.
-
-    :param rounds: how often each has its turn
-    :param updates: of a turn
-    :return: what each contestant did in each round, and the table for readers
     """
     # code is compiled for a number of threads
     th.set_num_threads(1)
@@ -285,9 +221,7 @@ class Stopwatch:
 
     @contextmanager
     def part(self, name: str) -> Iterator[None]:
-        """
-        :param name: of what follows
-        """
+        """"""
         self._turn()
         self._running.append(name)
         try:
@@ -297,11 +231,7 @@ class Stopwatch:
             self._running.pop()
 
     def watched(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        """
-        :param name: of the part
-        :param function: what it consists of
-        :return: the same function, its time taken
-        """
+        """"""
 
         def call(*arguments: Any, **keywords: Any) -> Any:
             with self.part(name):
@@ -311,13 +241,7 @@ class Stopwatch:
 
 
 def profile_learn(model: LAC | SAC, steps: int) -> dict[str, float]:
-    """
-    Where the time of ``learn()`` goes.
-
-    :param model: the model
-    :param steps: steps of all its cells
-    :return: seconds by part; the last one is what none of the others accounts for
-    """
+    """Where the time of ``learn()`` goes."""
     watch = Stopwatch()
     assert model.replay_buffer is not None and model.env is not None
     parts = [
@@ -344,14 +268,7 @@ def profile_learn(model: LAC | SAC, steps: int) -> dict[str, float]:
 
 
 def measure_learn(cells: int, rounds: int, steps: int) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]:
-    """
-    Environment steps a second of ``learn()`` with one update per step of all cells.
-
-    :param cells: how many
-    :param rounds: how often each has its turn
-    :param steps: steps of all cells in a turn
-    :return: what each contestant did in each round, the table for readers, and the shares of LAC's time
-    """
+    """Environment steps a second of ``learn()`` with one update per step of all cells."""
     models = {
         "LAC, all cells at once": ready_model(LAC, _LARGE, many_cells(cells)),
         "SAC, all cells at once": ready_model(SAC, _LARGE, many_cells(cells)),
@@ -370,13 +287,7 @@ def measure_learn(cells: int, rounds: int, steps: int) -> tuple[pd.DataFrame, pd
 
 
 def measure_growth(rounds: int, updates: int) -> pd.DataFrame:
-    """
-    How LAC's speed changes with cells, batch size and width.
-
-    :param rounds: how often each has its turn
-    :param updates: updates of a turn, and steps of all cells
-    :return: one row per point and round: ``over``, ``value``, ``speed`` (steps of cells a second, or updates a second)
-    """
+    """How LAC's speed changes with cells, batch size and width."""
     contestants: dict[str, Callable[[], int]] = {}
     for cells in _CELLS:
         contestants[f"cells {cells}"] = partial(steps_of, ready_model(LAC, _LARGE, many_cells(cells)), updates)
@@ -392,10 +303,7 @@ def measure_growth(rounds: int, updates: int) -> pd.DataFrame:
 
 
 def plot_growth(table: pd.DataFrame) -> Figure:
-    """
-    :param table: see :func:`measure_growth`
-    :return: medians, and bands from quartile to quartile
-    """
+    """"""
     figure = new_figure(10.0, 3.2)
     panels = {
         "cells": ("cells, one update per step of all", "cell steps a second"),
@@ -418,30 +326,19 @@ def plot_growth(table: pd.DataFrame) -> Figure:
 
 
 def own_env_ids() -> list[str]:
-    """
-    :return: ids of the environments of this project
-    """
+    """"""
     packages = ("battery_env", "sb3_lac")
     return sorted(name for name, spec in gym.registry.items() if str(spec.entry_point).startswith(packages))
 
 
 def transition_bytes(observation_space: spaces.Box, action_space: spaces.Box) -> int:
-    """
-    Memory of one transition: two observations, the action, and reward, end and time limit in fp32.
-
-    :param observation_space: of the environment
-    :param action_space: of the environment
-    :return: bytes
-    """
+    """Memory of one transition: two observations, the action, and reward, end and time limit in fp32."""
     numbers = 2 * int(np.prod(observation_space.shape)) + int(np.prod(action_space.shape)) + 3
     return 4 * numbers
 
 
 def measure_memory(transitions: int) -> pd.DataFrame:
-    """
-    :param transitions: that the replay buffer holds
-    :return: one row per environment: bytes of a transition, and of the buffer as computed and as allocated
-    """
+    """"""
     rows = []
     for env_id in own_env_ids():
         env = gym.make(env_id)
@@ -468,11 +365,7 @@ def measure_memory(transitions: int) -> pd.DataFrame:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """
-    The command line.
-
-    :param arguments: of the command line by default
-    """
+    """The command line."""
     parser = command_line("performance", __doc__, jobs=None)
     parser.add_argument("--only", nargs="+", choices=SECTIONS, default=list(SECTIONS), help="what to measure, all by default")
     parser.add_argument("--rounds", type=positive, default=20, help="turns of each contestant")

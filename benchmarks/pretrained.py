@@ -55,31 +55,14 @@ MISMATCHES = (0.0, 0.1, 0.2)
 
 
 def recipe_of(env_id: str, seed: int, updates: int, recorded: bool) -> Recipe:
-    """
-    What a policy depends on.
-
-    :param env_id: a key of ``FOUND``
-    :param seed: seed of everything
-    :param updates: gradient steps
-    :param recorded: whether it is one for recorded cells
-    :return: the recipe
-    """
+    """What a policy depends on."""
     timesteps = timesteps_of(updates, Recipe.of("lac", env_id, seed).hyperparameters)
     options = TRAINED_WITH | (RECORDED if recorded else {})
     return Recipe.of("lac", env_id, seed, timesteps, hyperparameters={"env_kwargs": options})
 
 
 def make(env_id: str, seed: int, updates: int, recorded: bool, folder: Path) -> Recipe:
-    """
-    Train a policy, unless that has been done, and write it as ONNX, with the options that it needs beside it.
-
-    :param env_id: a key of ``FOUND``
-    :param seed: seed of everything
-    :param updates: gradient steps
-    :param recorded: whether it is one for recorded cells
-    :param folder: where to
-    :return: the recipe
-    """
+    """Train a policy, unless that has been done, and write it as ONNX, with the options that it needs beside it."""
     recipe = recipe_of(env_id, seed, updates, recorded)
     chosen = {"env_kwargs": recipe.hyperparameters["env_kwargs"]}
     model = train_or_load("lac", env_id, seed, recipe.timesteps, folder / "models", chosen)
@@ -91,18 +74,7 @@ def make(env_id: str, seed: int, updates: int, recorded: bool, folder: Path) -> 
 
 
 def part(env_id: str, recorded: bool, recipe: str, mismatch: float, sensor: str, discharges: int, folder: Path) -> Tables:
-    """
-    Score a policy.
-
-    :param env_id: a key of ``FOUND``
-    :param recorded: whether it is one for recorded cells
-    :param recipe: digest of what it was made by
-    :param mismatch: how wrong the constants are
-    :param sensor: a name of :data:`benchmarks.contests.SENSORS`
-    :param discharges: how many of the test part
-    :param folder: where the policy is
-    :return: one row per discharge
-    """
+    """Score a policy."""
     policy, options = policy_of_file(folder / f"{file_stem(env_id, recorded)}.onnx")
     data = standard_dataset(FOUND[env_id], "piecewise", "test", mismatch=mismatch)[:discharges]
     scores = evaluate(PolicyEstimator(policy, env_id, **options), data, SENSORS[sensor], seed=1)
@@ -110,12 +82,7 @@ def part(env_id: str, recorded: bool, recipe: str, mismatch: float, sensor: str,
 
 
 def summary(scores: pd.DataFrame) -> pd.DataFrame:
-    """
-    The scores over discharges.
-
-    :param scores: one row per environment, mismatch, sensor and discharge
-    :return: one row per environment, mismatch, sensor and parameter that is to be found; errors of the second half in per cent
-    """
+    """The scores over discharges."""
     rows = []
     for (env_id, mismatch, sensor), group in scores.groupby(["env_id", "mismatch", "sensor"], sort=False):
         found = FOUND[str(env_id)]
@@ -139,15 +106,7 @@ def summary(scores: pd.DataFrame) -> pd.DataFrame:
 
 
 def card_of(recipe: Recipe, scores: pd.DataFrame, command: str, file: Path) -> dict[str, Any]:
-    """
-    What a policy says of itself.
-
-    :param recipe: what made it
-    :param scores: its rows of :func:`summary`
-    :param command: the one that made it
-    :param file: the policy, in the folder of its model's
-    :return: for JSON
-    """
+    """What a policy says of itself."""
     wander_V = recipe.hyperparameters["env_kwargs"].get("process_noise_V", 0.0)
     return {
         "env_id": recipe.env_id,
@@ -168,12 +127,7 @@ def card_of(recipe: Recipe, scores: pd.DataFrame, command: str, file: Path) -> d
 
 
 def shown(table: pd.DataFrame) -> str:
-    """
-    The summary for readers.
-
-    :param table: of :func:`summary`
-    :return: Markdown
-    """
+    """The summary for readers."""
     return markdown(
         [
             {
@@ -192,11 +146,7 @@ def shown(table: pd.DataFrame) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """
-    The command line.
-
-    :param arguments: of the command line by default
-    """
+    """The command line."""
     parser = command_line("pretrained", __doc__, jobs=1)
     parser.add_argument("--envs", nargs="+", choices=FOUND, default=list(FOUND), metavar="ID")
     parser.add_argument("--recorded", action="store_true", help="policies for recorded cells")

@@ -79,22 +79,12 @@ class ProgpyFilter(Estimator):
         self.seed = seed
 
     def estimate(self, record: Record) -> Estimate:
-        """
-        The estimate at the last sample of a record.
-
-        :param record: one discharge
-        :return: the estimate
-        """
+        """The estimate at the last sample of a record."""
         trace = self.trace([record])[0]
         return Estimate(float(trace.q_mobile[-1]), float(trace.r_o[-1]))
 
     def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:
-        """
-        One estimate for every sample but the first of many discharges.
-
-        :param records: discharges
-        :return: one trace per discharge, in the same order
-        """
+        """One estimate for every sample but the first of many discharges."""
         traces = []
         for record in records:
             values = {name: np.full(len(record.time_s) - 1, getattr(NEW_CELL, name)) for name in _NAMES}

@@ -44,23 +44,13 @@ _AGES = {"fresh": 0.0, "middle": 0.5, "aged": 1.0}
 
 
 def calibrator(prior_q_mobile_C: float | None = None) -> LeastSquares:
-    """
-    Least squares as used here.
-
-    :param prior_q_mobile_C: q_mobile of the previous discharge, C, if it is to be carried over
-    :return: the calibrator
-    """
+    """Least squares as used here."""
     prior = None if prior_q_mobile_C is None else (prior_q_mobile_C, PRIOR_SD_SHARE * prior_q_mobile_C)
     return LeastSquares(thermal=True, mismatch_V=MISMATCH_V, prior_q_mobile_C=prior)
 
 
 def fit_whole(discharge: Discharge) -> dict[str, float | str | bool]:
-    """
-    Calibrate to one whole discharge.
-
-    :param discharge: as recorded
-    :return: one row of the table of discharges
-    """
+    """Calibrate to one whole discharge."""
     record = discharge.loaded_part(CUT_OFF_V)
     duration_s = record.time_s[-1] - record.time_s[0]
     estimate = calibrator().estimate(record)
@@ -82,13 +72,7 @@ def fit_whole(discharge: Discharge) -> dict[str, float | str | bool]:
 
 
 def fit_in_progress(discharge: Discharge, previous_q_mobile_C: float) -> list[dict[str, float | str | bool]]:
-    """
-    Calibrate to the beginnings of one discharge, without and with a prior.
-
-    :param discharge: as recorded
-    :param previous_q_mobile_C: estimate from the whole previous discharge, C
-    :return: one row per share of the discharge and method
-    """
+    """Calibrate to the beginnings of one discharge, without and with a prior."""
     record = discharge.loaded_part(CUT_OFF_V)
     start_s, end_s = record.time_s[[0, -1]]
     rows = []
@@ -108,12 +92,7 @@ def fit_in_progress(discharge: Discharge, previous_q_mobile_C: float) -> list[di
 
 
 def part(cell: str) -> Tables:
-    """
-    Both experiments with one cell.
-
-    :param cell: its name
-    :return: ``discharges``, one row each, and ``in_progress``, one row per discharge, share of it and method
-    """
+    """Both experiments with one cell."""
     whole, in_progress = [], []
     previous_q_mobile_C = None
     for discharge in tqdm(load_nasa_discharges(cell), desc=cell, unit="discharge", file=sys.stderr):
@@ -125,12 +104,7 @@ def part(cell: str) -> Tables:
 
 
 def whole_table(whole: pd.DataFrame) -> pd.DataFrame:
-    """
-    The summary of the first experiment.
-
-    :param whole: one row per discharge
-    :return: one row per cell, as shown to readers
-    """
+    """The summary of the first experiment."""
     rows = []
     for cell, part in whole.groupby("cell"):
         first, last = part.iloc[0], part.iloc[-1]
@@ -158,13 +132,7 @@ def whole_table(whole: pd.DataFrame) -> pd.DataFrame:
 
 
 def progress_table(progress: pd.DataFrame, whole: pd.DataFrame) -> pd.DataFrame:
-    """
-    The summary of the second experiment.
-
-    :param progress: one row per discharge, share and method
-    :param whole: one row per discharge
-    :return: one row per cell, share and method, as shown to readers
-    """
+    """The summary of the second experiment."""
     known = progress.merge(whole[["cell", "cycle", "q_mobile_C"]], on=["cell", "cycle"], suffixes=("", "_whole"))
     rows = []
     for (cell, _, method), part in known.groupby(["cell", "share", "method"]):
@@ -186,12 +154,7 @@ def progress_table(progress: pd.DataFrame, whole: pd.DataFrame) -> pd.DataFrame:
 
 
 def repetition_table(whole: pd.DataFrame) -> pd.DataFrame:
-    """
-    How much a discharge is like the one before: what a prior can rest on, and what it has to compete with.
-
-    :param whole: one row per discharge
-    :return: one row per cell, as shown to readers
-    """
+    """How much a discharge is like the one before: what a prior can rest on, and what it has to compete with."""
     rows = []
     for cell, part in whole.groupby("cell"):
         move = 100.0 * part["q_mobile_C"].pct_change()
@@ -207,12 +170,7 @@ def repetition_table(whole: pd.DataFrame) -> pd.DataFrame:
 
 
 def plot_life(whole: pd.DataFrame) -> Figure:
-    """
-    Both parameters over the life of each cell, with what was measured.
-
-    :param whole: one row per discharge
-    :return: the figure
-    """
+    """Both parameters over the life of each cell, with what was measured."""
     cells = list(dict.fromkeys(whole["cell"]))
     figure = new_figure(4.2 * len(cells), 5.4)
     panels = figure.subplots(2, len(cells), sharex=True, sharey="row", squeeze=False)
@@ -256,13 +214,7 @@ def plot_life(whole: pd.DataFrame) -> Figure:
 
 
 def plot_voltages(discharges: dict[str, list[Discharge]], whole: pd.DataFrame) -> Figure:
-    """
-    A fresh, a middle and an aged discharge of each cell, with the fitted and the new cell's model.
-
-    :param discharges: by cell
-    :param whole: one row per discharge
-    :return: the figure
-    """
+    """A fresh, a middle and an aged discharge of each cell, with the fitted and the new cell's model."""
     figure = new_figure(9.6, 2.5 * len(discharges) + 0.6)
     panels = figure.subplots(len(discharges), len(_AGES), sharex=True, sharey=True, squeeze=False)
     for row, (cell, records) in zip(panels, discharges.items(), strict=True):
@@ -289,11 +241,7 @@ def plot_voltages(discharges: dict[str, list[Discharge]], whole: pd.DataFrame) -
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """
-    The command line.
-
-    :param arguments: of the command line by default
-    """
+    """The command line."""
     parser = command_line("real_cells", __doc__)
     parser.add_argument("--cells", nargs="+", default=list(BUNDLED_CELLS), choices=BUNDLED_CELLS)
     study = Study(parser, arguments)

@@ -46,12 +46,7 @@ _IMPULSE_INTERVAL = 85
 
 
 def conditions(env_id: str) -> dict[str, dict[str, Any]]:
-    """
-    The disturbances that a controller is tried with, one at a time.
-
-    :param env_id: id of a cost environment
-    :return: arguments of the environment by name of the condition
-    """
+    """The disturbances that a controller is tried with, one at a time."""
     impulse, changed, process_noise, observation_noise, delay = DISTURBANCES[env_id]
     return {
         "none": {},
@@ -64,14 +59,7 @@ def conditions(env_id: str) -> dict[str, dict[str, Any]]:
 
 
 def tried(policy: PolicyPredictor, env_id: str, episodes: int) -> pd.DataFrame:
-    """
-    Try a policy under all conditions.
-
-    :param policy: the policy, or a controller
-    :param env_id: id of the environment
-    :param episodes: episodes for each condition, with the same starts for every policy
-    :return: one row per condition
-    """
+    """Try a policy under all conditions."""
     problem = gym.make(env_id).unwrapped
     assert isinstance(problem, CostEnv)
     rows = []
@@ -98,23 +86,12 @@ def tried(policy: PolicyPredictor, env_id: str, episodes: int) -> pd.DataFrame:
 
 
 def part(env_id: str, episodes: int) -> Tables:
-    """
-    Try the reference controller under all conditions.
-
-    :param env_id: id of a cost environment
-    :param episodes: episodes for each condition
-    :return: ``references``, one row per condition
-    """
+    """Try the reference controller under all conditions."""
     return {"references": tried(reference_controller(gym.make(env_id)), env_id, episodes)}
 
 
 def report(results: pd.DataFrame) -> str:
-    """
-    One table, as Markdown.
-
-    :param results: see ``part()``, of all environments
-    :return: the table
-    """
+    """One table, as Markdown."""
     shown = {
         "environment": results["environment"],
         "disturbance": results["disturbance"] + [f" ({text})" if text else "" for text in results["arguments"]],
@@ -133,14 +110,7 @@ def report(results: pd.DataFrame) -> str:
 
 
 def draw_shares(axes: Axes, results: pd.DataFrame, by: str, order: list[str]) -> None:
-    """
-    A map of the share of episodes that end at the goal, and in brackets of those that die, by disturbance.
-
-    :param axes: to draw on
-    :param results: rows of :func:`tried`
-    :param by: column that has a row of the map for each of its values
-    :param order: of these rows
-    """
+    """A map of the share of episodes that end at the goal, and in brackets of those that die, by disturbance."""
     shares, deaths = (
         results.pivot_table(index=by, columns="disturbance", values=column, sort=False).loc[order]
         for column in ("at_goal", "died")
@@ -155,12 +125,7 @@ def draw_shares(axes: Axes, results: pd.DataFrame, by: str, order: list[str]) ->
 
 
 def plot(results: pd.DataFrame) -> Figure:
-    """
-    The share of episodes that end at the goal, and in brackets of those that die.
-
-    :param results: see ``part()``, of all environments
-    :return: the figure
-    """
+    """The share of episodes that end at the goal, and in brackets of those that die."""
     figure = new_figure(7.6, 3.2)
     axes = figure.subplots()
     draw_shares(axes, results, "environment", list(results["environment"].unique()))
@@ -169,11 +134,7 @@ def plot(results: pd.DataFrame) -> Figure:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """
-    The command line.
-
-    :param arguments: of the command line by default
-    """
+    """The command line."""
     parser = command_line("references", __doc__)
     parser.add_argument("--episodes", type=positive, default=100, help="episodes for each environment and condition")
     study = Study(parser, arguments)

@@ -59,14 +59,7 @@ the least to the largest seed.</p>
 
 
 def read_errors(results: Path) -> pd.DataFrame:
-    """
-    The errors of single discharges in all CSV files of a folder that hold such.
-
-    :param results: folder with CSV files, searched with the folders in it
-    :return: one row per discharge, seed, calibrator and ``comparison`` (file, parameter and sensor), with ``error_percent``;
-        ``source`` is the file, relative to the folder
-    :raises FileNotFoundError: if no file holds errors of discharges
-    """
+    """The errors of single discharges in all CSV files of a folder that hold such."""
     tables = []
     for file in sorted(results.rglob("*.csv")):
         columns = set(pd.read_csv(file, nrows=0).columns)
@@ -112,11 +105,6 @@ def interquartile_mean(errors: FloatArray, seed: int = 0) -> tuple[float, float,
     Mean of the half in the middle, with a bootstrap interval over seeds and discharges (percentiles). See Agarwal et al. 2021,
     Deep Reinforcement Learning at the Edge of the Statistical Precipice; there every task has runs of its own, here all
     discharges of a seed share its policy, so that seeds are resampled as a whole.
-
-    :param errors: shape (seeds, discharges)
-    :param seed: of the resampling
-    :return: the mean, lower and upper limit of its 95 % interval
-    :raises ValueError: for less than two discharges
     """
     if errors.ndim != 2 or errors.shape[1] < 2:
         raise ValueError(f"errors must have the shape (seeds, discharges) with at least two discharges, got {errors.shape}")
@@ -144,13 +132,7 @@ def interquartile_mean(errors: FloatArray, seed: int = 0) -> tuple[float, float,
 
 
 def summary(errors: pd.DataFrame) -> pd.DataFrame:
-    """
-    What one comparison says.
-
-    :param errors: rows of one comparison of :func:`read_errors`
-    :return: one row per calibrator: ``seeds``, ``discharges``, ``mean``, ``sd`` (over seeds, NaN if unknown), ``worst``,
-        ``interquartile_mean`` with ``low`` and ``high``; all but the counts in per cent
-    """
+    """What one comparison says."""
     rows = []
     for calibrator, of_calibrator in errors.groupby("calibrator", sort=False):
         matrix = _by_seed(of_calibrator)
@@ -164,24 +146,12 @@ def summary(errors: pd.DataFrame) -> pd.DataFrame:
 
 
 def profile(errors: FloatArray, thresholds: FloatArray) -> FloatArray:
-    """
-    The share of the discharges with an error below each of several values.
-
-    :param errors: shape (seeds, discharges)
-    :param thresholds: shape (n,)
-    :return: for each seed, shape (seeds, n), within 0 .. 1
-    """
+    """The share of the discharges with an error below each of several values."""
     return (errors[:, :, np.newaxis] < thresholds).mean(axis=1)
 
 
 def plot_profiles(errors: pd.DataFrame, title: str) -> Figure:
-    """
-    Performance profiles: one line per calibrator, with a band from the least to the largest seed.
-
-    :param errors: rows of one comparison of :func:`read_errors`
-    :param title: of the figure
-    :return: the figure
-    """
+    """Performance profiles: one line per calibrator, with a band from the least to the largest seed."""
     positive = errors["error_percent"][(errors["error_percent"] > 0) & np.isfinite(errors["error_percent"])]
     thresholds = np.geomspace(positive.min(), 1.05 * positive.max(), 200)
     figure = new_figure(6.4, 3.4)
@@ -204,13 +174,7 @@ def _by_seed(errors: pd.DataFrame) -> FloatArray:
 
 
 def pages(results: Path) -> tuple[str, str]:
-    """
-    The report.
-
-    :param results: folder with CSV files
-    :return: an HTML page that needs no other file, and its tables as Markdown
-    :raises FileNotFoundError: if no file holds errors of discharges
-    """
+    """The report."""
     page, tables = [_HEAD], [f"# {_TITLE}\n"]
     for (source, comparison), errors in read_errors(results).groupby(["source", "comparison"], sort=False):
         title, table = html.escape(str(comparison)), _shown(summary(errors))
@@ -249,11 +213,7 @@ def _shown(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """
-    The command line.
-
-    :param arguments: of the command line by default
-    """
+    """The command line."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.report", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -68,17 +68,7 @@ def roll_out(
     noise_std: float = 0.0,
     seed: int = EVALUATION_SEED,
 ) -> pd.DataFrame:
-    """
-    Run a policy, deterministically, in all episodes at once.
-
-    :param model: the policy, or a controller
-    :param make_env: makes the environment
-    :param episodes: how many; the same starts and disturbances for every policy
-    :param noise_std: standard deviation of the noise on each observed variable
-    :param seed: seed of the first episode, those of the others follow
-    :return: one row per episode: mean cost per step, length, distance to the goal at the start and at the end, and whether it
-        died
-    """
+    """Run a policy, deterministically, in all episodes at once."""
     envs = [make_env() for _ in range(episodes)]
     rngs = [np.random.default_rng((seed, episode)) for episode in range(episodes)]
     starts = [env.reset(seed=seed + episode) for episode, env in enumerate(envs)]
@@ -108,28 +98,14 @@ def roll_out(
 
 
 def conditions(study: str) -> list[tuple[dict[str, Any], float]]:
-    """
-    All combinations of a study.
-
-    :param study: its name
-    :return: arguments of the environment and noise on observations
-    """
+    """All combinations of a study."""
     _, arguments, noises = _STUDIES[study]
     grid = itertools.product(*arguments.values())
     return [(dict(zip(arguments, values, strict=True)), noise) for values in grid for noise in noises]
 
 
 def part(algo: str, seed: int, timesteps: dict[str, int], episodes: int, models: Path) -> Tables:
-    """
-    Train a policy for each environment, and try it under all conditions.
-
-    :param algo: ``lac``, ``sac`` or ``td3``
-    :param seed: seed of the training
-    :param timesteps: environment steps of the training, by environment
-    :param episodes: episodes for each condition
-    :param models: where trained policies are kept
-    :return: ``robustness``, one row per condition
-    """
+    """Train a policy for each environment, and try it under all conditions."""
     rows = []
     for study, (env_id, _, _) in _STUDIES.items():
         model = train_or_load(algo, env_id, seed, timesteps[env_id], models / f"{env_id}_{algo}_seed{seed}")
@@ -151,23 +127,12 @@ def part(algo: str, seed: int, timesteps: dict[str, int], episodes: int, models:
 
 
 def varied(study: str) -> list[str]:
-    """
-    What varies in a study.
-
-    :param study: its name
-    :return: columns of the table
-    """
+    """What varies in a study."""
     return [*_STUDIES[study][1]] or ["observation_noise"]
 
 
 def plot_lines(results: pd.DataFrame, studies: Sequence[tuple[str, str]]) -> Figure:
-    """
-    One panel per study: a metric over what varies, interquartile mean over seeds with its 95 % interval.
-
-    :param results: of all parts
-    :param studies: names of studies with one varied column, each with the metric to show
-    :return: the figure
-    """
+    """One panel per study: a metric over what varies, interquartile mean over seeds with its 95 % interval."""
     figure = new_figure(3.4 * len(studies), 3.0)
     for axes, (study, metric) in zip(figure.subplots(1, len(studies), squeeze=False)[0], studies, strict=True):
         column, of_study = varied(study)[0], results[results["study"] == study]
@@ -188,11 +153,6 @@ def plot_grid(results: pd.DataFrame, study: str, metric: str) -> Figure:
     """
     One map per algorithm: the interquartile mean over seeds of a metric over two parameters; in the titles of costs that over
     all conditions and seeds, with its 95 % interval.
-
-    :param results: of all parts
-    :param study: name of a study with two varied columns
-    :param metric: ``"death_rate"`` or ``"cost"``
-    :return: the figure
     """
     results = results[results["study"] == study]
     row, column = varied(study)
@@ -221,12 +181,7 @@ def plot_grid(results: pd.DataFrame, study: str, metric: str) -> Figure:
 
 
 def report(results: pd.DataFrame) -> str:
-    """
-    Mean and standard deviation over seeds, as Markdown.
-
-    :param results: of all parts
-    :return: one table per study
-    """
+    """Mean and standard deviation over seeds, as Markdown."""
 
     text = ""
     for study, of_study in results.groupby("study", sort=False):
@@ -240,11 +195,7 @@ def report(results: pd.DataFrame) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """
-    The command line.
-
-    :param arguments: of the command line by default
-    """
+    """The command line."""
     parser = command_line("robustness", __doc__)
     parser.add_argument("--algos", nargs="+", default=list(_ALGORITHMS), choices=_ALGORITHMS)
     parser.add_argument("--seeds", nargs="+", type=natural, default=[0, 1, 2, 3, 4])

@@ -179,14 +179,7 @@ FAMILIES = {
 
 
 def sampled(algo: str, env_id: str, trial: Trial) -> dict[str, Any]:
-    """
-    The settings of a trial.
-
-    :param algo: one that the family of the environment varies
-    :param env_id: one of ``FAMILIES``
-    :param trial: what chooses
-    :return: as in a file of ``zoo_configs``
-    """
+    """The settings of a trial."""
     family = FAMILIES[env_id]
     settings: dict[str, Any] = {}
     varied = family.varied[algo]
@@ -209,16 +202,7 @@ def sampled(algo: str, env_id: str, trial: Trial) -> dict[str, Any]:
 
 
 def score(algo: str, env_id: str, updates: int, folder: Path, trial: Trial) -> float:
-    """
-    Train one policy and score it.
-
-    :param algo: one that the family of the environment varies
-    :param env_id: one of ``FAMILIES``
-    :param updates: gradient steps
-    :param folder: where the zoo writes what it does
-    :param trial: what chooses the settings, and is told the median and the worst score
-    :return: mean score
-    """
+    """Train one policy and score it."""
     family = FAMILIES[env_id]
     recipe = Recipe.of(algo, env_id, trial.number, hyperparameters=sampled(algo, env_id, trial))
     _, model = set_up(recipe, folder)
@@ -240,19 +224,7 @@ def part(
     others: dict[str, dict[str, Any]],
     out: Path,
 ) -> Tables:
-    """
-    The search of one algorithm, or what is left of it.
-
-    :param algo: one that the family of the environment varies
-    :param env_id: one of ``FAMILIES``
-    :param trials: trials in all
-    :param updates: gradient steps of each
-    :param finalists: how many of the best are trained again
-    :param repeats: how often
-    :param others: settings that other algorithms found, by algorithm; each is one more trial, and trained again as often
-    :param out: folder of the journal
-    :return: ``search``, one row per trial; means over its seeds, the worst discharge of any seed
-    """
+    """The search of one algorithm, or what is left of it."""
     out.mkdir(parents=True, exist_ok=True)
     study = optuna.create_study(
         study_name=f"{env_id} {algo} {updates} updates",
@@ -330,12 +302,7 @@ def _taken_by(algo: str) -> set[str]:
 
 
 def report(trials: pd.DataFrame) -> str:
-    """
-    The best trials of each algorithm, trained with several seeds, and the first one, as Markdown.
-
-    :param trials: of all algorithms
-    :return: one table per algorithm
-    """
+    """The best trials of each algorithm, trained with several seeds, and the first one, as Markdown."""
     text = ""
     mean = next(name for name in trials.columns if name.startswith("mean_"))
     for algo, of_algo in trials.groupby("algo", sort=False):
@@ -347,11 +314,7 @@ def report(trials: pd.DataFrame) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """
-    The command line.
-
-    :param arguments: of the command line by default
-    """
+    """The command line."""
     parser = command_line("search", __doc__)
     parser.add_argument("--env", default="BatteryQmax-v0", choices=list(FAMILIES))
     parser.add_argument("--algos", nargs="+", default=["lac", "sac", "td3"], choices=list(_COST.varied))

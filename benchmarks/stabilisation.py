@@ -66,19 +66,7 @@ def part(
     certificate_episodes: int,
     models: Path,
 ) -> Tables:
-    """
-    Train a policy, or take the reference controller, and judge it.
-
-    :param policy: name of an algorithm, or ``reference``
-    :param env_id: id of the environment
-    :param seed: seed of the training, ``None`` for the reference controller
-    :param timesteps: environment steps of the training
-    :param recipe: digest of the training's recipe, which names the part: with other hyperparameters it is another one
-    :param episodes: episodes for each disturbance
-    :param certificate_episodes: episodes to fit a Lyapunov function, to judge it and to certify, each
-    :param models: where trained policies are kept
-    :return: ``stabilisation``, one row per disturbance; ``certificates``, one row per Lyapunov function
-    """
+    """Train a policy, or take the reference controller, and judge it."""
     predictor: PolicyPredictor
     if policy == _REFERENCE:
         predictor, updates, minutes = reference_controller(gym.make(env_id)), None, None
@@ -113,12 +101,7 @@ def _in_order(names: pd.Series) -> pd.Series:
 
 
 def undisturbed_table(results: pd.DataFrame) -> pd.DataFrame:
-    """
-    What policies cost and where they end, without disturbances.
-
-    :param results: ``stabilisation`` of all parts
-    :return: cells as they are shown, one row per environment and policy
-    """
+    """What policies cost and where they end, without disturbances."""
     rows = []
     undisturbed = results[results["disturbance"] == "none"]
     for (env_id, policy), group in undisturbed.groupby(["environment", "policy"], sort=False):
@@ -139,13 +122,7 @@ def undisturbed_table(results: pd.DataFrame) -> pd.DataFrame:
 
 
 def disturbed_table(results: pd.DataFrame) -> pd.DataFrame:
-    """
-    What each disturbance does.
-
-    :param results: ``stabilisation`` of all parts
-    :return: cells as they are shown, one row per environment and policy: mean over seeds of the share that ends at the goal,
-        and in brackets of the share that dies
-    """
+    """What each disturbance does."""
     rows = []
     for (env_id, policy), group in results.groupby(["environment", "policy"], sort=False):
         row: dict[str, Any] = {"environment": env_id, "policy": policy}
@@ -156,12 +133,7 @@ def disturbed_table(results: pd.DataFrame) -> pd.DataFrame:
 
 
 def certificate_table(certificates: pd.DataFrame) -> pd.DataFrame:
-    """
-    What the certificates say.
-
-    :param certificates: of all parts
-    :return: cells as they are shown, one row per environment, policy and Lyapunov function
-    """
+    """What the certificates say."""
     rows = []
     for (env_id, policy, function), group in certificates.groupby(["environment", "policy", "function"], sort=False):
         held, calibrated = group[group["holds"]], group["calibration_slope"].dropna()
@@ -183,12 +155,7 @@ def certificate_table(certificates: pd.DataFrame) -> pd.DataFrame:
 
 
 def report(tables: Tables) -> str:
-    """
-    All tables, as Markdown.
-
-    :param tables: of all parts
-    :return: three tables
-    """
+    """All tables, as Markdown."""
     results = tables["stabilisation"]
     return "\n".join(
         [
@@ -206,9 +173,6 @@ def report(tables: Tables) -> str:
 def plot_costs(results: pd.DataFrame) -> Figure:
     """
     The cost of each policy and the share that ends at the goal: each seed, and the interquartile mean with its 95 % interval.
-
-    :param results: ``stabilisation`` of all parts
-    :return: the figure
     """
     undisturbed = results[results["disturbance"] == "none"]
     envs, names = list(undisturbed["environment"].unique()), [name for name in _STYLES if name in set(undisturbed["policy"])]
@@ -241,9 +205,6 @@ def plot_costs(results: pd.DataFrame) -> Figure:
 def plot_disturbances(results: pd.DataFrame) -> Figure:
     """
     One map per environment: the share of episodes at the goal, and in brackets of those that die, by policy and disturbance.
-
-    :param results: ``stabilisation`` of all parts
-    :return: the figure
     """
     envs = list(results["environment"].unique())
     figure, panels = new_panels(len(envs), 2, (5.6, 2.1), margin=(0.0, 0.5))
@@ -256,11 +217,7 @@ def plot_disturbances(results: pd.DataFrame) -> Figure:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """
-    The command line.
-
-    :param arguments: of the command line by default
-    """
+    """The command line."""
     parser = command_line("stabilisation", __doc__)
     parser.add_argument("--algos", nargs="+", default=["lac", "sac", "td3"], choices=_ALGORITHMS)
     parser.add_argument("--envs", nargs="+", default=list(DISTURBANCES), choices=list(DISTURBANCES))

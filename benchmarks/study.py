@@ -50,20 +50,12 @@ _PACKAGES = ("torch", "stable_baselines3", "gymnasium", "numpy", "numba", "scipy
 
 
 def own_versions() -> dict[str, str]:
-    """
-    The versions of the packages of this project.
-
-    :return: by package
-    """
+    """The versions of the packages of this project."""
     return {"sb3_lac": sb3_lac.__version__, "battery_env": battery_env.__version__}
 
 
 def versions() -> dict[str, str]:
-    """
-    The versions that a result depends on.
-
-    :return: by package, with Python and the processor
-    """
+    """The versions that a result depends on."""
     found = {**own_versions(), "python": platform.python_version(), "processor": platform.machine()}
     for package in _PACKAGES:
         try:
@@ -74,23 +66,13 @@ def versions() -> dict[str, str]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """
-    Write a file beside its place and rename it, so that it is never there in part.
-
-    :param path: where to
-    :param text: its contents
-    """
+    """Write a file beside its place and rename it, so that it is never there in part."""
     with replacing(path) as part:
         part.write_text(text, encoding="utf-8")
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """
-    Write a JSON file; what is no JSON is written as text.
-
-    :param path: where to
-    :param content: its contents
-    """
+    """Write a JSON file; what is no JSON is written as text."""
     write_text(path, json.dumps(content, indent=2, default=_plain) + "\n")
 
 
@@ -99,12 +81,7 @@ def _plain(value: Any) -> Any:
 
 
 def digest_of(content: Mapping[str, Any]) -> str:
-    """
-    A short name for what something was made from.
-
-    :param content: everything that it depends on
-    :return: eight hexadecimal digits, the same for equal contents
-    """
+    """A short name for what something was made from."""
     return sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:8]
 
 
@@ -116,17 +93,7 @@ def new_panels(
     sharex: bool = False,
     sharey: bool = False,
 ) -> tuple[Figure, list[Axes]]:
-    """
-    A figure of panels in rows.
-
-    :param n: number of panels
-    :param most_columns: panels in a row
-    :param panel: width and height of each, inches
-    :param margin: of all together, inches
-    :param sharex: see matplotlib
-    :param sharey: see matplotlib
-    :return: the figure, and its panels row by row
-    """
+    """A figure of panels in rows."""
     n_columns = min(n, most_columns)
     n_rows = -(-n // n_columns)
     figure = new_figure(margin[0] + panel[0] * n_columns, margin[1] + panel[1] * n_rows)
@@ -137,25 +104,14 @@ def new_panels(
 
 
 def digits(value: float, significant: int = 2) -> str:
-    """
-    A number as readers see it: rounded, and never in powers of ten because it is large.
-
-    :param value: the number
-    :param significant: significant digits, if it has no more before the point
-    :return: ``"-"`` for NaN, ``"never"`` for infinity: no time will do
-    """
+    """A number as readers see it: rounded, and never in powers of ten because it is large."""
     if not np.isfinite(value):
         return "-" if np.isnan(value) else "never"
     return f"{value:.{significant}g}" if abs(value) < 10**significant - 0.5 else f"{value:.0f}"
 
 
 def duration(seconds: float) -> str:
-    """
-    A short time as readers see it.
-
-    :param seconds: the time
-    :return: in s, ms or µs
-    """
+    """A short time as readers see it."""
     for unit, size in (("s", 1.0), ("ms", 1e-3)):
         if seconds >= size:
             return f"{digits(seconds / size)} {unit}"
@@ -163,79 +119,42 @@ def duration(seconds: float) -> str:
 
 
 def with_spread(values: pd.Series) -> str:
-    """
-    Mean and standard deviation over seeds.
-
-    :param values: one per seed
-    :return: for readers; the mean alone of a single seed
-    """
+    """Mean and standard deviation over seeds."""
     return digits(values.mean()) + (f" ± {digits(values.std(), 1)}" if len(values) > 1 else "")
 
 
 def with_interval(values: pd.Series) -> str:
-    """
-    Interquartile mean over seeds, with the 95 % interval of a bootstrap.
-
-    :param values: one per seed
-    :return: for readers; the value alone of a single seed
-    """
+    """Interquartile mean over seeds, with the 95 % interval of a bootstrap."""
     middle, low, high = (digits(float(value)) for value in over_seeds(values))
     return middle if len(values) == 1 else f"{middle} [{low}, {high}]"
 
 
 def share_with_range(values: pd.Series) -> str:
-    """
-    Mean over seeds of a share, with the least and the most of a seed.
-
-    :param values: one per seed, within 0 .. 1
-    :return: for readers, in per cent; the value alone of a single seed
-    """
+    """Mean over seeds of a share, with the least and the most of a seed."""
     percent = 100 * values
     spread = f" ({percent.min():.0f} to {percent.max():.0f})" if len(values) > 1 else ""
     return f"{percent.mean():.0f} %{spread}"
 
 
 def side_by_side(values: Iterable[float]) -> str:
-    """
-    Each of a few numbers.
-
-    :param values: one per seed
-    :return: for readers
-    """
+    """Each of a few numbers."""
     return " / ".join(digits(value) for value in values)
 
 
 def markdown(rows: pd.DataFrame | Sequence[Mapping[str, Any]]) -> str:
-    """
-    A table for readers.
-
-    :param rows: its cells, as they are to be shown
-    :return: Markdown
-    """
+    """A table for readers."""
     return pd.DataFrame(rows).to_markdown(index=False, disable_numparse=True) + "\n"
 
 
 def natural(text: str) -> int:
-    """
-    A type of arguments of the command line, as of seeds.
-
-    :param text: like ``0``
-    :return: the number
-    :raises argparse.ArgumentTypeError: if it is not a whole number of at least 0
-    """
+    """A type of arguments of the command line, as of seeds."""
     if not text.isdecimal():
         raise argparse.ArgumentTypeError(f"must be a whole number of at least 0, got {text}")
     return int(text)
 
 
 def positive(text: str) -> int:
-    """
-    A type of arguments of the command line.
-
-    :param text: like ``20`` or ``2e5``
-    :return: the number
-    :raises argparse.ArgumentTypeError: if it is not at least 1
-    """
+    """A type of arguments of the command line."""
     try:
         number = int(float(text))
     except (ValueError, OverflowError):
@@ -246,14 +165,7 @@ def positive(text: str) -> int:
 
 
 def command_line(name: str, document: str | None, jobs: int | None = 2) -> argparse.ArgumentParser:
-    """
-    What the command lines of all studies have in common: ``--jobs``, ``--scheduler`` and ``--out``.
-
-    :param name: of the study, that of its module
-    :param document: what it says of itself
-    :param jobs: parts at the same time by default, on as many cores; ``None`` for a study that has no parts
-    :return: the parser
-    """
+    """What the command lines of all studies have in common: ``--jobs``, ``--scheduler`` and ``--out``."""
     parser = argparse.ArgumentParser(
         prog=f"python -m benchmarks.{name}", description=document, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -304,11 +216,6 @@ class Study:
         Make all parts, those that were made before from their files in ``<out>/parts``. Such a file stands for its arguments,
         the module of the function, and the versions of this project's packages; what the function needs beside them it has
         to keep itself.
-
-        :param part: makes one part; importable, since it is pickled
-        :param parts: the arguments of each
-        :param places: other arguments, the same for all, that results do not depend on
-        :return: tables by name, with the rows of all parts in their order
         """
         module = Path(inspect.getfile(part)).read_text(encoding="utf-8")
         files = []
@@ -337,12 +244,6 @@ class Study:
         was chosen, in processes of their own, or all in this one if one at a time. A call that fails stops no other; its
         error is raised when all are done. A call whose process is lost is made again. An interruption ends the program with
         a word on what is done.
-
-        :param function: importable, since it is pickled
-        :param runs: positional arguments of each call
-        :param keep: called here with the number of each call and its result, as soon as there is one; ``None``: the function
-            keeps it in ``out`` itself, a folder that all machines of a cluster must share
-        :return: the results, in the order of the runs
         """
         results: dict[int, Result] = {}
         errors = []
@@ -380,13 +281,7 @@ class Study:
                     yield numbers[future], future.result
 
     def write_table(self, name: str, table: pd.DataFrame, configuration: Mapping[str, Any] | None = None) -> None:
-        """
-        Write a table as CSV, and beside it as JSON what made it: command, configuration, versions.
-
-        :param name: of the files
-        :param table: the table
-        :param configuration: in place of that of the study
-        """
+        """Write a table as CSV, and beside it as JSON what made it: command, configuration, versions."""
         configuration = self.configuration if configuration is None else configuration
         write_json(
             self.out / f"{name}.json", {"command": self.command, "configuration": configuration, "versions": versions()}
@@ -394,14 +289,7 @@ class Study:
         write_text(self.out / f"{name}.csv", table.to_csv(index=False, float_format="%.6g"))
 
     def write(self, tables: Tables, figures: Mapping[str, Figure], text: str, name: str | None = None) -> None:
-        """
-        Write what came out, and show the text.
-
-        :param tables: by name of their files
-        :param figures: by name of their files
-        :param text: Markdown
-        :param name: of its file, that of the study by default
-        """
+        """Write what came out, and show the text."""
         for table_name, table in tables.items():
             self.write_table(table_name, table)
         for figure_name, figure in figures.items():

@@ -80,18 +80,7 @@ def filled_model(
     policy_kwargs: dict[str, Any] | None = None,
     **arguments: Any,
 ) -> Algorithm:
-    """
-    A model with transitions in its replay buffer, which has made its first updates.
-
-    :param algorithm: its class
-    :param env: the environment, or its id
-    :param net_arch: widths of the hidden layers, of all networks
-    :param batch_size: batch size
-    :param transitions: how many; the size of the replay buffer, too, unless ``arguments`` say otherwise
-    :param policy_kwargs: of the algorithm, beside networks and activation
-    :param arguments: other arguments of the algorithm
-    :return: the model
-    """
+    """A model with transitions in its replay buffer, which has made its first updates."""
     kwargs: dict[str, Any] = {
         "learning_starts": transitions,
         "buffer_size": transitions,
@@ -108,14 +97,7 @@ def filled_model(
 
 
 def race(contestants: dict[str, Callable[[], int]], rounds: int, clock: Callable[[], float]) -> pd.DataFrame:
-    """
-    How much each contestant does a second, in turns.
-
-    :param contestants: by name, what makes one turn and returns how much it did
-    :param rounds: how often each has its turn
-    :param clock: seconds
-    :return: one row per round, one column per contestant
-    """
+    """How much each contestant does a second, in turns."""
     speeds = []
     for number in trange(rounds, desc="rounds", disable=None):
         speed = {}
@@ -129,15 +111,7 @@ def race(contestants: dict[str, Callable[[], int]], rounds: int, clock: Callable
 
 
 def measure(models: dict[str, OffPolicyAlgorithm], rounds: int, updates: int, batch_size: int) -> pd.DataFrame:
-    """
-    Updates a second of each model, in turns.
-
-    :param models: by name
-    :param rounds: how often each model has its turn
-    :param updates: updates of a turn
-    :param batch_size: batch size
-    :return: one row per round, one column per model
-    """
+    """Updates a second of each model, in turns."""
 
     def turn(model: OffPolicyAlgorithm) -> int:
         model.train(gradient_steps=updates, batch_size=batch_size)
@@ -147,14 +121,7 @@ def measure(models: dict[str, OffPolicyAlgorithm], rounds: int, updates: int, ba
 
 
 def profile(model: OffPolicyAlgorithm, updates: int, batch_size: int) -> dict[str, float]:
-    """
-    Where the time of an update goes.
-
-    :param model: any model
-    :param updates: updates to profile
-    :param batch_size: batch size
-    :return: share of the time by part; what no operator accounts for is Python
-    """
+    """Where the time of an update goes."""
     start = time.perf_counter()
     with th.profiler.profile(activities=[th.profiler.ProfilerActivity.CPU]) as profiler:
         model.train(gradient_steps=updates, batch_size=batch_size)
@@ -170,9 +137,6 @@ def model_contestants(cells: int) -> dict[str, Callable[[], int]]:
     """
     The thermal model under a current of 2 A, from full charge, here and in progpy: one cell, and many at once. Under current
     the step itself needs no voltage, under power, which progpy does not take, it does.
-
-    :param cells: how many are many
-    :return: by name, what makes a turn of steps and returns how many
     """
     with rc_context():  # progpy changes the defaults of matplotlib
         from progpy.models import BatteryElectroChemEOD  # heavy, and needed here only
@@ -228,12 +192,7 @@ def model_contestants(cells: int) -> dict[str, Callable[[], int]]:
 
 
 def environment_contestants(cells: int) -> dict[str, Callable[[], int]]:
-    """
-    The environments for one cell and for many, with all that belongs to a step: observation, reward, info, new episodes.
-
-    :param cells: how many are many
-    :return: by name, what makes a turn of steps with random actions and returns how many
-    """
+    """The environments for one cell and for many, with all that belongs to a step: observation, reward, info, new episodes."""
     contestants: dict[str, Callable[[], int]] = {}
 
     def turn_of_one(env: gym.Env[Any, Any], actions: Any) -> int:
@@ -265,10 +224,6 @@ def filter_contestants(cells: int, folder: Path) -> dict[str, Callable[[], int]]
     """
     Calibrators that follow a stream of one sample a second, here and in progpy: both parameters unknown here, and ``q_mobile``
     alone in progpy. A policy decides once a minute, on all readings so far; the networks are untrained, which takes as long.
-
-    :param cells: of the batches, which go on along one discharge from turn to turn
-    :param folder: where the policy is written as an ONNX file
-    :return: by name, what makes a turn of updates and returns how many
     """
     from benchmarks.progpy_filters import ProgpyFilter  # heavy, and needed here only
     from sb3_lac.onnx import export_onnx
@@ -315,12 +270,7 @@ def filter_contestants(cells: int, folder: Path) -> dict[str, Callable[[], int]]
 
 
 def report_filters(speeds: pd.DataFrame) -> str:
-    """
-    What was measured of filters, as Markdown.
-
-    :param speeds: updates a second, see ``race()``
-    :return: a table
-    """
+    """What was measured of filters, as Markdown."""
     rows = []
     for name, values in speeds.items():
         ratio = speeds["progpy, unscented Kalman filter"].rdiv(values)
@@ -337,25 +287,13 @@ def report_filters(speeds: pd.DataFrame) -> str:
 
 
 def spread(values: pd.Series, digits: int) -> str:
-    """
-    What was measured in many rounds, as readers see it.
-
-    :param values: one per round
-    :param digits: after the point
-    :return: median and quartiles
-    """
+    """What was measured in many rounds, as readers see it."""
     low, median, high = np.quantile(values, [0.25, 0.5, 0.75])
     return f"{median:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
 
 
 def report(speeds: pd.DataFrame, parts: pd.DataFrame) -> str:
-    """
-    What was measured of updates, as Markdown.
-
-    :param speeds: see ``measure()``
-    :param parts: shares by part, one row per algorithm
-    :return: two tables
-    """
+    """What was measured of updates, as Markdown."""
     lac = speeds["LAC"]
     rows = [
         {
@@ -372,9 +310,6 @@ def report(speeds: pd.DataFrame, parts: pd.DataFrame) -> str:
 def report_steps(speeds: pd.DataFrame) -> str:
     """
     What was measured of steps, as Markdown. Where progpy does the same work, the ratio is to the contestant of this package.
-
-    :param speeds: see ``race()``; a column is called ``work: who``
-    :return: a table
     """
     rows = []
     for name, values in speeds.items():
@@ -389,11 +324,7 @@ def report_steps(speeds: pd.DataFrame) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """
-    The command line.
-
-    :param arguments: of the command line by default
-    """
+    """The command line."""
     parser = command_line("throughput", __doc__, jobs=None)
     parser.add_argument("--only", nargs="+", choices=SECTIONS, default=list(SECTIONS), help="what to measure, all by default")
     parser.add_argument("--rounds", type=positive, default=40, help="turns of each contestant")

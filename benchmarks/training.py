@@ -83,22 +83,7 @@ class Recipe:
         defaults: bool = False,
         evaluations: int | None = None,
     ) -> Recipe:
-        """
-        The recipe of a training.
-
-        :param algo: see the class
-        :param env_id: see the class
-        :param seed: seed of everything
-        :param timesteps: environment steps; ``n_timesteps`` of ``zoo_configs`` by default, or ``DEFAULTS_TIMESTEPS``
-        :param hyperparameters: what differs from ``zoo_configs``
-        :param defaults: the hyperparameters of ``ALGO("MlpPolicy", env_id)`` instead of those of ``zoo_configs``;
-            ``"MultiInputPolicy"`` where observations are dicts
-        :param evaluations: how often the training is interrupted by an evaluation, if at all
-        :return: the recipe
-        :raises ValueError: if the algorithm, the environment or its entry in ``zoo_configs`` does not exist, for a seed out of
-            range, or if so few steps would train nothing
-        :raises FileNotFoundError: if ``zoo_configs`` has no file for the algorithm
-        """
+        """The recipe of a training."""
         kind = algorithm(algo)
         if not 0 <= seed < 2**32:
             raise ValueError(f"a seed must lie within 0 .. 2**32 - 1, got {seed}")
@@ -160,13 +145,7 @@ class Recipe:
 
 
 def algorithm(algo: str) -> type[BaseAlgorithm]:
-    """
-    Find an algorithm, and let the RL Zoo know one that is not of its own.
-
-    :param algo: see :class:`Recipe`
-    :return: its class
-    :raises ValueError: if there is none
-    """
+    """Find an algorithm, and let the RL Zoo know one that is not of its own."""
     if algo not in ALGOS and ":" in algo:
         module, _, name = algo.partition(":")
         try:
@@ -204,13 +183,7 @@ def _digest_of_source(module: str) -> str:
 
 
 def registered_id(env_id: str) -> str:
-    """
-    Import the module that registers an environment, where one is named.
-
-    :param env_id: see :class:`Recipe`
-    :return: the id without the module
-    :raises ValueError: if there is no such module
-    """
+    """Import the module that registers an environment, where one is named."""
     module, _, plain_id = env_id.rpartition(":")
     try:
         if module:
@@ -237,15 +210,7 @@ def _environment(env_id: str) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def set_up(recipe: Recipe, folder: Path, **options: Any) -> tuple[LACExperimentManager, BaseAlgorithm]:
-    """
-    A model that is ready to learn, on one thread of the CPU.
-
-    :param recipe: what the model depends on
-    :param folder: where the zoo writes what it does
-    :param options: other arguments of the zoo's experiment manager
-    :return: the manager and the model
-    :raises ValueError: if it needs more than its model to be scored
-    """
+    """A model that is ready to learn, on one thread of the CPU."""
     if recipe.hyperparameters.get("normalize"):
         raise ValueError("policies with `normalize` cannot be scored here: their models do not hold the statistics")
     th.set_num_threads(1)
@@ -275,18 +240,7 @@ def set_up(recipe: Recipe, folder: Path, **options: Any) -> tuple[LACExperimentM
 def train_or_load(
     algo: str, env_id: str, seed: int, timesteps: int, folder: Path, hyperparameters: dict[str, Any] | None = None
 ) -> BaseAlgorithm:
-    """
-    Train one policy, or load it if that has been done.
-
-    :param algo: ``lac``, ``sac`` or ``td3``
-    :param env_id: id of the environment
-    :param seed: seed of everything
-    :param timesteps: environment steps
-    :param folder: where the model is kept, with its recipe and the duration of its training beside it (see
-        :func:`record_file`)
-    :param hyperparameters: what differs from ``zoo_configs``
-    :return: the model
-    """
+    """Train one policy, or load it if that has been done."""
     recipe = Recipe.of(algo, env_id, seed, timesteps, hyperparameters=hyperparameters)
     record = record_file(recipe, folder)
     file = record.with_suffix(".zip")
@@ -304,36 +258,18 @@ def train_or_load(
 
 
 def training_minutes(recipe: Recipe, folder: Path) -> float:
-    """
-    How long :func:`train_or_load` took to train a model.
-
-    :param recipe: of the training
-    :param folder: where the model is kept
-    :return: minutes
-    """
+    """How long :func:`train_or_load` took to train a model."""
     return float(json.loads(record_file(recipe, folder).read_text(encoding="utf-8"))["training_minutes"])
 
 
 def timesteps_of(updates: int, hyperparameters: dict[str, Any]) -> int:
-    """
-    How long to train for a number of updates, with one call of ``train()`` per step of all environments.
-
-    :param updates: gradient steps
-    :param hyperparameters: as in a file of ``zoo_configs``, with ``learning_starts`` and ``n_envs``
-    :return: environment steps
-    """
+    """How long to train for a number of updates, with one call of ``train()`` per step of all environments."""
     n_envs, starts = hyperparameters["n_envs"], hyperparameters["learning_starts"]
     return n_envs * (starts // n_envs + -(-updates // hyperparameters.get("gradient_steps", 1)))
 
 
 def record_file(recipe: Recipe, folder: Path) -> Path:
-    """
-    Where :func:`train_or_load` says what made a model: ``recipe``, ``training_minutes``, ``versions``.
-
-    :param recipe: of the model
-    :param folder: where the model is kept
-    :return: a JSON file
-    """
+    """Where :func:`train_or_load` says what made a model: ``recipe``, ``training_minutes``, ``versions``."""
     return folder / f"model_{recipe.name}.json"
 
 
@@ -369,8 +305,6 @@ class CheckpointCallback(BaseCallback):
     def recover(folder: Path) -> None:
         """
         Put the previous checkpoint back if an interruption fell between setting it aside and putting the new one in place.
-
-        :param folder: the folder
         """
         old = folder.with_suffix(".old")
         if old.exists() and not folder.exists():

@@ -45,33 +45,19 @@ IDS = [
 
 
 def page_class(env_id: str) -> Callable[..., Any]:
-    """
-    The class whose docstring is the page of an environment: its task's for a battery, and its own else.
-
-    :param env_id: its id
-    :return: the class
-    """
+    """The class whose docstring is the page of an environment: its task's for a battery, and its own else."""
     spec = gym.spec(env_id)
     return load_env_creator(str(spec.kwargs.get("task", spec.entry_point)))
 
 
 def environment_page(env_id: str) -> str:
-    """
-    The page of an environment, with links to the pages of the others that it names.
-
-    :param env_id: its id
-    :return: Markdown
-    """
+    """The page of an environment, with links to the pages of the others that it names."""
     page = inspect.getdoc(page_class(env_id)) or ""
     return f"# {env_id}\n\n" + re.sub(rf"``((?!{env_id}\b)\w+-v\d+)``", r"[`\1`](\1.md)", page) + "\n"
 
 
 def ids() -> str:
-    """
-    All environments in one table.
-
-    :return: Markdown
-    """
+    """All environments in one table."""
     # spaces and episodes do not depend on the discharges; these are quickly made, and as many as a life has cycles
     dataset = TrajectoryDataset.generate("joint", 20, [constant(8.0)], seed=0)
     rows = []
@@ -91,30 +77,18 @@ def ids() -> str:
 
 
 def data_sets() -> str:
-    """
-    The standard data sets.
-
-    :return: Markdown
-    """
+    """The standard data sets."""
     (table,) = _tables(standard_dataset)
     return _markdown([dict(zip(table[0], row, strict=True)) for row in table[1:]])
 
 
 def columns() -> str:
-    """
-    The columns of the evaluation.
-
-    :return: Markdown
-    """
+    """The columns of the evaluation."""
     return _markdown([{"column": name, "meaning": meaning} for table in _tables(evaluate) for name, meaning in table])
 
 
 def estimators() -> str:
-    """
-    All calibrators that need no learning in one table.
-
-    :return: Markdown
-    """
+    """All calibrators that need no learning in one table."""
     offered = [getattr(battery_env.estimators, name) for name in battery_env.estimators.__all__]
     rows = []
     for calibrator in offered:
@@ -151,12 +125,7 @@ def _markdown(rows: Sequence[Mapping[str, object]]) -> str:
 
 
 def _tables(documented: Callable[..., object]) -> list[list[list[str]]]:
-    """
-    The tables of a docstring, in reStructuredText's simple form.
-
-    :param documented: what has the docstring
-    :return: for each table its rows of cells; a line that goes on with the one before has been joined to it
-    """
+    """The tables of a docstring, in reStructuredText's simple form."""
     tables: list[list[list[str]]] = []
     columns_of_text: list[slice] = []  # of the table that the present line belongs to, if any
     for line in (inspect.getdoc(documented) or "").splitlines():
@@ -177,13 +146,7 @@ def _tables(documented: Callable[..., object]) -> list[list[list[str]]]:
 
 
 def render(page: str) -> str:
-    """
-    A page with its parts as the code has them now.
-
-    :param page: the page
-    :return: the same, with all that stands between markers written anew
-    :raises ValueError: if a marker is missing
-    """
+    """A page with its parts as the code has them now."""
     for name, write in PARTS.items():
         begin, end = f"<!-- begin {name} -->", f"<!-- end {name} -->"
         if page.count(begin) != 1 or page.count(end) != 1:
@@ -194,11 +157,7 @@ def render(page: str) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """
-    The command line.
-
-    :param arguments: of the command line by default
-    """
+    """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--docs", type=Path, default=DOCS)
     docs = parser.parse_args(arguments).docs

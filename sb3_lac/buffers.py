@@ -106,12 +106,7 @@ class HorizonReplayBuffer(ReplayBuffer):
         self.episode_lengths[finished] = 0
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> HorizonReplayBufferSamples:  # type: ignore[override]
-        """
-        :param batch_size: Number of transitions to sample, uniformly from those whose sum is known
-        :param env: Associated VecEnv to normalize observations and rewards when sampling
-        :return: The transitions with their sums
-        :raises ValueError: If no transition has ``horizon`` steps after it
-        """
+        """"""
         if self.n_complete == 0:
             raise ValueError(
                 f"No stored episode is as long as horizon={self.horizon} steps: use a smaller horizon, "
@@ -128,12 +123,7 @@ class HorizonReplayBuffer(ReplayBuffer):
         return self._get_horizon_samples(rows[:batch_size], envs[:batch_size], env)
 
     def _get_horizon_samples(self, rows: np.ndarray, envs: np.ndarray, env: VecNormalize | None) -> HorizonReplayBufferSamples:
-        """
-        :param rows: Positions of the transitions
-        :param envs: Environments of the transitions
-        :param env: Associated VecEnv to normalize observations and rewards
-        :return: The transitions with their sums
-        """
+        """"""
         future = (rows[:, None] + np.arange(self.horizon)) % self.buffer_size
         rewards = self._normalize_reward(self.rewards[future, envs[:, None]], env)
         # Steps after a termination belong to the next episode

@@ -162,11 +162,7 @@ class LyapunovCallback(EventCallback):
         return self._on_event()
 
     def _evaluate(self) -> dict[str, float]:
-        """
-        Evaluate, and log what was found.
-
-        :return: Values by name, for the history
-        """
+        """Evaluate, and log what was found."""
         assert isinstance(self.model, LAC)
         self.last_report = evaluate_lyapunov(
             self.model, self.eval_env, self.n_eval_episodes, deterministic=self.deterministic, seed=self.seed
@@ -174,12 +170,7 @@ class LyapunovCallback(EventCallback):
         return self._log("lyapunov", self._metrics(self.last_report), {"report": self.last_report.plot})
 
     def _metrics(self, report: LyapunovReport | None) -> dict[str, float]:
-        """
-        The metrics that are logged.
-
-        :param report: Of an evaluation, or None if there was nothing to judge
-        :return: Values and the limits of their intervals, by name
-        """
+        """The metrics that are logged."""
         values: dict[str, float] = {}
         for metric, name in self.METRICS.items():
             found = Interval(np.nan, np.nan, np.nan) if report is None else report.metrics[metric]
@@ -189,14 +180,7 @@ class LyapunovCallback(EventCallback):
     def _log(
         self, folder: str, values: dict[str, float], figures: dict[str, Callable[[], MatplotlibFigure]]
     ) -> dict[str, float]:
-        """
-        Log values everywhere; the limits of their intervals, and figures, in TensorBoard only.
-
-        :param folder: What all names begin with
-        :param values: By name
-        :param figures: What draws each, by name
-        :return: The values
-        """
+        """Log values everywhere; the limits of their intervals, and figures, in TensorBoard only."""
         in_tensorboard = tensorboard_writer(self.logger) is not None
         for name, value in values.items():
             if not name.endswith(("_low", "_high")):
@@ -213,11 +197,7 @@ class LyapunovCallback(EventCallback):
         return self.last_report.summary()
 
     def _add_to_history(self, entry: dict[str, float]) -> None:
-        """
-        Keep an evaluation, in place of an older one after as many timesteps (when continuing from a checkpoint).
-
-        :param entry: Timesteps and values of the evaluation
-        """
+        """Keep an evaluation, in place of an older one after as many timesteps (when continuing from a checkpoint)."""
         others = [old for old in self.history if old["timesteps"] != entry["timesteps"]]
         self.history = sorted([*others, entry], key=lambda evaluation: evaluation["timesteps"])
         if self.log_path is not None:

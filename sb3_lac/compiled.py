@@ -21,12 +21,7 @@ Metrics = tuple[tuple[str, ...], th.Tensor]
 
 
 def set_gradients(loss: th.Tensor, parameters: Sequence[th.Tensor]) -> None:
-    """
-    Let parameters have the gradient of a loss, for the next step of their optimizer.
-
-    :param loss: The loss
-    :param parameters: All parameters of the optimizer. Those of frozen layers get no gradient
-    """
+    """Let parameters have the gradient of a loss, for the next step of their optimizer."""
     trained = [parameter for parameter in parameters if parameter.requires_grad]
     if not th.compiler.is_compiling():
         # Without ``zero_grad()``, whose records for the profiler take longer than its work
@@ -44,10 +39,7 @@ def set_gradients(loss: th.Tensor, parameters: Sequence[th.Tensor]) -> None:
 
 
 def set_gradient(parameter: th.Tensor, gradient: th.Tensor) -> None:
-    """
-    :param parameter: Parameter of an optimizer
-    :param gradient: For its next step
-    """
+    """"""
     if th.compiler.is_compiling():
         # A compiled step reads the tensors that it was compiled with
         assert parameter.grad is not None
@@ -69,17 +61,12 @@ def step(optimizer: th.optim.Optimizer) -> None:
 
 
 def actors_of(model: Any) -> list[Actor]:
-    """
-    :param model: A LAC model
-    :return: Its actor, and its target actor if there is one
-    """
+    """"""
     return [model.actor] if model.actor_target is None else [model.actor, model.actor_target]
 
 
 def check_torch() -> None:
-    """
-    :raises RuntimeError: If this PyTorch cannot compile an update
-    """
+    """"""
     if th.__version__ < _OLDEST_TORCH:
         raise RuntimeError(
             f"compile_update=True needs torch>={_OLDEST_TORCH}, and this is torch {th.__version__}: "
@@ -88,10 +75,7 @@ def check_torch() -> None:
 
 
 def check_compiler(device: th.device) -> None:
-    """
-    :param device: Device of the model
-    :raises RuntimeError: If nothing can be compiled for that device
-    """
+    """"""
     try:
         th.compile(th.neg, backend=_BACKEND)(th.zeros(8, device=device))
     except Exception as error:
@@ -134,10 +118,6 @@ class CompiledUpdate:
         """
         Have optimizers in a form that can be compiled and, on a GPU, transitions sampled without waiting for it. All is as it
         was afterwards, so that models are saved as without compilation.
-
-        :param model: A LAC model
-        :param optimizers: All of its optimizers
-        :return: What to call in place of ``model._update``
         """
         from torch import _dynamo as dynamo  # Takes seconds
 

@@ -57,21 +57,13 @@ _NOT_LEARNING = {"device", "tensorboard_log", "verbose", "stats_window_size"}
 
 
 def tensorboard_writer(logger: Logger) -> SummaryWriter | None:
-    """
-    The writer of TensorBoard files behind a logger.
-
-    :param logger: The logger of a model
-    :return: Its writer, None if it has none
-    """
+    """The writer of TensorBoard files behind a logger."""
     return next((output.writer for output in logger.output_formats if isinstance(output, TensorBoardOutputFormat)), None)
 
 
 def hyperparameters_of(model: BaseAlgorithm) -> dict[str, bool | str | float]:
     """
     The hyperparameters of a model that a table can hold: numbers, texts, schedules, and ``net_arch`` of ``policy_kwargs``.
-
-    :param model: The model
-    :return: By name of the argument, with ``algorithm`` and ``n_envs``
     """
     values: dict[str, Any] = {"algorithm": type(model).__name__, "n_envs": model.n_envs}
     values |= {name: getattr(model, name, None) for name in inspect.signature(type(model)).parameters}

@@ -10,13 +10,7 @@ DEFAULT_DISCOUNT = 0.99
 
 
 def stated_discount(metadata: Sequence[Any]) -> float:
-    """
-    The discount factor that environments state as ``metadata["discount"]``, for how far to look ahead is part of a task.
-
-    :param metadata: Of each environment, None where it is not known
-    :return: ``DEFAULT_DISCOUNT`` where none is stated
-    :raises ValueError: If it is out of range, or if they differ
-    """
+    """The discount factor that environments state as ``metadata["discount"]``, for how far to look ahead is part of a task."""
     known = [of_env if isinstance(of_env, Mapping) else {} for of_env in metadata]
     stated = [of_env.get("discount", DEFAULT_DISCOUNT) for of_env in known]
     for discount in stated:
@@ -32,22 +26,10 @@ def stated_discount(metadata: Sequence[Any]) -> float:
 
 
 def sum_of_discounts(gamma: float, horizon: int | None) -> float:
-    """
-    How often a constant cost counts in ``L``.
-
-    :param gamma: The discount factor, below 1 with an infinite horizon
-    :param horizon: Number of steps, None for all to come
-    :return: ``1 + gamma + gamma^2 + ...``
-    """
+    """How often a constant cost counts in ``L``."""
     return 1 / (1 - gamma) if horizon is None else math.fsum(gamma**k for k in range(horizon))
 
 
 def weight_of_return(discounts: th.Tensor | None, gamma: float) -> th.Tensor | float:
-    """
-    How often a constant reward counts in the return of k steps: ``1 + gamma + ... + gamma^(k-1)``.
-
-    :param discounts: ``gamma^k``, None if all returns are of one step
-    :param gamma: The discount factor, below 1 with more than one step
-    :return: Sum of the discounts in each return
-    """
+    """How often a constant reward counts in the return of k steps: ``1 + gamma + ... + gamma^(k-1)``."""
     return 1.0 if discounts is None else (1 - discounts) / (1 - gamma)

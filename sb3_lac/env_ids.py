@@ -6,9 +6,6 @@ import gymnasium as gym
 def check_env_id(env_id: str) -> None:
     """
     Refuse the id of a battery environment where battery_env is not installed: Gymnasium only says that it does not know it.
-
-    :param env_id: Id of an environment
-    :raises gymnasium.error.NameNotFound: If it looks like one of battery_env, is not registered, and battery_env is missing
     """
     of_batteries = env_id.startswith(("Battery", "battery_env:"))
     # Without an origin it is a folder without code: uninstalling leaves compiled kernels behind

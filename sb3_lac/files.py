@@ -8,12 +8,7 @@ from pathlib import Path
 
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """
-    A place to write a file to, beside where it is to be. It is renamed when the block ends, and removed if it fails.
-
-    :param path: Where the file is to be; missing folders are made
-    :return: Where to write it
-    """
+    """A place to write a file to, beside where it is to be. It is renamed when the block ends, and removed if it fails."""
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
     # Libraries go by the suffix

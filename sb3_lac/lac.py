@@ -37,11 +37,6 @@ def update_multiplier(log_multiplier: th.Tensor, optimizer: th.optim.Optimizer, 
     Step of a Lagrange multiplier in log space, which grows while its constraint is violated:
     ``lambda`` with the decrease condition, ``ent_coef`` with the entropy constraint
     (see https://github.com/rail-berkeley/softlearning/issues/37 for the logarithm).
-
-    :param log_multiplier: Logarithm of the multiplier, shape (1,)
-    :param optimizer: Optimizer of the logarithm
-    :param violation: How much the constraint is violated on average (negative when it holds)
-    :return: The loss before the step, ``-log(multiplier) * violation``
     """
     violation = violation.detach()
     loss = -log_multiplier.detach() * violation
@@ -52,12 +47,7 @@ def update_multiplier(log_multiplier: th.Tensor, optimizer: th.optim.Optimizer, 
 
 
 def reward_scale(vec_normalize: VecNormalize | None) -> float:
-    """
-    What a reward of the environment is divided by before the agent sees it.
-
-    :param vec_normalize: Wrapper that the rewards come from, if any
-    :return: 1 without normalization of rewards
-    """
+    """What a reward of the environment is divided by before the agent sees it."""
     if vec_normalize is None or not vec_normalize.norm_reward:
         return 1.0
     return math.sqrt(vec_normalize.ret_rms.var + vec_normalize.epsilon)
@@ -406,11 +396,7 @@ class LAC(OffPolicyAlgorithm):
             self._check_discount(bound)
 
     def _check_discount(self, bound: float) -> None:
-        """
-        Check that ``L`` is finite.
-
-        :param bound: The reward that costs nothing
-        """
+        """Check that ``L`` is finite."""
         if bound > 0 and self.horizon is None and self.gamma >= 1:
             raise ValueError(
                 f"gamma={self.gamma} must be smaller than 1 with rewards up to {bound:g}: each step below that reward "
@@ -540,9 +526,6 @@ class LAC(OffPolicyAlgorithm):
         """
         Let the bound rise to the largest of some rewards, and the offset of the critics with it. So it stays valid when
         rewards are computed at sampling (HER) or were stored elsewhere. Of the latter, sums of n steps only tell their mean.
-
-        :param rewards: Rewards of single steps (normalized with ``VecNormalize``)
-        :return: The bound in their units, no smaller than any of them
         """
         largest_reward = rewards.max()
         self.reward_bound = th.maximum(self.reward_bound, largest_reward * reward_scale(self._vec_normalize_env))
@@ -552,13 +535,7 @@ class LAC(OffPolicyAlgorithm):
         return th.maximum(self.cost_bound(self._vec_normalize_env), largest_reward)
 
     def _target_values(self, replay_data: ReplayBufferSamples, next_actions: th.Tensor) -> th.Tensor:
-        """
-        What the critic learns.
-
-        :param replay_data: Sampled transitions
-        :param next_actions: Actions in the next states
-        :return: ``y`` relative to the offset, shape (n, 1), without a gradient
-        """
+        """What the critic learns."""
         if isinstance(replay_data, HorizonReplayBufferSamples):
             return -replay_data.horizon_returns
         # For n-step replay, discount factor is gamma**n_steps (when no early termination)
@@ -576,16 +553,7 @@ class LAC(OffPolicyAlgorithm):
     def _violation(
         self, replay_data: ReplayBufferSamples, next_actions: th.Tensor, values: th.Tensor, costs: th.Tensor
     ) -> th.Tensor:
-        """
-        Violation of the decrease condition, by the same critic, before its update, for both values.
-
-        :param replay_data: Sampled transitions
-        :param next_actions: Actions in the next states. A gradient through them is that of the violation
-        :param values: ``L(s, a)`` of the transitions, without a gradient, shape (n, 1)
-        :param costs: Of the transitions, shape (n, 1)
-        :return: Mean of ``L(s', a') - L(s, a) + alpha3 * c``, where the episode goes on: nothing follows a terminal state,
-            in which the critic is not trained and no action is taken
-        """
+        """Violation of the decrease condition, by the same critic, before its update, for both values."""
         if self.critic_has_batch_norm:
             # Normalized by the statistics of its own batch, neither value would show how much the other one differs
             self.critic.set_training_mode(False)
@@ -606,30 +574,13 @@ class LAC(OffPolicyAlgorithm):
         costs: th.Tensor,
         difference: th.Tensor,
     ) -> th.Tensor:
-        """
-        What the actor lowers, besides its negative entropy.
-
-        :param replay_data: Sampled transitions
-        :param actions: Of the present actor in their states
-        :param values: ``L(s, a)`` of the transitions, without a gradient, shape (n, 1)
-        :param costs: Of the transitions, shape (n, 1)
-        :param difference: See ``_violation()``
-        :return: Mean of ``L``, or with the published update the difference itself
-        """
+        """What the actor lowers, besides its negative entropy."""
         if self.published_update:
             return difference
         return largest_value(self.critic(replay_data.observations, actions)).mean()
 
     def _update(self, replay_data: ReplayBufferSamples, costs: th.Tensor, weights: Weights, update_targets: bool) -> Metrics:
-        """
-        One update of all that is learned.
-
-        :param replay_data: Sampled transitions
-        :param costs: Of these transitions
-        :param weights: Parameters of the networks
-        :param update_targets: Whether the target networks follow
-        :return: Names and values of what is logged
-        """
+        """One update of all that is learned."""
         # We need to sample because `log_std` may have changed between two gradient steps
         if self.use_sde:
             self.actor.reset_noise()

@@ -61,10 +61,7 @@ class DeterministicPolicy(th.nn.Module):
         self.to(policy.device)
 
     def forward(self, observation: th.Tensor) -> th.Tensor:
-        """
-        :param observation: Shape (n, ...)
-        :return: Actions in the units of the environment, shape (n, ...)
-        """
+        """"""
         if self.clip_obs is not None:
             observation = (observation - self.mean - self.rest_of_mean) / self.deviation
             observation = observation.clamp(-self.clip_obs, self.clip_obs)
@@ -158,11 +155,7 @@ def export_onnx(
 
 
 def _observations(space: spaces.Space, vec_normalize: VecNormalize | None) -> np.ndarray:
-    """
-    :param space: Space of the observations
-    :param vec_normalize: What knows where in it they lie, if anything does
-    :return: Observations to trace and check with, shape (n, ...)
-    """
+    """"""
     assert isinstance(space, spaces.Box)
     low, high = space.low.astype(np.float64), space.high.astype(np.float64)
     if vec_normalize is None:
@@ -181,13 +174,7 @@ def _observations(space: spaces.Space, vec_normalize: VecNormalize | None) -> np
 
 
 def _graph(module: DeterministicPolicy, observations: np.ndarray, env_id: str | None, algorithm: str) -> ModelProto:
-    """
-    :param module: What to write down
-    :param observations: An example, shape (n, ...)
-    :param env_id: See ``export_onnx``
-    :param algorithm: Name of the algorithm
-    :return: The graph, with any number of observations as its input
-    """
+    """"""
     import onnx
 
     import sb3_lac

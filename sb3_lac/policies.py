@@ -21,12 +21,7 @@ from torch import nn
 
 
 def largest_value(values: Sequence[th.Tensor]) -> th.Tensor:
-    """
-    The conservative value ``L(s, a)``: the largest of the critics' values.
-
-    :param values: One tensor of values per critic
-    :return: Element-wise maximum
-    """
+    """The conservative value ``L(s, a)``: the largest of the critics' values."""
     return reduce(th.maximum, values)
 
 
@@ -34,9 +29,6 @@ def with_linear_term(last_layer: nn.Linear) -> nn.Linear:
     """
     The last layer of a critic with one output more, for its linear term. That starts at zero and takes no random numbers, so
     that nothing changes until there is an offset.
-
-    :param last_layer: Layer of the terms that are squared
-    :return: The same layer with one output more, the last one
     """
     widened = nn.utils.skip_init(nn.Linear, last_layer.in_features, last_layer.out_features + 1)
     with th.no_grad():

@@ -170,12 +170,7 @@ class GymnasiumVecEnv(VecEnv):
 
 
 def in_processes(env: VecEnv) -> bool:
-    """
-    Whether single environments run in processes of their own, which end if asked for what cannot be pickled.
-
-    :param env: A vectorized environment, wrapped or not
-    :return: True for ``SubprocVecEnv``, and for Gymnasium's ``AsyncVectorEnv``
-    """
+    """Whether single environments run in processes of their own, which end if asked for what cannot be pickled."""
     inner = env.unwrapped
     if isinstance(inner, GymnasiumVecEnv):
         return isinstance(inner.env.unwrapped, gym.vector.AsyncVectorEnv)
@@ -183,12 +178,7 @@ def in_processes(env: VecEnv) -> bool:
 
 
 def env_specs(env: VecEnv) -> list[EnvSpec | None]:
-    """
-    Gymnasium's specifications.
-
-    :param env: Vectorized environment
-    :return: One per environment, None where it is not known
-    """
+    """Gymnasium's specifications."""
     # One that cannot be pickled, as with a lambda as entry point, would end the process of its environment
     if not in_processes(env):
         # A vector environment of somebody else may have no attributes
@@ -198,12 +188,7 @@ def env_specs(env: VecEnv) -> list[EnvSpec | None]:
 
 
 def time_limits(env: VecEnv) -> list[int | None]:
-    """
-    Gymnasium's time limits.
-
-    :param env: Vectorized environment
-    :return: ``max_episode_steps`` of each environment, None where it has none or is not known
-    """
+    """Gymnasium's time limits."""
     if in_processes(env):
         limit = "_max_episode_steps"  # of Gymnasium's wrapper TimeLimit, for there is no specification to ask
         return env.get_attr(limit) if env.has_attr(limit) else [None] * env.num_envs
@@ -211,14 +196,7 @@ def time_limits(env: VecEnv) -> list[int | None]:
 
 
 def _unbatched(batch: dict[str, Any], rows: np.ndarray) -> list[dict[str, Any]]:
-    """
-    The infos of single environments.
-
-    :param batch: The infos of a vector environment: arrays (or dicts of them) by name, and under ``_name`` for which
-        environments they hold, by default for all
-    :param rows: Which environments
-    :return: One dict per row
-    """
+    """The infos of single environments."""
     names, columns, partial = [], [], []
     for name, values in batch.items():
         if name in ("final_obs", "final_info") or (name[:1] == "_" and name[1:] in batch):

@@ -107,24 +107,14 @@ def _as_arguments(hyperparams: Hyperparams) -> Hyperparams:
 
 
 def convert_sac_params(sampled_params: Hyperparams) -> Hyperparams:
-    """
-    Convert sampled values to the hyperparameters of SAC.
-
-    :param sampled_params: See ``sample_sac_params()``
-    :return: Keyword arguments of ``SAC``
-    """
+    """Convert sampled values to the hyperparameters of SAC."""
     hyperparams = _convert_common_params(sampled_params)
     hyperparams["ent_coef"] = f"auto_{hyperparams.pop('ent_coef_init')}"
     return hyperparams
 
 
 def convert_lac_params(sampled_params: Hyperparams) -> Hyperparams:
-    """
-    Convert sampled values to the hyperparameters of LAC.
-
-    :param sampled_params: See ``sample_lac_params()``
-    :return: Keyword arguments of ``LAC``
-    """
+    """Convert sampled values to the hyperparameters of LAC."""
     hyperparams = convert_sac_params(sampled_params)
     hyperparams["policy_kwargs"]["output_dim"] = hyperparams.pop("output_dim")
     # Start with the full weight on the cost, as in the paper
@@ -133,12 +123,7 @@ def convert_lac_params(sampled_params: Hyperparams) -> Hyperparams:
 
 
 def convert_td3_params(sampled_params: Hyperparams) -> Hyperparams:
-    """
-    Convert sampled values to the hyperparameters of TD3, as they stand in a configuration of the RL Zoo.
-
-    :param sampled_params: See ``sample_td3_params()``
-    :return: Hyperparameters of ``TD3``
-    """
+    """Convert sampled values to the hyperparameters of TD3, as they stand in a configuration of the RL Zoo."""
     hyperparams = _convert_common_params(sampled_params)
     hyperparams["noise_type"] = "normal"
     # The ratio of the defaults is 0.5 to 0.2
@@ -147,15 +132,7 @@ def convert_td3_params(sampled_params: Hyperparams) -> Hyperparams:
 
 
 def sample_lac_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> Hyperparams:
-    """
-    Sampler for LAC hyperparams.
-
-    :param trial: Optuna trial
-    :param n_actions: Number of actions
-    :param n_envs: Number of environments, not needed
-    :param additional_args: Whether hindsight experience replay is used, and its arguments
-    :return: Keyword arguments of ``LAC``
-    """
+    """Sampler for LAC hyperparams."""
     sampled_params = {
         **_sample_common_params(trial),
         **_sample_entropy_params(trial, n_actions),
@@ -170,15 +147,7 @@ def sample_lac_params(trial: optuna.Trial, n_actions: int, n_envs: int, addition
 
 
 def sample_sac_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> Hyperparams:
-    """
-    Sampler for SAC hyperparams that reaches as far as that of LAC: the RL Zoo's own has gamma >= 0.97 and no entropy.
-
-    :param trial: Optuna trial
-    :param n_actions: Number of actions
-    :param n_envs: Number of environments, not needed
-    :param additional_args: Whether hindsight experience replay is used, and its arguments
-    :return: Keyword arguments of ``SAC``
-    """
+    """Sampler for SAC hyperparams that reaches as far as that of LAC: the RL Zoo's own has gamma >= 0.97 and no entropy."""
     sampled_params = {**_sample_common_params(trial), **_sample_entropy_params(trial, n_actions)}
     return _as_arguments(convert_sac_params(_finish_sample(trial, sampled_params, additional_args)))
 
@@ -186,12 +155,6 @@ def sample_sac_params(trial: optuna.Trial, n_actions: int, n_envs: int, addition
 def sample_td3_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> Hyperparams:
     """
     Sampler for TD3 hyperparams that reaches as far as that of LAC: the RL Zoo's own has gamma >= 0.97 and no target noise.
-
-    :param trial: Optuna trial
-    :param n_actions: Number of actions
-    :param n_envs: Number of environments, not needed
-    :param additional_args: Whether hindsight experience replay is used, and its arguments
-    :return: Keyword arguments of ``TD3``
     """
     sampled_params = {
         **_sample_common_params(trial),
@@ -209,9 +172,6 @@ def steps_as_one_batch(spec: EnvSpec) -> bool:
     """
     Whether all copies of an environment can be stepped by one call: it is registered with a vector environment that lets
     Stable-Baselines3 say when episodes start anew, and without wrappers that a vector environment would go without.
-
-    :param spec: How the environment is registered
-    :return: Whether it is
     """
     if spec.vector_entry_point is None or spec.max_episode_steps is not None or spec.additional_wrappers:
         return False
@@ -292,13 +252,7 @@ rl_zoo3.train.ExperimentManager = LACExperimentManager  # type: ignore[misc]
 
 
 def find_config(algo: str) -> Path:
-    """
-    Find the tuned hyperparameters of an algorithm.
-
-    :param algo: Name of the algorithm in the RL Zoo
-    :return: ``zoo_configs/<algo>.yml`` of the current directory, or else of this package
-    :raises FileNotFoundError: If neither has one
-    """
+    """Find the tuned hyperparameters of an algorithm."""
     package = Path(__file__).resolve().parent
     # In a source checkout, which an editable installation is too, the folder lies beside the package
     candidates = [folder / "zoo_configs" / f"{algo}.yml" for folder in (Path.cwd(), package, package.parent)]
@@ -331,11 +285,7 @@ def _run_plots(name: str) -> None:
 
 
 def main(args: Sequence[str] | None = None) -> None:
-    """
-    Run a command of the RL Zoo, with LAC and its hyperparameters as default.
-
-    :param args: Command and options, those of the command line by default
-    """
+    """Run a command of the RL Zoo, with LAC and its hyperparameters as default."""
     commands: dict[str, Callable[[], None]] = {
         "train": lambda: rl_zoo3.train.train(),
         "optimize": lambda: rl_zoo3.train.train(),

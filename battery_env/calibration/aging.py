@@ -29,12 +29,6 @@ def simulated_lives(lives: int, cycles: int, seed: int, cell: CellParameters | N
     A life starts with ``q_mobile`` of 6800 to 7600 C and ``r_o`` of 0.10 to 0.14 ohm. Over all its cycles it loses 10 to 40 %
     of the one and gains 20 to 100 % of the other, in steps of exponentially distributed size, so that some cycles wear a
     cell much and most do little.
-
-    :param lives: number of cells
-    :param cycles: discharges of each
-    :param seed: of ages, wear and loads
-    :param cell: constants of the cells; ``None``: the new cell's
-    :return: the discharges, life after life, each in the order of its cycles
     """
     rng = np.random.default_rng(seed)
 
@@ -153,14 +147,7 @@ class BatteryAging(VoltageTask):
         generators: Sequence[np.random.Generator],
         options: Mapping[str, Any] | None = None,
     ) -> None:
-        """
-        Begin new lives.
-
-        :param rows: which cells of the batch, shape (m,)
-        :param generators: one source of randomness for each of them
-        :param options: as of :meth:`VoltageTask.start`; ``discharge`` has to be the first one of a life
-        :raises ValueError: for an option that is unknown or out of range
-        """
+        """Begin new lives."""
         discharge = (options or {}).get("discharge", 0)
         if discharge % self.cycles:
             raise ValueError(f"options['discharge'] must be the first of a life of {self.cycles} cycles, got {discharge}")
@@ -175,14 +162,7 @@ class BatteryAging(VoltageTask):
 
     @classmethod
     def follow(cls, records: Sequence[Record], every: int, **options: Any) -> BatteryAging:
-        """
-        Go through whole lives, each with a cell of its own; see :meth:`VoltageTask.follow`.
-
-        :param records: discharges from full charge, life after life, each with ``cycles`` of them
-        :param every: readings between two decisions, and before the first one of each discharge
-        :param options: of the task, but for those of its data
-        :return: the task, at its first observations
-        """
+        """Go through whole lives, each with a cell of its own; see :meth:`VoltageTask.follow`."""
         task = super().follow(records, every, **options)
         assert isinstance(task, BatteryAging)
         task._carried = task._estimate.copy()
@@ -190,12 +170,7 @@ class BatteryAging(VoltageTask):
 
     @classmethod
     def discharges_of_an_episode(cls, options: Mapping[str, Any]) -> int:
-        """
-        How many discharges an episode goes through.
-
-        :param options: of the task
-        :return: the cycles of a life
-        """
+        """How many discharges an episode goes through."""
         return int(options.get("cycles", cls.options()["cycles"]))
 
     @property

@@ -73,20 +73,10 @@ class Cells:
         return self.sensed_before if self.sensed_before.size else self.state
 
     def take(self, rows: NDArray[np.bool_]) -> Cells:
-        """
-        Some of the cells.
-
-        :param rows: which, shape (n,)
-        :return: copies of them
-        """
+        """Some of the cells."""
         return Cells(**{name: np.ascontiguousarray(values[rows]) for name, values in vars(self).items()})
 
     def put(self, rows: NDArray[np.intp], others: Cells) -> None:
-        """
-        Overwrite some of the cells.
-
-        :param rows: which, shape (m,)
-        :param others: m cells
-        """
+        """Overwrite some of the cells."""
         for values, theirs in zip(vars(self).values(), vars(others).values(), strict=True):
             values[rows] = theirs

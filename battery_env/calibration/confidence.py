@@ -73,28 +73,12 @@ class Confidence:
         self._model = RecordModel(cell, dt_s=dt_s)
 
     def standard_deviations(self, fitted: Fitted, estimate: FloatArray) -> FloatArray:
-        """
-        Those of the fit, with the distance of the estimate from it.
-
-        :param fitted: what the policy has seen
-        :param estimate: (q_mobile, r_o) that it has made of it, C and ohm, shape (cells, 2)
-        :return: same shape; NaN where the parameter is known
-        """
+        """Those of the fit, with the distance of the estimate from it."""
         known = [name not in self._parameters for name in PARAMETER_NAMES]
         return np.where(known, np.nan, np.hypot(fitted.sd, fitted.estimate - estimate))
 
     def reason(self, fitted: Fitted, n: int, estimate: FloatArray, sd: FloatArray, record: Samples, rested: bool) -> str:
-        """
-        Why an estimate is not settled. What is quick to see is looked at first.
-
-        :param fitted: what the policy has seen
-        :param n: of which cell
-        :param estimate: (q_mobile, r_o) that it has made of it, C and ohm, shape (2,)
-        :param sd: their standard deviations, same shape
-        :param record: all samples so far
-        :param rested: whether the first voltage is known to be that of a cell at rest
-        :return: a sentence or two, empty if it is settled
-        """
+        """Why an estimate is not settled. What is quick to see is looked at first."""
         q_mobile, r_o = estimate.tolist()
         resistance_ohm = least_resistance_ohm(q_mobile, r_o)
         readings, white_V = int(fitted.readings[n]), float(fitted.white_V[n])

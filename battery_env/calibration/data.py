@@ -55,16 +55,6 @@ def standard_dataset(
     ``paper`` is trimmed to 5 .. 95 % of each discharge and, for one parameter of the new cell at 1 s without mismatch, the
     paper's own grid of 5511; the others run from full charge to the end of discharge. A parameter that does not age is that
     of ``cell``.
-
-    :param parameter: what ages: ``"q_mobile"``, ``"r_o"`` or ``"joint"``
-    :param load: kind of load
-    :param split: ``"train"``, ``"test"`` or ``"all"``
-    :param dt_s: time step, s
-    :param mismatch: how wrong the constants are that nobody can measure well, see
-        :meth:`~battery_env.trajectories.TrajectoryDataset.generate`; ages and loads do not depend on it
-    :param cell: constants of the cell, as a calibrator may know them
-    :return: the trajectories
-    :raises ValueError: for another parameter, load or split, or values out of range
     """
     if load not in get_args(LoadKind):
         raise ValueError(f"load must be one of {get_args(LoadKind)}, got {load!r}")
@@ -74,15 +64,7 @@ def standard_dataset(
 
 
 def opened(dataset: _Discharges | str | os.PathLike[str]) -> _Discharges | TrajectoryDataset:
-    """
-    Discharges that are given in place of a standard data set.
-
-    :param dataset: the discharges themselves, or the file of a :meth:`~battery_env.trajectories.TrajectoryDataset.save`, which
-        a YAML file of hyperparameters can name. It is read once per process, and again when it has changed
-    :return: the discharges
-    :raises FileNotFoundError: if there is no such file
-    :raises ValueError: if it holds no data set
-    """
+    """Discharges that are given in place of a standard data set."""
     if isinstance(dataset, (str, os.PathLike)):
         return _loaded(os.fspath(dataset), os.stat(dataset).st_mtime_ns)
     return dataset

@@ -20,12 +20,7 @@ _RENDER_MODES = ["rgb_array"]
 
 
 def task_class(task: str | type[CalibrationTask]) -> type[CalibrationTask]:
-    """
-    The class of a task.
-
-    :param task: itself, or where it is, as ``"module:name"``
-    :return: the class
-    """
+    """The class of a task."""
     if not isinstance(task, str):
         return task
     module, _, name = task.partition(":")
@@ -34,16 +29,7 @@ def task_class(task: str | type[CalibrationTask]) -> type[CalibrationTask]:
 
 
 def new_task(task: str | type[CalibrationTask], cells: int, options: Mapping[str, Any]) -> CalibrationTask:
-    """
-    A task for some cells.
-
-    :param task: its class, or where that is, as ``"module:name"``
-    :param cells: size of the batch
-    :param options: of the task
-    :return: the task
-    :raises TypeError: for an option that the task does not have
-    :raises ValueError: for values out of range
-    """
+    """A task for some cells."""
     kind: Any = task_class(task)  # of a class of its own, not of the base
     known = kind.options()
     unknown = options.keys() - known.keys()
@@ -54,12 +40,7 @@ def new_task(task: str | type[CalibrationTask], cells: int, options: Mapping[str
 
 
 def spaces_of(task: CalibrationTask) -> tuple[FloatSpace, FloatSpace]:
-    """
-    What one cell of a task shows and takes.
-
-    :param task: the task
-    :return: observation space, action space
-    """
+    """What one cell of a task shows and takes."""
     limit = OBSERVATION_LIMIT
     return (
         gym.spaces.Box(-limit, limit, shape=(task.observation_size,), dtype=np.float32),
@@ -68,13 +49,7 @@ def spaces_of(task: CalibrationTask) -> tuple[FloatSpace, FloatSpace]:
 
 
 def check_render_mode(render_mode: str | None) -> str | None:
-    """
-    Refuse a render mode that does not exist.
-
-    :param render_mode: ``"rgb_array"`` or ``None``
-    :return: the same
-    :raises ValueError: for another one
-    """
+    """Refuse a render mode that does not exist."""
     if render_mode is not None and render_mode not in _RENDER_MODES:
         raise ValueError(f"render_mode must be None or one of {_RENDER_MODES}, got {render_mode!r}")
     return render_mode

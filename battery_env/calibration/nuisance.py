@@ -124,16 +124,7 @@ class NuisanceFit:
         estimate: FloatArray,
         measured: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
     ) -> None:
-        """
-        Take one step.
-
-        :param rows: for which cells
-        :param count: readings of each cell so far, shape (cells,)
-        :param first: first reading that counts, shape (cells,)
-        :param estimate: (q_mobile, r_o), C and ohm, shape (cells, 2)
-        :param measured: ``voltage_V``, ``current_A``, ``moved_C`` and ``ohmic_A``, see
-            :func:`battery_env.calibration.readings.explain`
-        """
+        """Take one step."""
         nuisance_step(
             rows,
             count,
@@ -154,28 +145,14 @@ class NuisanceFit:
         self.logarithms[rows] = np.clip(self.logarithms[rows] + self._found[rows, _CONSTANTS], -limit, limit)
 
     def found(self, estimate: FloatArray, readings: IntArray, white_V: FloatArray) -> Fitted:
-        """
-        What the last step found.
-
-        :param estimate: (q_mobile, r_o) that it was taken from, C and ohm, shape (cells, 2)
-        :param readings: as of :class:`Fitted`
-        :param white_V: likewise
-        :return: of each cell
-        """
+        """What the last step found."""
         found = self._found.copy()
         step, sd = (found[:, start : start + 2] for start in (0, _UNKNOWNS))
         constants_sd = np.abs(self.logarithms / self._prior_sd[_CONSTANTS]).max(axis=1)
         return Fitted(estimate + step, sd, found[:, _NOISE], found[:, _OFFSET], constants_sd, readings, white_V)
 
     def parts(self, largest_step: FloatArray, width: FloatArray) -> list[FloatArray]:
-        """
-        What the agent sees.
-
-        :param largest_step: by how much an action of 1 moves each parameter
-        :param width: of the range of each
-        :return: the action that makes the step, logarithms of the standard deviations and of the noise, the offset, the
-            constants
-        """
+        """What the agent sees."""
         step, sd = (self._found[:, start : start + 2][:, self._columns] for start in (0, _UNKNOWNS))
         return [
             np.clip(np.sign(step) * np.sqrt(np.abs(step) / largest_step), -1.0, 1.0),
@@ -187,13 +164,7 @@ class NuisanceFit:
 
 
 def rates_of(readings: Readings) -> FloatArray:
-    """
-    How quickly the model follows its current.
-
-    :param readings: of the discharges
-    :return: rate of the difference between surface and bulk, of the ohmic drop and of Vsn, 1/s; the share of the surface in a
-        charge at rest; time between two readings, s; and that of the steps of the model, s; shape (6,)
-    """
+    """How quickly the model follows its current."""
     cell, constants = readings.cell, readings.cell.packed.constants[0]
     rate = constants[BULK_RATE] + constants[SURFACE_RATE]
     at_rest = constants[BULK_RATE] / rate
@@ -267,12 +238,6 @@ def nuisance_step(
     One Gauss-Newton step towards the (q_mobile, r_o), offset and constants that explain the readings of each cell best under
     their priors; unchecked, all arrays contiguous. The arguments that :func:`battery_env.calibration.readings.explain` has too
     are the same.
-
-    :param rates: see :func:`rates_of`
-    :param logarithms: of the factors of the constants to start from, shape (n, 4)
-    :param prior_mean: of the seven unknowns, C, ohm, V and logarithms
-    :param prior_sd: likewise; a parameter that is known has 0
-    :param found: steps, standard deviations, and the noise, V, shape (n, FOUND_SIZE), overwritten
     """
     rate_d, rate_o, rate_n, at_rest, interval_s, dt_s = rates
     left_d0, _ = _decay(rate_d, 1.0, interval_s, dt_s)

@@ -38,13 +38,7 @@ class Predictor(Protocol):
     """Anything with Stable-Baselines3's ``predict``: an algorithm or a policy."""
 
     def predict(self, observation: Any, /, *, deterministic: bool = False) -> tuple[Any, Any]:
-        """
-        Actions for a batch of observations.
-
-        :param observation: shape (n, observation_size)
-        :param deterministic: the mean instead of a sample
-        :return: actions, shape (n, action_size), and a state that is not used
-        """
+        """Actions for a batch of observations."""
         ...
 
 

@@ -15,23 +15,13 @@ _RECORDED = "_recorded"
 
 
 def pretrained_ids() -> tuple[str, ...]:
-    """
-    Which environments a policy comes with the package for.
-
-    :return: their ids
-    """
+    """Which environments a policy comes with the package for."""
     names = (entry.name for entry in files(_PACKAGE).iterdir() if entry.name.endswith(".onnx"))
     return tuple(sorted({name.removesuffix(".onnx").removesuffix(_RECORDED) for name in names}))
 
 
 def file_stem(env_id: str, recorded: bool) -> str:
-    """
-    What the files of a policy are called.
-
-    :param env_id: id of an environment
-    :param recorded: whether it is the one for recorded cells
-    :return: the name without its suffix
-    """
+    """What the files of a policy are called."""
     return env_id + (_RECORDED if recorded else "")
 
 
@@ -53,16 +43,7 @@ def pretrained_card(env_id: str, recorded: bool = False) -> dict[str, Any]:
 
 
 def pretrained_policy(env_id: str, recorded: bool = False) -> tuple[OnnxPolicy, dict[str, Any]]:
-    """
-    A policy that comes with the package, run by onnxruntime: no torch, and no pickle.
-
-    :param env_id: id of an environment
-    :param recorded: whether for recorded cells: one that has learned on a model whose error wanders. By default one that has
-        learned on a model with wrong constants, as simulated cells have
-    :return: the policy, and the options of the task that it needs
-    :raises ValueError: if none comes with the package
-    :raises ImportError: without the extra ``battery_env[onnx]``
-    """
+    """A policy that comes with the package, run by onnxruntime: no torch, and no pickle."""
     _check(env_id)
     with as_file(files(_PACKAGE)) as folder:
         return policy_of_file(folder / f"{file_stem(env_id, recorded)}.onnx")
@@ -72,12 +53,6 @@ def policy_of_file(path: Path) -> tuple[OnnxPolicy, dict[str, Any]]:
     """
     A policy from a file, with the options of its task from ``options`` of a JSON file of the same name beside it, if there is
     one. The constants of a cell (``cell``) are written there by name.
-
-    :param path: ONNX file
-    :return: the policy, and the options
-    :raises FileNotFoundError: if there is no such file
-    :raises ValueError: if one of the files is not what it should be
-    :raises ImportError: without the extra ``battery_env[onnx]``
     """
     policy, card = OnnxPolicy(path), path.with_suffix(".json")
     if not card.exists():

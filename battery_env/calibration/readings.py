@@ -90,18 +90,7 @@ class Readings:
     def of(
         cls, records: Sequence[Record], interval_s: float = 10.0, dt_s: float = 1.0, cell: CellParameters = NEW_CELL
     ) -> Readings:
-        """
-        Read discharges.
-
-        :param records: simulated or recorded discharges that start fully charged and at rest; of recorded ones,
-            :meth:`battery_env.cells.Discharge.loaded_part`
-        :param interval_s: time between readings, s, a multiple of ``dt_s``
-        :param dt_s: time step at which the current is followed, s
-        :param cell: constants of the model
-        :return: their readings
-        :raises ValueError: for an interval that is no multiple of the time step, a discharge shorter than two intervals, or
-            samples that cannot be meant
-        """
+        """Read discharges."""
         steps = round(interval_s / dt_s)
         if steps < 1 or abs(steps * dt_s - interval_s) > 1e-9 * interval_s:
             raise ValueError(f"interval_s must be a multiple of the time step, {dt_s:g} s, got {interval_s!r}")
@@ -152,31 +141,15 @@ class Readings:
         return len(self.count)
 
     def part(self, discharge: int) -> slice:
-        """
-        Where the readings of one discharge lie.
-
-        :param discharge: which
-        :return: the slice of the arrays of all readings
-        """
+        """Where the readings of one discharge lie."""
         return slice(int(self.start[discharge]), int(self.start[discharge] + self.count[discharge]))
 
     def decay(self, time_constant_s: ArrayLike) -> FloatArray:
-        """
-        What is left after one interval of a quantity that decays, in the model's own steps.
-
-        :param time_constant_s: s, any shape
-        :return: shares, same shape
-        """
+        """What is left after one interval of a quantity that decays, in the model's own steps."""
         return (1.0 - self.dt_s / np.asarray(time_constant_s)) ** round(self.interval_s / self.dt_s)
 
     def process_noise_V(self, deviation: float, draws: FloatArray) -> FloatArray:
-        """
-        What white noise on Vo, Vsn and Vsp of a cell adds to its voltage at the readings of one discharge.
-
-        :param deviation: standard deviation of the noise on each, V per root of a second
-        :param draws: standard normal, one row for each of the three, shape (3, count)
-        :return: V, shape (count,)
-        """
+        """What white noise on Vo, Vsn and Vsp of a cell adds to its voltage at the readings of one discharge."""
         from scipy.signal import lfilter  # slow to import, and only process noise needs it
 
         cell, dt_s = self.cell, self.dt_s
@@ -192,11 +165,6 @@ class Readings:
         """
         What another current sensor makes of one discharge. All is linear in the current: what each interval adds to the
         states is multiplied by its gain, and what a constant current adds is added.
-
-        :param discharge: which
-        :param gain: measured over true current, one value an interval, shape (count,)
-        :param offset_A: added to the measured current, A
-        :return: ``current_A``, ``moved_C`` and ``ohmic_A`` of the measured current, shape (count,)
         """
         from scipy.signal import lfilter  # slow to import, and only another current sensor needs it
 
@@ -327,33 +295,7 @@ def explain(
     rms_V: FloatArray,
     last_V: FloatArray,
 ) -> None:
-    """
-    Compare the model with the readings of many cells; unchecked, all arrays contiguous.
-
-    :param rows: which of the n cells to compare; of the others nothing is overwritten
-    :param count: how many readings each cell has so far, at least 1, shape (n,)
-    :param first: first reading that counts, less than ``count``, shape (n,)
-    :param q_mobile: estimate, C, shape (n,)
-    :param r_o: estimate, ohm, shape (n,)
-    :param voltage_V: measured, shape (n, K)
-    :param current_A: mean measured current since the reading before, shape (n, K)
-    :param moved_C: as in :class:`Readings`, of the measured current, shape (n, K)
-    :param ohmic_A: likewise, shape (n, K)
-    :param temperature_K: of the cell
-    :param relaxed_n: by what share Vsn nears its nominal value in one interval
-    :param relaxed_p: likewise for Vsp
-    :param constants: of the model, shape (1, 13)
-    :param polynomial_n: of the negative electrode
-    :param polynomial_p: of the positive electrode
-    :param residual_V: measured minus modelled voltage, shape (n, J, 2), overwritten: the readings that count are cut into J
-        equal stretches (which share them where they are fewer), each of these into the readings with less and with more than
-        its mean ohmic drop; and residuals averaged over each part. A wrong ``r_o`` and an offset of the sensor look alike in
-        the mean of a stretch, and differ in its halves
-    :param slope_V_per_C: likewise dV/dq of the model, overwritten
-    :param ohmic_means_A: likewise -dV/dr_o, overwritten
-    :param rms_V: root mean square of all residuals that count, shape (n,), overwritten
-    :param last_V: voltage of the model at the last reading, shape (n,), overwritten
-    """
+    """Compare the model with the readings of many cells; unchecked, all arrays contiguous."""
     stretches, block = residual_V.shape[1], np.empty(BLOCK_SIZE)
     # of all readings of one cell: measured minus modelled voltage, and dV/dq
     residual, slope = np.empty((2, voltage_V.shape[1]))

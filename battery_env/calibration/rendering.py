@@ -16,15 +16,7 @@ _LABELS = {"voltage": "voltage (V)", "q_mobile": "$q^{max}$ (C)", "r_o": "$R_o$ 
 def draw_frame(
     history: Sequence[dict[str, Any]], parameters: Sequence[str], steps: int, decision_s: float
 ) -> NDArray[np.uint8]:
-    """
-    Draw voltage and parameters over the episode, of the cell and of the model.
-
-    :param history: the ``info`` of each step so far
-    :param parameters: which of ``"q_mobile"`` and ``"r_o"``
-    :param steps: length of the episode, the width of the time axis
-    :param decision_s: time between two decisions, s
-    :return: shape (400, 600, 3)
-    """
+    """Draw voltage and parameters over the episode, of the cell and of the model."""
     figure = Figure(figsize=(6, 4), dpi=100, layout="constrained")
     canvas = FigureCanvasAgg(figure)
     time = decision_s * np.arange(1, len(history) + 1)

@@ -25,13 +25,7 @@ class ReadingsSoFar:
         self.current_A: list[float] = []
 
     def add(self, voltage_V: float, current_A: float, dt_s: float) -> None:
-        """
-        Take in a sample.
-
-        :param voltage_V: V, or NaN
-        :param current_A: A
-        :param dt_s: time since the previous one, s; without meaning at the first one
-        """
+        """Take in a sample."""
         self.time_s.append(self.time_s[-1] + dt_s if self.time_s else 0.0)
         self.voltage_V.append(float(voltage_V))
         self.current_A.append(float(current_A))
@@ -40,9 +34,6 @@ class ReadingsSoFar:
         """
         The same in equal steps: the mean current over each, so that the charge drawn is kept, and the voltage between the
         samples that have one.
-
-        :param dt_s: the step, s
-        :return: as many steps as are over, at least one
         """
         time_s, voltage_V, current_A = (np.array(column) for column in (self.time_s, self.voltage_V, self.current_A))
         steps = max(int(np.floor(time_s[-1] / dt_s + 1e-9)), 1)
@@ -53,47 +44,25 @@ class ReadingsSoFar:
         return Samples(grid_s, np.interp(grid_s, time_s[known], voltage_V[known]), mean_A)
 
     def known(self, until_s: float) -> Samples:
-        """
-        The samples that have a voltage.
-
-        :param until_s: up to this time, s
-        :return: these, as they came in
-        """
+        """The samples that have a voltage."""
         time_s, voltage_V, current_A = self.columns()
         known = ~np.isnan(voltage_V) & (time_s <= until_s + 1e-9)
         return Samples(time_s[known], voltage_V[known], current_A[known])
 
     def columns(self) -> FloatArray:
-        """
-        All samples.
-
-        :return: time, voltage and current, shape (3, T)
-        """
+        """All samples."""
         return np.array([self.time_s, self.voltage_V, self.current_A])
 
     @classmethod
     def of(cls, columns: FloatArray) -> ReadingsSoFar:
-        """
-        The reverse of :meth:`columns`.
-
-        :param columns: shape (3, T)
-        :return: the samples
-        """
+        """The reverse of :meth:`columns`."""
         readings = cls()
         readings.time_s, readings.voltage_V, readings.current_A = columns.tolist()
         return readings
 
 
 def resume(task: CalibrationTask, estimate: FloatArray, action: FloatArray, logarithms: FloatArray) -> FloatArray:
-    """
-    Let a task of one cell stand where its policy left off.
-
-    :param task: a voltage-only task, at its first observation
-    :param estimate: (q_mobile, r_o), C and ohm, shape (2,)
-    :param action: the last one, shape (len(parameters),)
-    :param logarithms: of the factors of the constants as of the last decision, shape (4,)
-    :return: the same as of the next one
-    """
+    """Let a task of one cell stand where its policy left off."""
     assert isinstance(task, VoltageTask)
     task._estimate[0] = estimate
     task._action[0] = action

@@ -21,38 +21,21 @@ OBSERVATION_LIMIT = 100.0
 
 
 def check_counts(**values: int) -> None:
-    """
-    Refuse numbers of things that there must be.
-
-    :param values: options by name
-    :raises ValueError: for a value below 1
-    """
+    """Refuse numbers of things that there must be."""
     for name, value in values.items():
         if not value >= 1:
             raise ValueError(f"{name} must be at least 1, got {value!r}")
 
 
 def check_not_negative(**values: float) -> None:
-    """
-    Refuse sizes that are negative, or no finite numbers.
-
-    :param values: options by name
-    :raises ValueError: for a value out of range
-    """
+    """Refuse sizes that are negative, or no finite numbers."""
     for name, value in values.items():
         if not 0.0 <= value < np.inf:
             raise ValueError(f"{name} must be finite and at least 0, got {value!r}")
 
 
 def checked_action(action: NDArray[np.floating], shape: tuple[int, ...]) -> FloatArray:
-    """
-    Refuse what is no action: compiled code would read beyond a short one, and NaN would spread through the episode.
-
-    :param action: the action
-    :param shape: its shape
-    :return: the same as a contiguous float64 array
-    :raises ValueError: for another shape, NaN, or what is no number
-    """
+    """Refuse what is no action: compiled code would read beyond a short one, and NaN would spread through the episode."""
     array = np.asarray(action)
     if array.dtype.kind not in "fiu" or array.shape != shape:
         raise ValueError(f"action must hold numbers, shape {shape}, got {array.dtype} values of shape {array.shape}")

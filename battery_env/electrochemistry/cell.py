@@ -74,10 +74,6 @@ def _redlich_kister_polynomial(coefficients: tuple[float, ...], faraday: float) 
     Collapse the Redlich-Kister sum of the equilibrium potential into one polynomial in y = 2x - 1.
 
     Term k is A_k/F * ((1 + k/2) * y^(k+1) - (k/2) * y^(k-1)); unlike the sum it has no singularity at x = 0.5.
-
-    :param coefficients: A_0, A_1, ... in J/mol
-    :param faraday: Faraday's constant in C/mol
-    :return: coefficients in V, lowest power first, shape (14,)
     """
     polynomial = np.zeros(_POLYNOMIAL_SIZE)
     for k, coefficient in enumerate(coefficients):
@@ -276,27 +272,14 @@ NEW_CELL = CellParameters()
 
 
 def rest_shares(soc: float = 1.0) -> FloatArray:
-    """
-    The charges of a cell at rest, as shares of ``q_mobile``.
-
-    :param soc: state of charge, within 0 .. 1
-    :return: of qnB, qnS, qpB and qpS, shape (4,)
-    :raises ValueError: if the state of charge is out of range
-    """
+    """The charges of a cell at rest, as shares of ``q_mobile``."""
     if not isinstance(soc, Real) or not 0.0 <= soc <= 1.0:
         raise ValueError(f"a state of charge must lie within 0 .. 1, got {soc!r}")
     return FULL_CHARGE_SHARES - (1.0 - float(soc)) * _DRAWN_SHARES
 
 
 def check_cell(cell: CellParameters | None, thermal: bool = False) -> CellParameters:
-    """
-    Refuse what is no cell.
-
-    :param cell: constants of the cell; ``None``: the new cell's
-    :param thermal: whether its temperature moves
-    :return: the constants
-    :raises TypeError: if the one is no ``CellParameters``, or the other no truth value
-    """
+    """Refuse what is no cell."""
     if cell is not None and not isinstance(cell, CellParameters):
         raise TypeError(f"cell must be CellParameters or None, got {cell!r}")
     if not isinstance(thermal, (bool, np.bool_)):
@@ -305,14 +288,7 @@ def check_cell(cell: CellParameters | None, thermal: bool = False) -> CellParame
 
 
 def check_dt(dt: float, cell: CellParameters) -> float:
-    """
-    Refuse time steps for which explicit Euler is unstable.
-
-    :param dt: time step, s
-    :param cell: constants of the cell; the fastest of them, ``to``, sets the limit
-    :return: the time step
-    :raises ValueError: unless 0 < dt <= 2 * to
-    """
+    """Refuse time steps for which explicit Euler is unstable."""
     limit = 2.0 * min(cell.to, cell.tsn, cell.tsp)
     if not isinstance(dt, Real) or not 0.0 < dt <= limit:
         raise ValueError(

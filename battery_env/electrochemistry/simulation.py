@@ -141,22 +141,7 @@ def step_into(
     packed: PackedConstants,
     extended: bool = False,
 ) -> None:
-    """
-    :func:`step` for inner loops: no checks, no broadcasting, no allocation; all arrays contiguous float64.
-
-    :param out: the next state, shape (n, 8); may be ``state`` itself
-    :param state: shape (n, 8)
-    :param load: shape (n,)
-    :param q_mobile: shape (n,)
-    :param r_o: shape (n,)
-    :param dt: time step, s
-    :param load_unit: ``"power"`` or ``"current"``
-    :param thermal: whether the temperature moves
-    :param packed: ``CellParameters.packed``, or with one row a cell ``CellParameters.packed_with``
-    :param extended: continue the model where it is not defined: the same numbers wherever it is, but finite for a
-        ``q_mobile`` that the charges of ``state`` contradict (mole fractions kept within 0.001 .. 0.999), and in voltage
-        collapse (power is turned into current at 1 V or more). For calibrators, which try wrong parameters
-    """
+    """:func:`step` for inner loops: no checks, no broadcasting, no allocation; all arrays contiguous float64."""
     step_batch(state, load, q_mobile, r_o, dt, load_unit == "power", thermal, extended, packed, out)
 
 
@@ -173,21 +158,7 @@ def advance_in_place(
     packed: PackedConstants,
     extended: bool = False,
 ) -> None:
-    """
-    Advance every cell by its own number of steps under its own stretch of ``load``; unchecked, like :func:`step_into`.
-
-    :param state: shape (n, 8), overwritten
-    :param load: the load profiles of all cells, end to end
-    :param first: where in ``load`` each cell starts, shape (n,)
-    :param steps: how many steps each cell takes, shape (n,)
-    :param q_mobile: shape (n,)
-    :param r_o: shape (n,)
-    :param dt: time step, s
-    :param load_unit: ``"power"`` or ``"current"``
-    :param thermal: whether the temperature moves
-    :param packed: ``CellParameters.packed``, or with one row a cell ``CellParameters.packed_with``
-    :param extended: as in :func:`step_into`
-    """
+    """Advance every cell by its own number of steps under its own stretch of ``load``; unchecked, like :func:`step_into`."""
     order = np.argsort(-steps)
     ordered = packed if len(packed.constants) == 1 else packed._replace(constants=packed.constants[order])
     ahead, flags = state[order], (load_unit == "power", thermal, extended)
@@ -198,26 +169,12 @@ def advance_in_place(
 def voltage_into(
     out: FloatArray, state: FloatArray, q_mobile: FloatArray, packed: PackedConstants, extended: bool = False
 ) -> None:
-    """
-    :func:`voltage` for inner loops: no checks, no broadcasting, no allocation; all arrays contiguous float64.
-
-    :param out: voltage in V, shape (n,)
-    :param state: shape (n, 8)
-    :param q_mobile: shape (n,)
-    :param packed: ``CellParameters.packed``, or with one row a cell ``CellParameters.packed_with``
-    :param extended: as in :func:`step_into`
-    """
+    """:func:`voltage` for inner loops: no checks, no broadcasting, no allocation; all arrays contiguous float64."""
     voltage_batch(state, q_mobile, extended, packed, out)
 
 
 def state_of_charge(state: FloatArray, q_mobile: FloatArray) -> FloatArray:
-    """
-    The share of ``q_mobile`` that is left in the negative electrode, 1 at full charge (progpy's ``SOC``).
-
-    :param state: shape (..., 8)
-    :param q_mobile: charge that can move, C, shape (...)
-    :return: shape (...)
-    """
+    """The share of ``q_mobile`` that is left in the negative electrode, 1 at full charge (progpy's ``SOC``)."""
     return np.asarray((state[..., QNB] + state[..., QNS]) / q_mobile)
 
 

@@ -76,12 +76,7 @@ class PolynomialDerivatives(NamedTuple):
 
     @classmethod
     def of(cls, packed: PackedConstants) -> PolynomialDerivatives:
-        """
-        Differentiate the polynomials of a cell.
-
-        :param packed: constants of the cell
-        :return: the derivatives
-        """
+        """Differentiate the polynomials of a cell."""
         slopes = [_differentiated(polynomial) for polynomial in packed[1:]]
         return cls(*slopes, *map(_differentiated, slopes))
 

@@ -54,23 +54,12 @@ class Estimator(ABC):
 
 
 def is_overfull(soc: FloatArray, first_soc: FloatArray) -> BoolArray:
-    """
-    Whether a load has charged a cell by more than it takes.
-
-    :param soc: state of charge, shape (...)
-    :param first_soc: when the load began, of the same shape or one that broadcasts to it
-    :return: shape (...)
-    """
+    """Whether a load has charged a cell by more than it takes."""
     return np.asarray(soc > np.maximum(first_soc, 1.0) + SURPLUS_SHARE)
 
 
 def overfull_error(after_s: float) -> ValueError:
-    """
-    What to say of such a load.
-
-    :param after_s: when that was, s after the load began
-    :return: to be raised
-    """
+    """What to say of such a load."""
     return ValueError(
         f"load charges the cell beyond full, by more than {SURPLUS_SHARE:.0%} of its charge, after {after_s:g} s. Positive "
         "loads discharge: check its sign, or begin with the discharge."
@@ -338,27 +327,14 @@ class OnlineBatch:
         self.reset()
 
     def reset(self, cells: Iterable[int] | None = None) -> None:
-        """
-        Let discharges begin.
-
-        :param cells: of which cells; ``None``: of all
-        """
+        """Let discharges begin."""
         for n in range(len(self.estimators)) if cells is None else cells:
             self.estimators[n].reset()
 
     def update(
         self, voltage_V: ArrayLike, current_A: ArrayLike, dt_s: ArrayLike, temperature_C: ArrayLike | None = None
     ) -> Sequence[Estimate]:
-        """
-        Take in one sample of each cell: of all, or of none if one is refused.
-
-        :param voltage_V: as of :meth:`OnlineEstimator.update`, one for all or shape (cells,)
-        :param current_A: likewise
-        :param dt_s: likewise
-        :param temperature_C: likewise
-        :return: one estimate a cell
-        :raises ValueError: for a sample that is refused; it says of which cell
-        """
+        """Take in one sample of each cell: of all, or of none if one is refused."""
         cells = len(self.estimators)
         # as objects, so that what is no number turns no other one into a text
         columns = (np.asarray(column, dtype=object) for column in (voltage_V, current_A, dt_s, temperature_C))
@@ -371,24 +347,12 @@ class OnlineBatch:
         return [estimator.update(*sample) for estimator, sample in zip(self.estimators, samples, strict=True)]
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """
-        Write what is known of all cells, as :meth:`OnlineEstimator.save`.
-
-        :param path: where to
-        :return: the file
-        :raises FileExistsError: if there is another file
-        """
+        """Write what is known of all cells, as :meth:`OnlineEstimator.save`."""
         arrays = {f"{n}/{name}": array for n, each in enumerate(self.estimators) for name, array in each._arrays().items()}
         return save_state(path, self._made_with(), arrays)
 
     def load(self, path: str | os.PathLike[str]) -> None:
-        """
-        Go on from what :meth:`save` wrote.
-
-        :param path: the file
-        :raises FileNotFoundError: if there is no such file
-        :raises ValueError: if it is damaged, of another version, or of other estimators
-        """
+        """Go on from what :meth:`save` wrote."""
         arrays = load_state(path, self._made_with())
         for n, estimator in enumerate(self.estimators):
             mark = f"{n}/"
@@ -401,14 +365,7 @@ class OnlineBatch:
 def check_bounds(
     q_mobile_bounds_C: tuple[float, float], r_o_bounds_ohm: tuple[float, float]
 ) -> dict[str, tuple[float, float]]:
-    """
-    Refuse bounds that cannot be meant.
-
-    :param q_mobile_bounds_C: least and largest ``q_mobile``, C
-    :param r_o_bounds_ohm: least and largest ``r_o``, ohm
-    :return: both, by name
-    :raises ValueError: if they are out of range or not in order
-    """
+    """Refuse bounds that cannot be meant."""
     given = zip(PARAMETERS.values(), (q_mobile_bounds_C, r_o_bounds_ohm), strict=True)
     return {parameter.name: parameter.check_bounds(f"the bounds of {parameter.name}", bounds) for parameter, bounds in given}
 

@@ -293,13 +293,7 @@ class CellFit:
 
 
 def read_cell(path: str | os.PathLike[str]) -> CellFit | CellParameters:
-    """
-    Read the constants of a cell.
-
-    :param path: what :meth:`CellFit.to_json` or :meth:`battery_env.CellParameters.to_json` wrote
-    :return: the fit, or the constants
-    :raises ValueError: if the file is damaged, was not written so, or is of another format version
-    """
+    """Read the constants of a cell."""
     try:
         return CellFit.from_json(path)
     except WrongFormatError:
@@ -422,14 +416,7 @@ def _prior(records: Sequence[Record], start: CellParameters | None, thermal: boo
 
 
 def with_equilibrium(cell: CellParameters, coefficients_V: Sequence[float] | FloatArray) -> CellParameters:
-    """
-    A cell with something added to its equilibrium voltage.
-
-    :param cell: its constants
-    :param coefficients_V: of Legendre polynomials 0, 1, ... over the mole fractions of the positive electrode that a discharge
-        passes through, V, at most 14
-    :return: the cell with the ``U0p`` and ``Ap`` that make it so, exactly
-    """
+    """A cell with something added to its equilibrium voltage."""
     # as a polynomial in y = 2x - 1, from the highest power down: term k of the Redlich-Kister sum is
     # A_k / F * ((1 + k / 2) * y^(k + 1) - (k / 2) * y^(k - 1))
     x = Polynomial([0.5, 0.5])

@@ -53,16 +53,7 @@ class CramerRaoBound:
     def of(
         cls, slopes: Sensitivities, voltage_noise_V: float, parameters: Sequence[str] = PARAMETER_NAMES, offset: bool = False
     ) -> CramerRaoBound:
-        """
-        The bound that sensitivities imply.
-
-        :param slopes: of the voltage
-        :param voltage_noise_V: standard deviation of the noise, V
-        :param parameters: which are unknown: ``"q_mobile"``, ``"r_o"`` or both; the other one is known
-        :param offset: whether the sensor has an unknown constant offset as well
-        :return: the bound
-        :raises ValueError: for an argument out of range
-        """
+        """The bound that sensitivities imply."""
         names = check_parameters(parameters)
         if not 0.0 < voltage_noise_V < np.inf:
             raise ValueError(f"voltage_noise_V must be greater than 0 V, got {voltage_noise_V!r}")
@@ -78,15 +69,7 @@ class CramerRaoBound:
 
 
 def sensitivities(record: Record, at: Estimate | None = None, model: RecordModel | None = None) -> Sensitivities:
-    """
-    The exact derivatives of the voltage of the model at the samples of a record.
-
-    :param record: one discharge, of which only time and current are used
-    :param at: the parameters; ``None``: the true ones of a simulated discharge
-    :param model: the model; ``None``: isothermal, in steps of 1 s, of a new cell that is full at the first sample
-    :return: the derivatives; NaN after the model cell is empty
-    :raises ValueError: if ``at`` is needed, or the record cannot be used
-    """
+    """The exact derivatives of the voltage of the model at the samples of a record."""
     if at is None:
         if not isinstance(record, Trajectory):
             raise ValueError("give the parameters of a recorded discharge, e.g. what LeastSquares estimates, as `at`")
@@ -126,10 +109,7 @@ def cramer_rao_bound(
 
 
 def _inverse_diagonals(information: FloatArray) -> FloatArray:
-    """
-    :param information: symmetric positive semi-definite matrices, shape (T, n, n)
-    :return: the diagonals of their inverses, infinite where there is none, shape (T, n)
-    """
+    """"""
     scale = np.sqrt(np.einsum("tii->ti", information))
     out = np.full_like(scale, np.inf)
     with np.errstate(divide="ignore", invalid="ignore"):

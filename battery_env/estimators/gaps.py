@@ -48,16 +48,7 @@ class Gap(NamedTuple):
 
 @njit(cache=True, error_model="numpy")
 def doubtful_charge_C(before_s: float, duration_s: float, after_s: float, load_A: float, q_mobile: float) -> float:
-    """
-    The charge of an interval between two samples that is in doubt, compiled.
-
-    :param before_s: length of the interval before it, 0 if there is none, s
-    :param duration_s: its own length, s
-    :param after_s: length of the one after it, 0 if there is none, s
-    :param load_A: largest magnitude of the current beside it, A
-    :param q_mobile: of the cell, C
-    :return: charge, C; 0 if the interval is no gap
-    """
+    """The charge of an interval between two samples that is in doubt, compiled."""
     usual_s = max(before_s, after_s)
     charge_C = load_A * (duration_s - usual_s)
     is_gap = duration_s > GAP_RATIO * usual_s and load_A > REST_CURRENT_A and charge_C > GAP_SHARE * q_mobile
@@ -69,12 +60,6 @@ def verdict(missing_V: float, fall_V: float, sd_V: float, most_share: float) -> 
     """
     What the voltage says of a gap, compiled. The model falls across the gap by the charge that its current draws. A cell that
     was not loaded meanwhile, or whose clock jumped, does not.
-
-    :param missing_V: by how much less the cell fell than the model, V
-    :param fall_V: by how much the model fell, V
-    :param sd_V: standard deviation of ``missing_V``, V; NaN if it is not known
-    :param most_share: share of ``fall_V`` that ``missing_V`` may be where the charge was drawn
-    :return: ``DRAWN``, ``NOT_DRAWN`` or ``UNSURE``
     """
     if not fall_V > 0.0:
         return UNSURE
@@ -86,12 +71,7 @@ def verdict(missing_V: float, fall_V: float, sd_V: float, most_share: float) -> 
 
 
 def long_intervals(time_s: FloatArray) -> IntArray:
-    """
-    The intervals between samples that are so much longer than those beside them that they may be gaps.
-
-    :param time_s: times of the samples, s, shape (T,), T >= 2
-    :return: their numbers
-    """
+    """The intervals between samples that are so much longer than those beside them that they may be gaps."""
     step_s = np.diff(time_s)
     beside_s = np.pad(step_s, 1)
     return np.flatnonzero(step_s > GAP_RATIO * np.maximum(beside_s[:-2], beside_s[2:]))
@@ -100,16 +80,7 @@ def long_intervals(time_s: FloatArray) -> IntArray:
 def find_gaps(
     time_s: FloatArray, voltage_V: FloatArray, current_A: FloatArray, model_V: FloatArray, q_mobile: float
 ) -> list[Gap]:
-    """
-    The gaps of a record. The model errs too: what it drifts from the cell beside a gap it may drift within it.
-
-    :param time_s: times of the samples, s, shape (T,), T >= 2
-    :param voltage_V: V, shape (T,)
-    :param current_A: positive in discharge, A, shape (T,)
-    :param model_V: voltage of the model under the current that is taken to flow, V, shape (T,)
-    :param q_mobile: of the model, C
-    :return: these, in their order
-    """
+    """The gaps of a record. The model errs too: what it drifts from the cell beside a gap it may drift within it."""
     gaps: list[Gap] = []
     step_s, long = np.diff(time_s), long_intervals(time_s)
     if not len(long):

@@ -374,12 +374,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
         return KalmanBatch(self, cells)
 
     def _run(self, samples: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
-        """
-        Take in samples.
-
-        :param samples: voltage (V), current (A), time since the previous sample (s) and temperature (K), shape (4, T)
-        :return: rows of the bank (:func:`~.kalman_bank.follow`), shape (T, 8), and codes of what contradicts, shape (T,)
-        """
+        """Take in samples."""
         voltage_V, current_A, dt_s, temperature_K = samples
         numbers, count = self._numbers, samples.shape[1]
         out, codes = np.empty((count, OUT_SIZE)), np.empty(count, dtype=np.int64)

@@ -139,16 +139,7 @@ class Bank(NamedTuple):
         cell: CellParameters,
         soc: float = 1.0,
     ) -> Bank:
-        """
-        The filters that a prior takes, before the first sample of a cell at rest.
-
-        :param means: of ``q_mobile``, C, and ``r_o``, ohm
-        :param sds: standard deviations of both, and of an offset of the voltage, whose mean is 0, V
-        :param settings: the bounds of ``q_mobile`` are among them
-        :param cell: constants of the model
-        :param soc: state of charge, 1 if it is full
-        :return: the bank
-        """
+        """The filters that a prior takes, before the first sample of a cell at rest."""
         (q, r_o), sd_q = means, sds[_Q]
         half = int(np.ceil(_REACH_SD * sd_q / (_WIDEST_SHARE * q))) if sd_q > _WIDEST_SHARE * q else 0
         deviations = np.linspace(-_REACH_SD, _REACH_SD, 2 * half + 1) if half else np.zeros(1)
@@ -175,11 +166,7 @@ class Bank(NamedTuple):
         )
 
     def copy(self) -> Bank:
-        """
-        A bank that goes its own way.
-
-        :return: the copy
-        """
+        """A bank that goes its own way."""
         return Bank(*(array.copy() for array in self))
 
     @property
@@ -400,21 +387,6 @@ def follow(
     derivatives: PolynomialDerivatives,
     out: FloatArray,
 ) -> None:
-    """
-    Take in samples; unchecked.
-
-    :param bank: the filters, which go on from where they are
-    :param voltage: V, shape (T,); where it is NaN the model goes on without a correction
-    :param current: from each sample to the next one, A, shape (T,)
-    :param duration: since the sample before, s, shape (T,)
-    :param temperature: of the cells, K, shape (T,); where it is NaN the model has its own
-    :param settings: of the bank
-    :param packed: constants of the model
-    :param derivatives: of its polynomials
-    :param out: what the bank says after each sample, overwritten, shape (T, 8): ``q_mobile``, ``r_o``, their standard
-        deviations, whether the model cell has a voltage, how far the correlation of successive innovations has been above
-        0, in standard deviations, the voltage that was expected, and the standard deviation of ``q_mobile`` that the error of
-        the model leaves at least
-    """
+    """Take in samples; unchecked."""
     for n in range(voltage.shape[0]):
         _take(bank, voltage[n], current[n], duration[n], temperature[n], settings, packed, derivatives, out, n)

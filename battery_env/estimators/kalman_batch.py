@@ -74,17 +74,7 @@ class KalmanBatch(OnlineBatch):
     def update(
         self, voltage_V: ArrayLike, current_A: ArrayLike, dt_s: ArrayLike, temperature_C: ArrayLike | None = None
     ) -> Estimates:
-        """
-        Take in one sample of each cell: of all, or of none if one is refused.
-
-        :param voltage_V: as of :meth:`ExtendedKalmanFilter.update`, one for all or shape (cells,)
-        :param current_A: likewise
-        :param dt_s: likewise
-        :param temperature_C: likewise
-        :return: one estimate a cell, as a sequence that also has them as arrays
-        :raises TypeError: for what is no number
-        :raises ValueError: for a sample that is refused; it says of which cell
-        """
+        """Take in one sample of each cell: of all, or of none if one is refused."""
         cells, one = len(self.estimators), self.estimators[0]
         if one.told_from_rest:  # filters begin anew with each sample of a rest
             return Estimates.of(super().update(voltage_V, current_A, dt_s, temperature_C))

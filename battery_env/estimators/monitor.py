@@ -197,22 +197,11 @@ class Monitor(NamedTuple):
 
     @classmethod
     def new(cls) -> Monitor:
-        """
-        Before the first sample.
-
-        :return: the monitor
-        """
+        """Before the first sample."""
         return cls(np.zeros(_SIZE), np.zeros((3, _KEPT)), np.zeros(_KEPT))
 
     def texts(self, start_V: float, initial_soc: float, clock_s: float = 0.0) -> list[str]:
-        """
-        The reasons that the codes stand for.
-
-        :param start_V: as of :class:`Limits`
-        :param initial_soc: state of charge at the first sample
-        :param clock_s: time of the first sample, s; 0 of a stream, which has no clock
-        :return: by code
-        """
+        """The reasons that the codes stand for."""
         memory = self.memory
         since_s, fault_s, gap_end_s = (clock_s + float(memory[n]) for n in (_FAULT_SINCE_S, _FAULT_S, _GAP_END_S))
         first_V, size = float(memory[_FIRST_V]), float(memory[_FAULT_SIZE])
@@ -442,19 +431,7 @@ def watch(
     out: FloatArray,
     codes: IntArray,
 ) -> None:
-    """
-    Judge estimates by the samples that they come from; unchecked.
-
-    :param monitor: goes on from where it is
-    :param voltage: V, NaN where it was not measured, shape (T,)
-    :param current: from each sample to the next one, A, shape (T,)
-    :param duration: since the sample before, s, shape (T,)
-    :param drawn_C: charge drawn since the first sample, C, shape (T,)
-    :param limits: what to compare with
-    :param out: as :func:`~battery_env.estimators.kalman_bank.follow` fills it, shape (T, 8); what the error of the model
-        leaves open, what does not show in the voltage, and charges in doubt are added to the standard deviations
-    :param codes: what was found, overwritten, shape (T,)
-    """
+    """Judge estimates by the samples that they come from; unchecked."""
     m = monitor.memory
     for n in range(voltage.shape[0]):
         m[_SAMPLES] += 1.0

@@ -43,13 +43,7 @@ class Start(NamedTuple):
 
 
 def check_initial_soc(initial_soc: InitialSoc) -> tuple[float, float]:
-    """
-    Refuse what is no state of charge.
-
-    :param initial_soc: a number, (mean, standard deviation), or ``"rest"``
-    :return: mean and standard deviation; those of a full cell for ``"rest"``
-    :raises ValueError: for anything else, and beyond 0.02 .. 1
-    """
+    """Refuse what is no state of charge."""
     if isinstance(initial_soc, str) and initial_soc == "rest":
         return 1.0, 0.0
     try:
@@ -64,26 +58,13 @@ def check_initial_soc(initial_soc: InitialSoc) -> tuple[float, float]:
 
 
 def follow_rest(means_V: FloatArray, voltage_V: float, since_s: float) -> None:
-    """
-    Take in one sample of a rest.
-
-    :param means_V: of the voltage over a short and a longer time, V, shape (2,); changed in place
-    :param voltage_V: V
-    :param since_s: time since the sample before, s
-    """
+    """Take in one sample of a rest."""
     for n, memory_s in enumerate(_REST_MEMORIES_S):
         means_V[n] += -np.expm1(-since_s / memory_s) * (voltage_V - means_V[n])
 
 
 def soc_at_rest(means_V: FloatArray, error_V: float, cell: CellParameters) -> tuple[float, float]:
-    """
-    The state of charge at which the open-circuit voltage of the model is that of a rest.
-
-    :param means_V: as :func:`follow_rest` has them, V, shape (2,)
-    :param error_V: standard deviation of the voltage, that of sensor and model, V
-    :param cell: constants of the model
-    :return: state of charge and its standard deviation, to which a voltage that still relaxes adds
-    """
+    """The state of charge at which the open-circuit voltage of the model is that of a rest."""
     rest_V = rest_voltages_V(cell)
     soc = float(np.interp(means_V[0], rest_V, _SOC_GRID))
     around = np.clip([soc - _SLOPE_SPAN, soc + _SLOPE_SPAN], _SOC_GRID[0], _SOC_GRID[-1])
@@ -92,28 +73,14 @@ def soc_at_rest(means_V: FloatArray, error_V: float, cell: CellParameters) -> tu
 
 
 def rest_voltages_V(cell: CellParameters) -> FloatArray:
-    """
-    The voltage of a cell at rest at each state of charge of a grid.
-
-    :param cell: constants of the model
-    :return: V, from 2 % to full
-    """
+    """The voltage of a cell at rest at each state of charge of a grid."""
     full, empty = (initial_state(cell=cell, soc=soc) for soc in (1.0, 0.0))
     states = empty + _SOC_GRID[:, None] * (full - empty)
     return np.asarray(voltage(states, cell=cell))
 
 
 def told_at_rest(record: Record, cell: CellParameters, error_V: float, dt_s: float) -> Start:
-    """
-    The state of charge that a record starts with, from the voltage of the rest before its load.
-
-    :param record: one discharge
-    :param cell: constants of the model
-    :param error_V: as of :func:`soc_at_rest`, V
-    :param dt_s: in a record whose samples lie this far apart the current is taken as it is, s
-    :return: as far as it can be told; a record that starts under load is taken for that of a full cell, with a reason
-    :raises ValueError: if the record cannot be used
-    """
+    """The state of charge that a record starts with, from the voltage of the rest before its load."""
     stream = Stream.of(record, dt_s)
     loaded = np.flatnonzero(np.abs(stream.current_A) > REST_CURRENT_A)
     count = int(loaded[0]) if len(loaded) else len(stream.time_s)

@@ -97,13 +97,7 @@ PRIOR_ALONE = "{} rests on its prior: the record alone does not determine it yet
 
 @lru_cache(maxsize=64)
 def rest_voltage_V(cell: CellParameters, soc: float = 1.0) -> float:
-    """
-    The voltage of a cell at rest.
-
-    :param cell: constants of the model
-    :param soc: its state of charge
-    :return: V
-    """
+    """The voltage of a cell at rest."""
     return float(voltage(initial_state(cell=cell, soc=soc), cell=cell))
 
 
@@ -112,24 +106,13 @@ def least_resistance_ohm(q_mobile: float, r_o: float) -> float:
     """
     The least resistance that a cell shows when its load is switched, compiled. An estimate of it may be too large, as may
     what is known of other cells, so that the least of all counts.
-
-    :param q_mobile: estimate, C
-    :param r_o: estimate, ohm
-    :return: ohm
     """
     return max(min(_LEAST_RESISTANCE_OHM, _LEAST_RESISTANCE_OHM * _NEW_Q_C / q_mobile, r_o), 0.0)
 
 
 @njit(cache=True, error_model="numpy")
 def lagging_current_A(before_A: float, current_A: float, duration_s: float) -> float:
-    """
-    The current that the ohmic drop stands for, which follows slowly, compiled.
-
-    :param before_A: the same a while ago, A
-    :param current_A: current since then, A
-    :param duration_s: length of the while, s
-    :return: A
-    """
+    """The current that the ohmic drop stands for, which follows slowly, compiled."""
     return before_A + (before_A - current_A) * expm1(-duration_s / _FOLLOWS_S)
 
 
@@ -138,11 +121,6 @@ def change_to_follow_A(switched_A: float, current_A: float, lagging_A: float) ->
     """
     The part of a switch of the load that the ohmic drop has to follow, compiled: after a pulse that was over before the drop
     had built up it has little to take back.
-
-    :param switched_A: by how much the current was switched, A
-    :param current_A: current after it, A
-    :param lagging_A: :func:`lagging_current_A` before it, A
-    :return: of the same sign and no larger than ``switched_A``, or 0, A
     """
     return max(min(current_A - lagging_A, max(switched_A, 0.0)), min(switched_A, 0.0))
 
@@ -170,16 +148,6 @@ def start_reason(
     Whether a record can start with a full cell, or with one of another charge. At rest its voltage tells. A first sample under
     load is corrected by the least ohmic drop that the cell can have: a full cell of a larger resistance cannot be told from
     one that lacks some charge.
-
-    :param time_s: times of the samples, s, shape (T,), T >= 1; those of the first 20 s suffice
-    :param voltage_V: V, shape (T,)
-    :param current_A: positive in discharge, A, shape (T,)
-    :param cell: constants of the model
-    :param initial_soc: state of charge that it is said to start with
-    :param resistance_ohm: the least that the cell can have, ohm
-    :param rested: whether the first voltage is known to be that of the cell at rest, though the first current is that of the
-        load, as in :meth:`battery_env.cells.Discharge.loaded_part`
-    :return: why it cannot, or cannot be told to; empty if it can
     """
     rest_V = rest_voltage_V(cell, initial_soc)
     soon = time_s <= time_s[0] + START_WINDOW_S
@@ -192,17 +160,7 @@ def start_reason(
 
 @njit(cache=True, error_model="numpy")
 def start_code(first_V: float, first_A: float, most_A: float, least_V: float, rest_V: float, resistance_ohm: float) -> int:
-    """
-    Whether the first samples of a record can be those of a cell that rested, compiled.
-
-    :param first_V: first voltage, V
-    :param first_A: first current, 0 where the cell is known to have rested, A
-    :param most_A: largest current of the first 20 s, A
-    :param least_V: least voltage of the first 20 s, V
-    :param rest_V: voltage of the cell at rest, V
-    :param resistance_ohm: the least that the cell can have, ohm
-    :return: 0 if they can, 1 if the voltage is too high, 2 if it is too low at rest, and 3 if it is under load
-    """
+    """Whether the first samples of a record can be those of a cell that rested, compiled."""
     drop_V = resistance_ohm * max(first_A, 0.0)
     low_V, high_V = rest_V - FULL_REST_V[0], rest_V + FULL_REST_V[1]
     if first_V > high_V:
@@ -215,15 +173,7 @@ def start_code(first_V: float, first_A: float, most_A: float, least_V: float, re
 
 
 def start_text(code: int, first_V: float, rest_V: float, initial_soc: float = 1.0) -> str:
-    """
-    The reason that a code of :func:`start_code` stands for.
-
-    :param code: 0 .. 3, or 4 where the charge was to be told from a rest, and there was none
-    :param first_V: first voltage, V
-    :param rest_V: voltage of the cell at rest, V
-    :param initial_soc: state of charge that the cell is said to start with
-    :return: why the record cannot start so, or cannot be told to; empty if it can
-    """
+    """The reason that a code of :func:`start_code` stands for."""
     if initial_soc == 1.0:
         what = "a full cell"
         advice = "Give the whole discharge of a full cell, with the rest before it, or state initial_soc (--initial-soc)."
@@ -247,12 +197,6 @@ def sensor_reason(
     Whether voltage and current belong to each other. Where the load is switched and stays so, the voltage follows by at least
     half of the least ohmic drop, as far as that had followed the load before; and it does not rise while the current stays as
     it was.
-
-    :param time_s: times of the samples, s, shape (T,), T >= 2
-    :param voltage_V: V, shape (T,)
-    :param current_A: positive in discharge, A, shape (T,)
-    :param resistance_ohm: the least that the cell can have, ohm
-    :return: where they do not; empty if they do
     """
     last = len(time_s) - 1
     noise_V = NOISES * white_noise_V(voltage_V)
@@ -283,25 +227,13 @@ def sensor_reason(
 
 
 def gap_reason(gaps: Sequence[Gap], verdict: int) -> str:
-    """
-    What gaps in a record leave open.
-
-    :param gaps: of the record
-    :param verdict: ``NOT_DRAWN`` or ``UNSURE``, see :mod:`~battery_env.estimators.gaps`
-    :return: of the first one with that verdict; empty if there is none
-    """
+    """What gaps in a record leave open."""
     text = {NOT_DRAWN: NOT_DRAWN_TEXT, UNSURE: UNSURE_TEXT}[verdict]
     return next((text.format(*gap[:3]) for gap in gaps if gap.verdict == verdict), "")
 
 
 def is_plausible(q_mobile: ArrayLike, cell: CellParameters) -> BoolArray:
-    """
-    Whether a cell of the kind of the model can have some ``q_mobile``.
-
-    :param q_mobile: C, any shape
-    :param cell: constants of the model
-    :return: same shape
-    """
+    """Whether a cell of the kind of the model can have some ``q_mobile``."""
     low, high = PLAUSIBLE_Q_SHARES
     share = np.asarray(q_mobile) / cell.q_mobile
     return np.asarray((share > low) & (share < high))
@@ -311,24 +243,12 @@ def white_noise_V(residual_V: FloatArray, order: int = 1) -> float:
     """
     The standard deviation of the white part of residuals, from their differences from sample to sample, which hardly hold
     what drifts. The median leaves single wild samples aside.
-
-    :param residual_V: V, shape (T,), T > order
-    :param order: of the differences; those of the second order hold nothing of what falls steadily either
-    :return: V
     """
     return float(np.median(np.abs(np.diff(residual_V, order))) / (0.6745 * np.sqrt(comb(2 * order, order))))
 
 
 def imprecise_text(share: float, depth_V: float, enough_V: float | None, rmse_V: float) -> str:
-    """
-    Why ``q_mobile`` is not precise enough, and what would make it so.
-
-    :param share: its standard deviation as a share of it
-    :param depth_V: voltage down to which the record would have to go, V; -inf: it would not help; NaN: no load goes on
-    :param enough_V: the ``mismatch_V`` with which this record would tell it, V; NaN: none would; ``None``: it is 0 already
-    :param rmse_V: how far the model is off in this record, V
-    :return: sentences
-    """
+    """Why ``q_mobile`` is not precise enough, and what would make it so."""
     reached = f", but to {np.ceil(1e4 * share) / 1e2:.3g} %" if share < 1.0 else ""
     text = f"q_mobile is not known to 2 % yet{reached}: the voltage shows it at the knee of the discharge."
     if depth_V >= LEAST_CUT_OFF_V:
@@ -347,10 +267,5 @@ def imprecise_text(share: float, depth_V: float, enough_V: float | None, rmse_V:
 
 
 def first_reason(conditions: Sequence[tuple[bool, str]]) -> str:
-    """
-    The reason of the first condition that holds.
-
-    :param conditions: each with its reason
-    :return: empty if none holds
-    """
+    """The reason of the first condition that holds."""
     return next((reason for holds, reason in conditions if holds), "")

@@ -18,15 +18,7 @@ _KIND = "state of an estimator"
 
 
 def save_state(path: str | os.PathLike[str], settings: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Path:
-    """
-    Write a state. It takes the place of an older one, and of no other file.
-
-    :param path: where to; ``.npz`` is added if it is missing
-    :param settings: of the estimator, as JSON may hold them
-    :param arrays: what it knows, by name
-    :return: the file
-    :raises FileExistsError: if there is a file that is no state of an estimator
-    """
+    """Write a state. It takes the place of an older one, and of no other file."""
     target = Path(path)
     target = target if target.suffix == ".npz" else target.with_name(target.name + ".npz")
     if target.exists():
@@ -41,15 +33,7 @@ def save_state(path: str | os.PathLike[str], settings: Mapping[str, Any], arrays
 
 
 def load_state(path: str | os.PathLike[str], settings: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
-    """
-    Read what :func:`save_state` wrote.
-
-    :param path: the file
-    :param settings: of the estimator that is to go on, which have to be those of the one that was saved
-    :return: what it knew, by name
-    :raises FileNotFoundError: if there is no such file
-    :raises ValueError: if the file is damaged, none of these, of another format version, or of another estimator
-    """
+    """Read what :func:`save_state` wrote."""
     metadata, arrays = _read(Path(path))
     if metadata["format"] != FORMAT_VERSION:
         raise ValueError(

@@ -9,37 +9,21 @@ from gymnasium import spaces
 
 
 def check_positive(**values: float) -> None:
-    """
-    Refuse parameters that make no sense.
-
-    :param values: Parameters by name
-    :raises ValueError: If one is not positive and finite
-    """
+    """Refuse parameters that make no sense."""
     for name, value in values.items():
         if not 0 < value < np.inf:
             raise ValueError(f"{name}={value} must be positive and finite.")
 
 
 def check_not_negative(**values: float) -> None:
-    """
-    Refuse parameters that make no sense.
-
-    :param values: Parameters by name
-    :raises ValueError: If one is negative or not finite
-    """
+    """Refuse parameters that make no sense."""
     for name, value in values.items():
         if not 0 <= value < np.inf:
             raise ValueError(f"{name}={value} must be finite and at least 0.")
 
 
 def _noise_std(name: str, std: float | Sequence[float], n: int) -> np.ndarray | None:
-    """
-    :param name: Name of the argument, for errors
-    :param std: One standard deviation for all variables, or one for each
-    :param n: Number of variables
-    :return: Shape (n,), or None if all are zero
-    :raises ValueError: If one is negative or not finite, or their number is wrong
-    """
+    """"""
     values = np.array(std, dtype=np.float64)
     if values.shape not in ((), (n,)) or not np.all((values >= 0) & (values < np.inf)):
         raise ValueError(f"{name}={std!r} must be a number, or {n} of them, finite and at least 0.")
@@ -123,55 +107,31 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
         self.n_steps = 0
 
     def _check_parameters(self, **parameters: float) -> None:
-        """
-        Refuse physical parameters that make no sense.
-
-        :param parameters: Some of them, by name
-        :raises ValueError: If one is not positive and finite
-        """
+        """Refuse physical parameters that make no sense."""
         check_positive(**parameters)
 
     @abstractmethod
     def _initial_state(self) -> np.ndarray:
-        """
-        :return: A random start, drawn with ``self.np_random``
-        """
+        """"""
 
     @abstractmethod
     def _next_state(self, state: np.ndarray, action: np.ndarray, push: float) -> np.ndarray:
-        """
-        :param state: Current state
-        :param action: Action in [-1, 1]
-        :param push: The impulse of this step, with its sign; 0 in all others
-        :return: Next state
-        """
+        """"""
 
     @abstractmethod
     def _cost(self, state: np.ndarray, action: np.ndarray, next_state: np.ndarray) -> tuple[float, bool]:
-        """
-        :param state: State before the step, which is step ``self.n_steps``
-        :param action: Action in [-1, 1]
-        :param next_state: State after it
-        :return: Cost of the transition, and whether the episode terminates
-        """
+        """"""
 
     @abstractmethod
     def _error(self) -> float:
-        """
-        :return: Distance of the current state to the goal, see ``error_name``
-        """
+        """"""
 
     def _limited(self, state: np.ndarray) -> np.ndarray:
-        """
-        :param state: A state
-        :return: The same within the limits
-        """
+        """"""
         return np.minimum(np.maximum(state, self.state_low), self.state_high)
 
     def _observation(self) -> np.ndarray:
-        """
-        :return: What the agent sees but for noise, the state by default
-        """
+        """"""
         return np.asarray(self.state, dtype=np.float32)
 
     def _noisy_observation(self) -> np.ndarray:

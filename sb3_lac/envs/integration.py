@@ -7,11 +7,6 @@ def runge_kutta_step(
     """
     One step of the classical Runge-Kutta method of fourth order. For a handful of variables, plain numbers are faster than
     arrays.
-
-    :param derivative: Time derivative of the state as a function of the state; inputs are held over the step
-    :param state: The state
-    :param dt_s: The step in seconds
-    :return: The state after it
     """
     half = 0.5 * dt_s
     k1 = derivative(state)

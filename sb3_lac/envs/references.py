@@ -23,13 +23,7 @@ from sb3_lac.envs.vehicle import VehicleCostEnv
 
 
 def _linearised(model: CostEnv, at_rest: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Matrices of ``s' = A s + B (a - at_rest)`` about state zero, by central differences.
-
-    :param model: A problem without noise
-    :param at_rest: Value of all actions with which it stays there
-    :return: A, shape (n, n), and B, shape (n, m)
-    """
+    """Matrices of ``s' = A s + B (a - at_rest)`` about state zero, by central differences."""
     n, m = len(model.state_high), len(model.action_space.low)  # type: ignore[attr-defined]
     step = 1e-5
 
@@ -41,15 +35,7 @@ def _linearised(model: CostEnv, at_rest: float = 0.0) -> tuple[np.ndarray, np.nd
 
 
 def _riccati(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """
-    The linear-quadratic regulator (discrete algebraic Riccati equation).
-
-    :param a: A of ``s' = A s + B u``
-    :param b: B
-    :param q: Q of the cost ``s^T Q s + u^T R u``
-    :param r: R
-    :return: Gain K of ``u = -K s``
-    """
+    """The linear-quadratic regulator (discrete algebraic Riccati equation)."""
     from scipy.linalg import solve_discrete_are  # slow to import, and no training needs it
 
     p = solve_discrete_are(a, b, q, r)
@@ -68,10 +54,7 @@ class ReferenceController(ABC):
 
     @abstractmethod
     def _actions(self, observations: np.ndarray) -> np.ndarray:
-        """
-        :param observations: Shape (n, number of observed variables), float64
-        :return: Shape (n, number of actions), not limited yet
-        """
+        """"""
 
     def predict(
         self,

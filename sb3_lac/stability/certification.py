@@ -299,16 +299,7 @@ def check_questions(
     level: float | None,
     window_steps: int | None,
 ) -> None:
-    """
-    Check what is asked of the episodes, see ``certify()``.
-
-    :param lyapunov: The function, if there is one
-    :param confidence: Of all statements together
-    :param cost_bound: The cost to stay within, if it is given
-    :param level: Value above which the function has to decrease, if it is given
-    :param window_steps: Over how many steps, if it is given
-    :raises ValueError: If one of them cannot be meant
-    """
+    """Check what is asked of the episodes, see ``certify()``."""
     if lyapunov is not None:
         check_function(lyapunov)
     if not isinstance(confidence, numbers.Real) or not 0 < confidence < 1:
@@ -334,12 +325,7 @@ def _description(policy: PolicyPredictor, env: VecEnv, seed: int, deterministic:
 
 
 def _check_starts(env: VecEnv, starts: np.ndarray) -> None:
-    """
-    Check that an environment starts where it is told to.
-
-    :param env: The environment
-    :param starts: Start states, shape (n_starts, n_states)
-    """
+    """Check that an environment starts where it is told to."""
     if len(starts) > 1:
         # Not every vector environment takes options for each of its elements
         env.set_options([{"state": starts[k % len(starts)].tolist()} for k in range(env.num_envs)])
@@ -372,17 +358,7 @@ def _attraction(
     cost_bound: float | None,
     confidence: float,
 ) -> pd.DataFrame:
-    """
-    What became of the start states.
-
-    :param transitions: One row per transition
-    :param starts: Start states, shape (n_starts, n_states)
-    :param n_episodes: Number of episodes from each
-    :param reward_bound: The reward that costs nothing
-    :param cost_bound: The cost to stay within
-    :param confidence: Of each interval
-    :return: One row per start state
-    """
+    """What became of the start states."""
     import pandas as pd
 
     assert starts is not None and cost_bound is not None

@@ -51,12 +51,7 @@ class SumOfSquares(nn.Module):
 
 
 def flatten(observations: Observations) -> np.ndarray:
-    """
-    Observations as vectors.
-
-    :param observations: n observations, of any shape or by key
-    :return: Shape (n, n_inputs)
-    """
+    """Observations as vectors."""
     parts = [observations[key] for key in sorted(observations)] if isinstance(observations, dict) else [observations]
     return np.concatenate([np.asarray(part, dtype=np.float64).reshape(len(part), -1) for part in parts], axis=1)
 
@@ -164,14 +159,7 @@ class FittedLyapunov(LyapunovFunction):
 
 
 def network_values(network: SumOfSquares, inputs: np.ndarray, unit: float) -> np.ndarray:
-    """
-    Values of a network.
-
-    :param network: The network
-    :param inputs: Scaled inputs, shape (n, n_inputs)
-    :param unit: Costs per output
-    :return: Shape (n,)
-    """
+    """Values of a network."""
     with th.no_grad():
         return unit * network(th.as_tensor(inputs, dtype=th.float32)).numpy().astype(np.float64)
 
@@ -182,13 +170,6 @@ def traced_returns(
     """
     The generalised multi-step return of the relative cost: ``G = c - c_bar + (1 - lambda) * L(s') + lambda * G'``, and
     ``c - c_bar + L(s')`` at the end of an episode (TD(lambda), Sutton 1988, with the average cost subtracted).
-
-    :param costs: One per transition, shape (n,)
-    :param next_values: ``L(s')`` of each transition
-    :param rows: Transitions by episode and step, -1 after the end of an episode, shape (n_episodes, n_steps)
-    :param average_cost: Of a step
-    :param trace_decay: lambda
-    :return: One per transition
     """
     returns = np.empty(len(costs))
     later = np.zeros(len(rows))
@@ -204,14 +185,7 @@ def traced_returns(
 
 
 def shortest_window(values: np.ndarray, rows: np.ndarray, level: float) -> int | None:
-    """
-    The shortest window over which a function decreases wherever it starts above a level.
-
-    :param values: One per transition
-    :param rows: Transitions by episode and step, -1 after the end of an episode, shape (n_episodes, n_steps)
-    :param level: The level
-    :return: One of ``WINDOWS``, or None if there is none
-    """
+    """The shortest window over which a function decreases wherever it starts above a level."""
     along = np.where(rows >= 0, values[rows], np.nan)
     for n_steps in WINDOWS:
         if n_steps >= along.shape[1]:

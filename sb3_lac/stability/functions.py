@@ -130,10 +130,7 @@ class LyapunovFunction:
 
 
 def check_function(lyapunov: object) -> None:
-    """
-    :param lyapunov: What is judged
-    :raises ValueError: If that is no Lyapunov function
-    """
+    """"""
     if not isinstance(lyapunov, LyapunovFunction):
         raise ValueError(
             f"lyapunov={lyapunov!r} must be a LyapunovFunction: that of fit_lyapunov(policy, env), or "
@@ -142,11 +139,7 @@ def check_function(lyapunov: object) -> None:
 
 
 def check_rewards(lyapunov: LyapunovFunction | None, rewards: pd.Series) -> None:
-    """
-    :param lyapunov: What is judged, if anything
-    :param rewards: Those that are to become costs
-    :raises ValueError: If it is not known which reward costs nothing
-    """
+    """"""
     if rewards.max() > 0 and (lyapunov is None or lyapunov.reward_bound is None):
         raise ValueError(
             f"A reward of {rewards.max():g} is positive, and it is not known which reward costs nothing: pass "

@@ -31,48 +31,25 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def is_wide(values: pd.Series | np.ndarray) -> bool:
-    """
-    Whether values are best shown on a logarithmic scale.
-
-    :param values: The values
-    :return: True if they are positive and span more than a decade
-    """
+    """Whether values are best shown on a logarithmic scale."""
     return 0 < 10 * values.min() < values.max()
 
 
 def format_log_axis(axis: Axis) -> None:
-    """
-    Label a logarithmic axis with numbers like 5 instead of powers like 5 * 10^0.
-
-    :param axis: The axis
-    """
+    """Label a logarithmic axis with numbers like 5 instead of powers like 5 * 10^0."""
     axis.set_major_formatter("{x:g}")
     axis.set_minor_formatter(LogFormatter())
 
 
 def set_log_scale(axes: Axes, which: Literal["x", "y"], values: pd.Series | np.ndarray) -> None:
-    """
-    Make an axis logarithmic if that suits its values.
-
-    :param axes: The panel
-    :param which: Which axis
-    :param values: Values on this axis
-    """
+    """Make an axis logarithmic if that suits its values."""
     if is_wide(values):
         axes.set(**{f"{which}scale": "log"})
         format_log_axis(axes.xaxis if which == "x" else axes.yaxis)
 
 
 def project(observations: np.ndarray | None, x: int, y: int, names: Sequence[str] | None) -> tuple[np.ndarray, dict[str, Any]]:
-    """
-    Two dimensions of the observations, and the labels of their axes.
-
-    :param observations: Those of the transitions, or None if they are no vectors
-    :param x: First dimension
-    :param y: Second dimension
-    :param names: Names of all dimensions
-    :return: Array with two columns, and arguments for ``axes.set()``
-    """
+    """Two dimensions of the observations, and the labels of their axes."""
     if observations is None:
         raise ValueError("This figure needs observations that are vectors (a Box space with at most one dimension).")
     n_dims = observations.shape[1]
@@ -86,25 +63,14 @@ def project(observations: np.ndarray | None, x: int, y: int, names: Sequence[str
 
 
 def scatter_groups(axes: Axes, points: np.ndarray, groups: Sequence[tuple[np.ndarray, str, dict[str, Any]]]) -> None:
-    """
-    Mark groups of points, with their sizes in a legend below the panel.
-
-    :param axes: The only panel of its figure
-    :param points: All points, shape (n, 2)
-    :param groups: Which points, label and style of each group
-    """
+    """Mark groups of points, with their sizes in a legend below the panel."""
     for chosen, label, style in groups:
         axes.scatter(points[chosen, 0], points[chosen, 1], label=f"{label} ({np.sum(chosen)})", zorder=3, **style)
     axes.figure.legend(loc="outside lower center", ncols=len(groups), fontsize=8)
 
 
 def draw_episodes(transitions: pd.DataFrame, axes: Axes) -> None:
-    """
-    Draw ``L`` along some episodes.
-
-    :param transitions: One row per transition
-    :param axes: The panel
-    """
+    """Draw ``L`` along some episodes."""
     # Few enough that each line can be followed
     chosen = np.unique(np.linspace(0, transitions["episode"].max(), 8).astype(int))
     shown = transitions[transitions["episode"].isin(chosen)]
@@ -119,13 +85,7 @@ def draw_episodes(transitions: pd.DataFrame, axes: Axes) -> None:
 
 
 def draw_by_cost(by_cost: pd.DataFrame, alpha3: float, axes: Axes) -> None:
-    """
-    Draw the decrease condition by level of the cost.
-
-    :param by_cost: One row per level
-    :param alpha3: Share of the cost by which ``L`` has to decrease
-    :param axes: The panel
-    """
+    """Draw the decrease condition by level of the cost."""
     positions = np.arange(len(by_cost))
     axes.axhline(0, color="0.4", lw=1)
     colours = np.select([by_cost["decrease_high"] < 0, by_cost["decrease_low"] > 0], [GREEN, VERMILION], GREY).tolist()
@@ -142,15 +102,7 @@ def draw_by_cost(by_cost: pd.DataFrame, alpha3: float, axes: Axes) -> None:
 
 
 def draw_drift(by_cost: pd.DataFrame, cost_bound: float, cost_bound_alpha3: float, start_cost: float, axes: Axes) -> None:
-    """
-    Draw the drift of ``L`` over the cost, below the line that bounds the mean cost in the long run.
-
-    :param by_cost: One row per level
-    :param cost_bound: Where the line is 0
-    :param cost_bound_alpha3: Its slope downwards, NaN if there is no line
-    :param start_cost: A cost to mark
-    :param axes: The panel
-    """
+    """Draw the drift of ``L`` over the cost, below the line that bounds the mean cost in the long run."""
     cost, drift = by_cost["cost"], by_cost["drift"]
     axes.axhline(0, color="0.4", lw=1)
     axes.scatter(cost, drift, color=np.where(drift < 0, GREEN, VERMILION).tolist(), s=30, zorder=3)
@@ -173,12 +125,7 @@ def draw_drift(by_cost: pd.DataFrame, cost_bound: float, cost_bound_alpha3: floa
 
 
 def draw_calibration(transitions: pd.DataFrame, axes: Axes) -> None:
-    """
-    Draw ``L`` against the cost-to-go.
-
-    :param transitions: One row per transition
-    :param axes: The panel
-    """
+    """Draw ``L`` against the cost-to-go."""
     axes.set(xlabel="$L(s, a)$", ylabel="cost-to-go", title="L against the cost-to-go")
     known = transitions.loc[transitions["cost_to_go"].notna(), ["lyapunov", "cost_to_go"]]
     if known.empty:
@@ -197,14 +144,7 @@ def draw_calibration(transitions: pd.DataFrame, axes: Axes) -> None:
 
 
 def draw_costs(transitions: pd.DataFrame, bound: float, axes: Axes, name: str = "ultimate bound") -> None:
-    """
-    Draw the costs over time.
-
-    :param transitions: One row per transition
-    :param bound: A cost to mark, NaN if there is none
-    :param axes: The panel
-    :param name: Of that cost
-    """
+    """Draw the costs over time."""
     low, median, high = transitions.groupby("step")["cost"].quantile(np.array([0.1, 0.5, 0.9])).unstack().to_numpy().T
     steps = np.arange(len(median))
     axes.fill_between(steps, low, high, color=BLUE, alpha=0.2, lw=0, label="10 % to 90 % of the episodes")
@@ -217,15 +157,7 @@ def draw_costs(transitions: pd.DataFrame, bound: float, axes: Axes, name: str = 
 
 
 def plot_report(transitions: pd.DataFrame, by_cost: pd.DataFrame, alpha3: float, ultimate_bound: float) -> Figure:
-    """
-    See ``LyapunovReport.plot()``.
-
-    :param transitions: One row per transition
-    :param by_cost: One row per level of the cost
-    :param alpha3: Share of the cost by which ``L`` has to decrease
-    :param ultimate_bound: A cost to mark, NaN if there is none
-    :return: The figure
-    """
+    """See ``LyapunovReport.plot()``."""
     figure = new_figure(9.5, 7.0)
     along_episodes, of_decrease, of_calibration, of_costs = figure.subplots(2, 2).flat
     draw_episodes(transitions, along_episodes)
@@ -236,15 +168,7 @@ def plot_report(transitions: pd.DataFrame, by_cost: pd.DataFrame, alpha3: float,
 
 
 def plot_drift(by_cost: pd.DataFrame, cost_bound: float, cost_bound_alpha3: float, start_cost: float) -> Figure:
-    """
-    See ``LyapunovReport.plot_drift()``.
-
-    :param by_cost: One row per level
-    :param cost_bound: Where the line is 0
-    :param cost_bound_alpha3: Its slope downwards, NaN if there is no line
-    :param start_cost: A cost to mark
-    :return: The figure
-    """
+    """See ``LyapunovReport.plot_drift()``."""
     figure = new_figure(5.6, 4.2)
     draw_drift(by_cost, cost_bound, cost_bound_alpha3, start_cost, figure.subplots())
     return figure
@@ -253,15 +177,7 @@ def plot_drift(by_cost: pd.DataFrame, cost_bound: float, cost_bound_alpha3: floa
 def plot_certification(
     statements: pd.DataFrame, transitions: pd.DataFrame, confidence: str, cost_bound: float | None
 ) -> Figure:
-    """
-    See ``CertificationReport.plot()``.
-
-    :param statements: One row per statement
-    :param transitions: One row per transition
-    :param confidence: Of all statements together, in per cent
-    :param cost_bound: A cost to mark, None if there is none
-    :return: The figure
-    """
+    """See ``CertificationReport.plot()``."""
     figure = new_figure(9.5, 3.6)
     of_statements, of_costs = figure.subplots(1, 2)
     positions = np.arange(len(statements))[::-1]
@@ -283,16 +199,7 @@ def plot_certification(
 
 
 def plot_attraction(starts: pd.DataFrame, confidence: str, x: int, y: int, names: Sequence[str] | None) -> Figure:
-    """
-    See ``CertificationReport.plot_region_of_attraction()``.
-
-    :param starts: One row per start state
-    :param confidence: Of each interval, in per cent
-    :param x: Dimension of the start state on the horizontal axis
-    :param y: Dimension of the start state on the vertical axis
-    :param names: Names of all dimensions
-    :return: The figure
-    """
+    """See ``CertificationReport.plot_region_of_attraction()``."""
     states = starts[[column for column in starts if str(column).startswith("state_")]].to_numpy()
     points, labels = project(states, x, y, names or [f"state {k}" for k in range(states.shape[1])])
     figure = new_figure(5.8, 4.8)
@@ -319,17 +226,7 @@ def plot_phase(
     y: int,
     names: Sequence[str] | None,
 ) -> Figure:
-    """
-    See ``LyapunovReport.plot_phase()``.
-
-    :param transitions: One row per transition
-    :param episodes: One row per episode
-    :param observations: Those of the transitions, or None if they are no vectors
-    :param x: Dimension of the observation on the horizontal axis
-    :param y: Dimension of the observation on the vertical axis
-    :param names: Names of all dimensions
-    :return: The figure
-    """
+    """See ``LyapunovReport.plot_phase()``."""
     points, labels = project(observations, x, y, names)
     figure = new_figure(6.4, 5.2)
     axes = figure.subplots()
@@ -365,18 +262,7 @@ def plot_region_of_attraction(
     y: int,
     names: Sequence[str] | None,
 ) -> Figure:
-    """
-    See ``LyapunovReport.plot_region_of_attraction()``.
-
-    :param transitions: One row per transition
-    :param episodes: One row per episode
-    :param observations: Those of the transitions, or None if they are no vectors
-    :param settled: Whether each episode has
-    :param x: Dimension of the observation on the horizontal axis
-    :param y: Dimension of the observation on the vertical axis
-    :param names: Names of all dimensions
-    :return: The figure
-    """
+    """See ``LyapunovReport.plot_region_of_attraction()``."""
     points, labels = project(observations, x, y, names)
     starts = (transitions["step"] == 0).to_numpy()
     points, lyapunov = points[starts], transitions["lyapunov"].to_numpy()[starts]

@@ -33,14 +33,7 @@ MANY_STEPS = 10_000
 
 
 def prepare_evaluation(policy: PolicyPredictor, env: gym.Env | VecEnv, of_the_critic: bool) -> VecEnv:
-    """
-    Wrap an evaluation environment as the policy would, and check that they fit together.
-
-    :param policy: What is evaluated
-    :param env: The evaluation environment
-    :param of_the_critic: Whether values of the critic are judged, which belong to the rewards of the training
-    :return: The wrapped environment
-    """
+    """Wrap an evaluation environment as the policy would, and check that they fit together."""
     if isinstance(policy, type) or not callable(getattr(policy, "predict", None)):
         raise ValueError(f"{policy!r} has no method predict(observation, deterministic=...), which every policy needs.")
     check_environment(env)
@@ -68,10 +61,7 @@ def prepare_evaluation(policy: PolicyPredictor, env: gym.Env | VecEnv, of_the_cr
 
 
 def check_environment(env: object) -> None:
-    """
-    :param env: What is to be an environment
-    :raises ValueError: If it is none that Stable-Baselines3 can step
-    """
+    """"""
     if isinstance(env, gym.vector.VectorEnv):
         raise ValueError(f"{env} is a vector environment of Gymnasium: pass sb3_lac.GymnasiumVecEnv(env).")
     if not isinstance(env, (gym.Env, VecEnv)):
@@ -79,23 +69,13 @@ def check_environment(env: object) -> None:
 
 
 def check_number(name: str, value: int) -> None:
-    """
-    :param name: Of an argument
-    :param value: Of the argument
-    :raises ValueError: If it is not how many there are of something
-    """
+    """"""
     if not isinstance(value, (int, np.integer)) or value < 1:
         raise ValueError(f"{name}={value!r} must be at least 1, and a whole number.")
 
 
 def known_seed(seed: int | None) -> int:
-    """
-    The seed of roll-outs, so that others can be told from them, and so that they can be made again.
-
-    :param seed: Seed that was asked for, if any
-    :return: That one, or a random one of 31 bits, whatever the state of numpy and PyTorch
-    :raises ValueError: If it cannot seed an environment
-    """
+    """The seed of roll-outs, so that others can be told from them, and so that they can be made again."""
     if seed is None:
         return int(np.random.SeedSequence().generate_state(1)[0] // 2)
     if not isinstance(seed, (int, np.integer)) or seed < 0:
@@ -104,13 +84,7 @@ def known_seed(seed: int | None) -> int:
 
 
 def check_seeds(lyapunov: LyapunovFunction, seed: int, n_envs: int) -> None:
-    """
-    Refuse to judge a function on the roll-outs that it was fitted on.
-
-    :param lyapunov: The function
-    :param seed: Seed of the evaluation
-    :param n_envs: Number of environments, whose seeds count up from it
-    """
+    """Refuse to judge a function on the roll-outs that it was fitted on."""
     if lyapunov.seeds is None:
         return
     if seed < lyapunov.seeds.stop and lyapunov.seeds.start < seed + n_envs:
@@ -122,13 +96,7 @@ def check_seeds(lyapunov: LyapunovFunction, seed: int, n_envs: int) -> None:
 
 
 def check_training_seeds(policy: PolicyPredictor, seed: int, n_envs: int) -> None:
-    """
-    Refuse exact statements of the episodes that a policy was trained on: those of equal seeds begin alike.
-
-    :param policy: The policy
-    :param seed: Seed of the episodes
-    :param n_envs: Number of environments, whose seeds count up from it
-    """
+    """Refuse exact statements of the episodes that a policy was trained on: those of equal seeds begin alike."""
     if not isinstance(policy, BaseAlgorithm) or policy.seed is None:
         return
     if seed < policy.seed + policy.n_envs and policy.seed < seed + n_envs:
@@ -140,13 +108,7 @@ def check_training_seeds(policy: PolicyPredictor, seed: int, n_envs: int) -> Non
 
 
 def trains_on(model: BaseAlgorithm, env: VecEnv) -> bool:
-    """
-    Whether a model collects its training data in an environment, or in one of those that it consists of.
-
-    :param model: The model
-    :param env: The environment, wrapped or not
-    :return: True if stepping the one steps the other
-    """
+    """Whether a model collects its training data in an environment, or in one of those that it consists of."""
     training_env = model.get_env()
     if training_env is None:
         return False
@@ -159,13 +121,7 @@ def trains_on(model: BaseAlgorithm, env: VecEnv) -> bool:
 
 
 def normalization(vec_normalize: VecNormalize | None, with_rewards: bool) -> str:
-    """
-    What a ``VecNormalize`` wrapper normalizes.
-
-    :param vec_normalize: The wrapper, if any
-    :param with_rewards: Whether rewards matter
-    :return: Description of it
-    """
+    """What a ``VecNormalize`` wrapper normalizes."""
     if vec_normalize is None or not (vec_normalize.norm_obs or (with_rewards and vec_normalize.norm_reward)):
         return "no normalization"
     return f"norm_obs={vec_normalize.norm_obs}" + (f" and norm_reward={vec_normalize.norm_reward}" if with_rewards else "")
@@ -176,10 +132,6 @@ def undisturbed(policy: PolicyPredictor, env: VecEnv, seed: int) -> Iterator[Non
     """
     Let a training go on after an evaluation as if there had been none: its random numbers, its normalization and, for LAC, the
     episodes that it was in.
-
-    :param policy: What is evaluated
-    :param env: The environment
-    :param seed: Seed for the environment, in place of one that it was given before, for PyTorch, numpy and the action space
     """
     vec_normalize = unwrap_vec_normalize(env)
     env.seed(seed)
@@ -210,13 +162,7 @@ def undisturbed(policy: PolicyPredictor, env: VecEnv, seed: int) -> Iterator[Non
 
 
 def combine(function: Callable[[list[np.ndarray]], np.ndarray], observations: Sequence[Observations]) -> Observations:
-    """
-    Make one batch of several observations or batches, of each key if they are dicts.
-
-    :param function: What to do with the arrays, like ``np.concatenate``
-    :param observations: At least one
-    :return: The batch
-    """
+    """Make one batch of several observations or batches, of each key if they are dicts."""
     first = observations[0]
     if isinstance(first, dict):
         return {key: function([observation[key] for observation in observations]) for key in first}
@@ -224,13 +170,7 @@ def combine(function: Callable[[list[np.ndarray]], np.ndarray], observations: Se
 
 
 def take(observations: Observations, rows: np.ndarray | slice) -> Observations:
-    """
-    Choose some observations of a batch.
-
-    :param observations: The batch
-    :param rows: Which ones
-    :return: The chosen ones
-    """
+    """Choose some observations of a batch."""
     return combine(lambda arrays: arrays[0][rows], [observations])
 
 
@@ -251,21 +191,13 @@ class RollOuts:
     last_observations: Observations | None
 
     def vectors(self) -> np.ndarray | None:
-        """
-        :return: The observations, shape (n, n_dims), or None if they are no vectors
-        """
+        """"""
         if isinstance(self.observations, dict) or self.observations.ndim > 2:
             return None
         return self.observations.reshape((len(self.observations), -1))
 
     def add_values(self, policy: PolicyPredictor, lyapunov: LyapunovFunction, deterministic: bool) -> None:
-        """
-        Add the columns ``lyapunov`` and ``next_lyapunov`` to the transitions.
-
-        :param policy: Whose action follows the last observation, which was not taken
-        :param lyapunov: The function
-        :param deterministic: Whether that is the mean action
-        """
+        """Add the columns ``lyapunov`` and ``next_lyapunov`` to the transitions."""
         # Few passes of a network, but not one huge tensor
         rows = [slice(start, start + CHUNK_SIZE) for start in range(0, len(self.actions), CHUNK_SIZE)]
         values = [lyapunov.values_of_actions(take(self.observations, chunk), self.actions[chunk]) for chunk in rows]
@@ -284,13 +216,7 @@ class RollOuts:
 
 
 def _what_it_asks_for(policy: PolicyPredictor, env: VecEnv) -> list[str]:
-    """
-    What ``predict`` takes beside observations: controllers without a memory need not know of episodes.
-
-    :param policy: The policy
-    :param env: The environment
-    :return: Of ``state``, ``episode_start`` and the ``action_masks`` of MaskablePPO those that there are
-    """
+    """What ``predict`` takes beside observations: controllers without a memory need not know of episodes."""
     parameters = inspect.signature(policy.predict).parameters
     takes_all = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
     asked = [name for name in ("state", "episode_start") if takes_all or name in parameters]
@@ -305,18 +231,7 @@ def roll_out(
     normalized_rewards: bool = False,
     starts: np.ndarray | None = None,
 ) -> RollOuts:
-    """
-    Run the policy.
-
-    :param policy: The policy
-    :param env: The environment
-    :param n_eval_episodes: Number of episodes, divided onto the elements of the environment: if the first episodes to end were
-        taken, they would be the short ones
-    :param deterministic: Whether to use deterministic or stochastic actions
-    :param normalized_rewards: Whether rewards are those of ``VecNormalize``, or those of the environment
-    :param starts: Start state of each episode, shape (n_eval_episodes, n_states), for ``reset(options={"state": ...})``
-    :return: All transitions
-    """
+    """Run the policy."""
     import pandas as pd  # slow to import, and only an evaluation needs it
 
     vec_normalize = None if normalized_rewards else unwrap_vec_normalize(env)
@@ -406,10 +321,6 @@ def relative_cost_to_go(transitions: pd.DataFrame, average_cost: float) -> np.nd
     """
     What a function of the average cost estimates, of one roll-out: the sum of the costs to come beyond the average one. What
     follows a time limit is the value of the function there, and so only the first half of each episode is looked at.
-
-    :param transitions: One row per transition with ``episode``, ``step``, ``cost``, ``next_lyapunov``, ``terminated``
-    :param average_cost: Of a step
-    :return: The sums, NaN in the second half of an episode, and in all of those that terminated
     """
     groups = transitions.groupby("episode")
     excess = (transitions["cost"] - average_cost)[::-1]
@@ -424,13 +335,6 @@ def cost_to_go(
     """
     What ``L`` estimates, of one roll-out: the discounted sum of the costs to come (in the next ``horizon`` steps).
     After a termination nothing is paid any more, while the costs after a time limit are not seen.
-
-    :param transitions: One row per transition with ``episode``, ``step``, ``cost`` and ``terminated``
-    :param gamma: The discount factor
-    :param horizon: Number of steps, None for all
-    :param max_tail_weight: Largest weight of costs that are not seen, with an infinite horizon
-    :param bound: Cost of each step after a termination
-    :return: The sums, NaN where too much is not seen, and where costs without discount never end
     """
     from scipy.signal import lfilter  # slow to import, and only an evaluation needs it
 
@@ -458,14 +362,7 @@ def cost_to_go(
 
 
 def summarize_episodes(transitions: pd.DataFrame) -> pd.DataFrame:
-    """
-    Summarize each episode.
-
-    :param transitions: One row per transition
-    :return: One row per episode with ``length``, ``total_cost``, ``final_cost``, ``largest_late_cost`` and ``late_cost``, the
-        largest and the mean one of the last fifth, ``late_rise``, by how much that mean is larger than those of the three
-        fifths before (NaN after a single step), and ``terminated``
-    """
+    """Summarize each episode."""
     import pandas as pd
 
     groups = transitions.groupby("episode")
@@ -491,9 +388,5 @@ def stay_within(episodes: pd.DataFrame, cost_bound: float) -> pd.Series:
     """
     Whether the last fifth of each episode costs no more than a bound. It is a comparison in single precision, in which some
     vector environments hold rewards: there a cost of 0.1 is a little more than 0.1.
-
-    :param episodes: See ``summarize_episodes()``
-    :param cost_bound: The bound
-    :return: One answer per episode
     """
     return episodes["largest_late_cost"].astype(np.float32) <= np.float32(cost_bound)

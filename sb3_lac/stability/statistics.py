@@ -29,13 +29,7 @@ class Interval(NamedTuple):
 
 
 def ratio(numerator: np.ndarray, denominator: np.ndarray) -> np.ndarray:
-    """
-    Divide where that is possible.
-
-    :param numerator: Any values
-    :param denominator: Values that are not negative
-    :return: The ratio, NaN where the denominator is 0
-    """
+    """Divide where that is possible."""
     numerator, denominator = np.asarray(numerator), np.asarray(denominator)
     return np.divide(numerator, denominator, out=np.full(numerator.shape, np.nan), where=denominator > 0)
 
@@ -60,14 +54,7 @@ class Bootstrap:
     def estimate(
         self, statistic: Callable[..., np.ndarray], episode: np.ndarray | pd.Series, *values: np.ndarray | pd.Series
     ) -> Interval:
-        """
-        Estimate a statistic.
-
-        :param statistic: Function of the sums of the values
-        :param episode: Episode that each value belongs to
-        :param values: What to sum
-        :return: The statistic of all episodes, with its interval
-        """
+        """Estimate a statistic."""
         sums = np.stack([np.bincount(episode, value, minlength=self.n_episodes) for value in values])
         samples = statistic(*(sums @ self.counts.T))
         return self._interval(float(statistic(*sums.sum(axis=1))), samples)
@@ -80,16 +67,7 @@ class Bootstrap:
         *values: np.ndarray,
         of_episodes: Sequence[np.ndarray] = (),
     ) -> Interval:
-        """
-        Estimate a statistic of several levels.
-
-        :param statistic: Function of the sums of the values, arrays whose last axis are the levels, and of those of episodes
-        :param level: Level that each value belongs to, 0 and up
-        :param episode: Episode that each value belongs to
-        :param values: What to sum
-        :param of_episodes: What else to sum, one value per episode
-        :return: The statistic of all episodes, with its interval
-        """
+        """Estimate a statistic of several levels."""
         n_levels = int(level.max()) + 1
         sums = np.zeros((len(values), self.n_episodes, n_levels))
         for total, value in zip(sums, values, strict=True):
@@ -109,69 +87,28 @@ class Bootstrap:
 
 
 def spread(n: np.ndarray, x: np.ndarray, xx: np.ndarray) -> np.ndarray:
-    """
-    Variance of x, times n^2.
-
-    :param n: Number of values
-    :param x: Sum of the values
-    :param xx: Sum of their squares
-    :return: The spread, 0 if it is no larger than rounding errors
-    """
+    """Variance of x, times n^2."""
     result = n * xx - x**2
     return np.where(result > 1e-12 * n * xx, result, 0.0)
 
 
 def slope(n: np.ndarray, x: np.ndarray, y: np.ndarray, xx: np.ndarray, xy: np.ndarray, yy: np.ndarray) -> np.ndarray:
-    """
-    Slope of the least squares line, of sums as ``intercept()`` and ``correlation()``.
-
-    :param n: Number of values
-    :param x: Sum of x
-    :param y: Sum of y
-    :param xx: Sum of x^2
-    :param xy: Sum of x * y
-    :param yy: Sum of y^2
-    :return: The slope
-    """
+    """Slope of the least squares line, of sums as ``intercept()`` and ``correlation()``."""
     return ratio(n * xy - x * y, spread(n, x, xx))
 
 
 def intercept(n: np.ndarray, x: np.ndarray, y: np.ndarray, *squares: np.ndarray) -> np.ndarray:
-    """
-    Intercept of the least squares line.
-
-    :param n: Number of values
-    :param x: Sum of x
-    :param y: Sum of y
-    :param squares: Sums of x^2, x * y and y^2
-    :return: The intercept
-    """
+    """Intercept of the least squares line."""
     return ratio(y - slope(n, x, y, *squares) * x, n)
 
 
 def correlation(n: np.ndarray, x: np.ndarray, y: np.ndarray, xx: np.ndarray, xy: np.ndarray, yy: np.ndarray) -> np.ndarray:
-    """
-    Pearson's correlation coefficient.
-
-    :param n: Number of values
-    :param x: Sum of x
-    :param y: Sum of y
-    :param xx: Sum of x^2
-    :param xy: Sum of x * y
-    :param yy: Sum of y^2
-    :return: The coefficient
-    """
+    """Pearson's correlation coefficient."""
     return ratio(n * xy - x * y, np.sqrt(spread(n, x, xx) * spread(n, y, yy)))
 
 
 def largest_mean(n: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """
-    The largest mean of all levels.
-
-    :param n: Number of values of each level, shape (..., n_levels)
-    :param x: Sum of the values of each level
-    :return: The mean of the level where it is largest, shape (...)
-    """
+    """The largest mean of all levels."""
     return np.where(n > 0, ratio(x, n), -np.inf).max(axis=-1)
 
 
@@ -179,15 +116,6 @@ def tightest_drift(n: np.ndarray, drift: np.ndarray, cost: np.ndarray, late_cost
     """
     The Foster-Lyapunov condition ``E[L' - L] <= -alpha3 * c + b`` at each level of the cost, with the alpha3 and b that say
     most: those with the least ``b / alpha3``, which bounds the mean cost in the long run.
-
-    :param n: Number of transitions of each level, shape (..., n_levels)
-    :param drift: Sum of ``L' - L`` of each level
-    :param cost: Sum of the costs of each level
-    :param late_cost: Mean cost of the ends of the roll-outs, shape (...), NaN if all died
-    :return: ``b / alpha3`` and alpha3, both of shape (...); alpha3 is NaN if L does not decrease where the cost is largest,
-        when the largest mean cost of a level is all that can be said. Both are NaN where there are no transitions. The bound
-        is never less than ``late_cost``, or the mean cost of the lowest level if there is none: over finite roll-outs the
-        value of the starts can pay for any costs, and below those that they came to nothing is known.
     """
     shape = np.shape(n)[:-1]
     bounds, alphas = np.empty(shape), np.empty(shape)
@@ -214,27 +142,13 @@ def tightest_drift(n: np.ndarray, drift: np.ndarray, cost: np.ndarray, late_cost
 
 
 def levels_of_cost(known: pd.DataFrame, n_levels: int) -> np.ndarray:
-    """
-    The level of the cost that each transition belongs to.
-
-    :param known: One row per transition
-    :param n_levels: Number of levels, at quantiles of the cost (fewer if many costs are equal)
-    :return: Numbers of levels, 0 and up, each of which has transitions
-    """
+    """The level of the cost that each transition belongs to."""
     quantiles = known["cost"].quantile(np.linspace(0, 1, n_levels + 1)[1:-1])
     return np.unique(np.searchsorted(quantiles, known["cost"]), return_inverse=True)[1]
 
 
 def estimate_drift(known: pd.DataFrame, episodes: pd.DataFrame, n_levels: int, bootstrap: Bootstrap) -> dict[str, Interval]:
-    """
-    Estimate the metrics of the decrease condition with a residual.
-
-    :param known: One row per transition that does not end in a terminal state
-    :param episodes: One row per episode
-    :param n_levels: Number of levels of the cost
-    :param bootstrap: Bootstrap of the episodes
-    :return: Values with their intervals, by name
-    """
+    """Estimate the metrics of the decrease condition with a residual."""
     names = ("residual", "cost_bound", "cost_bound_alpha3")
     if known.empty:
         return {name: Interval(math.nan, math.nan, math.nan) for name in names}
@@ -258,40 +172,21 @@ def estimate_drift(known: pd.DataFrame, episodes: pd.DataFrame, n_levels: int, b
 
 
 def percent(confidence: float) -> str:
-    """
-    A confidence in per cent as readers see it: never 100.
-
-    :param confidence: Between 0 and 1
-    :return: Without the sign, with two digits after the point or as many as it takes to tell it from 100
-    """
+    """A confidence in per cent as readers see it: never 100."""
     missing = 100 * (1 - confidence)
     decimals = max(2, -math.floor(math.log10(missing)))
     return f"{100 - missing:.{decimals}f}".rstrip("0").rstrip(".")
 
 
 def exact_lower_bound(n_true: int, n: int, confidence: float) -> float:
-    """
-    Lower bound of a probability, from independent trials (Clopper and Pearson, 1934).
-
-    :param n_true: Number of trials in which it was true
-    :param n: Number of trials
-    :param confidence: Probability with which the bound lies below the true probability
-    :return: The bound
-    """
+    """Lower bound of a probability, from independent trials (Clopper and Pearson, 1934)."""
     from scipy.stats import binomtest
 
     return float(binomtest(n_true, n, alternative="greater").proportion_ci(confidence, method="exact").low)
 
 
 def exact_interval(n_true: int, n: int, confidence: float) -> Interval:
-    """
-    Interval of a probability, from independent trials (Clopper and Pearson, 1934).
-
-    :param n_true: Number of trials in which it was true
-    :param n: Number of trials
-    :param confidence: Probability with which the interval contains the true probability
-    :return: The share of the trials with the interval
-    """
+    """Interval of a probability, from independent trials (Clopper and Pearson, 1934)."""
     from scipy.stats import binomtest
 
     interval = binomtest(n_true, n).proportion_ci(confidence, method="exact")
@@ -302,10 +197,6 @@ def exact_percentile(values: np.ndarray, percent: float) -> Interval:
     """
     A percentile with its interval between order statistics, which needs no assumption of how the values are distributed
     (Conover, 1999, Practical Nonparametric Statistics, section 3.2). A bootstrap has no sample above the largest value.
-
-    :param values: Independent values
-    :param percent: Which percentile
-    :return: The percentile of the values; the interval is infinite on a side on which they are too few to limit it
     """
     from scipy.stats import binom
 
@@ -325,15 +216,7 @@ def exact_percentile(values: np.ndarray, percent: float) -> Interval:
 def estimate_metrics(
     transitions: pd.DataFrame, episodes: pd.DataFrame, n_levels: int, bootstrap: Bootstrap
 ) -> dict[str, Interval]:
-    """
-    Estimate the metrics that ``evaluate_lyapunov()`` lists.
-
-    :param transitions: One row per transition
-    :param episodes: One row per episode
-    :param n_levels: Number of levels of the cost
-    :param bootstrap: Bootstrap of the episodes
-    :return: Values with their intervals, by name
-    """
+    """Estimate the metrics that ``evaluate_lyapunov()`` lists."""
     from scipy.stats import binomtest, rankdata
 
     # There is no L in a terminal state
@@ -373,14 +256,7 @@ def estimate_metrics(
 
 
 def decrease_by_cost(transitions: pd.DataFrame, n_levels: int, bootstrap: Bootstrap) -> pd.DataFrame:
-    """
-    Statistics of the decrease condition at each level of the cost.
-
-    :param transitions: One row per transition
-    :param n_levels: Number of levels, at quantiles of the cost (fewer if many costs are equal)
-    :param bootstrap: Bootstrap of the episodes
-    :return: One row per level
-    """
+    """Statistics of the decrease condition at each level of the cost."""
     known = transitions[~transitions["terminated"]]
     levels = known.groupby(levels_of_cost(known, n_levels))
     decrease = [bootstrap.estimate(ratio, level["episode"], level["difference"], np.ones(len(level))) for _, level in levels]

@@ -9,12 +9,7 @@ from sb3_lac import LAC
 @pytest.fixture
 def train_nothing(monkeypatch) -> Callable[[ModuleType], list[tuple]]:
     def _train_nothing(benchmark: ModuleType) -> list[tuple]:
-        """
-        Let a benchmark judge models that are not trained.
-
-        :param benchmark: Its module
-        :return: What it asks for: algorithm, environment, seed and steps of each model
-        """
+        """Let a benchmark judge models that are not trained."""
         from benchmarks.study import write_json
         from benchmarks.training import Recipe, record_file
 

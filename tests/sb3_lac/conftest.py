@@ -68,13 +68,7 @@ def make_model() -> Callable[..., LAC]:
         policy: str = "MlpPolicy",
         **kwargs: Any
     ) -> LAC:
-        """
-        :param env: The environment, a ``LinearCostEnv`` by default
-        :param n_collect: Transitions to collect before returning, without an update
-        :param policy_kwargs: Merged into those of a small policy
-        :param policy: Name of the policy
-        :param kwargs: Other arguments of ``LAC``
-        """
+        """"""
         policy_kwargs = {"net_arch": [16, 16], "activation_fn": nn.LeakyReLU, **(policy_kwargs or {})}
         kwargs = {"learning_starts": 40, "buffer_size": 500, "batch_size": 16, "seed": 0, "device": "cpu", **kwargs}
         model = LAC(policy, LinearCostEnv() if env is None else env, policy_kwargs=policy_kwargs, **kwargs)
@@ -92,14 +86,7 @@ def make_model_without_env() -> Callable[..., LAC]:
     def _make_model_without_env(
         n_states: int = 2, n_actions: int = 2, policy_kwargs: dict[str, Any] | None = None, **kwargs: Any
     ) -> LAC:
-        """
-        A model that knows the spaces of an environment and has none, to train on batches of any numbers.
-
-        :param n_states: Number of observed states
-        :param n_actions: Number of actions
-        :param policy_kwargs: Merged into those of a small policy
-        :param kwargs: Other arguments of ``LAC``
-        """
+        """A model that knows the spaces of an environment and has none, to train on batches of any numbers."""
         policy_kwargs = {"net_arch": [16, 16], "activation_fn": nn.LeakyReLU, **(policy_kwargs or {})}
         kwargs = {"buffer_size": 1, "seed": 0, "device": "cpu", **kwargs}
         # As in ``LAC.load()``
@@ -117,11 +104,7 @@ def make_model_without_env() -> Callable[..., LAC]:
 @pytest.fixture
 def train_metrics() -> Callable[..., dict[str, float]]:
     def _train_metrics(model: LAC, gradient_steps: int = 1, seed: int = 0) -> dict[str, float]:
-        """
-        Train with a reproducible sample of the replay buffer and of the policy.
-
-        :return: What was logged
-        """
+        """Train with a reproducible sample of the replay buffer and of the policy."""
         np.random.seed(seed)
         th.manual_seed(seed)
         model.train(gradient_steps=gradient_steps, batch_size=model.batch_size)
