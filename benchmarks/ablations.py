@@ -54,7 +54,6 @@ VARIANTS: dict[str, Variant] = {
     "gamma": Variant("discount 0.9", {"gamma": 0.9}),
     "entropy": Variant("target entropy -1, SAC's default", {"target_entropy": -1.0}),
     "alpha3": Variant("alpha3 0.1", {"alpha3": 0.1}),
-    "horizon": Variant("horizon of 5 steps", {"horizon": 5}),
     "charges": Variant("charges with a fifth of their weight", {"env_kwargs": {"charge_weight": 0.2}}),
     "no_charges": Variant("no charges in the cost", {"env_kwargs": {"charge_weight": 0.0}}),
     "limit": Variant("cost limit 100", {"env_kwargs": {"cost_limit": 100.0}}),

@@ -31,7 +31,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from battery_env.files import replacing
 from benchmarks.study import digest_of, own_versions, versions, write_json, write_text
-from sb3_lac.discounts import stated_discount
+from sb3_lac.discounts import DEFAULT_DISCOUNT
 from sb3_lac.zoo import LACExperimentManager, find_config
 
 #: Environment steps with the algorithms' own hyperparameters, which name none.
@@ -107,7 +107,7 @@ class Recipe:
             if parameter.default is not parameter.empty and name not in _NOT_LEARNING | set(entry)
         }
         if arguments.get("gamma") == "auto":
-            arguments["gamma"] = stated_discount([metadata])
+            arguments["gamma"] = metadata.get("discount", DEFAULT_DISCOUNT)
         learning_starts = entry.get("learning_starts", arguments.get("learning_starts", 0))
         if timesteps <= learning_starts:
             raise ValueError(

@@ -20,8 +20,9 @@ _LEFT_BEHIND = ("distribution", "gaussian_actions", "weights_dist", "exploration
 Metrics = tuple[tuple[str, ...], th.Tensor]
 
 
-def set_gradients(loss: th.Tensor, parameters: Sequence[th.Tensor]) -> None:
-    """Let parameters have the gradient of a loss, for the next step of their optimizer."""
+def set_gradients(loss: th.Tensor, optimizer: th.optim.Optimizer) -> None:
+    """Let what an optimizer changes have the gradient of a loss, and nothing else that the loss depends on."""
+    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     trained = [parameter for parameter in parameters if parameter.requires_grad]
     if not th.compiler.is_compiling():
         # Without ``zero_grad()``, whose records for the profiler take longer than its work
@@ -58,6 +59,20 @@ def step(optimizer: th.optim.Optimizer) -> None:
             inspect.unwrap(type(optimizer).step)(optimizer)
     else:
         optimizer.step()
+
+
+def update_multiplier(log_multiplier: th.Tensor, optimizer: th.optim.Optimizer, violation: th.Tensor) -> th.Tensor:
+    """
+    Step of a Lagrange multiplier in log space, which grows while its constraint is violated:
+    ``lambda`` with the decrease condition, ``ent_coef`` with the entropy constraint
+    (see https://github.com/rail-berkeley/softlearning/issues/37 for the logarithm).
+    """
+    violation = violation.detach()
+    loss = -log_multiplier.detach() * violation
+    # The loss is linear in the logarithm: autograd would only find the same number again
+    set_gradient(log_multiplier, -violation.reshape(1))
+    step(optimizer)
+    return loss
 
 
 def actors_of(model: Any) -> list[Actor]:

@@ -100,7 +100,7 @@ def test_sb3_lac_knows_nothing_of_batteries(path):
         ("plots", set()),
         ("statistics", set()),
         ("functions", {"lac"}),
-        ("rollout", {"discounts", "lac", "stability.functions"}),
+        ("rollout", {"stability.functions"}),
         ("fitting", {"files", "stability.functions", "stability.rollout"}),
     ],
 )

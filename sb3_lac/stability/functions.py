@@ -159,7 +159,7 @@ class CriticLyapunov(LyapunovFunction):
 
     def __init__(self, model: LAC):
         bound = model.reward_bound.item()
-        super().__init__(self._of_the_mean_action, model.alpha3, model.gamma, model.horizon, reward_bound=bound)
+        super().__init__(self._of_the_mean_action, model.alpha3, model.gamma, reward_bound=bound)
         self.model = model
 
     def _of_the_mean_action(self, observations: Observations) -> np.ndarray:

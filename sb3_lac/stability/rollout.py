@@ -19,8 +19,6 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, unwrap_vec_normalize
 
-from sb3_lac.discounts import sum_of_discounts
-from sb3_lac.lac import LAC
 from sb3_lac.stability.functions import LyapunovFunction, Observations
 
 if TYPE_CHECKING:
@@ -52,7 +50,7 @@ def prepare_evaluation(policy: PolicyPredictor, env: gym.Env | VecEnv, of_the_cr
                 "policy and L would get numbers that they were not trained on. Wrap the evaluation environment "
                 "with VecNormalize in the same way, and synchronize its statistics with sync_envs_normalization()."
             )
-        if not isinstance(policy, LAC) and trains_on(policy, env):
+        if trains_on(policy, env):
             raise ValueError(
                 f"The evaluation environment is the training environment: {type(policy).__name__} would go on with an "
                 "observation of before the evaluation. Make a second environment for the evaluation."
@@ -130,8 +128,7 @@ def normalization(vec_normalize: VecNormalize | None, with_rewards: bool) -> str
 @contextmanager
 def undisturbed(policy: PolicyPredictor, env: VecEnv, seed: int) -> Iterator[None]:
     """
-    Let a training go on after an evaluation as if there had been none: its random numbers, its normalization and, for LAC, the
-    episodes that it was in.
+    Let a training go on after an evaluation as if there had been none: its random numbers and its normalization.
     """
     vec_normalize = unwrap_vec_normalize(env)
     env.seed(seed)
@@ -152,8 +149,6 @@ def undisturbed(policy: PolicyPredictor, env: VecEnv, seed: int) -> Iterator[Non
                 vec_normalize.training = False
             yield
         finally:
-            if isinstance(policy, LAC) and trains_on(policy, env):
-                policy.end_episodes()
             if vec_normalize is not None:
                 vec_normalize.training = training
             if isinstance(policy, (BaseAlgorithm, BasePolicy)):
@@ -357,7 +352,7 @@ def cost_to_go(
         # Of the steps from now on, those after the termination
         passed = remaining if horizon is None else np.minimum(remaining, horizon)
         weights = np.append(0.0, np.cumsum(gamma ** np.arange(lengths.max())))
-        sums = sums + terminated * bound * (sum_of_discounts(gamma, horizon) - weights[passed])
+        sums = sums + terminated * bound * (1 / (1 - gamma) - weights[passed])
     return np.where(seen | terminated, sums, np.nan)
 
 

@@ -75,10 +75,18 @@ def make_model() -> Callable[..., LAC]:
         model.set_logger(Logger(folder=None, output_formats=[]))
         if n_collect > 0:
             model.learn(n_collect)
-        assert model._n_updates == 0
         return model
 
     return _make_model
+
+
+@pytest.fixture
+def n_updates() -> Callable[[LAC], int]:
+    def _n_updates(model: LAC) -> int:
+        """How often a model has been updated, saved and loaded in between or not."""
+        return int(model.lambda_optimizer.state.get(model.log_lambda, {}).get("step", 0))
+
+    return _n_updates
 
 
 @pytest.fixture

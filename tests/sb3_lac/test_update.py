@@ -7,7 +7,7 @@ import pytest
 import torch as th
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
-from sb3_lac.lac import update_multiplier
+from sb3_lac.compiled import update_multiplier
 from sb3_lac.policies import largest_value
 
 GAMMA, TAU, LEARNING_RATE, LAMBDA_LEARNING_RATE, ALPHA3 = 0.9, 0.05, 1e-2, 2e-2, 0.3
@@ -194,10 +194,10 @@ def test_lambda_has_its_own_learning_rate(make_model, train_metrics):
     def decay(progress_remaining: float) -> float:
         return 0.5 * progress_remaining
 
-    model = make_model(learning_rate=1e-3, lambda_learning_rate=decay)
-    model._current_progress_remaining = 0.5
+    model = make_model(learning_rate=1e-3, lambda_learning_rate=decay, n_collect=80)
+    # The last update is that after step 80 of 80
+    assert model.lambda_optimizer.param_groups[0]["lr"] == 0.0
     train_metrics(model)
-    assert model.lambda_optimizer.param_groups[0]["lr"] == 0.25
     for optimizer in (model.actor.optimizer, model.critic.optimizer, model.ent_coef_optimizer):
         assert optimizer.param_groups[0]["lr"] == 1e-3
     assert make_model(learning_rate=2e-3, n_collect=0).lambda_optimizer.param_groups[0]["lr"] == 2e-3
@@ -247,9 +247,9 @@ def test_no_gradient_step_changes_nothing(make_model, train_metrics):
     assert all(th.equal(before[name], tensor) for name, tensor in model.policy.state_dict().items())
 
 
-def test_same_seed_same_result(make_model):
+def test_same_seed_same_result(make_model, n_updates):
     first, second = (make_model(n_collect=0, seed=3).learn(80) for _ in range(2))
-    assert first._n_updates == 40
+    assert n_updates(first) == n_updates(second) == 40
     for parameter, other in zip(first.policy.state_dict().values(), second.policy.state_dict().values(), strict=True):
         assert th.equal(parameter, other)
     assert th.equal(first.log_lambda, second.log_lambda)

@@ -1,0 +1,102 @@
+"""Costs in place of rewards. Where no reward is positive, which is most often, a cost is the negated reward."""
+
+import math
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_lac.policies import LyapunovPolicy
+
+
+class CostAlgorithm(OffPolicyAlgorithm):
+    """
+    Off-policy algorithm that minimises the cost ``bound - reward >= 0``, where ``bound`` is the largest reward stated or seen,
+    and at least 0. After a termination nothing is paid, so that each step costs ``bound``. The critics learn
+    ``L - offset``, where ``offset = bound / (1 - gamma)`` is the value of ``L`` where nothing is ever paid: when the bound
+    rises, all values of ``L`` rise with it, and there is nothing to learn anew.
+    """
+
+    policy: LyapunovPolicy
+    #: The largest reward that the environment can pay as the user knows it, before any normalization
+    stated_reward_bound: float | None
+
+    @property
+    def reward_bound(self) -> th.Tensor:
+        """The largest reward stated or seen, before any normalization, shape (1,). It is part of the policy, as ``L`` is."""
+        return self.policy.reward_bound
+
+    def cost_bound(self, vec_normalize: VecNormalize | None = None) -> th.Tensor:
+        """
+        Get the reward that costs nothing, in the units of the rewards that the agent sees, shape (1,).
+
+        :param vec_normalize: Wrapper that these come from, if any
+        """
+        bound = self.reward_bound.clamp(min=self.stated_reward_bound or 0.0)
+        if vec_normalize is None or not vec_normalize.norm_reward:
+            return bound
+        return (bound / reward_scale(vec_normalize)).clamp(max=vec_normalize.clip_reward)
+
+    def update_offset(self, vec_normalize: VecNormalize | None) -> None:
+        """
+        Give the critics the offset of the present bound.
+
+        :param vec_normalize: Wrapper that the rewards come from, if any
+        :raises ValueError: If it is infinite
+        """
+        if self.gamma < 1:
+            offset = self.cost_bound(vec_normalize) / (1 - self.gamma)
+            self.policy.critic.offset.copy_(offset)
+            self.policy.critic_target.offset.copy_(offset)
+        elif self.reward_bound > 0:
+            raise ValueError(
+                f"gamma={self.gamma} must be smaller than 1 with rewards up to {self.reward_bound.item():g}: each step below "
+                "that reward has a cost, whose sum over all time is infinite. Use for instance gamma=0.99."
+            )
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        # The largest reward of a step, which n-step returns do not tell
+        vec_normalize = self._vec_normalize_env
+        largest_reward = float(np.max(reward if vec_normalize is None else vec_normalize.get_original_reward()))
+        if largest_reward > 0 and largest_reward > self.reward_bound:
+            self.reward_bound.fill_(largest_reward)
+            self.update_offset(vec_normalize)
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+
+    def costs(self, replay_data: ReplayBufferSamples) -> th.Tensor:
+        """
+        Get the costs of sampled transitions, of which none is negative. The bound follows rewards that are computed only then
+        (HER), or that were stored elsewhere; of the latter, n-step returns only tell their mean.
+
+        :param replay_data: The transitions
+        :return: As many costs, with n-step returns their discounted sums
+        """
+        # How often a reward of each step counts in a return: 1 + gamma + ... + gamma^(n-1)
+        n_rewards = 1.0 if replay_data.discounts is None else (1 - replay_data.discounts) / (1 - self.gamma)
+        largest_reward = (replay_data.rewards / n_rewards).max()
+        vec_normalize = self._vec_normalize_env
+        self.reward_bound.copy_(th.maximum(self.reward_bound, largest_reward * reward_scale(vec_normalize)))
+        # The scale of the rewards may have changed too
+        self.update_offset(vec_normalize)
+        # Changes of the units round
+        bound = th.maximum(self.cost_bound(vec_normalize), largest_reward)
+        return bound * n_rewards - replay_data.rewards
+
+
+def reward_scale(vec_normalize: VecNormalize | None) -> float:
+    """What a reward of the environment is divided by before the agent sees it."""
+    if vec_normalize is None or not vec_normalize.norm_reward:
+        return 1.0
+    return math.sqrt(vec_normalize.ret_rms.var + vec_normalize.epsilon)
