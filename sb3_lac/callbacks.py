@@ -10,29 +10,22 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, EventCallback
 from stable_baselines3.common.logger import Figure
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_lac.dashboard import NOT_TENSORBOARD, tensorboard_writer
 from sb3_lac.files import replacing
-from sb3_lac.lac import LAC
 from sb3_lac.stability import (
     CertificationReport,
-    Interval,
+    LyapunovFunction,
     LyapunovReport,
     NoCostError,
     certify,
     evaluate_lyapunov,
     fit_lyapunov,
 )
-from sb3_lac.stability.certification import check_questions
-from sb3_lac.stability.rollout import (
-    check_environment,
-    check_number,
-    check_training_seeds,
-    known_seed,
-    prepare_evaluation,
-    trains_on,
-)
+from sb3_lac.stability.certification import check_bound
+from sb3_lac.stability.loop import check_training_seeds, closed_loop, vectorized
+from sb3_lac.stability.report import critic_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
@@ -51,8 +44,7 @@ class LyapunovCallback(EventCallback):
       To account for that, you can use ``eval_freq = max(eval_freq // n_envs, 1)``
 
     :param eval_env: The environment used for evaluation, wrapped with ``VecNormalize`` if the training environment is:
-        its statistics are synchronized before each evaluation. It cannot be the training environment itself, whose episodes
-        the evaluation would end.
+        its statistics are synchronized before each evaluation. It cannot be the training environment itself.
     :param callback_after_eval: Callback to trigger after every evaluation, which finds the report in
         ``self.parent.last_report``
     :param n_eval_episodes: The number of episodes to test the agent
@@ -65,19 +57,11 @@ class LyapunovCallback(EventCallback):
     :param verbose: Verbosity level: 0 for no output, 1 for the summary of each evaluation
     """
 
-    #: Metrics that are logged, with their names in the log
-    METRICS: ClassVar[dict[str, str]] = {
-        "decrease": "decrease",
-        "share_decreasing": "share_decreasing",
-        "largest_feasible_alpha3": "feasible_alpha3",
-        "mean_cost": "mean_cost",
-        "calibration_slope": "calibration_slope",
-        "rank_correlation": "rank_correlation",
-        "ultimate_bound": "ultimate_bound",
-        "death_rate": "death_rate",
-    }
-    #: Whether values of the critic are judged
-    OF_THE_CRITIC: ClassVar[bool] = True
+    #: Metrics that are logged; SB3 cuts names after 36 characters, and so ``largest_feasible_alpha3`` is ``feasible_alpha3``
+    METRICS: ClassVar[tuple[str, ...]] = (
+        *("decrease", "share_decreasing", "largest_feasible_alpha3", "mean_cost", "calibration_slope", "rank_correlation"),
+        *("ultimate_bound", "death_rate"),
+    )
 
     def __init__(
         self,
@@ -91,11 +75,7 @@ class LyapunovCallback(EventCallback):
         verbose: int = 1,
     ):
         super().__init__(callback_after_eval, verbose=verbose)
-        check_environment(eval_env)
-        # Convert to VecEnv for consistency
-        if not isinstance(eval_env, VecEnv):
-            eval_env = DummyVecEnv([lambda: eval_env])  # type: ignore[list-item, return-value]
-        self.eval_env = eval_env
+        self.eval_env = vectorized(eval_env)
         self.n_eval_episodes = n_eval_episodes
         self.eval_freq = eval_freq
         self.deterministic = deterministic
@@ -107,36 +87,32 @@ class LyapunovCallback(EventCallback):
 
     def _init_callback(self) -> None:
         # A mistake is seen before the training, and not at its first evaluation
-        if self.OF_THE_CRITIC and not isinstance(self.model, LAC):
-            raise ValueError(
-                f"The model must be a LAC model, which has a Lyapunov function, and not {self.model!r}. CertificateCallback "
-                "learns one for any other model."
-            )
-        known_seed(self.seed)
-        check_number("n_eval_episodes", self.n_eval_episodes)
-        self.eval_env = prepare_evaluation(self.model, self.eval_env, self.OF_THE_CRITIC)
-        if trains_on(self.model, self.eval_env):
-            raise ValueError(
-                "The evaluation environment is the training environment: an evaluation would end its episodes, and the "
-                "replay buffer would join them with others. Make a second environment for the evaluation."
-            )
+        judged = self._judged()
+        with closed_loop(self.model, self.eval_env, judged, self.n_eval_episodes, self.deterministic, self.seed) as loop:
+            self.eval_env = loop.env
         if self.model.num_timesteps == 0:
             # Of another training
             self.history = []
         if self.log_path is not None:
-            import pandas as pd  # slow to import, and only an evaluation needs it
+            self._continue_log(self.log_path)
 
-            if self.log_path.is_dir():
-                raise ValueError(f"log_path={self.log_path} is a folder: give the path of a CSV file.")
-            self.log_path.parent.mkdir(parents=True, exist_ok=True)
-            if self.log_path.exists() and self.log_path.stat().st_size > 0:
-                if self.model.num_timesteps == 0:
-                    raise ValueError(
-                        f"log_path={self.log_path} holds the evaluations of another training, and this one starts anew: move "
-                        "the file away, give another path, or continue with learn(..., reset_num_timesteps=False)."
-                    )
-                records = pd.read_csv(self.log_path).to_dict("records")
-                self.history = [{str(name): value for name, value in record.items()} for record in records]
+    def _judged(self) -> LyapunovFunction | None:
+        """Return the function that is judged, if it is known before the evaluation."""
+        return critic_of(self.model)
+
+    def _continue_log(self, path: Path) -> None:
+        import pandas as pd  # slow to import, and only an evaluation needs it
+
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if not path.exists() or path.stat().st_size == 0:
+            return
+        if self.model.num_timesteps == 0:
+            raise ValueError(
+                f"log_path={path} holds the evaluations of another training, and this one starts anew: move the file away, "
+                "give another path, or continue with learn(..., reset_num_timesteps=False)."
+            )
+        records = pd.read_csv(path).to_dict("records")
+        self.history = [{str(name): value for name, value in record.items()} for record in records]
 
     def _on_step(self) -> bool:
         if self.eval_freq <= 0 or self.n_calls % self.eval_freq != 0:
@@ -149,12 +125,21 @@ class LyapunovCallback(EventCallback):
             if training.norm_obs:
                 evaluation.obs_rms = deepcopy(training.obs_rms)
 
-        entry = {"timesteps": self.num_timesteps, **self._evaluate()}
+        values = self._evaluate()
         # Dump log so the evaluation results are printed with the correct timestep
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(self.num_timesteps)
 
-        self._add_to_history(entry)
+        # In place of an older one after as many timesteps, when continuing from a checkpoint
+        entries = {entry["timesteps"]: entry for entry in self.history} | {
+            self.num_timesteps: {"timesteps": self.num_timesteps, **values}
+        }
+        self.history = [entries[timesteps] for timesteps in sorted(entries)]
+        if self.log_path is not None:
+            import pandas as pd
+
+            with replacing(self.log_path) as part:
+                pd.DataFrame(self.history).to_csv(part, index=False)
         if self.verbose >= 1:
             print(f"Eval num_timesteps={self.num_timesteps}, {self._summary()}")
 
@@ -163,18 +148,18 @@ class LyapunovCallback(EventCallback):
 
     def _evaluate(self) -> dict[str, float]:
         """Evaluate, and log what was found."""
-        assert isinstance(self.model, LAC)
         self.last_report = evaluate_lyapunov(
             self.model, self.eval_env, self.n_eval_episodes, deterministic=self.deterministic, seed=self.seed
         )
-        return self._log("lyapunov", self._metrics(self.last_report), {"report": self.last_report.plot})
+        return self._log("lyapunov", self._metrics(), {"report": self.last_report.plot})
 
-    def _metrics(self, report: LyapunovReport | None) -> dict[str, float]:
-        """The metrics that are logged."""
+    def _metrics(self) -> dict[str, float]:
+        """Return the metrics that are logged, NaN if there is no report."""
         values: dict[str, float] = {}
-        for metric, name in self.METRICS.items():
-            found = Interval(np.nan, np.nan, np.nan) if report is None else report.metrics[metric]
-            values.update({name: found.value, f"{name}_low": found.low, f"{name}_high": found.high})
+        for metric in self.METRICS:
+            name = metric.removeprefix("largest_")
+            found = (np.nan,) * 3 if self.last_report is None else self.last_report.metrics[metric]
+            values.update(zip((name, f"{name}_low", f"{name}_high"), found, strict=True))
         return values
 
     def _log(
@@ -196,54 +181,33 @@ class LyapunovCallback(EventCallback):
         assert self.last_report is not None
         return self.last_report.summary()
 
-    def _add_to_history(self, entry: dict[str, float]) -> None:
-        """Keep an evaluation, in place of an older one after as many timesteps (when continuing from a checkpoint)."""
-        others = [old for old in self.history if old["timesteps"] != entry["timesteps"]]
-        self.history = sorted([*others, entry], key=lambda evaluation: evaluation["timesteps"])
-        if self.log_path is not None:
-            import pandas as pd
-
-            with replacing(self.log_path) as part:
-                pd.DataFrame(self.history).to_csv(part, index=False)
-
 
 class CertificateCallback(LyapunovCallback):
     """
     Callback for certifying the policy of any algorithm while it trains: a Lyapunov function is fitted to roll-outs of the mean
-    action (see ``fit_lyapunov()``) and judged on others (see ``evaluate_lyapunov()``), about which exact statements are made
-    (see ``certify()``). The training is not changed by it. Each of the three takes its own seed, so that all evaluations have
-    the same start states and none is judged on what it was fitted on. Where nothing has a cost there is nothing to certify:
-    all values are then NaN. TensorBoard also gets the limits of the confidence intervals (``certificate/<name>_low``,
-    ``certificate/<name>_high``) and two figures, ``certificate/drift`` and ``certificate/statements``.
+    action (see ``fit_lyapunov()``), exact statements are made about others (see ``certify()``), and the function is judged on
+    yet others (see ``evaluate_lyapunov()``). The training is not changed by it. Each of the three takes its own seed, so that
+    all evaluations have the same start states and none is judged on what it was fitted on. Where nothing has a cost there is
+    nothing to certify: all values are then NaN. TensorBoard also gets the limits of the confidence intervals
+    (``certificate/<name>_low``, ``certificate/<name>_high``) and two figures, ``certificate/drift`` and
+    ``certificate/statements``.
 
     :param eval_env: The environment used for evaluation, as for ``LyapunovCallback``
     :param callback_after_eval: Callback to trigger after every evaluation, which finds the reports in
         ``self.parent.last_report`` and ``self.parent.last_certification``
     :param n_eval_episodes: Number of episodes for each of the three
     :param eval_freq: Evaluate the agent every ``eval_freq`` call of the callback.
-    :param confidence: Of all statements of one evaluation together; it is not corrected for the number of evaluations
-    :param cost_bound: The cost to stay within, the largest late cost of the roll-outs of the fit by default
+    :param ultimate_bound: The cost to stay within, the largest late cost of the roll-outs of the fit by default
     :param seed: Seed of each evaluation, far from those of the training; if it is None, each draws its own
     :param log_path: Path of a CSV file, as for ``LyapunovCallback``
     :param verbose: Verbosity level: 0 for no output, 1 for the summary of each evaluation
     """
 
-    #: Metrics that are logged beside the statements, with their names in the log
-    METRICS: ClassVar[dict[str, str]] = {
-        "largest_feasible_alpha3": "feasible_alpha3",
-        "mean_cost": "mean_cost",
-        "start_cost": "start_cost",
-        "cost_bound": "cost_bound",
-        "ultimate_bound": "ultimate_bound",
-        "death_rate": "death_rate",
-    }
-    #: Bounds of the statements that are logged, with their names in the log
-    BOUNDS: ClassVar[dict[str, str]] = {
-        "survives": "survives_at_least",
-        "stays_within": "stays_within_at_least",
-        "decreases": "decreases_at_least",
-    }
-    OF_THE_CRITIC: ClassVar[bool] = False
+    METRICS: ClassVar[tuple[str, ...]] = (
+        *("largest_feasible_alpha3", "mean_cost", "start_cost", "cost_bound", "ultimate_bound", "death_rate"),
+    )
+    #: Statements whose bounds are logged
+    STATEMENTS: ClassVar[tuple[str, ...]] = ("survives", "stays_within", "decreases")
 
     def __init__(
         self,
@@ -251,43 +215,48 @@ class CertificateCallback(LyapunovCallback):
         callback_after_eval: BaseCallback | None = None,
         n_eval_episodes: int = 100,
         eval_freq: int = 10_000,
-        confidence: float = 0.95,
-        cost_bound: float | None = None,
+        ultimate_bound: float | None = None,
         seed: int | None = 10_000,
         log_path: str | os.PathLike[str] | None = None,
         verbose: int = 1,
     ):
         super().__init__(eval_env, callback_after_eval, n_eval_episodes, eval_freq, True, seed, log_path, verbose)
-        self.confidence = confidence
-        self.cost_bound = cost_bound
+        check_bound(ultimate_bound)
+        self.ultimate_bound = ultimate_bound
         self.last_certification: CertificationReport | None = None
 
     def _init_callback(self) -> None:
-        check_questions(None, self.confidence, self.cost_bound, None, None)
         super()._init_callback()
         if self.seed is not None:
-            check_training_seeds(self.model, self.seed, 3 * self.eval_env.num_envs)
+            check_training_seeds(self.model, range(self.seed, self.seed + 3 * self.eval_env.num_envs))
+
+    def _judged(self) -> None:
+        return None
 
     def _evaluate(self) -> dict[str, float]:
-        first, n_envs, n_episodes = known_seed(self.seed), self.eval_env.num_envs, self.n_eval_episodes
         self.last_report = self.last_certification = None
+        n_episodes, n_envs = self.n_eval_episodes, self.eval_env.num_envs
+        figures = {}
         try:
-            lyapunov = fit_lyapunov(self.model, self.eval_env, n_episodes, seed=first, progress_bar=False)
+            lyapunov = fit_lyapunov(self.model, self.eval_env, n_episodes, seed=self.seed, progress_bar=False)
         except NoCostError:
-            nothing = dict.fromkeys(("holds", *self.BOUNDS.values()), np.nan)
-            return self._log("certificate", {**nothing, **self._metrics(None)}, {})
-        self.last_report = evaluate_lyapunov(self.model, self.eval_env, n_episodes, seed=first + n_envs, lyapunov=lyapunov)
-        self.last_certification = certify(
-            self.model, self.eval_env, lyapunov, n_episodes, self.confidence, self.cost_bound, seed=first + 2 * n_envs
-        )
-        values = {"holds": float(self.last_report.holds)}
-        for statement, name in self.BOUNDS.items():
-            # A statement that no episode could make
-            values[name] = float(self.last_certification.statements["at_least"].get(statement, np.nan))
-        figures = {"drift": self.last_report.plot_drift, "statements": self.last_certification.plot}
-        return self._log("certificate", {**values, **self._metrics(self.last_report)}, figures)
+            pass
+        else:
+            seed = lyapunov.seeds.stop
+            judged = (self.model, self.eval_env)
+            self.last_report = evaluate_lyapunov(*judged, n_episodes, seed=seed, lyapunov=lyapunov)
+            self.last_certification = certify(
+                *judged, lyapunov, n_episodes, ultimate_bound=self.ultimate_bound, seed=seed + n_envs
+            )
+            figures = {"drift": self.last_report.plot_drift, "statements": self.last_certification.plot}
+        values = {"holds": np.nan if self.last_report is None else float(self.last_report.holds)}
+        for statement in self.STATEMENTS:
+            # NaN for a statement that no episode could make
+            made = {} if self.last_certification is None else self.last_certification.statements["at_least"]
+            values[f"{statement}_at_least"] = float(made.get(statement, np.nan))
+        return self._log("certificate", {**values, **self._metrics()}, figures)
 
     def _summary(self) -> str:
         if self.last_certification is None:
             return "nothing had a cost, and so there is nothing to certify"
-        return "\n".join([super()._summary(), self.last_certification.summary()])
+        return "\n".join([self.last_certification.summary(), super()._summary()])

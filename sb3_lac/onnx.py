@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import inspect
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,10 +13,10 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecNormalize, unwrap_vec_normalize
-from torch.distributions import Distribution
+from torch.distributions import Distribution, Normal
 
 from sb3_lac.files import replacing
 from sb3_lac.vec_env import env_specs
@@ -61,11 +63,15 @@ class DeterministicPolicy(th.nn.Module):
         self.to(policy.device)
 
     def forward(self, observation: th.Tensor) -> th.Tensor:
-        """"""
+        """Compute actions of the environment from its observations."""
         if self.clip_obs is not None:
             observation = (observation - self.mean - self.rest_of_mean) / self.deviation
             observation = observation.clamp(-self.clip_obs, self.clip_obs)
-        action = self.policy._predict(observation, deterministic=True).reshape(-1, *self.low.shape)
+        if isinstance(self.policy, ActorCriticPolicy):
+            action = self.policy.get_distribution(observation).get_actions(deterministic=True)
+        else:
+            action = self.policy(observation, deterministic=True)
+        action = action.reshape(-1, *self.low.shape)
         if self.policy.squash_output:
             return self.low + 0.5 * (action + 1.0) * (self.high - self.low)
         return action.clamp(self.low, self.high)
@@ -96,7 +102,7 @@ def export_onnx(
     :raises ImportError: Without the extra
     """
     try:
-        import onnxruntime
+        import onnxruntime  # noqa: F401
         import onnxscript  # noqa: F401  (torch's exporter needs it)
     except ImportError as missing:
         raise ImportError(f"{missing}: export_onnx needs pip install 'sb3_lac[onnx]'.") from missing
@@ -110,7 +116,7 @@ def export_onnx(
     for name, space in (("observation", policy.observation_space), ("action", policy.action_space)):
         if not isinstance(space, spaces.Box):
             raise ValueError(f"The {name} space {space} must be a Box: other spaces have no ONNX export.")
-    if "lstm_states" in inspect.signature(policy._predict).parameters:
+    if "lstm_states" in inspect.signature(policy.forward).parameters:
         raise ValueError(f"{type(policy).__name__} has a memory: only policies of the observation alone have an ONNX export.")
     env = model.env if isinstance(model, BaseAlgorithm) else None
     if env is not None:
@@ -122,6 +128,15 @@ def export_onnx(
             "without. If they were, pass vec_normalize=VecNormalize.load(...), or load the model with its environment.",
             stacklevel=2,
         )
+    content = _checked_file(policy, vec_normalize, env_id, type(model).__name__)
+    with replacing(path) as part:
+        part.write_bytes(content)
+    return path
+
+
+def _checked_file(policy: BasePolicy, vec_normalize: VecNormalize | None, env_id: str | None, algorithm: str) -> bytes:
+    """Return the content of a file that does what the policy does."""
+    import onnxruntime
 
     if vec_normalize is not None and not vec_normalize.norm_obs:
         vec_normalize = None
@@ -130,41 +145,33 @@ def export_onnx(
             f"VecNormalize normalizes observations of shape {vec_normalize.observation_space.shape}, and those of the policy "
             f"have {policy.observation_space.shape}: a wrapper around it, like VecFrameStack, has no ONNX export."
         )
-
     was_training = policy.training
     policy.set_training_mode(False)
-    module = DeterministicPolicy(policy, vec_normalize).eval()
-    observations = _observations(policy.observation_space, vec_normalize)
     try:
+        module = DeterministicPolicy(policy, vec_normalize).eval()
+        observations = observations_to_check(policy.observation_space, vec_normalize)
         seen = observations if vec_normalize is None else vec_normalize.normalize_obs(observations)
         expected, _ = policy.predict(seen, deterministic=True)
-        with th.no_grad():
-            content = _graph(module, observations, env_id, type(model).__name__).SerializeToString()
+        content = graph_of(module, observations, env_id, algorithm).SerializeToString()
     finally:
         policy.set_training_mode(was_training)
-
     session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
     (action,) = session.run(None, {"observation": observations})
     ranges = (module.high - module.low).cpu().numpy()
     error = float(np.max(np.abs(action - expected) / np.where(ranges > 0, ranges, 1.0)))
     if not error <= TOLERANCE:
         raise ValueError(f"The exported policy differs from the original by {error:g} of the range of its actions.")
-    with replacing(path) as part:
-        part.write_bytes(content)
-    return path
+    return content
 
 
-def _observations(space: spaces.Space, vec_normalize: VecNormalize | None) -> np.ndarray:
-    """"""
+def observations_to_check(space: spaces.Space, vec_normalize: VecNormalize | None) -> np.ndarray:
+    """Draw observations that fill the space, or what ``VecNormalize`` has seen."""
     assert isinstance(space, spaces.Box)
     low, high = space.low.astype(np.float64), space.high.astype(np.float64)
     if vec_normalize is None:
         # Bounds like 3e38 are none: no observation comes near
-        far_below, far_above = low < -_FAR, high > _FAR
-        low, high = (
-            np.where(far_below, np.where(far_above, -10.0, high - 20.0), low),
-            np.where(far_above, np.where(far_below, 10.0, low + 20.0), high),
-        )
+        nearest = np.clip(0.0, low, high)
+        low, high = np.where(low < -_FAR, nearest - 10.0, low), np.where(high > _FAR, nearest + 10.0, high)
     else:
         assert isinstance(vec_normalize.obs_rms, RunningMeanStd)  # of a Box
         mean, spread = vec_normalize.obs_rms.mean, 3.0 * np.sqrt(vec_normalize.obs_rms.var)
@@ -173,16 +180,28 @@ def _observations(space: spaces.Space, vec_normalize: VecNormalize | None) -> np
     return rng.uniform(low, np.maximum(low, high), (_N_CHECKED, *space.shape)).astype(np.float32)
 
 
-def _graph(module: DeterministicPolicy, observations: np.ndarray, env_id: str | None, algorithm: str) -> ModelProto:
-    """"""
+@contextmanager
+def _unchecked_distributions() -> Iterator[None]:
+    """Let distributions take any arguments: checks depend on values, which a graph does not know."""
+    try:
+        Normal(0.0, -1.0)
+        checked = False
+    except ValueError:
+        checked = True
+    Distribution.set_default_validate_args(False)
+    try:
+        yield
+    finally:
+        Distribution.set_default_validate_args(checked)
+
+
+def graph_of(module: DeterministicPolicy, observations: np.ndarray, env_id: str | None, algorithm: str) -> ModelProto:
+    """Export a module, and describe it."""
     import onnx
 
     import sb3_lac
 
-    # Checks of arguments depend on values, which a graph does not know
-    validate_args = Distribution._validate_args
-    Distribution.set_default_validate_args(False)
-    try:
+    with _unchecked_distributions(), th.no_grad():
         program = th.onnx.export(
             module,
             (th.as_tensor(observations, device=module.low.device),),
@@ -192,8 +211,6 @@ def _graph(module: DeterministicPolicy, observations: np.ndarray, env_id: str | 
             dynamo=True,
             verbose=False,
         )
-    finally:
-        Distribution.set_default_validate_args(validate_args)
     assert program is not None
     graph = program.model_proto
     # Where the code lies on this machine, for whoever gets the file

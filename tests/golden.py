@@ -308,7 +308,7 @@ def certificates() -> Numbers:
         found = certify(policy, env, lyapunov, 8, seed=2000)
         for statement, row in found.statements.iterrows():
             yield f"certificate/{name}/{env_id}/statement/{statement}", row.to_numpy(dtype=float)
-        values = [np.nan if each is None else each for each in (found.cost_bound, found.level, found.window_steps)]
+        values = [np.nan if each is None else each for each in (found.ultimate_bound, found.level, found.window_steps)]
         yield f"certificate/{name}/{env_id}/bounds", np.array(values, dtype=float)
 
 

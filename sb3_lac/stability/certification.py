@@ -3,42 +3,37 @@
 from __future__ import annotations
 
 import math
-import numbers
 from collections.abc import Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
+from numbers import Real
 from typing import TYPE_CHECKING
 
 import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.type_aliases import PolicyPredictor
-from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_lac.stability.fitting import FittedLyapunov, flatten
-from sb3_lac.stability.functions import LyapunovFunction, check_function, check_rewards
-from sb3_lac.stability.rollout import (
-    check_number,
-    check_seeds,
-    check_training_seeds,
-    known_seed,
-    prepare_evaluation,
-    roll_out,
-    stay_within,
-    summarize_episodes,
-    undisturbed,
-)
-from sb3_lac.stability.statistics import exact_interval, exact_lower_bound, percent
-from sb3_lac.vec_env import env_specs
+from sb3_lac.stability.functions import LyapunovFunction
+from sb3_lac.stability.loop import ClosedLoop, check_training_seeds, closed_loop
+from sb3_lac.stability.rollout import flatten, summarize_episodes
+from sb3_lac.stability.statistics import CONFIDENCE, exact_interval, exact_lower_bound
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
+#: What it takes to make a statement that not every certification makes
+_NEEDS = {
+    "stays_within": "an ultimate_bound: give one, or a fitted function, whose roll-outs have one",
+    "decreases": "a function with a level and window_steps, as that of fit_lyapunov(policy, env) if it falls, and an episode "
+    "that starts above that level and is longer than that",
+}
+
 
 @dataclass(frozen=True, eq=False)
 class CertificationReport:
     """
-    What is known of a closed loop with a given confidence, see ``certify()``.
+    What is known of a closed loop with 95 % confidence, see ``certify()``.
 
     :param statements: One row per statement, by name: ``n_episodes`` that testify, ``n_true`` of them for it, their ``share``,
         and ``at_least``, which the probability is not below with the confidence
@@ -48,8 +43,7 @@ class CertificationReport:
         and one column per statement: 1 if it was true, 0 if not, NaN if the episode does not testify
     :param starts: One row per start state on the grid: ``state_0`` and so on, ``n_episodes``, ``n_attracted``, their ``share``
         with its exact interval ``low`` and ``high``; None if no start states were given
-    :param confidence: Of all statements together; of the interval of each start state by itself
-    :param cost_bound: The cost to stay within, None if there is none
+    :param ultimate_bound: The cost to stay within, None if there is none
     :param level: Value of the function above which it has to decrease, None if there is none
     :param window_steps: Over how many steps, None if there is none
     :param description: The policy, the environment and the seed
@@ -59,8 +53,7 @@ class CertificationReport:
     transitions: pd.DataFrame
     episodes: pd.DataFrame
     starts: pd.DataFrame | None
-    confidence: float
-    cost_bound: float | None
+    ultimate_bound: float | None
     level: float | None
     window_steps: int | None
     description: str
@@ -68,11 +61,11 @@ class CertificationReport:
     @property
     def confidence_of_each(self) -> float:
         """Confidence of a single statement, with which all of them hold together (Bonferroni's inequality)."""
-        return 1 - (1 - self.confidence) / len(self.statements)
+        return _of_each(len(self.statements))
 
     def to_frame(self) -> pd.DataFrame:
         """
-        The statements as a table.
+        Return the statements as a table.
 
         :return: One row per statement, with columns ``n_episodes``, ``n_true``, ``share`` and ``at_least``
         """
@@ -80,7 +73,7 @@ class CertificationReport:
 
     def summary(self) -> str:
         """
-        The statements in a readable form.
+        Say the statements in a readable form.
 
         :return: A text of several lines
         """
@@ -93,20 +86,18 @@ class CertificationReport:
             counts = f"{row['n_true']:.0f} of {row['n_episodes']:.0f}"
             at_least = math.floor(1e4 * row["at_least"]) / 1e4  # a lower bound is not rounded up
             lines.append(f"  {name:<14}{counts:>14}   {at_least:.4f}   {self._meaning(str(name))}")
-        for name, reason in self._not_made().items():
-            lines.append(f"  {name:<14}{'not made':>14}   {reason}")
-        n_statements = len(self.statements)
+        for name, needs in _NEEDS.items():
+            if name not in self.statements.index:
+                lines.append(f"  {name:<14}{'not made':>14}   it takes {needs}")
         lines.append(
-            f"All {n_statements} hold together with {percent(self.confidence)} % confidence: each bound is that of Clopper "
-            f"and Pearson with {percent(self.confidence_of_each)} % (Bonferroni)."
-            if n_statements > 1
-            else f"The bound is that of Clopper and Pearson with {percent(self.confidence)} % confidence."
+            f"Together with {100 * CONFIDENCE:g} % confidence: each bound is that of Clopper and Pearson with "
+            f"{100 * self.confidence_of_each:.4g} % (Bonferroni)."
         )
         if self.starts is not None:
             attracted = (self.starts["low"] >= 0.5).sum()
             lines.append(
                 f"Region of attraction: {attracted} of {len(self.starts)} start states are attracted with a probability of at "
-                f"least one half, each by its own {percent(self.confidence)} % interval of "
+                f"least one half, each by its own {100 * CONFIDENCE:g} % interval of "
                 f"{self.starts['n_episodes'].iloc[0]} episodes."
             )
         lines.append(
@@ -120,26 +111,10 @@ class CertificationReport:
             return "no termination"
         if name == "stays_within":
             start_cost = self.transitions.loc[self.transitions["step"] == 0, "cost"].mean()
-            return f"survives, and no cost in the last fifth is above {self.cost_bound:.3g} (first steps: {start_cost:.3g})"
+            return (
+                f"survives, and no cost in the last fifth is above {self.ultimate_bound:.3g} (first steps: {start_cost:.3g})"
+            )
         return f"L falls over every {self.window_steps} steps that begin with L above {self.level:.3g}"
-
-    def _not_made(self) -> dict[str, str]:
-        reasons = {}
-        if "stays_within" not in self.statements.index:
-            reasons["stays_within"] = "there is no cost_bound: give one, or a fitted function, whose roll-outs have one"
-        if "decreases" not in self.statements.index:
-            if "lyapunov" not in self.transitions:
-                reasons["decreases"] = "there is no Lyapunov function: pass that of fit_lyapunov(policy, env)"
-            elif self.level is None or self.window_steps is None:
-                reasons["decreases"] = (
-                    "there is no level and window: on the roll-outs of the fit L did not fall from its starts to where it ends"
-                )
-            else:
-                reasons["decreases"] = (
-                    f"no episode is above the level {self.level:.3g} for a window of {self.window_steps} steps: none starts "
-                    "further away than where the loop settles, if it settles"
-                )
-        return reasons
 
     def plot(self) -> Figure:
         """
@@ -149,7 +124,7 @@ class CertificationReport:
         """
         from sb3_lac.stability import plots  # matplotlib is slow to import, and only a figure needs it
 
-        return plots.plot_certification(self.statements, self.transitions, percent(self.confidence), self.cost_bound)
+        return plots.plot_certification(self.statements, self.transitions, self.ultimate_bound)
 
     def plot_region_of_attraction(self, x: int = 0, y: int = 1, names: Sequence[str] | None = None) -> Figure:
         """
@@ -164,7 +139,7 @@ class CertificationReport:
 
         if self.starts is None:
             raise ValueError("There are no start states: certify(..., starts=...) tries those of an array.")
-        return plots.plot_attraction(self.starts, percent(self.confidence), x, y, names)
+        return plots.plot_region_of_attraction(self.starts, x, y, names)
 
 
 def certify(
@@ -172,10 +147,7 @@ def certify(
     env: gym.Env | VecEnv,
     lyapunov: LyapunovFunction | None = None,
     n_episodes: int = 300,
-    confidence: float = 0.95,
-    cost_bound: float | None = None,
-    level: float | None = None,
-    window_steps: int | None = None,
+    ultimate_bound: float | None = None,
     starts: np.ndarray | None = None,
     n_episodes_per_start: int = 10,
     deterministic: bool = True,
@@ -188,22 +160,19 @@ def certify(
     98.6 % of each of three. The statements are
 
     - ``survives``: no termination
-    - ``stays_within``: survives, and no cost in the last fifth of the episode is above ``cost_bound``
-    - ``decreases``: survives, and ``L`` is lower ``window_steps`` later wherever it is above ``level``. Only episodes with
-      such a window testify, and those that died.
+    - ``stays_within``: survives, and no cost in the last fifth of the episode is above ``ultimate_bound``
+    - ``decreases``: survives, and ``L`` is lower ``lyapunov.window_steps`` later wherever it is above ``lyapunov.level``. Only
+      episodes with such a window testify, and those that died.
 
-    They hold together with the ``confidence`` (Bonferroni). What they are about (``cost_bound``, ``level``, ``window_steps``)
-    must not be chosen by the episodes that testify; a fitted function brings those of its own roll-outs, the largest late cost
-    and the largest late value there, and the shortest window over which it decreased there.
+    They hold together with 95 % confidence (Bonferroni). What they are about must not be chosen by the episodes that testify:
+    a fitted function brings the largest late cost and the largest late value of its own roll-outs, and the shortest window
+    over which it decreased there.
 
     :param policy: A model of Stable-Baselines3, or anything with ``predict(observation, deterministic=...)``
     :param env: The environment, wrapped as that of the training. Several at once are faster.
     :param lyapunov: The function, if decrease is to be certified
     :param n_episodes: Number of episodes
-    :param confidence: Of all statements together, and of the interval of each start state by itself
-    :param cost_bound: The cost to stay within, that of ``lyapunov`` by default
-    :param level: Value above which ``lyapunov`` has to decrease, that of its fit by default
-    :param window_steps: Number of steps over which it has to, that of its fit by default
+    :param ultimate_bound: The cost to stay within, that of ``lyapunov`` by default
     :param starts: Start states on a grid, shape (n, n_states), each handed to ``env.reset(options={"state": ...})``
     :param n_episodes_per_start: Number of episodes from each of them
     :param deterministic: Whether to certify the mean action or sampled actions
@@ -212,163 +181,133 @@ def certify(
     :return: The report
     :raises ValueError: If the arguments cannot be meant
     """
-    check_questions(lyapunov, confidence, cost_bound, level, window_steps)
-    check_number("n_episodes", n_episodes)
-    env = prepare_evaluation(policy, env, lyapunov is not None and lyapunov.normalized_rewards)
-    check_number("n_episodes_per_start", n_episodes_per_start)
+    check_bound(ultimate_bound)
     if starts is not None:
         starts = np.asarray(starts, dtype=np.float64)
-        if starts.ndim != 2 or len(starts) == 0 or not np.isfinite(starts).all():
-            raise ValueError(f"starts of shape {starts.shape} must be finite numbers of shape (n_starts, n_states).")
-    if isinstance(lyapunov, FittedLyapunov):
-        cost_bound = _chosen(cost_bound, lyapunov.ultimate_cost)
-        level, window_steps = _chosen(level, lyapunov.level), window_steps or lyapunov.window_steps
-    if starts is not None and cost_bound is None:
-        raise ValueError("A start state is attracted if its episode ends within cost_bound: give one, or a fitted lyapunov.")
-    seed = known_seed(seed)
-    check_training_seeds(policy, seed, env.num_envs)
-    if lyapunov is not None:
-        check_seeds(lyapunov, seed, env.num_envs)
-    # Asked for before the work: not every environment answers
-    description = _description(policy, env, seed, deterministic)
-
-    normalized = lyapunov is not None and lyapunov.normalized_rewards
-    vec_normalize = unwrap_vec_normalize(env)
-    bound = 0.0 if lyapunov is None else lyapunov.cost_bound(vec_normalize)
-    of_starts = None
-    with undisturbed(policy, env, seed), nullcontext() if lyapunov is None else lyapunov.in_units_of(vec_normalize):
+        if starts.ndim != 2 or len(starts) == 0 or not np.isfinite(starts).all() or n_episodes_per_start < 1:
+            raise ValueError(
+                f"starts of shape {starts.shape} must be finite numbers of shape (n_starts, n_states), and "
+                f"n_episodes_per_start={n_episodes_per_start} at least 1."
+            )
+    with closed_loop(policy, env, lyapunov, n_episodes, deterministic, seed) as loop:
+        check_training_seeds(policy, loop.seeds)
+        if ultimate_bound is None and lyapunov is not None:
+            ultimate_bound = lyapunov.ultimate_bound
+        attraction = None
         if starts is not None:
-            _check_starts(env, starts)
-            env.seed(seed)
-        roll_outs = roll_out(policy, env, n_episodes, deterministic, normalized)
-        if lyapunov is not None:
-            roll_outs.add_values(policy, lyapunov, deterministic)
-        if starts is not None:
-            # Other episodes than those above
-            env.seed(int(np.random.SeedSequence(seed).generate_state(1)[0] // 2))
-            repeated = np.repeat(starts, n_episodes_per_start, axis=0)
-            of_starts = roll_out(policy, env, len(repeated), deterministic, normalized, repeated).transitions
+            attraction = _attraction(loop, starts, n_episodes_per_start, ultimate_bound)
+            loop.env.seed(loop.seed)
+        transitions = loop.roll_out(n_episodes).transitions
+        if ultimate_bound is not None:
+            loop.check_costs(transitions["reward"])
+        description = loop.description
 
-    transitions = roll_outs.transitions
-    if cost_bound is not None:
-        for rewards in [transitions["reward"]] + ([] if of_starts is None else [of_starts["reward"]]):
-            check_rewards(lyapunov, rewards)
-    transitions["cost"] = np.maximum(bound - transitions["reward"], 0.0)
-    episodes = summarize_episodes(transitions)
-    alive = ~episodes["terminated"]
-    episodes["survives"] = alive.astype(float)
-    if cost_bound is not None:
-        episodes["stays_within"] = (alive & stay_within(episodes, cost_bound)).astype(float)
-    if lyapunov is not None and level is not None and window_steps is not None:
-        later = transitions.groupby("episode")["lyapunov"].shift(-window_steps)
-        windows = (transitions["lyapunov"] > level) & later.notna()
-        falls = (later < transitions["lyapunov"]).where(windows).groupby(transitions["episode"]).min()
-        # A death is no decrease, whatever came before it
-        episodes["decreases"] = falls.astype(float).where(alive, 0.0)
-
-    import pandas as pd
-
-    columns = [name for name in ("survives", "stays_within", "decreases") if name in episodes and episodes[name].notna().any()]
-    of_each = 1 - (1 - confidence) / len(columns)
-    counts = {name: (int(episodes[name].notna().sum()), int(episodes[name].sum())) for name in columns}
-    statements = pd.DataFrame(
-        {
-            name: {"n_episodes": n, "n_true": n_true, "share": n_true / n, "at_least": exact_lower_bound(n_true, n, of_each)}
-            for name, (n, n_true) in counts.items()
-        }
-    ).T.rename_axis("statement")
+    level, window_steps = (None, None) if lyapunov is None else (lyapunov.level, lyapunov.window_steps)
+    episodes = _testimonies(transitions, ultimate_bound, level, window_steps)
     return CertificationReport(
-        statements=statements.astype({"n_episodes": int, "n_true": int}),
+        statements=_statements(episodes),
         transitions=transitions,
         episodes=episodes,
-        starts=(
-            None if of_starts is None else _attraction(of_starts, starts, n_episodes_per_start, bound, cost_bound, confidence)
-        ),
-        confidence=confidence,
-        cost_bound=cost_bound,
+        starts=attraction,
+        ultimate_bound=ultimate_bound,
         level=level,
         window_steps=window_steps,
         description=description,
     )
 
 
-def check_questions(
-    lyapunov: LyapunovFunction | None,
-    confidence: float,
-    cost_bound: float | None,
-    level: float | None,
-    window_steps: int | None,
-) -> None:
-    """Check what is asked of the episodes, see ``certify()``."""
-    if lyapunov is not None:
-        check_function(lyapunov)
-    if not isinstance(confidence, numbers.Real) or not 0 < confidence < 1:
-        raise ValueError(f"confidence={confidence!r} must be a number between 0 and 1.")
-    for name, value in {"cost_bound": cost_bound, "level": level}.items():
-        if value is not None and (not isinstance(value, numbers.Real) or math.isnan(value)):
-            raise ValueError(f"{name}={value!r} must be a number, or None for that of a fitted function.")
-    if window_steps is not None:
-        check_number("window_steps", window_steps)
-
-
-def _chosen(given: float | None, of_the_fit: float) -> float | None:
-    if given is not None:
-        return given
-    return None if math.isnan(of_the_fit) else of_the_fit
-
-
-def _description(policy: PolicyPredictor, env: VecEnv, seed: int, deterministic: bool) -> str:
-    ids = {getattr(spec, "id", None) for spec in env_specs(env)}
-    name = ids.pop() if len(ids) == 1 else None
-    where = "an environment without a known id" if name is None else name
-    return f"{type(policy).__name__} ({'mean' if deterministic else 'sampled'} actions) in {where}, seed {seed}"
+def check_bound(ultimate_bound: float | None) -> None:
+    """Refuse what is no cost to stay within."""
+    if ultimate_bound is not None and not (isinstance(ultimate_bound, Real) and ultimate_bound >= 0):
+        raise ValueError(f"ultimate_bound={ultimate_bound!r} must be a number of at least 0, or None.")
 
 
 def _check_starts(env: VecEnv, starts: np.ndarray) -> None:
     """Check that an environment starts where it is told to."""
-    if len(starts) > 1:
-        # Not every vector environment takes options for each of its elements
-        env.set_options([{"state": starts[k % len(starts)].tolist()} for k in range(env.num_envs)])
-        env.reset()
-    distinct = np.unique(starts, axis=0)
-    # With the same random numbers: one that differs, or from the only one what the environment does by itself. The
-    # observation need not show all of the state.
-    asked = [{"state": start.tolist()} for start in distinct] if len(distinct) > 1 else [{"state": starts[0].tolist()}, None]
+    # Not every vector environment takes options for each of its elements
+    env.set_options([{"state": starts[k % len(starts)].tolist()} for k in range(env.num_envs)])
+    env.reset()
+    # With the same random numbers: one that differs, or from what the environment does by itself. The observation need not
+    # show all of the state.
     first = None
-    for options in asked:
+    for options in [*({"state": start} for start in starts.tolist()), None]:
         env.seed(0)
         env.set_options(options)
         # Copied, for wrappers that stack frames return the same array again
         seen = flatten(env.reset())  # type: ignore[arg-type]
         first = seen if first is None else first
         if not np.array_equal(seen, first):
-            break
-    else:
-        raise ValueError(
-            "The environment starts in the same state whatever reset(options={'state': ...}) says: it needs a wrapper that "
-            "puts it into the state that it is given. (If it starts in the only one of starts anyway, leave starts out.)"
-        )
+            return
+    raise ValueError(
+        "The environment starts in the same state whatever reset(options={'state': ...}) says: it needs a wrapper that "
+        "puts it into the state that it is given. (If it starts in the only one of starts anyway, leave starts out.)"
+    )
 
 
-def _attraction(
-    transitions: pd.DataFrame,
-    starts: np.ndarray | None,
-    n_episodes: int,
-    reward_bound: float,
-    cost_bound: float | None,
-    confidence: float,
+def _stay_within(episodes: pd.DataFrame, ultimate_bound: float) -> pd.Series:
+    """
+    Whether episodes survive, and the last fifth of each costs no more than a bound. It is a comparison in single precision, in
+    which some vector environments hold rewards: there a cost of 0.1 is a little more than 0.1.
+    """
+    within = episodes["largest_late_cost"].astype(np.float32) <= np.float32(ultimate_bound)
+    return ~episodes["terminated"] & within
+
+
+def _testimonies(
+    transitions: pd.DataFrame, ultimate_bound: float | None, level: float | None, window_steps: int | None
 ) -> pd.DataFrame:
-    """What became of the start states."""
+    """Summarize the episodes, with a column for what each says to each statement."""
+    episodes = summarize_episodes(transitions)
+    alive = ~episodes["terminated"]
+    episodes["survives"] = alive.astype(float)
+    if ultimate_bound is not None:
+        episodes["stays_within"] = _stay_within(episodes, ultimate_bound).astype(float)
+    if level is not None and window_steps is not None:
+        later = transitions.groupby("episode")["lyapunov"].shift(-window_steps)
+        windows = (transitions["lyapunov"] > level) & later.notna()
+        falls = (later < transitions["lyapunov"]).where(windows).groupby(transitions["episode"]).min()
+        # A death is no decrease, whatever came before it
+        episodes["decreases"] = falls.astype(float).where(alive, 0.0)
+    return episodes
+
+
+def _of_each(n_statements: int) -> float:
+    return 1 - (1 - CONFIDENCE) / n_statements
+
+
+def _statements(episodes: pd.DataFrame) -> pd.DataFrame:
+    """Count the testimonies, and bound the probability of each statement."""
     import pandas as pd
 
-    assert starts is not None and cost_bound is not None
-    transitions["cost"] = np.maximum(reward_bound - transitions["reward"], 0.0)
-    # Environment by environment in the order of the starts: each episode had a number of its own
-    episodes = summarize_episodes(transitions)
-    attracted = (~episodes["terminated"] & stay_within(episodes, cost_bound)).to_numpy()
+    names = [name for name in ("survives", "stays_within", "decreases") if name in episodes and episodes[name].notna().any()]
+    counts = {name: (int(episodes[name].notna().sum()), int(episodes[name].sum())) for name in names}
+    rows = {
+        name: {
+            "n_episodes": n,
+            "n_true": n_true,
+            "share": n_true / n,
+            "at_least": exact_lower_bound(n_true, n, _of_each(len(names))),
+        }
+        for name, (n, n_true) in counts.items()
+    }
+    return pd.DataFrame.from_dict(rows, orient="index").rename_axis("statement")
+
+
+def _attraction(loop: ClosedLoop, starts: np.ndarray, n_episodes: int, ultimate_bound: float | None) -> pd.DataFrame:
+    """Count the episodes that are attracted from each start state."""
+    import pandas as pd
+
+    if ultimate_bound is None:
+        raise ValueError("A start is attracted if its episode ends within ultimate_bound: give one, or a fitted lyapunov.")
+    _check_starts(loop.env, starts)
+    # Other episodes than those of the statements
+    loop.env.seed(int(np.random.SeedSequence(loop.seed).generate_state(1)[0] // 2))
+    transitions = loop.roll_out(np.repeat(starts, n_episodes, axis=0), with_values=False).transitions
+    loop.check_costs(transitions["reward"])
+    attracted = _stay_within(summarize_episodes(transitions), ultimate_bound).to_numpy()
+    # In the order of the starts: each episode had a number of its own
     counts = attracted.reshape(len(starts), n_episodes).sum(axis=1)
     table = pd.DataFrame(starts, columns=[f"state_{k}" for k in range(starts.shape[1])])
     table["n_episodes"], table["n_attracted"] = n_episodes, counts
-    intervals = [exact_interval(int(count), n_episodes, confidence) for count in counts]
-    table[["share", "low", "high"]] = np.reshape(intervals, (-1, 3))
+    table[["share", "low", "high"]] = np.array([exact_interval(int(count), n_episodes) for count in counts])
     return table

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
 
 import gymnasium as gym
 import numpy as np
@@ -17,18 +17,24 @@ from torch import nn
 
 from sb3_lac.files import replacing
 from sb3_lac.stability.functions import LyapunovFunction, Observations
-from sb3_lac.stability.rollout import (
-    RollOuts,
-    check_number,
-    known_seed,
-    prepare_evaluation,
-    roll_out,
-    summarize_episodes,
-    undisturbed,
-)
+from sb3_lac.stability.loop import closed_loop
+from sb3_lac.stability.rollout import RollOuts, flatten, summarize_episodes
 
+if TYPE_CHECKING:
+    import pandas as pd
+
+#: Widths of the hidden layers
+NET_ARCH = (64, 64)
 #: Outputs whose squares are summed, as in the critic of LAC
 N_FEATURES = 16
+#: Passes over the data
+N_ITERATIONS = 40
+#: Transitions of each gradient step
+BATCH_SIZE = 512
+#: Of Adam at the start, falling to zero
+LEARNING_RATE = 3e-3
+#: lambda of the returns: 0 looks one step ahead, 1 to the end of the episode
+TRACE_DECAY = 0.95
 #: Lengths of windows that are tried, in steps
 WINDOWS = (1, 2, 5, 10, 20, 50, 100, 200, 500)
 
@@ -38,80 +44,44 @@ class SumOfSquares(nn.Module):
     A network that is never negative: the sum of the squares of its last layer.
 
     :param n_inputs: Number of inputs
-    :param net_arch: Widths of the hidden layers
     """
 
-    def __init__(self, n_inputs: int, net_arch: Sequence[int]):
+    def __init__(self, n_inputs: int):
         super().__init__()
         # Smooth, for the slope of L is what a plot shows
-        self.features = nn.Sequential(*create_mlp(n_inputs, N_FEATURES, list(net_arch), nn.SiLU))
+        self.features = nn.Sequential(*create_mlp(n_inputs, N_FEATURES, list(NET_ARCH), nn.SiLU))
 
     def forward(self, inputs: th.Tensor) -> th.Tensor:
         return th.sum(self.features(inputs) ** 2, dim=-1)
 
-
-def flatten(observations: Observations) -> np.ndarray:
-    """Observations as vectors."""
-    parts = [observations[key] for key in sorted(observations)] if isinstance(observations, dict) else [observations]
-    return np.concatenate([np.asarray(part, dtype=np.float64).reshape(len(part), -1) for part in parts], axis=1)
-
-
-class NoCostError(ValueError):
-    """Nothing had a cost on the roll-outs, so that there is nothing that a Lyapunov function could decrease by."""
+    def values(self, inputs: np.ndarray) -> np.ndarray:
+        """Evaluate the network without gradients."""
+        with th.no_grad():
+            return self(th.as_tensor(inputs, dtype=th.float32)).numpy().astype(np.float64)
 
 
-class FittedLyapunov(LyapunovFunction):
+@dataclass(frozen=True, eq=False)
+class InputRange:
     """
-    A Lyapunov function that ``fit_lyapunov()`` learned: a network, and what its roll-outs say about the loop.
+    The numbers that observations were made of on the roll-outs of a fit, each of shape (n_inputs,).
 
-    :param network: Sum of squares of the scaled observations
-    :param mean: Subtracted from each input, shape (n_inputs,)
-    :param scale: Divides each input, shape (n_inputs,); infinite for one that never changed, which nothing is known of
-    :param unit: Costs per output of the network
-    :param floor: The least value on the roll-outs, which is subtracted: values below it are 0
-    :param ultimate_cost: Largest cost in the last fifth of those episodes that did not terminate, NaN if there are none
-    :param level: Largest value in the last fifth of those episodes, NaN if there are none
-    :param window_steps: The shortest window over which the function decreased wherever it started above ``level``, in all of
-        those episodes; None if there is none
-    :param average_cost: Cost per step where the loop settles
-    :param reward_bound: The reward that costs nothing
-    :param seeds: Seeds of the environments of the roll-outs, None if they are not known (of an earlier version)
-    :param low: Least value of each input on the roll-outs, shape (n_inputs,), None if it is not known (of an earlier version)
-    :param high: Largest value of each input
+    :param mean: Mean
+    :param scale: Standard deviation, infinite for a number that never changed, which nothing is known of
+    :param low: Least value
+    :param high: Largest value
     """
 
-    def __init__(
-        self,
-        network: SumOfSquares,
-        mean: np.ndarray,
-        scale: np.ndarray,
-        unit: float,
-        floor: float,
-        ultimate_cost: float,
-        level: float,
-        window_steps: int | None,
-        average_cost: float,
-        reward_bound: float,
-        seeds: range | None,
-        low: np.ndarray | None = None,
-        high: np.ndarray | None = None,
-    ):
-        super().__init__(self._of_network, average_cost=average_cost, reward_bound=reward_bound, seeds=seeds)
-        self.network = network
-        self.mean = mean
-        self.scale = scale
-        self.unit = unit
-        self.floor = floor
-        self.ultimate_cost = ultimate_cost
-        self.level = level
-        self.window_steps = window_steps
-        self.low = np.full(len(mean), -np.inf) if low is None else low
-        self.high = np.full(len(mean), np.inf) if high is None else high
+    mean: np.ndarray
+    scale: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
 
-    def _of_network(self, observations: Observations) -> np.ndarray:
-        inputs = flatten(observations)
-        if inputs.shape[1] != len(self.mean):
-            raise ValueError(f"The observations have {inputs.shape[1]} numbers, the Lyapunov function takes {len(self.mean)}.")
+    def scaled(self, inputs: np.ndarray) -> np.ndarray:
+        """Scale inputs for a network."""
+        return (inputs - self.mean) / self.scale
+
+    def warn_if_far(self, inputs: np.ndarray) -> None:
+        """Say which inputs lie further outside the range than that is wide."""
         # And what rounding makes of one that never changed
         margin = self.high - self.low + 1e-6 * np.maximum(np.abs(self.low), np.abs(self.high))
         far = ((inputs < self.low - margin) | (inputs > self.high + margin)).any(axis=0)
@@ -124,7 +94,57 @@ class FittedLyapunov(LyapunovFunction):
                 "roll-outs that go there.",
                 stacklevel=2,
             )
-        return np.maximum(network_values(self.network, (inputs - self.mean) / self.scale, self.unit) - self.floor, 0.0)
+
+
+class FittedLyapunov(LyapunovFunction):
+    """
+    A Lyapunov function that ``fit_lyapunov()`` learned: a network, and what its roll-outs say about the loop.
+
+    :param network: Sum of squares of the scaled observations
+    :param inputs: The observations that it has seen
+    :param unit: Costs per output of the network
+    :param floor: The least value on the roll-outs, which is subtracted: values below it are 0
+    :param average_cost: Cost per step where the loop settles
+    :param reward_bound: The reward that costs nothing
+    :param ultimate_bound: Largest cost in the last fifth of those episodes that did not terminate, None if there are none
+    :param level: Largest value in the last fifth of those episodes, None if there are none
+    :param window_steps: The shortest window over which the function decreased wherever it started above ``level``, in all of
+        those episodes; None if there is none
+    :param seeds: Seeds of the environments of the roll-outs
+    """
+
+    seeds: range
+
+    def __init__(
+        self,
+        network: SumOfSquares,
+        inputs: InputRange,
+        unit: float,
+        floor: float,
+        average_cost: float,
+        reward_bound: float,
+        ultimate_bound: float | None,
+        level: float | None,
+        window_steps: int | None,
+        seeds: range,
+    ):
+        super().__init__(self._of_network, reward_bound=reward_bound)
+        self.network = network
+        self.inputs = inputs
+        self.unit = unit
+        self.floor = floor
+        self.average_cost = average_cost
+        self.ultimate_bound = ultimate_bound
+        self.level = level
+        self.window_steps = window_steps
+        self.seeds = seeds
+
+    def _of_network(self, observations: Observations) -> np.ndarray:
+        inputs, n_known = flatten(observations), len(self.inputs.mean)
+        if inputs.shape[1] != n_known:
+            raise ValueError(f"The observations have {inputs.shape[1]} numbers, the Lyapunov function takes {n_known}.")
+        self.inputs.warn_if_far(inputs)
+        return np.maximum(self.unit * self.network.values(self.inputs.scaled(inputs)) - self.floor, 0.0)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """
@@ -132,11 +152,13 @@ class FittedLyapunov(LyapunovFunction):
 
         :param path: Name of the file
         """
-        numbers = ("unit", "floor", "ultimate_cost", "level", "window_steps", "average_cost", "reward_bound")
-        content: dict[str, Any] = {name: getattr(self, name) for name in numbers}
-        content |= {"seeds": None if self.seeds is None else (self.seeds.start, self.seeds.stop)}
-        content |= {name: th.as_tensor(getattr(self, name)) for name in ("mean", "scale", "low", "high")}
-        content |= {"network": self.network.state_dict()}
+        numbers = ("unit", "floor", "average_cost", "reward_bound", "ultimate_bound", "level", "window_steps")
+        content = {
+            "network": self.network.state_dict(),
+            "inputs": {field.name: th.as_tensor(getattr(self.inputs, field.name)) for field in fields(InputRange)},
+            "numbers": {name: getattr(self, name) for name in numbers},
+            "seeds": (self.seeds.start, self.seeds.stop),
+        }
         with replacing(path) as part:
             th.save(content, part)
 
@@ -149,52 +171,10 @@ class FittedLyapunov(LyapunovFunction):
         :return: The function
         """
         content = th.load(path, map_location="cpu", weights_only=True)
-        weights = content.pop("network")
-        widths = [weight.shape for name, weight in weights.items() if name.endswith("weight")]
-        network = SumOfSquares(widths[0][1], [n_outputs for n_outputs, _ in widths[:-1]])
-        network.load_state_dict(weights)
-        seeds = content.pop("seeds")
-        content = {name: value.numpy() if isinstance(value, th.Tensor) else value for name, value in content.items()}
-        return cls(network, seeds=None if seeds is None else range(*seeds), **content)
-
-
-def network_values(network: SumOfSquares, inputs: np.ndarray, unit: float) -> np.ndarray:
-    """Values of a network."""
-    with th.no_grad():
-        return unit * network(th.as_tensor(inputs, dtype=th.float32)).numpy().astype(np.float64)
-
-
-def traced_returns(
-    costs: np.ndarray, next_values: np.ndarray, rows: np.ndarray, average_cost: float, trace_decay: float
-) -> np.ndarray:
-    """
-    The generalised multi-step return of the relative cost: ``G = c - c_bar + (1 - lambda) * L(s') + lambda * G'``, and
-    ``c - c_bar + L(s')`` at the end of an episode (TD(lambda), Sutton 1988, with the average cost subtracted).
-    """
-    returns = np.empty(len(costs))
-    later = np.zeros(len(rows))
-    for step in range(rows.shape[1] - 1, -1, -1):
-        here = rows[:, step]
-        running = here >= 0
-        here = here[running]
-        goes_on = np.zeros(len(rows), dtype=bool) if step + 1 == rows.shape[1] else rows[:, step + 1] >= 0
-        share = np.where(goes_on, trace_decay, 0.0)[running]
-        later[running] = costs[here] - average_cost + (1 - share) * next_values[here] + share * later[running]
-        returns[here] = later[running]
-    return returns
-
-
-def shortest_window(values: np.ndarray, rows: np.ndarray, level: float) -> int | None:
-    """The shortest window over which a function decreases wherever it starts above a level."""
-    along = np.where(rows >= 0, values[rows], np.nan)
-    for n_steps in WINDOWS:
-        if n_steps >= along.shape[1]:
-            break
-        before, after = along[:, :-n_steps], along[:, n_steps:]
-        counts = (before > level) & ~np.isnan(after)
-        if counts.any() and (after < before)[counts].all():
-            return n_steps
-    return None
+        inputs = InputRange(**{name: tensor.numpy() for name, tensor in content["inputs"].items()})
+        network = SumOfSquares(len(inputs.mean))
+        network.load_state_dict(content["network"])
+        return cls(network, inputs, seeds=range(*content["seeds"]), **content["numbers"])
 
 
 def fit_lyapunov(
@@ -202,12 +182,6 @@ def fit_lyapunov(
     env: gym.Env | VecEnv,
     n_episodes: int = 100,
     deterministic: bool = True,
-    reward_bound: float | None = None,
-    net_arch: Sequence[int] = (64, 64),
-    n_iterations: int = 40,
-    learning_rate: float = 3e-3,
-    batch_size: int = 512,
-    trace_decay: float = 0.95,
     seed: int | None = None,
     progress_bar: bool = True,
 ) -> FittedLyapunov:
@@ -222,19 +196,14 @@ def fit_lyapunov(
     multi-step returns, which are computed anew before each pass over the data. ``L`` is a sum of squares and its least value
     on the roll-outs is subtracted, so that it is never negative.
 
-    A transition that ends in a death has no next value: what it costs is its cost, and with positive rewards also those that a
-    survivor could have had until the end of the longest episode.
+    The reward that costs nothing is the largest one of the roll-outs, and at least 0. A transition that ends in a death has no
+    next value: what it costs is its cost, and with positive rewards also those that a survivor could have had until the end of
+    the longest episode.
 
     :param policy: A model of Stable-Baselines3, or anything with ``predict(observation, deterministic=...)``
     :param env: The environment, wrapped as that of the training. Costs are of its own rewards, without ``VecNormalize``.
     :param n_episodes: Number of episodes to learn from
     :param deterministic: Whether the loop is that of the mean action, as it is used after the training
-    :param reward_bound: The reward that costs nothing, the largest one of the roll-outs by default, and at least 0
-    :param net_arch: Widths of the hidden layers
-    :param n_iterations: Number of passes over the data
-    :param learning_rate: Of Adam at the start, falling to zero
-    :param batch_size: Transitions of each gradient step
-    :param trace_decay: lambda of the returns: 0 looks one step ahead, 1 to the end of the episode
     :param seed: Seed of the roll-outs and of the network; drawn if it is None
     :param progress_bar: Whether to show the progress, in a terminal
     :return: The function. It is to be judged on other roll-outs: ``evaluate_lyapunov()`` and ``certify()`` refuse its seeds,
@@ -242,109 +211,150 @@ def fit_lyapunov(
     :raises ValueError: If the arguments cannot be meant
     :raises NoCostError: If nothing had a cost on the roll-outs, which say nothing about decrease then
     """
-    for name, value in {"n_episodes": n_episodes, "n_iterations": n_iterations, "batch_size": batch_size}.items():
-        check_number(name, value)
-    if not 0 < learning_rate < np.inf:
-        raise ValueError(f"learning_rate={learning_rate} must be finite and greater than 0.")
-    if not 0 <= trace_decay <= 1:
-        raise ValueError(f"trace_decay={trace_decay} must lie between 0 and 1.")
-    if reward_bound is not None and not 0 <= reward_bound < np.inf:
-        raise ValueError(f"reward_bound={reward_bound} must be finite and at least 0.")
-    env = prepare_evaluation(policy, env, of_the_critic=False)
-    seed = known_seed(seed)
-    with undisturbed(policy, env, seed):
-        roll_outs = roll_out(policy, env, n_episodes, deterministic)
+    with closed_loop(policy, env, None, n_episodes, deterministic, seed) as loop:
+        roll_outs = loop.roll_out(n_episodes)
+        transitions = roll_outs.transitions
         # A float, for a scalar of numpy in the file would keep it from being loaded
-        reward_bound = float(max(roll_outs.transitions["reward"].max(), 0.0) if reward_bound is None else reward_bound)
-        roll_outs.transitions["cost"] = np.maximum(reward_bound - roll_outs.transitions["reward"], 0.0)
-        seeds = range(seed, seed + env.num_envs)
-        return _fit(
-            roll_outs, reward_bound, seeds, net_arch, n_iterations, learning_rate, batch_size, trace_decay, seed, progress_bar
-        )
+        reward_bound = float(max(transitions["reward"].max(), 0.0))
+        transitions["cost"] = np.maximum(reward_bound - transitions["reward"], 0.0)
+        data = _Data.of(roll_outs, reward_bound)
+        network = SumOfSquares(data.scaled.shape[1])
+        average_cost = _learn(network, data, reward_bound, loop.seed, progress_bar)
+    return _described(network, data, transitions, average_cost, reward_bound, loop.seeds)
 
 
-def _fit(
-    roll_outs: RollOuts,
-    reward_bound: float,
-    seeds: range,
-    net_arch: Sequence[int],
-    n_iterations: int,
-    learning_rate: float,
-    batch_size: int,
-    trace_decay: float,
-    seed: int,
-    progress_bar: bool,
-) -> FittedLyapunov:
+class NoCostError(ValueError):
+    """Nothing had a cost on the roll-outs, so that there is nothing that a Lyapunov function could decrease by."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Data:
+    """Roll-outs as arrays with one entry per transition, and behind the inputs the last ones before the time limits."""
+
+    costs: np.ndarray
+    died: np.ndarray
+    #: Row of each transition by episode and step, -1 behind the end of an episode
+    rows: np.ndarray
+    #: Steps that a survivor could still have had
+    n_lost: np.ndarray
+    #: Row of the input that follows
+    following: np.ndarray
+    scaled: np.ndarray
+    inputs: InputRange
+    unit: float
+
+    @classmethod
+    def of(cls, roll_outs: RollOuts, reward_bound: float) -> _Data:
+        """Arrange roll-outs for the fit."""
+        transitions = roll_outs.transitions
+        costs = transitions["cost"].to_numpy().copy()
+        episode, step = transitions["episode"].to_numpy(), transitions["step"].to_numpy()
+        died, truncated = transitions["terminated"].to_numpy(), transitions["truncated"].to_numpy()
+        lengths = np.bincount(episode)
+        n_lost = np.where(died, lengths.max() - lengths[episode], 0)
+        # Not the largest cost, which may be that of a death, unless there is no other
+        unit = float(np.quantile(costs, 0.9)) or float(costs.max()) or reward_bound * float(n_lost.max())
+        if not unit > 0:
+            raise NoCostError(
+                "Nothing had a cost on the roll-outs, and no episode died early, so that L has nothing to decrease by: start "
+                "further away."
+            )
+        rows = np.full((len(lengths), lengths.max()), -1)
+        rows[episode, step] = np.arange(len(costs))
+        inputs = flatten(roll_outs.observations)
+        mean, scale = inputs.mean(axis=0), np.maximum(inputs.std(axis=0), 1e-6)
+        if roll_outs.last_observations is not None:
+            inputs = np.concatenate([inputs, flatten(roll_outs.last_observations)])
+        if not np.isfinite(inputs).all():
+            raise ValueError("The environment showed an infinite observation, which no network can learn from: bound it.")
+        low, high = inputs.min(axis=0), inputs.max(axis=0)
+        scale[low == high] = np.inf
+        following = np.arange(1, len(costs) + 1)
+        following[truncated] = len(costs) + np.arange(truncated.sum())
+        of_inputs = InputRange(mean, scale, low, high)
+        return cls(costs, died, rows, n_lost, following, of_inputs.scaled(inputs), of_inputs, unit)
+
+
+def _learn(network: SumOfSquares, data: _Data, reward_bound: float, seed: int, progress_bar: bool) -> float:
+    """Fit a network to the returns, and return the average cost."""
     from tqdm import tqdm  # only a fit needs it
 
-    transitions = roll_outs.transitions
-    costs = transitions["cost"].to_numpy().copy()
-    episode, step = transitions["episode"].to_numpy(), transitions["step"].to_numpy()
-    died, truncated = transitions["terminated"].to_numpy(), transitions["truncated"].to_numpy()
-    lengths = np.bincount(episode)
-    # Steps that a survivor could still have had
-    n_lost = np.where(died, lengths.max() - lengths[episode], 0)
-    # Not the largest cost, which may be that of a death, unless there is no other
-    unit = float(np.quantile(costs, 0.9)) or float(costs.max()) or reward_bound * float(n_lost.max())
-    if not unit > 0:
-        raise NoCostError(
-            "Nothing had a cost on the roll-outs, and no episode died early, so that L has nothing to decrease by: start "
-            "further away."
-        )
-    rows = np.full((len(lengths), lengths.max()), -1)
-    rows[episode, step] = np.arange(len(costs))
-
-    # The last observation of each episode that a time limit ended stands behind those of the transitions
-    inputs = flatten(roll_outs.observations)
-    mean, scale = inputs.mean(axis=0), np.maximum(inputs.std(axis=0), 1e-6)
-    if roll_outs.last_observations is not None:
-        inputs = np.concatenate([inputs, flatten(roll_outs.last_observations)])
-    if not np.isfinite(inputs).all():
-        raise ValueError("The environment showed an infinite observation, which no network can learn from: bound it.")
-    low, high = inputs.min(axis=0), inputs.max(axis=0)
-    scale[low == high] = np.inf
-    inputs = (inputs - mean) / scale
-    following = np.arange(1, len(costs) + 1)
-    following[truncated] = len(costs) + np.arange(truncated.sum())
-
+    costs, n = data.costs, len(data.costs)
     rng = np.random.default_rng(seed)
-    network = SumOfSquares(inputs.shape[1], net_arch)
-    optimizer = th.optim.Adam(network.parameters(), lr=learning_rate)
-    n_batches = -(-len(costs) // batch_size)
-    schedule = th.optim.lr_scheduler.LinearLR(optimizer, 1.0, 1e-3, n_iterations * n_batches)
-    tensor = th.as_tensor(inputs[: len(costs)], dtype=th.float32)
+    optimizer = th.optim.Adam(network.parameters(), lr=LEARNING_RATE)
+    schedule = th.optim.lr_scheduler.LinearLR(optimizer, 1.0, 1e-3, N_ITERATIONS * -(-n // BATCH_SIZE))
+    tensor = th.as_tensor(data.scaled[:n], dtype=th.float32)
     average_cost = 0.0
-    for _ in tqdm(range(n_iterations), desc="Lyapunov function", disable=None if progress_bar else True):
-        values = network_values(network, inputs, unit)
-        next_values = np.where(died, 0.0, values[np.minimum(following, len(values) - 1)])
-        if not died.all():
-            average_cost = float(np.mean((costs + next_values - values[: len(costs)])[~died]))
+    for _ in tqdm(range(N_ITERATIONS), desc="Lyapunov function", disable=None if progress_bar else True):
+        values = data.unit * network.values(data.scaled)
+        next_values = np.where(data.died, 0.0, values[np.minimum(data.following, len(values) - 1)])
+        if not data.died.all():
+            average_cost = float(np.mean((costs + next_values - values[:n])[~data.died]))
             # What diverges has no average, and one that runs away would take the values with it
-            average_cost = min(max(average_cost, 0.0), float(costs[~died].max()))
-        lost = max(reward_bound - average_cost, 0.0) * n_lost
-        returns = traced_returns(costs + lost, next_values, rows, average_cost, trace_decay)
+            average_cost = min(max(average_cost, 0.0), float(costs[~data.died].max()))
+        lost = max(reward_bound - average_cost, 0.0) * data.n_lost
+        returns = traced_returns(costs + lost, next_values, data.rows, average_cost)
         # The relative value is known up to a constant
-        targets = th.as_tensor((returns - returns.min()) / unit, dtype=th.float32)
-        order = th.as_tensor(rng.permutation(len(costs)))
-        for batch in order.split(batch_size):
+        targets = th.as_tensor((returns - returns.min()) / data.unit, dtype=th.float32)
+        for batch in th.as_tensor(rng.permutation(n)).split(BATCH_SIZE):
             loss = nn.functional.mse_loss(network(tensor[batch]), targets[batch])
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
             schedule.step()
+    return average_cost
 
-    values = network_values(network, inputs, unit)[: len(costs)]
+
+def traced_returns(costs: np.ndarray, next_values: np.ndarray, rows: np.ndarray, average_cost: float) -> np.ndarray:
+    """
+    Sum the relative costs of several steps: ``G = c - c_bar + (1 - lambda) * L(s') + lambda * G'``, and
+    ``c - c_bar + L(s')`` at the end of an episode (TD(lambda), Sutton 1988, with the average cost subtracted).
+    """
+    returns = np.empty(len(costs))
+    later = np.zeros(len(rows))
+    for step in range(rows.shape[1] - 1, -1, -1):
+        here = rows[:, step]
+        running = here >= 0
+        here = here[running]
+        goes_on = np.zeros(len(rows), dtype=bool) if step + 1 == rows.shape[1] else rows[:, step + 1] >= 0
+        share = np.where(goes_on, TRACE_DECAY, 0.0)[running]
+        later[running] = costs[here] - average_cost + (1 - share) * next_values[here] + share * later[running]
+        returns[here] = later[running]
+    return returns
+
+
+def _described(
+    network: SumOfSquares, data: _Data, transitions: pd.DataFrame, average_cost: float, reward_bound: float, seeds: range
+) -> FittedLyapunov:
+    """Add to a network what its own roll-outs say about the loop."""
+    n = len(data.costs)
+    values = data.unit * network.values(data.scaled)[:n]
     if not np.isfinite(values).all():
-        raise ValueError(f"The fit diverged: its values are not finite. Lower learning_rate={learning_rate}.")
+        raise ValueError("The fit diverged: its values are not finite.")
     floor = float(values.min())
-    transitions["lyapunov"] = values - floor
+    values = values - floor
     episodes = summarize_episodes(transitions)
-    survivors = ~episodes["terminated"].to_numpy()
-    late = step >= (lengths - np.maximum(lengths // 5, 1))[episode]
-    late &= survivors[episode]
-    level = float(transitions["lyapunov"][late].max()) if late.any() else np.nan
-    window_steps = shortest_window(transitions["lyapunov"].to_numpy(), rows[survivors], level) if late.any() else None
-    ultimate_cost = float(episodes["largest_late_cost"][survivors].max()) if late.any() else np.nan
+    survived = ~episodes["terminated"].to_numpy()
+    ultimate_bound = level = window_steps = None
+    if survived.any():
+        episode, lengths = transitions["episode"].to_numpy(), episodes["length"].to_numpy()
+        late = transitions["step"].to_numpy() >= (lengths - np.maximum(lengths // 5, 1))[episode]
+        level = float(values[late & survived[episode]].max())
+        window_steps = shortest_window(values, data.rows[survived], level)
+        ultimate_bound = float(episodes["largest_late_cost"][survived].max())
     return FittedLyapunov(
-        network, mean, scale, unit, floor, ultimate_cost, level, window_steps, average_cost, reward_bound, seeds, low, high
+        network, data.inputs, data.unit, floor, average_cost, reward_bound, ultimate_bound, level, window_steps, seeds
     )
+
+
+def shortest_window(values: np.ndarray, rows: np.ndarray, level: float) -> int | None:
+    """Return the shortest window over which a function decreases wherever it starts above a level."""
+    along = np.where(rows >= 0, values[rows], np.nan)
+    for n_steps in WINDOWS:
+        if n_steps >= along.shape[1]:
+            break
+        before, after = along[:, :-n_steps], along[:, n_steps:]
+        counts = (before > level) & ~np.isnan(after)
+        if counts.any() and (after < before)[counts].all():
+            return n_steps
+    return None

@@ -143,14 +143,14 @@ def draw_calibration(transitions: pd.DataFrame, axes: Axes) -> None:
     axes.legend(fontsize=8)
 
 
-def draw_costs(transitions: pd.DataFrame, bound: float, axes: Axes, name: str = "ultimate bound") -> None:
+def draw_costs(transitions: pd.DataFrame, ultimate_bound: float, axes: Axes) -> None:
     """Draw the costs over time."""
     low, median, high = transitions.groupby("step")["cost"].quantile(np.array([0.1, 0.5, 0.9])).unstack().to_numpy().T
     steps = np.arange(len(median))
     axes.fill_between(steps, low, high, color=BLUE, alpha=0.2, lw=0, label="10 % to 90 % of the episodes")
     axes.plot(steps, median, color=BLUE, lw=1.4, label="median")
-    if not math.isnan(bound):
-        axes.axhline(bound, color=ORANGE, ls="--", lw=1.2, label=f"{name} {bound:.2g}")
+    if not math.isnan(ultimate_bound):
+        axes.axhline(ultimate_bound, color=ORANGE, ls="--", lw=1.2, label=f"ultimate bound {ultimate_bound:.2g}")
     set_log_scale(axes, "y", low)
     axes.set(xlabel="step", ylabel="cost", title="Costs over time")
     axes.legend(fontsize=8)
@@ -174,9 +174,7 @@ def plot_drift(by_cost: pd.DataFrame, cost_bound: float, cost_bound_alpha3: floa
     return figure
 
 
-def plot_certification(
-    statements: pd.DataFrame, transitions: pd.DataFrame, confidence: str, cost_bound: float | None
-) -> Figure:
+def plot_certification(statements: pd.DataFrame, transitions: pd.DataFrame, ultimate_bound: float | None) -> Figure:
     """See ``CertificationReport.plot()``."""
     figure = new_figure(9.5, 3.6)
     of_statements, of_costs = figure.subplots(1, 2)
@@ -191,14 +189,14 @@ def plot_certification(
         xlim=(0, 1.02),
         ylim=(-0.9, len(statements) - 0.5),
         xlabel="probability",
-        title=f"With {confidence} % confidence",
+        title="With 95 % confidence",
     )
     of_statements.legend(fontsize=8, loc="lower left", ncols=2)
-    draw_costs(transitions, math.nan if cost_bound is None else cost_bound, of_costs, "cost bound")
+    draw_costs(transitions, math.nan if ultimate_bound is None else ultimate_bound, of_costs)
     return figure
 
 
-def plot_attraction(starts: pd.DataFrame, confidence: str, x: int, y: int, names: Sequence[str] | None) -> Figure:
+def plot_region_of_attraction(starts: pd.DataFrame, x: int, y: int, names: Sequence[str] | None) -> Figure:
     """See ``CertificationReport.plot_region_of_attraction()``."""
     states = starts[[column for column in starts if str(column).startswith("state_")]].to_numpy()
     points, labels = project(states, x, y, names or [f"state {k}" for k in range(states.shape[1])])
@@ -210,7 +208,7 @@ def plot_attraction(starts: pd.DataFrame, confidence: str, x: int, y: int, names
     marks = axes.scatter(shown[:, 0], shown[:, 1], c=low, s=42, marker="s", cmap="viridis", vmin=0.0, vmax=1.0)
     never = (starts["n_attracted"] == 0).to_numpy()
     axes.scatter(points[never, 0], points[never, 1], s=20, color=VERMILION, marker="x", lw=1, label="never attracted")
-    figure.colorbar(marks, ax=axes, label=f"probability of attraction, at least ({confidence} % interval)")
+    figure.colorbar(marks, ax=axes, label="probability of attraction, at least (95 % interval)")
     if never.any():
         # Beside the axes: a grid of starts leaves no room in a corner
         figure.legend(fontsize=8, loc="outside lower center")
@@ -250,43 +248,4 @@ def plot_phase(
         ],
     )
     axes.set(title=f"Trajectories of {len(episodes)} episodes", **labels)
-    return figure
-
-
-def plot_region_of_attraction(
-    transitions: pd.DataFrame,
-    episodes: pd.DataFrame,
-    observations: np.ndarray | None,
-    settled: np.ndarray,
-    x: int,
-    y: int,
-    names: Sequence[str] | None,
-) -> Figure:
-    """See ``LyapunovReport.plot_region_of_attraction()``."""
-    points, labels = project(observations, x, y, names)
-    starts = (transitions["step"] == 0).to_numpy()
-    points, lyapunov = points[starts], transitions["lyapunov"].to_numpy()[starts]
-    died = episodes["terminated"].to_numpy()
-    settled = settled & ~died
-
-    figure = new_figure(6.4, 5.2)
-    axes = figure.subplots()
-    # A triangulation needs points that are neither few nor on one line
-    distinct, first = np.unique(points, axis=0, return_index=True)
-    if len(distinct) >= 10 and np.linalg.matrix_rank(distinct - distinct.mean(axis=0)) == 2:
-        levels = axes.tricontourf(distinct[:, 0], distinct[:, 1], lyapunov[first], levels=12, cmap="Blues")
-        figure.colorbar(levels, ax=axes, label="$L(s, a)$ at the start")
-    style = {"s": 30, "edgecolor": "white", "lw": 0.6}
-    scatter_groups(
-        axes,
-        points,
-        [
-            (settled, "settled", {"color": GREEN, "marker": "o", **style}),
-            (~settled & ~died, "not settled", {"color": ORANGE, "marker": "s", **style}),
-            (died, "died", {"color": VERMILION, "marker": "X", **style}),
-        ],
-    )
-    # Contours end at the outermost points, whose markers would be cut
-    axes.use_sticky_edges = False
-    axes.set(title=f"What became of {len(points)} start states", **labels)
     return figure

@@ -11,7 +11,14 @@ import numpy as np
 if TYPE_CHECKING:
     import pandas as pd
 
+#: Of all intervals, and of all exact statements of one certification together
 CONFIDENCE = 0.95
+#: Number of bootstrap samples
+N_BOOTSTRAP = 1000
+#: Number of levels of the cost, at its quantiles, at each of which L has to decrease
+N_COST_LEVELS = 5
+#: Largest weight of the costs that follow a time limit, and were not seen, in a cost-to-go
+MAX_TAIL_WEIGHT = 0.05
 
 
 class Interval(NamedTuple):
@@ -43,13 +50,12 @@ class Bootstrap:
     no interval wherever one sample is not defined.
 
     :param n_episodes: Number of episodes
-    :param n_samples: Number of bootstrap samples
     """
 
-    def __init__(self, n_episodes: int, n_samples: int):
+    def __init__(self, n_episodes: int):
         self.n_episodes = n_episodes
         # How often each episode is in each sample. The same roll-outs always have the same intervals.
-        self.counts = np.random.default_rng(0).multinomial(n_episodes, np.full(n_episodes, 1 / n_episodes), size=n_samples)
+        self.counts = np.random.default_rng(0).multinomial(n_episodes, np.full(n_episodes, 1 / n_episodes), size=N_BOOTSTRAP)
 
     def estimate(
         self, statistic: Callable[..., np.ndarray], episode: np.ndarray | pd.Series, *values: np.ndarray | pd.Series
@@ -141,18 +147,18 @@ def tightest_drift(n: np.ndarray, drift: np.ndarray, cost: np.ndarray, late_cost
     return bounds, alphas
 
 
-def levels_of_cost(known: pd.DataFrame, n_levels: int) -> np.ndarray:
-    """The level of the cost that each transition belongs to."""
-    quantiles = known["cost"].quantile(np.linspace(0, 1, n_levels + 1)[1:-1])
+def levels_of_cost(known: pd.DataFrame) -> np.ndarray:
+    """Return the level of the cost that each transition belongs to."""
+    quantiles = known["cost"].quantile(np.linspace(0, 1, N_COST_LEVELS + 1)[1:-1])
     return np.unique(np.searchsorted(quantiles, known["cost"]), return_inverse=True)[1]
 
 
-def estimate_drift(known: pd.DataFrame, episodes: pd.DataFrame, n_levels: int, bootstrap: Bootstrap) -> dict[str, Interval]:
+def estimate_drift(known: pd.DataFrame, episodes: pd.DataFrame, bootstrap: Bootstrap) -> dict[str, Interval]:
     """Estimate the metrics of the decrease condition with a residual."""
     names = ("residual", "cost_bound", "cost_bound_alpha3")
     if known.empty:
         return {name: Interval(math.nan, math.nan, math.nan) for name in names}
-    level, episode, ones = levels_of_cost(known, n_levels), known["episode"], np.ones(len(known))
+    level, episode, ones = levels_of_cost(known), known["episode"], np.ones(len(known))
     drift, cost = (known["next_lyapunov"] - known["lyapunov"]).to_numpy(), known["cost"].to_numpy()
     survived = (~episodes["terminated"]).to_numpy(dtype=np.float64)
     late = (survived * episodes["late_cost"].to_numpy(), survived)
@@ -171,13 +177,6 @@ def estimate_drift(known: pd.DataFrame, episodes: pd.DataFrame, n_levels: int, b
     }
 
 
-def percent(confidence: float) -> str:
-    """A confidence in per cent as readers see it: never 100."""
-    missing = 100 * (1 - confidence)
-    decimals = max(2, -math.floor(math.log10(missing)))
-    return f"{100 - missing:.{decimals}f}".rstrip("0").rstrip(".")
-
-
 def exact_lower_bound(n_true: int, n: int, confidence: float) -> float:
     """Lower bound of a probability, from independent trials (Clopper and Pearson, 1934)."""
     from scipy.stats import binomtest
@@ -185,11 +184,11 @@ def exact_lower_bound(n_true: int, n: int, confidence: float) -> float:
     return float(binomtest(n_true, n, alternative="greater").proportion_ci(confidence, method="exact").low)
 
 
-def exact_interval(n_true: int, n: int, confidence: float) -> Interval:
+def exact_interval(n_true: int, n: int) -> Interval:
     """Interval of a probability, from independent trials (Clopper and Pearson, 1934)."""
     from scipy.stats import binomtest
 
-    interval = binomtest(n_true, n).proportion_ci(confidence, method="exact")
+    interval = binomtest(n_true, n).proportion_ci(CONFIDENCE, method="exact")
     return Interval(n_true / n, float(interval.low), float(interval.high))
 
 
@@ -213,9 +212,7 @@ def exact_percentile(values: np.ndarray, percent: float) -> Interval:
     return Interval(value, float(low), float(high))
 
 
-def estimate_metrics(
-    transitions: pd.DataFrame, episodes: pd.DataFrame, n_levels: int, bootstrap: Bootstrap
-) -> dict[str, Interval]:
+def estimate_metrics(transitions: pd.DataFrame, episodes: pd.DataFrame, bootstrap: Bootstrap) -> dict[str, Interval]:
     """Estimate the metrics that ``evaluate_lyapunov()`` lists."""
     from scipy.stats import binomtest, rankdata
 
@@ -251,17 +248,52 @@ def estimate_metrics(
         "start_cost": bootstrap.estimate(ratio, starts["episode"], starts["cost"], np.ones(len(starts))),
         "late_cost": bootstrap.estimate(ratio, survivors.index, survivors["late_cost"], np.ones(len(survivors))),
         "late_rise": bootstrap.estimate(ratio, long.index, long["late_rise"], np.ones(len(long))),
-        **estimate_drift(known, episodes, n_levels, bootstrap),
+        **estimate_drift(known, episodes, bootstrap),
     }
 
 
-def decrease_by_cost(transitions: pd.DataFrame, n_levels: int, bootstrap: Bootstrap) -> pd.DataFrame:
+def decrease_by_cost(transitions: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
     """Statistics of the decrease condition at each level of the cost."""
     known = transitions[~transitions["terminated"]]
-    levels = known.groupby(levels_of_cost(known, n_levels))
+    levels = known.groupby(levels_of_cost(known))
     decrease = [bootstrap.estimate(ratio, level["episode"], level["difference"], np.ones(len(level))) for _, level in levels]
     table = levels["cost"].agg(cost_low="min", cost_high="max", cost="mean", n_transitions="size")
     table["drift"] = (known["next_lyapunov"] - known["lyapunov"]).groupby(levels.ngroup()).mean().to_numpy()
     table[["decrease", "decrease_low", "decrease_high"]] = np.reshape(decrease, (-1, 3))
     table["share_decreasing"] = (known["difference"] <= 0).groupby(levels.ngroup()).mean().to_numpy()
     return table.reset_index(drop=True)
+
+
+def relative_cost_to_go(transitions: pd.DataFrame, average_cost: float) -> np.ndarray:
+    """
+    Sum the costs to come beyond the average one, which a function of the average cost estimates. What follows a time limit is
+    the value of the function there, and so only the first half of each episode is looked at.
+    """
+    groups = transitions.groupby("episode")
+    excess = (transitions["cost"] - average_cost)[::-1]
+    to_come = excess.groupby(transitions["episode"][::-1]).cumsum()[::-1]
+    seen = ~groups["terminated"].transform("any") & (2 * transitions["step"] < groups["step"].transform("size"))
+    return (to_come + groups["next_lyapunov"].transform("last")).where(seen, np.nan).to_numpy()
+
+
+def cost_to_go(transitions: pd.DataFrame, gamma: float, reward_bound: float) -> np.ndarray:
+    """
+    Sum the discounted costs to come, which ``L`` estimates. After a death nothing is paid any more, so that each step costs
+    what the bound is, while the costs after a time limit are not seen.
+    """
+    from scipy.signal import lfilter  # slow to import, and only an evaluation needs it
+
+    episode, step = transitions["episode"].to_numpy(), transitions["step"].to_numpy()
+    lengths = np.bincount(episode)
+    costs = np.zeros((len(lengths), lengths.max()))
+    costs[episode, step] = transitions["cost"]
+    # G = c + gamma * G' as a filter that runs back in time
+    sums = lfilter(np.ones(1), np.array([1.0, -gamma]), costs[:, ::-1], axis=1)[:, ::-1][episode, step]
+    remaining = lengths[episode] - step
+    terminated = transitions.groupby("episode")["terminated"].transform("any").to_numpy()
+    if reward_bound > 0:
+        weights = np.append(0.0, np.cumsum(gamma ** np.arange(lengths.max())))
+        # Without a discount these costs have no sum
+        after = 1 / (1 - gamma) - weights[remaining] if gamma < 1 else np.nan
+        sums = np.where(terminated, sums + reward_bound * after, sums)
+    return np.where((gamma**remaining <= MAX_TAIL_WEIGHT) | terminated, sums, np.nan)

@@ -1,7 +1,5 @@
 """The command judges controllers and models alike, and its tables say what it found."""
 
-from functools import partial
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -10,15 +8,15 @@ pytest.importorskip("rl_zoo3")
 
 from benchmarks import certificate
 from benchmarks.controllers import controllers
-from sb3_lac import fit_lyapunov
 from sb3_lac.envs import LinearCostEnv
+from sb3_lac.stability import fitting
 
 
 @pytest.fixture
 def quick(monkeypatch, train_nothing):
     """One controller instead of all, few passes over the data, and a model that is not trained; returns what was asked for."""
     asked = train_nothing(certificate)
-    monkeypatch.setattr(certificate, "fit_lyapunov", partial(fit_lyapunov, n_iterations=3, progress_bar=False))
+    monkeypatch.setattr(fitting, "N_ITERATIONS", 3)
     reference = {"reference": controllers("LinearCost-v0")["reference"]}
     monkeypatch.setattr(certificate, "controllers", lambda env_id: reference)
     return asked

@@ -1,7 +1,6 @@
 """Policies and reference controllers are judged alike, and the tables and figures say what came out."""
 
 import json
-from functools import partial
 
 import pandas as pd
 import pytest
@@ -9,9 +8,9 @@ import yaml
 
 pytest.importorskip("rl_zoo3")
 
-from benchmarks import certificate, stabilisation
+from benchmarks import stabilisation
 from benchmarks.references import DISTURBANCES
-from sb3_lac import fit_lyapunov
+from sb3_lac.stability import fitting
 from sb3_lac.zoo import find_config
 
 
@@ -19,7 +18,7 @@ from sb3_lac.zoo import find_config
 def quick(monkeypatch, train_nothing):
     """Few passes over the data, and a model that is not trained; returns what was asked for."""
     asked = train_nothing(stabilisation)
-    monkeypatch.setattr(certificate, "fit_lyapunov", partial(fit_lyapunov, n_iterations=3))
+    monkeypatch.setattr(fitting, "N_ITERATIONS", 3)
     return asked
 
 
