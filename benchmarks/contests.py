@@ -5,7 +5,6 @@ figures show them.
 
 from __future__ import annotations
 
-import argparse
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -46,16 +45,8 @@ _VOLTAGE_TRAJECTORIES, _BRIEF_VOLTAGE_TRAJECTORIES = 100, 20  # the first ones: 
 #: Episodes of an evaluation while training.
 EVALUATION_EPISODES = 20
 _SCORED_EPISODES = 100
-
-
 #: Discharges in the test part of a data set of a voltage-only task.
 HELD_OUT = 300
-
-
-def check_discharges(parser: argparse.ArgumentParser, discharges: int) -> None:
-    """Refuse more discharges than are held out, with an error of the command line."""
-    if discharges > HELD_OUT:
-        parser.error(f"--discharges must lie within 1 .. {HELD_OUT}")
 
 
 def held_out_trajectories(env_id: str, **options: Any) -> TrajectoryDataset:

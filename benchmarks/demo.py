@@ -14,7 +14,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks import compare, real_cells
+from benchmarks import cells, compare
 
 RESULTS = Path("results")
 TIMESTEPS = 154_560  # 2400 updates
@@ -29,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     envs = ["--envs", "BatteryRo-v0", "BatteryQmax-v0"]
     compare.main([*envs, "--timesteps", str(TIMESTEPS), "--evaluations", "6", "--out", str(RESULTS / "demo_compare")])
     print("\n2/2  q^max and R_o of NASA's cell B0005, from its recorded discharges\n", flush=True)
-    real_cells.main(["--cells", "B0005", "--out", str(RESULTS / "demo_real_cells")])
+    cells.main(["real_cells", "--cells", "B0005", "--out", str(RESULTS / "demo_real_cells")])
     print(f"\nFigures and tables: {RESULTS.resolve()}")
 
 

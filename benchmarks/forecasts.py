@@ -35,7 +35,7 @@ from battery_env.record_model import RecordModel
 from battery_env.records import Record, Samples
 from battery_env.sensors import SensorErrors
 from battery_env.trajectories import TrajectoryDataset
-from benchmarks.study import Study, command_line, markdown
+from benchmarks.study import Study, command_line, markdown, natural, positive
 
 CUT_OFF_V = 2.7
 #: Error of the model on the real cells, and on the simulated ones, V.
@@ -229,10 +229,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """The command line."""
     parser = command_line("forecasts", __doc__, jobs=None)
     parser.add_argument("--cells", nargs="*", default=list(BUNDLED_CELLS), choices=BUNDLED_CELLS)
-    parser.add_argument("--every", type=int, default=12, help="each how many-th real discharge is forecast")
-    parser.add_argument("--discharges", type=int, default=None, help="how many of each real cell are read")
-    parser.add_argument("--simulated", type=int, default=8, help="simulated discharges of each kind and seed")
-    parser.add_argument("--samples", type=int, default=200, help="of each forecast")
+    parser.add_argument("--every", type=positive, default=12, help="each how many-th real discharge is forecast")
+    parser.add_argument("--discharges", type=positive, help="how many of each real cell are read")
+    parser.add_argument("--simulated", type=natural, default=8, help="simulated discharges of each kind and seed")
+    parser.add_argument("--samples", type=positive, default=200, help="of each forecast")
     study = Study(parser, arguments)
     chosen = study.chosen
     study.configuration |= {

@@ -31,8 +31,8 @@ from battery_env.calibration.pretrained import file_stem, policy_of_file
 from battery_env.evaluation import evaluate
 from battery_env.files import replacing
 from battery_env.trajectories import AgedParameter
-from benchmarks.contests import SENSORS, check_discharges
-from benchmarks.study import SYMBOLS, Study, Tables, command_line, markdown, natural, positive, versions, write_json
+from benchmarks.contests import HELD_OUT, SENSORS
+from benchmarks.study import SYMBOLS, Study, Tables, at_most, command_line, markdown, natural, positive, versions, write_json
 from benchmarks.training import Recipe, timesteps_of, train_or_load, training_minutes
 from sb3_lac.onnx import export_onnx
 
@@ -152,10 +152,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--recorded", action="store_true", help="policies for recorded cells")
     parser.add_argument("--seed", type=natural, default=0)
     parser.add_argument("--updates", type=positive, default=5000, help="gradient steps")
-    parser.add_argument("--discharges", type=positive, default=60, help="test discharges of the evaluation, up to 300")
+    parser.add_argument("--discharges", type=at_most(HELD_OUT), default=60, help="test discharges of the evaluation")
     study = Study(parser, arguments)
     chosen = study.chosen
-    check_discharges(parser, chosen.discharges)
     trained_with = TRAINED_WITH | (RECORDED if chosen.recorded else {})
     study.configuration |= {"trained_with": trained_with, "options": OPTIONS}
     recipes = {env_id: make(env_id, chosen.seed, chosen.updates, chosen.recorded, study.out) for env_id in chosen.envs}

@@ -30,7 +30,7 @@ _WALK = {"q_mobile": 2.0, "r_o": 1e-4}
 _NAMES = {"q_mobile": "qMobile", "r_o": "Ro"}
 
 
-class _BatteryWithUnknown(BatteryElectroChemEOD):
+class BatteryWithUnknown(BatteryElectroChemEOD):
     """progpy's model; one of its parameters is one more state, and the voltage its only output."""
 
     states = [*BatteryElectroChemEOD.states, "unknown"]  # noqa: RUF012
@@ -95,10 +95,10 @@ class ProgpyFilter(Estimator):
         return traces
 
     def _run(self, record: Record) -> FloatArray:
-        noise = dict.fromkeys(_BatteryWithUnknown.states, 0.0)
+        noise = dict.fromkeys(BatteryWithUnknown.states, 0.0)
         if self.kind == "particles":
             noise["unknown"] = _WALK[self.parameter]
-        model = _BatteryWithUnknown(self.parameter, process_noise=noise, measurement_noise=0)
+        model = BatteryWithUnknown(self.parameter, process_noise=noise, measurement_noise=0)
         state = np.append(initial_state(NEW_CELL.q_mobile), getattr(NEW_CELL, self.parameter))
         slope = np.zeros(STATE_SIZE + 1)
         slope[-1] = 1.0

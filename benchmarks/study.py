@@ -164,8 +164,35 @@ def positive(text: str) -> int:
     return number
 
 
+def at_most(most: int) -> Callable[[str], int]:
+    """A type of arguments of the command line, as of discharges that are held out."""
+
+    def number(text: str) -> int:
+        if not text.isdecimal() or not 1 <= int(text) <= most:
+            raise argparse.ArgumentTypeError(f"must lie within 1 .. {most}, got {text}")
+        return int(text)
+
+    return number
+
+
+def run_named(
+    module: str, document: str | None, studies: Mapping[str, Callable[[Sequence[str]], None]], arguments: Sequence[str] | None
+) -> None:
+    """Run the study of a module that the first argument names, with the other arguments."""
+    parser = argparse.ArgumentParser(
+        prog=f"python -m benchmarks.{module}", description=document, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("study", choices=studies, help="with --help: what it can be told")
+    parser.add_argument("options", nargs=argparse.REMAINDER, help="of the study")
+    chosen = parser.parse_args(arguments)
+    studies[chosen.study](chosen.options)
+
+
 def command_line(name: str, document: str | None, jobs: int | None = 2) -> argparse.ArgumentParser:
-    """What the command lines of all studies have in common: ``--jobs``, ``--scheduler`` and ``--out``."""
+    """
+    What the command lines of all studies have in common: ``--jobs``, ``--scheduler`` and ``--out``. The name is that of the
+    module, and of the study if the module has several.
+    """
     parser = argparse.ArgumentParser(
         prog=f"python -m benchmarks.{name}", description=document, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -173,7 +200,7 @@ def command_line(name: str, document: str | None, jobs: int | None = 2) -> argpa
         jobs = min(jobs, os.cpu_count() or 1)
         parser.add_argument("--jobs", type=positive, default=jobs, help="parts at the same time, one core each")
         parser.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster that makes the parts, tcp://host:port")
-    parser.add_argument("--out", type=Path, default=Path("results") / name, help="folder of all results")
+    parser.add_argument("--out", type=Path, default=Path("results") / name.split()[-1], help="folder of all results")
     return parser
 
 
@@ -194,7 +221,7 @@ class Study:
             if isinstance(value, list):  # a seed that is named twice is one seed
                 setattr(self.chosen, name, list(dict.fromkeys(value)))
         self.command = f"{parser.prog} {shlex.join(words)}".strip()
-        self.name = parser.prog.rpartition(".")[2]
+        self.name = parser.prog.replace(".", " ").split()[-1]
         self.out: Path = self.chosen.out
         try:
             check_folder(self.out)
@@ -224,7 +251,7 @@ class Study:
             files.append(self.out / "parts" / f"{part.__name__}_{digest_of(made_from)}.json")
         missing = {file: dict(arguments) for file, arguments in zip(files, parts, strict=True) if not file.exists()}
         where = list(missing)
-        runs = [(partial(_importable(part), **places), arguments) for arguments in missing.values()]
+        runs = [(partial(importable(part), **places), arguments) for arguments in missing.values()]
         self.each(_make, runs, lambda number, content: write_json(where[number], content))
         made = [json.loads(file.read_text(encoding="utf-8"))["tables"] for file in files]
         names = dict.fromkeys(name for tables in made for name in tables)
@@ -276,7 +303,7 @@ class Study:
                 else cluster(self.scheduler, _CODE, self.out if shared else None)
             )
             with workers as submit:
-                numbers = {submit(_importable(function), *run): number for number, run in enumerate(runs)}
+                numbers = {submit(importable(function), *run): number for number, run in enumerate(runs)}
                 for future in as_completed(numbers):
                     yield numbers[future], future.result
 
@@ -298,7 +325,7 @@ class Study:
         sys.stdout.write("\n" + text)
 
 
-def _importable(function: Callable[..., Result]) -> Callable[..., Result]:
+def importable(function: Callable[..., Result]) -> Callable[..., Result]:
     """The function of its module instead of that of the program, which is all that ``python -m`` makes of the module."""
     program = sys.modules["__main__"].__spec__
     if function.__module__ != "__main__" or program is None:

@@ -18,7 +18,6 @@ from tensorboard.plugins.custom_scalar.layout_pb2 import Layout
 from battery_env.estimators.closed_form import ClosedForm
 from battery_env.evaluation import evaluate, summarize
 from benchmarks import compare, contests
-from benchmarks.report import read_errors
 from benchmarks.training import Recipe
 
 ENV_ID = "BatteryRo-v0"
@@ -180,8 +179,9 @@ def test_seeds_are_one_row_and_continued_runs_are_named(tmp_path, finished, caps
     assert "- LAC on BatteryRo-v0, seed 1: 2 times\n- SAC on BatteryRo-v0, seed 1: 2 times\n" in shown
     assert (tmp_path / "out" / "compare.md").read_text(encoding="utf-8") in shown
     assert list(pd.read_csv(tmp_path / "out" / "compare.csv")["resumed"][:4]) == [0, 2, 0, 2]
-    # errors of all discharges of all seeds, for the report
-    errors = read_errors(tmp_path / "out")
+    # errors of all discharges of all seeds
+    errors = pd.read_csv(tmp_path / "out" / f"{ENV_ID}_scores.csv")
+    errors = errors[errors["seed"].notna()]
     assert errors.groupby(["calibrator", "seed"]).size().to_dict() == {
         (who, seed): 6 for who in ("LAC", "SAC") for seed in (0, 1)
     }

@@ -1,4 +1,4 @@
-"""The policies that come with the package are made by one command, and compared by another."""
+"""The policies that come with the package are made by one command."""
 
 import json
 
@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 
 from battery_env.calibration.pretrained import policy_of_file
-from benchmarks import mismatch, pretrained
+from benchmarks import pretrained
 from benchmarks.training import record_file
 from sb3_lac import LAC
 
@@ -50,34 +50,3 @@ def test_those_for_recorded_cells_learn_on_a_model_that_wanders_and_take_their_o
     assert card["training_data"].endswith("noise of 2 mV per root of a second on Vo, Vsn and Vsp")
     assert policy_of_file(tmp_path / "BatteryVoltageRo-v0_recorded.onnx")[1] == pretrained.OPTIONS
     assert (tmp_path / "BatteryVoltageRo-v0.json").read_bytes() == before and b"Vo, Vsn" not in before
-
-
-def test_the_comparison_runs(tmp_path, monkeypatch, capsys):
-    few = ("LAC, pretrained", "LAC, pretrained for recorded cells", "Kalman filter")
-    monkeypatch.setattr(mismatch, "CALIBRATORS", {name: mismatch.CALIBRATORS[name] for name in few})
-    monkeypatch.setattr(mismatch, "MISMATCHES", (0.2,))
-    mismatch.main(["--discharges", "2", "--cells", "--out", str(tmp_path)])
-    scores = pd.read_csv(tmp_path / "mismatch.csv")
-    assert len(scores) == 2 * len(few) * 2
-    digests = [mismatch.pretrained_card(mismatch.ENV_ID, recorded)["sha256"][:8] for recorded in (False, True)]
-    assert scores.groupby("calibrator")["policy"].first().dropna().tolist() == digests
-    assert (tmp_path / "mismatch.png").exists()
-    assert "| LAC, pretrained" in capsys.readouterr().out
-
-
-def test_recorded_cells_are_compared_with_the_fit_of_whole_discharges(monkeypatch):
-    monkeypatch.setattr(mismatch, "_EVERY", 80)
-    found = pd.concat(
-        [mismatch.recorded_part(name, "B0005", "")["mismatch_cells"] for name in ("least squares", "LAC, pretrained")]
-    )
-    assert len(found) == 2 * 3 * 4
-    rows = mismatch.recorded_table(found).set_index("calibrator")
-    column = "q^max, whole: mean (worst) departure from least squares (%)"
-    assert rows.loc["least squares", column] == "0.0 (0.0)" != rows.loc["LAC, pretrained", column]
-
-
-@pytest.mark.parametrize("benchmark", [pretrained, mismatch])
-def test_more_discharges_than_there_are_are_refused(benchmark, tmp_path, capsys):
-    with pytest.raises(SystemExit):
-        benchmark.main(["--discharges", "301", "--out", str(tmp_path)])
-    assert "--discharges must lie within 1 .. 300" in capsys.readouterr().err

@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from benchmarks import nuisance, study
+from benchmarks import calibrators, study
 from benchmarks.study import Study, command_line, digits, natural, with_spread
 
 
@@ -226,11 +226,11 @@ def test_on_a_cluster_a_lost_part_is_made_again_and_one_that_fails_stops_no_othe
 
 def test_parts_of_a_program_are_those_of_its_module(monkeypatch):
     program = ModuleType("__main__")
-    program.__spec__ = find_spec("benchmarks.nuisance")
+    program.__spec__ = find_spec("benchmarks.calibrators")
     monkeypatch.setitem(sys.modules, "__main__", program)
-    copy = FunctionType(nuisance.part.__code__, {}, "part")
+    copy = FunctionType(calibrators.part.__code__, {}, "part")
     copy.__module__ = "__main__"
-    assert study._importable(copy) is nuisance.part and study._importable(part) is part
+    assert study.importable(copy) is calibrators.part and study.importable(part) is part
 
 
 def test_a_scheduler_that_is_not_there_is_an_error_of_the_command_line(tmp_path, capsys):

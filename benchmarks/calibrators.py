@@ -1,0 +1,559 @@
+"""
+Calibrators under conditions: how far off each one is, how often what it states holds, and when it takes itself for settled.
+
+.. code-block:: bash
+
+  python -m benchmarks.calibrators peers               # what a user would pick instead of a learned policy
+  python -m benchmarks.calibrators faults              # one thing wrong at a time
+  python -m benchmarks.calibrators mismatch            # constants of the model off: the policies that come with battery_env
+  python -m benchmarks.calibrators nuisance            # the same: least squares that estimate such constants as well
+  python -m benchmarks.calibrators mismatch_policies   # the same: LAC, SAC and TD3, trained for it with several seeds
+
+Each is a row of ``COMPARISONS``: its conditions, its calibrators, and its discharges, which start with a full cell at rest,
+under power that changes every 60 to 140 s. Every calibrator starts from a new cell's parameters. Finished parts are not run
+again. Parts that run at the same time (``--jobs``) may cost each other time, which is measured.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from battery_env.arrays import FloatArray
+from battery_env.calibration.data import Q_MOBILE_RANGE_C, R_O_RANGE_OHM, standard_dataset
+from battery_env.calibration.policy import PolicyEstimator
+from battery_env.calibration.pretrained import pretrained_card
+from battery_env.electrochemistry import NEW_CELL, UNCERTAIN_CONSTANTS
+from battery_env.estimators import ClosedForm, Estimator, ExtendedKalmanFilter, GreedyOneStep, LeastSquares
+from battery_env.evaluation import evaluate
+from battery_env.loads import RandomPiecewise
+from battery_env.parameters import PARAMETER_NAMES
+from battery_env.plotting import COLOURS, LABELS, new_figure
+from battery_env.sensors import RandomSensorErrors, SensorErrors
+from battery_env.trajectories import AgedParameter, TrajectoryDataset
+from benchmarks.contests import HELD_OUT, SENSORS
+from benchmarks.pretrained import OPTIONS, TRAINED_WITH
+from benchmarks.study import (
+    SYMBOLS,
+    Study,
+    Tables,
+    at_most,
+    command_line,
+    digits,
+    duration,
+    markdown,
+    natural,
+    positive,
+    run_named,
+)
+from benchmarks.training import Recipe, timesteps_of, train_or_load
+
+ENV_ID = "BatteryVoltageJoint-v0"
+NOISE_V = 0.005
+#: Error of the model that a calibrator is told where it is told of one, V: the best of a few.
+MODEL_ERROR_V = 0.02
+#: Relative standard deviation of the constants of the model where they are off.
+MISMATCH = 0.2
+#: Standard deviation of the offset, uniform within 10 mV to either side, V.
+OFFSET_SD_V = 0.01 / np.sqrt(3.0)
+#: Time between the estimates of least squares during a discharge, s.
+WINDOWS_S = {"peers": 60.0, "faults": 300.0, "mismatch": 300.0, "nuisance": 120.0}
+#: Standard deviations of the priors of progpy's filters, about the new cell's values, C and ohm.
+PRIOR_SD = {"q_mobile": 1900.0, "r_o": 0.15}
+#: Discharges of calibrators that take milliseconds a sample, for each parameter.
+SLOW_DISCHARGES = 2
+#: A cell that is a little worn in both parameters: 10 % less q_mobile, 10 % more r_o.
+WORN_CELL = NEW_CELL.replace(q_mobile=0.9 * NEW_CELL.q_mobile, r_o=1.1 * NEW_CELL.r_o)
+#: Where discharges are generated, by what is unknown.
+SEEDS = {"q_mobile": 0, "r_o": 1, "joint": 2}
+#: Discharges that are timed, and how often each.
+TIMED_DISCHARGES, TIMED_REPETITIONS = 3, 3
+#: A calibrator that is off by more than this at the end has lost the discharge.
+LOST_PERCENT = 5.0
+
+# Columns of tables with a row for each parameter
+_MEASURES = (
+    "true",
+    "final_error_percent",
+    "second_half_mape_percent",
+    "settling_time_1_percent_s",
+    "coverage_percent",
+    "bound",
+    "trajectory",
+    "settled_time_s",
+    "updates",
+    "cpu_time_per_estimate_s",
+)
+# The mean magnitude of a normal error is this times its standard deviation
+_MEAN_MAGNITUDE = float(np.sqrt(2.0 / np.pi))
+_POLICY_NEEDS = "training on simulated discharges, model"
+# Exact estimates are drawn here
+_FLOOR_PERCENT = 1e-4
+# Where an observation with a fit holds its step, as an action
+_STEP = slice(102, 104)
+
+
+@dataclass(frozen=True)
+class Calibrator:
+    """
+    A calibrator in a comparison.
+
+    :param name: as shown to readers
+    :param needs: what it has to know
+    :param make: makes it, from the names of what is unknown and the noise that it is told, V, if it is
+    :param full_state: whether it is shown the state without any sensor
+    :param slow: whether it is run on a few discharges only
+    :param policy: digest of the policy that it uses
+    """
+
+    name: str
+    needs: str
+    make: Callable[[Sequence[str], float | None], Estimator]
+    full_state: bool = False
+    slow: bool = False
+    policy: str = ""
+
+
+@dataclass(frozen=True)
+class Condition:
+    """
+    A condition.
+
+    :param labels: what names it, as columns of tables
+    :param sensors: errors of the sensors
+    :param told_V: noise of the voltage that calibrators are told; None: not any
+    :param mismatch: relative standard deviation of the constants of the model
+    :param alone: whether one parameter is unknown at a time, and the other one held at the new cell's value
+    :param other_worn: whether the one that is held is a little worn
+    :param share: of the discharges
+    :param tried: calibrators that are run, all if none is named
+    """
+
+    labels: Mapping[str, str | float]
+    sensors: SensorErrors | RandomSensorErrors = field(default_factory=lambda: SensorErrors(noise_V=NOISE_V))
+    told_V: float | None = NOISE_V
+    mismatch: float = 0.0
+    alone: bool = False
+    other_worn: bool = False
+    share: float = 1.0
+    tried: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """
+    A study: who is compared under which conditions.
+
+    :param about: what readers have to know
+    :param conditions: as above
+    :param calibrators: as above
+    :param discharges: how many, by default
+    :param work: the discharges of a condition, from what is unknown and their number
+    :param seed: of the noise
+    :param by_parameter: whether its raw table has a row for each parameter
+    """
+
+    about: str
+    conditions: tuple[Condition, ...]
+    calibrators: tuple[Calibrator, ...]
+    discharges: int
+    work: Callable[[Condition, Sequence[str], int], TrajectoryDataset]
+    seed: int = 1
+    by_parameter: bool = False
+
+
+class Follow:
+    """No policy: it makes the step of the fit that the observation holds."""
+
+    def predict(self, observation: FloatArray, /, *, deterministic: bool = False) -> tuple[FloatArray, None]:
+        """The step."""
+        return observation[:, _STEP], None
+
+
+def _pretrained(name: str, recorded: bool = False) -> Calibrator:
+    return Calibrator(
+        name,
+        _POLICY_NEEDS,
+        lambda unknown, told_V: PolicyEstimator.pretrained(ENV_ID, recorded=recorded),
+        policy=pretrained_card(ENV_ID, recorded)["sha256"][:8],
+    )
+
+
+#: The policies that come with ``battery_env``, and what is left without them.
+SHIPPED = (
+    _pretrained("LAC, pretrained"),
+    _pretrained("LAC, pretrained for recorded cells", recorded=True),
+    Calibrator(
+        "the fit that LAC sees, no policy", "model", lambda unknown, told_V: PolicyEstimator(Follow(), ENV_ID, **OPTIONS)
+    ),
+)
+
+
+def _least_squares(name: str, needs: str, **options: Any) -> Calibrator:
+    return Calibrator(name, needs, lambda unknown, told_V: LeastSquares(unknown, voltage_noise_V=told_V, **options))
+
+
+def _kalman(name: str, needs: str, mismatch_V: float = 0.0, thermal: bool = False) -> Calibrator:
+    def make(unknown: Sequence[str], told_V: float | None) -> ExtendedKalmanFilter:
+        noise_V = None if told_V is None else max(told_V, mismatch_V)
+        return ExtendedKalmanFilter(unknown, thermal=thermal, voltage_noise_V=noise_V, mismatch_V=mismatch_V)
+
+    return Calibrator(name, needs, make)
+
+
+def _progpy(name: str, kind: Literal["ukf", "particles"]) -> Calibrator:
+    def make(unknown: Sequence[str], told_V: float | None) -> Estimator:
+        from benchmarks.progpy_filters import ProgpyFilter  # heavy, and needed here only
+
+        return ProgpyFilter(unknown[0], kind, PRIOR_SD[unknown[0]], NOISE_V)
+
+    return Calibrator(name, "voltage, prior", make, slow=True)
+
+
+def _greedy(name: str, resync: bool = True) -> Calibrator:
+    return Calibrator(
+        name, "full state", lambda unknown, told_V: GreedyOneStep(unknown[0], resync=resync, thermal=True), full_state=True
+    )
+
+
+def _generated(condition: Condition, unknown: Sequence[str], n: int, **options: Any) -> TrajectoryDataset:
+    kind = "joint" if len(unknown) > 1 else unknown[0]
+    cell = WORN_CELL if condition.other_worn else NEW_CELL
+    return TrajectoryDataset.generate(cast(AgedParameter, kind), n, RandomPiecewise(), SEEDS[kind], cell=cell, **options)
+
+
+def _held_out(condition: Condition, unknown: Sequence[str], n: int) -> TrajectoryDataset:
+    # the first held-out ones of the environment, with the same ages and loads whatever the mismatch, but where one parameter
+    # alone is unknown
+    if condition.alone:
+        return _generated(condition, unknown, n, q_mobile_range=Q_MOBILE_RANGE_C, r_o_range=R_O_RANGE_OHM)
+    return standard_dataset("joint", "piecewise", "test", mismatch=condition.mismatch)[:n]
+
+
+_TRIED = ("least squares, whole discharge", "extended Kalman filter")
+_PEERS = Comparison(
+    """Simulated as progpy does it, with a temperature: cells with a worn q^max of 4000 to 7600 C and cells with a worn R_o of
+0.117 to 0.35 ohm, the other parameter new and known; then with both worn and unknown. Calibrators with the full state see
+it exactly, all others are told 5 mV of noise; the Kalman filter allows for an offset of the voltage, least squares do not.""",
+    (
+        Condition({"case": "5 mV noise"}, alone=True),
+        Condition({"case": "20 mV noise"}, SensorErrors(noise_V=0.020), alone=True, tried=_TRIED),
+        Condition({"case": "+10 mV offset"}, SensorErrors(noise_V=NOISE_V, offset_V=0.010), alone=True, tried=_TRIED),
+        Condition({"case": "+1 % current"}, SensorErrors(noise_V=NOISE_V, current_gain=1.01), alone=True, tried=_TRIED),
+        Condition({"case": "other one 10 % worn, held new"}, alone=True, other_worn=True, tried=_TRIED),
+        Condition({"case": "both unknown"}, tried=_TRIED),
+    ),
+    (
+        Calibrator("closed form", "full state", lambda unknown, told_V: ClosedForm(), full_state=True),
+        _greedy("greedy one-step cost"),
+        _greedy("greedy, free-running", resync=False),
+        _least_squares("least squares, whole discharge", "voltage", thermal=True),
+        _least_squares("least squares, growing window", "voltage", thermal=True, window_every_s=WINDOWS_S["peers"]),
+        _kalman("extended Kalman filter", "voltage, prior", thermal=True),
+        _progpy("progpy, unscented Kalman filter", "ukf"),
+        _progpy("progpy, 100 particles", "particles"),
+    ),
+    discharges=30,
+    work=partial(_generated, r_o_range=(0.117, 0.35), thermal=True),
+    seed=0,
+    by_parameter=True,
+)
+
+_FAULTS = Comparison(
+    f"""The first held-out discharges of `{ENV_ID}`, both parameters unknown, 5 mV of noise; one thing wrong at a time. Where
+one parameter is unknown, half as many discharges for each. Constants of the model: kn, tDiffusion, to and tsn of each cell are
+multiplied by log-normal factors. The closed form sees the exact state and the current of the sensor. Least squares estimate
+every 300 s, filters every second, the policy every minute.""",
+    (
+        Condition({"fault": "none"}),
+        Condition({"fault": "told a third of the noise"}, told_V=NOISE_V / 3.0),
+        Condition({"fault": "told three times the noise"}, told_V=3.0 * NOISE_V),
+        Condition({"fault": "voltage +10 mV"}, SensorErrors(noise_V=NOISE_V, offset_V=0.010)),
+        Condition({"fault": "current +1 %"}, SensorErrors(noise_V=NOISE_V, current_gain=1.01)),
+        Condition(
+            {"fault": "one unknown, the other 10 % worn but held new"},
+            alone=True,
+            other_worn=True,
+            share=0.5,
+            tried=("closed form", "least squares", "Kalman filter", "Kalman filter, told 20 mV of model error"),
+        ),
+        Condition({"fault": "constants of the model off by 10 %"}, mismatch=0.1),
+        Condition({"fault": "constants of the model off by 20 %"}, mismatch=0.2),
+    ),
+    (
+        Calibrator("closed form", "full state, model", lambda unknown, told_V: ClosedForm()),
+        _least_squares("least squares", "model; noise for what it states", window_every_s=WINDOWS_S["faults"]),
+        _kalman("Kalman filter", "model, noise, prior, size of an offset"),
+        _kalman("Kalman filter, told 20 mV of model error", "the same, error of the model", MODEL_ERROR_V),
+        SHIPPED[0],
+    ),
+    discharges=60,
+    work=_held_out,
+    by_parameter=True,
+)
+
+_NUISANCES = dict.fromkeys(UNCERTAIN_CONSTANTS, MISMATCH)
+
+
+def _off(mismatch: float) -> tuple[Condition, ...]:
+    labels: list[dict[str, str | float]] = [{"mismatch": mismatch, "sensor": sensor} for sensor in SENSORS]
+    return tuple(Condition(label, SENSORS[str(label["sensor"])], told_V=None, mismatch=mismatch) for label in labels)
+
+
+_ABOUT_MISMATCH = f"""Held-out discharges of `{ENV_ID}`, both parameters unknown; kn, tDiffusion, to and tsn of each cell are
+off by factors with this relative standard deviation (mismatch)."""
+_MISMATCH = Comparison(
+    f"""{_ABOUT_MISMATCH} Least squares with nuisances are told the truth: which
+constants are off, and by how much. Least squares and filters read every second, the others every two.""",
+    _off(0.0) + _off(MISMATCH),
+    (
+        *SHIPPED,
+        _least_squares(
+            "least squares, two parameters", "model", mismatch_V=MODEL_ERROR_V, window_every_s=WINDOWS_S["mismatch"]
+        ),
+        _least_squares(
+            "least squares, nuisances, offset",
+            "model, sizes of its errors",
+            nuisance={**_NUISANCES, "offset_V": OFFSET_SD_V},
+            window_every_s=WINDOWS_S["mismatch"],
+        ),
+        _kalman("Kalman filter", "model, noise, prior, size of an offset"),
+        _kalman("Kalman filter, told 20 mV", "the same, error of the model", MODEL_ERROR_V),
+    ),
+    discharges=60,
+    work=_held_out,
+)
+
+_NUISANCE = Comparison(
+    f"""{_ABOUT_MISMATCH} Least squares for q^max and R_o alone, and
+with these constants as nuisances under priors that state it.""",
+    _off(MISMATCH),
+    (
+        _least_squares("two parameters", "model", mismatch_V=MODEL_ERROR_V, window_every_s=WINDOWS_S["nuisance"]),
+        _least_squares(
+            "with nuisance constants", "sizes of errors", nuisance=_NUISANCES, window_every_s=WINDOWS_S["nuisance"]
+        ),
+        _least_squares(
+            "with nuisance constants and offset",
+            "sizes of errors",
+            nuisance={**_NUISANCES, "offset_V": OFFSET_SD_V},
+            window_every_s=WINDOWS_S["nuisance"],
+        ),
+    ),
+    discharges=60,
+    work=_held_out,
+)
+
+_POLICIES = Comparison(
+    f"""{_ABOUT_MISMATCH} Policies that learn as those that come with
+`battery_env` do, each algorithm with its own settings.""",
+    _MISMATCH.conditions,
+    (),
+    discharges=60,
+    work=_held_out,
+)
+
+COMPARISONS = {
+    "peers": _PEERS,
+    "faults": _FAULTS,
+    "mismatch": _MISMATCH,
+    "nuisance": _NUISANCE,
+    "mismatch_policies": _POLICIES,
+}
+
+
+def cpu_time_per_estimate_s(estimator: Estimator, data: TrajectoryDataset, slow: bool) -> float:
+    """What an estimate costs on one core, on a few discharges; the least of several times, as others may use the machine."""
+    records = [data[0].part(0, 200)] if slow else [data[n] for n in range(min(len(data), TIMED_DISCHARGES))]
+    spent_s, estimates = 0.0, 0
+    for record in records:
+        times_s = []
+        for _ in range(TIMED_REPETITIONS):
+            start_s = time.process_time()
+            trace = estimator.trace([record])[0]
+            times_s.append(time.process_time() - start_s)
+        spent_s += min(times_s)
+        estimates += len(trace.time_s)
+    return spent_s / estimates
+
+
+def part(comparison: str, calibrator: str, condition: int, unknown: Sequence[str], discharges: int, policy: str) -> Tables:
+    """Score one calibrator under one condition."""
+    study = COMPARISONS[comparison]
+    who = next(each for each in study.calibrators if each.name == calibrator)
+    where = study.conditions[condition]
+    estimator, data = who.make(unknown, where.told_V), study.work(where, unknown, discharges)
+    scores = evaluate(estimator, data, None if who.full_state else where.sensors, seed=study.seed)
+    scores["cpu_time_per_estimate_s"] = cpu_time_per_estimate_s(estimator, data, who.slow)
+    scores = scores.assign(calibrator=calibrator, **where.labels, policy=policy)
+    return {comparison: by_parameter(scores, where.labels, unknown) if study.by_parameter else scores}
+
+
+def parts(name: str, n: int) -> list[dict[str, Any]]:
+    """All parts of a comparison."""
+    chosen, study = [], COMPARISONS[name]
+    for number, condition in enumerate(study.conditions):
+        for who in study.calibrators:
+            if not condition.tried or who.name in condition.tried:
+                count = int(np.ceil(condition.share * n))
+                common = {"comparison": name, "calibrator": who.name, "condition": number, "policy": who.policy}
+                common["discharges"] = min(count, SLOW_DISCHARGES) if who.slow else count
+                unknowns = [(name,) for name in PARAMETER_NAMES] if condition.alone else [PARAMETER_NAMES]
+                chosen += [{**common, "unknown": list(unknown)} for unknown in unknowns]
+    return chosen
+
+
+def policy_part(algo: str, seed: int, updates: int, discharges: int, folder: Path) -> Tables:
+    """Train a policy, unless that has been done, and score it under all conditions."""
+    timesteps = timesteps_of(updates, Recipe.of(algo, ENV_ID, seed).hyperparameters)
+    model = train_or_load(algo, ENV_ID, seed, timesteps, folder / "models", {"env_kwargs": TRAINED_WITH})
+    estimator, scores = PolicyEstimator(model, ENV_ID, **OPTIONS), []
+    for condition in _POLICIES.conditions:
+        data = _held_out(condition, PARAMETER_NAMES, discharges)
+        found = evaluate(estimator, data, condition.sensors, seed=_POLICIES.seed)
+        found["cpu_time_per_estimate_s"] = cpu_time_per_estimate_s(estimator, data, slow=False)
+        scores.append(found.assign(calibrator=algo.upper(), seed=seed, **condition.labels))
+    return {"mismatch_policies": pd.concat(scores, ignore_index=True)}
+
+
+def by_parameter(scores: pd.DataFrame, labels: Iterable[str], unknown: Sequence[str] = PARAMETER_NAMES) -> pd.DataFrame:
+    """Scores as ``evaluate`` gives them, with a row for each parameter."""
+    keys = [name for name in ("calibrator", "seed", *labels, "parameter", *_MEASURES) if name != "seed" or name in scores]
+    tables = [
+        scores.rename(columns=lambda column, name=name: column.removeprefix(f"{name}_")).assign(
+            parameter=name, true=scores[name]
+        )
+        for name in unknown
+    ]
+    return pd.concat(tables, ignore_index=True)[keys]
+
+
+def summary(results: pd.DataFrame, labels: Sequence[str], needs: Mapping[str, str]) -> pd.DataFrame:
+    """The table for readers, from one with a row for each parameter."""
+    rows = []
+    for keys, group in results.groupby([*labels, "calibrator"], sort=False):
+        row = dict(zip([*labels, "calibrator"], keys, strict=True))
+        row["needs"] = needs.get(str(row["calibrator"]), _POLICY_NEEDS)
+        for parameter, part in group.groupby("parameter", sort=False):
+            symbol = SYMBOLS[str(parameter)]
+            for words, column in (("2nd half", "second_half_mape_percent"), ("last", "final_error_percent")):
+                seeds = part[column].groupby(part["seed"]) if "seed" in part else [(0, part[column])]
+                means = " / ".join(digits(of_seed.mean(), 3) for _, of_seed in seeds)
+                row[f"{symbol}: {words} (worst), %"] = f"{means} ({digits(part[column].max())})"
+            row[f"{symbol}: within 2 sd, %"] = digits(part["coverage_percent"].mean(), 3)
+            lost, settled = part["final_error_percent"] > LOST_PERCENT, np.isfinite(part["settled_time_s"])
+            row[f"{symbol}: lost / settled, %"] = f"{100.0 * lost.mean():.0f} / {100.0 * settled.mean():.0f}"
+            within_s = part["settling_time_1_percent_s"]
+            row[f"{symbol}: within 1 % after, s"] = f"{digits(within_s.median())} / {digits(within_s.max())}"
+            row[f"{symbol}: bound, %"] = digits(_MEAN_MAGNITUDE * 100.0 * (part["bound"] / part["true"]).mean())
+        row["discharges"] = group["trajectory"].nunique()
+        row["time per estimate"] = duration(group["cpu_time_per_estimate_s"].mean())
+        rows.append(row)
+    return pd.DataFrame(rows).fillna("-")
+
+
+def report(name: str, results: pd.DataFrame) -> str:
+    """What readers have to know, and the table."""
+    comparison = COMPARISONS[name]
+    table = summary(results, list(comparison.conditions[0].labels), {who.name: who.needs for who in comparison.calibrators})
+    return f"""{comparison.about}
+
+Errors are means over discharges, one for each seed of policies that are trained here, and (the worst discharge): in the
+second half of a discharge, and of the last estimate. Within 2 sd: share of the estimates within two stated standard deviations
+of the truth. Lost: off by more than {LOST_PERCENT:g} % in the end. Settled: the last estimate is taken for settled.
+Within 1 %: from when on all estimates are, median and worst discharge. Bound: the least mean error that the last estimate of
+an unbiased calibrator can have. Times are CPU times on one core.
+
+{markdown(table)}"""
+
+
+def plot(results: pd.DataFrame, labels: Sequence[str]) -> Figure:
+    """The errors of all discharges, from a table with a row for each parameter."""
+    names = list(dict.fromkeys(results["calibrator"]))
+    rows: list[tuple[str, pd.DataFrame | None]] = []
+    for keys, of_condition in results.groupby(list(labels), sort=False):
+        rows.append((", ".join(f"{name} {key}" for name, key in zip(labels, keys, strict=True)), None))
+        rows += [(f"{name}", group) for name, group in of_condition.groupby("calibrator", sort=False)]
+    figure = new_figure(10.4, 0.8 + 0.17 * len(rows))
+    panels = figure.subplots(1, len(PARAMETER_NAMES), sharey=True)
+    for axes, parameter in zip(panels, PARAMETER_NAMES, strict=True):
+        for y, (name, group) in enumerate(rows):
+            if group is None:
+                axes.axhline(y, color="0.8", lw=0.8)
+                continue
+            errors = group[group["parameter"] == parameter]["second_half_mape_percent"]
+            colour = COLOURS[names.index(name) % len(COLOURS)]
+            axes.plot(errors.clip(_FLOOR_PERCENT), [y] * len(errors), "o", ms=3, mew=0, alpha=0.35, color=colour)
+            if len(errors):
+                axes.plot([max(errors.mean(), _FLOOR_PERCENT)] * 2, [y - 0.4, y + 0.4], color=colour, lw=2.2)
+        axes.set(xscale="log", xlabel="error in the second half (%)", title=LABELS[parameter].split(" (")[0])
+        axes.grid(axis="x", alpha=0.25)
+    panels[0].set_yticks(range(len(rows)), [name for name, _ in rows], fontsize=7)
+    for label, (_, group) in zip(panels[0].get_yticklabels(), rows, strict=True):
+        label.set_fontweight("bold" if group is None else "normal")
+    panels[0].invert_yaxis()
+    return figure
+
+
+def _parser(name: str) -> argparse.ArgumentParser:
+    comparison = COMPARISONS[name]
+    parser = command_line(f"calibrators {name}", comparison.about, jobs=1)
+    number = at_most(HELD_OUT)
+    parser.add_argument("--discharges", type=number, default=comparison.discharges, help="of each condition, at most 300")
+    return parser
+
+
+def _write(study: Study, tables: Tables) -> None:
+    comparison = COMPARISONS[study.name]
+    study.configuration |= {
+        "conditions": [asdict(condition) for condition in comparison.conditions],
+        "calibrators": [{"name": who.name, "policy": who.policy} for who in comparison.calibrators],
+        "seed_of_noise": comparison.seed,
+        "window_every_s": WINDOWS_S.get(study.name),
+        "model_error_V": MODEL_ERROR_V,
+        "prior_sd": PRIOR_SD,
+        "loads": asdict(RandomPiecewise()),
+        "trained_with": TRAINED_WITH,
+    }
+    labels, results = list(comparison.conditions[0].labels), tables[study.name]
+    if not comparison.by_parameter:
+        results = by_parameter(results, labels)
+    study.write(tables, {study.name: plot(results, labels)}, report(study.name, results))
+
+
+def run(name: str, arguments: Sequence[str]) -> None:
+    """Compare calibrators that are there."""
+    study = Study(_parser(name), arguments)
+    _write(study, study.run(part, parts(name, study.chosen.discharges)))
+
+
+def run_policies(arguments: Sequence[str]) -> None:
+    """Compare policies that are trained first."""
+    parser = _parser("mismatch_policies")
+    parser.add_argument("--algos", nargs="+", choices=("lac", "sac", "td3"), default=["lac", "sac", "td3"])
+    parser.add_argument("--seeds", nargs="+", type=natural, default=[0, 1, 2])
+    parser.add_argument("--updates", type=positive, default=5000, help="gradient steps of each training")
+    study = Study(parser, arguments)
+    chosen = study.chosen
+    common = {"updates": chosen.updates, "discharges": chosen.discharges}
+    policies = [{"algo": algo, "seed": seed, **common} for algo in chosen.algos for seed in chosen.seeds]
+    _write(study, study.run(policy_part, policies, folder=study.out))
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """The command line."""
+    studies = {name: partial(run, name) for name in COMPARISONS} | {"mismatch_policies": run_policies}
+    run_named("calibrators", __doc__, studies, arguments)
+
+
+if __name__ == "__main__":
+    main()

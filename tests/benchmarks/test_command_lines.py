@@ -1,0 +1,64 @@
+"""Every command of the benchmarks explains itself, and refuses with a sentence what it cannot do, before it does anything."""
+
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+import benchmarks
+from benchmarks import calibrators, cells
+
+STUDIES = {"calibrators": calibrators.COMPARISONS, "cells": cells.STUDIES}
+MODULES = sorted(path.stem for path in Path(benchmarks.__path__[0]).glob("*.py") if "\ndef main(" in path.read_text("utf-8"))
+COMMANDS = [f"{module} {study}".strip() for module in MODULES for study in ("", *STUDIES.get(module, ()))]
+
+
+def call(command, *arguments):
+    """What a command ends with, which takes no time."""
+    module, *words = command.split()
+    with pytest.raises(SystemExit) as ended:
+        import_module(f"benchmarks.{module}").main([*words, *arguments])
+    return ended.value.code
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_says_how_the_command_is_called(command, capsys):
+    assert call(command, "--help") == 0
+    assert f"usage: python -m benchmarks.{command}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_an_argument_that_there_is_not_is_refused(command, capsys):
+    assert call(command, "--no-such-option") == 2
+    assert f"python -m benchmarks.{command}: error: " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("out", ["file", "file/below"])
+@pytest.mark.parametrize("command", [command for command in COMMANDS if command not in (*STUDIES, "demo")])
+def test_a_folder_that_cannot_be_is_refused(command, out, tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    assert call(command, "--out", str(tmp_path / out)) == 2
+    assert "is a file: choose another --out" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("calibrators everything", "invalid choice: 'everything'"),
+        ("calibrators peers --discharges 0", "--discharges: must lie within 1 .. 300, got 0"),
+        ("calibrators mismatch --discharges 301", "--discharges: must lie within 1 .. 300, got 301"),
+        ("calibrators mismatch_policies --algos ppo", "invalid choice: 'ppo'"),
+        ("calibrators mismatch_policies --seeds -1", "--seeds: must be a whole number of at least 0, got -1"),
+        ("cells real_cells --cells B0007", "invalid choice: 'B0007'"),
+        ("cells fit_cell --every 0", "--every: must be at least 1, got 0"),
+        ("cells own_cell --updates 0.5", "--updates: must be at least 1, got 0.5"),
+        ("direct_mapping --pairs 0", "--pairs: must be at least 1, got 0"),
+        ("forecasts --every 0", "--every: must be at least 1, got 0"),
+        ("identifiability --draws many", "--draws: must be at least 1, got many"),
+        ("pretrained --discharges 301", "--discharges: must lie within 1 .. 300, got 301"),
+        ("pretrained --envs BatteryQmax-v0", "invalid choice: 'BatteryQmax-v0'"),
+    ],
+)
+def test_what_a_study_cannot_use_is_refused(line, words, tmp_path, capsys):
+    assert call(line, "--out", str(tmp_path / "out")) == 2
+    assert words in capsys.readouterr().err and not (tmp_path / "out").exists()
