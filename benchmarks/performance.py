@@ -32,19 +32,22 @@ from matplotlib.ticker import LogFormatter
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
+from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from battery_env.plotting import new_figure
 from benchmarks.study import Study, command_line, markdown, positive
-from benchmarks.throughput import filled_model, race, spread
+from benchmarks.throughput import race, spread
 from sb3_lac import LAC, GymnasiumVecEnv
 
 SECTIONS = ("updates", "compiled", "learn", "growth", "memory")
 
 _ENV_ID = "BatteryQmax-v0"
 _TRANSITIONS = 1_024
+_WARM_UP_UPDATES = 10
 _LARGE = [256, 256, 256]
 _SMALL = [64, 64]
 _CELLS = (1, 4, 16, 64, 256)
@@ -62,10 +65,29 @@ def many_cells(cells: int) -> VecEnv:
 
 
 def ready_model(
-    algorithm: type[LAC] | type[SAC], net_arch: list[int], env: VecEnv, batch_size: int = 256, **kwargs: Any
+    algorithm: type[LAC] | type[SAC],
+    net_arch: list[int],
+    env: VecEnv,
+    batch_size: int = 256,
+    policy_kwargs: dict[str, Any] | None = None,
+    **kwargs: Any,
 ) -> LAC | SAC:
     """A model that has transitions in its replay buffer and has made its first updates."""
-    return filled_model(algorithm, env, net_arch, batch_size, _TRANSITIONS, buffer_size=100 * _TRANSITIONS, **kwargs)
+    model = algorithm(
+        "MlpPolicy",
+        env,
+        learning_starts=_TRANSITIONS,
+        buffer_size=100 * _TRANSITIONS,
+        batch_size=batch_size,
+        policy_kwargs={"net_arch": net_arch, "activation_fn": nn.LeakyReLU, **(policy_kwargs or {})},
+        device="cpu",
+        seed=0,
+        **kwargs,
+    )
+    model.set_logger(Logger(folder=None, output_formats=[]))
+    model.learn(_TRANSITIONS)
+    model.train(gradient_steps=_WARM_UP_UPDATES, batch_size=batch_size)
+    return model
 
 
 def update_flops(model: OffPolicyAlgorithm) -> int:
@@ -221,7 +243,7 @@ class Stopwatch:
 
     @contextmanager
     def part(self, name: str) -> Iterator[None]:
-        """"""
+        """Count the time of a block, less that of parts within it, for a part."""
         self._turn()
         self._running.append(name)
         try:
@@ -231,7 +253,7 @@ class Stopwatch:
             self._running.pop()
 
     def watched(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        """"""
+        """Count the time of each call of a function for a part."""
 
         def call(*arguments: Any, **keywords: Any) -> Any:
             with self.part(name):
@@ -303,7 +325,7 @@ def measure_growth(rounds: int, updates: int) -> pd.DataFrame:
 
 
 def plot_growth(table: pd.DataFrame) -> Figure:
-    """"""
+    """Draw LAC's speed over cells, batch size and width."""
     figure = new_figure(10.0, 3.2)
     panels = {
         "cells": ("cells, one update per step of all", "cell steps a second"),
@@ -325,42 +347,35 @@ def plot_growth(table: pd.DataFrame) -> Figure:
     return figure
 
 
-def own_env_ids() -> list[str]:
-    """"""
-    packages = ("battery_env", "sb3_lac")
-    return sorted(name for name, spec in gym.registry.items() if str(spec.entry_point).startswith(packages))
-
-
-def transition_bytes(observation_space: spaces.Box, action_space: spaces.Box) -> int:
+def transition_bytes(env: gym.Env[Any, Any]) -> int:
     """Memory of one transition: two observations, the action, and reward, end and time limit in fp32."""
-    numbers = 2 * int(np.prod(observation_space.shape)) + int(np.prod(action_space.shape)) + 3
-    return 4 * numbers
+    assert isinstance(env.observation_space, spaces.Box) and isinstance(env.action_space, spaces.Box)
+    return 4 * (2 * int(np.prod(env.observation_space.shape)) + int(np.prod(env.action_space.shape)) + 3)
 
 
 def measure_memory(transitions: int) -> pd.DataFrame:
-    """"""
+    """Memory of a replay buffer in each environment of the packages, computed and allocated."""
     rows = []
-    for env_id in own_env_ids():
+    for env_id, spec in sorted(gym.registry.items()):
+        if not str(spec.entry_point).startswith(("battery_env", "sb3_lac")):
+            continue
         env = gym.make(env_id)
-        observation_space, action_space = env.observation_space, env.action_space
-        assert isinstance(observation_space, spaces.Box) and isinstance(action_space, spaces.Box)
         tracemalloc.start()
-        buffer = ReplayBuffer(transitions, observation_space, action_space, device="cpu")
+        buffer = ReplayBuffer(transitions, env.observation_space, env.action_space, device="cpu")
         allocated = tracemalloc.get_traced_memory()[0]
         tracemalloc.stop()
-        del buffer
-        env.close()
-        each = transition_bytes(observation_space, action_space)
         rows.append(
             {
                 "environment": env_id,
-                "observation": int(np.prod(observation_space.shape)),
-                "action": int(np.prod(action_space.shape)),
-                "bytes of a transition": each,
-                "MB computed": f"{transitions * each / 1e6:.1f}",
+                "observation": int(np.prod(env.observation_space.shape or ())),
+                "action": int(np.prod(env.action_space.shape or ())),
+                "bytes of a transition": transition_bytes(env),
+                "MB computed": f"{transitions * transition_bytes(env) / 1e6:.1f}",
                 "MB allocated": f"{allocated / 1e6:.1f}",
             }
         )
+        del buffer
+        env.close()
     return pd.DataFrame(rows)
 
 
