@@ -1,4 +1,4 @@
-"""Contestants take turns and do the same work, the floor is that of the arithmetic that is done, and all sections are written."""
+"""Contestants take turns and do the same work, the floor is that of the arithmetic that is done, and sections are written."""
 
 import itertools
 import json
@@ -51,9 +51,9 @@ def test_contestants_take_turns_in_alternating_order():
 def test_the_model_does_the_same_work_as_progpy(monkeypatch):
     models = pytest.importorskip("progpy.models")
     final = {}
-    for name in ("step_into", "voltage_into"):
+    for name, original in (("step_into", throughput.step_into), ("voltage_into", throughput.voltage_into)):
 
-        def recorded(out, *arguments, name=name, original=getattr(throughput, name)):
+        def recorded(out, *arguments, name=name, original=original):
             original(out, *arguments)
             final[name] = out.copy()
 
