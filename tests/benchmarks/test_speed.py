@@ -127,29 +127,12 @@ def test_bytes_are_those_of_adam_and_of_the_target():
     assert performance.moved_bytes(model) == 28 * actor + 40 * critic
 
 
-def test_stopwatch_counts_each_second_once():
-    clock = itertools.count()
-    watch = performance.Stopwatch(lambda: next(clock))
-    inner = watch.watched("inner", lambda x: x + 1)
-    with watch.part("outer"):
-        assert inner(1) == 2
-        with pytest.raises(ZeroDivisionError):
-            watch.watched("failing", lambda: 1 / 0)()
-    # one second from each reading of the clock to the next
-    assert watch.seconds == {"outer": 3.0, "inner": 1.0, "failing": 1.0}
-
-
 def test_sections_of_performance_are_written(tmp_path, capsys):
-    short = ["--rounds", "2", "--updates", "1", "--cells", "2", "--threads", "1", "--transitions", "1000"]
+    short = ["--rounds", "2", "--updates", "1", "--cells", "2", "--threads", "1"]
     performance.main([*short, "--out", str(tmp_path)])
-    assert {path.stem for path in tmp_path.iterdir()} == {*performance.SECTIONS, "learn_profile"}
+    assert {path.stem for path in tmp_path.iterdir()} == set(performance.SECTIONS)
     assert pd.read_csv(tmp_path / "updates.csv").shape == (2, 10)
-    shares = pd.read_csv(tmp_path / "learn_profile.csv").set_index("part")["share"]
-    assert shares.sum() == pytest.approx(1.0, abs=1e-4) and (shares.drop("logging") > 0).all()
     growth = pd.read_csv(tmp_path / "growth.csv")
     assert growth.groupby("over")["value"].unique().map(list).to_dict() == {"batch": [8, 16], "cells": [1, 2], "width": [4, 8]}
-    memory = pd.read_csv(tmp_path / "memory.csv").set_index("environment")
-    np.testing.assert_allclose(memory["MB allocated"], memory["MB computed"], atol=0.11)
-    assert {"BatteryQmax-v0", "BatteryAging-v0", "LinearCost-v0", "VehicleCost-v0"} <= set(memory.index)
     shown = capsys.readouterr().out
     assert all((tmp_path / f"{name}.md").read_text(encoding="utf-8") in shown for name in performance.SECTIONS)
