@@ -23,57 +23,19 @@ import pandas as pd
 from matplotlib.figure import Figure
 from rl_zoo3 import ALGOS
 from scipy.linalg import eigh
-from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from tqdm import tqdm
 
-from battery_env.plotting import COLOURS, save_figure
-from benchmarks.controllers import controllers, factors
-from benchmarks.references import DISTURBANCES
+from battery_env.plotting import COLOURS
+from benchmarks.control import CERTIFICATE_ENVS, DISTURBANCES, SETTLED_SHARE, STATEMENTS, controllers, factors, judge
 from benchmarks.study import Study, command_line, digits, natural, new_panels
 from benchmarks.training import Recipe, train_or_load
-from sb3_lac import LAC, certify, evaluate_lyapunov, fit_lyapunov
 from sb3_lac.envs import LinearCostEnv
-from sb3_lac.stability import CriticLyapunov
 
-_N_ENVS = 25
-# no training seed comes close; environments count up from each
-_FIT_SEED, _EVALUATION_SEED, _CERTIFICATION_SEED = 10_000, 20_000, 30_000
-#: Share of the cost at the start below which a loop counts as settled.
-SETTLED_SHARE = 0.1
 _MEANING = (
     f"mean cost settles below (green: known to be below {SETTLED_SHARE:g} of the cost at the start; blue: below it; "
     "orange: not)"
 )
-_STATEMENTS = ("survives", "stays_within", "decreases")
-
-
-def judge(policy: PolicyPredictor, env_id: str, episodes: int, figures: Path | None = None) -> list[dict[str, Any]]:
-    """Fit, evaluate and certify one policy; for LAC, the critic beside the fitted function."""
-    env = make_vec_env(env_id, n_envs=_N_ENVS)
-    fitted = fit_lyapunov(policy, env, episodes, seed=_FIT_SEED, progress_bar=False)
-    certification = certify(policy, env, fitted, episodes, seed=_CERTIFICATION_SEED)
-    if figures is not None:
-        save_figure(certification.plot(), figures.with_name(f"{figures.name}_statements.png"))
-    functions = {"fitted": fitted} | ({"critic": CriticLyapunov(policy)} if isinstance(policy, LAC) else {})
-    rows = []
-    for function, lyapunov in functions.items():
-        report = evaluate_lyapunov(policy, env, episodes, seed=_EVALUATION_SEED, lyapunov=lyapunov)
-        if figures is not None:
-            save_figure(report.plot_drift(), figures.with_name(f"{figures.name}_{function}_drift.png"))
-        row: dict[str, Any] = {"function": function, "holds": report.holds}
-        row["settles"] = (
-            report.holds and report.metrics["cost_bound"].high < SETTLED_SHARE * report.metrics["start_cost"].value
-        )
-        for metric, (value, low, high) in report.metrics.items():
-            row |= {metric: value, f"{metric}_low": low, f"{metric}_high": high}
-        if function == "fitted":
-            bounds = certification.statements["at_least"]
-            row |= {f"{statement}_at_least": bounds.get(statement, np.nan) for statement in _STATEMENTS}
-            row |= {"settles_within": certification.ultimate_bound, "window_steps": certification.window_steps}
-        rows.append(row)
-    env.close()
-    return rows
 
 
 def policies(chosen: argparse.Namespace, env_id: str) -> list[tuple[str, int | None, PolicyPredictor]]:
@@ -142,7 +104,7 @@ def report(table: pd.DataFrame) -> str:
                 "its alpha3": _over_policies(of_policy["cost_bound_alpha3"]),
                 "alpha3 without residual": _over_policies(of_policy["largest_feasible_alpha3"]),
             }
-            for statement in _STATEMENTS:
+            for statement in STATEMENTS:
                 row[f"{statement.replace('_', ' ')}, at least"] = _over_policies(of_policy[f"{statement}_at_least"])
             rows.append(row)
         text += f"\n`{env_id}`:\n\n" + pd.DataFrame(rows).to_markdown(index=False, disable_numparse=True) + "\n"
@@ -194,8 +156,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     missing = [path for path in paths if not (Path(path).is_file() or Path(f"{path}.zip").is_file())]
     if missing:
         parser.error(f"there is no file {', '.join(missing)}")
-    if chosen.episodes < _N_ENVS or min(chosen.fractions) <= 0:
-        parser.error(f"--episodes must be at least {_N_ENVS}, and --fractions positive")
+    if chosen.episodes < CERTIFICATE_ENVS or min(chosen.fractions) <= 0:
+        parser.error(f"--episodes must be at least {CERTIFICATE_ENVS}, and --fractions positive")
 
     rows = []
     for env_id in chosen.envs:

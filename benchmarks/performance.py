@@ -1,6 +1,6 @@
 """
 Where the time of LAC goes: updates beside those of Stable-Baselines3's SAC, beside what their arithmetic takes, and compiled
-beside not; ``learn()`` with many cells at once, growth with cells, batches and widths; memory of a million transitions.
+beside not; ``learn()`` with many cells at once, growth with cells, batches and widths.
 
 .. code-block:: bash
 
@@ -13,38 +13,34 @@ measured by the time of the processor, which other processes do not count in.
 
 from __future__ import annotations
 
-import sys
 import time
-import tracemalloc
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
-from unittest.mock import patch
 
 import gymnasium as gym
-import numpy as np
 import pandas as pd
 import torch as th
-from gymnasium import spaces
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
 from stable_baselines3 import SAC
-from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
+from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from battery_env.plotting import new_figure
 from benchmarks.study import Study, command_line, markdown, positive
-from benchmarks.throughput import filled_model, race, spread
+from benchmarks.throughput import race, spread
 from sb3_lac import LAC, GymnasiumVecEnv
 
-SECTIONS = ("updates", "compiled", "learn", "growth", "memory")
+SECTIONS = ("updates", "compiled", "learn", "growth")
 
 _ENV_ID = "BatteryQmax-v0"
 _TRANSITIONS = 1_024
+_WARM_UP_UPDATES = 10
 _LARGE = [256, 256, 256]
 _SMALL = [64, 64]
 _CELLS = (1, 4, 16, 64, 256)
@@ -62,10 +58,29 @@ def many_cells(cells: int) -> VecEnv:
 
 
 def ready_model(
-    algorithm: type[LAC] | type[SAC], net_arch: list[int], env: VecEnv, batch_size: int = 256, **kwargs: Any
+    algorithm: type[LAC] | type[SAC],
+    net_arch: list[int],
+    env: VecEnv,
+    batch_size: int = 256,
+    policy_kwargs: dict[str, Any] | None = None,
+    **kwargs: Any,
 ) -> LAC | SAC:
     """A model that has transitions in its replay buffer and has made its first updates."""
-    return filled_model(algorithm, env, net_arch, batch_size, _TRANSITIONS, buffer_size=100 * _TRANSITIONS, **kwargs)
+    model = algorithm(
+        "MlpPolicy",
+        env,
+        learning_starts=_TRANSITIONS,
+        buffer_size=100 * _TRANSITIONS,
+        batch_size=batch_size,
+        policy_kwargs={"net_arch": net_arch, "activation_fn": nn.LeakyReLU, **(policy_kwargs or {})},
+        device="cpu",
+        seed=0,
+        **kwargs,
+    )
+    model.set_logger(Logger(folder=None, output_formats=[]))
+    model.learn(_TRANSITIONS)
+    model.train(gradient_steps=_WARM_UP_UPDATES, batch_size=batch_size)
+    return model
 
 
 def update_flops(model: OffPolicyAlgorithm) -> int:
@@ -199,75 +214,7 @@ def measure_compiled(rounds: int, updates: int) -> tuple[pd.DataFrame, pd.DataFr
     return speeds, pd.DataFrame(rows)
 
 
-class Stopwatch:
-    """
-    The time of parts of a program, each without those that it calls.
-
-    :param clock: seconds
-    :ivar seconds: by part
-    """
-
-    def __init__(self, clock: Callable[[], float] = time.process_time) -> None:
-        self.clock = clock
-        self.seconds: dict[str, float] = {}
-        self._running: list[str] = []
-        self._since = 0.0
-
-    def _turn(self) -> None:
-        now = self.clock()
-        if self._running:
-            self.seconds[self._running[-1]] = self.seconds.get(self._running[-1], 0.0) + now - self._since
-        self._since = now
-
-    @contextmanager
-    def part(self, name: str) -> Iterator[None]:
-        """"""
-        self._turn()
-        self._running.append(name)
-        try:
-            yield
-        finally:
-            self._turn()
-            self._running.pop()
-
-    def watched(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        """"""
-
-        def call(*arguments: Any, **keywords: Any) -> Any:
-            with self.part(name):
-                return function(*arguments, **keywords)
-
-        return call
-
-
-def profile_learn(model: LAC | SAC, steps: int) -> dict[str, float]:
-    """Where the time of ``learn()`` goes."""
-    watch = Stopwatch()
-    assert model.replay_buffer is not None and model.env is not None
-    parts = [
-        ("environment", model.env, "step_wait"),
-        ("actions", model, "_sample_action"),
-        ("storing", model, "_store_transition"),
-        ("sampling", model.replay_buffer, "sample"),
-        ("losses", model, "train"),
-        ("gradients", th.Tensor, "backward"),
-        ("optimizers", model.actor.optimizer, "step"),
-        ("optimizers", model.critic.optimizer, "step"),
-        ("multipliers", sys.modules[type(model).__module__], "update_multiplier"),
-        ("target network", sys.modules[type(model).__module__], "polyak_update"),
-        ("logging", model.logger, "record"),
-        ("logging", model, "dump_logs"),
-    ]
-    with ExitStack() as stack:
-        for name, owner, method in parts:
-            if hasattr(owner, method):
-                stack.enter_context(patch.object(owner, method, watch.watched(name, getattr(owner, method))))
-        with watch.part("loop"):
-            steps_of(model, steps)
-    return {name: watch.seconds.get(name, 0.0) for name in [*dict.fromkeys(name for name, _, _ in parts), "loop"]}
-
-
-def measure_learn(cells: int, rounds: int, steps: int) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]:
+def measure_learn(cells: int, rounds: int, steps: int) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Environment steps a second of ``learn()`` with one update per step of all cells."""
     models = {
         "LAC, all cells at once": ready_model(LAC, _LARGE, many_cells(cells)),
@@ -281,9 +228,7 @@ def measure_learn(cells: int, rounds: int, steps: int) -> tuple[pd.DataFrame, pd
         {"": name, "steps a second": spread(values, 0), "LAC is faster by a factor of": spread(lac / values, 2)}
         for name, values in speeds.items()
     ]
-    seconds = pd.Series(profile_learn(models["LAC, all cells at once"], 10 * steps), name="seconds")
-    shares = (seconds / seconds.sum()).rename_axis("part").rename("share").reset_index()
-    return speeds, pd.DataFrame(rows), shares
+    return speeds, pd.DataFrame(rows)
 
 
 def measure_growth(rounds: int, updates: int) -> pd.DataFrame:
@@ -303,7 +248,7 @@ def measure_growth(rounds: int, updates: int) -> pd.DataFrame:
 
 
 def plot_growth(table: pd.DataFrame) -> Figure:
-    """"""
+    """Draw LAC's speed over cells, batch size and width."""
     figure = new_figure(10.0, 3.2)
     panels = {
         "cells": ("cells, one update per step of all", "cell steps a second"),
@@ -325,45 +270,6 @@ def plot_growth(table: pd.DataFrame) -> Figure:
     return figure
 
 
-def own_env_ids() -> list[str]:
-    """"""
-    packages = ("battery_env", "sb3_lac")
-    return sorted(name for name, spec in gym.registry.items() if str(spec.entry_point).startswith(packages))
-
-
-def transition_bytes(observation_space: spaces.Box, action_space: spaces.Box) -> int:
-    """Memory of one transition: two observations, the action, and reward, end and time limit in fp32."""
-    numbers = 2 * int(np.prod(observation_space.shape)) + int(np.prod(action_space.shape)) + 3
-    return 4 * numbers
-
-
-def measure_memory(transitions: int) -> pd.DataFrame:
-    """"""
-    rows = []
-    for env_id in own_env_ids():
-        env = gym.make(env_id)
-        observation_space, action_space = env.observation_space, env.action_space
-        assert isinstance(observation_space, spaces.Box) and isinstance(action_space, spaces.Box)
-        tracemalloc.start()
-        buffer = ReplayBuffer(transitions, observation_space, action_space, device="cpu")
-        allocated = tracemalloc.get_traced_memory()[0]
-        tracemalloc.stop()
-        del buffer
-        env.close()
-        each = transition_bytes(observation_space, action_space)
-        rows.append(
-            {
-                "environment": env_id,
-                "observation": int(np.prod(observation_space.shape)),
-                "action": int(np.prod(action_space.shape)),
-                "bytes of a transition": each,
-                "MB computed": f"{transitions * each / 1e6:.1f}",
-                "MB allocated": f"{allocated / 1e6:.1f}",
-            }
-        )
-    return pd.DataFrame(rows)
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command line."""
     parser = command_line("performance", __doc__, jobs=None)
@@ -372,7 +278,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--updates", type=positive, default=6, help="updates of a turn, and steps of all cells")
     parser.add_argument("--cells", type=positive, default=64, help="cells of learn()")
     parser.add_argument("--threads", type=positive, nargs="+", default=[1, 2], help="threads of torch")
-    parser.add_argument("--transitions", type=positive, default=1_000_000, help="that a replay buffer holds")
     study = Study(parser, arguments)
     chosen = study.chosen
 
@@ -383,16 +288,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         speeds, table = measure_compiled(chosen.rounds, chosen.updates)
         study.write({"compiled": speeds}, {}, markdown(table), "compiled")
     if "learn" in chosen.only:
-        speeds, table, shares = measure_learn(chosen.cells, chosen.rounds, chosen.updates)
-        readable = shares.assign(share=(100 * shares["share"]).map("{:.1f} %".format))
-        study.write({"learn": speeds, "learn_profile": shares}, {}, markdown(table) + "\n" + markdown(readable), "learn")
+        speeds, table = measure_learn(chosen.cells, chosen.rounds, chosen.updates)
+        study.write({"learn": speeds}, {}, markdown(table), "learn")
     if "growth" in chosen.only:
         growth = measure_growth(max(1, chosen.rounds // 2), chosen.updates)
         medians = growth.groupby(["over", "value"], sort=False)["speed"].apply(spread, digits=0).reset_index()
         study.write({"growth": growth}, {"growth": plot_growth(growth)}, markdown(medians), "growth")
-    if "memory" in chosen.only:
-        memory = measure_memory(chosen.transitions)
-        study.write({"memory": memory}, {}, markdown(memory), "memory")
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ then run under each condition. What is done is not done again when the command i
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,17 +21,17 @@ import gymnasium as gym
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from battery_env.evaluation import over_seeds
 from battery_env.plotting import coloured, draw_over_seeds, new_figure
-from benchmarks.study import EVALUATION_SEED, Study, Tables, command_line, digits, markdown, natural, positive, with_spread
+from benchmarks.control import roll_out
+from benchmarks.study import Study, Tables, command_line, digits, markdown, natural, positive, with_spread
 from benchmarks.training import train_or_load
 
 _ALGORITHMS = ("lac", "sac", "td3")
 
 # each study: environment, the arguments that vary with their values, and standard deviations of the noise on observations
-_STUDIES: dict[str, tuple[str, dict[str, tuple[float, ...]], tuple[float, ...]]] = {
+STUDIES: dict[str, tuple[str, dict[str, tuple[float, ...]], tuple[float, ...]]] = {
     "impulse": ("CartPoleCost-v0", {"impulse_N": (0.0, 40.0, 80.0, 100.0, 120.0, 150.0)}, (0.0,)),
     "cart and pole": (
         "CartPoleCost-v0",
@@ -61,45 +61,9 @@ _LABELS = {
 }
 
 
-def roll_out(
-    model: PolicyPredictor,
-    make_env: Callable[[], gym.Env[Any, Any]],
-    episodes: int,
-    noise_std: float = 0.0,
-    seed: int = EVALUATION_SEED,
-) -> pd.DataFrame:
-    """Run a policy, deterministically, in all episodes at once."""
-    envs = [make_env() for _ in range(episodes)]
-    rngs = [np.random.default_rng((seed, episode)) for episode in range(episodes)]
-    starts = [env.reset(seed=seed + episode) for episode, env in enumerate(envs)]
-    observations = np.array([observation for observation, _ in starts])
-    errors_at_start = [info["error"] for _, info in starts]
-    costs, errors = np.zeros(episodes), np.zeros(episodes)
-    lengths, died = np.zeros(episodes, dtype=int), np.zeros(episodes, dtype=bool)
-    running = np.arange(episodes)
-    while len(running) > 0:
-        noisy = observations[running]
-        if noise_std > 0:
-            noisy += noise_std * np.array([rngs[episode].standard_normal(noisy.shape[1]) for episode in running], np.float32)
-        actions, _ = model.predict(noisy, deterministic=True)
-        going_on = []
-        for episode, action in zip(running, actions, strict=True):
-            observations[episode], _, terminated, truncated, info = envs[episode].step(action)
-            costs[episode] += info["cost"]
-            errors[episode] = info["error"]
-            lengths[episode] += 1
-            died[episode] = terminated
-            if not (terminated or truncated):
-                going_on.append(episode)
-        running = np.array(going_on, dtype=int)
-    return pd.DataFrame(
-        {"cost": costs / lengths, "length": lengths, "error_at_start": errors_at_start, "error": errors, "died": died}
-    )
-
-
-def conditions(study: str) -> list[tuple[dict[str, Any], float]]:
+def combinations(study: str) -> list[tuple[dict[str, Any], float]]:
     """All combinations of a study."""
-    _, arguments, noises = _STUDIES[study]
+    _, arguments, noises = STUDIES[study]
     grid = itertools.product(*arguments.values())
     return [(dict(zip(arguments, values, strict=True)), noise) for values in grid for noise in noises]
 
@@ -107,9 +71,9 @@ def conditions(study: str) -> list[tuple[dict[str, Any], float]]:
 def part(algo: str, seed: int, timesteps: dict[str, int], episodes: int, models: Path) -> Tables:
     """Train a policy for each environment, and try it under all conditions."""
     rows = []
-    for study, (env_id, _, _) in _STUDIES.items():
+    for study, (env_id, _, _) in STUDIES.items():
         model = train_or_load(algo, env_id, seed, timesteps[env_id], models / f"{env_id}_{algo}_seed{seed}")
-        for arguments, noise in conditions(study):
+        for arguments, noise in combinations(study):
             outcome = roll_out(model, partial(gym.make, env_id, **arguments), episodes, noise)
             rows.append(
                 {
@@ -128,7 +92,7 @@ def part(algo: str, seed: int, timesteps: dict[str, int], episodes: int, models:
 
 def varied(study: str) -> list[str]:
     """What varies in a study."""
-    return [*_STUDIES[study][1]] or ["observation_noise"]
+    return [*STUDIES[study][1]] or ["observation_noise"]
 
 
 def plot_lines(results: pd.DataFrame, studies: Sequence[tuple[str, str]]) -> Figure:
@@ -189,7 +153,7 @@ def report(results: pd.DataFrame) -> str:
         metrics = ["death_rate", "cost"] if of_study["death_rate"].any() else ["cost"]
         table = of_study.pivot_table(index=columns, columns="algo", values=metrics, aggfunc=with_spread)[metrics]
         table.columns = [f"{algo}, {_LABELS[metric]}" for metric, algo in table.columns]
-        text += f"**{study}** ({_STUDIES[str(study)][0]}, {of_study['seed'].nunique()} seeds)\n\n"
+        text += f"**{study}** ({STUDIES[str(study)][0]}, {of_study['seed'].nunique()} seeds)\n\n"
         text += markdown(table.reset_index().rename(columns=_LABELS)) + "\n"
     return text
 

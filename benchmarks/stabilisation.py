@@ -27,8 +27,7 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from battery_env.evaluation import over_seeds
 from battery_env.plotting import COLOURS, new_figure
-from benchmarks.certificate import SETTLED_SHARE, judge
-from benchmarks.references import DISTURBANCES, SHARES, conditions, draw_shares, tried
+from benchmarks.control import DISTURBANCES, SETTLED_SHARE, SHARES, conditions, draw_shares, judge, tried
 from benchmarks.study import (
     Study,
     Tables,
@@ -53,7 +52,7 @@ _STYLES = {
     "TQC": (COLOURS[3], "D"),
     _REFERENCE: ("black", "|"),
 }
-_ALGORITHMS = [name.lower() for name in _STYLES if name != _REFERENCE]
+ALGORITHMS = [name.lower() for name in _STYLES if name != _REFERENCE]
 
 
 def part(
@@ -219,7 +218,7 @@ def plot_disturbances(results: pd.DataFrame) -> Figure:
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command line."""
     parser = command_line("stabilisation", __doc__)
-    parser.add_argument("--algos", nargs="+", default=["lac", "sac", "td3"], choices=_ALGORITHMS)
+    parser.add_argument("--algos", nargs="+", default=["lac", "sac", "td3"], choices=ALGORITHMS)
     parser.add_argument("--envs", nargs="+", default=list(DISTURBANCES), choices=list(DISTURBANCES))
     parser.add_argument("--seeds", nargs="+", type=natural, default=[0, 1, 2, 3, 4])
     parser.add_argument("--timesteps", type=positive, help="environment steps at most; those of zoo_configs by default")

@@ -1,15 +1,14 @@
 """
-How many updates a second LAC makes on the CPU, beside Stable-Baselines3's SAC and TD3 at equal networks; how many steps a
-second the model makes, beside NASA's progpy; how many the environments make, for one cell and for many; and how long an update
-of a filter and of a policy takes, beside progpy's filters.
+How many steps a second the model makes, beside NASA's progpy; how many the environments make, for one cell and for many; and
+how long an update of a filter and of a policy takes, beside progpy's filters.
 
 .. code-block:: bash
 
   python -m benchmarks.throughput
-  python -m benchmarks.throughput --only model environments filters
+  python -m benchmarks.throughput --only filters
 
 Contestants take turns in short blocks, so that whatever else the machine does hits all of them; ratios are taken within each
-round, and their median and quartiles are reported. A profile says where the time of an update goes.
+round, and their median and quartiles are reported. All run on one core: its time, other processes not counted.
 """
 
 from __future__ import annotations
@@ -21,18 +20,12 @@ from functools import partial
 from itertools import cycle, islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, TypeVar
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pandas as pd
-import torch as th
 from matplotlib import rc_context
-from stable_baselines3 import SAC, TD3
-from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.type_aliases import GymEnv
-from torch import nn
 from tqdm import trange
 
 from battery_env import ExtendedKalmanFilter, OnnxPolicy, PolicyEstimator
@@ -42,14 +35,8 @@ from battery_env.records import Stream
 from benchmarks.study import Study, command_line, markdown, positive
 from sb3_lac import LAC
 
-Algorithm = TypeVar("Algorithm", bound=OffPolicyAlgorithm)
-
-_ALGORITHMS: dict[str, type[LAC] | type[SAC] | type[TD3]] = {"LAC": LAC, "SAC": SAC, "TD3": TD3}
-_TRANSITIONS = 5_000
 _POLICY_ENV = "BatteryVoltageJoint-v0"
-_WARM_UP_UPDATES = 10
-
-SECTIONS = ("updates", "model", "environments", "filters")
+SECTIONS = ("model", "environments", "filters")
 # of one turn
 _SIMULATED_STEPS = 1500
 _SIMULATIONS = 20
@@ -60,40 +47,6 @@ _SAMPLES, _PROGPY_SAMPLES, _PARTICLES_SAMPLES, _BATCH_SAMPLES = 600, 20, 4, 3
 _FILTERED_CELLS = 10_000
 # and how often all cells of each decide in one turn: whole episodes
 _ENVIRONMENTS = {"BatteryQmax-v0": 128, "BatteryVoltageJoint-v0": 8}
-
-# which operators of torch belong to what, by the beginnings of their names; the first that fits counts
-_PARTS = {
-    "matrix products": ("aten::mm", "aten::addmm"),
-    "activations": ("aten::leaky_relu",),
-    "optimizers and target networks": ("Optimizer", "aten::_fused_adam", "aten::_foreach", "aten::lerp"),
-    "other operators": ("aten::",),
-    "autograd": ("autograd::", "torch::autograd", "AddmmBackward", "LeakyReluBackward"),
-}
-
-
-def filled_model(
-    algorithm: type[Algorithm],
-    env: GymEnv | str,
-    net_arch: list[int],
-    batch_size: int,
-    transitions: int,
-    policy_kwargs: dict[str, Any] | None = None,
-    **arguments: Any,
-) -> Algorithm:
-    """A model with transitions in its replay buffer, which has made its first updates."""
-    kwargs: dict[str, Any] = {
-        "learning_starts": transitions,
-        "buffer_size": transitions,
-        "batch_size": batch_size,
-        "policy_kwargs": {"net_arch": net_arch, "activation_fn": nn.LeakyReLU, **(policy_kwargs or {})},
-        "device": "cpu",
-        "seed": 0,
-    }
-    model = algorithm("MlpPolicy", env, **{**kwargs, **arguments})
-    model.set_logger(Logger(folder=None, output_formats=[]))
-    model.learn(transitions)
-    model.train(gradient_steps=_WARM_UP_UPDATES, batch_size=batch_size)
-    return model
 
 
 def race(contestants: dict[str, Callable[[], int]], rounds: int, clock: Callable[[], float]) -> pd.DataFrame:
@@ -108,29 +61,6 @@ def race(contestants: dict[str, Callable[[], int]], rounds: int, clock: Callable
             speed[name] = done / (clock() - start)
         speeds.append(speed)
     return pd.DataFrame(speeds)[list(contestants)]
-
-
-def measure(models: dict[str, OffPolicyAlgorithm], rounds: int, updates: int, batch_size: int) -> pd.DataFrame:
-    """Updates a second of each model, in turns."""
-
-    def turn(model: OffPolicyAlgorithm) -> int:
-        model.train(gradient_steps=updates, batch_size=batch_size)
-        return updates
-
-    return race({name: partial(turn, model) for name, model in models.items()}, rounds, time.perf_counter)
-
-
-def profile(model: OffPolicyAlgorithm, updates: int, batch_size: int) -> dict[str, float]:
-    """Where the time of an update goes."""
-    start = time.perf_counter()
-    with th.profiler.profile(activities=[th.profiler.ProfilerActivity.CPU]) as profiler:
-        model.train(gradient_steps=updates, batch_size=batch_size)
-        wall_us = 1e6 * (time.perf_counter() - start)
-    shares = dict.fromkeys(_PARTS, 0.0)
-    for event in profiler.key_averages():
-        part = next((part for part, names in _PARTS.items() if event.key.startswith(names)), "autograd")
-        shares[part] += event.self_cpu_time_total / wall_us
-    return {**shares, "Python": 1.0 - sum(shares.values())}
 
 
 def model_contestants(cells: int) -> dict[str, Callable[[], int]]:
@@ -292,21 +222,6 @@ def spread(values: pd.Series, digits: int) -> str:
     return f"{median:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
 
 
-def report(speeds: pd.DataFrame, parts: pd.DataFrame) -> str:
-    """What was measured of updates, as Markdown."""
-    lac = speeds["LAC"]
-    rows = [
-        {
-            "algorithm": name,
-            "updates a second, median (quartiles)": spread(values, 1),
-            "LAC is faster by a factor of": spread(lac / values, 2),
-        }
-        for name, values in speeds.items()
-    ]
-    shares = (100.0 * parts).map("{:.0f} %".format).rename_axis("share of the time").reset_index()
-    return markdown(rows) + "\n" + markdown(shares)
-
-
 def report_steps(speeds: pd.DataFrame) -> str:
     """
     What was measured of steps, as Markdown. Where progpy does the same work, the ratio is to the contestant of this package.
@@ -328,37 +243,22 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = command_line("throughput", __doc__, jobs=None)
     parser.add_argument("--only", nargs="+", choices=SECTIONS, default=list(SECTIONS), help="what to measure, all by default")
     parser.add_argument("--rounds", type=positive, default=40, help="turns of each contestant")
-    parser.add_argument("--updates", type=positive, default=25, help="updates of a turn")
-    parser.add_argument("--env", default="BatteryQmax-v0", help="id of the environment, for the sizes of the input layers")
-    parser.add_argument("--net-arch", type=positive, nargs="+", default=[256, 256, 256], help="widths of the hidden layers")
-    parser.add_argument("--batch-size", type=positive, default=256)
     parser.add_argument(
         "--cells", type=positive, default=1024, help="cells of a batch of the model and of a vector environment"
     )
     parser.add_argument("--filtered-cells", type=positive, default=_FILTERED_CELLS, help="cells of a batch of filters")
-    parser.add_argument("--threads", type=positive, default=1, help="threads of torch")
     study = Study(parser, arguments)
     chosen = study.chosen
-
-    th.set_num_threads(chosen.threads)
-    if "updates" in chosen.only:
-        models: dict[str, OffPolicyAlgorithm] = {
-            name: filled_model(kind, chosen.env, chosen.net_arch, chosen.batch_size, _TRANSITIONS)
-            for name, kind in _ALGORITHMS.items()
+    with TemporaryDirectory() as folder:
+        sections = {
+            "model": (partial(model_contestants, chosen.cells), report_steps),
+            "environments": (partial(environment_contestants, chosen.cells), report_steps),
+            "filters": (partial(filter_contestants, chosen.filtered_cells, Path(folder)), report_filters),
         }
-        speeds = measure(models, chosen.rounds, chosen.updates, chosen.batch_size)
-        parts = pd.DataFrame({name: profile(model, chosen.updates, chosen.batch_size) for name, model in models.items()}).T
-        tables = {"updates": speeds, "updates_profile": parts.rename_axis("algorithm").reset_index()}
-        study.write(tables, {}, report(speeds, parts), "updates")
-    if "filters" in chosen.only:
-        with TemporaryDirectory() as folder:
-            speeds = race(filter_contestants(chosen.filtered_cells, Path(folder)), chosen.rounds, time.process_time)
-        study.write({"filters": speeds}, {}, report_filters(speeds), "filters")
-    for section, contestants in (("model", model_contestants), ("environments", environment_contestants)):
-        if section in chosen.only:
-            # they run on one core each: its time, other processes not counted
-            speeds = race(contestants(chosen.cells), chosen.rounds, time.process_time)
-            study.write({section: speeds}, {}, report_steps(speeds), section)
+        for section in chosen.only:
+            contestants, report = sections[section]
+            speeds = race(contestants(), chosen.rounds, time.process_time)
+            study.write({section: speeds}, {}, report(speeds), section)
 
 
 if __name__ == "__main__":

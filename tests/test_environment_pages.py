@@ -12,7 +12,7 @@ from battery_env.calibration.full_state_tasks import BatteryQmax
 from battery_env.calibration.registration import TASKS
 from battery_env.calibration.voltage_tasks import BatteryVoltageJoint
 from battery_env.loads import constant
-from benchmarks.references import DISTURBANCES
+from benchmarks.control import DISTURBANCES
 from docs import environment_pages
 
 TEXT = (environment_pages.DOCS / "battery_env.md").read_text(encoding="utf-8")

@@ -7,7 +7,6 @@ import pytest
 
 from battery_env.calibration.data import standard_dataset
 from benchmarks import ablations
-from benchmarks.training import Recipe
 
 
 @pytest.fixture
@@ -50,17 +49,6 @@ def test_a_policy_sees_in_its_test_what_it_saw_in_its_training(trained, tmp_path
     assert env.observation_space.shape == (seen,) == env.reset(seed=0)[0].shape
 
 
-def test_starts_and_lengths_of_episodes_are_one_of_the_choices(trained, tmp_path, monkeypatch):
-    test = standard_dataset("q_mobile", "paper", "test").subset([0, 900])
-    monkeypatch.setattr(ablations, "standard_dataset", lambda *which: test)
-    monkeypatch.setattr(ablations, "_DISCHARGES", 2)
-    tuned = Recipe.of("lac", "BatteryQmax-v0", 0).hyperparameters["env_kwargs"]
-    assert tuned
-    for name, expected in (("published", {}), ("gamma", {}), ("starts", tuned)):
-        ablations.part(name, 0, 10, tmp_path)
-        assert trained[-1]["env_kwargs"] == expected
-
-
 def test_hidden_columns_are_the_innovations():
     env = gym.make("BatteryQmax-v0")
     hidden = ablations.HideColumns(gym.make("BatteryQmax-v0"), range(15, 22))
@@ -78,10 +66,3 @@ def test_tables_name_what_was_changed_with_all_seeds(trained, tmp_path, capsys):
     assert table["changed"].tolist() == ["discount 0.9"] * 2 + ["episodes of 16 steps, the paper's"] * 2
     text = (tmp_path / "ablations.md").read_text()
     assert text in capsys.readouterr().out and len(text.splitlines()) == 4 and text.count(" / ") == 8
-
-
-@pytest.mark.parametrize("command", [["--updates", "0"], ["--jobs", "0"], ["--variants", "all"]])
-def test_nonsense_on_the_command_line_is_refused(command, trained):
-    with pytest.raises(SystemExit):
-        ablations.main(command)
-    assert not trained

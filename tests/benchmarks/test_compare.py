@@ -307,24 +307,6 @@ def test_algorithms_of_the_zoo_and_ones_own_are_compared_in_any_environment(tmp_
     assert re.search(r"\| Tank-v0 +\| TQC defaults +\|", capsys.readouterr().out)
 
 
-def test_every_environment_has_a_contest(monkeypatch):
-    monkeypatch.setattr(contests, "held_out_trajectories", lambda env_id: None)
-    kinds = {
-        env_id: type(contests.contest_of(env_id)).__name__ for env_id in ("BatteryJoint-v0", "BatteryAging-v0", "Pendulum-v1")
-    }
-    assert kinds == {"BatteryJoint-v0": "FullState", "BatteryAging-v0": "VoltageOnly", "Pendulum-v1": "Episodes"}
-
-
-def test_shares_of_discharges_are_drawn_over_seeds():
-    scores = pd.DataFrame({"calibrator": ["LAC"] * 4 + ["filter"] * 2, "seed": [0, 0, 1, 1, np.nan, np.nan]})
-    scores = scores.assign(sensor="5 mV noise", r_o_second_half_mape_percent=[1.0, 4.0, 2.0, 4.0, 1.0, 8.0])
-    (axes,) = contests.plot_ranks(scores, ["r_o"]).axes
-    assert [line.get_label() for line in axes.lines] == ["LAC", "filter"] and len(axes.collections) == 1
-    shares = axes.lines[0].get_ydata()
-    # at 1 % half of the discharges with one of two seeds, at 8 % all
-    assert shares[0] == 25.0 and shares[-1] == 100.0
-
-
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [

@@ -161,20 +161,3 @@ def test_each_algorithm_tries_what_the_others_found_as_often(trials, tmp_path):
     )
     search.main([*command, "--jobs", "1", "--out", str(tmp_path)])
     assert len(trials) == 3 * 6 + 3 * 4
-
-
-@pytest.mark.parametrize(
-    "command",
-    [
-        ["--trials", "0"],
-        ["--updates", "0"],
-        ["--jobs", "0"],
-        ["--env", "Pendulum-v1"],
-        ["--algos", "tqc"],
-        ["--algos", "lac", "--exchange"],
-    ],
-)
-def test_nonsense_on_the_command_line_is_refused(command, trials):
-    with pytest.raises(SystemExit):
-        search.main(command)
-    assert not trials

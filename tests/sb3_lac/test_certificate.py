@@ -20,7 +20,7 @@ from stable_baselines3.common.logger import Logger, configure
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecMonitor, VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from benchmarks.controllers import ScaledController
+from benchmarks.control import ScaledController
 from sb3_lac import (
     CertificateCallback,
     FittedLyapunov,

@@ -1,0 +1,214 @@
+"""
+What studies of control problems share: disturbances, roll-outs that all policies are judged by, loops that settle and loops
+that do not, and certificates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.type_aliases import PolicyPredictor
+
+from battery_env.plotting import save_figure
+from benchmarks.study import EVALUATION_SEED
+from sb3_lac import LAC, certify, evaluate_lyapunov, fit_lyapunov
+from sb3_lac.envs import CostEnv, reference_controller
+from sb3_lac.stability import CriticLyapunov
+
+#: By environment: its impulse, parameters that are not as they should be, noise on states, noise on observations, delay.
+DISTURBANCES: dict[str, tuple[float, dict[str, float], float, float, int]] = {
+    "LinearCost-v0": (5.0, {"control_max": 1.0}, 0.03, 0.1, 2),
+    "CartPoleCost-v0": (100.0, {"pole_half_length_m": 1.0}, 0.01, 0.02, 2),
+    "Oscillator-v0": (3.0, {"protein_decay": 0.05}, 0.1, 0.1, 1),
+    "PendulumCost-v0": (10.0, {"mass_kg": 1.4}, 0.01, 0.03, 2),
+    "QuadrotorCost-v0": (50.0, {"mass_kg": 1.2}, 0.01, 0.03, 2),
+    "VehicleCost-v0": (20_000.0, {"friction": 0.5}, 0.01, 0.03, 2),
+}
+#: Steps between impulses: no episode ends within 15 steps after one.
+IMPULSE_INTERVAL = 85
+#: Shares of episodes, with their titles in tables: the error at the end is within the tolerance, or within a part of that at
+#: the start.
+SHARES = {
+    "at_goal": "at the goal",
+    "within_1_percent": "within 1 % of the start",
+    "within_0.1_percent": "within 0.1 %",
+}
+#: Factors of the actions of a reference controller, by name of the loop.
+FACTORS = {"reference": 1.0, "weak": 0.5, "too weak": 0.15, "wrong sign": -1.0}
+#: The linear problem is stable by itself: with 15 % of the gain it settles, and with the wrong sign of -14 % hardly leaves.
+LINEAR_FACTORS = {"reference": 1.0, "weak": 0.15, "hardly unstable": -0.14, "wrong sign": -1.0}
+#: Share of the cost at the start below which a loop counts as settled.
+SETTLED_SHARE = 0.1
+#: What is certified, see ``sb3_lac.certify``.
+STATEMENTS = ("survives", "stays_within", "decreases")
+#: Environments of a certificate, which an equal number of episodes each start in.
+CERTIFICATE_ENVS = 25
+# no training seed comes close; environments count up from each
+_FIT_SEED, _JUDGE_SEED, _CERTIFICATION_SEED = 10_000, 20_000, 30_000
+
+
+def conditions(env_id: str) -> dict[str, dict[str, Any]]:
+    """The disturbances that a controller is tried with, one at a time."""
+    impulse, changed, process_noise, observation_noise, delay = DISTURBANCES[env_id]
+    return {
+        "none": {},
+        "impulses": {"impulse": impulse, "impulse_interval": IMPULSE_INTERVAL},
+        "other parameters": {"changed_parameters": changed},
+        "process noise": {"process_noise": process_noise},
+        "observation noise": {"observation_noise": observation_noise},
+        "action delay": {"action_delay": delay},
+    }
+
+
+def roll_out(
+    policy: PolicyPredictor,
+    make_env: Callable[[], gym.Env[Any, Any]],
+    episodes: int,
+    noise_std: float = 0.0,
+    seed: int = EVALUATION_SEED,
+) -> pd.DataFrame:
+    """Run the mean action of a policy in all episodes at once, and return one row per episode."""
+    envs = [make_env() for _ in range(episodes)]
+    rngs = [np.random.default_rng((seed, episode)) for episode in range(episodes)]
+    starts = [env.reset(seed=seed + episode) for episode, env in enumerate(envs)]
+    observations = np.array([observation for observation, _ in starts])
+    errors_at_start = [info["error"] for _, info in starts]
+    costs, errors = np.zeros(episodes), np.zeros(episodes)
+    lengths, died = np.zeros(episodes, dtype=int), np.zeros(episodes, dtype=bool)
+    running = np.arange(episodes)
+    while len(running) > 0:
+        noisy = observations[running]
+        if noise_std > 0:
+            noisy += noise_std * np.array([rngs[episode].standard_normal(noisy.shape[1]) for episode in running], np.float32)
+        actions, _ = policy.predict(noisy, deterministic=True)
+        going_on = []
+        for episode, action in zip(running, actions, strict=True):
+            observations[episode], _, terminated, truncated, info = envs[episode].step(action)
+            costs[episode] += info["cost"]
+            errors[episode] = info["error"]
+            lengths[episode] += 1
+            died[episode] = terminated
+            if not (terminated or truncated):
+                going_on.append(episode)
+        running = np.array(going_on, dtype=int)
+    return pd.DataFrame(
+        {"cost": costs / lengths, "length": lengths, "error_at_start": errors_at_start, "error": errors, "died": died}
+    )
+
+
+def shares_of(outcome: pd.DataFrame, tolerance: float) -> dict[str, float]:
+    """The shares of the episodes of a roll-out that end at the goal, and that go a part of the way; the dead have not."""
+    left = (outcome["error"] / outcome["error_at_start"]).where(~outcome["died"], np.inf)
+    return {
+        "at_goal": ((outcome["error"] <= tolerance) & ~outcome["died"]).mean(),
+        "within_1_percent": (left <= 0.01).mean(),
+        "within_0.1_percent": (left <= 0.001).mean(),
+    }
+
+
+def tried(policy: PolicyPredictor, env_id: str, episodes: int) -> pd.DataFrame:
+    """Try a policy under all conditions, and return one row each."""
+    problem = gym.make(env_id).unwrapped
+    assert isinstance(problem, CostEnv)
+    rows = []
+    for condition, arguments in conditions(env_id).items():
+        outcome = roll_out(policy, partial(gym.make, env_id, **arguments), episodes)
+        rows.append(
+            {
+                "environment": env_id,
+                "disturbance": condition,
+                "arguments": ", ".join(f"{name}={value}" for name, value in arguments.items()),
+                "cost": outcome["cost"].mean(),
+                "cost_worst": outcome["cost"].max(),
+                "error_median": outcome["error"].median(),
+                "error_worst": outcome["error"].max(),
+                "tolerance": problem.error_tolerance,
+                **shares_of(outcome, problem.error_tolerance),
+                "died": outcome["died"].mean(),
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def draw_shares(axes: Axes, results: pd.DataFrame, by: str, order: list[str]) -> None:
+    """Draw a map of the episodes that end at the goal, and in brackets of those that die, by disturbance."""
+    shares, deaths = (
+        results.pivot_table(index=by, columns="disturbance", values=column, sort=False).loc[order]
+        for column in ("at_goal", "died")
+    )
+    axes.imshow(shares, vmin=0.0, vmax=1.0, aspect="auto", cmap="cividis")
+    for i, j in np.ndindex(shares.shape):
+        share, death = shares.iloc[i, j], deaths.iloc[i, j]
+        text = f"{share:.0%}" + (f" ({death:.0%})" if death > 0 else "")
+        axes.text(j, i, text, ha="center", va="center", color="black" if share > 0.5 else "white", size=8)
+    axes.set_xticks(range(shares.shape[1]), [name.replace(" ", "\n") for name in shares.columns], fontsize="small")
+    axes.set_yticks(range(len(order)), order)
+
+
+class ScaledController:
+    """
+    A controller whose actions are multiplied by a factor.
+
+    :param controller: the controller
+    :param factor: -1 .. 1
+    """
+
+    def __init__(self, controller: PolicyPredictor, factor: float) -> None:
+        self.controller, self.factor = controller, factor
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Predict actions as Stable-Baselines3 does."""
+        actions, state = self.controller.predict(observation, state, episode_start, deterministic)
+        return self.factor * actions, state
+
+
+def factors(env_id: str) -> dict[str, float]:
+    """The loops of an environment."""
+    return LINEAR_FACTORS if env_id == "LinearCost-v0" else FACTORS
+
+
+def controllers(env_id: str) -> dict[str, PolicyPredictor]:
+    """Controllers that settle, and controllers that do not."""
+    reference = reference_controller(gym.make(env_id))
+    return {name: ScaledController(reference, factor) for name, factor in factors(env_id).items()}
+
+
+def judge(policy: PolicyPredictor, env_id: str, episodes: int, figures: Path | None = None) -> list[dict[str, Any]]:
+    """Fit, evaluate and certify one policy; for LAC, the critic beside the fitted function."""
+    env = make_vec_env(env_id, n_envs=CERTIFICATE_ENVS)
+    fitted = fit_lyapunov(policy, env, episodes, seed=_FIT_SEED, progress_bar=False)
+    certification = certify(policy, env, fitted, episodes, seed=_CERTIFICATION_SEED)
+    if figures is not None:
+        save_figure(certification.plot(), figures.with_name(f"{figures.name}_statements.png"))
+    functions = {"fitted": fitted} | ({"critic": CriticLyapunov(policy)} if isinstance(policy, LAC) else {})
+    rows = []
+    for function, lyapunov in functions.items():
+        report = evaluate_lyapunov(policy, env, episodes, seed=_JUDGE_SEED, lyapunov=lyapunov)
+        if figures is not None:
+            save_figure(report.plot_drift(), figures.with_name(f"{figures.name}_{function}_drift.png"))
+        row: dict[str, Any] = {"function": function, "holds": report.holds}
+        settled_below = SETTLED_SHARE * report.metrics["start_cost"].value
+        row["settles"] = report.holds and report.metrics["cost_bound"].high < settled_below
+        for metric, (value, low, high) in report.metrics.items():
+            row |= {metric: value, f"{metric}_low": low, f"{metric}_high": high}
+        if function == "fitted":
+            bounds = certification.statements["at_least"]
+            row |= {f"{statement}_at_least": bounds.get(statement, np.nan) for statement in STATEMENTS}
+            row |= {"settles_within": certification.ultimate_bound, "window_steps": certification.window_steps}
+        rows.append(row)
+    env.close()
+    return rows

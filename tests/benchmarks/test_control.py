@@ -1,0 +1,340 @@
+"""Policies of control problems have the same starts and disturbances, and tables and figures say what came out."""
+
+import itertools
+import json
+import re
+from functools import partial
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+from gymnasium import spaces
+
+pytest.importorskip("rl_zoo3")
+
+from benchmarks import certificate, control, linear_cost, references, robustness, stabilisation
+from docs.environment_pages import DOCS, environment_page
+from sb3_lac import LAC
+from sb3_lac.envs import LinearCostEnv, reference_controller
+from sb3_lac.stability import fitting
+from sb3_lac.zoo import find_config
+
+IDS = list(control.DISTURBANCES)
+
+
+class CountdownEnv(gym.Env):
+    """The cost is the number of the step; episodes with an odd seed die after three steps, the others run for five."""
+
+    observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float32)
+    action_space = spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, seed=None, options=None):
+        super().reset(seed=seed)
+        self.dies, self.n_steps = seed % 2 == 1, 0
+        return self.np_random.normal(size=2).astype(np.float32), {"error": 10.0}
+
+    def step(self, action):
+        self.n_steps += 1
+        observation = np.full(2, self.n_steps, np.float32)
+        info = {"cost": float(self.n_steps), "error": 10.0 - self.n_steps}
+        return observation, 0.0, self.dies and self.n_steps == 3, self.n_steps == 5, info
+
+
+class RecordingPolicy:
+    """Always the same action; keeps what it was shown."""
+
+    def __init__(self, action):
+        self.action, self.seen = action, []
+
+    def predict(self, observations, deterministic):
+        assert deterministic
+        self.seen.append(np.array(observations))
+        return np.full((len(observations), 1), self.action, np.float32), None
+
+
+def test_costs_lengths_and_deaths_are_those_of_each_episode():
+    policy = RecordingPolicy(0.0)
+    outcome = control.roll_out(policy, CountdownEnv, 4)
+    expected = {"cost": [3.0, 2.0] * 2, "length": [5, 3] * 2, "error_at_start": [10.0] * 4, "error": [5.0, 7.0] * 2}
+    pd.testing.assert_frame_equal(outcome, pd.DataFrame(expected | {"died": [False, True] * 2}))
+    # the dead are not asked any more
+    assert [len(seen) for seen in policy.seen] == [4, 4, 4, 2, 2]
+
+
+def test_each_policy_has_the_same_starts():
+    left, right = RecordingPolicy(-1.0), RecordingPolicy(1.0)
+    for policy in (left, right):
+        control.roll_out(policy, lambda: gym.make("CartPoleCost-v0"), 3)
+    np.testing.assert_array_equal(left.seen[0], right.seen[0])
+    assert len(np.unique(left.seen[0], axis=0)) == 3
+    # what they do then makes a difference
+    assert (left.seen[2] != right.seen[2]).any()
+
+
+def test_noise_is_on_what_the_policy_sees_and_nowhere_else():
+    clean, noisy, other = (RecordingPolicy(0.1) for _ in range(3))
+    outcomes = [control.roll_out(each, CountdownEnv, 200, std) for each, std in ((clean, 0.0), (noisy, 0.5), (other, 0.5))]
+    # the action does not depend on the observation here: the same happens
+    pd.testing.assert_frame_equal(outcomes[0], outcomes[1])
+    noise = [shown - true for shown, true in zip(noisy.seen, clean.seen, strict=True)]
+    assert np.concatenate(noise).std() == pytest.approx(0.5, rel=0.1)
+    # independent in time, and of each other
+    assert abs(np.corrcoef(noise[0].ravel(), noise[1].ravel())[0, 1]) < 0.2
+    assert abs(np.corrcoef(noise[0].T)[0, 1]) < 0.2
+    for seen, again in zip(noisy.seen, other.seen, strict=True):
+        np.testing.assert_array_equal(seen, again)
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_conditions_are_disturbances_of_the_environment(env_id):
+    tried = control.conditions(env_id)
+    assert tried["none"] == {} and len(tried) == 6
+    for arguments in tried.values():
+        gym.make(env_id, **arguments)
+    assert gym.spec(env_id).max_episode_steps % control.IMPULSE_INTERVAL >= 15
+
+
+def test_shares_are_of_the_way_that_is_left_and_the_dead_have_not_arrived():
+    outcome = {"error_at_start": [10.0, 2.0, 0.1, 10.0], "error": [0.1, 0.002, 0.09, 0.0], "died": [False] * 3 + [True]}
+    assert list(control.shares_of(pd.DataFrame(outcome), 0.1).values()) == [0.75, 0.5, 0.25]
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_only_some_loops_end_at_the_goal(env_id):
+    tolerance = gym.make(env_id).unwrapped.error_tolerance
+    at_goal = {
+        name: control.shares_of(control.roll_out(controller, partial(gym.make, env_id), 10), tolerance)["at_goal"]
+        for name, controller in control.controllers(env_id).items()
+    }
+    assert at_goal.pop("reference") == 1.0 and at_goal.pop("wrong sign") == 0.0
+    # half the gain still reaches the goal in some, and 15 % of it in the linear one
+    at_goal.pop("weak")
+    assert at_goal and max(at_goal.values()) <= 0.2
+
+
+def test_actions_are_multiplied_and_nothing_else():
+    env = gym.make("QuadrotorCost-v0")
+    reference = reference_controller(env)
+    observations = np.array([env.observation_space.sample() for _ in range(20)])
+    actions, state = control.ScaledController(reference, -0.25).predict(observations)
+    np.testing.assert_array_equal(actions, -0.25 * reference.predict(observations)[0])
+    assert state is None and actions.dtype == np.float32
+
+
+def test_references_are_tried_and_shown(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(references, "DISTURBANCES", {env_id: control.DISTURBANCES[env_id] for env_id in IDS[:1]})
+    references.main(["--episodes", "3", "--jobs", "1", "--out", str(tmp_path)])
+    table = pd.read_csv(tmp_path / "references.csv")
+    assert len(table) == 6 and json.loads((tmp_path / "references.json").read_text())["configuration"] == {"episodes": 3}
+    assert table.loc[table["disturbance"] == "none", ["at_goal", "died"]].to_numpy().tolist() == [[1, 0]]
+    assert (table["cost"] <= table["cost_worst"]).all() and (table["error_median"] <= table["error_worst"]).all()
+    text = (tmp_path / "references.md").read_text()
+    assert text.count("\n") == 8 and "observation_noise=0.1" in text and text in capsys.readouterr().out
+    assert (tmp_path / "references.png").stat().st_size > 1000
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_pages_say_what_the_published_table_says(env_id):
+    table = pd.read_csv(DOCS / "results/references/references.csv")
+    row = table[(table["environment"] == env_id) & (table["disturbance"] == "none")].iloc[0]
+    section = re.search(r"## Reference Controller\n(.*?)\n## ", environment_page(env_id), flags=re.DOTALL)[1]
+    text = " ".join(section.split())
+    assert float(re.search(r"costs? ([\d.]+) per step", text)[1]) == pytest.approx(row["cost"], rel=0.03)
+    assert float(re.search(r"the largest is ([\d.e-]*\d)", text)[1]) == pytest.approx(row["error_worst"], rel=0.03)
+    assert float(re.search(r"error below ([\d.]*\d)", text)[1]) == row["tolerance"]
+    assert "100 of 100 end" in text and row["at_goal"] == 1 and row["died"] == 0
+
+
+@pytest.fixture
+def quick(monkeypatch, train_nothing):
+    """One controller instead of all, few passes over the data, models that are not trained; returns what was asked for."""
+    monkeypatch.setattr(fitting, "N_ITERATIONS", 3)
+    reference = {"reference": control.controllers("LinearCost-v0")["reference"]}
+    monkeypatch.setattr(certificate, "controllers", lambda env_id: reference)
+    return [*map(train_nothing, (certificate, stabilisation))]
+
+
+def test_certificates_of_controllers_and_models_are_written(tmp_path, quick, capsys):
+    command = ["--envs", "LinearCost-v0", "--algos", "lac", "--seeds", "3", "--episodes", "25", "--out", str(tmp_path)]
+    certificate.main([*command, "--fractions", "0.1"])
+    table = pd.read_csv(tmp_path / "certificates.csv")
+    assert table["policy"].tolist() == ["reference"] + 2 * ["LAC, 10 % of the updates"]
+    assert table["function"].tolist() == ["fitted", "fitted", "critic"]
+    # Statements are made once for each policy
+    assert table["survives_at_least"].notna().tolist() == [True, True, False]
+    assert (table["cost_bound_low"] <= table["cost_bound"]).all() and table["start_cost"].gt(0).all()
+    assert len(list(tmp_path.glob("*_statements.png"))) == 2 and len(list(tmp_path.glob("*_drift.png"))) == 3
+    text = (tmp_path / "certificates.md").read_text(encoding="utf-8")
+    assert text in capsys.readouterr().out and "| LAC, 10 % of the updates (critic)" in text and "nan" not in text
+    # no longer than zoo_configs has, nor than what is asked for; a tenth of the updates follows the first thousand steps
+    certificate.main([*command, "--timesteps", "5000"])
+    assert [call[-1] for call in quick[0]] == [1900, 5000]
+
+
+def test_several_seeds_of_a_certificate_are_shown_from_least_to_most():
+    rows = [
+        {"env": "LinearCost-v0", "policy": "LAC", "seed": seed, "function": "fitted", "holds": seed > 0, "settles": False}
+        | {"start_cost": 2.0, "cost_bound": bound, "cost_bound_low": bound / 2, "cost_bound_high": 2 * bound}
+        | {"cost_bound_alpha3": alpha3, "largest_feasible_alpha3": 0.5, "survives_at_least": 0.9}
+        | {"stays_within_at_least": np.nan, "decreases_at_least": 0.1 * seed}
+        for seed, bound, alpha3 in ((0, 3.0, np.nan), (1, 1.0, 0.25), (2, 1.5, 0.75))
+    ]
+    of_seeds = certificate.report(pd.DataFrame(rows)).splitlines()[-1]
+    cells = [cell.strip() for cell in of_seeds.strip("|").split("|")]
+    assert cells[:4] == ["LAC", "2 of 3", "0 of 3", "2"]
+    assert cells[4:] == ["1.5 (1 to 3)", "0.5 (0.25 to 0.75), of 2", "0.5", "0.9", "-", "0.1 (0 to 0.2)"]
+
+
+def test_exact_function_decreases_by_the_feasible_share_and_by_no_more():
+    table = certificate.feasible_alpha3().set_index("controller")
+    shares = table.map(lambda cell: float(cell.split()[0]))
+    np.testing.assert_allclose(shares.loc["reference"], [0.14, 0.60, 0.78, 0.95, 1.0], atol=0.005)
+    assert (shares.loc["weak"] <= shares.loc["reference"]).all() and (np.diff(shares, axis=1) > 0).all()
+    env, gamma = LinearCostEnv(), 0.9
+    gain = env.optimal_gain(gamma)
+    p, closed_loop = env.value_matrix(gain, gamma), env.A - env.B @ gain
+    states = np.random.default_rng(0).normal(size=(10_000, 2))
+    costs = np.einsum("ni,ij,nj->n", states, env.Q + gain.T @ env.R @ gain, states)
+    drift = np.einsum("ni,ij,nj->n", states, closed_loop.T @ p @ closed_loop - p, states)
+    assert (-drift / costs).min() == pytest.approx(shares.loc["reference", "discount 0.9"], abs=0.006)
+
+
+def test_stabilisation_is_written_and_seeds_can_be_added(tmp_path, quick, capsys):
+    command = ["--envs", "LinearCost-v0", "--algos", "lac", "--timesteps", "20000", "--episodes", "3"]
+    command += ["--certificate-episodes", "25", "--jobs", "1", "--out", str(tmp_path)]
+    stabilisation.main([*command, "--seeds", "0"])
+    stabilisation.main([*command, "--seeds", "0", "1"])
+    # No more than zoo_configs has, and nothing twice
+    assert quick[1] == [("lac", "LinearCost-v0", 0, 10_000), ("lac", "LinearCost-v0", 1, 10_000)]
+    results, certificates = (pd.read_csv(tmp_path / f"{name}.csv") for name in ("stabilisation", "certificates"))
+    assert results["policy"].tolist() == 12 * ["LAC"] + 6 * ["reference"]
+    assert certificates["function"].tolist() == ["fitted", "critic", "fitted", "critic", "fitted"]
+    assert results["training_minutes"].tolist()[:12] == 12 * [1.5]
+    # An untrained policy is no match for the optimum, whose starts it has
+    undisturbed = results[results["disturbance"] == "none"].set_index("policy")["cost"]
+    assert undisturbed["LAC"].gt(undisturbed["reference"]).all()
+    record = json.loads((tmp_path / "stabilisation.json").read_text())
+    assert record["configuration"]["disturbances"]["LinearCost-v0"]["action delay"] == {"action_delay": 2}
+    text = (tmp_path / "stabilisation.md").read_text(encoding="utf-8")
+    assert text in capsys.readouterr().out and "| LAC (critic)" in text and "nan" not in text
+    assert all((tmp_path / name).stat().st_size > 1000 for name in ("costs.png", "disturbances.png"))
+
+
+def test_tables_of_stabilisation_count_episodes_and_seeds():
+    common = {"environment": "LinearCost-v0", "policy": "SAC", "updates": 10.0, "training_minutes": 0.5, "error_median": 0.1}
+    rows = [
+        {**common, "seed": seed, "disturbance": disturbance, "cost": cost, "at_goal": at_goal, "died": 1.0 - at_goal}
+        | {"within_1_percent": at_goal / 2, "within_0.1_percent": 0.0}
+        for seed, cost, at_goal in ((0, 1.0, 0.0), (1, 3.0, 0.5))
+        for disturbance in ("none", "impulses")
+    ]
+    row = stabilisation.undisturbed_table(pd.DataFrame(rows)).iloc[0]
+    assert (row["cost per step"], row["at the goal"], row["died"]) == ("2 [1, 3]", "25 % (0 to 50)", "75 % (50 to 100)")
+    assert (row["seeds"], row["updates"], row["within 0.1 %"]) == ("2", "10", "0 % (0 to 0)")
+    disturbed = stabilisation.disturbed_table(pd.DataFrame(rows)).iloc[0]
+    assert disturbed["none"] == disturbed["impulses"] == "25 % (75 %)"
+
+
+def test_all_algorithms_have_the_same_budget():
+    configs = [yaml.safe_load(find_config(algo).read_text(encoding="utf-8")) for algo in stabilisation.ALGORITHMS]
+    for env_id, config in itertools.product(IDS, configs):
+        for name in ("n_timesteps", "n_envs", "gradient_steps", "learning_starts"):
+            assert config[env_id][name] == configs[0][env_id][name]
+        assert "net_arch=[64, 64]" in config[env_id]["policy_kwargs"]
+
+
+def test_all_combinations_of_robustness_are_possible():
+    for study, (env_id, arguments, noises) in robustness.STUDIES.items():
+        found = [(*values.values(), noise) for values, noise in robustness.combinations(study)]
+        assert found == list(itertools.product(*arguments.values(), noises)), study
+        gym.make(env_id, **robustness.combinations(study)[-1][0])
+
+
+def test_robustness_is_written(tmp_path, monkeypatch, train_nothing, capsys):
+    asked = train_nothing(robustness)
+    small = {
+        study: (env_id, {name: values[:2] for name, values in arguments.items()}, noises[:2])
+        for study, (env_id, arguments, noises) in robustness.STUDIES.items()
+    }
+    monkeypatch.setattr(robustness, "STUDIES", small)
+    monkeypatch.setattr(robustness.gym, "make", partial(gym.make, max_episode_steps=20))
+    command = ["--algos", "lac", "--seeds", "0", "5", "--episodes", "1", "--jobs", "1", "--out", str(tmp_path)]
+    robustness.main([*command, "--cart-pole-timesteps", "2000", "--oscillator-timesteps", "3000"])
+    assert set(asked) == {("lac", "CartPoleCost-v0", s, 2000) for s in (0, 5)} | {
+        ("lac", "Oscillator-v0", s, 3000) for s in (0, 5)
+    }
+    table = pd.read_csv(tmp_path / "robustness.csv")
+    assert table.groupby("study").size().to_dict() == {study: 2 * len(robustness.combinations(study)) for study in small}
+    assert table["death_rate"].isin([0.0, 1.0]).all() and (table["cost"] == table["cost_worst"]).all()
+    assert table.loc[table["study"] == "measurement noise", "observation_noise"].tolist() == [0.0, 0.01] * 2
+    for name in ("disturbances.png", "cart_and_pole.png", "gene_network.png"):
+        assert (tmp_path / name).stat().st_size > 0
+    text = (tmp_path / "robustness.md").read_text(encoding="utf-8")
+    assert text in capsys.readouterr().out and "**cart and pole** (CartPoleCost-v0, 2 seeds)" in text and " ± " in text
+    # nobody dies: no such column
+    assert "death" not in robustness.report(table.assign(death_rate=0.0))
+
+
+@pytest.fixture
+def exact_model(monkeypatch):
+    """LAC with the optimal policy and its cost-to-go, in place of training."""
+    env = LinearCostEnv()
+
+    def train_or_load(algo, env_id, seed, timesteps, folder):
+        model = LAC("MlpPolicy", env_id, gamma=0.95, device="cpu", buffer_size=10, policy_kwargs={"net_arch": [8]})
+        gain = env.optimal_gain(model.gamma)
+
+        def predict(observations, deterministic):
+            return (-observations @ gain.T / env.control_max).astype(np.float32), None
+
+        def predict_lyapunov(observations, actions):
+            return env.cost_to_go(observations, env.control_max * actions, gain, model.gamma)
+
+        monkeypatch.setattr(model, "predict", predict)
+        monkeypatch.setattr(model.policy, "predict_lyapunov", predict_lyapunov)
+        return model
+
+    monkeypatch.setattr(linear_cost, "train_or_load", train_or_load)
+
+
+def test_the_exact_solution_is_recognized(tmp_path, exact_model):
+    tables = linear_cost.part(4, 123, 20, tmp_path)
+    row, values = tables["linear_cost"].iloc[0], tables["values"]
+    assert row["seed"] == 4 and set(values["seed"]) == {4} and len(values) == 20 * 100
+    for name in ("position", "velocity"):
+        assert row[f"gain_{name}"] == pytest.approx(row[f"gain_{name}_exact"], rel=1e-5)
+    assert row["linear_over_optimum"] == pytest.approx(1.0, abs=1e-9)
+    for end in ("", "_low", "_high"):
+        assert row[f"discounted_over_optimum{end}"] == pytest.approx(1.0, abs=1e-6)
+    # the best gain of the discounted cost is not that of the mean over an episode
+    assert 1.0 < row["per_step_over_optimum"] < 1.05
+    assert (row["value_slope"], row["value_intercept"], row["value_correlation"]) == pytest.approx((1, 0, 1), abs=1e-4)
+    assert row["calibration_slope"] == pytest.approx(1.0, abs=0.02)
+    assert row["alpha3_exact"] == pytest.approx(row["alpha3_optimum"], rel=1e-5)
+    assert row["alpha3_low"] < row["alpha3_exact"] < row["alpha3_high"]
+    np.testing.assert_allclose(values["learned"], values["exact"], rtol=1e-3)
+
+
+def test_what_a_policy_costs_too_much_is_seen_in_roll_outs():
+    env = LinearCostEnv()
+    gain = env.optimal_gain(0.95) / env.control_max
+    # an action that is off by a constant: no linear policy close to it shows that
+    optimal = linear_cost.episode_costs(lambda observed: -observed @ gain.T, 40)
+    biased = linear_cost.episode_costs(lambda observed: -observed @ gain.T + 0.1, 40)
+    assert optimal.shape == (100, 40)
+    discounted, per_step = (linear_cost.over_optimum(biased, optimal, gamma) for gamma in (0.95, 1.0))
+    for ratio, low, high in (discounted, per_step):
+        assert 1.0 < low < ratio < high < 10.0
+    # the same episodes are paired: their starts do not widen the interval
+    assert linear_cost.over_optimum(2 * optimal, optimal, 0.95) == pytest.approx((2.0, 2.0, 2.0))
+
+
+def test_linear_cost_is_written(tmp_path, exact_model, capsys):
+    linear_cost.main(["--seeds", "1", "2", "--timesteps", "50", "--episodes", "3", "--jobs", "1", "--out", str(tmp_path)])
+    table = pd.read_csv(tmp_path / "linear_cost.csv")
+    assert table["seed"].tolist() == [1, 2] and table.notna().all(axis=None)
+    assert (tmp_path / "linear_cost.png").stat().st_size > 0
+    text = (tmp_path / "linear_cost.md").read_text(encoding="utf-8")
+    assert text in capsys.readouterr().out and "| 1.000, 1.000 to 1.000 " in text and "| 1.0000 " in text
