@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -35,7 +35,7 @@ from battery_env.loads import RandomPiecewise
 from battery_env.parameters import PARAMETER_NAMES, PARAMETERS
 from battery_env.plotting import LABELS, coloured, new_figure
 from battery_env.sensors import SensorErrors
-from battery_env.trajectories import AgedParameter, TrajectoryDataset
+from battery_env.trajectories import TrajectoryDataset
 from benchmarks.contests import held_out_trajectories
 from benchmarks.peers import SEEDS, WORN_CELL, cpu_time_per_estimate_s
 from benchmarks.study import SYMBOLS, Study, Tables, command_line, digits, duration, markdown, positive
@@ -131,7 +131,7 @@ def work(fault: Fault, unknown: Sequence[str], n: int) -> TrajectoryDataset:
     """
     if fault.other_worn:
         return TrajectoryDataset.generate(
-            cast(AgedParameter, unknown[0]),
+            unknown[0],
             n,
             RandomPiecewise(),
             SEEDS[unknown[0]],

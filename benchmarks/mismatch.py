@@ -91,7 +91,7 @@ ON_CELLS: dict[str, Callable[[], Estimator]] = {
 def simulated_part(calibrator: str, mismatch: float, sensor: str, discharges: int, made: str) -> Tables:
     """Score one calibrator on simulated cells."""
     estimator = CALIBRATORS[calibrator]()
-    data = standard_dataset("joint", "piecewise", "test", mismatch=mismatch)[:discharges]
+    data = standard_dataset(("q_mobile", "r_o"), "piecewise", "test", mismatch=mismatch)[:discharges]
     scores = evaluate(estimator, data, SENSORS[sensor], seed=1)
     scores["cpu_time_per_estimate_s"] = cpu_time_per_estimate_s(estimator, data[:2], slow=False)
     return {"mismatch": scores.assign(calibrator=calibrator, mismatch=mismatch, sensor=sensor, policy=made)}

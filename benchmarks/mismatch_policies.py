@@ -34,7 +34,7 @@ def part(algo: str, seed: int, updates: int, discharges: int, folder: Path) -> T
     model = train_or_load(algo, ENV_ID, seed, timesteps, folder / "models", {"env_kwargs": TRAINED_WITH})
     estimator, scores = PolicyEstimator(model, ENV_ID, **OPTIONS), []
     for mismatch in MISMATCHES:
-        data = standard_dataset("joint", "piecewise", "test", mismatch=mismatch)[:discharges]
+        data = standard_dataset(("q_mobile", "r_o"), "piecewise", "test", mismatch=mismatch)[:discharges]
         for sensor, errors in SENSORS.items():
             found = evaluate(estimator, data, errors, seed=1)
             scores.append(found.assign(calibrator=algo.upper(), seed=seed, mismatch=mismatch, sensor=sensor))

@@ -60,7 +60,7 @@ def summary(scores: pd.DataFrame) -> pd.DataFrame:
 
 def part(mismatch: float, sensor: str, calibrator: str, discharges: int, every_s: float) -> Tables:
     """Score one calibrator."""
-    data = standard_dataset("joint", "piecewise", "test", mismatch=mismatch)[:discharges]
+    data = standard_dataset(("q_mobile", "r_o"), "piecewise", "test", mismatch=mismatch)[:discharges]
     scores = evaluate(calibrators(mismatch, every_s)[calibrator], data, SENSORS[sensor], seed=1)
     return {"nuisance": scores.assign(mismatch=mismatch, sensor=sensor, calibrator=calibrator)}
 

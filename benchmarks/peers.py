@@ -16,7 +16,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -34,7 +34,7 @@ from battery_env.loads import RandomPiecewise
 from battery_env.parameters import PARAMETER_NAMES, PARAMETERS
 from battery_env.plotting import COLOURS, LABELS, new_figure
 from battery_env.sensors import SensorErrors
-from battery_env.trajectories import AgedParameter, TrajectoryDataset
+from battery_env.trajectories import TrajectoryDataset
 from benchmarks.progpy_filters import ProgpyFilter
 from benchmarks.study import SYMBOLS, Study, Tables, command_line, digits, duration, markdown, positive
 
@@ -142,7 +142,7 @@ def work(case: Case, unknown: Sequence[str], n: int) -> TrajectoryDataset:
     """The work: discharges as progpy simulates them (the model with a temperature; tests compare both)."""
     kind = "joint" if case.both_unknown else unknown[0]
     return TrajectoryDataset.generate(
-        cast(AgedParameter, kind),
+        unknown,
         n,
         RandomPiecewise(),
         seed=SEEDS[kind],

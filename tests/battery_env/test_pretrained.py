@@ -76,7 +76,7 @@ def test_on_recorded_cells_the_one_for_them_agrees_with_least_squares(cell):
 
 def test_it_stays_in_its_range_and_says_how_sure_it_is():
     estimator = PolicyEstimator.pretrained()
-    for trace in estimator.trace(standard_dataset("joint", "piecewise", "test", mismatch=0.2)[:2]):
+    for trace in estimator.trace(standard_dataset(("q_mobile", "r_o"), "piecewise", "test", mismatch=0.2)[:2]):
         assert trace.settled[-1] and not trace.settled[0] and (trace.sd_q_mobile > 0.0).all()
         for name, (low, high) in ESTIMATE_RANGES.items():
             assert (getattr(trace, name) >= low).all() and (getattr(trace, name) <= high).all()

@@ -30,7 +30,7 @@ def test_every_algorithm_and_seed_is_scored_under_every_condition(tmp_path):
 def test_a_policy_sees_discharges_that_it_did_not_learn_on(monkeypatch, tmp_path):
     monkeypatch.setattr(mismatch_policies, "train_or_load", lambda *arguments: Follow())
     (scores,) = mismatch_policies.part("sac", 3, 8, 2, tmp_path).values()
-    data = standard_dataset("joint", "piecewise", "test", mismatch=0.2)[:2]
+    data = standard_dataset(("q_mobile", "r_o"), "piecewise", "test", mismatch=0.2)[:2]
     expected = evaluate(
         PolicyEstimator(Follow(), mismatch_policies.ENV_ID, **mismatch_policies.OPTIONS),
         data,
