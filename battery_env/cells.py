@@ -7,20 +7,19 @@ Two 18650 cells of NASA's battery data set come with the package: ``load_nasa_di
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from datetime import datetime, timedelta
 from functools import cached_property
 from importlib.resources import as_file, files
 from numbers import Real
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pandas as pd
 from scipy.io import loadmat
 
-from battery_env.arrays import FloatArray, IntArray
+from battery_env.arrays import FloatArray
 from battery_env.checks import check_positive
 from battery_env.parameters import Q_MOBILE
 from battery_env.records import (
@@ -29,7 +28,7 @@ from battery_env.records import (
     SWITCH_SHARE,
     check_column,
     check_drawn_charge,
-    check_record,
+    check_samples,
     drawn,
     least_load_A,
     switch_times_s,
@@ -52,7 +51,7 @@ _DURATION_LIMITS_S = (10.0, 1e6)
 _LITTLE_SHARE = 5e-3
 # No cell changes its voltage by this much from one sample to the next, and back, but for its load, V.
 _JUMP_V = 0.05
-# Where the load varies no more samples than these are left out, with the charge that they alone tell.
+# Where the load varies, more samples than these below the cut-off are no fault of the sensor.
 _FEW_SAMPLES = 3
 
 
@@ -80,15 +79,24 @@ class Discharge:
     temperature_C: FloatArray | None = None
     meta: dict[str, Any] = field(default_factory=dict)
     starts_at_rest: bool = False
+    #: see :func:`battery_env.records.check_record`
+    is_checked: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        arrays = check_record(self.time_s, self.voltage_V, self.current_A, _MIN_SAMPLES)
-        for name, array in zip(_COLUMNS, arrays, strict=True):
-            object.__setattr__(self, name, array)
+        samples = check_samples(self.time_s, self.voltage_V, self.current_A, _MIN_SAMPLES)
+        columns = dict(zip(_COLUMNS, samples, strict=True))
         if self.temperature_C is not None:
-            object.__setattr__(self, "temperature_C", check_column("temperature_C", self.temperature_C, _MIN_SAMPLES))
-            if len(self.temperature_C) != len(self.time_s):
+            columns["temperature_C"] = check_column("temperature_C", self.temperature_C, _MIN_SAMPLES)
+            if len(self.temperature_C) != len(columns["time_s"]):
                 raise ValueError(f"temperature_C has {len(self.temperature_C)} samples, but time_s has {len(self.time_s)}")
+        for name, array in columns.items():
+            object.__setattr__(self, name, array)
+        self._check_extent()
+
+    def _check_extent(self) -> None:
+        """Refuse a discharge of too few samples, or over a time or with a charge that no cell has."""
+        if len(self.time_s) < _MIN_SAMPLES:
+            raise ValueError(f"a discharge needs at least {_MIN_SAMPLES} samples, got {len(self.time_s)}")
         duration_s = self.time_s[-1] - self.time_s[0]
         if not _DURATION_LIMITS_S[0] <= duration_s <= _DURATION_LIMITS_S[1]:
             raise ValueError(
@@ -101,6 +109,20 @@ class Discharge:
                 f"this record draws {self.charge_C:.3g} C, more than the {Q_MOBILE.limits[1]:g} C that a cell may hold. "
                 f"{MILLIAMPERE}"
             )
+
+    def _derived(self, **changes: Any) -> Discharge:
+        """The same with other columns, made of these: each column is checked once, when it comes from outside."""
+        derived = object.__new__(Discharge)
+        for name, value in {**{each.name: getattr(self, each.name) for each in fields(self)}, **changes}.items():
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
+            object.__setattr__(derived, name, value)
+        derived._check_extent()
+        return derived
+
+    def without_temperature(self) -> Discharge:
+        """The same as if the temperature had not been measured."""
+        return self._derived(temperature_C=None)
 
     @property
     def charge_C(self) -> float:
@@ -119,29 +141,11 @@ class Discharge:
             return float(self.time_s[0])
         return float(switch_times_s(self.time_s, self.current_A, np.array([first - 1]))[0])
 
-    @property
-    def sd_load_on_time_s(self) -> float:
-        """
-        Standard deviation of ``load_on_time_s`` where samples are missing, s; 0 where none are. None are where the gap
-        between the last sample at rest and the first one under load is at most twice the interval before or the one after
-        it. Otherwise the load may have been switched on at any time in the gap, and this is the root of the mean square of
-        how far from ``load_on_time_s``.
-        """
-        first, _ = self._loaded
-        intervals_s = np.diff(self.time_s[max(first - 2, 0) : first + 2])
-        if not first or first + 1 == len(self.time_s):
-            return 0.0
-        gap_s = intervals_s[-2]
-        if gap_s <= 2.0 * max(intervals_s[:-2].max(initial=0.0), intervals_s[-1]):
-            return 0.0
-        from_middle_s = self.load_on_time_s - float(self.time_s[first - 1 : first + 1].mean())
-        return float(np.hypot(gap_s / np.sqrt(12.0), from_middle_s))
-
     @cached_property
     def _loaded(self) -> tuple[int, int]:
         """
-        The first sample under load and the last one. A load that is small beside a later or earlier one is one where it draws
-        what counts; what else flows before the first switch and after the last one is noise, or an offset.
+        The first sample under load and the last one. Small loads before the first or after the last large one belong to the
+        discharge if they draw more than ``_LITTLE_SHARE`` of its charge; all else there is noise, or an offset.
         """
         most_A = self.current_A.max()
         loaded = np.flatnonzero(self.current_A > SWITCH_SHARE * most_A)
@@ -155,50 +159,52 @@ class Discharge:
             last = int(small[-1])
         return first, last
 
-    def _below(self, cut_off_V: float) -> tuple[int | None, IntArray]:
-        """The first sample of the loaded part that is at the cut-off or below, and those before it that only seem to be."""
+    def _first_below(self, cut_off_V: float) -> int | None:
+        """The first sample under load that is at the cut-off or below."""
         if not isinstance(cut_off_V, Real) or np.isnan(cut_off_V):
             raise ValueError(f"cut_off_V must be a voltage in V, got {cut_off_V!r}")
         first, last = self._loaded
         below = np.flatnonzero(self.voltage_V[first : last + 1] <= cut_off_V) + first
-        runs = np.split(below, np.flatnonzero(np.diff(below) > 1) + 1) if len(below) else []
-        wild: list[int] = []
-        for run in runs:
-            if run[0] == 0 or run[-1] == last or not self._seems(int(run[0]), int(run[-1]), cut_off_V):
-                return int(run[0]), np.array(wild, dtype=np.int64)
-            wild += run.tolist()
-        return None, np.array(wild, dtype=np.int64)
+        if not len(below):
+            return None
+        begin = int(below[0])
+        back = np.flatnonzero(self.voltage_V[begin : last + 1] > cut_off_V) + begin
+        if begin > 0 and len(back):
+            self._refuse_dip(begin, int(back[0]), cut_off_V)
+        return begin
 
-    def _seems(self, begin: int, end: int, cut_off_V: float) -> bool:
+    def _refuse_dip(self, begin: int, back: int, cut_off_V: float) -> None:
         """
-        Whether some samples are below the cut-off by a fault of the sensor: the voltage falls to them in one step and comes
-        back in another, to no more than it was, and the load explains neither. An ohmic drop takes no more than all of the
-        voltage at the largest current.
+        Refuse a voltage that falls below the cut-off in one step and comes back in another, to no more than it was, where the
+        load explains neither: an ohmic drop takes no more than all of the voltage at the largest current.
         """
         voltage_V, current_A = self.voltage_V, self.current_A
         most_A = current_A.max()
         most_ohm = max(float(voltage_V.max()) - cut_off_V, 0.0) / most_A
-        ranges = np.ptp(current_A[begin - 1 : end + 2])
-        if end - begin >= _FEW_SAMPLES and ranges > SWITCH_SHARE * most_A:
-            return False
+        if back - begin > _FEW_SAMPLES and np.ptp(current_A[begin - 1 : back + 1]) > SWITCH_SHARE * most_A:
+            return
 
         def unexplained_V(higher: int, lower: int) -> float:
             explained_V = most_ohm * max(float(current_A[lower] - current_A[higher]), 0.0)
             return float(voltage_V[higher] - voltage_V[lower]) - explained_V
 
-        falls, returns = unexplained_V(begin - 1, begin), unexplained_V(end + 1, end)
-        return min(falls, returns) > _JUMP_V and unexplained_V(end + 1, begin - 1) < _JUMP_V
+        falls_V, returns_V = unexplained_V(begin - 1, begin), unexplained_V(back, back - 1)
+        if min(falls_V, returns_V) > _JUMP_V and unexplained_V(back, begin - 1) < _JUMP_V:
+            raise ValueError(
+                f"the voltage falls to {voltage_V[begin]:.2f} V at {self.time_s[begin]:g} s and is back at "
+                f"{self.time_s[back]:g} s, and the load explains neither: a fault of the sensor, or another discharge. Remove "
+                f"these samples ({back - begin}), or give each discharge alone, or number them in a column of the cycle"
+            )
 
     def eod_time_s(self, cut_off_V: float) -> float:
         """
-        When the voltage under load first fell to the cut-off, interpolated between the two samples around it. Samples that are
-        lower by a fault of the sensor are left aside: the voltage falls to them in one step and comes back in another, which
-        the load does not explain.
+        When the voltage under load first fell to the cut-off, interpolated between the two samples around it.
 
         :param cut_off_V: cut-off voltage, V
         :return: the end of discharge on the clock of ``time_s``, s; NaN if the record does not reach it
+        :raises ValueError: if the voltage only seems to be there, by a fault of the sensor
         """
-        n, _ = self._below(cut_off_V)
+        n = self._first_below(cut_off_V)
         if n is None:
             return float("nan")
         if n == self._loaded[0]:
@@ -210,47 +216,42 @@ class Discharge:
         """
         The part that a model of the discharge can be compared with: from load-on to the cut-off, or to the last sample
         under load if the cut-off is not reached. Its first sample is the moment of switching, with the voltage at rest
-        and the current under load; its last one, at the cut-off, is interpolated. Samples that are below the cut-off before
-        by a fault of the sensor are left out with a warning; another one says where samples are missing at load-on.
+        and the current under load; its last one, at the cut-off, is interpolated.
 
         :param cut_off_V: cut-off voltage, V
         :return: that part, on the same clock
-        :raises ValueError: if it has too few samples
+        :raises ValueError: if it has too few samples, or those are missing that would say when the load was switched on, or
+            the voltage is below the cut-off by a fault of the sensor
         """
         first, last = self._loaded
+        self._refuse_missing(first)
         start_s, end_s = self.load_on_time_s, self.eod_time_s(cut_off_V)
         if np.isnan(end_s):
             end_s = float(self.time_s[last])
-        _, wild = self._below(cut_off_V)
-        inside = (self.time_s > start_s) & (self.time_s < end_s)
-        inside[wild] = False
-        time_s = np.concatenate([[start_s], self.time_s[inside], [end_s]])
+        time_s = np.concatenate([[start_s], self.time_s[(self.time_s > start_s) & (self.time_s < end_s)], [end_s]])
         if len(time_s) < _MIN_SAMPLES:
             raise ValueError(
                 f"only {len(time_s)} samples lie between load-on at {start_s:g} s and {cut_off_V:g} V or the end of the load; "
                 f"at least {_MIN_SAMPLES} are needed"
             )
-        self._warn(first, wild)
-        parts = {name: np.interp(time_s, self.time_s, getattr(self, name)) for name in ("voltage_V", "current_A")}
-        parts["voltage_V"][0], parts["current_A"][0] = self.voltage_V[max(first - 1, 0)], self.current_A[first]
-        temperature_C = None if self.temperature_C is None else np.interp(time_s, self.time_s, self.temperature_C)
-        starts_at_rest = self.starts_at_rest if first == 0 else abs(self.current_A[first - 1]) <= REST_CURRENT_A
-        return Discharge(time_s, **parts, temperature_C=temperature_C, meta=self.meta, starts_at_rest=bool(starts_at_rest))
+        names = ("voltage_V", "current_A") if self.temperature_C is None else ("voltage_V", "current_A", "temperature_C")
+        columns = {name: np.interp(time_s, self.time_s, getattr(self, name)) for name in names}
+        columns["voltage_V"][0], columns["current_A"][0] = self.voltage_V[max(first - 1, 0)], self.current_A[first]
+        starts_at_rest = self.starts_at_rest if first == 0 else bool(abs(self.current_A[first - 1]) <= REST_CURRENT_A)
+        return self._derived(time_s=time_s, **columns, starts_at_rest=starts_at_rest)
 
-    def _warn(self, first: int, wild: IntArray) -> None:
-        """Of what :meth:`loaded_part` had to assume."""
-        if self.sd_load_on_time_s:
-            before_s, after_s = self.time_s[first - 1 : first + 1]
-            warnings.warn(
-                f"samples are missing from {before_s:g} s, at rest, to {after_s:g} s, under load: the load is taken to be on "
-                f"from {self.load_on_time_s:g} s",
-                stacklevel=3,
-            )
-        if len(wild):
-            warnings.warn(
-                f"the voltage falls to {self.voltage_V[wild[0]]:.2f} V at {self.time_s[wild[0]]:g} s and comes back, and the "
-                f"load explains neither: a fault of the sensor; samples left out: {len(wild)}",
-                stacklevel=3,
+    def _refuse_missing(self, first: int) -> None:
+        """
+        Refuse a gap between the last sample at rest and the first one under load that is more than twice the interval before
+        and the one after it: the load may have been switched on at any time in it.
+        """
+        if not first or first + 1 == len(self.time_s):
+            return
+        *before_s, gap_s, after_s = np.diff(self.time_s[max(first - 2, 0) : first + 2])
+        if gap_s > 2.0 * max([*before_s, after_s]):
+            raise ValueError(
+                f"samples are missing from {self.time_s[first - 1]:g} s, at rest, to {self.time_s[first]:g} s, under load: "
+                "what was drawn in between is not known. Give the last ones at rest, or remove those before the load"
             )
 
     def averaged(self, dt_s: float) -> Discharge:
@@ -278,7 +279,7 @@ class Discharge:
         current_A = np.diff(drawn(self.time_s, self.current_A, edges_s)) / np.diff(edges_s)
         current_A[[0, -1]] = self.current_A[[0, -1]]
         temperature_C = None if self.temperature_C is None else mean(self.temperature_C)
-        return Discharge(time_s, mean(self.voltage_V), current_A, temperature_C, self.meta, self.starts_at_rest)
+        return self._derived(time_s=time_s, voltage_V=mean(self.voltage_V), current_A=current_A, temperature_C=temperature_C)
 
     def until(self, time_s: float) -> Discharge:
         """
@@ -291,33 +292,8 @@ class Discharge:
         if not isinstance(time_s, Real) or np.isnan(time_s):
             raise ValueError(f"time_s must be a time in s, got {time_s!r}")
         n = int(np.searchsorted(self.time_s, time_s, side="right"))
-        temperature_C = None if self.temperature_C is None else self.temperature_C[:n]
-        columns = (self.time_s[:n], self.voltage_V[:n], self.current_A[:n], temperature_C)
-        return Discharge(*columns, self.meta, self.starts_at_rest)
-
-
-def read_discharge_csv(path: str | Path, discharge_is_negative: bool = False) -> Discharge:
-    """
-    Read one discharge from a file of comma-separated values with a header line.
-
-    Columns ``time_s``, ``voltage_V``, ``current_A`` (positive = discharge) and, if measured, ``temperature_C``; others are
-    left aside. A name that ends in .gz, .zip, .bz2 or .xz is unpacked.
-
-    :param path: the file
-    :param discharge_is_negative: whether the file counts the current of a discharge as negative; it is flipped then
-    :return: the discharge; its ``meta`` holds ``source``
-    :raises ValueError: if columns are missing, or the values cannot be meant
-    """
-    table = _read_table(Path(path), _COLUMNS)
-    temperature_C = table["temperature_C"].to_numpy() if "temperature_C" in table else None
-    current_A = table["current_A"].to_numpy()
-    try:
-        current_A = -current_A if discharge_is_negative else current_A
-        return Discharge(
-            table["time_s"].to_numpy(), table["voltage_V"].to_numpy(), current_A, temperature_C, {"source": str(path)}
-        )
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: {error}") from error
+        names = ("time_s", "voltage_V", "current_A", "temperature_C")
+        return self._derived(**{name: None if (column := getattr(self, name)) is None else column[:n] for name in names})
 
 
 def load_nasa_discharges(path_or_cell: str | Path) -> list[Discharge]:
@@ -329,57 +305,41 @@ def load_nasa_discharges(path_or_cell: str | Path) -> list[Discharge]:
     test nearest in time) and ``test_id`` (position among all tests of the cell). A discharge that fails the checks of
     :class:`Discharge` is left out with a warning.
 
-    :param path_or_cell: a cell that comes with the package (``BUNDLED_CELLS``); or one of NASA's own files, such as
-        ``B0018.mat``; or a file of comma-separated values laid out as the bundled ones, with ``cycles.csv`` beside it if
-        there is one
+    :param path_or_cell: a cell that comes with the package (``BUNDLED_CELLS``), or one of NASA's own files, such as
+        ``B0018.mat``
     :return: one :class:`Discharge` each
     :raises FileNotFoundError: if there is no such cell or file
     :raises ValueError: if the file is laid out in another way
     """
     if path_or_cell in BUNDLED_CELLS:
-        with as_file(files("battery_env.nasa_cells")) as folder:
-            return _read_nasa_csv(folder / f"{path_or_cell}_discharge.csv.gz")
+        return _bundled(str(path_or_cell))
     path = Path(path_or_cell)
     if not path.is_file():
         raise FileNotFoundError(f"no file {str(path)!r}; the cells that come with the package are {', '.join(BUNDLED_CELLS)}")
-    return _checked_discharges(path, read_nasa_mat(path)) if path.suffix.lower() == ".mat" else _read_nasa_csv(path)
+    if path.suffix.lower() != ".mat":
+        raise ValueError(f"{path} is none of NASA's .mat files: read it with read_discharges")
+    discharges = []
+    for arrays, meta in read_nasa_mat(path):
+        try:
+            discharges.append(Discharge(**arrays, meta=meta))
+        except (TypeError, ValueError) as error:
+            warnings.warn(f"{path}: discharge {meta['cycle']} is left out: {error}", stacklevel=2)
+    if not discharges:
+        raise ValueError(f"{path} holds no discharge that can be used")
+    return discharges
 
 
-def _read_table(path: Path, columns: Iterable[str]) -> pd.DataFrame:
-    try:
-        table = pd.read_csv(path)
-    except (FileNotFoundError, IsADirectoryError, PermissionError):
-        raise
-    except Exception as error:  # pandas and the unpackers raise whatever the damage leads them to
-        raise ValueError(f"{path} is not a file of comma-separated values: {str(error).strip()}") from error
-    missing = [name for name in columns if name not in table]
-    if missing:
-        raise ValueError(
-            f"{path} has no column {', '.join(missing)}; it has {', '.join(map(str, table.columns))}. "
-            f"Name the columns {', '.join(columns)} and separate them by commas."
-        )
-    return table
-
-
-def _read_nasa_csv(path: Path) -> list[Discharge]:
-    table = _read_table(path, ("cycle", *_COLUMNS, "temperature_C"))
-    cell = path.name.split("_")[0].split(".")[0]
-    known: dict[int, dict[str, Any]] = {}
-    summary = path.with_name("cycles.csv")
-    if summary.is_file():
-        tests = _read_table(summary, ("battery_id", "cycle", *_META_COLUMNS))
-        tests = tests[tests["battery_id"] == cell]
-        known = {int(row["cycle"]): {name: row[name] for name in _META_COLUMNS} for row in tests.to_dict(orient="records")}
-    cycles = pd.to_numeric(table["cycle"], errors="coerce").to_numpy()
-    if not (np.mod(cycles, 1.0) == 0.0).all():
-        raise ValueError(f"{path}: cycle must hold whole numbers")
-    cycles = cycles.astype(np.int64)
-    samples = []
-    for cycle in map(int, np.unique(cycles)):
-        part = table[cycles == cycle]
+def _bundled(cell: str) -> list[Discharge]:
+    with as_file(files("battery_env.nasa_cells")) as folder:
+        samples = pd.read_csv(folder / f"{cell}_discharge.csv.gz", usecols=["cycle", *_COLUMNS, "temperature_C"])
+        tests = pd.read_csv(folder / "cycles.csv").query("battery_id == @cell").set_index("cycle")[list(_META_COLUMNS)]
+    known = tests.to_dict(orient="index")
+    discharges = []
+    for cycle, part in samples.groupby("cycle"):
         arrays = {name: part[name].to_numpy() for name in (*_COLUMNS, "temperature_C")}
-        samples.append((arrays, {"cell": cell, "cycle": cycle, "source": NASA_CITATION, **known.get(cycle, {})}))
-    return _checked_discharges(path, samples)
+        meta = {"cell": cell, "cycle": int(cycle), "source": NASA_CITATION, **known[cycle]}
+        discharges.append(Discharge(**arrays, meta=meta))
+    return discharges
 
 
 def read_nasa_mat(path: Path) -> list[tuple[dict[str, Any], dict[str, Any]]]:
@@ -432,15 +392,3 @@ def _samples_of_mat(path: Path, content: dict[str, Any]) -> list[tuple[dict[str,
 def _start_time(date_vector: FloatArray) -> datetime:
     year, month, day, hour, minute, second = map(float, date_vector)
     return datetime(int(year), int(month), int(day)) + timedelta(hours=hour, minutes=minute, seconds=second)
-
-
-def _checked_discharges(path: Path, samples: Iterable[tuple[dict[str, Any], dict[str, Any]]]) -> list[Discharge]:
-    discharges = []
-    for arrays, meta in samples:
-        try:
-            discharges.append(Discharge(**arrays, meta=meta))
-        except (TypeError, ValueError) as error:
-            warnings.warn(f"{path}: discharge {meta['cycle']} is left out: {error}", stacklevel=4)
-    if not discharges:
-        raise ValueError(f"{path} holds no discharge that can be used")
-    return discharges

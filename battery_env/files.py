@@ -9,6 +9,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 
 class WrongFormatError(ValueError):
     """A file holds something else than what was asked for."""
@@ -60,3 +63,46 @@ def read_json(path: str | os.PathLike[str], file_format: str, version: int) -> d
     if (number := content.pop("version", None)) != version:
         raise ValueError(f"{path} is {file_format} of version {number!r}; this program reads version {version}")
     return dict(content)
+
+
+def save_npz(
+    path: str | os.PathLike[str],
+    kind: str,
+    version: int,
+    arrays: Mapping[str, NDArray[Any]],
+    settings: Mapping[str, Any],
+) -> Path:
+    """Write arrays, and settings as JSON, to a new npz file that says what it holds; no pickle."""
+    target = npz_path(path)
+    if target.exists():
+        raise FileExistsError(f"{target} exists already; delete it or choose another name")
+    metadata = json.dumps({**settings, "kind": kind, "format": version})
+    with replacing(target) as part:
+        np.savez_compressed(part, allow_pickle=False, metadata=np.array(metadata), **arrays)
+    return target
+
+
+def npz_path(path: str | os.PathLike[str]) -> Path:
+    """The path with the suffix .npz, which is added if it is missing."""
+    target = Path(path)
+    return target if target.suffix == ".npz" else target.with_name(target.name + ".npz")
+
+
+def load_npz(path: str | os.PathLike[str], kind: str, version: int) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    """Read the arrays and the settings that :func:`save_npz` wrote."""
+    with Path(path).open("rb") as stream:
+        try:
+            with np.load(stream, allow_pickle=False) as file:
+                if damaged := file.zip.testzip():
+                    raise ValueError(f"the checksum of {damaged} is wrong")
+                settings = json.loads(str(file["metadata"]))
+                found = settings["format"]
+                # data sets of earlier versions do not say what they are
+                if settings.get("kind", kind) != kind:
+                    raise ValueError(f"it is a {settings['kind']}")
+                arrays = {name: np.asarray(file[name]) for name in file.files if name != "metadata"}
+        except Exception as error:  # numpy and zipfile raise whatever the damage leads them to
+            raise ValueError(f"{path} is damaged, or no {kind}: {error}") from error
+    if found != version:
+        raise ValueError(f"{path} has format {found}, this version reads {version}: make it again")
+    return arrays, settings

@@ -17,14 +17,14 @@ from battery_env.electrochemistry import state_of_charge, step_into, voltage_int
 from battery_env.estimates import Estimate
 from battery_env.estimators.base import is_overfull, overfull_error
 from battery_env.estimators.settling import white_noise_V
-from battery_env.loads import BlockBootstrap, Cycle, Load, RandomLoad, Spliced, constant, in_steps, steadier_unit
+from battery_env.loads import BlockBootstrap, Cycle, KnownLoad, Load, RandomLoad, constant, in_steps, steadier_unit
 from battery_env.parameters import Q_MOBILE, R_O
 from battery_env.plotting import COLOURS, new_figure
 from battery_env.record_model import RecordModel
 from battery_env.records import Record, Samples, check_record, expected_current
 
 #: What a load to come can be given as.
-FutureLoad = float | Load | Cycle | Spliced | RandomLoad | Callable[[FloatArray], ArrayLike]
+FutureLoad = float | KnownLoad | RandomLoad | Callable[[FloatArray], ArrayLike]
 
 #: The ends and the middle of the intervals that are shown: nine of ten outcomes lie between the outer two.
 BAND = (0.05, 0.5, 0.95)
@@ -216,7 +216,7 @@ def forecast(
             check_positive(name, value)
     if check_whole_number("samples", samples) < 1 or check_whole_number("seed", seed) < 0:
         raise ValueError(f"samples must be at least 1 and seed at least 0, got {samples!r} and {seed!r}")
-    seen = check_record(record.time_s, record.voltage_V, record.current_A, least_samples=2)
+    seen = check_record(record, least_samples=2)
     rng = np.random.default_rng(seed)
     to_come, load_name = _to_come(load, load_unit, seen, model)
     notes = []
@@ -295,7 +295,7 @@ class _Function:
         return np.broadcast_to(values, time_s.shape)
 
 
-_Known = Load | Cycle | Spliced | _Function
+_Known = KnownLoad | _Function
 
 
 def _to_come(load: FutureLoad | None, unit: LoadUnit, record: Samples, model: RecordModel) -> tuple[_Known | RandomLoad, str]:
@@ -305,7 +305,7 @@ def _to_come(load: FutureLoad | None, unit: LoadUnit, record: Samples, model: Re
         if expected.varied:
             return BlockBootstrap(record, steadier_unit(record), dt_s=model.dt_s), "a load as so far"
         load, unit = expected.mean_A, "current"
-    if isinstance(load, (Load, Cycle, Spliced, RandomLoad)):
+    if isinstance(load, (KnownLoad, RandomLoad)):
         return load, {Load: "a given load", Cycle: "a cycle"}.get(type(load), "a random load")
     if callable(load):
         return _Function(load, unit), "a given load"
@@ -320,7 +320,7 @@ def _to_come(load: FutureLoad | None, unit: LoadUnit, record: Samples, model: Re
 
 def _draws(load: RandomLoad, count: int, rng: np.random.Generator) -> list[_Known]:
     name, draws = type(load).__name__, [load(rng) for _ in range(count)]
-    others = [drawn for drawn in draws if not isinstance(drawn, (Load, Cycle, Spliced))]
+    others = [drawn for drawn in draws if not isinstance(drawn, KnownLoad)]
     if others:
         raise TypeError(
             f"a draw of {name} must be a load of battery_env.loads, such as a Load or a Cycle, got {others[0]!r}. Lay a "

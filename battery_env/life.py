@@ -8,7 +8,6 @@ from math import exp, log, sqrt
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 from numba import njit
 from numpy.typing import ArrayLike
 from scipy.optimize import minimize
@@ -19,12 +18,13 @@ from battery_env.cells import Discharge
 from battery_env.checks import check_positive, check_whole_number
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.forecasts import BAND
-from battery_env.plotting import COLOURS, LABELS, new_figure
 from battery_env.records import drawn
 
 #: What is believed of a cell before its discharges tell, as shares of q_mobile: the step from one to the next, the error of
 #: one estimate beside the others (both known to a factor of e, one standard deviation), and the sd of the drift.
 PRIOR_STEP_SHARE, PRIOR_NOISE_SHARE, PRIOR_DRIFT_SD_SHARE = 0.01, 0.003, 0.003
+# Lives that are simulated, and discharges to look ahead.
+_LIVES, _MOST = 2000, 2000
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,16 +67,9 @@ class Life:
         """
         if not 1 <= check_whole_number("count", count) <= len(self.table):
             raise ValueError(f"count must lie within 1 .. {len(self.table)}, got {count}")
-        return _life(self.table.iloc[:count])
+        return life_of(self.table.iloc[:count])
 
-    def remaining_discharges(
-        self,
-        threshold_Ah: float,
-        probability: ArrayLike = BAND,
-        samples: int = 2000,
-        seed: int = 0,
-        most: int = 2000,
-    ) -> FloatArray:
+    def remaining_discharges(self, threshold_Ah: float, probability: ArrayLike = BAND, seed: int = 0) -> FloatArray:
         """
         The remaining useful life: how many discharges are still to come, the one included that first has less capacity than
         the threshold. The cell is used as before; its capacity is in proportion to ``q_mobile``, as in the last discharge, and
@@ -84,46 +77,24 @@ class Life:
 
         :param threshold_Ah: capacity at which the life ends, Ah
         :param probability: of the quantiles, within 0 .. 1, any shape
-        :param samples: how many lives are simulated
-        :param seed: of these
-        :param most: discharges to look ahead
-        :return: quantiles, same shape as ``probability``; infinite beyond ``most``
+        :param seed: of the 2000 lives that are simulated
+        :return: quantiles, same shape as ``probability``; infinite beyond 2000 discharges
         :raises ValueError: for an argument out of range
         """
         check_positive("threshold_Ah", threshold_Ah)
-        if min(check_whole_number("samples", samples), check_whole_number("most", most)) < 1:
-            raise ValueError(f"samples and most must be at least 1, got {samples!r} and {most!r}")
         last = self.table[self.table["settled"]].iloc[-1]
         end = log(threshold_Ah * last["q_mobile_C"] / last["capacity_Ah"])
         rng = np.random.default_rng(check_whole_number("seed", seed))
         (level_mean, drift_mean), ((p_level, p_both), (_, p_drift)) = self.state, self.covariance
         drift_sd = sqrt(p_drift)
-        drift = drift_mean + drift_sd * truncnorm.rvs(-np.inf, -drift_mean / drift_sd, size=samples, random_state=rng)
+        drift = drift_mean + drift_sd * truncnorm.rvs(-np.inf, -drift_mean / drift_sd, size=_LIVES, random_state=rng)
         level = level_mean + p_both / p_drift * (drift - drift_mean)
-        level += sqrt(max(p_level - p_both**2 / p_drift, 0.0)) * rng.standard_normal(samples)
-        left = np.full(samples, np.inf)
-        for n in range(1, most + 1):
-            level = level + drift + self.step_share * rng.standard_normal(samples)
+        level += sqrt(max(p_level - p_both**2 / p_drift, 0.0)) * rng.standard_normal(_LIVES)
+        left = np.full(_LIVES, np.inf)
+        for n in range(1, _MOST + 1):
+            level = level + drift + self.step_share * rng.standard_normal(_LIVES)
             left[np.isinf(left) & (level < end)] = n
         return np.asarray(np.quantile(left, np.asarray(probability, dtype=np.float64), method="inverted_cdf"))
-
-    def plot(self) -> Figure:
-        """
-        The estimates of ``q_mobile``, and what the discharges before let expect of each.
-
-        :return: the figure
-        """
-        figure = new_figure(6.4, 3.4)
-        axes = figure.subplots()
-        cycle, mean, sd = (self.table[name] for name in ("cycle", "expected_q_mobile_C", "expected_sd_C"))
-        axes.fill_between(
-            cycle, mean - 1.645 * sd, mean + 1.645 * sd, color=COLOURS[0], alpha=0.25, lw=0, label="expected, 90 %"
-        )
-        axes.plot(cycle, self.table["q_mobile_C"], ".", ms=4, color=COLOURS[1], label="estimate")
-        axes.set(xlabel="discharge", ylabel=LABELS["q_mobile"])
-        axes.grid(alpha=0.25)
-        axes.legend(frameon=False, fontsize=9)
-        return figure
 
 
 def track_life(discharges: Sequence[Discharge], cut_off_V: float, calibrator: LeastSquares | None = None) -> Life:
@@ -170,10 +141,11 @@ def track_life(discharges: Sequence[Discharge], cut_off_V: float, calibrator: Le
                 "reason": estimate.reason,
             }
         )
-    return _life(pd.DataFrame(rows))
+    return life_of(pd.DataFrame(rows))
 
 
-def _life(table: pd.DataFrame) -> Life:
+def life_of(table: pd.DataFrame) -> Life:
+    """Follow ``q_mobile`` over the rows of a table, as :class:`Life` has it."""
     settled = table["settled"].to_numpy()
     if not settled.any():
         raise ValueError(f"no discharge determines q_mobile. Of the first one: {table['reason'].iloc[0]}")

@@ -19,16 +19,34 @@ _MOST_SEGMENTS = 1e6  # of a random load; beyond, a time is meant in another uni
 #: The blocks of :class:`BlockBootstrap`, as a share of the record.
 BLOCK_SHARE = 0.1
 
-_AnyLoad = TypeVar("_AnyLoad")
-
 
 def _check_segments(total_s: float, name: str, shortest_s: float) -> None:
     if total_s / shortest_s > _MOST_SEGMENTS:
         raise ValueError(f"total_s and {name} make more than {_MOST_SEGMENTS:g} segments, got {total_s!r} and {shortest_s!r}")
 
 
+class KnownLoad(ABC):
+    """A load that is known at all times, with its unit, ``"power"`` or ``"current"``."""
+
+    unit: LoadUnit
+
+    @abstractmethod
+    def __call__(self, time_s: ArrayLike) -> FloatArray:
+        """The load at some times, W or A."""
+
+    @abstractmethod
+    def mean(self, time_s: FloatArray, dt_s: float) -> FloatArray:
+        """
+        The mean of the load over steps: what a simulation in such steps has to take, so that it draws what the load does.
+
+        :param time_s: starts of the steps, s, at least 0, any shape
+        :param dt_s: length of the steps, s
+        :return: the load, same shape
+        """
+
+
 @dataclass(frozen=True, eq=False)
-class Load:
+class Load(KnownLoad):
     """
     A piecewise-constant load. Value k holds from ``start_s[k]`` (included) to ``start_s[k + 1]`` (excluded), the last one
     for ever.
@@ -54,7 +72,6 @@ class Load:
         object.__setattr__(self, "value", value)
 
     def __call__(self, time_s: ArrayLike) -> FloatArray:
-        """The load at some times."""
         time = check_numbers("time_s", time_s)
         if not (time >= 0.0).all():
             raise ValueError(f"time_s must be at least 0, got {time[~(time >= 0.0)][0]:g}")
@@ -74,25 +91,18 @@ class Load:
     def _totals(self) -> FloatArray:
         return np.append(0.0, np.cumsum(self.value[:-1] * np.diff(self.start_s)))
 
-    def _drawn(self, time_s: FloatArray) -> FloatArray:
+    def drawn(self, time_s: FloatArray) -> FloatArray:
         """Until some times, charge of a current, C, or energy of a power, J."""
         # the last value goes on
         beyond_s = np.maximum(time_s - self.start_s[-1], 0.0)
         return np.asarray(np.interp(time_s, self.start_s, self._totals) + self.value[-1] * beyond_s)
 
     def mean(self, time_s: FloatArray, dt_s: float) -> FloatArray:
-        """
-        The mean of the load over steps: what a simulation in such steps has to take, so that it draws what the load does.
-
-        :param time_s: starts of the steps, s, at least 0, any shape
-        :param dt_s: length of the steps, s
-        :return: the load, same shape
-        """
-        return (self._drawn(time_s + dt_s) - self._drawn(time_s)) / dt_s
+        return (self.drawn(time_s + dt_s) - self.drawn(time_s)) / dt_s
 
 
 @dataclass(frozen=True, eq=False)
-class Cycle:
+class Cycle(KnownLoad):
     """
     A load that starts again and again: a mission, a drive cycle, a pulse.
 
@@ -108,65 +118,43 @@ class Cycle:
         check_positive("period_s", self.period_s)
 
     @property
-    def unit(self) -> LoadUnit:
+    def unit(self) -> LoadUnit:  # type: ignore[override]
         """``"power"`` or ``"current"``."""
         return self.load.unit
 
     def __call__(self, time_s: ArrayLike) -> FloatArray:
-        """The load at some times."""
         time = check_numbers("time_s", time_s)
         # a time that is a whole number of periods but for rounding belongs to the cycle that starts there
         within = time - self.period_s * np.floor(time / self.period_s + 1e-9)
         return self.load(np.where(time < 0.0, time, np.maximum(within, 0.0)))
 
-    def _drawn(self, time_s: FloatArray) -> FloatArray:
-        cycles, within_s = np.divmod(time_s, self.period_s)
-        return cycles * self.load._drawn(np.asarray(self.period_s)) + self.load._drawn(within_s)
-
     def mean(self, time_s: FloatArray, dt_s: float) -> FloatArray:
-        """
-        The mean of the load over steps, as :meth:`Load.mean`.
+        def drawn(until_s: FloatArray) -> FloatArray:
+            cycles, within_s = np.divmod(until_s, self.period_s)
+            return cycles * self.load.drawn(np.asarray(self.period_s)) + self.load.drawn(within_s)
 
-        :param time_s: starts of the steps, s, at least 0, any shape
-        :param dt_s: length of the steps, s
-        :return: the load, same shape
-        """
-        return (self._drawn(time_s + dt_s) - self._drawn(time_s)) / dt_s
+        return (drawn(time_s + dt_s) - drawn(time_s)) / dt_s
 
 
 @dataclass(frozen=True, eq=False)
-class Spliced:
+class _Spliced(KnownLoad):
     """
-    Stretches of one series of values, one after the other, and the same again after the last: what
-    :class:`BlockBootstrap` draws.
-
-    :param value: the series, one value for each ``dt_s``, power in W or current in A, shape (K,)
-    :param start: where in the series each stretch starts, shape (B,); a stretch that reaches its end goes on at its start
-    :param length: of each stretch, in values
-    :param dt_s: for how long a value holds, s
-    :param unit: ``"power"`` or ``"current"``
+    Blocks of a series of values, one after the other, and the same again after the last. A block that reaches the end of the
+    series goes on at its start. A day of values is not laid out: a forecast holds a thousand of these.
     """
 
-    value: FloatArray
-    start: IntArray
-    length: int
+    value: FloatArray  # one for each ``dt_s``
+    start: IntArray  # where in the series each block starts
+    length: int  # of a block, in values
     dt_s: float
     unit: LoadUnit
 
     def __call__(self, time_s: ArrayLike) -> FloatArray:
-        """The load at some times."""
         block, within = np.divmod((np.asarray(time_s) / self.dt_s + 1e-9).astype(np.int64), self.length)
         return np.asarray(self.value[(self.start[block % len(self.start)] + within) % len(self.value)])
 
     def mean(self, time_s: FloatArray, dt_s: float) -> FloatArray:
-        """
-        The mean of the load over steps, as :meth:`Load.mean`.
-
-        :param time_s: starts of the steps, s, at least 0, any shape
-        :param dt_s: length of the steps, s
-        :return: the load, same shape
-        """
-        # no more of the values than the steps are in: a draw is as long as a day
+        # no more of the values than the steps are in
         start, length = time_s / self.dt_s, dt_s / self.dt_s
         places = np.arange(int(start.min()), int(np.ceil(start.max() + length)) + 1, dtype=np.float64)
         totals = np.append(0.0, np.cumsum(self(self.dt_s * places[:-1])))
@@ -183,42 +171,28 @@ class RandomLoad(ABC):
     """
 
     @abstractmethod
-    def __call__(self, rng: np.random.Generator) -> Load | Cycle | Spliced:
+    def __call__(self, rng: np.random.Generator) -> KnownLoad:
         """Draw one load."""
 
 
+_AnyLoad = TypeVar("_AnyLoad")
+
+
 @dataclass(frozen=True, eq=False)
-class InSteps:
-    """
-    A load for a simulation in steps, whose load over each step is the mean of this one: pulses that are shorter than a step,
-    or not in step, draw what they do.
+class _InSteps:
+    """The mean of a load over each step of a simulation, at the starts of the steps."""
 
-    :param load: the load
-    :param dt_s: length of the steps, s
-    """
-
-    load: Load | Cycle | Spliced
+    load: KnownLoad
     dt_s: float
-
-    @property
-    def unit(self) -> LoadUnit:
-        """``"power"`` or ``"current"``."""
-        return self.load.unit
+    unit: LoadUnit
 
     def __call__(self, time_s: FloatArray) -> FloatArray:
-        """The load over some steps."""
         return self.load.mean(time_s, self.dt_s)
 
 
-def in_steps(load: _AnyLoad, dt_s: float) -> InSteps | _AnyLoad:
-    """
-    A load for a simulation in steps.
-
-    :param load: any that a simulation takes
-    :param dt_s: length of the steps, s
-    :return: the mean over each step of a load that knows it; others, such as functions of time, as they are
-    """
-    return InSteps(load, dt_s) if isinstance(load, (Load, Cycle, Spliced)) else load
+def in_steps(load: _AnyLoad, dt_s: float) -> _InSteps | _AnyLoad:
+    """A load for a simulation in steps: of a known load the mean over each; functions of time and all else as they are."""
+    return _InSteps(load, dt_s, load.unit) if isinstance(load, KnownLoad) else load
 
 
 def constant(value: float, unit: LoadUnit = "power") -> Load:
@@ -419,9 +393,9 @@ class BlockBootstrap(RandomLoad):
         block_s = self.block_s or BLOCK_SHARE * self.dt_s * len(self._values)
         return max(round(block_s / self.dt_s), 1)
 
-    def __call__(self, rng: np.random.Generator) -> Spliced:
+    def __call__(self, rng: np.random.Generator) -> KnownLoad:
         """Draw one load."""
         count = len(self._values)
         seen = rng.integers(count, size=-(-count // self._length))
         blocks = int(np.ceil(self.total_s / (self._length * self.dt_s)))
-        return Spliced(self._values, rng.choice(seen, size=blocks), self._length, self.dt_s, self.unit)
+        return _Spliced(self._values, rng.choice(seen, size=blocks), self._length, self.dt_s, self.unit)

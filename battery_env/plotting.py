@@ -19,7 +19,6 @@ from numpy.typing import ArrayLike
 
 from battery_env.arrays import FloatArray
 from battery_env.cells import Discharge
-from battery_env.checks import LOAD_UNIT_SYMBOLS, LoadUnit
 from battery_env.estimates import Estimate, EstimateTrace
 from battery_env.estimators.cell_fit import CellFit
 from battery_env.estimators.cramer_rao import CramerRaoBound, Sensitivities
@@ -44,8 +43,6 @@ _ROOM = 0.35
 # Stretches of time whose extremes are drawn of a long record: more than a figure is wide in dots.
 _STRETCHES = 2000
 _LIFE_COLUMNS = {"q_mobile_C": LABELS["q_mobile"], "r_o_ohm": LABELS["r_o"], "drawn_Ah": "charge drawn (Ah)"}
-# Bins of the lines through clouds of points.
-_BINS = 11
 # dV/dq is drawn on a scale that is linear within this, V/C, and logarithmic beyond: it spans three decades, from zero.
 _LINEAR_SLOPE_V_PER_C = 1e-6
 
@@ -354,32 +351,6 @@ def _limits(shown: Sequence[FloatArray]) -> tuple[float, float]:
     low, high = float(ends.min()), float(ends.max())
     room = max(_ROOM * (high - low), 1e-3 * abs(high))
     return low - room, high + room
-
-
-def plot_errors(scores: Mapping[str, pd.DataFrame], parameter: str, load_unit: LoadUnit = "power") -> Figure:
-    """
-    On which discharges a calibrator errs: the error of each against its mean load and against its true parameter, with a line
-    through the medians of bins.
-
-    :param scores: what :func:`battery_env.evaluation.evaluate` returned, by name of the calibrator
-    :param parameter: ``"q_mobile"`` or ``"r_o"``
-    :param load_unit: of the discharges: ``"power"`` or ``"current"``
-    :return: the figure
-    """
-    figure = new_figure(7.6, 3.4)
-    panels = figure.subplots(1, 2, sharey=True)
-    columns = {"load": f"mean load ({LOAD_UNIT_SYMBOLS[load_unit]})", parameter: f"true {LABELS[parameter]}"}
-    for axes, (column, label) in zip(panels, columns.items(), strict=True):
-        for colour, (name, table) in coloured(scores.items()):
-            mape = table[f"{parameter}_mape_percent"]
-            axes.scatter(table[column], mape, s=5, color=colour, alpha=0.35, lw=0, rasterized=True)
-            bins = pd.cut(table[column], _BINS) if table[column].nunique() > _BINS else table[column]
-            middles = table.groupby(bins, observed=True)[column].mean()
-            axes.plot(middles, mape.groupby(bins, observed=True).median(), "o-", ms=3.5, lw=1.4, color=colour, label=name)
-        axes.set(yscale="log", xlabel=label)
-    panels[0].set_ylabel("MAPE of a discharge (%)")
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=4, frameon=False, fontsize=9)
-    return _finished(figure, *panels)
 
 
 def plot_sensitivities(slopes: Mapping[str, Sensitivities]) -> Figure:

@@ -15,10 +15,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from battery_env.arrays import BoolArray, FloatArray, IntArray
+from battery_env.arrays import BoolArray, FloatArray
 from battery_env.cells import Discharge, read_nasa_mat
 from battery_env.columns import Column
-from battery_env.records import SWITCH_SHARE, drawn, least_load_A
+from battery_env.records import SWITCH_SHARE, drawn
 from battery_env.tables import read_columns
 
 # The voltage falls with the charge drawn: their correlation over the samples under load must be this clear to tell the sign of
@@ -26,20 +26,14 @@ from battery_env.tables import read_columns
 _CLEAR_CORRELATION = 0.5
 # A stretch of charging ends a discharge if it returns more than this share of the charge drawn until then; less is braking.
 _RETURNED_SHARE = 0.2
-# Charging before the load, of more than this share of what the load draws, is no part of the discharge; less is an offset. Nor
-# does a charge end a discharge that returns less of the most that is drawn: early pulses return much of the little drawn yet.
+# A charge before the load is cut off if it exceeds this share of the charge drawn; a smaller one is sensor offset. A charge
+# within the load ends the discharge only if it returns more than this share of the largest charge drawn: early pulses return
+# much of the little drawn yet.
 _CHARGED_SHARE = 0.02
 # What returns less than this share of the charge that passes in all is not looked at.
 _NOTHING_SHARE = 1e-3
 # What draws less than this share of the largest discharge of its file is a pulse between two charges, and left aside.
 _LEAST_SHARE = 0.01
-# A cell may be empty, and is as good as full, where its voltage is within these shares of its range from the ends; where the
-# range is smaller than this, V, it is neither.
-_EMPTY_SHARE, _FULL_SHARE, _LEAST_RANGE_V = 0.25, 0.1, 0.6
-# No cell is charged in less than this, nor is it discharged in less than this at its largest current, s.
-_LEAST_CHARGE_S, _LEAST_DISCHARGE_S = 600.0, 300.0
-# In an unlogged charge the voltage rises by more than this share of its range.
-_RISE_SHARE = 0.3
 # Over longer gaps than this a temperature that is missing is a guess, s.
 _TEMPERATURE_GAP_S = 600.0
 # Two rows of different steps may have the same time; the second counts as so much later, s.
@@ -79,9 +73,9 @@ def read_discharges(
 
     A file may hold charges and rests as well, and many cycles. A discharge is what lies between two charges, with the rest
     before the load; it is numbered by the cycle that the file gives, or else counted. If there are several, each has its own
-    clock, which starts at its first sample. Where the charges are not logged, a discharge ends where the voltage has come down
-    and is that of a full cell after a gap; a warning says so. Rows that are repeated, and lines below the table, are dropped
-    with a warning. A temperature that is missing in some rows is interpolated.
+    clock, which starts at its first sample. Discharges whose charges are not logged are told apart by the column of the cycle
+    alone. Rows that are repeated, and lines below the table, are dropped with a warning. A temperature that is missing in some
+    rows is interpolated.
 
     :param path: the file
     :param columns: by quantity (``time``, ``voltage``, ``current``, ``temperature``, ``ambient``, ``cycle``, ``step``,
@@ -107,6 +101,21 @@ def read_discharges(
     for reason in reasons:
         warnings.warn(f"{reason} It is left out.", stacklevel=2)
     return discharges
+
+
+def read_discharge_csv(path: str | Path, discharge_is_negative: bool = False) -> Discharge:
+    """
+    Read one discharge from a text file, with the sign of its current as stated and not told.
+
+    :param path: the file, as :func:`read_discharges` takes it
+    :param discharge_is_negative: whether the file counts the current of a discharge as negative; it is flipped then
+    :return: the discharge; its ``meta`` holds ``source``
+    :raises ValueError: if the file holds none, or several, or its values cannot be meant
+    """
+    discharges = read_discharges(path, discharge_is_negative=discharge_is_negative)
+    if len(discharges) > 1:
+        raise ValueError(f"{path} holds {len(discharges)} discharges: read them with read_discharges")
+    return discharges[0]
 
 
 def _numbered(recording: Recording) -> str:
@@ -193,20 +202,14 @@ class _Table:
         return cycles is not None and bool((cycles[back] != cycles[back - 1]).all())
 
     def _drop_repeated(self) -> None:
-        """The clock of a file stands still where a row is repeated; nowhere else rows are compared, which takes time."""
-        time_s = self.columns["time"]
-        if (np.diff(time_s) > 0.0).all():
+        """Rows are compared only where the clock stands still or goes back, as comparing them takes time."""
+        if (np.diff(self.columns["time"]) > 0.0).all():
             return
         names = [name for name in ("cycle", "time", "voltage", "current") if name in self.columns]
-        keys = {name: self.columns[name] for name in names} | {name: codes for name, (codes, _) in self.labels.items()}
-        rows = pd.DataFrame(keys)
-        # where the clock goes back all rows come once more, or another discharge begins, of which some are as before by chance
-        goes_back = np.diff(time_s) < 0.0
-        run = np.append(0, np.cumsum(goes_back))
-        latest_s = np.append(-np.inf, np.maximum.accumulate(time_s)[:-1][goes_back])[run]
-        repeated = rows.duplicated()
-        once_more = (repeated | (time_s > latest_s)).groupby(run).transform("all")
-        repeated = (repeated & (once_more | rows.assign(run=run).duplicated())).to_numpy()
+        rows = pd.DataFrame(
+            {name: self.columns[name] for name in names} | {name: each[0] for name, each in self.labels.items()}
+        )
+        repeated = rows.duplicated().to_numpy()
         if repeated.any():
             warnings.warn(f"{repeated.sum()} of {len(repeated)} rows are repeated, and dropped", stacklevel=2)
             self._select(~repeated)
@@ -255,10 +258,7 @@ class _Table:
         return np.where(np.append(charging, False)[codes], -1.0, 1.0)
 
     def _correlation(self) -> float:
-        """
-        Of the voltage with the charge that has passed, within each cycle, over the samples under load. Where that is not
-        clear, as of discharges whose charges are not logged, within each run of the load, which must all say the same.
-        """
+        """Of the voltage with the charge that has passed, within each cycle, over the samples under load; NaN if none is."""
         time_s, voltage_V, current_A = (self.columns[name] for name in ("time", "voltage", "current"))
         step_s = np.diff(time_s)
         charge_C = np.append(0.0, np.cumsum(0.5 * (current_A[1:] + current_A[:-1]) * np.maximum(step_s, 0.0)))
@@ -266,30 +266,27 @@ class _Table:
         if "cycle" in self.columns:
             new |= np.diff(self.columns["cycle"]) != 0.0
         loaded = np.abs(current_A) > SWITCH_SHARE * np.abs(current_A).max()
-        whole = _correlations(np.append(0, np.cumsum(new))[loaded], charge_C[loaded], voltage_V[loaded])[1]
-        if abs(whole) > _CLEAR_CORRELATION:
-            return whole
-        direction = np.where(np.abs(current_A) > least_load_A(current_A), np.sign(current_A), 0.0)
-        new |= (np.diff(direction) != 0.0) | (np.abs(np.diff(voltage_V)) > _RISE_SHARE * np.ptp(voltage_V))
-        loaded = direction != 0.0
-        each, together = _correlations(np.append(0, np.cumsum(new))[loaded], charge_C[loaded], voltage_V[loaded])
-        return together if len(each) and (np.sign(each) == np.sign(together)).all() else whole
+        cycle = np.append(0, np.cumsum(new))[loaded]
+        columns = pd.DataFrame({"charge": charge_C[loaded], "voltage": voltage_V[loaded]})
+        charge, voltage = (columns - columns.groupby(cycle).transform("mean")).to_numpy().T
+        with np.errstate(over="ignore", invalid="ignore"):  # of columns that are no measurements
+            norm = float(np.sqrt((charge @ charge) * (voltage @ voltage)))
+            return float(charge @ voltage) / norm if norm > 0.0 else float("nan")
 
     def _split(self, source: str) -> list[Recording]:
         cycles = self.columns.get("cycle")
         bounds = [0, len(self.columns["time"])]
-        charged = _charged_again(*(self.columns[name] for name in ("time", "voltage", "current")))
         if cycles is not None:
             bounds = [0, *(np.flatnonzero(np.diff(cycles)) + 1).tolist(), bounds[1]]
-        parts = [part for low, high in itertools.pairwise(bounds) for part in self._discharges(low, high, charged)]
+        parts = [part for low, high in itertools.pairwise(bounds) for part in self._discharges(low, high)]
         if not parts:
             raise ValueError("the file holds no discharge: no charge is drawn. Check the sign of the current")
         least_C = _LEAST_SHARE * max(drawn_C for _, drawn_C in parts)
         stretches = [stretch for stretch, drawn_C in parts if drawn_C > least_C]
         return [self._recording(stretch, n, len(stretches), source) for n, stretch in enumerate(stretches, start=1)]
 
-    def _discharges(self, low: int, high: int, charged: IntArray) -> list[tuple[slice, float]]:
-        """The discharges among some rows, and the charge that each draws, C; ``charged``: where unlogged ones have ended."""
+    def _discharges(self, low: int, high: int) -> list[tuple[slice, float]]:
+        """The discharges among some rows, and the charge that each draws, C."""
         time_s, current_A = self.columns["time"][low:high], self.columns["current"][low:high]
         clock_s = np.append(0.0, np.cumsum(np.maximum(np.diff(time_s), 0.0)))  # which does not go back
         passed_C = drawn(clock_s, current_A, clock_s)
@@ -307,8 +304,7 @@ class _Table:
                 lowest_C = highest_C = passed_C[end - 1]
         found.append((begin, high - low))
         parts = []
-        ends = charged[(charged > low) & (charged < high)] - low
-        for begin, end in [part for each in found for part in _parted(*each, ends, passed_C, current_A)]:
+        for begin, end in found:
             peak_A = current_A[begin:end].max()
             if not peak_A > 0.0:
                 continue
@@ -347,66 +343,6 @@ def _charges(current_A: FloatArray, passed_C: FloatArray) -> list[tuple[int, int
     starts, ends = np.flatnonzero(~charging[:-1] & charging[1:]), np.flatnonzero(charging[:-1] & ~charging[1:])
     counts = passed_C[starts] - passed_C[ends - 1] > _NOTHING_SHARE * float(np.ptp(passed_C))
     return list(zip(starts[counts].tolist(), ends[counts].tolist(), strict=True))
-
-
-def _correlations(group: IntArray, charge_C: FloatArray, voltage_V: FloatArray) -> tuple[FloatArray, float]:
-    """Of both columns, within each group through which as much passes as counts, and over all of them; NaN where none is."""
-    if not len(group):
-        return np.empty(0), float("nan")
-    group = np.unique(group, return_inverse=True)[1]
-    samples = np.bincount(group)
-    charge_C, voltage_V = (values - (np.bincount(group, values) / samples)[group] for values in (charge_C, voltage_V))
-    with np.errstate(over="ignore", invalid="ignore"):  # of columns that are no measurements
-        both, charges, voltages = (
-            np.bincount(group, product) for product in (charge_C * voltage_V, charge_C * charge_C, voltage_V * voltage_V)
-        )
-    norm = float(np.sqrt(charges.sum() * voltages.sum()))
-    counts = (charges > _RETURNED_SHARE**2 * charges.max()) & (voltages > 0.0)
-    each = both[counts] / np.sqrt(charges[counts] * voltages[counts])
-    return each, float(both.sum()) / norm if norm > 0.0 else float("nan")
-
-
-def _charged_again(time_s: FloatArray, voltage_V: FloatArray, current_A: FloatArray) -> IntArray:
-    """
-    Where a cell that may have been empty is as good as full, after a gap in which it may have been charged: each time the
-    first sample.
-    """
-    smooth_V = voltage_V.copy()
-    before_V, after_V = voltage_V[:-2], voltage_V[2:]
-    least_V, most_V = np.minimum(before_V, after_V), np.maximum(before_V, after_V)
-    smooth_V[1:-1] = np.clip(voltage_V[1:-1], least_V, most_V)  # the median of three
-    range_V = float(np.ptp(smooth_V))
-    if range_V < _LEAST_RANGE_V:
-        return np.empty(0, dtype=np.int64)
-    empty = smooth_V <= smooth_V.min() + _EMPTY_SHARE * range_V
-    full = (voltage_V >= smooth_V.max() - _FULL_SHARE * range_V) & (current_A >= -least_load_A(current_A))
-    marked = np.flatnonzero(empty | full)
-    turns = np.flatnonzero(empty[marked[:-1]] & full[marked[1:]])
-    step_s = np.append(0.0, np.diff(time_s))
-    # a clock that goes back is another one
-    gaps = np.cumsum((step_s >= _LEAST_CHARGE_S) | (step_s < 0.0))
-    lowest, begins = marked[turns], marked[turns + 1]
-    return begins[gaps[begins] > gaps[lowest]]
-
-
-def _parted(begin: int, end: int, charged: IntArray, passed_C: FloatArray, current_A: FloatArray) -> list[tuple[int, int]]:
-    """
-    The discharges among some rows between two logged charges, which end where the cell was charged without a row of it. What
-    is short, or draws less than a fifth of the largest one, empties no cell: there a heavy load brought the voltage down.
-    """
-    charged = charged[(charged > begin) & (charged < end)]
-    drawn_C = np.diff(passed_C[[begin, *charged, end - 1]])
-    least_C = max(_RETURNED_SHARE * drawn_C.max(), _LEAST_DISCHARGE_S * current_A[begin:end].max())
-    bounds = [begin]
-    for position in charged.tolist():
-        if passed_C[position] - passed_C[bounds[-1]] > least_C:
-            bounds.append(position)
-    if len(bounds) > 1:
-        warnings.warn(
-            f"the voltage comes back to that of a full cell, and no charge is logged: taken for {len(bounds)} discharges",
-            stacklevel=2,
-        )
-    return list(itertools.pairwise([*bounds, end]))
 
 
 def _filled(time_s: FloatArray, temperature_C: FloatArray) -> FloatArray | None:

@@ -140,7 +140,7 @@ class RecordModel:
             the K points of the grid reach the last sample
         :raises ValueError: as :func:`battery_env.records.check_record`
         """
-        time_s, _, current_A = check_record(record.time_s, record.voltage_V, record.current_A, least_samples=2)
+        time_s, _, current_A = check_record(record, least_samples=2)
         n_steps = int(np.ceil((time_s[-1] - time_s[0]) / self.dt_s - 1e-6)) + 1
         return time_s - time_s[0], resample_current(time_s, current_A, self.dt_s, n_steps)
 

@@ -23,7 +23,7 @@ VARIED_SHARE = 0.05
 SAMPLE_INTERVAL_LIMITS_S = (1e-3, 600.0)
 #: A cell whose current is below this rests, A; then the next sample may come after as long as a week, s.
 REST_CURRENT_A, REST_LIMIT_S = 0.02, 604_800.0
-#: As a share of the largest one, a current that may be noise, or an offset of the sensor.
+#: Currents below this share of the largest are taken for noise or sensor offset.
 LEAST_LOAD_SHARE = 0.03
 
 _MILLIVOLT = "Give the voltage of one cell in V, not in mV (command line: --units voltage=mV), and not that of a pack."
@@ -125,8 +125,15 @@ def _implausible(name: str, value: float, where: str = "") -> str:
     return f"{name} must lie within {low:g} .. {high:g} {unit}, got {value:g}{where}. {hint}"
 
 
-def check_record(time_s: ArrayLike, voltage_V: ArrayLike, current_A: ArrayLike, least_samples: int = 1) -> Samples:
-    """Refuse samples that cannot be meant."""
+def check_record(record: Record, least_samples: int = 1) -> Samples:
+    """Refuse a record that cannot be meant; one that was checked when it was made, a discharge, is not checked again."""
+    if getattr(record, "is_checked", False) and len(record.time_s) >= least_samples:
+        return Samples.of(record)
+    return check_samples(record.time_s, record.voltage_V, record.current_A, least_samples)
+
+
+def check_samples(time_s: ArrayLike, voltage_V: ArrayLike, current_A: ArrayLike, least_samples: int = 1) -> Samples:
+    """Refuse columns of a record that cannot be meant."""
     arrays = {
         name: check_column(name, values, least_samples)
         for name, values in (("time_s", time_s), ("voltage_V", voltage_V), ("current_A", current_A))
@@ -140,7 +147,7 @@ def check_record(time_s: ArrayLike, voltage_V: ArrayLike, current_A: ArrayLike, 
         n = stalls[0] + 1
         raise ValueError(
             f"time_s must increase from sample to sample, but sample {n} is at {time[n]:g} s, after {time[n - 1]:g} s. "
-            "Give one discharge at a time, and each sample once."
+            "Give one discharge at a time, or number them in a column of the cycle, and each sample once."
         )
     return Samples(**arrays)
 
@@ -209,15 +216,15 @@ def check_drawn_charge(charge_C: float, least_C: float = 0.0) -> None:
     if not charge_C > least_C:
         raise ValueError(
             f"current_A is positive in discharge, but this record draws {charge_C:.6g} C in total. If the tester "
-            "counts discharge as negative, flip the sign (read_discharge_csv: discharge_is_negative=True; command "
-            "line: --discharge-is-negative)."
+            "counts discharge as negative, flip the sign (discharge_is_negative=True; command line: "
+            "--discharge-is-negative)."
         )
 
 
 def least_load_A(current_A: FloatArray) -> float:
     """
-    What is more than noise and offset of a sensor: the current of a cell at rest, or a share of the largest one, but no more
-    than makes a switch.
+    The least current that counts as a load. It is above ``REST_CURRENT_A`` and ``LEAST_LOAD_SHARE`` of the largest current,
+    and never above the size of a switch.
     """
     most_A = float(np.abs(current_A).max())
     return min(max(REST_CURRENT_A, LEAST_LOAD_SHARE * most_A), SWITCH_SHARE * most_A)
@@ -251,7 +258,7 @@ def _knots(time_s: FloatArray, load: FloatArray) -> tuple[FloatArray, FloatArray
 
 def drawn(time_s: FloatArray, load: FloatArray, at_s: ArrayLike) -> FloatArray:
     """
-    What was drawn since the first sample: of a current the charge, of a power the energy. The load is linear between samples,
+    Charge of a current, or energy of a power, drawn since the first sample. The load is linear between samples,
     except where it was switched (see ``SWITCH_SHARE``): there it jumps, as :func:`switch_times_s` has it. Beyond the last
     sample it keeps its last value.
     """
@@ -299,7 +306,7 @@ class Stream(NamedTuple):
         Check a record and convert it. Between samples the current is linear, as
         :func:`drawn` has it, so that the charge drawn is kept exactly.
         """
-        time_s, voltage_V, current_A = check_record(record.time_s, record.voltage_V, record.current_A)
+        time_s, voltage_V, current_A = check_record(record)
         step_s = np.diff(time_s)
         if not np.allclose(step_s, dt_s, rtol=1e-6, atol=0.0):
             mean_A = np.diff(drawn(time_s, current_A, time_s)) / step_s
@@ -316,9 +323,9 @@ class Stream(NamedTuple):
 
 class ExpectedCurrent(NamedTuple):
     """
-    What a record lets expect of the current after its end.
+    The current to expect after the end of a record.
 
-    :param mean_A: current, A; 0 if the load was switched off and not on again
+    :param mean_A: its mean, A; 0 if the load was switched off and not on again
     :param varied: whether the load varied, so that ``mean_A`` is the mean of the last half of it and an assumption
     :param sd_A: how far means over quarters of the record lie from each other (standard deviation), A
     """

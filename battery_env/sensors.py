@@ -19,7 +19,7 @@ _MEASURED = get_args(Measured)
 @dataclass(frozen=True)
 class SensorErrors:
     """
-    What sensors make of a simulated discharge. A calibrator sees nothing else; state and load remain as they are.
+    Errors of the sensors in a simulated discharge. A calibrator sees their readings alone; state and load remain as they are.
 
     :param noise_V: standard deviation of white normal noise on the voltage, V
     :param offset_V: constant error of the voltage, V
@@ -51,38 +51,21 @@ class SensorErrors:
         return (self.current_gain, self.current_offset_A, self.measured) != (1.0, 0.0, "current")
 
     def draw(self, rng: np.random.Generator) -> SensorErrors:
-        """
-        The errors of one discharge: these, whatever ``rng``.
-
-        :param rng: source of randomness
-        :return: itself
-        """
+        """The errors of one discharge: these, whatever ``rng``."""
         return self
 
     def read_voltage_V(self, voltage_V: FloatArray, noise: FloatArray) -> FloatArray:
-        """
-        The voltage as it is read.
-
-        :param voltage_V: as it is, any shape
-        :param noise: standard normal, same shape
-        :return: same shape
-        """
+        """The voltage as it is read, where ``noise`` is standard normal; any shape."""
         return voltage_V + self.noise_V * noise + self.offset_V
 
     def gain(self, voltage_V: FloatArray, read_V: FloatArray) -> FloatArray:
-        """
-        What the current is multiplied by before its offset is added.
-
-        :param voltage_V: as it is, V
-        :param read_V: as it is read, V, same shape
-        :return: same shape
-        """
+        """The factor of the current before its offset is added, where the voltage is ``voltage_V`` and read as ``read_V``."""
         gain = np.full_like(voltage_V, self.current_gain)
         return gain * (voltage_V / read_V) if self.measured == "power" else gain
 
     def apply(self, trajectory: Trajectory, rng: np.random.Generator) -> Trajectory:
         """
-        A discharge as the sensors show it.
+        Read a discharge with these errors.
 
         :param trajectory: as it is
         :param rng: source of the noise
@@ -97,7 +80,7 @@ class SensorErrors:
 @dataclass(frozen=True)
 class RandomSensorErrors:
     """
-    Sensors that are other ones in each discharge. What they have wrong is constant within it, but for the noise.
+    Draw new sensor errors for each discharge. Gain and offset are constant within a discharge; only the noise varies.
 
     :param noise_V: least and greatest standard deviation of the noise, drawn log-uniformly, V; (0, 0): none
     :param offset_V: the offset of the voltage is drawn uniformly within this to either side, V
@@ -125,21 +108,11 @@ class RandomSensorErrors:
                 raise ValueError(f"{name} must be at least 0 and less than 0.5, got {getattr(self, name)!r}")
 
     def draw(self, rng: np.random.Generator) -> SensorErrors:
-        """
-        The errors of one discharge.
-
-        :param rng: source of randomness
-        :return: the errors
-        """
+        """Draw the errors of one discharge."""
         return self.draw_biases(rng, self.draw_noise_V(rng))
 
     def draw_noise_V(self, rng: np.random.Generator) -> float:
-        """
-        How large the noise of one discharge is.
-
-        :param rng: source of randomness; nothing is drawn where there is no noise
-        :return: its standard deviation, V
-        """
+        """Draw the standard deviation of the noise of one discharge, V; nothing is drawn where there is no noise."""
         return float(np.exp(rng.uniform(*self._log_noise))) if self.noise_V[1] > 0.0 else 0.0
 
     @cached_property
@@ -148,13 +121,7 @@ class RandomSensorErrors:
         return least, greatest
 
     def draw_biases(self, rng: np.random.Generator, noise_V: float) -> SensorErrors:
-        """
-        The errors of one discharge whose noise is known.
-
-        :param rng: source of randomness; nothing is drawn where a bound is 0
-        :param noise_V: standard deviation of the noise, V
-        :return: the errors
-        """
+        """Draw the errors of one discharge whose noise is known, V; nothing is drawn where a bound is 0."""
         offset_V, gain, offset_A = (
             rng.uniform(-bound, bound) if bound > 0.0 else 0.0
             for bound in (self.offset_V, self.current_gain, self.current_offset_A)

@@ -22,7 +22,7 @@ from battery_env.estimators.gaps import NOT_DRAWN, find_gaps
 from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.rest import InitialSoc, Start
-from battery_env.estimators.settling import SETTLED_SHARES, least_resistance_ohm, rest_voltage_V, start_reason
+from battery_env.estimators.settling import least_resistance_ohm, rest_voltage_V, start_reason
 from battery_env.parameters import PARAMETER_NAMES, check_parameters
 from battery_env.record_model import RecordModel, VoltageForecast
 from battery_env.records import ExpectedCurrent, drawn, expected_current
@@ -37,10 +37,6 @@ _MODEL_STEP_S = 1.0
 _ZERO_CELSIUS_K = 273.15
 # What is drawn after the cut-off is worth a word if it is more than this share of what was drawn before.
 _MORE_SHARE = 0.2
-_MISSING_SAMPLES = (
-    "Samples are missing when the load is switched on: what was drawn then is not known. Give the last ones at rest, or the "
-    "first ones under load."
-)
 _AMBIENT_LIMITS_C = (-60.0, 100.0)
 # The model of a cell in air warms by 2 K at 2 A, where the bundled cells warm by 16 K: that alone moves q_mobile by less than
 # 0.1 %. What is farther off than this is another cell, load or chamber than these.
@@ -230,13 +226,12 @@ def summarize(discharge: Discharge, settings: Settings) -> Summary:
     seen = record
     if settings.ambient_C is not None or not settings.thermal:
         # a temperature that is stated, or held, counts more than one that was measured
-        discharge, seen = replace(discharge, temperature_C=None), replace(record, temperature_C=None)
+        discharge, seen = discharge.without_temperature(), record.without_temperature()
     calibrator = settings.calibrator(cell)
     start = Start(1.0, 0.0) if isinstance(calibrator, PolicyEstimator) else calibrator.start_of(discharge)
     estimate = settings.calibrator(cell, start).estimate(seen)
     if start.reason:
         estimate = replace(estimate, settled=False, reason=start.reason)
-    estimate = _with_missing_samples(estimate, discharge, record)
     model = RecordModel(cell, settings.thermal and not is_policy, initial_soc=start.soc)
     future = load = expected_current(record.time_s, record.current_A)
     if settings.future_current_A is not None:
@@ -302,17 +297,6 @@ def _warn_of_more(discharge: Discharge, eod_time_s: float) -> None:
             "another discharge, give each alone, or number them in a column of the cycle",
             stacklevel=3,
         )
-
-
-def _with_missing_samples(estimate: Estimate, discharge: Discharge, record: Discharge) -> Estimate:
-    """What may have been drawn while samples are missing at load-on is not known of ``q_mobile`` either."""
-    share = discharge.sd_load_on_time_s * float(record.current_A[0]) / record.charge_C
-    if not share or np.isnan(estimate.sd_q_mobile):
-        return estimate
-    estimate = replace(estimate, sd_q_mobile=float(np.hypot(estimate.sd_q_mobile, share * estimate.q_mobile)))
-    if estimate.settled and estimate.sd_q_mobile >= SETTLED_SHARES["q_mobile"] * estimate.q_mobile:
-        return replace(estimate, settled=False, reason=_MISSING_SAMPLES)
-    return estimate
 
 
 def _starts_lower(discharge: Discharge, cell: CellParameters, soc: float, estimate: Estimate) -> bool:

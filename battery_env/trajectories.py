@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import os
+import platform
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
+from importlib.metadata import version
 from numbers import Real
 from pathlib import Path
 from typing import Any, Literal, overload
 
 import numpy as np
-import pandas as pd
 from numpy.typing import ArrayLike
 
 from battery_env.arrays import FloatArray, IntArray
 from battery_env.checks import LoadUnit, check_indices, check_load, check_range, check_whole_number
-from battery_env.dataset_files import described, load_npz, save_npz, save_parquet
 from battery_env.electrochemistry import (
     NEW_CELL,
-    STATE_NAMES,
     STATE_SIZE,
     UNCERTAIN_CONSTANTS,
     CellParameters,
@@ -31,10 +30,9 @@ from battery_env.electrochemistry import (
     initial_state,
 )
 from battery_env.electrochemistry.kernels import roll_out
+from battery_env.files import load_npz, save_npz
 from battery_env.loads import Load, LoadSampler, constant
-from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, R_O
-
-AgedParameter = Literal["q_mobile", "r_o", "joint"]
+from battery_env.parameters import Q_MOBILE, R_O, check_parameters
 
 #: Ranges of the aged parameters in the paper's data (the authors' code), C and ohm.
 PAPER_RANGES: dict[str, tuple[float, float]] = {"q_mobile": (4000.0, 7000.0), "r_o": (0.1, 0.2)}
@@ -47,11 +45,13 @@ MISMATCH_LIMIT = 0.5
 
 _CHECKPOINT_EVERY = 64  # steps between stored states: a window starts with 32 steps of re-simulation on average
 _MIN_SAMPLES = 8
+_LEFT_SAMPLES = 4  # of a discharge that is trimmed
 _LEAST_DT_S = 0.01  # of a discharge that may take a day
 _INDICES = ("load_start", "samples", "first", "stop", "checkpoint_start")
 _PER_TRAJECTORY = ("q_mobile", "r_o", "factors", "eod_time_s", *_INDICES)
 _ARRAYS = (*_PER_TRAJECTORY, "load_values", "checkpoint")
 _SETTINGS = ("load_unit", "dt_s", "thermal", "description")
+_KIND, _FORMAT = "data set of simulated discharges", 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +80,6 @@ class TrajectoryDataset(Sequence[Trajectory]):
     :param thermal: whether the temperature moves
     :param cell: constants of the cell, as a calibrator may know them
     :param description: how the data set was made, as JSON may hold it; saved with it
-    :raises ValueError: for arrays that do not fit together, or values out of range
     """
 
     q_mobile: FloatArray
@@ -100,142 +99,14 @@ class TrajectoryDataset(Sequence[Trajectory]):
     cell: CellParameters
     description: dict[str, Any]
 
-    def __post_init__(self) -> None:
-        n = np.size(self.q_mobile)
-        shapes = dict.fromkeys(_PER_TRAJECTORY, (n,)) | {
-            "factors": (n, len(UNCERTAIN_CONSTANTS)),
-            "load_values": (np.size(self.load_values),),
-            "checkpoint": (np.size(self.checkpoint) // STATE_SIZE, STATE_SIZE),
-        }
-        for name, shape in shapes.items():
-            array, dtype = getattr(self, name), np.int64 if name in _INDICES else np.float64
-            if not isinstance(array, np.ndarray) or array.dtype != dtype or array.shape != shape or n == 0:
-                found = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
-                raise ValueError(f"{name} must be an array of {dtype.__name__} of shape {shape}, not empty, got {found}")
-        Q_MOBILE.check(self.q_mobile)
-        R_O.check(self.r_o)
-        check_load(self.load_values, self.load_unit)
-        _check_factors(self.factors)
-        object.__setattr__(self, "cell", check_cell(self.cell, self.thermal))
-        object.__setattr__(self, "thermal", bool(self.thermal))
-        _check_dt(self.dt_s, self.cell, self.factors)
-        if not np.isfinite(self.checkpoint).all():
-            raise ValueError("checkpoint must be finite, got NaN or infinity")
-        fits = {
-            "first and stop": (self.first >= 0) & (self.first < self.stop) & (self.stop <= self.samples),
-            "load_start": (self.load_start >= 0) & (self.load_start + self.samples <= len(self.load_values)),
-            "checkpoint_start": (self.checkpoint_start >= 0)
-            & (self.checkpoint_start + _checkpoints(self.samples) <= len(self.checkpoint)),
-        }
-        for name, each in fits.items():
-            if not each.all():
-                raise ValueError(f"{name} of trajectory {np.flatnonzero(~each)[0]} lie outside its data")
-
-    @classmethod
-    def simulated(
-        cls,
-        q_mobile: ArrayLike,
-        r_o: ArrayLike,
-        loads: Sequence[Load],
-        load_index: ArrayLike,
-        trim: tuple[float, float] = (0.0, 1.0),
-        dt_s: float = 1.0,
-        thermal: bool = False,
-        cell: CellParameters | None = None,
-        description: dict[str, Any] | None = None,
-        factors: ArrayLike | None = None,
-    ) -> TrajectoryDataset:
-        """
-        Discharge cells from full charge to the end of discharge.
-
-        :param q_mobile: C, shape (n,)
-        :param r_o: ohm, shape (n,)
-        :param loads: the loads that occur, all in one unit
-        :param load_index: which of them each cell gets, shape (n,)
-        :param trim: the part of each discharge that counts as data, as shares of its length
-        :param dt_s: time step, s
-        :param thermal: whether the temperature moves
-        :param cell: constants of the cell, as a calibrator may know them; ``None``: the new cell's
-        :param description: how the data set was made, as JSON may hold it
-        :param factors: what ``UNCERTAIN_CONSTANTS`` of each cell are multiplied by, shape (n, 4); ``None``: ones
-        :return: the data set
-        :raises ValueError: for values out of range, or a discharge of fewer than eight samples
-        """
-        q, r = np.broadcast_arrays(*np.atleast_1d(Q_MOBILE.check(q_mobile), R_O.check(r_o)))
-        if q.ndim != 1 or q.size == 0:
-            raise ValueError(f"q_mobile and r_o must be 1-D and not empty, got shape {q.shape}")
-        low, high = check_range("trim", trim)
-        if not 0.0 <= low < high <= 1.0:
-            raise ValueError(f"trim must be two increasing shares within 0 .. 1, got {trim!r}")
-        units = {load.unit if isinstance(load, Load) else type(load).__name__ for load in loads}
-        if units not in ({"power"}, {"current"}):
-            raise ValueError(f"loads must be Loads, all in one unit (power or current), got {sorted(units)}")
-        unit = loads[0].unit
-        index = np.broadcast_to(check_indices("load_index", load_index, len(loads)), q.shape)
-        multiples = np.ones((q.size, len(UNCERTAIN_CONSTANTS))) if factors is None else np.array(factors, dtype=np.float64)
-        if multiples.shape != (q.size, len(UNCERTAIN_CONSTANTS)):
-            raise ValueError(f"factors must hold one value per cell and each of {UNCERTAIN_CONSTANTS}, got {multiples.shape}")
-        _check_factors(multiples)
-        cell = check_cell(cell, thermal)
-        dt_s = _check_dt(dt_s, cell, multiples)
-        if dt_s < _LEAST_DT_S:
-            raise ValueError(f"dt_s must be at least {_LEAST_DT_S:g} s (a day of it must fit in memory), got {dt_s!r}")
-
-        day = dt_s * np.arange(round(86_400 / dt_s), dtype=np.float64)
-        start = initial_state(q, cell)
-        samples = np.empty(q.size, dtype=np.int64)
-        profiles = []
-        checkpoints: dict[int, FloatArray] = {}
-        # one place to simulate in, for all cells in turn
-        state, voltage, current = np.empty((len(day) + 1, STATE_SIZE)), np.empty(len(day)), np.empty(len(day))
-        for k, load in enumerate(loads):
-            profile = load.on_grid(day)
-            cells = np.flatnonzero(index == k)
-            for n in cells:
-                state[0] = start[n]
-                packed = _packed(cell, multiples[[n]])
-                run = (profile, q[n], r[n], dt_s, cell.VEOD, unit == "power", thermal)
-                samples[n] = roll_out(*run, packed, state, voltage, current)
-                if samples[n] < _MIN_SAMPLES:
-                    raise ValueError(
-                        f"trajectory {n} (q_mobile {q[n]:g} C, r_o {r[n]:g} ohm) ends after {samples[n]} samples, at least "
-                        f"{_MIN_SAMPLES} are needed: lower its load ({load.value[0]:g}), r_o or dt_s ({dt_s:g})"
-                    )
-                if samples[n] == len(day):
-                    raise ValueError(f"trajectory {n} does not reach the end of discharge within a day: raise its load")
-                checkpoints[int(n)] = state[: samples[n] : _CHECKPOINT_EVERY].copy()
-            profiles.append(profile[: samples[cells].max(initial=0)].copy())
-        # short discharges keep four samples, whatever is trimmed
-        first = np.minimum(np.ceil(low * samples).astype(np.int64), samples - _MIN_SAMPLES // 2)
-        return cls(
-            q_mobile=np.array(q),
-            r_o=np.array(r),
-            factors=multiples,
-            eod_time_s=np.asarray(samples * dt_s, dtype=np.float64),
-            load_values=np.concatenate(profiles),
-            load_start=_starts(np.array([len(profile) for profile in profiles]))[index],
-            samples=samples,
-            first=first,
-            stop=np.maximum(np.floor(high * samples).astype(np.int64), first + _MIN_SAMPLES // 2),
-            checkpoint=np.concatenate([checkpoints[n] for n in range(q.size)]),
-            checkpoint_start=_starts(_checkpoints(samples)),
-            load_unit=unit,
-            dt_s=dt_s,
-            thermal=thermal,
-            cell=cell,
-            description=description or {},
-        )
-
-    @classmethod
+    @staticmethod
     def generate(
-        cls,
-        parameter: AgedParameter,
+        parameters: str | Sequence[str],
         n: int,
         loads: Sequence[Load] | LoadSampler,
         seed: int,
         q_mobile_range: tuple[float, float] = (4000.0, 7600.0),
         r_o_range: tuple[float, float] = (0.1, 0.2),
-        trim: tuple[float, float] = (0.0, 1.0),
         dt_s: float = 1.0,
         thermal: bool = False,
         cell: CellParameters | None = None,
@@ -244,13 +115,12 @@ class TrajectoryDataset(Sequence[Trajectory]):
         """
         Discharges of ``n`` cells whose age is drawn uniformly; the parameter that does not age is the cell's.
 
-        :param parameter: what ages: ``"q_mobile"``, ``"r_o"`` or ``"joint"`` (both, independently)
+        :param parameters: what ages, independently: ``"q_mobile"``, ``"r_o"``, or both, ``("q_mobile", "r_o")``
         :param n: number of discharges
         :param loads: loads to choose from at random, or a sampler of loads
         :param seed: seed of ages and loads
         :param q_mobile_range: C
         :param r_o_range: ohm
-        :param trim: the part of each discharge that counts as data, as shares of its length
         :param dt_s: time step, s
         :param thermal: whether the temperature moves
         :param cell: constants of the cell, as a calibrator may know them, and what does not age; ``None``: the new cell's
@@ -259,8 +129,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
         :return: the data set
         :raises ValueError: for values out of range
         """
-        if parameter not in ("q_mobile", "r_o", "joint"):
-            raise ValueError(f"parameter must be 'q_mobile', 'r_o' or 'joint', got {parameter!r}")
+        aged = aged_parameters(parameters)
         n, seed = check_whole_number("n", n), check_whole_number("seed", seed)
         if n < 1 or seed < 0:
             raise ValueError(f"n must be at least 1 and seed at least 0, got n = {n} and seed = {seed}")
@@ -270,22 +139,93 @@ class TrajectoryDataset(Sequence[Trajectory]):
             raise TypeError(f"loads must be a list of Loads or a sampler of them, got {type(loads).__name__}")
         if not callable(loads) and len(loads) == 0:
             raise ValueError("loads must not be empty")
-        low, high = check_range("trim", trim)
         q_range, r_range = check_range("q_mobile_range", q_mobile_range), check_range("r_o_range", r_o_range)
         Q_MOBILE.check(q_range)
         R_O.check(r_range)
         cell = check_cell(cell, thermal)
         rng = np.random.default_rng(seed)
-        q = np.full(n, cell.q_mobile) if parameter == "r_o" else rng.uniform(*q_range, size=n)
-        r = np.full(n, cell.r_o) if parameter == "q_mobile" else rng.uniform(*r_range, size=n)
+        q = rng.uniform(*q_range, size=n) if "q_mobile" in aged else np.full(n, cell.q_mobile)
+        r = rng.uniform(*r_range, size=n) if "r_o" in aged else np.full(n, cell.r_o)
         if callable(loads):
             drawn, index = [loads(rng) for _ in range(n)], np.arange(n)
         else:
             drawn, index = list(loads), rng.integers(len(loads), size=n)
         # drawn last, so that all else is the same with and without a mismatch
         factors = np.exp(np.sqrt(np.log1p(mismatch**2)) * rng.standard_normal((n, len(UNCERTAIN_CONSTANTS))))
-        asked = {"parameter": parameter, "n": n, "seed": seed, "trim": [low, high], "mismatch": float(mismatch)}
-        return cls.simulated(q, r, drawn, index, trim, dt_s, thermal, cell, {"made_by": "generate", **asked}, factors)
+        made = TrajectoryDataset.simulated(q, r, drawn, index, dt_s, thermal, cell, factors)
+        asked = {"parameters": list(aged), "n": n, "seed": seed, "mismatch": float(mismatch)}
+        return replace(made, description={"made_by": "generate", **asked})
+
+    @staticmethod
+    def simulated(
+        q_mobile: ArrayLike,
+        r_o: ArrayLike,
+        loads: Sequence[Load],
+        load_index: ArrayLike,
+        dt_s: float = 1.0,
+        thermal: bool = False,
+        cell: CellParameters | None = None,
+        factors: ArrayLike | None = None,
+    ) -> TrajectoryDataset:
+        """
+        Discharge cells from full charge to the end of discharge.
+
+        :param q_mobile: C, shape (n,)
+        :param r_o: ohm, shape (n,)
+        :param loads: the loads that occur, all in one unit
+        :param load_index: which of them each cell gets, shape (n,)
+        :param dt_s: time step, s
+        :param thermal: whether the temperature moves
+        :param cell: constants of the cell, as a calibrator may know them; ``None``: the new cell's
+        :param factors: what ``UNCERTAIN_CONSTANTS`` of each cell are multiplied by, shape (n, 4); ``None``: ones
+        :return: the data set
+        :raises ValueError: for values out of range, or a discharge of fewer than eight samples
+        """
+        q, r = np.broadcast_arrays(*np.atleast_1d(Q_MOBILE.check(q_mobile), R_O.check(r_o)))
+        units = {load.unit if isinstance(load, Load) else type(load).__name__ for load in loads}
+        if units not in ({"power"}, {"current"}):
+            raise ValueError(f"loads must be Loads, all in one unit (power or current), got {sorted(units)}")
+        index = np.broadcast_to(check_indices("load_index", load_index, len(loads)), q.shape)
+        multiples = np.ones((q.size, len(UNCERTAIN_CONSTANTS))) if factors is None else np.array(factors, dtype=np.float64)
+        cell = check_cell(cell, thermal)
+        dt_s = _check_dt(dt_s, cell, multiples)
+        if dt_s < _LEAST_DT_S:
+            raise ValueError(f"dt_s must be at least {_LEAST_DT_S:g} s (a day of it must fit in memory), got {dt_s!r}")
+        options = (dt_s, loads[0].unit == "power", thermal)
+        profiles, samples, checkpoints = _discharged(q, r, loads, index, options, cell, multiples)
+        return TrajectoryDataset(
+            q_mobile=np.array(q),
+            r_o=np.array(r),
+            factors=multiples,
+            eod_time_s=np.asarray(samples * dt_s, dtype=np.float64),
+            load_values=np.concatenate(profiles),
+            load_start=_starts(np.array([len(profile) for profile in profiles]))[index],
+            samples=samples,
+            first=np.zeros_like(samples),
+            stop=samples,
+            checkpoint=np.concatenate(checkpoints),
+            checkpoint_start=_starts(_checkpoints(samples)),
+            load_unit=loads[0].unit,
+            dt_s=dt_s,
+            thermal=bool(thermal),
+            cell=cell,
+            description={"made_by": "simulated"},
+        )
+
+    def trimmed(self, low: float, high: float) -> TrajectoryDataset:
+        """
+        The same of which only a part of each discharge counts as data.
+
+        :param low: where it begins, as a share of the length of the discharge
+        :param high: where it ends, likewise
+        :return: the data set; of short discharges four samples are left, whatever is trimmed
+        :raises ValueError: unless 0 <= low < high <= 1
+        """
+        if not 0.0 <= low < high <= 1.0:
+            raise ValueError(f"low and high must be two increasing shares within 0 .. 1, got {low!r} and {high!r}")
+        first = np.minimum(np.ceil(low * self.samples).astype(np.int64), self.samples - _LEFT_SAMPLES)
+        stop = np.maximum(np.floor(high * self.samples).astype(np.int64), first + _LEFT_SAMPLES)
+        return replace(self, first=first, stop=stop, description={**self.description, "trim": [low, high]})
 
     @classmethod
     def from_trajectories(cls, trajectories: Sequence[Trajectory]) -> TrajectoryDataset:
@@ -335,7 +275,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
         )
 
     @classmethod
-    def paper(cls, parameter: Literal["q_mobile", "r_o"]) -> TrajectoryDataset:
+    def paper(cls, parameter: str) -> TrajectoryDataset:
         """
         The data of Unagar et al. 2020 (their code): eleven constant loads of 8 to 16 W times 501 values of the parameter
         (q_mobile 4000 to 7000 C, or r_o 0.1 to 0.2 ohm), from full charge to 3 V, trimmed to 5 .. 95 %. Made once per
@@ -459,38 +399,27 @@ class TrajectoryDataset(Sequence[Trajectory]):
         return TrajectoryDataset(**{**self.__dict__, **changes})
 
     def split(
-        self, test: float = 0.3, by: Literal["trajectory", "load", "parameter"] = "trajectory", seed: int = 0
+        self, test: float = 0.3, by: Literal["trajectory", "parameter"] = "trajectory", seed: int = 0
     ) -> tuple[TrajectoryDataset, TrajectoryDataset]:
         """
         Divide into trajectories to train on and trajectories to test on.
 
         :param test: share of the test part, greater than 0 and less than 1
-        :param by: ``"trajectory"``: at random; ``"load"``: whole load profiles at random, so that the test loads are new;
-            ``"parameter"``: the most aged cells (lowest q_mobile, or highest r_o where q_mobile is the same) are the test
-            part, so that it is an extrapolation
-        :param seed: seed of the random divisions
+        :param by: ``"trajectory"``: at random; ``"parameter"``: the most aged cells (lowest q_mobile, or highest r_o where
+            q_mobile is the same) are the test part, so that it is an extrapolation
+        :param seed: seed of the random division
         :return: training part, test part
         :raises ValueError: if one of the parts would be empty
         """
         if not isinstance(test, Real) or not 0.0 < test < 1.0:
             raise ValueError(f"test must be greater than 0 and less than 1, got {test!r}")
-        rng = np.random.default_rng(check_whole_number("seed", seed))
-        if by == "trajectory":
-            order = rng.permutation(len(self))
-            is_test = np.zeros(len(self), dtype=bool)
-            is_test[order[: round(test * len(self))]] = True
-        elif by == "load":
-            profiles = np.unique(self.load_start)
-            is_test = np.isin(self.load_start, rng.permutation(profiles)[: max(1, round(test * len(profiles)))])
-        elif by == "parameter":
-            order = np.lexsort((self.r_o, -self.q_mobile))
-            is_test = np.zeros(len(self), dtype=bool)
-            is_test[order[len(self) - round(test * len(self)) :]] = True
-        else:
-            raise ValueError(f"by must be 'trajectory', 'load' or 'parameter', got {by!r}")
-        if is_test.all() or not is_test.any():
-            raise ValueError(f"a split of {len(self)} trajectories by {by} with test = {test} leaves one part empty")
-        return self.subset(np.flatnonzero(~is_test)), self.subset(np.flatnonzero(is_test))
+        rng, count = np.random.default_rng(check_whole_number("seed", seed)), round(test * len(self))
+        if by not in ("trajectory", "parameter"):
+            raise ValueError(f"by must be 'trajectory' or 'parameter', got {by!r}")
+        order = rng.permutation(len(self)) if by == "trajectory" else np.lexsort((self.r_o, -self.q_mobile))[::-1]
+        if not 0 < count < len(self):
+            raise ValueError(f"a split of {len(self)} trajectories with test = {test} leaves one part empty")
+        return self.subset(np.sort(order[count:])), self.subset(np.sort(order[:count]))
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """
@@ -500,7 +429,9 @@ class TrajectoryDataset(Sequence[Trajectory]):
         :return: the file
         :raises FileExistsError: if the file exists already
         """
-        return save_npz(path, {name: getattr(self, name) for name in _ARRAYS}, self._settings())
+        versions = {"python": platform.python_version(), "numpy": np.__version__, "numba": version("numba")}
+        settings = {**{name: getattr(self, name) for name in _SETTINGS}, "cell": asdict(self.cell), "versions": versions}
+        return save_npz(path, _KIND, _FORMAT, {name: getattr(self, name) for name in _ARRAYS}, settings)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> TrajectoryDataset:
@@ -511,72 +442,15 @@ class TrajectoryDataset(Sequence[Trajectory]):
         :return: the data set
         :raises ValueError: if the file is damaged, no such data set, or of another format version
         """
-        arrays, settings = load_npz(path, _ARRAYS)
+        arrays, settings = load_npz(path, _KIND, _FORMAT)
         try:
             constants: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in settings["cell"].items()}
-            fields: dict[str, Any] = {**arrays, **{name: settings[name] for name in _SETTINGS}}
-            return cls(**fields, cell=CellParameters(**constants))
+            fields: dict[str, Any] = {name: arrays[name] for name in _ARRAYS} | {name: settings[name] for name in _SETTINGS}
+            dataset = cls(**fields, cell=CellParameters(**constants))
+            _check(dataset)
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{path} holds no valid data set: {error}") from error
-
-    def _settings(self) -> dict[str, Any]:
-        return {**{name: getattr(self, name) for name in _SETTINGS}, "cell": asdict(self.cell)}
-
-    def to_frame(self) -> pd.DataFrame:
-        """
-        All samples as one table: ``trajectory`` (its number), ``time_s``, ``voltage_V``, ``current_A``, ``load`` (W or A),
-        the states under their names (K, V, C), and the true ``q_mobile`` (C) and ``r_o`` (ohm). Every trajectory is
-        simulated for it; the paper's 5511 are 7 million rows (0.9 GB).
-
-        :return: one row per sample, in the order of trajectories and time; its ``attrs`` hold constants, description and
-            versions
-        """
-        trajectories, lengths = list(self), self.stop - self.first
-        columns = {"trajectory": np.repeat(np.arange(len(self)), lengths)}
-        for name in ("time_s", "voltage_V", "current_A", "load"):
-            columns[name] = np.concatenate([getattr(trajectory, name) for trajectory in trajectories])
-        state = np.concatenate([trajectory.state for trajectory in trajectories])
-        columns |= dict(zip(STATE_NAMES, state.T, strict=True))
-        columns |= {name: np.repeat(getattr(self, name), lengths) for name in PARAMETER_NAMES}
-        frame = pd.DataFrame(columns)
-        frame.attrs = described(self._settings())
-        return frame
-
-    def summary(self) -> pd.DataFrame:
-        """
-        The trajectories as one table: ``trajectory`` (its number), the true ``q_mobile`` (C), ``r_o`` (ohm) and, as
-        ``kn_factor`` etc., what the uncertain constants are multiplied by; ``samples`` and ``start_time_s`` of its data;
-        ``load_mean``, ``load_lowest`` and ``load_highest`` over its data (W or A); ``eod_time_s``.
-
-        :return: one row per trajectory
-        """
-        begin, end = self.load_start + self.first, self.load_start + self.stop
-        loads = [self.load_values[a:b] for a, b in zip(begin, end, strict=True)]
-        return pd.DataFrame(
-            {
-                "trajectory": np.arange(len(self)),
-                "q_mobile": self.q_mobile,
-                "r_o": self.r_o,
-                **{f"{name}_factor": self.factors[:, k] for k, name in enumerate(UNCERTAIN_CONSTANTS)},
-                "samples": self.stop - self.first,
-                "start_time_s": self.first * self.dt_s,
-                "load_mean": [load.mean() for load in loads],
-                "load_lowest": [load.min() for load in loads],
-                "load_highest": [load.max() for load in loads],
-                "eod_time_s": self.eod_time_s,
-            }
-        )
-
-    def to_parquet(self, path: str | os.PathLike[str]) -> Path:
-        """
-        Write :meth:`to_frame` to a Parquet file, for programs other than this one; :meth:`save` is far smaller.
-
-        :param path: where to; ``.parquet`` is added if it is missing
-        :return: the file
-        :raises FileExistsError: if the file exists already
-        :raises ImportError: without the extra ``parquet``
-        """
-        return save_parquet(path, self.to_frame())
+        return dataset
 
 
 def _checkpoints(samples: IntArray) -> IntArray:
@@ -587,10 +461,79 @@ def _packed(cell: CellParameters, factors: FloatArray) -> PackedConstants:
     return cell.packed if (factors == 1.0).all() else cell.packed_with(factors)
 
 
-def _check_factors(factors: FloatArray) -> None:
-    good = np.isfinite(factors) & (factors > 0.0)
-    if not good.all():
-        raise ValueError(f"factors must be finite and greater than 0, got {factors[~good][0]:g}")
+def aged_parameters(parameters: str | Sequence[str]) -> tuple[str, ...]:
+    """The parameters that age, of which one may be given by its name alone, in the order of ``PARAMETER_NAMES``."""
+    return tuple(sorted(check_parameters([parameters] if isinstance(parameters, str) else parameters)))
+
+
+def _discharged(
+    q_mobile: FloatArray,
+    r_o: FloatArray,
+    loads: Sequence[Load],
+    load_index: IntArray,
+    options: tuple[float, bool, bool],
+    cell: CellParameters,
+    factors: FloatArray,
+) -> tuple[list[FloatArray], IntArray, list[FloatArray]]:
+    """The profile of each load as far as it is needed; of each cell the number of samples, and the states to keep."""
+    dt_s, is_power, thermal = options
+    day = dt_s * np.arange(round(86_400 / dt_s), dtype=np.float64)
+    start = initial_state(q_mobile, cell)
+    samples = np.empty(q_mobile.size, dtype=np.int64)
+    profiles, checkpoints = [], {}
+    # one place to simulate in, for all cells in turn
+    state, voltage, current = np.empty((len(day) + 1, STATE_SIZE)), np.empty(len(day)), np.empty(len(day))
+    for k, load in enumerate(loads):
+        profile = load.on_grid(day)
+        cells = np.flatnonzero(load_index == k)
+        for n in cells.tolist():
+            state[0] = start[n]
+            run = (profile, q_mobile[n], r_o[n], dt_s, cell.VEOD, is_power, thermal)
+            samples[n] = roll_out(*run, _packed(cell, factors[[n]]), state, voltage, current)
+            if samples[n] < _MIN_SAMPLES:
+                raise ValueError(
+                    f"trajectory {n} (q_mobile {q_mobile[n]:g} C, r_o {r_o[n]:g} ohm) ends after {samples[n]} samples, at "
+                    f"least {_MIN_SAMPLES} are needed: lower its load ({load.value[0]:g}), r_o or dt_s ({dt_s:g})"
+                )
+            if samples[n] == len(day):
+                raise ValueError(f"trajectory {n} does not reach the end of discharge within a day: raise its load")
+            checkpoints[n] = state[: samples[n] : _CHECKPOINT_EVERY].copy()
+        profiles.append(profile[: samples[cells].max(initial=0)].copy())
+    return profiles, samples, [checkpoints[n] for n in range(q_mobile.size)]
+
+
+def _check(data: TrajectoryDataset) -> None:
+    """Refuse arrays of a file that do not fit together, or values out of range."""
+    n = np.size(data.q_mobile)
+    shapes = dict.fromkeys(_PER_TRAJECTORY, (n,)) | {
+        "factors": (n, len(UNCERTAIN_CONSTANTS)),
+        "load_values": (np.size(data.load_values),),
+        "checkpoint": (np.size(data.checkpoint) // STATE_SIZE, STATE_SIZE),
+    }
+    for name, shape in shapes.items():
+        array, dtype = getattr(data, name), np.int64 if name in _INDICES else np.float64
+        if array.dtype != dtype or array.shape != shape or n == 0:
+            raise ValueError(
+                f"{name} must be an array of {dtype.__name__} of shape {shape}, not empty, got {array.dtype} {array.shape}"
+            )
+    Q_MOBILE.check(data.q_mobile)
+    R_O.check(data.r_o)
+    check_load(data.load_values, data.load_unit)
+    for name in ("factors", "checkpoint"):
+        if not np.isfinite(getattr(data, name)).all():
+            raise ValueError(f"{name} must be finite, got NaN or infinity")
+    if not (data.factors > 0.0).all():
+        raise ValueError(f"factors must be greater than 0, got {data.factors.min():g}")
+    _check_dt(data.dt_s, check_cell(data.cell, data.thermal), data.factors)
+    fits = {
+        "first and stop": (data.first >= 0) & (data.first < data.stop) & (data.stop <= data.samples),
+        "load_start": (data.load_start >= 0) & (data.load_start + data.samples <= len(data.load_values)),
+        "checkpoint_start": (data.checkpoint_start >= 0)
+        & (data.checkpoint_start + _checkpoints(data.samples) <= len(data.checkpoint)),
+    }
+    for name, each in fits.items():
+        if not each.all():
+            raise ValueError(f"{name} of trajectory {np.flatnonzero(~each)[0]} lie outside its data")
 
 
 def _check_dt(dt_s: float, cell: CellParameters, factors: FloatArray) -> float:
@@ -607,11 +550,10 @@ def _starts(lengths: IntArray) -> IntArray:
 def _paper(parameter: str) -> TrajectoryDataset:
     value = np.tile(np.linspace(*PAPER_RANGES[parameter], PAPER_VALUES), len(PAPER_LOADS_W))
     fixed = np.full_like(value, NEW_CELL.r_o if parameter == "q_mobile" else NEW_CELL.q_mobile)
-    return TrajectoryDataset.simulated(
+    made = TrajectoryDataset.simulated(
         q_mobile=value if parameter == "q_mobile" else fixed,
         r_o=fixed if parameter == "q_mobile" else value,
         loads=[constant(power) for power in PAPER_LOADS_W],
         load_index=np.repeat(np.arange(len(PAPER_LOADS_W)), PAPER_VALUES),
-        trim=PAPER_TRIM,
-        description={"made_by": "paper", "parameter": parameter},
     )
+    return replace(made.trimmed(*PAPER_TRIM), description={"made_by": "paper", "parameter": parameter})

@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -39,7 +39,7 @@ from battery_env.loads import RandomPiecewise
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.plotting import COLOURS, LABELS, new_figure
 from battery_env.sensors import RandomSensorErrors, SensorErrors
-from battery_env.trajectories import AgedParameter, TrajectoryDataset
+from battery_env.trajectories import TrajectoryDataset
 from benchmarks.contests import HELD_OUT, SENSORS
 from benchmarks.pretrained import OPTIONS, TRAINED_WITH
 from benchmarks.study import (
@@ -74,7 +74,7 @@ SLOW_DISCHARGES = 2
 #: A cell that is a little worn in both parameters: 10 % less q_mobile, 10 % more r_o.
 WORN_CELL = NEW_CELL.replace(q_mobile=0.9 * NEW_CELL.q_mobile, r_o=1.1 * NEW_CELL.r_o)
 #: Where discharges are generated, by what is unknown.
-SEEDS = {"q_mobile": 0, "r_o": 1, "joint": 2}
+SEEDS = {("q_mobile",): 0, ("r_o",): 1, ("q_mobile", "r_o"): 2}
 #: Discharges that are timed, and how often each.
 TIMED_DISCHARGES, TIMED_REPETITIONS = 3, 3
 #: A calibrator that is off by more than this at the end has lost the discharge.
@@ -226,9 +226,8 @@ def _greedy(name: str, resync: bool = True) -> Calibrator:
 
 
 def _generated(condition: Condition, unknown: Sequence[str], n: int, **options: Any) -> TrajectoryDataset:
-    kind = "joint" if len(unknown) > 1 else unknown[0]
     cell = WORN_CELL if condition.other_worn else NEW_CELL
-    return TrajectoryDataset.generate(cast(AgedParameter, kind), n, RandomPiecewise(), SEEDS[kind], cell=cell, **options)
+    return TrajectoryDataset.generate(unknown, n, RandomPiecewise(), SEEDS[tuple(unknown)], cell=cell, **options)
 
 
 def _held_out(condition: Condition, unknown: Sequence[str], n: int) -> TrajectoryDataset:
@@ -236,7 +235,7 @@ def _held_out(condition: Condition, unknown: Sequence[str], n: int) -> Trajector
     # alone is unknown
     if condition.alone:
         return _generated(condition, unknown, n, q_mobile_range=Q_MOBILE_RANGE_C, r_o_range=R_O_RANGE_OHM)
-    return standard_dataset("joint", "piecewise", "test", mismatch=condition.mismatch)[:n]
+    return standard_dataset(PARAMETER_NAMES, "piecewise", "test", mismatch=condition.mismatch)[:n]
 
 
 _TRIED = ("least squares, whole discharge", "extended Kalman filter")

@@ -105,7 +105,7 @@ def real_rows(cell: str, discharges: list[Discharge], life: Life, every: int, sa
 
 def simulated_rows(kind: str, seed: int, count: int, samples: int) -> list[dict[str, object]]:
     """Simulated discharges under a random load."""
-    data = TrajectoryDataset.generate("joint", count, LOADS[kind], seed=seed, mismatch=MISMATCH, dt_s=DT_S)
+    data = TrajectoryDataset.generate(("q_mobile", "r_o"), count, LOADS[kind], seed=seed, mismatch=MISMATCH, dt_s=DT_S)
     rng = np.random.default_rng(seed)
     model, mismatch_V = RecordModel(dt_s=DT_S), MISMATCH_V["simulated"]
     rows: list[dict[str, object]] = []

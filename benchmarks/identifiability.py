@@ -95,7 +95,7 @@ def beginning(record: Trajectory, share: float) -> Trajectory:
 
 def conservation_table() -> pd.DataFrame:
     """How exactly the full state tells both parameters, over discharges of cells of many ages under varying power."""
-    data = TrajectoryDataset.generate("joint", 50, RandomPiecewise(), SEED, r_o_range=(0.1, 0.3))
+    data = TrajectoryDataset.generate(PARAMETER_NAMES, 50, RandomPiecewise(), SEED, r_o_range=(0.1, 0.3))
     worst = dict.fromkeys(PARAMETER_NAMES, 0.0)
     samples = 0
     for record, trace in zip(data, ClosedForm().trace(data), strict=True):

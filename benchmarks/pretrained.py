@@ -30,17 +30,16 @@ from battery_env.calibration.policy import PolicyEstimator
 from battery_env.calibration.pretrained import file_stem, policy_of_file
 from battery_env.evaluation import evaluate
 from battery_env.files import replacing
-from battery_env.trajectories import AgedParameter
 from benchmarks.contests import HELD_OUT, SENSORS
 from benchmarks.study import SYMBOLS, Study, Tables, at_most, command_line, markdown, natural, positive, versions, write_json
 from benchmarks.training import Recipe, timesteps_of, train_or_load, training_minutes
 from sb3_lac.onnx import export_onnx
 
-#: What each policy finds, as data sets name it.
-FOUND: dict[str, AgedParameter] = {
-    "BatteryVoltageJoint-v0": "joint",
-    "BatteryVoltageQmax-v0": "q_mobile",
-    "BatteryVoltageRo-v0": "r_o",
+#: What each policy finds.
+FOUND: dict[str, tuple[str, ...]] = {
+    "BatteryVoltageJoint-v0": ("q_mobile", "r_o"),
+    "BatteryVoltageQmax-v0": ("q_mobile",),
+    "BatteryVoltageRo-v0": ("r_o",),
 }
 #: How far kn, tDiffusion, to and tsn of the cells are from the model's, in training and as the observation takes them to be.
 MISMATCH = 0.2
@@ -85,8 +84,7 @@ def summary(scores: pd.DataFrame) -> pd.DataFrame:
     """The scores over discharges."""
     rows = []
     for (env_id, mismatch, sensor), group in scores.groupby(["env_id", "mismatch", "sensor"], sort=False):
-        found = FOUND[str(env_id)]
-        for name in SYMBOLS if found == "joint" else (found,):
+        for name in FOUND[str(env_id)]:
             error = group[f"{name}_second_half_mape_percent"]
             rows.append(
                 {

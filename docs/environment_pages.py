@@ -59,7 +59,7 @@ def environment_page(env_id: str) -> str:
 def ids() -> str:
     """All environments in one table."""
     # spaces and episodes do not depend on the discharges; these are quickly made, and as many as a life has cycles
-    dataset = TrajectoryDataset.generate("joint", 20, [constant(8.0)], seed=0)
+    dataset = TrajectoryDataset.generate(("q_mobile", "r_o"), 20, [constant(8.0)], seed=0)
     rows = []
     for env_id in TASKS:
         task = page_class(env_id)(1, dataset=dataset)

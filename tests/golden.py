@@ -66,7 +66,7 @@ def model() -> Numbers:
         yield f"model/{name}/state", trajectory.state
         yield f"model/{name}/voltage", trajectory.voltage_V
     for aged, load in (("q_mobile", "paper"), ("r_o", "constant"), ("joint", "random_walk"), ("joint", "piecewise")):
-        dataset = standard_dataset(aged, load, "test")
+        dataset = standard_dataset(("q_mobile", "r_o") if aged == "joint" else aged, load, "test")
         for n in (0, len(dataset) // 2, len(dataset) - 1):
             record = dataset[n]
             yield f"dataset/{aged}/{load}/{n}", np.column_stack(
@@ -102,7 +102,7 @@ def tasks() -> Numbers:
 
 def calibrators() -> Numbers:
     """Estimates of every calibrator, on simulated and on recorded discharges."""
-    paper, drive = standard_dataset("q_mobile", "paper", "test"), standard_dataset("joint", "random_walk", "test")
+    paper, drive = standard_dataset("q_mobile", "paper", "test"), standard_dataset(("q_mobile", "r_o"), "random_walk", "test")
     of_paper, of_drive = paper.subset([5, 900]), drive.subset([1, 7])
     errors = SensorErrors(noise_V=0.005)
     for name, estimator in {"closed_form": ClosedForm(), "greedy": GreedyOneStep("q_mobile")}.items():
@@ -190,7 +190,7 @@ def fits() -> Numbers:
                 columns = (trace.time_s, trace.q_mobile, trace.r_o, trace.sd_q_mobile, trace.sd_r_o, trace.settled)
                 yield f"fit/{name}/{part}/{k}", np.column_stack(columns)
             yield f"fit/{name}/{part}/reason", np.array([LeastSquares(**options).estimate(of_part).reason])
-    drive = standard_dataset("joint", "random_walk", "test").subset([2, 11])
+    drive = standard_dataset(("q_mobile", "r_o"), "random_walk", "test").subset([2, 11])
     for name, options in {"offset": {"parameters": ("q_mobile", "r_o", "offset_V")}, "plain": {}}.items():
         with contextlib.suppress(ValueError):
             frame = evaluate(LeastSquares(**options), drive, errors, seed=1).drop(columns="time_per_update_s")
@@ -211,7 +211,7 @@ def forecasts() -> Numbers:
     whole = load_nasa_discharges("B0005")[60]
     record = whole.until(0.6 * float(whole.time_s[-1]))
     estimate = LeastSquares(prior_q_mobile_C=(6500.0, 100.0), mismatch_V=0.05).estimate(record)
-    walk = standard_dataset("joint", "random_walk", "test")[3]
+    walk = standard_dataset(("q_mobile", "r_o"), "random_walk", "test")[3]
     for name, load, unit in (
         ("goes_on", None, "current"),
         ("number", 1.5, "current"),
@@ -229,7 +229,7 @@ def forecasts() -> Numbers:
 def command_line() -> Numbers:
     """What battery-calibrate says of recorded discharges, and of files: lines of JSON, texts, and the exit status."""
     record = load_nasa_discharges("B0006")[30]
-    walk = standard_dataset("joint", "random_walk", "test")[0]
+    walk = standard_dataset(("q_mobile", "r_o"), "random_walk", "test")[0]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         rows = zip(record.time_s, record.voltage_V, record.current_A, strict=True)
@@ -283,7 +283,7 @@ def command_line() -> Numbers:
 
 def policies() -> Numbers:
     """What the policies that come with the package estimate."""
-    drive = standard_dataset("joint", "piecewise", "test").subset([2, 9])
+    drive = standard_dataset(("q_mobile", "r_o"), "piecewise", "test").subset([2, 9])
     for id_ in ("BatteryVoltageQmax-v0", "BatteryVoltageRo-v0", "BatteryVoltageJoint-v0"):
         frame = evaluate(PolicyEstimator.pretrained(id_), drive, SensorErrors(noise_V=0.005), seed=1)
         yield f"policy/{id_}", frame.drop(columns="time_per_update_s").select_dtypes("number").to_numpy(dtype=float)
@@ -340,7 +340,7 @@ def trainings() -> Numbers:
                 continue
             yield f"training/{algo.__name__}/{id_}/{name}", weights.numpy()
         if id_.startswith("Battery"):
-            aged, load = ("q_mobile", "paper") if id_ == "BatteryQmax-v0" else ("joint", "piecewise")
+            aged, load = ("q_mobile", "paper") if id_ == "BatteryQmax-v0" else (("q_mobile", "r_o"), "piecewise")
             discharges = standard_dataset(aged, load, "test").subset([3, 4])
             frame = evaluate(PolicyEstimator(policy, id_), discharges).drop(columns="time_per_update_s")
             yield f"training/{algo.__name__}/{id_}/evaluate", frame.select_dtypes("number").to_numpy()

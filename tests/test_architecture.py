@@ -27,7 +27,6 @@ LAYERS = (
     ("battery_env.electrochemistry",),
     ("battery_env.records", "battery_env.estimates"),
     ("battery_env.loads",),
-    ("battery_env.dataset_files",),
     ("battery_env.trajectories", "battery_env.cells", "battery_env.nasa_cells"),
     ("battery_env.record_files",),
     ("battery_env.sensors",),

@@ -27,7 +27,7 @@ def first_cells(section):
 
 @pytest.fixture(scope="module")
 def dataset():
-    return TrajectoryDataset.generate("joint", 20, [constant(8.0)], seed=0)
+    return TrajectoryDataset.generate(("q_mobile", "r_o"), 20, [constant(8.0)], seed=0)
 
 
 def test_the_pages_say_what_the_code_says():

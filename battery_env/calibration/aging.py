@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any, Literal
 
@@ -40,14 +41,9 @@ def simulated_lives(lives: int, cycles: int, seed: int, cell: CellParameters | N
     q_mobile = worn(rng.uniform(6800.0, 7600.0, lives), -rng.uniform(0.1, 0.4, lives))
     r_o = worn(rng.uniform(0.10, 0.14, lives), rng.uniform(0.2, 1.0, lives))
     sampler = RandomPiecewise()
-    return TrajectoryDataset.simulated(
-        q_mobile.ravel(),
-        r_o.ravel(),
-        [sampler(rng) for _ in range(lives * cycles)],
-        np.arange(lives * cycles),
-        cell=cell,
-        description={"made_by": "simulated_lives", "lives": lives, "cycles": cycles, "seed": seed},
-    )
+    loads = [sampler(rng) for _ in range(lives * cycles)]
+    made = TrajectoryDataset.simulated(q_mobile.ravel(), r_o.ravel(), loads, np.arange(lives * cycles), cell=cell)
+    return replace(made, description={"made_by": "simulated_lives", "lives": lives, "cycles": cycles, "seed": seed})
 
 
 class BatteryAging(VoltageTask):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Literal, TypeVar, get_args
 
@@ -11,7 +12,7 @@ import numpy as np
 from battery_env.cells import BUNDLED_CELLS, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.loads import Load, LoadSampler, RandomPiecewise, RandomWalk, constant, recorded
-from battery_env.trajectories import PAPER_LOADS_W, PAPER_RANGES, PAPER_TRIM, AgedParameter, TrajectoryDataset
+from battery_env.trajectories import PAPER_LOADS_W, PAPER_RANGES, PAPER_TRIM, TrajectoryDataset, aged_parameters
 
 _Discharges = TypeVar("_Discharges")
 
@@ -31,7 +32,7 @@ CONSTANT_LOADS_W: tuple[float, ...] = tuple(np.linspace(2.0, 8.0, 13))
 
 
 def standard_dataset(
-    parameter: AgedParameter,
+    parameters: str | Sequence[str],
     load: LoadKind,
     split: Split,
     dt_s: float = 1.0,
@@ -39,8 +40,8 @@ def standard_dataset(
     cell: CellParameters = NEW_CELL,
 ) -> TrajectoryDataset:
     """
-    A data set, or one side of its 70/30 split by trajectory, made once per process. All are at power, isothermal, and
-    follow the seed 0.
+    A data set of cells of which one parameter has aged or both have, or one side of its 70/30 split by trajectory, made once
+    per process. All are at power, isothermal, and follow the seed 0.
 
     =============== ============================================================== ============ ============== ==========
     load            what                                                           q_mobile     r_o            discharges
@@ -60,7 +61,7 @@ def standard_dataset(
         raise ValueError(f"load must be one of {get_args(LoadKind)}, got {load!r}")
     if split not in get_args(Split):
         raise ValueError(f"split must be 'train', 'test' or 'all', got {split!r}")
-    return _splits(parameter, load, dt_s, mismatch, cell)[split]
+    return _splits(aged_parameters(parameters), load, dt_s, mismatch, cell)[split]
 
 
 def opened(dataset: _Discharges | str | os.PathLike[str]) -> _Discharges | TrajectoryDataset:
@@ -77,29 +78,31 @@ def _loaded(path: str, modified_ns: int) -> TrajectoryDataset:
 
 @lru_cache(maxsize=6)
 def _splits(
-    parameter: AgedParameter, load: LoadKind, dt_s: float, mismatch: float, cell: CellParameters
+    parameters: tuple[str, ...], load: LoadKind, dt_s: float, mismatch: float, cell: CellParameters
 ) -> dict[Split, TrajectoryDataset]:
-    whole = _whole(parameter, load, dt_s, mismatch, cell)
-    train, test = whole.split(test=TEST_SHARE, by="trajectory", seed=SEED)
+    whole = _whole(parameters, load, dt_s, mismatch, cell)
+    train, test = whole.split(test=TEST_SHARE, seed=SEED)
     return {"train": train, "test": test, "all": whole}
 
 
-def _whole(parameter: AgedParameter, load: LoadKind, dt_s: float, mismatch: float, cell: CellParameters) -> TrajectoryDataset:
-    if load == "paper" and parameter != "joint" and dt_s == 1.0 and mismatch == 0.0 and cell == NEW_CELL:
-        return TrajectoryDataset.paper(parameter)
-    paper = load == "paper"
-    return TrajectoryDataset.generate(
-        parameter,
+def _whole(
+    parameters: tuple[str, ...], load: LoadKind, dt_s: float, mismatch: float, cell: CellParameters
+) -> TrajectoryDataset:
+    if load == "paper" and len(parameters) == 1 and dt_s == 1.0 and mismatch == 0.0 and cell == NEW_CELL:
+        return TrajectoryDataset.paper(parameters[0])
+    ranges = PAPER_RANGES if load == "paper" else {"q_mobile": Q_MOBILE_RANGE_C, "r_o": R_O_RANGE_OHM}
+    whole = TrajectoryDataset.generate(
+        parameters,
         DISCHARGES,
         _loads(load, dt_s),
         SEED,
-        q_mobile_range=PAPER_RANGES["q_mobile"] if paper else Q_MOBILE_RANGE_C,
-        r_o_range=PAPER_RANGES["r_o"] if paper else R_O_RANGE_OHM,
-        trim=PAPER_TRIM if paper else (0.0, 1.0),
+        q_mobile_range=ranges["q_mobile"],
+        r_o_range=ranges["r_o"],
         dt_s=dt_s,
         cell=cell,
         mismatch=mismatch,
     )
+    return whole.trimmed(*PAPER_TRIM) if load == "paper" else whole
 
 
 def _loads(load: LoadKind, dt_s: float) -> list[Load] | LoadSampler:

@@ -31,7 +31,7 @@ from battery_env.electrochemistry import (
     initial_state,
     voltage_into,
 )
-from battery_env.trajectories import AgedParameter, TrajectoryDataset
+from battery_env.trajectories import TrajectoryDataset
 
 # A model that was wrong for a while has moved too much or too little charge from one electrode to the other. In both
 # electrodes nine tenths of that charge are in the bulk.
@@ -39,9 +39,9 @@ _PERTURBATION = np.array([1.0, 1.0, 1.0, -0.9, -0.1, 0.9, 0.1])
 
 
 @lru_cache(maxsize=4)
-def _reachable(parameter: AgedParameter, load: LoadKind, split: Split, dt_s: float, mismatch: float) -> TrajectoryDataset:
+def _reachable(parameters: Sequence[str], load: LoadKind, split: Split, dt_s: float, mismatch: float) -> TrajectoryDataset:
     # the discharges of the standard data set whose parameters actions can stand for
-    dataset = standard_dataset(parameter, load, split, dt_s, mismatch)
+    dataset = standard_dataset(parameters, load, split, dt_s, mismatch)
     values = {"q_mobile": dataset.q_mobile, "r_o": dataset.r_o}
     within = np.all([(low <= values[name]) & (values[name] <= high) for name, (low, high) in ACTION_RANGES.items()], axis=0)
     return dataset if within.all() else dataset.subset(np.flatnonzero(within))
@@ -124,7 +124,7 @@ class FullStateTask(CalibrationTask):
         check_counts(episode_steps=self.episode_steps)
         data: dict[str, Any] = {"load": load, "split": split, "dt_s": dt_s, "mismatch": mismatch}
         if dataset is None:
-            self.dataset = dataset = _reachable("joint" if len(self.parameters) == 2 else self.parameters[0], **data)
+            self.dataset = dataset = _reachable(self.parameters, **data)
         else:
             self._refuse_beside_a_dataset(**data)
             self.dataset = dataset = opened(dataset)

@@ -264,7 +264,7 @@ class PolicyEstimator(OnlineEstimator):
         :return: the estimate
         :raises ValueError: for a record that cannot be meant
         """
-        time_s, _, current_A = check_record(record.time_s, record.voltage_V, record.current_A)
+        time_s, _, current_A = check_record(record)
         check_drawn_charge(float(drawn(time_s, current_A, time_s[-1])))
         trace = self.trace([record])[0]
         if trace.sd_q_mobile is not None:

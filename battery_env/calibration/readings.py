@@ -97,7 +97,7 @@ class Readings:
         columns: list[tuple[FloatArray, ...]] = []
         start_s: list[float] = []
         for n, record in enumerate(records):
-            samples = check_record(record.time_s, record.voltage_V, record.current_A, least_samples=2)
+            samples = check_record(record, least_samples=2)
             time_s = samples.time_s - samples.time_s[0]
             count = int(np.floor(time_s[-1] / interval_s + 1e-9))
             if count < 2:

@@ -112,7 +112,7 @@ class VoltageTask(CalibrationTask):
             cell = dataset.cell
         cell = check_cell(cell)
         if dataset is None:
-            dataset = standard_dataset("joint" if len(self.parameters) == 2 else self.parameters[0], **data, cell=cell)
+            dataset = standard_dataset(self.parameters, **data, cell=cell)
         else:
             self._refuse_beside_a_dataset(**data)
         if isinstance(dataset, TrajectoryDataset):

@@ -373,7 +373,7 @@ def _records(discharges: Sequence[Record], cut_off_V: float) -> list[Record]:
     for number, discharge in enumerate(discharges, start=1):
         try:
             record = discharge.loaded_part(cut_off_V) if isinstance(discharge, Discharge) else discharge
-            samples = check_record(record.time_s, record.voltage_V, record.current_A, _FEWEST_SAMPLES)
+            samples = check_record(record, _FEWEST_SAMPLES)
             check_drawn_charge(float(drawn(samples.time_s, samples.current_A, samples.time_s[-1])))
         except AttributeError as error:
             raise TypeError(f"discharge {number} of {len(discharges)} is no record: {error}") from error

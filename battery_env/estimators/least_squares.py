@@ -509,9 +509,7 @@ class LeastSquares(Estimator):
         return float(voltage_V[: (told[0] + 1) * stride].min() - fit.residual_V[-1]) if len(told) else -inf
 
     def _problem(self, record: Record) -> _Problem:
-        clock_s, voltage_V, measured_A = check_record(
-            record.time_s, record.voltage_V, record.current_A, least_samples=len(self.parameters) + 1
-        )
+        clock_s, voltage_V, measured_A = check_record(record, least_samples=len(self.parameters) + 1)
         time_s, current_A = self.model.grid(record)
         if not current_A[:-1].any():
             raise ValueError("no current flows in this record: it says nothing about q_mobile and r_o")

@@ -176,7 +176,7 @@ def test_a_perturbation_conserves_charge():
 @pytest.mark.parametrize("parameters", [("q_mobile",), ("r_o",), ("q_mobile", "r_o")])
 def test_a_batch_is_its_cells_one_by_one(parameters, formulation):
     kind = type("Task", (FullStateTask,), {"parameters": parameters, "formulation": formulation})
-    data = TrajectoryDataset.generate("joint", 6, RandomPiecewise(), seed=0)
+    data = TrajectoryDataset.generate(("q_mobile", "r_o"), 6, RandomPiecewise(), seed=0)
     rng = np.random.default_rng(0)
     actions = rng.uniform(-1.0, 1.0, (30, 6, len(parameters)))
     samples = rng.integers(0, 500, 6)

@@ -17,7 +17,7 @@ from battery_env.trajectories import TrajectoryDataset
 
 @pytest.fixture(scope="module")
 def data():
-    return TrajectoryDataset.generate("joint", 8, RandomPiecewise(), seed=0, trim=(0.05, 0.95))
+    return TrajectoryDataset.generate(("q_mobile", "r_o"), 8, RandomPiecewise(), seed=0).trimmed(0.05, 0.95)
 
 
 class Constant(Estimator):

@@ -26,7 +26,7 @@ STATE_SCALE = np.array([0.5, 0.1, 0.01, 6840.0, 760.0, 11400.0, 1266.0])
 
 @pytest.fixture(scope="module")
 def discharges():
-    return TrajectoryDataset.generate("joint", 5, RandomPiecewise(), seed=0, r_o_range=(0.1, 0.2))
+    return TrajectoryDataset.generate(("q_mobile", "r_o"), 5, RandomPiecewise(), seed=0, r_o_range=(0.1, 0.2))
 
 
 def started(task, trajectory=2, sample=300):
@@ -262,7 +262,7 @@ def test_perturbations_of_the_literal_form_are_in_error_scales_too(discharges):
 
 @pytest.mark.parametrize(("kind", "size"), [(BatteryQmax, 1), (BatteryJoint, 2)])
 def test_going_on_with_some_cells_changes_nothing_for_them(kind, size):
-    data = TrajectoryDataset.generate("joint", 4, RandomPiecewise(), seed=0, mismatch=0.1)
+    data = TrajectoryDataset.generate(("q_mobile", "r_o"), 4, RandomPiecewise(), seed=0, mismatch=0.1)
     options = {"sensor_noise": 1.0, "process_noise_V": 1e-4, "consistency": 0.5, "resync": 4, "start": "new_cell"}
     tasks = [make(data, kind, cells=4, **options) for _ in range(2)]
     for task in tasks:
@@ -315,7 +315,7 @@ def test_episodes_go_on_with_a_probability(discharges):
 
 
 def test_a_share_of_the_episodes_starts_where_the_whole_discharge_does():
-    cells, discharges = 400, TrajectoryDataset.generate("q_mobile", 5, RandomPiecewise(), seed=0, trim=(0.05, 0.95))
+    cells, discharges = 400, TrajectoryDataset.generate("q_mobile", 5, RandomPiecewise(), seed=0).trimmed(0.05, 0.95)
     assert (discharges.first > 0).all()
     for probability, low, high in ((0.0, 0, 0), (0.25, 60, 140), (1.0, cells, cells)):
         task = make(discharges, cells=cells, first_sample_probability=probability)

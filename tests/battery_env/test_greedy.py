@@ -13,7 +13,7 @@ from battery_env.trajectories import TrajectoryDataset
 
 @pytest.fixture(scope="module")
 def discharges():
-    return list(TrajectoryDataset.generate("joint", 3, RandomPiecewise(), seed=0, trim=(0.4, 0.9)))
+    return list(TrajectoryDataset.generate(("q_mobile", "r_o"), 3, RandomPiecewise(), seed=0).trimmed(0.4, 0.9))
 
 
 def errors_percent(estimator, record):

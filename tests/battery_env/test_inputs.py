@@ -5,11 +5,9 @@ import dataclasses
 import pickle
 from datetime import datetime
 from functools import partial
-from io import BytesIO
 
 import gymnasium as gym
 import numpy as np
-import pandas as pd
 import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
@@ -19,7 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 import battery_env
 from battery_env.calibration.registration import TASKS
-from battery_env.loads import RandomPiecewise, RandomWalk, constant, piecewise, recorded
+from battery_env.loads import RandomPiecewise, constant
 
 NUMBERS = st.floats() | st.integers(-(2**63), 2**63 - 1) | st.floats(0.0, 1e4)
 ARRAYS = arrays(np.float64, array_shapes(min_side=0), elements=st.floats() | st.floats(0.0, 1e4))
@@ -48,7 +46,7 @@ def right_or_refused(call, *names):
 
 @pytest.fixture(scope="module")
 def data():
-    return battery_env.TrajectoryDataset.generate("joint", 20, RandomPiecewise(), seed=0)
+    return battery_env.TrajectoryDataset.generate(("q_mobile", "r_o"), 20, RandomPiecewise(), seed=0)
 
 
 class TestModel:
@@ -96,10 +94,10 @@ class TestModel:
     @FAST
     @given(
         name=st.sampled_from([field.name for field in dataclasses.fields(battery_env.CellParameters)]),
-        value=st.floats(-1e6, 1e6) | st.sampled_from([np.nan, np.inf, -np.inf]),
+        value=st.floats(-1e6, 1e6) | st.sampled_from([np.nan, np.inf, -np.inf]) | JUNK,
     )
     def test_constants_are_kept_or_refused(self, name, value):
-        value = (value,) if name in ("An", "Ap") else value
+        value = (value,) if name in ("An", "Ap") and isinstance(value, float) else value
         cell = right_or_refused(lambda: battery_env.CellParameters(**{name: value}), name)
         assert cell is None or getattr(cell, name) == value
 
@@ -123,79 +121,8 @@ class TestModel:
         with pytest.raises(ValueError, match="load must be a number or one value a step"):
             battery_env.simulate([], 7600.0, 0.1)
 
-    @FAST
-    @given(name=st.sampled_from([field.name for field in dataclasses.fields(battery_env.CellParameters)]), value=JUNK)
-    def test_constants_are_numbers(self, name, value):
-        assert right_or_refused(lambda: battery_env.CellParameters(**{name: value}), name) is None
-
-
-class TestLoads:
-    @FAST
-    @given(name=st.sampled_from(["values", "durations_s"]), value=NUMBERS | ARRAYS | JUNK)
-    def test_piecewise(self, name, value):
-        arguments = {"values": [2.0, 3.0], "durations_s": [10.0, 20.0]} | {name: value}
-        load = right_or_refused(lambda: piecewise(**arguments), "values", "value", "durations_s", "load", "start_s")
-        if load is not None:
-            np.testing.assert_array_equal(load(load.start_s), load.value)
-
-    @FAST
-    @given(time_s=NUMBERS | ARRAYS | JUNK)
-    def test_at_any_time(self, time_s):
-        value = right_or_refused(lambda: constant(2.0)(time_s), "time_s")
-        assert value is None or ((value == 2.0).all() and value.shape == np.shape(time_s))
-
-    @FAST
-    @given(
-        sampler=st.sampled_from([RandomPiecewise, RandomWalk]),
-        name=st.sampled_from(["value_range", "duration_range_s", "largest_step", "segment_s", "total_s"]),
-        value=st.floats(1.0, 1e5) | st.sampled_from([0.0, -1.0, np.nan, np.inf]) | JUNK | st.tuples(NUMBERS, NUMBERS),
-    )
-    def test_samplers(self, sampler, name, value):
-        assume(name in {field.name for field in dataclasses.fields(sampler)})
-        made = right_or_refused(lambda: sampler(**{name: value}), name, "load")
-        if made is not None:
-            load = made(np.random.default_rng(0))
-            assert (load.value >= made.value_range[0]).all() and (load.value <= made.value_range[1]).all()
-
-    @FAST
-    @given(dt_s=NUMBERS | JUNK, unit=st.sampled_from(["power", "current", "energy"]))
-    def test_recorded(self, data, dt_s, unit):
-        assume(not isinstance(dt_s, (int, float)) or not 0.0 < dt_s < 1.0)  # as many steps as there is memory for
-        load = right_or_refused(lambda: recorded(data[0], unit, dt_s), "dt_s", "unit")
-        assert load is None or np.isfinite(load.value).all()
-
 
 class TestDataSets:
-    @pytest.mark.parametrize(
-        ("name", "values"),
-        [
-            ("parameter", JUNK),
-            ("n", JUNK | st.floats() | st.integers(-5, 3)),
-            ("loads", JUNK | NUMBERS | st.just(constant(8.0)) | st.just([constant(8.0), "8 W"])),
-            ("seed", JUNK | NUMBERS),
-            ("q_mobile_range", JUNK | NUMBERS | st.tuples(NUMBERS, NUMBERS)),
-            ("r_o_range", JUNK | NUMBERS | st.tuples(NUMBERS, NUMBERS)),
-            ("trim", JUNK | NUMBERS | st.tuples(st.floats(-0.1, 1.1), st.floats(-0.1, 1.1))),
-            ("dt_s", NUMBERS),
-            ("thermal", JUNK | NUMBERS | st.booleans()),
-            ("cell", JUNK | NUMBERS),
-            ("mismatch", JUNK | NUMBERS | st.floats(0.0, 0.6)),
-        ],
-    )
-    def test_generating(self, name, values):
-        @settings(FAST, max_examples=15)
-        @given(values)
-        def generate(value):
-            arguments = {"parameter": "joint", "n": 2, "loads": [constant(14.0)], "seed": 0} | {name: value}
-            meant = {"dt_s": "dt", "q_mobile_range": "q_mobile", "r_o_range": "r_o"}.get(name, name)
-            # fast cells and long steps may not go together, nor may a lot of resistance and power
-            others = {"mismatch": ("dt",), "r_o_range": ("at least 8 are needed",), "dt_s": ("dt_s", "at least 8")}
-            make = partial(battery_env.TrajectoryDataset.generate, **arguments)
-            made = right_or_refused(make, meant, *others.get(name, ()), "within a day")
-            assert made is None or all(np.isfinite(trajectory.state).all() for trajectory in made)
-
-        generate()
-
     @FAST
     @given(
         index=ARRAYS
@@ -213,17 +140,10 @@ class TestDataSets:
             data.subset(data.q_mobile > 5000.0)
 
     @FAST
-    @given(test=NUMBERS | JUNK, by=st.sampled_from(["trajectory", "load", "parameter"]) | st.text(), seed=st.integers() | JUNK)
+    @given(test=NUMBERS | JUNK, by=st.sampled_from(["trajectory", "parameter"]) | st.text(), seed=st.integers() | JUNK)
     def test_splitting(self, data, test, by, seed):
         parts = right_or_refused(lambda: data.split(test, by, seed), "test", "by", "seed", "non-negative")
         assert parts is None or len(parts[0]) + len(parts[1]) == len(data)
-
-    @FAST
-    @given(value=JUNK)
-    def test_gathering(self, value):
-        assert (
-            right_or_refused(lambda: battery_env.TrajectoryDataset.from_trajectories(value), "trajector", "iterable") is None
-        )
 
     @pytest.mark.parametrize("path", [None, 3, b"data.npz", 1.5])
     def test_paths(self, data, path):
@@ -233,58 +153,6 @@ class TestDataSets:
 
 
 class TestRecordings:
-    CSV = b"time_s,voltage_V,current_A,temperature_C\n" + b"".join(
-        b"%d,%.2f,2.0,24.5\n" % (10 * k, 4.0 - k / 20) for k in range(20)
-    )
-
-    @settings(FAST, max_examples=100)
-    @given(
-        start=st.integers(0, len(CSV)),
-        length=st.integers(0, 40),
-        middle=st.binary(max_size=30) | st.text("0123456789.,-\n e").map(str.encode),
-    )
-    def test_a_damaged_table_is_refused_by_name_or_is_a_discharge(self, tmp_path, start, length, middle):
-        path = tmp_path / "own.csv"
-        path.write_bytes(self.CSV[:start] + middle + self.CSV[start + length :])
-        discharge = right_or_refused(lambda: battery_env.read_discharge_csv(path), "own.csv")
-        if discharge is not None:
-            assert (np.diff(discharge.time_s) > 0.0).all() and discharge.charge_C > 0.0
-            assert ((discharge.voltage_V >= 0.0) & (discharge.voltage_V <= 5.5)).all()
-
-    @pytest.mark.parametrize(
-        ("contents", "message"),
-        [
-            (CSV.splitlines()[0] + b"\n", "at least 5"),
-            (CSV + b"200,,2.0,24\n", "voltage_V must be finite, got nan at sample 20"),
-            (CSV + b"200,1e999,2.0,24\n", "voltage_V must be finite, got inf"),
-            (CSV + b"190,3.0,2.0,24\n", "sample 20 is at 190 s, after 190 s"),
-            (CSV + b"2020-01-01 00:03,3.0,2.0,24\n", "time_s must hold numbers"),
-            (CSV + b"\x00\x00", "own.csv"),
-            (CSV[:100] + b'"' + CSV[100:], "own.csv"),
-            (CSV.replace(b",", b"\t"), "separate them by commas"),
-        ],
-    )
-    def test_what_is_wrong_with_a_table_is_said(self, tmp_path, contents, message):
-        (tmp_path / "own.csv").write_bytes(contents)
-        with pytest.raises(ValueError, match=f"(?s)own.csv.*{message}|{message}"):
-            battery_env.read_discharge_csv(tmp_path / "own.csv")
-
-    @pytest.mark.parametrize("name", ["own.csv.gz", "own.csv.zip", "own.csv.bz2", "own.csv.xz"])
-    @pytest.mark.parametrize("length", [0, 10, 60])
-    def test_a_damaged_archive_is_refused_by_name(self, tmp_path, name, length):
-        pd.read_csv(BytesIO(self.CSV)).to_csv(tmp_path / name, index=False)
-        assert len(battery_env.read_discharge_csv(tmp_path / name).time_s) == 20
-        (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:length])
-        with pytest.raises(ValueError, match=name):
-            battery_env.read_discharge_csv(tmp_path / name)
-
-    @pytest.mark.parametrize("cycle", ["", "first", "1.5"])
-    def test_cycles_are_counted_in_whole_numbers(self, tmp_path, cycle):
-        rows = [f"{cycle},{row}" for row in self.CSV.decode().splitlines()[1:]]
-        (tmp_path / "X1.csv").write_text("\n".join(["cycle,time_s,voltage_V,current_A,temperature_C", *rows]))
-        with pytest.raises(ValueError, match=r"X1.csv: cycle must hold whole numbers"):
-            battery_env.load_nasa_discharges(tmp_path / "X1.csv")
-
     @pytest.mark.parametrize("length", [0, 1, 100, 200, 1000])
     def test_a_truncated_mat_file_is_refused_by_name(self, tmp_path, length):
         savemat(tmp_path / "B1.mat", {"B1": {"cycle": np.array([{"type": "charge", "data": np.ones(200)}] * 2, dtype=object)}})
@@ -311,10 +179,6 @@ class TestRecordings:
         for method, name in ((discharge.until, "time_s"), (discharge.loaded_part, "cut_off_V")):
             with pytest.raises(ValueError, match=f"{name} must be a"):
                 method(value)
-
-    def test_a_byte_order_mark_does_no_harm(self, tmp_path):
-        (tmp_path / "own.csv").write_bytes(b"\xef\xbb\xbf" + self.CSV)
-        assert len(battery_env.read_discharge_csv(tmp_path / "own.csv").time_s) == 20
 
     @FAST
     @given(name=st.sampled_from(["voltage_V", "current_A", "temperature_C"]), value=ARRAYS | NUMBERS | arrays(np.float64, 20))

@@ -31,7 +31,7 @@ def steps(seed):
 @pytest.fixture(scope="module")
 def joint():
     """Ten discharges of cells with both parameters aged, as measured, and their traces."""
-    data = TrajectoryDataset.generate("joint", 10, RandomPiecewise(), seed=3, r_o_range=(0.117, 0.35))
+    data = TrajectoryDataset.generate(("q_mobile", "r_o"), 10, RandomPiecewise(), seed=3, r_o_range=(0.117, 0.35))
     records = [SensorErrors(noise_V=NOISE_V).apply(record, np.random.default_rng(n)) for n, record in enumerate(data)]
     return records, ExtendedKalmanFilter().trace(records)
 
@@ -59,7 +59,7 @@ class TestAccuracy:
             assert np.sqrt(np.mean(deviations**2)) > 0.4  # not by stating too much
 
     def test_noise_that_was_not_stated_is_noticed(self):
-        data = TrajectoryDataset.generate("joint", 6, RandomPiecewise(), seed=2, r_o_range=(0.117, 0.35))
+        data = TrajectoryDataset.generate(("q_mobile", "r_o"), 6, RandomPiecewise(), seed=2, r_o_range=(0.117, 0.35))
         scores = evaluate(ExtendedKalmanFilter(voltage_noise_V=0.005), data, SensorErrors(noise_V=0.02))
         assert scores["q_mobile_final_error_percent"].max() < 2.0
         assert scores["q_mobile_coverage_percent"].mean() > 70.0

@@ -8,7 +8,14 @@ from scipy.integrate import trapezoid
 
 from battery_env.cells import Discharge, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL
-from battery_env.loads import Cycle, Load, RandomPiecewise, RandomWalk, Spliced, constant, piecewise, recorded
+from battery_env.loads import BlockBootstrap, Cycle, Load, RandomPiecewise, RandomWalk, constant, piecewise, recorded
+from battery_env.records import Samples
+
+
+def blocks(values, dt_s, block_s):
+    """Blocks of a record, drawn at random."""
+    record = Samples(dt_s * np.arange(len(values)), np.full(len(values), 4.0), values)
+    return BlockBootstrap(record, "current", block_s, dt_s, total_s=200.0)(np.random.default_rng(0))
 
 
 def test_a_segment_holds_from_its_start_to_the_next():
@@ -52,7 +59,7 @@ def test_a_load_on_a_grid_is_the_load_at_its_times(durations, dt_s, steps, seed)
     [
         piecewise([3.0, -1.0, 8.0, 2.0], [0.37, 0.2, 7.0, 1.0]),
         Cycle(piecewise([3.0, -1.0, 8.0], [0.37, 0.2, 7.0]), 1.1),
-        Spliced(np.random.default_rng(0).uniform(-1.0, 9.0, 11), np.array([4, 9, 0]), 5, 0.7, "power"),
+        blocks(np.random.default_rng(0).uniform(0.5, 9.0, 12), 0.7, block_s=3.5),
     ],
 )
 @pytest.mark.parametrize("dt_s", [0.25, 1.0, 4.0])
@@ -67,7 +74,7 @@ def test_the_mean_over_steps_draws_what_the_load_does(load, dt_s):
 def test_the_mean_of_a_load_that_keeps_step_is_its_value():
     grid_s = 2.0 * np.arange(40_000)
     walk = RandomWalk(segment_s=60.0)(np.random.default_rng(0))
-    for load in (constant(1.45), walk, Cycle(walk, 1200.0), Spliced(walk.value, np.arange(0, 300, 7), 30, 2.0, "power")):
+    for load in (constant(1.45), walk, Cycle(walk, 1200.0), blocks(walk.value, 2.0, block_s=60.0)):
         np.testing.assert_allclose(load.mean(grid_s, 2.0), load(grid_s), rtol=1e-9)
 
 

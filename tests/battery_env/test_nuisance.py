@@ -21,7 +21,7 @@ KNOWS_NOTHING = (1e6, 1e3, 1e3, *[100.0] * 4)
 
 @pytest.fixture(scope="module")
 def data():
-    return TrajectoryDataset.generate("joint", 4, RandomPiecewise(), seed=5, r_o_range=(0.1, 0.3))
+    return TrajectoryDataset.generate(("q_mobile", "r_o"), 4, RandomPiecewise(), seed=5, r_o_range=(0.1, 0.3))
 
 
 def step(record, q_mobile, r_o, logarithms=(0.0, 0.0, 0.0, 0.0), prior_sd=KNOWS_NOTHING, count=None):
@@ -157,7 +157,7 @@ class Follow:
 
 
 def test_the_step_alone_is_a_good_calibrator_of_cells_that_are_not_the_model():
-    data = standard_dataset("joint", "piecewise", "test", mismatch=0.2)[:12]
+    data = standard_dataset(("q_mobile", "r_o"), "piecewise", "test", mismatch=0.2)[:12]
     estimator = PolicyEstimator(Follow(), "BatteryVoltageJoint-v0", nuisance=0.2, reading_s=2.0)
     scores = evaluate(estimator, data, SensorErrors(noise_V=0.005), seed=1)
     assert scores["q_mobile_second_half_mape_percent"].mean() < 1.0

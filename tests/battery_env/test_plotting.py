@@ -14,7 +14,6 @@ from battery_env.plotting import (
     LABELS,
     new_figure,
     plot_discharge,
-    plot_errors,
     plot_estimates,
     plot_learning_curves,
     plot_life,
@@ -149,22 +148,6 @@ def test_estimates_of_a_real_cell_have_no_truth(traces):
 def test_a_bound_needs_the_true_parameters(traces, record):
     with pytest.raises(ValueError, match="true"):
         plot_estimates(traces, bound=cramer_rao_bound(record, 0.01))
-
-
-def test_errors_are_drawn_against_load_and_parameter(scores):
-    many = pd.DataFrame({"load": np.linspace(1.0, 3.0, 60), "r_o": np.linspace(0.1, 0.2, 60)})
-    many["r_o_mape_percent"] = many["load"]
-    figure = plot_errors({"LAC": scores, "EKF": many}, "r_o", load_unit="current")
-    by_load, by_parameter = figure.axes
-    assert (by_load.get_xlabel(), by_parameter.get_xlabel()) == ("mean load (A)", f"true {LABELS['r_o']}")
-    assert by_load.get_ylabel() == "MAPE of a discharge (%)" and by_load.get_yscale() == "log"
-    assert by_load.collections[0].get_offsets()[:, 0].tolist() == [8.0, 12.0, 16.0]
-    assert by_parameter.collections[0].get_offsets()[:, 1].tolist() == [1.0, 1.0, 2.5]
-    # a line through every load if these are few, through bins if they are many
-    assert by_load.lines[0].get_xdata().tolist() == [8.0, 12.0, 16.0]
-    assert by_load.lines[0].get_ydata().tolist() == [1.0, 1.0, 2.5]
-    assert len(by_load.lines[1].get_xdata()) < 20
-    np.testing.assert_allclose(by_load.lines[1].get_ydata(), by_load.lines[1].get_xdata(), rtol=0.05)
 
 
 def test_sensitivities_are_drawn_in_microvolts_per_coulomb_and_volts_per_ohm(record):

@@ -32,7 +32,7 @@ class Constant:
 
 @pytest.fixture(scope="module")
 def data():
-    return TrajectoryDataset.generate("joint", 5, RandomPiecewise(), seed=5, r_o_range=(0.1, 0.3))
+    return TrajectoryDataset.generate(("q_mobile", "r_o"), 5, RandomPiecewise(), seed=5, r_o_range=(0.1, 0.3))
 
 
 def test_one_estimate_at_each_decision_of_each_discharge(data):
@@ -124,7 +124,7 @@ class Last:
 
 @pytest.fixture(scope="module")
 def own():
-    return TrajectoryDataset.generate("joint", 2, RandomPiecewise(), seed=3, cell=TestOwnCell.CELL)
+    return TrajectoryDataset.generate(("q_mobile", "r_o"), 2, RandomPiecewise(), seed=3, cell=TestOwnCell.CELL)
 
 
 class TestOwnCell:

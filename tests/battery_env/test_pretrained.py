@@ -19,7 +19,7 @@ from battery_env.electrochemistry import NEW_CELL
 from battery_env.sensors import SensorErrors
 
 FOLDER = files("battery_env.pretrained_policies")
-IDS = {"BatteryVoltageJoint-v0": "joint", "BatteryVoltageQmax-v0": "q_mobile", "BatteryVoltageRo-v0": "r_o"}
+IDS = {"BatteryVoltageJoint-v0": ("q_mobile", "r_o"), "BatteryVoltageQmax-v0": "q_mobile", "BatteryVoltageRo-v0": "r_o"}
 
 
 def test_there_is_one_for_each_voltage_only_task():
@@ -76,7 +76,7 @@ def test_on_recorded_cells_the_one_for_them_agrees_with_least_squares(cell):
 
 def test_it_stays_in_its_range_and_says_how_sure_it_is():
     estimator = PolicyEstimator.pretrained()
-    for trace in estimator.trace(standard_dataset("joint", "piecewise", "test", mismatch=0.2)[:2]):
+    for trace in estimator.trace(standard_dataset(("q_mobile", "r_o"), "piecewise", "test", mismatch=0.2)[:2]):
         assert trace.settled[-1] and not trace.settled[0] and (trace.sd_q_mobile > 0.0).all()
         for name, (low, high) in ESTIMATE_RANGES.items():
             assert (getattr(trace, name) >= low).all() and (getattr(trace, name) <= high).all()

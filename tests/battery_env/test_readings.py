@@ -13,7 +13,7 @@ from battery_env.trajectories import TrajectoryDataset
 
 @pytest.fixture(scope="module")
 def data():
-    return TrajectoryDataset.generate("joint", 12, RandomPiecewise(), seed=3, r_o_range=(0.1, 0.3))
+    return TrajectoryDataset.generate(("q_mobile", "r_o"), 12, RandomPiecewise(), seed=3, r_o_range=(0.1, 0.3))
 
 
 @pytest.fixture(scope="module")
@@ -197,7 +197,7 @@ def test_recorded_discharges_can_be_read():
 
 
 def test_other_intervals_and_time_steps():
-    data = TrajectoryDataset.generate("joint", 3, RandomPiecewise(), seed=3, dt_s=0.5)
+    data = TrajectoryDataset.generate(("q_mobile", "r_o"), 3, RandomPiecewise(), seed=3, dt_s=0.5)
     readings = Readings.of(data, interval_s=30.0, dt_s=0.5)
     assert compare(readings, readings.q_mobile, readings.r_o)[3].max() < 1e-3
     with pytest.raises(ValueError, match=r"interval_s must be a multiple of the time step, 1 s, got 2.5"):

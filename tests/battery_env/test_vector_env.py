@@ -21,7 +21,7 @@ NOISY = {"initial_perturbation": 3.0, "process_noise_V": 1e-4, "sensor_noise": 0
 
 @pytest.fixture(scope="module")
 def discharges():
-    return TrajectoryDataset.generate("joint", 6, RandomPiecewise(), seed=0, mismatch=0.1)
+    return TrajectoryDataset.generate(("q_mobile", "r_o"), 6, RandomPiecewise(), seed=0, mismatch=0.1)
 
 
 def make_pair(env_id, mode, cells=3, **options):

@@ -29,7 +29,7 @@ EXACT = {"noise_V": (0.0, 0.0), "offset_V": 0.0}
 
 @pytest.fixture(scope="module")
 def data():
-    return TrajectoryDataset.generate("joint", 8, RandomPiecewise(), seed=5, r_o_range=(0.1, 0.3))
+    return TrajectoryDataset.generate(("q_mobile", "r_o"), 8, RandomPiecewise(), seed=5, r_o_range=(0.1, 0.3))
 
 
 @pytest.fixture(scope="module")
@@ -174,7 +174,9 @@ class TestTask:
             np.testing.assert_array_equal(task.observation(), by_misfit.observation())
 
     def test_the_error_of_the_state_is_zero_at_the_truth_however_wrong_the_model(self):
-        wrong = TrajectoryDataset.generate("joint", 4, RandomPiecewise(), seed=5, r_o_range=(0.1, 0.3), mismatch=0.2)
+        wrong = TrajectoryDataset.generate(
+            ("q_mobile", "r_o"), 4, RandomPiecewise(), seed=5, r_o_range=(0.1, 0.3), mismatch=0.2
+        )
         task = started(wrong, start="true", cost="state")
         np.testing.assert_array_equal(task.advance(np.zeros((4, 2))), 0.0)
         assert (started(wrong, start="true").advance(np.zeros((4, 2))) > 0.5).all()
@@ -306,7 +308,7 @@ def test_recorded_discharges_make_a_task():
 @pytest.fixture(scope="module")
 def own():
     cell = TestOwnCell.CELL
-    return TrajectoryDataset.generate("joint", 4, RandomPiecewise(), seed=5, r_o_range=(0.1, 0.3), cell=cell)
+    return TrajectoryDataset.generate(("q_mobile", "r_o"), 4, RandomPiecewise(), seed=5, r_o_range=(0.1, 0.3), cell=cell)
 
 
 class TestOwnCell:
@@ -349,7 +351,9 @@ class TestOwnCell:
     def test_what_is_not_looked_for_may_be_anything(self, own):
         task = BatteryVoltageQmax(1, dataset=own, cell=self.CELL.replace(r_o=0.02))
         assert task.readings.cell.r_o == 0.02
-        beyond = TrajectoryDataset.generate("joint", 2, RandomPiecewise(), seed=5, cell=self.CELL.replace(q_mobile=9000.0))
+        beyond = TrajectoryDataset.generate(
+            ("q_mobile", "r_o"), 2, RandomPiecewise(), seed=5, cell=self.CELL.replace(q_mobile=9000.0)
+        )
         assert started(beyond, cells=2, start="new_cell").estimate[0, 0] == ESTIMATE_RANGES["q_mobile"][1]
 
     def test_what_is_no_cell_is_refused(self, own):

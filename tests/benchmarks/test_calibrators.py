@@ -117,7 +117,7 @@ class TestPolicies:
     def test_they_see_discharges_that_they_did_not_learn_on(self, monkeypatch, tmp_path):
         monkeypatch.setattr(calibrators, "train_or_load", lambda *arguments: Follow())
         (scores,) = calibrators.policy_part("sac", 3, 8, 2, tmp_path).values()
-        data = standard_dataset("joint", "piecewise", "test", mismatch=0.2)[:2]
+        data = standard_dataset(("q_mobile", "r_o"), "piecewise", "test", mismatch=0.2)[:2]
         estimator = PolicyEstimator(Follow(), calibrators.ENV_ID, **calibrators.OPTIONS)
         expected = evaluate(estimator, data, SENSORS["5 mV noise"], seed=1)
         found = scores[(scores["mismatch"] == 0.2) & (scores["sensor"] == "5 mV noise")]
