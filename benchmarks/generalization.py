@@ -15,8 +15,8 @@ import torch as th
 from torch import nn
 
 from battery_env.arrays import FloatArray
-from battery_env.calibration.formulation import ERROR_SCALE, LITERAL, OBSERVED
 from battery_env.calibration.full_state import FullStateTask
+from battery_env.calibration.full_state_layout import ERROR_SCALE, LITERAL, OBSERVED
 from battery_env.calibration.policy import PolicyEstimator
 from battery_env.electrochemistry import NEW_CELL, Trajectory, step
 from battery_env.estimates import Estimate, EstimateTrace

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from battery_env.calibration.formulation import ERROR_SCALE, OBSERVED
+from battery_env.calibration.full_state_layout import ERROR_SCALE, OBSERVED
 from battery_env.electrochemistry import NEW_CELL, QNS, STATE_SIZE, FloatArray, Trajectory, simulate, step_into
 from battery_env.estimators import (
     ClosedForm,

@@ -12,9 +12,7 @@ from numpy.typing import NDArray
 
 from battery_env.electrochemistry import FloatArray
 from battery_env.estimators.base import Record
-from battery_env.trajectories import IntArray
-
-Parameter = Literal["q_mobile", "r_o"]
+from battery_env.trajectories import AgedParameter, IntArray
 
 #: Observations are clipped here; what a calibrated model shows is of order 1.
 OBSERVATION_LIMIT = 100.0
@@ -64,7 +62,7 @@ class CalibrationTask(ABC):
     #: what :meth:`report` returns
     REPORTED: ClassVar[tuple[str, ...]] = ("q_mobile", "r_o", "q_mobile_hat", "r_o_hat", "voltage", "voltage_hat", "soc")
 
-    parameters: tuple[Parameter, ...]
+    parameters: tuple[Literal["q_mobile", "r_o"], ...]
     cells: int
     dataset: Sequence[Record]
     observation_size: int
@@ -85,6 +83,15 @@ class CalibrationTask(ABC):
         """
         arguments = inspect.signature(cls).parameters.values()
         return {argument.name: argument.default for argument in arguments if argument.kind is argument.KEYWORD_ONLY}
+
+    @classmethod
+    def aged(cls) -> AgedParameter:
+        """
+        What has aged in the cells of the standard data sets.
+
+        :return: as :func:`~battery_env.calibration.data.standard_dataset` takes it
+        """
+        return "joint" if len(cls.parameters) > 1 else cls.parameters[0]
 
     def _refuse_beside_a_dataset(self, **chosen: Any) -> None:
         """Refuse options that choose discharges, where the discharges are given."""
