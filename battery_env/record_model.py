@@ -279,7 +279,7 @@ class RecordModel:
         :return: voltage, V, dV/dq_mobile, V/C, and dV/dr_o, A, each of shape (K,); NaN after the model cell is empty
         """
         columns = np.full((3, len(current_A)), np.nan)
-        self._roll_out(current_A, q_mobile, r_o, stride, columns[0], columns[1:], np.empty(0))
+        self._roll_out(current_A, q_mobile, r_o, stride, columns)
         return columns[0], columns[1], columns[2]
 
     def tangents(self, current_A: FloatArray, q_mobile: float, r_o: float) -> Tangents:
@@ -293,20 +293,10 @@ class RecordModel:
         :return: voltage and derivatives
         """
         columns = np.full((len(TANGENT_NAMES) + 2, len(current_A)), np.nan)
-        tangents = Tangents(columns[0], columns[2:], columns[1])
-        self._roll_out(current_A, q_mobile, r_o, 1, *tangents)
-        return tangents
+        self._roll_out(current_A, q_mobile, r_o, 1, columns)
+        return Tangents(columns[0], columns[1:-1], columns[-1])
 
-    def _roll_out(
-        self,
-        current_A: FloatArray,
-        q_mobile: float,
-        r_o: float,
-        stride: int,
-        voltage_V: FloatArray,
-        by_parameter: FloatArray,
-        fraction_p: FloatArray,
-    ) -> None:
+    def _roll_out(self, current_A: FloatArray, q_mobile: float, r_o: float, stride: int, columns: FloatArray) -> None:
         roll_out_with_tangents(
             current_A,
             q_mobile,
@@ -317,9 +307,7 @@ class RecordModel:
             self._derivatives,
             self.start(q_mobile),
             self._shares,
-            voltage_V,
-            by_parameter,
-            fraction_p,
+            columns,
         )
 
     def least_q_mobile_C(self, current_A: FloatArray) -> float:

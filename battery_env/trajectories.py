@@ -302,11 +302,12 @@ class TrajectoryDataset(Sequence[Trajectory]):
             return self.subset(np.arange(len(self))[index])
         n = range(len(self))[index]
         samples, load = self.samples[n], self.load_profile(n)
-        state, voltage, current = np.empty((samples + 1, STATE_SIZE)), np.empty(samples), np.empty(samples)
+        state, columns = np.empty((samples + 1, STATE_SIZE)), np.empty((2, samples))
+        voltage, current = columns
         state[0] = self.checkpoint[self.checkpoint_start[n]]
         # no cut-off: a data set of recorded trajectories may hold samples below it
         run = (load, self.q_mobile[n], self.r_o[n], self.dt_s, -np.inf, self.load_unit == "power", self.thermal)
-        if roll_out(*run, self.packed(np.array([n])), state, voltage, current) < samples:
+        if roll_out(*run, self.packed(np.array([n])), state, columns) < samples:
             raise ValueError(f"trajectory {n} cannot be simulated again: it was made with another load or other constants")
         return Trajectory(
             time_s=self.dt_s * np.arange(samples, dtype=np.float64),
@@ -482,14 +483,14 @@ def _discharged(
     samples = np.empty(q_mobile.size, dtype=np.int64)
     profiles, checkpoints = [], {}
     # one place to simulate in, for all cells in turn
-    state, voltage, current = np.empty((len(day) + 1, STATE_SIZE)), np.empty(len(day)), np.empty(len(day))
+    state, columns = np.empty((len(day) + 1, STATE_SIZE)), np.empty((2, len(day)))
     for k, load in enumerate(loads):
         profile = load.on_grid(day)
         cells = np.flatnonzero(load_index == k)
         for n in cells.tolist():
             state[0] = start[n]
             run = (profile, q_mobile[n], r_o[n], dt_s, cell.VEOD, is_power, thermal)
-            samples[n] = roll_out(*run, _packed(cell, factors[[n]]), state, voltage, current)
+            samples[n] = roll_out(*run, _packed(cell, factors[[n]]), state, columns)
             if samples[n] < _MIN_SAMPLES:
                 raise ValueError(
                     f"trajectory {n} (q_mobile {q_mobile[n]:g} C, r_o {r_o[n]:g} ohm) ends after {samples[n]} samples, at "

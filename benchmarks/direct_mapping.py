@@ -26,7 +26,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import nn
 
 from battery_env.arrays import FloatArray
-from battery_env.calibration.formulation import LITERAL, OBSERVED
+from battery_env.calibration.full_state_layout import LITERAL, OBSERVED
 from battery_env.calibration.policy import PolicyEstimator
 from battery_env.electrochemistry import Trajectory
 from battery_env.estimates import Estimate, EstimateTrace

@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
 from battery_env.arrays import FloatArray
-from battery_env.calibration.formulation import ERROR_SCALE, OBSERVED
+from battery_env.calibration.full_state_layout import ERROR_SCALE, OBSERVED
 from battery_env.electrochemistry import NEW_CELL, QNS, STATE_SIZE, Trajectory, simulate, step_into
 from battery_env.estimators import (
     ClosedForm,

@@ -80,9 +80,7 @@ def test_common_options_are_options_of_all(dataset):
     names = first_cells("Options that all of them take")
     options = {
         "split": "test",
-        "start": "true",
         "consistency": 0.1,
-        "process_noise_V": 1e-4,
         "render_mode": "rgb_array",
         "load": "constant",
         "mismatch": 0.1,

@@ -1,14 +1,22 @@
-"""The compiled kernels (numba) of the full-state task: a decision, a look ahead, and what the agent sees, for many cells."""
+"""
+The compiled kernels (numba) of the full-state task: a decision, a look ahead, and what the agent sees, for many cells.
+
+``settings`` is one record of :data:`~battery_env.calibration.full_state_layout.SETTINGS`, ``cells`` an array of records of
+:data:`~battery_env.calibration.full_state_layout.CELL`, whose fields the kernels overwrite.
+"""
 
 from __future__ import annotations
 
 from math import sqrt
+from typing import Any
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from battery_env.arrays import FloatArray
+from battery_env.calibration.full_state_layout import Records
+from battery_env.electrochemistry.cell import QNB, QNS, STATE_SIZE
 from battery_env.electrochemistry.kernels import (
     BLOCK,
     BLOCK_SIZE,
@@ -17,6 +25,7 @@ from battery_env.electrochemistry.kernels import (
     fill_block,
     states_of_block,
     step_of_block,
+    voltage_of_block,
 )
 
 _compiled = njit(cache=True, error_model="numpy")
@@ -44,141 +53,104 @@ def state_distance(model_state: FloatArray, measured: FloatArray, n: int, per_er
     return 50.0 * distance if distance > 1e-4 else distance
 
 
+@_inlined
+def _take_action(action: FloatArray, task: Any, cell: Any, n: int) -> float:
+    # Set the model's parameters; returns the length of the change of the action
+    squared_change, column = 0.0, 0
+    for k in range(2):
+        if task.finds[k] > 0:
+            chosen = _clipped(action[n, column], 1.0)
+            squared_change += (chosen - cell.last_action[k]) ** 2
+            cell.last_action[k] = chosen
+            value = task.lowest[k] + 0.5 * (chosen + 1.0) * (task.highest[k] - task.lowest[k])
+            if k == 0:
+                cell.q_mobile_hat = value
+            else:
+                cell.r_o_hat = value
+            column += 1
+    return sqrt(squared_change)
+
+
 @_compiled
-def decide(
-    action: FloatArray,
-    lowest: FloatArray,
-    highest: FloatArray,
-    finds_q: bool,
-    finds_r: bool,
-    dt: float,
-    power: bool,
-    thermal: bool,
-    literal_cost: bool,
-    cost_limit: float,
-    consistency: float,
-    per_error: FloatArray,
-    measured: FloatArray,
-    load: FloatArray,
-    constants: FloatArray,
-    poly_n: FloatArray,
-    poly_p: FloatArray,
-    last_action: FloatArray,
-    model_state: FloatArray,
-    q_hat: FloatArray,
-    r_hat: FloatArray,
-    decisions: NDArray[np.int64],
-    sample: NDArray[np.int64],
-    cost: FloatArray,
-) -> None:
-    # Set the model's parameters, step it, and compare it with the measured state; overwrites what comes after the polynomials
-    block = np.empty(BLOCK_SIZE)
-    cells = len(cost)
-    for n in range(cells):
-        decisions[n] += 1
-        sample[n] += 1
-        squared_change = 0.0
-        for k in range(action.shape[1]):
-            chosen = _clipped(action[n, k], 1.0)
-            squared_change += (chosen - last_action[n, k]) ** 2
-            last_action[n, k] = chosen
-        cost[n] = consistency * sqrt(squared_change)
-        if finds_q:
-            q_hat[n] = lowest[0] + 0.5 * (last_action[n, 0] + 1.0) * (highest[0] - lowest[0])
-        if finds_r:
-            k = action.shape[1] - 1
-            r_hat[n] = lowest[k] + 0.5 * (last_action[n, k] + 1.0) * (highest[k] - lowest[k])
-    for first in range(0, cells, BLOCK):
-        size = min(BLOCK, cells - first)
-        fill_block(block, first, size, model_state, load, q_hat, r_hat, constants)
-        step_of_block(block, size, dt, power, power, thermal, True, poly_n, poly_p)
-        states_of_block(block, first, size, model_state)
+def decide(action: FloatArray, settings: Records, cells: Records, cost: FloatArray) -> None:
+    # Set the model's parameters, step it, and compare it with the measured state; then go on to the next sample
+    task, block = settings[0], np.empty(BLOCK_SIZE)
+    for n in range(len(cells)):
+        cells[n].decisions += 1
+        cells[n].sample += 1
+        cost[n] = task.consistency * _take_action(action, task, cells[n], n)
+    for first in range(0, len(cells), BLOCK):
+        size = min(BLOCK, len(cells) - first)
+        fill_block(block, first, size, cells.model_state, cells.load, cells.q_mobile_hat, cells.r_o_hat, task.constants)
+        step_of_block(block, size, task.dt_s, task.power, task.power, task.thermal, True, task.polynomial_n, task.polynomial_p)
+        states_of_block(block, first, size, cells.model_state)
         for n in range(first, first + size):
-            distance = state_distance(model_state, measured, n, per_error, literal_cost)
-            cost[n] += cost_limit if distance > cost_limit else distance
+            distance = state_distance(cells.model_state, cells.next_state, n, task.cost_per_error, task.literal_cost)
+            cost[n] += task.cost_limit if distance > task.cost_limit else distance
+            is_set = task.resync > 0 and cells[n].decisions % task.resync == 0
+            for k in range(STATE_SIZE):
+                cells[n].state[k] = cells[n].next_state[k]
+                if is_set:
+                    cells[n].model_state[k] = cells[n].next_state[k]
 
 
 @_compiled
-def look_ahead(
-    sample: NDArray[np.int64],
-    last_sample: NDArray[np.int64],
-    load_start: NDArray[np.int64],
-    load_values: FloatArray,
-    dt: float,
-    power: bool,
-    thermal: bool,
-    state: FloatArray,
-    q: FloatArray,
-    r_o: FloatArray,
-    constants: FloatArray,
-    poly_n: FloatArray,
-    poly_p: FloatArray,
-    load: FloatArray,
-    next_state: FloatArray,
-    voltage: FloatArray,
-    soc: FloatArray,
-) -> None:
-    # The load and the cell's next state; overwrites what comes after the polynomials. At the end of its data a cell stays on
-    # its last sample, and is not asked for more
-    block = np.empty(BLOCK_SIZE)
-    cells = len(load)
-    for n in range(cells):
-        load[n] = load_values[load_start[n] + min(sample[n], last_sample[n])]
-    for first in range(0, cells, BLOCK):
-        size = min(BLOCK, cells - first)
-        fill_block(block, first, size, state, load, q, r_o, constants)
-        step_of_block(block, size, dt, power, True, thermal, True, poly_n, poly_p)
+def look_ahead(settings: Records, load_values: FloatArray, constants: FloatArray, cells: Records) -> None:
+    # The load and the cell's next state. At the end of its data a cell stays on its last sample, and is not asked for more
+    task, block = settings[0], np.empty(BLOCK_SIZE)
+    for n in range(len(cells)):
+        cells[n].load = load_values[cells[n].load_start + min(cells[n].sample, cells[n].last_sample)]
+    for first in range(0, len(cells), BLOCK):
+        size = min(BLOCK, len(cells) - first)
+        fill_block(block, first, size, cells.state, cells.load, cells.q_mobile, cells.r_o, constants)
+        step_of_block(block, size, task.dt_s, task.power, True, task.thermal, True, task.polynomial_n, task.polynomial_p)
         for j in range(size):
-            n = first + j
-            voltage[n] = block[VOLTAGE + j]
-            soc[n] = (state[n, 4] + state[n, 5]) / q[n]
-        states_of_block(block, first, size, next_state)
+            cell = cells[first + j]
+            cell.voltage = block[VOLTAGE + j]
+            cell.soc = (cell.state[QNB] + cell.state[QNS]) / cell.q_mobile
+        states_of_block(block, first, size, cells.next_state)
 
 
 @_compiled
-def observe(
-    model_state: FloatArray,
-    measured_before: FloatArray,
-    measured: FloatArray,
-    load: FloatArray,
-    last_action: FloatArray,
-    per_state: FloatArray,
-    per_load: float,
-    per_error: FloatArray,
-    innovations: bool,
-    shows_action: bool,
-    limit: float,
-    dt: float,
-    power: bool,
-    thermal: bool,
-    nominal_q: FloatArray,
-    nominal_r_o: FloatArray,
-    constants: FloatArray,
-    poly_n: FloatArray,
-    poly_p: FloatArray,
-    out: NDArray[np.float32],
-) -> None:
+def model_voltage(settings: Records, cells: Records, out: FloatArray) -> None:
+    task, block = settings[0], np.empty(BLOCK_SIZE)
+    for first in range(0, len(cells), BLOCK):
+        size = min(BLOCK, len(cells) - first)
+        fill_block(block, first, size, cells.model_state, cells.load, cells.q_mobile_hat, cells.r_o_hat, task.constants)
+        voltage_of_block(block, size, True, task.polynomial_n, task.polynomial_p)
+        for j in range(size):
+            out[first + j] = block[VOLTAGE + j]
+
+
+@_compiled
+def observe(settings: Records, cells: Records, limit: float, out: NDArray[np.float32]) -> None:
     # The observations, into out
-    block = np.empty(BLOCK_SIZE)
-    cells = len(load)
-    for n in range(cells):
+    task, block = settings[0], np.empty(BLOCK_SIZE)
+    for n in range(len(cells)):
+        cell = cells[n]
         for k in range(7):
-            out[n, k] = _clipped(model_state[n, k + 1] * per_state[k], limit)
-            out[n, k + 7] = _clipped(measured[n, k + 1] * per_state[k], limit)
-        out[n, 14] = _clipped(load[n] * per_load, limit)
-        if shows_action:
-            for k in range(last_action.shape[1]):
-                out[n, out.shape[1] - last_action.shape[1] + k] = last_action[n, k]
-    if not innovations:
+            out[n, k] = _clipped(cell.model_state[k + 1] * task.per_state[k], limit)
+            out[n, k + 7] = _clipped(cell.next_state[k + 1] * task.per_state[k], limit)
+        out[n, 14] = _clipped(cell.load * task.per_load, limit)
+        if task.shows_action:
+            column = out.shape[1]
+            for k in range(1, -1, -1):
+                if task.finds[k] > 0:
+                    column -= 1
+                    out[n, column] = cell.last_action[k]
+    if not task.innovations:
         return
-    for column, origin in ((15, model_state), (22, measured_before)):
-        for first in range(0, cells, BLOCK):
-            size = min(BLOCK, cells - first)
-            fill_block(block, first, size, origin, load, nominal_q, nominal_r_o, constants)
-            step_of_block(block, size, dt, power, power, thermal, True, poly_n, poly_p)
+    q, r_o = np.full(len(cells), task.new_parameters[0]), np.full(len(cells), task.new_parameters[1])
+    for column, origin in ((15, cells.model_state), (22, cells.state)):
+        for first in range(0, len(cells), BLOCK):
+            size = min(BLOCK, len(cells) - first)
+            fill_block(block, first, size, origin, cells.load, q, r_o, task.constants)
+            step_of_block(
+                block, size, task.dt_s, task.power, task.power, task.thermal, True, task.polynomial_n, task.polynomial_p
+            )
             for j in range(size):
                 for k in range(1, 8):
-                    block[k * BLOCK + j] = (measured[first + j, k] - block[k * BLOCK + j]) * per_error[k - 1]
+                    block[k * BLOCK + j] = (cells[first + j].next_state[k] - block[k * BLOCK + j]) * task.per_error[k - 1]
             # asinh: they span five orders of magnitude, and must not drown the small ones in a network. A loop of its own, so
             # that the compiler uses vector instructions
             for k in range(1, 8):

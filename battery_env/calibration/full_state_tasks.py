@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from battery_env.calibration.formulation import LITERAL
 from battery_env.calibration.full_state import FullStateTask
+from battery_env.calibration.full_state_layout import LITERAL
 
 
 class BatteryQmax(FullStateTask):
@@ -34,11 +34,10 @@ class BatteryQmax(FullStateTask):
     network sees within about 10, and leaves small innovations as they are.
 
     The observation is Markov for a constant load: cost and next model state depend on it and the action alone, the next
-    measured state on the parameter too, which the observation determines. It stays so with ``start``,
-    ``initial_perturbation``, ``process_noise_V``, ``sensor_offset``, ``sensor_gain``, ``consistency`` (which appends what is
-    needed) and ``resync`` = 1. It is not Markov, though the cost of a decision still depends on observation and action alone,
-    with a load that changes (when, is hidden), ``resync`` > 1 (so is the step in the cycle), ``sensor_noise`` (so is the true
-    state) or ``mismatch`` (so are constants of the cell).
+    measured state on the parameter too, which the observation determines. It stays so with ``initial_perturbation``,
+    ``consistency`` (which appends what is needed) and ``resync`` = 1. It is not Markov, though the cost of a decision still
+    depends on observation and action alone, with a load that changes (when, is hidden), ``resync`` > 1 (so is the step in the
+    cycle) or ``mismatch`` (so are constants of the cell).
 
     ## Action space
 
@@ -63,15 +62,10 @@ class BatteryQmax(FullStateTask):
     | argument | default | meaning |
     |----------|---------|---------|
     | ``episode_steps`` | 64 | decisions per episode |
-    | ``continue_probability`` | 0 | probability that an episode goes on for another ``episode_steps``, and after these again; drawn at its start. Takes the model where the policy's own errors do in a whole discharge; goes with neither noise |
+    | ``continue_probability`` | 0 | probability that an episode goes on for another ``episode_steps``, and after these again; drawn at its start. Takes the model where the policy's own errors do in a whole discharge |
     | ``first_sample_probability`` | 0 | probability that an episode starts at the first sample of the whole discharge, at rest, in place of a random one. The data have little of the seconds after it: they leave out the first 5 % of each discharge |
-    | ``start`` | ``"true"`` | the model's first state: the cell's; or ``"new_cell"``: that of a cell that was full when the discharge began, is new in what is to be found, and has carried the same load since. No action makes up for the charge that it has too much |
     | ``initial_perturbation`` | 0 | the first state is off by a uniform draw within this many error scales to either side, in Vo, Vsn, Vsp and in charge that has moved between the electrodes |
     | ``resync`` | none | the model is set to the measured state after every so many decisions |
-    | ``process_noise_V`` | 0 | standard deviation of white noise on Vo, Vsn and Vsp of the cell, V per root of a second |
-    | ``sensor_noise`` | 0 | standard deviation of white noise on measured states, in error scales. Observation, cost and ``resync`` all use the measured state |
-    | ``sensor_offset`` | 0 | constant error of measured states, in error scales |
-    | ``sensor_gain`` | 1 | measured states are the true ones times this |
     | ``consistency`` | 0 | cost of a change of the action per unit of its Euclidean length (the paper's consistency penalty); above 0 the action before is appended to the observation, at first the one that stands for a new cell |
     | ``charge_weight`` | 1 | what the errors of the four charges are multiplied by in the cost: how much old errors count |
     | ``cost_limit`` | 5 | largest cost, without that of a change |

@@ -14,8 +14,6 @@ from battery_env.electrochemistry import FloatArray
 from battery_env.estimators.base import Record
 from battery_env.trajectories import IntArray
 
-Parameter = Literal["q_mobile", "r_o"]
-
 #: Observations are clipped here; what a calibrated model shows is of order 1.
 OBSERVATION_LIMIT = 100.0
 
@@ -64,7 +62,7 @@ class CalibrationTask(ABC):
     #: what :meth:`report` returns
     REPORTED: ClassVar[tuple[str, ...]] = ("q_mobile", "r_o", "q_mobile_hat", "r_o_hat", "voltage", "voltage_hat", "soc")
 
-    parameters: tuple[Parameter, ...]
+    parameters: tuple[Literal["q_mobile", "r_o"], ...]
     cells: int
     dataset: Sequence[Record]
     observation_size: int

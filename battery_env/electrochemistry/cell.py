@@ -28,7 +28,7 @@ FULL_CHARGE_SHARES: FloatArray = np.array([0.9, 0.1, 0.6, 1.0 / 15.0])
 # What leaves them for each share of q_mobile that is drawn, once the cell rests
 _DRAWN_SHARES: FloatArray = np.array([0.9, 0.1, -0.9, -0.1])
 
-CONSTANTS_SIZE = 13
+CONSTANTS_SIZE, POLYNOMIAL_SIZE = 13, 14
 # Columns of ``PackedConstants.constants``, in SI units
 (
     FRACTION_PER_SHARE,  # mole fraction, over the share of q_mobile that is in a surface
@@ -51,7 +51,6 @@ UNCERTAIN_CONSTANTS: tuple[str, ...] = ("kn", "tDiffusion", "to", "tsn")
 
 _FORMAT, _FORMAT_VERSION = "battery_env.CellParameters", 1
 _SIX_TENTHS = 0.6  # xnMax - xnMin: the share of all lithium sites that a full discharge uses
-_POLYNOMIAL_SIZE = 14
 
 
 class PackedConstants(NamedTuple):
@@ -75,7 +74,7 @@ def _redlich_kister_polynomial(coefficients: tuple[float, ...], faraday: float) 
 
     Term k is A_k/F * ((1 + k/2) * y^(k+1) - (k/2) * y^(k-1)); unlike the sum it has no singularity at x = 0.5.
     """
-    polynomial = np.zeros(_POLYNOMIAL_SIZE)
+    polynomial = np.zeros(POLYNOMIAL_SIZE)
     for k, coefficient in enumerate(coefficients):
         polynomial[k + 1] += coefficient / faraday * (1.0 + k / 2.0)
         if k > 0:
@@ -165,9 +164,9 @@ class CellParameters:
             if field.name not in ("U0n", "U0p", "An", "Ap", "r_o") and not value > 0.0:
                 raise ValueError(f"CellParameters: {field.name} must be greater than 0, got {value!r}")
         for name in ("An", "Ap"):
-            if not 1 <= len(getattr(self, name)) < _POLYNOMIAL_SIZE:
+            if not 1 <= len(getattr(self, name)) < POLYNOMIAL_SIZE:
                 raise ValueError(
-                    f"CellParameters: {name} must hold 1 to {_POLYNOMIAL_SIZE - 1} coefficients, got {getattr(self, name)!r}"
+                    f"CellParameters: {name} must hold 1 to {POLYNOMIAL_SIZE - 1} coefficients, got {getattr(self, name)!r}"
                 )
         if not self.VolSFraction < 1.0:
             raise ValueError(f"CellParameters: VolSFraction is a share and must be less than 1, got {self.VolSFraction!r}")

@@ -210,14 +210,7 @@ def nominal_overpotentials(i: float, xn: float, xp: float, tb: float, constants:
 
 
 @_inlined
-def cell_voltage(
-    x: FloatArray,
-    n: int,
-    q: float,
-    extended: bool,
-    packed: PackedConstants,
-    c: int,
-) -> float:
+def cell_voltage(x: FloatArray, n: int, q: float, extended: bool, packed: PackedConstants, c: int) -> float:
     # V = Vep(xp) - Ven(xn) - Vo - Vsn - Vsp
     constants, poly_n, poly_p = packed
     share = constants[c, FRACTION_PER_SHARE] / q
@@ -232,6 +225,7 @@ def cell_voltage(
 def cell_step(
     x: FloatArray,
     n: int,
+    m: int,
     i: float,
     q: float,
     r_o: float,
@@ -239,30 +233,27 @@ def cell_step(
     thermal: bool,
     extended: bool,
     constants: FloatArray,
-    c: int,
-    out: FloatArray,
-    m: int,
 ) -> None:
-    # One step of row n of x, into row m of out; may work in place
-    share = constants[c, FRACTION_PER_SHARE] / q
+    # One step of row n of x, into its row m, which may be the same; all rows share the first row of constants
+    share = constants[0, FRACTION_PER_SHARE] / q
     xn, xp = _fraction(share, x[n, QNS], extended), _fraction(share, x[n, QPS], extended)
     state = (x[n, TB], x[n, VO], x[n, VSN], x[n, VSP], x[n, QNB], x[n, QNS], x[n, QPB], x[n, QPS])
     k = (
-        constants[c, BULK_RATE],
-        constants[c, SURFACE_RATE],
-        constants[c, R_OVER_F],
-        constants[c, PER_CURRENT_N],
-        constants[c, PER_CURRENT_P],
-        constants[c, TO_RATE],
-        constants[c, TSN_RATE],
-        constants[c, TSP_RATE],
-        constants[c, WARMING],
-        constants[c, COOLING],
-        constants[c, SURROUNDINGS],
+        constants[0, BULK_RATE],
+        constants[0, SURFACE_RATE],
+        constants[0, R_OVER_F],
+        constants[0, PER_CURRENT_N],
+        constants[0, PER_CURRENT_P],
+        constants[0, TO_RATE],
+        constants[0, TSN_RATE],
+        constants[0, TSP_RATE],
+        constants[0, WARMING],
+        constants[0, COOLING],
+        constants[0, SURROUNDINGS],
     )
     y = _euler(state, i, xn, xp, r_o, dt, thermal, k)
-    out[m, TB], out[m, VO], out[m, VSN], out[m, VSP] = y[0], y[1], y[2], y[3]
-    out[m, QNB], out[m, QNS], out[m, QPB], out[m, QPS] = y[4], y[5], y[6], y[7]
+    x[m, TB], x[m, VO], x[m, VSN], x[m, VSP] = y[0], y[1], y[2], y[3]
+    x[m, QNB], x[m, QNS], x[m, QPB], x[m, QPS] = y[4], y[5], y[6], y[7]
 
 
 @_inlined
@@ -383,13 +374,7 @@ def states_of_block(block: FloatArray, first: int, cells: int, out: FloatArray) 
 
 
 @_compiled
-def voltage_batch(
-    state: FloatArray,
-    q: FloatArray,
-    extended: bool,
-    packed: PackedConstants,
-    out: FloatArray,
-) -> None:
+def voltage_batch(state: FloatArray, q: FloatArray, extended: bool, packed: PackedConstants, out: FloatArray) -> None:
     block = np.empty(BLOCK_SIZE)
     for first in range(0, out.shape[0], BLOCK):
         cells = min(BLOCK, out.shape[0] - first)
@@ -431,7 +416,6 @@ def advance_batch(
     dt: float,
     power: bool,
     thermal: bool,
-    extended: bool,
     packed: PackedConstants,
 ) -> None:
     # the cells with most steps come first, so that those of a block that are still on their way are always its first ones
@@ -444,7 +428,7 @@ def advance_batch(
                 running -= 1
             for j in range(running):
                 block[_LOAD * BLOCK + j] = load[first[start + j] + k]
-            step_of_block(block, running, dt, power, power, thermal, extended, packed.polynomial_n, packed.polynomial_p)
+            step_of_block(block, running, dt, power, power, thermal, False, packed.polynomial_n, packed.polynomial_p)
         states_of_block(block, start, cells, state)
 
 
@@ -459,16 +443,16 @@ def roll_out(
     thermal: bool,
     packed: PackedConstants,
     state: FloatArray,
-    voltage: FloatArray,
-    current: FloatArray,
+    columns: FloatArray,
 ) -> int:
-    # state has one row more than there are samples, and its row 0 is the start. Fills the samples up to the last one whose
-    # voltage is a number and at least the cut-off; returns how many they are. The condition is written so that NaN ends
-    # the discharge too: near its end V can fall from 3.3 V to NaN in one step.
+    # Fills columns, the voltage and the current at each sample, shape (2, samples), up to the last one whose voltage is a
+    # number and at least the cut-off; returns how many they are. state has one row more, and its row 0 is the start. The
+    # condition is written so that NaN ends the discharge too: near its end V can fall from 3.3 V to NaN in one step.
+    voltage, current = columns[0], columns[1]
     for k in range(load.shape[0]):
         voltage[k] = cell_voltage(state, k, q, False, packed, 0)
         if not voltage[k] >= cut_off:
             return k
         current[k] = cell_current(load[k], power, voltage[k], False)
-        cell_step(state, k, current[k], q, r_o, dt, thermal, False, packed.constants, 0, state, k + 1)
+        cell_step(state, k, k + 1, current[k], q, r_o, dt, thermal, False, packed.constants)
     return int(load.shape[0])

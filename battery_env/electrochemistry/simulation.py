@@ -156,13 +156,12 @@ def advance_in_place(
     load_unit: LoadUnit,
     thermal: bool,
     packed: PackedConstants,
-    extended: bool = False,
 ) -> None:
     """Advance every cell by its own number of steps under its own stretch of ``load``; unchecked, like :func:`step_into`."""
     order = np.argsort(-steps)
     ordered = packed if len(packed.constants) == 1 else packed._replace(constants=packed.constants[order])
-    ahead, flags = state[order], (load_unit == "power", thermal, extended)
-    advance_batch(ahead, load, first[order], steps[order], q_mobile[order], r_o[order], dt, *flags, ordered)
+    ahead, power = state[order], load_unit == "power"
+    advance_batch(ahead, load, first[order], steps[order], q_mobile[order], r_o[order], dt, power, thermal, ordered)
     state[order] = ahead
 
 
@@ -236,6 +235,36 @@ class Trajectory:
         )
 
 
+def _samples(until: Literal["eod"] | float, dt: float, max_duration_s: float) -> int:
+    """How many samples a simulation has at most."""
+    if until != "eod" and not (isinstance(until, (int, float)) and 0.0 < until <= max_duration_s):
+        raise ValueError(f"until must be 'eod' or a duration within 0 .. {max_duration_s:g} s, got {until!r}")
+    if not isinstance(max_duration_s, Real) or not 0.0 < max_duration_s / dt <= _MAX_STEPS:
+        raise ValueError(
+            f"max_duration_s must be greater than 0 and at most {_MAX_STEPS:g} steps of dt, got {max_duration_s!r}"
+        )
+    return int(np.floor((max_duration_s if until == "eod" else float(until)) / dt + 1e-9)) + 1
+
+
+def _loads(
+    load: float | ArrayLike | Callable[[FloatArray], ArrayLike], unit: LoadUnit, dt: float, most_samples: int
+) -> FloatArray:
+    """The load over the step that starts at each sample, an array of its own."""
+    given_unit = getattr(load, "unit", unit)
+    if given_unit != unit:
+        raise ValueError(f"the load is a {given_unit}, but load_unit is {unit!r}: give load_unit={given_unit!r}")
+    n_samples = most_samples
+    if callable(load):
+        values = check_numbers("load", load(dt * np.arange(n_samples, dtype=np.float64)))
+    else:
+        values = check_numbers("load", load)
+        n_samples = min(n_samples, len(values)) if values.ndim == 1 else n_samples
+    values = check_load(values if values.ndim == 0 else values[..., :n_samples], unit)
+    if values.shape not in ((), (n_samples,)) or n_samples == 0:
+        raise ValueError(f"load must be a number or one value a step, shape (steps,), got shape {values.shape}")
+    return np.full(n_samples, values) if values.ndim == 0 else np.array(values, order="C")
+
+
 def simulate(
     load: float | ArrayLike | Callable[[FloatArray], ArrayLike],
     q_mobile: float | None = None,
@@ -271,56 +300,23 @@ def simulate(
     dt = check_dt(dt, constants)
     if q.ndim or r.ndim:
         raise ValueError(f"q_mobile and r_o must be single numbers, got shapes {q.shape} and {r.shape}")
-    given_unit = getattr(load, "unit", load_unit)
-    if given_unit != load_unit:
-        raise ValueError(f"the load is a {given_unit}, but load_unit is {load_unit!r}: give load_unit={given_unit!r}")
-    if until != "eod" and not (isinstance(until, (int, float)) and 0.0 < until <= max_duration_s):
-        raise ValueError(f"until must be 'eod' or a duration within 0 .. {max_duration_s:g} s, got {until!r}")
-    duration_s = max_duration_s if until == "eod" else float(until)
-    if not isinstance(max_duration_s, Real) or not 0.0 < max_duration_s / dt <= _MAX_STEPS:
-        raise ValueError(
-            f"max_duration_s must be greater than 0 and at most {_MAX_STEPS:g} steps of dt, got {max_duration_s!r}"
-        )
-    n_samples = int(np.floor(duration_s / dt + 1e-9)) + 1
-    if callable(load):
-        loads = check_numbers("load", load(dt * np.arange(n_samples, dtype=np.float64)))
-    else:
-        loads = check_numbers("load", load)
-        if loads.ndim == 1:
-            n_samples = min(n_samples, len(loads))
-    if loads.ndim == 0:
-        loads = np.full(n_samples, check_load(loads, load_unit))
-    else:
-        loads = check_load(loads[..., :n_samples], load_unit)
-    if loads.shape != (n_samples,) or n_samples == 0:
-        raise ValueError(f"load must be a number or one value a step, shape (steps,), got shape {loads.shape}")
+    loads = _loads(load, load_unit, dt, _samples(until, dt, max_duration_s))
+    n_samples = len(loads)
     start = initial_state(q, constants) if initial is None else _check_state(initial)
     if start.shape != (STATE_SIZE,):
         raise ValueError(f"initial must have shape ({STATE_SIZE},), got {start.shape}")
     cut_off = constants.VEOD if cut_off_V is None else cut_off_V
     if not isinstance(cut_off, Real) or np.isnan(cut_off):
         raise ValueError(f"cut_off_V must be a number or None, got {cut_off_V!r}")
-    state, volts, amperes = np.empty((n_samples + 1, STATE_SIZE)), np.empty(n_samples), np.empty(n_samples)
+    state, columns, power = np.empty((n_samples + 1, STATE_SIZE)), np.empty((2, n_samples)), load_unit == "power"
     state[0] = start
-    flags = (load_unit == "power", thermal)
-    n = roll_out(
-        np.require(loads, requirements=["C", "W"]),
-        float(q),
-        float(r),
-        dt,
-        cut_off,
-        *flags,
-        constants.packed,
-        state,
-        volts,
-        amperes,
-    )
+    n = roll_out(loads, float(q), float(r), dt, cut_off, power, thermal, constants.packed, state, columns)
     return Trajectory(
         time_s=dt * np.arange(n, dtype=np.float64),
         state=state[:n].copy(),
-        voltage_V=volts[:n].copy(),
-        current_A=amperes[:n].copy(),
-        load=np.array(loads[:n]),
+        voltage_V=columns[0, :n].copy(),
+        current_A=columns[1, :n].copy(),
+        load=loads[:n].copy(),
         load_unit=load_unit,
         cell=constants.replace(q_mobile=float(q), r_o=float(r)),
         dt_s=dt,

@@ -265,7 +265,7 @@ def step_with_tangents(
         dtb = dx[n, row, TB]
         _follow(dx, n, row, i, (dvo_nominal, by_xn + vsn_tb * dtb, by_xp + vsp_tb * dtb), dt, thermal, constants)
     _diffuse(dx, n, BY_Q, dt, constants)
-    cell_step(x, n, i, q, r_o, dt, thermal, extended, constants, 0, x, n)
+    cell_step(x, n, n, i, q, r_o, dt, thermal, extended, constants)
 
 
 @_compiled
@@ -314,14 +314,14 @@ def roll_out_with_tangents(
     derivatives: PolynomialDerivatives,
     start: FloatArray,
     shares: FloatArray,
-    voltage: FloatArray,
-    by_parameter: FloatArray,
-    fraction_p: FloatArray,
+    columns: FloatArray,
 ) -> None:
-    # Fills voltage, the rows of by_parameter, its derivatives (the first two or all), and the mole fraction at the surface of
-    # the positive electrode (if there is room for it), up to the last sample at which the model has a voltage. The charges of
-    # the first state, start, have the derivatives shares with respect to q
-    rows, constants = by_parameter.shape[0], packed.constants
+    # Fills the rows of columns up to the last sample at which the model has a voltage: the voltage, its derivatives by q and
+    # r_o, and, if there is room, those by RATE_CONSTANTS and the mole fraction at the surface of the positive electrode. The
+    # charges of the first state, start, have the derivatives shares with respect to q
+    with_rates, constants = columns.shape[0] > 1 + BY_KN, packed.constants
+    rows = len(TANGENT_NAMES) if with_rates else BY_KN
+    voltage, by_parameter = columns[0], columns[1 : 1 + rows]
     x, dx = np.empty((1, STATE_SIZE)), np.zeros((1, rows, STATE_SIZE))
     x[0] = start
     dx[0, BY_Q, QNB:] = shares
@@ -330,10 +330,9 @@ def roll_out_with_tangents(
         if np.isnan(voltage_k):
             return
         voltage[k] = voltage_k
-        if fraction_p.shape[0] > 0:
-            fraction_p[k] = mole_fraction(x[0, QPS], q, False, constants, 0)
         by_parameter[BY_Q, k], by_parameter[BY_R, k] = voltage_tangents(x, dx, 0, q, thermal, packed, derivatives)
-        if rows > BY_KN:
+        if with_rates:
+            columns[1 + rows, k] = mole_fraction(x[0, QPS], q, False, constants, 0)
             _voltage_rate_tangents(x, dx, 0, q, thermal, packed, derivatives, by_parameter, k)
             _step_rate_tangents(x, dx, 0, current[k], q, r_o, dt, thermal, constants)
         step_with_tangents(x, dx, 0, current[k], q, r_o, dt, thermal, False, constants)
@@ -365,5 +364,5 @@ def least_q_mobile(
         _diffuse(dx, 0, by_t, dt, constants)
         _diffuse_slower(dx, 0, by_t, x[0], dt, constants)
         _diffuse(dx, 0, BY_Q, dt, constants)
-        cell_step(x, 0, current[k], q, 0.0, dt, False, False, constants, 0, x, 0)
+        cell_step(x, 0, 0, current[k], q, 0.0, dt, False, False, constants)
     return least, least_by_t

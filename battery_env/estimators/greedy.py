@@ -39,8 +39,7 @@ class _Search(NamedTuple):
     packed: PackedConstants
     load: FloatArray  # over each step
     measured: FloatArray  # states of the cell, shape (T, 8)
-    start: FloatArray  # state of the model before a step, shape (1, 8)
-    end: FloatArray  # and after it, overwritten
+    model: FloatArray  # state of the model before a step, and after it, which is overwritten, shape (2, 8)
 
 
 _compiled = njit(cache=True, error_model="numpy")
@@ -49,15 +48,15 @@ _compiled = njit(cache=True, error_model="numpy")
 @_compiled
 def _cost(value: float, k: int, search: _Search) -> float:
     # distance of the end of step k to the measured state; negative if its vo is too low
-    start, end, measured, packed = search.start, search.end, search.measured, search.packed
+    model, measured, packed = search.model, search.measured, search.packed
     q, r_o = (value, search.r_o) if search.search_q else (search.q, value)
-    volts = cell_voltage(start, 0, q, True, packed, 0) if search.power else 0.0
+    volts = cell_voltage(model, 0, q, True, packed, 0) if search.power else 0.0
     i = cell_current(search.load[k], search.power, volts, True)
-    cell_step(start, 0, i, q, r_o, search.dt, search.thermal, True, packed.constants, 0, end, 0)
+    cell_step(model, 0, 1, i, q, r_o, search.dt, search.thermal, True, packed.constants)
     square = 0.0
     for n in range(VO, STATE_SIZE):
-        square += (end[0, n] - measured[k + 1, n]) ** 2
-    return sqrt(square) if end[0, VO] >= measured[k + 1, VO] else -sqrt(square)
+        square += (model[1, n] - measured[k + 1, n]) ** 2
+    return sqrt(square) if model[1, VO] >= measured[k + 1, VO] else -sqrt(square)
 
 
 @_compiled
@@ -101,7 +100,7 @@ def _greedy(low: float, high: float, resync: bool, search: _Search, best: FloatA
     tolerance = _TOLERANCE * (high - low)
     for k in range(best.shape[0]):
         if resync:
-            search.start[0] = search.measured[k]
+            search.model[0] = search.measured[k]
         least = np.inf
         for a in range(_brackets(low, high, k, search, coarse)):
             for b in range(_brackets(coarse[a, 0], coarse[a, 1], k, search, fine)):
@@ -110,7 +109,7 @@ def _greedy(low: float, high: float, resync: bool, search: _Search, best: FloatA
                 if cost < least:
                     least, best[k] = cost, value
         _cost(best[k], k, search)
-        search.start[0] = search.end[0]
+        search.model[0] = search.model[1]
 
 
 class GreedyOneStep(Estimator):
@@ -185,8 +184,7 @@ class GreedyOneStep(Estimator):
                 self.cell.packed,
                 record.load,
                 record.state,
-                record.state[:1].copy(),
-                record.state[:1].copy(),
+                np.repeat(record.state[:1], 2, axis=0),
             )
             _greedy(*self.search_range, self.resync, search, values[self.parameter])
             traces.append(EstimateTrace(time_s=record.time_s[1:], **values))

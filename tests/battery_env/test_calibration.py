@@ -12,9 +12,9 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 import battery_env
 from battery_env.calibration.env import CalibrationEnv
-from battery_env.calibration.formulation import LITERAL, OBSERVED, SCALED
 from battery_env.calibration.full_state import FullStateTask
 from battery_env.calibration.full_state_kernels import state_distance
+from battery_env.calibration.full_state_layout import LITERAL, OBSERVED, SCALED
 from battery_env.calibration.full_state_tasks import BatteryQmax
 from battery_env.electrochemistry import NEW_CELL, QNB, step
 from battery_env.loads import RandomPiecewise
@@ -25,7 +25,7 @@ IDS = ("BatteryQmax-v0", "BatteryRo-v0", "BatteryJoint-v0", "BatteryQmaxPaper-v0
 
 def true_action(env):
     task = env.unwrapped.task
-    return task.action_of({"q_mobile": task.now.q_mobile, "r_o": task.now.r_o})[0]
+    return task.action_of({"q_mobile": task.now["q_mobile"], "r_o": task.now["r_o"]})[0]
 
 
 @pytest.mark.parametrize("env_id", IDS)
@@ -152,7 +152,7 @@ def test_the_perturbation_stays_in_its_bounds():
     for seed in range(20):
         env.reset(seed=seed)
         task = env.unwrapped.task
-        draws.append((task.now.model_state - task.now.state)[0, OBSERVED][:4] / scale[:4])
+        draws.append((task.now["model_state"] - task.now["state"])[0, OBSERVED][:4] / scale[:4])
     assert np.abs(draws).max() <= 10.0 + 1e-6 and np.abs(draws).max(axis=0).min() > 5.0
 
 
@@ -169,7 +169,7 @@ def test_a_perturbation_conserves_charge():
     env = gym.make("BatteryQmax-v0", initial_perturbation=10.0)
     env.reset(seed=0)
     task = env.unwrapped.task
-    assert task.now.model_state[0, QNB:].sum() == pytest.approx(task.now.state[0, QNB:].sum(), rel=1e-12)
+    assert task.now["model_state"][0, QNB:].sum() == pytest.approx(task.now["state"][0, QNB:].sum(), rel=1e-12)
 
 
 @pytest.mark.parametrize("formulation", [SCALED, LITERAL], ids=["scaled", "literal"])
@@ -231,7 +231,7 @@ def test_own_trajectories_can_be_used():
     data = TrajectoryDataset.generate("q_mobile", 3, RandomPiecewise(), seed=0)
     env = gym.make("BatteryQmax-v0", dataset=data)
     env.reset(seed=0)
-    assert env.unwrapped.task.now.q_mobile[0] in data.q_mobile
+    assert env.unwrapped.task.now["q_mobile"][0] in data.q_mobile
 
 
 def test_a_frame_is_a_picture():

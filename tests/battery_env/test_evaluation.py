@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from battery_env.calibration.formulation import ACTION_RANGES
+from battery_env.calibration.full_state_layout import ACTION_RANGES
 from battery_env.calibration.policy import PolicyEstimator
 from battery_env.electrochemistry import simulate
 from battery_env.estimators.base import Estimate, EstimateTrace, Estimator

@@ -4,18 +4,13 @@ import numpy as np
 import pytest
 
 from battery_env.calibration.data import standard_dataset
-from battery_env.calibration.formulation import ACTION_RANGES, ERROR_SCALE, OBSERVED
+from battery_env.calibration.full_state_layout import ACTION_RANGES, ERROR_SCALE, OBSERVED
 from battery_env.calibration.full_state_tasks import BatteryJoint, BatteryQmax, BatteryQmaxPaper, BatteryRo
 from battery_env.calibration.policy import PolicyEstimator
 from battery_env.electrochemistry import (
     NEW_CELL,
-    QNB,
     UNCERTAIN_CONSTANTS,
-    VO,
-    initial_state,
-    simulate,
     step,
-    step_into,
     voltage,
 )
 from battery_env.loads import RandomPiecewise, constant
@@ -40,7 +35,7 @@ def make(data, kind=BatteryQmax, cells=1, **options):
 
 
 def true_action(task):
-    return task.action_of({"q_mobile": task.now.q_mobile, "r_o": task.now.r_o})
+    return task.action_of({"q_mobile": task.now["q_mobile"], "r_o": task.now["r_o"]})
 
 
 def scaled_distance(task, model_state, measured):
@@ -51,8 +46,8 @@ def test_the_defaults_disturb_nothing(discharges):
     task = started(make(discharges))
     for k in range(5):
         trajectory = discharges[2]
-        np.testing.assert_array_equal(task.now.state[0], trajectory.state[300 + k])
-        np.testing.assert_array_equal(task.now.measured[0], trajectory.state[301 + k])
+        np.testing.assert_array_equal(task.now["state"][0], trajectory.state[300 + k])
+        np.testing.assert_array_equal(task.now["next_state"][0], trajectory.state[301 + k])
         task.advance(np.zeros((1, 1)))
 
 
@@ -62,13 +57,13 @@ def test_the_joint_task_shows_and_punishes_both_errors(discharges, wrong):
     assert task.parameters == ("q_mobile", "r_o") and task.observation().shape == (1, 29)
     action = true_action(task)
     assert task.advance(action) == pytest.approx(0.0, abs=1e-9)
-    np.testing.assert_allclose([task.now.q_mobile_hat, task.now.r_o_hat], [task.now.q_mobile, task.now.r_o])
-    values = {"q_mobile": task.now.q_mobile, "r_o": task.now.r_o}
+    np.testing.assert_allclose([task.now["q_mobile_hat"], task.now["r_o_hat"]], [task.now["q_mobile"], task.now["r_o"]])
+    values = {"q_mobile": task.now["q_mobile"], "r_o": task.now["r_o"]}
     name = task.parameters[wrong]
     action = task.action_of({**values, name: 1.05 * values[name]})
     cost = task.advance(action)
     assert 0.02 < cost < 1.0
-    np.testing.assert_allclose({"q_mobile": task.now.q_mobile_hat, "r_o": task.now.r_o_hat}[name], 1.05 * values[name])
+    np.testing.assert_allclose({"q_mobile": task.now["q_mobile_hat"], "r_o": task.now["r_o_hat"]}[name], 1.05 * values[name])
 
 
 def test_the_joint_environment_draws_from_cells_whose_parameters_have_both_aged():
@@ -80,70 +75,12 @@ def test_the_joint_environment_draws_from_cells_whose_parameters_have_both_aged(
 
 
 def test_resync_sets_the_model_to_the_measured_state(discharges):
-    task = started(make(discharges, resync=3, sensor_offset=0.5))
+    task = started(make(discharges, resync=3))
     for decision in range(1, 8):
-        measured = task.now.measured.copy()
+        measured = task.now["next_state"].copy()
         task.advance(np.full((1, 1), -1.0))
-        assert (task.now.model_state == measured).all() == (decision % 3 == 0)
-        np.testing.assert_array_equal(task.report()["voltage_hat"], voltage(task.now.model_state, task.now.q_mobile_hat))
-
-
-def test_the_model_of_a_new_cell_has_carried_the_same_load(discharges):
-    task = started(make(discharges, start="new_cell"), sample=333)
-    trajectory = discharges[2]
-    new = simulate(trajectory.load[:334], NEW_CELL.q_mobile, trajectory.r_o)
-    np.testing.assert_array_equal(task.now.model_state[0], new.state[333])
-    # no action makes up for the charge that a new cell has more
-    task.advance(true_action(task))
-    assert task.now.model_state[0, QNB:].sum() == pytest.approx(initial_state(NEW_CELL.q_mobile)[QNB:].sum(), rel=1e-12)
-    both = started(make(discharges, BatteryJoint, start="new_cell"), sample=333)
-    new = simulate(trajectory.load[:334], NEW_CELL.q_mobile, NEW_CELL.r_o)
-    np.testing.assert_array_equal(both.now.model_state[0], new.state[333])
-
-
-def test_process_noise_moves_the_voltages_of_the_cell():
-    data = TrajectoryDataset.generate("q_mobile", 1, [constant(8.0)], seed=0, dt_s=0.5)
-    task = started(make(data, cells=500, process_noise_V=1e-3), trajectory=0)
-    draws = []
-    for _ in range(4):
-        state, q, r = task.now.state, task.now.q_mobile, task.now.r_o
-        noise = task.now.next_state - step(state, task.now.load, q, r, dt=0.5)
-        assert not noise[:, [0, 4, 5, 6, 7]].any()
-        draws.append(noise[:, VO:QNB])
-        task.advance(np.zeros((500, 1)))
-    # white: over cells, states and time
-    drawn = np.concatenate(draws, axis=1) / (1e-3 * np.sqrt(0.5))
-    np.testing.assert_allclose(np.cov(drawn, rowvar=False), np.eye(12), atol=0.25)
-    assert drawn.std() == pytest.approx(1.0, abs=0.05) and abs(drawn.mean()) < 0.05
-
-
-def test_sensor_noise_is_white_and_in_what_is_paid(discharges):
-    task = started(make(discharges, cells=500, sensor_noise=2.0))
-    draws = []
-    for _ in range(3):
-        draws.append(((task.now.measured - task.now.next_state) / np.insert(ERROR_SCALE, 0, 1.0)).copy())
-        measured = task.now.measured.copy()
-        cost = task.advance(true_action(task))
-        expected = np.minimum(scaled_distance(task, task.now.model_state, measured), 5.0)
-        np.testing.assert_allclose(cost, expected, rtol=1e-9)
-    assert not np.array(draws)[..., 0].any()
-    drawn = np.concatenate([d[:, 1:] for d in draws], axis=1) / 2.0
-    np.testing.assert_allclose(np.cov(drawn, rowvar=False), np.eye(21), atol=0.25)
-    # the cell itself goes its way
-    np.testing.assert_array_equal(task.now.state[7], discharges[2].state[303])
-
-
-def test_sensors_may_have_an_offset_and_a_gain(discharges):
-    task = started(make(discharges, sensor_offset=-3.0, sensor_gain=1.02))
-    before, expected = (1.02 * discharges[2].state[t, OBSERVED] - 3.0 * ERROR_SCALE for t in (300, 301))
-    np.testing.assert_allclose(task.now.measured_before[0, OBSERVED], before, rtol=1e-12)
-    np.testing.assert_allclose(task.now.measured[0, OBSERVED], expected, rtol=1e-12)
-    observation = task.observation()[0]
-    np.testing.assert_allclose(observation[7:14], expected / STATE_SCALE, rtol=1e-6)
-    for origin, columns in ((task.now.model_state, slice(15, 22)), (task.now.measured_before, slice(22, 29))):
-        predicted = step(origin[0], task.now.load[0], NEW_CELL.q_mobile, NEW_CELL.r_o)
-        innovation = np.arcsinh((expected - predicted[OBSERVED]) / ERROR_SCALE)
-        np.testing.assert_allclose(observation[columns], innovation, rtol=1e-5)
+        assert (task.now["model_state"] == measured).all() == (decision % 3 == 0)
+        np.testing.assert_array_equal(task.report()["voltage_hat"], voltage(task.now["model_state"], task.now["q_mobile_hat"]))
 
 
 def test_the_second_innovation_does_not_see_the_drift_of_the_model(discharges):
@@ -153,26 +90,6 @@ def test_the_second_innovation_does_not_see_the_drift_of_the_model(discharges):
     drifted.advance(true_action(drifted) - 0.1)
     np.testing.assert_array_equal(drifted.observation()[:, 22:], task.observation()[:, 22:])
     assert np.abs(drifted.observation()[:, 15:18] - task.observation()[:, 15:18]).max() > 0.01
-
-
-def test_what_is_measured_becomes_what_was_measured(discharges):
-    task = started(make(discharges, cells=3, sensor_noise=2.0))
-    for _ in range(3):
-        measured = task.now.measured.copy()
-        assert (measured[:, OBSERVED] != task.now.next_state[:, OBSERVED]).all()
-        task.advance(true_action(task))
-        np.testing.assert_array_equal(task.now.measured_before, measured)
-    task.keep(np.array([True, False, True]))
-    np.testing.assert_array_equal(task.now.measured_before, measured[[0, 2]])
-
-
-def test_both_noises_at_once_do_not_share_draws(discharges):
-    task = started(make(discharges, cells=300, sensor_noise=1.0, process_noise_V=1e-3))
-    predicted = np.empty_like(task.now.state)
-    step_into(predicted, task.now.state, task.now.load, task.now.q_mobile, task.now.r_o, 1.0, "power", False, NEW_CELL.packed)
-    process = (task.now.next_state - predicted)[:, VO:QNB]
-    sensor = (task.now.measured - task.now.next_state)[:, VO:QNB]
-    assert np.abs(np.corrcoef(process.T, sensor.T)[:3, 3:]).max() < 0.25
 
 
 @pytest.mark.parametrize(("kind", "size"), [(BatteryQmax, 1), (BatteryJoint, 2)])
@@ -196,11 +113,11 @@ def test_charges_count_as_much_as_is_asked_for(discharges, kind):
     costs = {}
     for weight in (0.0, 0.5, 1.0):
         task = started(make(discharges, kind, cells=2, initial_perturbation=3.0, charge_weight=weight))
-        measured = task.now.measured.copy()
+        measured = task.now["next_state"].copy()
         observation = task.observation()
         costs[weight] = task.advance(true_action(task))
     voltages, charges = (
-        np.linalg.norm(((task.now.model_state - measured)[:, 1:] / kind.formulation.error_scale)[:, part], axis=1)
+        np.linalg.norm(((task.now["model_state"] - measured)[:, 1:] / kind.formulation.error_scale)[:, part], axis=1)
         for part in (slice(3), slice(3, None))
     )
     for weight, cost in costs.items():
@@ -217,9 +134,9 @@ def test_charges_count_as_much_as_is_asked_for(discharges, kind):
 
 def test_the_cost_is_limited(discharges):
     task = started(make(discharges, cells=2, cost_limit=0.2))
-    measured = task.now.measured.copy()
+    measured = task.now["next_state"].copy()
     cost = task.advance(true_action(task) + np.array([[0.02], [1.0]]))
-    distance = scaled_distance(task, task.now.model_state, measured)
+    distance = scaled_distance(task, task.now["model_state"], measured)
     np.testing.assert_allclose(cost, np.minimum(distance, 0.2), rtol=1e-9)
     assert cost[0] < 0.2 == cost[1]
 
@@ -233,11 +150,13 @@ def test_constants_may_differ_from_those_of_the_model():
         for row, n in enumerate((1, 4, 1)):
             own = zip(UNCERTAIN_CONSTANTS, data.factors[n], strict=True)
             true = NEW_CELL.replace(**{name: getattr(NEW_CELL, name) * factor for name, factor in own})
-            expected = step(task.now.state[row], task.now.load[row], task.now.q_mobile[row], task.now.r_o[row], cell=true)
-            np.testing.assert_allclose(task.now.next_state[row], expected, rtol=1e-13)
-        model, load, q, r = task.now.model_state.copy(), task.now.load.copy(), task.now.q_mobile, task.now.r_o
+            expected = step(
+                task.now["state"][row], task.now["load"][row], task.now["q_mobile"][row], task.now["r_o"][row], cell=true
+            )
+            np.testing.assert_allclose(task.now["next_state"][row], expected, rtol=1e-13)
+        model, load, q, r = task.now["model_state"].copy(), task.now["load"].copy(), task.now["q_mobile"], task.now["r_o"]
         assert (task.advance(true_action(task)) > 0.01).all()
-        np.testing.assert_allclose(task.now.model_state, step(model, load, q, r), rtol=1e-13)
+        np.testing.assert_allclose(task.now["model_state"], step(model, load, q, r), rtol=1e-13)
 
 
 def test_loads_of_other_kinds_and_time_steps():
@@ -249,21 +168,21 @@ def test_loads_of_other_kinds_and_time_steps():
     assert task.decision_s == 2.0 and len(np.unique(task.dataset[0].load)) > 5
     task.start(np.zeros(1, dtype=int), [np.random.default_rng(0)])
     np.testing.assert_array_equal(
-        task.now.next_state, step(task.now.state, task.now.load, task.now.q_mobile, task.now.r_o, dt=2.0)
+        task.now["next_state"], step(task.now["state"], task.now["load"], task.now["q_mobile"], task.now["r_o"], dt=2.0)
     )
 
 
 def test_perturbations_of_the_literal_form_are_in_error_scales_too(discharges):
     task = BatteryQmaxPaper(50, dataset=discharges, initial_perturbation=10.0)
     started(task)
-    off = (task.now.model_state - task.now.state)[:, OBSERVED] / ERROR_SCALE
+    off = (task.now["model_state"] - task.now["state"])[:, OBSERVED] / ERROR_SCALE
     assert 5.0 < np.abs(off).max() <= 10.0
 
 
 @pytest.mark.parametrize(("kind", "size"), [(BatteryQmax, 1), (BatteryJoint, 2)])
 def test_going_on_with_some_cells_changes_nothing_for_them(kind, size):
     data = TrajectoryDataset.generate(("q_mobile", "r_o"), 4, RandomPiecewise(), seed=0, mismatch=0.1)
-    options = {"sensor_noise": 1.0, "process_noise_V": 1e-4, "consistency": 0.5, "resync": 4, "start": "new_cell"}
+    options = {"initial_perturbation": 3.0, "consistency": 0.5, "resync": 4}
     tasks = [make(data, kind, cells=4, **options) for _ in range(2)]
     for task in tasks:
         for n in range(4):
@@ -296,19 +215,19 @@ def test_a_cell_whose_data_have_ended_goes_on_without_failing(discharges):
     for _ in range(5):
         task.advance(np.zeros((1, 1)))
         assert task.truncated() and np.isfinite(task.observation()).all()
-    assert task.now.load == discharges[2].load[-1]
+    assert task.now["load"] == discharges[2].load[-1]
 
 
 def test_episodes_go_on_with_a_probability(discharges):
     cells, probability = 2000, 0.5
     task = make(discharges, cells=cells, episode_steps=3, continue_probability=probability)
     task.start(np.arange(cells), [np.random.default_rng(n) for n in range(cells)])
-    lengths = task.now.steps // 3
-    assert (task.now.steps % 3 == 0).all() and lengths.min() == 1
+    lengths = task.now["steps"] // 3
+    assert (task.now["steps"] % 3 == 0).all() and lengths.min() == 1
     # geometric: 4 standard errors around the mean of 1 / (1 - p)
     assert abs(lengths.mean() - 2.0) < 4.0 * np.sqrt(2.0 / cells)
     task.keep(lengths == 2)
-    data_last = task.now.sample + 6 < task.now.last_decision
+    data_last = task.now["sample"] + 6 < task.now["last_decision"]
     for k in range(1, 7):
         task.advance(np.zeros((task.cells, 1)))
         assert (task.truncated()[data_last] == (k == 6)).all()
@@ -320,10 +239,10 @@ def test_a_share_of_the_episodes_starts_where_the_whole_discharge_does():
     for probability, low, high in ((0.0, 0, 0), (0.25, 60, 140), (1.0, cells, cells)):
         task = make(discharges, cells=cells, first_sample_probability=probability)
         task.start(np.arange(cells), [np.random.default_rng(n) for n in range(cells)])
-        at_rest = task.now.sample == 0
+        at_rest = task.now["sample"] == 0
         assert low <= at_rest.sum() <= high
     chosen = started(make(discharges, first_sample_probability=1.0))
-    assert chosen.now.sample == 300  # what is asked for counts
+    assert chosen.now["sample"] == 300  # what is asked for counts
 
 
 @pytest.mark.parametrize(
@@ -334,14 +253,9 @@ def test_a_share_of_the_episodes_starts_where_the_whole_discharge_does():
         ("continue_probability", -0.1, "continue_probability must be finite and at least 0, got -0.1"),
         ("first_sample_probability", 1.5, "first_sample_probability must be at most 1, got 1.5"),
         ("first_sample_probability", np.nan, "first_sample_probability must be finite"),
-        ("start", "old_cell", "start must be 'true' or 'new_cell', got 'old_cell'"),
         ("resync", 0, "resync must be None or at least 1, got 0"),
         ("initial_perturbation", -1.0, "initial_perturbation must be finite and at least 0, got -1.0"),
-        ("process_noise_V", np.nan, "process_noise_V must be finite and at least 0, got nan"),
-        ("sensor_noise", np.inf, "sensor_noise"),
         ("consistency", -0.1, "consistency"),
-        ("sensor_offset", np.inf, "sensor_offset must be finite, got inf"),
-        ("sensor_gain", 0.0, "sensor_gain must be finite and greater than 0, got 0.0"),
         ("charge_weight", -0.1, "charge_weight must be finite and at least 0, got -0.1"),
         ("cost_limit", 0.0, "cost_limit must be finite and greater than 0, got 0.0"),
         ("load", "sine", "load must be one of"),
@@ -352,12 +266,6 @@ def test_a_share_of_the_episodes_starts_where_the_whole_discharge_does():
 def test_options_out_of_range_are_refused(option, value, message):
     with pytest.raises(ValueError, match=message):
         BatteryQmax(1, **{option: value})
-
-
-@pytest.mark.parametrize("noise", ["sensor_noise", "process_noise_V"])
-def test_noise_is_not_repeated_in_episodes_that_go_on(noise):
-    with pytest.raises(ValueError, match="continue_probability does not go with sensor_noise or process_noise_V"):
-        BatteryQmax(1, continue_probability=0.5, **{noise: 0.01})
 
 
 @pytest.mark.parametrize("shape", [(2,), (2, 2), (1, 1), (3, 1)])

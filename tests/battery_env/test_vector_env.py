@@ -16,7 +16,7 @@ from battery_env.trajectories import TrajectoryDataset
 
 IDS = ("BatteryQmax-v0", "BatteryRo-v0", "BatteryJoint-v0", "BatteryQmaxPaper-v0", "BatteryRoPaper-v0")
 # whatever draws at random
-NOISY = {"initial_perturbation": 3.0, "process_noise_V": 1e-4, "sensor_noise": 0.5, "start": "new_cell", "resync": 3}
+NOISY = {"initial_perturbation": 3.0, "continue_probability": 0.5, "first_sample_probability": 0.3, "resync": 3}
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +76,7 @@ def test_row_n_has_the_generator_of_seed_plus_n(discharges):
     batch = gym.make_vec("BatteryQmax-v0", num_envs=4, dataset=discharges)
     batch.reset(seed=10)
     drawn = [np_random(10 + n)[0].integers(len(discharges)) for n in range(4)]
-    np.testing.assert_array_equal(batch.unwrapped.task.now.trajectory, drawn)
+    np.testing.assert_array_equal(batch.unwrapped.task.now["trajectory"], drawn)
 
 
 def test_the_mode_is_gymnasiums_default_and_its_reset_step_ignores_the_action(discharges):
@@ -101,7 +101,7 @@ def test_without_autoreset_the_caller_says_which_cells_start(discharges):
     batch.step(np.zeros((3, 1)))
     *_, info = batch.reset(seed=[None, 8, None], options={"reset_mask": mask, "trajectory": 4})
     np.testing.assert_array_equal(info["_cost"], mask)
-    assert task.now.decisions.tolist() == [1, 0, 1] and task.now.trajectory[1] == 4
+    assert task.now["decisions"].tolist() == [1, 0, 1] and task.now["trajectory"][1] == 4
     batch.step(np.zeros((3, 1)))
     assert batch.step(np.zeros((3, 1)))[3].tolist() == [True, False, True]
     with pytest.raises(gym.error.ResetNeeded, match=r"episodes of cells \[0, 2\] are over"):

@@ -1,0 +1,127 @@
+"""
+The layout of the full-state tasks: what actions stand for, how states become observations and costs, and the records that the
+kernels read and write.
+
+The kernels take records (structured arrays): numba passes one with all its fields in less time than a single array more takes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from battery_env.electrochemistry import STATE_SIZE, VO, FloatArray
+from battery_env.electrochemistry.cell import CONSTANTS_SIZE, POLYNOMIAL_SIZE
+
+Records = NDArray[np.void]
+
+#: The parameters at actions of -1 and 1 (the authors' code), C and ohm.
+ACTION_RANGES: dict[str, tuple[float, float]] = {"q_mobile": (4000.0, 8000.0), "r_o": (0.08, 0.22)}
+
+#: The state of the isothermal model, without the temperature.
+OBSERVED = slice(VO, STATE_SIZE)
+OBSERVED_SIZE = STATE_SIZE - VO
+
+#: Error scales of Vo, Vsn, Vsp, qnB, qnS, qpB, qpS, V and C. A parameter that is off by 10 % puts Vo, Vsn and Vsp off by some
+#: tenths of them in one step. Charges count little on purpose: they never forget an error, and with more weight in the
+#: cost the agent repays old errors with wrong parameters.
+ERROR_SCALE: FloatArray = np.array([0.01, 1e-5, 1e-5, 20.0, 20.0, 20.0, 20.0])
+
+
+@dataclass(frozen=True, eq=False)
+class Formulation:
+    """
+    How states become observations and costs. The arrays have the order of the state without temperature: Vo, Vsn, Vsp, qnB,
+    qnS, qpB, qpS, in V and C.
+
+    :param state_scale: divisor of observed states, shape (7,)
+    :param load_scale: divisor of observed loads, W
+    :param error_scale: divisor of errors of the state, in the cost and in the innovations, shape (7,)
+    :param innovations: whether the observation holds both innovations, asinh of x_{t+1} minus the prediction of a model with
+        a new cell's parameters, in error scales: one from the model's state x̂_t, one from the measured state x_t
+    :param literal_cost: whether the cost is that of the authors: 0.5 times the norm of the errors of the voltages plus 0.5
+        times that of the charges, times 50 where this exceeds 1e-4. Otherwise it is the norm of all errors
+    :param cost_limit: largest cost of a state. Distances span four orders of magnitude near the end of a discharge. A critic
+        that is fitted to such costs does not see the small ones
+    """
+
+    state_scale: FloatArray
+    load_scale: float
+    error_scale: FloatArray
+    innovations: bool
+    literal_cost: bool
+    cost_limit: float
+
+
+#: States and loads over what they reach in a new cell under 8 to 16 W; errors over error scales.
+SCALED = Formulation(
+    state_scale=np.array([0.5, 0.1, 0.01, 6840.0, 760.0, 11400.0, 1266.0]),
+    load_scale=16.0,
+    error_scale=ERROR_SCALE,
+    innovations=True,
+    literal_cost=False,
+    cost_limit=5.0,
+)
+#: The authors' code: states over a new cell's charges and 1 V, loads over 20 W.
+LITERAL = Formulation(
+    state_scale=np.array([1.0, 1.0, 1.0, 6840.0, 760.0, 4560.0, 506.67]),
+    load_scale=20.0,
+    error_scale=np.ones(OBSERVED_SIZE),
+    innovations=False,
+    literal_cost=True,
+    cost_limit=1e4,
+)
+
+#: What the kernels know of a task, one record. Ranges and actions are those of (q_mobile, r_o), in this order.
+SETTINGS = np.dtype(
+    [
+        ("dt_s", float),
+        ("power", bool),  # whether the load is power, not current
+        ("thermal", bool),
+        ("constants", float, (1, CONSTANTS_SIZE)),  # of the model
+        ("polynomial_n", float, (POLYNOMIAL_SIZE,)),
+        ("polynomial_p", float, (POLYNOMIAL_SIZE,)),
+        ("new_parameters", float, (2,)),
+        ("finds", np.int64, (2,)),  # 1 where a parameter is to be found
+        ("lowest", float, (2,)),  # what an action of -1 stands for
+        ("highest", float, (2,)),
+        ("resync", np.int64),  # 0: never
+        ("literal_cost", bool),
+        ("cost_limit", float),
+        ("cost_per_error", float, (OBSERVED_SIZE,)),
+        ("consistency", float),
+        ("per_state", float, (OBSERVED_SIZE,)),
+        ("per_load", float),
+        ("per_error", float, (OBSERVED_SIZE,)),
+        ("innovations", bool),
+        ("shows_action", bool),
+    ],
+    align=True,
+)
+#: A cell at its sample t, one record; a batch is an array of them.
+CELL = np.dtype(
+    [
+        ("trajectory", np.int64),  # number of the discharge
+        ("sample", np.int64),  # t
+        ("last_sample", np.int64),  # of the discharge
+        ("last_decision", np.int64),  # last sample at which there is a decision
+        ("load_start", np.int64),  # index of the first load of the discharge
+        ("steps", np.int64),  # decisions of this episode, fewer where the data end
+        ("decisions", np.int64),  # number of those made
+        ("state", float, (STATE_SIZE,)),  # x_t
+        ("next_state", float, (STATE_SIZE,)),  # x_{t+1}
+        ("model_state", float, (STATE_SIZE,)),  # of the model at t
+        ("load", float),  # u_{t+1}, over the step from t to t + 1, W or A
+        ("voltage", float),  # of the cell at t, V
+        ("soc", float),  # state of charge of the cell at t
+        ("q_mobile", float),  # of the cell, C
+        ("r_o", float),  # of the cell, ohm
+        ("q_mobile_hat", float),  # of the model, C
+        ("r_o_hat", float),  # of the model, ohm
+        ("last_action", float, (2,)),  # 0 for a parameter that is known
+    ]
+)
+#: Likewise, of a cell whose constants are not the model's.
+CELL_WITH_CONSTANTS = np.dtype([*CELL.descr, ("constants", float, (CONSTANTS_SIZE,))])
