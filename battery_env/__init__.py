@@ -25,6 +25,7 @@ if TYPE_CHECKING:
         LeastSquares,
         cramer_rao_bound,
         fit_cell,
+        soc_from_rest,
     )
     from battery_env.evaluation import evaluate
     from battery_env.forecasts import Forecast, forecast
@@ -64,6 +65,7 @@ _MODULES = {
     "read_discharge_csv": "battery_env.cells",
     "read_discharges": "battery_env.record_files",
     "simulate": "battery_env.electrochemistry",
+    "soc_from_rest": "battery_env.estimators",
     "step": "battery_env.electrochemistry",
     "track_life": "battery_env.life",
     "voltage": "battery_env.electrochemistry",
@@ -101,6 +103,7 @@ __all__ = [
     "read_discharges",
     "register_environments",
     "simulate",
+    "soc_from_rest",
     "step",
     "track_life",
     "voltage",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from math import comb, expm1
 
@@ -55,8 +55,6 @@ PRIOR_LIMIT_SD = 2.5
 #: The error of the model may be this much larger than stated before the residuals contradict it.
 MISMATCH_MARGIN = 2.0
 
-#: No Li-ion cell is to be discharged below this, V: it is no use to advise it.
-LEAST_CUT_OFF_V = 2.0
 #: Why a precision does not suffice, and what would help.
 IMPRECISE = {
     "q_mobile": "q_mobile is not known to 2 % yet: the voltage shows it at the knee of the discharge, the more the lower the "
@@ -247,25 +245,6 @@ def white_noise_V(residual_V: FloatArray, order: int = 1) -> float:
     return float(np.median(np.abs(np.diff(residual_V, order))) / (0.6745 * np.sqrt(comb(2 * order, order))))
 
 
-def imprecise_text(share: float, depth_V: float, enough_V: float | None, rmse_V: float) -> str:
-    """Why ``q_mobile`` is not precise enough, and what would make it so."""
-    reached = f", but to {np.ceil(1e4 * share) / 1e2:.3g} %" if share < 1.0 else ""
-    text = f"q_mobile is not known to 2 % yet{reached}: the voltage shows it at the knee of the discharge."
-    if depth_V >= LEAST_CUT_OFF_V:
-        text += f" Under this load the record has to go down to about {np.floor(1e2 * depth_V) / 1e2:.2f} V, if the cell may."
-    elif not np.isnan(depth_V):
-        text += f" Under this load no record down to {LEAST_CUT_OFF_V:g} V would tell it."
-    if enough_V is None:
-        return f"{text} To the same cut-off, a smaller load tells more."
-    text += " To the same cut-off, a smaller load or constants of the cell itself (fit_cell, --cell) tell more"
-    if not max(rmse_V, 1e-3) <= enough_V:
-        return f"{text}."
-    return (
-        f"{text}; so does a mismatch_V of {np.floor(1e3 * enough_V) / 1e3:.3f} V, if the model follows whole discharges of "
-        f"this cell that closely (this record: {rmse_V:.3f} V)."
-    )
-
-
-def first_reason(conditions: Sequence[tuple[bool, str]]) -> str:
+def first_reason(conditions: Iterable[tuple[bool, str]]) -> str:
     """The reason of the first condition that holds."""
     return next((reason for holds, reason in conditions if holds), "")
