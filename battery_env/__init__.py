@@ -27,6 +27,7 @@ if TYPE_CHECKING:
         LeastSquares,
         cramer_rao_bound,
         fit_cell,
+        soc_from_rest,
     )
     from battery_env.evaluation import evaluate
     from battery_env.forecasts import Forecast, forecast
@@ -46,7 +47,7 @@ _MODULES = {
     "estimates": ("Estimate",),
     "estimators": (
         *("CellFit", "ClosedForm", "Estimator", "ExtendedKalmanFilter", "GreedyOneStep", "LeastSquares"),
-        *("cramer_rao_bound", "fit_cell"),
+        *("cramer_rao_bound", "fit_cell", "soc_from_rest"),
     ),
     "evaluation": ("evaluate",),
     "forecasts": ("Forecast", "forecast"),

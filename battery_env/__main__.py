@@ -19,7 +19,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -248,7 +248,7 @@ def _jobs(text: str) -> int:
     return jobs
 
 
-def _initial_soc(text: str) -> InitialSoc:
+def _initial_soc(text: str) -> InitialSoc | Literal["rest"]:
     if text == "rest":
         return "rest"
     try:

@@ -121,7 +121,7 @@ def track_life(discharges: Sequence[Discharge], cut_off_V: float, calibrator: Le
     calibrator = LeastSquares(thermal=True, mismatch_V=0.05) if calibrator is None else calibrator
     if calibrator.prior_q_mobile_C is not None:
         raise ValueError("the calibrator must have no prior of q_mobile: each discharge has to speak for itself")
-    if calibrator.initial_soc != (1.0, 0.0) or calibrator.told_from_rest:
+    if calibrator.initial_soc != (1.0, 0.0):
         raise ValueError("the calibrator must take discharges to start full: the charge to the cut-off is no capacity else")
     if not len(discharges):
         raise ValueError("discharges must hold at least one discharge")

@@ -21,7 +21,7 @@ from battery_env.estimators.cell_fit import UNFITTED_MISMATCH_V, CellFit
 from battery_env.estimators.gaps import NOT_DRAWN, find_gaps
 from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
-from battery_env.estimators.rest import InitialSoc, Start
+from battery_env.estimators.rest import InitialSoc, Start, check_initial_soc, soc_from_rest
 from battery_env.estimators.settling import least_resistance_ohm, rest_voltage_V, start_reason
 from battery_env.parameters import PARAMETER_NAMES, check_parameters
 from battery_env.record_model import RecordModel, VoltageForecast
@@ -97,7 +97,7 @@ class Settings:
     nominal_Ah: float | None = None
     cell: CellParameters | None = None
     q_mobile_bounds_C: tuple[float, float] | None = None
-    initial_soc: InitialSoc = 1.0
+    initial_soc: InitialSoc | Literal["rest"] = 1.0
     policy: Path | None = None
 
     def __post_init__(self) -> None:
@@ -155,9 +155,19 @@ class Settings:
             prior_q_mobile_C=self.prior_q_mobile_C,
             mismatch_V=self.mismatch_V,
             current_gain_sd=self.current_gain_sd,
-            initial_soc=self.initial_soc if start is None else (start.soc, start.sd_soc),
+            initial_soc=self._stated_soc if start is None else (start.soc, start.sd_soc),
             **bounds,
         )
+
+    @property
+    def _stated_soc(self) -> InitialSoc:
+        return 1.0 if self.initial_soc == "rest" else self.initial_soc
+
+    def start_of(self, discharge: Discharge, cell: CellParameters) -> Start:
+        """The state of charge that a discharge starts with: the one that is stated, or what its rest tells."""
+        if self.initial_soc == "rest":
+            return soc_from_rest(discharge, cell, self.mismatch_V)
+        return Start(*check_initial_soc(self._stated_soc))
 
     def _policy(self) -> PolicyEstimator:
         if self.policy is None:
@@ -227,8 +237,7 @@ def summarize(discharge: Discharge, settings: Settings) -> Summary:
     if settings.ambient_C is not None or not settings.thermal:
         # a temperature that is stated, or held, counts more than one that was measured
         discharge, seen = discharge.without_temperature(), record.without_temperature()
-    calibrator = settings.calibrator(cell)
-    start = Start(1.0, 0.0) if isinstance(calibrator, PolicyEstimator) else calibrator.start_of(discharge)
+    start = settings.start_of(discharge, cell)
     estimate = settings.calibrator(cell, start).estimate(seen)
     if start.reason:
         estimate = replace(estimate, settled=False, reason=start.reason)

@@ -8,6 +8,7 @@ from battery_env.estimators.cramer_rao import CramerRaoBound, Sensitivities, cra
 from battery_env.estimators.greedy import GreedyOneStep
 from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
+from battery_env.estimators.rest import soc_from_rest
 
 __all__ = [
     "CellFit",
@@ -26,4 +27,5 @@ __all__ = [
     "cramer_rao_bound",
     "fit_cell",
     "sensitivities",
+    "soc_from_rest",
 ]

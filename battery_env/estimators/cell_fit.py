@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +14,6 @@ import numpy as np
 import pandas as pd
 from numpy.polynomial import Legendre, Polynomial
 from numpy.polynomial.legendre import legvander
-from scipy.optimize import least_squares
 
 from battery_env.arrays import FloatArray
 from battery_env.cells import Discharge
@@ -22,6 +21,7 @@ from battery_env.checks import check_numbers, check_positive
 from battery_env.electrochemistry import NEW_CELL, CellParameters, check_cell, check_dt
 from battery_env.electrochemistry.tangents import BY_Q, BY_R, RATE_CONSTANTS
 from battery_env.estimators.least_squares import LeastSquares
+from battery_env.estimators.search import MARGIN, OnGrid, distance_C, minimized, square
 from battery_env.estimators.settling import FULL_REST_V, rest_voltage_V
 from battery_env.files import WrongFormatError, read_json, write_json
 from battery_env.parameters import Q_MOBILE, R_O
@@ -43,16 +43,17 @@ UNFITTED_MISMATCH_V = 0.05
 
 _FORMAT, _FORMAT_VERSION = "battery_env.CellFit", 1
 
-# Mole fractions of the positive electrode at full charge and at none.
-_FRACTIONS_P = (0.4, 1.0)
-_MOST_DISCHARGES = 30
-_FEWEST_SAMPLES = 20
+_MOST_DISCHARGES, _FEWEST_SAMPLES = 30, 20
 # Longer records are thinned: what the constants shape is slower.
 _MOST_SAMPLES = 2000
+# Mole fractions of the positive electrode at full charge and at none.
+_FRACTIONS_P = (0.4, 1.0)
 # A cell that holds less or more than the new one by this factor is one of another size.
 _OTHER_SIZE = 2.0
 # The charge that can move is about this much more than what a discharge delivers.
 _UNDELIVERED = 1.05
+# A cell is not expected to hold more than this times the largest q_mobile that was fitted.
+_GROWTH = 1.2
 # Rounds of weighing the residuals by how large they turn out, and how large they are taken for in the first one, V.
 _ROUNDS = 3
 _FIRST_MISMATCH_V, _LEAST_MISMATCH_V = 0.02, 1e-3
@@ -60,24 +61,11 @@ _FIRST_MISMATCH_V, _LEAST_MISMATCH_V = 0.02, 1e-3
 # often.
 _INDEPENDENT_ERRORS = 50.0
 # The search: how many standard deviations of its prior a constant may move, the logarithm of the distance of q_mobile to its
-# least value, C, the least distance as a share of it, and the scale of r_o, ohm.
-_REACH_SD = 6.0
-_LOG_DISTANCE_LIMITS = (-30.0, 16.0)
-_MARGIN = 1e-6
-# A cell is not expected to hold more than this times the largest q_mobile that was fitted.
-_GROWTH = 1.2
-_R_O_SCALE_OHM = 0.1
-# Where the search for q_mobile starts beside the fit with the constants known before: this much above its least value.
-_START_EXCESS = 0.02
-
-
-class _Data(NamedTuple):
-    """One discharge as it is fitted."""
-
-    time_s: FloatArray  # of the samples, since the first one
-    voltage_V: FloatArray
-    current_A: FloatArray  # over each step of the model
-    at_rest: bool  # whether the first sample is the voltage of a full cell at rest
+# least value, C, and the scale of r_o, ohm.
+_REACH_SD, _LOG_DISTANCE_LIMITS, _R_O_SCALE_OHM = 6.0, (-30.0, 16.0), 0.1
+# Where the search for q_mobile starts beside the fit with the constants known before, and how near that may be to its least
+# value, as shares of it.
+_START_EXCESS, _LEAST_EXCESS = 0.02, 1e-4
 
 
 class FittedConstant(NamedTuple):
@@ -218,14 +206,6 @@ class CellFit:
         table = pd.DataFrame(self.constants)
         return table.assign(identified=[constant.identified for constant in self.constants])
 
-    def discharges_table(self) -> pd.DataFrame:
-        """
-        The discharges that were fitted.
-
-        :return: one row a discharge, the fields of :class:`FittedDischarge`
-        """
-        return pd.DataFrame(self.discharges)
-
     def summary(self) -> str:
         """
         The fit in a few lines.
@@ -348,8 +328,7 @@ def fit_cell(
     # a simulated record is at rest before its first current acts
     at_rest = [not isinstance(whole, Discharge) or _starts_at_rest(whole) for whole in discharges]
     _check_starts_alike(records, at_rest)
-    problem = _JointFit(records, at_rest, prior, thermal, dt_s)
-    fit = problem.result(*problem.solve())
+    fit = JointFit(records, at_rest, prior, thermal, dt_s).solve()
     if not fit.rmse_V <= limit_V:
         raise ValueError(
             f"the equations do not describe this cell: with all constants fitted the voltage is still {1e3 * fit.rmse_V:.0f} "
@@ -441,22 +420,34 @@ def _name(record: Record, number: int) -> str:
     return f"{meta['cell']}:{meta['cycle']}" if {"cell", "cycle"} <= set(meta) else str(number)
 
 
-class _Aged(NamedTuple):
-    """The parameters of one discharge at an x."""
+@dataclass(frozen=True)
+class AtDischarge:
+    """
+    The model of one discharge at an x of the search.
 
+    :param residual_V: at the samples, V
+    :param jacobian: their derivatives by x
+    :param q_mobile: C
+    :param r_o: ohm
+    :param q_gradient_C: derivatives of ``q_mobile`` by x
+    """
+
+    residual_V: FloatArray
+    jacobian: FloatArray
     q_mobile: float
     r_o: float
-    q_gradient_C: FloatArray  # of q_mobile by x
+    q_gradient_C: FloatArray
 
 
-class _Weights(NamedTuple):
+@dataclass(frozen=True)
+class _Weights:
     """How much the residuals of each discharge count."""
 
     mismatch_V: float
     independent: FloatArray  # errors in each discharge, shape (D,)
 
 
-class _JointFit:
+class JointFit:
     """
     The search over the constants and, for each discharge, ``q_mobile`` and ``r_o``. An x holds, in this order: of each
     constant how many standard deviations of its prior it has moved; of each discharge the logarithm of the distance of
@@ -466,131 +457,101 @@ class _JointFit:
     def __init__(
         self, records: Sequence[Record], at_rest: Sequence[bool], start: CellParameters, thermal: bool, dt_s: float
     ) -> None:
-        self.start, self.thermal, self.dt_s = start, thermal, dt_s
+        self.model = RecordModel(start, thermal, dt_s)
         self.names = [_name(record, number) for number, record in enumerate(records, start=1)]
         self.sd = np.array([*(RATE_PRIOR_SD[name] for name in RATE_CONSTANTS), *EQUILIBRIUM_PRIOR_SD_V])
-        model = RecordModel(start, thermal, dt_s)
-        self.data: list[_Data] = []
-        for record, rests in zip(records, at_rest, strict=True):
-            time_s, current_A = model.grid(record)
-            kept = np.unique(np.linspace(0, len(time_s) - 1, min(len(time_s), _MOST_SAMPLES)).round().astype(np.int64))
-            self.data.append(_Data(time_s[kept], np.asarray(record.voltage_V)[kept], current_A, rests))
+        self.at_rest = at_rest  # whether the first sample is the voltage of a full cell at rest
+        self.data = [_thinned(OnGrid.of(record, self.model)) for record in records]
         calibrator = LeastSquares(
             cell=start, thermal=thermal, dt_s=dt_s, q_mobile_bounds_C=Q_MOBILE.limits, r_o_bounds_ohm=R_O.limits
         )
         self.before = [calibrator.estimate(record) for record in records]
-        self._evaluated = lru_cache(maxsize=1)(self._evaluate)  # scipy asks for residuals and derivatives one after the other
+        self._evaluated = lru_cache(maxsize=1)(self.evaluate)
 
     def cell(self, x: FloatArray) -> CellParameters:
         """The constants of an x."""
-        moved = x[: len(self.sd)] * self.sd
+        start, moved = self.model.cell, x[: len(self.sd)] * self.sd
         rates = {
-            name: getattr(self.start, name) * float(np.exp(log))
+            name: getattr(start, name) * float(np.exp(log))
             for name, log in zip(RATE_CONSTANTS, moved[: len(RATE_CONSTANTS)], strict=True)
         }
-        return with_equilibrium(self.start.replace(**rates), moved[len(RATE_CONSTANTS) :])
+        return with_equilibrium(start.replace(**rates), moved[len(RATE_CONSTANTS) :])
 
-    def solve(self) -> tuple[FloatArray, _Weights]:
-        """The best x that is found from any start, and the weights that its residuals imply."""
-        n = len(self.data)
-        weights = _Weights(_FIRST_MISMATCH_V, np.full(n, _INDEPENDENT_ERRORS))
-        best = min((self._search(x, weights) for x in self._starts()), key=lambda x: self._square(x, weights))
+    def starts(self) -> list[FloatArray]:
+        """Where to start: at the constants known before."""
+        least_C = np.array([self.model.least_q_mobile_C(data.current_A) for data in self.data])
+        fitted_C = np.array([estimate.q_mobile for estimate in self.before]) - least_C
+        r_o = [estimate.r_o / _R_O_SCALE_OHM for estimate in self.before]
+        return [
+            np.concatenate([np.zeros(len(self.sd)), np.log(np.maximum(above_C, _LEAST_EXCESS * least_C)), r_o])
+            for above_C in (fitted_C, _START_EXCESS * least_C)
+        ]
+
+    def solve(self) -> CellFit:
+        """The best fit that is found from any start, with the weights that its residuals imply."""
+        weights = _Weights(_FIRST_MISMATCH_V, np.full(len(self.data), _INDEPENDENT_ERRORS))
+        found = [self._search(x, weights) for x in self.starts()]
+        best = min(found, key=lambda x: square(self._objective(x, weights)[0]))
         for _ in range(_ROUNDS):
             weights = self._weights(best, weights)
             best = self._search(best, weights)
-        return best, self._weights(best, weights)
-
-    def _starts(self) -> list[FloatArray]:
-        model = RecordModel(self.start, self.thermal, self.dt_s)
-        least_C = [model.least_q_mobile_C(data.current_A) for data in self.data]
-        fitted = [estimate.q_mobile - least for estimate, least in zip(self.before, least_C, strict=True)]
-        r_o = [estimate.r_o / _R_O_SCALE_OHM for estimate in self.before]
-        starts = []
-        for distance_C in (fitted, _START_EXCESS * np.array(least_C)):
-            logs = np.log(np.maximum(distance_C, 1e-4 * np.array(least_C)))
-            starts.append(np.concatenate([np.zeros(len(self.sd)), logs, r_o]))
-        return starts
+        return self._result(best, self._weights(best, weights))
 
     def _bounds(self) -> tuple[FloatArray, FloatArray]:
-        n = len(self.data)
         low, high = np.full(len(self.sd), -_REACH_SD), np.full(len(self.sd), _REACH_SD)
         for k, name in enumerate(RATE_CONSTANTS):
             if name in ("to", "tsn", "tsp"):  # the model is stable at twice this step
-                low[k] = max(low[k], np.log(self.dt_s / getattr(self.start, name)) / self.sd[k])
-        ends = [
-            np.concatenate([constants, np.full(n, log), np.full(n, r_o / _R_O_SCALE_OHM)])
-            for constants, log, r_o in zip((low, high), _LOG_DISTANCE_LIMITS, R_O.limits, strict=True)
-        ]
-        return ends[0], ends[1]
+                low[k] = max(low[k], np.log(self.model.dt_s / getattr(self.model.cell, name)) / self.sd[k])
+        (least, most), each = _LOG_DISTANCE_LIMITS, np.ones(len(self.data))
+        low_r, high_r = R_O.limits
+        return (
+            np.concatenate([low, least * each, low_r / _R_O_SCALE_OHM * each]),
+            np.concatenate([high, most * each, high_r / _R_O_SCALE_OHM * each]),
+        )
 
     def _search(self, x: FloatArray, weights: _Weights) -> FloatArray:
         low, high = self._bounds()
         room = 1e-6 * (high - low)
-
-        def residual(x: FloatArray) -> FloatArray:
-            return self._objective(x, weights)[0]
-
-        def jacobian(x: FloatArray) -> FloatArray:
-            return self._objective(x, weights)[1]
-
-        result = least_squares(
-            residual,
-            np.clip(x, low + room, high - room),
-            jac=jacobian,
-            bounds=(low, high),
-            x_scale=1.0,
-            ftol=1e-7,
-            xtol=1e-7,
-            gtol=1e-7,
-            max_nfev=200,
-        )
-        return np.asarray(result.x)
-
-    def _square(self, x: FloatArray, weights: _Weights) -> float:
-        residual = self._objective(x, weights)[0]
-        return float(residual @ residual)
+        tolerances = dict.fromkeys(("ftol", "xtol", "gtol"), 1e-7)
+        x = np.clip(x, low + room, high - room)
+        return minimized(lambda x: self._objective(x, weights), x, bounds=(low, high), max_nfev=200, **tolerances)
 
     def _objective(self, x: FloatArray, weights: _Weights) -> tuple[FloatArray, FloatArray]:
         """Weighted residuals and distances to the priors, and their derivatives."""
-        residuals_V, jacobians, _ = self._evaluated(tuple(x))
         n = len(self.sd)
         residuals, derivatives = [], []
-        for data, count, residual_V, jacobian in zip(self.data, weights.independent, residuals_V, jacobians, strict=True):
-            scale = np.full(len(residual_V), np.sqrt(count / len(residual_V)))
-            if data.at_rest:
+        for seen, at_rest, count in zip(self._evaluated(tuple(x)), self.at_rest, weights.independent, strict=True):
+            scale = np.full(len(seen.residual_V), np.sqrt(count / len(seen.residual_V)))
+            if at_rest:
                 scale[0] = 1.0  # one sample alone says what a full cell shows, however many follow
             scale /= weights.mismatch_V
-            residuals.append(scale * residual_V)
-            derivatives.append(scale[:, None] * jacobian)
+            residuals.append(scale * seen.residual_V)
+            derivatives.append(scale[:, None] * seen.jacobian)
         return np.concatenate([*residuals, x[:n]]), np.concatenate([*derivatives, np.eye(n, len(x))])
 
-    def _evaluate(self, x: tuple[float, ...]) -> tuple[list[FloatArray], list[FloatArray], list[_Aged]]:
-        """Of each discharge the residuals, V, their derivatives by x, and its parameters."""
+    def evaluate(self, x: Sequence[float]) -> list[AtDischarge]:
+        """The model of every discharge at an x."""
         values = np.array(x)
-        model = RecordModel(self.cell(values), self.thermal, self.dt_s)
+        model = self.model.of_cell(self.cell(values))
         n, rates = len(self.sd), len(RATE_CONSTANTS)
-        residuals, jacobians, aged = [], [], []
+        t_diffusion = RATE_CONSTANTS.index("tDiffusion")
+        found = []
         for d, data in enumerate(self.data):
             u, r = n + d, n + len(self.data) + d
             least_C, least_by_log_C = model.least_q_mobile_tangent_C(data.current_A)
-            distance_C = float(np.exp(values[u]))
-            q_mobile, r_o = (1.0 + _MARGIN) * least_C + distance_C, _R_O_SCALE_OHM * float(values[r])
-            voltage_V, by_parameter, fraction_p = model.tangents(data.current_A, q_mobile, r_o)
+            above_C, r_o = distance_C(values[u]), _R_O_SCALE_OHM * float(values[r])
+            q_mobile = (1.0 + MARGIN) * least_C + above_C
             q_gradient_C = np.zeros(len(values))
-            q_gradient_C[u] = distance_C
-            t_diffusion = RATE_CONSTANTS.index("tDiffusion")
-            q_gradient_C[t_diffusion] = (1.0 + _MARGIN) * least_by_log_C * self.sd[t_diffusion]
-            columns = by_parameter[BY_Q][:, None] * q_gradient_C
-            columns[:, :rates] += self.sd[:rates] * by_parameter[BY_R + 1 :].T
-            columns[:, rates:n] = self.sd[rates:] * legvander(_on_unit_range(fraction_p), n - rates - 1)
-            columns[:, r] = _R_O_SCALE_OHM * by_parameter[BY_R]
-            grid_s = self.dt_s * np.arange(len(voltage_V))
-            at = np.minimum(np.searchsorted(grid_s, data.time_s, side="right"), len(grid_s) - 1)
-            share = (data.time_s - grid_s[at - 1]) / self.dt_s
-            residuals.append(np.interp(data.time_s, grid_s, voltage_V) - data.voltage_V)
-            jacobians.append(columns[at - 1] + share[:, None] * (columns[at] - columns[at - 1]))
-            aged.append(_Aged(q_mobile, r_o, q_gradient_C))
-        return residuals, jacobians, aged
+            q_gradient_C[u] = above_C
+            q_gradient_C[t_diffusion] = (1.0 + MARGIN) * least_by_log_C * self.sd[t_diffusion]
+            voltage_V, by_parameter, fraction_p = model.tangents(data.current_A, q_mobile, r_o)
+            columns = by_parameter[BY_Q] * q_gradient_C[:, None]
+            columns[:rates] += self.sd[:rates, None] * by_parameter[BY_R + 1 :]
+            columns[rates:n] = self.sd[rates:, None] * legvander(_on_unit_range(fraction_p), n - rates - 1).T
+            columns[r] = _R_O_SCALE_OHM * by_parameter[BY_R]
+            seen_V, *by_x = data.at_samples([voltage_V, *columns])
+            found.append(AtDischarge(seen_V - data.voltage_V, np.column_stack(by_x), q_mobile, r_o, q_gradient_C))
+        return found
 
     def _covariance(self, x: FloatArray, weights: _Weights) -> FloatArray:
         jacobian = self._objective(x, weights)[1]
@@ -598,7 +559,7 @@ class _JointFit:
 
     def _weights(self, x: FloatArray, weights: _Weights) -> _Weights:
         """What the residuals say about their own size, and how many of them are independent."""
-        residuals_V = self._evaluated(tuple(x))[0]
+        residuals_V = [seen.residual_V for seen in self._evaluated(tuple(x))]
         changes = [float(np.count_nonzero(np.diff(np.signbit(residual)))) for residual in residuals_V]
         independent = np.maximum(changes, _INDEPENDENT_ERRORS)
         # what was fitted makes residuals smaller than errors, by as much as the data determine
@@ -607,48 +568,39 @@ class _JointFit:
         square_V2 = sum(count * _rms(residual) ** 2 for count, residual in zip(independent, residuals_V, strict=True))
         return _Weights(max(float(np.sqrt(square_V2 / (independent.sum() - fitted))), _LEAST_MISMATCH_V), independent)
 
-    def result(self, x: FloatArray, weights: _Weights) -> CellFit:
+    def _result(self, x: FloatArray, weights: _Weights) -> CellFit:
         """What was found."""
-        residuals_V, _, aged = self._evaluated(tuple(x))
-        n, discharges = len(self.sd), len(self.data)
+        start, cell, n, seen = self.model.cell, self.cell(x), len(self.sd), self._evaluated(tuple(x))
         covariance = self._covariance(x, weights)
         sds = np.sqrt(np.diag(covariance))
+        before = [getattr(start, name) for name in RATE_CONSTANTS] + [0.0] * len(EQUILIBRIUM_PRIOR_SD_V)
+        after = [getattr(cell, name) for name in RATE_CONSTANTS] + (self.sd * x[:n])[len(RATE_CONSTANTS) :].tolist()
         names = [*RATE_CONSTANTS, *(f"equilibrium {k}" for k in range(len(EQUILIBRIUM_PRIOR_SD_V)))]
-        cell = self.cell(x)
-        constants = []
-        for k, name in enumerate(names):
-            rate = name in RATE_PRIOR_SD
-            before, after = (getattr(self.start, name), getattr(cell, name)) if rate else (0.0, self.sd[k] * x[k])
-            constants.append(FittedConstant(name, before, float(self.sd[k]), float(after), float(self.sd[k] * sds[k])))
-        model = RecordModel(self.start, self.thermal, self.dt_s)
-        rows = []
-        for d, (residual_V, age) in enumerate(zip(residuals_V, aged, strict=True)):
-            before = self.before[d]
-            tangents = model.tangents(self.data[d].current_A, before.q_mobile, before.r_o)
-            grid_s = self.dt_s * np.arange(len(tangents.voltage_V))
-            before_V = np.interp(self.data[d].time_s, grid_s, tangents.voltage_V) - self.data[d].voltage_V
-            rows.append(
-                FittedDischarge(
-                    self.names[d],
-                    age.q_mobile,
-                    age.r_o,
-                    float(np.sqrt(age.q_gradient_C @ covariance @ age.q_gradient_C)),
-                    float(_R_O_SCALE_OHM * sds[n + discharges + d]),
-                    _rms(residual_V),
-                    _rms(before_V),
-                )
-            )
-        largest = max(rows, key=lambda row: row.q_mobile)
+        rows = zip(names, before, self.sd.tolist(), after, (self.sd * sds[:n]).tolist(), strict=True)
+        discharges = []
+        for d, (name, data, known, at) in enumerate(zip(self.names, self.data, self.before, seen, strict=True)):
+            (before_V,) = data.at_samples([self.model.tangents(data.current_A, known.q_mobile, known.r_o).voltage_V])
+            sd_q_C = float(np.sqrt(at.q_gradient_C @ covariance @ at.q_gradient_C))
+            sd_r_ohm = float(_R_O_SCALE_OHM * sds[n + len(seen) + d])
+            errors_V = _rms(at.residual_V), _rms(before_V - data.voltage_V)
+            discharges.append(FittedDischarge(name, at.q_mobile, at.r_o, sd_q_C, sd_r_ohm, *errors_V))
+        largest = max(discharges, key=lambda discharge: discharge.q_mobile)
         new = {"q_mobile": largest.q_mobile, "r_o": largest.r_o}
         return CellFit(
             cell.replace(**new),
-            self.start.replace(**new),
+            start.replace(**new),
             weights.mismatch_V,
-            _rms(np.concatenate(residuals_V)),
-            self.thermal,
-            tuple(constants),
-            tuple(rows),
+            _rms(np.concatenate([at.residual_V for at in seen])),
+            self.model.thermal,
+            tuple(FittedConstant(*row) for row in rows),
+            tuple(discharges),
         )
+
+
+def _thinned(data: OnGrid) -> OnGrid:
+    samples = len(data.time_s)
+    kept = np.unique(np.linspace(0, samples - 1, min(samples, _MOST_SAMPLES)).round().astype(np.int64))
+    return replace(data, time_s=data.time_s[kept], voltage_V=data.voltage_V[kept])
 
 
 def _rms(values: FloatArray) -> float:

@@ -10,11 +10,11 @@ from numba import njit
 from battery_env.arrays import FloatArray, IntArray
 from battery_env.records import REST_CURRENT_A, SWITCH_SHARE
 
-#: An interval between two samples is a gap where it is this many times longer than those before and after it, and the charge
-#: that it would be without, were it as long as these, is above this share of ``q_mobile``.
+#: An interval between two samples is a gap where it is so many times longer than those before and after it, and what its load
+#: draws in the time that is longer is above this share of ``q_mobile``.
 GAP_RATIO, GAP_SHARE = 2.5, 0.005
-#: It is none where the logger has a habit of it: one that writes a row when the voltage has changed has intervals of all
-#: lengths. Put in order, each is at most ``GAP_RATIO`` times longer than the one so many places before it.
+#: Loggers that write a row on a change of voltage have intervals of all lengths. An interval is no gap if, among all intervals
+#: under load in the order of their lengths, the one so many places before it is at least 1 / ``GAP_RATIO`` as long.
 HABIT = 3
 #: What the voltage says of a gap: that its charge was drawn, that it was not, or nothing.
 DRAWN, NOT_DRAWN, UNSURE = range(3)
@@ -23,8 +23,8 @@ DRAWN, NOT_DRAWN, UNSURE = range(3)
 _WINDOW_S, _SAMPLES = (60.0, 300.0), 5
 # A drift of the model counts up to this share of its fall: a fit to a record whose clock jumped drifts beside the jump.
 _MOST_DRIFT = 0.3
-# Where the charge was drawn, cell and model part across the gap by less than this share of the fall of the model. It is more
-# in the middle of a discharge, where the model knows less of the cell and nothing of what follows.
+#: Where the charge was drawn, cell and model part across the gap by less than this share of the fall of the model. The second
+#: one holds in the middle of a discharge, where the model knows less of the cell and nothing of what follows.
 MOST_SHARE, MOST_SHARE_SO_FAR = 0.5, 0.7
 # With so many standard deviations to spare it is a verdict.
 _SURE_SD = 1.5
@@ -48,7 +48,7 @@ class Gap(NamedTuple):
 
 @njit(cache=True, error_model="numpy")
 def doubtful_charge_C(before_s: float, duration_s: float, after_s: float, load_A: float, q_mobile: float) -> float:
-    """The charge of an interval between two samples that is in doubt, compiled."""
+    """Return the charge of an interval between two samples that is in doubt; 0 if the interval is no gap."""
     usual_s = max(before_s, after_s)
     charge_C = load_A * (duration_s - usual_s)
     is_gap = duration_s > GAP_RATIO * usual_s and load_A > REST_CURRENT_A and charge_C > GAP_SHARE * q_mobile
@@ -58,7 +58,7 @@ def doubtful_charge_C(before_s: float, duration_s: float, after_s: float, load_A
 @njit(cache=True, error_model="numpy")
 def verdict(missing_V: float, fall_V: float, sd_V: float, most_share: float) -> int:
     """
-    What the voltage says of a gap, compiled. The model falls across the gap by the charge that its current draws. A cell that
+    Say whether the charge of a gap was drawn. The model falls across the gap by the charge that its current draws. A cell that
     was not loaded meanwhile, or whose clock jumped, does not.
     """
     if not fall_V > 0.0:
@@ -71,7 +71,7 @@ def verdict(missing_V: float, fall_V: float, sd_V: float, most_share: float) -> 
 
 
 def long_intervals(time_s: FloatArray) -> IntArray:
-    """The intervals between samples that are so much longer than those beside them that they may be gaps."""
+    """Find the intervals that are so much longer than those beside them that they may be gaps."""
     step_s = np.diff(time_s)
     beside_s = np.pad(step_s, 1)
     return np.flatnonzero(step_s > GAP_RATIO * np.maximum(beside_s[:-2], beside_s[2:]))
@@ -80,7 +80,7 @@ def long_intervals(time_s: FloatArray) -> IntArray:
 def find_gaps(
     time_s: FloatArray, voltage_V: FloatArray, current_A: FloatArray, model_V: FloatArray, q_mobile: float
 ) -> list[Gap]:
-    """The gaps of a record. The model errs too: what it drifts from the cell beside a gap it may drift within it."""
+    """Find the gaps of a record. The model errs too: what it drifts from the cell beside a gap it may drift within it."""
     gaps: list[Gap] = []
     step_s, long = np.diff(time_s), long_intervals(time_s)
     if not len(long):
@@ -88,35 +88,37 @@ def find_gaps(
     beside_s, unusual_s = np.pad(step_s, 1), _unusual_s(step_s, current_A)
     for n in long:
         usual_s = max(beside_s[n], beside_s[n + 2])
-        if not ((unusual_s > usual_s) & (unusual_s <= step_s[n])).any():
-            continue
         load_A = float(np.abs(current_A[n : n + 2]).max())
         charge_C = doubtful_charge_C(beside_s[n], step_s[n], beside_s[n + 2], load_A, q_mobile)
-        if not charge_C:
+        if not charge_C or not ((unusual_s > usual_s) & (unusual_s <= step_s[n])).any():
             continue
-        window_s = max(float(np.clip(step_s[n], *_WINDOW_S)), 2.0 * _SAMPLES * usual_s)
-        # the first voltage may be that of the rest before the load
-        first = max(int(np.searchsorted(time_s, time_s[n] - window_s)), 1)
-        last = int(np.searchsorted(time_s, time_s[n + 1] + window_s, side="right"))
-        parted_V = voltage_V - model_V
-        before_V, before_slope, before_sd_V = _edge(time_s[first : n + 1], parted_V[first : n + 1], time_s[n])
-        after_V, after_slope, after_sd_V = _edge(time_s[n + 1 : last], parted_V[n + 1 : last], time_s[n + 1])
-        parted = after_V - before_V
-        fall_V = float(model_V[n] - model_V[n + 1])
-        # by what they drift on both sides alike they may drift in between
-        slope = min(before_slope, after_slope, key=abs) if before_slope * after_slope > 0.0 else 0.0
-        drift_V = slope * step_s[n]
-        allowed_V = min(max(drift_V, 0.0), _MOST_DRIFT * max(fall_V, 0.0))
-        missing_V = parted - float(np.clip(parted, min(drift_V, 0.0), allowed_V))
-        said = verdict(missing_V, fall_V, float(np.hypot(before_sd_V, after_sd_V)), MOST_SHARE)
+        said = _said(n, usual_s, time_s, voltage_V - model_V, float(model_V[n] - model_V[n + 1]))
         if abs(current_A[n + 1] - current_A[n]) > SWITCH_SHARE * load_A:
             said = UNSURE  # the load was switched, nobody knows when
         gaps.append(Gap(float(time_s[n]), float(time_s[n + 1]), float(charge_C), said))
     return gaps
 
 
+def _said(n: int, usual_s: float, time_s: FloatArray, parted_V: FloatArray, fall_V: float) -> int:
+    """What the voltage says of the gap after sample n, across which the model falls by ``fall_V``."""
+    duration_s = time_s[n + 1] - time_s[n]
+    window_s = max(float(np.clip(duration_s, *_WINDOW_S)), 2.0 * _SAMPLES * usual_s)
+    # the first voltage may be that of the rest before the load
+    first = max(int(np.searchsorted(time_s, time_s[n] - window_s)), 1)
+    last = int(np.searchsorted(time_s, time_s[n + 1] + window_s, side="right"))
+    before_V, before_slope, before_sd_V = _edge(time_s[first : n + 1], parted_V[first : n + 1], time_s[n])
+    after_V, after_slope, after_sd_V = _edge(time_s[n + 1 : last], parted_V[n + 1 : last], time_s[n + 1])
+    # by what they drift on both sides alike they may drift in between
+    slope = min(before_slope, after_slope, key=abs) if before_slope * after_slope > 0.0 else 0.0
+    drift_V = slope * duration_s
+    allowed_V = min(max(drift_V, 0.0), _MOST_DRIFT * max(fall_V, 0.0))
+    missing_V = after_V - before_V
+    missing_V -= float(np.clip(missing_V, min(drift_V, 0.0), allowed_V))
+    return int(verdict(missing_V, fall_V, float(np.hypot(before_sd_V, after_sd_V)), MOST_SHARE))
+
+
 def _unusual_s(step_s: FloatArray, current_A: FloatArray) -> FloatArray:
-    """Lengths of intervals under load that no shorter ones lead up to, in their order, s."""
+    """Lengths of intervals under load that are no habit of the logger, in their order, s."""
     loaded = np.maximum(np.abs(current_A[:-1]), np.abs(current_A[1:])) > REST_CURRENT_A
     length_s = np.sort(step_s[loaded])
     shorter_s = np.pad(length_s, (HABIT, 0))[: len(length_s)]
@@ -124,7 +126,7 @@ def _unusual_s(step_s: FloatArray, current_A: FloatArray) -> FloatArray:
 
 
 def _edge(time_s: FloatArray, voltage_V: FloatArray, edge_s: float) -> tuple[float, float, float]:
-    """Of a straight line through some samples: value at a time, slope, and standard deviation of the value."""
+    """Fit a straight line: value at a time, slope, and standard deviation of the value."""
     n = len(time_s)
     if n < _SAMPLES:
         return 0.0, 0.0, np.nan

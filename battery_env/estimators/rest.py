@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from battery_env.arrays import FloatArray
-from battery_env.electrochemistry import CellParameters, initial_state, voltage
+from battery_env.electrochemistry import NEW_CELL, CellParameters, initial_state, voltage
 from battery_env.estimators.settling import START_UNKNOWN
 from battery_env.records import REST_CURRENT_A, Record, Stream
 
-#: What a state of charge can be given as: a number, (mean, standard deviation), or told from the rest before the load.
-InitialSoc = float | tuple[float, float] | Literal["rest"]
+#: What a state of charge can be given as: a number, or (mean, standard deviation).
+InitialSoc = float | tuple[float, float]
 
 #: The charge of a cell is told from its voltage after so long a rest, s.
 LEAST_REST_S = 60.0
-# The voltage is averaged over about the first of these times; how far that mean is from the one over the second shows how much
-# is still to come, this many times their difference.
-_REST_MEMORIES_S = (20.0, 60.0)
-_STILL_TO_COME = 10.0
-# States of charge to choose from, where it is told from a voltage.
-_SOC_GRID = np.linspace(0.02, 1.0, 1961)
-# The slope of that voltage is taken over so much to each side.
-_SLOPE_SPAN = 0.01
+# Two running means of the resting voltage, over 20 s and 60 s. It is expected to move on by ten times their difference.
+_REST_MEMORIES_S, _STILL_TO_COME = (20.0, 60.0), 10.0
+# States of charge to choose from, where it is told from a voltage, and how far to each side the slope of the voltage is taken.
+_SOC_GRID, _SLOPE_SPAN = np.linspace(0.02, 1.0, 1961), 0.01
+# Sensor and model are not taken to be better than this, V.
+_LEAST_ERROR_V = 0.005
 
 
 class Start(NamedTuple):
@@ -44,39 +42,46 @@ class Start(NamedTuple):
 
 def check_initial_soc(initial_soc: InitialSoc) -> tuple[float, float]:
     """Refuse what is no state of charge."""
-    if isinstance(initial_soc, str) and initial_soc == "rest":
-        return 1.0, 0.0
     try:
         mean, sd = (float(initial_soc), 0.0) if np.ndim(initial_soc) == 0 else map(float, initial_soc)  # type: ignore[arg-type]
     except (TypeError, ValueError):
         mean = sd = np.nan
     if not (_SOC_GRID[0] <= mean <= 1.0 and 0.0 <= sd < 1.0):
         raise ValueError(
-            f"initial_soc is a state of charge within 0.02 .. 1, (mean, standard deviation), or 'rest', got {initial_soc!r}"
+            f"initial_soc is a state of charge within 0.02 .. 1, or (mean, standard deviation), got {initial_soc!r}. "
+            "battery_env.soc_from_rest tells both from the rest before the load."
         )
     return mean, sd
 
 
-def follow_rest(means_V: FloatArray, voltage_V: float, since_s: float) -> None:
-    """Take in one sample of a rest."""
-    for n, memory_s in enumerate(_REST_MEMORIES_S):
-        means_V[n] += -np.expm1(-since_s / memory_s) * (voltage_V - means_V[n])
+def soc_from_rest(
+    record: Record,
+    cell: CellParameters | None = None,
+    mismatch_V: float = 0.0,
+    voltage_noise_V: float | None = None,
+    dt_s: float = 1.0,
+) -> Start:
+    """
+    Tell the state of charge that a record starts with from the voltage of the rest before its load, of a minute at least, by
+    the open-circuit voltage of the model. A voltage that still relaxes widens the standard deviation.
 
+    .. code-block:: python
 
-def soc_at_rest(means_V: FloatArray, error_V: float, cell: CellParameters) -> tuple[float, float]:
-    """The state of charge at which the open-circuit voltage of the model is that of a rest."""
-    rest_V = rest_voltages_V(cell)
-    soc = float(np.interp(means_V[0], rest_V, _SOC_GRID))
-    around = np.clip([soc - _SLOPE_SPAN, soc + _SLOPE_SPAN], _SOC_GRID[0], _SOC_GRID[-1])
-    slope_V = float(np.diff(np.interp(around, _SOC_GRID, rest_V))[0] / np.diff(around)[0])
-    return soc, float(np.hypot(error_V, _STILL_TO_COME * (means_V[0] - means_V[1])) / slope_V)
+      start = soc_from_rest(record, mismatch_V=0.05)
+      estimate = LeastSquares(mismatch_V=0.05, initial_soc=(start.soc, start.sd_soc)).estimate(record)
 
-
-def rest_voltages_V(cell: CellParameters) -> FloatArray:
-    """The voltage of a cell at rest at each state of charge of a grid."""
-    full, empty = (initial_state(cell=cell, soc=soc) for soc in (1.0, 0.0))
-    states = empty + _SOC_GRID[:, None] * (full - empty)
-    return np.asarray(voltage(states, cell=cell))
+    :param record: one discharge, with the rest before its load
+    :param cell: constants of the model; ``None``: the new cell's
+    :param mismatch_V: error to expect of the model, V; at least 0.005 V are taken
+    :param voltage_noise_V: standard deviation of the noise of the voltage sensor, V; ``None``: as ``mismatch_V``
+    :param dt_s: time between the samples of simulated records, whose current is taken as it is, s
+    :return: the state of charge. If ``reason`` is not empty, the rest does not tell it, and no estimate that relies on it is
+        settled
+    :raises ValueError: if the record cannot be used
+    """
+    offset_sd_V = max(_LEAST_ERROR_V, mismatch_V)
+    error_V = float(np.hypot(voltage_noise_V or offset_sd_V, offset_sd_V))
+    return told_at_rest(record, NEW_CELL if cell is None else cell, error_V, dt_s)
 
 
 def told_at_rest(record: Record, cell: CellParameters, error_V: float, dt_s: float) -> Start:
@@ -91,3 +96,25 @@ def told_at_rest(record: Record, cell: CellParameters, error_V: float, dt_s: flo
         follow_rest(means_V, voltage_V, since_s)
     rest_s = float(stream.time_s[count - 1] - stream.time_s[0])
     return Start(*soc_at_rest(means_V, error_V, cell), count, "" if rest_s >= LEAST_REST_S else START_UNKNOWN)
+
+
+def follow_rest(means_V: FloatArray, voltage_V: float, since_s: float) -> None:
+    """Take in one sample of a rest."""
+    for n, memory_s in enumerate(_REST_MEMORIES_S):
+        means_V[n] += -np.expm1(-since_s / memory_s) * (voltage_V - means_V[n])
+
+
+def soc_at_rest(means_V: FloatArray, error_V: float, cell: CellParameters) -> tuple[float, float]:
+    """The state of charge at which the open-circuit voltage of the model is that of a rest, and its standard deviation."""
+    rest_V = rest_voltages_V(cell)
+    soc = float(np.interp(means_V[0], rest_V, _SOC_GRID))
+    around = np.clip([soc - _SLOPE_SPAN, soc + _SLOPE_SPAN], _SOC_GRID[0], _SOC_GRID[-1])
+    slope_V = float(np.diff(np.interp(around, _SOC_GRID, rest_V))[0] / np.diff(around)[0])
+    return soc, float(np.hypot(error_V, _STILL_TO_COME * (means_V[0] - means_V[1])) / slope_V)
+
+
+def rest_voltages_V(cell: CellParameters) -> FloatArray:
+    """The voltage of a cell at rest at each state of charge of a grid."""
+    full, empty = (initial_state(cell=cell, soc=soc) for soc in (1.0, 0.0))
+    states = empty + _SOC_GRID[:, None] * (full - empty)
+    return np.asarray(voltage(states, cell=cell))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from math import comb, expm1
 
@@ -10,53 +10,52 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike
 
-from battery_env.arrays import BoolArray, FloatArray
+from battery_env.arrays import BoolArray, FloatArray, IntArray
 from battery_env.electrochemistry import NEW_CELL, CellParameters, initial_state, voltage
 from battery_env.estimators.gaps import NOT_DRAWN, UNSURE, Gap
 from battery_env.records import SWITCH_SHARE
 
-#: An estimate counts as settled when its standard deviation is below this share of its value. That of ``r_o`` is wider: on a
-#: real cell the error of the model divided by the current is a quarter of it already.
+# Of estimates
+
+#: An estimate is settled when its standard deviation is below this share of its value. That of ``r_o`` is wider: on a real
+#: cell the error of the model divided by the current is a quarter of it already.
 SETTLED_SHARES = {"q_mobile": 0.02, "r_o": 0.3}
-
-#: How far below and above the model's voltage a full cell may rest, V. Real full cells of the bundled kind rest at 4.17 to
-#: 4.23 V, the model's at 4.19 V; at rest it falls by 11 mV with each percent of the charge, so that a cell that lacks 4 % or
-#: more is noticed.
-FULL_REST_V = (0.04, 0.06)
-# A cell has at least this resistance, ohm: the bundled ones show 0.105 ohm and more when the load is switched on, and those of
-# the tasks have 0.1 ohm and more.
-_LEAST_RESISTANCE_OHM = 0.1
-# That is for cells of this q_mobile at most, C. Of the same electrodes, larger ones have a smaller resistance.
-_NEW_Q_C = NEW_CELL.q_mobile
-#: The voltage of a cell that was at rest at the first sample falls by at least half of its ohmic drop within this time, s.
-START_WINDOW_S = 20.0
-
-# The ohmic drop follows the current with this time constant at most, s: cells may be twice as slow as the model's.
-_FOLLOWS_S = 2.0 * NEW_CELL.to
-
-#: Under a current that has been steady for this long, s, the voltage of a cell does not rise by this much, V.
-STEADY_S, RISE_V = 60.0, 0.05
-#: A smaller change of the current hardly shows in the voltage, A. Of a load that falls in such changes a rise of the voltage
-#: by this resistance, ohm, with what follows more slowly, says nothing.
-LEAST_JUMP_A, MOST_RESISTANCE_OHM = 0.05, 0.6
-#: What is more than this many standard deviations of the noise is not noise.
-NOISES = 8.0
-
-#: Residuals whose variance is above that of the noise by this share, over the root of their number, are not noise, where the
-#: noise is told from their differences.
-EXCESS_LIMIT_UNSTATED = 10.0
-#: With fewer samples than this beyond the number of parameters, the residuals do not tell how large the noise is.
-SPARE_SAMPLES = 10
 #: A ``q_mobile`` is plausible within these multiples of the model cell's: its electrodes are those of a 2 Ah cell.
 PLAUSIBLE_Q_SHARES = (0.2, 5.0)
-#: A prior farther from what the record says than this many standard deviations of their difference contradicts it. Within it,
-#: a prior of the settled width moves no estimate by more than 5 %.
-PRIOR_LIMIT_SD = 2.5
 #: The error of the model may be this much larger than stated before the residuals contradict it.
 MISMATCH_MARGIN = 2.0
+#: Where the noise is told from the residuals, their variance may exceed its by this share over the root of their number.
+EXCESS_LIMIT_UNSTATED = 10.0
+#: So many samples more than parameters tell how large the noise is.
+SPARE_SAMPLES = 10
+#: A prior contradicts the record beyond so many standard deviations of their difference. Within it, a prior of the settled
+#: width moves no estimate by more than 5 %.
+PRIOR_LIMIT_SD = 2.5
 
-#: No Li-ion cell is to be discharged below this, V: it is no use to advise it.
-LEAST_CUT_OFF_V = 2.0
+# Of the start
+
+#: A full cell may rest so far below and above the model's voltage, V. Real ones of the bundled kind rest at 4.17 to 4.23 V,
+#: the model's at 4.19 V, which falls by 11 mV with each percent of the charge: a cell that lacks 4 % or more is noticed.
+FULL_REST_V = (0.04, 0.06)
+#: A cell that was at rest at the first sample falls by at least half of its ohmic drop within this time, s. So does one whose
+#: load is switched.
+START_WINDOW_S = 20.0
+
+# Of the sensors: does the voltage belong to the current?
+
+# Least resistance of a cell, ohm, up to the q_mobile of a new one; larger cells of the same electrodes have a smaller one. The
+# bundled cells show 0.105 ohm and more when the load is switched on, those of the tasks have 0.1 ohm and more.
+_LEAST_RESISTANCE_OHM, _NEW_Q_C = 0.1, NEW_CELL.q_mobile
+# Time constant with which the ohmic drop follows the current at most, s: cells may be twice as slow as the model's.
+_FOLLOWS_S = 2.0 * NEW_CELL.to
+#: Under a current that was steady for so long, s, the voltage of a cell does not rise by so much, V.
+STEADY_S, RISE_V = 60.0, 0.05
+#: Smaller changes of the current than this, A, hardly show in the voltage. Where a load falls in such steps, a rise of the
+#: voltage by this resistance, ohm, says nothing.
+LEAST_JUMP_A, MOST_RESISTANCE_OHM = 0.05, 0.6
+#: A change of more than so many standard deviations of the noise is not noise.
+NOISES = 8.0
+
 #: Why a precision does not suffice, and what would help.
 IMPRECISE = {
     "q_mobile": "q_mobile is not known to 2 % yet: the voltage shows it at the knee of the discharge, the more the lower the "
@@ -103,25 +102,19 @@ def rest_voltage_V(cell: CellParameters, soc: float = 1.0) -> float:
 
 @njit(cache=True, error_model="numpy")
 def least_resistance_ohm(q_mobile: float, r_o: float) -> float:
-    """
-    The least resistance that a cell shows when its load is switched, compiled. An estimate of it may be too large, as may
-    what is known of other cells, so that the least of all counts.
-    """
+    """Return the least resistance that a cell can show: of those of other cells, of larger ones, and the estimate."""
     return max(min(_LEAST_RESISTANCE_OHM, _LEAST_RESISTANCE_OHM * _NEW_Q_C / q_mobile, r_o), 0.0)
 
 
 @njit(cache=True, error_model="numpy")
 def lagging_current_A(before_A: float, current_A: float, duration_s: float) -> float:
-    """The current that the ohmic drop stands for, which follows slowly, compiled."""
+    """Return the current that the ohmic drop stands for after a while; it follows slowly."""
     return before_A + (before_A - current_A) * expm1(-duration_s / _FOLLOWS_S)
 
 
 @njit(cache=True, error_model="numpy")
 def change_to_follow_A(switched_A: float, current_A: float, lagging_A: float) -> float:
-    """
-    The part of a switch of the load that the ohmic drop has to follow, compiled: after a pulse that was over before the drop
-    had built up it has little to take back.
-    """
+    """Return how much of a current step the ohmic drop must follow: little after a pulse too short for it to build up."""
     return max(min(current_A - lagging_A, max(switched_A, 0.0)), min(switched_A, 0.0))
 
 
@@ -145,9 +138,9 @@ def start_reason(
     rested: bool = False,
 ) -> str:
     """
-    Whether a record can start with a full cell, or with one of another charge. At rest its voltage tells. A first sample under
-    load is corrected by the least ohmic drop that the cell can have: a full cell of a larger resistance cannot be told from
-    one that lacks some charge.
+    Say why a record cannot start with a full cell, or with one of another charge. At rest its voltage tells. A first sample
+    under load is corrected by the least ohmic drop that the cell can have: a full cell of a larger resistance cannot be told
+    from one that lacks some charge.
     """
     rest_V = rest_voltage_V(cell, initial_soc)
     soon = time_s <= time_s[0] + START_WINDOW_S
@@ -160,7 +153,7 @@ def start_reason(
 
 @njit(cache=True, error_model="numpy")
 def start_code(first_V: float, first_A: float, most_A: float, least_V: float, rest_V: float, resistance_ohm: float) -> int:
-    """Whether the first samples of a record can be those of a cell that rested, compiled."""
+    """Return which text of :func:`start_text` the first samples deserve; 0 if they can be those of a cell that rested."""
     drop_V = resistance_ohm * max(first_A, 0.0)
     low_V, high_V = rest_V - FULL_REST_V[0], rest_V + FULL_REST_V[1]
     if first_V > high_V:
@@ -173,7 +166,7 @@ def start_code(first_V: float, first_A: float, most_A: float, least_V: float, re
 
 
 def start_text(code: int, first_V: float, rest_V: float, initial_soc: float = 1.0) -> str:
-    """The reason that a code of :func:`start_code` stands for."""
+    """Return the reason that a code of :func:`start_code` stands for."""
     if initial_soc == 1.0:
         what = "a full cell"
         advice = "Give the whole discharge of a full cell, with the rest before it, or state initial_soc (--initial-soc)."
@@ -193,47 +186,52 @@ def start_text(code: int, first_V: float, rest_V: float, initial_soc: float = 1.
 def sensor_reason(
     time_s: FloatArray, voltage_V: FloatArray, current_A: FloatArray, resistance_ohm: float = _LEAST_RESISTANCE_OHM
 ) -> str:
-    """
-    Whether voltage and current belong to each other. Where the load is switched and stays so, the voltage follows by at least
-    half of the least ohmic drop, as far as that had followed the load before; and it does not rise while the current stays as
-    it was.
-    """
-    last = len(time_s) - 1
-    noise_V = NOISES * white_noise_V(voltage_V)
-    switched_A = np.diff(current_A)
+    """Say why voltage and current do not belong to each other."""
+    n, noise_V = np.arange(len(time_s)), NOISES * white_noise_V(voltage_V)
+    # the last sample of the window that begins with each sample
+    window = np.minimum(np.maximum(np.searchsorted(time_s, time_s + START_WINDOW_S, side="right"), n + 2), n[-1])
+    record = time_s, voltage_V, current_A
+    return _not_followed(*record, window, noise_V, resistance_ohm) or _rises(*record, window, noise_V)
+
+
+def _not_followed(
+    time_s: FloatArray, voltage_V: FloatArray, current_A: FloatArray, window: IntArray, noise_V: float, resistance_ohm: float
+) -> str:
+    # Where the load is switched and stays so, the voltage follows by at least half of the least ohmic drop, as far as that had
+    # followed the load before.
+    last, switched_A = len(time_s) - 1, np.diff(current_A)
     switches = np.flatnonzero(np.abs(switched_A) > SWITCH_SHARE * np.abs(current_A).max()) + 1
-    until = np.minimum(
-        np.maximum(np.searchsorted(time_s, time_s + START_WINDOW_S, side="right"), np.arange(last + 1) + 2), last
-    )
     to_follow_A = _changes_to_follow_A(time_s, current_A)
     for n, following in zip(switches, np.append(switches, last)[1:], strict=True):
         drop_V = 0.5 * resistance_ohm * to_follow_A[n - 1]
-        after_V = voltage_V[n : until[n] + 1]
-        if until[n] <= min(following, last - 1) and abs(drop_V) > noise_V:
+        after_V = voltage_V[n : window[n] + 1]
+        if window[n] <= min(following, last - 1) and abs(drop_V) > noise_V:
             followed_V = voltage_V[n - 1] - (after_V.min() if drop_V > 0.0 else after_V.max())
             if followed_V / drop_V < 1.0:
                 return NOT_FOLLOWED.format(switched_A[n - 1], time_s[n])
-    since_s = np.full(last + 1, time_s[0])
-    jumps = np.flatnonzero(np.abs(switched_A) > min(SWITCH_SHARE * np.abs(current_A).max(), LEAST_JUMP_A)) + 1
-    since_s[jumps] = time_s[jumps]
-    steady = np.maximum.accumulate(since_s)[until[:-1]] <= time_s[:-1] - STEADY_S
-    # what a current that falls slowly explains
-    explained_V = MOST_RESISTANCE_OHM * np.maximum(current_A[:-1] - current_A[until[:-1]], 0.0)
-    rise_V = np.where(steady, voltage_V[until[:-1]] - voltage_V[:-1] - explained_V, 0.0)
-    highest = int(rise_V.argmax())
-    if rise_V[highest] > max(RISE_V, noise_V):
-        return RISES.format(rise_V[highest], time_s[highest])
     return ""
 
 
+def _rises(time_s: FloatArray, voltage_V: FloatArray, current_A: FloatArray, window: IntArray, noise_V: float) -> str:
+    # The voltage does not rise while the current stays as it was.
+    since_s = np.full(len(time_s), time_s[0])
+    jumps = np.flatnonzero(np.abs(np.diff(current_A)) > min(SWITCH_SHARE * np.abs(current_A).max(), LEAST_JUMP_A)) + 1
+    since_s[jumps] = time_s[jumps]
+    steady = np.maximum.accumulate(since_s)[window[:-1]] <= time_s[:-1] - STEADY_S
+    by_current_V = MOST_RESISTANCE_OHM * np.maximum(current_A[:-1] - current_A[window[:-1]], 0.0)
+    rise_V = np.where(steady, voltage_V[window[:-1]] - voltage_V[:-1] - by_current_V, 0.0)
+    highest = int(rise_V.argmax())
+    return RISES.format(rise_V[highest], time_s[highest]) if rise_V[highest] > max(RISE_V, noise_V) else ""
+
+
 def gap_reason(gaps: Sequence[Gap], verdict: int) -> str:
-    """What gaps in a record leave open."""
+    """Say what gaps in a record leave open."""
     text = {NOT_DRAWN: NOT_DRAWN_TEXT, UNSURE: UNSURE_TEXT}[verdict]
     return next((text.format(*gap[:3]) for gap in gaps if gap.verdict == verdict), "")
 
 
 def is_plausible(q_mobile: ArrayLike, cell: CellParameters) -> BoolArray:
-    """Whether a cell of the kind of the model can have some ``q_mobile``."""
+    """Return whether a cell of the kind of the model can have some ``q_mobile``."""
     low, high = PLAUSIBLE_Q_SHARES
     share = np.asarray(q_mobile) / cell.q_mobile
     return np.asarray((share > low) & (share < high))
@@ -241,31 +239,12 @@ def is_plausible(q_mobile: ArrayLike, cell: CellParameters) -> BoolArray:
 
 def white_noise_V(residual_V: FloatArray, order: int = 1) -> float:
     """
-    The standard deviation of the white part of residuals, from their differences from sample to sample, which hardly hold
-    what drifts. The median leaves single wild samples aside.
+    Return the standard deviation of the white part of residuals: from their differences from sample to sample, which hardly
+    hold what drifts, by the median, which leaves single wild samples aside.
     """
     return float(np.median(np.abs(np.diff(residual_V, order))) / (0.6745 * np.sqrt(comb(2 * order, order))))
 
 
-def imprecise_text(share: float, depth_V: float, enough_V: float | None, rmse_V: float) -> str:
-    """Why ``q_mobile`` is not precise enough, and what would make it so."""
-    reached = f", but to {np.ceil(1e4 * share) / 1e2:.3g} %" if share < 1.0 else ""
-    text = f"q_mobile is not known to 2 % yet{reached}: the voltage shows it at the knee of the discharge."
-    if depth_V >= LEAST_CUT_OFF_V:
-        text += f" Under this load the record has to go down to about {np.floor(1e2 * depth_V) / 1e2:.2f} V, if the cell may."
-    elif not np.isnan(depth_V):
-        text += f" Under this load no record down to {LEAST_CUT_OFF_V:g} V would tell it."
-    if enough_V is None:
-        return f"{text} To the same cut-off, a smaller load tells more."
-    text += " To the same cut-off, a smaller load or constants of the cell itself (fit_cell, --cell) tell more"
-    if not max(rmse_V, 1e-3) <= enough_V:
-        return f"{text}."
-    return (
-        f"{text}; so does a mismatch_V of {np.floor(1e3 * enough_V) / 1e3:.3f} V, if the model follows whole discharges of "
-        f"this cell that closely (this record: {rmse_V:.3f} V)."
-    )
-
-
-def first_reason(conditions: Sequence[tuple[bool, str]]) -> str:
-    """The reason of the first condition that holds."""
+def first_reason(conditions: Iterable[tuple[bool, str]]) -> str:
+    """Return the reason of the first condition that holds."""
     return next((reason for holds, reason in conditions if holds), "")

@@ -25,7 +25,7 @@ from battery_env.calibration.voltage import ESTIMATE_RANGES
 from battery_env.cells import Discharge, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate
 from battery_env.estimates import last_estimate
-from battery_env.estimators import ClosedForm, Estimate, ExtendedKalmanFilter, GreedyOneStep, LeastSquares
+from battery_env.estimators import ClosedForm, Estimate, ExtendedKalmanFilter, GreedyOneStep, LeastSquares, soc_from_rest
 from battery_env.estimators.base import OnlineEstimator
 from battery_env.records import Stream
 
@@ -198,11 +198,18 @@ def broken(case: Case, fault: str, rng: np.random.Generator) -> Case:
 def calibrators(case: Case) -> dict[str, object]:
     """As the command line has them, the filter with its defaults and with the error that real cells need, and policies."""
     more = {"thermal": True, "prior_q_mobile_C": case.prior_q_mobile_C, "current_gain_sd": case.gain_sd}
-    more["initial_soc"] = case.initial_soc
+
+    def calibrator(kind: type, mismatch_V: float) -> object:
+        initial_soc = case.initial_soc
+        if initial_soc == "rest":
+            # whatever its reason says
+            initial_soc = soc_from_rest(case, mismatch_V=mismatch_V)[:2]
+        return kind(mismatch_V=mismatch_V, initial_soc=initial_soc, **more)
+
     return {
-        "least squares": lambda: LeastSquares(mismatch_V=0.05, **more),
-        "filter": lambda: ExtendedKalmanFilter(**more),
-        "filter, mismatch": lambda: ExtendedKalmanFilter(mismatch_V=0.05, **more),
+        "least squares": lambda: calibrator(LeastSquares, 0.05),
+        "filter": lambda: calibrator(ExtendedKalmanFilter, 0.0),
+        "filter, mismatch": lambda: calibrator(ExtendedKalmanFilter, 0.05),
         "policy": PolicyEstimator.pretrained,
         "policy for recorded cells": lambda: PolicyEstimator.pretrained(recorded=True),
     }

@@ -7,12 +7,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from battery_env import ExtendedKalmanFilter, LeastSquares, fit_cell, load_nasa_discharges
+from battery_env import LeastSquares, fit_cell, load_nasa_discharges, soc_from_rest
 from battery_env.__main__ import NOT_SETTLED, SETTLED, calibrate
 from battery_env.cells import Discharge
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate
-from battery_env.estimators.rest import rest_voltages_V, told_at_rest
-from battery_env.forecasts import forecast
 from battery_env.life import track_life
 from battery_env.record_model import RecordModel
 
@@ -53,43 +51,46 @@ class TestStart:
         assert len(model.simulate(load_A, 0.999 * least_C, 0.0).time_s) < 1000
 
     def test_a_state_and_a_charge_are_too_much(self):
-        for soc in (0.8, "rest"):
-            with pytest.raises(ValueError, match="initial is a whole state: give it or initial_soc, got both"):
-                LeastSquares(initial=initial_state(), initial_soc=soc)
+        with pytest.raises(ValueError, match="initial is a whole state: give it or initial_soc, got both"):
+            LeastSquares(initial=initial_state(), initial_soc=0.8)
 
-    @pytest.mark.parametrize("make", [LeastSquares, ExtendedKalmanFilter])
-    @pytest.mark.parametrize("soc", [0.0, 1.1, np.nan, "full", (0.5, -0.1), (0.5, 0.1, 0.1), None])
-    def test_what_is_no_charge_is_refused(self, make, soc):
-        with pytest.raises(ValueError, match="initial_soc is a state of charge within"):
-            make(initial_soc=soc)
+    @pytest.mark.parametrize("soc", [0.0, 1.1, np.nan, "rest", (0.5, -0.1), (0.5, 0.1, 0.1), None])
+    def test_what_is_no_charge_is_refused(self, soc):
+        with pytest.raises(ValueError, match=r"initial_soc is a state of charge within .*\.soc_from_rest tells both"):
+            LeastSquares(initial_soc=soc)
 
+
+class TestRest:
     @pytest.mark.parametrize("soc", [0.15, 0.5, 0.97])
-    def test_a_rest_tells_it_within_its_error(self, soc):
-        found = told_at_rest(partly_charged(soc, noise_V=0.005), NEW_CELL, 0.007, 1.0)
+    def test_it_tells_the_charge_within_its_error(self, soc):
+        found = soc_from_rest(partly_charged(soc, noise_V=0.005))
         assert found.samples == REST_S and found.reason == ""
         assert abs(found.soc - soc) < 2.0 * found.sd_soc < 0.3
 
+    def test_errors_of_sensor_and_model_widen_it(self, record):
+        exact, noisy, mismatched = (
+            soc_from_rest(record, **errors) for errors in ({}, {"voltage_noise_V": 0.05}, {"mismatch_V": 0.05})
+        )
+        assert exact.sd_soc < 0.2 * noisy.sd_soc and noisy.sd_soc < 0.8 * mismatched.sd_soc
+        assert exact.soc == noisy.soc == mismatched.soc
+
     def test_a_voltage_that_still_relaxes_says_less(self, record):
         relaxing = replace(record, voltage_V=record.voltage_V - 0.05 * np.exp(-record.time_s / 100.0))
-        steady, moving = (told_at_rest(each, NEW_CELL, 0.007, 1.0) for each in (record, relaxing))
+        steady, moving = soc_from_rest(record), soc_from_rest(relaxing)
         assert abs(moving.soc - 0.8) < 2.0 * moving.sd_soc and moving.sd_soc > 2.0 * steady.sd_soc
 
-    def test_it_is_told_from_what_the_filter_sees(self, record):
-        filter_, fit = ExtendedKalmanFilter(thermal=True, initial_soc="rest"), LeastSquares(thermal=True, initial_soc="rest")
-        for voltage_V in record.voltage_V[:REST_S].tolist():
-            filter_.update(voltage_V, 0.0, 1.0)
-        assert fit.start_of(record) == filter_.start_of(record) and fit.start_of(record).soc == pytest.approx(filter_.soc)
-        assert (np.diff(rest_voltages_V(NEW_CELL)) > 0.0).all()
+    @pytest.mark.parametrize("samples_at_rest", [0, 30])
+    def test_less_than_a_minute_does_not_tell_it(self, record, samples_at_rest):
+        found = soc_from_rest(record.part(REST_S - samples_at_rest, len(record.time_s)))
+        assert found.samples == samples_at_rest and found.reason.startswith("The record does not start with a minute at rest")
+
+    def test_an_estimate_that_is_told_of_it_is_as_sure_as_it_is(self, record):
+        start = soc_from_rest(record, voltage_noise_V=0.002)
+        estimate = LeastSquares(thermal=True, voltage_noise_V=0.002, initial_soc=(start.soc, start.sd_soc)).estimate(record)
+        assert abs(estimate.q_mobile - 6000.0) < 3.0 * estimate.sd_q_mobile < 400.0
 
 
 class TestLeastSquares:
-    def test_a_full_start_is_what_it_was(self):
-        part = load_nasa_discharges("B0005")[40].loaded_part(2.7)
-        plain, stated = (
-            LeastSquares(thermal=True, mismatch_V=0.05, **more).estimate(part) for more in ({}, {"initial_soc": 1})
-        )
-        assert plain == stated and plain.settled
-
     @pytest.mark.parametrize("soc", [0.3, 0.7, 0.95])
     def test_a_charge_that_is_known_gives_both_parameters(self, soc):
         estimate = LeastSquares(thermal=True, initial_soc=soc).estimate(partly_charged(soc, noise_V=0.0))
@@ -122,26 +123,6 @@ class TestLeastSquares:
         assert stated.settled
         doubtful = LeastSquares(thermal=True, voltage_noise_V=0.002, initial_soc=(0.8, 0.05)).estimate(record)
         assert not doubtful.settled and "the charge at the start" in doubtful.reason
-
-    def test_a_rest_tells_the_charge(self, record):
-        fit = LeastSquares(thermal=True, voltage_noise_V=0.002, initial_soc="rest")
-        estimate = fit.estimate(record)
-        assert abs(estimate.q_mobile - 6000.0) < 3.0 * estimate.sd_q_mobile < 400.0
-        trace = LeastSquares(thermal=True, voltage_noise_V=0.002, window_every_s=900.0, initial_soc="rest").trace([record])[0]
-        assert trace.q_mobile[-1] == pytest.approx(estimate.q_mobile, rel=1e-5) and trace.settled[-1] == estimate.settled
-        model = fit.model_for(record)
-        assert model.forecast(record, estimate, 2.8).eod_time_s == pytest.approx(record.time_s[-1], rel=0.005)
-        seen = record.part(0, 1000)
-        ends = forecast(seen, fit.estimate(record), 2.0, 2.8, model=model, mismatch_V=0.01, samples=100)
-        assert ends.eod_quantile_s(0.5) == pytest.approx(record.time_s[-1], rel=0.03)
-        assert np.median(ends.soc) == pytest.approx(0.8 - 2.0 * (999 - REST_S) / 6000.0, abs=0.02)
-        with pytest.raises(ValueError, match=r"model_for\(record\)"):
-            fit.model  # noqa: B018
-
-    def test_without_a_rest_it_is_not_settled(self, record):
-        for part in (record.part(REST_S, len(record.time_s)), record.part(REST_S - 30, len(record.time_s))):
-            estimate = LeastSquares(thermal=True, initial_soc="rest").estimate(part)
-            assert not estimate.settled and estimate.reason.startswith("The record does not start with a minute at rest")
 
 
 class TestCommandLine:
@@ -198,6 +179,5 @@ class TestOthers:
             fit_cell([record, low])
 
     def test_a_life_is_of_full_cells(self):
-        for soc in (0.8, "rest"):
-            with pytest.raises(ValueError, match="must take discharges to start full"):
-                track_life(load_nasa_discharges("B0005")[:2], 2.7, LeastSquares(initial_soc=soc))
+        with pytest.raises(ValueError, match="must take discharges to start full"):
+            track_life(load_nasa_discharges("B0005")[:2], 2.7, LeastSquares(initial_soc=0.8))

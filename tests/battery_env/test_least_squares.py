@@ -9,9 +9,11 @@ from battery_env.cells import Discharge, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, Trajectory, initial_state, simulate
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimators.cramer_rao import cramer_rao_bound
-from battery_env.estimators.least_squares import LeastSquares, _Prior
+from battery_env.estimators.least_squares import LeastSquares
+from battery_env.estimators.search import Prior, Search
 from battery_env.estimators.settling import SETTLED_SHARES
 from battery_env.record_model import RecordModel
+from battery_env.records import Samples
 
 
 def discharged(
@@ -292,13 +294,14 @@ class TestNuisanceConstants:
         record = Discharge(record.time_s[::7], record.voltage_V[::7], record.current_A[::7])
         nuisance = {**dict.fromkeys(RATE_CONSTANTS, 0.2), "offset_V": 0.01}
         fit = LeastSquares(nuisance=nuisance, thermal=thermal)
-        problem, priors = fit._problem(record), (_Prior("q_mobile", 6000.0, 1e-4), _Prior("to", 0.0, 0.05))
+        search = Search.of(Samples.of(record), fit.model, fit.parameters, nuisance, fit.bounds)
+        priors = (Prior("q_mobile", 6000.0, 1e-4), Prior("to", 0.0, 0.05))
         values = {"q_mobile": 6100.0, "r_o": 0.14, **dict.fromkeys(nuisance, 0.1), "offset_V": 0.003}
-        residual_V, jacobian = fit._residual(problem, values, priors)
+        residual_V, jacobian = search.residual(values, priors)
         assert jacobian.shape == (len(residual_V), 9) and len(residual_V) == len(record.time_s) + 2
         for column, name in zip(jacobian.T, values, strict=True):
             step = 0.05 if name == "q_mobile" else 1e-5
-            more, less = (fit._residual(problem, values | {name: values[name] + sign * step}, priors)[0] for sign in (1, -1))
+            more, less = (search.residual(values | {name: values[name] + sign * step}, priors)[0] for sign in (1, -1))
             np.testing.assert_allclose(column, (more - less) / (2.0 * step), rtol=1e-4, atol=1e-8)
 
     def test_constants_that_are_known_are_not_moved(self):

@@ -1,0 +1,335 @@
+"""The search for parameters whose simulated voltage is closest to records: of least squares and of the fit of a cell."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from math import inf, isnan
+from typing import Any
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from battery_env.arrays import BoolArray, FloatArray
+from battery_env.electrochemistry.cell import BULK_RATE, SURFACE_RATE
+from battery_env.electrochemistry.tangents import RATE_CONSTANTS, TANGENT_NAMES
+from battery_env.parameters import PARAMETER_NAMES
+from battery_env.record_model import RecordModel
+from battery_env.records import Record, Samples, check_drawn_charge, drawn
+
+#: How far the search keeps from the least ``q_mobile``, as a share of it: more than rounding, less than anyone measures.
+MARGIN = 1e-6
+# The distance of q_mobile to its least value is below exp of this, so that no step of the search overflows.
+_LOG_LIMIT = 50.0
+# Logarithms of nuisance constants are held within this.
+_REACH = 5.0
+_SCALES = {"q_mobile": 1.0, "r_o": 0.1}
+# Where the search for q_mobile may start: this much above its least value. The narrow ones serve whole discharges, the wide
+# ones the first minutes of one.
+_START_EXCESS = 0.003 * 2.2 ** np.arange(13)
+# Starts whose squares are within this ratio of the least are promising. The intervals beside them are cut into so many parts,
+# and the search goes on from each that is a local minimum then.
+_RIVAL_RATIO, _FINER = 2.0, 4
+# Starts are compared on a coarse grid of time if it has at least this many points.
+_COARSE_POINTS = 100
+
+
+def minimized(
+    evaluate: Callable[[FloatArray], tuple[FloatArray, FloatArray]], start: FloatArray | list[float], **how: Any
+) -> FloatArray:
+    """The x with the least squares of residuals, by scipy; ``evaluate`` gives these and their derivatives in one roll-out."""
+    both = lru_cache(maxsize=1)(lambda x: evaluate(np.array(x)))  # scipy asks for them one after the other
+    result = least_squares(lambda x: both(tuple(x))[0], start, jac=lambda x: both(tuple(x))[1], **how)
+    return np.asarray(result.x)
+
+
+def distance_C(log_distance: float) -> float:
+    """
+    The distance of ``q_mobile`` to the least value that a record allows. The search is over its logarithm: so every simulation
+    lasts as long as the record, and the knee of a discharge is nearly straight.
+    """
+    return float(np.exp(min(log_distance, _LOG_LIMIT)))
+
+
+@dataclass(frozen=True)
+class OnGrid:
+    """
+    A record on the time grid of a model.
+
+    :param time_s: of the samples, since the first one, s
+    :param voltage_V: of the samples, V
+    :param current_A: over each step of the model, A
+    :param dt_s: step of the model, s
+    """
+
+    time_s: FloatArray
+    voltage_V: FloatArray
+    current_A: FloatArray
+    dt_s: float
+
+    @classmethod
+    def of(cls, record: Record, model: RecordModel) -> OnGrid:
+        """Any record."""
+        time_s, current_A = model.grid(record)
+        return cls(time_s, np.asarray(record.voltage_V), current_A, model.dt_s)
+
+    @cached_property
+    def grid_s(self) -> FloatArray:
+        """Times of the grid, s."""
+        return self.dt_s * np.arange(len(self.current_A))
+
+    @cached_property
+    def _samples_are_the_grid(self) -> bool:
+        same = len(self.time_s) == len(self.grid_s)
+        return same and np.allclose(self.time_s, self.grid_s, rtol=0.0, atol=1e-6 * self.dt_s)
+
+    def at_samples(self, columns: Iterable[FloatArray]) -> list[FloatArray]:
+        """Columns of the grid, at the samples."""
+        if self._samples_are_the_grid:
+            return list(columns)
+        return [np.interp(self.time_s, self.grid_s, column) for column in columns]
+
+
+@dataclass(frozen=True)
+class Prior:
+    """
+    What is known of one unknown, as one more residual.
+
+    :param name: of the unknown
+    :param mean: its expected value
+    :param weight_V: of the residual, V per unit of the unknown
+    """
+
+    name: str
+    mean: float
+    weight_V: float
+
+
+@dataclass(frozen=True)
+class Fit:
+    """
+    What a search has found.
+
+    :param values: of all unknowns, and of what is held
+    :param jacobian: derivatives of the residuals with respect to the unknowns, V
+    :param residual_V: at the samples
+    :param square_V2: sum of all squared residuals, those of priors included
+    :param at_bound: which parameters are at a bound
+    """
+
+    values: dict[str, float]
+    jacobian: FloatArray
+    residual_V: FloatArray
+    square_V2: float
+    at_bound: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Search:
+    """
+    The search in one record: Levenberg-Marquardt's (MINPACK's) with exact derivatives, from the best of several starts. A
+    parameter that leaves its bounds is held there.
+
+    :param model: of the record
+    :param parameters: to search for
+    :param nuisance: standard deviations of further unknowns, by name
+    :param bounds: of both parameters; ``q_mobile`` is above its least value
+    :param data: the record
+    :param least_q_C: ``q_mobile`` below which the model cell is empty before the record ends, C
+    """
+
+    model: RecordModel
+    parameters: tuple[str, ...]
+    nuisance: Mapping[str, float]
+    bounds: Mapping[str, tuple[float, float]]
+    data: OnGrid
+    least_q_C: float
+
+    @classmethod
+    def of(
+        cls,
+        record: Samples,
+        model: RecordModel,
+        parameters: tuple[str, ...],
+        nuisance: Mapping[str, float],
+        bounds: Mapping[str, tuple[float, float]],
+    ) -> Search:
+        """That in a record, which is refused if it says nothing, or takes more than the bounds allow."""
+        data = OnGrid.of(record, model)
+        if not data.current_A[:-1].any():
+            raise ValueError("no current flows in this record: it says nothing about q_mobile and r_o")
+        check_drawn_charge(float(drawn(record.time_s, record.current_A, record.time_s[-1])))
+        least_q_C = model.least_q_mobile_C(data.current_A)
+        low_C, high_C = max(bounds["q_mobile"][0], (1.0 + MARGIN) * least_q_C), bounds["q_mobile"][1]
+        if "q_mobile" in parameters and not low_C < high_C:
+            raise ValueError(
+                f"this record takes a q_mobile of at least {low_C:g} C, which is beyond the upper bound, {high_C:g} C. Raise "
+                "q_mobile_bounds_C (command line: --cell, with a fit of such a cell), or check that time is in s and current "
+                "in A."
+            )
+        return cls(model, parameters, nuisance, {**bounds, "q_mobile": (low_C, high_C)}, data, least_q_C)
+
+    @property
+    def unknown(self) -> tuple[str, ...]:
+        """All that is searched for, in the order of the columns of the Jacobian."""
+        return (*self.parameters, *self.nuisance)
+
+    def until_empty(self) -> Search:
+        """That in the samples that a cell of the held ``q_mobile`` lives to see, whatever its ``r_o``."""
+        q_mobile, data = self.model.cell.q_mobile, self.data
+        n = len(self.model.simulate(data.current_A, q_mobile, 0.0).time_s)
+        seen = data.time_s <= (n - 1) * data.dt_s
+        if seen.sum() <= len(self.parameters):
+            raise ValueError(
+                f"a cell with q_mobile = {q_mobile:g} C is empty at the start of this record, which takes at least "
+                f"{self.least_q_C:g} C. Search for q_mobile too, or hold it at another value."
+            )
+        part = OnGrid(data.time_s[seen], data.voltage_V[seen], data.current_A[:n], data.dt_s)
+        return replace(self, data=part, least_q_C=0.0)
+
+    def starts(self, q_candidates: Sequence[float]) -> tuple[list[dict[str, float]], FloatArray]:
+        """
+        Values of ``q_mobile`` within their bounds, each with the ``r_o`` that goes best with it (the voltage is linear in it
+        but for its small effect on the temperature), and the sums of their squared residuals, V^2, on a coarse grid of time.
+        """
+        cell, data = self.model.cell, self.data
+        # the largest step for which no voltage drop of explicit Euler oscillates
+        stride = max(int(min(cell.to, cell.tsn, cell.tsp) / data.dt_s), 1)
+        if len(data.current_A) < _COARSE_POINTS * stride:
+            stride = 1
+        points = len(data.current_A) // stride
+        current_A = data.current_A[: points * stride].reshape(points, stride).mean(axis=1)
+        voltage_V = np.interp(stride * data.dt_s * np.arange(points), data.time_s, data.voltage_V)
+        starts, squares_V2 = [], []
+        for candidate in q_candidates:
+            q_mobile, r_o = candidate, cell.r_o
+            if "q_mobile" in self.parameters:
+                q_mobile = _within(q_mobile, self.bounds["q_mobile"])
+            model_V, _, by_r_o_A = self.model.sensitivities(current_A, q_mobile, r_o, stride)
+            residual_V = model_V - voltage_V
+            if "r_o" in self.parameters:
+                best_ohm = _within(r_o - float(residual_V @ by_r_o_A) / square(by_r_o_A), self.bounds["r_o"])
+                residual_V += (best_ohm - r_o) * by_r_o_A
+                r_o = best_ohm
+            square_V2 = square(residual_V)
+            starts.append({"q_mobile": q_mobile, "r_o": r_o})
+            # on the coarse grid a cell may be empty a little too early
+            squares_V2.append(inf if isnan(square_V2) else square_V2)
+        return starts, np.array(squares_V2)
+
+    def best_starts(self, more_q_C: Sequence[float]) -> list[dict[str, float]]:
+        """The local minima on a grid of ``q_mobile``, refined where it is promising, that may lead to the global one."""
+        excess = _START_EXCESS
+        coarse, coarse_V2 = self.starts((self.least_q_C * (1.0 + excess)).tolist())
+        promising = _is_near_best(coarse_V2)
+        left = np.flatnonzero(promising[:-1] | promising[1:])
+        between = excess[left, None] * (excess[left + 1] / excess[left])[:, None] ** (np.arange(1, _FINER) / _FINER)
+        finer, finer_V2 = self.starts([*(self.least_q_C * (1.0 + between.ravel())).tolist(), *more_q_C])
+        starts, squares_V2 = [*coarse, *finer], np.append(coarse_V2, finer_V2)
+        order = np.argsort([start["q_mobile"] for start in starts], kind="stable")
+        squares_V2 = squares_V2[order]
+        beside_V2 = np.pad(squares_V2, 1, constant_values=np.inf)
+        minima = (squares_V2 <= beside_V2[:-2]) & (squares_V2 < beside_V2[2:]) & _is_near_best(squares_V2)
+        return [starts[order[n]] for n in np.union1d(np.flatnonzero(minima), squares_V2.argmin())]
+
+    def best(self, starts: Sequence[dict[str, float]], priors: Sequence[Prior]) -> Fit:
+        """The best fit that is found from any of the starts."""
+        return min((self._fit(start, priors) for start in starts), key=lambda fit: fit.square_V2)
+
+    def _fit(self, start: dict[str, float], priors: Sequence[Prior]) -> Fit:
+        free, values = list(self.unknown), dict.fromkeys(self.nuisance, 0.0) | start
+        while True:
+            values = self._minimized(values, free, priors)
+            clipped = {name: _within(values[name], self.bounds[name]) for name in free if name in self.bounds}
+            inside = [name for name in free if clipped.get(name, values[name]) == values[name]]
+            values = values | clipped
+            if len(inside) in (0, len(free)):
+                break
+            free = inside
+        residual_V, jacobian = self.residual(values, priors)
+        at_bound = tuple(name for name in self.parameters if values[name] in self.bounds[name])
+        return Fit(values, jacobian, residual_V[: len(self.data.time_s)], square(residual_V), at_bound)
+
+    def _minimized(self, start: dict[str, float], free: list[str], priors: Sequence[Prior]) -> dict[str, float]:
+        unknown = self.unknown
+        columns = [unknown.index(name) for name in free]
+
+        def values_at(x: Iterable[float]) -> tuple[dict[str, float], float, float]:
+            values = start | {name: float(value) for name, value in zip(free, x, strict=True)}
+            least_C, least_by_log_C = self._least_q_C(values)
+            if "q_mobile" in free:
+                values["q_mobile"] = least_C + distance_C(values["q_mobile"])
+            return values, least_C, least_by_log_C
+
+        def evaluate(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+            values, least_C, least_by_log_C = values_at(x)
+            residual_V, by_unknown = self.residual(values, priors)
+            slopes = [values[name] - least_C if name == "q_mobile" else 1.0 for name in free]
+            by_x = by_unknown[:, columns] * slopes
+            if "q_mobile" in free and "tDiffusion" in free:  # which moves q_mobile along with its least value
+                by_x[:, free.index("tDiffusion")] += least_by_log_C * by_unknown[:, unknown.index("q_mobile")]
+            return residual_V, by_x
+
+        least_C, _ = self._least_q_C(start)
+        x = minimized(
+            evaluate,
+            [np.log(start[name] - least_C) if name == "q_mobile" else start[name] for name in free],
+            method="lm",
+            x_scale=[(_SCALES | dict(self.nuisance))[name] for name in free],
+            gtol=1e-10,
+        )
+        return values_at(x)[0]
+
+    def residual(self, values: Mapping[str, float], priors: Sequence[Prior] = ()) -> tuple[FloatArray, FloatArray]:
+        """The residuals at the samples, V, and one more for each prior; and their derivatives by all that is unknown."""
+        q_mobile, r_o = values["q_mobile"], values["r_o"]
+        if self.nuisance:
+            model_V, slopes, _ = self.model_at(values).tangents(self.data.current_A, q_mobile, r_o)
+            by_name = dict(zip(TANGENT_NAMES, slopes, strict=True)) | {"offset_V": np.ones(len(model_V))}
+            model_V = model_V + values.get("offset_V", 0.0)
+        else:
+            model_V, *both = self.model.sensitivities(self.data.current_A, q_mobile, r_o)
+            by_name = dict(zip(PARAMETER_NAMES, both, strict=True))
+        seen_V, *columns = self.data.at_samples([model_V, *(by_name[name] for name in self.unknown)])
+        residual_V, jacobian = seen_V - self.data.voltage_V, np.column_stack(columns)
+        for prior in priors:
+            row = [prior.weight_V if name == prior.name else 0.0 for name in self.unknown]
+            residual_V = np.append(residual_V, prior.weight_V * (values[prior.name] - prior.mean))
+            jacobian = np.vstack([jacobian, row])
+        return residual_V, jacobian
+
+    def model_at(self, values: Mapping[str, float]) -> RecordModel:
+        """The model with the nuisance constants at some values."""
+        cell, constants = self.model.cell, {}
+        for name in self.nuisance.keys() & set(RATE_CONSTANTS):
+            # a step of the search may go far, but explicit Euler is stable only for rates below 2 / dt
+            constant = getattr(cell, name) * float(np.exp(_within(values[name], (-_REACH, _REACH))))
+            constants[name] = max(constant, self._least_stable(name))
+        return self.model.of_cell(cell.replace(**constants)) if constants else self.model
+
+    def _least_stable(self, name: str) -> float:
+        cell, dt_s = self.model.cell, self.model.dt_s
+        if name == "tDiffusion":
+            rates = cell.packed.constants[0, [BULK_RATE, SURFACE_RATE]]
+            return float(0.5 * cell.tDiffusion * dt_s * rates.sum())
+        return 0.5 * dt_s if name in ("to", "tsn", "tsp") else 0.0
+
+    def _least_q_C(self, values: Mapping[str, float]) -> tuple[float, float]:
+        """The least q_mobile that the record allows, and its derivative by the logarithm of ``tDiffusion``."""
+        if "tDiffusion" not in self.nuisance:
+            return self.least_q_C, 0.0
+        return self.model_at(values).least_q_mobile_tangent_C(self.data.current_A)
+
+
+def square(array: FloatArray) -> float:
+    """Sum of squares."""
+    return float(array @ array)
+
+
+def _within(value: float, limits: tuple[float, float]) -> float:
+    return min(max(value, limits[0]), limits[1])
+
+
+def _is_near_best(squares_V2: FloatArray) -> BoolArray:
+    return np.asarray(squares_V2 <= _RIVAL_RATIO * squares_V2.min())
