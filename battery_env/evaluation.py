@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -146,27 +147,26 @@ def _since(holds: BoolArray, time_s: FloatArray) -> float:
 
 
 def _forecasts(dataset: TrajectoryDataset, n: int, record: Trajectory, trace: EstimateTrace) -> dict[str, float]:
-    cell = dataset.cell
-    profile = dataset.load_profile(n)
+    """Errors of the end that single estimates of one discharge predict."""
+    columns = [f"eod_error_at_{percent}_percent_s" for percent in FORECAST_PERCENT]
+    held_s = 0.01 * np.array(FORECAST_PERCENT) * record.eod_time_s
+    at = [len(trace.time_s) - 1, *(np.searchsorted(trace.time_s, held_s, side="right") - 1)]
+    load = dataset.load_profile(n)
     # beyond the record its last load goes on, for as long again
-    load = np.concatenate([profile, np.full(len(profile), profile[-1])])
-    starts_full = dataset.starts_full(n)
-
-    def error_s(estimate: int) -> float:
-        if not starts_full or estimate < 0:
-            return np.nan
+    load = np.concatenate([load, np.full(len(load), load[-1])])
+    how: dict[str, Any] = {
+        "dt": dataset.dt_s,
+        "load_unit": dataset.load_unit,
+        "thermal": dataset.thermal,
+        "cell": dataset.cell,
+    }
+    errors_s = dict.fromkeys(["eod_error_s", *columns], np.nan)
+    for column, estimate in zip(errors_s, at, strict=True):
         values = {name: getattr(trace, name)[estimate] for name in PARAMETERS}
-        if not all(PARAMETERS[name].limits[0] <= value <= PARAMETERS[name].limits[1] for name, value in values.items()):
-            return np.nan
-        unit, thermal = dataset.load_unit, dataset.thermal
-        forecast = simulate(load, **values, dt=dataset.dt_s, load_unit=unit, thermal=thermal, cell=cell)
-        return forecast.eod_time_s - record.eod_time_s
-
-    errors = {"eod_error_s": error_s(len(trace.time_s) - 1)}
-    for percent in FORECAST_PERCENT:
-        made = np.searchsorted(trace.time_s, 0.01 * percent * record.eod_time_s, side="right")
-        errors[f"eod_error_at_{percent}_percent_s"] = error_s(int(made) - 1)
-    return errors
+        is_within = all(PARAMETERS[name].limits[0] <= value <= PARAMETERS[name].limits[1] for name, value in values.items())
+        if dataset.starts_full(n) and estimate >= 0 and is_within:
+            errors_s[column] = simulate(load, **values, **how).eod_time_s - record.eod_time_s
+    return errors_s
 
 
 def _bounds(

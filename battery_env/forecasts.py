@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 from scipy.stats import truncnorm
 
-from battery_env.arrays import BoolArray, FloatArray, IntArray
+from battery_env.arrays import FloatArray, IntArray
 from battery_env.checks import LOAD_UNIT_SYMBOLS, LoadUnit, check_load, check_numbers, check_positive, check_whole_number
-from battery_env.electrochemistry import state_of_charge, step_into, voltage_into
+from battery_env.electrochemistry import reached_s, state_of_charge
 from battery_env.estimates import Estimate
 from battery_env.estimators.base import is_overfull, overfull_error
 from battery_env.estimators.settling import white_noise_V
@@ -34,8 +34,8 @@ _RECENT_SHARE = 0.1
 #: It drifts with this constant, as a share of ``q_mobile``: the model is wrong in another way at another charge. That is how
 #: fast the residuals of whole discharges of B0005 lose their correlation.
 _MEMORY_SHARE = 0.15
-# Loads are laid out, and cells that have ended are left out, after so many steps.
-_CHUNK_STEPS = 256
+# No discharge is followed for longer than a day, s. A load is laid out for so many steps first, as most end within them.
+_LONGEST_S, _FIRST_STEPS = 86_400.0, 4096
 # The course of the voltage is kept about this often, s.
 _COURSE_S = 10.0
 # The last voltage of a record may be the cut-off but for rounding, V.
@@ -164,13 +164,12 @@ def forecast(
     nominal_Ah: float | None = None,
     samples: int = 1000,
     seed: int = 0,
-    max_duration_s: float = 86_400.0,
 ) -> Forecast:
     """
     The end of a discharge in progress, under a load to come, with what is not known of it.
 
     Each sample is a cell with its own parameters, its own error of the model, and its own load if that is random. All follow
-    the record and then the load, down to the cut-off.
+    the record and then the load, down to the cut-off, for a day at most.
 
     *Parameters* are drawn from the estimate and its standard deviations: ``q_mobile`` log-normal, above what the record has
     already taken out of the cell; ``r_o`` normal, with the correlation that the voltage of this record gives it with
@@ -198,47 +197,25 @@ def forecast(
         its own ``q_mobile`` and ``r_o``, gives from full under the load to come, on average where that is random
     :param samples: how many
     :param seed: seed of all that is drawn
-    :param max_duration_s: where to stop if the discharge does not end by itself, s
     :return: the samples, with quantiles, a summary and a plot
     :raises TypeError: for a load of another type
     :raises ValueError: for an argument out of range, an estimate that the record contradicts, or a load that charges the cell
         beyond full
     """
     model = RecordModel() if model is None else model
-    cell = model.cell
-    cut_off = cell.VEOD if cut_off_V is None else cut_off_V
-    if not 0.0 <= mismatch_V < np.inf:
-        raise ValueError(f"mismatch_V must be finite and at least 0 V, got {mismatch_V!r}")
-    if not 0.0 < cut_off < np.inf:
-        raise ValueError(f"cut_off_V must be a positive voltage in V, got {cut_off_V!r}")
-    for name, value in (("max_duration_s", max_duration_s), ("nominal_Ah", nominal_Ah)):
-        if value is not None:
-            check_positive(name, value)
-    if check_whole_number("samples", samples) < 1 or check_whole_number("seed", seed) < 0:
-        raise ValueError(f"samples must be at least 1 and seed at least 0, got {samples!r} and {seed!r}")
+    cut_off = model.cell.VEOD if cut_off_V is None else cut_off_V
+    _check_arguments(mismatch_V, cut_off, nominal_Ah, samples, seed)
     seen = check_record(record, least_samples=2)
     rng = np.random.default_rng(seed)
     to_come, load_name = _to_come(load, load_unit, seen, model)
-    notes = []
-    if not np.isfinite([estimate.sd_q_mobile, estimate.sd_r_o]).all():
-        notes.append("The estimate states no standard deviation of all its parameters: the interval leaves theirs out.")
-    if load is None and isinstance(to_come, RandomLoad):
-        expected = expected_current(seen.time_s, seen.current_A)
-        notes.append(
-            f"The load varied: its means over quarters of the record lie {expected.sd_A:.2g} A apart (root mean square). "
-            "The interval is that of a load that goes on so, not of one that drifts elsewhere. Give the load if it is known."
-        )
-    if not estimate.settled:
-        notes.append(f"The estimate is not settled. {estimate.reason}".strip())
+    notes = _notes(estimate, seen, load is None and isinstance(to_come, RandomLoad))
 
     _, current_A = model.grid(seen)
-    q_mobile, r_o = _draw_parameters(model, current_A[:-1], estimate, samples, rng)
-    cells = _Cells(model, q_mobile, r_o)
-    recent = _follow(cells, seen, current_A[:-1])
-    error = _ModelError.drawn(recent, seen, mismatch_V, rng)
+    parameters = _draw_parameters(model, current_A[:-1], estimate, samples, rng)
+    cells = _at_the_end_of(seen, model, current_A, parameters, mismatch_V, rng)
     over = seen.voltage_V[-1] <= cut_off + _ROUNDING_V and seen.current_A[-1] > 0.0
     if not over:
-        alive = np.flatnonzero(cells.voltage() + error.now_V > cut_off)
+        alive = np.flatnonzero(cells.voltage_V + cells.error_V > cut_off)
         if len(alive) == 0:
             raise ValueError(
                 f"the estimate contradicts the record: no cell with q_mobile = {estimate.q_mobile:g} +- "
@@ -247,39 +224,62 @@ def forecast(
         if 2 * len(alive) < samples:
             notes.append(f"The record contradicts {1.0 - len(alive) / samples:.0%} of what the estimate takes to be possible.")
         chosen = np.arange(samples)
-        chosen = np.where(np.isin(chosen, alive), chosen, rng.choice(alive, size=samples))
-        cells, error = cells.part(chosen), error.part(chosen)
-    soc = cells.soc()
+        cells = cells.part(np.where(np.isin(chosen, alive), chosen, rng.choice(alive, size=samples)))
     # the first draw is that of the new cell alone
     draws = _draws(to_come, samples + 1, rng) if isinstance(to_come, RandomLoad) else [to_come]
-    if nominal_Ah is None:
-        nominal_Ah = _nominal_Ah(model, draws[:_NOMINAL_DRAWS], cut_off, max_duration_s)
     if over:
-        ends = _Ends(np.zeros(samples), soc, np.zeros(1), np.full((len(BAND), 1), cut_off))
+        ends = _Ends(np.zeros(samples), cells.soc, np.zeros(1), np.full((len(BAND), 1), cut_off))
         above = np.flatnonzero(seen.voltage_V > cut_off + _ROUNDING_V)
         around = [above[-1] + 1, above[-1]] if len(above) else [0]
         now_s = float(np.interp(cut_off, seen.voltage_V[around], seen.time_s[around]))
     else:
-        ends, now_s = _discharge(cells, error, draws[-samples:], cut_off, max_duration_s), float(seen.time_s[-1])
+        ends, now_s = _discharge(model, cells, draws[-samples:], mismatch_V, cut_off), float(seen.time_s[-1])
     return Forecast(
         record=seen,
         load_name=load_name,
         cut_off_V=float(cut_off),
         eod_time_s=now_s + ends.time_s,
-        soc=soc,
+        soc=cells.soc,
         q_mobile=cells.q_mobile,
         r_o=cells.r_o,
         capacity_Ah=(1.0 - ends.soc) * cells.q_mobile / 3600.0,
-        nominal_Ah=float(nominal_Ah),
+        nominal_Ah=_nominal_Ah(model, draws[:_NOMINAL_DRAWS], cut_off) if nominal_Ah is None else float(nominal_Ah),
         time_s=now_s + ends.course_s,
         voltage_V=ends.course_V,
         notes=tuple(notes),
     )
 
 
+def _check_arguments(mismatch_V: float, cut_off_V: float, nominal_Ah: float | None, samples: int, seed: int) -> None:
+    if not 0.0 <= mismatch_V < np.inf:
+        raise ValueError(f"mismatch_V must be finite and at least 0 V, got {mismatch_V!r}")
+    if not 0.0 < cut_off_V < np.inf:
+        raise ValueError(f"cut_off_V must be a positive voltage in V, got {cut_off_V!r}")
+    if nominal_Ah is not None:
+        check_positive("nominal_Ah", nominal_Ah)
+    if check_whole_number("samples", samples) < 1 or check_whole_number("seed", seed) < 0:
+        raise ValueError(f"samples must be at least 1 and seed at least 0, got {samples!r} and {seed!r}")
+
+
+def _notes(estimate: Estimate, record: Samples, goes_on_varied: bool) -> list[str]:
+    notes = []
+    if not np.isfinite([estimate.sd_q_mobile, estimate.sd_r_o]).all():
+        notes.append("The estimate states no standard deviation of all its parameters: the interval leaves theirs out.")
+    if goes_on_varied:
+        sd_A = expected_current(record.time_s, record.current_A).sd_A
+        notes.append(
+            f"The load varied: its means over quarters of the record lie {sd_A:.2g} A apart (root mean square). "
+            "The interval is that of a load that goes on so, not of one that drifts elsewhere. Give the load if it is known."
+        )
+    if not estimate.settled:
+        notes.append(f"The estimate is not settled. {estimate.reason}".strip())
+    return notes
+
+
 def _quantile(values: FloatArray, probability: ArrayLike) -> FloatArray:
+    """Quantiles over the samples, the first axis."""
     # of the samples themselves: between two of them there is no number if one is infinite
-    return np.asarray(np.quantile(values, np.asarray(probability, dtype=np.float64), method="inverted_cdf"))
+    return np.asarray(np.quantile(values, np.asarray(probability, dtype=np.float64), axis=0, method="inverted_cdf"))
 
 
 class _Function:
@@ -332,9 +332,9 @@ def _draws(load: RandomLoad, count: int, rng: np.random.Generator) -> list[_Know
     return list(draws)
 
 
-def _nominal_Ah(model: RecordModel, loads: list[_Known], cut_off_V: float, max_duration_s: float) -> float:
+def _nominal_Ah(model: RecordModel, loads: list[_Known], cut_off_V: float) -> float:
     """The capacity of the model's cell, its mean over loads: under a single draw, health would be a matter of that draw."""
-    given = [model.capacity_Ah(in_steps(load, model.dt_s), load.unit, cut_off_V, max_duration_s) for load in loads]
+    given = [model.capacity_Ah(in_steps(load, model.dt_s), load.unit, cut_off_V, _LONGEST_S) for load in loads]
     reached = [each_Ah for each_Ah in given if each_Ah > 0.0]  # no charge takes a full cell to its end
     return float(np.mean(reached)) if reached else float("nan")
 
@@ -371,68 +371,68 @@ def _draw_parameters(
     return q_C * np.exp(share * deviation), np.clip(r_o, *R_O.limits)
 
 
-class _Cells:
-    """Cells that are simulated side by side."""
+class _Cells(NamedTuple):
+    """Samples of a cell at the end of its record, arrays over the samples."""
 
-    def __init__(self, model: RecordModel, q_mobile: FloatArray, r_o: FloatArray, state: FloatArray | None = None) -> None:
-        self.model, self.q_mobile, self.r_o = model, q_mobile, r_o
-        self.state = model.start(q_mobile) if state is None else state
+    q_mobile: FloatArray
+    r_o: FloatArray
+    state: FloatArray
+    voltage_V: FloatArray  # of the model; NaN if it was empty before
+    error_V: FloatArray  # what is to be added to that
+    drift: FloatArray  # standard normal: where that moves
 
-    def part(self, chosen: IntArray | BoolArray) -> _Cells:
-        return _Cells(self.model, self.q_mobile[chosen], self.r_o[chosen], self.state[chosen])
+    def part(self, chosen: IntArray) -> _Cells:
+        return _Cells(*(column[chosen] for column in self))
 
-    def voltage(self) -> FloatArray:
-        out = np.empty(len(self.q_mobile))
-        voltage_into(out, self.state, self.q_mobile, self.model.cell.packed)
-        return out
-
-    def step(self, load: FloatArray, unit: LoadUnit) -> None:
-        model = self.model
-        step_into(self.state, self.state, load, self.q_mobile, self.r_o, model.dt_s, unit, model.thermal, model.cell.packed)
-
+    @property
     def soc(self) -> FloatArray:
         return state_of_charge(self.state, self.q_mobile)
 
 
-def _follow(cells: _Cells, record: Samples, current_A: FloatArray) -> FloatArray:
-    """Take cells through a record. How far below the measured voltage theirs is in the last part of it, V, shape (n,)."""
-    dt_s, steps = cells.model.dt_s, len(current_A)
-    measured_V = np.interp(record.time_s[0] + dt_s * np.arange(steps + 1), record.time_s, record.voltage_V)
-    first = min(int((1.0 - _RECENT_SHARE) * steps), steps - 1)
-    residual_V = np.zeros(len(cells.q_mobile))
-    for k in range(steps):
-        cells.step(np.full(len(cells.q_mobile), current_A[k]), "current")
-        if k >= first:
-            residual_V += measured_V[k + 1] - cells.voltage()
-    return residual_V / (steps - first)
+def _at_the_end_of(
+    record: Samples,
+    model: RecordModel,
+    current_A: FloatArray,
+    parameters: tuple[FloatArray, FloatArray],
+    mismatch_V: float,
+    rng: np.random.Generator,
+) -> _Cells:
+    """Take cells with drawn parameters through a record, and draw their errors from the last voltages measured."""
+    steps, count = len(current_A) - 1, len(parameters[0])
+    measured_V = np.interp(record.time_s[0] + model.dt_s * np.arange(steps + 1), record.time_s, record.voltage_V)
+    last = slice(min(int((1.0 - _RECENT_SHARE) * steps), steps - 1) + 1, None)
+    state, recent_V = model.start(parameters[0]), np.empty(count)
+    voltage_V = np.full(count, np.nan)
+    for n, (q_mobile, r_o) in enumerate(zip(*parameters, strict=True)):
+        run = model.run_down(state[n], current_A, q_mobile, r_o)
+        state[n] = run.state[-1]
+        if len(run.voltage_V) == steps + 1:
+            voltage_V[n], recent_V[n] = run.voltage_V[-1], (measured_V[last] - run.voltage_V[last]).mean()
+    # the voltage measured is noisy
+    samples = max(int((record.time_s >= record.time_s[-1] - _RECENT_SHARE * np.ptp(record.time_s)).sum()), 1)
+    variance_V2, of_noise_V2 = mismatch_V**2, white_noise_V(record.voltage_V) ** 2 / samples
+    share = variance_V2 / (variance_V2 + of_noise_V2) if variance_V2 > 0.0 else 0.0
+    draws = rng.standard_normal((2, count))
+    return _Cells(*parameters, state, voltage_V, share * recent_V + mismatch_V * np.sqrt(1.0 - share) * draws[0], draws[1])
 
 
-@dataclass(frozen=True)
-class _ModelError:
-    """What is added to the voltage of each cell: known at the end of the record, and less and less from there."""
+class _Profile:
+    """A load laid out in steps, as far as it was asked for."""
 
-    now_V: FloatArray
-    mismatch_V: float
-    other: FloatArray  # standard normal: how it drifts
+    def __init__(self, load: _Known, dt_s: float) -> None:
+        self.unit, self._load, self._dt_s = load.unit, in_steps(load, dt_s), dt_s
+        self._values = np.empty(0)
 
-    @classmethod
-    def drawn(cls, recent_V: FloatArray, record: Samples, mismatch_V: float, rng: np.random.Generator) -> _ModelError:
-        """
-        The error of the model at the end of a record, from the mean difference to the voltage measured, which is noisy.
-        """
-        count = max(int((record.time_s >= record.time_s[-1] - _RECENT_SHARE * np.ptp(record.time_s)).sum()), 1)
-        variance_V2, of_noise_V2 = mismatch_V**2, white_noise_V(record.voltage_V) ** 2 / count
-        share = variance_V2 / (variance_V2 + of_noise_V2) if variance_V2 > 0.0 else 0.0
-        draws = rng.standard_normal((2, len(recent_V)))
-        return cls(share * recent_V + mismatch_V * np.sqrt(1.0 - share) * draws[0], mismatch_V, draws[1])
+    def first(self, steps: int) -> FloatArray:
+        if steps > len(self._values):
+            self._values = self._load(self._dt_s * np.arange(steps, dtype=np.float64))
+        return self._values[:steps]
 
-    def part(self, chosen: IntArray | BoolArray) -> _ModelError:
-        return _ModelError(self.now_V[chosen], self.mismatch_V, self.other[chosen])
 
-    def after(self, drawn_share: FloatArray) -> FloatArray:
-        # what the last voltages showed stays, as an error of r_o would; what the error is beside that changes
-        memory = np.exp(-np.maximum(drawn_share, 0.0) / _MEMORY_SHARE)
-        return self.now_V + self.mismatch_V * np.sqrt(1.0 - memory**2) * self.other
+class _Run(NamedTuple):
+    time_s: float  # of its end, infinite if it does not end
+    soc: float  # then; NaN likewise
+    voltage_V: FloatArray  # at each step before
 
 
 class _Ends(NamedTuple):
@@ -442,46 +442,51 @@ class _Ends(NamedTuple):
     course_V: FloatArray  # quantiles of all cells
 
 
-def _discharge(cells: _Cells, error: _ModelError, loads: list[_Known], cut_off_V: float, max_duration_s: float) -> _Ends:
+def _run(model: RecordModel, cells: _Cells, n: int, load: _Profile, mismatch_V: float, cut_off_V: float, steps: int) -> _Run:
+    """Take one cell down to the cut-off, or through so many steps."""
+    q_mobile, r_o, first_soc = float(cells.q_mobile[n]), float(cells.r_o[n]), float(cells.soc[n])
+    error_V, change_V = float(cells.error_V[n]), mismatch_V * float(cells.drift[n])
+    # the error drifts from the one to the sum of both
+    lowest_V, horizon = cut_off_V - error_V - max(change_V, 0.0) - _ROUNDING_V, min(_FIRST_STEPS, steps)
+    run = model.run_down(cells.state[n], load.first(horizon), q_mobile, r_o, load.unit, lowest_V)
+    while len(run.current_A) == horizon < steps:
+        horizon = min(4 * horizon, steps)
+        run = model.run_down(cells.state[n], load.first(horizon), q_mobile, r_o, load.unit, lowest_V)
+    drawn_share = np.append(0.0, np.cumsum(run.current_A))[: len(run.voltage_V)] * model.dt_s / q_mobile
+    # what the last voltages showed stays, as an error of r_o would; what the error is beside that changes
+    memory = np.exp(-np.maximum(drawn_share, 0.0) / _MEMORY_SHARE)
+    voltage_V = run.voltage_V + error_V + change_V * np.sqrt(1.0 - memory**2)
+    time_s = model.dt_s * np.arange(len(voltage_V), dtype=np.float64)
+    end_s = reached_s(time_s, voltage_V, cut_off_V)
+    ended = np.isfinite(end_s)
+    before = int(np.searchsorted(time_s, end_s)) if ended else len(voltage_V)
+    full = np.flatnonzero(is_overfull(first_soc - drawn_share[: before + 1], np.float64(first_soc)))
+    if len(full):
+        raise overfull_error(time_s[full[0]])
+    if not ended:
+        return _Run(np.inf, np.nan, voltage_V)
+    return _Run(end_s, first_soc - float(np.interp(end_s, time_s, drawn_share)), voltage_V[:before])
+
+
+def _discharge(model: RecordModel, cells: _Cells, loads: list[_Known], mismatch_V: float, cut_off_V: float) -> _Ends:
     """Take cells down to the cut-off; ``loads``: one for all, or one a cell."""
-    dt_s, unit, count = cells.model.dt_s, loads[0].unit, len(cells.q_mobile)
-    steps, every = int(max_duration_s / dt_s + 1e-9), max(round(_COURSE_S / dt_s), 1)
+    dt_s, count = model.dt_s, len(cells.q_mobile)
+    steps, every = int(_LONGEST_S / dt_s + 1e-9), max(round(_COURSE_S / dt_s), 1)
+    profiles = [_Profile(load, dt_s) for load in loads]
     # cells whose load is off for ever are followed no longer than the others
-    off = np.broadcast_to([isinstance(load, Load) and not (load.value > 0.0).any() for load in loads], count)
-    time_s, end_soc, shown_V = np.full(count, np.inf), np.full(count, np.nan), np.empty(count)
-    course: list[tuple[float, FloatArray]] = []
-    index, going = np.arange(count), np.ones(count, dtype=np.bool_)
-    first_soc = last_soc = cells.soc()
-    last_V = np.full(count, np.inf)
-    for k in range(steps + 1):
-        if k % _CHUNK_STEPS == 0:
-            cells, error, index = cells.part(going), error.part(going), index[going]
-            first_soc, last_soc, last_V, off = first_soc[going], last_soc[going], last_V[going], off[going]
-            if len(loads) > 1:
-                loads = [loads[n] for n in np.flatnonzero(going)]
-            going = np.ones(len(index), dtype=np.bool_)
-            times_s = dt_s * np.arange(k, k + _CHUNK_STEPS, dtype=np.float64)
-            profiles = np.array([in_steps(load, dt_s)(times_s) for load in loads])
-        soc = cells.soc()
-        if (going & is_overfull(soc, first_soc)).any():
-            raise overfull_error(dt_s * k)
-        voltage_V = cells.voltage() + error.after(first_soc - soc)
-        ended = np.flatnonzero(going & ~(voltage_V > cut_off_V))
-        if len(ended):
-            fall_V = last_V[ended] - voltage_V[ended]
-            # a cell that has no voltage is empty: until this step it was above
-            share = np.where(np.isfinite(fall_V), (last_V[ended] - cut_off_V) / fall_V, 1.0) if k else np.zeros(len(ended))
-            time_s[index[ended]] = dt_s * (k - 1 + share) if k else 0.0
-            end_soc[index[ended]] = last_soc[ended] + share * (soc[ended] - last_soc[ended])
-            going[ended] = False
-        is_over = not (going & ~off).any()
-        if k % every == 0 or is_over:
-            shown_V[:] = cut_off_V
-            shown_V[index[going]] = voltage_V[going]
-            course.append((dt_s * k, _quantile(shown_V, BAND)))
-        if is_over:
-            break
-        last_V, last_soc = voltage_V, soc
-        load = profiles[:, k % _CHUNK_STEPS]
-        cells.step(np.array(np.broadcast_to(load, index.shape)), unit)
-    return _Ends(time_s, end_soc, np.array([at_s for at_s, _ in course]), np.array([volts for _, volts in course]).T)
+    is_off = np.broadcast_to([isinstance(load, Load) and not (load.value > 0.0).any() for load in loads], count)
+    time_s, soc = np.full(count, np.inf), np.full(count, np.nan)
+    shown: dict[int, tuple[FloatArray, float]] = {}
+    last = 0
+    for n in sorted(range(count), key=is_off.__getitem__):
+        run = _run(model, cells, n, profiles[n % len(profiles)], mismatch_V, cut_off_V, (last if is_off[n] else steps) + 1)
+        time_s[n], soc[n] = run.time_s, run.soc
+        ended = np.isfinite(run.time_s)
+        if not is_off[n]:
+            last = max(last, len(run.voltage_V) if ended else steps)
+        shown[n] = run.voltage_V[::every], cut_off_V if ended else float(run.voltage_V[-1])
+    course = np.unique(np.append(np.arange(0, last + 1, every), last))
+    voltage_V = np.full((count, len(course)), cut_off_V)
+    for n, (kept_V, last_V) in shown.items():
+        voltage_V[n, : len(kept_V)], voltage_V[n, -1] = kept_V, last_V
+    return _Ends(time_s, soc, dt_s * course, _quantile(voltage_V, BAND))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import copy
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -16,11 +18,13 @@ from battery_env.electrochemistry import (
     QNB,
     STATE_SIZE,
     CellParameters,
+    RunDown,
     Trajectory,
     check_cell,
     check_dt,
     initial_state,
     rest_shares,
+    run_down,
     simulate,
 )
 from battery_env.electrochemistry.tangents import (
@@ -41,22 +45,62 @@ _Q_PER_CHARGE = 1.0 / float(FULL_CHARGE_SHARES.sum())
 LONGEST_FORECAST_S = 604_800.0
 
 
-class VoltageForecast(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class VoltageForecast:
     """
     The voltage of the model from the first sample of a record on, at some parameters.
 
-    :param time_s: of the steps of the model down to the cut-off, on the clock of the record, s, shape (K,)
-    :param voltage_V: shape (K,). The last point is at the cut-off, interpolated between steps; it is above if the cut-off is
-        never reached, as the load is off at the end of the record
-    :param eod_time_s: when the cut-off is reached, on the clock of the record, s; NaN if it is not, or under a current so
-        small that it would take more than a week
+    :param simulation: the steps of the model on the clock of the record, until its cell is empty or its load is over
+    :param cut_off_V: voltage at which the discharge ends, V
     :param at_samples_V: at the samples of the record, also below the cut-off, shape (T,); NaN after the model cell is empty
+    :param not_before_s: end of a record in progress, before which its cell has not ended, s; ``None`` of a whole one
     """
 
-    time_s: FloatArray
-    voltage_V: FloatArray
-    eod_time_s: float
+    simulation: Trajectory
+    cut_off_V: float
     at_samples_V: FloatArray
+    not_before_s: float | None = None
+
+    def reached_s(self, voltage_V: float) -> float:
+        """
+        When the voltage falls to a level. After a record in progress it falls for good, as a constant current has no pulses.
+
+        :param voltage_V: the level, V
+        :return: on the clock of the record, s; NaN if it is not reached
+        """
+        if self.not_before_s is None:
+            return self.simulation.reached_s(voltage_V)
+        return float(np.maximum(self.simulation.reached_s(voltage_V, for_good=True), self.not_before_s))
+
+    @property
+    def eod_time_s(self) -> float:
+        """
+        When the cut-off is reached, on the clock of the record, s; NaN if it is not, or under a current so small that it would
+        take more than a week.
+        """
+        return self.reached_s(self.cut_off_V)
+
+    @property
+    def time_s(self) -> FloatArray:
+        """Of the steps of the model down to the cut-off, on the clock of the record, s, shape (K,)."""
+        return self._down_to_the_cut_off[0]
+
+    @property
+    def voltage_V(self) -> FloatArray:
+        """
+        At these times, V, shape (K,). The last one is the cut-off, between two steps; it is above if the cut-off is never
+        reached, as the load is off at the end of the record.
+        """
+        return self._down_to_the_cut_off[1]
+
+    @cached_property
+    def _down_to_the_cut_off(self) -> tuple[FloatArray, FloatArray]:
+        time_s, voltage_V = self.simulation.time_s, self.simulation.voltage_V
+        reached_s = self.simulation.reached_s(self.cut_off_V, for_good=self.not_before_s is not None)
+        if np.isnan(reached_s):
+            return time_s, voltage_V
+        before = time_s < reached_s
+        return np.append(time_s[before], self.eod_time_s), np.append(voltage_V[before], self.cut_off_V)
 
 
 class Tangents(NamedTuple):
@@ -178,6 +222,19 @@ class RecordModel:
             max_duration_s=len(current_A) * self.dt_s,
         )
 
+    def run_down(
+        self,
+        state: FloatArray,
+        load: FloatArray,
+        q_mobile: float,
+        r_o: float,
+        load_unit: LoadUnit = "current",
+        cut_off_V: float = -np.inf,
+    ) -> RunDown:
+        """Run the model on from a state under a load, down to a cut-off; unchecked, for inner loops."""
+        packed = self.cell.packed
+        return run_down(state, load, q_mobile, r_o, self.dt_s, load_unit, self.thermal, packed, cut_off_V)
+
     def voltage(self, record: Record, at: Estimate) -> FloatArray:
         """
         The voltage of the model at the samples of a record, under its current.
@@ -215,7 +272,6 @@ class RecordModel:
         """
         Q_MOBILE.check(at.q_mobile)
         samples_s, current_A = self.grid(record)
-        cut_off = self.cell.VEOD if cut_off_V is None else cut_off_V
         if future_current_A is None:
             future_current_A = expected_current(record.time_s, record.current_A).mean_A
         elif not 0.0 <= future_current_A < np.inf:
@@ -224,24 +280,13 @@ class RecordModel:
             # no cell of this q_mobile lasts longer than this, whatever it had delivered before
             steps = int(at.q_mobile / (future_current_A * self.dt_s)) + 1
             current_A = np.append(current_A[:-1], np.full(steps + 1, future_current_A))
-        simulation = self.simulate(current_A, at.q_mobile, at.r_o)
-        start_s, at_samples_V = float(record.time_s[0]), _at(samples_s, simulation)
-        time_s, voltage_V = start_s + simulation.time_s, simulation.voltage_V
-        earliest_s = float(record.time_s[-1]) if in_progress else start_s
-        is_below = voltage_V <= cut_off
-        if in_progress:  # a constant current has no pulses: the voltage falls below for good
-            is_below = np.logical_and.accumulate(is_below[::-1])[::-1]
-        below = np.flatnonzero(is_below)
-        if len(below):
-            n = int(below[0])
-            around = [n, max(n - 1, 0)]
-            eod_time_s = max(float(np.interp(cut_off, voltage_V[around], time_s[around])), earliest_s)
-        elif np.isnan(simulation.eod_time_s):
-            return VoltageForecast(time_s, voltage_V, float("nan"), at_samples_V)
-        else:
-            # the cell is empty one step later
-            n, eod_time_s = len(time_s), max(start_s + simulation.eod_time_s, earliest_s)
-        return VoltageForecast(np.append(time_s[:n], eod_time_s), np.append(voltage_V[:n], cut_off), eod_time_s, at_samples_V)
+        simulation, start_s = self.simulate(current_A, at.q_mobile, at.r_o), float(record.time_s[0])
+        return VoltageForecast(
+            replace(simulation, time_s=start_s + simulation.time_s, eod_time_s=start_s + simulation.eod_time_s),
+            self.cell.VEOD if cut_off_V is None else cut_off_V,
+            _at(samples_s, simulation),
+            float(record.time_s[-1]) if in_progress else None,
+        )
 
     def capacity_Ah(
         self, load: float | Callable[[FloatArray], FloatArray], load_unit: LoadUnit, cut_off_V: float, max_duration_s: float

@@ -379,7 +379,9 @@ def simulated(fit: CellFit, cell: str, folder: Path) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
         loads = [recorded(discharge.loaded_part(CUT_OFF_V), "power", 1.0) for discharge in load_nasa_discharges(cell)]
         ranges: dict[str, Any] = {"q_mobile_range": Q_MOBILE_RANGE_C, "r_o_range": R_O_RANGE_OHM}
-        data = TrajectoryDataset.generate(PARAMETER_NAMES, N_CELLS, loads, 0, **ranges, cell=fit.cell, mismatch=pretrained.MISMATCH)
+        data = TrajectoryDataset.generate(
+            PARAMETER_NAMES, N_CELLS, loads, 0, **ranges, cell=fit.cell, mismatch=pretrained.MISMATCH
+        )
         data.save(file)
     return file
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from numbers import Real
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -177,6 +177,61 @@ def state_of_charge(state: FloatArray, q_mobile: FloatArray) -> FloatArray:
     return np.asarray((state[..., QNB] + state[..., QNS]) / q_mobile)
 
 
+def reached_s(time_s: FloatArray, voltage_V: FloatArray, level_V: float, for_good: bool = False) -> float:
+    """
+    The one way to the end of a discharge: when a voltage falls to a level, interpolated between two steps.
+
+    :param time_s: shape (K,)
+    :param voltage_V: shape (K,); NaN, of an empty cell, is below every level
+    :param level_V: the cut-off, or another voltage, V
+    :param for_good: whether the fall is meant after which the voltage stays below, not the first one
+    :return: s; NaN if the level is not reached
+    """
+    is_below = ~(voltage_V > level_V)
+    if for_good:
+        is_below = np.logical_and.accumulate(is_below[::-1])[::-1]
+    below = np.flatnonzero(is_below)
+    if not len(below):
+        return float("nan")
+    n = below[0]
+    if n == 0 or np.isnan(voltage_V[n]):
+        return float(time_s[n])
+    return float(np.interp(level_V, voltage_V[[n, n - 1]], time_s[[n, n - 1]]))
+
+
+class RunDown(NamedTuple):
+    """
+    A discharge of n steps, see :func:`run_down`.
+
+    :param voltage_V: before each step and, if the cut-off is reached, after the last one, shape (n,) or (n + 1,); that one is
+        at or below the cut-off, or NaN of an empty cell
+    :param current_A: over each step, shape (n,)
+    :param state: likewise, shape (n,) or (n + 1, 8)
+    """
+
+    voltage_V: FloatArray
+    current_A: FloatArray
+    state: FloatArray
+
+
+def run_down(
+    state: FloatArray,
+    load: FloatArray,
+    q_mobile: float,
+    r_o: float,
+    dt: float,
+    load_unit: LoadUnit,
+    thermal: bool,
+    packed: PackedConstants,
+    cut_off_V: float,
+) -> RunDown:
+    """:func:`simulate` for inner loops: no checks, and with the sample at which the discharge ends."""
+    states, volts, amperes = np.empty((len(load) + 1, STATE_SIZE)), np.empty(len(load)), np.empty(len(load))
+    states[0] = state
+    steps = roll_out(load, q_mobile, r_o, dt, cut_off_V, load_unit == "power", thermal, packed, states, volts, amperes)
+    return RunDown(volts[: steps + 1], amperes[:steps], states[: steps + 1][: len(load)])
+
+
 @dataclass(frozen=True)
 class Trajectory:
     """
@@ -215,6 +270,17 @@ class Trajectory:
     def r_o(self) -> float:
         """Ohmic resistance, ohm."""
         return self.cell.r_o
+
+    def reached_s(self, voltage_V: float, for_good: bool = False) -> float:
+        """
+        When the voltage falls to a level, as :func:`reached_s`; an empty cell is below every level.
+
+        :param voltage_V: the level, V
+        :param for_good: whether the fall is meant after which the voltage stays below
+        :return: on the clock of ``time_s``, s; NaN if the level is not reached
+        """
+        at_s = reached_s(self.time_s, self.voltage_V, voltage_V, for_good)
+        return self.eod_time_s if np.isnan(at_s) else at_s
 
     def part(self, first: int, stop: int) -> Trajectory:
         """

@@ -21,6 +21,9 @@ from battery_env.loads import in_steps
 from battery_env.parameters import PARAMETERS
 from battery_env.records import Record, Stream
 
+#: A load to come: a number, one value a step, or a function of time in s.
+LoadToCome = float | ArrayLike | Callable[[FloatArray], ArrayLike]
+
 #: A full cell takes no more charge than this share of its own.
 SURPLUS_SHARE = 0.01
 # A discharge is followed for no longer than a day, s.
@@ -97,6 +100,23 @@ class ModelNow(NamedTuple):
     state: FloatArray
     parameters: FloatArray
     deviations: FloatArray
+
+    def discharge(self, point: FloatArray, load: LoadToCome, load_unit: LoadUnit, cut_off_V: float) -> Trajectory:
+        """
+        The discharge from a state with some parameters on, a point of shape (11,), down to the cut-off.
+        """
+        return simulate(
+            load,
+            float(point[STATE_SIZE]),
+            float(point[STATE_SIZE + 1]),
+            dt=self.dt_s,
+            load_unit=load_unit,
+            thermal=self.thermal,
+            cell=self.cell,
+            initial=point[:STATE_SIZE],
+            cut_off_V=cut_off_V - float(point[-1]),
+            max_duration_s=_LONGEST_S,
+        )
 
 
 class OnlineEstimator(Estimator):
@@ -193,7 +213,7 @@ class OnlineEstimator(Estimator):
 
     def remaining(
         self,
-        load: float | ArrayLike | Callable[[FloatArray], ArrayLike],
+        load: LoadToCome,
         cut_off_V: float | None = None,
         load_unit: LoadUnit = "current",
     ) -> Remaining:
@@ -213,24 +233,8 @@ class OnlineEstimator(Estimator):
         """
         now = self.now()
         middle = np.concatenate([now.state, now.parameters])
-        end_V = now.cell.VEOD if cut_off_V is None else cut_off_V
-        load = in_steps(load, now.dt_s)
-
-        def discharge(point: FloatArray) -> Trajectory:
-            return simulate(
-                load,
-                float(point[STATE_SIZE]),
-                float(point[STATE_SIZE + 1]),
-                dt=now.dt_s,
-                load_unit=load_unit,
-                thermal=now.thermal,
-                cell=now.cell,
-                initial=point[:STATE_SIZE],
-                cut_off_V=end_V - float(point[-1]),
-                max_duration_s=_LONGEST_S,
-            )
-
-        expected = discharge(middle)
+        end_V, load = now.cell.VEOD if cut_off_V is None else cut_off_V, in_steps(load, now.dt_s)
+        expected = now.discharge(middle, load, load_unit, end_V)
         soc = state_of_charge(expected.state, middle[STATE_SIZE])
         full = np.flatnonzero(is_overfull(soc, soc[:1]))
         if len(full) and (callable(load) or np.ndim(load)):
@@ -248,8 +252,8 @@ class OnlineEstimator(Estimator):
 
         def change_s(deviation: FloatArray) -> float:
             shares = np.array([-_room(middle, -deviation), 0.0, _room(middle, deviation)])
-            below_s, above_s = (discharge(middle + share * deviation).eod_time_s for share in shares[::2])
-            ends_s = np.array([below_s, expected.eod_time_s, above_s])
+            below, above = (now.discharge(middle + share * deviation, load, load_unit, end_V) for share in shares[::2])
+            ends_s = np.array([below.eod_time_s, expected.eod_time_s, above.eod_time_s])
             reached = np.isfinite(ends_s)
             (first, last), (first_s, last_s) = shares[reached][[0, -1]], ends_s[reached][[0, -1]]
             return float((last_s - first_s) / (last - first)) if last > first else float("nan")

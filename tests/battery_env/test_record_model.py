@@ -161,9 +161,9 @@ class TestForecast:
 
     def test_forecast_follows_the_record_and_ends_at_the_cut_off(self):
         record = simulate(2.0, 6000.0, 0.15, load_unit="current")
-        time_s, voltage_V, *_ = RecordModel().forecast(record.part(0, 900), Estimate(6000.0, 0.15))
-        np.testing.assert_allclose(voltage_V[: len(record.time_s)], record.voltage_V, atol=1e-12)
-        assert voltage_V[-1] == 3.0 and (np.diff(time_s) > 0.0).all()
+        forecast = RecordModel().forecast(record.part(0, 900), Estimate(6000.0, 0.15))
+        np.testing.assert_allclose(forecast.voltage_V[: len(record.time_s)], record.voltage_V, atol=1e-12)
+        assert forecast.voltage_V[-1] == 3.0 and (np.diff(forecast.time_s) > 0.0).all()
 
     def test_time_counts_on_the_clock_of_the_record(self):
         record = simulate(2.0, 6000.0, 0.15, load_unit="current")
