@@ -226,10 +226,10 @@ def run_down(
     cut_off_V: float,
 ) -> RunDown:
     """:func:`simulate` for inner loops: no checks, and with the sample at which the discharge ends."""
-    states, volts, amperes = np.empty((len(load) + 1, STATE_SIZE)), np.empty(len(load)), np.empty(len(load))
+    states, columns = np.empty((len(load) + 1, STATE_SIZE)), np.empty((2, len(load)))
     states[0] = state
-    steps = roll_out(load, q_mobile, r_o, dt, cut_off_V, load_unit == "power", thermal, packed, states, volts, amperes)
-    return RunDown(volts[: steps + 1], amperes[:steps], states[: steps + 1][: len(load)])
+    steps = roll_out(load, q_mobile, r_o, dt, cut_off_V, load_unit == "power", thermal, packed, states, columns)
+    return RunDown(columns[0, : steps + 1], columns[1, :steps], states[: steps + 1][: len(load)])
 
 
 @dataclass(frozen=True)
