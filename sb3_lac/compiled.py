@@ -1,4 +1,4 @@
-"""The update of LAC as one compiled graph. What an update is stands in ``lac.py``, here is only how it is compiled."""
+"""Steps of an update, and all of it as one compiled graph. What an update is stands in ``lac.py``."""
 
 import inspect
 from collections.abc import Callable, Iterator, Sequence
@@ -40,7 +40,7 @@ def set_gradients(loss: th.Tensor, optimizer: th.optim.Optimizer) -> None:
 
 
 def set_gradient(parameter: th.Tensor, gradient: th.Tensor) -> None:
-    """"""
+    """Let a parameter have a gradient, for the next step of its optimizer."""
     if th.compiler.is_compiling():
         # A compiled step reads the tensors that it was compiled with
         assert parameter.grad is not None
@@ -50,9 +50,7 @@ def set_gradient(parameter: th.Tensor, gradient: th.Tensor) -> None:
 
 
 def step(optimizer: th.optim.Optimizer) -> None:
-    """
-    :param optimizer: Takes a step with the gradients of its parameters
-    """
+    """Let an optimizer take a step with the gradients of its parameters."""
     if th.compiler.is_compiling():
         # Without the wrappers for hooks and profiler, which no graph goes through
         with th.no_grad():
@@ -63,8 +61,7 @@ def step(optimizer: th.optim.Optimizer) -> None:
 
 def update_multiplier(log_multiplier: th.Tensor, optimizer: th.optim.Optimizer, violation: th.Tensor) -> th.Tensor:
     """
-    Step of a Lagrange multiplier in log space, which grows while its constraint is violated:
-    ``lambda`` with the decrease condition, ``ent_coef`` with the entropy constraint
+    Step of a Lagrange multiplier in log space, which grows while its constraint is violated
     (see https://github.com/rail-berkeley/softlearning/issues/37 for the logarithm).
     """
     violation = violation.detach()
@@ -76,21 +73,12 @@ def update_multiplier(log_multiplier: th.Tensor, optimizer: th.optim.Optimizer, 
 
 
 def actors_of(model: Any) -> list[Actor]:
-    """"""
+    """The actors whose distributions an update changes."""
     return [model.actor] if model.actor_target is None else [model.actor, model.actor_target]
 
 
-def check_torch() -> None:
-    """"""
-    if th.__version__ < _OLDEST_TORCH:
-        raise RuntimeError(
-            f"compile_update=True needs torch>={_OLDEST_TORCH}, and this is torch {th.__version__}: "
-            "older versions cannot have gradients within a compiled graph. Upgrade torch, or use compile_update=False."
-        )
-
-
 def check_compiler(device: th.device) -> None:
-    """"""
+    """Compile something, before a model has collected its first transitions."""
     try:
         th.compile(th.neg, backend=_BACKEND)(th.zeros(8, device=device))
     except Exception as error:
@@ -109,7 +97,11 @@ class CompiledUpdate:
     """
 
     def __init__(self, device: th.device) -> None:
-        check_torch()
+        if th.__version__ < _OLDEST_TORCH:
+            raise RuntimeError(
+                f"compile_update=True needs torch>={_OLDEST_TORCH}, the first that has gradients within a compiled graph, and "
+                f"this is torch {th.__version__}: upgrade it, or use compile_update=False."
+            )
 
         def run(model: Any, *args: Any) -> Metrics:
             with th.enable_grad():

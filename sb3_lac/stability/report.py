@@ -28,7 +28,7 @@ from sb3_lac.stability.rollout import (
     undisturbed,
 )
 from sb3_lac.stability.statistics import Bootstrap, Interval, decrease_by_cost, estimate_metrics
-from sb3_lac.vec_env import time_limits
+from sb3_lac.vec_env import env_specs
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -401,7 +401,7 @@ def evaluate_lyapunov(
 
     vec_normalize = unwrap_vec_normalize(env)
     # Asked for before the work: not every environment answers
-    limits = time_limits(env)
+    limits = [getattr(spec, "max_episode_steps", None) for spec in env_specs(env)]
     bound = lyapunov.cost_bound(vec_normalize)
     with undisturbed(policy, env, seed), lyapunov.in_units_of(vec_normalize):
         roll_outs = roll_out(policy, env, n_eval_episodes, deterministic, lyapunov.normalized_rewards)

@@ -20,7 +20,7 @@ import rl_zoo3
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 
 from sb3_lac import LAC, GymnasiumVecEnv, zoo
-from sb3_lac.zoo import LACExperimentManager, find_config, main, steps_as_one_batch
+from sb3_lac.zoo import LACExperimentManager, main, steps_as_one_batch
 
 ENV = "Pendulum-v1"
 CONFIG = {
@@ -48,15 +48,10 @@ def workdir(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_algorithm_is_registered():
-    assert rl_zoo3.ALGOS["lac"] is LAC
-    assert "lac" in HYPERPARAMS_SAMPLER and "lac" in HYPERPARAMS_CONVERTER
-
-
-def test_train_continue_and_enjoy(workdir, capsys):
+def test_train_continue_and_enjoy(workdir, n_updates, capsys):
     main(["train", "--env", ENV, "--eval-freq", "-1", "--seed", "1", "--save-replay-buffer"])
     first = LAC.load(workdir / "logs" / "lac" / f"{ENV}_1" / f"{ENV}.zip")
-    assert first.num_timesteps == 60 and first._n_updates == 20
+    assert first.num_timesteps == 60 and n_updates(first) == 20
     assert first.critic.output_dim == 4 and isinstance(first.actor.latent_pi[1], nn.LeakyReLU)
     assert first.lr_schedule(0.5) == pytest.approx(1.5e-4)
     assert first.lambda_lr_schedule(0.5) == pytest.approx(2.5e-5)
@@ -64,7 +59,7 @@ def test_train_continue_and_enjoy(workdir, capsys):
     trained_agent = str(workdir / "logs" / "lac" / f"{ENV}_1" / f"{ENV}.zip")
     main(["train", "--env", ENV, "--eval-freq", "-1", "-n", "50", "-i", trained_agent])
     second = LAC.load(workdir / "logs" / "lac" / f"{ENV}_2" / f"{ENV}.zip")
-    assert second._n_updates > first._n_updates
+    assert n_updates(second) > n_updates(first)
 
     capsys.readouterr()
     main(["enjoy", "--env", ENV, "-f", "logs", "--no-render", "-n", "201"])
@@ -233,22 +228,9 @@ def test_a_training_without_an_update_is_refused_before_anything_is_written(comm
     assert not (workdir / "logs").exists()
 
 
-def test_the_default_of_learning_starts_is_that_of_the_algorithm(workdir):
-    config = {"default": {"policy": "MlpPolicy", "n_timesteps": 100}}
-    (workdir / "zoo_configs" / "lac.yml").write_text(yaml.dump(config))
-    with pytest.raises(ValueError, match="learning_starts=100"):
-        manager_of(ENV, workdir).setup_experiment()
-    # PPO has none
-    manager_of(ENV, workdir, algo="ppo").setup_experiment()
-
-
 def test_the_experiment_manager_knows_the_hyperparameters_of_lac(workdir):
     assert manager_of(ENV, workdir, config=None).config == str(workdir / "zoo_configs" / "lac.yml")
     assert "rl_zoo3" in manager_of(ENV, workdir, algo="sac", config=None).config
-
-
-def test_config_of_the_current_folder_comes_first(workdir):
-    assert find_config("lac") == workdir / "zoo_configs" / "lac.yml"
 
 
 def test_other_algorithms_and_configs_can_be_chosen(workdir, monkeypatch):
@@ -267,14 +249,6 @@ def test_missing_config_is_explained(workdir, capsys):
     with pytest.raises(SystemExit):
         main(["train", "--algo", "a2c"])
     assert "No hyperparameters for 'a2c'" in capsys.readouterr().err
-
-
-def test_missing_batteries_are_explained(workdir, monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "battery_env", None)
-    monkeypatch.delitem(gym.registry, "BatteryRo-v0")
-    with pytest.raises(SystemExit):
-        main(["train", "--env", "BatteryRo-v0"])
-    assert "pip install ./battery_env" in capsys.readouterr().err
 
 
 def run_python(*args):
