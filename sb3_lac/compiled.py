@@ -11,8 +11,8 @@ from stable_baselines3.sac.policies import Actor
 
 # The first version that traces gradients within a graph
 _OLDEST_TORCH = "2.11"
-# Of ``torch.compile``. Tests have a quicker one
-_BACKEND = "inductor"
+#: Backend of ``torch.compile``. Tests have a quicker one
+BACKEND = "inductor"
 # What sampling leaves behind in an action distribution. The graphs that it belongs to are gone after an update
 _LEFT_BEHIND = ("distribution", "gaussian_actions", "weights_dist", "exploration_mat", "exploration_matrices", "_latent_sde")
 
@@ -80,7 +80,7 @@ def actors_of(model: Any) -> list[Actor]:
 def check_compiler(device: th.device) -> None:
     """Compile something, before a model has collected its first transitions."""
     try:
-        th.compile(th.neg, backend=_BACKEND)(th.zeros(8, device=device))
+        th.compile(th.neg, backend=BACKEND)(th.zeros(8, device=device))
     except Exception as error:
         raise RuntimeError(
             f"compile_update=True needs a working torch.compile, which fails on device={device}: {error}\n"
@@ -116,7 +116,7 @@ class CompiledUpdate:
         run.__code__ = run.__code__.replace()
         self._on_gpu = device.type == "cuda"
         mode = "reduce-overhead" if self._on_gpu else None
-        self._run = th.compile(run, fullgraph=True, dynamic=False, backend=_BACKEND, mode=mode)
+        self._run = th.compile(run, fullgraph=True, dynamic=False, backend=BACKEND, mode=mode)
         # One per group of parameters. A number would be a constant of the graph
         self._learning_rates: list[th.Tensor] = []
 

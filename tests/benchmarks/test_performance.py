@@ -28,7 +28,7 @@ def small(monkeypatch):
         "_COPIED_NUMBERS": 64,
     }.items():
         monkeypatch.setattr(performance, name, value)
-    monkeypatch.setattr(compiled, "_BACKEND", "eager")
+    monkeypatch.setattr(compiled, "BACKEND", "eager")
     yield
     th.set_num_threads(threads)
 

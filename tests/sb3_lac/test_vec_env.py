@@ -1,7 +1,5 @@
 """A vector environment of Gymnasium does in Stable-Baselines3 what as many single environments do."""
 
-from typing import Any, ClassVar
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -99,35 +97,6 @@ def test_arrays_that_the_environment_reuses_stay_as_they_were(make_env, mode):
     np.testing.assert_array_equal(first, kept)
     for info, other_info in zip(infos, other_infos, strict=True):
         assert_same(info, other_info)
-
-
-class ReusesItsLastObservations(gym.vector.VectorEnv):
-    """Counts steps, and tells of the last of two in an array that it uses again."""
-
-    metadata: ClassVar[dict[str, Any]] = {"autoreset_mode": AutoresetMode.SAME_STEP}
-
-    def __init__(self):
-        self.num_envs = 2
-        self.single_observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
-        self.single_action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
-        self.n_steps, self.last = 0, np.zeros((2, 1), np.float32)
-
-    def reset(self, *, seed=None, options=None):
-        return np.zeros((2, 1), np.float32), {}
-
-    def step(self, actions):
-        self.n_steps += 1
-        self.last[:] = self.n_steps
-        ends = np.full(2, self.n_steps % 2 == 0)
-        infos = {"final_obs": self.last, "final_info": {}} if ends.all() else {}
-        return np.zeros((2, 1), np.float32), np.zeros(2), np.zeros(2, bool), ends, infos
-
-
-def test_last_observations_that_the_environment_reuses_stay_as_they_were():
-    env = GymnasiumVecEnv(ReusesItsLastObservations())
-    env.reset()
-    seen = [env.step(np.zeros((2, 1)))[3] for _ in range(4)]
-    assert [infos[0]["terminal_observation"].item() for infos in seen[1::2]] == [2.0, 4.0]
 
 
 def test_statistics_of_gymnasium_belong_to_the_episode_that_ended(make_env):
@@ -234,7 +203,6 @@ def test_attributes_and_methods_of_single_environments(problems):
     env.set_attr("g", 9.81)
     assert env.get_attr("g") == [9.81] * N_ENVS
     env.reset()
-    assert len(env.env_method("_get_obs", indices=[2])) == 1
     # Of the chosen ones only, and a method is an attribute too
     single_envs = env.env.unwrapped.envs
     for single_env in single_envs:
