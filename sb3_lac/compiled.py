@@ -93,10 +93,11 @@ class CompiledUpdate:
     The update of a model as one graph without breaks, which a GPU replays at one launch (CUDA graph). It is compiled at its
     first call, and again when something has changed that it took for constant.
 
+    :param update: The update, a function of the model and of what else changes from one to the next
     :param device: Device of the model
     """
 
-    def __init__(self, device: th.device) -> None:
+    def __init__(self, update: Callable[..., Metrics], device: th.device) -> None:
         if th.__version__ < _OLDEST_TORCH:
             raise RuntimeError(
                 f"compile_update=True needs torch>={_OLDEST_TORCH}, the first that has gradients within a compiled graph, and "
@@ -105,7 +106,7 @@ class CompiledUpdate:
 
         def run(model: Any, *args: Any) -> Metrics:
             with th.enable_grad():
-                metrics = model._update(*args)
+                metrics = update(model, *args)
             for actor in actors_of(model):
                 for name in _LEFT_BEHIND:
                     if name in vars(actor.action_dist):

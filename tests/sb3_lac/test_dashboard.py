@@ -75,7 +75,7 @@ def test_every_chart_of_a_run_of_lac_has_data_and_common_charts_have_that_of_all
     for charts in CHARTS.values():
         for _, patterns in charts.values():
             for pattern in patterns:
-                found = {name: [tag for tag in runs[name].Tags()["scalars"] if re.match(pattern, tag)] for name in runs}
+                found = {name: [tag for tag in runs[name].Tags()["scalars"] if re.fullmatch(pattern, tag)] for name in runs}
                 # One, so that for instance the chart of lambda has no lambda_loss
                 assert len(found["LAC"]) == 1 and all(len(tags) <= 1 for tags in found.values()), pattern
                 if pattern.startswith(("eval", "rollout", "certificate")):
