@@ -1,4 +1,4 @@
-"""The update of LAC as one compiled graph. What an update is stands in ``lac.py``, here is only how it is compiled."""
+"""Steps of an update, and all of it as one compiled graph. What an update is stands in ``lac.py``."""
 
 import inspect
 from collections.abc import Callable, Iterator, Sequence
@@ -11,8 +11,8 @@ from stable_baselines3.sac.policies import Actor
 
 # The first version that traces gradients within a graph
 _OLDEST_TORCH = "2.11"
-# Of ``torch.compile``. Tests have a quicker one
-_BACKEND = "inductor"
+#: Backend of ``torch.compile``. Tests have a quicker one
+BACKEND = "inductor"
 # What sampling leaves behind in an action distribution. The graphs that it belongs to are gone after an update
 _LEFT_BEHIND = ("distribution", "gaussian_actions", "weights_dist", "exploration_mat", "exploration_matrices", "_latent_sde")
 
@@ -40,7 +40,7 @@ def set_gradients(loss: th.Tensor, optimizer: th.optim.Optimizer) -> None:
 
 
 def set_gradient(parameter: th.Tensor, gradient: th.Tensor) -> None:
-    """"""
+    """Let a parameter have a gradient, for the next step of its optimizer."""
     if th.compiler.is_compiling():
         # A compiled step reads the tensors that it was compiled with
         assert parameter.grad is not None
@@ -50,9 +50,7 @@ def set_gradient(parameter: th.Tensor, gradient: th.Tensor) -> None:
 
 
 def step(optimizer: th.optim.Optimizer) -> None:
-    """
-    :param optimizer: Takes a step with the gradients of its parameters
-    """
+    """Let an optimizer take a step with the gradients of its parameters."""
     if th.compiler.is_compiling():
         # Without the wrappers for hooks and profiler, which no graph goes through
         with th.no_grad():
@@ -63,8 +61,7 @@ def step(optimizer: th.optim.Optimizer) -> None:
 
 def update_multiplier(log_multiplier: th.Tensor, optimizer: th.optim.Optimizer, violation: th.Tensor) -> th.Tensor:
     """
-    Step of a Lagrange multiplier in log space, which grows while its constraint is violated:
-    ``lambda`` with the decrease condition, ``ent_coef`` with the entropy constraint
+    Step of a Lagrange multiplier in log space, which grows while its constraint is violated
     (see https://github.com/rail-berkeley/softlearning/issues/37 for the logarithm).
     """
     violation = violation.detach()
@@ -76,23 +73,14 @@ def update_multiplier(log_multiplier: th.Tensor, optimizer: th.optim.Optimizer, 
 
 
 def actors_of(model: Any) -> list[Actor]:
-    """"""
+    """The actors whose distributions an update changes."""
     return [model.actor] if model.actor_target is None else [model.actor, model.actor_target]
 
 
-def check_torch() -> None:
-    """"""
-    if th.__version__ < _OLDEST_TORCH:
-        raise RuntimeError(
-            f"compile_update=True needs torch>={_OLDEST_TORCH}, and this is torch {th.__version__}: "
-            "older versions cannot have gradients within a compiled graph. Upgrade torch, or use compile_update=False."
-        )
-
-
 def check_compiler(device: th.device) -> None:
-    """"""
+    """Compile something, before a model has collected its first transitions."""
     try:
-        th.compile(th.neg, backend=_BACKEND)(th.zeros(8, device=device))
+        th.compile(th.neg, backend=BACKEND)(th.zeros(8, device=device))
     except Exception as error:
         raise RuntimeError(
             f"compile_update=True needs a working torch.compile, which fails on device={device}: {error}\n"
@@ -105,15 +93,20 @@ class CompiledUpdate:
     The update of a model as one graph without breaks, which a GPU replays at one launch (CUDA graph). It is compiled at its
     first call, and again when something has changed that it took for constant.
 
+    :param update: The update, a function of the model and of what else changes from one to the next
     :param device: Device of the model
     """
 
-    def __init__(self, device: th.device) -> None:
-        check_torch()
+    def __init__(self, update: Callable[..., Metrics], device: th.device) -> None:
+        if th.__version__ < _OLDEST_TORCH:
+            raise RuntimeError(
+                f"compile_update=True needs torch>={_OLDEST_TORCH}, the first that has gradients within a compiled graph, and "
+                f"this is torch {th.__version__}: upgrade it, or use compile_update=False."
+            )
 
         def run(model: Any, *args: Any) -> Metrics:
             with th.enable_grad():
-                metrics = model._update(*args)
+                metrics = update(model, *args)
             for actor in actors_of(model):
                 for name in _LEFT_BEHIND:
                     if name in vars(actor.action_dist):
@@ -124,7 +117,7 @@ class CompiledUpdate:
         run.__code__ = run.__code__.replace()
         self._on_gpu = device.type == "cuda"
         mode = "reduce-overhead" if self._on_gpu else None
-        self._run = th.compile(run, fullgraph=True, dynamic=False, backend=_BACKEND, mode=mode)
+        self._run = th.compile(run, fullgraph=True, dynamic=False, backend=BACKEND, mode=mode)
         # One per group of parameters. A number would be a constant of the graph
         self._learning_rates: list[th.Tensor] = []
 

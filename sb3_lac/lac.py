@@ -249,7 +249,7 @@ class LAC(CostAlgorithm):
         self.log_lambda, self.lambda_optimizer = self._make_multiplier(self.lambda_init, self.lambda_lr_schedule)
 
         if self.compile_update:
-            self._compiled = CompiledUpdate(self.device)
+            self._compiled = CompiledUpdate(type(self)._update, self.device)
 
         self.reward_bound.fill_(self.stated_reward_bound or 0.0)
         self.update_offset(self._vec_normalize_env)

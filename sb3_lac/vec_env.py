@@ -90,13 +90,7 @@ class GymnasiumVecEnv(VecEnv):
         return [None] * self.num_envs if frames is None else list(frames)
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """
-        Attributes of the environments, or of the vector environment if it is not made of single ones.
-
-        :param attr_name: Name of the attribute
-        :param indices: Which environments, all by default
-        :return: One value per environment
-        """
+        """Get an attribute of the environments, or of the vector environment if it is not made of single ones."""
         chosen = self._get_indices(indices)
         if isinstance(self._single_envs, gym.vector.SyncVectorEnv):
             return [self._single_envs.envs[n].get_wrapper_attr(attr_name) for n in chosen]
@@ -108,14 +102,7 @@ class GymnasiumVecEnv(VecEnv):
         return [values[n] for n in chosen]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """
-        Set an attribute of the environments, or of the vector environment if it is not made of single ones.
-
-        :param attr_name: Name of the attribute
-        :param value: Its new value
-        :param indices: Which environments, all by default
-        :raises ValueError: If only some of the environments are meant, but share the attribute
-        """
+        """Set an attribute of the environments, or of the vector environment if it is not made of single ones."""
         chosen = set(self._get_indices(indices))
         if self._single_envs is not None:
             old = self.get_attr(attr_name) if len(chosen) < self.num_envs else [value] * self.num_envs
@@ -133,12 +120,6 @@ class GymnasiumVecEnv(VecEnv):
         """
         Call a method of the environments, also of those that are not chosen where they run in processes of their own, as
         Gymnasium does; if the vector environment is not made of single ones its own method, once.
-
-        :param method_name: Name of the method
-        :param method_args: Its positional arguments
-        :param indices: Which environments, all by default
-        :param method_kwargs: Its keyword arguments
-        :return: One result per environment, or for each of them the result of the one call
         """
         chosen = self._get_indices(indices)
         if isinstance(self._single_envs, gym.vector.SyncVectorEnv):
@@ -158,41 +139,23 @@ class GymnasiumVecEnv(VecEnv):
             raise AttributeError(f"{self._single_envs} has environments without {name!r}.")
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
-        """
-        Whether the environments are wrapped.
-
-        :param wrapper_class: The wrapper
-        :param indices: Which environments, all by default
-        :return: One answer per environment; False where they run in processes of their own, or there are no single ones
-        """
+        """Tell which environments are wrapped; of those in processes of their own none is known to be."""
         envs = getattr(self.env.unwrapped, "envs", None)
         return [envs is not None and is_wrapped(envs[n], wrapper_class) for n in self._get_indices(indices)]
 
 
-def in_processes(env: VecEnv) -> bool:
-    """Whether single environments run in processes of their own, which end if asked for what cannot be pickled."""
-    inner = env.unwrapped
-    if isinstance(inner, GymnasiumVecEnv):
-        return isinstance(inner.env.unwrapped, gym.vector.AsyncVectorEnv)
-    return isinstance(inner, SubprocVecEnv)
-
-
 def env_specs(env: VecEnv) -> list[EnvSpec | None]:
-    """Gymnasium's specifications."""
-    # One that cannot be pickled, as with a lambda as entry point, would end the process of its environment
-    if not in_processes(env):
+    """Gymnasium's specifications, where the environments run in this process."""
+    inner = env.unwrapped
+    in_processes = isinstance(inner, SubprocVecEnv) or (
+        isinstance(inner, GymnasiumVecEnv) and isinstance(inner.env.unwrapped, gym.vector.AsyncVectorEnv)
+    )
+    # A specification that cannot be pickled, as with a lambda as entry point, would end the process of its environment
+    if not in_processes:
         # A vector environment of somebody else may have no attributes
         with suppress(AttributeError, NotImplementedError):
             return env.get_attr("spec")
     return [None] * env.num_envs
-
-
-def time_limits(env: VecEnv) -> list[int | None]:
-    """Gymnasium's time limits."""
-    if in_processes(env):
-        limit = "_max_episode_steps"  # of Gymnasium's wrapper TimeLimit, for there is no specification to ask
-        return env.get_attr(limit) if env.has_attr(limit) else [None] * env.num_envs
-    return [getattr(spec, "max_episode_steps", None) for spec in env_specs(env)]
 
 
 def _unbatched(batch: dict[str, Any], rows: np.ndarray) -> list[dict[str, Any]]:

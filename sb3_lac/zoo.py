@@ -50,15 +50,14 @@ except ImportError as error:
     raise ImportError("sb3_lac.zoo needs the RL Zoo, install it with: pip install 'sb3_lac[zoo]'") from error
 
 from sb3_lac import LAC, DashboardCallback, GymnasiumVecEnv
-from sb3_lac.env_ids import check_env_id
 
 # What a sampler of the RL Zoo returns, and what it gets: see ``HYPERPARAMS_SAMPLER``
 Hyperparams = dict[str, Any]
 
 
-def _sample_common_params(trial: optuna.Trial) -> Hyperparams:
+def _sample(trial: optuna.Trial, own: Hyperparams, additional_args: dict[str, Any]) -> Hyperparams:
     # n_envs, train_freq and gradient_steps stay those of the configuration: they belong together
-    return {
+    sampled_params = {
         # gamma from 0.5 to 0.9999
         "one_minus_gamma": trial.suggest_float("one_minus_gamma", 0.0001, 0.5, log=True),
         # From 2**5=32 to 2**10=1024
@@ -70,7 +69,14 @@ def _sample_common_params(trial: optuna.Trial) -> Hyperparams:
         "tau": trial.suggest_float("tau", 0.001, 0.08, log=True),
         "net_arch": trial.suggest_categorical("net_arch", ["small", "medium", "large"]),
         "activation_fn": trial.suggest_categorical("activation_fn", ["relu", "leaky_relu"]),
+        **own,
     }
+    # Display true values
+    trial.set_user_attr("gamma", 1 - sampled_params["one_minus_gamma"])
+    trial.set_user_attr("batch_size", 2 ** sampled_params["batch_size_pow"])
+    if additional_args["using_her_replay_buffer"]:
+        sampled_params = sample_her_params(trial, sampled_params, additional_args["her_kwargs"])
+    return sampled_params
 
 
 def _sample_entropy_params(trial: optuna.Trial, n_actions: int) -> Hyperparams:
@@ -79,15 +85,6 @@ def _sample_entropy_params(trial: optuna.Trial, n_actions: int) -> Hyperparams:
         # -n_actions is the default of SAC and LAC
         "target_entropy": trial.suggest_float("target_entropy", -5.0 * n_actions, 0.0),
     }
-
-
-def _finish_sample(trial: optuna.Trial, sampled_params: Hyperparams, additional_args: dict[str, Any]) -> Hyperparams:
-    # Display true values
-    trial.set_user_attr("gamma", 1 - sampled_params["one_minus_gamma"])
-    trial.set_user_attr("batch_size", 2 ** sampled_params["batch_size_pow"])
-    if additional_args["using_her_replay_buffer"]:
-        sampled_params = sample_her_params(trial, sampled_params, additional_args["her_kwargs"])
-    return sampled_params
 
 
 def _convert_common_params(sampled_params: Hyperparams) -> Hyperparams:
@@ -133,8 +130,7 @@ def convert_td3_params(sampled_params: Hyperparams) -> Hyperparams:
 
 def sample_lac_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> Hyperparams:
     """Sampler for LAC hyperparams."""
-    sampled_params = {
-        **_sample_common_params(trial),
+    own = {
         **_sample_entropy_params(trial, n_actions),
         "lambda_learning_rate": trial.suggest_float("lambda_learning_rate", 1e-5, 0.002, log=True),
         # Up to 1, from where the decrease condition cannot hold and lambda stays at lambda_max
@@ -143,25 +139,21 @@ def sample_lac_params(trial: optuna.Trial, n_actions: int, n_envs: int, addition
         "lambda_max": trial.suggest_float("lambda_max", 0.1, 10.0, log=True),
         "output_dim": trial.suggest_categorical("output_dim", [8, 16, 32, 64]),
     }
-    return _as_arguments(convert_lac_params(_finish_sample(trial, sampled_params, additional_args)))
+    return _as_arguments(convert_lac_params(_sample(trial, own, additional_args)))
 
 
 def sample_sac_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> Hyperparams:
     """Sampler for SAC hyperparams that reaches as far as that of LAC: the RL Zoo's own has gamma >= 0.97 and no entropy."""
-    sampled_params = {**_sample_common_params(trial), **_sample_entropy_params(trial, n_actions)}
-    return _as_arguments(convert_sac_params(_finish_sample(trial, sampled_params, additional_args)))
+    return _as_arguments(convert_sac_params(_sample(trial, _sample_entropy_params(trial, n_actions), additional_args)))
 
 
 def sample_td3_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> Hyperparams:
     """
     Sampler for TD3 hyperparams that reaches as far as that of LAC: the RL Zoo's own has gamma >= 0.97 and no target noise.
     """
-    sampled_params = {
-        **_sample_common_params(trial),
-        "noise_std": trial.suggest_float("noise_std", 0.01, 0.5, log=True),
-        "target_policy_noise": trial.suggest_float("target_policy_noise", 0.01, 0.5, log=True),
-    }
-    hyperparams = _as_arguments(convert_td3_params(_finish_sample(trial, sampled_params, additional_args)))
+    names = ("noise_std", "target_policy_noise")
+    own = {name: trial.suggest_float(name, 0.01, 0.5, log=True) for name in names}
+    hyperparams = _as_arguments(convert_td3_params(_sample(trial, own, additional_args)))
     # The RL Zoo reads the type of noise from configurations only
     del hyperparams["noise_type"]
     sigma = np.full(n_actions, hyperparams.pop("noise_std"))
@@ -265,62 +257,52 @@ def find_config(algo: str) -> Path:
     )
 
 
-def _run_script(name: str) -> None:
-    runpy.run_module(f"rl_zoo3.{name}", run_name="__main__")
-
-
 def _run_benchmark() -> None:
     # The RL Zoo's calls ``python enjoy.py``, which lies in its own checkout and does not know LAC
     call = subprocess.call
     subprocess.call = lambda command: call([sys.executable, "-m", "sb3_lac.zoo", "enjoy", *command[2:]])  # type: ignore
     try:
-        _run_script("benchmark")
+        runpy.run_module("rl_zoo3.benchmark", run_name="__main__")
     finally:
         subprocess.call = call
 
 
-def _run_plots(name: str) -> None:
-    # Slow to import, and nothing else needs it
-    getattr(import_module("rl_zoo3.plots"), name)()
+_COMMANDS: dict[str, Callable[[], object]] = {
+    "train": lambda: rl_zoo3.train.train(),
+    "optimize": lambda: rl_zoo3.train.train(),
+    "enjoy": lambda: rl_zoo3.enjoy.enjoy(),
+    "record_video": lambda: runpy.run_module("rl_zoo3.record_video", run_name="__main__"),
+    "benchmark": _run_benchmark,
+    # Slow to import, and nothing else needs them
+    "all_plots": lambda: import_module("rl_zoo3.plots").all_plots(),
+    "plot_train": lambda: import_module("rl_zoo3.plots").plot_train(),
+    "plot_from_file": lambda: import_module("rl_zoo3.plots").plot_from_file(),
+}
 
 
 def main(args: Sequence[str] | None = None) -> None:
     """Run a command of the RL Zoo, with LAC and its hyperparameters as default."""
-    commands: dict[str, Callable[[], None]] = {
-        "train": lambda: rl_zoo3.train.train(),
-        "optimize": lambda: rl_zoo3.train.train(),
-        "enjoy": lambda: rl_zoo3.enjoy.enjoy(),
-        "record_video": lambda: _run_script("record_video"),
-        "benchmark": _run_benchmark,
-        "all_plots": lambda: _run_plots("all_plots"),
-        "plot_train": lambda: _run_plots("plot_train"),
-        "plot_from_file": lambda: _run_plots("plot_from_file"),
-    }
     prog = "python -m sb3_lac.zoo"
     parser = argparse.ArgumentParser(prog=prog, description="RL Zoo with LAC")
-    parser.add_argument("command", choices=commands, help="what to do")
+    parser.add_argument("command", choices=_COMMANDS, help="what to do")
     parser.add_argument("options", nargs=argparse.REMAINDER, help="options of the RL Zoo, add --help to see them")
     parsed = parser.parse_args(args)
     trains = parsed.command in ("train", "optimize")
 
-    # Only the options with another default, and the id, are read here, the RL Zoo reads all of them from sys.argv
+    # Only the options with another default are read here, the RL Zoo reads all of them from sys.argv
     options = parsed.options
     if trains or parsed.command in ("enjoy", "record_video"):
         defaults = argparse.ArgumentParser(prog=prog, add_help=False)
         defaults.add_argument("--algo", default="lac")
-        defaults.add_argument("--env")
         if trains:
             defaults.add_argument("-conf", "--conf-file")
         known, options = defaults.parse_known_args(options)
         options += ["--algo", known.algo]
-        try:
-            if known.env is not None:
-                check_env_id(known.env)
-                options = ["--env", known.env, *options]
-            if trains:
+        if trains:
+            try:
                 options += ["--conf-file", known.conf_file or str(find_config(known.algo))]
-        except (gym.error.NameNotFound, FileNotFoundError) as error:
-            parser.error(str(error))
+            except FileNotFoundError as error:
+                parser.error(str(error))
     if parsed.command == "optimize":
         options += ["--optimize-hyperparameters"]
 
@@ -328,7 +310,7 @@ def main(args: Sequence[str] | None = None) -> None:
     HYPERPARAMS_SAMPLER.update(sac=sample_sac_params, td3=sample_td3_params)
     HYPERPARAMS_CONVERTER.update(sac=convert_sac_params, td3=convert_td3_params)
     sys.argv = [f"{prog} {parsed.command}", *options]
-    commands[parsed.command]()
+    _COMMANDS[parsed.command]()
 
 
 if __name__ == "__main__":

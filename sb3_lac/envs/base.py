@@ -23,7 +23,7 @@ def check_not_negative(**values: float) -> None:
 
 
 def _noise_std(name: str, std: float | Sequence[float], n: int) -> np.ndarray | None:
-    """"""
+    """The standard deviation of each of n variables, None if there is no noise."""
     values = np.array(std, dtype=np.float64)
     if values.shape not in ((), (n,)) or not np.all((values >= 0) & (values < np.inf)):
         raise ValueError(f"{name}={std!r} must be a number, or {n} of them, finite and at least 0.")
@@ -112,26 +112,26 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
 
     @abstractmethod
     def _initial_state(self) -> np.ndarray:
-        """"""
+        """Draw the state that an episode starts from."""
 
     @abstractmethod
     def _next_state(self, state: np.ndarray, action: np.ndarray, push: float) -> np.ndarray:
-        """"""
+        """Move on by one step, with an action within its limits, and the push of an impulse if there is one."""
 
     @abstractmethod
     def _cost(self, state: np.ndarray, action: np.ndarray, next_state: np.ndarray) -> tuple[float, bool]:
-        """"""
+        """The cost of a transition, and whether it ends the episode."""
 
     @abstractmethod
     def _error(self) -> float:
-        """"""
+        """The distance of the present state to the goal."""
 
     def _limited(self, state: np.ndarray) -> np.ndarray:
-        """"""
+        """The nearest state within the limits."""
         return np.minimum(np.maximum(state, self.state_low), self.state_high)
 
     def _observation(self) -> np.ndarray:
-        """"""
+        """What can be seen of the present state, without noise."""
         return np.asarray(self.state, dtype=np.float32)
 
     def _noisy_observation(self) -> np.ndarray:
@@ -144,11 +144,7 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
         return np.clip(observation + noise, space.low, space.high).astype(np.float32)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
-        """
-        :param seed: Seed of all that is random from here on
-        :param options: ``{"state": ...}`` to start from a given state
-        :return: Observation, and ``info`` with ``"error"``
-        """
+        """Start an episode, with ``options={"state": ...}`` from a given state; ``info`` holds its ``"error"``."""
         super().reset(seed=seed)
         start = self._initial_state()
         if options is not None and "state" in options:
@@ -165,10 +161,7 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
         return self._noisy_observation(), {"error": self._error()}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """
-        :param action: Action in [-1, 1]
-        :return: Observation, reward (minus the cost), whether the episode terminates, False, and ``info``
-        """
+        """Move on by one step; ``info`` holds ``"cost"``, minus the reward, and ``"error"``."""
         if self.state is None:
             raise gym.error.ResetNeeded("Call reset() before step().")
         action = np.asarray(action, dtype=np.float64)
@@ -193,11 +186,7 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
         return self._noisy_observation(), -cost, terminated, False, {"cost": cost, "error": self._error()}
 
     def render(self) -> np.ndarray | None:
-        """
-        Draw the states and the costs of the episode so far.
-
-        :return: Picture of shape (height, width, 3), or None without a render mode
-        """
+        """Draw the states and the costs of the episode so far: a picture of shape (height, width, 3)."""
         if self.render_mode is None:
             return None
         if self.state is None:

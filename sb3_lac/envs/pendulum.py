@@ -94,12 +94,7 @@ class PendulumCostEnv(CostEnv):
         torque_max_Nm: float = 3.0,
         **options: Any,
     ) -> None:
-        parameters = {
-            "mass_kg": mass_kg,
-            "length_m": length_m,
-            "damping_Nms": damping_Nms,
-            "torque_max_Nm": torque_max_Nm,
-        }
+        parameters = dict(mass_kg=mass_kg, length_m=length_m, damping_Nms=damping_Nms, torque_max_Nm=torque_max_Nm)
         state_high = np.array([math.pi, self.SPEED_MAX_RAD_S])
         observation_high = np.array([1.0, 1.0, self.SPEED_MAX_RAD_S], dtype=np.float32)
         observation_space = spaces.Box(-observation_high, observation_high)

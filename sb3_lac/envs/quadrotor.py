@@ -104,12 +104,7 @@ class QuadrotorCostEnv(CostEnv):
         rotor_force_max_N: float = 9.81,
         **options: Any,
     ) -> None:
-        parameters = {
-            "mass_kg": mass_kg,
-            "inertia_kg_m2": inertia_kg_m2,
-            "arm_m": arm_m,
-            "rotor_force_max_N": rotor_force_max_N,
-        }
+        parameters = dict(mass_kg=mass_kg, inertia_kg_m2=inertia_kg_m2, arm_m=arm_m, rotor_force_max_N=rotor_force_max_N)
         position = 2 * self.POSITION_MAX_M
         state_high = np.array([position, position, math.pi, 20.0, 20.0, 50.0])
         # The float32 nearest to pi is above it

@@ -54,7 +54,7 @@ class ReferenceController(ABC):
 
     @abstractmethod
     def _actions(self, observations: np.ndarray) -> np.ndarray:
-        """"""
+        """The actions for a batch of observations, not yet limited."""
 
     def predict(
         self,

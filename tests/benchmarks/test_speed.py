@@ -24,7 +24,7 @@ def small(monkeypatch):
         monkeypatch.setattr(performance, name, value)
     for name, values in {"_CELLS": (1, 2), "_BATCH_SIZES": (8, 16), "_WIDTHS": (4, 8)}.items():
         monkeypatch.setattr(performance, name, values)
-    monkeypatch.setattr(compiled, "_BACKEND", "eager")
+    monkeypatch.setattr(compiled, "BACKEND", "eager")
     yield
     th.set_num_threads(threads)
 

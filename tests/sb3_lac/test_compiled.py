@@ -10,7 +10,7 @@ import torch as th
 import torch._dynamo as dynamo
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.envs import BitFlippingEnv
-from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.utils import ConstantSchedule, LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from torch._dynamo.backends.common import aot_autograd
 from torch._functorch.aot_autograd import make_boxed_func
@@ -22,7 +22,7 @@ from sb3_lac import LAC, compiled
 @pytest.fixture(autouse=True)
 def _quick_backend(monkeypatch):
     """The graph as it was traced, without minutes for making code of it."""
-    monkeypatch.setattr(compiled, "_BACKEND", "eager")
+    monkeypatch.setattr(compiled, "BACKEND", "eager")
     yield
     th.compiler.reset()
 
@@ -32,10 +32,15 @@ def trained(model, calls=3, gradient_steps=2):
     np.random.seed(0)
     th.manual_seed(0)
     logged = []
+    schedules = model.lr_schedule, model.lambda_lr_schedule
     for call in range(calls):
-        model._update_current_progress_remaining(call, calls)
+        # As far as the training is, for the schedules
+        model.lr_schedule, model.lambda_lr_schedule = (
+            ConstantSchedule(schedule(1.0 - call / calls)) for schedule in schedules
+        )
         model.train(gradient_steps, model.batch_size)
         logged.append(dict(model.logger.name_to_value))
+    model.lr_schedule, model.lambda_lr_schedule = schedules
     return model, logged
 
 
@@ -99,7 +104,7 @@ def test_graph_is_one_that_a_gpu_can_replay(make_model, monkeypatch):
         return make_boxed_func(graph.forward)
 
     backend = aot_autograd(fw_compiler=compiler, keep_inference_input_mutations=True)
-    monkeypatch.setattr(compiled, "_BACKEND", backend)
+    monkeypatch.setattr(compiled, "BACKEND", backend)
     model = make_model(compile_update=True, use_sde=True, published_update=True)
     graphs.clear()
     trained(model, calls=2)
@@ -116,12 +121,6 @@ def test_graph_is_one_that_a_gpu_can_replay(make_model, monkeypatch):
     assert len(inputs) - len(static) == 6
     assert len(graph.find_nodes(op="output")[0].args[0]) == 1
     assert not graph.find_nodes(op="call_function", target=th.ops.aten._local_scalar_dense.default)
-
-
-def test_every_model_may_be_compiled(make_model):
-    with dynamo.config.patch(recompile_limit=1):
-        for _ in range(2):
-            trained(make_model(compile_update=True), calls=1)
 
 
 def test_training_leaves_optimizers_and_exploration_as_they_were(make_model):
@@ -165,21 +164,9 @@ def test_any_replay_buffer_and_vec_normalize(make_model, n_updates):
     assert n_updates(model) == 6 and th.isfinite(model.log_lambda).all()
 
 
-def test_transitions_for_a_gpu_are_sampled_into_pinned_memory(make_model, monkeypatch):
-    model = make_model(compile_update=True)
-    pinned = []
-    monkeypatch.setattr(th.Tensor, "pin_memory", lambda tensor: pinned.append(tensor) or tensor)
-    model._compiled._on_gpu = True
-    eager, _ = trained(make_model(), calls=1)
-    trained(model, calls=1)
-    assert len(pinned) == 2 * 5
-    assert "to_torch" not in vars(model.replay_buffer)
-    assert_close(model, eager)
-
-
 def test_old_torch_is_refused(make_model, monkeypatch):
     monkeypatch.setattr(th, "__version__", TorchVersion("2.10.1+cpu"))
-    with pytest.raises(RuntimeError, match=r"needs torch>=2.11, and this is torch 2.10.1\+cpu"):
+    with pytest.raises(RuntimeError, match=r"needs torch>=2.11, .* this is torch 2.10.1\+cpu"):
         make_model(compile_update=True)
 
 
@@ -188,7 +175,7 @@ def test_missing_compiler_is_noticed_before_the_first_step(make_model, monkeypat
         raise OSError("no compiler here")
 
     model = make_model(n_collect=0, compile_update=True)
-    monkeypatch.setattr(compiled, "_BACKEND", no_compiler)
+    monkeypatch.setattr(compiled, "BACKEND", no_compiler)
     with pytest.raises(RuntimeError, match=r"fails on device=cpu: (.|\n)*no compiler here(.|\n)*compile_update=False"):
         model.learn(10)
     assert model.num_timesteps == 0
@@ -198,7 +185,7 @@ def test_missing_compiler_is_noticed_before_the_first_step(make_model, monkeypat
 @pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")
 def test_compiled_code_makes_the_same_updates(make_model, monkeypatch):
     kwargs = {"policy_kwargs": {"net_arch": [4], "optimizer_class": th.optim.SGD}}
-    monkeypatch.setattr(compiled, "_BACKEND", "inductor")
+    monkeypatch.setattr(compiled, "BACKEND", "inductor")
     eager, _ = trained(make_model(**kwargs))
     # Otherwise compiled code has random numbers of its own
     with th._inductor.config.patch(fallback_random=True):
@@ -208,7 +195,7 @@ def test_compiled_code_makes_the_same_updates(make_model, monkeypatch):
 
 @pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
 def test_updates_do_not_wait_for_the_gpu(make_model, monkeypatch):
-    monkeypatch.setattr(compiled, "_BACKEND", "inductor")
+    monkeypatch.setattr(compiled, "BACKEND", "inductor")
     model, _ = trained(make_model(compile_update=True, device="cuda"))
     sample, record = model.replay_buffer.sample, model.logger.record
 

@@ -1,13 +1,6 @@
-"""TensorBoard shows the runs of a folder as one comparison: what it serves is read back over HTTP."""
+"""TensorBoard shows the runs of a folder as one comparison: what it would show is read from their files."""
 
-import json
 import re
-import subprocess
-import sys
-import time
-import urllib.error
-import urllib.parse
-import urllib.request
 
 import gymnasium as gym
 import numpy as np
@@ -20,14 +13,13 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.utils import ConstantSchedule
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.custom_scalar.layout_pb2 import Layout
+from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 from torch import nn
 
 from sb3_lac import LAC, CertificateCallback, DashboardCallback, LyapunovCallback
 from sb3_lac.dashboard import CHARTS, hyperparameters_of
 
-READY_WITHIN_S = 120
-RUNS = ["LAC_1", "SAC_1", "TD3_1"]
-STEPS = 24
 CALIBRATION = {"Calibration": {"MAPE (%)": ["Multiline", ["calibration/mape_percent$"]]}}
 OPTIONS = {"learning_starts": 8, "batch_size": 4, "buffer_size": 100, "seed": 0, "device": "cpu"}
 
@@ -42,7 +34,7 @@ def make_model(algorithm, **options):
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
-    """A folder with a run of each algorithm."""
+    """What TensorBoard reads of a run of each algorithm."""
     folder = tmp_path_factory.mktemp("runs")
     for algorithm in (TD3, SAC, LAC):
         model = make_model(algorithm, tensorboard_log=str(folder))
@@ -53,155 +45,54 @@ def runs(tmp_path_factory):
         ]
         if algorithm is LAC:
             callbacks.append(LyapunovCallback(make_env(), n_eval_episodes=2, eval_freq=12, verbose=0))
-        model.learn(STEPS, callback=callbacks, log_interval=1)
+        model.learn(24, callback=callbacks, log_interval=1)
         model.logger.close()
-    return folder
+    return {name: EventAccumulator(str(folder / f"{name}_1")).Reload() for name in ("LAC", "SAC", "TD3")}
 
 
-class TensorBoard:
-    """
-    A server in a process of its own, on a port that it chooses.
-
-    :param runs: what it shows
-    :param log: where it says what it does
-    """
-
-    def __init__(self, runs, log):
-        self.log = log
-        options = ["--logdir", str(runs), "--port", "0", "--host", "127.0.0.1", "--load_fast", "false"]
-        with log.open("w") as output:
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "tensorboard.main", *options], stdout=subprocess.DEVNULL, stderr=output
-            )
-        # not through a proxy
-        self.opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
-
-    def wait_until(self, ready):
-        """What ``ready`` returns, as soon as that is true."""
-        end = time.monotonic() + READY_WITHIN_S
-        while not (found := ready()):
-            assert self.process.poll() is None, f"TensorBoard ended: {self.log.read_text()}"
-            assert time.monotonic() < end, f"TensorBoard is not ready: {self.log.read_text()}"
-            time.sleep(0.1)
-        return found
-
-    def start(self):
-        """Wait until it has read all runs, each of which ends with the end of an episode."""
-        self.url = self.wait_until(lambda: re.search(r"http://127\.0\.0\.1:\d+/", self.log.read_text())).group() + "data"
-        self.wait_until(lambda: [self.last(run, "rollout/ep_rew_mean")[1] for run in RUNS] == [STEPS] * 3)
-        return self
-
-    def last(self, run, tag):
-        """Value and step of the last entry, if any."""
-        scalars = self.get("plugin/custom_scalars/scalars", run=run, tag=f"{tag}$")["tag_to_events"]
-        return (scalars[tag][-1][2], scalars[tag][-1][1]) if scalars else (None, None)
-
-    def get(self, route, body=None, **query):
-        data = None if body is None else json.dumps(body).encode()
-        headers = {"Content-Type": "application/json"}
-        request = urllib.request.Request(f"{self.url}/{route}?{urllib.parse.urlencode(query)}", data, headers)
-        try:
-            with self.opener.open(request, timeout=READY_WITHIN_S) as answer:
-                return json.load(answer)
-        except urllib.error.HTTPError as error:
-            raise AssertionError(f"{request.full_url}: {error.code}, {error.read().decode()}") from error
-
-    def stop(self):
-        self.process.kill()
-        self.process.wait()
-
-
-@pytest.fixture(scope="module")
-def tensorboard(runs, tmp_path_factory):
-    server = TensorBoard(runs, tmp_path_factory.mktemp("server") / "log.txt")
-    try:
-        yield server.start()
-    finally:
-        server.stop()
-
-
-def test_every_tab_has_the_runs(tensorboard):
-    assert sorted(tensorboard.get("runs")) == RUNS
-    active = tensorboard.get("plugins_listing")
-    assert all(active[tab]["enabled"] for tab in ("custom_scalars", "hparams", "scalars", "images"))
-    tags = {run: set(tags) for run, tags in tensorboard.get("plugin/scalars/tags").items()}
+def test_every_run_has_its_scalars_and_images(runs):
     common = {"rollout/ep_rew_mean", "rollout/ep_len_mean", "rollout/cost_mean", "eval/mean_reward", "eval/mean_ep_length"}
-    assert all(common <= tags[run] for run in tags)
-    assert {"lyapunov/decrease", "lyapunov/decrease_low", "lyapunov/decrease_high", "train/lambda"} <= tags["LAC_1"]
-    images = tensorboard.get("plugin/images/tags")
     certificates = {"certificate/drift", "certificate/statements"}
-    of_lac = {run for run in RUNS if run.startswith("LAC")}
-    expected = {run: certificates | ({"lyapunov/report"} if run in of_lac else set()) for run in RUNS}
-    assert {run: set(tags) for run, tags in images.items()} == expected
+    for name, events in runs.items():
+        assert common <= set(events.Tags()["scalars"])
+        assert set(events.Tags()["images"]) == certificates | ({"lyapunov/report"} if name == "LAC" else set())
 
 
-def test_the_layout_is_that_of_the_callback_and_has_all_runs_in_one_chart(tensorboard):
-    layout = {
-        category["title"]: {chart["title"]: chart for chart in category["chart"]}
-        for category in tensorboard.get("plugin/custom_scalars/layout")["category"]
-    }
-    # not one for each run
-    assert {title: list(charts) for title, charts in layout.items()} == {
-        title: list(charts) for title, charts in {**CALIBRATION, **CHARTS}.items()
-    }
-    assert layout["Calibration"]["MAPE (%)"]["multiline"]["tag"] == ["calibration/mape_percent$"]
-    (margin,) = layout["Lyapunov"]["decrease along roll-outs"]["margin"]["series"]
-    assert margin == {f: f"lyapunov/decrease{s}" for f, s in (("value", ""), ("lower", "_low"), ("upper", "_high"))}
-
-    def shown(category, title):
-        (tag,) = layout[category][title]["multiline"]["tag"]
-        answers = {run: tensorboard.get("plugin/custom_scalars/scalars", run=run, tag=tag) for run in RUNS}
-        return {run: set(answer["tag_to_events"]) for run, answer in answers.items() if answer["tag_to_events"]}
-
-    for title, tag in (
-        ("return of an evaluation", "eval/mean_reward"),
-        ("cost per step of the training", "rollout/cost_mean"),
-    ):
-        assert shown("Returns and costs", title) == {run: {tag} for run in RUNS}
-    # and not lambda_loss
-    assert shown("Lyapunov", "lambda") == {"LAC_1": {"train/lambda"}}
-    assert shown("Certificates of any algorithm", "mean cost settles below") == {
-        run: {"certificate/cost_bound"} for run in RUNS
-    }
-    assert shown("Updates", "entropy coefficient") == {run: {"train/ent_coef"} for run in ("LAC_1", "SAC_1")}
+def test_the_layout_is_that_of_the_callback(runs):
+    for events in runs.values():
+        (event,) = events.Tensors("custom_scalars__config__")
+        layout = Layout.FromString(event.tensor_proto.string_val[0])
+        charts = {category.title: {chart.title: chart for chart in category.chart} for category in layout.category}
+        assert {title: list(of_category) for title, of_category in charts.items()} == {
+            title: list(of_category) for title, of_category in {**CALIBRATION, **CHARTS}.items()
+        }
+        assert charts["Calibration"]["MAPE (%)"].multiline.tag == ["calibration/mape_percent$"]
+        (margin,) = charts["Lyapunov"]["decrease along roll-outs"].margin.series
+        assert (margin.value, margin.lower) == ("lyapunov/decrease", "lyapunov/decrease_low")
 
 
-def test_every_chart_of_a_run_of_lac_has_data(runs):
-    events = EventAccumulator(str(runs / "LAC_1"))
-    events.Reload()
-    tags = events.Tags()["scalars"]
+def test_every_chart_of_a_run_of_lac_has_data_and_common_charts_have_that_of_all(runs):
     for charts in CHARTS.values():
         for _, patterns in charts.values():
             for pattern in patterns:
-                assert len([tag for tag in tags if re.fullmatch(pattern, tag)]) == 1, pattern
+                found = {name: [tag for tag in runs[name].Tags()["scalars"] if re.fullmatch(pattern, tag)] for name in runs}
+                # One, so that for instance the chart of lambda has no lambda_loss
+                assert len(found["LAC"]) == 1 and all(len(tags) <= 1 for tags in found.values()), pattern
+                if pattern.startswith(("eval", "rollout", "certificate")):
+                    assert found["SAC"] == found["TD3"] == found["LAC"]
 
 
-def test_the_table_has_the_hyperparameters_of_all_algorithms_beside_the_last_values(tensorboard):
-    experiment = tensorboard.get("plugin/hparams/experiment", {"experimentName": ""})
-    columns = {info["name"] for info in experiment["hparamInfos"]}
-    # of all, of LAC, of SAC and LAC, of TD3
-    assert {"algorithm", "gamma", "env", "n_envs", "net_arch", "seed", "train_freq"} <= columns
-    assert {"alpha3", "ent_coef", "target_policy_noise"} <= columns
-    assert not columns & {"device", "verbose", "tensorboard_log", "env_", "policy"}
-    statuses = ["STATUS_UNKNOWN", "STATUS_SUCCESS", "STATUS_FAILURE", "STATUS_RUNNING"]
-    wanted = {"experimentName": "", "allowedStatuses": statuses, "startIndex": 0, "sliceSize": 10}
-    groups = tensorboard.get("plugin/hparams/session_groups", {**wanted, "colParams": column_parameters(experiment)})
-    rows = {group["hparams"]["algorithm"]: group for group in groups["sessionGroups"]}
-    assert set(rows) == {"LAC", "SAC", "TD3"}
-    assert rows["LAC"]["hparams"]["alpha3"] == 1.0 and "alpha3" not in rows["TD3"]["hparams"]
-    assert rows["TD3"]["hparams"]["target_policy_noise"] == 0.2
-    assert rows["SAC"]["hparams"]["net_arch"] == "[4]" and rows["SAC"]["hparams"]["own"] == "[1, 2]"
-    for algorithm, row in rows.items():
-        last, _ = tensorboard.last(f"{algorithm}_1", "eval/mean_reward")
-        values = {metric["name"]["tag"]: metric["value"] for metric in row["metricValues"]}
-        assert values["eval/mean_reward"] == pytest.approx(last) and values["eval/mean_reward"] < 0
-
-
-def column_parameters(experiment):
-    """All columns, as the page asks for them."""
-    return [{"hparam": info["name"]} for info in experiment["hparamInfos"]] + [
-        {"metric": info["name"]} for info in experiment["metricInfos"]
-    ]
+def test_the_table_has_the_hyperparameters_of_all_algorithms(runs):
+    rows = {}
+    for name, events in runs.items():
+        content = events.SummaryMetadata("_hparams_/session_start_info").plugin_data.content
+        rows[name] = HParamsPluginData.FromString(content).session_start_info.hparams
+    for name, row in rows.items():
+        assert {"algorithm", "gamma", "env", "n_envs", "net_arch", "seed", "train_freq"} <= set(row)
+        assert not set(row) & {"device", "verbose", "tensorboard_log", "env_", "policy"}
+        assert row["algorithm"].string_value == name and row["own"].string_value == "[1, 2]"
+    assert rows["LAC"]["alpha3"].number_value == 1.0 and "alpha3" not in rows["TD3"]
+    assert rows["TD3"]["target_policy_noise"].number_value == 0.2 and rows["SAC"]["net_arch"].string_value == "[4]"
 
 
 @pytest.mark.parametrize("algorithm", [LAC, SAC])
@@ -226,8 +117,7 @@ def test_cost_is_that_of_the_environment(tmp_path):
             return super()._on_step()
 
     make_model(SAC, tensorboard_log=str(tmp_path)).learn(16, callback=Collect(), log_interval=1)
-    events = EventAccumulator(str(tmp_path / "SAC_1"))
-    events.Reload()
+    events = EventAccumulator(str(tmp_path / "SAC_1")).Reload()
     logged = [event.value for event in events.Scalars("rollout/cost_mean")]
     np.testing.assert_allclose(logged, [np.mean(costs[:8]), np.mean(costs[8:])], rtol=1e-6)
 
@@ -239,10 +129,8 @@ def test_an_environment_without_costs_has_no_entry_for_them(tmp_path):
 
 
 def test_algorithms_without_infos_train_too(tmp_path):
-    model = ARS("LinearPolicy", make_env(), n_delta=1, tensorboard_log=str(tmp_path), device="cpu").learn(
-        16, callback=DashboardCallback()
-    )
-    model.logger.close()
+    model = ARS("LinearPolicy", make_env(), n_delta=1, tensorboard_log=str(tmp_path), device="cpu")
+    model.learn(16, callback=DashboardCallback()).logger.close()
     assert "custom_scalars__config__" in EventAccumulator(str(tmp_path / "ARS_1")).Reload().Tags()["tensors"]
 
 

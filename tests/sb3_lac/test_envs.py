@@ -43,16 +43,6 @@ def test_both_checkers_find_nothing(env_id):
         check_gymnasium_env(gym.make(env_id, render_mode="rgb_array").unwrapped)
 
 
-@pytest.mark.parametrize("env_id", IDS)
-def test_reward_is_minus_the_cost(env_id):
-    env = gym.make(env_id)
-    env.reset(seed=0)
-    env.action_space.seed(0)
-    for _ in range(20):
-        _, reward, _, _, info = env.step(env.action_space.sample())
-        assert reward == -info["cost"] <= 0
-
-
 # A car without steering leaves its road
 @pytest.mark.parametrize("env_id", [env_id for env_id in IDS if env_id != "VehicleCost-v0"])
 def test_episode_ends_by_time_limit(env_id):
@@ -87,9 +77,9 @@ def test_observations_stay_in_their_space_whatever_the_actions(make, seed, scale
     env.reset(seed=seed)
     rng = np.random.default_rng(seed)
     for _ in range(30):
-        observation, reward, terminated, _, _ = env.step(scale * rng.standard_normal(env.action_space.shape))
+        observation, reward, terminated, _, info = env.step(scale * rng.standard_normal(env.action_space.shape))
         assert env.observation_space.contains(observation)
-        assert np.isfinite(reward)
+        assert -np.inf < reward == -info["cost"] <= 0
         if terminated:
             break
 
@@ -119,17 +109,6 @@ def test_cart_pole_costs():
         assert terminated and reward == -100.0
 
 
-def test_impulses_come_at_their_interval_in_both_directions():
-    pushed = CartPoleCostEnv(impulse_N=100.0, impulse_interval=3)
-    jumps = []
-    for seed in range(12):
-        pushed.reset(seed=seed, options={"state": np.zeros(4)})
-        velocities = [pushed.step(np.zeros(1))[0][1] for _ in range(3)]
-        assert velocities[:2] == [0.0, 0.0]
-        jumps.append(velocities[2])
-    assert min(jumps) == -max(jumps) < -1.0
-
-
 def test_oscillator_follows_its_equations():
     env = OscillatorEnv()
     start = np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
@@ -141,19 +120,6 @@ def test_oscillator_follows_its_equations():
     references = [8 + 7 * np.sin(2 * np.pi * t / 200) for t in (1, 2)]
     np.testing.assert_allclose(observation, [*messengers, *proteins, *references], rtol=1e-6)
     assert info["cost"] == pytest.approx((proteins[0] - references[0]) ** 2)
-
-
-def test_oscillator_of_equal_species_rests_where_making_and_decay_balance():
-    env = OscillatorEnv()
-    # With equal species; others would oscillate around that
-    observation, _ = env.reset(options={"state": [1.0, 1.0, 1.0, 2.0, 2.0, 2.0]})
-    for _ in range(3000):
-        observation, *_ = env.step(-np.ones(3))
-    messengers, proteins = observation[:3], observation[3:6]
-    # p solves p = (translation / protein_decay) * (1 / messenger_decay) * 1.6 / (1 + p^2)
-    p = np.roots([1.0, 0.0, 1.0, -0.16 / 0.06 * 1.6 / 0.16]).real[-1]
-    np.testing.assert_allclose(proteins, p, rtol=1e-4)
-    np.testing.assert_allclose(messengers, 0.06 / 0.16 * p, rtol=1e-4)
 
 
 def after_one_step(env, state, action):
@@ -191,23 +157,6 @@ def test_pendulum_goes_round_and_its_speed_ends_at_that_of_the_motor():
     state = after_one_step(env, [3.1, 4.0], [0.0])
     assert -np.pi <= state[0] < -2.9
     assert after_one_step(env, [-2.0, -11.99], [-1.0])[1] == -12.0
-
-
-def test_pendulum_cannot_be_lifted_by_its_motor_at_once():
-    env = PendulumCostEnv()
-    env.reset(options={"state": [np.pi, 0.0]})
-    angles = [env.step(np.ones(1))[4]["error"] for _ in range(200)]
-    assert min(angles) > np.pi / 2
-
-
-def test_quadrotor_falls_and_hovers():
-    env = QuadrotorCostEnv()
-    env.reset(options={"state": [0.0, 1.0, 0.3, 0.5, 0.0, 0.2]})
-    for _ in range(20):
-        env.step(-np.ones(2))
-    expected = [0.5 * 0.4, 1.0 - 0.5 * 9.81 * 0.4**2, 0.3 + 0.2 * 0.4, 0.5, -9.81 * 0.4, 0.2]
-    np.testing.assert_allclose(env.state, expected, rtol=1e-9)
-    np.testing.assert_allclose(after_one_step(env, [0.3, -0.4, 0.0, 0.0, 0.0, 0.0], [0.0, 0.0])[:2], [0.3, -0.4])
 
 
 def test_work_of_the_rotors_is_the_energy_of_the_quadrotor():
@@ -286,21 +235,14 @@ def test_the_observed_path_tells_the_place_on_it():
 
 
 @pytest.mark.parametrize(
-    ("env", "limits", "leaving"),
+    ("env", "leaving"),
     [
-        (QuadrotorCostEnv(), [1.5, 1.5, np.pi / 2, 0, 0, 0], [([1.49, 0, 0, 5, 0, 0]), ([0, 0, 1.56, 0, 0, 5])]),
-        (VehicleCostEnv(), [2.0, 0.9, 0.1, 0, 0.2, 0], [([1.99, 0.5, 0, 0, 0, 0]), ([0, 0.99, 0, 1, 0, 0])]),
+        (QuadrotorCostEnv(), [([1.49, 0, 0, 5, 0, 0]), ([0, 0, 1.56, 0, 0, 5])]),
+        (VehicleCostEnv(), [([1.99, 0.5, 0, 0, 0, 0]), ([0, 0.99, 0, 1, 0, 0])]),
     ],
     ids=["quadrotor", "vehicle"],
 )
-def test_leaving_costs_as_much_as_a_whole_episode_at_worst(env, limits, leaving):
-    rng = np.random.default_rng(0)
-    costs = []
-    for _ in range(500):
-        state = np.array(limits) * rng.choice([-1.0, 0.0, 1.0], len(limits))
-        costs.append(env._cost(state, rng.choice([-1.0, 1.0], env.action_space.shape), state))
-    assert not any(terminated for _, terminated in costs)
-    assert 0.9 < max(cost for cost, _ in costs) <= 1.0
+def test_leaving_costs_as_much_as_a_whole_episode_at_worst(env, leaving):
     for state in leaving:
         env.reset(options={"state": state})
         _, reward, terminated, _, _ = env.step(np.zeros(env.action_space.shape))
@@ -480,12 +422,6 @@ def test_largest_feasible_alpha3_is_that_of_roll_outs():
     assert env.largest_feasible_alpha3(gain, GAMMA) == pytest.approx(expected, rel=0.05)
 
 
-def test_without_noise_and_discount_all_of_the_cost_is_decrease():
-    env = LinearCostEnv(noise_std=0.0)
-    gamma = 1 - 1e-9
-    assert env.largest_feasible_alpha3(env.optimal_gain(gamma), gamma, n_steps=400) == pytest.approx(1.0, abs=1e-5)
-
-
 def test_value_of_a_gain_that_does_not_stabilise_is_refused():
     env = LinearCostEnv()
     with pytest.raises(ValueError, match="spectral radius"):
@@ -496,21 +432,17 @@ def test_value_of_a_gain_that_does_not_stabilise_is_refused():
     ("make", "kwargs", "message"),
     [
         (CartPoleCostEnv, {"cart_mass_kg": 0.0}, "cart_mass_kg=0.0 must be positive"),
-        (CartPoleCostEnv, {"pole_half_length_m": np.nan}, "pole_half_length_m=nan must be positive"),
-        (CartPoleCostEnv, {"impulse_N": -1.0}, "impulse_N=-1.0 must be finite and at least 0"),
         (OscillatorEnv, {"light": np.inf}, "light=inf must be positive and finite"),
         (OscillatorEnv, {"process_noise": -1.0}, "process_noise=-1.0 must be a number, or 6 of them, finite and at least 0"),
         (OscillatorEnv, {"observation_noise": [0.1] * 6}, "must be a number, or 8 of them"),
         (PendulumCostEnv, {"damping_Nms": -0.1}, "damping_Nms=-0.1 must be finite and at least 0"),
         (PendulumCostEnv, {"changed_parameters": {"length_m": 0.0}}, "length_m=0.0 must be positive"),
         (PendulumCostEnv, {"changed_parameters": {"length": 2.0}}, r"has \['length'\], which are none of \['damping_Nms', "),
-        (QuadrotorCostEnv, {"action_delay": -1}, "action_delay=-1 must be finite and at least 0"),
         (QuadrotorCostEnv, {"action_delay": 0.5}, "action_delay=0.5 must be a whole number"),
         (QuadrotorCostEnv, {"impulse_interval": 2.5}, "impulse_interval=2.5 must be a whole number"),
         (VehicleCostEnv, {"steering_max_rad": 1.5}, "steering_max_rad=1.5 must be at most 1"),
         (CartPoleCostEnv, {"impulse_N": 1.0, "impulse": 2.0}, "are the same: give one of them"),
         (LinearCostEnv, {"noise_std": np.nan}, "noise_std=nan must be finite and at least 0"),
-        (LinearCostEnv, {"control_max": 0.0}, "control_max=0.0 must be positive"),
         (LinearCostEnv, {"render_mode": "human"}, "render_mode='human' must be one of"),
     ],
 )

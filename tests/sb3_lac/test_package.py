@@ -2,7 +2,6 @@ import importlib
 import sys
 from pathlib import Path
 
-import gymnasium as gym
 import pytest
 
 import sb3_lac
@@ -51,28 +50,6 @@ def test_version_and_type_marker_are_shipped():
 def test_battery_env_is_optional(monkeypatch, reload_package):
     monkeypatch.setitem(sys.modules, "battery_env", None)
     assert reload_package().LAC is sb3_lac.LAC
-
-
-@pytest.mark.parametrize("env_id", ["BatteryQmax-v0", "battery_env:BatteryRo-v0"])
-def test_ids_of_batteries_say_what_to_install(monkeypatch, env_id):
-    monkeypatch.setitem(sys.modules, "battery_env", None)
-    monkeypatch.delitem(gym.registry, env_id, raising=False)
-    with pytest.raises(gym.error.NameNotFound, match=rf"'{env_id}'.*pip install ./battery_env"):
-        sb3_lac.LAC("MlpPolicy", env_id)
-
-
-def test_a_folder_without_code_is_no_battery_env(monkeypatch, tmp_path):
-    (tmp_path / "battery_env").mkdir()
-    monkeypatch.setattr(sys, "path", [str(tmp_path)])
-    monkeypatch.delitem(sys.modules, "battery_env")
-    monkeypatch.delitem(gym.registry, "BatteryRo-v0")
-    with pytest.raises(gym.error.NameNotFound, match=r"pip install ./battery_env"):
-        sb3_lac.LAC("MlpPolicy", "BatteryRo-v0")
-
-
-def test_other_missing_ids_are_refused_by_gymnasium():
-    with pytest.raises(gym.error.NameNotFound, match="Did you mean: `BatteryQmax`"):
-        sb3_lac.LAC("MlpPolicy", "BatteryQmx-v0")
 
 
 def test_broken_battery_env_is_not_hidden(monkeypatch, reload_package, tmp_path):
