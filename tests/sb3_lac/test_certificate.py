@@ -14,11 +14,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 from scipy.stats import binom
-from stable_baselines3 import DQN, PPO, SAC
+from stable_baselines3 import DQN, SAC
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.logger import Logger, configure
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecMonitor, VecNormalize
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor, VecNormalize
 
 from benchmarks.controllers import ScaledController
 from sb3_lac import (
@@ -76,7 +75,7 @@ def test_function_of_the_optimal_loop_is_the_exact_one(optimal, linear_env):
     assert average_cost * 0.8 < report.metrics["cost_bound"].value < average_cost * 1.5
     assert report.metrics["calibration_slope"].value == pytest.approx(1.0, abs=0.05)
     assert report.metrics["death_rate"].value == 0
-    statements = certify(controller, linear_env, lyapunov, 59, seed=200).to_frame()
+    statements = certify(controller, linear_env, lyapunov, 59, seed=200).statements
     assert statements.index.tolist() == ["survives", "stays_within", "decreases"]
     assert statements["share"].min() > 0.9 and statements["at_least"].min() > 0.8
 
@@ -287,30 +286,14 @@ def test_bound_on_the_mean_cost_is_the_tightest(levels, late_cost):
         assert (m <= -alpha3 * c + alpha3 * bound + 1e-9 * (1 + alpha3 * c.max())).all()
 
 
-class FallsToAHalf(gym.Env):
-    """x falls from 1 .. 2 to 0.5, where it costs 0.25 for ever; episodes end long before."""
-
-    observation_space, action_space = spaces.Box(-10, 10, (1,), np.float32), spaces.Box(-1, 1, (1,), np.float32)
-
-    def __init__(self, n_steps=60):
-        self.n_steps = n_steps
-
-    def reset(self, seed=None, options=None):
-        super().reset(seed=seed)
-        self.x, self.step_number = self.np_random.uniform(1.0, 2.0), 0
-        return np.array([self.x], np.float32), {}
-
-    def step(self, action):
-        self.x = 0.5 + 0.98 * (self.x - 0.5)
-        self.step_number += 1
-        return np.array([self.x], np.float32), -(self.x**2), False, self.step_number == self.n_steps, {}
-
-
 @pytest.mark.parametrize("n_cost_levels", [1, 5])
 def test_nothing_is_said_of_costs_below_those_that_were_seen(n_cost_levels, monkeypatch):
     monkeypatch.setattr(statistics, "N_COST_LEVELS", n_cost_levels)
-    square = LyapunovFunction(lambda observations: observations[:, 0].astype(float) ** 2)
-    report = evaluate_lyapunov(NoController(), FallsToAHalf(), 20, seed=0, lyapunov=square)
+    square = LyapunovFunction(lambda costs: np.where(costs[:, 0] < 99, costs[:, 0].astype(float), 0.25))
+    # x falls from 1 .. 2 to 0.5, where it costs 0.25 for ever; episodes end long before
+    starts = np.random.default_rng(0).uniform(1.0, 2.0, 20)
+    env = PlannedEnv((0.5 + 0.98 ** np.arange(60) * (start - 0.5)) ** 2 for start in starts)
+    report = evaluate_lyapunov(NoController(), env, 20, seed=0, lyapunov=square)
     assert report.metrics["cost_bound"].low >= report.by_cost["cost_low"].min() > 0.25
     assert report.metrics["cost_bound"] == pytest.approx(report.metrics["late_cost"])
     assert report.holds and report.metrics["cost_bound_alpha3"].value > 0
@@ -435,8 +418,17 @@ class PlannedEnv(gym.Env):
 
 
 class NoController:
+    """
+    A controller that does nothing.
+
+    :param answer: Makes of its actions what ``predict`` returns
+    """
+
+    def __init__(self, answer=lambda actions: (actions, None)):
+        self.answer = answer
+
     def predict(self, observation, deterministic=True):
-        return np.zeros((len(observation), 1), np.float32), None
+        return self.answer(np.zeros((len(observation), 1), np.float32))
 
 
 IDENTITY = LyapunovFunction(lambda observations: observations[:, 0])
@@ -448,7 +440,7 @@ def test_statements_count_what_they_say(monkeypatch):
     settles, rises, stays, dies, rests = [8, 4, 2, 1, 1], [8, 4, 9, 1, 1], [8, 4, 2, 1.5, 1.5], [8, 4, np.inf], [1, 1, 1, 1, 1]
     env = PlannedEnv([settles, rises, stays, dies, rests])
     report = certify(NoController(), env, FALLS, 10, seed=0)
-    frame = report.to_frame()
+    frame = report.statements
     assert frame["n_episodes"].to_dict() == {"survives": 10, "stays_within": 10, "decreases": 8}
     # The late costs are those of the last step; what rests never starts above the level and does not testify
     assert frame["n_true"].to_dict() == {"survives": 8, "stays_within": 6, "decreases": 4}
@@ -462,25 +454,6 @@ def test_statements_count_what_they_say(monkeypatch):
     # A wider window passes over the rise
     monkeypatch.setattr(FALLS, "window_steps", 3)
     assert certify(NoController(), env, FALLS, 5).statements.loc["decreases", "n_true"] == 3
-
-
-def test_a_bound_is_not_rounded_up():
-    report = certify(NoController(), PlannedEnv([[1, 1]]), n_episodes=4)
-    # 0.05 ** (1 / n) of n episodes is 0.99998
-    many = dataclasses.replace(report, statements=report.statements.assign(at_least=0.99998))
-    assert "0.9999 " in many.summary() and "1.0000" not in many.summary()
-
-
-def test_phases_of_single_steps_are_drawn(tmp_path):
-    report = evaluate_lyapunov(NoController(), PlannedEnv([[1], [20]]), 4, lyapunov=IDENTITY)
-    report.plot_phase(0, 0).savefig(tmp_path / "phase.png")
-
-
-def test_all_of_300_means_at_least_99_percent():
-    report = certify(NoController(), PlannedEnv([[1, 1]]), n_episodes=300)
-    assert report.statements.loc["survives", "at_least"] == pytest.approx(0.05 ** (1 / 300))
-    assert 0.05 ** (1 / 300) > 0.99
-    assert report.summary().count("not made") == 2
 
 
 def test_region_of_attraction_on_a_grid():
@@ -499,17 +472,6 @@ def test_region_of_attraction_on_a_grid():
     assert len(report.plot_region_of_attraction(2, 3).axes) == 2
     with pytest.raises(ValueError, match="There are no start states"):
         certify(controller, env, n_episodes=3).plot_region_of_attraction()
-
-
-def test_env_that_ignores_starts_is_refused():
-    with pytest.raises(ValueError, match="the same state whatever reset"):
-        certify(NoController(), PlannedEnv([[1, 1]]), n_episodes=2, ultimate_bound=1.0, starts=np.array([[1.0], [2.0]]))
-    # Also if there is only one
-    with pytest.raises(ValueError, match="the same state whatever reset"):
-        certify(NoController(), PlannedEnv([[1, 1]]), n_episodes=2, ultimate_bound=1.0, starts=[[5.0]])
-    controller = reference_controller(gym.make("LinearCost-v0"))
-    report = certify(controller, gym.make("LinearCost-v0"), n_episodes=2, ultimate_bound=1.0, starts=[[0.5, 0.5]], seed=0)
-    assert report.starts["n_attracted"].tolist() == [10]
 
 
 def test_starts_need_not_be_seen():
@@ -537,13 +499,6 @@ def test_env_that_takes_one_start_for_all_is_refused_before_the_episodes():
     assert controller.calls == 0
 
 
-def test_starts_of_wrappers_that_reuse_their_arrays():
-    training, env = (VecFrameStack(make_vec_env("LinearCost-v0", n_envs=2), 2) for _ in range(2))
-    model = PPO("MlpPolicy", training, n_steps=8, batch_size=16, device="cpu")
-    report = certify(model, env, n_episodes=2, ultimate_bound=9.0, starts=[[1.0, 0.0], [0.0, 1.0]])
-    assert len(report.starts) == 2
-
-
 # Deaths
 
 
@@ -562,26 +517,6 @@ def test_death_is_no_decrease():
     assert report.transitions["next_lyapunov"].isna().sum() == report.transitions["terminated"].sum() == 5
     assert report.metrics["decrease"].value == pytest.approx(known["difference"].mean())
     assert not report.holds and "5 of 10 episodes died" in report.summary()
-
-
-def test_training_and_evaluation_count_terminal_transitions_alike(make_model, make_env, monkeypatch):
-    model = make_model(
-        make_env(terminate=True, episode_length=2), n_collect=64, learning_starts=64, batch_size=64, learning_rate=1e-12
-    )
-    buffer = model.replay_buffer
-    everything = buffer._get_samples(np.arange(64))
-    monkeypatch.setattr(buffer, "sample", lambda *_, **__: everything)
-    th.manual_seed(0)
-    model.train(1, batch_size=64)
-    th.manual_seed(0)
-    with th.no_grad():
-        model.actor.action_log_prob(everything.observations)
-        next_actions = model.actor(everything.next_observations)
-        values = model.critic.lyapunov(everything.observations, everything.actions)
-        next_values = model.critic.lyapunov(everything.next_observations, next_actions)
-        terms = next_values - values - model.alpha3 * everything.rewards
-    expected = terms[everything.dones == 0].mean().item()
-    assert model.logger.name_to_value["train/lyapunov_difference"] == pytest.approx(expected, rel=1e-4)
 
 
 def test_states_that_die_have_a_large_value(monkeypatch):
@@ -622,24 +557,6 @@ def test_memory_of_a_policy_is_kept_within_an_episode():
     policy = Counter()
     certify(policy, PlannedEnv([[1, 1, 1]]), n_episodes=2)
     assert np.concatenate(policy.calls).tolist() == [0, 1, 2, 0, 1, 2]
-
-
-class Scheduled:
-    """Acts by a count of its own, that begins anew where an episode does."""
-
-    def __init__(self):
-        self.starts = []
-
-    def predict(self, observation, state=None, episode_start=None, deterministic=False):
-        self.starts += episode_start.tolist()
-        return np.zeros((len(observation), 1), np.float32), None
-
-
-def test_controllers_know_where_episodes_start():
-    """As in ``evaluate_policy()``; and they are asked for no action that is not taken."""
-    policy = Scheduled()
-    evaluate_lyapunov(policy, PlannedEnv([[3, 2, 1]]), 2, lyapunov=IDENTITY)
-    assert policy.starts == [True, False, False] * 2
 
 
 class Masked:
@@ -715,57 +632,6 @@ def test_critic_is_a_function_of_the_observation(make_model, make_env):
     assert "lyapunov" in report.transitions and len(report.episodes) == 3
 
 
-@pytest.mark.parametrize(
-    ("call", "arguments", "message"),
-    [
-        (certify, {"n_episodes": 0}, "number of episodes must be a whole number of at least 1, and not 0"),
-        (certify, {"ultimate_bound": np.nan}, "ultimate_bound=nan must be a number"),
-        (certify, {"lyapunov": np.sum}, "must be a LyapunovFunction"),
-        (certify, {"starts": np.ones((3, 1)), "n_episodes_per_start": 0}, "n_episodes_per_start=0"),
-        (certify, {"starts": np.ones(3), "ultimate_bound": 1.0}, r"starts of shape \(3,\)"),
-        (certify, {"starts": np.ones((3, 1))}, "give one, or a fitted lyapunov"),
-        (fit_lyapunov, {"n_episodes": 0}, "number of episodes"),
-    ],
-)
-def test_wrong_arguments_are_named_before_any_work(call, arguments, message):
-    env = PlannedEnv([[1, 1]])
-    with pytest.raises(ValueError, match=message):
-        call(NoController(), env, **arguments)
-    assert not hasattr(env, "costs")
-
-
-def test_what_says_nothing_is_refused():
-    with pytest.raises(ValueError, match="has no method predict"):
-        certify(None, PlannedEnv([[1, 1]]))
-    with pytest.raises(ValueError, match="has no method predict"):
-        certify(NoController, PlannedEnv([[1, 1]]))
-    with pytest.raises(ValueError, match=r"pass sb3_lac.GymnasiumVecEnv\(env\)"):
-        certify(NoController(), gym.make_vec("LinearCost-v0", num_envs=2))
-    with pytest.raises(ValueError, match=r"env='LinearCost-v0' is no environment: pass that of gym.make"):
-        certify(NoController(), "LinearCost-v0")
-    with pytest.raises(ValueError, match="observation that is NaN"):
-        certify(NoController(), gym.wrappers.TransformObservation(PlannedEnv([[1, 1]]), lambda _: np.full(1, np.nan), None))
-    with pytest.raises(ValueError, match="Nothing had a cost"):
-        fit_lyapunov(NoController(), PlannedEnv([[0, 0]]), 3, progress_bar=False)
-    with pytest.raises(ValueError, match="reward that is not finite"):
-        fit_lyapunov(NoController(), PlannedEnv([[np.nan, 0]]), 3, progress_bar=False)
-    with pytest.raises(ValueError, match="A reward of 2 is positive"):
-        certify(NoController(), PlannedEnv([[-2, 1]]), n_episodes=2, ultimate_bound=1.0)
-
-
-def test_fit_that_diverges_is_refused(linear_env, optimal, monkeypatch):
-    monkeypatch.setattr(fitting, "LEARNING_RATE", 1e30)
-    with pytest.raises(ValueError, match="The fit diverged"):
-        fit_lyapunov(optimal[0], linear_env, 5, progress_bar=False)
-
-
-def test_device_of_a_controller_may_be_a_name():
-    class OnTheCPU(NoController):
-        device = "cpu"
-
-    assert certify(OnTheCPU(), PlannedEnv([[1, 1]]), n_episodes=2).statements.loc["survives", "n_true"] == 2
-
-
 def test_where_the_function_does_not_fall_at_the_largest_cost_nothing_holds(monkeypatch):
     monkeypatch.setattr(statistics, "N_COST_LEVELS", 4)
     # L is flat above a cost of 6, and 0 at the end
@@ -773,15 +639,6 @@ def test_where_the_function_does_not_fall_at_the_largest_cost_nothing_holds(monk
     report = evaluate_lyapunov(NoController(), PlannedEnv([[10, 9, 1, 0.5]]), 4, lyapunov=lyapunov, seed=0)
     assert report.by_cost["drift"].iloc[-1] == 0.0
     assert not report.holds and "does not decrease where the cost is largest" in report.summary()
-
-
-def test_callbacks_refuse_seeds_and_environments_before_the_training(make_env):
-    model = SAC("MlpPolicy", make_env(), buffer_size=10)
-    with pytest.raises(ValueError, match="seed=-1 must be a whole number of at least 0"):
-        model.learn(10, callback=CertificateCallback(make_env(), seed=-1))
-    assert model.num_timesteps == 0
-    with pytest.raises(ValueError, match="GymnasiumVecEnv"):
-        CertificateCallback(gym.make_vec("LinearCost-v0", num_envs=2))
 
 
 # Callback
@@ -819,21 +676,6 @@ def test_callback_needs_no_more_alike_than_the_normalization(make_env, norm_obs)
     if norm_obs:
         np.testing.assert_array_equal(env.obs_rms.mean, training.obs_rms.mean)
         assert env.ret_rms.var == training.ret_rms.var
-
-
-def test_callback_refuses_questions_before_the_training(make_env):
-    with pytest.raises(ValueError, match="ultimate_bound='small' must be a number"):
-        CertificateCallback(make_env(), ultimate_bound="small")
-
-
-def test_callback_shows_intervals_and_figures_in_tensorboard(make_env, tmp_path):
-    model = SAC("MlpPolicy", make_env(), learning_starts=100, policy_kwargs={"net_arch": [8]}, buffer_size=100, seed=0)
-    model.set_logger(configure(str(tmp_path), ["tensorboard"]))
-    model.learn(10, callback=CertificateCallback(make_env(), n_eval_episodes=2, eval_freq=10, verbose=0))
-    events = EventAccumulator(str(tmp_path)).Reload()
-    assert set(events.Tags()["images"]) == {"certificate/drift", "certificate/statements"}
-    low, value, high = (events.Scalars(f"certificate/mean_cost{end}")[0].value for end in ("_low", "", "_high"))
-    assert low <= value <= high
 
 
 def test_callback_certifies_any_algorithm_and_changes_nothing(make_env, tmp_path):
@@ -881,45 +723,94 @@ class ConstantEnv(gym.Env):
         return np.array([self.place], np.float32), self.rewards(self.place), False, self.n_steps >= 10, {}
 
 
-class Resting:
-    """
-    A controller that does nothing.
-
-    :param answer: Makes of its actions what ``predict`` returns
-    """
-
-    def __init__(self, answer=lambda actions: (actions, None)):
-        self.answer = answer
-
-    def predict(self, observation, deterministic=True):
-        return self.answer(np.zeros((len(observation), 1), np.float32))
-
-
 @pytest.mark.parametrize("make_vec", [DummyVecEnv, SubprocVecEnv])
 def test_a_cost_of_the_bound_is_within_the_bound_in_all_vector_environments(make_vec):
     # Some hold rewards in single precision, where 0.1 is a little more than 0.1
-    env = make_vec([lambda: ConstantEnv(lambda place: -0.1)] * 2)
-    report = certify(Resting(), env, n_episodes=4, ultimate_bound=0.1, starts=[[0.0], [1.0]], seed=0)
+    options = {"start_method": "fork"} if make_vec is SubprocVecEnv else {}
+    env = make_vec([lambda: ConstantEnv(lambda place: -0.1)] * 2, **options)
+    report = certify(NoController(), env, n_episodes=4, ultimate_bound=0.1, starts=[[0.0], [1.0]], seed=0)
     assert report.statements.loc["stays_within", "n_true"] == 4 and (report.starts["share"] == 1).all()
-    assert certify(Resting(), env, n_episodes=4, ultimate_bound=0.0999, seed=0).statements.loc["stays_within", "n_true"] == 0
+    assert (
+        certify(NoController(), env, n_episodes=4, ultimate_bound=0.0999, seed=0).statements.loc["stays_within", "n_true"] == 0
+    )
     env.close()
 
 
-def test_positive_rewards_of_the_start_grid_need_a_bound_too():
-    env = ConstantEnv(lambda place: 1.0 if place > 5 else -0.1)
-    with pytest.raises(ValueError, match="reward of 1 is positive, and it is not known which reward costs nothing"):
-        certify(Resting(), env, n_episodes=2, ultimate_bound=0.5, starts=[[0.0], [10.0]], seed=0)
-    known = LyapunovFunction(lambda states: states[:, 0] ** 2, reward_bound=1.0)
-    starts = certify(Resting(), env, known, n_episodes=2, ultimate_bound=0.5, starts=[[0.0], [10.0]], seed=0).starts
-    assert starts["share"].tolist() == [0.0, 1.0]
+def test_a_controller_that_returns_something_else_is_told_what_is_expected():
+    env = DummyVecEnv([lambda: ConstantEnv(lambda place: -0.1)] * 2)
+    for answer, match in (
+        (lambda actions: actions, r"NoController returned ndarray, and must return two things"),
+        (lambda actions: actions.tolist(), r"NoController returned list, and must return two things"),
+        (lambda actions: (actions[0], None), r"actions of shape \(1,\), and must return one for each of 2 environments"),
+    ):
+        with pytest.raises(ValueError, match=match):
+            certify(NoController(answer), env, n_episodes=2, seed=0)
+    # A list of actions is as good as an array
+    assert len(certify(NoController(lambda actions: (actions.tolist(), None)), env, n_episodes=2, seed=0).episodes) == 2
+
+
+def test_300_of_300_means_at_least_99_percent():
+    report = certify(NoController(), PlannedEnv([[1, 1]]), n_episodes=300)
+    assert report.statements.loc["survives", "at_least"] == pytest.approx(0.05 ** (1 / 300))
+    assert report.summary().count("not made") == 2
+    # A lower bound is not rounded up
+    many = dataclasses.replace(report, statements=report.statements.assign(at_least=0.99998))
+    assert "0.9999 " in many.summary() and "1.0000" not in many.summary()
+
+
+# Refusals
+
+
+def showing(observation):
+    return gym.wrappers.TransformObservation(PlannedEnv([[1, 1]]), lambda _: np.full(1, observation), None)
+
+
+ONES = PlannedEnv([[1, 1]])
+SOMETIMES_PAID = ConstantEnv(lambda place: 1.0 if place > 5 else -0.1)
+
+
+@pytest.mark.parametrize(
+    ("call", "env", "arguments", "message"),
+    [
+        (certify, ONES, {"n_episodes": 0}, "number of episodes must be a whole number of at least 1, and not 0"),
+        (certify, ONES, {"n_episodes": 2.5}, "of at least 1, and not 2.5"),
+        (certify, ONES, {"seed": -1}, "seed=-1 must be a whole number of at least 0"),
+        (certify, ONES, {"ultimate_bound": np.nan}, "ultimate_bound=nan must be a number"),
+        (certify, ONES, {"lyapunov": np.sum}, r"must be a LyapunovFunction: .*LyapunovFunction\(function\)"),
+        (certify, ONES, {"starts": np.ones((3, 1)), "n_episodes_per_start": 0}, "n_episodes_per_start=0"),
+        (certify, ONES, {"starts": np.ones(3), "ultimate_bound": 1.0}, r"starts of shape \(3,\)"),
+        (certify, ONES, {"starts": np.ones((3, 1))}, "give one, or a fitted lyapunov"),
+        (certify, ONES, {"starts": [[1.0], [2.0]], "ultimate_bound": 1.0}, "the same state whatever reset"),
+        (certify, ONES, {"starts": [[5.0]], "ultimate_bound": 1.0}, "the same state whatever reset"),
+        (certify, PlannedEnv([[-2, 1]]), {"ultimate_bound": 1.0}, "A reward of 2 is positive, and it is not known"),
+        (certify, SOMETIMES_PAID, {"starts": [[0.0], [10.0]], "ultimate_bound": 0.5}, "A reward of 1 is positive"),
+        (evaluate_lyapunov, PlannedEnv([[-2, 1]]), {"lyapunov": IDENTITY}, "A reward of 2 is positive"),
+        (evaluate_lyapunov, ONES, {}, "must be a LAC model.*CertificateCallback"),
+        (certify, "LinearCost-v0", {}, r"env='LinearCost-v0' is no environment: pass that of gym.make"),
+        (certify, gym.make_vec("LinearCost-v0", num_envs=2), {}, r"pass sb3_lac.GymnasiumVecEnv\(env\)"),
+        (certify, showing(np.nan), {}, "observation that is NaN"),
+        (fit_lyapunov, showing(np.inf), {"n_episodes": 2}, "infinite observation"),
+        (fit_lyapunov, PlannedEnv([[0, 0]]), {}, "Nothing had a cost"),
+        (fit_lyapunov, PlannedEnv([[np.nan, 0]]), {}, "reward that is not finite"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused(call, env, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        call(NoController(), env, **arguments)
+
+
+@pytest.mark.parametrize("policy", [None, NoController])
+def test_a_policy_has_a_method_predict(policy):
+    with pytest.raises(ValueError, match="has no method predict"):
+        certify(policy, ONES)
 
 
 @pytest.mark.parametrize(
     ("argument", "value"),
     [
-        *(("reward_bound", value) for value in (-1.0, math.nan, math.inf, "1")),
-        *(("gamma", value) for value in (2.0, -0.1, math.nan, None)),
-        *(("alpha3", value) for value in (0.0, -1.0, math.inf, "1")),
+        *(("reward_bound", value) for value in (-1.0, math.inf, "1")),
+        *(("gamma", value) for value in (2.0, math.nan, None)),
+        *(("alpha3", value) for value in (0.0, math.inf, "1")),
     ],
 )
 def test_numbers_that_no_function_can_have_are_refused(argument, value):
@@ -927,14 +818,22 @@ def test_numbers_that_no_function_can_have_are_refused(argument, value):
         LyapunovFunction(lambda states: states[:, 0] ** 2, **{argument: value})
 
 
-def test_a_controller_that_returns_something_else_is_told_what_is_expected():
-    env = DummyVecEnv([lambda: ConstantEnv(lambda place: -0.1)] * 2)
-    for answer, match in (
-        (lambda actions: actions, r"Resting returned ndarray, and must return two things"),
-        (lambda actions: actions.tolist(), r"Resting returned list, and must return two things"),
-        (lambda actions: (actions[0], None), r"actions of shape \(1,\), and must return one for each of 2 environments"),
-    ):
-        with pytest.raises(ValueError, match=match):
-            certify(Resting(answer), env, n_episodes=2, seed=0)
-    # A list of actions is as good as an array
-    assert len(certify(Resting(lambda actions: (actions.tolist(), None)), env, n_episodes=2, seed=0).episodes) == 2
+def test_fit_that_diverges_is_refused(linear_env, optimal, monkeypatch):
+    monkeypatch.setattr(fitting, "LEARNING_RATE", 1e30)
+    with pytest.raises(ValueError, match="The fit diverged"):
+        fit_lyapunov(optimal[0], linear_env, 5, **FIT)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"seed": -1}, "seed=-1 must be a whole number of at least 0"),
+        ({"n_eval_episodes": -1}, "and not -1"),
+        ({"ultimate_bound": "small"}, "ultimate_bound='small' must be a number"),
+    ],
+)
+def test_callback_refuses_questions_before_the_training(make_env, arguments, message):
+    model = SAC("MlpPolicy", make_env(), buffer_size=10)
+    with pytest.raises(ValueError, match=message):
+        model.learn(10, callback=CertificateCallback(make_env(), **arguments))
+    assert model.num_timesteps == 0

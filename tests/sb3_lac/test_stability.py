@@ -77,11 +77,6 @@ def make_exact_model(make_model, monkeypatch):
     return _make_exact_model
 
 
-def without_order(frame):
-    """Transitions whatever the numbers of the episodes."""
-    return frame.drop(columns="episode").sort_values(["step", "cost"]).reset_index(drop=True)
-
-
 # Values of L
 
 
@@ -182,16 +177,6 @@ def test_scale_of_lyapunov_function_shows_in_calibration_only(make_exact_model, 
     assert report.alpha3 == 4.0 and report.metrics["share_decreasing"].value == 0.0
 
 
-def test_increasing_function_is_no_lyapunov_function(make_exact_model):
-    # An expansion, whose L grows with the costs
-    arguments = {"starts": ((0.1, 0.0), (0.2, 0.1)), "lengths": (10,), "rho": 1.2}
-    report = evaluate_lyapunov(make_exact_model(**arguments), ContractionEnv(**arguments), 4)
-    assert report.metrics["largest_feasible_alpha3"].value == pytest.approx(-0.44 / (1 - 0.5 * 1.44), rel=1e-5)
-    assert report.metrics["share_decreasing"].value == 0
-    assert report.metrics["decrease"].low > 0
-    assert "is violated on average" in report.summary()
-
-
 def test_ends_of_episodes(make_exact_model):
     # Dies after two steps, and survives three
     arguments = {"starts": ((1.0,),), "lengths": (2, 3), "deaths": (True, False)}
@@ -280,13 +265,8 @@ def square(observations):
     return observations[:, 0].astype(np.float64) ** 2
 
 
-def test_positive_rewards_need_a_bound():
-    lyapunov, message = LyapunovFunction(square), r"reward of 1 is positive, and it is not known .* reward_bound="
-    with pytest.raises(ValueError, match=message):
-        evaluate_lyapunov(Idle(), paying(1.0), 4, lyapunov=lyapunov)
-    with pytest.raises(ValueError, match=message):
-        certify(Idle(), paying(1.0), lyapunov, 4, ultimate_bound=0.1)
-    # What falls does so in any units
+def test_what_falls_does_so_in_any_units():
+    lyapunov = LyapunovFunction(square)
     lyapunov.level, lyapunov.window_steps = 0.1, 1
     assert certify(Idle(), paying(1.0), lyapunov, 4).statements["n_true"]["decreases"] == 2
 
@@ -297,16 +277,6 @@ def test_costs_after_a_death_have_no_sum_without_a_discount(monkeypatch):
     died = report.transitions["episode"].map(report.episodes["terminated"])
     assert report.transitions["cost_to_go"].isna().tolist() == died.tolist()
     assert report.transitions["cost"].max() == pytest.approx(1.0)
-
-
-def test_all_dead(make_exact_model):
-    arguments = {"lengths": (1,), "deaths": (True,)}
-    report = evaluate_lyapunov(make_exact_model(**arguments), ContractionEnv(**arguments), 3)
-    for name in ("decrease", "share_decreasing", "largest_feasible_alpha3", "ultimate_bound"):
-        assert np.isnan(report.metrics[name]).all(), name
-    assert report.metrics["death_rate"].value == 1 and report.by_cost.empty
-    assert "is undecided" in report.summary() and "nan" not in report.summary()
-    assert len(report.plot().axes) == 4
 
 
 def test_rewards_above_the_bound_cost_nothing(make_model, make_env):
@@ -417,7 +387,12 @@ def test_parallel_envs_give_the_same_transitions(make_model):
     np.testing.assert_allclose(
         parallel.transitions["next_lyapunov"].dropna().iloc[:6], parallel.transitions["lyapunov"].iloc[1:7]
     )
-    pd.testing.assert_frame_equal(without_order(parallel.transitions), without_order(single.transitions), rtol=1e-5)
+    # Whatever the numbers of the episodes
+    frames = [
+        report.transitions.drop(columns="episode").sort_values(["step", "cost"]).reset_index(drop=True)
+        for report in (parallel, single)
+    ]
+    pd.testing.assert_frame_equal(*frames, rtol=1e-5)
     for name in parallel.metrics:
         assert parallel.metrics[name].value == pytest.approx(single.metrics[name].value, rel=1e-4), name
 
@@ -518,18 +493,6 @@ def test_same_seed_gives_the_same_report(make_model, make_env):
     assert (deterministic.observations[1] != reports[0].observations[1]).all()
 
 
-@pytest.mark.parametrize("seed", [None, 3])
-def test_random_states_are_left_alone(make_model, make_env, seed):
-    model = make_model(n_collect=0)
-    th.manual_seed(1)
-    np.random.seed(1)
-    expected = th.rand(3).tolist(), np.random.rand(3).tolist()
-    th.manual_seed(1)
-    np.random.seed(1)
-    evaluate_lyapunov(model, make_env(), 2, seed=seed)
-    assert (th.rand(3).tolist(), np.random.rand(3).tolist()) == expected
-
-
 @pytest.mark.parametrize("normalize", [False, True])
 def test_training_with_callback_is_the_same_to_the_bit(make_model, make_env, normalize):
     def train(callback):
@@ -609,32 +572,9 @@ def test_episode_without_an_end_is_noticed(make_model, make_env, monkeypatch):
 # Mistakes
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"n_eval_episodes": 0}, "number of episodes must be a whole number of at least 1, and not 0"),
-        ({"n_eval_episodes": 2.5}, "of at least 1, and not 2.5"),
-        ({"seed": -1}, "seed=-1 must be a whole number of at least 0"),
-        ({"lyapunov": np.sum}, r"lyapunov=<function sum.* must be a LyapunovFunction.*LyapunovFunction\(function\)"),
-    ],
-)
-def test_wrong_arguments_are_named_before_any_work(make_model, make_env, arguments, message):
-    env = make_env()
-    with pytest.raises(ValueError, match=message):
-        evaluate_lyapunov(make_model(n_collect=0), env, **arguments)
-    assert not hasattr(env, "state")
-
-
 def test_model_and_env_must_fit(make_model, make_env):
-    with pytest.raises(ValueError, match="must be a LAC model"):
-        evaluate_lyapunov(SAC("MlpPolicy", make_env(), buffer_size=10), make_env())
     with pytest.raises(ValueError, match="Observation spaces do not match"):
         evaluate_lyapunov(make_model(n_collect=0), make_env(n_dim=3))
-    # Before the training starts, and not at the first evaluation
-    model = make_model(n_collect=0)
-    with pytest.raises(ValueError, match="and not -1"):
-        model.learn(10, callback=LyapunovCallback(make_env(), n_eval_episodes=-1))
-    assert model.num_timesteps == 0
 
 
 def test_loaded_model_can_be_evaluated_without_its_env(make_model, make_env, tmp_path):
