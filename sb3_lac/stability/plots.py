@@ -223,11 +223,12 @@ def plot_phase(
         format_log_axis(bar.ax.yaxis)
     died = episodes["terminated"].to_numpy()
     ends = points[np.append(~inside, True)]
-    for chosen, label, style in (
-        (~died, "end, survived", {"s": 16, "color": "black"}),
-        (died, "end, died", {"s": 28, "color": VERMILION, "marker": "x"}),
+    for chosen, label, size, colour, marker in (
+        (~died, "survived", 16, "black", "o"),
+        (died, "died", 28, VERMILION, "x"),
     ):
-        axes.scatter(*ends[chosen].T, label=f"{label} ({np.sum(chosen)})", zorder=3, **style)
+        label = f"end, {label} ({np.sum(chosen)})"
+        axes.scatter(*ends[chosen].T, s=size, color=colour, marker=marker, label=label, zorder=3)
     figure.legend(loc="outside lower center", ncols=2, fontsize=8)
     axes.set(title=f"Trajectories of {len(episodes)} episodes", **labels)
     return figure
