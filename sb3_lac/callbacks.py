@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 class LyapunovCallback(EventCallback):
     """
-    Callback for evaluating the learned Lyapunov function along roll-outs of the policy (see ``evaluate_lyapunov()``).
+    Callback for evaluating the learned Lyapunov function along roll-outs of the mean action (see ``evaluate_lyapunov()``).
     The training is not changed by it. TensorBoard also gets the limits of the confidence intervals (``lyapunov/<name>_low``,
     ``lyapunov/<name>_high``) and the figure of each report (``lyapunov/report``).
 
@@ -49,7 +49,6 @@ class LyapunovCallback(EventCallback):
         ``self.parent.last_report``
     :param n_eval_episodes: The number of episodes to test the agent
     :param eval_freq: Evaluate the agent every ``eval_freq`` call of the callback.
-    :param deterministic: Whether the evaluation should use stochastic or deterministic actions
     :param seed: Seed of each evaluation, so that all of them have the same start states; if it is None, each draws its own
     :param log_path: Path of a CSV file with the metrics and their confidence intervals, updated at each evaluation.
         If it exists already, its evaluations are kept, so that the history of a continued training is complete
@@ -69,7 +68,6 @@ class LyapunovCallback(EventCallback):
         callback_after_eval: BaseCallback | None = None,
         n_eval_episodes: int = 20,
         eval_freq: int = 10_000,
-        deterministic: bool = True,
         seed: int | None = None,
         log_path: str | os.PathLike[str] | None = None,
         verbose: int = 1,
@@ -78,7 +76,6 @@ class LyapunovCallback(EventCallback):
         self.eval_env = vectorized(eval_env)
         self.n_eval_episodes = n_eval_episodes
         self.eval_freq = eval_freq
-        self.deterministic = deterministic
         self.seed = seed
         self.log_path = None if log_path is None else Path(log_path)
         # One entry per evaluation, sorted by timesteps
@@ -87,8 +84,7 @@ class LyapunovCallback(EventCallback):
 
     def _init_callback(self) -> None:
         # A mistake is seen before the training, and not at its first evaluation
-        judged = self._judged()
-        with closed_loop(self.model, self.eval_env, judged, self.n_eval_episodes, self.deterministic, self.seed) as loop:
+        with closed_loop(self.model, self.eval_env, self._judged(), self.n_eval_episodes, seed=self.seed) as loop:
             self.eval_env = loop.env
         if self.model.num_timesteps == 0:
             # Of another training
@@ -131,10 +127,8 @@ class LyapunovCallback(EventCallback):
         self.logger.dump(self.num_timesteps)
 
         # In place of an older one after as many timesteps, when continuing from a checkpoint
-        entries = {entry["timesteps"]: entry for entry in self.history} | {
-            self.num_timesteps: {"timesteps": self.num_timesteps, **values}
-        }
-        self.history = [entries[timesteps] for timesteps in sorted(entries)]
+        others = [entry for entry in self.history if entry["timesteps"] != self.num_timesteps]
+        self.history = sorted([*others, {"timesteps": self.num_timesteps, **values}], key=lambda entry: entry["timesteps"])
         if self.log_path is not None:
             import pandas as pd
 
@@ -148,9 +142,7 @@ class LyapunovCallback(EventCallback):
 
     def _evaluate(self) -> dict[str, float]:
         """Evaluate, and log what was found."""
-        self.last_report = evaluate_lyapunov(
-            self.model, self.eval_env, self.n_eval_episodes, deterministic=self.deterministic, seed=self.seed
-        )
+        self.last_report = evaluate_lyapunov(self.model, self.eval_env, self.n_eval_episodes, seed=self.seed)
         return self._log("lyapunov", self._metrics(), {"report": self.last_report.plot})
 
     def _metrics(self) -> dict[str, float]:
@@ -220,7 +212,7 @@ class CertificateCallback(LyapunovCallback):
         log_path: str | os.PathLike[str] | None = None,
         verbose: int = 1,
     ):
-        super().__init__(eval_env, callback_after_eval, n_eval_episodes, eval_freq, True, seed, log_path, verbose)
+        super().__init__(eval_env, callback_after_eval, n_eval_episodes, eval_freq, seed, log_path, verbose)
         check_bound(ultimate_bound)
         self.ultimate_bound = ultimate_bound
         self.last_certification: CertificationReport | None = None

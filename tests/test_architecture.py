@@ -100,7 +100,8 @@ def test_sb3_lac_knows_nothing_of_batteries(path):
         ("statistics", set()),
         ("functions", {"lac"}),
         ("rollout", {"stability.functions"}),
-        ("fitting", {"files", "stability.functions", "stability.rollout"}),
+        ("loop", {"stability.functions", "stability.rollout", "vec_env"}),
+        ("fitting", {"files", "stability.functions", "stability.loop", "stability.rollout"}),
     ],
 )
 def test_only_reports_know_the_other_files_of_stability(module, may_import):

@@ -1,4 +1,4 @@
-"""Stability of the loop that a policy closes: Lyapunov functions learned, judged on other roll-outs, and exact statements."""
+"""Stability of the loop that a policy closes: Lyapunov functions learned, exact statements, estimates on other roll-outs."""
 
 from sb3_lac.stability.certification import CertificationReport, certify
 from sb3_lac.stability.fitting import FittedLyapunov, NoCostError, fit_lyapunov

@@ -63,14 +63,6 @@ class CertificationReport:
         """Confidence of a single statement, with which all of them hold together (Bonferroni's inequality)."""
         return _of_each(len(self.statements))
 
-    def to_frame(self) -> pd.DataFrame:
-        """
-        Return the statements as a table.
-
-        :return: One row per statement, with columns ``n_episodes``, ``n_true``, ``share`` and ``at_least``
-        """
-        return self.statements.copy()
-
     def summary(self) -> str:
         """
         Say the statements in a readable form.

@@ -18,7 +18,7 @@ from torch import nn
 from sb3_lac.files import replacing
 from sb3_lac.stability.functions import LyapunovFunction, Observations
 from sb3_lac.stability.loop import closed_loop
-from sb3_lac.stability.rollout import RollOuts, flatten, summarize_episodes
+from sb3_lac.stability.rollout import RollOuts, fifths_left, flatten, summarize_episodes
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -337,9 +337,8 @@ def _described(
     survived = ~episodes["terminated"].to_numpy()
     ultimate_bound = level = window_steps = None
     if survived.any():
-        episode, lengths = transitions["episode"].to_numpy(), episodes["length"].to_numpy()
-        late = transitions["step"].to_numpy() >= (lengths - np.maximum(lengths // 5, 1))[episode]
-        level = float(values[late & survived[episode]].max())
+        late = (fifths_left(transitions) == 0).to_numpy() & survived[transitions["episode"]]
+        level = float(values[late].max())
         window_steps = shortest_window(values, data.rows[survived], level)
         ultimate_bound = float(episodes["largest_late_cost"][survived].max())
     return FittedLyapunov(

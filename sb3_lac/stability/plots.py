@@ -20,13 +20,7 @@ BLUE, VERMILION, GREEN, ORANGE, GREY = "#0072b2", "#d55e00", "#009e73", "#e69f00
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """
-    An empty figure, outside pyplot's global state.
-
-    :param width: In inches
-    :param height: In inches
-    :return: The figure
-    """
+    """Make an empty figure of a size in inches, outside pyplot's global state."""
     return Figure(figsize=(width, height), dpi=150, layout="constrained")
 
 
@@ -62,13 +56,6 @@ def project(observations: np.ndarray | None, x: int, y: int, names: Sequence[str
     return observations[:, [x, y]], {"xlabel": names[x], "ylabel": names[y]}
 
 
-def scatter_groups(axes: Axes, points: np.ndarray, groups: Sequence[tuple[np.ndarray, str, dict[str, Any]]]) -> None:
-    """Mark groups of points, with their sizes in a legend below the panel."""
-    for chosen, label, style in groups:
-        axes.scatter(points[chosen, 0], points[chosen, 1], label=f"{label} ({np.sum(chosen)})", zorder=3, **style)
-    axes.figure.legend(loc="outside lower center", ncols=len(groups), fontsize=8)
-
-
 def draw_episodes(transitions: pd.DataFrame, axes: Axes) -> None:
     """Draw ``L`` along some episodes."""
     # Few enough that each line can be followed
@@ -99,29 +86,6 @@ def draw_by_cost(by_cost: pd.DataFrame, alpha3: float, axes: Axes) -> None:
         ylabel=r"mean of $L(s', a') - L(s, a) + \alpha_3 c$",
         title=f"Decrease condition by cost, alpha3={alpha3:g}",
     )
-
-
-def draw_drift(by_cost: pd.DataFrame, cost_bound: float, cost_bound_alpha3: float, start_cost: float, axes: Axes) -> None:
-    """Draw the drift of ``L`` over the cost, below the line that bounds the mean cost in the long run."""
-    cost, drift = by_cost["cost"], by_cost["drift"]
-    axes.axhline(0, color="0.4", lw=1)
-    axes.scatter(cost, drift, color=np.where(drift < 0, GREEN, VERMILION).tolist(), s=30, zorder=3)
-    if not math.isnan(cost_bound_alpha3):
-        # Many points, for the axes may be logarithmic
-        along = np.interp(np.linspace(0, len(cost) - 1, 500), np.arange(len(cost)), np.sort(cost))
-        axes.plot(along, cost_bound_alpha3 * (cost_bound - along), color=BLUE, lw=1.2, label=r"$-\alpha_3 c + b$")
-    if not math.isnan(cost_bound):
-        axes.axvline(cost_bound, color=ORANGE, ls="--", lw=1.2, label=f"$b / \\alpha_3$ = {cost_bound:.2g}")
-    axes.axvline(start_cost, color="0.4", ls=":", lw=1.2, label=f"at the start {start_cost:.2g}")
-    # The smallest costs are told apart, and the largest are still seen
-    largest = float(np.abs(drift).max()) if len(drift) > 0 else 0.0
-    if is_wide(cost) and largest > 0:
-        smallest = float(cost.min())
-        axes.set_xscale("symlog", linthresh=10 * smallest)
-        axes.set_yscale("symlog", linthresh=max(10 * smallest, 1e-3 * largest))
-    axes.margins(0.1)
-    axes.set(xlabel="cost of the transition", ylabel="mean of $L(s', a') - L(s, a)$", title="Drift by cost")
-    axes.legend(fontsize=8)
 
 
 def draw_calibration(transitions: pd.DataFrame, axes: Axes) -> None:
@@ -170,7 +134,26 @@ def plot_report(transitions: pd.DataFrame, by_cost: pd.DataFrame, alpha3: float,
 def plot_drift(by_cost: pd.DataFrame, cost_bound: float, cost_bound_alpha3: float, start_cost: float) -> Figure:
     """See ``LyapunovReport.plot_drift()``."""
     figure = new_figure(5.6, 4.2)
-    draw_drift(by_cost, cost_bound, cost_bound_alpha3, start_cost, figure.subplots())
+    axes = figure.subplots()
+    cost, drift = by_cost["cost"], by_cost["drift"]
+    axes.axhline(0, color="0.4", lw=1)
+    axes.scatter(cost, drift, color=np.where(drift < 0, GREEN, VERMILION).tolist(), s=30, zorder=3)
+    if not math.isnan(cost_bound_alpha3):
+        # Many points, for the axes may be logarithmic
+        along = np.interp(np.linspace(0, len(cost) - 1, 500), np.arange(len(cost)), np.sort(cost))
+        axes.plot(along, cost_bound_alpha3 * (cost_bound - along), color=BLUE, lw=1.2, label=r"$-\alpha_3 c + b$")
+    if not math.isnan(cost_bound):
+        axes.axvline(cost_bound, color=ORANGE, ls="--", lw=1.2, label=f"$b / \\alpha_3$ = {cost_bound:.2g}")
+    axes.axvline(start_cost, color="0.4", ls=":", lw=1.2, label=f"at the start {start_cost:.2g}")
+    # The smallest costs are told apart, and the largest are still seen
+    largest = float(np.abs(drift).max()) if len(drift) > 0 else 0.0
+    if is_wide(cost) and largest > 0:
+        smallest = float(cost.min())
+        axes.set_xscale("symlog", linthresh=10 * smallest)
+        axes.set_yscale("symlog", linthresh=max(10 * smallest, 1e-3 * largest))
+    axes.margins(0.1)
+    axes.set(xlabel="cost of the transition", ylabel="mean of $L(s', a') - L(s, a)$", title="Drift by cost")
+    axes.legend(fontsize=8)
     return figure
 
 
@@ -239,13 +222,13 @@ def plot_phase(
     if is_wide(lyapunov):
         format_log_axis(bar.ax.yaxis)
     died = episodes["terminated"].to_numpy()
-    scatter_groups(
-        axes,
-        points[np.append(~inside, True)],
-        [
-            (~died, "end, survived", {"s": 16, "color": "black"}),
-            (died, "end, died", {"s": 28, "color": VERMILION, "marker": "x"}),
-        ],
-    )
+    ends = points[np.append(~inside, True)]
+    for chosen, label, size, colour, marker in (
+        (~died, "survived", 16, "black", "o"),
+        (died, "died", 28, VERMILION, "x"),
+    ):
+        label = f"end, {label} ({np.sum(chosen)})"
+        axes.scatter(*ends[chosen].T, s=size, color=colour, marker=marker, label=label, zorder=3)
+    figure.legend(loc="outside lower center", ncols=2, fontsize=8)
     axes.set(title=f"Trajectories of {len(episodes)} episodes", **labels)
     return figure

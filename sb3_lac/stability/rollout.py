@@ -189,21 +189,24 @@ def roll_out(
     )
 
 
+def fifths_left(transitions: pd.DataFrame) -> pd.Series:
+    """Count how many fifths of its episode follow that of each transition: none in the last one, which is called late."""
+    length = transitions.groupby("episode")["step"].transform("size")
+    return (length - transitions["step"] - 1) // np.maximum(length // 5, 1)
+
+
 def summarize_episodes(transitions: pd.DataFrame) -> pd.DataFrame:
     """Summarize each episode."""
     import pandas as pd
 
-    groups = transitions.groupby("episode")
-    length = groups["step"].transform("size")
-    n_late = np.maximum(length // 5, 1)
-    fifths_left = (length - transitions["step"] - 1) // n_late
-    means = transitions["cost"].groupby([transitions["episode"], fifths_left]).mean().unstack().reindex(columns=range(4))
+    groups, left = transitions.groupby("episode"), fifths_left(transitions)
+    means = transitions["cost"].groupby([transitions["episode"], left]).mean().unstack().reindex(columns=range(4))
     return pd.DataFrame(
         {
             "length": groups.size(),
             "total_cost": groups["cost"].sum(),
             "final_cost": groups["cost"].last(),
-            "largest_late_cost": transitions["cost"].where(fifths_left == 0).groupby(transitions["episode"]).max(),
+            "largest_late_cost": transitions["cost"].where(left == 0).groupby(transitions["episode"]).max(),
             "late_cost": means[0],
             # A cost that goes up and down, as that of a moving goal, has been as high before
             "late_rise": means[0] - means[[1, 2, 3]].max(axis=1),

@@ -14,11 +14,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 from scipy.stats import binom
-from stable_baselines3 import DQN, PPO, SAC
+from stable_baselines3 import DQN, SAC
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.logger import Logger, configure
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecMonitor, VecNormalize
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor, VecNormalize
 
 from benchmarks.control import ScaledController
 from sb3_lac import (
@@ -32,11 +31,18 @@ from sb3_lac import (
     fit_lyapunov,
 )
 from sb3_lac.envs import LinearCostEnv, reference_controller
-from sb3_lac.stability import CriticLyapunov
+from sb3_lac.stability import CriticLyapunov, fitting, statistics
 from sb3_lac.stability.fitting import shortest_window, traced_returns
-from sb3_lac.stability.statistics import exact_interval, exact_lower_bound, percent, tightest_drift
+from sb3_lac.stability.statistics import exact_interval, exact_lower_bound, tightest_drift
 
-FIT = {"n_iterations": 20, "progress_bar": False}
+FIT = {"progress_bar": False}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _few_iterations():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fitting, "N_ITERATIONS", 20)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +75,7 @@ def test_function_of_the_optimal_loop_is_the_exact_one(optimal, linear_env):
     assert average_cost * 0.8 < report.metrics["cost_bound"].value < average_cost * 1.5
     assert report.metrics["calibration_slope"].value == pytest.approx(1.0, abs=0.05)
     assert report.metrics["death_rate"].value == 0
-    statements = certify(controller, linear_env, lyapunov, 59, seed=200).to_frame()
+    statements = certify(controller, linear_env, lyapunov, 59, seed=200).statements
     assert statements.index.tolist() == ["survives", "stays_within", "decreases"]
     assert statements["share"].min() > 0.9 and statements["at_least"].min() > 0.8
 
@@ -83,7 +89,7 @@ def test_destabilised_loop_fails(linear_env, optimal, factor):
     report = evaluate_lyapunov(controller, linear_env, 30, seed=100, lyapunov=lyapunov)
     assert not report.holds and report.metrics["largest_feasible_alpha3"].high < 0
     assert "does not hold: L does not fall" in report.summary()
-    certification = certify(controller, linear_env, lyapunov, 30, cost_bound=0.05, seed=200)
+    certification = certify(controller, linear_env, lyapunov, 30, ultimate_bound=0.05, seed=200)
     assert certification.statements.loc["stays_within", "n_true"] == 0
     assert certification.statements.loc["stays_within", "at_least"] == 0
     assert "decreases" not in certification.statements.index and "not made" in certification.summary()
@@ -139,7 +145,8 @@ def test_discount_and_ratio_tell_the_alpha3_of_an_exact_function(gamma):
     alpha3 = evaluate_lyapunov(*judged, 10, seed=0, lyapunov=exact).alpha3_by_discount
     assert 0 < alpha3 < 1
     # It decreases by that share of the cost in 95 % of the transitions (to which rounding of observations adds little)
-    report = evaluate_lyapunov(*judged, 10, seed=0, lyapunov=exact, alpha3=alpha3)
+    exact.alpha3 = alpha3
+    report = evaluate_lyapunov(*judged, 10, seed=0, lyapunov=exact)
     with_cost = report.transitions[report.transitions["cost"] > 1e-6]
     assert (with_cost["difference"] <= 1e-9).mean() == pytest.approx(0.95, abs=0.03)
     assert f"If L is exact, gamma={gamma:g} lets it decrease by at most {alpha3:.3g} of the cost" in report.summary()
@@ -147,9 +154,8 @@ def test_discount_and_ratio_tell_the_alpha3_of_an_exact_function(gamma):
     slow = LyapunovFunction(lambda states: 40 * (states**2).sum(axis=1), gamma=gamma)
     report = evaluate_lyapunov(*judged, 10, seed=0, lyapunov=slow)
     assert report.alpha3_by_discount < 0 and "decrease by no share of the cost" in report.summary()
-    for arguments in ({"gamma": 1.0}, {"gamma": gamma, "horizon": 5}):
-        other = LyapunovFunction(lambda states: (states**2).sum(axis=1), **arguments)
-        assert math.isnan(evaluate_lyapunov(*judged, 10, seed=0, lyapunov=other).alpha3_by_discount)
+    undiscounted = LyapunovFunction(lambda states: (states**2).sum(axis=1))
+    assert math.isnan(evaluate_lyapunov(*judged, 10, seed=0, lyapunov=undiscounted).alpha3_by_discount)
 
 
 # Other roll-outs
@@ -181,9 +187,9 @@ class NoisyController:
 def test_roll_outs_without_a_seed_are_new_ones(make_env, env_seed):
     # Whatever seed the environment was given before
     env, policy = make_vec_env(make_env, n_envs=2, seed=env_seed), NoisyController()
-    lyapunov = fit_lyapunov(policy, env, 2, n_iterations=1, progress_bar=False)
+    lyapunov = fit_lyapunov(policy, env, 2, progress_bar=False)
     assert lyapunov.seeds == range(lyapunov.seeds.start, lyapunov.seeds.start + 2)
-    with pytest.raises(ValueError, match="that the Lyapunov function was fitted on"):
+    with pytest.raises(ValueError, match="the Lyapunov function was fitted on"):
         certify(policy, env, lyapunov, 2, seed=lyapunov.seeds.start)
     reports = []
     for judge, n_episodes in ((certify, "n_episodes"), (certify, "n_episodes"), (evaluate_lyapunov, "n_eval_episodes")):
@@ -206,16 +212,10 @@ def test_fit_is_reproducible_and_leaves_random_numbers_alone(linear_env, optimal
     for seed in (3, 3, 30):
         th.manual_seed(1)
         np.random.seed(1)
-        values.append(fit_lyapunov(controller, linear_env, 10, seed=seed, n_iterations=2, progress_bar=False).values(points))
+        values.append(fit_lyapunov(controller, linear_env, 10, seed=seed, progress_bar=False).values(points))
         assert (th.rand(1).item(), np.random.rand()) == pytest.approx((0.7576315999, 0.417022004702574))
     np.testing.assert_array_equal(values[0], values[1])
     assert (values[0] != values[2]).any() and (values[0] >= 0).all()
-
-
-def test_function_of_a_numpy_bound_is_saved_and_loaded(linear_env, optimal, tmp_path):
-    fit_lyapunov(optimal[0], linear_env, 2, reward_bound=np.float64(1), seed=np.int64(3), **FIT).save(tmp_path / "l.pt")
-    loaded = FittedLyapunov.load(tmp_path / "l.pt")
-    assert loaded.reward_bound == 1.0 and loaded.seeds == range(3, 13)
 
 
 def test_function_is_saved_and_loaded(optimal, tmp_path):
@@ -226,18 +226,11 @@ def test_function_is_saved_and_loaded(optimal, tmp_path):
     loaded = FittedLyapunov.load(path)
     points = np.random.default_rng(0).uniform(-1, 1, (20, 2))
     np.testing.assert_array_equal(loaded.values(points), lyapunov.values(points))
-    np.testing.assert_array_equal([loaded.low, loaded.high], [lyapunov.low, lyapunov.high])
-    for name in ("average_cost", "level", "window_steps", "ultimate_cost", "reward_bound", "seeds", "alpha3", "gamma"):
+    np.testing.assert_array_equal([loaded.inputs.low, loaded.inputs.high], [lyapunov.inputs.low, lyapunov.inputs.high])
+    for name in ("average_cost", "level", "window_steps", "ultimate_bound", "reward_bound", "seeds", "alpha3", "gamma"):
         assert getattr(loaded, name) == getattr(lyapunov, name), name
     with pytest.raises(ValueError, match="have 3 numbers, the Lyapunov function takes 2"):
         loaded.values(np.ones((1, 3)))
-    # A file of an earlier version does not know where it was fitted
-    content = th.load(path, weights_only=True)
-    th.save({name: value for name, value in content.items() if name not in ("low", "high")}, path)
-    old = FittedLyapunov.load(path)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert (old.values(points) == lyapunov.values(points)).all() and old.values(np.full((1, 2), 99.0)) >= 0
 
 
 class ObservedGoal(gym.ObservationWrapper):
@@ -293,29 +286,14 @@ def test_bound_on_the_mean_cost_is_the_tightest(levels, late_cost):
         assert (m <= -alpha3 * c + alpha3 * bound + 1e-9 * (1 + alpha3 * c.max())).all()
 
 
-class FallsToAHalf(gym.Env):
-    """x falls from 1 .. 2 to 0.5, where it costs 0.25 for ever; episodes end long before."""
-
-    observation_space, action_space = spaces.Box(-10, 10, (1,), np.float32), spaces.Box(-1, 1, (1,), np.float32)
-
-    def __init__(self, n_steps=60):
-        self.n_steps = n_steps
-
-    def reset(self, seed=None, options=None):
-        super().reset(seed=seed)
-        self.x, self.step_number = self.np_random.uniform(1.0, 2.0), 0
-        return np.array([self.x], np.float32), {}
-
-    def step(self, action):
-        self.x = 0.5 + 0.98 * (self.x - 0.5)
-        self.step_number += 1
-        return np.array([self.x], np.float32), -(self.x**2), False, self.step_number == self.n_steps, {}
-
-
 @pytest.mark.parametrize("n_cost_levels", [1, 5])
-def test_nothing_is_said_of_costs_below_those_that_were_seen(n_cost_levels):
-    square = LyapunovFunction(lambda observations: observations[:, 0].astype(float) ** 2)
-    report = evaluate_lyapunov(NoController(), FallsToAHalf(), 20, seed=0, lyapunov=square, n_cost_levels=n_cost_levels)
+def test_nothing_is_said_of_costs_below_those_that_were_seen(n_cost_levels, monkeypatch):
+    monkeypatch.setattr(statistics, "N_COST_LEVELS", n_cost_levels)
+    square = LyapunovFunction(lambda costs: np.where(costs[:, 0] < 99, costs[:, 0].astype(float), 0.25))
+    # x falls from 1 .. 2 to 0.5, where it costs 0.25 for ever; episodes end long before
+    starts = np.random.default_rng(0).uniform(1.0, 2.0, 20)
+    env = PlannedEnv((0.5 + 0.98 ** np.arange(60) * (start - 0.5)) ** 2 for start in starts)
+    report = evaluate_lyapunov(NoController(), env, 20, seed=0, lyapunov=square)
     assert report.metrics["cost_bound"].low >= report.by_cost["cost_low"].min() > 0.25
     assert report.metrics["cost_bound"] == pytest.approx(report.metrics["late_cost"])
     assert report.holds and report.metrics["cost_bound_alpha3"].value > 0
@@ -360,8 +338,8 @@ def test_bound_of_the_cost_errs_on_the_safe_side(linear_env):
     exact = env.noise_std**2 * np.trace(p)
     lyapunov = LyapunovFunction(lambda states: np.einsum("ni,ij,nj->n", states.astype(float), p, states.astype(float)))
     controller = reference_controller(gym.make("LinearCost-v0"))
-    for seed in range(1000, 9000, 1000):
-        metrics = evaluate_lyapunov(controller, linear_env, 20, seed=seed, n_bootstrap=200, lyapunov=lyapunov).metrics
+    for seed in range(1000, 5000, 1000):
+        metrics = evaluate_lyapunov(controller, linear_env, 20, seed=seed, lyapunov=lyapunov).metrics
         assert metrics["residual"].high > exact and metrics["cost_bound"].high > exact
         assert metrics["cost_bound"].value < 1.5 * exact
 
@@ -377,38 +355,31 @@ def test_interval_of_few_episodes_with_a_cost_is_none():
         assert ("too few episodes have a cost" in report.summary()) != enough
 
 
-def test_how_far_costs_must_fall_can_be_said():
-    square = LyapunovFunction(lambda observations: observations[:, 0].astype(float) ** 2)
-    asked = {"lyapunov": square, "seed": 0}
-    assert evaluate_lyapunov(NoController(), FallsToAHalf(), 20, **asked, settled_share=0.4).holds
-    report = evaluate_lyapunov(NoController(), FallsToAHalf(), 20, **asked, settled_share=0.1)
-    assert not report.holds and "is not below 0.1 of the cost of the first steps" in report.summary()
-    for share in (0.0, 1.5, np.nan):
-        with pytest.raises(ValueError, match=r"settled_share=.* must be greater than 0, and at most 1"):
-            evaluate_lyapunov(NoController(), FallsToAHalf(), 20, **asked, settled_share=share)
-
-
-@pytest.mark.parametrize("n", [1, 2, 10, 60])
-@pytest.mark.parametrize("confidence", [0.8, 0.95, 0.983])
+@pytest.mark.parametrize("n", [1, 2, 60])
+@pytest.mark.parametrize("confidence", [0.8, 0.95])
 def test_exact_bounds_cover(n, confidence):
     counts = np.arange(n + 1)
     lower = np.array([exact_lower_bound(int(k), n, confidence) for k in counts])
-    intervals = np.array([exact_interval(int(k), n, confidence) for k in counts])
+    intervals = np.array([exact_interval(int(k), n) for k in counts])
     for probability in (0.01, 0.3, 0.5, 0.9, 0.99, 0.999):
         weights = binom.pmf(counts, n, probability)
         assert weights[lower <= probability].sum() >= confidence - 1e-9
-        assert weights[(intervals[:, 1] <= probability) & (probability <= intervals[:, 2])].sum() >= confidence - 1e-9
+        assert weights[(intervals[:, 1] <= probability) & (probability <= intervals[:, 2])].sum() >= 0.95 - 1e-9
     # Of all trials: (1 - confidence)^(1/n), which is at least 99 % for 300 of 300 with 95 %
     assert lower[-1] == pytest.approx((1 - confidence) ** (1 / n))
 
 
-def test_returns_look_as_far_as_the_trace():
+def test_returns_look_as_far_as_the_trace(monkeypatch):
     costs, next_values = np.array([1.0, 2.0, 4.0, 8.0]), np.array([10.0, 20.0, 30.0, 0.0])
     # Two steps until a time limit, and two until a death, after which nothing is paid
     rows = np.array([[0, 1, -1], [2, 3, -1]])
-    np.testing.assert_allclose(traced_returns(costs, next_values, rows, 0.5, 0.0), costs - 0.5 + next_values)
-    np.testing.assert_allclose(traced_returns(costs, next_values, rows, 0.5, 1.0), [22.0, 21.5, 11.0, 7.5])
-    np.testing.assert_allclose(traced_returns(costs, next_values, rows, 0.0, 0.5), [17.0, 22.0, 23.0, 8.0])
+    for trace_decay, average_cost, expected in (
+        (0.0, 0.5, costs - 0.5 + next_values),
+        (1.0, 0.5, [22.0, 21.5, 11.0, 7.5]),
+        (0.5, 0.0, [17.0, 22.0, 23.0, 8.0]),
+    ):
+        monkeypatch.setattr(fitting, "TRACE_DECAY", trace_decay)
+        np.testing.assert_allclose(traced_returns(costs, next_values, rows, average_cost), expected)
 
 
 def test_shortest_window():
@@ -447,18 +418,29 @@ class PlannedEnv(gym.Env):
 
 
 class NoController:
+    """
+    A controller that does nothing.
+
+    :param answer: Makes of its actions what ``predict`` returns
+    """
+
+    def __init__(self, answer=lambda actions: (actions, None)):
+        self.answer = answer
+
     def predict(self, observation, deterministic=True):
-        return np.zeros((len(observation), 1), np.float32), None
+        return self.answer(np.zeros((len(observation), 1), np.float32))
 
 
 IDENTITY = LyapunovFunction(lambda observations: observations[:, 0])
+FALLS = LyapunovFunction(lambda observations: observations[:, 0])
+FALLS.level, FALLS.window_steps, FALLS.ultimate_bound = 1.8, 1, 1.2
 
 
-def test_statements_count_what_they_say():
+def test_statements_count_what_they_say(monkeypatch):
     settles, rises, stays, dies, rests = [8, 4, 2, 1, 1], [8, 4, 9, 1, 1], [8, 4, 2, 1.5, 1.5], [8, 4, np.inf], [1, 1, 1, 1, 1]
     env = PlannedEnv([settles, rises, stays, dies, rests])
-    report = certify(NoController(), env, IDENTITY, 10, cost_bound=1.2, level=1.8, window_steps=1, seed=0)
-    frame = report.to_frame()
+    report = certify(NoController(), env, FALLS, 10, seed=0)
+    frame = report.statements
     assert frame["n_episodes"].to_dict() == {"survives": 10, "stays_within": 10, "decreases": 8}
     # The late costs are those of the last step; what rests never starts above the level and does not testify
     assert frame["n_true"].to_dict() == {"survives": 8, "stays_within": 6, "decreases": 4}
@@ -470,31 +452,8 @@ def test_statements_count_what_they_say():
     assert "8 of 10" in summary and "Bonferroni" in summary and "no proof of stability" in summary and "seed 0" in summary
     assert len(report.plot().axes) == 2
     # A wider window passes over the rise
-    wide = certify(NoController(), env, IDENTITY, 5, cost_bound=1.2, level=1.8, window_steps=3)
-    assert wide.statements.loc["decreases", "n_true"] == 3
-
-
-def test_confidence_is_never_all():
-    assert [percent(share) for share in (0.5, 0.95, 1 - 0.05 / 3, 0.9999, 0.9999999)] == [
-        "50", "95", "98.33", "99.99", "99.99999"
-    ]  # fmt: skip
-    report = certify(NoController(), PlannedEnv([[1, 1]]), n_episodes=4, confidence=0.9999999, cost_bound=2.0)
-    assert "100 %" not in report.summary() and "99.99999 %" in report.summary()
-    # 0.05 ** (1 / n) of n episodes is 0.99998
-    many = dataclasses.replace(report, statements=report.statements.assign(at_least=0.99998))
-    assert "0.9999 " in many.summary() and "1.0000" not in many.summary()
-
-
-def test_phases_of_single_steps_are_drawn(tmp_path):
-    report = evaluate_lyapunov(NoController(), PlannedEnv([[1], [20]]), 4, lyapunov=IDENTITY)
-    report.plot_phase(0, 0).savefig(tmp_path / "phase.png")
-
-
-def test_all_of_300_means_at_least_99_percent():
-    report = certify(NoController(), PlannedEnv([[1, 1]]), n_episodes=300)
-    assert report.statements.loc["survives", "at_least"] == pytest.approx(0.05 ** (1 / 300))
-    assert 0.05 ** (1 / 300) > 0.99
-    assert report.summary().count("not made") == 2 and "Bonferroni" not in report.summary()
+    monkeypatch.setattr(FALLS, "window_steps", 3)
+    assert certify(NoController(), env, FALLS, 5).statements.loc["decreases", "n_true"] == 3
 
 
 def test_region_of_attraction_on_a_grid():
@@ -503,27 +462,16 @@ def test_region_of_attraction_on_a_grid():
     # Three environments do not divide the twenty episodes
     env = make_vec_env("CartPoleCost-v0", n_envs=3)
     controller = reference_controller(gym.make("CartPoleCost-v0"))
-    report = certify(controller, env, n_episodes=3, cost_bound=0.05, starts=starts, n_episodes_per_start=5, seed=0)
+    report = certify(controller, env, n_episodes=3, ultimate_bound=0.05, starts=starts, n_episodes_per_start=5, seed=0)
     frame = report.starts
     np.testing.assert_array_equal(frame[[f"state_{k}" for k in range(4)]], starts)
     assert frame["n_attracted"].tolist() == [5, 5, 5, 0]
     assert (frame["low"] <= frame["share"]).all() and (frame["share"] <= frame["high"]).all()
-    assert frame["low"].iloc[0] == exact_interval(5, 5, 0.95).low
-    assert "3 of 4 start states" not in report.summary() or frame["low"].iloc[0] >= 0.5
+    assert frame["low"].iloc[0] == exact_interval(5, 5).low
+    assert "0 of 4 start states" in report.summary() or frame["low"].iloc[0] >= 0.5
     assert len(report.plot_region_of_attraction(2, 3).axes) == 2
     with pytest.raises(ValueError, match="There are no start states"):
         certify(controller, env, n_episodes=3).plot_region_of_attraction()
-
-
-def test_env_that_ignores_starts_is_refused():
-    with pytest.raises(ValueError, match="the same state whatever reset"):
-        certify(NoController(), PlannedEnv([[1, 1]]), n_episodes=2, cost_bound=1.0, starts=np.array([[1.0], [2.0]]))
-    # Also if there is only one
-    with pytest.raises(ValueError, match="the same state whatever reset"):
-        certify(NoController(), PlannedEnv([[1, 1]]), n_episodes=2, cost_bound=1.0, starts=[[5.0]])
-    controller = reference_controller(gym.make("LinearCost-v0"))
-    report = certify(controller, gym.make("LinearCost-v0"), n_episodes=2, cost_bound=1.0, starts=[[0.5, 0.5]], seed=0)
-    assert report.starts["n_attracted"].tolist() == [10]
 
 
 def test_starts_need_not_be_seen():
@@ -532,7 +480,7 @@ def test_starts_need_not_be_seen():
         gym.make("LinearCost-v0"), lambda observation: observation[:1], spaces.Box(-np.inf, np.inf, (1,), np.float32)
     )
     starts = [[x, y] for x in (-0.5, 0.5) for y in (-0.5, 0.0, 0.5)]
-    assert len(certify(NoController(), env, n_episodes=1, cost_bound=1.0, starts=starts).starts) == 6
+    assert len(certify(NoController(), env, n_episodes=1, ultimate_bound=1.0, starts=starts).starts) == 6
 
 
 def test_env_that_takes_one_start_for_all_is_refused_before_the_episodes():
@@ -547,15 +495,8 @@ def test_env_that_takes_one_start_for_all_is_refused_before_the_episodes():
         gym.make_vec("LinearCost-v0", num_envs=2, vector_kwargs={"autoreset_mode": "SameStep"})
     )
     with pytest.raises(ValueError, match="takes the same options for all"):
-        certify(controller, env, n_episodes=2, cost_bound=1.0, starts=[[0.5, 0.5], [0.5, 0.0]])
+        certify(controller, env, n_episodes=2, ultimate_bound=1.0, starts=[[0.5, 0.5], [0.5, 0.0]])
     assert controller.calls == 0
-
-
-def test_starts_of_wrappers_that_reuse_their_arrays():
-    training, env = (VecFrameStack(make_vec_env("LinearCost-v0", n_envs=2), 2) for _ in range(2))
-    model = PPO("MlpPolicy", training, n_steps=8, batch_size=16, device="cpu")
-    report = certify(model, env, n_episodes=2, cost_bound=9.0, starts=[[1.0, 0.0], [0.0, 1.0]])
-    assert len(report.starts) == 2
 
 
 # Deaths
@@ -578,30 +519,12 @@ def test_death_is_no_decrease():
     assert not report.holds and "5 of 10 episodes died" in report.summary()
 
 
-def test_training_and_evaluation_count_terminal_transitions_alike(make_model, make_env, monkeypatch):
-    model = make_model(
-        make_env(terminate=True, episode_length=2), n_collect=64, learning_starts=64, batch_size=64, learning_rate=1e-12
-    )
-    buffer = model.replay_buffer
-    everything = buffer._get_samples(np.arange(64))
-    monkeypatch.setattr(buffer, "sample", lambda *_, **__: everything)
-    th.manual_seed(0)
-    model.train(1, batch_size=64)
-    th.manual_seed(0)
-    with th.no_grad():
-        model.actor.action_log_prob(everything.observations)
-        next_actions = model.actor(everything.next_observations)
-        values = model.critic.lyapunov(everything.observations, everything.actions)
-        next_values = model.critic.lyapunov(everything.next_observations, next_actions)
-        terms = next_values - values - model.alpha3 * everything.rewards
-    expected = terms[everything.dones == 0].mean().item()
-    assert model.logger.name_to_value["train/lyapunov_difference"] == pytest.approx(expected, rel=1e-4)
-
-
-def test_states_that_die_have_a_large_value():
+def test_states_that_die_have_a_large_value(monkeypatch):
+    monkeypatch.setattr(fitting, "N_ITERATIONS", 60)
+    monkeypatch.setattr(fitting, "BATCH_SIZE", 64)
     # The same first cost; the one dies of it, the other settles
     env = PlannedEnv([[3, 50, np.inf], [4, 2, 1, 1, 1, 1, 1, 1]])
-    lyapunov = fit_lyapunov(NoController(), env, 60, seed=0, n_iterations=60, batch_size=64, progress_bar=False)
+    lyapunov = fit_lyapunov(NoController(), env, 60, seed=0, progress_bar=False)
     dying, settling = lyapunov.values(np.array([[3.0], [4.0]]))
     assert dying > 3 * settling
 
@@ -634,24 +557,6 @@ def test_memory_of_a_policy_is_kept_within_an_episode():
     policy = Counter()
     certify(policy, PlannedEnv([[1, 1, 1]]), n_episodes=2)
     assert np.concatenate(policy.calls).tolist() == [0, 1, 2, 0, 1, 2]
-
-
-class Scheduled:
-    """Acts by a count of its own, that begins anew where an episode does."""
-
-    def __init__(self):
-        self.starts = []
-
-    def predict(self, observation, state=None, episode_start=None, deterministic=False):
-        self.starts += episode_start.tolist()
-        return np.zeros((len(observation), 1), np.float32), None
-
-
-def test_controllers_know_where_episodes_start():
-    """As in ``evaluate_policy()``; and they are asked for no action that is not taken."""
-    policy = Scheduled()
-    evaluate_lyapunov(policy, PlannedEnv([[3, 2, 1]]), 2, lyapunov=IDENTITY)
-    assert policy.starts == [True, False, False] * 2
 
 
 class Masked:
@@ -704,7 +609,7 @@ def test_costs_of_other_functions_are_those_of_the_env(make_env):
     model.learn(100)
     eval_env = VecNormalize(make_vec_env(make_env, n_envs=2), gamma=0.9, training=False)
     eval_env.obs_rms, eval_env.ret_rms = env.obs_rms, env.ret_rms
-    lyapunov = fit_lyapunov(model, eval_env, 4, seed=0, n_iterations=2, progress_bar=False)
+    lyapunov = fit_lyapunov(model, eval_env, 4, seed=0, progress_bar=False)
     report = evaluate_lyapunov(model, eval_env, 4, seed=10, lyapunov=lyapunov)
     states = eval_env.unnormalize_obs(report.observations)
     np.testing.assert_allclose(report.transitions["cost"], np.sum(states**2, axis=1), rtol=1e-3, atol=1e-4)
@@ -713,7 +618,7 @@ def test_costs_of_other_functions_are_those_of_the_env(make_env):
     certify(model, only_observations, lyapunov, 2, seed=10)
     with pytest.raises(ValueError, match="has no normalization, but the training environment has norm_obs=True"):
         certify(model, make_env())
-    with pytest.raises(ValueError, match="is the training environment: SAC would go on"):
+    with pytest.raises(ValueError, match="is the training environment"):
         certify(model, model.get_env())
 
 
@@ -723,83 +628,17 @@ def test_critic_is_a_function_of_the_observation(make_model, make_env):
     observations = np.random.default_rng(0).normal(size=(5, 2)).astype(np.float32)
     actions, _ = model.predict(observations, deterministic=True)
     np.testing.assert_array_equal(lyapunov.values(observations), model.policy.predict_lyapunov(observations, actions))
-    report = certify(model, make_env(), lyapunov, 3, level=0.0, window_steps=2, cost_bound=1.0, seed=10)
+    report = certify(model, make_env(), lyapunov, 3, ultimate_bound=1.0, seed=10)
     assert "lyapunov" in report.transitions and len(report.episodes) == 3
 
 
-@pytest.mark.parametrize(
-    ("call", "arguments", "message"),
-    [
-        (certify, {"confidence": 1.0}, "confidence=1.0 must be a number between 0 and 1"),
-        (certify, {"n_episodes": 0}, "^n_episodes=0 must be at least 1"),
-        (certify, {"window_steps": 0}, "window_steps=0"),
-        (certify, {"window_steps": 2.5}, "window_steps=2.5 must be at least 1, and a whole number"),
-        (certify, {"cost_bound": np.nan}, "cost_bound=nan must be a number"),
-        (certify, {"level": np.nan}, "level=nan must be a number"),
-        (certify, {"lyapunov": np.sum}, "must be a LyapunovFunction"),
-        (certify, {"n_episodes_per_start": 0}, "n_episodes_per_start=0"),
-        (certify, {"starts": np.ones(3), "cost_bound": 1.0}, r"starts of shape \(3,\)"),
-        (certify, {"starts": np.ones((3, 1))}, "give one, or a fitted lyapunov"),
-        (fit_lyapunov, {"n_episodes": 0}, "^n_episodes=0"),
-        (fit_lyapunov, {"n_iterations": 0}, "n_iterations=0"),
-        (fit_lyapunov, {"learning_rate": 0.0}, "learning_rate=0.0"),
-        (fit_lyapunov, {"trace_decay": 1.5}, "trace_decay=1.5"),
-        (fit_lyapunov, {"reward_bound": -1.0}, "reward_bound=-1.0"),
-    ],
-)
-def test_wrong_arguments_are_named_before_any_work(call, arguments, message):
-    env = PlannedEnv([[1, 1]])
-    with pytest.raises(ValueError, match=message):
-        call(NoController(), env, **arguments)
-    assert not hasattr(env, "costs")
-
-
-def test_what_says_nothing_is_refused():
-    with pytest.raises(ValueError, match="has no method predict"):
-        certify(None, PlannedEnv([[1, 1]]))
-    with pytest.raises(ValueError, match="has no method predict"):
-        certify(NoController, PlannedEnv([[1, 1]]))
-    with pytest.raises(ValueError, match=r"pass sb3_lac.GymnasiumVecEnv\(env\)"):
-        certify(NoController(), gym.make_vec("LinearCost-v0", num_envs=2))
-    with pytest.raises(ValueError, match=r"env='LinearCost-v0' is no environment: pass that of gym.make"):
-        certify(NoController(), "LinearCost-v0")
-    with pytest.raises(ValueError, match="observation that is NaN"):
-        certify(NoController(), gym.wrappers.TransformObservation(PlannedEnv([[1, 1]]), lambda _: np.full(1, np.nan), None))
-    with pytest.raises(ValueError, match="Nothing had a cost"):
-        fit_lyapunov(NoController(), PlannedEnv([[0, 0]]), 3, progress_bar=False)
-    with pytest.raises(ValueError, match="reward that is not finite"):
-        fit_lyapunov(NoController(), PlannedEnv([[np.nan, 0]]), 3, progress_bar=False)
-    with pytest.raises(ValueError, match="A reward of 2 is positive"):
-        certify(NoController(), PlannedEnv([[-2, 1]]), n_episodes=2, cost_bound=1.0)
-
-
-def test_fit_that_diverges_is_refused(linear_env, optimal):
-    with pytest.raises(ValueError, match="The fit diverged"):
-        fit_lyapunov(optimal[0], linear_env, 5, learning_rate=1e30, progress_bar=False)
-
-
-def test_device_of_a_controller_may_be_a_name():
-    class OnTheCPU(NoController):
-        device = "cpu"
-
-    assert certify(OnTheCPU(), PlannedEnv([[1, 1]]), n_episodes=2).statements.loc["survives", "n_true"] == 2
-
-
-def test_where_the_function_does_not_fall_at_the_largest_cost_nothing_holds():
-    # L is flat above a cost of 6
-    lyapunov = LyapunovFunction(lambda observations: np.minimum(observations[:, 0].astype(float), 6.0))
-    report = evaluate_lyapunov(NoController(), PlannedEnv([[10, 9, 1, 0.5]]), 4, lyapunov=lyapunov, n_cost_levels=4, seed=0)
+def test_where_the_function_does_not_fall_at_the_largest_cost_nothing_holds(monkeypatch):
+    monkeypatch.setattr(statistics, "N_COST_LEVELS", 4)
+    # L is flat above a cost of 6, and 0 at the end
+    lyapunov = LyapunovFunction(lambda seen: np.where(seen[:, 0] < 99, np.minimum(seen[:, 0], 6.0), 0.0))
+    report = evaluate_lyapunov(NoController(), PlannedEnv([[10, 9, 1, 0.5]]), 4, lyapunov=lyapunov, seed=0)
     assert report.by_cost["drift"].iloc[-1] == 0.0
     assert not report.holds and "does not decrease where the cost is largest" in report.summary()
-
-
-def test_callbacks_refuse_seeds_and_environments_before_the_training(make_env):
-    model = SAC("MlpPolicy", make_env(), buffer_size=10)
-    with pytest.raises(ValueError, match="seed=-1 must be a whole number of at least 0"):
-        model.learn(10, callback=CertificateCallback(make_env(), seed=-1))
-    assert model.num_timesteps == 0
-    with pytest.raises(ValueError, match="GymnasiumVecEnv"):
-        CertificateCallback(gym.make_vec("LinearCost-v0", num_envs=2))
 
 
 # Callback
@@ -837,25 +676,6 @@ def test_callback_needs_no_more_alike_than_the_normalization(make_env, norm_obs)
     if norm_obs:
         np.testing.assert_array_equal(env.obs_rms.mean, training.obs_rms.mean)
         assert env.ret_rms.var == training.ret_rms.var
-
-
-@pytest.mark.parametrize("question", [{"confidence": 95}, {"cost_bound": "small"}])
-def test_callback_refuses_questions_before_the_training(make_env, question):
-    model = SAC("MlpPolicy", make_env(), policy_kwargs={"net_arch": [8]}, buffer_size=100)
-    (name,) = question
-    with pytest.raises(ValueError, match=f"{name}={question[name]!r} must be a number"):
-        model.learn(20, callback=CertificateCallback(make_env(), eval_freq=10, **question))
-    assert model.num_timesteps == 0
-
-
-def test_callback_shows_intervals_and_figures_in_tensorboard(make_env, tmp_path):
-    model = SAC("MlpPolicy", make_env(), learning_starts=100, policy_kwargs={"net_arch": [8]}, buffer_size=100, seed=0)
-    model.set_logger(configure(str(tmp_path), ["tensorboard"]))
-    model.learn(10, callback=CertificateCallback(make_env(), n_eval_episodes=2, eval_freq=10, verbose=0))
-    events = EventAccumulator(str(tmp_path)).Reload()
-    assert set(events.Tags()["images"]) == {"certificate/drift", "certificate/statements"}
-    low, value, high = (events.Scalars(f"certificate/mean_cost{end}")[0].value for end in ("_low", "", "_high"))
-    assert low <= value <= high
 
 
 def test_callback_certifies_any_algorithm_and_changes_nothing(make_env, tmp_path):
@@ -903,47 +723,94 @@ class ConstantEnv(gym.Env):
         return np.array([self.place], np.float32), self.rewards(self.place), False, self.n_steps >= 10, {}
 
 
-class Resting:
-    """
-    A controller that does nothing.
-
-    :param answer: Makes of its actions what ``predict`` returns
-    """
-
-    def __init__(self, answer=lambda actions: (actions, None)):
-        self.answer = answer
-
-    def predict(self, observation, deterministic=True):
-        return self.answer(np.zeros((len(observation), 1), np.float32))
-
-
 @pytest.mark.parametrize("make_vec", [DummyVecEnv, SubprocVecEnv])
 def test_a_cost_of_the_bound_is_within_the_bound_in_all_vector_environments(make_vec):
     # Some hold rewards in single precision, where 0.1 is a little more than 0.1
-    env = make_vec([lambda: ConstantEnv(lambda place: -0.1)] * 2)
-    report = certify(Resting(), env, n_episodes=4, cost_bound=0.1, starts=[[0.0], [1.0]], seed=0)
+    options = {"start_method": "fork"} if make_vec is SubprocVecEnv else {}
+    env = make_vec([lambda: ConstantEnv(lambda place: -0.1)] * 2, **options)
+    report = certify(NoController(), env, n_episodes=4, ultimate_bound=0.1, starts=[[0.0], [1.0]], seed=0)
     assert report.statements.loc["stays_within", "n_true"] == 4 and (report.starts["share"] == 1).all()
-    assert certify(Resting(), env, n_episodes=4, cost_bound=0.0999, seed=0).statements.loc["stays_within", "n_true"] == 0
+    assert (
+        certify(NoController(), env, n_episodes=4, ultimate_bound=0.0999, seed=0).statements.loc["stays_within", "n_true"] == 0
+    )
     env.close()
 
 
-def test_positive_rewards_of_the_start_grid_need_a_bound_too():
-    env = ConstantEnv(lambda place: 1.0 if place > 5 else -0.1)
-    with pytest.raises(ValueError, match="reward of 1 is positive, and it is not known which reward costs nothing"):
-        certify(Resting(), env, n_episodes=2, cost_bound=0.5, starts=[[0.0], [10.0]], seed=0)
-    known = LyapunovFunction(lambda states: states[:, 0] ** 2, reward_bound=1.0)
-    starts = certify(Resting(), env, known, n_episodes=2, cost_bound=0.5, starts=[[0.0], [10.0]], seed=0).starts
-    assert starts["share"].tolist() == [0.0, 1.0]
+def test_a_controller_that_returns_something_else_is_told_what_is_expected():
+    env = DummyVecEnv([lambda: ConstantEnv(lambda place: -0.1)] * 2)
+    for answer, match in (
+        (lambda actions: actions, r"NoController returned ndarray, and must return two things"),
+        (lambda actions: actions.tolist(), r"NoController returned list, and must return two things"),
+        (lambda actions: (actions[0], None), r"actions of shape \(1,\), and must return one for each of 2 environments"),
+    ):
+        with pytest.raises(ValueError, match=match):
+            certify(NoController(answer), env, n_episodes=2, seed=0)
+    # A list of actions is as good as an array
+    assert len(certify(NoController(lambda actions: (actions.tolist(), None)), env, n_episodes=2, seed=0).episodes) == 2
+
+
+def test_300_of_300_means_at_least_99_percent():
+    report = certify(NoController(), PlannedEnv([[1, 1]]), n_episodes=300)
+    assert report.statements.loc["survives", "at_least"] == pytest.approx(0.05 ** (1 / 300))
+    assert report.summary().count("not made") == 2
+    # A lower bound is not rounded up
+    many = dataclasses.replace(report, statements=report.statements.assign(at_least=0.99998))
+    assert "0.9999 " in many.summary() and "1.0000" not in many.summary()
+
+
+# Refusals
+
+
+def showing(observation):
+    return gym.wrappers.TransformObservation(PlannedEnv([[1, 1]]), lambda _: np.full(1, observation), None)
+
+
+ONES = PlannedEnv([[1, 1]])
+SOMETIMES_PAID = ConstantEnv(lambda place: 1.0 if place > 5 else -0.1)
+
+
+@pytest.mark.parametrize(
+    ("call", "env", "arguments", "message"),
+    [
+        (certify, ONES, {"n_episodes": 0}, "number of episodes must be a whole number of at least 1, and not 0"),
+        (certify, ONES, {"n_episodes": 2.5}, "of at least 1, and not 2.5"),
+        (certify, ONES, {"seed": -1}, "seed=-1 must be a whole number of at least 0"),
+        (certify, ONES, {"ultimate_bound": np.nan}, "ultimate_bound=nan must be a number"),
+        (certify, ONES, {"lyapunov": np.sum}, r"must be a LyapunovFunction: .*LyapunovFunction\(function\)"),
+        (certify, ONES, {"starts": np.ones((3, 1)), "n_episodes_per_start": 0}, "n_episodes_per_start=0"),
+        (certify, ONES, {"starts": np.ones(3), "ultimate_bound": 1.0}, r"starts of shape \(3,\)"),
+        (certify, ONES, {"starts": np.ones((3, 1))}, "give one, or a fitted lyapunov"),
+        (certify, ONES, {"starts": [[1.0], [2.0]], "ultimate_bound": 1.0}, "the same state whatever reset"),
+        (certify, ONES, {"starts": [[5.0]], "ultimate_bound": 1.0}, "the same state whatever reset"),
+        (certify, PlannedEnv([[-2, 1]]), {"ultimate_bound": 1.0}, "A reward of 2 is positive, and it is not known"),
+        (certify, SOMETIMES_PAID, {"starts": [[0.0], [10.0]], "ultimate_bound": 0.5}, "A reward of 1 is positive"),
+        (evaluate_lyapunov, PlannedEnv([[-2, 1]]), {"lyapunov": IDENTITY}, "A reward of 2 is positive"),
+        (evaluate_lyapunov, ONES, {}, "must be a LAC model.*CertificateCallback"),
+        (certify, "LinearCost-v0", {}, r"env='LinearCost-v0' is no environment: pass that of gym.make"),
+        (certify, gym.make_vec("LinearCost-v0", num_envs=2), {}, r"pass sb3_lac.GymnasiumVecEnv\(env\)"),
+        (certify, showing(np.nan), {}, "observation that is NaN"),
+        (fit_lyapunov, showing(np.inf), {"n_episodes": 2}, "infinite observation"),
+        (fit_lyapunov, PlannedEnv([[0, 0]]), {}, "Nothing had a cost"),
+        (fit_lyapunov, PlannedEnv([[np.nan, 0]]), {}, "reward that is not finite"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused(call, env, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        call(NoController(), env, **arguments)
+
+
+@pytest.mark.parametrize("policy", [None, NoController])
+def test_a_policy_has_a_method_predict(policy):
+    with pytest.raises(ValueError, match="has no method predict"):
+        certify(policy, ONES)
 
 
 @pytest.mark.parametrize(
     ("argument", "value"),
     [
-        *(("reward_bound", value) for value in (-1.0, math.nan, math.inf, "1")),
-        *(("gamma", value) for value in (2.0, -0.1, math.nan, None)),
-        *(("horizon", value) for value in (0, 2.5)),
-        *(("alpha3", value) for value in (0.0, -1.0, math.inf, "1")),
-        ("average_cost", math.nan),
+        *(("reward_bound", value) for value in (-1.0, math.inf, "1")),
+        *(("gamma", value) for value in (2.0, math.nan, None)),
+        *(("alpha3", value) for value in (0.0, math.inf, "1")),
     ],
 )
 def test_numbers_that_no_function_can_have_are_refused(argument, value):
@@ -951,14 +818,22 @@ def test_numbers_that_no_function_can_have_are_refused(argument, value):
         LyapunovFunction(lambda states: states[:, 0] ** 2, **{argument: value})
 
 
-def test_a_controller_that_returns_something_else_is_told_what_is_expected():
-    env = DummyVecEnv([lambda: ConstantEnv(lambda place: -0.1)] * 2)
-    for answer, match in (
-        (lambda actions: actions, r"Resting returned ndarray, and must return two things"),
-        (lambda actions: actions.tolist(), r"Resting returned list, and must return two things"),
-        (lambda actions: (actions[0], None), r"actions of shape \(1,\), and must return one for each of 2 environments"),
-    ):
-        with pytest.raises(ValueError, match=match):
-            certify(Resting(answer), env, n_episodes=2, seed=0)
-    # A list of actions is as good as an array
-    assert len(certify(Resting(lambda actions: (actions.tolist(), None)), env, n_episodes=2, seed=0).episodes) == 2
+def test_fit_that_diverges_is_refused(linear_env, optimal, monkeypatch):
+    monkeypatch.setattr(fitting, "LEARNING_RATE", 1e30)
+    with pytest.raises(ValueError, match="The fit diverged"):
+        fit_lyapunov(optimal[0], linear_env, 5, **FIT)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"seed": -1}, "seed=-1 must be a whole number of at least 0"),
+        ({"n_eval_episodes": -1}, "and not -1"),
+        ({"ultimate_bound": "small"}, "ultimate_bound='small' must be a number"),
+    ],
+)
+def test_callback_refuses_questions_before_the_training(make_env, arguments, message):
+    model = SAC("MlpPolicy", make_env(), buffer_size=10)
+    with pytest.raises(ValueError, match=message):
+        model.learn(10, callback=CertificateCallback(make_env(), **arguments))
+    assert model.num_timesteps == 0

@@ -1,5 +1,6 @@
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -16,122 +17,150 @@ from sb3_lac.onnx import export_onnx
 SMALL = {"net_arch": [16, 16]}  # copied, since Stable-Baselines3 writes into it
 
 
+class Spaces(gym.Env):
+    """Nothing but its spaces."""
+
+    def __init__(self, observation_space, action_space):
+        self.observation_space, self.action_space = observation_space, action_space
+
+
+def new_model(algorithm=LAC, env="Pendulum-v1", **kwargs):
+    return algorithm("MlpPolicy", env, seed=0, device="cpu", policy_kwargs=dict(SMALL), **kwargs)
+
+
+def normalized(mean, var, env_id="LinearCost-v0", **kwargs):
+    env = VecNormalize(make_vec_env(env_id), **kwargs)
+    env.obs_rms.mean, env.obs_rms.var = np.array(mean), np.array(var)
+    return env
+
+
+def assert_alike(policy, model, observations, seen=None):
+    expected, _ = model.predict(observations if seen is None else seen, deterministic=True)
+    np.testing.assert_allclose(policy.predict(observations)[0], expected, atol=1e-5)
+
+
 @pytest.mark.parametrize("algorithm", [LAC, SAC, TD3, TQC, PPO])
 def test_the_file_does_what_the_policy_does(algorithm, tmp_path):
-    # torch.compile switches it off for the whole process
-    validates = th.distributions.Distribution._validate_args
-    model = algorithm("MlpPolicy", "Pendulum-v1", seed=0, device="cpu", policy_kwargs=dict(SMALL))
+    model = new_model(algorithm)
     policy = OnnxPolicy(export_onnx(model, tmp_path / "policy"))
     observations = np.array([model.observation_space.sample() for _ in range(100)])
-    expected, _ = model.predict(observations, deterministic=True)
-    np.testing.assert_allclose(policy.predict(observations)[0], expected, atol=1e-5)
-    np.testing.assert_allclose(policy.predict(observations[:1])[0], expected[:1], atol=1e-5)
+    assert_alike(policy, model, observations)
+    assert_alike(policy, model, observations[:1])
     assert policy.env_id == "Pendulum-v1" and policy.description["algorithm"] == algorithm.__name__
     assert policy.observation_shape == (3,)
-    # The model is as it was, and nothing else was written
+    # Nothing else was written, and the file does not say where the code lies
     assert [file.name for file in tmp_path.iterdir()] == ["policy.onnx"]
-    # Nor does the file say where the code lies
     content = (tmp_path / "policy.onnx").read_bytes()
     assert str(Path(onnx.__file__).parent).encode() not in content and b"site-packages" not in content
-    assert th.distributions.Distribution._validate_args == validates
+
+
+@pytest.mark.parametrize("checked", [True, False])
+def test_torch_checks_distributions_afterwards_if_it_did_before(checked, tmp_path):
+    # torch.compile switches it off for the whole process
+    th.distributions.Distribution.set_default_validate_args(checked)
+    try:
+        export_onnx(new_model(), tmp_path / "policy")
+        if checked:
+            with pytest.raises(ValueError, match="GreaterThan"):
+                th.distributions.Normal(0.0, -1.0)
+        else:
+            th.distributions.Normal(0.0, -1.0)
+    finally:
+        th.distributions.Distribution.set_default_validate_args(True)
 
 
 def test_observations_are_normalized_as_in_training(tmp_path):
-    env = VecNormalize(make_vec_env("LinearCost-v0"), clip_obs=2.0)
-    env.obs_rms.mean, env.obs_rms.var = np.array([3.0, -1.0]), np.array([4.0, 0.01])
-    model = LAC("MlpPolicy", env, seed=0, device="cpu", policy_kwargs=dict(SMALL))
-    policy = OnnxPolicy(export_onnx(model, tmp_path / "policy.onnx"))
+    env = normalized([3.0, -1.0], [4.0, 0.01], clip_obs=2.0)
     observations = np.random.default_rng(0).uniform(-10, 10, (50, 2)).astype(np.float32)
-    expected, _ = model.predict(env.normalize_obs(observations), deterministic=True)
-    np.testing.assert_allclose(policy.predict(observations)[0], expected, atol=1e-5)
-
-
-def test_a_model_without_its_environment_needs_to_be_told_of_the_normalization(tmp_path):
-    env = VecNormalize(make_vec_env("LinearCost-v0"))
-    env.obs_rms.mean, env.obs_rms.var = np.array([3.0, -1.0]), np.array([4.0, 0.01])
-    LAC("MlpPolicy", env, seed=0, device="cpu", policy_kwargs=dict(SMALL)).save(tmp_path / "model")
-    model = LAC.load(tmp_path / "model", device="cpu")
-    for exported in (model, model.policy):
+    model = new_model(env=env)
+    assert_alike(OnnxPolicy(export_onnx(model, tmp_path / "p")), model, observations, env.normalize_obs(observations))
+    # A model without its environment needs to be told
+    model.save(tmp_path / "model")
+    loaded = LAC.load(tmp_path / "model", device="cpu")
+    for exported in (loaded, loaded.policy):
         with pytest.warns(UserWarning, match="has no environment that says whether observations were normalized"):
             export_onnx(exported, tmp_path / f"{type(exported).__name__}.onnx")
-    policy = OnnxPolicy(export_onnx(model, tmp_path / "policy.onnx", vec_normalize=env))
-    observations = np.random.default_rng(0).uniform(-10, 10, (50, 2)).astype(np.float32)
+    policy = OnnxPolicy(export_onnx(loaded, tmp_path / "told", vec_normalize=env))
+    assert_alike(policy, model, observations, env.normalize_obs(observations))
+
+
+def test_a_mean_far_larger_than_the_deviation_loses_no_digits():
+    env = normalized(np.full(3, 29_315.123_456_7), np.full(3, 0.01), "Pendulum-v1", clip_obs=10.0)
+    model = new_model(PPO, env)
+    observations = (29_315.0 + np.random.default_rng(0).uniform(-0.5, 0.5, (200, 3))).astype(np.float32)
     expected, _ = model.predict(env.normalize_obs(observations), deterministic=True)
-    np.testing.assert_allclose(policy.predict(observations)[0], expected, atol=1e-5)
-
-
-def test_actions_are_float32(tmp_path):
-    model = SAC("MlpPolicy", "Pendulum-v1", seed=0, device="cpu", policy_kwargs=dict(SMALL), _init_setup_model=False)
-    model.action_space = spaces.Box(-1.0, 3.0, (1,), np.float64)
-    model._setup_model()
-    policy = OnnxPolicy(export_onnx(model, tmp_path / "policy"))
-    observations = np.array([model.observation_space.sample() for _ in range(5)])
-    actions, _ = policy.predict(observations)
-    assert actions.dtype == np.float32
-    np.testing.assert_allclose(actions, model.predict(observations, deterministic=True)[0], atol=1e-5)
+    with th.no_grad():
+        actions = onnx.DeterministicPolicy(model.policy, env)(th.as_tensor(observations)).numpy()
+    np.testing.assert_allclose(actions, expected, atol=1e-6)
 
 
 def test_all_of_it_is_on_the_device_of_the_policy():
-    model = PPO("MlpPolicy", VecNormalize(make_vec_env("LinearCost-v0")), device="cpu", policy_kwargs=dict(SMALL))
+    model = new_model(PPO, VecNormalize(make_vec_env("LinearCost-v0")))
     # A device that every machine has
     module = onnx.DeterministicPolicy(model.policy.to("meta"), model.get_vec_normalize_env())
     assert {tensor.device.type for tensor in (*module.parameters(), *module.buffers())} == {"meta"}
 
 
-def test_policies_with_a_memory_are_refused(tmp_path):
-    model = RecurrentPPO("MlpLstmPolicy", "Pendulum-v1", device="cpu", n_steps=8, policy_kwargs={"lstm_hidden_size": 4})
-    with pytest.raises(ValueError, match="RecurrentActorCriticPolicy has a memory"):
-        export_onnx(model, tmp_path / "policy")
-
-
-def test_gsde_exports_its_mean(tmp_path):
-    model = LAC("MlpPolicy", "Pendulum-v1", use_sde=True, seed=0, device="cpu", policy_kwargs=dict(SMALL))
+@pytest.mark.parametrize(
+    ("algorithm", "low", "high", "dtype", "kwargs"),
+    [
+        (SAC, [-1.0], [3.0], np.float64, {}),
+        (PPO, [-1.0, 0.5], [1.0, 0.5], np.float32, {}),  # the second action has no choice
+        (LAC, [-1.0], [1.0], np.float32, {"use_sde": True}),
+    ],
+)
+def test_actions_are_those_of_the_mean_in_float32(algorithm, low, high, dtype, kwargs, tmp_path):
+    action_space = spaces.Box(np.array(low, dtype), np.array(high, dtype), dtype=dtype)
+    model = new_model(algorithm, Spaces(spaces.Box(-1, 1, (2,)), action_space), **kwargs)
     policy = OnnxPolicy(export_onnx(model, tmp_path / "policy"))
-    observations = np.array([model.observation_space.sample() for _ in range(20)])
-    np.testing.assert_allclose(policy.predict(observations)[0], model.predict(observations, deterministic=True)[0], atol=1e-5)
+    observations = np.array([model.observation_space.sample() for _ in range(5)])
+    assert policy.predict(observations)[0].dtype == np.float32
+    assert_alike(policy, model, observations)
 
 
 def test_a_calibration_policy_runs_without_torch(tmp_path):
-    model = LAC("MlpPolicy", "BatteryRo-v0", seed=0, device="cpu", policy_kwargs=dict(SMALL))
+    model = new_model(env="BatteryRo-v0")
     policy = OnnxPolicy(export_onnx(model, tmp_path / "policy"))
     discharge = TrajectoryDataset.paper("r_o")[0]
     estimate = PolicyEstimator(policy, policy.env_id).estimate(discharge)
     assert estimate.r_o == pytest.approx(PolicyEstimator(model, "BatteryRo-v0").estimate(discharge).r_o, rel=1e-4)
 
 
-def test_nothing_is_overwritten(tmp_path):
-    model = LAC("MlpPolicy", "Pendulum-v1", device="cpu", policy_kwargs=dict(SMALL))
-    (tmp_path / "policy.onnx").write_text("mine")
-    with pytest.raises(FileExistsError, match=r"policy\.onnx exists"):
-        export_onnx(model, tmp_path / "policy")
-    assert (tmp_path / "policy.onnx").read_text() == "mine"
-
-
-def test_a_file_that_does_something_else_is_not_written(tmp_path, monkeypatch):
-    model = LAC("MlpPolicy", "Pendulum-v1", device="cpu", policy_kwargs=dict(SMALL))
-    monkeypatch.setattr(onnx, "TOLERANCE", -1.0)
-    with pytest.raises(ValueError, match="differs from the original"):
-        export_onnx(model, tmp_path / "policy")
+@pytest.mark.parametrize(
+    ("make_model", "message"),
+    [
+        (lambda: PPO("MlpPolicy", "CartPole-v1", device="cpu"), r"action space Discrete\(2\) must be a Box"),
+        (
+            lambda: RecurrentPPO("MlpLstmPolicy", "Pendulum-v1", n_steps=8, policy_kwargs={"lstm_hidden_size": 4}),
+            "RecurrentActorCriticPolicy has a memory",
+        ),
+        (
+            lambda: new_model(PPO, VecFrameStack(VecNormalize(make_vec_env("LinearCost-v0")), 2)),
+            r"normalizes observations of shape \(2,\), and those of the policy have \(4,\)",
+        ),
+    ],
+)
+def test_what_has_no_export_is_refused(make_model, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        export_onnx(make_model(), tmp_path / "policy")
     assert not list(tmp_path.iterdir())
 
 
-def test_other_spaces_are_refused(tmp_path):
-    model = PPO("MlpPolicy", "CartPole-v1", device="cpu")
-    with pytest.raises(ValueError, match=r"action space Discrete\(2\) must be a Box"):
-        export_onnx(model, tmp_path / "policy")
+def test_nothing_is_overwritten(tmp_path):
+    (tmp_path / "policy.onnx").write_text("mine")
+    with pytest.raises(FileExistsError, match=r"policy\.onnx exists"):
+        export_onnx(new_model(), tmp_path / "policy")
+    assert (tmp_path / "policy.onnx").read_text() == "mine"
 
 
-@pytest.mark.filterwarnings("ignore:LAC has no environment")
+@pytest.mark.filterwarnings("ignore:.*has no environment")
 def test_bad_files_and_observations_are_refused(tmp_path):
     with pytest.raises(FileNotFoundError):
         OnnxPolicy(tmp_path / "missing.onnx")
     (tmp_path / "text.onnx").write_text("no graph")
     with pytest.raises(ValueError, match=r"text.onnx is no ONNX file"):
         OnnxPolicy(tmp_path / "text.onnx")
-    model = LAC("MlpPolicy", None, device="cpu", policy_kwargs=dict(SMALL), _init_setup_model=False)
-    model.observation_space, model.action_space, model.n_envs = spaces.Box(-1, 1, (2,)), spaces.Box(-1, 1, (1,)), 1
-    model._setup_model()
-    policy = OnnxPolicy(export_onnx(model, tmp_path / "policy"))
+    policy = OnnxPolicy(export_onnx(new_model(env="LinearCost-v0").policy, tmp_path / "policy"))
     with pytest.raises(ValueError, match="must have shape"):
         policy.predict(np.zeros((1, 3)))
     with pytest.raises(ValueError, match="deterministic"):
@@ -152,10 +181,9 @@ def test_observations_of_the_check_fill_the_space(space, least):
     assert (np.ptp(observations, axis=0) > least).all()
 
 
-def test_a_graph_of_a_constant_action_is_refused_where_observations_are_normalized(tmp_path, monkeypatch):
-    env = VecNormalize(make_vec_env("LinearCost-v0"))
-    env.obs_rms.mean, env.obs_rms.var = np.array([93.0, -93.0]), np.array([0.01, 0.01])
-    model = LAC("MlpPolicy", env, seed=0, device="cpu", policy_kwargs=dict(SMALL))
+def test_a_graph_of_a_constant_action_is_not_written(tmp_path, monkeypatch):
+    env = normalized([93.0, -93.0], [0.01, 0.01])
+    model = new_model(env=env)
     export = onnx.graph_of
 
     class Constant(th.nn.Module):
@@ -173,30 +201,4 @@ def test_a_graph_of_a_constant_action_is_refused_where_observations_are_normaliz
     monkeypatch.setattr(onnx, "graph_of", constant)
     with pytest.raises(ValueError, match="differs from the original"):
         export_onnx(model, tmp_path / "policy")
-
-
-def test_a_mean_far_larger_than_the_deviation_loses_no_digits(tmp_path):
-    env = VecNormalize(make_vec_env("Pendulum-v1"), clip_obs=10.0)
-    env.obs_rms.mean, env.obs_rms.var = np.full(3, 29_315.123_456_7), np.full(3, 0.01)
-    model = PPO("MlpPolicy", env, seed=0, device="cpu", policy_kwargs=dict(SMALL))
-    module = onnx.DeterministicPolicy(model.policy, env)
-    observations = (29_315.0 + np.random.default_rng(0).uniform(-0.5, 0.5, (200, 3))).astype(np.float32)
-    expected, _ = model.predict(env.normalize_obs(observations), deterministic=True)
-    with th.no_grad():
-        actions = module(th.as_tensor(observations)).numpy()
-    np.testing.assert_allclose(actions, expected, atol=1e-6)
-
-
-def test_wrappers_around_the_normalization_are_refused(tmp_path):
-    env = VecFrameStack(VecNormalize(make_vec_env("LinearCost-v0")), 2)
-    model = PPO("MlpPolicy", env, device="cpu", policy_kwargs=dict(SMALL))
-    with pytest.raises(ValueError, match=r"normalizes observations of shape \(2,\), and those of the policy have \(4,\)"):
-        export_onnx(model, tmp_path / "policy")
-
-
-def test_an_action_that_has_no_choice_is_exported(tmp_path):
-    model = PPO("MlpPolicy", "Pendulum-v1", seed=0, device="cpu", policy_kwargs=dict(SMALL), _init_setup_model=False)
-    model.action_space = spaces.Box(np.array([-1.0, 0.5], np.float32), np.array([1.0, 0.5], np.float32))
-    model._setup_model()
-    actions, _ = OnnxPolicy(export_onnx(model, tmp_path / "policy")).predict(np.ones((3, 3), np.float32))
-    assert (actions[:, 1] == 0.5).all()
+    assert not list(tmp_path.iterdir())
