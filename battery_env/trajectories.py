@@ -182,11 +182,14 @@ class TrajectoryDataset(Sequence[Trajectory]):
         :raises ValueError: for values out of range, or a discharge of fewer than eight samples
         """
         q, r = np.broadcast_arrays(*np.atleast_1d(Q_MOBILE.check(q_mobile), R_O.check(r_o)))
+        if q.ndim != 1 or q.size == 0:
+            raise ValueError(f"q_mobile and r_o must be 1-D and not empty, got shape {q.shape}")
         units = {load.unit if isinstance(load, Load) else type(load).__name__ for load in loads}
         if units not in ({"power"}, {"current"}):
             raise ValueError(f"loads must be Loads, all in one unit (power or current), got {sorted(units)}")
         index = np.broadcast_to(check_indices("load_index", load_index, len(loads)), q.shape)
-        multiples = np.ones((q.size, len(UNCERTAIN_CONSTANTS))) if factors is None else np.array(factors, dtype=np.float64)
+        known = np.ones(1) if factors is None else np.asarray(factors, dtype=np.float64)
+        multiples = np.broadcast_to(known, (q.size, len(UNCERTAIN_CONSTANTS))).copy()
         cell = check_cell(cell, thermal)
         dt_s = _check_dt(dt_s, cell, multiples)
         if dt_s < _LEAST_DT_S:
