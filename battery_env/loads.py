@@ -308,11 +308,8 @@ class RandomWalk(RandomLoad):
 
 def steadier_unit(record: Record) -> LoadUnit:
     """
-    Whether a consumer draws its current or its power, by which of the two drifts less between the switches of the load while
-    the voltage falls.
-
-    :param record: one discharge
-    :return: ``"power"`` or ``"current"``
+    The unit that a consumer holds: that of current and power which drifts less between the switches of the load while the
+    voltage falls.
     """
     current_A = np.asarray(record.current_A)
     switch_A = SWITCH_SHARE * np.abs(current_A).max()

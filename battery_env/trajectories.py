@@ -328,21 +328,11 @@ class TrajectoryDataset(Sequence[Trajectory]):
         return (self[n] for n in range(len(self)))
 
     def load_profile(self, n: int) -> FloatArray:
-        """
-        The load of a whole discharge, before it was trimmed.
-
-        :param n: which trajectory
-        :return: one value a step, W or A, shape (samples,)
-        """
+        """The load of a whole discharge, before it was trimmed: one value a step, W or A."""
         return self.load_values[self.load_start[n] : self.load_start[n] + self.samples[n]]
 
     def starts_full(self, n: int) -> bool:
-        """
-        Whether a whole discharge, before it was trimmed, starts with a fully charged cell at rest.
-
-        :param n: which trajectory
-        :return: whether it does
-        """
+        """Whether a whole discharge, before it was trimmed, starts with a fully charged cell at rest."""
         return np.array_equal(self.checkpoint[self.checkpoint_start[n]], initial_state(self.q_mobile[n], self.cell))
 
     def _cell(self, n: int) -> CellParameters:
@@ -352,22 +342,11 @@ class TrajectoryDataset(Sequence[Trajectory]):
         return self.cell.replace(q_mobile=float(self.q_mobile[n]), r_o=float(self.r_o[n]), **true)
 
     def packed(self, index: IntArray) -> PackedConstants:
-        """
-        The true constants of some trajectories, for the unchecked functions of :mod:`battery_env.electrochemistry`.
-
-        :param index: which trajectories, shape (m,)
-        :return: one row a cell; or the one row that all share, if their constants are those of ``cell``
-        """
+        """The true constants of some trajectories, one row a cell; or one row, where all have those of ``cell``."""
         return _packed(self.cell, self.factors[index])
 
     def states_at(self, index: IntArray, sample: IntArray) -> FloatArray:
-        """
-        True states of some trajectories at some samples.
-
-        :param index: which trajectories, shape (m,)
-        :param sample: which of their samples, counted from full charge, shape (m,)
-        :return: shape (m, 8)
-        """
+        """True states of some trajectories at some of their samples, counted from full charge: shape (m, 8)."""
         block, steps = np.divmod(sample, _CHECKPOINT_EVERY)
         state = self.checkpoint[self.checkpoint_start[index] + block]
         advance_in_place(
