@@ -333,12 +333,13 @@ def _bundled(cell: str) -> list[Discharge]:
     with as_file(files("battery_env.nasa_cells")) as folder:
         samples = pd.read_csv(folder / f"{cell}_discharge.csv.gz", usecols=["cycle", *_COLUMNS, "temperature_C"])
         tests = pd.read_csv(folder / "cycles.csv").query("battery_id == @cell").set_index("cycle")[list(_META_COLUMNS)]
-    known = tests.to_dict(orient="index")
+    known, numbers = tests.to_dict(orient="index"), samples["cycle"].to_numpy()
     discharges = []
-    for cycle, part in samples.groupby("cycle"):
-        arrays = {name: part[name].to_numpy() for name in (*_COLUMNS, "temperature_C")}
-        meta = {"cell": cell, "cycle": int(cycle), "source": NASA_CITATION, **known[cycle]}
-        discharges.append(Discharge(**arrays, meta=meta))
+    for cycle in np.unique(numbers).tolist():
+        part = samples[numbers == cycle]
+        columns = [part[name].to_numpy(dtype=np.float64) for name in (*_COLUMNS, "temperature_C")]
+        meta = {"cell": cell, "cycle": cycle, "source": NASA_CITATION, **known[cycle]}
+        discharges.append(Discharge(*columns, meta=meta))
     return discharges
 
 

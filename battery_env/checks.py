@@ -16,6 +16,8 @@ LoadUnit = Literal["power", "current"]
 #: Largest magnitude of the load of one cell, per unit. Beyond it a value is taken for a mistake in the unit (mA for A).
 LOAD_LIMITS: dict[str, float] = {"power": 5000.0, "current": 1000.0}
 LOAD_UNIT_SYMBOLS: dict[str, str] = {"power": "W", "current": "A"}
+#: 0 degC in K.
+ZERO_CELSIUS_K = 273.15
 
 
 def check_numbers(name: str, values: ArrayLike, unit: str = "") -> FloatArray:

@@ -6,6 +6,8 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+from battery_env.checks import ZERO_CELSIUS_K
+
 #: What a record must have.
 REQUIRED = ("time", "voltage", "current")
 
@@ -27,8 +29,8 @@ _NAMES: dict[str, tuple[str, ...]] = {
     "step": ("step count", "step", "step index", "step number", "step id", "steps", "ns"),
     "state": ("state", "md", "status", "step type"),
 }
-_DEGREES = {"c": (1.0, 0.0), "°c": (1.0, 0.0), "degc": (1.0, 0.0), "deg c": (1.0, 0.0), "celsius": (1.0, 0.0)}
-_KELVIN = {"k": (1.0, -273.15), "kelvin": (1.0, -273.15)}
+_DEGREES = dict.fromkeys(("c", "°c", "degc", "deg c", "celsius"), (1.0, 0.0))
+_KELVIN = dict.fromkeys(("k", "kelvin"), (1.0, -ZERO_CELSIUS_K))
 # By quantity and unit in lower case: factor and offset to s, V, A and degC.
 _UNITS: dict[str, dict[str, tuple[float, float]]] = {
     "time": {

@@ -206,21 +206,6 @@ def constant(value: float, unit: LoadUnit = "power") -> Load:
     return Load(np.zeros(1), check_numbers("value", [value]), unit)
 
 
-def piecewise(values: ArrayLike, durations_s: ArrayLike, unit: LoadUnit = "power") -> Load:
-    """
-    One value after the other, each for its duration; the last one goes on.
-
-    :param values: power in W or current in A, shape (K,)
-    :param durations_s: how long each value holds, s, shape (K,), all positive
-    :param unit: ``"power"`` or ``"current"``
-    :return: the load
-    """
-    durations = check_numbers("durations_s", durations_s)
-    if durations.ndim != 1 or not (durations > 0.0).all():
-        raise ValueError(f"durations_s must be 1-D and positive, got {durations_s!r}")
-    return Load(np.concatenate([[0.0], np.cumsum(durations)[:-1]]), check_numbers("values", values), unit)
-
-
 def recorded(record: Record, unit: LoadUnit = "power", dt_s: float = 1.0) -> Load:
     """
     The load of a recorded discharge, from its first sample on; beyond the last one its last value goes on, so give the part
@@ -275,8 +260,9 @@ class RandomPiecewise(RandomLoad):
         """Draw one load."""
         segments = int(np.ceil(self.total_s / self.duration_range_s[0]))
         durations = rng.uniform(*self.duration_range_s, size=segments)
-        count = int(np.searchsorted(np.cumsum(durations), self.total_s)) + 1
-        return piecewise(rng.uniform(*self.value_range, size=segments)[:count], durations[:count], self.unit)
+        starts_s = np.append(0.0, np.cumsum(durations)[:-1])
+        count = int(np.searchsorted(starts_s[1:], self.total_s)) + 1
+        return Load(starts_s[:count], rng.uniform(*self.value_range, size=segments)[:count], self.unit)
 
 
 @dataclass(frozen=True)
@@ -322,11 +308,8 @@ class RandomWalk(RandomLoad):
 
 def steadier_unit(record: Record) -> LoadUnit:
     """
-    Whether a consumer draws its current or its power, by which of the two drifts less between the switches of the load while
-    the voltage falls.
-
-    :param record: one discharge
-    :return: ``"power"`` or ``"current"``
+    The unit that a consumer holds: that of current and power which drifts less between the switches of the load while the
+    voltage falls.
     """
     current_A = np.asarray(record.current_A)
     switch_A = SWITCH_SHARE * np.abs(current_A).max()

@@ -48,13 +48,7 @@ _LINEAR_SLOPE_V_PER_C = 1e-6
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """
-    An empty figure in the project's style, outside pyplot's global state.
-
-    :param width: inches
-    :param height: inches
-    :return: the figure
-    """
+    """An empty figure in the project's style, outside pyplot's global state, of some inches."""
     figure = Figure(figsize=(width, height), dpi=150, layout="constrained")
     FigureCanvasAgg(figure)
     return figure
@@ -107,26 +101,14 @@ def plot_true_against_inferred(scores: Mapping[str, pd.DataFrame], parameter: st
 
 
 def coloured(things: Iterable[Thing]) -> Iterator[tuple[str, Thing]]:
-    """
-    Things to draw side by side.
-
-    :param things: any number of them; from the eleventh on colours come again
-    :return: each after its colour
-    """
+    """Things to draw side by side, each after its colour; from the eleventh on colours come again."""
     return zip(itertools.cycle(COLOURS), things, strict=False)
 
 
 def draw_over_seeds(axes: Axes, x: ArrayLike, scores: ArrayLike, colour: str, label: str, **style: Any) -> None:
     """
-    Draw the interquartile mean over seeds, with a band of its 95 % interval where there are several
+    Draw the interquartile mean of scores, one row a seed, with a band of its 95 % interval where there are several seeds
     (:func:`battery_env.evaluation.over_seeds`).
-
-    :param axes: where to
-    :param x: shape (n,)
-    :param scores: one row per seed, shape (seeds, n)
-    :param colour: of line and band
-    :param label: of the line in the legend
-    :param style: of the line, as matplotlib has it
     """
     middle, low, high = over_seeds(scores)
     axes.plot(x, middle, color=colour, label=label, **{"lw": 1.4, **style})

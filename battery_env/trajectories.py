@@ -182,11 +182,14 @@ class TrajectoryDataset(Sequence[Trajectory]):
         :raises ValueError: for values out of range, or a discharge of fewer than eight samples
         """
         q, r = np.broadcast_arrays(*np.atleast_1d(Q_MOBILE.check(q_mobile), R_O.check(r_o)))
+        if q.ndim != 1 or q.size == 0:
+            raise ValueError(f"q_mobile and r_o must be 1-D and not empty, got shape {q.shape}")
         units = {load.unit if isinstance(load, Load) else type(load).__name__ for load in loads}
         if units not in ({"power"}, {"current"}):
             raise ValueError(f"loads must be Loads, all in one unit (power or current), got {sorted(units)}")
         index = np.broadcast_to(check_indices("load_index", load_index, len(loads)), q.shape)
-        multiples = np.ones((q.size, len(UNCERTAIN_CONSTANTS))) if factors is None else np.array(factors, dtype=np.float64)
+        known = np.ones(1) if factors is None else np.asarray(factors, dtype=np.float64)
+        multiples = np.broadcast_to(known, (q.size, len(UNCERTAIN_CONSTANTS))).copy()
         cell = check_cell(cell, thermal)
         dt_s = _check_dt(dt_s, cell, multiples)
         if dt_s < _LEAST_DT_S:
@@ -326,21 +329,11 @@ class TrajectoryDataset(Sequence[Trajectory]):
         return (self[n] for n in range(len(self)))
 
     def load_profile(self, n: int) -> FloatArray:
-        """
-        The load of a whole discharge, before it was trimmed.
-
-        :param n: which trajectory
-        :return: one value a step, W or A, shape (samples,)
-        """
+        """The load of a whole discharge, before it was trimmed: one value a step, W or A."""
         return self.load_values[self.load_start[n] : self.load_start[n] + self.samples[n]]
 
     def starts_full(self, n: int) -> bool:
-        """
-        Whether a whole discharge, before it was trimmed, starts with a fully charged cell at rest.
-
-        :param n: which trajectory
-        :return: whether it does
-        """
+        """Whether a whole discharge, before it was trimmed, starts with a fully charged cell at rest."""
         return np.array_equal(self.checkpoint[self.checkpoint_start[n]], initial_state(self.q_mobile[n], self.cell))
 
     def _cell(self, n: int) -> CellParameters:
@@ -350,22 +343,11 @@ class TrajectoryDataset(Sequence[Trajectory]):
         return self.cell.replace(q_mobile=float(self.q_mobile[n]), r_o=float(self.r_o[n]), **true)
 
     def packed(self, index: IntArray) -> PackedConstants:
-        """
-        The true constants of some trajectories, for the unchecked functions of :mod:`battery_env.electrochemistry`.
-
-        :param index: which trajectories, shape (m,)
-        :return: one row a cell; or the one row that all share, if their constants are those of ``cell``
-        """
+        """The true constants of some trajectories, one row a cell; or one row, where all have those of ``cell``."""
         return _packed(self.cell, self.factors[index])
 
     def states_at(self, index: IntArray, sample: IntArray) -> FloatArray:
-        """
-        True states of some trajectories at some samples.
-
-        :param index: which trajectories, shape (m,)
-        :param sample: which of their samples, counted from full charge, shape (m,)
-        :return: shape (m, 8)
-        """
+        """True states of some trajectories at some of their samples, counted from full charge: shape (m, 8)."""
         block, steps = np.divmod(sample, _CHECKPOINT_EVERY)
         state = self.checkpoint[self.checkpoint_start[index] + block]
         advance_in_place(

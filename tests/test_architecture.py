@@ -17,9 +17,9 @@ ROOT = Path(__file__).parents[1]
 # each layer may import the ones before it, and itself
 LAYERS = (
     ("battery_env.arrays", "battery_env.files", "battery_env.parallel"),
+    ("battery_env.checks",),
     ("battery_env.columns",),
     ("battery_env.tables",),
-    ("battery_env.checks",),
     ("battery_env.parameters",),
     ("battery_env.electrochemistry.cell",),
     ("battery_env.electrochemistry.kernels",),
