@@ -70,7 +70,7 @@ _START_EXCESS, _LEAST_EXCESS = 0.02, 1e-4
 
 class FittedConstant(NamedTuple):
     """
-    What the discharges say about one constant.
+    What a fit says of one constant.
 
     :param name: a constant of :class:`~battery_env.CellParameters`; or ``equilibrium 0``, ``equilibrium 1``, ...: the
         coefficient of that Legendre polynomial in what is added to the equilibrium voltage
@@ -94,7 +94,7 @@ class FittedConstant(NamedTuple):
 
 class FittedDischarge(NamedTuple):
     """
-    One of the discharges that constants were fitted to.
+    What a fit says of one of its discharges.
 
     :param name: of the cell and the discharge, if the record tells; otherwise its number
     :param q_mobile: charge that can move, C
@@ -363,7 +363,7 @@ def _records(discharges: Sequence[Record], cut_off_V: float) -> list[Record]:
 
 
 def _check_starts_alike(records: Sequence[Record], at_rest: Sequence[bool]) -> None:
-    """A full cell, of whatever kind, always rests at about the same voltage."""
+    """Refuse discharges that cannot all start full: a full cell, of whatever kind, rests at about one voltage."""
     rests = [(float(each.voltage_V[0]), n) for n, (each, rested) in enumerate(zip(records, at_rest, strict=True), 1) if rested]
     (low_V, low), (high_V, high) = min(rests, default=(0.0, 0)), max(rests, default=(0.0, 0))
     if high_V - low_V > sum(FULL_REST_V):
@@ -378,7 +378,7 @@ def _starts_at_rest(discharge: Discharge) -> bool:
 
 
 def _prior(records: Sequence[Record], start: CellParameters | None, thermal: bool, cut_off_V: float) -> CellParameters:
-    """What is thought of the constants before the data, but for what is measured."""
+    """Return what is thought of the constants before the data, but for what is measured."""
     check_cell(start, thermal)
     charges_C = [float(drawn(record.time_s, record.current_A, record.time_s[-1])) for record in records]
     q_mobile = float(Q_MOBILE.check(_UNDELIVERED * max(charges_C)))
@@ -395,7 +395,7 @@ def _prior(records: Sequence[Record], start: CellParameters | None, thermal: boo
 
 
 def with_equilibrium(cell: CellParameters, coefficients_V: Sequence[float] | FloatArray) -> CellParameters:
-    """A cell with something added to its equilibrium voltage."""
+    """Return a cell with a Legendre series over ``_FRACTIONS_P`` added to its equilibrium voltage."""
     # as a polynomial in y = 2x - 1, from the highest power down: term k of the Redlich-Kister sum is
     # A_k / F * ((1 + k / 2) * y^(k + 1) - (k / 2) * y^(k - 1))
     x = Polynomial([0.5, 0.5])
@@ -422,21 +422,13 @@ def _name(record: Record, number: int) -> str:
 
 @dataclass(frozen=True)
 class AtDischarge:
-    """
-    The model of one discharge at an x of the search.
+    """The model of one discharge at an x of the search."""
 
-    :param residual_V: at the samples, V
-    :param jacobian: their derivatives by x
-    :param q_mobile: C
-    :param r_o: ohm
-    :param q_gradient_C: derivatives of ``q_mobile`` by x
-    """
-
-    residual_V: FloatArray
-    jacobian: FloatArray
+    residual_V: FloatArray  # at the samples
+    jacobian: FloatArray  # of these, by x
     q_mobile: float
     r_o: float
-    q_gradient_C: FloatArray
+    q_gradient_C: FloatArray  # of q_mobile, by x
 
 
 @dataclass(frozen=True)
