@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -68,7 +68,8 @@ _REACH_SD, _LOG_DISTANCE_LIMITS, _R_O_SCALE_OHM = 6.0, (-30.0, 16.0), 0.1
 _START_EXCESS, _LEAST_EXCESS = 0.02, 1e-4
 
 
-class FittedConstant(NamedTuple):
+@dataclass(frozen=True)
+class FittedConstant:
     """
     What a fit says of one constant.
 
@@ -92,7 +93,8 @@ class FittedConstant(NamedTuple):
         return self.sd < IDENTIFIED_SHARE * self.prior_sd
 
 
-class FittedDischarge(NamedTuple):
+@dataclass(frozen=True)
+class FittedDischarge:
     """
     What a fit says of one of its discharges.
 
@@ -156,7 +158,8 @@ class CellFit:
             check_positive(name, getattr(self, name))
         rows: tuple[FittedConstant | FittedDischarge, ...] = (*self.constants, *self.discharges)
         for row in rows:
-            if not isinstance(row.name, str) or not np.isfinite(check_numbers(row.name, row[1:])).all():
+            _, *numbers = vars(row).values()
+            if not isinstance(row.name, str) or not np.isfinite(check_numbers(row.name, numbers)).all():
                 raise ValueError(f"constants and discharges have names and finite numbers, got {row!r}")
 
     @property
@@ -246,11 +249,7 @@ class CellFit:
         :return: the file
         :raises FileExistsError: if the file exists already
         """
-        content = asdict(self) | {
-            "constants": [constant._asdict() for constant in self.constants],
-            "discharges": [discharge._asdict() for discharge in self.discharges],
-        }
-        return write_json(path, _FORMAT, _FORMAT_VERSION, content)
+        return write_json(path, _FORMAT, _FORMAT_VERSION, asdict(self))
 
     @classmethod
     def from_json(cls, path: str | os.PathLike[str]) -> CellFit:
@@ -301,14 +300,11 @@ def fit_cell(
     that follows within a fiftieth of the discharge. The search is scipy's trust region with exact derivatives.
 
     *How sure it is.* The residuals are the error of the model, and drift slowly: those of a discharge count as 50 independent
-    ones, however many samples there are, or as many as they change their sign. Their variance is found along with the
-    constants. The usual formula, for white noise, would state a fraction of these standard deviations.
-
-    *A start that is not full* is taken for that of another kind of cell. A fit whose full cell rests more than 0.04 V below
-    that of ``start`` warns of it, and its ``doubt`` keeps the warning.
+    ones, or as many as they change their sign. Their variance is found along with the constants.
 
     *Other cells.* A cell of another capacity starts with electrodes of another size. Another chemistry works as far as the
-    equations bend; where they do not, the residuals stay large and the fit is refused.
+    equations bend; where they do not, the residuals stay large and the fit is refused. A start that is not full is taken for
+    that of another chemistry: a fit whose full cell rests more than 0.04 V below that of ``start`` warns of it (``doubt``).
 
     :param discharges: of one cell, each from full charge. Of a :class:`~battery_env.Discharge` the part from load-on to the
         cut-off is taken; other records are taken whole
@@ -326,7 +322,10 @@ def fit_cell(
     prior = _prior(records, start, thermal, cut_off_V)
     check_dt(dt_s, prior)
     # a simulated record is at rest before its first current acts
-    at_rest = [not isinstance(whole, Discharge) or _starts_at_rest(whole) for whole in discharges]
+    at_rest = [
+        not isinstance(whole, Discharge) or bool(whole.current_A[0] <= SWITCH_SHARE * whole.current_A.max())
+        for whole in discharges
+    ]
     _check_starts_alike(records, at_rest)
     fit = JointFit(records, at_rest, prior, thermal, dt_s).solve()
     if not fit.rmse_V <= limit_V:
@@ -371,10 +370,6 @@ def _check_starts_alike(records: Sequence[Record], at_rest: Sequence[bool]) -> N
             f"discharge {low} of {len(records)} starts at rest at {low_V:.2f} V, discharge {high} at {high_V:.2f} V: they "
             "cannot both be of a full cell. Leave out those that do not start full."
         )
-
-
-def _starts_at_rest(discharge: Discharge) -> bool:
-    return bool(discharge.current_A[0] <= SWITCH_SHARE * discharge.current_A.max())
 
 
 def _prior(records: Sequence[Record], start: CellParameters | None, thermal: bool, cut_off_V: float) -> CellParameters:

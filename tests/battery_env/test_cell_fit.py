@@ -34,6 +34,7 @@ from battery_env.estimators.cell_fit import (
 from battery_env.plotting import plot_cell_fit
 from battery_env.summary import METHODS, Settings, summarize
 
+FIELDS = ("cell", "constants", "discharges", "mismatch_V", "thermal")
 OTHER = with_equilibrium(NEW_CELL, [0.02, -0.03, 0.02]).replace(kn=1000.0, tDiffusion=9e6, to=10.0, tsn=600.0, VEOD=2.7)
 
 
@@ -272,26 +273,29 @@ class TestFiles:
         assert not Settings.for_cell(dataclasses.replace(fit, thermal=False)).thermal
 
     @pytest.mark.parametrize(
-        ("change", "message"),
+        ("kind", "change", "message"),
         [
-            (lambda content: content.update(version=99), "of version 99"),
-            (lambda content: content.update(format="something"), "holds no battery_env.CellParameters but something"),
-            (lambda content: content["constants"].pop("kn"), "missing or unknown: kn"),
-            (lambda content: content["constants"].update(knn=1.0), "missing or unknown: knn"),
-            (lambda content: content["constants"].update(kn=-1.0), "kn must be greater than 0"),
-            (lambda content: content["constants"].update(kn="fast"), "kn must be float"),
-            (lambda content: content["constants"].update(Ap=1.0), "damaged"),
-            (lambda content: content.update(constants=[1.0]), "given by name"),
-            (lambda content: content.pop("constants"), "damaged"),
+            (CellParameters, lambda content: content.update(version=99), "of version 99"),
+            (CellParameters, lambda content: content.update(format="something"), "holds no battery_env.CellParameters but so"),
+            (CellParameters, lambda content: content["constants"].pop("kn"), "missing or unknown: kn"),
+            (CellParameters, lambda content: content["constants"].update(knn=1.0), "missing or unknown: knn"),
+            (CellParameters, lambda content: content["constants"].update(kn=-1.0), "kn must be greater than 0"),
+            (CellParameters, lambda content: content["constants"].update(kn="fast"), "kn must be float"),
+            (CellParameters, lambda content: content["constants"].update(Ap=1.0), "damaged"),
+            (CellParameters, lambda content: content.update(constants=[1.0]), "given by name"),
+            (CellParameters, lambda content: content.pop("constants"), "damaged"),
+            *((CellFit, lambda content, name=name: content.pop(name), "damaged") for name in FIELDS),
+            *((CellFit, lambda content, name=name: content.update({name: None}), "damaged") for name in FIELDS),
+            *((CellFit, lambda content, name=name: content.update({name: [{"name": "kn"}]}), "damaged") for name in FIELDS),
         ],
     )
-    def test_a_damaged_file_of_constants_is_refused(self, change, message, tmp_path):
-        path = OTHER.to_json(tmp_path / "constants.json")
+    def test_a_damaged_file_is_refused(self, kind, change, message, fit, tmp_path):
+        path = (fit if kind is CellFit else OTHER).to_json(tmp_path / "cell.json")
         content = json.loads(path.read_text())
         change(content)
         path.write_text(json.dumps(content))
         with pytest.raises(ValueError, match=message):
-            CellParameters.from_json(path)
+            kind.from_json(path)
 
     @pytest.mark.parametrize("text", ["", "{", "[]", "null", '"text"', "\udcff", "{}"])
     @pytest.mark.parametrize("kind", [CellFit, CellParameters])
@@ -300,19 +304,6 @@ class TestFiles:
         path.write_bytes(text.encode("utf-8", "surrogateescape"))
         with pytest.raises(ValueError, match=r"cell\.json"):
             kind.from_json(path)
-
-    @pytest.mark.parametrize("name", ["cell", "constants", "discharges", "mismatch_V", "thermal"])
-    def test_a_damaged_fit_is_refused(self, name, fit, tmp_path):
-        path = fit.to_json(tmp_path / "fit.json")
-        content = json.loads(path.read_text())
-        for wrong in (None, [{"name": "kn"}]):
-            path.write_text(json.dumps({**content, name: wrong}))
-            with pytest.raises(ValueError, match="damaged"):
-                CellFit.from_json(path)
-        del content[name]
-        path.write_text(json.dumps(content))
-        with pytest.raises(ValueError, match="damaged"):
-            CellFit.from_json(path)
 
 
 class TestBadInput:
