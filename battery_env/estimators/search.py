@@ -39,9 +39,18 @@ def minimized(
     evaluate: Callable[[FloatArray], tuple[FloatArray, FloatArray]], start: FloatArray | list[float], **how: Any
 ) -> FloatArray:
     """Minimize the squares of residuals by scipy; ``evaluate`` gives them and their derivatives in one roll-out."""
-    both = lru_cache(maxsize=1)(lambda x: evaluate(np.array(x)))  # scipy asks for them one after the other
-    result = least_squares(lambda x: both(tuple(x))[0], start, jac=lambda x: both(tuple(x))[1], **how)
-    return np.asarray(result.x)
+
+    @lru_cache(maxsize=1)  # scipy asks for them one after the other
+    def both(x: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
+        return evaluate(np.array(x))
+
+    def residual(x: FloatArray) -> FloatArray:
+        return both(tuple(x))[0]
+
+    def jacobian(x: FloatArray) -> FloatArray:
+        return both(tuple(x))[1]
+
+    return np.asarray(least_squares(residual, start, jac=jacobian, **how).x)
 
 
 def distance_C(log_distance: float) -> float:
@@ -70,7 +79,7 @@ class OnGrid:
     @cached_property
     def grid_s(self) -> FloatArray:
         """Times of the grid, s."""
-        return self.dt_s * np.arange(len(self.current_A))
+        return np.asarray(self.dt_s * np.arange(len(self.current_A)), dtype=np.float64)
 
     @cached_property
     def _samples_are_the_grid(self) -> bool:
