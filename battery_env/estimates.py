@@ -65,12 +65,6 @@ class Estimates(Sequence[Estimate]):
         self.q_mobile, self.r_o, self.sd_q_mobile, self.sd_r_o, self.settled = q_mobile, r_o, sd_q_mobile, sd_r_o, settled
         self._reason = reason
 
-    @classmethod
-    def of(cls, estimates: Sequence[Estimate]) -> Estimates:
-        """Single ones together."""
-        columns = {name: np.array([getattr(each, name) for each in estimates]) for name in _COLUMNS}
-        return cls(**columns, reason=lambda n: estimates[n].reason)
-
     def __len__(self) -> int:
         return len(self.q_mobile)
 

@@ -301,17 +301,13 @@ class OnlineEstimator(Estimator):
         traces = []
         for record in records:
             stream = Stream.of(record, self.dt_s)
+            measured: Iterable[tuple[float, ...]] = stream.samples()
+            if stream.temperature_C is not None:
+                measured = ((*sample, t_C) for sample, t_C in zip(measured, stream.temperature_C.tolist(), strict=True))
             self.reset()
-            traces.append(self._follow_samples(stream))
+            traces.append(EstimateTrace.of(stream.time_s, [self.update(*sample) for sample in measured]))
         self.reset()
         return traces
-
-    def _follow_samples(self, stream: Stream) -> EstimateTrace:
-        """One update per sample of a stream, after a reset."""
-        measured: Iterable[tuple[float, ...]] = stream.samples()
-        if stream.temperature_C is not None:
-            measured = ((*sample, t_C) for sample, t_C in zip(measured, stream.temperature_C.tolist(), strict=True))
-        return EstimateTrace.of(stream.time_s, [self.update(*sample) for sample in measured])
 
 
 class OnlineBatch:
@@ -327,8 +323,11 @@ class OnlineBatch:
     def __init__(self, estimator: OnlineEstimator, cells: int) -> None:
         if check_whole_number("cells", cells) < 1:
             raise ValueError(f"cells must be at least 1, got {cells!r}")
-        self.estimators: Sequence[OnlineEstimator] = [copy(estimator) for _ in range(cells)]
+        self.estimators: Sequence[OnlineEstimator] = self._copies(estimator, cells)
         self.reset()
+
+    def _copies(self, estimator: OnlineEstimator, cells: int) -> Sequence[OnlineEstimator]:
+        return [copy(estimator) for _ in range(cells)]
 
     def reset(self, cells: Iterable[int] | None = None) -> None:
         """Let discharges begin."""
@@ -339,16 +338,28 @@ class OnlineBatch:
         self, voltage_V: ArrayLike, current_A: ArrayLike, dt_s: ArrayLike, temperature_C: ArrayLike | None = None
     ) -> Sequence[Estimate]:
         """Take in one sample of each cell: of all, or of none if one is refused."""
-        cells = len(self.estimators)
+        samples = self.check(voltage_V, current_A, dt_s, temperature_C)
+        return [estimator.update(*sample) for estimator, sample in zip(self.estimators, samples, strict=True)]
+
+    def check(
+        self,
+        voltage_V: ArrayLike,
+        current_A: ArrayLike,
+        dt_s: ArrayLike,
+        temperature_C: ArrayLike | None = None,
+        cells: Iterable[int] | None = None,
+    ) -> list[tuple[Any, ...]]:
+        """Refuse what :meth:`update` would refuse, of these cells or of all; return the samples of all."""
+        count = len(self.estimators)
         # as objects, so that what is no number turns no other one into a text
         columns = (np.asarray(column, dtype=object) for column in (voltage_V, current_A, dt_s, temperature_C))
-        samples = list(zip(*(np.broadcast_to(column, cells).tolist() for column in columns), strict=True))
-        for n, (estimator, sample) in enumerate(zip(self.estimators, samples, strict=True)):
+        samples = list(zip(*(np.broadcast_to(column, count).tolist() for column in columns), strict=True))
+        for n in range(count) if cells is None else cells:
             try:
-                estimator.check(*sample)
+                self.estimators[n].check(*samples[n])
             except (TypeError, ValueError) as error:
                 raise type(error)(f"cell {n}: {error}") from error
-        return [estimator.update(*sample) for estimator, sample in zip(self.estimators, samples, strict=True)]
+        return samples
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write what is known of all cells, as :meth:`OnlineEstimator.save`."""

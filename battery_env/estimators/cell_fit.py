@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -68,9 +68,10 @@ _REACH_SD, _LOG_DISTANCE_LIMITS, _R_O_SCALE_OHM = 6.0, (-30.0, 16.0), 0.1
 _START_EXCESS, _LEAST_EXCESS = 0.02, 1e-4
 
 
-class FittedConstant(NamedTuple):
+@dataclass(frozen=True)
+class FittedConstant:
     """
-    What the discharges say about one constant.
+    What a fit says of one constant.
 
     :param name: a constant of :class:`~battery_env.CellParameters`; or ``equilibrium 0``, ``equilibrium 1``, ...: the
         coefficient of that Legendre polynomial in what is added to the equilibrium voltage
@@ -92,9 +93,10 @@ class FittedConstant(NamedTuple):
         return self.sd < IDENTIFIED_SHARE * self.prior_sd
 
 
-class FittedDischarge(NamedTuple):
+@dataclass(frozen=True)
+class FittedDischarge:
     """
-    One of the discharges that constants were fitted to.
+    What a fit says of one of its discharges.
 
     :param name: of the cell and the discharge, if the record tells; otherwise its number
     :param q_mobile: charge that can move, C
@@ -156,7 +158,8 @@ class CellFit:
             check_positive(name, getattr(self, name))
         rows: tuple[FittedConstant | FittedDischarge, ...] = (*self.constants, *self.discharges)
         for row in rows:
-            if not isinstance(row.name, str) or not np.isfinite(check_numbers(row.name, row[1:])).all():
+            _, *numbers = vars(row).values()
+            if not isinstance(row.name, str) or not np.isfinite(check_numbers(row.name, numbers)).all():
                 raise ValueError(f"constants and discharges have names and finite numbers, got {row!r}")
 
     @property
@@ -246,11 +249,7 @@ class CellFit:
         :return: the file
         :raises FileExistsError: if the file exists already
         """
-        content = asdict(self) | {
-            "constants": [constant._asdict() for constant in self.constants],
-            "discharges": [discharge._asdict() for discharge in self.discharges],
-        }
-        return write_json(path, _FORMAT, _FORMAT_VERSION, content)
+        return write_json(path, _FORMAT, _FORMAT_VERSION, asdict(self))
 
     @classmethod
     def from_json(cls, path: str | os.PathLike[str]) -> CellFit:
@@ -301,14 +300,11 @@ def fit_cell(
     that follows within a fiftieth of the discharge. The search is scipy's trust region with exact derivatives.
 
     *How sure it is.* The residuals are the error of the model, and drift slowly: those of a discharge count as 50 independent
-    ones, however many samples there are, or as many as they change their sign. Their variance is found along with the
-    constants. The usual formula, for white noise, would state a fraction of these standard deviations.
-
-    *A start that is not full* is taken for that of another kind of cell. A fit whose full cell rests more than 0.04 V below
-    that of ``start`` warns of it, and its ``doubt`` keeps the warning.
+    ones, or as many as they change their sign. Their variance is found along with the constants.
 
     *Other cells.* A cell of another capacity starts with electrodes of another size. Another chemistry works as far as the
-    equations bend; where they do not, the residuals stay large and the fit is refused.
+    equations bend; where they do not, the residuals stay large and the fit is refused. A start that is not full is taken for
+    that of another chemistry: a fit whose full cell rests more than 0.04 V below that of ``start`` warns of it (``doubt``).
 
     :param discharges: of one cell, each from full charge. Of a :class:`~battery_env.Discharge` the part from load-on to the
         cut-off is taken; other records are taken whole
@@ -326,7 +322,10 @@ def fit_cell(
     prior = _prior(records, start, thermal, cut_off_V)
     check_dt(dt_s, prior)
     # a simulated record is at rest before its first current acts
-    at_rest = [not isinstance(whole, Discharge) or _starts_at_rest(whole) for whole in discharges]
+    at_rest = [
+        not isinstance(whole, Discharge) or bool(whole.current_A[0] <= SWITCH_SHARE * whole.current_A.max())
+        for whole in discharges
+    ]
     _check_starts_alike(records, at_rest)
     fit = JointFit(records, at_rest, prior, thermal, dt_s).solve()
     if not fit.rmse_V <= limit_V:
@@ -363,7 +362,7 @@ def _records(discharges: Sequence[Record], cut_off_V: float) -> list[Record]:
 
 
 def _check_starts_alike(records: Sequence[Record], at_rest: Sequence[bool]) -> None:
-    """A full cell, of whatever kind, always rests at about the same voltage."""
+    """Refuse discharges that cannot all start full: a full cell, of whatever kind, rests at about one voltage."""
     rests = [(float(each.voltage_V[0]), n) for n, (each, rested) in enumerate(zip(records, at_rest, strict=True), 1) if rested]
     (low_V, low), (high_V, high) = min(rests, default=(0.0, 0)), max(rests, default=(0.0, 0))
     if high_V - low_V > sum(FULL_REST_V):
@@ -373,12 +372,8 @@ def _check_starts_alike(records: Sequence[Record], at_rest: Sequence[bool]) -> N
         )
 
 
-def _starts_at_rest(discharge: Discharge) -> bool:
-    return bool(discharge.current_A[0] <= SWITCH_SHARE * discharge.current_A.max())
-
-
 def _prior(records: Sequence[Record], start: CellParameters | None, thermal: bool, cut_off_V: float) -> CellParameters:
-    """What is thought of the constants before the data, but for what is measured."""
+    """Return what is thought of the constants before the data, but for what is measured."""
     check_cell(start, thermal)
     charges_C = [float(drawn(record.time_s, record.current_A, record.time_s[-1])) for record in records]
     q_mobile = float(Q_MOBILE.check(_UNDELIVERED * max(charges_C)))
@@ -395,7 +390,7 @@ def _prior(records: Sequence[Record], start: CellParameters | None, thermal: boo
 
 
 def with_equilibrium(cell: CellParameters, coefficients_V: Sequence[float] | FloatArray) -> CellParameters:
-    """A cell with something added to its equilibrium voltage."""
+    """Return a cell with a Legendre series over ``_FRACTIONS_P`` added to its equilibrium voltage."""
     # as a polynomial in y = 2x - 1, from the highest power down: term k of the Redlich-Kister sum is
     # A_k / F * ((1 + k / 2) * y^(k + 1) - (k / 2) * y^(k - 1))
     x = Polynomial([0.5, 0.5])
@@ -422,21 +417,13 @@ def _name(record: Record, number: int) -> str:
 
 @dataclass(frozen=True)
 class AtDischarge:
-    """
-    The model of one discharge at an x of the search.
+    """The model of one discharge at an x of the search."""
 
-    :param residual_V: at the samples, V
-    :param jacobian: their derivatives by x
-    :param q_mobile: C
-    :param r_o: ohm
-    :param q_gradient_C: derivatives of ``q_mobile`` by x
-    """
-
-    residual_V: FloatArray
-    jacobian: FloatArray
+    residual_V: FloatArray  # at the samples
+    jacobian: FloatArray  # of these, by x
     q_mobile: float
     r_o: float
-    q_gradient_C: FloatArray
+    q_gradient_C: FloatArray  # of q_mobile, by x
 
 
 @dataclass(frozen=True)

@@ -53,7 +53,7 @@ class CramerRaoBound:
     def of(
         cls, slopes: Sensitivities, voltage_noise_V: float, parameters: Sequence[str] = PARAMETER_NAMES, offset: bool = False
     ) -> CramerRaoBound:
-        """The bound that sensitivities imply."""
+        """Return the bound that sensitivities imply."""
         names = check_parameters(parameters)
         if not 0.0 < voltage_noise_V < np.inf:
             raise ValueError(f"voltage_noise_V must be greater than 0 V, got {voltage_noise_V!r}")
@@ -69,7 +69,15 @@ class CramerRaoBound:
 
 
 def sensitivities(record: Record, at: Estimate | None = None, model: RecordModel | None = None) -> Sensitivities:
-    """The exact derivatives of the voltage of the model at the samples of a record."""
+    """
+    Differentiate the voltage of the model at the samples of a record, exactly.
+
+    :param record: one discharge, of which only time and current are used
+    :param at: the parameters; ``None``: the true ones of a simulated discharge
+    :param model: the model; ``None``: isothermal, in steps of 1 s, of a new cell that is full at the first sample
+    :return: voltage and derivatives
+    :raises ValueError: for a recorded discharge without parameters
+    """
     if at is None:
         if not isinstance(record, Trajectory):
             raise ValueError("give the parameters of a recorded discharge, e.g. what LeastSquares estimates, as `at`")
@@ -90,7 +98,7 @@ def cramer_rao_bound(
     model: RecordModel | None = None,
 ) -> CramerRaoBound:
     """
-    The bound for a voltage sensor with white normal noise and an exact current, over time as the record grows:
+    Return the bound for a voltage sensor with white normal noise and an exact current, over time as the record grows:
     sd^2 = diag((sum over samples of g g^T)^-1) * noise^2, g the derivatives of the voltage with respect to all unknowns.
 
     What is known exactly is the current. Were it the power, the current would give the parameters away a little as well, and
@@ -109,7 +117,7 @@ def cramer_rao_bound(
 
 
 def _inverse_diagonals(information: FloatArray) -> FloatArray:
-    """"""
+    """Invert the information after each sample; infinite where it cannot be inverted."""
     scale = np.sqrt(np.einsum("tii->ti", information))
     out = np.full_like(scale, np.inf)
     with np.errstate(divide="ignore", invalid="ignore"):

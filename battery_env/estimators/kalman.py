@@ -1,44 +1,38 @@
-"""Calibration during a discharge: an extended Kalman filter on voltage and current."""
+"""Calibration during a discharge: an extended Kalman filter on voltage and current, of one cell or of many."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import asdict
+from math import inf, isnan, nan
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
 
 from battery_env.arrays import FloatArray
-from battery_env.checks import check_gain_sd
-from battery_env.electrochemistry import STATE_SIZE, CellParameters, check_cell, check_dt
+from battery_env.checks import check_gain_sd, check_numbers
+from battery_env.electrochemistry import STATE_SIZE, CellParameters, PackedConstants, check_cell, check_dt
 from battery_env.electrochemistry.tangents import PolynomialDerivatives
-from battery_env.estimates import Estimate, EstimateTrace
+from battery_env.estimates import Estimate, Estimates, EstimateTrace
 from battery_env.estimators.base import SURPLUS_SHARE, ModelNow, OnlineBatch, OnlineEstimator, check_bounds
-from battery_env.estimators.kalman_bank import OUT_SIZE, Bank, Settings, follow
-from battery_env.estimators.monitor import AT_REST, Limits, Monitor, watch
-from battery_env.estimators.rest import (
-    LEAST_REST_S,
-    InitialSoc,
-    Start,
-    check_initial_soc,
-    follow_rest,
-    soc_at_rest,
-    told_at_rest,
-)
+from battery_env.estimators.kalman_bank import filters_of_prior, take
+from battery_env.estimators.kalman_state import CELL, ESTIMATE, FILTER, SAMPLE, Settings
+from battery_env.estimators.monitor import Verdict, reason, watch
+from battery_env.estimators.rest import check_initial_soc
 from battery_env.estimators.settling import MISMATCH_MARGIN, PLAUSIBLE_Q_SHARES, rest_voltage_V
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, check_parameters
-from battery_env.records import REST_CURRENT_A, Record, Stream, check_drawn_charge, check_sample, starts_at_rest
+from battery_env.records import Record, Stream, are_plausible, check_drawn_charge, check_sample, starts_at_rest
 
 _PRIOR_SD_SHARE_Q = 0.25
 _PRIOR_SD_R_OHM = 0.15
 _HOUR_S = 3600.0
 _NOISE_V = 0.005
-ZERO_CELSIUS_K = 273.15
-#: What the filter remembers of a discharge beside its bank: how many samples, how long (s), the charge drawn (C), whether a
-# load was on, how long the cell rested before it (s), both means of its voltage then (V); the state of charge at the first
-# sample, its standard deviation; and the temperature of the surroundings (K).
-SAMPLES, TIME, DRAWN, _LOADED, _REST, _FAST_V, _SLOW_V, _SOC, _SD_SOC, _AMBIENT = range(10)
+_ZERO_CELSIUS_K = 273.15
+# What a reason is made of
+_SEEN = ("start", "fault", "gap", "start_V")
 
 
 class ExtendedKalmanFilter(OnlineEstimator):
@@ -119,15 +113,13 @@ class ExtendedKalmanFilter(OnlineEstimator):
     :param voltage_noise_V: standard deviation of the noise of one voltage sample, V; ``None``: ``mismatch_V``, and at least
         0.005 V. A model that wanders by ``mismatch_V`` is not followed more closely from sample to sample
     :param offset_sd_V: standard deviation of a constant offset of sensor and model, V; ``None``: ``mismatch_V``, and at least
-        0.005 V. With 0 errors are about half as large
-        if there is no offset, and several percent if there is one of 10 mV
+        0.005 V. With 0 errors are about half as large if there is no offset, and several percent if there is one of 10 mV
     :param mismatch_V: how far the error of the model itself wanders in an hour (standard deviation of a random walk), V
     :param drift_per_hour: how far the parameters may wander in an hour, as a share of their prior means. A little keeps the
         filter awake
     :param current_gain_sd: standard deviation of the gain of the current sensor, as a share of it
-    :param initial_soc: state of charge at the first sample, after a rest: a number; (mean, standard deviation), which adds to
-        that of ``q_mobile``; or ``"rest"``: it is told from the voltage of the rest before the load, of a minute at least, by
-        the open-circuit voltage of the model, with ``voltage_noise_V`` and ``offset_sd_V`` as its errors
+    :param initial_soc: state of charge at the first sample, after a rest: a number, or (mean, standard deviation), which adds
+        to that of ``q_mobile``
     :raises ValueError: for an argument out of range
     """
 
@@ -146,7 +138,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
         mismatch_V: float = 0.0,
         drift_per_hour: float = 0.001,
         current_gain_sd: float = 0.0,
-        initial_soc: InitialSoc = 1.0,
+        initial_soc: float | tuple[float, float] = 1.0,
     ) -> None:
         self.parameters = check_parameters(parameters)
         self.cell = check_cell(cell, thermal)
@@ -155,45 +147,37 @@ class ExtendedKalmanFilter(OnlineEstimator):
         self.bounds = check_bounds(q_mobile_bounds_C, r_o_bounds_ohm)
         offset_sd_V = max(_NOISE_V, mismatch_V) if offset_sd_V is None else offset_sd_V
         for name, value in (("offset_sd_V", offset_sd_V), ("mismatch_V", mismatch_V), ("drift_per_hour", drift_per_hour)):
-            if not 0.0 <= value < np.inf:
+            if not 0.0 <= value < inf:
                 raise ValueError(f"{name} must be finite and at least 0, got {value!r}")
-        voltage_noise_V = max(_NOISE_V, mismatch_V) if voltage_noise_V is None else voltage_noise_V
-        if not 0.0 < voltage_noise_V < np.inf:
-            raise ValueError(f"voltage_noise_V must be greater than 0 V, got {voltage_noise_V!r}. Exact records: 1e-4.")
-        if voltage_noise_V < mismatch_V:
-            raise ValueError(
-                f"voltage_noise_V must be at least mismatch_V, {mismatch_V!r} V, got {voltage_noise_V!r} V: the filter would "
-                "take each sample of a model that wanders for exact. Leave voltage_noise_V out to have it follow mismatch_V."
-            )
+        voltage_noise_V = _checked_noise_V(voltage_noise_V, mismatch_V)
         self.current_gain_sd = check_gain_sd(current_gain_sd)
         self.initial_soc = check_initial_soc(initial_soc)
-        self.told_from_rest = isinstance(initial_soc, str)
-        self._carried = {
-            name: (float(prior[0]), float(prior[1]))
-            for name, prior in (("q_mobile", prior_q_mobile_C), ("r_o", prior_r_o_ohm))
-            if prior is not None
-        }
         q, q_sd = self._prior("q_mobile", prior_q_mobile_C, _PRIOR_SD_SHARE_Q * self.cell.q_mobile)
         r_o, r_o_sd = self._prior("r_o", prior_r_o_ohm, _PRIOR_SD_R_OHM)
+        self._means, self._sds = (q, r_o), (q_sd, r_o_sd, float(offset_sd_V))
+        soc, sd_soc = self.initial_soc
         self._settings = Settings(
             dt_s=self.dt_s,
             thermal=thermal,
             noise_V2=float(voltage_noise_V) ** 2,
             spare_V2=(MISMATCH_MARGIN**2 - 1.0) * float(mismatch_V) ** 2,
             mismatch_V2=float(mismatch_V) ** 2,
-            q_prior=q_sd**2,
-            r_prior=r_o_sd**2,
-            q_growth=(drift_per_hour * q) ** 2 / _HOUR_S if q_sd > 0.0 else 0.0,
-            r_growth=(drift_per_hour * r_o) ** 2 / _HOUR_S if r_o_sd > 0.0 else 0.0,
+            searched=("q_mobile" in self.parameters, "r_o" in self.parameters),
+            variance=(q_sd**2, r_o_sd**2),
+            growth=(
+                (drift_per_hour * q) ** 2 / _HOUR_S if q_sd > 0.0 else 0.0,
+                (drift_per_hour * r_o) ** 2 / _HOUR_S if r_o_sd > 0.0 else 0.0,
+            ),
             offset_growth=float(mismatch_V) ** 2 / _HOUR_S,
-            least_q=float(q_mobile_bounds_C[0]),
-            most_q=float(q_mobile_bounds_C[1]),
-            least_r=float(r_o_bounds_ohm[0]),
-            most_r=float(r_o_bounds_ohm[1]),
+            bounds=(_pair(q_mobile_bounds_C), _pair(r_o_bounds_ohm)),
+            carried=(_pair(prior_q_mobile_C or (0.0, 0.0)), _pair(prior_r_o_ohm or (0.0, 0.0))),
+            scale_sd=(float(np.hypot(self.current_gain_sd, sd_soc / soc)), float(self.current_gain_sd)),
+            plausible_C=_pair(np.multiply(PLAUSIBLE_Q_SHARES, self.cell.q_mobile)),
+            cell_q_mobile=float(self.cell.q_mobile),
         )
         self._derivatives = PolynomialDerivatives.of(self.cell.packed)
-        self._means, self._sds = (q, r_o), (q_sd, r_o_sd, float(offset_sd_V))
-        self._rest_sd_V = float(np.hypot(voltage_noise_V, offset_sd_V))
+        self._cells = np.zeros(1, CELL)
+        self._filters = np.zeros((1, len(self._start(self.cell))), FILTER)
         self.reset()
 
     def _prior(self, name: str, prior: tuple[float, float] | None, default_sd: float) -> tuple[float, float]:
@@ -203,235 +187,227 @@ class ExtendedKalmanFilter(OnlineEstimator):
             return float(getattr(self.cell, name)), 0.0
         mean, sd = (getattr(self.cell, name), default_sd) if prior is None else prior
         low, high = self.bounds[name]
-        if not (low <= mean <= high and 0.0 < sd < np.inf):
+        if not (low <= mean <= high and 0.0 < sd < inf):
             raise ValueError(f"the prior of {name} is (mean within {low:g} .. {high:g}, sd above 0), got {prior!r}")
         return float(mean), float(sd)
 
+    def _start(self, cell: CellParameters) -> NDArray[np.void]:
+        return filters_of_prior(self._means, self._sds, self._settings.bounds[0], cell, self.initial_soc[0])
+
     def reset(self) -> None:
-        """
-        Forget all samples: the next one is the first of a discharge, of a cell at rest with ``initial_soc``.
-        """
-        self._numbers = np.zeros(_AMBIENT + 1)
-        self._numbers[_SOC], self._numbers[_SD_SOC] = self.initial_soc
-        self._numbers[_AMBIENT] = self.cell.Tb0
-        self._monitor, self._clock_s = Monitor.new(), 0.0
-        self._model_cell = self.cell
-        self._begin()
+        """Forget all samples: the next one is the first of a discharge, of a cell at rest with ``initial_soc``."""
+        self._cells[...] = np.zeros((), CELL)
+        bank = self._cells["bank"]
+        bank["least_r"], bank["most_r"], bank["offset_V2"] = -inf, inf, self._sds[2] ** 2
+        self._begin(self.cell.Tb0)
 
-    def _begin(self) -> None:
-        """The filters at the start, as far as it is known, and what their samples are compared with."""
-        soc, sd_soc = float(self._numbers[_SOC]), float(self._numbers[_SD_SOC])
-        self._bank = Bank.of(self._means, self._sds, self._settings, self._model_cell, soc)
-        self._set_limits(soc, sd_soc)
+    def _begin(self, ambient_K: float) -> None:
+        """Let the model start at this temperature, and in surroundings of it."""
+        self._cells["ambient_K"] = ambient_K
+        cell = self._cell_now()
+        self._cells["constants"], self._cells["start_V"] = cell.packed.constants, rest_voltage_V(cell, self.initial_soc[0])
+        self._filters[0] = self._start(cell)
 
-    def _set_limits(self, soc: float, sd_soc: float) -> None:
-        nothing = (np.nan, np.nan)
-        self._limits = Limits(
-            start_V=rest_voltage_V(self._model_cell, soc),
-            needs_rest=self.told_from_rest,
-            rested=bool(self._numbers[_REST] >= LEAST_REST_S),
-            searched=np.array([float(name in self.parameters) for name in PARAMETER_NAMES]),
-            bounds=np.array([self.bounds[name] for name in PARAMETER_NAMES]),
-            prior=np.array([self._carried.get(name, nothing) for name in PARAMETER_NAMES]),
-            scale_sd=np.array([np.hypot(self.current_gain_sd, sd_soc / soc), self.current_gain_sd]),
-            plausible_C=np.multiply(PLAUSIBLE_Q_SHARES, self.cell.q_mobile),
-            cell_q_mobile=self.cell.q_mobile,
-        )
+    def _cell_now(self) -> CellParameters:
+        ambient_K = float(self._cells["ambient_K"][0])
+        return self.cell if ambient_K == self.cell.Tb0 else self.cell.replace(Tb0=ambient_K)
 
     def check(self, voltage_V: float, current_A: float, dt_s: float, temperature_C: float | None = None) -> None:
-        """
-        Refuse a sample that :meth:`update` would refuse, and change nothing.
-
-        :param voltage_V: as of :meth:`update`
-        :param current_A: likewise
-        :param dt_s: likewise
-        :param temperature_C: likewise
-        :raises ValueError: as :meth:`update`
-        """
-        is_first, before_A = not self._numbers[SAMPLES], self._bank.current_A
-        check_sample(voltage_V, current_A, dt_s, temperature_C, None if is_first else before_A)
-        self._check_drawn(self._numbers[DRAWN] + (0.0 if is_first else dt_s * before_A))
+        """Refuse a sample that :meth:`update` would refuse, and change nothing."""
+        cell = self._cells[0]
+        before_A = float(cell["current_A"]) if cell["samples"] else None
+        check_sample(voltage_V, current_A, dt_s, temperature_C, before_A)
+        check_drawn_charge(float(cell["drawn_C"]) + (0.0 if before_A is None else dt_s * before_A), self.least_drawn_C)
 
     def update(self, voltage_V: float, current_A: float, dt_s: float, temperature_C: float | None = None) -> Estimate:
         """
-        Take in one sample.
-
-        :param voltage_V: terminal voltage, V; NaN where it is missing, but for the first sample
-        :param current_A: current that flows from this sample to the next one, positive in discharge, A
-        :param dt_s: time since the previous sample, s; without meaning at the first one. The current of the previous sample
-            has flowed all the time
-        :param temperature_C: of the cell, degC; ``None``: not measured
-        :return: the estimate
-        :raises TypeError: for what is no number
-        :raises ValueError: for what cannot be meant (:func:`battery_env.records.check_sample`), and for a current that charges
-            a full cell; the filter stays as it was
+        Take in one sample, as :meth:`OnlineEstimator.update` describes. A sample that :func:`battery_env.records.check_sample`
+        refuses, or one that charges a full cell, leaves the filter as it was.
         """
         self.check(voltage_V, current_A, dt_s, temperature_C)
-        since_s = dt_s if self._numbers[SAMPLES] else 0.0
-        temperature_K = np.nan if temperature_C is None else temperature_C + ZERO_CELSIUS_K
-        if not self._numbers[SAMPLES] and temperature_C is not None:
-            self._surround(temperature_K)
-        if self.told_from_rest and not self._numbers[_LOADED]:
-            self._rest(voltage_V, current_A, since_s)
-        samples = np.array([[voltage_V], [current_A], [since_s], [temperature_K]], dtype=np.float64)
-        out, codes = self._run(samples)
-        code = int(codes[0])
-        reason = self._texts()[code] if code else ""
-        q, r_o, sd_q, sd_r_o = out[0, :4].tolist()
-        searched = self._limits.searched
-        return Estimate(
-            q, r_o, sd_q if searched[0] else float("nan"), sd_r_o if searched[1] else float("nan"), not code, reason
-        )
+        temperature_K = nan if temperature_C is None else temperature_C + _ZERO_CELSIUS_K
+        if not self._cells["samples"][0]:
+            dt_s = 0.0
+            if not isnan(temperature_K):
+                self._begin(temperature_K)
+        sample = np.array([[(voltage_V, current_A, dt_s, temperature_K)]], dtype=SAMPLE)
+        said = self._follow(self._cells, self._filters, sample)[0, 0]
+        code, (sd_q_mobile, sd_r_o) = int(said["code"]), said["sd"].tolist()
+        text = reason(code, self._cells[0], self.initial_soc[0]) if code else ""
+        return Estimate(float(said["q_mobile"]), float(said["r_o"]), sd_q_mobile, sd_r_o, not code, text)
 
-    def _surround(self, temperature_K: float) -> None:
-        """The model starts at this temperature, and in surroundings of it."""
-        self._numbers[_AMBIENT] = temperature_K
-        self._model_cell = self.cell.replace(Tb0=temperature_K)
-        self._begin()
-
-    def _rest(self, voltage_V: float, current_A: float, since_s: float) -> None:
-        """Tell the state of charge from the voltage, as long as no load is on."""
-        numbers = self._numbers
-        if abs(current_A) > REST_CURRENT_A:
-            numbers[_LOADED] = 1.0
-            return
-        if np.isnan(voltage_V):
-            return
-        means_V = numbers[_FAST_V : _SLOW_V + 1]
-        if not numbers[SAMPLES]:
-            means_V[:] = voltage_V
-        follow_rest(means_V, voltage_V, since_s)
-        numbers[_REST] += since_s
-        numbers[_SOC], numbers[_SD_SOC] = soc_at_rest(means_V, self._rest_sd_V, self._model_cell)
-        self._begin()
-
-    def start_of(self, record: Record) -> Start:
-        """
-        The state of charge that a record starts with: the one that is stated, or what its rest tells.
-
-        :param record: one discharge
-        :return: as far as it can be told
-        :raises ValueError: if the record cannot be used
-        """
-        if self.told_from_rest:
-            measured_C = getattr(record, "temperature_C", None)
-            cell = self.cell if measured_C is None else self.cell.replace(Tb0=float(measured_C[0]) + ZERO_CELSIUS_K)
-            return told_at_rest(record, cell, self._rest_sd_V, self.dt_s)
-        return Start(*self.initial_soc)
+    def _follow(self, cells: NDArray[np.void], filters: NDArray[np.void], samples: NDArray[np.void]) -> NDArray[np.void]:
+        """What filters of these rows estimate after samples, shape (samples, cells)."""
+        estimates = np.empty(samples.shape, ESTIMATE)
+        _follow_all(cells, filters, samples, self._settings, self.cell.packed, self._derivatives, estimates)
+        return estimates
 
     def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:
         """
         One estimate for every sample of many discharges, in one compiled call each. A temperature that was measured is that of
         the model, as in a stream.
-
-        :param records: discharges; a :class:`~battery_env.trajectories.TrajectoryDataset` is one
-        :return: one trace per discharge, in the same order
-        :raises ValueError: if a record cannot be used
         """
         traces = []
         for record in records:
             stream = Stream.of(record, self.dt_s)
             self.reset()
             time_s, voltage_V, current_A, dt_s, temperature_C = stream
-            self._clock_s = float(time_s[0])
-            if self.told_from_rest:  # filters begin anew with each sample of a rest
-                traces.append(self._follow_samples(stream))
-                continue
-            temperature_K = np.full(len(time_s), np.nan)
+            samples = np.zeros((len(time_s), 1), SAMPLE)
+            samples["voltage_V"][:, 0], samples["current_A"][:, 0], samples["dt_s"][:, 0] = voltage_V, current_A, dt_s
+            samples["temperature_K"][:, 0] = nan if temperature_C is None else temperature_C + _ZERO_CELSIUS_K
             if temperature_C is not None:
-                temperature_K = temperature_C + ZERO_CELSIUS_K
-                self._surround(float(temperature_K[0]))
-            self._monitor.memory[AT_REST] = float(starts_at_rest(record))
-            self._check_drawn(float(np.cumsum(np.append(0.0, current_A[:-1]) * dt_s).min()))
-            out, codes = self._run(np.stack([voltage_V, current_A, dt_s, temperature_K]))
-            q, r_o, sd_q, sd_r_o = out[:, :4].T.copy()
-            for name, sd in (("q_mobile", sd_q), ("r_o", sd_r_o)):
-                if name not in self.parameters:
-                    sd[:] = np.nan
-            reason = np.array(self._texts(), dtype=object)[codes]
-            traces.append(EstimateTrace(time_s, q, r_o, sd_q, sd_r_o, codes == 0, reason))
+                self._begin(float(samples["temperature_K"][0, 0]))
+            self._cells["start"]["at_rest"] = starts_at_rest(record)
+            check_drawn_charge(float(np.cumsum(np.append(0.0, current_A[:-1]) * dt_s).min()), self.least_drawn_C)
+            said = self._follow(self._cells, self._filters, samples)[:, 0]
+            clock_s, soc = float(time_s[0]), self.initial_soc[0]
+            texts = {code: reason(code, self._cells[0], soc, clock_s) for code in np.unique(said["code"]).tolist()}
+            sd_q, sd_r_o = said["sd"].T.copy()
+            reasons = np.array([texts[code] for code in said["code"].tolist()], dtype=object)
+            columns = (said["q_mobile"].copy(), said["r_o"].copy(), sd_q, sd_r_o, said["code"] == Verdict.SETTLED, reasons)
+            traces.append(EstimateTrace(time_s, *columns))
         self.reset()
         return traces
 
     @property
     def least_drawn_C(self) -> float:
         """The charge drawn stays above this: a cell takes no more than it has room for, C."""
-        return -(SURPLUS_SHARE + (1.0 - float(self._numbers[_SOC]))) * self.cell.q_mobile
+        return -(SURPLUS_SHARE + (1.0 - self.initial_soc[0])) * self.cell.q_mobile
 
-    def _check_drawn(self, charge_C: float) -> None:
-        check_drawn_charge(charge_C, self.least_drawn_C)
-
-    def batch(self, cells: int) -> OnlineBatch:
-        """
-        Filters like this one, each for a cell of its own, which take their samples in one compiled call.
-
-        :param cells: how many
-        :return: these, before their first samples
-        :raises ValueError: for no cells
-        """
-        from battery_env.estimators.kalman_batch import KalmanBatch  # here, as it imports this module
-
+    def batch(self, cells: int) -> KalmanBatch:
+        """Filters like this one, each for a cell of its own, which take their samples in one compiled call."""
         return KalmanBatch(self, cells)
 
-    def _run(self, samples: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
-        """Take in samples."""
-        voltage_V, current_A, dt_s, temperature_K = samples
-        numbers, count = self._numbers, samples.shape[1]
-        out, codes = np.empty((count, OUT_SIZE)), np.empty(count, dtype=np.int64)
-        before_A = np.append(self._bank.current_A, current_A[:-1])
-        drawn_C = numbers[DRAWN] + np.cumsum(before_A * dt_s)
-        settings, packed = self._settings, self._model_cell.packed
-        follow(self._bank, voltage_V, current_A, dt_s, temperature_K, settings, packed, self._derivatives, out)
-        watch(self._monitor, voltage_V, current_A, dt_s, drawn_C, self._limits, out, codes)
-        numbers[SAMPLES] += count
-        numbers[TIME] += dt_s.sum()
-        numbers[DRAWN] = drawn_C[-1]
-        return out, codes
-
-    def _texts(self) -> list[str]:
-        return self._monitor.texts(self._limits.start_V, float(self._numbers[_SOC]), self._clock_s)
+    def _of_rows(self, cells: NDArray[np.void], filters: NDArray[np.void]) -> ExtendedKalmanFilter:
+        """Another filter with the same arguments, whose memory is a row of these tables."""
+        other = copy(self)
+        other._cells, other._filters = cells, filters
+        return other
 
     def now(self) -> ModelNow:
-        """
-        The model at the last sample, at the mean of all filters.
-
-        :return: where it stands
-        """
-        bank = self._bank
-        weight = np.exp(bank.log_weight - bank.log_weight.max())
+        """The model at the last sample, at the mean of all filters."""
+        filters = self._filters[0]
+        weight = np.exp(filters["log_weight"] - filters["log_weight"].max())
         weight /= weight.sum()
         best, alive = int(weight.argmax()), weight > 0.0
-        mean = weight[alive] @ bank.mean[alive]
-        apart = bank.mean[alive] - mean
-        covariance = np.tensordot(weight[alive], bank.covariance[alive] + apart[:, :, None] * apart[:, None, :], axes=1)
+        means, covariances = filters["mean"], filters["covariance"]
+        mean = weight[alive] @ means[alive]
+        apart = means[alive] - mean
+        covariance = np.tensordot(weight[alive], covariances[alive] + apart[:, :, None] * apart[:, None, :], axes=1)
         # the state goes along with the parameters, by its tangents
-        by_parameters = np.vstack([np.hstack([bank.tangents[best], np.eye(2, 3)]), np.eye(1, STATE_SIZE + 3, STATE_SIZE + 2)])
+        tangents = filters["tangents"][best, 0]
+        by_parameters = np.vstack([np.hstack([tangents, np.eye(2, 3)]), np.eye(1, STATE_SIZE + 3, STATE_SIZE + 2)])
         variances, directions = np.linalg.eigh(covariance)
         deviations = (directions * np.sqrt(np.maximum(variances, 0.0))).T @ by_parameters
-        state = bank.state[best] + (mean - bank.mean[best]) @ by_parameters[:, :STATE_SIZE]
-        return ModelNow(self._model_cell, self.thermal, self.dt_s, state, mean, deviations)
+        state = filters["state"][best, 0] + (mean - means[best]) @ by_parameters[:, :STATE_SIZE]
+        return ModelNow(self._cell_now(), self.thermal, self.dt_s, state, mean, deviations)
 
     def _made_with(self) -> dict[str, Any]:
         return {
             "estimator": type(self).__name__,
             "parameters": list(self.parameters),
             "cell": asdict(self.cell),
-            "means": list(self._means),
-            "standard deviations": list(self._sds),
-            "settings": self._settings._asdict(),
-            "priors": self._carried,
-            "current_gain_sd": self.current_gain_sd,
-            "initial_soc": "rest" if self.told_from_rest else list(self.initial_soc),
+            "initial_soc": self.initial_soc,
+            "means": self._means,
+            "standard_deviations": self._sds,
+            **self._settings._asdict(),
         }
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
-        arrays = {f"bank/{name}": array for name, array in self._bank._asdict().items()}
-        arrays |= {f"monitor/{name}": array for name, array in self._monitor._asdict().items()}
-        return {**arrays, "numbers": self._numbers}
+        return {"cells": self._cells, "filters": self._filters}
 
     def _restore(self, arrays: dict[str, NDArray[Any]]) -> None:
-        self._numbers = arrays["numbers"].copy()
-        self._model_cell = self.cell.replace(Tb0=float(self._numbers[_AMBIENT]))
-        self._bank = Bank(*(arrays[f"bank/{name}"].copy() for name in Bank._fields))
-        self._monitor = Monitor(*(arrays[f"monitor/{name}"].copy() for name in Monitor._fields))
-        self._set_limits(float(self._numbers[_SOC]), float(self._numbers[_SD_SOC]))
+        self._cells[...], self._filters[...] = arrays["cells"], arrays["filters"]
+
+
+class KalmanBatch(OnlineBatch):
+    """
+    Cells side by side, each followed by a filter of its own with the same arguments: rows of the same tables, which take their
+    samples in one compiled call.
+
+    :param estimator: what to copy; it stays as it is
+    :param cells: how many
+    :raises ValueError: for no cells
+    """
+
+    estimators: Sequence[ExtendedKalmanFilter]
+
+    def _copies(self, estimator: OnlineEstimator, cells: int) -> Sequence[ExtendedKalmanFilter]:
+        assert isinstance(estimator, ExtendedKalmanFilter)
+        self._cells = np.zeros(cells, CELL)
+        self._filters = np.zeros((cells, estimator._filters.shape[1]), FILTER)
+        return [estimator._of_rows(self._cells[n : n + 1], self._filters[n : n + 1]) for n in range(cells)]
+
+    def update(
+        self, voltage_V: ArrayLike, current_A: ArrayLike, dt_s: ArrayLike, temperature_C: ArrayLike | None = None
+    ) -> Estimates:
+        """Take in one sample of each cell: of all, or of none if one is refused."""
+        cells, one = self._cells, self.estimators[0]
+        is_first = cells["samples"] == 0
+        if is_first.any():
+            self.check(voltage_V, current_A, dt_s, temperature_C)
+        samples = np.zeros((1, len(cells)), SAMPLE)
+        (of,) = samples
+        of["voltage_V"], of["current_A"] = check_numbers("voltage_V", voltage_V), check_numbers("current_A", current_A)
+        of["dt_s"] = 0.0 if is_first.all() else np.where(is_first, 0.0, check_numbers("dt_s", dt_s))
+        degrees_C = None if temperature_C is None else np.asarray(temperature_C, dtype=np.float64)
+        of["temperature_K"] = nan if degrees_C is None else degrees_C + _ZERO_CELSIUS_K
+        drawn_C = cells["drawn_C"] + cells["current_A"] * of["dt_s"]
+        good = are_plausible(of["voltage_V"], of["current_A"], of["dt_s"], degrees_C, cells["current_A"])
+        self.check(
+            voltage_V, current_A, dt_s, temperature_C, np.flatnonzero(~is_first & ~(good & (drawn_C > one.least_drawn_C)))
+        )
+        for n in np.flatnonzero(is_first & ~np.isnan(of["temperature_K"])).tolist():
+            self.estimators[n]._begin(float(of["temperature_K"][n]))
+        (said,) = one._follow(cells, self._filters, samples)
+        sd_q_mobile, sd_r_o = said["sd"].T
+        seen = {name: cells[name].copy() for name in _SEEN}
+
+        def reason_of(n: int) -> str:
+            code = int(said["code"][n])
+            return reason(code, {name: column[n] for name, column in seen.items()}, one.initial_soc[0]) if code else ""
+
+        return Estimates(said["q_mobile"], said["r_o"], sd_q_mobile, sd_r_o, said["code"] == Verdict.SETTLED, reason_of)
+
+
+def _checked_noise_V(voltage_noise_V: float | None, mismatch_V: float) -> float:
+    """The noise of a voltage sample that is stated, or what follows from the error of the model."""
+    if voltage_noise_V is None:
+        return float(max(_NOISE_V, mismatch_V))
+    if not 0.0 < voltage_noise_V < inf:
+        raise ValueError(f"voltage_noise_V must be greater than 0 V, got {voltage_noise_V!r}. Exact records: 1e-4.")
+    if voltage_noise_V < mismatch_V:
+        raise ValueError(
+            f"voltage_noise_V must be at least mismatch_V, {mismatch_V!r} V, got {voltage_noise_V!r} V: the filter would "
+            "take each sample of a model that wanders for exact. Leave voltage_noise_V out to have it follow mismatch_V."
+        )
+    return float(voltage_noise_V)
+
+
+def _pair(values: Sequence[float] | FloatArray) -> tuple[float, float]:
+    low, high = map(float, values)
+    return low, high
+
+
+@njit(cache=True, error_model="numpy")
+def _follow_all(
+    cells: NDArray[np.void],
+    filters: NDArray[np.void],
+    samples: NDArray[np.void],
+    settings: Settings,
+    packed: PackedConstants,
+    derivatives: PolynomialDerivatives,
+    estimates: NDArray[np.void],
+) -> None:
+    # every sample of every cell, into the estimate after it
+    for n in range(samples.shape[1]):
+        cell = cells[n]
+        of_cell = PackedConstants(cell.constants, packed.polynomial_n, packed.polynomial_p)
+        for k in range(samples.shape[0]):
+            sample = samples[k, n]
+            cell.samples += 1
+            cell.time_s += sample.dt_s
+            cell.drawn_C += cell.current_A * sample.dt_s
+            take(cell, filters[n], sample, settings, of_cell, derivatives)
+            watch(cell, sample, settings, estimates[k, n])
+            cell.current_A = sample.current_A

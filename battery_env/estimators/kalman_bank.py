@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from math import exp, inf, isnan, log, sqrt
-from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from battery_env.arrays import FloatArray
 from battery_env.electrochemistry import (
@@ -30,20 +30,14 @@ from battery_env.electrochemistry.tangents import (
     voltage_curvature,
     voltage_tangents,
 )
+from battery_env.estimators.kalman_state import FILTER, OFFSET, Q, R, Row, Settings
 
 #: Standard deviations. Innovations count in full within the gate. A filter whose successive innovations are correlated, whose
 #: estimate leaves the range that it stated, or whose offset is beyond the stated one, by more than the limit does not follow
 #: its cell.
 GATE_SD, LIMIT_SD = 5.0, 5.0
 
-# What a filter estimates: q_mobile (C), r_o (ohm) and the offset of the voltage (V).
-_Q, _R, _OFFSET = range(3)
-# What the bank remembers: the current since the last sample (A), the mean of the noise that innovations showed (V^2), the last
-# innovations (of the mixture, normalized), the sum of the products of each with those before it and its variance, both over
-# about so many samples, how many standard deviations that sum has been above 0 at most, and the range that r_o cannot leave
-# if what the filter said about it before was right (q_mobile can: at the knee the error of the model moves it), and the
-# variance that the offset may have by now (V^2).
-_CURRENT, _NOISE, _LAST, _PRODUCTS, _VARIANCE, _TREND, _LEAST_R, _MOST_R, _OFFSET_V2 = range(9)
+# The last innovations, and the products of each one with those before it, are averaged with these weights of what was.
 _TREND_MEMORY, _PRODUCTS_MEMORY = 0.8, 0.999
 # A filter is linear over its standard deviation of q_mobile: a wider prior is divided among filters this far apart (as a
 # share of its mean), over so many standard deviations to each side.
@@ -53,340 +47,238 @@ _REACH_SD = 2.5
 # same, within this share of a standard deviation.
 _LEAST_LOG_WEIGHT = -15.0
 _SAME_SHARE = 0.25
-# Of all errors as large as the one that is stated the worst moves q_mobile as far as least squares state. On discharges of the
-# bundled cell B0005 the filter is about half as far from least squares, as it is on those of B0006.
+# Least squares state the worst case: the error of the model of the stated size that moves q_mobile most. The filter is moved
+# half as far (measured on the bundled cells B0005 and B0006).
 _MISMATCH_SHARE = 0.5
 # The noise that innovations show is averaged over about this many samples.
 _NOISE_MEMORY = 32.0
-#: How many numbers a bank says after each sample, see :func:`follow`.
-OUT_SIZE = 8
 
 _compiled = njit(cache=True, error_model="numpy")
-# a call passes all arrays of a bank, which takes longer than the arithmetic
 _inlined = njit(cache=True, error_model="numpy", forceinline=True)
 
 
-class Settings(NamedTuple):
-    """
-    What a bank is told.
-
-    :param dt_s: longest time step of the model, s
-    :param thermal: whether the temperature of the model moves
-    :param noise_V2: variance of the voltage noise, V^2
-    :param spare_V2: variance that innovations may show beyond it before they contradict the stated mismatch, V^2
-    :param mismatch_V2: variance of the error of the model, V^2
-    :param q_prior: variance of ``q_mobile`` before the discharge, 0 where it is held, C^2
-    :param r_prior: of ``r_o``, ohm^2
-    :param q_growth: growth of the variance of ``q_mobile``, C^2/s
-    :param r_growth: growth of the variance of ``r_o``, ohm^2/s
-    :param offset_growth: growth of the variance of the offset, V^2/s
-    :param least_q: lower bound of ``q_mobile``, C
-    :param most_q: upper bound of ``q_mobile``, C
-    :param least_r: lower bound of ``r_o``, ohm
-    :param most_r: upper bound of ``r_o``, ohm
-    """
-
-    dt_s: float
-    thermal: bool
-    noise_V2: float
-    spare_V2: float
-    mismatch_V2: float
-    q_prior: float
-    r_prior: float
-    q_growth: float
-    r_growth: float
-    offset_growth: float
-    least_q: float
-    most_q: float
-    least_r: float
-    most_r: float
-
-
-class Bank(NamedTuple):
-    """
-    Filters side by side, each with a model of its own at its estimate.
-
-    :param state: of the models, shape (filters, 8)
-    :param tangents: derivatives of the states with respect to ``q_mobile`` and ``r_o``, shape (filters, 2, 8)
-    :param mean: estimates of ``q_mobile``, ``r_o`` and the offset, shape (filters, 3)
-    :param covariance: their covariance, shape (filters, 3, 3)
-    :param log_weight: logarithm of the weight, -inf for a filter that is given up, shape (filters,)
-    :param shown: variance of the noise that the last innovation showed, V^2, shape (filters,)
-    :param innovation: the last one over its standard deviation, within the gate, shape (filters,)
-    :param expected_V: voltage of the model at the last sample before it was taken in, with the offset, V, shape (filters,)
-    :param seen: what the voltage told so far: sums over the charge drawn of the products of its derivatives with respect to
-        ``q_mobile`` and ``r_o`` (V^2/C, V A, A^2 C), and that charge (C), shape (filters, 4)
-    :param memory: what the bank remembers, shape (9,)
-    """
-
-    state: FloatArray
-    tangents: FloatArray
-    mean: FloatArray
-    covariance: FloatArray
-    log_weight: FloatArray
-    shown: FloatArray
-    innovation: FloatArray
-    expected_V: FloatArray
-    seen: FloatArray
-    memory: FloatArray
-
-    @classmethod
-    def of(
-        cls,
-        means: tuple[float, float],
-        sds: tuple[float, float, float],
-        settings: Settings,
-        cell: CellParameters,
-        soc: float = 1.0,
-    ) -> Bank:
-        """The filters that a prior takes, before the first sample of a cell at rest."""
-        (q, r_o), sd_q = means, sds[_Q]
-        half = int(np.ceil(_REACH_SD * sd_q / (_WIDEST_SHARE * q))) if sd_q > _WIDEST_SHARE * q else 0
-        deviations = np.linspace(-_REACH_SD, _REACH_SD, 2 * half + 1) if half else np.zeros(1)
-        q_mobile = q + sd_q * deviations
-        inside = (q_mobile >= settings.least_q) & (q_mobile <= settings.most_q)
-        q_mobile, deviations = q_mobile[inside], deviations[inside]
-        filters = len(q_mobile)
-        tangents = np.zeros((filters, 2, STATE_SIZE))
-        tangents[:, BY_Q, QNB:] = rest_shares(soc)
-        own_sds = [_REACH_SD / half * sd_q if half else sd_q, *sds[1:]]
-        memory = np.zeros(9)
-        memory[_LEAST_R:] = [-inf, inf, sds[_OFFSET] ** 2]
-        return cls(
-            state=initial_state(q_mobile, cell, soc),
-            tangents=tangents,
-            mean=np.column_stack([q_mobile, np.full(filters, r_o), np.zeros(filters)]),
-            covariance=np.tile(np.diag(np.square(own_sds)), (filters, 1, 1)),
-            log_weight=-0.5 * deviations**2,
-            shown=np.zeros(filters),
-            innovation=np.zeros(filters),
-            expected_V=np.zeros(filters),
-            seen=np.zeros((filters, 4)),
-            memory=memory,
-        )
-
-    def copy(self) -> Bank:
-        """A bank that goes its own way."""
-        return Bank(*(array.copy() for array in self))
-
-    @property
-    def current_A(self) -> float:
-        """The current since the last sample, A."""
-        return float(self.memory[_CURRENT])
+def filters_of_prior(
+    means: tuple[float, float],
+    sds: tuple[float, float, float],
+    bounds_C: tuple[float, float],
+    cell: CellParameters,
+    soc: float,
+) -> NDArray[np.void]:
+    """The filters that a prior takes, before the first sample of a cell at rest."""
+    (q, r_o), sd_q = means, sds[Q]
+    half = int(np.ceil(_REACH_SD * sd_q / (_WIDEST_SHARE * q))) if sd_q > _WIDEST_SHARE * q else 0
+    deviations = np.linspace(-_REACH_SD, _REACH_SD, 2 * half + 1) if half else np.zeros(1)
+    q_mobile = q + sd_q * deviations
+    inside = (q_mobile >= bounds_C[0]) & (q_mobile <= bounds_C[1])
+    q_mobile, deviations = q_mobile[inside], deviations[inside]
+    filters = np.zeros(len(q_mobile), FILTER)
+    filters["state"][:, 0] = initial_state(q_mobile, cell, soc)
+    filters["tangents"][:, 0, BY_Q, QNB:] = rest_shares(soc)
+    filters["mean"] = np.column_stack([q_mobile, np.full(len(q_mobile), r_o), np.zeros(len(q_mobile))])
+    filters["covariance"] = np.diag(np.square([_REACH_SD / half * sd_q if half else sd_q, *sds[1:]]))
+    filters["log_weight"] = -0.5 * deviations**2
+    return filters
 
 
 @_inlined
-def _move(bank: Bank, m: int, q_change: float, r_change: float) -> None:
+def _move(one: Row, q_change: float, r_change: float) -> None:
     # Another estimate is another past: the state goes along with it, by its tangents. For the charges that is exact.
-    state, tangents = bank.state, bank.tangents
+    state, tangents, mean = one.state, one.tangents, one.mean
     for j in range(STATE_SIZE):
-        state[m, j] += tangents[m, BY_Q, j] * q_change + tangents[m, BY_R, j] * r_change
-    bank.mean[m, _Q] += q_change
-    bank.mean[m, _R] += r_change
+        state[0, j] += tangents[0, BY_Q, j] * q_change + tangents[0, BY_R, j] * r_change
+    mean[Q] += q_change
+    mean[R] += r_change
 
 
 @_inlined
-def _keep_alive(bank: Bank, m: int, settings: Settings, constants: FloatArray) -> bool:
+def _keep_alive(one: Row, settings: Settings, constants: FloatArray) -> bool:
     # Raises q_mobile to what the charge drawn so far takes; tells whether the model cell has a voltage then.
-    q, least = bank.mean[m, _Q], 0.0
+    q, least = one.mean[Q], 0.0
     for surface in (QNS, QPS):
-        slope = bank.tangents[m, BY_Q, surface]
-        least = max(least, least_q(bank.state[m, surface], slope, q, MOLE_FRACTION_MARGIN, constants))
+        slope = one.tangents[0, BY_Q, surface]
+        least = max(least, least_q(one.state[0, surface], slope, q, MOLE_FRACTION_MARGIN, constants))
     if least > q:
-        if bank.covariance[m, _Q, _Q] == 0.0 or least > settings.most_q:
+        if one.covariance[Q, Q] == 0.0 or least > settings.bounds[Q][1]:
             return False
-        _move(bank, m, least - q, 0.0)
+        _move(one, least - q, 0.0)
     return True
 
 
 @_inlined
-def _predict(bank: Bank, m: int, duration: float, settings: Settings, constants: FloatArray) -> None:
-    state, tangents, current, p = bank.state, bank.tangents, bank.memory[_CURRENT], bank.covariance
-    q, r_o = bank.mean[m, _Q], bank.mean[m, _R]
+def _predict(one: Row, current: float, duration: float, settings: Settings, constants: FloatArray) -> None:
+    q, r_o, p = one.mean[Q], one.mean[R], one.covariance
     steps = int(np.ceil(duration / settings.dt_s - 1e-6))
     for _ in range(steps):
-        step_with_tangents(state, tangents, m, current, q, r_o, duration / steps, settings.thermal, True, constants)
-    p[m, _Q, _Q] += settings.q_growth * duration
-    p[m, _R, _R] += settings.r_growth * duration
-    p[m, _OFFSET, _OFFSET] += settings.offset_growth * duration
+        step_with_tangents(one.state, one.tangents, 0, current, q, r_o, duration / steps, settings.thermal, True, constants)
+    p[Q, Q] += settings.growth[Q] * duration
+    p[R, R] += settings.growth[R] * duration
+    p[OFFSET, OFFSET] += settings.offset_growth * duration
 
 
 @_inlined
-def _mismatch_sd(bank: Bank, m: int, settings: Settings) -> float:
+def _mismatch_sd(one: Row, settings: Settings) -> float:
     # What the error of the model leaves open of q_mobile, however many samples there are: the filter takes the error for noise
     # that is new with each of them. As in least squares it is one error common to the discharge.
-    qq, qr, rr, total_C = bank.seen[m]
-    if settings.mismatch_V2 == 0.0 or settings.q_prior == 0.0 or total_C == 0.0:
+    told, (q_prior, r_prior) = one.told, settings.variance
+    if settings.mismatch_V2 == 0.0 or q_prior == 0.0 or told.charge_C == 0.0:
         return 0.0
-    share = 1.0 / (_MISMATCH_SHARE**2 * settings.mismatch_V2 * total_C)
-    qq = qq * share + 1.0 / settings.q_prior
-    if settings.r_prior == 0.0:
+    share = 1.0 / (_MISMATCH_SHARE**2 * settings.mismatch_V2 * told.charge_C)
+    qq = told.qq * share + 1.0 / q_prior
+    if r_prior == 0.0:
         return sqrt(1.0 / qq)
-    qr, rr = qr * share, rr * share + 1.0 / settings.r_prior
+    qr, rr = told.qr * share, told.rr * share + 1.0 / r_prior
     return sqrt(rr / (qq * rr - qr * qr))
 
 
 @_inlined
 def _correct(
-    bank: Bank,
-    m: int,
+    one: Row,
     voltage: float,
-    duration: float,
+    charge: float,
     noise: float,
     settings: Settings,
     packed: PackedConstants,
     derivatives: PolynomialDerivatives,
 ) -> None:
-    # One measurement, to second order in q_mobile
-    state, tangents, mean, p = bank.state, bank.tangents, bank.mean, bank.covariance
-    q, r_o = mean[m, _Q], mean[m, _R]
-    by_q, by_r = voltage_tangents(state, tangents, m, q, settings.thermal, packed, derivatives)
+    # One measurement, to second order in q_mobile; charge: what flowed since the last one
+    state, tangents, mean, p = one.state, one.tangents, one.mean, one.covariance
+    q, r_o = mean[Q], mean[R]
+    by_q, by_r = voltage_tangents(state, tangents, 0, q, settings.thermal, packed, derivatives)
     h = (by_q, by_r, 1.0)
     # over the spread of q_mobile a curved voltage is higher by this in the mean, with twice its square as the variance
-    bend = 0.5 * voltage_curvature(state, tangents, m, q, packed, derivatives) * p[m, _Q, _Q]
+    bend = 0.5 * voltage_curvature(state, tangents, 0, q, packed, derivatives) * p[Q, Q]
     ph = (
-        p[m, 0, 0] * h[0] + p[m, 0, 1] * h[1] + p[m, 0, 2] * h[2],
-        p[m, 1, 0] * h[0] + p[m, 1, 1] * h[1] + p[m, 1, 2] * h[2],
-        p[m, 2, 0] * h[0] + p[m, 2, 1] * h[1] + p[m, 2, 2] * h[2],
+        p[0, 0] * h[0] + p[0, 1] * h[1] + p[0, 2] * h[2],
+        p[1, 0] * h[0] + p[1, 1] * h[1] + p[1, 2] * h[2],
+        p[2, 0] * h[0] + p[2, 1] * h[1] + p[2, 2] * h[2],
     )
     explained = h[0] * ph[0] + h[1] * ph[1] + h[2] * ph[2] + 2.0 * bend * bend
-    innovation = voltage - cell_voltage(state, m, q, True, packed, 0) - bend - mean[m, _OFFSET]
-    bank.expected_V[m] = voltage - innovation
+    innovation = voltage - cell_voltage(state, 0, q, True, packed, 0) - bend - mean[OFFSET]
+    one.expected_V = voltage - innovation
     variance = explained + noise
     sd = sqrt(variance)
-    bank.innovation[m] = min(max(innovation / sqrt(variance + settings.spare_V2), -GATE_SD), GATE_SD)
-    bank.shown[m] = min(innovation * innovation, (GATE_SD * sd) ** 2) - explained
+    one.innovation = min(max(innovation / sqrt(variance + settings.spare_V2), -GATE_SD), GATE_SD)
+    one.shown_V2 = min(innovation * innovation, (GATE_SD * sd) ** 2) - explained
     beyond = max(abs(innovation) / sd / GATE_SD, 1.0)
     # Huber's loss: quadratic up to the gate, linear beyond, where a larger variance stands for it
     loss = innovation * innovation / variance if beyond == 1.0 else GATE_SD**2 * (2.0 * beyond - 1.0)
-    bank.log_weight[m] -= 0.5 * loss + log(sd)
+    one.log_weight -= 0.5 * loss + log(sd)
     variance *= beyond * beyond
     gain = (ph[0] / variance, ph[1] / variance, ph[2] / variance)
     for j in range(3):
         for k in range(j + 1):
             # Joseph's form, multiplied out
-            p[m, j, k] += gain[j] * gain[k] * variance - gain[j] * ph[k] - ph[j] * gain[k]
-            p[m, k, j] = p[m, j, k]
-    charge = abs(bank.memory[_CURRENT]) * duration
-    seen = bank.seen[m]
-    seen[0] += charge * by_q * by_q
-    seen[1] += charge * by_q * by_r
-    seen[2] += charge * by_r * by_r
-    seen[3] += charge
-    to_q = min(max(q + gain[_Q] * innovation, settings.least_q), settings.most_q)
-    to_r = min(max(r_o + gain[_R] * innovation, settings.least_r), settings.most_r)
-    mean[m, _OFFSET] += gain[_OFFSET] * innovation
-    _move(bank, m, to_q - q, to_r - r_o)
+            p[j, k] += gain[j] * gain[k] * variance - gain[j] * ph[k] - ph[j] * gain[k]
+            p[k, j] = p[j, k]
+    told = one.told
+    told.qq += charge * by_q * by_q
+    told.qr += charge * by_q * by_r
+    told.rr += charge * by_r * by_r
+    told.charge_C += charge
+    (least_q_C, most_q_C), (least_r, most_r) = settings.bounds
+    to_q = min(max(q + gain[Q] * innovation, least_q_C), most_q_C)
+    to_r = min(max(r_o + gain[R] * innovation, least_r), most_r)
+    mean[OFFSET] += gain[OFFSET] * innovation
+    _move(one, to_q - q, to_r - r_o)
+
+
+@_inlined
+def _heaviest(filters: Row) -> int:
+    best = 0
+    for m in range(1, len(filters)):
+        if filters[m].log_weight > filters[best].log_weight:
+            best = m
+    return best
 
 
 @_compiled
-def _reduce(bank: Bank) -> int:
+def _reduce(filters: Row) -> int:
     # Makes weights relative to the heaviest filter's, gives up light ones and merges equal ones; returns the heaviest.
-    mean, p, log_weight, best = bank.mean, bank.covariance, bank.log_weight, 0
-    for m in range(1, log_weight.shape[0]):
-        if log_weight[m] > log_weight[best]:
-            best = m
-    total, heaviest = 1.0, log_weight[best]
-    for m in range(log_weight.shape[0]):
-        if m == best or log_weight[m] == -inf:
+    best = _heaviest(filters)
+    heaviest, total = filters[best], 1.0
+    mean, p, log_weight = heaviest.mean, heaviest.covariance, heaviest.log_weight
+    for m in range(len(filters)):
+        one = filters[m]
+        if m == best or one.log_weight == -inf:
             continue
-        log_weight[m] -= heaviest
+        one.log_weight -= log_weight
         same = True
         for j in range(2):
-            same &= abs(mean[m, j] - mean[best, j]) <= _SAME_SHARE * sqrt(p[best, j, j])
-            same &= abs(p[m, j, j] - p[best, j, j]) <= _SAME_SHARE * p[best, j, j]
-        if same or log_weight[m] < _LEAST_LOG_WEIGHT:
-            total += exp(log_weight[m])
-            log_weight[m] = -inf
-    log_weight[best] = log(total)
+            same &= abs(one.mean[j] - mean[j]) <= _SAME_SHARE * sqrt(p[j, j])
+            same &= abs(one.covariance[j, j] - p[j, j]) <= _SAME_SHARE * p[j, j]
+        if same or one.log_weight < _LEAST_LOG_WEIGHT:
+            total += exp(one.log_weight)
+            one.log_weight = -inf
+    heaviest.log_weight = log(total)
     return best
 
 
 @_inlined
-def _take(
-    bank: Bank,
-    voltage: float,
-    current: float,
-    duration: float,
-    temperature: float,
-    settings: Settings,
-    packed: PackedConstants,
-    derivatives: PolynomialDerivatives,
-    out: FloatArray,
-    n: int,
-) -> None:
-    # One sample, into row n of out (see follow)
-    mean, p, log_weight, memory, constants = bank.mean, bank.covariance, bank.log_weight, bank.memory, packed.constants
-    noise = max(memory[_NOISE], settings.noise_V2)
-    before = 0
-    for m in range(1, log_weight.shape[0]):
-        if log_weight[m] > log_weight[before]:
-            before = m
-    for m in range(log_weight.shape[0]):
-        if log_weight[m] > -inf:
-            if duration > 0.0:
-                _predict(bank, m, duration, settings, constants)
-            if not isnan(temperature):
-                # measured, it is no function of the parameters any more
-                bank.state[m, TB] = temperature
-                bank.tangents[m, BY_Q, TB] = bank.tangents[m, BY_R, TB] = 0.0
-            if _keep_alive(bank, m, settings, constants):
-                if not isnan(voltage):
-                    _correct(bank, m, voltage, duration, noise, settings, packed, derivatives)
-                    _keep_alive(bank, m, settings, constants)
-    best = _reduce(bank)
-    # moments of the mixture, about the heaviest filter
+def _mix(bank: Row, filters: Row, best: int, voltage: float) -> None:
+    # Moments of the mixture, about the heaviest filter, and what its innovations show
+    middle = filters[best].mean
     total, q, r, qq, rr, square, normalized = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for m in range(log_weight.shape[0]):
-        if log_weight[m] > -inf:
-            weight, dq, dr = exp(log_weight[m]), mean[m, _Q] - mean[best, _Q], mean[m, _R] - mean[best, _R]
+    for m in range(len(filters)):
+        one = filters[m]
+        if one.log_weight > -inf:
+            weight, dq, dr = exp(one.log_weight), one.mean[Q] - middle[Q], one.mean[R] - middle[R]
             total += weight
             q += weight * dq
             r += weight * dr
-            qq += weight * (p[m, _Q, _Q] + dq * dq)
-            rr += weight * (p[m, _R, _R] + dr * dr)
-            square += weight * bank.shown[m]
-            normalized += weight * bank.innovation[m]
+            qq += weight * (one.covariance[Q, Q] + dq * dq)
+            rr += weight * (one.covariance[R, R] + dr * dr)
+            square += weight * one.shown_V2
+            normalized += weight * one.innovation
     q, r = q / total, r / total
     normalized /= total
-    memory[_CURRENT] = current
     if not isnan(voltage):
-        memory[_NOISE] = max(memory[_NOISE] + (square / total - memory[_NOISE]) / _NOISE_MEMORY, 0.0)
-        memory[_PRODUCTS] = _PRODUCTS_MEMORY * memory[_PRODUCTS] + normalized * memory[_LAST]
-        memory[_VARIANCE] = _PRODUCTS_MEMORY**2 * memory[_VARIANCE] + 1.0
-        memory[_TREND] = max(memory[_TREND], memory[_PRODUCTS] / sqrt(memory[_VARIANCE]))
-        memory[_LAST] = _TREND_MEMORY * memory[_LAST] + sqrt(1.0 - _TREND_MEMORY**2) * normalized
-    out[n, 0] = mean[best, _Q] + q
-    out[n, 1] = mean[best, _R] + r
-    out[n, 2] = sqrt(qq / total - q * q)
-    out[n, 3] = sqrt(rr / total - r * r)
-    out[n, 4] = 1.0 if _keep_alive(bank, best, settings, constants) else 0.0
-    memory[_OFFSET_V2] += settings.offset_growth * duration
-    if mean[best, _OFFSET] ** 2 > LIMIT_SD**2 * memory[_OFFSET_V2]:
-        memory[_TREND] = inf
-    reach = LIMIT_SD * out[n, 3]
+        bank.noise_V2 = max(bank.noise_V2 + (square / total - bank.noise_V2) / _NOISE_MEMORY, 0.0)
+        bank.products = _PRODUCTS_MEMORY * bank.products + normalized * bank.last
+        bank.variance = _PRODUCTS_MEMORY**2 * bank.variance + 1.0
+        bank.trend_sd = max(bank.trend_sd, bank.products / sqrt(bank.variance))
+        bank.last = _TREND_MEMORY * bank.last + sqrt(1.0 - _TREND_MEMORY**2) * normalized
+    bank.mean[Q], bank.mean[R] = middle[Q] + q, middle[R] + r
+    bank.sd[Q], bank.sd[R] = sqrt(qq / total - q * q), sqrt(rr / total - r * r)
+
+
+@_inlined
+def _doubt(bank: Row, offset_V: float) -> None:
+    # An offset beyond the stated one, and an r_o out of the range that was stated before, contradict the filter
+    if offset_V**2 > LIMIT_SD**2 * bank.offset_V2:
+        bank.trend_sd = inf
+    r_o, reach = bank.mean[R], LIMIT_SD * bank.sd[R]
     if reach > 0.0:
-        memory[_LEAST_R] = max(memory[_LEAST_R], out[n, 1] - reach)
-        memory[_MOST_R] = min(memory[_MOST_R], out[n, 1] + reach)
-        if not memory[_LEAST_R] <= out[n, 1] <= memory[_MOST_R]:
-            memory[_TREND] = inf
-    out[n, 5] = memory[_TREND]
-    out[n, 6] = bank.expected_V[before]  # by the filter that did not know yet
-    out[n, 7] = _mismatch_sd(bank, best, settings)
+        bank.least_r, bank.most_r = max(bank.least_r, r_o - reach), min(bank.most_r, r_o + reach)
+        if not bank.least_r <= r_o <= bank.most_r:
+            bank.trend_sd = inf
 
 
-@_compiled
-def follow(
-    bank: Bank,
-    voltage: FloatArray,
-    current: FloatArray,
-    duration: FloatArray,
-    temperature: FloatArray,
-    settings: Settings,
-    packed: PackedConstants,
-    derivatives: PolynomialDerivatives,
-    out: FloatArray,
+@_inlined
+def take(
+    cell: Row, filters: Row, sample: Row, settings: Settings, packed: PackedConstants, derivatives: PolynomialDerivatives
 ) -> None:
-    """Take in samples; unchecked."""
-    for n in range(voltage.shape[0]):
-        _take(bank, voltage[n], current[n], duration[n], temperature[n], settings, packed, derivatives, out, n)
+    """Take in one sample of a cell; unchecked."""
+    bank, voltage, duration, temperature = cell.bank, sample.voltage_V, sample.dt_s, sample.temperature_K
+    constants, current = packed.constants, cell.current_A
+    noise, charge = max(bank.noise_V2, settings.noise_V2), abs(current) * duration
+    before = _heaviest(filters)
+    for m in range(len(filters)):
+        one = filters[m]
+        if one.log_weight > -inf:
+            if duration > 0.0:
+                _predict(one, current, duration, settings, constants)
+            if not isnan(temperature):
+                # measured, it is no function of the parameters any more
+                one.state[0, TB] = temperature
+                one.tangents[0, BY_Q, TB] = one.tangents[0, BY_R, TB] = 0.0
+            if _keep_alive(one, settings, constants):
+                if not isnan(voltage):
+                    _correct(one, voltage, charge, noise, settings, packed, derivatives)
+                    _keep_alive(one, settings, constants)
+    best = _reduce(filters)
+    _mix(bank, filters, best, voltage)
+    bank.has_voltage = _keep_alive(filters[best], settings, constants)
+    bank.offset_V2 += settings.offset_growth * duration
+    _doubt(bank, filters[best].mean[OFFSET])
+    bank.expected_V = filters[before].expected_V  # by the filter that did not know yet
+    bank.least_sd_q = _mismatch_sd(filters[best], settings)

@@ -59,23 +59,14 @@ _FEW = "These are too few samples to tell the noise. Record on or more often, or
 
 @dataclass(frozen=True)
 class _Fitted:
-    """
-    What the search says of a record, and how sure that is.
-
-    :param search: in the record
-    :param fit: with all priors
-    :param alone: without the prior of ``q_mobile``
-    :param variance_V2: of one residual, with what the error of the model adds, V^2
-    :param hidden_sd: standard deviations of what does not show in the voltage, by parameter
-    :param gaps: where the record was not written under load
-    """
+    """What the search says of a record, and how sure that is."""
 
     search: Search
-    fit: Fit
-    alone: Fit
-    variance_V2: float
-    hidden_sd: Mapping[str, float]
-    gaps: Sequence[Gap]
+    fit: Fit  # with all priors
+    alone: Fit  # without the prior of q_mobile
+    variance_V2: float  # of one residual, with what the error of the model adds
+    hidden_sd: Mapping[str, float]  # of what does not show in the voltage, by parameter
+    gaps: Sequence[Gap]  # where the record was not written under load
 
     def sd(self, fit: Fit) -> dict[str, float]:
         """The standard deviations of a fit, with those of what does not show, and with charges that nobody saw."""

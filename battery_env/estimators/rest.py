@@ -14,10 +14,10 @@ from battery_env.records import REST_CURRENT_A, Record, Stream
 #: What a state of charge can be given as: a number, or (mean, standard deviation).
 InitialSoc = float | tuple[float, float]
 
-#: The charge of a cell is told from its voltage after so long a rest, s.
-LEAST_REST_S = 60.0
+# The charge of a cell is told from its voltage after so long a rest, s.
+_LEAST_REST_S = 60.0
 # Two running means of the resting voltage, over 20 s and 60 s. It is expected to move on by ten times their difference.
-_REST_MEMORIES_S, _STILL_TO_COME = (20.0, 60.0), 10.0
+_MEMORIES_S, _STILL_TO_COME = (20.0, 60.0), 10.0
 # States of charge to choose from, where it is told from a voltage, and how far to each side the slope of the voltage is taken.
 _SOC_GRID, _SLOPE_SPAN = np.linspace(0.02, 1.0, 1961), 0.01
 # Sensor and model are not taken to be better than this, V.
@@ -79,42 +79,33 @@ def soc_from_rest(
         settled
     :raises ValueError: if the record cannot be used
     """
-    offset_sd_V = max(_LEAST_ERROR_V, mismatch_V)
-    error_V = float(np.hypot(voltage_noise_V or offset_sd_V, offset_sd_V))
-    return told_at_rest(record, NEW_CELL if cell is None else cell, error_V, dt_s)
-
-
-def told_at_rest(record: Record, cell: CellParameters, error_V: float, dt_s: float) -> Start:
-    """The state of charge that a record starts with, from the voltage of the rest before its load."""
-    stream = Stream.of(record, dt_s)
+    stream, cell = Stream.of(record, dt_s), NEW_CELL if cell is None else cell
     loaded = np.flatnonzero(np.abs(stream.current_A) > REST_CURRENT_A)
     count = int(loaded[0]) if len(loaded) else len(stream.time_s)
     if not count:
         return Start(1.0, 0.0, 0, START_UNKNOWN)
-    means_V = np.full(2, stream.voltage_V[0])
-    for voltage_V, since_s in zip(stream.voltage_V[:count].tolist(), stream.dt_s[:count].tolist(), strict=True):
-        follow_rest(means_V, voltage_V, since_s)
-    rest_s = float(stream.time_s[count - 1] - stream.time_s[0])
-    return Start(*soc_at_rest(means_V, error_V, cell), count, "" if rest_s >= LEAST_REST_S else START_UNKNOWN)
-
-
-def follow_rest(means_V: FloatArray, voltage_V: float, since_s: float) -> None:
-    """Take in one sample of a rest."""
-    for n, memory_s in enumerate(_REST_MEMORIES_S):
-        means_V[n] += -np.expm1(-since_s / memory_s) * (voltage_V - means_V[n])
-
-
-def soc_at_rest(means_V: FloatArray, error_V: float, cell: CellParameters) -> tuple[float, float]:
-    """The state of charge at which the open-circuit voltage of the model is that of a rest, and its standard deviation."""
-    rest_V = rest_voltages_V(cell)
-    soc = float(np.interp(means_V[0], rest_V, _SOC_GRID))
+    fast_V, slow_V = (_running_mean_V(stream, count, memory_s) for memory_s in _MEMORIES_S)
+    rest_V = _rest_voltages_V(cell)
+    soc = float(np.interp(fast_V, rest_V, _SOC_GRID))
     around = np.clip([soc - _SLOPE_SPAN, soc + _SLOPE_SPAN], _SOC_GRID[0], _SOC_GRID[-1])
     slope_V = float(np.diff(np.interp(around, _SOC_GRID, rest_V))[0] / np.diff(around)[0])
-    return soc, float(np.hypot(error_V, _STILL_TO_COME * (means_V[0] - means_V[1])) / slope_V)
+    model_sd_V = max(_LEAST_ERROR_V, mismatch_V)
+    sensor_sd_V = model_sd_V if voltage_noise_V is None else voltage_noise_V
+    sd_V = np.hypot(np.hypot(sensor_sd_V, model_sd_V), _STILL_TO_COME * (fast_V - slow_V))
+    rest_s = float(stream.time_s[count - 1] - stream.time_s[0])
+    return Start(soc, float(sd_V / slope_V), count, "" if rest_s >= _LEAST_REST_S else START_UNKNOWN)
 
 
-def rest_voltages_V(cell: CellParameters) -> FloatArray:
-    """The voltage of a cell at rest at each state of charge of a grid."""
+def _running_mean_V(stream: Stream, count: int, memory_s: float) -> float:
+    """Average the first voltages, each the less the longer it is over."""
+    mean_V = float(stream.voltage_V[0])
+    for voltage_V, since_s in zip(stream.voltage_V[:count].tolist(), stream.dt_s[:count].tolist(), strict=True):
+        mean_V += -np.expm1(-since_s / memory_s) * (voltage_V - mean_V)
+    return mean_V
+
+
+def _rest_voltages_V(cell: CellParameters) -> FloatArray:
+    """Return the voltage of a cell at rest at each state of charge of the grid."""
     full, empty = (initial_state(cell=cell, soc=soc) for soc in (1.0, 0.0))
     states = empty + _SOC_GRID[:, None] * (full - empty)
     return np.asarray(voltage(states, cell=cell))

@@ -38,46 +38,48 @@ _COARSE_POINTS = 100
 def minimized(
     evaluate: Callable[[FloatArray], tuple[FloatArray, FloatArray]], start: FloatArray | list[float], **how: Any
 ) -> FloatArray:
-    """The x with the least squares of residuals, by scipy; ``evaluate`` gives these and their derivatives in one roll-out."""
-    both = lru_cache(maxsize=1)(lambda x: evaluate(np.array(x)))  # scipy asks for them one after the other
-    result = least_squares(lambda x: both(tuple(x))[0], start, jac=lambda x: both(tuple(x))[1], **how)
-    return np.asarray(result.x)
+    """Minimize the squares of residuals by scipy; ``evaluate`` gives them and their derivatives in one roll-out."""
+
+    @lru_cache(maxsize=1)  # scipy asks for them one after the other
+    def both(x: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
+        return evaluate(np.array(x))
+
+    def residual(x: FloatArray) -> FloatArray:
+        return both(tuple(x))[0]
+
+    def jacobian(x: FloatArray) -> FloatArray:
+        return both(tuple(x))[1]
+
+    return np.asarray(least_squares(residual, start, jac=jacobian, **how).x)
 
 
 def distance_C(log_distance: float) -> float:
     """
-    The distance of ``q_mobile`` to the least value that a record allows. The search is over its logarithm: so every simulation
-    lasts as long as the record, and the knee of a discharge is nearly straight.
+    Return the distance of ``q_mobile`` to the least value that a record allows. The search is over its logarithm: so every
+    simulation lasts as long as the record, and the knee of a discharge is nearly straight.
     """
     return float(np.exp(min(log_distance, _LOG_LIMIT)))
 
 
 @dataclass(frozen=True)
 class OnGrid:
-    """
-    A record on the time grid of a model.
+    """A record on the time grid of a model."""
 
-    :param time_s: of the samples, since the first one, s
-    :param voltage_V: of the samples, V
-    :param current_A: over each step of the model, A
-    :param dt_s: step of the model, s
-    """
-
-    time_s: FloatArray
-    voltage_V: FloatArray
-    current_A: FloatArray
-    dt_s: float
+    time_s: FloatArray  # of the samples, since the first one
+    voltage_V: FloatArray  # of the samples
+    current_A: FloatArray  # over each step of the model
+    dt_s: float  # of the model
 
     @classmethod
     def of(cls, record: Record, model: RecordModel) -> OnGrid:
-        """Any record."""
+        """Resample any record."""
         time_s, current_A = model.grid(record)
         return cls(time_s, np.asarray(record.voltage_V), current_A, model.dt_s)
 
     @cached_property
     def grid_s(self) -> FloatArray:
         """Times of the grid, s."""
-        return self.dt_s * np.arange(len(self.current_A))
+        return np.asarray(self.dt_s * np.arange(len(self.current_A)), dtype=np.float64)
 
     @cached_property
     def _samples_are_the_grid(self) -> bool:
@@ -93,36 +95,22 @@ class OnGrid:
 
 @dataclass(frozen=True)
 class Prior:
-    """
-    What is known of one unknown, as one more residual.
-
-    :param name: of the unknown
-    :param mean: its expected value
-    :param weight_V: of the residual, V per unit of the unknown
-    """
+    """What is known of one unknown, as one more residual."""
 
     name: str
     mean: float
-    weight_V: float
+    weight_V: float  # per unit of the unknown
 
 
 @dataclass(frozen=True)
 class Fit:
-    """
-    What a search has found.
+    """What a search has found."""
 
-    :param values: of all unknowns, and of what is held
-    :param jacobian: derivatives of the residuals with respect to the unknowns, V
-    :param residual_V: at the samples
-    :param square_V2: sum of all squared residuals, those of priors included
-    :param at_bound: which parameters are at a bound
-    """
-
-    values: dict[str, float]
-    jacobian: FloatArray
-    residual_V: FloatArray
-    square_V2: float
-    at_bound: tuple[str, ...]
+    values: dict[str, float]  # of all unknowns, and of what is held
+    jacobian: FloatArray  # of all residuals, those of priors included, by the unknowns
+    residual_V: FloatArray  # at the samples
+    square_V2: float  # of all residuals
+    at_bound: tuple[str, ...]  # which parameters are
 
 
 @dataclass(frozen=True)
@@ -130,21 +118,14 @@ class Search:
     """
     The search in one record: Levenberg-Marquardt's (MINPACK's) with exact derivatives, from the best of several starts. A
     parameter that leaves its bounds is held there.
-
-    :param model: of the record
-    :param parameters: to search for
-    :param nuisance: standard deviations of further unknowns, by name
-    :param bounds: of both parameters; ``q_mobile`` is above its least value
-    :param data: the record
-    :param least_q_C: ``q_mobile`` below which the model cell is empty before the record ends, C
     """
 
     model: RecordModel
     parameters: tuple[str, ...]
-    nuisance: Mapping[str, float]
-    bounds: Mapping[str, tuple[float, float]]
+    nuisance: Mapping[str, float]  # standard deviations of further unknowns
+    bounds: Mapping[str, tuple[float, float]]  # of both parameters; q_mobile is above its least value
     data: OnGrid
-    least_q_C: float
+    least_q_C: float  # below it the model cell is empty before the record ends
 
     @classmethod
     def of(
@@ -155,7 +136,7 @@ class Search:
         nuisance: Mapping[str, float],
         bounds: Mapping[str, tuple[float, float]],
     ) -> Search:
-        """That in a record, which is refused if it says nothing, or takes more than the bounds allow."""
+        """Prepare the search in a record; refuse one that says nothing, or takes more charge than the bounds allow."""
         data = OnGrid.of(record, model)
         if not data.current_A[:-1].any():
             raise ValueError("no current flows in this record: it says nothing about q_mobile and r_o")
@@ -176,7 +157,7 @@ class Search:
         return (*self.parameters, *self.nuisance)
 
     def until_empty(self) -> Search:
-        """That in the samples that a cell of the held ``q_mobile`` lives to see, whatever its ``r_o``."""
+        """Leave out the samples that a cell of the held ``q_mobile`` does not live to see, whatever its ``r_o``."""
         q_mobile, data = self.model.cell.q_mobile, self.data
         n = len(self.model.simulate(data.current_A, q_mobile, 0.0).time_s)
         seen = data.time_s <= (n - 1) * data.dt_s
@@ -190,8 +171,8 @@ class Search:
 
     def starts(self, q_candidates: Sequence[float]) -> tuple[list[dict[str, float]], FloatArray]:
         """
-        Values of ``q_mobile`` within their bounds, each with the ``r_o`` that goes best with it (the voltage is linear in it
-        but for its small effect on the temperature), and the sums of their squared residuals, V^2, on a coarse grid of time.
+        Compare values of ``q_mobile`` on a coarse grid of time: return each, within its bounds, with the ``r_o`` that goes
+        best with it (the voltage is nearly linear in it), and the sums of squared residuals, V^2.
         """
         cell, data = self.model.cell, self.data
         # the largest step for which no voltage drop of explicit Euler oscillates
@@ -219,7 +200,7 @@ class Search:
         return starts, np.array(squares_V2)
 
     def best_starts(self, more_q_C: Sequence[float]) -> list[dict[str, float]]:
-        """The local minima on a grid of ``q_mobile``, refined where it is promising, that may lead to the global one."""
+        """Return the local minima on a grid of ``q_mobile``, refined where promising, that may lead to the global one."""
         excess = _START_EXCESS
         coarse, coarse_V2 = self.starts((self.least_q_C * (1.0 + excess)).tolist())
         promising = _is_near_best(coarse_V2)
@@ -234,7 +215,7 @@ class Search:
         return [starts[order[n]] for n in np.union1d(np.flatnonzero(minima), squares_V2.argmin())]
 
     def best(self, starts: Sequence[dict[str, float]], priors: Sequence[Prior]) -> Fit:
-        """The best fit that is found from any of the starts."""
+        """Return the best fit that is found from any of the starts."""
         return min((self._fit(start, priors) for start in starts), key=lambda fit: fit.square_V2)
 
     def _fit(self, start: dict[str, float], priors: Sequence[Prior]) -> Fit:
@@ -282,7 +263,7 @@ class Search:
         return values_at(x)[0]
 
     def residual(self, values: Mapping[str, float], priors: Sequence[Prior] = ()) -> tuple[FloatArray, FloatArray]:
-        """The residuals at the samples, V, and one more for each prior; and their derivatives by all that is unknown."""
+        """Return the residuals at the samples, V, with one more for each prior, and their derivatives by all unknowns."""
         q_mobile, r_o = values["q_mobile"], values["r_o"]
         if self.nuisance:
             model_V, slopes, _ = self.model_at(values).tangents(self.data.current_A, q_mobile, r_o)
@@ -300,7 +281,7 @@ class Search:
         return residual_V, jacobian
 
     def model_at(self, values: Mapping[str, float]) -> RecordModel:
-        """The model with the nuisance constants at some values."""
+        """Return the model with the nuisance constants at some values."""
         cell, constants = self.model.cell, {}
         for name in self.nuisance.keys() & set(RATE_CONSTANTS):
             # a step of the search may go far, but explicit Euler is stable only for rates below 2 / dt

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from battery_env.files import replacing
 
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 _KIND = "state of an estimator"
 
 

@@ -34,6 +34,7 @@ from battery_env.estimators.cell_fit import (
 from battery_env.plotting import plot_cell_fit
 from battery_env.summary import METHODS, Settings, summarize
 
+FIELDS = ("cell", "constants", "discharges", "mismatch_V", "thermal")
 OTHER = with_equilibrium(NEW_CELL, [0.02, -0.03, 0.02]).replace(kn=1000.0, tDiffusion=9e6, to=10.0, tsn=600.0, VEOD=2.7)
 
 
@@ -102,8 +103,7 @@ class TestSimulated:
         identified = {constant.name for constant in fit.constants if constant.identified}
         assert {"tDiffusion", "to", "tsn", "equilibrium 0"} <= identified
 
-    def test_the_cell_is_the_youngest_one(self, fit):
-        assert (fit.cell.q_mobile, fit.cell.r_o) == (fit.discharges[0].q_mobile, fit.discharges[0].r_o)
+        assert (fit.cell.q_mobile, fit.cell.r_o) == (fit.discharges[0].q_mobile, fit.discharges[0].r_o)  # the youngest one
         assert fit.cell.VEOD == 2.7
 
     def test_what_the_discharges_do_not_show_stays_at_its_prior(self):
@@ -212,19 +212,15 @@ class TestRealCells:
         assert 1.7 < found.nominal_Ah < 1.95  # the first discharge that was fitted gave 1.86 Ah
         assert found.nominal_Ah == pytest.approx(calibrator.model.capacity_Ah(record.current_A[-1], "current", 2.7, 8e4))
 
-    def test_temperature_is_the_measured_one(self, b0005_fit):
-        assert 295.0 < b0005_fit.cell.Tb0 < 300.0
-
-    def test_a_full_cell_rests_where_it_did(self, b0005_fit):
+    def test_a_fit_says_what_it_is_of(self, b0005_fit):
+        assert 295.0 < b0005_fit.cell.Tb0 < 300.0  # the measured temperature
         assert b0005_fit.full_V == pytest.approx(load_nasa_discharges("B0005")[84].voltage_V[0], abs=0.02)
         assert b0005_fit.doubt == "" and "a full cell rests at 4.19 V before, at 4.20 V after" in b0005_fit.summary()
-
-    def test_discharges_have_names(self, b0005_fit):
         assert [discharge.name for discharge in b0005_fit.discharges] == ["B0005:1", "B0005:85", "B0005:168"]
         assert "B0005:85" in b0005_fit.summary()
-
-    def test_tables_and_figure(self, b0005_fit):
         assert len(b0005_fit.constants_table()) == len(RATE_PRIOR_SD) + len(EQUILIBRIUM_PRIOR_SD_V)
+
+    def test_figure(self, b0005_fit):
         figure = plot_cell_fit(b0005_fit, load_nasa_discharges("B0006")[99:101])
         assert len(figure.axes) == 4
         before, after = (np.abs(line.get_ydata()).mean() for line in figure.axes[2].lines[1:])
@@ -232,18 +228,15 @@ class TestRealCells:
 
 
 class TestFiles:
-    def test_a_fit_survives_its_file(self, fit, tmp_path):
-        assert CellFit.from_json(fit.to_json(tmp_path / "cell.json")) == fit
-
-    def test_constants_survive_their_file(self, tmp_path):
-        assert CellParameters.from_json(OTHER.to_json(tmp_path / "constants.json")) == OTHER
-
-    def test_either_file_is_read_for_what_it_is(self, fit, tmp_path):
+    def test_a_fit_and_constants_survive_their_files_and_are_read_for_what_they_are(self, fit, tmp_path):
         assert read_cell(fit.to_json(tmp_path / "fit.json")) == fit
         assert read_cell(OTHER.to_json(tmp_path / "constants.json")) == OTHER
         (tmp_path / "other.json").write_text("{}")
         with pytest.raises(ValueError, match=r"other\.json holds no"):
             read_cell(tmp_path / "other.json")
+        for value, name in ((fit, "fit.json"), (OTHER, "constants.json")):
+            with pytest.raises(FileExistsError, match="exists already"):
+                value.to_json(tmp_path / name)
 
     def test_the_policy_that_comes_with_the_package_has_no_place_for_a_fit(self, fit):
         with pytest.raises(ValueError, match=r"the package takes no cell: .* policy of your own that was trained with these"):
@@ -279,34 +272,30 @@ class TestFiles:
         assert Settings(method=method).calibrator(NEW_CELL).bounds == LeastSquares().bounds == ExtendedKalmanFilter().bounds
         assert not Settings.for_cell(dataclasses.replace(fit, thermal=False)).thermal
 
-    @pytest.mark.parametrize("kind", [CellFit, CellParameters])
-    def test_nothing_is_overwritten(self, kind, fit, tmp_path):
-        value = fit if kind is CellFit else OTHER
-        value.to_json(tmp_path / "cell.json")
-        with pytest.raises(FileExistsError, match="exists already"):
-            value.to_json(tmp_path / "cell.json")
-
     @pytest.mark.parametrize(
-        ("change", "message"),
+        ("kind", "change", "message"),
         [
-            (lambda content: content.update(version=99), "of version 99"),
-            (lambda content: content.update(format="something"), "holds no battery_env.CellParameters but something"),
-            (lambda content: content["constants"].pop("kn"), "missing or unknown: kn"),
-            (lambda content: content["constants"].update(knn=1.0), "missing or unknown: knn"),
-            (lambda content: content["constants"].update(kn=-1.0), "kn must be greater than 0"),
-            (lambda content: content["constants"].update(kn="fast"), "kn must be float"),
-            (lambda content: content["constants"].update(Ap=1.0), "damaged"),
-            (lambda content: content.update(constants=[1.0]), "given by name"),
-            (lambda content: content.pop("constants"), "damaged"),
+            (CellParameters, lambda content: content.update(version=99), "of version 99"),
+            (CellParameters, lambda content: content.update(format="something"), "holds no battery_env.CellParameters but so"),
+            (CellParameters, lambda content: content["constants"].pop("kn"), "missing or unknown: kn"),
+            (CellParameters, lambda content: content["constants"].update(knn=1.0), "missing or unknown: knn"),
+            (CellParameters, lambda content: content["constants"].update(kn=-1.0), "kn must be greater than 0"),
+            (CellParameters, lambda content: content["constants"].update(kn="fast"), "kn must be float"),
+            (CellParameters, lambda content: content["constants"].update(Ap=1.0), "damaged"),
+            (CellParameters, lambda content: content.update(constants=[1.0]), "given by name"),
+            (CellParameters, lambda content: content.pop("constants"), "damaged"),
+            *((CellFit, lambda content, name=name: content.pop(name), "damaged") for name in FIELDS),
+            *((CellFit, lambda content, name=name: content.update({name: None}), "damaged") for name in FIELDS),
+            *((CellFit, lambda content, name=name: content.update({name: [{"name": "kn"}]}), "damaged") for name in FIELDS),
         ],
     )
-    def test_a_damaged_file_of_constants_is_refused(self, change, message, tmp_path):
-        path = OTHER.to_json(tmp_path / "constants.json")
+    def test_a_damaged_file_is_refused(self, kind, change, message, fit, tmp_path):
+        path = (fit if kind is CellFit else OTHER).to_json(tmp_path / "cell.json")
         content = json.loads(path.read_text())
         change(content)
         path.write_text(json.dumps(content))
         with pytest.raises(ValueError, match=message):
-            CellParameters.from_json(path)
+            kind.from_json(path)
 
     @pytest.mark.parametrize("text", ["", "{", "[]", "null", '"text"', "\udcff", "{}"])
     @pytest.mark.parametrize("kind", [CellFit, CellParameters])
@@ -316,19 +305,6 @@ class TestFiles:
         with pytest.raises(ValueError, match=r"cell\.json"):
             kind.from_json(path)
 
-    @pytest.mark.parametrize("name", ["cell", "constants", "discharges", "mismatch_V", "thermal"])
-    def test_a_damaged_fit_is_refused(self, name, fit, tmp_path):
-        path = fit.to_json(tmp_path / "fit.json")
-        content = json.loads(path.read_text())
-        for wrong in (None, [{"name": "kn"}]):
-            path.write_text(json.dumps({**content, name: wrong}))
-            with pytest.raises(ValueError, match="damaged"):
-                CellFit.from_json(path)
-        del content[name]
-        path.write_text(json.dumps(content))
-        with pytest.raises(ValueError, match="damaged"):
-            CellFit.from_json(path)
-
 
 class TestBadInput:
     @pytest.mark.parametrize(
@@ -336,6 +312,7 @@ class TestBadInput:
         [
             ({"discharges": []}, ValueError, "takes 1 to 30 discharges, got 0"),
             ({"discharges": 5}, TypeError, "must be a list of discharges"),
+            ({"discharges": load_nasa_discharges("B0005")[0]}, TypeError, "must be a list of discharges, got Discharge"),
             ({"discharges": [1.0]}, TypeError, "discharge 1 of 1"),
             ({"cut_off_V": -1.0}, ValueError, "cut_off_V"),
             ({"cut_off_V": "low"}, ValueError, "cut_off_V"),
@@ -348,7 +325,3 @@ class TestBadInput:
     def test_arguments_are_checked(self, arguments, error, message, simulated):
         with pytest.raises(error, match=message):
             fit_cell(**{"discharges": simulated, **arguments})
-
-    def test_a_single_discharge_is_no_list(self, simulated):
-        with pytest.raises(TypeError, match="must be a list of discharges, got Discharge"):
-            fit_cell(simulated[0])

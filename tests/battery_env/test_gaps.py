@@ -6,7 +6,7 @@ import pytest
 from battery_env.cells import Discharge, load_nasa_discharges
 from battery_env.electrochemistry import simulate
 from battery_env.estimators import ExtendedKalmanFilter, LeastSquares
-from battery_env.estimators.gaps import DRAWN, NOT_DRAWN, UNSURE, find_gaps, verdict
+from battery_env.estimators.gaps import UNSURE, find_gaps
 
 CALIBRATORS = {
     "least squares": lambda: LeastSquares(thermal=True, mismatch_V=0.05),
@@ -47,25 +47,22 @@ def simulated(load_A=2.0, noise_V=0.003, every_s=1, **more) -> Discharge:
 
 
 class TestRealCells:
-    @pytest.mark.parametrize("at_s", [400.0, 1200.0, 1700.0])
+    @pytest.mark.parametrize("at_s", [400.0, 1700.0])
     @pytest.mark.parametrize("by_s", [120.0, 600.0, 3600.0])
     def test_a_clock_that_jumps_is_noticed(self, whole, calibrator, at_s, by_s):
         estimate, right = calibrator.estimate(jumped(whole, at_s, by_s)), calibrator.estimate(whole)
         assert right.settled and not estimate.settled
         if by_s == 600.0 or isinstance(calibrator, LeastSquares):
             assert NEITHER in estimate.reason
+            start_s = whole.time_s[whole.time_s <= at_s][-1]
+            assert estimate.reason.startswith(f"No sample lies between {start_s:.0f} s and ")
         assert estimate.sd_q_mobile > 0.9 * (estimate.q_mobile - right.q_mobile)
 
-    @pytest.mark.parametrize("from_s", [400.0, 1200.0, 1700.0])
+    @pytest.mark.parametrize("from_s", [400.0, 1700.0])
     @pytest.mark.parametrize("length_s", [120.0, 600.0])
     def test_rows_that_are_lost_under_load_do_no_harm(self, whole, calibrator, from_s, length_s):
         estimate, right = calibrator.estimate(lost(whole, from_s, from_s + length_s)), calibrator.estimate(whole)
         assert estimate.settled and estimate.q_mobile == pytest.approx(right.q_mobile, rel=0.01)
-
-    def test_its_times_are_those_of_the_record(self, whole, calibrator):
-        late = jumped(changed(whole, late_s=5e4), 51_200.0, 600.0)
-        start_s = late.time_s[late.time_s <= 51_200.0][-1]
-        assert calibrator.estimate(late).reason.startswith(f"No sample lies between {start_s:.0f} s and ")
 
     def test_no_recorded_discharge_has_a_gap(self, whole):
         columns = whole.time_s, whole.voltage_V, whole.current_A
@@ -108,18 +105,6 @@ class TestSimulated:
         gap, *others = find_gaps(seen.time_s, seen.voltage_V, seen.current_A, seen.voltage_V, 6000.0)
         assert not others and gap.verdict == UNSURE and (gap.start_s, gap.end_s) == (1400.0, 1701.0)
 
-    def test_a_filter_that_is_stopped_within_a_gap_goes_on_alike(self, tmp_path):
-        record, at = jumped(simulated(every_s=10), 1500.0, 400.0), 152
-        columns = record.voltage_V, record.current_A, np.append(0.0, np.diff(record.time_s))
-        samples = list(zip(*(column.tolist() for column in columns), strict=True))
-        through, resumed = CALIBRATORS["filter"](), CALIBRATORS["filter"]()
-        for n, sample in enumerate(samples):
-            if n == at:
-                resumed.load(through.save(tmp_path / "state"))
-            whole = through.update(*sample)
-            part = resumed.update(*sample) if n >= at else whole
-        assert part == whole and not whole.settled and NEITHER in whole.reason
-
 
 def by_voltage(load_A, step_V: float, longest_s: float, noise_V: float) -> Discharge:
     """A record as cyclers write it: a row where the voltage has changed, a time is over, or the load is switched."""
@@ -142,7 +127,7 @@ class TestIrregularLoggers:
     @pytest.mark.parametrize("load_A", LOADS_A.values(), ids=list(LOADS_A))
     @pytest.mark.parametrize(
         ("step_V", "longest_s", "noise_V"),
-        [(0.005, 60.0, 0.001), (0.005, 60.0, 0.0015), (0.005, 60.0, 0.002), (0.01, 120.0, 0.003), (0.005, 30.0, 0.002)],
+        [(0.005, 60.0, 0.001), (0.01, 120.0, 0.003), (0.005, 30.0, 0.002)],
     )
     def test_one_that_writes_where_the_voltage_changes_leaves_no_gaps(self, calibrator, load_A, step_V, longest_s, noise_V):
         record = by_voltage(load_A, step_V, longest_s, noise_V)
@@ -166,11 +151,3 @@ class TestIrregularLoggers:
         logged = (record.current_A > 0.0) & ((record.time_s % 600 > 0.0) | (record.time_s == 0.0))
         estimate = calibrator.estimate(changed(record, logged & (record.time_s % every_s == 0)))
         assert not estimate.settled and estimate.sd_q_mobile > 0.9 * (estimate.q_mobile - 6000.0) > 4000.0
-
-
-def test_the_voltage_says_whether_the_charge_was_drawn():
-    share = 0.5
-    assert verdict(0.0, 0.05, 0.001, share) == DRAWN
-    assert verdict(0.05, 0.05, 0.001, share) == NOT_DRAWN
-    assert verdict(0.025, 0.05, 0.001, share) == verdict(0.05, 0.05, 0.03, share) == UNSURE
-    assert verdict(0.0, 0.05, np.nan, share) == verdict(0.0, -0.05, 0.001, share) == UNSURE

@@ -104,14 +104,16 @@ class TestLeastSquares:
         if "parameters" not in more:
             assert abs(estimate.q_mobile - 6000.0) < 4.0 * estimate.sd_q_mobile < 600.0
 
-    def test_nobody_told(self, record):
-        estimate = LeastSquares(thermal=True).estimate(record)
-        assert not estimate.settled and "where a full cell shows 4.19 V" in estimate.reason
-        assert "or state initial_soc (--initial-soc)" in estimate.reason
-
-    def test_told_wrongly(self, record):
-        estimate = LeastSquares(thermal=True, initial_soc=0.95).estimate(record)
-        assert not estimate.settled and "where a cell with 95% of its charge shows" in estimate.reason
+    @pytest.mark.parametrize(
+        ("initial_soc", "reasons"),
+        [
+            (1.0, ["where a full cell shows 4.19 V", "or state initial_soc"]),
+            (0.95, ["where a cell with 95% of its charge shows"]),
+        ],
+    )
+    def test_a_charge_that_is_not_told_or_wrong_is_noticed(self, initial_soc, reasons, record):
+        estimate = LeastSquares(thermal=True, initial_soc=initial_soc).estimate(record)
+        assert not estimate.settled and all(reason in estimate.reason for reason in reasons)
 
     def test_a_doubt_moves_the_parameters_as_far_as_it_says(self, record):
         stated, off = (

@@ -7,11 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from battery_env import ExtendedKalmanFilter, PolicyEstimator
+from battery_env import ExtendedKalmanFilter, PolicyEstimator, soc_from_rest
 from battery_env.cells import Discharge, load_nasa_discharges
-from battery_env.electrochemistry import NEW_CELL, STATE_SIZE, initial_state, rest_shares, simulate, voltage
+from battery_env.electrochemistry import NEW_CELL, STATE_SIZE, initial_state, rest_shares, simulate
 from battery_env.estimators.base import ModelNow, OnlineEstimator
-from battery_env.estimators.rest import rest_voltages_V
 from battery_env.loads import Cycle, Load
 from battery_env.records import Stream, are_plausible, check_sample
 
@@ -183,13 +182,12 @@ class TestTemperature:
         assert 303.0 < filter_.now().state[0] < 304.2
         assert filter_.now().cell.Tb0 == pytest.approx(293.15)
 
-    @pytest.mark.parametrize("initial_soc", [1.0, "rest"])
-    def test_a_record_is_taken_with_its_temperature(self, initial_soc, whole):
+    def test_a_record_is_taken_with_its_temperature(self, whole):
         part = whole.part(0, 900)
         samples = np.arange(len(part.time_s))
         warm_C = 30.0 + 0.01 * samples
         record = Discharge(part.time_s, part.voltage_V, part.current_A, warm_C)
-        filter_ = ExtendedKalmanFilter(thermal=True, initial_soc=initial_soc)
+        filter_ = ExtendedKalmanFilter(thermal=True)
         for sample, temperature_C in zip(Stream.of(record, 1.0).samples(), warm_C.tolist(), strict=True):
             last = filter_.update(*sample, temperature_C)
         (trace,) = filter_.trace([record])
@@ -232,8 +230,10 @@ class TestStart:
     def test_a_start_that_is_known_or_told_from_the_rest_finds_the_charge(self, soc):
         load_A = np.append(np.zeros(200), np.full(20_000, 2.0))
         record = measured(load_A, initial=initial_state(6000.0, soc=soc))
+        start = soc_from_rest(record)
         known, told, full = (
-            follow(ExtendedKalmanFilter(thermal=True, initial_soc=start), record) for start in (soc, "rest", 1.0)
+            follow(ExtendedKalmanFilter(thermal=True, initial_soc=each), record)
+            for each in (soc, (start.soc, start.sd_soc), 1.0)
         )
         for estimate in (known, told):
             assert abs(estimate.q_mobile - 6000.0) < 3.0 * estimate.sd_q_mobile < 400.0
@@ -246,19 +246,14 @@ class TestStart:
         estimate = ExtendedKalmanFilter(thermal=True, initial_soc=0.85).estimate(record)
         assert not estimate.settled and "where a cell with 85% of its charge shows" in estimate.reason
 
-    def test_without_a_rest_nothing_tells_the_charge(self):
-        record = measured(initial=initial_state(6000.0, soc=0.7))
-        estimate = ExtendedKalmanFilter(thermal=True, initial_soc="rest").estimate(record)
-        assert not estimate.settled and "does not start with a minute at rest" in estimate.reason
-
     def test_a_stated_doubt_widens_the_estimate(self, whole):
         sure, doubtful = (ExtendedKalmanFilter(thermal=True, initial_soc=soc).estimate(whole) for soc in (1.0, (1.0, 0.01)))
         assert doubtful.q_mobile == sure.q_mobile
         assert doubtful.sd_q_mobile == pytest.approx(np.hypot(sure.sd_q_mobile, 0.01 * sure.q_mobile))
 
-    @pytest.mark.parametrize("soc", [0.0, 1.1, np.nan, "full", (0.5, -0.1)])
+    @pytest.mark.parametrize("soc", [0.0, 1.1, np.nan, "rest", (0.5, -0.1)])
     def test_what_is_none_is_refused(self, soc):
-        with pytest.raises(ValueError, match="initial_soc is a state of charge within"):
+        with pytest.raises(ValueError, match=r"initial_soc is a state of charge within .*\.soc_from_rest tells both"):
             ExtendedKalmanFilter(initial_soc=soc)
 
 
@@ -383,13 +378,6 @@ class TestFiles:
         assert follow(one, record.part(500, 800)) == follow(other, record.part(500, 800))
         assert one.soc == other.soc and list(tmp_path.iterdir()) == [file]
 
-    def test_in_a_rest_too(self, tmp_path):
-        record = measured(np.append(np.zeros(200), np.full(500, 2.0)), initial=initial_state(6000.0, soc=0.8))
-        one, other = (ExtendedKalmanFilter(thermal=True, initial_soc="rest") for _ in range(2))
-        follow(one, record.part(0, 100), temperature_C=25.0)
-        other.load(one.save(tmp_path / "state.npz"))
-        assert follow(one, record.part(100, 600)) == follow(other, record.part(100, 600))
-
     def test_what_does_not_fit_is_refused(self, make, tmp_path):
         file = make().save(tmp_path / "state.npz")
         other = ExtendedKalmanFilter(thermal=True, mismatch_V=0.05)
@@ -483,24 +471,3 @@ class TestBatch:
         known = None if temperature_C is None else np.array([temperature_C])
         columns = (np.array([each]) for each in (voltage_V, current_A, dt_s))
         assert are_plausible(*columns, known, np.array([before_A])).tolist() == [good]
-
-
-class TestRecordedCells:
-    def test_the_rest_of_a_recorded_cell_tells_that_it_was_full(self):
-        discharge = load_nasa_discharges("B0005")[40]
-        record = Discharge(discharge.time_s, discharge.voltage_V, discharge.current_A)
-        rest = np.insert(record.time_s + 70.0, 0, np.arange(0.0, 70.0, 10.0))
-        record = Discharge(
-            rest, np.insert(record.voltage_V, 0, np.full(7, record.voltage_V[0])), np.insert(record.current_A, 0, np.zeros(7))
-        )
-        told = ExtendedKalmanFilter(thermal=True, mismatch_V=0.02, initial_soc="rest")
-        stream = Stream.of(record.until(300.0), 1.0)
-        for sample in stream.samples():
-            estimate = told.update(*sample)
-        drawn_C = float(stream.current_A[:-1] @ np.diff(stream.time_s))
-        assert told.soc + drawn_C / estimate.q_mobile == pytest.approx(1.0, abs=0.03) and not estimate.settled
-
-    def test_rests_of_the_model_at_all_charges(self):
-        rest_V = rest_voltages_V(NEW_CELL)
-        assert (np.diff(rest_V) > 0.0).all()
-        assert rest_V[-1] == pytest.approx(float(voltage(initial_state())))
