@@ -250,7 +250,7 @@ def _correct(
         p[m, 2, 0] * h[0] + p[m, 2, 1] * h[1] + p[m, 2, 2] * h[2],
     )
     explained = h[0] * ph[0] + h[1] * ph[1] + h[2] * ph[2] + 2.0 * bend * bend
-    innovation = voltage - cell_voltage(state, m, q, True, packed, 0) - bend - mean[m, _OFFSET]
+    innovation = voltage - cell_voltage(state, m, q, True, packed) - bend - mean[m, _OFFSET]
     bank.expected_V[m] = voltage - innovation
     variance = explained + noise
     sd = sqrt(variance)
