@@ -78,13 +78,13 @@ def ids() -> str:
 
 def data_sets() -> str:
     """The standard data sets."""
-    (table,) = _tables(standard_dataset)
+    (table,) = tables_of(standard_dataset)
     return _markdown([dict(zip(table[0], row, strict=True)) for row in table[1:]])
 
 
 def columns() -> str:
     """The columns of the evaluation."""
-    return _markdown([{"column": name, "meaning": meaning} for table in _tables(evaluate) for name, meaning in table])
+    return _markdown([{"column": name, "meaning": meaning} for table in tables_of(evaluate) for name, meaning in table])
 
 
 def estimators() -> str:
@@ -124,7 +124,7 @@ def _markdown(rows: Sequence[Mapping[str, object]]) -> str:
     return "\n".join("| " + " | ".join(cell.replace("|", r"\|") for cell in line) + " |" for line in lines)
 
 
-def _tables(documented: Callable[..., object]) -> list[list[list[str]]]:
+def tables_of(documented: Callable[..., object]) -> list[list[list[str]]]:
     """The tables of a docstring, in reStructuredText's simple form."""
     tables: list[list[list[str]]] = []
     columns_of_text: list[slice] = []  # of the table that the present line belongs to, if any

@@ -133,7 +133,7 @@ def documented():
 
 
 def test_tables_of_docstrings_are_read_with_their_continued_lines():
-    one, other = environment_pages._tables(documented)
+    one, other = environment_pages.tables_of(documented)
     assert one == [["name", "meaning"], ["``a``", "the first, going on"], ["``b``, ``c``", "both of them"]]
     assert other == [["``d``", "alone"]]
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from battery_env.calibration.task import check_counts
-from battery_env.calibration.voltage import Cost, VoltageTask
+from battery_env.calibration.voltage import VoltageTask
 from battery_env.electrochemistry import CellParameters, FloatArray
 from battery_env.estimators.base import Record
 from battery_env.loads import RandomPiecewise
@@ -82,8 +82,8 @@ class BatteryAging(VoltageTask):
 
     ``cycles`` (20), ``decisions_per_cycle`` (8), ``split`` (``"train"``; or ``"test"``: 30 other lives), ``dataset``
     (discharges, life after life, each with ``cycles`` of them), and those of ``BatteryVoltageJoint-v0`` but for
-    ``episode_steps``, ``load``, ``dt_s`` and ``mismatch``; ``new_readings`` is (10, 60) and ``start`` ``"new_cell"`` here.
-    ``reset(options={"discharge": n})`` takes the first discharge of a life.
+    ``episode_steps``, ``load``, ``dt_s``, ``mismatch`` and ``nuisance``; ``new_readings`` is (10, 60) and ``start``
+    ``"new_cell"`` here. ``reset(options={"discharge": n})`` takes the first discharge of a life.
 
     ## Version history
 
@@ -98,16 +98,12 @@ class BatteryAging(VoltageTask):
         *,
         cycles: int = 20,
         decisions_per_cycle: int = 8,
-        reading_s: float = 10.0,
-        new_readings: tuple[int, int] = (10, 60),
-        process_noise_V: float = 0.0,
-        start: Literal["random", "new_cell", "true"] = "new_cell",
-        consistency: float = 0.0,
-        cost: Cost = "misfit",
         split: Literal["train", "test"] = "train",
+        new_readings: tuple[int, int] = (10, 60),
+        start: Literal["random", "new_cell", "true"] = "new_cell",
         cell: CellParameters | None = None,
         dataset: Sequence[Record] | str | os.PathLike[str] | None = None,
-        **sensors: Any,
+        **others: Any,
     ) -> None:
         check_counts(cycles=cycles, decisions_per_cycle=decisions_per_cycle)
         if split not in LIVES:
@@ -119,15 +115,11 @@ class BatteryAging(VoltageTask):
         super().__init__(
             cells,
             episode_steps=cycles * decisions_per_cycle,
-            reading_s=reading_s,
             new_readings=new_readings,
-            process_noise_V=process_noise_V,
             start=start,
-            consistency=consistency,
-            cost=cost,
             cell=cell,
             dataset=dataset,
-            **sensors,
+            **others,
         )
         if len(self.readings) % cycles:
             raise ValueError(f"{len(self.readings)} discharges are no whole number of lives of {cycles} cycles")
@@ -136,6 +128,13 @@ class BatteryAging(VoltageTask):
         self._carried = self._estimate.copy()
         # of the episodes; none on whole records, where nothing is drawn
         self._generators: list[np.random.Generator | None] = [None] * cells
+
+    @classmethod
+    def options(cls) -> dict[str, Any]:
+        """Its own options, and those of the voltage-only tasks that choose no standard discharges."""
+        decided = ("episode_steps", "load", "dt_s", "mismatch", "nuisance")
+        inherited = {name: default for name, default in VoltageTask.options().items() if name not in decided}
+        return {**inherited, **super(VoltageTask, cls).options()}
 
     def start(
         self,

@@ -157,12 +157,9 @@ class FullStateTask(CalibrationTask):
         options: Mapping[str, Any] | None = None,
     ) -> None:
         """
-        Start some cells at random points of random trajectories.
+        Start some cells at random points of random trajectories; as of the base class.
 
-        :param rows: which cells of the batch, shape (m,)
-        :param generators: one source of randomness for each of them, of length m
         :param options: ``trajectory`` and ``sample`` (counted from the start of the discharge) choose the point instead
-        :raises ValueError: for an unknown option, or a point outside the data
         """
         chosen = options or {}
         unknown = set(chosen) - {"trajectory", "sample"}
@@ -223,13 +220,7 @@ class FullStateTask(CalibrationTask):
         look_ahead(self._settings, self.dataset.load_values, constants, cells)
 
     def advance(self, action: NDArray[np.floating]) -> FloatArray:
-        """
-        Take the actions, step the model, and move on to the next sample.
-
-        :param action: in [-1, 1] (beyond, it is clipped), mapped to the parameters' ranges, shape (cells, len(parameters))
-        :return: cost, shape (cells,)
-        :raises ValueError: for another shape, NaN, or what is no number
-        """
+        """Take the actions, step the model, and move on to the next sample."""
         chosen, cost = checked_action(action, (self.cells, len(self.parameters))), np.empty(self.cells)
         decide(chosen, self._settings, self.now, cost)
         self._look_ahead(self.now)
@@ -241,9 +232,6 @@ class FullStateTask(CalibrationTask):
         Go through whole discharges, each with a cell of its own, with the model's state running free from the first sample.
 
         :param records: simulated discharges; no recording has the full state
-        :param every: 1
-        :param options: of the task, but for those of its data
-        :return: the task, at its first observations
         """
         dataset = records if isinstance(records, TrajectoryDataset) else TrajectoryDataset.from_trajectories(records)
         samples = dataset.stop - dataset.first
@@ -255,20 +243,11 @@ class FullStateTask(CalibrationTask):
         return task
 
     def steps_between(self, decision_s: float) -> int:
-        """
-        How many samples arrive between two decisions on a whole record: the policy decides at each of them.
-
-        :param decision_s: ignored
-        :return: 1
-        """
+        """1: the policy decides at each sample."""
         return 1
 
     def seen(self) -> tuple[IntArray, FloatArray]:
-        """
-        Which data the next decision knows, x_{t+1} among them.
-
-        :return: each cell's discharge, and the time of its last sample on the clock of the data set, s, shape (cells,)
-        """
+        """Which data the next decision knows, x_{t+1} among them; times on the clock of the data set."""
         return self.now["trajectory"].copy(), np.asarray((self.now["sample"] + 1) * self.dataset.dt_s, dtype=np.float64)
 
     @property
@@ -278,12 +257,7 @@ class FullStateTask(CalibrationTask):
 
     @staticmethod
     def conclude(estimates: FloatArray) -> float:
-        """
-        The estimate for a whole record: the mean, for each estimate is made of its own sample.
-
-        :param estimates: of one parameter, shape (K,)
-        :return: one estimate
-        """
+        """The mean, for each estimate is made of its own sample."""
         return float(estimates.mean())
 
     def drop_ended(self) -> None:
@@ -293,11 +267,7 @@ class FullStateTask(CalibrationTask):
             self.keep(~over)
 
     def truncated(self) -> NDArray[np.bool_]:
-        """
-        Whose episode is over, as its steps or its data have come to an end.
-
-        :return: shape (cells,)
-        """
+        """Whose episode is over, as its steps or its data have come to an end."""
         now = self.now
         return np.asarray((now["decisions"] >= now["steps"]) | (now["sample"] >= now["last_decision"]))
 
@@ -305,8 +275,6 @@ class FullStateTask(CalibrationTask):
         """
         s_t = [x̂_t, x_{t+1}, u_{t+1}] and, with innovations, asinh of x_{t+1} - f(x̂_t, u_{t+1}; new cell) and of
         x_{t+1} - f(x_t, u_{t+1}; new cell), all scaled; with a price on changes of the action, the action before.
-
-        :return: shape (cells, observation_size)
         """
         out = np.empty((self.cells, self.observation_size), dtype=np.float32)
         observe(self._settings, self.now, OBSERVATION_LIMIT, out)
@@ -324,21 +292,12 @@ class FullStateTask(CalibrationTask):
         return 2.0 * (wanted - lowest) / (highest - lowest) - 1.0
 
     def keep(self, rows: NDArray[np.bool_]) -> None:
-        """
-        Go on with some of the cells only.
-
-        :param rows: which cells to keep, shape (cells,)
-        """
+        """Go on with some of the cells only, those where ``rows`` of shape (cells,) is true."""
         self.now = self.now[rows]
         self.cells = len(self.now)
 
     def report(self) -> dict[str, FloatArray]:
-        """
-        Where each cell stands after its last decision; for ``info``, rendering and evaluation, never for the policy.
-
-        :return: arrays of shape (cells,): true and inferred parameters, C and ohm; voltages of cell and model, V; the state
-            of charge of the cell
-        """
+        """Where each cell stands after its last decision."""
         voltage_hat = np.empty(self.cells)
         model_voltage(self._settings, self.now, voltage_hat)
         return {name: voltage_hat if name == "voltage_hat" else self.now[name].copy() for name in self.REPORTED}

@@ -54,9 +54,9 @@ def state_distance(model_state: FloatArray, measured: FloatArray, n: int, per_er
 
 
 @_inlined
-def _take_action(action: FloatArray, task: Any, cell: Any, n: int) -> float:
+def _take_action(action: FloatArray, task: Any, cells: Records, n: int) -> float:
     # Set the model's parameters; returns the length of the change of the action
-    squared_change, column = 0.0, 0
+    cell, squared_change, column = cells[n], 0.0, 0
     for k in range(2):
         if task.finds[k] > 0:
             chosen = _clipped(action[n, column], 1.0)
@@ -78,14 +78,16 @@ def decide(action: FloatArray, settings: Records, cells: Records, cost: FloatArr
     for n in range(len(cells)):
         cells[n].decisions += 1
         cells[n].sample += 1
-        cost[n] = task.consistency * _take_action(action, task, cells[n], n)
+        cost[n] = task.consistency * _take_action(action, task, cells, n)
     for first in range(0, len(cells), BLOCK):
         size = min(BLOCK, len(cells) - first)
-        fill_block(block, first, size, cells.model_state, cells.load, cells.q_mobile_hat, cells.r_o_hat, task.constants)
+        fill_block(
+            block, first, size, cells["model_state"], cells["load"], cells["q_mobile_hat"], cells["r_o_hat"], task.constants
+        )
         step_of_block(block, size, task.dt_s, task.power, task.power, task.thermal, True, task.polynomial_n, task.polynomial_p)
-        states_of_block(block, first, size, cells.model_state)
+        states_of_block(block, first, size, cells["model_state"])
         for n in range(first, first + size):
-            distance = state_distance(cells.model_state, cells.next_state, n, task.cost_per_error, task.literal_cost)
+            distance = state_distance(cells["model_state"], cells["next_state"], n, task.cost_per_error, task.literal_cost)
             cost[n] += task.cost_limit if distance > task.cost_limit else distance
             is_set = task.resync > 0 and cells[n].decisions % task.resync == 0
             for k in range(STATE_SIZE):
@@ -102,13 +104,13 @@ def look_ahead(settings: Records, load_values: FloatArray, constants: FloatArray
         cells[n].load = load_values[cells[n].load_start + min(cells[n].sample, cells[n].last_sample)]
     for first in range(0, len(cells), BLOCK):
         size = min(BLOCK, len(cells) - first)
-        fill_block(block, first, size, cells.state, cells.load, cells.q_mobile, cells.r_o, constants)
+        fill_block(block, first, size, cells["state"], cells["load"], cells["q_mobile"], cells["r_o"], constants)
         step_of_block(block, size, task.dt_s, task.power, True, task.thermal, True, task.polynomial_n, task.polynomial_p)
         for j in range(size):
             cell = cells[first + j]
             cell.voltage = block[VOLTAGE + j]
             cell.soc = (cell.state[QNB] + cell.state[QNS]) / cell.q_mobile
-        states_of_block(block, first, size, cells.next_state)
+        states_of_block(block, first, size, cells["next_state"])
 
 
 @_compiled
@@ -116,7 +118,9 @@ def model_voltage(settings: Records, cells: Records, out: FloatArray) -> None:
     task, block = settings[0], np.empty(BLOCK_SIZE)
     for first in range(0, len(cells), BLOCK):
         size = min(BLOCK, len(cells) - first)
-        fill_block(block, first, size, cells.model_state, cells.load, cells.q_mobile_hat, cells.r_o_hat, task.constants)
+        fill_block(
+            block, first, size, cells["model_state"], cells["load"], cells["q_mobile_hat"], cells["r_o_hat"], task.constants
+        )
         voltage_of_block(block, size, True, task.polynomial_n, task.polynomial_p)
         for j in range(size):
             out[first + j] = block[VOLTAGE + j]
@@ -141,10 +145,10 @@ def observe(settings: Records, cells: Records, limit: float, out: NDArray[np.flo
     if not task.innovations:
         return
     q, r_o = np.full(len(cells), task.new_parameters[0]), np.full(len(cells), task.new_parameters[1])
-    for column, origin in ((15, cells.model_state), (22, cells.state)):
+    for column, origin in ((15, cells["model_state"]), (22, cells["state"])):
         for first in range(0, len(cells), BLOCK):
             size = min(BLOCK, len(cells) - first)
-            fill_block(block, first, size, origin, cells.load, q, r_o, task.constants)
+            fill_block(block, first, size, origin, cells["load"], q, r_o, task.constants)
             step_of_block(
                 block, size, task.dt_s, task.power, task.power, task.thermal, True, task.polynomial_n, task.polynomial_p
             )

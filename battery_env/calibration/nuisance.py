@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from battery_env.arrays import FloatArray, IntArray
 from battery_env.calibration.readings import (
@@ -15,8 +16,6 @@ from battery_env.calibration.readings import (
     FURTHER_VSN,
     FURTHER_VSP,
     HALF,
-    LANES,
-    MEASURED,
     MOVED,
     OHMIC,
     RELATIVE_STEP,
@@ -24,16 +23,31 @@ from battery_env.calibration.readings import (
     SLOPE,
     VSN,
     VSP,
+    Overpotentials,
     Readings,
     nominal_overpotentials_of_block,
+    pad_block,
+    relax_block,
     surface_fractions,
+    take_readings,
     voltages_of_block,
 )
-from battery_env.electrochemistry.cell import BULK_RATE, PER_CURRENT_N, R_OVER_F, SURFACE_RATE, UNCERTAIN_CONSTANTS
+from battery_env.electrochemistry.cell import (
+    BULK_RATE,
+    PER_CURRENT_N,
+    R_OVER_F,
+    SURFACE_RATE,
+    SURROUNDINGS,
+    TO_RATE,
+    TSN_RATE,
+    UNCERTAIN_CONSTANTS,
+)
 from battery_env.electrochemistry.kernels import BLOCK
+from battery_env.parameters import columns_of
 
-# The unknowns: two parameters, the offset of the sensor, and the logarithms of UNCERTAIN_CONSTANTS
-_Q, _R, _OFFSET, _KN, _TD, _TO, _TSN = range(7)
+# The unknowns: two parameters, the offset of the sensor, and the logarithms of UNCERTAIN_CONSTANTS. In the values of a block
+# they are rows of the derivatives of the voltage, and the residual is the row after them
+_Q, _R, _OFFSET, _KN, _T_DIFFUSION, _TO, _TSN, _RESIDUAL = range(8)
 _UNKNOWNS = 7
 _CONSTANTS = slice(_KN, _UNKNOWNS)
 #: What :func:`nuisance_step` finds: a step and a standard deviation of every unknown, and at last the noise.
@@ -50,6 +64,7 @@ _LEAST_NOISE_V = 0.001
 _NOISE_ROUNDS = 3
 
 _compiled = njit(cache=True, error_model="numpy")
+_inlined = njit(cache=True, error_model="numpy", forceinline=True)
 # sums in any order, which vector instructions need
 _reassociating = njit(cache=True, error_model="numpy", fastmath={"reassoc"})
 assert UNCERTAIN_CONSTANTS == ("kn", "tDiffusion", "to", "tsn")
@@ -102,9 +117,8 @@ class NuisanceFit:
         offset_V: float,
         nuisance: float,
     ) -> None:
-        self._cell, self._rates = readings.cell, rates_of(readings)
-        self._relaxed_p = 1.0 - float(readings.decay(self._cell.tsp))
-        self._columns = [n for n, name in enumerate(ranges) if name in parameters]
+        self._model = readings.model
+        self._columns = columns_of(parameters)
         self._nuisance = nuisance
         limits = np.array(list(ranges.values()))
         unknown = [name in parameters for name in ranges]
@@ -116,31 +130,10 @@ class NuisanceFit:
         self._found = np.zeros((cells, FOUND_SIZE))
         self.observation_size = 2 * len(self._columns) + 2 + len(constants)
 
-    def step(
-        self,
-        rows: IntArray,
-        count: IntArray,
-        first: IntArray,
-        estimate: FloatArray,
-        measured: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
-    ) -> None:
-        """Take one step."""
-        nuisance_step(
-            rows,
-            count,
-            first,
-            np.ascontiguousarray(estimate[:, 0]),
-            np.ascontiguousarray(estimate[:, 1]),
-            *measured,
-            self._cell.Tb0,
-            self._relaxed_p,
-            self._rates,
-            self.logarithms,
-            *self._cell.packed,
-            self._prior_mean,
-            self._prior_sd,
-            self._found,
-        )
+    def step(self, rows: IntArray, count: IntArray, estimate: FloatArray, shown: FloatArray) -> None:
+        """Take one step for some cells; the arguments are those of :func:`nuisance_step`."""
+        priors = self._prior_mean, self._prior_sd
+        nuisance_step(rows, count, estimate, shown, self._model, self.logarithms, *priors, self._found)
         limit = REACH_SD * self._prior_sd[_CONSTANTS]
         self.logarithms[rows] = np.clip(self.logarithms[rows] + self._found[rows, _CONSTANTS], -limit, limit)
 
@@ -161,14 +154,6 @@ class NuisanceFit:
             np.arcsinh(self._found[:, _OFFSET, None] / _VOLTAGE_SCALE_V),
             self.logarithms / self._nuisance,
         ]
-
-
-def rates_of(readings: Readings) -> FloatArray:
-    """How quickly the model follows its current."""
-    cell, constants = readings.cell, readings.cell.packed.constants[0]
-    rate = constants[BULK_RATE] + constants[SURFACE_RATE]
-    at_rest = constants[BULK_RATE] / rate
-    return np.array([rate, 1.0 / cell.to, 1.0 / cell.tsn, at_rest, readings.interval_s, readings.dt_s])
 
 
 @_compiled
@@ -203,33 +188,190 @@ def _solve(matrix: FloatArray, right: FloatArray, inverse: FloatArray) -> None:
 
 
 @_reassociating
-def _add_products(values: FloatArray, begin: int, end: int, sums: FloatArray) -> None:
+def _add_products(values: FloatArray, size: int, sums: FloatArray) -> None:
     for j in range(len(values)):
         for m in range(j + 1):
             total = 0.0
-            for k in range(begin, end):
+            for k in range(size):
                 total += values[j, k] * values[m, k]
             sums[j, m] += total
+
+
+class _Rates(NamedTuple):
+    """What of charges and drops is left after an interval, and the derivatives by the logarithms of time constants."""
+
+    left_d: float  # of charge that diffuses
+    slope_d: float
+    gain_d: float  # how much of a current leaves the surface beyond its share at rest
+    gain_slope_d: float
+    left_o: float  # of the ohmic drop
+    slope_o: float
+    left_n: float  # of Vsn
+    slope_n: float
+    left_d0: float  # with the constants of the model
+    gain_d0: float
+    left_o0: float
+
+
+class _Linear(NamedTuple):
+    """The part of the states that is linear in the current, at one reading; 0 stands for the constants of the model."""
+
+    unequal: float  # charge that has left the surface beyond its share at rest, C
+    unequal_0: float
+    ohmic: float  # drop per ohm, A
+    ohmic_0: float
+    by_t_diffusion: float  # of the charge
+    by_to: float  # of the drop
+
+
+@_inlined
+def _rates(model: Any, logarithms: FloatArray) -> _Rates:
+    constants, interval_s, dt_s = model.constants, model.interval_s, model.dt_s
+    rate_d = constants[0, BULK_RATE] + constants[0, SURFACE_RATE]
+    at_rest = constants[0, BULK_RATE] / rate_d
+    factor_d, factor_o, factor_n = np.exp(logarithms[1]), np.exp(logarithms[2]), np.exp(logarithms[3])
+    left_d0, _ = _decay(rate_d, 1.0, interval_s, dt_s)
+    left_o0, _ = _decay(constants[0, TO_RATE], 1.0, interval_s, dt_s)
+    left_d, slope_d = _decay(rate_d, factor_d, interval_s, dt_s)
+    left_o, slope_o = _decay(constants[0, TO_RATE], factor_o, interval_s, dt_s)
+    left_n, slope_n = _decay(constants[0, TSN_RATE], factor_n, interval_s, dt_s)
+    gain_d0 = (1.0 - at_rest) * (1.0 - left_d0) / rate_d
+    gain_d = (1.0 - at_rest) * (1.0 - left_d) * factor_d / rate_d
+    gain_slope_d = gain_d - (1.0 - at_rest) * slope_d * factor_d / rate_d
+    return _Rates(left_d, slope_d, gain_d, gain_slope_d, left_o, slope_o, left_n, slope_n, left_d0, gain_d0, left_o0)
+
+
+@_inlined
+def _follow_current(block: FloatArray, values: FloatArray, size: int, r_o: float, rates: _Rates, before: _Linear) -> _Linear:
+    # From the states of the model's constants, in the block, to those of the fit, and their derivatives
+    unequal, unequal_0, ohmic, ohmic_0, by_t_diffusion, by_to = before
+    for k in range(size):
+        current, shown = block[CURRENT * BLOCK + k], block[OHMIC * BLOCK + k]
+        # the current that makes this ohmic drop of the one before
+        effective = (shown - rates.left_o0 * ohmic_0) / (1.0 - rates.left_o0)
+        ohmic_0 = shown
+        by_to = rates.left_o * by_to + rates.slope_o * (ohmic - effective)
+        ohmic = rates.left_o * ohmic + (1.0 - rates.left_o) * effective
+        # what has left the surface, beyond its share at rest
+        by_t_diffusion = rates.left_d * by_t_diffusion + rates.slope_d * unequal + rates.gain_slope_d * current
+        unequal = rates.left_d * unequal + rates.gain_d * current
+        unequal_0 = rates.left_d0 * unequal_0 + rates.gain_d0 * current
+        block[MOVED * BLOCK + k] = block[MOVED * BLOCK + k] + unequal - unequal_0
+        block[OHMIC * BLOCK + k] = ohmic
+        values[_T_DIFFUSION, k], values[_TO, k] = by_t_diffusion, -r_o * by_to
+    return _Linear(unequal, unequal_0, ohmic, ohmic_0, by_t_diffusion, by_to)
+
+
+@_inlined
+def _differentiate_vsn(
+    block: FloatArray, values: FloatArray, size: int, rates: _Rates, vsn: float, before: tuple[float, float]
+) -> tuple[float, float]:
+    # The derivatives by kn and tsn from the values that Vsn tends to, which values has by kn; returns the last ones
+    by_kn, by_tsn = before
+    for k in range(size):
+        nominal = block[VSN * BLOCK + k]
+        by_tsn = rates.left_n * by_tsn + rates.slope_n * (vsn - nominal)
+        by_kn += (1.0 - rates.left_n) * (values[_KN, k] - by_kn)
+        vsn += (1.0 - rates.left_n) * (nominal - vsn)
+        values[_KN, k], values[_TSN, k] = -by_kn, -by_tsn
+    return by_kn, by_tsn
+
+
+@_inlined
+def _differentiate_nominal(block: FloatArray, values: FloatArray, size: int, q: float, own: FloatArray) -> None:
+    # What Vsn tends to, by the logarithm of kn
+    scale = 2.0 * own[0, R_OVER_F] * own[0, SURROUNDINGS]
+    for k in range(size):
+        xn, _ = surface_fractions(block[HALF * BLOCK + k], q, own)
+        argument = block[CURRENT * BLOCK + k] * own[0, PER_CURRENT_N]
+        values[_KN, k] = -scale * argument / np.sqrt(argument * argument + (1.0 - xn) * xn)
+
+
+@_inlined
+def _differentiate_voltage(block: FloatArray, values: FloatArray, size: int, q: float) -> None:
+    step_C = q * RELATIVE_STEP
+    for k in range(size):
+        slope, moved = block[SLOPE * BLOCK + k], block[MOVED * BLOCK + k]
+        relaxing = block[FURTHER_VSN * BLOCK + k] - block[VSN * BLOCK + k]
+        relaxing += block[FURTHER_VSP * BLOCK + k] - block[VSP * BLOCK + k]
+        # the equilibrium is a function of moved / q
+        by_moved = -(slope + relaxing / step_C) * q / max(moved, 1.0)
+        values[_Q, k], values[_R, k] = slope, -block[OHMIC * BLOCK + k]
+        values[_OFFSET, k], values[_RESIDUAL, k] = 1.0, block[RESIDUAL * BLOCK + k]
+        values[_T_DIFFUSION, k] *= by_moved
+
+
+@_compiled
+def _linearize(
+    n: int, end: int, estimate: FloatArray, shown: FloatArray, model: Any, logarithms: FloatArray, sums: FloatArray
+) -> None:
+    # The sums of products of the derivatives by all unknowns, and of the residual, over the readings of a cell
+    block, values, own = np.empty(BLOCK_SIZE), np.empty((_UNKNOWNS + 1, BLOCK)), model.constants.copy()
+    q, r = estimate[n, 0], estimate[n, 1]
+    own[0, PER_CURRENT_N] = model.constants[0, PER_CURRENT_N] / np.exp(logarithms[n, 0])
+    rates = _rates(model, logarithms[n])
+    linear, overpotentials = _Linear(0.0, 0.0, 0.0, 0.0, 0.0, 0.0), Overpotentials(0.0, 0.0, 0.0, 0.0)
+    by_constants, moved_before = (0.0, 0.0), 0.0
+    sums[:] = 0.0
+    for low in range(0, end, BLOCK):
+        size = min(BLOCK, end - low)
+        take_readings(block, shown, n, low, size)
+        linear = _follow_current(block, values, size, r, rates, linear)
+        padded = pad_block(block, size, moved_before)
+        moved_before = block[MOVED * BLOCK + size - 1]
+        nominal_overpotentials_of_block(block, padded, q, own)
+        _differentiate_nominal(block, values, padded, q, own)
+        by_constants = _differentiate_vsn(block, values, size, rates, overpotentials.vsn, by_constants)
+        overpotentials = relax_block(block, size, 1.0 - rates.left_n, model.relaxed_p, overpotentials)
+        voltages_of_block(block, padded, q, r, model)
+        _differentiate_voltage(block, values, size, q)
+        _add_products(values, size, sums)
+
+
+@_compiled
+def _solve_under_priors(
+    sums: FloatArray,
+    before: FloatArray,
+    readings: int,
+    prior_mean: FloatArray,
+    prior_sd: FloatArray,
+    found: FloatArray,
+) -> None:
+    # The step, its standard deviations and the noise, into found of shape (FOUND_SIZE,)
+    matrix, inverse = np.empty((2, _UNKNOWNS, _UNKNOWNS))
+    step = np.empty(_UNKNOWNS)
+    residuals = sums[_RESIDUAL, _RESIDUAL]
+    noise2 = max(residuals / readings, _LEAST_NOISE_V**2)
+    for _ in range(_NOISE_ROUNDS):
+        for j in range(_UNKNOWNS):
+            for m in range(j + 1):
+                matrix[j, m] = matrix[m, j] = prior_sd[j] * prior_sd[m] * sums[j, m] / noise2
+            matrix[j, j] += 1.0
+            step[j] = prior_sd[j] * sums[_RESIDUAL, j] / noise2
+            if prior_sd[j] > 0.0:
+                step[j] += (prior_mean[j] - before[j]) / prior_sd[j]
+        _solve(matrix, step, inverse)
+        left = residuals
+        for j in range(_UNKNOWNS):
+            left -= 2.0 * prior_sd[j] * step[j] * sums[_RESIDUAL, j]
+            for m in range(_UNKNOWNS):
+                product = sums[max(j, m), min(j, m)]
+                left += prior_sd[j] * step[j] * prior_sd[m] * step[m] * product
+        noise2 = max(left / readings, _LEAST_NOISE_V**2)
+    for j in range(_UNKNOWNS):
+        found[j] = prior_sd[j] * step[j]
+        found[_UNKNOWNS + j] = prior_sd[j] * np.sqrt(inverse[j, j])
+    found[_NOISE] = np.sqrt(noise2)
 
 
 @_compiled
 def nuisance_step(
     rows: IntArray,
     count: IntArray,
-    first: IntArray,
-    q_mobile: FloatArray,
-    r_o: FloatArray,
-    voltage_V: FloatArray,
-    current_A: FloatArray,
-    moved_C: FloatArray,
-    ohmic_A: FloatArray,
-    temperature_K: float,
-    relaxed_p: float,
-    rates: FloatArray,
+    estimate: FloatArray,
+    shown: FloatArray,
+    model: NDArray[np.void],
     logarithms: FloatArray,
-    constants: FloatArray,
-    polynomial_n: FloatArray,
-    polynomial_p: FloatArray,
     prior_mean: FloatArray,
     prior_sd: FloatArray,
     found: FloatArray,
@@ -238,101 +380,15 @@ def nuisance_step(
     One Gauss-Newton step towards the (q_mobile, r_o), offset and constants that explain the readings of each cell best under
     their priors; unchecked, all arrays contiguous. The arguments that :func:`battery_env.calibration.readings.explain` has too
     are the same.
+
+    :param logarithms: of the factors that the constants of the model are multiplied by, shape (n, 4)
+    :param prior_mean: of all unknowns, shape (7,)
+    :param prior_sd: their standard deviations, 0 where one is known, same shape
+    :param found: overwritten: step, standard deviations and noise, shape (n, FOUND_SIZE)
     """
-    rate_d, rate_o, rate_n, at_rest, interval_s, dt_s = rates
-    left_d0, _ = _decay(rate_d, 1.0, interval_s, dt_s)
-    left_o0, _ = _decay(rate_o, 1.0, interval_s, dt_s)
-    gain_d0 = (1.0 - at_rest) * (1.0 - left_d0) / rate_d
-    scale_n = 2.0 * constants[0, R_OVER_F] * temperature_K
-    own, block = constants.copy(), np.empty(BLOCK_SIZE)
-    # derivatives by all unknowns, and the residual; sums of their products
-    rows_of_block, sums = np.empty((_UNKNOWNS + 1, BLOCK)), np.empty((_UNKNOWNS + 1, _UNKNOWNS + 1))
-    matrix, inverse = np.empty((2, _UNKNOWNS, _UNKNOWNS))
-    step, before = np.empty((2, _UNKNOWNS))
+    sums, before = np.empty((_UNKNOWNS + 1, _UNKNOWNS + 1)), np.zeros(_UNKNOWNS)
     for n in rows:
-        q, r, begin, end = q_mobile[n], r_o[n], first[n], count[n]
-        further_q, step_C = q * (1.0 + RELATIVE_STEP), q * RELATIVE_STEP
-        factor_kn, factor_td, factor_to, factor_tsn = np.exp(logarithms[n])
-        own[0, PER_CURRENT_N] = per_current = constants[0, PER_CURRENT_N] / factor_kn
-        left_d, slope_d = _decay(rate_d, factor_td, interval_s, dt_s)
-        left_o, slope_o = _decay(rate_o, factor_to, interval_s, dt_s)
-        left_n, slope_n = _decay(rate_n, factor_tsn, interval_s, dt_s)
-        gain_d = (1.0 - at_rest) * (1.0 - left_d) * factor_td / rate_d
-        gain_slope_d = gain_d - (1.0 - at_rest) * slope_d * factor_td / rate_d
-        sums[:] = 0.0
-        unequal = unequal_0 = ohmic = ohmic_0 = half_before = by_kn = by_td = by_to = by_tsn = 0.0
-        vsn = vsp = further_vsn = further_vsp = 0.0
-        for low in range(0, end, BLOCK):
-            size = min(BLOCK, end - low)
-            padded = (size + LANES - 1) // LANES * LANES
-            for k in range(padded):
-                at = low + min(k, size - 1)
-                current = current_A[n, at]
-                if k < size:
-                    # the current that makes this ohmic drop of the one before
-                    effective = (ohmic_A[n, at] - left_o0 * ohmic_0) / (1.0 - left_o0)
-                    ohmic_0 = ohmic_A[n, at]
-                    by_to = left_o * by_to + slope_o * (ohmic - effective)
-                    ohmic = left_o * ohmic + (1.0 - left_o) * effective
-                    # what has left the surface, beyond its share at rest
-                    by_td = left_d * by_td + slope_d * unequal + gain_slope_d * current
-                    unequal = left_d * unequal + gain_d * current
-                    unequal_0 = left_d0 * unequal_0 + gain_d0 * current
-                moved = moved_C[n, at] + unequal - unequal_0
-                block[MEASURED * BLOCK + k], block[CURRENT * BLOCK + k] = voltage_V[n, at], current
-                block[MOVED * BLOCK + k], block[OHMIC * BLOCK + k] = moved, ohmic
-                block[HALF * BLOCK + k] = 0.5 * (half_before + moved)
-                half_before = moved
-                rows_of_block[_TD, k], rows_of_block[_TO, k] = by_td, -r * by_to
-            nominal_overpotentials_of_block(block, padded, q, further_q, temperature_K, own)
-            for k in range(padded):
-                xn, _ = surface_fractions(block[HALF * BLOCK + k], q, constants)
-                argument = block[CURRENT * BLOCK + k] * per_current
-                rows_of_block[_KN, k] = -scale_n * argument / np.sqrt(argument * argument + (1.0 - xn) * xn)
-            for k in range(size):
-                nominal = block[VSN * BLOCK + k]
-                by_tsn = left_n * by_tsn + slope_n * (vsn - nominal)
-                by_kn += (1.0 - left_n) * (rows_of_block[_KN, k] - by_kn)
-                vsn += (1.0 - left_n) * (nominal - vsn)
-                vsp += relaxed_p * (block[VSP * BLOCK + k] - vsp)
-                further_vsn += (1.0 - left_n) * (block[FURTHER_VSN * BLOCK + k] - further_vsn)
-                further_vsp += relaxed_p * (block[FURTHER_VSP * BLOCK + k] - further_vsp)
-                block[VSN * BLOCK + k], block[VSP * BLOCK + k] = vsn, vsp
-                block[FURTHER_VSN * BLOCK + k], block[FURTHER_VSP * BLOCK + k] = further_vsn, further_vsp
-                rows_of_block[_KN, k], rows_of_block[_TSN, k] = -by_kn, -by_tsn
-            voltages_of_block(block, padded, q, further_q, r, temperature_K, constants, polynomial_n, polynomial_p)
-            for k in range(size):
-                slope, moved = block[SLOPE * BLOCK + k], block[MOVED * BLOCK + k]
-                relaxing = block[FURTHER_VSN * BLOCK + k] - block[VSN * BLOCK + k]
-                relaxing += block[FURTHER_VSP * BLOCK + k] - block[VSP * BLOCK + k]
-                # the equilibrium is a function of moved / q
-                by_moved = -(slope + relaxing / step_C) * q / max(moved, 1.0)
-                rows_of_block[_Q, k], rows_of_block[_R, k] = slope, -block[OHMIC * BLOCK + k]
-                rows_of_block[_OFFSET, k], rows_of_block[_UNKNOWNS, k] = 1.0, block[RESIDUAL * BLOCK + k]
-                rows_of_block[_TD, k] *= by_moved
-            _add_products(rows_of_block, max(begin - low, 0), size, sums)
-        readings, residuals = end - begin, sums[_UNKNOWNS, _UNKNOWNS]
-        before[:] = 0.0
-        before[_Q], before[_R] = q, r
+        _linearize(n, count[n], estimate, shown, model[0], logarithms, sums)
+        before[_Q], before[_R] = estimate[n, 0], estimate[n, 1]
         before[_KN:] = logarithms[n]
-        noise2 = max(residuals / readings, _LEAST_NOISE_V**2)
-        for _ in range(_NOISE_ROUNDS):
-            for j in range(_UNKNOWNS):
-                for m in range(j + 1):
-                    matrix[j, m] = matrix[m, j] = prior_sd[j] * prior_sd[m] * sums[j, m] / noise2
-                matrix[j, j] += 1.0
-                step[j] = prior_sd[j] * sums[_UNKNOWNS, j] / noise2
-                if prior_sd[j] > 0.0:
-                    step[j] += (prior_mean[j] - before[j]) / prior_sd[j]
-            _solve(matrix, step, inverse)
-            left = residuals
-            for j in range(_UNKNOWNS):
-                left -= 2.0 * prior_sd[j] * step[j] * sums[_UNKNOWNS, j]
-                for m in range(_UNKNOWNS):
-                    product = sums[max(j, m), min(j, m)]
-                    left += prior_sd[j] * step[j] * prior_sd[m] * step[m] * product
-            noise2 = max(left / readings, _LEAST_NOISE_V**2)
-        for j in range(_UNKNOWNS):
-            found[n, j] = prior_sd[j] * step[j]
-            found[n, _UNKNOWNS + j] = prior_sd[j] * np.sqrt(inverse[j, j])
-        found[n, _NOISE] = np.sqrt(noise2)
+        _solve_under_priors(sums, before, count[n], prior_mean, prior_sd, found[n])

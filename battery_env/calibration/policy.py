@@ -18,18 +18,15 @@ from battery_env.calibration.confidence import NO_FIT, Confidence
 from battery_env.calibration.env import CalibrationEnv, task_class
 from battery_env.calibration.nuisance import Fitted
 from battery_env.calibration.pretrained import pretrained_policy
-from battery_env.calibration.streaming import ReadingsSoFar, resume
 from battery_env.calibration.task import CalibrationTask
 from battery_env.calibration.voltage import VoltageTask
 from battery_env.electrochemistry import NEW_CELL, STATE_SIZE, UNCERTAIN_CONSTANTS
 from battery_env.estimates import last_estimate
-from battery_env.estimators.base import Estimate, EstimateTrace, ModelNow, OnlineEstimator, Record
+from battery_env.estimators.base import SURPLUS_SHARE, Estimate, EstimateTrace, ModelNow, OnlineEstimator, Record
 from battery_env.record_model import RecordModel
 from battery_env.records import Samples, check_drawn_charge, check_record, check_sample, drawn, starts_at_rest
 
 _NOT_YET = "The policy states nothing before its next decision."
-# A full cell takes no more charge than this share of that of a new one.
-_SURPLUS = 0.01
 # Steps in which a stream is followed, s
 _STEP_S = 1.0
 
@@ -40,6 +37,57 @@ class Predictor(Protocol):
     def predict(self, observation: Any, /, *, deterministic: bool = False) -> tuple[Any, Any]:
         """Actions for a batch of observations."""
         ...
+
+
+class ReadingsSoFar:
+    """
+    Samples of one discharge that come in one by one, at any intervals, with missing voltages (NaN) among them.
+
+    :ivar time_s: since the first sample, s
+    :ivar voltage_V: V
+    :ivar current_A: from each sample to the next one, A
+    """
+
+    def __init__(self) -> None:
+        self.time_s: list[float] = []
+        self.voltage_V: list[float] = []
+        self.current_A: list[float] = []
+
+    def add(self, voltage_V: float, current_A: float, dt_s: float) -> None:
+        """Take in a sample."""
+        self.time_s.append(self.time_s[-1] + dt_s if self.time_s else 0.0)
+        self.voltage_V.append(float(voltage_V))
+        self.current_A.append(float(current_A))
+
+    def record(self, dt_s: float) -> Samples:
+        """
+        The same in equal steps: the mean current over each, so that the charge drawn is kept, and the voltage between the
+        samples that have one.
+        """
+        time_s, voltage_V, current_A = (np.array(column) for column in (self.time_s, self.voltage_V, self.current_A))
+        steps = max(int(np.floor(time_s[-1] / dt_s + 1e-9)), 1)
+        grid_s = dt_s * np.arange(steps + 1, dtype=np.float64)
+        drawn_C = np.append(0.0, np.cumsum(current_A[:-1] * np.diff(time_s)))
+        mean_A = np.append(np.diff(np.interp(grid_s, time_s, drawn_C)) / dt_s, current_A[-1])
+        known = ~np.isnan(voltage_V)
+        return Samples(grid_s, np.interp(grid_s, time_s[known], voltage_V[known]), mean_A)
+
+    def known(self, until_s: float) -> Samples:
+        """The samples that have a voltage."""
+        time_s, voltage_V, current_A = self.columns()
+        known = ~np.isnan(voltage_V) & (time_s <= until_s + 1e-9)
+        return Samples(time_s[known], voltage_V[known], current_A[known])
+
+    def columns(self) -> FloatArray:
+        """All samples."""
+        return np.array([self.time_s, self.voltage_V, self.current_A])
+
+    @classmethod
+    def of(cls, columns: FloatArray) -> ReadingsSoFar:
+        """The reverse of :meth:`columns`."""
+        readings = cls()
+        readings.time_s, readings.voltage_V, readings.current_A = columns.tolist()
+        return readings
 
 
 def _without_data(env_id: str, options: dict[str, Any]) -> dict[str, Any]:
@@ -157,15 +205,7 @@ class PolicyEstimator(OnlineEstimator):
             self._sd = [nan if isnan(each) else each for each in sd.tolist()]
 
     def check(self, voltage_V: float, current_A: float, dt_s: float, temperature_C: float | None = None) -> None:
-        """
-        Refuse a sample that :meth:`update` would refuse, and change nothing.
-
-        :param voltage_V: as of :meth:`update`
-        :param current_A: likewise
-        :param dt_s: likewise
-        :param temperature_C: likewise
-        :raises ValueError: likewise
-        """
+        """Refuse a sample that :meth:`update` would refuse, and change nothing."""
         if not issubclass(self.task_class, VoltageTask) or issubclass(self.task_class, BatteryAging):
             raise ValueError(f"a policy of {self.env_id} takes no stream: it needs the full state, or a whole life")
         if temperature_C is not None:
@@ -175,7 +215,7 @@ class PolicyEstimator(OnlineEstimator):
             return
         before_A = self._readings.current_A[-1]
         check_sample(voltage_V, current_A, dt_s, previous_A=before_A)
-        check_drawn_charge(self._drawn_C + dt_s * before_A, -_SURPLUS * self.cell.q_mobile)
+        check_drawn_charge(self._drawn_C + dt_s * before_A, -SURPLUS_SHARE * self.cell.q_mobile)
 
     def update(self, voltage_V: float, current_A: float, dt_s: float, temperature_C: float | None = None) -> Estimate:
         """
@@ -207,19 +247,17 @@ class PolicyEstimator(OnlineEstimator):
     def _decide(self, due: int) -> None:
         """One decision, on all readings up to the time when it was due."""
         task = self._follow([self._readings.record(self.dt_s)], due * self._every)
-        self._logarithms = resume(task, self._now, self._action, self._logarithms)
-        self._fitted = _fitted(task)
+        assert isinstance(task, VoltageTask)  # no other follows a stream
+        task.restore(self._now, self._action, self._logarithms)
+        self._logarithms = task.logarithms[0]
+        self._fitted = task.fitted()
         action, _ = self.policy.predict(task.observation(), deterministic=True)
         task.advance(np.asarray(action))
         self._decisions, self._now, self._action = due, task.estimate[0], np.clip(np.asarray(action)[0], -1.0, 1.0)
         self._judge()
 
     def now(self) -> ModelNow:
-        """
-        The model at the last sample, with the estimate as its parameters.
-
-        :return: where it stands
-        """
+        """The model at the last sample, with the estimate as its parameters."""
         model, (q_mobile, r_o) = RecordModel(self.cell, dt_s=self.dt_s), self._now.tolist()
         state = model.start(q_mobile)
         if self._readings.time_s and self._readings.time_s[-1] > 0.0:
@@ -284,7 +322,7 @@ class PolicyEstimator(OnlineEstimator):
         made: list[FloatArray] = []
         reasons: list[str] = []
         while (running := ~task.truncated()).any():
-            (discharge, time_s), fitted = task.seen(), _fitted(task)
+            (discharge, time_s), fitted = task.seen(), task.fitted()
             action, _ = self.policy.predict(task.observation(), deterministic=True)
             task.advance(np.asarray(action))
             estimate = task.estimate
@@ -307,7 +345,3 @@ class PolicyEstimator(OnlineEstimator):
             EstimateTrace(rows[n, 1], rows[n, 2], rows[n, 3], rows[n, 4], rows[n, 5], texts[n] == "", texts[n])
             for n in of_each
         ]
-
-
-def _fitted(task: CalibrationTask) -> Fitted | None:
-    return task.fitted() if isinstance(task, VoltageTask) else None

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from battery_env.arrays import IntArray
+from battery_env.arrays import FloatArray, IntArray
 from battery_env.electrochemistry import (
     FULL_CHARGE_SHARES,
     NEW_CELL,
@@ -18,12 +20,11 @@ from battery_env.electrochemistry import (
     QPS,
     VO,
     CellParameters,
-    FloatArray,
     Trajectory,
     initial_state,
     simulate,
 )
-from battery_env.electrochemistry.cell import BULK_RATE, SURFACE_RATE
+from battery_env.electrochemistry.cell import BULK_RATE, CONSTANTS_SIZE, POLYNOMIAL_SIZE, SURFACE_RATE, SURROUNDINGS
 from battery_env.electrochemistry.kernels import BLOCK, equilibrium_voltage, mole_fraction, nominal_overpotentials
 from battery_env.records import Record, check_record, resample_current
 
@@ -41,8 +42,24 @@ _EQUAL_A = 1e-9
 # instructions where it sees that rows do not overlap, and where no reading waits for the one before
 MEASURED, CURRENT, MOVED, OHMIC, HALF, VSN, VSP, FURTHER_VSN, FURTHER_VSP, MODELLED, RESIDUAL, SLOPE = range(12)
 BLOCK_SIZE = 12 * BLOCK
+#: The first rows are what sensors show of a discharge: voltage, V, mean current, A, charge that has left the surface of the
+#: negative electrode, C, and ohmic drop per ohm, A.
+SHOWN = 4
 # the most numbers that an instruction takes at once (AVX-512)
-LANES = 8
+_LANES = 8
+
+#: What the kernels know of the model, one record; what Vsn and Vsp go of their way in one interval as shares.
+MODEL = np.dtype(
+    [
+        ("constants", float, (1, CONSTANTS_SIZE)),
+        ("polynomial_n", float, (POLYNOMIAL_SIZE,)),
+        ("polynomial_p", float, (POLYNOMIAL_SIZE,)),
+        ("relaxed_n", float),
+        ("relaxed_p", float),
+        ("interval_s", float),
+        ("dt_s", float),
+    ]
+)
 
 _compiled = njit(cache=True, error_model="numpy")
 _inlined = njit(cache=True, error_model="numpy", forceinline=True)
@@ -144,6 +161,25 @@ class Readings:
         """Where the readings of one discharge lie."""
         return slice(int(self.start[discharge]), int(self.start[discharge] + self.count[discharge]))
 
+    def shown(self, discharge: int) -> FloatArray:
+        """What exact sensors show of one discharge, shape (SHOWN, readings)."""
+        part = self.part(discharge)
+        return np.stack([self.voltage_V[part], self.current_A[part], self.moved_C[part], self.ohmic_A[part]])
+
+    @cached_property
+    def model(self) -> NDArray[np.void]:
+        """What the kernels know of the model, shape (1,)."""
+        model, cell = np.zeros(1, dtype=MODEL), self.cell
+        for name, value in {
+            **cell.packed._asdict(),
+            "relaxed_n": 1.0 - self.decay(cell.tsn),
+            "relaxed_p": 1.0 - self.decay(cell.tsp),
+            "interval_s": self.interval_s,
+            "dt_s": self.dt_s,
+        }.items():
+            model[name] = value
+        return model
+
     def decay(self, time_constant_s: ArrayLike) -> FloatArray:
         """What is left after one interval of a quantity that decays, in the model's own steps."""
         return (1.0 - self.dt_s / np.asarray(time_constant_s)) ** round(self.interval_s / self.dt_s)
@@ -208,18 +244,37 @@ def _linear_part(
     return moved_C + start[QNB] - state[:, QNB], moved_C, state[:, VO] / _ONE_OHM
 
 
-@_compiled
-def _fill_block(block: FloatArray, arrays: tuple[FloatArray, ...], n: int, low: int, size: int, moved_before: float) -> int:
-    # Take some readings of a cell into a block, and repeat the last one up to the length that is returned, which vector
-    # instructions divide without a rest
-    padded = (size + LANES - 1) // LANES * LANES
-    for row in range(len(arrays)):
-        values = arrays[row][n, low : low + size]
+class Overpotentials(NamedTuple):
+    """
+    Surface overpotentials at a reading, V.
+
+    :param vsn: of the negative electrode
+    :param vsp: of the positive electrode
+    :param further_vsn: of the negative electrode at q (1 + ``RELATIVE_STEP``)
+    :param further_vsp: likewise of the positive one
+    """
+
+    vsn: float
+    vsp: float
+    further_vsn: float
+    further_vsp: float
+
+
+@_inlined
+def take_readings(block: FloatArray, shown: FloatArray, n: int, first: int, size: int) -> None:
+    for row in range(SHOWN):
         for k in range(size):
-            block[row * BLOCK + k] = values[k]
+            block[row * BLOCK + k] = shown[row, n, first + k]
+
+
+@_inlined
+def pad_block(block: FloatArray, size: int, moved_before: float) -> int:
+    # Repeat the last reading up to the length that is returned, which vector instructions divide without a rest. The
+    # overpotentials relax towards their value half way between two readings
+    padded = (size + _LANES - 1) // _LANES * _LANES
+    for row in range(SHOWN):
         for k in range(size, padded):
-            block[row * BLOCK + k] = values[size - 1]
-    # the overpotentials relax towards their value half way between two readings
+            block[row * BLOCK + k] = block[row * BLOCK + size - 1]
     block[HALF * BLOCK] = 0.5 * (moved_before + block[MOVED * BLOCK])
     for k in range(1, padded):
         block[HALF * BLOCK + k] = 0.5 * (block[MOVED * BLOCK + k - 1] + block[MOVED * BLOCK + k])
@@ -228,128 +283,132 @@ def _fill_block(block: FloatArray, arrays: tuple[FloatArray, ...], n: int, low: 
 
 @_inlined
 def surface_fractions(moved: float, q: float, constants: FloatArray) -> tuple[float, float]:
-    xn = mole_fraction(_SURFACE_SHARE_N * q - moved, q, True, constants, 0)
-    return xn, mole_fraction(_SURFACE_SHARE_P * q + moved, q, True, constants, 0)
+    xn = mole_fraction(_SURFACE_SHARE_N * q - moved, q, True, constants)
+    return xn, mole_fraction(_SURFACE_SHARE_P * q + moved, q, True, constants)
 
 
 @_compiled
-def nominal_overpotentials_of_block(
-    block: FloatArray, size: int, q: float, further_q: float, temperature_K: float, constants: FloatArray
-) -> None:
+def nominal_overpotentials_of_block(block: FloatArray, size: int, q: float, constants: FloatArray) -> None:
+    further_q, temperature_K = q * (1.0 + RELATIVE_STEP), constants[0, SURROUNDINGS]
     for k in range(size):
         current, half = block[CURRENT * BLOCK + k], block[HALF * BLOCK + k]
         xn, xp = surface_fractions(half, q, constants)
-        vsn, vsp = nominal_overpotentials(current, xn, xp, temperature_K, constants, 0)
+        vsn, vsp = nominal_overpotentials(current, xn, xp, temperature_K, constants)
         block[VSN * BLOCK + k], block[VSP * BLOCK + k] = vsn, vsp
         xn, xp = surface_fractions(half, further_q, constants)
-        vsn, vsp = nominal_overpotentials(current, xn, xp, temperature_K, constants, 0)
+        vsn, vsp = nominal_overpotentials(current, xn, xp, temperature_K, constants)
         block[FURTHER_VSN * BLOCK + k], block[FURTHER_VSP * BLOCK + k] = vsn, vsp
 
 
+@_inlined
+def relax_block(block: FloatArray, size: int, relaxed_n: float, relaxed_p: float, before: Overpotentials) -> Overpotentials:
+    # From the values that overpotentials tend to to those that they have; returns the last ones
+    vsn, vsp, further_vsn, further_vsp = before
+    for k in range(size):
+        vsn += relaxed_n * (block[VSN * BLOCK + k] - vsn)
+        vsp += relaxed_p * (block[VSP * BLOCK + k] - vsp)
+        further_vsn += relaxed_n * (block[FURTHER_VSN * BLOCK + k] - further_vsn)
+        further_vsp += relaxed_p * (block[FURTHER_VSP * BLOCK + k] - further_vsp)
+        block[VSN * BLOCK + k], block[VSP * BLOCK + k] = vsn, vsp
+        block[FURTHER_VSN * BLOCK + k], block[FURTHER_VSP * BLOCK + k] = further_vsn, further_vsp
+    return Overpotentials(vsn, vsp, further_vsn, further_vsp)
+
+
 @_compiled
-def voltages_of_block(
-    block: FloatArray,
-    size: int,
-    q: float,
-    further_q: float,
-    r_o: float,
-    temperature_K: float,
-    constants: FloatArray,
-    polynomial_n: FloatArray,
-    polynomial_p: FloatArray,
-) -> None:
-    step_C = q * RELATIVE_STEP
+def voltages_of_block(block: FloatArray, size: int, q: float, r_o: float, model: Any) -> None:
+    constants, polynomial_n, polynomial_p = model.constants, model.polynomial_n, model.polynomial_p
+    further_q, step_C, temperature_K = q * (1.0 + RELATIVE_STEP), q * RELATIVE_STEP, constants[0, SURROUNDINGS]
     for k in range(size):
         moved, ohmic_V = block[MOVED * BLOCK + k], r_o * block[OHMIC * BLOCK + k]
         xn, xp = surface_fractions(moved, q, constants)
-        equilibrium = equilibrium_voltage(xn, xp, temperature_K, constants, 0, polynomial_n, polynomial_p)
+        equilibrium = equilibrium_voltage(xn, xp, temperature_K, constants, polynomial_n, polynomial_p)
         modelled = equilibrium - block[VSN * BLOCK + k] - block[VSP * BLOCK + k] - ohmic_V
         xn, xp = surface_fractions(moved, further_q, constants)
-        equilibrium = equilibrium_voltage(xn, xp, temperature_K, constants, 0, polynomial_n, polynomial_p)
+        equilibrium = equilibrium_voltage(xn, xp, temperature_K, constants, polynomial_n, polynomial_p)
         further = equilibrium - block[FURTHER_VSN * BLOCK + k] - block[FURTHER_VSP * BLOCK + k] - ohmic_V
         block[MODELLED * BLOCK + k] = modelled
         block[RESIDUAL * BLOCK + k] = block[MEASURED * BLOCK + k] - modelled
         block[SLOPE * BLOCK + k] = (further - modelled) / step_C
 
 
+@_inlined
+def _mean_of_halves(
+    residual: FloatArray, slope: FloatArray, ohmic: FloatArray, low: int, high: int, means: FloatArray
+) -> None:
+    # The means of a stretch over the readings with less and with more current than its mean, into means of shape (3, 2)
+    middle_A = 0.0
+    for k in range(low, high):
+        middle_A += ohmic[k]
+    middle_A = middle_A / (high - low) + _EQUAL_A
+    # a sum of zeros costs less than a branch that nobody foresees
+    residual_0 = residual_1 = slope_0 = slope_1 = ohmic_0 = ohmic_1 = 0.0
+    count_1 = 0
+    for k in range(low, high):
+        r, s, o = residual[k], slope[k], ohmic[k]
+        more = o > middle_A
+        residual_0 += 0.0 if more else r
+        residual_1 += r if more else 0.0
+        slope_0 += 0.0 if more else s
+        slope_1 += s if more else 0.0
+        ohmic_0 += 0.0 if more else o
+        ohmic_1 += o if more else 0.0
+        count_1 += 1 if more else 0
+    count_0 = high - low - count_1
+    if count_1 == 0:
+        # under a constant current there is one half only
+        residual_1, slope_1, ohmic_1, count_1 = residual_0, slope_0, ohmic_0, count_0
+    means[0, 0], means[0, 1] = residual_0 / count_0, residual_1 / count_1
+    means[1, 0], means[1, 1] = slope_0 / count_0, slope_1 / count_1
+    means[2, 0], means[2, 1] = ohmic_0 / count_0, ohmic_1 / count_1
+
+
 @_compiled
 def explain(
     rows: IntArray,
     count: IntArray,
-    first: IntArray,
-    q_mobile: FloatArray,
-    r_o: FloatArray,
-    voltage_V: FloatArray,
-    current_A: FloatArray,
-    moved_C: FloatArray,
-    ohmic_A: FloatArray,
-    temperature_K: float,
-    relaxed_n: float,
-    relaxed_p: float,
-    constants: FloatArray,
-    polynomial_n: FloatArray,
-    polynomial_p: FloatArray,
-    residual_V: FloatArray,
-    slope_V_per_C: FloatArray,
-    ohmic_means_A: FloatArray,
+    estimate: FloatArray,
+    shown: FloatArray,
+    model: NDArray[np.void],
+    means: FloatArray,
     rms_V: FloatArray,
     last_V: FloatArray,
 ) -> None:
-    """Compare the model with the readings of many cells; unchecked, all arrays contiguous."""
-    stretches, block = residual_V.shape[1], np.empty(BLOCK_SIZE)
+    """
+    Compare the model with the first readings of many cells; unchecked, all arrays contiguous.
+
+    :param rows: which of the n cells
+    :param count: how many readings of each cell there are, shape (n,)
+    :param estimate: q_mobile and r_o, shape (n, 2)
+    :param shown: as of :meth:`Readings.shown`, shape (SHOWN, n, most readings)
+    :param model: of :attr:`Readings.model`
+    :param means: overwritten: of the residual, dV/dq and the ohmic drop per ohm over the readings with less and with more
+        current in equal stretches, shape (3, n, stretches, 2)
+    :param rms_V: overwritten: root mean square of the residuals, shape (n,)
+    :param last_V: overwritten: modelled voltage at the last reading, shape (n,)
+    """
+    stretches, block = means.shape[2], np.empty(BLOCK_SIZE)
     # of all readings of one cell: measured minus modelled voltage, and dV/dq
-    residual, slope = np.empty((2, voltage_V.shape[1]))
-    arrays = (voltage_V, current_A, moved_C, ohmic_A)
+    residual, slope = np.empty((2, shown.shape[2]))
     for n in rows:
-        begin, end, q, r = first[n], count[n], q_mobile[n], r_o[n]
-        further_q = q * (1.0 + RELATIVE_STEP)
-        moved_before = vsn = vsp = further_vsn = further_vsp = 0.0
+        end, q, r = count[n], estimate[n, 0], estimate[n, 1]
+        moved_before, overpotentials = 0.0, Overpotentials(0.0, 0.0, 0.0, 0.0)
         for low in range(0, end, BLOCK):
             size = min(BLOCK, end - low)
-            padded = _fill_block(block, arrays, n, low, size, moved_before)
+            take_readings(block, shown, n, low, size)
+            padded = pad_block(block, size, moved_before)
             moved_before = block[MOVED * BLOCK + size - 1]
-            nominal_overpotentials_of_block(block, padded, q, further_q, temperature_K, constants)
-            for k in range(size):
-                vsn += relaxed_n * (block[VSN * BLOCK + k] - vsn)
-                vsp += relaxed_p * (block[VSP * BLOCK + k] - vsp)
-                further_vsn += relaxed_n * (block[FURTHER_VSN * BLOCK + k] - further_vsn)
-                further_vsp += relaxed_p * (block[FURTHER_VSP * BLOCK + k] - further_vsp)
-                block[VSN * BLOCK + k], block[VSP * BLOCK + k] = vsn, vsp
-                block[FURTHER_VSN * BLOCK + k], block[FURTHER_VSP * BLOCK + k] = further_vsn, further_vsp
-            voltages_of_block(block, padded, q, further_q, r, temperature_K, constants, polynomial_n, polynomial_p)
+            nominal_overpotentials_of_block(block, padded, q, model[0].constants)
+            overpotentials = relax_block(block, size, model[0].relaxed_n, model[0].relaxed_p, overpotentials)
+            voltages_of_block(block, padded, q, r, model[0])
             for k in range(size):
                 residual[low + k] = block[RESIDUAL * BLOCK + k]
                 slope[low + k] = block[SLOPE * BLOCK + k]
             last_V[n] = block[MODELLED * BLOCK + size - 1]
-        span = end - begin
         square = 0.0
-        for k in range(begin, end):
+        for k in range(end):
             square += residual[k] ** 2
-        rms_V[n] = np.sqrt(square / span)
+        rms_V[n] = np.sqrt(square / end)
         for j in range(stretches):
-            low = begin + j * span // stretches
-            high = max(low + 1, begin + (j + 1) * span // stretches)
-            middle_A = 0.0
-            for k in range(low, high):
-                middle_A += ohmic_A[n, k]
-            middle_A = middle_A / (high - low) + _EQUAL_A
-            # of the readings with less and with more than that; a sum of zeros costs less than a branch that nobody foresees
-            residual_0 = residual_1 = slope_0 = slope_1 = ohmic_0 = ohmic_1 = 0.0
-            count_1 = 0
-            for k in range(low, high):
-                r, s, o = residual[k], slope[k], ohmic_A[n, k]
-                more = o > middle_A
-                residual_0 += 0.0 if more else r
-                residual_1 += r if more else 0.0
-                slope_0 += 0.0 if more else s
-                slope_1 += s if more else 0.0
-                ohmic_0 += 0.0 if more else o
-                ohmic_1 += o if more else 0.0
-                count_1 += 1 if more else 0
-            count_0 = high - low - count_1
-            if count_1 == 0:
-                # under a constant current there is one half only
-                residual_1, slope_1, ohmic_1, count_1 = residual_0, slope_0, ohmic_0, count_0
-            residual_V[n, j, 0], residual_V[n, j, 1] = residual_0 / count_0, residual_1 / count_1
-            slope_V_per_C[n, j, 0], slope_V_per_C[n, j, 1] = slope_0 / count_0, slope_1 / count_1
-            ohmic_means_A[n, j, 0], ohmic_means_A[n, j, 1] = ohmic_0 / count_0, ohmic_1 / count_1
+            low = j * end // stretches
+            high = max(low + 1, (j + 1) * end // stretches)
+            _mean_of_halves(residual, slope, shown[OHMIC, n], low, high, means[:, n, j])

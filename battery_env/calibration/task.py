@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 from battery_env.electrochemistry import FloatArray
 from battery_env.estimators.base import Record
 from battery_env.trajectories import IntArray
+
+if TYPE_CHECKING:
+    from battery_env.calibration.nuisance import Fitted
 
 #: Observations are clipped here; what a calibrated model shows is of order 1.
 OBSERVATION_LIMIT = 100.0
@@ -174,6 +177,14 @@ class CalibrationTask(ABC):
         :param estimates: of one parameter, one per decision, shape (K,)
         :return: one estimate
         """
+
+    def fitted(self) -> Fitted | None:
+        """
+        What the fit in the observation says (option ``nuisance``).
+
+        :return: of each cell; ``None`` if there is none
+        """
+        return None
 
     def drop_ended(self) -> None:  # noqa: B027 (a task may go on with all cells)
         """Go on without the cells whose episodes are over, if that saves time; by default they stay."""

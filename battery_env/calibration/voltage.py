@@ -16,13 +16,14 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from battery_env.arrays import IntArray
+from battery_env.arrays import FloatArray, IntArray
 from battery_env.calibration.data import LoadKind, Split, opened, standard_dataset
 from battery_env.calibration.nuisance import Fitted, NuisanceFit
-from battery_env.calibration.readings import Readings, explain
+from battery_env.calibration.readings import CURRENT, MEASURED, OHMIC, SHOWN, Readings, explain
 from battery_env.calibration.task import OBSERVATION_LIMIT, CalibrationTask, check_counts, check_not_negative, checked_action
-from battery_env.electrochemistry import CellParameters, FloatArray, check_cell
+from battery_env.electrochemistry import UNCERTAIN_CONSTANTS, CellParameters, check_cell
 from battery_env.estimators.settling import white_noise_V
+from battery_env.parameters import PARAMETER_NAMES, columns_of
 from battery_env.records import Record
 from battery_env.sensors import RandomSensorErrors
 from battery_env.trajectories import TrajectoryDataset
@@ -104,7 +105,36 @@ class VoltageTask(CalibrationTask):
             raise ValueError(f"start must be one of ('random', 'new_cell', 'true'), got {start!r}")
         if cost not in get_args(Cost):
             raise ValueError(f"cost must be one of {get_args(Cost)}, got {cost!r}")
-        data: dict[str, Any] = {"load": load, "split": split, "dt_s": dt_s, "mismatch": mismatch}
+        self._open(dataset, reading_s, cell, {"load": load, "split": split, "dt_s": dt_s, "mismatch": mismatch})
+        self.cells, self.episode_steps, self.new_readings = cells, episode_steps, new_readings
+        self.sensors = replace(SENSORS, **sensors)
+        self.process_noise_V, self.first_estimate, self.consistency = process_noise_V, start, consistency
+        self.decision_s = self.readings.interval_s * (sum(new_readings) / 2.0)
+        self._set_scales()
+        self._cost = cost
+        is_unknown = np.isnan(self.readings.q_mobile) | np.isnan(self.readings.r_o)
+        if cost == "state" and is_unknown.any():
+            raise ValueError(
+                f"cost='state' is the error of a state that only a simulation knows, and {is_unknown.sum()} of "
+                f"{len(is_unknown)} discharges are not simulated: take cost='misfit' for recorded ones"
+            )
+        self.observation_size = 6 * STRETCHES + 4 + len(self.parameters) * (2 if consistency > 0.0 else 1)
+        self._fit: NuisanceFit | None = None
+        if nuisance > 0.0:
+            fitted = (self.readings, self.parameters, ESTIMATE_RANGES, self.sensors.offset_V, nuisance)
+            self._fit = NuisanceFit(cells, *fitted)
+            self.observation_size += self._fit.observation_size
+        self._every = 0  # readings between two decisions of a whole record; 0: of an episode they are drawn
+        self._allocate()
+
+    def _open(
+        self,
+        dataset: Sequence[Record] | str | os.PathLike[str] | None,
+        reading_s: float,
+        cell: CellParameters | None,
+        chosen: Mapping[str, Any],
+    ) -> None:
+        """Read the discharges that are given, or else those that are chosen."""
         dataset = opened(dataset)
         if cell is not None:
             self._check_reach(check_cell(cell))
@@ -112,57 +142,41 @@ class VoltageTask(CalibrationTask):
             cell = dataset.cell
         cell = check_cell(cell)
         if dataset is None:
-            dataset = standard_dataset(self.parameters, **data, cell=cell)
+            dataset = standard_dataset(self.parameters, **chosen, cell=cell)
         else:
-            self._refuse_beside_a_dataset(**data)
+            self._refuse_beside_a_dataset(**chosen)
+        self.dataset = dataset
         if isinstance(dataset, TrajectoryDataset):
-            readings = _readings_of_a_dataset(dataset, reading_s, cell)
+            self.readings = _readings_of_a_dataset(dataset, reading_s, cell)
         else:
-            readings = Readings.of(dataset, reading_s, cell=cell)
-        parameters = self.parameters
-        self.cells, self.dataset, self.readings = cells, dataset, readings
-        self.episode_steps, self.new_readings = episode_steps, new_readings
-        self.sensors = replace(SENSORS, **sensors)
-        self.process_noise_V, self.first_estimate, self.consistency = process_noise_V, start, consistency
-        self.decision_s = readings.interval_s * (sum(new_readings) / 2.0)
-        self._previous = len(parameters) if consistency > 0.0 else 0
-        self.observation_size = 6 * STRETCHES + 4 + len(parameters) + self._previous
-        self._columns = [("q_mobile", "r_o").index(name) for name in parameters]
-        self._low, self._high = np.array([ESTIMATE_RANGES[name] for name in parameters]).T
-        self._width = self._high - self._low
-        self._step = np.array([LARGEST_STEPS[name] for name in parameters])
+            self.readings = Readings.of(dataset, reading_s, cell=cell)
 
+    def _set_scales(self) -> None:
+        """What actions and first estimates are made of."""
+        cell, readings = self.readings.cell, self.readings
+        self._columns = columns_of(self.parameters)
+        self._low, self._high = np.array([ESTIMATE_RANGES[name] for name in self.parameters]).T
+        self._step = np.array([LARGEST_STEPS[name] for name in self.parameters])
         self._new: FloatArray = np.array([cell.q_mobile, cell.r_o])
         self._new[self._columns] = np.clip(self._new[self._columns], self._low, self._high)
         # the true parameters of the discharges, or the new cell's where they are not known
         true = np.column_stack([readings.q_mobile, readings.r_o])
-        is_unknown = np.isnan(true)
-        self._known = np.where(is_unknown, self._new, true)
-        if cost == "state" and is_unknown.any():
-            unknown = int(is_unknown.any(axis=1).sum())
-            raise ValueError(
-                f"cost='state' is the error of a state that only a simulation knows, and {unknown} of {len(true)} "
-                "discharges are not simulated: take cost='misfit' for recorded ones"
-            )
-        self._cost = cost
-        longest = int(readings.count.max())
-        self._all: IntArray = np.arange(cells)
-        self._first: IntArray = np.zeros(cells, dtype=np.int64)
+        self._known = np.where(np.isnan(true), self._new, true)
+
+    def _allocate(self) -> None:
+        """Make room for the state of all cells."""
+        cells, longest = self.cells, int(self.readings.count.max())
         self.discharge: IntArray = np.zeros(cells, dtype=np.int64)
         self.count: IntArray = np.ones(cells, dtype=np.int64)
         self._arrivals: IntArray = np.zeros((cells, self.episode_steps), dtype=np.int64)
         self._step_of_episode: IntArray = np.zeros(cells, dtype=np.int64)
         self._last_step: IntArray = np.zeros(cells, dtype=np.int64)  # of the discharge
-        self._every = 0  # readings between two decisions of a whole record; 0: of an episode they are drawn
         self._estimate = np.tile(self._new, (cells, 1))
-        self._action = np.zeros((cells, len(parameters)))
-        self._voltage_V, self._current_A, self._moved_C, self._ohmic_A = np.zeros((4, cells, longest))
-        self._residual_V, self._slope_V_per_C, self._ohmic_means_A = np.zeros((3, cells, STRETCHES, 2))
+        self._action = np.zeros((cells, len(self.parameters)))
+        self._shown = np.zeros((SHOWN, cells, longest))
+        # of the residual, V, of dV/dq_mobile, V/C, and of the ohmic drop per ohm, A
+        self._means = np.zeros((3, cells, STRETCHES, 2))
         self._rms_V, self._last_V, self._offset_V, self._misfit_V = np.zeros((4, cells))
-        self._fit: NuisanceFit | None = None
-        if nuisance > 0.0:
-            self._fit = NuisanceFit(cells, readings, parameters, ESTIMATE_RANGES, self.sensors.offset_V, nuisance)
-            self.observation_size += self._fit.observation_size
 
     def _check_reach(self, cell: CellParameters) -> None:
         for name in self.parameters:
@@ -190,13 +204,10 @@ class VoltageTask(CalibrationTask):
         options: Mapping[str, Any] | None = None,
     ) -> None:
         """
-        Begin new episodes, each at a random reading of a random discharge.
+        Begin new episodes, each at a random reading of a random discharge; as of the base class.
 
-        :param rows: which cells of the batch, shape (m,)
-        :param generators: one source of randomness for each of them
         :param options: ``discharge`` (its number), ``reading`` (how many readings there are at first), ``q_mobile_hat`` and
             ``r_o_hat`` (the first estimate)
-        :raises ValueError: for an option that is unknown or out of range
         """
         chosen = dict(options or {})
         discharge = chosen.pop("discharge", None)
@@ -223,7 +234,7 @@ class VoltageTask(CalibrationTask):
             self._arrivals[row] = generator.integers(fewest, most + 1, size=self.episode_steps)
             estimate = self._first_estimate(n, generator)
             for name, value in first.items():
-                estimate[("q_mobile", "r_o").index(name)] = value
+                estimate[PARAMETER_NAMES.index(name)] = value
             self._step_of_episode[row] = 0
             self._place(row, n, count, estimate)
             self._measure(row, n, generator)
@@ -249,8 +260,6 @@ class VoltageTask(CalibrationTask):
 
         :param records: discharges from full charge, simulated or recorded
         :param every: readings between two decisions, and before the first one
-        :param options: of the task, but for those of its data
-        :return: the task, at its first observations
         """
         discharges = cls.discharges_of_an_episode(options)
         task = cls(len(records) // discharges, **{"start": "new_cell", **options, "dataset": records, "cost": "misfit"})
@@ -263,22 +272,11 @@ class VoltageTask(CalibrationTask):
 
     @classmethod
     def discharges_of_an_episode(cls, options: Mapping[str, Any]) -> int:
-        """
-        How many discharges an episode goes through.
-
-        :param options: of the task
-        :return: their number
-        """
+        """How many discharges an episode goes through."""
         return 1
 
     def steps_between(self, decision_s: float) -> int:
-        """
-        How many readings arrive between two decisions on a whole record.
-
-        :param decision_s: time between them, s
-        :return: the readings
-        :raises ValueError: if the time is no multiple of that between two readings
-        """
+        """How many readings arrive between two decisions; only whole numbers of them."""
         interval_s = self.readings.interval_s
         every = round(decision_s / interval_s)
         if every < 1 or abs(every * interval_s - decision_s) > 1e-9 * interval_s:
@@ -288,11 +286,7 @@ class VoltageTask(CalibrationTask):
         return every
 
     def seen(self) -> tuple[IntArray, FloatArray]:
-        """
-        Which readings the next decision knows.
-
-        :return: each cell's discharge, and the time of its last reading, s, shape (cells,)
-        """
+        """Which readings the next decision knows."""
         readings = self.readings
         return self.discharge.copy(), readings.start_s[self.discharge] + self.count * readings.interval_s
 
@@ -302,38 +296,25 @@ class VoltageTask(CalibrationTask):
         return self._estimate.copy()
 
     def fitted(self) -> Fitted | None:
-        """
-        What the fit in the observation says (option ``nuisance``).
-
-        :return: of each cell; ``None`` if there is none
-        """
+        """What the fit in the observation says (option ``nuisance``)."""
         if self._fit is None:
             return None
         # without the ohmic drops, which jump where the load is switched
-        at_rest_V = self._voltage_V + self._estimate[:, 1:] * self._ohmic_A
+        at_rest_V = self._shown[MEASURED] + self._estimate[:, 1:] * self._shown[OHMIC]
         parts = zip(at_rest_V, self.count, strict=True)
         white_V = [white_noise_V(each[:end], order=2) if end > 2 else np.inf for each, end in parts]
         return self._fit.found(self._estimate, self.count.copy(), np.array(white_V))
 
     @staticmethod
     def conclude(estimates: FloatArray) -> float:
-        """
-        What is left of the estimates over a record: the last one, which explains all readings.
-
-        :param estimates: of one parameter, shape (K,)
-        :return: one estimate
-        """
+        """The last estimate, which explains all readings."""
         return float(estimates[-1])
 
     def _place(self, row: int, discharge: int, count: int, estimate: FloatArray) -> None:
         """Put one cell at one point of one discharge, measured without error."""
-        data = self.readings
-        part, length = data.part(discharge), data.count[discharge]
+        length = self.readings.count[discharge]
         self.discharge[row], self.count[row] = discharge, count
-        self._voltage_V[row, :length] = data.voltage_V[part]
-        self._current_A[row, :length] = data.current_A[part]
-        self._moved_C[row, :length] = data.moved_C[part]
-        self._ohmic_A[row, :length] = data.ohmic_A[part]
+        self._shown[:, row, :length] = self.readings.shown(discharge)
         self._estimate[row] = estimate
         if self._fit is not None:
             self._fit.logarithms[row] = 0.0
@@ -347,7 +328,7 @@ class VoltageTask(CalibrationTask):
     def _first_estimate(self, discharge: int, generator: np.random.Generator | None) -> FloatArray:
         estimate = self._known[discharge].copy()
         if self.first_estimate == "random" and generator is not None:
-            estimate[self._columns] = self._low + self._width * generator.random(len(self._width))
+            estimate[self._columns] = self._low + (self._high - self._low) * generator.random(len(self._low))
         elif self.first_estimate != "true":
             estimate[self._columns] = self._new[self._columns]
         return estimate
@@ -355,7 +336,7 @@ class VoltageTask(CalibrationTask):
     def _measure(self, row: int, discharge: int, generator: np.random.Generator) -> None:
         """The noise of the cell, and the errors of the sensors, over one discharge."""
         length = int(self.readings.count[discharge])
-        voltage_V = self._voltage_V[row, :length]
+        voltage_V = self._shown[MEASURED, row, :length]
         if self.process_noise_V > 0.0:
             voltage_V += self.readings.process_noise_V(self.process_noise_V, generator.standard_normal((3, length)))
         noise_V = self.sensors.draw_noise_V(generator)
@@ -364,75 +345,69 @@ class VoltageTask(CalibrationTask):
         read_V = errors.read_voltage_V(voltage_V, noise)
         if errors.change_the_current:
             measured = self.readings.remeasured(discharge, errors.gain(voltage_V, read_V), errors.current_offset_A)
-            for array, values in zip((self._current_A, self._moved_C, self._ohmic_A), measured, strict=True):
-                array[row, :length] = values
+            self._shown[CURRENT:, row, :length] = measured
         voltage_V[:] = read_V
 
     def _explain(self, rows: NDArray[np.intp] | None = None) -> None:
         """Compare some cells with their readings, all by default."""
-        cell = self.readings.cell
-        explain(
-            self._all if rows is None else np.asarray(rows, dtype=np.int64),
-            self.count,
-            self._first,
-            np.ascontiguousarray(self._estimate[:, 0]),
-            np.ascontiguousarray(self._estimate[:, 1]),
-            self._voltage_V,
-            self._current_A,
-            self._moved_C,
-            self._ohmic_A,
-            cell.Tb0,
-            1.0 - float(self.readings.decay(cell.tsn)),
-            1.0 - float(self.readings.decay(cell.tsp)),
-            *cell.packed,
-            self._residual_V,
-            self._slope_V_per_C,
-            self._ohmic_means_A,
-            self._rms_V,
-            self._last_V,
-        )
+        of_cells = np.arange(self.cells) if rows is None else np.asarray(rows, dtype=np.int64)
+        read = (of_cells, self.count, self._estimate, self._shown)
+        explain(*read, self.readings.model, self._means, self._rms_V, self._last_V)
         if self._fit is not None:
-            chosen = self._all if rows is None else np.asarray(rows, dtype=np.int64)
-            measured = (self._voltage_V, self._current_A, self._moved_C, self._ohmic_A)
-            self._fit.step(chosen, self.count, self._first, self._estimate, measured)
-        self._offset_V = np.clip(self._residual_V.mean(axis=(1, 2)), -self.sensors.offset_V, self.sensors.offset_V)
-        self._misfit_V = np.sqrt(np.mean((self._residual_V - self._offset_V[:, None, None]) ** 2, axis=(1, 2)))
+            self._fit.step(*read)
+        residual_V = self._means[0]
+        self._offset_V = np.clip(residual_V.mean(axis=(1, 2)), -self.sensors.offset_V, self.sensors.offset_V)
+        self._misfit_V = np.sqrt(np.mean((residual_V - self._offset_V[:, None, None]) ** 2, axis=(1, 2)))
+
+    def restore(self, estimate: FloatArray, action: FloatArray, logarithms: FloatArray) -> None:
+        """
+        Let all cells stand where a policy left off.
+
+        :param estimate: (q_mobile, r_o), C and ohm, shape (2,) or (cells, 2)
+        :param action: the last one, shape (len(parameters),) or (cells, len(parameters))
+        :param logarithms: as of :attr:`logarithms`
+        """
+        self._estimate[:], self._action[:] = estimate, action
+        if self._fit is not None:
+            self._fit.logarithms[:] = logarithms
+        self._explain()
+
+    @property
+    def logarithms(self) -> FloatArray:
+        """
+        The logarithms of the factors by which the fit in the observation multiplies ``UNCERTAIN_CONSTANTS``, 0 without one,
+        shape (cells, 4); a new array each time.
+        """
+        return np.zeros((self.cells, len(UNCERTAIN_CONSTANTS))) if self._fit is None else self._fit.logarithms.copy()
 
     def observation(self) -> NDArray[np.float32]:
         """
         Residuals over the misfit, sensitivities and ohmic drops per ohm over the data so far; how large misfit, noise and
         offset are; how long the discharge has lasted; and the estimate.
-
-        :return: shape (cells, observation_size)
         """
         clipped = np.clip(np.concatenate(self._parts(), axis=1), -OBSERVATION_LIMIT, OBSERVATION_LIMIT)
         return clipped.astype(np.float32)
 
     def _parts(self) -> list[FloatArray]:
-        unexplained_V = self._residual_V - self._offset_V[:, None, None]
+        residual_V, slope_V_per_C, ohmic_A = self._means
+        unexplained_V = residual_V - self._offset_V[:, None, None]
         return [
             (unexplained_V / (self._misfit_V + _MISFIT_FLOOR_V)[:, None, None]).reshape(self.cells, -1),
-            np.arcsinh(self._slope_V_per_C / _SLOPE_SCALE_V_PER_C).reshape(self.cells, -1),
-            (self._ohmic_means_A / _CURRENT_SCALE_A).reshape(self.cells, -1),
+            np.arcsinh(slope_V_per_C / _SLOPE_SCALE_V_PER_C).reshape(self.cells, -1),
+            (ohmic_A / _CURRENT_SCALE_A).reshape(self.cells, -1),
             np.log((np.stack([self._misfit_V, self._rms_V], axis=1) + 0.1 * _MISFIT_FLOOR_V) / _MISFIT_SCALE_V),
-            np.arcsinh(self._residual_V.mean(axis=(1, 2)) / _MISFIT_SCALE_V)[:, None],
+            np.arcsinh(residual_V.mean(axis=(1, 2)) / _MISFIT_SCALE_V)[:, None],
             (self.count * (self.readings.interval_s / _TIME_SCALE_S))[:, None],
             self._scaled(self._estimate),
-            self._action[:, : self._previous],
-            *([] if self._fit is None else self._fit.parts(self._step, self._width)),
+            *([self._action] if self.consistency > 0.0 else []),
+            *([] if self._fit is None else self._fit.parts(self._step, self._high - self._low)),
         ]
 
     def _scaled(self, estimate: FloatArray) -> FloatArray:
         return np.asarray((2.0 * estimate[:, self._columns] - self._low - self._high) / (self._high - self._low))
 
     def advance(self, action: NDArray[np.floating]) -> FloatArray:
-        """
-        Move the estimates, let new readings arrive, and compare all data so far with the model.
-
-        :param action: in [-1, 1], beyond it is clipped, shape (cells, len(parameters))
-        :return: cost, shape (cells,)
-        :raises ValueError: for another shape, NaN, or what is no number
-        """
+        """Move the estimates, let new readings arrive, and compare all data so far with the model."""
         chosen = checked_action(action, self._action.shape)
         step = np.clip(chosen, -1.0, 1.0)
         moved = self._estimate[:, self._columns] + np.sign(step) * step**2 * self._step
@@ -455,19 +430,11 @@ class VoltageTask(CalibrationTask):
         self._step_of_episode += 1
 
     def truncated(self) -> NDArray[np.bool_]:
-        """
-        Whose episode is over. An episode goes on after the last reading: the estimate may still be moved.
-
-        :return: shape (cells,)
-        """
+        """Whose episode is over. An episode goes on after the last reading: the estimate may still be moved."""
         return np.asarray(self._step_of_episode >= self._last_step)
 
     def report(self) -> dict[str, FloatArray]:
-        """
-        Where each cell stands; true parameters are NaN for recorded discharges.
-
-        :return: by name of ``REPORTED``, arrays of shape (cells,); ``voltage`` is the measured one
-        """
+        """Where each cell stands; true parameters are NaN for recorded discharges, ``voltage`` is the measured one."""
         data, last = self.readings, self.count - 1
         true_q_C = data.q_mobile[self.discharge]
         return {
@@ -475,7 +442,7 @@ class VoltageTask(CalibrationTask):
             "r_o": data.r_o[self.discharge],
             "q_mobile_hat": self._estimate[:, 0].copy(),
             "r_o_hat": self._estimate[:, 1].copy(),
-            "voltage": self._voltage_V[np.arange(self.cells), last],
+            "voltage": self._shown[MEASURED, np.arange(self.cells), last],
             "voltage_hat": self._last_V.copy(),
             # a full cell holds q_mobile in its negative electrode
             "soc": 1.0 - data.drawn_C[data.start[self.discharge] + last] / true_q_C,

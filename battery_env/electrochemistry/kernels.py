@@ -7,7 +7,7 @@ computed in blocks of cells, state by state instead of cell by cell, and in loop
 vector instructions. Both call the same arithmetic, whose every operation is exact to the bit by IEEE 754, so that a cell comes
 out the same alone, in a batch of any size, and on any machine.
 
-``constants`` has one row that all cells share, or one row a cell.
+``constants`` has one row that all cells share, or in a batch one row a cell.
 """
 
 from __future__ import annotations
@@ -190,34 +190,34 @@ def _euler(
 
 
 @_inlined
-def mole_fraction(surface_charge: float, q: float, extended: bool, constants: FloatArray, c: int) -> float:
-    return _fraction(constants[c, FRACTION_PER_SHARE] / q, surface_charge, extended)
+def mole_fraction(surface_charge: float, q: float, extended: bool, constants: FloatArray) -> float:
+    return _fraction(constants[0, FRACTION_PER_SHARE] / q, surface_charge, extended)
 
 
 @_inlined
 def equilibrium_voltage(
-    xn: float, xp: float, tb: float, constants: FloatArray, c: int, poly_n: FloatArray, poly_p: FloatArray
+    xn: float, xp: float, tb: float, constants: FloatArray, poly_n: FloatArray, poly_p: FloatArray
 ) -> float:
     # for mole fractions inside 0 .. 1
-    return _equilibrium(xn, xp, tb, constants[c, R_OVER_F], constants[c, U0], poly_n, poly_p)
+    return _equilibrium(xn, xp, tb, constants[0, R_OVER_F], constants[0, U0], poly_n, poly_p)
 
 
 @_inlined
-def nominal_overpotentials(i: float, xn: float, xp: float, tb: float, constants: FloatArray, c: int) -> tuple[float, float]:
+def nominal_overpotentials(i: float, xn: float, xp: float, tb: float, constants: FloatArray) -> tuple[float, float]:
     # for mole fractions inside 0 .. 1
-    scale = 2.0 * constants[c, R_OVER_F] * tb
-    return _overpotential(i, xn, scale, constants[c, PER_CURRENT_N]), _overpotential(i, xp, scale, constants[c, PER_CURRENT_P])
+    scale = 2.0 * constants[0, R_OVER_F] * tb
+    return _overpotential(i, xn, scale, constants[0, PER_CURRENT_N]), _overpotential(i, xp, scale, constants[0, PER_CURRENT_P])
 
 
 @_inlined
-def cell_voltage(x: FloatArray, n: int, q: float, extended: bool, packed: PackedConstants, c: int) -> float:
+def cell_voltage(x: FloatArray, n: int, q: float, extended: bool, packed: PackedConstants) -> float:
     # V = Vep(xp) - Ven(xn) - Vo - Vsn - Vsp
     constants, poly_n, poly_p = packed
-    share = constants[c, FRACTION_PER_SHARE] / q
+    share = constants[0, FRACTION_PER_SHARE] / q
     xn, xp = _fraction(share, x[n, QNS], extended), _fraction(share, x[n, QPS], extended)
     if not _has_voltage(xn, xp):
         return np.nan
-    equilibrium = _equilibrium(xn, xp, x[n, TB], constants[c, R_OVER_F], constants[c, U0], poly_n, poly_p)
+    equilibrium = _equilibrium(xn, xp, x[n, TB], constants[0, R_OVER_F], constants[0, U0], poly_n, poly_p)
     return equilibrium - x[n, VO] - x[n, VSN] - x[n, VSP]
 
 
@@ -234,7 +234,7 @@ def cell_step(
     extended: bool,
     constants: FloatArray,
 ) -> None:
-    # One step of row n of x, into its row m, which may be the same; all rows share the first row of constants
+    # One step of row n of x, into its row m, which may be the same
     share = constants[0, FRACTION_PER_SHARE] / q
     xn, xp = _fraction(share, x[n, QNS], extended), _fraction(share, x[n, QPS], extended)
     state = (x[n, TB], x[n, VO], x[n, VSN], x[n, VSP], x[n, QNB], x[n, QNS], x[n, QPB], x[n, QPS])
@@ -450,7 +450,7 @@ def roll_out(
     # condition is written so that NaN ends the discharge too: near its end V can fall from 3.3 V to NaN in one step.
     voltage, current = columns[0], columns[1]
     for k in range(load.shape[0]):
-        voltage[k] = cell_voltage(state, k, q, False, packed, 0)
+        voltage[k] = cell_voltage(state, k, q, False, packed)
         if not voltage[k] >= cut_off:
             return k
         current[k] = cell_current(load[k], power, voltage[k], False)

@@ -87,10 +87,10 @@ def _differentiated(coefficients: FloatArray) -> FloatArray:
 
 @_inlined
 def equilibrium_slopes(
-    xn: float, xp: float, tb: float, constants: FloatArray, c: int, derivatives: PolynomialDerivatives
+    xn: float, xp: float, tb: float, constants: FloatArray, derivatives: PolynomialDerivatives
 ) -> tuple[float, float]:
     # of kernels.equilibrium_voltage with respect to xn and xp
-    nernst = constants[c, R_OVER_F] * tb
+    nernst = constants[0, R_OVER_F] * tb
     by_xn = nernst / (xn * (1.0 - xn)) - 2.0 * polynomial(derivatives.slope_n, 2.0 * xn - 1.0)
     by_xp = 2.0 * polynomial(derivatives.slope_p, 2.0 * xp - 1.0) - nernst / (xp * (1.0 - xp))
     return by_xn, by_xp
@@ -98,24 +98,30 @@ def equilibrium_slopes(
 
 @_inlined
 def equilibrium_curvatures(
-    xn: float, xp: float, tb: float, constants: FloatArray, c: int, derivatives: PolynomialDerivatives
+    xn: float, xp: float, tb: float, constants: FloatArray, derivatives: PolynomialDerivatives
 ) -> tuple[float, float]:
     # second derivatives of kernels.equilibrium_voltage with respect to xn and xp; the mixed one is zero
-    nernst = constants[c, R_OVER_F] * tb
+    nernst = constants[0, R_OVER_F] * tb
     by_xn = nernst * (2.0 * xn - 1.0) / (xn * (1.0 - xn)) ** 2 - 4.0 * polynomial(derivatives.curvature_n, 2.0 * xn - 1.0)
     by_xp = 4.0 * polynomial(derivatives.curvature_p, 2.0 * xp - 1.0) - nernst * (2.0 * xp - 1.0) / (xp * (1.0 - xp)) ** 2
     return by_xn, by_xp
 
 
 @_inlined
-def overpotential_slopes(i: float, xn: float, xp: float, tb: float, constants: FloatArray, c: int) -> tuple[float, float]:
+def overpotential_slopes(i: float, xn: float, xp: float, tb: float, constants: FloatArray) -> tuple[float, float]:
     # of kernels.nominal_overpotentials, each with respect to the mole fraction of its own electrode
-    scale = 2.0 * constants[c, R_OVER_F] * tb
-    an, wn = i * constants[c, PER_CURRENT_N], (1.0 - xn) * xn
-    ap, wp = i * constants[c, PER_CURRENT_P], (1.0 - xp) * xp
+    scale = 2.0 * constants[0, R_OVER_F] * tb
+    an, wn = i * constants[0, PER_CURRENT_N], (1.0 - xn) * xn
+    ap, wp = i * constants[0, PER_CURRENT_P], (1.0 - xp) * xp
     by_xn = scale * an * (xn - 0.5) / (wn * sqrt(wn + an * an))
     by_xp = scale * ap * (xp - 0.5) / (wp * sqrt(wp + ap * ap))
     return by_xn, by_xp
+
+
+@_inlined
+def _fractions(x: FloatArray, n: int, q: float, extended: bool, constants: FloatArray) -> tuple[float, float]:
+    # at both surfaces of row n of x
+    return mole_fraction(x[n, QNS], q, extended, constants), mole_fraction(x[n, QPS], q, extended, constants)
 
 
 @_inlined
@@ -128,8 +134,8 @@ def _fraction_tangents(dx: FloatArray, n: int, xn: float, xp: float, q: float, c
 @_inlined
 def _rate_fraction_tangents(dx: FloatArray, n: int, row: int, q: float, constants: FloatArray) -> tuple[float, float]:
     # of xn and xp with respect to the logarithm of a rate constant; only tDiffusion moves them
-    dxn = mole_fraction(dx[n, row, QNS], q, False, constants, 0)
-    return dxn, mole_fraction(dx[n, row, QPS], q, False, constants, 0)
+    dxn = mole_fraction(dx[n, row, QNS], q, False, constants)
+    return dxn, mole_fraction(dx[n, row, QPS], q, False, constants)
 
 
 @_inlined
@@ -138,8 +144,8 @@ def _voltage_slopes(
 ) -> tuple[float, float, float, float, float]:
     # The mole fractions at the surfaces of row n of x, and the slopes of its voltage by them and by the temperature
     constants, tb = packed.constants, x[n, TB]
-    xn, xp = mole_fraction(x[n, QNS], q, False, constants, 0), mole_fraction(x[n, QPS], q, False, constants, 0)
-    v_xn, v_xp = equilibrium_slopes(xn, xp, tb, constants, 0, derivatives)
+    xn, xp = _fractions(x, n, q, False, constants)
+    v_xn, v_xp = equilibrium_slopes(xn, xp, tb, constants, derivatives)
     return xn, xp, v_xn, v_xp, constants[0, R_OVER_F] * nernst_logarithm(xn, xp) if thermal else 0.0
 
 
@@ -190,10 +196,10 @@ def voltage_curvature(
 ) -> float:
     # The second derivative of the voltage of row n of x with respect to q along the tangent of its state
     constants, tb = packed.constants, x[n, TB]
-    xn, xp = mole_fraction(x[n, QNS], q, False, constants, 0), mole_fraction(x[n, QPS], q, False, constants, 0)
+    xn, xp = _fractions(x, n, q, False, constants)
     dxn, dxp = _fraction_tangents(dx, n, xn, xp, q, constants)
-    v_xn, v_xp = equilibrium_slopes(xn, xp, tb, constants, 0, derivatives)
-    v_xn_xn, v_xp_xp = equilibrium_curvatures(xn, xp, tb, constants, 0, derivatives)
+    v_xn, v_xp = equilibrium_slopes(xn, xp, tb, constants, derivatives)
+    v_xn_xn, v_xp_xp = equilibrium_curvatures(xn, xp, tb, constants, derivatives)
     # of a charge that is linear in q, over q
     of_fractions = v_xn_xn * dxn * dxn + v_xp_xp * dxp * dxp - 2.0 * (v_xn * dxn + v_xp * dxp) / q
     nernst = constants[0, R_OVER_F] * dx[n, BY_Q, TB]
@@ -253,11 +259,11 @@ def step_with_tangents(
 ) -> None:
     # One step of row n of x and of its tangents with respect to q and r_o, in place
     tb = x[n, TB]
-    xn, xp = mole_fraction(x[n, QNS], q, extended, constants, 0), mole_fraction(x[n, QPS], q, extended, constants, 0)
-    vsn_xn, vsp_xp = overpotential_slopes(i, xn, xp, tb, constants, 0)
+    xn, xp = _fractions(x, n, q, extended, constants)
+    vsn_xn, vsp_xp = overpotential_slopes(i, xn, xp, tb, constants)
     vsn_tb, vsp_tb = 0.0, 0.0
     if thermal:
-        vsn, vsp = nominal_overpotentials(i, xn, xp, tb, constants, 0)
+        vsn, vsp = nominal_overpotentials(i, xn, xp, tb, constants)
         vsn_tb, vsp_tb = vsn / tb, vsp / tb
     dxn, dxp = _fraction_tangents(dx, n, xn, xp, q, constants)
     # what a parameter does at a given state: to the mole fractions, and to the ohmic drop
@@ -274,9 +280,9 @@ def _step_rate_tangents(
 ) -> None:
     # One step of the tangents with respect to the logarithms of RATE_CONSTANTS, in place; row n of x stays as it is
     tb = x[n, TB]
-    xn, xp = mole_fraction(x[n, QNS], q, False, constants, 0), mole_fraction(x[n, QPS], q, False, constants, 0)
-    vsn_xn, vsp_xp = overpotential_slopes(i, xn, xp, tb, constants, 0)
-    vsn, vsp = nominal_overpotentials(i, xn, xp, tb, constants, 0)
+    xn, xp = _fractions(x, n, q, False, constants)
+    vsn_xn, vsp_xp = overpotential_slopes(i, xn, xp, tb, constants)
+    vsn, vsp = nominal_overpotentials(i, xn, xp, tb, constants)
     vsn_tb, vsp_tb = (vsn / tb, vsp / tb) if thermal else (0.0, 0.0)
     for row in range(BY_KN, dx.shape[1]):
         dxn, dxp = _rate_fraction_tangents(dx, n, row, q, constants)
@@ -326,13 +332,13 @@ def roll_out_with_tangents(
     x[0] = start
     dx[0, BY_Q, QNB:] = shares
     for k in range(current.shape[0]):
-        voltage_k = cell_voltage(x, 0, q, False, packed, 0)
+        voltage_k = cell_voltage(x, 0, q, False, packed)
         if np.isnan(voltage_k):
             return
         voltage[k] = voltage_k
         by_parameter[BY_Q, k], by_parameter[BY_R, k] = voltage_tangents(x, dx, 0, q, thermal, packed, derivatives)
         if with_rates:
-            columns[1 + rows, k] = mole_fraction(x[0, QPS], q, False, constants, 0)
+            columns[1 + rows, k] = mole_fraction(x[0, QPS], q, False, constants)
             _voltage_rate_tangents(x, dx, 0, q, thermal, packed, derivatives, by_parameter, k)
             _step_rate_tangents(x, dx, 0, current[k], q, r_o, dt, thermal, constants)
         step_with_tangents(x, dx, 0, current[k], q, r_o, dt, thermal, False, constants)

@@ -50,7 +50,7 @@ def _cost(value: float, k: int, search: _Search) -> float:
     # distance of the end of step k to the measured state; negative if its vo is too low
     model, measured, packed = search.model, search.measured, search.packed
     q, r_o = (value, search.r_o) if search.search_q else (search.q, value)
-    volts = cell_voltage(model, 0, q, True, packed, 0) if search.power else 0.0
+    volts = cell_voltage(model, 0, q, True, packed) if search.power else 0.0
     i = cell_current(search.load[k], search.power, volts, True)
     cell_step(model, 0, 1, i, q, r_o, search.dt, search.thermal, True, packed.constants)
     square = 0.0

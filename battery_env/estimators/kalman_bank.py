@@ -153,7 +153,7 @@ def _correct(
         p[2, 0] * h[0] + p[2, 1] * h[1] + p[2, 2] * h[2],
     )
     explained = h[0] * ph[0] + h[1] * ph[1] + h[2] * ph[2] + 2.0 * bend * bend
-    innovation = voltage - cell_voltage(state, 0, q, True, packed, 0) - bend - mean[OFFSET]
+    innovation = voltage - cell_voltage(state, 0, q, True, packed) - bend - mean[OFFSET]
     one.expected_V = voltage - innovation
     variance = explained + noise
     sd = sqrt(variance)

@@ -259,6 +259,7 @@ def test_a_share_of_the_episodes_starts_where_the_whole_discharge_does():
         ("charge_weight", -0.1, "charge_weight must be finite and at least 0, got -0.1"),
         ("cost_limit", 0.0, "cost_limit must be finite and greater than 0, got 0.0"),
         ("load", "sine", "load must be one of"),
+        ("split", "validation", "split must be"),
         ("mismatch", -0.1, "mismatch"),
         ("dt_s", 20.0, "dt must be"),
     ],
@@ -266,13 +267,6 @@ def test_a_share_of_the_episodes_starts_where_the_whole_discharge_does():
 def test_options_out_of_range_are_refused(option, value, message):
     with pytest.raises(ValueError, match=message):
         BatteryQmax(1, **{option: value})
-
-
-@pytest.mark.parametrize("shape", [(2,), (2, 2), (1, 1), (3, 1)])
-def test_actions_of_another_shape_are_refused(discharges, shape):
-    task = started(make(discharges, cells=2))
-    with pytest.raises(ValueError, match=r"action must hold numbers, shape \(2, 1\), got float64 values of shape \(\d"):
-        task.advance(np.zeros(shape))
 
 
 def test_a_data_set_stands_in_place_of_what_would_choose_one(discharges):

@@ -5,7 +5,7 @@ import pytest
 
 from battery_env import PolicyEstimator, evaluate
 from battery_env.calibration.data import standard_dataset
-from battery_env.calibration.nuisance import FOUND_SIZE, nuisance_step, rates_of
+from battery_env.calibration.nuisance import FOUND_SIZE, nuisance_step
 from battery_env.calibration.readings import Readings
 from battery_env.calibration.vector_env import CalibrationVectorEnv
 from battery_env.calibration.voltage_tasks import BatteryVoltageJoint, BatteryVoltageRo
@@ -26,20 +26,14 @@ def data():
 
 def step(record, q_mobile, r_o, logarithms=(0.0, 0.0, 0.0, 0.0), prior_sd=KNOWS_NOTHING, count=None):
     """One step for one record, read every two seconds."""
-    readings = Readings.of([record], 2.0)
-    found, cell = np.full((1, FOUND_SIZE), np.nan), NEW_CELL
+    readings, found = Readings.of([record], 2.0), np.full((1, FOUND_SIZE), np.nan)
     nuisance_step(
         np.arange(1),
         readings.count if count is None else np.array([count]),
-        np.zeros(1, dtype=np.int64),
-        np.array([q_mobile]),
-        np.array([r_o]),
-        *(values[None] for values in (readings.voltage_V, readings.current_A, readings.moved_C, readings.ohmic_A)),
-        cell.Tb0,
-        1.0 - float(readings.decay(cell.tsp)),
-        rates_of(readings),
+        np.array([[q_mobile, r_o]]),
+        np.ascontiguousarray(readings.shown(0)[:, None]),
+        readings.model,
         np.array([logarithms]),
-        *cell.packed,
         np.array([q_mobile, r_o, 0.0, 0.0, 0.0, 0.0, 0.0]),
         np.array(prior_sd, dtype=np.float64),
         found,

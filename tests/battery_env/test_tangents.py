@@ -57,5 +57,5 @@ def test_at_the_least_q_the_mole_fraction_is_at_the_margin():
     states, tangents = after(2500, 6000.0, 0.15, False)
     charge, slope = states[1, QNS], tangents[1, BY_Q, QNS]
     least = least_q(charge, slope, 6000.0, MOLE_FRACTION_MARGIN, PACKED.constants)
-    fraction = mole_fraction(charge + slope * (least - 6000.0), least, False, PACKED.constants, 0)
+    fraction = mole_fraction(charge + slope * (least - 6000.0), least, False, PACKED.constants)
     assert fraction == pytest.approx(MOLE_FRACTION_MARGIN, rel=1e-9) and 5000.0 < least < 6000.0
