@@ -11,7 +11,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from battery_env.arrays import FloatArray
 from battery_env.checks import check_gain_sd, check_numbers
 from battery_env.electrochemistry import STATE_SIZE, CellParameters, PackedConstants, check_cell, check_dt
 from battery_env.electrochemistry.tangents import PolynomialDerivatives
@@ -21,7 +20,7 @@ from battery_env.estimators.kalman_bank import filters_of_prior, take
 from battery_env.estimators.kalman_state import CELL, ESTIMATE, FILTER, SAMPLE, Settings
 from battery_env.estimators.monitor import Verdict, reason, watch
 from battery_env.estimators.rest import check_initial_soc
-from battery_env.estimators.settling import MISMATCH_MARGIN, PLAUSIBLE_Q_SHARES, rest_voltage_V
+from battery_env.estimators.settling import rest_voltage_V
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, check_parameters
 from battery_env.records import Record, Stream, are_plausible, check_drawn_charge, check_sample, starts_at_rest
 
@@ -145,7 +144,6 @@ class ExtendedKalmanFilter(OnlineEstimator):
             dt_s=self.dt_s,
             thermal=thermal,
             noise_V2=float(voltage_noise_V) ** 2,
-            spare_V2=(MISMATCH_MARGIN**2 - 1.0) * float(mismatch_V) ** 2,
             mismatch_V2=float(mismatch_V) ** 2,
             searched=("q_mobile" in self.parameters, "r_o" in self.parameters),
             variance=(q_sd**2, r_o_sd**2),
@@ -157,7 +155,6 @@ class ExtendedKalmanFilter(OnlineEstimator):
             bounds=(_pair(q_mobile_bounds_C), _pair(r_o_bounds_ohm)),
             carried=(_pair(prior_q_mobile_C or (0.0, 0.0)), _pair(prior_r_o_ohm or (0.0, 0.0))),
             scale_sd=(float(np.hypot(self.current_gain_sd, sd_soc / soc)), float(self.current_gain_sd)),
-            plausible_C=_pair(np.multiply(PLAUSIBLE_Q_SHARES, self.cell.q_mobile)),
             cell_q_mobile=float(self.cell.q_mobile),
         )
         self._derivatives = PolynomialDerivatives.of(self.cell.packed)
@@ -371,9 +368,8 @@ def _checked_noise_V(voltage_noise_V: float | None, mismatch_V: float) -> float:
     return float(voltage_noise_V)
 
 
-def _pair(values: Sequence[float] | FloatArray) -> tuple[float, float]:
-    low, high = map(float, values)
-    return low, high
+def _pair(values: tuple[float, float]) -> tuple[float, float]:
+    return float(values[0]), float(values[1])
 
 
 @njit(cache=True, error_model="numpy")

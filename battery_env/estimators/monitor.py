@@ -300,7 +300,8 @@ def _judge(cell: Row, sd: tuple[float, float], doubt_C: float, settings: Setting
         low, high = settings.bounds[k]
         if searched[k] and not low + bank.sd[k] < bank.mean[k] < high - bank.sd[k]:
             return Verdict.Q_AT_BOUND + k
-    if searched[Q] and not settings.plausible_C[0] < bank.mean[Q] < settings.plausible_C[1]:
+    least, most = settling.PLAUSIBLE_Q_SHARES
+    if searched[Q] and not least * settings.cell_q_mobile < bank.mean[Q] < most * settings.cell_q_mobile:
         return Verdict.IMPLAUSIBLE
     if bank.trend_sd > LIMIT_SD:
         return Verdict.MISFIT
