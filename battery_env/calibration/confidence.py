@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from math import sqrt
 
 import numpy as np
@@ -78,36 +79,39 @@ class Confidence:
         return np.where(known, np.nan, np.hypot(fitted.sd, fitted.estimate - estimate))
 
     def reason(self, fitted: Fitted, n: int, estimate: FloatArray, sd: FloatArray, record: Samples, rested: bool) -> str:
-        """Why an estimate is not settled. What is quick to see is looked at first."""
-        q_mobile, r_o = estimate.tolist()
-        resistance_ohm = least_resistance_ohm(q_mobile, r_o)
-        readings, white_V = int(fitted.readings[n]), float(fitted.white_V[n])
+        """Why an estimate is not settled."""
+        return first_reason(self._conditions(fitted, n, estimate, sd, record, rested))
+
+    def _conditions(
+        self, fitted: Fitted, n: int, estimate: FloatArray, sd: FloatArray, record: Samples, rested: bool
+    ) -> Iterator[tuple[bool, str]]:
+        """What speaks against an estimate, in the order in which it counts. What takes long is looked at last."""
+        columns = [(name, PARAMETER_NAMES.index(name)) for name in self._parameters]
+        resistance_ohm = least_resistance_ohm(*estimate.tolist())
         start = start_reason(*record, self._model.cell, resistance_ohm=resistance_ohm, rested=rested)
-        limit_V2 = (1.0 + EXCESS_LIMIT_UNSTATED / sqrt(readings)) * white_V**2 + _NEGLIGIBLE_V**2
-        offset_V = abs(float(fitted.offset_V[n]))
-        first_V, full_V = float(record.voltage_V[0]), rest_voltage_V(self._model.cell)
+        yield bool(start), start
+        readings, white_V = int(fitted.readings[n]), float(fitted.white_V[n])
         often, share = self._without_samples(record.time_s, readings)
         sparse = _SPARSE.format(self._interval_s)
-        columns = [(name, PARAMETER_NAMES.index(name)) for name in self._parameters]
+        yield often, sparse
+        yield readings < len(columns) + SPARE_SAMPLES, _FEW
+        for name, k in columns:
+            yield estimate[k] in ESTIMATE_RANGES[name], AT_BOUND.format(name)
+        limit_V2 = (1.0 + EXCESS_LIMIT_UNSTATED / sqrt(readings)) * white_V**2 + _NEGLIGIBLE_V**2
+        yield not fitted.noise_V[n] ** 2 <= limit_V2, _UNEXPLAINED
+        first_V, full_V = float(record.voltage_V[0]), rest_voltage_V(self._model.cell)
+        yield first_V > full_V + self._offset_V + _NOISES * white_V, start_text(1, first_V, full_V)
+        offset_V = abs(float(fitted.offset_V[n]))
+        yield offset_V > _OFFSET_MARGIN * self._offset_V, _OFFSET.format(1e3 * offset_V, 1e3 * self._offset_V)
+        yield fitted.constants_sd[n] > _NEARLY * REACH_SD, _CONSTANTS
         differs = np.abs(fitted.estimate[n] / estimate - 1.0)
-        return (
-            first_reason(
-                [
-                    (bool(start), start),
-                    (often, sparse),
-                    (readings < len(columns) + SPARE_SAMPLES, _FEW),
-                    *((estimate[k] in ESTIMATE_RANGES[name], AT_BOUND.format(name)) for name, k in columns),
-                    (not fitted.noise_V[n] ** 2 <= limit_V2, _UNEXPLAINED),
-                    (first_V > full_V + self._offset_V + _NOISES * white_V, start_text(1, first_V, full_V)),
-                    (offset_V > _OFFSET_MARGIN * self._offset_V, _OFFSET.format(1e3 * offset_V, 1e3 * self._offset_V)),
-                    (fitted.constants_sd[n] > _NEARLY * REACH_SD, _CONSTANTS),
-                    *((not differs[k] < SETTLED_SHARES[name], _DIFFERS.format(differs[k], name)) for name, k in columns),
-                    *((not sd[k] < SETTLED_SHARES[name] * estimate[k], _IMPRECISE[name]) for name, k in columns),
-                ]
-            )
-            or self._reason_of_samples(record, Estimate(q_mobile, r_o), resistance_ohm)
-            or (sparse if share > _SPARSE_SHARE else "")
-        )
+        for name, k in columns:
+            yield not differs[k] < SETTLED_SHARES[name], _DIFFERS.format(differs[k], name)
+        for name, k in columns:
+            yield not sd[k] < SETTLED_SHARES[name] * estimate[k], _IMPRECISE[name]
+        of_samples = self._reason_of_samples(record, Estimate(*estimate.tolist()), resistance_ohm)
+        yield bool(of_samples), of_samples
+        yield share > _SPARSE_SHARE, sparse
 
     def _without_samples(self, time_s: FloatArray, readings: int) -> tuple[bool, float]:
         """

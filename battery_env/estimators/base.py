@@ -33,9 +33,7 @@ _ROUNDING = 1e-9
 
 
 class Estimator(ABC):
-    """
-    A calibrator: from the record of a discharge to (q_mobile, r_o), without labels.
-    """
+    """A calibrator: from the record of a discharge to (q_mobile, r_o), without labels."""
 
     @abstractmethod
     def estimate(self, record: Record) -> Estimate:
@@ -138,9 +136,7 @@ class OnlineEstimator(Estimator):
 
     @abstractmethod
     def reset(self) -> None:
-        """
-        Forget all samples: the next one is the first of a discharge.
-        """
+        """Forget all samples: the next one is the first of a discharge."""
 
     @abstractmethod
     def update(self, voltage_V: float, current_A: float, dt_s: float, temperature_C: float | None = None) -> Estimate:
@@ -158,15 +154,7 @@ class OnlineEstimator(Estimator):
         """
 
     def check(self, voltage_V: float, current_A: float, dt_s: float, temperature_C: float | None = None) -> None:
-        """
-        Refuse a sample that :meth:`update` would refuse, and change nothing.
-
-        :param voltage_V: as of :meth:`update`
-        :param current_A: likewise
-        :param dt_s: likewise
-        :param temperature_C: likewise
-        :raises ValueError: likewise
-        """
+        """Refuse a sample that :meth:`update` would refuse, and change nothing."""
 
     def batch(self, cells: int) -> OnlineBatch:
         """

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import asdict
 from math import inf, isnan, nan
 from typing import Any
@@ -12,7 +11,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from battery_env.arrays import FloatArray
 from battery_env.checks import check_gain_sd, check_numbers
 from battery_env.electrochemistry import STATE_SIZE, CellParameters, PackedConstants, check_cell, check_dt
 from battery_env.electrochemistry.tangents import PolynomialDerivatives
@@ -22,7 +20,7 @@ from battery_env.estimators.kalman_bank import filters_of_prior, take
 from battery_env.estimators.kalman_state import CELL, ESTIMATE, FILTER, SAMPLE, Settings
 from battery_env.estimators.monitor import Verdict, reason, watch
 from battery_env.estimators.rest import check_initial_soc
-from battery_env.estimators.settling import MISMATCH_MARGIN, PLAUSIBLE_Q_SHARES, rest_voltage_V
+from battery_env.estimators.settling import rest_voltage_V
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, check_parameters
 from battery_env.records import Record, Stream, are_plausible, check_drawn_charge, check_sample, starts_at_rest
 
@@ -78,25 +76,11 @@ class ExtendedKalmanFilter(OnlineEstimator):
 
     *Settled* means that the data determine every parameter searched for: its standard deviation, without what a given prior
     adds to it, is below :data:`~battery_env.estimators.settling.SETTLED_SHARES` of its value; and that nothing contradicts it:
-
-    - the first samples can be those of a full cell (:func:`~battery_env.estimators.settling.start_reason`), or of one with
-      ``initial_soc``;
-    - the voltage follows the current where the load is switched, does not rise where it is not, and does not come back to
-      where it started from without a charge (:mod:`~battery_env.estimators.monitor`);
-    - after a stretch of a load without samples (:mod:`~battery_env.estimators.gaps`) the voltage is lower by what was drawn
-      meanwhile. If noise hides that, the charge in doubt is in the standard deviation of ``q_mobile``;
-    - the estimate is farther than its standard deviation from its bounds, ``q_mobile`` is plausible for a cell of this kind,
-      and the model cell is not empty;
-    - innovations have not gone the same way again and again: the sum of the products of successive ones has never been 5
-      standard deviations above 0, with twice ``mismatch_V`` allowed for. It comes to that where the error of the model or the
-      noise is far larger than stated, a sensor fails, or the cell was charged without :meth:`reset`; one wild sample does no
-      harm;
-    - the offset that is found is within 5 standard deviations of ``offset_sd_V`` and what ``mismatch_V`` adds to it;
-    - ``r_o`` is where it was before, within 5 of the standard deviations stated then;
-    - a given prior is within 2.5 standard deviations of what the data say.
-
-    Otherwise ``reason`` of the estimate says which of these does not hold. In particular an estimate that rests on a prior is
-    not settled: it is as good as the prior.
+    not the start of the record, the voltage where the load is switched, steady or not logged, a bound, the kind of cell, the
+    prior, nor the innovations, which may not go the same way again and again, with twice ``mismatch_V`` allowed for. Otherwise
+    ``reason`` of the estimate says which of these does not hold, the first one in the order of
+    :class:`~battery_env.estimators.monitor.Verdict`. An estimate that rests on a prior is not settled: it is as good as the
+    prior.
 
     For a recorded discharge give :meth:`battery_env.cells.Discharge.loaded_part`, which starts when the load is switched on,
     and state the error of the model as ``mismatch_V``: 0.05 V for the cells that come with the package.
@@ -160,7 +144,6 @@ class ExtendedKalmanFilter(OnlineEstimator):
             dt_s=self.dt_s,
             thermal=thermal,
             noise_V2=float(voltage_noise_V) ** 2,
-            spare_V2=(MISMATCH_MARGIN**2 - 1.0) * float(mismatch_V) ** 2,
             mismatch_V2=float(mismatch_V) ** 2,
             searched=("q_mobile" in self.parameters, "r_o" in self.parameters),
             variance=(q_sd**2, r_o_sd**2),
@@ -172,7 +155,6 @@ class ExtendedKalmanFilter(OnlineEstimator):
             bounds=(_pair(q_mobile_bounds_C), _pair(r_o_bounds_ohm)),
             carried=(_pair(prior_q_mobile_C or (0.0, 0.0)), _pair(prior_r_o_ohm or (0.0, 0.0))),
             scale_sd=(float(np.hypot(self.current_gain_sd, sd_soc / soc)), float(self.current_gain_sd)),
-            plausible_C=_pair(np.multiply(PLAUSIBLE_Q_SHARES, self.cell.q_mobile)),
             cell_q_mobile=float(self.cell.q_mobile),
         )
         self._derivatives = PolynomialDerivatives.of(self.cell.packed)
@@ -278,10 +260,14 @@ class ExtendedKalmanFilter(OnlineEstimator):
         """Filters like this one, each for a cell of its own, which take their samples in one compiled call."""
         return KalmanBatch(self, cells)
 
+    def __copy__(self) -> ExtendedKalmanFilter:
+        """A filter that goes its own way."""
+        return self._of_rows(self._cells.copy(), self._filters.copy())
+
     def _of_rows(self, cells: NDArray[np.void], filters: NDArray[np.void]) -> ExtendedKalmanFilter:
-        """Another filter with the same arguments, whose memory is a row of these tables."""
-        other = copy(self)
-        other._cells, other._filters = cells, filters
+        """A filter with the same arguments, whose memory are these rows."""
+        other = object.__new__(type(self))
+        vars(other).update(vars(self), _cells=cells, _filters=filters)
         return other
 
     def now(self) -> ModelNow:
@@ -344,19 +330,17 @@ class KalmanBatch(OnlineBatch):
         """Take in one sample of each cell: of all, or of none if one is refused."""
         cells, one = self._cells, self.estimators[0]
         is_first = cells["samples"] == 0
-        if is_first.any():
-            self.check(voltage_V, current_A, dt_s, temperature_C)
         samples = np.zeros((1, len(cells)), SAMPLE)
         (of,) = samples
         of["voltage_V"], of["current_A"] = check_numbers("voltage_V", voltage_V), check_numbers("current_A", current_A)
-        of["dt_s"] = 0.0 if is_first.all() else np.where(is_first, 0.0, check_numbers("dt_s", dt_s))
+        of["dt_s"] = np.where(is_first, 0.0, check_numbers("dt_s", dt_s))
         degrees_C = None if temperature_C is None else np.asarray(temperature_C, dtype=np.float64)
         of["temperature_K"] = nan if degrees_C is None else degrees_C + _ZERO_CELSIUS_K
         drawn_C = cells["drawn_C"] + cells["current_A"] * of["dt_s"]
         good = are_plausible(of["voltage_V"], of["current_A"], of["dt_s"], degrees_C, cells["current_A"])
-        self.check(
-            voltage_V, current_A, dt_s, temperature_C, np.flatnonzero(~is_first & ~(good & (drawn_C > one.least_drawn_C)))
-        )
+        doubtful = is_first | ~(good & (drawn_C > one.least_drawn_C))
+        if doubtful.any():
+            self.check(voltage_V, current_A, dt_s, temperature_C, np.flatnonzero(doubtful).tolist())
         for n in np.flatnonzero(is_first & ~np.isnan(of["temperature_K"])).tolist():
             self.estimators[n]._begin(float(of["temperature_K"][n]))
         (said,) = one._follow(cells, self._filters, samples)
@@ -384,9 +368,8 @@ def _checked_noise_V(voltage_noise_V: float | None, mismatch_V: float) -> float:
     return float(voltage_noise_V)
 
 
-def _pair(values: Sequence[float] | FloatArray) -> tuple[float, float]:
-    low, high = map(float, values)
-    return low, high
+def _pair(values: tuple[float, float]) -> tuple[float, float]:
+    return float(values[0]), float(values[1])
 
 
 @njit(cache=True, error_model="numpy")

@@ -31,6 +31,7 @@ from battery_env.electrochemistry.tangents import (
     voltage_tangents,
 )
 from battery_env.estimators.kalman_state import FILTER, OFFSET, Q, R, Row, Settings
+from battery_env.estimators.settling import MISMATCH_MARGIN
 
 #: Standard deviations. Innovations count in full within the gate. A filter whose successive innovations are correlated, whose
 #: estimate leaves the range that it stated, or whose offset is beyond the stated one, by more than the limit does not follow
@@ -157,7 +158,9 @@ def _correct(
     one.expected_V = voltage - innovation
     variance = explained + noise
     sd = sqrt(variance)
-    one.innovation = min(max(innovation / sqrt(variance + settings.spare_V2), -GATE_SD), GATE_SD)
+    # innovations may show more than the stated mismatch before they contradict it
+    spare_V2 = (MISMATCH_MARGIN**2 - 1.0) * settings.mismatch_V2
+    one.innovation = min(max(innovation / sqrt(variance + spare_V2), -GATE_SD), GATE_SD)
     one.shown_V2 = min(innovation * innovation, (GATE_SD * sd) ** 2) - explained
     beyond = max(abs(innovation) / sd / GATE_SD, 1.0)
     # Huber's loss: quadratic up to the gate, linear beyond, where a larger variance stands for it

@@ -28,7 +28,6 @@ class Settings(NamedTuple):
     :param dt_s: longest time step of the model, s
     :param thermal: whether the temperature of the model moves
     :param noise_V2: variance of the voltage noise, V^2
-    :param spare_V2: variance that innovations may show beyond it before they contradict the stated mismatch, V^2
     :param mismatch_V2: variance of the error of the model, V^2
     :param searched: whether each is searched for
     :param variance: of each before the discharge, 0 where it is held, C^2 and ohm^2
@@ -37,14 +36,12 @@ class Settings(NamedTuple):
     :param bounds: where each stays, C and ohm
     :param carried: mean and standard deviation of each from an earlier discharge; zeros where none was given
     :param scale_sd: standard deviations of what scales each and does not show in the voltage, as shares
-    :param plausible_C: between which ``q_mobile`` can lie, C
     :param cell_q_mobile: of the model's cell, C
     """
 
     dt_s: float
     thermal: bool
     noise_V2: float
-    spare_V2: float
     mismatch_V2: float
     searched: tuple[bool, bool]
     variance: tuple[float, float]
@@ -53,7 +50,6 @@ class Settings(NamedTuple):
     bounds: tuple[tuple[float, float], tuple[float, float]]
     carried: tuple[tuple[float, float], tuple[float, float]]
     scale_sd: tuple[float, float]
-    plausible_C: tuple[float, float]
     cell_q_mobile: float
 
 

@@ -10,37 +10,9 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from battery_env.estimators.gaps import DRAWN, GAP_RATIO, MOST_SHARE_SO_FAR, NOT_DRAWN, doubtful_charge_C, verdict
+from battery_env.estimators import gaps, settling
 from battery_env.estimators.kalman_bank import LIMIT_SD
 from battery_env.estimators.kalman_state import KEPT, Q, R, Row, Settings
-from battery_env.estimators.settling import (
-    AT_BOUND,
-    EMPTY,
-    FULL_REST_V,
-    IMPLAUSIBLE,
-    IMPRECISE,
-    LEAST_JUMP_A,
-    MISFIT,
-    MOST_RESISTANCE_OHM,
-    NOISES,
-    NOT_DRAWN_TEXT,
-    NOT_FOLLOWED,
-    PRIOR_ALONE,
-    PRIOR_CONTRADICTED,
-    PRIOR_LIMIT_SD,
-    RISE_V,
-    RISES,
-    SCALE_UNKNOWN,
-    SETTLED_SHARES,
-    START_WINDOW_S,
-    STEADY_S,
-    UNSURE_TEXT,
-    change_to_follow_A,
-    lagging_current_A,
-    least_resistance_ohm,
-    start_code,
-    start_text,
-)
 from battery_env.records import REST_CURRENT_A, SWITCH_SHARE
 
 # The data must have narrowed a prior by this share of its width before a deviation from it says anything.
@@ -49,7 +21,7 @@ _LEAST_NARROWING = 0.2
 _RECOVERY_SHARE = 0.2
 # The least standard deviation of q_mobile that the error of the model leaves is not taken to be above this share: a discharge
 # whose knee the filter has not seen has a larger one of its own.
-_MOST_LEAST_SHARE = 0.5 * SETTLED_SHARES["q_mobile"]
+_MOST_LEAST_SHARE = 0.5 * settling.SETTLED_SHARES["q_mobile"]
 # A load that was switched for at least this long, s, and this many samples shows in the voltage: the ohmic drop of the model
 # comes to 80 % in 10 s.
 _LEAST_PULSE_S, _LEAST_PULSE_SAMPLES = 10.0, 3
@@ -62,7 +34,7 @@ _KEPT_EVERY_S = 0.9
 _PARTED_MEMORY, _RATE_MEMORY_S, _PARTED_SAMPLES = 8.0, 100.0, 3
 # Standard deviation of the difference of both, as a share of the noise.
 _PARTED_NOISE_SHARE = 0.72
-_SHARES = (SETTLED_SHARES["q_mobile"], SETTLED_SHARES["r_o"])
+_SHARES = (settling.SETTLED_SHARES["q_mobile"], settling.SETTLED_SHARES["r_o"])
 _RECOVERED_TEXT = (
     "The voltage comes back to that of the start at {:.0f} s, though {:.0f} C were drawn: the cell was charged. Reset the "
     "filter when a discharge begins."
@@ -73,8 +45,8 @@ _compiled = njit(cache=True, error_model="numpy")
 
 class Verdict(IntEnum):
     """
-    Why an estimate is not settled: the first one that holds is the reason, of the faults the first one in time. Beside its
-    text stands what fills the gaps of it, see :func:`reason`.
+    Why an estimate is not settled. A row holds the text of a reason, and the names of what fills it (:func:`reason`). The
+    first row that holds is the reason; of the faults it is the first one in time.
     """
 
     def __new__(cls, text: str, *names: str) -> Verdict:
@@ -88,30 +60,30 @@ class Verdict(IntEnum):
     names: tuple[str, ...]
 
     SETTLED = ""
-    # the start, numbered and told as settling.start_code and start_text do
+    # the start, with the numbers that settling.start_code gives and settling.start_text tells
     START_ABOVE = "", "start"
     START_BELOW = "", "start"
     START_LOADED = "", "start"
     # faults
     RECOVERED = _RECOVERED_TEXT, "fault_s", "size"
-    NOT_FOLLOWED = NOT_FOLLOWED, "size", "fault_s"
-    RISES = RISES, "size", "fault_s"
-    NOT_DRAWN = NOT_DRAWN_TEXT, "since_s", "fault_s", "size"
+    NOT_FOLLOWED = settling.NOT_FOLLOWED, "size", "fault_s"
+    RISES = settling.RISES, "size", "fault_s"
+    NOT_DRAWN = settling.NOT_DRAWN_TEXT, "since_s", "fault_s", "size"
     # the estimate
-    EMPTY = EMPTY
-    Q_AT_BOUND = AT_BOUND, "q_mobile"
-    R_AT_BOUND = AT_BOUND, "r_o"
-    IMPLAUSIBLE = IMPLAUSIBLE
-    MISFIT = MISFIT
-    Q_PRIOR_WRONG = PRIOR_CONTRADICTED, "q_mobile"
-    Q_PRIOR_ALONE = PRIOR_ALONE, "q_mobile"
-    R_PRIOR_WRONG = PRIOR_CONTRADICTED, "r_o"
-    R_PRIOR_ALONE = PRIOR_ALONE, "r_o"
-    GAP_UNSURE = UNSURE_TEXT, "gap_start_s", "gap_end_s", "gap_C"
-    Q_IMPRECISE = IMPRECISE["q_mobile"]
-    R_IMPRECISE = IMPRECISE["r_o"]
-    Q_SCALE_UNKNOWN = SCALE_UNKNOWN, "q_mobile"
-    R_SCALE_UNKNOWN = SCALE_UNKNOWN, "r_o"
+    EMPTY = settling.EMPTY
+    Q_AT_BOUND = settling.AT_BOUND, "q_mobile"
+    R_AT_BOUND = settling.AT_BOUND, "r_o"
+    IMPLAUSIBLE = settling.IMPLAUSIBLE
+    MISFIT = settling.MISFIT
+    Q_PRIOR_WRONG = settling.PRIOR_CONTRADICTED, "q_mobile"
+    Q_PRIOR_ALONE = settling.PRIOR_ALONE, "q_mobile"
+    R_PRIOR_WRONG = settling.PRIOR_CONTRADICTED, "r_o"
+    R_PRIOR_ALONE = settling.PRIOR_ALONE, "r_o"
+    GAP_UNSURE = settling.UNSURE_TEXT, "gap_start_s", "gap_end_s", "gap_C"
+    Q_IMPRECISE = settling.IMPRECISE["q_mobile"]
+    R_IMPRECISE = settling.IMPRECISE["r_o"]
+    Q_SCALE_UNKNOWN = settling.SCALE_UNKNOWN, "q_mobile"
+    R_SCALE_UNKNOWN = settling.SCALE_UNKNOWN, "r_o"
 
 
 _VERDICTS = tuple(Verdict)
@@ -121,7 +93,7 @@ def reason(code: int, seen: Mapping[str, Any], initial_soc: float, clock_s: floa
     """The reason that a code stands for, from the start, the fault and the gap that were seen, on a clock of its own."""
     said, fault, gap = _VERDICTS[code], seen["fault"], seen["gap"]
     if "start" in said.names:
-        return start_text(code, float(seen["start"]["first_V"]), float(seen["start_V"]), initial_soc)
+        return settling.start_text(code, float(seen["start"]["first_V"]), float(seen["start_V"]), initial_soc)
     end_s = clock_s + gap["end_s"]
     fills = {
         "fault_s": clock_s + fault["time_s"],
@@ -140,7 +112,7 @@ def _noise_V(cell: Row) -> float:
     n = min(cell.ring.n_changes, KEPT)
     if n < KEPT // 4:
         return inf
-    return NOISES * _SMOOTHED_SHARE * float(np.median(cell.ring.change_V[:n])) / (0.6745 * sqrt(2.0))
+    return settling.NOISES * _SMOOTHED_SHARE * float(np.median(cell.ring.change_V[:n])) / (0.6745 * sqrt(2.0))
 
 
 @_compiled
@@ -172,15 +144,15 @@ def _note_switch(cell: Row, time_s: float, current: float, resistance_ohm: float
         switch.time_s = last.jump_s = time_s
         return
     switched_A = current - last.current_A
-    if abs(switched_A) > min(SWITCH_SHARE * last.largest_A, LEAST_JUMP_A):
+    if abs(switched_A) > min(SWITCH_SHARE * last.largest_A, settling.LEAST_JUMP_A):
         last.jump_s = time_s
     if abs(switched_A) > SWITCH_SHARE * last.largest_A:
         if switch.size_A != 0.0 and time_s - switch.time_s >= _LEAST_PULSE_S and switch.samples >= _LEAST_PULSE_SAMPLES:
             _conclude_switch(cell, resistance_ohm)
         switch.time_s, switch.size_A, switch.before_V = time_s, switched_A, last.voltage_V
-        switch.to_follow_A = change_to_follow_A(switched_A, current, last.lagging_A)
+        switch.to_follow_A = settling.change_to_follow_A(switched_A, current, last.lagging_A)
         switch.lowest_V, switch.highest_V, switch.samples = inf, -inf, 0.0
-    last.lagging_A = lagging_current_A(last.lagging_A, last.current_A, time_s - last.time_s)
+    last.lagging_A = settling.lagging_current_A(last.lagging_A, last.current_A, time_s - last.time_s)
 
 
 @_compiled
@@ -190,9 +162,10 @@ def _look_for_rise(cell: Row, time_s: float, voltage: float, current: float) -> 
     for back in range(2, min(ring.n_kept, KEPT) + 1):
         n = (ring.n_kept - back) % KEPT
         since_s = time_s - ring.time_s[n]
-        if since_s > START_WINDOW_S:
-            rise_V = voltage - ring.voltage_V[n] - MOST_RESISTANCE_OHM * max(ring.current_A[n] - current, 0.0)
-            if rise_V > RISE_V and time_s - since_s - cell.examined.jump_s >= STEADY_S and rise_V > _noise_V(cell):
+        if since_s > settling.START_WINDOW_S:
+            rise_V = voltage - ring.voltage_V[n] - settling.MOST_RESISTANCE_OHM * max(ring.current_A[n] - current, 0.0)
+            was_steady = time_s - since_s - cell.examined.jump_s >= settling.STEADY_S
+            if was_steady and rise_V > settling.RISE_V and rise_V > _noise_V(cell):
                 _find(cell, Verdict.RISES, time_s - since_s, rise_V)
             break
     if ring.n_kept == 0 or time_s - ring.time_s[(ring.n_kept - 1) % KEPT] >= _KEPT_EVERY_S:
@@ -206,17 +179,17 @@ def _examine(cell: Row, voltage: float, settings: Settings) -> None:
     # The sample before the one at hand, with the middle voltage of three, which is no single wild one
     last, switch, q = cell.examined, cell.switch, cell.bank.mean[Q]
     time_s, current = cell.before.time_1_s, cell.before.current_1_A
-    resistance_ohm = least_resistance_ohm(q, cell.bank.mean[R])
+    resistance_ohm = settling.least_resistance_ohm(q, cell.bank.mean[R])
     _note_switch(cell, time_s, current, resistance_ohm)
     if switch.size_A != 0.0:
         switch.lowest_V, switch.highest_V = min(switch.lowest_V, voltage), max(switch.highest_V, voltage)
         switch.samples += 1.0
-        if time_s - switch.time_s > START_WINDOW_S and switch.samples >= _LEAST_PULSE_SAMPLES:
+        if time_s - switch.time_s > settling.START_WINDOW_S and switch.samples >= _LEAST_PULSE_SAMPLES:
             _conclude_switch(cell, resistance_ohm)
     _look_for_rise(cell, time_s, voltage, current)
     # under a steady load the voltage at rest is higher by the ohmic drop at least; a charge that is seen raises it
-    drop_V = resistance_ohm * max(current, 0.0) if time_s - switch.time_s > START_WINDOW_S else 0.0
-    is_high = voltage + drop_V > cell.start_V - FULL_REST_V[0] and min(current, last.lagging_A) >= -REST_CURRENT_A
+    drop_V = resistance_ohm * max(current, 0.0) if time_s - switch.time_s > settling.START_WINDOW_S else 0.0
+    is_high = voltage + drop_V > cell.start_V - settling.FULL_REST_V[0] and min(current, last.lagging_A) >= -REST_CURRENT_A
     if is_high and cell.drawn_C > _RECOVERY_SHARE * max(q, settings.cell_q_mobile):
         _find(cell, Verdict.RECOVERED, time_s, cell.drawn_C)
     last.count += 1
@@ -230,12 +203,12 @@ def _start(cell: Row, voltage: float, current: float) -> int:
         start.first_V, start.first_A, start.most_A, start.least_V = voltage, current, current, voltage
         if start.at_rest:
             start.first_A = 0.0
-    elif cell.samples == 2 or cell.time_s <= START_WINDOW_S:
+    elif cell.samples == 2 or cell.time_s <= settling.START_WINDOW_S:
         start.most_A = max(start.most_A, current)
         if not isnan(voltage):
             start.least_V = min(start.least_V, voltage)
-    resistance_ohm = least_resistance_ohm(cell.bank.mean[Q], cell.bank.mean[R])
-    return int(start_code(start.first_V, start.first_A, start.most_A, start.least_V, cell.start_V, resistance_ohm))
+    resistance_ohm = settling.least_resistance_ohm(cell.bank.mean[Q], cell.bank.mean[R])
+    return int(settling.start_code(start.first_V, start.first_A, start.most_A, start.least_V, cell.start_V, resistance_ohm))
 
 
 @_compiled
@@ -260,7 +233,7 @@ def _open_gap(cell: Row, voltage: float, current: float, duration: float, charge
     gap.length_s, gap.end_s, gap.charge_C, gap.samples = duration, cell.time_s, charge_C, 1.0
     # the filter gives way to the samples after a gap, so that these are compared with what it had expected before
     gap.fall_V = usual.expected_V - cell.bank.expected_V
-    if cell.time_s - duration - cell.examined.jump_s >= STEADY_S:
+    if cell.time_s - duration - cell.examined.jump_s >= settling.STEADY_S:
         # a model whose q_mobile is not known yet may take its cell for empty: the voltage falls at least as it did before
         gap.fall_V = min(gap.fall_V, usual.fall_V_per_s * duration)
     gap.model_V = usual.expected_V + usual.parted_V - gap.fall_V
@@ -273,13 +246,13 @@ def _open_gap(cell: Row, voltage: float, current: float, duration: float, charge
 def _close_gap(cell: Row, voltage: float, load_A: float) -> None:
     gap = cell.gap
     after_V = _middle(gap.after_V, gap.next_V, voltage)
-    sd_V = _PARTED_NOISE_SHARE * _noise_V(cell) / (NOISES * _SMOOTHED_SHARE)
-    said = verdict(after_V - gap.model_V, gap.fall_V, sd_V, MOST_SHARE_SO_FAR)
-    if said == DRAWN:
+    sd_V = _PARTED_NOISE_SHARE * _noise_V(cell) / (settling.NOISES * _SMOOTHED_SHARE)
+    said = gaps.verdict(after_V - gap.model_V, gap.fall_V, sd_V, gaps.MOST_SHARE_SO_FAR)
+    if said == gaps.DRAWN:
         _note_interval(cell, gap.length_s, load_A)
     else:
         cell.doubt_C += gap.charge_C
-    if said == NOT_DRAWN and cell.fault.code == Verdict.SETTLED:
+    if said == gaps.NOT_DRAWN and cell.fault.code == Verdict.SETTLED:
         cell.fault.since_s = gap.end_s - gap.length_s
         _find(cell, Verdict.NOT_DRAWN, gap.end_s, gap.charge_C)
     gap.samples = 0.0
@@ -290,11 +263,11 @@ def _follow_gaps(cell: Row, voltage: float, current: float, duration: float) -> 
     # One sample that is not the first. A gap is pending from its end until the voltages after it were seen.
     gap, usual, expected = cell.gap, cell.usual, cell.bank.expected_V
     load_A = max(abs(cell.current_A), abs(current))
-    if gap.samples > 0.0 and gap.length_s <= GAP_RATIO * duration and cell.time_s - duration == gap.end_s:
+    if gap.samples > 0.0 and gap.length_s <= gaps.GAP_RATIO * duration and cell.time_s - duration == gap.end_s:
         gap.samples = 0.0  # the samples are as far apart from now on
     charge_C = 0.0
-    if duration > GAP_RATIO * usual.longest_s[0]:  # else the logger has a habit of it
-        charge_C = doubtful_charge_C(usual.interval_s, duration, 0.0, load_A, cell.bank.mean[Q])
+    if duration > gaps.GAP_RATIO * usual.longest_s[0]:  # else the logger has a habit of it
+        charge_C = gaps.doubtful_charge_C(usual.interval_s, duration, 0.0, load_A, cell.bank.mean[Q])
     if charge_C > 0.0:
         _open_gap(cell, voltage, current, duration, charge_C, load_A)
     else:
@@ -327,7 +300,8 @@ def _judge(cell: Row, sd: tuple[float, float], doubt_C: float, settings: Setting
         low, high = settings.bounds[k]
         if searched[k] and not low + bank.sd[k] < bank.mean[k] < high - bank.sd[k]:
             return Verdict.Q_AT_BOUND + k
-    if searched[Q] and not settings.plausible_C[0] < bank.mean[Q] < settings.plausible_C[1]:
+    least, most = settling.PLAUSIBLE_Q_SHARES
+    if searched[Q] and not least * settings.cell_q_mobile < bank.mean[Q] < most * settings.cell_q_mobile:
         return Verdict.IMPLAUSIBLE
     if bank.trend_sd > LIMIT_SD:
         return Verdict.MISFIT
@@ -335,7 +309,7 @@ def _judge(cell: Row, sd: tuple[float, float], doubt_C: float, settings: Setting
         mean, prior_sd = settings.carried[k]
         if prior_sd > 0.0:
             narrowed = max(prior_sd**2 - bank.sd[k] ** 2, (_LEAST_NARROWING * prior_sd) ** 2)
-            if (bank.mean[k] - mean) ** 2 > PRIOR_LIMIT_SD**2 * narrowed:
+            if (bank.mean[k] - mean) ** 2 > settling.PRIOR_LIMIT_SD**2 * narrowed:
                 return Verdict.Q_PRIOR_WRONG + 2 * k
             # precisions add up
             of_data = max(bank.sd[k] ** -2.0 - prior_sd**-2.0, 0.0) ** -0.5

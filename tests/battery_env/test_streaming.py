@@ -1,5 +1,6 @@
 """Streams: sample by sample, with gaps and rests, stopped and resumed, one cell and many, of filters and policies."""
 
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -8,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from battery_env import ExtendedKalmanFilter, PolicyEstimator, soc_from_rest
-from battery_env.cells import Discharge, load_nasa_discharges
-from battery_env.electrochemistry import NEW_CELL, STATE_SIZE, initial_state, rest_shares, simulate
+from battery_env.cells import Discharge
+from battery_env.electrochemistry import NEW_CELL, STATE_SIZE, initial_state, simulate
 from battery_env.estimators.base import ModelNow, OnlineEstimator
 from battery_env.loads import Cycle, Load
 from battery_env.records import Stream, are_plausible, check_sample
@@ -126,40 +127,45 @@ class TestSamples:
             filter_.update(4.19, -2.0, 200.0)
 
     @pytest.mark.parametrize(
-        ("sample", "message"),
+        ("sample", "error", "message"),
         [
-            (("x", 2.0, 1.0), "voltage_V must be a number, got 'x'"),
-            ((None, 2.0, 1.0), r"voltage_V must be a number, got None\. A voltage may be missing \(NaN\)"),
-            ((4.1, None, 1.0), "current_A must be a number, got None"),
-            ((4.1, 2.0, None), "dt_s must be a number, got None"),
-            ((4.1, 2.0, "1"), "dt_s must be a number, got '1'"),
+            (("x", 2.0, 1.0), TypeError, "voltage_V must be a number, got 'x'"),
+            ((None, 2.0, 1.0), TypeError, r"voltage_V must be a number, got None\. A voltage may be missing \(NaN\)"),
+            ((4.1, None, 1.0), TypeError, "current_A must be a number, got None"),
+            ((4.1, 2.0, None), TypeError, "dt_s must be a number, got None"),
+            ((4.1, 2.0, "1"), TypeError, "dt_s must be a number, got '1'"),
+            ((np.inf, 2.0, 1.0), ValueError, "voltage_V must be finite, got inf"),
+            ((3.7, 2000.0, 1.0), ValueError, "current_A must lie within -1000 .. 1000 A, got 2000. .* not in mA"),
+            ((3700.0, 2.0, 1.0), ValueError, "voltage_V must lie within 0 .. 5.5 V, got 3700. .* not in mV"),
+            ((14.8, 2.0, 1.0), ValueError, "voltage_V must lie within 0 .. 5.5 V, got 14.8. .* not that of a pack"),
+            ((3.7, np.nan, 1.0), ValueError, "current_A must be finite, got nan. .* give the mean current"),
+            ((3.7, 2.0, 0.0), ValueError, "dt_s, .* must lie within 0.001 .. 600 s, got 0.0"),
+            ((3.7, 2.0, np.nan), ValueError, "dt_s, .* must lie within 0.001 .. 600 s, got nan"),
+            ((3.7, 2.0, 1000.0), ValueError, "dt_s, .* got 1000.0. Give it in seconds, not in hours or milliseconds"),
         ],
     )
-    def test_what_is_no_number_is_refused_and_named(self, make, sample, message):
-        estimator = make()
+    def test_what_cannot_be_meant_is_refused_and_changes_nothing(self, make, sample, error, message):
+        estimator, untouched, batch, good = make(), make(), make().batch(2), (4.1, 2.0, 1.0)
         if "dt_s" not in message:  # which the first sample does not need
-            with pytest.raises(TypeError, match=f"^{message}"):
+            with pytest.raises(error, match=f"^{message}"):
                 estimator.update(*sample)
-        estimator.update(4.19, 2.0, None)
-        with pytest.raises(TypeError, match=f"^{message}"):
+        for each in (estimator, untouched, batch):
+            each.update(4.19, 2.0, 0.0)
+        with pytest.raises(error, match=f"^{message}"):
             estimator.update(*sample)
-        batch = make().batch(2)
-        if "dt_s" not in message:
-            with pytest.raises(TypeError, match=f"^cell 1: {message}"):
-                batch.update([4.19, sample[0]], [2.0, sample[1]], 0.0)
-        untouched = make()
-        untouched.update(4.19, 2.0, None)
-        assert estimator.update(4.1, 2.0, 1.0) == untouched.update(4.1, 2.0, 1.0)
+        if error is ValueError:  # arrays make numbers of what is none, where they can
+            with pytest.raises(error, match=f"^cell 1: {message}"):
+                batch.update(*map(list, zip(good, sample, strict=True)))
+        expected = untouched.update(*good)
+        assert [estimator.update(*good), *batch.update(*good)] == [expected] * 3
 
-    def test_a_temperature_that_is_none_is_refused(self):
+    def test_kelvin_is_refused_and_a_policy_takes_no_temperature(self):
+        with pytest.raises(ValueError, match=r"temperature_C must lie within .* not in kelvin"):
+            ExtendedKalmanFilter().update(4.19, 2.0, 0.0, 293.0)
         with pytest.raises(TypeError, match="temperature_C must be a number, got 'warm'"):
-            ExtendedKalmanFilter(thermal=True).update(4.19, 2.0, 0.0, "warm")
-
-    def test_a_batch_names_what_is_no_number(self, make):
-        batch = make().batch(2)
-        batch.update(4.19, 2.0, 0.0)
-        with pytest.raises(TypeError, match="voltage_V must be a number"):
-            batch.update(["x", 4.1], 2.0, 1.0)
+            ExtendedKalmanFilter().update(4.19, 2.0, 0.0, "warm")
+        with pytest.raises(ValueError, match="a policy takes no temperature"):
+            policy_estimator().update(4.19, 2.0, 0.0, 20.0)
 
 
 class TestTemperature:
@@ -195,40 +201,10 @@ class TestTemperature:
         blind = filter_.estimate(Discharge(part.time_s, part.voltage_V, part.current_A))
         assert abs(blind.r_o / last.r_o - 1.0) > 1e-3
 
-    def test_a_trace_of_an_estimator_that_takes_none_refuses_it_as_its_update_does(self):
-        class Isothermal(ExtendedKalmanFilter):
-            def trace(self, records):
-                return super(ExtendedKalmanFilter, self).trace(records)
-
-            def update(self, voltage_V, current_A, dt_s, temperature_C=None):
-                if temperature_C is not None:
-                    raise ValueError("takes no temperature")
-                return super().update(voltage_V, current_A, dt_s)
-
-        record = load_nasa_discharges("B0005")[0].until(400.0)
-        with pytest.raises(ValueError, match="takes no temperature"):
-            Isothermal().trace([record])
-        assert Isothermal().estimate(replace(record, temperature_C=None)).r_o > 0.0
-
-    def test_kelvin_is_refused_and_a_policy_takes_none(self):
-        with pytest.raises(ValueError, match=r"temperature_C must lie within .* not in kelvin"):
-            ExtendedKalmanFilter().update(4.19, 2.0, 0.0, 293.0)
-        with pytest.raises(ValueError, match="a policy takes no temperature"):
-            policy_estimator().update(4.19, 2.0, 0.0, 20.0)
-
 
 class TestStart:
-    def test_a_state_of_charge_is_one_of_the_model_at_rest(self):
-        for soc in (0.2, 0.6, 1.0):
-            shares = rest_shares(soc)
-            assert shares.sum() == pytest.approx(1.0 / 0.6) and shares[:2].sum() == pytest.approx(soc)
-            state = initial_state(6000.0, soc=soc)
-            later = simulate(0.0, 6000.0, 0.1, initial=state, until=600.0).state[-1]
-            np.testing.assert_allclose(later, state, rtol=1e-9, atol=1e-9)
-
-    @pytest.mark.parametrize("soc", [0.7, 0.9])
-    def test_a_start_that_is_known_or_told_from_the_rest_finds_the_charge(self, soc):
-        load_A = np.append(np.zeros(200), np.full(20_000, 2.0))
+    def test_a_start_that_is_known_or_told_from_the_rest_finds_the_charge(self):
+        soc, load_A = 0.7, np.append(np.zeros(200), np.full(20_000, 2.0))
         record = measured(load_A, initial=initial_state(6000.0, soc=soc))
         start = soc_from_rest(record)
         known, told, full = (
@@ -250,11 +226,6 @@ class TestStart:
         sure, doubtful = (ExtendedKalmanFilter(thermal=True, initial_soc=soc).estimate(whole) for soc in (1.0, (1.0, 0.01)))
         assert doubtful.q_mobile == sure.q_mobile
         assert doubtful.sd_q_mobile == pytest.approx(np.hypot(sure.sd_q_mobile, 0.01 * sure.q_mobile))
-
-    @pytest.mark.parametrize("soc", [0.0, 1.1, np.nan, "rest", (0.5, -0.1)])
-    def test_what_is_none_is_refused(self, soc):
-        with pytest.raises(ValueError, match=r"initial_soc is a state of charge within .*\.soc_from_rest tells both"):
-            ExtendedKalmanFilter(initial_soc=soc)
 
 
 class TestModel:
@@ -282,7 +253,7 @@ class TestModel:
                 assert 2000.0 < left.time_s < 5000.0 and 500.0 < left.sd_s < 2000.0
             assert unsure
 
-    @pytest.mark.parametrize("sd_ohm", [0.02, 0.15, 0.5])
+    @pytest.mark.parametrize("sd_ohm", [0.02, 0.5])
     def test_a_deviation_beyond_what_a_cell_can_be_counts_as_far_as_it_can(self, sd_ohm):
         class AtHand(Bare):
             def now(self):
@@ -295,16 +266,6 @@ class TestModel:
         assert AtHand().remaining(1.0).sd_s == pytest.approx(
             sd_ohm * (late_s - early_s) / (ends_ohm[1] - ends_ohm[0]), abs=2.0
         )
-
-    def test_a_side_that_lasts_beyond_a_day_counts_from_the_other_one(self):
-        class AtHand(Bare):
-            def now(self):
-                by_q = np.zeros((1, STATE_SIZE + 3))
-                by_q[0, 4:8], by_q[0, STATE_SIZE] = 1200.0 * rest_shares(1.0), 1200.0
-                return ModelNow(NEW_CELL, True, 1.0, initial_state(6000.0), np.array([6000.0, 0.1, 0.0]), by_q)
-
-        left = AtHand().remaining(0.07)
-        assert left.time_s < 86_400.0 < 1.2 * left.time_s and left.sd_s == pytest.approx(0.2 * left.time_s, rel=0.05)
 
     def test_a_charge_never_ends_at_the_cut_off(self, whole):
         filter_ = ExtendedKalmanFilter(thermal=True)
@@ -392,6 +353,14 @@ class TestFiles:
 
 
 class TestBatch:
+    def test_a_copy_of_a_filter_goes_its_own_way(self, whole):
+        one = ExtendedKalmanFilter(thermal=True)
+        follow(one, whole.part(0, 130))
+        soc, other = one.soc, copy(one)
+        assert other.update(3.9, 2.0, 1.0) == copy(one).update(3.9, 2.0, 1.0)
+        other.reset()
+        assert one.soc == soc < other.soc == 1.0
+
     def test_cells_do_not_know_of_each_other(self, make, whole, tmp_path):
         records = [whole, measured(1.5, 5000.0, 0.2)]
         batch, alone = make().batch(2), [make(), make()]
@@ -403,14 +372,6 @@ class TestBatch:
         assert other.update(3.9, 1.0, 1.0) == batch.update(3.9, 1.0, 1.0)
         batch.reset([1])
         assert batch.estimators[1].soc == 1.0 and batch.estimators[0].soc < 1.0
-
-    def test_one_sample_that_is_refused_moves_none(self, make):
-        batch = make().batch(3)
-        batch.update(4.19, 2.0, 0.0)
-        before = batch.estimators[0].soc
-        with pytest.raises(ValueError, match=r"^cell 2: voltage_V must lie within"):
-            batch.update([4.1, 4.1, 4100.0], 2.0, 10.0)
-        assert batch.estimators[0].soc == before
         with pytest.raises(ValueError, match="cells must be at least 1"):
             make().batch(0)
 
