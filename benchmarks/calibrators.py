@@ -480,8 +480,9 @@ def plot(results: pd.DataFrame, labels: Sequence[str]) -> Figure:
     names = list(dict.fromkeys(results["calibrator"]))
     rows: list[tuple[str, pd.DataFrame | None]] = []
     for keys, of_condition in results.groupby(list(labels), sort=False):
-        rows.append((", ".join(f"{name} {key}" for name, key in zip(labels, keys, strict=True)), None))
-        rows += [(f"{name}", group) for name, group in of_condition.groupby("calibrator", sort=False)]
+        named = zip(labels, keys, strict=True)
+        rows.append((", ".join(key if isinstance(key, str) else f"{name} {key:g}" for name, key in named), None))
+        rows += [(str(name), group) for name, group in of_condition.groupby("calibrator", sort=False)]
     figure = new_figure(10.4, 0.8 + 0.17 * len(rows))
     panels = figure.subplots(1, len(PARAMETER_NAMES), sharey=True)
     for axes, parameter in zip(panels, PARAMETER_NAMES, strict=True):
@@ -499,7 +500,7 @@ def plot(results: pd.DataFrame, labels: Sequence[str]) -> Figure:
     panels[0].set_yticks(range(len(rows)), [name for name, _ in rows], fontsize=7)
     for label, (_, group) in zip(panels[0].get_yticklabels(), rows, strict=True):
         label.set_fontweight("bold" if group is None else "normal")
-    panels[0].invert_yaxis()
+    panels[0].set_ylim(len(rows) - 0.5, -0.5)
     return figure
 
 

@@ -17,6 +17,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -27,7 +28,7 @@ from battery_env.cells import BUNDLED_CELLS, NASA_CITATION, Discharge, load_nasa
 from battery_env.estimates import Estimate
 from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
-from battery_env.forecasts import BAND, FutureLoad, forecast
+from battery_env.forecasts import BAND, forecast
 from battery_env.life import Life, track_life
 from battery_env.loads import Load, RandomPiecewise, RandomWalk
 from battery_env.plotting import COLOURS, coloured, new_figure
@@ -53,21 +54,10 @@ SEEDS = (0, 1)
 LOADS: dict[str, RandomPiecewise | RandomWalk] = {"piecewise": RandomPiecewise(), "random walk": RandomWalk()}
 
 
-def score(
-    record: Record,
-    estimate: Estimate,
-    load: FutureLoad | None,
-    end_s: float,
-    start_s: float,
-    mismatch_V: float,
-    model: RecordModel,
-    cut_off_V: float,
-    samples: int,
-) -> dict[str, float | bool]:
+def score(record: Record, estimate: Estimate, start_s: float, end_s: float, **options: Any) -> dict[str, float | bool]:
     """One forecast against what happened."""
     began_s = perf_counter()
-    found = forecast(record, estimate, load, cut_off_V, model=model, mismatch_V=mismatch_V, samples=samples)
-    low_s, median_s, high_s = found.eod_quantile_s(BAND)
+    low_s, median_s, high_s = forecast(record, estimate, **options).eod_quantile_s(BAND)
     percent = 100.0 / (end_s - start_s)
     return {
         "error_percent": percent * (median_s - end_s),
@@ -81,25 +71,21 @@ def score(
 def real_rows(cell: str, discharges: list[Discharge], life: Life, every: int, samples: int) -> list[dict[str, object]]:
     """The discharges of one cell."""
     mismatch_V = MISMATCH_V["real"]
-    kalman = ExtendedKalmanFilter(thermal=True, mismatch_V=mismatch_V, voltage_noise_V=mismatch_V)
+    options = {"cut_off_V": CUT_OFF_V, "model": RecordModel(thermal=True), "mismatch_V": mismatch_V, "samples": samples}
     rows: list[dict[str, object]] = []
     for n in tqdm(range(1, len(discharges), every), desc=cell, unit="discharge", file=sys.stderr):
         record = discharges[n].loaded_part(CUT_OFF_V)
         start_s, end_s = record.time_s[[0, -1]]
         carried = life.after(n).prior_q_mobile_C
+        calibrators = {
+            "Kalman filter, no prior": ExtendedKalmanFilter(thermal=True, mismatch_V=mismatch_V, voltage_noise_V=mismatch_V),
+            "least squares, prior carried on": LeastSquares(thermal=True, mismatch_V=mismatch_V, prior_q_mobile_C=carried),
+        }
         for share in SHARES:
             seen = record.until(start_s + share * (end_s - start_s))
-            for name, calibrator in (
-                ("Kalman filter, no prior", kalman),
-                (
-                    "least squares, prior carried on",
-                    LeastSquares(thermal=True, mismatch_V=mismatch_V, prior_q_mobile_C=carried),
-                ),
-            ):
+            for name, calibrator in calibrators.items():
                 row = {"data": cell, "discharge": n + 1, "share": share, "calibrator": name, "load": "as so far"}
-                fit = calibrator.estimate(seen)
-                measured = (end_s, start_s, mismatch_V, RecordModel(thermal=True), CUT_OFF_V, samples)
-                rows.append(row | score(seen, fit, None, *measured))
+                rows.append(row | score(seen, calibrator.estimate(seen), start_s, end_s, **options))
     return rows
 
 
@@ -108,23 +94,23 @@ def simulated_rows(kind: str, seed: int, count: int, samples: int) -> list[dict[
     data = TrajectoryDataset.generate(("q_mobile", "r_o"), count, LOADS[kind], seed=seed, mismatch=MISMATCH, dt_s=DT_S)
     rng = np.random.default_rng(seed)
     model, mismatch_V = RecordModel(dt_s=DT_S), MISMATCH_V["simulated"]
+    options = {"cut_off_V": model.cell.VEOD, "model": model, "mismatch_V": mismatch_V, "samples": samples}
     rows: list[dict[str, object]] = []
     for n in tqdm(range(count), desc=f"{kind}, seed {seed}", unit="discharge", file=sys.stderr):
         whole = data[n]
         read = SensorErrors(noise_V=NOISE_V).apply(whole, rng)
         prior_C = whole.q_mobile * (1.0 + PRIOR_SD_SHARE * rng.standard_normal())
+        prior = (prior_C, PRIOR_SD_SHARE * prior_C)
+        fit = LeastSquares(dt_s=DT_S, mismatch_V=mismatch_V, voltage_noise_V=NOISE_V, prior_q_mobile_C=prior)
         for share in SHARES:
             stop = int(share * whole.eod_time_s / data.dt_s)
             seen = Samples(read.time_s, read.voltage_V, read.current_A).first(stop + 1)
             rest = Load(data.dt_s * np.arange(len(whole.load) - stop, dtype=np.float64), whole.load[stop:], whole.load_unit)
-            prior = (prior_C, PRIOR_SD_SHARE * prior_C)
-            fit = LeastSquares(dt_s=DT_S, mismatch_V=mismatch_V, voltage_noise_V=NOISE_V, prior_q_mobile_C=prior)
             estimate = fit.estimate(seen)
             for load_name, load in (("known", rest), ("as so far", None)):
                 row = {"data": f"{kind}, seed {seed}", "discharge": n, "share": share}
                 row |= {"calibrator": "least squares, prior", "load": load_name}
-                measured = (whole.eod_time_s, 0.0, mismatch_V, model, model.cell.VEOD, samples)
-                rows.append(row | score(seen, estimate, load, *measured))
+                rows.append(row | score(seen, estimate, 0.0, whole.eod_time_s, load=load, **options))
     return rows
 
 
@@ -198,19 +184,11 @@ def plot(rows: pd.DataFrame, remaining: pd.DataFrame) -> Figure:
             for marker, (_, by_data) in zip("os^v", each.groupby("data", sort=False), strict=False):
                 inside = 100.0 * by_data.groupby("share")["covered"].mean()
                 label = method[0] if title == "real cells" else f"load {method[1]}"
-                axes.plot(
-                    100.0 * inside.index,
-                    inside,
-                    marker=marker,
-                    ms=4,
-                    lw=1.1,
-                    color=colour,
-                    label=label if marker == "o" else None,
-                )
+                shown = label if marker == "o" else None
+                axes.plot(100.0 * inside.index, inside, marker=marker, ms=4, lw=1.1, color=colour, label=shown)
         axes.axhline(100.0 * (BAND[2] - BAND[0]), color="0.4", lw=0.8)
-        axes.set(
-            title=title, xlabel="seen of the discharge (%)", ylabel="ends inside the 90 % interval (%)", ylim=(0.0, 105.0)
-        )
+        axes.set(title=title, xlabel="seen of the discharge (%)", ylim=(0.0, 105.0))
+        axes.set_ylabel("ends inside the 90 % interval (%)")
         axes.grid(alpha=0.25)
         axes.legend(frameon=False, fontsize=8, loc="lower center")
     for axes, (cell, part) in zip(below, remaining.groupby("cell"), strict=False):
@@ -230,7 +208,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = command_line("forecasts", __doc__, jobs=None)
     parser.add_argument("--cells", nargs="*", default=list(BUNDLED_CELLS), choices=BUNDLED_CELLS)
     parser.add_argument("--every", type=positive, default=12, help="each how many-th real discharge is forecast")
-    parser.add_argument("--discharges", type=positive, help="how many of each real cell are read")
     parser.add_argument("--simulated", type=natural, default=8, help="simulated discharges of each kind and seed")
     parser.add_argument("--samples", type=positive, default=200, help="of each forecast")
     study = Study(parser, arguments)
@@ -247,7 +224,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     }
     rows, remaining, lives = [], [], {}
     for cell in chosen.cells:
-        discharges = load_nasa_discharges(cell)[: chosen.discharges]
+        discharges = load_nasa_discharges(cell)
         lives[cell] = track_life(discharges, CUT_OFF_V)
         remaining += life_rows(cell, lives[cell])
         rows += real_rows(cell, discharges, lives[cell], chosen.every, chosen.samples)

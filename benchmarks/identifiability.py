@@ -12,6 +12,7 @@ squares makes of records with noise, with errors that do not average out, and wi
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -91,6 +92,11 @@ def _discharge(load: Callable[[FloatArray], FloatArray], **changes: float) -> Tr
 def beginning(record: Trajectory, share: float) -> Trajectory:
     """What has been seen of a discharge."""
     return record.part(0, round(share * len(record.time_s)))
+
+
+def error_percent(estimate: Estimate, name: str) -> float:
+    """How far an estimate is from the aged cell."""
+    return PERCENT * float(getattr(estimate, name) / getattr(TRUE, name) - 1.0)
 
 
 def conservation_table() -> pd.DataFrame:
@@ -260,11 +266,8 @@ def faults_table() -> pd.DataFrame:
             fit = LeastSquares(free, cell=NEW_CELL.replace(**held))
             for share in FINE_SHARES:
                 estimate = fit.estimate(beginning(record, share))
-                row: dict[str, float | str] = {"load": load, "fault": name, "seen_percent": PERCENT * share}
-                for parameter in PARAMETER_NAMES:
-                    error = getattr(estimate, parameter) / getattr(TRUE, parameter) - 1.0
-                    row[f"{parameter}_error_percent"] = PERCENT * error if parameter in free else np.nan
-                rows.append(row)
+                errors = {f"{each}_error_percent": error_percent(estimate, each) for each in free}
+                rows.append({"load": load, "fault": name, "seen_percent": PERCENT * share, **errors})
     return pd.DataFrame(rows)
 
 
@@ -279,9 +282,9 @@ def offsets_table(records: dict[str, Trajectory]) -> pd.DataFrame:
             trace = ExtendedKalmanFilter(voltage_noise_V=OFFSET_NOISE_V, offset_sd_V=offset_sd_V).trace([seen])[0]
             for share in SHARES:
                 at = round(share * len(trace.time_s)) - 1
-                row = {"load": load, "offset_sd_V": offset_sd_V, "seen_percent": PERCENT * share}
-                errors = {name: getattr(trace, name)[at] / getattr(TRUE, name) - 1.0 for name in PARAMETER_NAMES}
-                rows.append(row | {f"{name}_error_percent": PERCENT * error for name, error in errors.items()})
+                estimate = Estimate(trace.q_mobile[at], trace.r_o[at])
+                errors = {f"{each}_error_percent": error_percent(estimate, each) for each in PARAMETER_NAMES}
+                rows.append({"load": load, "offset_sd_V": offset_sd_V, "seen_percent": PERCENT * share, **errors})
     return pd.DataFrame(rows)
 
 
@@ -317,7 +320,7 @@ def priors_table(record: Trajectory) -> pd.DataFrame:
                         "expected_mismatch_V": mismatch_V,
                         "prior": name,
                         "seen_percent": PERCENT * share,
-                        "q_mobile_error_percent": PERCENT * (estimate.q_mobile / TRUE.q_mobile - 1.0),
+                        "q_mobile_error_percent": error_percent(estimate, "q_mobile"),
                         "q_mobile_sd_percent": PERCENT * estimate.sd_q_mobile / TRUE.q_mobile,
                         "settled": estimate.settled,
                     }
@@ -468,12 +471,6 @@ def plot_faults(faults: pd.DataFrame) -> Figure:
     return figure
 
 
-def _as_shown(table: pd.DataFrame, columns: dict[str, str]) -> pd.DataFrame:
-    """For readers: columns by their titles, each a template that a row fills in."""
-    rows = table.to_dict("records")
-    return pd.DataFrame([{title: template.format_map(row) for title, template in columns.items()} for row in rows])
-
-
 def _at_shares(table: pd.DataFrame, column: str, digits: int = 1, sign: str = "+") -> str:
     """One column at ``SHARES``."""
     rows = table[np.isclose(table["seen_percent"].to_numpy()[:, None], PERCENT * np.array(SHARES)).any(axis=1)]
@@ -497,7 +494,7 @@ def _shown_within(table: pd.DataFrame) -> pd.DataFrame:
 
 def _shown_loads(table: pd.DataFrame) -> pd.DataFrame:
     rows = []
-    for _, bounds in table[table["noise_V"] == NOISE_V].iterrows():
+    for bounds in table[table["noise_V"] == NOISE_V].to_dict("records"):
         row = {"load": bounds["load"], "unknown": bounds["unknown"]}
         for name, label in SYMBOLS.items():
             values = [bounds[f"{name}_sd_percent_at_{share:.0%}"] for share in SHARES]
@@ -507,37 +504,16 @@ def _shown_loads(table: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def _shown_late(table: pd.DataFrame) -> pd.DataFrame:
-    r_o_percent = [f"{value:#.3g}".rstrip(".") for value in table["r_o_sd_percent"]]
-    columns = {
-        "load": "{load}",
-        "first reading after": "{start_s:.0f} s",
-        "sd of q^max at the end (%)": "{q_mobile_sd_percent:.2g}",
-        "sd of R_o at the end (%)": "{r_o}",
-    }
-    return _as_shown(table.assign(r_o=r_o_percent), columns)
-
-
-def _shown_windows(table: pd.DataFrame) -> pd.DataFrame:
-    columns = {
-        "until": "{seen_percent:.0f} %",
-        f"{EPISODE_STEPS} readings, R_o known": "{episode_alone_percent}",
-        f"{EPISODE_STEPS} readings, R_o unknown": "{episode_joint_percent}",
-        "all so far, R_o known": "{all_so_far_alone_percent}",
-        "all so far, R_o unknown": "{all_so_far_joint_percent}",
-    }
-    errors = {str(name): table[name].map(digits) for name in table.columns[1:]}
-    return _as_shown(table.assign(**errors), columns)
-
-
 def _shown_least_squares(table: pd.DataFrame) -> pd.DataFrame:
-    columns = {"load": "{load}", "noise": "{noise_mV:.0f} mV", "seen": "{seen_percent:.0f} %"}
-    for name, label in SYMBOLS.items():
-        columns[f"{label}: error / bound (%)"] = f"{{{name}_rms_percent:.2g}} / {{{name}_bound_percent:.2g}}"
-        columns[f"{label}: within 2 sd (%)"] = f"{{{name}_within_2_sd_percent:.0f}}"
-    columns |= {"settled (%)": "{settled_percent:.0f}", "worst q^max of these (%)": "{worst}"}
-    worst = [f"{row.q_mobile_worst_settled_percent:.2g}" if row.settled_percent else "" for row in table.itertuples()]
-    return _as_shown(table.assign(noise_mV=1e3 * table["noise_V"], worst=worst), columns)
+    rows = []
+    for found in table.to_dict("records"):
+        row = {"load": found["load"], "noise": f"{1e3 * found['noise_V']:.0f} mV", "seen": f"{found['seen_percent']:.0f} %"}
+        for name, label in SYMBOLS.items():
+            row[f"{label}: error / bound (%)"] = f"{found[f'{name}_rms_percent']:.2g} / {found[f'{name}_bound_percent']:.2g}"
+            row[f"{label}: within 2 sd (%)"] = f"{found[f'{name}_within_2_sd_percent']:.0f}"
+        settled, worst = found["settled_percent"], found["q_mobile_worst_settled_percent"]
+        rows.append(row | {"settled (%)": f"{settled:.0f}", "worst q^max of these (%)": f"{worst:.2g}" if settled else ""})
+    return pd.DataFrame(rows)
 
 
 def _shown_faults(table: pd.DataFrame) -> pd.DataFrame:
@@ -583,45 +559,86 @@ def _shown_minima(table: pd.DataFrame) -> pd.DataFrame:
     rows = []
     for cost, part in table.groupby("cost", sort=False):
         _, start, unit = str(cost).split("_")
-        minima = [f"{row['q_mobile_C']:.0f} C ({row['value']:.2g})" for _, row in part.iterrows()]
+        minima = [
+            f"{q_mobile_C:.0f} C ({value:.2g})" for q_mobile_C, value in zip(part["q_mobile_C"], part["value"], strict=True)
+        ]
         rows.append({"one-step cost in": units[unit], "from": starts[start], "minima (cost there)": ", ".join(minima)})
     return pd.DataFrame(rows)
 
 
+def _row_by_row(table: pd.DataFrame, **columns: tuple[str, Callable[[float], str]]) -> pd.DataFrame:
+    return pd.DataFrame({title: table[name].map(shown) for name, (title, shown) in columns.items()})
+
+
+def _response_row(table: pd.DataFrame) -> pd.DataFrame:
+    shares = zip(table["time_s"], table["share_of_final_percent"], strict=True)
+    row = {"time under load": "effect of R_o on the voltage"}
+    return pd.DataFrame([row | {f"{time_s:.0f} s": f"{percent:.0f} %" for time_s, percent in shares}])
+
+
+def _percent(value: float) -> str:
+    return f"{value:.0f} %"
+
+
+#: The tables as readers see them, by the name of what they show.
+READABLE: tuple[tuple[str, Callable[[pd.DataFrame], pd.DataFrame]], ...] = (
+    (
+        "conservation",
+        partial(
+            _row_by_row,
+            discharges=("discharges", str),
+            samples=("samples", str),
+            q_mobile_worst_relative_error=("largest error of q^max (%)", lambda share: f"{PERCENT * share:.1g}"),
+            r_o_worst_relative_error=("largest error of R_o (%)", lambda share: f"{PERCENT * share:.1g}"),
+        ),
+    ),
+    ("response", _response_row),
+    (
+        "sensitivity",
+        partial(
+            _row_by_row,
+            seen_percent=("seen", _percent),
+            voltage_V=("voltage (V)", "{:.2f}".format),
+            mV_per_percent_of_q_mobile=("1 % more q^max (mV)", "{:+.1f}".format),
+            mV_per_percent_of_r_o=("1 % more R_o (mV)", "{:+.1f}".format),
+            q_mobile_percent_per_10_mV=("10 mV are worth, in q^max (%)", "{:.2g}".format),
+            r_o_percent_per_10_mV=("in R_o (%)", "{:.2g}".format),
+        ),
+    ),
+    ("bounds", _shown_within),
+    ("bounds", _shown_loads),
+    (
+        "late",
+        partial(
+            _row_by_row,
+            load=("load", str),
+            start_s=("first reading after", "{:.0f} s".format),
+            q_mobile_sd_percent=("sd of q^max at the end (%)", "{:.2g}".format),
+            r_o_sd_percent=("sd of R_o at the end (%)", lambda percent: f"{percent:#.3g}".rstrip(".")),
+        ),
+    ),
+    ("offsets", _shown_offsets),
+    (
+        "windows",
+        partial(
+            _row_by_row,
+            seen_percent=("until", _percent),
+            episode_alone_percent=(f"{EPISODE_STEPS} readings, R_o known", digits),
+            episode_joint_percent=(f"{EPISODE_STEPS} readings, R_o unknown", digits),
+            all_so_far_alone_percent=("all so far, R_o known", digits),
+            all_so_far_joint_percent=("all so far, R_o unknown", digits),
+        ),
+    ),
+    ("least_squares", _shown_least_squares),
+    ("faults", _shown_faults),
+    ("priors", _shown_priors),
+    ("minima", _shown_minima),
+)
+
+
 def summary(tables: Tables) -> str:
     """The tables as readers see them, as Markdown."""
-    response = tables["response"]
-    shares = {f"{row['time_s']:.0f} s": f"{row['share_of_final_percent']:.0f} %" for _, row in response.iterrows()}
-    conservation = {
-        "discharges": "{discharges:.0f}",
-        "samples": "{samples:.0f}",
-        "largest error of q^max (%)": "{q_mobile_percent:.1g}",
-        "largest error of R_o (%)": "{r_o_percent:.1g}",
-    }
-    sensitivity = {
-        "seen": "{seen_percent:.0f} %",
-        "voltage (V)": "{voltage_V:.2f}",
-        "1 % more q^max (mV)": "{mV_per_percent_of_q_mobile:+.1f}",
-        "1 % more R_o (mV)": "{mV_per_percent_of_r_o:+.1f}",
-        "10 mV are worth, in q^max (%)": "{q_mobile_percent_per_10_mV:.2g}",
-        "in R_o (%)": "{r_o_percent_per_10_mV:.2g}",
-    }
-    worst = {f"{name}_percent": PERCENT * tables["conservation"][f"{name}_worst_relative_error"] for name in PARAMETER_NAMES}
-    readable = [
-        _as_shown(tables["conservation"].assign(**worst), conservation),
-        pd.DataFrame([{"time under load": "effect of R_o on the voltage"} | shares]),
-        _as_shown(tables["sensitivity"], sensitivity),
-        _shown_within(tables["bounds"]),
-        _shown_loads(tables["bounds"]),
-        _shown_late(tables["late"]),
-        _shown_offsets(tables["offsets"]),
-        _shown_windows(tables["windows"]),
-        _shown_least_squares(tables["least_squares"]),
-        _shown_faults(tables["faults"]),
-        _shown_priors(tables["priors"]),
-        _shown_minima(tables["minima"]),
-    ]
-    return "\n".join(markdown(table) for table in readable)
+    return "\n".join(markdown(shown(tables[name])) for name, shown in READABLE)
 
 
 #: By name, what makes each table, from the discharges and how often noise is drawn.
