@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from battery_env import ExtendedKalmanFilter, LeastSquares, fit_cell, load_nasa_discharges
-from battery_env.__main__ import NOT_SETTLED, SETTLED, calibrate
+from battery_env.app.command_line import NOT_SETTLED, SETTLED, calibrate
 from battery_env.cells import Discharge
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate
 from battery_env.estimators.rest import rest_voltages_V, told_at_rest
