@@ -30,9 +30,9 @@ from tqdm import tqdm
 
 import battery_env
 import sb3_lac
+from battery_env.app.many import workers
 from battery_env.evaluation import over_seeds
 from battery_env.files import check_folder, replacing
-from battery_env.parallel import cluster, processes
 from battery_env.plotting import new_figure, save_figure
 
 Result = TypeVar("Result")
@@ -44,8 +44,6 @@ SYMBOLS = {"q_mobile": "q^max", "r_o": "R_o"}
 #: Seed of evaluations; no training seed comes close.
 EVALUATION_SEED = 10_000
 
-# what parts are made by
-_CODE = ("battery_env", "sb3_lac", "benchmarks")
 _PACKAGES = ("torch", "stable_baselines3", "gymnasium", "numpy", "numba", "scipy", "pandas", "rl_zoo3", "progpy")
 
 
@@ -233,9 +231,9 @@ class Study:
         if self.scheduler is not None:
             self.out = self.out.absolute()  # workers are elsewhere
             try:
-                with cluster(self.scheduler, _CODE):
+                with workers(scheduler=self.scheduler):
                     pass
-            except (ImportError, OSError, RuntimeError) as error:
+            except (ImportError, OSError) as error:
                 parser.error(str(error))
 
     def run(self, part: Callable[..., Tables], parts: Sequence[Mapping[str, Any]], **places: Any) -> dict[str, pd.DataFrame]:
@@ -269,13 +267,12 @@ class Study:
         """
         Call a function with each of several arguments, with a progress bar: on the cluster, or as many at the same time as
         was chosen, in processes of their own, or all in this one if one at a time. A call that fails stops no other; its
-        error is raised when all are done. A call whose process is lost is made again. An interruption ends the program with
-        a word on what is done.
+        error is raised when all are done. An interruption ends the program with a word on what is done.
         """
         results: dict[int, Result] = {}
         errors = []
         try:
-            with closing(self._calls(function, runs, shared=keep is None)) as calls:
+            with closing(self._calls(function, runs)) as calls:
                 for number, result in tqdm(calls, desc="parts", total=len(runs), disable=None):
                     try:
                         results[number] = result()
@@ -291,19 +288,14 @@ class Study:
         return [results[number] for number in range(len(runs))]
 
     def _calls(
-        self, function: Callable[..., Result], runs: Sequence[tuple[Any, ...]], shared: bool
+        self, function: Callable[..., Result], runs: Sequence[tuple[Any, ...]]
     ) -> Generator[tuple[int, Callable[[], Result]]]:
         """The number of each run with what gives its result: as they are done elsewhere, or as they are to be done here."""
         if self.scheduler is None and self.chosen.jobs == 1:
             yield from ((number, partial(function, *run)) for number, run in enumerate(runs))
         elif runs:
-            workers = (
-                processes(self.chosen.jobs)
-                if self.scheduler is None
-                else cluster(self.scheduler, _CODE, self.out if shared else None)
-            )
-            with workers as submit:
-                numbers = {submit(importable(function), *run): number for number, run in enumerate(runs)}
+            with workers(self.chosen.jobs, self.scheduler) as executor:
+                numbers = {executor.submit(importable(function), *run): number for number, run in enumerate(runs)}
                 for future in as_completed(numbers):
                     yield numbers[future], future.result
 

@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[1]
 
 # each layer may import the ones before it, and itself
 LAYERS = (
-    ("battery_env.arrays", "battery_env.files", "battery_env.parallel"),
+    ("battery_env.arrays", "battery_env.files"),
     ("battery_env.checks",),
     ("battery_env.columns",),
     ("battery_env.tables",),
@@ -38,9 +38,10 @@ LAYERS = (
     ("battery_env.forecasts",),
     ("battery_env.life",),
     ("battery_env.callbacks",),
-    ("battery_env.summary",),
-    ("battery_env.fleet",),
-    ("battery_env.__main__",),
+    ("battery_env.app.calibrate",),
+    ("battery_env.app.many",),
+    ("battery_env.app.command_line",),
+    ("battery_env.app", "battery_env.__main__"),
 )
 
 

@@ -18,7 +18,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from battery_env.__main__ import NOT_SETTLED, REFUSED, SETTLED, calibrate
+from battery_env.app.command_line import NOT_SETTLED, REFUSED, SETTLED, calibrate
 from battery_env.calibration.policy import PolicyEstimator
 from battery_env.calibration.pretrained import pretrained_ids
 from battery_env.calibration.voltage import ESTIMATE_RANGES

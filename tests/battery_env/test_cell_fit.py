@@ -20,6 +20,7 @@ from battery_env import (
     forecast,
     load_nasa_discharges,
 )
+from battery_env.app.calibrate import METHODS, Settings, calibrate
 from battery_env.calibration.pretrained import pretrained_card
 from battery_env.cells import Discharge
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate, voltage
@@ -32,7 +33,6 @@ from battery_env.estimators.cell_fit import (
     with_equilibrium,
 )
 from battery_env.plotting import plot_cell_fit
-from battery_env.summary import METHODS, Settings, summarize
 
 FIELDS = ("cell", "constants", "discharges", "mismatch_V", "thermal")
 OTHER = with_equilibrium(NEW_CELL, [0.02, -0.03, 0.02]).replace(kn=1000.0, tDiffusion=9e6, to=10.0, tsn=600.0, VEOD=2.7)
@@ -247,15 +247,15 @@ class TestFiles:
         policy.write_bytes(files("battery_env.pretrained_policies").joinpath("BatteryVoltageJoint-v0.onnx").read_bytes())
         policy.with_suffix(".json").write_text(json.dumps({"options": card["options"]}))
         with pytest.raises(ValueError, match=r"mine\.onnx has learned on a new 18650, or the file beside it does not say"):
-            Settings.for_cell(fit, method="policy", policy=policy)
+            Settings.for_cell(fit, method="policy", policy=policy).calibrator()
         options = {**card["options"], "cell": dataclasses.asdict(fit.cell)}
         policy.with_suffix(".json").write_text(json.dumps({"options": options}))
         for cell in ({}, {"cell": OTHER}):
             with pytest.raises(ValueError, match=r"mine\.onnx has learned on the constants of a cell, which are others"):
-                Settings(method="policy", policy=policy, **cell)
+                Settings(method="policy", policy=policy, **cell).calibrator()
         settings = Settings.for_cell(fit, method="policy", policy=policy)
         record = discharged(fit.cell, 6000.0, 0.15, pulses(7)).loaded_part(fit.cell.VEOD)
-        row = summarize(record, settings).row
+        row = calibrate(record, settings).row()
         own = PolicyEstimator(OnnxPolicy(policy), "BatteryVoltageJoint-v0", cell=fit.cell, **card["options"])
         assert settings.cut_off_V == fit.cell.VEOD
         assert row["q_mobile_C"] == own.estimate(record).q_mobile != PolicyEstimator.pretrained().estimate(record).q_mobile

@@ -1,7 +1,8 @@
 import json
 import subprocess
 import sys
-from concurrent.futures import BrokenExecutor, Future
+import time
+from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
@@ -11,14 +12,15 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from battery_env import fleet
-from battery_env.__main__ import calibrate, main
+from battery_env.app import many
+from battery_env.app.calibrate import Settings
+from battery_env.app.calibrate import calibrate as calibrated
+from battery_env.app.command_line import calibrate, main
 from battery_env.calibration.policy import PolicyEstimator
 from battery_env.cells import Discharge, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, CellParameters, initial_state, simulate
 from battery_env.estimators.cell_fit import fit_cell, read_cell
 from battery_env.estimators.least_squares import LeastSquares
-from battery_env.summary import Settings, summarize
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +88,7 @@ def test_a_file_of_constants_takes_the_place_of_the_new_cell(recorded, tmp_path,
 def test_a_future_current_is_that_of_a_discharge_in_progress_only(recorded):
     records = (recorded, recorded.until(2000.0))
     plain, slow = (
-        [summarize(each, Settings(cell=NEW_CELL, future_current_A=current_A)).row for each in records]
+        [calibrated(each, Settings(cell=NEW_CELL, future_current_A=current_A)).row() for each in records]
         for current_A in (None, 0.5)
     )
     assert slow[0]["state_of_health"] == plain[0]["state_of_health"] and slow[0]["nominal_Ah"] == plain[0]["nominal_Ah"]
@@ -183,14 +185,14 @@ def test_the_end_is_as_unsure_as_the_voltage_at_the_cut_off(parameters):
     true = simulate(2.0, 6000.0, NEW_CELL.r_o, load_unit="current", thermal=True, cut_off_V=2.7)
     record = Discharge(true.time_s[:1200], true.voltage_V[:1200], true.current_A[:1200])
     settings = Settings(parameters=parameters, cut_off_V=3.5, prior_q_mobile_C=(6000.0, 20.0))
-    row = summarize(record, settings).row
+    row = calibrated(record, settings).row()
     assert row["q_mobile_C"] == pytest.approx(6000.0, rel=1e-3)
     off_V = np.hypot(0.05, 2.0 * row["sd_r_o_ohm"]) if "r_o" in parameters else 0.05
     early_s, late_s = np.interp([-3.5 - off_V, -3.5 + off_V], -true.voltage_V, true.time_s)
     expected_s = np.hypot(row["sd_q_mobile_C"] / 2.0, 0.5 * (late_s - early_s))
     assert row["sd_predicted_eod_time_s"] == pytest.approx(expected_s, rel=0.02)
     assert expected_s > 5.0 * row["sd_q_mobile_C"] / 2.0
-    assert summarize(record, replace(settings, cut_off_V=2.7)).row["sd_predicted_eod_time_s"] < 0.3 * expected_s
+    assert calibrated(record, replace(settings, cut_off_V=2.7)).row()["sd_predicted_eod_time_s"] < 0.3 * expected_s
 
 
 def test_a_discharge_in_progress_has_not_ended_in_a_pulse_before():
@@ -199,7 +201,7 @@ def test_a_discharge_in_progress_has_not_ended_in_a_pulse_before():
     for count in (3500, 3726):  # in a pause, in a pulse
         record = Discharge(true.time_s[:count], true.voltage_V[:count], true.current_A[:count])
         # the resistance of the new cell is too large, so that the model comes below the cut-off where the record does not
-        row = summarize(record, Settings(parameters=("q_mobile",), cut_off_V=3.0, prior_q_mobile_C=(6000.0, 10.0))).row
+        row = calibrated(record, Settings(parameters=("q_mobile",), cut_off_V=3.0, prior_q_mobile_C=(6000.0, 10.0))).row()
         assert record.voltage_V.min() > 3.02 and np.isnan(row["measured_eod_time_s"])
         assert row["remaining_s"] == row["predicted_eod_time_s"] - record.time_s[-1] > 100.0
         assert row["predicted_capacity_Ah"] > row["drawn_Ah"] + 0.03
@@ -265,8 +267,6 @@ def test_a_number_of_processes_that_cannot_be_is_refused(jobs, capsys):
         main(["calibrate", "B0005:1", f"--jobs={jobs}"])
     assert stopped.value.code == 2
     assert f"--jobs: expected a number of processes, 1 or more, or -1 for one a core, got '{jobs}'" in capsys.readouterr().err
-    with pytest.raises(ValueError, match="jobs must be at least 1, or -1"):
-        next(fleet.calibrate_all([], fleet.Reading(), Settings(), jobs=0))
 
 
 def test_a_wild_voltage_is_refused_with_its_time(recorded, tmp_path, capsys):
@@ -312,14 +312,14 @@ def test_nor_where_the_clock_jumps_under_load(method, recorded):
             for name in ("time_s", "voltage_V", "current_A", "temperature_C")
         },
     )
-    plain, jumped_row, lost_row = (summarize(each, Settings(method=method)).row for each in (recorded, jumped, lost))
+    plain, jumped_row, lost_row = (calibrated(each, Settings(method=method)).row() for each in (recorded, jumped, lost))
     assert np.isnan(jumped_row["capacity_Ah"]) and np.isnan(jumped_row["state_of_health"]) and not jumped_row["settled"]
     assert lost_row["settled"] and lost_row["capacity_Ah"] == pytest.approx(plain["capacity_Ah"], rel=1e-3)
 
 
 @pytest.mark.parametrize("method", ["least-squares", "kalman"])
 def test_a_rest_that_is_seldom_logged_moves_nothing_and_missing_samples_are_refused(method, recorded, tmp_path, capsys):
-    plain = summarize(recorded, Settings(method=method)).row
+    plain = calibrated(recorded, Settings(method=method)).row()
 
     def with_rest(rest_s: list[float]) -> list[str]:
         columns = [
@@ -441,34 +441,32 @@ def test_a_fleet_side_by_side_is_the_same_as_one_after_the_other(where, lab, tmp
     assert written == {path.name: path.read_bytes() for path in many.iterdir()} and "cell_2_voltage.png" in written
 
 
-def test_a_file_whose_worker_is_lost_is_refused_and_stops_nothing():
-    def submit(function, *arguments):
-        future = Future()
-        if arguments[1] == "bad":
+class Loses(ThreadPoolExecutor):
+    """Loses the worker of one call, and is slow with another one."""
+
+    def submit(self, function, *arguments):
+        if "life_002" in str(arguments):
+            future = Future()
             future.set_exception(BrokenExecutor("the worker died"))
-        else:
-            future.set_result(function(*arguments))
-        return future
+            return future
+        return super().submit(self.slowly if "life_001" in str(arguments) else self.at_once, function, *arguments)
 
-    calls = [("good",), ("bad",), ("better",)]
-    found = list(fleet._side_by_side(submit, 2, str.upper, calls))
-    assert [call for call, _ in found] == calls
-    assert [outcome.result for _, outcome in found] == ["GOOD", None, "BETTER"]
-    assert [outcome.error for _, outcome in found] == ["", "BrokenExecutor: the worker died", ""]
+    @staticmethod
+    def slowly(function, *arguments):
+        time.sleep(0.2)
+        return function(*arguments)
+
+    @staticmethod
+    def at_once(function, *arguments):
+        return function(*arguments)
 
 
-def test_results_keep_their_order_whatever_finishes_first():
-    futures = []
-
-    def submit(*call):
-        futures.append(Future())
-        if len(futures) == 4:  # the first one is what the others wait for
-            for number, future in reversed(list(enumerate(futures))):
-                future.set_result(fleet._Outcome(number, [], ""))
-        return futures[-1]
-
-    found = fleet._side_by_side(submit, 3, str, [(number,) for number in range(4)])
-    assert [(call[0], outcome.result) for call, outcome in found] == [(number, number) for number in range(4)]
+def test_a_lost_worker_stops_no_other_and_results_keep_their_order(lab):
+    sources = many.find_sources([f"{lab}/life.csv"])
+    with Loses(2) as executor:
+        found = list(many.calibrate_all(sources, many.FileFormat(), Settings(), executor=executor))
+    assert [each.record for each in found] == ["life_001", "life_002", "life_003"]
+    assert [each.error for each in found] == ["", "life_002: BrokenExecutor: the worker died", ""]
 
 
 def test_a_cluster_needs_an_extra_and_a_scheduler(monkeypatch, capsys):
@@ -495,16 +493,16 @@ def test_results_among_the_records_are_no_records(recorded, tmp_path, capsys):
         assert [json.loads(line)["record"] for line in lines] == ["cell", "own_voltage"]
     assert main(["calibrate", f"{tmp_path}/cell.csv", "--json", "--table-only", "--out", str(tmp_path)]) == 0
     assert (tmp_path / "cell_estimate.csv").exists() and (tmp_path / "own_voltage_voltage.csv").exists()
-    assert [Path(source.path).stem for source in fleet.find_sources([str(tmp_path)])] == ["cell", "own_voltage"]
+    assert [Path(source.path).stem for source in many.find_sources([str(tmp_path)])] == ["cell", "own_voltage"]
 
 
 def test_what_was_done_before_an_interruption_is_kept(lab, tmp_path, monkeypatch, capsys):
     def interrupted(discharge, settings):
         if discharge.meta["cycle"] == 2:
             raise KeyboardInterrupt
-        return summarize(discharge, settings)
+        return calibrated(discharge, settings)
 
-    monkeypatch.setattr(fleet, "summarize", interrupted)
+    monkeypatch.setattr(many, "calibrate", interrupted)
     assert main(["calibrate", f"{lab}/life.csv", "--out", str(tmp_path), "--table-only"]) == 130
     assert "interrupted" in capsys.readouterr().err
     assert list(pd.read_csv(tmp_path / "life_estimate.csv")["record"]) == ["life_001"]
@@ -555,7 +553,7 @@ def test_runs_as_a_module():
 def test_the_filter_follows_the_measured_temperature_unless_another_one_is_stated(recorded):
     def r_o(temperature_C, **more):
         record = Discharge(recorded.time_s, recorded.voltage_V, recorded.current_A, temperature_C)
-        return summarize(record, Settings(method="kalman", **more)).row["r_o_ohm"]
+        return calibrated(record, Settings(method="kalman", **more)).row()["r_o_ohm"]
 
     warming_C = np.linspace(20.0, 40.0, len(recorded.time_s))
     measured, stated, held = (r_o(warming_C, **more) for more in ({}, {"ambient_C": 20.0}, {"thermal": False}))

@@ -1,17 +1,13 @@
 """Parts are made once and side by side, files say what made them, and numbers read well."""
 
 import argparse
-import contextlib
 import json
 import operator
 import os
-import signal
-import subprocess
 import sys
 import time
 from concurrent.futures import BrokenExecutor
 from importlib.util import find_spec
-from pathlib import Path
 from types import FunctionType, ModuleType
 
 import numpy as np
@@ -106,75 +102,20 @@ def test_a_call_that_fails_stops_no_other(tmp_path, capsys):
 
 
 def dies_once(number, place):
-    with (place / f"tries_{number}").open("a") as tries:
-        tries.write("x")
-    if number == 1 and (place / "tries_1").stat().st_size == 1:
+    if number == 1 and not (place / "died").exists():
+        (place / "died").touch()
         os._exit(1)
-    return number
+    return {"example": pd.DataFrame([{"number": number}])}
 
 
-@pytest.mark.filterwarnings("ignore:The process of a call was lost")
-def test_calls_of_a_lost_process_are_made_again(tmp_path):
-    assert a_study(tmp_path / "out", jobs=2).each(dies_once, [(number, tmp_path) for number in range(4)]) == [0, 1, 2, 3]
-    assert [(tmp_path / f"tries_{number}").stat().st_size for number in range(4)] == [1, 2, 1, 1]
+def test_after_a_lost_process_the_same_command_makes_what_is_missing(tmp_path):
+    def run():
+        parts = [{"number": number} for number in range(4)]
+        return a_study(tmp_path / "out", jobs=2).run(dies_once, parts, place=tmp_path)["example"]
 
-
-def dies_always_or(number):
-    if number == 1:
-        os._exit(1)
-    return number
-
-
-@pytest.mark.filterwarnings("ignore:The process of a call was lost")
-def test_a_call_that_always_loses_its_process_stops_no_other(tmp_path):
-    kept = {}
     with pytest.raises(BrokenExecutor):
-        a_study(tmp_path, jobs=2).each(dies_always_or, [(number,) for number in range(6)], kept.__setitem__)
-    assert kept == {number: number for number in (0, 2, 3, 4, 5)}
-
-
-def breaks_a_pool_of_its_own(place):
-    with (place / "tries").open("a") as tries:
-        tries.write("x")
-    raise BrokenExecutor("not that of the call")
-
-
-def test_an_error_of_the_call_itself_is_no_lost_process(tmp_path):
-    with pytest.raises(BrokenExecutor, match="not that of the call"):
-        a_study(tmp_path, jobs=2).each(breaks_a_pool_of_its_own, [(tmp_path,)])
-    assert (tmp_path / "tries").stat().st_size == 1
-
-
-@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="asks Linux who is running")
-def test_processes_end_with_the_one_that_started_them(tmp_path):
-    program = (
-        "import os, signal, sys, time\n"
-        "from pathlib import Path\n"
-        "from battery_env.parallel import processes\n"
-        "if __name__ == '__main__':\n"
-        "    with processes(1) as submit:\n"
-        "        Path(sys.argv[1]).write_text(str(submit(os.getpid).result()))\n"
-        "        submit(time.sleep, 60)\n"
-        "        os.kill(os.getpid(), signal.SIGKILL)\n"
-    )
-    (tmp_path / "program.py").write_text(program)
-    subprocess.run([sys.executable, tmp_path / "program.py", tmp_path / "worker"], check=False, timeout=60)
-    worker = int((tmp_path / "worker").read_text())
-    try:
-        deadline = time.monotonic() + 20
-        while time.monotonic() < deadline and _is_running(worker):
-            time.sleep(0.05)
-        assert not _is_running(worker)
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(worker, signal.SIGKILL)
-
-
-def _is_running(process):
-    try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except (FileNotFoundError, ProcessLookupError):
-        return False
+        run()
+    assert run()["number"].tolist() == [0, 1, 2, 3]
 
 
 @pytest.mark.parametrize("out", ["file", "file/below"])

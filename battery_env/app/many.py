@@ -3,31 +3,28 @@
 from __future__ import annotations
 
 import io
-import os
+import multiprocessing
 import re
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future
-from contextlib import ExitStack
-from dataclasses import dataclass
-from functools import partial
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import pandas as pd
 
+from battery_env.app.calibrate import Calibration, Settings, calibrate, title_of
 from battery_env.cells import BUNDLED_CELLS, load_nasa_discharges
 from battery_env.files import check_folder, replacing
-from battery_env.parallel import Submit, cluster, processes
 from battery_env.record_files import Recording, read_recordings
-from battery_env.summary import Settings, Summary, summarize
 from battery_env.tables import BINARY_SUFFIXES, PACKED_SUFFIXES, TEXT_SUFFIXES, is_readable
 
 _NASA_SUFFIX = ".mat"
-# Calls under way at the same time on a cluster, whose workers come and go.
-_ON_A_CLUSTER = 64
+# A scheduler that is there answers within milliseconds.
+_PATIENCE_S = 5
 # What NASA's discharges have beside them, in the layout of the bundled ones, is a table of tests and no record.
 _NO_RECORDS = ("cycles.csv",)
 # Results that an earlier command wrote among the records: tables, and voltages, which have their figure beside them.
@@ -54,9 +51,9 @@ class Source(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Reading:
+class FileFormat:
     """
-    How files are read, see :func:`battery_env.record_files.read_discharges`.
+    What files do not tell of themselves, see :func:`battery_env.record_files.read_discharges`.
 
     :param columns: by quantity, the name of its column
     :param units: by quantity, its unit
@@ -106,7 +103,7 @@ def _stem(path: Path) -> str:
     return name
 
 
-def read_source(source: Source, reading: Reading) -> list[Recording]:
+def read_source(source: Source, file_format: FileFormat) -> list[Recording]:
     """Read what a source names."""
     path, cycle = source.path, source.cycle
     if path in BUNDLED_CELLS and not Path(path).exists():
@@ -122,7 +119,7 @@ def read_source(source: Source, reading: Reading) -> list[Recording]:
             f"no file {source.argument!r}; the bundled cells are given as {BUNDLED_CELLS[0]}:1, {BUNDLED_CELLS[0]}:2, ..."
         )
     else:
-        recordings = read_recordings(path, reading.columns, reading.units, reading.discharge_is_negative)
+        recordings = read_recordings(path, file_format.columns, file_format.units, file_format.discharge_is_negative)
     if cycle is None:
         return recordings
     chosen = [recording for recording in recordings if recording.meta.get("cycle") == cycle]
@@ -175,9 +172,9 @@ class Results:
             with replacing(self.folder / f"{name}{_VOLTAGE}.{suffix}") as part:
                 part.write_bytes(content)
 
-    def write_table(self, rows: Sequence[Mapping[str, Any]]) -> list[Path]:
+    def write_table(self, outcomes: Sequence[Outcome]) -> list[Path]:
         """Write the table of all discharges and, if there are several, the figure of their parameters over them."""
-        table = pd.DataFrame(rows).astype({"cycle": "Int64"})
+        table = pd.DataFrame([each.row() for each in outcomes]).astype({"cycle": "Int64"})
         table["settled"] = table["settled"].astype("boolean")
         with replacing(self.table) as part:
             table.to_csv(part, index=False)
@@ -195,49 +192,123 @@ class Results:
         return written
 
 
+@dataclass(frozen=True)
+class Outcome:
+    """
+    What became of one discharge, or of a source that could not be read.
+
+    :param record: what it is called in results
+    :param source: file or bundled cell
+    :param cell: stem of the source
+    :param cycle: number of the discharge; ``None`` if it has none
+    :param found: what it says; ``None`` if it could not be used
+    :param notes: warnings
+    :param error: why it could not be used, empty otherwise
+    """
+
+    record: str
+    source: str
+    cell: str
+    cycle: int | None
+    found: Calibration | None = None
+    notes: str = ""
+    error: str = ""
+
+    def row(self) -> dict[str, Any]:
+        """The columns of the table by name."""
+        told = {"record": self.record, "source": self.source, "cell": self.cell, "cycle": self.cycle}
+        return told | (self.found.row() if self.found else {}) | {"notes": self.notes, "error": self.error}
+
+
+class InThisProcess(Executor):
+    """Makes each call at once."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Make a call."""
+        future: Future[Any] = Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+@contextmanager
+def workers(jobs: int = 1, scheduler: str | None = None) -> Iterator[Executor]:
+    """
+    What makes calls side by side. When the block is left, what has not begun is not begun any more.
+
+    :param jobs: processes of this machine; -1: one a core
+    :param scheduler: address of a Dask cluster that is to make them instead
+    :yields: the executor
+    :raises ImportError: for a cluster, if Dask is not installed
+    :raises OSError: if no scheduler answers
+    """
+    if scheduler is not None:
+        try:
+            from distributed import Client
+        except ImportError as error:
+            raise ImportError("--scheduler needs Dask: pip install 'battery_env[cluster]'") from error
+        try:
+            client = Client(scheduler, timeout=_PATIENCE_S, set_as_default=False)
+        except (OSError, ValueError) as error:
+            raise OSError(f"no Dask scheduler at {scheduler!r}: {error}") from error
+        with client:
+            yield client.get_executor(pure=False)
+    elif jobs == 1:
+        yield InThisProcess()
+    else:
+        # spawn: torch does not survive a fork with threads
+        pool = ProcessPoolExecutor(None if jobs == -1 else jobs, mp_context=multiprocessing.get_context("spawn"))
+        try:
+            yield pool
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
 def calibrate_all(
     sources: Sequence[Source],
-    reading: Reading,
+    file_format: FileFormat,
     settings: Settings,
     results: Results | None = None,
-    jobs: int = 1,
-    scheduler: str | None = None,
-) -> Iterator[dict[str, Any]]:
-    """Calibrate the model to the discharges of many files, one after the other or side by side."""
-    with ExitStack() as stack:
-        each: _Each = _one_by_one
-        if scheduler is not None:
-            each = partial(_side_by_side, stack.enter_context(cluster(scheduler, ("battery_env",))), _ON_A_CLUSTER)
-        elif jobs != -1 and jobs < 1:
-            raise ValueError(f"jobs must be at least 1, or -1 for as many as there are cores, got {jobs!r}")
-        elif jobs != 1:
-            jobs = (os.cpu_count() or 1) if jobs == -1 else jobs
-            each = partial(_side_by_side, stack.enter_context(processes(jobs)), 2 * jobs)
-        read = each(read_source, ((source, reading) for source in sources))
-        with_voltages = results is not None and results.with_voltages
-        calls = ((known, recording, settings, with_voltages) for known, recording in _recordings(read))
-        for (known, *_), (calibrated, notes, error) in each(_calibrate, calls):
-            name = known["record"]
-            if results is not None and calibrated is not None:
-                error = _outcome(results.write_voltages, name, calibrated[1]).error
-            if known["error"] or error:
-                yield known | {"error": known["error"] or f"{name}: {error}"}
-            else:
-                told = {column: known[column] for column in ("record", "source", "cell", "cycle")}
-                yield told | calibrated[0] | {"notes": "; ".join(filter(None, [known["notes"], *notes])), "error": ""}
+    executor: Executor | None = None,
+    ahead: int = 64,
+) -> Iterator[Outcome]:
+    """
+    Calibrate the model to the discharges of many files.
+
+    :param sources: what to read
+    :param file_format: how
+    :param settings: of the calibration
+    :param results: files to write; ``None``: none
+    :param executor: what reads and calibrates, any of ``concurrent.futures`` or of Dask; ``None``: one after the other here
+    :param ahead: so many calls are under way at most beyond the one that is waited for, as each holds its data
+    :return: in the order of the sources
+    """
+    executor = executor or InThisProcess()
+    read = _in_order(executor, ahead, read_source, ((source, file_format) for source in sources))
+    with_voltages = results is not None and results.with_voltages
+    calls = ((known, recording, settings, with_voltages) for known, recording in _recordings(read))
+    for (known, *_), attempt in _in_order(executor, ahead, _calibrate, calls):
+        if known.error:
+            yield known
+            continue
+        error = attempt.error
+        if results is not None and not error:
+            error = _attempt(results.write_voltages, known.record, attempt.result[1]).error
+        if error:
+            yield replace(known, error=f"{known.record}: {error}")
+        else:
+            yield replace(known, found=attempt.result[0], notes="; ".join(filter(None, [known.notes, *attempt.notes])))
 
 
-class _Outcome(NamedTuple):
+class _Attempt(NamedTuple):
     result: Any  # None if there is an error
     notes: list[str]
     error: str
 
 
-#: Calls a function with each of many arguments; in their order, the arguments and what became of them.
-_Each = Callable[[Callable[..., Any], Iterable[tuple[Any, ...]]], Iterator[tuple[tuple[Any, ...], _Outcome]]]
-
-
-def _outcome(function: Callable[..., Any], *arguments: Any) -> _Outcome:
+def _attempt(function: Callable[..., Any], *arguments: Any) -> _Attempt:
     result, error = None, ""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -245,37 +316,31 @@ def _outcome(function: Callable[..., Any], *arguments: Any) -> _Outcome:
             result = function(*arguments)
         except Exception as problem:  # of whatever kind, it must not stop the others
             error = _message(problem)
-    return _Outcome(result, [str(each.message) for each in caught], error)
+    return _Attempt(result, [str(each.message) for each in caught], error)
 
 
-def _one_by_one(function: Callable[..., Any], calls: Iterable[tuple[Any, ...]]) -> Iterator[tuple[tuple[Any, ...], _Outcome]]:
-    return ((call, _outcome(function, *call)) for call in calls)
-
-
-def _side_by_side(
-    submit: Submit, ahead: int, function: Callable[..., Any], calls: Iterable[tuple[Any, ...]]
-) -> Iterator[tuple[tuple[Any, ...], _Outcome]]:
-    """As many calls ahead as keep all workers busy, and no more, as each holds its data."""
-    started: deque[tuple[tuple[Any, ...], Future[_Outcome]]] = deque()
+def _in_order(
+    executor: Executor, ahead: int, function: Callable[..., Any], calls: Iterable[tuple[Any, ...]]
+) -> Iterator[tuple[tuple[Any, ...], _Attempt]]:
+    """Each call with what became of it, in their order."""
+    started: deque[tuple[tuple[Any, ...], Future[_Attempt]]] = deque()
     for call in calls:
-        started.append((call, submit(_outcome, function, *call)))
+        started.append((call, executor.submit(_attempt, function, *call)))
         while started and (len(started) > ahead or started[0][1].done()):
             yield _finished(*started.popleft())
     while started:
         yield _finished(*started.popleft())
 
 
-def _finished(call: tuple[Any, ...], future: Future[_Outcome]) -> tuple[tuple[Any, ...], _Outcome]:
+def _finished(call: tuple[Any, ...], future: Future[_Attempt]) -> tuple[tuple[Any, ...], _Attempt]:
     try:
         return call, future.result()
     except Exception as error:  # of the worker
-        return call, _Outcome(None, [], _message(error))
+        return call, _Attempt(None, [], _message(error))
 
 
-def _recordings(
-    read: Iterable[tuple[tuple[Any, ...], _Outcome]],
-) -> Iterator[tuple[dict[str, Any], Recording | None]]:
-    """What was read, with what is known of it before it is calibrated: record, source, cell, cycle, notes, error."""
+def _recordings(read: Iterable[tuple[tuple[Any, ...], _Attempt]]) -> Iterator[tuple[Outcome, Recording | None]]:
+    """What was read, with what is known of it before it is calibrated."""
     used: set[str] = set()
     for (source, _), (recordings, notes, error) in read:
         if error and source.path not in error:
@@ -283,8 +348,7 @@ def _recordings(
         for recording in [None] if error else recordings:
             cycle = source.cycle if recording is None else recording.meta.get("cycle")
             name = _unused(record_name(source.stem, cycle), used)
-            known = {"record": name, "source": source.path, "cell": source.stem, "cycle": cycle}
-            yield known | {"notes": "; ".join(notes), "error": error}, recording
+            yield Outcome(name, source.path, source.stem, cycle, notes="; ".join(notes), error=error), recording
 
 
 def record_name(stem: str, cycle: int | None) -> str:
@@ -309,35 +373,23 @@ def _message(error: Exception) -> str:
 
 
 def _calibrate(
-    known: Mapping[str, Any], recording: Recording | None, settings: Settings, with_voltages: bool
-) -> tuple[dict[str, Any], dict[str, bytes]] | None:
+    known: Outcome, recording: Recording | None, settings: Settings, with_voltages: bool
+) -> tuple[Calibration, dict[str, bytes]] | None:
     """What the discharge says, and its voltages as files; nothing of a source that could not be read."""
     if recording is None:
         return None
-    summary = summarize(recording.discharge(), settings)
-    return summary.row, _voltages(summary, _title(known["record"], summary.row)) if with_voltages else {}
+    found = calibrate(recording.discharge(), settings)
+    files = _voltages(known.record, found) if with_voltages else {}
+    return replace(found, record=None, forecast=None), files
 
 
-def _voltages(summary: Summary, title: str) -> dict[str, bytes]:
+def _voltages(name: str, found: Calibration) -> dict[str, bytes]:
     from battery_env.plotting import plot_discharge  # here, as matplotlib takes long to import
 
-    record, forecast = summary.record, summary.forecast
+    record, forecast = found.record, found.forecast
+    assert record is not None and forecast is not None
     columns = {"time_s": record.time_s, "voltage_V": record.voltage_V, "current_A": record.current_A}
     table = pd.DataFrame(columns | {"model_V": forecast.at_samples_V}).to_csv(index=False)
     picture = io.BytesIO()
-    plot_discharge(record, {"model": forecast}, title).savefig(picture, dpi="figure")
+    plot_discharge(record, {"model": forecast}, title_of(name, found)).savefig(picture, dpi="figure")
     return {"csv": table.encode(), "png": picture.getvalue()}
-
-
-def _title(name: str, row: Mapping[str, Any]) -> str:
-    parts = []
-    for symbol, value, sd, digits, unit in (
-        ("$q^{max}$", row["q_mobile_C"], row["sd_q_mobile_C"], 0, "C"),
-        ("$R_o$", row["r_o_ohm"], row["sd_r_o_ohm"], 4, "$\\Omega$"),
-    ):
-        spread = " (held)" if np.isnan(sd) else f" (sd {sd:.{digits}f})"
-        # a policy states none
-        parts.append(f"{symbol} {value:.{digits}f} {unit}" + ("" if row["method"] == "policy" else spread))
-    state = "settled" if row["settled"] else "not settled"
-    drawn = f"{row['drawn_Ah']:.3f} Ah drawn"
-    return f"{name}: {state}\n" + ", ".join([*parts, drawn, f"RMSE {1e3 * row['voltage_rmse_V']:.0f} mV"])
