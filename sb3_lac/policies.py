@@ -386,29 +386,47 @@ MlpPolicy = LyapunovPolicy
 
 class CnnPolicy(LyapunovPolicy):
     """
-    Policy class (with both actor and critic) for LAC with image observations: a ``LyapunovPolicy`` whose features are those
-    of ``NatureCNN`` by default.
+    Policy class (with both actor and critic) for LAC with image observations.
 
-    :param args: Those of ``LyapunovPolicy``
+    :param observation_space: Observation space
+    :param action_space: Action space
+    :param lr_schedule: Learning rate schedule (could be constant)
     :param features_extractor_class: Features extractor to use.
-    :param kwargs: Those of ``LyapunovPolicy``
+    :param kwargs: The other arguments of ``LyapunovPolicy``
     """
 
-    def __init__(self, *args: Any, features_extractor_class: type[BaseFeaturesExtractor] = NatureCNN, **kwargs: Any) -> None:
-        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        features_extractor_class: type[BaseFeaturesExtractor] = NatureCNN,
+        **kwargs: Any,
+    ):
+        super().__init__(
+            observation_space, action_space, lr_schedule, features_extractor_class=features_extractor_class, **kwargs
+        )
 
 
 class MultiInputPolicy(LyapunovPolicy):
     """
-    Policy class (with both actor and critic) for LAC with dictionary observations: a ``LyapunovPolicy`` whose features are
-    those of ``CombinedExtractor`` by default.
+    Policy class (with both actor and critic) for LAC with dictionary observations.
 
-    :param args: Those of ``LyapunovPolicy``
+    :param observation_space: Observation space
+    :param action_space: Action space
+    :param lr_schedule: Learning rate schedule (could be constant)
     :param features_extractor_class: Features extractor to use.
-    :param kwargs: Those of ``LyapunovPolicy``
+    :param kwargs: The other arguments of ``LyapunovPolicy``
     """
 
     def __init__(
-        self, *args: Any, features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor, **kwargs: Any
-    ) -> None:
-        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor,
+        **kwargs: Any,
+    ):
+        super().__init__(
+            observation_space, action_space, lr_schedule, features_extractor_class=features_extractor_class, **kwargs
+        )
