@@ -244,8 +244,8 @@ class CertificateCallback(LyapunovCallback):
         values = {"holds": np.nan if self.last_report is None else float(self.last_report.holds)}
         for statement in self.STATEMENTS:
             # NaN for a statement that no episode could make
-            made = {} if self.last_certification is None else self.last_certification.statements["at_least"]
-            values[f"{statement}_at_least"] = float(made.get(statement, np.nan))
+            made = None if self.last_certification is None else self.last_certification.statements["at_least"]
+            values[f"{statement}_at_least"] = np.nan if made is None else float(made.get(statement, np.nan))
         return self._log("certificate", {**values, **self._metrics()}, figures)
 
     def _summary(self) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from numbers import Real
 from typing import TYPE_CHECKING
 
 import gymnasium as gym
@@ -210,7 +209,7 @@ def certify(
 
 def check_bound(ultimate_bound: float | None) -> None:
     """Refuse what is no cost to stay within."""
-    if ultimate_bound is not None and not (isinstance(ultimate_bound, Real) and ultimate_bound >= 0):
+    if ultimate_bound is not None and not (isinstance(ultimate_bound, (float, int, np.number)) and ultimate_bound >= 0):
         raise ValueError(f"ultimate_bound={ultimate_bound!r} must be a number of at least 0, or None.")
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from numbers import Real
 
 import numpy as np
 from stable_baselines3.common.vec_env import VecNormalize
@@ -13,6 +12,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_lac.lac import LAC
 
 Observations = np.ndarray | dict[str, np.ndarray]
+_NUMBER = (float, int, np.number)
 
 
 class LyapunovFunction:
@@ -58,11 +58,11 @@ class LyapunovFunction:
         gamma: float = 1.0,
         reward_bound: float | None = None,
     ):
-        if not (isinstance(alpha3, Real) and 0 < alpha3 < math.inf):
+        if not (isinstance(alpha3, _NUMBER) and 0 < alpha3 < math.inf):
             raise ValueError(f"alpha3={alpha3!r} must be greater than 0, and finite.")
-        if not (isinstance(gamma, Real) and 0 <= gamma <= 1):
+        if not (isinstance(gamma, _NUMBER) and 0 <= gamma <= 1):
             raise ValueError(f"gamma={gamma!r} must lie within 0 .. 1.")
-        if reward_bound is not None and not (isinstance(reward_bound, Real) and 0 <= reward_bound < math.inf):
+        if reward_bound is not None and not (isinstance(reward_bound, _NUMBER) and 0 <= reward_bound < math.inf):
             raise ValueError(
                 f"reward_bound={reward_bound!r} must be finite and at least 0, because nothing is paid after a termination, "
                 "or None if no reward is positive."

@@ -162,7 +162,7 @@ def _evaluation_env(policy: PolicyPredictor, env: gym.Env | VecEnv, with_rewards
         # A controller that knows nothing of images and their channels
         return vec_env
     space = vec_env.observation_space
-    parts = space.spaces.values() if isinstance(space, spaces.Dict) else [space]
+    parts: list[Any] = list(space.spaces.values()) if isinstance(space, spaces.Dict) else [space]
     channels_last = any(is_image_space(part) and not is_image_space_channels_first(part) for part in parts)
     if channels_last and not is_vecenv_wrapped(vec_env, VecTransposeImage):
         vec_env = VecTransposeImage(vec_env)
@@ -192,7 +192,7 @@ def vectorized(env: gym.Env | VecEnv) -> VecEnv:
         raise ValueError(f"{env} is a vector environment of Gymnasium: pass sb3_lac.GymnasiumVecEnv(env).")
     if not isinstance(env, (gym.Env, VecEnv)):
         raise ValueError(f"env={env!r} is no environment: pass that of gym.make(id), or a VecEnv.")
-    return env if isinstance(env, VecEnv) else DummyVecEnv([lambda: env])  # type: ignore[list-item, return-value]
+    return env if isinstance(env, VecEnv) else DummyVecEnv([lambda: env])
 
 
 def _share_environments(env: VecEnv, other: VecEnv) -> bool:

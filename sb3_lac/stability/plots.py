@@ -228,7 +228,7 @@ def plot_phase(
         (died, "died", 28, VERMILION, "x"),
     ):
         label = f"end, {label} ({np.sum(chosen)})"
-        axes.scatter(*ends[chosen].T, s=size, color=colour, marker=marker, label=label, zorder=3)
+        axes.scatter(ends[chosen, 0], ends[chosen, 1], s=size, color=colour, marker=marker, label=label, zorder=3)
     figure.legend(loc="outside lower center", ncols=2, fontsize=8)
     axes.set(title=f"Trajectories of {len(episodes)} episodes", **labels)
     return figure

@@ -80,7 +80,7 @@ class _Actor:
         given = {name: known[name] for name in self.asked}
         if self.masked:
             given["action_masks"] = np.stack(self.env.env_method("action_masks"))
-        predicted = self.policy.predict(observations, deterministic=self.deterministic, **given)  # type: ignore[arg-type]
+        predicted = self.policy.predict(observations, deterministic=self.deterministic, **given)
         called = f"predict() of {type(self.policy).__name__} returned"
         if not isinstance(predicted, tuple) or len(predicted) != 2:
             raise ValueError(
