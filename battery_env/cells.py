@@ -337,9 +337,9 @@ def _bundled(cell: str) -> list[Discharge]:
     discharges = []
     for cycle in np.unique(numbers).tolist():
         part = samples[numbers == cycle]
-        columns = [part[name].to_numpy(dtype=np.float64) for name in (*_COLUMNS, "temperature_C")]
+        time_s, voltage_V, current_A, temperature_C = (part[name].to_numpy() for name in (*_COLUMNS, "temperature_C"))
         meta = {"cell": cell, "cycle": cycle, "source": NASA_CITATION, **known[cycle]}
-        discharges.append(Discharge(*columns, meta=meta))
+        discharges.append(Discharge(time_s, voltage_V, current_A, temperature_C, meta))
     return discharges
 
 
