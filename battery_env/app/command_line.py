@@ -237,7 +237,7 @@ def _fit_parser(name: str) -> argparse.ArgumentParser:
     return parser
 
 
-def _add(group: argparse._ActionsContainer, options: _Options, **common: Any) -> None:
+def _add(group: Any, options: _Options, **common: Any) -> None:
     for flags, how in options.items():
         group.add_argument(*flags, **common, **how)
 
@@ -307,7 +307,7 @@ def _file_format(options: argparse.Namespace) -> FileFormat:
 
 def _settings(options: argparse.Namespace) -> Settings:
     names = {field.name for field in fields(Settings)} - {"cell"}
-    given = {
+    given: dict[str, Any] = {
         name: tuple(value) if isinstance(value, list) else value for name, value in vars(options).items() if name in names
     }
     path: Path | None = vars(options).get("cell")
