@@ -203,8 +203,8 @@ class FullStateTask(CalibrationTask):
         # before the first action the model is a new cell in what is to be found; what is known is the true value
         for name in PARAMETER_NAMES:
             cells[f"{name}_hat"] = getattr(NEW_CELL, name) if name in self.parameters else cells[name]
-        found, new = self._settings["finds"][0] > 0, {name: getattr(NEW_CELL, name) for name in self.parameters}
-        cells["last_action"][:, found] = self.action_of(new)
+        new: dict[str, float] = {name: getattr(NEW_CELL, name) for name in self.parameters}
+        cells["last_action"][:, self._settings["finds"][0] > 0] = self.action_of(new)
         cells["state"] = dataset.states_at(trajectory, sample)
         cells["model_state"] = cells["state"]
         if self.initial_perturbation > 0.0:
