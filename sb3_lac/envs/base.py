@@ -115,7 +115,7 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
         """Draw the state that an episode starts from."""
 
     @abstractmethod
-    def _next_state(self, state: np.ndarray, action: np.ndarray, push: float) -> np.ndarray:
+    def next_state(self, state: np.ndarray, action: np.ndarray, push: float) -> np.ndarray:
         """Move on by one step, with an action within its limits, and the push of an impulse if there is one."""
 
     @abstractmethod
@@ -174,7 +174,7 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
         push = 0.0
         if self.impulse > 0 and (self.n_steps + 1) % self.impulse_interval == 0:
             push = self.impulse * (1.0 if self.np_random.random() < 0.5 else -1.0)
-        next_state = self._next_state(self.state, action, push)
+        next_state = self.next_state(self.state, action, push)
         if self._process_noise is not None:
             next_state = next_state + self._process_noise * self.np_random.standard_normal(len(next_state))
         next_state = self._limited(next_state)

@@ -105,7 +105,7 @@ class CartPoleCostEnv(CostEnv):
     def _initial_state(self) -> np.ndarray:
         return self.np_random.uniform(-1.0, 1.0, 4) * (5.0, 0.2, 0.2, 0.2)
 
-    def _next_state(self, state: np.ndarray, action: np.ndarray, push: float) -> np.ndarray:
+    def next_state(self, state: np.ndarray, action: np.ndarray, push: float) -> np.ndarray:
         force = self.force_max_N * float(action[0]) + push
         x, x_dot, theta, theta_dot = state.tolist()
         sine, cosine = float(np.sin(theta)), float(np.cos(theta))

@@ -83,7 +83,7 @@ class LinearCostEnv(CostEnv):
     def _initial_state(self) -> np.ndarray:
         return self.np_random.uniform(-1.0, 1.0, 2)
 
-    def _next_state(self, state: np.ndarray, action: np.ndarray, push: float) -> np.ndarray:
+    def next_state(self, state: np.ndarray, action: np.ndarray, push: float) -> np.ndarray:
         control = self.control_max * action
         return self.A @ state + self.B @ (control + push) + self.noise_std * self.np_random.standard_normal(2)
 

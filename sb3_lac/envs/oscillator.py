@@ -120,7 +120,7 @@ class OscillatorEnv(CostEnv):
         assert self.state is not None
         return np.array([*self.state, self.reference(self.n_steps), self.reference(self.n_steps + 1)], dtype=np.float32)
 
-    def _next_state(self, state: np.ndarray, action: np.ndarray, push: float) -> np.ndarray:
+    def next_state(self, state: np.ndarray, action: np.ndarray, push: float) -> np.ndarray:
         messengers, proteins = state[:3], state[3:]
         repression = self.transcription / (self.half_saturation + proteins[[2, 0, 1]] ** 2)
         messenger_rate = repression - self.messenger_decay * messengers + self.light * 0.5 * (action + 1.0)

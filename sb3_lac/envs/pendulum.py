@@ -118,7 +118,7 @@ class PendulumCostEnv(CostEnv):
         speed_max = self.SPEED_MAX_RAD_S
         return np.array([math.remainder(theta, math.tau), min(max(speed, -speed_max), speed_max)])
 
-    def _next_state(self, state: np.ndarray, action: np.ndarray, push: float) -> np.ndarray:
+    def next_state(self, state: np.ndarray, action: np.ndarray, push: float) -> np.ndarray:
         inertia = self.mass_kg * self.length_m**2
         gravity, damping = self.GRAVITY_M_S2 / self.length_m, self.damping_Nms / inertia
         drive = (self.torque_max_Nm * float(action[0]) + push) / inertia

@@ -114,7 +114,7 @@ class QuadrotorCostEnv(CostEnv):
     def _initial_state(self) -> np.ndarray:
         return self.np_random.uniform(-1.0, 1.0, 6) * (1.0, 1.0, 0.3, 0.5, 0.5, 0.5)
 
-    def _next_state(self, state: np.ndarray, action: np.ndarray, push: float) -> np.ndarray:
+    def next_state(self, state: np.ndarray, action: np.ndarray, push: float) -> np.ndarray:
         left, right = (0.5 * self.rotor_force_max_N * (a + 1.0) for a in action.tolist())
         thrust, gust = (left + right) / self.mass_kg, push / self.mass_kg
         pitch_acceleration = self.arm_m * (right - left) / self.inertia_kg_m2

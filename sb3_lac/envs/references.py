@@ -28,7 +28,7 @@ def _linearised(model: CostEnv, at_rest: float = 0.0) -> tuple[np.ndarray, np.nd
     step = 1e-5
 
     def next_state(state_and_action: np.ndarray) -> np.ndarray:
-        return model._next_state(state_and_action[:n], at_rest + state_and_action[n:], 0.0)
+        return model.next_state(state_and_action[:n], at_rest + state_and_action[n:], 0.0)
 
     columns = [(next_state(step * unit) - next_state(-step * unit)) / (2.0 * step) for unit in np.eye(n + m)]
     return np.array(columns[:n]).T, np.array(columns[n:]).T
@@ -192,7 +192,7 @@ class VehicleController(ReferenceController):
         a = a[:, :n]
         # w = (sin, cos) of the place on the path, and what each does to a vehicle that drives straight ahead
         places = (model.PATH_PERIOD_M / 4.0, 0.0)
-        path = np.array([model._next_state(np.array([0.0] * n + [place]), np.zeros(1), 0.0)[:n] for place in places]).T
+        path = np.array([model.next_state(np.array([0.0] * n + [place]), np.zeros(1), 0.0)[:n] for place in places]).T
         turn = math.tau * model.speed_m_s * model.DT_S / model.PATH_PERIOD_M
         oscillator = np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]])
         # Pi S = A Pi + B Gamma + E with no offset, (1, 0, ..., 0) Pi = 0, for columns of Pi and Gamma one below the other

@@ -183,7 +183,7 @@ class VehicleCostEnv(CostEnv):
         # The path goes on where it began
         return super()._limited(np.array([*state[:5], state[5] % self.PATH_PERIOD_M]))
 
-    def _next_state(self, state: np.ndarray, action: np.ndarray, push: float) -> np.ndarray:
+    def next_state(self, state: np.ndarray, action: np.ndarray, push: float) -> np.ndarray:
         front, rear, speed = self.front_axle_m, self.rear_axle_m, self.speed_m_s
         command = self.steering_max_rad * float(action[0])
         grip = self.friction * self.GRAVITY_M_S2 / (front + rear)  # force per mass of an axle at the other one's distance
