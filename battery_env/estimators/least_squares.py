@@ -326,9 +326,8 @@ def _end_reason(record: Samples, search: Search, fit: Fit, deviation_V: float) -
         return ""
     estimate, model = Estimate(fit.values["q_mobile"], fit.values["r_o"]), search.model_at(fit.values)
     until, lowest_V = record.first(n + 1), float(voltage_V[n]) - fit.values.get("offset_V", 0.0)
-    early_s, late_s = (
-        model.forecast(until, estimate, lowest_V + sign * deviation_V, load_A).eod_time_s for sign in (1.0, -1.0)
-    )
+    forecast = model.forecast(until, estimate, lowest_V, load_A)
+    early_s, late_s = (forecast.reached_s(lowest_V + sign * deviation_V) for sign in (1.0, -1.0))
     allowed_s = _END_SHARE * (time_s[n] - time_s[0]) + 2.0 * model.dt_s
     if early_s - allowed_s <= time_s[n] <= late_s + allowed_s:
         return ""
