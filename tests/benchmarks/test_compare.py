@@ -323,7 +323,7 @@ def test_algorithms_of_the_zoo_and_ones_own_are_compared_in_any_environment(tmp_
         (["--seeds", str(2**32)], "a seed must lie within 0 .. 2**32 - 1, got 4294967296"),
         (["--hyperparams", "n_envs=1"], "--hyperparams takes NAME:VALUE, like n_envs:1, got n_envs=1"),
         (["--hyperparams", "n_env:1"], "lac on BatteryRo-v0: LAC.__init__() got an unexpected keyword argument 'n_env'"),
-        (["--hyperparams", "gamma:2"], "lac on BatteryRo-v0: gamma=2 must lie within 0 .. 1"),
+        (["--hyperparams", "gamma:2"], "lac on BatteryRo-v0: gamma=2.0 must lie within 0 .. 1"),
         (["--timesteps", "40"], "starts to learn after 40 steps (learning_starts): timesteps=40 must be more"),
     ],
 )
