@@ -124,14 +124,6 @@ def test_a_folder_that_cannot_be_is_an_error_of_the_command_line(tmp_path, capsy
     assert "is a file: choose another --out" in capsys.readouterr().err
 
 
-def test_two_may_write_the_same_file_at_the_same_time(tmp_path):
-    file = tmp_path / "table.csv"
-    with study.replacing(file) as first, study.replacing(file) as second:
-        first.write_text("first")
-        second.write_text("second")
-    assert [path.name for path in tmp_path.iterdir()] == ["table.csv"] and file.read_text() == "first"
-
-
 def fragile_part(seed, place):
     with (place / f"tries_{seed}").open("a") as tries:
         tries.write("x")
