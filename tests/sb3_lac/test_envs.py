@@ -84,35 +84,28 @@ def test_observations_stay_in_their_space_whatever_the_actions(make, seed, scale
             break
 
 
+def after_one_step(env, state, action):
+    """The state to which a step leads."""
+    env.reset(options={"state": state})
+    env.step(np.asarray(action, dtype=np.float64))
+    return env.state
+
+
 def test_cart_pole_accelerations_solve_the_equations_of_motion():
     # Lagrange's equations of cart and pole (a rod about its end), solved here as a linear system
     state, force = np.array([0.3, -0.4, 0.2, 0.7]), 6.0
     env = CartPoleCostEnv(cart_mass_kg=1.3, pole_mass_kg=0.2, pole_half_length_m=0.7)
-    env.reset(options={"state": state})
-    observation, *_ = env.step(np.array([force / 20.0]))
     m, mass, half, sine, cosine = 0.2, 1.5, 0.7, np.sin(0.2), np.cos(0.2)
     left = np.array([[mass, m * half * cosine], [cosine, 4.0 / 3.0 * half]])
     right = np.array([force + m * half * 0.7**2 * sine, 10.0 * sine])
     accelerations = np.linalg.solve(left, right)
     expected = state + 0.02 * np.array([-0.4, accelerations[0], 0.7, accelerations[1]])
-    np.testing.assert_allclose(observation, expected, rtol=1e-6)
-
-
-def test_cart_pole_costs():
-    env = CartPoleCostEnv()
-    env.reset(options={"state": [5.0, 0.0, 0.1, 0.0]})
-    _, _, terminated, _, info = env.step(np.zeros(1))
-    assert not terminated and info["cost"] == pytest.approx(0.25 + 20 * (0.1 / 0.349) ** 2)
-    for start in ([9.99, 5.0, 0.0, 0.0], [0.0, 0.0, 0.34, 5.0]):
-        env.reset(options={"state": start})
-        _, reward, terminated, _, _ = env.step(np.zeros(1))
-        assert terminated and reward == -100.0
+    np.testing.assert_allclose(after_one_step(env, state, [force / 20.0]), expected, rtol=1e-6)
 
 
 def test_oscillator_follows_its_equations():
     env = OscillatorEnv()
-    start = np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
-    env.reset(options={"state": start})
+    env.reset(options={"state": np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])})
     observation, _, _, _, info = env.step(np.array([-1.0, 0.0, 1.0]))
     # Each messenger is repressed by the protein before it: 3, 1, 2
     messengers = [m + 1.6 / (1 + p**2) - 0.16 * m + 5.0 * u for m, p, u in ((1, 6, 0.0), (2, 4, 0.5), (3, 5, 1.0))]
@@ -120,13 +113,7 @@ def test_oscillator_follows_its_equations():
     references = [8 + 7 * np.sin(2 * np.pi * t / 200) for t in (1, 2)]
     np.testing.assert_allclose(observation, [*messengers, *proteins, *references], rtol=1e-6)
     assert info["cost"] == pytest.approx((proteins[0] - references[0]) ** 2)
-
-
-def after_one_step(env, state, action):
-    """The state to which a step leads."""
-    env.reset(options={"state": state})
-    env.step(np.asarray(action, dtype=np.float64))
-    return env.state
+    assert info["error"] == pytest.approx(abs(proteins[0] - references[0]))
 
 
 def test_pendulum_follows_newtons_law():
@@ -140,18 +127,6 @@ def test_pendulum_follows_newtons_law():
     np.testing.assert_allclose(after_one_step(env, [2.0, -3.0], [0.6]), expected, rtol=1e-6)
 
 
-@pytest.mark.parametrize("theta", [0.5, 1.5, 3.0])
-def test_energy_of_the_free_pendulum_is_conserved(theta):
-    env = PendulumCostEnv()
-    env.reset(options={"state": [theta, 1.0]})
-    energies = []
-    for _ in range(200):
-        angle, speed = env.state
-        energies.append(0.5 * speed**2 + 9.81 * np.cos(angle))
-        env.step(np.zeros(1))
-    np.testing.assert_allclose(energies, energies[0], atol=1e-3 * 9.81)
-
-
 def test_pendulum_goes_round_and_its_speed_ends_at_that_of_the_motor():
     env = PendulumCostEnv()
     state = after_one_step(env, [3.1, 4.0], [0.0])
@@ -159,29 +134,18 @@ def test_pendulum_goes_round_and_its_speed_ends_at_that_of_the_motor():
     assert after_one_step(env, [-2.0, -11.99], [-1.0])[1] == -12.0
 
 
-def test_work_of_the_rotors_is_the_energy_of_the_quadrotor():
+def test_quadrotor_follows_newtons_law():
     env = QuadrotorCostEnv(mass_kg=1.2, inertia_kg_m2=0.03, arm_m=0.3)
-    m, inertia, arm = 1.2, 0.03, 0.3
     left, right = 9.81 * 0.5 * (1 + 0.1), 9.81 * 0.5 * (1 + 0.15)
 
-    def powers(_, x):
-        # Each force acts along the machine's axis at the end of an arm, whose velocity is that of the middle and of the turn
-        axis = np.array([-np.sin(x[2]), np.cos(x[2])])
-        along = axis @ x[3:5]
-        power = left * (along - arm * x[5]) + right * (along + arm * x[5])
-        pull = (left + right) / m * axis
-        return [x[3], x[4], x[5], pull[0], pull[1] - 9.81, arm * (right - left) / inertia, power]
-
-    def energy(x):
-        return 0.5 * m * (x[3] ** 2 + x[4] ** 2) + 0.5 * inertia * x[5] ** 2 + m * 9.81 * x[1]
+    def law(_, x):
+        # Both forces act along the machine's axis, each at the end of an arm
+        pull = (left + right) / 1.2 * np.array([-np.sin(x[2]), np.cos(x[2])])
+        return [x[3], x[4], x[5], pull[0], pull[1] - 9.81, 0.3 * (right - left) / 0.03]
 
     start = [0.1, 0.2, 0.3, 0.4, -0.5, 0.6]
-    env.reset(options={"state": start})
-    for _ in range(10):
-        env.step(np.array([0.1, 0.15]))
-    path = solve_ivp(powers, (0.0, 0.2), [*start, 0.0], rtol=1e-10, atol=1e-12).y[:, -1]
-    np.testing.assert_allclose(env.state, path[:6], rtol=1e-6)
-    assert energy(env.state) - energy(start) == pytest.approx(path[6], rel=1e-6)
+    expected = solve_ivp(law, (0.0, env.DT_S), start, rtol=1e-10, atol=1e-12).y[:, -1]
+    np.testing.assert_allclose(after_one_step(env, start, [0.1, 0.15]), expected, rtol=1e-6)
 
 
 def test_vehicle_is_where_it_would_be_on_a_map():
@@ -235,58 +199,55 @@ def test_the_observed_path_tells_the_place_on_it():
 
 
 @pytest.mark.parametrize(
-    ("env", "leaving"),
+    ("make", "start", "action", "cost", "error"),
     [
-        (QuadrotorCostEnv(), [([1.49, 0, 0, 5, 0, 0]), ([0, 0, 1.56, 0, 0, 5])]),
-        (VehicleCostEnv(), [([1.99, 0.5, 0, 0, 0, 0]), ([0, 0.99, 0, 1, 0, 0])]),
+        # The tip of a pole of 1 m
+        (
+            CartPoleCostEnv,
+            [5.0, 0.0, 0.1, 0.0],
+            [0.0],
+            lambda x: (x[0] / 10) ** 2 + 20 * (x[2] / 0.349) ** 2,
+            lambda x: np.hypot(x[0] + np.sin(x[2]), 1 - np.cos(x[2])),
+        ),
+        (PendulumCostEnv, [-1.0, 2.0], [-0.5], lambda x: x @ (x * [1.0, 0.1]) + 0.01 * 1.5**2, lambda x: abs(x[0])),
+        (
+            QuadrotorCostEnv,
+            [0.5, -0.4, 0.3, 0.0, 0.0, 0.0],
+            [-0.5, 0.2],
+            lambda x: x[:3] @ (x[:3] * [0.16, 0.16, 0.07]) + 0.05 * (0.25 + 0.04),
+            lambda x: np.hypot(x[0], x[1]),
+        ),
+        (
+            VehicleCostEnv,
+            [-0.5, 0.1, 0.3, 0.0, 0.04, 0.0],
+            [-0.5],
+            lambda x: 0.2 * x[0] ** 2 + 0.1 * (x[1] + np.arctan(x[2] / 15.0)) ** 2 + 0.1 * ((-0.5 - 0.2) / 2) ** 2,
+            lambda x: abs(x[0]),
+        ),
     ],
-    ids=["quadrotor", "vehicle"],
 )
-def test_leaving_costs_as_much_as_a_whole_episode_at_worst(env, leaving):
-    for state in leaving:
-        env.reset(options={"state": state})
-        _, reward, terminated, _, _ = env.step(np.zeros(env.action_space.shape))
-        assert terminated and reward == -300.0
-    assert env.TERMINAL_COST == EPISODE_STEPS[type(env).__name__.removesuffix("Env") + "-v0"]
-
-
-def test_costs_of_the_new_problems():
-    pendulum, quadrotor, vehicle = PendulumCostEnv(), QuadrotorCostEnv(), VehicleCostEnv()
-    pendulum.reset(options={"state": [1.0, 2.0]})
-    *_, info = pendulum.step(np.array([-0.5]))
-    theta, speed = pendulum.state
-    assert info["cost"] == pytest.approx(theta**2 + 0.1 * speed**2 + 0.01 * 1.5**2)
-    quadrotor.reset(options={"state": [0.5, -0.4, 0.3, 0.0, 0.0, 0.0]})
-    *_, info = quadrotor.step(np.array([-0.5, 0.2]))
-    x, z, phi = quadrotor.state[:3]
-    assert info["cost"] == pytest.approx(0.16 * (x**2 + z**2) + 0.07 * phi**2 + 0.05 * (0.25 + 0.04))
-    vehicle.reset(options={"state": [0.5, 0.1, 0.3, 0.0, 0.04, 0.0]})
-    *_, info = vehicle.step(np.array([-0.5]))
-    offset, heading, lateral = vehicle.state[:3]
-    course = heading + np.arctan(lateral / 15.0)
-    assert info["cost"] == pytest.approx(0.2 * offset**2 + 0.1 * course**2 + 0.1 * ((-0.5 - 0.2) / 2) ** 2)
+def test_cost_and_distance_to_the_goal_are_those_of_the_new_state(make, start, action, cost, error):
+    env = make()
+    env.reset(options={"state": start})
+    *_, info = env.step(np.array(action))
+    assert info == pytest.approx({"cost": cost(env.state), "error": error(env.state)})
 
 
 @pytest.mark.parametrize(
-    ("make", "state", "error"),
+    ("make", "state", "reward"),
     [
-        (CartPoleCostEnv, [0.0] * 4, 0.0),
-        (LinearCostEnv, [0.0] * 2, 0.0),
-        (PendulumCostEnv, [0.0] * 2, 0.0),
-        (QuadrotorCostEnv, [0.0] * 6, 0.0),
-        (VehicleCostEnv, [0.0] * 6, 0.0),
-        # The tip of a pole of 1 m
-        (CartPoleCostEnv, [3.0, 0.0, 0.3, 0.0], np.hypot(3.0 + np.sin(0.3), 1 - np.cos(0.3))),
-        (LinearCostEnv, [3.0, -4.0], 5.0),
-        (OscillatorEnv, [0.0, 0.0, 0.0, 3.0, 0.0, 0.0], 5.0),
-        (PendulumCostEnv, [-3.0, 1.0], 3.0),
-        (QuadrotorCostEnv, [-3.0, 2.0, 1.0, 0.0, 0.0, 0.0], np.sqrt(13.0)),
-        (VehicleCostEnv, [-2.0, 0.5, 0.0, 0.0, 0.0, 7.0], 2.0),
+        (CartPoleCostEnv, [9.99, 5.0, 0.0, 0.0], -100.0),
+        (CartPoleCostEnv, [0.0, 0.0, 0.34, 5.0], -100.0),
+        (QuadrotorCostEnv, [1.49, 0, 0, 5, 0, 0], -300.0),
+        (QuadrotorCostEnv, [0, 0, 1.56, 0, 0, 5], -300.0),
+        (VehicleCostEnv, [1.99, 0.5, 0, 0, 0, 0], -300.0),
+        (VehicleCostEnv, [0, 0.99, 0, 1, 0, 0], -300.0),
     ],
 )
-def test_error_is_the_distance_to_the_goal(make, state, error):
-    _, info = make().reset(options={"state": state})
-    assert info["error"] == pytest.approx(error)
+def test_leaving_is_a_termination_with_a_price(make, state, reward):
+    env = make()
+    env.reset(options={"state": state})
+    assert env.step(np.zeros(env.action_space.shape))[1:3] == (reward, True)
 
 
 @pytest.mark.parametrize("make", CLASSES)
@@ -322,19 +283,6 @@ class TestDisturbances:
             # As if it had been made so
             np.testing.assert_array_equal(different, self.states(self.quiet(make, **{name: changed}), actions))
 
-    def test_impulses_come_at_their_interval_in_both_directions(self, make, actions):
-        usual, pushed = self.quiet(make), self.quiet(make, impulse=0.1, impulse_interval=3)
-        signs = set()
-        for seed in range(12):
-            steps = []
-            for env in (usual, pushed):
-                env.reset(seed=seed)
-                steps.append(np.array([env.step(action) and env.state for action in actions[:3]]))
-            difference = steps[1] - steps[0]
-            assert not difference[:2].any() and difference[2].any()
-            signs.add(float(np.sign(difference[2][np.flatnonzero(difference[2])[0]])))
-        assert signs == {-1.0, 1.0}
-
     def test_process_noise_has_its_size_on_each_variable(self, make, actions):
         usual = self.quiet(make)
         n = len(usual.state_high)
@@ -347,16 +295,26 @@ class TestDisturbances:
         np.testing.assert_allclose(noise.std(axis=0), sizes, rtol=0.2, atol=1e-12)
         assert np.all(np.abs(noise.mean(axis=0)) <= 0.25 * sizes + 1e-12)
 
+    def test_impulses_come_at_their_interval_in_both_directions(self, make, actions):
+        signs = set()
+        for seed in range(12):
+            steps = []
+            for env in (self.quiet(make), self.quiet(make, impulse=0.1, impulse_interval=3)):
+                env.reset(seed=seed)
+                steps.append(np.array([env.step(action) and env.state for action in actions[:3]]))
+            difference = steps[1] - steps[0]
+            assert not difference[:2].any() and difference[2].any()
+            signs.add(float(np.sign(difference[2][np.flatnonzero(difference[2])[0]])))
+        assert signs == {-1.0, 1.0}
+
     def test_observation_noise_is_on_what_is_seen_and_nowhere_else(self, make, actions):
         usual, noisy = self.quiet(make), self.quiet(make, observation_noise=0.05)
-        first = [usual.reset(seed=2)[0], noisy.reset(seed=2)[0]]
+        usual.reset(seed=2), noisy.reset(seed=2)
         steps = [[env.step(action) for action in actions] for env in (usual, noisy)]
         assert [step[1:] for step in steps[0]] == [step[1:] for step in steps[1]]
-        seen = [np.array([start, *(step[0] for step in taken)]) for start, taken in zip(first, steps, strict=True)]
-        assert seen[1].dtype == np.float32
+        seen = [np.array([step[0] for step in taken]) for taken in steps]
         assert all(noisy.observation_space.contains(observation) for observation in seen[1])
-        differences = (seen[1] - seen[0]).ravel()
-        assert 0.02 < differences.std() < 0.08 and np.any(seen[1][0] != seen[0][0])
+        assert 0.02 < (seen[1] - seen[0]).std() < 0.08
 
     def test_delayed_actions_are_those_of_steps_before(self, make, actions):
         delayed = self.states(self.quiet(make, action_delay=3), actions)
@@ -364,10 +322,8 @@ class TestDisturbances:
         np.testing.assert_array_equal(delayed, self.states(self.quiet(make), shifted))
 
     def test_starts_do_not_depend_on_the_disturbances(self, make, actions):
-        everything = {"impulse": 1.0, "process_noise": 0.1, "observation_noise": 0.1, "action_delay": 2}
-        plain, disturbed = make(), make(**everything)
-        for env in (plain, disturbed):
-            env.reset(seed=5)
+        plain, disturbed = make(), make(impulse=1.0, process_noise=0.1, observation_noise=0.1, action_delay=2)
+        plain.reset(seed=5), disturbed.reset(seed=5)
         np.testing.assert_array_equal(plain.state, disturbed.state)
         check_env(disturbed)
 
@@ -422,24 +378,14 @@ def test_largest_feasible_alpha3_is_that_of_roll_outs():
     assert env.largest_feasible_alpha3(gain, GAMMA) == pytest.approx(expected, rel=0.05)
 
 
-def test_value_of_a_gain_that_does_not_stabilise_is_refused():
-    env = LinearCostEnv()
-    with pytest.raises(ValueError, match="spectral radius"):
-        env.value_matrix(np.array([[-5.0, -5.0]]), GAMMA)
-
-
 @pytest.mark.parametrize(
     ("make", "kwargs", "message"),
     [
         (CartPoleCostEnv, {"cart_mass_kg": 0.0}, "cart_mass_kg=0.0 must be positive"),
-        (OscillatorEnv, {"light": np.inf}, "light=inf must be positive and finite"),
         (OscillatorEnv, {"process_noise": -1.0}, "process_noise=-1.0 must be a number, or 6 of them, finite and at least 0"),
-        (OscillatorEnv, {"observation_noise": [0.1] * 6}, "must be a number, or 8 of them"),
         (PendulumCostEnv, {"damping_Nms": -0.1}, "damping_Nms=-0.1 must be finite and at least 0"),
-        (PendulumCostEnv, {"changed_parameters": {"length_m": 0.0}}, "length_m=0.0 must be positive"),
         (PendulumCostEnv, {"changed_parameters": {"length": 2.0}}, r"has \['length'\], which are none of \['damping_Nms', "),
         (QuadrotorCostEnv, {"action_delay": 0.5}, "action_delay=0.5 must be a whole number"),
-        (QuadrotorCostEnv, {"impulse_interval": 2.5}, "impulse_interval=2.5 must be a whole number"),
         (VehicleCostEnv, {"steering_max_rad": 1.5}, "steering_max_rad=1.5 must be at most 1"),
         (CartPoleCostEnv, {"impulse_N": 1.0, "impulse": 2.0}, "are the same: give one of them"),
         (LinearCostEnv, {"noise_std": np.nan}, "noise_std=nan must be finite and at least 0"),
@@ -451,26 +397,21 @@ def test_bad_arguments_are_named(make, kwargs, message):
         make(**kwargs)
 
 
-def test_bad_states_and_actions_are_named():
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda env: env.reset(options={"state": [1.0]}), "must hold 2 numbers"),
+        (lambda env: env.reset(options={"state": [np.nan, 0.0]}), "must hold 2 numbers"),
+        (lambda env: env.reset(options={"state": [2000.0, 0.0]}), "must hold 2 numbers"),
+        (lambda env: env.step(np.array([np.nan])), "must be finite numbers"),
+        (lambda env: env.step(np.zeros(2)), "must be finite numbers"),
+        (lambda env: env.value_matrix(np.array([[-5.0, -5.0]]), GAMMA), "spectral radius"),
+    ],
+)
+def test_bad_states_actions_and_gains_are_named(call, message):
     env = LinearCostEnv()
     with pytest.raises(gym.error.ResetNeeded):
         env.step(np.zeros(1))
-    for state in ([1.0], [np.nan, 0.0], [2000.0, 0.0]):
-        with pytest.raises(ValueError, match="must hold 2 numbers"):
-            env.reset(options={"state": state})
-    with pytest.raises(ValueError, match="must hold 6 numbers"):
-        OscillatorEnv().reset(options={"state": [-1.0] * 6})
     env.reset(seed=0)
-    for action in (np.array([np.nan]), np.zeros(2), 0.5):
-        with pytest.raises(ValueError, match="must be finite numbers"):
-            env.step(action)
-
-
-def test_picture_shows_the_episode():
-    env = gym.make("Oscillator-v0", render_mode="rgb_array")
-    env.reset(seed=0)
-    first = env.render()
-    env.step(env.action_space.sample())
-    second = env.render()
-    assert first.dtype == np.uint8 and first.shape == second.shape == (320, 480, 3)
-    assert not np.array_equal(first, second)
+    with pytest.raises(ValueError, match=message):
+        call(env)

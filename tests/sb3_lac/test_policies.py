@@ -102,6 +102,7 @@ def test_batch_norm_and_dropout_work_in_training_only(make_model, train_metrics)
     obs = np.ones(2, dtype=np.float32)
     actions = [model.predict(obs, deterministic=True)[0] for _ in range(5)]
     assert all(np.array_equal(action, actions[0]) for action in actions)
+    assert np.ptp(model.policy.predict_lyapunov(np.ones((100, 2), np.float32), np.zeros((100, 2), np.float32))) < 1e-5
     # Neither collecting transitions nor predicting has changed the statistics
     model.learn(10, reset_num_timesteps=False)
     assert all(th.equal(before, after) for before, after in zip(statistics, batch_norm_stats, strict=True))
