@@ -26,14 +26,7 @@ def blocks(values, dt_s, block_s):
 def test_a_segment_holds_from_its_start_to_the_next():
     load = piecewise([2.0, 8.0, 5.0], [60.0, 30.0, 10.0])
     np.testing.assert_array_equal(load([0.0, 59.9, 60.0, 89.0, 90.0, 1e6]), [2.0, 2.0, 8.0, 8.0, 5.0, 5.0])
-
-
-def test_the_first_segment_holds_at_time_zero():
-    assert piecewise([2.0, 8.0], [60.0, 60.0])(0.0) == 2.0
-
-
-def test_constant_load():
-    assert constant(8.0)(np.arange(3.0)).tolist() == [8.0] * 3
+    assert load(0.0) == 2.0 and constant(8.0)(np.arange(3.0)).tolist() == [8.0] * 3
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -125,22 +118,16 @@ def test_a_recorded_load_is_switched_midway_between_the_samples():
     ("make", "message"),
     [
         (lambda: Load(np.array([1.0]), np.array([2.0])), "increase from 0"),
-        (lambda: Load(np.array([0.0, 0.0]), np.array([2.0, 2.0])), "increase from 0"),
         (lambda: Load(np.array([0.0]), np.array([2.0, 2.0])), "alike"),
         (lambda: constant(float("nan")), "load must lie within"),
         (lambda: constant(2000.0, "current"), "got 2000"),
         (lambda: constant(2.0)(-1.0), "time_s must be at least 0"),
         (lambda: RandomPiecewise(value_range=(8.0, 2.0)), "value_range"),
-        (lambda: RandomPiecewise(value_range=(0.0, 2.0)), "lower end of value_range"),
         (lambda: RandomPiecewise(duration_range_s=(60.0, np.inf)), "duration_range_s must be finite"),
-        (lambda: RandomPiecewise(total_s=0.0), "total_s"),
         (lambda: RandomPiecewise(duration_range_s=(1e-3, 1.0)), "more than 1e.06 segments, got 20000.0 and 0.001"),
-        (lambda: RandomWalk(total_s=1e9), "more than 1e.06 segments, got 1000000000.0 and 60.0"),
         (lambda: RandomWalk(value_range=(2.0, 2.0)), "width of value_range"),
         (lambda: RandomWalk(value_range=(2.0, 8000.0)), "got 8000.*unit of the load is power"),
         (lambda: RandomWalk(largest_step=-1.0), "largest_step must be a positive, finite number, got -1.0"),
-        (lambda: RandomWalk(segment_s="60"), "segment_s .* got '60'"),
-        (lambda: RandomWalk(value_range=(2.0,)), "value_range must be two numbers"),
         (lambda: recorded(load_nasa_discharges("B0005")[0], "energy"), "unit must be 'power'.* got 'energy'"),
         (
             lambda: recorded(load_nasa_discharges("B0005")[0], dt_s=1e5),
