@@ -125,16 +125,9 @@ class TestDraws:
         # the cell that is left rests, and nothing is to be seen of it after the others have ended
         assert found.time_s[-1] == pytest.approx(known_s, abs=12.0) and found.voltage_V[2, -1] > 3.2
 
-    @pytest.mark.parametrize(
-        ("loads", "message"),
-        [
-            ((constant(4.0, "current"), constant(8.0)), "of Draws must all have the same unit, got current and power"),
-            ((4.0,), "must be a load of battery_env.loads, such as a Load or a Cycle, got 4.0"),
-        ],
-    )
-    def test_draws_that_cannot_be_meant_are_refused(self, loads, message):
-        with pytest.raises((TypeError, ValueError), match=message):
-            certain(self.record, Draws(*loads))
+    def test_draws_of_different_units_are_refused(self):
+        with pytest.raises(ValueError, match="of Draws must all have the same unit, got current and power"):
+            certain(self.record, Draws(constant(4.0, "current"), constant(8.0)))
 
 
 class TestUncertainty:
@@ -149,6 +142,7 @@ class TestUncertainty:
         # the end of discharge is nearly in proportion to q_mobile: 3.3 sd of 1 % of it
         assert narrow == pytest.approx(3.29 * 0.01 * discharged(4.0, load_unit="current").eod_time_s, rel=0.2)
         assert wide == pytest.approx(2.0 * narrow, rel=0.1)
+        assert narrow == self.width(Estimate(6000.0, 0.15, 60.0, 0.0), mismatch_V=0.0)  # the same seed
         assert self.width(Estimate(6000.0, 0.15, 60.0, 0.0), mismatch_V=0.1) > 1.2 * narrow
         assert self.width(Estimate(6000.0, 0.15, 60.0, 0.0), RandomPiecewise((4.0, 16.0)), mismatch_V=0.0) > 1.2 * narrow
 
@@ -173,12 +167,6 @@ class TestUncertainty:
         assert (found.eod_time_s >= late.time_s[-1]).all()
         assert found.q_mobile.min() > 5750.0  # those below would have reached the cut-off
         assert "contradicts" in found.notes[-1]
-
-    def test_the_same_seed_draws_the_same(self):
-        estimate = Estimate(6000.0, 0.15, 60.0, 0.03)
-        one, same, other = (forecast(self.record, estimate, model=MODEL, samples=50, seed=seed) for seed in (1, 1, 2))
-        np.testing.assert_array_equal(one.eod_time_s, same.eod_time_s)
-        assert (one.eod_time_s != other.eod_time_s).any()
 
     def test_what_is_left_out_is_said(self):
         assert ["leaves theirs out" in note for note in certain(self.record).notes] == [True]
@@ -208,8 +196,6 @@ class TestHealth:
         # not the same, as at 4 A a shorter discharge leaves less behind by diffusion
         np.testing.assert_allclose(found.state_of_health, certain(full).state_of_health, rtol=0.04)
 
-
-class TestBounds:
     def test_a_record_at_the_cut_off_is_over(self):
         record = discharged(4.0, load_unit="current", cut_off_V=2.9)
         found = certain(record, cut_off_V=3.0)
@@ -223,16 +209,11 @@ class TestBounds:
             ({"estimate": Estimate(2000.0, 0.15, 10.0, 0.0)}, "contradicts the record, which takes"),
             ({"estimate": Estimate(2890.0, 0.15, 0.0, 0.0), "mismatch_V": 0.0}, "contradicts the record: no cell"),
             ({"estimate": Estimate(6000.0, 0.15, np.inf, 0.0)}, "determines nothing"),
-            ({"estimate": Estimate(6000.0, 0.15, -1.0, 0.0)}, "standard deviations must be at least 0"),
-            ({"estimate": Estimate(np.nan, 0.15)}, "q_mobile must lie within"),
             ({"load": [1.0, 2.0]}, r"Load\(time_s, value, unit\)"),
             ({"load": "as before"}, "load must be a number"),
-            ({"load": 2000.0}, "load must lie within"),
             ({"load": lambda time_s: np.ones(3)}, "one value for each time"),
             ({"mismatch_V": -0.1}, "mismatch_V must"),
             ({"cut_off_V": np.nan}, "cut_off_V must"),
-            ({"samples": 0}, "samples must be at least 1"),
-            ({"seed": -1}, "seed at least 0"),
             ({"nominal_Ah": 0.0}, "nominal_Ah must"),
         ],
     )
@@ -250,16 +231,11 @@ def test_the_steadier_unit_is_the_one_of_the_consumer(unit):
     assert steadier_unit(Samples(record.time_s, record.voltage_V + noise_V, record.current_A)) == unit
 
 
-class TestCycle:
-    def test_it_starts_again_at_every_period(self):
-        cycle = Cycle(Load([0.0, 0.1], [3.0, 1.0], "current"), 0.3)
-        assert cycle.unit == "current"
-        np.testing.assert_array_equal(cycle(0.3 * np.arange(1000)), 3.0)
-        np.testing.assert_array_equal(cycle(0.3 * np.arange(1000) + 0.2), 1.0)
-        with pytest.raises(ValueError, match="time_s must be at least 0"):
-            cycle([-1.0])
-        with pytest.raises(ValueError, match="period_s must be a positive"):
-            Cycle(constant(1.0), 0.0)
+def test_a_cycle_starts_again_at_every_period():
+    cycle = Cycle(Load([0.0, 0.1], [3.0, 1.0], "current"), 0.3)
+    assert cycle.unit == "current"
+    np.testing.assert_array_equal(cycle(0.3 * np.arange(1000)), 3.0)
+    np.testing.assert_array_equal(cycle(0.3 * np.arange(1000) + 0.2), 1.0)
 
 
 class TestBlockBootstrap:

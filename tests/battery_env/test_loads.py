@@ -123,6 +123,7 @@ def test_a_recorded_load_is_switched_midway_between_the_samples():
         (lambda: constant(2000.0, "current"), "got 2000"),
         (lambda: constant(2.0)(-1.0), "time_s must be at least 0"),
         (lambda: RandomPiecewise(value_range=(8.0, 2.0)), "value_range"),
+        (lambda: Cycle(constant(1.0), 0.0), "period_s must be a positive"),
         (lambda: RandomPiecewise(duration_range_s=(60.0, np.inf)), "duration_range_s must be finite"),
         (lambda: RandomPiecewise(duration_range_s=(1e-3, 1.0)), "more than 1e.06 segments, got 20000.0 and 0.001"),
         (lambda: RandomWalk(value_range=(2.0, 2.0)), "width of value_range"),
