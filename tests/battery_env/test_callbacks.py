@@ -139,21 +139,17 @@ class Count(BaseCallback):
         return not self.stop
 
 
-def test_child_callbacks_are_triggered(make_model, capsys):
+def test_child_callbacks_are_triggered_and_can_stop_the_training(make_model, capsys):
     on_new_best, after_eval = Count(), Count()
-    callback = callback_of(
-        Evaluation(3.0, 4.0, 2.0), eval_freq=5, callback_on_new_best=on_new_best, callback_after_eval=after_eval
-    )
+    callbacks = {"callback_on_new_best": on_new_best, "callback_after_eval": after_eval}
+    callback = callback_of(Evaluation(3.0, 4.0, 2.0), eval_freq=5, **callbacks)
     make_model().learn(15, callback=callback)
     assert (on_new_best.n_calls, after_eval.n_calls) == (2, 3)
     assert on_new_best.parent is callback
     assert capsys.readouterr().out.count("New best mape_percent!") == 2
-
-
-@pytest.mark.parametrize("name", ["callback_on_new_best", "callback_after_eval"])
-def test_child_callback_can_stop_training(make_model, name):
-    callback = callback_of(Evaluation(3.0), eval_freq=5, verbose=0, **{name: Count(stop=True)})
-    assert make_model().learn(100, callback=callback).num_timesteps == 5
+    for name in callbacks:
+        callback = callback_of(Evaluation(3.0), eval_freq=5, verbose=0, **{name: Count(stop=True)})
+        assert make_model().learn(100, callback=callback).num_timesteps == 5
 
 
 def test_wrong_columns_are_named_before_the_training(make_model, tmp_path):

@@ -47,6 +47,9 @@ class TestDischarge:
             ({"temperature_C": np.full(7, 297.0)}, "got 297.*not in kelvin"),
             ({"current_A": np.full(7, -2.0)}, "draws -120 C.*flip the sign.*discharge_is_negative"),
             ({"voltage_V": ["4.1", "3.9", "ERROR", "3.5", "3.4", "3.0", "3.0"]}, "voltage_V must hold numbers"),
+            ({"current_A": np.full(7, 2.0 + 1.0j)}, "current_A must hold real numbers"),
+            ({"current_A": np.ma.masked_less(np.arange(7.0), 1.0)}, "current_A must hold real numbers"),
+            ({"time_s": None}, "time_s must hold real numbers"),
         ],
     )
     def test_refuses_what_cannot_be_meant_and_says_what_to_do(self, changes, message):
@@ -84,7 +87,7 @@ class TestDischarge:
         after = Discharge(time_s, voltage_V, current_A[::-1])
         assert after.loaded_part(2.0).time_s[-1] == time_s[-11]
 
-    @pytest.mark.parametrize(("offset_A", "noise_A"), [(0.0, 0.03), (0.01, 0.03), (0.05, 0.0), (0.03, 0.01)])
+    @pytest.mark.parametrize(("offset_A", "noise_A"), [(0.01, 0.03), (0.05, 0.0)])
     def test_noise_and_offset_at_rest_are_no_load(self, offset_A, noise_A):
         random = np.random.default_rng(0)
         time_s = np.arange(0.0, 9000.0, 10.0)
@@ -152,16 +155,14 @@ class TestDischarge:
         assert mean.charge_C == pytest.approx(discharge.charge_C, abs=4.0 * (dt_s + 3.0))
 
     def test_parts_are_checked_for_what_is_left_of_them_and_cannot_be_written_to_either(self):
-        part = Discharge(**recorded(), meta={"cell": "X"}, starts_at_rest=True).until(50.0)
+        part = Discharge(**recorded(), meta={"cell": "X"}, starts_at_rest=True).until(55.0)
+        np.testing.assert_array_equal(part.time_s, [0.0, 10.0, 20.0, 30.0, 40.0, 50.0])
         assert part.starts_at_rest and part.meta == {"cell": "X"} and part.without_temperature().temperature_C is None
         for each in (part, part.loaded_part(2.7), part.averaged(5.0)):
             with pytest.raises(ValueError, match="read-only"):
                 each.voltage_V[0] = 0.0
         with pytest.raises(ValueError, match="draws 0 C in total"):
             Discharge(**recorded(current_A=[0.0, 0.0, 0.0, 0.0, 0.0, 2.0, 2.0])).until(40.0)
-
-    def test_until_keeps_what_was_known_then(self):
-        np.testing.assert_array_equal(Discharge(**recorded()).until(45.0).time_s, [0.0, 10.0, 20.0, 30.0, 40.0])
 
 
 class TestResampling:
@@ -217,10 +218,14 @@ class TestBundledCells:
     def test_other_cells_and_files_are_refused(self, tmp_path):
         (tmp_path / "own.csv").write_text("time_s,voltage_V,current_A\n")
         savemat(tmp_path / "other.mat", {"x": np.ones(3)})
+        savemat(tmp_path / "B1.mat", {"B1": {"cycle": {"type": "discharge", "time": np.ones(2)}}})
+        (tmp_path / "cut.mat").write_bytes((tmp_path / "B1.mat").read_bytes()[:-100])
         for name, error, message in (
             ("B0007", FileNotFoundError, r"B0007.*B0005, B0006"),
             (tmp_path / "own.csv", ValueError, "own.csv is none of NASA's .mat files: read it with read_discharges"),
             (tmp_path / "other.mat", ValueError, r"not laid out as NASA's battery files.*\(x\)"),
+            (tmp_path / "B1.mat", ValueError, "B1.mat is damaged, or not laid out"),
+            (tmp_path / "cut.mat", ValueError, "cut.mat is damaged, or not laid out"),
         ):
             with pytest.raises(error, match=message):
                 load_nasa_discharges(name)
@@ -229,36 +234,27 @@ class TestBundledCells:
 class TestNasaMatFile:
     @staticmethod
     def write(path: Path, broken: bool = False) -> Path:
-        """A file in the layout of NASA's B0005.mat: charge, discharge, impedance, and one discharge without capacity."""
+        """Write the layout of NASA's B0005.mat: charge, discharge, impedance, and one discharge without capacity."""
+        arrays = {name: np.array(values) for name, values in recorded().items()}
+        data = {
+            "Voltage_measured": arrays["voltage_V"],
+            "Current_measured": -arrays["current_A"],
+            "Temperature_measured": arrays["temperature_C"],
+            "Time": arrays["time_s"],
+        }
+        short = {name: values[:2] for name, values in data.items()}
 
         def test(kind: str, hour: float, data: dict) -> dict:
-            return {
-                "type": kind,
-                "ambient_temperature": 24,
-                "time": np.array([2008.0, 4.0, 2.0, hour, 25.0, 41.593]),
-                "data": data,
-            }
+            time = np.array([2008.0, 4.0, 2.0, hour, 25.0, 41.593])
+            return {"type": kind, "ambient_temperature": 24, "time": time, "data": data}
 
-        def data(**more) -> dict:
-            arrays = recorded()
-            return {
-                "Voltage_measured": np.array(arrays["voltage_V"]),
-                "Current_measured": -np.array(arrays["current_A"]),
-                "Temperature_measured": np.array(arrays["temperature_C"]),
-                "Current_load": np.ones(7),
-                "Voltage_load": np.zeros(7),
-                "Time": np.array(arrays["time_s"]),
-                **more,
-            }
-
-        short = {name: values[:2] for name, values in data().items()}
         cycle = np.array(
             [
                 test("charge", 13.0, {"Voltage_charge": np.ones(3)}),
-                test("discharge", 15.0, data(Capacity=1.8565)),
+                test("discharge", 15.0, data | {"Capacity": 1.8565}),
                 test("impedance", 16.0, {"Re": 0.0447, "Rct": 0.0695}),
                 test("impedance", 23.0, {"Re": 0.05, "Rct": 0.07}),
-                test("discharge", 22.0, short if broken else data(Capacity=np.array([]))),
+                test("discharge", 22.0, short if broken else data | {"Capacity": np.array([])}),
             ],
             dtype=object,
         )

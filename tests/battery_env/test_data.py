@@ -56,15 +56,6 @@ def test_changing_loads_change_within_their_bounds(load):
     assert held.min() >= low and held.max() <= high and values.min() >= 2.0 and values.max() <= 8.0
 
 
-def test_a_mismatch_changes_the_constants_and_nothing_else():
-    exact, wrong = (standard_dataset(BOTH, "piecewise", "test", mismatch=mismatch) for mismatch in (0.0, 0.1))
-    np.testing.assert_array_equal(exact.q_mobile, wrong.q_mobile)
-    np.testing.assert_array_equal(exact.load_values[exact.load_start], wrong.load_values[wrong.load_start])
-    assert (exact.factors == 1.0).all()
-    np.testing.assert_allclose(wrong.factors.std(axis=0), 0.1, rtol=0.15)
-    assert not np.array_equal(exact.eod_time_s, wrong.eod_time_s)
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 
-from battery_env.calibration.full_state_layout import ACTION_RANGES
-from battery_env.calibration.policy import PolicyEstimator
 from battery_env.electrochemistry import simulate
 from battery_env.estimators.base import Estimate, EstimateTrace, Estimator
 from battery_env.estimators.closed_form import ClosedForm
@@ -63,17 +61,6 @@ class Reader(Estimator):
         return Estimate(1000.0 * record.voltage_V[-1], record.current_A[-1])
 
 
-class FixedPolicy:
-    """An SB3-like policy that always takes one action."""
-
-    def __init__(self, action):
-        self.action = action
-
-    def predict(self, observation, *, deterministic=False):
-        assert deterministic
-        return np.full((len(observation), 1), self.action, dtype=np.float32), None
-
-
 def test_the_closed_form_is_exact(data):
     scores = evaluate(ClosedForm(), data)
     for name in ("q_mobile", "r_o"):
@@ -110,22 +97,7 @@ def test_estimators_that_look_back_are_scored_too(data):
     assert (late["eod_error_s"] >= 0.0).all() and (early["eod_error_s"] <= 0.0).all()
 
 
-@pytest.mark.parametrize(("env_id", "parameter"), [("BatteryQmax-v0", "q_mobile"), ("BatteryRoPaper-v0", "r_o")])
-def test_a_policy_runs_free_over_whole_trajectories(data, env_id, parameter):
-    low, high = ACTION_RANGES[parameter]
-    traces = PolicyEstimator(FixedPolicy(0.5), env_id).trace(data)
-    other = {"q_mobile": "r_o", "r_o": "q_mobile"}[parameter]
-    for trace, trajectory in zip(traces, data, strict=True):
-        # T samples hold T - 1 transitions; the observation after the last decision needs one more of them
-        assert len(trace.time_s) == len(trajectory.time_s) - 2
-        np.testing.assert_array_equal(trace.time_s, trajectory.time_s[1:-1])
-        np.testing.assert_allclose(getattr(trace, parameter), low + 0.75 * (high - low))
-        np.testing.assert_array_equal(getattr(trace, other), getattr(trajectory, other))
-
-
 def test_what_cannot_be_evaluated_is_refused():
-    with pytest.raises(ValueError, match="Pendulum-v1 is no calibration environment"):
-        PolicyEstimator(FixedPolicy(0.0), "Pendulum-v1")
     for trajectories in ("B0005", [1.0]):
         with pytest.raises(TypeError, match="trajectories must hold Trajectory, got"):
             evaluate(ClosedForm(), trajectories)

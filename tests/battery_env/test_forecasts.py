@@ -125,10 +125,6 @@ class TestDraws:
         # the cell that is left rests, and nothing is to be seen of it after the others have ended
         assert found.time_s[-1] == pytest.approx(known_s, abs=12.0) and found.voltage_V[2, -1] > 3.2
 
-    def test_draws_of_different_units_are_refused(self):
-        with pytest.raises(ValueError, match="of Draws must all have the same unit, got current and power"):
-            certain(self.record, Draws(constant(4.0, "current"), constant(8.0)))
-
 
 class TestUncertainty:
     record = half(discharged(4.0, load_unit="current"))

@@ -39,19 +39,6 @@ def test_random_piecewise_stays_in_its_ranges_and_follows_its_seed(seed):
     assert load.start_s[-1] < 1000.0
 
 
-@given(
-    durations=st.lists(st.floats(0.1, 30.0), min_size=1, max_size=20),
-    dt_s=st.floats(0.1, 12.0),
-    steps=st.integers(0, 50),
-    seed=st.integers(0, 1000),
-)
-def test_a_load_on_a_grid_is_the_load_at_its_times(durations, dt_s, steps, seed):
-    load = piecewise(np.random.default_rng(seed).uniform(1.0, 9.0, len(durations)), durations)
-    grid = dt_s * np.arange(steps)
-    np.testing.assert_array_equal(load.on_grid(grid), load(grid))
-    np.testing.assert_array_equal(load.on_grid(load.start_s), load.value)
-
-
 @pytest.mark.parametrize(
     "load",
     [
@@ -67,13 +54,6 @@ def test_the_mean_over_steps_draws_what_the_load_does(load, dt_s):
     # a switch within a part counts for all of it
     error = 8.0 * np.ceil(dt_s / 0.2) / parts
     np.testing.assert_allclose(load.mean(starts_s, dt_s), load(middles_s).mean(axis=1), atol=error)
-
-
-def test_the_mean_of_a_load_that_keeps_step_is_its_value():
-    grid_s = 2.0 * np.arange(40_000)
-    walk = RandomWalk(segment_s=60.0)(np.random.default_rng(0))
-    for load in (constant(1.45), walk, Cycle(walk, 1200.0), blocks(walk.value, 2.0, block_s=60.0)):
-        np.testing.assert_allclose(load.mean(grid_s, 2.0), load(grid_s), rtol=1e-9)
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.1, 30.0))

@@ -56,55 +56,30 @@ def one(path: Path, **options):
     return discharge
 
 
+def named(time: str, voltage: str, current: str, temperature: str, factors=(1.0, 1.0, -1.0), zero_C=0.0) -> dict:
+    """Return the record by its columns' names, in units that the factors make of s, V and A."""
+    quantities = zip((time, voltage, current), factors, (TIME_S, VOLTAGE_V, CURRENT_A), strict=True)
+    return {name: factor * values for name, factor, values in quantities} | {temperature: TEMPERATURE_C + zero_C}
+
+
+ARBIN = named("Test_Time(s)", "Voltage(V)", "Current(A)", "Aux_Temperature_1 (C)")
+BDF = named("Test Time / s", "Voltage / V", "Current / A", "Surface Temperature T1 / degC")
+CLOCK = named("Time", "voltage_mv", "current_ma", "T1", (1.0, 1e3, -1e3))
+DATES = named("Date_Time", "Voltage", "Current", "Cell Temperature", (1.0, 1.0, 1.0))
 COLUMNS = {
-    "the own names": {"time_s": TIME_S, "voltage_V": VOLTAGE_V, "current_A": CURRENT_A, "temperature_C": TEMPERATURE_C},
-    "Battery Data Format": {
-        "Test Time / s": TIME_S,
-        "Voltage / V": VOLTAGE_V,
-        "Current / A": -CURRENT_A,
-        "Surface Temperature T1 / degC": TEMPERATURE_C,
-        "Ambient Temperature / degC": np.full(len(TIME_S), 23.0),
-    },
-    "Battery Data Format for machines": {
-        "test_time_second": TIME_S,
-        "voltage_volt": VOLTAGE_V,
-        "current_ampere": -CURRENT_A,
-        "temperature_t1_celsius": TEMPERATURE_C,
-    },
-    "Arbin": {
-        "Data_Point": np.arange(len(TIME_S)),
-        "Test_Time(s)": TIME_S,
-        "Step_Time(s)": np.mod(TIME_S, 100.0),
-        "Current(A)": -CURRENT_A,
-        "Voltage(V)": VOLTAGE_V,
-        "Aux_Temperature_1 (C)": TEMPERATURE_C,
-        "Charge_Capacity(Ah)": np.zeros(len(TIME_S)),
-    },
-    "NASA": {
-        "Time": TIME_S,
-        "Voltage_measured": VOLTAGE_V,
-        "Current_measured": -CURRENT_A,
-        "Temperature_measured": TEMPERATURE_C,
-    },
-    "thousandths, minutes and kelvin": {
-        "elapsed time [min]": TIME_S / 60.0,
-        "U (mV)": 1e3 * VOLTAGE_V,
-        "I [mA]": 1e3 * CURRENT_A,
-        "Temp (K)": TEMPERATURE_C + 273.15,
-    },
-    "hours": {"Time (h)": TIME_S / 3600.0, "Volts": VOLTAGE_V, "Amps": CURRENT_A, "temperature": TEMPERATURE_C},
-    "a clock": {
-        "Time": list(map(clock, TIME_S)),
-        "voltage_mv": 1e3 * VOLTAGE_V,
-        "current_ma": -1e3 * CURRENT_A,
-        "T1": TEMPERATURE_C,
-    },
-    "dates": {
-        "Date_Time": pd.Timestamp("2026-02-28 23:50") + pd.to_timedelta(TIME_S, unit="s"),
-        "Voltage": VOLTAGE_V,
-        "Current": CURRENT_A,
-        "Cell Temperature": TEMPERATURE_C,
-    },
+    "this package": named("time_s", "voltage_V", "current_A", "temperature_C", (1.0, 1.0, 1.0)),
+    "Battery Data Format": BDF | {"Ambient Temperature / degC": np.full(len(TIME_S), 23.0)},
+    "Battery Data Format for machines": named("test_time_second", "voltage_volt", "current_ampere", "temperature_t1_celsius"),
+    "Arbin": ARBIN | {"Step_Time(s)": np.mod(TIME_S, 100.0), "Charge_Capacity(Ah)": np.zeros(len(TIME_S))},
+    "BioLogic": named("time/s", "Ewe/V", "<I>/mA", "temperature", (1.0, 1.0, -1e3)),
+    "Neware": named("Total Time", "Voltage(V)", "Current(mA)", "T1", (1.0, 1.0, -1e3)),
+    "NASA": named("Time", "Voltage_measured", "Current_measured", "Temperature_measured"),
+    "thousandths, minutes and kelvin": named(
+        "elapsed time [min]", "U (mV)", "I [mA]", "Temp (K)", (1.0 / 60.0, 1e3, 1e3), zero_C=273.15
+    ),
+    "hours": named("Time (h)", "Volts", "Amps", "temperature", (1.0 / 3600.0, 1.0, 1.0)),
+    "a clock": CLOCK | {"Time": list(map(clock, TIME_S))},
+    "dates": DATES | {"Date_Time": pd.Timestamp("2026-02-28 23:50") + pd.to_timedelta(TIME_S, unit="s")},
 }
 
 
@@ -329,7 +304,6 @@ def test_discharges_whose_charges_are_not_logged_need_a_number(tmp_path):
     ("changes", "message"),
     [
         ({"voltage_V": 1e3 * VOLTAGE_V}, r"voltage_V must lie within 0 \.\. 5.5 V, got 4190.*not in mV"),
-        ({"current_A": 1e3 * CURRENT_A}, r"current_A must lie within .*not in mA"),
         ({"time_s": np.where(TIME_S == 40.0, 10.0, TIME_S)}, "time_s must increase from sample to sample.*each sample once"),
         ({"time_s": TIME_S / 3600.0}, "Give the time in seconds, not in hours"),
         ({"voltage_V": np.where(TIME_S == 40.0, np.nan, VOLTAGE_V)}, "the voltage must be finite, got nan in row 4"),
@@ -343,7 +317,6 @@ def test_discharges_whose_charges_are_not_logged_need_a_number(tmp_path):
         ({"Voltage(V)": VOLTAGE_V}, "both 'voltage_V' and 'Voltage.V.' may be the voltage"),
         ({"current_A": np.abs(np.sin(TIME_S)), "voltage_V": 3.7 + 0.3 * np.cos(TIME_S)}, "cannot be told"),
         ({"cycle": 1.5}, "the column of the cycle must hold whole numbers"),
-        ({"temperature_C": np.where(TIME_S == 40.0, np.inf, 24.0)}, "temperature_C must be finite"),
         (
             {"time_s": [f"{1e3 * time_s:,.1f}" for time_s in TIME_S]},
             "'time_s' must hold numbers, got '5,000.0' in row 2. Write numbers without separators of thousands",
@@ -407,9 +380,9 @@ def test_one_bad_discharge_does_not_lose_the_others(tmp_path):
 
 def test_binary_files_of_neware_and_biologic_go_by_the_names_of_its_readers(tmp_path, monkeypatch):
     neware, biologic = types.ModuleType("NewareNDA"), types.ModuleType("galvani.BioLogic")
-    table = pd.DataFrame({"Cycle": 1, "Step": np.where(LOADED, 2, 1), "Status": np.where(LOADED, "CC_DChg", "Rest")})
-    columns = {"Time": TIME_S, "Voltage": VOLTAGE_V, "Current(mA)": -1e3 * CURRENT_A, "Timestamp": pd.Timestamp("2026-02-28")}
-    neware.read = lambda path, log_level: table.assign(**columns)
+    table = pd.DataFrame(named("Time", "Voltage", "Current(mA)", "T1", (1.0, 1.0, -1e3)) | {"Cycle": 1})
+    table = table.assign(Step=np.where(LOADED, 2, 1), Status=np.where(LOADED, "CC_DChg", "Rest")).drop(columns="T1")
+    neware.read = lambda path, log_level: table.assign(Timestamp=pd.Timestamp("2026-02-28"))
     records = np.rec.fromarrays([TIME_S, -1e3 * CURRENT_A, VOLTAGE_V], names="time/s,I/mA,Ewe/V")
     biologic.MPRfile = lambda stream: types.SimpleNamespace(data=records)
     monkeypatch.setitem(sys.modules, "NewareNDA", neware)

@@ -56,14 +56,6 @@ def test_derivatives_are_those_of_the_simulated_voltage(model):
         checks(name, dlog, *(each.simulate(current_A, q, r_o) for each in changed))
 
 
-def test_the_equilibrium_voltage_depends_on_the_mole_fraction_that_is_given():
-    tangents = RecordModel(thermal=True).tangents(CURRENT_A, 6000.0, 0.15)
-    shifted = RecordModel(NEW_CELL.replace(U0p=4.04, Ap=(0.0, *NEW_CELL.Ap[1:])), thermal=True)
-    difference_V = shifted.simulate(CURRENT_A, 6000.0, 0.15).voltage_V - tangents.voltage_V
-    y = 2.0 * tangents.fraction_p - 1.0
-    np.testing.assert_allclose(difference_V, 0.01 - y * NEW_CELL.Ap[0] / NEW_CELL.F, rtol=0.0, atol=1e-12)
-
-
 @pytest.mark.parametrize("model", [RecordModel(), RecordModel(initial=PARTLY_DISCHARGED)])
 def test_the_least_q_mobile_follows_the_time_of_diffusion(model):
     _, by_log_C = model.least_q_mobile_tangent_C(CURRENT_A)
