@@ -229,14 +229,10 @@ POLICY = ["B0005:100", "--method", "policy"]
         (["B0005:1", "--prior-q", "1.9", "0.1"], "Ampere-hours"),
         (["B0005:1", "--cut-off", "4.3"], "between load-on at 26.242 s and 4.3 V"),
         (["B0005:1", "--cut-off", "nan"], "the cut-off must be a voltage above 0 V, got nan"),
-        (["B0005:1", "--mismatch", "-1"], "mismatch_V"),
-        (["B0005:1", "--current-gain-sd", "2"], "current_gain_sd is a share within 0 .. 1"),
         (["B0005:1", "--future-current", "-2"], "future_current_A must be finite and at least 0 A, got -2.0"),
         (["B0005:1", "--nominal", "0"], "the nominal capacity in Ah must be a positive, finite number, got 0.0"),
         (["B0005:1", "--ambient", "297"], "the ambient temperature must lie within -60 .. 100 degC, got 297.0"),
         ([*POLICY, "--prior", "5000", "50"], "a policy takes no prior_q_mobile_C"),
-        ([*POLICY, "--ambient", "30"], "a policy takes no ambient_C"),
-        ([*POLICY, "--mismatch", "0.01"], "a policy takes no mismatch_V"),
         ([*POLICY, "--initial-soc", "0.8"], "a policy takes no initial_soc"),
         ([*POLICY, "--policy", "none.onnx"], "none.onnx"),
         (["B0005:1", "--method", "kalman", "--policy", "mine.onnx"], "a policy is for the method policy, got 'kalman'"),
@@ -278,13 +274,6 @@ def test_no_capacity_is_stated_where_the_cell_did_not_start_full(first, more, re
     shown = terminal.shows(*arguments, status=3)
     assert "Ah   to 2.7 V; not the capacity, as not all of the charge is known" in shown
     assert "state of health          not known" in shown
-
-
-def test_what_is_drawn_after_the_cut_off_is_told(recorded, tmp_path, terminal):
-    time_s = np.append(recorded.time_s, recorded.time_s + recorded.time_s[-1] + 100.0)  # too soon for a charge between
-    columns = (np.append(column, column) for column in (recorded.voltage_V, recorded.current_A))
-    path = write(Discharge(time_s, *columns), tmp_path / "two.csv")
-    assert "Ah more are drawn after the cut-off at" in terminal.row(path, "--discharge-is-positive")["notes"]
 
 
 def test_large_cells_are_fitted_and_calibrated(tmp_path, terminal):
@@ -428,15 +417,6 @@ def test_the_temperature_is_that_of_the_record_or_the_one_given(recorded, tmp_pa
     assert [round(row["ambient_C"]) for row in rows] == [20, 50, 40, 10]
     assert ["its temperature does not hold" in row["notes"] for row in rows] == [True, True, False, False]
     assert rows[0]["r_o_ohm"] > rows[2]["r_o_ohm"] + 0.001 > rows[1]["r_o_ohm"]
-
-
-def test_the_filter_follows_the_measured_temperature_unless_another_one_is_stated(recorded):
-    warming = replace(recorded, temperature_C=np.linspace(20.0, 40.0, len(recorded.time_s)))
-    measured, stated, held = (
-        calibrated(warming, Settings(method="kalman", **more)).row()["r_o_ohm"]
-        for more in ({}, {"ambient_C": 20.0}, {"thermal": False})
-    )
-    assert measured < stated and measured < held
 
 
 def test_many_samples_are_averaged_and_say_the_same(recorded, tmp_path, terminal):

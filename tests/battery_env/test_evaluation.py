@@ -93,8 +93,9 @@ def test_estimators_that_look_back_are_scored_too(data):
     late, early = (evaluate(Constant(q, r), data) for q, r in ((7600.0, 0.1), (4000.0, 0.2)))
     assert (late["updates"] == 1).all()
     np.testing.assert_allclose(late["q_mobile_mape_percent"], 100 * np.abs(7600.0 / data.q_mobile - 1))
-    # a longer lasting cell predicts a later end
+    # a longer lasting cell predicts a later end, and one that cannot be predicts none
     assert (late["eod_error_s"] >= 0.0).all() and (early["eod_error_s"] <= 0.0).all()
+    assert evaluate(Constant(6000.0, -0.1), data)["eod_error_s"].isna().all()
 
 
 def test_what_cannot_be_evaluated_is_refused():
@@ -122,11 +123,6 @@ def test_forecasts_hold_the_estimate_of_the_time():
     assert summary["mape_worst_percent"] == scores["q_mobile_mape_percent"].max() > summary["mape_percent"]
     late = scores["eod_error_at_50_percent_s"].abs() / scores["eod_time_s"]
     assert summary["eod_error_percent_at_50_percent"] == pytest.approx(100.0 * late.mean())
-
-
-def test_there_is_no_forecast_for_estimates_that_no_cell_can_have(data):
-    for estimate in (Constant(6000.0, -0.1), Constant(np.nan, 0.1)):
-        assert evaluate(estimate, data)["eod_error_s"].isna().all()
 
 
 def test_coverage_is_the_share_within_two_stated_deviations(data):

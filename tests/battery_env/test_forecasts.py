@@ -1,13 +1,12 @@
 """Forecasts are the model's where everything is known, and as wide as what is not known where it is not."""
 
-import itertools
 import re
 
 import numpy as np
 import pytest
 
 from battery_env import Estimate, RecordModel, forecast, initial_state, simulate
-from battery_env.loads import BlockBootstrap, Cycle, Load, RandomLoad, RandomPiecewise, constant, steadier_unit
+from battery_env.loads import BlockBootstrap, Cycle, Load, RandomPiecewise, constant, steadier_unit
 from battery_env.records import Samples, resample_current
 
 TRUTH = Estimate(6000.0, 0.15)
@@ -96,34 +95,12 @@ class TestLoads:
         found.plot()
 
 
-class Draws(RandomLoad):
-    """One given load after the other."""
-
-    def __init__(self, *loads):
-        self.loads = itertools.cycle(loads)
-
-    def __call__(self, rng):
-        return next(self.loads)
-
-
-class TestDraws:
+def test_health_is_not_that_of_a_single_draw():
     record = half(discharged(4.0, load_unit="current"))
-
-    def test_health_is_not_that_of_a_single_draw(self):
-        load = RandomPiecewise((1.0, 6.0), (600.0, 2400.0), unit="current")
-        settings = {"model": MODEL, "mismatch_V": 0.0, "samples": 100}
-        nominal_Ah = [forecast(self.record, TRUTH, load, seed=seed, **settings).nominal_Ah for seed in range(5)]
-        assert np.ptp(nominal_Ah) < 0.06 * np.mean(nominal_Ah)  # of single draws a third
-
-    def test_the_first_draw_decides_for_no_other(self):
-        off, on = constant(0.0, "current"), constant(4.0, "current")
-        found = certain(self.record, Draws(off, on, off, on))
-        known_s = certain(self.record, 4.0).eod_time_s[0]
-        # the first one is the new cell's
-        np.testing.assert_array_equal(found.eod_time_s, [known_s, np.inf, known_s])
-        assert found.nominal_Ah == certain(self.record, 4.0).nominal_Ah
-        # the cell that is left rests, and nothing is to be seen of it after the others have ended
-        assert found.time_s[-1] == pytest.approx(known_s, abs=12.0) and found.voltage_V[2, -1] > 3.2
+    load = RandomPiecewise((1.0, 6.0), (600.0, 2400.0), unit="current")
+    settings = {"model": MODEL, "mismatch_V": 0.0, "samples": 100}
+    nominal_Ah = [forecast(record, TRUTH, load, seed=seed, **settings).nominal_Ah for seed in range(5)]
+    assert np.ptp(nominal_Ah) < 0.06 * np.mean(nominal_Ah)  # of single draws a third
 
 
 class TestUncertainty:

@@ -87,22 +87,14 @@ class TestModel:
             assert right_or_refused(lambda: battery_env.step(state, **arguments), name) is None
 
 
-class TestDataSets:
-    @FAST
-    @given(
-        index=ARRAYS
-        | JUNK
-        | st.lists(st.booleans())
-        | arrays(np.int64, array_shapes(max_dims=2), elements=st.integers(-2, 22))
-    )
-    def test_choosing(self, data, index):
-        part = right_or_refused(lambda: data.subset(index), "index")
-        if part is not None:
-            np.testing.assert_array_equal(part.q_mobile, data.q_mobile[np.asarray(index)])
-
-    def test_a_mask_is_not_taken_for_numbers(self, data):
-        with pytest.raises(TypeError, match=r"np.flatnonzero.*got bool"):
-            data.subset(data.q_mobile > 5000.0)
+@FAST
+@given(
+    index=ARRAYS | JUNK | st.lists(st.booleans()) | arrays(np.int64, array_shapes(max_dims=2), elements=st.integers(-2, 22))
+)
+def test_trajectories_are_chosen_by_numbers_that_there_are(data, index):
+    part = right_or_refused(lambda: data.subset(index), "index")
+    if part is not None:
+        np.testing.assert_array_equal(part.q_mobile, data.q_mobile[np.asarray(index)])
 
 
 @FAST
