@@ -20,14 +20,10 @@ from battery_env.loads import constant
 from sb3_lac import GymnasiumVecEnv
 
 
-@pytest.fixture
-def make_model():
-    def _make_model(env="Pendulum-v1"):
-        model = TD3("MlpPolicy", env, policy_kwargs={"net_arch": [8]}, buffer_size=500, device="cpu")
-        model.set_logger(Logger(folder=None, output_formats=[]))
-        return model
-
-    return _make_model
+def make_model(env="Pendulum-v1"):
+    model = TD3("MlpPolicy", env, policy_kwargs={"net_arch": [8]}, buffer_size=500, device="cpu")
+    model.set_logger(Logger(folder=None, output_formats=[]))
+    return model
 
 
 def callback_of(*args, **kwargs):
@@ -58,7 +54,7 @@ class Recorded(KVWriter):
         self.dumps.append((step, dict(key_values)))
 
 
-def test_mean_and_worst_are_logged_at_their_timesteps(make_model):
+def test_mean_and_worst_are_logged_at_their_timesteps():
     model = make_model()
     logged = Recorded()
     model.set_logger(Logger(folder=None, output_formats=[logged]))
@@ -79,7 +75,7 @@ def test_mean_and_worst_are_logged_at_their_timesteps(make_model):
     assert callback.best_objective == 3.0
 
 
-def test_frequency_counts_calls_and_not_timesteps(make_model):
+def test_frequency_counts_calls_and_not_timesteps():
     callback = callback_of(Evaluation(1.0, 1.0), eval_freq=5, verbose=0)
     make_model(make_vec_env("Pendulum-v1", n_envs=3)).learn(30, callback=callback)
     assert [entry["timesteps"] for entry in callback.history] == [15, 30]
@@ -88,7 +84,7 @@ def test_frequency_counts_calls_and_not_timesteps(make_model):
     assert never.history == []
 
 
-def test_history_and_best_model_are_saved_and_an_interrupted_run_goes_on(make_model, tmp_path):
+def test_history_and_best_model_are_saved_and_an_interrupted_run_goes_on(tmp_path):
     log_path, best_path = tmp_path / "run" / "calibration.csv", tmp_path / "best"
 
     def learn(model, n_steps, *means):
@@ -119,7 +115,7 @@ def test_history_and_best_model_are_saved_and_an_interrupted_run_goes_on(make_mo
     assert sorted(path.name for path in tmp_path.rglob("*.*")) == ["best_model.zip", "calibration.csv"]
 
 
-def test_missing_result_of_a_trajectory_is_not_hidden(make_model):
+def test_missing_result_of_a_trajectory_is_not_hidden():
     def evaluate(model):
         return pd.DataFrame({"mape_percent": [1.0, np.nan]})
 
@@ -139,7 +135,7 @@ class Count(BaseCallback):
         return not self.stop
 
 
-def test_child_callbacks_are_triggered_and_can_stop_the_training(make_model, capsys):
+def test_child_callbacks_are_triggered_and_can_stop_the_training(capsys):
     on_new_best, after_eval = Count(), Count()
     callbacks = {"callback_on_new_best": on_new_best, "callback_after_eval": after_eval}
     callback = callback_of(Evaluation(3.0, 4.0, 2.0), eval_freq=5, **callbacks)
@@ -152,7 +148,7 @@ def test_child_callbacks_are_triggered_and_can_stop_the_training(make_model, cap
         assert make_model().learn(100, callback=callback).num_timesteps == 5
 
 
-def test_wrong_columns_are_named_before_the_training(make_model, tmp_path):
+def test_wrong_columns_are_named_before_the_training(tmp_path):
     with pytest.raises(ValueError, match="at least one column"):
         callback_of(Evaluation(), metrics="mape_percent")
     model = make_model()
@@ -168,7 +164,7 @@ def test_wrong_columns_are_named_before_the_training(make_model, tmp_path):
 @pytest.mark.parametrize(
     ("env_id", "parameters", "batched"), [("BatteryRo-v0", ("r_o",), True), ("BatteryJoint-v0", ("q_mobile", "r_o"), False)]
 )
-def test_default_metrics_are_those_of_the_parameters_that_the_environment_finds(make_model, env_id, parameters, batched):
+def test_default_metrics_are_those_of_the_parameters_that_the_environment_finds(env_id, parameters, batched):
     env = GymnasiumVecEnv(gym.make_vec(env_id, 2, autoreset_mode="SameStep")) if batched else make_vec_env(env_id)
     discharges = TrajectoryDataset.paper("r_o")[:2]
     callback = CalibrationCallback(lambda model: evaluate(PolicyEstimator(model, env_id), discharges), eval_freq=2, verbose=0)
@@ -185,7 +181,7 @@ def test_without_stable_baselines3_the_extra_is_named():
     assert "pip install 'battery_env[sb3]'" in result.stderr
 
 
-def test_tensorboard_gets_a_figure_of_each_parameter_with_a_metric(make_model, tmp_path):
+def test_tensorboard_gets_a_figure_of_each_parameter_with_a_metric(tmp_path):
     scores = evaluate(ClosedForm(), TrajectoryDataset.generate("q_mobile", 3, [constant(8.0)], seed=0))
     for evaluation, metrics, parameters in (
         (lambda model: scores, ("q_mobile_mape_percent", "r_o_mape_percent"), {"q_mobile", "r_o"}),

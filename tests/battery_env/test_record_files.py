@@ -112,20 +112,18 @@ def test_blanks_separate_columns_as_numpy_writes_them(comments, tmp_path):
 
 
 def test_maccor_says_the_direction_of_the_current_by_a_letter(tmp_path):
-    lines = ["Today's Date\t02/28/2026", "Rec#\tCyc#\tStep\tTest (Sec)\tStep (Sec)\tAmp-hr\tAmps\tVolts\tState\tES\t"]
-    charge = [(60.0 * n, 1.0, 3.5 + 0.01 * n, "C", 1) for n in range(60)]
+    charge_s = 60.0 * np.arange(60)
+    names = ["Test (Sec)", "Amps", "Volts", "State", "Step"]
+    charge = (charge_s, np.ones(60), 3.5 + 0.01 * np.arange(60), np.full(60, "C"), np.ones(60, int))
     steps = np.where(LOADED, 3, np.where(TIME_S < 7.0, 2, 4))
-    discharge = [
-        (4000.0 + t, abs(i), v, "D" if i else "R", step)
-        for t, i, v, step in zip(TIME_S, CURRENT_A, VOLTAGE_V, steps, strict=True)
-    ]
-    for n, (time_s, current_A, voltage_V, state, step) in enumerate([*charge, *discharge]):
-        lines.append(f"{n}\t1\t{step}\t{time_s}\t0.0\t0.0\t{current_A}\t{voltage_V:.6f}\t{state}\t1\t")
-    (tmp_path / "cell.txt").write_text("\n".join(lines))
-    discharge = one(tmp_path / "cell.txt")
-    np.testing.assert_allclose(discharge.time_s - 4000.0, TIME_S)
-    np.testing.assert_allclose(discharge.current_A, CURRENT_A)
-    assert discharge.meta["cycle"] == 1
+    discharge = (4000.0 + TIME_S, CURRENT_A, VOLTAGE_V, np.where(LOADED, "D", "R"), steps)
+    table = {name: np.append(*parts) for name, *parts in zip(names, charge, discharge, strict=True)} | {"Cyc#": 1}
+    path = tmp_path / "cell.txt"
+    path.write_text("Today's Date\t02/28/2026\n" + pd.DataFrame(table).to_csv(sep="\t", index=False))
+    found = one(path)
+    np.testing.assert_allclose(found.time_s - 4000.0, TIME_S)
+    np.testing.assert_allclose(found.current_A, CURRENT_A)
+    assert found.meta["cycle"] == 1
 
 
 def test_biologic_text_has_lines_above_its_table(tmp_path):
