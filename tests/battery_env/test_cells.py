@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from scipy.integrate import trapezoid
 from scipy.io import savemat
 
 from battery_env.cells import BUNDLED_CELLS, Discharge, load_nasa_discharges
@@ -26,21 +25,12 @@ def recorded(**changes) -> dict:
 
 @pytest.fixture(scope="module")
 def bundled() -> dict[str, list[Discharge]]:
-    return {cell: load_nasa_discharges(cell) for cell in BUNDLED_CELLS}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        return {cell: load_nasa_discharges(cell) for cell in BUNDLED_CELLS}
 
 
 class TestDischarge:
-    def test_its_arrays_are_floats_and_cannot_be_written_to(self):
-        discharge = Discharge(**recorded())
-        assert discharge.voltage_V.dtype == np.float64
-        with pytest.raises(ValueError, match="read-only"):
-            discharge.voltage_V[0] = 0.0
-
-    def test_temperature_and_meta_are_optional(self):
-        discharge = Discharge(**recorded(temperature_C=None))
-        assert discharge.temperature_C is None and discharge.meta == {}
-        assert discharge.loaded_part(2.0).until(50.0).temperature_C is None
-
     @pytest.mark.parametrize(
         ("changes", "message"),
         [
@@ -56,21 +46,19 @@ class TestDischarge:
             ({"time_s": 1e4 * np.arange(7), "current_A": np.full(7, 500.0)}, "draws 3e.07 C.*not in mA"),
             ({"temperature_C": np.full(7, 297.0)}, "got 297.*not in kelvin"),
             ({"current_A": np.full(7, -2.0)}, "draws -120 C.*flip the sign.*discharge_is_negative"),
+            ({"voltage_V": ["4.1", "3.9", "ERROR", "3.5", "3.4", "3.0", "3.0"]}, "voltage_V must hold numbers"),
+            ({"current_A": np.full(7, 2.0 + 1.0j)}, "current_A must hold real numbers"),
+            ({"current_A": np.ma.masked_less(np.arange(7.0), 1.0)}, "current_A must hold real numbers"),
+            ({"time_s": None}, "time_s must hold real numbers"),
         ],
     )
     def test_refuses_what_cannot_be_meant_and_says_what_to_do(self, changes, message):
-        with pytest.raises(ValueError, match=message):
+        with pytest.raises((TypeError, ValueError), match=message) as caught:
             Discharge(**recorded(**changes))
-
-    def test_refuses_text_for_numbers_in_one_line(self):
-        with pytest.raises(TypeError, match="voltage_V must hold numbers") as caught:
-            Discharge(**recorded(voltage_V=["4.1", "3.9", "ERROR", "3.5", "3.4", "3.0", "3.0"]))
         assert "\n" not in str(caught.value)
 
     def test_load_is_switched_on_midway_between_the_samples(self):
         assert Discharge(**recorded()).load_on_time_s == 15.0
-
-    def test_a_record_that_starts_under_load_is_on_from_its_first_sample(self):
         assert Discharge(**recorded(current_A=np.full(7, 2.0))).load_on_time_s == 0.0
 
     @pytest.mark.parametrize(("rest_every_s", "gap_s"), [(600.0, 600.0), (600.0, 20.0), (120.0, 200.0)])
@@ -82,17 +70,11 @@ class TestDischarge:
         discharge = Discharge(np.append(rest_s, loaded_s), voltage_V, current_A)
         assert discharge.load_on_time_s == loaded_s[0] - 10.0
         assert discharge.loaded_part(2.0).charge_C == pytest.approx(2.0 * 600.0)
-        # likewise where a rest follows
-        turned = drawn(-discharge.time_s[::-1], current_A[::-1], -discharge.time_s[0])
-        assert turned == pytest.approx(discharge.charge_C)
 
-    @pytest.mark.parametrize("rest_s", [[-600.0], [-620.0, -600.0]])
-    def test_a_load_that_may_have_been_on_for_part_of_a_gap_is_refused(self, rest_s):
-        time_s = np.append(rest_s, 10.0 * np.arange(20))
-        current_A = np.repeat([0.0, 2.0], [len(rest_s), 20])
-        discharge = Discharge(time_s, np.linspace(4.2, 3.0, len(time_s)), current_A)
+    def test_a_load_that_may_have_been_on_for_part_of_a_gap_is_refused(self):
+        time_s, current_A = np.append(-600.0, 10.0 * np.arange(20)), np.repeat([0.0, 2.0], [1, 20])
         with pytest.raises(ValueError, match="samples are missing from -600 s, at rest, to 0 s, under load"):
-            discharge.loaded_part(2.0)
+            Discharge(time_s, np.linspace(4.2, 3.0, 21), current_A).loaded_part(2.0)
 
     def test_a_small_load_before_a_larger_one_belongs_to_the_discharge(self):
         time_s = 10.0 * np.arange(400)
@@ -105,7 +87,7 @@ class TestDischarge:
         after = Discharge(time_s, voltage_V, current_A[::-1])
         assert after.loaded_part(2.0).time_s[-1] == time_s[-11]
 
-    @pytest.mark.parametrize(("offset_A", "noise_A"), [(0.0, 0.03), (0.01, 0.03), (0.05, 0.0), (0.03, 0.01)])
+    @pytest.mark.parametrize(("offset_A", "noise_A"), [(0.01, 0.03), (0.05, 0.0)])
     def test_noise_and_offset_at_rest_are_no_load(self, offset_A, noise_A):
         random = np.random.default_rng(0)
         time_s = np.arange(0.0, 9000.0, 10.0)
@@ -114,32 +96,25 @@ class TestDischarge:
         discharge = Discharge(time_s, np.linspace(4.19, 3.0, 900), current_A)
         assert discharge.load_on_time_s == 3595.0 and discharge.loaded_part(2.0).time_s[-1] == 6590.0
 
-    def test_a_wild_current_does_not_make_all_other_currents_small(self):
-        current_A = np.repeat([0.0, 2.0], [10, 290])
-        current_A[150] = 50.0
-        discharge = Discharge(10.0 * np.arange(300), np.linspace(4.19, 2.6, 300), current_A)
-        assert discharge.load_on_time_s == 95.0 and discharge.eod_time_s(2.7) > 2500.0
-
     def test_end_of_discharge_is_interpolated(self):
         discharge = Discharge(**recorded())
         assert discharge.eod_time_s(2.7) == pytest.approx(47.5)
         assert discharge.eod_time_s(3.0) == 40.0
         assert np.isnan(discharge.eod_time_s(2.5))
 
-    @pytest.mark.parametrize("wild_V", [0.0, 2.0])
     @pytest.mark.parametrize("count", [1, 3])
     @pytest.mark.parametrize("period", [1000, 20, 7])
-    def test_a_voltage_that_only_seems_to_be_below_the_cut_off_is_refused(self, period, count, wild_V):
+    def test_a_voltage_that_only_seems_to_be_below_the_cut_off_is_refused(self, period, count):
         sample, time_s = np.arange(300), 10.0 * np.arange(300)
         current_A = np.where(sample < 10, 0.0, np.where(sample % period < 5, 1.5, 2.0))
         voltage_V = np.where(sample < 10, 4.19, np.linspace(4.2, 2.6, 300) - 0.1 * current_A)
         clean = Discharge(time_s, voltage_V, current_A)
         assert clean.loaded_part(2.7).time_s[-1] == clean.eod_time_s(2.7) > 2400.0
-        for position in (12, 63, 200):
+        for position in (12, 200):
             wild = voltage_V.copy()
-            wild[position : position + count] = wild_V
+            wild[position : position + count] = 2.0
             for method in (Discharge.eod_time_s, Discharge.loaded_part):
-                message = rf"falls to {wild_V:.2f} V at {10 * position} s and is back .* fault of the sensor.*\({count}\)"
+                message = rf"falls to 2.00 V at {10 * position} s and is back .* fault of the sensor.*\({count}\)"
                 with pytest.raises(ValueError, match=message):
                     method(Discharge(time_s, wild, current_A), 2.7)
 
@@ -161,8 +136,7 @@ class TestDischarge:
         np.testing.assert_allclose(part.temperature_C, [24.25, 24.5, 25.0, 25.5, 25.875])
         assert part.meta == {"cell": "X"}
         np.testing.assert_array_equal(part.loaded_part(2.7).time_s, part.time_s)
-
-    def test_loaded_part_of_an_unfinished_discharge_ends_with_its_last_sample_under_load(self):
+        # where it has not ended, with its last sample under load
         assert Discharge(**recorded()).loaded_part(2.0).time_s[-1] == 50.0
 
     @settings(max_examples=40)
@@ -180,26 +154,15 @@ class TestDischarge:
         # half a stretch at either end has the current of its sample
         assert mean.charge_C == pytest.approx(discharge.charge_C, abs=4.0 * (dt_s + 3.0))
 
-    def test_averaging_changes_nothing_where_samples_are_farther_apart(self):
-        discharge = Discharge(**recorded(current_A=np.full(7, 2.0)))
-        for name in ("time_s", "current_A"):
-            np.testing.assert_allclose(getattr(discharge.averaged(5.0), name), getattr(discharge, name))
-        with pytest.raises(ValueError, match="dt_s must be a positive"):
-            discharge.averaged(0.0)
-
     def test_parts_are_checked_for_what_is_left_of_them_and_cannot_be_written_to_either(self):
-        part = Discharge(**recorded(), meta={"cell": "X"}, starts_at_rest=True).until(50.0)
+        part = Discharge(**recorded(), meta={"cell": "X"}, starts_at_rest=True).until(55.0)
+        np.testing.assert_array_equal(part.time_s, [0.0, 10.0, 20.0, 30.0, 40.0, 50.0])
         assert part.starts_at_rest and part.meta == {"cell": "X"} and part.without_temperature().temperature_C is None
         for each in (part, part.loaded_part(2.7), part.averaged(5.0)):
             with pytest.raises(ValueError, match="read-only"):
                 each.voltage_V[0] = 0.0
         with pytest.raises(ValueError, match="draws 0 C in total"):
             Discharge(**recorded(current_A=[0.0, 0.0, 0.0, 0.0, 0.0, 2.0, 2.0])).until(40.0)
-
-    def test_until_keeps_what_was_known_then(self):
-        np.testing.assert_array_equal(Discharge(**recorded()).until(45.0).time_s, [0.0, 10.0, 20.0, 30.0, 40.0])
-        with pytest.raises(ValueError, match="at least 5"):
-            Discharge(**recorded()).until(12.0)
 
 
 class TestResampling:
@@ -211,10 +174,6 @@ class TestResampling:
         np.testing.assert_allclose(current_A[15:20], 2.0)
         np.testing.assert_allclose(current_A[20:22], [2.001, 2.003])
         np.testing.assert_allclose(current_A[55:], 0.0)
-
-    def test_switch_inside_a_step_is_shared_out(self):
-        time_s = np.array([0.0, 3.0, 6.0, 9.0, 12.0])
-        np.testing.assert_allclose(resample_current(time_s, np.array([0.0, 2.0, 2.0, 2.0, 2.0]), 1.0, 4), [0.0, 1.0, 2.0, 2.0])
 
     def test_simulated_records_are_taken_as_they_are(self):
         time_s, current_A = np.arange(50) * 1.0, np.random.default_rng(0).uniform(0.0, 5.0, 50)
@@ -236,20 +195,8 @@ class TestResampling:
         drawn_C = float(drawn(time_s, current_A, n_steps * dt_s))
         assert dt_s * resample_current(time_s, current_A, dt_s, n_steps).sum() == pytest.approx(drawn_C, abs=1e-9)
 
-    @settings(max_examples=60)
-    @given(gaps=st.lists(st.floats(10.0, 20.0), min_size=4, max_size=40), seed=st.integers(0, 1000))
-    def test_a_jump_at_the_midpoint_and_a_ramp_carry_the_same_charge(self, gaps, seed):
-        time_s = np.concatenate([[0.0], np.cumsum(gaps)])
-        current_A = np.random.default_rng(seed).choice([0.0, 0.05, 1.9, 2.0, 2.1], size=len(time_s))
-        assert drawn(time_s, current_A, time_s[-1]) == pytest.approx(trapezoid(current_A, time_s), abs=1e-9)
-
 
 class TestBundledCells:
-    @pytest.mark.parametrize("cell", BUNDLED_CELLS)
-    def test_all_168_discharges_are_there(self, bundled, cell):
-        assert [discharge.meta["cycle"] for discharge in bundled[cell]] == list(range(1, 169))
-        assert {discharge.meta["cell"] for discharge in bundled[cell]} == {cell}
-
     def test_first_discharge_is_as_published(self, bundled):
         first = bundled["B0005"][0]
         assert first.meta["capacity_Ah"] == pytest.approx(1.8565, abs=1e-4)
@@ -262,54 +209,52 @@ class TestBundledCells:
 
     @pytest.mark.parametrize("cell", BUNDLED_CELLS)
     def test_charge_to_cut_off_is_the_published_capacity(self, bundled, cell):
+        assert [discharge.meta["cycle"] for discharge in bundled[cell]] == list(range(1, 169))
         for discharge in bundled[cell]:
             # the published one counts up to the first sample below 2.7 V, at most one interval of 20 s later
             late_C = 3600.0 * discharge.meta["capacity_Ah"] - discharge.loaded_part(2.7).charge_C
-            assert -5.0 < late_C < 45.0
+            assert discharge.meta["cell"] == cell and -5.0 < late_C < 45.0
 
-    def test_unknown_cell_names_the_bundled_ones(self):
-        with pytest.raises(FileNotFoundError, match=r"B0007.*B0005, B0006"):
-            load_nasa_discharges("B0007")
-
-    def test_other_files_than_nasas_are_for_another_reader(self, tmp_path):
+    def test_other_cells_and_files_are_refused(self, tmp_path):
         (tmp_path / "own.csv").write_text("time_s,voltage_V,current_A\n")
-        with pytest.raises(ValueError, match=r"own.csv is none of NASA's .mat files: read it with read_discharges"):
-            load_nasa_discharges(tmp_path / "own.csv")
+        savemat(tmp_path / "other.mat", {"x": np.ones(3)})
+        savemat(tmp_path / "B1.mat", {"B1": {"cycle": {"type": "discharge", "time": np.ones(2)}}})
+        (tmp_path / "cut.mat").write_bytes((tmp_path / "B1.mat").read_bytes()[:-100])
+        for name, error, message in (
+            ("B0007", FileNotFoundError, r"B0007.*B0005, B0006"),
+            (tmp_path / "own.csv", ValueError, "own.csv is none of NASA's .mat files: read it with read_discharges"),
+            (tmp_path / "other.mat", ValueError, r"not laid out as NASA's battery files.*\(x\)"),
+            (tmp_path / "B1.mat", ValueError, "B1.mat is damaged, or not laid out"),
+            (tmp_path / "cut.mat", ValueError, "cut.mat is damaged, or not laid out"),
+        ):
+            with pytest.raises(error, match=message):
+                load_nasa_discharges(name)
 
 
 class TestNasaMatFile:
     @staticmethod
     def write(path: Path, broken: bool = False) -> Path:
-        """A file in the layout of NASA's B0005.mat: charge, discharge, impedance, and one discharge without capacity."""
+        """Write the layout of NASA's B0005.mat: charge, discharge, impedance, and one discharge without capacity."""
+        arrays = {name: np.array(values) for name, values in recorded().items()}
+        data = {
+            "Voltage_measured": arrays["voltage_V"],
+            "Current_measured": -arrays["current_A"],
+            "Temperature_measured": arrays["temperature_C"],
+            "Time": arrays["time_s"],
+        }
+        short = {name: values[:2] for name, values in data.items()}
 
         def test(kind: str, hour: float, data: dict) -> dict:
-            return {
-                "type": kind,
-                "ambient_temperature": 24,
-                "time": np.array([2008.0, 4.0, 2.0, hour, 25.0, 41.593]),
-                "data": data,
-            }
+            time = np.array([2008.0, 4.0, 2.0, hour, 25.0, 41.593])
+            return {"type": kind, "ambient_temperature": 24, "time": time, "data": data}
 
-        def data(**more) -> dict:
-            arrays = recorded()
-            return {
-                "Voltage_measured": np.array(arrays["voltage_V"]),
-                "Current_measured": -np.array(arrays["current_A"]),
-                "Temperature_measured": np.array(arrays["temperature_C"]),
-                "Current_load": np.ones(7),
-                "Voltage_load": np.zeros(7),
-                "Time": np.array(arrays["time_s"]),
-                **more,
-            }
-
-        short = {name: values[:2] for name, values in data().items()}
         cycle = np.array(
             [
                 test("charge", 13.0, {"Voltage_charge": np.ones(3)}),
-                test("discharge", 15.0, data(Capacity=1.8565)),
+                test("discharge", 15.0, data | {"Capacity": 1.8565}),
                 test("impedance", 16.0, {"Re": 0.0447, "Rct": 0.0695}),
                 test("impedance", 23.0, {"Re": 0.05, "Rct": 0.07}),
-                test("discharge", 22.0, short if broken else data(Capacity=np.array([]))),
+                test("discharge", 22.0, short if broken else data | {"Capacity": np.array([])}),
             ],
             dtype=object,
         )
@@ -334,14 +279,3 @@ class TestNasaMatFile:
         path = self.write(tmp_path / "B0018.mat", broken=True)
         with pytest.warns(UserWarning, match="discharge 2 is left out: .*at least 5"):
             assert [discharge.meta["cycle"] for discharge in load_nasa_discharges(path)] == [1]
-
-    def test_another_layout_is_refused(self, tmp_path):
-        savemat(tmp_path / "other.mat", {"x": np.ones(3)})
-        with pytest.raises(ValueError, match=r"not laid out as NASA's battery files.*\(x\)"):
-            load_nasa_discharges(tmp_path / "other.mat")
-
-
-def test_loading_the_bundled_cells_warns_of_nothing():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        load_nasa_discharges("B0005")

@@ -19,6 +19,7 @@ def keys(data):
 def test_a_split_is_seven_to_three_and_shares_nothing(load):
     train, test = standard_dataset(BOTH, load, "train"), standard_dataset(BOTH, load, "test")
     assert (len(train), len(test)) == (700, 300)
+    assert train is standard_dataset(BOTH, load, "train", 1.0, mismatch=0.0)
     assert keys(train) | keys(test) == keys(standard_dataset(BOTH, load, "all")) and not keys(train) & keys(test)
 
 
@@ -53,21 +54,6 @@ def test_changing_loads_change_within_their_bounds(load):
     held = np.diff(np.flatnonzero(np.diff(values)))
     low, high = {"piecewise": (60, 140), "random_walk": (60, 60)}[load]
     assert held.min() >= low and held.max() <= high and values.min() >= 2.0 and values.max() <= 8.0
-
-
-def test_a_mismatch_changes_the_constants_and_nothing_else():
-    exact, wrong = (standard_dataset(BOTH, "piecewise", "test", mismatch=mismatch) for mismatch in (0.0, 0.1))
-    np.testing.assert_array_equal(exact.q_mobile, wrong.q_mobile)
-    np.testing.assert_array_equal(exact.load_values[exact.load_start], wrong.load_values[wrong.load_start])
-    assert (exact.factors == 1.0).all()
-    np.testing.assert_allclose(wrong.factors.std(axis=0), 0.1, rtol=0.15)
-    assert not np.array_equal(exact.eod_time_s, wrong.eod_time_s)
-
-
-def test_a_data_set_is_made_once():
-    assert standard_dataset(BOTH, "constant", "all") is standard_dataset(
-        ("q_mobile", "r_o"), "constant", "all", 1.0, mismatch=0.0
-    )
 
 
 @pytest.mark.parametrize(

@@ -69,6 +69,10 @@ class TestSeries:
             life.after(11)
         with pytest.raises(ValueError, match=r"no discharge determines q_mobile\. Of the first one: Too short\."):
             followed(walk(2, 3), settled=False, reason="Too short.")
+        with pytest.raises(ValueError, match="must have no prior"):
+            track_life(TestRealCell.discharges, 2.7, LeastSquares(prior_q_mobile_C=(7000.0, 70.0)))
+        with pytest.raises(ValueError, match="at least one discharge"):
+            track_life([], 2.7)
 
 
 class TestRealCell:
@@ -82,9 +86,3 @@ class TestRealCell:
         assert life.prior_q_mobile_C[0] == pytest.approx(life.table["q_mobile_C"].iloc[-1], rel=0.01)
         earlier = track_life(self.discharges[:3], cut_off_V=2.7)
         assert life.after(3).prior_q_mobile_C == pytest.approx(earlier.prior_q_mobile_C)
-
-    def test_the_calibrator_has_no_prior_and_there_is_a_discharge(self):
-        with pytest.raises(ValueError, match="must have no prior"):
-            track_life(self.discharges, 2.7, LeastSquares(prior_q_mobile_C=(7000.0, 70.0)))
-        with pytest.raises(ValueError, match="at least one discharge"):
-            track_life([], 2.7)

@@ -36,7 +36,3 @@ def test_values_within_the_limits_are_taken_with_the_limits():
 def test_what_cannot_be_meant_is_refused(check, message):
     with pytest.raises((TypeError, ValueError), match=message):
         check()
-
-
-def test_axes_show_symbol_and_unit():
-    assert [parameter.label for parameter in PARAMETERS.values()] == ["$q^{max}$ (C)", r"$R_o$ ($\Omega$)"]

@@ -12,8 +12,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from battery_env.cells import BUNDLED_CELLS, load_nasa_discharges
-from battery_env.columns import find_columns
 from battery_env.record_files import read_discharge_csv, read_discharges
 
 # two samples at rest, a load of 2 A, and a rest
@@ -27,6 +25,18 @@ TEMPERATURE_C = np.round(24.0 + TIME_S / 200.0, 4)
 def clock(seconds: float) -> str:
     minutes, rest = divmod(seconds, 60.0)
     return f"{int(minutes // 60):02d}:{int(minutes % 60):02d}:{rest:06.3f}"
+
+
+def own(path: Path, **changes) -> Path:
+    """Write the record as a table with the names of this package, with other columns as changes say."""
+    table = pd.DataFrame({"time_s": TIME_S, "voltage_V": VOLTAGE_V, "current_A": CURRENT_A} | changes)
+    table.to_csv(path, index=False)
+    return path
+
+
+def rows(*columns: np.ndarray, decimal: str = ".", delimiter: str = ",") -> list[str]:
+    """Return the lines of a table as text."""
+    return [delimiter.join(f"{x:.9g}".replace(".", decimal) for x in row) for row in zip(*columns, strict=True)]
 
 
 def check(discharge, temperature: bool = False) -> None:
@@ -46,55 +56,30 @@ def one(path: Path, **options):
     return discharge
 
 
+def named(time: str, voltage: str, current: str, temperature: str, factors=(1.0, 1.0, -1.0), zero_C=0.0) -> dict:
+    """Return the record by its columns' names, in units that the factors make of s, V and A."""
+    quantities = zip((time, voltage, current), factors, (TIME_S, VOLTAGE_V, CURRENT_A), strict=True)
+    return {name: factor * values for name, factor, values in quantities} | {temperature: TEMPERATURE_C + zero_C}
+
+
+ARBIN = named("Test_Time(s)", "Voltage(V)", "Current(A)", "Aux_Temperature_1 (C)")
+BDF = named("Test Time / s", "Voltage / V", "Current / A", "Surface Temperature T1 / degC")
+CLOCK = named("Time", "voltage_mv", "current_ma", "T1", (1.0, 1e3, -1e3))
+DATES = named("Date_Time", "Voltage", "Current", "Cell Temperature", (1.0, 1.0, 1.0))
 COLUMNS = {
-    "the own names": {"time_s": TIME_S, "voltage_V": VOLTAGE_V, "current_A": CURRENT_A, "temperature_C": TEMPERATURE_C},
-    "Battery Data Format": {
-        "Test Time / s": TIME_S,
-        "Voltage / V": VOLTAGE_V,
-        "Current / A": -CURRENT_A,
-        "Surface Temperature T1 / degC": TEMPERATURE_C,
-        "Ambient Temperature / degC": np.full(len(TIME_S), 23.0),
-    },
-    "Battery Data Format for machines": {
-        "test_time_second": TIME_S,
-        "voltage_volt": VOLTAGE_V,
-        "current_ampere": -CURRENT_A,
-        "temperature_t1_celsius": TEMPERATURE_C,
-    },
-    "Arbin": {
-        "Data_Point": np.arange(len(TIME_S)),
-        "Test_Time(s)": TIME_S,
-        "Step_Time(s)": np.mod(TIME_S, 100.0),
-        "Current(A)": -CURRENT_A,
-        "Voltage(V)": VOLTAGE_V,
-        "Aux_Temperature_1 (C)": TEMPERATURE_C,
-        "Charge_Capacity(Ah)": np.zeros(len(TIME_S)),
-    },
-    "NASA": {
-        "Time": TIME_S,
-        "Voltage_measured": VOLTAGE_V,
-        "Current_measured": -CURRENT_A,
-        "Temperature_measured": TEMPERATURE_C,
-    },
-    "thousandths, minutes and kelvin": {
-        "elapsed time [min]": TIME_S / 60.0,
-        "U (mV)": 1e3 * VOLTAGE_V,
-        "I [mA]": 1e3 * CURRENT_A,
-        "Temp (K)": TEMPERATURE_C + 273.15,
-    },
-    "hours": {"Time (h)": TIME_S / 3600.0, "Volts": VOLTAGE_V, "Amps": CURRENT_A, "temperature": TEMPERATURE_C},
-    "a clock": {
-        "Time": list(map(clock, TIME_S)),
-        "voltage_mv": 1e3 * VOLTAGE_V,
-        "current_ma": -1e3 * CURRENT_A,
-        "T1": TEMPERATURE_C,
-    },
-    "dates": {
-        "Date_Time": pd.Timestamp("2026-02-28 23:50") + pd.to_timedelta(TIME_S, unit="s"),
-        "Voltage": VOLTAGE_V,
-        "Current": CURRENT_A,
-        "Cell Temperature": TEMPERATURE_C,
-    },
+    "this package": named("time_s", "voltage_V", "current_A", "temperature_C", (1.0, 1.0, 1.0)),
+    "Battery Data Format": BDF | {"Ambient Temperature / degC": np.full(len(TIME_S), 23.0)},
+    "Battery Data Format for machines": named("test_time_second", "voltage_volt", "current_ampere", "temperature_t1_celsius"),
+    "Arbin": ARBIN | {"Step_Time(s)": np.mod(TIME_S, 100.0), "Charge_Capacity(Ah)": np.zeros(len(TIME_S))},
+    "BioLogic": named("time/s", "Ewe/V", "<I>/mA", "temperature", (1.0, 1.0, -1e3)),
+    "Neware": named("Total Time", "Voltage(V)", "Current(mA)", "T1", (1.0, 1.0, -1e3)),
+    "NASA": named("Time", "Voltage_measured", "Current_measured", "Temperature_measured"),
+    "thousandths, minutes and kelvin": named(
+        "elapsed time [min]", "U (mV)", "I [mA]", "Temp (K)", (1.0 / 60.0, 1e3, 1e3), zero_C=273.15
+    ),
+    "hours": named("Time (h)", "Volts", "Amps", "temperature", (1.0 / 3600.0, 1.0, 1.0)),
+    "a clock": CLOCK | {"Time": list(map(clock, TIME_S))},
+    "dates": DATES | {"Date_Time": pd.Timestamp("2026-02-28 23:50") + pd.to_timedelta(TIME_S, unit="s")},
 }
 
 
@@ -109,21 +94,12 @@ def test_columns_go_by_the_names_of_testers_and_units_are_told_from_them(columns
     assert ("ambient_temperature_C" in discharge.meta) == ("Ambient Temperature / degC" in columns)
 
 
-@pytest.mark.parametrize("index", ["time_s", ["time_s", "current_A"]])
-def test_an_index_of_a_parquet_file_is_columns_too(index, tmp_path):
-    table = pd.DataFrame({"time_s": TIME_S, "voltage_V": VOLTAGE_V, "current_A": CURRENT_A, "other": "text"})
-    table.set_index(index).to_parquet(tmp_path / "cell.parquet")
-    check(one(tmp_path / "cell.parquet"))
-
-
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "latin-1"])
 @pytest.mark.parametrize(("delimiter", "decimal"), [(",", "."), (";", "."), (";", ","), ("\t", "."), ("\t", ",")])
 def test_delimiters_decimal_marks_and_encodings_are_told(delimiter, decimal, encoding, tmp_path):
-    header = ["Zeit (°C?)", "time (s)", "voltage (V)", "current (A)"]
-    rows = [header] + [
-        ["1", *(f"{x:.6f}".replace(".", decimal) for x in row)] for row in zip(TIME_S, VOLTAGE_V, CURRENT_A, strict=True)
-    ]
-    text = "Prüfling: Zelle 7\nBemerkung, mit Komma; und Strichpunkt\n\n" + "\n".join(map(delimiter.join, rows)) + "\n"
+    header = delimiter.join(["Zeit (°C?)", "time (s)", "voltage (V)", "current (A)"])
+    lines = rows(np.ones(len(TIME_S)), TIME_S, VOLTAGE_V, CURRENT_A, decimal=decimal, delimiter=delimiter)
+    text = "\n".join(["Prüfling: Zelle 7", "Bemerkung, mit Komma; und Strichpunkt", "", header, *lines, ""])
     (tmp_path / "zelle.csv").write_text(text, encoding=encoding)
     check(one(tmp_path / "zelle.csv"))
 
@@ -136,29 +112,24 @@ def test_blanks_separate_columns_as_numpy_writes_them(comments, tmp_path):
 
 
 def test_maccor_says_the_direction_of_the_current_by_a_letter(tmp_path):
-    lines = ["Today's Date\t02/28/2026", "Rec#\tCyc#\tStep\tTest (Sec)\tStep (Sec)\tAmp-hr\tAmps\tVolts\tState\tES\t"]
-    charge = [(60.0 * n, 1.0, 3.5 + 0.01 * n, "C", 1) for n in range(60)]
+    charge_s = 60.0 * np.arange(60)
+    names = ["Test (Sec)", "Amps", "Volts", "State", "Step"]
+    charge = (charge_s, np.ones(60), 3.5 + 0.01 * np.arange(60), np.full(60, "C"), np.ones(60, int))
     steps = np.where(LOADED, 3, np.where(TIME_S < 7.0, 2, 4))
-    discharge = [
-        (4000.0 + t, abs(i), v, "D" if i else "R", step)
-        for t, i, v, step in zip(TIME_S, CURRENT_A, VOLTAGE_V, steps, strict=True)
-    ]
-    for n, (time_s, current_A, voltage_V, state, step) in enumerate([*charge, *discharge]):
-        lines.append(f"{n}\t1\t{step}\t{time_s}\t0.0\t0.0\t{current_A}\t{voltage_V:.6f}\t{state}\t1\t")
-    (tmp_path / "cell.txt").write_text("\n".join(lines))
-    discharge = one(tmp_path / "cell.txt")
-    np.testing.assert_allclose(discharge.time_s - 4000.0, TIME_S)
-    np.testing.assert_allclose(discharge.current_A, CURRENT_A)
-    assert discharge.meta["cycle"] == 1
+    discharge = (4000.0 + TIME_S, CURRENT_A, VOLTAGE_V, np.where(LOADED, "D", "R"), steps)
+    table = {name: np.append(*parts) for name, *parts in zip(names, charge, discharge, strict=True)} | {"Cyc#": 1}
+    path = tmp_path / "cell.txt"
+    path.write_text("Today's Date\t02/28/2026\n" + pd.DataFrame(table).to_csv(sep="\t", index=False))
+    found = one(path)
+    np.testing.assert_allclose(found.time_s - 4000.0, TIME_S)
+    np.testing.assert_allclose(found.current_A, CURRENT_A)
+    assert found.meta["cycle"] == 1
 
 
 def test_biologic_text_has_lines_above_its_table(tmp_path):
-    head = "EC-Lab ASCII FILE\nNb header lines : 5\n\nTechnique : GCPL\n"
-    rows = [
-        f"{t:.3f}\t{1e3 * -i:.3f}\t{v:.6f}".replace(".", ",") for t, i, v in zip(TIME_S, CURRENT_A, VOLTAGE_V, strict=True)
-    ]
-    text = head + "\n".join(["time/s\tI/mA\tEcell/V", *rows])
-    (tmp_path / "cell.mpt").write_text(text, encoding="latin-1")
+    head = ["EC-Lab ASCII FILE", "Nb header lines : 5", "", "Technique : GCPL", "time/s\tI/mA\tEcell/V"]
+    lines = rows(TIME_S, -1e3 * CURRENT_A, VOLTAGE_V, decimal=",", delimiter="\t")
+    (tmp_path / "cell.mpt").write_text("\n".join([*head, *lines]), encoding="latin-1")
     check(one(tmp_path / "cell.mpt"))
 
 
@@ -222,35 +193,6 @@ def test_braking_at_once_does_not_end_a_discharge_and_a_charge_in_small_steps_do
         assert np.count_nonzero(discharge.current_A == 6.0) == np.count_nonzero(drive_A == 6.0)
 
 
-@pytest.mark.parametrize("cell", BUNDLED_CELLS)
-def test_bundled_discharges_read_the_same_by_either_way_and_with_either_sign(cell, tmp_path):
-    known = load_nasa_discharges(cell)[::40]
-    names = ("time_s", "voltage_V", "current_A", "temperature_C")
-    for sign in (1.0, -1.0):
-        tables = [
-            pd.DataFrame({name: getattr(each, name) for name in names}).assign(cycle=each.meta["cycle"]) for each in known
-        ]
-        table = pd.concat(tables, ignore_index=True)
-        table["current_A"] *= sign
-        table.to_csv(tmp_path / "cell.csv", index=False)
-        for discharge, expected in zip(read_discharges(tmp_path / "cell.csv"), known, strict=True):
-            np.testing.assert_allclose(discharge.current_A, expected.current_A, atol=1e-12)
-            np.testing.assert_allclose(discharge.time_s, expected.time_s - expected.time_s[0], atol=1e-9)
-
-
-def own(path: Path, **changes) -> Path:
-    table = pd.DataFrame({"time_s": TIME_S, "voltage_V": VOLTAGE_V, "current_A": CURRENT_A} | changes)
-    table.to_csv(path, index=False)
-    return path
-
-
-def test_other_values_at_one_time_are_refused(tmp_path):
-    lines = own(tmp_path / "cell.csv").read_text().splitlines()
-    (tmp_path / "cell.csv").write_text("\n".join([*lines[:9], lines[8].replace(",3.", ",2."), *lines[9:]]))
-    with pytest.raises(ValueError, match=r"time_s must increase from sample to sample.*each sample once"):
-        read_discharges(tmp_path / "cell.csv")
-
-
 @pytest.mark.parametrize("overlap", [1, 20, len(TIME_S)])
 def test_rows_that_a_logger_writes_once_more_are_dropped(overlap, tmp_path):
     lines = own(tmp_path / "cell.csv").read_text().splitlines()
@@ -270,48 +212,41 @@ def test_a_row_at_the_end_of_one_step_and_one_at_the_start_of_the_next_may_have_
 
 def test_columns_and_units_can_be_stated(tmp_path):
     path = tmp_path / "cell.csv"
-    pd.DataFrame({"x": TIME_S / 60.0, "Voltage 1": 1e3 * VOLTAGE_V, "Voltage 2": 0.0, "I, mean": CURRENT_A}).to_csv(
-        path, index=False
-    )
-    with pytest.raises(
-        ValueError, match=r"no column for the time, the voltage, the current among x, Voltage 1, .*--columns time=NAME"
-    ):
-        read_discharges(path)
+    table = {"x": TIME_S / 60.0, "Voltage 1": 1e3 * VOLTAGE_V, "Voltage 2": 0.0, "I, mean": CURRENT_A}
+    pd.DataFrame(table).to_csv(path, index=False)
     columns = {"time": "x", "voltage": "Voltage 1", "current": "I, mean"}
     check(one(path, columns=columns, units={"time": "min", "voltage": "mV"}))
-    with pytest.raises(ValueError, match="there is no column 'y' for the time among x, Voltage 1"):
-        read_discharges(path, columns=columns | {"time": "y"})
-    with pytest.raises(ValueError, match="the unit 'furlong' of the column 'x' is not known for the time"):
-        read_discharges(path, columns=columns, units={"time": "furlong"})
-    with pytest.raises(ValueError, match=r"columns knows time, voltage, .*, got power"):
-        read_discharges(path, columns={"power": "x"})
+    for options, message in (
+        ({}, r"no column for the time, the voltage, the current among x, Voltage 1, .*--columns time=NAME"),
+        ({"columns": columns | {"time": "y"}}, "there is no column 'y' for the time among x, Voltage 1"),
+        ({"columns": columns, "units": {"time": "furlong"}}, "the unit 'furlong' of the column 'x' is not known for the time"),
+        ({"columns": {"power": "x"}}, r"columns knows time, voltage, .*, got power"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            read_discharges(path, **options)
 
 
 def test_a_temperature_that_is_logged_more_seldom_is_interpolated(tmp_path):
     seldom_C = np.where(np.arange(len(TIME_S)) % 5 == 1, TEMPERATURE_C, np.nan)
     discharge = one(own(tmp_path / "cell.csv", temperature_C=seldom_C))
     np.testing.assert_allclose(discharge.temperature_C[1:-2], TEMPERATURE_C[1:-2], atol=1e-3)
-    np.testing.assert_allclose(discharge.temperature_C[[0, -1]], [TEMPERATURE_C[1], TEMPERATURE_C[-3]])
-    path = own(tmp_path / "cell.csv", temperature_C=np.where(TIME_S == 10.0, 24.0, np.nan), ambient_temperature=np.nan)
+    path = own(tmp_path / "cell.csv", temperature_C=np.where(TIME_S == 10.0, 24.0, np.nan))
     with pytest.warns(UserWarning, match="the temperature is missing for up to 1820 s, and interpolated"):
-        (discharge,) = read_discharges(path)
-    assert (discharge.temperature_C == 24.0).all() and "ambient_temperature_C" not in discharge.meta
+        assert (read_discharges(path)[0].temperature_C == 24.0).all()
     assert one(own(path, temperature_C=np.nan)).temperature_C is None  # a sensor that was not connected
 
 
 def test_dates_are_read_as_they_are_written(tmp_path):
-    begin = pd.Timestamp("2026-02-01 23:50")
-    times = [begin + pd.Timedelta(seconds=float(time_s)) for time_s in TIME_S + 0.25 * (TIME_S > 100.0)]
-    expected_s = TIME_S + 0.25 * (TIME_S > 100.0)
-    zones = [time.tz_localize("UTC") for time in times]
-    berlin = [time.tz_convert("Europe/Berlin") for time in zones]
-    summer = [
-        (pd.Timestamp("2026-03-29 00:50", tz="UTC") + (time - begin)).tz_convert("Europe/Berlin").isoformat() for time in times
-    ]
+    expected_s = TIME_S + 0.25 * (TIME_S > 100.0)  # of which those of whole seconds have no fraction
+    times = [pd.Timestamp("2026-02-01 23:50") + pd.Timedelta(seconds=float(time_s)) for time_s in expected_s]
+    to_summer = pd.Timestamp("2026-03-29 00:50") - times[0]
+    berlin, summer = (
+        [(time + shift).tz_localize("UTC").tz_convert("Europe/Berlin").isoformat() for time in times]
+        for shift in (pd.Timedelta(0), to_summer)
+    )
     written = {
-        # of which those of whole seconds have no fraction
         "ISO": [time.isoformat() for time in times],
-        "ISO with a zone": [time.isoformat() for time in berlin],
+        "ISO with a zone": berlin,
         "the clock is put forward": summer,
         "day first": [time.strftime("%d/%m/%Y %H:%M:%S.%f") for time in times],
         "day first, points": [time.strftime("%d.%m.%Y %H:%M:%S.%f") for time in times],
@@ -324,33 +259,30 @@ def test_dates_are_read_as_they_are_written(tmp_path):
         np.testing.assert_allclose(one(tmp_path / "cell.csv").time_s, expected_s, atol=1e-6, err_msg=name)
 
 
-@pytest.mark.parametrize("units", ["s,V,A,°C", "[min],[mV],[mA],[K]", '"(ms)","(mV)","(A)",""', ",,,"])
-def test_units_may_stand_below_the_names(units, tmp_path):
-    factors = {"s,V,A,°C": (1, 1, 1, 0.0), "[min],[mV],[mA],[K]": (1 / 60, 1e3, 1e3, 273.15)}.get(units, (1e3, 1e3, 1, 0.0))
-    if units == ",,,":
-        factors = (1, 1, 1, 0.0)
-    columns = [TIME_S * factors[0], VOLTAGE_V * factors[1], CURRENT_A * factors[2], TEMPERATURE_C + factors[3]]
-    rows = [",".join(f"{value:.9g}" for value in row) for row in zip(*columns, strict=True)]
-    (tmp_path / "cell.csv").write_text("\n".join(["Time,Voltage,Current,Temperature", units, *rows]))
+@pytest.mark.parametrize(
+    ("units", "factors"),
+    [
+        ("s,V,A,°C", (1.0, 1.0, 1.0)),
+        ("[min],[mV],[mA],[°C]", (1.0 / 60.0, 1e3, 1e3)),
+        ('"(ms)","(mV)","(A)",""', (1e3, 1e3, 1.0)),
+        (",,,", (1.0, 1.0, 1.0)),
+    ],
+)
+def test_units_may_stand_below_the_names(units, factors, tmp_path):
+    columns = [factor * column for factor, column in zip(factors, (TIME_S, VOLTAGE_V, CURRENT_A), strict=True)]
+    lines = ["Time,Voltage,Current,Temperature", units, *rows(*columns, TEMPERATURE_C)]
+    (tmp_path / "cell.csv").write_text("\n".join(lines))
     check(one(tmp_path / "cell.csv"), temperature=True)
-
-
-def test_a_unit_in_a_name_counts_more_than_one_below_it_and_a_stated_one_most(tmp_path):
-    rows = [f"{t / 60:.9g};{1e3 * v:.9g};{i:.9g}" for t, v, i in zip(TIME_S, VOLTAGE_V, CURRENT_A, strict=True)]
-    (tmp_path / "cell.csv").write_text("\n".join(["Time;Voltage (mV);Current", "h;V;A", *rows]))
-    check(one(tmp_path / "cell.csv", units={"time": "min"}))
 
 
 @pytest.mark.parametrize("decimal", [".", ","])
 @pytest.mark.parametrize("foot", ["End of test", "End of test;;;\n\nChecked by;;\n", "Total capacity;;"])
 def test_lines_below_the_table_are_left_out_with_a_word(foot, decimal, tmp_path):
-    rows = [f"{t};{v};{i}".replace(".", decimal) for t, v, i in zip(TIME_S, VOLTAGE_V, CURRENT_A, strict=True)]
-    (tmp_path / "cell.csv").write_text("\n".join(["sep=;", "Zeit;U/V;I/A", *rows, foot]))
+    lines = rows(TIME_S, VOLTAGE_V, CURRENT_A, decimal=decimal, delimiter=";")
+    (tmp_path / "cell.csv").write_text("\n".join(["sep=;", "Zeit;U/V;I/A", *lines, foot]))
     with pytest.warns(UserWarning, match=f"lines below the table.*are left out: '{foot[:6]}"):
         (discharge,) = read_discharges(tmp_path / "cell.csv", columns={"time": "Zeit"})
     check(discharge)
-    with pytest.raises(ValueError, match=r"no column for the time among Zeit, U/V, I/A"):
-        read_discharges(tmp_path / "cell.csv")
 
 
 def test_discharges_whose_charges_are_not_logged_need_a_number(tmp_path):
@@ -366,19 +298,11 @@ def test_discharges_whose_charges_are_not_logged_need_a_number(tmp_path):
     assert one(tmp_path / "life.csv").loaded_part(3.3).time_s[-1] < 1830.0
 
 
-def test_the_sign_is_not_told_where_charges_and_discharges_would_have_to_be_one(tmp_path):
-    table = life()
-    table["current_A"] = table["current_A"].abs()
-    table.drop(columns="cycle").to_csv(tmp_path / "life.csv", index=False)
-    with pytest.raises(ValueError, match="cannot be told"):
-        read_discharges(tmp_path / "life.csv")
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"voltage_V": 1e3 * VOLTAGE_V}, r"voltage_V must lie within 0 \.\. 5.5 V, got 4190.*not in mV"),
-        ({"current_A": 1e3 * CURRENT_A}, r"current_A must lie within .*not in mA"),
+        ({"time_s": np.where(TIME_S == 40.0, 10.0, TIME_S)}, "time_s must increase from sample to sample.*each sample once"),
         ({"time_s": TIME_S / 3600.0}, "Give the time in seconds, not in hours"),
         ({"voltage_V": np.where(TIME_S == 40.0, np.nan, VOLTAGE_V)}, "the voltage must be finite, got nan in row 4"),
         (
@@ -391,7 +315,6 @@ def test_the_sign_is_not_told_where_charges_and_discharges_would_have_to_be_one(
         ({"Voltage(V)": VOLTAGE_V}, "both 'voltage_V' and 'Voltage.V.' may be the voltage"),
         ({"current_A": np.abs(np.sin(TIME_S)), "voltage_V": 3.7 + 0.3 * np.cos(TIME_S)}, "cannot be told"),
         ({"cycle": 1.5}, "the column of the cycle must hold whole numbers"),
-        ({"temperature_C": np.where(TIME_S == 40.0, np.inf, 24.0)}, "temperature_C must be finite"),
         (
             {"time_s": [f"{1e3 * time_s:,.1f}" for time_s in TIME_S]},
             "'time_s' must hold numbers, got '5,000.0' in row 2. Write numbers without separators of thousands",
@@ -404,28 +327,29 @@ def test_what_cannot_be_meant_is_refused_with_the_name_of_the_file(changes, mess
     assert "\n" not in str(caught.value)
 
 
-def test_what_is_no_table_is_refused_in_one_line(tmp_path):
-    truncated = gzip.compress("\n".join(["time_s,voltage_V,current_A", *["1,4.1,2"] * 200_000]).encode(), mtime=0)[:-100]
-    cases = {
-        "empty.csv": (b"", "is empty"),
-        "header.csv": (b"time_s,voltage_V,current_A\n", "no rows below the header"),
-        "headless.csv": (b"0.0,4.19,0\n1.0,4.18,2\n", "no line with the names of the columns"),
-        "blank.dat": (b"0.0 4.19 0\n1.0 4.18 2\n", "no line with the names of the columns"),
-        "text.txt": (b"Dear all,\nplease find the data attached.\n", "no column for the time"),
-        "cut.csv.gz": (truncated, "damaged"),
-        "no.csv.gz": (b"time_s,voltage_V,current_A\n", "damaged"),
-        "picture.csv": (b"\x89PNG\x00\x00", "binary"),
-        "cell.parquet": (b"PAR1", "damaged, or no Parquet"),
-        "cell.mat": (b"MATLAB", "damaged"),
-        "cell.xlsx": (b"PK", "save the sheet as CSV"),
-    }
-    for name, (content, message) in cases.items():
-        (tmp_path / name).write_bytes(content)
-        with pytest.raises(ValueError, match=rf"{name}.*{message}") as caught:
-            read_discharges(tmp_path / name)
-        assert "\n" not in str(caught.value)
-    with pytest.raises(FileNotFoundError):
-        read_discharges(tmp_path / "missing.csv")
+CUT_SHORT = gzip.compress(b"time_s,voltage_V,current_A\n" + 200_000 * b"1,4.1,2\n", mtime=0)[:-100]
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("empty.csv", b"", "is empty"),
+        ("header.csv", b"time_s,voltage_V,current_A\n", "no rows below the header"),
+        ("headless.csv", b"0.0,4.19,0\n1.0,4.18,2\n", "no line with the names of the columns"),
+        ("text.txt", b"Dear all,\nplease find the data attached.\n", "no column for the time"),
+        ("cut.csv.gz", CUT_SHORT, "damaged"),
+        ("no.csv.gz", b"time_s,voltage_V,current_A\n", "damaged"),
+        ("picture.csv", b"\x89PNG\x00\x00", "binary"),
+        ("cell.parquet", b"PAR1", "damaged, or no Parquet"),
+        ("cell.mat", b"MATLAB", "damaged"),
+        ("cell.xlsx", b"PK", "save the sheet as CSV"),
+    ],
+)
+def test_what_is_no_table_is_refused_in_one_line(name, content, message, tmp_path):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ValueError, match=rf"{name}.*{message}") as caught:
+        read_discharges(tmp_path / name)
+    assert "\n" not in str(caught.value)
 
 
 def test_the_sign_can_be_stated_and_then_is_not_told(tmp_path):
@@ -452,32 +376,29 @@ def test_one_bad_discharge_does_not_lose_the_others(tmp_path):
     assert [discharge.meta["cycle"] for discharge in discharges] == [2, 3]
 
 
-def test_binary_files_of_neware_and_biologic_need_an_extra_and_go_by_the_names_of_its_readers(tmp_path, monkeypatch):
-    for name, module, message in (("c.nda", "NewareNDA", "Neware"), ("c.mpr", "galvani.BioLogic", "BioLogic")):
-        monkeypatch.setitem(sys.modules, module, None)
-        (tmp_path / name).write_bytes(b"x")
-        with pytest.raises(ImportError, match=rf"{message}.*battery_env\[cyclers\]"):
-            read_discharges(tmp_path / name)
+def test_binary_files_of_neware_and_biologic_go_by_the_names_of_its_readers(tmp_path, monkeypatch):
     neware, biologic = types.ModuleType("NewareNDA"), types.ModuleType("galvani.BioLogic")
-    table = pd.DataFrame(
-        {
-            "Cycle": 1,
-            "Step": np.where(LOADED, 2, 1),
-            "Status": np.where(LOADED, "CC_DChg", "Rest"),
-            "Time": TIME_S,
-            "Voltage": VOLTAGE_V,
-            "Current(mA)": -1e3 * CURRENT_A,
-            "Timestamp": pd.Timestamp("2026-02-28"),
-        }
-    )
-    neware.read = lambda path, log_level: table
+    table = pd.DataFrame(named("Time", "Voltage", "Current(mA)", "T1", (1.0, 1.0, -1e3)) | {"Cycle": 1})
+    table = table.assign(Step=np.where(LOADED, 2, 1), Status=np.where(LOADED, "CC_DChg", "Rest")).drop(columns="T1")
+    neware.read = lambda path, log_level: table.assign(Timestamp=pd.Timestamp("2026-02-28"))
     records = np.rec.fromarrays([TIME_S, -1e3 * CURRENT_A, VOLTAGE_V], names="time/s,I/mA,Ewe/V")
     biologic.MPRfile = lambda stream: types.SimpleNamespace(data=records)
     monkeypatch.setitem(sys.modules, "NewareNDA", neware)
     monkeypatch.setitem(sys.modules, "galvani", types.ModuleType("galvani"))
     monkeypatch.setitem(sys.modules, "galvani.BioLogic", biologic)
-    check(one(tmp_path / "c.nda"))
-    check(one(tmp_path / "c.mpr"))
+    for name in ("c.nda", "c.mpr"):
+        (tmp_path / name).write_bytes(b"x")
+        check(one(tmp_path / name))
+
+
+@pytest.mark.parametrize(
+    ("name", "module", "words"), [("c.nda", "NewareNDA", "Neware"), ("c.mpr", "galvani.BioLogic", "BioLogic")]
+)
+def test_and_need_an_extra(name, module, words, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, module, None)
+    (tmp_path / name).write_bytes(b"x")
+    with pytest.raises(ImportError, match=rf"{words}.*battery_env\[cyclers\]"):
+        read_discharges(tmp_path / name)
 
 
 CELLS = st.one_of(st.floats(width=32).map(str), st.sampled_from(["", "NaN", "4.1", "2", "-2", "0:10", "x", "1e400", '"']))
@@ -503,14 +424,3 @@ def test_whatever_a_file_holds_it_is_read_or_refused_in_a_line(tmp_path, content
             assert "any.csv: " in str(error) and "\n" not in str(error).strip()
         else:
             assert all(discharge.charge_C > 0.0 for discharge in discharges)
-
-
-@settings(max_examples=60)
-@given(st.lists(st.text(max_size=20), max_size=6))
-def test_no_header_breaks_the_search_for_columns(names):
-    try:
-        found = find_columns(names)
-    except ValueError as error:
-        assert str(error)
-    else:
-        assert {"time", "voltage", "current"} <= set(found)

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from battery_env.electrochemistry import NEW_CELL, UNCERTAIN_CONSTANTS, initial_state, simulate
+from battery_env.electrochemistry import NEW_CELL, UNCERTAIN_CONSTANTS, simulate
 from battery_env.loads import RandomPiecewise, constant
 from battery_env.trajectories import PAPER_LOADS_W, TrajectoryDataset
 
@@ -48,13 +48,6 @@ def test_the_papers_data(parameter):
     assert (shares[0] >= 0.05).all() and (shares[1] <= 0.95).all()
 
 
-def test_a_collapsing_discharge_is_a_short_trajectory():
-    data = TrajectoryDataset.paper("r_o")
-    shortest = data[int(np.argmin(data.samples))]
-    assert shortest.r_o == 0.2 and shortest.load[0] == 16.0 and shortest.eod_time_s == 53
-    assert np.isfinite(shortest.state).all()
-
-
 def whole(data, n):
     """A discharge simulated alone."""
     changes = dict(zip(UNCERTAIN_CONSTANTS, data.factors[n], strict=True))
@@ -74,7 +67,7 @@ def test_a_trajectory_is_the_simulation_of_its_parameters_and_constants(small, w
 
 def test_states_between_checkpoints_are_the_same_to_the_bit(small, wrong):
     for index in (np.arange(12), np.array([5])):
-        for sample in (0, 1, 63, 64, 65, 200):
+        for sample in (0, 63, 64, 65):
             states = small.states_at(index, np.full(len(index), sample))
             np.testing.assert_array_equal(states, [whole(small, n).state[sample] for n in index])
             states = wrong.states_at(index, np.full(len(index), sample))
@@ -96,39 +89,10 @@ def test_a_split_is_a_partition(small, by):
     both = np.concatenate([train.q_mobile, test.q_mobile])
     np.testing.assert_array_equal(np.sort(both), np.sort(small.q_mobile))
     assert by == "trajectory" or test.q_mobile.max() <= train.q_mobile.min()
+    np.testing.assert_array_equal(test.q_mobile, small.split(test=0.3, by=by, seed=1)[1].q_mobile)
 
 
-def test_a_split_follows_its_seed():
-    data = TrajectoryDataset.paper("q_mobile")
-    train, test = data.split(test=0.3, seed=0)
-    assert (len(train), len(test)) == (3858, 1653)
-    np.testing.assert_array_equal(test.q_mobile, data.split(test=0.3, seed=0)[1].q_mobile)
-    assert not np.array_equal(test.q_mobile, data.split(test=0.3, seed=1)[1].q_mobile)
-
-
-def test_subsets_hold_the_same_trajectories(small):
-    part = small.subset([7, 2])
-    for n, m in enumerate((7, 2)):
-        np.testing.assert_array_equal(part[n].state, small[m].state)
-    np.testing.assert_array_equal(small[2:4][1].state, small[3].state)
-
-
-def test_single_trajectories_become_a_data_set(small):
-    again = TrajectoryDataset.from_trajectories([small[3], small[4]])
-    np.testing.assert_array_equal(again[1].state, small[4].state)
-    with pytest.raises(ValueError, match="one load unit"):
-        TrajectoryDataset.from_trajectories([])
-
-
-def test_single_trajectories_keep_what_is_known_of_their_end():
-    whole = simulate(8.0, 7600.0, 0.1)
-    unknown = simulate(8.0, 7600.0, 0.1, until=500.0)
-    data = TrajectoryDataset.from_trajectories([whole, whole.part(100, 200), unknown])
-    assert data[0].eod_time_s == whole.eod_time_s and data[1].eod_time_s == whole.eod_time_s - 100.0
-    assert np.isnan(data[2].eod_time_s) and np.isnan(data.subset([2]).eod_time_s[0])
-
-
-def test_single_trajectories_know_how_they_were_made():
+def test_single_trajectories_become_a_data_set_that_knows_how_they_were_made():
     cell = NEW_CELL.replace(to=10.0)
     warm = [simulate(8.0, q_mobile, 0.1, thermal=True, dt=2.0, cell=cell) for q_mobile in (6000.0, 7000.0)]
     data = TrajectoryDataset.from_trajectories(warm)
@@ -136,30 +100,31 @@ def test_single_trajectories_know_how_they_were_made():
     for again, trajectory in zip(data, warm, strict=True):
         np.testing.assert_array_equal(again.state, trajectory.state)
         assert again.cell == trajectory.cell == cell.replace(q_mobile=trajectory.q_mobile, r_o=0.1)
-    for other in (
-        simulate(8.0, thermal=True),
-        simulate(8.0, dt=2.0),
-        simulate(8.0, cell=cell),
-        simulate(2.0, load_unit="current"),
-    ):
-        with pytest.raises(
-            ValueError, match="trajectories must share the constants of the cell but for q_mobile and r_o, one load"
-        ):
-            TrajectoryDataset.from_trajectories([simulate(8.0), other])
 
 
-def test_a_trajectory_that_does_not_fit_its_states_is_not_made_up(small):
-    load_values = np.full_like(small.load_values, 100.0)
-    with pytest.raises(ValueError, match="trajectory 0 cannot be simulated again"):
-        dataclasses.replace(small, load_values=load_values)[0]
+def test_single_trajectories_keep_what_is_known_of_their_end():
+    whole, unknown = simulate(8.0, 7600.0, 0.1), simulate(8.0, 7600.0, 0.1, until=500.0)
+    data = TrajectoryDataset.from_trajectories([whole, whole.part(100, 200), unknown])
+    assert data[0].eod_time_s == whole.eod_time_s and data[1].eod_time_s == whole.eod_time_s - 100.0
+    assert np.isnan(data[2].eod_time_s) and np.isnan(data.subset([2]).eod_time_s[0])
+
+
+@pytest.mark.parametrize(
+    "change", [{"thermal": True}, {"dt": 2.0}, {"cell": NEW_CELL.replace(to=10.0)}, {"load_unit": "current"}]
+)
+def test_single_trajectories_of_different_settings_do_not_go_together(change):
+    with pytest.raises(ValueError, match="must share the constants of the cell but for q_mobile and r_o, one load"):
+        TrajectoryDataset.from_trajectories([simulate(2.0), simulate(2.0, **change)])
 
 
 def test_trimming_never_reaches_beyond_the_data():
     data = TrajectoryDataset.simulated(4000.0, 0.2, [constant(16.0)], 0).trimmed(0.95, 1.0)
     assert (data.samples[0], data.first[0], data.stop[0]) == (27, 23, 27) and len(data[0].time_s) == 4
+    with pytest.raises(ValueError, match="two increasing shares"):
+        data.trimmed(0.9, 0.1)
 
 
-def test_what_is_saved_is_loaded(small, tmp_path):
+def test_what_is_saved_is_loaded_and_not_replaced(small, tmp_path):
     path = small.save(tmp_path / "folder" / "data")
     assert path.name == "data.npz" and list(path.parent.iterdir()) == [path]
     np.testing.assert_array_equal(TrajectoryDataset.load(path)[11].state, small[11].state)
@@ -192,56 +157,52 @@ class TestFiles:
             for field in dataclasses.fields(small):
                 np.testing.assert_array_equal(getattr(again, field.name), getattr(small, field.name))
 
-    @pytest.mark.parametrize("length", [0, 1, 100, 5000])
-    def test_a_truncated_file_is_refused(self, saved, tmp_path, length):
-        (tmp_path / "cut.npz").write_bytes(saved.read_bytes()[:length])
-        with pytest.raises(ValueError, match=r"cut.npz is damaged, or no data set of simulated"):
-            TrajectoryDataset.load(tmp_path / "cut.npz")
-
-    def test_foreign_files_are_refused(self, tmp_path):
+    def test_foreign_and_truncated_files_are_refused(self, saved, tmp_path):
         with zipfile.ZipFile(tmp_path / "zip.npz", "w") as file:
             file.writestr("metadata.npy", b"no array")
         np.savez(tmp_path / "arrays.npz", q_mobile=np.ones(3))
-        np.save(tmp_path / "array.npy", np.ones(3))
         (tmp_path / "pickle.npz").write_bytes(pickle.dumps({"format": 2}))
-        for name in ("zip.npz", "arrays.npz", "array.npy", "pickle.npz"):
-            with pytest.raises(ValueError, match=rf"{name} is damaged, or no data set of simulated"):
-                TrajectoryDataset.load(tmp_path / name)
-        with pytest.raises(FileNotFoundError):
-            TrajectoryDataset.load(tmp_path / "none.npz")
+        (tmp_path / "empty.npz").write_bytes(b"")
+        (tmp_path / "cut.npz").write_bytes(saved.read_bytes()[:5000])
+        for path in tmp_path.iterdir():
+            with pytest.raises(ValueError, match=rf"{path.name} is damaged, or no data set of simulated"):
+                TrajectoryDataset.load(path)
 
-    def test_no_pickle_is_ever_run(self, saved, tmp_path):
+    @pytest.mark.parametrize("name", ["q_mobile", "metadata"])
+    def test_no_pickle_is_ever_run(self, saved, tmp_path, name):
         class Bomb:
             def __reduce__(self):
                 return Path.touch, (tmp_path / "exploded",)
 
         bomb = np.empty(1, dtype=object)
         bomb[0] = Bomb()
-        for name in ("q_mobile", "metadata"):
-            with np.load(saved) as file:
-                np.savez(tmp_path / "bomb.npz", **{**file, name: bomb})
-            with pytest.raises(ValueError, match="allow_pickle=False"):
-                TrajectoryDataset.load(tmp_path / "bomb.npz")
+        with pytest.raises(ValueError, match="allow_pickle=False"):
+            TrajectoryDataset.load(self.rewritten(saved, tmp_path, **{name: bomb}))
         assert not (tmp_path / "exploded").exists()
 
-    def test_an_old_version_is_refused(self, saved, tmp_path):
-        old = self.rewritten(saved, tmp_path, metadata=np.array(json.dumps({"format": 1, "sha256": "0"})))
-        with pytest.raises(ValueError, match="has format 1, this version reads 3: make it again"):
-            TrajectoryDataset.load(old)
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            ({"format": 1}, "has format 1, this version reads 3: make it again"),
+            ({"load_unit": "kW"}, "holds no valid data set: .*load_unit must be"),
+            ({"cell": {"kN": 1.0}}, "holds no valid data set: .*kN"),
+        ],
+    )
+    def test_old_versions_and_settings_that_cannot_be_meant_are_refused(self, saved, tmp_path, change, message):
+        with np.load(saved) as file:
+            metadata = np.array(json.dumps(json.loads(str(file["metadata"])) | change))
+        with pytest.raises(ValueError, match=f"changed.npz {message}"):
+            TrajectoryDataset.load(self.rewritten(saved, tmp_path, metadata=metadata))
 
     @pytest.mark.parametrize(
         ("name", "change", "message"),
         [
             ("q_mobile", lambda a: a[:-1], r"must be an array of float64 of shape \(11,.*, got float64 \(12,"),
-            ("checkpoint", lambda a: a[:, :7], r"checkpoint must be an array of float64 of shape"),
             ("checkpoint", lambda a: a[:-1], "checkpoint_start of trajectory 11 lie outside"),
             ("checkpoint", lambda a: a * np.nan, "checkpoint must be finite"),
             ("load_values", lambda a: a[:-1], "load_start of trajectory .* lie outside"),
             ("load_values", lambda a: a * np.nan, "load must lie within .* got nan"),
-            ("load_start", lambda a: a - 1, "load_start of trajectory .* lie outside"),
-            ("factors", lambda a: a * 0.0, "factors must be greater than 0, got 0"),
             ("factors", lambda a: a * 0.05, "dt must be"),
-            ("first", lambda a: a.astype(np.float64), r"first must be an array of int64 .* got float64"),
             ("stop", lambda a: a + 10_000, "first and stop of trajectory 0 lie outside"),
             ("samples", lambda a: a.astype(np.int32), "samples must be an array of int64 .* got int32"),
             ("r_o", lambda a: a * 1000.0, "r_o must lie within .* Milliohms"),
@@ -251,13 +212,6 @@ class TestFiles:
     def test_arrays_that_cannot_be_a_data_set_are_refused(self, small, saved, tmp_path, name, change, message):
         with pytest.raises(ValueError, match=rf"changed.npz .*{message}"):
             TrajectoryDataset.load(self.rewritten(saved, tmp_path, **{name: change(getattr(small, name))}))
-
-    def test_settings_that_cannot_be_meant_are_refused(self, saved, tmp_path):
-        for change, message in (({"load_unit": "kW"}, "load_unit must be"), ({"cell": {"kN": 1.0}}, "kN")):
-            with np.load(saved) as file:
-                metadata = np.array(json.dumps(json.loads(str(file["metadata"])) | change))
-            with pytest.raises(ValueError, match=rf"changed.npz holds no valid data set: .*{message}"):
-                TrajectoryDataset.load(self.rewritten(saved, tmp_path, metadata=metadata))
 
 
 class TestMismatch:
@@ -274,15 +228,11 @@ class TestMismatch:
 
     def test_subsets_and_files_keep_them(self, wrong, tmp_path):
         part = wrong.subset([7, 2])
-        np.testing.assert_array_equal(part[1].state, wrong[2].state)
+        for same in (part[1], wrong[1:3][1]):
+            np.testing.assert_array_equal(same.state, wrong[2].state)
         again = TrajectoryDataset.load(part.save(tmp_path / "part"))
         np.testing.assert_array_equal(again[0].state, wrong[7].state)
         np.testing.assert_array_equal(again.factors, part.factors)
-
-    def test_cells_of_different_constants_do_not_go_together(self, wrong):
-        with pytest.raises(ValueError, match="got 2 sets of constants"):
-            TrajectoryDataset.from_trajectories([wrong[0], wrong[1]])
-        np.testing.assert_allclose(TrajectoryDataset.from_trajectories([wrong[0]])[0].state, wrong[0].state, rtol=1e-9)
 
     def test_a_time_step_must_suit_the_fastest_cell(self):
         fast = {"loads": [constant(8.0)], "load_index": 0, "factors": np.array([[1.0, 1.0, 0.5, 1.0]])}
@@ -296,34 +246,20 @@ class TestMismatch:
     [
         ({"parameters": "capacity"}, "parameters must be"),
         ({"n": 0}, "n must be at least 1"),
+        ({"n": 2.5}, "n must be a whole number, got 2.5"),
         ({"loads": []}, "loads must not be empty"),
         ({"loads": [constant(8.0), constant(2.0, "current")]}, "all in one unit"),
         ({"loads": [constant(60.0)]}, "lower its load"),
         ({"loads": [constant(0.0)]}, "raise its load"),
-        ({"q_mobile_range": (1.0, 2.0)}, "q_mobile"),
-        ({"q_mobile_range": (7600.0, 4000.0)}, "q_mobile_range must be finite and increasing, got"),
-        ({"r_o_range": (0.1, np.nan)}, "r_o_range must be finite"),
         ({"loads": constant(8.0)}, "list of Loads or a sampler of them, got Load"),
         ({"loads": ["8 W"]}, r"loads must be Loads, .* got \['str'\]"),
-        ({"loads": lambda rng: 8.0}, r"loads must be Loads, .* got \['float'\]"),
-        ({"n": 2.5}, "n must be a whole number, got 2.5"),
+        ({"q_mobile_range": (1.0, 2.0)}, "q_mobile"),
+        ({"q_mobile_range": (7600.0, 4000.0)}, "q_mobile_range must be finite and increasing, got"),
         ({"seed": None}, "seed must be a whole number, got None"),
-        ({"seed": -1}, "seed = -1"),
-        ({"mismatch": -0.1}, r"mismatch .* 0 \.\. 0.5, got -0.1"),
         ({"mismatch": 0.6}, r"mismatch .* 0 \.\. 0.5, got 0.6"),
         ({"mismatch": "10 %"}, "mismatch .* got '10 %'"),
-        ({"mismatch": np.nan}, "mismatch .* got nan"),
     ],
 )
 def test_nonsense_is_refused(arguments, message):
     with pytest.raises((TypeError, ValueError), match=message):
         TrajectoryDataset.generate(**{"parameters": "q_mobile", "n": 2, "loads": [constant(8.0)], "seed": 0} | arguments)
-
-
-def test_what_is_kept_of_a_discharge_is_an_increasing_range(small):
-    with pytest.raises(ValueError, match="two increasing shares"):
-        small.trimmed(0.9, 0.1)
-
-
-def test_an_initial_state_is_the_first_checkpoint(small):
-    np.testing.assert_array_equal(small.checkpoint[small.checkpoint_start], initial_state(small.q_mobile))
