@@ -10,7 +10,6 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 import battery_env
 from battery_env.calibration.full_state import FullStateTask
-from battery_env.calibration.full_state_kernels import state_distance
 from battery_env.calibration.full_state_layout import LITERAL, OBSERVED, SCALED
 from battery_env.electrochemistry import NEW_CELL, QNB, step
 from battery_env.loads import RandomPiecewise

@@ -3,20 +3,11 @@
 import numpy as np
 import pytest
 
-from battery_env.calibration.data import standard_dataset
 from battery_env.calibration.full_state_layout import ACTION_RANGES, ERROR_SCALE, OBSERVED
-from battery_env.calibration.full_state_tasks import BatteryJoint, BatteryQmax, BatteryQmaxPaper, BatteryRo
-from battery_env.calibration.policy import PolicyEstimator
-from battery_env.electrochemistry import (
-    NEW_CELL,
-    UNCERTAIN_CONSTANTS,
-    step,
-    voltage,
-)
+from battery_env.calibration.full_state_tasks import BatteryJoint, BatteryQmax, BatteryQmaxPaper
+from battery_env.electrochemistry import NEW_CELL, UNCERTAIN_CONSTANTS, step, voltage
 from battery_env.loads import RandomPiecewise, constant
 from battery_env.trajectories import TrajectoryDataset
-
-STATE_SCALE = np.array([0.5, 0.1, 0.01, 6840.0, 760.0, 11400.0, 1266.0])
 
 
 @pytest.fixture(scope="module")

@@ -83,7 +83,8 @@ VERDICTS = {
     "not full": (BOTH, LOW, {}, "The record starts at rest at 4.00 V, where a full cell shows 4.19 V. Give the whole"),
     "not full, rest cut off": (BOTH, LOW.loaded_part(2.7), {}, "The record starts at rest at 4.00 V"),
     "wrong initial charge": (
-        BOTH, discharged(initial=initial_state(soc=0.7)), {"initial_soc": 0.85}, "The record starts at rest at 3.83 V, where a cell with 85% of its charge shows 4.03 V"
+        BOTH, discharged(initial=initial_state(soc=0.7)), {"initial_soc": 0.85},
+        "The record starts at rest at 3.83 V, where a cell with 85% of its charge shows 4.03 V",
     ),
     "late start": (BOTH, changed(WHOLE, slice(300, None), rested=False), {}, "The record starts under load at 3."),
     "forgotten reset": (("filter",), TWICE, {}, "The voltage comes back to that of the start at 2882 s"),
@@ -99,6 +100,10 @@ VERDICTS = {
     "bound of r_o": (BOTH, WHOLE, {"r_o_bounds_ohm": (0.0, 0.14)}, "r_o is at a bound"),
     "minutes": (BOTH, replace(WHOLE, time_s=WHOLE.time_s / 60.0), {}, "No cell of this kind has such a q_mobile. Check that"),
     "misfit": (BOTH, REAL.loaded_part(2.7), {"mismatch_V": 0.0}, MISFIT),
+    "misfit beyond a known noise": (
+        BOTH[:1], WHOLE,
+        {"parameters": ["q_mobile"], "cell": NEW_CELL.replace(r_o=0.12), "mismatch_V": 0.0, "voltage_noise_V": 0.005}, MISFIT,
+    ),
     "prior of another end": (
         BOTH[:1], WHOLE, {"prior_q_mobile_C": (8000.0, 80.0)}, "The record falls to 2.80 V at 2820 s, where this estimate says"
     ),
