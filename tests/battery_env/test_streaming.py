@@ -1,6 +1,5 @@
 """Streams: sample by sample, with gaps and rests, stopped and resumed, one cell and many, of filters and policies."""
 
-from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -69,14 +68,6 @@ class TestSamples:
         estimate = follow(ExtendedKalmanFilter(thermal=True), replace(whole, voltage_V=gone))
         assert estimate.settled and abs(estimate.q_mobile - 6000.0) < 3.0 * estimate.sd_q_mobile
         assert abs(estimate.r_o - 0.15) < 3.0 * estimate.sd_r_o
-
-    def test_without_voltages_nothing_is_learned(self):
-        filter_ = ExtendedKalmanFilter(thermal=True)
-        first = filter_.update(4.19, 2.0, 0.0)
-        for _ in range(600):
-            last = filter_.update(np.nan, 2.0, 1.0)
-        assert last.q_mobile == pytest.approx(first.q_mobile, rel=0.01) and last.sd_q_mobile >= first.sd_q_mobile
-        assert not last.settled and filter_.soc == pytest.approx(1.0 - 1200.0 / last.q_mobile, abs=1e-6)
 
     def test_the_first_voltage_may_not_be_missing(self, make):
         with pytest.raises(ValueError, match=r"voltage_V must be finite, got nan. .*tells whether the cell is full"):
@@ -148,16 +139,6 @@ class TestSamples:
 
 class TestTemperature:
 
-    def test_later_ones_move_it(self):
-        filter_ = ExtendedKalmanFilter(thermal=True)
-        filter_.update(4.19, 2.0, 0.0, 20.0)
-        assert filter_.now().state[0] == pytest.approx(293.15)
-        filter_.update(4.0, 2.0, 10.0, 31.0)
-        assert filter_.now().state[0] == pytest.approx(304.15)
-        filter_.update(3.99, 0.0, 1.0)
-        assert 303.0 < filter_.now().state[0] < 304.2
-        assert filter_.now().cell.Tb0 == pytest.approx(293.15)
-
     def test_a_record_is_taken_with_its_temperature(self, whole):
         part = whole.part(0, 900)
         samples = np.arange(len(part.time_s))
@@ -205,18 +186,6 @@ class TestModel:
         assert filter_.remaining(1.0).time_s > 1.9 * left.time_s
         assert filter_.remaining(8.0, load_unit="power").time_s < left.time_s
         assert filter_.remaining(0.0).time_s == np.inf
-
-    def test_the_time_left_is_told_before_the_load_has_shown_the_resistance(self):
-        for rest_s, load_A in ((0, 2.0), (60, 2.0)):
-            filter_ = ExtendedKalmanFilter(thermal=True, mismatch_V=0.05)
-            record = measured(np.append(np.zeros(rest_s), np.full(60, load_A)), noise_V=0.0)
-            unsure = 0
-            for voltage_V, current_A in zip(record.voltage_V.tolist(), record.current_A.tolist(), strict=True):
-                estimate = filter_.update(voltage_V, current_A, 1.0)
-                unsure += estimate.sd_r_o > estimate.r_o
-                left = filter_.remaining(2.0, cut_off_V=2.7)
-                assert 2000.0 < left.time_s < 5000.0 and 500.0 < left.sd_s < 2000.0
-            assert unsure
 
     def test_a_charge_never_ends_at_the_cut_off(self, whole):
         filter_ = ExtendedKalmanFilter(thermal=True)
@@ -292,13 +261,6 @@ class TestFiles:
 
 
 class TestBatch:
-    def test_a_copy_of_a_filter_goes_its_own_way(self, whole):
-        one = ExtendedKalmanFilter(thermal=True)
-        follow(one, whole.part(0, 130))
-        soc, other = one.soc, copy(one)
-        assert other.update(3.9, 2.0, 1.0) == copy(one).update(3.9, 2.0, 1.0)
-        other.reset()
-        assert one.soc == soc < other.soc == 1.0
 
     def test_cells_do_not_know_of_each_other(self, make, whole, tmp_path):
         records = [whole, measured(1.5, 5000.0, 0.2)]
@@ -341,18 +303,6 @@ class TestBatch:
         np.testing.assert_array_equal(found.q_mobile, [each.q_mobile for each in expected])
         assert [each.soc for each in batch.estimators] == [each.soc for each in alone]
         assert [repr(each) for each in found[:2]] == [repr(each) for each in expected[:2]]
-
-    def test_the_temperature_may_be_missing_of_some_cells_of_a_batch(self):
-        filter_ = ExtendedKalmanFilter(thermal=True)
-        batch, alone = filter_.batch(3), [ExtendedKalmanFilter(thermal=True) for _ in range(3)]
-        for degrees_C in ([25.0, None, 26.0], [25.1, None, None], [None, 24.0, 26.2]):
-            found = batch.update(4.15, 2.0, 1.0, degrees_C)
-            expected = [one.update(4.15, 2.0, 1.0, each) for one, each in zip(alone, degrees_C, strict=True)]
-            assert [repr(each) for each in found] == [repr(each) for each in expected]
-        with pytest.raises(ValueError, match=r"^cell 1: temperature_C must be finite, got nan"):
-            batch.update(4.15, 2.0, 1.0, [None, np.nan, 26.0])
-        with pytest.raises(ValueError, match=r"^cell 0: current_A must lie within"):
-            batch.update(4.15, [2000.0, 2.0, 2.0], 1.0, [None, 24.0, 26.0])
 
     @settings(max_examples=60, deadline=None, derandomize=True, database=None)
     @given(

@@ -305,11 +305,6 @@ class TestOwnCell:
             BatteryVoltageJoint(1, dataset=tmp_path / "none.npz")
 
 
-def test_a_data_set_stands_in_place_of_what_would_choose_one(data):
-    with pytest.raises(ValueError, match="dataset stands in place of load"):
-        CalibrationEnv(BatteryVoltageJoint, dataset=data, load="constant")
-
-
 @pytest.fixture(scope="module")
 def lives():
     return simulated_lives(3, 4, seed=0)
