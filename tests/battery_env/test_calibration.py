@@ -10,7 +10,6 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 import battery_env
 from battery_env.calibration.full_state import FullStateTask
-from battery_env.calibration.full_state_kernels import state_distance
 from battery_env.calibration.full_state_layout import LITERAL, OBSERVED, SCALED
 from battery_env.electrochemistry import NEW_CELL, QNB, step
 from battery_env.loads import RandomPiecewise
@@ -63,21 +62,6 @@ def test_episodes_are_truncated_after_their_steps(env_id, steps):
     assert ends[-1] == (False, True) and not any(t or u for t, u in ends[:-1])
 
 
-def test_the_end_of_the_data_truncates():
-    env = gym.make("BatteryRo-v0", split="all")
-    dataset = env.unwrapped.dataset
-    n = int(np.argmin(dataset.samples))
-    env.reset(options={"trajectory": n, "sample": int(dataset.first[n])})
-    steps = 0
-    truncated = False
-    while not truncated:
-        observation, _, terminated, truncated, _ = env.step(true_action(env))
-        steps += 1
-    assert not terminated and np.isfinite(observation).all()
-    # T samples hold T - 1 transitions; the observation after the last decision needs one more of them
-    assert steps == len(dataset[n].time_s) - 2 < 64
-
-
 def test_the_observation_is_what_the_documentation_says():
     env = gym.make("BatteryQmax-v0")
     dataset = env.unwrapped.dataset
@@ -110,22 +94,6 @@ def test_the_literal_observation_is_divided_by_the_new_cells_state():
     reference = np.array([1.0, 1.0, 1.0, 6840.0, 760.0, 4560.0, 506.67])
     expected = [*(trajectory.state[0, 1:] / reference), *(trajectory.state[1, 1:] / reference), trajectory.load[0] / 20.0]
     np.testing.assert_allclose(observation, expected, rtol=1e-6)
-
-
-def distances(formulation, *errors):
-    form, measured = formulation, np.random.default_rng(0).uniform(0.0, 1e-3, (len(errors), 8))
-    model = measured + np.pad(errors, ((0, 0), (1, 0)))
-    return [state_distance(model, measured, n, 1.0 / form.error_scale, form.literal_cost) for n in range(len(errors))]
-
-
-def test_the_literal_cost():
-    found = distances(LITERAL, [3e-5, 0, 4e-5, 0, 0, 0, 0], [0.3, 0.4, 0, 0, 0, 0.6, 0.8])
-    np.testing.assert_allclose(found, [2.5e-5, 50.0 * (0.25 + 0.5)])
-
-
-def test_the_distance_is_a_norm_in_error_scales():
-    found = distances(SCALED, [0.003, 0, 0, 8.0, 0, 0, 0], [0, 2e-5, 0, 0, 0, 0, 0])
-    np.testing.assert_allclose(found, [0.5, 2.0])
 
 
 def test_the_perturbation_stays_in_its_bounds_and_conserves_charge():

@@ -151,12 +151,6 @@ class TestSimulated:
             warnings.simplefilter("error")
             assert fit_cell(low, start=known).doubt == ""
 
-    def test_so_is_one_whose_rest_was_cut_off(self):
-        record = load_nasa_discharges("B0006")[84]
-        loaded = Discharge(*(column[3:] for column in (record.time_s, record.voltage_V, record.current_A)))
-        with pytest.warns(UserWarning, match="or lack the rest before the load"):
-            assert fit_cell([loaded]).full_V < 4.1
-
     def test_what_no_constants_can_describe_is_refused(self, simulated):
         record = simulated[0]
         wild = record.voltage_V - 0.3 * (np.sin(record.time_s / 100.0) > 0.0)
@@ -179,24 +173,6 @@ class TestRealCells:
                 late.append(abs(eod_time_s / record.time_s[-1] - 1.0))
         assert np.sum(rmse_V[1::2]) < 0.5 * np.sum(rmse_V[::2])
         assert np.mean(late[1::2]) < 0.5 * np.mean(late[::2])
-
-    def test_a_search_for_nuisance_constants_never_leaves_what_is_stable(self, b0005_fit):
-        # told of no error of the model, the search for a quarter of this discharge tries diffusion of less than a second
-        record = load_nasa_discharges("B0006")[104].loaded_part(2.7)
-        start_s, end_s = record.time_s[[0, -1]]
-        nuisance = {"kn": 0.4, "tDiffusion": 0.4, "to": 0.4, "tsn": 0.4, "offset_V": 0.006}
-        calibrator = LeastSquares(cell=b0005_fit.cell, thermal=True, nuisance=nuisance, prior_q_mobile_C=(6000.0, 1155.0))
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            estimate = calibrator.estimate(record.until(start_s + 0.25 * (end_s - start_s)))
-        assert np.isfinite(estimate.q_mobile) and not estimate.settled
-
-    @pytest.mark.parametrize("dt_s", [1.0, 10.0])
-    def test_and_finds_all_that_is(self, dt_s):
-        cell = NEW_CELL.replace(tDiffusion=0.6 * NEW_CELL.tDiffusion)  # at 10 s half of what one step can follow
-        record = simulate(8.0, 6000.0, 0.15, dt=dt_s, cell=cell)
-        estimate = LeastSquares(dt_s=dt_s, mismatch_V=0.0, nuisance={"tDiffusion": 0.4}).estimate(record)
-        assert estimate.q_mobile == pytest.approx(6000.0, abs=1.0) and estimate.settled
 
     def test_a_forecast_takes_the_model_of_a_fit(self, b0005_fit):
         calibrator = b0005_fit.calibrator()
@@ -237,10 +213,6 @@ class TestFiles:
         for value, name in ((fit, "fit.json"), (OTHER, "constants.json")):
             with pytest.raises(FileExistsError, match="exists already"):
                 value.to_json(tmp_path / name)
-
-    def test_the_policy_that_comes_with_the_package_has_no_place_for_a_fit(self, fit):
-        with pytest.raises(ValueError, match=r"the package takes no cell: .* policy of your own that was trained with these"):
-            Settings.for_cell(fit, method="policy")
 
     def test_a_policy_of_ones_own_takes_the_constants_and_the_cut_off_of_a_fit(self, fit, tmp_path):
         policy, card = tmp_path / "mine.onnx", pretrained_card("BatteryVoltageJoint-v0")

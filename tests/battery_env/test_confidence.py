@@ -37,6 +37,7 @@ def whole_discharge(q_mobile=6000.0, r_o=0.15, load_A=1.5, noise_V=0.002, **more
 
 
 WHOLE = whole_discharge()
+SAMPLE = np.arange(len(WHOLE.time_s))
 
 
 def estimator(policy=None, **options):
@@ -79,56 +80,44 @@ def test_a_policy_that_sees_no_fit_states_nothing_and_is_never_sure():
     assert np.isnan([estimate.sd_q_mobile, estimate.sd_r_o]).all()
 
 
+def shifted(volts) -> Samples:
+    return Samples(WHOLE.time_s, WHOLE.voltage_V + volts, WHOLE.current_A)
+
+
+def without(lost) -> Samples:
+    return Samples(*(column[~lost] for column in WHOLE))
+
+
 @pytest.mark.parametrize(
     ("record", "options", "message"),
     [
         (whole_discharge(q_mobile=9500.0), {}, "q_mobile is at a bound of its search"),
-        (WHOLE._replace(voltage_V=WHOLE.voltage_V + 0.035), {}, "The record starts at 4.2. V, above the 4.19 V"),
-        (WHOLE._replace(voltage_V=WHOLE.voltage_V - 0.035), {}, "takes the voltage for 3. mV off"),
+        (shifted(0.035), {}, "The record starts at 4.2. V, above the 4.19 V"),
+        (shifted(-0.035), {}, "takes the voltage for 3. mV off"),
         (whole_discharge(cell=NEW_CELL.replace(kn=6.0 * NEW_CELL.kn)), {}, "A constant of the cell is farther"),
         (whole_discharge(cell=NEW_CELL.replace(U0p=NEW_CELL.U0p + 0.1)), {}, "The record starts at .* another kind of cell"),
-        (WHOLE._replace(voltage_V=WHOLE.voltage_V + 0.02 * np.sin(WHOLE.time_s / 300.0)), {}, "farther off than noise"),
+        (shifted(0.02 * np.sin(WHOLE.time_s / 300.0)), {}, "farther off than noise"),
         (WHOLE.first(500), {}, "q_mobile is not known to 2 % yet"),
+        (WHOLE.first(9), {}, "These are too few readings"),
         (WHOLE, {"policy": Step(beyond=0.15)}, "The policy and the fit in its observation differ by .* in q_mobile"),
         (Samples(*(column[900:] for column in WHOLE)), {}, "The record starts under load|The record starts at rest"),
+        (without((SAMPLE > 0) & (SAMPLE < 4)), {}, "farther apart than the 2 s"),
+        (without(SAMPLE % 3 != 0), {}, "farther apart than the 2 s"),
     ],
-    ids=["range", "sensor", "offset", "constant", "another cell", "misfit", "in progress", "distrust", "late start"],
-)
+    ids=["range", "sensor", "offset", "constant", "another cell", "misfit", "in progress", "few", "distrust", "late", "start",
+         "sparse"],
+)  # fmt: skip
 def test_what_it_is_not_sure_of_is_said(record, options, message):
     estimate = estimator(**options).estimate(record)
     assert not estimate.settled
     assert re.search(message, estimate.reason), estimate.reason
 
 
-@pytest.mark.parametrize(
-    "missing", [slice(1, 4), np.arange(3003) % 3 != 0, np.arange(3003) % 5 != 0], ids=["start", "3 s", "5 s"]
-)
-def test_what_lies_between_samples_settles_nothing(missing):
-    """R_o was 0.157 to 0.165 instead of 0.15 ohm, with a standard deviation of 0.0015."""
-    kept = np.ones(len(WHOLE.time_s), dtype=bool)
-    kept[missing if isinstance(missing, slice) else missing[: len(kept)]] = False
-    estimate = estimator().estimate(Samples(*(column[kept] for column in WHOLE)))
-    assert not estimate.settled and "farther apart than the 2 s" in estimate.reason
+def test_what_lies_between_samples_of_a_stream_settles_nothing():
     policy = estimator()
-    for voltage_V, current_A, there in zip(*(column.tolist() for column in WHOLE[1:]), kept.tolist(), strict=True):
-        streamed = policy.update(voltage_V if there else float("nan"), current_A, 1.0)
-    assert not streamed.settled and "farther apart than the 2 s" in streamed.reason
-
-
-def test_few_readings_settle_nothing():
-    """R_o was settled after one reading, and with a voltage that was 60 mV off 39 % too large."""
-    policy = PolicyEstimator(Step(columns=slice(101, 102)), "BatteryVoltageRo-v0", 2.0, **OPTIONS)
-    record = whole_discharge(q_mobile=NEW_CELL.q_mobile).first(40)
-    trace = policy.trace([record])[0]
-    assert not trace.settled[:10].any() and trace.settled[-1]
-    assert "too few readings" in trace.reason[9] and not np.isnan(trace.sd_r_o).any()
-
-
-def test_a_sample_long_after_the_first_one_is_no_error():
-    policy, record = estimator(), simulate(np.full(300, 0.2), 7600.0, 0.2, load_unit="current")
-    for n, since_s in ((5, 1.0), (102, 102.0)):
-        estimate = policy.update(float(record.voltage_V[n]), 0.2, since_s)
-    assert not estimate.settled and estimate.reason
+    for n, (voltage_V, current_A) in enumerate(zip(*(column.tolist() for column in WHOLE[1:]), strict=True)):
+        estimate = policy.update(voltage_V if n % 3 == 0 else float("nan"), current_A, 1.0)
+    assert not estimate.settled and "farther apart than the 2 s" in estimate.reason
 
 
 def test_a_stream_goes_on_as_sure_as_it_was_saved(tmp_path):

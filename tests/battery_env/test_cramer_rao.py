@@ -45,13 +45,6 @@ def test_bounds_of_the_reference_case(slopes_at_known_power, samples, alone_C, j
         assert bound.sd_q_mobile[samples - 1] == pytest.approx(expected_C, rel=0.015)
 
 
-def test_a_known_current_tells_a_little_less_than_a_known_power(record, slopes_at_known_power):
-    for parameters in (["q_mobile"], BOTH):
-        at_current = cramer_rao_bound(record, NOISE_V, parameters).sd_q_mobile[15:]
-        ratio = at_current / CramerRaoBound.of(slopes_at_known_power, NOISE_V, parameters).sd_q_mobile[15:]
-        assert 1.0 < ratio.min() and ratio.max() < 1.4
-
-
 def test_it_is_the_inverse_of_the_information(record):
     slopes = sensitivities(record)
     gradient = np.column_stack([slopes.by_q_mobile_V_per_C, slopes.by_r_o_A, np.ones(len(record.time_s))])

@@ -22,7 +22,6 @@ from battery_env.electrochemistry import (
     voltage,
     voltage_into,
 )
-from battery_env.electrochemistry.kernels import logarithm
 
 # Tb, Vo, Vsn, Vsp, qnB, qnS, qpB, qpS, V of a new cell, dt 1 s
 REFERENCE_2A_THERMAL = {
@@ -165,15 +164,6 @@ def test_a_cell_comes_out_the_same_in_a_batch_of_any_size_and_on_its_own_way(loa
             some = packed._replace(constants=packed.constants[:size])
             step_into(part, state[:size], loads[first][:size], q[:size], r[:size], 1.0, load_unit, False, some)
             np.testing.assert_array_equal(part, out[:size])
-
-
-def test_the_logarithm_is_that_of_the_c_library_to_one_unit_in_the_last_place():
-    rng = np.random.default_rng(4)
-    near_one = 1.0 + rng.uniform(-1.0, 1.0, 1000) * 10.0 ** rng.uniform(-15.0, -0.4, 1000)
-    values = [*np.exp(rng.uniform(-700.0, 700.0, 1000)), *near_one, 0.5**0.5, 2.0**0.5, 1.0, 2.3e-308, 1.7e308]
-    found, expected = np.array([logarithm(value) for value in values]), np.log(values)
-    assert (np.abs(found - expected) <= np.spacing(np.abs(expected))).all()
-    assert np.isnan(logarithm(np.nan)) and logarithm(np.inf) == np.inf and logarithm(1.0) == 0.0
 
 
 def test_roll_out_equals_single_steps():

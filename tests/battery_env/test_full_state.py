@@ -3,20 +3,11 @@
 import numpy as np
 import pytest
 
-from battery_env.calibration.data import standard_dataset
 from battery_env.calibration.full_state_layout import ACTION_RANGES, ERROR_SCALE, OBSERVED
-from battery_env.calibration.full_state_tasks import BatteryJoint, BatteryQmax, BatteryQmaxPaper, BatteryRo
-from battery_env.calibration.policy import PolicyEstimator
-from battery_env.electrochemistry import (
-    NEW_CELL,
-    UNCERTAIN_CONSTANTS,
-    step,
-    voltage,
-)
+from battery_env.calibration.full_state_tasks import BatteryJoint, BatteryQmax, BatteryQmaxPaper
+from battery_env.electrochemistry import NEW_CELL, UNCERTAIN_CONSTANTS, step, voltage
 from battery_env.loads import RandomPiecewise, constant
 from battery_env.trajectories import TrajectoryDataset
-
-STATE_SCALE = np.array([0.5, 0.1, 0.01, 6840.0, 760.0, 11400.0, 1266.0])
 
 
 @pytest.fixture(scope="module")
@@ -132,15 +123,6 @@ def test_charges_count_as_much_as_is_asked_for(discharges, kind):
     )
 
 
-def test_the_cost_is_limited(discharges):
-    task = started(make(discharges, cells=2, cost_limit=0.2))
-    measured = task.now["next_state"].copy()
-    cost = task.advance(true_action(task) + np.array([[0.02], [1.0]]))
-    distance = scaled_distance(task, task.now["model_state"], measured)
-    np.testing.assert_allclose(cost, np.minimum(distance, 0.2), rtol=1e-9)
-    assert cost[0] < 0.2 == cost[1]
-
-
 def test_constants_may_differ_from_those_of_the_model():
     data = TrajectoryDataset.generate("q_mobile", 5, [constant(12.0)], seed=0, mismatch=0.2)
     task = make(data, cells=3)
@@ -159,26 +141,6 @@ def test_constants_may_differ_from_those_of_the_model():
         np.testing.assert_allclose(task.now["model_state"], step(model, load, q, r), rtol=1e-13)
 
 
-def test_loads_of_other_kinds_and_time_steps():
-    task = BatteryRo(1, load="piecewise", split="test", dt_s=2.0)
-    whole = standard_dataset("r_o", "piecewise", "test", dt_s=2.0)
-    within = whole.r_o <= ACTION_RANGES["r_o"][1]
-    np.testing.assert_array_equal(task.dataset.r_o, whole.r_o[within])
-    assert 100 < len(task.dataset) < len(whole)
-    assert task.decision_s == 2.0 and len(np.unique(task.dataset[0].load)) > 5
-    task.start(np.zeros(1, dtype=int), [np.random.default_rng(0)])
-    np.testing.assert_array_equal(
-        task.now["next_state"], step(task.now["state"], task.now["load"], task.now["q_mobile"], task.now["r_o"], dt=2.0)
-    )
-
-
-def test_perturbations_of_the_literal_form_are_in_error_scales_too(discharges):
-    task = BatteryQmaxPaper(50, dataset=discharges, initial_perturbation=10.0)
-    started(task)
-    off = (task.now["model_state"] - task.now["state"])[:, OBSERVED] / ERROR_SCALE
-    assert 5.0 < np.abs(off).max() <= 10.0
-
-
 @pytest.mark.parametrize(("kind", "size"), [(BatteryQmax, 1), (BatteryJoint, 2)])
 def test_going_on_with_some_cells_changes_nothing_for_them(kind, size):
     data = TrajectoryDataset.generate(("q_mobile", "r_o"), 4, RandomPiecewise(), seed=0, mismatch=0.1)
@@ -195,18 +157,6 @@ def test_going_on_with_some_cells_changes_nothing_for_them(kind, size):
         costs = [task.advance(action[kept] if task.cells == 3 else action) for task in tasks]
         np.testing.assert_array_equal(costs[0][kept], costs[1] if k >= 3 else costs[1][kept])
     np.testing.assert_array_equal(tasks[0].observation()[kept], tasks[1].observation())
-
-
-def test_a_policy_is_evaluated_under_the_options_it_is_given(discharges):
-    class Repeater:
-        """Repeats the action before, which the observation ends with."""
-
-        def predict(self, observation, deterministic=False):
-            assert observation.shape[1] == 30
-            return observation[:, -1:], None
-
-    trace = PolicyEstimator(Repeater(), "BatteryQmax-v0", consistency=0.1).trace(discharges)[0]
-    np.testing.assert_allclose(trace.q_mobile, NEW_CELL.q_mobile, rtol=1e-6)
 
 
 def test_a_cell_whose_data_have_ended_goes_on_without_failing(discharges):
@@ -267,8 +217,3 @@ def test_a_share_of_the_episodes_starts_where_the_whole_discharge_does():
 def test_options_out_of_range_are_refused(option, value, message):
     with pytest.raises(ValueError, match=message):
         BatteryQmax(1, **{option: value})
-
-
-def test_a_data_set_stands_in_place_of_what_would_choose_one(discharges):
-    with pytest.raises(ValueError, match="dataset stands in place of load, split: give one or the other"):
-        BatteryQmax(1, dataset=discharges, load="piecewise", split="test")

@@ -50,15 +50,6 @@ class TestStart:
         assert len(model.simulate(load_A, 1.0001 * least_C, 0.0).time_s) == 1000
         assert len(model.simulate(load_A, 0.999 * least_C, 0.0).time_s) < 1000
 
-    def test_a_state_and_a_charge_are_too_much(self):
-        with pytest.raises(ValueError, match="initial is a whole state: give it or initial_soc, got both"):
-            LeastSquares(initial=initial_state(), initial_soc=0.8)
-
-    @pytest.mark.parametrize("soc", [0.0, 1.1, np.nan, "rest", (0.5, -0.1), (0.5, 0.1, 0.1), None])
-    def test_what_is_no_charge_is_refused(self, soc):
-        with pytest.raises(ValueError, match=r"initial_soc is a state of charge within .*\.soc_from_rest tells both"):
-            LeastSquares(initial_soc=soc)
-
 
 class TestRest:
     @pytest.mark.parametrize("soc", [0.15, 0.5, 0.97])
@@ -84,36 +75,12 @@ class TestRest:
         found = soc_from_rest(record.part(REST_S - samples_at_rest, len(record.time_s)))
         assert found.samples == samples_at_rest and found.reason.startswith("The record does not start with a minute at rest")
 
-    def test_an_estimate_that_is_told_of_it_is_as_sure_as_it_is(self, record):
-        start = soc_from_rest(record, voltage_noise_V=0.002)
-        estimate = LeastSquares(thermal=True, voltage_noise_V=0.002, initial_soc=(start.soc, start.sd_soc)).estimate(record)
-        assert abs(estimate.q_mobile - 6000.0) < 3.0 * estimate.sd_q_mobile < 400.0
-
 
 class TestLeastSquares:
     @pytest.mark.parametrize("soc", [0.3, 0.7, 0.95])
     def test_a_charge_that_is_known_gives_both_parameters(self, soc):
         estimate = LeastSquares(thermal=True, initial_soc=soc).estimate(partly_charged(soc, noise_V=0.0))
         assert (estimate.q_mobile, estimate.r_o) == pytest.approx((6000.0, 0.15), rel=1e-6) and estimate.settled
-
-    @pytest.mark.parametrize("more", [{}, {"nuisance": {"tDiffusion": 0.1, "kn": 0.1}}, {"parameters": ["r_o"]}])
-    def test_with_other_unknowns_too(self, more, record):
-        cell = NEW_CELL.replace(q_mobile=6000.0)
-        estimate = LeastSquares(thermal=True, voltage_noise_V=0.002, initial_soc=0.8, cell=cell, **more).estimate(record)
-        assert abs(estimate.r_o - 0.15) < 4.0 * estimate.sd_r_o < 0.05
-        if "parameters" not in more:
-            assert abs(estimate.q_mobile - 6000.0) < 4.0 * estimate.sd_q_mobile < 600.0
-
-    @pytest.mark.parametrize(
-        ("initial_soc", "reasons"),
-        [
-            (1.0, ["where a full cell shows 4.19 V", "or state initial_soc"]),
-            (0.95, ["where a cell with 95% of its charge shows"]),
-        ],
-    )
-    def test_a_charge_that_is_not_told_or_wrong_is_noticed(self, initial_soc, reasons, record):
-        estimate = LeastSquares(thermal=True, initial_soc=initial_soc).estimate(record)
-        assert not estimate.settled and all(reason in estimate.reason for reason in reasons)
 
     def test_a_doubt_moves_the_parameters_as_far_as_it_says(self, record):
         stated, off = (
@@ -156,13 +123,6 @@ class TestCommandLine:
         assert abs(row["q_mobile_C"] - 6000.0) < 3.0 * row["sd_q_mobile_C"] < 500.0
         status, row = self.row(record.part(REST_S - 20, len(record.time_s)), tmp_path, capsys, *options)
         assert status == NOT_SETTLED and row["reason"].startswith("The record does not start with a minute at rest")
-
-    def test_in_words(self, record, tmp_path, capsys):
-        columns = {"time_s": record.time_s, "voltage_V": record.voltage_V, "current_A": record.current_A}
-        pd.DataFrame(columns).to_csv(tmp_path / "record.csv", index=False)
-        calibrate([str(tmp_path / "record.csv"), "--initial-soc", "0.8,0.01", "--cut-off", "2.9"])
-        shown = capsys.readouterr().out
-        assert "charge at the start         80.0 %   sd 1.0 %" in shown and "from full it would have been 1.5" in shown
 
     @pytest.mark.parametrize("given", ["half", "0.8,0.1,0.1", ""])
     def test_what_is_none(self, given, capsys):

@@ -8,7 +8,7 @@ from battery_env.calibration.data import standard_dataset
 from battery_env.calibration.nuisance import FOUND_SIZE, nuisance_step
 from battery_env.calibration.readings import Readings
 from battery_env.calibration.vector_env import CalibrationVectorEnv
-from battery_env.calibration.voltage_tasks import BatteryVoltageJoint, BatteryVoltageRo
+from battery_env.calibration.voltage_tasks import BatteryVoltageJoint
 from battery_env.electrochemistry import NEW_CELL, UNCERTAIN_CONSTANTS, simulate
 from battery_env.loads import RandomPiecewise
 from battery_env.records import Samples
@@ -107,19 +107,7 @@ def test_it_states_how_far_off_it_may_be(data):
         assert 0.6 < found[:, n].std() / stated < 1.6
 
 
-def test_nothing_is_moved_without_readings_that_say_so(data):
-    """Three readings leave the priors as they are, but for R_o."""
-    trajectory = data[1]
-    found = step(trajectory, trajectory.q_mobile, trajectory.r_o, prior_sd=(1000.0, 0.05, 0.005, 0.2, 0.2, 0.2, 0.2), count=3)
-    assert abs(found[0]) < 100.0 and np.abs(found[3:7]).max() < 0.2
-    assert (found[len(UNKNOWNS) : -1] <= 1.0001 * np.array([1000.0, 0.05, 0.005, 0.2, 0.2, 0.2, 0.2])).all()
-
-
 class TestTask:
-    def test_without_it_nothing_is_shown(self, data):
-        assert BatteryVoltageJoint(1, dataset=data).observation_size == 102
-        assert BatteryVoltageJoint(1, dataset=data, nuisance=0.2).observation_size == 112
-        assert BatteryVoltageRo(1, dataset=data, nuisance=0.2).observation_size == 109
 
     def test_the_rest_of_the_observation_is_the_same(self, data):
         shown = []
@@ -137,10 +125,6 @@ class TestTask:
         for _ in range(20):  # beyond the end of an episode
             np.testing.assert_array_equal(together[2], alone[0])
             together, alone = many.step(np.full((3, 2), 0.05))[0], one.step(np.full((1, 2), 0.05))[0]
-
-    def test_what_is_out_of_range_is_refused(self, data):
-        with pytest.raises(ValueError, match=r"nuisance must be finite and at least 0, got -0\.1"):
-            BatteryVoltageJoint(1, dataset=data, nuisance=-0.1)
 
 
 class Follow:

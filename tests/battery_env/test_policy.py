@@ -89,13 +89,6 @@ def test_a_life_is_followed_with_one_estimate():
     assert scores["q_mobile_final"][2] == traces[2].q_mobile[-1]
 
 
-def test_policies_are_scored_with_the_sensors_they_were_trained_with(data):
-    env = PolicyEstimator.environment("BatteryVoltageJoint-v0", dataset=data, current_gain=0.02, measured="power")
-    assert env.task.sensors == RandomSensorErrors((0.001, 0.030), 0.010, 0.02, 0.0, "power")
-    scores = evaluate(PolicyEstimator(Constant(0.0, 0.0), "BatteryVoltageJoint-v0"), data, env.task.sensors)
-    assert (scores["q_mobile_final"] == NEW_CELL.q_mobile).all()
-
-
 def test_recorded_discharges():
     discharge = load_nasa_discharges("B0005")[0].loaded_part(3.0)
     estimator = PolicyEstimator(Constant(-0.1, 0.0), "BatteryVoltageJoint-v0")
@@ -152,15 +145,3 @@ class TestOwnCell:
             of_set, of_list = (self.estimator(**cell).trace(records) for records in (own, list(own)))
             for one, other in zip(of_set, of_list, strict=True):
                 np.testing.assert_array_equal(one.q_mobile, other.q_mobile)
-
-    def test_an_id_may_name_the_module_that_registers_it(self):
-        for env_id in ("BatteryVoltageJoint-v0", "BatteryQmax-v0"):
-            assert PolicyEstimator(Last(), f"battery_env:{env_id}").parameters == PolicyEstimator(Last(), env_id).parameters
-        with pytest.raises(ModuleNotFoundError, match="no_such_module"):
-            PolicyEstimator(Last(), "no_such_module:BatteryQmax-v0")
-
-    def test_to_make_one_simulates_nothing(self, monkeypatch):
-        monkeypatch.setattr(TrajectoryDataset, "generate", None)
-        odd = self.CELL.replace(VEOD=3.7)  # a data set of which would end at once
-        assert self.estimator(cell=odd).cell == odd
-        assert PolicyEstimator(Last(), "BatteryAging-v0", cell=self.CELL, cycles=3).cell == self.CELL

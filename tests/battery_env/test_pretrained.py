@@ -1,10 +1,8 @@
 """The policies that come with the package."""
 
 import hashlib
-import json
 import subprocess
 import sys
-from dataclasses import asdict
 from importlib.resources import files
 
 import numpy as np
@@ -12,18 +10,12 @@ import pytest
 
 from battery_env import LeastSquares, PolicyEstimator, evaluate, load_nasa_discharges
 from battery_env.calibration.data import standard_dataset
-from battery_env.calibration.pretrained import file_stem, policy_of_file, pretrained_card, pretrained_ids, pretrained_policy
-from battery_env.calibration.voltage import ESTIMATE_RANGES
+from battery_env.calibration.pretrained import file_stem, policy_of_file, pretrained_card, pretrained_policy
 from battery_env.cells import BUNDLED_CELLS
-from battery_env.electrochemistry import NEW_CELL
 from battery_env.sensors import SensorErrors
 
 FOLDER = files("battery_env.pretrained_policies")
 IDS = {"BatteryVoltageJoint-v0": ("q_mobile", "r_o"), "BatteryVoltageQmax-v0": "q_mobile", "BatteryVoltageRo-v0": "r_o"}
-
-
-def test_there_is_one_for_each_voltage_only_task():
-    assert pretrained_ids() == tuple(IDS)
 
 
 @pytest.mark.parametrize("recorded", [False, True])
@@ -74,14 +66,6 @@ def test_on_recorded_cells_the_one_for_them_agrees_with_least_squares(cell):
     assert off[True].max() < 0.04 and off[True].mean() < 0.6 * off[False].mean()
 
 
-def test_it_stays_in_its_range_and_says_how_sure_it_is():
-    estimator = PolicyEstimator.pretrained()
-    for trace in estimator.trace(standard_dataset(("q_mobile", "r_o"), "piecewise", "test", mismatch=0.2)[:2]):
-        assert trace.settled[-1] and not trace.settled[0] and (trace.sd_q_mobile > 0.0).all()
-        for name, (low, high) in ESTIMATE_RANGES.items():
-            assert (getattr(trace, name) >= low).all() and (getattr(trace, name) <= high).all()
-
-
 def test_it_needs_no_torch():
     code = (
         "import sys; sys.modules['torch'] = None; sys.modules['stable_baselines3'] = None\n"
@@ -119,19 +103,6 @@ class TestFiles:
         path = tmp_path / "mine.onnx"
         path.write_bytes(FOLDER.joinpath("BatteryVoltageRo-v0.onnx").read_bytes())
         return path
-
-    def test_one_without_a_card_has_no_options(self, copy):
-        policy, options = policy_of_file(copy)
-        assert options == {} and policy.env_id == "BatteryVoltageRo-v0"
-
-    def test_a_card_says_the_options(self, copy):
-        copy.with_suffix(".json").write_text(json.dumps({"options": {"reading_s": 5.0}}))
-        assert policy_of_file(copy)[1] == {"reading_s": 5.0}
-
-    def test_a_card_says_the_constants(self, copy):
-        cell = NEW_CELL.replace(kn=1000.0)
-        copy.with_suffix(".json").write_text(json.dumps({"options": {"cell": asdict(cell)}}))
-        assert policy_of_file(copy)[1] == {"cell": cell}
 
     @pytest.mark.parametrize("text", ["{", "[]", "{}", '{"options": 3}', '{"options": {"cell": {"kn": 1000.0}}}'])
     def test_a_card_that_is_none_is_refused(self, copy, text):

@@ -1,12 +1,9 @@
 """Readings of discharges, and the model's misfit to them."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from battery_env.calibration.readings import SHOWN, Readings, explain
-from battery_env.calibration.voltage_tasks import BatteryVoltageJoint
 from battery_env.cells import load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, QNB, QNS, VO, simulate
 from battery_env.loads import RandomPiecewise
@@ -45,16 +42,6 @@ def test_linear_part_is_that_of_the_simulation(data, readings):
         np.testing.assert_allclose(readings.ohmic_A[part] * trajectory.r_o, trajectory.state[at, VO], atol=1e-9)
 
 
-def test_cells_that_are_not_asked_for_stay_as_they_are(data):
-    task = BatteryVoltageJoint(3, dataset=data)
-    task.start(np.arange(3), [np.random.default_rng(k) for k in range(3)])
-    before = task.observation()
-    task.start(np.array([1]), [np.random.default_rng(7)])
-    after = task.observation()
-    np.testing.assert_array_equal(after[[0, 2]], before[[0, 2]])
-    assert (after[1] != before[1]).any()
-
-
 def test_the_true_parameters_explain_a_discharge(readings):
     rms_V = compare(readings, readings.q_mobile, readings.r_o)[3]
     assert rms_V.max() < 2e-4  # a step of ten seconds for the overpotentials; the prototype of a fixed table had 1.6 mV
@@ -87,31 +74,6 @@ def test_stretches_are_averaged_in_halves_of_less_and_of_more_current(readings):
             for k in range(3):
                 values = fine[k][n, inside, 0]
                 np.testing.assert_allclose(coarse[k][n, stretch], [values[~more].mean(), values[more].mean()], rtol=1e-9)
-
-
-# The mean of several numbers like the third is below them, as it rounds
-@pytest.mark.parametrize("current_A", [1.0, 0.0, 1.7320508075688772, 0.1])
-def test_under_a_constant_current_both_halves_are_the_whole(data, readings, current_A):
-    constant = replace(readings, ohmic_A=np.full_like(readings.ohmic_A, current_A))
-    for values in compare(constant, readings.q_mobile * 1.05, readings.r_o)[:3]:
-        np.testing.assert_array_equal(values[:, :, 0], values[:, :, 1])
-
-
-def test_rounding_of_a_constant_current_tells_no_halves_apart(readings):
-    nearly = 1.7 * (1.0 + 1e-15 * np.random.default_rng(0).standard_normal(len(readings.ohmic_A)))
-    rounded, constant = (
-        compare(replace(readings, ohmic_A=each), readings.q_mobile * 1.05, readings.r_o)
-        for each in (nearly, np.full_like(nearly, 1.7))
-    )
-    for one, other in zip(rounded, constant, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
-
-
-def test_fewer_readings_than_stretches_share_them(readings):
-    count = np.full(len(readings), 3)
-    fine = compare(readings, readings.q_mobile, readings.r_o * 1.1, count, stretches=3)[0]
-    shared = compare(readings, readings.q_mobile, readings.r_o * 1.1, count, stretches=12)[0]
-    np.testing.assert_array_equal(shared, np.repeat(fine, 4, axis=1))
 
 
 @pytest.mark.parametrize("readings_so_far", [1, 7, 8, 9, 63, 64, 65, 127, 128, 129])

@@ -8,15 +8,14 @@ import pytest
 from battery_env.cells import Discharge, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate
 from battery_env.estimators import Estimate, ExtendedKalmanFilter, LeastSquares
-from battery_env.estimators.settling import start_reason
 from battery_env.record_model import RecordModel
 from battery_env.records import expected_current
 
 CALIBRATORS = {
-    "least squares": lambda **more: LeastSquares(thermal=True, mismatch_V=0.05, **more),
-    "filter": lambda **more: ExtendedKalmanFilter(thermal=True, **more),
-    "filter, mismatch": lambda **more: ExtendedKalmanFilter(thermal=True, mismatch_V=0.05, **more),
+    "least squares": lambda **more: LeastSquares(**{"thermal": True, "mismatch_V": 0.05, **more}),
+    "filter": lambda **more: ExtendedKalmanFilter(**{"thermal": True, "mismatch_V": 0.05, **more}),
 }
+BOTH = tuple(CALIBRATORS)
 SECONDS = np.arange(60_000)
 
 
@@ -25,21 +24,24 @@ def calibrator(request):
     return request.param
 
 
-def simulated(current_A=2.0, q_mobile=6000.0, r_o=0.15, noise_V=0.005, **more) -> Discharge:
+def discharged(current_A=2.0, q_mobile=6000.0, r_o=0.15, noise_V=0.005, **more) -> Discharge:
     record = simulate(current_A, q_mobile, r_o, load_unit="current", thermal=True, cut_off_V=2.8, **more)
     voltage_V = record.voltage_V + np.random.default_rng(0).normal(0.0, noise_V, len(record.voltage_V))
-    return Discharge(record.time_s, voltage_V, record.current_A)
+    return Discharge(record.time_s, voltage_V, record.current_A, starts_at_rest=True)
 
 
-@pytest.fixture(scope="module", params=["simulated", "B0005", "B0006"])
-def whole(request) -> Discharge:
-    if request.param == "simulated":
-        return simulated()
-    return load_nasa_discharges(request.param)[60].loaded_part(2.7)
+def changed(record: Discharge, kept=slice(None), late_s=0.0, rested=True) -> Discharge:
+    time_s = record.time_s + late_s
+    return Discharge(time_s[kept], record.voltage_V[kept], record.current_A[kept], starts_at_rest=rested)
 
 
-def cut(record: Discharge, start: int, stop: int | None = None) -> Discharge:
-    return Discharge(record.time_s[start:stop], record.voltage_V[start:stop], record.current_A[start:stop])
+def jumped(record: Discharge, at_s: float, by_s: float) -> Discharge:
+    """The clock of its logger is set."""
+    return changed(record, late_s=np.where(record.time_s > at_s, by_s, 0.0))
+
+
+def lost(record: Discharge, from_s: float, to_s: float) -> Discharge:
+    return changed(record, (record.time_s <= from_s) | (record.time_s > to_s))
 
 
 def stuck(record: Discharge, from_s: float, until_s: float) -> Discharge:
@@ -48,247 +50,279 @@ def stuck(record: Discharge, from_s: float, until_s: float) -> Discharge:
     return replace(record, voltage_V=np.where(failed, record.voltage_V[failed.argmax()], record.voltage_V))
 
 
-class TestStart:
+def logged_by_voltage(load_A) -> Discharge:
+    """A record as cyclers write it: a row where the voltage has changed, a minute is over, or the load is switched."""
+    record, kept = discharged(load_A, noise_V=0.001), [0]
+    switched = np.append(np.diff(record.current_A) != 0.0, False)
+    switched[1:] |= switched[:-1]
+    for n in range(1, len(record.time_s)):
+        is_late = record.time_s[n] - record.time_s[kept[-1]] >= 60.0
+        if is_late or switched[n] or abs(record.voltage_V[n] - record.voltage_V[kept[-1]]) >= 0.005:
+            kept.append(n)
+    return changed(record, kept)
+
+
+def pulsed(length: int, period: int, high_A: float, low_A: float, start_s: int = 0) -> np.ndarray:
+    since_s = SECONDS - start_s
+    return np.where((since_s >= 0) & (since_s % period < length), high_A, low_A)
+
+
+WHOLE = discharged()
+REAL = load_nasa_discharges("B0005")[60]
+LOW = replace(REAL, voltage_V=REAL.voltage_V - 0.2)
+STUCK = stuck(discharged(np.where(SECONDS < 100, 0.0, pulsed(100, 200, 1.0, 3.0))), 1190.0, 1270.0)
+RISING = discharged(pulsed(200, 400, 2.0, 0.2))
+AFTER_REST = discharged(np.append(np.zeros(60), np.full(20_000, 2.0)))
+AGAIN = changed(AFTER_REST, late_s=AFTER_REST.time_s[-1] + 1.0)
+TWICE = Discharge(*(np.append(getattr(AFTER_REST, c), getattr(AGAIN, c)) for c in ("time_s", "voltage_V", "current_A")))
+MISFIT = "The voltage of the model is farther off than noise and mismatch_V explain: state a larger mismatch_V"
+
+#: Each reason of the tables of conditions: whose, of which record, with which arguments of the calibrator.
+VERDICTS = {
+    "above full": (BOTH, replace(REAL, voltage_V=REAL.voltage_V + 0.15), {}, "The record starts at 4.35 V, above the 4.19 V"),
+    "not full": (BOTH, LOW, {}, "The record starts at rest at 4.00 V, where a full cell shows 4.19 V. Give the whole"),
+    "not full, rest cut off": (BOTH, LOW.loaded_part(2.7), {}, "The record starts at rest at 4.00 V"),
+    "wrong initial charge": (
+        BOTH, discharged(initial=initial_state(soc=0.7)), {"initial_soc": 0.85},
+        "The record starts at rest at 3.83 V, where a cell with 85% of its charge shows 4.03 V",
+    ),
+    "late start": (BOTH, changed(WHOLE, slice(300, None), rested=False), {}, "The record starts under load at 3."),
+    "forgotten reset": (("filter",), TWICE, {}, "The voltage comes back to that of the start at 2882 s"),
+    "stuck voltage": (BOTH, STUCK, {}, "The current changes by -2.00 A at 1200 s, and the voltage does not follow."),
+    "its clock": (BOTH, changed(STUCK, late_s=50_000.0), {}, "The current changes by -2.00 A at 51200 s"),
+    "stuck current": (
+        BOTH, replace(RISING, current_A=np.where(RISING.time_s > 1300.0, 2.0, RISING.current_A)),
+        {"voltage_noise_V": 1.0}, "The voltage rises by 0.",
+    ),
+    "not drawn": (BOTH, jumped(WHOLE, 1700.0, 600.0), {}, "No sample lies between 1700 s and 2301 s, and the voltage does"),
+    "empty": (BOTH, WHOLE, {"parameters": ["r_o"], "cell": NEW_CELL.replace(q_mobile=4000.0)}, "The model cell is empty"),
+    "bound of q_mobile": (BOTH, changed(WHOLE, slice(2000)), {"q_mobile_bounds_C": (6500.0, 8000.0)}, "q_mobile is at a"),
+    "bound of r_o": (BOTH, WHOLE, {"r_o_bounds_ohm": (0.0, 0.14)}, "r_o is at a bound"),
+    "minutes": (BOTH, replace(WHOLE, time_s=WHOLE.time_s / 60.0), {}, "No cell of this kind has such a q_mobile. Check that"),
+    "misfit": (BOTH, REAL.loaded_part(2.7), {"mismatch_V": 0.0}, MISFIT),
+    "misfit beyond a known noise": (
+        BOTH[:1], WHOLE,
+        {"parameters": ["q_mobile"], "cell": NEW_CELL.replace(r_o=0.12), "mismatch_V": 0.0, "voltage_noise_V": 0.005}, MISFIT,
+    ),
+    "prior of another end": (
+        BOTH[:1], WHOLE, {"prior_q_mobile_C": (8000.0, 80.0)}, "The record falls to 2.80 V at 2820 s, where this estimate says"
+    ),
+    "wrong prior of q_mobile": (BOTH[:1], WHOLE, {"prior_q_mobile_C": (5400.0, 20.0)}, "The prior of q_mobile contradicts"),
+    "wrong prior, filter": (BOTH[1:], WHOLE, {"prior_q_mobile_C": (5700.0, 60.0)}, "The prior of q_mobile contradicts"),
+    "wrong prior of r_o": (BOTH[1:], WHOLE, {"prior_r_o_ohm": (0.25, 0.02)}, "The prior of r_o contradicts"),
+    "prior of q_mobile": (
+        BOTH, changed(WHOLE, slice(120)), {"prior_q_mobile_C": (6100.0, 60.0)}, "q_mobile rests on its prior: the record alone"
+    ),
+    "prior of r_o": (BOTH[1:], discharged(0.5), {"prior_r_o_ohm": (0.15, 0.01)}, "r_o rests on its prior: the record alone"),
+    "noise hides whether it was drawn": (
+        BOTH, lost(changed(discharged(noise_V=0.03), slice(None, None, 10)), 1200.0, 1280.0), {},
+        "No sample lies between 1200 s and 1290 s, and the voltage does not tell whether the load was on: 160 C are in doubt",
+    ),
+    "switched meanwhile": (
+        BOTH, lost(discharged(np.where(SECONDS < 1500, 2.0, 1.0), noise_V=0.003), 1400.0, 1700.0), {},
+        "No sample lies between 1400 s and 1701 s, and the voltage does not tell whether the load was on",
+    ),
+    "half a discharge": (BOTH, changed(WHOLE, slice(1400)), {}, "q_mobile is not known to 2 % yet: the voltage shows it at"),
+    "a small current": (BOTH, discharged(0.5), {}, "r_o is not known to 30 %: the error expected of noise and model"),
+    "gain of the current": (BOTH, WHOLE, {"current_gain_sd": 0.03}, "q_mobile is known no better than what scales it"),
+    "charge at the start": (BOTH, WHOLE, {"initial_soc": (1.0, 0.03)}, "q_mobile is known no better than what scales it"),
+    "its gain, for r_o": (
+        BOTH, WHOLE, {"parameters": ["r_o"], "cell": NEW_CELL.replace(q_mobile=6000.0), "current_gain_sd": 0.4},
+        "r_o is known no better than what scales it",
+    ),
+    "few samples": (
+        BOTH[:1], changed(WHOLE, slice(0, 100, 10)),
+        {"parameters": ["r_o"], "cell": NEW_CELL.replace(q_mobile=6000.0), "mismatch_V": 0.0}, "These are too few samples",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "record", "arguments", "reason"),
+    [(name, *verdict[1:]) for verdict in VERDICTS.values() for name in verdict[0]],
+    ids=[f"{case}, {name}" for case, verdict in VERDICTS.items() for name in verdict[0]],
+)
+def test_each_reason_is_said_of_its_record(name, record, arguments, reason):
+    estimate = CALIBRATORS[name](**arguments).estimate(record)
+    assert not estimate.settled and estimate.reason.startswith(reason), estimate.reason
+
+
+NOISY_REST = discharged(1e-6 + pulsed(30, 60, 2.0, 0.0))
+LONG_REST = discharged(np.concatenate([np.full(1500, 2.0), np.zeros(4000), np.full(40_000, 2.0)]))
+QUIET = discharged(noise_V=0.001)
+
+
+def charged_now_and_then(rest_s: int) -> Discharge:
+    rest_A = np.zeros(rest_s)
+    cycle_A = np.concatenate([np.full(10, 4.0), rest_A, np.full(10, -3.0), rest_A, np.full(280, 2.0), np.zeros(300)])
+    return discharged(np.tile(cycle_A, 40), noise_V=1e-6)
+
+
+#: Records that look odd, and are not.
+SOUND = {
+    "whole": WHOLE,
+    "pulses of charge": charged_now_and_then(0),
+    "pulses of charge and rests": charged_now_and_then(40),
+    "a small resistance": discharged(pulsed(60, 120, 2.0, 0.4), r_o=0.04),
+    "a large cell": discharged(pulsed(60, 120, 5.0, 1.0), 18_900.0, 0.02),
+    "pulses too short for the voltage to follow": discharged(pulsed(1, 60, 5.0, 1.0, 100), noise_V=0.002),
+    "short pulses": discharged(pulsed(8, 60, 5.0, 1.0, 100), noise_V=0.002),
+    "a current at rest, at the end": changed(NOISY_REST, slice(len(NOISY_REST.time_s) // 60 * 60)),
+    "a logger that slows down": changed(QUIET, (QUIET.time_s < 300.0) | (QUIET.time_s % 60 == 0)),
+    "a long rest that was not logged": changed(LONG_REST, (LONG_REST.time_s < 1520.0) | (LONG_REST.time_s > 5480.0)),
+    "a logger that writes changes": logged_by_voltage(2.0),
+    "changes, under steps": logged_by_voltage(np.repeat(np.random.default_rng(0).uniform(1.0, 3.0, 200), 120)),
+}
+
+
+@pytest.mark.parametrize("record", SOUND.values(), ids=list(SOUND))
+def test_a_sound_record_settles(record, calibrator):
+    q_mobile = 18_900.0 if record is SOUND["a large cell"] else 6000.0
+    cell = NEW_CELL.replace(q_mobile=q_mobile)
+    estimate = calibrator(mismatch_V=0.01, cell=cell).estimate(record)
+    assert estimate.settled and estimate.reason == "", estimate.reason
+    assert estimate.q_mobile == pytest.approx(q_mobile, rel=0.01)
+
+
+@pytest.fixture(scope="module", params=["simulated", "B0005", "B0006"])
+def whole(request) -> Discharge:
+    return WHOLE if request.param == "simulated" else load_nasa_discharges(request.param)[60].loaded_part(2.7)
+
+
+class TestWholeDischarges:
+    @pytest.mark.parametrize("cell", ["B0005", "B0006"])
+    def test_recorded_ones_settle(self, cell, calibrator):
+        for record in load_nasa_discharges(cell)[::24]:
+            estimate = calibrator().estimate(record.loaded_part(2.7))
+            assert estimate.settled and estimate.reason == ""
+
     @pytest.mark.parametrize("times", [1.0, 5.0])
-    @pytest.mark.parametrize("share", [0.05, 0.3, 0.5])
-    def test_a_record_that_starts_late_is_never_settled_whatever_the_size_of_the_cell(self, whole, calibrator, share, times):
-        late = cut(whole, round(share * len(whole.time_s)))
+    @pytest.mark.parametrize("share", [0.05, 0.5])
+    def test_one_that_starts_late_is_never_settled_whatever_the_size_of_the_cell(self, whole, calibrator, share, times):
+        late = changed(whole, slice(round(share * len(whole.time_s)), None), rested=False)
         estimate = calibrator().estimate(replace(late, current_A=times * late.current_A))
         assert not estimate.settled and estimate.reason.startswith("The record starts under load at 3.")
 
-    def test_a_cell_that_was_not_full_at_rest_is_noticed_before_and_after_the_rest_is_cut_off(self, calibrator):
-        raw = load_nasa_discharges("B0005")[60]
-        low = Discharge(raw.time_s, raw.voltage_V - 0.2, raw.current_A)
-        for record in (low, low.loaded_part(2.7)):
-            estimate = calibrator().estimate(record)
-            assert not estimate.settled and estimate.reason.startswith("The record starts at rest at 4.00 V")
+    @pytest.mark.parametrize("prior", [(8000.0, 80.0), (4000.0, 40.0)])
+    def test_a_prior_far_off_is_not_settled_by_one(self, whole, calibrator, prior):
+        assert not calibrator(prior_q_mobile_C=prior).estimate(whole).settled
 
-    @pytest.mark.parametrize("soc", [0.9, 0.5])
-    def test_so_is_a_large_cell_that_rested_with_less_charge(self, calibrator, soc):
-        rest_and_load_A = np.append(np.zeros(300), np.full(40_000, 5.0))
-        raw = simulated(rest_and_load_A, 18_000.0, 0.03, initial=initial_state(18_000.0, soc=soc))
-        part = raw.loaded_part(2.8)
-        for record in (raw, part, part.averaged(5.0), part.until(part.time_s[-2])):
-            estimate = calibrator().estimate(record)
-            assert not estimate.settled and estimate.reason.startswith("The record starts at rest at ")
+    def test_a_prior_that_agrees_leaves_it_settled(self, calibrator):
+        assert calibrator(mismatch_V=0.02, prior_q_mobile_C=(6050.0, 60.0)).estimate(WHOLE).settled
 
-    @pytest.mark.parametrize("cell", ["B0005", "B0006"])
-    def test_every_recorded_discharge_starts_full_with_its_rest_and_a_fresh_one_without(self, cell):
-        for n, discharge in enumerate(load_nasa_discharges(cell)):
-            part = discharge.loaded_part(2.7)
-            for record in (discharge, part) if n else (discharge, part, cut(part, 1)):
-                assert start_reason(record.time_s, record.voltage_V, record.current_A, NEW_CELL) == ""
-
-    def test_a_loaded_part_knows_whether_the_cell_rested_before_it(self):
-        raw = load_nasa_discharges("B0005")[60]
-        part = raw.loaded_part(2.7)
-        for record in (part, part.until(1000.0), part.averaged(30.0), part.loaded_part(2.8)):
-            assert record.starts_at_rest
-        trickle = replace(raw, current_A=np.where(raw.current_A < 0.1, 0.1, raw.current_A))
-        for record in (raw, cut(part, 5), trickle.loaded_part(2.7)):
-            assert not record.starts_at_rest
-
-    def test_a_voltage_above_that_of_a_full_cell_is_not_one(self, calibrator):
-        whole = load_nasa_discharges("B0005")[60]
-        estimate = calibrator().estimate(replace(whole, voltage_V=whole.voltage_V + 0.15))
-        assert not estimate.settled and "above the 4.19 V of a full cell" in estimate.reason
-
-    def test_who_gives_the_first_state_is_not_asked(self):
+    def test_who_gives_the_first_state_is_not_asked_about_it(self):
         full = simulate(2.0, 6000.0, 0.15, load_unit="current", thermal=True)
         late = full.part(600, len(full.time_s))
         assert LeastSquares(thermal=True, initial=late.state[0]).estimate(late).settled
 
-
-class TestContradictions:
-    @pytest.mark.parametrize("prior", [(8000.0, 80.0), (4000.0, 40.0)])
-    def test_a_prior_far_off_is_not_settled_by_a_whole_discharge(self, whole, calibrator, prior):
-        assert not calibrator(prior_q_mobile_C=prior).estimate(whole).settled
-
-    @pytest.mark.parametrize(
-        ("arguments", "reason"),
-        [
-            ({"prior_q_mobile_C": (8000.0, 80.0)}, "The record falls to 2.80 V at 28"),
-            ({"prior_q_mobile_C": (5400.0, 20.0)}, "The prior of q_mobile contradicts what the record says."),
-            ({"r_o_bounds_ohm": (0.0, 0.14)}, "r_o is at a bound"),
-        ],
-    )
-    def test_what_contradicts_is_named(self, arguments, reason):
-        estimate = LeastSquares(thermal=True, mismatch_V=0.05, **arguments).estimate(simulated())
-        assert not estimate.settled and estimate.reason.startswith(reason)
-
-    @pytest.mark.parametrize("make", [LeastSquares, ExtendedKalmanFilter])
-    def test_a_prior_that_agrees_leaves_a_whole_discharge_settled(self, make):
-        estimate = make(thermal=True, mismatch_V=0.02, prior_q_mobile_C=(6050.0, 60.0)).estimate(simulated())
-        assert estimate.settled and estimate.reason == ""
-
-    def test_minutes_taken_for_seconds_make_no_cell(self, calibrator):
-        record = simulated()
-        estimate = calibrator().estimate(replace(record, time_s=record.time_s / 60.0))
-        assert not estimate.settled
-        if isinstance(calibrator(), LeastSquares):
-            assert estimate.reason.startswith("No cell of this kind has such a q_mobile. Check that time is in s")
-
-    @pytest.mark.parametrize("make", [LeastSquares, ExtendedKalmanFilter])
-    @pytest.mark.parametrize("cell", ["B0005", "B0006"])
-    def test_the_error_of_a_model_that_is_taken_for_exact_is_no_noise(self, cell, make):
-        record = load_nasa_discharges(cell)[60].loaded_part(2.7)
-        estimate = make(thermal=True).estimate(record)
-        assert estimate.sd_q_mobile < 0.02 * estimate.q_mobile  # what white residuals would tell
-        assert not estimate.settled and "larger mismatch_V" in estimate.reason
-
-    @pytest.mark.parametrize("name", ["filter", "filter, mismatch"])
-    def test_a_forgotten_reset_is_noticed(self, name):
-        record, filter_ = simulated(), CALIBRATORS[name]()
-        for voltage_V, current_A in [*zip(record.voltage_V, record.current_A, strict=True)] * 2:
-            estimate = filter_.update(voltage_V, current_A, dt_s=1.0)
-        assert not estimate.settled
-
-    @pytest.mark.parametrize("rest_s", [0, 40])
-    def test_a_pulse_of_charge_in_a_discharge_is_none(self, rest_s):
-        rest_A = np.zeros(rest_s)
-        cycle_A = np.concatenate([np.full(10, 4.0), rest_A, np.full(10, -3.0), rest_A, np.full(280, 2.0), np.zeros(300)])
-        self.check_settled(simulated(np.tile(cycle_A, 40), noise_V=1e-6))
-
-    def check_settled(self, record, q_mobile=6000.0, r_o=0.15):
-        cell = NEW_CELL.replace(q_mobile=q_mobile, r_o=r_o)
-        for estimator in (
-            LeastSquares(thermal=True, mismatch_V=0.01),
-            ExtendedKalmanFilter(cell=cell, thermal=True, mismatch_V=0.01),
-        ):
-            estimate = estimator.estimate(record)
-            assert estimate.settled and estimate.q_mobile == pytest.approx(q_mobile, rel=0.01)
+    def test_a_loaded_part_knows_whether_the_cell_rested_before_it(self):
+        part = REAL.loaded_part(2.7)
+        for record in (part, part.until(1000.0), part.averaged(30.0), part.loaded_part(2.8)):
+            assert record.starts_at_rest
+        trickle = replace(REAL, current_A=np.where(REAL.current_A < 0.1, 0.1, REAL.current_A))
+        for record in (REAL, trickle.loaded_part(2.7)):
+            assert not record.starts_at_rest
 
     @pytest.mark.parametrize("length", [30, 200])
     def test_a_current_that_drops_out_is_noticed(self, calibrator, length):
-        record = simulated()
-        current_A = record.current_A.copy()
-        current_A[1500 : 1500 + length] = 0.0
-        assert not calibrator().estimate(replace(record, current_A=current_A)).settled
+        gone = (WHOLE.time_s >= 1500.0) & (WHOLE.time_s < 1500.0 + length)
+        assert not calibrator().estimate(replace(WHOLE, current_A=np.where(gone, 0.0, WHOLE.current_A))).settled
 
     def test_one_wild_sample_is_forgiven_by_the_filter(self):
-        record = simulated()
-        voltage_V = record.voltage_V.copy()
-        voltage_V[1500] = 0.0
-        assert ExtendedKalmanFilter(thermal=True).estimate(replace(record, voltage_V=voltage_V)).settled
-
-    @pytest.mark.parametrize("rest_A", [0.0, 1e-6])
-    def test_the_current_that_a_sensor_shows_at_rest_is_none(self, rest_A):
-        record = simulated(rest_A + np.where(SECONDS[:20_000] % 60 < 30, 2.0, 0.0))
-        late_V = np.append(record.voltage_V[[0, 0]], record.voltage_V[:-2])
-        # the lowest voltage is at rest, and the record ends there
-        pulses = cut(replace(record, voltage_V=late_V), 0, len(late_V) // 60 * 60)
-        assert np.isclose(pulses.current_A[pulses.voltage_V.argmin()], rest_A, rtol=0.0, atol=1e-5)
-        estimate = LeastSquares(thermal=True, mismatch_V=0.02).estimate(pulses)
-        assert estimate.settled and estimate.q_mobile == pytest.approx(6000.0, rel=0.01)
-
-    @pytest.mark.parametrize(("q_mobile", "r_o", "load_A"), [(18_900.0, 0.02, 5.0), (6000.0, 0.04, 2.0)])
-    def test_a_small_resistance_is_no_failed_sensor_and_no_charge(self, q_mobile, r_o, load_A):
-        self.check_settled(simulated(np.where(SECONDS % 120 < 60, load_A, 0.2 * load_A), q_mobile, r_o), q_mobile, r_o)
-        self.check_settled(simulated(load_A, q_mobile, r_o), q_mobile, r_o)
-
-    def test_a_sensor_of_a_cell_of_small_resistance_is_still_watched(self):
-        record = stuck(simulated(np.where(SECONDS % 120 < 60, 5.0, 1.0), 18_900.0, 0.02), 1800.0, np.inf)
-        assert not LeastSquares(thermal=True, mismatch_V=0.01).estimate(record.until(2400.0)).settled
-
-    def test_a_stuck_current_shows_in_a_voltage_that_rises(self, calibrator):
-        record = simulated(np.where(SECONDS[:20_000] % 400 < 200, 2.0, 0.2))
-        stuck_A = np.where(record.time_s > 1300.0, 2.0, record.current_A)
-        estimate = calibrator(voltage_noise_V=1.0).estimate(replace(record, current_A=stuck_A))
-        assert estimate.reason.startswith("The voltage rises by 0.")
-
-    @pytest.mark.parametrize("r_o", [0.1, 0.15])
-    @pytest.mark.parametrize("length", [1, 3, 8])
-    def test_a_pulse_that_ends_before_the_voltage_has_followed_is_no_failed_sensor(self, length, r_o):
-        since = SECONDS - 100
-        record = simulated(np.where((since >= 0) & (since % 60 < length), 5.0, 1.0), r_o=r_o, noise_V=0.002)
-        for estimator in (LeastSquares(thermal=True), ExtendedKalmanFilter(thermal=True)):
-            estimate = estimator.estimate(record)
-            assert estimate.settled and estimate.q_mobile == pytest.approx(6000.0, rel=0.005)
-
-    @pytest.mark.parametrize("length", [20, 30])
-    def test_a_voltage_that_is_stuck_under_longer_ones_still_is(self, calibrator, length):
-        record = simulated(np.where(SECONDS % 60 < length, 5.0, 1.0), noise_V=0.002)
-        estimate = calibrator(voltage_noise_V=1.0).estimate(stuck(record, 605.0, np.inf).until(900.0))
-        assert estimate.reason.startswith("The current changes by -4.00 A at 6")
-
-    @pytest.mark.parametrize("make", [LeastSquares, ExtendedKalmanFilter])
-    def test_times_are_those_of_the_clock_of_the_record(self, make):
-        record = stuck(simulated(np.where(SECONDS < 100, 0.0, np.where(SECONDS % 200 < 100, 1.0, 3.0))), 1190.0, 1270.0)
-        estimate = make(thermal=True, mismatch_V=0.05).estimate(replace(record, time_s=record.time_s + 50_000.0))
-        assert estimate.reason == "The current changes by -2.00 A at 51200 s, and the voltage does not follow."
-
-
-class TestPrecision:
-    def test_half_a_discharge_does_not_tell_the_charge(self, whole):
-        for name in ("least squares", "filter, mismatch"):
-            estimate = CALIBRATORS[name]().estimate(cut(whole, 0, len(whole.time_s) // 2))
-            assert not estimate.settled and estimate.reason.startswith("q_mobile is not known to 2 % yet")
+        wild = replace(WHOLE, voltage_V=np.where(WHOLE.time_s == 1500.0, 0.0, WHOLE.voltage_V))
+        assert ExtendedKalmanFilter(thermal=True).estimate(wild).settled
 
     def test_beside_a_prior_it_is_said_what_the_record_lacks(self):
         record = load_nasa_discharges("B0006")[101].loaded_part(3.0)
         alone, carried = (CALIBRATORS["least squares"](**more) for more in ({}, {"prior_q_mobile_C": (5300.0, 50.0)}))
-        assert carried.estimate(record).reason == (
-            "q_mobile rests on its prior: the record alone does not determine it yet. "
-            f"Without it {alone.estimate(record).reason}"
-        )
+        assert carried.estimate(record).reason.endswith(f" Without it {alone.estimate(record).reason}")
 
-    def test_a_small_current_does_not_tell_the_resistance_and_that_is_the_reason(self):
-        estimate = LeastSquares(thermal=True, mismatch_V=0.05).estimate(simulated(0.5))
-        assert not estimate.settled and estimate.sd_q_mobile < 0.02 * estimate.q_mobile
-        assert estimate.reason.startswith("r_o is not known to 30 %") and "larger current" in estimate.reason
 
-    @pytest.mark.parametrize("name", ["least squares", "filter, mismatch"])
+class TestGaps:
+    """A charge that nobody saw is stated as a doubt, or noticed."""
+
+    @pytest.mark.parametrize(("at_s", "by_s"), [(400.0, 120.0), (400.0, 3600.0), (1700.0, 600.0)])
+    def test_a_clock_that_jumps_is_noticed(self, whole, calibrator, at_s, by_s):
+        estimate, right = calibrator().estimate(jumped(whole, at_s, by_s)), calibrator().estimate(whole)
+        assert not estimate.settled and estimate.sd_q_mobile > 0.9 * (estimate.q_mobile - right.q_mobile)
+        if by_s == 600.0:
+            assert estimate.reason.startswith(f"No sample lies between {whole.time_s[whole.time_s <= at_s][-1]:.0f} s and ")
+
     @pytest.mark.parametrize("cell", ["B0005", "B0006"])
-    def test_whole_discharges_settle(self, cell, name):
-        for record in load_nasa_discharges(cell)[::24]:
-            estimate = CALIBRATORS[name]().estimate(record.loaded_part(2.7))
-            assert estimate.settled and estimate.reason == ""
+    @pytest.mark.parametrize(("from_s", "length_s"), [(400.0, 600.0), (1700.0, 120.0)])
+    def test_rows_that_are_lost_under_load_do_no_harm(self, cell, calibrator, from_s, length_s):
+        whole = load_nasa_discharges(cell)[60].loaded_part(2.7)
+        estimate, right = calibrator().estimate(lost(whole, from_s, from_s + length_s)), calibrator().estimate(whole)
+        assert estimate.settled and estimate.q_mobile == pytest.approx(right.q_mobile, rel=0.01)
 
+    @pytest.mark.parametrize(("every_s", "pause_s"), [(1, 300), (20, 600), (60, 600)])
+    def test_a_pause_that_was_not_logged_is_noticed(self, calibrator, every_s, pause_s):
+        record = discharged(np.concatenate([np.full(1500, 2.0), np.zeros(pause_s), np.full(40_000, 2.0)]), noise_V=0.003)
+        time_s, end_s = record.time_s, 1500.0 + pause_s
+        kept = ((time_s < 1500.0) & (time_s % every_s == 0)) | ((time_s > end_s) & ((time_s - end_s) % every_s == 0))
+        estimate = calibrator().estimate(changed(record, kept))
+        assert not estimate.settled and estimate.sd_q_mobile > 0.9 * (estimate.q_mobile - 6000.0)
+
+    @pytest.mark.parametrize("every_s", [1, 10])
+    def test_pauses_that_are_never_logged_are_no_habit_of_a_logger(self, calibrator, every_s):
+        record = discharged(pulsed(300, 600, 2.0, 0.0), noise_V=0.001)
+        # the first row after a pause has not seen the load yet
+        logged = (record.current_A > 0.0) & ((record.time_s % 600 > 0.0) | (record.time_s == 0.0))
+        estimate = calibrator().estimate(changed(record, logged & (record.time_s % every_s == 0)))
+        assert not estimate.settled and estimate.sd_q_mobile > 0.9 * (estimate.q_mobile - 6000.0) > 4000.0
+
+    def test_the_clock_of_a_logger_that_writes_changes_may_jump_all_the_same(self, calibrator):
+        estimate = calibrator().estimate(jumped(SOUND["a logger that writes changes"], 1500.0, 300.0))
+        assert not estimate.settled and estimate.reason.startswith("No sample lies between 1")
+
+    def test_a_charge_in_doubt_widens_the_estimate_by_as_much(self, calibrator):
+        estimate = calibrator().estimate(VERDICTS["noise hides whether it was drawn"][1])
+        assert 2.0 * 80.0 < estimate.sd_q_mobile < 2.0 * 80.0 + 100.0
+
+
+class TestPrecision:
     def test_the_gain_of_the_current_sensor_is_covered_where_it_is_stated(self, calibrator):
-        record = simulated()
         for gain in (0.97, 1.03):
-            seen = replace(record, current_A=gain * record.current_A)
+            seen = replace(WHOLE, current_A=gain * WHOLE.current_A)
             stated, unstated = calibrator(current_gain_sd=0.015).estimate(seen), calibrator().estimate(seen)
             assert stated.q_mobile == unstated.q_mobile == pytest.approx(gain * 6000.0, rel=0.005)
             assert abs(stated.q_mobile - 6000.0) < 3.0 * stated.sd_q_mobile
             assert stated.sd_r_o == pytest.approx(np.hypot(unstated.sd_r_o, 0.015 * stated.r_o))
 
-    @pytest.mark.parametrize(("cell", "index"), [("B0005", 80), ("B0006", 85), ("B0006", 160)])
+    @pytest.mark.parametrize(("cell", "index"), [("B0005", 80), ("B0006", 160)])
     def test_the_filter_states_what_the_error_of_its_model_leaves_open(self, cell, index):
         record = load_nasa_discharges(cell)[index].loaded_part(2.7)
-        filtered, fitted = (CALIBRATORS[name]().estimate(record) for name in ("filter, mismatch", "least squares"))
+        filtered, fitted = (CALIBRATORS[name]().estimate(record) for name in ("filter", "least squares"))
         assert abs(filtered.q_mobile - fitted.q_mobile) < 1.5 * filtered.sd_q_mobile
         assert filtered.settled and 0.005 < filtered.sd_q_mobile / filtered.q_mobile < 0.011
 
     @pytest.mark.parametrize("factor", [0.8, 1.2])
     @pytest.mark.parametrize("every", [1, 10])
     def test_so_does_it_where_a_constant_is_wrong_however_many_samples_there_are(self, factor, every):
-        record = simulated(cell=NEW_CELL.replace(tDiffusion=factor * NEW_CELL.tDiffusion))
-        seen = Discharge(*(column[::every] for column in (record.time_s, record.voltage_V, record.current_A)))
-        estimate = CALIBRATORS["filter, mismatch"]().estimate(seen)
+        record = discharged(cell=NEW_CELL.replace(tDiffusion=factor * NEW_CELL.tDiffusion))
+        estimate = CALIBRATORS["filter"]().estimate(changed(record, slice(None, None, every), rested=False))
         assert 0.0 < abs(estimate.q_mobile - 6000.0) < 2.0 * estimate.sd_q_mobile < 0.03 * 6000.0
 
 
 class TestForecasts:
-    truth, model = Estimate(6500.0, 0.12), RecordModel(thermal=True)
+    ages, model = (6500.0, 0.12), RecordModel(thermal=True)
+    truth = Estimate(*ages)
 
-    @pytest.mark.parametrize("low_A", [0.0, 0.5])
-    @pytest.mark.parametrize("period", [60, 300])
+    @pytest.mark.parametrize(("low_A", "period"), [(0.0, 60), (0.5, 300)])
     def test_pulses_go_on_at_their_mean_whatever_the_last_current(self, low_A, period):
-        current_A = np.where(SECONDS % period < period // 2, 3.0, low_A)
-        record = simulated(current_A, *(self.truth.q_mobile, self.truth.r_o), noise_V=1e-6)
+        record = discharged(pulsed(period // 2, period, 3.0, low_A), *self.ages, noise_V=1e-6)
         half, errors = len(record.time_s) // 2, []
         for stop in range(half, half + period, period // 4):
-            seen = cut(record, 0, stop)
+            seen = changed(record, slice(stop))
             assert expected_current(seen.time_s, seen.current_A).varied
             errors.append(self.model.forecast(seen, self.truth, 2.8).eod_time_s / record.time_s[-1] - 1.0)
         assert 0.0 < np.mean(errors) < 0.1  # under pulses the cut-off is reached earlier than under their mean
         assert np.max(errors) < 0.15
 
     def test_a_future_current_takes_the_place_of_the_assumption(self):
-        record = simulated(np.where(SECONDS < 1000, 3.0, 1.0), 6500.0, 0.12, noise_V=1e-6)
-        assert self.model.forecast(cut(record, 0, 900), self.truth, 2.8).eod_time_s < 0.6 * record.time_s[-1]
-        known = self.model.forecast(cut(record, 0, 1001), self.truth, 2.8, future_current_A=1.0)
+        record = discharged(np.where(SECONDS < 1000, 3.0, 1.0), *self.ages, noise_V=1e-6)
+        assert self.model.forecast(changed(record, slice(900)), self.truth, 2.8).eod_time_s < 0.6 * record.time_s[-1]
+        known = self.model.forecast(changed(record, slice(1001)), self.truth, 2.8, future_current_A=1.0)
         assert known.eod_time_s == pytest.approx(record.time_s[-1], abs=2.0)
         with pytest.raises(ValueError, match="future_current_A must be finite and at least 0 A, got nan"):
             self.model.forecast(record, self.truth, future_current_A=np.nan)

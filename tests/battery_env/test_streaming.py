@@ -1,6 +1,5 @@
 """Streams: sample by sample, with gaps and rests, stopped and resumed, one cell and many, of filters and policies."""
 
-from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -10,9 +9,8 @@ from hypothesis import strategies as st
 
 from battery_env import ExtendedKalmanFilter, PolicyEstimator, soc_from_rest
 from battery_env.cells import Discharge
-from battery_env.electrochemistry import NEW_CELL, STATE_SIZE, initial_state, simulate
-from battery_env.estimators.base import ModelNow, OnlineEstimator
-from battery_env.loads import Cycle, Load
+from battery_env.electrochemistry import initial_state, simulate
+from battery_env.estimators.base import OnlineEstimator
 from battery_env.records import Stream, are_plausible, check_sample
 
 NOISE_V = 0.005
@@ -71,32 +69,9 @@ class TestSamples:
         assert estimate.settled and abs(estimate.q_mobile - 6000.0) < 3.0 * estimate.sd_q_mobile
         assert abs(estimate.r_o - 0.15) < 3.0 * estimate.sd_r_o
 
-    def test_without_voltages_nothing_is_learned(self):
-        filter_ = ExtendedKalmanFilter(thermal=True)
-        first = filter_.update(4.19, 2.0, 0.0)
-        for _ in range(600):
-            last = filter_.update(np.nan, 2.0, 1.0)
-        assert last.q_mobile == pytest.approx(first.q_mobile, rel=0.01) and last.sd_q_mobile >= first.sd_q_mobile
-        assert not last.settled and filter_.soc == pytest.approx(1.0 - 1200.0 / last.q_mobile, abs=1e-6)
-
     def test_the_first_voltage_may_not_be_missing(self, make):
         with pytest.raises(ValueError, match=r"voltage_V must be finite, got nan. .*tells whether the cell is full"):
             make().update(np.nan, 2.0, 0.0)
-
-    @settings(max_examples=8, deadline=None, derandomize=True, database=None)
-    @given(st.integers(0, 1000))
-    def test_irregular_samples_give_the_same_answer(self, seed):
-        rng = np.random.default_rng(seed)
-        whole = measured(np.repeat(rng.uniform(1.0, 3.0, 400), 60), seed=seed)
-        kept = np.unique(np.append(0, np.cumsum(rng.integers(1, 20, len(whole.time_s)))))
-        kept = kept[kept < len(whole.time_s)]
-        drawn_C = np.append(0.0, np.cumsum(whole.current_A))[kept]
-        dt_s = np.diff(whole.time_s[kept])
-        filter_ = ExtendedKalmanFilter(thermal=True, current_gain_sd=0.001)
-        current_A = np.append(np.diff(drawn_C) / dt_s, whole.current_A[-1])
-        for sample in zip(whole.voltage_V[kept], current_A, np.append(0.0, dt_s), strict=True):
-            estimate = filter_.update(*sample)
-        assert not estimate.settled or abs(estimate.q_mobile - 6000.0) < max(3.0 * estimate.sd_q_mobile, 30.0)
 
     def test_a_week_of_rest_is_one_sample_and_a_gap_under_load_is_refused(self, make):
         estimator = make()
@@ -109,12 +84,6 @@ class TestSamples:
         assert (1.0 - estimator.soc) * estimator.now().parameters[0] == pytest.approx(2.0 * 660.0)
         with pytest.raises(ValueError, match=r"within 0.001 .. 604800 s"):
             estimator.update(4.0, 0.0, 700_000.0)
-
-    def test_a_rest_within_a_discharge_is_modelled(self):
-        load_A = np.full(20_000, 2.0)
-        load_A[900:2700] = 0.0
-        estimate = follow(ExtendedKalmanFilter(thermal=True), measured(load_A))
-        assert estimate.settled and abs(estimate.q_mobile - 6000.0) < 3.0 * estimate.sd_q_mobile
 
     def test_charge_that_flows_back_is_modelled_and_an_overcharge_is_refused(self):
         load_A = np.where(np.arange(20_000) % 300 < 200, 2.5, -1.0)
@@ -169,24 +138,6 @@ class TestSamples:
 
 
 class TestTemperature:
-    def test_it_is_that_of_the_model(self):
-        cold = replace(NEW_CELL, Tb0=NEW_CELL.Tb0 - 15.0)
-        record = measured(cell=cold, thermal=False, noise_V=0.001)
-        told = follow(ExtendedKalmanFilter(voltage_noise_V=0.001), record, temperature_C=cold.Tb0 - 273.15)
-        known = follow(ExtendedKalmanFilter(voltage_noise_V=0.001, cell=cold), record)
-        blind = follow(ExtendedKalmanFilter(voltage_noise_V=0.001), record)
-        assert (told.q_mobile, told.r_o) == pytest.approx((known.q_mobile, known.r_o), rel=1e-9)
-        assert abs(told.r_o - 0.15) < abs(blind.r_o - 0.15)
-
-    def test_later_ones_move_it(self):
-        filter_ = ExtendedKalmanFilter(thermal=True)
-        filter_.update(4.19, 2.0, 0.0, 20.0)
-        assert filter_.now().state[0] == pytest.approx(293.15)
-        filter_.update(4.0, 2.0, 10.0, 31.0)
-        assert filter_.now().state[0] == pytest.approx(304.15)
-        filter_.update(3.99, 0.0, 1.0)
-        assert 303.0 < filter_.now().state[0] < 304.2
-        assert filter_.now().cell.Tb0 == pytest.approx(293.15)
 
     def test_a_record_is_taken_with_its_temperature(self, whole):
         part = whole.part(0, 900)
@@ -217,11 +168,6 @@ class TestStart:
         assert known.settled and known.sd_q_mobile < told.sd_q_mobile
         assert not full.settled and full.reason.startswith("The record starts at rest at")
 
-    def test_a_start_that_is_stated_wrongly_is_noticed(self):
-        record = measured(initial=initial_state(6000.0, soc=0.7))
-        estimate = ExtendedKalmanFilter(thermal=True, initial_soc=0.85).estimate(record)
-        assert not estimate.settled and "where a cell with 85% of its charge shows" in estimate.reason
-
     def test_a_stated_doubt_widens_the_estimate(self, whole):
         sure, doubtful = (ExtendedKalmanFilter(thermal=True, initial_soc=soc).estimate(whole) for soc in (1.0, (1.0, 0.01)))
         assert doubtful.q_mobile == sure.q_mobile
@@ -240,32 +186,6 @@ class TestModel:
         assert filter_.remaining(1.0).time_s > 1.9 * left.time_s
         assert filter_.remaining(8.0, load_unit="power").time_s < left.time_s
         assert filter_.remaining(0.0).time_s == np.inf
-
-    def test_the_time_left_is_told_before_the_load_has_shown_the_resistance(self):
-        for rest_s, load_A in ((0, 2.0), (60, 2.0)):
-            filter_ = ExtendedKalmanFilter(thermal=True, mismatch_V=0.05)
-            record = measured(np.append(np.zeros(rest_s), np.full(60, load_A)), noise_V=0.0)
-            unsure = 0
-            for voltage_V, current_A in zip(record.voltage_V.tolist(), record.current_A.tolist(), strict=True):
-                estimate = filter_.update(voltage_V, current_A, 1.0)
-                unsure += estimate.sd_r_o > estimate.r_o
-                left = filter_.remaining(2.0, cut_off_V=2.7)
-                assert 2000.0 < left.time_s < 5000.0 and 500.0 < left.sd_s < 2000.0
-            assert unsure
-
-    @pytest.mark.parametrize("sd_ohm", [0.02, 0.5])
-    def test_a_deviation_beyond_what_a_cell_can_be_counts_as_far_as_it_can(self, sd_ohm):
-        class AtHand(Bare):
-            def now(self):
-                by_r_o = np.zeros((1, STATE_SIZE + 3))
-                by_r_o[0, STATE_SIZE + 1] = sd_ohm
-                return ModelNow(NEW_CELL, True, 1.0, initial_state(6000.0), np.array([6000.0, 0.1, 0.0]), by_r_o)
-
-        ends_ohm = max(0.1 - sd_ohm, 0.0), 0.1 + sd_ohm
-        late_s, early_s = (measured(1.0, r_o=r_o).eod_time_s for r_o in ends_ohm)
-        assert AtHand().remaining(1.0).sd_s == pytest.approx(
-            sd_ohm * (late_s - early_s) / (ends_ohm[1] - ends_ohm[0]), abs=2.0
-        )
 
     def test_a_charge_never_ends_at_the_cut_off(self, whole):
         filter_ = ExtendedKalmanFilter(thermal=True)
@@ -289,18 +209,6 @@ class TestModel:
             filter_.remaining(np.full(600, 2.0))
         # a day of rest is none
         assert filter_.remaining(np.zeros(86_401)).time_s == np.inf
-
-    def test_pulses_shorter_than_a_step_draw_what_they_do(self, whole):
-        filter_ = ExtendedKalmanFilter(thermal=True)
-        follow(filter_, whole.part(0, 600))
-        pulses = Cycle(Load([0.0, 0.25, 0.75], [1.0, 10.0, 1.0], "current"), 5.0)
-        assert filter_.remaining(pulses).time_s == pytest.approx(filter_.remaining(1.9).time_s, rel=0.02)
-
-    def test_of_a_policy(self, whole):
-        estimator, half = policy_estimator(), len(whole.time_s) // 2
-        estimate = follow(estimator, whole.part(0, half))
-        assert estimator.soc == pytest.approx(1.0 - 2.0 * (half - 1) / estimate.q_mobile)
-        assert 0.0 < estimator.remaining(2.0).time_s < np.inf and np.isnan(estimator.remaining(2.0).sd_s)
 
     def test_who_has_none_says_so(self):
         with pytest.raises(NotImplementedError, match="Bare has no model"):
@@ -353,13 +261,6 @@ class TestFiles:
 
 
 class TestBatch:
-    def test_a_copy_of_a_filter_goes_its_own_way(self, whole):
-        one = ExtendedKalmanFilter(thermal=True)
-        follow(one, whole.part(0, 130))
-        soc, other = one.soc, copy(one)
-        assert other.update(3.9, 2.0, 1.0) == copy(one).update(3.9, 2.0, 1.0)
-        other.reset()
-        assert one.soc == soc < other.soc == 1.0
 
     def test_cells_do_not_know_of_each_other(self, make, whole, tmp_path):
         records = [whole, measured(1.5, 5000.0, 0.2)]
@@ -402,18 +303,6 @@ class TestBatch:
         np.testing.assert_array_equal(found.q_mobile, [each.q_mobile for each in expected])
         assert [each.soc for each in batch.estimators] == [each.soc for each in alone]
         assert [repr(each) for each in found[:2]] == [repr(each) for each in expected[:2]]
-
-    def test_the_temperature_may_be_missing_of_some_cells_of_a_batch(self):
-        filter_ = ExtendedKalmanFilter(thermal=True)
-        batch, alone = filter_.batch(3), [ExtendedKalmanFilter(thermal=True) for _ in range(3)]
-        for degrees_C in ([25.0, None, 26.0], [25.1, None, None], [None, 24.0, 26.2]):
-            found = batch.update(4.15, 2.0, 1.0, degrees_C)
-            expected = [one.update(4.15, 2.0, 1.0, each) for one, each in zip(alone, degrees_C, strict=True)]
-            assert [repr(each) for each in found] == [repr(each) for each in expected]
-        with pytest.raises(ValueError, match=r"^cell 1: temperature_C must be finite, got nan"):
-            batch.update(4.15, 2.0, 1.0, [None, np.nan, 26.0])
-        with pytest.raises(ValueError, match=r"^cell 0: current_A must lie within"):
-            batch.update(4.15, [2000.0, 2.0, 2.0], 1.0, [None, 24.0, 26.0])
 
     @settings(max_examples=60, deadline=None, derandomize=True, database=None)
     @given(

@@ -6,9 +6,7 @@ import pickle
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode
-from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from battery_env.calibration.task import CalibrationTask
 from battery_env.loads import RandomPiecewise
@@ -72,13 +70,6 @@ def test_a_batch_makes_the_episodes_of_scalar_environments_to_the_bit(env_id, op
             step[3][:] = False  # what was returned is the caller's
 
 
-def test_row_n_has_the_generator_of_seed_plus_n(discharges):
-    batch = gym.make_vec("BatteryQmax-v0", num_envs=4, dataset=discharges)
-    batch.reset(seed=10)
-    drawn = [np_random(10 + n)[0].integers(len(discharges)) for n in range(4)]
-    np.testing.assert_array_equal(batch.unwrapped.task.now["trajectory"], drawn)
-
-
 def test_the_mode_is_gymnasiums_default_and_its_reset_step_ignores_the_action(discharges):
     episodes = []
     for action in (-1.0, 1.0):
@@ -119,19 +110,6 @@ def test_environments_can_be_copied_and_pickled_within_episodes(discharges):
         expected = batch.step(np.full((3, 2), 0.3))[0]
         for twin in twins:
             np.testing.assert_array_equal(twin.step(np.full((3, 2), 0.3))[0], expected)
-
-
-def test_worker_processes_make_the_same_episodes(discharges):
-    def make():
-        return gym.make("BatteryQmax-v0", dataset=discharges, episode_steps=3)
-
-    workers = SubprocVecEnv([make, make], start_method="fork")
-    batch = gym.make_vec("BatteryQmax-v0", num_envs=2, autoreset_mode="SameStep", dataset=discharges, episode_steps=3)
-    workers.seed(4)
-    np.testing.assert_array_equal(workers.reset(), batch.reset(seed=4)[0])
-    for _ in range(4):
-        np.testing.assert_array_equal(workers.step(np.zeros((2, 1)))[0], batch.step(np.zeros((2, 1)))[0])
-    workers.close()
 
 
 def test_pictures_of_all_cells(discharges):
