@@ -34,8 +34,8 @@ _RECENT_SHARE = 0.1
 #: It drifts with this constant, as a share of ``q_mobile``: the model is wrong in another way at another charge. That is how
 #: fast the residuals of whole discharges of B0005 lose their correlation.
 _MEMORY_SHARE = 0.15
-# No discharge is followed for longer than a day, s. A load is laid out for so many steps first, as most end within them.
-_LONGEST_S, _FIRST_STEPS = 86_400.0, 4096
+# No discharge is followed for longer than a day, s. Cells that have ended are left out every so many steps.
+_LONGEST_S, _CHUNK_STEPS = 86_400.0, 512
 # The course of the voltage is kept about this often, s.
 _COURSE_S = 10.0
 # The last voltage of a record may be the cut-off but for rounding, V.
@@ -384,6 +384,12 @@ class _Cells(NamedTuple):
     def part(self, chosen: IntArray) -> _Cells:
         return _Cells(*(column[chosen] for column in self))
 
+    def error_after(self, drawn_share: FloatArray, mismatch_V: float) -> FloatArray:
+        """What is to be added after a share of ``q_mobile`` was drawn, shape (..., cells)."""
+        # what the last voltages showed stays, as an error of r_o would; what the error is beside that changes
+        memory = np.exp(-np.maximum(drawn_share, 0.0) / _MEMORY_SHARE)
+        return self.error_V + mismatch_V * self.drift * np.sqrt(1.0 - memory**2)
+
     @property
     def soc(self) -> FloatArray:
         return state_of_charge(self.state, self.q_mobile)
@@ -401,38 +407,16 @@ def _at_the_end_of(
     steps, count = len(current_A) - 1, len(parameters[0])
     measured_V = np.interp(record.time_s[0] + model.dt_s * np.arange(steps + 1), record.time_s, record.voltage_V)
     last = slice(min(int((1.0 - _RECENT_SHARE) * steps), steps - 1) + 1, None)
-    state, recent_V = model.start(parameters[0]), np.empty(count)
-    voltage_V = np.full(count, np.nan)
-    for n, (q_mobile, r_o) in enumerate(zip(*parameters, strict=True)):
-        run = model.run_down(state[n], current_A, q_mobile, r_o)
-        state[n] = run.state[-1]
-        if len(run.voltage_V) == steps + 1:
-            voltage_V[n], recent_V[n] = run.voltage_V[-1], (measured_V[last] - run.voltage_V[last]).mean()
+    state = model.start(parameters[0])
+    model.advance(state, current_A[: last.start], *parameters)
+    run_V, _ = model.run_on(state, current_A[None, last.start : -1], *parameters, "current")
+    voltage_V, recent_V = run_V[-1], np.mean(measured_V[last, None] - run_V, axis=0)
     # the voltage measured is noisy
     samples = max(int((record.time_s >= record.time_s[-1] - _RECENT_SHARE * np.ptp(record.time_s)).sum()), 1)
     variance_V2, of_noise_V2 = mismatch_V**2, white_noise_V(record.voltage_V) ** 2 / samples
     share = variance_V2 / (variance_V2 + of_noise_V2) if variance_V2 > 0.0 else 0.0
     draws = rng.standard_normal((2, count))
     return _Cells(*parameters, state, voltage_V, share * recent_V + mismatch_V * np.sqrt(1.0 - share) * draws[0], draws[1])
-
-
-class _Profile:
-    """A load laid out in steps, as far as it was asked for."""
-
-    def __init__(self, load: _Known, dt_s: float) -> None:
-        self.unit, self._load, self._dt_s = load.unit, in_steps(load, dt_s), dt_s
-        self._values = np.empty(0)
-
-    def first(self, steps: int) -> FloatArray:
-        if steps > len(self._values):
-            self._values = self._load(self._dt_s * np.arange(steps, dtype=np.float64))
-        return self._values[:steps]
-
-
-class _Run(NamedTuple):
-    time_s: float  # of its end, infinite if it does not end
-    soc: float  # then; NaN likewise
-    voltage_V: FloatArray  # at each step before
 
 
 class _Ends(NamedTuple):
@@ -442,51 +426,43 @@ class _Ends(NamedTuple):
     course_V: FloatArray  # quantiles of all cells
 
 
-def _run(model: RecordModel, cells: _Cells, n: int, load: _Profile, mismatch_V: float, cut_off_V: float, steps: int) -> _Run:
-    """Take one cell down to the cut-off, or through so many steps."""
-    q_mobile, r_o, first_soc = float(cells.q_mobile[n]), float(cells.r_o[n]), float(cells.soc[n])
-    error_V, change_V = float(cells.error_V[n]), mismatch_V * float(cells.drift[n])
-    # the error drifts from the one to the sum of both
-    lowest_V, horizon = cut_off_V - error_V - max(change_V, 0.0) - _ROUNDING_V, min(_FIRST_STEPS, steps)
-    run = model.run_down(cells.state[n], load.first(horizon), q_mobile, r_o, load.unit, lowest_V)
-    while len(run.current_A) == horizon < steps:
-        horizon = min(4 * horizon, steps)
-        run = model.run_down(cells.state[n], load.first(horizon), q_mobile, r_o, load.unit, lowest_V)
-    drawn_share = np.append(0.0, np.cumsum(run.current_A))[: len(run.voltage_V)] * model.dt_s / q_mobile
-    # what the last voltages showed stays, as an error of r_o would; what the error is beside that changes
-    memory = np.exp(-np.maximum(drawn_share, 0.0) / _MEMORY_SHARE)
-    voltage_V = run.voltage_V + error_V + change_V * np.sqrt(1.0 - memory**2)
-    time_s = model.dt_s * np.arange(len(voltage_V), dtype=np.float64)
-    end_s = reached_s(time_s, voltage_V, cut_off_V)
-    ended = np.isfinite(end_s)
-    before = int(np.searchsorted(time_s, end_s)) if ended else len(voltage_V)
-    full = np.flatnonzero(is_overfull(first_soc - drawn_share[: before + 1], np.float64(first_soc)))
-    if len(full):
-        raise overfull_error(time_s[full[0]])
-    if not ended:
-        return _Run(np.inf, np.nan, voltage_V)
-    return _Run(end_s, first_soc - float(np.interp(end_s, time_s, drawn_share)), voltage_V[:before])
-
-
 def _discharge(model: RecordModel, cells: _Cells, loads: list[_Known], mismatch_V: float, cut_off_V: float) -> _Ends:
-    """Take cells down to the cut-off; ``loads``: one for all, or one a cell."""
-    dt_s, count = model.dt_s, len(cells.q_mobile)
+    """Take cells down to the cut-off, side by side; ``loads``: one for all, or one a cell."""
+    dt_s, count, first_soc = model.dt_s, len(cells.q_mobile), cells.soc
     steps, every = int(_LONGEST_S / dt_s + 1e-9), max(round(_COURSE_S / dt_s), 1)
-    profiles = [_Profile(load, dt_s) for load in loads]
     # cells whose load is off for ever are followed no longer than the others
     is_off = np.broadcast_to([isinstance(load, Load) and not (load.value > 0.0).any() for load in loads], count)
-    time_s, soc = np.full(count, np.inf), np.full(count, np.nan)
-    shown: dict[int, tuple[FloatArray, float]] = {}
-    last = 0
-    for n in sorted(range(count), key=is_off.__getitem__):
-        run = _run(model, cells, n, profiles[n % len(profiles)], mismatch_V, cut_off_V, (last if is_off[n] else steps) + 1)
-        time_s[n], soc[n] = run.time_s, run.soc
-        ended = np.isfinite(run.time_s)
-        if not is_off[n]:
-            last = max(last, len(run.voltage_V) if ended else steps)
-        shown[n] = run.voltage_V[::every], cut_off_V if ended else float(run.voltage_V[-1])
-    course = np.unique(np.append(np.arange(0, last + 1, every), last))
-    voltage_V = np.full((count, len(course)), cut_off_V)
-    for n, (kept_V, last_V) in shown.items():
-        voltage_V[n, : len(kept_V)], voltage_V[n, -1] = kept_V, last_V
-    return _Ends(time_s, soc, dt_s * course, _quantile(voltage_V, BAND))
+    time_s, end_soc = np.full(count, np.inf), np.full(count, np.nan)
+    course: list[tuple[FloatArray, FloatArray]] = []
+    going, state, drawn_A = np.arange(count), cells.state.copy(), np.zeros((1, count))
+    for first in range(0, steps, _CHUNK_STEPS):
+        now, size = cells.part(going), min(_CHUNK_STEPS, steps - first)
+        grid_s = dt_s * np.arange(first, first + size + 1, dtype=np.float64)
+        to_come = np.array([in_steps(loads[n], dt_s)(grid_s[:-1]) for n in (going if len(loads) > 1 else [0])])
+        voltage_V, current_A = model.run_on(state, to_come, now.q_mobile, now.r_o, loads[0].unit)
+        drawn_A = np.cumsum(np.vstack([drawn_A[-1], current_A]), axis=0)
+        soc = first_soc[going] - drawn_A * dt_s / now.q_mobile
+        voltage_V += now.error_after(first_soc[going] - soc, mismatch_V)
+        # the row of each cell's end, and the last one to look at: beyond the chunk where it is not reached
+        below = ~(voltage_V > cut_off_V)
+        end = np.where(below.any(axis=0), below.argmax(axis=0), size + 1)
+        last = int(end[~is_off[going]].max(initial=0))
+        is_over, last = last <= size or first + size == steps, min(last, size)
+        rows = np.arange(last + 1)[:, None]
+        overfull = is_overfull(soc[: last + 1], first_soc[going]) & (rows <= end)
+        if overfull.any():
+            raise overfull_error(grid_s[overfull.any(axis=1).argmax()])
+        for n in np.flatnonzero(end <= last):
+            around = slice(max(end[n] - 1, 0), end[n] + 1)
+            time_s[going[n]] = reached_s(grid_s[around], voltage_V[around, n], cut_off_V)
+            end_soc[going[n]] = np.interp(time_s[going[n]], grid_s[around], soc[around, n])
+        shown = [row for row in range(last + 1) if (row < size and (first + row) % every == 0) or (is_over and row == last)]
+        shown_V = np.full((count, len(shown)), cut_off_V)
+        shown_V[going] = np.where(rows[shown] < end, voltage_V[shown], cut_off_V).T
+        course.append((grid_s[shown], _quantile(shown_V, BAND)))
+        if is_over:
+            break
+        left = end > size
+        going, state, drawn_A = going[left], state[left], drawn_A[-1:, left]
+    course_s, course_V = zip(*course, strict=True)
+    return _Ends(time_s, end_soc, np.concatenate(course_s), np.concatenate(course_V, axis=1))

@@ -18,13 +18,13 @@ from battery_env.electrochemistry import (
     QNB,
     STATE_SIZE,
     CellParameters,
-    RunDown,
     Trajectory,
+    advance_in_place,
     check_cell,
     check_dt,
     initial_state,
     rest_shares,
-    run_down,
+    run_on_in_place,
     simulate,
 )
 from battery_env.electrochemistry.tangents import (
@@ -222,18 +222,16 @@ class RecordModel:
             max_duration_s=len(current_A) * self.dt_s,
         )
 
-    def run_down(
-        self,
-        state: FloatArray,
-        load: FloatArray,
-        q_mobile: float,
-        r_o: float,
-        load_unit: LoadUnit = "current",
-        cut_off_V: float = -np.inf,
-    ) -> RunDown:
-        """Run the model on from a state under a load, down to a cut-off; unchecked, for inner loops."""
-        packed = self.cell.packed
-        return run_down(state, load, q_mobile, r_o, self.dt_s, load_unit, self.thermal, packed, cut_off_V)
+    def advance(self, state: FloatArray, current_A: FloatArray, q_mobile: FloatArray, r_o: FloatArray) -> None:
+        """Take cells through a current, shape (K,), in place; unchecked, for inner loops."""
+        first, steps = np.zeros(len(state), dtype=np.int64), np.full(len(state), len(current_A))
+        advance_in_place(state, current_A, first, steps, q_mobile, r_o, self.dt_s, "current", self.thermal, self.cell.packed)
+
+    def run_on(
+        self, state: FloatArray, load: FloatArray, q_mobile: FloatArray, r_o: FloatArray, load_unit: LoadUnit
+    ) -> tuple[FloatArray, FloatArray]:
+        """Take cells on from their states, in place, as :func:`~battery_env.electrochemistry.run_on_in_place`."""
+        return run_on_in_place(state, load, q_mobile, r_o, self.dt_s, load_unit, self.thermal, self.cell.packed)
 
     def voltage(self, record: Record, at: Estimate) -> FloatArray:
         """

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from numbers import Real
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,7 +24,7 @@ from battery_env.electrochemistry.cell import (
     check_dt,
     rest_shares,
 )
-from battery_env.electrochemistry.kernels import advance_batch, roll_out, step_batch, voltage_batch
+from battery_env.electrochemistry.kernels import advance_batch, roll_out, run_on_batch, step_batch, voltage_batch
 from battery_env.parameters import Q_MOBILE, R_O
 
 _MAX_STEPS = 1e8  # of one simulation, in memory
@@ -199,37 +199,34 @@ def reached_s(time_s: FloatArray, voltage_V: FloatArray, level_V: float, for_goo
     return float(np.interp(level_V, voltage_V[[n, n - 1]], time_s[[n, n - 1]]))
 
 
-class RunDown(NamedTuple):
-    """
-    A discharge of n steps, see :func:`run_down`.
-
-    :param voltage_V: before each step and, if the cut-off is reached, after the last one, shape (n,) or (n + 1,); that one is
-        at or below the cut-off, or NaN of an empty cell
-    :param current_A: over each step, shape (n,)
-    :param state: likewise, shape (n,) or (n + 1, 8)
-    """
-
-    voltage_V: FloatArray
-    current_A: FloatArray
-    state: FloatArray
-
-
-def run_down(
+def run_on_in_place(
     state: FloatArray,
     load: FloatArray,
-    q_mobile: float,
-    r_o: float,
+    q_mobile: FloatArray,
+    r_o: FloatArray,
     dt: float,
     load_unit: LoadUnit,
     thermal: bool,
     packed: PackedConstants,
-    cut_off_V: float,
-) -> RunDown:
-    """:func:`simulate` for inner loops: no checks, and with the sample at which the discharge ends."""
-    states, columns = np.empty((len(load) + 1, STATE_SIZE)), np.empty((2, len(load)))
-    states[0] = state
-    steps = roll_out(load, q_mobile, r_o, dt, cut_off_V, load_unit == "power", thermal, packed, states, columns)
-    return RunDown(columns[0, : steps + 1], columns[1, :steps], states[: steps + 1][: len(load)])
+) -> tuple[FloatArray, FloatArray]:
+    """
+    Take every cell through a load of its own, or all through one; unchecked, like :func:`step_into`.
+
+    :param state: shape (n, 8), overwritten by the states after the last step
+    :param load: over each step, W or A, shape (n, K) or (1, K)
+    :param q_mobile: charge that can move, C, shape (n,)
+    :param r_o: ohmic resistance, ohm, shape (n,)
+    :param dt: time step, s
+    :param load_unit: ``"power"`` or ``"current"``
+    :param thermal: whether the temperature moves
+    :param packed: constants of the cells
+    :return: voltage before each step and after the last one, V, shape (K + 1, n), NaN once a cell is empty; and current over
+        each step, A, shape (K, n)
+    """
+    steps, cells = load.shape[1], len(state)
+    voltage_V, current_A = np.empty((steps + 1, cells)), np.empty((steps, cells))
+    run_on_batch(load, q_mobile, r_o, dt, load_unit == "power", thermal, packed, state, voltage_V, current_A)
+    return voltage_V, current_A
 
 
 @dataclass(frozen=True)
