@@ -165,9 +165,12 @@ def test_wrong_columns_are_named_before_the_training(tmp_path):
     ("env_id", "parameters", "batched"), [("BatteryRo-v0", ("r_o",), True), ("BatteryJoint-v0", ("q_mobile", "r_o"), False)]
 )
 def test_default_metrics_are_those_of_the_parameters_that_the_environment_finds(env_id, parameters, batched):
-    env = GymnasiumVecEnv(gym.make_vec(env_id, 2, autoreset_mode="SameStep")) if batched else make_vec_env(env_id)
-    discharges = TrajectoryDataset.paper("r_o")[:2]
-    callback = CalibrationCallback(lambda model: evaluate(PolicyEstimator(model, env_id), discharges), eval_freq=2, verbose=0)
+    data = TrajectoryDataset.generate(parameters, 2, [constant(8.0)], seed=0)
+    if batched:
+        env = GymnasiumVecEnv(gym.make_vec(env_id, 2, dataset=data, autoreset_mode="SameStep"))
+    else:
+        env = make_vec_env(env_id, env_kwargs={"dataset": data})
+    callback = CalibrationCallback(lambda model: evaluate(PolicyEstimator(model, env_id), data), eval_freq=2, verbose=0)
     make_model(env).learn(4, callback=callback)
     names = [f"{parameter}_mape_percent{which}" for parameter in parameters for which in ("", "_worst")]
     assert list(callback.history[0]) == ["timesteps", *names]

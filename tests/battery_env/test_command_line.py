@@ -276,6 +276,13 @@ def test_no_capacity_is_stated_where_the_cell_did_not_start_full(first, more, re
     assert "state of health          not known" in shown
 
 
+def test_what_is_drawn_after_the_cut_off_is_told(recorded, tmp_path, terminal):
+    time_s = np.append(recorded.time_s, recorded.time_s + recorded.time_s[-1] + 100.0)  # too soon for a charge between
+    columns = (np.append(column, column) for column in (recorded.voltage_V, recorded.current_A))
+    path = write(Discharge(time_s, *columns), tmp_path / "two.csv")
+    assert "Ah more are drawn after the cut-off at" in terminal.row(path, "--discharge-is-positive")["notes"]
+
+
 def test_large_cells_are_fitted_and_calibrated(tmp_path, terminal):
     load_A = np.append(np.zeros(60), np.full(4000, 2.0))
     small = simulate(load_A, 6000.0, 0.15, load_unit="current", thermal=True, cut_off_V=2.65)
@@ -417,6 +424,15 @@ def test_the_temperature_is_that_of_the_record_or_the_one_given(recorded, tmp_pa
     assert [round(row["ambient_C"]) for row in rows] == [20, 50, 40, 10]
     assert ["its temperature does not hold" in row["notes"] for row in rows] == [True, True, False, False]
     assert rows[0]["r_o_ohm"] > rows[2]["r_o_ohm"] + 0.001 > rows[1]["r_o_ohm"]
+
+
+def test_the_filter_follows_the_measured_temperature_unless_another_one_is_stated(recorded):
+    warming = replace(recorded, temperature_C=np.linspace(20.0, 40.0, len(recorded.time_s)))
+    measured, stated, held = (
+        calibrated(warming, Settings(method="kalman", **more)).row()["r_o_ohm"]
+        for more in ({}, {"ambient_C": 20.0}, {"thermal": False})
+    )
+    assert measured < stated and measured < held
 
 
 def test_many_samples_are_averaged_and_say_the_same(recorded, tmp_path, terminal):

@@ -35,7 +35,7 @@ class TestSeries:
 
     def test_the_end_of_life_lies_inside_as_often_as_said(self):
         inside = []
-        for seed in range(24):
+        for seed in range(14):
             q_C = walk(seed, count=400)
             end = np.flatnonzero(q_C < 3780.0 * 1.4)[0]
             if end > 25:
