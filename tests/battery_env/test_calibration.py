@@ -158,24 +158,6 @@ def test_wrong_parameters_never_leave_the_finite_numbers():
                 assert all(np.isfinite(value) for value in info.values())
 
 
-def test_training_and_test_trajectories_differ():
-    sides = [gym.make("BatteryRo-v0", split=split).unwrapped.dataset for split in ("train", "test")]
-    keys = [set(zip(data.r_o, data.load_values[data.load_start], strict=True)) for data in sides]
-    assert not keys[0] & keys[1] and len(keys[0]) + len(keys[1]) == 5511
-
-
-def test_a_frame_is_a_picture():
-    env = gym.make("BatteryRo-v0", render_mode="rgb_array")
-    env.reset(seed=0)
-    empty = env.render()
-    for _ in range(5):
-        env.step(env.action_space.sample())
-    frame = env.render()
-    env.reset()
-    np.testing.assert_array_equal(env.render(), empty)
-    assert frame.shape == (400, 600, 3) and frame.dtype == np.uint8 and frame.std() > 10.0
-
-
 def test_points_outside_the_data_are_refused():
     env = gym.make("BatteryQmax-v0")
     with pytest.raises(ValueError, match=r"options\['trajectory'\] must lie within 0 \.\. 3857, got 9999"):

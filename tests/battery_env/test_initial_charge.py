@@ -124,14 +124,6 @@ class TestCommandLine:
         status, row = self.row(record.part(REST_S - 20, len(record.time_s)), tmp_path, capsys, *options)
         assert status == NOT_SETTLED and row["reason"].startswith("The record does not start with a minute at rest")
 
-    @pytest.mark.parametrize("given", ["half", "0.8,0.1,0.1", ""])
-    def test_what_is_none(self, given, capsys):
-        with pytest.raises(SystemExit):
-            calibrate(["B0005:1", "--initial-soc", given])
-        assert "expected SOC, SOC,SD or rest" in capsys.readouterr().err
-        assert calibrate(["B0005:1", "--initial-soc", "1.5"]) == 2
-        assert "initial_soc is a state of charge within" in capsys.readouterr().err
-
 
 class TestOthers:
     def test_constants_are_not_fitted_to_full_cells_and_others(self):

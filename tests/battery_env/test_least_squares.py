@@ -125,16 +125,6 @@ class TestNoise:
         fit = LeastSquares(voltage_noise_V=0.005, prior_q_mobile_C=(known.q_mobile, sd))
         assert fit.estimate(record).sd_q_mobile == pytest.approx(sd / np.sqrt(2.0), rel=1e-3)
 
-    def test_a_prior_decides_but_does_not_settle_them_and_a_whole_record_overrules_it(self):
-        record = discharged(noise_V=0.005)
-        fit = LeastSquares(prior_q_mobile_C=(6100.0, 60.0))
-        early, late = fit.estimate(record.part(0, 120)), fit.estimate(record)
-        assert early.q_mobile == pytest.approx(6100.0, abs=60.0)
-        assert early.sd_q_mobile <= 60.0
-        assert not early.settled and early.reason.startswith("q_mobile rests on its prior: the record alone does not")
-        assert late.settled and late.reason == ""
-        assert abs(late.q_mobile - 6000.0) < 4.0 * late.sd_q_mobile < 10.0
-
     def test_prior_and_record_are_weighed_by_their_variances(self):
         beginning = discharged(noise_V=0.005).part(0, 1500)
         alone = LeastSquares(["q_mobile"], cell=NEW_CELL.replace(r_o=0.15)).estimate(beginning)

@@ -31,8 +31,8 @@ class Constant:
 
 
 @pytest.fixture(scope="module")
-def data():
-    return TrajectoryDataset.generate(("q_mobile", "r_o"), 5, RandomPiecewise(), seed=5, r_o_range=(0.1, 0.3))
+def data(aged_both):
+    return aged_both[:5]
 
 
 def test_one_estimate_at_each_decision_of_each_discharge(data):

@@ -151,14 +151,6 @@ class TestTask:
             # nothing else knows of it
             np.testing.assert_array_equal(task.observation(), by_misfit.observation())
 
-    def test_the_error_of_the_state_is_zero_at_the_truth_however_wrong_the_model(self):
-        wrong = TrajectoryDataset.generate(
-            ("q_mobile", "r_o"), 4, RandomPiecewise(), seed=5, r_o_range=(0.1, 0.3), mismatch=0.2
-        )
-        task = started(wrong, start="true", cost="state")
-        np.testing.assert_array_equal(task.advance(np.zeros((4, 2))), 0.0)
-        assert (started(wrong, start="true").advance(np.zeros((4, 2))) > 0.5).all()
-
     def test_a_recording_does_not_know_its_state(self, data):
         recorded = [discharge.loaded_part(3.0) for discharge in load_nasa_discharges("B0005")[:2]]
         with pytest.raises(ValueError, match="and 2 of 10 discharges are not simulated: take cost='misfit'"):
@@ -199,11 +191,14 @@ class TestTask:
             ({"start": "new"}, "start must be one of .*, got 'new'"),
             ({"measured": "voltage"}, "measured must be one of .*, got 'voltage'"),
             ({"consistency": np.inf}, "consistency must be .*, got inf"),
+            ({"nuisance": -0.1}, "nuisance must be finite and at least 0, got -0.1"),
+            ({"cell": {"kn": 1.0}}, "cell must be CellParameters or None"),
+            ({"load": "constant"}, "dataset stands in place of load"),
             ({"cost": "label"}, "cost must be one of .*, got 'label'"),
         ],
     )
     def test_bad_options_are_refused(self, data, options, message):
-        with pytest.raises(ValueError, match=message):
+        with pytest.raises((TypeError, ValueError), match=message):
             BatteryVoltageJoint(1, dataset=data, **options)
 
 
