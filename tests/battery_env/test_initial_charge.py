@@ -43,13 +43,6 @@ class TestStart:
         above, below = (model.sensitivities(load_A, 6000.0 + step, 0.15)[0] for step in (1.0, -1.0))
         np.testing.assert_allclose(by_q, 0.5 * (above - below), rtol=1e-4, atol=1e-9)
 
-    def test_the_least_q_mobile_is_one_that_just_lasts(self):
-        model, load_A = RecordModel(initial_soc=0.5), np.full(1000, 2.0)
-        least_C = model.least_q_mobile_C(load_A)
-        assert least_C > 2.0 * 2000.0
-        assert len(model.simulate(load_A, 1.0001 * least_C, 0.0).time_s) == 1000
-        assert len(model.simulate(load_A, 0.999 * least_C, 0.0).time_s) < 1000
-
 
 class TestRest:
     @pytest.mark.parametrize("soc", [0.15, 0.5, 0.97])

@@ -308,19 +308,3 @@ class TestBadInput:
             LeastSquares(q_mobile_bounds_C=(100.0, 4000.0)).estimate(discharged())
         with pytest.raises(ValueError, match="q_mobile = 100 C is empty at the start"):
             LeastSquares(["r_o"], cell=NEW_CELL.replace(q_mobile=100.0)).estimate(discharged(load=30.0, load_unit="current"))
-
-    @pytest.mark.parametrize(
-        ("changes", "message"),
-        [
-            ({"voltage_V": np.full(100, np.nan)}, "finite"),
-            ({"voltage_V": np.full(99, 3.0)}, "voltage_V has 99 samples, but time_s has 100"),
-            ({"time_s": np.zeros(100)}, "time_s must increase from sample to sample, but sample 1 is at 0 s"),
-            ({"voltage_V": np.full(100, 3700.0)}, "not in mV"),
-            ({"current_A": np.full(100, -2.0)}, "flip the sign"),
-            ({"current_A": np.zeros(100)}, "no current"),
-            ({"current_A": np.where(np.arange(100) < 99, 0.0, 2.0)}, "no current"),
-        ],
-    )
-    def test_records_are_checked(self, changes, message):
-        with pytest.raises(ValueError, match=message):
-            LeastSquares().estimate(replace(discharged().part(0, 100), **changes))

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from battery_env import ExtendedKalmanFilter, PolicyEstimator
 from battery_env.cells import Discharge
 from battery_env.electrochemistry import simulate
-from battery_env.estimators.base import OnlineEstimator
 from battery_env.records import Stream, are_plausible, check_sample
 
 NOISE_V = 0.005
@@ -40,14 +39,6 @@ class Nudge:
 
 def policy_estimator(**more):
     return PolicyEstimator(Nudge(-0.2, 0.1), "BatteryVoltageJoint-v0", **more)
-
-
-class Bare(OnlineEstimator):
-    """An estimator that has no model."""
-
-    def reset(self): ...
-
-    def update(self, voltage_V, current_A, dt_s, temperature_C=None): ...
 
 
 @pytest.fixture(params=[lambda: ExtendedKalmanFilter(thermal=True), policy_estimator], ids=["filter", "policy"])
@@ -188,12 +179,6 @@ class TestModel:
             filter_.remaining(np.full(600, 2.0))
         # a day of rest is none
         assert filter_.remaining(np.zeros(86_401)).time_s == np.inf
-
-    def test_who_has_none_says_so(self):
-        with pytest.raises(NotImplementedError, match="Bare has no model"):
-            Bare().soc  # noqa: B018
-        with pytest.raises(NotImplementedError, match="Bare cannot be saved"):
-            Bare().save("nowhere")
 
 
 class TestPolicies:
