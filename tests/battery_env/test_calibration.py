@@ -108,15 +108,6 @@ def test_the_perturbation_stays_in_its_bounds_and_conserves_charge():
     assert np.abs(draws).max() <= 10.0 + 1e-6 and np.abs(draws).max(axis=0).min() > 5.0
 
 
-def test_the_model_runs_free():
-    env = gym.make("BatteryRo-v0")
-    env.reset(seed=1)
-    env.step(np.array([1.0]))
-    # the error of one wrong step stays in the model's state, though the next parameter is the true one
-    *_, info = env.step(true_action(env))
-    assert info["cost"] > 0.1
-
-
 @pytest.mark.parametrize("formulation", [SCALED, LITERAL], ids=["scaled", "literal"])
 @pytest.mark.parametrize("parameters", [("q_mobile",), ("r_o",), ("q_mobile", "r_o")])
 def test_a_batch_is_its_cells_one_by_one(parameters, formulation):
@@ -156,24 +147,6 @@ def test_wrong_parameters_never_leave_the_finite_numbers():
                 observation, reward, _, truncated, info = env.step(np.full(env.action_space.shape, action))
                 assert env.observation_space.contains(observation) and np.isfinite(reward)
                 assert all(np.isfinite(value) for value in info.values())
-
-
-def test_training_and_test_trajectories_differ():
-    sides = [gym.make("BatteryRo-v0", split=split).unwrapped.dataset for split in ("train", "test")]
-    keys = [set(zip(data.r_o, data.load_values[data.load_start], strict=True)) for data in sides]
-    assert not keys[0] & keys[1] and len(keys[0]) + len(keys[1]) == 5511
-
-
-def test_a_frame_is_a_picture():
-    env = gym.make("BatteryRo-v0", render_mode="rgb_array")
-    env.reset(seed=0)
-    empty = env.render()
-    for _ in range(5):
-        env.step(env.action_space.sample())
-    frame = env.render()
-    env.reset()
-    np.testing.assert_array_equal(env.render(), empty)
-    assert frame.shape == (400, 600, 3) and frame.dtype == np.uint8 and frame.std() > 10.0
 
 
 def test_points_outside_the_data_are_refused():

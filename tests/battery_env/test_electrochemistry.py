@@ -1,7 +1,5 @@
 """The model against the published reference, against progpy, and against its own invariants."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -62,6 +60,7 @@ R_O = st.floats(0.05, 0.3)
     [
         (2.0, "current", True, REFERENCE_2A_THERMAL, 3572),
         (8.0, "power", False, REFERENCE_8W_ISOTHERMAL, 3102),
+        (8.0, "power", True, {}, 3101),
     ],
 )
 def test_reference_trajectories_to_all_printed_digits(load, load_unit, thermal, reference, eod_time_s):
@@ -78,14 +77,10 @@ def test_end_of_discharge_times(power, q_mobile):
     assert tuple(found) == EOD_TIMES_S[power, q_mobile]
 
 
-def test_thermal_model_under_power_ends_a_second_earlier():
-    assert simulate(8.0, 7600.0, 0.117215, thermal=True).eod_time_s == 3101
-
-
 def test_agrees_with_progpy_on_random_cells_and_loads():
     progpy_models = pytest.importorskip("progpy.models")
     rng = np.random.default_rng(0)
-    for _ in range(50):
+    for _ in range(15):
         q_mobile, r_o = rng.uniform(4000.0, 7600.0), rng.uniform(0.08, 0.3)
         load = np.repeat(rng.uniform(0.0, 3.0, size=12), 25)
         # given to the constructor: set later, progpy's initial state would stay that of the new cell
@@ -144,8 +139,9 @@ def test_a_cell_comes_out_the_same_in_a_batch_of_any_size_and_on_its_own_way(loa
     loads, first = rng.uniform(1.0, 3.0, 60), rng.integers(0, 50, n)
     factors = np.exp(0.1 * rng.standard_normal((n, 4)))
     known = np.array([getattr(NEW_CELL, name) for name in UNCERTAIN_CONSTANTS])
-    cells = [NEW_CELL.replace(**dict(zip(UNCERTAIN_CONSTANTS, known * own, strict=True))) for own in factors]
-    for packed, constants in ((NEW_CELL.packed, [NEW_CELL] * n), (NEW_CELL.packed_with(factors), cells)):
+    cells = [NEW_CELL.replace(**dict(zip(UNCERTAIN_CONSTANTS, known * each, strict=True))) for each in factors]
+    for own, constants in ((False, [NEW_CELL] * n), (True, cells)):
+        packed = NEW_CELL.packed_with(factors) if own else NEW_CELL.packed
         state = initial_state(q)
         advance_in_place(state, loads, first, steps, q, r, 1.0, load_unit, False, packed)
         volts = np.empty(n)
@@ -161,7 +157,7 @@ def test_a_cell_comes_out_the_same_in_a_batch_of_any_size_and_on_its_own_way(loa
         step_into(out, state, loads[first], q, r, 1.0, load_unit, False, packed)
         for size in (1, 3, 64, 65):
             part = np.empty((size, 8))
-            some = packed._replace(constants=packed.constants[:size])
+            some = NEW_CELL.packed_with(factors[:size]) if own else packed
             step_into(part, state[:size], loads[first][:size], q[:size], r[:size], 1.0, load_unit, False, some)
             np.testing.assert_array_equal(part, out[:size])
 
@@ -188,23 +184,11 @@ def test_voltage_collapse_ends_the_discharge():
     assert np.isfinite(discharge.state).all() and (discharge.voltage_V >= 3.0).all()
 
 
-def test_a_state_without_voltage_ends_the_discharge_whatever_the_cut_off():
-    discharge = simulate(16.0, 4000.0, 0.2, cut_off_V=-np.inf)
-    assert 27 < discharge.eod_time_s < 1000 and discharge.voltage_V.min() < 3.0
-    assert np.isfinite(discharge.state).all() and np.isfinite(discharge.voltage_V).all()
-
-
 def test_simulation_stops_where_it_is_told():
     assert len(simulate(2.0, 7600.0, 0.1, until=100.0).time_s) == 101
     assert np.isnan(simulate(2.0, 7600.0, 0.1, until=100.0).eod_time_s)
     assert len(simulate(np.full(40, 2.0), 7600.0, 0.1).time_s) == 40
     assert simulate(0.0, 7600.0, 0.1, max_duration_s=1000.0).time_s[-1] == 1000.0
-
-
-def test_part_keeps_the_clock():
-    part = simulate(8.0, 7600.0, 0.117215).part(100, 200)
-    assert part.time_s[0] == 100.0 and len(part.state) == len(part.voltage_V) == len(part.load) == 100
-    assert part.eod_time_s == 3102
 
 
 def test_extended_model_is_the_model_where_it_is_defined_and_finite_where_not():
@@ -268,15 +252,6 @@ def test_wrong_shapes_are_refused():
 def test_constants_out_of_range_are_refused(changes, message):
     with pytest.raises(ValueError, match=message):
         CellParameters(**changes)
-
-
-def test_constants_are_frozen_and_replaceable():
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        NEW_CELL.kn = 1.0
-    slower = NEW_CELL.replace(kn=100.0)
-    assert slower.kn == 100.0 and NEW_CELL.kn == 2120.96
-    state = initial_state(7600.0)
-    assert step(state, 8.0, 7600.0, 0.1, cell=slower)[2] > step(state, 8.0, 7600.0, 0.1)[2]
 
 
 def test_a_cell_brings_its_own_age():

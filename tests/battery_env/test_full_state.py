@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from battery_env.calibration.full_state_layout import ACTION_RANGES, ERROR_SCALE, OBSERVED
+from battery_env.calibration.full_state_layout import ERROR_SCALE, OBSERVED
 from battery_env.calibration.full_state_tasks import BatteryJoint, BatteryQmax, BatteryQmaxPaper
 from battery_env.electrochemistry import NEW_CELL, UNCERTAIN_CONSTANTS, step, voltage
 from battery_env.loads import RandomPiecewise, constant
@@ -55,14 +55,6 @@ def test_the_joint_task_shows_and_punishes_both_errors(discharges, wrong):
     cost = task.advance(action)
     assert 0.02 < cost < 1.0
     np.testing.assert_allclose({"q_mobile": task.now["q_mobile_hat"], "r_o": task.now["r_o_hat"]}[name], 1.05 * values[name])
-
-
-def test_the_joint_environment_draws_from_cells_whose_parameters_have_both_aged():
-    task = BatteryJoint(1, split="test")
-    assert len(task.dataset) == 300 and abs(np.corrcoef(task.dataset.q_mobile, task.dataset.r_o)[0, 1]) < 0.2
-    for name, values in (("q_mobile", task.dataset.q_mobile), ("r_o", task.dataset.r_o)):
-        low, high = ACTION_RANGES[name]
-        assert low <= values.min() and values.max() <= high and values.std() > 0.15 * (high - low)
 
 
 def test_resync_sets_the_model_to_the_measured_state(discharges):
@@ -139,24 +131,6 @@ def test_constants_may_differ_from_those_of_the_model():
         model, load, q, r = task.now["model_state"].copy(), task.now["load"].copy(), task.now["q_mobile"], task.now["r_o"]
         assert (task.advance(true_action(task)) > 0.01).all()
         np.testing.assert_allclose(task.now["model_state"], step(model, load, q, r), rtol=1e-13)
-
-
-@pytest.mark.parametrize(("kind", "size"), [(BatteryQmax, 1), (BatteryJoint, 2)])
-def test_going_on_with_some_cells_changes_nothing_for_them(kind, size):
-    data = TrajectoryDataset.generate(("q_mobile", "r_o"), 4, RandomPiecewise(), seed=0, mismatch=0.1)
-    options = {"initial_perturbation": 3.0, "consistency": 0.5, "resync": 4}
-    tasks = [make(data, kind, cells=4, **options) for _ in range(2)]
-    for task in tasks:
-        for n in range(4):
-            task.start(np.array([n]), [np.random.default_rng(n)], {"trajectory": n})
-    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (10, 4, size))
-    kept = np.array([True, False, True, True])
-    for k, action in enumerate(actions):
-        if k == 3:
-            tasks[1].keep(kept)
-        costs = [task.advance(action[kept] if task.cells == 3 else action) for task in tasks]
-        np.testing.assert_array_equal(costs[0][kept], costs[1] if k >= 3 else costs[1][kept])
-    np.testing.assert_array_equal(tasks[0].observation()[kept], tasks[1].observation())
 
 
 def test_a_cell_whose_data_have_ended_goes_on_without_failing(discharges):

@@ -43,13 +43,6 @@ class TestStart:
         above, below = (model.sensitivities(load_A, 6000.0 + step, 0.15)[0] for step in (1.0, -1.0))
         np.testing.assert_allclose(by_q, 0.5 * (above - below), rtol=1e-4, atol=1e-9)
 
-    def test_the_least_q_mobile_is_one_that_just_lasts(self):
-        model, load_A = RecordModel(initial_soc=0.5), np.full(1000, 2.0)
-        least_C = model.least_q_mobile_C(load_A)
-        assert least_C > 2.0 * 2000.0
-        assert len(model.simulate(load_A, 1.0001 * least_C, 0.0).time_s) == 1000
-        assert len(model.simulate(load_A, 0.999 * least_C, 0.0).time_s) < 1000
-
 
 class TestRest:
     @pytest.mark.parametrize("soc", [0.15, 0.5, 0.97])
@@ -123,14 +116,6 @@ class TestCommandLine:
         assert abs(row["q_mobile_C"] - 6000.0) < 3.0 * row["sd_q_mobile_C"] < 500.0
         status, row = self.row(record.part(REST_S - 20, len(record.time_s)), tmp_path, capsys, *options)
         assert status == NOT_SETTLED and row["reason"].startswith("The record does not start with a minute at rest")
-
-    @pytest.mark.parametrize("given", ["half", "0.8,0.1,0.1", ""])
-    def test_what_is_none(self, given, capsys):
-        with pytest.raises(SystemExit):
-            calibrate(["B0005:1", "--initial-soc", given])
-        assert "expected SOC, SOC,SD or rest" in capsys.readouterr().err
-        assert calibrate(["B0005:1", "--initial-soc", "1.5"]) == 2
-        assert "initial_soc is a state of charge within" in capsys.readouterr().err
 
 
 class TestOthers:

@@ -5,9 +5,8 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
-from battery_env import PolicyEstimator, load_nasa_discharges
+from battery_env import PolicyEstimator
 from battery_env.calibration.aging import simulated_lives
-from battery_env.calibration.confidence import NO_FIT
 from battery_env.calibration.voltage import LARGEST_STEPS
 from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.evaluation import evaluate
@@ -31,8 +30,8 @@ class Constant:
 
 
 @pytest.fixture(scope="module")
-def data():
-    return TrajectoryDataset.generate(("q_mobile", "r_o"), 5, RandomPiecewise(), seed=5, r_o_range=(0.1, 0.3))
+def data(aged_both):
+    return aged_both[:5]
 
 
 def test_one_estimate_at_each_decision_of_each_discharge(data):
@@ -87,16 +86,6 @@ def test_a_life_is_followed_with_one_estimate():
     scores = evaluate(estimator, lives, RandomSensorErrors((0.001, 0.030), 0.010))
     np.testing.assert_array_equal(scores["q_mobile"], lives.q_mobile)
     assert scores["q_mobile_final"][2] == traces[2].q_mobile[-1]
-
-
-def test_recorded_discharges():
-    discharge = load_nasa_discharges("B0005")[0].loaded_part(3.0)
-    estimator = PolicyEstimator(Constant(-0.1, 0.0), "BatteryVoltageJoint-v0")
-    estimate, trace = estimator.estimate(discharge), estimator.trace([discharge])[0]
-    assert estimate.q_mobile == trace.q_mobile[-1] < NEW_CELL.q_mobile
-    assert not estimate.settled and estimate.reason == NO_FIT
-    assert discharge.time_s[0] + 60.0 == trace.time_s[0]
-    assert discharge.time_s[-1] - 10.0 <= trace.time_s[-1] <= discharge.time_s[-1]
 
 
 def test_bad_arguments_are_refused(data):

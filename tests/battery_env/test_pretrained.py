@@ -1,8 +1,10 @@
 """The policies that come with the package."""
 
 import hashlib
+import json
 import subprocess
 import sys
+from dataclasses import asdict
 from importlib.resources import files
 
 import numpy as np
@@ -12,6 +14,7 @@ from battery_env import LeastSquares, PolicyEstimator, evaluate, load_nasa_disch
 from battery_env.calibration.data import standard_dataset
 from battery_env.calibration.pretrained import file_stem, policy_of_file, pretrained_card, pretrained_policy
 from battery_env.cells import BUNDLED_CELLS
+from battery_env.electrochemistry import NEW_CELL
 from battery_env.sensors import SensorErrors
 
 FOLDER = files("battery_env.pretrained_policies")
@@ -20,7 +23,7 @@ IDS = {"BatteryVoltageJoint-v0": ("q_mobile", "r_o"), "BatteryVoltageQmax-v0": "
 
 @pytest.mark.parametrize("recorded", [False, True])
 @pytest.mark.parametrize("env_id", IDS)
-def test_the_card_is_that_of_the_file(env_id, recorded):
+def test_the_card_is_that_of_the_file(env_id, recorded, aged_both):
     content, card = FOLDER.joinpath(f"{file_stem(env_id, recorded)}.onnx").read_bytes(), pretrained_card(env_id, recorded)
     assert len(content) < 1_000_000
     assert hashlib.sha256(content).hexdigest() == card["sha256"]
@@ -33,7 +36,7 @@ def test_the_card_is_that_of_the_file(env_id, recorded):
     assert ("process_noise_V" in trained_with) == recorded
     assert card["command"].startswith("python -m benchmarks.pretrained") and "seed" in card["recipe"]
     assert {row["mismatch"] for row in card["scores"]} == {0.0, 0.1, 0.2}
-    env = PolicyEstimator.environment(env_id, **options)
+    env = PolicyEstimator.environment(env_id, dataset=aged_both, **options)
     assert policy.observation_shape == env.observation_space.shape
 
 
@@ -103,6 +106,13 @@ class TestFiles:
         path = tmp_path / "mine.onnx"
         path.write_bytes(FOLDER.joinpath("BatteryVoltageRo-v0.onnx").read_bytes())
         return path
+
+    def test_a_card_says_the_options_and_the_constants(self, copy):
+        policy, options = policy_of_file(copy)
+        assert options == {} and policy.env_id == "BatteryVoltageRo-v0"
+        cell = NEW_CELL.replace(kn=1000.0)
+        copy.with_suffix(".json").write_text(json.dumps({"options": {"reading_s": 5.0, "cell": asdict(cell)}}))
+        assert policy_of_file(copy)[1] == {"reading_s": 5.0, "cell": cell}
 
     @pytest.mark.parametrize("text", ["{", "[]", "{}", '{"options": 3}', '{"options": {"cell": {"kn": 1000.0}}}'])
     def test_a_card_that_is_none_is_refused(self, copy, text):

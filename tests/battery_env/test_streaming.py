@@ -7,10 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from battery_env import ExtendedKalmanFilter, PolicyEstimator, soc_from_rest
+from battery_env import ExtendedKalmanFilter, PolicyEstimator
 from battery_env.cells import Discharge
-from battery_env.electrochemistry import initial_state, simulate
-from battery_env.estimators.base import OnlineEstimator
+from battery_env.electrochemistry import simulate
 from battery_env.records import Stream, are_plausible, check_sample
 
 NOISE_V = 0.005
@@ -40,14 +39,6 @@ class Nudge:
 
 def policy_estimator(**more):
     return PolicyEstimator(Nudge(-0.2, 0.1), "BatteryVoltageJoint-v0", **more)
-
-
-class Bare(OnlineEstimator):
-    """An estimator that has no model."""
-
-    def reset(self): ...
-
-    def update(self, voltage_V, current_A, dt_s, temperature_C=None): ...
 
 
 @pytest.fixture(params=[lambda: ExtendedKalmanFilter(thermal=True), policy_estimator], ids=["filter", "policy"])
@@ -153,27 +144,6 @@ class TestTemperature:
         assert abs(blind.r_o / last.r_o - 1.0) > 1e-3
 
 
-class TestStart:
-    def test_a_start_that_is_known_or_told_from_the_rest_finds_the_charge(self):
-        soc, load_A = 0.7, np.append(np.zeros(200), np.full(20_000, 2.0))
-        record = measured(load_A, initial=initial_state(6000.0, soc=soc))
-        start = soc_from_rest(record)
-        known, told, full = (
-            follow(ExtendedKalmanFilter(thermal=True, initial_soc=each), record)
-            for each in (soc, (start.soc, start.sd_soc), 1.0)
-        )
-        for estimate in (known, told):
-            assert abs(estimate.q_mobile - 6000.0) < 3.0 * estimate.sd_q_mobile < 400.0
-            assert abs(estimate.r_o - 0.15) < 3.0 * estimate.sd_r_o
-        assert known.settled and known.sd_q_mobile < told.sd_q_mobile
-        assert not full.settled and full.reason.startswith("The record starts at rest at")
-
-    def test_a_stated_doubt_widens_the_estimate(self, whole):
-        sure, doubtful = (ExtendedKalmanFilter(thermal=True, initial_soc=soc).estimate(whole) for soc in (1.0, (1.0, 0.01)))
-        assert doubtful.q_mobile == sure.q_mobile
-        assert doubtful.sd_q_mobile == pytest.approx(np.hypot(sure.sd_q_mobile, 0.01 * sure.q_mobile))
-
-
 class TestModel:
     def test_state_of_charge_voltage_and_time_left(self, whole):
         filter_, half = ExtendedKalmanFilter(thermal=True, prior_q_mobile_C=(6050.0, 60.0)), len(whole.time_s) // 2
@@ -209,12 +179,6 @@ class TestModel:
             filter_.remaining(np.full(600, 2.0))
         # a day of rest is none
         assert filter_.remaining(np.zeros(86_401)).time_s == np.inf
-
-    def test_who_has_none_says_so(self):
-        with pytest.raises(NotImplementedError, match="Bare has no model"):
-            Bare().soc  # noqa: B018
-        with pytest.raises(NotImplementedError, match="Bare cannot be saved"):
-            Bare().save("nowhere")
 
 
 class TestPolicies:
