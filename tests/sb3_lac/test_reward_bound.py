@@ -125,7 +125,7 @@ def test_lac_learns_to_live():
         seed=0,
         device="cpu",
     )
-    model.learn(1200)
+    model.learn(900)
     report = evaluate_lyapunov(model, BalanceEnv(), 10, deterministic=True, seed=0)
     assert report.episodes["length"].mean() > 60
 
