@@ -68,7 +68,6 @@ def make_model() -> Callable[..., LAC]:
         policy: str = "MlpPolicy",
         **kwargs: Any
     ) -> LAC:
-        """"""
         policy_kwargs = {"net_arch": [16, 16], "activation_fn": nn.LeakyReLU, **(policy_kwargs or {})}
         kwargs = {"learning_starts": 40, "buffer_size": 500, "batch_size": 16, "seed": 0, "device": "cpu", **kwargs}
         model = LAC(policy, LinearCostEnv() if env is None else env, policy_kwargs=policy_kwargs, **kwargs)
@@ -94,15 +93,12 @@ def make_model_without_env() -> Callable[..., LAC]:
     def _make_model_without_env(
         n_states: int = 2, n_actions: int = 2, policy_kwargs: dict[str, Any] | None = None, **kwargs: Any
     ) -> LAC:
-        """A model that knows the spaces of an environment and has none, to train on batches of any numbers."""
+        """A model that never steps its environment, to train on batches of any numbers."""
         policy_kwargs = {"net_arch": [16, 16], "activation_fn": nn.LeakyReLU, **(policy_kwargs or {})}
         kwargs = {"buffer_size": 1, "seed": 0, "device": "cpu", **kwargs}
-        # As in ``LAC.load()``
-        model = LAC("MlpPolicy", None, policy_kwargs=policy_kwargs, _init_setup_model=False, **kwargs)
-        model.observation_space = spaces.Box(-np.inf, np.inf, (n_states,))
-        model.action_space = spaces.Box(-1, 1, (n_actions,))
-        model.n_envs = 1
-        model._setup_model()
+        env = LinearCostEnv(n_dim=n_actions)
+        env.observation_space = spaces.Box(-np.inf, np.inf, (n_states,))
+        model = LAC("MlpPolicy", env, policy_kwargs=policy_kwargs, **kwargs)
         model.set_logger(Logger(folder=None, output_formats=[]))
         return model
 

@@ -413,15 +413,6 @@ def test_region_of_attraction_on_a_grid():
         certify(controller, env, n_episodes=3).plot_region_of_attraction()
 
 
-def test_starts_need_not_be_seen():
-    """On a grid the state that differs first may be one that is not observed."""
-    env = gym.wrappers.TransformObservation(
-        gym.make("LinearCost-v0"), lambda observation: observation[:1], spaces.Box(-np.inf, np.inf, (1,), np.float32)
-    )
-    starts = [[x, y] for x in (-0.5, 0.5) for y in (-0.5, 0.0, 0.5)]
-    assert len(certify(NoController(), env, n_episodes=1, ultimate_bound=1.0, starts=starts).starts) == 6
-
-
 def test_a_cost_of_the_bound_is_within_the_bound():
     # DummyVecEnv holds rewards in single precision, where 0.1 is a little more than 0.1
     for ultimate_bound, n_true in ((0.1, 4), (0.0999, 0)):

@@ -1,19 +1,19 @@
 """An update as one compiled graph makes the numbers of the update that it was compiled from."""
 
-import json
 import shutil
-import zipfile
 
 import numpy as np
 import pytest
 import torch as th
 import torch._dynamo as dynamo
+import torch._inductor.config as inductor
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.utils import ConstantSchedule, LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from torch._dynamo.backends.common import aot_autograd
 from torch._functorch.aot_autograd import make_boxed_func
+from torch._guards import TracingContext
 from torch.torch_version import TorchVersion
 
 from sb3_lac import LAC, compiled
@@ -85,7 +85,7 @@ def test_compiled_and_eager_updates_are_the_same(make_model, kwargs):
 def test_constants_may_change(make_model):
     models = [make_model(compile_update=compile_update, target_update_interval=2) for compile_update in (False, True)]
     for model in models:
-        trained(model, calls=1)
+        trained(model, calls=1, gradient_steps=1)
         model.alpha3, model.lambda_min = 0.2, 0.5
         model.actor.latent_pi[0].requires_grad_(False)
         frozen = model.actor.latent_pi[0].weight.clone()
@@ -99,7 +99,7 @@ def test_graph_is_one_that_a_gpu_can_replay(make_model, monkeypatch):
     graphs = []
 
     def compiler(graph, inputs):
-        static = th._guards.TracingContext.get().fw_metadata.static_input_indices
+        static = TracingContext.get().fw_metadata.static_input_indices
         graphs.append((graph.graph, static))
         return make_boxed_func(graph.forward)
 
@@ -120,30 +120,12 @@ def test_graph_is_one_that_a_gpu_can_replay(make_model, monkeypatch):
     # Sampled: observations, actions, next observations, ends and rewards; and their costs
     assert len(inputs) - len(static) == 6
     assert len(graph.find_nodes(op="output")[0].args[0]) == 1
-    assert not graph.find_nodes(op="call_function", target=th.ops.aten._local_scalar_dense.default)
-
-
-def test_training_leaves_optimizers_and_exploration_as_they_were(make_model):
-    model = make_model(compile_update=True, use_sde=True)
-    optimizers = [model.actor.optimizer, model.critic.optimizer, model.lambda_optimizer, model.ent_coef_optimizer]
-    options = [
-        {name: value for name, value in optimizer.param_groups[0].items() if name != "params"} for optimizer in optimizers
-    ]
-    matrix = model.actor.action_dist.exploration_mat
-    trained(model, calls=1)
-    for optimizer, before in zip(optimizers, options, strict=True):
-        assert {name: value for name, value in optimizer.param_groups[0].items() if name != "params"} == before
-        assert isinstance(optimizer.param_groups[0]["lr"], float)
-    assert model.actor.action_dist.exploration_mat is matrix
-    assert np.isfinite(model.predict(np.zeros(2, dtype=np.float32))[0]).all()
+    assert not any("local_scalar_dense" in str(node.target) for node in graph.nodes)
 
 
 def test_saved_models_go_on_compiled_or_not(make_model, tmp_path):
     model, _ = trained(make_model(compile_update=True, **SCHEDULES), calls=1)
     model.save(tmp_path / "compiled")
-    with zipfile.ZipFile(tmp_path / "compiled.zip") as file:
-        data = json.loads(file.read("data"))
-    assert data["compile_update"] is True and "_compiled" not in data
     going_on = [model]
     for compile_update in (False, True):
         loaded = LAC.load(tmp_path / "compiled", compile_update=compile_update)
@@ -188,7 +170,7 @@ def test_compiled_code_makes_the_same_updates(make_model, monkeypatch):
     monkeypatch.setattr(compiled, "BACKEND", "inductor")
     eager, _ = trained(make_model(**kwargs))
     # Otherwise compiled code has random numbers of its own
-    with th._inductor.config.patch(fallback_random=True):
+    with inductor.patch(fallback_random=True):
         model, _ = trained(make_model(compile_update=True, **kwargs))
     assert_close(model, eager)
 

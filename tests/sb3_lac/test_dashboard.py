@@ -6,7 +6,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from sb3_contrib import ARS
 from stable_baselines3 import SAC, TD3
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.logger import Logger
@@ -126,12 +125,6 @@ def test_an_environment_without_costs_has_no_entry_for_them(tmp_path):
     model = SAC("MlpPolicy", "Pendulum-v1", policy_kwargs={"net_arch": [4]}, tensorboard_log=str(tmp_path), **OPTIONS)
     model.learn(10, callback=DashboardCallback())
     assert "rollout/cost_mean" not in model.logger.name_to_value
-
-
-def test_algorithms_without_infos_train_too(tmp_path):
-    model = ARS("LinearPolicy", make_env(), n_delta=1, tensorboard_log=str(tmp_path), device="cpu")
-    model.learn(16, callback=DashboardCallback()).logger.close()
-    assert "custom_scalars__config__" in EventAccumulator(str(tmp_path / "ARS_1")).Reload().Tags()["tensors"]
 
 
 def test_without_tensorboard_there_is_no_dashboard():

@@ -11,6 +11,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
 from battery_env import OnnxPolicy, PolicyEstimator, TrajectoryDataset
+from battery_env.loads import constant
 from sb3_lac import LAC, onnx
 from sb3_lac.onnx import export_onnx
 
@@ -39,8 +40,9 @@ def assert_alike(policy, model, observations, seen=None):
     np.testing.assert_allclose(policy.predict(observations)[0], expected, atol=1e-5)
 
 
-@pytest.mark.parametrize("algorithm", [LAC, SAC, TD3, TQC, PPO])
+@pytest.mark.parametrize("algorithm", [LAC, TD3, TQC, PPO])
 def test_the_file_does_what_the_policy_does(algorithm, tmp_path):
+    th.distributions.Distribution.set_default_validate_args(True)
     model = new_model(algorithm)
     policy = OnnxPolicy(export_onnx(model, tmp_path / "policy"))
     observations = np.array([model.observation_space.sample() for _ in range(100)])
@@ -48,25 +50,13 @@ def test_the_file_does_what_the_policy_does(algorithm, tmp_path):
     assert_alike(policy, model, observations[:1])
     assert policy.env_id == "Pendulum-v1" and policy.description["algorithm"] == algorithm.__name__
     assert policy.observation_shape == (3,)
+    # Torch checks distributions as before: its exporter switches that off for the whole process
+    with pytest.raises(ValueError, match="GreaterThan"):
+        th.distributions.Normal(0.0, -1.0)
     # Nothing else was written, and the file does not say where the code lies
     assert [file.name for file in tmp_path.iterdir()] == ["policy.onnx"]
     content = (tmp_path / "policy.onnx").read_bytes()
     assert str(Path(onnx.__file__).parent).encode() not in content and b"site-packages" not in content
-
-
-@pytest.mark.parametrize("checked", [True, False])
-def test_torch_checks_distributions_afterwards_if_it_did_before(checked, tmp_path):
-    # torch.compile switches it off for the whole process
-    th.distributions.Distribution.set_default_validate_args(checked)
-    try:
-        export_onnx(new_model(), tmp_path / "policy")
-        if checked:
-            with pytest.raises(ValueError, match="GreaterThan"):
-                th.distributions.Normal(0.0, -1.0)
-        else:
-            th.distributions.Normal(0.0, -1.0)
-    finally:
-        th.distributions.Distribution.set_default_validate_args(True)
 
 
 def test_observations_are_normalized_as_in_training(tmp_path):
@@ -94,13 +84,6 @@ def test_a_mean_far_larger_than_the_deviation_loses_no_digits():
     np.testing.assert_allclose(actions, expected, atol=1e-6)
 
 
-def test_all_of_it_is_on_the_device_of_the_policy():
-    model = new_model(PPO, VecNormalize(make_vec_env("LinearCost-v0")))
-    # A device that every machine has
-    module = onnx.DeterministicPolicy(model.policy.to("meta"), model.get_vec_normalize_env())
-    assert {tensor.device.type for tensor in (*module.parameters(), *module.buffers())} == {"meta"}
-
-
 @pytest.mark.parametrize(
     ("algorithm", "low", "high", "dtype", "kwargs"),
     [
@@ -121,7 +104,7 @@ def test_actions_are_those_of_the_mean_in_float32(algorithm, low, high, dtype, k
 def test_a_calibration_policy_runs_without_torch(tmp_path):
     model = new_model(env="BatteryRo-v0")
     policy = OnnxPolicy(export_onnx(model, tmp_path / "policy"))
-    discharge = TrajectoryDataset.paper("r_o")[0]
+    discharge = TrajectoryDataset.generate("r_o", 1, [constant(12.0)], seed=0)[0]
     estimate = PolicyEstimator(policy, policy.env_id).estimate(discharge)
     assert estimate.r_o == pytest.approx(PolicyEstimator(model, "BatteryRo-v0").estimate(discharge).r_o, rel=1e-4)
 
@@ -146,17 +129,13 @@ def test_what_has_no_export_is_refused(make_model, message, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_nothing_is_overwritten(tmp_path):
-    (tmp_path / "policy.onnx").write_text("mine")
-    with pytest.raises(FileExistsError, match=r"policy\.onnx exists"):
-        export_onnx(new_model(), tmp_path / "policy")
-    assert (tmp_path / "policy.onnx").read_text() == "mine"
-
-
 @pytest.mark.filterwarnings("ignore:.*has no environment")
 def test_bad_files_and_observations_are_refused(tmp_path):
     with pytest.raises(FileNotFoundError):
         OnnxPolicy(tmp_path / "missing.onnx")
+    (tmp_path / "mine.onnx").write_text("mine")
+    with pytest.raises(FileExistsError, match=r"mine\.onnx exists"):
+        export_onnx(new_model(), tmp_path / "mine")
     (tmp_path / "text.onnx").write_text("no graph")
     with pytest.raises(ValueError, match=r"text.onnx is no ONNX file"):
         OnnxPolicy(tmp_path / "text.onnx")
@@ -167,18 +146,6 @@ def test_bad_files_and_observations_are_refused(tmp_path):
         policy.predict(np.zeros((1, 2)), deterministic=False)
     with pytest.raises(ValueError, match="which environment"):
         policy.env_id  # noqa: B018
-
-
-ROOMS = spaces.Box(np.array([90e3, 250.0], np.float32), np.array([110e3, 350.0], np.float32))
-IMAGES = spaces.Box(0, 255, (3, 4, 4), np.uint8)
-HALF = spaces.Box(np.array([5.0, -np.inf], np.float32), np.array([np.inf, -50.0], np.float32))
-
-
-@pytest.mark.parametrize(("space", "least"), [(ROOMS, 80.0), (IMAGES, 200.0), (HALF, 8.0)])
-def test_observations_of_the_check_fill_the_space(space, least):
-    observations = onnx.observations_to_check(space, None)
-    assert all(space.contains(observation.astype(space.dtype)) for observation in observations)
-    assert (np.ptp(observations, axis=0) > least).all()
 
 
 def test_a_graph_of_a_constant_action_is_not_written(tmp_path, monkeypatch):

@@ -9,8 +9,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.envs import BitFlippingEnv, FakeImageEnv, SimpleMultiObsEnv
-from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
+from stable_baselines3.common.envs import BitFlippingEnv, FakeImageEnv
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_lac import LAC
@@ -67,12 +66,8 @@ def test_arguments_are_those_of_sac_and_the_own_ones_follow_target_entropy():
     ("action_space", "message"),
     [
         (spaces.Discrete(3), "only supports .* as action spaces but Discrete"),
-        (spaces.MultiDiscrete([2, 2]), "only supports .* as action spaces but MultiDiscrete"),
-        (spaces.MultiBinary(2), "only supports .* as action spaces but MultiBinary"),
-        (spaces.Dict({"force": spaces.Box(-1, 1)}), "only supports .* as action spaces but Dict"),
         (spaces.Box(-1, np.inf, (2,)), "must have a finite lower and upper bound"),
     ],
-    ids=["discrete", "multi_discrete", "multi_binary", "dict", "unbounded"],
 )
 def test_only_bounded_continuous_actions_are_supported(make_model, action_space, message):
     with pytest.raises(AssertionError, match=message):
@@ -100,12 +95,6 @@ def test_gsde_noise_of_both_actors_is_sampled_in_each_update(make_model):
 @pytest.mark.parametrize("observation_space", [spaces.Discrete(4), spaces.MultiDiscrete([3, 2]), spaces.MultiBinary(3)])
 def test_discrete_observations(make_model, observation_space):
     check_training(make_model(RandomEnv(observation_space, spaces.Box(-1, 1, (2,))), n_collect=0))
-
-
-def test_dict_observations(make_model):
-    env = SimpleMultiObsEnv(discrete_actions=False, random_start=True)
-    features = {"features_extractor_kwargs": {"cnn_output_dim": 8}}
-    check_training(make_model(env, n_collect=0, policy="MultiInputPolicy", policy_kwargs=features, buffer_size=60))
 
 
 @pytest.mark.parametrize("n_channels", [1, 3])
@@ -154,32 +143,6 @@ def test_vec_normalize(make_model, make_env, norm_reward):
 
 def test_n_step_returns(make_model, make_env):
     check_training(make_model(make_env(offset=2.0), n_collect=0, n_steps=3))
-
-
-def test_memory_efficient_replay_buffer(make_model):
-    check_training(
-        make_model(
-            n_collect=0, optimize_memory_usage=True, replay_buffer_kwargs={"handle_timeout_termination": False}, buffer_size=45
-        )
-    )
-
-
-def test_action_noise(make_model):
-    noise = NormalActionNoise(mean=np.zeros(2), sigma=0.1 * np.ones(2))
-    check_training(make_model(n_collect=0, action_noise=noise, use_sde_at_warmup=True))
-
-
-def test_each_env_has_its_own_action_noise_until_its_episode_ends(make_model, make_env):
-    env = make_vec_env(make_env, n_envs=2)
-    noise = OrnsteinUhlenbeckActionNoise(mean=np.zeros(2), sigma=0.1 * np.ones(2))
-    model = make_model(env, n_collect=0, action_noise=noise)
-    check_training(model, n_steps=78)
-    assert isinstance(model.action_noise, VectorizedActionNoise)
-    first, second = (own_noise.noise_prev for own_noise in model.action_noise.noises)
-    assert np.all(first != 0) and np.all(first != second)
-    # Episodes of both environments end after 20 steps of each
-    model.learn(2, reset_num_timesteps=False)
-    assert all(np.all(own_noise.noise_prev == 0) for own_noise in model.action_noise.noises)
 
 
 @pytest.mark.parametrize(

