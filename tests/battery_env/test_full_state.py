@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from battery_env.calibration.full_state_layout import ERROR_SCALE, OBSERVED
-from battery_env.calibration.full_state_tasks import BatteryJoint, BatteryQmax, BatteryQmaxPaper
+from battery_env.calibration.data import standard_dataset
+from battery_env.calibration.full_state_layout import ACTION_RANGES, ERROR_SCALE, OBSERVED
+from battery_env.calibration.full_state_tasks import BatteryJoint, BatteryQmax, BatteryQmaxPaper, BatteryRo
 from battery_env.electrochemistry import NEW_CELL, UNCERTAIN_CONSTANTS, step, voltage
 from battery_env.loads import RandomPiecewise, constant
 from battery_env.trajectories import TrajectoryDataset
@@ -115,6 +116,15 @@ def test_charges_count_as_much_as_is_asked_for(discharges, kind):
     )
 
 
+def test_the_cost_is_limited(discharges):
+    task = started(make(discharges, cells=2, cost_limit=0.2))
+    measured = task.now["next_state"].copy()
+    cost = task.advance(true_action(task) + np.array([[0.02], [1.0]]))
+    distance = scaled_distance(task, task.now["model_state"], measured)
+    np.testing.assert_allclose(cost, np.minimum(distance, 0.2), rtol=1e-9)
+    assert cost[0] < 0.2 == cost[1]
+
+
 def test_constants_may_differ_from_those_of_the_model():
     data = TrajectoryDataset.generate("q_mobile", 5, [constant(12.0)], seed=0, mismatch=0.2)
     task = make(data, cells=3)
@@ -167,6 +177,19 @@ def test_a_share_of_the_episodes_starts_where_the_whole_discharge_does():
         assert low <= at_rest.sum() <= high
     chosen = started(make(discharges, first_sample_probability=1.0))
     assert chosen.now["sample"] == 300  # what is asked for counts
+
+
+def test_loads_of_other_kinds_and_time_steps():
+    task = BatteryRo(1, load="piecewise", split="test", dt_s=2.0)
+    whole = standard_dataset("r_o", "piecewise", "test", dt_s=2.0)
+    within = whole.r_o <= ACTION_RANGES["r_o"][1]
+    np.testing.assert_array_equal(task.dataset.r_o, whole.r_o[within])
+    assert 100 < len(task.dataset) < len(whole)
+    assert task.decision_s == 2.0 and len(np.unique(task.dataset[0].load)) > 5
+    task.start(np.zeros(1, dtype=int), [np.random.default_rng(0)])
+    np.testing.assert_array_equal(
+        task.now["next_state"], step(task.now["state"], task.now["load"], task.now["q_mobile"], task.now["r_o"], dt=2.0)
+    )
 
 
 @pytest.mark.parametrize(

@@ -87,17 +87,6 @@ class TestUncertainty:
         settled &= trace.sd_r_o < SETTLED_SHARES["r_o"] * trace.r_o
         np.testing.assert_array_equal(trace.settled, settled)
 
-    def test_a_prior_decides_before_the_data_do(self):
-        record = measured()
-        early, late = (
-            ExtendedKalmanFilter(prior_q_mobile_C=(6100.0, 60.0)).estimate(part) for part in (record.part(0, 60), record)
-        )
-        assert early.q_mobile == pytest.approx(6100.0, abs=60.0) and not early.settled
-        assert early.reason == "q_mobile rests on its prior: the record alone does not determine it yet."
-        assert late.settled and late.reason == ""
-        assert 50.0 < early.sd_q_mobile <= 60.0
-        assert abs(late.q_mobile - 6000.0) < 3.0 * late.sd_q_mobile < 15.0
-
 
 class TestGuards:
 

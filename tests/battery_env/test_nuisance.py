@@ -58,31 +58,22 @@ def cell_that_is_off(trajectory, unknown, size):
     return Samples(trajectory.time_s, whole.voltage_V[: len(current_A)] + offset_V, current_A)
 
 
-@pytest.mark.parametrize(("unknown", "size"), [("q_mobile", 0.02), ("r_o", 0.2), ("offset_V", 0.01)])
-def test_it_finds_what_is_off(data, unknown, size):
+@pytest.mark.parametrize("unknown", UNKNOWNS)
+def test_steps_repeated_find_what_is_off(data, unknown):
+    n, is_constant = UNKNOWNS.index(unknown), unknown in UNCERTAIN_CONSTANTS
+    size = {"q_mobile": 0.02, "r_o": 0.2, "offset_V": 0.01}.get(unknown, 0.3)
     only = [sd * (name == unknown) for name, sd in zip(UNKNOWNS, KNOWS_NOTHING, strict=True)]
     for trajectory in data:
-        readings = int(0.9 * (len(trajectory.time_s) - 1) / 2)
-        found = step(
-            cell_that_is_off(trajectory, unknown, size), trajectory.q_mobile, trajectory.r_o, (0.0,) * 4, only, readings
-        )
-        scale = {"q_mobile": trajectory.q_mobile, "r_o": trajectory.r_o, "offset_V": 1.0}[unknown]
-        n = UNKNOWNS.index(unknown)
-        assert found[n] / scale == pytest.approx(size, rel=0.1)
-        assert not np.delete(found[: len(UNKNOWNS)], n).any()
-
-
-@pytest.mark.parametrize("unknown", UNCERTAIN_CONSTANTS)
-def test_steps_repeated_find_a_constant(data, unknown):
-    n = UNKNOWNS.index(unknown)
-    only = [sd * (name == unknown) for name, sd in zip(UNKNOWNS, KNOWS_NOTHING, strict=True)]
-    for trajectory in data:
-        record = cell_that_is_off(trajectory, unknown, 0.3)
-        logarithms = np.zeros(4)
-        for _ in range(3):
-            logarithms += step(record, trajectory.q_mobile, trajectory.r_o, logarithms, only)[3:7]
+        record, logarithms = cell_that_is_off(trajectory, unknown, size), np.zeros(4)
+        count = None if is_constant else int(0.9 * (len(trajectory.time_s) - 1) / 2)
+        for _ in range(3 if is_constant else 1):
+            found = step(record, trajectory.q_mobile, trajectory.r_o, logarithms, only, count)
+            logarithms += found[3:7]
+        scale = {"q_mobile": trajectory.q_mobile, "r_o": trajectory.r_o}.get(unknown, 1.0)
+        total = logarithms[n - 3] if is_constant else found[n] / scale
         # where the load changes between two readings the time constant of the ohmic drop is told less exactly
-        assert logarithms[n - 3] == pytest.approx(0.3, rel=0.15 if unknown == "to" else 0.04)
+        assert total == pytest.approx(size, rel={"to": 0.15}.get(unknown, 0.04 if is_constant else 0.1))
+        assert not np.delete(found[: len(UNKNOWNS)], n).any()
 
 
 def test_it_states_how_far_off_it_may_be(data):

@@ -137,6 +137,14 @@ class TestTask:
         np.testing.assert_allclose(task.observation(), evaluated.observation(), atol=0.05)
         assert np.abs(exact.observation() - evaluated.observation()).max() > 0.2
 
+    def test_consistency_is_charged_and_seen(self, data):
+        plain, task = started(data), started(data, consistency=2.0)
+        assert task.observation_size == plain.observation_size + 2
+        np.testing.assert_array_equal(task.observation()[:, -2:], 0.0)
+        for action, change in ((np.full((4, 2), 0.3), 0.3 * np.sqrt(2.0)), (np.full((4, 2), -0.1), 0.4 * np.sqrt(2.0))):
+            np.testing.assert_allclose(task.advance(action), plain.advance(action) + 2.0 * change)
+            np.testing.assert_array_equal(task.observation()[:, -2:], action.astype(np.float32))
+
     @pytest.mark.parametrize("kind", [BatteryVoltageQmax, BatteryVoltageRo, BatteryVoltageJoint])
     def test_the_error_of_the_state_is_that_of_the_parameters(self, data, kind):
         task, by_misfit = (started(data, kind, cost=cost) for cost in ("state", "misfit"))
