@@ -117,6 +117,8 @@ class FullStateTask(CalibrationTask):
         self.observation_size = (4 if self.formulation.innovations else 2) * OBSERVED_SIZE + 1
         self.observation_size += len(self.parameters) if consistency > 0.0 else 0
         self._settings = self._kernel_settings(limit, consistency, charge_weight, resync or 0)
+        self._first_action = self.action_of({name: getattr(NEW_CELL, name) for name in self.parameters})
+        self._starts = list(zip(self.dataset.first.tolist(), (self.dataset.stop - 2).tolist(), strict=True))
         self._has_own_constants = bool((self.dataset.factors != 1.0).any())
         nowhere = np.zeros(cells, dtype=np.int64)
         first = nowhere + self.dataset.first[0]
@@ -176,7 +178,7 @@ class FullStateTask(CalibrationTask):
                 if not 0 <= n < trajectories:
                     raise ValueError(f"options['trajectory'] must lie within 0 .. {trajectories - 1}, got {n}")
             # one decision needs the two samples that follow
-            first, stop = int(self.dataset.first[n]), int(self.dataset.stop[n]) - 2
+            first, stop = self._starts[n]
             t = int(generator.integers(first, stop))
             if self.first_sample_probability > 0.0 and generator.random() < self.first_sample_probability:
                 t = 0  # of the whole discharge, before what the data leave out
@@ -203,8 +205,7 @@ class FullStateTask(CalibrationTask):
         # before the first action the model is a new cell in what is to be found; what is known is the true value
         for name in PARAMETER_NAMES:
             cells[f"{name}_hat"] = getattr(NEW_CELL, name) if name in self.parameters else cells[name]
-        new: dict[str, float] = {name: getattr(NEW_CELL, name) for name in self.parameters}
-        cells["last_action"][:, self._settings["finds"][0] > 0] = self.action_of(new)
+        cells["last_action"][:, self._settings["finds"][0] > 0] = self._first_action
         cells["state"] = dataset.states_at(trajectory, sample)
         cells["model_state"] = cells["state"]
         if self.initial_perturbation > 0.0:

@@ -75,6 +75,7 @@ def _take_action(action: FloatArray, task: Any, cells: Records, n: int) -> float
 def decide(action: FloatArray, settings: Records, cells: Records, cost: FloatArray) -> None:
     # Set the model's parameters, step it, and compare it with the measured state; then go on to the next sample
     task, block = settings[0], np.empty(BLOCK_SIZE)
+    state, next_state, model_state = cells["state"], cells["next_state"], cells["model_state"]
     for n in range(len(cells)):
         cells[n].decisions += 1
         cells[n].sample += 1
@@ -87,13 +88,13 @@ def decide(action: FloatArray, settings: Records, cells: Records, cost: FloatArr
         step_of_block(block, size, task.dt_s, task.power, task.power, task.thermal, True, task.polynomial_n, task.polynomial_p)
         states_of_block(block, first, size, cells["model_state"])
         for n in range(first, first + size):
-            distance = state_distance(cells["model_state"], cells["next_state"], n, task.cost_per_error, task.literal_cost)
+            distance = state_distance(model_state, next_state, n, task.cost_per_error, task.literal_cost)
             cost[n] += task.cost_limit if distance > task.cost_limit else distance
             is_set = task.resync > 0 and cells[n].decisions % task.resync == 0
             for k in range(STATE_SIZE):
-                cells[n].state[k] = cells[n].next_state[k]
+                state[n, k] = next_state[n, k]
                 if is_set:
-                    cells[n].model_state[k] = cells[n].next_state[k]
+                    model_state[n, k] = next_state[n, k]
 
 
 @_compiled
@@ -130,11 +131,12 @@ def model_voltage(settings: Records, cells: Records, out: FloatArray) -> None:
 def observe(settings: Records, cells: Records, limit: float, out: NDArray[np.float32]) -> None:
     # The observations, into out
     task, block = settings[0], np.empty(BLOCK_SIZE)
+    per_state, per_error, model_state, next_state = task.per_state, task.per_error, cells["model_state"], cells["next_state"]
     for n in range(len(cells)):
         cell = cells[n]
         for k in range(7):
-            out[n, k] = _clipped(cell.model_state[k + 1] * task.per_state[k], limit)
-            out[n, k + 7] = _clipped(cell.next_state[k + 1] * task.per_state[k], limit)
+            out[n, k] = _clipped(model_state[n, k + 1] * per_state[k], limit)
+            out[n, k + 7] = _clipped(next_state[n, k + 1] * per_state[k], limit)
         out[n, 14] = _clipped(cell.load * task.per_load, limit)
         if task.shows_action:
             column = out.shape[1]
@@ -145,7 +147,7 @@ def observe(settings: Records, cells: Records, limit: float, out: NDArray[np.flo
     if not task.innovations:
         return
     q, r_o = np.full(len(cells), task.new_parameters[0]), np.full(len(cells), task.new_parameters[1])
-    for column, origin in ((15, cells["model_state"]), (22, cells["state"])):
+    for column, origin in ((15, model_state), (22, cells["state"])):
         for first in range(0, len(cells), BLOCK):
             size = min(BLOCK, len(cells) - first)
             fill_block(block, first, size, origin, cells["load"], q, r_o, task.constants)
@@ -154,7 +156,7 @@ def observe(settings: Records, cells: Records, limit: float, out: NDArray[np.flo
             )
             for j in range(size):
                 for k in range(1, 8):
-                    block[k * BLOCK + j] = (cells[first + j].next_state[k] - block[k * BLOCK + j]) * task.per_error[k - 1]
+                    block[k * BLOCK + j] = (next_state[first + j, k] - block[k * BLOCK + j]) * per_error[k - 1]
             # asinh: they span five orders of magnitude, and must not drown the small ones in a network. A loop of its own, so
             # that the compiler uses vector instructions
             for k in range(1, 8):

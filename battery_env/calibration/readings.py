@@ -163,8 +163,11 @@ class Readings:
 
     def shown(self, discharge: int) -> FloatArray:
         """What exact sensors show of one discharge, shape (SHOWN, readings)."""
-        part = self.part(discharge)
-        return np.stack([self.voltage_V[part], self.current_A[part], self.moved_C[part], self.ohmic_A[part]])
+        return self._all_shown[:, self.part(discharge)]
+
+    @cached_property
+    def _all_shown(self) -> FloatArray:
+        return np.stack([self.voltage_V, self.current_A, self.moved_C, self.ohmic_A])
 
     @cached_property
     def model(self) -> NDArray[np.void]:
