@@ -392,6 +392,8 @@ def explain(
     stretches, block = means.shape[2], np.empty(BLOCK_SIZE)
     # of all readings of one cell: measured minus modelled voltage, and dV/dq
     residual, slope = np.empty((2, shown.shape[2]))
+    cell = model[0]
+    constants, relaxed_n, relaxed_p = cell.constants, cell.relaxed_n, cell.relaxed_p
     for n in rows:
         end, q, r = count[n], estimate[n, 0], estimate[n, 1]
         moved_before, overpotentials = 0.0, Overpotentials(0.0, 0.0, 0.0, 0.0)
@@ -400,9 +402,9 @@ def explain(
             take_readings(block, shown, n, low, size)
             padded = pad_block(block, size, moved_before)
             moved_before = block[MOVED * BLOCK + size - 1]
-            nominal_overpotentials_of_block(block, padded, q, model[0].constants)
-            overpotentials = relax_block(block, size, model[0].relaxed_n, model[0].relaxed_p, overpotentials)
-            voltages_of_block(block, padded, q, r, model[0])
+            nominal_overpotentials_of_block(block, padded, q, constants)
+            overpotentials = relax_block(block, size, relaxed_n, relaxed_p, overpotentials)
+            voltages_of_block(block, padded, q, r, cell)
             for k in range(size):
                 residual[low + k] = block[RESIDUAL * BLOCK + k]
                 slope[low + k] = block[SLOPE * BLOCK + k]
