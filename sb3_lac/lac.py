@@ -286,12 +286,19 @@ class LAC(CostAlgorithm):
         discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
         with th.no_grad():
             # Compute the next Lyapunov values: max over all critics targets, never negative
-            next_values = largest_value(self.critic_target(replay_data.next_observations, next_actions))
-            next_values = th.maximum(next_values, -self.critic_target.offset)
+            next_roots = largest_value(self.critic_target(replay_data.next_observations, next_actions))
+            next_values = th.maximum(self.critic_target.value(next_roots), -self.critic_target.offset)
             # td error, without entropy term. In terminal states nothing is paid any more, so that L is the offset:
             # y = (bound - reward) + gamma * ((1 - done) * (next_value + offset) + done * offset),
             # where bound + gamma * offset = offset is left out on both sides
-            return -replay_data.rewards + (1 - replay_data.dones) * discounts * next_values
+            values = -replay_data.rewards + (1 - replay_data.dones) * discounts * next_values
+            return self.critic.root(values)
+
+    def _critic_loss(self, current_values: Any, target_values: th.Tensor) -> Any:
+        return 0.5 * sum(F.mse_loss(current_value, target_values) for current_value in current_values)
+
+    def _objective(self, roots: th.Tensor) -> th.Tensor:
+        return roots.mean()
 
     def _update(self, replay_data: ReplayBufferSamples, costs: th.Tensor, update_targets: bool) -> Metrics:
         """One update of all that is learned."""
@@ -313,7 +320,7 @@ class LAC(CostAlgorithm):
         # using action from the replay buffer (all values are relative to the offset)
         target_values = self._target_values(replay_data, next_actions)
         current_values = self.critic(replay_data.observations, replay_data.actions)
-        critic_loss = 0.5 * sum(F.mse_loss(current_value, target_values) for current_value in current_values)
+        critic_loss = self._critic_loss(current_values, target_values)
         assert isinstance(critic_loss, th.Tensor)  # for type checker
 
         # Compute the violation of the decrease condition, where the episode goes on
@@ -334,7 +341,7 @@ class LAC(CostAlgorithm):
         ent_coef = self.ent_coef_tensor if self.log_ent_coef is None else th.exp(self.log_ent_coef.detach())
         objective = violation
         if not self.published_update:
-            objective = largest_value(self.critic(replay_data.observations, actions_pi)).mean()
+            objective = self._objective(largest_value(self.critic(replay_data.observations, actions_pi)))
         actor_loss = lambda_coef * objective + ent_coef * log_prob.mean()
 
         # Optimize the critic and the actor, both with the gradient at the current parameters

@@ -21,20 +21,8 @@ from torch import nn
 
 
 def largest_value(values: Sequence[th.Tensor]) -> th.Tensor:
-    """The conservative value ``L(s, a)``: the largest of the critics' values."""
+    """The conservative value: the largest of the critics' values."""
     return reduce(th.maximum, values)
-
-
-def with_linear_term(last_layer: nn.Linear) -> nn.Linear:
-    """
-    The last layer of a critic with one output more, for its linear term. That starts at zero and takes no random numbers, so
-    that nothing changes until there is an offset.
-    """
-    widened = nn.utils.skip_init(nn.Linear, last_layer.in_features, last_layer.out_features + 1)
-    with th.no_grad():
-        widened.weight.copy_(nn.functional.pad(last_layer.weight, (0, 0, 0, 1)))
-        widened.bias.copy_(nn.functional.pad(last_layer.bias, (0, 1)))
-    return widened
 
 
 class LyapunovCritic(BaseModel):
@@ -81,8 +69,8 @@ class LyapunovCritic(BaseModel):
         features_dim: int,
         activation_fn: type[nn.Module] = nn.ReLU,
         normalize_images: bool = True,
-        output_dim: int = 16,
-        n_critics: int = 1,
+        n_critics: int = 2,
+        power: float = 0.25,
         share_features_extractor: bool = False,
     ):
         super().__init__(
@@ -92,26 +80,20 @@ class LyapunovCritic(BaseModel):
             normalize_images=normalize_images,
         )
 
-        if output_dim < 0:
-            raise ValueError(
-                f"output_dim={output_dim} must not be negative, it is the number of squares (0: a linear critic)."
-            )
         if n_critics < 1:
             raise ValueError(f"n_critics={n_critics} must be at least 1.")
 
         action_dim = get_action_dim(self.action_space)
 
         self.share_features_extractor = share_features_extractor
-        self.output_dim = output_dim
         self.n_critics = n_critics
+        self.power = power
         self.lyapunov_networks: list[nn.Sequential] = []
         # What all exact values have in common. Set by the algorithm, saved with the weights
         self.offset: th.Tensor
         self.register_buffer("offset", th.zeros(1))
         for idx in range(n_critics):
-            *hidden_layers, last_layer = create_mlp(features_dim + action_dim, max(output_dim, 1), net_arch, activation_fn)
-            assert isinstance(last_layer, nn.Linear)
-            lyapunov_net = nn.Sequential(*hidden_layers, with_linear_term(last_layer) if output_dim > 0 else last_layer)
+            lyapunov_net = nn.Sequential(*create_mlp(features_dim + action_dim, 1, net_arch, activation_fn))
             self.add_module(f"lf{idx}", lyapunov_net)
             self.lyapunov_networks.append(lyapunov_net)
 
@@ -128,14 +110,25 @@ class LyapunovCritic(BaseModel):
         with th.set_grad_enabled(th.is_grad_enabled() and not self.share_features_extractor):
             features = self.extract_features(obs, self.features_extractor)
         lyapunov_input = th.cat([features, actions], dim=1)
-        if self.output_dim == 0:
-            return tuple(lyapunov_net(lyapunov_input) for lyapunov_net in self.lyapunov_networks)
-        has_offset = self.offset > 0
-        values = []
-        for lyapunov_net in self.lyapunov_networks:
-            squared, linear_term = lyapunov_net(lyapunov_input).split([self.output_dim, 1], dim=1)
-            values.append(squared.square().sum(dim=1, keepdim=True) + has_offset * linear_term)
-        return tuple(values)
+        return tuple(lyapunov_net(lyapunov_input) for lyapunov_net in self.lyapunov_networks)
+
+    def root(self, values: th.Tensor) -> th.Tensor:
+        """
+        What the networks learn of values, ``sign(x) |x|^power``.
+
+        :param values: ``L - offset``
+        :return: As many roots, in the same order
+        """
+        return values.sign() * values.abs().pow(self.power)
+
+    def value(self, roots: th.Tensor) -> th.Tensor:
+        """
+        The inverse of :meth:`root`.
+
+        :param roots: What the networks learn
+        :return: ``L - offset``
+        """
+        return roots.sign() * roots.abs().pow(1 / self.power)
 
     def lyapunov(self, obs: PyTorchObs, actions: th.Tensor) -> th.Tensor:
         """
@@ -145,7 +138,7 @@ class LyapunovCritic(BaseModel):
         :param actions: As many flat actions in [-1, 1]
         :return: The largest of the critics' values and never negative, shape (n, 1)
         """
-        return (largest_value(self(obs, actions)) + self.offset).clamp(min=0.0)
+        return (self.value(largest_value(self(obs, actions))) + self.offset).clamp(min=0.0)
 
 
 class LyapunovPolicy(BasePolicy):
@@ -202,8 +195,8 @@ class LyapunovPolicy(BasePolicy):
         normalize_images: bool = True,
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
-        output_dim: int = 16,
-        n_critics: int = 1,
+        n_critics: int = 2,
+        power: float = 0.25,
         share_features_extractor: bool = False,
     ):
         # Other implementations of Adam, which exclude the fused one
@@ -249,8 +242,8 @@ class LyapunovPolicy(BasePolicy):
         self.critic_kwargs.update(
             {
                 "net_arch": critic_arch,
-                "output_dim": output_dim,
                 "n_critics": n_critics,
+                "power": power,
                 "share_features_extractor": share_features_extractor,
             }
         )
@@ -304,8 +297,8 @@ class LyapunovPolicy(BasePolicy):
                 log_std_init=self.actor_kwargs["log_std_init"],
                 use_expln=self.actor_kwargs["use_expln"],
                 clip_mean=self.actor_kwargs["clip_mean"],
-                output_dim=self.critic_kwargs["output_dim"],
                 n_critics=self.critic_kwargs["n_critics"],
+                power=self.critic_kwargs["power"],
                 share_features_extractor=self.share_features_extractor,
                 lr_schedule=self._dummy_schedule,  # dummy lr schedule, not needed for loading policy alone
                 optimizer_class=self.optimizer_class,
