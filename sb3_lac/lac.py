@@ -28,8 +28,10 @@ class LAC(CostAlgorithm):
     This implementation uses the SB3 SAC implementation as base.
     Paper: https://arxiv.org/abs/2004.14288
 
-    The critic ``L(s, a) >= 0`` learns the discounted sum of costs. The actor makes it decrease by ``alpha3`` times the cost
-    in each step: a Lagrange multiplier ``lambda`` enforces that, while ``ent_coef`` keeps the entropy up as in SAC.
+    The critic ``L(s, a) >= 0`` is the discounted sum of costs, and its networks learn a root of it, in which small costs count
+    beside large ones and whose gradient does not fade towards the goal. The actor lowers that root, and makes it decrease by
+    the share ``alpha3`` in each step: a Lagrange multiplier ``lambda`` enforces that, while ``ent_coef`` keeps the entropy up
+    as in SAC.
 
     Note: the cost is ``bound - reward``, where ``bound`` is the largest reward (stated or seen, at least 0). A termination
     pays 0 for ever after, and so costs ``bound`` per step: where living pays, LAC lives.
@@ -66,10 +68,11 @@ class LAC(CostAlgorithm):
     :param target_update_interval: update the target networks every ``target_update_interval``
         gradient steps.
     :param target_entropy: target entropy when learning ``ent_coef`` (``ent_coef = 'auto'``)
-    :param published_update: Whether to update as the paper does: the actor lowers ``L`` in the states that follow the
-        sampled ones instead of in these, and the critic's target has the action of a target actor.
-    :param alpha3: Share of the cost by which ``L`` has to decrease in each step. From 1 on the condition cannot hold
-        in stationary data: ``lambda`` then stays at ``lambda_max``, a fixed weight of the cost.
+    :param published_update: Whether to have the paper's condition and actor: ``L`` decreases by ``alpha3`` times the cost, the
+        actor lowers ``L`` itself, in the states that follow the sampled ones instead of in these, and the critic's target has
+        the action of a target actor.
+    :param alpha3: Share by which the root of ``L`` has to decrease in each step. With 1 the condition cannot hold:
+        ``lambda`` then stays at ``lambda_max``, a fixed weight of the cost.
     :param lambda_init: Initial value of ``lambda``
     :param lambda_min: Lower limit of ``lambda`` (with ``lambda`` at zero, the actor would only maximise its entropy)
     :param lambda_max: Upper limit of ``lambda``
@@ -281,7 +284,7 @@ class LAC(CostAlgorithm):
         self.critic_target = self.policy.critic_target
 
     def _target_values(self, replay_data: ReplayBufferSamples, next_actions: th.Tensor) -> th.Tensor:
-        """What the critic learns, relative to its offset."""
+        """What the critic learns the root of: values of ``L``, relative to its offset."""
         # For n-step replay, discount factor is gamma**n_steps (when no early termination)
         discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
         with th.no_grad():
@@ -291,14 +294,7 @@ class LAC(CostAlgorithm):
             # td error, without entropy term. In terminal states nothing is paid any more, so that L is the offset:
             # y = (bound - reward) + gamma * ((1 - done) * (next_value + offset) + done * offset),
             # where bound + gamma * offset = offset is left out on both sides
-            values = -replay_data.rewards + (1 - replay_data.dones) * discounts * next_values
-            return self.critic.root(values)
-
-    def _critic_loss(self, current_values: Any, target_values: th.Tensor) -> Any:
-        return 0.5 * sum(F.mse_loss(current_value, target_values) for current_value in current_values)
-
-    def _objective(self, roots: th.Tensor) -> th.Tensor:
-        return roots.mean()
+            return -replay_data.rewards + (1 - replay_data.dones) * discounts * next_values
 
     def _update(self, replay_data: ReplayBufferSamples, costs: th.Tensor, update_targets: bool) -> Metrics:
         """One update of all that is learned."""
@@ -316,11 +312,11 @@ class LAC(CostAlgorithm):
             next_actor = self.actor if self.actor_target is None else self.actor_target
             next_actions = next_actor(replay_data.next_observations)
 
-        # Compute critic loss, with the current values of each critic network
+        # Compute critic loss, with the current root of each critic network
         # using action from the replay buffer (all values are relative to the offset)
-        target_values = self._target_values(replay_data, next_actions)
-        current_values = self.critic(replay_data.observations, replay_data.actions)
-        critic_loss = self._critic_loss(current_values, target_values)
+        target_roots = self.critic.root(self._target_values(replay_data, next_actions))
+        current_roots = self.critic(replay_data.observations, replay_data.actions)
+        critic_loss = 0.5 * sum(F.mse_loss(current_root, target_roots) for current_root in current_roots)
         assert isinstance(critic_loss, th.Tensor)  # for type checker
 
         # Compute the violation of the decrease condition, where the episode goes on
@@ -328,10 +324,15 @@ class LAC(CostAlgorithm):
             # A gradient through the next action
             next_actions = self.actor(replay_data.next_observations)
         with th.set_grad_enabled(next_actions.requires_grad):
-            next_values = largest_value(self.critic(replay_data.next_observations, next_actions))
-        values = largest_value(current_values).detach()
+            next_roots = largest_value(self.critic(replay_data.next_observations, next_actions))
+        roots = largest_value(current_roots).detach()
+        values = self.critic.lyapunov_of(roots)
+        if self.published_update:
+            difference = self.critic.value(next_roots) - self.critic.value(roots) + self.alpha3 * costs
+        else:
+            difference = self.critic.root(self.critic.lyapunov_of(next_roots)) - (1 - self.alpha3) * self.critic.root(values)
         going_on = 1 - replay_data.dones
-        violation = (going_on * (next_values - values + self.alpha3 * costs)).sum() / going_on.sum().clamp(min=1)
+        violation = (going_on * difference).sum() / going_on.sum().clamp(min=1)
 
         # Compute actor loss: the Lagrangian of the decrease condition and of the entropy constraint
         # Important: detach the multipliers from the graph
@@ -341,7 +342,7 @@ class LAC(CostAlgorithm):
         ent_coef = self.ent_coef_tensor if self.log_ent_coef is None else th.exp(self.log_ent_coef.detach())
         objective = violation
         if not self.published_update:
-            objective = self._objective(largest_value(self.critic(replay_data.observations, actions_pi)))
+            objective = largest_value(self.critic(replay_data.observations, actions_pi)).mean()
         actor_loss = lambda_coef * objective + ent_coef * log_prob.mean()
 
         # Optimize the critic and the actor, both with the gradient at the current parameters
@@ -365,7 +366,7 @@ class LAC(CostAlgorithm):
             "lambda_saturation": self.log_lambda >= log_lambda_max,
             "lambda_loss": lambda_loss,
             "lyapunov_difference": violation,
-            "lyapunov_mean": values.mean() + self.critic.offset,
+            "lyapunov_mean": values.mean(),
             "cost": costs.mean(),
         }
 

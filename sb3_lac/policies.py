@@ -21,26 +21,22 @@ from torch import nn
 
 
 def largest_value(values: Sequence[th.Tensor]) -> th.Tensor:
-    """The conservative value: the largest of the critics' values."""
+    """The conservative one of several critics."""
     return reduce(th.maximum, values)
 
 
 class LyapunovCritic(BaseModel):
     """
     Lyapunov critic network(s) for LAC.
-    Each network maps state and action to a vector ``f(s, a)`` and returns its squared norm,
-    so that the value ``L(s, a) = f(s, a)^T f(s, a)`` is never negative.
+    Each network maps state and action to a root of the value, ``f(s, a)`` with ``L - offset = sign(f) |f|^(1 / power)``.
 
-    The last layer is linear (no unit of it can die), and narrow by default because a sum of squares grows with the
-    number of its terms: a wide last layer starts far above the values that small costs lead to.
+    Costs of a loop that settles fade over orders of magnitude. An error in ``f`` counts alike at all of them, while one in
+    ``L`` only counts where costs are large; and ``f`` falls towards the goal like a norm, while the gradient of ``L`` vanishes
+    there. The unit of the costs is nothing but a factor of ``f``. With noise ``L`` is biased low: the root of a mean is
+    larger than the mean of the roots.
 
-    Where rewards are positive, ``L`` has an ``offset``, the value of states from which nothing is ever paid, and the networks
-    only learn the difference to it, ``L(s, a) - offset``. It is negative wherever rewards are collected, so that it takes a
-    linear term beside the sum of squares, the last output of each network. Without an offset that term is zero and stays zero.
-
-    With ``output_dim=0`` there are no squares, and the value is that linear term alone, as in other actor-critics. It is not
-    bound to be positive, but what it learns is. A sum of squares learns small costs more exactly. Single costs that are large,
-    as those of a crash, make it jump, since its gradient grows with its value.
+    Where rewards are positive, ``L`` has an ``offset``, the value of states from which nothing is ever paid, and ``f`` is
+    negative wherever rewards are collected. The signed root is that of https://arxiv.org/abs/1805.11593 without its linear part.
 
     :param observation_space: Observation space
     :param action_space: Action space
@@ -51,8 +47,8 @@ class LyapunovCritic(BaseModel):
     :param activation_fn: Activation function of the hidden layers
     :param normalize_images: Whether to normalize images or not,
          dividing by 255.0 (True by default)
-    :param output_dim: Width of the last layer, the number of squares in the sum; 0 for a linear critic
     :param n_critics: Number of critic networks to create
+    :param power: Power of the root, above 0 and at most 1 (the value itself)
     :param share_features_extractor: Whether the features extractor is shared with the actor
         (it is then trained by the loss of the actor only)
     """
@@ -82,6 +78,8 @@ class LyapunovCritic(BaseModel):
 
         if n_critics < 1:
             raise ValueError(f"n_critics={n_critics} must be at least 1.")
+        if not 0 < power <= 1:
+            raise ValueError(f"power={power} must be above 0 and at most 1: 0.5 is the square root, 1 the value itself.")
 
         action_dim = get_action_dim(self.action_space)
 
@@ -99,11 +97,11 @@ class LyapunovCritic(BaseModel):
 
     def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:
         """
-        The values relative to the offset, which differences and the errors of the critic do not depend on.
+        Get the roots of the values relative to the offset.
 
         :param obs: Observations, preprocessed by ``extract_features()``
         :param actions: As many flat actions in [-1, 1]
-        :return: ``L(s, a) - offset``, one tensor of shape (n, 1) per critic
+        :return: Roots of ``L(s, a) - offset``, one tensor of shape (n, 1) per critic
         """
         # Learn the features extractor using the policy loss only
         # when the features_extractor is shared with the actor
@@ -114,31 +112,40 @@ class LyapunovCritic(BaseModel):
 
     def root(self, values: th.Tensor) -> th.Tensor:
         """
-        What the networks learn of values, ``sign(x) |x|^power``.
+        Get what the networks learn of values.
 
-        :param values: ``L - offset``
-        :return: As many roots, in the same order
+        :param values: Values of any sign
+        :return: As many roots, ``sign(x) |x|^power``
         """
         return values.sign() * values.abs().pow(self.power)
 
     def value(self, roots: th.Tensor) -> th.Tensor:
         """
-        The inverse of :meth:`root`.
+        Get the values that roots belong to.
 
         :param roots: What the networks learn
-        :return: ``L - offset``
+        :return: As many values, the inverse of ``root()``
         """
         return roots.sign() * roots.abs().pow(1 / self.power)
 
+    def lyapunov_of(self, roots: th.Tensor) -> th.Tensor:
+        """
+        Get the values of ``L`` that roots belong to.
+
+        :param roots: What the networks learn
+        :return: As many values, offset included, and none negative
+        """
+        return (self.value(roots) + self.offset).clamp(min=0.0)
+
     def lyapunov(self, obs: PyTorchObs, actions: th.Tensor) -> th.Tensor:
         """
-        The conservative values ``L(s, a)``, offset included.
+        Get the conservative values ``L(s, a)``, offset included.
 
         :param obs: Observations, preprocessed by ``extract_features()``
         :param actions: As many flat actions in [-1, 1]
         :return: The largest of the critics' values and never negative, shape (n, 1)
         """
-        return (self.value(largest_value(self(obs, actions))) + self.offset).clamp(min=0.0)
+        return self.lyapunov_of(largest_value(self(obs, actions)))
 
 
 class LyapunovPolicy(BasePolicy):
@@ -166,9 +173,8 @@ class LyapunovPolicy(BasePolicy):
     :param optimizer_kwargs: Additional keyword arguments,
         excluding the learning rate, to pass to the optimizer
         (the fused implementation of ``th.optim.Adam`` is used, unless ``fused``, ``foreach`` or ``differentiable`` is given)
-    :param output_dim: Width of the last layer of the Lyapunov critic, the number of squares that are summed; 0 for a linear
-        critic, which learns better where single costs are large (see ``LyapunovCritic``)
     :param n_critics: Number of Lyapunov critic networks to create, the largest of their values is used.
+    :param power: Power of the root of ``L`` that they learn (see ``LyapunovCritic``)
     :param share_features_extractor: Whether to share or not the features extractor
         between the actor and the critic (this saves computation time)
     """

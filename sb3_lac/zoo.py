@@ -113,7 +113,7 @@ def convert_sac_params(sampled_params: Hyperparams) -> Hyperparams:
 def convert_lac_params(sampled_params: Hyperparams) -> Hyperparams:
     """Convert sampled values to the hyperparameters of LAC."""
     hyperparams = convert_sac_params(sampled_params)
-    hyperparams["policy_kwargs"]["output_dim"] = hyperparams.pop("output_dim")
+    hyperparams["policy_kwargs"]["n_critics"] = hyperparams.pop("n_critics")
     # Start with the full weight on the cost, as in the paper
     hyperparams["lambda_init"] = hyperparams["lambda_max"]
     return hyperparams
@@ -137,7 +137,7 @@ def sample_lac_params(trial: optuna.Trial, n_actions: int, n_envs: int, addition
         "alpha3": trial.suggest_float("alpha3", 0.01, 1.0, log=True),
         # Weight of the cost relative to the entropy
         "lambda_max": trial.suggest_float("lambda_max", 0.1, 10.0, log=True),
-        "output_dim": trial.suggest_categorical("output_dim", [8, 16, 32, 64]),
+        "n_critics": trial.suggest_categorical("n_critics", [1, 2]),
     }
     return _as_arguments(convert_lac_params(_sample(trial, own, additional_args)))
 

@@ -1,12 +1,16 @@
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
+from hypothesis import given
+from hypothesis import strategies as st
 from stable_baselines3.common.envs import FakeImageEnv
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from stable_baselines3.common.utils import get_parameters_by_name
 from torch import nn
 
 from sb3_lac import LyapunovPolicy
+from sb3_lac.policies import LyapunovCritic
 
 
 class BatchNormExtractor(BaseFeaturesExtractor):
@@ -23,38 +27,50 @@ class BatchNormDropoutExtractor(BatchNormExtractor):
         return nn.functional.dropout(super().forward(observations), training=self.training)
 
 
-def test_value_is_the_sum_of_squares_of_the_last_layer(make_model):
-    critic = make_model(n_collect=0, policy_kwargs={"n_critics": 2, "output_dim": 5}).critic
-    obs, actions = th.randn(30, 2), th.rand(30, 2)
-    values = critic(obs, actions)
-    assert len(values) == 2
-    for value, net in zip(values, critic.lyapunov_networks, strict=True):
-        outputs = net(th.cat([obs, actions], dim=1))
-        # The last one is the linear term, without an offset zero
-        assert outputs.shape == (30, 5 + 1) and not outputs[:, 5].any()
-        th.testing.assert_close(value, (outputs**2).sum(dim=1, keepdim=True))
-    assert not th.equal(values[0], values[1])
+@pytest.fixture(scope="module")
+def make_critic():
+    box = spaces.Box(-1, 1, (1,))
+    extractor = FlattenExtractor(box)
+    return lambda power: LyapunovCritic(box, box, [4], extractor, extractor.features_dim, power=power)
 
 
-def test_a_critic_without_squares_is_linear_in_its_last_layer_and_reports_no_negative_value(make_model):
-    model = make_model(n_collect=16, policy_kwargs={"output_dim": 0, "n_critics": 2})
+@pytest.mark.parametrize("power", [0.25, 0.5, 1.0])
+def test_networks_learn_a_root_and_the_policy_shows_the_value(make_model, power):
+    model = make_model(n_collect=16, policy_kwargs={"n_critics": 2, "power": power})
     critic = model.critic
     obs, actions = th.randn(200, 2), th.rand(200, 2)
     with th.no_grad():
-        for value, net in zip(critic(obs, actions), critic.lyapunov_networks, strict=True):
-            net[-1].bias -= value.mean()
-    values = critic(obs, actions)
-    for value, net in zip(values, critic.lyapunov_networks, strict=True):
+        for roots, net in zip(critic(obs, actions), critic.lyapunov_networks, strict=True):
+            net[-1].bias -= roots.mean()
+    roots = critic(obs, actions)
+    for of_critic, net in zip(roots, critic.lyapunov_networks, strict=True):
         assert net[-1].out_features == 1
-        th.testing.assert_close(value, net(th.cat([obs, actions], dim=1)))
-        assert value.min() < 0 < value.max()
+        th.testing.assert_close(of_critic, net(th.cat([obs, actions], dim=1)))
+    assert not th.equal(roots[0], roots[1])
+    largest = th.maximum(*roots)
+    assert largest.min() < 0 < largest.max()
     conservative = critic.lyapunov(obs, actions)
     assert conservative.min() == 0
-    th.testing.assert_close(conservative, th.maximum(*values).clamp(min=0))
+    th.testing.assert_close(conservative, largest.clamp(min=0) ** (1 / power))
     # and it learns: the gradient reaches every parameter
     before = [parameter.clone() for parameter in critic.parameters()]
     model.train(gradient_steps=1, batch_size=8)
     assert not any(th.equal(old, new) for old, new in zip(before, critic.parameters(), strict=True))
+
+
+@given(
+    value=st.floats(-1e6, 1e6).filter(lambda value: value == 0 or abs(value) > 1e-6),
+    factor=st.floats(1e-3, 1e3),
+    power=st.sampled_from([0.1, 0.25, 0.5, 1.0]),
+)
+def test_root_has_an_inverse_keeps_the_order_and_takes_units_as_factors(make_critic, value, factor, power):
+    critic = make_critic(power)
+    values = th.tensor([value, value + abs(value) + 1.0], dtype=th.float64)
+    roots = critic.root(values)
+    th.testing.assert_close(critic.value(roots), values)
+    assert roots[0] < roots[1]
+    assert th.sign(roots[0]) == np.sign(value)
+    th.testing.assert_close(critic.root(factor * values), factor**power * roots)
 
 
 def test_targets_start_as_copies_and_stay_in_eval_mode(make_model):
@@ -126,8 +142,8 @@ def test_policy_keeps_all_arguments_when_saved_and_loaded(make_model, tmp_path):
         "use_expln": True,
         "optimizer_class": th.optim.AdamW,
         "optimizer_kwargs": {"weight_decay": 0.1},
-        "output_dim": 5,
-        "n_critics": 2,
+        "n_critics": 3,
+        "power": 0.5,
         "share_features_extractor": True,
     }
     policy = make_model(n_collect=0, use_sde=True, policy_kwargs=policy_kwargs).policy

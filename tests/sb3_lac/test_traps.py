@@ -52,16 +52,6 @@ def test_default_arguments_do_not_warn(make_env):
         model.learn(10, log_interval=None)
 
 
-def test_last_layer_of_the_critic_is_linear(make_model):
-    model = make_model(n_collect=0, policy_kwargs={"activation_fn": nn.ReLU, "output_dim": 7})
-    last_layer = model.critic.lyapunov_networks[0][-1]
-    assert isinstance(last_layer, nn.Linear) and last_layer.out_features == 7 + 1
-    # Also units with negative output learn, none of them can die
-    nn.init.constant_(last_layer.bias, -5.0)
-    model.critic(th.randn(20, 2), th.rand(20, 2))[0].sum().backward()
-    assert th.all(last_layer.bias.grad[:7] < 0)
-
-
 @pytest.mark.parametrize("terminate, expected", [(False, 2.0), (True, 1.0)])
 def test_time_limits_bootstrap_and_terminations_do_not(make_model, make_env, train_metrics, terminate, expected):
     # Reward -1 in each step, each of which ends an episode: 1 + 0.5 + 0.25 + ... or only 1
@@ -179,7 +169,8 @@ def test_both_values_of_the_difference_are_from_the_online_critic(make_model, tr
         ({"n_steps": 3, "gamma": 1.0}, "gamma must be smaller than 1 with n-step returns"),
         ({"gamma": 1.1}, "gamma=1.1 must lie within 0 .. 1"),
         ({"gamma": math.nan}, "gamma=nan must lie within 0 .. 1"),
-        ({"policy_kwargs": {"output_dim": -1}}, "output_dim=-1 must not be negative"),
+        ({"policy_kwargs": {"power": 0.0}}, "power=0.0 must be above 0 and at most 1"),
+        ({"policy_kwargs": {"power": 2}}, "power=2 must be above 0 and at most 1"),
         ({"policy_kwargs": {"n_critics": 0}}, "n_critics=0 must be at least 1"),
     ],
 )

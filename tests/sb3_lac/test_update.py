@@ -33,16 +33,22 @@ def policy_sample(weights, obs):
     return action, log_prob.sum(dim=1)
 
 
-def lyapunov(weights, obs, actions, n_critics, offset=0.0):
-    """One value per critic: sum of squares of a linear layer and, with an offset, the offset and a linear term."""
-    values = []
+def roots_of(weights, obs, actions, n_critics):
+    """What each critic learns, one output of a linear layer."""
+    outputs = []
     for i in range(n_critics):
         latent = mlp(weights, f"lf{i}", th.cat([obs, actions], dim=1), 2)
-        outputs = latent @ weights[f"lf{i}.4.weight"].T + weights[f"lf{i}.4.bias"]
-        values.append((outputs[:, :-1] ** 2).sum(dim=1))
-        if offset > 0:
-            values[-1] = values[-1] + offset + outputs[:, -1]
-    return th.stack(values)
+        outputs.append((latent @ weights[f"lf{i}.4.weight"].T + weights[f"lf{i}.4.bias"]).squeeze(1))
+    return th.stack(outputs)
+
+
+def root(value):
+    return th.sign(value) * th.sqrt(th.sqrt(abs(value)))
+
+
+def lyapunov(roots, offset):
+    """L of the largest of several critics."""
+    return (roots.amax(dim=0) ** 3 * abs(roots.amax(dim=0)) + offset).clamp(min=0)
 
 
 class ScalarAdam:
@@ -75,7 +81,7 @@ def test_train_is_the_update_of_the_equations(make_model_without_env, n_critics,
         lambda_max=LAMBDA_MAX,
         ent_coef="auto_0.7",
         # With plain gradient descent, a wrong factor in a loss cannot hide (Adam is invariant to scale)
-        policy_kwargs={"optimizer_class": th.optim.SGD, "n_critics": n_critics, "output_dim": 3},
+        policy_kwargs={"optimizer_class": th.optim.SGD, "n_critics": n_critics},
     )
     th.manual_seed(0)
     batch = ReplayBufferSamples(
@@ -106,18 +112,23 @@ def test_train_is_the_update_of_the_equations(make_model_without_env, n_critics,
         actions_pi, log_prob = policy_sample(actor, obs)
         with th.no_grad():
             next_actions, _ = policy_sample(actor_target if published_update else actor, next_obs)
-            next_values = lyapunov(critic_target, next_obs, next_actions, n_critics, offset).amax(dim=0)
+            next_values = lyapunov(roots_of(critic_target, next_obs, next_actions, n_critics), offset)
             y = costs + GAMMA * ((1 - dones) * next_values + dones * offset)
-        values = lyapunov(critic, obs, actions, n_critics, offset)
-        critic_loss = (0.5 * (values - y) ** 2).mean(dim=1).sum()
+        roots = roots_of(critic, obs, actions, n_critics)
+        critic_loss = (0.5 * (roots - root(y - offset)) ** 2).mean(dim=1).sum()
+        values = lyapunov(roots, offset).detach()
         if published_update:
             next_actions, _ = policy_sample(actor, next_obs)
-        next_values = lyapunov(critic, next_obs, next_actions, n_critics, offset).amax(dim=0)
+        next_roots = roots_of(critic, next_obs, next_actions, n_critics)
+        if published_update:
+            # Nowhere cut off at zero, where the actor would learn nothing
+            next_values, values_of_roots = (x.amax(dim=0) ** 3 * abs(x.amax(dim=0)) for x in (next_roots, roots.detach()))
+            difference = next_values - values_of_roots + ALPHA3 * costs
+        else:
+            difference = root(lyapunov(next_roots, offset)) - (1 - ALPHA3) * root(values)
         # Where the episode goes on
-        d = (next_values - values.amax(dim=0).detach() + ALPHA3 * costs)[dones == 0].mean()
-        objective = (
-            d if published_update else (lyapunov(critic, obs, actions_pi, n_critics, offset).amax(dim=0) - offset).mean()
-        )
+        d = difference[dones == 0].mean()
+        objective = d if published_update else roots_of(critic, obs, actions_pi, n_critics).amax(dim=0).mean()
         lambda_, beta = math.exp(log_lambda.value), math.exp(log_beta.value)
         actor_loss = lambda_ * objective + beta * log_prob.mean()
         violation = log_prob.mean().item() - 2.0  # target entropy: minus the number of actions
@@ -125,7 +136,7 @@ def test_train_is_the_update_of_the_equations(make_model_without_env, n_critics,
         assert logged["train/critic_loss"] == pytest.approx(critic_loss.item(), rel=1e-4)
         assert logged["train/actor_loss"] == pytest.approx(actor_loss.item(), rel=1e-4)
         assert logged["train/lyapunov_difference"] == pytest.approx(d.item(), rel=1e-4)
-        assert logged["train/lyapunov_mean"] == pytest.approx(values.amax(dim=0).mean().item(), rel=1e-4)
+        assert logged["train/lyapunov_mean"] == pytest.approx(values.mean().item(), rel=1e-4)
         assert logged["train/cost"] == pytest.approx(costs.mean().item(), rel=1e-5)
         assert logged["train/lambda"] == pytest.approx(lambda_, rel=1e-4)
         assert logged["train/ent_coef"] == pytest.approx(beta, rel=1e-4)
@@ -168,10 +179,13 @@ def test_value_of_several_critics_is_the_largest():
 
 def test_actor_step_leaves_no_gradient_in_the_critic(make_model, train_metrics):
     # In the last step the critic is exact, so that any gradient must come from the loss of the actor
-    model = make_model(gamma=0.0)
+    model = make_model(gamma=0.0, policy_kwargs={"n_critics": 1})
     batch = model.replay_buffer.sample(16)
-    values = model.critic(batch.observations, batch.actions)[0].detach()
-    model.replay_buffer.sample = lambda *args, **kwargs: batch._replace(rewards=-values)
+    with th.no_grad():
+        (roots,) = model.critic(batch.observations, batch.actions)
+        # as rounded as the target will be
+        model.critic.root = lambda values: roots
+    model.replay_buffer.sample = lambda *args, **kwargs: batch._replace(rewards=-model.critic.value(roots))
     train_metrics(model)
     gradients = th.cat([parameter.grad.flatten() for parameter in model.critic.parameters()])
     assert th.all(gradients == 0)

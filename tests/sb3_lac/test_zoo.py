@@ -33,7 +33,7 @@ CONFIG = {
         "buffer_size": 500,
         "batch_size": 8,
         "normalize": "dict(norm_obs=True, norm_reward=True)",
-        "policy_kwargs": "dict(net_arch=[8], activation_fn=nn.LeakyReLU, output_dim=4)",
+        "policy_kwargs": "dict(net_arch=[8], activation_fn=nn.LeakyReLU, power=0.5)",
     }
 }
 
@@ -52,7 +52,7 @@ def test_train_continue_and_enjoy(workdir, n_updates, capsys):
     main(["train", "--env", ENV, "--eval-freq", "-1", "--seed", "1", "--save-replay-buffer"])
     first = LAC.load(workdir / "logs" / "lac" / f"{ENV}_1" / f"{ENV}.zip")
     assert first.num_timesteps == 60 and n_updates(first) == 20
-    assert first.critic.output_dim == 4 and isinstance(first.actor.latent_pi[1], nn.LeakyReLU)
+    assert first.critic.power == 0.5 and isinstance(first.actor.latent_pi[1], nn.LeakyReLU)
     assert first.lr_schedule(0.5) == pytest.approx(1.5e-4)
     assert first.lambda_lr_schedule(0.5) == pytest.approx(2.5e-5)
 
@@ -105,7 +105,7 @@ def test_optimize(workdir):
     storage_backend = optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend(str(workdir / "study.log")))
     trials = optuna.load_study(study_name="lac", storage=storage_backend).trials
     assert len(trials) == 2
-    assert {"alpha3", "lambda_max", "output_dim", "lambda_learning_rate"} <= set(trials[0].params)
+    assert {"alpha3", "lambda_max", "n_critics", "lambda_learning_rate"} <= set(trials[0].params)
 
 
 @pytest.mark.parametrize("algo", ["lac", "sac", "td3"])
@@ -134,7 +134,7 @@ def test_every_sample_is_a_valid_model(algo, make_env, workdir, monkeypatch):
         assert not {"train_freq", "gradient_steps", "n_envs"} & set(hyperparams)
         model = rl_zoo3.ALGOS[algo]("MlpPolicy", make_env(), buffer_size=10, device="cpu", **hyperparams)
         if algo == "lac":
-            assert model.alpha3 == trial.params["alpha3"] and model.critic.output_dim == trial.params["output_dim"]
+            assert model.alpha3 == trial.params["alpha3"] and model.critic.n_critics == trial.params["n_critics"]
             assert model.lambda_init == model.lambda_max == trial.params["lambda_max"]
 
 
