@@ -20,130 +20,26 @@ import gymnasium as gym
 import numpy as np
 import pandas as pd
 import torch as th
+from stable_baselines3 import SAC
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.torch_layers import create_mlp
-from stable_baselines3.common.type_aliases import ReplayBufferSamples
-from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from torch import nn
 
 from benchmarks.control import DISTURBANCES, roll_out, shares_of
 from benchmarks.study import Study, Tables, command_line, markdown, natural, positive, with_interval
 from sb3_lac import LAC
 from sb3_lac.envs import CostEnv
-from sb3_lac.policies import LyapunovCritic, LyapunovPolicy
 
 _STARTS = 20_000  # seed of the episodes that designs are judged by
-N_QUANTILES = 25
 
 
-class LogCritic(LyapunovCritic):
-    """Learns the logarithm of one plus the value over a scale."""
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self.scale: th.Tensor
-        self.register_buffer("scale", th.ones(1))
-
-    def root(self, values: th.Tensor) -> th.Tensor:
-        return values.sign() * (values.abs() / self.scale).log1p()
-
-    def value(self, roots: th.Tensor) -> th.Tensor:
-        return roots.sign() * roots.abs().clamp(max=40.0).expm1() * self.scale
-
-
-class LogPolicy(LyapunovPolicy):
-    """With the logarithm."""
-
-    def make_critic(self, features_extractor: Any = None) -> LyapunovCritic:
-        return LogCritic(**self._update_features_extractor(self.critic_kwargs, features_extractor)).to(self.device)
-
-
-class LogLAC(LAC):
-    """Takes a hundredth of the median cost of the first transitions for the scale."""
-
-    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        if self._n_updates == 0:
-            costs = -self.replay_buffer.rewards[: self.replay_buffer.pos]
-            for critic in (self.critic, self.critic_target):
-                critic.scale.fill_(max(0.01 * float(np.median(costs)), 1e-9))
-        super().train(gradient_steps, batch_size)
-
-
-class QuantileCritic(LyapunovCritic):
-    """Quantiles of the root."""
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        kinds = (kwargs["features_dim"] + self.action_space.shape[0], N_QUANTILES, kwargs["net_arch"], kwargs["activation_fn"])
-        for idx in range(self.n_critics):
-            self.lyapunov_networks[idx] = nn.Sequential(*create_mlp(*kinds))
-            self.add_module(f"lf{idx}", self.lyapunov_networks[idx])
-
-
-class QuantilePolicy(LyapunovPolicy):
-    """With quantiles."""
-
-    def make_critic(self, features_extractor: Any = None) -> LyapunovCritic:
-        return QuantileCritic(**self._update_features_extractor(self.critic_kwargs, features_extractor)).to(self.device)
-
-
-class QuantileLAC(LAC):
-    """The mean of L has no bias: quantiles commute with the root."""
-
-    def _critic_loss(self, current_values: Any, target_values: th.Tensor) -> Any:
-        levels = (th.arange(N_QUANTILES) + 0.5) / N_QUANTILES
-        error = target_values[:, None, :] - current_values[0][:, :, None]
-        huber = th.where(error.abs() > 1, error.abs() - 0.5, 0.5 * error.square())
-        return ((levels[None, :, None] - (error.detach() < 0).float()).abs() * huber).sum(dim=1).mean()
-
-    def _objective(self, roots: th.Tensor) -> th.Tensor:
-        # a root has no slope at 0
-        means = self.critic.value(roots).mean(dim=1)
-        return (means.sign() * (means.abs() + 1e-8).pow(self.critic.power)).mean()
-
-
-class ValueLAC(LAC):
-    """The actor lowers L."""
-
-    def _objective(self, roots: th.Tensor) -> th.Tensor:
-        return self.critic.value(roots).mean()
-
-
-class MetricSAC(ValueLAC):
-    """SAC in the metric: entropy in the target too."""
-
-    def _target_values(self, replay_data: ReplayBufferSamples, next_actions: th.Tensor) -> th.Tensor:
-        with th.no_grad():
-            next_actions, log_prob = self.actor.action_log_prob(replay_data.next_observations)
-            assert self.log_ent_coef is not None
-            roots = th.maximum(*self.critic_target(replay_data.next_observations, next_actions))
-            soft = self.critic_target.value(roots) + th.exp(self.log_ent_coef) * log_prob.reshape(-1, 1)
-            return self.critic.root(-replay_data.rewards + (1 - replay_data.dones) * self.gamma * soft)
-
-
-#: Algorithm, policy, its arguments and those of the algorithm.
-DESIGNS: dict[str, tuple[type[LAC], Any, dict[str, Any], dict[str, Any]]] = {
-    "quarter_two": (LAC, "MlpPolicy", {"power": 0.25, "n_critics": 2}, {}),
-    "quarter_one": (LAC, "MlpPolicy", {"power": 0.25, "n_critics": 1}, {}),
-    "half_two": (LAC, "MlpPolicy", {"power": 0.5, "n_critics": 2}, {}),
-    "half_one": (LAC, "MlpPolicy", {"power": 0.5, "n_critics": 1}, {}),
-    "quarter_two_falling_rate": (
-        LAC,
-        "MlpPolicy",
-        {"power": 0.25, "n_critics": 2},
-        {"learning_rate": LinearSchedule(1e-3, 0.0, 1.0)},
-    ),
-    "half_two_falling_rate": (
-        LAC,
-        "MlpPolicy",
-        {"power": 0.5, "n_critics": 2},
-        {"learning_rate": LinearSchedule(1e-3, 0.0, 1.0)},
-    ),
-    "log_two": (LogLAC, LogPolicy, {"n_critics": 2}, {}),
-    "quantiles_half_one": (QuantileLAC, QuantilePolicy, {"power": 0.5, "n_critics": 1}, {}),
-    "quarter_two_actor_on_L": (ValueLAC, "MlpPolicy", {"power": 0.25, "n_critics": 2}, {}),
-    "quarter_two_SAC": (MetricSAC, "MlpPolicy", {"power": 0.25, "n_critics": 2}, {"lambda_min": 1.0}),
-    "value_two": (LAC, "MlpPolicy", {"power": 1.0, "n_critics": 2}, {}),
+#: Algorithm, arguments of its policy and its own.
+DESIGNS: dict[str, tuple[type[OffPolicyAlgorithm], dict[str, Any], dict[str, Any]]] = {
+    "LAC": (LAC, {}, {}),
+    "SAC": (SAC, {}, {}),
+    "alpha3_0.3": (LAC, {}, {"alpha3": 0.3}),
+    "alpha3_0.03": (LAC, {}, {"alpha3": 0.03}),
+    "alpha3_0.003": (LAC, {}, {"alpha3": 0.003}),
 }
 
 
@@ -165,27 +61,33 @@ def _set_back(model: LAC, fresh: LAC, seed: int) -> None:
     model.action_space.seed(seed)
 
 
-def part(design: str, env_id: str, seeds: list[int], timesteps: int, episodes: int) -> Tables:
+def _in_units(env_id: str, factor: float) -> gym.Env[Any, Any]:
+    """An environment whose rewards have another unit."""
+    return gym.wrappers.TransformReward(gym.make(env_id), lambda reward: factor * float(reward))
+
+
+def part(design: str, env_id: str, seeds: list[int], timesteps: int, episodes: int, factor: float) -> Tables:
     """Train a design with several seeds on one problem, and judge it."""
     th.set_num_threads(1)
-    kind, policy, policy_kwargs, arguments = DESIGNS[design]
+    kind, policy_kwargs, arguments = DESIGNS[design]
+    if issubclass(kind, LAC):
+        arguments = {**arguments, "compile_update": True}
     make_env, rows = partial(gym.make, env_id), []
-    model: LAC | None = None
+    model: Any = None
     for seed in seeds:
         fresh = kind(
-            policy,
-            make_vec_env(env_id, 4, seed=seed),
+            "MlpPolicy",
+            make_vec_env(partial(_in_units, env_id, factor), 4, seed=seed),
             gamma=0.99,
             learning_starts=1000,
             buffer_size=200_000,
             gradient_steps=2,
             seed=seed,
             device="cpu",
-            compile_update=True,
             policy_kwargs={"net_arch": [64, 64], "activation_fn": nn.LeakyReLU, **policy_kwargs},
             **{"learning_rate": 1e-3, **arguments},
         )
-        if model is None:
+        if model is None or kind is SAC:
             model = fresh
         else:
             _set_back(model, fresh, seed)
@@ -200,6 +102,9 @@ def part(design: str, env_id: str, seeds: list[int], timesteps: int, episodes: i
                 "seed": seed,
                 "timesteps": timesteps,
                 "updates": model._n_updates,
+                "factor": factor,
+                "lambda": float(model.log_lambda.exp()) if kind is LAC else np.nan,
+                "ent_coef": float(model.log_ent_coef.exp()),
                 "cost": outcome["cost"].mean(),
                 "error_median": outcome["error"].median(),
                 "died": outcome["died"].mean(),
@@ -212,8 +117,8 @@ def part(design: str, env_id: str, seeds: list[int], timesteps: int, episodes: i
 def report(results: pd.DataFrame) -> str:
     """Costs, and shares that die."""
     rows = []
-    for design, of_design in results.groupby("design", sort=False):
-        row: dict[str, str] = {"design": str(design)}
+    for (design, factor), of_design in results.groupby(["design", "factor"], sort=False):
+        row: dict[str, str] = {"design": str(design), "costs times": f"{factor:g}"}
         for env_id, group in of_design.groupby("environment", sort=False):
             died = f", {100 * group['died'].mean():.1f} % die" if group["died"].any() else ""
             row[str(env_id)] = f"{with_interval(group['cost'])} (worst {group['cost'].max():.2g}{died})"
@@ -227,6 +132,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--designs", nargs="+", default=list(DESIGNS), choices=list(DESIGNS))
     parser.add_argument("--envs", nargs="+", default=list(DISTURBANCES), choices=list(DISTURBANCES))
     parser.add_argument("--seeds", nargs="+", type=natural, default=[100, 101, 102, 103, 104])
+    parser.add_argument("--factors", nargs="+", type=float, default=[1.0], help="of the rewards")
     parser.add_argument("--timesteps", type=positive, default=15_000)
     parser.add_argument("--episodes", type=positive, default=60)
     study = Study(parser, arguments)
@@ -238,8 +144,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
             "seeds": chosen.seeds,
             "timesteps": chosen.timesteps,
             "episodes": chosen.episodes,
+            "factor": factor,
         }
         for design in chosen.designs
+        for factor in chosen.factors
         for env_id in chosen.envs
     ]
     results = study.run(part, parts)["critics"]

@@ -36,7 +36,8 @@ class LyapunovCritic(BaseModel):
     larger than the mean of the roots.
 
     Where rewards are positive, ``L`` has an ``offset``, the value of states from which nothing is ever paid, and ``f`` is
-    negative wherever rewards are collected. The signed root is that of https://arxiv.org/abs/1805.11593 without its linear part.
+    negative wherever rewards are collected. The signed root, without a linear part, is that of
+    https://arxiv.org/abs/1805.11593.
 
     :param observation_space: Observation space
     :param action_space: Action space
