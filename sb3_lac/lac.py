@@ -28,10 +28,10 @@ class LAC(CostAlgorithm):
     This implementation uses the SB3 SAC implementation as base.
     Paper: https://arxiv.org/abs/2004.14288
 
-    The critic ``L(s, a) >= 0`` is the discounted sum of costs, and its networks learn a root of it, in which small costs count
-    beside large ones and whose gradient does not fade towards the goal. The actor lowers that root, and makes it decrease by
-    the share ``alpha3`` in each step: a Lagrange multiplier ``lambda`` enforces that, while ``ent_coef`` keeps the entropy up
-    as in SAC.
+    The critic ``L(s, a) >= 0`` is the discounted sum of costs. Its networks learn a root of it, in which small costs count
+    beside large ones and whose gradient does not fade towards the goal, and the actor lowers that root. ``L`` has to decrease
+    by ``alpha3`` times the cost in each step: a Lagrange multiplier ``lambda`` enforces that, while ``ent_coef`` keeps the
+    entropy up as in SAC.
 
     Note: the cost is ``bound - reward``, where ``bound`` is the largest reward (stated or seen, at least 0). A termination
     pays 0 for ever after, and so costs ``bound`` per step: where living pays, LAC lives.
@@ -68,11 +68,10 @@ class LAC(CostAlgorithm):
     :param target_update_interval: update the target networks every ``target_update_interval``
         gradient steps.
     :param target_entropy: target entropy when learning ``ent_coef`` (``ent_coef = 'auto'``)
-    :param published_update: Whether to have the paper's condition and actor: ``L`` decreases by ``alpha3`` times the cost, the
-        actor lowers ``L`` itself, in the states that follow the sampled ones instead of in these, and the critic's target has
-        the action of a target actor.
-    :param alpha3: Share by which the root of ``L`` has to decrease in each step. With 1 the condition cannot hold:
-        ``lambda`` then stays at ``lambda_max``, a fixed weight of the cost.
+    :param published_update: Whether to update as the paper does: the actor lowers ``L`` in the states that follow the
+        sampled ones instead of in these, and the critic's target has the action of a target actor.
+    :param alpha3: Share of the cost by which ``L`` has to decrease in each step. From 1 on the condition cannot hold
+        in stationary data: ``lambda`` then stays at ``lambda_max``, a fixed weight of the cost.
     :param lambda_init: Initial value of ``lambda``
     :param lambda_min: Lower limit of ``lambda`` (with ``lambda`` at zero, the actor would only maximise its entropy)
     :param lambda_max: Upper limit of ``lambda``
@@ -326,11 +325,8 @@ class LAC(CostAlgorithm):
         with th.set_grad_enabled(next_actions.requires_grad):
             next_roots = largest_value(self.critic(replay_data.next_observations, next_actions))
         roots = largest_value(current_roots).detach()
-        values = self.critic.lyapunov_of(roots)
-        if self.published_update:
-            difference = self.critic.value(next_roots) - self.critic.value(roots) + self.alpha3 * costs
-        else:
-            difference = self.critic.root(self.critic.lyapunov_of(next_roots)) - (1 - self.alpha3) * self.critic.root(values)
+        # L(s', a') <= L(s, a) - alpha3 * cost, both sides in the metric of the critic
+        difference = next_roots - self.critic.root(self.critic.value(roots) - self.alpha3 * costs)
         going_on = 1 - replay_data.dones
         violation = (going_on * difference).sum() / going_on.sum().clamp(min=1)
 
@@ -366,7 +362,7 @@ class LAC(CostAlgorithm):
             "lambda_saturation": self.log_lambda >= log_lambda_max,
             "lambda_loss": lambda_loss,
             "lyapunov_difference": violation,
-            "lyapunov_mean": values.mean(),
+            "lyapunov_mean": self.critic.lyapunov_of(roots).mean(),
             "cost": costs.mean(),
         }
 

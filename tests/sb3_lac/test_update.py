@@ -120,12 +120,8 @@ def test_train_is_the_update_of_the_equations(make_model_without_env, n_critics,
         if published_update:
             next_actions, _ = policy_sample(actor, next_obs)
         next_roots = roots_of(critic, next_obs, next_actions, n_critics)
-        if published_update:
-            # Nowhere cut off at zero, where the actor would learn nothing
-            next_values, values_of_roots = (x.amax(dim=0) ** 3 * abs(x.amax(dim=0)) for x in (next_roots, roots.detach()))
-            difference = next_values - values_of_roots + ALPHA3 * costs
-        else:
-            difference = root(lyapunov(next_roots, offset)) - (1 - ALPHA3) * root(values)
+        relative = roots.detach().amax(dim=0) ** 3 * abs(roots.detach().amax(dim=0))
+        difference = next_roots.amax(dim=0) - root(relative - ALPHA3 * costs)
         # Where the episode goes on
         d = difference[dones == 0].mean()
         objective = d if published_update else roots_of(critic, obs, actions_pi, n_critics).amax(dim=0).mean()
