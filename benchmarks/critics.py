@@ -22,11 +22,11 @@ import pandas as pd
 import torch as th
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.torch_layers import create_mlp
-from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.utils import LinearSchedule
 from torch import nn
 
 from benchmarks.control import DISTURBANCES, roll_out, shares_of
+from benchmarks.metric_sac import MetricSAC
 from benchmarks.study import Study, Tables, command_line, markdown, natural, positive, with_interval
 from sb3_lac import LAC
 from sb3_lac.envs import CostEnv
@@ -109,18 +109,6 @@ class ValueLAC(LAC):
         return self.critic.value(roots).mean()
 
 
-class MetricSAC(ValueLAC):
-    """SAC in the metric: entropy in the target too."""
-
-    def _target_values(self, replay_data: ReplayBufferSamples, next_actions: th.Tensor) -> th.Tensor:
-        with th.no_grad():
-            next_actions, log_prob = self.actor.action_log_prob(replay_data.next_observations)
-            assert self.log_ent_coef is not None
-            roots = th.maximum(*self.critic_target(replay_data.next_observations, next_actions))
-            soft = self.critic_target.value(roots) + th.exp(self.log_ent_coef) * log_prob.reshape(-1, 1)
-            return self.critic.root(-replay_data.rewards + (1 - replay_data.dones) * self.gamma * soft)
-
-
 #: Algorithm, policy, its arguments and those of the algorithm.
 DESIGNS: dict[str, tuple[type[LAC], Any, dict[str, Any], dict[str, Any]]] = {
     "quarter_two": (LAC, "MlpPolicy", {"power": 0.25, "n_critics": 2}, {}),
@@ -142,7 +130,7 @@ DESIGNS: dict[str, tuple[type[LAC], Any, dict[str, Any], dict[str, Any]]] = {
     "log_two": (LogLAC, LogPolicy, {"n_critics": 2}, {}),
     "quantiles_half_one": (QuantileLAC, QuantilePolicy, {"power": 0.5, "n_critics": 1}, {}),
     "quarter_two_actor_on_L": (ValueLAC, "MlpPolicy", {"power": 0.25, "n_critics": 2}, {}),
-    "quarter_two_SAC": (MetricSAC, "MlpPolicy", {"power": 0.25, "n_critics": 2}, {"lambda_min": 1.0}),
+    "quarter_two_SAC": (MetricSAC, "MlpPolicy", {"power": 0.25, "n_critics": 2}, {}),
     "value_two": (LAC, "MlpPolicy", {"power": 1.0, "n_critics": 2}, {}),
 }
 
