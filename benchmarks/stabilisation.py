@@ -1,20 +1,23 @@
 """
-LAC, SAC, TD3 and TQC on the six cost environments, beside their reference controllers: what a policy costs, whether it ends at
-the goal, what disturbances that it was not trained for do to it, and what a certificate says of it.
+LAC, SAC, TD3 and TQC on the six cost environments, beside their reference controllers: how fast they learn, what a policy
+costs, whether it ends at the goal, what disturbances that it was not trained for do to it, and what a certificate says of it.
 
 .. code-block:: bash
 
   python -m benchmarks.stabilisation --timesteps 16000 --seeds 0 1 2
-  python -m benchmarks.stabilisation --algos lac sac td3 tqc
+  python -m benchmarks.stabilisation --algos lac sac td3 tqc metric_sac --compile
 
 Policies are trained without disturbances, with the hyperparameters of ``zoo_configs``, and judged by their mean action. All of
-them have the same starts and disturbances. What is done is not done again when the command is repeated, so that seeds can be
-added. ``tensorboard --logdir results/stabilisation/models`` overlays the curves of all trainings.
+them have the same starts and disturbances. ``metric_sac`` is SAC with critics that learn in LAC's metric, which tells what is
+LAC's from what is the metric's. What is done is not done again when the command is repeated, so that seeds can be added.
+``tensorboard --logdir results/stabilisation/models`` overlays the curves of all trainings.
 """
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +25,13 @@ import gymnasium as gym
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogFormatter
+from matplotlib.ticker import EngFormatter, LogFormatter
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from battery_env.evaluation import over_seeds
 from battery_env.plotting import COLOURS, new_figure
-from benchmarks.control import DISTURBANCES, SETTLED_SHARE, SHARES, conditions, draw_shares, judge, tried
+from benchmarks.control import DISTURBANCES, SETTLED_SHARE, SHARES, conditions, draw_shares, judge, roll_out, shares_of, tried
 from benchmarks.study import (
     Study,
     Tables,
@@ -39,20 +43,70 @@ from benchmarks.study import (
     positive,
     share_with_range,
     with_interval,
+    write_text,
 )
-from benchmarks.training import Recipe, train_or_load, training_minutes
-from sb3_lac.envs import reference_controller
+from benchmarks.training import Recipe, record_file, train_or_load, training_minutes
+from sb3_lac.envs import CostEnv, reference_controller
 
 _REFERENCE = "reference"
+_METRIC_SAC = "SAC, LAC's metric"
 # how they are drawn
 _STYLES = {
     "LAC": (COLOURS[0], "o"),
     "SAC": (COLOURS[1], "s"),
     "TD3": (COLOURS[2], "^"),
     "TQC": (COLOURS[3], "D"),
+    _METRIC_SAC: (COLOURS[4], "v"),
     _REFERENCE: ("black", "|"),
 }
-ALGORITHMS = [name.lower() for name in _STYLES if name != _REFERENCE]
+#: What algorithms are called in tables and figures.
+ALGORITHMS = {"lac": "LAC", "sac": "SAC", "td3": "TD3", "tqc": "TQC", "metric_sac": _METRIC_SAC}
+_COMPILED = ("lac", "metric_sac")
+# learning curves, whose episodes have other starts than those of all other judgements
+_POINTS, _CURVE_EPISODES, _CURVE_SEED = 12, 30, 40_000
+
+
+class LearningCurve(BaseCallback):
+    """
+    Judges the mean action while a policy is trained, at evenly spaced points of which the last is the end, and writes what it
+    costs when the training has ended.
+
+    :param env_id: id of the environment
+    :param timesteps: environment steps of the training
+    :param file: table to write
+    """
+
+    def __init__(self, env_id: str, timesteps: int, file: Path) -> None:
+        super().__init__()
+        self.env_id, self.timesteps, self.file = env_id, timesteps, file
+        self.rows: list[dict[str, float]] = []
+
+    def _on_step(self) -> bool:
+        if len(self.rows) + 1 < _POINTS and self.num_timesteps >= self.timesteps * (len(self.rows) + 1) / _POINTS:
+            self._judge()
+        return True
+
+    def _on_training_end(self) -> None:
+        self._judge()
+        write_text(self.file, pd.DataFrame(self.rows).to_csv(index=False))
+
+    def _judge(self) -> None:
+        start = time.perf_counter()
+        judged = {"timesteps": self.model.num_timesteps, "updates": getattr(self.model, "_n_updates", np.nan)}
+        judged |= _cost_of(self.model, self.env_id)
+        self.rows.append(judged | {"seconds": time.perf_counter() - start})
+
+
+def _cost_of(policy: PolicyPredictor, env_id: str) -> dict[str, float]:
+    outcome = roll_out(policy, partial(gym.make, env_id), _CURVE_EPISODES, seed=_CURVE_SEED)
+    problem = gym.make(env_id).unwrapped
+    assert isinstance(problem, CostEnv)
+    return {"cost": outcome["cost"].mean(), "at_goal": shares_of(outcome, problem.error_tolerance)["at_goal"]}
+
+
+def _recipe(policy: str, env_id: str, seed: int, timesteps: int | None) -> Recipe:
+    algo = "benchmarks.metric_sac:MetricSAC" if policy == "metric_sac" else policy
+    return Recipe.of(algo, env_id, seed, timesteps)
 
 
 def part(
@@ -64,22 +118,32 @@ def part(
     episodes: int,
     certificate_episodes: int,
     models: Path,
+    compiled: bool,
 ) -> Tables:
     """Train a policy, or take the reference controller, and judge it."""
     predictor: PolicyPredictor
     if policy == _REFERENCE:
         predictor, updates, minutes = reference_controller(gym.make(env_id)), None, None
+        learning = pd.DataFrame([{"timesteps": np.nan, "updates": np.nan, **_cost_of(predictor, env_id)}])
     else:
         assert seed is not None and timesteps is not None
+        made_from = _recipe(policy, env_id, seed, timesteps)
+        if made_from.digest != recipe:
+            raise RuntimeError(
+                f"the hyperparameters of {policy} on {env_id} have changed since the study began: start it again"
+            )
         folder = models / f"{env_id}_{policy}_seed{seed}"
-        model = train_or_load(policy, env_id, seed, timesteps, folder)
+        file = record_file(made_from, folder).with_name(f"learning_{made_from.name}.csv")
+        curve = LearningCurve(env_id, timesteps, file)
+        compile_update = compiled and policy in _COMPILED
+        model = train_or_load(made_from.algo, env_id, seed, timesteps, folder, callback=curve, compile_update=compile_update)
         # of all algorithms that learn from a replay buffer
         predictor, updates = model, getattr(model, "_n_updates", None)
-        minutes = training_minutes(Recipe.of(policy, env_id, seed, timesteps), folder)
+        learning = pd.read_csv(file)
+        minutes = training_minutes(made_from, folder) - learning.pop("seconds").sum() / 60.0
+    of_policy = {"environment": env_id, "policy": ALGORITHMS.get(policy, policy), "seed": seed}
     described: dict[str, Any] = {
-        "environment": env_id,
-        "policy": policy if policy == _REFERENCE else policy.upper(),
-        "seed": seed,
+        **of_policy,
         "timesteps": timesteps,
         "updates": updates,
         "training_minutes": minutes,
@@ -87,7 +151,11 @@ def part(
     }
     outcomes = tried(predictor, env_id, episodes).drop(columns="environment")
     certificates = pd.DataFrame(judge(predictor, env_id, certificate_episodes))
-    return {"stabilisation": _beside(described, outcomes), "certificates": _beside(described, certificates)}
+    return {
+        "stabilisation": _beside(described, outcomes),
+        "certificates": _beside(described, certificates),
+        "learning": _beside(of_policy, learning),
+    }
 
 
 def _beside(described: dict[str, Any], rows: pd.DataFrame) -> pd.DataFrame:
@@ -163,7 +231,7 @@ def report(tables: Tables) -> str:
             markdown(undisturbed_table(results)),
             "Share of the episodes that end at the goal, and in brackets of those that die:\n",
             markdown(disturbed_table(results)),
-            "Certificates, of a function that is fitted to the policy's roll-outs, and of LAC's critic:\n",
+            "Certificates, of a function that is fitted to the policy's roll-outs, and of critics in LAC's metric:\n",
             markdown(certificate_table(tables["certificates"])),
         ]
     )
@@ -201,6 +269,33 @@ def plot_costs(results: pd.DataFrame) -> Figure:
     return figure
 
 
+def plot_learning(learning: pd.DataFrame) -> Figure:
+    """
+    Cost of the mean action while policies are trained, one panel per environment: the interquartile mean over seeds in a band
+    from the least to the most of a seed, and the reference controller.
+    """
+    envs = list(learning["environment"].unique())
+    figure, panels = new_panels(len(envs), 3, (3.1, 2.3), margin=(0.0, 0.4))
+    for axes, env_id in zip(panels, envs, strict=True):
+        of_env = learning[learning["environment"] == env_id]
+        for name, (colour, marker) in _STYLES.items():
+            of_policy = of_env[of_env["policy"] == name]
+            if name == _REFERENCE:
+                axes.axhline(float(of_policy["cost"].iloc[0]), color=colour, ls="--", lw=1.0, label=name)
+            elif not of_policy.empty:
+                costs = of_policy.pivot_table(index="seed", columns="timesteps", values="cost").dropna(axis="columns")
+                axes.fill_between(costs.columns, costs.min(), costs.max(), color=colour, alpha=0.15, lw=0)
+                axes.plot(costs.columns, over_seeds(costs)[0], marker=marker, ms=3, lw=1.4, color=colour, label=name)
+        axes.set(title=env_id, yscale="log")
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    for axes in panels[::3]:
+        axes.set_ylabel("cost per step")
+    for axes in panels[-3:]:
+        axes.set_xlabel("environment steps")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(_STYLES), fontsize="small")
+    return figure
+
+
 def plot_disturbances(results: pd.DataFrame) -> Figure:
     """
     One map per environment: the share of episodes at the goal, and in brackets of those that die, by policy and disturbance.
@@ -218,10 +313,13 @@ def plot_disturbances(results: pd.DataFrame) -> Figure:
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command line."""
     parser = command_line("stabilisation", __doc__)
-    parser.add_argument("--algos", nargs="+", default=["lac", "sac", "td3"], choices=ALGORITHMS)
+    parser.add_argument("--algos", nargs="+", default=["lac", "sac", "td3"], choices=list(ALGORITHMS))
     parser.add_argument("--envs", nargs="+", default=list(DISTURBANCES), choices=list(DISTURBANCES))
     parser.add_argument("--seeds", nargs="+", type=natural, default=[0, 1, 2, 3, 4])
-    parser.add_argument("--timesteps", type=positive, help="environment steps at most; those of zoo_configs by default")
+    parser.add_argument(
+        "--timesteps", type=positive, help="environment steps on every problem; those of zoo_configs by default"
+    )
+    parser.add_argument("--compile", action="store_true", help="compile the updates of lac and metric_sac to one graph each")
     parser.add_argument("--episodes", type=positive, default=100, help="episodes for each policy and disturbance")
     parser.add_argument("--certificate-episodes", type=positive, default=50, help="to fit, to judge and to certify, each")
     study = Study(parser, arguments)
@@ -235,22 +333,23 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for seed in chosen.seeds:
         for env_id in chosen.envs:
             for algo in chosen.algos:
-                timesteps = Recipe.of(algo, env_id, seed).timesteps
-                timesteps = min(timesteps, chosen.timesteps or timesteps)
                 try:
-                    recipe = Recipe.of(algo, env_id, seed, timesteps).digest
+                    recipe = _recipe(algo, env_id, seed, chosen.timesteps)
                 except ValueError as error:
                     parser.error(str(error))
-                parts.append(
-                    {"policy": algo, "env_id": env_id, "seed": seed, "timesteps": timesteps, "recipe": recipe, **judged}
-                )
+                made_from = {"seed": seed, "timesteps": recipe.timesteps, "recipe": recipe.digest}
+                parts.append({"policy": algo, "env_id": env_id, **made_from, **judged})
     study.configuration["disturbances"] = {env_id: conditions(env_id) for env_id in chosen.envs}
     tables = {
         name: table.sort_values(["environment", "policy"], key=_in_order, kind="stable", ignore_index=True)
-        for name, table in study.run(part, parts, models=study.out / "models").items()
+        for name, table in study.run(part, parts, models=study.out / "models", compiled=chosen.compile).items()
     }
     results = tables["stabilisation"]
-    figures = {"costs": plot_costs(results), "disturbances": plot_disturbances(results)}
+    figures = {
+        "costs": plot_costs(results),
+        "disturbances": plot_disturbances(results),
+        "learning": plot_learning(tables["learning"]),
+    }
     study.write(tables, figures, report(tables))
 
 

@@ -92,7 +92,8 @@ class Recipe:
             of_dicts = environment["observation_space"].startswith("Dict(")
             source, entry = "defaults", {"policy": "MultiInputPolicy" if of_dicts else "MlpPolicy"}
         else:
-            source, config = "zoo_configs", find_config(kind.__name__.lower() if ":" in algo else algo)
+            named = kind.__name__.lower() if ":" in algo else algo
+            source, config = "zoo_configs", find_config(getattr(kind, "zoo_config", named))
             entries = yaml.safe_load(config.read_text(encoding="utf-8"))
             plain_id = registered_id(env_id)
             if plain_id not in entries:
@@ -173,7 +174,8 @@ def _digest_of_source(module: str) -> str:
     except TypeError as error:
         raise ValueError(f"{module} has no file of its own: name the module that defines what you mean") from error
     top = file.parent
-    if not (top / "__init__.py").exists():
+    # of the benchmarks one file too: a change of another one must not discard a run
+    if not (top / "__init__.py").exists() or top == Path(__file__).parent:
         return digest_of({file.name: sha256(file.read_bytes()).hexdigest()})
     # of a package all files, for the module that is named may only pass on what others define
     while (top.parent / "__init__.py").exists():
@@ -238,17 +240,27 @@ def set_up(recipe: Recipe, folder: Path, **options: Any) -> tuple[LACExperimentM
 
 
 def train_or_load(
-    algo: str, env_id: str, seed: int, timesteps: int, folder: Path, hyperparameters: dict[str, Any] | None = None
+    algo: str,
+    env_id: str,
+    seed: int,
+    timesteps: int,
+    folder: Path,
+    hyperparameters: dict[str, Any] | None = None,
+    callback: BaseCallback | None = None,
+    compile_update: bool = False,
 ) -> BaseAlgorithm:
-    """Train one policy, or load it if that has been done."""
+    """
+    Train one policy, or load it if that has been done. A callback that changes nothing, and whether updates are compiled, are
+    no part of the recipe.
+    """
     recipe = Recipe.of(algo, env_id, seed, timesteps, hyperparameters=hyperparameters)
     record = record_file(recipe, folder)
     file = record.with_suffix(".zip")
     if not file.exists():
         start = time.perf_counter()
-        _, model = set_up(recipe, folder / "zoo")
+        _, model = set_up(recipe, folder / "zoo", hyperparams={"compile_update": True} if compile_update else {})
         model.set_logger(configure(str(folder), ["csv", "tensorboard"]))
-        model.learn(timesteps)
+        model.learn(timesteps, callback)
         minutes = (time.perf_counter() - start) / 60.0
         described = {"recipe": asdict(recipe), "training_minutes": minutes, "versions": versions()}
         write_json(record, described)

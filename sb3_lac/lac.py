@@ -295,6 +295,10 @@ class LAC(CostAlgorithm):
             # where bound + gamma * offset = offset is left out on both sides
             return -replay_data.rewards + (1 - replay_data.dones) * discounts * next_values
 
+    def _objective(self, roots: th.Tensor) -> th.Tensor:
+        """What the actor lowers, given the roots at its actions."""
+        return roots.mean()
+
     def _update(self, replay_data: ReplayBufferSamples, costs: th.Tensor, update_targets: bool) -> Metrics:
         """One update of all that is learned."""
         # We need to sample because `log_std` may have changed between two gradient steps
@@ -338,7 +342,7 @@ class LAC(CostAlgorithm):
         ent_coef = self.ent_coef_tensor if self.log_ent_coef is None else th.exp(self.log_ent_coef.detach())
         objective = violation
         if not self.published_update:
-            objective = largest_value(self.critic(replay_data.observations, actions_pi)).mean()
+            objective = self._objective(largest_value(self.critic(replay_data.observations, actions_pi)))
         actor_loss = lambda_coef * objective + ent_coef * log_prob.mean()
 
         # Optimize the critic and the actor, both with the gradient at the current parameters

@@ -15,10 +15,14 @@ def train_nothing(monkeypatch) -> Callable[[ModuleType], list[tuple]]:
 
         asked = []
 
-        def train_or_load(algo, env_id, seed, timesteps, folder):
+        def train_or_load(algo, env_id, seed, timesteps, folder, callback=None, compile_update=False):
             asked.append((algo, env_id, seed, timesteps))
             write_json(record_file(Recipe.of(algo, env_id, seed, timesteps), folder), {"training_minutes": 1.5})
-            return LAC("MlpPolicy", env_id, device="cpu", buffer_size=10, seed=seed, policy_kwargs={"net_arch": [8]})
+            model = LAC("MlpPolicy", env_id, device="cpu", buffer_size=10, seed=seed, policy_kwargs={"net_arch": [8]})
+            if callback is not None:
+                callback.init_callback(model)
+                callback.on_training_end()
+            return model
 
         monkeypatch.setattr(benchmark, "train_or_load", train_or_load)
         return asked

@@ -206,12 +206,16 @@ def test_stabilisation_is_written_and_seeds_can_be_added(tmp_path, quick, capsys
     command += ["--certificate-episodes", "25", "--jobs", "1", "--out", str(tmp_path)]
     stabilisation.main([*command, "--seeds", "0"])
     stabilisation.main([*command, "--seeds", "0", "1"])
-    # No more than zoo_configs has, and nothing twice
-    assert quick[1] == [("lac", "LinearCost-v0", 0, 10_000), ("lac", "LinearCost-v0", 1, 10_000)]
-    results, certificates = (pd.read_csv(tmp_path / f"{name}.csv") for name in ("stabilisation", "certificates"))
+    # As long as was asked for, and nothing twice
+    assert quick[1] == [("lac", "LinearCost-v0", 0, 20_000), ("lac", "LinearCost-v0", 1, 20_000)]
+    names = ("stabilisation", "certificates", "learning")
+    results, certificates, learning = (pd.read_csv(tmp_path / f"{name}.csv") for name in names)
     assert results["policy"].tolist() == 12 * ["LAC"] + 6 * ["reference"]
     assert certificates["function"].tolist() == ["fitted", "critic", "fitted", "critic", "fitted"]
-    assert results["training_minutes"].tolist()[:12] == 12 * [1.5]
+    # without what the learning curve took
+    assert results["training_minutes"].iloc[:12].between(1.4, 1.5, inclusive="left").all()
+    assert learning["policy"].tolist() == ["LAC", "LAC", "reference"] and learning["cost"].notna().all()
+    assert list(learning) == ["environment", "policy", "seed", "timesteps", "updates", "cost", "at_goal"]
     # An untrained policy is no match for the optimum, whose starts it has
     undisturbed = results[results["disturbance"] == "none"].set_index("policy")["cost"]
     assert undisturbed["LAC"].gt(undisturbed["reference"]).all()
@@ -219,7 +223,36 @@ def test_stabilisation_is_written_and_seeds_can_be_added(tmp_path, quick, capsys
     assert record["configuration"]["disturbances"]["LinearCost-v0"]["action delay"] == {"action_delay": 2}
     text = (tmp_path / "stabilisation.md").read_text(encoding="utf-8")
     assert text in capsys.readouterr().out and "| LAC (critic)" in text and "nan" not in text
-    assert all((tmp_path / name).stat().st_size > 1000 for name in ("costs.png", "disturbances.png"))
+    assert all((tmp_path / name).stat().st_size > 1000 for name in ("costs.png", "disturbances.png", "learning.png"))
+
+
+def test_without_a_number_of_steps_it_is_that_of_the_zoo(tmp_path, quick):
+    command = ["--envs", "LinearCost-v0", "--algos", "sac", "metric_sac", "--seeds", "0", "--episodes", "2", "--jobs", "1"]
+    stabilisation.main([*command, "--certificate-episodes", "25", "--out", str(tmp_path)])
+    algos = ("sac", "benchmarks.metric_sac:MetricSAC")
+    assert quick[1] == [(algo, "LinearCost-v0", 0, 10_000) for algo in algos]
+    assert set(pd.read_csv(tmp_path / "learning.csv")["policy"]) == {"SAC", "SAC, LAC's metric", "reference"}
+
+
+def test_settings_that_change_during_a_study_are_refused(tmp_path):
+    with pytest.raises(RuntimeError, match="lac on LinearCost-v0 have changed since the study began"):
+        stabilisation.part("lac", "LinearCost-v0", 0, 2000, "0" * 8, 1, 25, tmp_path, False)
+
+
+def test_a_learning_curve_is_evenly_spaced_and_changes_no_training(tmp_path, monkeypatch):
+    monkeypatch.setattr(stabilisation, "_CURVE_EPISODES", 2)
+    monkeypatch.setattr(stabilisation, "_POINTS", 4)
+    curve = stabilisation.LearningCurve("LinearCost-v0", 40, tmp_path / "run" / "curve.csv")
+    models = []
+    for callback in (None, curve):
+        arguments = {"buffer_size": 50, "learning_starts": 10, "batch_size": 4, "policy_kwargs": {"net_arch": [8]}}
+        models.append(LAC("MlpPolicy", "LinearCost-v0", seed=0, device="cpu", **arguments).learn(40, callback))
+    for with_curve, without in zip(models[1].policy.parameters(), models[0].policy.parameters(), strict=True):
+        assert (with_curve == without).all()
+    learning = pd.read_csv(curve.file)
+    assert learning["timesteps"].tolist() == [10, 20, 30, 40] and learning["updates"].iloc[-1] == models[1]._n_updates
+    last = control.roll_out(models[1], partial(gym.make, "LinearCost-v0"), 2, seed=stabilisation._CURVE_SEED)
+    assert learning["cost"].iloc[-1] == pytest.approx(last["cost"].mean())
 
 
 def test_tables_of_stabilisation_count_episodes_and_seeds():
@@ -238,7 +271,9 @@ def test_tables_of_stabilisation_count_episodes_and_seeds():
 
 
 def test_all_algorithms_have_the_same_budget():
-    configs = [yaml.safe_load(find_config(algo).read_text(encoding="utf-8")) for algo in stabilisation.ALGORITHMS]
+    # that of metric_sac is LAC's
+    algos = [algo for algo in stabilisation.ALGORITHMS if algo != "metric_sac"]
+    configs = [yaml.safe_load(find_config(algo).read_text(encoding="utf-8")) for algo in algos]
     for env_id, config in itertools.product(IDS, configs):
         for name in ("n_timesteps", "n_envs", "gradient_steps", "learning_starts"):
             assert config[env_id][name] == configs[0][env_id][name]

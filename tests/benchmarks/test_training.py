@@ -1,6 +1,7 @@
 """A policy is trained once, with the hyperparameters it should have, and known by what it was made from."""
 
 import json
+from hashlib import sha256
 from pathlib import Path
 
 import gymnasium as gym
@@ -9,7 +10,8 @@ import pytest
 import torch as th
 
 from benchmarks import training
-from sb3_lac import LAC
+from benchmarks.study import digest_of
+from sb3_lac import LAC, compiled
 
 ENV_ID = "LinearCost-v0"
 PUBLISHED = Path(__file__).parents[2] / "docs" / "results"
@@ -135,6 +137,23 @@ def test_beside_a_model_stands_what_made_it(tmp_path):
     record = json.loads(training.record_file(recipe, tmp_path).read_text())
     assert training.Recipe(**record["recipe"]) == recipe
     assert record["training_minutes"] > 0 and "torch" in record["versions"]
+
+
+def test_compilation_is_no_part_of_the_recipe(tmp_path, monkeypatch, trainings):
+    monkeypatch.setattr(compiled, "BACKEND", "eager")
+    model = training.train_or_load("lac", ENV_ID, 0, 25, tmp_path, compile_update=True)
+    assert model.compile_update and not training.set_up(training.Recipe.of("lac", ENV_ID, 0, 25), tmp_path)[1].compile_update
+    trainings.clear()
+    assert training.train_or_load("lac", ENV_ID, 0, 25, tmp_path).num_timesteps == 25 and not trainings
+
+
+def test_an_algorithm_may_name_whose_settings_it_has(tmp_path):
+    recipe = training.Recipe.of("benchmarks.metric_sac:MetricSAC", ENV_ID, 0)
+    assert recipe.hyperparameters == training.Recipe.of("lac", ENV_ID, 0).hyperparameters
+    assert training.train_or_load(recipe.algo, ENV_ID, 0, 25, tmp_path).alpha3 == 0.7
+    # of this package only the file that is named counts
+    source = Path(training.__file__).with_name("metric_sac.py")
+    assert recipe.packages["benchmarks.metric_sac"] == digest_of({source.name: sha256(source.read_bytes()).hexdigest()})
 
 
 def test_an_interrupted_training_leaves_no_model(tmp_path, monkeypatch, trainings):
