@@ -1,6 +1,7 @@
 """Costs in place of rewards. Where no reward is positive, which is most often, a cost is the negated reward."""
 
 import math
+import warnings
 from typing import Any
 
 import numpy as np
@@ -93,6 +94,27 @@ class CostAlgorithm(OffPolicyAlgorithm):
         # Changes of the units round
         bound = th.maximum(self.cost_bound(vec_normalize), largest_reward)
         return bound * n_rewards - replay_data.rewards
+
+    def warn_of_free_terminations(self) -> None:
+        """Warn if what is stored shows no price of an early end: where that is a failure, it is the cheapest policy of all."""
+        buffer = self.replay_buffer
+        # A buffer that does not keep time limits apart cannot tell; and where living pays, an end costs the bound for ever
+        if buffer is None or not buffer.handle_timeout_termination or self.reward_bound > 0:
+            return
+        rewards, dones, timeouts = (stored[: buffer.size()] for stored in (buffer.rewards, buffer.dones, buffer.timeouts))
+        costs, ends = 0.0 - rewards, dones > timeouts
+        if not ends.any() or ends.all() or costs.min() < 0:
+            return
+        last, dearest = costs[ends].mean(), costs[~ends].max()
+        price = costs[~ends].mean() / (1 - self.gamma) if self.gamma < 1 else math.inf
+        if last <= dearest:
+            warnings.warn(
+                f"The last step before a termination costs {last:.3g} on average, no more than another step does (up to "
+                f"{dearest:.3g}). Where the end is the goal, all is well. Where it is a failure, to fail early is the "
+                "cheapest policy of any algorithm: give the last step a cost of its own, above that of going on, here about "
+                f"{price:.3g} (mean cost per step / (1 - gamma)).",
+                stacklevel=2,
+            )
 
 
 def reward_scale(vec_normalize: VecNormalize | None) -> float:

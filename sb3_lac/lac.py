@@ -389,6 +389,8 @@ class LAC(CostAlgorithm):
             return tuple(metrics), th.hstack(tuple(metrics.values()))
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        if self._n_updates == 0:
+            self.warn_of_free_terminations()
         # Switch to train mode (this affects batch norm / dropout)
         self.policy.set_training_mode(True)
         # Update optimizers learning rate

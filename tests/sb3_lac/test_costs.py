@@ -1,0 +1,107 @@
+"""What LAC says about an environment whose terminations cost nothing."""
+
+import warnings
+
+import gymnasium as gym
+import pytest
+from gymnasium import spaces
+from stable_baselines3.common.env_util import make_vec_env
+
+import sb3_lac.envs  # noqa: F401  # registers the ids
+
+
+class Priced(gym.Wrapper):
+    """A termination has a price."""
+
+    def __init__(self, env, price):
+        super().__init__(env)
+        self.price = price
+
+    def step(self, action):
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        return obs, reward - self.price * terminated, terminated, truncated, info
+
+
+def in_dict(env):
+    space = spaces.Dict({"state": env.observation_space})
+    return gym.wrappers.TransformObservation(env, lambda obs: {"state": obs}, space)
+
+
+def warnings_of(model, n_steps=60):
+    """What it says of terminations, in training and when that is continued."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        model.learn(n_steps)
+        model.learn(20, reset_num_timesteps=False)
+    assert model._n_updates > 0
+    return [str(warning.message) for warning in caught if "termination" in str(warning.message)]
+
+
+@pytest.mark.parametrize(
+    ("n_envs", "wrapper", "kwargs"),
+    [
+        (1, None, {}),
+        (3, None, {}),
+        (1, None, {"n_steps": 3}),
+        (1, None, {"buffer_size": 30}),
+        (2, in_dict, {"policy": "MultiInputPolicy"}),
+    ],
+)
+def test_free_terminations_warn_once(make_model, make_env, n_envs, wrapper, kwargs):
+    env = make_vec_env(lambda: make_env(episode_length=5, terminate=True), n_envs, wrapper_class=wrapper)
+    model = make_model(env, n_collect=0, gamma=0.9, **kwargs)
+    (message,) = warnings_of(model)
+    assert "the cheapest policy" in message
+
+
+def test_warning_names_the_costs(make_model):
+    class Fixed(gym.Env):
+        """Costs of 1, 3, 1, 3, and of 2 in the step that ends an episode."""
+
+        observation_space = action_space = spaces.Box(-1, 1, (1,))
+
+        def reset(self, seed=None, options=None):
+            self.n_steps = 0
+            return self.observation_space.low, {}
+
+        def step(self, action):
+            self.n_steps += 1
+            cost = 2 if self.n_steps == 5 else 3 - 2 * (self.n_steps % 2)
+            return self.observation_space.low, -cost, self.n_steps == 5, False, {}
+
+    (message,) = warnings_of(make_model(Fixed(), n_collect=0, gamma=0.75, learning_starts=39))
+    # 2 per step for ever: 2 / (1 - 0.75)
+    assert "costs 2 on average" in message and "(up to 3)" in message and "about 8 " in message
+    (message,) = warnings_of(make_model(Fixed(), n_collect=0, gamma=1.0, learning_starts=39))
+    assert "about inf " in message
+
+
+@pytest.mark.parametrize(
+    ("env", "kwargs"),
+    [
+        # a time limit; one that the buffer cannot tell from a termination; living pays; each step is an end
+        ({"terminate": False}, {}),
+        ({"terminate": False}, {"replay_buffer_kwargs": {"handle_timeout_termination": False}, "optimize_memory_usage": True}),
+        ({"terminate": True, "offset": 1.0}, {}),
+        ({"terminate": True}, {"reward_bound": 1.0}),
+        ({"terminate": True, "episode_length": 1}, {}),
+    ],
+)
+def test_nothing_to_warn_of(make_model, make_env, env, kwargs):
+    assert warnings_of(make_model(make_env(**{"episode_length": 5, **env}), n_collect=0, **kwargs)) == []
+
+
+def test_termination_with_a_price_does_not_warn(make_model, make_env):
+    # More than the dearest step, whose state is (10, 10) at most
+    env = Priced(make_env(episode_length=5, terminate=True), 200.0)
+    assert warnings_of(make_model(env, n_collect=0)) == []
+
+
+@pytest.mark.parametrize(
+    "env_id", ["CartPoleCost-v0", "LinearCost-v0", "Oscillator-v0", "PendulumCost-v0", "QuadrotorCost-v0", "VehicleCost-v0"]
+)
+def test_cost_environments_do_not_warn(make_model, env_id):
+    model = make_model(env_id, n_collect=0, learning_starts=400)
+    assert warnings_of(model, n_steps=401) == []
+    ends = model.replay_buffer.dones > model.replay_buffer.timeouts
+    assert ends.any() == (env_id in ("CartPoleCost-v0", "QuadrotorCost-v0", "VehicleCost-v0"))
