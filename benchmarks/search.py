@@ -48,7 +48,6 @@ _COMMON = ["learning_rate", "gamma", "tau"]
 _SOFT = [*_COMMON, "ent_coef", "target_entropy"]
 _TD3 = [*_COMMON, "noise_std", "target_policy_noise"]
 _DONE_OR_TO_DO = [TrialState.COMPLETE, TrialState.WAITING]
-_COST_NETWORKS = "net_arch=[64, 64], activation_fn=nn.LeakyReLU"  # as in zoo_configs
 
 
 @dataclass(frozen=True)
@@ -135,13 +134,10 @@ _COST = Family(
         "tau": [0.005, 0.01, 0.02],
         "ent_coef": (0.01, 10.0),
         "target_entropy": [-1.0, -2.0, -4.0, -6.0],
-        "output_dim": [0, 16],
-        "n_critics": [1, 2],
         "noise_std": (0.05, 0.5),
         "target_policy_noise": (0.05, 0.5),
     },
-    # LAC has a choice of critics that the others do not have
-    {"lac": ["learning_rate", "gamma", "ent_coef", "output_dim", "n_critics"], "sac": _SOFT, "td3": _TD3, "tqc": _SOFT},
+    {"lac": _SOFT, "sac": _SOFT, "td3": _TD3, "tqc": _SOFT},
     "{:.2g}",
     [
         {
@@ -150,8 +146,6 @@ _COST = Family(
             "tau": 0.005,
             "ent_coef": 0.1,
             "target_entropy": -2.0,
-            "output_dim": 16,
-            "n_critics": 1,
             "noise_std": 0.1,
             "target_policy_noise": 0.2,
         },
@@ -161,8 +155,6 @@ _COST = Family(
             "tau": 0.01,
             "ent_coef": 0.7,
             "target_entropy": -1.0,
-            "output_dim": 0,
-            "n_critics": 2,
             "noise_std": 0.3,
             "target_policy_noise": 0.3,
         },
@@ -194,9 +186,6 @@ def sampled(algo: str, env_id: str, trial: Trial) -> dict[str, Any]:
         settings["ent_coef"] = f"auto_{settings['ent_coef']:.2g}"
     if "target_policy_noise" in settings:
         settings["target_noise_clip"] = 2.0 * settings["target_policy_noise"]
-    if "output_dim" in settings:
-        critics = f"output_dim={settings.pop('output_dim')}, n_critics={settings.pop('n_critics')}"
-        settings["policy_kwargs"] = f"dict({_COST_NETWORKS}, {critics})"
     return settings
 
 
