@@ -230,7 +230,7 @@ def test_without_a_number_of_steps_it_is_that_of_the_zoo(tmp_path, quick):
     command = ["--envs", "LinearCost-v0", "--algos", "sac", "metric_sac", "--seeds", "0", "--episodes", "2", "--jobs", "1"]
     stabilisation.main([*command, "--certificate-episodes", "25", "--out", str(tmp_path)])
     algos = ("sac", "benchmarks.metric_sac:MetricSAC")
-    assert quick[1] == [(algo, "LinearCost-v0", 0, 10_000) for algo in algos]
+    assert quick[1] == [(algo, "LinearCost-v0", 0, 60_000) for algo in algos]
     assert set(pd.read_csv(tmp_path / "learning.csv")["policy"]) == {"SAC", "SAC, LAC's metric", "reference"}
 
 
