@@ -192,7 +192,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """The command line."""
     parser = command_line("linear_cost", __doc__)
     parser.add_argument("--seeds", nargs="+", type=natural, default=[0, 1, 2, 3, 4])
-    parser.add_argument("--timesteps", type=positive, default=10_000, help="environment steps of each training")
+    parser.add_argument("--timesteps", type=positive, default=15_000, help="environment steps of each training")
     parser.add_argument("--episodes", type=positive, default=100, help="episodes of the evaluation")
     study = Study(parser, arguments)
     chosen = study.chosen

@@ -102,15 +102,15 @@ def test_environments_and_filters_are_raced_and_written(monkeypatch, tmp_path, c
     assert "| batch of 3 cells" in shown and "| progpy, unscented Kalman filter" in shown and "1.00 (1.00 to 1.00)" in shown
 
 
-def products(env, width, algorithm):
+def products(env, width):
     """FLOPs of an update with one hidden layer, pass by pass."""
     observation, action = env.observation_space.shape[0], env.action_space.shape[0]
     actor_in, actor_out = observation * width, width * 2 * action
-    critic_in, critic_out = (observation + action) * width, width * (17 if algorithm is LAC else 1)
+    critic_in, critic_out = (observation + action) * width, width
     actor = 3 * actor_in + 4 * actor_out  # s and s', gradients of weights, and of what comes before the last layer
-    # (s, a), (s', a') twice, (s, pi); weights for (s, a); inputs of the last layer twice, and of the first for (s, pi).
-    # SAC, twice: target, (s, a), (s, pi); weights for both of the latter; inputs
-    critic = (1 if algorithm is LAC else 2) * (6 * critic_in + 7 * critic_out)
+    # Two of them. LAC: (s, a), (s', a') twice, (s, pi); weights for (s, a); inputs of the last layer twice, and of the first
+    # for (s, pi). SAC: target, (s, a), (s, pi); weights for both of the latter; inputs
+    critic = 2 * (6 * critic_in + 7 * critic_out)
     return 2 * 8 * (actor + critic)
 
 
@@ -118,7 +118,7 @@ def products(env, width, algorithm):
 def test_floating_point_operations_are_those_of_the_passes(algorithm):
     env = performance.many_cells(2)
     model = performance.ready_model(algorithm, [16], env, batch_size=8)
-    assert performance.update_flops(model) == products(env, 16, algorithm)
+    assert performance.update_flops(model) == products(env, 16)
 
 
 def test_bytes_are_those_of_adam_and_of_the_target():

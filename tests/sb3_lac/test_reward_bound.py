@@ -126,7 +126,7 @@ def test_lac_learns_to_live():
         seed=0,
         device="cpu",
     )
-    model.learn(900)
+    model.learn(1500)
     report = evaluate_lyapunov(model, BalanceEnv(), 10, deterministic=True, seed=0)
     assert report.episodes["length"].mean() > 60
 

@@ -230,7 +230,8 @@ def test_log_names_are_those_of_sac_and_unique_when_truncated(make_model, train_
 
 
 def test_update_reads_no_value_back_from_the_device(make_model, monkeypatch):
-    model = make_model()
+    # But for the first one, before which the costs of terminations are looked at
+    model = make_model(n_collect=41)
     reads = []
 
     def count(method):
