@@ -28,7 +28,9 @@ from torch import nn
 
 from benchmarks.control import DISTURBANCES, roll_out, shares_of
 from benchmarks.study import Study, Tables, command_line, markdown, natural, positive, with_interval
+import sb3_lac.lac as lac_module
 from sb3_lac import LAC
+from sb3_lac.policies import largest_value
 from sb3_lac.envs import CostEnv
 from sb3_lac.policies import LyapunovCritic, LyapunovPolicy
 
@@ -143,6 +145,59 @@ DESIGNS: dict[str, tuple[type[LAC], Any, dict[str, Any], dict[str, Any]]] = {
     "quantiles_half_one": (QuantileLAC, QuantilePolicy, {"power": 0.5, "n_critics": 1}, {}),
     "quarter_two_actor_on_L": (ValueLAC, "MlpPolicy", {"power": 0.25, "n_critics": 2}, {}),
     "quarter_two_SAC": (MetricSAC, "MlpPolicy", {"power": 0.25, "n_critics": 2}, {"lambda_min": 1.0}),
+    "quarter_lin2_tau": (LAC, "MlpPolicy", {"power": 0.25}, {"learning_rate": LinearSchedule(2e-3, 0.0, 1.0), "tau": 0.01}),
+    "half_lin2_tau": (LAC, "MlpPolicy", {"power": 0.5}, {"learning_rate": LinearSchedule(2e-3, 0.0, 1.0), "tau": 0.01}),
+    "quarter_lin1": (LAC, "MlpPolicy", {"power": 0.25}, {"learning_rate": LinearSchedule(1e-3, 0.0, 1.0), "tau": 0.005}),
+    "quarter_lin1_tau": (LAC, "MlpPolicy", {"power": 0.25}, {"learning_rate": LinearSchedule(1e-3, 0.0, 1.0), "tau": 0.01}),
+    "half_lin1_tau": (LAC, "MlpPolicy", {"power": 0.5}, {"learning_rate": LinearSchedule(1e-3, 0.0, 1.0), "tau": 0.01}),
+    "half_lin1": (LAC, "MlpPolicy", {"power": 0.5}, {"learning_rate": LinearSchedule(1e-3, 0.0, 1.0), "tau": 0.005}),
+    "quarter_lin3_tau": (LAC, "MlpPolicy", {"power": 0.25}, {"learning_rate": LinearSchedule(3e-3, 0.0, 1.0), "tau": 0.01}),
+    "third_lin2_tau": (LAC, "MlpPolicy", {"power": 1 / 3}, {"learning_rate": LinearSchedule(2e-3, 0.0, 1.0), "tau": 0.01}),
+    "quarter_lin2_tau2": (LAC, "MlpPolicy", {"power": 0.25}, {"learning_rate": LinearSchedule(2e-3, 0.0, 1.0), "tau": 0.02}),
+    "quarter_lin3_tau1": (LAC, "MlpPolicy", {"power": 0.25}, {"learning_rate": LinearSchedule(3e-3, 0.0, 1.0), "tau": 0.01}),
+    "quarter_lin3_tau2": (LAC, "MlpPolicy", {"power": 0.25}, {"learning_rate": LinearSchedule(3e-3, 0.0, 1.0), "tau": 0.02}),
+    "quarter_lin2_tau2_ent2": (
+        LAC,
+        "MlpPolicy",
+        {"power": 0.25},
+        {"learning_rate": LinearSchedule(2e-3, 0.0, 1.0), "tau": 0.02, "target_entropy": -2.0},
+    ),
+    "quarter_2_tau2": (LAC, "MlpPolicy", {"power": 0.25}, {"learning_rate": 2e-3, "tau": 0.02}),
+    "mean_quarter_lin2_tau2": (
+        LAC,
+        "MlpPolicy",
+        {"power": 0.25},
+        {"learning_rate": LinearSchedule(2e-3, 0.0, 1.0), "tau": 0.02},
+    ),
+    "mean_quarter_lin2_tau1": (
+        LAC,
+        "MlpPolicy",
+        {"power": 0.25},
+        {"learning_rate": LinearSchedule(2e-3, 0.0, 1.0), "tau": 0.01},
+    ),
+    "min_quarter_lin2_tau2": (
+        LAC,
+        "MlpPolicy",
+        {"power": 0.25},
+        {"learning_rate": LinearSchedule(2e-3, 0.0, 1.0), "tau": 0.02},
+    ),
+    "min_quarter_lin2_tau1": (
+        LAC,
+        "MlpPolicy",
+        {"power": 0.25},
+        {"learning_rate": LinearSchedule(2e-3, 0.0, 1.0), "tau": 0.01},
+    ),
+    "quarter_lin2_tau1_g98": (
+        LAC,
+        "MlpPolicy",
+        {"power": 0.25},
+        {"learning_rate": LinearSchedule(2e-3, 0.0, 1.0), "tau": 0.01, "gamma": 0.98},
+    ),
+    "quarter_2_tau1": (LAC, "MlpPolicy", {"power": 0.25}, {"learning_rate": 2e-3, "tau": 0.01}),
+    "quarter_2_tau1_g98": (LAC, "MlpPolicy", {"power": 0.25}, {"learning_rate": 2e-3, "tau": 0.01, "gamma": 0.98}),
+    "quarter_1_tau1": (LAC, "MlpPolicy", {"power": 0.25}, {"learning_rate": 1e-3, "tau": 0.01}),
+    "mean_quarter_1_tau1": (LAC, "MlpPolicy", {"power": 0.25}, {"learning_rate": 1e-3, "tau": 0.01}),
+    "mean_quarter_1": (LAC, "MlpPolicy", {"power": 0.25}, {"learning_rate": 1e-3, "tau": 0.005}),
     "value_two": (LAC, "MlpPolicy", {"power": 1.0, "n_critics": 2}, {}),
 }
 
@@ -169,13 +224,14 @@ def part(design: str, env_id: str, seeds: list[int], timesteps: int, episodes: i
     """Train a design with several seeds on one problem, and judge it."""
     th.set_num_threads(1)
     kind, policy, policy_kwargs, arguments = DESIGNS[design]
+    pooled = {"mean": lambda roots: sum(roots) / len(roots), "min": lambda roots: th.minimum(*roots)}
+    lac_module.largest_value = pooled.get(design.split("_")[0], largest_value)
     make_env, rows = partial(gym.make, env_id), []
     model: LAC | None = None
     for seed in seeds:
         fresh = kind(
             policy,
             make_vec_env(env_id, 4, seed=seed),
-            gamma=0.99,
             learning_starts=1000,
             buffer_size=200_000,
             gradient_steps=2,
@@ -183,7 +239,7 @@ def part(design: str, env_id: str, seeds: list[int], timesteps: int, episodes: i
             device="cpu",
             compile_update=True,
             policy_kwargs={"net_arch": [64, 64], "activation_fn": nn.LeakyReLU, **policy_kwargs},
-            **{"learning_rate": 1e-3, **arguments},
+            **{"learning_rate": 1e-3, "gamma": 0.99, **arguments},
         )
         if model is None:
             model = fresh
