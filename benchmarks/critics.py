@@ -111,6 +111,29 @@ class ValueLAC(LAC):
         return self.critic.value(roots).mean()
 
 
+class MeanTargetLAC(LAC):
+    """The target has the mean of the critics, and the actor lowers the larger one."""
+
+    def _target_values(self, replay_data: ReplayBufferSamples, next_actions: th.Tensor) -> th.Tensor:
+        with th.no_grad():
+            roots = sum(self.critic_target(replay_data.next_observations, next_actions)) / self.critic_target.n_critics
+            values = th.maximum(self.critic_target.value(roots), -self.critic_target.offset)
+            return self.critic.root(-replay_data.rewards + (1 - replay_data.dones) * self.gamma * values)
+
+
+class OwnTargetLAC(LAC):
+    """Each critic learns from its own target network, and the actor lowers the larger one."""
+
+    def _target_values(self, replay_data: ReplayBufferSamples, next_actions: th.Tensor) -> th.Tensor:
+        with th.no_grad():
+            roots = th.hstack(self.critic_target(replay_data.next_observations, next_actions))
+            values = th.maximum(self.critic_target.value(roots), -self.critic_target.offset)
+            return self.critic.root(-replay_data.rewards + (1 - replay_data.dones) * self.gamma * values)
+
+    def _critic_loss(self, current_values: Any, target_values: th.Tensor) -> Any:
+        return 0.5 * th.nn.functional.mse_loss(th.hstack(current_values), target_values) * len(current_values)
+
+
 class MetricSAC(ValueLAC):
     """SAC in the metric: entropy in the target too."""
 
@@ -198,6 +221,72 @@ DESIGNS: dict[str, tuple[type[LAC], Any, dict[str, Any], dict[str, Any]]] = {
     "quarter_1_tau1": (LAC, "MlpPolicy", {"power": 0.25}, {"learning_rate": 1e-3, "tau": 0.01}),
     "mean_quarter_1_tau1": (LAC, "MlpPolicy", {"power": 0.25}, {"learning_rate": 1e-3, "tau": 0.01}),
     "mean_quarter_1": (LAC, "MlpPolicy", {"power": 0.25}, {"learning_rate": 1e-3, "tau": 0.005}),
+    "quarter_lin2_tau1_ent3": (
+        LAC,
+        "MlpPolicy",
+        {"power": 0.25},
+        {"learning_rate": LinearSchedule(2e-3, 0.0, 1.0), "tau": 0.01, "entropies": 3},
+    ),
+    "quarter_lin2_tau1_ent2": (
+        LAC,
+        "MlpPolicy",
+        {"power": 0.25},
+        {"learning_rate": LinearSchedule(2e-3, 0.0, 1.0), "tau": 0.01, "entropies": 2},
+    ),
+    "half_lin2_tau1_ent3": (
+        LAC,
+        "MlpPolicy",
+        {"power": 0.5},
+        {"learning_rate": LinearSchedule(2e-3, 0.0, 1.0), "tau": 0.01, "entropies": 3},
+    ),
+    "quarter_lin2_tau1_n3": (
+        LAC,
+        "MlpPolicy",
+        {"power": 0.25},
+        {"learning_rate": LinearSchedule(2e-3, 0.0, 1.0), "tau": 0.01, "n_steps": 3},
+    ),
+    "quarter_lin2_tau1_n5": (
+        LAC,
+        "MlpPolicy",
+        {"power": 0.25},
+        {"learning_rate": LinearSchedule(2e-3, 0.0, 1.0), "tau": 0.01, "n_steps": 5},
+    ),
+    "min_quarter_lin2_tau1_n3": (
+        LAC,
+        "MlpPolicy",
+        {"power": 0.25},
+        {"learning_rate": LinearSchedule(2e-3, 0.0, 1.0), "tau": 0.01, "n_steps": 3},
+    ),
+    "quarter_lin2_tau1_g95": (
+        LAC,
+        "MlpPolicy",
+        {"power": 0.25},
+        {"learning_rate": LinearSchedule(2e-3, 0.0, 1.0), "tau": 0.01, "gamma": 0.95},
+    ),
+    "mean_target_lin2_tau1": (
+        MeanTargetLAC,
+        "MlpPolicy",
+        {"power": 0.25},
+        {"learning_rate": LinearSchedule(2e-3, 0.0, 1.0), "tau": 0.01},
+    ),
+    "mean_target_half_lin2_tau1": (
+        MeanTargetLAC,
+        "MlpPolicy",
+        {"power": 0.5},
+        {"learning_rate": LinearSchedule(2e-3, 0.0, 1.0), "tau": 0.01},
+    ),
+    "own_lin2_tau1": (
+        OwnTargetLAC,
+        "MlpPolicy",
+        {"power": 0.25},
+        {"learning_rate": LinearSchedule(2e-3, 0.0, 1.0), "tau": 0.01},
+    ),
+    "tmean_lin2_tau1": (
+        MeanTargetLAC,
+        "MlpPolicy",
+        {"power": 0.25},
+        {"learning_rate": LinearSchedule(2e-3, 0.0, 1.0), "tau": 0.01},
+    ),
     "value_two": (LAC, "MlpPolicy", {"power": 1.0, "n_critics": 2}, {}),
 }
 
@@ -227,6 +316,9 @@ def part(design: str, env_id: str, seeds: list[int], timesteps: int, episodes: i
     pooled = {"mean": lambda roots: sum(roots) / len(roots), "min": lambda roots: th.minimum(*roots)}
     lac_module.largest_value = pooled.get(design.split("_")[0], largest_value)
     make_env, rows = partial(gym.make, env_id), []
+    arguments = dict(arguments)
+    if "entropies" in arguments:
+        arguments["target_entropy"] = -float(arguments.pop("entropies") * make_env().action_space.shape[0])
     model: LAC | None = None
     for seed in seeds:
         fresh = kind(
@@ -256,6 +348,17 @@ def part(design: str, env_id: str, seeds: list[int], timesteps: int, episodes: i
                 "seed": seed,
                 "timesteps": timesteps,
                 "updates": model._n_updates,
+                "least_L": float(
+                    model.critic.lyapunov(
+                        *(
+                            th.as_tensor(a[-1000:].reshape(-1, a.shape[-1]))
+                            for a in (
+                                model.replay_buffer.observations[: model.replay_buffer.pos],
+                                model.replay_buffer.actions[: model.replay_buffer.pos],
+                            )
+                        )
+                    ).quantile(0.05)
+                ),
                 "cost": outcome["cost"].mean(),
                 "error_median": outcome["error"].median(),
                 "died": outcome["died"].mean(),
