@@ -11,6 +11,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
 from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, polyak_update, update_learning_rate
 from stable_baselines3.sac.policies import Actor
+from torch.nn import functional as F
 
 from sb3_lac.compiled import CompiledUpdate, Metrics, check_compiler, set_gradients, step, update_multiplier
 from sb3_lac.costs import CostAlgorithm
@@ -282,13 +283,12 @@ class LAC(CostAlgorithm):
         self.critic_target = self.policy.critic_target
 
     def _target_values(self, replay_data: ReplayBufferSamples, next_actions: th.Tensor) -> th.Tensor:
-        """What the critics learn the roots of, one column each: values of ``L``, relative to the offset."""
+        """What the critic learns the root of: values of ``L``, relative to its offset."""
         # For n-step replay, discount factor is gamma**n_steps (when no early termination)
         discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
         with th.no_grad():
-            # Compute the next Lyapunov values, never negative. Each critic has its own: the larger of several in all targets
-            # would add up, step by step, to an L that is far too large near the goal
-            next_roots = th.hstack(self.critic_target(replay_data.next_observations, next_actions))
+            # Compute the next Lyapunov values: max over all critics targets, never negative
+            next_roots = largest_value(self.critic_target(replay_data.next_observations, next_actions))
             next_values = th.maximum(self.critic_target.value(next_roots), -self.critic_target.offset)
             # td error, without entropy term. In terminal states nothing is paid any more, so that L is the offset:
             # y = (bound - reward) + gamma * ((1 - done) * (next_value + offset) + done * offset),
@@ -319,7 +319,8 @@ class LAC(CostAlgorithm):
         # using action from the replay buffer (all values are relative to the offset)
         target_roots = self.critic.root(self._target_values(replay_data, next_actions))
         current_roots = self.critic(replay_data.observations, replay_data.actions)
-        critic_loss = 0.5 * (th.hstack(current_roots) - target_roots).square().mean(dim=0).sum()
+        critic_loss = 0.5 * sum(F.mse_loss(current_root, target_roots) for current_root in current_roots)
+        assert isinstance(critic_loss, th.Tensor)  # for type checker
 
         # Compute the violation of the decrease condition, where the episode goes on
         if self.published_update:

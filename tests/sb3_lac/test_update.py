@@ -112,10 +112,7 @@ def test_train_is_the_update_of_the_equations(make_model_without_env, n_critics,
         actions_pi, log_prob = policy_sample(actor, obs)
         with th.no_grad():
             next_actions, _ = policy_sample(actor_target if published_update else actor, next_obs)
-            # Each critic has its own
-            next_values = th.stack(
-                [lyapunov(r[None], offset) for r in roots_of(critic_target, next_obs, next_actions, n_critics)]
-            )
+            next_values = lyapunov(roots_of(critic_target, next_obs, next_actions, n_critics), offset)
             y = costs + GAMMA * ((1 - dones) * next_values + dones * offset)
         roots = roots_of(critic, obs, actions, n_critics)
         critic_loss = (0.5 * (roots - root(y - offset)) ** 2).mean(dim=1).sum()
