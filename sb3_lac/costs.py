@@ -105,9 +105,10 @@ class CostAlgorithm(OffPolicyAlgorithm):
         costs, ends = 0.0 - rewards, dones > timeouts
         if not ends.any() or ends.all() or costs.min() < 0:
             return
-        last, dearest = costs[ends].mean(), costs[~ends].max()
+        last, cheapest, dearest = costs[ends].mean(), costs[~ends].min(), costs[~ends].max()
         price = costs[~ends].mean() / (1 - self.gamma) if self.gamma < 1 else math.inf
-        if last <= dearest:
+        # An end that costs less than any other step is a goal
+        if cheapest <= last <= dearest:
             warnings.warn(
                 f"The last step before a termination costs {last:.3g} on average, no more than another step does (up to "
                 f"{dearest:.3g}). Where the end is the goal, all is well. Where it is a failure, to fail early is the "
