@@ -35,8 +35,9 @@ class Life:
     The logarithm of ``q_mobile`` is a random walk with drift over the discharges, of which each estimate is one reading.
 
     :param table: one row per discharge: ``cycle`` (its number, or its position), ``q_mobile_C``, ``sd_q_mobile_C``,
-        ``r_o_ohm``, ``settled``, ``reason``, ``capacity_Ah`` (charge to the cut-off), and what the discharges before let
-        expect of ``q_mobile``, ``expected_q_mobile_C`` and ``expected_sd_C`` (NaN for the first)
+        ``r_o_ohm``, ``settled``, ``reason``, ``capacity_Ah`` (charge to the cut-off), ``lasted_share`` (its duration, as a
+        share of the model's at this ``q_mobile``; NaN if it was cut short), and what the discharges before let expect of
+        ``q_mobile``, ``expected_q_mobile_C`` and ``expected_sd_C`` (NaN for the first)
     :param step_share: standard deviation of the step from one discharge to the next, as a share of ``q_mobile``
     :param noise_share: standard deviation of an estimate beside the others, likewise
     :param drift_share: mean step
@@ -53,9 +54,13 @@ class Life:
 
     @property
     def prior_q_mobile_C(self) -> tuple[float, float]:
-        """Mean and standard deviation of ``q_mobile`` in the next discharge, C: a prior for its calibration."""
-        mean, variance = self.state.sum(), self.covariance.sum() + self.step_share**2
-        return exp(mean), exp(mean) * sqrt(variance)
+        """
+        Mean and standard deviation of ``q_mobile`` in the next discharge, C: a prior for its calibration. At the ``q_mobile``
+        of a whole discharge the model ends a little early or late, about as much as in the one before: the mean allows for it.
+        """
+        whole = self.table[self.table["settled"] & self.table["lasted_share"].notna()]
+        mean = exp(self.state.sum()) * (float(whole["lasted_share"].iloc[-1]) if len(whole) else 1.0)
+        return mean, mean * sqrt(self.covariance.sum() + self.step_share**2)
 
     def after(self, count: int) -> Life:
         """
@@ -130,6 +135,7 @@ def track_life(discharges: Sequence[Discharge], cut_off_V: float, calibrator: Le
         record = discharge.loaded_part(cut_off_V)
         estimate = calibrator.estimate(record)
         end_s = calibrator.model.forecast(record, estimate, cut_off_V).eod_time_s
+        start_s, measured_s = record.time_s[0], discharge.eod_time_s(cut_off_V)
         rows.append(
             {
                 "cycle": discharge.meta.get("cycle", position + 1),
@@ -138,6 +144,7 @@ def track_life(discharges: Sequence[Discharge], cut_off_V: float, calibrator: Le
                 "r_o_ohm": estimate.r_o,
                 "settled": estimate.settled,
                 "capacity_Ah": float(drawn(record.time_s, record.current_A, end_s)) / 3600.0,
+                "lasted_share": (measured_s - start_s) / (end_s - start_s),
                 "reason": estimate.reason,
             }
         )
