@@ -70,7 +70,7 @@ class Discharge:
     :param meta: what else is known, e.g. ``cell``, ``cycle``, ``capacity_Ah``, ``start_time``, ``source``
     :param starts_at_rest: whether the first voltage is that of the cell at rest, and the first current that of the load
         that is switched on then, as in a :meth:`loaded_part`. Calibrators judge by it whether the cell was full
-    :raises ValueError: for arrays that do not fit together, or values that cannot be meant; it says what to do
+    :raises ValueError: for arrays that do not fit together, or invalid values; it says what to do
     """
 
     time_s: FloatArray

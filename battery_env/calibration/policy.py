@@ -226,7 +226,7 @@ class PolicyEstimator(OnlineEstimator):
         :param dt_s: time since the previous sample, s; without meaning at the first one
         :param temperature_C: must be ``None``: the model of the environments is isothermal
         :return: the estimate, as of the last decision
-        :raises ValueError: for what cannot be meant, a temperature, or a policy that takes no stream
+        :raises ValueError: for invalid values, a temperature, or a policy that takes no stream
         """
         self.check(voltage_V, current_A, dt_s, temperature_C)
         readings = self._readings
@@ -300,7 +300,7 @@ class PolicyEstimator(OnlineEstimator):
 
         :param record: one discharge; with the full state a simulated one, as no recording has it
         :return: the estimate
-        :raises ValueError: for a record that cannot be meant
+        :raises ValueError: for an invalid record
         """
         time_s, _, current_A = check_record(record)
         check_drawn_charge(float(drawn(time_s, current_A, time_s[-1])))

@@ -170,7 +170,7 @@ def certify(
     :param seed: Seed of the episodes, which cannot be one that ``lyapunov`` was fitted on, or the policy trained; drawn if it
         is None, and named in the description of the report
     :return: The report
-    :raises ValueError: If the arguments cannot be meant
+    :raises ValueError: If an argument is invalid
     """
     check_bound(ultimate_bound)
     if starts is not None:

@@ -208,7 +208,7 @@ def fit_lyapunov(
     :param progress_bar: Whether to show the progress, in a terminal
     :return: The function. It is to be judged on other roll-outs: ``evaluate_lyapunov()`` and ``certify()`` refuse its seeds,
         which it keeps in ``seeds``.
-    :raises ValueError: If the arguments cannot be meant
+    :raises ValueError: If an argument is invalid
     :raises NoCostError: If nothing had a cost on the roll-outs, which say nothing about decrease then
     """
     with closed_loop(policy, env, None, n_episodes, deterministic, seed) as loop:

@@ -33,7 +33,7 @@ class LyapunovFunction:
     :param alpha3: Share of the cost by which the function is meant to decrease
     :param gamma: Discount factor of the costs to come that it estimates
     :param reward_bound: The reward that costs nothing, needed where rewards are positive
-    :raises ValueError: If one of these numbers cannot be meant
+    :raises ValueError: If a number is invalid
     """
 
     #: Whether costs are those of the training, in the units of ``VecNormalize``

@@ -255,7 +255,7 @@ def evaluate_lyapunov(
     :param seed: Seed for ``env`` and for the actions; drawn if it is None, and kept in the report
     :param lyapunov: The function to judge, the critic by default. It cannot be judged on roll-outs that it was fitted on.
     :return: The report
-    :raises ValueError: If the arguments cannot be meant, or the policy is not LAC and there is no ``lyapunov``
+    :raises ValueError: If an argument is invalid, or the policy is not LAC and there is no ``lyapunov``
     """
     if lyapunov is None:
         lyapunov = critic_of(policy)
