@@ -300,6 +300,14 @@ def load_nasa_discharges(path_or_cell: str | Path) -> list[Discharge]:
     """
     All discharges of one cell of NASA's battery data set, in the order they were made. Cite it as ``NASA_CITATION``.
 
+    .. code-block:: python
+
+      from battery_env import load_nasa_discharges
+
+      discharges = load_nasa_discharges("B0005")  # or "B0006", or a .mat file of NASA's
+      print([(each.meta["cycle"], each.meta["capacity_Ah"]) for each in discharges[::40]])
+      first = discharges[0].loaded_part(cut_off_V=2.7)  # what estimators take
+
     Their ``meta`` holds ``cell``, ``cycle`` (1, 2, ... over the discharges), ``source`` and, as far as the file tells,
     ``start_time``, ``ambient_temperature_C``, ``capacity_Ah`` (charge to 2.7 V), ``Re_ohm`` and ``Rct_ohm`` (of the impedance
     test nearest in time) and ``test_id`` (position among all tests of the cell). A discharge that fails the checks of

@@ -1,10 +1,11 @@
-"""The API reference lists what a user can import, and what a call returns."""
+"""The API reference lists what a user can import, and what a call returns; its examples run."""
 
 import ast
 import inspect
 import pkgutil
 import re
 import sys
+import textwrap
 from pathlib import Path
 
 import pytest
@@ -64,3 +65,27 @@ def test_what_a_call_returns_is_in_the_reference():
 
 def test_nothing_is_listed_twice():
     assert len(LISTED) == len(set(LISTED)) == len(IDENTITIES)
+
+
+EXAMPLES = {
+    name: "\n".join(textwrap.dedent(block) for block in found)
+    for name, value in OBJECTS.items()
+    if (found := re.findall(r"\.\. code-block:: python\n\n((?: {2,}.*\n|\n)+)", f"{inspect.getdoc(value) or ''}\n"))
+}
+WITH_EXAMPLE = (
+    *("CalibrationCallback", "LAC", "LyapunovFunction", "LyapunovPolicy", "GymnasiumVecEnv", "PolicyEstimator"),
+    *("TrajectoryDataset", "certify", "evaluate", "evaluate_lyapunov", "export_onnx", "fit_lyapunov"),
+    *("load_nasa_discharges", "simulate"),
+)
+
+
+@pytest.mark.parametrize("name", WITH_EXAMPLE)
+def test_what_users_call_first_has_an_example(name):
+    assert name in {path.rpartition(".")[2] for path in EXAMPLES}
+
+
+@pytest.mark.parametrize("name", [name for name, example in EXAMPLES.items() if "import " in example])
+def test_whole_examples_of_docstrings_run(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    brief = re.sub(r"\.learn\([\d_]+", ".learn(150", EXAMPLES[name])  # a few training steps instead of thousands
+    exec(compile(brief, name, "exec"), {})
