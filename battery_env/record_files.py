@@ -68,10 +68,11 @@ def read_discharges(
     """
     Read the discharges of a file or of a table.
 
-    A table is a ``pandas.DataFrame``, whose index is a column too if it has a name. A file is text with a header (commas, semicolons, tabs or blanks, decimal points or commas, also packed as .gz, .bz2,
-    .xz or .zip), Parquet, one of NASA's .mat files, or with the extra ``cyclers`` a binary file of Neware (.nda, .ndax) or
-    BioLogic (.mpr). Columns go by the names that testers give them, the Battery Data Format's, Arbin's, Maccor's, Neware's
-    and BioLogic's among them; their units are told from the names.
+    A table is a ``pandas.DataFrame``, whose index is a column too if it has a name. A file is text with a header (commas,
+    semicolons, tabs or blanks, decimal points or commas, also packed as .gz, .bz2, .xz or .zip), Parquet, one of NASA's .mat
+    files, or with the extra ``cyclers`` a binary file of Neware (.nda, .ndax) or BioLogic (.mpr). Columns go by the names
+    that testers give them, the Battery Data Format's, Arbin's, Maccor's, Neware's and BioLogic's among them; their units are
+    told from the names.
 
     It may hold charges and rests as well, and many cycles. A discharge is what lies between two charges, with the rest
     before the load; it is numbered by the cycle that is given, or else counted. If there are several, each has its own
@@ -232,7 +233,8 @@ class _Table:
         if len(on_end):
             n = on_end[0] + 1
             raise ValueError(
-                f"the clock runs backwards: row {n + 1} is at {time_s[n]:g} s, after {time_s[n - 1]:g} s. Sort the rows by time"
+                f"the clock runs backwards: row {n + 1} is at {time_s[n]:g} s, after {time_s[n - 1]:g} s. Sort the rows by "
+                "time"
             )
 
     def _accumulate_step_times(self) -> None:

@@ -152,7 +152,8 @@ def check_samples(time_s: ArrayLike, voltage_V: ArrayLike, current_A: ArrayLike,
         else:
             advice = "Sort the samples, and give one discharge at a time, or number them in a column of the cycle"
         raise ValueError(
-            f"time_s must increase from sample to sample, but sample {n} is at {time[n]:g} s, after {time[n - 1]:g} s. {advice}."
+            f"time_s must increase from sample to sample, but sample {n} is at {time[n]:g} s, after {time[n - 1]:g} s. "
+            f"{advice}."
         )
     return Samples(**arrays)
 
