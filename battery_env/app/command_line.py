@@ -19,6 +19,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 from dataclasses import fields
+from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal
 
@@ -35,6 +36,8 @@ from battery_env.parameters import PARAMETER_NAMES
 #: What the process returns: all records settled, one or more refused, one or more not settled, stopped by Ctrl-C.
 SETTLED, REFUSED, NOT_SETTLED, INTERRUPTED = 0, 2, 3, 130
 
+_VERSION = files("battery_env").joinpath("version.txt").read_text(encoding="utf-8").strip()
+
 # So many discharges fit beside each other in the figure of a fit.
 _MOST_SHOWN = 4
 
@@ -46,6 +49,16 @@ def _assignments(text: str) -> dict[str, str]:
     if any(not (name.strip() and equals and value.strip()) for name, equals, value in pairs):
         raise argparse.ArgumentTypeError(f"expected quantity=NAME,quantity=NAME, got {text!r}")
     return {name.strip(): value.strip() for name, _, value in pairs}
+
+
+def _cell_name(text: str) -> re.Pattern[str]:
+    try:
+        pattern = re.compile(text)
+    except re.error as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is no regular expression: {error}") from error
+    if pattern.groups != 1:
+        raise argparse.ArgumentTypeError(f"expected a regular expression with one group, such as '(B[0-9]+)_', got {text!r}")
+    return pattern
 
 
 def _jobs(text: str) -> int:
@@ -177,6 +190,12 @@ _RESULTS: _Options = {
         "metavar": "DIR",
         "help": "write the table of estimates (CSV, Parquet), the voltages and figures there",
     },
+    ("--cell-name",): {
+        "type": _cell_name,
+        "metavar": "PATTERN",
+        "help": "regular expression whose group is the name of the cell in the name of a file, such as '(B[0-9]+)_' (default: "
+        "the folder, if records lie in several, or else the file)",
+    },
     ("--table-only",): {"action": "store_true", "help": "write no voltages of single discharges"},
     ("--force",): {"action": "store_true", "help": "replace results that are there already"},
     ("--json",): {"action": "store_true", "help": "print one JSON object a discharge and line"},
@@ -204,6 +223,7 @@ def _parser(name: str) -> argparse.ArgumentParser:
         epilog="Exit status: 0 if every discharge is settled, 3 if one is not, 2 if one cannot be used.",
         allow_abbrev=False,
     )
+    parser.add_argument("--version", action="version", version=f"battery_env {_VERSION}")
     _add_files(parser)
     _add(parser.add_argument_group("calibration"), _CALIBRATION, default=argparse.SUPPRESS)
     _add(parser.add_argument_group("results"), _RESULTS)
@@ -247,7 +267,8 @@ def _add_files(parser: argparse.ArgumentParser) -> None:
         "records",
         nargs="+",
         metavar="FILE",
-        help="text of any delimiter, Parquet, NASA's .mat, Neware's .nda and .ndax, BioLogic's .mpr; a folder of them; "
+        help="text of any delimiter, Parquet, NASA's .mat, Neware's .nda and .ndax, BioLogic's .mpr; a folder of them, or of "
+        "folders; "
         "FILE:CYCLE for one discharge of a life; or a bundled cell, B0005, and its discharge, B0005:12",
     )
     group = parser.add_argument_group("reading")
@@ -259,6 +280,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command."""
     given = sys.argv[1:] if arguments is None else list(arguments)
     parser = argparse.ArgumentParser(prog="python -m battery_env", description="Calibrate a battery model to real cells.")
+    parser.add_argument("--version", action="version", version=f"battery_env {_VERSION}")
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("calibrate", help="capacity and resistance of cells from their discharges", add_help=False)
     commands.add_parser("fit", help="the constants of a cell from a few of its discharges", add_help=False)
@@ -274,7 +296,7 @@ def calibrate(arguments: Sequence[str] | None = None, name: str = "battery-calib
     try:
         settings = _settings(options)
         settings.calibrator()  # what it refuses it refuses of every file
-        sources = find_sources(options.records)
+        sources = find_sources(options.records, options.cell_name)
         results = Results(options.out, sources, not options.table_only, options.force) if options.out else None
         try:
             with workers(options.jobs, options.scheduler) as executor:
@@ -374,7 +396,7 @@ def _discharges(records: Sequence[str], file_format: FileFormat) -> list[Dischar
             try:
                 recordings = read_source(source, file_format)
                 for number, recording in enumerate(recordings, start=1):
-                    meta = {"cycle": number, **recording.meta, "cell": source.stem}
+                    meta = {"cycle": number, **recording.meta, "cell": source.cell}
                     discharges.append(recording._replace(meta=meta).discharge())
             except Exception as error:  # readers of files raise what they like
                 text = " ".join(str(error).split())
@@ -407,7 +429,7 @@ def _conclude(done: Sequence[Outcome], settings: Settings) -> None:
         if settings.method == "policy":
             print(f"calibrated by {settings.calibrated_by}")
     elif done and done[0].found:
-        print(text_of(done[0].record, done[0].found, settings))
+        print(text_of(done[0].record, done[0].found))
 
 
 def _plain(value: Any) -> Any:
