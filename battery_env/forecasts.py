@@ -20,7 +20,7 @@ from battery_env.estimators.settling import white_noise_V
 from battery_env.loads import BlockBootstrap, Cycle, KnownLoad, Load, RandomLoad, constant, in_steps, steadier_unit
 from battery_env.parameters import Q_MOBILE, R_O
 from battery_env.plotting import COLOURS, new_figure
-from battery_env.record_model import RecordModel
+from battery_env.record_model import RECENT_SHARE, RecordModel
 from battery_env.records import Record, Samples, check_record, expected_current
 
 #: What a load to come can be given as.
@@ -29,9 +29,7 @@ FutureLoad = float | KnownLoad | RandomLoad | Callable[[FloatArray], ArrayLike]
 #: The ends and the middle of the intervals that are shown: nine of ten outcomes lie between the outer two.
 BAND = (0.05, 0.5, 0.95)
 
-#: The error of the model shortly before the end of a record is the mean over this share of the record.
-_RECENT_SHARE = 0.1
-#: It drifts with this constant, as a share of ``q_mobile``: the model is wrong in another way at another charge. That is how
+#: The error of the model drifts with this constant, as a share of ``q_mobile``: the model is wrong in another way at another charge. That is how
 #: fast the residuals of whole discharges of B0005 lose their correlation.
 _MEMORY_SHARE = 0.15
 # No discharge is followed for longer than a day, s. Cells that have ended are left out every so many steps.
@@ -406,13 +404,13 @@ def _at_the_end_of(
     """Take cells with drawn parameters through a record, and draw their errors from the last voltages measured."""
     steps, count = len(current_A) - 1, len(parameters[0])
     measured_V = np.interp(record.time_s[0] + model.dt_s * np.arange(steps + 1), record.time_s, record.voltage_V)
-    last = slice(min(int((1.0 - _RECENT_SHARE) * steps), steps - 1) + 1, None)
+    last = slice(min(int((1.0 - RECENT_SHARE) * steps), steps - 1) + 1, None)
     state = model.start(parameters[0])
     model.advance(state, current_A[: last.start], *parameters)
     run_V, _ = model.run_on(state, current_A[None, last.start : -1], *parameters, "current")
     voltage_V, recent_V = run_V[-1], np.mean(measured_V[last, None] - run_V, axis=0)
     # the voltage measured is noisy
-    samples = max(int((record.time_s >= record.time_s[-1] - _RECENT_SHARE * np.ptp(record.time_s)).sum()), 1)
+    samples = max(int((record.time_s >= record.time_s[-1] - RECENT_SHARE * np.ptp(record.time_s)).sum()), 1)
     variance_V2, of_noise_V2 = mismatch_V**2, white_noise_V(record.voltage_V) ** 2 / samples
     share = variance_V2 / (variance_V2 + of_noise_V2) if variance_V2 > 0.0 else 0.0
     draws = rng.standard_normal((2, count))

@@ -96,8 +96,8 @@ _SIGN: _Options = {
 _CALIBRATION: _Options = {
     ("--method",): {
         "choices": METHODS,
-        "help": "least squares for whole discharges, the filter for one in progress without a prior, or a policy trained on "
-        f"simulated cells (default: {METHODS[0]})",
+        "help": "of calibration: least squares, the filter (kalman), or a policy trained on simulated cells (default: least "
+        "squares; the filter where these do not settle a discharge in progress without --prior and --cell)",
     },
     ("--policy",): {
         "type": Path,

@@ -133,6 +133,16 @@ class TestUncertainty:
             inside += low_s <= whole.eod_time_s <= high_s
         assert 0.8 * n <= inside <= 0.98 * n
 
+    def test_an_offset_that_the_record_shows_goes_on(self):
+        record, cut_off_V = self.record, 3.2
+        higher = Samples(record.time_s, record.voltage_V + 0.05, record.current_A)
+        point = MODEL.forecast(higher, TRUTH, cut_off_V, in_progress=True)
+        assert point.offset_V == pytest.approx(0.05)
+        assert point.eod_time_s == pytest.approx(MODEL.forecast(record, TRUTH, cut_off_V - 0.05, in_progress=True).eod_time_s)
+        sampled = forecast(higher, TRUTH, cut_off_V=cut_off_V, model=MODEL, mismatch_V=0.02, samples=200)
+        assert sampled.eod_quantile_s(0.5) == pytest.approx(point.eod_time_s, rel=0.01)
+        assert point.eod_time_s > 1.01 * MODEL.forecast(record, TRUTH, cut_off_V).eod_time_s
+
     def test_samples_agree_with_the_record(self):
         whole = discharged(4.0, load_unit="current")
         late = whole.part(0, int(0.97 * len(whole.time_s)))

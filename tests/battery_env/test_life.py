@@ -106,5 +106,5 @@ class TestRealCell:
         starts, falls, short = life.table["reason"].iloc[1:4]
         assert "starts under load" in starts and "the voltage falls to 2.00 V" in falls and "not known to 2 %" in short
         assert life.prior_q_mobile_C[0] == pytest.approx(track_life([first, fourth], 3.2).prior_q_mobile_C[0], rel=0.002)
-        with pytest.raises(ValueError, match="no discharge determines q_mobile. Of 1 of 1: the voltage falls to 2.00 V"):
+        with pytest.raises(ValueError, match=r"Of 1 of 1: the voltage falls to 2\.00 V"):
             track_life([broken], cut_off_V=3.2)
