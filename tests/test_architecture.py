@@ -40,6 +40,7 @@ LAYERS = (
     ("battery_env.callbacks",),
     ("battery_env.app.calibrate",),
     ("battery_env.app.many",),
+    ("battery_env.app.forecast",),
     ("battery_env.app.command_line",),
     ("battery_env.app", "battery_env.__main__"),
 )
