@@ -40,9 +40,9 @@ def capacity_Ah(
 
     .. code-block:: python
 
-      fit = LeastSquares(thermal=True, mismatch_V=0.05)
-      estimate = fit.estimate(load_nasa_discharges("B0005")[99].loaded_part(cut_off_V=2.7))
-      at_1_A = capacity_Ah(estimate, 1.0, cut_off_V=2.7, model=fit.model)
+      record = load_nasa_discharges("B0005")[99].loaded_part(cut_off_V=2.7)
+      estimate = LeastSquares(thermal=True, mismatch_V=0.05).estimate(record)
+      at_1_A = capacity_Ah(estimate, 1.0, cut_off_V=2.7, model=RecordModel(thermal=True))
       print(f"{at_1_A.value:.3f} +- {at_1_A.sd:.3f} Ah")
 
     The standard deviation is that of the estimate, to first order, with independent errors of ``q_mobile`` and ``r_o``. The
@@ -53,7 +53,7 @@ def capacity_Ah(
     :param load: constant, above 0, in A, or with ``load_unit="power"`` in W
     :param cut_off_V: voltage at which the discharge ends, V; ``None``: the ``VEOD`` of the model's cell
     :param load_unit: ``"current"`` or ``"power"``
-    :param model: the model that the estimate belongs to, ``LeastSquares(...).model``; ``None``: ``RecordModel()``
+    :param model: the model that the estimate belongs to, ``RecordModel(cell, thermal)``; ``None``: ``RecordModel()``
     :return: Ah; NaN if the cut-off is not reached within a week
     :raises ValueError: for an argument out of range
     """
@@ -85,7 +85,7 @@ def dc_resistance_ohm(
 
     .. code-block:: python
 
-      value, sd = dc_resistance_ohm(estimate, 2.0, duration_s=10.0, soc=0.5, model=fit.model)
+      value, sd = dc_resistance_ohm(estimate, 2.0, duration_s=10.0, soc=0.5, model=RecordModel(thermal=True))
 
     The standard deviation is that of the estimate, to first order, with independent errors of ``q_mobile`` and ``r_o``. It
     does not hold the error of the model. The ohmic drop of the model follows the current with a time constant of 6 s
@@ -95,7 +95,7 @@ def dc_resistance_ohm(
     :param current_A: of the pulse, above 0, A
     :param duration_s: of the pulse, s
     :param soc: state of charge at rest before the pulse, within 0 .. 1
-    :param model: the model that the estimate belongs to, ``LeastSquares(...).model``; ``None``: ``RecordModel()``
+    :param model: the model that the estimate belongs to, ``RecordModel(cell, thermal)``; ``None``: ``RecordModel()``
     :return: ohm; NaN if the cell is empty before the pulse ends
     :raises ValueError: for an argument out of range
     """
