@@ -315,10 +315,12 @@ class RecordModel:
             load_unit=load_unit,
             thermal=self.thermal,
             cell=self.cell,
-            cut_off_V=cut_off_V,
+            cut_off_V=-np.inf,
             max_duration_s=min(max_duration_s, LONGEST_FORECAST_S),
         )
-        return float(new.current_A.sum() * self.dt_s / 3600.0) if np.isfinite(new.eod_time_s) else float("nan")
+        drawn_C = np.append(0.0, np.cumsum(new.current_A)) * self.dt_s
+        steps = new.reached_s(cut_off_V) / self.dt_s
+        return float(np.interp(steps, np.arange(len(drawn_C)), drawn_C)) / 3600.0
 
     def sensitivities(
         self, current_A: FloatArray, q_mobile: float, r_o: float, stride: int = 1

@@ -30,7 +30,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from battery_env.evaluation import over_seeds
-from battery_env.plotting import COLOURS, new_figure
+from battery_env.plotting import COLOUR_OF, COLOURS, new_figure
 from benchmarks.control import DISTURBANCES, SETTLED_SHARE, SHARES, conditions, draw_shares, judge, roll_out, shares_of, tried
 from benchmarks.study import (
     Study,
@@ -52,10 +52,10 @@ _REFERENCE = "reference"
 _METRIC_SAC = "SAC, LAC's metric"
 #: How they are drawn: colour and marker.
 STYLES = {
-    "LAC": (COLOURS[0], "o"),
-    "SAC": (COLOURS[1], "s"),
-    "TD3": (COLOURS[2], "^"),
-    "TQC": (COLOURS[3], "D"),
+    "LAC": (COLOUR_OF["LAC"], "o"),
+    "SAC": (COLOUR_OF["SAC"], "s"),
+    "TD3": (COLOUR_OF["TD3"], "^"),
+    "TQC": (COLOUR_OF["TQC"], "D"),
     _METRIC_SAC: (COLOURS[4], "v"),
     _REFERENCE: ("black", "|"),
 }

@@ -31,6 +31,7 @@ LAYERS = (
     ("battery_env.record_files",),
     ("battery_env.sensors",),
     ("battery_env.record_model",),
+    ("battery_env.conversions",),
     ("battery_env.estimators",),
     ("battery_env.calibration", "battery_env.pretrained_policies"),
     ("battery_env.evaluation",),

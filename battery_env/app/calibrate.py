@@ -31,6 +31,8 @@ from battery_env.records import ExpectedCurrent, drawn, expected_current
 
 Method = Literal["least-squares", "kalman", "policy"]
 METHODS: tuple[Method, ...] = get_args(Method)
+#: For readers of a figure.
+METHOD_NAMES: dict[str, str] = {"least-squares": "least squares", "kalman": "Kalman filter", "policy": "policy"}
 
 # A record of more samples than this is averaged over the time step of the model, or longer where it lasts longer than so many
 # steps: what lies between says nothing to the model.
@@ -295,6 +297,14 @@ class Calibration:
     def in_progress(self) -> bool:
         """Whether the record ends above the cut-off."""
         return bool(np.isnan(self.measured_eod_time_s))
+
+    @property
+    def end_quantiles_s(self) -> tuple[float, float, float] | None:
+        """Of a record in progress, the 5 %, 50 % and 95 % quantiles of its end, s."""
+        if not self.in_progress:
+            return None
+        reach_s = 1.645 * self.sd_predicted_eod_time_s
+        return self.predicted_eod_time_s - reach_s, self.predicted_eod_time_s, self.predicted_eod_time_s + reach_s
 
 
 _HOW = {each.name: each.metadata for each in fields(Calibration)}

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from battery_env.app.calibrate import Calibration, Settings, calibrate, title_of
+from battery_env.app.calibrate import METHOD_NAMES, Calibration, Settings, calibrate, title_of
 from battery_env.cells import BUNDLED_CELLS, load_nasa_discharges
 from battery_env.files import check_folder, replacing
 from battery_env.record_files import Recording, read_recordings
@@ -418,5 +418,6 @@ def _voltages(name: str, found: Calibration) -> dict[str, bytes]:
     columns = {"time_s": record.time_s, "voltage_V": record.voltage_V, "current_A": record.current_A}
     table = pd.DataFrame(columns | {"model_V": forecast.at_samples_V}).to_csv(index=False)
     picture = io.BytesIO()
-    plot_discharge(record, {"model": forecast}, title_of(name, found)).savefig(picture, dpi="figure")
+    shown = {f"model, {METHOD_NAMES[found.method]}": forecast}
+    plot_discharge(record, shown, title_of(name, found), found.end_quantiles_s).savefig(picture, dpi="figure")
     return {"csv": table.encode(), "png": picture.getvalue()}
