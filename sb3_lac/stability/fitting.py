@@ -192,9 +192,9 @@ def fit_lyapunov(
     The function is the relative value of the average cost: ``L(s) = c - c_bar + E[L(s')]``, so that its exact drift is
     ``E[L(s')] - L(s) = -(c - c_bar)``: it decreases by all of the cost (alpha3 = 1) up to the residual ``b = c_bar``, the mean
     cost at which the loop settles, however slow the loop is. The value of a discounted cost decreases by a share only, that
-    shrinks as the loop gets slower (``docs/stability.md`` compares them). ``L`` and ``c_bar`` are fitted to generalised
-    multi-step returns, which are computed anew before each pass over the data. ``L`` is a sum of squares and its least value
-    on the roll-outs is subtracted, so that it is never negative.
+    shrinks as the loop gets slower (``docs/reports/certificates.md`` compares them). ``L`` and ``c_bar`` are fitted to
+    generalised multi-step returns, which are computed anew before each pass over the data. ``L`` is a sum of squares and its
+    least value on the roll-outs is subtracted, so that it is never negative.
 
     The reward that costs nothing is the largest one of the roll-outs, and at least 0. A transition that ends in a death has no
     next value: what it costs is its cost, and with positive rewards also those that a survivor could have had until the end of

@@ -97,7 +97,7 @@ class LyapunovReport:
         if any(math.isnan(value) for value, _, _ in self.metrics.values()):
             lines.append(
                 "What is not available takes what these roll-outs do not have, like a survivor or costs that fade before the "
-                "time limit: docs/stability.md lists what each metric takes."
+                "time limit: docs/stability_metrics.md lists what each metric takes."
             )
         lines.append(f"With alpha3={self.alpha3:g} the decrease condition {self._verdict()}.")
         lines.append(self._verdict_with_residual())
@@ -236,7 +236,8 @@ def evaluate_lyapunov(
     Run the policy for ``n_eval_episodes`` episodes and check whether ``L`` is a Lyapunov function along them: whether it
     decreases by ``alpha3`` times the cost, ``E[L(s', a')] - L(s, a) <= -alpha3 * c``, where it does so up to a residual, and
     whether it is what it should have learned, the sum of costs to come. ``L`` is the critic of LAC, or for any policy the
-    function ``lyapunov``, like that of ``fit_lyapunov()``. ``docs/stability.md`` says what each metric means and takes.
+    function ``lyapunov``, like that of ``fit_lyapunov()``. ``docs/stability_metrics.md`` says what each metric means and
+    takes.
 
     ``a'`` is the action taken next; after a time limit it is an action of the policy. A terminal state has no ``L``:
     transitions into it do not count for the decrease condition, but as deaths.
