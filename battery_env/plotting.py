@@ -345,7 +345,8 @@ def title_of_life(cells: Sequence[pd.DataFrame]) -> str:
     least = float(np.min(correlations))
     if not least >= _FOLLOWS:
         return ""
-    return f"{LABELS['q_mobile'].split(' (')[0]} follows the measured capacity (r > {min(np.floor(1e3 * least) / 1e3, 0.999):.3f})"
+    title = LABELS["q_mobile"].split(" (")[0]
+    return f"{title} follows the measured capacity (r > {min(np.floor(1e3 * least) / 1e3, 0.999):.3f})"
 
 
 def _life_legend(figure: Figure, table: pd.DataFrame) -> None:

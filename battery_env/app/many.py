@@ -200,7 +200,7 @@ class Results:
                 part.write_bytes(content)
 
     def write_table(self, outcomes: Sequence[Outcome]) -> list[Path]:
-        """Write the table of all discharges and, if there are several, the figure of their parameters over them."""
+        """Write the table of all discharges and, if several are whole, the figure of their parameters over them."""
         table = pd.DataFrame([each.row() for each in outcomes]).astype({"cycle": "Int64"})
         table["settled"] = table["settled"].astype("boolean")
         with replacing(self.table) as part:
@@ -212,10 +212,11 @@ class Results:
             written.append(self.parquet)
         except ImportError:
             pass
-        if (table["error"] == "").sum() > 1:
+        whole = table[table["measured_eod_time_s"].notna()]
+        if len(whole) > 1:
             from battery_env.plotting import plot_life, save_figure
 
-            written.append(save_figure(plot_life(table[table["error"] == ""]), self.life))
+            written.append(save_figure(plot_life(whole), self.life))
         return written
 
 
