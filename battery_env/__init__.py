@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from battery_env.calibration.onnx_policy import OnnxPolicy
     from battery_env.calibration.policy import PolicyEstimator
     from battery_env.cells import Discharge, load_nasa_discharges
+    from battery_env.conversions import capacity_Ah, dc_resistance_ohm
     from battery_env.electrochemistry import NEW_CELL, CellParameters, Trajectory, initial_state, simulate, step, voltage
     from battery_env.estimates import Estimate
     from battery_env.estimators import (
@@ -45,6 +46,7 @@ _MODULES = {
     "calibration.onnx_policy": ("OnnxPolicy",),
     "calibration.policy": ("PolicyEstimator",),
     "cells": ("Discharge", "load_nasa_discharges"),
+    "conversions": ("capacity_Ah", "dc_resistance_ohm"),
     "electrochemistry": ("NEW_CELL", "CellParameters", "Trajectory", "initial_state", "simulate", "step", "voltage"),
     "estimates": ("Estimate",),
     "estimators": (

@@ -71,7 +71,7 @@ class Discharge:
     :param meta: what else is known, e.g. ``cell``, ``cycle``, ``capacity_Ah``, ``start_time``, ``source``
     :param starts_at_rest: whether the first voltage is that of the cell at rest, and the first current that of the load
         that is switched on then, as in a :meth:`loaded_part`. Calibrators judge by it whether the cell was full
-    :raises ValueError: for arrays that do not fit together, or values that cannot be meant; it says what to do
+    :raises ValueError: for arrays that do not fit together, or invalid values; it says what to do
     """
 
     time_s: FloatArray
@@ -301,6 +301,14 @@ class Discharge:
 def load_nasa_discharges(path_or_cell: str | Path) -> list[Discharge]:
     """
     All discharges of one cell of NASA's battery data set, in the order they were made. Cite it as ``NASA_CITATION``.
+
+    .. code-block:: python
+
+      from battery_env import load_nasa_discharges
+
+      discharges = load_nasa_discharges("B0005")  # or "B0006", or a .mat file of NASA's
+      print([(each.meta["cycle"], each.meta["capacity_Ah"]) for each in discharges[::40]])
+      first = discharges[0].loaded_part(cut_off_V=2.7)  # what estimators take
 
     Their ``meta`` holds ``cell``, ``cycle`` (1, 2, ... over the discharges), ``source`` and, as far as the file tells,
     ``start_time``, ``ambient_temperature_C``, ``capacity_Ah`` (charge to 2.7 V), ``Re_ohm`` and ``Rct_ohm`` (of the impedance

@@ -129,7 +129,7 @@ def read_discharge_csv(path: str | Path, discharge_is_negative: bool = False) ->
     :param path: the file, as :func:`read_discharges` takes it
     :param discharge_is_negative: whether the file counts the current of a discharge as negative; it is flipped then
     :return: the discharge; its ``meta`` holds ``source``
-    :raises ValueError: if the file holds none, or several, or its values cannot be meant
+    :raises ValueError: if the file holds none, or several, or if its values are invalid
     """
     discharges = read_discharges(path, discharge_is_negative=discharge_is_negative)
     if len(discharges) > 1:

@@ -10,7 +10,11 @@ import pytest
 from battery_env.__main__ import calibrate, main
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "docs/environments").glob("*.md"))]
+DOCS = ROOT / "docs"
+PAGES = [
+    ROOT / "README.md",
+    *sorted(page for folder in ("", "environments", "reports") for page in (DOCS / folder).glob("*.md")),
+]
 # What an example needs that no installation for the tests has: it is skipped there.
 OPTIONAL = {"compare_with_pybop.py": ("pybop",)}
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
@@ -68,3 +72,9 @@ def test_links_between_pages_lead_somewhere(page):
     for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text(encoding="utf-8")):
         if "://" not in target:
             assert (page.parent / target).exists(), f"{page.name} links to {target}"
+
+
+def test_every_published_table_is_on_the_page_of_all_tables():
+    page = (DOCS / "all_tables.md").read_text(encoding="utf-8")
+    tables = sorted(path.relative_to(DOCS).as_posix() for path in DOCS.glob("results/*/*.md"))
+    assert sorted(re.findall(r"\]\((results/[^)]+)\)", page)) == tables

@@ -31,6 +31,8 @@ from battery_env.records import ExpectedCurrent, drawn, expected_current
 
 Method = Literal["least-squares", "kalman", "policy"]
 METHODS: tuple[Method, ...] = get_args(Method)
+#: For readers of a figure.
+METHOD_NAMES: dict[str, str] = {"least-squares": "least squares", "kalman": "Kalman filter", "policy": "policy"}
 
 # A record of more samples than this is averaged over the time step of the model, or longer where it lasts longer than so many
 # steps: what lies between says nothing to the model.
@@ -66,7 +68,8 @@ class Settings:
     How a discharge of a real cell is looked at. ``Settings().calibrator()`` is least squares, and
     ``Settings(method="kalman").calibrator()`` the filter, with what such a cell needs.
 
-    :param method: of calibration
+    :param method: of calibration; ``None``: least squares, and where they do not settle a record in progress, of which neither
+        a prior nor the constants of its cell are known, the filter
     :param parameters: which to search for; the other is held at the cell's value
     :param cut_off_V: voltage at which the discharge ends, V
     :param prior_q_mobile_C: mean and standard deviation of ``q_mobile`` before the discharge, C; ``None``: nothing is known
@@ -89,7 +92,7 @@ class Settings:
         refuse when :meth:`calibrator` makes them
     """
 
-    method: Method = "least-squares"
+    method: Method | None = None
     parameters: tuple[str, ...] = PARAMETER_NAMES
     cut_off_V: float = 2.7
     prior_q_mobile_C: tuple[float, float] | None = None
@@ -105,7 +108,7 @@ class Settings:
     policy: Path | None = None
 
     def __post_init__(self) -> None:
-        if self.method not in METHODS:
+        if self.method not in (None, *METHODS):
             raise ValueError(f"the method is {' or '.join(METHODS)}, got {self.method!r}")
         if self.nominal_Ah is not None:
             check_positive("the nominal capacity in Ah", self.nominal_Ah)
@@ -149,6 +152,13 @@ class Settings:
             others, cell = {**known, **others}, cell.cell
         return cls(**{"cell": cell, **others})
 
+    def methods(self, in_progress: bool) -> list[Method]:
+        """What to calibrate a record by: the first one that settles it, or the last one."""
+        if self.method is not None:
+            return [self.method]
+        is_new = in_progress and self.prior_q_mobile_C is None and self.cell is None
+        return ["least-squares", "kalman"] if is_new else ["least-squares"]
+
     def calibrator(
         self, cell: CellParameters | None = None, start: Start | None = None
     ) -> LeastSquares | ExtendedKalmanFilter | PolicyEstimator:
@@ -162,7 +172,7 @@ class Settings:
         """
         if self.method == "policy":
             return self._policy()
-        calibrator = LeastSquares if self.method == "least-squares" else ExtendedKalmanFilter
+        calibrator = ExtendedKalmanFilter if self.method == "kalman" else LeastSquares
         stated: InitialSoc = 1.0 if self.initial_soc == "rest" else self.initial_soc
         bounds: dict[str, Any] = {} if self.q_mobile_bounds_C is None else {"q_mobile_bounds_C": self.q_mobile_bounds_C}
         return calibrator(
@@ -202,7 +212,7 @@ class Settings:
     def calibrated_by(self) -> str:
         """The calibrator, for readers."""
         if self.method != "policy":
-            return self.method
+            return self.method or "least-squares"
         return "the policy that comes with the package" if self.policy is None else f"the policy of {self.policy}"
 
 
@@ -288,6 +298,14 @@ class Calibration:
         """Whether the record ends above the cut-off."""
         return bool(np.isnan(self.measured_eod_time_s))
 
+    @property
+    def end_quantiles_s(self) -> tuple[float, float, float] | None:
+        """Of a record in progress, the 5 %, 50 % and 95 % quantiles of its end, s."""
+        if not self.in_progress:
+            return None
+        reach_s = 1.645 * self.sd_predicted_eod_time_s
+        return self.predicted_eod_time_s - reach_s, self.predicted_eod_time_s, self.predicted_eod_time_s + reach_s
+
 
 _HOW = {each.name: each.metadata for each in fields(Calibration)}
 
@@ -348,19 +366,23 @@ def calibrate(
 def _calibrated(discharge: Discharge, settings: Settings) -> Calibration:
     """What one discharge says."""
     loaded, measured_eod_s = discharge.loaded_part(settings.cut_off_V), discharge.eod_time_s(settings.cut_off_V)
+    in_progress = bool(np.isnan(measured_eod_s))
     _warn_of_more(discharge, measured_eod_s)
     record, averaged_over_s = _of_few_samples(loaded)
     cell = _cell_at_the_temperature(record, settings)
     discharge = _with_the_temperature_that_counts(discharge, settings)
     start = _start(discharge, settings, cell)
-    estimate = settings.calibrator(cell, start).estimate(_with_the_temperature_that_counts(record, settings))
+    for method in settings.methods(in_progress):
+        calibrator = replace(settings, method=method).calibrator(cell, start)
+        estimate = calibrator.estimate(_with_the_temperature_that_counts(record, settings))
+        if estimate.settled:
+            break
     if start.reason:
         estimate = replace(estimate, settled=False, reason=start.reason)
     model = RecordModel(cell, settings.thermal and settings.method != "policy", initial_soc=start.soc)
     future = load = expected_current(record.time_s, record.current_A)
     if settings.future_current_A is not None:
         future = ExpectedCurrent(settings.future_current_A, varied=False, sd_A=0.0)
-    in_progress = bool(np.isnan(measured_eod_s))
     forecast = model.forecast(record, estimate, settings.cut_off_V, future.mean_A, in_progress)
     is_known = (
         not start.reason and _is_logged(record, forecast, estimate) and not _starts_lower(discharge, cell, start.soc, estimate)
@@ -378,7 +400,7 @@ def _calibrated(discharge: Discharge, settings: Settings) -> Calibration:
     sd_whole_Ah = float(np.hypot(sd_seen_Ah, start.sd_soc * estimate.q_mobile / 3600.0)) if is_known else float("nan")
     return Calibration(
         cycle=discharge.meta.get("cycle"),
-        method=settings.method,
+        method=method,
         q_mobile_C=estimate.q_mobile,
         sd_q_mobile_C=estimate.sd_q_mobile,
         r_o_ohm=estimate.r_o,
@@ -525,8 +547,9 @@ def text_of(name: str, found: Calibration) -> str:
         f"{name}: {found.samples} samples{averaged} from load-on at {found.shown('load_on_time_s')}, "
         f"{3600.0 * found.drawn_Ah:.0f} C drawn"
     ]
-    if found.settings.method == "policy":
-        lines.append(f"calibrated by {found.settings.calibrated_by}")
+    if found.method != "least-squares":
+        by = found.settings.calibrated_by if found.method == "policy" else "the Kalman filter"
+        lines.append(f"calibrated by {by}")
     lines.append("")
 
     def add(column: str, remark: str = "", label: str = "", value: str = "") -> None:
@@ -554,11 +577,8 @@ def text_of(name: str, found: Calibration) -> str:
         add(column, "" if is_end else _of_the_load(found), label)
     if not found.settled:
         lines += ["", f"Not settled: {found.reason}"]
-        if found.in_progress and found.settings.method == "least-squares" and found.settings.prior_q_mobile_C is None:
-            lines += [
-                "During a discharge give --prior with the q_mobile of an earlier one of this cell. Without it",
-                '--method kalman (in Python method="kalman") predicts the end better than this fit.',
-            ]
+        if found.in_progress and found.settings.prior_q_mobile_C is None:
+            lines.append("During a discharge give --prior with the q_mobile of an earlier one, or forecast it with --life.")
     return "\n".join(lines)
 
 

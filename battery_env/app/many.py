@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from battery_env.app.calibrate import Calibration, Settings, calibrate, title_of
+from battery_env.app.calibrate import METHOD_NAMES, Calibration, Settings, calibrate, title_of
 from battery_env.cells import BUNDLED_CELLS, load_nasa_discharges
 from battery_env.files import check_folder, replacing
 from battery_env.record_files import Recording, read_recordings
@@ -200,7 +200,7 @@ class Results:
                 part.write_bytes(content)
 
     def write_table(self, outcomes: Sequence[Outcome]) -> list[Path]:
-        """Write the table of all discharges and, if there are several, the figure of their parameters over them."""
+        """Write the table of all discharges and, if several are whole, the figure of their parameters over them."""
         table = pd.DataFrame([each.row() for each in outcomes]).astype({"cycle": "Int64"})
         table["settled"] = table["settled"].astype("boolean")
         with replacing(self.table) as part:
@@ -212,10 +212,11 @@ class Results:
             written.append(self.parquet)
         except ImportError:
             pass
-        if (table["error"] == "").sum() > 1:
+        whole = table[table["measured_eod_time_s"].notna()]
+        if len(whole) > 1:
             from battery_env.plotting import plot_life, save_figure
 
-            written.append(save_figure(plot_life(table[table["error"] == ""]), self.life))
+            written.append(save_figure(plot_life(whole), self.life))
         return written
 
 
@@ -418,5 +419,6 @@ def _voltages(name: str, found: Calibration) -> dict[str, bytes]:
     columns = {"time_s": record.time_s, "voltage_V": record.voltage_V, "current_A": record.current_A}
     table = pd.DataFrame(columns | {"model_V": forecast.at_samples_V}).to_csv(index=False)
     picture = io.BytesIO()
-    plot_discharge(record, {"model": forecast}, title_of(name, found)).savefig(picture, dpi="figure")
+    shown = {f"model, {METHOD_NAMES[found.method]}": forecast}
+    plot_discharge(record, shown, title_of(name, found), found.end_quantiles_s).savefig(picture, dpi="figure")
     return {"csv": table.encode(), "png": picture.getvalue()}

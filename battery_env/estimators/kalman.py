@@ -63,9 +63,9 @@ class ExtendedKalmanFilter(OnlineEstimator):
     fractions never leave 0 .. 1. If ``q_mobile`` is held and too small for that, the estimate freezes and is not settled.
 
     *Standard deviations* count the error of the model as noise that is new with each sample. As it is not, that of
-    ``q_mobile`` does not fall below half of what :class:`~battery_env.estimators.LeastSquares` states for an error common to
-    the whole discharge, up to 1 % of ``q_mobile``: on whole discharges of the bundled cells, with ``mismatch_V=0.05``, it is
-    0.7 to 1 %.
+    ``q_mobile`` does not fall below what an error common to the whole discharge leaves open: before the knee what
+    :class:`~battery_env.estimators.LeastSquares` state, and at the knee what an error of twice ``mismatch_V`` at every sample
+    does, as a larger one would show. On whole discharges of the bundled cells that is about 1.2 % with ``mismatch_V=0.05``.
 
     The gain of the current sensor scales both parameters and does not show in the voltage: state it as ``current_gain_sd``.
 

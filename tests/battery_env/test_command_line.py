@@ -153,9 +153,10 @@ def test_what_remains_of_a_discharge_in_progress_needs_a_prior_or_the_filter(rec
     path = write(recorded.until(1500.0), tmp_path / "half.csv")
     shown = terminal.shows(path, status=3)
     assert "remaining" in shown and "Not settled: q_mobile is not known to 2 % yet" in shown
-    assert "give --prior" in shown and "--method kalman" in shown and "Ah   so far" in shown
+    assert "give --prior" in shown and "calibrated by the Kalman filter" in shown and "Ah   so far" in shown
+    assert terminal.row(path, status=3) == terminal.row(path, "--method", "kalman", status=3)
     shown = terminal.shows(path, "--prior", 5460, 55, "--nominal", 2, "--out", tmp_path, status=3)
-    assert "Not settled: q_mobile rests on its prior" in shown and "give --prior" not in shown
+    assert "Not settled: q_mobile rests on its prior" in shown and "give --prior" not in shown and "Kalman" not in shown
     assert "2.01 A to go on" in shown and "Ah), predicted, of 2 Ah" in shown
     (row,) = pd.read_csv(tmp_path / "half_estimate.csv").to_dict(orient="records")
     end_s, whole_Ah = recorded.eod_time_s(2.7), recorded.loaded_part(2.7).charge_C / 3600.0
