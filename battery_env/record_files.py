@@ -179,7 +179,7 @@ class _Table:
         if blank.any():
             table = table[~blank]
         if len(table) < LEAST_SAMPLES:
-            raise ValueError(f"there are {len(table) or 'no'} rows below the header; a discharge needs {LEAST_SAMPLES}")
+            raise ValueError(f"a discharge needs {LEAST_SAMPLES} rows below the header, got {len(table)}")
         columns, labels = {}, {}
         for quantity, scale in scales.items():
             values = table[quantity]
@@ -317,7 +317,7 @@ class _Table:
         time_s, voltage_V, current_A = (self.columns[name] for name in ("time", "voltage", "current"))
         step_s = np.diff(time_s)
         charge_C = np.append(0.0, np.cumsum(0.5 * (current_A[1:] + current_A[:-1]) * np.maximum(step_s, 0.0)))
-        new = step_s <= 0.0
+        new = step_s < 0.0
         if "cycle" in self.columns:
             new |= np.diff(self.columns["cycle"]) != 0.0
         cycle = np.append(0, np.cumsum(new))

@@ -221,9 +221,8 @@ def check_drawn_charge(charge_C: float, least_C: float = 0.0) -> None:
     """Refuse a current of the wrong sign."""
     if not charge_C > least_C:
         raise ValueError(
-            f"current_A is positive in discharge, but this record draws {charge_C:.6g} C in total. If the tester "
-            "counts discharge as negative, flip the sign (discharge_is_negative=True; command line: "
-            "--discharge-is-negative)."
+            f"current_A is positive in discharge, but this record draws {charge_C:.6g} C in total: flip the sign of the "
+            "current (discharge_is_negative; command line: --discharge-is-negative or --discharge-is-positive)."
         )
 
 

@@ -140,7 +140,7 @@ def read_source(source: Source, file_format: FileFormat) -> list[Recording]:
         ]
     elif Path(path).is_dir():
         endings = ", ".join((*TEXT_SUFFIXES, *BINARY_SUFFIXES, _NASA_SUFFIX))
-        raise ValueError(f"{path} and its folders hold no file whose name ends as that of a record ({endings})")
+        raise ValueError(f"{path} holds no file whose name ends as that of a record ({endings}), nor do the folders in it")
     elif not Path(path).exists():
         raise FileNotFoundError(
             f"no file {source.argument!r}; the bundled cells are given as {BUNDLED_CELLS[0]}:1, {BUNDLED_CELLS[0]}:2, ..."

@@ -82,8 +82,9 @@ class ExtendedKalmanFilter(OnlineEstimator):
     :class:`~battery_env.estimators.monitor.Verdict`. An estimate that rests on a prior is not settled: it is as good as the
     prior.
 
-    For a recorded discharge give :meth:`battery_env.cells.Discharge.loaded_part`, which starts when the load is switched on,
-    and state the error of the model as ``mismatch_V``: 0.05 V for the cells that come with the package.
+    The defaults are those of simulated records. For recorded cells take :func:`battery_env.calibrate`, or
+    ``battery_env.Settings(method="kalman").calibrator()``: a model of the temperature, and the errors of model and sensor to
+    expect. Give it :meth:`battery_env.cells.Discharge.loaded_part`, which starts when the load is switched on.
 
     :param parameters: which to search for; the other is held at ``cell``'s value
     :param cell: constants of the model; ``None``: the new cell's

@@ -344,7 +344,7 @@ CUT_SHORT = gzip.compress(b"time_s,voltage_V,current_A\n" + 200_000 * b"1,4.1,2\
         (
             "aborted.csv",
             b"time_s,voltage_V,current_A\n0,4.2,0\n10,4.2,0\n20,4.0,2\n",
-            "are 3 rows below the header; .* needs 5",
+            "needs 5 rows below the header, got 3",
         ),
         ("text.txt", b"Dear all,\nplease find the data attached.\n", "no column for the time"),
         ("cut.csv.gz", CUT_SHORT, "damaged"),
