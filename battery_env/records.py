@@ -100,6 +100,8 @@ def check_column(name: str, values: ArrayLike, least_samples: int) -> FloatArray
     """Refuse an invalid column of a record."""
     if values is None or np.ma.is_masked(values) or np.iscomplexobj(values):
         raise TypeError(f"{name} must hold real numbers, none of them masked, got {type(values).__name__}")
+    if np.asarray(values).dtype.kind in "mM":
+        raise TypeError(f"{name} must hold numbers, got dates. read_discharges takes a table with dates")
     try:
         array = np.array(values, dtype=np.float64)
     except (OverflowError, TypeError, ValueError) as error:
@@ -145,9 +147,13 @@ def check_samples(time_s: ArrayLike, voltage_V: ArrayLike, current_A: ArrayLike,
     stalls = np.flatnonzero(np.diff(time) <= 0.0)
     if len(stalls):
         n = stalls[0] + 1
+        if time[n] == time[n - 1]:
+            advice = "Give each sample once, with a clock that tells it from the next"
+        else:
+            advice = "Sort the samples, and give one discharge at a time, or number them in a column of the cycle"
         raise ValueError(
             f"time_s must increase from sample to sample, but sample {n} is at {time[n]:g} s, after {time[n - 1]:g} s. "
-            "Give one discharge at a time, or number them in a column of the cycle, and each sample once."
+            f"{advice}."
         )
     return Samples(**arrays)
 
@@ -215,9 +221,8 @@ def check_drawn_charge(charge_C: float, least_C: float = 0.0) -> None:
     """Refuse a current of the wrong sign."""
     if not charge_C > least_C:
         raise ValueError(
-            f"current_A is positive in discharge, but this record draws {charge_C:.6g} C in total. If the tester "
-            "counts discharge as negative, flip the sign (discharge_is_negative=True; command line: "
-            "--discharge-is-negative)."
+            f"current_A is positive in discharge, but this record draws {charge_C:.6g} C in total: flip the sign of the "
+            "current (discharge_is_negative; command line: --discharge-is-negative or --discharge-is-positive)."
         )
 
 

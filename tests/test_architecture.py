@@ -31,6 +31,7 @@ LAYERS = (
     ("battery_env.record_files",),
     ("battery_env.sensors",),
     ("battery_env.record_model",),
+    ("battery_env.conversions",),
     ("battery_env.estimators",),
     ("battery_env.calibration", "battery_env.pretrained_policies"),
     ("battery_env.evaluation",),
@@ -40,6 +41,7 @@ LAYERS = (
     ("battery_env.callbacks",),
     ("battery_env.app.calibrate",),
     ("battery_env.app.many",),
+    ("battery_env.app.forecast",),
     ("battery_env.app.command_line",),
     ("battery_env.app", "battery_env.__main__"),
 )
