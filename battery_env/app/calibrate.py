@@ -372,13 +372,7 @@ def _calibrated(discharge: Discharge, settings: Settings) -> Calibration:
     cell = _cell_at_the_temperature(record, settings)
     discharge = _with_the_temperature_that_counts(discharge, settings)
     start = _start(discharge, settings, cell)
-    for method in settings.methods(in_progress):
-        calibrator = replace(settings, method=method).calibrator(cell, start)
-        estimate = calibrator.estimate(_with_the_temperature_that_counts(record, settings))
-        if estimate.settled:
-            break
-    if start.reason:
-        estimate = replace(estimate, settled=False, reason=start.reason)
+    method, estimate = _estimated(record, in_progress, settings, cell, start)
     model = RecordModel(cell, settings.thermal and settings.method != "policy", initial_soc=start.soc)
     future = load = expected_current(record.time_s, record.current_A)
     if settings.future_current_A is not None:
@@ -433,6 +427,18 @@ def _calibrated(discharge: Discharge, settings: Settings) -> Calibration:
         record=record,
         forecast=forecast,
     )
+
+
+def _estimated(
+    record: Discharge, in_progress: bool, settings: Settings, cell: CellParameters, start: Start
+) -> tuple[Method, Estimate]:
+    """The first method whose estimate has settled, or the last one, and that estimate."""
+    for method in settings.methods(in_progress):
+        calibrator = replace(settings, method=method).calibrator(cell, start)
+        estimate = calibrator.estimate(_with_the_temperature_that_counts(record, settings))
+        if estimate.settled:
+            break
+    return method, replace(estimate, settled=False, reason=start.reason) if start.reason else estimate
 
 
 def _of_few_samples(record: Discharge) -> tuple[Discharge, float]:
