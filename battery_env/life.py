@@ -27,7 +27,7 @@ from battery_env.records import drawn
 #: What is believed of a cell before its discharges tell, as shares of q_mobile: the step from one to the next, the error of
 #: one estimate beside the others (both known to a factor of e, one standard deviation), and the sd of the drift.
 PRIOR_STEP_SHARE, PRIOR_NOISE_SHARE, PRIOR_DRIFT_SD_SHARE = 0.01, 0.003, 0.003
-_COLUMNS = ("q_mobile_C", "sd_q_mobile_C", "r_o_ohm", "settled", "reason", "valid", "capacity_Ah")
+_COLUMNS = ("q_mobile_C", "sd_q_mobile_C", "r_o_ohm", "settled", "reason", "valid", "capacity_Ah", "lasted_share")
 # Lives that are simulated, and discharges to look ahead.
 _LIVES, _MOST = 2000, 2000
 
@@ -40,8 +40,9 @@ class Life:
     The logarithm of ``q_mobile`` is a random walk with drift over the discharges, of which each estimate is one reading.
 
     :param table: one row per discharge: ``cycle`` (its number, or its position), ``q_mobile_C``, ``sd_q_mobile_C``,
-        ``r_o_ohm``, ``settled``, ``reason``, ``valid`` (whether it counts), ``capacity_Ah`` (charge to the cut-off), and what
-        the discharges before let expect of ``q_mobile``, ``expected_q_mobile_C`` and ``expected_sd_C`` (NaN for the first)
+        ``r_o_ohm``, ``settled``, ``reason``, ``valid`` (whether it counts), ``capacity_Ah`` (charge to the cut-off),
+        ``lasted_share`` (its duration, as a share of the model's at this ``q_mobile``; NaN if it was cut short), and what the
+        discharges before let expect of ``q_mobile``, ``expected_q_mobile_C`` and ``expected_sd_C`` (NaN for the first)
     :param step_share: standard deviation of the step from one discharge to the next, as a share of ``q_mobile``
     :param noise_share: standard deviation of an estimate beside the others, likewise
     :param drift_share: mean step
@@ -58,9 +59,13 @@ class Life:
 
     @property
     def prior_q_mobile_C(self) -> tuple[float, float]:
-        """Mean and standard deviation of ``q_mobile`` in the next discharge, C: a prior for its calibration."""
-        mean, variance = self.state.sum(), self.covariance.sum() + self.step_share**2
-        return exp(mean), exp(mean) * sqrt(variance)
+        """
+        Mean and standard deviation of ``q_mobile`` in the next discharge, C: a prior for its calibration. At the ``q_mobile``
+        of a whole discharge the model ends a little early or late, about as much as in the one before: the mean allows for it.
+        """
+        whole = self.table[self.table["valid"] & self.table["lasted_share"].notna()]
+        mean = exp(self.state.sum()) * (float(whole["lasted_share"].iloc[-1]) if len(whole) else 1.0)
+        return mean, mean * sqrt(self.covariance.sum() + self.step_share**2)
 
     def after(self, count: int) -> Life:
         """
@@ -150,10 +155,17 @@ def _told(discharge: Discharge, cut_off_V: float, calibrator: LeastSquares) -> d
     estimate = calibrator.estimate(record)
     end_s = calibrator.model.forecast(record, estimate, cut_off_V).eod_time_s
     capacity_Ah = float(drawn(record.time_s, record.current_A, end_s)) / 3600.0
-    is_whole = not isnan(discharge.eod_time_s(cut_off_V))
-    valid = estimate.settled or (is_whole and is_only_imprecise(estimate.reason))
-    values = (estimate.q_mobile, estimate.sd_q_mobile, estimate.r_o, estimate.settled, estimate.reason, valid, capacity_Ah)
-    return dict(zip(_COLUMNS, values, strict=True))
+    start_s, measured_s = record.time_s[0], discharge.eod_time_s(cut_off_V)
+    return {
+        "q_mobile_C": estimate.q_mobile,
+        "sd_q_mobile_C": estimate.sd_q_mobile,
+        "r_o_ohm": estimate.r_o,
+        "settled": estimate.settled,
+        "reason": estimate.reason,
+        "valid": estimate.settled or (not isnan(measured_s) and is_only_imprecise(estimate.reason)),
+        "capacity_Ah": capacity_Ah,
+        "lasted_share": (measured_s - start_s) / (end_s - start_s),
+    }
 
 
 def life_of(table: pd.DataFrame) -> Life:

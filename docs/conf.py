@@ -20,7 +20,7 @@ extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary"]
 templates_path = ["_templates"]
 exclude_patterns = ["_build"]
 html_theme = "furo"
-html_title = f"sb3_lac {release}"
+html_title = f"sb3_lac and battery_env {release}"
 
 myst_heading_anchors = 4  # as on GitHub
 autodoc_typehints = "description"

@@ -116,8 +116,9 @@ def _predict(one: Row, current: float, duration: float, settings: Settings, cons
 @_inlined
 def _common_error_sd(one: Row, settings: Settings) -> float:
     # What an error of the model that is common to the discharge leaves open of q_mobile, without its prior, however many
-    # samples there are: as much as least squares state. Theirs is the worst error of the stated mean square. Once the knee is seen,
-    # almost all of that lies on the few samples there, but an error beyond the margin would show: so it is no larger anywhere.
+    # samples there are: as much as least squares state. Theirs is the worst error of the stated mean square. Once the knee is
+    # seen, almost all of that lies on the few samples there, but an error beyond the margin would show: so it is no larger
+    # anywhere.
     told, (q_prior, r_prior), mismatch_V2 = one.told, settings.variance, settings.mismatch_V2
     if mismatch_V2 == 0.0 or q_prior == 0.0 or told.charge_C == 0.0:
         return 0.0

@@ -10,7 +10,8 @@ from battery_env.life import life_of
 
 def followed(q_mobile_C, **columns):
     table = pd.DataFrame({"q_mobile_C": q_mobile_C, "valid": True, "reason": ""})
-    return life_of(table.assign(cycle=np.arange(len(table)) + 1, capacity_Ah=table["q_mobile_C"] / 3780.0, **columns))
+    known = {"cycle": np.arange(len(table)) + 1, "capacity_Ah": table["q_mobile_C"] / 3780.0, "lasted_share": 1.0}
+    return life_of(table.assign(**{**known, **columns}))
 
 
 def walk(seed, count=150, step=0.01, noise=0.002, drift=-0.002):
@@ -54,6 +55,12 @@ class TestSeries:
     def test_one_discharge_is_enough_for_a_prior(self):
         mean_C, sd_C = followed(np.array([7000.0])).prior_q_mobile_C
         assert mean_C == pytest.approx(7000.0) and 0.005 < sd_C / mean_C < 0.03
+
+    def test_a_prior_makes_up_for_a_model_that_ends_early(self):
+        q_C = walk(3, 5)
+        plain, early, short = (followed(q_C, lasted_share=[1.0] * 4 + [last]) for last in (1.0, 1.02, np.nan))
+        assert early.prior_q_mobile_C == pytest.approx(1.02 * np.array(plain.prior_q_mobile_C))
+        assert short.prior_q_mobile_C == plain.prior_q_mobile_C
 
     def test_a_lower_threshold_is_reached_later(self):
         life = followed(walk(1, 60))
