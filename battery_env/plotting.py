@@ -345,13 +345,15 @@ def title_of_life(cells: Sequence[pd.DataFrame]) -> str:
     least = float(np.min(correlations))
     if not least >= _FOLLOWS:
         return ""
-    return f"{LABELS['q_mobile'].split(' (')[0]} follows the measured capacity (r > {min(np.floor(1e3 * least) / 1e3, 0.999):.3f})"
+    shown = min(np.floor(1e3 * least) / 1e3, 0.999)
+    return f"{Q_MOBILE.symbol} follows the measured capacity (r > {shown:.3f})"
 
 
 def _life_legend(figure: Figure, table: pd.DataFrame) -> None:
     axes = figure.axes[0]
     named = [pair for pair in zip(*axes.get_legend_handles_labels(), strict=True) if pair[1]][: len(COLOURS)]
-    handles, labels = [handle for handle, _ in named], [label for _, label in named]
+    handles: list[Any] = [handle for handle, _ in named]
+    labels = [label for _, label in named]
     if not table["settled"].astype(bool).all():
         handles += axes.plot([], [], "o", ms=3.2, mfc="white", mec="0.25", mew=0.8)
         labels.append("not settled")
