@@ -133,7 +133,9 @@ def coloured(things: Iterable[Thing]) -> Iterator[tuple[str, Thing]]:
     """
     listed = list(things)
     own = [_own_colour(thing) for thing in listed]
-    others = itertools.cycle([colour for colour in COLOURS if colour not in own])
+    left = [colour for colour in COLOURS if colour not in own]
+    # beside names, a colour of another name comes last
+    others = itertools.cycle(sorted(left, key=lambda colour: any(own) and colour in COLOUR_OF.values()))
     seen: set[str] = set()
     for thing, colour in zip(listed, own, strict=True):
         yield next(others) if colour is None or colour in seen else colour, thing
