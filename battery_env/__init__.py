@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from battery_env.calibration.registration import register_environments
 
 if TYPE_CHECKING:
+    from battery_env.app.calibrate import Calibration, Settings, calibrate
     from battery_env.calibration.onnx_policy import OnnxPolicy
     from battery_env.calibration.policy import PolicyEstimator
     from battery_env.cells import Discharge, load_nasa_discharges
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
 # Where each name comes from: numba, pandas and scipy take seconds to import, and an environment by its id needs none of them.
 # Type checkers see the imports above instead; a test holds the two together.
 _MODULES = {
+    "app.calibrate": ("Calibration", "Settings", "calibrate"),
     "calibration.onnx_policy": ("OnnxPolicy",),
     "calibration.policy": ("PolicyEstimator",),
     "cells": ("Discharge", "load_nasa_discharges"),

@@ -63,9 +63,9 @@ class ExtendedKalmanFilter(OnlineEstimator):
     fractions never leave 0 .. 1. If ``q_mobile`` is held and too small for that, the estimate freezes and is not settled.
 
     *Standard deviations* count the error of the model as noise that is new with each sample. As it is not, that of
-    ``q_mobile`` does not fall below half of what :class:`~battery_env.estimators.LeastSquares` states for an error common to
-    the whole discharge, up to 1 % of ``q_mobile``: on whole discharges of the bundled cells, with ``mismatch_V=0.05``, it is
-    0.7 to 1 %.
+    ``q_mobile`` does not fall below what an error common to the whole discharge leaves open: before the knee what
+    :class:`~battery_env.estimators.LeastSquares` state, and at the knee what an error of twice ``mismatch_V`` at every sample
+    does, as a larger one would show. On whole discharges of the bundled cells that is about 1.2 % with ``mismatch_V=0.05``.
 
     The gain of the current sensor scales both parameters and does not show in the voltage: state it as ``current_gain_sd``.
 
@@ -82,8 +82,9 @@ class ExtendedKalmanFilter(OnlineEstimator):
     :class:`~battery_env.estimators.monitor.Verdict`. An estimate that rests on a prior is not settled: it is as good as the
     prior.
 
-    For a recorded discharge give :meth:`battery_env.cells.Discharge.loaded_part`, which starts when the load is switched on,
-    and state the error of the model as ``mismatch_V``: 0.05 V for the cells that come with the package.
+    The defaults are those of simulated records. For recorded cells take :func:`battery_env.calibrate`, or
+    ``battery_env.Settings(method="kalman").calibrator()``: a model of the temperature, and the errors of model and sensor to
+    expect. Give it :meth:`battery_env.cells.Discharge.loaded_part`, which starts when the load is switched on.
 
     :param parameters: which to search for; the other is held at ``cell``'s value
     :param cell: constants of the model; ``None``: the new cell's

@@ -48,9 +48,6 @@ _REACH_SD = 2.5
 # same, within this share of a standard deviation.
 _LEAST_LOG_WEIGHT = -15.0
 _SAME_SHARE = 0.25
-# Least squares state the worst case: the error of the model of the stated size that moves q_mobile most. The filter is moved
-# half as far (measured on the bundled cells B0005 and B0006).
-_MISMATCH_SHARE = 0.5
 # The noise that innovations show is averaged over about this many samples.
 _NOISE_MEMORY = 32.0
 
@@ -117,18 +114,21 @@ def _predict(one: Row, current: float, duration: float, settings: Settings, cons
 
 
 @_inlined
-def _mismatch_sd(one: Row, settings: Settings) -> float:
-    # What the error of the model leaves open of q_mobile, however many samples there are: the filter takes the error for noise
-    # that is new with each of them. As in least squares it is one error common to the discharge.
-    told, (q_prior, r_prior) = one.told, settings.variance
-    if settings.mismatch_V2 == 0.0 or q_prior == 0.0 or told.charge_C == 0.0:
+def _common_error_sd(one: Row, settings: Settings) -> float:
+    # What an error of the model that is common to the discharge leaves open of q_mobile, without its prior, however many
+    # samples there are: as much as least squares state. Theirs is the worst error of the stated mean square. Once the knee is
+    # seen, almost all of that lies on the few samples there, but an error beyond the margin would show: so it is no larger
+    # anywhere.
+    told, (q_prior, r_prior), mismatch_V2 = one.told, settings.variance, settings.mismatch_V2
+    if mismatch_V2 == 0.0 or q_prior == 0.0 or told.charge_C == 0.0:
         return 0.0
-    share = 1.0 / (_MISMATCH_SHARE**2 * settings.mismatch_V2 * told.charge_C)
-    qq = told.qq * share + 1.0 / q_prior
-    if r_prior == 0.0:
-        return sqrt(1.0 / qq)
-    qr, rr = told.qr * share, told.rr * share + 1.0 / r_prior
-    return sqrt(rr / (qq * rr - qr * qr))
+    beside_r = told.qq
+    if r_prior > 0.0:
+        beside_r -= told.qr * told.qr / (told.rr + mismatch_V2 * told.charge_C / r_prior)
+    if not beside_r > 0.0:
+        return inf
+    spread = min(1.0, MISMATCH_MARGIN * told.q / sqrt(told.charge_C * told.qq))
+    return spread * sqrt(mismatch_V2 * told.charge_C / beside_r)
 
 
 @_inlined
@@ -174,6 +174,7 @@ def _correct(
             p[j, k] += gain[j] * gain[k] * variance - gain[j] * ph[k] - ph[j] * gain[k]
             p[k, j] = p[j, k]
     told = one.told
+    told.q += charge * abs(by_q)
     told.qq += charge * by_q * by_q
     told.qr += charge * by_q * by_r
     told.rr += charge * by_r * by_r
@@ -182,6 +183,12 @@ def _correct(
     to_q = min(max(q + gain[Q] * innovation, least_q_C), most_q_C)
     to_r = min(max(r_o + gain[R] * innovation, least_r), most_r)
     mean[OFFSET] += gain[OFFSET] * innovation
+    # along the curve of the voltage over the state of charge: with a smaller q_mobile the record comes further
+    if told.qq > 0.0:
+        scale = exp(-0.5 * (1.0 + told.charge_C * by_q * by_q / told.qq) * (to_q / q - 1.0))
+        told.q *= scale
+        told.qq *= scale * scale
+        told.qr *= scale
     _move(one, to_q - q, to_r - r_o)
 
 
@@ -284,4 +291,4 @@ def take(
     bank.offset_V2 += settings.offset_growth * duration
     _doubt(bank, filters[best].mean[OFFSET])
     bank.expected_V = filters[before].expected_V  # by the filter that did not know yet
-    bank.least_sd_q = _mismatch_sd(filters[best], settings)
+    bank.common_sd_q = _common_error_sd(filters[best], settings)

@@ -64,8 +64,9 @@ SAMPLE = _table("voltage_V current_A dt_s temperature_K")
 #: What is said after a sample; ``code`` is one of :class:`~battery_env.estimators.monitor.Verdict`.
 ESTIMATE = _table([("q_mobile", "f8"), ("r_o", "f8"), ("sd", "f8", 2), ("code", "i8")])
 
-# Sums over the charge drawn, of products of the derivatives of the voltage (V^2/C, V A, A^2 C), and that charge (C)
-_INFORMATION = _table("qq qr rr charge_C")
+# Sums over the charge drawn, of the derivative of the voltage by q_mobile (V) and of products with that by r_o (V^2/C, V A,
+# A^2 C), and that charge (C)
+_INFORMATION = _table("q qq qr rr charge_C")
 
 #: One filter of a bank, with a model of its own at its estimate.
 FILTER = _table(
@@ -85,11 +86,11 @@ FILTER = _table(
 # What a bank remembers beside its filters.
 _BANK = _table(
     [
-        # after the last sample: moments of the mixture of all filters, the standard deviation of q_mobile that the error of
-        # the model leaves at least, the voltage that was expected, and whether the model cell has one
+        # after the last sample: moments of the mixture of all filters, the standard deviation of q_mobile that an error of the
+        # model leaves which is common to the discharge, the voltage that was expected, and whether the model cell has one
         ("mean", "f8", 2),
         ("sd", "f8", 2),
-        ("least_sd_q", "f8"),
+        ("common_sd_q", "f8"),
         ("expected_V", "f8"),
         ("has_voltage", "b1"),
         # of innovations: the noise that they showed in the mean; the last ones, averaged; the sum of the products of each one

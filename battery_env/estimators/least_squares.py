@@ -81,6 +81,9 @@ class LeastSquares(Estimator):
     """
     The (q_mobile, r_o) whose simulated voltage is closest to the recorded one, over all samples of the record.
 
+    The defaults are those of simulated records. For recorded cells take :func:`battery_env.calibrate`, or
+    ``battery_env.Settings().calibrator()``: a model of the temperature, and the errors of model and sensor to expect.
+
     The model starts at the first sample of the record, fully charged and at rest unless ``initial_soc`` or ``initial`` say
     otherwise, and follows the recorded current (:func:`battery_env.records.resample_current`). For a recorded discharge give
     :meth:`battery_env.cells.Discharge.loaded_part`, which starts when the load is switched on.

@@ -19,9 +19,6 @@ from battery_env.records import REST_CURRENT_A, SWITCH_SHARE
 _LEAST_NARROWING = 0.2
 # A cell from which this share of its charge was drawn does not come back to the voltage of its first sample without a charge.
 _RECOVERY_SHARE = 0.2
-# The least standard deviation of q_mobile that the error of the model leaves is not taken to be above this share: a discharge
-# whose knee the filter has not seen has a larger one of its own.
-_MOST_LEAST_SHARE = 0.5 * settling.SETTLED_SHARES["q_mobile"]
 # A load that was switched for at least this long, s, and this many samples shows in the voltage: the ohmic drop of the model
 # comes to 80 % in 10 s.
 _LEAST_PULSE_S, _LEAST_PULSE_SAMPLES = 10.0, 3
@@ -312,7 +309,7 @@ def _judge(cell: Row, sd: tuple[float, float], doubt_C: float, settings: Setting
             if (bank.mean[k] - mean) ** 2 > settling.PRIOR_LIMIT_SD**2 * narrowed:
                 return Verdict.Q_PRIOR_WRONG + 2 * k
             # precisions add up
-            of_data = max(bank.sd[k] ** -2.0 - prior_sd**-2.0, 0.0) ** -0.5
+            of_data = max(max(bank.sd[k] ** -2.0 - prior_sd**-2.0, 0.0) ** -0.5, bank.common_sd_q if k == Q else 0.0)
             if of_data >= _SHARES[k] * bank.mean[k]:
                 return Verdict.Q_PRIOR_ALONE + 2 * k
     if searched[Q] and hypot(sd[Q], doubt_C) >= _SHARES[Q] * bank.mean[Q] > sd[Q]:
@@ -337,8 +334,8 @@ def watch(cell: Row, sample: Row, settings: Settings, estimate: Row) -> None:
     if not isnan(voltage):
         before.voltage_2_V = before.voltage_1_V if cell.samples > 1 else voltage
         before.voltage_1_V, before.time_1_s, before.current_1_A = voltage, cell.time_s, current
-    # what the error of the model leaves open, and what shows nowhere in the voltage
-    least_sd_q = min(bank.least_sd_q, _MOST_LEAST_SHARE * bank.mean[Q])
+    # what the error of the model leaves open beside the prior, and what shows nowhere in the voltage
+    least_sd_q = (bank.common_sd_q**-2.0 + 1.0 / settings.variance[Q]) ** -0.5
     sd = (
         hypot(max(bank.sd[Q], least_sd_q), settings.scale_sd[Q] * bank.mean[Q]),
         hypot(max(bank.sd[R], 0.0), settings.scale_sd[R] * bank.mean[R]),

@@ -92,6 +92,11 @@ SCALE_UNKNOWN = (
     "(current_gain_sd) and the charge at the start (initial_soc)."
 )
 PRIOR_ALONE = "{} rests on its prior: the record alone does not determine it yet."
+# The reasons why an estimate is not settled though nothing contradicts it
+_ONLY_IMPRECISE = (
+    *IMPRECISE.values(),
+    *(text.format(name) for text in (SCALE_UNKNOWN, PRIOR_ALONE) for name in IMPRECISE),
+)
 
 
 @lru_cache(maxsize=64)
@@ -243,6 +248,11 @@ def white_noise_V(residual_V: FloatArray, order: int = 1) -> float:
     hold what drifts, by the median, which leaves single wild samples aside.
     """
     return float(np.median(np.abs(np.diff(residual_V, order))) / (0.6745 * np.sqrt(comb(2 * order, order))))
+
+
+def is_only_imprecise(reason: str) -> bool:
+    """Return whether an estimate is not settled by its precision alone: nothing in the record contradicts it."""
+    return reason.startswith(_ONLY_IMPRECISE)
 
 
 def first_reason(conditions: Iterable[tuple[bool, str]]) -> str:
