@@ -372,13 +372,7 @@ def _calibrated(discharge: Discharge, settings: Settings) -> Calibration:
     cell = _cell_at_the_temperature(record, settings)
     discharge = _with_the_temperature_that_counts(discharge, settings)
     start = _start(discharge, settings, cell)
-    for method in settings.methods(in_progress):
-        calibrator = replace(settings, method=method).calibrator(cell, start)
-        estimate = calibrator.estimate(_with_the_temperature_that_counts(record, settings))
-        if estimate.settled:
-            break
-    if start.reason:
-        estimate = replace(estimate, settled=False, reason=start.reason)
+    estimate, method = _estimate(record, settings, cell, start, in_progress)
     model = RecordModel(cell, settings.thermal and settings.method != "policy", initial_soc=start.soc)
     future = load = expected_current(record.time_s, record.current_A)
     if settings.future_current_A is not None:
@@ -433,6 +427,20 @@ def _calibrated(discharge: Discharge, settings: Settings) -> Calibration:
         record=record,
         forecast=forecast,
     )
+
+
+def _estimate(
+    record: Discharge, settings: Settings, cell: CellParameters, start: Start, in_progress: bool
+) -> tuple[Estimate, Method]:
+    """The estimate of the first method that settles the discharge, or of the last one; and which it is."""
+    for method in settings.methods(in_progress):
+        calibrator = replace(settings, method=method).calibrator(cell, start)
+        estimate = calibrator.estimate(_with_the_temperature_that_counts(record, settings))
+        if estimate.settled:
+            break
+    if start.reason:
+        estimate = replace(estimate, settled=False, reason=start.reason)
+    return estimate, method
 
 
 def _of_few_samples(record: Discharge) -> tuple[Discharge, float]:
