@@ -19,8 +19,8 @@ from scipy.stats import truncnorm
 from battery_env.arrays import BoolArray, FloatArray
 from battery_env.cells import Discharge
 from battery_env.checks import check_positive, check_whole_number
+from battery_env.estimators.diagnosis import is_only_imprecise
 from battery_env.estimators.least_squares import LeastSquares
-from battery_env.estimators.settling import is_only_imprecise
 from battery_env.forecasts import BAND
 from battery_env.records import drawn
 

@@ -22,12 +22,12 @@ from battery_env.estimators.cell_fit import UNFITTED_MISMATCH_V, CellFit
 from battery_env.estimators.gaps import NOT_DRAWN, find_gaps
 from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
+from battery_env.estimators.monitor import start_condition, watched
 from battery_env.estimators.rest import InitialSoc, Start, check_initial_soc, soc_from_rest
-from battery_env.estimators.settling import least_resistance_ohm, rest_voltage_V, start_reason
 from battery_env.parameters import PARAMETER_NAMES, check_parameters
 from battery_env.record_files import each_usable
 from battery_env.record_model import RecordModel, VoltageForecast
-from battery_env.records import CUT_OFF_V, ExpectedCurrent, drawn, expected_current
+from battery_env.records import CUT_OFF_V, ExpectedCurrent, Samples, drawn, expected_current
 
 Method = Literal["least-squares", "kalman", "policy"]
 METHODS: tuple[Method, ...] = get_args(Method)
@@ -372,13 +372,7 @@ def _calibrated(discharge: Discharge, settings: Settings) -> Calibration:
     cell = _cell_at_the_temperature(record, settings)
     discharge = _with_the_temperature_that_counts(discharge, settings)
     start = _start(discharge, settings, cell)
-    for method in settings.methods(in_progress):
-        calibrator = replace(settings, method=method).calibrator(cell, start)
-        estimate = calibrator.estimate(_with_the_temperature_that_counts(record, settings))
-        if estimate.settled:
-            break
-    if start.reason:
-        estimate = replace(estimate, settled=False, reason=start.reason)
+    estimate, method = _estimate(record, settings, cell, start, in_progress)
     model = RecordModel(cell, settings.thermal and settings.method != "policy", initial_soc=start.soc)
     future = load = expected_current(record.time_s, record.current_A)
     if settings.future_current_A is not None:
@@ -433,6 +427,20 @@ def _calibrated(discharge: Discharge, settings: Settings) -> Calibration:
         record=record,
         forecast=forecast,
     )
+
+
+def _estimate(
+    record: Discharge, settings: Settings, cell: CellParameters, start: Start, in_progress: bool
+) -> tuple[Estimate, Method]:
+    """The estimate of the first method that settles the discharge, or of the last one; and which it is."""
+    for method in settings.methods(in_progress):
+        calibrator = replace(settings, method=method).calibrator(cell, start)
+        estimate = calibrator.estimate(_with_the_temperature_that_counts(record, settings))
+        if estimate.settled:
+            break
+    if start.reason:
+        estimate = replace(estimate, settled=False, reason=start.reason)
+    return estimate, method
 
 
 def _of_few_samples(record: Discharge) -> tuple[Discharge, float]:
@@ -491,10 +499,10 @@ def _is_logged(record: Discharge, forecast: VoltageForecast, estimate: Estimate)
 def _starts_lower(discharge: Discharge, cell: CellParameters, soc: float, estimate: Estimate) -> bool:
     """Whether the voltage before the load, or the first one under it, is below that of a cell with this charge."""
     begin = int(np.searchsorted(discharge.time_s, discharge.load_on_time_s, side="right")) - 1
-    time_s, voltage_V, current_A = (column[begin:] for column in (discharge.time_s, discharge.voltage_V, discharge.current_A))
-    rest_V = rest_voltage_V(cell, soc)
-    resistance_ohm = least_resistance_ohm(estimate.q_mobile, estimate.r_o)
-    return bool(voltage_V[0] < rest_V and start_reason(time_s, voltage_V, current_A, cell, soc, resistance_ohm))
+    columns = (discharge.time_s, discharge.voltage_V, discharge.current_A)
+    seen = watched(Samples(*(column[begin:] for column in columns)), cell, soc, estimate.q_mobile, estimate.r_o)
+    is_lower = seen["start"]["first_V"] < seen["start_V"]
+    return bool(is_lower and start_condition(seen, estimate.q_mobile, estimate.r_o))
 
 
 def _nominal_Ah(model: RecordModel, settings: Settings, load_A: float) -> float:

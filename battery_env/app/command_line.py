@@ -238,11 +238,11 @@ def _fit_parser(name: str) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=name,
         description=(
-            "Fit the constants of the model to a few discharges of one cell, each from full charge to its knee, and save them "
-            "for --cell of calibrate. Take three or more, of all ages and loads that they are to hold for."
+            "Fit the constants of the model to a few discharges of one cell, each from full charge to the cut-off, and save "
+            "them for --cell of calibrate. Take three or more, of all ages and loads that they are to hold for."
         ),
-        epilog="Exit status: 0, 3 if the discharges may not have started full, or 2 if one cannot be used or the equations do "
-        "not describe the cell.",
+        epilog="Exit status: 0, 3 if the discharges may not have started full, are of one age or not of one cell, or 2 if one "
+        "cannot be used or does not reach the cut-off, or the equations do not describe the cell.",
         allow_abbrev=False,
     )
     _add_files(parser)
@@ -394,7 +394,7 @@ def fit(arguments: Sequence[str] | None = None, name: str = "python -m battery_e
 
     :param arguments: as in :func:`main`, without the name of the command
     :param name: of the program, for its help
-    :return: 0, 3 if the discharges may not have started full, or 2 if nothing was fitted; a line on standard error says why
+    :return: 0, 3 if there is doubt about the fit, or 2 if nothing was fitted; a line on standard error says why
     """
     options = _fit_parser(name).parse_args(arguments)
     out: Path = options.out

@@ -18,8 +18,8 @@ from battery_env.cells import Discharge
 from battery_env.checks import ZERO_CELSIUS_K, LoadUnit
 from battery_env.electrochemistry import NEW_CELL
 from battery_env.estimates import Estimate
+from battery_env.estimators.diagnosis import is_only_imprecise
 from battery_env.estimators.least_squares import LeastSquares
-from battery_env.estimators.settling import is_only_imprecise
 from battery_env.files import check_folder, replacing
 from battery_env.forecasts import BAND, Forecast, FutureLoad, forecast, quantile
 from battery_env.life import Life, track_life
