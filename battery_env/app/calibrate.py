@@ -27,7 +27,7 @@ from battery_env.estimators.rest import InitialSoc, Start, check_initial_soc, so
 from battery_env.parameters import PARAMETER_NAMES, check_parameters
 from battery_env.record_files import each_usable
 from battery_env.record_model import RecordModel, VoltageForecast
-from battery_env.records import ExpectedCurrent, Samples, drawn, expected_current
+from battery_env.records import CUT_OFF_V, ExpectedCurrent, Samples, drawn, expected_current
 
 Method = Literal["least-squares", "kalman", "policy"]
 METHODS: tuple[Method, ...] = get_args(Method)
@@ -94,7 +94,7 @@ class Settings:
 
     method: Method | None = None
     parameters: tuple[str, ...] = PARAMETER_NAMES
-    cut_off_V: float = 2.7
+    cut_off_V: float = CUT_OFF_V
     prior_q_mobile_C: tuple[float, float] | None = None
     mismatch_V: float = UNFITTED_MISMATCH_V
     current_gain_sd: float = 0.005

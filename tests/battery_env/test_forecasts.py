@@ -47,6 +47,10 @@ class TestLoads:
         assert found.load_name == "4 A"
         np.testing.assert_allclose(found.eod_time_s, MODEL.forecast(record, TRUTH, cut_off_V).eod_time_s, atol=1e-6)
 
+    def test_a_recorded_cell_ends_at_the_same_voltage_as_everywhere(self):
+        found = forecast(half(discharged(4.0, load_unit="current")), TRUTH, samples=3)
+        assert found.cut_off_V == Settings().cut_off_V == 2.7
+
     def test_a_known_profile_ends_when_the_cell_does(self):
         record = discharged(RandomPiecewise((4.0, 12.0))(np.random.default_rng(3)))
         found = certain(half(record), rest_of(record))
