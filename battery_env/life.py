@@ -6,7 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import exp, isnan, log, sqrt
+from math import exp, hypot, isnan, log, sqrt
 from typing import Any
 
 import numpy as np
@@ -27,7 +27,7 @@ from battery_env.records import drawn
 #: What is believed of a cell before its discharges tell, as shares of q_mobile: the step from one to the next, the error of
 #: one estimate beside the others (both known to a factor of e, one standard deviation), and the sd of the drift.
 PRIOR_STEP_SHARE, PRIOR_NOISE_SHARE, PRIOR_DRIFT_SD_SHARE = 0.01, 0.003, 0.003
-_COLUMNS = ("q_mobile_C", "sd_q_mobile_C", "r_o_ohm", "settled", "reason", "valid", "capacity_Ah")
+_COLUMNS = ("q_mobile_C", "sd_q_mobile_C", "r_o_ohm", "settled", "reason", "valid", "capacity_Ah", "mean_current_A")
 # Lives that are simulated, and discharges to look ahead.
 _LIVES, _MOST = 2000, 2000
 
@@ -40,8 +40,9 @@ class Life:
     The logarithm of ``q_mobile`` is a random walk with drift over the discharges, of which each estimate is one reading.
 
     :param table: one row per discharge: ``cycle`` (its number, or its position), ``q_mobile_C``, ``sd_q_mobile_C``,
-        ``r_o_ohm``, ``settled``, ``reason``, ``valid`` (whether it counts), ``capacity_Ah`` (charge to the cut-off), and what
-        the discharges before let expect of ``q_mobile``, ``expected_q_mobile_C`` and ``expected_sd_C`` (NaN for the first)
+        ``r_o_ohm``, ``settled``, ``reason``, ``valid`` (whether it counts), ``capacity_Ah`` (charge to the cut-off),
+        ``mean_current_A``, and what the discharges before let expect of ``q_mobile``, ``expected_q_mobile_C`` and
+        ``expected_sd_C`` (NaN for the first)
     :param step_share: standard deviation of the step from one discharge to the next, as a share of ``q_mobile``
     :param noise_share: standard deviation of an estimate beside the others, likewise
     :param drift_share: mean step
@@ -58,9 +59,19 @@ class Life:
 
     @property
     def prior_q_mobile_C(self) -> tuple[float, float]:
-        """Mean and standard deviation of ``q_mobile`` in the next discharge, C: a prior for its calibration."""
+        """
+        Mean and standard deviation of ``q_mobile`` in the next discharge, C: a prior for its calibration. It is for the load
+        of the life, under which the error that all estimates share cancels from the end.
+        """
         mean, variance = self.state.sum(), self.covariance.sum() + self.step_share**2
         return exp(mean), exp(mean) * sqrt(variance)
+
+    @property
+    def prior_at_other_loads_C(self) -> tuple[float, float]:
+        """The same for a load that is not that of the life: the error that all estimates share counts too."""
+        mean_C, sd_C = self.prior_q_mobile_C
+        last = self.table[self.table["valid"]].iloc[-1]
+        return mean_C, hypot(sd_C, mean_C * last["sd_q_mobile_C"] / last["q_mobile_C"])
 
     def after(self, count: int) -> Life:
         """
@@ -152,8 +163,9 @@ def _told(discharge: Discharge, cut_off_V: float, calibrator: LeastSquares) -> d
     capacity_Ah = float(drawn(record.time_s, record.current_A, end_s)) / 3600.0
     is_whole = not isnan(discharge.eod_time_s(cut_off_V))
     valid = estimate.settled or (is_whole and is_only_imprecise(estimate.reason))
-    values = (estimate.q_mobile, estimate.sd_q_mobile, estimate.r_o, estimate.settled, estimate.reason, valid, capacity_Ah)
-    return dict(zip(_COLUMNS, values, strict=True))
+    mean_A = record.charge_C / float(np.ptp(record.time_s))
+    found = (estimate.q_mobile, estimate.sd_q_mobile, estimate.r_o, estimate.settled, estimate.reason)
+    return dict(zip(_COLUMNS, (*found, valid, capacity_Ah, mean_A), strict=True))
 
 
 def life_of(table: pd.DataFrame) -> Life:

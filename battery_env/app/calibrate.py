@@ -62,8 +62,8 @@ class Settings:
     """
     How a discharge is looked at.
 
-    :param method: of calibration; ``None``: least squares, and where they do not settle a record in progress, of which neither
-        a prior nor the constants of its cell are known, the filter
+    :param method: of calibration; ``None``: least squares; and where they do not settle a record in progress at a constant
+        load that goes on, of a cell of which neither a prior nor the constants are known, the filter
     :param parameters: which to search for; the other is held at the cell's value
     :param cut_off_V: voltage at which the discharge ends, V
     :param prior_q_mobile_C: mean and standard deviation of ``q_mobile`` before the discharge, C; ``None``: nothing is known
@@ -140,12 +140,13 @@ class Settings:
             others, cell = {**known, **others}, cell.cell
         return cls(**{"cell": cell, **others})
 
-    def methods(self, in_progress: bool) -> list[Method]:
-        """What to calibrate a record by: the first one that settles it, or the last one."""
+    def methods(self, goes_on: bool) -> list[Method]:
+        """What to calibrate a record by: the first one that settles it, or the last; ``goes_on``: a constant load does."""
         if self.method is not None:
             return [self.method]
-        is_new = in_progress and self.prior_q_mobile_C is None and self.cell is None
-        return ["least-squares", "kalman"] if is_new else ["least-squares"]
+        # under other loads the filter, which takes the error of the model for noise, is surer than it may be
+        is_new = self.prior_q_mobile_C is None and self.cell is None and self.future_current_A is None
+        return ["least-squares", "kalman"] if goes_on and is_new else ["least-squares"]
 
     def calibrator(
         self, cell: CellParameters | None = None, start: Start | None = None
@@ -292,7 +293,8 @@ def calibrate(discharge: Discharge, settings: Settings) -> Calibration:
     cell = _cell_at_the_temperature(record, settings)
     discharge = _with_the_temperature_that_counts(discharge, settings)
     start = _start(discharge, settings, cell)
-    for method in settings.methods(in_progress):
+    load = expected_current(record.time_s, record.current_A)
+    for method in settings.methods(in_progress and not load.varied):
         calibrator = replace(settings, method=method).calibrator(cell, start)
         estimate = calibrator.estimate(_with_the_temperature_that_counts(record, settings))
         if estimate.settled:
@@ -300,7 +302,7 @@ def calibrate(discharge: Discharge, settings: Settings) -> Calibration:
     if start.reason:
         estimate = replace(estimate, settled=False, reason=start.reason)
     model = RecordModel(cell, settings.thermal and settings.method != "policy", initial_soc=start.soc)
-    future = load = expected_current(record.time_s, record.current_A)
+    future = load
     if settings.future_current_A is not None:
         future = ExpectedCurrent(settings.future_current_A, varied=False, sd_A=0.0)
     forecast = model.forecast(record, estimate, settings.cut_off_V, future.mean_A, in_progress)
