@@ -113,7 +113,7 @@ _CALIBRATION: _Options = {
     ("--method",): {
         "choices": METHODS,
         "help": "of calibration: least squares, the filter (kalman), or a policy trained on simulated cells (default: least "
-        "squares; the filter where these do not settle a discharge in progress without --prior and --cell)",
+        "squares; the filter where these do not settle one in progress at a constant load, without --prior and --cell)",
     },
     ("--policy",): {
         "type": Path,
