@@ -59,16 +59,11 @@ GUIDE = {
 NOT_YET = {
     "docs/lac",
     "docs/cost_environments",
-    "docs/own_algorithm",
-    "docs/onnx",
-    "docs/tensorboard",
     "docs/real_cells",
     "docs/own_cell",
     "docs/command_line",
     "docs/forecasts",
     "docs/streaming",
-    "docs/cluster",
-    "docs/identifiability",
     "docs/battery_env",
 }
 STYLED = [name for names in GUIDE.values() for name in names if name not in NOT_YET]
@@ -124,9 +119,11 @@ def published(path):
 
 
 def run_briefly(source, name, folder, monkeypatch):
-    """Run an example in an empty folder, with a few training steps instead of thousands."""
+    """Run an example in an empty folder, with a few training steps and episodes instead of thousands."""
     monkeypatch.chdir(folder)
     source = re.sub(r"\.learn\((total_timesteps=)?[\d_.e]+", r".learn(\g<1>150", source)
+    source = re.sub(r"\b(n_envs|n_episodes|n_eval_episodes)=\d+", r"\1=10", source)
+    source = re.sub(r"\bn_episodes_per_start=\d+", "n_episodes_per_start=2", source)
     exec(compile(source, name, "exec"), {"__name__": "__main__"})
 
 
