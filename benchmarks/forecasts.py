@@ -31,7 +31,7 @@ from battery_env.estimators.least_squares import LeastSquares
 from battery_env.forecasts import BAND, forecast
 from battery_env.life import Life, track_life
 from battery_env.loads import Load, RandomPiecewise, RandomWalk
-from battery_env.plotting import COLOURS, coloured, new_figure
+from battery_env.plotting import COLOUR_OF, COLOURS, coloured, new_figure
 from battery_env.record_model import RecordModel
 from battery_env.records import Record, Samples
 from battery_env.sensors import SensorErrors
@@ -195,7 +195,7 @@ def plot(rows: pd.DataFrame, remaining: pd.DataFrame) -> Figure:
         high = part["high"].clip(upper=1e4)  # what is beyond the forecast is infinite
         axes.fill_between(part["seen"], part["low"], high, color=COLOURS[0], alpha=0.25, lw=0, label="90 %")
         axes.plot(part["seen"], part["median"], color=COLOURS[0], lw=1.4, label="median")
-        axes.plot(part["seen"], part["remaining"], color=COLOURS[1], lw=1.2, label="measured")
+        axes.plot(part["seen"], part["remaining"], color=COLOUR_OF["measured"], lw=1.2, label="measured")
         axes.set(title=cell, xlabel="discharges seen", ylabel=f"discharges to {END_OF_LIFE_Ah:g} Ah")
         axes.set_ylim(0.0, 3.0 * part["remaining"].max())
         axes.grid(alpha=0.25)

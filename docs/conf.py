@@ -23,7 +23,6 @@ html_theme = "furo"
 html_title = f"sb3_lac and battery_env {release}"
 
 myst_heading_anchors = 4  # as on GitHub
-autosummary_ignore_module_all = False
 autodoc_typehints = "description"
 autodoc_member_order = "bysource"
 autodoc_type_aliases = {name: name for name in ("BoolArray", "FloatArray", "IntArray")}

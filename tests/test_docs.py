@@ -42,6 +42,7 @@ GUIDE = {
         "docs/first_discharge",
         "docs/cell_life",
         "docs/which_estimator",
+        "docs/parameters",
         "docs/real_cells",
         "docs/own_cell",
         "docs/command_line",

@@ -6,7 +6,8 @@ import os
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
+from math import hypot, log
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +15,17 @@ import numpy as np
 import pandas as pd
 from numpy.polynomial import Legendre, Polynomial
 from numpy.polynomial.legendre import legvander
+from numpy.typing import ArrayLike
 
-from battery_env.arrays import FloatArray
+from battery_env.arrays import FloatArray, IntArray
 from battery_env.cells import Discharge
 from battery_env.checks import check_numbers, check_positive
 from battery_env.electrochemistry import NEW_CELL, CellParameters, check_cell, check_dt
 from battery_env.electrochemistry.tangents import BY_Q, BY_R, RATE_CONSTANTS
+from battery_env.estimates import Estimate
+from battery_env.estimators.diagnosis import FULL_REST_V, MISMATCH_MARGIN, rest_voltage_V
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.search import MARGIN, OnGrid, distance_C, minimized, square
-from battery_env.estimators.settling import FULL_REST_V, rest_voltage_V
 from battery_env.files import WrongFormatError, read_json, write_json
 from battery_env.parameters import Q_MOBILE, R_O
 from battery_env.record_model import RecordModel
@@ -40,8 +43,13 @@ IDENTIFIED_SHARE = 0.5
 LIMIT_V = 0.05
 #: Error to expect on a real cell of constants that were not fitted to it, V.
 UNFITTED_MISMATCH_V = 0.05
+#: Over its life a cell loses this share of ``q_mobile``. Constants that were fitted at one end of it are taken to be
+#: :data:`UNFITTED_MISMATCH_V` off at the other one, and between in proportion to the logarithm of ``q_mobile``: constants of
+#: one discharge of B0005 are off the others by that.
+LIFE_LOSS = 0.3
 
-_FORMAT, _FORMAT_VERSION = "battery_env.CellFit", 1
+# Version 1 took the residuals of what was fitted for the error to expect.
+_FORMAT, _FORMAT_VERSION = "battery_env.CellFit", 2
 
 _MOST_DISCHARGES, _FEWEST_SAMPLES = 30, 20
 # Longer records are thinned: what the constants shape is slower.
@@ -60,6 +68,10 @@ _FIRST_MISMATCH_V, _LEAST_MISMATCH_V = 0.02, 1e-3
 # The error of the model drifts slowly: a discharge shows so many independent ones, unless its residuals change sign more
 # often.
 _INDEPENDENT_ERRORS = 50.0
+# For the error to expect each of so many groups, from the youngest to the oldest, is left out of the fit once.
+_GROUPS = 3
+# How much the logarithm of q_mobile falls over a life.
+_LIFE = -log(1.0 - LIFE_LOSS)
 # The search: how many standard deviations of its prior a constant may move, the logarithm of the distance of q_mobile to its
 # least value, C, and the scale of r_o, ohm.
 _REACH_SD, _LOG_DISTANCE_LIMITS, _R_O_SCALE_OHM = 6.0, (-30.0, 16.0), 0.1
@@ -105,6 +117,7 @@ class FittedDischarge:
     :param sd_r_o: likewise, ohm
     :param rmse_V: root mean square of the voltage error, V
     :param rmse_before_V: likewise with the constants known before and the ``q_mobile`` and ``r_o`` that fit best to them
+    :param left_out_V: likewise with constants that were fitted without this discharge; ``None`` if there are no others
     """
 
     name: str
@@ -114,6 +127,7 @@ class FittedDischarge:
     sd_r_o: float
     rmse_V: float
     rmse_before_V: float
+    left_out_V: float | None = None
 
 
 @dataclass(frozen=True)
@@ -131,8 +145,7 @@ class CellFit:
     :param cell: the constants, with ``q_mobile`` and ``r_o`` of the discharge with the largest ``q_mobile``, and the cut-off
         voltage as ``VEOD``
     :param start: the constants before, with the same ``q_mobile``, ``r_o`` and ``VEOD``
-    :param mismatch_V: error to expect of the model with these constants, V: the root mean square of the residuals, corrected
-        for what was fitted
+    :param mismatch_V: error to expect of the model with these constants, V, also at ages that were not fitted
     :param rmse_V: root mean square of the residuals, V
     :param thermal: whether the temperature of the model moves
     :param constants: what the discharges say about each constant
@@ -156,9 +169,12 @@ class CellFit:
             check_cell(getattr(self, name), self.thermal)
         for name in ("mismatch_V", "rmse_V"):
             check_positive(name, getattr(self, name))
+        if not self.discharges:
+            raise ValueError("a fit is of at least one discharge")
+        Q_MOBILE.check([discharge.q_mobile for discharge in self.discharges])
         rows: tuple[FittedConstant | FittedDischarge, ...] = (*self.constants, *self.discharges)
         for row in rows:
-            _, *numbers = vars(row).values()
+            _, *numbers = (value for item, value in vars(row).items() if (item, value) != ("left_out_V", None))
             if not isinstance(row.name, str) or not np.isfinite(check_numbers(row.name, numbers)).all():
                 raise ValueError(f"constants and discharges have names and finite numbers, got {row!r}")
 
@@ -169,7 +185,10 @@ class CellFit:
 
     @property
     def doubt(self) -> str:
-        """Why the discharges that were fitted may not have shown a full cell at rest; empty if nothing speaks against it."""
+        """What the discharges that were fitted may lack: a full cell at rest, other ages, one cell. Empty if they do not."""
+        return " ".join(filter(None, (self._doubt_of_start(), self._doubt_of_ages(), self._doubt_of_others())))
+
+    def _doubt_of_start(self) -> str:
         before_V = rest_voltage_V(self.start)
         if self.full_V >= before_V - FULL_REST_V[0]:
             return ""
@@ -177,6 +196,30 @@ class CellFit:
             f"A full cell rests at {self.full_V:.2f} V with these constants, at {before_V:.2f} V with those before. If the "
             "discharges that were fitted did not start full, or lack the rest before the load, the constants are wrong, and "
             "so is every q_mobile found with them: fit others. If a full cell of this kind rests there, all is well."
+        )
+
+    def _doubt_of_ages(self) -> str:
+        q_C = np.array([discharge.q_mobile for discharge in self.discharges])
+        if _unseen(q_C) <= 0.5 * _LIFE:
+            return ""
+        return (
+            "The discharges that were fitted show one age, or less than half of a cell's life: q_mobile is "
+            f"{q_C.min():.0f} to {q_C.max():.0f} C. What the constants are worth at other ages is not known: mismatch_V, "
+            f"{1e3 * self.mismatch_V:.0f} mV, allows for that. Add discharges of other ages when there are some."
+        )
+
+    def _doubt_of_others(self) -> str:
+        log_q, ratios = np.log([discharge.q_mobile for discharge in self.discharges]), {}
+        for group, others in _groups(log_q):
+            for d in group.tolist():
+                by_age_V = _aged_V(float(np.abs(log_q[others] - log_q[d]).min()))
+                ratios[d] = (self.discharges[d].left_out_V or 0.0) / hypot(self.rmse_V, by_age_V)
+        odd = max(ratios, key=ratios.__getitem__, default=0)
+        if ratios.get(odd, 0.0) <= MISMATCH_MARGIN:
+            return ""
+        return (
+            f"Constants fitted without {self.discharges[odd].name} are {ratios[odd]:.1f} times as far off it as its age "
+            "explains: leave it out if it is of another cell; if it is of another load, add discharges of that load."
         )
 
     def calibrator(self, **arguments: Any) -> LeastSquares:
@@ -232,12 +275,16 @@ class CellFit:
                 f"{constant.name:<16}{prior:>12}{value:>12}{next(sds):>12}{next(sds):>10}"
                 + ("" if constant.identified else "   not identified")
             )
-        lines += ["", f"{'discharge':<16}{'q_mobile':>10}{'sd':>8}{'r_o':>12}{'sd':>12}{'RMSE before':>14}{'after':>10}"]
+        lines += [
+            "",
+            f"{'discharge':<16}{'q_mobile':>10}{'sd':>8}{'r_o':>12}{'sd':>12}{'RMSE before':>14}{'after':>10}{'left out':>12}",
+        ]
         for discharge in self.discharges:
             lines.append(
                 f"{discharge.name:<16}{discharge.q_mobile:>8.0f} C{discharge.sd_q_mobile:>6.0f} C"
                 f"{discharge.r_o:>8.4f} ohm{discharge.sd_r_o:>8.4f} ohm"
                 f"{1e3 * discharge.rmse_before_V:>11.1f} mV{1e3 * discharge.rmse_V:>7.1f} mV"
+                + ("" if discharge.left_out_V is None else f"{1e3 * discharge.left_out_V:>9.1f} mV")
             )
         return "\n".join(lines)
 
@@ -291,7 +338,7 @@ def fit_cell(
     Fit the constants of the model to a cell of your own: how fast it follows its load (``kn``, ``kp``, ``tDiffusion``,
     ``to``, ``tsn``, ``tsp``) and its equilibrium voltage (``U0p``, ``Ap``), to a few of its discharges at once, each with a
     ``q_mobile`` and ``r_o`` of its own. Three discharges suffice; take them from all ages, and at all loads, that the
-    constants are to hold for. Each must start with a full cell, and reach its knee.
+    constants are to hold for. Each must start with a full cell, and reach the cut-off: one in progress is refused.
 
     *What is minimized* is the sum of squares of the residuals of the voltage and of the distances to the priors: logarithms
     of the rate constants have ``RATE_PRIOR_SD``, and the change of the equilibrium voltage is a polynomial in the mole
@@ -302,9 +349,14 @@ def fit_cell(
     *How sure it is.* The residuals are the error of the model, and drift slowly: those of a discharge count as 50 independent
     ones, or as many as they change their sign. Their variance is found along with the constants.
 
+    *The error to expect* of another discharge, ``mismatch_V``, is what discharges show that are left out of the fit: the
+    young, the middle and the old third, one after the other. What none shows, of a life (:data:`LIFE_LOSS` of ``q_mobile``)
+    and of ``q_mobile`` itself, counts in proportion to the error of constants that were not fitted.
+
     *Other cells.* A cell of another capacity starts with electrodes of another size. Another chemistry works as far as the
     equations bend; where they do not, the residuals stay large and the fit is refused. A start that is not full is taken for
-    that of another chemistry: a fit whose full cell rests more than 0.04 V below that of ``start`` warns of it (``doubt``).
+    that of another chemistry: a fit whose full cell rests more than 0.04 V below that of ``start`` warns of it (``doubt``). So
+    does a fit of less than half a life, and one that a discharge does not belong to.
 
     :param discharges: of one cell, each from full charge. Of a :class:`~battery_env.Discharge` the part from load-on to the
         cut-off is taken; other records are taken whole
@@ -315,7 +367,8 @@ def fit_cell(
     :param limit_V: the largest root mean square of the residuals, V
     :return: the fit
     :raises TypeError: for what is no sequence of records
-    :raises ValueError: for an argument out of range, records that cannot be used, or a cell that the equations cannot describe
+    :raises ValueError: for an argument out of range, records that cannot be used or stay more than 0.05 V above the cut-off,
+        or a cell that the equations cannot describe
     """
     records = _records(discharges, cut_off_V)
     check_positive("limit_V", limit_V)
@@ -353,12 +406,22 @@ def _records(discharges: Sequence[Record], cut_off_V: float) -> list[Record]:
             record = discharge.loaded_part(cut_off_V) if isinstance(discharge, Discharge) else discharge
             samples = check_record(record, _FEWEST_SAMPLES)
             check_drawn_charge(float(drawn(samples.time_s, samples.current_A, samples.time_s[-1])))
+            _check_ends(float(samples.voltage_V.min()), cut_off_V)
         except AttributeError as error:
             raise TypeError(f"discharge {number} of {len(discharges)} is no record: {error}") from error
         except (TypeError, ValueError) as error:
             raise type(error)(f"discharge {number} of {len(discharges)}: {error}") from error
         records.append(record)
     return records
+
+
+def _check_ends(lowest_V: float, cut_off_V: float) -> None:
+    """Refuse a discharge in progress: before its knee, a cell that holds less looks like one that follows its load slower."""
+    if lowest_V > cut_off_V + UNFITTED_MISMATCH_V:
+        raise ValueError(
+            f"its lowest voltage is {lowest_V:.4g} V, above the cut-off, {cut_off_V:.4g} V. A discharge in progress does not "
+            "determine the constants: leave it out. If it was discharged no further, state cut_off_V (--cut-off)."
+        )
 
 
 def _check_starts_alike(records: Sequence[Record], at_rest: Sequence[bool]) -> None:
@@ -375,8 +438,7 @@ def _check_starts_alike(records: Sequence[Record], at_rest: Sequence[bool]) -> N
 def _prior(records: Sequence[Record], start: CellParameters | None, thermal: bool, cut_off_V: float) -> CellParameters:
     """Return what is thought of the constants before the data, but for what is measured."""
     check_cell(start, thermal)
-    charges_C = [float(drawn(record.time_s, record.current_A, record.time_s[-1])) for record in records]
-    q_mobile = float(Q_MOBILE.check(_UNDELIVERED * max(charges_C)))
+    q_mobile = float(Q_MOBILE.check(_UNDELIVERED * max(_charge_C(record) for record in records)))
     if start is None:
         size = q_mobile / NEW_CELL.q_mobile
         start = NEW_CELL
@@ -387,6 +449,10 @@ def _prior(records: Sequence[Record], start: CellParameters | None, thermal: boo
     temperatures_C = [column[0] for column in known if column is not None]
     measured = {"Tb0": 273.15 + float(np.mean(temperatures_C))} if temperatures_C else {}
     return start.replace(VEOD=float(cut_off_V), **measured)
+
+
+def _charge_C(record: Record) -> float:
+    return float(drawn(record.time_s, record.current_A, record.time_s[-1]))
 
 
 def with_equilibrium(cell: CellParameters, coefficients_V: Sequence[float] | FloatArray) -> CellParameters:
@@ -447,13 +513,24 @@ class JointFit:
         self.model = RecordModel(start, thermal, dt_s)
         self.names = [_name(record, number) for number, record in enumerate(records, start=1)]
         self.sd = np.array([*(RATE_PRIOR_SD[name] for name in RATE_CONSTANTS), *EQUILIBRIUM_PRIOR_SD_V])
-        self.at_rest = at_rest  # whether the first sample is the voltage of a full cell at rest
+        self.records, self.at_rest = records, at_rest  # whether the first sample is the voltage of a full cell at rest
         self.data = [_thinned(OnGrid.of(record, self.model)) for record in records]
-        calibrator = LeastSquares(
-            cell=start, thermal=thermal, dt_s=dt_s, q_mobile_bounds_C=Q_MOBILE.limits, r_o_bounds_ohm=R_O.limits
-        )
-        self.before = [calibrator.estimate(record) for record in records]
+        self.charges_C = np.array([_charge_C(record) for record in records])
         self._evaluated = lru_cache(maxsize=1)(self.evaluate)
+
+    @cached_property
+    def before(self) -> list[tuple[Estimate, float]]:
+        """With the constants known before, what fits best to each discharge, and the error left, V."""
+        return [self._alone(self.model.cell, d) for d in range(len(self.data))]
+
+    def _alone(self, cell: CellParameters, d: int) -> tuple[Estimate, float]:
+        """With some constants, what fits best to one discharge, and the error left (root mean square), V."""
+        model, data = self.model.of_cell(cell), self.data[d]
+        estimate = LeastSquares(
+            cell=cell, thermal=model.thermal, dt_s=model.dt_s, q_mobile_bounds_C=Q_MOBILE.limits, r_o_bounds_ohm=R_O.limits
+        ).estimate(self.records[d])
+        (voltage_V,) = data.at_samples([model.tangents(data.current_A, estimate.q_mobile, estimate.r_o).voltage_V])
+        return estimate, _rms(voltage_V - data.voltage_V)
 
     def cell(self, x: FloatArray) -> CellParameters:
         """The constants of an x."""
@@ -467,8 +544,8 @@ class JointFit:
     def starts(self) -> list[FloatArray]:
         """Where to start: at the constants known before."""
         least_C = np.array([self.model.least_q_mobile_C(data.current_A) for data in self.data])
-        fitted_C = np.array([estimate.q_mobile for estimate in self.before]) - least_C
-        r_o = [estimate.r_o / _R_O_SCALE_OHM for estimate in self.before]
+        fitted_C = np.array([estimate.q_mobile for estimate, _ in self.before]) - least_C
+        r_o = [estimate.r_o / _R_O_SCALE_OHM for estimate, _ in self.before]
         return [
             np.concatenate([np.zeros(len(self.sd)), np.log(np.maximum(above_C, _LEAST_EXCESS * least_C)), r_o])
             for above_C in (fitted_C, _START_EXCESS * least_C)
@@ -555,6 +632,40 @@ class JointFit:
         square_V2 = sum(count * _rms(residual) ** 2 for count, residual in zip(independent, residuals_V, strict=True))
         return _Weights(max(float(np.sqrt(square_V2 / (independent.sum() - fitted))), _LEAST_MISMATCH_V), independent)
 
+    def _left_out_V(self, x: FloatArray, weights: _Weights) -> list[float | None]:
+        """
+        How far each discharge is from constants that were fitted without it, and without those of its age (root mean square),
+        V. That is what a discharge shows that nobody has fitted.
+        """
+        count, n = len(self.data), len(self.sd)
+        errors_V: list[float | None] = [None] * count
+        for group, kept in _groups([at.q_mobile for at in self._evaluated(tuple(x))]):
+            others = JointFit(
+                [self.records[d] for d in kept],
+                [self.at_rest[d] for d in kept],
+                self.model.cell,
+                self.model.thermal,
+                self.model.dt_s,
+            )
+            own = np.append(np.arange(n), (n + kept, n + count + kept))
+            fitted = others._search(x[own], _Weights(weights.mismatch_V, weights.independent[kept]))
+            for d in group.tolist():
+                try:
+                    errors_V[d] = self._alone(others.cell(fitted), d)[1]
+                except ValueError as error:
+                    raise ValueError(
+                        f"constants fitted to the other discharges cannot follow {self.names[d]}: leave it out"
+                    ) from error
+        return errors_V
+
+    def _expected_V(self, discharges: Sequence[FittedDischarge], residual_V: float) -> float:
+        """The error to expect of any discharge of the cell: of those left out, and of ages and charges that none shows."""
+        q_mobile_C = np.array([each.q_mobile for each in discharges])
+        shown_V = [each.left_out_V for each in discharges if each.left_out_V is not None]
+        undrawn = 1.0 - float((self.charges_C / q_mobile_C).max())
+        unseen_V = hypot(_aged_V(_unseen(q_mobile_C)), UNFITTED_MISMATCH_V * max(undrawn, 0.0))
+        return hypot(max(residual_V, _rms(np.array(shown_V or [0.0]))), unseen_V)
+
     def _result(self, x: FloatArray, weights: _Weights) -> CellFit:
         """What was found."""
         start, cell, n, seen = self.model.cell, self.cell(x), len(self.sd), self._evaluated(tuple(x))
@@ -565,23 +676,41 @@ class JointFit:
         names = [*RATE_CONSTANTS, *(f"equilibrium {k}" for k in range(len(EQUILIBRIUM_PRIOR_SD_V)))]
         rows = zip(names, before, self.sd.tolist(), after, (self.sd * sds[:n]).tolist(), strict=True)
         discharges = []
-        for d, (name, data, known, at) in enumerate(zip(self.names, self.data, self.before, seen, strict=True)):
-            (before_V,) = data.at_samples([self.model.tangents(data.current_A, known.q_mobile, known.r_o).voltage_V])
+        left_out_V = self._left_out_V(x, weights)
+        rows_of = zip(self.names, self.before, seen, left_out_V, strict=True)
+        for d, (name, (_, before_V), at, error_V) in enumerate(rows_of):
             sd_q_C = float(np.sqrt(at.q_gradient_C @ covariance @ at.q_gradient_C))
             sd_r_ohm = float(_R_O_SCALE_OHM * sds[n + len(seen) + d])
-            errors_V = _rms(at.residual_V), _rms(before_V - data.voltage_V)
+            errors_V = _rms(at.residual_V), before_V, error_V
             discharges.append(FittedDischarge(name, at.q_mobile, at.r_o, sd_q_C, sd_r_ohm, *errors_V))
         largest = max(discharges, key=lambda discharge: discharge.q_mobile)
         new = {"q_mobile": largest.q_mobile, "r_o": largest.r_o}
         return CellFit(
             cell.replace(**new),
             start.replace(**new),
-            weights.mismatch_V,
+            self._expected_V(discharges, weights.mismatch_V),
             _rms(np.concatenate([at.residual_V for at in seen])),
             self.model.thermal,
             tuple(FittedConstant(*row) for row in rows),
             tuple(discharges),
         )
+
+
+def _groups(q_mobile_C: ArrayLike) -> list[tuple[IntArray, IntArray]]:
+    """Discharges in groups of one age, each with all others; one discharge has no others."""
+    order = np.argsort(q_mobile_C, kind="stable")
+    groups = np.array_split(order, min(_GROUPS, len(order)))
+    return [(group, np.setdiff1d(order, group)) for group in groups if len(group) < len(order)]
+
+
+def _aged_V(apart: float) -> float:
+    """The error to expect of constants at ages whose logarithms of ``q_mobile`` are so far apart from those fitted."""
+    return UNFITTED_MISMATCH_V * apart / _LIFE
+
+
+def _unseen(q_mobile_C: FloatArray) -> float:
+    """How much of a life lies outside of the ages of some discharges, as a logarithm of ``q_mobile``."""
+    return max(_LIFE - float(np.log(q_mobile_C.max() / q_mobile_C.min())), 0.0)
 
 
 def _thinned(data: OnGrid) -> OnGrid:

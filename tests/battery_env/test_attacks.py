@@ -18,6 +18,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from battery_env.app.calibrate import Settings
+from battery_env.app.calibrate import calibrate as calibration_of
 from battery_env.app.command_line import NOT_SETTLED, REFUSED, SETTLED, calibrate
 from battery_env.calibration.policy import PolicyEstimator
 from battery_env.calibration.pretrained import pretrained_ids
@@ -25,7 +27,16 @@ from battery_env.calibration.voltage import ESTIMATE_RANGES
 from battery_env.cells import Discharge, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate
 from battery_env.estimates import last_estimate
-from battery_env.estimators import ClosedForm, Estimate, ExtendedKalmanFilter, GreedyOneStep, LeastSquares, soc_from_rest
+from battery_env.estimators import (
+    CellFit,
+    ClosedForm,
+    Estimate,
+    ExtendedKalmanFilter,
+    GreedyOneStep,
+    LeastSquares,
+    fit_cell,
+    soc_from_rest,
+)
 from battery_env.estimators.base import OnlineEstimator
 from battery_env.records import Stream
 
@@ -416,6 +427,65 @@ def test_nor_is_the_command_line(fault, method, tmp_path, capsys):
     status = calibrate([str(tmp_path / "record.csv"), "--method", method, *options])
     assert status == SETTLED if fault == "none" else status in (REFUSED, NOT_SETTLED)
     capsys.readouterr()
+
+
+#: What constants may be fitted to by mistake: discharges of B0005.
+FITTED = {
+    "all ages": [0, 84, 167],
+    "young": [0, 10, 20],
+    "one": [0],
+    "old": [160],
+    "two ages": [0, 167],
+    "half a life": [0, 40, 80],
+    "copies": [0, 0, 0],
+    "copies of all ages": [0, 84, 167] * 2,
+    "another cell at 4 A": [0, 84, "other"],
+    "young, and another cell at 4 A": [0, 20, "other"],
+    "halves, as if whole": [(0, 0.5), (84, 0.5), (167, 0.5)],
+    "in progress, half": [(0, 0.5), (84, 0.5), (167, 0.5)],
+    "in progress, three quarters": [(0, 0.75), (84, 0.75), (167, 0.75)],
+}
+
+
+def begun(discharge: Discharge, share: float, cut_off_V: float = 2.7) -> Discharge:
+    """The first part of a discharge, with the rest before it."""
+    on_s, end_s = discharge.load_on_time_s, discharge.eod_time_s(cut_off_V)
+    return discharge.until(on_s + share * (end_s - on_s))
+
+
+def fitted_wrongly(numbers: list[object], cut_off_V: float = 2.7) -> CellFit:
+    """Constants from some of B0005's discharges, parts of them, or another cell's."""
+    other = simulate(4.0, 6200.0, 0.12, load_unit="current", thermal=True, cut_off_V=2.7)
+    records = []
+    for each in numbers:
+        number, share = each if isinstance(each, tuple) else (each, 1.0)
+        whole = other if number == "other" else discharges("B0005")[number]
+        records.append(begun(whole, share) if share < 1.0 else whole)
+    return fit_cell(records, cut_off_V)
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+@pytest.mark.parametrize("fitted", FITTED)
+def test_nor_is_one_with_constants_that_were_fitted_to_the_wrong_discharges(fitted):
+    """Once the filter settled at half time, 42 % off, with constants of young discharges."""
+    if fitted.startswith("in progress"):
+        with pytest.raises(ValueError, match="A discharge in progress does not determine the constants"):
+            fitted_wrongly(FITTED[fitted])
+        return
+    cut_off_V = 3.56 if fitted == "halves, as if whole" else 2.7
+    fit = fitted_wrongly(FITTED[fitted], cut_off_V)
+    for method in ("least-squares", "kalman"):
+        for discharge in discharges("B0006")[6::32]:
+            on_s, end_s = discharge.load_on_time_s, discharge.eod_time_s(cut_off_V)
+            for share in (0.25, 0.5, 0.75, 1.0):
+                record = begun(discharge, share, cut_off_V) if share < 1.0 else discharge
+                try:
+                    found = calibration_of(record, Settings.for_cell(fit, method=method))
+                except ValueError as error:  # takes more charge than a cell that was fitted when old ever holds
+                    assert fitted == "old" and "beyond the upper bound" in str(error)
+                    continue
+                wrong = abs(found.predicted_eod_time_s - end_s) > WRONG_SHARE * (end_s - on_s)
+                assert not (found.settled and wrong), f"{method}: {found}"
 
 
 @pytest.mark.parametrize(
