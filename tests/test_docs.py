@@ -177,7 +177,7 @@ def test_every_published_table_is_on_the_page_of_all_tables():
 
 def test_every_page_is_in_the_guide_or_has_a_form_of_its_own():
     guide = {name for names in GUIDE.values() for name in names}
-    own_form = {"docs/index", "docs/api", "docs/architecture", "docs/changelog", "docs/all_tables"}
+    own_form = {"docs/index", "docs/api", "docs/architecture", "docs/contributing", "docs/changelog", "docs/all_tables"}
     others = {name_of(page) for page in PAGES if page.parent.name not in ("environments", "reports")} - guide - own_form
     assert not others, f"name them in GUIDE, and in NOT_YET as long as they are not in the house style: {others}"
     assert guide >= NOT_YET
