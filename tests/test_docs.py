@@ -151,6 +151,14 @@ def test_commands_of_the_calibrator_run_and_exit_as_their_page_says(tmp_path, mo
         assert command(arguments) == int(status[1] if status else 0), line
 
 
+@pytest.mark.parametrize("name", ["first_discharge", "real_cells"])
+def test_a_page_shows_what_the_calibrator_prints(name, capsys):
+    text = (DOCS / f"{name}.md").read_text(encoding="utf-8")
+    (shown,) = re.findall(r"^```(?:text)?\n(B0005_100: .*?)^```", text, flags=re.MULTILINE | re.DOTALL)
+    assert calibrate(["B0005:100"]) == 0
+    assert capsys.readouterr().out.strip() == shown.strip()
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_commands_in_pages_exist(page):
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
