@@ -133,7 +133,9 @@ def coloured(things: Iterable[Thing]) -> Iterator[tuple[str, Thing]]:
     """
     listed = list(things)
     own = [_own_colour(thing) for thing in listed]
-    others = itertools.cycle([colour for colour in COLOURS if colour not in own])
+    left = [colour for colour in COLOURS if colour not in own]
+    # beside names, a colour of another name comes last
+    others = itertools.cycle(sorted(left, key=lambda colour: any(own) and colour in COLOUR_OF.values()))
     seen: set[str] = set()
     for thing, colour in zip(listed, own, strict=True):
         yield next(others) if colour is None or colour in seen else colour, thing
@@ -345,14 +347,15 @@ def title_of_life(cells: Sequence[pd.DataFrame]) -> str:
     least = float(np.min(correlations))
     if not least >= _FOLLOWS:
         return ""
-    title = LABELS["q_mobile"].split(" (")[0]
-    return f"{title} follows the measured capacity (r > {min(np.floor(1e3 * least) / 1e3, 0.999):.3f})"
+    shown = min(np.floor(1e3 * least) / 1e3, 0.999)
+    return f"{Q_MOBILE.symbol} follows the measured capacity (r > {shown:.3f})"
 
 
 def _life_legend(figure: Figure, table: pd.DataFrame) -> None:
     axes = figure.axes[0]
     named = [pair for pair in zip(*axes.get_legend_handles_labels(), strict=True) if pair[1]][: len(COLOURS)]
-    handles, labels = [handle for handle, _ in named], [label for _, label in named]
+    handles: list[Any] = [handle for handle, _ in named]
+    labels = [label for _, label in named]
     if not table["settled"].astype(bool).all():
         handles += axes.plot([], [], "o", ms=3.2, mfc="white", mec="0.25", mew=0.8)
         labels.append("not settled")

@@ -111,7 +111,7 @@ def conversion_table(found: pd.DataFrame) -> pd.DataFrame:
 
 
 def _errors(error: pd.Series, digits: int) -> dict[str, str]:
-    worst = error[error.abs().idxmax()]
+    worst = error.iloc[int(error.abs().to_numpy().argmax())]
     return {
         "mean error": f"{error.mean():+.{digits}f}",
         "mean size": f"{error.abs().mean():.{digits}f}",
@@ -138,7 +138,7 @@ def plot_curves() -> Figure:
     left.set_ylabel("voltage (V)")
     arrow = {"arrowstyle": "-|>", "lw": 2.0, "color": "0.15", "mutation_scale": 16}
     left.annotate("", (39.8, 3.05), (55.0, 3.05), arrowprops=arrow)
-    left.text(47.5, 2.98, "ends\nearlier", ha="center", va="top", fontsize=10, bbox={"fc": "white", "ec": "none", "pad": 1})
+    left.text(37.2, 3.05, "ends\nearlier", ha="right", va="center", fontsize=10)
     right.annotate("", (20.0, 3.44), (20.0, 3.71), arrowprops=arrow)
     right.text(21.5, 3.78, "lies lower", ha="left", va="center", fontsize=10)
     return figure

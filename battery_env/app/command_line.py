@@ -33,6 +33,7 @@ from battery_env.estimators.cell_fit import CellFit, fit_cell, read_cell
 from battery_env.estimators.rest import InitialSoc
 from battery_env.files import check_folder
 from battery_env.parameters import PARAMETER_NAMES
+from battery_env.records import CUT_OFF_V
 
 #: What the process returns: all records settled, one or more refused, one or more not settled, stopped by Ctrl-C.
 SETTLED, REFUSED, NOT_SETTLED, INTERRUPTED = 0, 2, 3, 130
@@ -112,7 +113,7 @@ _CALIBRATION: _Options = {
     ("--method",): {
         "choices": METHODS,
         "help": "of calibration: least squares, the filter (kalman), or a policy trained on simulated cells (default: least "
-        "squares; the filter where these do not settle a discharge in progress without --prior and --cell)",
+        "squares; the filter where these do not settle one in progress at a constant load, without --prior and --cell)",
     },
     ("--policy",): {
         "type": Path,
@@ -237,17 +238,17 @@ def _fit_parser(name: str) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=name,
         description=(
-            "Fit the constants of the model to a few discharges of one cell, each from full charge to its knee, and save them "
-            "for --cell of calibrate. Take three or more, of all ages and loads that they are to hold for."
+            "Fit the constants of the model to a few discharges of one cell, each from full charge to the cut-off, and save "
+            "them for --cell of calibrate. Take three or more, of all ages and loads that they are to hold for."
         ),
-        epilog="Exit status: 0, 3 if the discharges may not have started full, or 2 if one cannot be used or the equations do "
-        "not describe the cell.",
+        epilog="Exit status: 0, 3 if the discharges may not have started full, are of one age or not of one cell, or 2 if one "
+        "cannot be used or does not reach the cut-off, or the equations do not describe the cell.",
         allow_abbrev=False,
     )
     _add_files(parser)
     group = parser.add_argument_group("fit")
     group.add_argument(
-        "--cut-off", type=float, default=2.7, metavar="V", help="voltage at which the discharge ends, V (default: %(default)s)"
+        "--cut-off", type=float, default=CUT_OFF_V, metavar="V", help="where the discharge ends, V (default: %(default)s)"
     )
     group.add_argument("--isothermal", action="store_true", help="keep the temperature of the model constant")
     group.add_argument(
@@ -393,7 +394,7 @@ def fit(arguments: Sequence[str] | None = None, name: str = "python -m battery_e
 
     :param arguments: as in :func:`main`, without the name of the command
     :param name: of the program, for its help
-    :return: 0, 3 if the discharges may not have started full, or 2 if nothing was fitted; a line on standard error says why
+    :return: 0, 3 if there is doubt about the fit, or 2 if nothing was fitted; a line on standard error says why
     """
     options = _fit_parser(name).parse_args(arguments)
     out: Path = options.out

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from battery_env.arrays import FloatArray
 from battery_env.calibration.aging import BatteryAging
-from battery_env.calibration.confidence import NO_FIT, Confidence
+from battery_env.calibration.confidence import Confidence
 from battery_env.calibration.env import CalibrationEnv, task_class
 from battery_env.calibration.nuisance import Fitted
 from battery_env.calibration.pretrained import pretrained_policy
@@ -23,10 +23,10 @@ from battery_env.calibration.voltage import VoltageTask
 from battery_env.electrochemistry import NEW_CELL, STATE_SIZE, UNCERTAIN_CONSTANTS
 from battery_env.estimates import last_estimate
 from battery_env.estimators.base import SURPLUS_SHARE, Estimate, EstimateTrace, ModelNow, OnlineEstimator, Record
+from battery_env.estimators.diagnosis import Condition
 from battery_env.record_model import RecordModel
 from battery_env.records import Samples, check_drawn_charge, check_record, check_sample, drawn, starts_at_rest
 
-_NOT_YET = "The policy states nothing before its next decision."
 # Steps in which a stream is followed, s
 _STEP_S = 1.0
 
@@ -205,7 +205,8 @@ class PolicyEstimator(OnlineEstimator):
 
     def _judge(self) -> None:
         """Tell how sure the estimate is, of the samples up to the last decision."""
-        self._sd, self._reason = [nan, nan], NO_FIT if self._confidence is None else _NOT_YET
+        self._sd = [nan, nan]
+        self._reason = Condition.NO_FIT.text if self._confidence is None else Condition.NOT_YET.text
         if self._confidence is not None and self._fitted is not None:
             samples = self._readings.known(self._decisions * self.decision_s)
             (sd,) = self._confidence.standard_deviations(self._fitted, self._now[None])
@@ -317,7 +318,7 @@ class PolicyEstimator(OnlineEstimator):
         if trace.sd_q_mobile is not None:
             return last_estimate(trace)
         q_mobile, r_o = (self.task_class.conclude(values) for values in (trace.q_mobile, trace.r_o))
-        return Estimate(q_mobile, r_o, settled=False, reason=NO_FIT)
+        return Estimate(q_mobile, r_o, settled=False, reason=Condition.NO_FIT.text)
 
     def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:
         """

@@ -23,13 +23,13 @@ from battery_env.checks import check_numbers, check_positive
 from battery_env.electrochemistry import NEW_CELL, CellParameters, check_cell, check_dt
 from battery_env.electrochemistry.tangents import BY_Q, BY_R, RATE_CONSTANTS
 from battery_env.estimates import Estimate
+from battery_env.estimators.diagnosis import FULL_REST_V, MISMATCH_MARGIN, rest_voltage_V
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.search import MARGIN, OnGrid, distance_C, minimized, square
-from battery_env.estimators.settling import FULL_REST_V, MISMATCH_MARGIN, rest_voltage_V
 from battery_env.files import WrongFormatError, read_json, write_json
 from battery_env.parameters import Q_MOBILE, R_O
 from battery_env.record_model import RecordModel
-from battery_env.records import SWITCH_SHARE, Record, check_drawn_charge, check_record, drawn
+from battery_env.records import CUT_OFF_V, SWITCH_SHARE, Record, check_drawn_charge, check_record, drawn
 
 #: How well the constants that say how fast a cell follows its load are known before any data: standard deviations of their
 #: logarithms. The overpotential of kn stands for whatever slows a worn cell down, so that it may differ most.
@@ -44,7 +44,8 @@ LIMIT_V = 0.05
 #: Error to expect on a real cell of constants that were not fitted to it, V.
 UNFITTED_MISMATCH_V = 0.05
 #: Over its life a cell loses this share of ``q_mobile``. Constants that were fitted at one end of it are taken to be
-#: :data:`UNFITTED_MISMATCH_V` off at the other one, and in proportion to the logarithm of ``q_mobile`` between.
+#: :data:`UNFITTED_MISMATCH_V` off at the other one, and between in proportion to the logarithm of ``q_mobile``: constants of
+#: one discharge of B0005 are off the others by that.
 LIFE_LOSS = 0.3
 
 # Version 1 took the residuals of what was fitted for the error to expect.
@@ -168,9 +169,12 @@ class CellFit:
             check_cell(getattr(self, name), self.thermal)
         for name in ("mismatch_V", "rmse_V"):
             check_positive(name, getattr(self, name))
+        if not self.discharges:
+            raise ValueError("a fit is of at least one discharge")
+        Q_MOBILE.check([discharge.q_mobile for discharge in self.discharges])
         rows: tuple[FittedConstant | FittedDischarge, ...] = (*self.constants, *self.discharges)
         for row in rows:
-            numbers = [value for name, value in vars(row).items() if name != "name" and value is not None]
+            _, *numbers = (value for item, value in vars(row).items() if (item, value) != ("left_out_V", None))
             if not isinstance(row.name, str) or not np.isfinite(check_numbers(row.name, numbers)).all():
                 raise ValueError(f"constants and discharges have names and finite numbers, got {row!r}")
 
@@ -181,7 +185,7 @@ class CellFit:
 
     @property
     def doubt(self) -> str:
-        """What the discharges that were fitted may not have shown: a full cell at rest, all ages, one cell. Often empty."""
+        """What the discharges that were fitted may lack: a full cell at rest, other ages, one cell. Empty if they do not."""
         return " ".join(filter(None, (self._doubt_of_start(), self._doubt_of_ages(), self._doubt_of_others())))
 
     def _doubt_of_start(self) -> str:
@@ -200,24 +204,23 @@ class CellFit:
             return ""
         return (
             "The discharges that were fitted show one age, or less than half of a cell's life: q_mobile is "
-            f"{q_C.min():.0f} to {q_C.max():.0f} C. What the constants are worth at other ages is not known, and mismatch_V, "
+            f"{q_C.min():.0f} to {q_C.max():.0f} C. What the constants are worth at other ages is not known: mismatch_V, "
             f"{1e3 * self.mismatch_V:.0f} mV, allows for that. Add discharges of other ages when there are some."
         )
 
     def _doubt_of_others(self) -> str:
-        log_q = np.log([discharge.q_mobile for discharge in self.discharges])
-        worst, doubt = MISMATCH_MARGIN, ""
-        for group, kept in _groups(log_q):
-            for d in group:
-                discharge = self.discharges[d]
-                by_age_V = _aged_V(float(np.abs(log_q[kept] - log_q[d]).min()))
-                ratio = (discharge.left_out_V or 0.0) / hypot(self.rmse_V, by_age_V)
-                if ratio > worst:
-                    worst, doubt = ratio, (
-                        f"Constants fitted without {discharge.name} are {ratio:.1f} times as far off it as its age explains: "
-                        "leave it out if it is of another cell; if it is of another load, add discharges of that load."
-                    )
-        return doubt
+        log_q, ratios = np.log([discharge.q_mobile for discharge in self.discharges]), {}
+        for group, others in _groups(log_q):
+            for d in group.tolist():
+                by_age_V = _aged_V(float(np.abs(log_q[others] - log_q[d]).min()))
+                ratios[d] = (self.discharges[d].left_out_V or 0.0) / hypot(self.rmse_V, by_age_V)
+        odd = max(ratios, key=ratios.__getitem__, default=0)
+        if ratios.get(odd, 0.0) <= MISMATCH_MARGIN:
+            return ""
+        return (
+            f"Constants fitted without {self.discharges[odd].name} are {ratios[odd]:.1f} times as far off it as its age "
+            "explains: leave it out if it is of another cell; if it is of another load, add discharges of that load."
+        )
 
     def calibrator(self, **arguments: Any) -> LeastSquares:
         """
@@ -325,7 +328,7 @@ def read_cell(path: str | os.PathLike[str]) -> CellFit | CellParameters:
 
 def fit_cell(
     discharges: Sequence[Record],
-    cut_off_V: float = 2.7,
+    cut_off_V: float = CUT_OFF_V,
     start: CellParameters | None = None,
     thermal: bool = True,
     dt_s: float = 1.0,
@@ -335,7 +338,7 @@ def fit_cell(
     Fit the constants of the model to a cell of your own: how fast it follows its load (``kn``, ``kp``, ``tDiffusion``,
     ``to``, ``tsn``, ``tsp``) and its equilibrium voltage (``U0p``, ``Ap``), to a few of its discharges at once, each with a
     ``q_mobile`` and ``r_o`` of its own. Three discharges suffice; take them from all ages, and at all loads, that the
-    constants are to hold for. Each must start with a full cell, and reach its knee.
+    constants are to hold for. Each must start with a full cell, and reach the cut-off: one in progress is refused.
 
     *What is minimized* is the sum of squares of the residuals of the voltage and of the distances to the priors: logarithms
     of the rate constants have ``RATE_PRIOR_SD``, and the change of the equilibrium voltage is a polynomial in the mole
@@ -346,9 +349,14 @@ def fit_cell(
     *How sure it is.* The residuals are the error of the model, and drift slowly: those of a discharge count as 50 independent
     ones, or as many as they change their sign. Their variance is found along with the constants.
 
+    *The error to expect* of another discharge, ``mismatch_V``, is what discharges show that are left out of the fit: the
+    young, the middle and the old third, one after the other. What none shows, of a life (:data:`LIFE_LOSS` of ``q_mobile``)
+    and of ``q_mobile`` itself, counts in proportion to the error of constants that were not fitted.
+
     *Other cells.* A cell of another capacity starts with electrodes of another size. Another chemistry works as far as the
     equations bend; where they do not, the residuals stay large and the fit is refused. A start that is not full is taken for
-    that of another chemistry: a fit whose full cell rests more than 0.04 V below that of ``start`` warns of it (``doubt``).
+    that of another chemistry: a fit whose full cell rests more than 0.04 V below that of ``start`` warns of it (``doubt``). So
+    does a fit of less than half a life, and one that a discharge does not belong to.
 
     :param discharges: of one cell, each from full charge. Of a :class:`~battery_env.Discharge` the part from load-on to the
         cut-off is taken; other records are taken whole
@@ -359,7 +367,8 @@ def fit_cell(
     :param limit_V: the largest root mean square of the residuals, V
     :return: the fit
     :raises TypeError: for what is no sequence of records
-    :raises ValueError: for an argument out of range, records that cannot be used, or a cell that the equations cannot describe
+    :raises ValueError: for an argument out of range, records that cannot be used or stay more than 0.05 V above the cut-off,
+        or a cell that the equations cannot describe
     """
     records = _records(discharges, cut_off_V)
     check_positive("limit_V", limit_V)
@@ -429,8 +438,7 @@ def _check_starts_alike(records: Sequence[Record], at_rest: Sequence[bool]) -> N
 def _prior(records: Sequence[Record], start: CellParameters | None, thermal: bool, cut_off_V: float) -> CellParameters:
     """Return what is thought of the constants before the data, but for what is measured."""
     check_cell(start, thermal)
-    charges_C = [float(drawn(record.time_s, record.current_A, record.time_s[-1])) for record in records]
-    q_mobile = float(Q_MOBILE.check(_UNDELIVERED * max(charges_C)))
+    q_mobile = float(Q_MOBILE.check(_UNDELIVERED * max(_charge_C(record) for record in records)))
     if start is None:
         size = q_mobile / NEW_CELL.q_mobile
         start = NEW_CELL
@@ -441,6 +449,10 @@ def _prior(records: Sequence[Record], start: CellParameters | None, thermal: boo
     temperatures_C = [column[0] for column in known if column is not None]
     measured = {"Tb0": 273.15 + float(np.mean(temperatures_C))} if temperatures_C else {}
     return start.replace(VEOD=float(cut_off_V), **measured)
+
+
+def _charge_C(record: Record) -> float:
+    return float(drawn(record.time_s, record.current_A, record.time_s[-1]))
 
 
 def with_equilibrium(cell: CellParameters, coefficients_V: Sequence[float] | FloatArray) -> CellParameters:
@@ -503,6 +515,7 @@ class JointFit:
         self.sd = np.array([*(RATE_PRIOR_SD[name] for name in RATE_CONSTANTS), *EQUILIBRIUM_PRIOR_SD_V])
         self.records, self.at_rest = records, at_rest  # whether the first sample is the voltage of a full cell at rest
         self.data = [_thinned(OnGrid.of(record, self.model)) for record in records]
+        self.charges_C = np.array([_charge_C(record) for record in records])
         self._evaluated = lru_cache(maxsize=1)(self.evaluate)
 
     @cached_property
@@ -637,8 +650,21 @@ class JointFit:
             own = np.append(np.arange(n), (n + kept, n + count + kept))
             fitted = others._search(x[own], _Weights(weights.mismatch_V, weights.independent[kept]))
             for d in group.tolist():
-                errors_V[d] = self._alone(others.cell(fitted), d)[1]
+                try:
+                    errors_V[d] = self._alone(others.cell(fitted), d)[1]
+                except ValueError as error:
+                    raise ValueError(
+                        f"constants fitted to the other discharges cannot follow {self.names[d]}: leave it out"
+                    ) from error
         return errors_V
+
+    def _expected_V(self, discharges: Sequence[FittedDischarge], residual_V: float) -> float:
+        """The error to expect of any discharge of the cell: of those left out, and of ages and charges that none shows."""
+        q_mobile_C = np.array([each.q_mobile for each in discharges])
+        shown_V = [each.left_out_V for each in discharges if each.left_out_V is not None]
+        undrawn = 1.0 - float((self.charges_C / q_mobile_C).max())
+        unseen_V = hypot(_aged_V(_unseen(q_mobile_C)), UNFITTED_MISMATCH_V * max(undrawn, 0.0))
+        return hypot(max(residual_V, _rms(np.array(shown_V or [0.0]))), unseen_V)
 
     def _result(self, x: FloatArray, weights: _Weights) -> CellFit:
         """What was found."""
@@ -662,7 +688,7 @@ class JointFit:
         return CellFit(
             cell.replace(**new),
             start.replace(**new),
-            _expected_V(discharges, weights.mismatch_V),
+            self._expected_V(discharges, weights.mismatch_V),
             _rms(np.concatenate([at.residual_V for at in seen])),
             self.model.thermal,
             tuple(FittedConstant(*row) for row in rows),
@@ -685,13 +711,6 @@ def _aged_V(apart: float) -> float:
 def _unseen(q_mobile_C: FloatArray) -> float:
     """How much of a life lies outside of the ages of some discharges, as a logarithm of ``q_mobile``."""
     return max(_LIFE - float(np.log(q_mobile_C.max() / q_mobile_C.min())), 0.0)
-
-
-def _expected_V(discharges: Sequence[FittedDischarge], residual_V: float) -> float:
-    """The error to expect of any discharge of the cell: of those left out of the fit, and at the ages that none shows."""
-    shown_V = [each.left_out_V for each in discharges if each.left_out_V is not None]
-    unseen_V = _aged_V(_unseen(np.array([each.q_mobile for each in discharges])))
-    return hypot(max(residual_V, _rms(np.array(shown_V or [0.0]))), unseen_V)
 
 
 def _thinned(data: OnGrid) -> OnGrid:

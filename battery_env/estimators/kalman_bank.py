@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import exp, inf, isnan, log, sqrt
+from math import exp, hypot, inf, isnan, log, nan, sqrt
 
 import numpy as np
 from numba import njit
@@ -30,8 +30,15 @@ from battery_env.electrochemistry.tangents import (
     voltage_curvature,
     voltage_tangents,
 )
-from battery_env.estimators.kalman_state import FILTER, OFFSET, Q, R, Row, Settings
-from battery_env.estimators.settling import MISMATCH_MARGIN
+from battery_env.estimators.diagnosis import (
+    MISMATCH_MARGIN,
+    PLAUSIBLE_Q_SHARES,
+    PRIOR_LIMIT_SD,
+    SETTLED_SHARES,
+    Condition,
+)
+from battery_env.estimators.kalman_state import FILTER, OFFSET, Q, R, Settings
+from battery_env.estimators.monitor import Row, start_condition
 
 #: Standard deviations. Innovations count in full within the gate. A filter whose successive innovations are correlated, whose
 #: estimate leaves the range that it stated, or whose offset is beyond the stated one, by more than the limit does not follow
@@ -48,6 +55,9 @@ _REACH_SD = 2.5
 # same, within this share of a standard deviation.
 _LEAST_LOG_WEIGHT = -15.0
 _SAME_SHARE = 0.25
+# The data must have narrowed a prior by this share of its width before a deviation from it says anything.
+_LEAST_NARROWING = 0.2
+_SHARES = (SETTLED_SHARES["q_mobile"], SETTLED_SHARES["r_o"])
 # The noise that innovations show is averaged over about this many samples.
 _NOISE_MEMORY = 32.0
 
@@ -117,8 +127,7 @@ def _predict(one: Row, current: float, duration: float, settings: Settings, cons
 def _common_error_sd(one: Row, settings: Settings) -> float:
     # What an error of the model that is common to the discharge leaves open of q_mobile, without its prior, however many
     # samples there are: as much as least squares state. Theirs is the worst error of the stated mean square. Once the knee is
-    # seen, almost all of that lies on the few samples there, but an error beyond the margin would show: so it is no larger
-    # anywhere.
+    # seen, almost all of that lies on the few samples there, but an error beyond the margin would show: it is no larger.
     told, (q_prior, r_prior), mismatch_V2 = one.told, settings.variance, settings.mismatch_V2
     if mismatch_V2 == 0.0 or q_prior == 0.0 or told.charge_C == 0.0:
         return 0.0
@@ -269,7 +278,7 @@ def take(
 ) -> None:
     """Take in one sample of a cell; unchecked."""
     bank, voltage, duration, temperature = cell.bank, sample.voltage_V, sample.dt_s, sample.temperature_K
-    constants, current = packed.constants, cell.current_A
+    constants, current = packed.constants, cell.seen.current_A
     noise, charge = max(bank.noise_V2, settings.noise_V2), abs(current) * duration
     before = _heaviest(filters)
     for m in range(len(filters)):
@@ -292,3 +301,49 @@ def take(
     _doubt(bank, filters[best].mean[OFFSET])
     bank.expected_V = filters[before].expected_V  # by the filter that did not know yet
     bank.common_sd_q = _common_error_sd(filters[best], settings)
+
+
+@_compiled
+def _note(estimate: Row, condition: int, holds: bool) -> None:
+    # the row of the table that comes first counts
+    if holds and condition < estimate.condition:
+        estimate.condition = condition
+
+
+@_compiled
+def conclude(cell: Row, settings: Settings, estimate: Row) -> None:
+    """Say what a bank estimates after a sample that was examined, and what speaks against it; unchecked."""
+    bank, seen, searched = cell.bank, cell.seen, settings.searched
+    # what the error of the model leaves open beside the prior, what shows nowhere in the voltage, and what nobody saw
+    common_sd_q = (bank.common_sd_q**-2.0 + 1.0 / settings.variance[Q]) ** -0.5
+    doubt_C = seen.doubt_C + (seen.gap.charge_C if seen.gap.samples > 0.0 else 0.0)
+    own_sd = (max(bank.sd[Q], common_sd_q), max(bank.sd[R], 0.0))
+    estimate.q_mobile, estimate.r_o = bank.mean[Q], bank.mean[R]
+    estimate.condition = Condition.SETTLED + 0
+    start, fault = start_condition(seen, bank.mean[Q], bank.mean[R]), seen.fault.condition
+    _note(estimate, start, start > 0)
+    _note(estimate, fault, fault > 0)
+    _note(estimate, Condition.EMPTY, not bank.has_voltage)
+    least, most = PLAUSIBLE_Q_SHARES
+    plausible = least * settings.cell_q_mobile < bank.mean[Q] < most * settings.cell_q_mobile
+    _note(estimate, Condition.IMPLAUSIBLE, searched[Q] and not plausible)
+    _note(estimate, Condition.MISFIT, bank.trend_sd > LIMIT_SD)
+    for k in range(2):
+        if not searched[k]:
+            estimate.sd[k] = nan
+            continue
+        value, (low, high), (mean, prior_sd) = bank.mean[k], settings.bounds[k], settings.carried[k]
+        sd = hypot(hypot(own_sd[k], settings.scale_sd[k] * value), doubt_C if k == Q else 0.0)
+        estimate.sd[k] = sd
+        _note(estimate, Condition.Q_AT_BOUND + k, not low + bank.sd[k] < value < high - bank.sd[k])
+        if prior_sd > 0.0:
+            narrowed = max(prior_sd**2 - bank.sd[k] ** 2, (_LEAST_NARROWING * prior_sd) ** 2)
+            _note(estimate, Condition.Q_PRIOR_WRONG + k, (value - mean) ** 2 > PRIOR_LIMIT_SD**2 * narrowed)
+            # precisions add up
+            of_data = max(bank.sd[k] ** -2.0 - prior_sd**-2.0, 0.0) ** -0.5
+            of_data = max(of_data, bank.common_sd_q if k == Q else 0.0)
+            _note(estimate, Condition.Q_PRIOR_ALONE + k, of_data >= _SHARES[k] * value)
+        if not sd < _SHARES[k] * value:
+            _note(estimate, Condition.GAP_UNSURE, k == Q and doubt_C > 0.0)
+            _note(estimate, Condition.Q_SCALE_UNKNOWN + k, settings.scale_sd[k] >= _SHARES[k])
+            _note(estimate, Condition.Q_IMPRECISE + k, True)

@@ -307,7 +307,7 @@ def test_large_cells_are_fitted_and_calibrated(tmp_path, terminal):
     large = Discharge(small.time_s[::10], small.voltage_V[::10], 50.0 * small.current_A[::10])
     path, cell = write(large, tmp_path / "large.csv"), tmp_path / "cell.json"
     assert "at least 29" in (said := terminal.refuses(path)) and "--cell" in said
-    assert main(["fit", path, "--out", str(cell)]) == 0
+    assert main(["fit", path, "--out", str(cell)]) == 3  # of one discharge, and so of one age
     assert terminal.row(path, "--cell", cell)["q_mobile_C"] == pytest.approx(300_000.0, rel=0.01)
 
 
@@ -482,7 +482,8 @@ class TestInPython:
             assert [each.cycle for each in battery_env.calibrate(table)] == [1, 3]
 
     def test_all_that_a_fit_knows_is_used(self, recorded):
-        fit = fit_cell([recorded], cut_off_V=2.75)
+        with pytest.warns(UserWarning, match="one age"):
+            fit = fit_cell([recorded], cut_off_V=2.75)
         settings = battery_env.calibrate(recorded, cell=fit, method="kalman").settings
         assert settings.cut_off_V == 2.75 and settings.mismatch_V == fit.mismatch_V
 

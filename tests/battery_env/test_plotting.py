@@ -184,6 +184,7 @@ def test_a_name_has_one_colour_in_all_figures():
     colours = [colour for colour, _ in coloured(names)]
     assert colours[0] == COLOUR_OF["SAC"] and colours[1] == COLOUR_OF["least squares"] and len(set(colours)) == 5
     assert colours[4] == COLOUR_OF["Kalman filter"] and colours[3] == next(coloured(["a policy"]))[0]
+    assert not {colours[2]} & set(COLOUR_OF.values())
     # a second one of a name is told apart, and what only sounds alike has no name
     (first, _), (second, _) = coloured(["least squares", "least squares, prior 2 %"])
     assert first == COLOUR_OF["least squares"] != second
