@@ -7,9 +7,11 @@ from typing import NamedTuple
 import numpy as np
 
 from battery_env.checks import LoadUnit, check_load, check_positive
+from battery_env.electrochemistry import NEW_CELL
 from battery_env.estimates import Estimate
 from battery_env.parameters import Q_MOBILE, R_O
 from battery_env.record_model import LONGEST_FORECAST_S, RecordModel
+from battery_env.records import CUT_OFF_V
 
 # For its derivatives a capacity is computed again with q_mobile moved by this share, and r_o by this many ohm.
 _STEP_SHARE, _STEP_OHM = 0.01, 0.002
@@ -51,13 +53,14 @@ def capacity_Ah(
 
     :param estimate: of any calibrator
     :param load: constant, above 0, in A, or with ``load_unit="power"`` in W
-    :param cut_off_V: voltage at which the discharge ends, V; ``None``: the ``VEOD`` of the model's cell
+    :param cut_off_V: voltage at which the discharge ends, V; ``None``: the ``VEOD`` of the model's cell, 2.7 V if no
+        ``model`` is given
     :param load_unit: ``"current"`` or ``"power"``
     :param model: the model that the estimate belongs to, ``RecordModel(cell, thermal)``; ``None``: ``RecordModel()``
     :return: Ah; NaN if the cut-off is not reached within a week
     :raises ValueError: for an argument out of range
     """
-    model = RecordModel() if model is None else model
+    model = RecordModel(NEW_CELL.replace(VEOD=CUT_OFF_V)) if model is None else model
     check_load(check_positive("load", load), load_unit)
     cut_off = check_positive("cut_off_V", model.cell.VEOD if cut_off_V is None else cut_off_V)
     q_C, r_ohm = float(Q_MOBILE.check(estimate.q_mobile)), float(R_O.check(estimate.r_o))

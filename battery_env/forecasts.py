@@ -13,7 +13,7 @@ from scipy.stats import truncnorm
 
 from battery_env.arrays import FloatArray, IntArray
 from battery_env.checks import LOAD_UNIT_SYMBOLS, LoadUnit, check_load, check_numbers, check_positive, check_whole_number
-from battery_env.electrochemistry import reached_s, state_of_charge
+from battery_env.electrochemistry import NEW_CELL, reached_s, state_of_charge
 from battery_env.estimates import Estimate
 from battery_env.estimators.base import is_overfull, overfull_error
 from battery_env.estimators.diagnosis import white_noise_V
@@ -21,7 +21,7 @@ from battery_env.loads import BlockBootstrap, Cycle, KnownLoad, Load, RandomLoad
 from battery_env.parameters import Q_MOBILE, R_O
 from battery_env.plotting import COLOURS, new_figure
 from battery_env.record_model import RECENT_SHARE, RecordModel
-from battery_env.records import Record, Samples, check_record, expected_current
+from battery_env.records import CUT_OFF_V, Record, Samples, check_record, expected_current
 
 #: What a load to come can be given as.
 FutureLoad = float | KnownLoad | RandomLoad | Callable[[FloatArray], ArrayLike]
@@ -188,7 +188,8 @@ def forecast(
     :param load: from the end of the record on: a number; a profile, ``Load(time_s, value, unit)``; a ``Cycle``; a function
         of time in s that takes an array; or a ``RandomLoad``, of which each sample draws its own. ``None``: as above. Over
         each time step of the model the mean of the load flows, and of a function its value at the start of the step
-    :param cut_off_V: voltage at which the discharge ends, V; ``None``: the ``VEOD`` of the model's cell
+    :param cut_off_V: voltage at which the discharge ends, V; ``None``: the ``VEOD`` of the model's cell, 2.7 V if no
+        ``model`` is given
     :param load_unit: of a number or a function: ``"power"`` in W or ``"current"`` in A. Other loads have their own
     :param model: the model that the estimate belongs to, ``LeastSquares(...).model``; ``None``: ``RecordModel()``
     :param mismatch_V: error to expect of the model, V; 0.05 V suits the bundled real cells, 0 simulated ones without mismatch
@@ -201,7 +202,7 @@ def forecast(
     :raises ValueError: for an argument out of range, an estimate that the record contradicts, or a load that charges the cell
         beyond full
     """
-    model = RecordModel() if model is None else model
+    model = RecordModel(NEW_CELL.replace(VEOD=CUT_OFF_V)) if model is None else model
     cut_off = model.cell.VEOD if cut_off_V is None else cut_off_V
     _check_arguments(mismatch_V, cut_off, nominal_Ah, samples, seed)
     seen = check_record(record, least_samples=2)

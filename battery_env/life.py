@@ -6,7 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import exp, isnan, log, sqrt
+from math import exp, hypot, isnan, log, sqrt
 from typing import Any
 
 import numpy as np
@@ -27,7 +27,17 @@ from battery_env.records import drawn
 #: What is believed of a cell before its discharges tell, as shares of q_mobile: the step from one to the next, the error of
 #: one estimate beside the others (both known to a factor of e, one standard deviation), and the sd of the drift.
 PRIOR_STEP_SHARE, PRIOR_NOISE_SHARE, PRIOR_DRIFT_SD_SHARE = 0.01, 0.003, 0.003
-_COLUMNS = ("q_mobile_C", "sd_q_mobile_C", "r_o_ohm", "settled", "reason", "valid", "capacity_Ah", "lasted_share")
+_COLUMNS = (
+    "q_mobile_C",
+    "sd_q_mobile_C",
+    "r_o_ohm",
+    "settled",
+    "reason",
+    "valid",
+    "capacity_Ah",
+    "mean_current_A",
+    "lasted_share",
+)
 # Lives that are simulated, and discharges to look ahead.
 _LIVES, _MOST = 2000, 2000
 
@@ -41,8 +51,9 @@ class Life:
 
     :param table: one row per discharge: ``cycle`` (its number, or its position), ``q_mobile_C``, ``sd_q_mobile_C``,
         ``r_o_ohm``, ``settled``, ``reason``, ``valid`` (whether it counts), ``capacity_Ah`` (charge to the cut-off),
-        ``lasted_share`` (its duration, as a share of the model's at this ``q_mobile``; NaN if it was cut short), and what the
-        discharges before let expect of ``q_mobile``, ``expected_q_mobile_C`` and ``expected_sd_C`` (NaN for the first)
+        ``mean_current_A``, ``lasted_share`` (its duration, as a share of the model's at this ``q_mobile``; NaN if it was cut
+        short), and what the discharges before let expect of ``q_mobile``, ``expected_q_mobile_C`` and ``expected_sd_C`` (NaN
+        for the first)
     :param step_share: standard deviation of the step from one discharge to the next, as a share of ``q_mobile``
     :param noise_share: standard deviation of an estimate beside the others, likewise
     :param drift_share: mean step
@@ -60,12 +71,26 @@ class Life:
     @property
     def prior_q_mobile_C(self) -> tuple[float, float]:
         """
-        Mean and standard deviation of ``q_mobile`` in the next discharge, C: a prior for its calibration. At the ``q_mobile``
-        of a whole discharge the model ends a little early or late, about as much as in the one before: the mean allows for it.
+        Mean and standard deviation of ``q_mobile`` in the next discharge, C: a prior for its calibration. It is for the load
+        of the life, under which the error that all estimates share cancels from the end. At the ``q_mobile`` of a whole
+        discharge the model ends a little early or late, about as much as in the one before: the mean allows for it.
         """
+        mean_C, sd_C = self._next_q_mobile_C
         whole = self.table[self.table["valid"] & self.table["lasted_share"].notna()]
-        mean = exp(self.state.sum()) * (float(whole["lasted_share"].iloc[-1]) if len(whole) else 1.0)
-        return mean, mean * sqrt(self.covariance.sum() + self.step_share**2)
+        lasted = float(whole["lasted_share"].iloc[-1]) if len(whole) else 1.0
+        return lasted * mean_C, lasted * sd_C
+
+    @property
+    def _next_q_mobile_C(self) -> tuple[float, float]:
+        mean_C = exp(self.state.sum())
+        return mean_C, mean_C * sqrt(self.covariance.sum() + self.step_share**2)
+
+    @property
+    def prior_at_other_loads_C(self) -> tuple[float, float]:
+        """The same for a load that is not that of the life: the error that all estimates share counts too."""
+        mean_C, sd_C = self._next_q_mobile_C
+        last = self.table[self.table["valid"]].iloc[-1]
+        return mean_C, hypot(sd_C, mean_C * last["sd_q_mobile_C"] / last["q_mobile_C"])
 
     def after(self, count: int) -> Life:
         """
@@ -164,6 +189,7 @@ def _told(discharge: Discharge, cut_off_V: float, calibrator: LeastSquares) -> d
         "reason": estimate.reason,
         "valid": estimate.settled or (not isnan(measured_s) and is_only_imprecise(estimate.reason)),
         "capacity_Ah": capacity_Ah,
+        "mean_current_A": record.charge_C / float(np.ptp(record.time_s)),
         "lasted_share": (measured_s - start_s) / (end_s - start_s),
     }
 

@@ -217,13 +217,15 @@ class _Table:
 
     def _turn_rows(self) -> None:
         """Rows of which the newest comes first are turned."""
-        counters = [*(self.columns[name] for name in ("cycle",) if name in self.columns)]
-        counters += [self.labels[name][0] for name in ("step",) if name in self.labels]
-        goes_on = np.all([np.diff(counter) == 0 for counter in counters], axis=0) if counters else slice(None)
-        step_s = np.diff(self.columns["time"])[goes_on]
+        time_s = self.columns["time"]
+        starts_anew = np.zeros(len(time_s) - 1, dtype=np.bool_)
+        for counter in (self.columns.get("cycle"), self.labels.get("step", (None,))[0]):
+            if counter is not None:
+                starts_anew |= np.diff(counter) != 0
+        step_s = np.diff(time_s)[~starts_anew]
         if (step_s <= 0.0).all() and (step_s < 0.0).any():
             warnings.warn("the clock runs backwards: the rows are taken from the last one to the first", stacklevel=2)
-            self._select(np.arange(len(self.columns["time"]))[::-1])
+            self._select(np.arange(len(time_s))[::-1])
 
     def _refuse_backwards(self) -> None:
         """A clock that starts anew goes back once; one that goes back in two rows on end is none."""

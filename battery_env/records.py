@@ -23,6 +23,8 @@ VARIED_SHARE = 0.05
 SAMPLE_INTERVAL_LIMITS_S = (1e-3, 600.0)
 #: A cell whose current is below this rests, A; then the next sample may come after as long as a week, s.
 REST_CURRENT_A, REST_LIMIT_S = 0.02, 604_800.0
+#: Where discharges of recorded cells end if nothing else is said, V.
+CUT_OFF_V = 2.7
 #: Currents below this share of the largest are taken for noise or sensor offset.
 LEAST_LOAD_SHARE = 0.03
 

@@ -27,7 +27,7 @@ from battery_env.estimators.rest import InitialSoc, Start, check_initial_soc, so
 from battery_env.parameters import PARAMETER_NAMES, check_parameters
 from battery_env.record_files import each_usable
 from battery_env.record_model import RecordModel, VoltageForecast
-from battery_env.records import ExpectedCurrent, Samples, drawn, expected_current
+from battery_env.records import CUT_OFF_V, ExpectedCurrent, Samples, drawn, expected_current
 
 Method = Literal["least-squares", "kalman", "policy"]
 METHODS: tuple[Method, ...] = get_args(Method)
@@ -68,8 +68,8 @@ class Settings:
     How a discharge of a real cell is looked at. ``Settings().calibrator()`` is least squares, and
     ``Settings(method="kalman").calibrator()`` the filter, with what such a cell needs.
 
-    :param method: of calibration; ``None``: least squares, and where they do not settle a record in progress, of which neither
-        a prior nor the constants of its cell are known, the filter
+    :param method: of calibration; ``None``: least squares; and where they do not settle a record in progress at a constant
+        load that goes on, of a cell of which neither a prior nor the constants are known, the filter
     :param parameters: which to search for; the other is held at the cell's value
     :param cut_off_V: voltage at which the discharge ends, V
     :param prior_q_mobile_C: mean and standard deviation of ``q_mobile`` before the discharge, C; ``None``: nothing is known
@@ -94,7 +94,7 @@ class Settings:
 
     method: Method | None = None
     parameters: tuple[str, ...] = PARAMETER_NAMES
-    cut_off_V: float = 2.7
+    cut_off_V: float = CUT_OFF_V
     prior_q_mobile_C: tuple[float, float] | None = None
     mismatch_V: float = UNFITTED_MISMATCH_V
     current_gain_sd: float = 0.005
@@ -152,12 +152,13 @@ class Settings:
             others, cell = {**known, **others}, cell.cell
         return cls(**{"cell": cell, **others})
 
-    def methods(self, in_progress: bool) -> list[Method]:
-        """What to calibrate a record by: the first one that settles it, or the last one."""
+    def methods(self, goes_on: bool) -> list[Method]:
+        """What to calibrate a record by: the first one that settles it, or the last; ``goes_on``: a constant load does."""
         if self.method is not None:
             return [self.method]
-        is_new = in_progress and self.prior_q_mobile_C is None and self.cell is None
-        return ["least-squares", "kalman"] if is_new else ["least-squares"]
+        # under other loads the filter, which takes the error of the model for noise, is surer than it may be
+        is_new = self.prior_q_mobile_C is None and self.cell is None and self.future_current_A is None
+        return ["least-squares", "kalman"] if goes_on and is_new else ["least-squares"]
 
     def calibrator(
         self, cell: CellParameters | None = None, start: Start | None = None
@@ -372,9 +373,10 @@ def _calibrated(discharge: Discharge, settings: Settings) -> Calibration:
     cell = _cell_at_the_temperature(record, settings)
     discharge = _with_the_temperature_that_counts(discharge, settings)
     start = _start(discharge, settings, cell)
-    estimate, method = _estimate(record, settings, cell, start, in_progress)
+    load = expected_current(record.time_s, record.current_A)
+    estimate, method = _estimate(record, settings, cell, start, in_progress and not load.varied)
     model = RecordModel(cell, settings.thermal and settings.method != "policy", initial_soc=start.soc)
-    future = load = expected_current(record.time_s, record.current_A)
+    future = load
     if settings.future_current_A is not None:
         future = ExpectedCurrent(settings.future_current_A, varied=False, sd_A=0.0)
     forecast = model.forecast(record, estimate, settings.cut_off_V, future.mean_A, in_progress)
@@ -430,10 +432,10 @@ def _calibrated(discharge: Discharge, settings: Settings) -> Calibration:
 
 
 def _estimate(
-    record: Discharge, settings: Settings, cell: CellParameters, start: Start, in_progress: bool
+    record: Discharge, settings: Settings, cell: CellParameters, start: Start, goes_on: bool
 ) -> tuple[Estimate, Method]:
     """The estimate of the first method that settles the discharge, or of the last one; and which it is."""
-    for method in settings.methods(in_progress):
+    for method in settings.methods(goes_on):
         calibrator = replace(settings, method=method).calibrator(cell, start)
         estimate = calibrator.estimate(_with_the_temperature_that_counts(record, settings))
         if estimate.settled:

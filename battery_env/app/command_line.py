@@ -33,6 +33,7 @@ from battery_env.estimators.cell_fit import CellFit, fit_cell, read_cell
 from battery_env.estimators.rest import InitialSoc
 from battery_env.files import check_folder
 from battery_env.parameters import PARAMETER_NAMES
+from battery_env.records import CUT_OFF_V
 
 #: What the process returns: all records settled, one or more refused, one or more not settled, stopped by Ctrl-C.
 SETTLED, REFUSED, NOT_SETTLED, INTERRUPTED = 0, 2, 3, 130
@@ -112,7 +113,7 @@ _CALIBRATION: _Options = {
     ("--method",): {
         "choices": METHODS,
         "help": "of calibration: least squares, the filter (kalman), or a policy trained on simulated cells (default: least "
-        "squares; the filter where these do not settle a discharge in progress without --prior and --cell)",
+        "squares; the filter where these do not settle one in progress at a constant load, without --prior and --cell)",
     },
     ("--policy",): {
         "type": Path,
@@ -247,7 +248,7 @@ def _fit_parser(name: str) -> argparse.ArgumentParser:
     _add_files(parser)
     group = parser.add_argument_group("fit")
     group.add_argument(
-        "--cut-off", type=float, default=2.7, metavar="V", help="voltage at which the discharge ends, V (default: %(default)s)"
+        "--cut-off", type=float, default=CUT_OFF_V, metavar="V", help="where the discharge ends, V (default: %(default)s)"
     )
     group.add_argument("--isothermal", action="store_true", help="keep the temperature of the model constant")
     group.add_argument(

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from battery_env.app.calibrate import Calibration, Settings, calibrate
@@ -26,6 +27,7 @@ from battery_env.life import Life, track_life
 from battery_env.loads import Load
 from battery_env.plotting import save_figure
 from battery_env.record_model import RecordModel
+from battery_env.records import VARIED_SHARE
 
 # By name of the column of a profile: the unit of the load.
 _LOAD_COLUMNS: dict[str, LoadUnit] = {"current_A": "current", "power_W": "power"}
@@ -40,12 +42,14 @@ class End:
     :param calibration: what the record says
     :param forecast: what may come
     :param life: of the cell before; ``None``: not known
+    :param prior_q_mobile_C: mean and standard deviation that were carried over, C; ``None``: none were
     """
 
     name: str
     calibration: Calibration
     forecast: Forecast
     life: Life | None = None
+    prior_q_mobile_C: tuple[float, float] | None = None
 
     @property
     def contradicted(self) -> bool:
@@ -75,7 +79,7 @@ class End:
             **{name: [_plain(value) for value in quantile(values, BAND).tolist()] for name, values in samples.items()},
             "nominal_Ah": _plain(found.nominal_Ah),
             "life_discharges": 0 if past is None else int(past.table["valid"].sum()),
-            "prior_q_mobile_C": None if past is None else list(past.prior_q_mobile_C),
+            "prior_q_mobile_C": None if self.prior_q_mobile_C is None else list(self.prior_q_mobile_C),
             "notes": list(found.notes),
         }
 
@@ -83,12 +87,11 @@ class End:
         """The same for reading."""
         lines = [self.name]
         if self.life is not None:
-            table, (mean_C, sd_C) = self.life.table, self.life.prior_q_mobile_C
-            left_out = len(table) - int(table["valid"].sum())
-            lines.append(
-                f"q_mobile before: {mean_C:.0f} C, sd {sd_C:.0f} C, from {len(table) - left_out} earlier discharges"
-                + (f"; {left_out} left out" if left_out else "")
-            )
+            valid = self.life.table["valid"]
+            left_out = f"; {(~valid).sum()} left out" if not valid.all() else ""
+            lines.append(f"life of {valid.sum()} earlier discharges{left_out}")
+        if self.prior_q_mobile_C is not None:
+            lines.append("q_mobile before: {:.0f} C, sd {:.0f} C".format(*self.prior_q_mobile_C))
         return "\n".join([*lines, self.forecast.summary()])
 
 
@@ -97,7 +100,9 @@ def _plain(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def forecast_end(discharge: Discharge, settings: Settings | None = None, load: FutureLoad | None = None) -> Forecast:
+def forecast_end(
+    discharge: Discharge, settings: Settings | None = None, load: FutureLoad | None = None, samples: int = 1000
+) -> Forecast:
     """
     The end of a discharge in progress, with all that :class:`~battery_env.app.calibrate.Settings` know of it.
 
@@ -110,14 +115,20 @@ def forecast_end(discharge: Discharge, settings: Settings | None = None, load: F
     :param discharge: what was recorded until now
     :param settings: how to look at it; ``None``: the defaults
     :param load: from the last sample under load on, as :func:`battery_env.forecast` takes it; ``None``: as so far
-    :return: what may come
+    :param samples: of what may come
+    :return: these
     :raises ValueError: if the discharge cannot be used, or a load cannot be meant
     """
-    return _forecast(calibrate(discharge, settings or Settings()), settings or Settings(), load)
+    return _forecast(discharge, Settings() if settings is None else settings, load, samples)[1]
 
 
-def _forecast(found: Calibration, settings: Settings, load: FutureLoad | None) -> Forecast:
-    """What comes after a record that was calibrated."""
+def _forecast(
+    discharge: Discharge, settings: Settings, load: FutureLoad | None, samples: int = 1000
+) -> tuple[Calibration, Forecast]:
+    """What a record says, and what comes after it."""
+    # under another load the filter is surer than it may be
+    method = settings.method if load is None else settings.method or "least-squares"
+    found = calibrate(discharge, replace(settings, method=method))
     assert found.record is not None
     cell = (settings.cell or NEW_CELL).replace(Tb0=found.ambient_C + ZERO_CELSIUS_K)
     expected = forecast(
@@ -128,10 +139,11 @@ def _forecast(found: Calibration, settings: Settings, load: FutureLoad | None) -
         model=RecordModel(cell, settings.thermal and found.method != "policy", initial_soc=found.initial_soc),
         mismatch_V=settings.mismatch_V,
         nominal_Ah=settings.nominal_Ah,
+        samples=samples,
     )
     # a cell of which nothing is known has no health
     is_known = settings.nominal_Ah is not None or settings.cell is not None
-    return expected if is_known else replace(expected, nominal_Ah=float("nan"))
+    return found, expected if is_known else replace(expected, nominal_Ah=float("nan"))
 
 
 def read_load(path: str | Path) -> Load:
@@ -227,9 +239,26 @@ def end_of_record(
         calibrator = replace(settings, method="least-squares", initial_soc=1.0).calibrator()
         assert isinstance(calibrator, LeastSquares)
         past = track_life(before, settings.cut_off_V, calibrator)
-        settings = replace(settings, prior_q_mobile_C=past.prior_q_mobile_C)
-    found = calibrate(running, settings)
-    return End(record_name(source.stem, source.cycle), found, _forecast(found, settings, to_come), past)
+        prior_C = past.prior_q_mobile_C if has_usual_load(past, running, to_come) else past.prior_at_other_loads_C
+        settings = replace(settings, prior_q_mobile_C=prior_C)
+    return End(record_name(source.stem, source.cycle), *_forecast(running, settings, to_come), past, settings.prior_q_mobile_C)
+
+
+def has_usual_load(life: Life, running: Discharge, load: Load | None) -> bool:
+    """
+    Whether a discharge has the constant load of its cell's life, so far and afterwards.
+
+    :param life: of the cell before
+    :param running: the discharge so far
+    :param load: the load to come; ``None``: as so far
+    :return: whether all these currents lie within 5 % of the largest
+    """
+    if load is not None and load.unit != "current":
+        return False
+    usual_A = life.table["mean_current_A"][life.table["valid"]].iloc[-1]
+    low_A, high_A = np.quantile(running.current_A[running.time_s > running.load_on_time_s], [0.05, 0.95])
+    currents_A = [usual_A, low_A, high_A, *([] if load is None else load.value)]
+    return bool(np.ptp(currents_A) <= VARIED_SHARE * max(currents_A))
 
 
 class EndFiles:

@@ -72,7 +72,7 @@ class Condition(IntEnum):
     # a policy that states nothing
     NO_FIT = "A policy whose observation has no fit (option nuisance) states no uncertainty."
     NOT_YET = "The policy states nothing before its next decision."
-    # the start
+    # the start, and samples that a policy cannot read
     START_UNKNOWN = (
         "The record does not start with a minute at rest, whose voltage would tell the charge. Give the rest before the load, "
         "or state initial_soc."
@@ -84,6 +84,10 @@ class Condition(IntEnum):
     START_LOADED = (
         "The record starts under load at {first_V:.2f} V, which need not be that of {expected}: it rests at {rest_V:.2f} V "
         "then. {start_advice}"
+    )
+    SPARSE = (
+        "Samples lie farther apart than the {interval_s:g} s between the readings of the policy, or are missing at the start: "
+        "it reads a straight line between them, which misleads it. Least squares and the filter take such records."
     )
     # faults of the samples; a stream keeps the first one in time
     RECOVERED = (
@@ -98,10 +102,6 @@ class Condition(IntEnum):
         "no current."
     )
     # what was given does not suffice
-    SPARSE = (
-        "Samples lie farther apart than the {interval_s:g} s between the readings of the policy, or are missing at the start: "
-        "it reads a straight line between them, which misleads it. Least squares and the filter take such records."
-    )
     NO_CURRENT = "No current flows in the last step, so that r_o does not show."
     EMPTY = "The model cell is empty before the record ends: its q_mobile is too small for this record."
     FEW = "These are too few {of} to tell the noise. Record on or more often{or_else}."
@@ -150,11 +150,19 @@ class Condition(IntEnum):
 
     def of(self, name: str) -> Condition:
         """The row of a parameter, where this one is that of ``q_mobile``."""
-        return Condition(self + PARAMETER_NAMES.index(name))
+        return Condition.numbered(self + PARAMETER_NAMES.index(name))
+
+    @staticmethod
+    def numbered(number: int) -> Condition:
+        """The row of a number that compiled code found."""
+        return _ROWS[number - 1]
 
     def said(self, measured: Mapping[str, Any]) -> str:
         """The text, filled with what was measured."""
         return self.text.format_map(measured)
+
+
+_ROWS = tuple(Condition)
 
 
 class Diagnosis:

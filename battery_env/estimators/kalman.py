@@ -216,7 +216,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
                 self._begin(temperature_K)
         sample = np.array([[(voltage_V, current_A, dt_s, temperature_K)]], dtype=SAMPLE)
         said = self._follow(self._cells, self._filters, sample)[0, 0]
-        condition, (sd_q_mobile, sd_r_o) = Condition(said["condition"]), said["sd"].tolist()
+        condition, (sd_q_mobile, sd_r_o) = Condition.numbered(said["condition"]), said["sd"].tolist()
         text = condition.said(measured(self._cells["seen"][0], self.initial_soc[0]))
         return Estimate(float(said["q_mobile"]), float(said["r_o"]), sd_q_mobile, sd_r_o, not text, text)
 
@@ -245,7 +245,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
             check_drawn_charge(float(np.cumsum(np.append(0.0, current_A[:-1]) * dt_s).min()), self.least_drawn_C)
             said = self._follow(self._cells, self._filters, samples)[:, 0]
             shown = measured(self._cells["seen"][0], self.initial_soc[0], float(time_s[0]))
-            texts = {number: Condition(number).said(shown) for number in np.unique(said["condition"]).tolist()}
+            texts = {number: Condition.numbered(number).said(shown) for number in np.unique(said["condition"]).tolist()}
             sd_q, sd_r_o = said["sd"].T.copy()
             reasons = np.array([texts[number] for number in said["condition"].tolist()], dtype=object)
             columns = (said["q_mobile"].copy(), said["r_o"].copy(), sd_q, sd_r_o, reasons == "", reasons)
@@ -351,7 +351,7 @@ class KalmanBatch(OnlineBatch):
 
         def reason_of(n: int) -> str:
             of_cell = {name: column[n] for name, column in shown.items()}
-            return Condition(said["condition"][n]).said(measured(of_cell, one.initial_soc[0]))
+            return Condition.numbered(said["condition"][n]).said(measured(of_cell, one.initial_soc[0]))
 
         settled = said["condition"] == Condition.SETTLED
         return Estimates(said["q_mobile"], said["r_o"], sd_q_mobile, sd_r_o, settled, reason_of)

@@ -122,7 +122,8 @@ def watched(
     seen = np.zeros(1, SEEN)
     seen["start_V"] = nan if initial_soc is None else rest_voltage_V(cell, initial_soc)
     seen["start"]["at_rest"] = rested
-    _watch_all(seen, *(np.ascontiguousarray(column) for column in record), q_mobile, r_o, cell.q_mobile)
+    time_s, voltage_V, current_A = (np.ascontiguousarray(column) for column in record)
+    _watch_all(seen, time_s, voltage_V, current_A, q_mobile, r_o, cell.q_mobile)
     return seen[0]
 
 
@@ -139,7 +140,8 @@ def note_samples(
     seen = watched(record, cell, initial_soc, q_mobile, r_o, rested)
     said = measured(seen, initial_soc or 1.0, float(record.time_s[0]))
     for number in (start_condition(seen, q_mobile, r_o), int(seen["fault"]["condition"])):
-        diagnosis.note(Condition(number or Condition.SETTLED), **said)
+        if number:
+            diagnosis.note(Condition.numbered(number), **said)
 
 
 def measured(seen: Any, initial_soc: float, clock_s: float = 0.0) -> dict[str, Any]:

@@ -47,6 +47,10 @@ class TestLoads:
         assert found.load_name == "4 A"
         np.testing.assert_allclose(found.eod_time_s, MODEL.forecast(record, TRUTH, cut_off_V).eod_time_s, atol=1e-6)
 
+    def test_a_recorded_cell_ends_at_the_same_voltage_as_everywhere(self):
+        found = forecast(half(discharged(4.0, load_unit="current")), TRUTH, samples=3)
+        assert found.cut_off_V == Settings().cut_off_V == 2.7
+
     def test_a_known_profile_ends_when_the_cell_does(self):
         record = discharged(RandomPiecewise((4.0, 12.0))(np.random.default_rng(3)))
         found = certain(half(record), rest_of(record))
@@ -285,14 +289,18 @@ class TestCommand:
         assert main(["forecast", *arguments, "--json"]) == status
         return json.loads(capsys.readouterr().out)
 
+    def wide_sd_C(self, capsys):
+        return self.row(capsys, "running.csv", "--life", "lab", "--load", "profile.csv")["prior_q_mobile_C"][1]
+
     def test_life_and_load_give_the_end_that_python_gives(self, capsys):
         assert main(["forecast", "running.csv", "--life", "lab", "--load", "profile.csv", "--out", "out"]) == 0
         shown = capsys.readouterr()
-        assert "from 10 earlier discharges" in shown.out and "then a given load" in shown.out and "health" not in shown.out
+        assert "life of 10 earlier discharges" in shown.out and "then a given load" in shown.out and "health" not in shown.out
         assert "notes.txt is left out" in shown.err
         written = json.loads(Path("out/running_forecast.json").read_text())
         life = track_life(self.discharges[:10], 2.7)
-        assert written["prior_q_mobile_C"] == pytest.approx(life.prior_q_mobile_C, rel=2e-3)
+        # another load than that of the life
+        assert written["prior_q_mobile_C"] == pytest.approx(life.prior_at_other_loads_C, rel=0.05)
         known = Settings(prior_q_mobile_C=tuple(written["prior_q_mobile_C"]))
         seen = self.discharges[10].until(1200.0)
         again = forecast_end(seen, known, read_load("profile.csv"))
@@ -310,6 +318,7 @@ class TestCommand:
         assert together["record"] == "all_011" and together["life_discharges"] == 10
         assert together["eod_time_s"] == pytest.approx(apart["eod_time_s"], rel=1e-3)
         assert together["eod_time_s"][1] == pytest.approx(self.end_s, rel=0.02)
+        assert together["prior_q_mobile_C"][1] < 0.8 * self.wide_sd_C(capsys)
         assert self.row(capsys, "all.csv:4", "--life", "all.csv")["life_discharges"] == 3
 
     def test_without_a_life_the_interval_is_wide_and_the_filter_is_taken(self, capsys):

@@ -9,6 +9,7 @@ from battery_env.app.calibrate import METHODS, Settings
 from battery_env.cells import Discharge, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate
 from battery_env.estimators import CellFit, Estimate, ExtendedKalmanFilter, LeastSquares, fit_cell
+from battery_env.estimators.diagnosis import Condition, Diagnosis
 from battery_env.record_model import RecordModel
 from battery_env.records import expected_current
 
@@ -146,6 +147,16 @@ VERDICTS = {
 def test_each_reason_is_said_of_its_record(name, record, arguments, reason):
     estimate = CALIBRATORS[name](**arguments).estimate(record)
     assert not estimate.settled and estimate.reason.startswith(reason), estimate.reason
+
+
+def test_the_table_decides_what_is_said_first_whoever_notes_it():
+    diagnosis = Diagnosis()
+    assert diagnosis.reason == ""
+    diagnosis.note(Condition.Q_IMPRECISE.of("r_o"))
+    diagnosis.note(Condition.MISFIT, False)
+    assert diagnosis.reason.startswith("r_o is not known to 30 %")
+    diagnosis.note(Condition.RISES, size=0.1, fault_s=60.0)
+    assert diagnosis.reason == "The voltage rises by 0.10 V at 60 s, where the current stays as it was."
 
 
 NOISY_REST = discharged(1e-6 + pulsed(30, 60, 2.0, 0.0))
