@@ -31,7 +31,7 @@ $(VENV)/.installed: setup.cfg pyproject.toml battery_env/setup.cfg battery_env/p
 
 install: $(VENV)/.installed  ## make .venv with everything in it
 
-demo: install  ## LAC, SAC and TD3 on two tasks, then the life of a real cell: minutes; figures in results/
+demo: install  ## LAC, SAC and TD3 learn R_o, then the life of a real cell: some minutes; figures in results/
 	$(BIN)/python -m benchmarks.demo
 
 test: install  ## all tests

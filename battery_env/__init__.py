@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING, Any
 from battery_env.calibration.registration import register_environments
 
 if TYPE_CHECKING:
+    from battery_env.app.calibrate import Calibration, Settings, calibrate
     from battery_env.calibration.onnx_policy import OnnxPolicy
     from battery_env.calibration.policy import PolicyEstimator
     from battery_env.cells import Discharge, load_nasa_discharges
+    from battery_env.conversions import capacity_Ah, dc_resistance_ohm
     from battery_env.electrochemistry import NEW_CELL, CellParameters, Trajectory, initial_state, simulate, step, voltage
     from battery_env.estimates import Estimate
     from battery_env.estimators import (
@@ -40,9 +42,11 @@ if TYPE_CHECKING:
 # Where each name comes from: numba, pandas and scipy take seconds to import, and an environment by its id needs none of them.
 # Type checkers see the imports above instead; a test holds the two together.
 _MODULES = {
+    "app.calibrate": ("Calibration", "Settings", "calibrate"),
     "calibration.onnx_policy": ("OnnxPolicy",),
     "calibration.policy": ("PolicyEstimator",),
     "cells": ("Discharge", "load_nasa_discharges"),
+    "conversions": ("capacity_Ah", "dc_resistance_ohm"),
     "electrochemistry": ("NEW_CELL", "CellParameters", "Trajectory", "initial_state", "simulate", "step", "voltage"),
     "estimates": ("Estimate",),
     "estimators": (

@@ -35,6 +35,18 @@ CALIBRATION_CHARTS = {
 class CalibrationCallback(EventCallback):
     """
     Callback for evaluating a calibrator on held-out trajectories while it learns.
+
+    .. code-block:: python
+
+      from battery_env import PolicyEstimator, TrajectoryDataset, evaluate
+      from battery_env.callbacks import CalibrationCallback
+      from sb3_lac import LAC
+
+      _, test = TrajectoryDataset.paper("r_o").split(test=0.3, seed=0)
+      held_out = test[::160]
+      callback = CalibrationCallback(lambda model: evaluate(PolicyEstimator(model, "BatteryRo-v0"), held_out), eval_freq=5_000)
+      LAC("MlpPolicy", "BatteryRo-v0", tensorboard_log="runs").learn(10_000, callback)
+
     For each metric, it logs the mean over trajectories as ``calibration/<name>``
     and the worst (largest) value as ``calibration/<name>_worst``: smaller is better.
     TensorBoard also gets a figure for each parameter with a metric, ``calibration/<parameter>_inferred``

@@ -42,7 +42,8 @@ NASA_CITATION = (
 #: Cells whose discharges come with the package.
 BUNDLED_CELLS: tuple[str, ...] = ("B0005", "B0006")
 
-_MIN_SAMPLES = 5
+#: A discharge needs so many.
+LEAST_SAMPLES = 5
 _COLUMNS = ("time_s", "voltage_V", "current_A")
 # what cycles.csv tells about each discharge beyond the samples themselves
 _META_COLUMNS = ("test_id", "start_time", "ambient_temperature_C", "capacity_Ah", "Re_ohm", "Rct_ohm")
@@ -70,7 +71,7 @@ class Discharge:
     :param meta: what else is known, e.g. ``cell``, ``cycle``, ``capacity_Ah``, ``start_time``, ``source``
     :param starts_at_rest: whether the first voltage is that of the cell at rest, and the first current that of the load
         that is switched on then, as in a :meth:`loaded_part`. Calibrators judge by it whether the cell was full
-    :raises ValueError: for arrays that do not fit together, or values that cannot be meant; it says what to do
+    :raises ValueError: for arrays that do not fit together, or invalid values; it says what to do
     """
 
     time_s: FloatArray
@@ -83,10 +84,10 @@ class Discharge:
     is_checked: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        samples = check_samples(self.time_s, self.voltage_V, self.current_A, _MIN_SAMPLES)
+        samples = check_samples(self.time_s, self.voltage_V, self.current_A, LEAST_SAMPLES)
         columns = dict(zip(_COLUMNS, samples, strict=True))
         if self.temperature_C is not None:
-            columns["temperature_C"] = check_column("temperature_C", self.temperature_C, _MIN_SAMPLES)
+            columns["temperature_C"] = check_column("temperature_C", self.temperature_C, LEAST_SAMPLES)
             if len(self.temperature_C) != len(columns["time_s"]):
                 raise ValueError(f"temperature_C has {len(self.temperature_C)} samples, but time_s has {len(self.time_s)}")
         for name, array in columns.items():
@@ -95,13 +96,14 @@ class Discharge:
 
     def _check_extent(self) -> None:
         """Refuse a discharge of too few samples, or over a time or with a charge that no cell has."""
-        if len(self.time_s) < _MIN_SAMPLES:
-            raise ValueError(f"a discharge needs at least {_MIN_SAMPLES} samples, got {len(self.time_s)}")
+        if len(self.time_s) < LEAST_SAMPLES:
+            raise ValueError(f"a discharge needs at least {LEAST_SAMPLES} samples, got {len(self.time_s)}")
         duration_s = self.time_s[-1] - self.time_s[0]
         if not _DURATION_LIMITS_S[0] <= duration_s <= _DURATION_LIMITS_S[1]:
+            unit, symbol = ("hours", "h") if duration_s < _DURATION_LIMITS_S[0] else ("milliseconds", "ms")
             raise ValueError(
                 f"time_s must span {_DURATION_LIMITS_S[0]:g} .. {_DURATION_LIMITS_S[1]:g} s, got {duration_s:g} s. "
-                "Give the time in seconds, not in hours or milliseconds (command line: --units time=h)."
+                f"Give the time in seconds, not in {unit} (command line: --units time={symbol})."
             )
         check_drawn_charge(self.charge_C)
         if self.charge_C > Q_MOBILE.limits[1]:
@@ -229,10 +231,10 @@ class Discharge:
         if np.isnan(end_s):
             end_s = float(self.time_s[last])
         time_s = np.concatenate([[start_s], self.time_s[(self.time_s > start_s) & (self.time_s < end_s)], [end_s]])
-        if len(time_s) < _MIN_SAMPLES:
+        if len(time_s) < LEAST_SAMPLES:
             raise ValueError(
                 f"only {len(time_s)} samples lie between load-on at {start_s:g} s and {cut_off_V:g} V or the end of the load; "
-                f"at least {_MIN_SAMPLES} are needed"
+                f"at least {LEAST_SAMPLES} are needed"
             )
         names = ("voltage_V", "current_A") if self.temperature_C is None else ("voltage_V", "current_A", "temperature_C")
         columns = {name: np.interp(time_s, self.time_s, getattr(self, name)) for name in names}
@@ -299,6 +301,14 @@ class Discharge:
 def load_nasa_discharges(path_or_cell: str | Path) -> list[Discharge]:
     """
     All discharges of one cell of NASA's battery data set, in the order they were made. Cite it as ``NASA_CITATION``.
+
+    .. code-block:: python
+
+      from battery_env import load_nasa_discharges
+
+      discharges = load_nasa_discharges("B0005")  # or "B0006", or a .mat file of NASA's
+      print([(each.meta["cycle"], each.meta["capacity_Ah"]) for each in discharges[::40]])
+      first = discharges[0].loaded_part(cut_off_V=2.7)  # what estimators take
 
     Their ``meta`` holds ``cell``, ``cycle`` (1, 2, ... over the discharges), ``source`` and, as far as the file tells,
     ``start_time``, ``ambient_temperature_C``, ``capacity_Ah`` (charge to 2.7 V), ``Re_ohm`` and ``Rct_ohm`` (of the impedance

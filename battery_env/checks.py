@@ -1,4 +1,4 @@
-"""Refuses arguments that cannot be meant; each check returns what it was given, converted."""
+"""Refuses invalid arguments; each check returns what it was given, converted."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def check_indices(name: str, values: ArrayLike, size: int) -> IntArray:
 
 
 def check_load(load: ArrayLike, load_unit: LoadUnit) -> FloatArray:
-    """Refuse loads that cannot be meant. Negative loads charge the cell."""
+    """Refuse invalid loads. Negative loads charge the cell."""
     if not isinstance(load_unit, str) or load_unit not in LOAD_LIMITS:
         raise ValueError(f"load_unit must be 'power' (W) or 'current' (A), got {load_unit!r}")
     limit = LOAD_LIMITS[load_unit]
@@ -89,7 +89,7 @@ def check_load(load: ArrayLike, load_unit: LoadUnit) -> FloatArray:
 
 
 def check_gain_sd(current_gain_sd: float) -> float:
-    """Refuse an uncertainty of the current sensor that cannot be meant."""
+    """Refuse an invalid uncertainty of the current sensor."""
     if not 0.0 <= current_gain_sd < 1.0:
         raise ValueError(f"current_gain_sd is a share within 0 .. 1 (1 %: 0.01), got {current_gain_sd!r}")
     return float(current_gain_sd)

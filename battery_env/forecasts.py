@@ -13,15 +13,15 @@ from scipy.stats import truncnorm
 
 from battery_env.arrays import FloatArray, IntArray
 from battery_env.checks import LOAD_UNIT_SYMBOLS, LoadUnit, check_load, check_numbers, check_positive, check_whole_number
-from battery_env.electrochemistry import reached_s, state_of_charge
+from battery_env.electrochemistry import NEW_CELL, reached_s, state_of_charge
 from battery_env.estimates import Estimate
 from battery_env.estimators.base import is_overfull, overfull_error
-from battery_env.estimators.settling import white_noise_V
+from battery_env.estimators.diagnosis import white_noise_V
 from battery_env.loads import BlockBootstrap, Cycle, KnownLoad, Load, RandomLoad, constant, in_steps, steadier_unit
 from battery_env.parameters import Q_MOBILE, R_O
 from battery_env.plotting import COLOURS, new_figure
-from battery_env.record_model import RecordModel
-from battery_env.records import Record, Samples, check_record, expected_current
+from battery_env.record_model import RECENT_SHARE, RecordModel
+from battery_env.records import CUT_OFF_V, Record, Samples, check_record, expected_current
 
 #: What a load to come can be given as.
 FutureLoad = float | KnownLoad | RandomLoad | Callable[[FloatArray], ArrayLike]
@@ -29,10 +29,8 @@ FutureLoad = float | KnownLoad | RandomLoad | Callable[[FloatArray], ArrayLike]
 #: The ends and the middle of the intervals that are shown: nine of ten outcomes lie between the outer two.
 BAND = (0.05, 0.5, 0.95)
 
-#: The error of the model shortly before the end of a record is the mean over this share of the record.
-_RECENT_SHARE = 0.1
-#: It drifts with this constant, as a share of ``q_mobile``: the model is wrong in another way at another charge. That is how
-#: fast the residuals of whole discharges of B0005 lose their correlation.
+#: The error of the model drifts with this constant, as a share of ``q_mobile``: it is wrong in another way at another charge.
+#: That is how fast the residuals of whole discharges of B0005 lose their correlation.
 _MEMORY_SHARE = 0.15
 # No discharge is followed for longer than a day, s. Cells that have ended are left out every so many steps.
 _LONGEST_S, _CHUNK_STEPS = 86_400.0, 512
@@ -103,7 +101,7 @@ class Forecast:
         :param probability: within 0 .. 1, any shape
         :return: on the clock of the record, s, same shape
         """
-        return _quantile(self.eod_time_s, probability)
+        return quantile(self.eod_time_s, probability)
 
     def summary(self) -> str:
         """
@@ -118,15 +116,16 @@ class Forecast:
             "q_mobile (C)": (self.q_mobile, "10.0f"),
             "r_o (ohm)": (self.r_o, "10.4f"),
             "capacity (Ah)": (self.capacity_Ah, "10.3f"),
-            f"state of health (% of {self.nominal_Ah:.3f} Ah)": (100.0 * self.state_of_health, "10.1f"),
         }
+        if not np.isnan(self.nominal_Ah):
+            rows[f"state of health (% of {self.nominal_Ah:.3f} Ah)"] = 100.0 * self.state_of_health, "10.1f"
         head = "".join(f"{'median' if p == 0.5 else f'{100.0 * p:g} %':>10}" for p in BAND)
         lines = [
             f"Discharge to {self.cut_off_V:g} V, {self.now_s:.0f} s seen, then {self.load_name} ({len(self.soc)} samples)",
             f"  {'':<34}{head}",
         ]
         for name, (values, form) in rows.items():
-            lines.append(f"  {name:<34}" + "".join(f"{value:{form}}" for value in _quantile(values, BAND)))
+            lines.append(f"  {name:<34}" + "".join(f"{value:{form}}" for value in quantile(values, BAND)))
         return "\n".join([*lines, *self.notes])
 
     def plot(self) -> Figure:
@@ -189,7 +188,8 @@ def forecast(
     :param load: from the end of the record on: a number; a profile, ``Load(time_s, value, unit)``; a ``Cycle``; a function
         of time in s that takes an array; or a ``RandomLoad``, of which each sample draws its own. ``None``: as above. Over
         each time step of the model the mean of the load flows, and of a function its value at the start of the step
-    :param cut_off_V: voltage at which the discharge ends, V; ``None``: the ``VEOD`` of the model's cell
+    :param cut_off_V: voltage at which the discharge ends, V; ``None``: the ``VEOD`` of the model's cell, 2.7 V if no
+        ``model`` is given
     :param load_unit: of a number or a function: ``"power"`` in W or ``"current"`` in A. Other loads have their own
     :param model: the model that the estimate belongs to, ``LeastSquares(...).model``; ``None``: ``RecordModel()``
     :param mismatch_V: error to expect of the model, V; 0.05 V suits the bundled real cells, 0 simulated ones without mismatch
@@ -202,7 +202,7 @@ def forecast(
     :raises ValueError: for an argument out of range, an estimate that the record contradicts, or a load that charges the cell
         beyond full
     """
-    model = RecordModel() if model is None else model
+    model = RecordModel(NEW_CELL.replace(VEOD=CUT_OFF_V)) if model is None else model
     cut_off = model.cell.VEOD if cut_off_V is None else cut_off_V
     _check_arguments(mismatch_V, cut_off, nominal_Ah, samples, seed)
     seen = check_record(record, least_samples=2)
@@ -276,7 +276,7 @@ def _notes(estimate: Estimate, record: Samples, goes_on_varied: bool) -> list[st
     return notes
 
 
-def _quantile(values: FloatArray, probability: ArrayLike) -> FloatArray:
+def quantile(values: FloatArray, probability: ArrayLike) -> FloatArray:
     """Quantiles over the samples, the first axis."""
     # of the samples themselves: between two of them there is no number if one is infinite
     return np.asarray(np.quantile(values, np.asarray(probability, dtype=np.float64), axis=0, method="inverted_cdf"))
@@ -406,13 +406,13 @@ def _at_the_end_of(
     """Take cells with drawn parameters through a record, and draw their errors from the last voltages measured."""
     steps, count = len(current_A) - 1, len(parameters[0])
     measured_V = np.interp(record.time_s[0] + model.dt_s * np.arange(steps + 1), record.time_s, record.voltage_V)
-    last = slice(min(int((1.0 - _RECENT_SHARE) * steps), steps - 1) + 1, None)
+    last = slice(min(int((1.0 - RECENT_SHARE) * steps), steps - 1) + 1, None)
     state = model.start(parameters[0])
     model.advance(state, current_A[: last.start], *parameters)
     run_V, _ = model.run_on(state, current_A[None, last.start : -1], *parameters, "current")
     voltage_V, recent_V = run_V[-1], np.mean(measured_V[last, None] - run_V, axis=0)
     # the voltage measured is noisy
-    samples = max(int((record.time_s >= record.time_s[-1] - _RECENT_SHARE * np.ptp(record.time_s)).sum()), 1)
+    samples = max(int((record.time_s >= record.time_s[-1] - RECENT_SHARE * np.ptp(record.time_s)).sum()), 1)
     variance_V2, of_noise_V2 = mismatch_V**2, white_noise_V(record.voltage_V) ** 2 / samples
     share = variance_V2 / (variance_V2 + of_noise_V2) if variance_V2 > 0.0 else 0.0
     draws = rng.standard_normal((2, count))
@@ -459,7 +459,7 @@ def _discharge(model: RecordModel, cells: _Cells, loads: list[_Known], mismatch_
         shown = [row for row in range(last + 1) if (row < size and (first + row) % every == 0) or (is_over and row == last)]
         shown_V = np.full((count, len(shown)), cut_off_V)
         shown_V[going] = np.where(rows[shown] < end, voltage_V[shown], cut_off_V).T
-        course.append((grid_s[shown], _quantile(shown_V, BAND)))
+        course.append((grid_s[shown], quantile(shown_V, BAND)))
         if is_over:
             break
         left = end > size

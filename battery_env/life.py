@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import exp, log, sqrt
+from math import exp, hypot, isnan, log, sqrt
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -16,6 +19,7 @@ from scipy.stats import truncnorm
 from battery_env.arrays import BoolArray, FloatArray
 from battery_env.cells import Discharge
 from battery_env.checks import check_positive, check_whole_number
+from battery_env.estimators.diagnosis import is_only_imprecise
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.forecasts import BAND
 from battery_env.records import drawn
@@ -23,6 +27,17 @@ from battery_env.records import drawn
 #: What is believed of a cell before its discharges tell, as shares of q_mobile: the step from one to the next, the error of
 #: one estimate beside the others (both known to a factor of e, one standard deviation), and the sd of the drift.
 PRIOR_STEP_SHARE, PRIOR_NOISE_SHARE, PRIOR_DRIFT_SD_SHARE = 0.01, 0.003, 0.003
+_COLUMNS = (
+    "q_mobile_C",
+    "sd_q_mobile_C",
+    "r_o_ohm",
+    "settled",
+    "reason",
+    "valid",
+    "capacity_Ah",
+    "mean_current_A",
+    "lasted_share",
+)
 # Lives that are simulated, and discharges to look ahead.
 _LIVES, _MOST = 2000, 2000
 
@@ -35,9 +50,10 @@ class Life:
     The logarithm of ``q_mobile`` is a random walk with drift over the discharges, of which each estimate is one reading.
 
     :param table: one row per discharge: ``cycle`` (its number, or its position), ``q_mobile_C``, ``sd_q_mobile_C``,
-        ``r_o_ohm``, ``settled``, ``reason``, ``capacity_Ah`` (charge to the cut-off), ``lasted_share`` (its duration, as a
-        share of the model's at this ``q_mobile``; NaN if it was cut short), and what the discharges before let expect of
-        ``q_mobile``, ``expected_q_mobile_C`` and ``expected_sd_C`` (NaN for the first)
+        ``r_o_ohm``, ``settled``, ``reason``, ``valid`` (whether it counts), ``capacity_Ah`` (charge to the cut-off),
+        ``mean_current_A``, ``lasted_share`` (its duration, as a share of the model's at this ``q_mobile``; NaN if it was cut
+        short), and what the discharges before let expect of ``q_mobile``, ``expected_q_mobile_C`` and ``expected_sd_C`` (NaN
+        for the first)
     :param step_share: standard deviation of the step from one discharge to the next, as a share of ``q_mobile``
     :param noise_share: standard deviation of an estimate beside the others, likewise
     :param drift_share: mean step
@@ -55,12 +71,26 @@ class Life:
     @property
     def prior_q_mobile_C(self) -> tuple[float, float]:
         """
-        Mean and standard deviation of ``q_mobile`` in the next discharge, C: a prior for its calibration. At the ``q_mobile``
-        of a whole discharge the model ends a little early or late, about as much as in the one before: the mean allows for it.
+        Mean and standard deviation of ``q_mobile`` in the next discharge, C: a prior for its calibration. It is for the load
+        of the life, under which the error that all estimates share cancels from the end. At the ``q_mobile`` of a whole
+        discharge the model ends a little early or late, about as much as in the one before: the mean allows for it.
         """
-        whole = self.table[self.table["settled"] & self.table["lasted_share"].notna()]
-        mean = exp(self.state.sum()) * (float(whole["lasted_share"].iloc[-1]) if len(whole) else 1.0)
-        return mean, mean * sqrt(self.covariance.sum() + self.step_share**2)
+        mean_C, sd_C = self._next_q_mobile_C
+        whole = self.table[self.table["valid"] & self.table["lasted_share"].notna()]
+        lasted = float(whole["lasted_share"].iloc[-1]) if len(whole) else 1.0
+        return lasted * mean_C, lasted * sd_C
+
+    @property
+    def _next_q_mobile_C(self) -> tuple[float, float]:
+        mean_C = exp(self.state.sum())
+        return mean_C, mean_C * sqrt(self.covariance.sum() + self.step_share**2)
+
+    @property
+    def prior_at_other_loads_C(self) -> tuple[float, float]:
+        """The same for a load that is not that of the life: the error that all estimates share counts too."""
+        mean_C, sd_C = self._next_q_mobile_C
+        last = self.table[self.table["valid"]].iloc[-1]
+        return mean_C, hypot(sd_C, mean_C * last["sd_q_mobile_C"] / last["q_mobile_C"])
 
     def after(self, count: int) -> Life:
         """
@@ -68,7 +98,7 @@ class Life:
 
         :param count: how many
         :return: that part of the life, with the sizes of step and noise that it shows
-        :raises ValueError: for fewer discharges than one or more than there are, or if none of them determines ``q_mobile``
+        :raises ValueError: for fewer discharges than one or more than there are, or if none of them is valid
         """
         if not 1 <= check_whole_number("count", count) <= len(self.table):
             raise ValueError(f"count must lie within 1 .. {len(self.table)}, got {count}")
@@ -87,7 +117,7 @@ class Life:
         :raises ValueError: for an argument out of range
         """
         check_positive("threshold_Ah", threshold_Ah)
-        last = self.table[self.table["settled"]].iloc[-1]
+        last = self.table[self.table["valid"]].iloc[-1]
         end = log(threshold_Ah * last["q_mobile_C"] / last["capacity_Ah"])
         rng = np.random.default_rng(check_whole_number("seed", seed))
         (level_mean, drift_mean), ((p_level, p_both), (_, p_drift)) = self.state, self.covariance
@@ -109,7 +139,11 @@ def track_life(discharges: Sequence[Discharge], cut_off_V: float, calibrator: Le
     Each discharge is calibrated alone. Over the discharges the logarithm of ``q_mobile`` is a random walk with drift (the
     local level model of Durbin and Koopman, *Time Series Analysis by State Space Methods*, 2012, with a constant slope),
     filtered by Kalman's recursions. The sizes of step and noise are those that make the series most probable, under weak
-    priors (:data:`PRIOR_STEP_SHARE`). Estimates that are not settled, as of discharges that were cut short, are left aside.
+    priors (:data:`PRIOR_STEP_SHARE`).
+
+    A discharge is *valid* if its estimate is settled, or only imprecise though it reaches the cut-off: discharges of one
+    cell share that error, so that it hides no step. Others are left out: those that cannot be used, that something in the
+    record contradicts, or that were cut short.
 
     .. code-block:: python
 
@@ -121,7 +155,7 @@ def track_life(discharges: Sequence[Discharge], cut_off_V: float, calibrator: Le
     :param cut_off_V: where they end, V
     :param calibrator: without a prior; ``None``: ``LeastSquares(thermal=True, mismatch_V=0.05)``
     :return: the cell's life so far
-    :raises ValueError: if no discharge determines ``q_mobile``, or the calibrator has a prior or no full cell at the start
+    :raises ValueError: if no discharge is valid, or the calibrator has a prior or no full cell at the start
     """
     calibrator = LeastSquares(thermal=True, mismatch_V=0.05) if calibrator is None else calibrator
     if calibrator.prior_q_mobile_C is not None:
@@ -132,39 +166,48 @@ def track_life(discharges: Sequence[Discharge], cut_off_V: float, calibrator: Le
         raise ValueError("discharges must hold at least one discharge")
     rows = []
     for position, discharge in enumerate(discharges):
-        record = discharge.loaded_part(cut_off_V)
-        estimate = calibrator.estimate(record)
-        end_s = calibrator.model.forecast(record, estimate, cut_off_V).eod_time_s
-        start_s, measured_s = record.time_s[0], discharge.eod_time_s(cut_off_V)
-        rows.append(
-            {
-                "cycle": discharge.meta.get("cycle", position + 1),
-                "q_mobile_C": estimate.q_mobile,
-                "sd_q_mobile_C": estimate.sd_q_mobile,
-                "r_o_ohm": estimate.r_o,
-                "settled": estimate.settled,
-                "capacity_Ah": float(drawn(record.time_s, record.current_A, end_s)) / 3600.0,
-                "lasted_share": (measured_s - start_s) / (end_s - start_s),
-                "reason": estimate.reason,
-            }
-        )
-    return life_of(pd.DataFrame(rows))
+        row: dict[str, Any] = {"cycle": discharge.meta.get("cycle", position + 1)}
+        try:
+            rows.append(row | _told(discharge, cut_off_V, calibrator))
+        except ValueError as error:  # of one that cannot be used
+            rows.append(row | {"settled": False, "valid": False, "reason": str(error)})
+    return life_of(pd.DataFrame(rows, columns=["cycle", *_COLUMNS]))
+
+
+def _told(discharge: Discharge, cut_off_V: float, calibrator: LeastSquares) -> dict[str, Any]:
+    """What one discharge says alone."""
+    record = discharge.loaded_part(cut_off_V)
+    estimate = calibrator.estimate(record)
+    end_s = calibrator.model.forecast(record, estimate, cut_off_V).eod_time_s
+    capacity_Ah = float(drawn(record.time_s, record.current_A, end_s)) / 3600.0
+    start_s, measured_s = record.time_s[0], discharge.eod_time_s(cut_off_V)
+    return {
+        "q_mobile_C": estimate.q_mobile,
+        "sd_q_mobile_C": estimate.sd_q_mobile,
+        "r_o_ohm": estimate.r_o,
+        "settled": estimate.settled,
+        "reason": estimate.reason,
+        "valid": estimate.settled or (not isnan(measured_s) and is_only_imprecise(estimate.reason)),
+        "capacity_Ah": capacity_Ah,
+        "mean_current_A": record.charge_C / float(np.ptp(record.time_s)),
+        "lasted_share": (measured_s - start_s) / (end_s - start_s),
+    }
 
 
 def life_of(table: pd.DataFrame) -> Life:
     """Follow ``q_mobile`` over the rows of a table, as :class:`Life` has it."""
-    settled = table["settled"].to_numpy()
-    if not settled.any():
-        raise ValueError(f"no discharge determines q_mobile. Of the first one: {table['reason'].iloc[0]}")
+    valid = table["valid"].to_numpy(dtype=np.bool_)
+    if not valid.any():
+        raise ValueError(f"no discharge determines q_mobile. {_most_common(table['reason'])}")
     readings = np.log(table["q_mobile_C"].to_numpy())
-    first = int(np.flatnonzero(settled)[0])
+    first = int(np.flatnonzero(valid)[0])
     centre = np.log([PRIOR_STEP_SHARE, PRIOR_NOISE_SHARE])
     expected = np.full((len(readings), 2), np.nan)
     state, covariance = np.zeros(2), np.zeros((2, 2))
 
     def surprise(logarithms: FloatArray) -> float:
         step, noise = np.exp(np.clip(logarithms, -15.0, 0.0))
-        out = _filtered(readings, settled, first, step, noise, PRIOR_DRIFT_SD_SHARE, expected, state, covariance)
+        out = _filtered(readings, valid, first, step, noise, PRIOR_DRIFT_SD_SHARE, expected, state, covariance)
         return float(out + 0.5 * ((logarithms - centre) ** 2).sum())
 
     best = minimize(surprise, centre, method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-4}).x
@@ -175,10 +218,17 @@ def life_of(table: pd.DataFrame) -> Life:
     return Life(table, float(step), float(noise), float(state[1]), state, covariance)
 
 
+def _most_common(reasons: pd.Series) -> str:
+    """The reason that most discharges share, but for the numbers in it."""
+    kinds = [re.sub(r"\d+", "", reason) for reason in reasons]
+    kind, count = Counter(kinds).most_common(1)[0]
+    return f"Of {count} of {len(kinds)}: {reasons.iloc[kinds.index(kind)]}"
+
+
 @njit(cache=True, error_model="numpy")
 def _filtered(
     readings: FloatArray,
-    settled: BoolArray,
+    valid: BoolArray,
     first: int,
     step: float,
     noise: float,
@@ -197,7 +247,7 @@ def _filtered(
         p_level += 2.0 * p_both + p_drift + step**2
         p_both += p_drift
         expected[n, 0], expected[n, 1] = level, p_level
-        if settled[n]:
+        if valid[n]:
             variance, innovation = p_level + noise**2, readings[n] - level
             surprise += 0.5 * (np.log(variance) + innovation**2 / variance)
             gain_level, gain_drift = p_level / variance, p_both / variance

@@ -36,11 +36,11 @@ class Parameter:
         return f"{self.symbol} ({_UNIT_SYMBOLS[self.unit]})"
 
     def check(self, values: ArrayLike) -> FloatArray:
-        """Refuse values that cannot be meant."""
+        """Refuse invalid values."""
         return check_within(self.name, values, self.limits, self.unit, self.hint)
 
     def check_bounds(self, name: str, bounds: tuple[float, float]) -> tuple[float, float]:
-        """Refuse bounds of a search that cannot be meant."""
+        """Refuse invalid bounds of a search."""
         ends = self.check(bounds)
         if ends.shape != (2,) or not ends[0] < ends[1]:
             raise ValueError(f"{name} must be (lower, upper) with lower < upper, got {bounds!r}")

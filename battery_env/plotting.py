@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -13,7 +14,6 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
@@ -27,12 +27,25 @@ from battery_env.evaluation import over_seeds
 from battery_env.files import replacing
 from battery_env.parameters import PARAMETER_NAMES, PARAMETERS, Q_MOBILE, R_O
 from battery_env.record_model import VoltageForecast
-from battery_env.records import Record
+from battery_env.records import SWITCH_SHARE, Record
 
 Thing = TypeVar("Thing")
 
 #: Colours that colour-blind readers can tell apart (the first six of Okabe & Ito, the others of Tol).
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#882255", "#777777", "#999933", "#332288")
+#: What is drawn in more than one figure has one colour in all of them, wherever its name occurs in a label.
+COLOUR_OF: Mapping[str, str] = {
+    "LAC": COLOURS[0],
+    "policy": COLOURS[0],
+    "SAC": COLOURS[1],
+    "TD3": COLOURS[2],
+    "TQC": COLOURS[3],
+    "Kalman filter": COLOURS[5],
+    "least squares": COLOURS[6],
+    "closed form": COLOURS[8],
+    "measured": "0.5",
+    "true": "0.25",
+}
 #: Of the axes of parameters.
 LABELS = {name: parameter.label for name, parameter in PARAMETERS.items()}
 
@@ -42,9 +55,19 @@ _OUTLIERS = 0.02
 _ROOM = 0.35
 # Stretches of time whose extremes are drawn of a long record: more than a figure is wide in dots.
 _STRETCHES = 2000
+# A load that is switched more often is drawn by its envelope.
+_FEW_SWITCHES = 60
+# A figure of a discharge in progress goes on for at most this many times its record, or its expected end.
+_LONGEST_SHOWN = 1.5
 _LIFE_COLUMNS = {"q_mobile_C": LABELS["q_mobile"], "r_o_ohm": LABELS["r_o"], "drawn_Ah": "charge drawn (Ah)"}
+# Distance of the bars of cells, as a share of the axis.
+_BAR_STEP = 0.02
+# q_mobile follows the capacity if their correlation is this close over so many discharges or more.
+_FOLLOWS, _LEAST_POINTS = 0.99, 5
 # dV/dq is drawn on a scale that is linear within this, V/C, and logarithmic beyond: it spans three decades, from zero.
 _LINEAR_SLOPE_V_PER_C = 1e-6
+_NAMES = re.compile("|".join(rf"\b{name}\b" for name in COLOUR_OF), flags=re.IGNORECASE)
+_COLOUR_OF_LOWER = {name.lower(): colour for name, colour in COLOUR_OF.items()}
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -101,8 +124,29 @@ def plot_true_against_inferred(scores: Mapping[str, pd.DataFrame], parameter: st
 
 
 def coloured(things: Iterable[Thing]) -> Iterator[tuple[str, Thing]]:
-    """Things to draw side by side, each after its colour; from the eleventh on colours come again."""
-    return zip(itertools.cycle(COLOURS), things, strict=False)
+    """
+    Things to draw side by side, each after its colour.
+
+    :param things: names, or tuples that start with their name. The first with a name of :data:`COLOUR_OF` has its colour; all
+        others have those of :data:`COLOURS` that are left, which come again when they are used up
+    :yields: a colour and the thing
+    """
+    listed = list(things)
+    own = [_own_colour(thing) for thing in listed]
+    left = [colour for colour in COLOURS if colour not in own]
+    # beside names, a colour of another name comes last
+    others = itertools.cycle(sorted(left, key=lambda colour: any(own) and colour in COLOUR_OF.values()))
+    seen: set[str] = set()
+    for thing, colour in zip(listed, own, strict=True):
+        yield next(others) if colour is None or colour in seen else colour, thing
+        seen.add(colour or "")
+
+
+def _own_colour(thing: object) -> str | None:
+    while isinstance(thing, tuple):
+        thing = thing[0]
+    named = _NAMES.search(str(thing).replace("-", " "))
+    return _COLOUR_OF_LOWER[named[0].lower()] if named else None
 
 
 def draw_over_seeds(axes: Axes, x: ArrayLike, scores: ArrayLike, colour: str, label: str, **style: Any) -> None:
@@ -144,29 +188,43 @@ def plot_learning_curves(
     return figure
 
 
-def plot_discharge(record: Record, forecasts: Mapping[str, VoltageForecast], title: str = "") -> Figure:
+def plot_discharge(
+    record: Record, forecasts: Mapping[str, VoltageForecast], title: str = "", end_s: tuple[float, float, float] | None = None
+) -> Figure:
     """
-    The measured voltage of one discharge with that of the model at some estimates, and below it the error of the model. Of
-    more points than can be told apart, the least and the greatest in each of 2000 stretches of time are drawn.
+    The measured voltage of one discharge with that of the model at some estimates, the current, and the error of the model.
+
+    Of a long record the least and the greatest value in each of 2000 stretches of time are drawn. Under a load that is
+    switched often the stretches hold four switches each: what is drawn is the envelope, not a block of pulses.
 
     :param record: one discharge, simulated or recorded
     :param forecasts: what :meth:`battery_env.RecordModel.forecast` made of estimates, by name for the legend
     :param title: of the figure
+    :param end_s: of a discharge in progress, the 5 %, 50 % and 95 % quantiles of its end, s: drawn as a band and a line
     :return: the figure; a line ends at the cut-off, and that of its error where the model cell is empty
     """
-    figure = new_figure(6.4, 4.6)
-    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[3, 2])
-    upper.plot(*_drawn_points(record.time_s, record.voltage_V), "o", ms=2.2, color="0.6", label="measured")
+    figure = new_figure(6.4, 5.4)
+    upper, middle, lower = panels = figure.subplots(3, 1, sharex=True, height_ratios=[5, 2, 3])
+    stretches = _stretches(record)
+    time_s, voltage_V = _drawn_points(record.time_s, record.voltage_V, stretches)
+    upper.plot(time_s, voltage_V, "o", ms=2.2, color=COLOUR_OF["measured"], label="measured")
+    middle.plot(*_drawn_points(record.time_s, record.current_A, stretches), color=COLOUR_OF["measured"], lw=1.2)
     lower.axhline(0.0, color="0.6", lw=0.8)
     for colour, (name, forecast) in coloured(forecasts.items()):
-        upper.plot(*_drawn_points(forecast.time_s, forecast.voltage_V), color=colour, lw=1.4, label=name)
+        upper.plot(*_drawn_points(forecast.time_s, forecast.voltage_V, stretches), color=colour, lw=1.4, label=name)
         error_mV = 1e3 * (forecast.at_samples_V - record.voltage_V)
-        lower.plot(*_drawn_points(record.time_s, error_mV), color=colour, lw=1.0, label=name)
+        lower.plot(*_drawn_points(record.time_s, error_mV, stretches), color=colour, lw=1.0, label=name)
+    if end_s is not None and np.isfinite(end_s).all():
+        shown_s = np.clip(end_s, record.time_s[-1], _LONGEST_SHOWN * max(record.time_s[-1], end_s[1]))
+        upper.axvspan(shown_s[0], shown_s[2], color=COLOURS[1], alpha=0.2, lw=0, label="end of discharge, 90 %")
+        upper.axvline(shown_s[1], color=COLOURS[1], lw=1.2)
     figure.suptitle(title, fontsize=10)
     upper.set_ylabel("voltage (V)")
-    upper.legend(frameon=False, fontsize=9)
-    lower.set(xlabel="time (s)", ylabel="model - measured (mV)")
-    return _finished(figure, upper, lower)
+    upper.legend(frameon=False, fontsize=9, loc="lower left")
+    most_A = float(record.current_A.max())
+    middle.set(ylabel="current (A)", ylim=(min(-0.1 * most_A, 1.1 * float(record.current_A.min())), 1.2 * most_A))
+    lower.set(xlabel="time (s)", ylabel="model -\nmeasured (mV)")
+    return _finished(figure, *panels)
 
 
 def plot_cell_fit(fit: CellFit, discharges: Sequence[Record]) -> Figure:
@@ -185,7 +243,7 @@ def plot_cell_fit(fit: CellFit, discharges: Sequence[Record]) -> Figure:
     for (upper, lower), discharge in zip(panels.T, discharges, strict=True):
         record = discharge.loaded_part(fit.cell.VEOD) if isinstance(discharge, Discharge) else discharge
         since_s = record.time_s - record.time_s[0]
-        upper.plot(*_drawn_points(since_s, record.voltage_V), "o", ms=2.2, color="0.6", label="measured")
+        upper.plot(*_drawn_points(since_s, record.voltage_V), "o", ms=2.2, color=COLOUR_OF["measured"], label="measured")
         lower.axhline(0.0, color="0.6", lw=0.8)
         errors_mV = []
         for name, (cell, style, colour) in cells.items():
@@ -207,64 +265,103 @@ def plot_cell_fit(fit: CellFit, discharges: Sequence[Record]) -> Figure:
     return _finished(figure, *panels.ravel())
 
 
-def _drawn_points(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The extremes of each stretch, in their order."""
-    if len(x) <= 2 * _STRETCHES:
+def _stretches(record: Record) -> int:
+    """How many stretches of time the points of a record are drawn by: fewer where each would show one pulse."""
+    current_A = np.abs(np.diff(record.current_A))
+    switches = int((current_A > SWITCH_SHARE * np.abs(record.current_A).max()).sum())
+    return _STRETCHES if switches <= _FEW_SWITCHES else min(_STRETCHES, switches // 4)
+
+
+def _drawn_points(x: FloatArray, y: FloatArray, stretches: int = _STRETCHES) -> tuple[FloatArray, FloatArray]:
+    """The points, or of many the least one of each stretch, then NaN, then the greatest: two lines, the envelope."""
+    if len(x) <= 2 * stretches:
         return x, y
-    edges = np.linspace(0, len(x), _STRETCHES + 1).astype(np.int64)
-    stretches = [y[low:high] for low, high in itertools.pairwise(edges)]
+    edges = np.linspace(0, len(x), stretches + 1).astype(np.int64)
+    parts = [y[low:high] for low, high in itertools.pairwise(edges)]
     # NaN, where the model cell is empty, is neither least nor greatest; a stretch of nothing else stays a gap
-    least = edges[:-1] + np.array([np.where(np.isnan(part), np.inf, part).argmin() for part in stretches])
-    greatest = edges[:-1] + np.array([np.where(np.isnan(part), -np.inf, part).argmax() for part in stretches])
-    kept = np.unique(np.concatenate([least, greatest, [0, len(x) - 1]]))
-    return x[kept], y[kept]
+    least = edges[:-1] + np.array([np.where(np.isnan(part), np.inf, part).argmin() for part in parts])
+    greatest = edges[:-1] + np.array([np.where(np.isnan(part), -np.inf, part).argmax() for part in parts])
+    return np.concatenate([x[least], [np.nan], x[greatest]]), np.concatenate([y[least], [np.nan], y[greatest]])
 
 
 def plot_life(table: pd.DataFrame) -> Figure:
     """
-    What became of cells over their discharges: both parameters with bands of two stated standard deviations, and the charge
-    drawn. Estimates that are not settled are hollow.
+    What became of cells over their discharges: both parameters and the charge drawn, one line a cell. Estimates that are not
+    settled are hollow.
 
-    :param table: a row a discharge with ``cell``, ``cycle``, ``q_mobile_C``, ``sd_q_mobile_C``, ``r_o_ohm``, ``sd_r_o_ohm``,
-        ``drawn_Ah`` and ``settled``, as the command line writes it. Where each cell has one discharge in it, the rows are
-        taken for the discharges of one cell in their order
-    :return: the figure
+    Most of the error of an estimate is that of the model or of a sensor, which all discharges of a cell share: it shifts a
+    line and does not bend it. It is drawn as one bar behind the line, of two median standard deviations. What the discharges
+    do not share shows in the scatter of the points.
+
+    :param table: a row a discharge with ``cycle``, ``q_mobile_C``, ``sd_q_mobile_C``, ``r_o_ohm``, ``sd_r_o_ohm``,
+        ``drawn_Ah`` and ``settled``, as the command line writes it, and if there are several cells with ``cell``. Where each
+        cell has one discharge in it, the rows are taken for the discharges of one cell. They are drawn over their cycles, or
+        over their order where the cycles are not known
+    :return: the figure; its title says so if ``capacity_Ah`` is there and ``q_mobile`` follows it
+    :raises ValueError: for estimates of more than one ``method``, whose ``r_o`` mean different things
     """
-    figure = new_figure(6.8, 6.6)
+    if "method" in table and table["method"].nunique() > 1:
+        raise ValueError(
+            f"a life is drawn for one method, got {' and '.join(table['method'].unique())}: their r_o differ by up to a third"
+        )
+    figure = new_figure(6.8, 6.8)
     panels = figure.subplots(3, 1, sharex=True)
-    one_each = not table["cell"].duplicated().any()
+    one_each = "cell" not in table or not table["cell"].duplicated().any()
     cells = [("", table)] if one_each else list(table.groupby("cell", sort=False))
-    for colour, (name, rows) in coloured(cells):
-        counted = one_each or rows["cycle"].isna().any() or rows["cycle"].duplicated().any()
-        cycle = np.arange(1.0, len(rows) + 1.0) if counted else rows["cycle"].to_numpy(dtype=np.float64)
-        settled = rows["settled"].to_numpy(dtype=np.bool_)
-        for axes, value, sd in zip(panels, _LIFE_COLUMNS, ("sd_q_mobile_C", "sd_r_o_ohm", None), strict=True):
-            values = rows[value].to_numpy(dtype=np.float64)
-            if sd is not None:
-                reach = 2.0 * rows[sd].to_numpy(dtype=np.float64)
-                axes.fill_between(cycle, values - reach, values + reach, color=colour, alpha=0.18, lw=0)
-            axes.plot(cycle, values, color=colour, lw=0.8, alpha=0.6)
-            axes.plot(cycle[settled], values[settled], "o", ms=2.6, color=colour, label=name)
-            axes.plot(cycle[~settled], values[~settled], "o", ms=3.2, mfc="white", mec=colour, mew=0.8)
-    for axes, label in zip(panels, _LIFE_COLUMNS.values(), strict=True):
+    is_numbered = all(rows["cycle"].notna().all() and not rows["cycle"].duplicated().any() for _, rows in cells)
+    lives = {
+        name: rows.set_index(rows["cycle"].astype(float) if is_numbered else np.arange(1.0, len(rows) + 1.0)).sort_index()
+        for name, rows in cells
+    }
+    width = np.ptp(np.concatenate([rows.index for rows in lives.values()]))
+    for number, (colour, (name, rows)) in enumerate(coloured(lives.items())):
+        bar_x = rows.index.max() + _BAR_STEP * width * (1 + number % len(COLOURS))
+        settled = rows[rows["settled"].astype(bool)]
+        for axes, column in zip(panels, _LIFE_COLUMNS, strict=True):
+            axes.plot(rows[column], color=colour, lw=0.8, alpha=0.6)
+            axes.plot(settled[column], "o", ms=2.6, color=colour, label=name)
+            axes.plot(rows[column].drop(settled.index), "o", ms=3.2, mfc="white", mec=colour, mew=0.8)
+            if len(settled) and f"sd_{column}" in settled:
+                reach = 2.0 * settled[f"sd_{column}"].median()
+                axes.errorbar(bar_x, settled[column].iloc[-1], reach, fmt="none", color=colour, capsize=2.5, lw=1.2)
+    for axes, (column, label) in zip(panels, _LIFE_COLUMNS.items(), strict=True):
         axes.set_ylabel(label)
-    for axes, value, sd in zip(panels, _LIFE_COLUMNS, ("sd_q_mobile_C", "sd_r_o_ohm"), strict=False):
-        values, reach = table[value].to_numpy(dtype=np.float64), 2.0 * table[sd].to_numpy(dtype=np.float64)
-        # the bands of what is not settled may be of any width
-        reach[~table["settled"].to_numpy(dtype=np.bool_) | np.isnan(reach)] = 0.0
-        axes.set_ylim(*_limits([values - reach, values + reach]))
+        if (sd := f"sd_{column}") in table:
+            values, reach = table[column].to_numpy(dtype=np.float64), 2.0 * table[sd].to_numpy(dtype=np.float64)
+            # the standard deviations of what is not settled may be of any size
+            reach[~table["settled"].to_numpy(dtype=np.bool_) | np.isnan(reach)] = 0.0
+            axes.set_ylim(*_limits([values - reach, values + reach]))
+    panels[0].set_title(title_of_life(list(lives.values())), fontsize=10)
     panels[-1].xaxis.set_major_locator(MaxNLocator(integer=True))
-    panels[-1].set_xlabel("file" if one_each else "discharge")
-    handles, labels = panels[0].get_legend_handles_labels()
-    kinds = [pair for pair in zip(handles, labels, strict=True) if pair[1]][: len(COLOURS)]
-    handles, labels = [handle for handle, _ in kinds], [label for _, label in kinds]
-    if not table["settled"].astype(bool).all():
-        handles += panels[0].plot([], [], "o", ms=3.2, mfc="white", mec="0.25", mew=0.8)
-        labels.append("not settled")
-    handles.append(Patch(color="0.5", alpha=0.3, lw=0))
-    labels.append("± 2 sd")
-    figure.legend(handles, labels, loc="outside upper center", ncols=4, frameon=False, fontsize=9)
+    panels[-1].set_xlabel("cycle" if is_numbered else "discharge")
+    _life_legend(figure, table)
     return _finished(figure, *panels)
+
+
+def title_of_life(cells: Sequence[pd.DataFrame]) -> str:
+    """That ``q_mobile_C`` follows ``capacity_Ah`` in the tables of cells; empty where it does not, or nobody can say."""
+    correlations = []
+    for table in cells:
+        known = table[table["settled"].astype(bool)].reindex(columns=["q_mobile_C", "capacity_Ah"]).dropna()
+        correlations.append(known["q_mobile_C"].corr(known["capacity_Ah"]) if len(known) >= _LEAST_POINTS else np.nan)
+    least = float(np.min(correlations))
+    if not least >= _FOLLOWS:
+        return ""
+    shown = min(np.floor(1e3 * least) / 1e3, 0.999)
+    return f"{Q_MOBILE.symbol} follows the measured capacity (r > {shown:.3f})"
+
+
+def _life_legend(figure: Figure, table: pd.DataFrame) -> None:
+    axes = figure.axes[0]
+    named = [pair for pair in zip(*axes.get_legend_handles_labels(), strict=True) if pair[1]][: len(COLOURS)]
+    handles: list[Any] = [handle for handle, _ in named]
+    labels = [label for _, label in named]
+    if not table["settled"].astype(bool).all():
+        handles += axes.plot([], [], "o", ms=3.2, mfc="white", mec="0.25", mew=0.8)
+        labels.append("not settled")
+    handles.append(axes.errorbar([], [], [], fmt="none", color="0.4", capsize=2.5))
+    labels.append("± 2 sd, mostly common to all points of a cell")
+    figure.legend(handles, labels, loc="outside upper center", ncols=4, frameon=False, fontsize=9)
 
 
 def plot_estimates(

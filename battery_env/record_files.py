@@ -1,6 +1,6 @@
 """
-Recorded discharges from files as testers write them: which columns, which unit, which sign, and which of the rows are a
-discharge.
+Recorded discharges from files and tables as testers write them: which columns, which unit, which sign, and which of the rows
+are a discharge.
 """
 
 from __future__ import annotations
@@ -10,20 +10,22 @@ import re
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import pandas as pd
 
-from battery_env.arrays import BoolArray, FloatArray
-from battery_env.cells import Discharge, read_nasa_mat
+from battery_env.arrays import BoolArray, FloatArray, IntArray
+from battery_env.cells import LEAST_SAMPLES, Discharge, read_nasa_mat
 from battery_env.columns import Column
 from battery_env.records import SWITCH_SHARE, drawn
-from battery_env.tables import read_columns
+from battery_env.tables import columns_of, read_columns
 
-# The voltage falls with the charge drawn: their correlation over the samples under load must be this clear to tell the sign of
-# the current. In the discharges that come with the package it is -0.87 or clearer.
-_CLEAR_CORRELATION = 0.5
+Made = TypeVar("Made")
+
+# The voltage falls with the current and with the charge drawn. The sum of both effects, in standard deviations, must be this
+# clear to tell the sign of the current. In the discharges that come with the package it is -0.84 or clearer.
+_CLEAR_EFFECT = 0.5
 # A stretch of charging ends a discharge if it returns more than this share of the charge drawn until then; less is braking.
 _RETURNED_SHARE = 0.2
 # A charge before the load is cut off if it exceeds this share of the charge drawn; a smaller one is sensor offset. A charge
@@ -43,7 +45,7 @@ _THOUSANDS = re.compile(r"^\s*[-+]?\d{1,3}(?:[,.' ]\d{3})+(?:[.,]\d+)?\s*$")
 
 class Recording(NamedTuple):
     """
-    What a file holds of one discharge, not checked yet.
+    What a file or a table holds of one discharge, not checked yet.
 
     :param arrays: arguments of :class:`~battery_env.cells.Discharge`, by name
     :param meta: what else is known; ``cycle`` is missing if the file holds one discharge and does not number it
@@ -58,49 +60,66 @@ class Recording(NamedTuple):
 
 
 def read_discharges(
-    path: str | Path,
+    source: str | Path | pd.DataFrame,
     columns: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
     discharge_is_negative: bool | None = None,
 ) -> list[Discharge]:
     """
-    Read the discharges of a file.
+    Read the discharges of a file or of a table.
 
-    The file is text with a header (commas, semicolons, tabs or blanks, decimal points or commas, also packed as .gz, .bz2,
-    .xz or .zip), Parquet, one of NASA's .mat files, or with the extra ``cyclers`` a binary file of Neware (.nda, .ndax) or
-    BioLogic (.mpr). Columns go by the names that testers give them, the Battery Data Format's, Arbin's, Maccor's, Neware's
-    and BioLogic's among them; their units are told from the names.
+    A table is a ``pandas.DataFrame``, whose index is a column too if it has a name. A file is text with a header (commas,
+    semicolons, tabs or blanks, decimal points or commas, also packed as .gz, .bz2, .xz or .zip), Parquet, one of NASA's .mat
+    files, or with the extra ``cyclers`` a binary file of Neware (.nda, .ndax) or BioLogic (.mpr). Columns go by the names
+    that testers give them, the Battery Data Format's, Arbin's, Maccor's, Neware's and BioLogic's among them; their units are
+    told from the names.
 
-    A file may hold charges and rests as well, and many cycles. A discharge is what lies between two charges, with the rest
-    before the load; it is numbered by the cycle that the file gives, or else counted. If there are several, each has its own
+    It may hold charges and rests as well, and many cycles. A discharge is what lies between two charges, with the rest
+    before the load; it is numbered by the cycle that is given, or else counted. If there are several, each has its own
     clock, which starts at its first sample. Discharges whose charges are not logged are told apart by the column of the cycle
     alone. Rows that are repeated, and lines below the table, are dropped with a warning. A temperature that is missing in some
     rows is interpolated.
 
-    :param path: the file
+    .. code-block:: python
+
+      frame = pd.DataFrame({"Test Time / s": time, "Voltage / V": voltage, "Current / A": current})
+      discharges = read_discharges(frame)
+
+    :param source: the file, or the table
     :param columns: by quantity (``time``, ``voltage``, ``current``, ``temperature``, ``ambient``, ``cycle``, ``step``,
         ``state``), the name of its column, where the names do not tell
     :param units: by quantity, its unit, where the name does not tell: ``s``, ``ms``, ``min``, ``h``; ``V``, ``mV``; ``A``,
         ``mA``; ``degC``, ``K``
-    :param discharge_is_negative: how the file counts the current of a discharge; ``None``: told from the voltage, which falls
-        as charge is drawn
-    :return: the discharges; their ``meta`` holds ``source`` and, if there are several or the file numbers them, ``cycle``. One
+    :param discharge_is_negative: how the current of a discharge is counted; ``None``: told from the voltage, which falls where
+        a load is switched on and as charge is drawn
+    :return: the discharges; their ``meta`` holds ``source`` and, if there are several or they are numbered, ``cycle``. One
         that fails the checks of :class:`~battery_env.cells.Discharge` is left out with a warning
     :raises ValueError: if there is none, the file is damaged, or it does not tell what is asked for
     :raises ImportError: if the file needs an extra that is not installed
     """
-    discharges = []
-    reasons = []
-    for recording in read_recordings(path, columns, units, discharge_is_negative):
+    return each_usable(lambda discharge: discharge, source, columns, units, discharge_is_negative)
+
+
+def each_usable(
+    use: Callable[[Discharge], Made],
+    source: str | Path | pd.DataFrame,
+    columns: Mapping[str, str] | None = None,
+    units: Mapping[str, str] | None = None,
+    discharge_is_negative: bool | None = None,
+) -> list[Made]:
+    """What is made of each discharge. One that cannot be used is left out with a warning; if none can, that is an error."""
+    made, reasons = [], []
+    for recording in read_recordings(source, columns, units, discharge_is_negative):
         try:
-            discharges.append(recording.discharge())
+            made.append(use(recording.discharge()))
         except (TypeError, ValueError) as error:
-            reasons.append(f"{path}: {_numbered(recording)}{error}")
-    if not discharges:
+            number = f"discharge {recording.meta['cycle']}: " if "cycle" in recording.meta else ""
+            reasons.append(f"{_name_of(source)}: {number}{error}")
+    if not made:
         raise ValueError(reasons[0])
     for reason in reasons:
-        warnings.warn(f"{reason} It is left out.", stacklevel=2)
-    return discharges
+        warnings.warn(f"{reason} It is left out.", stacklevel=3)
+    return made
 
 
 def read_discharge_csv(path: str | Path, discharge_is_negative: bool = False) -> Discharge:
@@ -110,7 +129,7 @@ def read_discharge_csv(path: str | Path, discharge_is_negative: bool = False) ->
     :param path: the file, as :func:`read_discharges` takes it
     :param discharge_is_negative: whether the file counts the current of a discharge as negative; it is flipped then
     :return: the discharge; its ``meta`` holds ``source``
-    :raises ValueError: if the file holds none, or several, or its values cannot be meant
+    :raises ValueError: if the file holds none, or several, or if its values are invalid
     """
     discharges = read_discharges(path, discharge_is_negative=discharge_is_negative)
     if len(discharges) > 1:
@@ -118,29 +137,37 @@ def read_discharge_csv(path: str | Path, discharge_is_negative: bool = False) ->
     return discharges[0]
 
 
-def _numbered(recording: Recording) -> str:
-    return f"discharge {recording.meta['cycle']}: " if "cycle" in recording.meta else ""
-
-
 def read_recordings(
-    path: str | Path,
+    source: str | Path | pd.DataFrame,
     columns: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
     discharge_is_negative: bool | None = None,
 ) -> list[Recording]:
-    """The discharges of a file before they are checked, so that one that cannot be used does not lose the others."""
-    path = Path(path)
-    if path.suffix.lower() == ".mat":
-        return [Recording(arrays, meta) for arrays, meta in read_nasa_mat(path)]
+    """
+    The discharges of a file or a table before they are checked, so that one that cannot be used does not lose the others; one
+    at least.
+    """
+    name = _name_of(source)
     try:
-        table = _Table.of(*read_columns(path, columns, units))
-        return table.recordings(str(path), discharge_is_negative)
+        if isinstance(source, pd.DataFrame):
+            recordings = _Table.of(*columns_of(source, columns, units)).recordings(name, discharge_is_negative)
+        elif Path(source).suffix.lower() == ".mat":
+            recordings = [Recording(arrays, meta) for arrays, meta in read_nasa_mat(Path(source))]
+        else:
+            recordings = _Table.of(*read_columns(Path(source), columns, units)).recordings(name, discharge_is_negative)
+        if not recordings:
+            raise ValueError("there is no discharge")
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: {error}") from error
+        raise ValueError(str(error) if name in str(error) else f"{name}: {error}") from error
+    return recordings
+
+
+def _name_of(source: str | Path | pd.DataFrame) -> str:
+    return "DataFrame" if isinstance(source, pd.DataFrame) else str(source)
 
 
 class _Table:
-    """The columns of a file in SI units, arrays of shape (T,)."""
+    """The columns of a table in SI units, arrays of shape (T,)."""
 
     def __init__(self, columns: dict[str, FloatArray], labels: dict[str, Any]) -> None:
         self.columns = columns  # numbers, by quantity
@@ -151,8 +178,8 @@ class _Table:
         blank = table[["time", "voltage", "current"]].isna().all(axis=1).to_numpy()
         if blank.any():
             table = table[~blank]
-        if not len(table):
-            raise ValueError("there are no rows below the header")
+        if len(table) < LEAST_SAMPLES:
+            raise ValueError(f"a discharge needs {LEAST_SAMPLES} rows below the header, got {len(table)}")
         columns, labels = {}, {}
         for quantity, scale in scales.items():
             values = table[quantity]
@@ -170,9 +197,11 @@ class _Table:
         cycles = self.columns.get("cycle")
         if cycles is not None and not (np.isfinite(cycles).all() and (cycles == np.round(cycles)).all()):
             raise ValueError("the column of the cycle must hold whole numbers")
+        self._turn_rows()
         self._accumulate_step_times()
         self._drop_repeated()
         self._separate_steps()
+        self._refuse_backwards()
         for name in ("time", "voltage", "current"):
             bad = np.flatnonzero(~np.isfinite(self.columns[name]))
             if len(bad):
@@ -182,9 +211,33 @@ class _Table:
         self._turn_current(discharge_is_negative)
         return self._split(source)
 
-    def _select(self, keep: BoolArray) -> None:
+    def _select(self, keep: BoolArray | IntArray) -> None:
         self.columns = {name: column[keep] for name, column in self.columns.items()}
         self.labels = {name: (codes[keep], values) for name, (codes, values) in self.labels.items()}
+
+    def _turn_rows(self) -> None:
+        """Rows of which the newest comes first are turned."""
+        time_s = self.columns["time"]
+        starts_anew = np.zeros(len(time_s) - 1, dtype=np.bool_)
+        for counter in (self.columns.get("cycle"), self.labels.get("step", (None,))[0]):
+            if counter is not None:
+                starts_anew |= np.diff(counter) != 0
+        step_s = np.diff(time_s)[~starts_anew]
+        if (step_s <= 0.0).all() and (step_s < 0.0).any():
+            warnings.warn("the clock runs backwards: the rows are taken from the last one to the first", stacklevel=2)
+            self._select(np.arange(len(time_s))[::-1])
+
+    def _refuse_backwards(self) -> None:
+        """A clock that starts anew goes back once; one that goes back in two rows on end is none."""
+        time_s = self.columns["time"]
+        back = np.diff(time_s) < 0.0
+        on_end = np.flatnonzero(back[1:] & back[:-1])
+        if len(on_end):
+            n = on_end[0] + 1
+            raise ValueError(
+                f"the clock runs backwards: row {n + 1} is at {time_s[n]:g} s, after {time_s[n - 1]:g} s. Sort the rows by "
+                "time"
+            )
 
     def _accumulate_step_times(self) -> None:
         """Times that start anew with each step become times since the start of the test."""
@@ -234,14 +287,14 @@ class _Table:
             self.columns["current"] = current_A * signs
             return
         if discharge_is_negative is None:
-            correlation = self._correlation()
-            if not abs(correlation) > _CLEAR_CORRELATION:
+            effect = self._effect_on_voltage()
+            if not abs(effect) > _CLEAR_EFFECT:
                 raise ValueError(
                     "whether the current of a discharge is positive or negative cannot be told, as the voltage neither falls "
-                    f"nor rises clearly with the charge (correlation {correlation:.2f}). State it: --discharge-is-negative or "
-                    "--discharge-is-positive (Python: discharge_is_negative)"
+                    f"nor rises clearly with the current and the charge (by {effect:.2f} standard deviations). State it: "
+                    "--discharge-is-negative or --discharge-is-positive (Python: discharge_is_negative)"
                 )
-            discharge_is_negative = correlation > 0.0
+            discharge_is_negative = effect > 0.0
         if discharge_is_negative:
             self.columns["current"] = -current_A
 
@@ -257,21 +310,27 @@ class _Table:
             return None
         return np.where(np.append(charging, False)[codes], -1.0, 1.0)
 
-    def _correlation(self) -> float:
-        """Of the voltage with the charge that has passed, within each cycle, over the samples under load; NaN if none is."""
+    def _effect_on_voltage(self) -> float:
+        """
+        How the voltage goes with the current, which shows where the load is switched, and with the charge that has passed,
+        which shows where it is steady: the sum of the coefficients of a linear fit within each cycle, all columns in standard
+        deviations.
+        """
         time_s, voltage_V, current_A = (self.columns[name] for name in ("time", "voltage", "current"))
         step_s = np.diff(time_s)
         charge_C = np.append(0.0, np.cumsum(0.5 * (current_A[1:] + current_A[:-1]) * np.maximum(step_s, 0.0)))
-        new = step_s <= 0.0
+        new = step_s < 0.0
         if "cycle" in self.columns:
             new |= np.diff(self.columns["cycle"]) != 0.0
-        loaded = np.abs(current_A) > SWITCH_SHARE * np.abs(current_A).max()
-        cycle = np.append(0, np.cumsum(new))[loaded]
-        columns = pd.DataFrame({"charge": charge_C[loaded], "voltage": voltage_V[loaded]})
-        charge, voltage = (columns - columns.groupby(cycle).transform("mean")).to_numpy().T
+        cycle = np.append(0, np.cumsum(new))
+        columns = pd.DataFrame({"current": current_A, "charge": charge_C, "voltage": voltage_V})
         with np.errstate(over="ignore", invalid="ignore"):  # of columns that are no measurements
-            norm = float(np.sqrt((charge @ charge) * (voltage @ voltage)))
-            return float(charge @ voltage) / norm if norm > 0.0 else float("nan")
+            within = (columns - columns.groupby(cycle).transform("mean")).to_numpy()
+            rounding = np.finfo(np.float64).tiny + 1e-9 * np.abs(columns.to_numpy()).max(axis=0)
+            scaled = within / np.maximum(within.std(axis=0), rounding)
+        if not np.isfinite(scaled).all():
+            return float("nan")
+        return float(np.linalg.lstsq(scaled[:, :2], scaled[:, 2], rcond=None)[0].sum())
 
     def _split(self, source: str) -> list[Recording]:
         cycles = self.columns.get("cycle")
@@ -280,9 +339,9 @@ class _Table:
             bounds = [0, *(np.flatnonzero(np.diff(cycles)) + 1).tolist(), bounds[1]]
         parts = [part for low, high in itertools.pairwise(bounds) for part in self._discharges(low, high)]
         if not parts:
-            raise ValueError("the file holds no discharge: no charge is drawn. Check the sign of the current")
+            raise ValueError("there is no discharge: no charge is drawn. Check the sign of the current")
         least_C = _LEAST_SHARE * max(drawn_C for _, drawn_C in parts)
-        stretches = [stretch for stretch, drawn_C in parts if drawn_C > least_C]
+        stretches = [stretch for stretch, drawn_C in parts if drawn_C >= least_C]
         return [self._recording(stretch, n, len(stretches), source) for n, stretch in enumerate(stretches, start=1)]
 
     def _discharges(self, low: int, high: int) -> list[tuple[slice, float]]:
@@ -372,11 +431,11 @@ def _numbers(values: pd.Series, column: Column) -> FloatArray:
 
 
 def _seconds(values: pd.Series, column: Column) -> FloatArray:
-    """Numbers in their unit; a clock, hours:minutes:seconds, in seconds; dates in seconds since the first one."""
+    """Numbers in their unit; a clock, hours:minutes:seconds, in seconds; dates in seconds since the earliest one."""
     if pd.api.types.is_numeric_dtype(values.dtype):
         return column.factor * _numbers(values, column)
     if pd.api.types.is_datetime64_any_dtype(values.dtype):
-        return (values - values.iloc[0]).dt.total_seconds().to_numpy(dtype=np.float64)
+        return (values - values.min()).dt.total_seconds().to_numpy(dtype=np.float64)
     if pd.api.types.is_timedelta64_dtype(values.dtype):
         return values.dt.total_seconds().to_numpy(dtype=np.float64)
     if not values.dropna().astype(str).str.contains(":").all():

@@ -40,6 +40,8 @@ from battery_env.records import Record, check_record, expected_current, resample
 # The total of the four charges is q_mobile / 0.6 at all times.
 _Q_PER_CHARGE = 1.0 / float(FULL_CHARGE_SHARES.sum())
 
+#: The error of the model shortly before the end of a record is the mean over this last share of its time.
+RECENT_SHARE = 0.1
 #: No discharge is followed longer than this into the future, s: a current that takes more than a week to empty the cell is
 #: that of a cell at rest.
 LONGEST_FORECAST_S = 604_800.0
@@ -54,12 +56,14 @@ class VoltageForecast:
     :param cut_off_V: voltage at which the discharge ends, V
     :param at_samples_V: at the samples of the record, also below the cut-off, shape (T,); NaN after the model cell is empty
     :param not_before_s: end of a record in progress, before which its cell has not ended, s; ``None`` of a whole one
+    :param offset_V: by how much a record in progress was higher than the model at its end, V; it goes on so
     """
 
     simulation: Trajectory
     cut_off_V: float
     at_samples_V: FloatArray
     not_before_s: float | None = None
+    offset_V: float = 0.0
 
     def reached_s(self, voltage_V: float) -> float:
         """
@@ -70,7 +74,7 @@ class VoltageForecast:
         """
         if self.not_before_s is None:
             return self.simulation.reached_s(voltage_V)
-        return float(np.maximum(self.simulation.reached_s(voltage_V, for_good=True), self.not_before_s))
+        return float(np.maximum(self.simulation.reached_s(voltage_V - self.offset_V, for_good=True), self.not_before_s))
 
     @property
     def eod_time_s(self) -> float:
@@ -96,7 +100,9 @@ class VoltageForecast:
     @cached_property
     def _down_to_the_cut_off(self) -> tuple[FloatArray, FloatArray]:
         time_s, voltage_V = self.simulation.time_s, self.simulation.voltage_V
-        reached_s = self.simulation.reached_s(self.cut_off_V, for_good=self.not_before_s is not None)
+        if self.not_before_s is not None:
+            voltage_V = voltage_V + self.offset_V * (time_s > self.not_before_s)
+        reached_s = self.simulation.reached_s(self.cut_off_V - self.offset_V, for_good=self.not_before_s is not None)
         if np.isnan(reached_s):
             return time_s, voltage_V
         before = time_s < reached_s
@@ -264,7 +270,8 @@ class RecordModel:
             :func:`~battery_env.records.expected_current` has it, the last current of a constant load and the mean of a load
             that varied, which is an assumption
         :param in_progress: whether the record is known not to have reached the cut-off: then the model does so after its end
-            only, and at its last sample at the earliest, however low it comes in the pulses before
+            only, and at its last sample at the earliest, however low it comes in the pulses before; and the cell goes on to
+            be as much higher or lower than the model as it was over the last tenth of the record
         :return: the voltage, and when the cut-off is reached
         :raises ValueError: for a negative future current, parameters out of range, or a record that cannot be used
         """
@@ -279,11 +286,15 @@ class RecordModel:
             steps = int(at.q_mobile / (future_current_A * self.dt_s)) + 1
             current_A = np.append(current_A[:-1], np.full(steps + 1, future_current_A))
         simulation, start_s = self.simulate(current_A, at.q_mobile, at.r_o), float(record.time_s[0])
+        at_samples_V = _at(samples_s, simulation)
+        recent = samples_s >= (1.0 - RECENT_SHARE) * samples_s[-1]
+        higher_V = (record.voltage_V - at_samples_V)[recent & ~np.isnan(at_samples_V)]
         return VoltageForecast(
             replace(simulation, time_s=start_s + simulation.time_s, eod_time_s=start_s + simulation.eod_time_s),
             self.cell.VEOD if cut_off_V is None else cut_off_V,
-            _at(samples_s, simulation),
+            at_samples_V,
             float(record.time_s[-1]) if in_progress else None,
+            float(higher_V.mean()) if in_progress and len(higher_V) else 0.0,
         )
 
     def capacity_Ah(
@@ -304,10 +315,12 @@ class RecordModel:
             load_unit=load_unit,
             thermal=self.thermal,
             cell=self.cell,
-            cut_off_V=cut_off_V,
+            cut_off_V=-np.inf,
             max_duration_s=min(max_duration_s, LONGEST_FORECAST_S),
         )
-        return float(new.current_A.sum() * self.dt_s / 3600.0) if np.isfinite(new.eod_time_s) else float("nan")
+        drawn_C = np.append(0.0, np.cumsum(new.current_A)) * self.dt_s
+        steps = new.reached_s(cut_off_V) / self.dt_s
+        return float(np.interp(steps, np.arange(len(drawn_C)), drawn_C)) / 3600.0
 
     def sensitivities(
         self, current_A: FloatArray, q_mobile: float, r_o: float, stride: int = 1

@@ -1,5 +1,5 @@
 """
-A record: time, voltage and current as they were measured during one discharge. What can be meant, how the current runs between
+A record: time, voltage and current as they were measured during one discharge. What is valid, how the current runs between
 the samples, and what to expect of it after the last one.
 """
 
@@ -23,11 +23,13 @@ VARIED_SHARE = 0.05
 SAMPLE_INTERVAL_LIMITS_S = (1e-3, 600.0)
 #: A cell whose current is below this rests, A; then the next sample may come after as long as a week, s.
 REST_CURRENT_A, REST_LIMIT_S = 0.02, 604_800.0
+#: Where discharges of recorded cells end if nothing else is said, V.
+CUT_OFF_V = 2.7
 #: Currents below this share of the largest are taken for noise or sensor offset.
 LEAST_LOAD_SHARE = 0.03
 
 _MILLIVOLT = "Give the voltage of one cell in V, not in mV (command line: --units voltage=mV), and not that of a pack."
-#: What a current that cannot be meant usually is.
+#: What a current that is out of range usually is.
 MILLIAMPERE = "Give the current in A, not in mA (command line: --units current=mA), and that of one cell."
 # What to do about a value that is missing in a stream
 _MISSING = {
@@ -97,9 +99,11 @@ def starts_at_rest(record: Record) -> bool:
 
 
 def check_column(name: str, values: ArrayLike, least_samples: int) -> FloatArray:
-    """Refuse a column of a record that cannot be meant."""
+    """Refuse an invalid column of a record."""
     if values is None or np.ma.is_masked(values) or np.iscomplexobj(values):
         raise TypeError(f"{name} must hold real numbers, none of them masked, got {type(values).__name__}")
+    if np.asarray(values).dtype.kind in "mM":
+        raise TypeError(f"{name} must hold numbers, got dates. read_discharges takes a table with dates")
     try:
         array = np.array(values, dtype=np.float64)
     except (OverflowError, TypeError, ValueError) as error:
@@ -126,14 +130,14 @@ def _implausible(name: str, value: float, where: str = "") -> str:
 
 
 def check_record(record: Record, least_samples: int = 1) -> Samples:
-    """Refuse a record that cannot be meant; one that was checked when it was made, a discharge, is not checked again."""
+    """Refuse an invalid record; one that was checked when it was made, a discharge, is not checked again."""
     if getattr(record, "is_checked", False) and len(record.time_s) >= least_samples:
         return Samples.of(record)
     return check_samples(record.time_s, record.voltage_V, record.current_A, least_samples)
 
 
 def check_samples(time_s: ArrayLike, voltage_V: ArrayLike, current_A: ArrayLike, least_samples: int = 1) -> Samples:
-    """Refuse columns of a record that cannot be meant."""
+    """Refuse invalid columns of a record."""
     arrays = {
         name: check_column(name, values, least_samples)
         for name, values in (("time_s", time_s), ("voltage_V", voltage_V), ("current_A", current_A))
@@ -145,9 +149,13 @@ def check_samples(time_s: ArrayLike, voltage_V: ArrayLike, current_A: ArrayLike,
     stalls = np.flatnonzero(np.diff(time) <= 0.0)
     if len(stalls):
         n = stalls[0] + 1
+        if time[n] == time[n - 1]:
+            advice = "Give each sample once, with a clock that tells it from the next"
+        else:
+            advice = "Sort the samples, and give one discharge at a time, or number them in a column of the cycle"
         raise ValueError(
             f"time_s must increase from sample to sample, but sample {n} is at {time[n]:g} s, after {time[n - 1]:g} s. "
-            "Give one discharge at a time, or number them in a column of the cycle, and each sample once."
+            f"{advice}."
         )
     return Samples(**arrays)
 
@@ -215,9 +223,8 @@ def check_drawn_charge(charge_C: float, least_C: float = 0.0) -> None:
     """Refuse a current of the wrong sign."""
     if not charge_C > least_C:
         raise ValueError(
-            f"current_A is positive in discharge, but this record draws {charge_C:.6g} C in total. If the tester "
-            "counts discharge as negative, flip the sign (discharge_is_negative=True; command line: "
-            "--discharge-is-negative)."
+            f"current_A is positive in discharge, but this record draws {charge_C:.6g} C in total: flip the sign of the "
+            "current (discharge_is_negative; command line: --discharge-is-negative or --discharge-is-positive)."
         )
 
 

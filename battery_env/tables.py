@@ -64,15 +64,17 @@ def read_columns(
     if suffix == ".parquet":
         return _read_parquet(path, chosen, units)
     if suffix in (".nda", ".ndax"):
-        return _selected(_read_neware(path), chosen, units)
+        return columns_of(_read_neware(path), chosen, units)
     if suffix == ".mpr":
-        return _selected(_read_biologic(path), chosen, units)
+        return columns_of(_read_biologic(path), chosen, units)
     return _read_text(path, chosen, units)
 
 
-def _selected(
-    table: pd.DataFrame, chosen: Mapping[str, str] | None, units: Mapping[str, str] | None
+def columns_of(
+    table: pd.DataFrame, chosen: Mapping[str, str] | None = None, units: Mapping[str, str] | None = None
 ) -> tuple[pd.DataFrame, dict[str, Column]]:
+    """The columns of a record, of a table; an index with a name is a column too."""
+    table = table.reset_index(drop=table.index.names == [None])
     columns = find_columns([str(name) for name in table.columns], chosen, units)
     return pd.DataFrame({quantity: table.iloc[:, column.position] for quantity, column in columns.items()}), columns
 

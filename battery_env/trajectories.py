@@ -57,11 +57,22 @@ _KIND, _FORMAT = "data set of simulated discharges", 3
 @dataclass(frozen=True, eq=False)
 class TrajectoryDataset(Sequence[Trajectory]):
     """
-    Simulated discharges, kept as their parameters, loads and a state every 64 steps; everything between is simulated
-    again when it is asked for, to the same bits, which costs less than reading it from memory would gain.
+    Simulated discharges of many cells, to train and to test on.
 
-    Made by :meth:`generate`, :meth:`paper`, :meth:`simulated` or :meth:`load`. ``dataset[i]`` is a
-    :class:`~battery_env.electrochemistry.Trajectory`.
+    .. code-block:: python
+
+      from battery_env import TrajectoryDataset
+      from battery_env.loads import constant
+
+      aged = TrajectoryDataset.generate("q_mobile", n=100, loads=[constant(8.0), constant(12.0)], seed=0)
+      train, test = aged.split(test=0.3, seed=0)
+      print(len(train), test[0].q_mobile, test[0].eod_time_s)
+
+    Made by :meth:`generate`, :meth:`paper` (the data of Unagar et al.), :meth:`simulated`, :meth:`from_trajectories` or
+    :meth:`load`. ``dataset[i]`` is a :class:`~battery_env.electrochemistry.Trajectory`, ``dataset[:10]`` a data set.
+
+    It keeps parameters, loads and a state every 64 steps. States between are simulated again when they are asked for, to the
+    same bits.
 
     :param q_mobile: C, shape (n,)
     :param r_o: ohm, shape (n,)

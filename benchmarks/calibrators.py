@@ -37,7 +37,7 @@ from battery_env.estimators import ClosedForm, Estimator, ExtendedKalmanFilter, 
 from battery_env.evaluation import evaluate
 from battery_env.loads import RandomPiecewise
 from battery_env.parameters import PARAMETER_NAMES
-from battery_env.plotting import COLOURS, LABELS, new_figure
+from battery_env.plotting import LABELS, coloured, new_figure
 from battery_env.sensors import RandomSensorErrors, SensorErrors
 from battery_env.trajectories import TrajectoryDataset
 from benchmarks.contests import HELD_OUT, SENSORS
@@ -477,7 +477,7 @@ an unbiased calibrator can have. Times are CPU times on one core.
 
 def plot(results: pd.DataFrame, labels: Sequence[str]) -> Figure:
     """The errors of all discharges, from a table with a row for each parameter."""
-    names = list(dict.fromkeys(results["calibrator"]))
+    colours = {name: colour for colour, name in coloured(dict.fromkeys(results["calibrator"]))}
     rows: list[tuple[str, pd.DataFrame | None]] = []
     for keys, of_condition in results.groupby(list(labels), sort=False):
         named = zip(labels, keys, strict=True)
@@ -491,10 +491,9 @@ def plot(results: pd.DataFrame, labels: Sequence[str]) -> Figure:
                 axes.axhline(y, color="0.8", lw=0.8)
                 continue
             errors = group[group["parameter"] == parameter]["second_half_mape_percent"]
-            colour = COLOURS[names.index(name) % len(COLOURS)]
-            axes.plot(errors.clip(_FLOOR_PERCENT), [y] * len(errors), "o", ms=3, mew=0, alpha=0.35, color=colour)
+            axes.plot(errors.clip(_FLOOR_PERCENT), [y] * len(errors), "o", ms=3, mew=0, alpha=0.35, color=colours[name])
             if len(errors):
-                axes.plot([max(errors.mean(), _FLOOR_PERCENT)] * 2, [y - 0.4, y + 0.4], color=colour, lw=2.2)
+                axes.plot([max(errors.mean(), _FLOOR_PERCENT)] * 2, [y - 0.4, y + 0.4], color=colours[name], lw=2.2)
         axes.set(xscale="log", xlabel="error in the second half (%)", title=LABELS[parameter].split(" (")[0])
         axes.grid(axis="x", alpha=0.25)
     panels[0].set_yticks(range(len(rows)), [name for name, _ in rows], fontsize=7)

@@ -35,7 +35,7 @@ from battery_env.estimators import Estimator, ExtendedKalmanFilter, LeastSquares
 from battery_env.estimators.cell_fit import UNFITTED_MISMATCH_V, CellFit, fit_cell
 from battery_env.loads import recorded
 from battery_env.parameters import PARAMETER_NAMES
-from battery_env.plotting import COLOURS, LABELS, new_figure, plot_cell_fit
+from battery_env.plotting import COLOUR_OF, COLOURS, LABELS, coloured, new_figure, plot_cell_fit, title_of_life
 from battery_env.record_model import RecordModel
 from battery_env.trajectories import TrajectoryDataset
 from benchmarks import pretrained
@@ -218,23 +218,25 @@ def plot_life(whole: pd.DataFrame) -> Figure:
     panels = figure.subplots(2, len(cells), sharex=True, sharey="row", squeeze=False)
     limits_C = np.array([0.93 * whole["q_mobile_C"].min(), 1.05 * whole["q_mobile_C"].max()])
     c_per_Ah = float((whole["q_mobile_C"] / whole["capacity_Ah"]).median())
+    fitted, measured = COLOUR_OF["least squares"], COLOUR_OF["measured"]
     for cell, (upper, lower) in zip(cells, panels.T, strict=True):
         part = whole[whole["cell"] == cell]
         for axes, name, unit in ((upper, "q_mobile", "C"), (lower, "r_o", "ohm")):
             value, sd = part[f"{name}_{unit}"], part[f"sd_{name}_{unit}"]
-            axes.fill_between(part["cycle"], value - sd, value + sd, color=COLOURS[0], alpha=0.2, lw=0)
-            axes.plot(part["cycle"], value, color=COLOURS[0], lw=1.6, label=f"{LABELS[name].split(' (')[0]}, fitted, ± 1 sd")
+            symbol = LABELS[name].split(" (")[0]
+            axes.fill_between(part["cycle"], value - sd, value + sd, color=fitted, alpha=0.15, lw=0, label="± 1 sd, common")
+            axes.plot(part["cycle"], value, color=fitted, lw=1.6, label=f"{symbol}, least squares")
             axes.grid(alpha=0.25)
         capacity = upper.twinx()
-        capacity.plot(part["cycle"], part["capacity_Ah"], ".", ms=3.5, color=COLOURS[1])
+        capacity.plot(part["cycle"], part["capacity_Ah"], ".", ms=3.5, color=measured)
         capacity.set_ylim(*(limits_C / c_per_Ah))
-        capacity.tick_params(axis="y", colors=COLOURS[1])
-        capacity.set_ylabel("capacity to 2.7 V (Ah)", color=COLOURS[1])
-        upper.plot([], [], ".", ms=5, color=COLOURS[1], label="capacity, measured")
+        capacity.set_ylabel("capacity to 2.7 V (Ah)")
+        upper.plot([], [], ".", ms=5, color=measured, label="capacity, measured")
         impedance_ohm = part["Re_ohm"] + part["Rct_ohm"]
-        lower.plot(part["cycle"], impedance_ohm, ".", ms=3.5, color=COLOURS[1], label="$R_e + R_{ct}$, impedance tests")
-        upper.set(title=cell, ylim=limits_C)
-        lower.set_xlabel("discharge")
+        lower.plot(part["cycle"], impedance_ohm, ".", ms=3.5, color=measured, label="$R_e + R_{ct}$, impedance tests")
+        upper.set_title(f"{cell}\n{title_of_life([part])}", fontsize=10)
+        upper.set_ylim(*limits_C)
+        lower.set_xlabel("cycle")
         upper.legend(frameon=False, loc="upper right", fontsize=9)
         lower.legend(frameon=False, loc="upper left", fontsize=9)
     low_ohm, high_ohm = (whole["r_o_ohm"] - whole["sd_r_o_ohm"]).min(), (whole["r_o_ohm"] + whole["sd_r_o_ohm"]).max()
@@ -254,9 +256,10 @@ def plot_voltages(discharges: Mapping[str, Sequence[Discharge]], whole: pd.DataF
             n = round(position * (len(records) - 1))
             record, fit = records[n].loaded_part(CUT_OFF_V), fits.iloc[n]
             start_s = record.time_s[0]
-            axes.plot(record.time_s - start_s, record.voltage_V, "o", ms=2.6, color="0.5", label="measured")
+            since_s = record.time_s - start_s
+            axes.plot(since_s, record.voltage_V, "o", ms=2.6, color=COLOUR_OF["measured"], label="measured")
             for estimate, style, colour, label in (
-                (Estimate(fit["q_mobile_C"], fit["r_o_ohm"]), "-", COLOURS[0], "model, fitted"),
+                (Estimate(fit["q_mobile_C"], fit["r_o_ohm"]), "-", COLOUR_OF["least squares"], "model, fitted"),
                 (_NEW, "--", COLOURS[1], "model, new cell's parameters"),
             ):
                 forecast = _THERMAL.forecast(record, estimate, CUT_OFF_V)
@@ -498,13 +501,13 @@ def plot_departures(found: pd.DataFrame) -> Figure:
     discharge is that is predicted on the way.
     """
     names = [name for name in found["calibrator"].unique() if "together" not in name and not name.startswith("the fit")]
-    families = list(dict.fromkeys(name.partition(",")[0] for name in names))
+    colours = {family: colour for colour, family in coloured(dict.fromkeys(name.partition(",")[0] for name in names))}
     figure = new_figure(10.4, 6.6)
     panels = figure.subplots(2, found["tested"].nunique(), sharey="row", squeeze=False)
     for (upper, lower), (tested, of_cell) in zip(panels.T, with_departure(found).groupby("tested", sort=False), strict=True):
         for name in names:
             family = name.partition(",")[0]
-            of_name, colour = of_cell[of_cell["calibrator"] == name], COLOURS[families.index(family)]
+            of_name, colour = of_cell[of_cell["calibrator"] == name], colours[family]
             style = "-" if name == family else "--"
             whole = of_name[of_name["share"] == 1.0].groupby("cycle")["departure_percent"].mean()
             upper.plot(whole.index, whole, ls=style, lw=1.2, color=colour)

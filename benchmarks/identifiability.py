@@ -1,5 +1,5 @@
 """
-What a discharge says about q_mobile and r_o, and when: every number and figure of docs/identifiability.md.
+What a discharge says about q_mobile and r_o, and when: every number and figure of docs/reports/identifiability.md.
 
 .. code-block:: bash
 

@@ -30,7 +30,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from battery_env.evaluation import over_seeds
-from battery_env.plotting import COLOURS, new_figure
+from battery_env.plotting import COLOUR_OF, COLOURS, new_figure
 from benchmarks.control import DISTURBANCES, SETTLED_SHARE, SHARES, conditions, draw_shares, judge, roll_out, shares_of, tried
 from benchmarks.study import (
     Study,
@@ -50,12 +50,12 @@ from sb3_lac.envs import CostEnv, reference_controller
 
 _REFERENCE = "reference"
 _METRIC_SAC = "SAC, LAC's metric"
-# how they are drawn
-_STYLES = {
-    "LAC": (COLOURS[0], "o"),
-    "SAC": (COLOURS[1], "s"),
-    "TD3": (COLOURS[2], "^"),
-    "TQC": (COLOURS[3], "D"),
+#: How they are drawn: colour and marker.
+STYLES = {
+    "LAC": (COLOUR_OF["LAC"], "o"),
+    "SAC": (COLOUR_OF["SAC"], "s"),
+    "TD3": (COLOUR_OF["TD3"], "^"),
+    "TQC": (COLOUR_OF["TQC"], "D"),
     _METRIC_SAC: (COLOURS[4], "v"),
     _REFERENCE: ("black", "|"),
 }
@@ -163,7 +163,7 @@ def _beside(described: dict[str, Any], rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def _in_order(names: pd.Series) -> pd.Series:
-    order = [*DISTURBANCES, *_STYLES]
+    order = [*DISTURBANCES, *STYLES]
     return names.map(order.index)
 
 
@@ -242,7 +242,7 @@ def plot_costs(results: pd.DataFrame) -> Figure:
     The cost of each policy and the share that ends at the goal: each seed, and the interquartile mean with its 95 % interval.
     """
     undisturbed = results[results["disturbance"] == "none"]
-    envs, names = list(undisturbed["environment"].unique()), [name for name in _STYLES if name in set(undisturbed["policy"])]
+    envs, names = list(undisturbed["environment"].unique()), [name for name in STYLES if name in set(undisturbed["policy"])]
     figure = new_figure(8.6, 1.0 + 0.75 * len(envs))
     costs, goals = figure.subplots(1, 2, sharey=True)
     yardsticks = undisturbed[undisturbed["policy"] == _REFERENCE].set_index("environment")["cost"]
@@ -251,7 +251,7 @@ def plot_costs(results: pd.DataFrame) -> Figure:
             of_policy = undisturbed[(undisturbed["environment"] == env_id) & (undisturbed["policy"] == name)]
             if of_policy.empty:
                 continue
-            colour, marker = _STYLES[name]
+            colour, marker = STYLES[name]
             height = row + 0.7 * ((number + 0.5) / len(names) - 0.5)
             for axes, values in ((costs, of_policy["cost"] / yardsticks[env_id]), (goals, of_policy["at_goal"])):
                 middle, low, high = (float(value) for value in over_seeds(values))
@@ -278,7 +278,7 @@ def plot_learning(learning: pd.DataFrame) -> Figure:
     figure, panels = new_panels(len(envs), 3, (3.1, 2.3), margin=(0.0, 0.4))
     for axes, env_id in zip(panels, envs, strict=True):
         of_env = learning[learning["environment"] == env_id]
-        for name, (colour, marker) in _STYLES.items():
+        for name, (colour, marker) in STYLES.items():
             of_policy = of_env[of_env["policy"] == name]
             if name == _REFERENCE:
                 axes.axhline(float(of_policy["cost"].iloc[0]), color=colour, ls="--", lw=1.0, label=name)
@@ -292,7 +292,7 @@ def plot_learning(learning: pd.DataFrame) -> Figure:
         axes.set_ylabel("cost per step")
     for axes in panels[-3:]:
         axes.set_xlabel("environment steps")
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(_STYLES), fontsize="small")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(STYLES), fontsize="small")
     return figure
 
 
@@ -304,7 +304,7 @@ def plot_disturbances(results: pd.DataFrame) -> Figure:
     figure, panels = new_panels(len(envs), 2, (5.6, 2.1), margin=(0.0, 0.5))
     for axes, env_id in zip(panels, envs, strict=True):
         of_env = results[results["environment"] == env_id]
-        draw_shares(axes, of_env, "policy", [name for name in _STYLES if name in set(of_env["policy"])])
+        draw_shares(axes, of_env, "policy", [name for name in STYLES if name in set(of_env["policy"])])
         axes.set_title(env_id)
     figure.suptitle("episodes that end at the goal (that die)")
     return figure

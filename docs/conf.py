@@ -20,30 +20,37 @@ extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary"]
 templates_path = ["_templates"]
 exclude_patterns = ["_build"]
 html_theme = "furo"
-html_title = f"sb3_lac {release}"
+html_title = f"sb3_lac and battery_env {release}"
 
 myst_heading_anchors = 4  # as on GitHub
-autosummary_ignore_module_all = False
 autodoc_typehints = "description"
 autodoc_member_order = "bysource"
 autodoc_type_aliases = {name: name for name in ("BoolArray", "FloatArray", "IntArray")}
 
 
 def entitle_table(app: Sphinx, docname: str, source: list[str]) -> None:
-    """The tables in results have no title of their own."""
+    """The tables in results have no title of their own, and no place in the sidebar: the page of all tables leads to them."""
     if docname.startswith("results/"):
-        source[0] = f"# {docname.removeprefix('results/')}\n\n{source[0]}"
+        source[0] = f"---\norphan: true\n---\n\n# {docname.removeprefix('results/')}\n\n{source[0]}"
 
 
 def lead_to_site(app: Sphinx, doctree: nodes.document) -> None:
-    """The README is the index of the site, and links to what lies in the repository only stay text."""
+    """Of what links lead to outside of the site, files are downloads, the README is the index, and folders stay text."""
+    page = Path(app.env.doc2path(app.env.docname))
     for link in list(doctree.findall(addnodes.pending_xref)):
         target = link["reftarget"]
-        if target == str(ROOT / "README"):
+        if link["reftype"] != "myst" or target in app.env.found_docs:
+            continue
+        found = next(
+            (path for folder in (page.parent, ROOT, ROOT / "docs") if (path := (folder / target).resolve()).exists()), None
+        )
+        if found == ROOT / "README.md":
             link["reftarget"] = "index"
-        elif link["reftype"] == "myst" and target not in app.env.found_docs:
-            if any((folder / target).exists() for folder in (ROOT, ROOT / "docs")):
-                link.replace_self(link.children)
+        elif found is not None and found.is_file():
+            name = app.env.dlfiles.add_file(app.env.docname, str(found))
+            link.replace_self(addnodes.download_reference("", "", *link.children, filename=name, reftarget=str(found)))
+        elif found is not None:
+            link.replace_self(link.children)
 
 
 def refer_to_page(app: Sphinx, what: str, name: str, documented: Any, options: Any, lines: list[str]) -> None:

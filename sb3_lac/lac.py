@@ -23,18 +23,28 @@ SelfLAC = TypeVar("SelfLAC", bound="LAC")
 
 class LAC(CostAlgorithm):
     """
-    Lyapunov Actor-Critic (LAC)
+    Lyapunov Actor-Critic (LAC), a soft actor-critic for tasks with a cost
     Actor-Critic Reinforcement Learning for Control with Stability Guarantee,
     This implementation uses the SB3 SAC implementation as base.
     Paper: https://arxiv.org/abs/2004.14288
 
+    .. code-block:: python
+
+      from sb3_lac import LAC
+
+      model = LAC("MlpPolicy", "CartPoleCost-v0", seed=0)
+      model.learn(20_000)
+      model.save("lac_cart_pole")
+
+    Pay costs as they are, ``reward = -cost``, and let a failure have its price. Nothing has to be scaled. Choose the discount,
+    the learning rate and the number of steps; leave ``alpha3``, the multipliers and ``ent_coef`` at their defaults.
+
     The critic ``L(s, a) >= 0`` is the discounted sum of costs. Its networks learn a root of it, in which small costs count
-    beside large ones and whose gradient does not fade towards the goal, and the actor lowers that root. ``L`` has to decrease
-    by ``alpha3`` times the cost in each step: a Lagrange multiplier ``lambda`` enforces that, while ``ent_coef`` keeps the
-    entropy up as in SAC.
+    beside large ones, and the actor lowers that root. ``L`` has to decrease by ``alpha3`` times the cost in each step: a
+    Lagrange multiplier ``lambda`` enforces that, while ``ent_coef`` keeps the entropy up as in SAC.
 
     Note: the cost is ``bound - reward``, where ``bound`` is the largest reward (stated or seen, at least 0). A termination
-    pays 0 for ever after, and so costs ``bound`` per step: where living pays, LAC lives.
+    pays 0 for ever after, and so costs ``bound`` per step where rewards are positive.
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...)
     :param env: The environment to learn from (if registered in Gym, can be str)

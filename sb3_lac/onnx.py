@@ -84,11 +84,19 @@ def export_onnx(
     vec_normalize: VecNormalize | None = None,
 ) -> Path:
     """
-    Write the deterministic policy of a model as an ONNX file: input ``observation``, output ``action``, both float32, with the
-    normalization of the observations by ``VecNormalize`` and the scaling of the actions included. Images are those of the
-    policy, with the channels first. The file is checked with onnxruntime before it takes its name.
+    Write the deterministic policy of a model as an ONNX file, which runs without torch and without pickle.
 
-    Needs the extra ``sb3_lac[onnx]``.
+    .. code-block:: python
+
+      from sb3_lac import LAC
+      from sb3_lac.onnx import export_onnx
+
+      model = LAC("MlpPolicy", "LinearCost-v0").learn(5_000)
+      export_onnx(model, "policy.onnx")
+
+    Its input is ``observation`` and its output ``action``, both float32. The normalization of the observations by
+    ``VecNormalize`` and the scaling of the actions are included. Images are those of the policy, with the channels first. The
+    file is checked with onnxruntime before it takes its name. Needs the extra ``sb3_lac[onnx]``.
 
     :param model: LAC, SAC, TD3, TQC, PPO, ... or a policy
     :param path: Of the file, which must not exist yet; ``.onnx`` is added where it is missing

@@ -151,7 +151,14 @@ class LyapunovCritic(BaseModel):
 
 class LyapunovPolicy(BasePolicy):
     """
-    Policy class (with both actor and critic) for LAC.
+    Policy class (with both actor and critic) for LAC; ``MlpPolicy`` is another name of it.
+    ``LAC(policy_kwargs=...)`` takes the arguments from ``net_arch`` on:
+
+    .. code-block:: python
+
+      from sb3_lac import LAC
+
+      model = LAC("MlpPolicy", "LinearCost-v0", policy_kwargs=dict(net_arch=[64, 64], n_critics=1))
 
     :param observation_space: Observation space
     :param action_space: Action space

@@ -13,16 +13,20 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices,
 
 class GymnasiumVecEnv(VecEnv):
     """
-    A vector environment of Gymnasium as a vectorized environment of Stable-Baselines3: one call steps all environments.
+    Train Stable-Baselines3 on a vector environment of Gymnasium: one call steps all environments.
 
     .. code-block:: python
 
-        env = gym.make_vec("BatteryQmax-v0", num_envs=64, autoreset_mode="SameStep")
-        model = LAC("MlpPolicy", VecMonitor(GymnasiumVecEnv(env)))
+      import gymnasium as gym
+      from sb3_lac import LAC, GymnasiumVecEnv
+      from stable_baselines3.common.vec_env import VecMonitor
 
-    The environments must start a new episode in the step that ends the last one, as Stable-Baselines3 expects, or leave it to
-    the caller; with Gymnasium's default, a step later, the replay buffer would hold transitions from the end of one episode to
-    the start of the next.
+      env = gym.make_vec("BatteryQmax-v0", num_envs=64, autoreset_mode="SameStep")
+      model = LAC("MlpPolicy", VecMonitor(GymnasiumVecEnv(env))).learn(100_000)
+
+    ``autoreset_mode`` is ``"SameStep"``, as Stable-Baselines3 expects, or ``"Disabled"``. With Gymnasium's default a new
+    episode starts one step late, and the replay buffer would hold transitions from the end of one episode to the start of the
+    next.
 
     :param env: The vector environment, wrapped or not
     :raises ValueError: If it starts new episodes one step late, or does not say when

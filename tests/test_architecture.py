@@ -31,6 +31,7 @@ LAYERS = (
     ("battery_env.record_files",),
     ("battery_env.sensors",),
     ("battery_env.record_model",),
+    ("battery_env.conversions",),
     ("battery_env.estimators",),
     ("battery_env.calibration", "battery_env.pretrained_policies"),
     ("battery_env.evaluation",),
@@ -40,6 +41,7 @@ LAYERS = (
     ("battery_env.callbacks",),
     ("battery_env.app.calibrate",),
     ("battery_env.app.many",),
+    ("battery_env.app.forecast",),
     ("battery_env.app.command_line",),
     ("battery_env.app", "battery_env.__main__"),
 )
@@ -166,3 +168,25 @@ def test_every_import_is_declared(package, distributions, extras):
     used = {name.split(".")[0] for path in files(package) for name in imports(path)}
     needed = {DISTRIBUTIONS.get(name, name) for name in used - own - STANDARD}
     assert needed <= declared(distributions, extras), f"{package} uses what setup.cfg does not declare"
+
+
+# What an object is made of, and a simulation, has more arguments than ten.
+MANY_ARGUMENTS = {"__init__", "simulate"}
+SOURCES = [path for package in ("battery_env", "sb3_lac") for path in sorted((ROOT / package).rglob("*.py"))]
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=module_name)
+def test_no_function_is_long_and_no_private_name_leaves_its_module(path):
+    text = path.read_text(encoding="utf-8")
+    code = {number for number, line in enumerate(text.splitlines(), 1) if line.strip() and not line.strip().startswith("#")}
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.ImportFrom) and node.module.split(".")[0] in ("battery_env", "sb3_lac"):
+            assert not any(alias.name.startswith("_") for alias in node.names), f"line {node.lineno}"
+        if isinstance(node, ast.FunctionDef):
+            body = node.body[1:] if ast.get_docstring(node) else node.body
+            lines = code & set(range(body[0].lineno, node.end_lineno + 1)) if body else ()
+            assert len(lines) <= 60, f"{node.name} has {len(lines)} lines of code"
+            names = [each.arg for each in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)]
+            assert (
+                len(set(names) - {"self", "cls"}) <= 10 or node.name in MANY_ARGUMENTS
+            ), f"{node.name} has {len(names)} arguments"

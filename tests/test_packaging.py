@@ -1,6 +1,7 @@
 """What is installed is what is in the tree."""
 
 import configparser
+import email
 import importlib.resources
 import os
 import re
@@ -63,6 +64,11 @@ def test_each_wheel_owns_its_files_and_brings_its_data_and_license(wheels):
     assert data <= packaged["battery_env"]
 
 
+def test_the_example_that_a_registry_shows_of_battery_env_runs():
+    (example,) = re.findall("^```python\n(.*?)^```", (ROOT / "battery_env/README.md").read_text("utf-8"), re.M | re.S)
+    exec(compile(example, "battery_env/README.md", "exec"), {})
+
+
 def test_the_calibrator_is_a_command(wheels):
     with zipfile.ZipFile(wheels["battery_env"]) as wheel:
         (name,) = (name for name in wheel.namelist() if name.endswith("entry_points.txt"))
@@ -118,8 +124,25 @@ def test_both_distributions_ask_for_the_same_versions():
 def test_versions_agree():
     assert (ROOT / "sb3_lac/version.txt").read_text() == (ROOT / "battery_env/version.txt").read_text()
     version = (ROOT / "sb3_lac/version.txt").read_text().strip()
-    assert f"version: {version}" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
-    assert version in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    release = version.partition(".dev")[0]
+    heading = re.search("^## (.*)$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert heading and heading[1].startswith(f"{release} (")
+    # what is released has a date, in the changelog and in the citation
+    assert (version == release) == ("unreleased" not in heading[1])
+    pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
+    cited = [each for page in pages for each in re.findall(r"version\s*= \{(.*)\}", page.read_text(encoding="utf-8"))]
+    assert cited and set(cited) <= {release, version}
+
+
+@pytest.mark.parametrize("package", DISTRIBUTIONS)
+def test_each_wheel_says_what_it_is(wheels, package):
+    with zipfile.ZipFile(wheels[package]) as wheel:
+        (name,) = (name for name in wheel.namelist() if name.endswith(".dist-info/METADATA"))
+        metadata = email.message_from_bytes(wheel.read(name))
+    assert metadata["Description-Content-Type"] == "text/markdown" and len(metadata.get_payload()) > 500
+    assert metadata["License"] == "MIT" and metadata["Author"] and metadata["Summary"] and metadata["Keywords"]
+    assert "Typing :: Typed" in metadata.get_all("Classifier") and metadata.get_all("Project-URL")
 
 
 @pytest.mark.parametrize("package", ["sb3_lac", "battery_env"])

@@ -1,13 +1,15 @@
-"""Calibrate the model to one discharge: estimate, capacity and end of discharge, as numbers and as text."""
+"""Calibrate the model to discharges: estimate, capacity and end of discharge, as numbers and as text."""
 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, get_args, overload
 
 import numpy as np
+import pandas as pd
 
 from battery_env.calibration.policy import PolicyEstimator
 from battery_env.calibration.pretrained import policy_of_file, pretrained_policy
@@ -20,14 +22,17 @@ from battery_env.estimators.cell_fit import UNFITTED_MISMATCH_V, CellFit
 from battery_env.estimators.gaps import NOT_DRAWN, find_gaps
 from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
+from battery_env.estimators.monitor import start_condition, watched
 from battery_env.estimators.rest import InitialSoc, Start, check_initial_soc, soc_from_rest
-from battery_env.estimators.settling import least_resistance_ohm, rest_voltage_V, start_reason
 from battery_env.parameters import PARAMETER_NAMES, check_parameters
+from battery_env.record_files import each_usable
 from battery_env.record_model import RecordModel, VoltageForecast
-from battery_env.records import ExpectedCurrent, drawn, expected_current
+from battery_env.records import CUT_OFF_V, ExpectedCurrent, Samples, drawn, expected_current
 
 Method = Literal["least-squares", "kalman", "policy"]
 METHODS: tuple[Method, ...] = get_args(Method)
+#: For readers of a figure.
+METHOD_NAMES: dict[str, str] = {"least-squares": "least squares", "kalman": "Kalman filter", "policy": "policy"}
 
 # A record of more samples than this is averaged over the time step of the model, or longer where it lasts longer than so many
 # steps: what lies between says nothing to the model.
@@ -60,9 +65,11 @@ _NOT_FOR_POLICIES = (
 @dataclass(frozen=True)
 class Settings:
     """
-    How a discharge is looked at.
+    How a discharge of a real cell is looked at. ``Settings().calibrator()`` is least squares, and
+    ``Settings(method="kalman").calibrator()`` the filter, with what such a cell needs.
 
-    :param method: of calibration
+    :param method: of calibration; ``None``: least squares; and where they do not settle a record in progress at a constant
+        load that goes on, of a cell of which neither a prior nor the constants are known, the filter
     :param parameters: which to search for; the other is held at the cell's value
     :param cut_off_V: voltage at which the discharge ends, V
     :param prior_q_mobile_C: mean and standard deviation of ``q_mobile`` before the discharge, C; ``None``: nothing is known
@@ -85,9 +92,9 @@ class Settings:
         refuse when :meth:`calibrator` makes them
     """
 
-    method: Method = "least-squares"
+    method: Method | None = None
     parameters: tuple[str, ...] = PARAMETER_NAMES
-    cut_off_V: float = 2.7
+    cut_off_V: float = CUT_OFF_V
     prior_q_mobile_C: tuple[float, float] | None = None
     mismatch_V: float = UNFITTED_MISMATCH_V
     current_gain_sd: float = 0.005
@@ -101,7 +108,7 @@ class Settings:
     policy: Path | None = None
 
     def __post_init__(self) -> None:
-        if self.method not in METHODS:
+        if self.method not in (None, *METHODS):
             raise ValueError(f"the method is {' or '.join(METHODS)}, got {self.method!r}")
         if self.nominal_Ah is not None:
             check_positive("the nominal capacity in Ah", self.nominal_Ah)
@@ -126,8 +133,14 @@ class Settings:
             raise ValueError(f"a policy is for the method policy, got {self.method!r}")
 
     @classmethod
-    def for_cell(cls, cell: CellFit | CellParameters, **others: Any) -> Settings:
-        """Settings that use all that is known of a cell."""
+    def for_cell(cls, cell: CellFit | CellParameters | None = None, **others: Any) -> Settings:
+        """
+        Settings that use all that is known of a cell.
+
+        :param cell: what ``fit_cell`` found; or the constants alone
+        :param others: further settings, which replace what the fit knows
+        :return: the settings
+        """
         if isinstance(cell, CellFit):
             known: dict[str, Any] = {"cut_off_V": cell.cell.VEOD}
             if others.get("method") != "policy":
@@ -138,6 +151,14 @@ class Settings:
                 }
             others, cell = {**known, **others}, cell.cell
         return cls(**{"cell": cell, **others})
+
+    def methods(self, goes_on: bool) -> list[Method]:
+        """What to calibrate a record by: the first one that settles it, or the last; ``goes_on``: a constant load does."""
+        if self.method is not None:
+            return [self.method]
+        # under other loads the filter, which takes the error of the model for noise, is surer than it may be
+        is_new = self.prior_q_mobile_C is None and self.cell is None and self.future_current_A is None
+        return ["least-squares", "kalman"] if goes_on and is_new else ["least-squares"]
 
     def calibrator(
         self, cell: CellParameters | None = None, start: Start | None = None
@@ -152,7 +173,7 @@ class Settings:
         """
         if self.method == "policy":
             return self._policy()
-        calibrator = LeastSquares if self.method == "least-squares" else ExtendedKalmanFilter
+        calibrator = ExtendedKalmanFilter if self.method == "kalman" else LeastSquares
         stated: InitialSoc = 1.0 if self.initial_soc == "rest" else self.initial_soc
         bounds: dict[str, Any] = {} if self.q_mobile_bounds_C is None else {"q_mobile_bounds_C": self.q_mobile_bounds_C}
         return calibrator(
@@ -192,7 +213,7 @@ class Settings:
     def calibrated_by(self) -> str:
         """The calibrator, for readers."""
         if self.method != "policy":
-            return self.method
+            return self.method or "least-squares"
         return "the policy that comes with the package" if self.policy is None else f"the policy of {self.policy}"
 
 
@@ -209,15 +230,19 @@ def quantity(text: str = "", unit: str = "", digits: int = 0, scale: float = 1.0
     return field(metadata={"text": text, "unit": f" {unit}" if unit else "", "digits": digits, "scale": scale})
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Calibration:
     """
-    What a discharge says: a column of tables and of JSON for each field but the last two. NaN stands for what is not known.
+    What a discharge says. ``print`` shows it, :meth:`row` gives its columns, and a table of many is
+    ``pd.DataFrame(each.row() for each in found)``. Names of columns end with units; NaN stands for what is not known.
 
+    :param settings: how it was looked at
     :param record: what was looked at; ``None`` where only the columns are kept
     :param forecast: the voltage of the model at the estimate; likewise
     """
 
+    settings: Settings = field(compare=False)
+    cycle: int | None = quantity("discharge")
     method: str = quantity()
     q_mobile_C: float = quantity("q_mobile", "C")
     sd_q_mobile_C: float = quantity("sd", "C")
@@ -233,8 +258,10 @@ class Calibration:
     drawn_Ah: float = quantity("drawn", "Ah", 3)
     capacity_Ah: float = quantity("capacity", "Ah", 3)
     predicted_capacity_Ah: float = quantity("predicted capacity", "Ah", 3)
+    sd_predicted_capacity_Ah: float = quantity("sd", "Ah", 3)
     nominal_Ah: float = quantity("nominal capacity", "Ah", 3)
     state_of_health: float = quantity("state of health", "", 3)
+    sd_state_of_health: float = quantity("sd", "", 3)
     voltage_rmse_V: float = quantity("voltage RMSE", "mV", 1, 1e3)
     predicted_eod_time_s: float = quantity("predicted at", "s")
     sd_predicted_eod_time_s: float = quantity("sd", "s")
@@ -245,8 +272,18 @@ class Calibration:
     ambient_C: float = quantity("temperature at the start", "degC", 1)
     end_temperature_C: float = quantity("temperature at the end", "degC", 1)
     model_end_temperature_C: float = quantity("temperature of the model at the end", "degC", 1)
-    record: Discharge | None = field(default=None, repr=False, compare=False)
-    forecast: VoltageForecast | None = field(default=None, repr=False, compare=False)
+    record: Discharge | None = field(default=None, compare=False)
+    forecast: VoltageForecast | None = field(default=None, compare=False)
+
+    def __str__(self) -> str:
+        return text_of(self._name, self)
+
+    def __repr__(self) -> str:
+        return f"<{line_of(self._name, self)}>"
+
+    @property
+    def _name(self) -> str:
+        return "discharge" if self.cycle is None else f"discharge {self.cycle}"
 
     def row(self) -> dict[str, Any]:
         """The columns by name."""
@@ -262,35 +299,86 @@ class Calibration:
         """Whether the record ends above the cut-off."""
         return bool(np.isnan(self.measured_eod_time_s))
 
+    @property
+    def end_quantiles_s(self) -> tuple[float, float, float] | None:
+        """Of a record in progress, the 5 %, 50 % and 95 % quantiles of its end, s."""
+        if not self.in_progress:
+            return None
+        reach_s = 1.645 * self.sd_predicted_eod_time_s
+        return self.predicted_eod_time_s - reach_s, self.predicted_eod_time_s, self.predicted_eod_time_s + reach_s
+
 
 _HOW = {each.name: each.metadata for each in fields(Calibration)}
 
 
-def calibrate(discharge: Discharge, settings: Settings) -> Calibration:
-    """
-    Calibrate the model to one discharge. Where its start is not known, or the voltage before the load contradicts it, or where
-    nothing was drawn though the samples beside say so, its capacity is not known either. Its surroundings, and its temperature
-    at the start, are those measured at load-on; a model that departs far from the temperatures measured later is warned of.
+@overload
+def calibrate(source: Discharge, settings: Settings | None = None, **options: Any) -> Calibration: ...
 
-    :param discharge: one discharge, whole or in progress
-    :param settings: how to look at it
-    :return: what it says
-    :raises ValueError: if it cannot be used
+
+@overload
+def calibrate(
+    source: pd.DataFrame | str | Path,
+    settings: Settings | None = None,
+    *,
+    columns: Mapping[str, str] | None = None,
+    units: Mapping[str, str] | None = None,
+    discharge_is_negative: bool | None = None,
+    **options: Any,
+) -> list[Calibration]: ...
+
+
+def calibrate(
+    source: Discharge | pd.DataFrame | str | Path,
+    settings: Settings | None = None,
+    *,
+    columns: Mapping[str, str] | None = None,
+    units: Mapping[str, str] | None = None,
+    discharge_is_negative: bool | None = None,
+    **options: Any,
+) -> Calibration | list[Calibration]:
     """
+    Calibrate the model to recorded discharges, as the command line does.
+
+    .. code-block:: python
+
+      for found in battery_env.calibrate("life.csv", method="kalman", nominal_Ah=2.0):
+          print(found)
+
+    Where the start of a discharge is not known, or the voltage before the load contradicts it, or where nothing was drawn
+    though the samples beside say so, its capacity is not known either. Its surroundings, and its temperature at the start, are
+    those measured at load-on; a model that departs far from the temperatures measured later is warned of.
+
+    :param source: one discharge, whole or in progress; or a table or a file of them, see
+        :func:`battery_env.record_files.read_discharges`
+    :param settings: how to look at them; ``None``: as ``options`` say
+    :param columns: of a table or a file, as ``read_discharges`` takes it
+    :param units: likewise
+    :param discharge_is_negative: likewise
+    :param options: of :class:`Settings`, by name; ``cell`` may be what ``fit_cell`` found
+    :return: what a discharge says; of a table or a file a list, in which those that cannot be used are left out with a warning
+    :raises ValueError: if none can be used
+    """
+    settings = Settings.for_cell(**options) if settings is None else replace(settings, **options)
+    if isinstance(source, Discharge):
+        return _calibrated(source, settings)
+    return each_usable(lambda each: _calibrated(each, settings), source, columns, units, discharge_is_negative)
+
+
+def _calibrated(discharge: Discharge, settings: Settings) -> Calibration:
+    """What one discharge says."""
     loaded, measured_eod_s = discharge.loaded_part(settings.cut_off_V), discharge.eod_time_s(settings.cut_off_V)
+    in_progress = bool(np.isnan(measured_eod_s))
     _warn_of_more(discharge, measured_eod_s)
     record, averaged_over_s = _of_few_samples(loaded)
     cell = _cell_at_the_temperature(record, settings)
     discharge = _with_the_temperature_that_counts(discharge, settings)
     start = _start(discharge, settings, cell)
-    estimate = settings.calibrator(cell, start).estimate(_with_the_temperature_that_counts(record, settings))
-    if start.reason:
-        estimate = replace(estimate, settled=False, reason=start.reason)
+    load = expected_current(record.time_s, record.current_A)
+    estimate, method = _estimate(record, settings, cell, start, in_progress and not load.varied)
     model = RecordModel(cell, settings.thermal and settings.method != "policy", initial_soc=start.soc)
-    future = load = expected_current(record.time_s, record.current_A)
+    future = load
     if settings.future_current_A is not None:
         future = ExpectedCurrent(settings.future_current_A, varied=False, sd_A=0.0)
-    in_progress = bool(np.isnan(measured_eod_s))
     forecast = model.forecast(record, estimate, settings.cut_off_V, future.mean_A, in_progress)
     is_known = (
         not start.reason and _is_logged(record, forecast, estimate) and not _starts_lower(discharge, cell, start.soc, estimate)
@@ -303,8 +391,12 @@ def calibrate(discharge: Discharge, settings: Settings) -> Calibration:
     # what comes after the end of a discharge is no part of it
     nominal_Ah = _nominal_Ah(model, settings, future.mean_A if in_progress else load.mean_A)
     end_C, model_end_C = _end_temperatures(record, forecast)
+    sd_eod_s = _sd_eod_s(forecast, estimate, remaining_s, future, settings.mismatch_V)
+    sd_seen_Ah = sd_eod_s * future.mean_A / 3600.0 if in_progress else settings.current_gain_sd * drawn_Ah
+    sd_whole_Ah = float(np.hypot(sd_seen_Ah, start.sd_soc * estimate.q_mobile / 3600.0)) if is_known else float("nan")
     return Calibration(
-        method=settings.method,
+        cycle=discharge.meta.get("cycle"),
+        method=method,
         q_mobile_C=estimate.q_mobile,
         sd_q_mobile_C=estimate.sd_q_mobile,
         r_o_ohm=estimate.r_o,
@@ -319,11 +411,13 @@ def calibrate(discharge: Discharge, settings: Settings) -> Calibration:
         drawn_Ah=drawn_Ah,
         capacity_Ah=float("nan") if in_progress or start.soc < 1.0 or not is_known else drawn_Ah,
         predicted_capacity_Ah=whole_Ah,
+        sd_predicted_capacity_Ah=sd_whole_Ah,
         nominal_Ah=nominal_Ah,
         state_of_health=whole_Ah / nominal_Ah,
+        sd_state_of_health=sd_whole_Ah / nominal_Ah,
         voltage_rmse_V=float(np.sqrt(np.nanmean((forecast.at_samples_V - record.voltage_V) ** 2))),
         predicted_eod_time_s=forecast.eod_time_s,
-        sd_predicted_eod_time_s=_sd_eod_s(forecast, estimate, remaining_s, future, settings.mismatch_V),
+        sd_predicted_eod_time_s=sd_eod_s,
         measured_eod_time_s=measured_eod_s,
         remaining_s=remaining_s,
         future_current_A=future.mean_A,
@@ -331,9 +425,24 @@ def calibrate(discharge: Discharge, settings: Settings) -> Calibration:
         ambient_C=cell.Tb0 - _ZERO_CELSIUS_K,
         end_temperature_C=end_C,
         model_end_temperature_C=model_end_C,
+        settings=settings,
         record=record,
         forecast=forecast,
     )
+
+
+def _estimate(
+    record: Discharge, settings: Settings, cell: CellParameters, start: Start, goes_on: bool
+) -> tuple[Estimate, Method]:
+    """The estimate of the first method that settles the discharge, or of the last one; and which it is."""
+    for method in settings.methods(goes_on):
+        calibrator = replace(settings, method=method).calibrator(cell, start)
+        estimate = calibrator.estimate(_with_the_temperature_that_counts(record, settings))
+        if estimate.settled:
+            break
+    if start.reason:
+        estimate = replace(estimate, settled=False, reason=start.reason)
+    return estimate, method
 
 
 def _of_few_samples(record: Discharge) -> tuple[Discharge, float]:
@@ -379,7 +488,7 @@ def _warn_of_more(discharge: Discharge, eod_time_s: float) -> None:
         warnings.warn(
             f"{more_C / 3600.0:.3f} Ah more are drawn after the cut-off at {eod_time_s:.0f} s, and left aside. If that is "
             "another discharge, give each alone, or number them in a column of the cycle",
-            stacklevel=3,
+            stacklevel=4,
         )
 
 
@@ -392,10 +501,10 @@ def _is_logged(record: Discharge, forecast: VoltageForecast, estimate: Estimate)
 def _starts_lower(discharge: Discharge, cell: CellParameters, soc: float, estimate: Estimate) -> bool:
     """Whether the voltage before the load, or the first one under it, is below that of a cell with this charge."""
     begin = int(np.searchsorted(discharge.time_s, discharge.load_on_time_s, side="right")) - 1
-    time_s, voltage_V, current_A = (column[begin:] for column in (discharge.time_s, discharge.voltage_V, discharge.current_A))
-    rest_V = rest_voltage_V(cell, soc)
-    resistance_ohm = least_resistance_ohm(estimate.q_mobile, estimate.r_o)
-    return bool(voltage_V[0] < rest_V and start_reason(time_s, voltage_V, current_A, cell, soc, resistance_ohm))
+    columns = (discharge.time_s, discharge.voltage_V, discharge.current_A)
+    seen = watched(Samples(*(column[begin:] for column in columns)), cell, soc, estimate.q_mobile, estimate.r_o)
+    is_lower = seen["start"]["first_V"] < seen["start_V"]
+    return bool(is_lower and start_condition(seen, estimate.q_mobile, estimate.r_o))
 
 
 def _nominal_Ah(model: RecordModel, settings: Settings, load_A: float) -> float:
@@ -420,7 +529,7 @@ def _end_temperatures(record: Discharge, forecast: VoltageForecast) -> tuple[flo
         warnings.warn(
             f"the cell is at {record.temperature_C[worst]:.0f} degC at {record.time_s[worst]:.0f} s, where the model is at "
             f"{model_C[worst]:.0f} degC: its temperature does not hold for this cell or chamber",
-            stacklevel=3,
+            stacklevel=4,
         )
     return float(record.temperature_C[-1]), float(model_C[-1])
 
@@ -441,15 +550,16 @@ def _sd_eod_s(
     return float(np.hypot(charge_s, 0.5 * (late_s - early_s)))
 
 
-def text_of(name: str, found: Calibration, settings: Settings) -> str:
+def text_of(name: str, found: Calibration) -> str:
     """What a discharge says, for reading."""
     averaged = f", averaged over {found.averaged_over_s:g} s," if found.averaged_over_s else ""
     lines = [
         f"{name}: {found.samples} samples{averaged} from load-on at {found.shown('load_on_time_s')}, "
         f"{3600.0 * found.drawn_Ah:.0f} C drawn"
     ]
-    if settings.method == "policy":
-        lines.append(f"calibrated by {settings.calibrated_by}")
+    if found.method != "least-squares":
+        by = found.settings.calibrated_by if found.method == "policy" else "the Kalman filter"
+        lines.append(f"calibrated by {by}")
     lines.append("")
 
     def add(column: str, remark: str = "", label: str = "", value: str = "") -> None:
@@ -461,32 +571,29 @@ def text_of(name: str, found: Calibration, settings: Settings) -> str:
         add("initial_soc", f"sd {found.shown('sd_initial_soc')}")
     for column, parameter in (("q_mobile_C", "q_mobile"), ("r_o_ohm", "r_o")):
         sd = "no sd stated" if np.isnan(getattr(found, f"sd_{column}")) else f"sd {found.shown(f'sd_{column}')}"
-        add(column, sd if parameter in settings.parameters else "held")
+        add(column, sd if parameter in found.settings.parameters else "held")
     add("settled", value="yes" if found.settled else "no")
-    add("drawn_Ah", _of_the_charge(found, settings))
+    add("drawn_Ah", _of_the_charge(found))
     if not np.isnan(found.nominal_Ah):
         known = not np.isnan(found.state_of_health)
-        add("state_of_health", _of_the_health(found, settings), value="" if known else "not known")
+        add("state_of_health", _of_the_health(found), value="" if known else "not known")
     add("voltage_rmse_V")
     if not np.isnan(found.end_temperature_C):
-        ends = f"from {found.shown('ambient_C')}; the model ends at {found.shown('model_end_temperature_C')}"
-        add("end_temperature_C", ends)
+        model = f"{found.shown('ambient_C')} to {found.shown('model_end_temperature_C')}"
+        add("end_temperature_C", f"measured; the model goes from {model}")
     for column in ("predicted_eod_time_s", "remaining_s" if found.in_progress else "measured_eod_time_s"):
         is_end = column != "remaining_s"
-        label = f"{settings.cut_off_V:g} V, {_HOW[column]['text']}" if is_end else ""
-        add(column, "" if is_end else _of_the_load(found, settings), label)
+        label = f"{found.settings.cut_off_V:g} V, {_HOW[column]['text']}" if is_end else ""
+        add(column, "" if is_end else _of_the_load(found), label)
     if not found.settled:
         lines += ["", f"Not settled: {found.reason}"]
-        if found.in_progress and settings.method == "least-squares" and settings.prior_q_mobile_C is None:
-            lines += [
-                "During a discharge give --prior with the q_mobile of an earlier one of this cell. Without it",
-                "--method kalman (in Python ExtendedKalmanFilter) predicts the end better than this fit.",
-            ]
+        if found.in_progress and found.settings.prior_q_mobile_C is None:
+            lines.append("During a discharge give --prior with the q_mobile of an earlier one, or forecast it with --life.")
     return "\n".join(lines)
 
 
-def _of_the_charge(found: Calibration, settings: Settings) -> str:
-    cut_off = f"{settings.cut_off_V:g} V"
+def _of_the_charge(found: Calibration) -> str:
+    cut_off = f"{found.settings.cut_off_V:g} V"
     if found.in_progress:
         return "so far"
     if np.isnan(found.predicted_capacity_Ah):
@@ -496,16 +603,17 @@ def _of_the_charge(found: Calibration, settings: Settings) -> str:
     return f"the capacity to {cut_off}"
 
 
-def _of_the_health(found: Calibration, settings: Settings) -> str:
+def _of_the_health(found: Calibration) -> str:
     if np.isnan(found.state_of_health):
         return "as the capacity is not"
     how = "predicted" if found.in_progress or found.initial_soc < 1.0 else "drawn"
-    of = "" if settings.nominal_Ah is not None else ", what the given cell yields at this load"
-    return f"{found.shown('predicted_capacity_Ah')}, {how}, of {found.nominal_Ah:.4g} Ah{of}"
+    of = "" if found.settings.nominal_Ah is not None else ", what the given cell yields at this load"
+    sd = f"sd {found.shown('sd_predicted_capacity_Ah')}"
+    return f"{found.shown('predicted_capacity_Ah')} ({sd}), {how}, of {found.nominal_Ah:.4g} Ah{of}"
 
 
-def _of_the_load(found: Calibration, settings: Settings) -> str:
-    is_sure = "q_mobile" in settings.parameters and not np.isnan(found.sd_predicted_eod_time_s)
+def _of_the_load(found: Calibration) -> str:
+    is_sure = "q_mobile" in found.settings.parameters and not np.isnan(found.sd_predicted_eod_time_s)
     sd = f"sd {found.shown('sd_predicted_eod_time_s')}, " if is_sure else ""
     goes_on = "the mean current so far, an assumption: the load varied" if found.load_varied else "to go on"
     return f"{sd}{found.future_current_A:.3g} A {goes_on}"
@@ -515,7 +623,8 @@ def line_of(name: str, found: Calibration) -> str:
     """The same in one line."""
     sd_q_mobile = "" if np.isnan(found.sd_q_mobile_C) else f" sd {found.sd_q_mobile_C:3.0f}"
     sd_r_o = "" if np.isnan(found.sd_r_o_ohm) else f" sd {found.sd_r_o_ohm:.4f}"
-    health = "" if np.isnan(found.state_of_health) else f"  health {found.shown('state_of_health')}"
+    known = not np.isnan(found.state_of_health)
+    health = f"  health {found.shown('state_of_health')} sd {found.shown('sd_state_of_health')}" if known else ""
     return (
         f"{name:<18} q_mobile {found.shown('q_mobile_C'):>7}{sd_q_mobile}  r_o {found.shown('r_o_ohm')}{sd_r_o}  "
         f"drawn {found.shown('drawn_Ah')}{health}  RMSE {found.shown('voltage_rmse_V', 0):>6}  "

@@ -1,11 +1,12 @@
 """
-The command line: what records of discharges say about their cells, and how their constants are found.
+The command line: what records of discharges say about their cells, when one in progress ends, and how constants are found.
 
 .. code-block:: bash
 
   python -m battery_env calibrate discharge.csv
   python -m battery_env calibrate B0005:12 --out results/B0005
   battery-calibrate lab/ --out results --jobs 2
+  battery-calibrate forecast running.csv --life lab/ --load profile.csv
   python -m battery_env fit B0005:1 B0005:84 B0005:168 --out my_cell.json
 """
 
@@ -19,6 +20,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 from dataclasses import fields
+from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal
 
@@ -31,9 +33,13 @@ from battery_env.estimators.cell_fit import CellFit, fit_cell, read_cell
 from battery_env.estimators.rest import InitialSoc
 from battery_env.files import check_folder
 from battery_env.parameters import PARAMETER_NAMES
+from battery_env.records import CUT_OFF_V
 
 #: What the process returns: all records settled, one or more refused, one or more not settled, stopped by Ctrl-C.
 SETTLED, REFUSED, NOT_SETTLED, INTERRUPTED = 0, 2, 3, 130
+
+_VERSION = files("battery_env").joinpath("version.txt").read_text(encoding="utf-8").strip()
+_INSTALLED = "battery-calibrate"
 
 # So many discharges fit beside each other in the figure of a fit.
 _MOST_SHOWN = 4
@@ -46,6 +52,16 @@ def _assignments(text: str) -> dict[str, str]:
     if any(not (name.strip() and equals and value.strip()) for name, equals, value in pairs):
         raise argparse.ArgumentTypeError(f"expected quantity=NAME,quantity=NAME, got {text!r}")
     return {name.strip(): value.strip() for name, _, value in pairs}
+
+
+def _cell_name(text: str) -> re.Pattern[str]:
+    try:
+        pattern = re.compile(text)
+    except re.error as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is no regular expression: {error}") from error
+    if pattern.groups != 1:
+        raise argparse.ArgumentTypeError(f"expected a regular expression with one group, such as '(B[0-9]+)_', got {text!r}")
+    return pattern
 
 
 def _jobs(text: str) -> int:
@@ -96,8 +112,8 @@ _SIGN: _Options = {
 _CALIBRATION: _Options = {
     ("--method",): {
         "choices": METHODS,
-        "help": "least squares for whole discharges, the filter for one in progress without a prior, or a policy trained on "
-        f"simulated cells (default: {METHODS[0]})",
+        "help": "of calibration: least squares, the filter (kalman), or a policy trained on simulated cells (default: least "
+        "squares; the filter where these do not settle one in progress at a constant load, without --prior and --cell)",
     },
     ("--policy",): {
         "type": Path,
@@ -177,6 +193,12 @@ _RESULTS: _Options = {
         "metavar": "DIR",
         "help": "write the table of estimates (CSV, Parquet), the voltages and figures there",
     },
+    ("--cell-name",): {
+        "type": _cell_name,
+        "metavar": "PATTERN",
+        "help": "regular expression whose group is the name of the cell in the name of a file, such as '(B[0-9]+)_' (default: "
+        "the folder, if records lie in several, or else the file)",
+    },
     ("--table-only",): {"action": "store_true", "help": "write no voltages of single discharges"},
     ("--force",): {"action": "store_true", "help": "replace results that are there already"},
     ("--json",): {"action": "store_true", "help": "print one JSON object a discharge and line"},
@@ -201,9 +223,11 @@ def _parser(name: str) -> argparse.ArgumentParser:
             "Fit the charge that can move, q_mobile, and the ohmic resistance, r_o, of the model to discharges that each "
             "start with a full cell, or with --initial-soc, and predict when the cut-off voltage is reached."
         ),
-        epilog="Exit status: 0 if every discharge is settled, 3 if one is not, 2 if one cannot be used.",
+        epilog="Exit status: 0 if every discharge is settled, 3 if one is not, 2 if one cannot be used. Other commands: "
+        "battery-calibrate forecast --help, battery-calibrate fit --help.",
         allow_abbrev=False,
     )
+    parser.add_argument("--version", action="version", version=f"battery_env {_VERSION}")
     _add_files(parser)
     _add(parser.add_argument_group("calibration"), _CALIBRATION, default=argparse.SUPPRESS)
     _add(parser.add_argument_group("results"), _RESULTS)
@@ -224,7 +248,7 @@ def _fit_parser(name: str) -> argparse.ArgumentParser:
     _add_files(parser)
     group = parser.add_argument_group("fit")
     group.add_argument(
-        "--cut-off", type=float, default=2.7, metavar="V", help="voltage at which the discharge ends, V (default: %(default)s)"
+        "--cut-off", type=float, default=CUT_OFF_V, metavar="V", help="where the discharge ends, V (default: %(default)s)"
     )
     group.add_argument("--isothermal", action="store_true", help="keep the temperature of the model constant")
     group.add_argument(
@@ -237,18 +261,54 @@ def _fit_parser(name: str) -> argparse.ArgumentParser:
     return parser
 
 
+def _forecast_parser(name: str) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=name,
+        description=(
+            "Forecast the end of a discharge in progress, with an interval that holds nine of ten ends, from the life of its "
+            "cell and the load to come."
+        ),
+        epilog="Exit status: 0, 3 if something in the record contradicts the estimate, or 2 if something cannot be used.",
+        allow_abbrev=False,
+    )
+    _add_files(parser, many=False)
+    group = parser.add_argument_group("forecast")
+    group.add_argument(
+        "--life",
+        nargs="+",
+        default=(),
+        metavar="FILE",
+        help="discharges of the cell before this one, oldest first: files, folders of them, or a bundled cell. They say what "
+        "q_mobile to expect",
+    )
+    group.add_argument(
+        "--load",
+        type=Path,
+        metavar="FILE.csv",
+        help="the load to come: time_s, from 0 at the last sample under load, and current_A or power_W, each held until the "
+        "next (default: as so far)",
+    )
+    known = ("--cut-off", "--prior", "--initial-soc", "--mismatch", "--cell", "--nominal", "--ambient", "--isothermal")
+    options = {flags: how for flags, how in _CALIBRATION.items() if flags[0] in known}
+    _add(parser.add_argument_group("calibration"), options, default=argparse.SUPPRESS)
+    group = parser.add_argument_group("results")
+    group.add_argument("--out", type=Path, metavar="DIR", help="write a figure and a JSON file there; neither may exist")
+    group.add_argument("--json", action="store_true", help="print one JSON object")
+    return parser
+
+
 def _add(group: Any, options: _Options, **common: Any) -> None:
     for flags, how in options.items():
         group.add_argument(*flags, **common, **how)
 
 
-def _add_files(parser: argparse.ArgumentParser) -> None:
+def _add_files(parser: argparse.ArgumentParser, many: bool = True) -> None:
     parser.add_argument(
-        "records",
-        nargs="+",
+        "records" if many else "record",
+        nargs="+" if many else None,
         metavar="FILE",
-        help="text of any delimiter, Parquet, NASA's .mat, Neware's .nda and .ndax, BioLogic's .mpr; a folder of them; "
-        "FILE:CYCLE for one discharge of a life; or a bundled cell, B0005, and its discharge, B0005:12",
+        help="text of any delimiter, Parquet, NASA's .mat, Neware's .nda and .ndax, BioLogic's .mpr; a folder of them, or of "
+        "folders; FILE:CYCLE for one discharge of a life; or a bundled cell, B0005, and its discharge, B0005:12",
     )
     group = parser.add_argument_group("reading")
     _add(group, _FILES)
@@ -259,22 +319,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command."""
     given = sys.argv[1:] if arguments is None else list(arguments)
     parser = argparse.ArgumentParser(prog="python -m battery_env", description="Calibrate a battery model to real cells.")
+    parser.add_argument("--version", action="version", version=f"battery_env {_VERSION}")
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("calibrate", help="capacity and resistance of cells from their discharges", add_help=False)
     commands.add_parser("fit", help="the constants of a cell from a few of its discharges", add_help=False)
-    command = {"calibrate": calibrate, "fit": fit}[parser.parse_args(given[:1]).command]
+    commands.add_parser("forecast", help="the end of a discharge in progress", add_help=False)
+    command = {"calibrate": calibrate, "fit": fit, "forecast": forecast}[parser.parse_args(given[:1]).command]
     return command(given[1:], f"{parser.prog} {given[0]}")
 
 
-def calibrate(arguments: Sequence[str] | None = None, name: str = "battery-calibrate") -> int:
-    """The command ``calibrate``, which is also installed as ``battery-calibrate``."""
-    options = _parser(name).parse_args(arguments)
+def calibrate(arguments: Sequence[str] | None = None, name: str = _INSTALLED) -> int:
+    """The command ``calibrate``, which is also installed as ``battery-calibrate``, as are others by their names behind it."""
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    if name == _INSTALLED and given[:1] in (["fit"], ["forecast"]):
+        return {"fit": fit, "forecast": forecast}[given[0]](given[1:], f"{name} {given[0]}")
+    options = _parser(name).parse_args(given)
     done: list[Outcome] = []
     interrupted = False
     try:
         settings = _settings(options)
         settings.calibrator()  # what it refuses it refuses of every file
-        sources = find_sources(options.records)
+        sources = find_sources(options.records, options.cell_name)
         results = Results(options.out, sources, not options.table_only, options.force) if options.out else None
         try:
             with workers(options.jobs, options.scheduler) as executor:
@@ -365,6 +430,43 @@ def fit(arguments: Sequence[str] | None = None, name: str = "python -m battery_e
     return NOT_SETTLED if found.doubt else SETTLED
 
 
+def forecast(arguments: Sequence[str] | None = None, name: str = "python -m battery_env forecast") -> int:
+    """
+    The command ``forecast``.
+
+    :param arguments: as in :func:`main`, without the name of the command
+    :param name: of the program, for its help
+    :return: 0, 3 if something in the record contradicts the estimate, or 2 if there is none; a line on standard error says why
+    """
+    options = _forecast_parser(name).parse_args(arguments)
+    from battery_env.app.forecast import EndFiles, end_of_record  # here, as matplotlib takes long to import
+
+    try:
+        settings, file_format = _settings(options), _file_format(options)
+        if options.life and settings.prior_q_mobile_C is not None:
+            raise ValueError("--life and --prior say the same: give one of them")
+        files = EndFiles(options.out, options.record) if options.out else None
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            try:
+                end = end_of_record(options.record, settings, file_format, options.life, options.load)
+            finally:
+                for each in caught:
+                    print(f"warning: {each.message}", file=sys.stderr)
+        print(json.dumps(end.row()) if options.json else end.text())
+        if files:
+            files.write(end)
+            if not options.json:
+                print(f"\nwritten: {files.table}, {files.figure}")
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except (ValueError, TypeError, OSError, ImportError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return REFUSED
+    return NOT_SETTLED if end.contradicted else SETTLED
+
+
 def _discharges(records: Sequence[str], file_format: FileFormat) -> list[Discharge]:
     """All that the arguments name, each with the cell and the number that it is shown by."""
     discharges = []
@@ -374,7 +476,7 @@ def _discharges(records: Sequence[str], file_format: FileFormat) -> list[Dischar
             try:
                 recordings = read_source(source, file_format)
                 for number, recording in enumerate(recordings, start=1):
-                    meta = {"cycle": number, **recording.meta, "cell": source.stem}
+                    meta = {"cycle": number, **recording.meta, "cell": source.cell}
                     discharges.append(recording._replace(meta=meta).discharge())
             except Exception as error:  # readers of files raise what they like
                 text = " ".join(str(error).split())
@@ -407,7 +509,7 @@ def _conclude(done: Sequence[Outcome], settings: Settings) -> None:
         if settings.method == "policy":
             print(f"calibrated by {settings.calibrated_by}")
     elif done and done[0].found:
-        print(text_of(done[0].record, done[0].found, settings))
+        print(text_of(done[0].record, done[0].found))
 
 
 def _plain(value: Any) -> Any:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import io
 import multiprocessing
+import os
 import re
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -16,7 +17,7 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from battery_env.app.calibrate import Calibration, Settings, calibrate, title_of
+from battery_env.app.calibrate import METHOD_NAMES, Calibration, Settings, calibrate, title_of
 from battery_env.cells import BUNDLED_CELLS, load_nasa_discharges
 from battery_env.files import check_folder, replacing
 from battery_env.record_files import Recording, read_recordings
@@ -38,11 +39,13 @@ class Source(NamedTuple):
     :param path: a file, or the name of a bundled cell
     :param cycle: which discharge; ``None``: all of them
     :param stem: what names of results start with
+    :param cell: which cell it is of
     """
 
     path: str
     cycle: int | None
     stem: str
+    cell: str
 
     @property
     def argument(self) -> str:
@@ -65,27 +68,51 @@ class FileFormat:
     discharge_is_negative: bool | None = None
 
 
-def find_sources(arguments: Iterable[str]) -> list[Source]:
-    """What the arguments of a command line name."""
+def find_sources(arguments: Iterable[str], cell_name: re.Pattern[str] | None = None) -> list[Source]:
+    """
+    What the arguments of a command line name. A cell is called as its file; as its folder, if folders are given and their
+    records lie in several; or as the group that a pattern finds in the name of the file.
+    """
+    arguments = list(arguments)
+    inside = {argument: _records(Path(argument)) for argument in arguments if Path(argument).is_dir()}
+    folders = {file.parent.absolute() for files in inside.values() for file in files}
     sources = []
     for argument in arguments:
-        path = Path(argument)
-        if path.is_dir():
-            files = sorted(entry for entry in path.iterdir() if _is_record(entry))
-            sources += [Source(str(file), None, _stem(file)) for file in files] or [Source(argument, None, path.name)]
+        if inside.get(argument):
+            sources += [Source(str(file), None, *_names(file, folders)) for file in inside[argument]]
             continue
         name, colon, cycle = argument.rpartition(":")
-        if colon and cycle.isdecimal() and not path.exists():
-            stem = name if name in BUNDLED_CELLS else _stem(Path(name))
-            sources.append(Source(name, int(cycle), stem))
-        else:
-            sources.append(Source(argument, None, argument if argument in BUNDLED_CELLS else _stem(path)))
-    return sources
+        if not (colon and cycle.isdecimal()) or Path(argument).exists():
+            name, cycle = argument, ""
+        stem = name if name in BUNDLED_CELLS else _stem(Path(name))
+        sources.append(Source(name, int(cycle) if cycle else None, stem, stem))
+    if cell_name is None:
+        return sources
+    found = [cell_name.search(Path(source.path).name) for source in sources]
+    return [source._replace(cell=match[1]) if match else source for source, match in zip(sources, found, strict=True)]
 
 
-def _is_record(path: Path) -> bool:
-    hidden = path.name.startswith(".") or path.name in _NO_RECORDS
-    return path.is_file() and not hidden and not _is_result(path) and is_readable(path, (_NASA_SUFFIX,))
+def _records(folder: Path) -> list[Path]:
+    """The files in a folder, and in those in it, that may be records."""
+    return sorted(
+        path
+        for path in folder.rglob("*")
+        if path.is_file()
+        and not any(part.startswith(".") for part in path.relative_to(folder).parts)
+        and path.name not in _NO_RECORDS
+        and not _is_result(path)
+        and is_readable(path, (_NASA_SUFFIX,))
+    )
+
+
+def _names(file: Path, folders: Collection[Path]) -> tuple[str, str]:
+    """Stem and cell of a file that was found in one of some folders."""
+    if len(folders) == 1:
+        return _stem(file), _stem(file)
+    common = Path(os.path.commonpath(folders))
+    folder = file.parent.absolute()
+    cell = folder.name if folder == common else folder.relative_to(common).as_posix()
+    return f"{cell.replace('/', '_')}_{_stem(file)}", cell
 
 
 def _is_result(path: Path) -> bool:
@@ -113,7 +140,7 @@ def read_source(source: Source, file_format: FileFormat) -> list[Recording]:
         ]
     elif Path(path).is_dir():
         endings = ", ".join((*TEXT_SUFFIXES, *BINARY_SUFFIXES, _NASA_SUFFIX))
-        raise ValueError(f"{path} holds no file whose name ends as that of a record ({endings})")
+        raise ValueError(f"{path} holds no file whose name ends as that of a record ({endings}), nor do the folders in it")
     elif not Path(path).exists():
         raise FileNotFoundError(
             f"no file {source.argument!r}; the bundled cells are given as {BUNDLED_CELLS[0]}:1, {BUNDLED_CELLS[0]}:2, ..."
@@ -173,7 +200,7 @@ class Results:
                 part.write_bytes(content)
 
     def write_table(self, outcomes: Sequence[Outcome]) -> list[Path]:
-        """Write the table of all discharges and, if there are several, the figure of their parameters over them."""
+        """Write the table of all discharges and, if several are whole, the figure of their parameters over them."""
         table = pd.DataFrame([each.row() for each in outcomes]).astype({"cycle": "Int64"})
         table["settled"] = table["settled"].astype("boolean")
         with replacing(self.table) as part:
@@ -185,10 +212,11 @@ class Results:
             written.append(self.parquet)
         except ImportError:
             pass
-        if (table["error"] == "").sum() > 1:
+        whole = table[table["measured_eod_time_s"].notna()]
+        if len(whole) > 1:
             from battery_env.plotting import plot_life, save_figure
 
-            written.append(save_figure(plot_life(table[table["error"] == ""]), self.life))
+            written.append(save_figure(plot_life(whole), self.life))
         return written
 
 
@@ -199,7 +227,7 @@ class Outcome:
 
     :param record: what it is called in results
     :param source: file or bundled cell
-    :param cell: stem of the source
+    :param cell: that of the source
     :param cycle: number of the discharge; ``None`` if it has none
     :param found: what it says; ``None`` if it could not be used
     :param notes: warnings
@@ -348,7 +376,7 @@ def _recordings(read: Iterable[tuple[tuple[Any, ...], _Attempt]]) -> Iterator[tu
         for recording in [None] if error else recordings:
             cycle = source.cycle if recording is None else recording.meta.get("cycle")
             name = _unused(record_name(source.stem, cycle), used)
-            yield Outcome(name, source.path, source.stem, cycle, notes="; ".join(notes), error=error), recording
+            yield Outcome(name, source.path, source.cell, cycle, notes="; ".join(notes), error=error), recording
 
 
 def record_name(stem: str, cycle: int | None) -> str:
@@ -391,5 +419,6 @@ def _voltages(name: str, found: Calibration) -> dict[str, bytes]:
     columns = {"time_s": record.time_s, "voltage_V": record.voltage_V, "current_A": record.current_A}
     table = pd.DataFrame(columns | {"model_V": forecast.at_samples_V}).to_csv(index=False)
     picture = io.BytesIO()
-    plot_discharge(record, {"model": forecast}, title_of(name, found)).savefig(picture, dpi="figure")
+    shown = {f"model, {METHOD_NAMES[found.method]}": forecast}
+    plot_discharge(record, shown, title_of(name, found), found.end_quantiles_s).savefig(picture, dpi="figure")
     return {"csv": table.encode(), "png": picture.getvalue()}

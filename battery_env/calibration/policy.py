@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from battery_env.arrays import FloatArray
 from battery_env.calibration.aging import BatteryAging
-from battery_env.calibration.confidence import NO_FIT, Confidence
+from battery_env.calibration.confidence import Confidence
 from battery_env.calibration.env import CalibrationEnv, task_class
 from battery_env.calibration.nuisance import Fitted
 from battery_env.calibration.pretrained import pretrained_policy
@@ -23,10 +23,10 @@ from battery_env.calibration.voltage import VoltageTask
 from battery_env.electrochemistry import NEW_CELL, STATE_SIZE, UNCERTAIN_CONSTANTS
 from battery_env.estimates import last_estimate
 from battery_env.estimators.base import SURPLUS_SHARE, Estimate, EstimateTrace, ModelNow, OnlineEstimator, Record
+from battery_env.estimators.diagnosis import Condition
 from battery_env.record_model import RecordModel
 from battery_env.records import Samples, check_drawn_charge, check_record, check_sample, drawn, starts_at_rest
 
-_NOT_YET = "The policy states nothing before its next decision."
 # Steps in which a stream is followed, s
 _STEP_S = 1.0
 
@@ -107,21 +107,30 @@ def _without_data(env_id: str, options: dict[str, Any]) -> dict[str, Any]:
 
 class PolicyEstimator(OnlineEstimator):
     """
-    A policy, in closed loop with the model over whole discharges; all discharges run as one batch.
+    Estimate q_max and R_o with a trained policy, over whole discharges or sample by sample.
 
-    One of a full-state environment estimates at every step, with the model's state running free from the true state at the
-    first sample. One of a voltage-only environment starts with the estimate of a new cell and moves it at a fixed interval;
-    it takes any record that starts fully charged, simulated or recorded. One of ``BatteryAging-v0`` takes such records life
-    after life, ``cycles`` of them each, and carries its estimate over from one to the next.
+    .. code-block:: python
 
-    One of a voltage-only environment of single discharges also follows a stream (:meth:`update`): its estimate is the new
-    cell's until ``decision_s`` are over, and moves every ``decision_s`` from then on. What :meth:`save` wrote is refused with
-    another :class:`~battery_env.calibration.onnx_policy.OnnxPolicy`; models of Stable-Baselines3 are not told from each other.
+      from battery_env import PolicyEstimator, load_nasa_discharges
 
-    A policy whose observation has a fit (option ``nuisance``) states standard deviations: those of the fit under its priors,
-    with the distance of the estimate from it. It has settled where these are as small as least squares ask for, the residuals
-    of the fit are noise, its offset and constants are such as the policy has learned of, and nothing in the record
-    contradicts it. They hold for records with a sample for each reading. Other policies state nothing, and never settle.
+      whole = load_nasa_discharges("B0005")[0].loaded_part(cut_off_V=2.7)
+      print(PolicyEstimator.pretrained(recorded=True).estimate(whole))  # a policy that comes with the package
+
+    A model of your own is ``PolicyEstimator(model, "BatteryRo-v0")``, with the options of the environment that it was trained
+    on. Discharges that are estimated together run as one batch.
+
+    - A policy of a full-state environment estimates at every step, from the true state at the first sample on.
+    - A policy of a voltage-only environment starts with the estimate of a new cell, and moves it every ``decision_s``. It
+      takes any record that starts fully charged, simulated or recorded, or a stream (:meth:`update`).
+    - A policy of ``BatteryAging-v0`` takes such records life after life, ``cycles`` of them each, and carries its estimate
+      over from one to the next. It takes no stream.
+
+    A policy states standard deviations if its observation has a fit (option ``nuisance``): those of the fit under its priors,
+    with the distance of the estimate from it. It has settled if they are as small as least squares ask for, the fit explains
+    the record, and nothing in the record contradicts it. Other policies state none, and never settle.
+
+    What :meth:`save` wrote is refused with another :class:`~battery_env.calibration.onnx_policy.OnnxPolicy`; models of
+    Stable-Baselines3 are not told from each other.
 
     :param policy: what to ask for actions, deterministically
     :param env_id: id of the environment that the policy was trained on
@@ -196,7 +205,8 @@ class PolicyEstimator(OnlineEstimator):
 
     def _judge(self) -> None:
         """Tell how sure the estimate is, of the samples up to the last decision."""
-        self._sd, self._reason = [nan, nan], NO_FIT if self._confidence is None else _NOT_YET
+        self._sd = [nan, nan]
+        self._reason = Condition.NO_FIT.text if self._confidence is None else Condition.NOT_YET.text
         if self._confidence is not None and self._fitted is not None:
             samples = self._readings.known(self._decisions * self.decision_s)
             (sd,) = self._confidence.standard_deviations(self._fitted, self._now[None])
@@ -226,7 +236,7 @@ class PolicyEstimator(OnlineEstimator):
         :param dt_s: time since the previous sample, s; without meaning at the first one
         :param temperature_C: must be ``None``: the model of the environments is isothermal
         :return: the estimate, as of the last decision
-        :raises ValueError: for what cannot be meant, a temperature, or a policy that takes no stream
+        :raises ValueError: for invalid values, a temperature, or a policy that takes no stream
         """
         self.check(voltage_V, current_A, dt_s, temperature_C)
         readings = self._readings
@@ -300,7 +310,7 @@ class PolicyEstimator(OnlineEstimator):
 
         :param record: one discharge; with the full state a simulated one, as no recording has it
         :return: the estimate
-        :raises ValueError: for a record that cannot be meant
+        :raises ValueError: for an invalid record
         """
         time_s, _, current_A = check_record(record)
         check_drawn_charge(float(drawn(time_s, current_A, time_s[-1])))
@@ -308,7 +318,7 @@ class PolicyEstimator(OnlineEstimator):
         if trace.sd_q_mobile is not None:
             return last_estimate(trace)
         q_mobile, r_o = (self.task_class.conclude(values) for values in (trace.q_mobile, trace.r_o))
-        return Estimate(q_mobile, r_o, settled=False, reason=NO_FIT)
+        return Estimate(q_mobile, r_o, settled=False, reason=Condition.NO_FIT.text)
 
     def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:
         """

@@ -22,7 +22,7 @@ from battery_env.calibration.nuisance import Fitted, NuisanceFit
 from battery_env.calibration.readings import CURRENT, MEASURED, OHMIC, SHOWN, Readings, explain
 from battery_env.calibration.task import OBSERVATION_LIMIT, CalibrationTask, check_counts, check_not_negative, checked_action
 from battery_env.electrochemistry import UNCERTAIN_CONSTANTS, CellParameters, check_cell
-from battery_env.estimators.settling import white_noise_V
+from battery_env.estimators.diagnosis import white_noise_V
 from battery_env.parameters import PARAMETER_NAMES, columns_of
 from battery_env.records import Record
 from battery_env.sensors import RandomSensorErrors

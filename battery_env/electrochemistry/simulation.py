@@ -342,7 +342,17 @@ def simulate(
     max_duration_s: float = 86_400.0,
 ) -> Trajectory:
     """
-    Discharge one cell under a load, from full charge (or from ``initial``), compiled.
+    Discharge one cell of a given age under a load, from full charge (or from ``initial``).
+
+    .. code-block:: python
+
+      from battery_env import simulate
+
+      aged = simulate(8.0, q_mobile=6000.0, r_o=0.15)  # 8 W
+      print(aged.eod_time_s, aged.voltage_V.min())
+
+    ``cell`` has the constants, and ``q_mobile`` and ``r_o`` the age. For many cells take
+    :class:`~battery_env.trajectories.TrajectoryDataset`.
 
     :param load: a number; an array, one value a step; or a function of time in s (a :class:`battery_env.loads.Load`)
         that takes an array, and whose value at the start of each step holds for the step. Power in W or current in A

@@ -150,7 +150,7 @@ class OnlineEstimator(Estimator):
         :param temperature_C: of the cell, degC; ``None``: not measured
         :return: the estimate
         :raises TypeError: for what is no number
-        :raises ValueError: for values that cannot be meant; after either error the estimator is as it was
+        :raises ValueError: for invalid values; after either error the estimator is as it was
         """
 
     def check(self, voltage_V: float, current_A: float, dt_s: float, temperature_C: float | None = None) -> None:
@@ -216,7 +216,7 @@ class OnlineEstimator(Estimator):
         :param cut_off_V: V; ``None``: the ``VEOD`` of the cell
         :param load_unit: ``"current"`` in A or ``"power"`` in W
         :return: time and standard deviation
-        :raises ValueError: for a load that cannot be meant, also for one that varies and charges the cell beyond full, and for
+        :raises ValueError: for an invalid load, also for one that varies and charges the cell beyond full, and for
             an array that ends before the discharge does
         """
         now = self.now()
@@ -368,7 +368,7 @@ class OnlineBatch:
 def check_bounds(
     q_mobile_bounds_C: tuple[float, float], r_o_bounds_ohm: tuple[float, float]
 ) -> dict[str, tuple[float, float]]:
-    """Refuse bounds that cannot be meant."""
+    """Refuse invalid bounds."""
     given = zip(PARAMETERS.values(), (q_mobile_bounds_C, r_o_bounds_ohm), strict=True)
     return {parameter.name: parameter.check_bounds(f"the bounds of {parameter.name}", bounds) for parameter, bounds in given}
 

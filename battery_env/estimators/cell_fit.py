@@ -23,13 +23,13 @@ from battery_env.checks import check_numbers, check_positive
 from battery_env.electrochemistry import NEW_CELL, CellParameters, check_cell, check_dt
 from battery_env.electrochemistry.tangents import BY_Q, BY_R, RATE_CONSTANTS
 from battery_env.estimates import Estimate
+from battery_env.estimators.diagnosis import FULL_REST_V, MISMATCH_MARGIN, rest_voltage_V
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.search import MARGIN, OnGrid, distance_C, minimized, square
-from battery_env.estimators.settling import FULL_REST_V, MISMATCH_MARGIN, rest_voltage_V
 from battery_env.files import WrongFormatError, read_json, write_json
 from battery_env.parameters import Q_MOBILE, R_O
 from battery_env.record_model import RecordModel
-from battery_env.records import SWITCH_SHARE, Record, check_drawn_charge, check_record, drawn
+from battery_env.records import CUT_OFF_V, SWITCH_SHARE, Record, check_drawn_charge, check_record, drawn
 
 #: How well the constants that say how fast a cell follows its load are known before any data: standard deviations of their
 #: logarithms. The overpotential of kn stands for whatever slows a worn cell down, so that it may differ most.
@@ -329,7 +329,7 @@ def read_cell(path: str | os.PathLike[str]) -> CellFit | CellParameters:
 
 def fit_cell(
     discharges: Sequence[Record],
-    cut_off_V: float = 2.7,
+    cut_off_V: float = CUT_OFF_V,
     start: CellParameters | None = None,
     thermal: bool = True,
     dt_s: float = 1.0,

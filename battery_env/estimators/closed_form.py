@@ -9,15 +9,10 @@ import numpy as np
 from battery_env.electrochemistry import FULL_CHARGE_SHARES, NEW_CELL, QNB, QNS, VO, CellParameters, Trajectory
 from battery_env.estimates import Estimate, EstimateTrace
 from battery_env.estimators.base import Estimator
-from battery_env.estimators.settling import IMPLAUSIBLE, first_reason, is_plausible
+from battery_env.estimators.diagnosis import Condition, Diagnosis, is_plausible
 
 # The charges of the state agree with the current within this share.
 _CHARGE_SHARE = 0.02
-_NO_CURRENT = "No current flows in the last step, so that r_o does not show."
-_CONTRADICTED = (
-    "The charge that moves in the last step, {:.4g} C, is not that of the current, {:.4g} C: check time, current and their "
-    "units."
-)
 
 
 class ClosedForm(Estimator):
@@ -46,14 +41,12 @@ class ClosedForm(Estimator):
         q_mobile, r_o = float(trace.q_mobile[-1]), float(trace.r_o[-1])
         negative_C = record.state[-2:, [QNB, QNS]].sum(axis=1)
         moved_C, drawn_C = float(negative_C[0] - negative_C[1]), float(record.current_A[-2]) * record.dt_s
-        reason = first_reason(
-            [
-                (np.isnan(r_o), _NO_CURRENT),
-                (abs(moved_C - drawn_C) > _CHARGE_SHARE * abs(moved_C), _CONTRADICTED.format(moved_C, drawn_C)),
-                (not is_plausible(q_mobile, self.cell), IMPLAUSIBLE),
-            ]
-        )
-        return Estimate(q_mobile, r_o, settled=not reason, reason=reason)
+        diagnosis = Diagnosis()
+        diagnosis.note(Condition.NO_CURRENT, bool(np.isnan(r_o)))
+        contradicted = abs(moved_C - drawn_C) > _CHARGE_SHARE * abs(moved_C)
+        diagnosis.note(Condition.CHARGE_DIFFERS, contradicted, moved_C=moved_C, drawn_C=drawn_C)
+        diagnosis.note(Condition.IMPLAUSIBLE, not is_plausible(q_mobile, self.cell))
+        return Estimate(q_mobile, r_o, settled=not diagnosis.reason, reason=diagnosis.reason)
 
     def trace(self, records: Sequence[Trajectory]) -> list[EstimateTrace]:  # type: ignore[override]
         """

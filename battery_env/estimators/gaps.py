@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
 from battery_env.arrays import FloatArray, IntArray
+from battery_env.estimators.diagnosis import Condition, Diagnosis
 from battery_env.records import REST_CURRENT_A, SWITCH_SHARE
 
 #: An interval between two samples is a gap where it is so many times longer than those before and after it, and what its load
@@ -97,6 +99,14 @@ def find_gaps(
             said = UNSURE  # the load was switched, nobody knows when
         gaps.append(Gap(float(time_s[n]), float(time_s[n + 1]), float(charge_C), said))
     return gaps
+
+
+def note_gaps(diagnosis: Diagnosis, gaps: Sequence[Gap], doubt_counts: bool = True) -> None:
+    """Note the first gap whose charge was not drawn, and the first one that leaves it in doubt, if a doubt counts."""
+    for start_s, end_s, charge_C, said in gaps:
+        diagnosis.note(Condition.NOT_DRAWN, said == NOT_DRAWN, since_s=start_s, fault_s=end_s, size=charge_C)
+        in_doubt = said == UNSURE and doubt_counts
+        diagnosis.note(Condition.GAP_UNSURE, in_doubt, gap_start_s=start_s, gap_end_s=end_s, gap_C=charge_C)
 
 
 def _said(n: int, usual_s: float, time_s: FloatArray, parted_V: FloatArray, fall_V: float) -> int:

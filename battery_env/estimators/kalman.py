@@ -16,11 +16,11 @@ from battery_env.electrochemistry import STATE_SIZE, CellParameters, PackedConst
 from battery_env.electrochemistry.tangents import PolynomialDerivatives
 from battery_env.estimates import Estimate, Estimates, EstimateTrace
 from battery_env.estimators.base import SURPLUS_SHARE, ModelNow, OnlineBatch, OnlineEstimator, check_bounds
-from battery_env.estimators.kalman_bank import filters_of_prior, take
-from battery_env.estimators.kalman_state import CELL, ESTIMATE, FILTER, SAMPLE, Settings
-from battery_env.estimators.monitor import Verdict, reason, watch
+from battery_env.estimators.diagnosis import Condition, rest_voltage_V
+from battery_env.estimators.kalman_bank import conclude, filters_of_prior, take
+from battery_env.estimators.kalman_state import CELL, ESTIMATE, FILTER, SAMPLE, Q, R, Settings
+from battery_env.estimators.monitor import begin, examine, follow_gaps, measured, remember
 from battery_env.estimators.rest import check_initial_soc
-from battery_env.estimators.settling import rest_voltage_V
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, check_parameters
 from battery_env.records import Record, Stream, are_plausible, check_drawn_charge, check_sample, starts_at_rest
 
@@ -29,8 +29,8 @@ _PRIOR_SD_R_OHM = 0.15
 _HOUR_S = 3600.0
 _NOISE_V = 0.005
 _ZERO_CELSIUS_K = 273.15
-# What a reason is made of
-_SEEN = ("start", "fault", "gap", "start_V")
+# What reasons are made of
+_SHOWN = ("start", "fault", "gap", "start_V")
 
 
 class ExtendedKalmanFilter(OnlineEstimator):
@@ -63,9 +63,9 @@ class ExtendedKalmanFilter(OnlineEstimator):
     fractions never leave 0 .. 1. If ``q_mobile`` is held and too small for that, the estimate freezes and is not settled.
 
     *Standard deviations* count the error of the model as noise that is new with each sample. As it is not, that of
-    ``q_mobile`` does not fall below half of what :class:`~battery_env.estimators.LeastSquares` states for an error common to
-    the whole discharge, up to 1 % of ``q_mobile``: on whole discharges of the bundled cells, with ``mismatch_V=0.05``, it is
-    0.7 to 1 %.
+    ``q_mobile`` does not fall below what an error common to the whole discharge leaves open: before the knee what
+    :class:`~battery_env.estimators.LeastSquares` state, and at the knee what an error of twice ``mismatch_V`` at every sample
+    does, as a larger one would show. On whole discharges of the bundled cells that is about 1.2 % with ``mismatch_V=0.05``.
 
     The gain of the current sensor scales both parameters and does not show in the voltage: state it as ``current_gain_sd``.
 
@@ -75,15 +75,16 @@ class ExtendedKalmanFilter(OnlineEstimator):
     then; the first one is also that of its surroundings.
 
     *Settled* means that the data determine every parameter searched for: its standard deviation, without what a given prior
-    adds to it, is below :data:`~battery_env.estimators.settling.SETTLED_SHARES` of its value; and that nothing contradicts it:
-    not the start of the record, the voltage where the load is switched, steady or not logged, a bound, the kind of cell, the
-    prior, nor the innovations, which may not go the same way again and again, with twice ``mismatch_V`` allowed for. Otherwise
-    ``reason`` of the estimate says which of these does not hold, the first one in the order of
-    :class:`~battery_env.estimators.monitor.Verdict`. An estimate that rests on a prior is not settled: it is as good as the
-    prior.
+    adds to it, is below :data:`~battery_env.estimators.diagnosis.SETTLED_SHARES` of its value; and that nothing contradicts
+    it: not the start of the record, the voltage where the load is switched, steady or not logged, a bound, the kind of cell,
+    the prior, nor the innovations, which may not go the same way again and again, with twice ``mismatch_V`` allowed for.
+    Otherwise ``reason`` of the estimate says which of these does not hold, the first one in the order of
+    :class:`~battery_env.estimators.diagnosis.Condition`. An estimate that rests on a prior is not settled: it is as good as
+    the prior.
 
-    For a recorded discharge give :meth:`battery_env.cells.Discharge.loaded_part`, which starts when the load is switched on,
-    and state the error of the model as ``mismatch_V``: 0.05 V for the cells that come with the package.
+    The defaults are those of simulated records. For recorded cells take :func:`battery_env.calibrate`, or
+    ``battery_env.Settings(method="kalman").calibrator()``: a model of the temperature, and the errors of model and sensor to
+    expect. Give it :meth:`battery_env.cells.Discharge.loaded_part`, which starts when the load is switched on.
 
     :param parameters: which to search for; the other is held at ``cell``'s value
     :param cell: constants of the model; ``None``: the new cell's
@@ -187,7 +188,8 @@ class ExtendedKalmanFilter(OnlineEstimator):
         """Let the model start at this temperature, and in surroundings of it."""
         self._cells["ambient_K"] = ambient_K
         cell = self._cell_now()
-        self._cells["constants"], self._cells["start_V"] = cell.packed.constants, rest_voltage_V(cell, self.initial_soc[0])
+        self._cells["constants"] = cell.packed.constants
+        self._cells["seen"]["start_V"] = rest_voltage_V(cell, self.initial_soc[0])
         self._filters[0] = self._start(cell)
 
     def _cell_now(self) -> CellParameters:
@@ -196,10 +198,10 @@ class ExtendedKalmanFilter(OnlineEstimator):
 
     def check(self, voltage_V: float, current_A: float, dt_s: float, temperature_C: float | None = None) -> None:
         """Refuse a sample that :meth:`update` would refuse, and change nothing."""
-        cell = self._cells[0]
-        before_A = float(cell["current_A"]) if cell["samples"] else None
+        seen = self._cells["seen"][0]
+        before_A = float(seen["current_A"]) if seen["samples"] else None
         check_sample(voltage_V, current_A, dt_s, temperature_C, before_A)
-        check_drawn_charge(float(cell["drawn_C"]) + (0.0 if before_A is None else dt_s * before_A), self.least_drawn_C)
+        check_drawn_charge(float(seen["drawn_C"]) + (0.0 if before_A is None else dt_s * before_A), self.least_drawn_C)
 
     def update(self, voltage_V: float, current_A: float, dt_s: float, temperature_C: float | None = None) -> Estimate:
         """
@@ -208,15 +210,15 @@ class ExtendedKalmanFilter(OnlineEstimator):
         """
         self.check(voltage_V, current_A, dt_s, temperature_C)
         temperature_K = nan if temperature_C is None else temperature_C + _ZERO_CELSIUS_K
-        if not self._cells["samples"][0]:
+        if not self._cells["seen"]["samples"][0]:
             dt_s = 0.0
             if not isnan(temperature_K):
                 self._begin(temperature_K)
         sample = np.array([[(voltage_V, current_A, dt_s, temperature_K)]], dtype=SAMPLE)
         said = self._follow(self._cells, self._filters, sample)[0, 0]
-        code, (sd_q_mobile, sd_r_o) = int(said["code"]), said["sd"].tolist()
-        text = reason(code, self._cells[0], self.initial_soc[0]) if code else ""
-        return Estimate(float(said["q_mobile"]), float(said["r_o"]), sd_q_mobile, sd_r_o, not code, text)
+        condition, (sd_q_mobile, sd_r_o) = Condition.numbered(said["condition"]), said["sd"].tolist()
+        text = condition.said(measured(self._cells["seen"][0], self.initial_soc[0]))
+        return Estimate(float(said["q_mobile"]), float(said["r_o"]), sd_q_mobile, sd_r_o, not text, text)
 
     def _follow(self, cells: NDArray[np.void], filters: NDArray[np.void], samples: NDArray[np.void]) -> NDArray[np.void]:
         """What filters of these rows estimate after samples, shape (samples, cells)."""
@@ -239,14 +241,14 @@ class ExtendedKalmanFilter(OnlineEstimator):
             samples["temperature_K"][:, 0] = nan if temperature_C is None else temperature_C + _ZERO_CELSIUS_K
             if temperature_C is not None:
                 self._begin(float(samples["temperature_K"][0, 0]))
-            self._cells["start"]["at_rest"] = starts_at_rest(record)
+            self._cells["seen"]["start"]["at_rest"] = starts_at_rest(record)
             check_drawn_charge(float(np.cumsum(np.append(0.0, current_A[:-1]) * dt_s).min()), self.least_drawn_C)
             said = self._follow(self._cells, self._filters, samples)[:, 0]
-            clock_s, soc = float(time_s[0]), self.initial_soc[0]
-            texts = {code: reason(code, self._cells[0], soc, clock_s) for code in np.unique(said["code"]).tolist()}
+            shown = measured(self._cells["seen"][0], self.initial_soc[0], float(time_s[0]))
+            texts = {number: Condition.numbered(number).said(shown) for number in np.unique(said["condition"]).tolist()}
             sd_q, sd_r_o = said["sd"].T.copy()
-            reasons = np.array([texts[code] for code in said["code"].tolist()], dtype=object)
-            columns = (said["q_mobile"].copy(), said["r_o"].copy(), sd_q, sd_r_o, said["code"] == Verdict.SETTLED, reasons)
+            reasons = np.array([texts[number] for number in said["condition"].tolist()], dtype=object)
+            columns = (said["q_mobile"].copy(), said["r_o"].copy(), sd_q, sd_r_o, reasons == "", reasons)
             traces.append(EstimateTrace(time_s, *columns))
         self.reset()
         return traces
@@ -328,16 +330,16 @@ class KalmanBatch(OnlineBatch):
         self, voltage_V: ArrayLike, current_A: ArrayLike, dt_s: ArrayLike, temperature_C: ArrayLike | None = None
     ) -> Estimates:
         """Take in one sample of each cell: of all, or of none if one is refused."""
-        cells, one = self._cells, self.estimators[0]
-        is_first = cells["samples"] == 0
+        cells, seen, one = self._cells, self._cells["seen"], self.estimators[0]
+        is_first = seen["samples"] == 0
         samples = np.zeros((1, len(cells)), SAMPLE)
         (of,) = samples
         of["voltage_V"], of["current_A"] = check_numbers("voltage_V", voltage_V), check_numbers("current_A", current_A)
         of["dt_s"] = np.where(is_first, 0.0, check_numbers("dt_s", dt_s))
         degrees_C = None if temperature_C is None else np.asarray(temperature_C, dtype=np.float64)
         of["temperature_K"] = nan if degrees_C is None else degrees_C + _ZERO_CELSIUS_K
-        drawn_C = cells["drawn_C"] + cells["current_A"] * of["dt_s"]
-        good = are_plausible(of["voltage_V"], of["current_A"], of["dt_s"], degrees_C, cells["current_A"])
+        drawn_C = seen["drawn_C"] + seen["current_A"] * of["dt_s"]
+        good = are_plausible(of["voltage_V"], of["current_A"], of["dt_s"], degrees_C, seen["current_A"])
         doubtful = is_first | ~(good & (drawn_C > one.least_drawn_C))
         if doubtful.any():
             self.check(voltage_V, current_A, dt_s, temperature_C, np.flatnonzero(doubtful).tolist())
@@ -345,13 +347,14 @@ class KalmanBatch(OnlineBatch):
             self.estimators[n]._begin(float(of["temperature_K"][n]))
         (said,) = one._follow(cells, self._filters, samples)
         sd_q_mobile, sd_r_o = said["sd"].T
-        seen = {name: cells[name].copy() for name in _SEEN}
+        shown = {name: seen[name].copy() for name in _SHOWN}
 
         def reason_of(n: int) -> str:
-            code = int(said["code"][n])
-            return reason(code, {name: column[n] for name, column in seen.items()}, one.initial_soc[0]) if code else ""
+            of_cell = {name: column[n] for name, column in shown.items()}
+            return Condition.numbered(said["condition"][n]).said(measured(of_cell, one.initial_soc[0]))
 
-        return Estimates(said["q_mobile"], said["r_o"], sd_q_mobile, sd_r_o, said["code"] == Verdict.SETTLED, reason_of)
+        settled = said["condition"] == Condition.SETTLED
+        return Estimates(said["q_mobile"], said["r_o"], sd_q_mobile, sd_r_o, settled, reason_of)
 
 
 def _checked_noise_V(voltage_noise_V: float | None, mismatch_V: float) -> float:
@@ -384,13 +387,16 @@ def _follow_all(
 ) -> None:
     # every sample of every cell, into the estimate after it
     for n in range(samples.shape[1]):
-        cell = cells[n]
+        cell, bank, seen = cells[n], cells[n].bank, cells[n].seen
         of_cell = PackedConstants(cell.constants, packed.polynomial_n, packed.polynomial_p)
         for k in range(samples.shape[0]):
             sample = samples[k, n]
-            cell.samples += 1
-            cell.time_s += sample.dt_s
-            cell.drawn_C += cell.current_A * sample.dt_s
+            voltage, current, duration = sample.voltage_V, sample.current_A, sample.dt_s
+            begin(seen, duration)
             take(cell, filters[n], sample, settings, of_cell, derivatives)
-            watch(cell, sample, settings, estimates[k, n])
-            cell.current_A = sample.current_A
+            q_mobile, r_o = bank.mean[Q], bank.mean[R]
+            examine(seen, voltage, current, q_mobile, r_o, settings.cell_q_mobile)
+            if seen.samples > 1 and duration > 0.0:
+                follow_gaps(seen, voltage, current, duration, bank.expected_V, q_mobile)
+            conclude(cell, settings, estimates[k, n])
+            remember(seen, voltage, current)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import exp, inf, isnan, log, sqrt
+from math import exp, hypot, inf, isnan, log, nan, sqrt
 
 import numpy as np
 from numba import njit
@@ -30,8 +30,15 @@ from battery_env.electrochemistry.tangents import (
     voltage_curvature,
     voltage_tangents,
 )
-from battery_env.estimators.kalman_state import FILTER, OFFSET, Q, R, Row, Settings
-from battery_env.estimators.settling import MISMATCH_MARGIN
+from battery_env.estimators.diagnosis import (
+    MISMATCH_MARGIN,
+    PLAUSIBLE_Q_SHARES,
+    PRIOR_LIMIT_SD,
+    SETTLED_SHARES,
+    Condition,
+)
+from battery_env.estimators.kalman_state import FILTER, OFFSET, Q, R, Settings
+from battery_env.estimators.monitor import Row, start_condition
 
 #: Standard deviations. Innovations count in full within the gate. A filter whose successive innovations are correlated, whose
 #: estimate leaves the range that it stated, or whose offset is beyond the stated one, by more than the limit does not follow
@@ -48,9 +55,9 @@ _REACH_SD = 2.5
 # same, within this share of a standard deviation.
 _LEAST_LOG_WEIGHT = -15.0
 _SAME_SHARE = 0.25
-# Least squares state the worst case: the error of the model of the stated size that moves q_mobile most. The filter is moved
-# half as far (measured on the bundled cells B0005 and B0006).
-_MISMATCH_SHARE = 0.5
+# The data must have narrowed a prior by this share of its width before a deviation from it says anything.
+_LEAST_NARROWING = 0.2
+_SHARES = (SETTLED_SHARES["q_mobile"], SETTLED_SHARES["r_o"])
 # The noise that innovations show is averaged over about this many samples.
 _NOISE_MEMORY = 32.0
 
@@ -117,18 +124,20 @@ def _predict(one: Row, current: float, duration: float, settings: Settings, cons
 
 
 @_inlined
-def _mismatch_sd(one: Row, settings: Settings) -> float:
-    # What the error of the model leaves open of q_mobile, however many samples there are: the filter takes the error for noise
-    # that is new with each of them. As in least squares it is one error common to the discharge.
-    told, (q_prior, r_prior) = one.told, settings.variance
-    if settings.mismatch_V2 == 0.0 or q_prior == 0.0 or told.charge_C == 0.0:
+def _common_error_sd(one: Row, settings: Settings) -> float:
+    # What an error of the model that is common to the discharge leaves open of q_mobile, without its prior, however many
+    # samples there are: as much as least squares state. Theirs is the worst error of the stated mean square. Once the knee is
+    # seen, almost all of that lies on the few samples there, but an error beyond the margin would show: it is no larger.
+    told, (q_prior, r_prior), mismatch_V2 = one.told, settings.variance, settings.mismatch_V2
+    if mismatch_V2 == 0.0 or q_prior == 0.0 or told.charge_C == 0.0:
         return 0.0
-    share = 1.0 / (_MISMATCH_SHARE**2 * settings.mismatch_V2 * told.charge_C)
-    qq = told.qq * share + 1.0 / q_prior
-    if r_prior == 0.0:
-        return sqrt(1.0 / qq)
-    qr, rr = told.qr * share, told.rr * share + 1.0 / r_prior
-    return sqrt(rr / (qq * rr - qr * qr))
+    beside_r = told.qq
+    if r_prior > 0.0:
+        beside_r -= told.qr * told.qr / (told.rr + mismatch_V2 * told.charge_C / r_prior)
+    if not beside_r > 0.0:
+        return inf
+    spread = min(1.0, MISMATCH_MARGIN * told.q / sqrt(told.charge_C * told.qq))
+    return spread * sqrt(mismatch_V2 * told.charge_C / beside_r)
 
 
 @_inlined
@@ -174,6 +183,7 @@ def _correct(
             p[j, k] += gain[j] * gain[k] * variance - gain[j] * ph[k] - ph[j] * gain[k]
             p[k, j] = p[j, k]
     told = one.told
+    told.q += charge * abs(by_q)
     told.qq += charge * by_q * by_q
     told.qr += charge * by_q * by_r
     told.rr += charge * by_r * by_r
@@ -182,6 +192,12 @@ def _correct(
     to_q = min(max(q + gain[Q] * innovation, least_q_C), most_q_C)
     to_r = min(max(r_o + gain[R] * innovation, least_r), most_r)
     mean[OFFSET] += gain[OFFSET] * innovation
+    # along the curve of the voltage over the state of charge: with a smaller q_mobile the record comes further
+    if told.qq > 0.0:
+        scale = exp(-0.5 * (1.0 + told.charge_C * by_q * by_q / told.qq) * (to_q / q - 1.0))
+        told.q *= scale
+        told.qq *= scale * scale
+        told.qr *= scale
     _move(one, to_q - q, to_r - r_o)
 
 
@@ -262,7 +278,7 @@ def take(
 ) -> None:
     """Take in one sample of a cell; unchecked."""
     bank, voltage, duration, temperature = cell.bank, sample.voltage_V, sample.dt_s, sample.temperature_K
-    constants, current = packed.constants, cell.current_A
+    constants, current = packed.constants, cell.seen.current_A
     noise, charge = max(bank.noise_V2, settings.noise_V2), abs(current) * duration
     before = _heaviest(filters)
     for m in range(len(filters)):
@@ -284,4 +300,50 @@ def take(
     bank.offset_V2 += settings.offset_growth * duration
     _doubt(bank, filters[best].mean[OFFSET])
     bank.expected_V = filters[before].expected_V  # by the filter that did not know yet
-    bank.least_sd_q = _mismatch_sd(filters[best], settings)
+    bank.common_sd_q = _common_error_sd(filters[best], settings)
+
+
+@_compiled
+def _note(estimate: Row, condition: int, holds: bool) -> None:
+    # the row of the table that comes first counts
+    if holds and condition < estimate.condition:
+        estimate.condition = condition
+
+
+@_compiled
+def conclude(cell: Row, settings: Settings, estimate: Row) -> None:
+    """Say what a bank estimates after a sample that was examined, and what speaks against it; unchecked."""
+    bank, seen, searched = cell.bank, cell.seen, settings.searched
+    # what the error of the model leaves open beside the prior, what shows nowhere in the voltage, and what nobody saw
+    common_sd_q = (bank.common_sd_q**-2.0 + 1.0 / settings.variance[Q]) ** -0.5
+    doubt_C = seen.doubt_C + (seen.gap.charge_C if seen.gap.samples > 0.0 else 0.0)
+    own_sd = (max(bank.sd[Q], common_sd_q), max(bank.sd[R], 0.0))
+    estimate.q_mobile, estimate.r_o = bank.mean[Q], bank.mean[R]
+    estimate.condition = Condition.SETTLED + 0
+    start, fault = start_condition(seen, bank.mean[Q], bank.mean[R]), seen.fault.condition
+    _note(estimate, start, start > 0)
+    _note(estimate, fault, fault > 0)
+    _note(estimate, Condition.EMPTY, not bank.has_voltage)
+    least, most = PLAUSIBLE_Q_SHARES
+    plausible = least * settings.cell_q_mobile < bank.mean[Q] < most * settings.cell_q_mobile
+    _note(estimate, Condition.IMPLAUSIBLE, searched[Q] and not plausible)
+    _note(estimate, Condition.MISFIT, bank.trend_sd > LIMIT_SD)
+    for k in range(2):
+        if not searched[k]:
+            estimate.sd[k] = nan
+            continue
+        value, (low, high), (mean, prior_sd) = bank.mean[k], settings.bounds[k], settings.carried[k]
+        sd = hypot(hypot(own_sd[k], settings.scale_sd[k] * value), doubt_C if k == Q else 0.0)
+        estimate.sd[k] = sd
+        _note(estimate, Condition.Q_AT_BOUND + k, not low + bank.sd[k] < value < high - bank.sd[k])
+        if prior_sd > 0.0:
+            narrowed = max(prior_sd**2 - bank.sd[k] ** 2, (_LEAST_NARROWING * prior_sd) ** 2)
+            _note(estimate, Condition.Q_PRIOR_WRONG + k, (value - mean) ** 2 > PRIOR_LIMIT_SD**2 * narrowed)
+            # precisions add up
+            of_data = max(bank.sd[k] ** -2.0 - prior_sd**-2.0, 0.0) ** -0.5
+            of_data = max(of_data, bank.common_sd_q if k == Q else 0.0)
+            _note(estimate, Condition.Q_PRIOR_ALONE + k, of_data >= _SHARES[k] * value)
+        if not sd < _SHARES[k] * value:
+            _note(estimate, Condition.GAP_UNSURE, k == Q and doubt_C > 0.0)
+            _note(estimate, Condition.Q_SCALE_UNKNOWN + k, settings.scale_sd[k] >= _SHARES[k])
+            _note(estimate, Condition.Q_IMPRECISE + k, True)

@@ -5,20 +5,13 @@ reads and writes in place. A single filter has tables of one row, a batch one ro
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
-
-import numpy as np
+from typing import NamedTuple
 
 from battery_env.electrochemistry import NEW_CELL, STATE_SIZE
-from battery_env.estimators.gaps import HABIT
-
-#: A row of a table, whose columns numba knows and type checkers do not.
-Row = Any
+from battery_env.estimators.monitor import SEEN, table
 
 #: What a filter estimates: ``q_mobile`` (C), ``r_o`` (ohm) and the offset of the voltage (V).
 Q, R, OFFSET = range(3)
-#: As many voltages are kept.
-KEPT = 32
 
 
 class Settings(NamedTuple):
@@ -53,22 +46,18 @@ class Settings(NamedTuple):
     cell_q_mobile: float
 
 
-def _table(columns: str | list[tuple[Any, ...]]) -> np.dtype[np.void]:
-    """The type of a row: numbers by their names, or names with types."""
-    return np.dtype([(name, "f8") for name in columns.split()] if isinstance(columns, str) else columns, align=True)
-
-
 #: One sample of one cell.
-SAMPLE = _table("voltage_V current_A dt_s temperature_K")
+SAMPLE = table("voltage_V current_A dt_s temperature_K")
 
-#: What is said after a sample; ``code`` is one of :class:`~battery_env.estimators.monitor.Verdict`.
-ESTIMATE = _table([("q_mobile", "f8"), ("r_o", "f8"), ("sd", "f8", 2), ("code", "i8")])
+#: What is said after a sample, with the :class:`~battery_env.estimators.diagnosis.Condition` that speaks first against it.
+ESTIMATE = table([("q_mobile", "f8"), ("r_o", "f8"), ("sd", "f8", 2), ("condition", "i8")])
 
-# Sums over the charge drawn, of products of the derivatives of the voltage (V^2/C, V A, A^2 C), and that charge (C)
-_INFORMATION = _table("qq qr rr charge_C")
+# Sums over the charge drawn, of the derivative of the voltage by q_mobile (V) and of products with that by r_o (V^2/C, V A,
+# A^2 C), and that charge (C)
+_INFORMATION = table("q qq qr rr charge_C")
 
 #: One filter of a bank, with a model of its own at its estimate.
-FILTER = _table(
+FILTER = table(
     [
         ("state", "f8", (1, STATE_SIZE)),
         ("tangents", "f8", (1, 2, STATE_SIZE)),  # derivatives of the state with respect to q_mobile and r_o
@@ -83,13 +72,13 @@ FILTER = _table(
 )
 
 # What a bank remembers beside its filters.
-_BANK = _table(
+_BANK = table(
     [
-        # after the last sample: moments of the mixture of all filters, the standard deviation of q_mobile that the error of
-        # the model leaves at least, the voltage that was expected, and whether the model cell has one
+        # after the last sample: moments of the mixture of all filters, the standard deviation of q_mobile that an error of the
+        # model leaves which is common to the discharge, the voltage that was expected, and whether the model cell has one
         ("mean", "f8", 2),
         ("sd", "f8", 2),
-        ("least_sd_q", "f8"),
+        ("common_sd_q", "f8"),
         ("expected_V", "f8"),
         ("has_voltage", "b1"),
         # of innovations: the noise that they showed in the mean; the last ones, averaged; the sum of the products of each one
@@ -109,61 +98,12 @@ _BANK = _table(
     ]
 )
 
-# The start: the first sample, and within the start window the largest current and the least voltage.
-_START = _table([("at_rest", "b1"), *((name, "f8") for name in ("first_V", "first_A", "most_A", "least_V"))])
-
-# The two voltages before the one at hand, and time and current of the last of them: the middle one of three is examined.
-_BEFORE = _table("voltage_2_V voltage_1_V time_1_s current_1_A")
-
-# The last sample that was examined, the current that the ohmic drop stands for then, the largest magnitude of the current, and
-# when the current last jumped.
-_EXAMINED = _table(
-    [("count", "i8"), *((f, "f8") for f in ("time_s", "voltage_V", "current_A", "lagging_A", "largest_A", "jump_s"))]
-)
-
-# The last switch of the load: the part of its size that the voltage has to follow, the voltages before and since.
-_SWITCH = _table("time_s size_A to_follow_A before_V lowest_V highest_V samples")
-
-# Some samples of the last minute, and the last changes of the voltage from sample to sample, in rings.
-_RING = _table(
+#: All that is remembered of a discharge but for the filters.
+CELL = table(
     [
-        *(("n_kept", "i8"), ("time_s", "f8", KEPT), ("voltage_V", "f8", KEPT), ("current_A", "f8", KEPT)),
-        *(("n_changes", "i8"), ("change_V", "f8", KEPT)),
-    ]
-)
-
-# What was expected before a gap: the last interval, the voltage, by how much cell and model part and how fast the voltage
-# falls, both in the mean; the longest intervals under load that were not in doubt, in their order.
-_USUAL = _table(
-    [*((name, "f8") for name in ("interval_s", "expected_V", "parted_V", "fall_V_per_s")), ("longest_s", "f8", HABIT)]
-)
-
-# The first fault that was found: its code, when, and how large it is.
-_FAULT = _table([("code", "i8"), *((name, "f8") for name in ("time_s", "since_s", "size"))])
-
-# The last gap, pending until the voltages after it were seen: its charge, the fall of the model within it, the voltage of the
-# model after it, the first voltages then, and how many; 0: none is pending.
-_GAP = _table("length_s end_s charge_C fall_V model_V after_V next_V samples")
-
-#: All that is remembered of a discharge but for the filters: of the cell, of their bank, and what the samples showed.
-CELL = _table(
-    [
-        ("samples", "i8"),
-        ("time_s", "f8"),
-        ("current_A", "f8"),  # since the last sample
-        ("drawn_C", "f8"),
-        ("ambient_K", "f8"),  # the model's surroundings, and what follows from them: constants and voltage at the start
+        ("ambient_K", "f8"),  # the model's surroundings, and the constants that follow from them
         ("constants", "f8", NEW_CELL.packed.constants.shape),
-        ("start_V", "f8"),
         ("bank", _BANK),
-        ("start", _START),
-        ("before", _BEFORE),
-        ("examined", _EXAMINED),
-        ("switch", _SWITCH),
-        ("ring", _RING),
-        ("usual", _USUAL),
-        ("gap", _GAP),
-        ("doubt_C", "f8"),  # charge of gaps that are in doubt
-        ("fault", _FAULT),
+        ("seen", SEEN),
     ]
 )

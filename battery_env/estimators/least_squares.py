@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import hypot, nan, sqrt
 
@@ -15,31 +15,21 @@ from battery_env.electrochemistry import CellParameters
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimates import Estimate, EstimateTrace
 from battery_env.estimators.base import Estimator, check_bounds
-from battery_env.estimators.gaps import DRAWN, NOT_DRAWN, UNSURE, Gap, find_gaps
-from battery_env.estimators.rest import InitialSoc, check_initial_soc
-from battery_env.estimators.search import Fit, Prior, Search, square
-from battery_env.estimators.settling import (
-    AT_BOUND,
-    EMPTY,
+from battery_env.estimators.diagnosis import (
     EXCESS_LIMIT_UNSTATED,
-    IMPLAUSIBLE,
-    IMPRECISE,
-    MISFIT,
     MISMATCH_MARGIN,
-    PRIOR_ALONE,
-    PRIOR_CONTRADICTED,
     PRIOR_LIMIT_SD,
-    SCALE_UNKNOWN,
     SETTLED_SHARES,
     SPARE_SAMPLES,
-    first_reason,
-    gap_reason,
+    Condition,
+    Diagnosis,
     is_plausible,
-    least_resistance_ohm,
-    sensor_reason,
-    start_reason,
     white_noise_V,
 )
+from battery_env.estimators.gaps import DRAWN, Gap, find_gaps, note_gaps
+from battery_env.estimators.monitor import note_samples
+from battery_env.estimators.rest import InitialSoc, check_initial_soc
+from battery_env.estimators.search import Fit, Prior, Search, square
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, check_parameters
 from battery_env.record_model import LONGEST_FORECAST_S, RecordModel
 from battery_env.records import Record, Samples, check_record, starts_at_rest
@@ -54,7 +44,6 @@ _LEAST_NOISE_V = 1e-4
 _SOC_STEP = 1e-3
 # The end of a record agrees with an estimate within this share of its duration.
 _END_SHARE = 0.02
-_FEW = "These are too few samples to tell the noise. Record on or more often, or state voltage_noise_V."
 
 
 @dataclass(frozen=True)
@@ -81,6 +70,9 @@ class LeastSquares(Estimator):
     """
     The (q_mobile, r_o) whose simulated voltage is closest to the recorded one, over all samples of the record.
 
+    The defaults are those of simulated records. For recorded cells take :func:`battery_env.calibrate`, or
+    ``battery_env.Settings().calibrator()``: a model of the temperature, and the errors of model and sensor to expect.
+
     The model starts at the first sample of the record, fully charged and at rest unless ``initial_soc`` or ``initial`` say
     otherwise, and follows the recorded current (:func:`battery_env.records.resample_current`). For a recorded discharge give
     :meth:`battery_env.cells.Discharge.loaded_part`, which starts when the load is switched on.
@@ -99,7 +91,7 @@ class LeastSquares(Estimator):
     both parameters and does not show in the voltage: state it as ``current_gain_sd``.
 
     *Settled* means that the record alone determines every parameter searched for, with a standard deviation below
-    :data:`~battery_env.estimators.settling.SETTLED_SHARES` of its value without any prior, and that nothing contradicts it:
+    :data:`~battery_env.estimators.diagnosis.SETTLED_SHARES` of its value without any prior, and that nothing contradicts it:
 
     - the record can start with a full cell, or with one of ``initial_soc``, unless ``initial`` is given;
     - where it was not logged for a while under load (:mod:`~battery_env.estimators.gaps`), the voltage falls by what was drawn
@@ -232,7 +224,7 @@ class LeastSquares(Estimator):
             starts = search.starts([self.model.cell.q_mobile])[0]
         found = self._fitted(record, search, starts)
         sd = found.sd(found.fit)
-        reason = first_reason(self._conditions(record, rested, found))
+        reason = self._diagnosis(record, rested, found).reason
         values = found.fit.values
         return Estimate(values["q_mobile"], values["r_o"], sd["q_mobile"], sd["r_o"], not reason, reason)
 
@@ -277,64 +269,52 @@ class LeastSquares(Estimator):
             for n, name in enumerate(self.parameters)
         }
 
-    def _conditions(self, record: Samples, rested: bool, found: _Fitted) -> Iterator[tuple[bool, str]]:
-        """What speaks against an estimate, whether it is so, and how to say it; what counts most comes first."""
-        search, fit, alone, cell = found.search, found.fit, found.alone, self.model.cell
-        n, q_mobile, free = len(fit.residual_V), fit.values["q_mobile"], self.parameters
-        yield n < len(record.time_s), EMPTY
-        # what in the record contradicts the fit
-        resistance_ohm = least_resistance_ohm(q_mobile, fit.values["r_o"])
-        if self._at_rest:
-            yield _said(start_reason(*record, cell, self.initial_soc[0], resistance_ohm, rested))
-        yield _said(gap_reason(found.gaps, NOT_DRAWN))
-        yield from ((True, AT_BOUND.format(name)) for name in fit.at_bound)
-        yield "q_mobile" in free and not is_plausible(q_mobile, cell), IMPLAUSIBLE
+    def _diagnosis(self, record: Samples, rested: bool, found: _Fitted) -> Diagnosis:
+        """What speaks against an estimate."""
+        fit, alone, cell, diagnosis = found.fit, found.alone, self.model.cell, Diagnosis()
+        n, free, (q_mobile, r_o) = len(fit.residual_V), self.parameters, (fit.values[name] for name in PARAMETER_NAMES)
+        own, moved_V2 = found.sd(alone), fit.square_V2 - alone.square_V2
+        unknown = [name for name in free if not own[name] < SETTLED_SHARES[name] * alone.values[name]]
+        note_gaps(diagnosis, found.gaps, "q_mobile" in unknown)
+        note_samples(diagnosis, record, cell, self.initial_soc[0] if self._at_rest else None, q_mobile, r_o, rested)
+        diagnosis.note(Condition.EMPTY, n < len(record.time_s))
         if self.voltage_noise_V is None:
             noise_V, excess = white_noise_V(fit.residual_V), EXCESS_LIMIT_UNSTATED / sqrt(n)
+            few = n < len(free) + SPARE_SAMPLES
+            diagnosis.note(Condition.FEW, few, of="samples", or_else=", or state voltage_noise_V")
         else:
             noise_V, excess = self.voltage_noise_V, _EXCESS_LIMIT * sqrt(2.0 / n)
         limit_V2 = noise_V**2 * (1.0 + excess) + (MISMATCH_MARGIN * self.mismatch_V) ** 2 + _NEGLIGIBLE_V**2
-        yield square(fit.residual_V) > n * limit_V2, MISFIT
-        yield _said(sensor_reason(*record, resistance_ohm))
-        yield _said(_end_reason(record, search, fit, max(2.0 * self.mismatch_V, 3.0 * noise_V, _NEGLIGIBLE_V)))
-        # why the record alone does not determine the parameters
-        own, unsure = found.sd(alone), gap_reason(found.gaps, UNSURE)
-        unknown = [name for name in free if not own[name] < SETTLED_SHARES[name] * alone.values[name]]
-        q_unknown = "q_mobile" in unknown
-        moved_V2 = fit.square_V2 - alone.square_V2
-        yield moved_V2 > PRIOR_LIMIT_SD**2 * found.variance_V2, PRIOR_CONTRADICTED.format("q_mobile")
-        yield q_unknown and bool(unsure), unsure
-        carried = self.prior_q_mobile_C is not None
-        yield q_unknown and carried, f"{PRIOR_ALONE.format('q_mobile')} Without it {IMPRECISE['q_mobile']}"
+        diagnosis.note(Condition.MISFIT, square(fit.residual_V) > n * limit_V2)
+        diagnosis.note(Condition.IMPLAUSIBLE, "q_mobile" in free and not is_plausible(q_mobile, cell))
+        _note_end(diagnosis, record, found, max(2.0 * self.mismatch_V, 3.0 * noise_V, _NEGLIGIBLE_V))
+        diagnosis.note(Condition.Q_PRIOR_WRONG, moved_V2 > PRIOR_LIMIT_SD**2 * found.variance_V2)
+        diagnosis.note(Condition.Q_PRIOR_ALONE, "q_mobile" in unknown and self.prior_q_mobile_C is not None)
+        for name in fit.at_bound:
+            diagnosis.note(Condition.Q_AT_BOUND.of(name))
         for name in unknown:
-            yield found.hidden_sd[name] >= SETTLED_SHARES[name] * fit.values[name], SCALE_UNKNOWN.format(name)
-        yield from ((True, IMPRECISE[name]) for name in unknown)
-        yield self.voltage_noise_V is None and n < len(free) + SPARE_SAMPLES, _FEW
+            scaled = found.hidden_sd[name] >= SETTLED_SHARES[name] * fit.values[name]
+            diagnosis.note(Condition.Q_SCALE_UNKNOWN.of(name), scaled)
+            diagnosis.note(Condition.Q_IMPRECISE.of(name))
+        return diagnosis
 
 
-def _said(reason: str) -> tuple[bool, str]:
-    return bool(reason), reason
-
-
-def _end_reason(record: Samples, search: Search, fit: Fit, deviation_V: float) -> str:
-    """Whether the model comes as low as the record did much earlier or later than the record."""
-    time_s, voltage_V, current_A = record
+def _note_end(diagnosis: Diagnosis, record: Samples, found: _Fitted, deviation_V: float) -> None:
+    """Note where the model comes as low as the record did much earlier or later than the record."""
+    values, (time_s, voltage_V, current_A) = found.fit.values, record
     n = int(voltage_V.argmin())
     load_A = float(current_A[max(n - 1, 0) : n + 1].max())
     # at rest, with whatever current a sensor shows then, no voltage is reached
-    if n == 0 or load_A * LONGEST_FORECAST_S <= fit.values["q_mobile"]:
-        return ""
-    estimate, model = Estimate(fit.values["q_mobile"], fit.values["r_o"]), search.model_at(fit.values)
-    until, lowest_V = record.first(n + 1), float(voltage_V[n]) - fit.values.get("offset_V", 0.0)
+    if n == 0 or load_A * LONGEST_FORECAST_S <= values["q_mobile"]:
+        return
+    estimate, model = Estimate(values["q_mobile"], values["r_o"]), found.search.model_at(values)
+    until, lowest_V = record.first(n + 1), float(voltage_V[n]) - values.get("offset_V", 0.0)
     forecast = model.forecast(until, estimate, lowest_V, load_A)
     early_s, late_s = (forecast.reached_s(lowest_V + sign * deviation_V) for sign in (1.0, -1.0))
     allowed_s = _END_SHARE * (time_s[n] - time_s[0]) + 2.0 * model.dt_s
-    if early_s - allowed_s <= time_s[n] <= late_s + allowed_s:
-        return ""
-    return (
-        f"The record falls to {voltage_V[n]:.2f} V at {time_s[n]:.0f} s, where this estimate says "
-        f"{early_s if early_s > time_s[n] else late_s:.0f} s."
-    )
+    agrees = early_s - allowed_s <= time_s[n] <= late_s + allowed_s
+    model_s = early_s if early_s > time_s[n] else late_s
+    diagnosis.note(Condition.OTHER_END, not agrees, lowest_V=voltage_V[n], end_s=time_s[n], model_end_s=model_s)
 
 
 def _check_nuisance(nuisance: Mapping[str, float], parameters: tuple[str, ...]) -> dict[str, float]:

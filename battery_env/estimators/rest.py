@@ -8,7 +8,7 @@ import numpy as np
 
 from battery_env.arrays import FloatArray
 from battery_env.electrochemistry import NEW_CELL, CellParameters, initial_state, voltage
-from battery_env.estimators.settling import START_UNKNOWN
+from battery_env.estimators.diagnosis import Condition
 from battery_env.records import REST_CURRENT_A, Record, Stream
 
 #: What a state of charge can be given as: a number, or (mean, standard deviation).
@@ -83,7 +83,7 @@ def soc_from_rest(
     loaded = np.flatnonzero(np.abs(stream.current_A) > REST_CURRENT_A)
     count = int(loaded[0]) if len(loaded) else len(stream.time_s)
     if not count:
-        return Start(1.0, 0.0, 0, START_UNKNOWN)
+        return Start(1.0, 0.0, 0, Condition.START_UNKNOWN.text)
     fast_V, slow_V = (_running_mean_V(stream, count, memory_s) for memory_s in _MEMORIES_S)
     rest_V = _rest_voltages_V(cell)
     soc = float(np.interp(fast_V, rest_V, _SOC_GRID))
@@ -93,7 +93,7 @@ def soc_from_rest(
     sensor_sd_V = model_sd_V if voltage_noise_V is None else voltage_noise_V
     sd_V = np.hypot(np.hypot(sensor_sd_V, model_sd_V), _STILL_TO_COME * (fast_V - slow_V))
     rest_s = float(stream.time_s[count - 1] - stream.time_s[0])
-    return Start(soc, float(sd_V / slope_V), count, "" if rest_s >= _LEAST_REST_S else START_UNKNOWN)
+    return Start(soc, float(sd_V / slope_V), count, "" if rest_s >= _LEAST_REST_S else Condition.START_UNKNOWN.text)
 
 
 def _running_mean_V(stream: Stream, count: int, memory_s: float) -> float:

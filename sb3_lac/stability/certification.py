@@ -32,7 +32,8 @@ _NEEDS = {
 @dataclass(frozen=True, eq=False)
 class CertificationReport:
     """
-    What is known of a closed loop with 95 % confidence, see ``certify()``.
+    What ``certify()`` returns: statements about a closed loop that hold together with 95 % confidence. Read ``summary()``
+    first; ``statements`` has its numbers.
 
     :param statements: One row per statement, by name: ``n_episodes`` that testify, ``n_true`` of them for it, their ``share``,
         and ``at_least``, which the probability is not below with the confidence
@@ -145,19 +146,30 @@ def certify(
     seed: int | None = None,
 ) -> CertificationReport:
     """
-    State what finitely many episodes say about the loop that a policy closes. Each statement is a question that an episode
-    answers with yes or no, so that the exact bound of Clopper and Pearson (1934) holds for its probability, without any
-    assumption but that episodes are independent: 300 of 300 means at least 99 % with 95 % confidence, of one statement, and
-    98.6 % of each of three. The statements are
+    Bound from below, with 95 % confidence, how probable it is that an episode survives, comes to rest, and decreases ``L``.
+
+    .. code-block:: python
+
+      import gymnasium as gym
+      from sb3_lac import certify, fit_lyapunov
+      from sb3_lac.envs import reference_controller
+
+      env = gym.make("LinearCost-v0")
+      controller = reference_controller(env)  # or a model of any algorithm
+      lyapunov = fit_lyapunov(controller, env, n_episodes=20, seed=0)
+      print(certify(controller, env, lyapunov, n_episodes=100, seed=1000).summary())
+
+    Each statement is a question that an episode answers with yes or no. The bound is that of Clopper and Pearson (1934), which
+    only assumes independent episodes: 300 of 300 means at least 99 % for one statement, and 98.6 % for each of three. The
+    statements are
 
     - ``survives``: no termination
     - ``stays_within``: survives, and no cost in the last fifth of the episode is above ``ultimate_bound``
     - ``decreases``: survives, and ``L`` is lower ``lyapunov.window_steps`` later wherever it is above ``lyapunov.level``. Only
       episodes with such a window testify, and those that died.
 
-    They hold together with 95 % confidence (Bonferroni). What they are about must not be chosen by the episodes that testify:
-    a fitted function brings the largest late cost and the largest late value of its own roll-outs, and the shortest window
-    over which it decreased there.
+    Thresholds must not be chosen on the episodes that are counted. A fitted function brings those of its own roll-outs: the
+    largest late cost, the largest late value, and the shortest window over which it decreased.
 
     :param policy: A model of Stable-Baselines3, or anything with ``predict(observation, deterministic=...)``
     :param env: The environment, wrapped as that of the training. Several at once are faster.
@@ -170,7 +182,7 @@ def certify(
     :param seed: Seed of the episodes, which cannot be one that ``lyapunov`` was fitted on, or the policy trained; drawn if it
         is None, and named in the description of the report
     :return: The report
-    :raises ValueError: If the arguments cannot be meant
+    :raises ValueError: If an argument is invalid
     """
     check_bound(ultimate_bound)
     if starts is not None:

@@ -186,15 +186,26 @@ def fit_lyapunov(
     progress_bar: bool = True,
 ) -> FittedLyapunov:
     """
-    Learn a Lyapunov function of the loop that a policy closes, on roll-outs of that policy. It makes no difference which
-    algorithm trained the policy, or whether one did.
+    Learn a Lyapunov function of the loop that a policy closes, on roll-outs of that policy. Any policy will do: one of any
+    algorithm, or a controller that nobody trained.
 
-    The function is the relative value of the average cost: ``L(s) = c - c_bar + E[L(s')]``, so that its exact drift is
+    .. code-block:: python
+
+      import gymnasium as gym
+      from sb3_lac import fit_lyapunov
+      from sb3_lac.envs import reference_controller
+
+      env = gym.make("LinearCost-v0")
+      lyapunov = fit_lyapunov(reference_controller(env), env, n_episodes=20, seed=0)
+      lyapunov.save("lyapunov.pt")
+
+    Judge it on other episodes, with ``evaluate_lyapunov()`` and ``certify()``.
+
+    The function is the relative value of the average cost, ``L(s) = c - c_bar + E[L(s')]``. Its exact drift is
     ``E[L(s')] - L(s) = -(c - c_bar)``: it decreases by all of the cost (alpha3 = 1) up to the residual ``b = c_bar``, the mean
-    cost at which the loop settles, however slow the loop is. The value of a discounted cost decreases by a share only, that
-    shrinks as the loop gets slower (``docs/stability.md`` compares them). ``L`` and ``c_bar`` are fitted to generalised
-    multi-step returns, which are computed anew before each pass over the data. ``L`` is a sum of squares and its least value
-    on the roll-outs is subtracted, so that it is never negative.
+    cost at which the loop comes to rest, however slow the loop is. (The value of a discounted cost decreases by a share only,
+    which shrinks as the loop gets slower.) ``L`` is a sum of squares less its least value on the roll-outs, and so never
+    negative. It is fitted to multi-step returns, which are computed anew before each pass over the data.
 
     The reward that costs nothing is the largest one of the roll-outs, and at least 0. A transition that ends in a death has no
     next value: what it costs is its cost, and with positive rewards also those that a survivor could have had until the end of
@@ -208,7 +219,7 @@ def fit_lyapunov(
     :param progress_bar: Whether to show the progress, in a terminal
     :return: The function. It is to be judged on other roll-outs: ``evaluate_lyapunov()`` and ``certify()`` refuse its seeds,
         which it keeps in ``seeds``.
-    :raises ValueError: If the arguments cannot be meant
+    :raises ValueError: If an argument is invalid
     :raises NoCostError: If nothing had a cost on the roll-outs, which say nothing about decrease then
     """
     with closed_loop(policy, env, None, n_episodes, deterministic, seed) as loop:

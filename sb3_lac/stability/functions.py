@@ -17,13 +17,18 @@ _NUMBER = (float, int, np.number)
 
 class LyapunovFunction:
     """
-    A Lyapunov function of a closed loop, as ``evaluate_lyapunov()`` and ``certify()`` take it. One that is known, for instance
-    from a Riccati equation, is judged like one that was learned:
+    A Lyapunov function that is known, for instance from a Riccati equation. ``evaluate_lyapunov()`` and ``certify()`` judge it
+    like one that was learned.
 
     .. code-block:: python
 
-      quadratic = LyapunovFunction(lambda states: np.einsum("ni,ij,nj->n", states, P, states))
-      evaluate_lyapunov(controller, env, lyapunov=quadratic)
+      import gymnasium as gym
+      from sb3_lac import LyapunovFunction, evaluate_lyapunov
+      from sb3_lac.envs import reference_controller
+
+      env = gym.make("LinearCost-v0")
+      squares = LyapunovFunction(lambda states: (states**2).sum(axis=1))
+      print(evaluate_lyapunov(reference_controller(env), env, lyapunov=squares, seed=0).summary())
 
     Costs are ``c = max(reward_bound - reward, 0)``, or ``c = -reward`` if no bound is given and no reward is positive.
     What ``certify()`` asks about, ``ultimate_bound``, ``level`` and ``window_steps``, is known of a fitted function, and may
@@ -33,7 +38,7 @@ class LyapunovFunction:
     :param alpha3: Share of the cost by which the function is meant to decrease
     :param gamma: Discount factor of the costs to come that it estimates
     :param reward_bound: The reward that costs nothing, needed where rewards are positive
-    :raises ValueError: If one of these numbers cannot be meant
+    :raises ValueError: If a number is invalid
     """
 
     #: Whether costs are those of the training, in the units of ``VecNormalize``

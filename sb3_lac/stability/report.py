@@ -36,7 +36,8 @@ _COLUMNS = ["episode", "step", "reward", "cost", "lyapunov", "next_lyapunov", "d
 @dataclass(frozen=True, eq=False)
 class LyapunovReport:
     """
-    How ``L`` behaves along roll-outs of a policy, see ``evaluate_lyapunov()``.
+    What ``evaluate_lyapunov()`` returns: the metrics of ``L`` along roll-outs of a policy, and their verdict. Read
+    ``summary()`` first, then ``holds``; ``plot()`` shows where the condition fails.
 
     :param transitions: One row per transition, episodes one after the other: ``episode``, ``step``, ``reward``, ``cost``,
         ``lyapunov`` (``L(s, a)``), ``next_lyapunov`` (``L(s', a')``, NaN if s' is terminal), ``difference``
@@ -97,7 +98,7 @@ class LyapunovReport:
         if any(math.isnan(value) for value, _, _ in self.metrics.values()):
             lines.append(
                 "What is not available takes what these roll-outs do not have, like a survivor or costs that fade before the "
-                "time limit: docs/stability.md lists what each metric takes."
+                "time limit: docs/reports/certificates.md lists what each metric takes."
             )
         lines.append(f"With alpha3={self.alpha3:g} the decrease condition {self._verdict()}.")
         lines.append(self._verdict_with_residual())
@@ -233,19 +234,31 @@ def evaluate_lyapunov(
     lyapunov: LyapunovFunction | None = None,
 ) -> LyapunovReport:
     """
-    Run the policy for ``n_eval_episodes`` episodes and check whether ``L`` is a Lyapunov function along them: whether it
-    decreases by ``alpha3`` times the cost, ``E[L(s', a')] - L(s, a) <= -alpha3 * c``, where it does so up to a residual, and
-    whether it is what it should have learned, the sum of costs to come. ``L`` is the critic of LAC, or for any policy the
-    function ``lyapunov``, like that of ``fit_lyapunov()``. ``docs/stability.md`` says what each metric means and takes.
+    Measure on roll-outs whether ``L`` is a Lyapunov function of the loop that a policy closes: whether it decreases by
+    ``alpha3`` times the cost, ``E[L(s', a')] - L(s, a) <= -alpha3 * c``, at least where the cost is above a residual.
+
+    .. code-block:: python
+
+      import gymnasium as gym
+      from sb3_lac import evaluate_lyapunov, fit_lyapunov
+      from sb3_lac.envs import reference_controller
+
+      env = gym.make("LinearCost-v0")
+      controller = reference_controller(env)  # or a model of any algorithm
+      lyapunov = fit_lyapunov(controller, env, n_episodes=20, seed=0)
+      report = evaluate_lyapunov(controller, env, n_eval_episodes=20, lyapunov=lyapunov, seed=1000)
+      print(report.summary())
+
+    Take the function of ``fit_lyapunov()`` for a verdict on the loop. Without ``lyapunov``, the critic of LAC is judged, which
+    tells what was learned. ``docs/reports/certificates.md`` says what each metric means.
 
     ``a'`` is the action taken next; after a time limit it is an action of the policy. A terminal state has no ``L``:
-    transitions into it do not count for the decrease condition, but as deaths.
+    transitions into it are counted as deaths, and do not count for the decrease.
 
     .. note::
-        The critic is judged with the costs that it was trained on, of rewards and ends of episodes as they appear with
-        ``env.step`` calls: wrap ``env`` as the training environment. Any other function is judged with the rewards of the
-        environment itself, whether ``VecNormalize`` normalizes them or not. Unlike in ``evaluate_policy()``, a ``Monitor``
-        makes no difference. With gSDE, the noise matrix of the last roll-out is kept.
+        The critic is judged with the costs that it was trained on: wrap ``env`` as the training environment. Any other
+        function is judged with the rewards of the environment itself, also under ``VecNormalize``. Unlike in
+        ``evaluate_policy()``, a ``Monitor`` makes no difference. With gSDE, the noise matrix of the last roll-out is kept.
 
     :param policy: The policy: a model of Stable-Baselines3, or anything with ``predict(observation, deterministic=...)``
     :param env: The gym environment or ``VecEnv`` environment, not the one that the policy trains in. Its normalization
@@ -255,7 +268,7 @@ def evaluate_lyapunov(
     :param seed: Seed for ``env`` and for the actions; drawn if it is None, and kept in the report
     :param lyapunov: The function to judge, the critic by default. It cannot be judged on roll-outs that it was fitted on.
     :return: The report
-    :raises ValueError: If the arguments cannot be meant, or the policy is not LAC and there is no ``lyapunov``
+    :raises ValueError: If an argument is invalid, or the policy is not LAC and there is no ``lyapunov``
     """
     if lyapunov is None:
         lyapunov = critic_of(policy)

@@ -2,6 +2,7 @@ import warnings
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
@@ -50,6 +51,7 @@ class TestDischarge:
             ({"current_A": np.full(7, 2.0 + 1.0j)}, "current_A must hold real numbers"),
             ({"current_A": np.ma.masked_less(np.arange(7.0), 1.0)}, "current_A must hold real numbers"),
             ({"time_s": None}, "time_s must hold real numbers"),
+            ({"time_s": pd.date_range("2026-02-28", periods=7)}, "time_s must hold numbers, got dates. read_discharges takes"),
         ],
     )
     def test_refuses_what_cannot_be_meant_and_says_what_to_do(self, changes, message):

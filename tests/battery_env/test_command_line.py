@@ -13,14 +13,15 @@ import numpy as np
 import pandas as pd
 import pytest
 
+import battery_env
 from battery_env.app import many
-from battery_env.app.calibrate import Settings
+from battery_env.app.calibrate import Calibration, Settings
 from battery_env.app.calibrate import calibrate as calibrated
 from battery_env.app.command_line import main
 from battery_env.calibration.policy import PolicyEstimator
 from battery_env.cells import Discharge, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, CellParameters, Trajectory, initial_state, simulate
-from battery_env.estimators.cell_fit import read_cell
+from battery_env.estimators.cell_fit import fit_cell, read_cell
 from battery_env.estimators.least_squares import LeastSquares
 
 
@@ -72,7 +73,7 @@ def test_calibrates_a_bundled_discharge_and_writes_what_it_found(tmp_path, termi
     shown = terminal.shows("B0005:100", "--out", folder)
     assert "settled" in shown and "yes" in shown and "measured at" in shown and "remaining" not in shown
     assert "1.486 Ah   the capacity to 2.7 V" in shown and "state of health" not in shown
-    assert "40.3 degC   from 24.3 degC; the model ends at 26.2 degC" in shown
+    assert "40.3 degC   measured; the model goes from 24.3 degC to 26.2 degC" in shown
     kinds = ("estimate.csv", "estimate.parquet", "voltage.csv", "voltage.png")
     assert {path.name for path in folder.iterdir()} == {f"B0005_100_{kind}" for kind in kinds}
     (row,) = pd.read_csv(folder / "B0005_100_estimate.csv").to_dict(orient="records")
@@ -96,7 +97,8 @@ def test_a_file_of_constants_takes_the_place_of_the_new_cell(recorded, tmp_path,
     drawn_Ah = record.charge_C / 3600.0
     given_Ah = fit.model.capacity_Ah(record.current_A[-1], "current", 2.7, 7000.0)
     assert f"{fit.estimate(record).q_mobile:.0f} C" in shown
-    health = f"{drawn_Ah / given_Ah:.3f}   {drawn_Ah:.3f} Ah, drawn, of {given_Ah:.4g} Ah, what the given cell yields"
+    drawn = f"{drawn_Ah:.3f} Ah (sd {0.005 * drawn_Ah:.3f} Ah), drawn"
+    health = f"{drawn_Ah / given_Ah:.3f}   {drawn}, of {given_Ah:.4g} Ah, what the given cell yields"
     assert health in shown
     cell.write_text("{}")
     assert "cell.json holds no battery_env.CellParameters" in terminal.refuses(path, "--cell", cell)
@@ -151,16 +153,18 @@ def test_what_remains_of_a_discharge_in_progress_needs_a_prior_or_the_filter(rec
     path = write(recorded.until(1500.0), tmp_path / "half.csv")
     shown = terminal.shows(path, status=3)
     assert "remaining" in shown and "Not settled: q_mobile is not known to 2 % yet" in shown
-    assert "give --prior" in shown and "--method kalman" in shown and "Ah   so far" in shown
+    assert "give --prior" in shown and "calibrated by the Kalman filter" in shown and "Ah   so far" in shown
+    assert terminal.row(path, status=3) == terminal.row(path, "--method", "kalman", status=3)
     shown = terminal.shows(path, "--prior", 5460, 55, "--nominal", 2, "--out", tmp_path, status=3)
-    assert "Not settled: q_mobile rests on its prior" in shown and "give --prior" not in shown
-    assert "2.01 A to go on" in shown and "Ah, predicted, of 2 Ah" in shown
+    assert "Not settled: q_mobile rests on its prior" in shown and "give --prior" not in shown and "Kalman" not in shown
+    assert "2.01 A to go on" in shown and "Ah), predicted, of 2 Ah" in shown
     (row,) = pd.read_csv(tmp_path / "half_estimate.csv").to_dict(orient="records")
     end_s, whole_Ah = recorded.eod_time_s(2.7), recorded.loaded_part(2.7).charge_C / 3600.0
     assert 1500.0 + row["remaining_s"] == pytest.approx(end_s, rel=0.02)
     assert np.isnan(row["measured_eod_time_s"]) and np.isnan(row["capacity_Ah"])
     assert row["predicted_capacity_Ah"] == pytest.approx(whole_Ah, rel=0.02)
     assert row["state_of_health"] == row["predicted_capacity_Ah"] / 2.0
+    assert row["sd_state_of_health"] == pytest.approx(row["sd_predicted_eod_time_s"] * row["future_current_A"] / 7200.0)
     filtered = terminal.row(path, "--method", "kalman", status=3)
     assert filtered["settled"] is False and filtered["measured_eod_time_s"] is None
     assert 1500.0 + filtered["remaining_s"] == pytest.approx(end_s, rel=0.2)
@@ -249,12 +253,26 @@ def test_bad_input_is_one_line_and_no_traceback(arguments, message, lab, recorde
     assert message in terminal.refuses(*arguments)
 
 
-@pytest.mark.parametrize("jobs", ["0", "many"])
-def test_a_number_of_processes_that_cannot_be_is_refused(jobs, capsys):
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ("--jobs=0", "--jobs: expected a number of processes, 1 or more, or -1 for one a core, got '0'"),
+        ("--jobs=many", "or -1 for one a core, got 'many'"),
+        ("--cell-name=B0005", "expected a regular expression with one group, such as '(B[0-9]+)_', got 'B0005'"),
+        ("--cell-name=(B", "'(B' is no regular expression"),
+    ],
+)
+def test_an_option_that_cannot_be_meant_is_refused(option, message, capsys):
     with pytest.raises(SystemExit) as stopped:
-        main(["calibrate", "B0005:1", f"--jobs={jobs}"])
-    assert stopped.value.code == 2
-    assert f"--jobs: expected a number of processes, 1 or more, or -1 for one a core, got '{jobs}'" in capsys.readouterr().err
+        main(["calibrate", "B0005:1", option])
+    assert stopped.value.code == 2 and message in capsys.readouterr().err
+
+
+def test_the_version_is_that_of_the_package(capsys):
+    for arguments in (["--version"], ["calibrate", "--version"]):
+        with pytest.raises(SystemExit, match="0"):
+            main(arguments)
+        assert capsys.readouterr().out == f"battery_env {battery_env.__version__}\n"
 
 
 @pytest.mark.parametrize("method", ["least-squares", "kalman"])
@@ -289,7 +307,7 @@ def test_large_cells_are_fitted_and_calibrated(tmp_path, terminal):
     large = Discharge(small.time_s[::10], small.voltage_V[::10], 50.0 * small.current_A[::10])
     path, cell = write(large, tmp_path / "large.csv"), tmp_path / "cell.json"
     assert "at least 29" in (said := terminal.refuses(path)) and "--cell" in said
-    assert main(["fit", path, "--out", str(cell)]) == 3  # one discharge is of one age
+    assert main(["fit", path, "--out", str(cell)]) == 3  # of one discharge, and so of one age
     assert terminal.row(path, "--cell", cell)["q_mobile_C"] == pytest.approx(300_000.0, rel=0.01)
 
 
@@ -334,6 +352,30 @@ def test_a_folder_becomes_one_table_and_what_cannot_be_used_stops_nothing(lab, t
     assert pd.read_parquet(tmp_path / "estimate.parquet")["q_mobile_C"].equals(table["q_mobile_C"])
     kinds = [f"{name}_voltage.{kind}" for name in records[1:6] for kind in ("csv", "png")]
     assert {path.name for path in tmp_path.iterdir()} == {*kinds, "estimate.csv", "estimate.parquet", "life.png"}
+
+
+@pytest.mark.parametrize("given", [["cells"], ["cells/B7", "cells/B18"]])
+def test_each_folder_of_records_is_a_cell(given, recorded, tmp_path, monkeypatch, terminal):
+    monkeypatch.chdir(tmp_path)
+    for name in ("B7/001", "B7/002", "B18/001", "B18/old/001", ".cache/001"):
+        file = Path("cells", f"{name}.csv")
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write(recorded, file)
+    rows = [json.loads(line) for line in terminal.shows(*given, "--json").splitlines()]
+    cells = {"B7_001": "B7", "B7_002": "B7", "B18_001": "B18", "B18_old_001": "B18/old"}
+    assert {row["record"]: row["cell"] for row in rows} == cells
+    named = terminal.shows(*given, "--json", "--cell-name", "(00[0-9])").splitlines()
+    assert {json.loads(line)["cell"] for line in named} == {"001", "002"}
+
+
+def test_a_file_without_a_discharge_is_a_row_with_an_error(recorded, tmp_path, capsys):
+    write(recorded, tmp_path / "good.csv")
+    pd.DataFrame({"time_s": 10.0 * np.arange(6), "voltage_V": 4.2, "current_A": 5 * [0.0] + [2.0]}).to_csv(
+        tmp_path / "aborted.csv"
+    )
+    assert main(["calibrate", str(tmp_path), "--discharge-is-positive", "--json"]) == 2
+    aborted, good = map(json.loads, capsys.readouterr().out.splitlines())
+    assert aborted["error"].startswith("aborted: only ") and good["settled"]
 
 
 @pytest.fixture(scope="module")
@@ -412,6 +454,38 @@ def test_what_was_done_before_an_interruption_is_kept(lab, tmp_path, monkeypatch
     assert main(["calibrate", f"{lab}/life.csv", "--out", str(tmp_path), "--table-only"]) == 130
     assert "interrupted" in capsys.readouterr().err
     assert list(pd.read_csv(tmp_path / "life_estimate.csv")["record"]) == ["life_001"]
+
+
+class TestInPython:
+    def test_files_tables_and_discharges_say_the_same_as_on_the_command_line(self, recorded, tmp_path, terminal):
+        path = Path(write(recorded, tmp_path / "cell.csv", sign=-1.0))
+        row = terminal.row(path, "--nominal", 2, "--method", "kalman")
+        options = {"nominal_Ah": 2.0, "method": "kalman"}
+        (of_file,), (of_table,) = (battery_env.calibrate(each, **options) for each in (path, pd.read_csv(path)))
+        of_discharge = battery_env.calibrate(battery_env.read_discharges(path)[0], Settings(**options))
+        for found in (of_file, of_table, of_discharge):
+            assert isinstance(found, Calibration)
+            known = pd.Series(found.row()).dropna()
+            assert known.to_dict() == {name: row[name] for name in known.index}
+
+    def test_it_prints_as_on_the_command_line_and_makes_a_table(self, lab, terminal):
+        found = battery_env.calibrate(lab / "life.csv")
+        assert str(found[1]).splitlines()[1:] == terminal.shows(f"{lab}/life.csv:2").splitlines()[1:]
+        assert repr(found).count("\n") == 0 and "<discharge 2 " in repr(found)
+        table = pd.DataFrame(each.row() for each in found)
+        assert list(table["cycle"]) == [1, 2, 3] and table["settled"].all()
+
+    def test_what_cannot_be_used_is_left_out_with_a_warning(self, lab):
+        table = pd.read_csv(lab / "life.csv")
+        table.loc[table.index[table["cycle"] == 2][50], "Voltage(V)"] = 0.0
+        with pytest.warns(UserWarning, match="DataFrame: discharge 2: the voltage falls to 0.00 V .* It is left out"):
+            assert [each.cycle for each in battery_env.calibrate(table)] == [1, 3]
+
+    def test_all_that_a_fit_knows_is_used(self, recorded):
+        with pytest.warns(UserWarning, match="one age"):
+            fit = fit_cell([recorded], cut_off_V=2.75)
+        settings = battery_env.calibrate(recorded, cell=fit, method="kalman").settings
+        assert settings.cut_off_V == 2.75 and settings.mismatch_V == fit.mismatch_V
 
 
 def test_the_temperature_is_that_of_the_record_or_the_one_given(recorded, tmp_path, terminal):

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from battery_env import PolicyEstimator, evaluate
-from battery_env.calibration.confidence import NO_FIT
 from battery_env.calibration.data import standard_dataset
 from battery_env.electrochemistry import NEW_CELL, simulate
 from battery_env.records import Samples
@@ -76,7 +75,7 @@ def test_what_is_known_has_none():
 
 def test_a_policy_that_sees_no_fit_states_nothing_and_is_never_sure():
     estimate = PolicyEstimator(Step(columns=slice(0, 2)), ENV_ID).estimate(WHOLE)
-    assert not estimate.settled and estimate.reason == NO_FIT
+    assert not estimate.settled and estimate.reason.startswith("A policy whose observation has no fit")
     assert np.isnan([estimate.sd_q_mobile, estimate.sd_r_o]).all()
 
 

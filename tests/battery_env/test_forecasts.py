@@ -1,11 +1,18 @@
 """Forecasts are the model's where everything is known, and as wide as what is not known where it is not."""
 
+import json
 import re
+import sys
+from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
-from battery_env import Estimate, RecordModel, forecast, initial_state, simulate
+from battery_env import Estimate, RecordModel, forecast, initial_state, load_nasa_discharges, simulate, track_life
+from battery_env.__main__ import calibrate, main
+from battery_env.app.calibrate import Settings
+from battery_env.app.forecast import forecast_end, read_load
 from battery_env.loads import BlockBootstrap, Cycle, Load, RandomPiecewise, constant, steadier_unit
 from battery_env.records import Samples, resample_current
 
@@ -39,6 +46,10 @@ class TestLoads:
         found = certain(record, cut_off_V=cut_off_V)
         assert found.load_name == "4 A"
         np.testing.assert_allclose(found.eod_time_s, MODEL.forecast(record, TRUTH, cut_off_V).eod_time_s, atol=1e-6)
+
+    def test_a_recorded_cell_ends_at_the_same_voltage_as_everywhere(self):
+        found = forecast(half(discharged(4.0, load_unit="current")), TRUTH, samples=3)
+        assert found.cut_off_V == Settings().cut_off_V == 2.7
 
     def test_a_known_profile_ends_when_the_cell_does(self):
         record = discharged(RandomPiecewise((4.0, 12.0))(np.random.default_rng(3)))
@@ -132,6 +143,16 @@ class TestUncertainty:
             low_s, _, high_s = forecast(record, estimate, model=MODEL, mismatch_V=0.0, samples=100).eod_quantile_s()
             inside += low_s <= whole.eod_time_s <= high_s
         assert 0.8 * n <= inside <= 0.98 * n
+
+    def test_an_offset_that_the_record_shows_goes_on(self):
+        record, cut_off_V = self.record, 3.2
+        higher = Samples(record.time_s, record.voltage_V + 0.05, record.current_A)
+        point = MODEL.forecast(higher, TRUTH, cut_off_V, in_progress=True)
+        assert point.offset_V == pytest.approx(0.05)
+        assert point.eod_time_s == pytest.approx(MODEL.forecast(record, TRUTH, cut_off_V - 0.05, in_progress=True).eod_time_s)
+        sampled = forecast(higher, TRUTH, cut_off_V=cut_off_V, model=MODEL, mismatch_V=0.02, samples=200)
+        assert sampled.eod_quantile_s(0.5) == pytest.approx(point.eod_time_s, rel=0.01)
+        assert point.eod_time_s > 1.01 * MODEL.forecast(record, TRUTH, cut_off_V).eod_time_s
 
     def test_samples_agree_with_the_record(self):
         whole = discharged(4.0, load_unit="current")
@@ -243,3 +264,103 @@ class TestBlockBootstrap:
             BlockBootstrap(Samples(self.time_s, self.record.voltage_V, np.zeros(601)))
         with pytest.raises(ValueError, match="block_s must be at most half of the"):
             BlockBootstrap(self.record, block_s=400.0)
+
+
+class TestCommand:
+    discharges = load_nasa_discharges("B0006")[70:81]
+    end_s = discharges[10].eod_time_s(2.7)
+
+    @pytest.fixture(autouse=True)
+    def files(self, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        Path("lab").mkdir()
+        tables = [
+            pd.DataFrame({"time_s": each.time_s, "voltage_V": each.voltage_V, "current_A": each.current_A, "cycle": n})
+            for n, each in enumerate([*self.discharges[:10], self.discharges[10].until(1200.0)], start=1)
+        ]
+        pd.concat(tables).to_csv("all.csv", index=False)
+        pd.concat(tables[:10]).to_csv("lab/life.csv", index=False)
+        tables[10].drop(columns="cycle").to_csv("running.csv", index=False)
+        Path("lab/notes.txt").write_text("moved to channel 4")
+        Path("profile.csv").write_text("time_s;current_A\n0;1.0\n600;3.0\n")
+
+    def row(self, capsys, *arguments, status=0):
+        capsys.readouterr()
+        assert main(["forecast", *arguments, "--json"]) == status
+        return json.loads(capsys.readouterr().out)
+
+    def wide_sd_C(self, capsys):
+        return self.row(capsys, "running.csv", "--life", "lab", "--load", "profile.csv")["prior_q_mobile_C"][1]
+
+    def test_life_and_load_give_the_end_that_python_gives(self, capsys):
+        assert main(["forecast", "running.csv", "--life", "lab", "--load", "profile.csv", "--out", "out"]) == 0
+        shown = capsys.readouterr()
+        assert "life of 10 earlier discharges" in shown.out and "then a given load" in shown.out and "health" not in shown.out
+        assert "notes.txt is left out" in shown.err
+        written = json.loads(Path("out/running_forecast.json").read_text())
+        life = track_life(self.discharges[:10], 2.7)
+        # another load than that of the life
+        assert written["prior_q_mobile_C"] == pytest.approx(life.prior_at_other_loads_C, rel=0.05)
+        known = Settings(prior_q_mobile_C=tuple(written["prior_q_mobile_C"]))
+        seen = self.discharges[10].until(1200.0)
+        again = forecast_end(seen, known, read_load("profile.csv"))
+        assert written["eod_time_s"] == pytest.approx(again.eod_quantile_s(), abs=2.0)
+        # the charge that 2 A draw until the end, and what is over at once under 3 A
+        assert written["eod_time_s"][1] < 1800.0 + (2.0 * (self.end_s - 1200.0) - 600.0) / 3.0
+        assert Path("out/running_forecast.png").read_bytes().startswith(b"\x89PNG")
+        assert main(["forecast", "running.csv", "--out", "out"]) == 2
+        assert "running_forecast.json, out/running_forecast.png would be replaced" in capsys.readouterr().err
+
+    def test_of_its_own_file_only_what_came_before_counts(self, capsys):
+        apart, together = (
+            self.row(capsys, *names) for names in (("running.csv", "--life", "lab"), ("all.csv", "--life", "all.csv"))
+        )
+        assert together["record"] == "all_011" and together["life_discharges"] == 10
+        assert together["eod_time_s"] == pytest.approx(apart["eod_time_s"], rel=1e-3)
+        assert together["eod_time_s"][1] == pytest.approx(self.end_s, rel=0.02)
+        assert together["prior_q_mobile_C"][1] < 0.8 * self.wide_sd_C(capsys)
+        assert self.row(capsys, "all.csv:4", "--life", "all.csv")["life_discharges"] == 3
+
+    def test_without_a_life_the_interval_is_wide_and_the_filter_is_taken(self, capsys):
+        alone, carried = self.row(capsys, "running.csv"), self.row(capsys, "running.csv", "--prior", "5600", "60")
+        assert (alone["method"], carried["method"]) == ("kalman", "least-squares")
+        low_s, _, high_s = alone["eod_time_s"]
+        assert low_s < self.end_s < high_s and high_s - low_s > 5.0 * np.ptp(carried["eod_time_s"])
+        assert alone["prior_q_mobile_C"] is None and alone["state_of_health"] == [None] * 3
+        assert 0.6 < self.row(capsys, "running.csv", "--nominal", "2")["state_of_health"][1] < 0.9
+
+    def test_a_record_that_contradicts_its_estimate_has_its_own_status(self, capsys):
+        late = pd.read_csv("running.csv").query("time_s > 400")
+        late.to_csv("late.csv", index=False)
+        row = self.row(capsys, "late.csv", "--life", "lab", status=3)
+        assert row["settled"] is False and "starts under load" in row["notes"][0]
+
+    def test_the_installed_command_has_the_others_behind_it(self, capsys, monkeypatch):
+        monkeypatch.setattr(sys, "argv", ["battery-calibrate", "forecast", "running.csv"])
+        assert calibrate() == 0
+        assert "remaining time (s)" in capsys.readouterr().out
+        assert calibrate(["fit", "running.csv", "--out", "cell.txt"]) == 2
+        assert calibrate(["running.csv"]) == 3
+
+    @pytest.mark.parametrize(
+        ("arguments", "message"),
+        [
+            (["running.csv", "--life", "running.csv"], "running.csv: no discharge before running.csv"),
+            (["running.csv", "--life", "lab", "--prior", "5000", "50"], "give one of them"),
+            (["lab"], "lab holds 2 files"),
+            (
+                ["running.csv", "--load", "lab/notes.txt"],
+                "columns time_s and either current_A or power_W, got moved",
+            ),
+            (["running.csv", "--load", "late.csv"], "late.csv: start_s must be finite and increase from 0"),
+            (["running.csv", "--load", "none.csv"], "none.csv"),
+            (["running.csv", "--out", "running.csv"], "running.csv is a file"),
+        ],
+    )
+    def test_what_cannot_be_meant_is_refused_and_nothing_is_written(self, arguments, message, capsys):
+        Path("late.csv").write_text("time_s,power_W\n10,4\n20,5\n")
+        before = sorted(Path().rglob("*"))
+        assert main(["forecast", *arguments]) == 2
+        error = capsys.readouterr().err.splitlines()[-1]
+        assert error.startswith("error: ") and message in error
+        assert sorted(Path().rglob("*")) == before

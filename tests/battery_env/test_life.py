@@ -4,12 +4,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from battery_env import LeastSquares, load_nasa_discharges, track_life
+from battery_env import Discharge, LeastSquares, load_nasa_discharges, track_life
 from battery_env.life import life_of
 
 
 def followed(q_mobile_C, **columns):
-    table = pd.DataFrame({"q_mobile_C": q_mobile_C, "settled": True, "reason": ""})
+    table = pd.DataFrame({"q_mobile_C": q_mobile_C, "valid": True, "reason": ""})
     known = {"cycle": np.arange(len(table)) + 1, "capacity_Ah": table["q_mobile_C"] / 3780.0, "lasted_share": 1.0}
     return life_of(table.assign(**{**known, **columns}))
 
@@ -44,12 +44,13 @@ class TestSeries:
                 inside.append(low <= end + 1 - 20 <= high)
         assert np.mean(inside) >= 0.8
 
-    def test_estimates_that_are_not_settled_are_left_aside(self):
-        q_C, settled = walk(0, 30), np.arange(30) != 17
-        lives = [followed(np.where(settled, q_C, wrong), settled=settled) for wrong in (1000.0, 20_000.0)]
-        assert lives[0].prior_q_mobile_C == lives[1].prior_q_mobile_C
+    def test_estimates_that_are_not_valid_are_left_aside(self):
+        q_C, valid = walk(0, 30), np.arange(30) != 17
+        lives = [followed(np.where(valid, q_C, wrong), valid=valid) for wrong in (1000.0, 20_000.0, np.nan)]
+        assert lives[0].prior_q_mobile_C == lives[1].prior_q_mobile_C == lives[2].prior_q_mobile_C
         expected = [life.table["expected_q_mobile_C"] for life in lives]
-        pd.testing.assert_series_equal(*expected)
+        pd.testing.assert_series_equal(*expected[:2])
+        pd.testing.assert_series_equal(*expected[1:])
 
     def test_one_discharge_is_enough_for_a_prior(self):
         mean_C, sd_C = followed(np.array([7000.0])).prior_q_mobile_C
@@ -74,8 +75,9 @@ class TestSeries:
             life.remaining_discharges(0.0)
         with pytest.raises(ValueError, match=r"count must lie within 1 \.\. 10, got 11"):
             life.after(11)
-        with pytest.raises(ValueError, match=r"no discharge determines q_mobile\. Of the first one: Too short\."):
-            followed(walk(2, 3), settled=False, reason="Too short.")
+        reasons = ["It rests at 3.85 V.", "Cut at 2.90 V.", "Cut at 2.80 V."]
+        with pytest.raises(ValueError, match=r"no discharge determines q_mobile\. Of 2 of 3: Cut at 2\.90 V\."):
+            followed(walk(2, 3), valid=False, reason=reasons)
         with pytest.raises(ValueError, match="must have no prior"):
             track_life(TestRealCell.discharges, 2.7, LeastSquares(prior_q_mobile_C=(7000.0, 70.0)))
         with pytest.raises(ValueError, match="at least one discharge"):
@@ -93,3 +95,23 @@ class TestRealCell:
         assert life.prior_q_mobile_C[0] == pytest.approx(life.table["q_mobile_C"].iloc[-1], rel=0.01)
         earlier = track_life(self.discharges[:3], cut_off_V=2.7)
         assert life.after(3).prior_q_mobile_C == pytest.approx(earlier.prior_q_mobile_C)
+
+    def test_an_error_that_all_discharges_share_hides_no_step(self):
+        life = track_life(self.discharges, cut_off_V=3.2)
+        assert not life.table["settled"].any() and life.table["valid"].all()
+        mean_C, sd_C = life.prior_q_mobile_C
+        assert (life.table["sd_q_mobile_C"] > 0.03 * mean_C).all() and sd_C < 0.02 * mean_C
+        assert mean_C == pytest.approx(track_life(self.discharges, cut_off_V=2.7).prior_q_mobile_C[0], rel=0.03)
+
+    def test_what_contradicts_is_left_out_and_the_others_count(self):
+        first, second, third, fourth = self.discharges
+        late = Discharge(*(column[second.time_s > 900.0] for column in (second.time_s, second.voltage_V, second.current_A)))
+        dip = np.where(np.arange(len(third.time_s)) == 50, 2.0, third.voltage_V)
+        broken = Discharge(third.time_s, dip, third.current_A)
+        life = track_life([first, late, broken, fourth.until(2000.0), fourth], cut_off_V=3.2)
+        assert life.table["valid"].tolist() == [True, False, False, False, True]
+        starts, falls, short = life.table["reason"].iloc[1:4]
+        assert "starts under load" in starts and "the voltage falls to 2.00 V" in falls and "not known to 2 %" in short
+        assert life.prior_q_mobile_C[0] == pytest.approx(track_life([first, fourth], 3.2).prior_q_mobile_C[0], rel=0.002)
+        with pytest.raises(ValueError, match=r"Of 1 of 1: the voltage falls to 2\.00 V"):
+            track_life([broken], cut_off_V=3.2)

@@ -8,8 +8,10 @@ from battery_env.electrochemistry import simulate
 from battery_env.estimators import CramerRaoBound, Estimate, EstimateTrace, sensitivities
 from battery_env.files import replacing
 from battery_env.plotting import (
+    COLOUR_OF,
     COLOURS,
     LABELS,
+    coloured,
     new_figure,
     plot_discharge,
     plot_estimates,
@@ -62,8 +64,9 @@ def test_discharge_shows_the_measured_voltage_the_model_and_its_error(record):
     forecast = RecordModel().forecast
     estimates = {"true": Estimate(6000.0, 0.15), "aged": Estimate(5000.0, 0.15)}
     figure = plot_discharge(offset, {name: forecast(offset, estimate) for name, estimate in estimates.items()})
-    voltage, error = figure.axes
+    voltage, current, error = figure.axes
     measured, model, _ = voltage.lines
+    np.testing.assert_array_equal(current.lines[0].get_ydata(), offset.current_A)
     np.testing.assert_array_equal(measured.get_ydata(), offset.voltage_V)
     np.testing.assert_allclose(model.get_ydata()[: len(record.time_s)], record.voltage_V, atol=1e-9)
     assert model.get_ydata()[-1] == 3.0
@@ -94,7 +97,7 @@ def test_estimates_have_a_panel_per_parameter_bands_and_a_dotted_part_that_is_no
     assert set(true.get_ydata()) == {6000.0}
     np.testing.assert_array_equal(settled.get_ydata(), [np.nan, np.nan, 6050.0, 6001.0])
     np.testing.assert_array_equal(dotted.get_ydata(), [7000.0, 6200.0, 6050.0, np.nan])
-    assert dotted.get_linestyle() == ":" and single.get_marker() == "o" and single.get_color() == COLOURS[1]
+    assert dotted.get_linestyle() == ":" and single.get_marker() == "o" and single.get_color() == COLOUR_OF["policy"]
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
     assert labels == ["true", "Cramér-Rao bound, ± 2 sd", "filter", "policy", "not settled yet"]
     with pytest.raises(ValueError, match="true"):
@@ -137,7 +140,8 @@ def test_a_life_is_drawn_over_the_numbers_of_its_discharges_with_a_colour_a_cell
     figure = plot_life(life(["A", "B"]))
     assert [line.get_xdata().tolist() for line in points_of(figure)] == [[2.0, 5.0, 9.0]] * 2
     assert [line.get_color() for line in points_of(figure)] == list(COLOURS[:2])
-    assert [text.get_text() for text in figure.legends[0].texts] == ["A", "B", "± 2 sd"]
+    *names, bar = [text.get_text() for text in figure.legends[0].texts]
+    assert names == ["A", "B"] and bar.startswith("± 2 sd")
 
 
 def test_files_of_one_discharge_each_are_a_life_in_their_order_and_unsettled_ones_are_hollow():
@@ -145,6 +149,66 @@ def test_files_of_one_discharge_each_are_a_life_in_their_order_and_unsettled_one
     settled, hollow = points_of(plot_life(table))
     assert settled.get_xdata().tolist() == [1.0, 3.0] and hollow.get_xdata().tolist() == [2.0]
     assert hollow.get_markerfacecolor() == "white"
+
+
+def test_the_common_error_of_a_cell_is_one_bar_and_its_line_has_no_band():
+    upper, lower, _ = plot_life(life(["A", "B"])).axes
+    for axes, last, reach in ((upper, 6100.0, 100.0), (lower, 0.1, 0.04)):
+        bars = [bar.get_segments()[0] for bar in axes.collections if len(bar.get_segments())]
+        assert len(bars) == 2 and min(bar[0, 0] for bar in bars) > 9.0
+        np.testing.assert_allclose(bars[0][:, 1], [last - reach, last + reach])
+
+
+def test_the_cycles_of_files_are_the_axis_and_one_method_is_drawn():
+    table = life(["A"]).assign(cell=["a", "b", "c"])
+    figure = plot_life(table)
+    assert points_of(figure)[0].get_xdata().tolist() == [2.0, 5.0, 9.0] and figure.axes[-1].get_xlabel() == "cycle"
+    assert plot_life(table.drop(columns="cell").assign(cycle=None)).axes[-1].get_xlabel() == "discharge"
+    with pytest.raises(ValueError, match="one method, got kalman and least-squares"):
+        plot_life(table.assign(method=["kalman", "kalman", "least-squares"]))
+
+
+@pytest.mark.parametrize(("noise_Ah", "follows"), [(0.0, True), (0.5, False)])
+def test_the_title_says_that_q_max_follows_the_capacity_only_if_it_does(noise_Ah, follows):
+    table = pd.concat([life(["A"])] * 3, ignore_index=True)
+    table["cycle"] += 10 * (table.index // 3)
+    table["q_mobile_C"] = 7000.0 - 10.0 * table["cycle"]
+    drawn_Ah = table["q_mobile_C"] / 3800.0 + noise_Ah * np.random.default_rng(0).standard_normal(len(table))
+    title = plot_life(table.assign(capacity_Ah=drawn_Ah)).axes[0].get_title()
+    assert title == ("$q^{max}$ follows the measured capacity (r > 0.999)" if follows else "")
+    assert plot_life(table).axes[0].get_title() == ""
+
+
+def test_a_name_has_one_colour_in_all_figures():
+    names = ["SAC", "least squares, prior 2 %", "mine", "LAC", ("Kalman filter, no prior", "data")]
+    colours = [colour for colour, _ in coloured(names)]
+    assert colours[0] == COLOUR_OF["SAC"] and colours[1] == COLOUR_OF["least squares"] and len(set(colours)) == 5
+    assert colours[4] == COLOUR_OF["Kalman filter"] and colours[3] == next(coloured(["a policy"]))[0]
+    assert not {colours[2]} & set(COLOUR_OF.values())
+    # a second one of a name is told apart, and what only sounds alike has no name
+    (first, _), (second, _) = coloured(["least squares", "least squares, prior 2 %"])
+    assert first == COLOUR_OF["least squares"] != second
+    assert [colour for colour, _ in coloured(["replaced", 0.01])] == list(COLOURS[:2])
+
+
+def test_pulses_are_drawn_by_their_envelope():
+    pulses = simulate(np.tile(np.repeat([4.0, 0.0], 10), 300), 6000.0, 0.1, load_unit="current")
+    record = Samples(pulses.time_s, pulses.voltage_V, pulses.current_A)
+    voltage, current, _ = plot_discharge(record, {"model": RecordModel().forecast(record, Estimate(6000.0, 0.1))}).axes
+    for line in (voltage.lines[0], voltage.lines[1], current.lines[0]):
+        low, high = np.split(line.get_ydata(), np.flatnonzero(np.isnan(line.get_xdata())))
+        assert len(low) == len(high) - 1 < len(record.time_s) / 20 and (low <= high[1:]).all()
+    assert set(low[:-1]) == {0.0} and set(high[1:]) == {4.0}
+
+
+def test_a_discharge_in_progress_ends_in_a_band(record):
+    seen = Samples.of(record).first(1000)
+    forecast = RecordModel().forecast(seen, Estimate(6000.0, 0.15), in_progress=True)
+    voltage, *_ = plot_discharge(seen, {"model": forecast}, end_s=(500.0, 2500.0, 9000.0)).axes
+    band, end = voltage.patches[0], voltage.lines[-1]
+    # from the end of the record, which has not reached it, to what can be shown
+    assert (band.get_x(), band.get_x() + band.get_width()) == (999.0, 3750.0) and set(end.get_xdata()) == {2500.0}
+    assert not plot_discharge(seen, {"model": forecast}, end_s=(np.nan, 2500.0, np.nan)).axes[0].patches
 
 
 def test_of_many_points_the_extremes_are_drawn():
@@ -155,6 +219,6 @@ def test_of_many_points_the_extremes_are_drawn():
     record = Samples(time_s, voltage_V, np.full(100_000, 2.0))
     figure = plot_discharge(record, {"model": RecordModel().forecast(record, Estimate(5000.0, 0.12))}, "title")
     measured = figure.axes[0].lines[0]
-    assert len(measured.get_xdata()) <= 4002 and (np.diff(measured.get_xdata()) > 0.0).all()
+    assert len(measured.get_xdata()) <= 4001 and np.nansum(np.diff(measured.get_xdata()) <= 0.0) == 0
     assert {time_s[0], time_s[12_345], time_s[67_890], time_s[-1]} <= set(measured.get_xdata())
-    assert np.isnan(figure.axes[1].lines[-1].get_ydata()).any() and figure.get_suptitle() == "title"
+    assert np.isnan(figure.axes[2].lines[-1].get_ydata()).sum() > 2 and figure.get_suptitle() == "title"

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from battery_env.electrochemistry import simulate
 from battery_env.record_files import read_discharge_csv, read_discharges
 
 # two samples at rest, a load of 2 A, and a rest
@@ -303,7 +304,12 @@ def test_discharges_whose_charges_are_not_logged_need_a_number(tmp_path):
     [
         ({"voltage_V": 1e3 * VOLTAGE_V}, r"voltage_V must lie within 0 \.\. 5.5 V, got 4190.*not in mV"),
         ({"time_s": np.where(TIME_S == 40.0, 10.0, TIME_S)}, "time_s must increase from sample to sample.*each sample once"),
-        ({"time_s": TIME_S / 3600.0}, "Give the time in seconds, not in hours"),
+        ({"time_s": TIME_S / 3600.0}, "Give the time in seconds, not in hours .*--units time=h"),
+        ({"time_s": 1e3 * TIME_S}, "Give the time in seconds, not in milliseconds .*--units time=ms"),
+        (
+            {"time_s": [clock(time_s)[:5] for time_s in TIME_S]},
+            "time_s must increase .*with a clock that tells it from the next",
+        ),
         ({"voltage_V": np.where(TIME_S == 40.0, np.nan, VOLTAGE_V)}, "the voltage must be finite, got nan in row 4"),
         (
             {"voltage_V": ["4.1", "OVERLOAD", *map(str, VOLTAGE_V[2:])]},
@@ -311,7 +317,6 @@ def test_discharges_whose_charges_are_not_logged_need_a_number(tmp_path):
         ),
         ({"current_A": 0.0}, "no current flows"),
         ({"voltage_V": 3.7}, "whether the current of a discharge is positive or negative cannot be told"),
-        ({"time_s": TIME_S[::-1]}, "the file holds no discharge|must increase|cannot be told"),
         ({"Voltage(V)": VOLTAGE_V}, "both 'voltage_V' and 'Voltage.V.' may be the voltage"),
         ({"current_A": np.abs(np.sin(TIME_S)), "voltage_V": 3.7 + 0.3 * np.cos(TIME_S)}, "cannot be told"),
         ({"cycle": 1.5}, "the column of the cycle must hold whole numbers"),
@@ -336,6 +341,11 @@ CUT_SHORT = gzip.compress(b"time_s,voltage_V,current_A\n" + 200_000 * b"1,4.1,2\
         ("empty.csv", b"", "is empty"),
         ("header.csv", b"time_s,voltage_V,current_A\n", "no rows below the header"),
         ("headless.csv", b"0.0,4.19,0\n1.0,4.18,2\n", "no line with the names of the columns"),
+        (
+            "aborted.csv",
+            b"time_s,voltage_V,current_A\n0,4.2,0\n10,4.2,0\n20,4.0,2\n",
+            "needs 5 rows below the header, got 3",
+        ),
         ("text.txt", b"Dear all,\nplease find the data attached.\n", "no column for the time"),
         ("cut.csv.gz", CUT_SHORT, "damaged"),
         ("no.csv.gz", b"time_s,voltage_V,current_A\n", "damaged"),
@@ -357,8 +367,52 @@ def test_the_sign_can_be_stated_and_then_is_not_told(tmp_path):
     check(one(path, discharge_is_negative=True))
     check(read_discharge_csv(path, discharge_is_negative=True))
     for read in (read_discharges, read_discharge_csv):
-        with pytest.raises(ValueError, match=r"holds no discharge.*sign of the current"):
+        with pytest.raises(ValueError, match=r"no discharge.*sign of the current"):
             read(path, discharge_is_negative=False)
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_the_sign_of_a_random_load_is_told_from_its_steps(sign, seed):
+    # of which parts may have a voltage that rises while charge is drawn
+    walk_A = np.repeat(np.random.default_rng(seed).choice(np.arange(0.5, 5.0, 0.5), 20), 300)
+    record = simulate(walk_A, 7000.0, 0.12, load_unit="current", thermal=True)
+    part = pd.DataFrame({"t": record.time_s, "U": record.voltage_V, "I": sign * record.current_A})[900:2100]
+    (discharge,) = read_discharges(part)
+    np.testing.assert_array_equal(discharge.current_A, walk_A[900:2100])
+
+
+@pytest.mark.parametrize("names", [["time_s", "cycle"], ["date", "cycle"], ["time_s"]])
+def test_a_table_of_which_the_newest_row_comes_first_is_turned(names):
+    table = life().assign(date=lambda each: pd.Timestamp("2026-02-28 23:50") + pd.to_timedelta(each["time_s"], unit="s"))
+    table = table[[*names, "voltage_V", "current_A"]]
+    with pytest.warns(UserWarning, match="the clock runs backwards: the rows are taken from the last one to the first"):
+        turned = read_discharges(table[::-1])
+    for discharge, expected in zip(turned, read_discharges(table), strict=True):
+        np.testing.assert_allclose(discharge.time_s, expected.time_s, atol=1e-6)
+        np.testing.assert_array_equal(discharge.voltage_V, expected.voltage_V)
+
+
+def test_a_clock_that_runs_backwards_for_a_while_is_refused_with_the_row():
+    table = life()
+    table.loc[70:90] = table.loc[90:70:-1].to_numpy()
+    with pytest.raises(ValueError, match="the clock runs backwards: row 72 is at 4520 s, after 4550 s"):
+        read_discharges(table)
+
+
+def test_a_table_is_read_as_a_file_is(tmp_path):
+    table = pd.DataFrame(BDF)
+    check(one(table), temperature=True)
+    check(one(table.set_index("Test Time / s").astype(str)), temperature=True)
+    check(one(table[table["Current / A"] > -9.0].astype("Float64")), temperature=True)
+    check(one(table.rename(columns={"Test Time / s": "x"}), columns={"time": "x"}), temperature=True)
+    assert [discharge.meta["cycle"] for discharge in read_discharges(life())] == [1, 2, 3]
+    for changes, message in (
+        ({"Current / A": 0.0}, "DataFrame: no current flows"),
+        ({"Voltage / V": 1e3 * VOLTAGE_V}, "DataFrame: voltage_V must lie within"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            read_discharges(table.assign(**changes))
 
 
 def test_a_file_of_several_discharges_is_not_taken_for_one(tmp_path):

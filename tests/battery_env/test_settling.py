@@ -5,9 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from battery_env.app.calibrate import METHODS, Settings
 from battery_env.cells import Discharge, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate
-from battery_env.estimators import Estimate, ExtendedKalmanFilter, LeastSquares
+from battery_env.estimators import CellFit, Estimate, ExtendedKalmanFilter, LeastSquares, fit_cell
+from battery_env.estimators.diagnosis import Condition, Diagnosis
 from battery_env.record_model import RecordModel
 from battery_env.records import expected_current
 
@@ -147,6 +149,16 @@ def test_each_reason_is_said_of_its_record(name, record, arguments, reason):
     assert not estimate.settled and estimate.reason.startswith(reason), estimate.reason
 
 
+def test_the_table_decides_what_is_said_first_whoever_notes_it():
+    diagnosis = Diagnosis()
+    assert diagnosis.reason == ""
+    diagnosis.note(Condition.Q_IMPRECISE.of("r_o"))
+    diagnosis.note(Condition.MISFIT, False)
+    assert diagnosis.reason.startswith("r_o is not known to 30 %")
+    diagnosis.note(Condition.RISES, size=0.1, fault_s=60.0)
+    assert diagnosis.reason == "The voltage rises by 0.10 V at 60 s, where the current stays as it was."
+
+
 NOISY_REST = discharged(1e-6 + pulsed(30, 60, 2.0, 0.0))
 LONG_REST = discharged(np.concatenate([np.full(1500, 2.0), np.zeros(4000), np.full(40_000, 2.0)]))
 QUIET = discharged(noise_V=0.001)
@@ -280,6 +292,11 @@ class TestGaps:
         assert 2.0 * 80.0 < estimate.sd_q_mobile < 2.0 * 80.0 + 100.0
 
 
+@pytest.fixture(scope="module")
+def young_fit() -> CellFit:
+    return fit_cell([load_nasa_discharges("B0005")[n] for n in (0, 10, 20)], cut_off_V=2.7)
+
+
 class TestPrecision:
     def test_the_gain_of_the_current_sensor_is_covered_where_it_is_stated(self, calibrator):
         for gain in (0.97, 1.03):
@@ -294,14 +311,29 @@ class TestPrecision:
         record = load_nasa_discharges(cell)[index].loaded_part(2.7)
         filtered, fitted = (CALIBRATORS[name]().estimate(record) for name in ("filter", "least squares"))
         assert abs(filtered.q_mobile - fitted.q_mobile) < 1.5 * filtered.sd_q_mobile
-        assert filtered.settled and 0.005 < filtered.sd_q_mobile / filtered.q_mobile < 0.011
+        assert filtered.settled and 0.5 * fitted.sd_q_mobile < filtered.sd_q_mobile < fitted.sd_q_mobile
+
+    @pytest.mark.parametrize("share", [0.25, 0.5, 0.75])
+    def test_before_the_knee_it_is_no_surer_than_least_squares_with_constants_of_young_discharges(self, young_fit, share):
+        """With an error stated too small it answered 4657 +- 84 C at half time; the whole discharge says 5986 C."""
+        record = load_nasa_discharges("B0006")[64].loaded_part(2.7)
+        seen = record.until(record.time_s[0] + share * (record.time_s[-1] - record.time_s[0]))
+        stated = [Settings.for_cell(young_fit, method=method, mismatch_V=0.0055) for method in METHODS[:2]]
+        fitted, filtered = (settings.calibrator().estimate(seen) for settings in stated)
+        assert not filtered.settled and filtered.sd_q_mobile > 0.9 * fitted.sd_q_mobile
+
+    def test_nor_is_it_by_a_prior(self, young_fit):
+        record = load_nasa_discharges("B0006")[64].until(1800.0).loaded_part(2.7)
+        stated = Settings.for_cell(young_fit, method="kalman", prior_q_mobile_C=(4700.0, 90.0), mismatch_V=0.0055)
+        estimate = stated.calibrator().estimate(record)
+        assert estimate.reason.startswith("q_mobile rests on its prior") and estimate.sd_q_mobile < 90.0
 
     @pytest.mark.parametrize("factor", [0.8, 1.2])
     @pytest.mark.parametrize("every", [1, 10])
     def test_so_does_it_where_a_constant_is_wrong_however_many_samples_there_are(self, factor, every):
         record = discharged(cell=NEW_CELL.replace(tDiffusion=factor * NEW_CELL.tDiffusion))
         estimate = CALIBRATORS["filter"]().estimate(changed(record, slice(None, None, every), rested=False))
-        assert 0.0 < abs(estimate.q_mobile - 6000.0) < 2.0 * estimate.sd_q_mobile < 0.03 * 6000.0
+        assert 0.0 < abs(estimate.q_mobile - 6000.0) < 2.0 * estimate.sd_q_mobile < 0.04 * 6000.0
 
 
 class TestForecasts:

@@ -277,8 +277,8 @@ def test_voltage_only_tasks_are_compared_under_sensors_beside_their_peers(tmp_pa
 
 
 def test_algorithms_of_the_zoo_and_ones_own_are_compared_in_any_environment(tmp_path, capsys, monkeypatch):
-    page = (ROOT / "docs" / "own_algorithm.md").read_text(encoding="utf-8")
-    environment, algorithm, _ = re.findall(r"^```python\n(.*?)^```", page, flags=re.MULTILINE | re.DOTALL)
+    pages = [(ROOT / "docs" / name).read_text(encoding="utf-8") for name in ("own_problem.md", "own_algorithm.md")]
+    environment, algorithm = (re.search(r"^```python\n(.*?)^```", page, flags=re.MULTILINE | re.DOTALL)[1] for page in pages)
     (tmp_path / "tank.py").write_text(environment + algorithm)
     monkeypatch.syspath_prepend(str(tmp_path))
     common = [

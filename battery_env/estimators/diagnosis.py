@@ -1,0 +1,218 @@
+"""
+What speaks against an estimate: one table of conditions for least squares, the filter, policies and the closed form. Who makes
+an estimate notes which of them hold, and what was measured; the table has their order and their texts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import IntEnum
+from functools import lru_cache
+from math import comb
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from battery_env.arrays import BoolArray, FloatArray
+from battery_env.electrochemistry import CellParameters, initial_state, voltage
+from battery_env.parameters import PARAMETER_NAMES
+
+#: An estimate is settled when its standard deviation is below this share of its value. That of ``r_o`` is wider: on a real
+#: cell the error of the model divided by the current is a quarter of it already.
+SETTLED_SHARES = {"q_mobile": 0.02, "r_o": 0.3}
+#: A ``q_mobile`` is plausible within these multiples of the model cell's: its electrodes are those of a 2 Ah cell.
+PLAUSIBLE_Q_SHARES = (0.2, 5.0)
+#: The error of the model may be this much larger than stated before the residuals contradict it.
+MISMATCH_MARGIN = 2.0
+#: Where the noise is told from the residuals, their variance may exceed its by this share over the root of their number.
+EXCESS_LIMIT_UNSTATED = 10.0
+#: So many samples more than parameters tell how large the noise is.
+SPARE_SAMPLES = 10
+#: A prior contradicts the record beyond so many standard deviations of their difference. Within it, a prior of the settled
+#: width moves no estimate by more than 5 %.
+PRIOR_LIMIT_SD = 2.5
+#: A full cell may rest so far below and above the model's voltage, V. Real ones of the bundled kind rest at 4.17 to 4.23 V,
+#: the model's at 4.19 V, which falls by 11 mV with each percent of the charge: a cell that lacks 4 % or more is noticed.
+FULL_REST_V = (0.04, 0.06)
+
+_AT_BOUND = "{} is at a bound of its search, where the record does not determine it."
+_DIFFERS = "The policy and the fit in its observation differ by {{differs:.1%}} in {}: it does not trust the fit."
+_PRIOR_WRONG = "The prior of {} contradicts what the record says."
+_PRIOR_ALONE = "{} rests on its prior: the record alone does not determine it yet. Without it {}"
+_SCALE_UNKNOWN = (
+    "{} is known no better than what scales it and shows nowhere in the voltage: the gain of the current sensor "
+    "(current_gain_sd) and the charge at the start (initial_soc)."
+)
+_IMPRECISE_Q = (
+    "q_mobile is not known to 2 % yet: the voltage shows it at the knee of the discharge, the more the lower the record goes. "
+    "To the same cut-off, a smaller load or constants of the cell itself (fit_cell, --cell) tell more."
+)
+_IMPRECISE_R = (
+    "r_o is not known to 30 %: the error expected of noise and model, divided by the current, is larger. A larger current, or "
+    "a smaller mismatch_V if the model is that good, tells more."
+)
+
+
+class Condition(IntEnum):
+    """
+    What speaks against an estimate, in the order in which it counts: the first row that holds is the reason. Braces name what
+    was measured. A row of ``q_mobile`` is followed by that of ``r_o``.
+    """
+
+    def __new__(cls, text: str) -> Condition:
+        number = len(cls.__members__) + 1
+        member = int.__new__(cls, number)
+        member._value_ = number
+        member.text = text
+        return member
+
+    text: str
+
+    # a policy that states nothing
+    NO_FIT = "A policy whose observation has no fit (option nuisance) states no uncertainty."
+    NOT_YET = "The policy states nothing before its next decision."
+    # the start, and samples that a policy cannot read
+    START_UNKNOWN = (
+        "The record does not start with a minute at rest, whose voltage would tell the charge. Give the rest before the load, "
+        "or state initial_soc."
+    )
+    START_ABOVE = (
+        "The record starts at {first_V:.2f} V, above the {rest_V:.2f} V of {expected}: another kind of cell or sensor."
+    )
+    START_BELOW = "The record starts at rest at {first_V:.2f} V, where {expected} shows {rest_V:.2f} V. {start_advice}"
+    START_LOADED = (
+        "The record starts under load at {first_V:.2f} V, which need not be that of {expected}: it rests at {rest_V:.2f} V "
+        "then. {start_advice}"
+    )
+    SPARSE = (
+        "Samples lie farther apart than the {interval_s:g} s between the readings of the policy, or are missing at the start: "
+        "it reads a straight line between them, which misleads it. Least squares and the filter take such records."
+    )
+    # faults of the samples; a stream keeps the first one in time
+    RECOVERED = (
+        "The voltage comes back to that of the start at {fault_s:.0f} s, though {size:.0f} C were drawn: the cell was charged."
+        " Reset the filter when a discharge begins."
+    )
+    NOT_FOLLOWED = "The current changes by {size:.2f} A at {fault_s:.0f} s, and the voltage does not follow."
+    RISES = "The voltage rises by {size:.2f} V at {fault_s:.0f} s, where the current stays as it was."
+    NOT_DRAWN = (
+        "No sample lies between {since_s:.0f} s and {fault_s:.0f} s, and the voltage does not fall by what the {size:.0f} C "
+        "of that time would make it: the clock jumped, or the load was off. Correct the times, or give the rest as samples of "
+        "no current."
+    )
+    # what was given does not suffice
+    NO_CURRENT = "No current flows in the last step, so that r_o does not show."
+    EMPTY = "The model cell is empty before the record ends: its q_mobile is too small for this record."
+    FEW = "These are too few {of} to tell the noise. Record on or more often{or_else}."
+    # the fit
+    Q_AT_BOUND = _AT_BOUND.format("q_mobile")
+    R_AT_BOUND = _AT_BOUND.format("r_o")
+    CHARGE_DIFFERS = (
+        "The charge that moves in the last step, {moved_C:.4g} C, is not that of the current, {drawn_C:.4g} C: check time, "
+        "current and their units."
+    )
+    IMPLAUSIBLE = (
+        "No cell of this kind has such a q_mobile. Check that time is in s and current in A, and that the record is of one "
+        "cell."
+    )
+    MISFIT = (
+        "The voltage of the model is farther off than noise and mismatch_V explain: state a larger mismatch_V, or check the "
+        "sensors and that this is one discharge."
+    )
+    UNEXPLAINED = (
+        "The voltage is farther off than noise, an offset and the constants that the policy knows of explain: use least "
+        "squares with mismatch_V, or check the sensors and that this is one discharge."
+    )
+    OTHER_END = "The record falls to {lowest_V:.2f} V at {end_s:.0f} s, where this estimate says {model_end_s:.0f} s."
+    OFFSET = (
+        "The fit in the observation takes the voltage for {offset_mV:.0f} mV off, where the policy has learned of "
+        "{most_mV:.0f} mV at most."
+    )
+    CONSTANTS = "A constant of the cell is farther from the model's than the policy has learned of (option nuisance)."
+    Q_DIFFERS = _DIFFERS.format("q_mobile")
+    R_DIFFERS = _DIFFERS.format("r_o")
+    # what the record does not tell
+    Q_PRIOR_WRONG = _PRIOR_WRONG.format("q_mobile")
+    R_PRIOR_WRONG = _PRIOR_WRONG.format("r_o")
+    GAP_UNSURE = (
+        "No sample lies between {gap_start_s:.0f} s and {gap_end_s:.0f} s, and the voltage does not tell whether the load was "
+        "on: {gap_C:.0f} C are in doubt."
+    )
+    Q_PRIOR_ALONE = _PRIOR_ALONE.format("q_mobile", _IMPRECISE_Q)
+    R_PRIOR_ALONE = _PRIOR_ALONE.format("r_o", _IMPRECISE_R)
+    Q_SCALE_UNKNOWN = _SCALE_UNKNOWN.format("q_mobile")
+    R_SCALE_UNKNOWN = _SCALE_UNKNOWN.format("r_o")
+    Q_IMPRECISE = _IMPRECISE_Q
+    R_IMPRECISE = _IMPRECISE_R
+    # none of these
+    SETTLED = ""
+
+    def of(self, name: str) -> Condition:
+        """The row of a parameter, where this one is that of ``q_mobile``."""
+        return Condition.numbered(self + PARAMETER_NAMES.index(name))
+
+    @staticmethod
+    def numbered(number: int) -> Condition:
+        """The row of a number that compiled code found."""
+        return _ROWS[number - 1]
+
+    def said(self, measured: Mapping[str, Any]) -> str:
+        """The text, filled with what was measured."""
+        return self.text.format_map(measured)
+
+
+_ROWS = tuple(Condition)
+
+
+class Diagnosis:
+    """What speaks against one estimate: the conditions that hold, each with what was measured of it."""
+
+    def __init__(self) -> None:
+        self.measured: dict[Condition, Mapping[str, Any]] = {}
+
+    def note(self, condition: Condition, holds: bool = True, /, **measured: Any) -> None:
+        """Note that a condition holds, if it does."""
+        if holds:
+            self.measured.setdefault(condition, measured)
+
+    @property
+    def reason(self) -> str:
+        """Why the estimate is not settled; empty if nothing speaks against it."""
+        first = min(self.measured, default=Condition.SETTLED)
+        return first.said(self.measured.get(first, {}))
+
+
+def is_only_imprecise(reason: str) -> bool:
+    """Return whether an estimate is not settled by its precision alone: nothing in the record contradicts it."""
+    return reason in {row.text for row in Condition if Condition.Q_PRIOR_ALONE <= row < Condition.SETTLED}
+
+
+def start_measured(first_V: float, rest_V: float, initial_soc: float = 1.0) -> dict[str, Any]:
+    """What is said of the start of a record: its first voltage, and what a cell at rest shows with the charge expected."""
+    expected, advice = f"a cell with {initial_soc:.0%} of its charge", "State another initial_soc (--initial-soc)."
+    if initial_soc == 1.0:
+        expected = "a full cell"
+        advice = "Give the whole discharge of a full cell, with the rest before it, or state initial_soc (--initial-soc)."
+    return {"first_V": first_V, "rest_V": rest_V, "expected": expected, "start_advice": advice}
+
+
+@lru_cache(maxsize=64)
+def rest_voltage_V(cell: CellParameters, soc: float = 1.0) -> float:
+    """The voltage of a cell at rest."""
+    return float(voltage(initial_state(cell=cell, soc=soc), cell=cell))
+
+
+def is_plausible(q_mobile: ArrayLike, cell: CellParameters) -> BoolArray:
+    """Return whether a cell of the kind of the model can have some ``q_mobile``."""
+    low, high = PLAUSIBLE_Q_SHARES
+    share = np.asarray(q_mobile) / cell.q_mobile
+    return np.asarray((share > low) & (share < high))
+
+
+def white_noise_V(residual_V: FloatArray, order: int = 1) -> float:
+    """
+    Return the standard deviation of the white part of residuals: from their differences from sample to sample, which hardly
+    hold what drifts, by the median, which leaves single wild samples aside.
+    """
+    return float(np.median(np.abs(np.diff(residual_V, order))) / (0.6745 * np.sqrt(comb(2 * order, order))))
