@@ -34,6 +34,10 @@ def entitle_table(app: Sphinx, docname: str, source: list[str]) -> None:
         source[0] = f"---\norphan: true\n---\n\n# {docname.removeprefix('results/')}\n\n{source[0]}"
 
 
+# the pages that include files of the root
+INCLUDING = {ROOT / "README": "index", ROOT / "CONTRIBUTING": "contributing", ROOT / "CHANGELOG": "changelog"}
+
+
 def lead_to_site(app: Sphinx, doctree: nodes.document) -> None:
     """Of what links lead to outside of the site, files are downloads, the README is the index, and folders stay text."""
     page = Path(app.env.doc2path(app.env.docname))
@@ -44,8 +48,11 @@ def lead_to_site(app: Sphinx, doctree: nodes.document) -> None:
         found = next(
             (path for folder in (page.parent, ROOT, ROOT / "docs") if (path := (folder / target).resolve()).exists()), None
         )
-        if found == ROOT / "README.md":
-            link["reftarget"] = "index"
+        outside = Path(target) if found is None else found
+        if (including := INCLUDING.get(outside.with_suffix(""))) is not None:
+            link["reftarget"] = including
+        elif found is not None and (name := app.env.path2doc(found)) in app.env.found_docs:
+            link["reftarget"] = name
         elif found is not None and found.is_file():
             name = app.env.dlfiles.add_file(app.env.docname, str(found))
             link.replace_self(addnodes.download_reference("", "", *link.children, filename=name, reftarget=str(found)))
