@@ -34,23 +34,25 @@ def entitle_table(app: Sphinx, docname: str, source: list[str]) -> None:
         source[0] = f"---\norphan: true\n---\n\n# {docname.removeprefix('results/')}\n\n{source[0]}"
 
 
+#: Pages of the site that include a file beside docs/, by its name.
+INCLUDED = {ROOT / "README": "index", ROOT / "CONTRIBUTING": "contributing", ROOT / "CHANGELOG": "changelog"}
+
+
 def lead_to_site(app: Sphinx, doctree: nodes.document) -> None:
-    """Of what links lead to outside of the site, files are downloads, the README is the index, and folders stay text."""
+    """Of what links lead to outside of the site, files are downloads, some have a page, and folders stay text."""
     page = Path(app.env.doc2path(app.env.docname))
     for link in list(doctree.findall(addnodes.pending_xref)):
         target = link["reftarget"]
-        if link["reftype"] != "myst" or target in app.env.found_docs:
-            continue
-        found = next(
-            (path for folder in (page.parent, ROOT, ROOT / "docs") if (path := (folder / target).resolve()).exists()), None
-        )
-        if found == ROOT / "README.md":
-            link["reftarget"] = "index"
-        elif found is not None and found.is_file():
-            name = app.env.dlfiles.add_file(app.env.docname, str(found))
-            link.replace_self(addnodes.download_reference("", "", *link.children, filename=name, reftarget=str(found)))
-        elif found is not None:
-            link.replace_self(link.children)
+        if Path(target) in INCLUDED:
+            link["reftarget"] = INCLUDED[Path(target)]
+        elif link["reftype"] == "myst" and target not in app.env.found_docs:
+            folders = (page.parent, ROOT, ROOT / "docs")
+            found = next((path for folder in folders if (path := (folder / target).resolve()).exists()), None)
+            if found is not None and found.is_file() and found.suffix != ".md":
+                name = str(app.env.dlfiles.add_file(app.env.docname, str(found)))
+                link.replace_self(addnodes.download_reference("", "", *link.children, filename=name, reftarget=str(found)))
+            elif found is not None:
+                link.replace_self(link.children)
 
 
 def refer_to_page(app: Sphinx, what: str, name: str, documented: Any, options: Any, lines: list[str]) -> None:
