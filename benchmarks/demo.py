@@ -40,7 +40,7 @@ def followed(out: Path) -> str:
     """Calibrate to all discharges of a real cell, and say how it aged."""
     with contextlib.redirect_stdout(io.StringIO()):
         calibrate([CELL, "--table-only", "--jobs", "2", "--force", "--out", str(out)])
-    first, *_, last = pd.read_csv(out / "estimate.csv").itertuples()
+    first, *_, last = pd.read_csv(out / f"{CELL}_estimate.csv").itertuples()
     return (
         f"real cell {CELL} over {last.cycle} discharges: q_max {first.q_mobile_C:.0f} -> {last.q_mobile_C:.0f} C, "
         f"R_o {first.r_o_ohm:.3f} -> {last.r_o_ohm:.3f} ohm"
@@ -59,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(f"\n2/2  battery-calibrate {CELL} --out {life}: all discharges of a real cell\n", flush=True)
     aged = followed(life)
     print(f"Found:    {errors}; {aged}")
-    print(f"Pictures: {trained / f'{ENV}_inferred.png'}, {trained / f'{ENV}_learning.png'}, {life / 'life.png'}")
+    print(f"Pictures: {trained / f'{ENV}_inferred.png'}, {trained / f'{ENV}_learning.png'}, {life / f'{CELL}_life.png'}")
     print(
         "Next:     battery-calibrate with a file of your own (docs/command_line.md), LAC with your environment (docs/lac.md)"
     )

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -103,12 +104,17 @@ def last_curve(last: Record, seen: Record, load: Load, stretches: Sequence[float
     return float(seen.time_s[-1] + np.argmax(expected_V <= CUT_OFF_V))
 
 
+def stretched_curve(last: Record, seen: Record, load: Load) -> float:
+    """The end by the last curve, stretched by up to 20 %."""
+    return last_curve(last, seen, load, np.linspace(0.8, 1.2, 81).tolist())
+
+
 #: What needs no model.
 BASELINES: dict[str, Callable[[Record, Record, Load], float]] = {
     "as long as the last": as_long_as_the_last,
     "Coulomb count, last capacity": coulomb_count,
     "last curve, R fitted": last_curve,
-    "last curve, stretch and R fitted": lambda last, seen, load: last_curve(last, seen, load, np.linspace(0.8, 1.2, 81)),
+    "last curve, stretch and R fitted": stretched_curve,
 }
 
 
@@ -137,6 +143,10 @@ def ends(
             }
 
 
+def _held(load: Load, now_s: float) -> Load:
+    return load
+
+
 def real_rows(cell: str, discharges: list[Discharge], life: Life, every: int) -> list[dict[str, object]]:
     """The discharges of one real cell."""
     rows: list[dict[str, object]] = []
@@ -144,7 +154,7 @@ def real_rows(cell: str, discharges: list[Discharge], life: Life, every: int) ->
         running, last = discharges[n], discharges[n - 1].loaded_part(CUT_OFF_V)
         current_A = float(running.loaded_part(CUT_OFF_V).current_A[-1])
         prior_C, end_s = life.after(n).prior_q_mobile_C, running.eod_time_s(CUT_OFF_V)
-        said = ends(last, running, prior_C, lambda now_s, load_A=current_A: constant(load_A, "current"), end_s)
+        said = ends(last, running, prior_C, partial(_held, constant(current_A, "current")), end_s)
         rows += [{"data": cell, "load": "2 A", "discharge": n + 1} | row for row in said]
     return rows
 

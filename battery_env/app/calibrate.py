@@ -376,9 +376,8 @@ def _calibrated(discharge: Discharge, settings: Settings) -> Calibration:
     load = expected_current(record.time_s, record.current_A)
     estimate, method = _estimate(record, settings, cell, start, in_progress and not load.varied)
     model = RecordModel(cell, settings.thermal and settings.method != "policy", initial_soc=start.soc)
-    future = load
-    if settings.future_current_A is not None:
-        future = ExpectedCurrent(settings.future_current_A, varied=False, sd_A=0.0)
+    stated_A = settings.future_current_A
+    future = load if stated_A is None else ExpectedCurrent(stated_A, varied=False, sd_A=0.0)
     forecast = model.forecast(record, estimate, settings.cut_off_V, future.mean_A, in_progress)
     is_known = (
         not start.reason and _is_logged(record, forecast, estimate) and not _starts_lower(discharge, cell, start.soc, estimate)

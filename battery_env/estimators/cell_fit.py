@@ -209,7 +209,8 @@ class CellFit:
         )
 
     def _doubt_of_others(self) -> str:
-        log_q, ratios = np.log([discharge.q_mobile for discharge in self.discharges]), {}
+        log_q = np.log([discharge.q_mobile for discharge in self.discharges])
+        ratios: dict[int, float] = {}
         for group, others in _groups(log_q):
             for d in group.tolist():
                 by_age_V = _aged_V(float(np.abs(log_q[others] - log_q[d]).min()))

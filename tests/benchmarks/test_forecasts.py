@@ -24,7 +24,7 @@ def test_the_study_writes_its_tables(monkeypatch, tmp_path, capsys):
 def test_the_life_that_remains_is_compared_with_the_measured_one(tmp_path):
     published = pd.read_csv("docs/results/real_cells/discharges.csv")
     # the second half of its life
-    table = published[published["cell"] == "B0005"][84:].reset_index(drop=True).assign(reason="", valid=True)
+    table = published[published["cell"] == "B0005"][84:].reset_index(drop=True).assign(reason="", valid=True, lasted_share=1.0)
     life = forecasts.Life(table, 0.0, 0.0, 0.0, None, None).after(len(table))
     rows = pd.DataFrame(forecasts.life_rows("B0005", life))
     ended = int((table["capacity_Ah"] < forecasts.END_OF_LIFE_Ah).to_numpy().argmax()) + 1
