@@ -54,7 +54,7 @@ def lead_to_site(app: Sphinx, doctree: nodes.document) -> None:
         elif found is not None and (name := app.env.path2doc(found)) in app.env.found_docs:
             link["reftarget"] = name
         elif found is not None and found.is_file():
-            name = app.env.dlfiles.add_file(app.env.docname, str(found))
+            name = str(app.env.dlfiles.add_file(app.env.docname, str(found)))
             link.replace_self(addnodes.download_reference("", "", *link.children, filename=name, reftarget=str(found)))
         elif found is not None:
             link.replace_self(link.children)
