@@ -75,20 +75,21 @@ class Life:
         of the life, under which the error that all estimates share cancels from the end. At the ``q_mobile`` of a whole
         discharge the model ends a little early or late, about as much as in the one before: the mean allows for it.
         """
-        mean_C, sd_C = self._next_q_mobile_C
+        mean_C, sd_C = self.next_q_mobile_C
         whole = self.table[self.table["valid"] & self.table["lasted_share"].notna()]
         lasted = float(whole["lasted_share"].iloc[-1]) if len(whole) else 1.0
         return lasted * mean_C, lasted * sd_C
 
     @property
-    def _next_q_mobile_C(self) -> tuple[float, float]:
+    def next_q_mobile_C(self) -> tuple[float, float]:
+        """Mean and standard deviation of ``q_mobile`` in the next discharge, C."""
         mean_C = exp(self.state.sum())
         return mean_C, mean_C * sqrt(self.covariance.sum() + self.step_share**2)
 
     @property
     def prior_at_other_loads_C(self) -> tuple[float, float]:
         """The same for a load that is not that of the life: the error that all estimates share counts too."""
-        mean_C, sd_C = self._next_q_mobile_C
+        mean_C, sd_C = self.next_q_mobile_C
         last = self.table[self.table["valid"]].iloc[-1]
         return mean_C, hypot(sd_C, mean_C * last["sd_q_mobile_C"] / last["q_mobile_C"])
 
