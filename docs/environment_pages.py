@@ -42,6 +42,10 @@ IDS = [
     for env_id, spec in gym.registry.items()
     if str(spec.entry_point).startswith((f"{battery_env.__name__}.", f"{sb3_lac.__name__}."))
 ]
+#: Those without a battery.
+CONTROL_IDS = [env_id for env_id in IDS if env_id not in TASKS]
+#: Their pictures.
+PICTURES = DOCS / "pictures"
 
 
 def page_class(env_id: str) -> Callable[..., Any]:
@@ -53,7 +57,10 @@ def page_class(env_id: str) -> Callable[..., Any]:
 def environment_page(env_id: str) -> str:
     """The page of an environment, with links to the pages of the others that it names."""
     page = inspect.getdoc(page_class(env_id)) or ""
-    return f"# {env_id}\n\n" + re.sub(rf"``((?!{env_id}\b)\w+-v\d+)``", r"[`\1`](\1.md)", page) + "\n"
+    picture = ""
+    if env_id in CONTROL_IDS:
+        picture = f"![An episode of {env_id}](../pictures/{env_id}.png)\n\n*States and costs in an episode of the reference controller.*\n\n"
+    return f"# {env_id}\n\n{picture}" + re.sub(rf"``((?!{env_id}\b)\w+-v\d+)``", r"[`\1`](\1.md)", page) + "\n"
 
 
 def ids() -> str:
