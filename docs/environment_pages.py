@@ -44,7 +44,7 @@ IDS = [
 ]
 #: Those without a battery.
 CONTROL_IDS = [env_id for env_id in IDS if env_id not in TASKS]
-#: Their pictures.
+#: Where their pictures are.
 PICTURES = DOCS / "pictures"
 
 
@@ -59,7 +59,8 @@ def environment_page(env_id: str) -> str:
     page = inspect.getdoc(page_class(env_id)) or ""
     picture = ""
     if env_id in CONTROL_IDS:
-        picture = f"![An episode of {env_id}](../pictures/{env_id}.png)\n\n*States and costs in an episode of the reference controller.*\n\n"
+        caption = "*States and costs in an episode of the reference controller.*"
+        picture = f"![An episode of {env_id}](../pictures/{env_id}.png)\n\n{caption}\n\n"
     return f"# {env_id}\n\n{picture}" + re.sub(rf"``((?!{env_id}\b)\w+-v\d+)``", r"[`\1`](\1.md)", page) + "\n"
 
 
