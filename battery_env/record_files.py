@@ -6,6 +6,7 @@ are a discharge.
 from __future__ import annotations
 
 import itertools
+import os
 import re
 import warnings
 from collections.abc import Callable, Mapping
@@ -163,6 +164,8 @@ def read_recordings(
 
 
 def _name_of(source: str | Path | pd.DataFrame) -> str:
+    if not isinstance(source, pd.DataFrame | str | os.PathLike):
+        raise TypeError(f"expected a DataFrame or the path of a file, got {type(source).__name__}")
     return "DataFrame" if isinstance(source, pd.DataFrame) else str(source)
 
 

@@ -89,7 +89,8 @@ class End:
         if self.life is not None:
             valid = self.life.table["valid"]
             left_out = f"; {(~valid).sum()} left out" if not valid.all() else ""
-            lines.append(f"life of {valid.sum()} earlier discharges{left_out}")
+            plural = "" if valid.sum() == 1 else "s"
+            lines.append(f"life of {valid.sum()} earlier discharge{plural}{left_out}")
         if self.prior_q_mobile_C is not None:
             lines.append("q_mobile before: {:.0f} C, sd {:.0f} C".format(*self.prior_q_mobile_C))
         return "\n".join([*lines, self.forecast.summary()])
@@ -165,9 +166,12 @@ def read_load(path: str | Path) -> Load:
         names = ", ".join(table.columns)
         raise ValueError(f"{path}: a load has the columns time_s and either current_A or power_W, got {names}")
     try:
-        return Load(table["time_s"].to_numpy(), table[found[0]].to_numpy(), _LOAD_COLUMNS[found[0]])
+        load = Load(table["time_s"].to_numpy(), table[found[0]].to_numpy(), _LOAD_COLUMNS[found[0]])
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path}: {error}") from error
+    if load.value.max() <= 0.0:
+        raise ValueError(f"{path}: {found[0]} is nowhere above 0, so that nothing is drawn: a discharge is positive")
+    return load
 
 
 def read_running(argument: str, file_format: FileFormat) -> tuple[Source, Discharge]:
@@ -189,7 +193,7 @@ def read_running(argument: str, file_format: FileFormat) -> tuple[Source, Discha
 def read_life(arguments: Sequence[str], running: Source, file_format: FileFormat) -> list[Discharge]:
     """
     Read the discharges of a cell before the one in progress. What cannot be read is left out with a warning, and of the file
-    of the one in progress all that does not come before it.
+    of the one in progress all that does not come before it. Records of several folders are one cell too, with a warning.
 
     :param arguments: files, folders or bundled cells, in their order
     :param running: the one in progress
@@ -198,7 +202,11 @@ def read_life(arguments: Sequence[str], running: Source, file_format: FileFormat
     :raises ValueError: if there are none
     """
     discharges: list[Discharge] = []
-    for source in find_sources(arguments):
+    sources = find_sources(arguments)
+    folders = sorted({str(Path(source.path).parent) for source in sources})
+    if len(folders) > 1:
+        warnings.warn(f"--life: the records of {', '.join(folders)} are taken for one cell's", stacklevel=2)
+    for source in sources:
         try:
             recordings = read_source(source, file_format)
         except Exception as error:  # readers of files raise what they like

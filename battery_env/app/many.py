@@ -93,8 +93,8 @@ def find_sources(arguments: Iterable[str], cell_name: re.Pattern[str] | None = N
 
 
 def _records(folder: Path) -> list[Path]:
-    """The files in a folder, and in those in it, that may be records."""
-    return sorted(
+    """The files in a folder, and in those in it, that may be records; their numbers count, so that 2 comes before 10."""
+    records = (
         path
         for path in folder.rglob("*")
         if path.is_file()
@@ -103,6 +103,12 @@ def _records(folder: Path) -> list[Path]:
         and not _is_result(path)
         and is_readable(path, (_NASA_SUFFIX,))
     )
+    return sorted(records, key=_by_number)
+
+
+def _by_number(path: Path) -> tuple[list[list[str | int]], Path]:
+    parts = [re.split("([0-9]+)", part) for part in path.parts]
+    return [[int(each) if k % 2 else each for k, each in enumerate(part)] for part in parts], path
 
 
 def _names(file: Path, folders: Collection[Path]) -> tuple[str, str]:

@@ -338,6 +338,14 @@ def lab(tmp_path_factory, recorded) -> Path:
     return folder
 
 
+def test_the_second_file_of_a_folder_comes_before_the_tenth(tmp_path):
+    for name in ("cell2/c10.csv", "cell2/c9.csv", "cell10/1.csv", "cell2/c01.csv"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    names = [Path(source.path).relative_to(tmp_path).as_posix() for source in many.find_sources([str(tmp_path)])]
+    assert names == ["cell2/c01.csv", "cell2/c9.csv", "cell2/c10.csv", "cell10/1.csv"]
+
+
 def test_a_folder_becomes_one_table_and_what_cannot_be_used_stops_nothing(lab, tmp_path, capsys):
     assert main(["calibrate", str(lab), "--out", str(tmp_path), "--nominal", "1.9"]) == 2
     captured = capsys.readouterr()

@@ -292,6 +292,18 @@ class TestCommand:
     def wide_sd_C(self, capsys):
         return self.row(capsys, "running.csv", "--life", "lab", "--load", "profile.csv")["prior_q_mobile_C"][1]
 
+    def test_two_cells_are_not_one_life_without_a_word(self, capsys):
+        Path("other").mkdir()
+        Path("lab/life.csv").rename("other/life.csv")
+        pd.read_csv("other/life.csv").query("cycle < 3").to_csv("lab/life.csv", index=False)
+        assert main(["forecast", "running.csv", "--life", "lab", "other"]) == 0
+        assert "the records of lab, other are taken for one cell's" in capsys.readouterr().err
+
+    def test_a_load_that_draws_nothing_is_refused(self, capsys):
+        Path("profile.csv").write_text("time_s,current_A\n0,-1.0\n600,-3.0\n")
+        assert main(["forecast", "running.csv", "--prior", "5460", "55", "--load", "profile.csv"]) == 2
+        assert "current_A is nowhere above 0" in capsys.readouterr().err
+
     def test_life_and_load_give_the_end_that_python_gives(self, capsys):
         assert main(["forecast", "running.csv", "--life", "lab", "--load", "profile.csv", "--out", "out"]) == 0
         shown = capsys.readouterr()

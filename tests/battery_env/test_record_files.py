@@ -478,3 +478,9 @@ def test_whatever_a_file_holds_it_is_read_or_refused_in_a_line(tmp_path, content
             assert "any.csv: " in str(error) and "\n" not in str(error).strip()
         else:
             assert all(discharge.charge_C > 0.0 for discharge in discharges)
+
+
+@pytest.mark.parametrize("source", [np.zeros((9, 3)), [pd.DataFrame()], None])
+def test_what_is_neither_table_nor_file_is_refused(source):
+    with pytest.raises(TypeError, match=f"DataFrame or the path of a file, got {type(source).__name__}"):
+        read_discharges(source)
