@@ -14,6 +14,7 @@ sys.path.insert(0, str(ROOT))  # the packages of this tree, also where others ar
 
 project = "sb3_lac"
 author = "The sb3_lac contributors"
+project_copyright = author
 release = (ROOT / "sb3_lac" / "version.txt").read_text(encoding="utf-8").strip()
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary"]

@@ -587,7 +587,10 @@ def text_of(name: str, found: Calibration) -> str:
     if not found.settled:
         lines += ["", f"Not settled: {found.reason}"]
         if found.in_progress and found.settings.prior_q_mobile_C is None:
-            lines.append("During a discharge give --prior with the q_mobile of an earlier one, or forecast it with --life.")
+            lines += [
+                "During a discharge give --prior with the q_mobile of an earlier one, or the earlier ones themselves:",
+                "battery-calibrate forecast FILE --life FOLDER",
+            ]
     return "\n".join(lines)
 
 

@@ -192,8 +192,8 @@ def read_running(argument: str, file_format: FileFormat) -> tuple[Source, Discha
 
 def read_life(arguments: Sequence[str], running: Source, file_format: FileFormat) -> list[Discharge]:
     """
-    Read the discharges of a cell before the one in progress. What cannot be read is left out with a warning, and of the file
-    of the one in progress all that does not come before it. Records of several folders are one cell too, with a warning.
+    Read the discharges of a cell before the one in progress, up to it where it is among them. What cannot be read is left
+    out with a warning. Records of several folders are one cell too, with a warning.
 
     :param arguments: files, folders or bundled cells, in their order
     :param running: the one in progress
@@ -212,7 +212,8 @@ def read_life(arguments: Sequence[str], running: Source, file_format: FileFormat
         except Exception as error:  # readers of files raise what they like
             warnings.warn(f"{source.argument} is left out: {' '.join(str(error).split())}", stacklevel=2)
             continue
-        if Path(source.path).resolve() == Path(running.path).resolve():
+        is_reached = Path(source.path).resolve() == Path(running.path).resolve()
+        if is_reached:
             recordings = [each for each in recordings if each.meta.get("cycle", math.inf) < (running.cycle or 0)]
         for recording in recordings:
             try:
@@ -220,6 +221,8 @@ def read_life(arguments: Sequence[str], running: Source, file_format: FileFormat
             except (TypeError, ValueError) as error:
                 number = recording.meta.get("cycle", "")
                 warnings.warn(f"{source.path}:{number} is left out: {error}", stacklevel=2)
+        if is_reached:
+            break  # what follows is the future
     if not discharges:
         raise ValueError(f"{', '.join(arguments)}: no discharge before {running.argument}")
     return discharges
@@ -249,7 +252,13 @@ def end_of_record(
         past = track_life(before, settings.cut_off_V, calibrator)
         prior_C = past.prior_q_mobile_C if has_usual_load(past, running, to_come) else past.prior_at_other_loads_C
         settings = replace(settings, prior_q_mobile_C=prior_C)
-    return End(record_name(source.stem, source.cycle), *_forecast(running, settings, to_come), past, settings.prior_q_mobile_C)
+    found, expected = _forecast(running, settings, to_come)
+    if not found.in_progress:
+        raise ValueError(
+            f"{argument} reaches {settings.cut_off_V:g} V at {found.measured_eod_time_s:.0f} s, so that nothing is left to "
+            "forecast: calibrate it, or give a lower --cut-off"
+        )
+    return End(record_name(source.stem, source.cycle), found, expected, past, settings.prior_q_mobile_C)
 
 
 def has_usual_load(life: Life, running: Discharge, load: Load | None) -> bool:

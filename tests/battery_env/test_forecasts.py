@@ -323,6 +323,18 @@ class TestCommand:
         assert main(["forecast", "running.csv", "--out", "out"]) == 2
         assert "running_forecast.json, out/running_forecast.png would be replaced" in capsys.readouterr().err
 
+    def test_of_its_own_folder_only_what_came_before_counts(self, capsys):
+        table = pd.read_csv("all.csv")
+        Path("folder").mkdir()
+        for number, cycle in table.groupby("cycle"):
+            cycle.drop(columns="cycle").to_csv(f"folder/{number}.csv", index=False)
+        table.query("cycle == 6 and time_s < 1200").drop(columns="cycle").to_csv("folder/6.csv", index=False)
+        assert self.row(capsys, "folder/6.csv", "--life", "folder")["life_discharges"] == 5
+
+    def test_a_discharge_that_has_ended_is_not_forecast(self, capsys):
+        assert main(["forecast", "lab/life.csv"]) == 2
+        assert "reaches 2.7 V at" in capsys.readouterr().err
+
     def test_of_its_own_file_only_what_came_before_counts(self, capsys):
         apart, together = (
             self.row(capsys, *names) for names in (("running.csv", "--life", "lab"), ("all.csv", "--life", "all.csv"))
@@ -331,7 +343,6 @@ class TestCommand:
         assert together["eod_time_s"] == pytest.approx(apart["eod_time_s"], rel=1e-3)
         assert together["eod_time_s"][1] == pytest.approx(self.end_s, rel=0.02)
         assert together["prior_q_mobile_C"][1] < 0.8 * self.wide_sd_C(capsys)
-        assert self.row(capsys, "all.csv:4", "--life", "all.csv")["life_discharges"] == 3
 
     def test_without_a_life_the_interval_is_wide_and_the_filter_is_taken(self, capsys):
         alone, carried = self.row(capsys, "running.csv"), self.row(capsys, "running.csv", "--prior", "5600", "60")
