@@ -1,13 +1,12 @@
 """
 Write what the documentation takes from the code: the page of each environment, docs/environments/ID.md, from the docstring of
-its task or class, and in docs/battery_env.md the tables of environments, data sets, estimators and columns of the evaluation.
+its task or class, and in other pages the tables of environments, data sets, estimators and columns of the evaluation.
 
 .. code-block:: bash
 
   python -m docs.environment_pages
 
-The rest of docs/battery_env.md is written by hand. What is not stands between ``<!-- begin NAME -->`` and
-``<!-- end NAME -->``.
+The rest of these pages is written by hand. What is not stands between ``<!-- begin NAME -->`` and ``<!-- end NAME -->``.
 """
 
 from __future__ import annotations
@@ -116,12 +115,10 @@ def estimators() -> str:
     return _markdown(rows)
 
 
-#: The parts of docs/battery_env.md that are not written by hand.
-PARTS: dict[str, Callable[[], str]] = {
-    "ids": ids,
-    "data sets": data_sets,
-    "estimators": estimators,
-    "columns": columns,
+#: What is not written by hand, by page.
+PARTS: dict[str, dict[str, Callable[[], str]]] = {
+    "battery_env": {"ids": ids, "data sets": data_sets},
+    "compare_calibrators": {"estimators": estimators, "columns": columns},
 }
 
 
@@ -153,9 +150,9 @@ def tables_of(documented: Callable[..., object]) -> list[list[list[str]]]:
     return tables
 
 
-def render(page: str) -> str:
-    """A page with its parts as the code has them now."""
-    for name, write in PARTS.items():
+def render(name_of_page: str, page: str) -> str:
+    """The text of a page with its parts as the code has them now."""
+    for name, write in PARTS[name_of_page].items():
         begin, end = f"<!-- begin {name} -->", f"<!-- end {name} -->"
         if page.count(begin) != 1 or page.count(end) != 1:
             raise ValueError(f"the page must have {begin} and {end}, once each")
@@ -170,7 +167,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--docs", type=Path, default=DOCS)
     docs = parser.parse_args(arguments).docs
     pages = {docs / "environments" / f"{env_id}.md": environment_page(env_id) for env_id in IDS}
-    pages[docs / "battery_env.md"] = render((docs / "battery_env.md").read_text(encoding="utf-8"))
+    pages |= {docs / f"{name}.md": render(name, (docs / f"{name}.md").read_text(encoding="utf-8")) for name in PARTS}
     for page, text in pages.items():
         with replacing(page) as part:
             part.write_text(text, encoding="utf-8")

@@ -51,6 +51,7 @@ GUIDE = {
         "docs/pretrained",
         "docs/cluster",
         "docs/identifiability",
+        "docs/compare_calibrators",
         "docs/battery_env",
     ],
     "results": ["docs/results_at_a_glance", "docs/paper_claims"],
@@ -62,7 +63,6 @@ NOT_YET = {
     "docs/own_cell",
     "docs/command_line",
     "docs/forecasts",
-    "docs/battery_env",
 }
 STYLED = [name for names in GUIDE.values() for name in names if name not in NOT_YET]
 REPORTS = sorted((DOCS / "reports").glob("*.md"))

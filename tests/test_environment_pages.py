@@ -15,12 +15,12 @@ from battery_env.loads import constant
 from benchmarks.control import DISTURBANCES
 from docs import environment_pages
 
-TEXT = (environment_pages.DOCS / "battery_env.md").read_text(encoding="utf-8")
+TEXTS = {name: (environment_pages.DOCS / f"{name}.md").read_text(encoding="utf-8") for name in environment_pages.PARTS}
 
 
-def first_cells(section):
+def first_cells(page, section):
     """The first column of the tables of one section, without its code marks."""
-    part = re.search(rf"^#+ {section}\n(.*?)(?=^#)", TEXT + "\n#", flags=re.MULTILINE | re.DOTALL)[1]
+    part = re.search(rf"^#+ {section}\n(.*?)(?=^#)", TEXTS[page] + "\n#", flags=re.MULTILINE | re.DOTALL)[1]
     cells = [line.split("|")[1].strip() for line in part.splitlines() if re.match(r"\| `", line)]
     return [name for cell in cells for name in re.findall(r"`+(.*?)`+", cell)]
 
@@ -31,7 +31,8 @@ def dataset():
 
 
 def test_the_pages_say_what_the_code_says():
-    assert environment_pages.render(TEXT) == TEXT, "run python -m docs.environment_pages"
+    for name, text in TEXTS.items():
+        assert environment_pages.render(name, text) == text, "run python -m docs.environment_pages"
     pages = {path.stem: path.read_text(encoding="utf-8") for path in (environment_pages.DOCS / "environments").glob("*.md")}
     assert pages == {env_id: environment_pages.environment_page(env_id) for env_id in environment_pages.IDS}
 
@@ -52,7 +53,7 @@ def test_every_environment_has_all_sections_of_its_page():
         headings = re.findall(r"^## (.*)", page, flags=re.MULTILINE)
         assert [heading for heading in headings if heading in wanted] == wanted, env_id
         assert headings[-1] == "Version history", env_id
-        assert f"[`{env_id}`](environments/{env_id}.md)" in TEXT
+        assert f"[`{env_id}`](environments/{env_id}.md)" in TEXTS["battery_env"]
 
 
 def test_boxes_in_the_docstrings_are_the_spaces(dataset):
@@ -77,7 +78,7 @@ def test_the_table_of_arguments_is_that_of_the_options(task):
 
 
 def test_common_options_are_options_of_all(dataset):
-    names = first_cells("Options that all of them take")
+    names = first_cells("battery_env", "Options that all of them take")
     options = {
         "split": "test",
         "consistency": 0.1,
@@ -101,7 +102,7 @@ def test_common_options_are_options_of_all(dataset):
 
 def test_columns_in_the_page_are_those_of_the_evaluation(dataset):
     scores = evaluate(ClosedForm(), dataset[:1])
-    names = [name.strip(",. ") for name in first_cells("Evaluation")]
+    names = [name.strip(",. ") for name in first_cells("compare_calibrators", "Evaluation")]
     shown = {name.replace("p_", f"{p}_", 1) if name.startswith("p_") else name for name in names for p in ("q_mobile", "r_o")}
     shown |= {p if name == "p" else name for name in names for p in ("q_mobile", "r_o")}
     shown |= {name.replace("25", share) for name in names for share in ("50", "75") if "at_25" in name}
@@ -110,7 +111,7 @@ def test_columns_in_the_page_are_those_of_the_evaluation(dataset):
 
 def test_all_plots_are_listed():
     functions = {name for name in vars(plotting) if name.startswith("plot_")}
-    assert set(first_cells("Plots")) == functions
+    assert set(first_cells("compare_calibrators", "Plots")) == functions
 
 
 def documented():
@@ -139,15 +140,17 @@ def test_tables_of_docstrings_are_read_with_their_continued_lines():
 
 
 def test_only_what_stands_between_markers_is_written(tmp_path, capsys):
-    page = tmp_path / "battery_env.md"
-    stale = re.sub(r"(<!-- begin columns -->).*?(<!-- end columns -->)", r"\1 old \2", TEXT, flags=re.DOTALL)
-    page.write_text(stale, encoding="utf-8")
+    for name, text in TEXTS.items():
+        stale = re.sub(r"(<!-- begin (\w[\w ]*) -->).*?(<!-- end \2 -->)", r"\1 old \3", text, flags=re.DOTALL)
+        assert stale != text
+        (tmp_path / f"{name}.md").write_text(stale, encoding="utf-8")
     (tmp_path / "environments").mkdir()
     environment_pages.main(["--docs", str(tmp_path)])
-    assert page.read_text(encoding="utf-8") == TEXT and str(page) in capsys.readouterr().out
+    assert {name: (tmp_path / f"{name}.md").read_text(encoding="utf-8") for name in TEXTS} == TEXTS
+    assert str(tmp_path / "battery_env.md") in capsys.readouterr().out
     assert len(list((tmp_path / "environments").iterdir())) == len(environment_pages.IDS)
 
 
 def test_a_page_without_its_markers_is_refused():
     with pytest.raises(ValueError, match="begin ids"):
-        environment_pages.render(TEXT.replace("<!-- begin ids -->", ""))
+        environment_pages.render("battery_env", TEXTS["battery_env"].replace("<!-- begin ids -->", ""))
