@@ -55,4 +55,4 @@ docs: install  ## the documentation site, in docs/_build/html
 commit-checks: lint type-check docs test  ## everything that must pass before a commit
 
 clean:  ## remove what the build left (not .venv, not results)
-	rm -rf build docs/_build docs/_api *.egg-info battery_env/build battery_env/*.egg-info .pytest_cache .mypy_cache .ruff_cache
+	rm -rf build docs/_build docs/_api docs/_notebooks *.egg-info battery_env/build battery_env/*.egg-info .pytest_cache .mypy_cache .ruff_cache

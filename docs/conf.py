@@ -1,10 +1,12 @@
 """The documentation site: ``make docs`` builds it in docs/_build/html."""
 
+import re
 import sys
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import jupytext
 from docutils import nodes
 from sphinx import addnodes
 from sphinx.application import Sphinx
@@ -33,6 +35,20 @@ def entitle_table(app: Sphinx, docname: str, source: list[str]) -> None:
     """The tables in results have no title of their own, and no place in the sidebar: the page of all tables leads to them."""
     if docname.startswith("results/"):
         source[0] = f"---\norphan: true\n---\n\n# {docname.removeprefix('results/')}\n\n{source[0]}"
+
+
+# pages that can be downloaded as notebooks
+TUTORIALS = ("first_controller", "first_discharge", "own_problem", "cell_life")
+
+
+def offer_notebook(app: Sphinx, docname: str, source: list[str]) -> None:
+    """A tutorial as a notebook: Python as cells; of links and pictures, which lead to files of the site, the text."""
+    if docname in TUTORIALS:
+        file = ROOT / "docs" / "_notebooks" / f"{docname}.ipynb"
+        file.parent.mkdir(exist_ok=True)
+        text = re.sub(r"!?\[([^\]]*)\]\((?!http)[^)]*\)|<!--.*?-->", r"\1", source[0])
+        jupytext.write(jupytext.reads(text, fmt="md"), file)
+        source[0] += f"\n[This page as a Jupyter notebook](_notebooks/{file.name})\n"
 
 
 # the pages that include files of the root
@@ -71,5 +87,6 @@ def refer_to_page(app: Sphinx, what: str, name: str, documented: Any, options: A
 
 def setup(app: Sphinx) -> None:
     app.connect("source-read", entitle_table)
+    app.connect("source-read", offer_notebook)
     app.connect("doctree-read", lead_to_site)
     app.connect("autodoc-process-docstring", refer_to_page)
