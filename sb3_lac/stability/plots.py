@@ -188,7 +188,9 @@ def plot_region_of_attraction(starts: pd.DataFrame, x: int, y: int, names: Seque
     # The worst of those that differ in other dimensions
     order = np.argsort(-starts["low"].to_numpy(), kind="stable")
     shown, low = points[order], starts["low"].to_numpy()[order]
-    marks = axes.scatter(shown[:, 0], shown[:, 1], c=low, s=42, marker="s", cmap="viridis", vmin=0.0, vmax=1.0)
+    # tiles that nearly touch on a grid, and points where starts lie anywhere
+    side_points = np.clip(200.0 / max(len(np.unique(column)) for column in points.T), 6.5, 40.0)
+    marks = axes.scatter(shown[:, 0], shown[:, 1], c=low, s=side_points**2, marker="s", cmap="viridis", vmin=0.0, vmax=1.0)
     never = (starts["n_attracted"] == 0).to_numpy()
     axes.scatter(points[never, 0], points[never, 1], s=20, color=VERMILION, marker="x", lw=1, label="never attracted")
     figure.colorbar(marks, ax=axes, label="probability of attraction, at least (95 % interval)")
