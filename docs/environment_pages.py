@@ -32,6 +32,7 @@ from battery_env.evaluation import evaluate
 from battery_env.files import replacing
 from battery_env.loads import constant
 from battery_env.trajectories import TrajectoryDataset
+from docs.environment_pictures import EPISODES
 
 DOCS = Path(__file__).parent
 
@@ -43,8 +44,6 @@ IDS = [
 ]
 #: Those without a battery.
 CONTROL_IDS = [env_id for env_id in IDS if env_id not in TASKS]
-#: Where their pictures are.
-PICTURES = DOCS / "pictures"
 
 
 def page_class(env_id: str) -> Callable[..., Any]:
@@ -58,8 +57,9 @@ def environment_page(env_id: str) -> str:
     page = inspect.getdoc(page_class(env_id)) or ""
     picture = ""
     if env_id in CONTROL_IDS:
-        caption = "*States and costs in an episode of the reference controller.*"
-        picture = f"![An episode of {env_id}](../pictures/{env_id}.png)\n\n{caption}\n\n"
+        path, end = f"../pictures/{env_id}", "The end of the same episode of the reference controller, as `render()` draws it."
+        picture = f"![{env_id} in motion]({path}.gif)\n\n*{EPISODES[env_id].caption}*\n\n"
+        picture += f"![States and costs of {env_id}]({path}.png)\n\n*{end}*\n\n"
     return f"# {env_id}\n\n{picture}" + re.sub(rf"``((?!{env_id}\b)\w+-v\d+)``", r"[`\1`](\1.md)", page) + "\n"
 
 

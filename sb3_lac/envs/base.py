@@ -1,11 +1,14 @@
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+
+if TYPE_CHECKING:  # slow to import, and only pictures need it
+    from matplotlib.axes import Axes
 
 
 def check_positive(**values: float) -> None:
@@ -52,7 +55,7 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
         step, in its unit; one number for all, or one for each
     :param observation_noise: Disturbance: the same for each observed variable
     :param action_delay: Disturbance: steps until an action takes effect. Before that the plant gets zeros
-    :param render_mode: ``"rgb_array"`` for a picture of the episode so far, or None
+    :param render_mode: ``"rgb_array"`` for pictures of the plant and of the episode so far, or None
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012 (as in gym.Env)
@@ -126,6 +129,11 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
     def _error(self) -> float:
         """The distance of the present state to the goal."""
 
+    def _draw(self, axes: "Axes", states: np.ndarray) -> None:
+        """Draw the plant in the last of its states so far, and its goal in green; without a drawing, the state in numbers."""
+        text = "\n".join(f"{name} = {value:.3g}" for name, value in zip(self.state_names, states[-1], strict=True))
+        axes.text(0.5, 0.5, text, ha="center", va="center", transform=axes.transAxes)
+
     def _limited(self, state: np.ndarray) -> np.ndarray:
         """The nearest state within the limits."""
         return np.minimum(np.maximum(state, self.state_low), self.state_high)
@@ -186,7 +194,7 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
         return self._noisy_observation(), -cost, terminated, False, {"cost": cost, "error": self._error()}
 
     def render(self) -> np.ndarray | None:
-        """Draw the states and the costs of the episode so far: a picture of shape (height, width, 3)."""
+        """Draw the plant, and to the right of it states and costs so far: a picture of shape (300, 800, 3)."""
         if self.render_mode is None:
             return None
         if self.state is None:
@@ -196,12 +204,16 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
         from matplotlib.figure import Figure
 
         states = np.array([state for state, _ in self._history])
-        figure = Figure(figsize=(6, 4), dpi=80, layout="constrained")
+        figure = Figure(figsize=(8, 3), dpi=100, layout="constrained")
         canvas = FigureCanvasAgg(figure)
-        state_axes, cost_axes = figure.subplots(2, sharex=True, height_ratios=(2, 1))
+        plant_axes = figure.add_axes((0.0, 0.0, 0.5, 1.0), aspect="equal")
+        plant_axes.set_axis_off()
+        self._draw(plant_axes, states)
+        right = figure.add_subfigure(figure.add_gridspec(1, 2)[1])
+        state_axes, cost_axes = right.subplots(2, sharex=True, height_ratios=(2, 1))
         for name, values in zip(self.state_names, states.T, strict=True):
             state_axes.plot(values, marker="." if len(values) == 1 else None, label=name)
-        state_axes.legend(loc="upper right", ncols=3, fontsize="small")
+        right.legend(loc="outside upper center", ncols=3, fontsize="small")
         state_axes.set_ylabel("state")
         cost_axes.plot([cost for _, cost in self._history], color="tab:red")
         cost_axes.set(xlabel="step", ylabel="cost")

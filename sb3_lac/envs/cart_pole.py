@@ -1,10 +1,13 @@
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium import spaces
 
 from sb3_lac.envs.base import CostEnv, check_not_negative
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 class CartPoleCostEnv(CostEnv):
@@ -135,3 +138,15 @@ class CartPoleCostEnv(CostEnv):
         x, _, theta, _ = self.state.tolist()
         length = 2 * self.pole_half_length_m
         return math.hypot(x + length * math.sin(theta), length * (1.0 - math.cos(theta)))
+
+    def _draw(self, axes: "Axes", states: np.ndarray) -> None:
+        x, _, theta, _ = states[-1]
+        # The pole is five times as long as it is, to be seen on a track of 20 m
+        length, track = 10.0 * self.pole_half_length_m, self.X_MAX_M
+        axes.set(xlim=(-1.1 * track, 1.1 * track), ylim=(-3.0, 13.5))
+        axes.plot([-track, -track, track, track], [0.6, 0.0, 0.0, 0.6], color="0.6")
+        axes.plot([0.0, 0.0], [-1.2, 1.2 + length], color="tab:green", linestyle="--")
+        axes.fill(x + np.array([-1.5, 1.5, 1.5, -1.5]), [0.3, 0.3, 1.2, 1.2], color="0.2")
+        axes.plot([x - 1.0, x + 1.0], [0.3, 0.3], "o", color="0.2", markersize=8)
+        tip = [x + length * math.sin(theta), 1.2 + length * math.cos(theta)]
+        axes.plot([x, tip[0]], [1.2, tip[1]], color="tab:orange", linewidth=6, solid_capstyle="round")

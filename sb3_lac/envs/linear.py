@@ -1,10 +1,13 @@
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium import spaces
 
 from sb3_lac.envs.base import CostEnv, check_not_negative
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 class LinearCostEnv(CostEnv):
@@ -94,6 +97,18 @@ class LinearCostEnv(CostEnv):
     def _error(self) -> float:
         assert self.state is not None
         return math.hypot(*self.state)
+
+    def _draw(self, axes: "Axes", states: np.ndarray) -> None:
+        reach = max(1.3, 1.1 * float(np.abs(states).max()))
+        axes.set(xlim=(-1.33 * reach, 1.33 * reach), ylim=(-reach, reach))
+        axes.axhline(color="0.8")
+        axes.axvline(color="0.8")
+        axes.text(1.3 * reach, 0.03 * reach, self.state_names[0], ha="right", fontsize="large")
+        axes.text(0.05 * reach, 0.88 * reach, self.state_names[1], fontsize="large")
+        turn = np.linspace(0.0, math.tau, 50)
+        axes.fill(self.error_tolerance * np.cos(turn), self.error_tolerance * np.sin(turn), color="tab:green")
+        axes.plot(*states.T, ".-", color="tab:blue")
+        axes.plot(*states[-1], "o", color="0.2", markersize=10)
 
     def optimal_gain(self, gamma: float = 1.0) -> np.ndarray:
         """

@@ -1,12 +1,15 @@
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium import spaces
 
 from sb3_lac.envs.base import CostEnv, check_not_negative, check_positive
 from sb3_lac.envs.integration import runge_kutta_step
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 class PendulumCostEnv(CostEnv):
@@ -137,3 +140,13 @@ class PendulumCostEnv(CostEnv):
     def _error(self) -> float:
         assert self.state is not None
         return abs(float(self.state[0]))
+
+    def _draw(self, axes: "Axes", states: np.ndarray) -> None:
+        reach = 1.25 * self.length_m
+        axes.set(xlim=(-1.33 * reach, 1.33 * reach), ylim=(-reach, reach))
+        x, z = self.length_m * np.sin(states[:, 0]), self.length_m * np.cos(states[:, 0])
+        axes.plot(0.0, self.length_m, "o", color="tab:green", markersize=34, markerfacecolor="none", markeredgewidth=3)
+        axes.plot(x[-20:], z[-20:], color="tab:blue", alpha=0.5)
+        axes.plot([0.0, x[-1]], [0.0, z[-1]], color="0.2", linewidth=5)
+        axes.plot(0.0, 0.0, "o", color="0.6", markersize=10)
+        axes.plot(x[-1], z[-1], "o", color="tab:orange", markersize=24)

@@ -1,12 +1,15 @@
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium import spaces
 
 from sb3_lac.envs.base import CostEnv
 from sb3_lac.envs.integration import runge_kutta_step
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 class QuadrotorCostEnv(CostEnv):
@@ -137,3 +140,16 @@ class QuadrotorCostEnv(CostEnv):
     def _error(self) -> float:
         assert self.state is not None
         return math.hypot(self.state[0], self.state[1])
+
+    def _draw(self, axes: "Axes", states: np.ndarray) -> None:
+        limit = self.POSITION_MAX_M
+        axes.set(xlim=(-1.47 * limit, 1.47 * limit), ylim=(-1.1 * limit, 1.1 * limit))
+        axes.plot(limit * np.array([-1, 1, 1, -1, -1]), limit * np.array([-1, -1, 1, 1, -1]), color="0.8", linestyle="--")
+        axes.plot(0.0, 0.0, "o", color="tab:green", markersize=30, markerfacecolor="none", markeredgewidth=3)
+        axes.plot(states[:, 0], states[:, 1], color="tab:blue", alpha=0.5)
+        x, z, phi = states[-1, :3]
+        along, up = np.array([math.cos(phi), math.sin(phi)]), np.array([-math.sin(phi), math.cos(phi)])
+        for side in (-self.arm_m, self.arm_m):
+            rotor = [[x, z] + side * along, [x, z] + side * along + 0.06 * up]
+            axes.plot(*np.transpose([[x, z], *rotor]), color="0.2", linewidth=4)
+            axes.plot(*np.transpose([rotor[1] - 0.13 * along, rotor[1] + 0.13 * along]), color="tab:orange", linewidth=3)

@@ -1,12 +1,15 @@
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium import spaces
 
 from sb3_lac.envs.base import CostEnv
 from sb3_lac.envs.integration import runge_kutta_step
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 class VehicleCostEnv(CostEnv):
@@ -223,3 +226,34 @@ class VehicleCostEnv(CostEnv):
     def _error(self) -> float:
         assert self.state is not None
         return abs(float(self.state[0]))
+
+    def _draw(self, axes: "Axes", states: np.ndarray) -> None:
+        # The car from above, on a piece of the path around it; points of the plane are complex numbers
+        offset, heading, _, _, steering, here = states[-1]
+        distances = math.floor(here) + np.arange(-20.0, 45.0, 0.25)
+        swing = self.PATH_CURVATURE_1_m * self.PATH_PERIOD_M / math.tau
+        headings = -swing * np.cos(math.tau * distances / self.PATH_PERIOD_M)
+        middle = 0.25 * np.cumsum(np.exp(1j * headings))
+
+        def place(distance: Any, aside: Any) -> np.ndarray:
+            along = np.exp(1j * np.interp(distance, distances, headings))
+            return np.interp(distance, distances, middle) + 1j * aside * along
+
+        view = place(here + 8.0, 0.0)
+        axes.set(xlim=(view.real - 16.0, view.real + 16.0), ylim=(view.imag - 12.0, view.imag + 12.0))
+        road = np.concatenate((place(distances, self.OFFSET_MAX_M), place(distances, -self.OFFSET_MAX_M)[::-1]))
+        axes.fill(road.real, road.imag, color="0.8")
+        dashes = place(distances, np.where(distances % 5.0 < 2.5, 0.0, np.nan))
+        axes.plot(dashes.real, dashes.imag, color="tab:green", linewidth=3)
+        travelled = np.unwrap(states[:, 5], period=self.PATH_PERIOD_M)
+        seen = travelled > travelled[-1] - 20.0
+        trace = place(travelled[seen] - travelled[-1] + here, states[seen, 0])
+        axes.plot(trace.real, trace.imag, color="tab:blue")
+        car, along = place(here, offset), np.exp(1j * (heading + np.interp(here, distances, headings)))
+        front, rear = self.front_axle_m, self.rear_axle_m
+        body = car + along * np.array([front + 0.8 + 0.9j, front + 0.8 - 0.9j, -rear - 0.8 - 0.9j, -rear - 0.8 + 0.9j])
+        axes.fill(body.real, body.imag, color="tab:orange")
+        for axle, turn in ((front, np.exp(1j * steering)), (-rear, 1.0)):
+            for side in (-0.9j, 0.9j):
+                wheel = car + along * (axle + side + turn * np.array([-0.5, 0.5]))
+                axes.plot(wheel.real, wheel.imag, color="0.2", linewidth=3)

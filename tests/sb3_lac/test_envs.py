@@ -15,6 +15,7 @@ from stable_baselines3.common.env_checker import check_env
 
 from sb3_lac.envs import (
     CartPoleCostEnv,
+    CostEnv,
     LinearCostEnv,
     OscillatorEnv,
     PendulumCostEnv,
@@ -41,6 +42,19 @@ def test_both_checkers_find_nothing(env_id):
         warnings.simplefilter("error")
         check_env(gym.make(env_id, render_mode="rgb_array"))
         check_gymnasium_env(gym.make(env_id, render_mode="rgb_array").unwrapped)
+
+
+@pytest.mark.parametrize("make", CLASSES)
+def test_a_picture_shows_the_plant_where_it_is_and_the_state_in_numbers_without_a_drawing(make):
+    class Undrawn(make):
+        _draw = CostEnv._draw
+
+    for shown in (make, Undrawn):
+        env, plants = shown(render_mode="rgb_array"), []
+        for start in (0.0, 0.3):
+            env.reset(seed=0, options={"state": np.full(len(env.state_names), start)})
+            plants.append(env.render()[:, :400])
+        assert not np.array_equal(*plants) and plants[0].shape == (300, 400, 3)
 
 
 # A car without steering leaves its road
