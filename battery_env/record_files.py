@@ -19,7 +19,7 @@ import pandas as pd
 from battery_env.arrays import BoolArray, FloatArray, IntArray
 from battery_env.cells import LEAST_SAMPLES, Discharge, read_nasa_mat
 from battery_env.columns import Column
-from battery_env.records import SWITCH_SHARE, drawn
+from battery_env.records import REST_CURRENT_A, SWITCH_SHARE, drawn
 from battery_env.tables import columns_of, read_columns
 
 Made = TypeVar("Made")
@@ -283,8 +283,10 @@ class _Table:
     def _turn_current(self, discharge_is_negative: bool | None) -> None:
         """Makes the current of a discharge positive."""
         current_A = self.columns["current"]
-        if not current_A.any():
-            raise ValueError("no current flows in this file")
+        if not (np.abs(current_A) > REST_CURRENT_A).any():
+            raise ValueError(
+                f"no current flows above {REST_CURRENT_A:g} A, below which a cell rests: there is no discharge. Check its unit"
+            )
         signs = self._signs_of_states()
         if signs is not None and (current_A >= 0.0).all():
             self.columns["current"] = current_A * signs

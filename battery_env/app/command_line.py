@@ -15,14 +15,16 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import os
 import re
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import fields
+from functools import wraps
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, ParamSpec
 
 import numpy as np
 
@@ -35,8 +37,8 @@ from battery_env.files import check_folder
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.records import CUT_OFF_V
 
-#: What the process returns: all records settled, one or more refused, one or more not settled, stopped by Ctrl-C.
-SETTLED, REFUSED, NOT_SETTLED, INTERRUPTED = 0, 2, 3, 130
+#: What the process returns: all records settled, one or more refused, one or more not settled, Ctrl-C, nobody reads on.
+SETTLED, REFUSED, NOT_SETTLED, INTERRUPTED, PIPE_CLOSED = 0, 2, 3, 130, 141
 
 _VERSION = files("battery_env").joinpath("version.txt").read_text(encoding="utf-8").strip()
 _INSTALLED = "battery-calibrate"
@@ -44,6 +46,7 @@ _INSTALLED = "battery-calibrate"
 # So many discharges fit beside each other in the figure of a fit.
 _MOST_SHOWN = 4
 
+_P = ParamSpec("_P")
 _QUANTITY = re.compile(r",\s*(?=\w+=)")
 
 
@@ -279,7 +282,7 @@ def _forecast_parser(name: str) -> argparse.ArgumentParser:
         default=(),
         metavar="FILE",
         help="discharges of the cell before this one, oldest first: files, folders of them, or a bundled cell. They say what "
-        "q_mobile to expect",
+        "q_mobile to expect. All are taken for one cell's; refused if the files themselves (.mat) name several",
     )
     group.add_argument(
         "--load",
@@ -328,6 +331,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return command(given[1:], f"{parser.prog} {given[0]}")
 
 
+def _ending(command: Callable[_P, int]) -> Callable[_P, int]:
+    """A command of which errors are a line, an interruption another, and a closed pipe none; each has its exit status."""
+
+    @wraps(command)
+    def run(*args: _P.args, **kwargs: _P.kwargs) -> int:
+        try:
+            status = command(*args, **kwargs)
+            sys.stdout.flush()
+        except KeyboardInterrupt:
+            print("interrupted", file=sys.stderr)
+            return INTERRUPTED
+        except BrokenPipeError:  # head, or a pager that was left
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is still to be flushed
+            return PIPE_CLOSED
+        except (ValueError, TypeError, OSError, ImportError) as error:
+            print(f"error: {error}", file=sys.stderr)
+            return REFUSED
+        return status
+
+    return run
+
+
+@_ending
 def calibrate(arguments: Sequence[str] | None = None, name: str = _INSTALLED) -> int:
     """The command ``calibrate``, which is also installed as ``battery-calibrate``, as are others by their names behind it."""
     given = sys.argv[1:] if arguments is None else list(arguments)
@@ -336,29 +362,25 @@ def calibrate(arguments: Sequence[str] | None = None, name: str = _INSTALLED) ->
     options = _parser(name).parse_args(given)
     done: list[Outcome] = []
     interrupted = False
+    settings = _settings(options)
+    settings.calibrator()  # what it refuses it refuses of every file
+    sources = find_sources(options.records, options.cell_name)
+    results = Results(options.out, sources, not options.table_only, options.force) if options.out else None
     try:
-        settings = _settings(options)
-        settings.calibrator()  # what it refuses it refuses of every file
-        sources = find_sources(options.records, options.cell_name)
-        results = Results(options.out, sources, not options.table_only, options.force) if options.out else None
-        try:
-            with workers(options.jobs, options.scheduler) as executor:
-                ahead = 64 if options.scheduler else 2 * abs(options.jobs)
-                for outcome in calibrate_all(sources, _file_format(options), settings, results, executor, ahead):
-                    done.append(outcome)
-                    _show(done, options.json)
-        except KeyboardInterrupt:
-            print("interrupted: what is done is kept", file=sys.stderr)
-            interrupted = True
+        with workers(options.jobs, options.scheduler) as executor:
+            ahead = 64 if options.scheduler else 2 * abs(options.jobs)
+            for outcome in calibrate_all(sources, _file_format(options), settings, results, executor, ahead):
+                done.append(outcome)
+                _show(done, options.json)
+    except KeyboardInterrupt:
+        print("interrupted: what is done is kept", file=sys.stderr)
+        interrupted = True
+    if not options.json:
+        _conclude(done, settings)
+    if results and any(not each.error for each in done):
+        written = results.write_table(done)
         if not options.json:
-            _conclude(done, settings)
-        if results and any(not each.error for each in done):
-            written = results.write_table(done)
-            if not options.json:
-                print("\nwritten: " + ", ".join(map(str, written)))
-    except (ValueError, TypeError, OSError, ImportError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return REFUSED
+            print("\nwritten: " + ", ".join(map(str, written)))
     if interrupted:
         return INTERRUPTED
     if any(each.error for each in done):
@@ -388,6 +410,7 @@ def _settings(options: argparse.Namespace) -> Settings:
     return Settings.for_cell(cell, **given)
 
 
+@_ending
 def fit(arguments: Sequence[str] | None = None, name: str = "python -m battery_env fit") -> int:
     """
     The command ``fit``.
@@ -399,37 +422,31 @@ def fit(arguments: Sequence[str] | None = None, name: str = "python -m battery_e
     options = _fit_parser(name).parse_args(arguments)
     out: Path = options.out
     picture = out.with_suffix(".png")
-    try:
-        if out.suffix != ".json":
-            raise ValueError(f"the fit is written as JSON: --out {out.name}.json instead of {out.name}")
-        check_folder(out.parent)
-        existing = [str(path) for path in (out, picture) if path.exists()]
-        if existing:
-            raise FileExistsError(f"{', '.join(existing)} would be replaced; choose another --out, or delete what is there")
-        discharges = _discharges(options.records, _file_format(options))
-        print(f"fitting {len(discharges)} discharges", file=sys.stderr, flush=True)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of the doubt, which is printed
-            found = fit_cell(discharges, options.cut_off, thermal=not options.isothermal)
-        print(found.summary())
-        if found.doubt:
-            print(f"warning: {found.doubt}", file=sys.stderr)
-        found.to_json(out)
+    if out.suffix != ".json":
+        raise ValueError(f"the fit is written as JSON: --out {out.name}.json instead of {out.name}")
+    check_folder(out.parent)
+    existing = [str(path) for path in (out, picture) if path.exists()]
+    if existing:
+        raise FileExistsError(f"{', '.join(existing)} would be replaced; choose another --out, or delete what is there")
+    discharges = _discharges(options.records, _file_format(options))
+    print(f"fitting {len(discharges)} discharges", file=sys.stderr, flush=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of the doubt, which is printed
+        found = fit_cell(discharges, options.cut_off, thermal=not options.isothermal)
+    print(found.summary())
+    if found.doubt:
+        print(f"warning: {found.doubt}", file=sys.stderr)
+    found.to_json(out)
 
-        from battery_env.plotting import plot_cell_fit, save_figure  # here, as matplotlib takes long to import
+    from battery_env.plotting import plot_cell_fit, save_figure  # here, as matplotlib takes long to import
 
-        shown = np.unique(np.linspace(0, len(discharges) - 1, _MOST_SHOWN).round().astype(np.int64))
-        save_figure(plot_cell_fit(found, [discharges[n] for n in shown]), picture)
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return INTERRUPTED
-    except (ValueError, TypeError, OSError, ImportError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return REFUSED
+    shown = np.unique(np.linspace(0, len(discharges) - 1, _MOST_SHOWN).round().astype(np.int64))
+    save_figure(plot_cell_fit(found, [discharges[n] for n in shown]), picture)
     print(f"\nwritten: {out}, {picture}")
     return NOT_SETTLED if found.doubt else SETTLED
 
 
+@_ending
 def forecast(arguments: Sequence[str] | None = None, name: str = "python -m battery_env forecast") -> int:
     """
     The command ``forecast``.
@@ -441,34 +458,27 @@ def forecast(arguments: Sequence[str] | None = None, name: str = "python -m batt
     options = _forecast_parser(name).parse_args(arguments)
     from battery_env.app.forecast import EndFiles, end_of_record  # here, as matplotlib takes long to import
 
-    try:
-        settings, file_format = _settings(options), _file_format(options)
-        if options.life and settings.prior_q_mobile_C is not None:
-            raise ValueError("--life and --prior say the same: give one of them")
-        files = EndFiles(options.out, options.record) if options.out else None
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            try:
-                end = end_of_record(options.record, settings, file_format, options.life, options.load)
-            finally:
-                for each in caught:
-                    print(f"warning: {each.message}", file=sys.stderr)
-        print(json.dumps(end.row()) if options.json else end.text())
-        if files:
-            files.write(end)
-            if not options.json:
-                print(f"\nwritten: {files.table}, {files.figure}")
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return INTERRUPTED
-    except (ValueError, TypeError, OSError, ImportError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return REFUSED
+    settings, file_format = _settings(options), _file_format(options)
+    if options.life and settings.prior_q_mobile_C is not None:
+        raise ValueError("--life and --prior say the same: give one of them")
+    files = EndFiles(options.out, options.record) if options.out else None
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            end = end_of_record(options.record, settings, file_format, options.life, options.load)
+        finally:
+            for each in caught:
+                print(f"warning: {each.message}", file=sys.stderr)
+    print(json.dumps(end.row()) if options.json else end.text())
+    if files:
+        files.write(end)
+        if not options.json:
+            print(f"\nwritten: {files.table}, {files.figure}")
     return NOT_SETTLED if end.contradicted else SETTLED
 
 
 def _discharges(records: Sequence[str], file_format: FileFormat) -> list[Discharge]:
-    """All that the arguments name, each with the cell and the number that it is shown by."""
+    """All that the arguments name, each with the name of its file and the number that it is shown by."""
     discharges = []
     for source in find_sources(records):
         with warnings.catch_warnings(record=True) as caught:
@@ -476,7 +486,7 @@ def _discharges(records: Sequence[str], file_format: FileFormat) -> list[Dischar
             try:
                 recordings = read_source(source, file_format)
                 for number, recording in enumerate(recordings, start=1):
-                    meta = {"cycle": number, **recording.meta, "cell": source.cell}
+                    meta = {"cycle": number, **recording.meta, "cell": source.stem}
                     discharges.append(recording._replace(meta=meta).discharge())
             except Exception as error:  # readers of files raise what they like
                 text = " ".join(str(error).split())

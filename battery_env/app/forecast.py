@@ -192,8 +192,8 @@ def read_running(argument: str, file_format: FileFormat) -> tuple[Source, Discha
 
 def read_life(arguments: Sequence[str], running: Source, file_format: FileFormat) -> list[Discharge]:
     """
-    Read the discharges of a cell before the one in progress, up to it where it is among them. What cannot be read is left
-    out with a warning. Records of several folders are one cell too, with a warning.
+    Read the discharges of a cell before the one in progress, up to it where it is among them. All that is named counts as of
+    one cell: of several folders with a warning. What cannot be read is left out with a warning.
 
     :param arguments: files, folders or bundled cells, in their order
     :param running: the one in progress
@@ -247,6 +247,9 @@ def end_of_record(
     past = None
     if life:
         before = read_life(life, source, file_format)
+        named = sorted({each.meta["cell"] for each in [*before, running] if "cell" in each.meta})
+        if len(named) > 1:
+            raise ValueError(f"--life: these are discharges of {' and '.join(named)}: give those of the cell in progress")
         calibrator = replace(settings, method="least-squares", initial_soc=1.0).calibrator()
         assert isinstance(calibrator, LeastSquares)
         past = track_life(before, settings.cut_off_V, calibrator)

@@ -409,9 +409,9 @@ def _records(discharges: Sequence[Record], cut_off_V: float) -> list[Record]:
             check_drawn_charge(float(drawn(samples.time_s, samples.current_A, samples.time_s[-1])))
             _check_ends(float(samples.voltage_V.min()), cut_off_V)
         except AttributeError as error:
-            raise TypeError(f"discharge {number} of {len(discharges)} is no record: {error}") from error
+            raise TypeError(f"discharge {_name(discharge, number)} is no record: {error}") from error
         except (TypeError, ValueError) as error:
-            raise type(error)(f"discharge {number} of {len(discharges)}: {error}") from error
+            raise type(error)(f"discharge {_name(discharge, number)}: {error}") from error
         records.append(record)
     return records
 
@@ -427,11 +427,12 @@ def _check_ends(lowest_V: float, cut_off_V: float) -> None:
 
 def _check_starts_alike(records: Sequence[Record], at_rest: Sequence[bool]) -> None:
     """Refuse discharges that cannot all start full: a full cell, of whatever kind, rests at about one voltage."""
-    rests = [(float(each.voltage_V[0]), n) for n, (each, rested) in enumerate(zip(records, at_rest, strict=True), 1) if rested]
-    (low_V, low), (high_V, high) = min(rests, default=(0.0, 0)), max(rests, default=(0.0, 0))
+    found = enumerate(zip(records, at_rest, strict=True), start=1)
+    rests = [(float(each.voltage_V[0]), _name(each, n)) for n, (each, rested) in found if rested]
+    (low_V, low), (high_V, high) = min(rests, default=(0.0, "")), max(rests, default=(0.0, ""))
     if high_V - low_V > sum(FULL_REST_V):
         raise ValueError(
-            f"discharge {low} of {len(records)} starts at rest at {low_V:.2f} V, discharge {high} at {high_V:.2f} V: they "
+            f"discharge {low} starts at rest at {low_V:.2f} V, discharge {high} at {high_V:.2f} V: they "
             "cannot both be of a full cell. Leave out those that do not start full."
         )
 

@@ -118,7 +118,7 @@ class Condition(IntEnum):
     )
     MISFIT = (
         "The voltage of the model is farther off than noise and mismatch_V explain: state a larger mismatch_V, or check the "
-        "sensors and that this is one discharge."
+        "sensors, the prior if one was given, and that this is one discharge."
     )
     UNEXPLAINED = (
         "The voltage is farther off than noise, an offset and the constants that the policy knows of explain: use least "

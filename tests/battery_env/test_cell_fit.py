@@ -203,7 +203,7 @@ class TestRealCells:
 
     def test_a_discharge_in_progress_is_refused(self):
         whole = load_nasa_discharges("B0005")[40]
-        with pytest.raises(ValueError, match=r"discharge 2 of 2: its lowest voltage is 3\.\d+ V, above the cut-off, 2\.7 V"):
+        with pytest.raises(ValueError, match=r"discharge B0005:41: its lowest voltage is 3\.\d+ V, above the cut-off, 2\.7 V"):
             fit_cell([whole, whole.until(1700.0)])
 
     def test_a_forecast_takes_the_model_of_a_fit(self, b0005_fit):
@@ -317,7 +317,7 @@ class TestBadInput:
             ({"discharges": []}, ValueError, "takes 1 to 30 discharges, got 0"),
             ({"discharges": 5}, TypeError, "must be a list of discharges"),
             ({"discharges": load_nasa_discharges("B0005")[0]}, TypeError, "must be a list of discharges, got Discharge"),
-            ({"discharges": [1.0]}, TypeError, "discharge 1 of 1"),
+            ({"discharges": [1.0]}, TypeError, "discharge 1 is no record"),
             ({"cut_off_V": -1.0}, ValueError, "cut_off_V"),
             ({"cut_off_V": "low"}, ValueError, "cut_off_V"),
             ({"limit_V": 0.0}, ValueError, "limit_V"),

@@ -134,18 +134,21 @@ def test_constants_of_cells_that_did_not_start_full_are_warned_of_whenever_they_
         (["B0005:1", "--out", "old.png/cell.json"], "old.png is a file"),
         (["B0005:1", "notes.txt", "--out", "cell.json"], "notes.txt"),
         (["B0005", "--out", "cell.json"], "fit_cell takes 1 to 30 discharges, got 168"),
-        (["B0005:1", "--cut-off", "4.3", "--out", "cell.json"], "discharge 1 of 1"),
+        (["B0005:1", "half.csv", "--out", "cell.json"], "discharge half:1: its lowest voltage is 3."),
     ],
 )
-def test_nothing_is_fitted_to_bad_input_and_nothing_is_overwritten(arguments, message, tmp_path, monkeypatch, capsys):
+def test_nothing_is_fitted_to_bad_input_and_nothing_is_overwritten(
+    arguments, message, recorded, tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
+    write(recorded.until(1500.0), Path("half.csv"))
     for name in ("old.json", "old.png"):
         Path(name).write_text("precious")
     Path("notes.txt").write_text("Dear all,\nplease find the data attached.\n")
     assert main(["fit", *arguments]) == 2
     error = capsys.readouterr().err.splitlines()[-1]
     assert error.startswith("error: ") and message in error
-    assert {path.name for path in tmp_path.iterdir()} == {"old.json", "old.png", "notes.txt"}
+    assert {path.name for path in tmp_path.iterdir()} == {"old.json", "old.png", "notes.txt", "half.csv"}
     assert Path("old.json").read_text() == Path("old.png").read_text() == "precious"
 
 
@@ -535,6 +538,14 @@ def test_many_samples_are_averaged_and_say_the_same(recorded, tmp_path, terminal
 def test_runs_as_a_module():
     done = subprocess.run([sys.executable, "-m", "battery_env", "calibrate", "B0005:1"], capture_output=True, text=True)
     assert done.returncode == 0 and "q_mobile" in done.stdout and done.stderr == ""
+
+
+def test_a_reader_that_leaves_ends_it_in_silence():
+    command = [sys.executable, "-m", "battery_env", "calibrate", "B0005:1"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        process.stdout.close()
+        assert process.stderr.read() == ""
+    assert process.returncode == 141
 
 
 class TestPolicies:

@@ -370,6 +370,7 @@ class TestCommand:
         [
             (["running.csv", "--life", "running.csv"], "running.csv: no discharge before running.csv"),
             (["running.csv", "--life", "lab", "--prior", "5000", "50"], "give one of them"),
+            (["B0006:81", "--life", "B0005", "lab"], "discharges of B0005 and B0006: give those of the cell in progress"),
             (["lab"], "lab holds 2 files"),
             (
                 ["running.csv", "--load", "lab/notes.txt"],

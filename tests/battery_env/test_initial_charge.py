@@ -122,7 +122,7 @@ class TestOthers:
     def test_constants_are_not_fitted_to_full_cells_and_others(self):
         record = load_nasa_discharges("B0005")[0]
         low = Discharge(record.time_s, record.voltage_V - 0.2, record.current_A)
-        with pytest.raises(ValueError, match=r"discharge 2 of 2 starts at rest at 3.99 V, discharge 1 at 4.19 V"):
+        with pytest.raises(ValueError, match=r"discharge 2 starts at rest at 3.99 V, discharge B0005:1 at 4.19 V"):
             fit_cell([record, low])
 
     def test_a_life_is_of_full_cells(self):

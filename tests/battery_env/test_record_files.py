@@ -315,7 +315,7 @@ def test_discharges_whose_charges_are_not_logged_need_a_number(tmp_path):
             {"voltage_V": ["4.1", "OVERLOAD", *map(str, VOLTAGE_V[2:])]},
             "'voltage_V' must hold numbers, got 'OVERLOAD' in row 2",
         ),
-        ({"current_A": 0.0}, "no current flows"),
+        ({"current_A": 0.01 * np.sin(TIME_S)}, r"no current flows above 0\.02 A, .*: there is no discharge"),
         ({"voltage_V": 3.7}, "whether the current of a discharge is positive or negative cannot be told"),
         ({"Voltage(V)": VOLTAGE_V}, "both 'voltage_V' and 'Voltage.V.' may be the voltage"),
         ({"current_A": np.abs(np.sin(TIME_S)), "voltage_V": 3.7 + 0.3 * np.cos(TIME_S)}, "cannot be told"),

@@ -77,7 +77,8 @@ RISING = discharged(pulsed(200, 400, 2.0, 0.2))
 AFTER_REST = discharged(np.append(np.zeros(60), np.full(20_000, 2.0)))
 AGAIN = changed(AFTER_REST, late_s=AFTER_REST.time_s[-1] + 1.0)
 TWICE = Discharge(*(np.append(getattr(AFTER_REST, c), getattr(AGAIN, c)) for c in ("time_s", "voltage_V", "current_A")))
-MISFIT = "The voltage of the model is farther off than noise and mismatch_V explain: state a larger mismatch_V"
+MISFIT = "The voltage of the model is farther off than noise and mismatch_V explain: state a larger mismatch_V, or check "
+MISFIT += "the sensors, the prior if one was given, and that this is one discharge."
 
 #: Each reason of the tables of conditions: whose, of which record, with which arguments of the calibrator.
 VERDICTS = {
@@ -106,6 +107,7 @@ VERDICTS = {
         BOTH[:1], WHOLE,
         {"parameters": ["q_mobile"], "cell": NEW_CELL.replace(r_o=0.12), "mismatch_V": 0.0, "voltage_noise_V": 0.005}, MISFIT,
     ),
+    "misfit by a prior": (BOTH, REAL.loaded_part(2.7), {"prior_q_mobile_C": (8000.0, 80.0)}, MISFIT),
     "prior of another end": (
         BOTH[:1], WHOLE, {"prior_q_mobile_C": (8000.0, 80.0)}, "The record falls to 2.80 V at 2820 s, where this estimate says"
     ),
