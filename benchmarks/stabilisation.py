@@ -25,7 +25,7 @@ import gymnasium as gym
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, LogFormatter
+from matplotlib.ticker import EngFormatter
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import PolicyPredictor
 
@@ -47,6 +47,7 @@ from benchmarks.study import (
 )
 from benchmarks.training import Recipe, record_file, train_or_load, training_minutes
 from sb3_lac.envs import CostEnv, reference_controller
+from sb3_lac.stability.plots import format_log_axis
 
 _REFERENCE = "reference"
 _METRIC_SAC = "SAC, LAC's metric"
@@ -259,9 +260,7 @@ def plot_costs(results: pd.DataFrame) -> Figure:
                 axes.plot([low, high], [height, height], color=colour, lw=1.5)
                 axes.plot(middle, height, marker, color=colour, ms=6, label=name if row == 0 else None)
     costs.set(xscale="log", xlabel="cost per step over that of the reference controller")
-    # numbers, which are shorter than powers of ten: there may be several of them within a decade
-    costs.xaxis.set_major_formatter(LogFormatter())
-    costs.xaxis.set_minor_formatter(LogFormatter())
+    format_log_axis(costs.xaxis)
     costs.set_yticks(range(len(envs)), envs)
     costs.invert_yaxis()
     goals.set(xlabel="share of episodes that end at the goal", xlim=(-0.03, 1.03))
@@ -287,6 +286,7 @@ def plot_learning(learning: pd.DataFrame) -> Figure:
                 axes.fill_between(costs.columns, costs.min(), costs.max(), color=colour, alpha=0.15, lw=0)
                 axes.plot(costs.columns, over_seeds(costs)[0], marker=marker, ms=3, lw=1.4, color=colour, label=name)
         axes.set(title=env_id, yscale="log")
+        format_log_axis(axes.yaxis)
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     for axes in panels[::3]:
         axes.set_ylabel("cost per step")
