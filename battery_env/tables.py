@@ -171,7 +171,9 @@ def _layout(head: bytes, chosen: Mapping[str, str] | None) -> _Layout:
             raise ValueError("the file is empty")
         if any(map(_NUMBER.match, lines[number].split(","))):
             raise ValueError("there is no line with the names of the columns above the numbers. Add one")
-        delimiter = max(delimiters, key=lambda each: len(_fields(lines[number], each)))
+        # names may hold blanks and units: the numbers below have to come apart as often
+        names, first_row = lines[number], lines[min(number + 1, len(lines) - 1)]
+        delimiter = max(delimiters, key=lambda each: min(len(_fields(names, each)), len(_fields(first_row, each))))
     values = [field for line in lines[number + 1 :] for field in _fields(line, delimiter)]
     comma = (
         delimiter not in (",", _BLANKS)

@@ -1,6 +1,7 @@
 """Files as testers and people write them, and as a new user would get them wrong."""
 
 import gzip
+import re
 import sys
 import types
 import warnings
@@ -93,6 +94,13 @@ def test_columns_go_by_the_names_of_testers_and_units_are_told_from_them(columns
     discharge = one(path)
     check(discharge, temperature=True)
     assert ("ambient_temperature_C" in discharge.meta) == ("Ambient Temperature / degC" in columns)
+
+
+def test_columns_of_unknown_names_with_blanks_are_named_as_the_file_has_them(tmp_path):
+    lines = rows(TIME_S / 60, 1e3 * VOLTAGE_V, 1e3 * CURRENT_A, decimal=",", delimiter=";")
+    (tmp_path / "cell.csv").write_text("\n".join(["Zeit [min];Spannung [mV];Strom [mA]", *lines]))
+    with pytest.raises(ValueError, match=re.escape("Zeit [min], Spannung [mV], Strom [mA]")):
+        read_discharges(tmp_path / "cell.csv")
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "latin-1"])
