@@ -1,7 +1,7 @@
 """
 Train a policy for a cell: on simulations with its fitted constants, under its recorded loads, at all ages. Two minutes.
 
-It writes ``mine.onnx``, its options ``mine.json``, and ``my_cell.json``, all for ``battery-calibrate --method policy``.
+It writes ``mine.onnx``, its options ``mine.json``, and ``mine_cell.json``, all for ``battery-calibrate --method policy``.
 """
 
 import json
@@ -18,7 +18,7 @@ from sb3_lac.onnx import export_onnx
 
 discharges = load_nasa_discharges("B0005")
 fit = fit_cell([discharges[0], discharges[84], discharges[167]], cut_off_V=2.7)
-fit.to_json("my_cell.json")
+fit.to_json("mine_cell.json")
 
 loads = [recorded(discharge.loaded_part(cut_off_V=2.7), "power") for discharge in discharges[::24]]
 ages = {"q_mobile_range": (4000.0, 8000.0), "r_o_range": (0.06, 0.3)}
