@@ -39,9 +39,10 @@ class LAC(CostAlgorithm):
     Pay costs as they are, ``reward = -cost``, and let a failure have its price. Nothing has to be scaled. Choose the discount,
     the learning rate and the number of steps; leave ``alpha3``, the multipliers and ``ent_coef`` at their defaults.
 
-    The critic ``L(s, a) >= 0`` is the discounted sum of costs. Its networks learn a root of it, in which small costs count
-    beside large ones, and the actor lowers that root. ``L`` has to decrease by ``alpha3`` times the cost in each step: a
-    Lagrange multiplier ``lambda`` enforces that, while ``ent_coef`` keeps the entropy up as in SAC.
+    The critic ``L(s, a) >= 0`` is the discounted sum of costs. Its networks learn the fourth root of what it is above its
+    lowest value, in which small costs count beside large ones, and the actor lowers the square root. ``L`` has to decrease by
+    ``alpha3`` times the cost in each step: a Lagrange multiplier ``lambda`` enforces that, while ``ent_coef`` keeps the
+    entropy up as in SAC.
 
     Note: the cost is ``bound - reward``, where ``bound`` is the largest reward (stated or seen, at least 0). A termination
     pays 0 for ever after, and so costs ``bound`` per step where rewards are positive.
@@ -307,7 +308,7 @@ class LAC(CostAlgorithm):
 
     def _objective(self, roots: th.Tensor) -> th.Tensor:
         """What the actor lowers, given the roots at its actions."""
-        return roots.mean()
+        return self.critic.distance(roots).mean()
 
     def _update(self, replay_data: ReplayBufferSamples, costs: th.Tensor, update_targets: bool) -> Metrics:
         """One update of all that is learned."""
@@ -327,7 +328,10 @@ class LAC(CostAlgorithm):
 
         # Compute critic loss, with the current root of each critic network
         # using action from the replay buffer (all values are relative to the offset)
-        target_roots = self.critic.root(self._target_values(replay_data, next_actions))
+        target_values = self._target_values(replay_data, next_actions)
+        # The floor follows the lowest value as the target critic follows the critic
+        self.critic.floor.lerp_(target_values.min(), self.tau)
+        target_roots = self.critic.root(target_values)
         current_roots = self.critic(replay_data.observations, replay_data.actions)
         critic_loss = 0.5 * sum(F.mse_loss(current_root, target_roots) for current_root in current_roots)
         assert isinstance(critic_loss, th.Tensor)  # for type checker
@@ -339,8 +343,9 @@ class LAC(CostAlgorithm):
         with th.set_grad_enabled(next_actions.requires_grad):
             next_roots = largest_value(self.critic(replay_data.next_observations, next_actions))
         roots = largest_value(current_roots).detach()
-        # L(s', a') <= L(s, a) - alpha3 * cost, both sides in the metric of the critic
-        difference = next_roots - self.critic.root(self.critic.value(roots) - self.alpha3 * costs)
+        # L(s', a') <= L(s, a) - alpha3 * cost, in the metric of the objective
+        allowed_roots = self.critic.root(self.critic.value(roots) - self.alpha3 * costs)
+        difference = self.critic.distance(next_roots) - self.critic.distance(allowed_roots)
         going_on = 1 - replay_data.dones
         violation = (going_on * difference).sum() / going_on.sum().clamp(min=1)
 
@@ -390,6 +395,7 @@ class LAC(CostAlgorithm):
         # Update target networks
         if update_targets:
             polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
+            self.critic_target.floor.lerp_(self.critic.floor, self.tau)
             # Copy running stats, see GH issue #996
             polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
             if self.actor_target is not None:

@@ -28,16 +28,17 @@ def largest_value(values: Sequence[th.Tensor]) -> th.Tensor:
 class LyapunovCritic(BaseModel):
     """
     Lyapunov critic network(s) for LAC.
-    Each network maps state and action to a root of the value, ``f(s, a)`` with ``L - offset = sign(f) |f|^(1 / power)``.
+    Each network maps state and action to the fourth root ``f(s, a)`` of what ``L`` is above its floor, the value of the loop
+    at rest: ``L = offset + floor + sign(f) |f|^4``.
 
     Costs of a loop that settles fade over orders of magnitude. An error in ``f`` counts alike at all of them, while one in
-    ``L`` only counts where costs are large; and ``f`` falls towards the goal like a norm, while the gradient of ``L`` vanishes
-    there. The unit of the costs is nothing but a factor of ``f``. With noise ``L`` is biased low: the root of a mean is
-    larger than the mean of the roots.
+    ``L`` only counts where costs are large. The unit of the costs is nothing but a factor of ``f``. With noise ``L`` is biased
+    low: the root of a mean is larger than the mean of the roots.
 
-    Where rewards are positive, ``L`` has an ``offset``, the value of states from which nothing is ever paid, and ``f`` is
-    negative wherever rewards are collected. The signed root, without a linear part, is that of
-    https://arxiv.org/abs/1805.11593.
+    The floor is the lowest value. All values have it in common, and with a discount near 1 it is large and hardly falls while
+    the loop gets better: a root from zero on would be flat just where the loop comes to rest. What is learned is a relative
+    value, as in relative value iteration. Where rewards are positive, ``L`` also has an ``offset``, the value of states from
+    which nothing is ever paid. The signed root is that of https://arxiv.org/abs/1805.11593, without its linear part.
 
     :param observation_space: Observation space
     :param action_space: Action space
@@ -49,7 +50,6 @@ class LyapunovCritic(BaseModel):
     :param normalize_images: Whether to normalize images or not,
          dividing by 255.0 (True by default)
     :param n_critics: Number of critic networks to create
-    :param power: Power of the root, above 0 and at most 1 (the value itself)
     :param share_features_extractor: Whether the features extractor is shared with the actor
         (it is then trained by the loss of the actor only)
     """
@@ -67,7 +67,6 @@ class LyapunovCritic(BaseModel):
         activation_fn: type[nn.Module] = nn.ReLU,
         normalize_images: bool = True,
         n_critics: int = 2,
-        power: float = 0.25,
         share_features_extractor: bool = False,
     ):
         super().__init__(
@@ -79,18 +78,17 @@ class LyapunovCritic(BaseModel):
 
         if n_critics < 1:
             raise ValueError(f"n_critics={n_critics} must be at least 1.")
-        if not 0 < power <= 1:
-            raise ValueError(f"power={power} must be above 0 and at most 1: 0.5 is the square root, 1 the value itself.")
 
         action_dim = get_action_dim(self.action_space)
 
         self.share_features_extractor = share_features_extractor
         self.n_critics = n_critics
-        self.power = power
         self.lyapunov_networks: list[nn.Sequential] = []
-        # What all exact values have in common. Set by the algorithm, saved with the weights
+        # What all values have in common. Set by the algorithm, saved with the weights
         self.offset: th.Tensor
+        self.floor: th.Tensor
         self.register_buffer("offset", th.zeros(1))
+        self.register_buffer("floor", th.zeros(1))
         for idx in range(n_critics):
             lyapunov_net = nn.Sequential(*create_mlp(features_dim + action_dim, 1, net_arch, activation_fn))
             self.add_module(f"lf{idx}", lyapunov_net)
@@ -98,11 +96,11 @@ class LyapunovCritic(BaseModel):
 
     def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:
         """
-        Get the roots of the values relative to the offset.
+        Get what the networks learn.
 
         :param obs: Observations, preprocessed by ``extract_features()``
         :param actions: As many flat actions in [-1, 1]
-        :return: Roots of ``L(s, a) - offset``, one tensor of shape (n, 1) per critic
+        :return: Roots of ``L(s, a) - offset - floor``, one tensor of shape (n, 1) per critic
         """
         # Learn the features extractor using the policy loss only
         # when the features_extractor is shared with the actor
@@ -115,19 +113,29 @@ class LyapunovCritic(BaseModel):
         """
         Get what the networks learn of values.
 
-        :param values: Values of any sign
-        :return: As many roots, ``sign(x) |x|^power``
+        :param values: Values relative to the offset
+        :return: As many fourth roots of what the values are above the floor, negative below it
         """
-        return values.sign() * values.abs().pow(self.power)
+        above = values - self.floor
+        return above.sign() * above.abs().pow(0.25)
 
     def value(self, roots: th.Tensor) -> th.Tensor:
         """
         Get the values that roots belong to.
 
         :param roots: What the networks learn
-        :return: As many values, the inverse of ``root()``
+        :return: As many values relative to the offset, the inverse of ``root()``
         """
-        return roots.sign() * roots.abs().pow(1 / self.power)
+        return roots.pow(3) * roots.abs() + self.floor
+
+    def distance(self, roots: th.Tensor) -> th.Tensor:
+        """
+        Get a measure of values that is like a norm where values are like its square.
+
+        :param roots: What the networks learn
+        :return: As many square roots of what the values are above the floor, negative below it
+        """
+        return roots * roots.abs()
 
     def lyapunov_of(self, roots: th.Tensor) -> th.Tensor:
         """
@@ -182,7 +190,6 @@ class LyapunovPolicy(BasePolicy):
         excluding the learning rate, to pass to the optimizer
         (the fused implementation of ``th.optim.Adam`` is used, unless ``fused``, ``foreach`` or ``differentiable`` is given)
     :param n_critics: Number of Lyapunov critic networks to create, the largest of their values is used.
-    :param power: Power of the root of ``L`` that they learn (see ``LyapunovCritic``)
     :param share_features_extractor: Whether to share or not the features extractor
         between the actor and the critic (this saves computation time)
     """
@@ -210,7 +217,6 @@ class LyapunovPolicy(BasePolicy):
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
         n_critics: int = 2,
-        power: float = 0.25,
         share_features_extractor: bool = False,
     ):
         # Other implementations of Adam, which exclude the fused one
@@ -257,7 +263,6 @@ class LyapunovPolicy(BasePolicy):
             {
                 "net_arch": critic_arch,
                 "n_critics": n_critics,
-                "power": power,
                 "share_features_extractor": share_features_extractor,
             }
         )
@@ -312,7 +317,6 @@ class LyapunovPolicy(BasePolicy):
                 use_expln=self.actor_kwargs["use_expln"],
                 clip_mean=self.actor_kwargs["clip_mean"],
                 n_critics=self.critic_kwargs["n_critics"],
-                power=self.critic_kwargs["power"],
                 share_features_extractor=self.share_features_extractor,
                 lr_schedule=self._dummy_schedule,  # dummy lr schedule, not needed for loading policy alone
                 optimizer_class=self.optimizer_class,

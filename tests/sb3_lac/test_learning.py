@@ -46,14 +46,16 @@ def exact_value(env, gain):
 class ExactCritic(nn.Module):
     """The root of an exact value in place of the critic's networks, times a factor that is learned."""
 
-    power = 0.25
-    root, value, lyapunov_of = LyapunovCritic.root, LyapunovCritic.value, LyapunovCritic.lyapunov_of
+    root, value, distance = LyapunovCritic.root, LyapunovCritic.value, LyapunovCritic.distance
+    lyapunov_of = LyapunovCritic.lyapunov_of
 
     def __init__(self, exact, factor=1.0):
         super().__init__()
         self.exact = exact
         self.factor = nn.Parameter(th.tensor(factor))
         self.register_buffer("offset", th.zeros(1))
+        # Any floor will do for an exact value
+        self.register_buffer("floor", th.ones(1))
 
     def forward(self, states, controls):
         return (self.factor * self.root(self.exact(states, controls)),)

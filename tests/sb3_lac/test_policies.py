@@ -28,15 +28,14 @@ class BatchNormDropoutExtractor(BatchNormExtractor):
 
 
 @pytest.fixture(scope="module")
-def make_critic():
+def critic():
     box = spaces.Box(-1, 1, (1,))
     extractor = FlattenExtractor(box)
-    return lambda power: LyapunovCritic(box, box, [4], extractor, extractor.features_dim, power=power)
+    return LyapunovCritic(box, box, [4], extractor, extractor.features_dim)
 
 
-@pytest.mark.parametrize("power", [0.25, 0.5, 1.0])
-def test_networks_learn_a_root_and_the_policy_shows_the_value(make_model, power):
-    model = make_model(n_collect=16, policy_kwargs={"n_critics": 2, "power": power})
+def test_networks_learn_a_root_and_the_policy_shows_the_value(make_model):
+    model = make_model(n_collect=16)
     critic = model.critic
     obs, actions = th.randn(200, 2), th.rand(200, 2)
     with th.no_grad():
@@ -51,7 +50,9 @@ def test_networks_learn_a_root_and_the_policy_shows_the_value(make_model, power)
     assert largest.min() < 0 < largest.max()
     conservative = critic.lyapunov(obs, actions)
     assert conservative.min() == 0
-    th.testing.assert_close(conservative, largest.clamp(min=0) ** (1 / power))
+    th.testing.assert_close(conservative, largest.clamp(min=0) ** 4)
+    critic.floor.fill_(2.0)
+    th.testing.assert_close(critic.lyapunov(obs, actions), (largest**3 * largest.abs() + 2).clamp(min=0))
     # and it learns: the gradient reaches every parameter
     before = [parameter.clone() for parameter in critic.parameters()]
     model.train(gradient_steps=1, batch_size=8)
@@ -61,16 +62,20 @@ def test_networks_learn_a_root_and_the_policy_shows_the_value(make_model, power)
 @given(
     value=st.floats(-1e6, 1e6).filter(lambda value: value == 0 or abs(value) > 1e-6),
     factor=st.floats(1e-3, 1e3),
-    power=st.sampled_from([0.1, 0.25, 0.5, 1.0]),
 )
-def test_root_has_an_inverse_keeps_the_order_and_takes_units_as_factors(make_critic, value, factor, power):
-    critic = make_critic(power)
+def test_root_has_an_inverse_keeps_the_order_and_takes_units_as_factors(critic, value, factor):
     values = th.tensor([value, value + abs(value) + 1.0], dtype=th.float64)
+    critic.floor.fill_(0.0)
     roots = critic.root(values)
     th.testing.assert_close(critic.value(roots), values)
+    th.testing.assert_close(critic.distance(roots), th.sign(values) * values.abs().sqrt())
     assert roots[0] < roots[1]
     assert th.sign(roots[0]) == np.sign(value)
-    th.testing.assert_close(critic.root(factor * values), factor**power * roots)
+    th.testing.assert_close(critic.root(factor * values), factor**0.25 * roots)
+    # The floor is what all values have in common
+    critic.floor.fill_(3.0)
+    th.testing.assert_close(critic.root(values + critic.floor), roots, rtol=1e-3, atol=1e-2)
+    th.testing.assert_close(critic.value(roots), values + critic.floor)
 
 
 def test_targets_start_as_copies_and_stay_in_eval_mode(make_model):
@@ -143,7 +148,6 @@ def test_policy_keeps_all_arguments_when_saved_and_loaded(make_model, tmp_path):
         "optimizer_class": th.optim.AdamW,
         "optimizer_kwargs": {"weight_decay": 0.1},
         "n_critics": 3,
-        "power": 0.5,
         "share_features_extractor": True,
     }
     policy = make_model(n_collect=0, use_sde=True, policy_kwargs=policy_kwargs).policy

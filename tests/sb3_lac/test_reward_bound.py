@@ -97,9 +97,7 @@ def test_rise_of_the_bound_shifts_all_values_and_no_gradient(
 )
 def test_value_counts_the_bound_after_a_termination(make_model, make_env, train_metrics, terminate, reward, expected):
     env = make_env(episode_length=1, terminate=terminate)
-    # The metric in which values are learned soonest
-    kwargs = {"tau": 0.1, "learning_rate": 3e-3, "policy_kwargs": {"power": 1.0}}
-    model = make_model(env, gamma=0.5, reward_bound=2.0, **kwargs)
+    model = make_model(env, gamma=0.5, reward_bound=2.0, tau=0.1, learning_rate=3e-3)
     model.replay_buffer.rewards[:] = reward
     train_metrics(model, gradient_steps=400)
     assert train_metrics(model, seed=1)["lyapunov_mean"] == pytest.approx(expected, abs=0.2)

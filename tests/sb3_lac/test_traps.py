@@ -56,8 +56,7 @@ def test_default_arguments_do_not_warn(make_env):
 def test_time_limits_bootstrap_and_terminations_do_not(make_model, make_env, train_metrics, terminate, expected):
     # Reward -1 in each step, each of which ends an episode: 1 + 0.5 + 0.25 + ... or only 1
     env = make_env(episode_length=1, terminate=terminate)
-    # The metric in which values are learned soonest
-    model = make_model(env, gamma=0.5, tau=0.1, learning_rate=3e-3, policy_kwargs={"power": 1.0})
+    model = make_model(env, gamma=0.5, tau=0.1, learning_rate=3e-3)
     model.replay_buffer.rewards[:] = -1.0
     train_metrics(model, gradient_steps=400)
     assert train_metrics(model, seed=1)["lyapunov_mean"] == pytest.approx(expected, abs=0.4)
@@ -135,7 +134,7 @@ def test_everything_that_is_learned_is_saved(make_model, train_metrics):
 
     # All weights and biases of actor and critic are parameters, have an optimizer and change
     for module in (model.actor, model.critic):
-        assert {name for name, _ in module.named_parameters()} == set(module.state_dict()) - {"offset"}
+        assert {name for name, _ in module.named_parameters()} == set(module.state_dict()) - {"offset", "floor"}
         optimized = [parameter for group in module.optimizer.param_groups for parameter in group["params"]]
         assert {id(parameter) for parameter in optimized} == {id(parameter) for parameter in module.parameters()}
     before = {name: tensor.clone() for name, tensor in model.policy.state_dict().items()}
@@ -146,16 +145,18 @@ def test_everything_that_is_learned_is_saved(make_model, train_metrics):
 
 
 def test_both_values_of_the_difference_are_from_the_online_critic(make_model, train_metrics):
-    # A critic that is the same number everywhere, in the metric that is the value itself: the difference is alpha3 times the
-    # cost, whatever the target says
-    model = make_model(alpha3=0.3, policy_kwargs={"power": 1.0})
-    for module, value in ((model.critic, 3.0), (model.critic_target, 50.0)):
+    # A critic that is the same number everywhere: the difference is that of the condition, whatever the target says
+    model = make_model(alpha3=0.3)
+    for module, root in ((model.critic, 3.0), (model.critic_target, 50.0)):
         for network in module.lyapunov_networks:
             nn.init.zeros_(network[-1].weight)
-            nn.init.constant_(network[-1].bias, value)
-    metrics = train_metrics(model)
-    assert metrics["lyapunov_mean"] == pytest.approx(3.0, rel=1e-5)
-    assert metrics["lyapunov_difference"] == pytest.approx(0.3 * metrics["cost"], rel=1e-4)
+            nn.init.constant_(network[-1].bias, root)
+    batch = model.replay_buffer.sample(16)
+    model.replay_buffer.sample = lambda *args, **kwargs: batch
+    # The floor falls out of it
+    allowed = 3.0**4 + 0.3 * batch.rewards
+    expected = (3.0**2 - allowed.sign() * allowed.abs().sqrt()).mean().item()
+    assert train_metrics(model)["lyapunov_difference"] == pytest.approx(expected, rel=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -170,8 +171,6 @@ def test_both_values_of_the_difference_are_from_the_online_critic(make_model, tr
         ({"n_steps": 3, "gamma": 1.0}, "gamma must be smaller than 1 with n-step returns"),
         ({"gamma": 1.1}, "gamma=1.1 must lie within 0 .. 1"),
         ({"gamma": math.nan}, "gamma=nan must lie within 0 .. 1"),
-        ({"policy_kwargs": {"power": 0.0}}, "power=0.0 must be above 0 and at most 1"),
-        ({"policy_kwargs": {"power": 2}}, "power=2 must be above 0 and at most 1"),
         ({"policy_kwargs": {"n_critics": 0}}, "n_critics=0 must be at least 1"),
     ],
 )

@@ -46,9 +46,13 @@ def root(value):
     return th.sign(value) * th.sqrt(th.sqrt(abs(value)))
 
 
-def lyapunov(roots, offset):
-    """L of the largest of several critics."""
-    return (roots.amax(dim=0) ** 3 * abs(roots.amax(dim=0)) + offset).clamp(min=0)
+def distance(value):
+    return th.sign(value) * th.sqrt(abs(value))
+
+
+def relative(roots):
+    """L of the largest of several critics, above its floor."""
+    return roots.amax(dim=0) ** 3 * abs(roots.amax(dim=0))
 
 
 class ScalarAdam:
@@ -101,7 +105,7 @@ def test_train_is_the_update_of_the_equations(make_model_without_env, n_critics,
     obs, next_obs, actions = batch.observations, batch.next_observations, batch.actions
     costs, dones = bound - batch.rewards.flatten(), batch.dones.flatten()
     # After a termination nothing is paid, which costs the bound in every step
-    offset = bound / (1 - GAMMA)
+    offset, floor, target_floor = bound / (1 - GAMMA), 0.0, 0.0
 
     for step in range(4):
         th.manual_seed(step)
@@ -112,19 +116,22 @@ def test_train_is_the_update_of_the_equations(make_model_without_env, n_critics,
         actions_pi, log_prob = policy_sample(actor, obs)
         with th.no_grad():
             next_actions, _ = policy_sample(actor_target if published_update else actor, next_obs)
-            next_values = lyapunov(roots_of(critic_target, next_obs, next_actions, n_critics), offset)
-            y = costs + GAMMA * ((1 - dones) * next_values + dones * offset)
+            next_values = relative(roots_of(critic_target, next_obs, next_actions, n_critics)) + target_floor
+            next_values = th.maximum(next_values, -th.tensor(offset))
+            # y - offset, where bound + GAMMA * offset is the offset
+            y = costs - bound + GAMMA * (1 - dones) * next_values
+            floor = (1 - TAU) * floor + TAU * y.min()
+            target_floor = (1 - TAU) * target_floor + TAU * floor
         roots = roots_of(critic, obs, actions, n_critics)
-        critic_loss = (0.5 * (roots - root(y - offset)) ** 2).mean(dim=1).sum()
-        values = lyapunov(roots, offset).detach()
+        critic_loss = (0.5 * (roots - root(y - floor)) ** 2).mean(dim=1).sum()
+        values = (relative(roots) + floor + offset).clamp(min=0).detach()
         if published_update:
             next_actions, _ = policy_sample(actor, next_obs)
         next_roots = roots_of(critic, next_obs, next_actions, n_critics)
-        relative = roots.detach().amax(dim=0) ** 3 * abs(roots.detach().amax(dim=0))
-        difference = next_roots.amax(dim=0) - root(relative - ALPHA3 * costs)
+        difference = distance(relative(next_roots)) - distance(relative(roots.detach()) - ALPHA3 * costs)
         # Where the episode goes on
         d = difference[dones == 0].mean()
-        objective = d if published_update else roots_of(critic, obs, actions_pi, n_critics).amax(dim=0).mean()
+        objective = d if published_update else distance(relative(roots_of(critic, obs, actions_pi, n_critics))).mean()
         lambda_, beta = math.exp(log_lambda.value), math.exp(log_beta.value)
         actor_loss = lambda_ * objective + beta * log_prob.mean()
         violation = log_prob.mean().item() - 2.0  # target entropy: minus the number of actions

@@ -33,7 +33,7 @@ CONFIG = {
         "buffer_size": 500,
         "batch_size": 8,
         "normalize": "dict(norm_obs=True, norm_reward=True)",
-        "policy_kwargs": "dict(net_arch=[8], activation_fn=nn.LeakyReLU, power=0.5)",
+        "policy_kwargs": "dict(net_arch=[8], activation_fn=nn.LeakyReLU, n_critics=3)",
     }
 }
 
@@ -52,7 +52,7 @@ def test_train_continue_and_enjoy(workdir, n_updates, capsys):
     main(["train", "--env", ENV, "--eval-freq", "-1", "--seed", "1", "--save-replay-buffer"])
     first = LAC.load(workdir / "logs" / "lac" / f"{ENV}_1" / f"{ENV}.zip")
     assert first.num_timesteps == 60 and n_updates(first) == 20
-    assert first.critic.power == 0.5 and isinstance(first.actor.latent_pi[1], nn.LeakyReLU)
+    assert first.critic.n_critics == 3 and isinstance(first.actor.latent_pi[1], nn.LeakyReLU)
     assert first.lr_schedule(0.5) == pytest.approx(1.5e-4)
     assert first.lambda_lr_schedule(0.5) == pytest.approx(2.5e-5)
 
