@@ -94,7 +94,7 @@ def part(seed: int, timesteps: int, episodes: int, models: Path) -> Tables:
     slope, intercept = np.polyfit(exact, learned, 1)
     # What noise adds to all values: that of the steps, and that of the policy that L is learned of, which explores
     explored = env.control_max * (model.predict(states.astype(np.float32), deterministic=False)[0] - actions)
-    noise_floor = noise_cost(gain, model.gamma, float(np.sqrt(np.mean(np.square(explored)))))
+    intercept_exact = noise_cost(gain, model.gamma, float(np.sqrt(np.mean(np.square(explored)))))
     rolled_out = episode_costs(lambda observed: model.predict(observed, deterministic=True)[0], episodes)
     ratios: dict[str, float] = {}
     for name, gamma in (("discounted", model.gamma), ("per_step", 1.0)):
@@ -113,7 +113,7 @@ def part(seed: int, timesteps: int, episodes: int, models: Path) -> Tables:
         "linear_over_optimum": np.trace(env.value_matrix(gain, model.gamma)) / np.trace(env.value_matrix(best, model.gamma)),
         "value_slope": slope,
         "value_intercept": intercept,
-        "value_intercept_exact": noise_floor,
+        "value_intercept_exact": intercept_exact,
         "value_correlation": np.corrcoef(exact, learned)[0, 1],
         "calibration_slope": measured.to_frame().loc["calibration_slope", "value"],
         "alpha3": measured.to_frame().loc["largest_feasible_alpha3", "value"],

@@ -18,7 +18,7 @@ class CostAlgorithm(OffPolicyAlgorithm):
     """
     Off-policy algorithm that minimises the cost ``bound - reward >= 0``, where ``bound`` is the largest reward stated or seen,
     and at least 0. After a termination nothing is paid, so that each step costs ``bound``. The critics learn
-    ``L - offset``, where ``offset = bound / (1 - gamma)`` is the value of ``L`` where nothing is ever paid: when the bound
+    of ``L - offset``, where ``offset = bound / (1 - gamma)`` is the value of ``L`` where nothing is ever paid: when the bound
     rises, all values of ``L`` rise with it, and there is nothing to learn anew.
     """
 

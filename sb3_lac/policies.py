@@ -28,17 +28,17 @@ def largest_value(values: Sequence[th.Tensor]) -> th.Tensor:
 class LyapunovCritic(BaseModel):
     """
     Lyapunov critic network(s) for LAC.
-    Each network maps state and action to the fourth root ``f(s, a)`` of what ``L`` is above its floor, the value of the loop
-    at rest: ``L = offset + floor + sign(f) |f|^4``.
+    Each network maps state and action to the fourth root ``f(s, a)`` of what ``L`` is above its floor, about the value of the
+    loop at rest: ``L = offset + floor + sign(f) |f|^4``.
 
-    Costs of a loop that settles fade over orders of magnitude. An error in ``f`` counts alike at all of them, while one in
-    ``L`` only counts where costs are large. The unit of the costs is nothing but a factor of ``f``. With noise ``L`` is biased
-    low: the root of a mean is larger than the mean of the roots.
+    Costs of a loop that settles fade over orders of magnitude. A relative error of ``L`` counts a thousand times more at a
+    thousand times the cost, and one of ``f`` less than six times. The unit of the costs is nothing but a factor of ``f``. With
+    noise ``L`` is biased low: the root of a mean is larger than the mean of the roots.
 
-    The floor is the lowest value. All values have it in common, and with a discount near 1 it is large and hardly falls while
-    the loop gets better: a root from zero on would be flat just where the loop comes to rest. What is learned is a relative
-    value, as in relative value iteration. Where rewards are positive, ``L`` also has an ``offset``, the value of states from
-    which nothing is ever paid. The signed root is that of https://arxiv.org/abs/1805.11593, without its linear part.
+    The floor follows the lowest value. What all values have in common falls slowly while the loop gets better, if the discount
+    is near 1: a root from zero on would be flat just where the loop comes to rest. What is learned is a relative value, as in
+    relative value iteration. Where rewards are positive, ``L`` also has an ``offset``, the value of states from which nothing
+    is ever paid. The signed root is that of https://arxiv.org/abs/1805.11593, without its linear part.
 
     :param observation_space: Observation space
     :param action_space: Action space
@@ -326,11 +326,6 @@ class LyapunovPolicy(BasePolicy):
             )
         )
         return data
-
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        # Earlier versions kept the bound outside of the policy
-        state_dict.setdefault(f"{prefix}reward_bound", self.reward_bound)
-        super()._load_from_state_dict(state_dict, prefix, *args)
 
     def reset_noise(self, batch_size: int = 1) -> None:
         """

@@ -20,13 +20,14 @@ def test_target_is_that_of_sac_with_negated_values(ent_coef):
     model = make_model(ent_coef=ent_coef).learn(20)
     batch = model.replay_buffer.sample(8)
     batch = batch._replace(dones=(th.arange(8) % 2).float().reshape(-1, 1))
+    model.critic_target.floor.fill_(3.0)
     th.manual_seed(3)
     targets = model._target_values(batch, None)
     th.manual_seed(3)
     with th.no_grad():
         actions, log_prob = model.actor.action_log_prob(batch.next_observations)
         q_values = th.cat(
-            [-model.critic.value(roots) for roots in model.critic_target(batch.next_observations, actions)], dim=1
+            [-model.critic_target.value(roots) for roots in model.critic_target(batch.next_observations, actions)], dim=1
         )
     soft = q_values.min(dim=1, keepdim=True).values - 0.3 * log_prob.reshape(-1, 1)
     th.testing.assert_close(targets, -(batch.rewards + (1 - batch.dones) * 0.9 * soft))

@@ -5,7 +5,6 @@ import pytest
 import torch as th
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
-from stable_baselines3.common.save_util import load_from_zip_file, save_to_zip_file
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_lac import LAC
@@ -116,18 +115,3 @@ def test_arguments_are_kept_checked_and_can_be_changed(make_model, tmp_path):
     assert LAC.load(tmp_path / "model", alpha3=0.5).alpha3 == 0.5
     with pytest.raises(ValueError, match="alpha3=-1 must be greater than 0"):
         LAC.load(tmp_path / "model", alpha3=-1)
-
-
-def test_models_of_version_0_3_load(make_model, make_env, train_metrics, tmp_path):
-    model = make_model(make_env(offset=4.0), gamma=0.75)
-    train_metrics(model, gradient_steps=5)
-    model.save(tmp_path / "model")
-    data, parameters, tensors = load_from_zip_file(tmp_path / "model")
-    # It had a finite horizon, by default none, and the bound was a tensor of the algorithm
-    data["horizon"] = None
-    tensors["reward_bound"] = parameters["policy"].pop("reward_bound")
-    save_to_zip_file(tmp_path / "old", data=data, params=parameters, pytorch_variables=tensors)
-    loaded = LAC.load(tmp_path / "old", env=make_env(offset=4.0), device="cpu")
-    assert loaded.cost_bound().item() == model.cost_bound().item() > 3.0
-    assert_same_learned_state(model, loaded)
-    loaded.learn(50, reset_num_timesteps=False)

@@ -205,6 +205,7 @@ def test_targets_follow_every_target_update_interval(make_model, train_metrics):
     for online, target in ((model.actor, model.actor_target), (model.critic, model.critic_target)):
         for parameter, target_parameter in zip(online.parameters(), target.parameters(), strict=True):
             assert th.equal(parameter, target_parameter)
+    assert model.critic.floor == model.critic_target.floor != 0
 
 
 def test_lambda_has_its_own_learning_rate(make_model, train_metrics):
@@ -296,6 +297,7 @@ def test_target_update_interval_counts_the_updates_of_all_calls(make_model):
     followed = []
     for _ in range(7):
         model.train(gradient_steps=1, batch_size=16)
-        pairs = zip(model.critic.parameters(), model.critic_target.parameters(), strict=True)
+        pairs = [(model.critic.floor, model.critic_target.floor)]
+        pairs += zip(model.critic.parameters(), model.critic_target.parameters(), strict=True)
         followed.append(all(th.equal(*pair) for pair in pairs))
     assert followed == [True, False, False, True, False, False, True]
