@@ -41,8 +41,8 @@ def assert_alike(policy, model, observations, seen=None):
 
 
 @pytest.mark.parametrize("algorithm", [LAC, TD3, TQC, PPO])
-def test_the_file_does_what_the_policy_does(algorithm, tmp_path):
-    th.distributions.Distribution.set_default_validate_args(True)
+def test_the_file_does_what_the_policy_does(algorithm, monkeypatch, tmp_path):
+    monkeypatch.setattr(th.distributions.Distribution, "_validate_args", True)
     model = new_model(algorithm)
     policy = OnnxPolicy(export_onnx(model, tmp_path / "policy"))
     observations = np.array([model.observation_space.sample() for _ in range(100)])
