@@ -16,7 +16,7 @@ LAC's from what is the metric's. What is done is not done again when the command
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 from stable_baselines3.common.callbacks import BaseCallback
@@ -258,14 +259,21 @@ def plot_costs(results: pd.DataFrame) -> Figure:
                 middle, low, high = (float(value) for value in over_seeds(values))
                 axes.scatter(values, np.full(len(values), height), s=8, color=colour, alpha=0.35, lw=0)
                 axes.plot([low, high], [height, height], color=colour, lw=1.5)
-                axes.plot(middle, height, marker, color=colour, ms=6, label=name if row == 0 else None)
+                axes.plot(middle, height, marker, color=colour, ms=6, label=name)
     costs.set(xscale="log", xlabel="cost per step over that of the reference controller")
     format_log_axis(costs.xaxis)
     costs.set_yticks(range(len(envs)), envs)
     costs.invert_yaxis()
     goals.set(xlabel="share of episodes that end at the goal", xlim=(-0.03, 1.03))
-    figure.legend(*costs.get_legend_handles_labels(), loc="outside lower center", ncols=len(names), fontsize="small")
+    _add_legend(figure, [costs], names)
     return figure
+
+
+def _add_legend(figure: Figure, panels: Sequence[Axes], names: Iterable[str]) -> None:
+    """One entry for each name that any panel has, whichever that is."""
+    handles = {label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    shown = [name for name in names if name in handles]
+    figure.legend([handles[name] for name in shown], shown, loc="outside lower center", ncols=len(shown), fontsize="small")
 
 
 def plot_learning(learning: pd.DataFrame) -> Figure:
@@ -292,7 +300,7 @@ def plot_learning(learning: pd.DataFrame) -> Figure:
         axes.set_ylabel("cost per step")
     for axes in panels[-3:]:
         axes.set_xlabel("environment steps")
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(STYLES), fontsize="small")
+    _add_legend(figure, panels, STYLES)
     return figure
 
 
