@@ -46,8 +46,9 @@ def root(value):
     return th.sign(value) * th.sqrt(th.sqrt(abs(value)))
 
 
-def distance(value):
-    return th.sign(value) * th.sqrt(abs(value))
+def distance(value, at_rest):
+    """Like the value up to what a step costs at rest, and like its square root beyond."""
+    return th.sign(value) * (th.sqrt(abs(value) + at_rest) - th.sqrt(at_rest))
 
 
 def relative(roots):
@@ -122,16 +123,18 @@ def test_train_is_the_update_of_the_equations(make_model_without_env, n_critics,
             y = costs - bound + GAMMA * (1 - dones) * next_values
             floor = (1 - TAU) * floor + TAU * y.min()
             target_floor = (1 - TAU) * target_floor + TAU * floor
+            at_rest = (1 - GAMMA) * (floor + offset)
         roots = roots_of(critic, obs, actions, n_critics)
         critic_loss = (0.5 * (roots - root(y - floor)) ** 2).mean(dim=1).sum()
         values = (relative(roots) + floor + offset).clamp(min=0).detach()
         if published_update:
             next_actions, _ = policy_sample(actor, next_obs)
         next_roots = roots_of(critic, next_obs, next_actions, n_critics)
-        difference = distance(relative(next_roots)) - distance(relative(roots.detach()) - ALPHA3 * costs)
+        allowed = relative(roots.detach()) - ALPHA3 * costs
+        difference = distance(relative(next_roots), at_rest) - distance(allowed, at_rest)
         # Where the episode goes on
         d = difference[dones == 0].mean()
-        objective = d if published_update else distance(relative(roots_of(critic, obs, actions_pi, n_critics))).mean()
+        objective = d if published_update else distance(relative(roots_of(critic, obs, actions_pi, n_critics)), at_rest).mean()
         lambda_, beta = math.exp(log_lambda.value), math.exp(log_beta.value)
         actor_loss = lambda_ * objective + beta * log_prob.mean()
         violation = log_prob.mean().item() - 2.0  # target entropy: minus the number of actions
