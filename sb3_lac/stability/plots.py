@@ -29,10 +29,17 @@ def is_wide(values: pd.Series | np.ndarray) -> bool:
     return 0 < 10 * values.min() < values.max()
 
 
+class _Numbers(LogFormatter):
+    """Labels as few of the minor ticks as its base does, with three digits."""
+
+    def __call__(self, x: float, pos: int | None = None) -> str:
+        return f"{x:.3g}" if super().__call__(x, pos) else ""
+
+
 def format_log_axis(axis: Axis) -> None:
     """Label a logarithmic axis with numbers like 5 instead of powers like 5 * 10^0."""
     axis.set_major_formatter("{x:g}")
-    axis.set_minor_formatter(LogFormatter())
+    axis.set_minor_formatter(_Numbers())
 
 
 def set_log_scale(axes: Axes, which: Literal["x", "y"], values: pd.Series | np.ndarray) -> None:
