@@ -306,10 +306,14 @@ class LAC(CostAlgorithm):
             # where bound + gamma * offset = offset is left out on both sides
             return -replay_data.rewards + (1 - replay_data.dones) * discounts * next_values
 
+    def _cost_at_rest(self) -> th.Tensor:
+        """What a step costs at rest, by the Bellman equation of the lowest values."""
+        # Next to nothing where nothing is paid, also while the values fall: the floor of the target lags as that of the critic
+        return self.critic.floor + self.critic.offset - self.gamma * (self.critic_target.floor + self.critic_target.offset)
+
     def _distance(self, roots: th.Tensor) -> th.Tensor:
         """The metric of the objective and of the decrease condition."""
-        # What a step costs at rest, if the lowest L is that of paying it for ever
-        return self.critic.distance(roots, (1 - self.gamma) * (self.critic.floor + self.critic.offset))
+        return self.critic.distance(roots, self._cost_at_rest())
 
     def _objective(self, roots: th.Tensor) -> th.Tensor:
         """What the actor lowers, given the roots at its actions."""
