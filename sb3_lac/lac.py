@@ -82,7 +82,7 @@ class LAC(CostAlgorithm):
     :param published_update: Whether to update as the paper does: the actor lowers ``L`` in the states that follow the
         sampled ones instead of in these, and the critic's target has the action of a target actor.
     :param alpha3: Share of the cost by which ``L`` has to decrease in each step. From 1 on the condition cannot hold
-        in stationary data: ``lambda`` then stays at ``lambda_max``, a fixed weight of the cost.
+        in stationary data: ``lambda`` then stays at ``lambda_max``, a fixed weight of the cost, but while ``L`` comes down.
     :param lambda_init: Initial value of ``lambda``
     :param lambda_min: Lower limit of ``lambda`` (with ``lambda`` at zero, the actor would only maximise its entropy)
     :param lambda_max: Upper limit of ``lambda``
@@ -307,9 +307,10 @@ class LAC(CostAlgorithm):
             return -replay_data.rewards + (1 - replay_data.dones) * discounts * next_values
 
     def _cost_at_rest(self) -> th.Tensor:
-        """What a step costs at rest, by the Bellman equation of the lowest values."""
+        """What a backup costs at rest, by the Bellman equation of the lowest values."""
         # Next to nothing where nothing is paid, also while the values fall: the floor of the target lags as that of the critic
-        return self.critic.floor + self.critic.offset - self.gamma * (self.critic_target.floor + self.critic_target.offset)
+        next_lowest = self.critic_target.floor + self.critic_target.offset
+        return self.critic.floor + self.critic.offset - self.gamma**self.n_steps * next_lowest
 
     def _distance(self, roots: th.Tensor) -> th.Tensor:
         """The metric of the objective and of the decrease condition."""

@@ -134,7 +134,7 @@ class LyapunovCritic(BaseModel):
         a loop at rest costs, where noise rules: the pseudo-Huber loss of the square root.
 
         :param roots: What the networks learn
-        :param cost_at_rest: Value above the floor at which the one becomes the other, at least 0
+        :param cost_at_rest: Value above the floor at which the one becomes the other, 0 if it is negative
         :return: As many distances, negative below the floor
         """
         cost_at_rest = cost_at_rest.clamp(min=th.finfo(cost_at_rest.dtype).tiny)

@@ -30,10 +30,10 @@ def is_wide(values: pd.Series | np.ndarray) -> bool:
 
 
 class _Numbers(LogFormatter):
-    """Labels as few of the minor ticks as its base does, with three digits."""
+    """Labels as few of the minor ticks as its base does, with numbers."""
 
     def __call__(self, x: float, pos: int | None = None) -> str:
-        return f"{x:.3g}" if super().__call__(x, pos) else ""
+        return f"{x:g}" if super().__call__(x, pos) else ""
 
 
 def format_log_axis(axis: Axis) -> None:

@@ -72,6 +72,7 @@ def test_root_has_an_inverse_keeps_the_order_and_takes_units_as_factors(critic, 
     distances = critic.distance(roots, th.zeros(1))
     th.testing.assert_close(distances, th.sign(values) * values.abs().sqrt())
     th.testing.assert_close(critic.distance(roots, 1e8 * values.abs().max()) * 2e4 * values.abs().max().sqrt(), values)
+    th.testing.assert_close(critic.distance(roots, -th.ones(1)), distances)
     at_rest = th.tensor(0.7, dtype=th.float64)
     scaled = critic.distance(critic.root(factor * values), factor * at_rest)
     th.testing.assert_close(scaled, factor**0.5 * critic.distance(roots, at_rest))
