@@ -40,9 +40,9 @@ class LAC(CostAlgorithm):
     the learning rate and the number of steps; leave ``alpha3``, the multipliers and ``ent_coef`` at their defaults.
 
     The critic ``L(s, a) >= 0`` is the discounted sum of costs. Its networks learn the fourth root of what it is above its
-    lowest value, in which small costs count beside large ones. The actor lowers a distance: the square root of the same, but
-    ``L`` itself where the loop rests. ``L`` has to decrease by ``alpha3`` times the cost in each step: a Lagrange multiplier
-    ``lambda`` enforces that, while ``ent_coef`` keeps the entropy up as in SAC.
+    lowest value, in which small costs count beside large ones, and the actor lowers the square root. ``L`` has to decrease by
+    ``alpha3`` times the cost in each step: a Lagrange multiplier ``lambda`` enforces that, while ``ent_coef`` keeps the
+    entropy up as in SAC.
 
     Note: the cost is ``bound - reward``, where ``bound`` is the largest reward (stated or seen, at least 0). A termination
     pays 0 for ever after, and so costs ``bound`` per step where rewards are positive.
@@ -306,19 +306,9 @@ class LAC(CostAlgorithm):
             # where bound + gamma * offset = offset is left out on both sides
             return -replay_data.rewards + (1 - replay_data.dones) * discounts * next_values
 
-    def _cost_at_rest(self) -> th.Tensor:
-        """What a backup costs at rest, by the Bellman equation of the lowest values."""
-        # Next to nothing where nothing is paid, also while the values fall: the floor of the target lags as that of the critic
-        next_lowest = self.critic_target.floor + self.critic_target.offset
-        return self.critic.floor + self.critic.offset - self.gamma**self.n_steps * next_lowest
-
-    def _distance(self, roots: th.Tensor) -> th.Tensor:
-        """The metric of the objective and of the decrease condition."""
-        return self.critic.distance(roots, self._cost_at_rest())
-
     def _objective(self, roots: th.Tensor) -> th.Tensor:
         """What the actor lowers, given the roots at its actions."""
-        return self._distance(roots).mean()
+        return self.critic.distance(roots).mean()
 
     def _update(self, replay_data: ReplayBufferSamples, costs: th.Tensor, update_targets: bool) -> Metrics:
         """One update of all that is learned."""
@@ -355,7 +345,7 @@ class LAC(CostAlgorithm):
         roots = largest_value(current_roots).detach()
         # L(s', a') <= L(s, a) - alpha3 * cost, in the metric of the objective
         allowed_roots = self.critic.root(self.critic.value(roots) - self.alpha3 * costs)
-        difference = self._distance(next_roots) - self._distance(allowed_roots)
+        difference = self.critic.distance(next_roots) - self.critic.distance(allowed_roots)
         going_on = 1 - replay_data.dones
         violation = (going_on * difference).sum() / going_on.sum().clamp(min=1)
 

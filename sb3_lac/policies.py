@@ -128,18 +128,14 @@ class LyapunovCritic(BaseModel):
         """
         return roots.pow(3) * roots.abs() + self.floor
 
-    def distance(self, roots: th.Tensor, cost_at_rest: th.Tensor) -> th.Tensor:
+    def distance(self, roots: th.Tensor) -> th.Tensor:
         """
-        Get a measure of values that is like a norm where values are like its square, and like the values themselves up to what
-        a loop at rest costs, where noise rules: the pseudo-Huber loss of the square root.
+        Get a measure of values that is like a norm where values are like its square.
 
         :param roots: What the networks learn
-        :param cost_at_rest: Value above the floor at which the one becomes the other, 0 if it is negative
-        :return: As many distances, negative below the floor
+        :return: As many square roots of what the values are above the floor, negative below it
         """
-        cost_at_rest = cost_at_rest.clamp(min=th.finfo(cost_at_rest.dtype).tiny)
-        # sqrt(f^4 + r) - sqrt(r) with the sign of f, without cancellation
-        return roots.pow(3) * roots.abs() / ((roots.pow(4) + cost_at_rest).sqrt() + cost_at_rest.sqrt())
+        return roots * roots.abs()
 
     def lyapunov_of(self, roots: th.Tensor) -> th.Tensor:
         """

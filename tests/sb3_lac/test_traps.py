@@ -147,18 +147,16 @@ def test_everything_that_is_learned_is_saved(make_model, train_metrics):
 def test_both_values_of_the_difference_are_from_the_online_critic(make_model, train_metrics):
     # A critic that is the same number everywhere: the difference is that of the condition, whatever the target says
     model = make_model(alpha3=0.3)
-    for module, root in ((model.critic, 3.0), (model.critic_target, 5.0)):
+    for module, root in ((model.critic, 3.0), (model.critic_target, 50.0)):
         for network in module.lyapunov_networks:
             nn.init.zeros_(network[-1].weight)
             nn.init.constant_(network[-1].bias, root)
     batch = model.replay_buffer.sample(16)
     model.replay_buffer.sample = lambda *args, **kwargs: batch
-    difference = train_metrics(model)["lyapunov_difference"]
-    # The floor itself falls out of it, not so what a step costs there: that of the target was 0
-    allowed, at_rest = 3.0**4 + 0.3 * batch.rewards.double(), model.critic.floor.double()
-    assert allowed.min() > 0 and 0 < at_rest < 10
-    expected = ((3.0**4 + at_rest).sqrt() - (allowed + at_rest).sqrt()).mean().item()
-    assert difference == pytest.approx(expected, rel=1e-4)
+    # The floor falls out of it
+    allowed = 3.0**4 + 0.3 * batch.rewards
+    expected = (3.0**2 - allowed.sign() * allowed.abs().sqrt()).mean().item()
+    assert train_metrics(model)["lyapunov_difference"] == pytest.approx(expected, rel=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -46,9 +46,8 @@ def root(value):
     return th.sign(value) * th.sqrt(th.sqrt(abs(value)))
 
 
-def distance(value, at_rest):
-    """Like the value up to what a step costs at rest, and like its square root beyond."""
-    return th.sign(value) * (th.sqrt(abs(value) + at_rest) - th.sqrt(at_rest))
+def distance(value):
+    return th.sign(value) * th.sqrt(abs(value))
 
 
 def relative(roots):
@@ -122,8 +121,6 @@ def test_train_is_the_update_of_the_equations(make_model_without_env, n_critics,
             # y - offset, where bound + GAMMA * offset is the offset
             y = costs - bound + GAMMA * (1 - dones) * next_values
             floor = (1 - TAU) * floor + TAU * y.min()
-            # c = L - GAMMA * L' of the lowest values
-            at_rest = th.clamp(floor + offset - GAMMA * (target_floor + offset), min=1e-30)
             target_floor = (1 - TAU) * target_floor + TAU * floor
         roots = roots_of(critic, obs, actions, n_critics)
         critic_loss = (0.5 * (roots - root(y - floor)) ** 2).mean(dim=1).sum()
@@ -131,11 +128,10 @@ def test_train_is_the_update_of_the_equations(make_model_without_env, n_critics,
         if published_update:
             next_actions, _ = policy_sample(actor, next_obs)
         next_roots = roots_of(critic, next_obs, next_actions, n_critics)
-        allowed = relative(roots.detach()) - ALPHA3 * costs
-        difference = distance(relative(next_roots), at_rest) - distance(allowed, at_rest)
+        difference = distance(relative(next_roots)) - distance(relative(roots.detach()) - ALPHA3 * costs)
         # Where the episode goes on
         d = difference[dones == 0].mean()
-        objective = d if published_update else distance(relative(roots_of(critic, obs, actions_pi, n_critics)), at_rest).mean()
+        objective = d if published_update else distance(relative(roots_of(critic, obs, actions_pi, n_critics))).mean()
         lambda_, beta = math.exp(log_lambda.value), math.exp(log_beta.value)
         actor_loss = lambda_ * objective + beta * log_prob.mean()
         violation = log_prob.mean().item() - 2.0  # target entropy: minus the number of actions
@@ -210,18 +206,6 @@ def test_targets_follow_every_target_update_interval(make_model, train_metrics):
         for parameter, target_parameter in zip(online.parameters(), target.parameters(), strict=True):
             assert th.equal(parameter, target_parameter)
     assert model.critic.floor == model.critic_target.floor != 0
-
-
-def test_cost_at_rest_is_what_is_paid_and_not_what_falls(make_model, train_metrics):
-    model = make_model(gamma=0.9, tau=0.05, learning_rate=1e-2)
-    model.replay_buffer.rewards[:] = -2.0
-    train_metrics(model, gradient_steps=800)
-    assert model._cost_at_rest().item() == pytest.approx(2.0, rel=0.1)
-    # Nothing is paid any more, and L comes down slowly: some of it would seem to be paid for ever, but is not
-    model.replay_buffer.rewards[:] = 0.0
-    train_metrics(model, gradient_steps=200)
-    assert model.critic.floor > 4.0
-    assert abs(model._cost_at_rest().item()) < 0.3 * (1 - 0.9) * model.critic.floor.item()
 
 
 def test_lambda_has_its_own_learning_rate(make_model, train_metrics):
