@@ -82,7 +82,7 @@ class LAC(CostAlgorithm):
     :param published_update: Whether to update as the paper does: the actor lowers ``L`` in the states that follow the
         sampled ones instead of in these, and the critic's target has the action of a target actor.
     :param alpha3: Share of the cost by which ``L`` has to decrease in each step. From 1 on the condition cannot hold
-        in stationary data: ``lambda`` then stays at ``lambda_max``, a fixed weight of the cost, but while ``L`` comes down.
+        in stationary data: ``lambda`` then stays at ``lambda_max``, a fixed weight of the cost. It may fall while ``L`` does.
     :param lambda_init: Initial value of ``lambda``
     :param lambda_min: Lower limit of ``lambda`` (with ``lambda`` at zero, the actor would only maximise its entropy)
     :param lambda_max: Upper limit of ``lambda``
