@@ -102,7 +102,7 @@ class GymnasiumVecEnv(VecEnv):
             self._check_attr(attr_name)
             values = self._single_envs.get_attr(attr_name)
         else:
-            values = (getattr(self.env, attr_name),) * self.num_envs
+            values = (getattr(self.env.unwrapped, attr_name),) * self.num_envs
         return [values[n] for n in chosen]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
@@ -133,7 +133,7 @@ class GymnasiumVecEnv(VecEnv):
             self._check_attr(method_name)
             results = self._single_envs.call(method_name, *method_args, **method_kwargs)
         else:
-            results = (getattr(self.env, method_name)(*method_args, **method_kwargs),) * self.num_envs
+            results = (getattr(self.env.unwrapped, method_name)(*method_args, **method_kwargs),) * self.num_envs
         return [results[n] for n in chosen]
 
     def _check_attr(self, name: str) -> None:

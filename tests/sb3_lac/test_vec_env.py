@@ -189,8 +189,11 @@ def test_an_environment_that_computes_all_at_once(discharges):
     vector = gym.make_vec(
         "BatteryQmax-v0", num_envs=N_ENVS, autoreset_mode="SameStep", render_mode="rgb_array", dataset=discharges
     )
-    env = GymnasiumVecEnv(vector)
+    # Wrappers of Gymnasium hide what they hold
+    env = GymnasiumVecEnv(gym.wrappers.vector.RecordEpisodeStatistics(vector))
     assert env.get_attr("num_envs", indices=[0, 1]) == [N_ENVS] * 2 and not env.has_attr("gravity")
+    env.set_attr("mark", 3)
+    assert env.has_attr("task") and env.get_attr("mark") == [3] * N_ENVS
     with pytest.raises(ValueError, match=r"All 3 environments share 'mark': it cannot be set for \[1\] only"):
         env.set_attr("mark", 4, indices=1)
     # Seeds are used once
