@@ -5,18 +5,16 @@ from typing import Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.policies import BaseModel, BasePolicy
+from stable_baselines3.common.policies import BaseModel
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import (
     BaseFeaturesExtractor,
     CombinedExtractor,
-    FlattenExtractor,
     NatureCNN,
     create_mlp,
-    get_actor_critic_arch,
 )
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
-from stable_baselines3.sac.policies import Actor
+from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
 
 
@@ -157,7 +155,7 @@ class LyapunovCritic(BaseModel):
         return self.lyapunov_of(largest_value(self(obs, actions)))
 
 
-class LyapunovPolicy(BasePolicy):
+class LyapunovPolicy(SACPolicy):
     """
     Policy class (with both actor and critic) for LAC; ``MlpPolicy`` is another name of it.
     ``LAC(policy_kwargs=...)`` takes the arguments from ``net_arch`` on:
@@ -194,160 +192,27 @@ class LyapunovPolicy(BasePolicy):
         between the actor and the critic (this saves computation time)
     """
 
-    actor: Actor
-    critic: LyapunovCritic
-    critic_target: LyapunovCritic
+    critic: LyapunovCritic  # type: ignore[assignment]
+    critic_target: LyapunovCritic  # type: ignore[assignment]
     action_space: spaces.Box
     reward_bound: th.Tensor
 
-    def __init__(
-        self,
-        observation_space: spaces.Space,
-        action_space: spaces.Box,
-        lr_schedule: Schedule,
-        net_arch: list[int] | dict[str, list[int]] | None = None,
-        activation_fn: type[nn.Module] = nn.ReLU,
-        use_sde: bool = False,
-        log_std_init: float = -3,
-        use_expln: bool = False,
-        clip_mean: float = 2.0,
-        features_extractor_class: type[BaseFeaturesExtractor] = FlattenExtractor,
-        features_extractor_kwargs: dict[str, Any] | None = None,
-        normalize_images: bool = True,
-        optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
-        optimizer_kwargs: dict[str, Any] | None = None,
-        n_critics: int = 2,
-        share_features_extractor: bool = False,
-    ):
-        # Other implementations of Adam, which exclude the fused one
-        if optimizer_class is th.optim.Adam and not {"fused", "foreach", "differentiable"} & (optimizer_kwargs or {}).keys():
+    def _build(self, lr_schedule: Schedule) -> None:
+        # Other implementations of Adam exclude the fused one
+        if self.optimizer_class is th.optim.Adam and not {"fused", "foreach", "differentiable"} & self.optimizer_kwargs.keys():
             # One kernel per step instead of several per tensor
-            optimizer_kwargs = {"fused": True, **(optimizer_kwargs or {})}
-
-        super().__init__(
-            observation_space,
-            action_space,
-            features_extractor_class,
-            features_extractor_kwargs,
-            optimizer_class=optimizer_class,
-            optimizer_kwargs=optimizer_kwargs,
-            squash_output=True,
-            normalize_images=normalize_images,
-        )
-
-        if net_arch is None:
-            net_arch = [256, 256]
-
-        actor_arch, critic_arch = get_actor_critic_arch(net_arch)
-
-        self.net_arch = net_arch
-        self.activation_fn = activation_fn
-        self.net_args = {
-            "observation_space": self.observation_space,
-            "action_space": self.action_space,
-            "net_arch": actor_arch,
-            "activation_fn": self.activation_fn,
-            "normalize_images": normalize_images,
-        }
-        self.actor_kwargs = self.net_args.copy()
-
-        sde_kwargs = {
-            "use_sde": use_sde,
-            "log_std_init": log_std_init,
-            "use_expln": use_expln,
-            "clip_mean": clip_mean,
-        }
-        self.actor_kwargs.update(sde_kwargs)
-        self.critic_kwargs = self.net_args.copy()
-        self.critic_kwargs.update(
-            {
-                "net_arch": critic_arch,
-                "n_critics": n_critics,
-                "share_features_extractor": share_features_extractor,
-            }
-        )
-
-        self.share_features_extractor = share_features_extractor
+            self.optimizer_kwargs = {"fused": True, **self.optimizer_kwargs}
         # The reward that costs nothing, which the critics' offset belongs to. Set by the algorithm, saved with the weights
         self.register_buffer("reward_bound", th.zeros(1))
-
-        self._build(lr_schedule)
-
-    def _build(self, lr_schedule: Schedule) -> None:
-        self.actor = self.make_actor()
-        self.actor.optimizer = self.optimizer_class(
-            self.actor.parameters(),
-            lr=lr_schedule(1),  # type: ignore[call-arg]
-            **self.optimizer_kwargs,
-        )
-
-        if self.share_features_extractor:
-            self.critic = self.make_critic(features_extractor=self.actor.features_extractor)
-            # Do not optimize the shared features extractor with the critic loss
-            # otherwise, there are gradient computation issues
-            critic_parameters = [param for name, param in self.critic.named_parameters() if "features_extractor" not in name]
-        else:
-            # Create a separate features extractor for the critic
-            # this requires more memory and computation
-            self.critic = self.make_critic(features_extractor=None)
-            critic_parameters = list(self.critic.parameters())
-
-        self.critic.optimizer = self.optimizer_class(
-            critic_parameters,
-            lr=lr_schedule(1),  # type: ignore[call-arg]
-            **self.optimizer_kwargs,
-        )
-
-        # The target shares no features extractor, it follows the critic slowly
-        self.critic_target = self.make_critic(features_extractor=None)
-        self.critic_target.load_state_dict(self.critic.state_dict())
-
-        # Target networks should always be in eval mode
-        self.critic_target.set_training_mode(False)
+        super()._build(lr_schedule)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        data = super()._get_constructor_parameters()
+        # The one argument that SACPolicy leaves out
+        return super()._get_constructor_parameters() | {"share_features_extractor": self.share_features_extractor}
 
-        data.update(
-            dict(
-                net_arch=self.net_arch,
-                activation_fn=self.net_args["activation_fn"],
-                use_sde=self.actor_kwargs["use_sde"],
-                log_std_init=self.actor_kwargs["log_std_init"],
-                use_expln=self.actor_kwargs["use_expln"],
-                clip_mean=self.actor_kwargs["clip_mean"],
-                n_critics=self.critic_kwargs["n_critics"],
-                share_features_extractor=self.share_features_extractor,
-                lr_schedule=self._dummy_schedule,  # dummy lr schedule, not needed for loading policy alone
-                optimizer_class=self.optimizer_class,
-                optimizer_kwargs=self.optimizer_kwargs,
-                features_extractor_class=self.features_extractor_class,
-                features_extractor_kwargs=self.features_extractor_kwargs,
-            )
-        )
-        return data
-
-    def reset_noise(self, batch_size: int = 1) -> None:
-        """
-        Sample new weights for the exploration matrix, when using gSDE.
-
-        :param batch_size: Number of exploration matrices, one per environment
-        """
-        self.actor.reset_noise(batch_size=batch_size)
-
-    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
-        actor_kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
-        return Actor(**actor_kwargs).to(self.device)
-
-    def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> LyapunovCritic:
+    def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> LyapunovCritic:  # type: ignore[override]
         critic_kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
         return LyapunovCritic(**critic_kwargs).to(self.device)
-
-    def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        return self._predict(obs, deterministic=deterministic)
-
-    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        return self.actor(observation, deterministic)
 
     def predict_lyapunov(self, observation: np.ndarray | dict[str, np.ndarray], action: np.ndarray) -> np.ndarray:
         """
@@ -373,18 +238,6 @@ class LyapunovPolicy(BasePolicy):
         with th.no_grad():
             values = self.critic.lyapunov(obs_tensor, th.as_tensor(scaled_actions, dtype=th.float32, device=self.device))
         return values.flatten().cpu().numpy()
-
-    def set_training_mode(self, mode: bool) -> None:
-        """
-        Put the policy in either training or evaluation mode.
-
-        This affects certain modules, such as batch normalisation and dropout.
-
-        :param mode: if true, set to training mode, else set to evaluation mode
-        """
-        self.actor.set_training_mode(mode)
-        self.critic.set_training_mode(mode)
-        self.training = mode
 
 
 MlpPolicy = LyapunovPolicy
