@@ -28,7 +28,7 @@ from tqdm import tqdm
 
 from battery_env.plotting import COLOURS
 from benchmarks.control import CERTIFICATE_ENVS, DISTURBANCES, SETTLED_SHARE, STATEMENTS, controllers, factors, judge
-from benchmarks.study import Study, command_line, digits, natural, new_panels
+from benchmarks.study import Study, command_line, digits, markdown, natural, new_panels
 from benchmarks.training import Recipe, train_or_load
 from sb3_lac.envs import LinearCostEnv
 
@@ -50,10 +50,10 @@ def policies(chosen: argparse.Namespace, env_id: str) -> list[tuple[str, int | N
         for fraction in chosen.fractions:
             for seed in chosen.seeds:
                 recipe = Recipe.of(algo, env_id, seed)
-                given = {**recipe.arguments, **recipe.hyperparameters}
+                starts = {**recipe.arguments, **recipe.hyperparameters}.get("learning_starts", 0)
                 whole = min(recipe.timesteps, int(chosen.timesteps or recipe.timesteps))
                 # a share of what is learned: nothing is before learning_starts
-                steps = given["learning_starts"] + round(fraction * (whole - given["learning_starts"]))
+                steps = starts + round(fraction * (whole - starts))
                 name = algo.upper() if fraction == 1 else f"{algo.upper()}, {100 * fraction:g} % of the updates"
                 found.append((name, seed, train_or_load(algo, env_id, seed, steps, chosen.out / "models")))
     return found
@@ -89,7 +89,7 @@ def _over_policies(values: pd.Series) -> str:
 def report(table: pd.DataFrame) -> str:
     """The certificates side by side, as Markdown. Numbers of several seeds are their median (least to most of a seed)."""
     text = "The largest feasible `alpha3` of the exact function, and in brackets the largest L / c:\n\n"
-    text += feasible_alpha3().to_markdown(index=False, disable_numparse=True) + "\n"
+    text += markdown(feasible_alpha3())
     for env_id, of_env in table.groupby("env", sort=False):
         rows = []
         for (policy, function), of_policy in of_env.groupby(["policy", "function"], sort=False):
@@ -107,7 +107,7 @@ def report(table: pd.DataFrame) -> str:
             for statement in STATEMENTS:
                 row[f"{statement.replace('_', ' ')}, at least"] = _over_policies(of_policy[f"{statement}_at_least"])
             rows.append(row)
-        text += f"\n`{env_id}`:\n\n" + pd.DataFrame(rows).to_markdown(index=False, disable_numparse=True) + "\n"
+        text += f"\n`{env_id}`:\n\n" + markdown(pd.DataFrame(rows))
     return text
 
 

@@ -206,7 +206,7 @@ def report(study: Study) -> None:
     study.write({}, {}, "\n".join(texts))
 
 
-def _checked(recipe: Recipe, out: Path) -> Recipe:
+def _check(recipe: Recipe, out: Path) -> None:
     """Refuse what could not be trained or scored, before anything is."""
     if recipe.algo == "ppo_lstm":
         raise ValueError("ppo_lstm: policies with a memory cannot be scored here")
@@ -217,7 +217,6 @@ def _checked(recipe: Recipe, out: Path) -> Recipe:
                 set_up(recipe, Path(folder))
         except (AssertionError, TypeError, ValueError) as error:
             raise ValueError(f"{recipe.algo} on {recipe.env_id}: {error}") from error
-    return recipe
 
 
 def _differing(settings: Sequence[str]) -> dict[str, Any]:
@@ -265,7 +264,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             for env_id, seed in itertools.product(chosen.envs, chosen.seeds)
         ]
         for recipe in {recipe.digest: recipe for of_seed in recipes for recipe in of_seed}.values():
-            _checked(recipe, study.out)
+            _check(recipe, study.out)
     except (ValueError, FileNotFoundError, gym.error.Error) as error:
         parser.error(str(error))
     jobs = [recipe for of_seed in recipes for recipe in of_seed]

@@ -49,9 +49,9 @@ _SCORED_EPISODES = 100
 HELD_OUT = 300
 
 
-def held_out_trajectories(env_id: str, **options: Any) -> TrajectoryDataset:
+def held_out_trajectories(env_id: str) -> TrajectoryDataset:
     """The discharges that no policy has seen."""
-    data = PolicyEstimator.environment(env_id, split="test", **options).task.dataset
+    data = PolicyEstimator.environment(env_id, split="test").task.dataset
     assert isinstance(data, TrajectoryDataset)
     return data
 

@@ -55,9 +55,8 @@ def report(results: pd.DataFrame) -> str:
     """The table, as Markdown."""
     costs = results.groupby(["environment", "policy", "factor"], sort=False)["cost"].apply(with_interval)
     table = costs.unstack("factor").rename(columns=lambda factor: f"rewards times {factor:g}").reset_index()
-    return "Cost per step of the mean action, in the unit of the environment: interquartile mean over seeds with its 95 % " + (
-        "interval.\n\n" + markdown(table)
-    )
+    unit = "Cost per step of the mean action, in the unit of the environment"
+    return f"{unit}: interquartile mean over seeds with its 95 % interval.\n\n{markdown(table)}"
 
 
 def plot(results: pd.DataFrame) -> Figure:

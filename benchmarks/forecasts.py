@@ -212,12 +212,12 @@ def end_of_discharge_table(rows: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(table)
 
 
-def life_rows(cell: str, life: Life, seed: int = 0) -> list[dict[str, object]]:
+def life_rows(cell: str, life: Life) -> list[dict[str, object]]:
     """What was expected of the life that remained."""
     ended = np.flatnonzero(life.table["capacity_Ah"] < END_OF_LIFE_Ah)
     rows: list[dict[str, object]] = []
     for n in range(10, int(ended[0]) + 1 if len(ended) else 0):
-        low, median, high = life.after(n).remaining_discharges(END_OF_LIFE_Ah, seed=seed)
+        low, median, high = life.after(n).remaining_discharges(END_OF_LIFE_Ah)
         row = {"cell": cell, "seen": n, "share": n / (ended[0] + 1), "remaining": ended[0] + 1 - n}
         rows.append(row | {"low": low, "median": median, "high": high})
     return rows

@@ -173,8 +173,7 @@ def sampled(algo: str, env_id: str, trial: Trial) -> dict[str, Any]:
     """The settings of a trial."""
     family = FAMILIES[env_id]
     settings: dict[str, Any] = {}
-    varied = family.varied[algo]
-    for name in [*varied, *(name for name in trial.user_attrs.get("settings", {}) if name not in varied)]:
+    for name in family.varied[algo]:
         of_name = family.ranges[name]
         if isinstance(of_name, tuple):
             settings[name] = float(f"{trial.suggest_float(name, *of_name, log=True):.2g}")
@@ -234,7 +233,7 @@ def part(
     _train_again(study, objective, best, repeats)
     start = min(best, key=lambda trial: np.mean([run.value for run in _runs(study, trial)]))
     for other, settings in others.items():
-        shared = {name: value for name, value in settings.items() if name in _taken_by(algo)}
+        shared = {name: value for name, value in settings.items() if name in family.varied[algo]}
         of_other = {"settings_of": other, "settings": shared}
         if not _adopted(study, of_other):
             study.enqueue_trial(start.params | shared, user_attrs=of_other)
@@ -282,11 +281,6 @@ def _train_again(
         for _ in range(repeats + 1 - len(_runs(study, trial))):
             study.enqueue_trial(trial.params, user_attrs={**trial.user_attrs, "repeats": trial.number})
             study.optimize(objective, n_trials=1)
-
-
-def _taken_by(algo: str) -> set[str]:
-    # settings of other algorithms that this one has too
-    return set(_COMMON if algo == "td3" else _SOFT)
 
 
 def report(trials: pd.DataFrame) -> str:

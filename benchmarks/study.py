@@ -226,8 +226,9 @@ class Study:
         except OSError as error:
             parser.error(str(error))
         self.scheduler: str | None = vars(self.chosen).get("scheduler")
-        others = {name: value for name, value in vars(self.chosen).items() if name not in ("jobs", "scheduler", "out")}
-        self.configuration: dict[str, Any] = others
+        self.configuration: dict[str, Any] = {
+            name: value for name, value in vars(self.chosen).items() if name not in ("jobs", "scheduler", "out")
+        }
         if self.scheduler is not None:
             self.out = self.out.absolute()  # workers are elsewhere
             try:

@@ -32,23 +32,14 @@ class CostAlgorithm(OffPolicyAlgorithm):
         return self.policy.reward_bound
 
     def cost_bound(self, vec_normalize: VecNormalize | None = None) -> th.Tensor:
-        """
-        Get the reward that costs nothing, in the units of the rewards that the agent sees, shape (1,).
-
-        :param vec_normalize: Wrapper that these come from, if any
-        """
+        """The reward that costs nothing, in the units of the rewards that the agent sees, shape (1,)."""
         bound = self.reward_bound.clamp(min=self.stated_reward_bound or 0.0)
         if vec_normalize is None or not vec_normalize.norm_reward:
             return bound
         return (bound / reward_scale(vec_normalize)).clamp(max=vec_normalize.clip_reward)
 
     def update_offset(self, vec_normalize: VecNormalize | None) -> None:
-        """
-        Give the critics the offset of the present bound.
-
-        :param vec_normalize: Wrapper that the rewards come from, if any
-        :raises ValueError: If it is infinite
-        """
+        """Give the critics the offset of the present bound, and refuse an infinite one."""
         if self.gamma < 1:
             offset = self.cost_bound(vec_normalize) / (1 - self.gamma)
             self.policy.critic.offset.copy_(offset)
@@ -80,9 +71,6 @@ class CostAlgorithm(OffPolicyAlgorithm):
         """
         Get the costs of sampled transitions, of which none is negative. The bound follows rewards that are computed only then
         (HER), or that were stored elsewhere; of the latter, n-step returns only tell their mean.
-
-        :param replay_data: The transitions
-        :return: As many costs, with n-step returns their discounted sums
         """
         # How often a reward of each step counts in a return: 1 + gamma + ... + gamma^(n-1)
         n_rewards = 1.0 if replay_data.discounts is None else (1 - replay_data.discounts) / (1 - self.gamma)

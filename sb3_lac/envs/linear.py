@@ -10,6 +10,14 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
+def riccati_gain(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray:
+    """The linear-quadratic regulator (discrete algebraic Riccati equation)."""
+    from scipy.linalg import solve_discrete_are  # slow to import, and no training needs it
+
+    p = solve_discrete_are(a, b, q, r)
+    return np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a)
+
+
 class LinearCostEnv(CostEnv):
     """
     ## Description
@@ -117,11 +125,7 @@ class LinearCostEnv(CostEnv):
         :param gamma: The discount factor
         :return: K, shape (1, 2)
         """
-        from scipy.linalg import solve_discrete_are  # slow to import, and no training needs it
-
-        a, b = np.sqrt(gamma) * self.A, np.sqrt(gamma) * self.B
-        p = solve_discrete_are(a, b, self.Q, self.R)
-        return np.linalg.solve(self.R + b.T @ p @ b, b.T @ p @ a)
+        return riccati_gain(np.sqrt(gamma) * self.A, np.sqrt(gamma) * self.B, self.Q, self.R)
 
     def value_matrix(self, gain: np.ndarray, gamma: float) -> np.ndarray:
         """

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_lac.envs.base import CostEnv, check_not_negative, check_positive
+from sb3_lac.envs.base import CostEnv, check_not_negative
 from sb3_lac.envs.integration import runge_kutta_step
 
 if TYPE_CHECKING:
@@ -105,8 +105,8 @@ class PendulumCostEnv(CostEnv):
 
     def _check_parameters(self, **parameters: float) -> None:
         # A pendulum without friction is one of them
-        check_not_negative(**{name: value for name, value in parameters.items() if name == "damping_Nms"})
-        check_positive(**{name: value for name, value in parameters.items() if name != "damping_Nms"})
+        check_not_negative(damping_Nms=parameters.pop("damping_Nms", 0.0))
+        super()._check_parameters(**parameters)
 
     def _initial_state(self) -> np.ndarray:
         return self.np_random.uniform(-1.0, 1.0, 2) * (math.pi, 1.0)

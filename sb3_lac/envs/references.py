@@ -15,7 +15,7 @@ import numpy as np
 
 from sb3_lac.envs.base import CostEnv
 from sb3_lac.envs.cart_pole import CartPoleCostEnv
-from sb3_lac.envs.linear import LinearCostEnv
+from sb3_lac.envs.linear import LinearCostEnv, riccati_gain
 from sb3_lac.envs.oscillator import OscillatorEnv
 from sb3_lac.envs.pendulum import PendulumCostEnv
 from sb3_lac.envs.quadrotor import QuadrotorCostEnv
@@ -32,14 +32,6 @@ def _linearised(model: CostEnv, at_rest: float = 0.0) -> tuple[np.ndarray, np.nd
 
     columns = [(next_state(step * unit) - next_state(-step * unit)) / (2.0 * step) for unit in np.eye(n + m)]
     return np.array(columns[:n]).T, np.array(columns[n:]).T
-
-
-def _riccati(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """The linear-quadratic regulator (discrete algebraic Riccati equation)."""
-    from scipy.linalg import solve_discrete_are  # slow to import, and no training needs it
-
-    p = solve_discrete_are(a, b, q, r)
-    return np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a)
 
 
 class ReferenceController(ABC):
@@ -107,7 +99,7 @@ class CartPoleController(ReferenceController):
     def __init__(self, model: CartPoleCostEnv) -> None:
         super().__init__(model)
         a, b = _linearised(model)
-        self.gain = _riccati(a, b, np.diag([0.03, 0.0, 10.0, 0.0]), np.eye(1))
+        self.gain = riccati_gain(a, b, np.diag([0.03, 0.0, 10.0, 0.0]), np.eye(1))
 
     def _actions(self, observations: np.ndarray) -> np.ndarray:
         return -observations @ self.gain.T
@@ -151,7 +143,7 @@ class PendulumController(ReferenceController):
         super().__init__(model)
         self.model = model
         a, b = _linearised(model)
-        self.gain = _riccati(a, b, np.diag([1.0, 0.1]), np.array([[0.01 * model.torque_max_Nm**2]]))
+        self.gain = riccati_gain(a, b, np.diag([1.0, 0.1]), np.array([[0.01 * model.torque_max_Nm**2]]))
 
     def _actions(self, observations: np.ndarray) -> np.ndarray:
         model = self.model
@@ -169,10 +161,10 @@ class QuadrotorController(ReferenceController):
 
     def __init__(self, model: QuadrotorCostEnv) -> None:
         super().__init__(model)
-        self.hover = 2.0 * model.mass_kg * model.GRAVITY_M_S2 / (2.0 * model.rotor_force_max_N) - 1.0
+        self.hover = model.mass_kg * model.GRAVITY_M_S2 / model.rotor_force_max_N - 1.0
         a, b = _linearised(model, self.hover)
         position, pitch, effort = model.WEIGHTS
-        self.gain = _riccati(a, b, np.diag([position, position, pitch, 0.0, 0.0, 0.0]), effort * np.eye(2))
+        self.gain = riccati_gain(a, b, np.diag([position, position, pitch, 0.0, 0.0, 0.0]), effort * np.eye(2))
 
     def _actions(self, observations: np.ndarray) -> np.ndarray:
         return self.hover - observations @ self.gain.T
@@ -205,7 +197,7 @@ class VehicleController(ReferenceController):
         # The cost as a quadratic form, but for its products of state and action
         course_row = np.array([[0.0, 1.0, 1.0 / model.speed_m_s, 0.0, 0.0]])
         q = offset * np.diag(np.eye(n)[0]) + course * course_row.T @ course_row
-        self.gain = _riccati(a, b, q, np.array([[0.25 * turning]]))
+        self.gain = riccati_gain(a, b, q, np.array([[0.25 * turning]]))
         ahead = math.tau * model.PREVIEW_M / model.PATH_PERIOD_M
         amplitude = model.speed_m_s * model.PATH_CURVATURE_1_m
         # From the two observed yaw rates to w

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -197,18 +197,14 @@ def exact_percentile(values: np.ndarray, percent: float) -> Interval:
     A percentile with its interval between order statistics, which needs no assumption of how the values are distributed
     (Conover, 1999, Practical Nonparametric Statistics, section 3.2). A bootstrap has no sample above the largest value.
     """
-    from scipy.stats import binom
+    from scipy.stats import quantile_test
 
     value = float(np.percentile(values, percent)) if len(values) > 0 else math.nan
     if len(values) < 2:
         return Interval(value, math.nan, math.nan)
-    # How many of them lie below the true percentile: at least ``below``, at most ``above``
-    below, above = (
-        int(binom.ppf(share, len(values), percent / 100)) for share in ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2)
-    )
-    ordered = np.sort(values)
-    low = ordered[below - 1] if below > 0 else -math.inf
-    high = ordered[above] if above < len(values) else math.inf
+    interval: Any = quantile_test(values, p=percent / 100).confidence_interval(CONFIDENCE)
+    # scipy says NaN where no order statistic is a limit
+    low, high = np.nan_to_num(interval.low, nan=-math.inf), np.nan_to_num(interval.high, nan=math.inf)
     return Interval(value, float(low), float(high))
 
 

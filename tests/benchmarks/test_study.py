@@ -116,14 +116,6 @@ def test_after_a_lost_process_the_same_command_makes_what_is_missing(tmp_path):
     assert table["number"].tolist() == [0, 1, 2, 3]
 
 
-@pytest.mark.parametrize("out", ["file", "file/below"])
-def test_a_folder_that_cannot_be_is_an_error_of_the_command_line(tmp_path, capsys, out):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(SystemExit):
-        a_study(tmp_path / out)
-    assert "is a file: choose another --out" in capsys.readouterr().err
-
-
 def fragile_part(seed, place):
     with (place / f"tries_{seed}").open("a") as tries:
         tries.write("x")

@@ -52,16 +52,6 @@ def test_default_arguments_do_not_warn(make_env):
         model.learn(10, log_interval=None)
 
 
-@pytest.mark.parametrize("terminate, expected", [(False, 2.0), (True, 1.0)])
-def test_time_limits_bootstrap_and_terminations_do_not(make_model, make_env, train_metrics, terminate, expected):
-    # Reward -1 in each step, each of which ends an episode: 1 + 0.5 + 0.25 + ... or only 1
-    env = make_env(episode_length=1, terminate=terminate)
-    model = make_model(env, gamma=0.5, tau=0.1, learning_rate=3e-3)
-    model.replay_buffer.rewards[:] = -1.0
-    train_metrics(model, gradient_steps=400)
-    assert train_metrics(model, seed=1)["lyapunov_mean"] == pytest.approx(expected, abs=0.4)
-
-
 def test_episodes_of_one_step_are_learned(make_model_without_env):
     """The states that they lead to are terminal: an actor that learns there only would learn nothing."""
     model = make_model_without_env(learning_rate=3e-3, ent_coef=0.01)
