@@ -30,6 +30,7 @@ from battery_env.records import (
     check_drawn_charge,
     check_samples,
     drawn,
+    drawn_charge_C,
     least_load_A,
     switch_times_s,
 )
@@ -129,7 +130,7 @@ class Discharge:
     @property
     def charge_C(self) -> float:
         """The charge drawn from the first sample to the last, C."""
-        return float(drawn(self.time_s, self.current_A, self.time_s[-1]))
+        return drawn_charge_C(self)
 
     @property
     def load_on_time_s(self) -> float:
@@ -356,13 +357,11 @@ def _bundled(cell: str) -> list[Discharge]:
 def read_nasa_mat(path: Path) -> list[tuple[dict[str, Any], dict[str, Any]]]:
     """The discharges of one of NASA's own files before they are checked."""
     try:
-        content = loadmat(path, simplify_cells=True)
-        samples = _samples_of_mat(path, content)
+        return _samples_of_mat(path, loadmat(path, simplify_cells=True))
     except FileNotFoundError:
         raise
     except Exception as error:  # scipy raises whatever the damage leads it to, and a field may be missing anywhere
         raise ValueError(f"{path} is damaged, or not laid out as NASA's battery files: {error!r}") from error
-    return samples
 
 
 def _samples_of_mat(path: Path, content: dict[str, Any]) -> list[tuple[dict[str, Any], dict[str, Any]]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -38,6 +39,19 @@ def check_folder(folder: Path) -> None:
         raise FileExistsError(f"{there} is a file: choose another --out")
     if not os.access(there, os.W_OK):
         raise PermissionError(f"{there} cannot be written to: choose another --out")
+
+
+def check_new(*paths: Path) -> None:
+    """Refuse to write files where some are, or to a folder that cannot be written to."""
+    check_folder(paths[0].parent)
+    existing = [str(path) for path in paths if path.exists()]
+    if existing:
+        raise FileExistsError(f"{', '.join(existing)} would be replaced; choose another --out, or delete what is there")
+
+
+def finite_or_none(value: Any) -> Any:
+    """JSON has no NaN and no infinity."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def write_json(path: str | os.PathLike[str], file_format: str, version: int, content: Mapping[str, Any]) -> Path:
@@ -90,19 +104,25 @@ def npz_path(path: str | os.PathLike[str]) -> Path:
 
 def load_npz(path: str | os.PathLike[str], kind: str, version: int) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """Read the arrays and the settings that :func:`save_npz` wrote."""
+    # data sets of earlier versions do not say what they are
+    arrays, settings = read_npz(path, kind, unstated=kind)
+    if settings["format"] != version:
+        raise ValueError(f"{path} has format {settings['format']}, this version reads {version}: make it again")
+    return arrays, settings
+
+
+def read_npz(
+    path: str | os.PathLike[str], kind: str, unstated: str | None = None
+) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    """Read arrays and metadata of any format; refuse a damaged file, and one of another kind."""
     with Path(path).open("rb") as stream:
         try:
             with np.load(stream, allow_pickle=False) as file:
                 if damaged := file.zip.testzip():
                     raise ValueError(f"the checksum of {damaged} is wrong")
-                settings = json.loads(str(file["metadata"]))
-                found = settings["format"]
-                # data sets of earlier versions do not say what they are
-                if settings.get("kind", kind) != kind:
-                    raise ValueError(f"it is a {settings['kind']}")
-                arrays = {name: np.asarray(file[name]) for name in file.files if name != "metadata"}
+                metadata = json.loads(str(file["metadata"]))
+                if (found := metadata.get("kind", unstated)) != kind or "format" not in metadata:
+                    raise ValueError(f"it is a {found}")
+                return {name: np.asarray(file[name]) for name in file.files if name != "metadata"}, metadata
         except Exception as error:  # numpy and zipfile raise whatever the damage leads them to
             raise ValueError(f"{path} is damaged, or no {kind}: {error}") from error
-    if found != version:
-        raise ValueError(f"{path} has format {found}, this version reads {version}: make it again")
-    return arrays, settings

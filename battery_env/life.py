@@ -21,7 +21,7 @@ from battery_env.cells import Discharge
 from battery_env.checks import check_positive, check_whole_number
 from battery_env.estimators.diagnosis import is_only_imprecise
 from battery_env.estimators.least_squares import LeastSquares
-from battery_env.forecasts import BAND
+from battery_env.forecasts import BAND, quantile
 from battery_env.records import drawn
 
 #: What is believed of a cell before its discharges tell, as shares of q_mobile: the step from one to the next, the error of
@@ -130,7 +130,7 @@ class Life:
         for n in range(1, _MOST + 1):
             level = level + drift + self.step_share * rng.standard_normal(_LIVES)
             left[np.isinf(left) & (level < end)] = n
-        return np.asarray(np.quantile(left, np.asarray(probability, dtype=np.float64), method="inverted_cdf"))
+        return quantile(left, probability)
 
 
 def track_life(discharges: Sequence[Discharge], cut_off_V: float, calibrator: LeastSquares | None = None) -> Life:

@@ -104,7 +104,6 @@ def plot_true_against_inferred(scores: Mapping[str, pd.DataFrame], parameter: st
     panels = figure.subplots(2, len(scores), sharex=True, sharey="row", height_ratios=[3, 2], squeeze=False)
     low = min(table[parameter].min() for table in scores.values())
     high = max(table[parameter].max() for table in scores.values())
-    points = None
     for (upper, lower), (name, table) in zip(panels.T, scores.items(), strict=True):
         true, inferred, spread = table[parameter], table[f"{parameter}_hat"], table[f"{parameter}_spread"]
         mape = table[f"{parameter}_mape_percent"]
@@ -118,8 +117,7 @@ def plot_true_against_inferred(scores: Mapping[str, pd.DataFrame], parameter: st
     panels[0, 0].set_ylabel(f"inferred {LABELS[parameter]}")
     panels[1, 0].set_ylabel("MAPE of a discharge (%)")
     figure.align_ylabels(panels[:, 0])
-    if points is not None:
-        figure.colorbar(points, ax=panels.ravel().tolist(), label="mean load (W)")
+    figure.colorbar(points, ax=panels.ravel().tolist(), label="mean load (W)")
     return figure
 
 
@@ -368,7 +366,6 @@ def plot_estimates(
     traces: Mapping[str, EstimateTrace],
     true: Estimate | None = None,
     bound: CramerRaoBound | None = None,
-    parameters: Sequence[str] = PARAMETER_NAMES,
 ) -> Figure:
     """
     Estimates during one discharge, one panel per parameter and one colour per calibrator, with bands of two stated standard
@@ -377,15 +374,14 @@ def plot_estimates(
     :param traces: estimates of that discharge, by name of the calibrator
     :param true: the true parameters, if they are known
     :param bound: the least standard deviations that are possible, drawn around ``true``
-    :param parameters: which to show
     :return: the figure
     :raises ValueError: for a bound without true parameters
     """
     if bound is not None and true is None:
         raise ValueError("the bound is drawn around the true parameters: give them as `true`")
-    figure = new_figure(6.8, 2.4 * len(parameters) + 0.5)
-    panels = figure.subplots(len(parameters), 1, sharex=True, squeeze=False)[:, 0]
-    for axes, parameter in zip(panels, parameters, strict=True):
+    figure = new_figure(6.8, 2.4 * len(PARAMETER_NAMES) + 0.5)
+    panels = figure.subplots(len(PARAMETER_NAMES), 1, sharex=True)
+    for axes, parameter in zip(panels, PARAMETER_NAMES, strict=True):
         shown = [getattr(trace, parameter) for trace in traces.values()]
         if true is not None:
             shown.append(np.array([getattr(true, parameter)]))

@@ -278,6 +278,11 @@ def drawn(time_s: FloatArray, load: FloatArray, at_s: ArrayLike) -> FloatArray:
     return total[n] + since * (i[n] + 0.5 * slope[n] * since)
 
 
+def drawn_charge_C(record: Record) -> float:
+    """The charge drawn from the first sample to the last."""
+    return float(drawn(record.time_s, record.current_A, record.time_s[-1]))
+
+
 def resample_current(time_s: FloatArray, current_A: FloatArray, dt_s: float, n_steps: int) -> FloatArray:
     """
     The current on the model's time grid, which starts at the first sample: its mean over each step, so that the charge

@@ -10,6 +10,7 @@ import lzma
 import re
 import warnings
 import zipfile
+from codecs import getincrementaldecoder
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, NamedTuple
@@ -192,7 +193,7 @@ def _decoded(head: bytes) -> tuple[str, str]:
         raise ValueError("the file is binary, and its ending is none of those that can be read")
     try:
         # the head may end within a character
-        return "utf-8", head.decode("utf-8", errors="strict" if len(head) < _HEAD_BYTES else "ignore")
+        return "utf-8", getincrementaldecoder("utf-8")().decode(head, final=len(head) < _HEAD_BYTES)
     except UnicodeDecodeError:
         return "latin-1", head.decode("latin-1")
 

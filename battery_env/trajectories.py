@@ -390,7 +390,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
         rows = np.arange(counts.sum()) + np.repeat(self.checkpoint_start[chosen] - starts, counts)
         changes = {name: getattr(self, name)[chosen] for name in _PER_TRAJECTORY}
         changes.update(checkpoint=self.checkpoint[rows], checkpoint_start=starts)
-        return TrajectoryDataset(**{**self.__dict__, **changes})
+        return replace(self, **changes)
 
     def split(
         self, test: float = 0.3, by: Literal["trajectory", "parameter"] = "trajectory", seed: int = 0

@@ -14,7 +14,7 @@ import pandas as pd
 from battery_env.calibration.policy import PolicyEstimator
 from battery_env.calibration.pretrained import policy_of_file, pretrained_policy
 from battery_env.cells import Discharge
-from battery_env.checks import check_positive
+from battery_env.checks import ZERO_CELSIUS_K, check_positive
 from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.electrochemistry.cell import TB
 from battery_env.estimates import Estimate
@@ -38,7 +38,6 @@ METHOD_NAMES: dict[str, str] = {"least-squares": "least squares", "kalman": "Kal
 # steps: what lies between says nothing to the model.
 _MANY_SAMPLES = 100_000
 _MODEL_STEP_S = 1.0
-_ZERO_CELSIUS_K = 273.15
 # What is drawn after the cut-off is worth a word if it is more than this share of what was drawn before.
 _MORE_SHARE = 0.2
 _AMBIENT_LIMITS_C = (-60.0, 100.0)
@@ -421,7 +420,7 @@ def _calibrated(discharge: Discharge, settings: Settings) -> Calibration:
         remaining_s=remaining_s,
         future_current_A=future.mean_A,
         load_varied=future.varied,
-        ambient_C=cell.Tb0 - _ZERO_CELSIUS_K,
+        ambient_C=cell.Tb0 - ZERO_CELSIUS_K,
         end_temperature_C=end_C,
         model_end_temperature_C=model_end_C,
         settings=settings,
@@ -468,7 +467,7 @@ def _cell_at_the_temperature(record: Discharge, settings: Settings) -> CellParam
         ambient_C = record.meta.get("ambient_temperature_C")
     if ambient_C is None or settings.method == "policy":
         return cell
-    return cell.replace(Tb0=float(ambient_C) + _ZERO_CELSIUS_K)
+    return cell.replace(Tb0=float(ambient_C) + ZERO_CELSIUS_K)
 
 
 def _start(discharge: Discharge, settings: Settings, cell: CellParameters) -> Start:
@@ -521,7 +520,7 @@ def _end_temperatures(record: Discharge, forecast: VoltageForecast) -> tuple[flo
         return float("nan"), float("nan")
     model_K = forecast.simulation.state[:, TB]
     steps_s = forecast.simulation.dt_s * np.arange(len(model_K))
-    model_C = np.interp(record.time_s - record.time_s[0], steps_s, model_K) - _ZERO_CELSIUS_K
+    model_C = np.interp(record.time_s - record.time_s[0], steps_s, model_K) - ZERO_CELSIUS_K
     departure_K = record.temperature_C - model_C
     worst = int(np.abs(departure_K).argmax())
     if abs(departure_K[worst]) > _WARMTH_LIMIT_K:

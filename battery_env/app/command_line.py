@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import os
 import re
 import sys
@@ -33,7 +32,7 @@ from battery_env.app.many import FileFormat, Outcome, Results, calibrate_all, fi
 from battery_env.cells import Discharge
 from battery_env.estimators.cell_fit import CellFit, fit_cell, read_cell
 from battery_env.estimators.rest import InitialSoc
-from battery_env.files import check_folder
+from battery_env.files import check_new, finite_or_none
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.records import CUT_OFF_V
 
@@ -368,7 +367,7 @@ def calibrate(arguments: Sequence[str] | None = None, name: str = _INSTALLED) ->
     results = Results(options.out, sources, not options.table_only, options.force) if options.out else None
     try:
         with workers(options.jobs, options.scheduler) as executor:
-            ahead = 64 if options.scheduler else 2 * abs(options.jobs)
+            ahead = 64 if options.scheduler or options.jobs == -1 else 2 * options.jobs
             for outcome in calibrate_all(sources, _file_format(options), settings, results, executor, ahead):
                 done.append(outcome)
                 _show(done, options.json)
@@ -424,10 +423,7 @@ def fit(arguments: Sequence[str] | None = None, name: str = "python -m battery_e
     picture = out.with_suffix(".png")
     if out.suffix != ".json":
         raise ValueError(f"the fit is written as JSON: --out {out.name}.json instead of {out.name}")
-    check_folder(out.parent)
-    existing = [str(path) for path in (out, picture) if path.exists()]
-    if existing:
-        raise FileExistsError(f"{', '.join(existing)} would be replaced; choose another --out, or delete what is there")
+    check_new(out, picture)
     discharges = _discharges(options.records, _file_format(options))
     print(f"fitting {len(discharges)} discharges", file=sys.stderr, flush=True)
     with warnings.catch_warnings():
@@ -500,7 +496,7 @@ def _show(done: Sequence[Outcome], as_json: bool) -> None:
     """Prints the last one as it comes: a line each, but the first one waits, as the only one is printed in full."""
     last = done[-1]
     if as_json:
-        print(json.dumps({name: _plain(value) for name, value in last.row().items()}), flush=True)
+        print(json.dumps({name: finite_or_none(value) for name, value in last.row().items()}), flush=True)
     if last.notes:
         print(f"warning: {last.record}: {last.notes}", file=sys.stderr)
     if last.error:
@@ -520,8 +516,3 @@ def _conclude(done: Sequence[Outcome], settings: Settings) -> None:
             print(f"calibrated by {settings.calibrated_by}")
     elif done and done[0].found:
         print(text_of(done[0].record, done[0].found))
-
-
-def _plain(value: Any) -> Any:
-    """JSON has no NaN and no infinity."""
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import math
 import warnings
@@ -21,7 +22,7 @@ from battery_env.electrochemistry import NEW_CELL
 from battery_env.estimates import Estimate
 from battery_env.estimators.diagnosis import is_only_imprecise
 from battery_env.estimators.least_squares import LeastSquares
-from battery_env.files import check_folder, replacing
+from battery_env.files import check_new, finite_or_none, replacing
 from battery_env.forecasts import BAND, Forecast, FutureLoad, forecast, quantile
 from battery_env.life import Life, track_life
 from battery_env.loads import Load
@@ -76,8 +77,8 @@ class End:
             "cut_off_V": found.cut_off_V,
             "now_s": found.now_s,
             "probability": list(BAND),
-            **{name: [_plain(value) for value in quantile(values, BAND).tolist()] for name, values in samples.items()},
-            "nominal_Ah": _plain(found.nominal_Ah),
+            **{name: [finite_or_none(value) for value in quantile(values, BAND).tolist()] for name, values in samples.items()},
+            "nominal_Ah": finite_or_none(found.nominal_Ah),
             "life_discharges": 0 if past is None else int(past.table["valid"].sum()),
             "prior_q_mobile_C": None if self.prior_q_mobile_C is None else list(self.prior_q_mobile_C),
             "notes": list(found.notes),
@@ -94,11 +95,6 @@ class End:
         if self.prior_q_mobile_C is not None:
             lines.append("q_mobile before: {:.0f} C, sd {:.0f} C".format(*self.prior_q_mobile_C))
         return "\n".join([*lines, self.forecast.summary()])
-
-
-def _plain(value: float) -> float | None:
-    """JSON has no NaN and no infinity."""
-    return value if math.isfinite(value) else None
 
 
 def forecast_end(
@@ -158,7 +154,7 @@ def read_load(path: str | Path) -> Load:
     """
     try:
         table = pd.read_csv(path, sep=None, engine="python", encoding="utf-8-sig")
-    except (UnicodeDecodeError, pd.errors.ParserError, pd.errors.EmptyDataError) as error:
+    except (csv.Error, UnicodeDecodeError, pd.errors.ParserError, pd.errors.EmptyDataError) as error:
         raise ValueError(f"{path}: no table: {error}") from error
     table.columns = table.columns.str.strip()
     found = [name for name in _LOAD_COLUMNS if name in table.columns]
@@ -292,12 +288,9 @@ class EndFiles:
 
     def __init__(self, folder: Path, argument: str) -> None:
         (source,) = find_sources([argument])[:1]
-        stem = folder / f"{record_name(source.stem, source.cycle)}_forecast"
-        self.table, self.figure = stem.with_suffix(".json"), stem.with_suffix(".png")
-        check_folder(folder)
-        existing = [str(path) for path in (self.table, self.figure) if path.exists()]
-        if existing:
-            raise FileExistsError(f"{', '.join(existing)} would be replaced; choose another --out, or delete what is there")
+        name = f"{record_name(source.stem, source.cycle)}_forecast"
+        self.table, self.figure = folder / f"{name}.json", folder / f"{name}.png"
+        check_new(self.table, self.figure)
 
     def write(self, end: End) -> None:
         """Write both."""

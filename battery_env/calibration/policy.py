@@ -25,7 +25,7 @@ from battery_env.estimates import last_estimate
 from battery_env.estimators.base import SURPLUS_SHARE, Estimate, EstimateTrace, ModelNow, OnlineEstimator, Record
 from battery_env.estimators.diagnosis import Condition
 from battery_env.record_model import RecordModel
-from battery_env.records import Samples, check_drawn_charge, check_record, check_sample, drawn, starts_at_rest
+from battery_env.records import Samples, check_drawn_charge, check_record, check_sample, drawn_charge_C, starts_at_rest
 
 # Steps in which a stream is followed, s
 _STEP_S = 1.0
@@ -64,7 +64,7 @@ class ReadingsSoFar:
         The same in equal steps: the mean current over each, so that the charge drawn is kept, and the voltage between the
         samples that have one.
         """
-        time_s, voltage_V, current_A = (np.array(column) for column in (self.time_s, self.voltage_V, self.current_A))
+        time_s, voltage_V, current_A = self.columns()
         steps = max(int(np.floor(time_s[-1] / dt_s + 1e-9)), 1)
         grid_s = dt_s * np.arange(steps + 1, dtype=np.float64)
         drawn_C = np.append(0.0, np.cumsum(current_A[:-1] * np.diff(time_s)))
@@ -312,8 +312,7 @@ class PolicyEstimator(OnlineEstimator):
         :return: the estimate
         :raises ValueError: for an invalid record
         """
-        time_s, _, current_A = check_record(record)
-        check_drawn_charge(float(drawn(time_s, current_A, time_s[-1])))
+        check_drawn_charge(drawn_charge_C(check_record(record)))
         trace = self.trace([record])[0]
         if trace.sd_q_mobile is not None:
             return last_estimate(trace)

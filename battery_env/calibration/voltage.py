@@ -54,6 +54,11 @@ _TIME_SCALE_S = 3000.0
 
 @lru_cache(maxsize=4)
 def _readings_of_a_dataset(dataset: TrajectoryDataset, reading_s: float, cell: CellParameters) -> Readings:
+    if dataset.first.any():
+        raise ValueError(
+            "dataset leaves out the start of discharges (it is trimmed, as with load='paper'), and voltages are judged from "
+            "full charge on: take whole discharges, or another load"
+        )
     return Readings.of(dataset, reading_s, dataset.dt_s, cell)
 
 

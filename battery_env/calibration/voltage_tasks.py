@@ -97,7 +97,7 @@ class BatteryVoltageJoint(VoltageTask):
     | ``start`` | ``"random"`` | first estimate; or ``"new_cell"``, ``"true"`` |
     | ``consistency`` | 0 | cost of a change of the action per unit of its length (the paper's consistency penalty); above 0 the action before is appended to the observation |
     | ``cost`` | ``"misfit"`` | or ``"state"``: the error of the model's hidden state, for simulated discharges |
-    | ``load`` | ``"piecewise"`` | or ``"constant"``, ``"random_walk"``, ``"recorded"``, ``"paper"`` |
+    | ``load`` | ``"piecewise"`` | or ``"constant"``, ``"random_walk"``, ``"recorded"`` |
     | ``split`` | ``"train"`` | or ``"test"``, ``"all"`` |
     | ``dt_s`` | 1 | time step of the cell, s |
     | ``mismatch`` | 0 | how far kn, tDiffusion, to and tsn of the cell are from the model's (relative standard deviation) |

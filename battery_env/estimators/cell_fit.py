@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from battery_env.arrays import FloatArray, IntArray
 from battery_env.cells import Discharge
-from battery_env.checks import check_numbers, check_positive
+from battery_env.checks import ZERO_CELSIUS_K, check_numbers, check_positive
 from battery_env.electrochemistry import NEW_CELL, CellParameters, check_cell, check_dt
 from battery_env.electrochemistry.tangents import BY_Q, BY_R, RATE_CONSTANTS
 from battery_env.estimates import Estimate
@@ -29,7 +29,7 @@ from battery_env.estimators.search import MARGIN, OnGrid, distance_C, minimized,
 from battery_env.files import WrongFormatError, read_json, write_json
 from battery_env.parameters import Q_MOBILE, R_O
 from battery_env.record_model import RecordModel
-from battery_env.records import CUT_OFF_V, SWITCH_SHARE, Record, check_drawn_charge, check_record, drawn
+from battery_env.records import CUT_OFF_V, SWITCH_SHARE, Record, check_drawn_charge, check_record, drawn_charge_C
 
 #: How well the constants that say how fast a cell follows its load are known before any data: standard deviations of their
 #: logarithms. The overpotential of kn stands for whatever slows a worn cell down, so that it may differ most.
@@ -406,7 +406,7 @@ def _records(discharges: Sequence[Record], cut_off_V: float) -> list[Record]:
         try:
             record = discharge.loaded_part(cut_off_V) if isinstance(discharge, Discharge) else discharge
             samples = check_record(record, _FEWEST_SAMPLES)
-            check_drawn_charge(float(drawn(samples.time_s, samples.current_A, samples.time_s[-1])))
+            check_drawn_charge(drawn_charge_C(samples))
             _check_ends(float(samples.voltage_V.min()), cut_off_V)
         except AttributeError as error:
             raise TypeError(f"discharge {_name(discharge, number)} is no record: {error}") from error
@@ -440,7 +440,7 @@ def _check_starts_alike(records: Sequence[Record], at_rest: Sequence[bool]) -> N
 def _prior(records: Sequence[Record], start: CellParameters | None, thermal: bool, cut_off_V: float) -> CellParameters:
     """Return what is thought of the constants before the data, but for what is measured."""
     check_cell(start, thermal)
-    q_mobile = float(Q_MOBILE.check(_UNDELIVERED * max(_charge_C(record) for record in records)))
+    q_mobile = float(Q_MOBILE.check(_UNDELIVERED * max(drawn_charge_C(record) for record in records)))
     if start is None:
         size = q_mobile / NEW_CELL.q_mobile
         start = NEW_CELL
@@ -449,12 +449,8 @@ def _prior(records: Sequence[Record], start: CellParameters | None, thermal: boo
             start = NEW_CELL.replace(q_mobile=q_mobile, r_o=NEW_CELL.r_o / size, **surfaces)
     known = [getattr(record, "temperature_C", None) for record in records]
     temperatures_C = [column[0] for column in known if column is not None]
-    measured = {"Tb0": 273.15 + float(np.mean(temperatures_C))} if temperatures_C else {}
+    measured = {"Tb0": ZERO_CELSIUS_K + float(np.mean(temperatures_C))} if temperatures_C else {}
     return start.replace(VEOD=float(cut_off_V), **measured)
-
-
-def _charge_C(record: Record) -> float:
-    return float(drawn(record.time_s, record.current_A, record.time_s[-1]))
 
 
 def with_equilibrium(cell: CellParameters, coefficients_V: Sequence[float] | FloatArray) -> CellParameters:
@@ -517,7 +513,7 @@ class JointFit:
         self.sd = np.array([*(RATE_PRIOR_SD[name] for name in RATE_CONSTANTS), *EQUILIBRIUM_PRIOR_SD_V])
         self.records, self.at_rest = records, at_rest  # whether the first sample is the voltage of a full cell at rest
         self.data = [_thinned(OnGrid.of(record, self.model)) for record in records]
-        self.charges_C = np.array([_charge_C(record) for record in records])
+        self.charges_C = np.array([drawn_charge_C(record) for record in records])
         self._evaluated = lru_cache(maxsize=1)(self.evaluate)
 
     @cached_property

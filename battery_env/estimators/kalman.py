@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from battery_env.checks import check_gain_sd, check_numbers
+from battery_env.checks import ZERO_CELSIUS_K, check_gain_sd, check_numbers
 from battery_env.electrochemistry import STATE_SIZE, CellParameters, PackedConstants, check_cell, check_dt
 from battery_env.electrochemistry.tangents import PolynomialDerivatives
 from battery_env.estimates import Estimate, Estimates, EstimateTrace
@@ -28,7 +28,6 @@ _PRIOR_SD_SHARE_Q = 0.25
 _PRIOR_SD_R_OHM = 0.15
 _HOUR_S = 3600.0
 _NOISE_V = 0.005
-_ZERO_CELSIUS_K = 273.15
 # What reasons are made of
 _SHOWN = ("start", "fault", "gap", "start_V")
 
@@ -209,7 +208,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
         refuses, or one that charges a full cell, leaves the filter as it was.
         """
         self.check(voltage_V, current_A, dt_s, temperature_C)
-        temperature_K = nan if temperature_C is None else temperature_C + _ZERO_CELSIUS_K
+        temperature_K = nan if temperature_C is None else temperature_C + ZERO_CELSIUS_K
         if not self._cells["seen"]["samples"][0]:
             dt_s = 0.0
             if not isnan(temperature_K):
@@ -238,7 +237,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
             time_s, voltage_V, current_A, dt_s, temperature_C = stream
             samples = np.zeros((len(time_s), 1), SAMPLE)
             samples["voltage_V"][:, 0], samples["current_A"][:, 0], samples["dt_s"][:, 0] = voltage_V, current_A, dt_s
-            samples["temperature_K"][:, 0] = nan if temperature_C is None else temperature_C + _ZERO_CELSIUS_K
+            samples["temperature_K"][:, 0] = nan if temperature_C is None else temperature_C + ZERO_CELSIUS_K
             if temperature_C is not None:
                 self._begin(float(samples["temperature_K"][0, 0]))
             self._cells["seen"]["start"]["at_rest"] = starts_at_rest(record)
@@ -337,7 +336,7 @@ class KalmanBatch(OnlineBatch):
         of["voltage_V"], of["current_A"] = check_numbers("voltage_V", voltage_V), check_numbers("current_A", current_A)
         of["dt_s"] = np.where(is_first, 0.0, check_numbers("dt_s", dt_s))
         degrees_C = None if temperature_C is None else np.asarray(temperature_C, dtype=np.float64)
-        of["temperature_K"] = nan if degrees_C is None else degrees_C + _ZERO_CELSIUS_K
+        of["temperature_K"] = nan if degrees_C is None else degrees_C + ZERO_CELSIUS_K
         drawn_C = seen["drawn_C"] + seen["current_A"] * of["dt_s"]
         good = are_plausible(of["voltage_V"], of["current_A"], of["dt_s"], degrees_C, seen["current_A"])
         doubtful = is_first | ~(good & (drawn_C > one.least_drawn_C))

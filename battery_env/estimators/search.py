@@ -16,7 +16,7 @@ from battery_env.electrochemistry.cell import BULK_RATE, SURFACE_RATE
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS, TANGENT_NAMES
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.record_model import RecordModel
-from battery_env.records import Record, Samples, check_drawn_charge, drawn
+from battery_env.records import Record, Samples, check_drawn_charge, drawn_charge_C
 
 #: How far the search keeps from the least ``q_mobile``, as a share of it: more than rounding, less than anyone measures.
 MARGIN = 1e-6
@@ -140,7 +140,7 @@ class Search:
         data = OnGrid.of(record, model)
         if not data.current_A[:-1].any():
             raise ValueError("no current flows in this record: it says nothing about q_mobile and r_o")
-        check_drawn_charge(float(drawn(record.time_s, record.current_A, record.time_s[-1])))
+        check_drawn_charge(drawn_charge_C(record))
         least_q_C = model.least_q_mobile_C(data.current_A)
         low_C, high_C = max(bounds["q_mobile"][0], (1.0 + MARGIN) * least_q_C), bounds["q_mobile"][1]
         if "q_mobile" in parameters and not low_C < high_C:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from battery_env.files import replacing
+from battery_env.files import npz_path, read_npz, replacing
 
 FORMAT_VERSION = 4
 _KIND = "state of an estimator"
@@ -19,11 +19,10 @@ _KIND = "state of an estimator"
 
 def save_state(path: str | os.PathLike[str], settings: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Path:
     """Write a state. It takes the place of an older one, and of no other file."""
-    target = Path(path)
-    target = target if target.suffix == ".npz" else target.with_name(target.name + ".npz")
+    target = npz_path(path)
     if target.exists():
         try:
-            _read(target)
+            read_npz(target, _KIND)
         except ValueError as error:
             raise FileExistsError(f"{target} exists, and is no state of an estimator: choose another name") from error
     metadata = json.dumps({"kind": _KIND, "format": FORMAT_VERSION, "settings": settings})
@@ -34,7 +33,7 @@ def save_state(path: str | os.PathLike[str], settings: Mapping[str, Any], arrays
 
 def load_state(path: str | os.PathLike[str], settings: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
     """Read what :func:`save_state` wrote."""
-    metadata, arrays = _read(Path(path))
+    arrays, metadata = read_npz(path, _KIND)
     if metadata["format"] != FORMAT_VERSION:
         raise ValueError(
             f"{path} has format {metadata['format']}, this version reads {FORMAT_VERSION}: begin a discharge anew"
@@ -48,17 +47,3 @@ def load_state(path: str | os.PathLike[str], settings: Mapping[str, Any]) -> dic
             f"same arguments (different: {', '.join(different)})"
         )
     return arrays
-
-
-def _read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    with path.open("rb") as stream:
-        try:
-            with np.load(stream, allow_pickle=False) as file:
-                if damaged := file.zip.testzip():
-                    raise ValueError(f"the checksum of {damaged} is wrong")
-                metadata = json.loads(str(file["metadata"]))
-                if metadata["kind"] != _KIND:
-                    raise ValueError(f"it is a {metadata['kind']}")
-                return metadata, {name: np.asarray(file[name]) for name in file.files if name != "metadata"}
-        except Exception as error:  # numpy and zipfile raise whatever the damage leads them to
-            raise ValueError(f"{path} is damaged, or no state of an estimator: {error}") from error

@@ -299,17 +299,22 @@ class TestCommand:
         assert main(["forecast", "running.csv", "--life", "lab", "other"]) == 0
         assert "the records of lab, other are taken for one cell's" in capsys.readouterr().err
 
-    def test_a_load_that_draws_nothing_is_refused(self, capsys):
-        Path("profile.csv").write_text("time_s,current_A\n0,-1.0\n600,-3.0\n")
+    @pytest.mark.parametrize(
+        ("load", "message"),
+        [("time_s,current_A\n0,-1.0\n600,-3.0\n", "current_A is nowhere above 0"), ("", "profile.csv: no table")],
+    )
+    def test_a_load_that_draws_nothing_is_refused(self, capsys, load, message):
+        Path("profile.csv").write_text(load)
         assert main(["forecast", "running.csv", "--prior", "5460", "55", "--load", "profile.csv"]) == 2
-        assert "current_A is nowhere above 0" in capsys.readouterr().err
+        assert message in capsys.readouterr().err
 
     def test_life_and_load_give_the_end_that_python_gives(self, capsys):
-        assert main(["forecast", "running.csv", "--life", "lab", "--load", "profile.csv", "--out", "out"]) == 0
+        Path("running.csv").rename("run_2.5A.csv")
+        assert main(["forecast", "run_2.5A.csv", "--life", "lab", "--load", "profile.csv", "--out", "out"]) == 0
         shown = capsys.readouterr()
         assert "life of 10 earlier discharges" in shown.out and "then a given load" in shown.out and "health" not in shown.out
         assert "notes.txt is left out" in shown.err
-        written = json.loads(Path("out/running_forecast.json").read_text())
+        written = json.loads(Path("out/run_2.5A_forecast.json").read_text())
         life = track_life(self.discharges[:10], 2.7)
         # another load than that of the life
         assert written["prior_q_mobile_C"] == pytest.approx(life.prior_at_other_loads_C, rel=0.05)
@@ -319,9 +324,9 @@ class TestCommand:
         assert written["eod_time_s"] == pytest.approx(again.eod_quantile_s(), abs=2.0)
         # the charge that 2 A draw until the end, and what is over at once under 3 A
         assert written["eod_time_s"][1] < 1800.0 + (2.0 * (self.end_s - 1200.0) - 600.0) / 3.0
-        assert Path("out/running_forecast.png").read_bytes().startswith(b"\x89PNG")
-        assert main(["forecast", "running.csv", "--out", "out"]) == 2
-        assert "running_forecast.json, out/running_forecast.png would be replaced" in capsys.readouterr().err
+        assert Path("out/run_2.5A_forecast.png").read_bytes().startswith(b"\x89PNG")
+        assert main(["forecast", "run_2.5A.csv", "--out", "out"]) == 2
+        assert "run_2.5A_forecast.json, out/run_2.5A_forecast.png would be replaced" in capsys.readouterr().err
 
     def test_of_its_own_folder_only_what_came_before_counts(self, capsys):
         table = pd.read_csv("all.csv")

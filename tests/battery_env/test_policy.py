@@ -46,13 +46,6 @@ def test_one_estimate_at_each_decision_of_each_discharge(data):
     assert policy.seen[0].shape == (5, 102)
 
 
-def test_discharges_do_not_influence_each_other(data):
-    policy = Constant(-0.2, 0.1)
-    together = PolicyEstimator(policy, "BatteryVoltageJoint-v0").trace(data)
-    alone = PolicyEstimator(policy, "BatteryVoltageJoint-v0").trace(data[2:3])
-    np.testing.assert_array_equal(together[2].q_mobile, alone[0].q_mobile)
-
-
 def test_it_sees_what_the_sensors_show_and_nothing_more(data):
     exact, noisy = Constant(0.0, 0.0), Constant(0.0, 0.0)
     evaluate(PolicyEstimator(exact, "BatteryVoltageJoint-v0"), data)

@@ -113,6 +113,16 @@ def test_delimiters_decimal_marks_and_encodings_are_told(delimiter, decimal, enc
     check(one(tmp_path / "zelle.csv"))
 
 
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
+def test_the_encoding_of_a_long_file_is_told(encoding, tmp_path):
+    # Longer than what is looked at
+    lines = [f"{line},{'é' * 5000}" for line in rows(TIME_S, VOLTAGE_V, CURRENT_A)]
+    text = "\n".join(["time (s),voltage (V),current (A),State", *lines])
+    (tmp_path / "cell.csv").write_text(text, encoding=encoding)
+    assert len(text) > 2**18
+    check(one(tmp_path / "cell.csv"))
+
+
 @pytest.mark.parametrize("comments", ["# ", ""])
 def test_blanks_separate_columns_as_numpy_writes_them(comments, tmp_path):
     columns = np.column_stack([TIME_S, VOLTAGE_V, CURRENT_A])

@@ -167,15 +167,6 @@ class TestTask:
         task = BatteryVoltageJoint.follow(recorded, 30, cost="state")
         assert np.isfinite(task.advance(np.zeros((2, 2)))).all()
 
-    def test_actions_that_cannot_be_meant_are_refused(self, data):
-        task = started(data)
-        before = task.estimate.copy()
-        with pytest.raises(ValueError, match=r"action must hold numbers, shape \(4, 2\), got float64 values of shape \(2,\)"):
-            task.advance(np.zeros(2))
-        with pytest.raises(ValueError, match="got NaN"):
-            task.advance(np.array([[0.0, 0.0], [np.nan, 0.0], [0.0, 0.0], [0.0, 0.0]]))
-        np.testing.assert_array_equal(task.estimate, before)
-
     @pytest.mark.parametrize(
         ("options", "message"),
         [
@@ -197,6 +188,10 @@ class TestTask:
     def test_bad_options_are_refused(self, data, options, message):
         with pytest.raises((TypeError, ValueError), match=message):
             BatteryVoltageJoint(1, dataset=data, **options)
+
+    def test_discharges_without_their_start_are_refused(self, data):
+        with pytest.raises(ValueError, match="dataset leaves out the start of discharges"):
+            BatteryVoltageJoint(1, dataset=data.trimmed(0.05, 0.95))
 
 
 @pytest.mark.parametrize(
