@@ -19,7 +19,6 @@ from battery_env.arrays import IntArray
 from battery_env.calibration.data import LoadKind, Split, opened, standard_dataset
 from battery_env.calibration.full_state_kernels import decide, look_ahead, model_voltage, observe
 from battery_env.calibration.full_state_layout import (
-    ACTION_RANGES,
     CELL,
     CELL_WITH_CONSTANTS,
     ERROR_SCALE,
@@ -41,11 +40,14 @@ _PERTURBATION = np.array([1.0, 1.0, 1.0, -0.9, -0.1, 0.9, 0.1])
 
 
 @lru_cache(maxsize=4)
-def _reachable(parameters: Sequence[str], load: LoadKind, split: Split, dt_s: float, mismatch: float) -> TrajectoryDataset:
+def _reachable(
+    formulation: Formulation, parameters: Sequence[str], load: LoadKind, split: Split, dt_s: float, mismatch: float
+) -> TrajectoryDataset:
     # the discharges of the standard data set whose parameters actions can stand for
     dataset = standard_dataset(parameters, load, split, dt_s, mismatch)
     values = {"q_mobile": dataset.q_mobile, "r_o": dataset.r_o}
-    within = np.all([(low <= values[name]) & (values[name] <= high) for name, (low, high) in ACTION_RANGES.items()], axis=0)
+    ranges = formulation.action_ranges.items()
+    within = np.all([(low <= values[name]) & (values[name] <= high) for name, (low, high) in ranges], axis=0)
     return dataset if within.all() else dataset.subset(np.flatnonzero(within))
 
 
@@ -107,7 +109,7 @@ class FullStateTask(CalibrationTask):
         check_counts(episode_steps=self.episode_steps)
         data: dict[str, Any] = {"load": load, "split": split, "dt_s": dt_s, "mismatch": mismatch}
         if dataset is None:
-            self.dataset = _reachable(self.parameters, **data)
+            self.dataset = _reachable(self.formulation, self.parameters, **data)
         else:
             self._refuse_beside_a_dataset(**data)
             self.dataset = opened(dataset)
@@ -136,8 +138,8 @@ class FullStateTask(CalibrationTask):
             **dataset.cell.packed._asdict(),
             "new_parameters": (NEW_CELL.q_mobile, NEW_CELL.r_o),
             "finds": [name in self.parameters for name in PARAMETER_NAMES],
-            "lowest": [ACTION_RANGES[name][0] for name in PARAMETER_NAMES],
-            "highest": [ACTION_RANGES[name][1] for name in PARAMETER_NAMES],
+            "lowest": [form.action_ranges[name][0] for name in PARAMETER_NAMES],
+            "highest": [form.action_ranges[name][1] for name in PARAMETER_NAMES],
             "resync": resync,
             "literal_cost": form.literal_cost,
             "cost_limit": cost_limit,
@@ -289,7 +291,7 @@ class FullStateTask(CalibrationTask):
         :return: shape (..., len(parameters)), beyond [-1, 1] for parameters out of the actions' range
         """
         wanted = np.stack([np.asarray(values[name], dtype=np.float64) for name in self.parameters], axis=-1)
-        lowest, highest = np.array([ACTION_RANGES[name] for name in self.parameters]).T
+        lowest, highest = np.array([self.formulation.action_ranges[name] for name in self.parameters]).T
         return 2.0 * (wanted - lowest) / (highest - lowest) - 1.0
 
     def keep(self, rows: NDArray[np.bool_]) -> None:

@@ -7,6 +7,7 @@ The kernels take records (structured arrays): numba passes one with all its fiel
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,9 +17,6 @@ from battery_env.electrochemistry import STATE_SIZE, VO, FloatArray
 from battery_env.electrochemistry.cell import CONSTANTS_SIZE, POLYNOMIAL_SIZE
 
 Records = NDArray[np.void]
-
-#: The parameters at actions of -1 and 1 (the authors' code), C and ohm.
-ACTION_RANGES: dict[str, tuple[float, float]] = {"q_mobile": (4000.0, 8000.0), "r_o": (0.08, 0.22)}
 
 #: The state of the isothermal model, without the temperature.
 OBSERVED = slice(VO, STATE_SIZE)
@@ -36,6 +34,9 @@ class Formulation:
     How states become observations and costs. The arrays have the order of the state without temperature: Vo, Vsn, Vsp, qnB,
     qnS, qpB, qpS, in V and C.
 
+    :param action_ranges: the parameters at actions of -1 and 1, C and ohm. They reach beyond those of all cells, since charge
+        that errors have moved is taken back by errors of the other sign. In the authors' range no estimate is below the truth
+        of the oldest cells: their models drift off
     :param state_scale: divisor of observed states, shape (7,)
     :param load_scale: divisor of observed loads, W
     :param error_scale: divisor of errors of the state, in the cost and in the innovations, shape (7,)
@@ -47,6 +48,7 @@ class Formulation:
         that is fitted to such costs does not see the small ones
     """
 
+    action_ranges: Mapping[str, tuple[float, float]]
     state_scale: FloatArray
     load_scale: float
     error_scale: FloatArray
@@ -57,6 +59,7 @@ class Formulation:
 
 #: States and loads over what they reach in a new cell under 8 to 16 W; errors over error scales.
 SCALED = Formulation(
+    action_ranges={"q_mobile": (3500.0, 8100.0), "r_o": (0.08, 0.22)},
     state_scale=np.array([0.5, 0.1, 0.01, 6840.0, 760.0, 11400.0, 1266.0]),
     load_scale=16.0,
     error_scale=ERROR_SCALE,
@@ -66,6 +69,7 @@ SCALED = Formulation(
 )
 #: The authors' code: states over a new cell's charges and 1 V, loads over 20 W.
 LITERAL = Formulation(
+    action_ranges={"q_mobile": (4000.0, 8000.0), "r_o": (0.08, 0.22)},
     state_scale=np.array([1.0, 1.0, 1.0, 6840.0, 760.0, 4560.0, 506.67]),
     load_scale=20.0,
     error_scale=np.ones(OBSERVED_SIZE),

@@ -41,7 +41,7 @@ class BatteryQmax(FullStateTask):
 
     ## Action space
 
-    ``Box(-1, 1, (1,), float32)``, mapped linearly to q_mobile = 4000 .. 8000 C. R_o is known.
+    ``Box(-1, 1, (1,), float32)``, mapped linearly to q_mobile = 3500 .. 8100 C. R_o is known.
 
     ## Reward
 
@@ -225,7 +225,7 @@ class BatteryJoint(FullStateTask):
 
     ## Action space
 
-    ``Box(-1, 1, (2,), float32)``, mapped linearly to q_mobile = 4000 .. 8000 C and r_o = 0.08 .. 0.22 ohm.
+    ``Box(-1, 1, (2,), float32)``, mapped linearly to q_mobile = 3500 .. 8100 C and r_o = 0.08 .. 0.22 ohm.
 
     ## Reward
 

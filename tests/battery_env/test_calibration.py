@@ -69,7 +69,7 @@ def test_the_observation_is_what_the_documentation_says():
     first, _ = env.reset(options={"trajectory": 4, "sample": int(dataset.first[4]) + t - 1})
     observation, *_ = env.step(np.array([0.5]))
     x, x_next = trajectory.state[t], trajectory.state[t + 1]
-    x_hat = step(trajectory.state[t - 1], trajectory.load[t - 1], 7000.0, NEW_CELL.r_o)
+    x_hat = step(trajectory.state[t - 1], trajectory.load[t - 1], 6950.0, NEW_CELL.r_o)
     state_scale = np.array([0.5, 0.1, 0.01, 6840.0, 760.0, 11400.0, 1266.0])
     np.testing.assert_allclose(first[7:14] * state_scale, x[OBSERVED], rtol=1e-6)
     error_scale = np.array([0.01, 1e-5, 1e-5, 20.0, 20.0, 20.0, 20.0])

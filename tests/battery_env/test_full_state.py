@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from battery_env.calibration.data import standard_dataset
-from battery_env.calibration.full_state_layout import ACTION_RANGES, ERROR_SCALE, OBSERVED
+from battery_env.calibration.full_state_layout import ERROR_SCALE, OBSERVED, SCALED
 from battery_env.calibration.full_state_tasks import BatteryJoint, BatteryQmax, BatteryQmaxPaper, BatteryRo
 from battery_env.electrochemistry import NEW_CELL, UNCERTAIN_CONSTANTS, step, voltage
 from battery_env.loads import RandomPiecewise, constant
@@ -81,7 +81,8 @@ def test_changes_of_the_action_cost_and_the_action_before_is_shown(discharges, k
     plain = started(make(discharges, kind, cells=2))
     task = started(make(discharges, kind, cells=2, consistency=0.7))
     assert task.observation_size == plain.observation_size + size
-    before = np.array([[0.8, 2.0 * (NEW_CELL.r_o - 0.08) / 0.14 - 1.0]])[:, :size].repeat(2, axis=0)
+    new_cell = [2.0 * (NEW_CELL.q_mobile - 3500.0) / 4600.0 - 1.0, 2.0 * (NEW_CELL.r_o - 0.08) / 0.14 - 1.0]
+    before = np.array([new_cell])[:, :size].repeat(2, axis=0)
     rng = np.random.default_rng(0)
     for _ in range(3):
         np.testing.assert_array_equal(task.observation()[:, :-size], plain.observation())
@@ -179,10 +180,18 @@ def test_a_share_of_the_episodes_starts_where_the_whole_discharge_does():
     assert chosen.now["sample"] == 300  # what is asked for counts
 
 
+@pytest.mark.parametrize("kind", [BatteryQmax, BatteryRo, BatteryJoint])
+def test_actions_reach_beyond_all_cells(kind):
+    # or no error of the other sign takes back the charge that an error has moved
+    dataset = kind(1, split="all").dataset
+    actions = kind(1).action_of({"q_mobile": dataset.q_mobile, "r_o": dataset.r_o})
+    assert np.abs(actions).max() < 0.8
+
+
 def test_loads_of_other_kinds_and_time_steps():
     task = BatteryRo(1, load="piecewise", split="test", dt_s=2.0)
     whole = standard_dataset("r_o", "piecewise", "test", dt_s=2.0)
-    within = whole.r_o <= ACTION_RANGES["r_o"][1]
+    within = whole.r_o <= SCALED.action_ranges["r_o"][1]
     np.testing.assert_array_equal(task.dataset.r_o, whole.r_o[within])
     assert 100 < len(task.dataset) < len(whole)
     assert task.decision_s == 2.0 and len(np.unique(task.dataset[0].load)) > 5
