@@ -157,7 +157,7 @@ class LyapunovCritic(BaseModel):
 
 class LyapunovPolicy(SACPolicy):
     """
-    Policy class (with both actor and critic) for LAC; ``MlpPolicy`` is another name of it.
+    Policy class (with both actor and critic) for LAC: SAC's, with a ``LyapunovCritic``. ``MlpPolicy`` is another name of it.
     ``LAC(policy_kwargs=...)`` takes the arguments from ``net_arch`` on:
 
     .. code-block:: python
