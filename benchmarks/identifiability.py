@@ -23,7 +23,7 @@ from matplotlib.ticker import LogLocator
 
 from battery_env.arrays import FloatArray
 from battery_env.calibration.full_state_layout import ERROR_SCALE, OBSERVED
-from battery_env.electrochemistry import NEW_CELL, QNS, STATE_SIZE, Trajectory, simulate, step_into
+from battery_env.electrochemistry import NEW_CELL, QNS, STATE_SIZE, VO, VSP, Trajectory, simulate, step_into
 from battery_env.estimators import (
     ClosedForm,
     Estimate,
@@ -70,7 +70,7 @@ ONE_STEP_POWER_W = 12.0
 ONE_STEP_TIME_S = 900
 ONE_STEP_RANGE_C = (4000.0, 8000.0)
 #: Charge that a model which was wrong for a while has too much in its negative surface, C.
-DRIFT_C = 0.05
+DRIFTS_C = {"true": 0.0, "drifted": 0.05, "far": 20.0}
 PERCENT = 100.0
 # Of a discharge, as tables say it
 _SEEN = "25 / 50 / 75 / 100 %"
@@ -330,18 +330,18 @@ def priors_table(record: Trajectory) -> pd.DataFrame:
 
 def one_step_costs() -> pd.DataFrame:
     """
-    The distance between the model's next state and the cell's, over q_mobile, with the full state measured: in volts and
-    coulombs as they are and in the error scales of the tasks, from the true state and from one that has drifted.
+    How far the model's next state is from the cell's, over q_mobile, with the full state measured: in volts and coulombs as
+    they are, in the error scales of the tasks, and in Vsp alone, the cost of the tasks, from states that have drifted or not.
     """
     record = simulate(ONE_STEP_POWER_W, TRUE.q_mobile, NEW_CELL.r_o)
     now, following = record.state[ONE_STEP_TIME_S], record.state[ONE_STEP_TIME_S + 1]
-    drifted = now.copy()
-    drifted[QNS] += DRIFT_C
     # the true value is one of them
     q_mobile_C = np.arange(ONE_STEP_RANGE_C[0], ONE_STEP_RANGE_C[1] + 1.0)
     n = len(q_mobile_C)
     table = {"q_mobile_C": q_mobile_C}
-    for name, start in (("true", now), ("drifted", drifted)):
+    for name, drift_C in DRIFTS_C.items():
+        start = now.copy()
+        start[QNS] += drift_C
         after = np.empty((n, STATE_SIZE))
         load_W, r_o_ohm = np.full(n, ONE_STEP_POWER_W), np.full(n, NEW_CELL.r_o)
         step_into(
@@ -350,6 +350,7 @@ def one_step_costs() -> pd.DataFrame:
         error = (after - following)[:, OBSERVED]
         table[f"cost_{name}_si"] = np.linalg.norm(error, axis=1)
         table[f"cost_{name}_scaled"] = np.linalg.norm(error / ERROR_SCALE, axis=1)
+        table[f"cost_{name}_task"] = np.abs(error / ERROR_SCALE)[:, VSP - VO]
     return pd.DataFrame(table)
 
 
@@ -438,10 +439,12 @@ def plot_misfits(records: dict[str, Trajectory]) -> Figure:
 
 def plot_one_step(costs: pd.DataFrame) -> Figure:
     """The one-step cost over q_mobile."""
-    figure = new_figure(7.6, 3.3)
-    panels = figure.subplots(1, 2, sharex=True)
-    titles = {"si": "in V and C", "scaled": "in error scales of the tasks"}
-    starts = {"true": "from the true state", "drifted": f"{1e3 * DRIFT_C:.0f} mC off in $q_{{nS}}$"}
+    figure = new_figure(10.0, 3.3)
+    panels = figure.subplots(1, 3, sharex=True)
+    titles = {"si": "all states, V and C", "scaled": "all states, error scales", "task": "$V_{sp}$, error scales"}
+    starts = {
+        name: f"{drift_C:g} C off in $q_{{nS}}$" if drift_C else "from the true state" for name, drift_C in DRIFTS_C.items()
+    }
     for axes, (kind, title) in zip(panels, titles.items(), strict=True):
         for colour, (start, label) in coloured(starts.items()):
             axes.plot(costs["q_mobile_C"], costs[f"cost_{start}_{kind}"], color=colour, lw=1.4, label=label)
@@ -449,7 +452,7 @@ def plot_one_step(costs: pd.DataFrame) -> Figure:
         axes.set(yscale="log", xlabel=LABELS["q_mobile"], ylabel="one-step cost")
         axes.set_title(title, fontsize=10)
         axes.grid(alpha=0.25)
-    panels[0].legend(frameon=False, fontsize=9)
+    panels[2].legend(frameon=False, fontsize=8, loc="lower left")
     return figure
 
 
@@ -554,15 +557,15 @@ def _shown_priors(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def _shown_minima(table: pd.DataFrame) -> pd.DataFrame:
-    starts = {"true": "the true state", "drifted": f"a state {1e3 * DRIFT_C:.0f} mC off"}
-    units = {"si": "V and C", "scaled": "error scales"}
+    starts = {name: f"a state {drift_C:g} C off" if drift_C else "the true state" for name, drift_C in DRIFTS_C.items()}
+    units = {"si": "all states, V and C", "scaled": "all states, error scales", "task": "Vsp, error scales"}
     rows = []
     for cost, part in table.groupby("cost", sort=False):
         _, start, unit = str(cost).split("_")
         minima = [
             f"{q_mobile_C:.0f} C ({value:.2g})" for q_mobile_C, value in zip(part["q_mobile_C"], part["value"], strict=True)
         ]
-        rows.append({"one-step cost in": units[unit], "from": starts[start], "minima (cost there)": ", ".join(minima)})
+        rows.append({"one-step cost of": units[unit], "from": starts[start], "minima (cost there)": ", ".join(minima)})
     return pd.DataFrame(rows)
 
 

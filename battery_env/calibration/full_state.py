@@ -2,7 +2,7 @@
 Calibration from the full state of a cell as a Markov decision process, for a batch of cells at once.
 
 The agent picks the aged parameter of the model. The model then takes one step from its own state x̂_t under the load. The cost
-is its distance from the measured state x_{t+1} (Unagar et al. 2020).
+is how far its state is from the measured x_{t+1} (Unagar et al. 2020).
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from battery_env.calibration.full_state_layout import (
     CELL,
     CELL_WITH_CONSTANTS,
     ERROR_SCALE,
+    JUDGED_BY,
     OBSERVED,
     OBSERVED_SIZE,
     SCALED,
@@ -30,7 +31,7 @@ from battery_env.calibration.full_state_layout import (
     Records,
 )
 from battery_env.calibration.task import OBSERVATION_LIMIT, CalibrationTask, check_counts, check_not_negative, checked_action
-from battery_env.electrochemistry import NEW_CELL, QNB, VO, FloatArray, Trajectory
+from battery_env.electrochemistry import NEW_CELL, FloatArray, Trajectory
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.trajectories import TrajectoryDataset
 
@@ -80,7 +81,6 @@ class FullStateTask(CalibrationTask):
         initial_perturbation: float = 0.0,
         resync: int | None = None,
         consistency: float = 0.0,
-        charge_weight: float = 1.0,
         cost_limit: float | None = None,
         load: LoadKind = "paper",
         split: Split = "train",
@@ -96,7 +96,6 @@ class FullStateTask(CalibrationTask):
             first_sample_probability=first_sample_probability,
             initial_perturbation=initial_perturbation,
             consistency=consistency,
-            charge_weight=charge_weight,
         )
         if continue_probability >= 1.0:
             raise ValueError(f"continue_probability must be less than 1, or episodes never end, got {continue_probability!r}")
@@ -118,7 +117,7 @@ class FullStateTask(CalibrationTask):
         self.initial_perturbation = initial_perturbation
         self.observation_size = (4 if self.formulation.innovations else 2) * OBSERVED_SIZE + 1
         self.observation_size += len(self.parameters) if consistency > 0.0 else 0
-        self._settings = self._kernel_settings(limit, consistency, charge_weight, resync or 0)
+        self._settings = self._kernel_settings(limit, consistency, resync or 0)
         self._first_action = self.action_of({name: getattr(NEW_CELL, name) for name in self.parameters})
         self._starts = list(zip(self.dataset.first.tolist(), (self.dataset.stop - 2).tolist(), strict=True))
         self._has_own_constants = bool((self.dataset.factors != 1.0).any())
@@ -126,10 +125,8 @@ class FullStateTask(CalibrationTask):
         first = nowhere + self.dataset.first[0]
         self.now = self._begin(nowhere, first, nowhere + self.episode_steps, np.zeros((cells, 4)))
 
-    def _kernel_settings(self, cost_limit: float, consistency: float, charge_weight: float, resync: int) -> Records:
+    def _kernel_settings(self, cost_limit: float, consistency: float, resync: int) -> Records:
         form, dataset = self.formulation, self.dataset
-        cost_per_error = 1.0 / form.error_scale
-        cost_per_error[QNB - VO :] *= charge_weight
         settings = np.zeros(1, dtype=SETTINGS)
         for name, value in {
             "dt_s": dataset.dt_s,
@@ -143,11 +140,11 @@ class FullStateTask(CalibrationTask):
             "resync": resync,
             "literal_cost": form.literal_cost,
             "cost_limit": cost_limit,
-            "cost_per_error": cost_per_error,
+            "judged_by": [JUDGED_BY[name] for name in PARAMETER_NAMES],
             "consistency": consistency,
             "per_state": 1.0 / form.state_scale,
             "per_load": 1.0 / form.load_scale,
-            "per_error": 1.0 / form.error_scale,
+            "per_error": 1.0 / ERROR_SCALE,
             "innovations": form.innovations,
             "shows_action": consistency > 0.0,
         }.items():

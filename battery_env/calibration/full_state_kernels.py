@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from battery_env.arrays import FloatArray
 from battery_env.calibration.full_state_layout import Records
-from battery_env.electrochemistry.cell import QNB, QNS, STATE_SIZE
+from battery_env.electrochemistry.cell import QNB, QNS, STATE_SIZE, VO
 from battery_env.electrochemistry.kernels import (
     BLOCK,
     BLOCK_SIZE,
@@ -39,18 +39,26 @@ def _clipped(value: float, limit: float) -> float:
 
 
 @_inlined
-def state_distance(model_state: FloatArray, measured: FloatArray, n: int, per_error: FloatArray, literal_cost: bool) -> float:
+def _literal_distance(model_state: FloatArray, measured: FloatArray, n: int) -> float:
     voltages, charges = 0.0, 0.0
-    for k in range(3):
-        error = (model_state[n, k + 1] - measured[n, k + 1]) * per_error[k]
-        voltages += error * error
-    for k in range(3, 7):
-        error = (model_state[n, k + 1] - measured[n, k + 1]) * per_error[k]
-        charges += error * error
-    if not literal_cost:
-        return sqrt(voltages + charges)
+    for k in range(VO, QNB):
+        voltages += (model_state[n, k] - measured[n, k]) ** 2
+    for k in range(QNB, STATE_SIZE):
+        charges += (model_state[n, k] - measured[n, k]) ** 2
     distance = 0.5 * sqrt(voltages) + 0.5 * sqrt(charges)
     return 50.0 * distance if distance > 1e-4 else distance
+
+
+@_inlined
+def _cost_of_state(model_state: FloatArray, measured: FloatArray, n: int, task: Any) -> float:
+    if task.literal_cost:
+        return min(_literal_distance(model_state, measured, n), task.cost_limit)
+    cost = 0.0
+    for k in range(2):
+        if task.finds[k] > 0:
+            voltage = task.judged_by[k]
+            cost += min(abs(model_state[n, voltage] - measured[n, voltage]) * task.per_error[voltage - VO], task.cost_limit)
+    return cost
 
 
 @_inlined
@@ -88,8 +96,7 @@ def decide(action: FloatArray, settings: Records, cells: Records, cost: FloatArr
         step_of_block(block, size, task.dt_s, task.power, task.power, task.thermal, True, task.polynomial_n, task.polynomial_p)
         states_of_block(block, first, size, cells["model_state"])
         for n in range(first, first + size):
-            distance = state_distance(model_state, next_state, n, task.cost_per_error, task.literal_cost)
-            cost[n] += task.cost_limit if distance > task.cost_limit else distance
+            cost[n] += _cost_of_state(model_state, next_state, n, task)
             is_set = task.resync > 0 and cells[n].decisions % task.resync == 0
             for k in range(STATE_SIZE):
                 state[n, k] = next_state[n, k]

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from battery_env.electrochemistry import STATE_SIZE, VO, FloatArray
+from battery_env.electrochemistry import STATE_SIZE, VO, VSP, FloatArray
 from battery_env.electrochemistry.cell import CONSTANTS_SIZE, POLYNOMIAL_SIZE
 
 Records = NDArray[np.void]
@@ -23,9 +23,12 @@ OBSERVED = slice(VO, STATE_SIZE)
 OBSERVED_SIZE = STATE_SIZE - VO
 
 #: Error scales of Vo, Vsn, Vsp, qnB, qnS, qpB, qpS, V and C. A parameter that is off by 10 % puts Vo, Vsn and Vsp off by some
-#: tenths of them in one step. Charges count little on purpose: they never forget an error, and with more weight in the
-#: cost the agent repays old errors with wrong parameters.
+#: tenths of them in one step.
 ERROR_SCALE: FloatArray = np.array([0.01, 1e-5, 1e-5, 20.0, 20.0, 20.0, 20.0])
+#: The voltage by which each parameter is judged: a wrong one moves it in one step, and the model forgets the error in a minute
+#: (time constants of 46 and 6 s). Vsn keeps errors for a quarter of an hour, and charges keep them for ever: in their cost old
+#: errors hide what the last decision did.
+JUDGED_BY: Mapping[str, int] = {"q_mobile": VSP, "r_o": VO}
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,30 +42,28 @@ class Formulation:
         of the oldest cells: their models drift off
     :param state_scale: divisor of observed states, shape (7,)
     :param load_scale: divisor of observed loads, W
-    :param error_scale: divisor of errors of the state, in the cost and in the innovations, shape (7,)
     :param innovations: whether the observation holds both innovations, asinh of x_{t+1} minus the prediction of a model with
         a new cell's parameters, in error scales: one from the model's state x̂_t, one from the measured state x_t
     :param literal_cost: whether the cost is that of the authors: 0.5 times the norm of the errors of the voltages plus 0.5
-        times that of the charges, times 50 where this exceeds 1e-4. Otherwise it is the norm of all errors
-    :param cost_limit: largest cost of a state. Distances span four orders of magnitude near the end of a discharge. A critic
+        times that of the charges, times 50 where this exceeds 1e-4. Otherwise it is the error of the voltage by which a
+        parameter is judged (:data:`JUDGED_BY`), added over the parameters that are to be found
+    :param cost_limit: largest cost of a parameter. Errors span four orders of magnitude near the end of a discharge. A critic
         that is fitted to such costs does not see the small ones
     """
 
     action_ranges: Mapping[str, tuple[float, float]]
     state_scale: FloatArray
     load_scale: float
-    error_scale: FloatArray
     innovations: bool
     literal_cost: bool
     cost_limit: float
 
 
-#: States and loads over what they reach in a new cell under 8 to 16 W; errors over error scales.
+#: States and loads over what they reach in a new cell under 8 to 16 W.
 SCALED = Formulation(
     action_ranges={"q_mobile": (3500.0, 8100.0), "r_o": (0.08, 0.22)},
     state_scale=np.array([0.5, 0.1, 0.01, 6840.0, 760.0, 11400.0, 1266.0]),
     load_scale=16.0,
-    error_scale=ERROR_SCALE,
     innovations=True,
     literal_cost=False,
     cost_limit=5.0,
@@ -72,7 +73,6 @@ LITERAL = Formulation(
     action_ranges={"q_mobile": (4000.0, 8000.0), "r_o": (0.08, 0.22)},
     state_scale=np.array([1.0, 1.0, 1.0, 6840.0, 760.0, 4560.0, 506.67]),
     load_scale=20.0,
-    error_scale=np.ones(OBSERVED_SIZE),
     innovations=False,
     literal_cost=True,
     cost_limit=1e4,
@@ -94,7 +94,7 @@ SETTINGS = np.dtype(
         ("resync", np.int64),  # 0: never
         ("literal_cost", bool),
         ("cost_limit", float),
-        ("cost_per_error", float, (OBSERVED_SIZE,)),
+        ("judged_by", np.int64, (2,)),  # index of a voltage
         ("consistency", float),
         ("per_state", float, (OBSERVED_SIZE,)),
         ("per_load", float),

@@ -45,7 +45,8 @@ class BatteryQmax(FullStateTask):
 
     ## Reward
 
-    Minus the cost, the Euclidean norm of x̂_{t+1} - x_{t+1} in error scales, at most 5.
+    Minus the cost, the error of Vsp in x̂_{t+1} in error scales, at most 5. A wrong q_mobile moves Vsp at once, and the model
+    forgets the error in a minute. Vsn and the charges keep what earlier decisions did, and would hide what the last one did.
 
     ## Starting state
 
@@ -67,8 +68,7 @@ class BatteryQmax(FullStateTask):
     | ``initial_perturbation`` | 0 | the first state is off by a uniform draw within this many error scales to either side, in Vo, Vsn, Vsp and in charge that has moved between the electrodes |
     | ``resync`` | none | the model is set to the measured state after every so many decisions |
     | ``consistency`` | 0 | cost of a change of the action per unit of its Euclidean length (the paper's consistency penalty); above 0 the action before is appended to the observation, at first the one that stands for a new cell |
-    | ``charge_weight`` | 1 | what the errors of the four charges are multiplied by in the cost: how much old errors count |
-    | ``cost_limit`` | 5 | largest cost, without that of a change |
+    | ``cost_limit`` | 5 | largest cost of a parameter, without that of a change |
     | ``load`` | ``"paper"`` | or ``"constant"``, ``"piecewise"``, ``"random_walk"``, ``"recorded"``: see ``battery_env.calibration.data.standard_dataset``; cells whose parameters no action stands for are left out |
     | ``split`` | ``"train"`` | or ``"test"``, ``"all"`` |
     | ``dt_s`` | 1 | time step, s |
@@ -85,7 +85,8 @@ class BatteryQmax(FullStateTask):
 
     ## Version history
 
-    * v0: initial version; since 0.2.0 with the second innovation; since 0.3.0 with asinh of both
+    * v0: initial version; since 0.2.0 with the second innovation; since 0.3.0 with asinh of both; since 0.4.0 with actions
+      beyond the oldest cells, and a cost of the voltage that shows the parameter in place of all states
     """  # noqa: E501 (rows of a table)
 
     parameters = ("q_mobile",)
@@ -107,7 +108,7 @@ class BatteryRo(FullStateTask):
 
     ## Reward
 
-    That of ``BatteryQmax-v0``.
+    As ``BatteryQmax-v0``, with the error of Vo, which shows a wrong R_o at once and forgets it in seconds.
 
     ## Starting state
 
@@ -229,7 +230,7 @@ class BatteryJoint(FullStateTask):
 
     ## Reward
 
-    That of ``BatteryQmax-v0``.
+    Minus the sum of the costs of ``BatteryQmax-v0`` and ``BatteryRo-v0``, each at most 5.
 
     ## Starting state
 

@@ -10,7 +10,7 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 import battery_env
 from battery_env.calibration.full_state import FullStateTask
-from battery_env.calibration.full_state_layout import LITERAL, OBSERVED, SCALED
+from battery_env.calibration.full_state_layout import ERROR_SCALE, LITERAL, OBSERVED, SCALED
 from battery_env.electrochemistry import NEW_CELL, QNB, step
 from battery_env.loads import RandomPiecewise
 from battery_env.trajectories import TrajectoryDataset
@@ -98,7 +98,7 @@ def test_the_literal_observation_is_divided_by_the_new_cells_state():
 
 def test_the_perturbation_stays_in_its_bounds_and_conserves_charge():
     env = gym.make("BatteryQmax-v0", initial_perturbation=10.0)
-    scale = SCALED.error_scale
+    scale = ERROR_SCALE
     draws = []
     for seed in range(20):
         env.reset(seed=seed)

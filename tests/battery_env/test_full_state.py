@@ -6,7 +6,7 @@ import pytest
 from battery_env.calibration.data import standard_dataset
 from battery_env.calibration.full_state_layout import ERROR_SCALE, OBSERVED, SCALED
 from battery_env.calibration.full_state_tasks import BatteryJoint, BatteryQmax, BatteryQmaxPaper, BatteryRo
-from battery_env.electrochemistry import NEW_CELL, UNCERTAIN_CONSTANTS, step, voltage
+from battery_env.electrochemistry import NEW_CELL, QNB, STATE_NAMES, UNCERTAIN_CONSTANTS, VO, step, voltage
 from battery_env.loads import RandomPiecewise, constant
 from battery_env.trajectories import TrajectoryDataset
 
@@ -30,8 +30,10 @@ def true_action(task):
     return task.action_of({"q_mobile": task.now["q_mobile"], "r_o": task.now["r_o"]})
 
 
-def scaled_distance(task, model_state, measured):
-    return np.linalg.norm((model_state - measured)[:, OBSERVED] / ERROR_SCALE, axis=1)
+def errors_in_scales(task, measured):
+    return dict(
+        zip(STATE_NAMES[OBSERVED], np.abs((task.now["model_state"] - measured)[:, OBSERVED] / ERROR_SCALE).T, strict=True)
+    )
 
 
 def test_the_defaults_disturb_nothing(discharges):
@@ -93,42 +95,36 @@ def test_changes_of_the_action_cost_and_the_action_before_is_shown(discharges, k
         before = np.clip(action, -1.0, 1.0)
 
 
-@pytest.mark.parametrize("kind", [BatteryQmax, BatteryQmaxPaper])
-def test_charges_count_as_much_as_is_asked_for(discharges, kind):
-    costs = {}
-    for weight in (0.0, 0.5, 1.0):
-        task = started(make(discharges, kind, cells=2, initial_perturbation=3.0, charge_weight=weight))
+@pytest.mark.parametrize(
+    ("kind", "voltages"), [(BatteryQmax, ["Vsp"]), (BatteryRo, ["Vo"]), (BatteryJoint, ["Vsp", "Vo"])], ids=["q", "r", "both"]
+)
+def test_a_parameter_is_judged_by_the_voltage_that_shows_it(discharges, kind, voltages):
+    task = started(make(discharges, kind, cells=4, initial_perturbation=8.0))
+    for _ in range(3):
         measured = task.now["next_state"].copy()
-        observation = task.observation()
-        costs[weight] = task.advance(true_action(task))
-    voltages, charges = (
-        np.linalg.norm(((task.now["model_state"] - measured)[:, 1:] / kind.formulation.error_scale)[:, part], axis=1)
-        for part in (slice(3), slice(3, None))
-    )
-    for weight, cost in costs.items():
-        if kind is BatteryQmax:
-            np.testing.assert_allclose(cost, np.minimum(np.hypot(voltages, weight * charges), 5.0), rtol=1e-9)
-        else:
-            half = 0.5 * (voltages + weight * charges)
-            np.testing.assert_allclose(cost, half * np.where(half > 1e-4, 50.0, 1.0), rtol=1e-9)
-    assert (costs[0.0] < costs[0.5]).all() and (costs[0.5] < costs[1.0]).all()
-    np.testing.assert_array_equal(  # what is seen does not depend on it
-        observation, started(make(discharges, kind, cells=2, initial_perturbation=3.0)).observation()
-    )
+        cost, errors = task.advance(np.zeros((4, len(task.parameters)))), errors_in_scales(task, measured)
+        np.testing.assert_allclose(cost, sum(np.minimum(errors[name], 5.0) for name in voltages), rtol=1e-9)
+
+
+def test_the_cost_of_the_paper_counts_all_states(discharges):
+    task = started(make(discharges, BatteryQmaxPaper, cells=2, initial_perturbation=3.0))
+    measured = task.now["next_state"].copy()
+    cost, error = task.advance(true_action(task)), task.now["model_state"] - measured
+    half = 0.5 * (np.linalg.norm(error[:, VO:QNB], axis=1) + np.linalg.norm(error[:, QNB:], axis=1))
+    np.testing.assert_allclose(cost, half * np.where(half > 1e-4, 50.0, 1.0), rtol=1e-9)
 
 
 def test_the_cost_is_limited(discharges):
-    task = started(make(discharges, cells=2, cost_limit=0.2))
+    task = started(make(discharges, cells=2, cost_limit=0.01))
     measured = task.now["next_state"].copy()
     cost = task.advance(true_action(task) + np.array([[0.02], [1.0]]))
-    distance = scaled_distance(task, task.now["model_state"], measured)
-    np.testing.assert_allclose(cost, np.minimum(distance, 0.2), rtol=1e-9)
-    assert cost[0] < 0.2 == cost[1]
+    np.testing.assert_allclose(cost, np.minimum(errors_in_scales(task, measured)["Vsp"], 0.01), rtol=1e-9)
+    assert cost[0] < 0.01 == cost[1]
 
 
 def test_constants_may_differ_from_those_of_the_model():
     data = TrajectoryDataset.generate("q_mobile", 5, [constant(12.0)], seed=0, mismatch=0.2)
-    task = make(data, cells=3)
+    task = make(data, BatteryRo, cells=3)
     task.start(np.array([0, 2]), [np.random.default_rng()] * 2, {"trajectory": 1})
     task.start(np.array([1]), [np.random.default_rng()], {"trajectory": 4})
     for _ in range(2):
@@ -140,7 +136,7 @@ def test_constants_may_differ_from_those_of_the_model():
             )
             np.testing.assert_allclose(task.now["next_state"][row], expected, rtol=1e-13)
         model, load, q, r = task.now["model_state"].copy(), task.now["load"].copy(), task.now["q_mobile"], task.now["r_o"]
-        assert (task.advance(true_action(task)) > 0.01).all()
+        assert (task.advance(true_action(task)) > 1e-6).all()
         np.testing.assert_allclose(task.now["model_state"], step(model, load, q, r), rtol=1e-13)
 
 
@@ -212,7 +208,6 @@ def test_loads_of_other_kinds_and_time_steps():
         ("resync", 0, "resync must be None or at least 1, got 0"),
         ("initial_perturbation", -1.0, "initial_perturbation must be finite and at least 0, got -1.0"),
         ("consistency", -0.1, "consistency"),
-        ("charge_weight", -0.1, "charge_weight must be finite and at least 0, got -0.1"),
         ("cost_limit", 0.0, "cost_limit must be finite and greater than 0, got 0.0"),
         ("load", "sine", "load must be one of"),
         ("split", "validation", "split must be"),

@@ -68,11 +68,13 @@ def test_a_filter_that_knows_of_the_offset_is_not_misled_by_it(records):
     assert table.xs(measure.OFFSET_V, level="offset_sd_V").abs().to_numpy().max() < 1.0
 
 
-def test_the_one_step_cost_has_three_minima_in_volts_and_coulombs_and_one_in_error_scales():
+def test_the_cost_of_vsp_points_to_the_truth_from_states_that_have_drifted():
     minima = measure.minima_table(measure.one_step_costs()).groupby("cost")["q_mobile_C"].agg(list)
     assert minima["cost_true_si"] == pytest.approx([5480.0, 5730.0, 6000.0], abs=5.0)
     assert minima["cost_true_scaled"] == minima["cost_drifted_scaled"] == [6000.0]
     assert 6000.0 not in minima["cost_drifted_si"]
+    assert abs(minima["cost_far_scaled"][0] - 6000.0) > 20.0
+    assert minima["cost_far_task"] == pytest.approx([6000.0], abs=10.0)
 
 
 @pytest.fixture
