@@ -24,7 +24,7 @@ from benchmarks import compare
 
 RESULTS = Path("results")
 ENV, CELL = "BatteryRo-v0", "B0005"
-UPDATES, CELLS_AT_ONCE, LEARNING_STARTS = 2400, 64, 1000  # published results have 12 000 updates
+UPDATES, CELLS_AT_ONCE, LEARNING_STARTS = 2400, 64, 1000  # published results have 6000 updates
 
 
 def compared(out: Path) -> str:

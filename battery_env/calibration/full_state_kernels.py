@@ -52,12 +52,13 @@ def _literal_distance(model_state: FloatArray, measured: FloatArray, n: int) -> 
 @_inlined
 def _cost_of_state(model_state: FloatArray, measured: FloatArray, n: int, task: Any) -> float:
     if task.literal_cost:
-        return min(_literal_distance(model_state, measured, n), task.cost_limit)
+        return _clipped(_literal_distance(model_state, measured, n), task.cost_limit)
     cost = 0.0
     for k in range(2):
         if task.finds[k] > 0:
             voltage = task.judged_by[k]
-            cost += min(abs(model_state[n, voltage] - measured[n, voltage]) * task.per_error[voltage - VO], task.cost_limit)
+            error = model_state[n, voltage] - measured[n, voltage]
+            cost += _clipped(abs(error) * task.per_error[voltage - VO], task.cost_limit)
     return cost
 
 

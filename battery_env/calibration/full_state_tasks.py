@@ -65,7 +65,7 @@ class BatteryQmax(FullStateTask):
     | ``episode_steps`` | 64 | decisions per episode |
     | ``continue_probability`` | 0 | probability that an episode goes on for another ``episode_steps``, and after these again; drawn at its start. Takes the model where the policy's own errors do in a whole discharge |
     | ``first_sample_probability`` | 0 | probability that an episode starts at the first sample of the whole discharge, at rest, in place of a random one. The data have little of the seconds after it: they leave out the first 5 % of each discharge |
-    | ``initial_perturbation`` | 0 | the first state is off by a uniform draw within this many error scales to either side, in Vo, Vsn, Vsp and in charge that has moved between the electrodes |
+    | ``initial_perturbation`` | 0 | the first state is off by a uniform draw within this many error scales to either side, in Vo, Vsn, Vsp and in charge that has moved between the electrodes. Teaches policies to stand a state of the model that is not exact |
     | ``resync`` | none | the model is set to the measured state after every so many decisions |
     | ``consistency`` | 0 | cost of a change of the action per unit of its Euclidean length (the paper's consistency penalty); above 0 the action before is appended to the observation, at first the one that stands for a new cell |
     | ``cost_limit`` | 5 | largest cost of a parameter, without that of a change |
