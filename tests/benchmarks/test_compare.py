@@ -81,6 +81,8 @@ def test_a_comparison_writes_table_figures_and_logs(tmp_path, capsys):
     assert "Interrupted" not in shown
     for name in ("inferred.png", "inferred.csv", "scores.csv", "learning.png", "learning.csv", "learning.json"):
         assert (out / f"{ENV_ID}_{name}").stat().st_size > 0
+    scores = pd.read_csv(out / f"{ENV_ID}_scores.csv")
+    assert (scores["start_off_r_o_mape_percent"] != scores["r_o_mape_percent"]).all()
     logs = {path.parent.name for path in (out / "tensorboard" / ENV_ID).rglob("events*")}
     assert logs == {f"{algo.upper()}_seed0_{recipe(algo).digest}" for algo in ("lac", "sac", "td3")}
     assert {path.name for path in (out / ENV_ID).iterdir()} == {recipe(algo).name for algo in ("lac", "sac", "td3")}
