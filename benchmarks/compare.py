@@ -15,8 +15,8 @@ the module before the colon registers. Hyperparameters and numbers of steps are 
 those of ``ALGO("MlpPolicy", env_id)``. What ``--hyperparams`` names differs from them.
 
 Policies of full-state tasks are scored on all held-out discharges, from exact starts and from starts that are off, beside the
-closed form; those of voltage-only tasks on the first 100, under two sensors, beside least squares and a Kalman filter that read
-every second; and in all other environments by the returns of episodes with the mean action.
+closed form; those of voltage-only tasks on the first 100, under two sensors, beside least squares and a Kalman filter that
+read every second; and in all other environments by the returns of episodes with the mean action.
 
 Every run has a folder of its own, named by its recipe: algorithm, environment, seed, steps, evaluations, hyperparameters and
 version of this project. A run that is finished is not run again; with another recipe it is. An interrupted run goes on from
