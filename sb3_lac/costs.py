@@ -96,7 +96,7 @@ class CostAlgorithm(OffPolicyAlgorithm):
         last, cheapest, dearest = costs[ends].mean(), costs[~ends].min(), costs[~ends].max()
         price = costs[~ends].mean() / (1 - self.gamma) if self.gamma < 1 else math.inf
         # An end that costs less than any other step is a goal
-        if cheapest <= last <= dearest:
+        if cheapest <= last <= dearest and price > 0:
             warnings.warn(
                 f"The last step before a termination costs {last:.3g} on average, no more than another step does (up to "
                 f"{dearest:.3g}). Where the end is the goal, all is well. Where it is a failure, to fail early is the "

@@ -97,6 +97,11 @@ def test_termination_with_a_price_does_not_warn(make_model, make_env):
     assert warnings_of(make_model(env, n_collect=0)) == []
 
 
+def test_steps_that_cost_nothing_do_not_warn(make_model, make_env):
+    env = gym.wrappers.TransformReward(make_env(episode_length=5, terminate=True), lambda reward: 0.0)
+    assert warnings_of(make_model(env, n_collect=0)) == []
+
+
 @pytest.mark.parametrize(
     "env_id", ["CartPoleCost-v0", "LinearCost-v0", "Oscillator-v0", "PendulumCost-v0", "QuadrotorCost-v0", "VehicleCost-v0"]
 )

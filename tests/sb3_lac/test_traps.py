@@ -69,6 +69,23 @@ def test_episodes_of_one_step_are_learned(make_model_without_env):
     assert np.all(np.abs(actions - 0.5) < 0.25)
 
 
+def test_a_chance_of_a_dear_event_is_underrated(make_model_without_env):
+    """The price of a root, which docs/how_lac_works.md states: 1 % of 300 seems less than a sure 1."""
+    model = make_model_without_env(learning_rate=3e-3, ent_coef=0.01)
+    rng = np.random.default_rng(0)
+
+    def sample(batch_size, env=None):
+        obs, actions = (th.as_tensor(rng.uniform(-1, 1, (batch_size, 2)), dtype=th.float32) for _ in range(2))
+        by_chance = th.as_tensor(300.0 * (rng.random((batch_size, 1)) < 0.01), dtype=th.float32)
+        costs = th.where(actions[:, :1] > 0, th.ones_like(by_chance), by_chance)
+        return ReplayBufferSamples(obs, actions, th.zeros_like(obs), th.ones_like(costs), -costs)
+
+    model.replay_buffer.sample = sample
+    model.train(gradient_steps=500, batch_size=64)
+    actions, _ = model.predict(np.zeros(2, dtype=np.float32), deterministic=True)
+    assert actions[0] < -0.3
+
+
 def costs_of(model, rewards):
     return model.costs(ReplayBufferSamples(None, None, None, None, th.tensor(rewards))).tolist()
 
