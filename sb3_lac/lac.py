@@ -37,8 +37,8 @@ class LAC(CostAlgorithm):
       model.save("lac_cart_pole")
 
     Pay costs as they are, ``reward = -cost``, and let a failure have its price. Choose the discount, the learning rate and the
-    number of steps; leave ``alpha3``, the multipliers and ``ent_coef`` at their defaults. Take SAC where chance decides on rare
-    events that cost a lot: a mean of roots underrates them.
+    number of steps; leave ``alpha3``, the multipliers and ``ent_coef`` at their defaults. Take SAC where chance decides on
+    rare events that cost a lot: a mean of roots underrates them.
 
     The critic ``L(s, a) >= 0`` is the discounted sum of costs. Its networks learn the fourth root of what it is above its
     lowest value, in which small costs count beside large ones, and the actor lowers the square root. ``L`` has to decrease by

@@ -2,7 +2,7 @@
 Calibration from the full state of a cell as a Markov decision process, for a batch of cells at once.
 
 The agent picks the aged parameter of the model. The model then takes one step from its own state x̂_t under the load. The cost
-is how far its state is from the measured x_{t+1} (Unagar et al. 2020).
+is how far a voltage of its state, or all of it, is from the measured x_{t+1} (Unagar et al. 2020).
 """
 
 from __future__ import annotations

@@ -46,7 +46,8 @@ class BatteryQmax(FullStateTask):
     ## Reward
 
     Minus the cost, the error of Vsp in x̂_{t+1} in error scales, at most 5. A wrong q_mobile moves Vsp at once, and the model
-    forgets the error in a minute. Vsn and the charges keep what earlier decisions did, and would hide what the last one did.
+    forgets the error in a minute. Vsn keeps old errors for a quarter of an hour and the charges for ever, which would outweigh
+    what the last decision did.
 
     ## Starting state
 
