@@ -109,7 +109,7 @@ class Life:
         """
         The remaining useful life: how many discharges are still to come, the one included that first has less capacity than
         the threshold. The cell is used as before; its capacity is in proportion to ``q_mobile``, as in the last discharge, and
-        does not grow in the long run.
+        does not grow in the long run. A row of the table counts as one discharge: check-ups make the answer too long.
 
         :param threshold_Ah: capacity at which the life ends, Ah
         :param probability: of the quantiles, within 0 .. 1, any shape

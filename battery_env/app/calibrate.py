@@ -343,9 +343,9 @@ def calibrate(
       for found in battery_env.calibrate("life.csv", method="kalman", nominal_Ah=2.0):
           print(found)
 
-    Where the start of a discharge is not known, or the voltage before the load contradicts it, or where nothing was drawn
-    though the samples beside say so, its capacity is not known either. Its surroundings, and its temperature at the start, are
-    those measured at load-on; a model that departs far from the temperatures measured later is warned of.
+    Where the start of a discharge is not known, or the voltage before the load contradicts it, where a sensor fails, or where
+    nothing was drawn though the samples beside say so, its capacity is not known either. Its surroundings, and its temperature
+    at the start, are those measured at load-on; a model that departs far from the temperatures measured later is warned of.
 
     :param source: one discharge, whole or in progress; or a table or a file of them, see
         :func:`battery_env.record_files.read_discharges`
@@ -379,7 +379,9 @@ def _calibrated(discharge: Discharge, settings: Settings) -> Calibration:
     future = load if stated_A is None else ExpectedCurrent(stated_A, varied=False, sd_A=0.0)
     forecast = model.forecast(record, estimate, settings.cut_off_V, future.mean_A, in_progress)
     is_known = (
-        not start.reason and _is_logged(record, forecast, estimate) and not _starts_lower(discharge, cell, start.soc, estimate)
+        not start.reason
+        and _is_logged(record, forecast, estimate)
+        and _is_followed(discharge, float(record.time_s[-1]), cell, start.soc, estimate)
     )
     drawn_Ah = loaded.charge_C / 3600.0
     remaining_s = forecast.eod_time_s - float(record.time_s[-1]) if in_progress else 0.0
@@ -496,13 +498,15 @@ def _is_logged(record: Discharge, forecast: VoltageForecast, estimate: Estimate)
     return all(gap.verdict != NOT_DRAWN for gap in find_gaps(*columns, estimate.q_mobile))
 
 
-def _starts_lower(discharge: Discharge, cell: CellParameters, soc: float, estimate: Estimate) -> bool:
-    """Whether the voltage before the load, or the first one under it, is below that of a cell with this charge."""
+def _is_followed(discharge: Discharge, end_s: float, cell: CellParameters, soc: float, estimate: Estimate) -> bool:
+    """Whether the cell starts, before or under the load, no lower than with this charge, and no sensor fails until the end."""
     begin = int(np.searchsorted(discharge.time_s, discharge.load_on_time_s, side="right")) - 1
+    end = int(np.searchsorted(discharge.time_s, end_s, side="right"))
     columns = (discharge.time_s, discharge.voltage_V, discharge.current_A)
-    seen = watched(Samples(*(column[begin:] for column in columns)), cell, soc, estimate.q_mobile, estimate.r_o)
+    seen = watched(Samples(*(column[begin:end] for column in columns)), cell, soc, estimate.q_mobile, estimate.r_o)
     is_lower = seen["start"]["first_V"] < seen["start_V"]
-    return bool(is_lower and start_condition(seen, estimate.q_mobile, estimate.r_o))
+    starts_lower = is_lower and start_condition(seen, estimate.q_mobile, estimate.r_o)
+    return not (starts_lower or seen["fault"]["condition"])
 
 
 def _nominal_Ah(model: RecordModel, settings: Settings, load_A: float) -> float:

@@ -6,7 +6,7 @@ import csv
 import json
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -140,7 +140,21 @@ def _forecast(
     )
     # a cell of which nothing is known has no health
     is_known = settings.nominal_Ah is not None or settings.cell is not None
-    return found, expected if is_known else replace(expected, nominal_Ah=float("nan"))
+    nominal_Ah = expected.nominal_Ah if is_known else float("nan")
+    return found, replace(expected, nominal_Ah=nominal_Ah, notes=(*expected.notes, *_notes(discharge, found)))
+
+
+def _notes(discharge: Discharge, found: Calibration) -> Iterator[str]:
+    """What a forecast from this calibration rests on, beyond its record."""
+    assert found.record is not None
+    settings, seen_s = found.settings, float(found.record.time_s[-1])
+    if float(discharge.time_s[-1]) > seen_s:
+        yield f"What was recorded after the last sample under load, at {seen_s:.0f} s, is left out."
+    if found.method == "kalman" and settings.prior_q_mobile_C is None and settings.cell is None:
+        yield "The filter expects a cell of some 2 Ah: of another one give the life, a prior of q_mobile or the constants."
+    if found.voltage_rmse_V > settings.mismatch_V:
+        rmse = found.shown("voltage_rmse_V", 0)
+        yield f"The model misses the voltage by {rmse} (RMSE), more than mismatch_V. Other loads make the interval too narrow."
 
 
 def read_load(path: str | Path) -> Load:

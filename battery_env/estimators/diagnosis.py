@@ -77,6 +77,10 @@ class Condition(IntEnum):
         "The record does not start with a minute at rest, whose voltage would tell the charge. Give the rest before the load, "
         "or state initial_soc."
     )
+    REST_UNKNOWN = (
+        "The voltage at rest of these constants does not rise with the charge, and so does not tell it: state initial_soc, or "
+        "fit constants to discharges with pauses."
+    )
     START_ABOVE = (
         "The record starts at {first_V:.2f} V, above the {rest_V:.2f} V of {expected}: another kind of cell or sensor."
     )

@@ -297,6 +297,15 @@ def test_no_capacity_is_stated_where_the_cell_did_not_start_full(first, more, re
     assert "state of health          not known" in shown
 
 
+def test_no_capacity_is_stated_where_the_current_sensor_fails(recorded, tmp_path, terminal):
+    current_A = recorded.current_A.copy()
+    current_A[60:100] = 0.0
+    path = write(Discharge(recorded.time_s, recorded.voltage_V, current_A), tmp_path / "cell.csv")
+    row = terminal.row(path, "--nominal", 2, "--discharge-is-positive", status=3)
+    assert "the voltage does not follow" in row["reason"]
+    assert row["capacity_Ah"] is row["state_of_health"] is None
+
+
 def test_what_is_drawn_after_the_cut_off_is_told(recorded, tmp_path, terminal):
     time_s = np.append(recorded.time_s, recorded.time_s + recorded.time_s[-1] + 100.0)  # too soon for a charge between
     columns = (np.append(column, column) for column in (recorded.voltage_V, recorded.current_A))

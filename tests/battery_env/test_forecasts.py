@@ -355,7 +355,22 @@ class TestCommand:
         low_s, _, high_s = alone["eod_time_s"]
         assert low_s < self.end_s < high_s and high_s - low_s > 5.0 * np.ptp(carried["eod_time_s"])
         assert alone["prior_q_mobile_C"] is None and alone["state_of_health"] == [None] * 3
+        assert any("a cell of some 2 Ah" in note for note in alone["notes"])
+        assert not any("2 Ah" in note for note in carried["notes"])
         assert 0.6 < self.row(capsys, "running.csv", "--nominal", "2")["state_of_health"][1] < 0.9
+
+    def test_a_pause_at_the_end_and_a_poor_model_are_noted(self, capsys):
+        table = pd.read_csv("running.csv")
+        rest = table.tail(1).assign(current_A=0.0)
+        rest = pd.concat([rest.assign(time_s=rest["time_s"] + since_s) for since_s in (60.0, 120.0)])
+        pd.concat([table, rest]).to_csv("paused.csv", index=False)
+        known = ("--prior", "5460", "55")
+        plain, paused = (self.row(capsys, name, *known)["notes"] for name in ("running.csv", "paused.csv"))
+        assert [note for note in paused if note not in plain] == [
+            f"What was recorded after the last sample under load, at {table['time_s'].iloc[-1]:.0f} s, is left out."
+        ]
+        sure = self.row(capsys, "running.csv", *known, "--mismatch", "0.01", status=3)["notes"]
+        assert any("more than mismatch_V" in note for note in sure) and not any("mismatch_V." in note for note in plain)
 
     def test_a_record_that_contradicts_its_estimate_has_its_own_status(self, capsys):
         late = pd.read_csv("running.csv").query("time_s > 400")

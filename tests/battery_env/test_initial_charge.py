@@ -87,6 +87,14 @@ class TestLeastSquares:
         assert not doubtful.settled and "the charge at the start" in doubtful.reason
 
 
+def test_constants_whose_rest_does_not_rise_with_the_charge_do_not_tell_it():
+    discharges = load_nasa_discharges("B0005")
+    # at one load the voltage at rest and the drop under load are not told apart
+    cell = fit_cell([discharges[n] for n in (0, 84, 167)]).cell
+    found = soc_from_rest(partly_charged(0.8), cell)
+    assert "does not rise with the charge" in found.reason and found.sd_soc >= 0.0
+
+
 class TestCommandLine:
     def row(self, record, folder, capsys, *options):
         columns = {"time_s": record.time_s, "voltage_V": record.voltage_V, "current_A": record.current_A}
