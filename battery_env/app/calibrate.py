@@ -378,11 +378,7 @@ def _calibrated(discharge: Discharge, settings: Settings) -> Calibration:
     stated_A = settings.future_current_A
     future = load if stated_A is None else ExpectedCurrent(stated_A, varied=False, sd_A=0.0)
     forecast = model.forecast(record, estimate, settings.cut_off_V, future.mean_A, in_progress)
-    is_known = (
-        not start.reason
-        and _is_logged(record, forecast, estimate)
-        and _is_followed(discharge, float(record.time_s[-1]), cell, start.soc, estimate)
-    )
+    is_known = not start.reason and _is_followed(discharge, record, forecast, cell, start.soc, estimate)
     drawn_Ah = loaded.charge_C / 3600.0
     remaining_s = forecast.eod_time_s - float(record.time_s[-1]) if in_progress else 0.0
     # what a full cell would have given more, as its end comes at the same charge
@@ -492,21 +488,27 @@ def _warn_of_more(discharge: Discharge, eod_time_s: float) -> None:
         )
 
 
-def _is_logged(record: Discharge, forecast: VoltageForecast, estimate: Estimate) -> bool:
-    """Whether all that was drawn is in the record."""
-    columns = (record.time_s, record.voltage_V, record.current_A, forecast.at_samples_V)
-    return all(gap.verdict != NOT_DRAWN for gap in find_gaps(*columns, estimate.q_mobile))
-
-
-def _is_followed(discharge: Discharge, end_s: float, cell: CellParameters, soc: float, estimate: Estimate) -> bool:
-    """Whether the cell starts, before or under the load, no lower than with this charge, and no sensor fails until the end."""
+def _is_followed(
+    discharge: Discharge,
+    record: Discharge,
+    forecast: VoltageForecast,
+    cell: CellParameters,
+    soc: float,
+    estimate: Estimate,
+) -> bool:
+    """
+    Whether all that was drawn is in the record: the cell starts, before or under the load, no lower than with this charge, no
+    sensor fails, and no gap was without a load.
+    """
     begin = int(np.searchsorted(discharge.time_s, discharge.load_on_time_s, side="right")) - 1
-    end = int(np.searchsorted(discharge.time_s, end_s, side="right"))
+    end = int(np.searchsorted(discharge.time_s, record.time_s[-1], side="right"))
     columns = (discharge.time_s, discharge.voltage_V, discharge.current_A)
     seen = watched(Samples(*(column[begin:end] for column in columns)), cell, soc, estimate.q_mobile, estimate.r_o)
     is_lower = seen["start"]["first_V"] < seen["start_V"]
-    starts_lower = is_lower and start_condition(seen, estimate.q_mobile, estimate.r_o)
-    return not (starts_lower or seen["fault"]["condition"])
+    if seen["fault"]["condition"] or (is_lower and start_condition(seen, estimate.q_mobile, estimate.r_o)):
+        return False
+    gaps = find_gaps(record.time_s, record.voltage_V, record.current_A, forecast.at_samples_V, estimate.q_mobile)
+    return all(gap.verdict != NOT_DRAWN for gap in gaps)
 
 
 def _nominal_Ah(model: RecordModel, settings: Settings, load_A: float) -> float:
