@@ -378,7 +378,7 @@ def _calibrated(discharge: Discharge, settings: Settings) -> Calibration:
     stated_A = settings.future_current_A
     future = load if stated_A is None else ExpectedCurrent(stated_A, varied=False, sd_A=0.0)
     forecast = model.forecast(record, estimate, settings.cut_off_V, future.mean_A, in_progress)
-    is_known = not start.reason and _is_followed(discharge, record, forecast, cell, start.soc, estimate)
+    is_known = not start.reason and _is_all_logged(discharge, record, forecast, cell, start.soc, estimate)
     drawn_Ah = loaded.charge_C / 3600.0
     remaining_s = forecast.eod_time_s - float(record.time_s[-1]) if in_progress else 0.0
     # what a full cell would have given more, as its end comes at the same charge
@@ -488,7 +488,7 @@ def _warn_of_more(discharge: Discharge, eod_time_s: float) -> None:
         )
 
 
-def _is_followed(
+def _is_all_logged(
     discharge: Discharge,
     record: Discharge,
     forecast: VoltageForecast,
