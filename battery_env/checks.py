@@ -57,6 +57,13 @@ def check_positive(name: str, value: float) -> float:
     return float(value)
 
 
+def check_not_negative(**values: float) -> None:
+    """Refuse what is negative, or no finite number."""
+    for name, value in values.items():
+        if not 0.0 <= value < np.inf:
+            raise ValueError(f"{name} must be finite and at least 0, got {value!r}")
+
+
 def check_whole_number(name: str, value: int) -> int:
     """Refuse what is no whole number."""
     try:

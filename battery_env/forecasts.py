@@ -12,7 +12,15 @@ from numpy.typing import ArrayLike
 from scipy.stats import truncnorm
 
 from battery_env.arrays import FloatArray, IntArray
-from battery_env.checks import LOAD_UNIT_SYMBOLS, LoadUnit, check_load, check_numbers, check_positive, check_whole_number
+from battery_env.checks import (
+    LOAD_UNIT_SYMBOLS,
+    LoadUnit,
+    check_load,
+    check_not_negative,
+    check_numbers,
+    check_positive,
+    check_whole_number,
+)
 from battery_env.electrochemistry import NEW_CELL, reached_s, state_of_charge
 from battery_env.estimates import Estimate
 from battery_env.estimators.base import is_overfull, overfull_error
@@ -251,8 +259,7 @@ def forecast(
 
 
 def _check_arguments(mismatch_V: float, cut_off_V: float, nominal_Ah: float | None, samples: int, seed: int) -> None:
-    if not 0.0 <= mismatch_V < np.inf:
-        raise ValueError(f"mismatch_V must be finite and at least 0 V, got {mismatch_V!r}")
+    check_not_negative(mismatch_V=mismatch_V)
     if not 0.0 < cut_off_V < np.inf:
         raise ValueError(f"cut_off_V must be a positive voltage in V, got {cut_off_V!r}")
     if nominal_Ah is not None:

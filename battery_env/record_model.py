@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from battery_env.arrays import FloatArray
-from battery_env.checks import LoadUnit
+from battery_env.checks import LoadUnit, check_not_negative
 from battery_env.electrochemistry import (
     FULL_CHARGE_SHARES,
     QNB,
@@ -24,9 +24,9 @@ from battery_env.electrochemistry import (
     check_dt,
     initial_state,
     rest_shares,
-    run_on_in_place,
     simulate,
 )
+from battery_env.electrochemistry.kernels import run_on_batch
 from battery_env.electrochemistry.tangents import (
     TANGENT_NAMES,
     PolynomialDerivatives,
@@ -236,8 +236,22 @@ class RecordModel:
     def run_on(
         self, state: FloatArray, load: FloatArray, q_mobile: FloatArray, r_o: FloatArray, load_unit: LoadUnit
     ) -> tuple[FloatArray, FloatArray]:
-        """Take cells on from their states, in place, as :func:`~battery_env.electrochemistry.run_on_in_place`."""
-        return run_on_in_place(state, load, q_mobile, r_o, self.dt_s, load_unit, self.thermal, self.cell.packed)
+        """
+        Take every cell on through a load of its own, or all through one; unchecked, for inner loops.
+
+        :param state: shape (n, 8), overwritten by the states after the last step
+        :param load: over each step, W or A, shape (n, K) or (1, K)
+        :param q_mobile: charge that can move, C, shape (n,)
+        :param r_o: ohmic resistance, ohm, shape (n,)
+        :param load_unit: ``"power"`` or ``"current"``
+        :return: voltage before each step and after the last one, V, shape (K + 1, n), NaN once a cell is empty; and current
+            over each step, A, shape (K, n)
+        """
+        steps, cells = load.shape[1], len(state)
+        voltage_V, current_A = np.empty((steps + 1, cells)), np.empty((steps, cells))
+        is_power, packed = load_unit == "power", self.cell.packed
+        run_on_batch(load, q_mobile, r_o, self.dt_s, is_power, self.thermal, packed, state, voltage_V, current_A)
+        return voltage_V, current_A
 
     def voltage(self, record: Record, at: Estimate) -> FloatArray:
         """
@@ -279,8 +293,8 @@ class RecordModel:
         samples_s, current_A = self.grid(record)
         if future_current_A is None:
             future_current_A = expected_current(record.time_s, record.current_A).mean_A
-        elif not 0.0 <= future_current_A < np.inf:
-            raise ValueError(f"future_current_A must be finite and at least 0 A, got {future_current_A!r}")
+        else:
+            check_not_negative(future_current_A=future_current_A)
         if future_current_A * LONGEST_FORECAST_S > at.q_mobile:
             # no cell of this q_mobile lasts longer than this, whatever it had delivered before
             steps = int(at.q_mobile / (future_current_A * self.dt_s)) + 1

@@ -78,7 +78,7 @@ class LyapunovCallback(EventCallback):
         self.eval_freq = eval_freq
         self.seed = seed
         self.log_path = None if log_path is None else Path(log_path)
-        # One entry per evaluation, sorted by timesteps
+        # One entry per evaluation, by timesteps
         self.history: list[dict[str, float]] = []
         self.last_report: LyapunovReport | None = None
 
@@ -86,11 +86,10 @@ class LyapunovCallback(EventCallback):
         # A mistake is seen before the training, and not at its first evaluation
         with closed_loop(self.model, self.eval_env, self._judged(), self.n_eval_episodes, seed=self.seed) as loop:
             self.eval_env = loop.env
-        if self.model.num_timesteps == 0:
-            # Of another training
-            self.history = []
         if self.log_path is not None:
             self._continue_log(self.log_path)
+        # Not of another training, nor of steps that are taken again from a checkpoint on
+        self.history = [entry for entry in self.history if entry["timesteps"] <= self.model.num_timesteps]
 
     def _judged(self) -> LyapunovFunction | None:
         """Return the function that is judged, if it is known before the evaluation."""
@@ -126,9 +125,7 @@ class LyapunovCallback(EventCallback):
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(self.num_timesteps)
 
-        # In place of an older one after as many timesteps, when continuing from a checkpoint
-        others = [entry for entry in self.history if entry["timesteps"] != self.num_timesteps]
-        self.history = sorted([*others, {"timesteps": self.num_timesteps, **values}], key=lambda entry: entry["timesteps"])
+        self.history.append({"timesteps": self.num_timesteps, **values})
         if self.log_path is not None:
             import pandas as pd
 

@@ -33,6 +33,7 @@ class CostAlgorithm(OffPolicyAlgorithm):
 
     def cost_bound(self, vec_normalize: VecNormalize | None = None) -> th.Tensor:
         """The reward that costs nothing, in the units of the rewards that the agent sees, shape (1,)."""
+        # One that is stated when a model is loaded may be larger than the one in its file
         bound = self.reward_bound.clamp(min=self.stated_reward_bound or 0.0)
         if vec_normalize is None or not vec_normalize.norm_reward:
             return bound
@@ -76,7 +77,7 @@ class CostAlgorithm(OffPolicyAlgorithm):
         n_rewards = 1.0 if replay_data.discounts is None else (1 - replay_data.discounts) / (1 - self.gamma)
         largest_reward = (replay_data.rewards / n_rewards).max()
         vec_normalize = self._vec_normalize_env
-        self.reward_bound.copy_(th.maximum(self.reward_bound, largest_reward * reward_scale(vec_normalize)))
+        self.reward_bound.copy_(th.maximum(self.cost_bound(), largest_reward * reward_scale(vec_normalize)))
         # The scale of the rewards may have changed too
         self.update_offset(vec_normalize)
         # Changes of the units round
@@ -86,8 +87,9 @@ class CostAlgorithm(OffPolicyAlgorithm):
     def warn_of_free_terminations(self) -> None:
         """Warn if what is stored shows no price of an early end: where that is a failure, it is the cheapest policy of all."""
         buffer = self.replay_buffer
-        # A buffer that does not keep time limits apart cannot tell; and where living pays, an end costs the bound for ever
-        if buffer is None or not buffer.handle_timeout_termination or self.reward_bound > 0:
+        # A buffer that does not keep time limits apart cannot tell; and where living pays, an end costs the bound
+        # for ever. A buffer of somebody else may have arrays of its own
+        if buffer is None or self.reward_bound > 0 or not (buffer.handle_timeout_termination and hasattr(buffer, "timeouts")):
             return
         rewards, dones, timeouts = (stored[: buffer.size()] for stored in (buffer.rewards, buffer.dones, buffer.timeouts))
         costs, ends = 0.0 - rewards, dones > timeouts

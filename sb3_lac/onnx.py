@@ -13,7 +13,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecNormalize, unwrap_vec_normalize
 from torch.distributions import Distribution, Normal
@@ -67,11 +67,7 @@ class DeterministicPolicy(th.nn.Module):
         if self.clip_obs is not None:
             observation = (observation - self.mean - self.rest_of_mean) / self.deviation
             observation = observation.clamp(-self.clip_obs, self.clip_obs)
-        if isinstance(self.policy, ActorCriticPolicy):
-            action = self.policy.get_distribution(observation).get_actions(deterministic=True)
-        else:
-            action = self.policy(observation, deterministic=True)
-        action = action.reshape(-1, *self.low.shape)
+        action = self.policy._predict(observation, deterministic=True).reshape(-1, *self.low.shape)
         if self.policy.squash_output:
             return self.low + 0.5 * (action + 1.0) * (self.high - self.low)
         return action.clamp(self.low, self.high)

@@ -194,14 +194,10 @@ def _copied(observations: Any) -> Any:
     # The replay buffer is filled one step later: an environment that reuses its arrays must not change them meanwhile
     if isinstance(observations, dict):
         return {name: _copied(part) for name, part in observations.items()}
-    if isinstance(observations, tuple):
-        return tuple(_copied(part) for part in observations)
     return np.array(observations)
 
 
 def _of_one(observations: Any, n: int) -> Any:
     if isinstance(observations, dict):
         return {name: _of_one(part, n) for name, part in observations.items()}
-    if isinstance(observations, tuple):
-        return tuple(_of_one(part, n) for part in observations)
     return observations[n]

@@ -14,7 +14,7 @@ import pandas as pd
 from battery_env.calibration.policy import PolicyEstimator
 from battery_env.calibration.pretrained import policy_of_file, pretrained_policy
 from battery_env.cells import Discharge
-from battery_env.checks import ZERO_CELSIUS_K, check_positive
+from battery_env.checks import ZERO_CELSIUS_K, check_not_negative, check_positive
 from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.electrochemistry.cell import TB
 from battery_env.estimates import Estimate
@@ -116,8 +116,8 @@ class Settings:
             raise ValueError(f"the ambient temperature must lie within {low:g} .. {high:g} degC, got {self.ambient_C!r}")
         if not 0.0 < self.cut_off_V < np.inf:
             raise ValueError(f"the cut-off must be a voltage above 0 V, got {self.cut_off_V!r}")
-        if self.future_current_A is not None and not 0.0 <= self.future_current_A < np.inf:
-            raise ValueError(f"future_current_A must be finite and at least 0 A, got {self.future_current_A!r}")
+        if self.future_current_A is not None:
+            check_not_negative(future_current_A=self.future_current_A)
         if self.method == "policy":
             defaults = {field.name: field.default for field in fields(self)}
             for name in _NOT_FOR_POLICIES:

@@ -30,7 +30,8 @@ from battery_env.calibration.full_state_layout import (
     Formulation,
     Records,
 )
-from battery_env.calibration.task import OBSERVATION_LIMIT, CalibrationTask, check_counts, check_not_negative, checked_action
+from battery_env.calibration.task import OBSERVATION_LIMIT, CalibrationTask, check_counts, checked_action
+from battery_env.checks import check_not_negative
 from battery_env.electrochemistry import NEW_CELL, FloatArray, Trajectory
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.trajectories import TrajectoryDataset

@@ -28,13 +28,6 @@ def check_counts(**values: int) -> None:
             raise ValueError(f"{name} must be at least 1, got {value!r}")
 
 
-def check_not_negative(**values: float) -> None:
-    """Refuse sizes that are negative, or no finite numbers."""
-    for name, value in values.items():
-        if not 0.0 <= value < np.inf:
-            raise ValueError(f"{name} must be finite and at least 0, got {value!r}")
-
-
 def checked_action(action: NDArray[np.floating], shape: tuple[int, ...]) -> FloatArray:
     """Refuse what is no action: compiled code would read beyond a short one, and NaN would spread through the episode."""
     array = np.asarray(action)

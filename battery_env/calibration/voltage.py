@@ -20,7 +20,8 @@ from battery_env.arrays import FloatArray, IntArray
 from battery_env.calibration.data import LoadKind, Split, opened, standard_dataset
 from battery_env.calibration.nuisance import Fitted, NuisanceFit
 from battery_env.calibration.readings import CURRENT, MEASURED, OHMIC, SHOWN, Readings, explain
-from battery_env.calibration.task import OBSERVATION_LIMIT, CalibrationTask, check_counts, check_not_negative, checked_action
+from battery_env.calibration.task import OBSERVATION_LIMIT, CalibrationTask, check_counts, checked_action
+from battery_env.checks import check_not_negative
 from battery_env.electrochemistry import UNCERTAIN_CONSTANTS, CellParameters, check_cell
 from battery_env.estimators.diagnosis import white_noise_V
 from battery_env.parameters import PARAMETER_NAMES, columns_of

@@ -24,7 +24,7 @@ from battery_env.electrochemistry.cell import (
     check_dt,
     rest_shares,
 )
-from battery_env.electrochemistry.kernels import advance_batch, roll_out, run_on_batch, step_batch, voltage_batch
+from battery_env.electrochemistry.kernels import advance_batch, roll_out, step_batch, voltage_batch
 from battery_env.parameters import Q_MOBILE, R_O
 
 _MAX_STEPS = 1e8  # of one simulation, in memory
@@ -197,36 +197,6 @@ def reached_s(time_s: FloatArray, voltage_V: FloatArray, level_V: float, for_goo
     if n == 0 or np.isnan(voltage_V[n]):
         return float(time_s[n])
     return float(np.interp(level_V, voltage_V[[n, n - 1]], time_s[[n, n - 1]]))
-
-
-def run_on_in_place(
-    state: FloatArray,
-    load: FloatArray,
-    q_mobile: FloatArray,
-    r_o: FloatArray,
-    dt: float,
-    load_unit: LoadUnit,
-    thermal: bool,
-    packed: PackedConstants,
-) -> tuple[FloatArray, FloatArray]:
-    """
-    Take every cell through a load of its own, or all through one; unchecked, like :func:`step_into`.
-
-    :param state: shape (n, 8), overwritten by the states after the last step
-    :param load: over each step, W or A, shape (n, K) or (1, K)
-    :param q_mobile: charge that can move, C, shape (n,)
-    :param r_o: ohmic resistance, ohm, shape (n,)
-    :param dt: time step, s
-    :param load_unit: ``"power"`` or ``"current"``
-    :param thermal: whether the temperature moves
-    :param packed: constants of the cells
-    :return: voltage before each step and after the last one, V, shape (K + 1, n), NaN once a cell is empty; and current over
-        each step, A, shape (K, n)
-    """
-    steps, cells = load.shape[1], len(state)
-    voltage_V, current_A = np.empty((steps + 1, cells)), np.empty((steps, cells))
-    run_on_batch(load, q_mobile, r_o, dt, load_unit == "power", thermal, packed, state, voltage_V, current_A)
-    return voltage_V, current_A
 
 
 @dataclass(frozen=True)

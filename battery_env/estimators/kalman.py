@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from battery_env.checks import ZERO_CELSIUS_K, check_gain_sd, check_numbers
+from battery_env.checks import ZERO_CELSIUS_K, check_gain_sd, check_not_negative, check_numbers
 from battery_env.electrochemistry import STATE_SIZE, CellParameters, PackedConstants, check_cell, check_dt
 from battery_env.electrochemistry.tangents import PolynomialDerivatives
 from battery_env.estimates import Estimate, Estimates, EstimateTrace
@@ -130,9 +130,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
         self.dt_s = check_dt(dt_s, self.cell)
         self.bounds = check_bounds(q_mobile_bounds_C, r_o_bounds_ohm)
         offset_sd_V = max(_NOISE_V, mismatch_V) if offset_sd_V is None else offset_sd_V
-        for name, value in (("offset_sd_V", offset_sd_V), ("mismatch_V", mismatch_V), ("drift_per_hour", drift_per_hour)):
-            if not 0.0 <= value < inf:
-                raise ValueError(f"{name} must be finite and at least 0, got {value!r}")
+        check_not_negative(offset_sd_V=offset_sd_V, mismatch_V=mismatch_V, drift_per_hour=drift_per_hour)
         voltage_noise_V = _checked_noise_V(voltage_noise_V, mismatch_V)
         self.current_gain_sd = check_gain_sd(current_gain_sd)
         self.initial_soc = check_initial_soc(initial_soc)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from battery_env.arrays import FloatArray
-from battery_env.checks import check_gain_sd, check_positive
+from battery_env.checks import check_gain_sd, check_not_negative, check_positive
 from battery_env.electrochemistry import CellParameters
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimates import Estimate, EstimateTrace
@@ -166,8 +166,7 @@ class LeastSquares(Estimator):
             if not 0.0 < prior_q_mobile_C[1] < np.inf:
                 raise ValueError(f"prior_q_mobile_C is (mean, sd) with sd > 0, got {prior_q_mobile_C!r}")
         self.prior_q_mobile_C = prior_q_mobile_C
-        if not 0.0 <= mismatch_V < np.inf:
-            raise ValueError(f"mismatch_V must be at least 0 V, got {mismatch_V!r}")
+        check_not_negative(mismatch_V=mismatch_V)
         self.mismatch_V = mismatch_V
         self.current_gain_sd = check_gain_sd(current_gain_sd)
         self._at_rest = initial is None

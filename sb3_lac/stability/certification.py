@@ -38,7 +38,7 @@ class CertificationReport:
     :param statements: One row per statement, by name: ``n_episodes`` that testify, ``n_true`` of them for it, their ``share``,
         and ``at_least``, which the probability is not below with the confidence
     :param transitions: One row per transition of those episodes: ``episode``, ``step``, ``reward``, ``cost``, ``terminated``,
-        and ``lyapunov`` if there is a function
+        ``lyapunov`` if there is a function, and others
     :param episodes: One row per episode: ``length``, ``total_cost``, ``final_cost``, ``largest_late_cost``, ``terminated``,
         and one column per statement: 1 if it was true, 0 if not, NaN if the episode does not testify
     :param starts: One row per start state on the grid: ``state_0`` and so on, ``n_episodes``, ``n_attracted``, their ``share``

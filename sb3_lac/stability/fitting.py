@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 #: Widths of the hidden layers
 NET_ARCH = (64, 64)
-#: Outputs whose squares are summed, as in the critic of LAC
+#: Outputs whose squares are summed
 N_FEATURES = 16
 #: Passes over the data
 N_ITERATIONS = 40
@@ -152,11 +152,12 @@ class FittedLyapunov(LyapunovFunction):
 
         :param path: Name of the file
         """
-        numbers = ("unit", "floor", "average_cost", "reward_bound", "ultimate_bound", "level", "window_steps")
+        numbers = ("unit", "floor", "average_cost", "reward_bound", "ultimate_bound", "level", "window_steps", "alpha3")
         content = {
             "network": self.network.state_dict(),
             "inputs": {field.name: th.as_tensor(getattr(self.inputs, field.name)) for field in fields(InputRange)},
-            "numbers": {name: getattr(self, name) for name in numbers},
+            # Of Python, for a scalar of numpy would keep the file from being loaded
+            "numbers": {name: np.asarray(getattr(self, name)).item() for name in numbers},
             "seeds": (self.seeds.start, self.seeds.stop),
         }
         with replacing(path) as part:
@@ -174,7 +175,10 @@ class FittedLyapunov(LyapunovFunction):
         inputs = InputRange(**{name: tensor.numpy() for name, tensor in content["inputs"].items()})
         network = SumOfSquares(len(inputs.mean))
         network.load_state_dict(content["network"])
-        return cls(network, inputs, seeds=range(*content["seeds"]), **content["numbers"])
+        alpha3 = content["numbers"].pop("alpha3", 1.0)
+        lyapunov = cls(network, inputs, seeds=range(*content["seeds"]), **content["numbers"])
+        lyapunov.alpha3 = alpha3
+        return lyapunov
 
 
 def fit_lyapunov(
@@ -225,7 +229,6 @@ def fit_lyapunov(
     with closed_loop(policy, env, None, n_episodes, deterministic, seed) as loop:
         roll_outs = loop.roll_out(n_episodes)
         transitions = roll_outs.transitions
-        # A float, for a scalar of numpy in the file would keep it from being loaded
         reward_bound = float(max(transitions["reward"].max(), 0.0))
         transitions["cost"] = np.maximum(reward_bound - transitions["reward"], 0.0)
         data = _Data.of(roll_outs, reward_bound)
@@ -274,15 +277,15 @@ class _Data:
         rows[episode, step] = np.arange(len(costs))
         inputs = flatten(roll_outs.observations)
         mean, scale = inputs.mean(axis=0), np.maximum(inputs.std(axis=0), 1e-6)
+        # Not in what is learned from: its weights stay as they are drawn
+        scale[inputs.min(axis=0) == inputs.max(axis=0)] = np.inf
         if roll_outs.last_observations is not None:
             inputs = np.concatenate([inputs, flatten(roll_outs.last_observations)])
         if not np.isfinite(inputs).all():
             raise ValueError("The environment showed an infinite observation, which no network can learn from: bound it.")
-        low, high = inputs.min(axis=0), inputs.max(axis=0)
-        scale[low == high] = np.inf
         following = np.arange(1, len(costs) + 1)
         following[truncated] = len(costs) + np.arange(truncated.sum())
-        of_inputs = InputRange(mean, scale, low, high)
+        of_inputs = InputRange(mean, scale, inputs.min(axis=0), inputs.max(axis=0))
         return cls(costs, died, rows, n_lost, following, of_inputs.scaled(inputs), of_inputs, unit)
 
 

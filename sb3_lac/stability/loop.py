@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from copy import deepcopy
@@ -199,7 +200,9 @@ def _share_environments(env: VecEnv, other: VecEnv) -> bool:
     """Whether two environments are one, or have a single one in common."""
     if env.unwrapped is other.unwrapped:
         return True
-    singles = [{id(single.unwrapped) for single in getattr(each.unwrapped, "envs", [])} for each in (env, other)]
+    # Those of a vector environment of somebody else may be anything
+    inner = [getattr(each.unwrapped, "envs", []) for each in (env, other)]
+    singles = [{id(getattr(single, "unwrapped", single)) for single in envs} for envs in inner]
     return not singles[0].isdisjoint(singles[1])
 
 
@@ -218,8 +221,9 @@ def _undisturbed(policy: PolicyPredictor, env: VecEnv, seed: int) -> Iterator[No
     device = str(getattr(policy, "device", "cpu"))
     with th.random.fork_rng(devices=[device] if device.startswith("cuda") else []):
         th.manual_seed(seed)
-        # DQN explores with these two
-        numpy_state = np.random.get_state()
+        # Environments may draw from these two, and DQN explores with the second
+        python_state, numpy_state = random.getstate(), np.random.get_state()
+        random.seed(seed)
         np.random.seed(seed % 2**32)
         action_space: Any = getattr(policy, "action_space", None)
         if isinstance(policy, (BaseAlgorithm, BasePolicy)):
@@ -236,4 +240,5 @@ def _undisturbed(policy: PolicyPredictor, env: VecEnv, seed: int) -> Iterator[No
                 vec_normalize.training = training
             if isinstance(policy, (BaseAlgorithm, BasePolicy)):
                 policy.action_space = action_space
+            random.setstate(python_state)
             np.random.set_state(numpy_state)

@@ -98,7 +98,7 @@ class LyapunovReport:
         if any(math.isnan(value) for value, _, _ in self.metrics.values()):
             lines.append(
                 "What is not available takes what these roll-outs do not have, like a survivor or costs that fade before the "
-                "time limit: docs/reports/certificates.md lists what each metric takes."
+                "time limit: docs/stability_metrics.md lists what each metric takes."
             )
         lines.append(f"With alpha3={self.alpha3:g} the decrease condition {self._verdict()}.")
         lines.append(self._verdict_with_residual())
@@ -250,7 +250,7 @@ def evaluate_lyapunov(
       print(report.summary())
 
     Take the function of ``fit_lyapunov()`` for a verdict on the loop. Without ``lyapunov``, the critic of LAC is judged, which
-    tells what was learned. ``docs/reports/certificates.md`` says what each metric means.
+    tells what was learned. ``docs/stability_metrics.md`` says what each metric means.
 
     ``a'`` is the action taken next; after a time limit it is an action of the policy. A terminal state has no ``L``:
     transitions into it are counted as deaths, and do not count for the decrease.

@@ -236,7 +236,7 @@ POLICY = ["B0005:100", "--method", "policy"]
         (["B0005:1", "--prior-q", "1.9", "0.1"], "Ampere-hours"),
         (["B0005:1", "--cut-off", "4.3"], "between load-on at 26.242 s and 4.3 V"),
         (["B0005:1", "--cut-off", "nan"], "the cut-off must be a voltage above 0 V, got nan"),
-        (["B0005:1", "--future-current", "-2"], "future_current_A must be finite and at least 0 A, got -2.0"),
+        (["B0005:1", "--future-current", "-2"], "future_current_A must be finite and at least 0, got -2.0"),
         (["B0005:1", "--nominal", "0"], "the nominal capacity in Ah must be a positive, finite number, got 0.0"),
         (["B0005:1", "--ambient", "297"], "the ambient temperature must lie within -60 .. 100 degC, got 297.0"),
         ([*POLICY, "--prior", "5000", "50"], "a policy takes no prior_q_mobile_C"),

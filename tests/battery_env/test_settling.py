@@ -358,7 +358,7 @@ class TestForecasts:
         assert self.model.forecast(changed(record, slice(900)), self.truth, 2.8).eod_time_s < 0.6 * record.time_s[-1]
         known = self.model.forecast(changed(record, slice(1001)), self.truth, 2.8, future_current_A=1.0)
         assert known.eod_time_s == pytest.approx(record.time_s[-1], abs=2.0)
-        with pytest.raises(ValueError, match="future_current_A must be finite and at least 0 A, got nan"):
+        with pytest.raises(ValueError, match="future_current_A must be finite and at least 0, got nan"):
             self.model.forecast(record, self.truth, future_current_A=np.nan)
 
     @pytest.mark.parametrize(

@@ -3,7 +3,9 @@
 import dataclasses
 import itertools
 import math
+import random
 import warnings
+from copy import copy
 
 import gymnasium as gym
 import numpy as np
@@ -222,14 +224,18 @@ def test_fit_is_reproducible_and_leaves_random_numbers_alone(linear_env, optimal
     for seed in (3, 3, 30):
         th.manual_seed(1)
         np.random.seed(1)
+        random.seed(1)
         values.append(fit_lyapunov(controller, linear_env, 10, seed=seed, progress_bar=False).values(points))
-        assert (th.rand(1).item(), np.random.rand()) == pytest.approx((0.7576315999, 0.417022004702574))
+        drawn = (th.rand(1).item(), np.random.rand(), random.random())
+        assert drawn == pytest.approx((0.7576315999, 0.417022004702574, 0.13436424411240122))
     np.testing.assert_array_equal(values[0], values[1])
     assert (values[0] != values[2]).any() and (values[0] >= 0).all()
 
 
 def test_function_is_saved_and_loaded(optimal, tmp_path):
-    _, lyapunov = optimal
+    lyapunov = copy(optimal[1])
+    # As a user may set them
+    lyapunov.alpha3, lyapunov.ultimate_bound = 0.5, np.float64(lyapunov.ultimate_bound)
     path = tmp_path / "new" / "lyapunov.pt"
     lyapunov.save(path)
     assert [file.name for file in path.parent.iterdir()] == ["lyapunov.pt"]
@@ -244,12 +250,19 @@ def test_function_is_saved_and_loaded(optimal, tmp_path):
 
 
 def test_function_does_not_depend_on_what_never_changed(make_env):
-    env = gym.wrappers.TransformObservation(
-        make_env(), lambda state: np.append(state, np.float32(0.1)), spaces.Box(-np.inf, np.inf, (3,), np.float32)
-    )
-    policy = NoController(sampled)
-    lyapunov = fit_lyapunov(policy, env, 10, seed=0, **FIT)
+    env, policy = make_env(), NoController(sampled)
+
+    def fit(last):
+        # A number that is another one in the observation of the time limit only, from which nothing is learned
+        def shown(state):
+            return np.append(state, np.float32(last if env.n_steps == env.episode_length else 0.1))
+
+        space = spaces.Box(-np.inf, np.inf, (3,), np.float32)
+        return fit_lyapunov(policy, gym.wrappers.TransformObservation(env, shown, space), 10, seed=0, **FIT)
+
+    lyapunov, changed = fit(0.1), fit(1.0)
     points = np.array([[1.0, 0.5, 0.1], [0.0, -1.0, 0.1]])
+    np.testing.assert_array_equal(changed.values(points), lyapunov.values(points))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         values = lyapunov.values(points)

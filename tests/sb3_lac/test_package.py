@@ -18,28 +18,6 @@ def reload_package(monkeypatch):
     importlib.reload(sb3_lac)
 
 
-def test_exports():
-    assert set(sb3_lac.__all__) == {
-        "LAC",
-        "CertificateCallback",
-        "CnnPolicy",
-        "DashboardCallback",
-        "FittedLyapunov",
-        "GymnasiumVecEnv",
-        "LyapunovCallback",
-        "LyapunovFunction",
-        "LyapunovPolicy",
-        "LyapunovReport",
-        "MlpPolicy",
-        "MultiInputPolicy",
-        "__version__",
-        "certify",
-        "evaluate_lyapunov",
-        "fit_lyapunov",
-    }
-    assert all(hasattr(sb3_lac, name) for name in sb3_lac.__all__)
-
-
 def test_battery_env_is_optional(monkeypatch, reload_package):
     monkeypatch.setitem(sys.modules, "battery_env", None)
     assert reload_package().LAC is sb3_lac.LAC

@@ -177,6 +177,7 @@ def test_bound_and_offset_are_saved_and_a_larger_bound_can_be_stated_on_loading(
     changed.replay_buffer = model.replay_buffer
     changed.costs(model.replay_buffer.sample(4))
     np.testing.assert_allclose(predictions(changed), predictions(model) + 8.0, rtol=1e-5)
+    assert changed.reward_bound.item() == 7.0
 
 
 def test_report_does_not_change_the_critic(make_model, make_env, train_metrics):

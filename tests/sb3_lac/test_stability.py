@@ -440,9 +440,10 @@ def test_callback_logs_the_metrics(make_model, make_env, tmp_path, capsys):
     assert frame["timesteps"].tolist() == [10, 20] and frame["feasible_alpha3_low"].iloc[1] == pytest.approx(feasible.low)
     # A training that is continued from a checkpoint, until the next callback stops it
     callback = LyapunovCallback(make_env(), AfterEval(), n_eval_episodes=2, eval_freq=10, log_path=path, verbose=0)
-    model.num_timesteps = 10
-    assert model.learn(200, callback=callback, reset_num_timesteps=False).num_timesteps == 20
-    assert pd.read_csv(path)["timesteps"].tolist() == [10, 20] == [entry["timesteps"] for entry in callback.history]
+    model.num_timesteps = 12
+    assert model.learn(200, callback=callback, reset_num_timesteps=False).num_timesteps == 22
+    # What was evaluated after the checkpoint was of a model that is gone
+    assert pd.read_csv(path)["timesteps"].tolist() == [10, 22] == [entry["timesteps"] for entry in callback.history]
     # Another training is not mixed with it
     content = path.read_bytes()
     with pytest.raises(ValueError, match=r"holds the evaluations of another training, and this one starts anew"):

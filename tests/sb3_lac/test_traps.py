@@ -9,25 +9,8 @@ import torch as th
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
-from torch import nn
 
 from sb3_lac import LAC
-
-
-def flat_parameters(module):
-    return nn.utils.parameters_to_vector(module.parameters()).detach()
-
-
-def test_actor_follows_the_decrease_condition_in_proportion_to_lambda(make_model, train_metrics):
-    steps = []
-    for lambda_init in (0.25, 0.5):
-        # Without the entropy term, and with plain gradient descent
-        model = make_model(ent_coef=0.0, alpha3=0.3, lambda_init=lambda_init, policy_kwargs={"optimizer_class": th.optim.SGD})
-        before = flat_parameters(model.actor)
-        train_metrics(model)
-        steps.append(flat_parameters(model.actor) - before)
-    assert steps[0].abs().max() > 0
-    th.testing.assert_close(2 * steps[0], steps[1], rtol=1e-2, atol=1e-6)
 
 
 def test_lambda_does_not_wind_up(make_model, train_metrics):
@@ -149,21 +132,6 @@ def test_everything_that_is_learned_is_saved(make_model, train_metrics):
     unchanged = {name for name, tensor in model.policy.state_dict().items() if th.equal(before[name], tensor)}
     # It waits for positive rewards
     assert unchanged == {"critic.offset", "critic_target.offset", "reward_bound"}
-
-
-def test_both_values_of_the_difference_are_from_the_online_critic(make_model, train_metrics):
-    # A critic that is the same number everywhere: the difference is that of the condition, whatever the target says
-    model = make_model(alpha3=0.3)
-    for module, root in ((model.critic, 3.0), (model.critic_target, 50.0)):
-        for network in module.lyapunov_networks:
-            nn.init.zeros_(network[-1].weight)
-            nn.init.constant_(network[-1].bias, root)
-    batch = model.replay_buffer.sample(16)
-    model.replay_buffer.sample = lambda *args, **kwargs: batch
-    # The floor falls out of it
-    allowed = 3.0**4 + 0.3 * batch.rewards
-    expected = (3.0**2 - allowed.sign() * allowed.abs().sqrt()).mean().item()
-    assert train_metrics(model)["lyapunov_difference"] == pytest.approx(expected, rel=1e-4)
 
 
 @pytest.mark.parametrize(

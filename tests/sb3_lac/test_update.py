@@ -7,8 +7,6 @@ import pytest
 import torch as th
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
-from sb3_lac.compiled import update_multiplier
-
 GAMMA, TAU, LEARNING_RATE, LAMBDA_LEARNING_RATE, ALPHA3 = 0.9, 0.05, 1e-2, 2e-2, 0.3
 LAMBDA_MIN, LAMBDA_MAX = 0.1, 1.0
 
@@ -166,13 +164,6 @@ def test_train_is_the_update_of_the_equations(make_model_without_env, n_critics,
             th.testing.assert_close(tensor, weights[name].detach(), rtol=1e-4, atol=1e-6)
     assert model.log_lambda.item() == pytest.approx(log_lambda.value, rel=1e-4)
     assert model.log_ent_coef.item() == pytest.approx(log_beta.value, rel=1e-4)
-
-
-def test_multiplier_grows_by_the_violation_of_its_constraint():
-    log_multiplier = th.tensor([2.0])
-    loss = update_multiplier(log_multiplier, th.optim.SGD([log_multiplier], lr=0.1), th.tensor(3.65))
-    assert loss.item() == pytest.approx(-7.3)
-    assert log_multiplier.item() == pytest.approx(2.365)
 
 
 def test_actor_step_leaves_no_gradient_in_the_critic(make_model, train_metrics):
