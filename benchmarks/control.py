@@ -72,12 +72,10 @@ def roll_out(
     policy: PolicyPredictor,
     make_env: Callable[[], gym.Env[Any, Any]],
     episodes: int,
-    noise_std: float = 0.0,
     seed: int = EVALUATION_SEED,
 ) -> pd.DataFrame:
     """Run the mean action of a policy in all episodes at once, and return one row per episode."""
     envs = [make_env() for _ in range(episodes)]
-    rngs = [np.random.default_rng((seed, episode)) for episode in range(episodes)]
     starts = [env.reset(seed=seed + episode) for episode, env in enumerate(envs)]
     observations = np.array([observation for observation, _ in starts])
     errors_at_start = [info["error"] for _, info in starts]
@@ -85,10 +83,7 @@ def roll_out(
     lengths, died = np.zeros(episodes, dtype=int), np.zeros(episodes, dtype=bool)
     running = np.arange(episodes)
     while len(running) > 0:
-        noisy = observations[running]
-        if noise_std > 0:
-            noisy += noise_std * np.array([rngs[episode].standard_normal(noisy.shape[1]) for episode in running], np.float32)
-        actions, _ = policy.predict(noisy, deterministic=True)
+        actions, _ = policy.predict(observations[running], deterministic=True)
         going_on = []
         for episode, action in zip(running, actions, strict=True):
             observations[episode], _, terminated, truncated, info = envs[episode].step(action)

@@ -14,7 +14,7 @@ from gymnasium import spaces
 
 pytest.importorskip("rl_zoo3")
 
-from benchmarks import certificate, control, cost_units, linear_cost, references, robustness, stabilisation
+from benchmarks import certificate, control, cost_units, linear_cost, references, stabilisation
 from docs.environment_pages import DOCS, environment_page
 from sb3_lac import LAC
 from sb3_lac.envs import LinearCostEnv, reference_controller
@@ -71,20 +71,6 @@ def test_each_policy_has_the_same_starts():
     assert len(np.unique(left.seen[0], axis=0)) == 3
     # what they do then makes a difference
     assert (left.seen[2] != right.seen[2]).any()
-
-
-def test_noise_is_on_what_the_policy_sees_and_nowhere_else():
-    clean, noisy, other = (RecordingPolicy(0.1) for _ in range(3))
-    outcomes = [control.roll_out(each, CountdownEnv, 200, std) for each, std in ((clean, 0.0), (noisy, 0.5), (other, 0.5))]
-    # the action does not depend on the observation here: the same happens
-    pd.testing.assert_frame_equal(outcomes[0], outcomes[1])
-    noise = [shown - true for shown, true in zip(noisy.seen, clean.seen, strict=True)]
-    assert np.concatenate(noise).std() == pytest.approx(0.5, rel=0.1)
-    # independent in time, and of each other
-    assert abs(np.corrcoef(noise[0].ravel(), noise[1].ravel())[0, 1]) < 0.2
-    assert abs(np.corrcoef(noise[0].T)[0, 1]) < 0.2
-    for seen, again in zip(noisy.seen, other.seen, strict=True):
-        np.testing.assert_array_equal(seen, again)
 
 
 @pytest.mark.parametrize("env_id", IDS)
@@ -298,38 +284,6 @@ def test_all_algorithms_have_the_same_budget():
         for name in ("n_timesteps", "n_envs", "gradient_steps", "learning_starts"):
             assert config[env_id][name] == configs[0][env_id][name]
         assert "net_arch=[64, 64]" in config[env_id]["policy_kwargs"]
-
-
-def test_all_combinations_of_robustness_are_possible():
-    for study, (env_id, arguments, noises) in robustness.STUDIES.items():
-        found = [(*values.values(), noise) for values, noise in robustness.combinations(study)]
-        assert found == list(itertools.product(*arguments.values(), noises)), study
-        gym.make(env_id, **robustness.combinations(study)[-1][0])
-
-
-def test_robustness_is_written(tmp_path, monkeypatch, train_nothing, capsys):
-    asked = train_nothing(robustness)
-    small = {
-        study: (env_id, {name: values[:2] for name, values in arguments.items()}, noises[:2])
-        for study, (env_id, arguments, noises) in robustness.STUDIES.items()
-    }
-    monkeypatch.setattr(robustness, "STUDIES", small)
-    monkeypatch.setattr(robustness.gym, "make", partial(gym.make, max_episode_steps=20))
-    command = ["--algos", "lac", "--seeds", "0", "5", "--episodes", "1", "--jobs", "1", "--out", str(tmp_path)]
-    robustness.main([*command, "--cart-pole-timesteps", "2000", "--oscillator-timesteps", "3000"])
-    assert set(asked) == {("lac", "CartPoleCost-v0", s, 2000) for s in (0, 5)} | {
-        ("lac", "Oscillator-v0", s, 3000) for s in (0, 5)
-    }
-    table = pd.read_csv(tmp_path / "robustness.csv")
-    assert table.groupby("study").size().to_dict() == {study: 2 * len(robustness.combinations(study)) for study in small}
-    assert table["death_rate"].isin([0.0, 1.0]).all() and (table["cost"] == table["cost_worst"]).all()
-    assert table.loc[table["study"] == "measurement noise", "observation_noise"].tolist() == [0.0, 0.01] * 2
-    for name in ("disturbances.png", "cart_and_pole.png", "gene_network.png"):
-        assert (tmp_path / name).stat().st_size > 0
-    text = (tmp_path / "robustness.md").read_text(encoding="utf-8")
-    assert text in capsys.readouterr().out and "**cart and pole** (CartPoleCost-v0, 2 seeds)" in text and " ± " in text
-    # nobody dies: no such column
-    assert "death" not in robustness.report(table.assign(death_rate=0.0))
 
 
 @pytest.fixture
