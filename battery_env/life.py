@@ -22,7 +22,7 @@ from battery_env.checks import check_positive, check_whole_number
 from battery_env.estimators.diagnosis import is_only_imprecise
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.forecasts import BAND, quantile
-from battery_env.records import drawn
+from battery_env.records import drawn, mean_current_A
 
 #: What is believed of a cell before its discharges tell, as shares of q_mobile: the step from one to the next, the error of
 #: one estimate beside the others (both known to a factor of e, one standard deviation), and the sd of the drift.
@@ -190,7 +190,7 @@ def _told(discharge: Discharge, cut_off_V: float, calibrator: LeastSquares) -> d
         "reason": estimate.reason,
         "valid": estimate.settled or (not isnan(measured_s) and is_only_imprecise(estimate.reason)),
         "capacity_Ah": capacity_Ah,
-        "mean_current_A": record.charge_C / float(np.ptp(record.time_s)),
+        "mean_current_A": mean_current_A(record),
         "lasted_share": (measured_s - start_s) / (end_s - start_s),
     }
 

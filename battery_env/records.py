@@ -152,7 +152,10 @@ def check_samples(time_s: ArrayLike, voltage_V: ArrayLike, current_A: ArrayLike,
         if time[n] == time[n - 1]:
             advice = "Give each sample once, with a clock that tells it from the next"
         else:
-            advice = "Sort the samples, and give one discharge at a time, or number them in a column of the cycle"
+            advice = (
+                "Sort the samples, and give one discharge at a time, or number them in a column of the cycle. A clock that "
+                "starts anew at midnight needs dates, and one that does with each step a column of the step"
+            )
         raise ValueError(
             f"time_s must increase from sample to sample, but sample {n} is at {time[n]:g} s, after {time[n - 1]:g} s. "
             f"{advice}."
@@ -281,6 +284,11 @@ def drawn(time_s: FloatArray, load: FloatArray, at_s: ArrayLike) -> FloatArray:
 def drawn_charge_C(record: Record) -> float:
     """The charge drawn from the first sample to the last."""
     return float(drawn(record.time_s, record.current_A, record.time_s[-1]))
+
+
+def mean_current_A(record: Record) -> float:
+    """The charge drawn over the time from the first sample to the last."""
+    return drawn_charge_C(record) / float(np.ptp(record.time_s))
 
 
 def resample_current(time_s: FloatArray, current_A: FloatArray, dt_s: float, n_steps: int) -> FloatArray:

@@ -162,7 +162,11 @@ def _layout(head: bytes, chosen: Mapping[str, str] | None) -> _Layout:
         lines[0], delimiters = "", (stated[1],)
     best, found = (0, delimiters[0]), -1
     for number, line in enumerate(lines):
+        next_line = lines[number + 1] if number + 1 < len(lines) else ""
         for delimiter in delimiters:
+            # blanks within names
+            if delimiter == _BLANKS and len(_fields(next_line, delimiter)) < len(_fields(line, delimiter)):
+                continue
             if (count := count_required(_fields(line, delimiter), chosen)) > found:
                 best, found = (number, delimiter), count
     number, delimiter = best

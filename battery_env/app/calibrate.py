@@ -19,6 +19,7 @@ from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.electrochemistry.cell import TB
 from battery_env.estimates import Estimate
 from battery_env.estimators.cell_fit import UNFITTED_MISMATCH_V, CellFit
+from battery_env.estimators.diagnosis import Condition
 from battery_env.estimators.gaps import NOT_DRAWN, find_gaps
 from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
@@ -27,7 +28,7 @@ from battery_env.estimators.rest import InitialSoc, Start, check_initial_soc, so
 from battery_env.parameters import PARAMETER_NAMES, check_parameters
 from battery_env.record_files import each_usable
 from battery_env.record_model import RecordModel, VoltageForecast
-from battery_env.records import CUT_OFF_V, ExpectedCurrent, Samples, drawn, expected_current
+from battery_env.records import CUT_OFF_V, ExpectedCurrent, Samples, drawn, expected_current, mean_current_A
 
 Method = Literal["least-squares", "kalman", "policy"]
 METHODS: tuple[Method, ...] = get_args(Method)
@@ -40,6 +41,11 @@ _MANY_SAMPLES = 100_000
 _MODEL_STEP_S = 1.0
 # What is drawn after the cut-off is worth a word if it is more than this share of what was drawn before.
 _MORE_SHARE = 0.2
+# Constants that were fitted at one load moved q_mobile by 5 % at twice that load, and so by less than the 2 % of a settled
+# estimate within this ratio.
+_SAME_LOAD = 1.25
+# Without a load for longer than this a discharge is over, or pauses.
+_REST_S = 60.0
 _AMBIENT_LIMITS_C = (-60.0, 100.0)
 # The model of a cell in air warms by 2 K at 2 A, where the bundled cells warm by 16 K: that alone moves q_mobile by less than
 # 0.1 %. What is farther off than this is another cell, load or chamber than these.
@@ -82,6 +88,8 @@ class Settings:
     :param nominal_Ah: nominal capacity, which the state of health refers to, Ah; ``None``: the charge that ``cell``, with its
         own ``q_mobile`` and ``r_o``, gives from full at the current of the discharge, or not known if there is no ``cell``
     :param cell: constants of the model; ``None``: those of a new 18650
+    :param cell_currents_A: lowest and highest mean current that these constants were fitted to, A: beyond them by more than a
+        quarter no estimate is settled, and no nominal capacity is told. ``None``: they hold for all
     :param q_mobile_bounds_C: where to search for ``q_mobile``, C; ``None``: where the calibrator does by default
     :param initial_soc: state of charge when the load is switched on, after a rest: a number, (mean, standard deviation), or
         ``"rest"``: told from the voltage of the rest before the load, of a minute at least
@@ -102,6 +110,7 @@ class Settings:
     ambient_C: float | None = None
     nominal_Ah: float | None = None
     cell: CellParameters | None = None
+    cell_currents_A: tuple[float, float] | None = None
     q_mobile_bounds_C: tuple[float, float] | None = None
     initial_soc: InitialSoc | Literal["rest"] = 1.0
     policy: Path | None = None
@@ -146,10 +155,20 @@ class Settings:
                 known |= {
                     "mismatch_V": cell.mismatch_V,
                     "thermal": cell.thermal,
+                    "cell_currents_A": cell.currents_A,
                     "q_mobile_bounds_C": cell.q_mobile_bounds_C,
                 }
             others, cell = {**known, **others}, cell.cell
         return cls(**{"cell": cell, **others})
+
+    def other_load(self, current_A: float) -> str:
+        """Why the constants may not hold for a mean current; empty if they do."""
+        if self.cell_currents_A is None or not current_A > 0.0:
+            return ""
+        low_A, high_A = self.cell_currents_A
+        if low_A / _SAME_LOAD <= current_A <= high_A * _SAME_LOAD:
+            return ""
+        return Condition.OTHER_LOAD.said({"load_A": current_A, "low_A": low_A, "high_A": high_A})
 
     def methods(self, goes_on: bool) -> list[Method]:
         """What to calibrate a record by: the first one that settles it, or the last; ``goes_on``: a constant load does."""
@@ -367,7 +386,7 @@ def _calibrated(discharge: Discharge, settings: Settings) -> Calibration:
     """What one discharge says."""
     loaded, measured_eod_s = discharge.loaded_part(settings.cut_off_V), discharge.eod_time_s(settings.cut_off_V)
     in_progress = bool(np.isnan(measured_eod_s))
-    _warn_of_more(discharge, measured_eod_s)
+    more_C = _charge_after(discharge, loaded, measured_eod_s, settings.cut_off_V)
     record, averaged_over_s = _of_few_samples(loaded)
     cell = _cell_at_the_temperature(record, settings)
     discharge = _with_the_temperature_that_counts(discharge, settings)
@@ -378,7 +397,7 @@ def _calibrated(discharge: Discharge, settings: Settings) -> Calibration:
     stated_A = settings.future_current_A
     future = load if stated_A is None else ExpectedCurrent(stated_A, varied=False, sd_A=0.0)
     forecast = model.forecast(record, estimate, settings.cut_off_V, future.mean_A, in_progress)
-    is_known = not start.reason and _is_all_logged(discharge, record, forecast, cell, start.soc, estimate)
+    is_known = not start.reason and not more_C and _is_all_logged(discharge, record, forecast, cell, start.soc, estimate)
     drawn_Ah = loaded.charge_C / 3600.0
     remaining_s = forecast.eod_time_s - float(record.time_s[-1]) if in_progress else 0.0
     # what a full cell would have given more, as its end comes at the same charge
@@ -436,8 +455,8 @@ def _estimate(
         estimate = calibrator.estimate(_with_the_temperature_that_counts(record, settings))
         if estimate.settled:
             break
-    if start.reason:
-        estimate = replace(estimate, settled=False, reason=start.reason)
+    if reason := start.reason or settings.other_load(mean_current_A(record)):
+        estimate = replace(estimate, settled=False, reason=reason)
     return estimate, method
 
 
@@ -475,17 +494,27 @@ def _start(discharge: Discharge, settings: Settings, cell: CellParameters) -> St
     return Start(*check_initial_soc(settings.initial_soc))
 
 
-def _warn_of_more(discharge: Discharge, eod_time_s: float) -> None:
+def _charge_after(discharge: Discharge, loaded: Discharge, eod_time_s: float, cut_off_V: float) -> float:
+    """What is drawn after the cut-off, if that is more than a discharge leaves behind: then it was not the end."""
     if np.isnan(eod_time_s):
-        return
+        if discharge.time_s[-1] - loaded.time_s[-1] > _REST_S:
+            warnings.warn(
+                f"the load ends at {loaded.voltage_V[-1]:.4g} V, above the cut-off of {cut_off_V:g} V, so that the capacity "
+                "is not known: if the cell was discharged no further, state cut_off_V (--cut-off)",
+                stacklevel=4,
+            )
+        return 0.0
     until_C = float(drawn(discharge.time_s, discharge.current_A, eod_time_s))
     more_C = discharge.charge_C - until_C
-    if more_C > _MORE_SHARE * until_C:
-        warnings.warn(
-            f"{more_C / 3600.0:.3f} Ah more are drawn after the cut-off at {eod_time_s:.0f} s, and left aside. If that is "
-            "another discharge, give each alone, or number them in a column of the cycle",
-            stacklevel=4,
-        )
+    if more_C <= _MORE_SHARE * until_C:
+        return 0.0
+    warnings.warn(
+        f"{more_C / 3600.0:.3f} Ah more are drawn after the cut-off at {eod_time_s:.0f} s, and left aside. If that is "
+        "another discharge, give each alone, or number them in a column of the cycle; if a pulse fell below it, state a lower "
+        "cut_off_V (--cut-off)",
+        stacklevel=4,
+    )
+    return more_C
 
 
 def _is_all_logged(
@@ -514,7 +543,7 @@ def _is_all_logged(
 def _nominal_Ah(model: RecordModel, settings: Settings, load_A: float) -> float:
     if settings.nominal_Ah is not None:
         return settings.nominal_Ah
-    if settings.cell is None or not load_A > 0.0:
+    if settings.cell is None or not load_A > 0.0 or settings.other_load(load_A):
         return float("nan")
     # the cell is empty by then
     return model.capacity_Ah(load_A, "current", settings.cut_off_V, model.cell.q_mobile / load_A + model.dt_s)

@@ -138,14 +138,24 @@ def _forecast(
         nominal_Ah=settings.nominal_Ah,
         samples=samples,
     )
+    other_load = settings.other_load(found.future_current_A if load is None else _largest_A(load))
     # a cell of which nothing is known has no health
-    is_known = settings.nominal_Ah is not None or settings.cell is not None
+    is_known = settings.nominal_Ah is not None or (settings.cell is not None and not other_load)
     nominal_Ah = expected.nominal_Ah if is_known else float("nan")
-    return found, replace(expected, nominal_Ah=nominal_Ah, notes=(*expected.notes, *_notes(discharge, found)))
+    return found, replace(expected, nominal_Ah=nominal_Ah, notes=(*expected.notes, *_notes(discharge, found, other_load)))
 
 
-def _notes(discharge: Discharge, found: Calibration) -> Iterator[str]:
+def _largest_A(load: FutureLoad) -> float:
+    """The largest current of a load to come; 0 of one that is no known current."""
+    if isinstance(load, Load):
+        return float(load.value.max()) if load.unit == "current" else 0.0
+    return float(load) if isinstance(load, int | float) else 0.0
+
+
+def _notes(discharge: Discharge, found: Calibration, other_load: str) -> Iterator[str]:
     """What a forecast from this calibration rests on, beyond its record."""
+    if other_load:
+        yield other_load
     assert found.record is not None
     settings, seen_s = found.settings, float(found.record.time_s[-1])
     if float(discharge.time_s[-1]) > seen_s:

@@ -29,7 +29,15 @@ from battery_env.estimators.search import MARGIN, OnGrid, distance_C, minimized,
 from battery_env.files import WrongFormatError, read_json, write_json
 from battery_env.parameters import Q_MOBILE, R_O
 from battery_env.record_model import RecordModel
-from battery_env.records import CUT_OFF_V, SWITCH_SHARE, Record, check_drawn_charge, check_record, drawn_charge_C
+from battery_env.records import (
+    CUT_OFF_V,
+    SWITCH_SHARE,
+    Record,
+    check_drawn_charge,
+    check_record,
+    drawn_charge_C,
+    mean_current_A,
+)
 
 #: How well the constants that say how fast a cell follows its load are known before any data: standard deviations of their
 #: logarithms. The overpotential of kn stands for whatever slows a worn cell down, so that it may differ most.
@@ -118,6 +126,7 @@ class FittedDischarge:
     :param rmse_V: root mean square of the voltage error, V
     :param rmse_before_V: likewise with the constants known before and the ``q_mobile`` and ``r_o`` that fit best to them
     :param left_out_V: likewise with constants that were fitted without this discharge; ``None`` if there are no others
+    :param current_A: its mean current, A; ``None`` in files of fits that were made without it
     """
 
     name: str
@@ -128,6 +137,7 @@ class FittedDischarge:
     rmse_V: float
     rmse_before_V: float
     left_out_V: float | None = None
+    current_A: float | None = None
 
 
 @dataclass(frozen=True)
@@ -174,7 +184,8 @@ class CellFit:
         Q_MOBILE.check([discharge.q_mobile for discharge in self.discharges])
         rows: tuple[FittedConstant | FittedDischarge, ...] = (*self.constants, *self.discharges)
         for row in rows:
-            _, *numbers = (value for item, value in vars(row).items() if (item, value) != ("left_out_V", None))
+            absent = {("left_out_V", None), ("current_A", None)}
+            _, *numbers = (value for item, value in vars(row).items() if (item, value) not in absent)
             if not isinstance(row.name, str) or not np.isfinite(check_numbers(row.name, numbers)).all():
                 raise ValueError(f"constants and discharges have names and finite numbers, got {row!r}")
 
@@ -182,6 +193,12 @@ class CellFit:
     def full_V(self) -> float:
         """The voltage at which a full cell rests with these constants, V."""
         return rest_voltage_V(self.cell)
+
+    @property
+    def currents_A(self) -> tuple[float, float] | None:
+        """The lowest and the highest mean current of the discharges, A; ``None`` if the file of the fit does not tell."""
+        found = [each.current_A for each in self.discharges if each.current_A is not None]
+        return (min(found), max(found)) if found else None
 
     @property
     def doubt(self) -> str:
@@ -675,12 +692,12 @@ class JointFit:
         rows = zip(names, before, self.sd.tolist(), after, (self.sd * sds[:n]).tolist(), strict=True)
         discharges = []
         left_out_V = self._left_out_V(x, weights)
-        rows_of = zip(self.names, self.before, seen, left_out_V, strict=True)
-        for d, (name, (_, before_V), at, error_V) in enumerate(rows_of):
+        rows_of = zip(self.names, self.before, seen, left_out_V, self.records, strict=True)
+        for d, (name, (_, before_V), at, error_V, record) in enumerate(rows_of):
             sd_q_C = float(np.sqrt(at.q_gradient_C @ covariance @ at.q_gradient_C))
             sd_r_ohm = float(_R_O_SCALE_OHM * sds[n + len(seen) + d])
-            errors_V = _rms(at.residual_V), before_V, error_V
-            discharges.append(FittedDischarge(name, at.q_mobile, at.r_o, sd_q_C, sd_r_ohm, *errors_V))
+            others = _rms(at.residual_V), before_V, error_V, mean_current_A(record)
+            discharges.append(FittedDischarge(name, at.q_mobile, at.r_o, sd_q_C, sd_r_ohm, *others))
         largest = max(discharges, key=lambda discharge: discharge.q_mobile)
         new = {"q_mobile": largest.q_mobile, "r_o": largest.r_o}
         return CellFit(

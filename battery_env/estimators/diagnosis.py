@@ -93,6 +93,10 @@ class Condition(IntEnum):
         "Samples lie farther apart than the {interval_s:g} s between the readings of the policy, or are missing at the start: "
         "it reads a straight line between them, which misleads it. Least squares and the filter take such records."
     )
+    OTHER_LOAD = (
+        "The load, {load_A:.3g} A, is none of those that the constants were fitted to, {low_A:.3g} to {high_A:.3g} A, and "
+        "they hold for these: fit discharges of this load, too."
+    )
     # faults of the samples; a stream keeps the first one in time
     RECOVERED = (
         "The voltage comes back to that of the start at {fault_s:.0f} s, though {size:.0f} C were drawn: the cell was charged."
@@ -118,11 +122,11 @@ class Condition(IntEnum):
     )
     IMPLAUSIBLE = (
         "No cell of this kind has such a q_mobile. Check that time is in s and current in A, and that the record is of one "
-        "cell."
+        "cell; for a cell of another size fit constants (fit_cell, --cell)."
     )
     MISFIT = (
-        "The voltage of the model is farther off than noise and mismatch_V explain: state a larger mismatch_V, or check the "
-        "sensors, the prior if one was given, and that this is one discharge."
+        "The voltage of the model is farther off than noise and mismatch_V explain: fit constants to this cell (fit_cell, "
+        "--cell), state a larger mismatch_V, or check the sensors, the prior if one was given, and that this is one discharge."
     )
     UNEXPLAINED = (
         "The voltage is farther off than noise, an offset and the constants that the policy knows of explain: use least "

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from battery_env.arrays import BoolArray, FloatArray
-from battery_env.electrochemistry.cell import BULK_RATE, SURFACE_RATE
+from battery_env.electrochemistry.cell import BULK_RATE, SURFACE_RATE, CellParameters
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS, TANGENT_NAMES
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.record_model import RecordModel
@@ -175,8 +175,8 @@ class Search:
         best with it (the voltage is nearly linear in it), and the sums of squared residuals, V^2.
         """
         cell, data = self.model.cell, self.data
-        # the largest step for which no voltage drop of explicit Euler oscillates
-        stride = max(int(min(cell.to, cell.tsn, cell.tsp) / data.dt_s), 1)
+        # the largest step for which neither a voltage drop nor the diffusion oscillates with explicit Euler
+        stride = max(int(min(cell.to, cell.tsn, cell.tsp, 1.0 / _diffusion_rate(cell)) / data.dt_s), 1)
         if len(data.current_A) < _COARSE_POINTS * stride:
             stride = 1
         points = len(data.current_A) // stride
@@ -292,8 +292,7 @@ class Search:
     def _least_stable(self, name: str) -> float:
         cell, dt_s = self.model.cell, self.model.dt_s
         if name == "tDiffusion":
-            rates = cell.packed.constants[0, [BULK_RATE, SURFACE_RATE]]
-            return float(0.5 * cell.tDiffusion * dt_s * rates.sum())
+            return 0.5 * cell.tDiffusion * dt_s * _diffusion_rate(cell)
         return 0.5 * dt_s if name in ("to", "tsn", "tsp") else 0.0
 
     def _least_q_C(self, values: Mapping[str, float]) -> tuple[float, float]:
@@ -301,6 +300,11 @@ class Search:
         if "tDiffusion" not in self.nuisance:
             return self.least_q_C, 0.0
         return self.model_at(values).least_q_mobile_tangent_C(self.data.current_A)
+
+
+def _diffusion_rate(cell: CellParameters) -> float:
+    """At which the charges of bulk and surface come together, 1/s."""
+    return float(cell.packed.constants[0, [BULK_RATE, SURFACE_RATE]].sum())
 
 
 def square(array: FloatArray) -> float:

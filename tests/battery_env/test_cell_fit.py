@@ -21,6 +21,7 @@ from battery_env import (
     load_nasa_discharges,
 )
 from battery_env.app.calibrate import METHODS, Settings, calibrate
+from battery_env.app.forecast import forecast_end
 from battery_env.calibration.pretrained import pretrained_card
 from battery_env.cells import Discharge
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate, voltage
@@ -264,6 +265,19 @@ class TestFiles:
         assert settings.cut_off_V == fit.cell.VEOD
         assert row["q_mobile_C"] == own.estimate(record).q_mobile != PolicyEstimator.pretrained().estimate(record).q_mobile
         assert row["q_mobile_C"] == pytest.approx(6000.0, rel=0.05)
+
+    def test_constants_hold_for_the_loads_that_were_fitted(self, fit):
+        low_A, high_A = fit.currents_A
+        for current_A, is_known in ((0.5 * low_A, False), (low_A, True), (high_A, True), (2.0 * high_A, False)):
+            record = discharged(fit.cell, 6500.0, 0.15, current_A)
+            found = calibrate(record, cell=fit)
+            assert found.settled == is_known == bool(found.nominal_Ah > 0.0)
+            assert ("is none of those that the constants were fitted to" in found.reason) != is_known
+            running, settings = record.until(0.5 * record.time_s[-1]), Settings.for_cell(fit)
+            expected = forecast_end(running, settings, load=high_A, samples=10)
+            assert bool(expected.nominal_Ah > 0.0)
+            expected = forecast_end(running, settings, load=2.0 * high_A, samples=10)
+            assert any("is none of those" in note for note in expected.notes) and np.isnan(expected.nominal_Ah)
 
     @pytest.mark.parametrize("method", [method for method in METHODS if method != "policy"])
     def test_settings_use_all_that_a_fit_knows(self, method, fit):

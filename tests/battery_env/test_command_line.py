@@ -310,7 +310,17 @@ def test_what_is_drawn_after_the_cut_off_is_told(recorded, tmp_path, terminal):
     time_s = np.append(recorded.time_s, recorded.time_s + recorded.time_s[-1] + 100.0)  # too soon for a charge between
     columns = (np.append(column, column) for column in (recorded.voltage_V, recorded.current_A))
     path = write(Discharge(time_s, *columns), tmp_path / "two.csv")
-    assert "Ah more are drawn after the cut-off at" in terminal.row(path, "--discharge-is-positive")["notes"]
+    row = terminal.row(path, "--discharge-is-positive")
+    assert "Ah more are drawn after the cut-off at" in row["notes"] and row["capacity_Ah"] is None
+
+
+def test_a_load_that_ends_above_the_cut_off_is_told(recorded, tmp_path, terminal):
+    last_s, rest_s = recorded.time_s[-1], 10.0 + 10.0 * np.arange(30)
+    columns = (recorded.time_s, last_s + rest_s), (recorded.voltage_V, 3.2 + 0 * rest_s), (recorded.current_A, 0 * rest_s)
+    path = write(Discharge(*map(np.concatenate, columns)), tmp_path / "cell.csv")
+    said = "if the cell was discharged no further, state cut_off_V (--cut-off)"
+    assert said in terminal.row(path, "--cut-off", 2.0, "--discharge-is-positive")["notes"]
+    assert said not in (terminal.row(path, "--discharge-is-positive")["notes"] or "")
 
 
 def test_large_cells_are_fitted_and_calibrated(tmp_path, terminal):

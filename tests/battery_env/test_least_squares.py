@@ -308,3 +308,10 @@ class TestBadInput:
             LeastSquares(q_mobile_bounds_C=(100.0, 4000.0)).estimate(discharged())
         with pytest.raises(ValueError, match="q_mobile = 100 C is empty at the start"):
             LeastSquares(["r_o"], cell=NEW_CELL.replace(q_mobile=100.0)).estimate(discharged(load=30.0, load_unit="current"))
+
+
+def test_a_cell_whose_charges_meet_fast_is_found():
+    # faster than the steps that starts are compared on with the constants of others
+    cell = NEW_CELL.replace(tDiffusion=1.2e6)
+    estimate = LeastSquares(cell=cell).estimate(simulate(2.0, 7000.0, 0.12, load_unit="current", cell=cell))
+    assert (estimate.q_mobile, estimate.r_o) == pytest.approx((7000.0, 0.12), rel=1e-4)

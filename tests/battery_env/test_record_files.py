@@ -101,6 +101,10 @@ def test_columns_of_unknown_names_with_blanks_are_named_as_the_file_has_them(tmp
     (tmp_path / "cell.csv").write_text("\n".join(["Zeit [min];Spannung [mV];Strom [mA]", *lines]))
     with pytest.raises(ValueError, match=re.escape("Zeit [min], Spannung [mV], Strom [mA]")):
         read_discharges(tmp_path / "cell.csv")
+    # two words of which are names of other files' columns
+    (tmp_path / "cell.csv").write_text("Time (s),Cell Voltage (V),Load Current (A)\n0.0,4.2,0.0\n")
+    with pytest.raises(ValueError, match=re.escape("Time (s), Cell Voltage (V), Load Current (A)")):
+        read_discharges(tmp_path / "cell.csv")
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "latin-1"])

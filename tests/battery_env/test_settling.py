@@ -77,8 +77,10 @@ RISING = discharged(pulsed(200, 400, 2.0, 0.2))
 AFTER_REST = discharged(np.append(np.zeros(60), np.full(20_000, 2.0)))
 AGAIN = changed(AFTER_REST, late_s=AFTER_REST.time_s[-1] + 1.0)
 TWICE = Discharge(*(np.append(getattr(AFTER_REST, c), getattr(AGAIN, c)) for c in ("time_s", "voltage_V", "current_A")))
-MISFIT = "The voltage of the model is farther off than noise and mismatch_V explain: state a larger mismatch_V, or check "
-MISFIT += "the sensors, the prior if one was given, and that this is one discharge."
+MISFIT = "The voltage of the model is farther off than noise and mismatch_V explain: fit constants to this cell (fit_cell, "
+MISFIT += (
+    "--cell), state a larger mismatch_V, or check the sensors, the prior if one was given, and that this is one discharge."
+)
 
 #: Each reason of the tables of conditions: whose, of which record, with which arguments of the calibrator.
 VERDICTS = {
