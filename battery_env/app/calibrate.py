@@ -168,7 +168,8 @@ class Settings:
         low_A, high_A = self.cell_currents_A
         if low_A / _SAME_LOAD <= current_A <= high_A * _SAME_LOAD:
             return ""
-        return Condition.OTHER_LOAD.said({"load_A": current_A, "low_A": low_A, "high_A": high_A})
+        fitted = f"{low_A:.3g}" if low_A == high_A else f"{low_A:.3g} to {high_A:.3g}"
+        return Condition.OTHER_LOAD.said({"load_A": current_A, "fitted": fitted})
 
     def methods(self, goes_on: bool) -> list[Method]:
         """What to calibrate a record by: the first one that settles it, or the last; ``goes_on``: a constant load does."""

@@ -94,8 +94,8 @@ class Condition(IntEnum):
         "it reads a straight line between them, which misleads it. Least squares and the filter take such records."
     )
     OTHER_LOAD = (
-        "The load, {load_A:.3g} A, is none of those that the constants were fitted to, {low_A:.3g} to {high_A:.3g} A, and "
-        "they hold for these: fit discharges of this load, too."
+        "The load, {load_A:.3g} A, is none of those that the constants were fitted to, {fitted} A, and they hold for these: "
+        "fit discharges of this load, too."
     )
     # faults of the samples; a stream keeps the first one in time
     RECOVERED = (
