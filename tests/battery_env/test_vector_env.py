@@ -8,11 +8,16 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
+from battery_env.calibration.aging import simulated_lives
+from battery_env.calibration.registration import TASKS
 from battery_env.calibration.task import CalibrationTask
 from battery_env.loads import RandomPiecewise
 from battery_env.trajectories import TrajectoryDataset
 
 IDS = ("BatteryQmax-v0", "BatteryRo-v0", "BatteryJoint-v0", "BatteryQmaxPaper-v0", "BatteryRoPaper-v0")
+#: All environments, with short episodes.
+CASES = [(env_id, {"episode_steps": 4}) for env_id in TASKS if env_id != "BatteryAging-v0"]
+CASES += [("BatteryAging-v0", {"cycles": 4, "decisions_per_cycle": 2})]
 # whatever draws at random
 NOISY = {"initial_perturbation": 3.0, "continue_probability": 0.5, "first_sample_probability": 0.3, "resync": 3}
 
@@ -20,6 +25,11 @@ NOISY = {"initial_perturbation": 3.0, "continue_probability": 0.5, "first_sample
 @pytest.fixture(scope="module")
 def discharges():
     return TrajectoryDataset.generate(("q_mobile", "r_o"), 6, RandomPiecewise(), seed=0, mismatch=0.1)
+
+
+@pytest.fixture(scope="module")
+def lives():
+    return simulated_lives(3, 4, seed=0)
 
 
 def make_pair(env_id, mode, cells=3, **options):
@@ -48,10 +58,9 @@ def assert_same_infos(found, expected, mask=None):
 
 
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-@pytest.mark.parametrize("options", [{}, NOISY], ids=["plain", "noisy"])
-@pytest.mark.parametrize("env_id", IDS)
-def test_a_batch_makes_the_episodes_of_scalar_environments_to_the_bit(env_id, options, mode, discharges):
-    batch, sync = make_pair(env_id, mode, episode_steps=4, dataset=discharges, **options)
+@pytest.mark.parametrize(("env_id", "options"), [*CASES, *((env_id, {"episode_steps": 4} | NOISY) for env_id in IDS)])
+def test_a_batch_makes_the_episodes_of_scalar_environments_to_the_bit(env_id, options, mode, discharges, lives):
+    batch, sync = make_pair(env_id, mode, dataset=lives if env_id == "BatteryAging-v0" else discharges, **options)
     assert (batch.observation_space, batch.action_space) == (sync.observation_space, sync.action_space)
     assert batch.metadata["autoreset_mode"] is mode and batch.metadata["discount"] == 0.8
     sync.action_space.seed(0)

@@ -10,7 +10,6 @@ from battery_env.calibration.aging import BatteryAging, simulated_lives
 from battery_env.calibration.env import CalibrationEnv
 from battery_env.calibration.full_state_tasks import BatteryQmax
 from battery_env.calibration.readings import Readings
-from battery_env.calibration.vector_env import CalibrationVectorEnv
 from battery_env.calibration.voltage import ESTIMATE_RANGES, LARGEST_STEPS
 from battery_env.calibration.voltage_tasks import BatteryVoltageJoint, BatteryVoltageQmax, BatteryVoltageRo
 from battery_env.cells import Discharge, load_nasa_discharges
@@ -204,23 +203,6 @@ class TestEnvironments:
         assert env.action_space.shape == (actions,)
         check_env(env, skip_render_check=True)
 
-    def test_one_cell_and_many_make_the_same_episodes(self, kind, actions, data):
-        many = CalibrationVectorEnv(kind, num_envs=3, dataset=data)
-        singles = [CalibrationEnv(kind, dataset=data) for _ in range(3)]
-        observation, _ = many.reset(seed=7)
-        for k, env in enumerate(singles):
-            np.testing.assert_array_equal(env.reset(seed=7 + k)[0], observation[k])
-        rng = np.random.default_rng(0)
-        for _ in range(6):
-            action = rng.uniform(-1.0, 1.0, (3, actions)).astype(np.float32)
-            observation, reward, _, _, info = many.step(action)
-            for k, env in enumerate(singles):
-                alone, alone_reward, _, _, alone_info = env.step(action[k])
-                np.testing.assert_array_equal(alone, observation[k])
-                assert alone_reward == reward[k]
-                for name in ("q_mobile", "r_o_hat", "voltage", "soc"):
-                    assert alone_info[name] == info[name][k]
-
     def test_reset_options(self, kind, actions, data):
         env = CalibrationEnv(kind, dataset=data)
         name = env.task.parameters[0]
@@ -325,15 +307,6 @@ class TestAging:
                 scaled = 2.0 * (carried - LOW) / (HIGH - LOW) - 1.0
                 np.testing.assert_allclose(task.observation()[:, -2:], scaled, atol=1e-6)
         assert task.truncated().all()
-
-    def test_same_seed_same_life(self, lives):
-        many, one = (BatteryAging(cells, dataset=lives, cycles=4, decisions_per_cycle=3) for cells in (3, 1))
-        many.start(np.arange(3), generators(3))
-        one.start(np.arange(1), generators(3)[1:2])
-        for _ in range(12):
-            np.testing.assert_array_equal(many.observation()[1], one.observation()[0])
-            many.advance(np.full((3, 2), 0.1))
-            one.advance(np.full((1, 2), 0.1))
 
     def test_environment(self, lives):
         env = CalibrationEnv(BatteryAging, dataset=lives, cycles=4, decisions_per_cycle=2)
