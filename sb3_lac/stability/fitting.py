@@ -277,7 +277,7 @@ class _Data:
         rows[episode, step] = np.arange(len(costs))
         inputs = flatten(roll_outs.observations)
         mean, scale = inputs.mean(axis=0), np.maximum(inputs.std(axis=0), 1e-6)
-        # Not in what is learned from: its weights stay as they are drawn
+        # Nothing is learned of a number that is the same in all these states, whatever it is in the last observations
         scale[inputs.min(axis=0) == inputs.max(axis=0)] = np.inf
         if roll_outs.last_observations is not None:
             inputs = np.concatenate([inputs, flatten(roll_outs.last_observations)])
