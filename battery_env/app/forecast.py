@@ -8,6 +8,7 @@ import math
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -149,14 +150,15 @@ def _largest_A(load: FutureLoad) -> float:
     """The largest current of a load to come; 0 of one that is no known current."""
     if isinstance(load, Load):
         return float(load.value.max()) if load.unit == "current" else 0.0
-    return float(load) if isinstance(load, int | float) else 0.0
+    return float(load) if isinstance(load, Real) else 0.0
 
 
 def _notes(discharge: Discharge, found: Calibration, other_load: str) -> Iterator[str]:
     """What a forecast from this calibration rests on, beyond its record."""
-    if other_load:
-        yield other_load
     assert found.record is not None
+    # which is said where the load so far is another one, too
+    if other_load not in found.reason:
+        yield other_load
     settings, seen_s = found.settings, float(found.record.time_s[-1])
     if float(discharge.time_s[-1]) > seen_s:
         yield f"What was recorded after the last sample under load, at {seen_s:.0f} s, is left out."
