@@ -123,11 +123,9 @@ def plot_true_against_inferred(scores: Mapping[str, pd.DataFrame], parameter: st
 
 def coloured(things: Iterable[Thing]) -> Iterator[tuple[str, Thing]]:
     """
-    Things to draw side by side, each after its colour.
-
-    :param things: names, or tuples that start with their name. The first with a name of :data:`COLOUR_OF` has its colour; all
-        others have those of :data:`COLOURS` that are left, which come again when they are used up
-    :yields: a colour and the thing
+    Things to draw side by side, names or tuples that start with one, each after its colour. The first with a name of
+    :data:`COLOUR_OF` has its colour; all others have those of :data:`COLOURS` that are left, which come again when they are
+    used up.
     """
     listed = list(things)
     own = [_own_colour(thing) for thing in listed]

@@ -237,15 +237,7 @@ class Settings:
 
 
 def quantity(text: str = "", unit: str = "", digits: int = 0, scale: float = 1.0) -> Any:
-    """
-    A column of the table of estimates. Its name ends with its unit; for readers it has another one.
-
-    :param text: what readers know it by
-    :param unit: for readers
-    :param digits: after the point
-    :param scale: from the unit of the column to that of the readers
-    :return: a field of :class:`Calibration`
-    """
+    """A column of the table of estimates: its name and unit for readers, digits, and the scale to that unit."""
     return field(metadata={"text": text, "unit": f" {unit}" if unit else "", "digits": digits, "scale": scale})
 
 

@@ -411,13 +411,7 @@ def _settings(options: argparse.Namespace) -> Settings:
 
 @_ending
 def fit(arguments: Sequence[str] | None = None, name: str = "python -m battery_env fit") -> int:
-    """
-    The command ``fit``.
-
-    :param arguments: as in :func:`main`, without the name of the command
-    :param name: of the program, for its help
-    :return: 0, 3 if there is doubt about the fit, or 2 if nothing was fitted; a line on standard error says why
-    """
+    """The command ``fit``; its exit status is 3 if there is doubt about the fit."""
     options = _fit_parser(name).parse_args(arguments)
     out: Path = options.out
     picture = out.with_suffix(".png")
@@ -444,13 +438,7 @@ def fit(arguments: Sequence[str] | None = None, name: str = "python -m battery_e
 
 @_ending
 def forecast(arguments: Sequence[str] | None = None, name: str = "python -m battery_env forecast") -> int:
-    """
-    The command ``forecast``.
-
-    :param arguments: as in :func:`main`, without the name of the command
-    :param name: of the program, for its help
-    :return: 0, 3 if something in the record contradicts the estimate, or 2 if there is none; a line on standard error says why
-    """
+    """The command ``forecast``; its exit status is 3 if something in the record contradicts the estimate."""
     options = _forecast_parser(name).parse_args(arguments)
     from battery_env.app.forecast import EndFiles, end_of_record  # here, as matplotlib takes long to import
 

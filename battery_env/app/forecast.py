@@ -197,14 +197,7 @@ def read_load(path: str | Path) -> Load:
 
 
 def read_running(argument: str, file_format: FileFormat) -> tuple[Source, Discharge]:
-    """
-    Read a discharge in progress; of a file that holds several the last one.
-
-    :param argument: file, ``FILE:CYCLE`` or a bundled cell's, as on the command line
-    :param file_format: how
-    :return: where it comes from, and the discharge
-    :raises ValueError: if there is none
-    """
+    """Read a discharge in progress; of a file that holds several the last one."""
     sources = find_sources([argument])
     if len(sources) > 1:
         raise ValueError(f"{argument} holds {len(sources)} files: name the one in progress, and the others with --life")
@@ -216,12 +209,6 @@ def read_life(arguments: Sequence[str], running: Source, file_format: FileFormat
     """
     Read the discharges of a cell before the one in progress, up to it where it is among them. All that is named counts as of
     one cell: of several folders with a warning. What cannot be read is left out with a warning.
-
-    :param arguments: files, folders or bundled cells, in their order
-    :param running: the one in progress
-    :param file_format: how
-    :return: the discharges
-    :raises ValueError: if there are none
     """
     discharges: list[Discharge] = []
     sources = find_sources(arguments)
@@ -254,15 +241,8 @@ def end_of_record(
     argument: str, settings: Settings, file_format: FileFormat, life: Sequence[str] = (), load: Path | None = None
 ) -> End:
     """
-    The end of a discharge in a file.
-
-    :param argument: the discharge in progress, as :func:`read_running` takes it
-    :param settings: how to look at it; the discharges before start full
-    :param file_format: of all records
-    :param life: where the discharges before are, as :func:`read_life` takes them; none: their life is not known
-    :param load: file of the load to come, as :func:`read_load` takes it; ``None``: as so far
-    :return: the end, and what it rests on
-    :raises ValueError: if something of it cannot be used
+    The end of a discharge in a file, as the command line names it, the discharges before it (none: their life is not known)
+    and the load to come (``None``: as so far).
     """
     to_come = None if load is None else read_load(load)
     source, running = read_running(argument, file_format)
@@ -287,14 +267,7 @@ def end_of_record(
 
 
 def has_usual_load(life: Life, running: Discharge, load: Load | None) -> bool:
-    """
-    Whether a discharge has the constant load of its cell's life, so far and afterwards.
-
-    :param life: of the cell before
-    :param running: the discharge so far
-    :param load: the load to come; ``None``: as so far
-    :return: whether all these currents lie within 5 % of the largest
-    """
+    """Whether a discharge has the constant load of its cell's life within 5 %, so far and under the load to come."""
     if load is not None and load.unit != "current":
         return False
     usual_A = life.table["mean_current_A"][life.table["valid"]].iloc[-1]
@@ -304,13 +277,7 @@ def has_usual_load(life: Life, running: Discharge, load: Load | None) -> bool:
 
 
 class EndFiles:
-    """
-    The files that an end is written to.
-
-    :param folder: for both
-    :param argument: the discharge in progress
-    :raises FileExistsError: if one is there already
-    """
+    """The files that an end is written to, refused if they are there already."""
 
     def __init__(self, folder: Path, argument: str) -> None:
         (source,) = find_sources([argument])[:1]

@@ -164,15 +164,7 @@ def read_source(source: Source, file_format: FileFormat) -> list[Recording]:
 
 
 class Results:
-    """
-    The files that results are written to.
-
-    :param folder: for all of them
-    :param sources: what is calibrated
-    :param with_voltages: whether the voltages of each discharge are written, as a table and a figure
-    :param replace: whether files of an earlier run may be replaced
-    :raises FileExistsError: if there are some, and may not
-    """
+    """The files that results are written to, refused if they are there already and may not be replaced."""
 
     def __init__(self, folder: Path, sources: Sequence[Source], with_voltages: bool, replace: bool) -> None:
         self.folder, self.with_voltages = folder, with_voltages
@@ -270,13 +262,8 @@ class InThisProcess(Executor):
 @contextmanager
 def workers(jobs: int = 1, scheduler: str | None = None) -> Iterator[Executor]:
     """
-    What makes calls side by side. When the block is left, what has not begun is not begun any more.
-
-    :param jobs: processes of this machine; -1: one a core
-    :param scheduler: address of a Dask cluster that is to make them instead
-    :yields: the executor
-    :raises ImportError: for a cluster, if Dask is not installed
-    :raises OSError: if no scheduler answers
+    What makes calls side by side, in processes of this machine or on a Dask cluster. When the block is left, what has not
+    begun is not begun any more.
     """
     if scheduler is not None:
         try:

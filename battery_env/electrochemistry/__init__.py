@@ -27,7 +27,7 @@ One compiled kernel (numba) serves one cell and a million: every public function
 """
 
 from battery_env.arrays import FloatArray
-from battery_env.checks import LOAD_LIMITS, LOAD_UNIT_SYMBOLS, LoadUnit, check_load
+from battery_env.checks import LoadUnit
 from battery_env.electrochemistry.cell import (
     FULL_CHARGE_SHARES,
     NEW_CELL,
@@ -63,8 +63,6 @@ from battery_env.electrochemistry.simulation import (
 
 __all__ = [
     "FULL_CHARGE_SHARES",
-    "LOAD_LIMITS",
-    "LOAD_UNIT_SYMBOLS",
     "NEW_CELL",
     "QNB",
     "QNS",
@@ -85,7 +83,6 @@ __all__ = [
     "advance_in_place",
     "check_cell",
     "check_dt",
-    "check_load",
     "initial_state",
     "reached_s",
     "rest_shares",

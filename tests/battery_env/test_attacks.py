@@ -11,6 +11,7 @@ from __future__ import annotations
 import sys
 import warnings
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 import pandas as pd
@@ -126,35 +127,24 @@ def simulated(rng: np.random.Generator, soc: float = 1.0, rest_s: int = 0) -> Ca
     return Case(record.time_s, voltage_V, record.current_A, q_mobile, r_o, recorded=False)
 
 
-_WHOLE: dict[tuple[str, int], Case] = {}
+discharges = cache(load_nasa_discharges)
 
 
-def recorded(rng: np.random.Generator, cells: tuple[str, ...]) -> Case:
+@cache
+def recorded(cell: str, n: int) -> Case:
     """A bundled discharge, with what least squares find in the whole of it as the truth."""
-    cell, n = str(rng.choice(cells)), int(rng.integers(0, 168))
-    if (cell, n) not in _WHOLE:
-        part = discharges(cell)[n].loaded_part(2.7)
-        estimate = LeastSquares(thermal=True, mismatch_V=0.05).estimate(part)
-        sd = {name: getattr(estimate, name) for name in ("sd_q_mobile", "sd_r_o")}
-        _WHOLE[cell, n] = Case(
-            part.time_s, part.voltage_V, part.current_A, estimate.q_mobile, estimate.r_o, recorded=True, cell=cell, **sd
-        )
-    return _WHOLE[cell, n]
-
-
-_CELLS: dict[str, list[Discharge]] = {}
-
-
-def discharges(cell: str) -> list[Discharge]:
-    """Read once."""
-    if cell not in _CELLS:
-        _CELLS[cell] = load_nasa_discharges(cell)
-    return _CELLS[cell]
+    part = discharges(cell)[n].loaded_part(2.7)
+    estimate = LeastSquares(thermal=True, mismatch_V=0.05).estimate(part)
+    sd = {name: getattr(estimate, name) for name in ("sd_q_mobile", "sd_r_o")}
+    return Case(part.time_s, part.voltage_V, part.current_A, estimate.q_mobile, estimate.r_o, recorded=True, cell=cell, **sd)
 
 
 def drawn(rng: np.random.Generator, cells: tuple[str, ...]) -> Case:
     """A record, whole or in progress."""
-    case = recorded(rng, cells) if cells and rng.random() < 0.3 else simulated(rng)
+    if cells and rng.random() < 0.3:
+        case = recorded(str(rng.choice(cells)), int(rng.integers(0, 168)))
+    else:
+        case = simulated(rng)
     if rng.random() < 0.3:
         case = case.part(0, max(int(rng.uniform(0.2, 0.95) * len(case.time_s)), 12))
     return case
@@ -236,9 +226,7 @@ def paths(estimator: object) -> dict[str, object]:
         return estimate
 
     def trace(record: Discharge | Case) -> Estimate:
-        found = estimator.trace([record])[0]
-        names = ("q_mobile", "r_o", "sd_q_mobile", "sd_r_o", "settled", "reason")
-        return Estimate(*(getattr(found, name)[-1] for name in names))
+        return last_estimate(estimator.trace([record])[0])
 
     known = {"whole": estimator.estimate, "trace": trace, "stream": stream}
     return known if isinstance(estimator, OnlineEstimator) else {"whole": estimator.estimate}

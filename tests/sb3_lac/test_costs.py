@@ -91,15 +91,16 @@ def test_nothing_to_warn_of(make_model, make_env, env, kwargs):
     assert warnings_of(make_model(make_env(**{"episode_length": 5, **env}), n_collect=0, **kwargs)) == []
 
 
-def test_termination_with_a_price_does_not_warn(make_model, make_env):
-    # More than the dearest step, whose state is (10, 10) at most
-    env = Priced(make_env(episode_length=5, terminate=True), 200.0)
-    assert warnings_of(make_model(env, n_collect=0)) == []
-
-
-def test_steps_that_cost_nothing_do_not_warn(make_model, make_env):
-    env = gym.wrappers.TransformReward(make_env(episode_length=5, terminate=True), lambda reward: 0.0)
-    assert warnings_of(make_model(env, n_collect=0)) == []
+@pytest.mark.parametrize(
+    "wrapped",
+    [
+        # a price of more than the dearest step, whose state is (10, 10) at most; steps that cost nothing
+        lambda env: Priced(env, 200.0),
+        lambda env: gym.wrappers.TransformReward(env, lambda reward: 0.0),
+    ],
+)
+def test_ends_with_a_price_and_free_steps_do_not_warn(make_model, make_env, wrapped):
+    assert warnings_of(make_model(wrapped(make_env(episode_length=5, terminate=True)), n_collect=0)) == []
 
 
 @pytest.mark.parametrize(
