@@ -29,7 +29,7 @@ class LyapunovCritic(BaseModel):
     Each network maps state and action to the fourth root ``f(s, a)`` of what ``L`` is above its floor, about the value of the
     loop at rest: ``L = offset + floor + sign(f) |f|^4``.
 
-    Costs of a loop that settles fade over orders of magnitude. A relative error of ``L`` counts a thousand times more at a
+    Costs of a loop that settles fade over orders of magnitude. A relative error of ``L`` is a thousand times larger at a
     thousand times the cost, and one of ``f`` less than six times. The unit of the costs is nothing but a factor of ``f``. With
     noise ``L`` is biased low: the root of a mean is larger than the mean of the roots.
 

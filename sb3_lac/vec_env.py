@@ -51,7 +51,9 @@ class GymnasiumVecEnv(VecEnv):
 
     def reset(self) -> VecEnvObs:
         if any(options != self._options[0] for options in self._options):
-            raise ValueError(f"A vector environment takes the same options for all its environments, not {self._options}.")
+            raise ValueError(
+                f"A vector environment takes the same options for all its environments, not {self._options}: use make_vec_env."
+            )
         # Seeds count up from the first one, as in Gymnasium
         observations, infos = self.env.reset(seed=self._seeds[0], options=self._options[0] or None)
         self.reset_infos = _unbatched(infos, self._all)

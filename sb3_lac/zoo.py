@@ -22,6 +22,7 @@ import runpy
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -114,8 +115,6 @@ def convert_lac_params(sampled_params: Hyperparams) -> Hyperparams:
     """Convert sampled values to the hyperparameters of LAC."""
     hyperparams = convert_sac_params(sampled_params)
     hyperparams["policy_kwargs"]["n_critics"] = hyperparams.pop("n_critics")
-    # Start with the full weight on the cost, as in the paper
-    hyperparams["lambda_init"] = hyperparams["lambda_max"]
     return hyperparams
 
 
@@ -132,11 +131,6 @@ def sample_lac_params(trial: optuna.Trial, n_actions: int, n_envs: int, addition
     """Sampler for LAC hyperparams."""
     own = {
         **_sample_entropy_params(trial, n_actions),
-        "lambda_learning_rate": trial.suggest_float("lambda_learning_rate", 1e-5, 0.002, log=True),
-        # Up to 1, from where the decrease condition cannot hold and lambda stays at lambda_max
-        "alpha3": trial.suggest_float("alpha3", 0.01, 1.0, log=True),
-        # Weight of the cost relative to the entropy
-        "lambda_max": trial.suggest_float("lambda_max", 0.1, 10.0, log=True),
         "n_critics": trial.suggest_categorical("n_critics", [1, 2]),
     }
     return _as_arguments(convert_lac_params(_sample(trial, own, additional_args)))
@@ -299,10 +293,9 @@ def main(args: Sequence[str] | None = None) -> None:
         known, options = defaults.parse_known_args(options)
         options += ["--algo", known.algo]
         if trains:
-            try:
+            # Algorithms without a file of ours have the RL Zoo's
+            with suppress(FileNotFoundError):
                 options += ["--conf-file", known.conf_file or str(find_config(known.algo))]
-            except FileNotFoundError as error:
-                parser.error(str(error))
     if parsed.command == "optimize":
         options += ["--optimize-hyperparameters"]
 
