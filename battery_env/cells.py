@@ -188,7 +188,8 @@ class Discharge:
             return
 
         def unexplained_V(higher: int, lower: int) -> float:
-            explained_V = most_ohm * max(float(current_A[lower] - current_A[higher]), 0.0)
+            # one of them may be logged a sample later than the other
+            explained_V = most_ohm * max(float(current_A[max(lower - 1, 0) : lower + 1].max() - current_A[higher]), 0.0)
             return float(voltage_V[higher] - voltage_V[lower]) - explained_V
 
         falls_V, returns_V = unexplained_V(begin - 1, begin), unexplained_V(back, back - 1)

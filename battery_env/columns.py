@@ -48,6 +48,7 @@ _UNITS: dict[str, dict[str, tuple[float, float]]] = {
     "current": {
         **dict.fromkeys(("a", "amp", "amps", "ampere", "amperes"), (1.0, 0.0)),
         **dict.fromkeys(("ma", "milliamp", "milliamps", "milliampere", "milliamperes"), (1e-3, 0.0)),
+        **dict.fromkeys(("ua", "µa", "μa", "microamp", "microamps"), (1e-6, 0.0)),
     },
     "temperature": _DEGREES | _KELVIN,
     "ambient": _DEGREES | _KELVIN,

@@ -288,7 +288,7 @@ class _Table:
                 f"no current flows above {REST_CURRENT_A:g} A, below which a cell rests: there is no discharge. Check its unit"
             )
         signs = self._signs_of_states()
-        if signs is not None and (current_A >= 0.0).all():
+        if signs is not None and (current_A >= -REST_CURRENT_A).all():
             self.columns["current"] = current_A * signs
             return
         if discharge_is_negative is None:
@@ -457,7 +457,7 @@ def _seconds(values: pd.Series, column: Column) -> FloatArray:
     for convert, options in readings:
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore", UserWarning)  # of a day that is no month
+                warnings.simplefilter("ignore")  # of a day that is no month, and of each row with one
                 found.append(_seconds(pd.Series(convert(text, **options), index=values.index), column))
         except ValueError:
             continue

@@ -150,7 +150,7 @@ def check_samples(time_s: ArrayLike, voltage_V: ArrayLike, current_A: ArrayLike,
     if len(stalls):
         n = stalls[0] + 1
         if time[n] == time[n - 1]:
-            advice = "Give each sample once, with a clock that tells it from the next"
+            advice = "Give each sample once, with a clock that tells it from the next, or name the column of its step"
         else:
             advice = (
                 "Sort the samples, and give one discharge at a time, or number them in a column of the cycle. A clock that "

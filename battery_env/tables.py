@@ -180,11 +180,7 @@ def _layout(head: bytes, chosen: Mapping[str, str] | None) -> _Layout:
         names, first_row = lines[number], lines[min(number + 1, len(lines) - 1)]
         delimiter = max(delimiters, key=lambda each: min(len(_fields(names, each)), len(_fields(first_row, each))))
     values = [field for line in lines[number + 1 :] for field in _fields(line, delimiter)]
-    comma = (
-        delimiter not in (",", _BLANKS)
-        and any(map(_DECIMAL_COMMA.match, values))
-        and not any(map(_DECIMAL_POINT.match, values))
-    )
+    comma = delimiter != _BLANKS and any(map(_DECIMAL_COMMA.match, values)) and not any(map(_DECIMAL_POINT.match, values))
     below = _fields(lines[number + 1], delimiter) if number + 1 < len(lines) else []
     return _Layout(encoding, number, delimiter, "," if comma else ".", _fields(lines[number], delimiter), below)
 

@@ -20,7 +20,7 @@ from battery_env.electrochemistry.cell import TB
 from battery_env.estimates import Estimate
 from battery_env.estimators.cell_fit import UNFITTED_MISMATCH_V, CellFit
 from battery_env.estimators.diagnosis import Condition
-from battery_env.estimators.gaps import NOT_DRAWN, find_gaps
+from battery_env.estimators.gaps import DRAWN, find_gaps
 from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.monitor import start_condition, watched
@@ -170,6 +170,11 @@ class Settings:
             return ""
         fitted = f"{low_A:.3g}" if low_A == high_A else f"{low_A:.3g} to {high_A:.3g}"
         return Condition.OTHER_LOAD.said({"load_A": current_A, "fitted": fitted})
+
+    def tells_new_capacity(self, current_A: float) -> bool:
+        """Whether the constants tell what a new cell yields under a load: where they were fitted to this load alone."""
+        low_A, high_A = self.cell_currents_A or (current_A, current_A)
+        return self.cell is not None and high_A <= low_A * _SAME_LOAD and not self.other_load(current_A)
 
     def methods(self, goes_on: bool) -> list[Method]:
         """What to calibrate a record by: the first one that settles it, or the last; ``goes_on``: a constant load does."""
@@ -520,7 +525,7 @@ def _is_all_logged(
 ) -> bool:
     """
     Whether all that was drawn is in the record: the cell starts, before or under the load, no lower than with this charge, no
-    sensor fails, and no gap was without a load.
+    sensor fails, and the voltage says of each gap that its charge was drawn.
     """
     begin = int(np.searchsorted(discharge.time_s, discharge.load_on_time_s, side="right")) - 1
     end = int(np.searchsorted(discharge.time_s, record.time_s[-1], side="right"))
@@ -530,13 +535,13 @@ def _is_all_logged(
     if seen["fault"]["condition"] or (is_lower and start_condition(seen, estimate.q_mobile, estimate.r_o)):
         return False
     gaps = find_gaps(record.time_s, record.voltage_V, record.current_A, forecast.at_samples_V, estimate.q_mobile)
-    return all(gap.verdict != NOT_DRAWN for gap in gaps)
+    return all(gap.verdict == DRAWN for gap in gaps)
 
 
 def _nominal_Ah(model: RecordModel, settings: Settings, load_A: float) -> float:
     if settings.nominal_Ah is not None:
         return settings.nominal_Ah
-    if settings.cell is None or not load_A > 0.0 or settings.other_load(load_A):
+    if not load_A > 0.0 or not settings.tells_new_capacity(load_A):
         return float("nan")
     # the cell is empty by then
     return model.capacity_Ah(load_A, "current", settings.cut_off_V, model.cell.q_mobile / load_A + model.dt_s)

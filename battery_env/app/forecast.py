@@ -139,17 +139,18 @@ def _forecast(
         nominal_Ah=settings.nominal_Ah,
         samples=samples,
     )
-    other_load = settings.other_load(found.future_current_A if load is None else _largest_A(load))
+    load_A = found.future_current_A if load is None else _largest_A(load, settings.cut_off_V)
+    other_load = settings.other_load(load_A)
     # a cell of which nothing is known has no health
-    is_known = settings.nominal_Ah is not None or (settings.cell is not None and not other_load)
+    is_known = settings.nominal_Ah is not None or settings.tells_new_capacity(load_A)
     nominal_Ah = expected.nominal_Ah if is_known else float("nan")
     return found, replace(expected, nominal_Ah=nominal_Ah, notes=(*expected.notes, *_notes(discharge, found, other_load)))
 
 
-def _largest_A(load: FutureLoad) -> float:
-    """The largest current of a load to come; 0 of one that is no known current."""
+def _largest_A(load: FutureLoad, cut_off_V: float) -> float:
+    """The largest current of a load to come, of a power that at the cut-off; 0 of one that is not known."""
     if isinstance(load, Load):
-        return float(load.value.max()) if load.unit == "current" else 0.0
+        return float(load.value.max()) / (1.0 if load.unit == "current" else cut_off_V)
     return float(load) if isinstance(load, Real) else 0.0
 
 

@@ -46,7 +46,8 @@ _SCALE_UNKNOWN = (
 )
 _IMPRECISE_Q = (
     "q_mobile is not known to 2 % yet: the voltage shows it at the knee of the discharge, the more the lower the record goes. "
-    "To the same cut-off, a smaller load or constants of the cell itself (fit_cell, --cell) tell more."
+    "To the same cut-off, a smaller load or constants that were fitted to more of a life of this cell (fit_cell, --cell) tell "
+    "more."
 )
 _IMPRECISE_R = (
     "r_o is not known to 30 %: the error expected of noise and model, divided by the current, is larger. A larger current, or "
@@ -84,7 +85,7 @@ class Condition(IntEnum):
     START_ABOVE = (
         "The record starts at {first_V:.2f} V, above the {rest_V:.2f} V of {expected}: another kind of cell or sensor."
     )
-    START_BELOW = "The record starts at rest at {first_V:.2f} V, where {expected} shows {rest_V:.2f} V. {start_advice}"
+    START_BELOW = "The record starts at {first_V:.2f} V, where {expected} at rest shows {rest_V:.2f} V. {start_advice}"
     START_LOADED = (
         "The record starts under load at {first_V:.2f} V, which need not be that of {expected}: it rests at {rest_V:.2f} V "
         "then. {start_advice}"

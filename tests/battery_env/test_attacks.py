@@ -349,7 +349,7 @@ def test_no_estimator_settles_on_a_start_that_is_not_full_and_that_nobody_told(m
     case = simulated(np.random.default_rng(int(100 * soc)), soc, rest_s=120)
     for record in (case, case.part(119, len(case.time_s))):
         estimate = make(record)
-        assert not estimate.settled and estimate.reason.startswith("The record starts at rest at")
+        assert not estimate.settled and estimate.reason.startswith("The record starts at")
     late = case.part(130, len(case.time_s))
     assert not make(late).settled
 

@@ -20,6 +20,7 @@ from battery_env import (
     forecast,
     load_nasa_discharges,
 )
+from battery_env import loads as known_loads
 from battery_env.app.calibrate import METHODS, Settings, calibrate
 from battery_env.app.forecast import forecast_end
 from battery_env.calibration.pretrained import pretrained_card
@@ -278,6 +279,11 @@ class TestFiles:
             assert bool(expected.nominal_Ah > 0.0)
             expected = forecast_end(running, settings, load=2.0 * high_A, samples=10)
             assert any("is none of those" in note for note in expected.notes) and np.isnan(expected.nominal_Ah)
+            expected = forecast_end(running, settings, load=known_loads.constant(4.0 * high_A, "power"), samples=10)
+            assert any("is none of those" in note for note in expected.notes) and np.isnan(expected.nominal_Ah)
+            # of several loads, the new cell is that of one
+            of_several = dataclasses.replace(settings, cell_currents_A=(0.5 * low_A, high_A))
+            assert np.isnan(calibrate(record, of_several).nominal_Ah)
 
     @pytest.mark.parametrize("method", [method for method in METHODS if method != "policy"])
     def test_settings_use_all_that_a_fit_knows(self, method, fit):

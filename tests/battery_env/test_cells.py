@@ -120,6 +120,11 @@ class TestDischarge:
                 with pytest.raises(ValueError, match=message):
                     method(Discharge(time_s, wild, current_A), 2.7)
 
+    def test_a_load_that_is_logged_a_sample_early_explains_the_voltage_after_it(self):
+        current_A = np.array([0.0, *[2.0] * 8, 0.2, 0.2, 0.2])
+        voltage_V = np.array([4.2, *np.linspace(3.5, 2.74, 8), 2.68, 2.78, 2.80])
+        assert Discharge(np.arange(12.0), voltage_V, current_A).eod_time_s(2.7) == pytest.approx(8.7, abs=0.05)
+
     def test_the_end_under_a_heavy_load_is_an_end_though_the_voltage_comes_back(self):
         time_s = 10.0 * np.arange(40)
         current_A = np.where(np.arange(40) < 2, 0.0, np.where(np.arange(40) % 10 == 9, 6.0, 1.0))

@@ -281,7 +281,7 @@ def test_the_version_is_that_of_the_package(capsys):
 @pytest.mark.parametrize("method", ["least-squares", "kalman"])
 @pytest.mark.parametrize(
     ("first", "more", "reason"),
-    [(0, [], "starts at rest at 3.94 V"), (400, ["--initial-soc", "rest"], "does not start with a minute at rest")],
+    [(0, [], "starts at 3.94 V"), (400, ["--initial-soc", "rest"], "does not start with a minute at rest")],
 )
 def test_no_capacity_is_stated_where_the_cell_did_not_start_full(first, more, reason, method, tmp_path, terminal):
     load_A = np.append(np.zeros(120), np.full(3000, 2.0))

@@ -1,5 +1,6 @@
 """Files as testers and people write them, and as a new user would get them wrong."""
 
+import dataclasses
 import gzip
 import re
 import sys
@@ -125,6 +126,22 @@ def test_the_encoding_of_a_long_file_is_told(encoding, tmp_path):
     (tmp_path / "cell.csv").write_text(text, encoding=encoding)
     assert len(text) > 2**18
     check(one(tmp_path / "cell.csv"))
+
+
+def test_decimal_commas_in_quotes_microamperes_and_days_are_read(tmp_path):
+    lines = [
+        f'1d {clock(time_s)},"{voltage_V:.6f}","{1e6 * current_A:.1f}"'.replace(".", ",")
+        for time_s, voltage_V, current_A in zip(TIME_S, VOLTAGE_V, CURRENT_A, strict=True)
+    ]
+    (tmp_path / "cell.csv").write_text("\n".join(["time,voltage (V),current (µA)", *lines]).replace(",000,", ".000,"))
+    discharge = one(tmp_path / "cell.csv")
+    check(dataclasses.replace(discharge, time_s=discharge.time_s - 86400.0))
+
+
+def test_an_unsigned_current_takes_its_sign_from_the_states_though_a_rest_is_noisy(tmp_path):
+    noisy_A = np.where(LOADED, np.abs(CURRENT_A), -2e-4)
+    path = own(tmp_path / "cell.csv", current_A=noisy_A, State=np.where(LOADED, "CC_DChg", "Rest"))
+    np.testing.assert_allclose(one(path).current_A[LOADED], CURRENT_A[LOADED])
 
 
 @pytest.mark.parametrize("comments", ["# ", ""])

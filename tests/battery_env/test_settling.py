@@ -85,11 +85,11 @@ MISFIT += (
 #: Each reason of the tables of conditions: whose, of which record, with which arguments of the calibrator.
 VERDICTS = {
     "above full": (BOTH, replace(REAL, voltage_V=REAL.voltage_V + 0.15), {}, "The record starts at 4.35 V, above the 4.19 V"),
-    "not full": (BOTH, LOW, {}, "The record starts at rest at 4.00 V, where a full cell shows 4.19 V. Give the whole"),
-    "not full, rest cut off": (BOTH, LOW.loaded_part(2.7), {}, "The record starts at rest at 4.00 V"),
+    "not full": (BOTH, LOW, {}, "The record starts at 4.00 V, where a full cell at rest shows 4.19 V. Give the whole"),
+    "not full, rest cut off": (BOTH, LOW.loaded_part(2.7), {}, "The record starts at 4.00 V"),
     "wrong initial charge": (
         BOTH, discharged(initial=initial_state(soc=0.7)), {"initial_soc": 0.85},
-        "The record starts at rest at 3.83 V, where a cell with 85% of its charge shows 4.03 V",
+        "The record starts at 3.83 V, where a cell with 85% of its charge at rest shows 4.03 V",
     ),
     "late start": (BOTH, changed(WHOLE, slice(300, None), rested=False), {}, "The record starts under load at 3."),
     "forgotten reset": (("filter",), TWICE, {}, "The voltage comes back to that of the start at 2882 s"),
@@ -127,6 +127,10 @@ VERDICTS = {
     "switched meanwhile": (
         BOTH, lost(discharged(np.where(SECONDS < 1500, 2.0, 1.0), noise_V=0.003), 1400.0, 1700.0), {},
         "No sample lies between 1400 s and 1701 s, and the voltage does not tell whether the load was on",
+    ),
+    "pulses meanwhile": (
+        BOTH[:1], lost(discharged(pulsed(30, 60, 3.0, 0.3), noise_V=0.002), 1504.0, 1804.0), {"mismatch_V": 0.02},
+        "No sample lies between 1504 s and 1805 s, and the voltage does not tell whether the load was on",
     ),
     "half a discharge": (BOTH, changed(WHOLE, slice(1400)), {}, "q_mobile is not known to 2 % yet: the voltage shows it at"),
     "a small current": (BOTH, discharged(0.5), {}, "r_o is not known to 30 %: the error expected of noise and model"),
