@@ -428,9 +428,10 @@ def _numbers(values: pd.Series, column: Column) -> FloatArray:
     numbers = pd.to_numeric(values, errors="coerce")
     bad = values[numbers.isna() & values.notna()]
     if len(bad):
-        text, advice = str(bad.iloc[0]), ""
-        if _THOUSANDS.match(text):
-            advice = ". Write numbers without separators of thousands"
+        advice, thousands = "", bad[bad.astype(str).str.match(_THOUSANDS)]
+        if len(thousands):
+            advice, bad = ". Write numbers without separators of thousands", thousands
+        text = str(bad.iloc[0])
         raise ValueError(f"the column {column.name!r} must hold numbers, got {text!r} in row {bad.index[0] + 1}{advice}")
     return numbers.to_numpy(dtype=np.float64)
 
