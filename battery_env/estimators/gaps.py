@@ -96,9 +96,9 @@ def find_gaps(
             continue
         said = _said(n, usual_s, time_s, voltage_V - model_V, float(model_V[n] - model_V[n + 1]))
         # one that varies beside the gap, over as long as the gap, varied in it
-        first = max(int(np.searchsorted(time_s, time_s[n] - step_s[n])), 1)
+        first = max(int(np.searchsorted(time_s, time_s[n] - step_s[n])), min(n, 1))
         last = int(np.searchsorted(time_s, time_s[n + 1] + step_s[n], side="right"))
-        if np.ptp(current_A[min(first, n) : last]) > SWITCH_SHARE * load_A:
+        if np.ptp(current_A[first:last]) > SWITCH_SHARE * load_A:
             said = UNSURE  # the load was switched, nobody knows when
         gaps.append(Gap(float(time_s[n]), float(time_s[n + 1]), float(charge_C), said))
     return gaps

@@ -20,7 +20,6 @@ from battery_env import (
     forecast,
     load_nasa_discharges,
 )
-from battery_env import loads as known_loads
 from battery_env.app.calibrate import METHODS, Settings, calibrate
 from battery_env.app.forecast import forecast_end
 from battery_env.calibration.pretrained import pretrained_card
@@ -34,6 +33,7 @@ from battery_env.estimators.cell_fit import (
     read_cell,
     with_equilibrium,
 )
+from battery_env.loads import constant as constant_load
 from battery_env.plotting import plot_cell_fit
 
 FIELDS = ("cell", "constants", "discharges", "mismatch_V", "thermal")
@@ -279,7 +279,7 @@ class TestFiles:
             assert bool(expected.nominal_Ah > 0.0)
             expected = forecast_end(running, settings, load=2.0 * high_A, samples=10)
             assert any("is none of those" in note for note in expected.notes) and np.isnan(expected.nominal_Ah)
-            expected = forecast_end(running, settings, load=known_loads.constant(4.0 * high_A, "power"), samples=10)
+            expected = forecast_end(running, settings, load=constant_load(4.0 * high_A, "power"), samples=10)
             assert any("is none of those" in note for note in expected.notes) and np.isnan(expected.nominal_Ah)
             # of several loads, the new cell is that of one
             of_several = dataclasses.replace(settings, cell_currents_A=(0.5 * low_A, high_A))
