@@ -31,6 +31,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 from gymnasium.vector import AutoresetMode
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.utils import LinearSchedule
@@ -51,6 +52,9 @@ except ImportError as error:
     raise ImportError("sb3_lac.zoo needs the RL Zoo, install it with: pip install 'sb3_lac[zoo]'") from error
 
 from sb3_lac import LAC, DashboardCallback, GymnasiumVecEnv
+
+#: The algorithms that the RL Zoo gets from this package
+ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"lac": LAC}
 
 # What a sampler of the RL Zoo returns, and what it gets: see ``HYPERPARAMS_SAMPLER``
 Hyperparams = dict[str, Any]
@@ -169,13 +173,13 @@ def steps_as_one_batch(spec: EnvSpec) -> bool:
 class LACExperimentManager(ExperimentManager):
     """
     Experiment manager that steps all copies of an environment by one call where it can, understands schedules like
-    ``lin_5e-5`` for the learning rate of lambda, and refuses trainings without an update. The hyperparameters of LAC are
-    those of ``find_config()`` by default. Logs for TensorBoard are a comparison (see ``DashboardCallback``). Trials of a
+    ``lin_5e-5`` for all learning rates, and refuses trainings without an update. The hyperparameters of LAC are those of
+    ``find_config()`` by default. Logs for TensorBoard are a comparison (see ``DashboardCallback``). Trials of a
     search are scored on held-out discharges where the environment is one of battery_env.
     """
 
     def __init__(self, args: argparse.Namespace, algo: str, env_id: str, *others: Any, **options: Any) -> None:
-        if algo == "lac" and options.get("config") is None:
+        if algo in ALGORITHMS and options.get("config") is None:
             options["config"] = str(find_config(algo))
         super().__init__(args, algo, env_id, *others, **options)
         if self.optimize_hyperparameters and "battery_env." in self.entry_point(env_id) and self._eval_env_kwargs_args is None:
@@ -225,15 +229,16 @@ class LACExperimentManager(ExperimentManager):
     @staticmethod
     def _preprocess_schedules(hyperparams: dict[str, Any]) -> dict[str, Any]:
         hyperparams = ExperimentManager._preprocess_schedules(hyperparams)
-        if hyperparams.get("lambda_learning_rate") is not None:
-            schedule = ExperimentManager._preprocess_schedules({"learning_rate": hyperparams["lambda_learning_rate"]})
-            hyperparams["lambda_learning_rate"] = schedule["learning_rate"]
+        # Those of single networks and multipliers
+        for name, rate in hyperparams.items():
+            if name.endswith("_learning_rate") and rate is not None:
+                hyperparams[name] = ExperimentManager._preprocess_schedules({"learning_rate": rate})["learning_rate"]
         return hyperparams
 
 
-rl_zoo3.ALGOS["lac"] = LAC
-HYPERPARAMS_SAMPLER["lac"] = sample_lac_params
-HYPERPARAMS_CONVERTER["lac"] = convert_lac_params
+rl_zoo3.ALGOS.update(ALGORITHMS)
+HYPERPARAMS_SAMPLER.update(dict.fromkeys(ALGORITHMS, sample_lac_params))
+HYPERPARAMS_CONVERTER.update(dict.fromkeys(ALGORITHMS, convert_lac_params))
 rl_zoo3.train.ExperimentManager = LACExperimentManager  # type: ignore[misc]
 
 

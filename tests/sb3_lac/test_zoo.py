@@ -184,6 +184,24 @@ def test_other_algorithms_and_configs_can_be_chosen(workdir, monkeypatch):
     ]
 
 
+def test_all_learning_rates_take_schedules():
+    rates = LACExperimentManager._preprocess_schedules({"critic_learning_rate": "lin_1e-3", "lambda_learning_rate": None})
+    assert rates["critic_learning_rate"](0.5) == 5e-4 and rates["lambda_learning_rate"] is None
+
+
+def test_another_algorithm_of_the_package_needs_a_file_only(workdir, monkeypatch):
+    class OtherLAC(LAC):
+        pass
+
+    monkeypatch.setitem(zoo.ALGORITHMS, "other_lac", OtherLAC)
+    monkeypatch.setitem(rl_zoo3.ALGOS, "other_lac", OtherLAC)
+    with pytest.raises(FileNotFoundError, match=r"there is no .*zoo_configs/other_lac\.yml"):
+        main(["train", "--algo", "other_lac", "--env", ENV, "--eval-freq", "-1"])
+    (workdir / "zoo_configs" / "lac.yml").rename(workdir / "zoo_configs" / "other_lac.yml")
+    main(["train", "--algo", "other_lac", "--env", ENV, "--eval-freq", "-1"])
+    assert OtherLAC.load(workdir / "logs" / "other_lac" / f"{ENV}_1" / f"{ENV}.zip").num_timesteps == 60
+
+
 def test_missing_zoo_names_the_extra():
     command = [sys.executable, "-c", "import sys; sys.modules['rl_zoo3'] = None; import sb3_lac.zoo"]
     result = subprocess.run(command, capture_output=True, text=True)
