@@ -12,7 +12,7 @@ RL Zoo with LAC: training, continuing, hyperparameter search, evaluation, videos
   python -m sb3_lac.zoo benchmark --log-dir logs --no-hub
 
 Options are those of the RL Zoo's modules of these names, with two other defaults: the algorithm is LAC, and the
-hyperparameters of ``train`` and ``optimize`` come from ``zoo_configs/<algo>.yml``. ``optimize`` has samplers of its own for
+hyperparameters of ``train`` and ``optimize`` are those of ``find_config()``. ``optimize`` has samplers of its own for
 LAC, SAC and TD3, which reach equally far.
 """
 
@@ -29,6 +29,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import yaml
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -55,6 +56,10 @@ from sb3_lac import LAC, DashboardCallback, GymnasiumVecEnv
 
 #: The algorithms that the RL Zoo gets from this package
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"lac": LAC}
+
+_RL_ZOO = Path(rl_zoo3.__file__).parent
+#: Where the RL Zoo has its hyperparameters; in a source checkout of it they lie beside the package
+RL_ZOO_CONFIGS = (_RL_ZOO if (_RL_ZOO / "hyperparams").is_dir() else _RL_ZOO.parent) / "hyperparams"
 
 # What a sampler of the RL Zoo returns, and what it gets: see ``HYPERPARAMS_SAMPLER``
 Hyperparams = dict[str, Any]
@@ -173,17 +178,26 @@ def steps_as_one_batch(spec: EnvSpec) -> bool:
 class LACExperimentManager(ExperimentManager):
     """
     Experiment manager that steps all copies of an environment by one call where it can, understands schedules like
-    ``lin_5e-5`` for all learning rates, and refuses trainings without an update. The hyperparameters of LAC are those of
-    ``find_config()`` by default. Logs for TensorBoard are a comparison (see ``DashboardCallback``). Trials of a
-    search are scored on held-out discharges where the environment is one of battery_env.
+    ``lin_5e-5`` for all learning rates, and refuses trainings without an update. It says which file hyperparameters are from:
+    for the algorithms of this package that of ``find_config()`` by default. Logs for TensorBoard are a
+    comparison (see ``DashboardCallback``). Trials of a search are scored on held-out discharges where the environment is one
+    of battery_env.
     """
 
     def __init__(self, args: argparse.Namespace, algo: str, env_id: str, *others: Any, **options: Any) -> None:
         if algo in ALGORITHMS and options.get("config") is None:
-            options["config"] = str(find_config(algo))
+            options["config"] = str(find_config(algo, env_id))
         super().__init__(args, algo, env_id, *others, **options)
         if self.optimize_hyperparameters and "battery_env." in self.entry_point(env_id) and self._eval_env_kwargs_args is None:
             self.eval_env_kwargs = self._eval_env_kwargs_args = {**self.env_kwargs, "split": "test"}
+
+    def read_hyperparameters(self) -> tuple[Hyperparams, Hyperparams]:
+        env_id, entries = self.env_name.gym_id, _entries(self.config)
+        source = f"the RL Zoo's ({self.config})" if Path(self.config).parent == RL_ZOO_CONFIGS else self.config
+        if env_id not in entries and not self._is_atari:
+            source += ", entry 'default'"
+        print(f"hyperparameters of {self.algo} on {env_id}: {source}")
+        return super().read_hyperparameters()
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
         spec = gym.spec(self.env_name.gym_id)
@@ -242,18 +256,38 @@ HYPERPARAMS_CONVERTER.update(dict.fromkeys(ALGORITHMS, convert_lac_params))
 rl_zoo3.train.ExperimentManager = LACExperimentManager  # type: ignore[misc]
 
 
-def find_config(algo: str) -> Path:
-    """Find the tuned hyperparameters of an algorithm."""
+def _entries(config: str | Path) -> dict[str, Hyperparams]:
+    """The entries of a configuration, which is one of those that the RL Zoo reads."""
+    name = str(config)
+    if name.endswith((".yml", ".yaml")):
+        return yaml.safe_load(Path(name).read_text(encoding="utf-8")) or {}
+    return runpy.run_path(name)["hyperparams"] if name.endswith(".py") else import_module(name).hyperparams
+
+
+def find_config(algo: str, env_id: str | None = None) -> Path:
+    """
+    Find the hyperparameters of an algorithm.
+
+    :param algo: Name of the algorithm
+    :param env_id: Id of an environment. The first file with an entry for it is taken, or else the first one with the entry
+        ``default``, of ``zoo_configs/<algo>.yml`` in the current folder, that of this package, and that of the RL Zoo. Without
+        an id it is the first one of the former two.
+    :return: The file
+    :raises FileNotFoundError: If there is none
+    """
     package = Path(__file__).resolve().parent
     # In a source checkout, which an editable installation is too, the folder lies beside the package
-    candidates = [folder / "zoo_configs" / f"{algo}.yml" for folder in (Path.cwd(), package, package.parent)]
-    for candidate in candidates:
-        if candidate.is_file():
-            return candidate
-    raise FileNotFoundError(
-        f"No hyperparameters for '{algo}': there is no {candidates[0]}, and sb3_lac brings none. "
-        "Run from a folder with zoo_configs, or pass a YAML file with -conf."
-    )
+    folders = [folder / "zoo_configs" for folder in (Path.cwd(), package, package.parent)]
+    if env_id is not None:
+        folders.append(RL_ZOO_CONFIGS)
+    files = [path for folder in folders if (path := folder / f"{algo}.yml").is_file()]
+    if not files:
+        raise FileNotFoundError(
+            f"No hyperparameters for '{algo}': there is no {folders[0] / algo}.yml, and sb3_lac brings none. "
+            "Run from a folder with zoo_configs, or pass a YAML file with -conf."
+        )
+    names = () if env_id is None else (env_id, "default")
+    return next((path for name in names for path in files if name in _entries(path)), files[0])
 
 
 def _run_benchmark() -> None:
@@ -294,13 +328,15 @@ def main(args: Sequence[str] | None = None) -> None:
         defaults = argparse.ArgumentParser(prog=prog, add_help=False)
         defaults.add_argument("--algo", default="lac")
         if trains:
+            defaults.add_argument("--env", default="CartPole-v1")
             defaults.add_argument("-conf", "--conf-file")
         known, options = defaults.parse_known_args(options)
         options += ["--algo", known.algo]
         if trains:
-            # Algorithms without a file of ours have the RL Zoo's
+            options += ["--env", known.env]
+            # The RL Zoo says which algorithms there are
             with suppress(FileNotFoundError):
-                options += ["--conf-file", known.conf_file or str(find_config(known.algo))]
+                options += ["--conf-file", known.conf_file or str(find_config(known.algo, known.env))]
     if parsed.command == "optimize":
         options += ["--optimize-hyperparameters"]
 

@@ -20,21 +20,19 @@ import rl_zoo3
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 
 from sb3_lac import LAC, GymnasiumVecEnv, zoo
-from sb3_lac.zoo import LACExperimentManager, main, steps_as_one_batch
+from sb3_lac.zoo import RL_ZOO_CONFIGS, LACExperimentManager, find_config, main, steps_as_one_batch
 
 ENV = "Pendulum-v1"
-CONFIG = {
-    "default": {
-        "policy": "MlpPolicy",
-        "n_timesteps": 60,
-        "learning_rate": "lin_3e-4",
-        "lambda_learning_rate": "lin_5e-5",
-        "learning_starts": 40,
-        "buffer_size": 500,
-        "batch_size": 8,
-        "normalize": "dict(norm_obs=True, norm_reward=True)",
-        "policy_kwargs": "dict(net_arch=[8], activation_fn=nn.LeakyReLU, n_critics=3)",
-    }
+SETTINGS = {
+    "policy": "MlpPolicy",
+    "n_timesteps": 60,
+    "learning_rate": "lin_3e-4",
+    "lambda_learning_rate": "lin_5e-5",
+    "learning_starts": 40,
+    "buffer_size": 500,
+    "batch_size": 8,
+    "normalize": "dict(norm_obs=True, norm_reward=True)",
+    "policy_kwargs": "dict(net_arch=[8], activation_fn=nn.LeakyReLU, n_critics=3)",
 }
 
 
@@ -42,7 +40,7 @@ CONFIG = {
 def workdir(tmp_path, monkeypatch):
     """A folder with hyperparameters in zoo_configs, as the current one."""
     (tmp_path / "zoo_configs").mkdir()
-    (tmp_path / "zoo_configs" / "lac.yml").write_text(yaml.dump(CONFIG))
+    (tmp_path / "zoo_configs" / "lac.yml").write_text(yaml.dump({ENV: SETTINGS, "default": SETTINGS}))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["python"])
     return tmp_path
@@ -155,8 +153,7 @@ def test_trials_on_batteries_are_scored_on_held_out_discharges(workdir):
 
 @pytest.mark.parametrize(("gamma", "of_normalization"), [("auto", 0.99), (0.5, 0.5)])
 def test_discount_of_normalized_rewards(gamma, of_normalization, workdir):
-    config = {"default": {**CONFIG["default"], "gamma": gamma}}
-    (workdir / "zoo_configs" / "lac.yml").write_text(yaml.dump(config))
+    (workdir / "zoo_configs" / "lac.yml").write_text(yaml.dump({"default": {**SETTINGS, "gamma": gamma}}))
     model, _ = manager_of(ENV, workdir).setup_experiment()
     assert model.get_vec_normalize_env().gamma == of_normalization
     model.learn(10)
@@ -172,15 +169,14 @@ def test_a_training_without_an_update_is_refused_before_anything_is_written(comm
 def test_other_algorithms_and_configs_can_be_chosen(workdir, monkeypatch):
     calls = []
     monkeypatch.setattr(rl_zoo3.train, "train", lambda: calls.append(sys.argv[1:]))
-    (workdir / "zoo_configs" / "td3.yml").write_text("{}")
-    main(["train", "--algo", "td3"])
+    main(["train", "--env", ENV])
     main(["optimize", "--algo=ppo", "-conf", "my.yml", "--env", ENV])
     # One that only the RL Zoo has hyperparameters of
     main(["train", "--algo", "a2c"])
     assert calls == [
-        ["--algo", "td3", "--conf-file", str(workdir / "zoo_configs" / "td3.yml")],
-        ["--env", ENV, "--algo", "ppo", "--conf-file", "my.yml", "--optimize-hyperparameters"],
-        ["--algo", "a2c"],
+        ["--algo", "lac", "--env", ENV, "--conf-file", str(workdir / "zoo_configs" / "lac.yml")],
+        ["--algo", "ppo", "--env", ENV, "--conf-file", "my.yml", "--optimize-hyperparameters"],
+        ["--algo", "a2c", "--env", "CartPole-v1", "--conf-file", str(RL_ZOO_CONFIGS / "a2c.yml")],
     ]
 
 
@@ -202,6 +198,37 @@ def test_another_algorithm_of_the_package_needs_a_file_only(workdir, monkeypatch
     assert OtherLAC.load(workdir / "logs" / "other_lac" / f"{ENV}_1" / f"{ENV}.zip").num_timesteps == 60
 
 
+# Which hyperparameters
+
+
+def test_hyperparameters_are_of_the_first_file_that_knows_the_environment(workdir):
+    brought, tuned = find_config("sac"), RL_ZOO_CONFIGS / "sac.yml"
+    own = workdir / "zoo_configs" / "sac.yml"
+    own.write_text("{Own-v0: {}, default: {}}")
+    assert find_config("sac") == own != brought != tuned
+    assert find_config("sac", "Own-v0") == own
+    assert find_config("sac", ENV) == brought
+    assert find_config("sac", "BipedalWalker-v3") == tuned
+    assert find_config("sac", "Unknown-v0") == own
+    own.write_text("# nothing yet")
+    assert find_config("sac", "Unknown-v0") == brought
+    assert find_config("ppo", "Unknown-v0") == RL_ZOO_CONFIGS / "ppo.yml"
+
+
+def test_where_hyperparameters_are_from_is_printed(workdir, capsys):
+    def said(algo, env_id):
+        config = str(find_config(algo, env_id))
+        manager_of(env_id, workdir, algo, config=config).read_hyperparameters()
+        return next(line for line in capsys.readouterr().out.splitlines() if line.startswith("hyperparameters of"))
+
+    tuned, brought, own = RL_ZOO_CONFIGS / "sac.yml", find_config("sac"), workdir / "zoo_configs" / "lac.yml"
+    assert said("sac", "BipedalWalker-v3") == f"hyperparameters of sac on BipedalWalker-v3: the RL Zoo's ({tuned})"
+    assert said("sac", ENV) == f"hyperparameters of sac on {ENV}: {brought}"
+    assert said("lac", ENV) == f"hyperparameters of lac on {ENV}: {own}"
+    of_ppo = RL_ZOO_CONFIGS / "ppo.yml"
+    assert said("ppo", "LinearCost-v0").endswith(f"on LinearCost-v0: the RL Zoo's ({of_ppo}), entry 'default'")
+
+
 def test_missing_zoo_names_the_extra():
     command = [sys.executable, "-c", "import sys; sys.modules['rl_zoo3'] = None; import sb3_lac.zoo"]
     result = subprocess.run(command, capture_output=True, text=True)
@@ -213,7 +240,7 @@ class TestEnvironments:
 
     @pytest.fixture
     def model_of(self, workdir):
-        (workdir / "zoo_configs" / "lac.yml").write_text(yaml.dump({"default": {**CONFIG["default"], "n_envs": 3}}))
+        (workdir / "zoo_configs" / "lac.yml").write_text(yaml.dump({"default": {**SETTINGS, "n_envs": 3}}))
 
         def set_up(env_id):
             manager = manager_of(env_id, workdir)
