@@ -179,7 +179,8 @@ class LACExperimentManager(ExperimentManager):
     """
     Experiment manager that steps all copies of an environment by one call where it can, understands schedules like
     ``lin_5e-5`` for all learning rates, and refuses trainings without an update. It says which file hyperparameters are from:
-    for the algorithms of this package that of ``find_config()`` by default. Logs for TensorBoard are a
+    for the algorithms of this package that of ``find_config()`` by default. The entry ``default`` of a file knows nothing of
+    the environment, and so has the discount that the environment states, if it states one. Logs for TensorBoard are a
     comparison (see ``DashboardCallback``). Trials of a search are scored on held-out discharges where the environment is one
     of battery_env.
     """
@@ -196,8 +197,23 @@ class LACExperimentManager(ExperimentManager):
         source = f"the RL Zoo's ({self.config})" if Path(self.config).parent == RL_ZOO_CONFIGS else self.config
         if env_id not in entries and not self._is_atari:
             source += ", entry 'default'"
+            custom, discount = self.custom_hyperparams or {}, self._stated_discount(entries.get("default", {}))
+            # A trial of a search has a discount of its own
+            if discount is not None and "gamma" not in custom and not self.trial_id:
+                source += f", with the discount that the environment states, {discount}"
+                self.custom_hyperparams = {**custom, "gamma": discount}
         print(f"hyperparameters of {self.algo} on {env_id}: {source}")
         return super().read_hyperparameters()
+
+    def _stated_discount(self, entry: Hyperparams) -> float | None:
+        """The discount of the environment, None if it states none, or if the algorithm has none."""
+        if "gamma" not in inspect.signature(rl_zoo3.ALGOS[self.algo]).parameters:
+            return None
+        spec = gym.spec(self.env_name.gym_id)
+        make: Callable[..., Any] = gym.make_vec if spec.entry_point is None else gym.make
+        env = make(spec, **(self.env_kwargs or entry.get("env_kwargs", {})))
+        env.close()
+        return env.metadata.get("discount")
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
         spec = gym.spec(self.env_name.gym_id)

@@ -215,7 +215,50 @@ def test_hyperparameters_are_of_the_first_file_that_knows_the_environment(workdi
     assert find_config("ppo", "Unknown-v0") == RL_ZOO_CONFIGS / "ppo.yml"
 
 
-def test_where_hyperparameters_are_from_is_printed(workdir, capsys):
+@pytest.fixture
+def stating():
+    """The id of an environment that states a discount of 0.8."""
+    spaces = {"observation_space": gym.spaces.Box(-1, 1, (1,)), "action_space": gym.spaces.Box(-1, 1, (1,))}
+    stating = type("Stating", (gym.Env,), {"metadata": {"render_modes": [], "discount": 0.8}, **spaces})
+    gym.register("Stating-v0", entry_point=stating)
+    yield "Stating-v0"
+    del gym.registry["Stating-v0"]
+
+
+def hyperparameters_of(folder, env_id, algo, entries, **options):
+    config = folder / "entries.yml"
+    config.write_text(yaml.dump(entries))
+    manager = manager_of(env_id, folder, algo, config=str(config), **options)
+    return manager.read_hyperparameters()[1]
+
+
+@pytest.mark.parametrize("algo", ["lac", "sac", "td3", "tqc", "ppo"])
+def test_default_entry_has_the_discount_that_the_environment_states(algo, workdir, stating, monkeypatch):
+    entry = {"policy": "MlpPolicy", "n_timesteps": 10}
+    for named in ({}, {"gamma": 0.99}):
+        default = {"default": {**entry, **named}}
+        assert hyperparameters_of(workdir, stating, algo, default)["gamma"] == 0.8
+        # Unless somebody says otherwise
+        assert hyperparameters_of(workdir, stating, algo, default, hyperparams={"gamma": 0.9})["gamma"] == 0.9
+        assert hyperparameters_of(workdir, stating, algo, {stating: {**entry, "gamma": 0.7}, **default})["gamma"] == 0.7
+        # Where none is stated it is that of the entry, or of the algorithm
+        assert hyperparameters_of(workdir, ENV, algo, default).get("gamma") == named.get("gamma")
+    monkeypatch.setattr(LACExperimentManager, "load_trial", lambda *_: {"gamma": 0.6})
+    of_trial = {"storage": "study.log", "study_name": "study", "trial_id": 1}
+    assert hyperparameters_of(workdir, stating, algo, default, **of_trial)["gamma"] == 0.6
+
+
+def test_algorithm_without_a_discount_is_told_none(workdir, stating):
+    assert "gamma" not in hyperparameters_of(workdir, stating, "ars", {"default": {"policy": "LinearPolicy"}})
+
+
+def test_model_and_normalization_have_the_stated_discount(workdir, stating):
+    (workdir / "zoo_configs" / "lac.yml").write_text(yaml.dump({"default": {**SETTINGS, "gamma": 0.99}}))
+    model, _ = manager_of(stating, workdir).setup_experiment()
+    assert model.gamma == model.get_vec_normalize_env().gamma == 0.8
+
+
+def test_where_hyperparameters_are_from_is_printed(workdir, stating, capsys):
     def said(algo, env_id):
         config = str(find_config(algo, env_id))
         manager_of(env_id, workdir, algo, config=config).read_hyperparameters()
@@ -227,6 +270,7 @@ def test_where_hyperparameters_are_from_is_printed(workdir, capsys):
     assert said("lac", ENV) == f"hyperparameters of lac on {ENV}: {own}"
     of_ppo = RL_ZOO_CONFIGS / "ppo.yml"
     assert said("ppo", "LinearCost-v0").endswith(f"on LinearCost-v0: the RL Zoo's ({of_ppo}), entry 'default'")
+    assert said("lac", stating).endswith(f"{own}, entry 'default', with the discount that the environment states, 0.8")
 
 
 def test_missing_zoo_names_the_extra():
