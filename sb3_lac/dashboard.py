@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Mapping
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -61,12 +63,17 @@ def tensorboard_writer(logger: Logger) -> SummaryWriter | None:
     return next((output.writer for output in logger.output_formats if isinstance(output, TensorBoardOutputFormat)), None)
 
 
+def _plain(value: Any) -> Any:
+    """A scalar of numpy or PyTorch as one of Python, which is what TensorBoard takes; anything else as it is."""
+    return value.item() if getattr(value, "shape", None) == () else value
+
+
 def hyperparameters_of(model: BaseAlgorithm) -> dict[str, bool | str | float]:
     """
     The hyperparameters of a model that a table can hold: numbers, texts, schedules, and ``net_arch`` of ``policy_kwargs``.
     """
     values: dict[str, Any] = {"algorithm": type(model).__name__, "n_envs": model.n_envs}
-    values |= {name: getattr(model, name, None) for name in inspect.signature(type(model)).parameters}
+    values |= {name: _plain(getattr(model, name, None)) for name in inspect.signature(type(model)).parameters}
     if "net_arch" in model.policy_kwargs:
         values["net_arch"] = str(model.policy_kwargs["net_arch"])
     found: dict[str, bool | str | float] = {}
@@ -94,7 +101,8 @@ class DashboardCallback(BaseCallback):
 
     - the layout of the Custom Scalars tab: one chart per quantity, with all runs in it
     - the hyperparameters for the HParams tab, where they stand beside the last value of each scalar of the run
-    - ``rollout/cost_mean``, the mean of ``info["cost"]`` over the steps since the last entry, if the environment has costs
+    - ``rollout/cost_mean``, the mean of ``info["cost"]`` over the steps since the last entry, if the environment has costs;
+      what is no finite number does not count
 
     Evaluations are left to ``EvalCallback`` (``eval/``), ``LyapunovCallback`` (``lyapunov/``, of LAC's critic) and
     ``CertificateCallback`` (``certificate/``, of any algorithm).
@@ -119,9 +127,9 @@ class DashboardCallback(BaseCallback):
     ):
         super().__init__(verbose)
         self.charts: Charts = {**(charts or {}), **CHARTS}
+        plain = {name: _plain(value) for name, value in (hparams or {}).items()}
         self.hparams = {
-            name: value if isinstance(value, (bool, int, float, str)) else str(value)
-            for name, value in (hparams or {}).items()
+            name: value if isinstance(value, (bool, int, float, str)) else str(value) for name, value in plain.items()
         }
 
     def _init_callback(self) -> None:
@@ -142,7 +150,9 @@ class DashboardCallback(BaseCallback):
 
     def _on_step(self) -> bool:
         # not every algorithm hands over what the environment said (ARS does not)
-        costs = [info["cost"] for info in self.locals.get("infos", ()) if "cost" in info]
+        said = [_plain(info.get("cost")) for info in self.locals.get("infos", ())]
+        # Environments of others use that key for other things, too
+        costs = [float(cost) for cost in said if isinstance(cost, Real) and math.isfinite(cost)]
         if costs:
             self.logger.record_mean("rollout/cost_mean", float(np.mean(costs)))
         return True

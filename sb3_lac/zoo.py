@@ -12,7 +12,7 @@ RL Zoo with LAC: training, continuing, hyperparameter search, evaluation, videos
   python -m sb3_lac.zoo benchmark --log-dir logs --no-hub
 
 Options are those of the RL Zoo's modules of these names, with two other defaults: the algorithm is LAC, and the
-hyperparameters of ``train`` and ``optimize`` come from ``zoo_configs/<algo>.yml``. ``optimize`` has samplers of its own for
+hyperparameters of ``train`` and ``optimize`` are those of ``find_config()``. ``optimize`` has samplers of its own for
 LAC, SAC and TD3, which reach equally far.
 """
 
@@ -29,8 +29,10 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import yaml
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 from gymnasium.vector import AutoresetMode
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.utils import LinearSchedule
@@ -51,6 +53,13 @@ except ImportError as error:
     raise ImportError("sb3_lac.zoo needs the RL Zoo, install it with: pip install 'sb3_lac[zoo]'") from error
 
 from sb3_lac import LAC, DashboardCallback, GymnasiumVecEnv
+
+#: The algorithms that the RL Zoo gets from this package
+ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"lac": LAC}
+
+_RL_ZOO = Path(rl_zoo3.__file__).parent
+#: Where the RL Zoo has its hyperparameters; in a source checkout of it they lie beside the package
+RL_ZOO_CONFIGS = (_RL_ZOO if (_RL_ZOO / "hyperparams").is_dir() else _RL_ZOO.parent) / "hyperparams"
 
 # What a sampler of the RL Zoo returns, and what it gets: see ``HYPERPARAMS_SAMPLER``
 Hyperparams = dict[str, Any]
@@ -169,17 +178,42 @@ def steps_as_one_batch(spec: EnvSpec) -> bool:
 class LACExperimentManager(ExperimentManager):
     """
     Experiment manager that steps all copies of an environment by one call where it can, understands schedules like
-    ``lin_5e-5`` for the learning rate of lambda, and refuses trainings without an update. The hyperparameters of LAC are
-    those of ``find_config()`` by default. Logs for TensorBoard are a comparison (see ``DashboardCallback``). Trials of a
-    search are scored on held-out discharges where the environment is one of battery_env.
+    ``lin_5e-5`` for all learning rates, and refuses trainings without an update. It says which file hyperparameters are from:
+    for the algorithms of this package that of ``find_config()`` by default. The entry ``default`` of a file knows nothing of
+    the environment, and so has the discount that the environment states, if it states one. Logs for TensorBoard are a
+    comparison (see ``DashboardCallback``). Trials of a search are scored on held-out discharges where the environment is one
+    of battery_env.
     """
 
     def __init__(self, args: argparse.Namespace, algo: str, env_id: str, *others: Any, **options: Any) -> None:
-        if algo == "lac" and options.get("config") is None:
-            options["config"] = str(find_config(algo))
+        if algo in ALGORITHMS and options.get("config") is None:
+            options["config"] = str(find_config(algo, env_id))
         super().__init__(args, algo, env_id, *others, **options)
         if self.optimize_hyperparameters and "battery_env." in self.entry_point(env_id) and self._eval_env_kwargs_args is None:
             self.eval_env_kwargs = self._eval_env_kwargs_args = {**self.env_kwargs, "split": "test"}
+
+    def read_hyperparameters(self) -> tuple[Hyperparams, Hyperparams]:
+        env_id, entries = self.env_name.gym_id, _entries(self.config)
+        source = f"the RL Zoo's ({self.config})" if Path(self.config).parent == RL_ZOO_CONFIGS else self.config
+        if env_id not in entries and not self._is_atari:
+            source += ", entry 'default'"
+            custom, discount = self.custom_hyperparams or {}, self._stated_discount(entries.get("default", {}))
+            # A trial of a search has a discount of its own
+            if discount is not None and "gamma" not in custom and not self.trial_id:
+                source += f", with the discount that the environment states, {discount}"
+                self.custom_hyperparams = {**custom, "gamma": discount}
+        print(f"hyperparameters of {self.algo} on {env_id}: {source}")
+        return super().read_hyperparameters()
+
+    def _stated_discount(self, entry: Hyperparams) -> float | None:
+        """The discount of the environment, None if it states none, or if the algorithm has none."""
+        if "gamma" not in inspect.signature(rl_zoo3.ALGOS[self.algo]).parameters:
+            return None
+        spec = gym.spec(self.env_name.gym_id)
+        make: Callable[..., Any] = gym.make_vec if spec.entry_point is None else gym.make
+        env = make(spec, **(self.env_kwargs or entry.get("env_kwargs", {})))
+        env.close()
+        return env.metadata.get("discount")
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
         spec = gym.spec(self.env_name.gym_id)
@@ -225,30 +259,51 @@ class LACExperimentManager(ExperimentManager):
     @staticmethod
     def _preprocess_schedules(hyperparams: dict[str, Any]) -> dict[str, Any]:
         hyperparams = ExperimentManager._preprocess_schedules(hyperparams)
-        if hyperparams.get("lambda_learning_rate") is not None:
-            schedule = ExperimentManager._preprocess_schedules({"learning_rate": hyperparams["lambda_learning_rate"]})
-            hyperparams["lambda_learning_rate"] = schedule["learning_rate"]
+        # Those of single networks and multipliers
+        for name, rate in hyperparams.items():
+            if name.endswith("_learning_rate") and rate is not None:
+                hyperparams[name] = ExperimentManager._preprocess_schedules({"learning_rate": rate})["learning_rate"]
         return hyperparams
 
 
-rl_zoo3.ALGOS["lac"] = LAC
-HYPERPARAMS_SAMPLER["lac"] = sample_lac_params
-HYPERPARAMS_CONVERTER["lac"] = convert_lac_params
+rl_zoo3.ALGOS.update(ALGORITHMS)
+HYPERPARAMS_SAMPLER.update(dict.fromkeys(ALGORITHMS, sample_lac_params))
+HYPERPARAMS_CONVERTER.update(dict.fromkeys(ALGORITHMS, convert_lac_params))
 rl_zoo3.train.ExperimentManager = LACExperimentManager  # type: ignore[misc]
 
 
-def find_config(algo: str) -> Path:
-    """Find the tuned hyperparameters of an algorithm."""
+def _entries(config: str | Path) -> dict[str, Hyperparams]:
+    """The entries of a configuration, which is one of those that the RL Zoo reads."""
+    name = str(config)
+    if name.endswith((".yml", ".yaml")):
+        return yaml.safe_load(Path(name).read_text(encoding="utf-8")) or {}
+    return runpy.run_path(name)["hyperparams"] if name.endswith(".py") else import_module(name).hyperparams
+
+
+def find_config(algo: str, env_id: str | None = None) -> Path:
+    """
+    Find the hyperparameters of an algorithm.
+
+    :param algo: Name of the algorithm
+    :param env_id: Id of an environment. The first file with an entry for it is taken, or else the first one with the entry
+        ``default``, of ``zoo_configs/<algo>.yml`` in the current folder, that of this package, and that of the RL Zoo. Without
+        an id it is the first one of the former two.
+    :return: The file
+    :raises FileNotFoundError: If there is none
+    """
     package = Path(__file__).resolve().parent
     # In a source checkout, which an editable installation is too, the folder lies beside the package
-    candidates = [folder / "zoo_configs" / f"{algo}.yml" for folder in (Path.cwd(), package, package.parent)]
-    for candidate in candidates:
-        if candidate.is_file():
-            return candidate
-    raise FileNotFoundError(
-        f"No hyperparameters for '{algo}': there is no {candidates[0]}, and sb3_lac brings none. "
-        "Run from a folder with zoo_configs, or pass a YAML file with -conf."
-    )
+    folders = [folder / "zoo_configs" for folder in (Path.cwd(), package, package.parent)]
+    if env_id is not None:
+        folders.append(RL_ZOO_CONFIGS)
+    files = [path for folder in folders if (path := folder / f"{algo}.yml").is_file()]
+    if not files:
+        raise FileNotFoundError(
+            f"No hyperparameters for '{algo}': there is no {folders[0] / algo}.yml, and sb3_lac brings none. "
+            "Run from a folder with zoo_configs, or pass a YAML file with -conf."
+        )
+    names = () if env_id is None else (env_id, "default")
+    return next((path for name in names for path in files if name in _entries(path)), files[0])
 
 
 def _run_benchmark() -> None:
@@ -289,13 +344,15 @@ def main(args: Sequence[str] | None = None) -> None:
         defaults = argparse.ArgumentParser(prog=prog, add_help=False)
         defaults.add_argument("--algo", default="lac")
         if trains:
+            defaults.add_argument("--env", default="CartPole-v1")
             defaults.add_argument("-conf", "--conf-file")
         known, options = defaults.parse_known_args(options)
         options += ["--algo", known.algo]
         if trains:
-            # Algorithms without a file of ours have the RL Zoo's
+            options += ["--env", known.env]
+            # The RL Zoo says which algorithms there are
             with suppress(FileNotFoundError):
-                options += ["--conf-file", known.conf_file or str(find_config(known.algo))]
+                options += ["--conf-file", known.conf_file or str(find_config(known.algo, known.env))]
     if parsed.command == "optimize":
         options += ["--optimize-hyperparameters"]
 

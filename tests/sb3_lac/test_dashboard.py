@@ -124,6 +124,35 @@ def test_an_environment_without_costs_has_no_entry_for_them(tmp_path):
     assert "rollout/cost_mean" not in model.logger.name_to_value
 
 
+@pytest.mark.parametrize(
+    ("said", "logged"),
+    [
+        *[(number, 2.0) for number in (2, np.float32(2), np.int64(2), np.array(2.0), th.tensor(2.0))],
+        *[(other, None) for other in (None, "high", "2", {"energy": 1.0}, [1.0, [2.0]], np.ones(2), np.nan, np.inf, 2j)],
+    ],
+)
+def test_what_is_no_number_is_no_cost(said, logged, tmp_path):
+    class Saying(gym.Wrapper):
+        def step(self, action):
+            *step, info = self.env.step(action)
+            return *step, {**info, "cost": said}
+
+    model = SAC("MlpPolicy", Saying(make_env()), policy_kwargs={"net_arch": [4]}, tensorboard_log=str(tmp_path), **OPTIONS)
+    model.learn(10, callback=DashboardCallback(), log_interval=100)
+    assert model.logger.name_to_value.get("rollout/cost_mean") == logged
+
+
+def test_numbers_of_numpy_are_numbers_in_the_table():
+    model = make_model(SAC, gamma=np.float32(0.5), target_update_interval=np.int64(4))
+    found = hyperparameters_of(model)
+    assert (found["gamma"], found["target_update_interval"]) == (0.5, 4)
+    assert DashboardCallback(hparams={"factor": np.float32(0.5), "n": np.array(3), "all": np.ones(2)}).hparams == {
+        "factor": 0.5,
+        "n": 3,
+        "all": "[1. 1.]",
+    }
+
+
 def test_without_tensorboard_there_is_no_dashboard():
     model = make_model(SAC)
     model.set_logger(Logger(folder=None, output_formats=[]))

@@ -20,21 +20,19 @@ import rl_zoo3
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 
 from sb3_lac import LAC, GymnasiumVecEnv, zoo
-from sb3_lac.zoo import LACExperimentManager, main, steps_as_one_batch
+from sb3_lac.zoo import RL_ZOO_CONFIGS, LACExperimentManager, find_config, main, steps_as_one_batch
 
 ENV = "Pendulum-v1"
-CONFIG = {
-    "default": {
-        "policy": "MlpPolicy",
-        "n_timesteps": 60,
-        "learning_rate": "lin_3e-4",
-        "lambda_learning_rate": "lin_5e-5",
-        "learning_starts": 40,
-        "buffer_size": 500,
-        "batch_size": 8,
-        "normalize": "dict(norm_obs=True, norm_reward=True)",
-        "policy_kwargs": "dict(net_arch=[8], activation_fn=nn.LeakyReLU, n_critics=3)",
-    }
+SETTINGS = {
+    "policy": "MlpPolicy",
+    "n_timesteps": 60,
+    "learning_rate": "lin_3e-4",
+    "lambda_learning_rate": "lin_5e-5",
+    "learning_starts": 40,
+    "buffer_size": 500,
+    "batch_size": 8,
+    "normalize": "dict(norm_obs=True, norm_reward=True)",
+    "policy_kwargs": "dict(net_arch=[8], activation_fn=nn.LeakyReLU, n_critics=3)",
 }
 
 
@@ -42,7 +40,7 @@ CONFIG = {
 def workdir(tmp_path, monkeypatch):
     """A folder with hyperparameters in zoo_configs, as the current one."""
     (tmp_path / "zoo_configs").mkdir()
-    (tmp_path / "zoo_configs" / "lac.yml").write_text(yaml.dump(CONFIG))
+    (tmp_path / "zoo_configs" / "lac.yml").write_text(yaml.dump({ENV: SETTINGS, "default": SETTINGS}))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["python"])
     return tmp_path
@@ -155,8 +153,7 @@ def test_trials_on_batteries_are_scored_on_held_out_discharges(workdir):
 
 @pytest.mark.parametrize(("gamma", "of_normalization"), [("auto", 0.99), (0.5, 0.5)])
 def test_discount_of_normalized_rewards(gamma, of_normalization, workdir):
-    config = {"default": {**CONFIG["default"], "gamma": gamma}}
-    (workdir / "zoo_configs" / "lac.yml").write_text(yaml.dump(config))
+    (workdir / "zoo_configs" / "lac.yml").write_text(yaml.dump({"default": {**SETTINGS, "gamma": gamma}}))
     model, _ = manager_of(ENV, workdir).setup_experiment()
     assert model.get_vec_normalize_env().gamma == of_normalization
     model.learn(10)
@@ -172,16 +169,108 @@ def test_a_training_without_an_update_is_refused_before_anything_is_written(comm
 def test_other_algorithms_and_configs_can_be_chosen(workdir, monkeypatch):
     calls = []
     monkeypatch.setattr(rl_zoo3.train, "train", lambda: calls.append(sys.argv[1:]))
-    (workdir / "zoo_configs" / "td3.yml").write_text("{}")
-    main(["train", "--algo", "td3"])
+    main(["train", "--env", ENV])
     main(["optimize", "--algo=ppo", "-conf", "my.yml", "--env", ENV])
     # One that only the RL Zoo has hyperparameters of
     main(["train", "--algo", "a2c"])
     assert calls == [
-        ["--algo", "td3", "--conf-file", str(workdir / "zoo_configs" / "td3.yml")],
-        ["--env", ENV, "--algo", "ppo", "--conf-file", "my.yml", "--optimize-hyperparameters"],
-        ["--algo", "a2c"],
+        ["--algo", "lac", "--env", ENV, "--conf-file", str(workdir / "zoo_configs" / "lac.yml")],
+        ["--algo", "ppo", "--env", ENV, "--conf-file", "my.yml", "--optimize-hyperparameters"],
+        ["--algo", "a2c", "--env", "CartPole-v1", "--conf-file", str(RL_ZOO_CONFIGS / "a2c.yml")],
     ]
+
+
+def test_all_learning_rates_take_schedules():
+    rates = LACExperimentManager._preprocess_schedules({"critic_learning_rate": "lin_1e-3", "lambda_learning_rate": None})
+    assert rates["critic_learning_rate"](0.5) == 5e-4 and rates["lambda_learning_rate"] is None
+
+
+def test_another_algorithm_of_the_package_needs_a_file_only(workdir, monkeypatch):
+    class OtherLAC(LAC):
+        pass
+
+    monkeypatch.setitem(zoo.ALGORITHMS, "other_lac", OtherLAC)
+    monkeypatch.setitem(rl_zoo3.ALGOS, "other_lac", OtherLAC)
+    with pytest.raises(FileNotFoundError, match=r"there is no .*zoo_configs/other_lac\.yml"):
+        main(["train", "--algo", "other_lac", "--env", ENV, "--eval-freq", "-1"])
+    (workdir / "zoo_configs" / "lac.yml").rename(workdir / "zoo_configs" / "other_lac.yml")
+    main(["train", "--algo", "other_lac", "--env", ENV, "--eval-freq", "-1"])
+    assert OtherLAC.load(workdir / "logs" / "other_lac" / f"{ENV}_1" / f"{ENV}.zip").num_timesteps == 60
+
+
+# Which hyperparameters
+
+
+def test_hyperparameters_are_of_the_first_file_that_knows_the_environment(workdir):
+    brought, tuned = find_config("sac"), RL_ZOO_CONFIGS / "sac.yml"
+    own = workdir / "zoo_configs" / "sac.yml"
+    own.write_text("{Own-v0: {}, default: {}}")
+    assert find_config("sac") == own != brought != tuned
+    assert find_config("sac", "Own-v0") == own
+    assert find_config("sac", ENV) == brought
+    assert find_config("sac", "BipedalWalker-v3") == tuned
+    assert find_config("sac", "Unknown-v0") == own
+    own.write_text("# nothing yet")
+    assert find_config("sac", "Unknown-v0") == brought
+    assert find_config("ppo", "Unknown-v0") == RL_ZOO_CONFIGS / "ppo.yml"
+
+
+@pytest.fixture
+def stating():
+    """The id of an environment that states a discount of 0.8."""
+    spaces = {"observation_space": gym.spaces.Box(-1, 1, (1,)), "action_space": gym.spaces.Box(-1, 1, (1,))}
+    stating = type("Stating", (gym.Env,), {"metadata": {"render_modes": [], "discount": 0.8}, **spaces})
+    gym.register("Stating-v0", entry_point=stating)
+    yield "Stating-v0"
+    del gym.registry["Stating-v0"]
+
+
+def hyperparameters_of(folder, env_id, algo, entries, **options):
+    config = folder / "entries.yml"
+    config.write_text(yaml.dump(entries))
+    manager = manager_of(env_id, folder, algo, config=str(config), **options)
+    return manager.read_hyperparameters()[1]
+
+
+@pytest.mark.parametrize("algo", ["lac", "sac", "td3", "tqc", "ppo"])
+def test_default_entry_has_the_discount_that_the_environment_states(algo, workdir, stating, monkeypatch):
+    entry = {"policy": "MlpPolicy", "n_timesteps": 10}
+    for named in ({}, {"gamma": 0.99}):
+        default = {"default": {**entry, **named}}
+        assert hyperparameters_of(workdir, stating, algo, default)["gamma"] == 0.8
+        # Unless somebody says otherwise
+        assert hyperparameters_of(workdir, stating, algo, default, hyperparams={"gamma": 0.9})["gamma"] == 0.9
+        assert hyperparameters_of(workdir, stating, algo, {stating: {**entry, "gamma": 0.7}, **default})["gamma"] == 0.7
+        # Where none is stated it is that of the entry, or of the algorithm
+        assert hyperparameters_of(workdir, ENV, algo, default).get("gamma") == named.get("gamma")
+    monkeypatch.setattr(LACExperimentManager, "load_trial", lambda *_: {"gamma": 0.6})
+    of_trial = {"storage": "study.log", "study_name": "study", "trial_id": 1}
+    assert hyperparameters_of(workdir, stating, algo, default, **of_trial)["gamma"] == 0.6
+
+
+def test_algorithm_without_a_discount_is_told_none(workdir, stating):
+    assert "gamma" not in hyperparameters_of(workdir, stating, "ars", {"default": {"policy": "LinearPolicy"}})
+
+
+def test_model_and_normalization_have_the_stated_discount(workdir, stating):
+    (workdir / "zoo_configs" / "lac.yml").write_text(yaml.dump({"default": {**SETTINGS, "gamma": 0.99}}))
+    model, _ = manager_of(stating, workdir).setup_experiment()
+    assert model.gamma == model.get_vec_normalize_env().gamma == 0.8
+
+
+def test_where_hyperparameters_are_from_is_printed(workdir, stating, capsys):
+    def said(algo, env_id):
+        config = str(find_config(algo, env_id))
+        manager_of(env_id, workdir, algo, config=config).read_hyperparameters()
+        return next(line for line in capsys.readouterr().out.splitlines() if line.startswith("hyperparameters of"))
+
+    tuned, brought, own = RL_ZOO_CONFIGS / "sac.yml", find_config("sac"), workdir / "zoo_configs" / "lac.yml"
+    assert said("sac", "BipedalWalker-v3") == f"hyperparameters of sac on BipedalWalker-v3: the RL Zoo's ({tuned})"
+    assert said("sac", ENV) == f"hyperparameters of sac on {ENV}: {brought}"
+    assert said("lac", ENV) == f"hyperparameters of lac on {ENV}: {own}"
+    of_ppo = RL_ZOO_CONFIGS / "ppo.yml"
+    assert said("ppo", "LinearCost-v0").endswith(f"on LinearCost-v0: the RL Zoo's ({of_ppo}), entry 'default'")
+    assert said("lac", stating).endswith(f"{own}, entry 'default', with the discount that the environment states, 0.8")
 
 
 def test_missing_zoo_names_the_extra():
@@ -195,7 +284,7 @@ class TestEnvironments:
 
     @pytest.fixture
     def model_of(self, workdir):
-        (workdir / "zoo_configs" / "lac.yml").write_text(yaml.dump({"default": {**CONFIG["default"], "n_envs": 3}}))
+        (workdir / "zoo_configs" / "lac.yml").write_text(yaml.dump({"default": {**SETTINGS, "n_envs": 3}}))
 
         def set_up(env_id):
             manager = manager_of(env_id, workdir)
