@@ -19,7 +19,8 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from battery_env.plotting import save_figure
 from benchmarks.study import EVALUATION_SEED
-from sb3_lac import LAC, certify, evaluate_lyapunov, fit_lyapunov
+from sb3_lac import certify, evaluate_lyapunov, fit_lyapunov
+from sb3_lac.costs import CostAlgorithm
 from sb3_lac.envs import CostEnv, reference_controller
 from sb3_lac.stability import CriticLyapunov
 
@@ -189,7 +190,7 @@ def judge(policy: PolicyPredictor, env_id: str, episodes: int, figures: Path | N
     certification = certify(policy, env, fitted, episodes, seed=_CERTIFICATION_SEED)
     if figures is not None:
         save_figure(certification.plot(), figures.with_name(f"{figures.name}_statements.png"))
-    functions = {"fitted": fitted} | ({"critic": CriticLyapunov(policy)} if isinstance(policy, LAC) else {})
+    functions = {"fitted": fitted} | ({"critic": CriticLyapunov(policy)} if isinstance(policy, CostAlgorithm) else {})
     rows = []
     for function, lyapunov in functions.items():
         report = evaluate_lyapunov(policy, env, episodes, seed=_JUDGE_SEED, lyapunov=lyapunov)

@@ -10,7 +10,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from battery_env.callbacks import CALIBRATION_CHARTS
 from benchmarks.training import Recipe
-from sb3_lac import LAC, DashboardCallback, LyapunovCallback
+from sb3_lac import DashboardCallback, LyapunovCallback
+from sb3_lac.costs import CostAlgorithm
 from sb3_lac.zoo import LACExperimentManager
 
 
@@ -20,7 +21,7 @@ def dashboard_callbacks(
     """Callbacks that make a run part of a comparison in TensorBoard. They do not change the training."""
     about = {"env": recipe.env_id, "recipe": recipe.digest, "timesteps": recipe.timesteps, "source": recipe.source}
     callbacks: list[BaseCallback] = [DashboardCallback(CALIBRATION_CHARTS, {**recipe.hyperparameters, **about})]
-    if isinstance(model, LAC):
+    if isinstance(model, CostAlgorithm):
         with contextlib.redirect_stdout(io.StringIO()):
             env = manager.create_envs(n_envs=1, eval_env=True, no_log=True)
         # from the same start states each time, which are not those of the training

@@ -14,15 +14,13 @@ from sb3_lac.policies import largest_value
 class MetricSAC(LAC):
     """
     SAC whose critics learn the root that LAC's do: the entropy is part of the value, the actor lowers the value itself, and
-    there is no decrease condition (``lambda`` is 1). Its arguments are LAC's, but for ``published_update``.
+    there is no decrease condition (``lambda`` is 1). Its arguments are LAC's.
     """
 
     #: The algorithm whose file of ``zoo_configs`` it is trained with.
     zoo_config: ClassVar[str] = "lac"
 
     def _setup_model(self) -> None:
-        if self.published_update:
-            raise ValueError("MetricSAC has no published_update")
         self.lambda_min = self.lambda_init = self.lambda_max = 1.0
         super()._setup_model()
 
@@ -31,7 +29,7 @@ class MetricSAC(LAC):
         with th.no_grad():
             next_actions, log_prob = self.actor.action_log_prob(replay_data.next_observations)
             ent_coef = self.ent_coef_tensor if self.log_ent_coef is None else th.exp(self.log_ent_coef)
-            next_roots = largest_value(self.critic_target(replay_data.next_observations, next_actions))
+            next_roots = largest_value(self.critic_target.outputs(replay_data.next_observations, next_actions))
             next_values = self.critic_target.value(next_roots) + ent_coef * log_prob.reshape(-1, 1)
             return -replay_data.rewards + (1 - replay_data.dones) * discounts * next_values
 

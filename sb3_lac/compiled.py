@@ -74,7 +74,7 @@ def update_multiplier(log_multiplier: th.Tensor, optimizer: th.optim.Optimizer, 
 
 def actors_of(model: Any) -> list[Actor]:
     """The actors whose distributions an update changes."""
-    return [model.actor] if model.actor_target is None else [model.actor, model.actor_target]
+    return [module for module in model.policy.children() if isinstance(module, Actor)]
 
 
 def check_compiler(device: th.device) -> None:

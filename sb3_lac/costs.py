@@ -1,55 +1,214 @@
-"""Costs in place of rewards. Where no reward is positive, which is most often, a cost is the negated reward."""
+"""What algorithms for costs share: costs in place of rewards, Lagrange multipliers, the loop of updates, files."""
 
 import math
+import os
 import warnings
-from typing import Any
+from contextlib import nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.buffers import ReplayBuffer
+from gymnasium import spaces
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
+from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, update_learning_rate
 from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.sac.policies import Actor
 
-from sb3_lac.policies import LyapunovPolicy
+from sb3_lac.compiled import CompiledUpdate, Metrics, check_compiler, update_multiplier
+from sb3_lac.discounts import stated_discount
+from sb3_lac.files import replacing
+from sb3_lac.policies import LyapunovCritic, LyapunovPolicy
+
+SelfCostAlgorithm = TypeVar("SelfCostAlgorithm", bound="CostAlgorithm")
 
 
 class CostAlgorithm(OffPolicyAlgorithm):
     """
-    Off-policy algorithm that minimises the cost ``bound - reward >= 0``, where ``bound`` is the largest reward stated or seen,
-    and at least 0. After a termination nothing is paid, so that each step costs ``bound``. The critics learn
-    of ``L - offset``, where ``offset = bound / (1 - gamma)`` is the value of ``L`` where nothing is ever paid: when the bound
-    rises, all values of ``L`` rise with it, and there is nothing to learn anew.
+    Soft actor-critic for the cost ``bound - reward >= 0``, where ``bound`` is the largest reward stated or seen, at least 0.
+    After a termination nothing is paid, so that each step costs ``bound``: ``L`` is ``bound / (1 - gamma)`` there. Multipliers
+    hold the entropy of the policy and a decrease of ``L``. Subclasses say what an update is, in ``_update()``. The arguments
+    are described there.
     """
 
     policy: LyapunovPolicy
-    #: The largest reward that the environment can pay as the user knows it, before any normalization
-    stated_reward_bound: float | None
+    actor: Actor
+    critic: LyapunovCritic
+    critic_target: LyapunovCritic
+
+    def __init__(
+        self,
+        policy: str | type[LyapunovPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule,
+        buffer_size: int,
+        learning_starts: int,
+        batch_size: int,
+        tau: float,
+        gamma: float | str,
+        train_freq: int | tuple[int, str],
+        gradient_steps: int,
+        action_noise: ActionNoise | None,
+        replay_buffer_class: type[ReplayBuffer] | None,
+        replay_buffer_kwargs: dict[str, Any] | None,
+        ent_coef: str | float,
+        target_update_interval: int,
+        target_entropy: str | float,
+        alpha3: float,
+        lambda_init: float,
+        lambda_min: float,
+        lambda_max: float | None,
+        lambda_learning_rate: float | Schedule | None,
+        reward_bound: float | None,
+        compile_update: bool,
+        **kwargs: Any,
+    ):
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            buffer_size,
+            learning_starts,
+            batch_size,
+            tau,
+            gamma,  # type: ignore[arg-type]  # a number from _setup_model() on
+            train_freq,
+            gradient_steps,
+            action_noise,
+            replay_buffer_class,
+            replay_buffer_kwargs,
+            supported_action_spaces=(spaces.Box,),
+            support_multi_env=True,
+            **kwargs,
+        )
+        self.target_entropy = target_entropy
+        self.log_ent_coef = None  # type: th.Tensor | None
+        # Entropy coefficient / Entropy temperature
+        self.ent_coef = ent_coef
+        self.target_update_interval = target_update_interval
+        self.ent_coef_optimizer: th.optim.Adam | None = None
+        self.alpha3 = alpha3
+        self.lambda_init = lambda_init
+        self.lambda_min = lambda_min
+        self.lambda_max = lambda_max
+        self.lambda_learning_rate = lambda_learning_rate
+        self.reward_bound = reward_bound
+        self.compile_update = compile_update
+        self._compiled: CompiledUpdate | None = None
+
+    def _setup_model(self) -> None:
+        if self.gamma == "auto":
+            self.gamma = stated_discount(self.env)
+        # One of numpy would make n-step returns double precision
+        self.gamma = float(self.gamma)
+        self._check_arguments()
+
+        super()._setup_model()
+        self.actor, self.critic, self.critic_target = self.policy.actor, self.policy.critic, self.policy.critic_target
+        # Running mean and running var
+        self.batch_norm_stats = get_parameters_by_name(self.critic, ["running_"])
+        self.batch_norm_stats_target = get_parameters_by_name(self.critic_target, ["running_"])
+        # Target entropy is used when learning the entropy coefficient
+        if self.target_entropy == "auto":
+            # automatically set target entropy if needed
+            self.target_entropy = float(-np.prod(self.action_space.shape))  # type: ignore[arg-type]
+        else:
+            # Force conversion
+            # this will also throw an error for unexpected string
+            self.target_entropy = float(self.target_entropy)
+
+        # The entropy coefficient or entropy can be learned automatically
+        # see Automating Entropy Adjustment for Maximum Entropy RL section
+        # of https://arxiv.org/abs/1812.05905
+        if isinstance(self.ent_coef, str) and self.ent_coef.startswith("auto"):
+            # Default initial value of ent_coef when learned
+            init_value = 1.0
+            if "_" in self.ent_coef:
+                init_value = float(self.ent_coef.split("_")[1])
+                assert init_value > 0.0, "The initial value of ent_coef must be greater than 0"
+            self.log_ent_coef, self.ent_coef_optimizer = self._make_multiplier(init_value)
+        else:
+            # Force conversion to float
+            # this will throw an error if a malformed string (different from 'auto')
+            # is passed
+            self.ent_coef_tensor = th.tensor(float(self.ent_coef), device=self.device)
+
+        # The multiplier of the decrease condition is learned like that of the entropy
+        self.critic_lr_schedule = self.lambda_lr_schedule = self.lr_schedule
+        if self.lambda_learning_rate is not None:
+            self.lambda_lr_schedule = FloatSchedule(self.lambda_learning_rate)
+        self.log_lambda, self.lambda_optimizer = self._make_multiplier(self.lambda_init)
+        self.lambda_optimizer.param_groups[0]["lr"] = self.lambda_lr_schedule(1)
+        self._project_lambda()
+
+        if self.compile_update:
+            self._compiled = CompiledUpdate(type(self)._update, self.device)
+
+        self.largest_reward.fill_(self.reward_bound or 0.0)
+        self.update_offset(self._vec_normalize_env)
+        self._terminations = Terminations()
+
+    def _check_arguments(self) -> None:
+        """Check the arguments that SAC does not have."""
+        needed = self.policy_aliases["MlpPolicy"]
+        critics = [getattr(policy, "critic_class", object) for policy in (self.policy_class, needed)]
+        if not (issubclass(self.policy_class, needed) and issubclass(*critics)):
+            named = self.policy_class.__name__
+            raise ValueError(f"{type(self).__name__} needs a policy derived from {needed.__name__}, and this is {named}.")
+        if not 0 <= self.gamma <= 1:
+            raise ValueError(f"gamma={self.gamma} must lie within 0 .. 1.")
+        if self.gamma == 1 and (self.n_steps > 1 or self.replay_buffer_class is NStepReplayBuffer):
+            raise ValueError("gamma must be smaller than 1 with n-step returns.")
+        if not 0 < self.alpha3 < math.inf:
+            raise ValueError(f"alpha3={self.alpha3} must be greater than 0, and finite.")
+        lambda_max = self.lambda_init if self.lambda_max is None else self.lambda_max
+        if not 0 < self.lambda_min <= lambda_max < math.inf or not 0 < self.lambda_init < math.inf:
+            limits = f"lambda_min={self.lambda_min}, lambda_init={self.lambda_init} and lambda_max={self.lambda_max}"
+            raise ValueError(f"{limits} must be greater than 0 and finite, and the least of them lambda_min.")
+        if not 0 <= (self.reward_bound or 0.0) < math.inf:
+            raise ValueError(f"reward_bound={self.reward_bound} must be finite and at least 0, what a termination pays.")
+        if self.reward_bound and self.gamma == 1:
+            raise ValueError(
+                f"gamma={self.gamma} must be smaller than 1 with rewards up to {self.reward_bound}: each step below that has "
+                "a cost, and the sum over all time is infinite. Use for instance gamma=0.99."
+            )
+
+    def _make_multiplier(self, initial: float) -> tuple[th.Tensor, th.optim.Adam]:
+        """The logarithm of a Lagrange multiplier, and its optimizer."""
+        log_multiplier = th.log(th.ones(1, device=self.device) * initial).requires_grad_(True)
+        return log_multiplier, th.optim.Adam([log_multiplier], lr=self.lr_schedule(1))
+
+    def _project_lambda(self) -> th.Tensor:
+        """Keep ``lambda`` within its limits, and tell whether it is at the upper one."""
+        upper = math.log(max(self.lambda_init, 1.0) if self.lambda_max is None else self.lambda_max)
+        # A logarithm beyond its limits would need as many steps to come back (wind-up)
+        with th.no_grad():
+            self.log_lambda.clamp_(math.log(self.lambda_min), upper)
+        return self.log_lambda >= upper
 
     @property
-    def reward_bound(self) -> th.Tensor:
+    def largest_reward(self) -> th.Tensor:
         """The largest reward stated or seen, before any normalization, shape (1,). It is part of the policy, as ``L`` is."""
         return self.policy.reward_bound
 
     def cost_bound(self, vec_normalize: VecNormalize | None = None) -> th.Tensor:
         """The reward that costs nothing, in the units of the rewards that the agent sees, shape (1,)."""
         # One that is stated when a model is loaded may be larger than the one in its file
-        bound = self.reward_bound.clamp(min=self.stated_reward_bound or 0.0)
+        bound = self.largest_reward.clamp(min=self.reward_bound or 0.0)
         if vec_normalize is None or not vec_normalize.norm_reward:
             return bound
         return (bound / reward_scale(vec_normalize)).clamp(max=vec_normalize.clip_reward)
 
     def update_offset(self, vec_normalize: VecNormalize | None) -> None:
-        """Give the critics the offset of the present bound, and refuse an infinite one."""
-        if self.gamma < 1:
-            offset = self.cost_bound(vec_normalize) / (1 - self.gamma)
-            self.policy.critic.offset.copy_(offset)
-            self.policy.critic_target.offset.copy_(offset)
-        elif self.reward_bound > 0:
-            raise ValueError(
-                f"gamma={self.gamma} must be smaller than 1 with rewards up to {self.reward_bound.item():g}: each step below "
-                "that reward has a cost, whose sum over all time is infinite. Use for instance gamma=0.99."
-            )
+        """Give the critics the value of ``L`` where nothing is ever paid, which is infinite without a discount."""
+        bound = self.cost_bound(vec_normalize)
+        offset = th.where(bound > 0, bound / (1 - self.gamma), 0.0)
+        self.policy.critic.offset.copy_(offset)
+        self.policy.critic_target.offset.copy_(offset)
 
     def _store_transition(
         self,
@@ -60,11 +219,25 @@ class CostAlgorithm(OffPolicyAlgorithm):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        # The largest reward of a step, which n-step returns do not tell
         vec_normalize = self._vec_normalize_env
-        largest_reward = float(np.max(reward if vec_normalize is None else vec_normalize.get_original_reward()))
-        if largest_reward > 0 and largest_reward > self.reward_bound:
-            self.reward_bound.fill_(largest_reward)
+        # What the environments said, before any normalization
+        said, paid = new_obs, reward
+        if vec_normalize is not None:
+            said, paid = vec_normalize.get_original_obs(), vec_normalize.get_original_reward()
+        last = [infos[index].get("terminal_observation") for index in np.flatnonzero(dones)]
+        for name, value in (("reward", paid), ("observation", said), *(("last observation", obs) for obs in last)):
+            refuse_what_is_not_finite(name, value, self.num_timesteps)
+        if self._n_updates == 0:
+            self._terminations.see(paid, dones, infos)
+        # The largest reward of a step, which n-step returns do not tell
+        if paid.max() > 0 and paid.max() > self.largest_reward:
+            if self.gamma == 1 and self.largest_reward == 0:
+                warnings.warn(
+                    f"With gamma=1 and rewards up to {paid.max():g}, L is infinite: it is learned up to that constant, and "
+                    "shown as infinite. Use for instance gamma=0.99.",
+                    stacklevel=2,
+                )
+            self.largest_reward.fill_(float(paid.max()))
             self.update_offset(vec_normalize)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
@@ -77,26 +250,160 @@ class CostAlgorithm(OffPolicyAlgorithm):
         n_rewards = 1.0 if replay_data.discounts is None else (1 - replay_data.discounts) / (1 - self.gamma)
         largest_reward = (replay_data.rewards / n_rewards).max()
         vec_normalize = self._vec_normalize_env
-        self.reward_bound.copy_(th.maximum(self.cost_bound(), largest_reward * reward_scale(vec_normalize)))
+        self.largest_reward.copy_(th.maximum(self.cost_bound(), largest_reward * reward_scale(vec_normalize)))
         # The scale of the rewards may have changed too
         self.update_offset(vec_normalize)
         # Changes of the units round
         bound = th.maximum(self.cost_bound(vec_normalize), largest_reward)
         return bound * n_rewards - replay_data.rewards
 
-    def warn_of_free_terminations(self) -> None:
-        """Warn if what is stored shows no price of an early end: where that is a failure, it is the cheapest policy of all."""
-        buffer = self.replay_buffer
-        # A buffer that does not keep time limits apart cannot tell; and where living pays, an end costs the bound
-        # for ever. A buffer of somebody else may have arrays of its own
-        if buffer is None or self.reward_bound > 0 or not (buffer.handle_timeout_termination and hasattr(buffer, "timeouts")):
+    def _update(self, replay_data: ReplayBufferSamples, costs: th.Tensor, update_targets: bool) -> Metrics:
+        """One update of all that is learned. It may be compiled: nothing in it may wait for a value on the host."""
+        raise NotImplementedError
+
+    def _weights(self) -> tuple[th.Tensor, th.Tensor]:
+        """``lambda`` and the entropy coefficient, as weights in the loss of the actor."""
+        # Important: detach the multipliers from the graph
+        # so we don't change them with other losses
+        # see https://github.com/rail-berkeley/softlearning/issues/60
+        ent_coef = self.ent_coef_tensor if self.log_ent_coef is None else th.exp(self.log_ent_coef.detach())
+        return th.exp(self.log_lambda.detach()), ent_coef
+
+    def _update_multipliers(self, violation: th.Tensor, log_prob: th.Tensor) -> dict[str, th.Tensor]:
+        """Optimize the multipliers of the decrease condition and of the entropy, and tell their losses."""
+        metrics = {"lambda_loss": update_multiplier(self.log_lambda, self.lambda_optimizer, violation)}
+        metrics["lambda_saturation"] = self._project_lambda()
+        # Optimize entropy coefficient, also called
+        # entropy temperature or beta in the paper
+        if self.ent_coef_optimizer is not None and self.log_ent_coef is not None:
+            assert isinstance(self.target_entropy, float)
+            entropy_violation = log_prob.mean() + self.target_entropy
+            metrics["ent_coef_loss"] = update_multiplier(self.log_ent_coef, self.ent_coef_optimizer, entropy_violation)
+        return metrics
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        if self._n_updates == 0:
+            self._terminations.warn_if_free(self.gamma, float(self.largest_reward))
+        # Switch to train mode (this affects batch norm / dropout)
+        self.policy.set_training_mode(True)
+        # Update learning rates according to their schedules
+        optimizers = [self.actor.optimizer, self.critic.optimizer, self.lambda_optimizer]
+        if self.ent_coef_optimizer is not None:
+            optimizers.insert(2, self.ent_coef_optimizer)
+        self._update_learning_rate(optimizers)
+        for optimizer, schedule in (
+            (self.critic.optimizer, self.critic_lr_schedule),
+            (self.lambda_optimizer, self.lambda_lr_schedule),
+        ):
+            update_learning_rate(optimizer, schedule(self._current_progress_remaining))
+
+        if isinstance(self.replay_buffer, NStepReplayBuffer):
+            # One discount for returns and values
+            self.replay_buffer.gamma = self.gamma
+
+        # Kept on the device until the end: reading one value would wait for all pending work
+        names: tuple[str, ...] = ()
+        metrics_per_step: list[th.Tensor] = []
+
+        with nullcontext(self._update) if self._compiled is None else self._compiled.ready(self, optimizers) as update:
+            for gradient_step in range(gradient_steps):
+                # Sample replay buffer
+                replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
+                update_targets = (self._n_updates + gradient_step) % self.target_update_interval == 0
+                names, metrics = update(replay_data, self.costs(replay_data), update_targets)
+                metrics_per_step.append(metrics)
+
+        self._n_updates += gradient_steps
+
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        if metrics_per_step:
+            # One transfer from the device for all metrics of all gradient steps
+            for name, value in zip(names, th.stack(metrics_per_step).mean(dim=0).tolist(), strict=True):
+                self.logger.record(f"train/{name}", value)
+
+    def learn(
+        self: SelfCostAlgorithm,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfCostAlgorithm:
+        if self.compile_update:
+            check_compiler(self.device)
+        return super().learn(
+            total_timesteps=total_timesteps,
+            callback=callback,
+            log_interval=log_interval,
+            tb_log_name=type(self).__name__ if tb_log_name is None else tb_log_name,
+            reset_num_timesteps=reset_num_timesteps,
+            progress_bar=progress_bar,
+        )
+
+    def save(self, path: Any, *args: Any, **kwargs: Any) -> None:
+        # A file that is there stays until the new one is whole
+        if not isinstance(path, (str, os.PathLike)):
+            return super().save(path, *args, **kwargs)
+        with replacing(with_suffix(path, ".zip")) as part:
+            super().save(part, *args, **kwargs)
+
+    def save_replay_buffer(self, path: Any) -> None:
+        if not isinstance(path, (str, os.PathLike)):
+            return super().save_replay_buffer(path)
+        with replacing(with_suffix(path, ".pkl")) as part:
+            super().save_replay_buffer(part)
+
+    def set_parameters(self, load_path_or_dict: Any, exact_match: bool = True, device: th.device | str = "auto") -> None:
+        try:
+            super().set_parameters(load_path_or_dict, exact_match, device)
+        except (AttributeError, KeyError, RuntimeError, ValueError) as error:
+            # No ValueError: for one, ``load()`` tries to read the parameters as those of an old DQN
+            raise RuntimeError(
+                f"These parameters are not those of this {type(self).__name__}: {error}\n"
+                "They are of another version of sb3_lac (see the changelog), of another algorithm, or of other arguments: "
+                "policy_kwargs, and whether ent_coef is learned, cannot be changed on loading."
+            ) from error
+
+    def _excluded_save_params(self) -> list[str]:
+        own = ["actor", "critic", "critic_target", "batch_norm_stats", "batch_norm_stats_target", "_compiled", "_terminations"]
+        return super()._excluded_save_params() + own
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts = ["policy", "actor.optimizer", "critic.optimizer", "lambda_optimizer"]
+        if self.ent_coef_optimizer is None:
+            return state_dicts, ["log_lambda", "ent_coef_tensor"]
+        return [*state_dicts, "ent_coef_optimizer"], ["log_lambda", "log_ent_coef"]
+
+
+class _Steps(NamedTuple):
+    """What steps cost, each."""
+
+    cost: np.ndarray
+    is_end: np.ndarray
+
+
+@dataclass
+class Terminations:
+    """What is collected before the first update, which tells whether a termination has a price."""
+
+    steps: list[_Steps] = field(default_factory=list)
+
+    def see(self, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
+        """Note a step of all environments. A time limit is no termination."""
+        in_time = np.array([not info.get("TimeLimit.truncated", False) for info in infos])
+        self.steps.append(_Steps(0.0 - rewards, dones & in_time))
+
+    def warn_if_free(self, gamma: float, largest_reward: float) -> None:
+        """Warn if the last step before a termination costs no more than another step does."""
+        # Where living pays, an end costs the bound for ever
+        if not self.steps or largest_reward > 0:
             return
-        rewards, dones, timeouts = (stored[: buffer.size()] for stored in (buffer.rewards, buffer.dones, buffer.timeouts))
-        costs, ends = 0.0 - rewards, dones > timeouts
-        if not ends.any() or ends.all() or costs.min() < 0:
+        costs, ends = (np.concatenate(values) for values in zip(*self.steps, strict=True))
+        if not ends.any() or ends.all():
             return
         last, cheapest, dearest = costs[ends].mean(), costs[~ends].min(), costs[~ends].max()
-        price = costs[~ends].mean() / (1 - self.gamma) if self.gamma < 1 else math.inf
+        price = costs[~ends].mean() / (1 - gamma) if gamma < 1 else math.inf
         # An end that costs less than any other step is a goal
         if cheapest <= last <= dearest and price > 0:
             warnings.warn(
@@ -104,8 +411,18 @@ class CostAlgorithm(OffPolicyAlgorithm):
                 f"{dearest:.3g}). Where the end is the goal, all is well. Where it is a failure, to fail early is the "
                 "cheapest policy of any algorithm: give the last step a cost of its own, above that of going on, here about "
                 f"{price:.3g} (mean cost per step / (1 - gamma)).",
-                stacklevel=2,
+                stacklevel=3,
             )
+
+
+def refuse_what_is_not_finite(name: str, value: Any, step: int) -> None:
+    """Raise a ``ValueError`` that names the number. One of them would spoil all weights."""
+    if isinstance(value, dict):
+        for key, part in value.items():
+            refuse_what_is_not_finite(f"{name} {key!r}", part, step)
+    elif value is not None and np.asarray(value).dtype.kind == "f" and not np.isfinite(value).all():
+        found = np.asarray(value)[~np.isfinite(value)].ravel()[0]
+        raise ValueError(f"The environment gave the {name} {found} at step {step}: all must be finite. See check_env().")
 
 
 def reward_scale(vec_normalize: VecNormalize | None) -> float:
@@ -113,3 +430,9 @@ def reward_scale(vec_normalize: VecNormalize | None) -> float:
     if vec_normalize is None or not vec_normalize.norm_reward:
         return 1.0
     return math.sqrt(vec_normalize.ret_rms.var + vec_normalize.epsilon)
+
+
+def with_suffix(path: str | os.PathLike[str], suffix: str) -> Path:
+    """The path that Stable-Baselines3 writes to."""
+    path = Path(path)
+    return path if path.suffix else path.with_name(path.name + suffix)

@@ -1,6 +1,6 @@
 from collections.abc import Sequence
 from functools import reduce
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
@@ -14,7 +14,7 @@ from stable_baselines3.common.torch_layers import (
     create_mlp,
 )
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
-from stable_baselines3.sac.policies import SACPolicy
+from stable_baselines3.sac.policies import Actor, SACPolicy
 from torch import nn
 
 
@@ -25,18 +25,8 @@ def largest_value(values: Sequence[th.Tensor]) -> th.Tensor:
 
 class LyapunovCritic(BaseModel):
     """
-    Lyapunov critic network(s) for LAC.
-    Each network maps state and action to the fourth root ``f(s, a)`` of what ``L`` is above its floor, about the value of the
-    loop at rest: ``L = offset + floor + sign(f) |f|^4``.
-
-    Costs of a loop that settles fade over orders of magnitude. A relative error of ``L`` is a thousand times larger at a
-    thousand times the cost, and one of ``f`` less than six times. The unit of the costs is nothing but a factor of ``f``. With
-    noise ``L`` is biased low: the root of a mean is larger than the mean of the roots.
-
-    The floor follows the lowest value. What all values have in common falls slowly while the loop gets better, if the discount
-    is near 1: a root from zero on would be flat just where the loop comes to rest. What is learned is a relative value, as in
-    relative value iteration. Where rewards are positive, ``L`` also has an ``offset``, the value of states from which nothing
-    is ever paid. The signed root is that of https://arxiv.org/abs/1805.11593, without its linear part.
+    Lyapunov critic network(s): each maps state and action to a value ``L(s, a) >= 0``, the cost to come. What a network learns
+    of it is up to the subclasses.
 
     :param observation_space: Observation space
     :param action_space: Action space
@@ -54,6 +44,8 @@ class LyapunovCritic(BaseModel):
 
     action_space: spaces.Box
     features_extractor: BaseFeaturesExtractor
+    #: Outputs of a linear layer at the end of each network; -1 for none, the last hidden layer is the end then
+    n_outputs: ClassVar[int]
 
     def __init__(
         self,
@@ -82,23 +74,21 @@ class LyapunovCritic(BaseModel):
         self.share_features_extractor = share_features_extractor
         self.n_critics = n_critics
         self.lyapunov_networks: list[nn.Sequential] = []
-        # What all values have in common. Set by the algorithm, saved with the weights
+        # The value where nothing is ever paid. Set by the algorithm, saved with the weights
         self.offset: th.Tensor
-        self.floor: th.Tensor
         self.register_buffer("offset", th.zeros(1))
-        self.register_buffer("floor", th.zeros(1))
         for idx in range(n_critics):
-            lyapunov_net = nn.Sequential(*create_mlp(features_dim + action_dim, 1, net_arch, activation_fn))
+            lyapunov_net = nn.Sequential(*create_mlp(features_dim + action_dim, self.n_outputs, net_arch, activation_fn))
             self.add_module(f"lf{idx}", lyapunov_net)
             self.lyapunov_networks.append(lyapunov_net)
 
-    def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:
+    def outputs(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:
         """
-        Get what the networks learn.
+        Get what the networks give.
 
         :param obs: Observations, preprocessed by ``extract_features()``
         :param actions: As many flat actions in [-1, 1]
-        :return: Roots of ``L(s, a) - offset - floor``, one tensor of shape (n, 1) per critic
+        :return: One tensor of as many rows per critic
         """
         # Learn the features extractor using the policy loss only
         # when the features_extractor is shared with the actor
@@ -106,6 +96,65 @@ class LyapunovCritic(BaseModel):
             features = self.extract_features(obs, self.features_extractor)
         lyapunov_input = th.cat([features, actions], dim=1)
         return tuple(lyapunov_net(lyapunov_input) for lyapunov_net in self.lyapunov_networks)
+
+    def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:
+        """
+        Get the values ``L(s, a)``, none of them negative.
+
+        :param obs: Observations, preprocessed by ``extract_features()``
+        :param actions: As many flat actions in [-1, 1]
+        :return: One tensor of shape (n, 1) per critic
+        """
+        raise NotImplementedError
+
+    def lyapunov(self, obs: PyTorchObs, actions: th.Tensor) -> th.Tensor:
+        """
+        Get the conservative values ``L(s, a)``, the largest of the critics'.
+
+        :param obs: Observations, preprocessed by ``extract_features()``
+        :param actions: As many flat actions in [-1, 1]
+        :return: Values of shape (n, 1)
+        """
+        return largest_value(self(obs, actions))
+
+
+class SumOfSquaresCritic(LyapunovCritic):
+    """
+    Lyapunov critic of ``PublishedLAC``: ``L`` is the sum of the squares of the activations of the last layer, with which
+    ``net_arch`` ends. The arguments are those of ``LyapunovCritic``.
+    """
+
+    n_outputs = -1
+
+    def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:
+        return tuple(output.square().sum(dim=1, keepdim=True) for output in self.outputs(obs, actions))
+
+
+class RootCritic(LyapunovCritic):
+    """
+    Lyapunov critic of ``LAC``: each network learns the fourth root ``f(s, a)`` of what ``L`` is above its floor, about the
+    value of the loop at rest: ``L = offset + floor + sign(f) |f|^4``. The arguments are those of ``LyapunovCritic``.
+
+    Costs of a loop that settles fade over orders of magnitude. A relative error of ``L`` is a thousand times larger at a
+    thousand times the cost, and one of ``f`` less than six times. The unit of the costs is nothing but a factor of ``f``. With
+    noise ``L`` is biased low: the root of a mean is larger than the mean of the roots.
+
+    The floor follows the lowest value. What all values have in common falls slowly while the loop gets better, if the discount
+    is near 1: a root from zero on would be flat just where the loop comes to rest. What is learned is a relative value, as in
+    relative value iteration. Where rewards are positive, ``L`` also has the ``offset``. The signed root is that of
+    https://arxiv.org/abs/1805.11593, without its linear part.
+    """
+
+    n_outputs = 1
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        # What all values have in common. Set by the algorithm, saved with the weights
+        self.floor: th.Tensor
+        self.register_buffer("floor", th.zeros(1))
+
+    def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:
+        return tuple(self.lyapunov_of(root) for root in self.outputs(obs, actions))
 
     def root(self, values: th.Tensor) -> th.Tensor:
         """
@@ -144,20 +193,10 @@ class LyapunovCritic(BaseModel):
         """
         return (self.value(roots) + self.offset).clamp(min=0.0)
 
-    def lyapunov(self, obs: PyTorchObs, actions: th.Tensor) -> th.Tensor:
-        """
-        Get the conservative values ``L(s, a)``, offset included.
-
-        :param obs: Observations, preprocessed by ``extract_features()``
-        :param actions: As many flat actions in [-1, 1]
-        :return: The largest of the critics' values and never negative, shape (n, 1)
-        """
-        return self.lyapunov_of(largest_value(self(obs, actions)))
-
 
 class LyapunovPolicy(SACPolicy):
     """
-    Policy class (with both actor and critic) for LAC: SAC's, with a ``LyapunovCritic``. ``MlpPolicy`` is another name of it.
+    Policy class (with both actor and critic) for LAC: SAC's, with a ``RootCritic``. ``MlpPolicy`` is another name of it.
     ``LAC(policy_kwargs=...)`` takes the arguments from ``net_arch`` on:
 
     .. code-block:: python
@@ -196,6 +235,7 @@ class LyapunovPolicy(SACPolicy):
     critic_target: LyapunovCritic  # type: ignore[assignment]
     action_space: spaces.Box
     reward_bound: th.Tensor
+    critic_class: ClassVar[type[LyapunovCritic]] = RootCritic
 
     def _build(self, lr_schedule: Schedule) -> None:
         # Other implementations of Adam exclude the fused one
@@ -212,7 +252,7 @@ class LyapunovPolicy(SACPolicy):
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> LyapunovCritic:  # type: ignore[override]
         critic_kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
-        return LyapunovCritic(**critic_kwargs).to(self.device)
+        return self.critic_class(**critic_kwargs).to(self.device)
 
     def predict_lyapunov(self, observation: np.ndarray | dict[str, np.ndarray], action: np.ndarray) -> np.ndarray:
         """
@@ -289,3 +329,53 @@ class MultiInputPolicy(LyapunovPolicy):
         super().__init__(
             observation_space, action_space, lr_schedule, features_extractor_class=features_extractor_class, **kwargs
         )
+
+
+class PublishedPolicy(LyapunovPolicy):
+    """
+    Policy class (with both actor and critic) for ``PublishedLAC``: that of LAC, with a ``SumOfSquaresCritic``, a target actor,
+    and the networks of Han et al. (2020).
+
+    :param observation_space: Observation space
+    :param action_space: Action space
+    :param lr_schedule: Learning rate schedule (could be constant)
+    :param net_arch: Hidden layers of the actor (``pi``), and those of the critic (``qf``), whose last one is squared
+    :param n_critics: Number of Lyapunov critic networks to create, the largest of their values is used.
+    :param kwargs: The other arguments of ``LyapunovPolicy``
+    """
+
+    critic_class = SumOfSquaresCritic
+    actor_target: Actor
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
+        n_critics: int = 1,
+        **kwargs: Any,
+    ):
+        net_arch = {"pi": [64, 64], "qf": [64, 64, 16]} if net_arch is None else net_arch
+        super().__init__(observation_space, action_space, lr_schedule, net_arch, n_critics=n_critics, **kwargs)
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        super()._build(lr_schedule)
+        self.actor_target = self.make_actor()
+        self.actor_target.load_state_dict(self.actor.state_dict())
+        # Target networks should always be in eval mode
+        self.actor_target.set_training_mode(False)
+
+
+class PublishedCnnPolicy(PublishedPolicy):
+    """``PublishedPolicy`` for image observations, with the arguments of ``CnnPolicy``."""
+
+    def __init__(self, *args: Any, features_extractor_class: type[BaseFeaturesExtractor] = NatureCNN, **kwargs: Any):
+        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
+
+
+class PublishedMultiInputPolicy(PublishedPolicy):
+    """``PublishedPolicy`` for dictionary observations, with the arguments of ``MultiInputPolicy``."""
+
+    def __init__(self, *args: Any, features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor, **kwargs: Any):
+        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)

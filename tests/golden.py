@@ -314,7 +314,6 @@ def lac_trainings() -> Numbers:
     """Weights of LAC after short trainings with each of its variants."""
     th.set_num_threads(1)
     for name, env_id, arguments in (
-        ("published", "LinearCost-v0", {"published_update": True}),
         ("compiled", "LinearCost-v0", {"compile_update": True}),
         ("n_steps", "Pendulum-v1", {"n_steps": 3, "ent_coef": 0.1}),
         ("gsde", "Pendulum-v1", {"use_sde": True, "train_freq": 8, "gradient_steps": 4}),

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 import numpy as np
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_lac.lac import LAC
+from sb3_lac.costs import CostAlgorithm
 
 Observations = np.ndarray | dict[str, np.ndarray]
 _NUMBER = (float, int, np.number)
@@ -118,16 +118,16 @@ class LyapunovFunction:
 
 class CriticLyapunov(LyapunovFunction):
     """
-    The critic of LAC: ``L(s, pi(s))`` with the mean action of the policy.
+    The critic of LAC or PublishedLAC: ``L(s, pi(s))`` with the mean action of the policy.
 
-    :param model: The LAC model
+    :param model: The model
     """
 
     normalized_rewards = True
     of_actions = True
 
-    def __init__(self, model: LAC):
-        super().__init__(self._of_the_mean_action, model.alpha3, model.gamma, model.reward_bound.item())
+    def __init__(self, model: CostAlgorithm):
+        super().__init__(self._of_the_mean_action, model.alpha3, model.gamma, model.largest_reward.item())
         self.model = model
 
     def _of_the_mean_action(self, observations: Observations) -> np.ndarray:

@@ -12,7 +12,7 @@ import numpy as np
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_lac.lac import LAC
+from sb3_lac.costs import CostAlgorithm
 from sb3_lac.stability.functions import CriticLyapunov, LyapunovFunction
 from sb3_lac.stability.loop import closed_loop
 from sb3_lac.stability.rollout import summarize_episodes
@@ -299,9 +299,9 @@ def evaluate_lyapunov(
 
 def critic_of(policy: PolicyPredictor) -> CriticLyapunov:
     """Return the Lyapunov function that LAC has learned, and refuse any other policy."""
-    if not isinstance(policy, LAC):
+    if not isinstance(policy, CostAlgorithm):
         raise ValueError(
-            f"The model must be a LAC model, which has a Lyapunov function, and not {policy!r}. For any other policy, learn "
-            "one with fit_lyapunov(policy, env), and pass it as lyapunov=... (CertificateCallback does so)."
+            f"The model must be a LAC or PublishedLAC, which has a Lyapunov function, and not {policy!r}. For any other policy, "
+            "learn one with fit_lyapunov(policy, env), and pass it as lyapunov=... (CertificateCallback does so)."
         )
     return CriticLyapunov(policy)

@@ -12,6 +12,7 @@ from stable_baselines3.common.logger import Logger
 from torch import nn
 
 from sb3_lac import LAC
+from sb3_lac.costs import CostAlgorithm
 
 
 class LinearCostEnv(gym.Env):
@@ -60,17 +61,19 @@ def make_env() -> Callable[..., LinearCostEnv]:
 
 
 @pytest.fixture
-def make_model() -> Callable[..., LAC]:
+def make_model() -> Callable[..., CostAlgorithm]:
     def _make_model(
         env: Any = None,
         n_collect: int = 40,
         policy_kwargs: dict[str, Any] | None = None,
         policy: str = "MlpPolicy",
+        algorithm: type[CostAlgorithm] = LAC,
         **kwargs: Any
-    ) -> LAC:
+    ) -> CostAlgorithm:
         policy_kwargs = {"net_arch": [16, 16], "activation_fn": nn.LeakyReLU, **(policy_kwargs or {})}
         kwargs = {"learning_starts": 40, "buffer_size": 500, "batch_size": 16, "seed": 0, "device": "cpu", **kwargs}
-        model = LAC(policy, LinearCostEnv() if env is None else env, policy_kwargs=policy_kwargs, **kwargs)
+        kwargs = {"train_freq": 1, "gradient_steps": 1, **kwargs}
+        model = algorithm(policy, LinearCostEnv() if env is None else env, policy_kwargs=policy_kwargs, **kwargs)
         model.set_logger(Logger(folder=None, output_formats=[]))
         if n_collect > 0:
             model.learn(n_collect)
@@ -89,16 +92,20 @@ def n_updates() -> Callable[[LAC], int]:
 
 
 @pytest.fixture
-def make_model_without_env() -> Callable[..., LAC]:
+def make_model_without_env() -> Callable[..., CostAlgorithm]:
     def _make_model_without_env(
-        n_states: int = 2, n_actions: int = 2, policy_kwargs: dict[str, Any] | None = None, **kwargs: Any
-    ) -> LAC:
+        n_states: int = 2,
+        n_actions: int = 2,
+        policy_kwargs: dict[str, Any] | None = None,
+        algorithm: type[CostAlgorithm] = LAC,
+        **kwargs: Any
+    ) -> CostAlgorithm:
         """A model that never steps its environment, to train on batches of any numbers."""
         policy_kwargs = {"net_arch": [16, 16], "activation_fn": nn.LeakyReLU, **(policy_kwargs or {})}
         kwargs = {"buffer_size": 1, "seed": 0, "device": "cpu", **kwargs}
         env = LinearCostEnv(n_dim=n_actions)
         env.observation_space = spaces.Box(-np.inf, np.inf, (n_states,))
-        model = LAC("MlpPolicy", env, policy_kwargs=policy_kwargs, **kwargs)
+        model = algorithm("MlpPolicy", env, policy_kwargs=policy_kwargs, **kwargs)
         model.set_logger(Logger(folder=None, output_formats=[]))
         return model
 

@@ -623,7 +623,7 @@ ONE_START_FOR_ALL = GymnasiumVecEnv(gym.vector.SyncVectorEnv([lambda: PlannedEnv
         (certify, PlannedEnv([[-2, 1]]), {"ultimate_bound": 1.0}, "A reward of 2 is positive, and it is not known"),
         (certify, SOMETIMES_PAID, {"starts": [[0.0, 0.0], [0.9, 0.9]], "ultimate_bound": 0.5}, "A reward of 1 is positive"),
         (evaluate_lyapunov, PlannedEnv([[-2, 1]]), {"lyapunov": IDENTITY}, "A reward of 2 is positive"),
-        (evaluate_lyapunov, ONES, {}, "must be a LAC model.*CertificateCallback"),
+        (evaluate_lyapunov, ONES, {}, "must be a LAC or PublishedLAC.*CertificateCallback"),
         (certify, "LinearCost-v0", {}, r"env='LinearCost-v0' is no environment: pass that of gym.make"),
         (certify, gym.make_vec("LinearCost-v0", num_envs=2), {}, r"pass sb3_lac.GymnasiumVecEnv\(env\)"),
         (certify, showing(np.nan), {}, "observation that is NaN"),
@@ -682,7 +682,7 @@ def test_fit_that_diverges_is_refused(linear_env, optimal, monkeypatch):
         (CertificateCallback, {"seed": 0}, "starts episodes that SAC was trained on"),
         (CertificateCallback, {"n_eval_episodes": -1}, "and not -1"),
         (CertificateCallback, {"ultimate_bound": "small"}, "ultimate_bound='small' must be a number"),
-        (LyapunovCallback, {}, "must be a LAC model.*CertificateCallback"),
+        (LyapunovCallback, {}, "must be a LAC or PublishedLAC.*CertificateCallback"),
     ],
 )
 def test_callback_refuses_questions_before_the_training(make_env, make, arguments, message):

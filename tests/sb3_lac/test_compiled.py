@@ -16,7 +16,7 @@ from torch._functorch.aot_autograd import make_boxed_func
 from torch._guards import TracingContext
 from torch.torch_version import TorchVersion
 
-from sb3_lac import LAC, compiled
+from sb3_lac import LAC, PublishedLAC, compiled
 
 
 @pytest.fixture(autouse=True)
@@ -32,15 +32,15 @@ def trained(model, calls=3, gradient_steps=2):
     np.random.seed(0)
     th.manual_seed(0)
     logged = []
-    schedules = model.lr_schedule, model.lambda_lr_schedule
-    for call in range(calls):
+    names = ("lr_schedule", "critic_lr_schedule", "lambda_lr_schedule")
+    schedules = [getattr(model, name) for name in names]
+    for call in range(calls + 1):
         # As far as the training is, for the schedules
-        model.lr_schedule, model.lambda_lr_schedule = (
-            ConstantSchedule(schedule(1.0 - call / calls)) for schedule in schedules
-        )
-        model.train(gradient_steps, model.batch_size)
-        logged.append(dict(model.logger.name_to_value))
-    model.lr_schedule, model.lambda_lr_schedule = schedules
+        for name, schedule in zip(names, schedules, strict=True):
+            setattr(model, name, ConstantSchedule(schedule(1.0 - call / calls)) if call < calls else schedule)
+        if call < calls:
+            model.train(gradient_steps, model.batch_size)
+            logged.append(dict(model.logger.name_to_value))
     return model, logged
 
 
@@ -64,10 +64,12 @@ SCHEDULES = {"learning_rate": LinearSchedule(1e-2, 1e-4, 1.0), "lambda_learning_
     "kwargs",
     [
         SCHEDULES,
-        {"published_update": True, "ent_coef": 0.2, "reward_bound": 3.0, "n_steps": 3},
+        {"ent_coef": 0.2, "reward_bound": 3.0, "n_steps": 3},
+        {"algorithm": PublishedLAC, "reward_bound": 3.0, "critic_learning_rate": LinearSchedule(1e-2, 1e-3, 1.0)},
+        {"algorithm": PublishedLAC, "horizon": 4, "ent_coef": 0.2},
         {"policy_kwargs": {"n_critics": 2, "optimizer_class": th.optim.SGD, "share_features_extractor": True}},
     ],
-    ids=["schedules", "published", "two_critics"],
+    ids=["schedules", "n_steps", "published", "horizon", "two_critics"],
 )
 def test_compiled_and_eager_updates_are_the_same(make_model, kwargs):
     eager, eager_logged = trained(make_model(**kwargs))
@@ -105,7 +107,7 @@ def test_graph_is_one_that_a_gpu_can_replay(make_model, monkeypatch):
 
     backend = aot_autograd(fw_compiler=compiler, keep_inference_input_mutations=True)
     monkeypatch.setattr(compiled, "BACKEND", backend)
-    model = make_model(compile_update=True, use_sde=True, published_update=True)
+    model = make_model(compile_update=True, use_sde=True, algorithm=PublishedLAC)
     graphs.clear()
     trained(model, calls=2)
     ((graph, static),) = graphs
@@ -114,11 +116,11 @@ def test_graph_is_one_that_a_gpu_can_replay(make_model, monkeypatch):
     changed = {inputs.index(node.args[0]) for node in copies}
     n_learned = sum(len(list(module.parameters())) for module in (model.actor, model.critic)) + 2
     n_targets = sum(len(list(module.parameters())) for module in (model.actor_target, model.critic_target))
-    # Weight, gradient, both moments and number of steps; and the floors of critic and target
-    assert len(changed) == 5 * n_learned + n_targets + 2
+    # Weight, gradient, both moments and number of steps
+    assert len(changed) == 5 * n_learned + n_targets
     assert changed <= set(static)
-    # Sampled: observations, actions, next observations, ends and rewards; and their costs
-    assert len(inputs) - len(static) == 6
+    # Sampled: observations, actions, next observations and ends; and their costs
+    assert len(inputs) - len(static) == 5
     assert len(graph.find_nodes(op="output")[0].args[0]) == 1
     assert not any("local_scalar_dense" in str(node.target) for node in graph.nodes)
 

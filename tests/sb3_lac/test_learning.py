@@ -9,7 +9,7 @@ from torch import nn
 
 from sb3_lac import LAC, evaluate_lyapunov
 from sb3_lac.envs import LinearCostEnv
-from sb3_lac.policies import LyapunovCritic
+from sb3_lac.policies import RootCritic
 
 GAMMA = 0.95
 
@@ -46,8 +46,8 @@ def exact_value(env, gain):
 class ExactCritic(nn.Module):
     """The root of an exact value in place of the critic's networks, times a factor that is learned."""
 
-    root, value, distance = LyapunovCritic.root, LyapunovCritic.value, LyapunovCritic.distance
-    lyapunov_of = LyapunovCritic.lyapunov_of
+    root, value, distance = RootCritic.root, RootCritic.value, RootCritic.distance
+    lyapunov_of = RootCritic.lyapunov_of
 
     def __init__(self, exact, factor=1.0):
         super().__init__()
@@ -57,7 +57,7 @@ class ExactCritic(nn.Module):
         # Any floor will do for an exact value
         self.register_buffer("floor", th.ones(1))
 
-    def forward(self, states, controls):
+    def outputs(self, states, controls):
         return (self.factor * self.root(self.exact(states, controls)),)
 
 

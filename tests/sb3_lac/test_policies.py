@@ -9,8 +9,8 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Flatten
 from stable_baselines3.common.utils import get_parameters_by_name
 from torch import nn
 
-from sb3_lac import LyapunovPolicy
-from sb3_lac.policies import LyapunovCritic
+from sb3_lac import LyapunovPolicy, PublishedLAC
+from sb3_lac.policies import RootCritic
 
 
 class BatchNormExtractor(BaseFeaturesExtractor):
@@ -31,7 +31,7 @@ class BatchNormDropoutExtractor(BatchNormExtractor):
 def critic():
     box = spaces.Box(-1, 1, (1,))
     extractor = FlattenExtractor(box)
-    return LyapunovCritic(box, box, [4], extractor, extractor.features_dim)
+    return RootCritic(box, box, [4], extractor, extractor.features_dim)
 
 
 def test_networks_learn_a_root_and_the_policy_shows_the_value(make_model):
@@ -39,15 +39,17 @@ def test_networks_learn_a_root_and_the_policy_shows_the_value(make_model):
     critic = model.critic
     obs, actions = th.randn(200, 2), th.rand(200, 2)
     with th.no_grad():
-        for roots, net in zip(critic(obs, actions), critic.lyapunov_networks, strict=True):
+        for roots, net in zip(critic.outputs(obs, actions), critic.lyapunov_networks, strict=True):
             net[-1].bias -= roots.mean()
-    roots = critic(obs, actions)
+    roots = critic.outputs(obs, actions)
     for of_critic, net in zip(roots, critic.lyapunov_networks, strict=True):
         assert net[-1].out_features == 1
         th.testing.assert_close(of_critic, net(th.cat([obs, actions], dim=1)))
     assert not th.equal(roots[0], roots[1])
     largest = th.maximum(*roots)
     assert largest.min() < 0 < largest.max()
+    for value, root in zip(critic(obs, actions), roots, strict=True):
+        th.testing.assert_close(value, root.clamp(min=0) ** 4)
     conservative = critic.lyapunov(obs, actions)
     assert conservative.min() == 0
     th.testing.assert_close(conservative, largest.clamp(min=0) ** 4)
@@ -79,7 +81,7 @@ def test_root_has_an_inverse_keeps_the_order_and_takes_units_as_factors(critic, 
 
 
 def test_targets_start_as_copies_and_stay_in_eval_mode(make_model):
-    model = make_model(n_collect=0, published_update=True)
+    model = make_model(n_collect=0, algorithm=PublishedLAC)
     for online, target in ((model.actor, model.actor_target), (model.critic, model.critic_target)):
         assert online is not target
         for parameter, target_parameter in zip(online.parameters(), target.parameters(), strict=True):
@@ -87,11 +89,10 @@ def test_targets_start_as_copies_and_stay_in_eval_mode(make_model):
     model.policy.set_training_mode(True)
     assert model.actor.training and model.critic.training
     assert not model.actor_target.training and not model.critic_target.training
-    assert make_model(n_collect=0).actor_target is None
 
 
 def test_batch_norm_statistics_of_both_targets_are_updated(make_model, train_metrics):
-    model = make_model(published_update=True, policy_kwargs={"features_extractor_class": BatchNormExtractor})
+    model = make_model(algorithm=PublishedLAC, policy_kwargs={"features_extractor_class": BatchNormExtractor})
     assert len(model.batch_norm_stats) == len(model.batch_norm_stats_target) == 4
     train_metrics(model, gradient_steps=3)
     for online, target in ((model.actor, model.actor_target), (model.critic, model.critic_target)):

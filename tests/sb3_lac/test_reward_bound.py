@@ -46,6 +46,7 @@ def gradients_of(monkeypatch, train_metrics):
         with monkeypatch.context() as patch:
             patch.setattr(F, "mse_loss", lambda values, y: targets.append(y) or loss(values, y))
             patch.setattr(model, "lr_schedule", lambda _: 0.0)
+            patch.setattr(model, "critic_lr_schedule", lambda _: 0.0)
             patch.setattr(model, "tau", 0.0)
             train_metrics(model)
         gradients = [
@@ -71,11 +72,11 @@ def test_rise_of_the_bound_shifts_all_values_and_no_gradient(
     # Also with terminations
     model = make_model(make_env(episode_length=7, terminate=True), **kwargs)
     # Far enough from 0, where values are cut off
-    model.reward_bound.add_(5.0)
+    model.largest_reward.add_(5.0)
     train_metrics(model, gradient_steps=20)
     for rise in (2.0, 1.0):
         before, (targets, actor, critic) = predictions(model), gradients_of(model)
-        model.reward_bound.add_(rise)
+        model.largest_reward.add_(rise)
         new_targets, new_actor, new_critic = gradients_of(model)
         np.testing.assert_allclose(predictions(model) - before, rise * sum_of_discounts, rtol=1e-4)
         assert th.equal(new_targets, targets)
@@ -151,7 +152,7 @@ def test_offset_has_the_units_of_normalized_rewards(make_model, make_env, train_
 def test_bound_is_the_largest_reward_of_one_step(make_model, make_env, normalized, kwargs):
     env = DummyVecEnv([lambda: make_env(offset=4.0)])
     model = make_model(VecNormalize(env) if normalized else env, gamma=0.75, **kwargs)
-    assert model.reward_bound.item() == model.replay_buffer.rewards.max() > 1
+    assert model.largest_reward.item() == model.replay_buffer.rewards.max() > 1
     # Seen before the first update, and in L
     if not normalized:
         assert model.critic.offset.item() == pytest.approx(4 * model.replay_buffer.rewards.max(), rel=1e-4)
@@ -177,7 +178,7 @@ def test_bound_and_offset_are_saved_and_a_larger_bound_can_be_stated_on_loading(
     changed.replay_buffer = model.replay_buffer
     changed.costs(model.replay_buffer.sample(4))
     np.testing.assert_allclose(predictions(changed), predictions(model) + 8.0, rtol=1e-5)
-    assert changed.reward_bound.item() == 7.0
+    assert changed.largest_reward.item() == 7.0
 
 
 def test_report_does_not_change_the_critic(make_model, make_env, train_metrics):
@@ -196,13 +197,13 @@ def test_report_does_not_change_the_critic(make_model, make_env, train_metrics):
     np.testing.assert_allclose(report.transitions["lyapunov"], of_the_training + shift, rtol=1e-3, atol=1e-3)
 
 
-def test_positive_rewards_need_a_discount(make_model, make_env, train_metrics):
-    message = "gamma=1.0 must be smaller than 1 with rewards up to"
-    with pytest.raises(ValueError, match=message):
-        make_model(make_env(offset=4.0), gamma=1.0)
-    # Rewards that replay computes, as HER does
-    model = make_model(gamma=1.0)
-    train_metrics(model)
-    model.replay_buffer.rewards[:] = 1.0
-    with pytest.raises(ValueError, match=message):
-        train_metrics(model)
+def test_without_discount_a_positive_reward_makes_values_infinite_and_ends_no_training(make_model, make_env, train_metrics):
+    with pytest.raises(ValueError, match=r"gamma=1\.0 must be smaller than 1 with rewards up to 2"):
+        make_model(make_env(), gamma=1.0, reward_bound=2.0)
+    with pytest.warns(UserWarning, match="With gamma=1 and rewards up to"):
+        model = make_model(make_env(offset=4.0), n_collect=60, gamma=1.0)
+    before = [parameter.clone() for parameter in model.actor.parameters()]
+    assert train_metrics(model)["lyapunov_mean"] == np.inf
+    # What is learned is relative
+    assert all(th.isfinite(parameter).all() for parameter in model.policy.parameters())
+    assert not any(th.equal(*pair) for pair in zip(before, model.actor.parameters(), strict=True))

@@ -12,7 +12,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import BitFlippingEnv, FakeImageEnv
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_lac import LAC
+from sb3_lac import LAC, PublishedLAC
 
 
 class RandomEnv(gym.Env):
@@ -45,7 +45,6 @@ def test_arguments_are_those_of_sac_and_the_own_ones_follow_target_entropy():
     parameters, sac_parameters = (list(inspect.signature(cls.__init__).parameters.values()) for cls in (LAC, SAC))
     names = [parameter.name for parameter in parameters]
     own = [
-        "published_update",
         "alpha3",
         "lambda_init",
         "lambda_min",
@@ -85,7 +84,7 @@ def test_parallel_envs_and_gsde(make_model, make_env, n_updates, n_envs, use_sde
 
 
 def test_gsde_noise_of_both_actors_is_sampled_in_each_update(make_model):
-    model = make_model(use_sde=True, published_update=True)
+    model = make_model(use_sde=True, algorithm=PublishedLAC)
     noise = [actor.action_dist.exploration_mat for actor in (model.actor, model.actor_target)]
     model.train(gradient_steps=1, batch_size=16)
     for actor, old_noise in zip((model.actor, model.actor_target), noise, strict=True):
@@ -112,7 +111,7 @@ def test_hindsight_experience_replay(make_model):
     model = make_model(env, n_collect=0, policy="MultiInputPolicy", replay_buffer_class=HerReplayBuffer)
     check_training(model)
     # Rewards of -1, and of 0 at the goal
-    assert model.reward_bound.item() == 0.0
+    assert model.largest_reward.item() == 0.0
 
 
 def test_rewards_computed_at_sampling_raise_the_bound(make_model):
@@ -130,7 +129,7 @@ def test_rewards_computed_at_sampling_raise_the_bound(make_model):
     )
     assert model.replay_buffer.rewards.max() <= 0.0
     check_training(model)
-    assert model.reward_bound.item() == 1.0
+    assert model.largest_reward.item() == 1.0
 
 
 @pytest.mark.parametrize("norm_reward", [False, True])
@@ -138,7 +137,7 @@ def test_vec_normalize(make_model, make_env, norm_reward):
     env = VecNormalize(make_vec_env(lambda: make_env(offset=2.0), n_envs=2), norm_reward=norm_reward)
     model = make_model(env, n_collect=0)
     check_training(model)
-    assert 0 < model.reward_bound.item() <= 2.0001
+    assert 0 < model.largest_reward.item() <= 2.0001
 
 
 def test_n_step_returns(make_model, make_env):

@@ -79,11 +79,13 @@ def test_value_is_the_largest_of_the_critics_for_actions_in_units_of_the_space(m
     policy = make_model(env, n_collect=0, policy_kwargs={"n_critics": 2}).policy
     observations = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
     actions = np.array([[3, 0.5, 2]] * 50, np.float32)
-    values = policy.predict_lyapunov(observations, actions)
     scaled = th.tensor([[1.0, 0.0, -1.0]] * 50)
+    # No value is cut off at 0
+    policy.critic.floor.fill_(1.0)
     first, second = (value.detach().numpy()[:, 0] for value in policy.critic(th.as_tensor(observations), scaled))
+    values = policy.predict_lyapunov(observations, actions)
     assert (first > second).any() and (second > first).any()
-    np.testing.assert_allclose(values, np.maximum(0, np.maximum(first, second)) ** 4, rtol=1e-5)
+    np.testing.assert_allclose(values, np.maximum(first, second), rtol=1e-5)
     # A single one
     np.testing.assert_allclose(policy.predict_lyapunov(observations[7], actions[7]), values[7:8], rtol=1e-6)
 
@@ -178,7 +180,7 @@ def test_interval_of_a_percentile_covers_it(n):
 
 def test_rewards_above_the_bound_cost_nothing(make_model, make_env):
     model = make_model(n_collect=0)
-    model.reward_bound.fill_(3.0)
+    model.largest_reward.fill_(3.0)
     report = evaluate_lyapunov(model, make_env(offset=5.0), 4, seed=1)
     rewards = report.transitions["reward"]
     assert rewards.max() > 3
@@ -294,7 +296,7 @@ def test_short_episodes_are_not_over_represented(make_model):
 def test_costs_have_the_units_of_the_training(make_model, make_env):
     env, eval_env = (VecNormalize(DummyVecEnv([lambda: make_env(offset=2.0)] * 2), gamma=0.9) for _ in range(2))
     model = make_model(env, gamma=0.9)
-    model.reward_bound.fill_(2.0)
+    model.largest_reward.fill_(2.0)
     sync_envs_normalization(env, eval_env)
     before = eval_env.obs_rms.mean.copy(), eval_env.ret_rms.var
     report = evaluate_lyapunov(model, eval_env, 6, seed=2)

@@ -76,25 +76,25 @@ def costs_of(model, rewards):
 def test_costs_are_the_negated_rewards_unless_rewards_are_positive(make_model):
     model = make_model(n_collect=0)
     assert costs_of(model, [-3.0, -0.5]) == [3.0, 0.5]
-    assert model.reward_bound.item() == 0.0
+    assert model.largest_reward.item() == 0.0
     assert costs_of(model, [-3.0, 2.0]) == [5.0, 0.0]
     # The bound is remembered
     assert costs_of(model, [-1.0, 1.0]) == [3.0, 1.0]
-    assert model.reward_bound.item() == 2.0
+    assert model.largest_reward.item() == 2.0
 
 
 def test_costs_of_normalized_rewards_are_not_negative_and_the_bound_follows_the_scale(make_model, make_env):
     env = VecNormalize(DummyVecEnv([lambda: make_env(offset=30.0)]))
     model = make_model(env)
     # Forget the rewards that were collected
-    model.reward_bound.zero_()
+    model.largest_reward.zero_()
     env.ret_rms.var = 4.0
     assert costs_of(model, [-1.0, 2.5]) == pytest.approx([3.5, 0.0])
-    assert model.reward_bound.item() == pytest.approx(5.0)
+    assert model.largest_reward.item() == pytest.approx(5.0)
     # Another scale: a reward of 5 is normalized to 0.5 now
     env.ret_rms.var = 100.0
     assert costs_of(model, [-1.0, 0.1]) == pytest.approx([1.5, 0.4])
-    assert model.reward_bound.item() == pytest.approx(5.0)
+    assert model.largest_reward.item() == pytest.approx(5.0)
     # Rewards are clipped, and so is the bound
     env.ret_rms.var = 1e-4
     assert costs_of(model, [10.0, -10.0]) == pytest.approx([0.0, 20.0])
@@ -111,7 +111,7 @@ def test_constant_positive_reward_costs_nothing_over_n_steps(make_model, make_en
     # Some of the sums are cut by the end of the episode
     assert len(sample.discounts.unique()) == 3
     assert model.costs(sample).abs().max() < 1e-4
-    assert model.reward_bound.item() == pytest.approx(5.0, rel=1e-5)
+    assert model.largest_reward.item() == pytest.approx(5.0, rel=1e-5)
 
 
 def test_everything_that_is_learned_is_saved(make_model, train_metrics):
@@ -138,8 +138,11 @@ def test_everything_that_is_learned_is_saved(make_model, train_metrics):
     ("kwargs", "message"),
     [
         ({"alpha3": 0.0}, "alpha3=0.0 must be greater than 0"),
-        ({"lambda_min": 2.0}, "lambda_min=2.0, lambda_init=1.0 and lambda_max=1.0 must be .* in this order"),
-        ({"lambda_init": 1.5}, "lambda_init=1.5 and lambda_max=1.0 must be .* in this order"),
+        (
+            {"lambda_min": 2.0, "lambda_max": 1.0},
+            "lambda_min=2.0, .* and lambda_max=1.0 must be .* the least of them lambda_min",
+        ),
+        ({"lambda_min": 0.0}, "lambda_min=0.0, .* must be greater than 0"),
         ({"lambda_max": math.inf}, "lambda_max=inf must be .* finite"),
         ({"reward_bound": -1.0}, "reward_bound=-1.0 must be finite and at least 0"),
         ({"reward_bound": 0.5, "gamma": 1.0}, "gamma=1.0 must be smaller than 1 with rewards up to 0.5"),

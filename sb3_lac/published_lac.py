@@ -1,0 +1,233 @@
+from typing import Any, ClassVar
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, Schedule
+from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, polyak_update
+from stable_baselines3.sac.policies import Actor
+from torch.nn import functional as F
+
+from sb3_lac.buffers import HorizonReplayBuffer
+from sb3_lac.compiled import Metrics, set_gradients, step
+from sb3_lac.costs import CostAlgorithm
+from sb3_lac.policies import PublishedCnnPolicy, PublishedMultiInputPolicy, PublishedPolicy, largest_value
+
+
+class PublishedLAC(CostAlgorithm):
+    """
+    Lyapunov Actor-Critic as published (Algorithm 1 of Han et al.)
+    Actor-Critic Reinforcement Learning for Control with Stability Guarantee
+    Paper: https://arxiv.org/abs/2004.14288, code: https://github.com/hithmh/Actor-critic-with-stability-guarantee
+
+    .. code-block:: python
+
+      from sb3_lac import PublishedLAC
+
+      model = PublishedLAC("MlpPolicy", "CartPoleCost-v0", horizon=5, seed=0)
+      model.learn(20_000)
+
+    ``L(s, a)``, the sum of the squares of the critic's last layer, learns the discounted sum of costs or, with a ``horizon``,
+    the plain sum of the next ones. The actor lowers ``lambda d + beta log pi``, ``d = L(s', pi(s')) - L(s, a) + alpha3 cost``.
+    ``lambda`` grows while ``d`` is above zero, and ``beta`` (``ent_coef``) while the entropy is below its target.
+
+    Defaults are those of the paper's table [P] or of the authors' code [C]. The code differs in these: a time limit is an end
+    (``replay_buffer_kwargs=dict(handle_timeout_termination=False)``); rates but that of ``lambda`` fall to zero
+    (``LinearSchedule(rate, 0.0, 1.0)``); ``alpha3`` is 0.1; and ``lambda`` is clipped when it is read, so that its logarithm
+    can wind up. Costs where rewards are positive are those of ``LAC``.
+
+    :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...), see ``PublishedPolicy`` for its networks [P]
+    :param env: The environment to learn from (if registered in Gym, can be str)
+    :param learning_rate: learning rate of the actor and of ``ent_coef`` [P],
+        it can be a function of the current progress remaining (from 1 to 0)
+    :param buffer_size: size of the replay buffer [C]
+    :param learning_starts: how many steps of the model to collect transitions for before learning starts [C]
+    :param batch_size: Minibatch size for each gradient update [P]
+    :param tau: the soft update coefficient ("Polyak update", between 0 and 1) [P]
+    :param gamma: the discount factor [P]. 'auto' is the one that the environment states. It has no effect with a ``horizon``.
+    :param train_freq: Update the model every ``train_freq`` steps [C]
+    :param gradient_steps: How many gradient steps to do after each rollout [C]
+    :param action_noise: the action noise type (None by default)
+    :param replay_buffer_class: Replay buffer class to use. If ``None``, it will be automatically selected.
+    :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation.
+    :param optimize_memory_usage: Enable a memory efficient variant of the replay buffer (not with a ``horizon``)
+    :param ent_coef: Entropy regularization coefficient (``beta`` in the paper), 'auto_2' is learned from 2 on [C]
+    :param target_update_interval: update the target networks every ``target_update_interval`` gradient steps.
+    :param target_entropy: target entropy when learning ``ent_coef``, 'auto' is minus the number of actions [P]
+    :param alpha3: Share of the cost by which ``L`` has to decrease in each step [P]
+    :param horizon: Number of costs whose plain sum is ``L``. It is 5 in four of the paper's five tasks [P]. ``None`` is the
+        discounted sum of all costs. Not with dictionary observations.
+    :param critic_learning_rate: learning rate of the critic [P], it can be a function of the current progress remaining
+    :param lambda_learning_rate: learning rate of ``lambda`` [C], it can be a function of the current progress remaining
+    :param lambda_init: Initial value of ``lambda`` [C]
+    :param lambda_min: Lower limit of ``lambda`` (the code has 0, which a logarithm does not reach)
+    :param lambda_max: Upper limit of ``lambda`` [C]. If ``None``, it is 1, or ``lambda_init`` if that is larger.
+    :param reward_bound: Largest reward that the environment can pay, see ``LAC``
+    :param compile_update: Whether to compile each update to one graph, see ``LAC``
+    :param kwargs: ``use_sde``, ``sde_sample_freq``, ``use_sde_at_warmup``, ``stats_window_size``, ``tensorboard_log``,
+        ``policy_kwargs``, ``verbose``, ``seed`` and ``device``, as those of ``LAC``
+    :param _init_setup_model: Whether or not to build the network at the creation of the instance
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": PublishedPolicy,
+        "CnnPolicy": PublishedCnnPolicy,
+        "MultiInputPolicy": PublishedMultiInputPolicy,
+    }
+    policy: PublishedPolicy
+    actor_target: Actor
+
+    def __init__(
+        self,
+        policy: str | type[PublishedPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 1e-4,
+        buffer_size: int = 1_000_000,  # 1e6
+        learning_starts: int = 1000,
+        batch_size: int = 256,
+        tau: float = 0.005,
+        gamma: float | str = 0.995,
+        train_freq: int | tuple[int, str] = 100,
+        gradient_steps: int = 80,
+        action_noise: ActionNoise | None = None,
+        replay_buffer_class: type[ReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        optimize_memory_usage: bool = False,
+        ent_coef: str | float = "auto_2",
+        target_update_interval: int = 1,
+        target_entropy: str | float = "auto",
+        alpha3: float = 1.0,
+        horizon: int | None = None,
+        critic_learning_rate: float | Schedule = 3e-4,
+        lambda_learning_rate: float | Schedule = 1e-4,
+        lambda_init: float = 1.0,
+        lambda_min: float = 1e-4,
+        lambda_max: float | None = None,
+        reward_bound: float | None = None,
+        compile_update: bool = False,
+        _init_setup_model: bool = True,
+        **kwargs: Any,
+    ):
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            buffer_size,
+            learning_starts,
+            batch_size,
+            tau,
+            gamma,
+            train_freq,
+            gradient_steps,
+            action_noise,
+            replay_buffer_class,
+            replay_buffer_kwargs,
+            ent_coef,
+            target_update_interval,
+            target_entropy,
+            alpha3,
+            lambda_init,
+            lambda_min,
+            lambda_max,
+            lambda_learning_rate,
+            reward_bound,
+            compile_update,
+            optimize_memory_usage=optimize_memory_usage,
+            **kwargs,
+        )
+        self.horizon = horizon
+        self.critic_learning_rate = critic_learning_rate
+        if _init_setup_model:
+            self._setup_model()
+
+    def _setup_model(self) -> None:
+        if self.horizon is not None:
+            # A model that is loaded may have had no horizon before
+            plain = self.replay_buffer_class in (None, ReplayBuffer)
+            self.replay_buffer_class = HorizonReplayBuffer if plain else self.replay_buffer_class
+            self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "horizon": self.horizon}
+        super()._setup_model()
+        self.critic_lr_schedule = FloatSchedule(self.critic_learning_rate)
+        self.actor_target = self.policy.actor_target
+        self.batch_norm_stats += get_parameters_by_name(self.actor, ["running_"])
+        self.batch_norm_stats_target += get_parameters_by_name(self.actor_target, ["running_"])
+
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        if self.horizon is None:
+            if self.gamma == 1:
+                raise ValueError("gamma must be smaller than 1 without a horizon: L would be an infinite sum.")
+        elif isinstance(self.observation_space, spaces.Dict) or not issubclass(self.replay_buffer_class, HorizonReplayBuffer):  # type: ignore[arg-type]
+            raise ValueError(f"horizon={self.horizon} needs a HorizonReplayBuffer, and observations that are no dictionaries.")
+        elif not 1 <= self.horizon <= self.learning_starts // self.n_envs:
+            limit = f"the steps before the first update, learning_starts={self.learning_starts} of {self.n_envs} environments"
+            raise ValueError(f"horizon={self.horizon} must be at least 1, and no more than {limit}.")
+
+    def _candidate(self, replay_data: Any, costs: th.Tensor) -> th.Tensor:
+        """The Lyapunov candidate, the target of ``L``."""
+        if self.horizon is not None:
+            # A cost is the bound less the reward
+            return self.horizon * (costs + replay_data.rewards) - replay_data.horizon_rewards
+        with th.no_grad():
+            next_actions = self.actor_target(replay_data.next_observations)
+            next_values = self.critic_target.lyapunov(replay_data.next_observations, next_actions)
+            # After a termination, each step costs the bound
+            next_values = (1 - replay_data.dones) * next_values + replay_data.dones * self.critic.offset
+            return costs + self.gamma * next_values
+
+    def _update(self, replay_data: ReplayBufferSamples, costs: th.Tensor, update_targets: bool) -> Metrics:
+        # We need to sample because `log_std` may have changed between two gradient steps
+        if self.use_sde:
+            self.actor.reset_noise()
+            self.actor_target.reset_noise()
+
+        # a~ for the sampled states
+        _, log_prob = self.actor.action_log_prob(replay_data.observations)
+
+        # J(L) = E 1/2 (L(s, a) - candidate)^2
+        targets = self._candidate(replay_data, costs)
+        current_values = self.critic(replay_data.observations, replay_data.actions)
+        critic_loss = 0.5 * sum(F.mse_loss(values, targets) for values in current_values)
+        assert isinstance(critic_loss, th.Tensor)  # for type checker
+
+        # d = E[L(s', pi(s')) - L(s, a) + alpha3 cost], with a gradient through the next action
+        values = largest_value(current_values).detach()
+        next_values = self.critic.lyapunov(replay_data.next_observations, self.actor(replay_data.next_observations))
+        violation = (next_values - values + self.alpha3 * costs).mean()
+
+        # J(pi) = lambda d + beta E log pi(a~|s)
+        lambda_coef, ent_coef = self._weights()
+        actor_loss = lambda_coef * violation + ent_coef * log_prob.mean()
+
+        # Optimize the critic and the actor, both with the gradient at the current parameters
+        set_gradients(critic_loss, self.critic.optimizer)
+        set_gradients(actor_loss, self.actor.optimizer)
+        step(self.critic.optimizer)
+        step(self.actor.optimizer)
+
+        metrics = {
+            "actor_loss": actor_loss,
+            "critic_loss": critic_loss,
+            "ent_coef": ent_coef,
+            "lambda": lambda_coef,
+            "lyapunov_difference": violation,
+            "lyapunov_mean": values.mean(),
+            "cost": costs.mean(),
+            # J(lambda) = -log lambda d, J(beta) = -log beta E[log pi(a~|s) + target entropy]
+            **self._update_multipliers(violation, log_prob),
+        }
+
+        # Update target networks
+        if update_targets:
+            polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
+            polyak_update(self.actor.parameters(), self.actor_target.parameters(), self.tau)
+            # Copy running stats, see GH issue #996
+            polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
+
+        with th.no_grad():
+            return tuple(metrics), th.hstack(tuple(metrics.values()))
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "actor_target"]

@@ -1,0 +1,273 @@
+"""The published algorithm: one update, written out a second time from the equations, and the sums of its finite horizon."""
+
+import math
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.envs import BitFlippingEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from sb3_lac import LAC, LyapunovPolicy, PublishedLAC, PublishedPolicy, certify, evaluate_lyapunov, fit_lyapunov
+from sb3_lac.buffers import HorizonReplayBuffer
+
+GAMMA, TAU, ALPHA3 = 0.9, 0.05, 0.3
+RATES = {"actor": 1e-2, "critic": 3e-2}
+LAMBDA_RATE = 2e-2
+
+
+class ShortEpisodes(gym.Wrapper):
+    """Rewards above zero, and a termination after five steps."""
+
+    def reset(self, **kwargs):
+        self.n_steps = 0
+        return self.env.reset(**kwargs)
+
+    def step(self, action):
+        self.n_steps += 1
+        obs, reward, _, truncated, info = self.env.step(action)
+        return obs, reward + 2.0, self.n_steps == 5, truncated, info
+
+
+def layers(weights, prefix, x, n_layers):
+    for i in range(n_layers):
+        x = th.relu(x @ weights[f"{prefix}.{2 * i}.weight"].T + weights[f"{prefix}.{2 * i}.bias"])
+    return x
+
+
+def action_of(weights, obs):
+    """A sampled action of the squashed Gaussian, and its log probability."""
+    latent = layers(weights, "latent_pi", obs, 2)
+    mean = latent @ weights["mu.weight"].T + weights["mu.bias"]
+    log_std = (latent @ weights["log_std.weight"].T + weights["log_std.bias"]).clamp(-20, 2)
+    noise = th.normal(th.zeros_like(mean), th.ones_like(mean))
+    action = th.tanh(mean + log_std.exp() * noise)
+    log_prob = -0.5 * noise**2 - log_std - 0.5 * math.log(2 * math.pi) - th.log(1 - action**2 + 1e-6)
+    return action, log_prob.sum(dim=1)
+
+
+def lyapunov(weights, obs, actions):
+    """The sum of the squares of the last layer."""
+    return (layers(weights, "lf0", th.cat([obs, actions], dim=1), 3) ** 2).sum(dim=1)
+
+
+@pytest.mark.parametrize("horizon", [None, 5])
+@pytest.mark.parametrize("make_env", ["CartPoleCost-v0", "LinearCost-v0", lambda: ShortEpisodes(gym.make("LinearCost-v0"))])
+def test_step_is_that_of_the_equations(make_model, make_env, horizon):
+    model = make_model(
+        make_env if isinstance(make_env, str) else make_env(),
+        algorithm=PublishedLAC,
+        n_collect=120,
+        learning_starts=120,
+        gamma=GAMMA,
+        tau=TAU,
+        alpha3=ALPHA3,
+        horizon=horizon,
+        learning_rate=RATES["actor"],
+        critic_learning_rate=RATES["critic"],
+        lambda_learning_rate=LAMBDA_RATE,
+        ent_coef="auto_0.7",
+        lambda_init=0.5,
+        policy="MlpPolicy",
+        # With plain gradient descent, a wrong factor in a loss cannot hide (Adam is invariant to scale)
+        policy_kwargs={"net_arch": None, "activation_fn": th.nn.ReLU, "optimizer_class": th.optim.SGD},
+    )
+    batch = model.replay_buffer.sample(32)
+    model.replay_buffer.sample = lambda *args, **kwargs: batch
+    obs, next_obs, actions, dones = batch.observations, batch.next_observations, batch.actions, batch.dones.flatten()
+    bound = model.largest_reward.item()
+    costs = bound - batch.rewards.flatten()
+    assert (costs >= 0).all()
+
+    networks = ("actor", "critic", "actor_target", "critic_target")
+    for network in networks[:2]:
+        for parameter in getattr(model, network).parameters():
+            # Targets differ from what they follow
+            parameter.data.add_(0.05 * th.randn_like(parameter))
+    actor, critic, actor_target, critic_target = (
+        {name: tensor.detach().clone().requires_grad_(True) for name, tensor in getattr(model, network).named_parameters()}
+        for network in networks
+    )
+    th.manual_seed(1)
+    model.train(gradient_steps=1, batch_size=32)
+
+    th.manual_seed(1)
+    _, log_prob = action_of(actor, obs)
+    if horizon is None:
+        with th.no_grad():
+            next_actions, _ = action_of(actor_target, next_obs)
+            after = bound / (1 - GAMMA)  # nothing is paid any more
+            next_values = (1 - dones) * lyapunov(critic_target, next_obs, next_actions) + dones * after
+            target = costs + GAMMA * next_values
+    else:
+        target = horizon * bound - batch.horizon_rewards.flatten()
+    critic_loss = (0.5 * (lyapunov(critic, obs, actions) - target) ** 2).mean()
+    next_actions, _ = action_of(actor, next_obs)
+    d = (lyapunov(critic, next_obs, next_actions) - lyapunov(critic, obs, actions).detach() + ALPHA3 * costs).mean()
+    actor_loss = 0.5 * d + 0.7 * log_prob.mean()
+    entropy_violation = log_prob.mean() - actions.shape[1]
+
+    logged = {name.removeprefix("train/"): value for name, value in model.logger.name_to_value.items()}
+    expected = {
+        "critic_loss": critic_loss,
+        "actor_loss": actor_loss,
+        "lyapunov_difference": d,
+        "cost": costs.mean(),
+        "lambda": 0.5,
+        "ent_coef": 0.7,
+        "lambda_loss": -math.log(0.5) * d,
+        "ent_coef_loss": -math.log(0.7) * entropy_violation,
+    }
+    for name, value in expected.items():
+        assert logged[name] == pytest.approx(float(value), rel=1e-4), name
+    for name, weights, loss in (("critic", critic, critic_loss), ("actor", actor, actor_loss)):
+        gradients = th.autograd.grad(loss, list(weights.values()), retain_graph=True)
+        for (key, parameter), gradient in zip(getattr(model, name).named_parameters(), gradients, strict=True):
+            th.testing.assert_close(parameter.grad, gradient, rtol=1e-4, atol=1e-5 * gradient.abs().max().item() + 1e-9)
+            new = (weights[key] - RATES[name] * gradient).detach()
+            th.testing.assert_close(parameter.detach(), new, rtol=1e-4, atol=1e-5 * new.abs().max().item() + 1e-9)
+            target_network = {"critic": critic_target, "actor": actor_target}[name]
+            followed = dict(getattr(model, f"{name}_target").named_parameters())[key]
+            lagged = (1 - TAU) * target_network[key] + TAU * parameter
+            th.testing.assert_close(followed.detach(), lagged.detach(), rtol=1e-4, atol=1e-6)
+    # Adam's first step is its rate
+    assert model.log_lambda.item() == pytest.approx(math.log(0.5) + LAMBDA_RATE * float(d.sign()), rel=1e-4)
+    assert model.log_ent_coef.item() == pytest.approx(
+        math.log(0.7) + RATES["actor"] * float(entropy_violation.sign()), rel=1e-4
+    )
+
+
+def test_defaults_are_those_of_the_paper_and_the_code():
+    model = PublishedLAC("MlpPolicy", "CartPoleCost-v0", device="cpu")
+    assert [layer.out_features for layer in model.critic.lyapunov_networks[0] if hasattr(layer, "out_features")] == [
+        64,
+        64,
+        16,
+    ]
+    assert len(model.critic.lyapunov_networks) == 1
+    rates = [optimizer.param_groups[0]["lr"] for optimizer in (model.actor.optimizer, model.lambda_optimizer)]
+    assert rates == [1e-4, 1e-4] and model.critic_lr_schedule(1) == 3e-4
+    assert (model.gamma, model.tau, model.alpha3, model.horizon) == (0.995, 0.005, 1.0, None)
+    assert model.log_ent_coef.exp().item() == pytest.approx(2.0)
+
+
+@settings(deadline=None, max_examples=40)
+@given(data=st.data(), horizon=st.integers(1, 6), n_envs=st.integers(1, 3), buffer_size=st.integers(8, 20))
+def test_horizon_sums_the_next_rewards_and_goes_on_with_the_last_one(data, horizon, n_envs, buffer_size):
+    box = spaces.Box(-np.inf, np.inf, (1,), np.float64)
+    buffer = HorizonReplayBuffer(buffer_size * n_envs, box, spaces.Box(-1, 1, (1,)), "cpu", n_envs, horizon=horizon)
+    n_steps = data.draw(st.integers(horizon, 3 * buffer_size))
+    ends = np.array(
+        data.draw(st.lists(st.lists(st.booleans(), min_size=n_envs, max_size=n_envs), min_size=n_steps, max_size=n_steps))
+    )
+    rewards = np.arange(n_steps * n_envs, dtype=np.float32).reshape(n_steps, n_envs) - 40
+    for step in range(n_steps):
+        number = (step * n_envs + np.arange(n_envs))[:, None]
+        buffer.add(number, number + 0.5, np.zeros((n_envs, 1)), rewards[step], ends[step], [{}] * n_envs)
+    batch = buffer.sample(64)
+    for observation, following, reward, total in zip(
+        batch.observations, batch.next_observations, batch.rewards, batch.horizon_rewards, strict=True
+    ):
+        step, env = divmod(int(observation), n_envs)
+        assert following == observation + 0.5 and reward == rewards[step, env]
+        summed, at = 0.0, step
+        for _ in range(horizon):
+            summed += rewards[at, env]
+            at += not ends[at, env]
+        # The steps of a horizon are known, and none was overwritten
+        assert total == summed and n_steps - buffer_size <= step <= n_steps - horizon
+
+
+def test_normalized_costs_of_a_horizon_are_summed_in_units_of_the_agent(make_model, make_env):
+    env = VecNormalize(DummyVecEnv([lambda: make_env(offset=3.0)]))
+    model = make_model(env, algorithm=PublishedLAC, horizon=3)
+    env.ret_rms.var = 4.0
+    batch = model.replay_buffer.sample(64, env=env)
+    costs = model.costs(batch)
+    targets = model._candidate(batch, costs)
+    assert (targets >= costs - 1e-5).all()
+    th.testing.assert_close(targets, 3 * model.cost_bound(env) - batch.horizon_rewards)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"horizon": 0}, "horizon=0 must be at least 1"),
+        ({"horizon": 41}, "horizon=41 must be .* no more than the steps before the first update, learning_starts=40"),
+        ({"gamma": 1.0}, "gamma must be smaller than 1 without a horizon"),
+        ({"policy": LyapunovPolicy}, "PublishedLAC needs a policy derived from PublishedPolicy, and this is LyapunovPolicy"),
+        ({"horizon": 3, "replay_buffer_class": HerReplayBuffer}, "needs a HorizonReplayBuffer"),
+    ],
+)
+def test_bad_arguments_are_named(make_model, kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        make_model(algorithm=PublishedLAC, n_collect=0, **kwargs)
+
+
+def test_horizon_needs_a_buffer_of_its_own(make_model, make_env):
+    with pytest.raises(NotImplementedError, match="doesn't support optimize_memory_usage"):
+        kwargs = {"optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}}
+        make_model(algorithm=PublishedLAC, n_collect=0, horizon=3, **kwargs)
+    with pytest.raises(ValueError, match="observations that are no dictionaries"):
+        env = BitFlippingEnv(n_bits=3, continuous=True)
+        make_model(env, algorithm=PublishedLAC, n_collect=0, policy="MultiInputPolicy", horizon=3)
+
+
+def test_horizon_can_be_changed_on_loading(make_model, tmp_path):
+    for before, after in ((None, 3), (3, 5), (3, None)):
+        make_model(algorithm=PublishedLAC, n_collect=0, horizon=before).save(tmp_path / "model")
+        env = make_model(n_collect=0).get_env()
+        loaded = PublishedLAC.load(tmp_path / "model", env=env, horizon=after).learn(80)
+        assert loaded.horizon == after and loaded._n_updates > 0
+
+
+def test_stability_functions_take_it(make_model, make_env):
+    model = make_model(algorithm=PublishedLAC, horizon=3, n_collect=60)
+    report = evaluate_lyapunov(model, make_env(), 4, seed=1)
+    # Its own L, and none negative
+    assert (report.transitions["lyapunov"] >= 0).all()
+    lyapunov_function = fit_lyapunov(model, make_env(), 4, seed=100)
+    assert len(certify(model, make_env(), lyapunov_function, 4, seed=200).statements) > 0
+
+
+def test_it_learns_to_control(make_model, make_env):
+    def mean_cost(model):
+        report = evaluate_lyapunov(model, make_env(n_dim=1), 10, deterministic=True, seed=1000)
+        return report.transitions["cost"].mean()
+
+    for horizon in (None, 5):
+        model = make_model(
+            make_env(n_dim=1),
+            n_collect=0,
+            algorithm=PublishedLAC,
+            horizon=horizon,
+            gamma=0.9,
+            tau=0.02,
+            learning_rate=3e-3,
+            critic_learning_rate=3e-3,
+            ent_coef="auto",
+            buffer_size=2000,
+        ).learn(1500)
+        # Doing nothing costs 1.15 per step, the best controller 0.09
+        assert mean_cost(model) < 0.4, horizon
+
+
+def test_model_of_another_algorithm_or_version_is_named(make_model, tmp_path):
+    model = make_model(n_collect=0)
+    model.save(tmp_path / "model")
+    with pytest.raises(ValueError, match="PublishedLAC needs a policy derived from PublishedPolicy"):
+        PublishedLAC.load(tmp_path / "model")
+    with pytest.raises(ValueError, match="LAC needs a policy derived from LyapunovPolicy, and this is PublishedPolicy"):
+        make_model(n_collect=0, policy=PublishedPolicy)
+    # Another version has other tensors
+    del model.critic.floor
+    model.save(tmp_path / "older")
+    with pytest.raises(RuntimeError, match=r"not those of this LAC: (.|\n)*another version of sb3_lac"):
+        LAC.load(tmp_path / "older")
+    with pytest.raises(RuntimeError, match="whether ent_coef is learned, cannot be changed"):
+        LAC.load(tmp_path / "model", ent_coef=0.1)
