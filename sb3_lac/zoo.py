@@ -52,10 +52,10 @@ try:
 except ImportError as error:
     raise ImportError("sb3_lac.zoo needs the RL Zoo, install it with: pip install 'sb3_lac[zoo]'") from error
 
-from sb3_lac import LAC, DashboardCallback, GymnasiumVecEnv
+from sb3_lac import LAC, DashboardCallback, GymnasiumVecEnv, PublishedLAC
 
 #: The algorithms that the RL Zoo gets from this package
-ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"lac": LAC}
+ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"lac": LAC, "published_lac": PublishedLAC}
 
 _RL_ZOO = Path(rl_zoo3.__file__).parent
 #: Where the RL Zoo has its hyperparameters; in a source checkout of it they lie beside the package
