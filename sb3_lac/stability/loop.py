@@ -152,9 +152,9 @@ def check_seeds(seeds: range, of_others: Collection[int], others: str) -> None:
 
 def check_training_seeds(policy: PolicyPredictor, seeds: range) -> None:
     """
-    Refuse episodes that begin as those of the training. Its seeds are those of its environments, whoever gave them, and
-    Gymnasium's environments know the seed of their random numbers. Environments that a model has no more, because it was
-    loaded or got others, cannot be asked: of them only those are known that the model seeded itself, from its ``seed`` on.
+    Refuse episodes that begin as those of the training. Its seeds are those of its environments, whoever gave them: each
+    knows the seed of its ``np_random``. Environments that a model has no more, because it was loaded or got others, cannot be
+    asked. Of them only those are known that the model seeded itself: from its ``seed`` on, as many as it has now.
     """
     if not isinstance(policy, BaseAlgorithm):
         return
