@@ -301,7 +301,7 @@ def critic_of(policy: PolicyPredictor) -> CriticLyapunov:
     """Return the Lyapunov function that LAC has learned, and refuse any other policy."""
     if not isinstance(policy, CostAlgorithm):
         raise ValueError(
-            f"The model must be a LAC or PublishedLAC, which has a Lyapunov function, and not {policy!r}. For any other "
-            "policy, learn one with fit_lyapunov(policy, env), and pass it as lyapunov=... (CertificateCallback does so)."
+            f"The model must be a LAC or PublishedLAC, which has a Lyapunov function, not {policy!r}. For any other policy, "
+            "learn one with fit_lyapunov(policy, env), and pass it as lyapunov=... (CertificateCallback does so)."
         )
     return CriticLyapunov(policy)

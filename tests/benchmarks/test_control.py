@@ -1,6 +1,5 @@
 """Policies of control problems have the same starts and disturbances, and tables and figures say what came out."""
 
-import itertools
 import json
 import re
 from functools import partial
@@ -9,7 +8,6 @@ import gymnasium as gym
 import numpy as np
 import pandas as pd
 import pytest
-import yaml
 from gymnasium import spaces
 
 pytest.importorskip("rl_zoo3")
@@ -19,7 +17,6 @@ from docs.environment_pages import DOCS, environment_page
 from sb3_lac import LAC
 from sb3_lac.envs import LinearCostEnv, reference_controller
 from sb3_lac.stability import fitting
-from sb3_lac.zoo import find_config
 
 IDS = list(control.DISTURBANCES)
 
@@ -277,13 +274,17 @@ def test_tables_of_stabilisation_count_episodes_and_seeds():
 
 
 def test_all_algorithms_have_the_same_budget():
-    # that of metric_sac is LAC's
-    algos = [algo for algo in stabilisation.ALGORITHMS if algo != "metric_sac"]
-    configs = [yaml.safe_load(find_config(algo).read_text(encoding="utf-8")) for algo in algos]
-    for env_id, config in itertools.product(IDS, configs):
-        for name in ("n_timesteps", "n_envs", "gradient_steps", "learning_starts"):
-            assert config[env_id][name] == configs[0][env_id][name]
-        assert "net_arch=[64, 64]" in config[env_id]["policy_kwargs"]
+    contenders = {name: each for name, each in stabilisation.CONTENDERS.items() if name != "published_lac_paper"}
+    for env_id in IDS:
+        recipes = {name: contender.recipe(env_id, 0, None) for name, contender in contenders.items()}
+        of_lac = recipes["lac"]
+        for name, recipe in recipes.items():
+            assert recipe.timesteps == of_lac.timesteps
+            for setting in ("n_envs", "gradient_steps", "learning_starts"):
+                assert recipe.hyperparameters[setting] == of_lac.hyperparameters[setting]
+            assert "net_arch=[64, 64]" in recipe.hyperparameters["policy_kwargs"]
+            if name.endswith("_common"):
+                assert of_lac.hyperparameters.items() <= recipe.hyperparameters.items()
 
 
 @pytest.fixture
