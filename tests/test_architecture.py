@@ -101,7 +101,7 @@ def test_sb3_lac_knows_nothing_of_batteries(path):
     [
         ("plots", set()),
         ("statistics", set()),
-        ("functions", {"lac"}),
+        ("functions", {"costs"}),
         ("rollout", {"stability.functions"}),
         ("loop", {"stability.functions", "stability.rollout", "vec_env"}),
         ("fitting", {"files", "stability.functions", "stability.loop", "stability.rollout"}),

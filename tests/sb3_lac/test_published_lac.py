@@ -228,7 +228,7 @@ def test_horizon_can_be_changed_on_loading(make_model, tmp_path):
 
 def test_stability_functions_take_it(make_model, make_env):
     model = make_model(algorithm=PublishedLAC, horizon=3, n_collect=60)
-    report = evaluate_lyapunov(model, make_env(), 4, seed=0)
+    report = evaluate_lyapunov(model, make_env(), 4, seed=1)
     # Its own L, and none negative
     assert (report.transitions["lyapunov"] >= 0).all()
     lyapunov_function = fit_lyapunov(model, make_env(), 4, seed=100)
