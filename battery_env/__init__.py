@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from battery_env.app.calibrate import Calibration, Settings, calibrate
     from battery_env.calibration.onnx_policy import OnnxPolicy
     from battery_env.calibration.policy import PolicyEstimator
-    from battery_env.cells import Discharge, load_nasa_discharges
     from battery_env.conversions import capacity_Ah, dc_resistance_ohm
     from battery_env.electrochemistry import NEW_CELL, CellParameters, Trajectory, initial_state, simulate, step, voltage
     from battery_env.estimates import Estimate
@@ -35,7 +34,8 @@ if TYPE_CHECKING:
     from battery_env.forecasts import Forecast, forecast
     from battery_env.life import Life, track_life
     from battery_env.record_files import read_discharge_csv, read_discharges
-    from battery_env.record_model import RecordModel
+    from battery_env.records.discharge import Discharge, load_nasa_discharges
+    from battery_env.records.model import RecordModel
     from battery_env.sensors import RandomSensorErrors, SensorErrors
     from battery_env.trajectories import TrajectoryDataset
 
@@ -45,7 +45,6 @@ _MODULES = {
     "app.calibrate": ("Calibration", "Settings", "calibrate"),
     "calibration.onnx_policy": ("OnnxPolicy",),
     "calibration.policy": ("PolicyEstimator",),
-    "cells": ("Discharge", "load_nasa_discharges"),
     "conversions": ("capacity_Ah", "dc_resistance_ohm"),
     "electrochemistry": ("NEW_CELL", "CellParameters", "Trajectory", "initial_state", "simulate", "step", "voltage"),
     "estimates": ("Estimate",),
@@ -57,7 +56,8 @@ _MODULES = {
     "forecasts": ("Forecast", "forecast"),
     "life": ("Life", "track_life"),
     "record_files": ("read_discharge_csv", "read_discharges"),
-    "record_model": ("RecordModel",),
+    "records.discharge": ("Discharge", "load_nasa_discharges"),
+    "records.model": ("RecordModel",),
     "sensors": ("RandomSensorErrors", "SensorErrors"),
     "trajectories": ("TrajectoryDataset",),
 }

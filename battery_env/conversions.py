@@ -10,8 +10,8 @@ from battery_env.checks import LoadUnit, check_load, check_positive
 from battery_env.electrochemistry import NEW_CELL
 from battery_env.estimates import Estimate
 from battery_env.parameters import Q_MOBILE, R_O
-from battery_env.record_model import LONGEST_FORECAST_S, RecordModel
 from battery_env.records import CUT_OFF_V
+from battery_env.records.model import LONGEST_FORECAST_S, RecordModel
 
 # For its derivatives a capacity is computed again with q_mobile moved by this share, and r_o by this many ohm.
 _STEP_SHARE, _STEP_OHM = 0.01, 0.002

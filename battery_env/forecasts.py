@@ -28,8 +28,8 @@ from battery_env.estimators.diagnosis import white_noise_V
 from battery_env.loads import BlockBootstrap, Cycle, KnownLoad, Load, RandomLoad, constant, in_steps, steadier_unit
 from battery_env.parameters import Q_MOBILE, R_O
 from battery_env.plotting import COLOURS, new_figure
-from battery_env.record_model import RECENT_SHARE, RecordModel
 from battery_env.records import CUT_OFF_V, Record, Samples, check_record, expected_current
+from battery_env.records.model import RECENT_SHARE, RecordModel
 
 #: What a load to come can be given as.
 FutureLoad = float | KnownLoad | RandomLoad | Callable[[FloatArray], ArrayLike]

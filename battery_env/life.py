@@ -17,12 +17,12 @@ from scipy.optimize import minimize
 from scipy.stats import truncnorm
 
 from battery_env.arrays import BoolArray, FloatArray
-from battery_env.cells import Discharge
 from battery_env.checks import check_positive, check_whole_number
 from battery_env.estimators.diagnosis import is_only_imprecise
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.forecasts import BAND, quantile
 from battery_env.records import drawn, mean_current_A
+from battery_env.records.discharge import Discharge
 
 #: What is believed of a cell before its discharges tell, as shares of q_mobile: the step from one to the next, the error of
 #: one estimate beside the others (both known to a factor of e, one standard deviation), and the sd of the drift.

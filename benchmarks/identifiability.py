@@ -35,7 +35,7 @@ from battery_env.estimators import (
 from battery_env.loads import RandomPiecewise, constant
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.plotting import COLOURS, LABELS, coloured, new_figure, plot_estimates, plot_sensitivities
-from battery_env.record_model import RecordModel
+from battery_env.records.model import RecordModel
 from battery_env.sensors import SensorErrors
 from battery_env.trajectories import TrajectoryDataset
 from benchmarks.study import SYMBOLS, Study, Tables, command_line, digits, markdown, positive

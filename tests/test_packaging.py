@@ -60,7 +60,7 @@ def test_each_wheel_owns_its_files_and_brings_its_data_and_license(wheels):
         assert {name.split("/")[0].split("-")[0] for name in names} == {package}
         assert any(name.endswith(".dist-info/licenses/LICENSE") for name in names)
     assert {f"sb3_lac/zoo_configs/{path.name}" for path in (ROOT / "zoo_configs").iterdir()} <= packaged["sb3_lac"]
-    data = {f"battery_env/nasa_cells/{path.name}" for path in (ROOT / "battery_env/nasa_cells").glob("*.*")}
+    data = {f"battery_env/records/nasa_cells/{path.name}" for path in (ROOT / "battery_env/records/nasa_cells").glob("*.*")}
     assert data <= packaged["battery_env"]
 
 

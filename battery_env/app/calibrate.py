@@ -13,7 +13,6 @@ import pandas as pd
 
 from battery_env.calibration.policy import PolicyEstimator
 from battery_env.calibration.pretrained import policy_of_file, pretrained_policy
-from battery_env.cells import Discharge
 from battery_env.checks import ZERO_CELSIUS_K, check_not_negative, check_positive
 from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.electrochemistry.cell import TB
@@ -27,8 +26,9 @@ from battery_env.estimators.monitor import start_condition, watched
 from battery_env.estimators.rest import InitialSoc, Start, check_initial_soc, soc_from_rest
 from battery_env.parameters import PARAMETER_NAMES, check_parameters
 from battery_env.record_files import each_usable
-from battery_env.record_model import RecordModel, VoltageForecast
 from battery_env.records import CUT_OFF_V, ExpectedCurrent, Samples, drawn, expected_current, mean_current_A
+from battery_env.records.discharge import Discharge
+from battery_env.records.model import RecordModel, VoltageForecast
 
 Method = Literal["least-squares", "kalman", "policy"]
 METHODS: tuple[Method, ...] = get_args(Method)

@@ -29,12 +29,12 @@ import numpy as np
 
 from battery_env.app.calibrate import METHODS, Settings, line_of, text_of
 from battery_env.app.many import FileFormat, Outcome, Results, calibrate_all, find_sources, read_source, workers
-from battery_env.cells import Discharge
 from battery_env.estimators.cell_fit import CellFit, fit_cell, read_cell
 from battery_env.estimators.rest import InitialSoc
 from battery_env.files import check_new, finite_or_none
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.records import CUT_OFF_V
+from battery_env.records.discharge import Discharge
 
 #: What the process returns: all records settled, one or more refused, one or more not settled, Ctrl-C, nobody reads on.
 SETTLED, REFUSED, NOT_SETTLED, INTERRUPTED, PIPE_CLOSED = 0, 2, 3, 130, 141

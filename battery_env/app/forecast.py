@@ -17,7 +17,6 @@ import pandas as pd
 
 from battery_env.app.calibrate import Calibration, Settings, calibrate
 from battery_env.app.many import FileFormat, Source, find_sources, read_source, record_name
-from battery_env.cells import Discharge
 from battery_env.checks import ZERO_CELSIUS_K, LoadUnit
 from battery_env.electrochemistry import NEW_CELL
 from battery_env.estimates import Estimate
@@ -28,8 +27,9 @@ from battery_env.forecasts import BAND, Forecast, FutureLoad, forecast, quantile
 from battery_env.life import Life, track_life
 from battery_env.loads import Load
 from battery_env.plotting import save_figure
-from battery_env.record_model import RecordModel
 from battery_env.records import VARIED_SHARE
+from battery_env.records.discharge import Discharge
+from battery_env.records.model import RecordModel
 
 # By name of the column of a profile: the unit of the load.
 _LOAD_COLUMNS: dict[str, LoadUnit] = {"current_A": "current", "power_W": "power"}

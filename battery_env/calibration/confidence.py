@@ -23,8 +23,8 @@ from battery_env.estimators.diagnosis import (
 from battery_env.estimators.gaps import find_gaps, long_intervals, note_gaps
 from battery_env.estimators.monitor import note_samples
 from battery_env.parameters import PARAMETER_NAMES
-from battery_env.record_model import RecordModel
 from battery_env.records import Samples
+from battery_env.records.model import RecordModel
 
 # Residuals below this may be what a linear step leaves, V
 _NEGLIGIBLE_V = 2e-3

@@ -9,9 +9,9 @@ from typing import Literal, TypeVar, get_args
 
 import numpy as np
 
-from battery_env.cells import BUNDLED_CELLS, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.loads import Load, LoadSampler, RandomPiecewise, RandomWalk, constant, recorded
+from battery_env.records.discharge import BUNDLED_CELLS, load_nasa_discharges
 from battery_env.trajectories import PAPER_LOADS_W, PAPER_RANGES, PAPER_TRIM, TrajectoryDataset, aged_parameters
 
 _Discharges = TypeVar("_Discharges")

@@ -31,8 +31,8 @@ from battery_env.estimators.monitor import note_samples
 from battery_env.estimators.rest import InitialSoc, check_initial_soc
 from battery_env.estimators.search import Fit, Prior, Search, square
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, check_parameters
-from battery_env.record_model import LONGEST_FORECAST_S, RecordModel
 from battery_env.records import Record, Samples, check_record, starts_at_rest
+from battery_env.records.model import LONGEST_FORECAST_S, RecordModel
 
 # Residuals whose variance is this many of its standard deviations above the one expected are not noise.
 _EXCESS_LIMIT = 5.0
@@ -75,7 +75,7 @@ class LeastSquares(Estimator):
 
     The model starts at the first sample of the record, fully charged and at rest unless ``initial_soc`` or ``initial`` say
     otherwise, and follows the recorded current (:func:`battery_env.records.resample_current`). For a recorded discharge give
-    :meth:`battery_env.cells.Discharge.loaded_part`, which starts when the load is switched on.
+    :meth:`battery_env.records.discharge.Discharge.loaded_part`, which starts when the load is switched on.
 
     *The search.* At a fixed current the charges of the model are linear in ``q_mobile``; so one simulation gives exactly the
     value below which the model cell would be empty before the record ends. The search is over the logarithm of the distance

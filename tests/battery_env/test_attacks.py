@@ -25,7 +25,6 @@ from battery_env.app.command_line import NOT_SETTLED, REFUSED, SETTLED, calibrat
 from battery_env.calibration.policy import PolicyEstimator
 from battery_env.calibration.pretrained import pretrained_ids
 from battery_env.calibration.voltage import ESTIMATE_RANGES
-from battery_env.cells import Discharge, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate
 from battery_env.estimates import last_estimate
 from battery_env.estimators import (
@@ -40,6 +39,7 @@ from battery_env.estimators import (
 )
 from battery_env.estimators.base import OnlineEstimator
 from battery_env.records import Stream
+from battery_env.records.discharge import Discharge, load_nasa_discharges
 
 WRONG_SHARE = 0.05
 COVERED_SD = 3.0

@@ -23,7 +23,6 @@ from battery_env import (
 from battery_env.app.calibrate import METHODS, Settings, calibrate
 from battery_env.app.forecast import forecast_end
 from battery_env.calibration.pretrained import pretrained_card
-from battery_env.cells import Discharge
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate, voltage
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimators.cell_fit import (
@@ -35,6 +34,7 @@ from battery_env.estimators.cell_fit import (
 )
 from battery_env.loads import constant as constant_load
 from battery_env.plotting import plot_cell_fit
+from battery_env.records.discharge import Discharge
 
 FIELDS = ("cell", "constants", "discharges", "mismatch_V", "thermal")
 OTHER = with_equilibrium(NEW_CELL, [0.02, -0.03, 0.02]).replace(kn=1000.0, tDiffusion=9e6, to=10.0, tsn=600.0, VEOD=2.7)

@@ -19,10 +19,10 @@ from battery_env.app.calibrate import Calibration, Settings
 from battery_env.app.calibrate import calibrate as calibrated
 from battery_env.app.command_line import main
 from battery_env.calibration.policy import PolicyEstimator
-from battery_env.cells import Discharge, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, CellParameters, Trajectory, initial_state, simulate
 from battery_env.estimators.cell_fit import fit_cell, read_cell
 from battery_env.estimators.least_squares import LeastSquares
+from battery_env.records.discharge import Discharge, load_nasa_discharges
 
 
 @pytest.fixture(scope="module")

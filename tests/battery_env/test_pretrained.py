@@ -13,8 +13,8 @@ import pytest
 from battery_env import LeastSquares, PolicyEstimator, evaluate, load_nasa_discharges
 from battery_env.calibration.data import standard_dataset
 from battery_env.calibration.pretrained import file_stem, policy_of_file, pretrained_card, pretrained_policy
-from battery_env.cells import BUNDLED_CELLS
 from battery_env.electrochemistry import NEW_CELL
+from battery_env.records.discharge import BUNDLED_CELLS
 from battery_env.sensors import SensorErrors
 
 FOLDER = files("battery_env.pretrained_policies")

@@ -12,9 +12,9 @@ from battery_env.calibration.full_state_tasks import BatteryQmax
 from battery_env.calibration.readings import Readings
 from battery_env.calibration.voltage import ESTIMATE_RANGES, LARGEST_STEPS
 from battery_env.calibration.voltage_tasks import BatteryVoltageJoint, BatteryVoltageQmax, BatteryVoltageRo
-from battery_env.cells import Discharge, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL
 from battery_env.loads import RandomPiecewise
+from battery_env.records.discharge import Discharge, load_nasa_discharges
 from battery_env.sensors import RandomSensorErrors
 from battery_env.trajectories import TrajectoryDataset
 

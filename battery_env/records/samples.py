@@ -54,7 +54,7 @@ _PLAUSIBLE: dict[str, tuple[float, float, str, str]] = {
 class Record(Protocol):
     """
     What was measured during one discharge; a simulated :class:`~battery_env.trajectories.Trajectory` and a recorded
-    :class:`~battery_env.cells.Discharge` are both records. All arrays have shape (T,); the current is positive in discharge.
+    :class:`~battery_env.Discharge` are both records. All arrays have shape (T,); the current is positive in discharge.
     """
 
     @property

@@ -35,7 +35,7 @@ from battery_env.electrochemistry.tangents import (
 )
 from battery_env.estimates import Estimate
 from battery_env.parameters import Q_MOBILE
-from battery_env.records import Record, check_record, expected_current, resample_current
+from battery_env.records.samples import Record, check_record, expected_current, resample_current
 
 # The total of the four charges is q_mobile / 0.6 at all times.
 _Q_PER_CHARGE = 1.0 / float(FULL_CHARGE_SHARES.sum())

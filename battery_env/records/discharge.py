@@ -22,7 +22,7 @@ from scipy.io import loadmat
 from battery_env.arrays import FloatArray
 from battery_env.checks import check_positive
 from battery_env.parameters import Q_MOBILE
-from battery_env.records import (
+from battery_env.records.samples import (
     MILLIAMPERE,
     REST_CURRENT_A,
     SWITCH_SHARE,
@@ -342,7 +342,7 @@ def load_nasa_discharges(path_or_cell: str | Path) -> list[Discharge]:
 
 
 def _bundled(cell: str) -> list[Discharge]:
-    with as_file(files("battery_env.nasa_cells")) as folder:
+    with as_file(files("battery_env.records.nasa_cells")) as folder:
         samples = pd.read_csv(folder / f"{cell}_discharge.csv.gz", usecols=["cycle", *_COLUMNS, "temperature_C"])
         tests = pd.read_csv(folder / "cycles.csv").query("battery_id == @cell").set_index("cycle")[list(_META_COLUMNS)]
     known, numbers = tests.to_dict(orient="index"), samples["cycle"].to_numpy()
