@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 from battery_env.calibration.registration import register_environments
 
 if TYPE_CHECKING:
-    from battery_env.app.calibrate import Calibration, Settings, calibrate
     from battery_env.calibration.onnx_policy import OnnxPolicy
     from battery_env.calibration.policy import PolicyEstimator
     from battery_env.conversions import capacity_Ah, dc_resistance_ohm
@@ -32,6 +31,7 @@ if TYPE_CHECKING:
     )
     from battery_env.evaluation import evaluate
     from battery_env.forecasts import Forecast, forecast
+    from battery_env.lab.calibrate import Calibration, Settings, calibrate
     from battery_env.life import Life, track_life
     from battery_env.record_files import read_discharge_csv, read_discharges
     from battery_env.records.discharge import Discharge, load_nasa_discharges
@@ -42,7 +42,6 @@ if TYPE_CHECKING:
 # Where each name comes from: numba, pandas and scipy take seconds to import, and an environment by its id needs none of them.
 # Type checkers see the imports above instead; a test holds the two together.
 _MODULES = {
-    "app.calibrate": ("Calibration", "Settings", "calibrate"),
     "calibration.onnx_policy": ("OnnxPolicy",),
     "calibration.policy": ("PolicyEstimator",),
     "conversions": ("capacity_Ah", "dc_resistance_ohm"),
@@ -54,6 +53,7 @@ _MODULES = {
     ),
     "evaluation": ("evaluate",),
     "forecasts": ("Forecast", "forecast"),
+    "lab.calibrate": ("Calibration", "Settings", "calibrate"),
     "life": ("Life", "track_life"),
     "record_files": ("read_discharge_csv", "read_discharges"),
     "records.discharge": ("Discharge", "load_nasa_discharges"),

@@ -24,11 +24,11 @@ import pandas as pd
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
-from battery_env.app.calibrate import Settings
-from battery_env.app.forecast import forecast_end
 from battery_env.electrochemistry import UNCERTAIN_CONSTANTS, simulate
 from battery_env.estimators.cell_fit import CellFit, fit_cell
 from battery_env.forecasts import BAND
+from battery_env.lab.calibrate import Settings
+from battery_env.lab.running import forecast_end
 from battery_env.life import Life, track_life
 from battery_env.loads import Load, RandomPiecewise, RandomWalk, constant
 from battery_env.plotting import coloured, new_figure

@@ -38,11 +38,7 @@ LAYERS = (
     ("battery_env.forecasts",),
     ("battery_env.life",),
     ("battery_env.callbacks",),
-    ("battery_env.app.calibrate",),
-    ("battery_env.app.many",),
-    ("battery_env.app.forecast",),
-    ("battery_env.app.command_line",),
-    ("battery_env.app", "battery_env.__main__"),
+    ("battery_env.lab", "battery_env.__main__"),
 )
 
 

@@ -19,9 +19,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from battery_env.app.calibrate import Settings
-from battery_env.app.calibrate import calibrate as calibration_of
-from battery_env.app.command_line import NOT_SETTLED, REFUSED, SETTLED, calibrate
 from battery_env.calibration.policy import PolicyEstimator
 from battery_env.calibration.pretrained import pretrained_ids
 from battery_env.calibration.voltage import ESTIMATE_RANGES
@@ -38,6 +35,9 @@ from battery_env.estimators import (
     soc_from_rest,
 )
 from battery_env.estimators.base import OnlineEstimator
+from battery_env.lab.calibrate import Settings
+from battery_env.lab.calibrate import calibrate as calibration_of
+from battery_env.lab.command_line import NOT_SETTLED, REFUSED, SETTLED, calibrate
 from battery_env.records import Stream
 from battery_env.records.discharge import Discharge, load_nasa_discharges
 

@@ -20,8 +20,6 @@ from battery_env import (
     forecast,
     load_nasa_discharges,
 )
-from battery_env.app.calibrate import METHODS, Settings, calibrate
-from battery_env.app.forecast import forecast_end
 from battery_env.calibration.pretrained import pretrained_card
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate, voltage
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
@@ -32,6 +30,8 @@ from battery_env.estimators.cell_fit import (
     read_cell,
     with_equilibrium,
 )
+from battery_env.lab.calibrate import METHODS, Settings, calibrate
+from battery_env.lab.running import forecast_end
 from battery_env.loads import constant as constant_load
 from battery_env.plotting import plot_cell_fit
 from battery_env.records.discharge import Discharge

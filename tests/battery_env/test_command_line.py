@@ -14,14 +14,14 @@ import pandas as pd
 import pytest
 
 import battery_env
-from battery_env.app import many
-from battery_env.app.calibrate import Calibration, Settings
-from battery_env.app.calibrate import calibrate as calibrated
-from battery_env.app.command_line import main
 from battery_env.calibration.policy import PolicyEstimator
 from battery_env.electrochemistry import NEW_CELL, CellParameters, Trajectory, initial_state, simulate
 from battery_env.estimators.cell_fit import fit_cell, read_cell
 from battery_env.estimators.least_squares import LeastSquares
+from battery_env.lab import many
+from battery_env.lab.calibrate import Calibration, Settings
+from battery_env.lab.calibrate import calibrate as calibrated
+from battery_env.lab.command_line import main
 from battery_env.records.discharge import Discharge, load_nasa_discharges
 
 

@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from battery_env.app.calibrate import METHOD_NAMES, Calibration, Settings, calibrate, title_of
 from battery_env.files import check_folder, replacing
+from battery_env.lab.calibrate import METHOD_NAMES, Calibration, Settings, calibrate, title_of
 from battery_env.record_files import Recording, read_recordings
 from battery_env.records.discharge import BUNDLED_CELLS, load_nasa_discharges
 from battery_env.tables import BINARY_SUFFIXES, PACKED_SUFFIXES, TEXT_SUFFIXES, is_readable

@@ -27,11 +27,11 @@ from typing import Any, Literal, ParamSpec
 
 import numpy as np
 
-from battery_env.app.calibrate import METHODS, Settings, line_of, text_of
-from battery_env.app.many import FileFormat, Outcome, Results, calibrate_all, find_sources, read_source, workers
 from battery_env.estimators.cell_fit import CellFit, fit_cell, read_cell
 from battery_env.estimators.rest import InitialSoc
 from battery_env.files import check_new, finite_or_none
+from battery_env.lab.calibrate import METHODS, Settings, line_of, text_of
+from battery_env.lab.many import FileFormat, Outcome, Results, calibrate_all, find_sources, read_source, workers
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.records import CUT_OFF_V
 from battery_env.records.discharge import Discharge
@@ -440,7 +440,7 @@ def fit(arguments: Sequence[str] | None = None, name: str = "python -m battery_e
 def forecast(arguments: Sequence[str] | None = None, name: str = "python -m battery_env forecast") -> int:
     """The command ``forecast``; its exit status is 3 if something in the record contradicts the estimate."""
     options = _forecast_parser(name).parse_args(arguments)
-    from battery_env.app.forecast import EndFiles, end_of_record  # here, as matplotlib takes long to import
+    from battery_env.lab.running import EndFiles, end_of_record  # here, as matplotlib takes long to import
 
     settings, file_format = _settings(options), _file_format(options)
     if options.life and settings.prior_q_mobile_C is not None:

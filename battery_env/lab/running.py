@@ -15,8 +15,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from battery_env.app.calibrate import Calibration, Settings, calibrate
-from battery_env.app.many import FileFormat, Source, find_sources, read_source, record_name
 from battery_env.checks import ZERO_CELSIUS_K, LoadUnit
 from battery_env.electrochemistry import NEW_CELL
 from battery_env.estimates import Estimate
@@ -24,6 +22,8 @@ from battery_env.estimators.diagnosis import is_only_imprecise
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.files import check_new, finite_or_none, replacing
 from battery_env.forecasts import BAND, Forecast, FutureLoad, forecast, quantile
+from battery_env.lab.calibrate import Calibration, Settings, calibrate
+from battery_env.lab.many import FileFormat, Source, find_sources, read_source, record_name
 from battery_env.life import Life, track_life
 from battery_env.loads import Load
 from battery_env.plotting import save_figure
@@ -102,7 +102,7 @@ def forecast_end(
     discharge: Discharge, settings: Settings | None = None, load: FutureLoad | None = None, samples: int = 1000
 ) -> Forecast:
     """
-    The end of a discharge in progress, with all that :class:`~battery_env.app.calibrate.Settings` know of it.
+    The end of a discharge in progress, with all that :class:`~battery_env.lab.calibrate.Settings` know of it.
 
     .. code-block:: python
 
