@@ -30,9 +30,9 @@ if TYPE_CHECKING:
         soc_from_rest,
     )
     from battery_env.evaluation import evaluate
-    from battery_env.forecasts import Forecast, forecast
     from battery_env.lab.calibrate import Calibration, Settings, calibrate
-    from battery_env.life import Life, track_life
+    from battery_env.lab.forecast import Forecast, forecast
+    from battery_env.lab.life import Life, track_life
     from battery_env.record_files import read_discharge_csv, read_discharges
     from battery_env.records.discharge import Discharge, load_nasa_discharges
     from battery_env.records.model import RecordModel
@@ -52,9 +52,9 @@ _MODULES = {
         *("cramer_rao_bound", "fit_cell", "soc_from_rest"),
     ),
     "evaluation": ("evaluate",),
-    "forecasts": ("Forecast", "forecast"),
     "lab.calibrate": ("Calibration", "Settings", "calibrate"),
-    "life": ("Life", "track_life"),
+    "lab.forecast": ("Forecast", "forecast"),
+    "lab.life": ("Life", "track_life"),
     "record_files": ("read_discharge_csv", "read_discharges"),
     "records.discharge": ("Discharge", "load_nasa_discharges"),
     "records.model": ("RecordModel",),

@@ -35,8 +35,6 @@ LAYERS = (
     ("battery_env.calibration", "battery_env.pretrained_policies"),
     ("battery_env.evaluation",),
     ("battery_env.plotting",),
-    ("battery_env.forecasts",),
-    ("battery_env.life",),
     ("battery_env.callbacks",),
     ("battery_env.lab", "battery_env.__main__"),
 )
