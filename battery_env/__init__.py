@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from battery_env.lab.calibrate import Calibration, Settings, calibrate
     from battery_env.lab.forecast import Forecast, forecast
     from battery_env.lab.life import Life, track_life
-    from battery_env.record_files import read_discharge_csv, read_discharges
+    from battery_env.lab.readers.discharges import read_discharge_csv, read_discharges
     from battery_env.records.discharge import Discharge, load_nasa_discharges
     from battery_env.records.model import RecordModel
     from battery_env.sensors import RandomSensorErrors, SensorErrors
@@ -55,7 +55,7 @@ _MODULES = {
     "lab.calibrate": ("Calibration", "Settings", "calibrate"),
     "lab.forecast": ("Forecast", "forecast"),
     "lab.life": ("Life", "track_life"),
-    "record_files": ("read_discharge_csv", "read_discharges"),
+    "lab.readers.discharges": ("read_discharge_csv", "read_discharges"),
     "records.discharge": ("Discharge", "load_nasa_discharges"),
     "records.model": ("RecordModel",),
     "sensors": ("RandomSensorErrors", "SensorErrors"),

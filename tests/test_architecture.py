@@ -18,8 +18,6 @@ ROOT = Path(__file__).parents[1]
 LAYERS = (
     ("battery_env.arrays", "battery_env.files"),
     ("battery_env.checks",),
-    ("battery_env.columns",),
-    ("battery_env.tables",),
     ("battery_env.parameters",),
     ("battery_env.electrochemistry.cell",),
     ("battery_env.electrochemistry.kernels",),
@@ -28,7 +26,6 @@ LAYERS = (
     ("battery_env.records", "battery_env.estimates"),
     ("battery_env.loads",),
     ("battery_env.trajectories",),
-    ("battery_env.record_files",),
     ("battery_env.sensors",),
     ("battery_env.conversions",),
     ("battery_env.estimators",),

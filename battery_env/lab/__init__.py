@@ -1,1 +1,1 @@
-"""What a laboratory uses: one discharge, many of them, forecasts, and the command line. Nothing else imports it."""
+"""What a laboratory uses: files of testers, one discharge, many of them, forecasts, lives, and the command line."""

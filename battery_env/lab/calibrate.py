@@ -24,8 +24,8 @@ from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.monitor import start_condition, watched
 from battery_env.estimators.rest import InitialSoc, Start, check_initial_soc, soc_from_rest
+from battery_env.lab.readers.discharges import each_usable
 from battery_env.parameters import PARAMETER_NAMES, check_parameters
-from battery_env.record_files import each_usable
 from battery_env.records import CUT_OFF_V, ExpectedCurrent, Samples, drawn, expected_current, mean_current_A
 from battery_env.records.discharge import Discharge
 from battery_env.records.model import RecordModel, VoltageForecast
@@ -365,7 +365,7 @@ def calibrate(
     at the start, are those measured at load-on; a model that departs far from the temperatures measured later is warned of.
 
     :param source: one discharge, whole or in progress; or a table or a file of them, see
-        :func:`battery_env.record_files.read_discharges`
+        :func:`battery_env.read_discharges`
     :param settings: how to look at them; ``None``: as ``options`` say
     :param columns: of a table or a file, as ``read_discharges`` takes it
     :param units: likewise

@@ -19,9 +19,9 @@ import pandas as pd
 
 from battery_env.files import check_folder, replacing
 from battery_env.lab.calibrate import METHOD_NAMES, Calibration, Settings, calibrate, title_of
-from battery_env.record_files import Recording, read_recordings
+from battery_env.lab.readers.discharges import Recording, read_recordings
+from battery_env.lab.readers.tables import BINARY_SUFFIXES, PACKED_SUFFIXES, TEXT_SUFFIXES, is_readable
 from battery_env.records.discharge import BUNDLED_CELLS, load_nasa_discharges
-from battery_env.tables import BINARY_SUFFIXES, PACKED_SUFFIXES, TEXT_SUFFIXES, is_readable
 
 _NASA_SUFFIX = ".mat"
 # A scheduler that is there answers within milliseconds.
@@ -56,7 +56,7 @@ class Source(NamedTuple):
 @dataclass(frozen=True)
 class FileFormat:
     """
-    What files do not tell of themselves, see :func:`battery_env.record_files.read_discharges`.
+    What files do not tell of themselves, see :func:`battery_env.read_discharges`.
 
     :param columns: by quantity, the name of its column
     :param units: by quantity, its unit

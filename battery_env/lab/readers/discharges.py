@@ -17,10 +17,10 @@ import numpy as np
 import pandas as pd
 
 from battery_env.arrays import BoolArray, FloatArray, IntArray
-from battery_env.columns import Column
+from battery_env.lab.readers.columns import Column
+from battery_env.lab.readers.tables import columns_of, read_columns
 from battery_env.records import REST_CURRENT_A, SWITCH_SHARE, drawn
 from battery_env.records.discharge import LEAST_SAMPLES, Discharge, read_nasa_mat
-from battery_env.tables import columns_of, read_columns
 
 Made = TypeVar("Made")
 

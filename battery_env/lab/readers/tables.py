@@ -18,7 +18,7 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from battery_env.columns import Column, count_required, find_columns, units_below
+from battery_env.lab.readers.columns import Column, count_required, find_columns, units_below
 
 #: Endings of the names of files that can be read, besides those of NASA (.mat); of text also packed (.gz, .bz2, .xz, .zip).
 TEXT_SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".mpt", ".bdf")
