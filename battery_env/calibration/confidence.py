@@ -11,7 +11,7 @@ from battery_env.calibration.nuisance import REACH_SD, Fitted
 from battery_env.calibration.voltage import ESTIMATE_RANGES, VoltageTask
 from battery_env.electrochemistry import CellParameters
 from battery_env.estimates import Estimate
-from battery_env.estimators.diagnosis import (
+from battery_env.estimators.diagnosis.conditions import (
     EXCESS_LIMIT_UNSTATED,
     SETTLED_SHARES,
     SPARE_SAMPLES,
@@ -20,8 +20,8 @@ from battery_env.estimators.diagnosis import (
     rest_voltage_V,
     start_measured,
 )
-from battery_env.estimators.gaps import find_gaps, long_intervals, note_gaps
-from battery_env.estimators.monitor import note_samples
+from battery_env.estimators.diagnosis.gaps import find_gaps, long_intervals, note_gaps
+from battery_env.estimators.diagnosis.samples import note_samples
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.records import Samples
 from battery_env.records.model import RecordModel

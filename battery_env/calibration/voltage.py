@@ -23,7 +23,7 @@ from battery_env.calibration.readings import CURRENT, MEASURED, OHMIC, SHOWN, Re
 from battery_env.calibration.task import OBSERVATION_LIMIT, CalibrationTask, check_counts, checked_action
 from battery_env.checks import check_not_negative
 from battery_env.electrochemistry import UNCERTAIN_CONSTANTS, CellParameters, check_cell
-from battery_env.estimators.diagnosis import white_noise_V
+from battery_env.estimators.diagnosis.conditions import white_noise_V
 from battery_env.parameters import PARAMETER_NAMES, columns_of
 from battery_env.records import Record
 from battery_env.sensors import RandomSensorErrors

@@ -22,7 +22,7 @@ from battery_env.checks import ZERO_CELSIUS_K, check_numbers, check_positive
 from battery_env.electrochemistry import NEW_CELL, CellParameters, check_cell, check_dt
 from battery_env.electrochemistry.tangents import BY_Q, BY_R, RATE_CONSTANTS
 from battery_env.estimates import Estimate
-from battery_env.estimators.diagnosis import FULL_REST_V, MISMATCH_MARGIN, rest_voltage_V
+from battery_env.estimators.diagnosis.conditions import FULL_REST_V, MISMATCH_MARGIN, rest_voltage_V
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.search import MARGIN, OnGrid, distance_C, minimized, square
 from battery_env.files import WrongFormatError, read_json, write_json

@@ -16,11 +16,11 @@ from battery_env.electrochemistry import STATE_SIZE, CellParameters, PackedConst
 from battery_env.electrochemistry.tangents import PolynomialDerivatives
 from battery_env.estimates import Estimate, Estimates, EstimateTrace
 from battery_env.estimators.base import SURPLUS_SHARE, ModelNow, OnlineBatch, OnlineEstimator, check_bounds
-from battery_env.estimators.diagnosis import Condition, rest_voltage_V
+from battery_env.estimators.diagnosis.conditions import Condition, rest_voltage_V
+from battery_env.estimators.diagnosis.rest import check_initial_soc
+from battery_env.estimators.diagnosis.samples import begin, examine, follow_gaps, measured, remember
 from battery_env.estimators.kalman_bank import conclude, filters_of_prior, take
 from battery_env.estimators.kalman_state import CELL, ESTIMATE, FILTER, SAMPLE, Q, R, Settings
-from battery_env.estimators.monitor import begin, examine, follow_gaps, measured, remember
-from battery_env.estimators.rest import check_initial_soc
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, check_parameters
 from battery_env.records import Record, Stream, are_plausible, check_drawn_charge, check_sample, starts_at_rest
 
@@ -74,9 +74,10 @@ class ExtendedKalmanFilter(OnlineEstimator):
     then; the first one is also that of its surroundings.
 
     *Settled* means that the data determine every parameter searched for: its standard deviation, without what a given prior
-    adds to it, is below :data:`~battery_env.estimators.diagnosis.SETTLED_SHARES` of its value; and that nothing contradicts
-    it: not the start of the record, the voltage where the load is switched, steady or not logged, a bound, the kind of cell,
-    the prior, nor the innovations, which may not go the same way again and again, with twice ``mismatch_V`` allowed for.
+    adds to it, is below :data:`~battery_env.estimators.diagnosis.conditions.SETTLED_SHARES` of its value; and that nothing
+    contradicts it: not the start of the record, the voltage where the load is switched, steady or not logged, a bound, the
+    kind of cell, the prior, nor the innovations, which may not go the same way again and again, with twice ``mismatch_V``
+    allowed for.
     Otherwise ``reason`` of the estimate says which of these does not hold, the first one in the order of
     :class:`~battery_env.estimators.diagnosis.Condition`. An estimate that rests on a prior is not settled: it is as good as
     the prior.

@@ -30,15 +30,15 @@ from battery_env.electrochemistry.tangents import (
     voltage_curvature,
     voltage_tangents,
 )
-from battery_env.estimators.diagnosis import (
+from battery_env.estimators.diagnosis.conditions import (
     MISMATCH_MARGIN,
     PLAUSIBLE_Q_SHARES,
     PRIOR_LIMIT_SD,
     SETTLED_SHARES,
     Condition,
 )
+from battery_env.estimators.diagnosis.samples import Row, start_condition
 from battery_env.estimators.kalman_state import FILTER, OFFSET, Q, R, Settings
-from battery_env.estimators.monitor import Row, start_condition
 
 #: Standard deviations. Innovations count in full within the gate. A filter whose successive innovations are correlated, whose
 #: estimate leaves the range that it stated, or whose offset is beyond the stated one, by more than the limit does not follow

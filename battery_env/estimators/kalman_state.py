@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from battery_env.electrochemistry import NEW_CELL, STATE_SIZE
-from battery_env.estimators.monitor import SEEN, table
+from battery_env.estimators.diagnosis.samples import SEEN, table
 
 #: What a filter estimates: ``q_mobile`` (C), ``r_o`` (ohm) and the offset of the voltage (V).
 Q, R, OFFSET = range(3)

@@ -15,7 +15,7 @@ from battery_env.electrochemistry import CellParameters
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimates import Estimate, EstimateTrace
 from battery_env.estimators.base import Estimator, check_bounds
-from battery_env.estimators.diagnosis import (
+from battery_env.estimators.diagnosis.conditions import (
     EXCESS_LIMIT_UNSTATED,
     MISMATCH_MARGIN,
     PRIOR_LIMIT_SD,
@@ -26,9 +26,9 @@ from battery_env.estimators.diagnosis import (
     is_plausible,
     white_noise_V,
 )
-from battery_env.estimators.gaps import DRAWN, Gap, find_gaps, note_gaps
-from battery_env.estimators.monitor import note_samples
-from battery_env.estimators.rest import InitialSoc, check_initial_soc
+from battery_env.estimators.diagnosis.gaps import DRAWN, Gap, find_gaps, note_gaps
+from battery_env.estimators.diagnosis.rest import InitialSoc, check_initial_soc
+from battery_env.estimators.diagnosis.samples import note_samples
 from battery_env.estimators.search import Fit, Prior, Search, square
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, check_parameters
 from battery_env.records import Record, Samples, check_record, starts_at_rest
@@ -91,11 +91,12 @@ class LeastSquares(Estimator):
     both parameters and does not show in the voltage: state it as ``current_gain_sd``.
 
     *Settled* means that the record alone determines every parameter searched for, with a standard deviation below
-    :data:`~battery_env.estimators.diagnosis.SETTLED_SHARES` of its value without any prior, and that nothing contradicts it:
+    :data:`~battery_env.estimators.diagnosis.conditions.SETTLED_SHARES` of its value without any prior, and that nothing
+    contradicts it:
 
     - the record can start with a full cell, or with one of ``initial_soc``, unless ``initial`` is given;
-    - where it was not logged for a while under load (:mod:`~battery_env.estimators.gaps`), the voltage falls by what was drawn
-      meanwhile. If noise hides that, the charge in doubt is in the standard deviation of ``q_mobile``;
+    - where it was not logged for a while under load (:mod:`~battery_env.estimators.diagnosis.gaps`), the voltage falls by
+      what was drawn meanwhile. If noise hides that, the charge in doubt is in the standard deviation of ``q_mobile``;
     - each parameter is inside its bounds, ``q_mobile`` is plausible for a cell of this kind, and the model lasts as long as
       the record;
     - the residuals are no larger than noise and twice ``mismatch_V`` explain. They are where the sensor has an offset, or

@@ -18,12 +18,12 @@ from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.electrochemistry.cell import TB
 from battery_env.estimates import Estimate
 from battery_env.estimators.cell_fit import UNFITTED_MISMATCH_V, CellFit
-from battery_env.estimators.diagnosis import Condition
-from battery_env.estimators.gaps import DRAWN, find_gaps
+from battery_env.estimators.diagnosis.conditions import Condition
+from battery_env.estimators.diagnosis.gaps import DRAWN, find_gaps
+from battery_env.estimators.diagnosis.rest import InitialSoc, Start, check_initial_soc, soc_from_rest
+from battery_env.estimators.diagnosis.samples import start_condition, watched
 from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
-from battery_env.estimators.monitor import start_condition, watched
-from battery_env.estimators.rest import InitialSoc, Start, check_initial_soc, soc_from_rest
 from battery_env.lab.readers.discharges import each_usable
 from battery_env.parameters import PARAMETER_NAMES, check_parameters
 from battery_env.records import CUT_OFF_V, ExpectedCurrent, Samples, drawn, expected_current, mean_current_A

@@ -28,7 +28,7 @@ from typing import Any, Literal, ParamSpec
 import numpy as np
 
 from battery_env.estimators.cell_fit import CellFit, fit_cell, read_cell
-from battery_env.estimators.rest import InitialSoc
+from battery_env.estimators.diagnosis.rest import InitialSoc
 from battery_env.files import check_new, finite_or_none
 from battery_env.lab.calibrate import METHODS, Settings, line_of, text_of
 from battery_env.lab.many import FileFormat, Outcome, Results, calibrate_all, find_sources, read_source, workers

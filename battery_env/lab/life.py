@@ -18,7 +18,7 @@ from scipy.stats import truncnorm
 
 from battery_env.arrays import BoolArray, FloatArray
 from battery_env.checks import check_positive, check_whole_number
-from battery_env.estimators.diagnosis import is_only_imprecise
+from battery_env.estimators.diagnosis.conditions import is_only_imprecise
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.lab.forecast import BAND, quantile
 from battery_env.records import drawn, mean_current_A

@@ -18,7 +18,7 @@ import pandas as pd
 from battery_env.checks import ZERO_CELSIUS_K, LoadUnit
 from battery_env.electrochemistry import NEW_CELL
 from battery_env.estimates import Estimate
-from battery_env.estimators.diagnosis import is_only_imprecise
+from battery_env.estimators.diagnosis.conditions import is_only_imprecise
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.files import check_new, finite_or_none, replacing
 from battery_env.lab.calibrate import Calibration, Settings, calibrate

@@ -7,7 +7,7 @@ import pytest
 
 from battery_env.electrochemistry import simulate
 from battery_env.estimators.base import OnlineEstimator
-from battery_env.estimators.diagnosis import SETTLED_SHARES
+from battery_env.estimators.diagnosis.conditions import SETTLED_SHARES
 from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.evaluation import evaluate, summarize
 from battery_env.loads import RandomPiecewise

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 
 from battery_env.arrays import FloatArray, IntArray
-from battery_env.estimators.diagnosis import Condition, Diagnosis
+from battery_env.estimators.diagnosis.conditions import Condition, Diagnosis
 from battery_env.records import REST_CURRENT_A, SWITCH_SHARE
 
 #: An interval between two samples is a gap where it is so many times longer than those before and after it, and what its load

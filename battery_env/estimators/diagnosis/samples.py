@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from battery_env.arrays import FloatArray
 from battery_env.electrochemistry import NEW_CELL, CellParameters
-from battery_env.estimators import gaps
-from battery_env.estimators.diagnosis import FULL_REST_V, Condition, Diagnosis, rest_voltage_V, start_measured
+from battery_env.estimators.diagnosis import gaps
+from battery_env.estimators.diagnosis.conditions import FULL_REST_V, Condition, Diagnosis, rest_voltage_V, start_measured
 from battery_env.records import REST_CURRENT_A, SWITCH_SHARE, Samples
 
 #: A row of a table, whose columns numba knows and type checkers do not.

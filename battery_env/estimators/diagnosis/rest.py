@@ -8,7 +8,7 @@ import numpy as np
 
 from battery_env.arrays import FloatArray
 from battery_env.electrochemistry import NEW_CELL, CellParameters, initial_state, voltage
-from battery_env.estimators.diagnosis import Condition
+from battery_env.estimators.diagnosis.conditions import Condition
 from battery_env.records import REST_CURRENT_A, Record, Stream
 
 #: What a state of charge can be given as: a number, or (mean, standard deviation).
