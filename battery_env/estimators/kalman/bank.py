@@ -38,7 +38,7 @@ from battery_env.estimators.diagnosis.conditions import (
     Condition,
 )
 from battery_env.estimators.diagnosis.samples import Row, start_condition
-from battery_env.estimators.kalman_state import FILTER, OFFSET, Q, R, Settings
+from battery_env.estimators.kalman.state import FILTER, OFFSET, Q, R, Settings
 
 #: Standard deviations. Innovations count in full within the gate. A filter whose successive innovations are correlated, whose
 #: estimate leaves the range that it stated, or whose offset is beyond the stated one, by more than the limit does not follow

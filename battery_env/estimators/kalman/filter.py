@@ -19,8 +19,8 @@ from battery_env.estimators.base import SURPLUS_SHARE, ModelNow, OnlineBatch, On
 from battery_env.estimators.diagnosis.conditions import Condition, rest_voltage_V
 from battery_env.estimators.diagnosis.rest import check_initial_soc
 from battery_env.estimators.diagnosis.samples import begin, examine, follow_gaps, measured, remember
-from battery_env.estimators.kalman_bank import conclude, filters_of_prior, take
-from battery_env.estimators.kalman_state import CELL, ESTIMATE, FILTER, SAMPLE, Q, R, Settings
+from battery_env.estimators.kalman.bank import conclude, filters_of_prior, take
+from battery_env.estimators.kalman.state import CELL, ESTIMATE, FILTER, SAMPLE, Q, R, Settings
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, check_parameters
 from battery_env.records import Record, Stream, are_plausible, check_drawn_charge, check_sample, starts_at_rest
 
