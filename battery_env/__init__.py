@@ -15,7 +15,6 @@ from battery_env.calibration.registration import register_environments
 if TYPE_CHECKING:
     from battery_env.calibration.onnx_policy import OnnxPolicy
     from battery_env.calibration.policy import PolicyEstimator
-    from battery_env.conversions import capacity_Ah, dc_resistance_ohm
     from battery_env.electrochemistry import NEW_CELL, CellParameters, Trajectory, initial_state, simulate, step, voltage
     from battery_env.estimates import Estimate
     from battery_env.estimators import (
@@ -31,6 +30,7 @@ if TYPE_CHECKING:
     )
     from battery_env.evaluation import evaluate
     from battery_env.lab.calibrate import Calibration, Settings, calibrate
+    from battery_env.lab.conversions import capacity_Ah, dc_resistance_ohm
     from battery_env.lab.forecast import Forecast, forecast
     from battery_env.lab.life import Life, track_life
     from battery_env.lab.readers.discharges import read_discharge_csv, read_discharges
@@ -44,7 +44,6 @@ if TYPE_CHECKING:
 _MODULES = {
     "calibration.onnx_policy": ("OnnxPolicy",),
     "calibration.policy": ("PolicyEstimator",),
-    "conversions": ("capacity_Ah", "dc_resistance_ohm"),
     "electrochemistry": ("NEW_CELL", "CellParameters", "Trajectory", "initial_state", "simulate", "step", "voltage"),
     "estimates": ("Estimate",),
     "estimators": (
@@ -53,6 +52,7 @@ _MODULES = {
     ),
     "evaluation": ("evaluate",),
     "lab.calibrate": ("Calibration", "Settings", "calibrate"),
+    "lab.conversions": ("capacity_Ah", "dc_resistance_ohm"),
     "lab.forecast": ("Forecast", "forecast"),
     "lab.life": ("Life", "track_life"),
     "lab.readers.discharges": ("read_discharge_csv", "read_discharges"),

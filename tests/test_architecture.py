@@ -27,7 +27,6 @@ LAYERS = (
     ("battery_env.loads",),
     ("battery_env.trajectories",),
     ("battery_env.sensors",),
-    ("battery_env.conversions",),
     ("battery_env.estimators",),
     ("battery_env.calibration", "battery_env.pretrained_policies"),
     ("battery_env.evaluation",),
