@@ -30,8 +30,8 @@ from battery_env.calibration.full_state_layout import LITERAL, OBSERVED
 from battery_env.calibration.policy import PolicyEstimator
 from battery_env.electrochemistry import Trajectory
 from battery_env.estimates import Estimate, EstimateTrace
-from battery_env.estimators.base import Estimator
 from battery_env.estimators.closed_form import ClosedForm
+from battery_env.estimators.estimator import Estimator
 from battery_env.evaluation import evaluate
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.plotting import LABELS, coloured, new_figure

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from battery_env.calibration.task import check_counts
 from battery_env.calibration.voltage import VoltageTask
 from battery_env.electrochemistry import CellParameters, FloatArray
-from battery_env.estimators.base import Record
+from battery_env.estimators.estimator import Record
 from battery_env.loads import RandomPiecewise
 from battery_env.trajectories import TrajectoryDataset
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from battery_env.calibration.task import OBSERVATION_LIMIT, CalibrationTask
-from battery_env.estimators.base import Record
+from battery_env.estimators.estimator import Record
 
 _ROW = np.zeros(1, dtype=np.intp)
 FloatSpace = gym.Space[NDArray[np.float32]]

@@ -22,8 +22,8 @@ from battery_env.calibration.task import CalibrationTask
 from battery_env.calibration.voltage import VoltageTask
 from battery_env.electrochemistry import NEW_CELL, STATE_SIZE, UNCERTAIN_CONSTANTS
 from battery_env.estimates import last_estimate
-from battery_env.estimators.base import SURPLUS_SHARE, Estimate, EstimateTrace, ModelNow, OnlineEstimator, Record
 from battery_env.estimators.diagnosis.conditions import Condition
+from battery_env.estimators.estimator import SURPLUS_SHARE, Estimate, EstimateTrace, ModelNow, OnlineEstimator, Record
 from battery_env.records import Samples, check_drawn_charge, check_record, check_sample, drawn_charge_C, starts_at_rest
 from battery_env.records.model import RecordModel
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from battery_env.electrochemistry import FloatArray
-from battery_env.estimators.base import Record
+from battery_env.estimators.estimator import Record
 from battery_env.trajectories import IntArray
 
 if TYPE_CHECKING:

@@ -14,7 +14,6 @@ from battery_env.checks import check_gain_sd, check_not_negative, check_positive
 from battery_env.electrochemistry import CellParameters
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimates import Estimate, EstimateTrace
-from battery_env.estimators.base import Estimator, check_bounds
 from battery_env.estimators.diagnosis.conditions import (
     EXCESS_LIMIT_UNSTATED,
     MISMATCH_MARGIN,
@@ -29,6 +28,7 @@ from battery_env.estimators.diagnosis.conditions import (
 from battery_env.estimators.diagnosis.gaps import DRAWN, Gap, find_gaps, note_gaps
 from battery_env.estimators.diagnosis.rest import InitialSoc, check_initial_soc
 from battery_env.estimators.diagnosis.samples import note_samples
+from battery_env.estimators.estimator import Estimator, check_bounds
 from battery_env.estimators.search import Fit, Prior, Search, square
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, check_parameters
 from battery_env.records import Record, Samples, check_record, starts_at_rest

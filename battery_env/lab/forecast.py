@@ -23,8 +23,8 @@ from battery_env.checks import (
 )
 from battery_env.electrochemistry import NEW_CELL, reached_s, state_of_charge
 from battery_env.estimates import Estimate
-from battery_env.estimators.base import is_overfull, overfull_error
 from battery_env.estimators.diagnosis.conditions import white_noise_V
+from battery_env.estimators.estimator import is_overfull, overfull_error
 from battery_env.loads import BlockBootstrap, Cycle, KnownLoad, Load, RandomLoad, constant, in_steps, steadier_unit
 from battery_env.parameters import Q_MOBILE, R_O
 from battery_env.plotting import COLOURS, new_figure

@@ -34,7 +34,7 @@ from battery_env.estimators import (
     fit_cell,
     soc_from_rest,
 )
-from battery_env.estimators.base import OnlineEstimator
+from battery_env.estimators.estimator import OnlineEstimator
 from battery_env.lab.calibrate import Settings
 from battery_env.lab.calibrate import calibrate as calibration_of
 from battery_env.lab.command_line import NOT_SETTLED, REFUSED, SETTLED, calibrate

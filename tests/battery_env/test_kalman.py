@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from battery_env.electrochemistry import simulate
-from battery_env.estimators.base import OnlineEstimator
 from battery_env.estimators.diagnosis.conditions import SETTLED_SHARES
+from battery_env.estimators.estimator import OnlineEstimator
 from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.evaluation import evaluate, summarize
 from battery_env.loads import RandomPiecewise
