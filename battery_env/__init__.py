@@ -13,8 +13,6 @@ from typing import TYPE_CHECKING, Any
 from battery_env.calibration.registration import register_environments
 
 if TYPE_CHECKING:
-    from battery_env.calibration.onnx_policy import OnnxPolicy
-    from battery_env.calibration.policy import PolicyEstimator
     from battery_env.electrochemistry import NEW_CELL, CellParameters, Trajectory, initial_state, simulate, step, voltage
     from battery_env.estimates import Estimate
     from battery_env.estimators import (
@@ -34,6 +32,8 @@ if TYPE_CHECKING:
     from battery_env.lab.forecast import Forecast, forecast
     from battery_env.lab.life import Life, track_life
     from battery_env.lab.readers.discharges import read_discharge_csv, read_discharges
+    from battery_env.policies.estimator import PolicyEstimator
+    from battery_env.policies.onnx import OnnxPolicy
     from battery_env.records.discharge import Discharge, load_nasa_discharges
     from battery_env.records.model import RecordModel
     from battery_env.sensors import RandomSensorErrors, SensorErrors
@@ -42,8 +42,6 @@ if TYPE_CHECKING:
 # Where each name comes from: numba, pandas and scipy take seconds to import, and an environment by its id needs none of them.
 # Type checkers see the imports above instead; a test holds the two together.
 _MODULES = {
-    "calibration.onnx_policy": ("OnnxPolicy",),
-    "calibration.policy": ("PolicyEstimator",),
     "electrochemistry": ("NEW_CELL", "CellParameters", "Trajectory", "initial_state", "simulate", "step", "voltage"),
     "estimates": ("Estimate",),
     "estimators": (
@@ -56,6 +54,8 @@ _MODULES = {
     "lab.forecast": ("Forecast", "forecast"),
     "lab.life": ("Life", "track_life"),
     "lab.readers.discharges": ("read_discharge_csv", "read_discharges"),
+    "policies.estimator": ("PolicyEstimator",),
+    "policies.onnx": ("OnnxPolicy",),
     "records.discharge": ("Discharge", "load_nasa_discharges"),
     "records.model": ("RecordModel",),
     "sensors": ("RandomSensorErrors", "SensorErrors"),

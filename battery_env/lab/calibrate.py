@@ -11,8 +11,6 @@ from typing import Any, Literal, get_args, overload
 import numpy as np
 import pandas as pd
 
-from battery_env.calibration.policy import PolicyEstimator
-from battery_env.calibration.pretrained import policy_of_file, pretrained_policy
 from battery_env.checks import ZERO_CELSIUS_K, check_not_negative, check_positive
 from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.electrochemistry.cell import TB
@@ -26,6 +24,8 @@ from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.lab.readers.discharges import each_usable
 from battery_env.parameters import PARAMETER_NAMES, check_parameters
+from battery_env.policies.estimator import PolicyEstimator
+from battery_env.policies.pretrained import policy_of_file, pretrained_policy
 from battery_env.records import CUT_OFF_V, ExpectedCurrent, Samples, drawn, expected_current, mean_current_A
 from battery_env.records.discharge import Discharge
 from battery_env.records.model import RecordModel, VoltageForecast

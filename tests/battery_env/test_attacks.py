@@ -19,8 +19,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from battery_env.calibration.policy import PolicyEstimator
-from battery_env.calibration.pretrained import pretrained_ids
 from battery_env.calibration.voltage import ESTIMATE_RANGES
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate
 from battery_env.estimates import last_estimate
@@ -38,6 +36,8 @@ from battery_env.estimators.estimator import OnlineEstimator
 from battery_env.lab.calibrate import Settings
 from battery_env.lab.calibrate import calibrate as calibration_of
 from battery_env.lab.command_line import NOT_SETTLED, REFUSED, SETTLED, calibrate
+from battery_env.policies.estimator import PolicyEstimator
+from battery_env.policies.pretrained import pretrained_ids
 from battery_env.records import Stream
 from battery_env.records.discharge import Discharge, load_nasa_discharges
 

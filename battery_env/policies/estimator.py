@@ -14,16 +14,16 @@ from numpy.typing import NDArray
 
 from battery_env.arrays import FloatArray
 from battery_env.calibration.aging import BatteryAging
-from battery_env.calibration.confidence import Confidence
 from battery_env.calibration.env import CalibrationEnv, task_class
 from battery_env.calibration.nuisance import Fitted
-from battery_env.calibration.pretrained import pretrained_policy
 from battery_env.calibration.task import CalibrationTask
 from battery_env.calibration.voltage import VoltageTask
 from battery_env.electrochemistry import NEW_CELL, STATE_SIZE, UNCERTAIN_CONSTANTS
 from battery_env.estimates import last_estimate
 from battery_env.estimators.diagnosis.conditions import Condition
 from battery_env.estimators.estimator import SURPLUS_SHARE, Estimate, EstimateTrace, ModelNow, OnlineEstimator, Record
+from battery_env.policies.confidence import Confidence
+from battery_env.policies.pretrained import pretrained_policy
 from battery_env.records import Samples, check_drawn_charge, check_record, check_sample, drawn_charge_C, starts_at_rest
 from battery_env.records.model import RecordModel
 
@@ -129,7 +129,7 @@ class PolicyEstimator(OnlineEstimator):
     with the distance of the estimate from it. It has settled if they are as small as least squares ask for, the fit explains
     the record, and nothing in the record contradicts it. Other policies state none, and never settle.
 
-    What :meth:`save` wrote is refused with another :class:`~battery_env.calibration.onnx_policy.OnnxPolicy`; models of
+    What :meth:`save` wrote is refused with another :class:`~battery_env.OnnxPolicy`; models of
     Stable-Baselines3 are not told from each other.
 
     :param policy: what to ask for actions, deterministically
@@ -162,7 +162,7 @@ class PolicyEstimator(OnlineEstimator):
     ) -> PolicyEstimator:
         """
         A policy of LAC that comes with the package, with the options of the task that it was trained on. What made it and what
-        it is worth says :func:`~battery_env.calibration.pretrained.pretrained_card`.
+        it is worth says :func:`~battery_env.policies.pretrained.pretrained_card`.
 
         :param env_id: id of a voltage-only environment of single discharges
         :param decision_s: time between two estimates, s, a multiple of the interval between its readings

@@ -7,10 +7,10 @@ from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any
 
-from battery_env.calibration.onnx_policy import OnnxPolicy
 from battery_env.electrochemistry import CellParameters
+from battery_env.policies.onnx import OnnxPolicy
 
-_PACKAGE = "battery_env.pretrained_policies"
+_PACKAGE = "battery_env.policies.pretrained_policies"
 _RECORDED = "_recorded"
 
 
