@@ -10,7 +10,7 @@ from importlib import import_module
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
-from battery_env.calibration.registration import register_environments
+from battery_env.tasks.registration import register_environments
 
 if TYPE_CHECKING:
     from battery_env.electrochemistry import NEW_CELL, CellParameters, Trajectory, initial_state, simulate, step, voltage

@@ -25,11 +25,11 @@ from typing import Any
 
 import pandas as pd
 
-from battery_env.calibration.data import standard_dataset
 from battery_env.evaluation import evaluate
 from battery_env.files import replacing
 from battery_env.policies.estimator import PolicyEstimator
 from battery_env.policies.pretrained import file_stem, policy_of_file
+from battery_env.tasks.data import standard_dataset
 from benchmarks.contests import HELD_OUT, SENSORS
 from benchmarks.study import SYMBOLS, Study, Tables, at_most, command_line, markdown, natural, positive, versions, write_json
 from benchmarks.training import Recipe, timesteps_of, train_or_load, training_minutes

@@ -28,7 +28,7 @@ LAYERS = (
     ("battery_env.trajectories",),
     ("battery_env.sensors",),
     ("battery_env.estimators",),
-    ("battery_env.calibration",),
+    ("battery_env.tasks",),
     ("battery_env.policies",),
     ("battery_env.evaluation",),
     ("battery_env.plotting",),

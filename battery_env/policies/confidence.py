@@ -7,8 +7,6 @@ from math import sqrt
 import numpy as np
 
 from battery_env.arrays import FloatArray
-from battery_env.calibration.nuisance import REACH_SD, Fitted
-from battery_env.calibration.voltage import ESTIMATE_RANGES, VoltageTask
 from battery_env.electrochemistry import CellParameters
 from battery_env.estimates import Estimate
 from battery_env.estimators.diagnosis.conditions import (
@@ -25,6 +23,8 @@ from battery_env.estimators.diagnosis.samples import note_samples
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.records import Samples
 from battery_env.records.model import RecordModel
+from battery_env.tasks.voltage.fit import REACH_SD, Fitted
+from battery_env.tasks.voltage.task import ESTIMATE_RANGES, VoltageTask
 
 # Residuals below this may be what a linear step leaves, V
 _NEGLIGIBLE_V = 2e-3

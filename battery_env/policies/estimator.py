@@ -13,11 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from battery_env.arrays import FloatArray
-from battery_env.calibration.aging import BatteryAging
-from battery_env.calibration.env import CalibrationEnv, task_class
-from battery_env.calibration.nuisance import Fitted
-from battery_env.calibration.task import CalibrationTask
-from battery_env.calibration.voltage import VoltageTask
 from battery_env.electrochemistry import NEW_CELL, STATE_SIZE, UNCERTAIN_CONSTANTS
 from battery_env.estimates import last_estimate
 from battery_env.estimators.diagnosis.conditions import Condition
@@ -26,6 +21,11 @@ from battery_env.policies.confidence import Confidence
 from battery_env.policies.pretrained import pretrained_policy
 from battery_env.records import Samples, check_drawn_charge, check_record, check_sample, drawn_charge_C, starts_at_rest
 from battery_env.records.model import RecordModel
+from battery_env.tasks.env import CalibrationEnv, task_class
+from battery_env.tasks.task import CalibrationTask
+from battery_env.tasks.voltage.aging import BatteryAging
+from battery_env.tasks.voltage.fit import Fitted
+from battery_env.tasks.voltage.task import VoltageTask
 
 # Steps in which a stream is followed, s
 _STEP_S = 1.0

@@ -19,7 +19,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from battery_env.calibration.voltage import ESTIMATE_RANGES
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate
 from battery_env.estimates import last_estimate
 from battery_env.estimators import (
@@ -40,6 +39,7 @@ from battery_env.policies.estimator import PolicyEstimator
 from battery_env.policies.pretrained import pretrained_ids
 from battery_env.records import Stream
 from battery_env.records.discharge import Discharge, load_nasa_discharges
+from battery_env.tasks.voltage.task import ESTIMATE_RANGES
 
 WRONG_SHARE = 0.05
 COVERED_SD = 3.0

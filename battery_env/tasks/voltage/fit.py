@@ -10,7 +10,19 @@ from numba import njit
 from numpy.typing import NDArray
 
 from battery_env.arrays import FloatArray, IntArray
-from battery_env.calibration.readings import (
+from battery_env.electrochemistry.cell import (
+    BULK_RATE,
+    PER_CURRENT_N,
+    R_OVER_F,
+    SURFACE_RATE,
+    SURROUNDINGS,
+    TO_RATE,
+    TSN_RATE,
+    UNCERTAIN_CONSTANTS,
+)
+from battery_env.electrochemistry.kernels import BLOCK
+from battery_env.parameters import columns_of
+from battery_env.tasks.voltage.readings import (
     BLOCK_SIZE,
     CURRENT,
     FURTHER_VSN,
@@ -32,18 +44,6 @@ from battery_env.calibration.readings import (
     take_readings,
     voltages_of_block,
 )
-from battery_env.electrochemistry.cell import (
-    BULK_RATE,
-    PER_CURRENT_N,
-    R_OVER_F,
-    SURFACE_RATE,
-    SURROUNDINGS,
-    TO_RATE,
-    TSN_RATE,
-    UNCERTAIN_CONSTANTS,
-)
-from battery_env.electrochemistry.kernels import BLOCK
-from battery_env.parameters import columns_of
 
 # The unknowns: two parameters, the offset of the sensor, and the logarithms of UNCERTAIN_CONSTANTS. In the values of a block
 # they are rows of the derivatives of the voltage, and the residual is the row after them
@@ -378,8 +378,8 @@ def nuisance_step(
 ) -> None:
     """
     One Gauss-Newton step towards the (q_mobile, r_o), offset and constants that explain the readings of each cell best under
-    their priors; unchecked, all arrays contiguous. The arguments that :func:`battery_env.calibration.readings.explain` has too
-    are the same.
+    their priors; unchecked, all arrays contiguous. The arguments that :func:`battery_env.tasks.voltage.readings.explain` has
+    too are the same.
 
     :param logarithms: of the factors that the constants of the model are multiplied by, shape (n, 4)
     :param prior_mean: of all unknowns, shape (7,)

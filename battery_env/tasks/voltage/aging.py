@@ -11,11 +11,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from battery_env.calibration.task import check_counts
-from battery_env.calibration.voltage import VoltageTask
 from battery_env.electrochemistry import CellParameters, FloatArray
 from battery_env.estimators.estimator import Record
 from battery_env.loads import RandomPiecewise
+from battery_env.tasks.task import check_counts
+from battery_env.tasks.voltage.task import VoltageTask
 from battery_env.trajectories import TrajectoryDataset
 
 #: Lives to train on and to test on.
@@ -51,7 +51,7 @@ class BatteryAging(VoltageTask):
     ## Description
 
     The life of a Li-ion cell: 20 cycles, each a discharge from full charge as in ``BatteryVoltageJoint-v0``, with wear
-    between them (``battery_env.calibration.aging.simulated_lives``: q^max falls by 10 to 40 % and R_o rises by 20 to 100 %
+    between them (``battery_env.tasks.voltage.aging.simulated_lives``: q^max falls by 10 to 40 % and R_o rises by 20 to 100 %
     over a life, in uneven steps). The estimate is carried over from cycle to cycle. Only the readings of the present cycle
     count in observation and cost, so that early in a discharge, when the data say nothing of q^max, the estimate of the last
     cycle is the best there is.

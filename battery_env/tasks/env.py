@@ -11,8 +11,8 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from battery_env.calibration.task import OBSERVATION_LIMIT, CalibrationTask
 from battery_env.estimators.estimator import Record
+from battery_env.tasks.task import OBSERVATION_LIMIT, CalibrationTask
 
 _ROW = np.zeros(1, dtype=np.intp)
 FloatSpace = gym.Space[NDArray[np.float32]]
@@ -58,7 +58,7 @@ def check_render_mode(render_mode: str | None) -> str | None:
 class CalibrationEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     """
     A calibration task for one cell. The reward is minus the cost, and ``info`` holds the cost and what
-    :meth:`~battery_env.calibration.task.CalibrationTask.report` says. ``help(env.task)`` describes what is observed, done,
+    :meth:`~battery_env.tasks.task.CalibrationTask.report` says. ``help(env.task)`` describes what is observed, done,
     paid and can be chosen.
 
     :param task: the class of the task, or where it is, as ``"module:name"``
@@ -130,7 +130,7 @@ class CalibrationEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         """
         if self.render_mode is None:
             return None
-        from battery_env.calibration.rendering import draw_frame  # matplotlib only for those who look
+        from battery_env.tasks.rendering import draw_frame  # matplotlib only for those who look
 
         task = self.task
         return draw_frame(list(self._history), task.parameters, task.episode_steps, task.decision_s)

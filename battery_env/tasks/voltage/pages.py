@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from battery_env.calibration.voltage import VoltageTask
+from battery_env.tasks.voltage.task import VoltageTask
 
 
 class BatteryVoltageJoint(VoltageTask):
@@ -16,7 +16,7 @@ class BatteryVoltageJoint(VoltageTask):
     knows readings and estimate alone, so that the task can be made of recorded discharges too.
 
     The voltage of the model for any (q_mobile, r_o) at all readings so far costs no simulation: see
-    ``battery_env.calibration.readings.Readings``.
+    ``battery_env.tasks.voltage.readings.Readings``.
 
     ## Observation space
 

@@ -13,9 +13,9 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from battery_env.calibration.env import CalibrationEnv, check_render_mode, new_task, spaces_of
-from battery_env.calibration.task import CalibrationTask
 from battery_env.electrochemistry import FloatArray
+from battery_env.tasks.env import CalibrationEnv, check_render_mode, new_task, spaces_of
+from battery_env.tasks.task import CalibrationTask
 
 Mask = NDArray[np.bool_]
 
@@ -133,7 +133,7 @@ class CalibrationVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.
         """
         if self.render_mode is None:
             return None
-        from battery_env.calibration.rendering import draw_frame  # matplotlib only for those who look
+        from battery_env.tasks.rendering import draw_frame  # matplotlib only for those who look
 
         task = self.task
         return tuple(draw_frame(list(h), task.parameters, task.episode_steps, task.decision_s) for h in self._histories)

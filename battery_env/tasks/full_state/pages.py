@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from battery_env.calibration.full_state import FullStateTask
-from battery_env.calibration.full_state_layout import LITERAL
+from battery_env.tasks.full_state.layout import LITERAL
+from battery_env.tasks.full_state.task import FullStateTask
 
 
 class BatteryQmax(FullStateTask):
@@ -70,7 +70,7 @@ class BatteryQmax(FullStateTask):
     | ``resync`` | none | the model is set to the measured state after every so many decisions |
     | ``consistency`` | 0 | cost of a change of the action per unit of its Euclidean length (the paper's consistency penalty); above 0 the action before is appended to the observation, at first the one that stands for a new cell |
     | ``cost_limit`` | 5 | largest cost of a parameter, without that of a change |
-    | ``load`` | ``"paper"`` | or ``"constant"``, ``"piecewise"``, ``"random_walk"``, ``"recorded"``: see ``battery_env.calibration.data.standard_dataset``; cells whose parameters no action stands for are left out |
+    | ``load`` | ``"paper"`` | or ``"constant"``, ``"piecewise"``, ``"random_walk"``, ``"recorded"``: see ``battery_env.tasks.data.standard_dataset``; cells whose parameters no action stands for are left out |
     | ``split`` | ``"train"`` | or ``"test"``, ``"all"`` |
     | ``dt_s`` | 1 | time step, s |
     | ``mismatch`` | 0 | how far kn, tDiffusion, to and tsn of the cell are from the model's (relative standard deviation) |

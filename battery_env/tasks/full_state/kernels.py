@@ -1,8 +1,8 @@
 """
 The compiled kernels (numba) of the full-state task: a decision, a look ahead, and what the agent sees, for many cells.
 
-``settings`` is one record of :data:`~battery_env.calibration.full_state_layout.SETTINGS`, ``cells`` an array of records of
-:data:`~battery_env.calibration.full_state_layout.CELL`, whose fields the kernels overwrite.
+``settings`` is one record of :data:`~battery_env.tasks.full_state.layout.SETTINGS`, ``cells`` an array of records of
+:data:`~battery_env.tasks.full_state.layout.CELL`, whose fields the kernels overwrite.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 from battery_env.arrays import FloatArray
-from battery_env.calibration.full_state_layout import Records
 from battery_env.electrochemistry.cell import QNB, QNS, STATE_SIZE, VO
 from battery_env.electrochemistry.kernels import (
     BLOCK,
@@ -27,6 +26,7 @@ from battery_env.electrochemistry.kernels import (
     step_of_block,
     voltage_of_block,
 )
+from battery_env.tasks.full_state.layout import Records
 
 _compiled = njit(cache=True, error_model="numpy")
 _inlined = njit(cache=True, error_model="numpy", forceinline=True)

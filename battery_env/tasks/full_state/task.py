@@ -16,9 +16,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from battery_env.arrays import IntArray
-from battery_env.calibration.data import LoadKind, Split, opened, standard_dataset
-from battery_env.calibration.full_state_kernels import decide, look_ahead, model_voltage, observe
-from battery_env.calibration.full_state_layout import (
+from battery_env.checks import check_not_negative
+from battery_env.electrochemistry import NEW_CELL, FloatArray, Trajectory
+from battery_env.parameters import PARAMETER_NAMES
+from battery_env.tasks.data import LoadKind, Split, opened, standard_dataset
+from battery_env.tasks.full_state.kernels import decide, look_ahead, model_voltage, observe
+from battery_env.tasks.full_state.layout import (
     CELL,
     CELL_WITH_CONSTANTS,
     ERROR_SCALE,
@@ -30,10 +33,7 @@ from battery_env.calibration.full_state_layout import (
     Formulation,
     Records,
 )
-from battery_env.calibration.task import OBSERVATION_LIMIT, CalibrationTask, check_counts, checked_action
-from battery_env.checks import check_not_negative
-from battery_env.electrochemistry import NEW_CELL, FloatArray, Trajectory
-from battery_env.parameters import PARAMETER_NAMES
+from battery_env.tasks.task import OBSERVATION_LIMIT, CalibrationTask, check_counts, checked_action
 from battery_env.trajectories import TrajectoryDataset
 
 # A model that was wrong for a while has moved too much or too little charge from one electrode to the other. In both
@@ -57,13 +57,13 @@ class FullStateTask(CalibrationTask):
     """
     The paper's task for ``cells`` cells side by side. The state of the cell is measured. One parameter is to be found and the
     other one is known, or both are to be found. The registered tasks differ in attributes of their classes. The page of
-    :class:`~battery_env.calibration.full_state_tasks.BatteryQmax` describes the options.
+    :class:`~battery_env.tasks.full_state.pages.BatteryQmax` describes the options.
 
     The cell is simulated beside the model, from the parameters and loads of the data set. The model is extended where a wrong
     parameter leaves its domain (:func:`battery_env.electrochemistry.step_into`, ``extended``).
 
     :ivar formulation: how states become observations and costs
-    :ivar now: the cells at their samples, records of :data:`~battery_env.calibration.full_state_layout.CELL`
+    :ivar now: the cells at their samples, records of :data:`~battery_env.tasks.full_state.layout.CELL`
     :param cells: size of the batch
     :raises ValueError: for values out of range
     """

@@ -15,7 +15,7 @@ from battery_env.estimators.estimator import Record
 from battery_env.trajectories import IntArray
 
 if TYPE_CHECKING:
-    from battery_env.calibration.nuisance import Fitted
+    from battery_env.tasks.voltage.fit import Fitted
 
 #: Observations are clipped here; what a calibrated model shows is of order 1.
 OBSERVATION_LIMIT = 100.0

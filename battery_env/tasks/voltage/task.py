@@ -17,16 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from battery_env.arrays import FloatArray, IntArray
-from battery_env.calibration.data import LoadKind, Split, opened, standard_dataset
-from battery_env.calibration.nuisance import Fitted, NuisanceFit
-from battery_env.calibration.readings import CURRENT, MEASURED, OHMIC, SHOWN, Readings, explain
-from battery_env.calibration.task import OBSERVATION_LIMIT, CalibrationTask, check_counts, checked_action
 from battery_env.checks import check_not_negative
 from battery_env.electrochemistry import UNCERTAIN_CONSTANTS, CellParameters, check_cell
 from battery_env.estimators.diagnosis.conditions import white_noise_V
 from battery_env.parameters import PARAMETER_NAMES, columns_of
 from battery_env.records import Record
 from battery_env.sensors import RandomSensorErrors
+from battery_env.tasks.data import LoadKind, Split, opened, standard_dataset
+from battery_env.tasks.task import OBSERVATION_LIMIT, CalibrationTask, check_counts, checked_action
+from battery_env.tasks.voltage.fit import Fitted, NuisanceFit
+from battery_env.tasks.voltage.readings import CURRENT, MEASURED, OHMIC, SHOWN, Readings, explain
 from battery_env.trajectories import TrajectoryDataset
 
 #: Where estimates are kept, C and ohm.
@@ -75,7 +75,7 @@ class VoltageTask(CalibrationTask):
 
     One parameter may be known instead: the true one of a simulated discharge, and the new cell's of a recorded one. What
     differs between the registered tasks is data of their classes; their options are described on the page of
-    :class:`~battery_env.calibration.voltage_tasks.BatteryVoltageJoint`.
+    :class:`~battery_env.tasks.voltage.pages.BatteryVoltageJoint`.
 
     :ivar readings: what is read of the discharges
     :ivar sensors: what they are read with

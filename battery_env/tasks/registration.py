@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from gymnasium.envs.registration import register, registry
 
-_PACKAGE = "battery_env.calibration"
+_PACKAGE = "battery_env.tasks"
 
 #: By id, the task that the environments for one cell and for many run; its docstring is their page.
 TASKS: dict[str, str] = {
-    "BatteryQmax-v0": f"{_PACKAGE}.full_state_tasks:BatteryQmax",
-    "BatteryRo-v0": f"{_PACKAGE}.full_state_tasks:BatteryRo",
-    "BatteryJoint-v0": f"{_PACKAGE}.full_state_tasks:BatteryJoint",
-    "BatteryQmaxPaper-v0": f"{_PACKAGE}.full_state_tasks:BatteryQmaxPaper",
-    "BatteryRoPaper-v0": f"{_PACKAGE}.full_state_tasks:BatteryRoPaper",
-    "BatteryVoltageQmax-v0": f"{_PACKAGE}.voltage_tasks:BatteryVoltageQmax",
-    "BatteryVoltageRo-v0": f"{_PACKAGE}.voltage_tasks:BatteryVoltageRo",
-    "BatteryVoltageJoint-v0": f"{_PACKAGE}.voltage_tasks:BatteryVoltageJoint",
-    "BatteryAging-v0": f"{_PACKAGE}.aging:BatteryAging",
+    "BatteryQmax-v0": f"{_PACKAGE}.full_state.pages:BatteryQmax",
+    "BatteryRo-v0": f"{_PACKAGE}.full_state.pages:BatteryRo",
+    "BatteryJoint-v0": f"{_PACKAGE}.full_state.pages:BatteryJoint",
+    "BatteryQmaxPaper-v0": f"{_PACKAGE}.full_state.pages:BatteryQmaxPaper",
+    "BatteryRoPaper-v0": f"{_PACKAGE}.full_state.pages:BatteryRoPaper",
+    "BatteryVoltageQmax-v0": f"{_PACKAGE}.voltage.pages:BatteryVoltageQmax",
+    "BatteryVoltageRo-v0": f"{_PACKAGE}.voltage.pages:BatteryVoltageRo",
+    "BatteryVoltageJoint-v0": f"{_PACKAGE}.voltage.pages:BatteryVoltageJoint",
+    "BatteryAging-v0": f"{_PACKAGE}.voltage.aging:BatteryAging",
 }
 
 
