@@ -6,6 +6,7 @@ import pickle
 import re
 import subprocess
 import sys
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -14,16 +15,12 @@ import battery_env
 
 ROOT = Path(__file__).parents[1]
 
-# each layer may import the ones before it, and itself
+# each layer may import the ones before it, and itself; a folder is one
 LAYERS = (
-    ("battery_env.arrays", "battery_env.files"),
-    ("battery_env.checks",),
-    ("battery_env.parameters",),
-    ("battery_env.electrochemistry.cell",),
-    ("battery_env.electrochemistry.kernels",),
-    ("battery_env.electrochemistry.tangents",),
+    ("battery_env.arrays", "battery_env.checks", "battery_env.files"),
+    ("battery_env.parameters", "battery_env.estimates"),
     ("battery_env.electrochemistry",),
-    ("battery_env.records", "battery_env.estimates"),
+    ("battery_env.records",),
     ("battery_env.loads",),
     ("battery_env.trajectories",),
     ("battery_env.sensors",),
@@ -72,6 +69,15 @@ def test_battery_env_imports_run_one_way(path):
     for imported in imports(path):
         if imported.startswith("battery_env"):
             assert layer(imported) is not None and layer(imported) <= own, f"{path} imports {imported}"
+
+
+def test_no_modules_of_battery_env_import_each_other_in_a_circle():
+    paths = {module_name(path): path for path in files("battery_env")}
+    list(TopologicalSorter({name: set(imports(path)) - {name} for name, path in paths.items()}).static_order())
+
+
+def test_on_the_ground_floor_of_battery_env_is_what_users_import_by_path_and_all_rooms_share():
+    assert len(list((ROOT / "battery_env").glob("*.py"))) <= 14, "give it a room: a folder named after its subject"
 
 
 @pytest.mark.parametrize("path", files("battery_env"), ids=module_name)
