@@ -75,7 +75,7 @@ class LeastSquares(Estimator):
 
     The model starts at the first sample of the record, fully charged and at rest unless ``initial_soc`` or ``initial`` say
     otherwise, and follows the recorded current (:func:`battery_env.records.resample_current`). For a recorded discharge give
-    :meth:`battery_env.records.discharge.Discharge.loaded_part`, which starts when the load is switched on.
+    :meth:`battery_env.Discharge.loaded_part`, which starts when the load is switched on.
 
     *The search.* At a fixed current the charges of the model are linear in ``q_mobile``; so one simulation gives exactly the
     value below which the model cell would be empty before the record ends. The search is over the logarithm of the distance

@@ -102,7 +102,7 @@ def forecast_end(
     discharge: Discharge, settings: Settings | None = None, load: FutureLoad | None = None, samples: int = 1000
 ) -> Forecast:
     """
-    The end of a discharge in progress, with all that :class:`~battery_env.lab.calibrate.Settings` know of it.
+    The end of a discharge in progress, with all that :class:`~battery_env.Settings` know of it.
 
     .. code-block:: python
 

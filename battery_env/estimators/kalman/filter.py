@@ -84,7 +84,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
 
     The defaults are those of simulated records. For recorded cells take :func:`battery_env.calibrate`, or
     ``battery_env.Settings(method="kalman").calibrator()``: a model of the temperature, and the errors of model and sensor to
-    expect. Give it :meth:`battery_env.records.discharge.Discharge.loaded_part`, which starts when the load is switched on.
+    expect. Give it :meth:`battery_env.Discharge.loaded_part`, which starts when the load is switched on.
 
     :param parameters: which to search for; the other is held at ``cell``'s value
     :param cell: constants of the model; ``None``: the new cell's

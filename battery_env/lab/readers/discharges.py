@@ -48,7 +48,7 @@ class Recording(NamedTuple):
     """
     What a file or a table holds of one discharge, not checked yet.
 
-    :param arrays: arguments of :class:`~battery_env.records.discharge.Discharge`, by name
+    :param arrays: arguments of :class:`~battery_env.Discharge`, by name
     :param meta: what else is known; ``cycle`` is missing if the file holds one discharge and does not number it
     """
 
@@ -94,7 +94,7 @@ def read_discharges(
     :param discharge_is_negative: how the current of a discharge is counted; ``None``: told from the voltage, which falls where
         a load is switched on and as charge is drawn
     :return: the discharges; their ``meta`` holds ``source`` and, if there are several or they are numbered, ``cycle``. One
-        that fails the checks of :class:`~battery_env.records.discharge.Discharge` is left out with a warning
+        that fails the checks of :class:`~battery_env.Discharge` is left out with a warning
     :raises ValueError: if there is none, the file is damaged, or it does not tell what is asked for
     :raises ImportError: if the file needs an extra that is not installed
     """
