@@ -110,6 +110,19 @@ def shares_of(outcome: pd.DataFrame, tolerance: float) -> dict[str, float]:
     }
 
 
+def summary(outcome: pd.DataFrame, tolerance: float) -> dict[str, float]:
+    """What the episodes of a roll-out cost, and where they end."""
+    return {
+        "cost": outcome["cost"].mean(),
+        "cost_worst": outcome["cost"].max(),
+        "error_median": outcome["error"].median(),
+        "error_worst": outcome["error"].max(),
+        "tolerance": tolerance,
+        **shares_of(outcome, tolerance),
+        "died": outcome["died"].mean(),
+    }
+
+
 def tried(policy: PolicyPredictor, env_id: str, episodes: int) -> pd.DataFrame:
     """Try a policy under all conditions, and return one row each."""
     problem = gym.make(env_id).unwrapped
@@ -122,13 +135,7 @@ def tried(policy: PolicyPredictor, env_id: str, episodes: int) -> pd.DataFrame:
                 "environment": env_id,
                 "disturbance": condition,
                 "arguments": ", ".join(f"{name}={value}" for name, value in arguments.items()),
-                "cost": outcome["cost"].mean(),
-                "cost_worst": outcome["cost"].max(),
-                "error_median": outcome["error"].median(),
-                "error_worst": outcome["error"].max(),
-                "tolerance": problem.error_tolerance,
-                **shares_of(outcome, problem.error_tolerance),
-                "died": outcome["died"].mean(),
+                **summary(outcome, problem.error_tolerance),
             }
         )
     return pd.DataFrame(rows)

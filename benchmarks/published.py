@@ -1,0 +1,369 @@
+"""
+The experiments of Han et al. (2020) that can be made here: LAC as published and SAC on the cart and pole and on the synthetic
+gene network, and what impulses, other parameters, noise and other references do to their policies.
+
+.. code-block:: bash
+
+  python -m benchmarks.published --compile
+  python -m benchmarks.published --compile --envs CartPoleCost-v0 --timesteps 1000000
+
+Settings are those of the authors' code, with ``alpha3 = 1`` and the horizon of 5 of the paper: one environment, 80 updates
+every 100 steps, rates of 1e-4 (actor) and 3e-4 (critics) that fall to zero, time limits that are ends. SAC has the same, with
+as many updates (their code makes 50) and the hidden layers of LAC's networks. Their cart and pole has a million steps.
+Policies are trained without disturbances and judged by their mean action. ``lac_20`` and ``lac_inf`` are LAC with other
+horizons. What is done is not done again when the command is repeated, so that seeds can be added.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+from gymnasium.wrappers import TimeLimit
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter, PercentFormatter
+from stable_baselines3.common.type_aliases import PolicyPredictor
+
+from battery_env.plotting import COLOUR_OF, COLOURS
+from benchmarks.control import roll_out, summary
+from benchmarks.stabilisation import Contender, LearningCurve, undisturbed_table
+from benchmarks.study import (
+    Study,
+    Tables,
+    command_line,
+    markdown,
+    natural,
+    new_panels,
+    positive,
+    share_with_range,
+    with_spread,
+)
+from benchmarks.training import record_file, train_or_load, training_minutes
+from sb3_lac import PublishedLAC
+from sb3_lac.envs import CostEnv, OscillatorEnv, reference_controller
+from sb3_lac.stability.plots import format_log_axis
+
+_REFERENCE = "reference"
+#: How policies are drawn: colour and marker.
+STYLES = {
+    "LAC as published": (COLOUR_OF["LAC"], "o"),
+    "the same, N = 20": (COLOURS[5], "P"),
+    "the same, N = inf": (COLOURS[2], "X"),
+    "SAC": (COLOUR_OF["SAC"], "s"),
+    _REFERENCE: ("black", "|"),
+}
+#: LAC by horizon: what it is called.
+HORIZONS = {"lac": (5, "LAC as published"), "lac_20": (20, "the same, N = 20"), "lac_inf": (None, "the same, N = inf")}
+#: Environment steps of a training.
+TIMESTEPS = {"Oscillator-v0": 100_000, "CartPoleCost-v0": 200_000}
+_CRITIC_LAYERS = {"Oscillator-v0": [256, 256], "CartPoleCost-v0": [64, 64]}
+#: What a disturbance is judged by: a column with its title.
+MEASURES = {"Oscillator-v0": ("cost", "cost per step"), "CartPoleCost-v0": ("died", "episodes that die")}
+_IMPULSES = {"Oscillator-v0": "amount of the first protein every 20 steps", "CartPoleCost-v0": "force every 20 steps (N)"}
+_LEARNED = {"cost": "cost per step", "at_goal": "episodes at rest"}
+#: By environment and disturbance: arguments of the environment, by what is different.
+DISTURBANCES: dict[str, dict[str, dict[str, dict[str, Any]]]] = {
+    "Oscillator-v0": {
+        "none": {"": {}},
+        "impulses": {f"{size:g}": {"impulse": size, "impulse_interval": 20} for size in (0.5, 1.0, 2.0, 4.0)},
+        "other parameters": {
+            f"{name} = {value:g}": {"changed_parameters": {name: value}}
+            for name, values in {
+                "transcription": (0.8, 3.2),
+                "half_saturation": (0.5, 2.0),
+                "messenger_decay": (0.08, 0.24),
+                "translation": (0.08, 0.24),
+                "protein_decay": (0.03, 0.09),
+            }.items()
+            for value in values
+        },
+        "process noise": {f"{std:g}": {"process_noise": std} for std in (0.1, 0.3, 1.0)},
+        "other reference": {
+            "period 150": {"reference": (8.0, 7.0, 150)},
+            "period 400": {"reference": (8.0, 7.0, 400)},
+            "constant 8": {"reference": (8.0, 0.0, 1)},
+            "constant 16": {"reference": (16.0, 0.0, 1)},
+        },
+    },
+    "CartPoleCost-v0": {
+        "none": {"": {}},
+        "impulses": {f"{size} N": {"impulse": float(size), "impulse_interval": 20} for size in range(80, 151, 10)},
+        "other parameters": {
+            f"half length {length:g} m, cart {mass:g} kg": {
+                "changed_parameters": {"pole_half_length_m": length, "cart_mass_kg": mass}
+            }
+            for length in (0.1, 0.5, 1.0, 2.0)
+            for mass in (0.1, 0.5, 1.0, 2.0)
+        },
+    },
+}
+
+
+class EndFarAway(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]):
+    """Ends an episode with a step that costs more than 100, as the authors' gene network does in training."""
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, Any, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return observation, reward, terminated or info["cost"] > 100.0, truncated, info
+
+
+class OtherReferenceEnv(OscillatorEnv):
+    """
+    The gene network with a reference that nobody was trained with.
+
+    :param mean: of the reference
+    :param amplitude: of its sine
+    :param period_steps: of its sine
+    """
+
+    def __init__(self, mean: float, amplitude: float, period_steps: int) -> None:
+        super().__init__()
+        self.mean, self.amplitude, self.period_steps = mean, amplitude, period_steps
+
+    def reference(self, step: int) -> float:
+        return self.mean + self.amplitude * float(np.sin(2.0 * np.pi * step / self.period_steps))
+
+
+def make_env(env_id: str, reference: tuple[float, float, int] | None = None, **arguments: Any) -> gym.Env[Any, Any]:
+    """An environment with a disturbance, or the gene network with another reference."""
+    if reference is None:
+        return gym.make(env_id, **arguments)
+    max_episode_steps = gym.spec(env_id).max_episode_steps
+    assert max_episode_steps is not None
+    return TimeLimit(OtherReferenceEnv(*reference), max_episode_steps)
+
+
+def contender(policy: str, env_id: str) -> Contender:
+    """An algorithm with the settings and networks for an environment."""
+    own: dict[str, Any]
+    if policy in HORIZONS:
+        algo, layers = "published_lac", [*_CRITIC_LAYERS[env_id], 16]
+        horizon, label = HORIZONS[policy]
+        own = {"horizon": horizon}
+    else:
+        algo, label, layers = "benchmarks.two_rate_sac:TwoRateSAC", "SAC", _CRITIC_LAYERS[env_id]
+        own = {"ent_coef": "auto_1.0", "gamma": 0.995, "train_freq": 100, "gradient_steps": 80, "learning_starts": 1000}
+    own["policy_kwargs"] = {"net_arch": {"pi": [64, 64], "qf": layers}}
+    if env_id == "Oscillator-v0":
+        own["env_wrapper"] = "benchmarks.published.EndFarAway"
+    return Contender(algo, label, *STYLES[label], "published_lac", own, compiles=policy in HORIZONS)
+
+
+def tried(policy: PolicyPredictor, env_id: str, episodes: int) -> list[dict[str, Any]]:
+    """Try a policy with all disturbances, and return one row each."""
+    problem = gym.make(env_id).unwrapped
+    assert isinstance(problem, CostEnv)
+    rows = []
+    for disturbance, settings in DISTURBANCES[env_id].items():
+        for setting, arguments in settings.items():
+            outcome = roll_out(policy, partial(make_env, env_id, **arguments), episodes)
+            row = {"disturbance": disturbance, "setting": setting, "impulse": arguments.get("impulse", 0.0)}
+            rows.append(row | summary(outcome, problem.error_tolerance))
+    return rows
+
+
+def part(
+    policy: str,
+    env_id: str,
+    seed: int | None,
+    timesteps: int | None,
+    recipe: str | None,
+    episodes: int,
+    models: Path,
+    compiled: bool,
+) -> Tables:
+    """Train a policy, or take the reference controller, and try it."""
+    predictor: PolicyPredictor
+    described: dict[str, Any] = {"environment": env_id, "policy": policy, "seed": seed}
+    learning = None
+    if policy == _REFERENCE:
+        predictor = reference_controller(gym.make(env_id))
+        trained: dict[str, Any] = {"timesteps": None, "updates": None, "lambda": None, "training_minutes": None}
+    else:
+        assert seed is not None and timesteps is not None
+        chosen = contender(policy, env_id)
+        made_from = chosen.recipe(env_id, seed, timesteps)
+        if made_from.digest != recipe:
+            raise RuntimeError(f"the settings of {policy} on {env_id} have changed since the study began: start it again")
+        folder = models / f"{env_id}_{policy}_seed{seed}"
+        file = record_file(made_from, folder).with_name(f"learning_{made_from.name}.csv")
+        predictor = model = train_or_load(
+            chosen.algo,
+            env_id,
+            seed,
+            timesteps,
+            folder,
+            dict(chosen.hyperparameters),
+            chosen.settings,
+            callback=LearningCurve(env_id, timesteps, file),
+            compile_update=compiled and chosen.compiles,
+        )
+        learning = pd.read_csv(file)
+        minutes = training_minutes(made_from, folder) - learning.pop("seconds").sum() / 60.0
+        described["policy"] = chosen.label
+        weight = model.log_lambda.exp().item() if isinstance(model, PublishedLAC) else None
+        updates = getattr(model, "_n_updates", None)
+        trained = {"timesteps": timesteps, "updates": updates, "lambda": weight, "training_minutes": minutes}
+    results = pd.DataFrame([described | trained | row for row in tried(predictor, env_id, episodes)])
+    return {"published": results} | ({} if learning is None else {"learning": learning.assign(**described)})
+
+
+def _in_order(names: pd.Series) -> pd.Series:
+    order = [*DISTURBANCES, *STYLES]
+    return names.map(order.index)
+
+
+def disturbed_table(results: pd.DataFrame) -> pd.DataFrame:
+    """What disturbances do to the policies for one environment, by what it is judged by: means over seeds."""
+    (env_id,) = results["environment"].unique()
+    measure, _ = MEASURES[env_id]
+    shown = share_with_range if measure == "died" else with_spread
+    rows = []
+    for (disturbance, setting), group in results.groupby(["disturbance", "setting"], sort=False):
+        row: dict[str, str] = {"disturbance": str(disturbance), "setting": str(setting)}
+        of_policies = group.groupby("policy", sort=False)[measure]
+        rows.append(row | {str(policy): shown(values) for policy, values in of_policies})
+    return pd.DataFrame(rows)
+
+
+def report(results: pd.DataFrame) -> str:
+    """All tables, as Markdown."""
+    text = [
+        "Without disturbances. Costs and errors are interquartile means over seeds with 95 % intervals, shares of "
+        "episodes are means (least to most of a seed):\n",
+        markdown(undisturbed_table(results)),
+    ]
+    for env_id in results["environment"].unique():
+        measure, title = MEASURES[env_id]
+        spread = "least to most of a seed" if measure == "died" else "± standard deviation"
+        text.append(f"{env_id} with disturbances. {title.capitalize()}, mean over seeds ({spread}):\n")
+        text.append(markdown(disturbed_table(results[results["environment"] == env_id])))
+    return "\n".join(text)
+
+
+def _draw(axes: Axes, results: pd.DataFrame, x: str, y: str) -> None:
+    """The mean over seeds, in a band from the least to the most of a seed."""
+    for name, of_policy in results.groupby("policy", sort=False):
+        colour, marker = STYLES[str(name)]
+        values = of_policy.groupby(x)[y].agg(["mean", "min", "max"])
+        axes.fill_between(values.index, values["min"], values["max"], color=colour, alpha=0.15, lw=0)
+        axes.plot(values.index, values["mean"], marker=marker, ms=4, lw=1.4, color=colour, label=str(name))
+
+
+def _set_scale(axes: Axes, measure: str, along: str) -> None:
+    axis = axes.xaxis if along == "x" else axes.yaxis
+    if measure == "cost":
+        axes.set(**{f"{along}scale": "log"})
+        format_log_axis(axis)
+    else:
+        axes.set(**{f"{along}lim": (-0.03, 1.03)})
+        axis.set_major_formatter(PercentFormatter(1.0))
+
+
+def plot_learning(learning: pd.DataFrame, results: pd.DataFrame) -> Figure:
+    """What the mean action costs while policies are trained, and the share of episodes that come to rest."""
+    envs = list(learning["environment"].unique())
+    figure, panels = new_panels(2 * len(envs), 2, (3.9, 2.4), margin=(0.0, 0.3))
+    measures = [(env_id, measure, label) for env_id in envs for measure, label in _LEARNED.items()]
+    for axes, (env_id, measure, label) in zip(panels, measures, strict=True):
+        _draw(axes, learning[learning["environment"] == env_id], "timesteps", measure)
+        references = results[(results["environment"] == env_id) & (results["policy"] == _REFERENCE)]
+        level = references.loc[references["disturbance"] == "none", measure].mean()
+        axes.axhline(level, color=STYLES[_REFERENCE][0], ls="--", lw=1.0, label=_REFERENCE)
+        axes.set(title=env_id, ylabel=label)
+        _set_scale(axes, measure, "y")
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    for axes in panels[-2:]:
+        axes.set_xlabel("environment steps")
+    _add_legend(figure, panels[0])
+    return figure
+
+
+def plot_impulses(results: pd.DataFrame) -> Figure:
+    """What impulses of a size do, by what an environment is judged by."""
+    pushed = results[results["disturbance"].isin(["none", "impulses"])]
+    envs = list(pushed["environment"].unique())
+    figure, panels = new_panels(len(envs), 2, (3.9, 2.6), margin=(0.0, 0.3))
+    for axes, env_id in zip(panels, envs, strict=True):
+        measure, label = MEASURES[env_id]
+        _draw(axes, pushed[pushed["environment"] == env_id], "impulse", measure)
+        axes.set(title=env_id, xlabel=_IMPULSES[env_id], ylabel=label)
+        _set_scale(axes, measure, "y")
+    _add_legend(figure, panels[0])
+    return figure
+
+
+def plot_changes(results: pd.DataFrame) -> Figure:
+    """What all other changes do: each seed, and the mean."""
+    changed = results[results["disturbance"] != "impulses"]
+    envs = list(changed["environment"].unique())
+    figure, panels = new_panels(len(envs), 2, (5.0, 4.6), margin=(0.0, 0.3))
+    for axes, env_id in zip(panels, envs, strict=True):
+        of_env = changed[changed["environment"] == env_id]
+        labels = list(dict.fromkeys(of_env["setting"]))
+        measure, label = MEASURES[env_id]
+        for name, of_policy in of_env.groupby("policy", sort=False):
+            colour, marker = STYLES[str(name)]
+            axes.plot(of_policy[measure], of_policy["setting"].map(labels.index), ".", color=colour, alpha=0.35, ms=4)
+            means = of_policy.groupby("setting")[measure].mean()
+            axes.plot(means, means.index.map(labels.index), marker, color=colour, ms=6, label=str(name))
+        noise = of_env.loc[of_env["disturbance"] == "process noise", "setting"].unique()
+        named = {"": "undisturbed", **{setting: f"process noise {setting}" for setting in noise}}
+        axes.set_yticks(range(len(labels)), [named.get(setting, setting) for setting in labels], fontsize="small")
+        axes.invert_yaxis()
+        axes.set(title=env_id, xlabel=label)
+        _set_scale(axes, measure, "x")
+    _add_legend(figure, panels[0])
+    return figure
+
+
+def _add_legend(figure: Figure, axes: Axes) -> None:
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize="small")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """The command line."""
+    parser = command_line("published", __doc__)
+    parser.add_argument("--algos", nargs="+", default=["lac", "sac"], choices=[*HORIZONS, "sac"])
+    parser.add_argument("--envs", nargs="+", default=list(TIMESTEPS), choices=list(TIMESTEPS))
+    parser.add_argument("--seeds", nargs="+", type=natural, default=[0, 1, 2, 3, 4])
+    steps = ", ".join(f"{steps} ({env_id})" for env_id, steps in TIMESTEPS.items())
+    parser.add_argument("--timesteps", type=positive, help=f"environment steps of each training, {steps} by default")
+    parser.add_argument("--compile", action="store_true", help="compile the updates of LAC to one graph each")
+    parser.add_argument("--episodes", type=positive, default=40, help="episodes for each policy and disturbance")
+    study = Study(parser, arguments)
+    chosen = study.chosen
+    untrained = {"seed": None, "timesteps": None, "recipe": None, "episodes": chosen.episodes}
+    parts: list[dict[str, Any]] = [{"policy": _REFERENCE, "env_id": env_id, **untrained} for env_id in chosen.envs]
+    # seed by seed, so that an interrupted study has whole seeds
+    for seed in chosen.seeds:
+        for env_id in chosen.envs:
+            for policy in chosen.algos:
+                try:
+                    recipe = contender(policy, env_id).recipe(env_id, seed, chosen.timesteps or TIMESTEPS[env_id])
+                except ValueError as error:
+                    parser.error(str(error))
+                made_from = {"seed": seed, "timesteps": recipe.timesteps, "recipe": recipe.digest}
+                parts.append({"policy": policy, "env_id": env_id, **made_from, "episodes": chosen.episodes})
+    study.configuration["disturbances"] = {env_id: DISTURBANCES[env_id] for env_id in chosen.envs}
+    tables = {
+        name: table.sort_values(["environment", "policy"], key=_in_order, kind="stable", ignore_index=True)
+        for name, table in study.run(part, parts, models=study.out / "models", compiled=chosen.compile).items()
+    }
+    results = tables["published"]
+    figures = {
+        "learning": plot_learning(tables["learning"], results),
+        "impulses": plot_impulses(results),
+        "changes": plot_changes(results),
+    }
+    study.write(tables, figures, report(results))
+
+
+if __name__ == "__main__":
+    main()
