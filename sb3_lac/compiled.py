@@ -12,6 +12,8 @@ from stable_baselines3.sac.policies import Actor
 _OLDEST_TORCH = "2.11"
 #: Backend of ``torch.compile``. Tests have a quicker one
 BACKEND = "inductor"
+# In place of a learning rate of 0: with Adam's epsilon of 1e-8, no weight changes by it
+_SMALLEST_RATE = 1e-30
 # What sampling leaves behind in an action distribution. The graphs that it belongs to are gone after an update
 _LEFT_BEHIND = ("distribution", "gaussian_actions", "weights_dist", "exploration_mat", "exploration_matrices", "_latent_sde")
 
@@ -137,7 +139,8 @@ class CompiledUpdate:
             for tensor in (*self._learning_rates, *(parameter for group in groups for parameter in group["params"])):
                 dynamo.mark_static_address(tensor)
         for group, learning_rate in zip(groups, self._learning_rates, strict=True):
-            learning_rate.fill_(group["lr"])
+            # Adam divides by a rate that is a tensor
+            learning_rate.fill_(max(group["lr"], _SMALLEST_RATE))
             # The compiler fuses the operations of a step by itself
             form = {"lr": learning_rate, "capturable": self._on_gpu, "foreach": None, "fused": None}
             group.update({name: value for name, value in form.items() if name in group})

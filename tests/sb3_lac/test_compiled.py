@@ -11,6 +11,7 @@ from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.utils import ConstantSchedule, LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from torch import nn
 from torch._dynamo.backends.common import aot_autograd
 from torch._functorch.aot_autograd import make_boxed_func
 from torch._guards import TracingContext
@@ -82,6 +83,22 @@ def test_compiled_and_eager_updates_are_the_same(make_model, kwargs):
     for values, eager_values in zip(logged, eager_logged, strict=True):
         assert values == pytest.approx(eager_values, rel=1e-4, abs=1e-5)
     assert_close(model, eager)
+
+
+def test_a_rate_that_has_fallen_to_zero_changes_nothing(make_model):
+    """Weights of a dead unit included, whose gradients have always been zero."""
+    falls = LinearSchedule(1e-2, 0.0, 1.0)
+    rates = {"learning_rate": falls, "critic_learning_rate": falls}
+    model = make_model(compile_update=True, algorithm=PublishedLAC, policy_kwargs={"activation_fn": nn.ReLU}, **rates)
+    with th.no_grad():
+        model.actor.latent_pi[0].bias[0] = -100.0
+    trained(model)
+    networks = (model.actor, model.critic)
+    before = [parameter.clone() for network in networks for parameter in network.parameters()]
+    model._current_progress_remaining = 0.0
+    model.train(1, model.batch_size)
+    after = [parameter for network in networks for parameter in network.parameters()]
+    assert all(th.equal(*parameters) for parameters in zip(before, after, strict=True))
 
 
 def test_constants_may_change(make_model):
