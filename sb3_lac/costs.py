@@ -4,9 +4,8 @@ import math
 import os
 import warnings
 from contextlib import nullcontext
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch as th
@@ -210,6 +209,13 @@ class CostAlgorithm(OffPolicyAlgorithm):
         self.policy.critic.offset.copy_(offset)
         self.policy.critic_target.offset.copy_(offset)
 
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
+        prepared = super()._setup_learn(*args, **kwargs)
+        vec_normalize = self._vec_normalize_env
+        first = self._last_obs if vec_normalize is None else vec_normalize.get_original_obs()
+        refuse_what_is_not_finite("first observation", first, self.num_timesteps)
+        return prepared
+
     def _store_transition(
         self,
         replay_buffer: ReplayBuffer,
@@ -376,30 +382,24 @@ class CostAlgorithm(OffPolicyAlgorithm):
         return [*state_dicts, "ent_coef_optimizer"], ["log_lambda", "log_ent_coef"]
 
 
-class _Steps(NamedTuple):
-    """What steps cost, each."""
-
-    cost: np.ndarray
-    is_end: np.ndarray
-
-
-@dataclass
 class Terminations:
     """What is collected before the first update, which tells whether a termination has a price."""
 
-    steps: list[_Steps] = field(default_factory=list)
+    def __init__(self) -> None:
+        self.costs: list[np.ndarray] = []
+        self.ends: list[np.ndarray] = []
 
     def see(self, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
         """Note a step of all environments. A time limit is no termination."""
-        in_time = np.array([not info.get("TimeLimit.truncated", False) for info in infos])
-        self.steps.append(_Steps(0.0 - rewards, dones & in_time))
+        self.costs.append(0.0 - rewards)
+        self.ends.append(dones & [not info.get("TimeLimit.truncated", False) for info in infos])
 
     def warn_if_free(self, gamma: float, largest_reward: float) -> None:
         """Warn if the last step before a termination costs no more than another step does."""
         # Where living pays, an end costs the bound for ever
-        if not self.steps or largest_reward > 0:
+        if not self.ends or largest_reward > 0:
             return
-        costs, ends = (np.concatenate(values) for values in zip(*self.steps, strict=True))
+        costs, ends = np.concatenate(self.costs), np.concatenate(self.ends)
         if not ends.any() or ends.all():
             return
         last, cheapest, dearest = costs[ends].mean(), costs[~ends].min(), costs[~ends].max()
