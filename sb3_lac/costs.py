@@ -137,11 +137,10 @@ class CostAlgorithm(OffPolicyAlgorithm):
             self.ent_coef_tensor = th.tensor(float(self.ent_coef), device=self.device)
 
         # The multiplier of the decrease condition is learned like that of the entropy
-        self.critic_lr_schedule = self.lambda_lr_schedule = self.lr_schedule
-        if self.lambda_learning_rate is not None:
-            self.lambda_lr_schedule = FloatSchedule(self.lambda_learning_rate)
         self.log_lambda, self.lambda_optimizer = self._make_multiplier(self.lambda_init)
-        self.lambda_optimizer.param_groups[0]["lr"] = self.lambda_lr_schedule(1)
+        # Rates that are not those of ``learning_rate``
+        self.critic_lr_schedule: Schedule | None = None
+        self.lambda_lr_schedule = None if self.lambda_learning_rate is None else FloatSchedule(self.lambda_learning_rate)
         self._project_lambda()
 
         if self.compile_update:
@@ -297,11 +296,10 @@ class CostAlgorithm(OffPolicyAlgorithm):
         if self.ent_coef_optimizer is not None:
             optimizers.insert(2, self.ent_coef_optimizer)
         self._update_learning_rate(optimizers)
-        for optimizer, schedule in (
-            (self.critic.optimizer, self.critic_lr_schedule),
-            (self.lambda_optimizer, self.lambda_lr_schedule),
-        ):
-            update_learning_rate(optimizer, schedule(self._current_progress_remaining))
+        own = (self.critic.optimizer, self.critic_lr_schedule), (self.lambda_optimizer, self.lambda_lr_schedule)
+        for optimizer, schedule in own:
+            if schedule is not None:
+                update_learning_rate(optimizer, schedule(self._current_progress_remaining))
 
         if isinstance(self.replay_buffer, NStepReplayBuffer):
             # One discount for returns and values
@@ -360,15 +358,16 @@ class CostAlgorithm(OffPolicyAlgorithm):
         with replacing(with_suffix(path, ".pkl")) as part:
             super().save_replay_buffer(part)
 
-    def set_parameters(self, load_path_or_dict: Any, exact_match: bool = True, device: th.device | str = "auto") -> None:
+    @classmethod
+    def load(cls: type[SelfCostAlgorithm], path: Any, *args: Any, **kwargs: Any) -> SelfCostAlgorithm:
         try:
-            super().set_parameters(load_path_or_dict, exact_match, device)
-        except (AttributeError, KeyError, RuntimeError, ValueError) as error:
-            # No ValueError: for one, ``load()`` tries to read the parameters as those of an old DQN
-            raise RuntimeError(
-                f"These parameters are not those of this {type(self).__name__}: {error}\n"
-                "They are of another version of sb3_lac (see the changelog), of another algorithm, or of other arguments: "
-                "policy_kwargs, and whether ent_coef is learned, cannot be changed on loading."
+            return super().load(path, *args, **kwargs)
+        # What comes of parameters that are not there, or of another shape
+        except (AttributeError, KeyError, RuntimeError) as error:
+            raise ValueError(
+                f"The model in {path} does not fit this {cls.__name__}: {error!r}\n"
+                "It is of another version of sb3_lac (see the changelog), of another algorithm, or of other arguments: "
+                "whether ent_coef is learned cannot be changed on loading."
             ) from error
 
     def _excluded_save_params(self) -> list[str]:
