@@ -364,8 +364,9 @@ class CostAlgorithm(OffPolicyAlgorithm):
             return super().load(path, *args, **kwargs)
         # What comes of parameters that are not there, or of another shape
         except (AttributeError, KeyError, RuntimeError) as error:
+            # The first of them, which Stable-Baselines3 may have met with an attempt of its own
             raise ValueError(
-                f"The model in {path} does not fit this {cls.__name__}: {error!r}\n"
+                f"The model in {path} does not fit this {cls.__name__}: {error.__context__ or error}\n"
                 "It is of another version of sb3_lac (see the changelog), of another algorithm, or of other arguments: "
                 "whether ent_coef is learned cannot be changed on loading."
             ) from error
