@@ -13,7 +13,7 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_lac.stability.functions import LyapunovFunction
-from sb3_lac.stability.loop import ClosedLoop, closed_loop
+from sb3_lac.stability.loop import ClosedLoop, check_training_seeds, closed_loop
 from sb3_lac.stability.rollout import flatten, summarize_episodes
 from sb3_lac.stability.statistics import CONFIDENCE, exact_interval, exact_lower_bound
 
@@ -193,6 +193,7 @@ def certify(
                 f"n_episodes_per_start={n_episodes_per_start} at least 1."
             )
     with closed_loop(policy, env, lyapunov, n_episodes, deterministic, seed) as loop:
+        check_training_seeds(policy, loop.seeds)
         if ultimate_bound is None and lyapunov is not None:
             ultimate_bound = lyapunov.ultimate_bound
         attraction = None

@@ -219,8 +219,7 @@ def fit_lyapunov(
     :param env: The environment, wrapped as that of the training. Costs are of its own rewards, without ``VecNormalize``.
     :param n_episodes: Number of episodes to learn from
     :param deterministic: Whether the loop is that of the mean action, as it is used after the training
-    :param seed: Seed of the roll-outs and of the network, which cannot be one that the policy was trained on; drawn if it is
-        None
+    :param seed: Seed of the roll-outs and of the network; drawn if it is None
     :param progress_bar: Whether to show the progress, in a terminal
     :return: The function. It is to be judged on other roll-outs: ``evaluate_lyapunov()`` and ``certify()`` refuse its seeds,
         which it keeps in ``seeds``.

@@ -135,7 +135,6 @@ def closed_loop(
     seeds = range(seed, seed + vec_env.num_envs)
     if lyapunov is not None and lyapunov.seeds is not None:
         check_seeds(seeds, lyapunov.seeds, "the Lyapunov function was fitted on")
-    check_training_seeds(policy, seeds)
     units = nullcontext(0.0) if lyapunov is None else lyapunov.in_units_of(unwrap_vec_normalize(vec_env))
     with _undisturbed(policy, vec_env, seed), units as reward_bound:
         yield ClosedLoop(policy, vec_env, lyapunov, reward_bound, deterministic, seed)

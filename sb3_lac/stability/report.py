@@ -265,8 +265,7 @@ def evaluate_lyapunov(
         statistics are used as they are: call ``sync_envs_normalization()`` before.
     :param n_eval_episodes: Number of episodes, divided onto the elements of a vector env as in ``evaluate_policy()``
     :param deterministic: Whether to judge the policy's mean action, as it is used after the training, or sampled actions
-    :param seed: Seed for ``env`` and for the actions, which cannot be one that the policy was trained on; drawn if it is None,
-        and kept in the report
+    :param seed: Seed for ``env`` and for the actions; drawn if it is None, and kept in the report
     :param lyapunov: The function to judge, the critic by default. It cannot be judged on roll-outs that it was fitted on.
     :return: The report
     :raises ValueError: If an argument is invalid, or the policy is not LAC and there is no ``lyapunov``

@@ -38,7 +38,8 @@ def trained(model, calls=3, gradient_steps=2):
     for call in range(calls + 1):
         # As far as the training is, for the schedules
         for name, schedule in zip(names, schedules, strict=True):
-            setattr(model, name, ConstantSchedule(schedule(1.0 - call / calls)) if call < calls else schedule)
+            if schedule is not None:
+                setattr(model, name, ConstantSchedule(schedule(1.0 - call / calls)) if call < calls else schedule)
         if call < calls:
             model.train(gradient_steps, model.batch_size)
             logged.append(dict(model.logger.name_to_value))

@@ -46,7 +46,6 @@ def gradients_of(monkeypatch, train_metrics):
         with monkeypatch.context() as patch:
             patch.setattr(F, "mse_loss", lambda values, y: targets.append(y) or loss(values, y))
             patch.setattr(model, "lr_schedule", lambda _: 0.0)
-            patch.setattr(model, "critic_lr_schedule", lambda _: 0.0)
             patch.setattr(model, "tau", 0.0)
             train_metrics(model)
         gradients = [
