@@ -10,8 +10,8 @@ gene network, and what impulses, other parameters, noise and other references do
 Settings are those of the authors' code, with ``alpha3 = 1`` and the horizon of 5 of the paper: one environment, 80 updates
 every 100 steps, rates of 1e-4 (actor) and 3e-4 (critics) that fall to zero, time limits that are ends. SAC has the same, with
 as many updates (their code makes 50) and the hidden layers of LAC's networks. Their cart and pole has a million steps.
-Policies are trained without disturbances and judged by their mean action. ``lac_20`` and ``lac_inf`` are LAC with other
-horizons. What is done is not done again when the command is repeated, so that seeds can be added.
+Policies are trained without disturbances and judged by their mean action. ``lac_inf`` is LAC with the
+discounted sum of all costs. What is done is not done again when the command is repeated, so that seeds can be added.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from benchmarks.study import (
     new_panels,
     positive,
     share_with_range,
-    with_spread,
+    side_by_side,
 )
 from benchmarks.training import record_file, train_or_load, training_minutes
 from sb3_lac import PublishedLAC
@@ -53,13 +53,12 @@ _REFERENCE = "reference"
 #: How policies are drawn: colour and marker.
 STYLES = {
     "LAC as published": (COLOUR_OF["LAC"], "o"),
-    "the same, N = 20": (COLOURS[5], "P"),
-    "the same, N = inf": (COLOURS[2], "X"),
+    "the same, N = inf": (COLOURS[5], "X"),
     "SAC": (COLOUR_OF["SAC"], "s"),
     _REFERENCE: ("black", "|"),
 }
 #: LAC by horizon: what it is called.
-HORIZONS = {"lac": (5, "LAC as published"), "lac_20": (20, "the same, N = 20"), "lac_inf": (None, "the same, N = inf")}
+HORIZONS = {"lac": (5, "LAC as published"), "lac_inf": (None, "the same, N = inf")}
 #: Environment steps of a training.
 TIMESTEPS = {"Oscillator-v0": 100_000, "CartPoleCost-v0": 200_000}
 _CRITIC_LAYERS = {"Oscillator-v0": [256, 256], "CartPoleCost-v0": [64, 64]}
@@ -70,7 +69,7 @@ _LEARNED = {"cost": "cost per step", "at_goal": "episodes at rest"}
 #: By environment and disturbance: arguments of the environment, by what is different.
 DISTURBANCES: dict[str, dict[str, dict[str, dict[str, Any]]]] = {
     "Oscillator-v0": {
-        "none": {"": {}},
+        "none": {"undisturbed": {}},
         "impulses": {f"{size:g}": {"impulse": size, "impulse_interval": 20} for size in (0.5, 1.0, 2.0, 4.0)},
         "other parameters": {
             f"{name} = {value:g}": {"changed_parameters": {name: value}}
@@ -83,7 +82,7 @@ DISTURBANCES: dict[str, dict[str, dict[str, dict[str, Any]]]] = {
             }.items()
             for value in values
         },
-        "process noise": {f"{std:g}": {"process_noise": std} for std in (0.1, 0.3, 1.0)},
+        "process noise": {f"noise {std:g}": {"process_noise": std} for std in (0.1, 0.3, 1.0)},
         "other reference": {
             "period 150": {"reference": (8.0, 7.0, 150)},
             "period 400": {"reference": (8.0, 7.0, 400)},
@@ -92,7 +91,7 @@ DISTURBANCES: dict[str, dict[str, dict[str, dict[str, Any]]]] = {
         },
     },
     "CartPoleCost-v0": {
-        "none": {"": {}},
+        "none": {"undisturbed": {}},
         "impulses": {f"{size} N": {"impulse": float(size), "impulse_interval": 20} for size in range(80, 151, 10)},
         "other parameters": {
             f"half length {length:g} m, cart {mass:g} kg": {
@@ -220,10 +219,10 @@ def _in_order(names: pd.Series) -> pd.Series:
 
 
 def disturbed_table(results: pd.DataFrame) -> pd.DataFrame:
-    """What disturbances do to the policies for one environment, by what it is judged by: means over seeds."""
+    """What disturbances do to the policies for one environment, by what it is judged by."""
     (env_id,) = results["environment"].unique()
     measure, _ = MEASURES[env_id]
-    shown = share_with_range if measure == "died" else with_spread
+    shown = share_with_range if measure == "died" else side_by_side
     rows = []
     for (disturbance, setting), group in results.groupby(["disturbance", "setting"], sort=False):
         row: dict[str, str] = {"disturbance": str(disturbance), "setting": str(setting)}
@@ -241,19 +240,19 @@ def report(results: pd.DataFrame) -> str:
     ]
     for env_id in results["environment"].unique():
         measure, title = MEASURES[env_id]
-        spread = "least to most of a seed" if measure == "died" else "± standard deviation"
-        text.append(f"{env_id} with disturbances. {title.capitalize()}, mean over seeds ({spread}):\n")
+        seeds = "mean over seeds (least to most of a seed)" if measure == "died" else "each seed"
+        text.append(f"{env_id} with disturbances. {title.capitalize()}, {seeds}:\n")
         text.append(markdown(disturbed_table(results[results["environment"] == env_id])))
     return "\n".join(text)
 
 
 def _draw(axes: Axes, results: pd.DataFrame, x: str, y: str) -> None:
-    """The mean over seeds, in a band from the least to the most of a seed."""
+    """The median over seeds, in a band from the least to the most of a seed."""
     for name, of_policy in results.groupby("policy", sort=False):
         colour, marker = STYLES[str(name)]
-        values = of_policy.groupby(x)[y].agg(["mean", "min", "max"])
+        values = of_policy.groupby(x)[y].agg(["median", "min", "max"])
         axes.fill_between(values.index, values["min"], values["max"], color=colour, alpha=0.15, lw=0)
-        axes.plot(values.index, values["mean"], marker=marker, ms=4, lw=1.4, color=colour, label=str(name))
+        axes.plot(values.index, values["median"], marker=marker, ms=4, lw=1.4, color=colour, label=str(name))
 
 
 def _set_scale(axes: Axes, measure: str, along: str) -> None:
@@ -300,7 +299,7 @@ def plot_impulses(results: pd.DataFrame) -> Figure:
 
 
 def plot_changes(results: pd.DataFrame) -> Figure:
-    """What all other changes do: each seed, and the mean."""
+    """What all other changes do: each seed, and the median."""
     changed = results[results["disturbance"] != "impulses"]
     envs = list(changed["environment"].unique())
     figure, panels = new_panels(len(envs), 2, (5.0, 4.6), margin=(0.0, 0.3))
@@ -311,11 +310,9 @@ def plot_changes(results: pd.DataFrame) -> Figure:
         for name, of_policy in of_env.groupby("policy", sort=False):
             colour, marker = STYLES[str(name)]
             axes.plot(of_policy[measure], of_policy["setting"].map(labels.index), ".", color=colour, alpha=0.35, ms=4)
-            means = of_policy.groupby("setting")[measure].mean()
-            axes.plot(means, means.index.map(labels.index), marker, color=colour, ms=6, label=str(name))
-        noise = of_env.loc[of_env["disturbance"] == "process noise", "setting"].unique()
-        named = {"": "undisturbed", **{setting: f"process noise {setting}" for setting in noise}}
-        axes.set_yticks(range(len(labels)), [named.get(setting, setting) for setting in labels], fontsize="small")
+            medians = of_policy.groupby("setting")[measure].median()
+            axes.plot(medians, medians.index.map(labels.index), marker, color=colour, ms=6, label=str(name))
+        axes.set_yticks(range(len(labels)), labels, fontsize="small")
         axes.invert_yaxis()
         axes.set(title=env_id, xlabel=label)
         _set_scale(axes, measure, "x")
