@@ -10,14 +10,9 @@ from importlib import import_module
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
-from battery_env.calibration.registration import register_environments
+from battery_env.tasks.registration import register_environments
 
 if TYPE_CHECKING:
-    from battery_env.app.calibrate import Calibration, Settings, calibrate
-    from battery_env.calibration.onnx_policy import OnnxPolicy
-    from battery_env.calibration.policy import PolicyEstimator
-    from battery_env.cells import Discharge, load_nasa_discharges
-    from battery_env.conversions import capacity_Ah, dc_resistance_ohm
     from battery_env.electrochemistry import NEW_CELL, CellParameters, Trajectory, initial_state, simulate, step, voltage
     from battery_env.estimates import Estimate
     from battery_env.estimators import (
@@ -32,21 +27,21 @@ if TYPE_CHECKING:
         soc_from_rest,
     )
     from battery_env.evaluation import evaluate
-    from battery_env.forecasts import Forecast, forecast
-    from battery_env.life import Life, track_life
-    from battery_env.record_files import read_discharge_csv, read_discharges
-    from battery_env.record_model import RecordModel
+    from battery_env.lab.calibrate import Calibration, Settings, calibrate
+    from battery_env.lab.conversions import capacity_Ah, dc_resistance_ohm
+    from battery_env.lab.forecast import Forecast, forecast
+    from battery_env.lab.life import Life, track_life
+    from battery_env.lab.readers.discharges import read_discharge_csv, read_discharges
+    from battery_env.policies.estimator import PolicyEstimator
+    from battery_env.policies.onnx import OnnxPolicy
+    from battery_env.records.discharge import Discharge, load_nasa_discharges
+    from battery_env.records.model import RecordModel
     from battery_env.sensors import RandomSensorErrors, SensorErrors
     from battery_env.trajectories import TrajectoryDataset
 
 # Where each name comes from: numba, pandas and scipy take seconds to import, and an environment by its id needs none of them.
 # Type checkers see the imports above instead; a test holds the two together.
 _MODULES = {
-    "app.calibrate": ("Calibration", "Settings", "calibrate"),
-    "calibration.onnx_policy": ("OnnxPolicy",),
-    "calibration.policy": ("PolicyEstimator",),
-    "cells": ("Discharge", "load_nasa_discharges"),
-    "conversions": ("capacity_Ah", "dc_resistance_ohm"),
     "electrochemistry": ("NEW_CELL", "CellParameters", "Trajectory", "initial_state", "simulate", "step", "voltage"),
     "estimates": ("Estimate",),
     "estimators": (
@@ -54,10 +49,15 @@ _MODULES = {
         *("cramer_rao_bound", "fit_cell", "soc_from_rest"),
     ),
     "evaluation": ("evaluate",),
-    "forecasts": ("Forecast", "forecast"),
-    "life": ("Life", "track_life"),
-    "record_files": ("read_discharge_csv", "read_discharges"),
-    "record_model": ("RecordModel",),
+    "lab.calibrate": ("Calibration", "Settings", "calibrate"),
+    "lab.conversions": ("capacity_Ah", "dc_resistance_ohm"),
+    "lab.forecast": ("Forecast", "forecast"),
+    "lab.life": ("Life", "track_life"),
+    "lab.readers.discharges": ("read_discharge_csv", "read_discharges"),
+    "policies.estimator": ("PolicyEstimator",),
+    "policies.onnx": ("OnnxPolicy",),
+    "records.discharge": ("Discharge", "load_nasa_discharges"),
+    "records.model": ("RecordModel",),
     "sensors": ("RandomSensorErrors", "SensorErrors"),
     "trajectories": ("TrajectoryDataset",),
 }

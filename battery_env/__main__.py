@@ -1,8 +1,8 @@
-"""``python -m battery_env``, see :mod:`battery_env.app.command_line`."""
+"""``python -m battery_env``, see :mod:`battery_env.lab.command_line`."""
 
 import sys
 
-from battery_env.app.command_line import calibrate, main
+from battery_env.lab.command_line import calibrate, main
 
 __all__ = ["calibrate", "main"]
 

@@ -14,10 +14,10 @@ from numpy.typing import ArrayLike
 from battery_env.arrays import BoolArray, FloatArray
 from battery_env.electrochemistry import Trajectory, simulate
 from battery_env.estimates import EstimateTrace
-from battery_env.estimators.base import Estimator
 from battery_env.estimators.cramer_rao import cramer_rao_bound
+from battery_env.estimators.estimator import Estimator
 from battery_env.parameters import PARAMETER_NAMES, PARAMETERS
-from battery_env.record_model import RecordModel
+from battery_env.records.model import RecordModel
 from battery_env.sensors import RandomSensorErrors, SensorErrors
 from battery_env.trajectories import TrajectoryDataset
 

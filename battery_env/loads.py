@@ -209,7 +209,7 @@ def constant(value: float, unit: LoadUnit = "power") -> Load:
 def recorded(record: Record, unit: LoadUnit = "power", dt_s: float = 1.0) -> Load:
     """
     The load of a recorded discharge, from its first sample on; beyond the last one its last value goes on, so give the part
-    under load (:meth:`battery_env.cells.Discharge.loaded_part`).
+    under load (:meth:`battery_env.Discharge.loaded_part`).
 
     Between samples it runs as :func:`battery_env.records.drawn` has it. It is taken as its mean over each time step, which
     keeps the drawn energy (power) or charge (current).

@@ -18,7 +18,6 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
 from battery_env.arrays import FloatArray
-from battery_env.cells import Discharge
 from battery_env.estimates import Estimate, EstimateTrace
 from battery_env.estimators.cell_fit import CellFit
 from battery_env.estimators.cramer_rao import CramerRaoBound, Sensitivities
@@ -26,8 +25,9 @@ from battery_env.estimators.least_squares import LeastSquares
 from battery_env.evaluation import over_seeds
 from battery_env.files import replacing
 from battery_env.parameters import PARAMETER_NAMES, PARAMETERS, Q_MOBILE, R_O
-from battery_env.record_model import VoltageForecast
 from battery_env.records import SWITCH_SHARE, Record
+from battery_env.records.discharge import Discharge
+from battery_env.records.model import VoltageForecast
 
 Thing = TypeVar("Thing")
 

@@ -20,9 +20,9 @@ import gymnasium as gym
 import numpy as np
 import pandas as pd
 
-from battery_env.calibration.data import standard_dataset
-from battery_env.calibration.policy import PolicyEstimator, Predictor
 from battery_env.evaluation import evaluate
+from battery_env.policies.estimator import PolicyEstimator, Predictor
+from battery_env.tasks.data import standard_dataset
 from benchmarks.study import Study, Tables, command_line, markdown, natural, positive, side_by_side
 from benchmarks.training import Recipe, timesteps_of, train_or_load
 

@@ -29,16 +29,16 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from battery_env.arrays import FloatArray
-from battery_env.calibration.data import Q_MOBILE_RANGE_C, R_O_RANGE_OHM, standard_dataset
-from battery_env.calibration.policy import PolicyEstimator
-from battery_env.calibration.pretrained import pretrained_card
 from battery_env.electrochemistry import NEW_CELL, UNCERTAIN_CONSTANTS
 from battery_env.estimators import ClosedForm, Estimator, ExtendedKalmanFilter, GreedyOneStep, LeastSquares
 from battery_env.evaluation import evaluate
 from battery_env.loads import RandomPiecewise
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.plotting import LABELS, coloured, new_figure
+from battery_env.policies.estimator import PolicyEstimator
+from battery_env.policies.pretrained import pretrained_card
 from battery_env.sensors import RandomSensorErrors, SensorErrors
+from battery_env.tasks.data import Q_MOBILE_RANGE_C, R_O_RANGE_OHM, standard_dataset
 from battery_env.trajectories import TrajectoryDataset
 from benchmarks.contests import HELD_OUT, SENSORS
 from benchmarks.pretrained import OPTIONS, TRAINED_WITH

@@ -27,8 +27,6 @@ from matplotlib.figure import Figure
 from scipy.stats import spearmanr
 
 from battery_env.arrays import FloatArray
-from battery_env.calibration.policy import PolicyEstimator, Predictor
-from battery_env.cells import BUNDLED_CELLS, NASA_CITATION, Discharge, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL
 from battery_env.estimates import Estimate
 from battery_env.estimators import Estimator, ExtendedKalmanFilter, LeastSquares
@@ -36,7 +34,9 @@ from battery_env.estimators.cell_fit import UNFITTED_MISMATCH_V, CellFit, fit_ce
 from battery_env.loads import recorded
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.plotting import COLOUR_OF, COLOURS, LABELS, coloured, new_figure, plot_cell_fit, title_of_life
-from battery_env.record_model import RecordModel
+from battery_env.policies.estimator import PolicyEstimator, Predictor
+from battery_env.records.discharge import BUNDLED_CELLS, NASA_CITATION, Discharge, load_nasa_discharges
+from battery_env.records.model import RecordModel
 from battery_env.trajectories import TrajectoryDataset
 from benchmarks import pretrained
 from benchmarks.calibrators import ENV_ID, SHIPPED, Follow

@@ -17,8 +17,6 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
 
-from battery_env.calibration.full_state import FullStateTask
-from battery_env.calibration.policy import PolicyEstimator
 from battery_env.estimators import ClosedForm, Estimator, ExtendedKalmanFilter, LeastSquares
 from battery_env.evaluation import evaluate, summarize
 from battery_env.plotting import (
@@ -30,7 +28,9 @@ from battery_env.plotting import (
     plot_true_against_inferred,
     save_figure,
 )
+from battery_env.policies.estimator import PolicyEstimator
 from battery_env.sensors import RandomSensorErrors, SensorErrors
+from battery_env.tasks.full_state.task import FullStateTask
 from battery_env.trajectories import TrajectoryDataset
 from benchmarks.study import EVALUATION_SEED, SYMBOLS, Study, Tables, digits, side_by_side, with_interval, with_spread
 from benchmarks.training import registered_id

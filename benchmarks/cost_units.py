@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 
 from battery_env.evaluation import over_seeds
 from benchmarks.control import DISTURBANCES, roll_out
-from benchmarks.stabilisation import ALGORITHMS, STYLES
+from benchmarks.stabilisation import CONTENDERS, STYLES
 from benchmarks.study import Study, Tables, command_line, markdown, natural, new_panels, positive, with_interval
 from benchmarks.training import train_or_load
 
@@ -47,7 +47,7 @@ def part(algo: str, env_id: str, factor: float, seed: int, timesteps: int, episo
     folder = models / f"{env_id}_{algo}_{factor:g}_seed{seed}"
     model = train_or_load(algo, env_id, seed, timesteps, folder, hyperparameters={"env_wrapper": wrapper})
     outcome = roll_out(model, partial(gym.make, env_id), episodes)
-    row = {"environment": env_id, "policy": ALGORITHMS[algo], "factor": factor, "seed": seed}
+    row = {"environment": env_id, "policy": CONTENDERS[algo].label, "factor": factor, "seed": seed}
     return {"cost_units": pd.DataFrame([{**row, "cost": outcome["cost"].mean(), "died": outcome["died"].mean()}])}
 
 

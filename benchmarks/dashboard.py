@@ -24,6 +24,7 @@ def dashboard_callbacks(
     if isinstance(model, CostAlgorithm):
         with contextlib.redirect_stdout(io.StringIO()):
             env = manager.create_envs(n_envs=1, eval_env=True, no_log=True)
-        # from the same start states each time
-        callbacks.append(LyapunovCallback(env, n_eval_episodes=episodes, eval_freq=every, seed=recipe.seed, verbose=0))
+        # from the same start states each time, which are not those of the training
+        seed = recipe.seed + model.n_envs
+        callbacks.append(LyapunovCallback(env, n_eval_episodes=episodes, eval_freq=every, seed=seed, verbose=0))
     return callbacks

@@ -26,15 +26,15 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import nn
 
 from battery_env.arrays import FloatArray
-from battery_env.calibration.full_state_layout import LITERAL, OBSERVED
-from battery_env.calibration.policy import PolicyEstimator
 from battery_env.electrochemistry import Trajectory
 from battery_env.estimates import Estimate, EstimateTrace
-from battery_env.estimators.base import Estimator
 from battery_env.estimators.closed_form import ClosedForm
+from battery_env.estimators.estimator import Estimator
 from battery_env.evaluation import evaluate
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.plotting import LABELS, coloured, new_figure
+from battery_env.policies.estimator import PolicyEstimator
+from battery_env.tasks.full_state.layout import LITERAL, OBSERVED
 from battery_env.trajectories import TrajectoryDataset
 from benchmarks.study import SYMBOLS, Study, Tables, command_line, digits, markdown, natural, positive, with_spread
 from benchmarks.training import Recipe, timesteps_of, train_or_load

@@ -24,16 +24,16 @@ import pandas as pd
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
-from battery_env.app.calibrate import Settings
-from battery_env.app.forecast import forecast_end
-from battery_env.cells import BUNDLED_CELLS, NASA_CITATION, Discharge, load_nasa_discharges
 from battery_env.electrochemistry import UNCERTAIN_CONSTANTS, simulate
 from battery_env.estimators.cell_fit import CellFit, fit_cell
-from battery_env.forecasts import BAND
-from battery_env.life import Life, track_life
+from battery_env.lab.calibrate import Settings
+from battery_env.lab.forecast import BAND
+from battery_env.lab.life import Life, track_life
+from battery_env.lab.running import forecast_end
 from battery_env.loads import Load, RandomPiecewise, RandomWalk, constant
 from battery_env.plotting import coloured, new_figure
 from battery_env.records import Record, drawn
+from battery_env.records.discharge import BUNDLED_CELLS, NASA_CITATION, Discharge, load_nasa_discharges
 from benchmarks.study import Study, command_line, markdown, natural, positive
 
 CUT_OFF_V = 2.7

@@ -22,7 +22,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
 from battery_env.arrays import FloatArray
-from battery_env.calibration.full_state_layout import ERROR_SCALE, OBSERVED
 from battery_env.electrochemistry import NEW_CELL, QNS, STATE_SIZE, VO, VSP, Trajectory, simulate, step_into
 from battery_env.estimators import (
     ClosedForm,
@@ -35,8 +34,9 @@ from battery_env.estimators import (
 from battery_env.loads import RandomPiecewise, constant
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.plotting import COLOURS, LABELS, coloured, new_figure, plot_estimates, plot_sensitivities
-from battery_env.record_model import RecordModel
+from battery_env.records.model import RecordModel
 from battery_env.sensors import SensorErrors
+from battery_env.tasks.full_state.layout import ERROR_SCALE, OBSERVED
 from battery_env.trajectories import TrajectoryDataset
 from benchmarks.study import SYMBOLS, Study, Tables, command_line, digits, markdown, positive
 

@@ -36,18 +36,15 @@ def linear_gain(states: np.ndarray, controls: np.ndarray) -> np.ndarray:
     return -np.linalg.lstsq(states, controls, rcond=None)[0].T
 
 
-def noise_cost(gain: np.ndarray, gamma: float, control_std: float) -> float:
+def noise_cost(gain: np.ndarray, gamma: float) -> float:
     """
-    What noise adds to the exact value of every state and control, under the policy ``u = -K s`` and noise on its controls.
+    What noise adds to the exact value of every state and control, under the policy ``u = -K s``.
 
     :param gain: K
     :param gamma: The discount factor, below 1
-    :param control_std: Standard deviation of the controls
     """
     env = LinearCostEnv()
-    p = env.value_matrix(gain, gamma)
-    of_controls = control_std**2 * (env.R + gamma * env.B.T @ p @ env.B).item()
-    return gamma / (1 - gamma) * (env.noise_std**2 * np.trace(p) + of_controls)
+    return gamma / (1 - gamma) * env.noise_std**2 * np.trace(env.value_matrix(gain, gamma))
 
 
 def _linear_actions(gain: np.ndarray, observations: np.ndarray) -> np.ndarray:
@@ -92,9 +89,8 @@ def part(seed: int, timesteps: int, episodes: int, models: Path) -> Tables:
     exact = env.cost_to_go(states, env.control_max * actions, gain, model.gamma)
     learned = measured.transitions["lyapunov"].to_numpy()
     slope, intercept = np.polyfit(exact, learned, 1)
-    # What noise adds to all values: that of the steps, and that of the policy that L is learned of, which explores
-    explored = env.control_max * (model.predict(states.astype(np.float32), deterministic=False)[0] - actions)
-    intercept_exact = noise_cost(gain, model.gamma, float(np.sqrt(np.mean(np.square(explored)))))
+    # What the noise of the steps adds to all values
+    intercept_exact = noise_cost(gain, model.gamma)
     rolled_out = episode_costs(lambda observed: model.predict(observed, deterministic=True)[0], episodes)
     ratios: dict[str, float] = {}
     for name, gamma in (("discounted", model.gamma), ("per_step", 1.0)):

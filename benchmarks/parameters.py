@@ -21,13 +21,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from battery_env.cells import BUNDLED_CELLS, NASA_CITATION, Discharge, load_nasa_discharges
-from battery_env.conversions import capacity_Ah, dc_resistance_ohm
 from battery_env.electrochemistry import simulate
 from battery_env.estimators import ExtendedKalmanFilter, LeastSquares
 from battery_env.estimators.cell_fit import UNFITTED_MISMATCH_V
+from battery_env.lab.conversions import capacity_Ah, dc_resistance_ohm
 from battery_env.plotting import COLOUR_OF, COLOURS, LABELS, new_figure
-from battery_env.record_model import RecordModel
+from battery_env.records.discharge import BUNDLED_CELLS, NASA_CITATION, Discharge, load_nasa_discharges
+from battery_env.records.model import RecordModel
 from benchmarks.study import Study, Tables, command_line, markdown, positive
 
 CUT_OFF_V = 2.7

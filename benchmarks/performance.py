@@ -34,7 +34,8 @@ from torch.utils.flop_counter import FlopCounterMode
 from battery_env.plotting import new_figure
 from benchmarks.study import Study, command_line, markdown, positive
 from benchmarks.throughput import race, spread
-from sb3_lac import LAC, GymnasiumVecEnv
+from sb3_lac import LAC, GymnasiumVecEnv, PublishedLAC
+from sb3_lac.costs import CostAlgorithm
 
 SECTIONS = ("updates", "compiled", "learn", "growth")
 
@@ -58,13 +59,13 @@ def many_cells(cells: int) -> VecEnv:
 
 
 def ready_model(
-    algorithm: type[LAC] | type[SAC],
+    algorithm: type[CostAlgorithm] | type[SAC],
     net_arch: list[int],
     env: VecEnv,
     batch_size: int = 256,
     policy_kwargs: dict[str, Any] | None = None,
     **kwargs: Any,
-) -> LAC | SAC:
+) -> CostAlgorithm | SAC:
     """A model that has transitions in its replay buffer and has made its first updates."""
     model = algorithm(
         "MlpPolicy",
@@ -136,7 +137,7 @@ def clock_of(threads: int) -> Callable[[], float]:
 def measure_updates(rounds: int, updates: int, threads: Sequence[int]) -> tuple[pd.DataFrame, pd.DataFrame]:
     """
     Updates a second of LAC and SAC with large and small networks, and how long their arithmetic takes at least; beside them
-    LAC with one critic.
+    LAC with one critic, and as published.
     """
     contestants: dict[int, dict[str, Callable[[], int]]] = {count: {} for count in threads}
     work: dict[str, tuple[int, int, int]] = {}
@@ -146,10 +147,12 @@ def measure_updates(rounds: int, updates: int, threads: Sequence[int]) -> tuple[
         lac, sac = (ready_model(algorithm, net_arch, many_cells(64)) for algorithm in (LAC, SAC))
         assert isinstance(lac, LAC)
         one_critic = ready_model(LAC, net_arch, many_cells(64), policy_kwargs={"n_critics": 1})
+        published = ready_model(PublishedLAC, net_arch, many_cells(64))
         work[layers] = update_flops(lac), update_flops(sac), moved_bytes(lac)
         for count, turns in contestants.items():
             turns[f"LAC, {layers}, {count}"] = partial(updates_of, lac, updates, count)
             turns[f"one critic, {layers}, {count}"] = partial(updates_of, one_critic, updates, count)
+            turns[f"as published, {layers}, {count}"] = partial(updates_of, published, updates, count)
             turns[f"SAC, {layers}, {count}"] = partial(updates_of, sac, updates, count)
             turns[f"products, {layers}, {count}"] = partial(matrix_products, net_arch[0], count)
             turns[f"copies, {layers}, {count}"] = partial(copies, source, target, count)
@@ -158,8 +161,9 @@ def measure_updates(rounds: int, updates: int, threads: Sequence[int]) -> tuple[
     rows = []
     for layers, (flops, sac_flops, moved) in work.items():
         for count in threads:
-            lac_speed, one_speed, sac_speed, rate, bandwidth = (
-                speeds[f"{name}, {layers}, {count}"] for name in ("LAC", "one critic", "SAC", "products", "copies")
+            names = ("LAC", "one critic", "as published", "SAC", "products", "copies")
+            lac_speed, one_speed, published_speed, sac_speed, rate, bandwidth = (
+                speeds[f"{name}, {layers}, {count}"] for name in names
             )
             floor_s = flops / rate + moved / bandwidth
             rows.append(
@@ -170,6 +174,7 @@ def measure_updates(rounds: int, updates: int, threads: Sequence[int]) -> tuple[
                     "SAC": spread(sac_speed, 0),
                     "LAC is faster by a factor of": spread(lac_speed / sac_speed, 2),
                     "with one critic": spread(one_speed / sac_speed, 2),
+                    "as published": spread(published_speed / sac_speed, 2),
                     "MFLOP of an update, LAC / SAC": f"{flops / 1e6:.0f} / {sac_flops / 1e6:.0f}",
                     "GFLOP/s of matrix products": spread(rate / 1e9, 0),
                     "MB of optimizers and target": f"{moved / 1e6:.1f}",

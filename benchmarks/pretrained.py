@@ -8,8 +8,8 @@ files with a card each that says what made them and what they are worth.
   python -m benchmarks.pretrained --envs BatteryVoltageJoint-v0 --updates 16000 --out results/pretrained_joint
   python -m benchmarks.pretrained --recorded --out results/pretrained_recorded
 
-Files and cards are shipped from ``battery_env/pretrained_policies``, Joint from the second command, and those for recorded
-cells, whose models are wrong in more ways than in their constants, from the third one. The settings are those
+Files and cards are shipped from ``battery_env/policies/pretrained_policies``, Joint from the second command, and those for
+recorded cells, whose models are wrong in more ways than in their constants, from the third one. The settings are those
 of ``zoo_configs``, with the options of the task below. Scores are of held-out discharges of the same environments (mean error
 over the second half of each), with the constants of the model right and wrong. Training is not repeated, nor is a part of the
 evaluation.
@@ -25,11 +25,11 @@ from typing import Any
 
 import pandas as pd
 
-from battery_env.calibration.data import standard_dataset
-from battery_env.calibration.policy import PolicyEstimator
-from battery_env.calibration.pretrained import file_stem, policy_of_file
 from battery_env.evaluation import evaluate
 from battery_env.files import replacing
+from battery_env.policies.estimator import PolicyEstimator
+from battery_env.policies.pretrained import file_stem, policy_of_file
+from battery_env.tasks.data import standard_dataset
 from benchmarks.contests import HELD_OUT, SENSORS
 from benchmarks.study import SYMBOLS, Study, Tables, at_most, command_line, markdown, natural, positive, versions, write_json
 from benchmarks.training import Recipe, timesteps_of, train_or_load, training_minutes

@@ -35,9 +35,9 @@ from optuna.storages.journal import JournalFileBackend
 from optuna.trial import FrozenTrial, Trial, TrialState
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from battery_env.calibration.full_state import FullStateTask
-from battery_env.calibration.policy import PolicyEstimator
 from battery_env.evaluation import evaluate
+from battery_env.policies.estimator import PolicyEstimator
+from battery_env.tasks.full_state.task import FullStateTask
 from benchmarks.control import DISTURBANCES, roll_out
 from benchmarks.study import Study, Tables, command_line, positive, side_by_side
 from benchmarks.training import Recipe, set_up, timesteps_of

@@ -5,18 +5,21 @@ costs, whether it ends at the goal, what disturbances that it was not trained fo
 .. code-block:: bash
 
   python -m benchmarks.stabilisation --timesteps 16000 --seeds 0 1 2
-  python -m benchmarks.stabilisation --algos lac sac td3 tqc metric_sac --compile
+  python -m benchmarks.stabilisation --algos lac published_lac sac td3 tqc metric_sac --compile
 
 Policies are trained without disturbances, with the hyperparameters of ``zoo_configs``, and judged by their mean action. All of
-them have the same starts and disturbances. ``metric_sac`` is SAC with critics that learn in LAC's metric, which tells what is
-LAC's from what is the metric's. What is done is not done again when the command is repeated, so that seeds can be added.
+them have the same starts and disturbances. ``sac_common``, ``td3_common`` and ``tqc_common`` have the one setting of LAC for
+all problems in place of their own for each; ``published_lac`` has it too, and ``published_lac_paper`` that of its authors.
+``metric_sac`` is SAC with critics that learn in LAC's metric, which tells what is LAC's from what is the metric's. What is
+done is not done again when the command is repeated, so that seeds can be added.
 ``tensorboard --logdir results/stabilisation/models`` overlays the curves of all trainings.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -50,20 +53,55 @@ from benchmarks.training import Recipe, record_file, train_or_load, training_min
 from sb3_lac.envs import CostEnv, reference_controller
 from sb3_lac.stability.plots import format_log_axis
 
+
+@dataclass(frozen=True)
+class Contender:
+    """
+    An algorithm with settings.
+
+    :param algo: the algorithm, see :class:`Recipe`
+    :param label: what it is called in tables and figures
+    :param colour: what it is drawn in
+    :param marker: and with
+    :param settings: whose ``default`` entry of ``zoo_configs`` it has in place of its own for each problem
+    :param hyperparameters: what differs from that
+    :param compiles: whether its updates can be compiled
+    """
+
+    algo: str
+    label: str
+    colour: str
+    marker: str
+    settings: str | None = None
+    hyperparameters: Mapping[str, Any] = field(default_factory=dict)
+    compiles: bool = False
+
+    def recipe(self, env_id: str, seed: int, timesteps: int | None) -> Recipe:
+        """What it is trained by."""
+        differing = dict(self.hyperparameters)
+        return Recipe.of(self.algo, env_id, seed, timesteps, hyperparameters=differing, settings=self.settings)
+
+
 _REFERENCE = "reference"
-_METRIC_SAC = "SAC, LAC's metric"
-#: How they are drawn: colour and marker.
-STYLES = {
-    "LAC": (COLOUR_OF["LAC"], "o"),
-    "SAC": (COLOUR_OF["SAC"], "s"),
-    "TD3": (COLOUR_OF["TD3"], "^"),
-    "TQC": (COLOUR_OF["TQC"], "D"),
-    _METRIC_SAC: (COLOURS[4], "v"),
-    _REFERENCE: ("black", "|"),
+_METRIC_SAC = "benchmarks.metric_sac:MetricSAC"
+_NOISE = {"noise_type": "normal", "noise_std": 0.1}
+#: Who is judged, by the name on the command line.
+CONTENDERS = {
+    "lac": Contender("lac", "LAC", COLOUR_OF["LAC"], "o", compiles=True),
+    "published_lac": Contender("published_lac", "LAC as published", COLOURS[5], "P", compiles=True),
+    "published_lac_paper": Contender(
+        "published_lac", "LAC as published, its setting", COLOURS[5], "X", settings="published_lac", compiles=True
+    ),
+    "sac": Contender("sac", "SAC", COLOUR_OF["SAC"], "s"),
+    "sac_common": Contender("sac", "SAC, LAC's setting", COLOUR_OF["SAC"], "8", settings="lac"),
+    "td3": Contender("td3", "TD3", COLOUR_OF["TD3"], "^"),
+    "td3_common": Contender("td3", "TD3, LAC's setting", COLOUR_OF["TD3"], ">", settings="lac", hyperparameters=_NOISE),
+    "tqc": Contender("tqc", "TQC", COLOUR_OF["TQC"], "D"),
+    "tqc_common": Contender("tqc", "TQC, LAC's setting", COLOUR_OF["TQC"], "d", settings="lac"),
+    "metric_sac": Contender(_METRIC_SAC, "SAC, LAC's metric", COLOURS[4], "v", compiles=True),
 }
-#: What algorithms are called in tables and figures.
-ALGORITHMS = {"lac": "LAC", "sac": "SAC", "td3": "TD3", "tqc": "TQC", "metric_sac": _METRIC_SAC}
-_COMPILED = ("lac", "metric_sac")
+#: How they are drawn: colour and marker.
+STYLES = {each.label: (each.colour, each.marker) for each in CONTENDERS.values()} | {_REFERENCE: ("black", "|")}
 # learning curves, whose episodes have other starts than those of all other judgements
 _POINTS, _CURVE_EPISODES, _CURVE_SEED = 12, 30, 40_000
 
@@ -106,11 +144,6 @@ def _cost_of(policy: PolicyPredictor, env_id: str) -> dict[str, float]:
     return {"cost": outcome["cost"].mean(), "at_goal": shares_of(outcome, problem.error_tolerance)["at_goal"]}
 
 
-def _recipe(policy: str, env_id: str, seed: int, timesteps: int | None) -> Recipe:
-    algo = "benchmarks.metric_sac:MetricSAC" if policy == "metric_sac" else policy
-    return Recipe.of(algo, env_id, seed, timesteps)
-
-
 def part(
     policy: str,
     env_id: str,
@@ -129,7 +162,8 @@ def part(
         learning = pd.DataFrame([{"timesteps": np.nan, "updates": np.nan, **_cost_of(predictor, env_id)}])
     else:
         assert seed is not None and timesteps is not None
-        made_from = _recipe(policy, env_id, seed, timesteps)
+        contender = CONTENDERS[policy]
+        made_from = contender.recipe(env_id, seed, timesteps)
         if made_from.digest != recipe:
             raise RuntimeError(
                 f"the hyperparameters of {policy} on {env_id} have changed since the study began: start it again"
@@ -137,13 +171,23 @@ def part(
         folder = models / f"{env_id}_{policy}_seed{seed}"
         file = record_file(made_from, folder).with_name(f"learning_{made_from.name}.csv")
         curve = LearningCurve(env_id, timesteps, file)
-        compile_update = compiled and policy in _COMPILED
-        model = train_or_load(made_from.algo, env_id, seed, timesteps, folder, callback=curve, compile_update=compile_update)
+        model = train_or_load(
+            contender.algo,
+            env_id,
+            seed,
+            timesteps,
+            folder,
+            dict(contender.hyperparameters),
+            contender.settings,
+            callback=curve,
+            compile_update=compiled and contender.compiles,
+        )
         # of all algorithms that learn from a replay buffer
         predictor, updates = model, getattr(model, "_n_updates", None)
         learning = pd.read_csv(file)
         minutes = training_minutes(made_from, folder) - learning.pop("seconds").sum() / 60.0
-    of_policy = {"environment": env_id, "policy": ALGORITHMS.get(policy, policy), "seed": seed}
+    label = policy if policy == _REFERENCE else CONTENDERS[policy].label
+    of_policy = {"environment": env_id, "policy": label, "seed": seed}
     described: dict[str, Any] = {
         **of_policy,
         "timesteps": timesteps,
@@ -321,13 +365,13 @@ def plot_disturbances(results: pd.DataFrame) -> Figure:
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command line."""
     parser = command_line("stabilisation", __doc__)
-    parser.add_argument("--algos", nargs="+", default=["lac", "sac", "td3"], choices=list(ALGORITHMS))
+    parser.add_argument("--algos", nargs="+", default=["lac", "sac", "td3"], choices=list(CONTENDERS))
     parser.add_argument("--envs", nargs="+", default=list(DISTURBANCES), choices=list(DISTURBANCES))
     parser.add_argument("--seeds", nargs="+", type=natural, default=[0, 1, 2, 3, 4])
     parser.add_argument(
         "--timesteps", type=positive, help="environment steps on every problem; those of zoo_configs by default"
     )
-    parser.add_argument("--compile", action="store_true", help="compile the updates of lac and metric_sac to one graph each")
+    parser.add_argument("--compile", action="store_true", help="compile the updates that can be, to one graph each")
     parser.add_argument("--episodes", type=positive, default=100, help="episodes for each policy and disturbance")
     parser.add_argument("--certificate-episodes", type=positive, default=50, help="to fit, to judge and to certify, each")
     study = Study(parser, arguments)
@@ -340,13 +384,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     # seed by seed, so that an interrupted study has whole seeds
     for seed in chosen.seeds:
         for env_id in chosen.envs:
-            for algo in chosen.algos:
+            for policy in chosen.algos:
                 try:
-                    recipe = _recipe(algo, env_id, seed, chosen.timesteps)
+                    recipe = CONTENDERS[policy].recipe(env_id, seed, chosen.timesteps)
                 except ValueError as error:
                     parser.error(str(error))
                 made_from = {"seed": seed, "timesteps": recipe.timesteps, "recipe": recipe.digest}
-                parts.append({"policy": algo, "env_id": env_id, **made_from, **judged})
+                parts.append({"policy": policy, "env_id": env_id, **made_from, **judged})
     study.configuration["disturbances"] = {env_id: conditions(env_id) for env_id in chosen.envs}
     tables = {
         name: table.sort_values(["environment", "policy"], key=_in_order, kind="stable", ignore_index=True)

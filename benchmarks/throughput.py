@@ -30,7 +30,7 @@ from tqdm import trange
 
 from battery_env import ExtendedKalmanFilter, OnnxPolicy, PolicyEstimator
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate, step_into, voltage_into
-from battery_env.estimators.base import OnlineBatch, OnlineEstimator
+from battery_env.estimators.estimator import OnlineBatch, OnlineEstimator
 from battery_env.records import Stream
 from benchmarks.study import Study, command_line, markdown, positive
 from sb3_lac import LAC

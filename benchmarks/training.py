@@ -80,10 +80,14 @@ class Recipe:
         timesteps: int | None = None,
         *,
         hyperparameters: dict[str, Any] | None = None,
+        settings: str | None = None,
         defaults: bool = False,
         evaluations: int | None = None,
     ) -> Recipe:
-        """The recipe of a training."""
+        """
+        The recipe of a training: with the entry of ``zoo_configs`` for the environment, the ``default`` entry of the algorithm
+        that ``settings`` names, or ``defaults``.
+        """
         kind = algorithm(algo)
         if not 0 <= seed < 2**32:
             raise ValueError(f"a seed must lie within 0 .. 2**32 - 1, got {seed}")
@@ -92,13 +96,13 @@ class Recipe:
             of_dicts = environment["observation_space"].startswith("Dict(")
             source, entry = "defaults", {"policy": "MultiInputPolicy" if of_dicts else "MlpPolicy"}
         else:
-            named = kind.__name__.lower() if ":" in algo else algo
-            source, config = "zoo_configs", find_config(getattr(kind, "zoo_config", named))
+            own = getattr(kind, "zoo_config", kind.__name__.lower() if ":" in algo else algo)
+            source, config = "zoo_configs", find_config(own if settings is None else settings)
             entries = yaml.safe_load(config.read_text(encoding="utf-8"))
-            plain_id = registered_id(env_id)
-            if plain_id not in entries:
-                raise ValueError(f"{config} has no entry for {plain_id}: add one, or train with the defaults of the algorithm")
-            entry = entries[plain_id]
+            key = registered_id(env_id) if settings is None else "default"
+            if key not in entries:
+                raise ValueError(f"{config} has no entry for {key}: add one, or train with the defaults of the algorithm")
+            entry = entries[key]
         entry = {**entry, **(hyperparameters or {})}
         in_entry = int(float(entry.pop("n_timesteps", DEFAULTS_TIMESTEPS)))
         timesteps = in_entry if timesteps is None else timesteps
@@ -246,6 +250,7 @@ def train_or_load(
     timesteps: int,
     folder: Path,
     hyperparameters: dict[str, Any] | None = None,
+    settings: str | None = None,
     callback: BaseCallback | None = None,
     compile_update: bool = False,
 ) -> BaseAlgorithm:
@@ -253,7 +258,7 @@ def train_or_load(
     Train one policy, or load it if that has been done. A callback that changes nothing, and whether updates are compiled, are
     no part of the recipe.
     """
-    recipe = Recipe.of(algo, env_id, seed, timesteps, hyperparameters=hyperparameters)
+    recipe = Recipe.of(algo, env_id, seed, timesteps, hyperparameters=hyperparameters, settings=settings)
     record = record_file(recipe, folder)
     file = record.with_suffix(".zip")
     if not file.exists():

@@ -24,13 +24,13 @@ from gymnasium.envs.registration import load_env_creator
 
 import battery_env.estimators
 import sb3_lac
-from battery_env.calibration.data import standard_dataset
-from battery_env.calibration.full_state import FullStateTask
-from battery_env.calibration.registration import TASKS
 from battery_env.estimators import Estimator, OnlineEstimator
 from battery_env.evaluation import evaluate
 from battery_env.files import replacing
 from battery_env.loads import constant
+from battery_env.tasks.data import standard_dataset
+from battery_env.tasks.full_state.task import FullStateTask
+from battery_env.tasks.registration import TASKS
 from battery_env.trajectories import TrajectoryDataset
 from docs.environment_pictures import EPISODES
 

@@ -13,7 +13,7 @@ import pybop
 
 from battery_env import ExtendedKalmanFilter, LeastSquares, initial_state, load_nasa_discharges
 from battery_env.electrochemistry import voltage
-from battery_env.record_model import RecordModel
+from battery_env.records.model import RecordModel
 
 record = load_nasa_discharges("B0005")[99].loaded_part(cut_off_V=2.7)
 

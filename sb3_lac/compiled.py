@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-import numpy as np
 import torch as th
 from stable_baselines3.sac.policies import Actor
 
@@ -124,8 +123,8 @@ class CompiledUpdate:
     @contextmanager
     def ready(self, model: Any, optimizers: Sequence[th.optim.Optimizer]) -> Iterator[Callable[..., Metrics]]:
         """
-        Have optimizers in a form that can be compiled and, on a GPU, transitions sampled without waiting for it. All is as it
-        was afterwards, so that models are saved as without compilation.
+        Have optimizers in a form that can be compiled. All is as it was afterwards, so that models are saved as without
+        compilation.
         """
         from torch import _dynamo as dynamo  # Takes seconds
 
@@ -155,17 +154,9 @@ class CompiledUpdate:
             names, values = self._run(model, *args)
             return names, values.clone()
 
-        def to_gpu(array: np.ndarray, copy: bool = True) -> th.Tensor:
-            return th.as_tensor(array).pin_memory().to(model.device, non_blocking=True)
-
-        if self._on_gpu:
-            # Hides the method, whose copies wait for the GPU
-            model.replay_buffer.to_torch = to_gpu
         try:
             with th.no_grad(), dynamo.config.patch(trace_autograd_ops=True):
                 yield update
         finally:
             for values, old in zip(changed, before, strict=True):
                 values.update(old)
-            if self._on_gpu:
-                del model.replay_buffer.to_torch

@@ -4,9 +4,8 @@ import math
 import os
 import warnings
 from contextlib import nullcontext
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch as th
@@ -138,11 +137,10 @@ class CostAlgorithm(OffPolicyAlgorithm):
             self.ent_coef_tensor = th.tensor(float(self.ent_coef), device=self.device)
 
         # The multiplier of the decrease condition is learned like that of the entropy
-        self.critic_lr_schedule = self.lambda_lr_schedule = self.lr_schedule
-        if self.lambda_learning_rate is not None:
-            self.lambda_lr_schedule = FloatSchedule(self.lambda_learning_rate)
         self.log_lambda, self.lambda_optimizer = self._make_multiplier(self.lambda_init)
-        self.lambda_optimizer.param_groups[0]["lr"] = self.lambda_lr_schedule(1)
+        # Rates that are not those of ``learning_rate``
+        self.critic_lr_schedule: Schedule | None = None
+        self.lambda_lr_schedule = None if self.lambda_learning_rate is None else FloatSchedule(self.lambda_learning_rate)
         self._project_lambda()
 
         if self.compile_update:
@@ -209,6 +207,13 @@ class CostAlgorithm(OffPolicyAlgorithm):
         offset = th.where(bound > 0, bound / (1 - self.gamma), 0.0)
         self.policy.critic.offset.copy_(offset)
         self.policy.critic_target.offset.copy_(offset)
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
+        prepared = super()._setup_learn(*args, **kwargs)
+        vec_normalize = self._vec_normalize_env
+        first = self._last_obs if vec_normalize is None else vec_normalize.get_original_obs()
+        refuse_what_is_not_finite("first observation", first, self.num_timesteps)
+        return prepared
 
     def _store_transition(
         self,
@@ -291,11 +296,10 @@ class CostAlgorithm(OffPolicyAlgorithm):
         if self.ent_coef_optimizer is not None:
             optimizers.insert(2, self.ent_coef_optimizer)
         self._update_learning_rate(optimizers)
-        for optimizer, schedule in (
-            (self.critic.optimizer, self.critic_lr_schedule),
-            (self.lambda_optimizer, self.lambda_lr_schedule),
-        ):
-            update_learning_rate(optimizer, schedule(self._current_progress_remaining))
+        own = (self.critic.optimizer, self.critic_lr_schedule), (self.lambda_optimizer, self.lambda_lr_schedule)
+        for optimizer, schedule in own:
+            if schedule is not None:
+                update_learning_rate(optimizer, schedule(self._current_progress_remaining))
 
         if isinstance(self.replay_buffer, NStepReplayBuffer):
             # One discount for returns and values
@@ -354,15 +358,17 @@ class CostAlgorithm(OffPolicyAlgorithm):
         with replacing(with_suffix(path, ".pkl")) as part:
             super().save_replay_buffer(part)
 
-    def set_parameters(self, load_path_or_dict: Any, exact_match: bool = True, device: th.device | str = "auto") -> None:
+    @classmethod
+    def load(cls: type[SelfCostAlgorithm], path: Any, *args: Any, **kwargs: Any) -> SelfCostAlgorithm:
         try:
-            super().set_parameters(load_path_or_dict, exact_match, device)
-        except (AttributeError, KeyError, RuntimeError, ValueError) as error:
-            # No ValueError: for one, ``load()`` tries to read the parameters as those of an old DQN
-            raise RuntimeError(
-                f"These parameters are not those of this {type(self).__name__}: {error}\n"
-                "They are of another version of sb3_lac (see the changelog), of another algorithm, or of other arguments: "
-                "policy_kwargs, and whether ent_coef is learned, cannot be changed on loading."
+            return super().load(path, *args, **kwargs)
+        # What comes of parameters that are not there, or of another shape
+        except (AttributeError, KeyError, RuntimeError) as error:
+            # The first of them, which Stable-Baselines3 may have met with an attempt of its own
+            raise ValueError(
+                f"The model in {path} does not fit this {cls.__name__}: {error.__context__ or error}\n"
+                "It is of another version of sb3_lac (see the changelog), of another algorithm, or of other arguments: "
+                "whether ent_coef is learned cannot be changed on loading."
             ) from error
 
     def _excluded_save_params(self) -> list[str]:
@@ -376,30 +382,24 @@ class CostAlgorithm(OffPolicyAlgorithm):
         return [*state_dicts, "ent_coef_optimizer"], ["log_lambda", "log_ent_coef"]
 
 
-class _Steps(NamedTuple):
-    """What steps cost, each."""
-
-    cost: np.ndarray
-    is_end: np.ndarray
-
-
-@dataclass
 class Terminations:
     """What is collected before the first update, which tells whether a termination has a price."""
 
-    steps: list[_Steps] = field(default_factory=list)
+    def __init__(self) -> None:
+        self.costs: list[np.ndarray] = []
+        self.ends: list[np.ndarray] = []
 
     def see(self, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
         """Note a step of all environments. A time limit is no termination."""
-        in_time = np.array([not info.get("TimeLimit.truncated", False) for info in infos])
-        self.steps.append(_Steps(0.0 - rewards, dones & in_time))
+        self.costs.append(0.0 - rewards)
+        self.ends.append(dones & [not info.get("TimeLimit.truncated", False) for info in infos])
 
     def warn_if_free(self, gamma: float, largest_reward: float) -> None:
         """Warn if the last step before a termination costs no more than another step does."""
         # Where living pays, an end costs the bound for ever
-        if not self.steps or largest_reward > 0:
+        if not self.ends or largest_reward > 0:
             return
-        costs, ends = (np.concatenate(values) for values in zip(*self.steps, strict=True))
+        costs, ends = np.concatenate(self.costs), np.concatenate(self.ends)
         if not ends.any() or ends.all():
             return
         last, cheapest, dearest = costs[ends].mean(), costs[~ends].min(), costs[~ends].max()

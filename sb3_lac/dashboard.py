@@ -9,7 +9,6 @@ from numbers import Real
 from typing import Any
 
 import numpy as np
-import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
@@ -73,7 +72,9 @@ def hyperparameters_of(model: BaseAlgorithm) -> dict[str, bool | str | float]:
     The hyperparameters of a model that a table can hold: numbers, texts, schedules, and ``net_arch`` of ``policy_kwargs``.
     """
     values: dict[str, Any] = {"algorithm": type(model).__name__, "n_envs": model.n_envs}
-    values |= {name: _plain(getattr(model, name, None)) for name in inspect.signature(type(model)).parameters}
+    # Those that a class hands on to the one above it as ``**kwargs``, too
+    names = {name for kind in type(model).__mro__ for name in inspect.signature(kind).parameters}
+    values |= {name: _plain(getattr(model, name, None)) for name in sorted(names)}
     if "net_arch" in model.policy_kwargs:
         values["net_arch"] = str(model.policy_kwargs["net_arch"])
     found: dict[str, bool | str | float] = {}
@@ -84,9 +85,6 @@ def hyperparameters_of(model: BaseAlgorithm) -> dict[str, bool | str | float]:
             found[name] = value.val
         elif isinstance(value, TrainFreq):
             found[name] = f"{value.frequency} {value.unit.value}"
-        elif isinstance(value, th.Tensor) and value.numel() == 1:
-            # Kept on the device of the model, like LAC's ``reward_bound``
-            found[name] = value.item()
         elif isinstance(value, (bool, int, float, str)):
             found[name] = value
         elif name.endswith("learning_rate") and callable(value):

@@ -23,7 +23,7 @@ class LAC(CostAlgorithm):
     It changes the published algorithm, which is ``PublishedLAC``. Two critics learn the fourth root of what ``L`` is above its
     lowest value, in which small costs count beside large ones; the published one learns ``L`` itself, as a sum of squares. The
     actor lowers the square root of ``L`` in the sampled states; the published one lowers the condition on ``L``, in the next
-    states. Targets have actions of the actor itself; the published ones have those of a target actor.
+    states. Targets have the mean action of the actor; the published ones have sampled actions of a target actor.
 
     .. code-block:: python
 
@@ -215,8 +215,9 @@ class LAC(CostAlgorithm):
         actions_pi, log_prob = self.actor.action_log_prob(replay_data.observations)
 
         with th.no_grad():
-            # Next action by the current actor
-            next_actions = self.actor(replay_data.next_observations)
+            # Next action of the loop that is to be judged, the mean one. A root resolves differences far below the noise
+            # of a sampled one, and takes it for a cost
+            next_actions = self.actor(replay_data.next_observations, deterministic=True)
 
         # Compute critic loss, with the current root of each critic network
         # using action from the replay buffer (all values are relative to the offset)

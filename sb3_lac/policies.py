@@ -126,6 +126,13 @@ class SumOfSquaresCritic(LyapunovCritic):
 
     n_outputs = -1
 
+    def __init__(
+        self, observation_space: spaces.Space, action_space: spaces.Box, net_arch: list[int], *args: Any, **kwargs: Any
+    ):
+        if not net_arch:
+            raise ValueError("net_arch must have a layer for the critic: L is the sum of its squares.")
+        super().__init__(observation_space, action_space, net_arch, *args, **kwargs)
+
     def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:
         return tuple(output.square().sum(dim=1, keepdim=True) for output in self.outputs(obs, actions))
 

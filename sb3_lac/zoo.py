@@ -29,7 +29,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import yaml
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -42,6 +41,7 @@ try:
     import optuna
     import rl_zoo3.enjoy
     import rl_zoo3.train
+    import yaml
     from rl_zoo3.exp_manager import ExperimentManager
     from rl_zoo3.hyperparams_opt import (
         HYPERPARAMS_CONVERTER,

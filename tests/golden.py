@@ -45,8 +45,8 @@ from battery_env import (
     track_life,
 )
 from battery_env.__main__ import main as battery_calibrate
-from battery_env.calibration.data import standard_dataset
 from battery_env.loads import BlockBootstrap, Cycle, Load
+from battery_env.tasks.data import standard_dataset
 from sb3_lac import LAC, certify, evaluate_lyapunov, fit_lyapunov
 from sb3_lac.envs import reference_controller
 

@@ -6,6 +6,7 @@ import pickle
 import re
 import subprocess
 import sys
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -14,36 +15,22 @@ import battery_env
 
 ROOT = Path(__file__).parents[1]
 
-# each layer may import the ones before it, and itself
+# each layer may import the ones before it, and itself; a folder is one
 LAYERS = (
-    ("battery_env.arrays", "battery_env.files"),
-    ("battery_env.checks",),
-    ("battery_env.columns",),
-    ("battery_env.tables",),
-    ("battery_env.parameters",),
-    ("battery_env.electrochemistry.cell",),
-    ("battery_env.electrochemistry.kernels",),
-    ("battery_env.electrochemistry.tangents",),
+    ("battery_env.arrays", "battery_env.checks", "battery_env.files"),
+    ("battery_env.parameters", "battery_env.estimates"),
     ("battery_env.electrochemistry",),
-    ("battery_env.records", "battery_env.estimates"),
+    ("battery_env.records",),
     ("battery_env.loads",),
-    ("battery_env.trajectories", "battery_env.cells", "battery_env.nasa_cells"),
-    ("battery_env.record_files",),
+    ("battery_env.trajectories",),
     ("battery_env.sensors",),
-    ("battery_env.record_model",),
-    ("battery_env.conversions",),
     ("battery_env.estimators",),
-    ("battery_env.calibration", "battery_env.pretrained_policies"),
+    ("battery_env.tasks",),
+    ("battery_env.policies",),
     ("battery_env.evaluation",),
     ("battery_env.plotting",),
-    ("battery_env.forecasts",),
-    ("battery_env.life",),
     ("battery_env.callbacks",),
-    ("battery_env.app.calibrate",),
-    ("battery_env.app.many",),
-    ("battery_env.app.forecast",),
-    ("battery_env.app.command_line",),
-    ("battery_env.app", "battery_env.__main__"),
+    ("battery_env.lab", "battery_env.__main__"),
 )
 
 
@@ -84,6 +71,15 @@ def test_battery_env_imports_run_one_way(path):
             assert layer(imported) is not None and layer(imported) <= own, f"{path} imports {imported}"
 
 
+def test_no_modules_of_battery_env_import_each_other_in_a_circle():
+    paths = {module_name(path): path for path in files("battery_env")}
+    list(TopologicalSorter({name: set(imports(path)) - {name} for name, path in paths.items()}).static_order())
+
+
+def test_on_the_ground_floor_of_battery_env_is_what_users_import_by_path_and_all_rooms_share():
+    assert len(list((ROOT / "battery_env").glob("*.py"))) <= 14, "give it a room: a folder named after its subject"
+
+
 @pytest.mark.parametrize("path", files("battery_env"), ids=module_name)
 def test_battery_env_knows_nothing_of_learning(path):
     learning = {name.split(".")[0] for name in imports(path)} & {"torch", "stable_baselines3", "sb3_lac", "benchmarks"}
@@ -101,7 +97,7 @@ def test_sb3_lac_knows_nothing_of_batteries(path):
     [
         ("plots", set()),
         ("statistics", set()),
-        ("functions", {"lac"}),
+        ("functions", {"costs"}),
         ("rollout", {"stability.functions"}),
         ("loop", {"stability.functions", "stability.rollout", "vec_env"}),
         ("fitting", {"files", "stability.functions", "stability.loop", "stability.rollout"}),

@@ -36,6 +36,7 @@ GUIDE = {
         "docs/onnx",
         "docs/own_algorithm",
         "docs/lac",
+        "docs/published_lac",
         "docs/cost_environments",
     ],
     "batteries": [

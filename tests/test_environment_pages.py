@@ -7,11 +7,11 @@ import re
 import pytest
 
 from battery_env import ClosedForm, TrajectoryDataset, evaluate, plotting
-from battery_env.calibration.env import CalibrationEnv
-from battery_env.calibration.full_state_tasks import BatteryQmax
-from battery_env.calibration.registration import TASKS
-from battery_env.calibration.voltage_tasks import BatteryVoltageJoint
 from battery_env.loads import constant
+from battery_env.tasks.env import CalibrationEnv
+from battery_env.tasks.full_state.pages import BatteryQmax
+from battery_env.tasks.registration import TASKS
+from battery_env.tasks.voltage.pages import BatteryVoltageJoint
 from benchmarks.control import DISTURBANCES
 from docs import environment_pages
 

@@ -18,17 +18,15 @@ from numpy.polynomial.legendre import legvander
 from numpy.typing import ArrayLike
 
 from battery_env.arrays import FloatArray, IntArray
-from battery_env.cells import Discharge
 from battery_env.checks import ZERO_CELSIUS_K, check_numbers, check_positive
 from battery_env.electrochemistry import NEW_CELL, CellParameters, check_cell, check_dt
 from battery_env.electrochemistry.tangents import BY_Q, BY_R, RATE_CONSTANTS
 from battery_env.estimates import Estimate
-from battery_env.estimators.diagnosis import FULL_REST_V, MISMATCH_MARGIN, rest_voltage_V
+from battery_env.estimators.diagnosis.conditions import FULL_REST_V, MISMATCH_MARGIN, rest_voltage_V
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.search import MARGIN, OnGrid, distance_C, minimized, square
 from battery_env.files import WrongFormatError, read_json, write_json
 from battery_env.parameters import Q_MOBILE, R_O
-from battery_env.record_model import RecordModel
 from battery_env.records import (
     CUT_OFF_V,
     SWITCH_SHARE,
@@ -38,6 +36,8 @@ from battery_env.records import (
     drawn_charge_C,
     mean_current_A,
 )
+from battery_env.records.discharge import Discharge
+from battery_env.records.model import RecordModel
 
 #: How well the constants that say how fast a cell follows its load are known before any data: standard deviations of their
 #: logarithms. The overpotential of kn stands for whatever slows a worn cell down, so that it may differ most.

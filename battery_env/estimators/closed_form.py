@@ -8,8 +8,8 @@ import numpy as np
 
 from battery_env.electrochemistry import FULL_CHARGE_SHARES, NEW_CELL, QNB, QNS, VO, CellParameters, Trajectory
 from battery_env.estimates import Estimate, EstimateTrace
-from battery_env.estimators.base import Estimator
-from battery_env.estimators.diagnosis import Condition, Diagnosis, is_plausible
+from battery_env.estimators.diagnosis.conditions import Condition, Diagnosis, is_plausible
+from battery_env.estimators.estimator import Estimator
 
 # The charges of the state agree with the current within this share.
 _CHARGE_SHARE = 0.02

@@ -11,8 +11,8 @@ from battery_env.arrays import FloatArray
 from battery_env.electrochemistry import Trajectory
 from battery_env.estimates import Estimate
 from battery_env.parameters import PARAMETER_NAMES, check_parameters
-from battery_env.record_model import RecordModel
 from battery_env.records import Record
+from battery_env.records.model import RecordModel
 
 # Below this determinant of the normalized information, unknowns cannot be told apart but by rounding errors.
 _LEAST_DETERMINANT = 1e-10

@@ -13,7 +13,7 @@ from battery_env.arrays import FloatArray
 from battery_env.electrochemistry import NEW_CELL, STATE_SIZE, VO, CellParameters, PackedConstants, Trajectory, check_dt
 from battery_env.electrochemistry.kernels import cell_current, cell_step, cell_voltage
 from battery_env.estimates import Estimate, EstimateTrace
-from battery_env.estimators.base import Estimator
+from battery_env.estimators.estimator import Estimator
 from battery_env.parameters import PARAMETERS
 
 #: Where to search, C and ohm: what aged cells may have, with a margin.

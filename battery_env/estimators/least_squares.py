@@ -14,8 +14,7 @@ from battery_env.checks import check_gain_sd, check_not_negative, check_positive
 from battery_env.electrochemistry import CellParameters
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimates import Estimate, EstimateTrace
-from battery_env.estimators.base import Estimator, check_bounds
-from battery_env.estimators.diagnosis import (
+from battery_env.estimators.diagnosis.conditions import (
     EXCESS_LIMIT_UNSTATED,
     MISMATCH_MARGIN,
     PRIOR_LIMIT_SD,
@@ -26,13 +25,14 @@ from battery_env.estimators.diagnosis import (
     is_plausible,
     white_noise_V,
 )
-from battery_env.estimators.gaps import DRAWN, Gap, find_gaps, note_gaps
-from battery_env.estimators.monitor import note_samples
-from battery_env.estimators.rest import InitialSoc, check_initial_soc
+from battery_env.estimators.diagnosis.gaps import DRAWN, Gap, find_gaps, note_gaps
+from battery_env.estimators.diagnosis.rest import InitialSoc, check_initial_soc
+from battery_env.estimators.diagnosis.samples import note_samples
+from battery_env.estimators.estimator import Estimator, check_bounds
 from battery_env.estimators.search import Fit, Prior, Search, square
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, check_parameters
-from battery_env.record_model import LONGEST_FORECAST_S, RecordModel
 from battery_env.records import Record, Samples, check_record, starts_at_rest
+from battery_env.records.model import LONGEST_FORECAST_S, RecordModel
 
 # Residuals whose variance is this many of its standard deviations above the one expected are not noise.
 _EXCESS_LIMIT = 5.0
@@ -75,7 +75,7 @@ class LeastSquares(Estimator):
 
     The model starts at the first sample of the record, fully charged and at rest unless ``initial_soc`` or ``initial`` say
     otherwise, and follows the recorded current (:func:`battery_env.records.resample_current`). For a recorded discharge give
-    :meth:`battery_env.cells.Discharge.loaded_part`, which starts when the load is switched on.
+    :meth:`battery_env.Discharge.loaded_part`, which starts when the load is switched on.
 
     *The search.* At a fixed current the charges of the model are linear in ``q_mobile``; so one simulation gives exactly the
     value below which the model cell would be empty before the record ends. The search is over the logarithm of the distance
@@ -91,11 +91,12 @@ class LeastSquares(Estimator):
     both parameters and does not show in the voltage: state it as ``current_gain_sd``.
 
     *Settled* means that the record alone determines every parameter searched for, with a standard deviation below
-    :data:`~battery_env.estimators.diagnosis.SETTLED_SHARES` of its value without any prior, and that nothing contradicts it:
+    :data:`~battery_env.estimators.diagnosis.conditions.SETTLED_SHARES` of its value without any prior, and that nothing
+    contradicts it:
 
     - the record can start with a full cell, or with one of ``initial_soc``, unless ``initial`` is given;
-    - where it was not logged for a while under load (:mod:`~battery_env.estimators.gaps`), the voltage falls by what was drawn
-      meanwhile. If noise hides that, the charge in doubt is in the standard deviation of ``q_mobile``;
+    - where it was not logged for a while under load (:mod:`~battery_env.estimators.diagnosis.gaps`), the voltage falls by
+      what was drawn meanwhile. If noise hides that, the charge in doubt is in the standard deviation of ``q_mobile``;
     - each parameter is inside its bounds, ``q_mobile`` is plausible for a cell of this kind, and the model lasts as long as
       the record;
     - the residuals are no larger than noise and twice ``mismatch_V`` explain. They are where the sensor has an offset, or

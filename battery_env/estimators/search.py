@@ -15,8 +15,8 @@ from battery_env.arrays import BoolArray, FloatArray
 from battery_env.electrochemistry.cell import BULK_RATE, SURFACE_RATE, CellParameters
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS, TANGENT_NAMES
 from battery_env.parameters import PARAMETER_NAMES
-from battery_env.record_model import RecordModel
 from battery_env.records import Record, Samples, check_drawn_charge, drawn_charge_C
+from battery_env.records.model import RecordModel
 
 #: How far the search keeps from the least ``q_mobile``, as a share of it: more than rounding, less than anyone measures.
 MARGIN = 1e-6

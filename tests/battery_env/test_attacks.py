@@ -19,13 +19,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from battery_env.app.calibrate import Settings
-from battery_env.app.calibrate import calibrate as calibration_of
-from battery_env.app.command_line import NOT_SETTLED, REFUSED, SETTLED, calibrate
-from battery_env.calibration.policy import PolicyEstimator
-from battery_env.calibration.pretrained import pretrained_ids
-from battery_env.calibration.voltage import ESTIMATE_RANGES
-from battery_env.cells import Discharge, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate
 from battery_env.estimates import last_estimate
 from battery_env.estimators import (
@@ -38,8 +31,15 @@ from battery_env.estimators import (
     fit_cell,
     soc_from_rest,
 )
-from battery_env.estimators.base import OnlineEstimator
+from battery_env.estimators.estimator import OnlineEstimator
+from battery_env.lab.calibrate import Settings
+from battery_env.lab.calibrate import calibrate as calibration_of
+from battery_env.lab.command_line import NOT_SETTLED, REFUSED, SETTLED, calibrate
+from battery_env.policies.estimator import PolicyEstimator
+from battery_env.policies.pretrained import pretrained_ids
 from battery_env.records import Stream
+from battery_env.records.discharge import Discharge, load_nasa_discharges
+from battery_env.tasks.voltage.task import ESTIMATE_RANGES
 
 WRONG_SHARE = 0.05
 COVERED_SD = 3.0

@@ -9,10 +9,10 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 import battery_env
-from battery_env.calibration.full_state import FullStateTask
-from battery_env.calibration.full_state_layout import ERROR_SCALE, LITERAL, OBSERVED, SCALED
 from battery_env.electrochemistry import NEW_CELL, QNB, step
 from battery_env.loads import RandomPiecewise
+from battery_env.tasks.full_state.layout import ERROR_SCALE, LITERAL, OBSERVED, SCALED
+from battery_env.tasks.full_state.task import FullStateTask
 from battery_env.trajectories import TrajectoryDataset
 
 IDS = ("BatteryQmax-v0", "BatteryRo-v0", "BatteryJoint-v0", "BatteryQmaxPaper-v0", "BatteryRoPaper-v0")

@@ -20,10 +20,6 @@ from battery_env import (
     forecast,
     load_nasa_discharges,
 )
-from battery_env.app.calibrate import METHODS, Settings, calibrate
-from battery_env.app.forecast import forecast_end
-from battery_env.calibration.pretrained import pretrained_card
-from battery_env.cells import Discharge
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate, voltage
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimators.cell_fit import (
@@ -33,8 +29,12 @@ from battery_env.estimators.cell_fit import (
     read_cell,
     with_equilibrium,
 )
+from battery_env.lab.calibrate import METHODS, Settings, calibrate
+from battery_env.lab.running import forecast_end
 from battery_env.loads import constant as constant_load
 from battery_env.plotting import plot_cell_fit
+from battery_env.policies.pretrained import pretrained_card
+from battery_env.records.discharge import Discharge
 
 FIELDS = ("cell", "constants", "discharges", "mismatch_V", "thermal")
 OTHER = with_equilibrium(NEW_CELL, [0.02, -0.03, 0.02]).replace(kn=1000.0, tDiffusion=9e6, to=10.0, tsn=600.0, VEOD=2.7)
@@ -250,7 +250,9 @@ class TestFiles:
 
     def test_a_policy_of_ones_own_takes_the_constants_and_the_cut_off_of_a_fit(self, fit, tmp_path):
         policy, card = tmp_path / "mine.onnx", pretrained_card("BatteryVoltageJoint-v0")
-        policy.write_bytes(files("battery_env.pretrained_policies").joinpath("BatteryVoltageJoint-v0.onnx").read_bytes())
+        policy.write_bytes(
+            files("battery_env.policies.pretrained_policies").joinpath("BatteryVoltageJoint-v0.onnx").read_bytes()
+        )
         policy.with_suffix(".json").write_text(json.dumps({"options": card["options"]}))
         with pytest.raises(ValueError, match=r"mine\.onnx has learned on a new 18650, or the file beside it does not say"):
             Settings.for_cell(fit, method="policy", policy=policy).calibrator()

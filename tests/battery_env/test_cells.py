@@ -8,9 +8,9 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.io import savemat
 
-from battery_env.cells import BUNDLED_CELLS, Discharge, load_nasa_discharges
-from battery_env.record_files import read_discharges
+from battery_env.lab.readers.discharges import read_discharges
 from battery_env.records import drawn, resample_current
+from battery_env.records.discharge import BUNDLED_CELLS, Discharge, load_nasa_discharges
 
 
 def recorded(**changes) -> dict:

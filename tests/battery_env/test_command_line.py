@@ -14,15 +14,15 @@ import pandas as pd
 import pytest
 
 import battery_env
-from battery_env.app import many
-from battery_env.app.calibrate import Calibration, Settings
-from battery_env.app.calibrate import calibrate as calibrated
-from battery_env.app.command_line import main
-from battery_env.calibration.policy import PolicyEstimator
-from battery_env.cells import Discharge, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, CellParameters, Trajectory, initial_state, simulate
 from battery_env.estimators.cell_fit import fit_cell, read_cell
 from battery_env.estimators.least_squares import LeastSquares
+from battery_env.lab import many
+from battery_env.lab.calibrate import Calibration, Settings
+from battery_env.lab.calibrate import calibrate as calibrated
+from battery_env.lab.command_line import main
+from battery_env.policies.estimator import PolicyEstimator
+from battery_env.records.discharge import Discharge, load_nasa_discharges
 
 
 @pytest.fixture(scope="module")
@@ -580,7 +580,7 @@ class TestPolicies:
     def test_one_of_a_file_takes_its_place(self, tmp_path, terminal):
         file = tmp_path / "mine.onnx"
         for suffix in (".onnx", ".json"):
-            content = files("battery_env.pretrained_policies").joinpath(f"BatteryVoltageQmax-v0{suffix}").read_bytes()
+            content = files("battery_env.policies.pretrained_policies").joinpath(f"BatteryVoltageQmax-v0{suffix}").read_bytes()
             file.with_suffix(suffix).write_bytes(content)
         arguments = (*POLICY, "--policy", file)
         assert f"calibrated by the policy of {file}" in terminal.shows(*arguments, "--parameters", "q_mobile", status=3)

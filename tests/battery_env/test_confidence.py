@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from battery_env import PolicyEstimator, evaluate
-from battery_env.calibration.data import standard_dataset
 from battery_env.electrochemistry import NEW_CELL, simulate
 from battery_env.records import Samples
 from battery_env.sensors import RandomSensorErrors, SensorErrors
+from battery_env.tasks.data import standard_dataset
 
 ENV_ID = "BatteryVoltageJoint-v0"
 OPTIONS = {"nuisance": 0.2, "reading_s": 2.0}

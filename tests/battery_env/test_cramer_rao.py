@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from battery_env.cells import load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, simulate
 from battery_env.estimates import Estimate
 from battery_env.estimators.cramer_rao import CramerRaoBound, Sensitivities, cramer_rao_bound, sensitivities
 from battery_env.estimators.least_squares import LeastSquares
-from battery_env.record_model import RecordModel
+from battery_env.records.discharge import load_nasa_discharges
+from battery_env.records.model import RecordModel
 
 NOISE_V = 0.010
 BOTH = ("q_mobile", "r_o")

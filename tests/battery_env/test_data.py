@@ -5,7 +5,7 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from battery_env.calibration.data import LoadKind, standard_dataset
+from battery_env.tasks.data import LoadKind, standard_dataset
 from battery_env.trajectories import TrajectoryDataset
 
 BOTH = ("q_mobile", "r_o")

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from battery_env.calibration.data import standard_dataset
-from battery_env.calibration.full_state_layout import ERROR_SCALE, OBSERVED, SCALED
-from battery_env.calibration.full_state_tasks import BatteryJoint, BatteryQmax, BatteryQmaxPaper, BatteryRo
 from battery_env.electrochemistry import NEW_CELL, QNB, STATE_NAMES, UNCERTAIN_CONSTANTS, VO, step, voltage
 from battery_env.loads import RandomPiecewise, constant
+from battery_env.tasks.data import standard_dataset
+from battery_env.tasks.full_state.layout import ERROR_SCALE, OBSERVED, SCALED
+from battery_env.tasks.full_state.pages import BatteryJoint, BatteryQmax, BatteryQmaxPaper, BatteryRo
 from battery_env.trajectories import TrajectoryDataset
 
 

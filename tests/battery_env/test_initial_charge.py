@@ -8,11 +8,11 @@ import pandas as pd
 import pytest
 
 from battery_env import LeastSquares, fit_cell, load_nasa_discharges, soc_from_rest
-from battery_env.app.command_line import NOT_SETTLED, SETTLED, calibrate
-from battery_env.cells import Discharge
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate
-from battery_env.life import track_life
-from battery_env.record_model import RecordModel
+from battery_env.lab.command_line import NOT_SETTLED, SETTLED, calibrate
+from battery_env.lab.life import track_life
+from battery_env.records.discharge import Discharge
+from battery_env.records.model import RecordModel
 
 REST_S = 200
 

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
 import battery_env
-from battery_env.calibration.registration import TASKS
 from battery_env.loads import RandomPiecewise
+from battery_env.tasks.registration import TASKS
 
 NUMBERS = st.floats() | st.integers(-(2**63), 2**63 - 1) | st.floats(0.0, 1e4)
 ARRAYS = arrays(np.float64, array_shapes(min_side=0), elements=st.floats() | st.floats(0.0, 1e4))

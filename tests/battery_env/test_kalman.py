@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from battery_env.cells import load_nasa_discharges
 from battery_env.electrochemistry import simulate
-from battery_env.estimators.base import OnlineEstimator
-from battery_env.estimators.diagnosis import SETTLED_SHARES
+from battery_env.estimators.diagnosis.conditions import SETTLED_SHARES
+from battery_env.estimators.estimator import OnlineEstimator
 from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.evaluation import evaluate, summarize
 from battery_env.loads import RandomPiecewise
+from battery_env.records.discharge import load_nasa_discharges
 from battery_env.sensors import SensorErrors
 from battery_env.trajectories import TrajectoryDataset
 

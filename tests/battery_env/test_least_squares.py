@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from battery_env.cells import Discharge, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, Trajectory, initial_state, simulate
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimators.cramer_rao import cramer_rao_bound
@@ -13,6 +12,7 @@ from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.search import Prior, Search
 from battery_env.records import Samples
+from battery_env.records.discharge import Discharge, load_nasa_discharges
 
 
 def discharged(

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from battery_env import Discharge, LeastSquares, load_nasa_discharges, track_life
-from battery_env.life import life_of
+from battery_env.lab.life import life_of
 
 
 def followed(q_mobile_C, **columns):

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from battery_env import PolicyEstimator, evaluate
-from battery_env.calibration.nuisance import FOUND_SIZE, nuisance_step
-from battery_env.calibration.readings import Readings
-from battery_env.calibration.vector_env import CalibrationVectorEnv
-from battery_env.calibration.voltage_tasks import BatteryVoltageJoint
 from battery_env.electrochemistry import NEW_CELL, UNCERTAIN_CONSTANTS, simulate
 from battery_env.loads import RandomPiecewise
 from battery_env.records import Samples
 from battery_env.sensors import SensorErrors
+from battery_env.tasks.vector_env import CalibrationVectorEnv
+from battery_env.tasks.voltage.fit import FOUND_SIZE, nuisance_step
+from battery_env.tasks.voltage.pages import BatteryVoltageJoint
+from battery_env.tasks.voltage.readings import Readings
 from battery_env.trajectories import TrajectoryDataset
 
 UNKNOWNS = ("q_mobile", "r_o", "offset_V", *UNCERTAIN_CONSTANTS)

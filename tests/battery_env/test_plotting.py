@@ -21,8 +21,8 @@ from battery_env.plotting import (
     plot_true_against_inferred,
     save_figure,
 )
-from battery_env.record_model import RecordModel
 from battery_env.records import Samples
+from battery_env.records.model import RecordModel
 from battery_env.sensors import SensorErrors
 
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from battery_env import PolicyEstimator
-from battery_env.calibration.aging import simulated_lives
-from battery_env.calibration.voltage import LARGEST_STEPS
 from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.evaluation import evaluate
 from battery_env.loads import RandomPiecewise
 from battery_env.records import Samples
 from battery_env.sensors import RandomSensorErrors, SensorErrors
+from battery_env.tasks.voltage.aging import simulated_lives
+from battery_env.tasks.voltage.task import LARGEST_STEPS
 from battery_env.trajectories import TrajectoryDataset
 
 

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from battery_env import LeastSquares, PolicyEstimator, evaluate, load_nasa_discharges
-from battery_env.calibration.data import standard_dataset
-from battery_env.calibration.pretrained import file_stem, policy_of_file, pretrained_card, pretrained_policy
-from battery_env.cells import BUNDLED_CELLS
 from battery_env.electrochemistry import NEW_CELL
+from battery_env.policies.pretrained import file_stem, policy_of_file, pretrained_card, pretrained_policy
+from battery_env.records.discharge import BUNDLED_CELLS
 from battery_env.sensors import SensorErrors
+from battery_env.tasks.data import standard_dataset
 
-FOLDER = files("battery_env.pretrained_policies")
+FOLDER = files("battery_env.policies.pretrained_policies")
 IDS = {"BatteryVoltageJoint-v0": ("q_mobile", "r_o"), "BatteryVoltageQmax-v0": "q_mobile", "BatteryVoltageRo-v0": "r_o"}
 
 

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from battery_env import ExtendedKalmanFilter, PolicyEstimator
-from battery_env.cells import Discharge
 from battery_env.electrochemistry import simulate
 from battery_env.records import Stream, are_plausible, check_sample
+from battery_env.records.discharge import Discharge
 
 NOISE_V = 0.005
 

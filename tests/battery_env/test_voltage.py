@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from battery_env.calibration.aging import BatteryAging, simulated_lives
-from battery_env.calibration.env import CalibrationEnv
-from battery_env.calibration.full_state_tasks import BatteryQmax
-from battery_env.calibration.readings import Readings
-from battery_env.calibration.voltage import ESTIMATE_RANGES, LARGEST_STEPS
-from battery_env.calibration.voltage_tasks import BatteryVoltageJoint, BatteryVoltageQmax, BatteryVoltageRo
-from battery_env.cells import Discharge, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL
 from battery_env.loads import RandomPiecewise
+from battery_env.records.discharge import Discharge, load_nasa_discharges
 from battery_env.sensors import RandomSensorErrors
+from battery_env.tasks.env import CalibrationEnv
+from battery_env.tasks.full_state.pages import BatteryQmax
+from battery_env.tasks.voltage.aging import BatteryAging, simulated_lives
+from battery_env.tasks.voltage.pages import BatteryVoltageJoint, BatteryVoltageQmax, BatteryVoltageRo
+from battery_env.tasks.voltage.readings import Readings
+from battery_env.tasks.voltage.task import ESTIMATE_RANGES, LARGEST_STEPS
 from battery_env.trajectories import TrajectoryDataset
 
 BOTH = ("q_mobile", "r_o")

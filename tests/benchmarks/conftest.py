@@ -15,9 +15,10 @@ def train_nothing(monkeypatch) -> Callable[[ModuleType], list[tuple]]:
 
         asked = []
 
-        def train_or_load(algo, env_id, seed, timesteps, folder, callback=None, compile_update=False):
+        def train_or_load(algo, env_id, seed, timesteps, folder, *differing, callback=None, compile_update=False):
             asked.append((algo, env_id, seed, timesteps))
-            write_json(record_file(Recipe.of(algo, env_id, seed, timesteps), folder), {"training_minutes": 1.5})
+            chosen = dict(zip(("hyperparameters", "settings"), differing, strict=False))
+            write_json(record_file(Recipe.of(algo, env_id, seed, timesteps, **chosen), folder), {"training_minutes": 1.5})
             model = LAC("MlpPolicy", env_id, device="cpu", buffer_size=10, seed=seed, policy_kwargs={"net_arch": [8]})
             if callback is not None:
                 callback.init_callback(model)

@@ -5,7 +5,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from battery_env.calibration.data import standard_dataset
+from battery_env.tasks.data import standard_dataset
 from benchmarks import ablations
 
 

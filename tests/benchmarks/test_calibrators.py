@@ -10,10 +10,10 @@ import pandas as pd
 import pytest
 
 from battery_env import PolicyEstimator, evaluate
-from battery_env.calibration.data import standard_dataset
 from battery_env.electrochemistry import NEW_CELL, simulate, step, voltage
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.sensors import SensorErrors
+from battery_env.tasks.data import standard_dataset
 from benchmarks import calibrators
 from benchmarks.calibrators import COMPARISONS, Condition, Follow
 from benchmarks.contests import SENSORS

@@ -2,7 +2,7 @@
 
 import pandas as pd
 
-from battery_env.cells import load_nasa_discharges
+from battery_env.records.discharge import load_nasa_discharges
 from benchmarks import forecasts
 
 

@@ -5,7 +5,7 @@ import json
 import pandas as pd
 import pytest
 
-from battery_env.calibration.pretrained import policy_of_file
+from battery_env.policies.pretrained import policy_of_file
 from benchmarks import pretrained
 from benchmarks.training import record_file
 from sb3_lac import LAC

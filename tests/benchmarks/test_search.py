@@ -8,8 +8,8 @@ import pandas as pd
 import pytest
 from stable_baselines3 import SAC
 
-from battery_env.calibration.policy import PolicyEstimator
 from battery_env.evaluation import evaluate
+from battery_env.policies.estimator import PolicyEstimator
 from benchmarks import search
 from benchmarks.training import Recipe
 

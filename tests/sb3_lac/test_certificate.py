@@ -18,7 +18,7 @@ from scipy.optimize import linprog
 from scipy.stats import binom
 from stable_baselines3 import DQN, SAC
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from benchmarks.control import ScaledController
 from sb3_lac import (
@@ -174,19 +174,49 @@ def test_loop_whose_cost_rises_in_the_end_does_not_hold(optimal, factor, holds):
 # Other roll-outs
 
 
-def test_roll_outs_of_a_fit_or_a_training_say_nothing_of_others(optimal, linear_env, make_env):
+def test_roll_outs_of_a_fit_say_nothing_of_others(optimal, linear_env):
     controller, lyapunov = optimal
     for judge in (evaluate_lyapunov, certify):
         for seed in (0, 9):
             with pytest.raises(ValueError, match=rf"seed={seed} with 10 environments .* \(seeds 0 to 9\).* from 10 on"):
                 judge(controller, linear_env, lyapunov=lyapunov, seed=seed)
     evaluate_lyapunov(controller, linear_env, 10, seed=10, lyapunov=lyapunov)
-    model = SAC("MlpPolicy", make_vec_env(make_env, n_envs=4), policy_kwargs={"net_arch": [8]}, buffer_size=100, seed=5)
-    env = make_vec_env(make_env, n_envs=3)
+
+
+# Whoever gave the seeds: the model, or who made the environments
+@pytest.mark.parametrize("of_the_model", [True, False])
+@pytest.mark.parametrize("kind", ["one by one", "in processes", "of Gymnasium", "in one call", "normalized"])
+def test_seeds_of_a_training_are_those_of_its_environments(kind, of_the_model, make_env):
+    same_step = {"autoreset_mode": "SameStep"}
+    make_envs = {
+        "one by one": lambda n: make_vec_env(make_env, n),
+        "in processes": lambda n: SubprocVecEnv([make_env] * n, start_method="fork"),
+        "of Gymnasium": lambda n: GymnasiumVecEnv(gym.vector.SyncVectorEnv([make_env] * n, **same_step)),
+        "in one call": lambda n: GymnasiumVecEnv(gym.make_vec("BatteryRo-v0", num_envs=n, **same_step)),
+        "normalized": lambda n: VecNormalize(make_vec_env(make_env, n)),
+    }[kind]
+    training_env, env = make_envs(4), make_envs(3)
+    if not of_the_model:
+        training_env.seed(5)
+    settings = {"learning_starts": 100, "buffer_size": 100, "policy_kwargs": {"net_arch": [8]}}
+    model = SAC("MlpPolicy", training_env, seed=5 if of_the_model else None, **settings).learn(8)
     for seed in (3, 8):
         with pytest.raises(ValueError, match=rf"seed={seed} with 3 environments .* SAC was trained on .seeds 5 to 8."):
-            certify(model, env, n_episodes=3, seed=seed)
+            certify(model, env, seed=seed)
     certify(model, env, n_episodes=3, seed=9)
+    # Closed environments may be unable to tell
+    training_env.close()
+    certify(model, env, n_episodes=3, seed=9)
+    env.close()
+
+
+def test_environments_that_came_later_have_other_seeds_than_the_model(make_model, make_env):
+    model = make_model(make_env(), n_collect=0, seed=5)
+    model.set_env(make_vec_env(make_env, seed=50))
+    model.learn(10)
+    for seed in (5, 50):
+        with pytest.raises(ValueError, match=f"LAC was trained on .seeds {seed} to {seed}."):
+            certify(model, make_env(), n_episodes=1, seed=seed)
 
 
 def sampled(actions):
@@ -522,7 +552,7 @@ def test_costs_of_other_functions_are_those_of_the_env(make_env):
     model = SAC("MlpPolicy", env, buffer_size=100, learning_starts=1000, policy_kwargs={"net_arch": [8]}, seed=0)
     model.learn(100)
     eval_env.obs_rms, eval_env.ret_rms = env.obs_rms, env.ret_rms
-    lyapunov = fit_lyapunov(model, eval_env, 4, seed=0, progress_bar=False)
+    lyapunov = fit_lyapunov(model, eval_env, 4, seed=2, progress_bar=False)
     report = evaluate_lyapunov(model, eval_env, 4, seed=10, lyapunov=lyapunov)
     states = eval_env.unnormalize_obs(report.observations)
     np.testing.assert_allclose(report.transitions["cost"], np.sum(states**2, axis=1), rtol=1e-3, atol=1e-4)
@@ -582,7 +612,7 @@ ONE_START_FOR_ALL = GymnasiumVecEnv(gym.vector.SyncVectorEnv([lambda: PlannedEnv
         (certify, PlannedEnv([[-2, 1]]), {"ultimate_bound": 1.0}, "A reward of 2 is positive, and it is not known"),
         (certify, SOMETIMES_PAID, {"starts": [[0.0, 0.0], [0.9, 0.9]], "ultimate_bound": 0.5}, "A reward of 1 is positive"),
         (evaluate_lyapunov, PlannedEnv([[-2, 1]]), {"lyapunov": IDENTITY}, "A reward of 2 is positive"),
-        (evaluate_lyapunov, ONES, {}, "must be a LAC model.*CertificateCallback"),
+        (evaluate_lyapunov, ONES, {}, "must be a LAC or PublishedLAC.*CertificateCallback"),
         (certify, "LinearCost-v0", {}, r"env='LinearCost-v0' is no environment: pass that of gym.make"),
         (certify, gym.make_vec("LinearCost-v0", num_envs=2), {}, r"pass sb3_lac.GymnasiumVecEnv\(env\)"),
         (certify, showing(np.nan), {}, "observation that is NaN"),
@@ -641,7 +671,7 @@ def test_fit_that_diverges_is_refused(linear_env, optimal, monkeypatch):
         (CertificateCallback, {"seed": 0}, "starts episodes that SAC was trained on"),
         (CertificateCallback, {"n_eval_episodes": -1}, "and not -1"),
         (CertificateCallback, {"ultimate_bound": "small"}, "ultimate_bound='small' must be a number"),
-        (LyapunovCallback, {}, "must be a LAC model.*CertificateCallback"),
+        (LyapunovCallback, {}, "must be a LAC or PublishedLAC.*CertificateCallback"),
     ],
 )
 def test_callback_refuses_questions_before_the_training(make_env, make, arguments, message):

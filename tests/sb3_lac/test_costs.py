@@ -1,11 +1,13 @@
-"""What LAC says about an environment whose terminations cost nothing."""
+"""What enters from an environment: terminations that cost nothing, and numbers that are not finite."""
 
 import warnings
 
 import gymnasium as gym
+import numpy as np
 import pytest
 from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecNormalize
 
 import sb3_lac.envs  # noqa: F401  # registers the ids
 
@@ -111,3 +113,62 @@ def test_cost_environments_do_not_warn(make_model, env_id):
     assert warnings_of(model, n_steps=401) == []
     ends = model.replay_buffer.dones > model.replay_buffer.timeouts
     assert ends.any() == (env_id in ("CartPoleCost-v0", "QuadrotorCost-v0", "VehicleCost-v0"))
+
+
+class Spoilt(gym.Wrapper):
+    """Something is not a finite number: what ``reset()`` observes, or what the fifth step observes or pays."""
+
+    def __init__(self, env, where, number):
+        super().__init__(env)
+        self.where, self.number = where, number
+
+    def reset(self, **kwargs):
+        self.n_steps = 0
+        obs, info = self.env.reset(**kwargs)
+        return (obs + self.number if self.where == "first observation" else obs), info
+
+    def step(self, action):
+        self.n_steps += 1
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        if self.n_steps == 5:
+            reward += self.number if self.where == "reward" else 0.0
+            obs = obs + self.number if self.where != "reward" else obs
+            terminated = self.where == "last observation"
+        return obs, reward, terminated, truncated, info
+
+
+@pytest.mark.parametrize("wrapper", [None, in_dict])
+@pytest.mark.parametrize("normalized", [False, True])
+@pytest.mark.parametrize("number", [float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize("where", ["first observation", "observation", "last observation", "reward"])
+def test_what_is_not_finite_is_refused_before_it_is_stored(make_model, make_env, where, number, normalized, wrapper):
+    env = make_vec_env(lambda: Spoilt(make_env(), where, number), 1, wrapper_class=wrapper)
+    policy = "MlpPolicy" if wrapper is None else "MultiInputPolicy"
+    model = make_model(VecNormalize(env) if normalized else env, n_collect=0, policy=policy)
+    named = "nan" if normalized and where == "last observation" else str(number)
+    # VecNormalize hands on the last observation of an episode clipped
+    if normalized and where == "last observation" and number == number:
+        model.learn(10)
+        return
+    with pytest.raises(ValueError, match=rf"gave the {where} .*{named} at step \d+: all must be finite"):
+        model.learn(20)
+    assert model._n_updates == 0 and model.replay_buffer.pos <= 4
+    assert np.isfinite(model.replay_buffer.rewards).all()
+
+
+def test_a_file_is_replaced_when_the_new_one_is_whole(make_model, tmp_path, monkeypatch):
+    model = make_model()
+    for save, file in ((model.save, "model.zip"), (model.save_replay_buffer, "buffer.pkl")):
+        save(tmp_path / file.partition(".")[0])
+        before = (tmp_path / file).read_bytes()
+        with monkeypatch.context() as patch:
+
+            def fail_half_way(*args, **kwargs):
+                raise OSError("no space left on device")
+
+            patch.setattr("torch.save", fail_half_way)
+            patch.setattr("pickle.dump", fail_half_way)
+            with pytest.raises(OSError, match="no space left"):
+                save(tmp_path / file)
+        assert (tmp_path / file).read_bytes() == before
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["buffer.pkl", "model.zip"]

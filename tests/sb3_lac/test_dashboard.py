@@ -142,6 +142,16 @@ def test_what_is_no_number_is_no_cost(said, logged, tmp_path):
     assert model.logger.name_to_value.get("rollout/cost_mean") == logged
 
 
+def test_what_a_class_hands_on_is_in_the_table():
+    class Handing(SAC):
+        def __init__(self, *args, fall=2.0, **kwargs):
+            super().__init__(*args, **kwargs)
+            self.fall = fall
+
+    handed, plain = (hyperparameters_of(make_model(algorithm)) for algorithm in (Handing, SAC))
+    assert handed == {**plain, "algorithm": "Handing", "fall": 2.0} and plain["seed"] == 0
+
+
 def test_numbers_of_numpy_are_numbers_in_the_table():
     model = make_model(SAC, gamma=np.float32(0.5), target_update_interval=np.int64(4))
     found = hyperparameters_of(model)

@@ -68,7 +68,7 @@ class LinearActor(nn.Module):
         super().__init__()
         self.gain = nn.Parameter(th.as_tensor(gain))
 
-    def forward(self, states):
+    def forward(self, states, deterministic=True):
         return -states @ self.gain.T
 
     def action_log_prob(self, states):

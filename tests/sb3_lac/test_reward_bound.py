@@ -46,7 +46,6 @@ def gradients_of(monkeypatch, train_metrics):
         with monkeypatch.context() as patch:
             patch.setattr(F, "mse_loss", lambda values, y: targets.append(y) or loss(values, y))
             patch.setattr(model, "lr_schedule", lambda _: 0.0)
-            patch.setattr(model, "critic_lr_schedule", lambda _: 0.0)
             patch.setattr(model, "tau", 0.0)
             train_metrics(model)
         gradients = [
@@ -118,13 +117,13 @@ def test_lac_learns_to_live():
         device="cpu",
     )
     model.learn(1500)
-    report = evaluate_lyapunov(model, BalanceEnv(), 10, deterministic=True, seed=0)
+    report = evaluate_lyapunov(model, BalanceEnv(), 10, deterministic=True, seed=1)
     assert report.episodes["length"].mean() > 60
 
 
 def test_report_counts_the_bound_after_a_termination(make_model, make_env):
     model = make_model(make_env(), n_collect=0, gamma=0.5, reward_bound=2.0)
-    report = evaluate_lyapunov(model, make_env(episode_length=3, terminate=True, offset=1.0), 2, seed=0)
+    report = evaluate_lyapunov(model, make_env(episode_length=3, terminate=True, offset=1.0), 2, seed=1)
     costs = report.transitions["cost"].to_numpy().reshape(2, 3)
     np.testing.assert_allclose(costs, 2.0 - report.transitions["reward"].to_numpy().reshape(2, 3))
     last = costs[:, 2] + 0.5 * 4.0
@@ -188,7 +187,7 @@ def test_report_does_not_change_the_critic(make_model, make_env, train_metrics):
     state = {name: tensor.clone() for name, tensor in model.policy.state_dict().items()}
     eval_env = VecNormalize(DummyVecEnv([lambda: make_env(offset=3.0)]), gamma=0.75)
     eval_env.ret_rms.var = 4.0 - eval_env.epsilon
-    report = evaluate_lyapunov(model, eval_env, 2, seed=0)
+    report = evaluate_lyapunov(model, eval_env, 2, seed=1)
     assert all(th.equal(state[name], tensor) for name, tensor in model.policy.state_dict().items())
     # Its values have the units of its rewards: with an offset of 4 * 3 / 2
     actions, _ = model.predict(report.observations, deterministic=True)

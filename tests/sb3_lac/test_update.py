@@ -19,6 +19,10 @@ def mlp(weights, prefix, x, n_layers):
     return x
 
 
+def mean_action(weights, obs):
+    return th.tanh(mlp(weights, "latent_pi", obs, 2) @ weights["mu.weight"].T + weights["mu.bias"])
+
+
 def policy_sample(weights, obs):
     """Sampled action of the squashed Gaussian, and its log probability summed over action dimensions."""
     latent = mlp(weights, "latent_pi", obs, 2)
@@ -110,7 +114,7 @@ def test_train_is_the_update_of_the_equations(make_model_without_env, n_critics,
         th.manual_seed(step)
         actions_pi, log_prob = policy_sample(actor, obs)
         with th.no_grad():
-            next_actions, _ = policy_sample(actor, next_obs)
+            next_actions = mean_action(actor, next_obs)
             next_values = relative(roots_of(critic_target, next_obs, next_actions, n_critics)) + target_floor
             next_values = th.maximum(next_values, -th.tensor(offset))
             # y - offset, where bound + GAMMA * offset is the offset

@@ -19,7 +19,7 @@ import optuna
 import rl_zoo3
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 
-from sb3_lac import LAC, GymnasiumVecEnv, zoo
+from sb3_lac import LAC, GymnasiumVecEnv, PublishedLAC, zoo
 from sb3_lac.zoo import RL_ZOO_CONFIGS, LACExperimentManager, find_config, main, steps_as_one_batch
 
 ENV = "Pendulum-v1"
@@ -106,7 +106,7 @@ def test_optimize(workdir):
     assert {"ent_coef_init", "n_critics"} <= set(trials[0].params)
 
 
-@pytest.mark.parametrize("algo", ["lac", "sac", "td3"])
+@pytest.mark.parametrize("algo", ["lac", "published_lac", "sac", "td3"])
 def test_every_sample_is_a_valid_model(algo, make_env, workdir, monkeypatch):
     # The commands of the wrapper set them, which is taken back afterwards
     monkeypatch.setattr(zoo, "HYPERPARAMS_SAMPLER", (sampler := {**HYPERPARAMS_SAMPLER}))
@@ -131,7 +131,7 @@ def test_every_sample_is_a_valid_model(algo, make_env, workdir, monkeypatch):
         # Those of the configuration belong together
         assert not {"train_freq", "gradient_steps", "n_envs"} & set(hyperparams)
         model = rl_zoo3.ALGOS[algo]("MlpPolicy", make_env(), buffer_size=10, device="cpu", **hyperparams)
-        if algo == "lac":
+        if algo in zoo.ALGORITHMS:
             assert model.critic.n_critics == trial.params["n_critics"]
 
 
@@ -185,17 +185,19 @@ def test_all_learning_rates_take_schedules():
     assert rates["critic_learning_rate"](0.5) == 5e-4 and rates["lambda_learning_rate"] is None
 
 
-def test_another_algorithm_of_the_package_needs_a_file_only(workdir, monkeypatch):
-    class OtherLAC(LAC):
-        pass
+def test_the_published_algorithm_needs_a_file_only(workdir):
+    arguments = ["--algo", "published_lac", "--env", ENV, "--eval-freq", "-1"]
+    settings = {**SETTINGS, "critic_learning_rate": "lin_1e-3", "train_freq": 1, "gradient_steps": 1}
+    (workdir / "zoo_configs" / "published_lac.yml").write_text(yaml.dump({ENV: settings}))
+    main(["train", *arguments])
+    model = PublishedLAC.load(workdir / "logs" / "published_lac" / f"{ENV}_1" / f"{ENV}.zip")
+    assert model.num_timesteps == 60 and model.critic_learning_rate(0.5) == 5e-4
 
-    monkeypatch.setitem(zoo.ALGORITHMS, "other_lac", OtherLAC)
-    monkeypatch.setitem(rl_zoo3.ALGOS, "other_lac", OtherLAC)
+
+def test_algorithm_without_a_file_is_told_what_to_do(workdir, monkeypatch):
+    monkeypatch.setitem(zoo.ALGORITHMS, "other_lac", LAC)
     with pytest.raises(FileNotFoundError, match=r"there is no .*zoo_configs/other_lac\.yml"):
-        main(["train", "--algo", "other_lac", "--env", ENV, "--eval-freq", "-1"])
-    (workdir / "zoo_configs" / "lac.yml").rename(workdir / "zoo_configs" / "other_lac.yml")
-    main(["train", "--algo", "other_lac", "--env", ENV, "--eval-freq", "-1"])
-    assert OtherLAC.load(workdir / "logs" / "other_lac" / f"{ENV}_1" / f"{ENV}.zip").num_timesteps == 60
+        manager_of(ENV, workdir, "other_lac", config=None)
 
 
 # Which hyperparameters

@@ -1,0 +1,113 @@
+"""The state of charge that a discharge starts with: stated, or told from the voltage of the rest before the load."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from battery_env.arrays import FloatArray
+from battery_env.electrochemistry import NEW_CELL, CellParameters, initial_state, voltage
+from battery_env.estimators.diagnosis.conditions import Condition
+from battery_env.records import REST_CURRENT_A, Record, Stream
+
+#: What a state of charge can be given as: a number, or (mean, standard deviation).
+InitialSoc = float | tuple[float, float]
+
+# The charge of a cell is told from its voltage after so long a rest, s.
+_LEAST_REST_S = 60.0
+# Two running means of the resting voltage, over 20 s and 60 s. It is expected to move on by ten times their difference.
+_MEMORIES_S, _STILL_TO_COME = (20.0, 60.0), 10.0
+# States of charge to choose from, where it is told from a voltage, and how far to each side the slope of the voltage is taken.
+_SOC_GRID, _SLOPE_SPAN = np.linspace(0.02, 1.0, 1961), 0.01
+# Sensor and model are not taken to be better than this, V.
+_LEAST_ERROR_V = 0.005
+
+
+class Start(NamedTuple):
+    """
+    How a discharge starts.
+
+    :param soc: state of charge
+    :param sd_soc: its standard deviation
+    :param samples: how many samples at rest it was told from; 0 where it was stated
+    :param reason: why it could not be told, empty if it could
+    """
+
+    soc: float
+    sd_soc: float
+    samples: int = 0
+    reason: str = ""
+
+
+def check_initial_soc(initial_soc: InitialSoc) -> tuple[float, float]:
+    """Refuse what is no state of charge."""
+    try:
+        mean, sd = (float(initial_soc), 0.0) if np.ndim(initial_soc) == 0 else map(float, initial_soc)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        mean = sd = np.nan
+    if not (_SOC_GRID[0] <= mean <= 1.0 and 0.0 <= sd < 1.0):
+        raise ValueError(
+            f"initial_soc is a state of charge within 0.02 .. 1, or (mean, standard deviation), got {initial_soc!r}. "
+            "battery_env.soc_from_rest tells both from the rest before the load."
+        )
+    return mean, sd
+
+
+def soc_from_rest(
+    record: Record,
+    cell: CellParameters | None = None,
+    mismatch_V: float = 0.0,
+    voltage_noise_V: float | None = None,
+    dt_s: float = 1.0,
+) -> Start:
+    """
+    Tell the state of charge that a record starts with from the voltage of the rest before its load, of a minute at least, by
+    the open-circuit voltage of the model. A voltage that still relaxes widens the standard deviation.
+
+    .. code-block:: python
+
+      start = soc_from_rest(record, mismatch_V=0.05)
+      estimate = LeastSquares(mismatch_V=0.05, initial_soc=(start.soc, start.sd_soc)).estimate(record)
+
+    :param record: one discharge, with the rest before its load
+    :param cell: constants of the model; ``None``: the new cell's
+    :param mismatch_V: error to expect of the model, V; at least 0.005 V are taken
+    :param voltage_noise_V: standard deviation of the noise of the voltage sensor, V; ``None``: as ``mismatch_V``
+    :param dt_s: time between the samples of simulated records, whose current is taken as it is, s
+    :return: the state of charge. If ``reason`` is not empty, the rest does not tell it, and no estimate that relies on it is
+        settled
+    :raises ValueError: if the record cannot be used
+    """
+    stream, cell = Stream.of(record, dt_s), NEW_CELL if cell is None else cell
+    loaded = np.flatnonzero(np.abs(stream.current_A) > REST_CURRENT_A)
+    count = int(loaded[0]) if len(loaded) else len(stream.time_s)
+    if not count:
+        return Start(1.0, 0.0, 0, Condition.START_UNKNOWN.text)
+    fast_V, slow_V = (_running_mean_V(stream, count, memory_s) for memory_s in _MEMORIES_S)
+    rest_V = _rest_voltages_V(cell)
+    if not (np.diff(rest_V) > 0.0).all():
+        return Start(1.0, 0.0, count, Condition.REST_UNKNOWN.text)
+    soc = float(np.interp(fast_V, rest_V, _SOC_GRID))
+    around = np.clip([soc - _SLOPE_SPAN, soc + _SLOPE_SPAN], _SOC_GRID[0], _SOC_GRID[-1])
+    slope_V = float(np.diff(np.interp(around, _SOC_GRID, rest_V))[0] / np.diff(around)[0])
+    model_sd_V = max(_LEAST_ERROR_V, mismatch_V)
+    sensor_sd_V = model_sd_V if voltage_noise_V is None else voltage_noise_V
+    sd_V = np.hypot(np.hypot(sensor_sd_V, model_sd_V), _STILL_TO_COME * (fast_V - slow_V))
+    rest_s = float(stream.time_s[count - 1] - stream.time_s[0])
+    return Start(soc, float(sd_V / slope_V), count, "" if rest_s >= _LEAST_REST_S else Condition.START_UNKNOWN.text)
+
+
+def _running_mean_V(stream: Stream, count: int, memory_s: float) -> float:
+    """Average the first voltages, each the less the longer it is over."""
+    mean_V = float(stream.voltage_V[0])
+    for voltage_V, since_s in zip(stream.voltage_V[:count].tolist(), stream.dt_s[:count].tolist(), strict=True):
+        mean_V += -np.expm1(-since_s / memory_s) * (voltage_V - mean_V)
+    return mean_V
+
+
+def _rest_voltages_V(cell: CellParameters) -> FloatArray:
+    """Return the voltage of a cell at rest at each state of charge of the grid."""
+    full, empty = (initial_state(cell=cell, soc=soc) for soc in (1.0, 0.0))
+    states = empty + _SOC_GRID[:, None] * (full - empty)
+    return np.asarray(voltage(states, cell=cell))

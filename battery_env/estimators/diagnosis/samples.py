@@ -1,0 +1,427 @@
+"""
+The evidence of samples, compiled (numba): whether a cell starts with the charge expected, and whether its voltage belongs to
+its current. A stream is watched sample by sample, and a whole record in the same way.
+"""
+
+from __future__ import annotations
+
+from math import expm1, inf, isnan, nan, sqrt
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from battery_env.arrays import FloatArray
+from battery_env.electrochemistry import NEW_CELL, CellParameters
+from battery_env.estimators.diagnosis import gaps
+from battery_env.estimators.diagnosis.conditions import FULL_REST_V, Condition, Diagnosis, rest_voltage_V, start_measured
+from battery_env.records import REST_CURRENT_A, SWITCH_SHARE, Samples
+
+#: A row of a table, whose columns numba knows and type checkers do not.
+Row = Any
+
+# A cell that was at rest at the first sample falls by at least half of its ohmic drop within this time, s. So does one whose
+# load is switched.
+_START_WINDOW_S = 20.0
+# Least resistance of a cell, ohm, up to the q_mobile of a new one; larger cells of the same electrodes have a smaller one. The
+# bundled cells show 0.105 ohm and more when the load is switched on, those of the tasks have 0.1 ohm and more.
+_LEAST_RESISTANCE_OHM, _NEW_Q_C = 0.1, NEW_CELL.q_mobile
+# Time constant with which the ohmic drop follows the current at most, s: cells may be twice as slow as the model's.
+_FOLLOWS_S = 2.0 * NEW_CELL.to
+# Under a current that was steady for so long, s, the voltage of a cell does not rise by so much, V.
+_STEADY_S, _RISE_V = 60.0, 0.05
+# Smaller changes of the current than this, A, hardly show in the voltage. Where a load falls in such steps, a rise of the
+# voltage by this resistance, ohm, says nothing.
+_LEAST_JUMP_A, _MOST_RESISTANCE_OHM = 0.05, 0.6
+# A change of more than so many standard deviations of the noise is not noise. The middle one of three samples has this share
+# of their noise.
+_NOISES, _SMOOTHED_SHARE = 8.0, 0.67
+# A cell from which this share of its charge was drawn does not come back to the voltage of its first sample without a charge.
+_RECOVERY_SHARE = 0.2
+# A load that was switched for at least this long, s, and this many samples shows in the voltage: the ohmic drop of the model
+# comes to 80 % in 10 s.
+_LEAST_PULSE_S, _LEAST_PULSE_SAMPLES = 10.0, 3
+# So many voltages are kept, about this far apart, s: all that are kept cover the window in which a voltage may not rise.
+_KEPT, _KEPT_EVERY_S = 32, 0.9
+# What model and cell part by is averaged over about so many samples before a gap, and how fast the voltage falls over so long,
+# s; after it the middle voltage of three counts.
+_PARTED_MEMORY, _RATE_MEMORY_S, _PARTED_SAMPLES = 8.0, 100.0, 3
+# Standard deviation of the difference of both, as a share of the noise.
+_PARTED_NOISE_SHARE = 0.72
+
+_compiled = njit(cache=True, error_model="numpy")
+
+
+def table(columns: str | list[tuple[Any, ...]]) -> np.dtype[np.void]:
+    """The type of a row: numbers by their names, or names with types."""
+    return np.dtype([(name, "f8") for name in columns.split()] if isinstance(columns, str) else columns, align=True)
+
+
+# The start: the first sample, and within the start window the largest current and the least voltage.
+_START = table([("at_rest", "b1"), *((name, "f8") for name in ("first_V", "first_A", "most_A", "least_V"))])
+
+# The two voltages before the one at hand, and time and current of the last of them: the middle one of three is examined.
+_BEFORE = table("voltage_2_V voltage_1_V time_1_s current_1_A")
+
+# The last sample that was examined, the current that the ohmic drop stands for then, the largest magnitude of the current, and
+# when the current last jumped.
+_EXAMINED = table(
+    [("count", "i8"), *((f, "f8") for f in ("time_s", "voltage_V", "current_A", "lagging_A", "largest_A", "jump_s"))]
+)
+
+# The last switch of the load: the part of its size that the voltage has to follow, the voltages before and since.
+_SWITCH = table("time_s size_A to_follow_A before_V lowest_V highest_V samples")
+
+# Some samples of the last minute, and the last changes of the voltage from sample to sample, in rings.
+_RING = table(
+    [
+        *(("n_kept", "i8"), ("time_s", "f8", _KEPT), ("voltage_V", "f8", _KEPT), ("current_A", "f8", _KEPT)),
+        *(("n_changes", "i8"), ("change_V", "f8", _KEPT)),
+    ]
+)
+
+# What was expected before a gap: the last interval, the voltage, by how much cell and model part and how fast the voltage
+# falls, both in the mean; the longest intervals under load that were not in doubt, in their order.
+_USUAL = table(
+    [*((name, "f8") for name in ("interval_s", "expected_V", "parted_V", "fall_V_per_s")), ("longest_s", "f8", gaps.HABIT)]
+)
+
+# The last gap, pending until the voltages after it were seen: its charge, the fall of the model within it, the voltage of the
+# model after it, the first voltages then, and how many; 0: none is pending.
+_GAP = table("length_s end_s charge_C fall_V model_V after_V next_V samples")
+
+# The first fault that was found, 0 if there is none: when, and how large it is.
+_FAULT = table([("condition", "i8"), *((name, "f8") for name in ("time_s", "since_s", "size"))])
+
+#: What the samples of a discharge have shown so far.
+SEEN = table(
+    [
+        ("samples", "i8"),
+        ("time_s", "f8"),
+        ("current_A", "f8"),  # since the last sample
+        ("drawn_C", "f8"),
+        ("start_V", "f8"),  # of a cell at rest with the charge expected at the start; NaN: none is
+        ("start", _START),
+        ("before", _BEFORE),
+        ("examined", _EXAMINED),
+        ("switch", _SWITCH),
+        ("ring", _RING),
+        ("usual", _USUAL),
+        ("gap", _GAP),
+        ("doubt_C", "f8"),  # charge of gaps that are in doubt
+        ("fault", _FAULT),
+    ]
+)
+
+
+def watched(
+    record: Samples, cell: CellParameters, initial_soc: float | None, q_mobile: float, r_o: float, rested: bool = False
+) -> Any:
+    """What the samples of a whole record show, beside an estimate. ``initial_soc`` is ``None`` where no rest is expected."""
+    seen = np.zeros(1, SEEN)
+    seen["start_V"] = nan if initial_soc is None else rest_voltage_V(cell, initial_soc)
+    seen["start"]["at_rest"] = rested
+    time_s, voltage_V, current_A = (np.ascontiguousarray(column) for column in record)
+    _watch_all(seen, time_s, voltage_V, current_A, q_mobile, r_o, cell.q_mobile)
+    return seen[0]
+
+
+def note_samples(
+    diagnosis: Diagnosis,
+    record: Samples,
+    cell: CellParameters,
+    initial_soc: float | None,
+    q_mobile: float,
+    r_o: float,
+    rested: bool,
+) -> None:
+    """Note what the start of a record and its sensors say against an estimate, as :func:`watched`."""
+    seen = watched(record, cell, initial_soc, q_mobile, r_o, rested)
+    said = measured(seen, initial_soc or 1.0, float(record.time_s[0]))
+    for number in (start_condition(seen, q_mobile, r_o), int(seen["fault"]["condition"])):
+        if number:
+            diagnosis.note(Condition.numbered(number), **said)
+
+
+def measured(seen: Any, initial_soc: float, clock_s: float = 0.0) -> dict[str, Any]:
+    """What texts say of samples, by the names in their braces, on a clock of its own."""
+    fault, gap = seen["fault"], seen["gap"]
+    end_s = clock_s + gap["end_s"]
+    return start_measured(float(seen["start"]["first_V"]), float(seen["start_V"]), initial_soc) | {
+        "fault_s": clock_s + fault["time_s"],
+        "since_s": clock_s + fault["since_s"],
+        "size": fault["size"],
+        "gap_start_s": end_s - gap["length_s"],
+        "gap_end_s": end_s,
+        "gap_C": gap["charge_C"],
+    }
+
+
+@_compiled
+def _watch_all(
+    rows: NDArray[np.void],
+    time_s: FloatArray,
+    voltage_V: FloatArray,
+    current_A: FloatArray,
+    q_mobile: float,
+    r_o: float,
+    cell_q_mobile: float,
+) -> None:
+    seen = rows[0]
+    for n in range(len(time_s)):
+        begin(seen, time_s[n] - time_s[max(n - 1, 0)])
+        examine(seen, voltage_V[n], current_A[n], q_mobile, r_o, cell_q_mobile)
+        remember(seen, voltage_V[n], current_A[n])
+
+
+@_compiled
+def begin(seen: Row, duration: float) -> None:
+    """Count the time since the sample before, and the charge drawn in it."""
+    seen.samples += 1
+    seen.time_s += duration
+    seen.drawn_C += seen.current_A * duration
+
+
+@_compiled
+def examine(seen: Row, voltage: float, current: float, q_mobile: float, r_o: float, cell_q_mobile: float) -> None:
+    """Look whether one more voltage belongs to its current, beside an estimate and the model's cell."""
+    if seen.samples > 1 and not isnan(voltage):
+        before, ring = seen.before, seen.ring
+        ring.change_V[ring.n_changes % _KEPT] = abs(voltage - before.voltage_1_V)
+        ring.n_changes += 1
+        middle_V = _middle(before.voltage_2_V, before.voltage_1_V, voltage)
+        _examine_last(seen, middle_V, _least_resistance_ohm(q_mobile, r_o), max(q_mobile, cell_q_mobile))
+    _note_start(seen, voltage, current)
+
+
+@_compiled
+def remember(seen: Row, voltage: float, current: float) -> None:
+    """Keep a sample that was examined."""
+    before = seen.before
+    if not isnan(voltage):
+        before.voltage_2_V = before.voltage_1_V if seen.samples > 1 else voltage
+        before.voltage_1_V, before.time_1_s, before.current_1_A = voltage, seen.time_s, current
+    seen.current_A = current
+
+
+@_compiled
+def _least_resistance_ohm(q_mobile: float, r_o: float) -> float:
+    # of those that a cell can show: of other cells, of larger ones, and of the estimate
+    return max(min(_LEAST_RESISTANCE_OHM, _LEAST_RESISTANCE_OHM * _NEW_Q_C / q_mobile, r_o), 0.0)
+
+
+@_compiled
+def _note_start(seen: Row, voltage: float, current: float) -> None:
+    start = seen.start
+    if seen.samples == 1:
+        start.first_V, start.first_A, start.most_A, start.least_V = voltage, current, current, voltage
+        if start.at_rest:
+            start.first_A = 0.0
+    elif seen.samples == 2 or seen.time_s <= _START_WINDOW_S:
+        start.most_A = max(start.most_A, current)
+        if not isnan(voltage):
+            start.least_V = min(start.least_V, voltage)
+
+
+@_compiled
+def start_condition(seen: Row, q_mobile: float, r_o: float) -> int:
+    """
+    Say why a cell cannot have started with the charge expected; 0 if it can. At rest its voltage tells. A first sample
+    under load is corrected by the least ohmic drop that the cell can have: a full cell of a larger resistance cannot be told
+    from one that lacks some charge.
+    """
+    start, (below_V, above_V) = seen.start, FULL_REST_V
+    drop_V = _least_resistance_ohm(q_mobile, r_o) * max(start.first_A, 0.0)
+    if start.first_V > seen.start_V + above_V:
+        return Condition.START_ABOVE + 0
+    if not start.first_V < seen.start_V - below_V:
+        return 0
+    if start.first_A <= SWITCH_SHARE * start.most_A or start.first_V - start.least_V >= 0.5 * drop_V:
+        return Condition.START_BELOW + 0
+    return Condition.START_LOADED + 0 if start.first_V + drop_V < seen.start_V - below_V else 0
+
+
+@_compiled
+def _lagging_current_A(before_A: float, current_A: float, duration_s: float) -> float:
+    # what the ohmic drop stands for after a while; it follows slowly
+    return before_A + (before_A - current_A) * expm1(-duration_s / _FOLLOWS_S)
+
+
+@_compiled
+def _change_to_follow_A(switched_A: float, current_A: float, lagging_A: float) -> float:
+    # how much of a current step the ohmic drop must follow: little after a pulse too short for it to build up
+    return max(min(current_A - lagging_A, max(switched_A, 0.0)), min(switched_A, 0.0))
+
+
+@_compiled
+def _noise_V(seen: Row) -> float:
+    # what is more than noise; infinite as long as there are too few samples to tell
+    n = min(seen.ring.n_changes, _KEPT)
+    if n < _KEPT // 4:
+        return inf
+    return _NOISES * _SMOOTHED_SHARE * float(np.median(seen.ring.change_V[:n])) / (0.6745 * sqrt(2.0))
+
+
+@_compiled
+def _find(seen: Row, condition: int, time_s: float, size: float) -> None:
+    # the first one is kept
+    fault = seen.fault
+    if fault.condition == 0:
+        fault.condition, fault.time_s, fault.size = condition, time_s, size
+
+
+@_compiled
+def _conclude_switch(seen: Row, resistance_ohm: float) -> None:
+    # whether the voltage followed the last switch of the load by half of the least ohmic drop
+    switch = seen.switch
+    drop_V = 0.5 * resistance_ohm * switch.to_follow_A
+    if abs(drop_V) > _noise_V(seen):
+        followed_V = switch.before_V - (switch.lowest_V if drop_V > 0.0 else switch.highest_V)
+        if followed_V / drop_V < 1.0:
+            _find(seen, Condition.NOT_FOLLOWED, switch.time_s, switch.size_A)
+    switch.size_A = 0.0
+
+
+@_compiled
+def _note_switch(seen: Row, time_s: float, current: float, resistance_ohm: float) -> None:
+    # whether the load jumped, or was switched, since the last sample that was examined
+    switch, last = seen.switch, seen.examined
+    last.largest_A = max(last.largest_A, abs(current))
+    if last.count == 0:
+        switch.time_s = last.jump_s = time_s
+        return
+    switched_A = current - last.current_A
+    if abs(switched_A) > min(SWITCH_SHARE * last.largest_A, _LEAST_JUMP_A):
+        last.jump_s = time_s
+    if abs(switched_A) > SWITCH_SHARE * last.largest_A:
+        if switch.size_A != 0.0 and time_s - switch.time_s >= _LEAST_PULSE_S and switch.samples >= _LEAST_PULSE_SAMPLES:
+            _conclude_switch(seen, resistance_ohm)
+        switch.time_s, switch.size_A, switch.before_V = time_s, switched_A, last.voltage_V
+        switch.to_follow_A = _change_to_follow_A(switched_A, current, last.lagging_A)
+        switch.lowest_V, switch.highest_V, switch.samples = inf, -inf, 0.0
+    last.lagging_A = _lagging_current_A(last.lagging_A, last.current_A, time_s - last.time_s)
+
+
+@_compiled
+def _look_for_rise(seen: Row, time_s: float, voltage: float, current: float) -> None:
+    # since the voltage a little more than the window ago, under a current that has been steady since long before
+    ring = seen.ring
+    for back in range(2, min(ring.n_kept, _KEPT) + 1):
+        n = (ring.n_kept - back) % _KEPT
+        since_s = time_s - ring.time_s[n]
+        if since_s > _START_WINDOW_S:
+            rise_V = voltage - ring.voltage_V[n] - _MOST_RESISTANCE_OHM * max(ring.current_A[n] - current, 0.0)
+            was_steady = time_s - since_s - seen.examined.jump_s >= _STEADY_S
+            if was_steady and rise_V > _RISE_V and rise_V > _noise_V(seen):
+                _find(seen, Condition.RISES, time_s - since_s, rise_V)
+            break
+    if ring.n_kept == 0 or time_s - ring.time_s[(ring.n_kept - 1) % _KEPT] >= _KEPT_EVERY_S:
+        n = ring.n_kept % _KEPT
+        ring.time_s[n], ring.voltage_V[n], ring.current_A[n] = time_s, voltage, current
+        ring.n_kept += 1
+
+
+@_compiled
+def _examine_last(seen: Row, voltage: float, resistance_ohm: float, most_q: float) -> None:
+    # The sample before the one at hand, with the middle voltage of three, which is no single wild one
+    last, switch = seen.examined, seen.switch
+    time_s, current = seen.before.time_1_s, seen.before.current_1_A
+    _note_switch(seen, time_s, current, resistance_ohm)
+    if switch.size_A != 0.0:
+        switch.lowest_V, switch.highest_V = min(switch.lowest_V, voltage), max(switch.highest_V, voltage)
+        switch.samples += 1.0
+        if time_s - switch.time_s > _START_WINDOW_S and switch.samples >= _LEAST_PULSE_SAMPLES:
+            _conclude_switch(seen, resistance_ohm)
+    _look_for_rise(seen, time_s, voltage, current)
+    # under a steady load the voltage at rest is higher by the ohmic drop at least; a charge that is seen raises it
+    drop_V = resistance_ohm * max(current, 0.0) if time_s - switch.time_s > _START_WINDOW_S else 0.0
+    is_high = voltage + drop_V > seen.start_V - FULL_REST_V[0] and min(current, last.lagging_A) >= -REST_CURRENT_A
+    if is_high and seen.drawn_C > _RECOVERY_SHARE * most_q:
+        _find(seen, Condition.RECOVERED, time_s, seen.drawn_C)
+    last.count += 1
+    last.time_s, last.voltage_V, last.current_A = time_s, voltage, current
+
+
+@_compiled
+def _middle(a: float, b: float, c: float) -> float:
+    return max(min(a, b), min(max(a, b), c))
+
+
+@_compiled
+def _note_interval(seen: Row, interval_s: float, load_A: float) -> None:
+    # one that was no gap, or whose charge was drawn
+    longest_s = seen.usual.longest_s
+    if interval_s > longest_s[0] and load_A > REST_CURRENT_A:
+        longest_s[0] = interval_s
+        longest_s.sort()
+
+
+@_compiled
+def _open_gap(
+    seen: Row, voltage: float, current: float, duration: float, expected_V: float, charge_C: float, load_A: float
+) -> None:
+    gap, usual = seen.gap, seen.usual
+    if gap.samples > 0.0:
+        seen.doubt_C += gap.charge_C
+    gap.length_s, gap.end_s, gap.charge_C, gap.samples = duration, seen.time_s, charge_C, 1.0
+    # the filter gives way to the samples after a gap, so that these are compared with what it had expected before
+    gap.fall_V = usual.expected_V - expected_V
+    if seen.time_s - duration - seen.examined.jump_s >= _STEADY_S:
+        # a model whose q_mobile is not known yet may take its cell for empty: the voltage falls at least as it did before
+        gap.fall_V = min(gap.fall_V, usual.fall_V_per_s * duration)
+    gap.model_V = usual.expected_V + usual.parted_V - gap.fall_V
+    gap.after_V = voltage
+    if isnan(voltage) or abs(current - seen.current_A) > SWITCH_SHARE * load_A:
+        gap.fall_V = 0.0  # which leaves it in doubt
+
+
+@_compiled
+def _close_gap(seen: Row, voltage: float, load_A: float) -> None:
+    gap = seen.gap
+    after_V = _middle(gap.after_V, gap.next_V, voltage)
+    sd_V = _PARTED_NOISE_SHARE * _noise_V(seen) / (_NOISES * _SMOOTHED_SHARE)
+    said = gaps.verdict(after_V - gap.model_V, gap.fall_V, sd_V, gaps.MOST_SHARE_SO_FAR)
+    if said == gaps.DRAWN:
+        _note_interval(seen, gap.length_s, load_A)
+    else:
+        seen.doubt_C += gap.charge_C
+    if said == gaps.NOT_DRAWN and seen.fault.condition == 0:
+        seen.fault.since_s = gap.end_s - gap.length_s
+        _find(seen, Condition.NOT_DRAWN, gap.end_s, gap.charge_C)
+    gap.samples = 0.0
+
+
+@_compiled
+def follow_gaps(seen: Row, voltage: float, current: float, duration: float, expected_V: float, q_mobile: float) -> None:
+    """
+    Look whether the charge of gaps was drawn, at one sample that is not the first, of which the model expected a voltage. A
+    gap is pending from its end until the voltages after it were seen.
+    """
+    gap, usual = seen.gap, seen.usual
+    load_A = max(abs(seen.current_A), abs(current))
+    if gap.samples > 0.0 and gap.length_s <= gaps.GAP_RATIO * duration and seen.time_s - duration == gap.end_s:
+        gap.samples = 0.0  # the samples are as far apart from now on
+    charge_C = 0.0
+    if duration > gaps.GAP_RATIO * usual.longest_s[0]:  # else the logger has a habit of it
+        charge_C = gaps.doubtful_charge_C(usual.interval_s, duration, 0.0, load_A, q_mobile)
+    if charge_C > 0.0:
+        _open_gap(seen, voltage, current, duration, expected_V, charge_C, load_A)
+    else:
+        _note_interval(seen, duration, min(abs(seen.current_A), abs(current)))
+        if gap.samples > 0.0 and not isnan(voltage):
+            gap.samples += 1.0
+            if gap.samples < _PARTED_SAMPLES:
+                gap.next_V = voltage
+                # by how much it falls from one sample to the next
+                gap.model_V -= gap.fall_V * (seen.time_s - gap.end_s) / gap.length_s
+            else:
+                _close_gap(seen, voltage, load_A)
+    if not isnan(voltage):
+        if gap.samples == 0.0:
+            usual.parted_V += (voltage - expected_V - usual.parted_V) / min(seen.samples - 1.0, _PARTED_MEMORY)
+        usual.expected_V = expected_V
+        if charge_C == 0.0 and seen.samples > 2:
+            fall_V_per_s = (seen.before.voltage_1_V - voltage) / duration
+            usual.fall_V_per_s += -expm1(-duration / _RATE_MEMORY_S) * (fall_V_per_s - usual.fall_V_per_s)
+    usual.interval_s = duration

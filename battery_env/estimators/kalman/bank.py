@@ -1,0 +1,349 @@
+"""A bank of Kalman filters, each from its own part of the prior of ``q_mobile``, compiled (numba)."""
+
+from __future__ import annotations
+
+from math import exp, hypot, inf, isnan, log, nan, sqrt
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from battery_env.arrays import FloatArray
+from battery_env.electrochemistry import (
+    QNB,
+    QNS,
+    QPS,
+    STATE_SIZE,
+    TB,
+    CellParameters,
+    PackedConstants,
+    initial_state,
+    rest_shares,
+)
+from battery_env.electrochemistry.kernels import MOLE_FRACTION_MARGIN, cell_voltage
+from battery_env.electrochemistry.tangents import (
+    BY_Q,
+    BY_R,
+    PolynomialDerivatives,
+    least_q,
+    step_with_tangents,
+    voltage_curvature,
+    voltage_tangents,
+)
+from battery_env.estimators.diagnosis.conditions import (
+    MISMATCH_MARGIN,
+    PLAUSIBLE_Q_SHARES,
+    PRIOR_LIMIT_SD,
+    SETTLED_SHARES,
+    Condition,
+)
+from battery_env.estimators.diagnosis.samples import Row, start_condition
+from battery_env.estimators.kalman.state import FILTER, OFFSET, Q, R, Settings
+
+#: Standard deviations. Innovations count in full within the gate. A filter whose successive innovations are correlated, whose
+#: estimate leaves the range that it stated, or whose offset is beyond the stated one, by more than the limit does not follow
+#: its cell.
+GATE_SD, LIMIT_SD = 5.0, 5.0
+
+# The last innovations, and the products of each one with those before it, are averaged with these weights of what was.
+_TREND_MEMORY, _PRODUCTS_MEMORY = 0.8, 0.999
+# A filter is linear over its standard deviation of q_mobile: a wider prior is divided among filters this far apart (as a
+# share of its mean), over so many standard deviations to each side.
+_WIDEST_SHARE = 0.08
+_REACH_SD = 2.5
+# A filter is given up when its weight falls below this share of the heaviest one's, and merged with that one when both say the
+# same, within this share of a standard deviation.
+_LEAST_LOG_WEIGHT = -15.0
+_SAME_SHARE = 0.25
+# The data must have narrowed a prior by this share of its width before a deviation from it says anything.
+_LEAST_NARROWING = 0.2
+_SHARES = (SETTLED_SHARES["q_mobile"], SETTLED_SHARES["r_o"])
+# The noise that innovations show is averaged over about this many samples.
+_NOISE_MEMORY = 32.0
+
+_compiled = njit(cache=True, error_model="numpy")
+_inlined = njit(cache=True, error_model="numpy", forceinline=True)
+
+
+def filters_of_prior(
+    means: tuple[float, float],
+    sds: tuple[float, float, float],
+    bounds_C: tuple[float, float],
+    cell: CellParameters,
+    soc: float,
+) -> NDArray[np.void]:
+    """The filters that a prior takes, before the first sample of a cell at rest."""
+    (q, r_o), sd_q = means, sds[Q]
+    half = int(np.ceil(_REACH_SD * sd_q / (_WIDEST_SHARE * q))) if sd_q > _WIDEST_SHARE * q else 0
+    deviations = np.linspace(-_REACH_SD, _REACH_SD, 2 * half + 1) if half else np.zeros(1)
+    q_mobile = q + sd_q * deviations
+    inside = (q_mobile >= bounds_C[0]) & (q_mobile <= bounds_C[1])
+    q_mobile, deviations = q_mobile[inside], deviations[inside]
+    filters = np.zeros(len(q_mobile), FILTER)
+    filters["state"][:, 0] = initial_state(q_mobile, cell, soc)
+    filters["tangents"][:, 0, BY_Q, QNB:] = rest_shares(soc)
+    filters["mean"] = np.column_stack([q_mobile, np.full(len(q_mobile), r_o), np.zeros(len(q_mobile))])
+    filters["covariance"] = np.diag(np.square([_REACH_SD / half * sd_q if half else sd_q, *sds[1:]]))
+    filters["log_weight"] = -0.5 * deviations**2
+    return filters
+
+
+@_inlined
+def _move(one: Row, q_change: float, r_change: float) -> None:
+    # Another estimate is another past: the state goes along with it, by its tangents. For the charges that is exact.
+    state, tangents, mean = one.state, one.tangents, one.mean
+    for j in range(STATE_SIZE):
+        state[0, j] += tangents[0, BY_Q, j] * q_change + tangents[0, BY_R, j] * r_change
+    mean[Q] += q_change
+    mean[R] += r_change
+
+
+@_inlined
+def _keep_alive(one: Row, settings: Settings, constants: FloatArray) -> bool:
+    # Raises q_mobile to what the charge drawn so far takes; tells whether the model cell has a voltage then.
+    q, least = one.mean[Q], 0.0
+    for surface in (QNS, QPS):
+        slope = one.tangents[0, BY_Q, surface]
+        least = max(least, least_q(one.state[0, surface], slope, q, MOLE_FRACTION_MARGIN, constants))
+    if least > q:
+        if one.covariance[Q, Q] == 0.0 or least > settings.bounds[Q][1]:
+            return False
+        _move(one, least - q, 0.0)
+    return True
+
+
+@_inlined
+def _predict(one: Row, current: float, duration: float, settings: Settings, constants: FloatArray) -> None:
+    q, r_o, p = one.mean[Q], one.mean[R], one.covariance
+    steps = int(np.ceil(duration / settings.dt_s - 1e-6))
+    for _ in range(steps):
+        step_with_tangents(one.state, one.tangents, 0, current, q, r_o, duration / steps, settings.thermal, True, constants)
+    p[Q, Q] += settings.growth[Q] * duration
+    p[R, R] += settings.growth[R] * duration
+    p[OFFSET, OFFSET] += settings.offset_growth * duration
+
+
+@_inlined
+def _common_error_sd(one: Row, settings: Settings) -> float:
+    # What an error of the model that is common to the discharge leaves open of q_mobile, without its prior, however many
+    # samples there are: as much as least squares state. Theirs is the worst error of the stated mean square. Once the knee is
+    # seen, almost all of that lies on the few samples there, but an error beyond the margin would show: it is no larger.
+    told, (q_prior, r_prior), mismatch_V2 = one.told, settings.variance, settings.mismatch_V2
+    if mismatch_V2 == 0.0 or q_prior == 0.0 or told.charge_C == 0.0:
+        return 0.0
+    beside_r = told.qq
+    if r_prior > 0.0:
+        beside_r -= told.qr * told.qr / (told.rr + mismatch_V2 * told.charge_C / r_prior)
+    if not beside_r > 0.0:
+        return inf
+    spread = min(1.0, MISMATCH_MARGIN * told.q / sqrt(told.charge_C * told.qq))
+    return spread * sqrt(mismatch_V2 * told.charge_C / beside_r)
+
+
+@_inlined
+def _correct(
+    one: Row,
+    voltage: float,
+    charge: float,
+    noise: float,
+    settings: Settings,
+    packed: PackedConstants,
+    derivatives: PolynomialDerivatives,
+) -> None:
+    # One measurement, to second order in q_mobile; charge: what flowed since the last one
+    state, tangents, mean, p = one.state, one.tangents, one.mean, one.covariance
+    q, r_o = mean[Q], mean[R]
+    by_q, by_r = voltage_tangents(state, tangents, 0, q, settings.thermal, packed, derivatives)
+    h = (by_q, by_r, 1.0)
+    # over the spread of q_mobile a curved voltage is higher by this in the mean, with twice its square as the variance
+    bend = 0.5 * voltage_curvature(state, tangents, 0, q, packed, derivatives) * p[Q, Q]
+    ph = (
+        p[0, 0] * h[0] + p[0, 1] * h[1] + p[0, 2] * h[2],
+        p[1, 0] * h[0] + p[1, 1] * h[1] + p[1, 2] * h[2],
+        p[2, 0] * h[0] + p[2, 1] * h[1] + p[2, 2] * h[2],
+    )
+    explained = h[0] * ph[0] + h[1] * ph[1] + h[2] * ph[2] + 2.0 * bend * bend
+    innovation = voltage - cell_voltage(state, 0, q, True, packed) - bend - mean[OFFSET]
+    one.expected_V = voltage - innovation
+    variance = explained + noise
+    sd = sqrt(variance)
+    # innovations may show more than the stated mismatch before they contradict it
+    spare_V2 = (MISMATCH_MARGIN**2 - 1.0) * settings.mismatch_V2
+    one.innovation = min(max(innovation / sqrt(variance + spare_V2), -GATE_SD), GATE_SD)
+    one.shown_V2 = min(innovation * innovation, (GATE_SD * sd) ** 2) - explained
+    beyond = max(abs(innovation) / sd / GATE_SD, 1.0)
+    # Huber's loss: quadratic up to the gate, linear beyond, where a larger variance stands for it
+    loss = innovation * innovation / variance if beyond == 1.0 else GATE_SD**2 * (2.0 * beyond - 1.0)
+    one.log_weight -= 0.5 * loss + log(sd)
+    variance *= beyond * beyond
+    gain = (ph[0] / variance, ph[1] / variance, ph[2] / variance)
+    for j in range(3):
+        for k in range(j + 1):
+            # Joseph's form, multiplied out
+            p[j, k] += gain[j] * gain[k] * variance - gain[j] * ph[k] - ph[j] * gain[k]
+            p[k, j] = p[j, k]
+    told = one.told
+    told.q += charge * abs(by_q)
+    told.qq += charge * by_q * by_q
+    told.qr += charge * by_q * by_r
+    told.rr += charge * by_r * by_r
+    told.charge_C += charge
+    (least_q_C, most_q_C), (least_r, most_r) = settings.bounds
+    to_q = min(max(q + gain[Q] * innovation, least_q_C), most_q_C)
+    to_r = min(max(r_o + gain[R] * innovation, least_r), most_r)
+    mean[OFFSET] += gain[OFFSET] * innovation
+    # along the curve of the voltage over the state of charge: with a smaller q_mobile the record comes further
+    if told.qq > 0.0:
+        scale = exp(-0.5 * (1.0 + told.charge_C * by_q * by_q / told.qq) * (to_q / q - 1.0))
+        told.q *= scale
+        told.qq *= scale * scale
+        told.qr *= scale
+    _move(one, to_q - q, to_r - r_o)
+
+
+@_inlined
+def _heaviest(filters: Row) -> int:
+    best = 0
+    for m in range(1, len(filters)):
+        if filters[m].log_weight > filters[best].log_weight:
+            best = m
+    return best
+
+
+@_compiled
+def _reduce(filters: Row) -> int:
+    # Makes weights relative to the heaviest filter's, gives up light ones and merges equal ones; returns the heaviest.
+    best = _heaviest(filters)
+    heaviest, total = filters[best], 1.0
+    mean, p, log_weight = heaviest.mean, heaviest.covariance, heaviest.log_weight
+    for m in range(len(filters)):
+        one = filters[m]
+        if m == best or one.log_weight == -inf:
+            continue
+        one.log_weight -= log_weight
+        same = True
+        for j in range(2):
+            same &= abs(one.mean[j] - mean[j]) <= _SAME_SHARE * sqrt(p[j, j])
+            same &= abs(one.covariance[j, j] - p[j, j]) <= _SAME_SHARE * p[j, j]
+        if same or one.log_weight < _LEAST_LOG_WEIGHT:
+            total += exp(one.log_weight)
+            one.log_weight = -inf
+    heaviest.log_weight = log(total)
+    return best
+
+
+@_inlined
+def _mix(bank: Row, filters: Row, best: int, voltage: float) -> None:
+    # Moments of the mixture, about the heaviest filter, and what its innovations show
+    middle = filters[best].mean
+    total, q, r, qq, rr, square, normalized = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for m in range(len(filters)):
+        one = filters[m]
+        if one.log_weight > -inf:
+            weight, dq, dr = exp(one.log_weight), one.mean[Q] - middle[Q], one.mean[R] - middle[R]
+            total += weight
+            q += weight * dq
+            r += weight * dr
+            qq += weight * (one.covariance[Q, Q] + dq * dq)
+            rr += weight * (one.covariance[R, R] + dr * dr)
+            square += weight * one.shown_V2
+            normalized += weight * one.innovation
+    q, r = q / total, r / total
+    normalized /= total
+    if not isnan(voltage):
+        bank.noise_V2 = max(bank.noise_V2 + (square / total - bank.noise_V2) / _NOISE_MEMORY, 0.0)
+        bank.products = _PRODUCTS_MEMORY * bank.products + normalized * bank.last
+        bank.variance = _PRODUCTS_MEMORY**2 * bank.variance + 1.0
+        bank.trend_sd = max(bank.trend_sd, bank.products / sqrt(bank.variance))
+        bank.last = _TREND_MEMORY * bank.last + sqrt(1.0 - _TREND_MEMORY**2) * normalized
+    bank.mean[Q], bank.mean[R] = middle[Q] + q, middle[R] + r
+    bank.sd[Q], bank.sd[R] = sqrt(qq / total - q * q), sqrt(rr / total - r * r)
+
+
+@_inlined
+def _doubt(bank: Row, offset_V: float) -> None:
+    # An offset beyond the stated one, and an r_o out of the range that was stated before, contradict the filter
+    if offset_V**2 > LIMIT_SD**2 * bank.offset_V2:
+        bank.trend_sd = inf
+    r_o, reach = bank.mean[R], LIMIT_SD * bank.sd[R]
+    if reach > 0.0:
+        bank.least_r, bank.most_r = max(bank.least_r, r_o - reach), min(bank.most_r, r_o + reach)
+        if not bank.least_r <= r_o <= bank.most_r:
+            bank.trend_sd = inf
+
+
+@_inlined
+def take(
+    cell: Row, filters: Row, sample: Row, settings: Settings, packed: PackedConstants, derivatives: PolynomialDerivatives
+) -> None:
+    """Take in one sample of a cell; unchecked."""
+    bank, voltage, duration, temperature = cell.bank, sample.voltage_V, sample.dt_s, sample.temperature_K
+    constants, current = packed.constants, cell.seen.current_A
+    noise, charge = max(bank.noise_V2, settings.noise_V2), abs(current) * duration
+    before = _heaviest(filters)
+    for m in range(len(filters)):
+        one = filters[m]
+        if one.log_weight > -inf:
+            if duration > 0.0:
+                _predict(one, current, duration, settings, constants)
+            if not isnan(temperature):
+                # measured, it is no function of the parameters any more
+                one.state[0, TB] = temperature
+                one.tangents[0, BY_Q, TB] = one.tangents[0, BY_R, TB] = 0.0
+            if _keep_alive(one, settings, constants):
+                if not isnan(voltage):
+                    _correct(one, voltage, charge, noise, settings, packed, derivatives)
+                    _keep_alive(one, settings, constants)
+    best = _reduce(filters)
+    _mix(bank, filters, best, voltage)
+    bank.has_voltage = _keep_alive(filters[best], settings, constants)
+    bank.offset_V2 += settings.offset_growth * duration
+    _doubt(bank, filters[best].mean[OFFSET])
+    bank.expected_V = filters[before].expected_V  # by the filter that did not know yet
+    bank.common_sd_q = _common_error_sd(filters[best], settings)
+
+
+@_compiled
+def _note(estimate: Row, condition: int, holds: bool) -> None:
+    # the row of the table that comes first counts
+    if holds and condition < estimate.condition:
+        estimate.condition = condition
+
+
+@_compiled
+def conclude(cell: Row, settings: Settings, estimate: Row) -> None:
+    """Say what a bank estimates after a sample that was examined, and what speaks against it; unchecked."""
+    bank, seen, searched = cell.bank, cell.seen, settings.searched
+    # what the error of the model leaves open beside the prior, what shows nowhere in the voltage, and what nobody saw
+    common_sd_q = (bank.common_sd_q**-2.0 + 1.0 / settings.variance[Q]) ** -0.5
+    doubt_C = seen.doubt_C + (seen.gap.charge_C if seen.gap.samples > 0.0 else 0.0)
+    own_sd = (max(bank.sd[Q], common_sd_q), max(bank.sd[R], 0.0))
+    estimate.q_mobile, estimate.r_o = bank.mean[Q], bank.mean[R]
+    estimate.condition = Condition.SETTLED + 0
+    start, fault = start_condition(seen, bank.mean[Q], bank.mean[R]), seen.fault.condition
+    _note(estimate, start, start > 0)
+    _note(estimate, fault, fault > 0)
+    _note(estimate, Condition.EMPTY, not bank.has_voltage)
+    least, most = PLAUSIBLE_Q_SHARES
+    plausible = least * settings.cell_q_mobile < bank.mean[Q] < most * settings.cell_q_mobile
+    _note(estimate, Condition.IMPLAUSIBLE, searched[Q] and not plausible)
+    _note(estimate, Condition.MISFIT, bank.trend_sd > LIMIT_SD)
+    for k in range(2):
+        if not searched[k]:
+            estimate.sd[k] = nan
+            continue
+        value, (low, high), (mean, prior_sd) = bank.mean[k], settings.bounds[k], settings.carried[k]
+        sd = hypot(hypot(own_sd[k], settings.scale_sd[k] * value), doubt_C if k == Q else 0.0)
+        estimate.sd[k] = sd
+        _note(estimate, Condition.Q_AT_BOUND + k, not low + bank.sd[k] < value < high - bank.sd[k])
+        if prior_sd > 0.0:
+            narrowed = max(prior_sd**2 - bank.sd[k] ** 2, (_LEAST_NARROWING * prior_sd) ** 2)
+            _note(estimate, Condition.Q_PRIOR_WRONG + k, (value - mean) ** 2 > PRIOR_LIMIT_SD**2 * narrowed)
+            # precisions add up
+            of_data = max(bank.sd[k] ** -2.0 - prior_sd**-2.0, 0.0) ** -0.5
+            of_data = max(of_data, bank.common_sd_q if k == Q else 0.0)
+            _note(estimate, Condition.Q_PRIOR_ALONE + k, of_data >= _SHARES[k] * value)
+        if not sd < _SHARES[k] * value:
+            _note(estimate, Condition.GAP_UNSURE, k == Q and doubt_C > 0.0)
+            _note(estimate, Condition.Q_SCALE_UNKNOWN + k, settings.scale_sd[k] >= _SHARES[k])
+            _note(estimate, Condition.Q_IMPRECISE + k, True)

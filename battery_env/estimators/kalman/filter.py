@@ -1,0 +1,400 @@
+"""Calibration during a discharge: an extended Kalman filter on voltage and current, of one cell or of many."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from math import inf, isnan, nan
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from battery_env.checks import ZERO_CELSIUS_K, check_gain_sd, check_not_negative, check_numbers
+from battery_env.electrochemistry import STATE_SIZE, CellParameters, PackedConstants, check_cell, check_dt
+from battery_env.electrochemistry.tangents import PolynomialDerivatives
+from battery_env.estimates import Estimate, Estimates, EstimateTrace
+from battery_env.estimators.diagnosis.conditions import Condition, rest_voltage_V
+from battery_env.estimators.diagnosis.rest import check_initial_soc
+from battery_env.estimators.diagnosis.samples import begin, examine, follow_gaps, measured, remember
+from battery_env.estimators.estimator import SURPLUS_SHARE, ModelNow, OnlineBatch, OnlineEstimator, check_bounds
+from battery_env.estimators.kalman.bank import conclude, filters_of_prior, take
+from battery_env.estimators.kalman.state import CELL, ESTIMATE, FILTER, SAMPLE, Q, R, Settings
+from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, check_parameters
+from battery_env.records import Record, Stream, are_plausible, check_drawn_charge, check_sample, starts_at_rest
+
+_PRIOR_SD_SHARE_Q = 0.25
+_PRIOR_SD_R_OHM = 0.15
+_HOUR_S = 3600.0
+_NOISE_V = 0.005
+# What reasons are made of
+_SHOWN = ("start", "fault", "gap", "start_V")
+
+
+class ExtendedKalmanFilter(OnlineEstimator):
+    """
+    Follows (q_mobile, r_o) along a discharge that starts with a cell at rest, fully charged unless ``initial_soc`` says
+    otherwise: one estimate a sample, with its standard deviation.
+
+    *State.* Given the current, the state of the model is a function of its two parameters; the charges are even linear in
+    ``q_mobile``, with slope ``FULL_CHARGE_SHARES``. So the covariance of the augmented state (states and parameters) has the
+    rank of the parameters from the start and keeps it: the filter carries the covariance of (q_mobile, r_o, offset) and the
+    derivatives of the state with respect to them (:mod:`battery_env.electrochemistry.tangents`). When an estimate moves
+    the state moves with it. A parameter not searched for has variance zero.
+
+    *Curvature.* Each measurement is taken to second order in ``q_mobile`` (Gaussian second-order filter): where the voltage is
+    curved over the spread of the estimate, at the knee above all, it counts for less.
+
+    *Wide priors.* Over the middle of a discharge many values of ``q_mobile`` explain the voltage; a single filter that starts
+    from a wide prior may take to a wrong one and claim to be sure. Such a prior is divided among several filters, each of them
+    weighted with the likelihood of its innovations; estimate and standard deviation are those of the mixture. Filters that
+    lost their weight or agree with the heaviest one are dropped. A prior of 8 % or less, carried over from an earlier
+    discharge, takes one filter.
+
+    *Gate.* Innovations count in full up to 5 standard deviations, and beyond as if the noise had been larger (Huber's loss): a
+    wild sample moves nothing far, and a filter that is wrong still finds back.
+
+    *Noise.* Where the innovations of the last 30 or so samples show more noise than stated, that noise is used; the first ones
+    count as stated.
+
+    *Bounds.* Estimates stay within their bounds, and ``q_mobile`` above the least value that has the charge drawn so far: mole
+    fractions never leave 0 .. 1. If ``q_mobile`` is held and too small for that, the estimate freezes and is not settled.
+
+    *Standard deviations* count the error of the model as noise that is new with each sample. As it is not, that of
+    ``q_mobile`` does not fall below what an error common to the whole discharge leaves open: before the knee what
+    :class:`~battery_env.estimators.LeastSquares` state, and at the knee what an error of twice ``mismatch_V`` at every sample
+    does, as a larger one would show. On whole discharges of the bundled cells that is about 1.2 % with ``mismatch_V=0.05``.
+
+    The gain of the current sensor scales both parameters and does not show in the voltage: state it as ``current_gain_sd``.
+
+    *A stream.* :meth:`update` takes sample after sample, at any intervals. Between two samples the current of the first one
+    flows; a cell at rest may be left alone for a week. A voltage that is missing (NaN) corrects nothing. Charge may flow back,
+    as far as the cell has room for it: the model charges by the same equations. A measured temperature is that of the model
+    then; the first one is also that of its surroundings.
+
+    *Settled* means that the data determine every parameter searched for: its standard deviation, without what a given prior
+    adds to it, is below :data:`~battery_env.estimators.diagnosis.conditions.SETTLED_SHARES` of its value; and that nothing
+    contradicts it: not the start of the record, the voltage where the load is switched, steady or not logged, a bound, the
+    kind of cell, the prior, nor the innovations, which may not go the same way again and again, with twice ``mismatch_V``
+    allowed for.
+    Otherwise ``reason`` of the estimate says which of these does not hold, the first one in the order of
+    :class:`~battery_env.estimators.diagnosis.Condition`. An estimate that rests on a prior is not settled: it is as good as
+    the prior.
+
+    The defaults are those of simulated records. For recorded cells take :func:`battery_env.calibrate`, or
+    ``battery_env.Settings(method="kalman").calibrator()``: a model of the temperature, and the errors of model and sensor to
+    expect. Give it :meth:`battery_env.Discharge.loaded_part`, which starts when the load is switched on.
+
+    :param parameters: which to search for; the other is held at ``cell``'s value
+    :param cell: constants of the model; ``None``: the new cell's
+    :param thermal: whether the temperature of the model moves
+    :param dt_s: longest time step of the model, s; that of simulated records if these are to be reproduced exactly
+    :param prior_q_mobile_C: mean and standard deviation of ``q_mobile`` before the discharge, C; ``None``: ``cell``'s value,
+        and a quarter of it
+    :param prior_r_o_ohm: likewise of ``r_o``, ohm; ``None``: ``cell``'s value, and 0.15 ohm
+    :param q_mobile_bounds_C: where the estimate stays, C
+    :param r_o_bounds_ohm: likewise, ohm
+    :param voltage_noise_V: standard deviation of the noise of one voltage sample, V; ``None``: ``mismatch_V``, and at least
+        0.005 V. A model that wanders by ``mismatch_V`` is not followed more closely from sample to sample
+    :param offset_sd_V: standard deviation of a constant offset of sensor and model, V; ``None``: ``mismatch_V``, and at least
+        0.005 V. With 0 errors are about half as large if there is no offset, and several percent if there is one of 10 mV
+    :param mismatch_V: how far the error of the model itself wanders in an hour (standard deviation of a random walk), V
+    :param drift_per_hour: how far the parameters may wander in an hour, as a share of their prior means. A little keeps the
+        filter awake
+    :param current_gain_sd: standard deviation of the gain of the current sensor, as a share of it
+    :param initial_soc: state of charge at the first sample, after a rest: a number, or (mean, standard deviation), which adds
+        to that of ``q_mobile``
+    :raises ValueError: for an argument out of range
+    """
+
+    def __init__(
+        self,
+        parameters: Sequence[str] = PARAMETER_NAMES,
+        cell: CellParameters | None = None,
+        thermal: bool = False,
+        dt_s: float = 1.0,
+        prior_q_mobile_C: tuple[float, float] | None = None,
+        prior_r_o_ohm: tuple[float, float] | None = None,
+        q_mobile_bounds_C: tuple[float, float] = (Q_MOBILE.limits[0], 1e5),
+        r_o_bounds_ohm: tuple[float, float] = (0.0, 1.0),
+        voltage_noise_V: float | None = None,
+        offset_sd_V: float | None = None,
+        mismatch_V: float = 0.0,
+        drift_per_hour: float = 0.001,
+        current_gain_sd: float = 0.0,
+        initial_soc: float | tuple[float, float] = 1.0,
+    ) -> None:
+        self.parameters = check_parameters(parameters)
+        self.cell = check_cell(cell, thermal)
+        self.thermal = thermal
+        self.dt_s = check_dt(dt_s, self.cell)
+        self.bounds = check_bounds(q_mobile_bounds_C, r_o_bounds_ohm)
+        offset_sd_V = max(_NOISE_V, mismatch_V) if offset_sd_V is None else offset_sd_V
+        check_not_negative(offset_sd_V=offset_sd_V, mismatch_V=mismatch_V, drift_per_hour=drift_per_hour)
+        voltage_noise_V = _checked_noise_V(voltage_noise_V, mismatch_V)
+        self.current_gain_sd = check_gain_sd(current_gain_sd)
+        self.initial_soc = check_initial_soc(initial_soc)
+        q, q_sd = self._prior("q_mobile", prior_q_mobile_C, _PRIOR_SD_SHARE_Q * self.cell.q_mobile)
+        r_o, r_o_sd = self._prior("r_o", prior_r_o_ohm, _PRIOR_SD_R_OHM)
+        self._means, self._sds = (q, r_o), (q_sd, r_o_sd, float(offset_sd_V))
+        soc, sd_soc = self.initial_soc
+        self._settings = Settings(
+            dt_s=self.dt_s,
+            thermal=thermal,
+            noise_V2=float(voltage_noise_V) ** 2,
+            mismatch_V2=float(mismatch_V) ** 2,
+            searched=("q_mobile" in self.parameters, "r_o" in self.parameters),
+            variance=(q_sd**2, r_o_sd**2),
+            growth=(
+                (drift_per_hour * q) ** 2 / _HOUR_S if q_sd > 0.0 else 0.0,
+                (drift_per_hour * r_o) ** 2 / _HOUR_S if r_o_sd > 0.0 else 0.0,
+            ),
+            offset_growth=float(mismatch_V) ** 2 / _HOUR_S,
+            bounds=(_pair(q_mobile_bounds_C), _pair(r_o_bounds_ohm)),
+            carried=(_pair(prior_q_mobile_C or (0.0, 0.0)), _pair(prior_r_o_ohm or (0.0, 0.0))),
+            scale_sd=(float(np.hypot(self.current_gain_sd, sd_soc / soc)), float(self.current_gain_sd)),
+            cell_q_mobile=float(self.cell.q_mobile),
+        )
+        self._derivatives = PolynomialDerivatives.of(self.cell.packed)
+        self._cells = np.zeros(1, CELL)
+        self._filters = np.zeros((1, len(self._start(self.cell))), FILTER)
+        self.reset()
+
+    def _prior(self, name: str, prior: tuple[float, float] | None, default_sd: float) -> tuple[float, float]:
+        if name not in self.parameters:
+            if prior is not None:
+                raise ValueError(f"a prior of {name} needs {name!r} among the parameters to search for")
+            return float(getattr(self.cell, name)), 0.0
+        mean, sd = (getattr(self.cell, name), default_sd) if prior is None else prior
+        low, high = self.bounds[name]
+        if not (low <= mean <= high and 0.0 < sd < inf):
+            raise ValueError(f"the prior of {name} is (mean within {low:g} .. {high:g}, sd above 0), got {prior!r}")
+        return float(mean), float(sd)
+
+    def _start(self, cell: CellParameters) -> NDArray[np.void]:
+        return filters_of_prior(self._means, self._sds, self._settings.bounds[0], cell, self.initial_soc[0])
+
+    def reset(self) -> None:
+        """Forget all samples: the next one is the first of a discharge, of a cell at rest with ``initial_soc``."""
+        self._cells[...] = np.zeros((), CELL)
+        bank = self._cells["bank"]
+        bank["least_r"], bank["most_r"], bank["offset_V2"] = -inf, inf, self._sds[2] ** 2
+        self._begin(self.cell.Tb0)
+
+    def _begin(self, ambient_K: float) -> None:
+        """Let the model start at this temperature, and in surroundings of it."""
+        self._cells["ambient_K"] = ambient_K
+        cell = self._cell_now()
+        self._cells["constants"] = cell.packed.constants
+        self._cells["seen"]["start_V"] = rest_voltage_V(cell, self.initial_soc[0])
+        self._filters[0] = self._start(cell)
+
+    def _cell_now(self) -> CellParameters:
+        ambient_K = float(self._cells["ambient_K"][0])
+        return self.cell if ambient_K == self.cell.Tb0 else self.cell.replace(Tb0=ambient_K)
+
+    def check(self, voltage_V: float, current_A: float, dt_s: float, temperature_C: float | None = None) -> None:
+        """Refuse a sample that :meth:`update` would refuse, and change nothing."""
+        seen = self._cells["seen"][0]
+        before_A = float(seen["current_A"]) if seen["samples"] else None
+        check_sample(voltage_V, current_A, dt_s, temperature_C, before_A)
+        check_drawn_charge(float(seen["drawn_C"]) + (0.0 if before_A is None else dt_s * before_A), self.least_drawn_C)
+
+    def update(self, voltage_V: float, current_A: float, dt_s: float, temperature_C: float | None = None) -> Estimate:
+        """
+        Take in one sample, as :meth:`OnlineEstimator.update` describes. A sample that :func:`battery_env.records.check_sample`
+        refuses, or one that charges a full cell, leaves the filter as it was.
+        """
+        self.check(voltage_V, current_A, dt_s, temperature_C)
+        temperature_K = nan if temperature_C is None else temperature_C + ZERO_CELSIUS_K
+        if not self._cells["seen"]["samples"][0]:
+            dt_s = 0.0
+            if not isnan(temperature_K):
+                self._begin(temperature_K)
+        sample = np.array([[(voltage_V, current_A, dt_s, temperature_K)]], dtype=SAMPLE)
+        said = self._follow(self._cells, self._filters, sample)[0, 0]
+        condition, (sd_q_mobile, sd_r_o) = Condition.numbered(said["condition"]), said["sd"].tolist()
+        text = condition.said(measured(self._cells["seen"][0], self.initial_soc[0]))
+        return Estimate(float(said["q_mobile"]), float(said["r_o"]), sd_q_mobile, sd_r_o, not text, text)
+
+    def _follow(self, cells: NDArray[np.void], filters: NDArray[np.void], samples: NDArray[np.void]) -> NDArray[np.void]:
+        """What filters of these rows estimate after samples, shape (samples, cells)."""
+        estimates = np.empty(samples.shape, ESTIMATE)
+        _follow_all(cells, filters, samples, self._settings, self.cell.packed, self._derivatives, estimates)
+        return estimates
+
+    def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:
+        """
+        One estimate for every sample of many discharges, in one compiled call each. A temperature that was measured is that of
+        the model, as in a stream.
+        """
+        traces = []
+        for record in records:
+            stream = Stream.of(record, self.dt_s)
+            self.reset()
+            time_s, voltage_V, current_A, dt_s, temperature_C = stream
+            samples = np.zeros((len(time_s), 1), SAMPLE)
+            samples["voltage_V"][:, 0], samples["current_A"][:, 0], samples["dt_s"][:, 0] = voltage_V, current_A, dt_s
+            samples["temperature_K"][:, 0] = nan if temperature_C is None else temperature_C + ZERO_CELSIUS_K
+            if temperature_C is not None:
+                self._begin(float(samples["temperature_K"][0, 0]))
+            self._cells["seen"]["start"]["at_rest"] = starts_at_rest(record)
+            check_drawn_charge(float(np.cumsum(np.append(0.0, current_A[:-1]) * dt_s).min()), self.least_drawn_C)
+            said = self._follow(self._cells, self._filters, samples)[:, 0]
+            shown = measured(self._cells["seen"][0], self.initial_soc[0], float(time_s[0]))
+            texts = {number: Condition.numbered(number).said(shown) for number in np.unique(said["condition"]).tolist()}
+            sd_q, sd_r_o = said["sd"].T.copy()
+            reasons = np.array([texts[number] for number in said["condition"].tolist()], dtype=object)
+            columns = (said["q_mobile"].copy(), said["r_o"].copy(), sd_q, sd_r_o, reasons == "", reasons)
+            traces.append(EstimateTrace(time_s, *columns))
+        self.reset()
+        return traces
+
+    @property
+    def least_drawn_C(self) -> float:
+        """The charge drawn stays above this: a cell takes no more than it has room for, C."""
+        return -(SURPLUS_SHARE + (1.0 - self.initial_soc[0])) * self.cell.q_mobile
+
+    def batch(self, cells: int) -> KalmanBatch:
+        """Filters like this one, each for a cell of its own, which take their samples in one compiled call."""
+        return KalmanBatch(self, cells)
+
+    def __copy__(self) -> ExtendedKalmanFilter:
+        """A filter that goes its own way."""
+        return self._of_rows(self._cells.copy(), self._filters.copy())
+
+    def _of_rows(self, cells: NDArray[np.void], filters: NDArray[np.void]) -> ExtendedKalmanFilter:
+        """A filter with the same arguments, whose memory are these rows."""
+        other = object.__new__(type(self))
+        vars(other).update(vars(self), _cells=cells, _filters=filters)
+        return other
+
+    def now(self) -> ModelNow:
+        """The model at the last sample, at the mean of all filters."""
+        filters = self._filters[0]
+        weight = np.exp(filters["log_weight"] - filters["log_weight"].max())
+        weight /= weight.sum()
+        best, alive = int(weight.argmax()), weight > 0.0
+        means, covariances = filters["mean"], filters["covariance"]
+        mean = weight[alive] @ means[alive]
+        apart = means[alive] - mean
+        covariance = np.tensordot(weight[alive], covariances[alive] + apart[:, :, None] * apart[:, None, :], axes=1)
+        # the state goes along with the parameters, by its tangents
+        tangents = filters["tangents"][best, 0]
+        by_parameters = np.vstack([np.hstack([tangents, np.eye(2, 3)]), np.eye(1, STATE_SIZE + 3, STATE_SIZE + 2)])
+        variances, directions = np.linalg.eigh(covariance)
+        deviations = (directions * np.sqrt(np.maximum(variances, 0.0))).T @ by_parameters
+        state = filters["state"][best, 0] + (mean - means[best]) @ by_parameters[:, :STATE_SIZE]
+        return ModelNow(self._cell_now(), self.thermal, self.dt_s, state, mean, deviations)
+
+    def _made_with(self) -> dict[str, Any]:
+        return {
+            "estimator": type(self).__name__,
+            "parameters": list(self.parameters),
+            "cell": asdict(self.cell),
+            "initial_soc": self.initial_soc,
+            "means": self._means,
+            "standard_deviations": self._sds,
+            **self._settings._asdict(),
+        }
+
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        return {"cells": self._cells, "filters": self._filters}
+
+    def _restore(self, arrays: dict[str, NDArray[Any]]) -> None:
+        self._cells[...], self._filters[...] = arrays["cells"], arrays["filters"]
+
+
+class KalmanBatch(OnlineBatch):
+    """
+    Cells side by side, each followed by a filter of its own with the same arguments: rows of the same tables, which take their
+    samples in one compiled call.
+
+    :param estimator: what to copy; it stays as it is
+    :param cells: how many
+    :raises ValueError: for no cells
+    """
+
+    estimators: Sequence[ExtendedKalmanFilter]
+
+    def _copies(self, estimator: OnlineEstimator, cells: int) -> Sequence[ExtendedKalmanFilter]:
+        assert isinstance(estimator, ExtendedKalmanFilter)
+        self._cells = np.zeros(cells, CELL)
+        self._filters = np.zeros((cells, estimator._filters.shape[1]), FILTER)
+        return [estimator._of_rows(self._cells[n : n + 1], self._filters[n : n + 1]) for n in range(cells)]
+
+    def update(
+        self, voltage_V: ArrayLike, current_A: ArrayLike, dt_s: ArrayLike, temperature_C: ArrayLike | None = None
+    ) -> Estimates:
+        """Take in one sample of each cell: of all, or of none if one is refused."""
+        cells, seen, one = self._cells, self._cells["seen"], self.estimators[0]
+        is_first = seen["samples"] == 0
+        samples = np.zeros((1, len(cells)), SAMPLE)
+        (of,) = samples
+        of["voltage_V"], of["current_A"] = check_numbers("voltage_V", voltage_V), check_numbers("current_A", current_A)
+        of["dt_s"] = np.where(is_first, 0.0, check_numbers("dt_s", dt_s))
+        degrees_C = None if temperature_C is None else np.asarray(temperature_C, dtype=np.float64)
+        of["temperature_K"] = nan if degrees_C is None else degrees_C + ZERO_CELSIUS_K
+        drawn_C = seen["drawn_C"] + seen["current_A"] * of["dt_s"]
+        good = are_plausible(of["voltage_V"], of["current_A"], of["dt_s"], degrees_C, seen["current_A"])
+        doubtful = is_first | ~(good & (drawn_C > one.least_drawn_C))
+        if doubtful.any():
+            self.check(voltage_V, current_A, dt_s, temperature_C, np.flatnonzero(doubtful).tolist())
+        for n in np.flatnonzero(is_first & ~np.isnan(of["temperature_K"])).tolist():
+            self.estimators[n]._begin(float(of["temperature_K"][n]))
+        (said,) = one._follow(cells, self._filters, samples)
+        sd_q_mobile, sd_r_o = said["sd"].T
+        shown = {name: seen[name].copy() for name in _SHOWN}
+
+        def reason_of(n: int) -> str:
+            of_cell = {name: column[n] for name, column in shown.items()}
+            return Condition.numbered(said["condition"][n]).said(measured(of_cell, one.initial_soc[0]))
+
+        settled = said["condition"] == Condition.SETTLED
+        return Estimates(said["q_mobile"], said["r_o"], sd_q_mobile, sd_r_o, settled, reason_of)
+
+
+def _checked_noise_V(voltage_noise_V: float | None, mismatch_V: float) -> float:
+    """The noise of a voltage sample that is stated, or what follows from the error of the model."""
+    if voltage_noise_V is None:
+        return float(max(_NOISE_V, mismatch_V))
+    if not 0.0 < voltage_noise_V < inf:
+        raise ValueError(f"voltage_noise_V must be greater than 0 V, got {voltage_noise_V!r}. Exact records: 1e-4.")
+    if voltage_noise_V < mismatch_V:
+        raise ValueError(
+            f"voltage_noise_V must be at least mismatch_V, {mismatch_V!r} V, got {voltage_noise_V!r} V: the filter would "
+            "take each sample of a model that wanders for exact. Leave voltage_noise_V out to have it follow mismatch_V."
+        )
+    return float(voltage_noise_V)
+
+
+def _pair(values: tuple[float, float]) -> tuple[float, float]:
+    return float(values[0]), float(values[1])
+
+
+@njit(cache=True, error_model="numpy")
+def _follow_all(
+    cells: NDArray[np.void],
+    filters: NDArray[np.void],
+    samples: NDArray[np.void],
+    settings: Settings,
+    packed: PackedConstants,
+    derivatives: PolynomialDerivatives,
+    estimates: NDArray[np.void],
+) -> None:
+    # every sample of every cell, into the estimate after it
+    for n in range(samples.shape[1]):
+        cell, bank, seen = cells[n], cells[n].bank, cells[n].seen
+        of_cell = PackedConstants(cell.constants, packed.polynomial_n, packed.polynomial_p)
+        for k in range(samples.shape[0]):
+            sample = samples[k, n]
+            voltage, current, duration = sample.voltage_V, sample.current_A, sample.dt_s
+            begin(seen, duration)
+            take(cell, filters[n], sample, settings, of_cell, derivatives)
+            q_mobile, r_o = bank.mean[Q], bank.mean[R]
+            examine(seen, voltage, current, q_mobile, r_o, settings.cell_q_mobile)
+            if seen.samples > 1 and duration > 0.0:
+                follow_gaps(seen, voltage, current, duration, bank.expected_V, q_mobile)
+            conclude(cell, settings, estimates[k, n])
+            remember(seen, voltage, current)

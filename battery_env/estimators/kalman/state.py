@@ -1,0 +1,109 @@
+"""
+What a Kalman filter is told, and what it remembers of a discharge: tables with named columns, which compiled code (numba)
+reads and writes in place. A single filter has tables of one row, a batch one row a cell.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from battery_env.electrochemistry import NEW_CELL, STATE_SIZE
+from battery_env.estimators.diagnosis.samples import SEEN, table
+
+#: What a filter estimates: ``q_mobile`` (C), ``r_o`` (ohm) and the offset of the voltage (V).
+Q, R, OFFSET = range(3)
+
+
+class Settings(NamedTuple):
+    """
+    What a filter is told, with pairs for ``q_mobile`` and ``r_o``.
+
+    :param dt_s: longest time step of the model, s
+    :param thermal: whether the temperature of the model moves
+    :param noise_V2: variance of the voltage noise, V^2
+    :param mismatch_V2: variance of the error of the model, V^2
+    :param searched: whether each is searched for
+    :param variance: of each before the discharge, 0 where it is held, C^2 and ohm^2
+    :param growth: of the variance of each, C^2/s and ohm^2/s
+    :param offset_growth: of the variance of the offset, V^2/s
+    :param bounds: where each stays, C and ohm
+    :param carried: mean and standard deviation of each from an earlier discharge; zeros where none was given
+    :param scale_sd: standard deviations of what scales each and does not show in the voltage, as shares
+    :param cell_q_mobile: of the model's cell, C
+    """
+
+    dt_s: float
+    thermal: bool
+    noise_V2: float
+    mismatch_V2: float
+    searched: tuple[bool, bool]
+    variance: tuple[float, float]
+    growth: tuple[float, float]
+    offset_growth: float
+    bounds: tuple[tuple[float, float], tuple[float, float]]
+    carried: tuple[tuple[float, float], tuple[float, float]]
+    scale_sd: tuple[float, float]
+    cell_q_mobile: float
+
+
+#: One sample of one cell.
+SAMPLE = table("voltage_V current_A dt_s temperature_K")
+
+#: What is said after a sample, with the :class:`~battery_env.estimators.diagnosis.Condition` that speaks first against it.
+ESTIMATE = table([("q_mobile", "f8"), ("r_o", "f8"), ("sd", "f8", 2), ("condition", "i8")])
+
+# Sums over the charge drawn, of the derivative of the voltage by q_mobile (V) and of products with that by r_o (V^2/C, V A,
+# A^2 C), and that charge (C)
+_INFORMATION = table("q qq qr rr charge_C")
+
+#: One filter of a bank, with a model of its own at its estimate.
+FILTER = table(
+    [
+        ("state", "f8", (1, STATE_SIZE)),
+        ("tangents", "f8", (1, 2, STATE_SIZE)),  # derivatives of the state with respect to q_mobile and r_o
+        ("mean", "f8", 3),
+        ("covariance", "f8", (3, 3)),
+        ("log_weight", "f8"),  # -inf: given up
+        ("shown_V2", "f8"),  # variance of the noise that the last innovation showed
+        ("innovation", "f8"),  # the last one over its standard deviation, within the gate
+        ("expected_V", "f8"),  # voltage of the model at the last sample before it was taken in, with the offset
+        ("told", _INFORMATION),
+    ]
+)
+
+# What a bank remembers beside its filters.
+_BANK = table(
+    [
+        # after the last sample: moments of the mixture of all filters, the standard deviation of q_mobile that an error of the
+        # model leaves which is common to the discharge, the voltage that was expected, and whether the model cell has one
+        ("mean", "f8", 2),
+        ("sd", "f8", 2),
+        ("common_sd_q", "f8"),
+        ("expected_V", "f8"),
+        ("has_voltage", "b1"),
+        # of innovations: the noise that they showed in the mean; the last ones, averaged; the sum of the products of each one
+        # with those before it, its variance, and how many standard deviations it has been above 0 at most: infinite once
+        # something else has shown that the filter does not follow its cell
+        ("noise_V2", "f8"),
+        ("last", "f8"),
+        ("products", "f8"),
+        ("variance", "f8"),
+        ("trend_sd", "f8"),
+        # r_o stays in this range unless an earlier estimate was wrong. q_mobile has none: the error of the model moves it at
+        # the knee
+        ("least_r", "f8"),
+        ("most_r", "f8"),
+        # prior variance of the offset, which grows with time
+        ("offset_V2", "f8"),
+    ]
+)
+
+#: All that is remembered of a discharge but for the filters.
+CELL = table(
+    [
+        ("ambient_K", "f8"),  # the model's surroundings, and the constants that follow from them
+        ("constants", "f8", NEW_CELL.packed.constants.shape),
+        ("bank", _BANK),
+        ("seen", SEEN),
+    ]
+)

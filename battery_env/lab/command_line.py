@@ -1,0 +1,506 @@
+"""
+The command line: what records of discharges say about their cells, when one in progress ends, and how constants are found.
+
+.. code-block:: bash
+
+  python -m battery_env calibrate discharge.csv
+  python -m battery_env calibrate B0005:12 --out results/B0005
+  battery-calibrate lab/ --out results --jobs 2
+  battery-calibrate forecast running.csv --life lab/ --load profile.csv
+  python -m battery_env fit B0005:1 B0005:84 B0005:168 --out my_cell.json
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import sys
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import fields
+from functools import wraps
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, Literal, ParamSpec
+
+import numpy as np
+
+from battery_env.estimators.cell_fit import CellFit, fit_cell, read_cell
+from battery_env.estimators.diagnosis.rest import InitialSoc
+from battery_env.files import check_new, finite_or_none
+from battery_env.lab.calibrate import METHODS, Settings, line_of, text_of
+from battery_env.lab.many import FileFormat, Outcome, Results, calibrate_all, find_sources, read_source, workers
+from battery_env.parameters import PARAMETER_NAMES
+from battery_env.records import CUT_OFF_V
+from battery_env.records.discharge import Discharge
+
+#: What the process returns: all records settled, one or more refused, one or more not settled, Ctrl-C, nobody reads on.
+SETTLED, REFUSED, NOT_SETTLED, INTERRUPTED, PIPE_CLOSED = 0, 2, 3, 130, 141
+
+_VERSION = files("battery_env").joinpath("version.txt").read_text(encoding="utf-8").strip()
+_INSTALLED = "battery-calibrate"
+
+# So many discharges fit beside each other in the figure of a fit.
+_MOST_SHOWN = 4
+
+_P = ParamSpec("_P")
+_QUANTITY = re.compile(r",\s*(?=\w+=)")
+
+
+def _assignments(text: str) -> dict[str, str]:
+    pairs = [part.partition("=") for part in _QUANTITY.split(text)]
+    if any(not (name.strip() and equals and value.strip()) for name, equals, value in pairs):
+        raise argparse.ArgumentTypeError(f"expected quantity=NAME,quantity=NAME, got {text!r}")
+    return {name.strip(): value.strip() for name, _, value in pairs}
+
+
+def _cell_name(text: str) -> re.Pattern[str]:
+    try:
+        pattern = re.compile(text)
+    except re.error as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is no regular expression: {error}") from error
+    if pattern.groups != 1:
+        raise argparse.ArgumentTypeError(f"expected a regular expression with one group, such as '(B[0-9]+)_', got {text!r}")
+    return pattern
+
+
+def _jobs(text: str) -> int:
+    try:
+        jobs = int(text)
+    except ValueError:
+        jobs = 0
+    if jobs != -1 and jobs < 1:
+        raise argparse.ArgumentTypeError(f"expected a number of processes, 1 or more, or -1 for one a core, got {text!r}")
+    return jobs
+
+
+def _initial_soc(text: str) -> InitialSoc | Literal["rest"]:
+    if text == "rest":
+        return "rest"
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (1, 2):
+        raise argparse.ArgumentTypeError(f"expected SOC, SOC,SD or rest, got {text!r}")
+    return numbers[0] if len(numbers) == 1 else (numbers[0], numbers[1])
+
+
+_Options = dict[tuple[str, ...], dict[str, Any]]
+
+_FILES: _Options = {
+    ("--columns",): {
+        "type": _assignments,
+        "metavar": "time=NAME,...",
+        "help": "names of the columns of time, voltage, current, temperature, ambient, cycle, step and state, where their "
+        "names do not tell",
+    },
+    ("--units",): {
+        "type": _assignments,
+        "metavar": "time=UNIT,...",
+        "help": "their units, where the names do not tell: s, ms, min, h; V, mV; A, mA; degC, K",
+    },
+}
+_SIGN: _Options = {
+    ("--discharge-is-negative",): {
+        "const": True,
+        "help": "the files count discharge as negative (default: told from the voltage)",
+    },
+    ("--discharge-is-positive",): {"const": False, "help": "or as positive"},
+}
+# What is given is an argument of Settings, whose defaults hold for the others
+_CALIBRATION: _Options = {
+    ("--method",): {
+        "choices": METHODS,
+        "help": "of calibration: least squares, the filter (kalman), or a policy trained on simulated cells (default: least "
+        "squares; the filter where these do not settle one in progress at a constant load, without --prior and --cell)",
+    },
+    ("--policy",): {
+        "type": Path,
+        "metavar": "FILE.onnx",
+        "help": "what --method policy follows, with the constants of --cell if it was trained with them (default: the "
+        "policy that comes with the package, which has learned on a new 18650)",
+    },
+    ("--parameters",): {
+        "nargs": "+",
+        "choices": PARAMETER_NAMES,
+        "help": "what to fit; the other is held at the cell's value (default: both). Give it after the files",
+    },
+    ("--cut-off",): {
+        "dest": "cut_off_V",
+        "type": float,
+        "metavar": "V",
+        "help": "voltage at which the discharge ends, V (default: 2.7, or that of the fit of --cell)",
+    },
+    ("--prior", "--prior-q"): {
+        "dest": "prior_q_mobile_C",
+        "nargs": 2,
+        "type": float,
+        "metavar": ("MEAN", "SD"),
+        "help": "q_mobile as known from an earlier discharge, C; while a discharge is in progress the estimate rests on it",
+    },
+    ("--initial-soc",): {
+        "type": _initial_soc,
+        "metavar": "SOC",
+        "help": "state of charge when the load is switched on, after a rest: 0.8; with its standard deviation 0.8,0.02; or "
+        "rest: told from the voltage of a minute or more at rest before the load (default: 1, a full cell)",
+    },
+    ("--mismatch",): {
+        "dest": "mismatch_V",
+        "type": float,
+        "metavar": "V",
+        "help": "error to expect of the model itself, V; 0 for simulated data (default: 0.05, or that of the fit of --cell)",
+    },
+    ("--current-gain-sd",): {
+        "type": float,
+        "metavar": "SHARE",
+        "help": "standard deviation of the gain of the current sensor, which q_mobile and r_o share (default: 0.005)",
+    },
+    ("--future-current",): {
+        "dest": "future_current_A",
+        "type": float,
+        "metavar": "A",
+        "help": "current after the end of a record in progress, A (default: its last one, or its mean if it varied)",
+    },
+    ("--cell",): {
+        "type": Path,
+        "metavar": "FILE",
+        "help": "constants of the cell, as the command fit saves them, or CellParameters.to_json (default: those of a new "
+        "18650)",
+    },
+    ("--nominal",): {
+        "dest": "nominal_Ah",
+        "type": float,
+        "metavar": "AH",
+        "help": "nominal capacity, Ah, which the state of health refers to (default: what the cell of --cell gives at this "
+        "load)",
+    },
+    ("--ambient",): {
+        "dest": "ambient_C",
+        "type": float,
+        "metavar": "DEGC",
+        "help": "temperature of the surroundings, degC (default: the first one measured, or the model cell's 19 degC)",
+    },
+    ("--isothermal",): {
+        "dest": "thermal",
+        "action": "store_false",
+        "help": "keep the temperature of the model constant (default: it moves, or as in the fit of --cell)",
+    },
+}
+_RESULTS: _Options = {
+    ("--out",): {
+        "type": Path,
+        "metavar": "DIR",
+        "help": "write the table of estimates (CSV, Parquet), the voltages and figures there",
+    },
+    ("--cell-name",): {
+        "type": _cell_name,
+        "metavar": "PATTERN",
+        "help": "regular expression whose group is the name of the cell in the name of a file, such as '(B[0-9]+)_' (default: "
+        "the folder, if records lie in several, or else the file)",
+    },
+    ("--table-only",): {"action": "store_true", "help": "write no voltages of single discharges"},
+    ("--force",): {"action": "store_true", "help": "replace results that are there already"},
+    ("--json",): {"action": "store_true", "help": "print one JSON object a discharge and line"},
+    ("--jobs",): {
+        "type": _jobs,
+        "default": 1,
+        "metavar": "N",
+        "help": "processes; -1: one a core (default: %(default)s)",
+    },
+    ("--scheduler",): {
+        "metavar": "ADDRESS",
+        "help": "of a Dask cluster, tcp://host:port, whose workers read and calibrate; they must see the files by the same "
+        "names",
+    },
+}
+
+
+def _parser(name: str) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=name,
+        description=(
+            "Fit the charge that can move, q_mobile, and the ohmic resistance, r_o, of the model to discharges that each "
+            "start with a full cell, or with --initial-soc, and predict when the cut-off voltage is reached."
+        ),
+        epilog="Exit status: 0 if every discharge is settled, 3 if one is not, 2 if one cannot be used. Other commands: "
+        "battery-calibrate forecast --help, battery-calibrate fit --help.",
+        allow_abbrev=False,
+    )
+    parser.add_argument("--version", action="version", version=f"battery_env {_VERSION}")
+    _add_files(parser)
+    _add(parser.add_argument_group("calibration"), _CALIBRATION, default=argparse.SUPPRESS)
+    _add(parser.add_argument_group("results"), _RESULTS)
+    return parser
+
+
+def _fit_parser(name: str) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=name,
+        description=(
+            "Fit the constants of the model to a few discharges of one cell, each from full charge to the cut-off, and save "
+            "them for --cell of calibrate. Take three or more, of all ages and loads that they are to hold for."
+        ),
+        epilog="Exit status: 0, 3 if the discharges may not have started full, are of one age or not of one cell, or 2 if one "
+        "cannot be used or does not reach the cut-off, or the equations do not describe the cell.",
+        allow_abbrev=False,
+    )
+    _add_files(parser)
+    group = parser.add_argument_group("fit")
+    group.add_argument(
+        "--cut-off", type=float, default=CUT_OFF_V, metavar="V", help="where the discharge ends, V (default: %(default)s)"
+    )
+    group.add_argument("--isothermal", action="store_true", help="keep the temperature of the model constant")
+    group.add_argument(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="FILE.json",
+        help="write the fit there, and beside it a figure, FILE.png; neither may exist",
+    )
+    return parser
+
+
+def _forecast_parser(name: str) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=name,
+        description=(
+            "Forecast the end of a discharge in progress, with an interval that holds nine of ten ends, from the life of its "
+            "cell and the load to come."
+        ),
+        epilog="Exit status: 0, 3 if something in the record contradicts the estimate, or 2 if something cannot be used.",
+        allow_abbrev=False,
+    )
+    _add_files(parser, many=False)
+    group = parser.add_argument_group("forecast")
+    group.add_argument(
+        "--life",
+        nargs="+",
+        default=(),
+        metavar="FILE",
+        help="discharges of the cell before this one, oldest first: files, folders of them, or a bundled cell. They say what "
+        "q_mobile to expect. All are taken for one cell's; refused if the files themselves (.mat) name several",
+    )
+    group.add_argument(
+        "--load",
+        type=Path,
+        metavar="FILE.csv",
+        help="the load to come: time_s, from 0 at the last sample under load, and current_A or power_W, each held until the "
+        "next (default: as so far)",
+    )
+    known = ("--cut-off", "--prior", "--initial-soc", "--mismatch", "--cell", "--nominal", "--ambient", "--isothermal")
+    options = {flags: how for flags, how in _CALIBRATION.items() if flags[0] in known}
+    _add(parser.add_argument_group("calibration"), options, default=argparse.SUPPRESS)
+    group = parser.add_argument_group("results")
+    group.add_argument("--out", type=Path, metavar="DIR", help="write a figure and a JSON file there; neither may exist")
+    group.add_argument("--json", action="store_true", help="print one JSON object")
+    return parser
+
+
+def _add(group: Any, options: _Options, **common: Any) -> None:
+    for flags, how in options.items():
+        group.add_argument(*flags, **common, **how)
+
+
+def _add_files(parser: argparse.ArgumentParser, many: bool = True) -> None:
+    parser.add_argument(
+        "records" if many else "record",
+        nargs="+" if many else None,
+        metavar="FILE",
+        help="text of any delimiter, Parquet, NASA's .mat, Neware's .nda and .ndax, BioLogic's .mpr; a folder of them, or of "
+        "folders; FILE:CYCLE for one discharge of a life; or a bundled cell, B0005, and its discharge, B0005:12",
+    )
+    group = parser.add_argument_group("reading")
+    _add(group, _FILES)
+    _add(group.add_mutually_exclusive_group(), _SIGN, action="store_const", dest="discharge_is_negative")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command."""
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    parser = argparse.ArgumentParser(prog="python -m battery_env", description="Calibrate a battery model to real cells.")
+    parser.add_argument("--version", action="version", version=f"battery_env {_VERSION}")
+    commands = parser.add_subparsers(dest="command", required=True)
+    commands.add_parser("calibrate", help="capacity and resistance of cells from their discharges", add_help=False)
+    commands.add_parser("fit", help="the constants of a cell from a few of its discharges", add_help=False)
+    commands.add_parser("forecast", help="the end of a discharge in progress", add_help=False)
+    command = {"calibrate": calibrate, "fit": fit, "forecast": forecast}[parser.parse_args(given[:1]).command]
+    return command(given[1:], f"{parser.prog} {given[0]}")
+
+
+def _ending(command: Callable[_P, int]) -> Callable[_P, int]:
+    """A command of which errors are a line, an interruption another, and a closed pipe none; each has its exit status."""
+
+    @wraps(command)
+    def run(*args: _P.args, **kwargs: _P.kwargs) -> int:
+        try:
+            status = command(*args, **kwargs)
+            sys.stdout.flush()
+        except KeyboardInterrupt:
+            print("interrupted", file=sys.stderr)
+            return INTERRUPTED
+        except BrokenPipeError:  # head, or a pager that was left
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is still to be flushed
+            return PIPE_CLOSED
+        except (ValueError, TypeError, OSError, ImportError) as error:
+            print(f"error: {error}", file=sys.stderr)
+            return REFUSED
+        return status
+
+    return run
+
+
+@_ending
+def calibrate(arguments: Sequence[str] | None = None, name: str = _INSTALLED) -> int:
+    """The command ``calibrate``, which is also installed as ``battery-calibrate``, as are others by their names behind it."""
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    if name == _INSTALLED and given[:1] in (["fit"], ["forecast"]):
+        return {"fit": fit, "forecast": forecast}[given[0]](given[1:], f"{name} {given[0]}")
+    options = _parser(name).parse_args(given)
+    done: list[Outcome] = []
+    interrupted = False
+    settings = _settings(options)
+    settings.calibrator()  # what it refuses it refuses of every file
+    sources = find_sources(options.records, options.cell_name)
+    results = Results(options.out, sources, not options.table_only, options.force) if options.out else None
+    try:
+        with workers(options.jobs, options.scheduler) as executor:
+            ahead = 64 if options.scheduler or options.jobs == -1 else 2 * options.jobs
+            for outcome in calibrate_all(sources, _file_format(options), settings, results, executor, ahead):
+                done.append(outcome)
+                _show(done, options.json)
+    except KeyboardInterrupt:
+        print("interrupted: what is done is kept", file=sys.stderr)
+        interrupted = True
+    if not options.json:
+        _conclude(done, settings)
+    if results and any(not each.error for each in done):
+        written = results.write_table(done)
+        if not options.json:
+            print("\nwritten: " + ", ".join(map(str, written)))
+    if interrupted:
+        return INTERRUPTED
+    if any(each.error for each in done):
+        return REFUSED
+    return SETTLED if all(each.found and each.found.settled for each in done) else NOT_SETTLED
+
+
+def _file_format(options: argparse.Namespace) -> FileFormat:
+    return FileFormat(options.columns, options.units, options.discharge_is_negative)
+
+
+def _settings(options: argparse.Namespace) -> Settings:
+    names = {field.name for field in fields(Settings)} - {"cell"}
+    given: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value for name, value in vars(options).items() if name in names
+    }
+    path: Path | None = vars(options).get("cell")
+    if path is None:
+        return Settings(**given)
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"no file {str(path)!r} for --cell: give what the command fit, or CellParameters.to_json, wrote"
+        )
+    cell = read_cell(path)
+    if isinstance(cell, CellFit) and cell.doubt:
+        print(f"warning: {path}: {cell.doubt}", file=sys.stderr)
+    return Settings.for_cell(cell, **given)
+
+
+@_ending
+def fit(arguments: Sequence[str] | None = None, name: str = "python -m battery_env fit") -> int:
+    """The command ``fit``; its exit status is 3 if there is doubt about the fit."""
+    options = _fit_parser(name).parse_args(arguments)
+    out: Path = options.out
+    picture = out.with_suffix(".png")
+    if out.suffix != ".json":
+        raise ValueError(f"the fit is written as JSON: --out {out.name}.json instead of {out.name}")
+    check_new(out, picture)
+    discharges = _discharges(options.records, _file_format(options))
+    print(f"fitting {len(discharges)} discharges", file=sys.stderr, flush=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of the doubt, which is printed
+        found = fit_cell(discharges, options.cut_off, thermal=not options.isothermal)
+    print(found.summary())
+    if found.doubt:
+        print(f"warning: {found.doubt}", file=sys.stderr)
+    found.to_json(out)
+
+    from battery_env.plotting import plot_cell_fit, save_figure  # here, as matplotlib takes long to import
+
+    shown = np.unique(np.linspace(0, len(discharges) - 1, _MOST_SHOWN).round().astype(np.int64))
+    save_figure(plot_cell_fit(found, [discharges[n] for n in shown]), picture)
+    print(f"\nwritten: {out}, {picture}")
+    return NOT_SETTLED if found.doubt else SETTLED
+
+
+@_ending
+def forecast(arguments: Sequence[str] | None = None, name: str = "python -m battery_env forecast") -> int:
+    """The command ``forecast``; its exit status is 3 if something in the record contradicts the estimate."""
+    options = _forecast_parser(name).parse_args(arguments)
+    from battery_env.lab.running import EndFiles, end_of_record  # here, as matplotlib takes long to import
+
+    settings, file_format = _settings(options), _file_format(options)
+    if options.life and settings.prior_q_mobile_C is not None:
+        raise ValueError("--life and --prior say the same: give one of them")
+    files = EndFiles(options.out, options.record) if options.out else None
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            end = end_of_record(options.record, settings, file_format, options.life, options.load)
+        finally:
+            for each in caught:
+                print(f"warning: {each.message}", file=sys.stderr)
+    print(json.dumps(end.row()) if options.json else end.text())
+    if files:
+        files.write(end)
+        if not options.json:
+            print(f"\nwritten: {files.table}, {files.figure}")
+    return NOT_SETTLED if end.contradicted else SETTLED
+
+
+def _discharges(records: Sequence[str], file_format: FileFormat) -> list[Discharge]:
+    """All that the arguments name, each with the name of its file and the number that it is shown by."""
+    discharges = []
+    for source in find_sources(records):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            try:
+                recordings = read_source(source, file_format)
+                for number, recording in enumerate(recordings, start=1):
+                    meta = {"cycle": number, **recording.meta, "cell": source.stem}
+                    discharges.append(recording._replace(meta=meta).discharge())
+            except Exception as error:  # readers of files raise what they like
+                text = " ".join(str(error).split())
+                raise ValueError(text if source.path in text else f"{source.argument}: {text}") from error
+        for each in caught:
+            print(f"warning: {source.argument}: {each.message}", file=sys.stderr)
+    return discharges
+
+
+def _show(done: Sequence[Outcome], as_json: bool) -> None:
+    """Prints the last one as it comes: a line each, but the first one waits, as the only one is printed in full."""
+    last = done[-1]
+    if as_json:
+        print(json.dumps({name: finite_or_none(value) for name, value in last.row().items()}), flush=True)
+    if last.notes:
+        print(f"warning: {last.record}: {last.notes}", file=sys.stderr)
+    if last.error:
+        print(f"error: {last.error}", file=sys.stderr, flush=True)
+    if len(done) > 1 and not as_json:
+        for each in done if len(done) == 2 else done[-1:]:
+            if each.found:
+                print(line_of(each.record, each.found), flush=True)
+
+
+def _conclude(done: Sequence[Outcome], settings: Settings) -> None:
+    if len(done) > 1:
+        settled = sum(bool(each.found and each.found.settled) for each in done)
+        refused = sum(bool(each.error) for each in done)
+        print(f"\n{len(done)} discharges: {settled} settled, {len(done) - settled - refused} not settled, {refused} refused")
+        if settings.method == "policy":
+            print(f"calibrated by {settings.calibrated_by}")
+    elif done and done[0].found:
+        print(text_of(done[0].record, done[0].found))

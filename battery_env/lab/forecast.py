@@ -1,0 +1,475 @@
+"""When a cell will be discharged under the load to come, and how sure that is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
+from scipy.stats import truncnorm
+
+from battery_env.arrays import FloatArray, IntArray
+from battery_env.checks import (
+    LOAD_UNIT_SYMBOLS,
+    LoadUnit,
+    check_load,
+    check_not_negative,
+    check_numbers,
+    check_positive,
+    check_whole_number,
+)
+from battery_env.electrochemistry import NEW_CELL, reached_s, state_of_charge
+from battery_env.estimates import Estimate
+from battery_env.estimators.diagnosis.conditions import white_noise_V
+from battery_env.estimators.estimator import is_overfull, overfull_error
+from battery_env.loads import BlockBootstrap, Cycle, KnownLoad, Load, RandomLoad, constant, in_steps, steadier_unit
+from battery_env.parameters import Q_MOBILE, R_O
+from battery_env.plotting import COLOURS, new_figure
+from battery_env.records import CUT_OFF_V, Record, Samples, check_record, expected_current
+from battery_env.records.model import RECENT_SHARE, RecordModel
+
+#: What a load to come can be given as.
+FutureLoad = float | KnownLoad | RandomLoad | Callable[[FloatArray], ArrayLike]
+
+#: The ends and the middle of the intervals that are shown: nine of ten outcomes lie between the outer two.
+BAND = (0.05, 0.5, 0.95)
+
+#: The error of the model drifts with this constant, as a share of ``q_mobile``: it is wrong in another way at another charge.
+#: That is how fast the residuals of whole discharges of B0005 lose their correlation.
+_MEMORY_SHARE = 0.15
+# No discharge is followed for longer than a day, s. Cells that have ended are left out every so many steps.
+_LONGEST_S, _CHUNK_STEPS = 86_400.0, 512
+# The course of the voltage is kept about this often, s.
+_COURSE_S = 10.0
+# The last voltage of a record may be the cut-off but for rounding, V.
+_ROUNDING_V = 1e-6
+# The capacity of a new cell under a random load is the mean of so many draws, which makes it sure to 1 %.
+_NOMINAL_DRAWS = 100
+# An estimate this many standard deviations below what the record takes out of the cell contradicts the record.
+_CONTRADICTION_SD = 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class Forecast:
+    """
+    What :func:`forecast` expects of a discharge in progress: n samples of what may come, all equally likely.
+
+    :param record: the discharge so far
+    :param load_name: the load to come, in words
+    :param cut_off_V: where the discharge ends, V
+    :param eod_time_s: end of discharge, on the clock of the record, s, shape (n,); infinite where it is not reached
+    :param soc: state of charge at the end of the record: the share of ``q_mobile`` left in the negative electrode, shape (n,)
+    :param q_mobile: charge that can move, C, shape (n,)
+    :param r_o: ohmic resistance, ohm, shape (n,)
+    :param capacity_Ah: charge given from full to the end of discharge, which is the capacity at this load, Ah, shape (n,).
+        Where the record starts partly charged (``initial_soc`` of the model), what was missing then is added; NaN where the
+        end is not reached
+    :param nominal_Ah: capacity of the cell when new, Ah
+    :param time_s: from the end of the record on, on its clock, s, shape (K,)
+    :param voltage_V: quantiles :data:`BAND` of the voltage then, V, shape (3, K); a discharge that has ended counts as at
+        the cut-off
+    :param notes: what a reader should know of this forecast, sentences
+    """
+
+    record: Samples
+    load_name: str
+    cut_off_V: float
+    eod_time_s: FloatArray
+    soc: FloatArray
+    q_mobile: FloatArray
+    r_o: FloatArray
+    capacity_Ah: FloatArray
+    nominal_Ah: float
+    time_s: FloatArray
+    voltage_V: FloatArray
+    notes: tuple[str, ...] = ()
+
+    @property
+    def now_s(self) -> float:
+        """The end of the record, s."""
+        return float(self.record.time_s[-1])
+
+    @property
+    def remaining_s(self) -> FloatArray:
+        """Time from the end of the record to the end of discharge, s, shape (n,)."""
+        return np.maximum(self.eod_time_s - self.now_s, 0.0)
+
+    @property
+    def state_of_health(self) -> FloatArray:
+        """Capacity as a share of ``nominal_Ah``, shape (n,)."""
+        return self.capacity_Ah / self.nominal_Ah
+
+    def eod_quantile_s(self, probability: ArrayLike = BAND) -> FloatArray:
+        """
+        Quantiles of the end of discharge.
+
+        :param probability: within 0 .. 1, any shape
+        :return: on the clock of the record, s, same shape
+        """
+        return quantile(self.eod_time_s, probability)
+
+    def summary(self) -> str:
+        """
+        The forecast in a readable form.
+
+        :return: a text of several lines
+        """
+        rows = {
+            "end of discharge (s)": (self.eod_time_s, "10.0f"),
+            "remaining time (s)": (self.remaining_s, "10.0f"),
+            "state of charge now (%)": (100.0 * self.soc, "10.1f"),
+            "q_mobile (C)": (self.q_mobile, "10.0f"),
+            "r_o (ohm)": (self.r_o, "10.4f"),
+            "capacity (Ah)": (self.capacity_Ah, "10.3f"),
+        }
+        if not np.isnan(self.nominal_Ah):
+            rows[f"state of health (% of {self.nominal_Ah:.3f} Ah)"] = 100.0 * self.state_of_health, "10.1f"
+        head = "".join(f"{'median' if p == 0.5 else f'{100.0 * p:g} %':>10}" for p in BAND)
+        lines = [
+            f"Discharge to {self.cut_off_V:g} V, {self.now_s:.0f} s seen, then {self.load_name} ({len(self.soc)} samples)",
+            f"  {'':<34}{head}",
+        ]
+        for name, (values, form) in rows.items():
+            lines.append(f"  {name:<34}" + "".join(f"{value:{form}}" for value in quantile(values, BAND)))
+        return "\n".join([*lines, *self.notes])
+
+    def plot(self) -> Figure:
+        """
+        The voltage of the record and the one to expect, with the interval of the end of discharge.
+
+        :return: the figure
+        """
+        figure = new_figure(6.4, 3.6)
+        axes = figure.subplots()
+        low_s, median_s, high_s = self.eod_quantile_s()
+        inside = f"{100.0 * (BAND[2] - BAND[0]):.0f} %"
+        axes.plot(self.record.time_s, self.record.voltage_V, ".", ms=2.5, color="0.6", label="measured")
+        axes.fill_between(self.time_s, *self.voltage_V[[0, 2]], color=COLOURS[0], alpha=0.25, lw=0, label=f"voltage, {inside}")
+        axes.plot(self.time_s, self.voltage_V[1], color=COLOURS[0], lw=1.4, label="voltage, median")
+        axes.axhline(self.cut_off_V, color="0.6", lw=0.8)
+        if np.isfinite(high_s):
+            axes.axvspan(low_s, high_s, color=COLOURS[1], alpha=0.2, lw=0, label=f"end of discharge, {inside}")
+            axes.axvline(median_s, color=COLOURS[1], lw=1.2)
+        axes.set(xlabel="time (s)", ylabel="voltage (V)")
+        axes.grid(alpha=0.25)
+        axes.legend(frameon=False, fontsize=9, loc="lower left")
+        return figure
+
+
+def forecast(
+    record: Record,
+    estimate: Estimate,
+    load: FutureLoad | None = None,
+    cut_off_V: float | None = None,
+    *,
+    load_unit: LoadUnit = "current",
+    model: RecordModel | None = None,
+    mismatch_V: float = 0.05,
+    nominal_Ah: float | None = None,
+    samples: int = 1000,
+    seed: int = 0,
+) -> Forecast:
+    """
+    The end of a discharge in progress, under a load to come, with what is not known of it.
+
+    Each sample is a cell with its own parameters, its own error of the model, and its own load if that is random. All follow
+    the record and then the load, down to the cut-off, for a day at most.
+
+    *Parameters* are drawn from the estimate and its standard deviations: ``q_mobile`` log-normal, above what the record has
+    already taken out of the cell; ``r_o`` normal, with the correlation that the voltage of this record gives it with
+    ``q_mobile``. Standard deviations of NaN count as zero, and ``notes`` say so.
+
+    *The error of the model* has the standard deviation ``mismatch_V``. Shortly before the end of the record it is the mean
+    difference between measured voltage and that of the sample, so that samples of any resistance agree with what was
+    measured. From there it drifts with the charge that is drawn. Samples that would have reached the cut-off within the
+    record are replaced by others.
+
+    *The load.* Without ``load`` the discharge goes on as before: at its last current if that was constant (none, if it was
+    switched off), and otherwise in blocks of the record (:class:`battery_env.loads.BlockBootstrap`), of its current or of its
+    power, whichever is steadier between the switches of the load.
+
+    :param record: one discharge from its first sample to now, of a cell that was full unless ``model`` says otherwise
+    :param estimate: of any calibrator, best with its standard deviations
+    :param load: from the end of the record on: a number; a profile, ``Load(time_s, value, unit)``; a ``Cycle``; a function
+        of time in s that takes an array; or a ``RandomLoad``, of which each sample draws its own. ``None``: as above. Over
+        each time step of the model the mean of the load flows, and of a function its value at the start of the step
+    :param cut_off_V: voltage at which the discharge ends, V; ``None``: the ``VEOD`` of the model's cell, 2.7 V if no
+        ``model`` is given
+    :param load_unit: of a number or a function: ``"power"`` in W or ``"current"`` in A. Other loads have their own
+    :param model: the model that the estimate belongs to, ``LeastSquares(...).model``; ``None``: ``RecordModel()``
+    :param mismatch_V: error to expect of the model, V; 0.05 V suits the bundled real cells, 0 simulated ones without mismatch
+    :param nominal_Ah: capacity that counts as a state of health of 1, Ah; ``None``: the charge that the model's cell, with
+        its own ``q_mobile`` and ``r_o``, gives from full under the load to come, on average where that is random
+    :param samples: how many
+    :param seed: seed of all that is drawn
+    :return: the samples, with quantiles, a summary and a plot
+    :raises TypeError: for a load of another type
+    :raises ValueError: for an argument out of range, an estimate that the record contradicts, or a load that charges the cell
+        beyond full
+    """
+    model = RecordModel(NEW_CELL.replace(VEOD=CUT_OFF_V)) if model is None else model
+    cut_off = model.cell.VEOD if cut_off_V is None else cut_off_V
+    _check_arguments(mismatch_V, cut_off, nominal_Ah, samples, seed)
+    seen = check_record(record, least_samples=2)
+    rng = np.random.default_rng(seed)
+    to_come, load_name = _to_come(load, load_unit, seen, model)
+    notes = _notes(estimate, seen, load is None and isinstance(to_come, RandomLoad))
+
+    _, current_A = model.grid(seen)
+    parameters = _draw_parameters(model, current_A[:-1], estimate, samples, rng)
+    cells = _at_the_end_of(seen, model, current_A, parameters, mismatch_V, rng)
+    over = seen.voltage_V[-1] <= cut_off + _ROUNDING_V and seen.current_A[-1] > 0.0
+    if not over:
+        alive = np.flatnonzero(cells.voltage_V + cells.error_V > cut_off)
+        if len(alive) == 0:
+            raise ValueError(
+                f"the estimate contradicts the record: no cell with q_mobile = {estimate.q_mobile:g} +- "
+                f"{estimate.sd_q_mobile:.3g} C is still above {cut_off:g} V at its end. Estimate anew from this record."
+            )
+        if 2 * len(alive) < samples:
+            notes.append(f"The record contradicts {1.0 - len(alive) / samples:.0%} of what the estimate takes to be possible.")
+        chosen = np.arange(samples)
+        cells = cells.part(np.where(np.isin(chosen, alive), chosen, rng.choice(alive, size=samples)))
+    # the first draw is that of the new cell alone
+    draws = _draws(to_come, samples + 1, rng) if isinstance(to_come, RandomLoad) else [to_come]
+    if over:
+        ends = _Ends(np.zeros(samples), cells.soc, np.zeros(1), np.full((len(BAND), 1), cut_off))
+        above = np.flatnonzero(seen.voltage_V > cut_off + _ROUNDING_V)
+        around = [above[-1] + 1, above[-1]] if len(above) else [0]
+        now_s = float(np.interp(cut_off, seen.voltage_V[around], seen.time_s[around]))
+    else:
+        ends, now_s = _discharge(model, cells, draws[-samples:], mismatch_V, cut_off), float(seen.time_s[-1])
+    return Forecast(
+        record=seen,
+        load_name=load_name,
+        cut_off_V=float(cut_off),
+        eod_time_s=now_s + ends.time_s,
+        soc=cells.soc,
+        q_mobile=cells.q_mobile,
+        r_o=cells.r_o,
+        capacity_Ah=(1.0 - ends.soc) * cells.q_mobile / 3600.0,
+        nominal_Ah=_nominal_Ah(model, draws[:_NOMINAL_DRAWS], cut_off) if nominal_Ah is None else float(nominal_Ah),
+        time_s=now_s + ends.course_s,
+        voltage_V=ends.course_V,
+        notes=tuple(notes),
+    )
+
+
+def _check_arguments(mismatch_V: float, cut_off_V: float, nominal_Ah: float | None, samples: int, seed: int) -> None:
+    check_not_negative(mismatch_V=mismatch_V)
+    if not 0.0 < cut_off_V < np.inf:
+        raise ValueError(f"cut_off_V must be a positive voltage in V, got {cut_off_V!r}")
+    if nominal_Ah is not None:
+        check_positive("nominal_Ah", nominal_Ah)
+    if check_whole_number("samples", samples) < 1 or check_whole_number("seed", seed) < 0:
+        raise ValueError(f"samples must be at least 1 and seed at least 0, got {samples!r} and {seed!r}")
+
+
+def _notes(estimate: Estimate, record: Samples, goes_on_varied: bool) -> list[str]:
+    notes = []
+    if not np.isfinite([estimate.sd_q_mobile, estimate.sd_r_o]).all():
+        notes.append("The estimate states no standard deviation of all its parameters: the interval leaves theirs out.")
+    if goes_on_varied:
+        sd_A = expected_current(record.time_s, record.current_A).sd_A
+        notes.append(
+            f"The load varied: its means over quarters of the record lie {sd_A:.2g} A apart (root mean square). "
+            "The interval is that of a load that goes on so, not of one that drifts elsewhere. Give the load if it is known."
+        )
+    if not estimate.settled:
+        notes.append(f"The estimate is not settled. {estimate.reason}".strip())
+    return notes
+
+
+def quantile(values: FloatArray, probability: ArrayLike) -> FloatArray:
+    """Quantiles over the samples, the first axis."""
+    # of the samples themselves: between two of them there is no number if one is infinite
+    return np.asarray(np.quantile(values, np.asarray(probability, dtype=np.float64), axis=0, method="inverted_cdf"))
+
+
+class _Function:
+    """A function of time as a load."""
+
+    def __init__(self, function: Callable[[FloatArray], ArrayLike], unit: LoadUnit) -> None:
+        self.function, self.unit = function, unit
+
+    def __call__(self, time_s: FloatArray) -> FloatArray:
+        values = check_load(self.function(time_s), self.unit)
+        if values.shape not in ((), time_s.shape):
+            raise ValueError(f"load must return one value for each time, shape {time_s.shape}, got shape {values.shape}")
+        return np.broadcast_to(values, time_s.shape)
+
+
+_Known = KnownLoad | _Function
+
+
+def _to_come(load: FutureLoad | None, unit: LoadUnit, record: Samples, model: RecordModel) -> tuple[_Known | RandomLoad, str]:
+    """The load to come, and its name."""
+    if load is None:
+        expected = expected_current(record.time_s, record.current_A)
+        if expected.varied:
+            return BlockBootstrap(record, steadier_unit(record), dt_s=model.dt_s), "a load as so far"
+        load, unit = expected.mean_A, "current"
+    if isinstance(load, (KnownLoad, RandomLoad)):
+        return load, {Load: "a given load", Cycle: "a cycle"}.get(type(load), "a random load")
+    if callable(load):
+        return _Function(load, unit), "a given load"
+    value = check_numbers("load", load)
+    if value.ndim:
+        raise TypeError(
+            f"load must be a number, a function of time or a load of battery_env.loads, got an array of shape {value.shape}. "
+            "Give Load(time_s, value, unit), with time_s from 0 at the end of the record."
+        )
+    return constant(float(value), unit), f"{value:g} {LOAD_UNIT_SYMBOLS[unit]}"
+
+
+def _draws(load: RandomLoad, count: int, rng: np.random.Generator) -> list[_Known]:
+    name, draws = type(load).__name__, [load(rng) for _ in range(count)]
+    others = [drawn for drawn in draws if not isinstance(drawn, KnownLoad)]
+    if others:
+        raise TypeError(
+            f"a draw of {name} must be a load of battery_env.loads, such as a Load or a Cycle, got {others[0]!r}. Lay a "
+            "function of time out: Load(time_s, function(time_s), unit)."
+        )
+    units = sorted({drawn.unit for drawn in draws})
+    if len(units) > 1:
+        raise ValueError(f"the draws of {name} must all have the same unit, got {' and '.join(units)}")
+    return list(draws)
+
+
+def _nominal_Ah(model: RecordModel, loads: list[_Known], cut_off_V: float) -> float:
+    """The capacity of the model's cell, its mean over loads: under a single draw, health would be a matter of that draw."""
+    given = [model.capacity_Ah(in_steps(load, model.dt_s), load.unit, cut_off_V, _LONGEST_S) for load in loads]
+    reached = [each_Ah for each_Ah in given if each_Ah > 0.0]  # no charge takes a full cell to its end
+    return float(np.mean(reached)) if reached else float("nan")
+
+
+def _draw_parameters(
+    model: RecordModel, current_A: FloatArray, estimate: Estimate, samples: int, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    q_C, r_ohm = float(Q_MOBILE.check(estimate.q_mobile)), float(R_O.check(estimate.r_o))
+    if np.inf in (estimate.sd_q_mobile, estimate.sd_r_o):
+        raise ValueError(
+            "this estimate determines nothing (its standard deviation is infinite): record on, or give its calibrator a prior"
+        )
+    share, sd_ohm = np.nan_to_num([estimate.sd_q_mobile / q_C, estimate.sd_r_o])
+    if share < 0.0 or sd_ohm < 0.0:
+        raise ValueError(f"standard deviations must be at least 0, got {estimate!r}")
+    least_C = max(model.least_q_mobile_C(current_A), Q_MOBILE.limits[0])
+    low, high = np.log([least_C / q_C, Q_MOBILE.limits[1] / q_C])
+    if low > _CONTRADICTION_SD * share:
+        raise ValueError(
+            f"the estimate contradicts the record, which takes a q_mobile of at least {least_C:.6g} C: got {q_C:.6g} +- "
+            f"{share * q_C:.3g} C. Estimate anew from this record."
+        )
+    deviation = np.zeros(samples)
+    if share > 0.0:
+        deviation = truncnorm.rvs(low / share, high / share, size=samples, random_state=rng)
+    # at a given voltage a larger q_mobile goes with a larger r_o
+    _, by_q, by_r = model.sensitivities(current_A, max(q_C, 1.01 * least_C), r_ohm)
+    known = np.isfinite(by_q) & np.isfinite(by_r)
+    squares = float(by_r[known] @ by_r[known])
+    slope_ohm = -share * q_C * float(by_r[known] @ by_q[known]) / squares if squares > 0.0 else 0.0
+    slope_ohm = float(np.clip(slope_ohm, -sd_ohm, sd_ohm))
+    own_ohm = np.sqrt(sd_ohm**2 - slope_ohm**2)
+    r_o = r_ohm + slope_ohm * deviation + own_ohm * rng.standard_normal(samples)
+    return q_C * np.exp(share * deviation), np.clip(r_o, *R_O.limits)
+
+
+class _Cells(NamedTuple):
+    """Samples of a cell at the end of its record, arrays over the samples."""
+
+    q_mobile: FloatArray
+    r_o: FloatArray
+    state: FloatArray
+    voltage_V: FloatArray  # of the model; NaN if it was empty before
+    error_V: FloatArray  # what is to be added to that
+    drift: FloatArray  # standard normal: where that moves
+
+    def part(self, chosen: IntArray) -> _Cells:
+        return _Cells(*(column[chosen] for column in self))
+
+    def error_after(self, drawn_share: FloatArray, mismatch_V: float) -> FloatArray:
+        """What is to be added after a share of ``q_mobile`` was drawn, shape (..., cells)."""
+        # what the last voltages showed stays, as an error of r_o would; what the error is beside that changes
+        memory = np.exp(-np.maximum(drawn_share, 0.0) / _MEMORY_SHARE)
+        return self.error_V + mismatch_V * self.drift * np.sqrt(1.0 - memory**2)
+
+    @property
+    def soc(self) -> FloatArray:
+        return state_of_charge(self.state, self.q_mobile)
+
+
+def _at_the_end_of(
+    record: Samples,
+    model: RecordModel,
+    current_A: FloatArray,
+    parameters: tuple[FloatArray, FloatArray],
+    mismatch_V: float,
+    rng: np.random.Generator,
+) -> _Cells:
+    """Take cells with drawn parameters through a record, and draw their errors from the last voltages measured."""
+    steps, count = len(current_A) - 1, len(parameters[0])
+    measured_V = np.interp(record.time_s[0] + model.dt_s * np.arange(steps + 1), record.time_s, record.voltage_V)
+    last = slice(min(int((1.0 - RECENT_SHARE) * steps), steps - 1) + 1, None)
+    state = model.start(parameters[0])
+    model.advance(state, current_A[: last.start], *parameters)
+    run_V, _ = model.run_on(state, current_A[None, last.start : -1], *parameters, "current")
+    voltage_V, recent_V = run_V[-1], np.mean(measured_V[last, None] - run_V, axis=0)
+    # the voltage measured is noisy
+    samples = max(int((record.time_s >= record.time_s[-1] - RECENT_SHARE * np.ptp(record.time_s)).sum()), 1)
+    variance_V2, of_noise_V2 = mismatch_V**2, white_noise_V(record.voltage_V) ** 2 / samples
+    share = variance_V2 / (variance_V2 + of_noise_V2) if variance_V2 > 0.0 else 0.0
+    draws = rng.standard_normal((2, count))
+    return _Cells(*parameters, state, voltage_V, share * recent_V + mismatch_V * np.sqrt(1.0 - share) * draws[0], draws[1])
+
+
+class _Ends(NamedTuple):
+    time_s: FloatArray  # of each cell, since the start; infinite if it does not end
+    soc: FloatArray  # then; NaN likewise
+    course_s: FloatArray
+    course_V: FloatArray  # quantiles of all cells
+
+
+def _discharge(model: RecordModel, cells: _Cells, loads: list[_Known], mismatch_V: float, cut_off_V: float) -> _Ends:
+    """Take cells down to the cut-off, side by side; ``loads``: one for all, or one a cell."""
+    dt_s, count, first_soc = model.dt_s, len(cells.q_mobile), cells.soc
+    steps, every = int(_LONGEST_S / dt_s + 1e-9), max(round(_COURSE_S / dt_s), 1)
+    # cells whose load is off for ever are followed no longer than the others
+    is_off = np.broadcast_to([isinstance(load, Load) and not (load.value > 0.0).any() for load in loads], count)
+    time_s, end_soc = np.full(count, np.inf), np.full(count, np.nan)
+    course: list[tuple[FloatArray, FloatArray]] = []
+    going, state, drawn_A = np.arange(count), cells.state.copy(), np.zeros((1, count))
+    for first in range(0, steps, _CHUNK_STEPS):
+        now, size = cells.part(going), min(_CHUNK_STEPS, steps - first)
+        grid_s = dt_s * np.arange(first, first + size + 1, dtype=np.float64)
+        to_come = np.array([in_steps(loads[n], dt_s)(grid_s[:-1]) for n in (going if len(loads) > 1 else [0])])
+        voltage_V, current_A = model.run_on(state, to_come, now.q_mobile, now.r_o, loads[0].unit)
+        drawn_A = np.cumsum(np.vstack([drawn_A[-1], current_A]), axis=0)
+        soc = first_soc[going] - drawn_A * dt_s / now.q_mobile
+        voltage_V += now.error_after(first_soc[going] - soc, mismatch_V)
+        # the row of each cell's end, and the last one to look at: beyond the chunk where it is not reached
+        below = ~(voltage_V > cut_off_V)
+        end = np.where(below.any(axis=0), below.argmax(axis=0), size + 1)
+        last = int(end[~is_off[going]].max(initial=0))
+        is_over, last = last <= size or first + size == steps, min(last, size)
+        rows = np.arange(last + 1)[:, None]
+        overfull = is_overfull(soc[: last + 1], first_soc[going]) & (rows <= end)
+        if overfull.any():
+            raise overfull_error(grid_s[overfull.any(axis=1).argmax()])
+        for n in np.flatnonzero(end <= last):
+            around = slice(max(end[n] - 1, 0), end[n] + 1)
+            time_s[going[n]] = reached_s(grid_s[around], voltage_V[around, n], cut_off_V)
+            end_soc[going[n]] = np.interp(time_s[going[n]], grid_s[around], soc[around, n])
+        shown = [row for row in range(last + 1) if (row < size and (first + row) % every == 0) or (is_over and row == last)]
+        shown_V = np.full((count, len(shown)), cut_off_V)
+        shown_V[going] = np.where(rows[shown] < end, voltage_V[shown], cut_off_V).T
+        course.append((grid_s[shown], quantile(shown_V, BAND)))
+        if is_over:
+            break
+        left = end > size
+        going, state, drawn_A = going[left], state[left], drawn_A[-1:, left]
+    course_s, course_V = zip(*course, strict=True)
+    return _Ends(time_s, end_soc, np.concatenate(course_s), np.concatenate(course_V, axis=1))

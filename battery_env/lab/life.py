@@ -1,0 +1,262 @@
+"""A cell over its discharges: what each lets expect of the next one, and when the capacity will be used up."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import exp, hypot, isnan, log, sqrt
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numba import njit
+from numpy.typing import ArrayLike
+from scipy.optimize import minimize
+from scipy.stats import truncnorm
+
+from battery_env.arrays import BoolArray, FloatArray
+from battery_env.checks import check_positive, check_whole_number
+from battery_env.estimators.diagnosis.conditions import is_only_imprecise
+from battery_env.estimators.least_squares import LeastSquares
+from battery_env.lab.forecast import BAND, quantile
+from battery_env.records import drawn, mean_current_A
+from battery_env.records.discharge import Discharge
+
+#: What is believed of a cell before its discharges tell, as shares of q_mobile: the step from one to the next, the error of
+#: one estimate beside the others (both known to a factor of e, one standard deviation), and the sd of the drift.
+PRIOR_STEP_SHARE, PRIOR_NOISE_SHARE, PRIOR_DRIFT_SD_SHARE = 0.01, 0.003, 0.003
+_COLUMNS = (
+    "q_mobile_C",
+    "sd_q_mobile_C",
+    "r_o_ohm",
+    "settled",
+    "reason",
+    "valid",
+    "capacity_Ah",
+    "mean_current_A",
+    "lasted_share",
+)
+# Lives that are simulated, and discharges to look ahead.
+_LIVES, _MOST = 2000, 2000
+
+
+@dataclass(frozen=True, eq=False)
+class Life:
+    """
+    What :func:`track_life` found.
+
+    The logarithm of ``q_mobile`` is a random walk with drift over the discharges, of which each estimate is one reading.
+
+    :param table: one row per discharge: ``cycle`` (its number, or its position), ``q_mobile_C``, ``sd_q_mobile_C``,
+        ``r_o_ohm``, ``settled``, ``reason``, ``valid`` (whether it counts), ``capacity_Ah`` (charge to the cut-off),
+        ``mean_current_A``, ``lasted_share`` (its duration, as a share of the model's at this ``q_mobile``; NaN if it was cut
+        short), and what the discharges before let expect of ``q_mobile``, ``expected_q_mobile_C`` and ``expected_sd_C`` (NaN
+        for the first)
+    :param step_share: standard deviation of the step from one discharge to the next, as a share of ``q_mobile``
+    :param noise_share: standard deviation of an estimate beside the others, likewise
+    :param drift_share: mean step
+    :param state: mean of (ln ``q_mobile`` after the last discharge, drift), shape (2,)
+    :param covariance: theirs, shape (2, 2)
+    """
+
+    table: pd.DataFrame
+    step_share: float
+    noise_share: float
+    drift_share: float
+    state: FloatArray
+    covariance: FloatArray
+
+    @property
+    def prior_q_mobile_C(self) -> tuple[float, float]:
+        """
+        Mean and standard deviation of ``q_mobile`` in the next discharge, C: a prior for its calibration. It is for the load
+        of the life, under which the error that all estimates share cancels from the end. At the ``q_mobile`` of a whole
+        discharge the model ends a little early or late, about as much as in the one before: the mean allows for it.
+        """
+        mean_C, sd_C = self.next_q_mobile_C
+        whole = self.table[self.table["valid"] & self.table["lasted_share"].notna()]
+        lasted = float(whole["lasted_share"].iloc[-1]) if len(whole) else 1.0
+        return lasted * mean_C, lasted * sd_C
+
+    @property
+    def next_q_mobile_C(self) -> tuple[float, float]:
+        """Mean and standard deviation of ``q_mobile`` in the next discharge, C."""
+        mean_C = exp(self.state.sum())
+        return mean_C, mean_C * sqrt(self.covariance.sum() + self.step_share**2)
+
+    @property
+    def prior_at_other_loads_C(self) -> tuple[float, float]:
+        """The same for a load that is not that of the life: the error that all estimates share counts too."""
+        mean_C, sd_C = self.next_q_mobile_C
+        last = self.table[self.table["valid"]].iloc[-1]
+        return mean_C, hypot(sd_C, mean_C * last["sd_q_mobile_C"] / last["q_mobile_C"])
+
+    def after(self, count: int) -> Life:
+        """
+        The life as it was known after its first discharges.
+
+        :param count: how many
+        :return: that part of the life, with the sizes of step and noise that it shows
+        :raises ValueError: for fewer discharges than one or more than there are, or if none of them is valid
+        """
+        if not 1 <= check_whole_number("count", count) <= len(self.table):
+            raise ValueError(f"count must lie within 1 .. {len(self.table)}, got {count}")
+        return life_of(self.table.iloc[:count])
+
+    def remaining_discharges(self, threshold_Ah: float, probability: ArrayLike = BAND, seed: int = 0) -> FloatArray:
+        """
+        The remaining useful life: how many discharges are still to come, the one included that first has less capacity than
+        the threshold. The cell is used as before; its capacity is in proportion to ``q_mobile``, as in the last discharge, and
+        does not grow in the long run. A row of the table counts as one discharge: check-ups make the answer too long.
+
+        :param threshold_Ah: capacity at which the life ends, Ah
+        :param probability: of the quantiles, within 0 .. 1, any shape
+        :param seed: of the 2000 lives that are simulated
+        :return: quantiles, same shape as ``probability``; infinite beyond 2000 discharges
+        :raises ValueError: for an argument out of range
+        """
+        check_positive("threshold_Ah", threshold_Ah)
+        last = self.table[self.table["valid"]].iloc[-1]
+        end = log(threshold_Ah * last["q_mobile_C"] / last["capacity_Ah"])
+        rng = np.random.default_rng(check_whole_number("seed", seed))
+        (level_mean, drift_mean), ((p_level, p_both), (_, p_drift)) = self.state, self.covariance
+        drift_sd = sqrt(p_drift)
+        drift = drift_mean + drift_sd * truncnorm.rvs(-np.inf, -drift_mean / drift_sd, size=_LIVES, random_state=rng)
+        level = level_mean + p_both / p_drift * (drift - drift_mean)
+        level += sqrt(max(p_level - p_both**2 / p_drift, 0.0)) * rng.standard_normal(_LIVES)
+        left = np.full(_LIVES, np.inf)
+        for n in range(1, _MOST + 1):
+            level = level + drift + self.step_share * rng.standard_normal(_LIVES)
+            left[np.isinf(left) & (level < end)] = n
+        return quantile(left, probability)
+
+
+def track_life(discharges: Sequence[Discharge], cut_off_V: float, calibrator: LeastSquares | None = None) -> Life:
+    """
+    Follow ``q_mobile`` of one cell from discharge to discharge.
+
+    Each discharge is calibrated alone. Over the discharges the logarithm of ``q_mobile`` is a random walk with drift (the
+    local level model of Durbin and Koopman, *Time Series Analysis by State Space Methods*, 2012, with a constant slope),
+    filtered by Kalman's recursions. The sizes of step and noise are those that make the series most probable, under weak
+    priors (:data:`PRIOR_STEP_SHARE`).
+
+    A discharge is *valid* if its estimate is settled, or only imprecise though it reaches the cut-off: discharges of one
+    cell share that error, so that it hides no step. Others are left out: those that cannot be used, that something in the
+    record contradicts, or that were cut short.
+
+    .. code-block:: python
+
+      life = track_life(load_nasa_discharges("B0005")[:60], cut_off_V=2.7)
+      next_fit = LeastSquares(thermal=True, mismatch_V=0.05, prior_q_mobile_C=life.prior_q_mobile_C)
+      print(life.remaining_discharges(threshold_Ah=1.4))
+
+    :param discharges: of one cell, in their order
+    :param cut_off_V: where they end, V
+    :param calibrator: without a prior; ``None``: ``LeastSquares(thermal=True, mismatch_V=0.05)``
+    :return: the cell's life so far
+    :raises ValueError: if no discharge is valid, or the calibrator has a prior or no full cell at the start
+    """
+    calibrator = LeastSquares(thermal=True, mismatch_V=0.05) if calibrator is None else calibrator
+    if calibrator.prior_q_mobile_C is not None:
+        raise ValueError("the calibrator must have no prior of q_mobile: each discharge has to speak for itself")
+    if calibrator.initial_soc != (1.0, 0.0):
+        raise ValueError("the calibrator must take discharges to start full: the charge to the cut-off is no capacity else")
+    if not len(discharges):
+        raise ValueError("discharges must hold at least one discharge")
+    rows = []
+    for position, discharge in enumerate(discharges):
+        row: dict[str, Any] = {"cycle": discharge.meta.get("cycle", position + 1)}
+        try:
+            rows.append(row | _told(discharge, cut_off_V, calibrator))
+        except ValueError as error:  # of one that cannot be used
+            rows.append(row | {"settled": False, "valid": False, "reason": str(error)})
+    return life_of(pd.DataFrame(rows, columns=["cycle", *_COLUMNS]))
+
+
+def _told(discharge: Discharge, cut_off_V: float, calibrator: LeastSquares) -> dict[str, Any]:
+    """What one discharge says alone."""
+    record = discharge.loaded_part(cut_off_V)
+    estimate = calibrator.estimate(record)
+    end_s = calibrator.model.forecast(record, estimate, cut_off_V).eod_time_s
+    capacity_Ah = float(drawn(record.time_s, record.current_A, end_s)) / 3600.0
+    start_s, measured_s = record.time_s[0], discharge.eod_time_s(cut_off_V)
+    return {
+        "q_mobile_C": estimate.q_mobile,
+        "sd_q_mobile_C": estimate.sd_q_mobile,
+        "r_o_ohm": estimate.r_o,
+        "settled": estimate.settled,
+        "reason": estimate.reason,
+        "valid": estimate.settled or (not isnan(measured_s) and is_only_imprecise(estimate.reason)),
+        "capacity_Ah": capacity_Ah,
+        "mean_current_A": mean_current_A(record),
+        "lasted_share": (measured_s - start_s) / (end_s - start_s),
+    }
+
+
+def life_of(table: pd.DataFrame) -> Life:
+    """Follow ``q_mobile`` over the rows of a table, as :class:`Life` has it."""
+    valid = table["valid"].to_numpy(dtype=np.bool_)
+    if not valid.any():
+        raise ValueError(f"no discharge determines q_mobile. {_most_common(table['reason'])}")
+    readings = np.log(table["q_mobile_C"].to_numpy())
+    first = int(np.flatnonzero(valid)[0])
+    centre = np.log([PRIOR_STEP_SHARE, PRIOR_NOISE_SHARE])
+    expected = np.full((len(readings), 2), np.nan)
+    state, covariance = np.zeros(2), np.zeros((2, 2))
+
+    def surprise(logarithms: FloatArray) -> float:
+        step, noise = np.exp(np.clip(logarithms, -15.0, 0.0))
+        out = _filtered(readings, valid, first, step, noise, PRIOR_DRIFT_SD_SHARE, expected, state, covariance)
+        return float(out + 0.5 * ((logarithms - centre) ** 2).sum())
+
+    best = minimize(surprise, centre, method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-4}).x
+    surprise(best)
+    step, noise = np.exp(best)
+    mean_C = np.exp(expected[:, 0])
+    table = table.assign(expected_q_mobile_C=mean_C, expected_sd_C=mean_C * np.sqrt(expected[:, 1]))
+    return Life(table, float(step), float(noise), float(state[1]), state, covariance)
+
+
+def _most_common(reasons: pd.Series) -> str:
+    """The reason that most discharges share, but for the numbers in it."""
+    kinds = [re.sub(r"\d+", "", reason) for reason in reasons]
+    kind, count = Counter(kinds).most_common(1)[0]
+    return f"Of {count} of {len(kinds)}: {reasons.iloc[kinds.index(kind)]}"
+
+
+@njit(cache=True, error_model="numpy")
+def _filtered(
+    readings: FloatArray,
+    valid: BoolArray,
+    first: int,
+    step: float,
+    noise: float,
+    drift_sd: float,
+    expected: FloatArray,
+    state: FloatArray,
+    covariance: FloatArray,
+) -> float:
+    # Kalman's recursions. Returns minus the log likelihood; fills what was expected of each reading (mean and variance of the
+    # level) and the state after the last one
+    level, drift = readings[first], 0.0
+    p_level, p_both, p_drift = noise**2, 0.0, drift_sd**2
+    surprise = 0.0
+    for n in range(first + 1, len(readings)):
+        level += drift
+        p_level += 2.0 * p_both + p_drift + step**2
+        p_both += p_drift
+        expected[n, 0], expected[n, 1] = level, p_level
+        if valid[n]:
+            variance, innovation = p_level + noise**2, readings[n] - level
+            surprise += 0.5 * (np.log(variance) + innovation**2 / variance)
+            gain_level, gain_drift = p_level / variance, p_both / variance
+            level += gain_level * innovation
+            drift += gain_drift * innovation
+            p_drift -= gain_drift * p_both
+            p_both -= gain_level * p_both
+            p_level -= gain_level * p_level
+    state[0], state[1] = level, drift
+    covariance[0, 0], covariance[0, 1], covariance[1, 0], covariance[1, 1] = p_level, p_both, p_both, p_drift
+    return surprise

@@ -1,0 +1,1 @@
+"""Files of testers, in three steps: names of columns, tables, and the discharges in them."""

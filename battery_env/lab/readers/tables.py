@@ -1,0 +1,262 @@
+"""Files of measurements as tables: text of any delimiter, Parquet, and the binary files of testers."""
+
+from __future__ import annotations
+
+import bz2
+import csv
+import gzip
+import io
+import lzma
+import re
+import warnings
+import zipfile
+from codecs import getincrementaldecoder
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import IO, Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from battery_env.lab.readers.columns import Column, count_required, find_columns, units_below
+
+#: Endings of the names of files that can be read, besides those of NASA (.mat); of text also packed (.gz, .bz2, .xz, .zip).
+TEXT_SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".mpt", ".bdf")
+BINARY_SUFFIXES = (".parquet", ".nda", ".ndax", ".mpr")
+PACKED_SUFFIXES = (".gz", ".bz2", ".xz", ".zip")
+
+_OPENERS: dict[str, Callable[[Path], Any]] = {".gz": gzip.open, ".bz2": bz2.open, ".xz": lzma.open}
+# Testers write what they know about a test above the table: so many bytes and lines are searched for its header.
+_HEAD_BYTES, _HEAD_LINES = 1 << 18, 400
+_BLANKS = r"\s+"
+_DELIMITERS = (",", ";", "\t", _BLANKS)
+_DECIMAL_COMMA = re.compile(r"^\s*[-+]?\d+,\d+(?:[eE][-+]?\d+)?\s*$")
+_NUMBER = re.compile(r"^\s*[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?(?:[;\s]|$)")
+_DECIMAL_POINT = re.compile(r"^\s*[-+]?\d*\.\d+(?:[eE][-+]?\d+)?\s*$")
+# What Excel reads in the first line of a file: the delimiter.
+_DELIMITER_LINE = re.compile(r"^\s*sep=([,;\t|])\s*$", flags=re.IGNORECASE)
+# So many lines below a table may be no part of it.
+_FOOT_LINES = 50
+_EXPORT = {
+    ".xls": "save the sheet as CSV",
+    ".xlsx": "save the sheet as CSV",
+    ".res": "export the channel as CSV in MITS Pro",
+}
+
+
+class _Layout(NamedTuple):
+    """How a text file is laid out."""
+
+    encoding: str
+    header_line: int
+    delimiter: str
+    decimal: str
+    names: list[str]
+    below: list[str]  # fields of the line below the header
+
+
+def read_columns(
+    path: Path, chosen: Mapping[str, str] | None = None, units: Mapping[str, str] | None = None
+) -> tuple[pd.DataFrame, dict[str, Column]]:
+    """Read the columns of a record, and no others."""
+    suffix = path.suffix.lower()
+    if suffix in _EXPORT:
+        raise ValueError(f"{suffix} files cannot be read: {_EXPORT[suffix]}")
+    if suffix == ".parquet":
+        return _read_parquet(path, chosen, units)
+    if suffix in (".nda", ".ndax"):
+        return columns_of(_read_neware(path), chosen, units)
+    if suffix == ".mpr":
+        return columns_of(_read_biologic(path), chosen, units)
+    return _read_text(path, chosen, units)
+
+
+def columns_of(
+    table: pd.DataFrame, chosen: Mapping[str, str] | None = None, units: Mapping[str, str] | None = None
+) -> tuple[pd.DataFrame, dict[str, Column]]:
+    """The columns of a record, of a table; an index with a name is a column too."""
+    table = table.reset_index(drop=table.index.names == [None])
+    columns = find_columns([str(name) for name in table.columns], chosen, units)
+    return pd.DataFrame({quantity: table.iloc[:, column.position] for quantity, column in columns.items()}), columns
+
+
+def _read_text(
+    path: Path, chosen: Mapping[str, str] | None, units: Mapping[str, str] | None
+) -> tuple[pd.DataFrame, dict[str, Column]]:
+    layout = _layout(_head(path), chosen)
+    columns, header_lines = find_columns(layout.names, chosen, units), layout.header_line + 1
+    below = units_below(columns, layout.below)
+    if below is not None:
+        columns, header_lines = find_columns(layout.names, chosen, {**below, **(units or {})}), header_lines + 1
+    # one column may serve as two quantities
+    positions = sorted({column.position for column in columns.values()})
+
+    def read(rows: int | None = None) -> pd.DataFrame:
+        try:
+            return pd.read_csv(
+                path,
+                sep=layout.delimiter,
+                decimal=layout.decimal,
+                encoding=layout.encoding,
+                header=None,
+                skiprows=header_lines,
+                nrows=rows,
+                usecols=positions,
+                index_col=False,
+                low_memory=False,
+            )
+        except pd.errors.EmptyDataError as error:
+            raise ValueError("there are no rows below the header") from error
+        except Exception as error:  # pandas and the unpackers raise whatever the damage leads them to
+            raise ValueError(f"the file is damaged, or no table: {str(error).strip()}") from error
+
+    table = read()
+    foot = _foot_lines(table[[columns[quantity].position for quantity in ("voltage", "current")]], layout.decimal)
+    text = table[columns["time"].position].tail(foot).dropna().astype(str).str.strip()
+    if len(text):
+        warnings.warn(
+            f"lines below the table, which hold neither voltage nor current, are left out: {text.iloc[0]!r}", stacklevel=2
+        )
+        # once more, as text below a column makes text of it
+        table = read(len(table) - foot)
+    return pd.DataFrame({quantity: table[column.position] for quantity, column in columns.items()}), columns
+
+
+def _foot_lines(measured: pd.DataFrame, decimal: str) -> int:
+    """How many of the last rows hold neither voltage nor current."""
+    tail = measured.tail(_FOOT_LINES).apply(lambda column: column.astype(str).str.strip().str.replace(decimal, "."))
+    nothing = tail.apply(pd.to_numeric, errors="coerce").isna().all(axis=1).to_numpy()
+    return int(np.argmin(nothing[::-1])) if len(nothing) else 0
+
+
+def _head(path: Path) -> bytes:
+    """The beginning of a file, unpacked."""
+    try:
+        with _open(path) as stream:
+            head = stream.read(_HEAD_BYTES)
+    except (FileNotFoundError, IsADirectoryError, PermissionError):
+        raise
+    except Exception as error:
+        raise ValueError(f"the file is damaged: {str(error).strip() or type(error).__name__}") from error
+    if not head.strip():
+        raise ValueError("the file is empty")
+    return head
+
+
+def _open(path: Path) -> IO[bytes]:
+    suffix = path.suffix.lower()
+    if suffix == ".zip":
+        archive = zipfile.ZipFile(path)
+        names = archive.namelist()
+        if len(names) != 1:
+            raise ValueError(f"the archive must hold one file, got {len(names)}")
+        return archive.open(names[0])
+    return _OPENERS[suffix](path) if suffix in _OPENERS else path.open("rb")
+
+
+def _layout(head: bytes, chosen: Mapping[str, str] | None) -> _Layout:
+    encoding, text = _decoded(head)
+    lines = io.StringIO(text, newline=None).read().split("\n")[:_HEAD_LINES]
+    delimiters: tuple[str, ...] = _DELIMITERS
+    if stated := _DELIMITER_LINE.match(lines[0]):
+        lines[0], delimiters = "", (stated[1],)
+    best, found = (0, delimiters[0]), -1
+    for number, line in enumerate(lines):
+        next_line = lines[number + 1] if number + 1 < len(lines) else ""
+        for delimiter in delimiters:
+            # blanks within names
+            if delimiter == _BLANKS and len(_fields(next_line, delimiter)) < len(_fields(line, delimiter)):
+                continue
+            if (count := count_required(_fields(line, delimiter), chosen)) > found:
+                best, found = (number, delimiter), count
+    number, delimiter = best
+    if found <= 0:
+        number = next((n for n, line in enumerate(lines) if line.strip()), -1)
+        if number < 0:
+            raise ValueError("the file is empty")
+        if any(map(_NUMBER.match, lines[number].split(","))):
+            raise ValueError("there is no line with the names of the columns above the numbers. Add one")
+        # names may hold blanks and units: the numbers below have to come apart as often
+        names, first_row = lines[number], lines[min(number + 1, len(lines) - 1)]
+        delimiter = max(delimiters, key=lambda each: min(len(_fields(names, each)), len(_fields(first_row, each))))
+    values = [field for line in lines[number + 1 :] for field in _fields(line, delimiter)]
+    comma = delimiter != _BLANKS and any(map(_DECIMAL_COMMA.match, values)) and not any(map(_DECIMAL_POINT.match, values))
+    below = _fields(lines[number + 1], delimiter) if number + 1 < len(lines) else []
+    return _Layout(encoding, number, delimiter, "," if comma else ".", _fields(lines[number], delimiter), below)
+
+
+def _decoded(head: bytes) -> tuple[str, str]:
+    for mark, encoding in ((b"\xef\xbb\xbf", "utf-8-sig"), (b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16")):
+        if head.startswith(mark):
+            return encoding, head.decode(encoding, errors="ignore")
+    if b"\0" in head:
+        raise ValueError("the file is binary, and its ending is none of those that can be read")
+    try:
+        # the head may end within a character
+        return "utf-8", getincrementaldecoder("utf-8")().decode(head, final=len(head) < _HEAD_BYTES)
+    except UnicodeDecodeError:
+        return "latin-1", head.decode("latin-1")
+
+
+def _fields(line: str, delimiter: str) -> list[str]:
+    # numpy writes a header as a comment
+    line = line.lstrip("# ")
+    if delimiter == _BLANKS:
+        return line.split()
+    try:
+        return [field.strip() for field in next(csv.reader([line], delimiter=delimiter), [])]
+    except csv.Error:
+        return []
+
+
+def _read_parquet(
+    path: Path, chosen: Mapping[str, str] | None, units: Mapping[str, str] | None
+) -> tuple[pd.DataFrame, dict[str, Column]]:
+    try:
+        from pyarrow import parquet
+    except ImportError as error:
+        raise ImportError("Parquet files need pyarrow: pip install 'battery_env[parquet]'") from error
+    try:
+        file = parquet.ParquetFile(path)
+    except FileNotFoundError:
+        raise
+    except Exception as error:
+        raise ValueError(f"the file is damaged, or no Parquet: {str(error).strip()}") from error
+    with file:
+        columns = find_columns(file.schema_arrow.names, chosen, units)
+        # the metadata of pandas would make an index of a column
+        table = file.read(columns=sorted({column.name for column in columns.values()})).to_pandas(ignore_metadata=True)
+    return pd.DataFrame({quantity: table[column.name] for quantity, column in columns.items()}), columns
+
+
+def _read_neware(path: Path) -> pd.DataFrame:
+    try:
+        import NewareNDA
+    except ImportError as error:
+        raise ImportError("Neware's files need NewareNDA: pip install 'battery_env[cyclers]'") from error
+    with path.open("rb"):  # a missing file is that, not a damaged one
+        pass
+    try:
+        return NewareNDA.read(str(path), log_level="ERROR")
+    except Exception as error:
+        raise ValueError(f"the file is damaged, or none of Neware's: {str(error).strip()}") from error
+
+
+def _read_biologic(path: Path) -> pd.DataFrame:
+    try:
+        from galvani.BioLogic import MPRfile
+    except ImportError as error:
+        raise ImportError("BioLogic's files need galvani: pip install 'battery_env[cyclers]'") from error
+    with path.open("rb") as stream:
+        try:
+            return pd.DataFrame(MPRfile(stream).data)
+        except Exception as error:
+            raise ValueError(f"the file is damaged, or none of BioLogic's: {str(error).strip()}") from error
+
+
+def is_readable(path: Path, more: Sequence[str] = ()) -> bool:
+    """Whether the name of a file ends as that of a record may."""
+    suffixes = [suffix.lower() for suffix in path.suffixes]
+    if suffixes and suffixes[-1] in PACKED_SUFFIXES:
+        return len(suffixes) > 1 and suffixes[-2] in TEXT_SUFFIXES
+    return bool(suffixes) and suffixes[-1] in (*TEXT_SUFFIXES, *BINARY_SUFFIXES, *more)

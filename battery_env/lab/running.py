@@ -1,0 +1,295 @@
+"""The end of a discharge in progress, from the life of its cell and the load to come."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from numbers import Real
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from battery_env.checks import ZERO_CELSIUS_K, LoadUnit
+from battery_env.electrochemistry import NEW_CELL
+from battery_env.estimates import Estimate
+from battery_env.estimators.diagnosis.conditions import is_only_imprecise
+from battery_env.estimators.least_squares import LeastSquares
+from battery_env.files import check_new, finite_or_none, replacing
+from battery_env.lab.calibrate import Calibration, Settings, calibrate
+from battery_env.lab.forecast import BAND, Forecast, FutureLoad, forecast, quantile
+from battery_env.lab.life import Life, track_life
+from battery_env.lab.many import FileFormat, Source, find_sources, read_source, record_name
+from battery_env.loads import Load
+from battery_env.plotting import save_figure
+from battery_env.records import VARIED_SHARE
+from battery_env.records.discharge import Discharge
+from battery_env.records.model import RecordModel
+
+# By name of the column of a profile: the unit of the load.
+_LOAD_COLUMNS: dict[str, LoadUnit] = {"current_A": "current", "power_W": "power"}
+
+
+@dataclass(frozen=True)
+class End:
+    """
+    When a discharge in progress will end, and what that rests on.
+
+    :param name: what the discharge is called in results
+    :param calibration: what the record says
+    :param forecast: what may come
+    :param life: of the cell before; ``None``: not known
+    :param prior_q_mobile_C: mean and standard deviation that were carried over, C; ``None``: none were
+    """
+
+    name: str
+    calibration: Calibration
+    forecast: Forecast
+    life: Life | None = None
+    prior_q_mobile_C: tuple[float, float] | None = None
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether something in the record contradicts the estimate; one that is only imprecise has a wide interval."""
+        return not self.calibration.settled and not is_only_imprecise(self.calibration.reason)
+
+    def row(self) -> dict[str, Any]:
+        """All of it by name, with units; of what is uncertain the quantiles ``probability``."""
+        found, past = self.forecast, self.life
+        samples = {
+            "eod_time_s": found.eod_time_s,
+            "remaining_s": found.remaining_s,
+            "soc": found.soc,
+            "q_mobile_C": found.q_mobile,
+            "r_o_ohm": found.r_o,
+            "capacity_Ah": found.capacity_Ah,
+            "state_of_health": found.state_of_health,
+        }
+        return {
+            "record": self.name,
+            "method": self.calibration.method,
+            "settled": self.calibration.settled,
+            "load": found.load_name,
+            "cut_off_V": found.cut_off_V,
+            "now_s": found.now_s,
+            "probability": list(BAND),
+            **{name: [finite_or_none(value) for value in quantile(values, BAND).tolist()] for name, values in samples.items()},
+            "nominal_Ah": finite_or_none(found.nominal_Ah),
+            "life_discharges": 0 if past is None else int(past.table["valid"].sum()),
+            "prior_q_mobile_C": None if self.prior_q_mobile_C is None else list(self.prior_q_mobile_C),
+            "notes": list(found.notes),
+        }
+
+    def text(self) -> str:
+        """The same for reading."""
+        lines = [self.name]
+        if self.life is not None:
+            valid = self.life.table["valid"]
+            left_out = f"; {(~valid).sum()} left out" if not valid.all() else ""
+            plural = "" if valid.sum() == 1 else "s"
+            lines.append(f"life of {valid.sum()} earlier discharge{plural}{left_out}")
+        if self.prior_q_mobile_C is not None:
+            lines.append("q_mobile before: {:.0f} C, sd {:.0f} C".format(*self.prior_q_mobile_C))
+        return "\n".join([*lines, self.forecast.summary()])
+
+
+def forecast_end(
+    discharge: Discharge, settings: Settings | None = None, load: FutureLoad | None = None, samples: int = 1000
+) -> Forecast:
+    """
+    The end of a discharge in progress, with all that :class:`~battery_env.Settings` know of it.
+
+    .. code-block:: python
+
+      life = track_life(read_discharges("life.csv"), cut_off_V=2.7)
+      found = forecast_end(read_discharges("running.csv")[0], Settings(prior_q_mobile_C=life.prior_q_mobile_C), load=1.5)
+      print(found.eod_quantile_s([0.05, 0.5, 0.95]), found.summary())
+
+    :param discharge: what was recorded until now
+    :param settings: how to look at it; ``None``: the defaults
+    :param load: from the last sample under load on, as :func:`battery_env.forecast` takes it; ``None``: as so far
+    :param samples: of what may come
+    :return: these
+    :raises ValueError: if the discharge cannot be used, or a load cannot be meant
+    """
+    return _forecast(discharge, Settings() if settings is None else settings, load, samples)[1]
+
+
+def _forecast(
+    discharge: Discharge, settings: Settings, load: FutureLoad | None, samples: int = 1000
+) -> tuple[Calibration, Forecast]:
+    """What a record says, and what comes after it."""
+    # under another load the filter is surer than it may be
+    method = settings.method if load is None else settings.method or "least-squares"
+    found = calibrate(discharge, replace(settings, method=method))
+    assert found.record is not None
+    cell = (settings.cell or NEW_CELL).replace(Tb0=found.ambient_C + ZERO_CELSIUS_K)
+    expected = forecast(
+        found.record,
+        Estimate(found.q_mobile_C, found.r_o_ohm, found.sd_q_mobile_C, found.sd_r_o_ohm, found.settled, found.reason),
+        load,
+        settings.cut_off_V,
+        model=RecordModel(cell, settings.thermal and found.method != "policy", initial_soc=found.initial_soc),
+        mismatch_V=settings.mismatch_V,
+        nominal_Ah=settings.nominal_Ah,
+        samples=samples,
+    )
+    load_A = found.future_current_A if load is None else _largest_A(load, settings.cut_off_V)
+    other_load = settings.other_load(load_A)
+    # a cell of which nothing is known has no health
+    is_known = settings.nominal_Ah is not None or settings.tells_new_capacity(load_A)
+    nominal_Ah = expected.nominal_Ah if is_known else float("nan")
+    return found, replace(expected, nominal_Ah=nominal_Ah, notes=(*expected.notes, *_notes(discharge, found, other_load)))
+
+
+def _largest_A(load: FutureLoad, cut_off_V: float) -> float:
+    """The largest current of a load to come, of a power that at the cut-off; 0 of one that is not known."""
+    if isinstance(load, Load):
+        return float(load.value.max()) / (1.0 if load.unit == "current" else cut_off_V)
+    return float(load) if isinstance(load, Real) else 0.0
+
+
+def _notes(discharge: Discharge, found: Calibration, other_load: str) -> Iterator[str]:
+    """What a forecast from this calibration rests on, beyond its record."""
+    assert found.record is not None
+    # which is said where the load so far is another one, too
+    if other_load not in found.reason:
+        yield other_load
+    settings, seen_s = found.settings, float(found.record.time_s[-1])
+    if float(discharge.time_s[-1]) > seen_s:
+        yield f"What was recorded after the last sample under load, at {seen_s:.0f} s, is left out."
+    if found.method == "kalman" and settings.prior_q_mobile_C is None and settings.cell is None:
+        yield "The filter expects a cell of some 2 Ah: of another one give the life, a prior of q_mobile or the constants."
+    if found.voltage_rmse_V > settings.mismatch_V:
+        rmse = found.shown("voltage_rmse_V", 0)
+        yield f"The model misses the voltage by {rmse} (RMSE), more than mismatch_V. Other loads make the interval too narrow."
+
+
+def read_load(path: str | Path) -> Load:
+    """
+    Read a load to come: text with the columns ``time_s``, from 0 on, and ``current_A`` or ``power_W``, positive in discharge.
+    Each value holds until the next time, and the last one for ever.
+
+    :param path: the file, with commas, semicolons or tabs
+    :return: the load
+    :raises ValueError: if the file holds none
+    """
+    try:
+        table = pd.read_csv(path, sep=None, engine="python", encoding="utf-8-sig")
+    except (csv.Error, UnicodeDecodeError, pd.errors.ParserError, pd.errors.EmptyDataError) as error:
+        raise ValueError(f"{path}: no table: {error}") from error
+    table.columns = table.columns.str.strip()
+    found = [name for name in _LOAD_COLUMNS if name in table.columns]
+    if "time_s" not in table.columns or len(found) != 1:
+        names = ", ".join(table.columns)
+        raise ValueError(f"{path}: a load has the columns time_s and either current_A or power_W, got {names}")
+    try:
+        load = Load(table["time_s"].to_numpy(), table[found[0]].to_numpy(), _LOAD_COLUMNS[found[0]])
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: {error}") from error
+    if load.value.max() <= 0.0:
+        raise ValueError(f"{path}: {found[0]} is nowhere above 0, so that nothing is drawn: a discharge is positive")
+    return load
+
+
+def read_running(argument: str, file_format: FileFormat) -> tuple[Source, Discharge]:
+    """Read a discharge in progress; of a file that holds several the last one."""
+    sources = find_sources([argument])
+    if len(sources) > 1:
+        raise ValueError(f"{argument} holds {len(sources)} files: name the one in progress, and the others with --life")
+    running = read_source(sources[0], file_format)[-1]
+    return sources[0]._replace(cycle=running.meta.get("cycle")), running.discharge()
+
+
+def read_life(arguments: Sequence[str], running: Source, file_format: FileFormat) -> list[Discharge]:
+    """
+    Read the discharges of a cell before the one in progress, up to it where it is among them. All that is named counts as of
+    one cell: of several folders with a warning. What cannot be read is left out with a warning.
+    """
+    discharges: list[Discharge] = []
+    sources = find_sources(arguments)
+    folders = sorted({str(Path(source.path).parent) for source in sources})
+    if len(folders) > 1:
+        warnings.warn(f"--life: the records of {', '.join(folders)} are taken for one cell's", stacklevel=2)
+    for source in sources:
+        try:
+            recordings = read_source(source, file_format)
+        except Exception as error:  # readers of files raise what they like
+            warnings.warn(f"{source.argument} is left out: {' '.join(str(error).split())}", stacklevel=2)
+            continue
+        is_reached = Path(source.path).resolve() == Path(running.path).resolve()
+        if is_reached:
+            recordings = [each for each in recordings if each.meta.get("cycle", math.inf) < (running.cycle or 0)]
+        for recording in recordings:
+            try:
+                discharges.append(recording.discharge())
+            except (TypeError, ValueError) as error:
+                number = recording.meta.get("cycle", "")
+                warnings.warn(f"{source.path}:{number} is left out: {error}", stacklevel=2)
+        if is_reached:
+            break  # what follows is the future
+    if not discharges:
+        raise ValueError(f"{', '.join(arguments)}: no discharge before {running.argument}")
+    return discharges
+
+
+def end_of_record(
+    argument: str, settings: Settings, file_format: FileFormat, life: Sequence[str] = (), load: Path | None = None
+) -> End:
+    """
+    The end of a discharge in a file, as the command line names it, the discharges before it (none: their life is not known)
+    and the load to come (``None``: as so far).
+    """
+    to_come = None if load is None else read_load(load)
+    source, running = read_running(argument, file_format)
+    past = None
+    if life:
+        before = read_life(life, source, file_format)
+        named = sorted({each.meta["cell"] for each in [*before, running] if "cell" in each.meta})
+        if len(named) > 1:
+            raise ValueError(f"--life: these are discharges of {' and '.join(named)}: give those of the cell in progress")
+        calibrator = replace(settings, method="least-squares", initial_soc=1.0).calibrator()
+        assert isinstance(calibrator, LeastSquares)
+        past = track_life(before, settings.cut_off_V, calibrator)
+        prior_C = past.prior_q_mobile_C if has_usual_load(past, running, to_come) else past.prior_at_other_loads_C
+        settings = replace(settings, prior_q_mobile_C=prior_C)
+    found, expected = _forecast(running, settings, to_come)
+    if not found.in_progress:
+        raise ValueError(
+            f"{argument} reaches {settings.cut_off_V:g} V at {found.measured_eod_time_s:.0f} s, so that nothing is left to "
+            "forecast: calibrate it, or give a lower --cut-off"
+        )
+    return End(record_name(source.stem, source.cycle), found, expected, past, settings.prior_q_mobile_C)
+
+
+def has_usual_load(life: Life, running: Discharge, load: Load | None) -> bool:
+    """Whether a discharge has the constant load of its cell's life within 5 %, so far and under the load to come."""
+    if load is not None and load.unit != "current":
+        return False
+    usual_A = life.table["mean_current_A"][life.table["valid"]].iloc[-1]
+    low_A, high_A = np.quantile(running.current_A[running.time_s > running.load_on_time_s], [0.05, 0.95])
+    currents_A = [usual_A, low_A, high_A, *([] if load is None else load.value)]
+    return bool(np.ptp(currents_A) <= VARIED_SHARE * max(currents_A))
+
+
+class EndFiles:
+    """The files that an end is written to, refused if they are there already."""
+
+    def __init__(self, folder: Path, argument: str) -> None:
+        (source,) = find_sources([argument])[:1]
+        name = f"{record_name(source.stem, source.cycle)}_forecast"
+        self.table, self.figure = folder / f"{name}.json", folder / f"{name}.png"
+        check_new(self.table, self.figure)
+
+    def write(self, end: End) -> None:
+        """Write both."""
+        with replacing(self.table) as part:
+            part.write_text(json.dumps(end.row(), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        figure = end.forecast.plot()
+        figure.suptitle(f"{end.name}, then {end.forecast.load_name}", fontsize=10)
+        save_figure(figure, self.figure)

@@ -1,0 +1,356 @@
+"""A trained policy as an estimator."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from importlib import import_module
+from math import isnan, nan
+from typing import Any, Protocol
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from battery_env.arrays import FloatArray
+from battery_env.electrochemistry import NEW_CELL, STATE_SIZE, UNCERTAIN_CONSTANTS
+from battery_env.estimates import last_estimate
+from battery_env.estimators.diagnosis.conditions import Condition
+from battery_env.estimators.estimator import SURPLUS_SHARE, Estimate, EstimateTrace, ModelNow, OnlineEstimator, Record
+from battery_env.policies.confidence import Confidence
+from battery_env.policies.pretrained import pretrained_policy
+from battery_env.records import Samples, check_drawn_charge, check_record, check_sample, drawn_charge_C, starts_at_rest
+from battery_env.records.model import RecordModel
+from battery_env.tasks.env import CalibrationEnv, task_class
+from battery_env.tasks.task import CalibrationTask
+from battery_env.tasks.voltage.aging import BatteryAging
+from battery_env.tasks.voltage.fit import Fitted
+from battery_env.tasks.voltage.task import VoltageTask
+
+# Steps in which a stream is followed, s
+_STEP_S = 1.0
+
+
+class Predictor(Protocol):
+    """Anything with Stable-Baselines3's ``predict``: an algorithm or a policy."""
+
+    def predict(self, observation: Any, /, *, deterministic: bool = False) -> tuple[Any, Any]:
+        """Actions for a batch of observations."""
+        ...
+
+
+class ReadingsSoFar:
+    """
+    Samples of one discharge that come in one by one, at any intervals, with missing voltages (NaN) among them.
+
+    :ivar time_s: since the first sample, s
+    :ivar voltage_V: V
+    :ivar current_A: from each sample to the next one, A
+    """
+
+    def __init__(self) -> None:
+        self.time_s: list[float] = []
+        self.voltage_V: list[float] = []
+        self.current_A: list[float] = []
+
+    def add(self, voltage_V: float, current_A: float, dt_s: float) -> None:
+        """Take in a sample."""
+        self.time_s.append(self.time_s[-1] + dt_s if self.time_s else 0.0)
+        self.voltage_V.append(float(voltage_V))
+        self.current_A.append(float(current_A))
+
+    def record(self, dt_s: float) -> Samples:
+        """
+        The same in equal steps: the mean current over each, so that the charge drawn is kept, and the voltage between the
+        samples that have one.
+        """
+        time_s, voltage_V, current_A = self.columns()
+        steps = max(int(np.floor(time_s[-1] / dt_s + 1e-9)), 1)
+        grid_s = dt_s * np.arange(steps + 1, dtype=np.float64)
+        drawn_C = np.append(0.0, np.cumsum(current_A[:-1] * np.diff(time_s)))
+        mean_A = np.append(np.diff(np.interp(grid_s, time_s, drawn_C)) / dt_s, current_A[-1])
+        known = ~np.isnan(voltage_V)
+        return Samples(grid_s, np.interp(grid_s, time_s[known], voltage_V[known]), mean_A)
+
+    def known(self, until_s: float) -> Samples:
+        """The samples that have a voltage."""
+        time_s, voltage_V, current_A = self.columns()
+        known = ~np.isnan(voltage_V) & (time_s <= until_s + 1e-9)
+        return Samples(time_s[known], voltage_V[known], current_A[known])
+
+    def columns(self) -> FloatArray:
+        """All samples."""
+        return np.array([self.time_s, self.voltage_V, self.current_A])
+
+    @classmethod
+    def of(cls, columns: FloatArray) -> ReadingsSoFar:
+        """The reverse of :meth:`columns`."""
+        readings = cls()
+        readings.time_s, readings.voltage_V, readings.current_A = columns.tolist()
+        return readings
+
+
+def _without_data(env_id: str, options: dict[str, Any]) -> dict[str, Any]:
+    """Options of an environment that simulates nothing, where it needs no simulation: only its task is asked for."""
+    module, _, plain_id = env_id.rpartition(":")
+    if module:  # as gym.make has it
+        import_module(module)
+    task = gym.spec(plain_id).kwargs.get("task")
+    kind = None if task is None else task_class(task)
+    if kind is None or not issubclass(kind, VoltageTask):
+        return options
+    reading_s = float({**kind.options(), **options}["reading_s"])
+    time_s = np.array([0.0, 1.0, 2.0, 3.0]) * reading_s
+    blank = Samples(time_s, np.full(4, NEW_CELL.VEOD), np.zeros(4))
+    return {**options, "cost": "misfit", "dataset": [blank] * kind.discharges_of_an_episode(options)}
+
+
+class PolicyEstimator(OnlineEstimator):
+    """
+    Estimate q_max and R_o with a trained policy, over whole discharges or sample by sample.
+
+    .. code-block:: python
+
+      from battery_env import PolicyEstimator, load_nasa_discharges
+
+      whole = load_nasa_discharges("B0005")[0].loaded_part(cut_off_V=2.7)
+      print(PolicyEstimator.pretrained(recorded=True).estimate(whole))  # a policy that comes with the package
+
+    A model of your own is ``PolicyEstimator(model, "BatteryRo-v0")``, with the options of the environment that it was trained
+    on. Discharges that are estimated together run as one batch.
+
+    - A policy of a full-state environment estimates at every step, from the true state at the first sample on.
+    - A policy of a voltage-only environment starts with the estimate of a new cell, and moves it every ``decision_s``. It
+      takes any record that starts fully charged, simulated or recorded, or a stream (:meth:`update`).
+    - A policy of ``BatteryAging-v0`` takes such records life after life, ``cycles`` of them each, and carries its estimate
+      over from one to the next. It takes no stream.
+
+    A policy states standard deviations if its observation has a fit (option ``nuisance``): those of the fit under its priors,
+    with the distance of the estimate from it. It has settled if they are as small as least squares ask for, the fit explains
+    the record, and nothing in the record contradicts it. Other policies state none, and never settle.
+
+    What :meth:`save` wrote is refused with another :class:`~battery_env.OnnxPolicy`; models of
+    Stable-Baselines3 are not told from each other.
+
+    :param policy: what to ask for actions, deterministically
+    :param env_id: id of the environment that the policy was trained on
+    :param decision_s: time between two estimates of a voltage-only policy, s, a multiple of the interval between its readings
+    :param options: of its task, but for its data and the length of its episodes; ``cell`` among them, the constants that a
+        voltage-only policy was trained with, if not the new cell's
+    :raises ValueError: if the id is not one of a calibration environment
+    """
+
+    def __init__(self, policy: Predictor, env_id: str, decision_s: float = 60.0, **options: Any) -> None:
+        self.policy = policy
+        self.env_id = env_id
+        self.options = options
+        task = self.environment(env_id, **_without_data(env_id, options)).task
+        self.task_class = type(task)
+        self.parameters = task.parameters
+        self.cell = task.readings.cell if isinstance(task, VoltageTask) else NEW_CELL
+        self._every = task.steps_between(decision_s)
+        self.decision_s = decision_s
+        self.dt_s = _STEP_S
+        self._confidence: Confidence | None = None
+        if isinstance(task, VoltageTask) and task.fitted() is not None:
+            self._confidence = Confidence(task, self.cell, self.dt_s)
+        self.reset()
+
+    @classmethod
+    def pretrained(
+        cls, env_id: str = "BatteryVoltageJoint-v0", decision_s: float = 60.0, *, recorded: bool = False
+    ) -> PolicyEstimator:
+        """
+        A policy of LAC that comes with the package, with the options of the task that it was trained on. What made it and what
+        it is worth says :func:`~battery_env.policies.pretrained.pretrained_card`.
+
+        :param env_id: id of a voltage-only environment of single discharges
+        :param decision_s: time between two estimates, s, a multiple of the interval between its readings
+        :param recorded: whether for recorded cells: one that has learned on a model whose error wanders. By default one that
+            has learned on a model with wrong constants, as simulated cells have
+        :return: the estimator
+        :raises ValueError: for another id, or a time out of range
+        :raises ImportError: without the extra ``battery_env[onnx]``
+        """
+        policy, options = pretrained_policy(env_id, recorded)
+        return cls(policy, env_id, decision_s, **options)
+
+    @staticmethod
+    def environment(env_id: str, **options: Any) -> CalibrationEnv:
+        """
+        A calibration environment without its wrappers.
+
+        :param env_id: id of a calibration environment
+        :param options: of the environment
+        :return: the environment
+        :raises ValueError: if it is none
+        """
+        env = gym.make(env_id, disable_env_checker=True, **options).unwrapped
+        if not isinstance(env, CalibrationEnv):
+            raise ValueError(f"{env_id} is no calibration environment")
+        return env
+
+    def reset(self) -> None:
+        """
+        Forget all samples: the next one is the first of a discharge, of a fully charged cell at rest.
+        """
+        self._readings = ReadingsSoFar()
+        self._drawn_C = 0.0
+        self._decisions = 0
+        self._now = np.array([self.cell.q_mobile, self.cell.r_o])
+        self._action = np.zeros(len(self.parameters))
+        self._logarithms = np.zeros(len(UNCERTAIN_CONSTANTS))
+        self._fitted: Fitted | None = None
+        self._judge()
+
+    def _judge(self) -> None:
+        """Tell how sure the estimate is, of the samples up to the last decision."""
+        self._sd = [nan, nan]
+        self._reason = Condition.NO_FIT.text if self._confidence is None else Condition.NOT_YET.text
+        if self._confidence is not None and self._fitted is not None:
+            samples = self._readings.known(self._decisions * self.decision_s)
+            (sd,) = self._confidence.standard_deviations(self._fitted, self._now[None])
+            self._reason = self._confidence.reason(self._fitted, 0, self._now, sd, samples, rested=False)
+            # the same NaN always, so that equal estimates are equal
+            self._sd = [nan if isnan(each) else each for each in sd.tolist()]
+
+    def check(self, voltage_V: float, current_A: float, dt_s: float, temperature_C: float | None = None) -> None:
+        """Refuse a sample that :meth:`update` would refuse, and change nothing."""
+        if not issubclass(self.task_class, VoltageTask) or issubclass(self.task_class, BatteryAging):
+            raise ValueError(f"a policy of {self.env_id} takes no stream: it needs the full state, or a whole life")
+        if temperature_C is not None:
+            raise ValueError("a policy takes no temperature: its model is isothermal. Leave temperature_C out.")
+        if not self._readings.time_s:
+            check_sample(voltage_V, current_A, dt_s)
+            return
+        before_A = self._readings.current_A[-1]
+        check_sample(voltage_V, current_A, dt_s, previous_A=before_A)
+        check_drawn_charge(self._drawn_C + dt_s * before_A, -SURPLUS_SHARE * self.cell.q_mobile)
+
+    def update(self, voltage_V: float, current_A: float, dt_s: float, temperature_C: float | None = None) -> Estimate:
+        """
+        Take in one sample. The policy decides when ``decision_s`` are over, as it would on the record so far.
+
+        :param voltage_V: terminal voltage, V; NaN where it is missing, but for the first sample
+        :param current_A: current that flows from this sample to the next one, positive in discharge, A
+        :param dt_s: time since the previous sample, s; without meaning at the first one
+        :param temperature_C: must be ``None``: the model of the environments is isothermal
+        :return: the estimate, as of the last decision
+        :raises ValueError: for invalid values, a temperature, or a policy that takes no stream
+        """
+        self.check(voltage_V, current_A, dt_s, temperature_C)
+        readings = self._readings
+        if readings.time_s:
+            self._drawn_C += dt_s * readings.current_A[-1]
+        readings.add(voltage_V, current_A, dt_s)
+        due = int(readings.time_s[-1] / self.decision_s + 1e-9)
+        if due > self._decisions and due * self._every > 1:
+            self._decide(due)
+        (q_mobile, r_o), (sd_q_mobile, sd_r_o) = self._now.tolist(), self._sd
+        return Estimate(q_mobile, r_o, sd_q_mobile, sd_r_o, not self._reason, self._reason)
+
+    def _follow(self, records: Sequence[Record], every: int) -> CalibrationTask:
+        # a data set may know its own constants, of which the policy must not learn
+        cell = {"cell": self.cell} if issubclass(self.task_class, VoltageTask) else {}
+        return self.task_class.follow(records, every, **{**self.options, **cell})
+
+    def _decide(self, due: int) -> None:
+        """One decision, on all readings up to the time when it was due."""
+        task = self._follow([self._readings.record(self.dt_s)], due * self._every)
+        assert isinstance(task, VoltageTask)  # no other follows a stream
+        task.restore(self._now, self._action, self._logarithms)
+        self._logarithms = task.logarithms[0]
+        self._fitted = task.fitted()
+        action, _ = self.policy.predict(task.observation(), deterministic=True)
+        task.advance(np.asarray(action))
+        self._decisions, self._now, self._action = due, task.estimate[0], np.clip(np.asarray(action)[0], -1.0, 1.0)
+        self._judge()
+
+    def now(self) -> ModelNow:
+        """The model at the last sample, with the estimate as its parameters."""
+        model, (q_mobile, r_o) = RecordModel(self.cell, dt_s=self.dt_s), self._now.tolist()
+        state = model.start(q_mobile)
+        if self._readings.time_s and self._readings.time_s[-1] > 0.0:
+            state = model.simulate(self._readings.record(self.dt_s).current_A, q_mobile, r_o).state[-1]
+        return ModelNow(model.cell, False, self.dt_s, state, np.append(self._now, 0.0), np.zeros((0, STATE_SIZE + 3)))
+
+    def _made_with(self) -> dict[str, Any]:
+        return {
+            "estimator": type(self).__name__,
+            "env_id": self.env_id,
+            "policy": getattr(self.policy, "sha256", None),
+            "decision_s": self.decision_s,
+            "cell": asdict(self.cell),
+            "options": {name: repr(value) for name, value in self.options.items() if name != "cell"},
+        }
+
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        progress = np.array([self._drawn_C, self._decisions, *self._now])
+        fitted = {} if self._fitted is None else {f"fitted_{name}": each for name, each in self._fitted._asdict().items()}
+        return fitted | {
+            "samples": self._readings.columns(),
+            "progress": progress,
+            "action": self._action,
+            "logarithms": self._logarithms,
+        }
+
+    def _restore(self, arrays: dict[str, NDArray[Any]]) -> None:
+        self._readings = ReadingsSoFar.of(arrays["samples"])
+        self._drawn_C, self._decisions = float(arrays["progress"][0]), int(arrays["progress"][1])
+        self._now, self._action = arrays["progress"][2:].copy(), arrays["action"].copy()
+        self._logarithms = arrays["logarithms"].copy()
+        names = [f"fitted_{name}" for name in Fitted._fields]
+        self._fitted = Fitted(*(arrays[name] for name in names)) if set(names) <= arrays.keys() else None
+        self._judge()
+
+    def estimate(self, record: Record) -> Estimate:
+        """
+        The estimate after one discharge: of a voltage-only policy the last one, of a full-state one, whose estimates are
+        independent of each other, the mean.
+
+        :param record: one discharge; with the full state a simulated one, as no recording has it
+        :return: the estimate
+        :raises ValueError: for an invalid record
+        """
+        check_drawn_charge(drawn_charge_C(check_record(record)))
+        trace = self.trace([record])[0]
+        if trace.sd_q_mobile is not None:
+            return last_estimate(trace)
+        q_mobile, r_o = (self.task_class.conclude(values) for values in (trace.q_mobile, trace.r_o))
+        return Estimate(q_mobile, r_o, settled=False, reason=Condition.NO_FIT.text)
+
+    def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:
+        """
+        The estimates over time of many discharges.
+
+        :param records: discharges; a :class:`~battery_env.trajectories.TrajectoryDataset` is such a sequence
+        :return: one trace per discharge, in the same order
+        """
+        task = self._follow(records, self._every)
+        samples = [] if self._confidence is None else [(Samples.of(record), starts_at_rest(record)) for record in records]
+        made: list[FloatArray] = []
+        reasons: list[str] = []
+        while (running := ~task.truncated()).any():
+            (discharge, time_s), fitted = task.seen(), task.fitted()
+            action, _ = self.policy.predict(task.observation(), deterministic=True)
+            task.advance(np.asarray(action))
+            estimate = task.estimate
+            columns = [discharge[:, None], time_s[:, None], estimate]
+            if self._confidence is not None and fitted is not None:
+                sd = self._confidence.standard_deviations(fitted, estimate)
+                columns.append(sd)
+                for n in np.flatnonzero(running).tolist():
+                    record, rested = samples[discharge[n]]
+                    so_far = record.first(int(np.searchsorted(record.time_s, time_s[n], side="right")))
+                    reasons.append(self._confidence.reason(fitted, n, estimate[n], sd[n], so_far, rested))
+            made.append(np.concatenate(columns, axis=1)[running])
+            task.drop_ended()
+        rows, texts = np.concatenate(made), np.array(reasons, dtype=object)
+        in_order = np.argsort(rows[:, 0], kind="stable")
+        of_each = np.split(in_order, np.searchsorted(rows[in_order, 0], np.arange(1, len(records))))
+        if self._confidence is None:
+            return [EstimateTrace(rows[n, 1], rows[n, 2], rows[n, 3]) for n in of_each]
+        return [
+            EstimateTrace(rows[n, 1], rows[n, 2], rows[n, 3], rows[n, 4], rows[n, 5], texts[n] == "", texts[n])
+            for n in of_each
+        ]

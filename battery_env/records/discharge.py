@@ -1,0 +1,405 @@
+"""
+Recorded discharges of real cells, and their files.
+
+Two 18650 cells of NASA's battery data set come with the package: ``load_nasa_discharges("B0005")``, ``"B0006"``.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, field, fields
+from datetime import datetime, timedelta
+from functools import cached_property
+from importlib.resources import as_file, files
+from numbers import Real
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pandas as pd
+from scipy.io import loadmat
+
+from battery_env.arrays import FloatArray
+from battery_env.checks import check_positive
+from battery_env.parameters import Q_MOBILE
+from battery_env.records.samples import (
+    MILLIAMPERE,
+    REST_CURRENT_A,
+    SWITCH_SHARE,
+    check_column,
+    check_drawn_charge,
+    check_samples,
+    drawn,
+    drawn_charge_C,
+    least_load_A,
+    switch_times_s,
+)
+
+#: How to cite the bundled data.
+NASA_CITATION = (
+    "B. Saha and K. Goebel (2007). Battery Data Set, NASA Ames Prognostics Data Repository, "
+    "NASA Ames Research Center, Moffett Field, CA."
+)
+#: Cells whose discharges come with the package.
+BUNDLED_CELLS: tuple[str, ...] = ("B0005", "B0006")
+
+#: A discharge needs so many.
+LEAST_SAMPLES = 5
+_COLUMNS = ("time_s", "voltage_V", "current_A")
+# what cycles.csv tells about each discharge beyond the samples themselves
+_META_COLUMNS = ("test_id", "start_time", "ambient_temperature_C", "capacity_Ah", "Re_ohm", "Rct_ohm")
+_DURATION_LIMITS_S = (10.0, 1e6)
+# What draws no more than this share of the charge before or after the main load is noise, or an offset.
+_LITTLE_SHARE = 5e-3
+# No cell changes its voltage by this much from one sample to the next, and back, but for its load, V.
+_JUMP_V = 0.05
+# Where the load varies, more samples than these below the cut-off are no fault of the sensor.
+_FEW_SAMPLES = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Discharge:
+    """
+    One recorded discharge of one cell; it checks itself when it is made, and its arrays cannot be written to.
+
+    :param time_s: times of the samples, strictly increasing, s, shape (T,)
+    :param voltage_V: terminal voltage, V, shape (T,)
+    :param current_A: current, positive in discharge, A, shape (T,)
+    :param temperature_C: temperature of the cell, degC, shape (T,); ``None`` if it was not measured. The model of
+        ``ExtendedKalmanFilter`` follows it. ``LeastSquares`` does not read it: its model makes its own, from the surroundings
+        ``Tb0`` of its cell, for which the command line takes the first one. Nor does ``PolicyEstimator``, whose model is
+        isothermal
+    :param meta: what else is known, e.g. ``cell``, ``cycle``, ``capacity_Ah``, ``start_time``, ``source``
+    :param starts_at_rest: whether the first voltage is that of the cell at rest, and the first current that of the load
+        that is switched on then, as in a :meth:`loaded_part`. Calibrators judge by it whether the cell was full
+    :raises ValueError: for arrays that do not fit together, or invalid values; it says what to do
+    """
+
+    time_s: FloatArray
+    voltage_V: FloatArray
+    current_A: FloatArray
+    temperature_C: FloatArray | None = None
+    meta: dict[str, Any] = field(default_factory=dict)
+    starts_at_rest: bool = False
+    #: see :func:`battery_env.records.check_record`
+    is_checked: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        samples = check_samples(self.time_s, self.voltage_V, self.current_A, LEAST_SAMPLES)
+        columns = dict(zip(_COLUMNS, samples, strict=True))
+        if self.temperature_C is not None:
+            columns["temperature_C"] = check_column("temperature_C", self.temperature_C, LEAST_SAMPLES)
+            if len(self.temperature_C) != len(columns["time_s"]):
+                raise ValueError(f"temperature_C has {len(self.temperature_C)} samples, but time_s has {len(self.time_s)}")
+        for name, array in columns.items():
+            object.__setattr__(self, name, array)
+        self._check_extent()
+
+    def _check_extent(self) -> None:
+        """Refuse a discharge of too few samples, or over a time or with a charge that no cell has."""
+        if len(self.time_s) < LEAST_SAMPLES:
+            raise ValueError(f"a discharge needs at least {LEAST_SAMPLES} samples, got {len(self.time_s)}")
+        duration_s = self.time_s[-1] - self.time_s[0]
+        if not _DURATION_LIMITS_S[0] <= duration_s <= _DURATION_LIMITS_S[1]:
+            unit, symbol = ("hours", "h") if duration_s < _DURATION_LIMITS_S[0] else ("milliseconds", "ms")
+            raise ValueError(
+                f"time_s must span {_DURATION_LIMITS_S[0]:g} .. {_DURATION_LIMITS_S[1]:g} s, got {duration_s:g} s. "
+                f"Give the time in seconds, not in {unit} (command line: --units time={symbol})."
+            )
+        check_drawn_charge(self.charge_C)
+        if self.charge_C > Q_MOBILE.limits[1]:
+            raise ValueError(
+                f"this record draws {self.charge_C:.3g} C, more than the {Q_MOBILE.limits[1]:g} C that a cell may hold. "
+                f"{MILLIAMPERE}"
+            )
+
+    def _derived(self, **changes: Any) -> Discharge:
+        """The same with other columns, made of these: each column is checked once, when it comes from outside."""
+        derived = object.__new__(Discharge)
+        for name, value in {**{each.name: getattr(self, each.name) for each in fields(self)}, **changes}.items():
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
+            object.__setattr__(derived, name, value)
+        derived._check_extent()
+        return derived
+
+    def without_temperature(self) -> Discharge:
+        """The same as if the temperature had not been measured."""
+        return self._derived(temperature_C=None)
+
+    @property
+    def charge_C(self) -> float:
+        """The charge drawn from the first sample to the last, C."""
+        return drawn_charge_C(self)
+
+    @property
+    def load_on_time_s(self) -> float:
+        """
+        When the load was switched on, s: midway between the last sample at rest and the first one under load, as the switch
+        falls between the two, but at most one interval of the samples under load before these. A rest is often logged more
+        seldom than a load.
+        """
+        first, _ = self._loaded
+        if not first:
+            return float(self.time_s[0])
+        return float(switch_times_s(self.time_s, self.current_A, np.array([first - 1]))[0])
+
+    @cached_property
+    def _loaded(self) -> tuple[int, int]:
+        """
+        The first sample under load and the last one. Small loads before the first or after the last large one belong to the
+        discharge if they draw more than ``_LITTLE_SHARE`` of its charge; all else there is noise, or an offset.
+        """
+        most_A = self.current_A.max()
+        loaded = np.flatnonzero(self.current_A > SWITCH_SHARE * most_A)
+        first, last = int(loaded[0]), int(loaded[-1])
+        small_A = np.where(self.current_A > least_load_A(np.maximum(self.current_A, 0.0)), self.current_A, 0.0)
+        drawn_C = drawn(self.time_s, small_A, self.time_s)
+        little_C, small = _LITTLE_SHARE * drawn_C[-1], np.flatnonzero(small_A)
+        if drawn_C[max(first - 1, 0)] > little_C:
+            first = int(small[0])
+        if drawn_C[-1] - drawn_C[min(last + 1, len(drawn_C) - 1)] > little_C:
+            last = int(small[-1])
+        return first, last
+
+    def _first_below(self, cut_off_V: float) -> int | None:
+        """The first sample under load that is at the cut-off or below."""
+        if not isinstance(cut_off_V, Real) or np.isnan(cut_off_V):
+            raise ValueError(f"cut_off_V must be a voltage in V, got {cut_off_V!r}")
+        first, last = self._loaded
+        below = np.flatnonzero(self.voltage_V[first : last + 1] <= cut_off_V) + first
+        if not len(below):
+            return None
+        begin = int(below[0])
+        back = np.flatnonzero(self.voltage_V[begin : last + 1] > cut_off_V) + begin
+        if begin > 0 and len(back):
+            self._refuse_dip(begin, int(back[0]), cut_off_V)
+        return begin
+
+    def _refuse_dip(self, begin: int, back: int, cut_off_V: float) -> None:
+        """
+        Refuse a voltage that falls below the cut-off in one step and comes back in another, to no more than it was, where the
+        load explains neither: an ohmic drop takes no more than all of the voltage at the largest current.
+        """
+        voltage_V, current_A = self.voltage_V, self.current_A
+        most_A = current_A.max()
+        most_ohm = max(float(voltage_V.max()) - cut_off_V, 0.0) / most_A
+        if back - begin > _FEW_SAMPLES and np.ptp(current_A[begin - 1 : back + 1]) > SWITCH_SHARE * most_A:
+            return
+
+        def unexplained_V(higher: int, lower: int) -> float:
+            # one of them may be logged a sample later than the other
+            explained_V = most_ohm * max(float(current_A[max(lower - 1, 0) : lower + 1].max() - current_A[higher]), 0.0)
+            return float(voltage_V[higher] - voltage_V[lower]) - explained_V
+
+        falls_V, returns_V = unexplained_V(begin - 1, begin), unexplained_V(back, back - 1)
+        if min(falls_V, returns_V) > _JUMP_V and unexplained_V(back, begin - 1) < _JUMP_V:
+            raise ValueError(
+                f"the voltage falls to {voltage_V[begin]:.2f} V at {self.time_s[begin]:g} s and is back at "
+                f"{self.time_s[back]:g} s, and the load explains neither: a fault of the sensor, or another discharge. Remove "
+                f"these samples ({back - begin}), or give each discharge alone, or number them in a column of the cycle"
+            )
+
+    def eod_time_s(self, cut_off_V: float) -> float:
+        """
+        When the voltage under load first fell to the cut-off, interpolated between the two samples around it.
+
+        :param cut_off_V: cut-off voltage, V
+        :return: the end of discharge on the clock of ``time_s``, s; NaN if the record does not reach it
+        :raises ValueError: if the voltage only seems to be there, by a fault of the sensor
+        """
+        n = self._first_below(cut_off_V)
+        if n is None:
+            return float("nan")
+        if n == self._loaded[0]:
+            return float(self.time_s[n])
+        share = (self.voltage_V[n - 1] - cut_off_V) / (self.voltage_V[n - 1] - self.voltage_V[n])
+        return float(self.time_s[n - 1] + share * (self.time_s[n] - self.time_s[n - 1]))
+
+    def loaded_part(self, cut_off_V: float) -> Discharge:
+        """
+        The part that a model of the discharge can be compared with: from load-on to the cut-off, or to the last sample
+        under load if the cut-off is not reached. Its first sample is the moment of switching, with the voltage at rest
+        and the current under load; its last one, at the cut-off, is interpolated.
+
+        :param cut_off_V: cut-off voltage, V
+        :return: that part, on the same clock
+        :raises ValueError: if it has too few samples, or those are missing that would say when the load was switched on, or
+            the voltage is below the cut-off by a fault of the sensor
+        """
+        first, last = self._loaded
+        self._refuse_missing(first)
+        start_s, end_s = self.load_on_time_s, self.eod_time_s(cut_off_V)
+        if np.isnan(end_s):
+            end_s = float(self.time_s[last])
+        time_s = np.concatenate([[start_s], self.time_s[(self.time_s > start_s) & (self.time_s < end_s)], [end_s]])
+        if len(time_s) < LEAST_SAMPLES:
+            raise ValueError(
+                f"only {len(time_s)} samples lie between load-on at {start_s:g} s and {cut_off_V:g} V or the end of the load; "
+                f"at least {LEAST_SAMPLES} are needed"
+            )
+        names = ("voltage_V", "current_A") if self.temperature_C is None else ("voltage_V", "current_A", "temperature_C")
+        columns = {name: np.interp(time_s, self.time_s, getattr(self, name)) for name in names}
+        columns["voltage_V"][0], columns["current_A"][0] = self.voltage_V[max(first - 1, 0)], self.current_A[first]
+        starts_at_rest = self.starts_at_rest if first == 0 else bool(abs(self.current_A[first - 1]) <= REST_CURRENT_A)
+        return self._derived(time_s=time_s, **columns, starts_at_rest=starts_at_rest)
+
+    def _refuse_missing(self, first: int) -> None:
+        """
+        Refuse a gap between the last sample at rest and the first one under load that is more than twice the interval before
+        and the one after it: the load may have been switched on at any time in it.
+        """
+        if not first or first + 1 == len(self.time_s):
+            return
+        *before_s, gap_s, after_s = np.diff(self.time_s[max(first - 2, 0) : first + 2])
+        if gap_s > 2.0 * max([*before_s, after_s]):
+            raise ValueError(
+                f"samples are missing from {self.time_s[first - 1]:g} s, at rest, to {self.time_s[first]:g} s, under load: "
+                "what was drawn in between is not known. Give the last ones at rest, or remove those before the load"
+            )
+
+    def averaged(self, dt_s: float) -> Discharge:
+        """
+        The same with one sample for each stretch of time: the means of voltage and temperature over its samples, and the mean
+        current, so that the charge drawn is kept. The first and the last sample stay as they are. A load that is switched
+        within a stretch is switched in two steps.
+
+        :param dt_s: length of a stretch, s
+        :return: at most ``2 + (last time - first time) / dt_s`` samples, rounded up
+        :raises ValueError: for a ``dt_s`` that is not positive, or leaves too few samples
+        """
+        check_positive("dt_s", dt_s)
+        inner = slice(1, len(self.time_s) - 1)
+        stretch = ((self.time_s[inner] - self.time_s[0]) / dt_s).astype(np.int64)
+        firsts = np.flatnonzero(np.diff(stretch, prepend=-1))
+        counts = np.diff(np.append(firsts, len(stretch)))
+
+        def mean(values: FloatArray) -> FloatArray:
+            return np.concatenate([values[:1], np.add.reduceat(values[inner], firsts) / counts, values[-1:]])
+
+        time_s = mean(self.time_s)
+        # from the middle between two means to the next middle, so that nothing is drawn twice or left out
+        edges_s = np.concatenate([time_s[:1], 0.5 * (time_s[1:] + time_s[:-1]), time_s[-1:]])
+        current_A = np.diff(drawn(self.time_s, self.current_A, edges_s)) / np.diff(edges_s)
+        current_A[[0, -1]] = self.current_A[[0, -1]]
+        temperature_C = None if self.temperature_C is None else mean(self.temperature_C)
+        return self._derived(time_s=time_s, voltage_V=mean(self.voltage_V), current_A=current_A, temperature_C=temperature_C)
+
+    def until(self, time_s: float) -> Discharge:
+        """
+        What had been recorded by some moment.
+
+        :param time_s: that moment, on the clock of the record, s
+        :return: the samples up to then
+        :raises ValueError: if these are too few
+        """
+        if not isinstance(time_s, Real) or np.isnan(time_s):
+            raise ValueError(f"time_s must be a time in s, got {time_s!r}")
+        n = int(np.searchsorted(self.time_s, time_s, side="right"))
+        names = ("time_s", "voltage_V", "current_A", "temperature_C")
+        return self._derived(**{name: None if (column := getattr(self, name)) is None else column[:n] for name in names})
+
+
+def load_nasa_discharges(path_or_cell: str | Path) -> list[Discharge]:
+    """
+    All discharges of one cell of NASA's battery data set, in the order they were made. Cite it as ``NASA_CITATION``.
+
+    .. code-block:: python
+
+      from battery_env import load_nasa_discharges
+
+      discharges = load_nasa_discharges("B0005")  # or "B0006", or a .mat file of NASA's
+      print([(each.meta["cycle"], each.meta["capacity_Ah"]) for each in discharges[::40]])
+      first = discharges[0].loaded_part(cut_off_V=2.7)  # what estimators take
+
+    Their ``meta`` holds ``cell``, ``cycle`` (1, 2, ... over the discharges), ``source`` and, as far as the file tells,
+    ``start_time``, ``ambient_temperature_C``, ``capacity_Ah`` (charge to 2.7 V), ``Re_ohm`` and ``Rct_ohm`` (of the impedance
+    test nearest in time) and ``test_id`` (position among all tests of the cell). A discharge that fails the checks of
+    :class:`Discharge` is left out with a warning.
+
+    :param path_or_cell: a cell that comes with the package (``BUNDLED_CELLS``), or one of NASA's own files, such as
+        ``B0018.mat``
+    :return: one :class:`Discharge` each
+    :raises FileNotFoundError: if there is no such cell or file
+    :raises ValueError: if the file is laid out in another way
+    """
+    if path_or_cell in BUNDLED_CELLS:
+        return _bundled(str(path_or_cell))
+    path = Path(path_or_cell)
+    if not path.is_file():
+        raise FileNotFoundError(f"no file {str(path)!r}; the cells that come with the package are {', '.join(BUNDLED_CELLS)}")
+    if path.suffix.lower() != ".mat":
+        raise ValueError(f"{path} is none of NASA's .mat files: read it with read_discharges")
+    discharges = []
+    for arrays, meta in read_nasa_mat(path):
+        try:
+            discharges.append(Discharge(**arrays, meta=meta))
+        except (TypeError, ValueError) as error:
+            warnings.warn(f"{path}: discharge {meta['cycle']} is left out: {error}", stacklevel=2)
+    if not discharges:
+        raise ValueError(f"{path} holds no discharge that can be used")
+    return discharges
+
+
+def _bundled(cell: str) -> list[Discharge]:
+    with as_file(files("battery_env.records.nasa_cells")) as folder:
+        samples = pd.read_csv(folder / f"{cell}_discharge.csv.gz", usecols=["cycle", *_COLUMNS, "temperature_C"])
+        tests = pd.read_csv(folder / "cycles.csv").query("battery_id == @cell").set_index("cycle")[list(_META_COLUMNS)]
+    known, numbers = tests.to_dict(orient="index"), samples["cycle"].to_numpy()
+    discharges = []
+    for cycle in np.unique(numbers).tolist():
+        part = samples[numbers == cycle]
+        time_s, voltage_V, current_A, temperature_C = (part[name].to_numpy() for name in (*_COLUMNS, "temperature_C"))
+        meta = {"cell": cell, "cycle": cycle, "source": NASA_CITATION, **known[cycle]}
+        discharges.append(Discharge(time_s, voltage_V, current_A, temperature_C, meta))
+    return discharges
+
+
+def read_nasa_mat(path: Path) -> list[tuple[dict[str, Any], dict[str, Any]]]:
+    """The discharges of one of NASA's own files before they are checked."""
+    try:
+        return _samples_of_mat(path, loadmat(path, simplify_cells=True))
+    except FileNotFoundError:
+        raise
+    except Exception as error:  # scipy raises whatever the damage leads it to, and a field may be missing anywhere
+        raise ValueError(f"{path} is damaged, or not laid out as NASA's battery files: {error!r}") from error
+
+
+def _samples_of_mat(path: Path, content: dict[str, Any]) -> list[tuple[dict[str, Any], dict[str, Any]]]:
+    cells = {name: value for name, value in content.items() if isinstance(value, dict) and "cycle" in value}
+    if len(cells) != 1:
+        names = ", ".join(name for name in content if not name.startswith("__"))
+        raise ValueError(f"{path} is not laid out as NASA's battery files: of its variables ({names}) one must be a cell")
+    cell, value = next(iter(cells.items()))
+    tests = [(n, test, _start_time(test["time"])) for n, test in enumerate(np.atleast_1d(value["cycle"]))]
+    impedances = [(start, test["data"]) for _, test, start in tests if test["type"] == "impedance"]
+    discharges = [entry for entry in tests if entry[1]["type"] == "discharge"]
+    samples = []
+    for cycle, (n, test, start) in enumerate(discharges, start=1):
+        data = test["data"]
+        meta = {
+            "cell": cell,
+            "cycle": cycle,
+            "source": NASA_CITATION,
+            "test_id": n,
+            "start_time": start.isoformat(timespec="milliseconds"),
+            "ambient_temperature_C": float(test["ambient_temperature"]),
+        }
+        if np.size(data.get("Capacity", [])) == 1:
+            meta["capacity_Ah"] = float(data["Capacity"])
+        if impedances:
+            nearest = min(impedances, key=lambda entry: abs(entry[0] - start))[1]
+            meta.update(Re_ohm=float(np.real(nearest["Re"])), Rct_ohm=float(np.real(nearest["Rct"])))
+        arrays = {
+            "time_s": data["Time"],
+            "voltage_V": data["Voltage_measured"],
+            "current_A": -np.asarray(data["Current_measured"], dtype=np.float64),
+            "temperature_C": data["Temperature_measured"],
+        }
+        samples.append((arrays, meta))
+    return samples
+
+
+def _start_time(date_vector: FloatArray) -> datetime:
+    year, month, day, hour, minute, second = map(float, date_vector)
+    return datetime(int(year), int(month), int(day)) + timedelta(hours=hour, minutes=minute, seconds=second)

@@ -1,0 +1,407 @@
+"""The model under the current of a record: what it shows then and afterwards, and how that depends on both parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import copy
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from battery_env.arrays import FloatArray
+from battery_env.checks import LoadUnit, check_not_negative
+from battery_env.electrochemistry import (
+    FULL_CHARGE_SHARES,
+    QNB,
+    STATE_SIZE,
+    CellParameters,
+    Trajectory,
+    advance_in_place,
+    check_cell,
+    check_dt,
+    initial_state,
+    rest_shares,
+    simulate,
+)
+from battery_env.electrochemistry.kernels import run_on_batch
+from battery_env.electrochemistry.tangents import (
+    TANGENT_NAMES,
+    PolynomialDerivatives,
+    least_q_mobile,
+    roll_out_with_tangents,
+)
+from battery_env.estimates import Estimate
+from battery_env.parameters import Q_MOBILE
+from battery_env.records.samples import Record, check_record, expected_current, resample_current
+
+# The total of the four charges is q_mobile / 0.6 at all times.
+_Q_PER_CHARGE = 1.0 / float(FULL_CHARGE_SHARES.sum())
+
+#: The error of the model shortly before the end of a record is the mean over this last share of its time.
+RECENT_SHARE = 0.1
+#: No discharge is followed longer than this into the future, s: a current that takes more than a week to empty the cell is
+#: that of a cell at rest.
+LONGEST_FORECAST_S = 604_800.0
+
+
+@dataclass(frozen=True, eq=False)
+class VoltageForecast:
+    """
+    The voltage of the model from the first sample of a record on, at some parameters.
+
+    :param simulation: the steps of the model on the clock of the record, until its cell is empty or its load is over
+    :param cut_off_V: voltage at which the discharge ends, V
+    :param at_samples_V: at the samples of the record, also below the cut-off, shape (T,); NaN after the model cell is empty
+    :param not_before_s: end of a record in progress, before which its cell has not ended, s; ``None`` of a whole one
+    :param offset_V: by how much a record in progress was higher than the model at its end, V; it goes on so
+    """
+
+    simulation: Trajectory
+    cut_off_V: float
+    at_samples_V: FloatArray
+    not_before_s: float | None = None
+    offset_V: float = 0.0
+
+    def reached_s(self, voltage_V: float) -> float:
+        """
+        When the voltage falls to a level. After a record in progress it falls for good, as a constant current has no pulses.
+
+        :param voltage_V: the level, V
+        :return: on the clock of the record, s; NaN if it is not reached
+        """
+        if self.not_before_s is None:
+            return self.simulation.reached_s(voltage_V)
+        return float(np.maximum(self.simulation.reached_s(voltage_V - self.offset_V, for_good=True), self.not_before_s))
+
+    @property
+    def eod_time_s(self) -> float:
+        """
+        When the cut-off is reached, on the clock of the record, s; NaN if it is not, or under a current so small that it would
+        take more than a week.
+        """
+        return self.reached_s(self.cut_off_V)
+
+    @property
+    def time_s(self) -> FloatArray:
+        """Of the steps of the model down to the cut-off, on the clock of the record, s, shape (K,)."""
+        return self._down_to_the_cut_off[0]
+
+    @property
+    def voltage_V(self) -> FloatArray:
+        """
+        At these times, V, shape (K,). The last one is the cut-off, between two steps; it is above if the cut-off is never
+        reached, as the load is off at the end of the record.
+        """
+        return self._down_to_the_cut_off[1]
+
+    @cached_property
+    def _down_to_the_cut_off(self) -> tuple[FloatArray, FloatArray]:
+        time_s, voltage_V = self.simulation.time_s, self.simulation.voltage_V
+        if self.not_before_s is not None:
+            voltage_V = voltage_V + self.offset_V * (time_s > self.not_before_s)
+        reached_s = self.simulation.reached_s(self.cut_off_V - self.offset_V, for_good=self.not_before_s is not None)
+        if np.isnan(reached_s):
+            return time_s, voltage_V
+        before = time_s < reached_s
+        return np.append(time_s[before], self.eod_time_s), np.append(voltage_V[before], self.cut_off_V)
+
+
+class Tangents(NamedTuple):
+    """
+    The voltage of the model and its derivatives, at the points of its grid; NaN after the model cell is empty.
+
+    :param voltage_V: shape (K,)
+    :param by_parameter: in the order of :data:`~battery_env.electrochemistry.tangents.TANGENT_NAMES`: with respect to
+        ``q_mobile``, V/C, ``r_o``, A, and the logarithms of constants, V, shape (8, K)
+    :param fraction_p: mole fraction at the surface of the positive electrode, on which the equilibrium voltage depends,
+        shape (K,)
+    """
+
+    voltage_V: FloatArray
+    by_parameter: FloatArray
+    fraction_p: FloatArray
+
+
+class RecordModel:
+    """
+    The model as it follows the current of a record: what calibration by the voltage of whole records rests on, and what the
+    estimate of any calibrator lets expect.
+
+    .. code-block:: python
+
+      estimate = ExtendedKalmanFilter(thermal=True, mismatch_V=0.05).estimate(record)
+      forecast = RecordModel(thermal=True).forecast(record, estimate, cut_off_V=2.7)
+      print(forecast.eod_time_s)
+
+    :param cell: constants of the model; ``None``: the new cell's
+    :param thermal: whether the temperature of the model moves
+    :param dt_s: time step of the model, s
+    :param initial: state of the model at the first sample, shape (8,). It stands for a history of the current: its charges
+        move along with ``q_mobile``. ``None``: at rest, with ``initial_soc``
+    :param initial_soc: state of charge at the first sample, within 0 .. 1; 1: fully charged
+    :raises ValueError: for an argument out of range, or both ``initial`` and an ``initial_soc``
+    """
+
+    def __init__(
+        self,
+        cell: CellParameters | None = None,
+        thermal: bool = False,
+        dt_s: float = 1.0,
+        initial: ArrayLike | None = None,
+        initial_soc: float = 1.0,
+    ) -> None:
+        self.cell = check_cell(cell, thermal)
+        self.thermal = thermal
+        self.dt_s = check_dt(dt_s, self.cell)
+        reference_q_C = Q_MOBILE.limits[1]
+        self._shares = rest_shares(initial_soc)
+        if initial is None:
+            self.initial = initial_state(reference_q_C, self.cell, initial_soc)
+        elif initial_soc == 1.0:
+            self.initial = np.array(initial, dtype=np.float64)
+        else:
+            raise ValueError(f"initial is a whole state: give it or initial_soc, got both, initial_soc = {initial_soc!r}")
+        self.initial_soc = float(initial_soc)
+        if self.initial.shape != (STATE_SIZE,) or not np.isfinite(self.initial).all():
+            raise ValueError(f"initial must hold {STATE_SIZE} finite numbers, got {initial!r}")
+        self._derivatives = PolynomialDerivatives.of(self.cell.packed)
+
+    def of_cell(self, cell: CellParameters) -> RecordModel:
+        """
+        The same with other constants.
+
+        :param cell: constants of the model, at the temperature of these
+        :return: the model, with the same start
+        """
+        model = copy(self)
+        model.cell, model._derivatives = check_cell(cell, self.thermal), PolynomialDerivatives.of(cell.packed)
+        check_dt(self.dt_s, cell)
+        return model
+
+    def grid(self, record: Record) -> tuple[FloatArray, FloatArray]:
+        """
+        A record on the time grid of the model, which starts at the first sample.
+
+        :param record: one discharge
+        :return: times of the samples since the first one, s, shape (T,); current over each step, A, shape (K,), such that
+            the K points of the grid reach the last sample
+        :raises ValueError: as :func:`battery_env.records.check_record`
+        """
+        time_s, _, current_A = check_record(record, least_samples=2)
+        n_steps = int(np.ceil((time_s[-1] - time_s[0]) / self.dt_s - 1e-6)) + 1
+        return time_s - time_s[0], resample_current(time_s, current_A, self.dt_s, n_steps)
+
+    def start(self, q_mobile: float | FloatArray) -> FloatArray:
+        """
+        The state at the first sample of a cell with the history that ``initial`` stands for, or at rest with ``initial_soc``.
+
+        :param q_mobile: charge that can move, C, shape (...)
+        :return: shape (..., 8)
+        """
+        missing_C = np.asarray(q_mobile - _Q_PER_CHARGE * self.initial[QNB:].sum())
+        start = np.broadcast_to(self.initial, (*missing_C.shape, STATE_SIZE)).copy()
+        start[..., QNB:] += missing_C[..., None] * self._shares
+        return start
+
+    def simulate(self, current_A: FloatArray, q_mobile: float, r_o: float) -> Trajectory:
+        """
+        What the model does under a current, with no cut-off.
+
+        :param current_A: current over each step, A, shape (K,)
+        :param q_mobile: charge that can move, C
+        :param r_o: ohmic resistance, ohm
+        :return: the samples down to where the model cell is empty, or all K of them
+        """
+        return simulate(
+            current_A,
+            q_mobile,
+            r_o,
+            dt=self.dt_s,
+            load_unit="current",
+            thermal=self.thermal,
+            cell=self.cell,
+            initial=self.start(q_mobile),
+            cut_off_V=-np.inf,
+            max_duration_s=len(current_A) * self.dt_s,
+        )
+
+    def advance(self, state: FloatArray, current_A: FloatArray, q_mobile: FloatArray, r_o: FloatArray) -> None:
+        """Take cells through a current, shape (K,), in place; unchecked, for inner loops."""
+        first, steps = np.zeros(len(state), dtype=np.int64), np.full(len(state), len(current_A))
+        advance_in_place(state, current_A, first, steps, q_mobile, r_o, self.dt_s, "current", self.thermal, self.cell.packed)
+
+    def run_on(
+        self, state: FloatArray, load: FloatArray, q_mobile: FloatArray, r_o: FloatArray, load_unit: LoadUnit
+    ) -> tuple[FloatArray, FloatArray]:
+        """
+        Take every cell on through a load of its own, or all through one; unchecked, for inner loops.
+
+        :param state: shape (n, 8), overwritten by the states after the last step
+        :param load: over each step, W or A, shape (n, K) or (1, K)
+        :param q_mobile: charge that can move, C, shape (n,)
+        :param r_o: ohmic resistance, ohm, shape (n,)
+        :param load_unit: ``"power"`` or ``"current"``
+        :return: voltage before each step and after the last one, V, shape (K + 1, n), NaN once a cell is empty; and current
+            over each step, A, shape (K, n)
+        """
+        steps, cells = load.shape[1], len(state)
+        voltage_V, current_A = np.empty((steps + 1, cells)), np.empty((steps, cells))
+        is_power, packed = load_unit == "power", self.cell.packed
+        run_on_batch(load, q_mobile, r_o, self.dt_s, is_power, self.thermal, packed, state, voltage_V, current_A)
+        return voltage_V, current_A
+
+    def voltage(self, record: Record, at: Estimate) -> FloatArray:
+        """
+        The voltage of the model at the samples of a record, under its current.
+
+        :param record: one discharge
+        :param at: the parameters
+        :return: voltage in V, shape (T,); NaN after the model cell is empty
+        :raises ValueError: for parameters out of range, or a record that cannot be used
+        """
+        time_s, current_A = self.grid(record)
+        return _at(time_s, self.simulate(current_A, at.q_mobile, at.r_o))
+
+    def forecast(
+        self,
+        record: Record,
+        at: Estimate,
+        cut_off_V: float | None = None,
+        future_current_A: float | None = None,
+        in_progress: bool = False,
+    ) -> VoltageForecast:
+        """
+        The voltage of the model from the first sample of a record down to the cut-off, under the current of the record, and
+        beyond its end under a constant one.
+
+        :param record: one discharge, whole or in progress
+        :param at: the parameters
+        :param cut_off_V: cut-off voltage, V; ``None``: the ``VEOD`` of ``cell``
+        :param future_current_A: current beyond the end of the record, at least 0 A; ``None``: as
+            :func:`~battery_env.records.expected_current` has it, the last current of a constant load and the mean of a load
+            that varied, which is an assumption
+        :param in_progress: whether the record is known not to have reached the cut-off: then the model does so after its end
+            only, and at its last sample at the earliest, however low it comes in the pulses before; and the cell goes on to
+            be as much higher or lower than the model as it was over the last tenth of the record
+        :return: the voltage, and when the cut-off is reached
+        :raises ValueError: for a negative future current, parameters out of range, or a record that cannot be used
+        """
+        Q_MOBILE.check(at.q_mobile)
+        samples_s, current_A = self.grid(record)
+        if future_current_A is None:
+            future_current_A = expected_current(record.time_s, record.current_A).mean_A
+        else:
+            check_not_negative(future_current_A=future_current_A)
+        if future_current_A * LONGEST_FORECAST_S > at.q_mobile:
+            # no cell of this q_mobile lasts longer than this, whatever it had delivered before
+            steps = int(at.q_mobile / (future_current_A * self.dt_s)) + 1
+            current_A = np.append(current_A[:-1], np.full(steps + 1, future_current_A))
+        simulation, start_s = self.simulate(current_A, at.q_mobile, at.r_o), float(record.time_s[0])
+        at_samples_V = _at(samples_s, simulation)
+        recent = samples_s >= (1.0 - RECENT_SHARE) * samples_s[-1]
+        higher_V = (record.voltage_V - at_samples_V)[recent & ~np.isnan(at_samples_V)]
+        return VoltageForecast(
+            replace(simulation, time_s=start_s + simulation.time_s, eod_time_s=start_s + simulation.eod_time_s),
+            self.cell.VEOD if cut_off_V is None else cut_off_V,
+            at_samples_V,
+            float(record.time_s[-1]) if in_progress else None,
+            float(higher_V.mean()) if in_progress and len(higher_V) else 0.0,
+        )
+
+    def capacity_Ah(
+        self, load: float | Callable[[FloatArray], FloatArray], load_unit: LoadUnit, cut_off_V: float, max_duration_s: float
+    ) -> float:
+        """
+        The charge that the model's cell, with its own ``q_mobile`` and ``r_o``, gives from full down to the cut-off.
+
+        :param load: a number, or a function of time in s that takes an array
+        :param load_unit: of the load, ``"power"`` in W or ``"current"`` in A
+        :param cut_off_V: cut-off voltage, V
+        :param max_duration_s: where to stop if the cut-off is not reached, s; at most a week is followed
+        :return: Ah; NaN if the cut-off is not reached
+        """
+        new = simulate(
+            load,
+            dt=self.dt_s,
+            load_unit=load_unit,
+            thermal=self.thermal,
+            cell=self.cell,
+            cut_off_V=-np.inf,
+            max_duration_s=min(max_duration_s, LONGEST_FORECAST_S),
+        )
+        drawn_C = np.append(0.0, np.cumsum(new.current_A)) * self.dt_s
+        steps = new.reached_s(cut_off_V) / self.dt_s
+        return float(np.interp(steps, np.arange(len(drawn_C)), drawn_C)) / 3600.0
+
+    def sensitivities(
+        self, current_A: FloatArray, q_mobile: float, r_o: float, stride: int = 1
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """
+        The voltage under a current and its derivatives with respect to both parameters; unchecked.
+
+        :param current_A: current over each step, A, shape (K,)
+        :param q_mobile: charge that can move, C
+        :param r_o: ohmic resistance, ohm
+        :param stride: steps of ``dt_s`` that ``current_A`` holds for: 1, or more for a coarse look
+        :return: voltage, V, dV/dq_mobile, V/C, and dV/dr_o, A, each of shape (K,); NaN after the model cell is empty
+        """
+        columns = np.full((3, len(current_A)), np.nan)
+        self._roll_out(current_A, q_mobile, r_o, stride, columns)
+        return columns[0], columns[1], columns[2]
+
+    def tangents(self, current_A: FloatArray, q_mobile: float, r_o: float) -> Tangents:
+        """
+        The voltage under a current and its derivatives with respect to both parameters and the constants that say how fast the
+        cell follows its load; unchecked.
+
+        :param current_A: current over each step, A, shape (K,)
+        :param q_mobile: charge that can move, C
+        :param r_o: ohmic resistance, ohm
+        :return: voltage and derivatives
+        """
+        columns = np.full((len(TANGENT_NAMES) + 2, len(current_A)), np.nan)
+        self._roll_out(current_A, q_mobile, r_o, 1, columns)
+        return Tangents(columns[0], columns[1:-1], columns[-1])
+
+    def _roll_out(self, current_A: FloatArray, q_mobile: float, r_o: float, stride: int, columns: FloatArray) -> None:
+        roll_out_with_tangents(
+            current_A,
+            q_mobile,
+            r_o,
+            stride * self.dt_s,
+            self.thermal,
+            self.cell.packed,
+            self._derivatives,
+            self.start(q_mobile),
+            self._shares,
+            columns,
+        )
+
+    def least_q_mobile_C(self, current_A: FloatArray) -> float:
+        """
+        The ``q_mobile`` below which the model cell is empty before a current ends. At a fixed current its charges are linear
+        in ``q_mobile``, so that one roll-out gives it exactly.
+
+        :param current_A: current over each step, A, shape (K,)
+        :return: C
+        """
+        return self.least_q_mobile_tangent_C(current_A)[0]
+
+    def least_q_mobile_tangent_C(self, current_A: FloatArray) -> tuple[float, float]:
+        """
+        The same and its derivative with respect to the logarithm of ``tDiffusion``, the only other constant it depends on.
+
+        :param current_A: current over each step, A, shape (K,)
+        :return: both, C
+        """
+        q_C = Q_MOBILE.limits[1]
+        constants = self.cell.packed.constants
+        least_C, by_t_C = least_q_mobile(current_A, q_C, self.dt_s, constants, self.start(q_C), self._shares)
+        return float(least_C), float(by_t_C)
+
+
+def _at(time_s: FloatArray, simulation: Trajectory) -> FloatArray:
+    return np.interp(time_s, simulation.time_s, simulation.voltage_V, right=np.nan)

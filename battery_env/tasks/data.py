@@ -1,0 +1,116 @@
+"""The data sets that the calibration tasks draw from."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Literal, TypeVar, get_args
+
+import numpy as np
+
+from battery_env.electrochemistry import NEW_CELL, CellParameters
+from battery_env.loads import Load, LoadSampler, RandomPiecewise, RandomWalk, constant, recorded
+from battery_env.records.discharge import BUNDLED_CELLS, load_nasa_discharges
+from battery_env.trajectories import PAPER_LOADS_W, PAPER_RANGES, PAPER_TRIM, TrajectoryDataset, aged_parameters
+
+_Discharges = TypeVar("_Discharges")
+
+LoadKind = Literal["paper", "constant", "piecewise", "random_walk", "recorded"]
+Split = Literal["train", "test", "all"]
+
+#: Discharges in a data set, but for the paper's.
+DISCHARGES = 1000
+#: Seed of ages, loads and of the division into train and test: all data sets of a parameter hold the same cells.
+SEED = 0
+TEST_SHARE = 0.3
+#: Ages of the cells that discharge under other loads than the paper's, C and ohm.
+Q_MOBILE_RANGE_C = (4000.0, 7600.0)
+R_O_RANGE_OHM = (0.1, 0.3)
+#: Powers of the constant loads, W; the ends are those of the piecewise-constant and the random-walk loads.
+CONSTANT_LOADS_W: tuple[float, ...] = tuple(np.linspace(2.0, 8.0, 13))
+
+
+def standard_dataset(
+    parameters: str | Sequence[str],
+    load: LoadKind,
+    split: Split,
+    dt_s: float = 1.0,
+    mismatch: float = 0.0,
+    cell: CellParameters = NEW_CELL,
+) -> TrajectoryDataset:
+    """
+    A data set of cells of which one parameter has aged or both have, or one side of its 70/30 split by trajectory, made once
+    per process. All are at power, isothermal, and follow the seed 0.
+
+    =============== ============================================================== ============ ============== ==========
+    load            what                                                           q_mobile     r_o            discharges
+    =============== ============================================================== ============ ============== ==========
+    ``paper``       eleven constant loads, 8 to 16 W                               4000-7000 C  0.1-0.2 ohm    1000, 5511
+    ``constant``    thirteen constant loads, 2 to 8 W                              4000-7600 C  0.1-0.3 ohm    1000
+    ``piecewise``   2 to 8 W, uniform, changed every 60 to 140 s                   4000-7600 C  0.1-0.3 ohm    1000
+    ``random_walk`` 2 to 8 W, changed every 60 s by at most 2 W                    4000-7600 C  0.1-0.3 ohm    1000
+    ``recorded``    the power of the 336 discharges of the bundled cells, 5 to 9 W 4000-7600 C  0.1-0.3 ohm    1000
+    =============== ============================================================== ============ ============== ==========
+
+    ``paper`` is trimmed to 5 .. 95 % of each discharge and, for one parameter of the new cell at 1 s without mismatch, the
+    paper's own grid of 5511; the others run from full charge to the end of discharge. A parameter that does not age is that
+    of ``cell``.
+    """
+    if load not in get_args(LoadKind):
+        raise ValueError(f"load must be one of {get_args(LoadKind)}, got {load!r}")
+    if split not in get_args(Split):
+        raise ValueError(f"split must be 'train', 'test' or 'all', got {split!r}")
+    return _splits(aged_parameters(parameters), load, dt_s, mismatch, cell)[split]
+
+
+def opened(dataset: _Discharges | str | os.PathLike[str]) -> _Discharges | TrajectoryDataset:
+    """Discharges that are given in place of a standard data set."""
+    if isinstance(dataset, (str, os.PathLike)):
+        return _loaded(os.fspath(dataset), os.stat(dataset).st_mtime_ns)
+    return dataset
+
+
+@lru_cache(maxsize=6)
+def _loaded(path: str, modified_ns: int) -> TrajectoryDataset:
+    return TrajectoryDataset.load(path)
+
+
+@lru_cache(maxsize=6)
+def _splits(
+    parameters: tuple[str, ...], load: LoadKind, dt_s: float, mismatch: float, cell: CellParameters
+) -> dict[Split, TrajectoryDataset]:
+    whole = _whole(parameters, load, dt_s, mismatch, cell)
+    train, test = whole.split(test=TEST_SHARE, seed=SEED)
+    return {"train": train, "test": test, "all": whole}
+
+
+def _whole(
+    parameters: tuple[str, ...], load: LoadKind, dt_s: float, mismatch: float, cell: CellParameters
+) -> TrajectoryDataset:
+    if load == "paper" and len(parameters) == 1 and dt_s == 1.0 and mismatch == 0.0 and cell == NEW_CELL:
+        return TrajectoryDataset.paper(parameters[0])
+    ranges = PAPER_RANGES if load == "paper" else {"q_mobile": Q_MOBILE_RANGE_C, "r_o": R_O_RANGE_OHM}
+    whole = TrajectoryDataset.generate(
+        parameters,
+        DISCHARGES,
+        _loads(load, dt_s),
+        SEED,
+        q_mobile_range=ranges["q_mobile"],
+        r_o_range=ranges["r_o"],
+        dt_s=dt_s,
+        cell=cell,
+        mismatch=mismatch,
+    )
+    return whole.trimmed(*PAPER_TRIM) if load == "paper" else whole
+
+
+def _loads(load: LoadKind, dt_s: float) -> list[Load] | LoadSampler:
+    if load == "piecewise":
+        return RandomPiecewise()
+    if load == "random_walk":
+        return RandomWalk()
+    if load == "recorded":
+        discharges = (discharge for cell in BUNDLED_CELLS for discharge in load_nasa_discharges(cell))
+        return [recorded(discharge.loaded_part(NEW_CELL.VEOD), "power", dt_s) for discharge in discharges]
+    return [constant(power) for power in (PAPER_LOADS_W if load == "paper" else CONSTANT_LOADS_W)]

@@ -1,0 +1,136 @@
+"""A calibration task as a Gymnasium environment."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from importlib import import_module
+from typing import Any, SupportsFloat
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from battery_env.estimators.estimator import Record
+from battery_env.tasks.task import OBSERVATION_LIMIT, CalibrationTask
+
+_ROW = np.zeros(1, dtype=np.intp)
+FloatSpace = gym.Space[NDArray[np.float32]]
+_RENDER_MODES = ["rgb_array"]
+
+
+def task_class(task: str | type[CalibrationTask]) -> type[CalibrationTask]:
+    """The class of a task."""
+    if not isinstance(task, str):
+        return task
+    module, _, name = task.partition(":")
+    found: type[CalibrationTask] = getattr(import_module(module), name)
+    return found
+
+
+def new_task(task: str | type[CalibrationTask], cells: int, options: Mapping[str, Any]) -> CalibrationTask:
+    """A task for some cells."""
+    kind: Any = task_class(task)  # of a class of its own, not of the base
+    known = kind.options()
+    unknown = options.keys() - known.keys()
+    if unknown:
+        raise TypeError(f"{', '.join(sorted(unknown))}: no such option. There are {', '.join(sorted(known))}")
+    made: CalibrationTask = kind(cells, **options)
+    return made
+
+
+def spaces_of(task: CalibrationTask) -> tuple[FloatSpace, FloatSpace]:
+    """What one cell of a task shows and takes."""
+    limit = OBSERVATION_LIMIT
+    return (
+        gym.spaces.Box(-limit, limit, shape=(task.observation_size,), dtype=np.float32),
+        gym.spaces.Box(-1.0, 1.0, shape=(len(task.parameters),), dtype=np.float32),
+    )
+
+
+def check_render_mode(render_mode: str | None) -> str | None:
+    """Refuse a render mode that does not exist."""
+    if render_mode is not None and render_mode not in _RENDER_MODES:
+        raise ValueError(f"render_mode must be None or one of {_RENDER_MODES}, got {render_mode!r}")
+    return render_mode
+
+
+class CalibrationEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
+    """
+    A calibration task for one cell. The reward is minus the cost, and ``info`` holds the cost and what
+    :meth:`~battery_env.tasks.task.CalibrationTask.report` says. ``help(env.task)`` describes what is observed, done,
+    paid and can be chosen.
+
+    :param task: the class of the task, or where it is, as ``"module:name"``
+    :param render_mode: ``"rgb_array"`` or ``None``
+    :param options: of the task
+    :raises TypeError: for an option that the task does not have
+    :raises ValueError: for values out of range
+    :cvar metadata: what Gymnasium asks for, and ``discount``, the discount factor that the tasks are for, which LAC takes by
+        default: a wrong parameter shows within a second or a decision, and what lies further ahead only blurs it
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012 (as in gym.Env)
+        "render_modes": _RENDER_MODES,
+        "render_fps": 10,
+        "discount": 0.8,
+    }
+
+    def __init__(self, task: str | type[CalibrationTask], render_mode: str | None = None, **options: Any) -> None:
+        self.render_mode = check_render_mode(render_mode)
+        self.task = new_task(task, 1, options)
+        self.observation_space, self.action_space = spaces_of(self.task)
+        self._history: deque[dict[str, float]] = deque(maxlen=self.task.episode_steps)
+
+    @property
+    def dataset(self) -> Sequence[Record]:
+        """The discharges that episodes are drawn from."""
+        return self.task.dataset
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """
+        Start an episode.
+
+        :param seed: seed of this and the following episodes
+        :param options: choices that replace random draws; the page of the environment names them
+        :return: observation, info
+        """
+        super().reset(seed=seed)
+        self.task.start(_ROW, [self.np_random], options)
+        self._history.clear()
+        return self.task.observation()[0], self._info(0.0)
+
+    def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], SupportsFloat, bool, bool, dict[str, Any]]:
+        """
+        Take one decision.
+
+        :param action: shape (number of parameters,), in [-1, 1]
+        :return: observation, reward (minus the cost), terminated (never), truncated (end of the episode or of the data), info
+        :raises ValueError: for an action of another shape, NaN, or what is no number
+        """
+        task = self.task
+        cost = task.advance(np.asarray(action)[None]).item()
+        info = self._info(cost)
+        if self.render_mode is not None:
+            self._history.append(info)
+        return task.observation()[0], -cost, False, task.truncated().item(), info
+
+    def _info(self, cost: float) -> dict[str, Any]:
+        info = {name: value.item() for name, value in self.task.report().items()}
+        info["cost"] = cost
+        return info
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """
+        A picture of the episode so far: voltage and parameters, of the cell and of the model.
+
+        :return: shape (height, width, 3), or ``None`` without a render mode
+        """
+        if self.render_mode is None:
+            return None
+        from battery_env.tasks.rendering import draw_frame  # matplotlib only for those who look
+
+        task = self.task
+        return draw_frame(list(self._history), task.parameters, task.episode_steps, task.decision_s)

@@ -1,0 +1,175 @@
+"""
+The compiled kernels (numba) of the full-state task: a decision, a look ahead, and what the agent sees, for many cells.
+
+``settings`` is one record of :data:`~battery_env.tasks.full_state.layout.SETTINGS`, ``cells`` an array of records of
+:data:`~battery_env.tasks.full_state.layout.CELL`, whose fields the kernels overwrite.
+"""
+
+from __future__ import annotations
+
+from math import sqrt
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from battery_env.arrays import FloatArray
+from battery_env.electrochemistry.cell import QNB, QNS, STATE_SIZE, VO
+from battery_env.electrochemistry.kernels import (
+    BLOCK,
+    BLOCK_SIZE,
+    VOLTAGE,
+    asinh_ratio,
+    fill_block,
+    states_of_block,
+    step_of_block,
+    voltage_of_block,
+)
+from battery_env.tasks.full_state.layout import Records
+
+_compiled = njit(cache=True, error_model="numpy")
+_inlined = njit(cache=True, error_model="numpy", forceinline=True)
+
+
+@_inlined
+def _clipped(value: float, limit: float) -> float:
+    # NaN stays NaN
+    return -limit if value < -limit else (limit if value > limit else value)
+
+
+@_inlined
+def _literal_distance(model_state: FloatArray, measured: FloatArray, n: int) -> float:
+    voltages, charges = 0.0, 0.0
+    for k in range(VO, QNB):
+        voltages += (model_state[n, k] - measured[n, k]) ** 2
+    for k in range(QNB, STATE_SIZE):
+        charges += (model_state[n, k] - measured[n, k]) ** 2
+    distance = 0.5 * sqrt(voltages) + 0.5 * sqrt(charges)
+    return 50.0 * distance if distance > 1e-4 else distance
+
+
+@_inlined
+def _cost_of_state(model_state: FloatArray, measured: FloatArray, n: int, task: Any) -> float:
+    if task.literal_cost:
+        return _clipped(_literal_distance(model_state, measured, n), task.cost_limit)
+    cost = 0.0
+    for k in range(2):
+        if task.finds[k] > 0:
+            voltage = task.judged_by[k]
+            error = model_state[n, voltage] - measured[n, voltage]
+            cost += _clipped(abs(error) * task.per_error[voltage - VO], task.cost_limit)
+    return cost
+
+
+@_inlined
+def _take_action(action: FloatArray, task: Any, cells: Records, n: int) -> float:
+    # Set the model's parameters; returns the length of the change of the action
+    cell, squared_change, column = cells[n], 0.0, 0
+    for k in range(2):
+        if task.finds[k] > 0:
+            chosen = _clipped(action[n, column], 1.0)
+            squared_change += (chosen - cell.last_action[k]) ** 2
+            cell.last_action[k] = chosen
+            value = task.lowest[k] + 0.5 * (chosen + 1.0) * (task.highest[k] - task.lowest[k])
+            if k == 0:
+                cell.q_mobile_hat = value
+            else:
+                cell.r_o_hat = value
+            column += 1
+    return sqrt(squared_change)
+
+
+@_compiled
+def decide(action: FloatArray, settings: Records, cells: Records, cost: FloatArray) -> None:
+    # Set the model's parameters, step it, and compare it with the measured state; then go on to the next sample
+    task, block = settings[0], np.empty(BLOCK_SIZE)
+    state, next_state, model_state = cells["state"], cells["next_state"], cells["model_state"]
+    for n in range(len(cells)):
+        cells[n].decisions += 1
+        cells[n].sample += 1
+        cost[n] = task.consistency * _take_action(action, task, cells, n)
+    for first in range(0, len(cells), BLOCK):
+        size = min(BLOCK, len(cells) - first)
+        fill_block(
+            block, first, size, cells["model_state"], cells["load"], cells["q_mobile_hat"], cells["r_o_hat"], task.constants
+        )
+        step_of_block(block, size, task.dt_s, task.power, task.power, task.thermal, True, task.polynomial_n, task.polynomial_p)
+        states_of_block(block, first, size, cells["model_state"])
+        for n in range(first, first + size):
+            cost[n] += _cost_of_state(model_state, next_state, n, task)
+            is_set = task.resync > 0 and cells[n].decisions % task.resync == 0
+            for k in range(STATE_SIZE):
+                state[n, k] = next_state[n, k]
+                if is_set:
+                    model_state[n, k] = next_state[n, k]
+
+
+@_compiled
+def look_ahead(settings: Records, load_values: FloatArray, constants: FloatArray, cells: Records) -> None:
+    # The load and the cell's next state. At the end of its data a cell stays on its last sample, and is not asked for more
+    task, block = settings[0], np.empty(BLOCK_SIZE)
+    for n in range(len(cells)):
+        cells[n].load = load_values[cells[n].load_start + min(cells[n].sample, cells[n].last_sample)]
+    for first in range(0, len(cells), BLOCK):
+        size = min(BLOCK, len(cells) - first)
+        fill_block(block, first, size, cells["state"], cells["load"], cells["q_mobile"], cells["r_o"], constants)
+        step_of_block(block, size, task.dt_s, task.power, True, task.thermal, True, task.polynomial_n, task.polynomial_p)
+        for j in range(size):
+            cell = cells[first + j]
+            cell.voltage = block[VOLTAGE + j]
+            cell.soc = (cell.state[QNB] + cell.state[QNS]) / cell.q_mobile
+        states_of_block(block, first, size, cells["next_state"])
+
+
+@_compiled
+def model_voltage(settings: Records, cells: Records, out: FloatArray) -> None:
+    task, block = settings[0], np.empty(BLOCK_SIZE)
+    for first in range(0, len(cells), BLOCK):
+        size = min(BLOCK, len(cells) - first)
+        fill_block(
+            block, first, size, cells["model_state"], cells["load"], cells["q_mobile_hat"], cells["r_o_hat"], task.constants
+        )
+        voltage_of_block(block, size, True, task.polynomial_n, task.polynomial_p)
+        for j in range(size):
+            out[first + j] = block[VOLTAGE + j]
+
+
+@_compiled
+def observe(settings: Records, cells: Records, limit: float, out: NDArray[np.float32]) -> None:
+    # The observations, into out
+    task, block = settings[0], np.empty(BLOCK_SIZE)
+    per_state, per_error, model_state, next_state = task.per_state, task.per_error, cells["model_state"], cells["next_state"]
+    for n in range(len(cells)):
+        cell = cells[n]
+        for k in range(7):
+            out[n, k] = _clipped(model_state[n, k + 1] * per_state[k], limit)
+            out[n, k + 7] = _clipped(next_state[n, k + 1] * per_state[k], limit)
+        out[n, 14] = _clipped(cell.load * task.per_load, limit)
+        if task.shows_action:
+            column = out.shape[1]
+            for k in range(1, -1, -1):
+                if task.finds[k] > 0:
+                    column -= 1
+                    out[n, column] = cell.last_action[k]
+    if not task.innovations:
+        return
+    q, r_o = np.full(len(cells), task.new_parameters[0]), np.full(len(cells), task.new_parameters[1])
+    for column, origin in ((15, model_state), (22, cells["state"])):
+        for first in range(0, len(cells), BLOCK):
+            size = min(BLOCK, len(cells) - first)
+            fill_block(block, first, size, origin, cells["load"], q, r_o, task.constants)
+            step_of_block(
+                block, size, task.dt_s, task.power, task.power, task.thermal, True, task.polynomial_n, task.polynomial_p
+            )
+            for j in range(size):
+                for k in range(1, 8):
+                    block[k * BLOCK + j] = (next_state[first + j, k] - block[k * BLOCK + j]) * per_error[k - 1]
+            # asinh: they span five orders of magnitude, and must not drown the small ones in a network. A loop of its own, so
+            # that the compiler uses vector instructions
+            for k in range(1, 8):
+                for j in range(size):
+                    block[k * BLOCK + j] = asinh_ratio(block[k * BLOCK + j], 1.0)
+            for j in range(size):
+                for k in range(7):
+                    out[first + j, k + column] = block[(k + 1) * BLOCK + j]

@@ -1,0 +1,172 @@
+"""A calibration task as a Gymnasium vector environment."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from battery_env.electrochemistry import FloatArray
+from battery_env.tasks.env import CalibrationEnv, check_render_mode, new_task, spaces_of
+from battery_env.tasks.task import CalibrationTask
+
+Mask = NDArray[np.bool_]
+
+
+class CalibrationVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any]]):
+    """
+    A calibration task for many cells, each in its own episode.
+
+    With the same seeds it makes the episodes of as many scalar environments, to the bit. As in Gymnasium, seed s gives cell n
+    the seed s + n, and ``info`` holds arrays of shape (num_envs,), with the cells that they are valid for under ``_name``.
+
+    :param task: the class of the task, or where it is, as ``"module:name"``
+    :param num_envs: number of cells
+    :param autoreset_mode: when a cell whose episode is over is started again: ``NEXT_STEP``: by the step that follows, whose
+        action does nothing to it; ``SAME_STEP``: at once, with ``final_obs`` and ``final_info`` in ``info``; ``DISABLED``: by
+        the caller, with ``reset(options={"reset_mask": ...})``. The mode or its value, a string
+    :param render_mode: ``"rgb_array"`` or ``None``
+    :param options: of the task
+    :raises TypeError: for an option that the task does not have
+    :raises ValueError: for values out of range
+    """
+
+    metadata: dict[str, Any] = dict(CalibrationEnv.metadata)  # noqa: RUF012 (as in gym.vector.VectorEnv)
+
+    def __init__(
+        self,
+        task: str | type[CalibrationTask],
+        num_envs: int = 1,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        render_mode: str | None = None,
+        **options: Any,
+    ) -> None:
+        if num_envs < 1:
+            raise ValueError(f"num_envs must be at least 1, got {num_envs!r}")
+        self.num_envs = num_envs
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
+        self.render_mode = check_render_mode(render_mode)
+        self.task = new_task(task, num_envs, options)
+        self.single_observation_space, self.single_action_space = spaces_of(self.task)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._generators: list[np.random.Generator] = []
+        self._over: Mask = np.zeros(num_envs, dtype=np.bool_)
+        self._histories = [deque[dict[str, float]](maxlen=self.task.episode_steps) for _ in range(num_envs)]
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """
+        Start an episode in every cell, or in some.
+
+        :param seed: seed of this and the following episodes: one a cell, or the first cell's, from which the others count up
+        :param options: choices that replace random draws; the page of the environment names them. ``reset_mask``, shape
+            (num_envs,), says which cells to start, all by default
+        :return: observations, info
+        :raises ValueError: for a wrong number of seeds, or a mask that is none
+        """
+        chosen = dict(options or {})
+        mask = self._checked_mask(chosen.pop("reset_mask", np.ones(self.num_envs, dtype=np.bool_)))
+        if seed is None or isinstance(seed, (int, np.integer)):
+            seeds: list[int | None] = [None if seed is None else int(seed) + n for n in range(self.num_envs)]
+        else:
+            seeds = list(seed)
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"seed must be one number, or one for each of the {self.num_envs} cells, got {len(seeds)}")
+        if not self._generators:
+            self._generators = [seeding.np_random(value)[0] for value in seeds]
+        else:
+            for n in np.flatnonzero(mask):
+                if seeds[n] is not None:
+                    self._generators[n] = seeding.np_random(seeds[n])[0]
+        self._start(mask, chosen)
+        self._over = self._over & ~mask
+        return self.task.observation(), self._info(np.zeros(self.num_envs), mask)
+
+    def step(self, actions: NDArray[np.float32]) -> tuple[NDArray[np.float32], FloatArray, Mask, Mask, dict[str, Any]]:
+        """
+        Take one decision in every cell.
+
+        :param actions: shape (num_envs, number of parameters), in [-1, 1]
+        :return: observations, rewards (minus the cost), terminated (never), truncated (end of an episode or of its data), info
+        :raises gymnasium.error.ResetNeeded: before the first reset; without autoreset, if an episode is over
+        """
+        if not self._generators:
+            raise gym.error.ResetNeeded("call reset() before step()")
+        if self.autoreset_mode is AutoresetMode.DISABLED and self._over.any():
+            cells = np.flatnonzero(self._over).tolist()
+            raise gym.error.ResetNeeded(f"the episodes of cells {cells} are over: start them with reset_mask before step()")
+        cost = self.task.advance(actions)
+        reward, truncated, final = -cost, self.task.truncated(), {}
+        started = None
+        if self.autoreset_mode is AutoresetMode.NEXT_STEP and self._over.any():
+            started = self._over
+            self._start(started)
+            reward[started], truncated[started] = 0.0, False
+        elif self.autoreset_mode is AutoresetMode.SAME_STEP and truncated.any():
+            started = truncated
+            final = self._final(started, cost)
+            self._start(started)
+        if started is not None:
+            cost[started] = 0.0
+        if self.autoreset_mode is not AutoresetMode.SAME_STEP:
+            self._over = truncated.copy()
+        info = self._info(cost)
+        if self.render_mode is not None:
+            self._remember(info, started)
+        return self.task.observation(), reward, np.zeros(self.num_envs, dtype=np.bool_), truncated, {**final, **info}
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """
+        A picture of the episode so far of every cell, as the scalar environment draws it.
+
+        :return: arrays of shape (height, width, 3), or ``None`` without a render mode
+        """
+        if self.render_mode is None:
+            return None
+        from battery_env.tasks.rendering import draw_frame  # matplotlib only for those who look
+
+        task = self.task
+        return tuple(draw_frame(list(h), task.parameters, task.episode_steps, task.decision_s) for h in self._histories)
+
+    def _checked_mask(self, mask: Any) -> Mask:
+        if not (isinstance(mask, np.ndarray) and mask.dtype == np.bool_ and mask.shape == (self.num_envs,) and mask.any()):
+            raise ValueError(
+                f"options['reset_mask'] must be a boolean array of shape ({self.num_envs},), not all False, got {mask!r}"
+            )
+        return mask
+
+    def _start(self, mask: Mask, options: Mapping[str, Any] | None = None) -> None:
+        rows = np.flatnonzero(mask)
+        cells = rows.tolist()
+        self.task.start(rows, [self._generators[n] for n in cells], options)
+        if self.render_mode is not None:
+            for n in cells:
+                self._histories[n].clear()
+
+    def _info(self, cost: FloatArray, mask: Mask | None = None) -> dict[str, Any]:
+        info: dict[str, Any] = {"cost": cost, **self.task.report()}
+        valid = np.ones(self.num_envs, dtype=np.bool_) if mask is None else mask
+        info.update({f"_{name}": valid.copy() for name in tuple(info)})
+        return info
+
+    def _final(self, mask: Mask, cost: FloatArray) -> dict[str, Any]:
+        observation, observations = self.task.observation(), np.full(self.num_envs, None, dtype=object)
+        for n in np.flatnonzero(mask).tolist():
+            observations[n] = observation[n]
+        final = self._info(cost.copy(), mask)
+        return {"final_obs": observations, "_final_obs": mask.copy(), "final_info": final, "_final_info": mask.copy()}
+
+    def _remember(self, info: dict[str, Any], started: Mask | None) -> None:
+        names = ("cost", *self.task.REPORTED)
+        for n in range(self.num_envs) if started is None else np.flatnonzero(~started):
+            self._histories[n].append({name: float(info[name][n]) for name in names})

@@ -1,0 +1,1 @@
+"""Tasks whose agent sees measured voltages and currents only."""

@@ -1,0 +1,455 @@
+"""
+Calibration from current and voltage alone, for a batch of cells at once: no state of the cell is measured.
+
+The paper names this as future work. The parameters are constant within a discharge, so that the agent is asked to explain all
+data so far with one (q_mobile, r_o): it holds an estimate, sees what the data say against it, and moves it.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from functools import lru_cache
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from battery_env.arrays import FloatArray, IntArray
+from battery_env.checks import check_not_negative
+from battery_env.electrochemistry import UNCERTAIN_CONSTANTS, CellParameters, check_cell
+from battery_env.estimators.diagnosis.conditions import white_noise_V
+from battery_env.parameters import PARAMETER_NAMES, columns_of
+from battery_env.records import Record
+from battery_env.sensors import RandomSensorErrors
+from battery_env.tasks.data import LoadKind, Split, opened, standard_dataset
+from battery_env.tasks.task import OBSERVATION_LIMIT, CalibrationTask, check_counts, checked_action
+from battery_env.tasks.voltage.fit import Fitted, NuisanceFit
+from battery_env.tasks.voltage.readings import CURRENT, MEASURED, OHMIC, SHOWN, Readings, explain
+from battery_env.trajectories import TrajectoryDataset
+
+#: Where estimates are kept, C and ohm.
+ESTIMATE_RANGES: dict[str, tuple[float, float]] = {"q_mobile": (3500.0, 8100.0), "r_o": (0.05, 0.35)}
+#: By how much an action of 1 moves the estimate, C and ohm.
+LARGEST_STEPS: dict[str, float] = {"q_mobile": 1500.0, "r_o": 0.12}
+
+#: Equal stretches of the data so far; each is averaged in two halves, of less and of more current.
+STRETCHES = 16
+# An estimate needs more readings than it has parameters
+_FEWEST_READINGS = 3
+#: What the discharges that episodes are made of are read with.
+SENSORS = RandomSensorErrors(noise_V=(0.001, 0.030), offset_V=0.010)
+
+#: What a decision costs: what the readings say against the estimate, or the error of the model's hidden state.
+Cost = Literal["misfit", "state"]
+_COST_SCALE_V = 0.002
+_STATE_COST_SCALE = 0.01
+# What the parts of an observation are divided by
+_MISFIT_FLOOR_V = 0.001
+_SLOPE_SCALE_V_PER_C = 5e-5
+_CURRENT_SCALE_A = 3.0
+_MISFIT_SCALE_V = 0.010
+_TIME_SCALE_S = 3000.0
+
+
+@lru_cache(maxsize=4)
+def _readings_of_a_dataset(dataset: TrajectoryDataset, reading_s: float, cell: CellParameters) -> Readings:
+    if dataset.first.any():
+        raise ValueError(
+            "dataset leaves out the start of discharges (it is trimmed, as with load='paper'), and voltages are judged from "
+            "full charge on: take whole discharges, or another load"
+        )
+    return Readings.of(dataset, reading_s, dataset.dt_s, cell)
+
+
+class VoltageTask(CalibrationTask):
+    """
+    Find ``parameters`` from voltage and current, in ``cells`` episodes side by side.
+
+    An action moves the estimate by ``sign(a) * a**2`` times ``LARGEST_STEPS``: far where the misfit is large, finely near the
+    optimum. Then new readings arrive, and the cost grows with the misfit to all data so far at the new estimate: the root mean
+    square of the mean residuals of equal stretches of the data, whose noise is smaller than that of single readings, after
+    the offset that the sensor may have. It knows no true parameter, so that a task can be made of recorded discharges too.
+    Of simulated ones the cost may be the error of the model's hidden state instead, as in the paper.
+
+    One parameter may be known instead: the true one of a simulated discharge, and the new cell's of a recorded one. What
+    differs between the registered tasks is data of their classes; their options are described on the page of
+    :class:`~battery_env.tasks.voltage.pages.BatteryVoltageJoint`.
+
+    :ivar readings: what is read of the discharges
+    :ivar sensors: what they are read with
+    :param cells: size of the batch
+    :raises ValueError: for values out of range
+    """
+
+    def __init__(
+        self,
+        cells: int,
+        *,
+        episode_steps: int = 8,
+        reading_s: float = 10.0,
+        new_readings: tuple[int, int] = (0, 29),
+        process_noise_V: float = 0.0,
+        start: Literal["random", "new_cell", "true"] = "random",
+        consistency: float = 0.0,
+        cost: Cost = "misfit",
+        load: LoadKind = "piecewise",
+        split: Split = "train",
+        dt_s: float = 1.0,
+        mismatch: float = 0.0,
+        nuisance: float = 0.0,
+        cell: CellParameters | None = None,
+        dataset: Sequence[Record] | str | os.PathLike[str] | None = None,
+        **sensors: Any,
+    ) -> None:
+        check_counts(episode_steps=episode_steps)
+        check_not_negative(consistency=consistency, process_noise_V=process_noise_V, nuisance=nuisance)
+        if not 0 <= new_readings[0] <= new_readings[1]:
+            raise ValueError(f"new_readings must be (fewest, most) with 0 <= fewest <= most, got {new_readings!r}")
+        if start not in ("random", "new_cell", "true"):
+            raise ValueError(f"start must be one of ('random', 'new_cell', 'true'), got {start!r}")
+        if cost not in get_args(Cost):
+            raise ValueError(f"cost must be one of {get_args(Cost)}, got {cost!r}")
+        self._open(dataset, reading_s, cell, {"load": load, "split": split, "dt_s": dt_s, "mismatch": mismatch})
+        self.cells, self.episode_steps, self.new_readings = cells, episode_steps, new_readings
+        self.sensors = replace(SENSORS, **sensors)
+        self.process_noise_V, self.first_estimate, self.consistency = process_noise_V, start, consistency
+        self.decision_s = self.readings.interval_s * (sum(new_readings) / 2.0)
+        self._set_scales()
+        self._cost = cost
+        is_unknown = np.isnan(self.readings.q_mobile) | np.isnan(self.readings.r_o)
+        if cost == "state" and is_unknown.any():
+            raise ValueError(
+                f"cost='state' is the error of a state that only a simulation knows, and {is_unknown.sum()} of "
+                f"{len(is_unknown)} discharges are not simulated: take cost='misfit' for recorded ones"
+            )
+        self.observation_size = 6 * STRETCHES + 4 + len(self.parameters) * (2 if consistency > 0.0 else 1)
+        self._fit: NuisanceFit | None = None
+        if nuisance > 0.0:
+            fitted = (self.readings, self.parameters, ESTIMATE_RANGES, self.sensors.offset_V, nuisance)
+            self._fit = NuisanceFit(cells, *fitted)
+            self.observation_size += self._fit.observation_size
+        self._every = 0  # readings between two decisions of a whole record; 0: of an episode they are drawn
+        self._allocate()
+
+    def _open(
+        self,
+        dataset: Sequence[Record] | str | os.PathLike[str] | None,
+        reading_s: float,
+        cell: CellParameters | None,
+        chosen: Mapping[str, Any],
+    ) -> None:
+        """Read the discharges that are given, or else those that are chosen."""
+        dataset = opened(dataset)
+        if cell is not None:
+            self._check_reach(check_cell(cell))
+        elif isinstance(dataset, TrajectoryDataset):
+            cell = dataset.cell
+        cell = check_cell(cell)
+        if dataset is None:
+            dataset = standard_dataset(self.parameters, **chosen, cell=cell)
+        else:
+            self._refuse_beside_a_dataset(**chosen)
+        self.dataset = dataset
+        if isinstance(dataset, TrajectoryDataset):
+            self.readings = _readings_of_a_dataset(dataset, reading_s, cell)
+        else:
+            self.readings = Readings.of(dataset, reading_s, cell=cell)
+
+    def _set_scales(self) -> None:
+        """What actions and first estimates are made of."""
+        cell, readings = self.readings.cell, self.readings
+        self._columns = columns_of(self.parameters)
+        self._low, self._high = np.array([ESTIMATE_RANGES[name] for name in self.parameters]).T
+        self._step = np.array([LARGEST_STEPS[name] for name in self.parameters])
+        self._new: FloatArray = np.array([cell.q_mobile, cell.r_o])
+        self._new[self._columns] = np.clip(self._new[self._columns], self._low, self._high)
+        # the true parameters of the discharges, or the new cell's where they are not known
+        true = np.column_stack([readings.q_mobile, readings.r_o])
+        self._known = np.where(np.isnan(true), self._new, true)
+
+    def _allocate(self) -> None:
+        """Make room for the state of all cells."""
+        cells, longest = self.cells, int(self.readings.count.max())
+        self.discharge: IntArray = np.zeros(cells, dtype=np.int64)
+        self.count: IntArray = np.ones(cells, dtype=np.int64)
+        self._arrivals: IntArray = np.zeros((cells, self.episode_steps), dtype=np.int64)
+        self._step_of_episode: IntArray = np.zeros(cells, dtype=np.int64)
+        self._last_step: IntArray = np.zeros(cells, dtype=np.int64)  # of the discharge
+        self._estimate = np.tile(self._new, (cells, 1))
+        self._action = np.zeros((cells, len(self.parameters)))
+        self._shown = np.zeros((SHOWN, cells, longest))
+        # of the residual, V, of dV/dq_mobile, V/C, and of the ohmic drop per ohm, A
+        self._means = np.zeros((3, cells, STRETCHES, 2))
+        self._rms_V, self._last_V, self._offset_V, self._misfit_V = np.zeros((4, cells))
+
+    def _check_reach(self, cell: CellParameters) -> None:
+        for name in self.parameters:
+            (low, high), value = ESTIMATE_RANGES[name], getattr(cell, name)
+            if not low <= value <= high:
+                raise ValueError(
+                    f"{name} of cell must lie within {low:g} .. {high:g}, where the task looks for it, got {value:g}. "
+                    "Take least squares or the filter for such cells."
+                )
+
+    @classmethod
+    def options(cls) -> dict[str, Any]:
+        """
+        What the task can be asked for; its page says what each option means. Errors of the sensors are those of
+        :class:`~battery_env.sensors.RandomSensorErrors`.
+
+        :return: default values by name
+        """
+        return {**super().options(), **asdict(SENSORS)}
+
+    def start(
+        self,
+        rows: NDArray[np.intp],
+        generators: Sequence[np.random.Generator],
+        options: Mapping[str, Any] | None = None,
+    ) -> None:
+        """
+        Begin new episodes, each at a random reading of a random discharge; as of the base class.
+
+        :param options: ``discharge`` (its number), ``reading`` (how many readings there are at first), ``q_mobile_hat`` and
+            ``r_o_hat`` (the first estimate)
+        """
+        chosen = dict(options or {})
+        discharge = chosen.pop("discharge", None)
+        reading = chosen.pop("reading", None)
+        first = {name: chosen.pop(f"{name}_hat") for name in self.parameters if f"{name}_hat" in chosen}
+        if chosen:
+            raise ValueError(
+                f"unknown reset options {tuple(chosen)}; known: discharge, reading, "
+                + ", ".join(f"{name}_hat" for name in self.parameters)
+            )
+        if discharge is not None and not 0 <= discharge < len(self.readings):
+            raise ValueError(f"options['discharge'] must lie within 0 .. {len(self.readings) - 1}, got {discharge!r}")
+        for name in first:
+            low, high = ESTIMATE_RANGES[name]
+            if not low <= first[name] <= high:
+                raise ValueError(f"options['{name}_hat'] must lie within {low:g} .. {high:g}, got {first[name]!r}")
+        fewest, most = self.new_readings
+        for row, generator in zip(rows, generators, strict=True):
+            n = self._draw_discharge(generator) if discharge is None else int(discharge)
+            length = int(self.readings.count[n])
+            count = self._first_count(n, generator) if reading is None else int(reading)
+            if not 1 <= count <= length:
+                raise ValueError(f"options['reading'] must lie within 1 .. {length} for discharge {n}, got {count}")
+            self._arrivals[row] = generator.integers(fewest, most + 1, size=self.episode_steps)
+            estimate = self._first_estimate(n, generator)
+            for name, value in first.items():
+                estimate[PARAMETER_NAMES.index(name)] = value
+            self._step_of_episode[row] = 0
+            self._place(row, n, count, estimate)
+            self._measure(row, n, generator)
+        self._action[rows] = 0.0
+        self._explain(rows)
+
+    def _draw_discharge(self, generator: np.random.Generator) -> int:
+        return int(generator.integers(len(self.readings)))
+
+    def _first_count(self, discharge: int, generator: np.random.Generator | None) -> int:
+        """How many readings there are at first: on a whole record as many as arrive between two decisions."""
+        length = int(self.readings.count[discharge])
+        return min(self._every, length) if generator is None else self._draw_count(length, generator)
+
+    def _draw_count(self, length: int, generator: np.random.Generator) -> int:
+        return int(generator.integers(_FEWEST_READINGS, length, endpoint=True))
+
+    @classmethod
+    def follow(cls, records: Sequence[Record], every: int, **options: Any) -> VoltageTask:
+        """
+        Go through whole records, each with a cell of its own: from its first readings, measured as they are, and from the
+        estimate of a new cell. The cost is the misfit, so that a policy of any cost can be asked about recorded discharges.
+
+        :param records: discharges from full charge, simulated or recorded
+        :param every: readings between two decisions, and before the first one
+        """
+        discharges = cls.discharges_of_an_episode(options)
+        task = cls(len(records) // discharges, **{"start": "new_cell", **options, "dataset": records, "cost": "misfit"})
+        task._every = every
+        for row in range(task.cells):
+            n = row * discharges
+            task._place(row, n, task._first_count(n, None), task._first_estimate(n, None))
+        task._explain()
+        return task
+
+    @classmethod
+    def discharges_of_an_episode(cls, options: Mapping[str, Any]) -> int:
+        """How many discharges an episode goes through."""
+        return 1
+
+    def steps_between(self, decision_s: float) -> int:
+        """How many readings arrive between two decisions; only whole numbers of them."""
+        interval_s = self.readings.interval_s
+        every = round(decision_s / interval_s)
+        if every < 1 or abs(every * interval_s - decision_s) > 1e-9 * interval_s:
+            raise ValueError(
+                f"decision_s must be a multiple of the interval between readings, {interval_s:g} s, got {decision_s!r}"
+            )
+        return every
+
+    def seen(self) -> tuple[IntArray, FloatArray]:
+        """Which readings the next decision knows."""
+        readings = self.readings
+        return self.discharge.copy(), readings.start_s[self.discharge] + self.count * readings.interval_s
+
+    @property
+    def estimate(self) -> FloatArray:
+        """(q_mobile, r_o), C and ohm, shape (cells, 2)."""
+        return self._estimate.copy()
+
+    def fitted(self) -> Fitted | None:
+        """What the fit in the observation says (option ``nuisance``)."""
+        if self._fit is None:
+            return None
+        # without the ohmic drops, which jump where the load is switched
+        at_rest_V = self._shown[MEASURED] + self._estimate[:, 1:] * self._shown[OHMIC]
+        parts = zip(at_rest_V, self.count, strict=True)
+        white_V = [white_noise_V(each[:end], order=2) if end > 2 else np.inf for each, end in parts]
+        return self._fit.found(self._estimate, self.count.copy(), np.array(white_V))
+
+    @staticmethod
+    def conclude(estimates: FloatArray) -> float:
+        """The last estimate, which explains all readings."""
+        return float(estimates[-1])
+
+    def _place(self, row: int, discharge: int, count: int, estimate: FloatArray) -> None:
+        """Put one cell at one point of one discharge, measured without error."""
+        length = self.readings.count[discharge]
+        self.discharge[row], self.count[row] = discharge, count
+        self._shown[:, row, :length] = self.readings.shown(discharge)
+        self._estimate[row] = estimate
+        if self._fit is not None:
+            self._fit.logarithms[row] = 0.0
+        decisions = -(-int(length) // self._every) if self._every else self._decisions_in_a_discharge
+        self._last_step[row] = self._step_of_episode[row] + decisions
+
+    @property
+    def _decisions_in_a_discharge(self) -> int:
+        return self.episode_steps
+
+    def _first_estimate(self, discharge: int, generator: np.random.Generator | None) -> FloatArray:
+        estimate = self._known[discharge].copy()
+        if self.first_estimate == "random" and generator is not None:
+            estimate[self._columns] = self._low + (self._high - self._low) * generator.random(len(self._low))
+        elif self.first_estimate != "true":
+            estimate[self._columns] = self._new[self._columns]
+        return estimate
+
+    def _measure(self, row: int, discharge: int, generator: np.random.Generator) -> None:
+        """The noise of the cell, and the errors of the sensors, over one discharge."""
+        length = int(self.readings.count[discharge])
+        voltage_V = self._shown[MEASURED, row, :length]
+        if self.process_noise_V > 0.0:
+            voltage_V += self.readings.process_noise_V(self.process_noise_V, generator.standard_normal((3, length)))
+        noise_V = self.sensors.draw_noise_V(generator)
+        noise = generator.standard_normal(length) if noise_V > 0.0 else np.zeros(length)
+        errors = self.sensors.draw_biases(generator, noise_V)
+        read_V = errors.read_voltage_V(voltage_V, noise)
+        if errors.change_the_current:
+            measured = self.readings.remeasured(discharge, errors.gain(voltage_V, read_V), errors.current_offset_A)
+            self._shown[CURRENT:, row, :length] = measured
+        voltage_V[:] = read_V
+
+    def _explain(self, rows: NDArray[np.intp] | None = None) -> None:
+        """Compare some cells with their readings, all by default."""
+        of_cells = np.arange(self.cells) if rows is None else np.asarray(rows, dtype=np.int64)
+        read = (of_cells, self.count, self._estimate, self._shown)
+        explain(*read, self.readings.model, self._means, self._rms_V, self._last_V)
+        if self._fit is not None:
+            self._fit.step(*read)
+        residual_V = self._means[0]
+        self._offset_V = np.clip(residual_V.mean(axis=(1, 2)), -self.sensors.offset_V, self.sensors.offset_V)
+        self._misfit_V = np.sqrt(np.mean((residual_V - self._offset_V[:, None, None]) ** 2, axis=(1, 2)))
+
+    def restore(self, estimate: FloatArray, action: FloatArray, logarithms: FloatArray) -> None:
+        """
+        Let all cells stand where a policy left off.
+
+        :param estimate: (q_mobile, r_o), C and ohm, shape (2,) or (cells, 2)
+        :param action: the last one, shape (len(parameters),) or (cells, len(parameters))
+        :param logarithms: as of :attr:`logarithms`
+        """
+        self._estimate[:], self._action[:] = estimate, action
+        if self._fit is not None:
+            self._fit.logarithms[:] = logarithms
+        self._explain()
+
+    @property
+    def logarithms(self) -> FloatArray:
+        """
+        The logarithms of the factors by which the fit in the observation multiplies ``UNCERTAIN_CONSTANTS``, 0 without one,
+        shape (cells, 4); a new array each time.
+        """
+        return np.zeros((self.cells, len(UNCERTAIN_CONSTANTS))) if self._fit is None else self._fit.logarithms.copy()
+
+    def observation(self) -> NDArray[np.float32]:
+        """
+        Residuals over the misfit, sensitivities and ohmic drops per ohm over the data so far; how large misfit, noise and
+        offset are; how long the discharge has lasted; and the estimate.
+        """
+        clipped = np.clip(np.concatenate(self._parts(), axis=1), -OBSERVATION_LIMIT, OBSERVATION_LIMIT)
+        return clipped.astype(np.float32)
+
+    def _parts(self) -> list[FloatArray]:
+        residual_V, slope_V_per_C, ohmic_A = self._means
+        unexplained_V = residual_V - self._offset_V[:, None, None]
+        return [
+            (unexplained_V / (self._misfit_V + _MISFIT_FLOOR_V)[:, None, None]).reshape(self.cells, -1),
+            np.arcsinh(slope_V_per_C / _SLOPE_SCALE_V_PER_C).reshape(self.cells, -1),
+            (ohmic_A / _CURRENT_SCALE_A).reshape(self.cells, -1),
+            np.log((np.stack([self._misfit_V, self._rms_V], axis=1) + 0.1 * _MISFIT_FLOOR_V) / _MISFIT_SCALE_V),
+            np.arcsinh(residual_V.mean(axis=(1, 2)) / _MISFIT_SCALE_V)[:, None],
+            (self.count * (self.readings.interval_s / _TIME_SCALE_S))[:, None],
+            self._scaled(self._estimate),
+            *([self._action] if self.consistency > 0.0 else []),
+            *([] if self._fit is None else self._fit.parts(self._step, self._high - self._low)),
+        ]
+
+    def _scaled(self, estimate: FloatArray) -> FloatArray:
+        return np.asarray((2.0 * estimate[:, self._columns] - self._low - self._high) / (self._high - self._low))
+
+    def advance(self, action: NDArray[np.floating]) -> FloatArray:
+        """Move the estimates, let new readings arrive, and compare all data so far with the model."""
+        chosen = checked_action(action, self._action.shape)
+        step = np.clip(chosen, -1.0, 1.0)
+        moved = self._estimate[:, self._columns] + np.sign(step) * step**2 * self._step
+        self._estimate[:, self._columns] = np.clip(moved, self._low, self._high)
+        self._arrive()
+        self._explain()
+        cost = np.arcsinh(self._state_error() / _STATE_COST_SCALE if self._cost == "state" else self._misfit_V / _COST_SCALE_V)
+        cost += self.consistency * np.linalg.norm(step - self._action, axis=1)
+        self._action = step
+        return cost
+
+    def _state_error(self) -> FloatArray:
+        # relative: at a given current the charges are linear in q_mobile, and the ohmic drop is linear in r_o
+        return np.asarray(np.linalg.norm(self._estimate / self._known[self.discharge] - 1.0, axis=1))
+
+    def _arrive(self) -> None:
+        step = np.minimum(self._step_of_episode, self.episode_steps - 1)
+        arrived = self._every or self._arrivals[np.arange(self.cells), step]
+        self.count = np.minimum(self.count + arrived, self.readings.count[self.discharge])
+        self._step_of_episode += 1
+
+    def truncated(self) -> NDArray[np.bool_]:
+        """Whose episode is over. An episode goes on after the last reading: the estimate may still be moved."""
+        return np.asarray(self._step_of_episode >= self._last_step)
+
+    def report(self) -> dict[str, FloatArray]:
+        """Where each cell stands; true parameters are NaN for recorded discharges, ``voltage`` is the measured one."""
+        data, last = self.readings, self.count - 1
+        true_q_C = data.q_mobile[self.discharge]
+        return {
+            "q_mobile": true_q_C,
+            "r_o": data.r_o[self.discharge],
+            "q_mobile_hat": self._estimate[:, 0].copy(),
+            "r_o_hat": self._estimate[:, 1].copy(),
+            "voltage": self._shown[MEASURED, np.arange(self.cells), last],
+            "voltage_hat": self._last_V.copy(),
+            # a full cell holds q_mobile in its negative electrode
+            "soc": 1.0 - data.drawn_C[data.start[self.discharge] + last] / true_q_C,
+        }
