@@ -12,7 +12,8 @@ on the battery tasks, with calibrators that do not learn.
 
 Algorithms are those of the RL Zoo, LAC, and classes of your own; environments are all that are registered, or that importing
 the module before the colon registers. Hyperparameters and numbers of steps are those of ``zoo_configs``; with ``--defaults``,
-those of ``ALGO("MlpPolicy", env_id)``. What ``--hyperparams`` names differs from them.
+those of ``ALGO("MlpPolicy", env_id)``. What ``--hyperparams`` names differs from them: for all, or with the name of an
+algorithm or of an environment before it, as in ``sac.tau:0.02``, for that one.
 
 Policies of full-state tasks are scored on all held-out discharges, from exact starts and from starts that are off, beside the
 closed form; those of voltage-only tasks on the first 100, under two sensors, beside least squares and a Kalman filter that
@@ -36,6 +37,7 @@ import json
 import shutil
 import sys
 import tempfile
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -219,17 +221,21 @@ def _check(recipe: Recipe, out: Path) -> None:
             raise ValueError(f"{recipe.algo} on {recipe.env_id}: {error}") from error
 
 
-def _differing(settings: Sequence[str]) -> dict[str, Any]:
-    """Hyperparameters by name; what is no literal of Python is text, like ``lin_1e-3``."""
-    hyperparameters: dict[str, Any] = {}
+def _differing(settings: Sequence[str]) -> defaultdict[str, dict[str, Any]]:
+    """
+    Hyperparameters by name, of each algorithm or environment that is named before a dot, and under ``""`` of all; what is no
+    literal of Python is text, like ``lin_1e-3``.
+    """
+    hyperparameters: defaultdict[str, dict[str, Any]] = defaultdict(dict)
     for setting in settings:
-        name, _, value = setting.partition(":")
+        before, _, value = setting.partition(":")
+        whose, _, name = before.rpartition(".")
         if not name or not value:
             raise ValueError(f"--hyperparams takes NAME:VALUE, like n_envs:1, got {setting}")
         try:
-            hyperparameters[name] = ast.literal_eval(value)
+            hyperparameters[whose][name] = ast.literal_eval(value)
         except (ValueError, SyntaxError):
-            hyperparameters[name] = value
+            hyperparameters[whose][name] = value
     return hyperparameters
 
 
@@ -250,17 +256,28 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--defaults", action="store_true", help="the algorithms' own hyperparameters and one environment, not zoo_configs"
     )
     parser.add_argument(
-        "--hyperparams", nargs="+", metavar="NAME:VALUE", default=[], help="what differs, like learning_rate:lin_1e-3"
+        "--hyperparams",
+        nargs="+",
+        metavar="NAME:VALUE",
+        default=[],
+        help="what differs, like learning_rate:lin_1e-3, or sac.tau:0.02 for one algorithm or environment",
     )
     parser.add_argument("--evaluations", type=positive, default=10, help="evaluations and checkpoints during each run")
     study = Study(parser, arguments)
     chosen = study.chosen
     given = {"timesteps": chosen.timesteps, "defaults": chosen.defaults, "evaluations": chosen.evaluations}
     try:
-        given["hyperparameters"] = _differing(chosen.hyperparams)
+        differing = _differing(chosen.hyperparams)
         finished_runs(study.out)
+        names = {name: name.rpartition(":")[2] for name in (*chosen.envs, *chosen.algos)}
+        if unknown := differing.keys() - {"", *names.values()}:
+            raise ValueError(f"--hyperparams has some of {', '.join(sorted(unknown))}, which is not compared")
+        differ = {
+            (algo, env_id): {**differing[""], **differing[names[env_id]], **differing[names[algo]]}
+            for algo, env_id in itertools.product(chosen.algos, chosen.envs)
+        }
         recipes = [
-            [Recipe.of(algo, env_id, seed, **given) for algo in chosen.algos]
+            [Recipe.of(algo, env_id, seed, hyperparameters=differ[algo, env_id], **given) for algo in chosen.algos]
             for env_id, seed in itertools.product(chosen.envs, chosen.seeds)
         ]
         for recipe in {recipe.digest: recipe for of_seed in recipes for recipe in of_seed}.values():

@@ -313,6 +313,7 @@ class Episodes(Contest):
                 "environment": self.env_id,
                 **_who(str(label), group, learned=True),
                 "cost of an episode": with_spread(group["cost"]),
+                "return, interquartile mean": with_interval(-group["cost"]),
                 "worst episode": digits(group["cost_worst"].max()),
                 "steps of an episode": with_spread(group["length"]),
                 "training (min)": f"{group['training_minutes'].mean():.1f}",

@@ -152,7 +152,7 @@ def test_a_finished_run_stands_for_its_own_recipe_only(tmp_path, finished, capsy
     assert len(finished) == 1
     before = recipe().digest
     (tmp_path / "zoo_configs" / "lac.yml").write_text(CONFIG.replace("batch_size: 16", "batch_size: 32"))
-    differing = ["--hyperparams", "learning_rate:lin_1e-3", "n_envs:2"]
+    differing = ["--hyperparams", "lac.n_envs:2", "n_envs:1", "learning_rate:1e-3", f"{ENV_ID}.learning_rate:lin_1e-3"]
     for changed in ([], differing, ["--timesteps", "500"], ["--defaults", "--timesteps", "300"], ["--evaluations", "1"]):
         compare.main([*command("--algos", "lac"), *changed])
     assert len(finished) == 6
@@ -325,6 +325,7 @@ def test_algorithms_of_the_zoo_and_ones_own_are_compared_in_any_environment(tmp_
         (["--seeds", "-1"], "must be a whole number of at least 0, got -1"),
         (["--seeds", str(2**32)], "a seed must lie within 0 .. 2**32 - 1, got 4294967296"),
         (["--hyperparams", "n_envs=1"], "--hyperparams takes NAME:VALUE, like n_envs:1, got n_envs=1"),
+        (["--hyperparams", "tqc.n_envs:1"], "--hyperparams has some of tqc, which is not compared"),
         (["--hyperparams", "n_env:1"], "lac on BatteryRo-v0: LAC.__init__() got an unexpected keyword argument 'n_env'"),
         (["--hyperparams", "gamma:2"], "lac on BatteryRo-v0: gamma=2.0 must lie within 0 .. 1"),
         (["--timesteps", "40"], "starts to learn after 40 steps (learning_starts): timesteps=40 must be more"),

@@ -131,7 +131,7 @@ def test_sections_of_performance_are_written(tmp_path, capsys):
     short = ["--rounds", "2", "--updates", "1", "--cells", "2", "--threads", "1"]
     performance.main([*short, "--out", str(tmp_path)])
     assert {path.stem for path in tmp_path.iterdir()} == set(performance.SECTIONS)
-    assert pd.read_csv(tmp_path / "updates.csv").shape == (2, 10)
+    assert pd.read_csv(tmp_path / "updates.csv").shape == (2, 12)
     growth = pd.read_csv(tmp_path / "growth.csv")
     assert growth.groupby("over")["value"].unique().map(list).to_dict() == {"batch": [8, 16], "cells": [1, 2], "width": [4, 8]}
     shown = capsys.readouterr().out
