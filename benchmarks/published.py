@@ -10,8 +10,8 @@ gene network, and what impulses, other parameters, noise and other references do
 Settings are those of the authors' code, with ``alpha3 = 1`` and the horizon of 5 of the paper: one environment, 80 updates
 every 100 steps, rates of 1e-4 (actor) and 3e-4 (critics) that fall to zero, time limits that are ends. SAC has the same, with
 as many updates (their code makes 50) and the hidden layers of LAC's networks. Their cart and pole has a million steps.
-Policies are trained without disturbances and judged by their mean action. ``lac_inf`` is LAC with the
-discounted sum of all costs. What is done is not done again when the command is repeated, so that seeds can be added.
+Policies are trained without disturbances and judged by their mean action. ``lac_inf`` is LAC with the discounted sum of all
+costs. What is done is not done again when the command is repeated, so that seeds can be added.
 """
 
 from __future__ import annotations
