@@ -39,15 +39,15 @@ def test_settings_are_those_of_the_paper_and_rates_fall_apart(policy, tmp_path):
     recipe = published.contender(policy, "Oscillator-v0").recipe("Oscillator-v0", 0, 1400)
     _, model = set_up(recipe, tmp_path)
     model.learn(1400)
-    # a rate is set before an update, the last one with a fourteenth of the training to go
-    rates = [optimizer.param_groups[0]["lr"] for optimizer in (model.actor.optimizer, model.critic.optimizer)]
-    np.testing.assert_allclose(rates, np.array([1e-4, 3e-4]) * model._current_progress_remaining)
     assert model._n_updates == 320 and (model.gamma, model.tau, model.batch_size) == (0.995, 0.005, 256)
     assert model.ent_coef == {"lac": "auto_2", "sac": "auto_1.0"}[policy]
     # episodes end with a step that costs more than 100
     ends = model.replay_buffer.dones[:1400].ravel() > 0
     np.testing.assert_array_equal(ends, model.replay_buffer.rewards[:1400].ravel() < -100)
     assert ends.any() and not model.replay_buffer.timeouts.any()
+    model._current_progress_remaining = 0.5
+    model.train(1, model.batch_size)
+    assert [optimizer.param_groups[0]["lr"] for optimizer in (model.actor.optimizer, model.critic.optimizer)] == [5e-5, 1.5e-4]
 
 
 def test_two_rates_are_kept_in_files(tmp_path):
