@@ -18,7 +18,7 @@ done is not done again when the command is repeated, so that seeds can be added.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -234,15 +234,23 @@ def undisturbed_table(results: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def disturbed_table(results: pd.DataFrame) -> pd.DataFrame:
-    """What each disturbance does."""
+def disturbed_table(results: pd.DataFrame, cell: Callable[[pd.DataFrame], str]) -> pd.DataFrame:
+    """What each disturbance does, as one cell says of all tries of a policy."""
     rows = []
     for (env_id, policy), group in results.groupby(["environment", "policy"], sort=False):
-        row: dict[str, Any] = {"environment": env_id, "policy": policy}
-        for condition, tries in group.groupby("disturbance", sort=False):
-            row[str(condition)] = f"{100 * tries['at_goal'].mean():.0f} % ({100 * tries['died'].mean():.0f} %)"
-        rows.append(row)
+        cells = {str(condition): cell(tries) for condition, tries in group.groupby("disturbance", sort=False)}
+        rows.append({"environment": env_id, "policy": policy, **cells})
     return pd.DataFrame(rows)
+
+
+def cost_of(tries: pd.DataFrame) -> str:
+    """Cost per step, interquartile mean over seeds."""
+    return digits(float(over_seeds(tries["cost"])[0]))
+
+
+def ends_of(tries: pd.DataFrame) -> str:
+    """Share of the episodes that end at the goal, and of those that die."""
+    return f"{100 * tries['at_goal'].mean():.0f} % ({100 * tries['died'].mean():.0f} %)"
 
 
 def certificate_table(certificates: pd.DataFrame) -> pd.DataFrame:
@@ -275,8 +283,10 @@ def report(tables: Tables) -> str:
             "Without disturbances. Costs and errors are interquartile means over seeds with 95 % intervals, shares of "
             "episodes are means (least to most of a seed):\n",
             markdown(undisturbed_table(results)),
+            "Cost per step with each disturbance, interquartile mean over seeds:\n",
+            markdown(disturbed_table(results, cost_of)),
             "Share of the episodes that end at the goal, and in brackets of those that die:\n",
-            markdown(disturbed_table(results)),
+            markdown(disturbed_table(results, ends_of)),
             "Certificates, of a function that is fitted to the policy's roll-outs, and of critics in LAC's metric:\n",
             markdown(certificate_table(tables["certificates"])),
         ]

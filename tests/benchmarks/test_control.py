@@ -269,8 +269,9 @@ def test_tables_of_stabilisation_count_episodes_and_seeds():
     row = stabilisation.undisturbed_table(pd.DataFrame(rows)).iloc[0]
     assert (row["cost per step"], row["at the goal"], row["died"]) == ("2 [1, 3]", "25 % (0 to 50)", "75 % (50 to 100)")
     assert (row["seeds"], row["updates"], row["within 0.1 %"]) == ("2", "10", "0 % (0 to 0)")
-    disturbed = stabilisation.disturbed_table(pd.DataFrame(rows)).iloc[0]
-    assert disturbed["none"] == disturbed["impulses"] == "25 % (75 %)"
+    for cell, expected in ((stabilisation.ends_of, "25 % (75 %)"), (stabilisation.cost_of, "2")):
+        disturbed = stabilisation.disturbed_table(pd.DataFrame(rows), cell).iloc[0]
+        assert disturbed["none"] == disturbed["impulses"] == expected
 
 
 def test_all_algorithms_have_the_same_budget():
