@@ -36,6 +36,7 @@ from sb3_lac.zoo import LACExperimentManager, find_config
 
 #: Environment steps with the algorithms' own hyperparameters, which name none.
 DEFAULTS_TIMESTEPS = 20_000
+_LABELS = {"published_lac": "LAC as published"}
 # arguments of algorithms that the recipe states elsewhere, or that change nothing but rounding
 _NOT_LEARNING = {"seed", "verbose", "device", "tensorboard_log", "stats_window_size", "compile_update", "_init_setup_model"}
 
@@ -140,7 +141,7 @@ class Recipe:
     @property
     def label(self) -> str:
         """What the policy is called in tables and figures."""
-        name = self.algo.rpartition(":")[2] if ":" in self.algo else self.algo.upper()
+        name = self.algo.rpartition(":")[2] if ":" in self.algo else _LABELS.get(self.algo, self.algo.upper())
         return name if self.source == "zoo_configs" else f"{name} {self.source}"
 
     @property
