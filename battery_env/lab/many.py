@@ -18,9 +18,11 @@ from typing import Any, NamedTuple
 import pandas as pd
 
 from battery_env.files import check_folder, replacing
-from battery_env.lab.calibrate import METHOD_NAMES, Calibration, Settings, calibrate, title_of
+from battery_env.lab.calibrate import calibrate
 from battery_env.lab.readers.discharges import Recording, read_recordings
 from battery_env.lab.readers.tables import BINARY_SUFFIXES, PACKED_SUFFIXES, TEXT_SUFFIXES, is_readable
+from battery_env.lab.report import METHOD_NAMES, Calibration, title_of
+from battery_env.lab.settings import Settings
 from battery_env.records.discharge import BUNDLED_CELLS, load_nasa_discharges
 
 _NASA_SUFFIX = ".mat"

@@ -32,9 +32,9 @@ from battery_env.estimators import (
     soc_from_rest,
 )
 from battery_env.estimators.estimator import OnlineEstimator
-from battery_env.lab.calibrate import Settings
 from battery_env.lab.calibrate import calibrate as calibration_of
 from battery_env.lab.command_line import NOT_SETTLED, REFUSED, SETTLED, calibrate
+from battery_env.lab.settings import Settings
 from battery_env.policies.estimator import PolicyEstimator
 from battery_env.policies.pretrained import pretrained_ids
 from battery_env.records import Stream

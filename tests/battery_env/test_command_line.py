@@ -18,9 +18,10 @@ from battery_env.electrochemistry import NEW_CELL, CellParameters, Trajectory, i
 from battery_env.estimators.cell_fit import fit_cell, read_cell
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.lab import many
-from battery_env.lab.calibrate import Calibration, Settings
 from battery_env.lab.calibrate import calibrate as calibrated
 from battery_env.lab.command_line import main
+from battery_env.lab.report import Calibration
+from battery_env.lab.settings import Settings
 from battery_env.policies.estimator import PolicyEstimator
 from battery_env.records.discharge import Discharge, load_nasa_discharges
 

@@ -8,7 +8,7 @@ import pytest
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate
 from battery_env.estimators import CellFit, Estimate, ExtendedKalmanFilter, LeastSquares, fit_cell
 from battery_env.estimators.diagnosis.conditions import Condition, Diagnosis
-from battery_env.lab.calibrate import METHODS, Settings
+from battery_env.lab.settings import METHODS, Settings
 from battery_env.records import expected_current
 from battery_env.records.discharge import Discharge, load_nasa_discharges
 from battery_env.records.model import RecordModel
