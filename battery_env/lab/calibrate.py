@@ -120,6 +120,8 @@ def _calibrated(discharge: Discharge, settings: Settings) -> Calibration:
         r_o_ohm=estimate.r_o,
         sd_r_o_ohm=estimate.sd_r_o,
         settled=estimate.settled,
+        settled_q_mobile=estimate.settled_q_mobile,
+        settled_r_o=estimate.settled_r_o,
         reason=estimate.reason,
         initial_soc=seen.start.soc,
         sd_initial_soc=seen.start.sd_soc,
@@ -174,7 +176,7 @@ def _estimate(seen: _Seen, settings: Settings) -> tuple[Estimate, Method]:
         if estimate.settled:
             break
     if reason := seen.start.reason or settings.other_load(mean_current_A(seen.record)):
-        estimate = replace(estimate, settled=False, reason=reason)
+        estimate = replace(estimate, settled_q_mobile=False, settled_r_o=False, reason=reason)
     return estimate, method
 
 

@@ -46,6 +46,8 @@ class Calibration:
     r_o_ohm: float = quantity("r_o", "ohm", 4)
     sd_r_o_ohm: float = quantity("sd", "ohm", 4)
     settled: bool = quantity("settled")
+    settled_q_mobile: bool = quantity("q_mobile")
+    settled_r_o: bool = quantity("r_o")
     reason: str = quantity("Not settled")
     initial_soc: float = quantity("charge at the start", "%", 1, 100.0)
     sd_initial_soc: float = quantity("sd", "%", 1, 100.0)
@@ -102,6 +104,18 @@ class Calibration:
         return self.shown(sd, with_unit=False) if sd in _HOW and not np.isnan(getattr(self, sd)) else ""
 
     @property
+    def settled_alone(self) -> str:
+        """The parameter that is settled though the other one, which was searched for as well, is not; empty if none is."""
+        if len(self.settings.parameters) < 2 or self.settled_q_mobile == self.settled_r_o:
+            return ""
+        return "q_mobile" if self.settled_q_mobile else "r_o"
+
+    @property
+    def state(self) -> str:
+        """What is settled, for readers."""
+        return "settled" if self.settled else f"only {self.settled_alone} settled" if self.settled_alone else "not settled"
+
+    @property
     def in_progress(self) -> bool:
         """Whether the record ends above the cut-off."""
         return bool(np.isnan(self.measured_eod_time_s))
@@ -142,7 +156,7 @@ def text_of(name: str, found: Calibration) -> str:
         lines.append(f"{line}   {remark}" if remark else line)
     if not found.settled:
         lines += ["", f"{_HOW['reason']['text']}: {found.reason}"]
-        if found.in_progress and found.settings.prior_q_mobile_C is None:
+        if found.in_progress and not found.settled_q_mobile and found.settings.prior_q_mobile_C is None:
             lines += [
                 "During a discharge give --prior with the q_mobile of an earlier one, or the earlier ones themselves:",
                 "battery-calibrate forecast FILE --life FOLDER",
@@ -157,7 +171,7 @@ def _told(found: Calibration) -> Iterator[tuple[str, str]]:
     for parameter, column in _COLUMN_OF.items():
         sd = f"sd {found.shown(f'sd_{column}')}" if found.sd_of(column) else "no sd stated"
         yield column, sd if parameter in found.settings.parameters else "held"
-    yield "settled", ""
+    yield "settled", f"only {found.settled_alone} is" if found.settled_alone else ""
     yield "drawn_Ah", _of_the_charge(found)
     if not np.isnan(found.nominal_Ah):
         yield "state_of_health", _of_the_health(found)
@@ -206,7 +220,7 @@ def line_of(name: str, found: Calibration) -> str:
         if not np.isnan(getattr(found, column)):
             sd, label = found.sd_of(column), _HOW[column]["text"].split()[-1]
             parts.append(f"{label} {found.shown(column, digits):>{width}}" + (f" sd {sd:>3}" if sd else ""))
-    return f"{name:<18} " + "  ".join([*parts, "settled" if found.settled else f"not settled: {found.reason}"])
+    return f"{name:<18} " + "  ".join([*parts, f"{found.state}: {found.reason}".removesuffix(": ")])
 
 
 def title_of(name: str, found: Calibration) -> str:
@@ -217,6 +231,5 @@ def title_of(name: str, found: Calibration) -> str:
         # a policy states none
         value = found.shown(column).replace("ohm", r"$\Omega$")
         parts.append(f"{PARAMETERS[parameter].symbol} {value}" + ("" if found.method == "policy" else spread))
-    state = "settled" if found.settled else "not settled"
     rmse = f"RMSE {found.shown('voltage_rmse_V', 0)}"
-    return f"{name}: {state}\n" + ", ".join([*parts, f"{found.shown('drawn_Ah')} drawn", rmse])
+    return f"{name}: {found.state}\n" + ", ".join([*parts, f"{found.shown('drawn_Ah')} drawn", rmse])

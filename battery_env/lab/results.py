@@ -15,6 +15,9 @@ from battery_env.files import check_folder, replacing
 from battery_env.lab.report import METHOD_NAMES, Calibration, title_of
 from battery_env.lab.sources import TABLES, VOLTAGE, Source, record_name
 
+# Discharges that could not be used have no values there.
+_TYPES = {"cycle": "Int64", "settled": "boolean", "settled_q_mobile": "boolean", "settled_r_o": "boolean"}
+
 
 class Results:
     """The files that results are written to, refused if they are there already and may not be replaced."""
@@ -52,8 +55,7 @@ class Results:
 
     def write_table(self, outcomes: Sequence[Outcome]) -> list[Path]:
         """Write the table of all discharges and, if several are whole, the figure of their parameters over them."""
-        table = pd.DataFrame([each.row() for each in outcomes]).astype({"cycle": "Int64"})
-        table["settled"] = table["settled"].astype("boolean")
+        table = pd.DataFrame([each.row() for each in outcomes]).astype(_TYPES)
         with replacing(self.table) as part:
             table.to_csv(part, index=False)
         written = [self.table]
