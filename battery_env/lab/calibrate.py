@@ -89,14 +89,15 @@ class _Seen(NamedTuple):
     discharge: Discharge  # all of it
     loaded: Discharge
     record: Discharge  # the same, of few samples
+    fitted: Discharge  # the same, with the temperature that counts
     averaged_over_s: float
-    eod_time_s: float  # NaN: in progress
-    more_C: float  # drawn after that
+    eod_time_s: float
+    in_progress: bool
+    more_C: float  # drawn after the end
     cell: CellParameters
     start: Start
     load: ExpectedCurrent
     future: ExpectedCurrent
-    in_progress: bool
 
 
 def _calibrated(discharge: Discharge, settings: Settings) -> Calibration:
@@ -153,14 +154,22 @@ def _look_at(discharge: Discharge, settings: Settings) -> _Seen:
     """The part under load, how it starts, and what comes after it."""
     loaded, eod_time_s = discharge.loaded_part(settings.cut_off_V), discharge.eod_time_s(settings.cut_off_V)
     more_C = _charge_after(discharge, loaded, eod_time_s, settings.cut_off_V)
-    record, averaged_over_s = _of_few_samples(loaded)
-    cell = _cell_at_the_temperature(record, settings)
-    discharge = _with_the_temperature_that_counts(discharge, settings)
-    start = _start(discharge, settings, cell)
+    record, over_s = loaded, 0.0
+    if len(loaded.time_s) > _MANY_SAMPLES:
+        over_s = max(_MODEL_STEP_S, float(loaded.time_s[-1] - loaded.time_s[0]) / _MANY_SAMPLES)
+        record = loaded.averaged(over_s)
+    cell, fitted = _cell_at_the_temperature(record, settings), record
+    if settings.ambient_C is not None or not settings.thermal:
+        # one that is stated, or held, counts more than one that was measured
+        discharge, fitted = discharge.without_temperature(), record.without_temperature()
+    if settings.initial_soc == "rest":
+        start = soc_from_rest(discharge, cell, settings.mismatch_V)
+    else:
+        start = Start(*check_initial_soc(settings.initial_soc))
     load, stated_A = expected_current(record.time_s, record.current_A), settings.future_current_A
     future = load if stated_A is None else ExpectedCurrent(stated_A, varied=False, sd_A=0.0)
     in_progress = bool(np.isnan(eod_time_s))
-    return _Seen(discharge, loaded, record, averaged_over_s, eod_time_s, more_C, cell, start, load, future, in_progress)
+    return _Seen(discharge, loaded, record, fitted, over_s, eod_time_s, in_progress, more_C, cell, start, load, future)
 
 
 def _estimate(seen: _Seen, settings: Settings) -> tuple[Estimate, Method]:
@@ -171,8 +180,7 @@ def _estimate(seen: _Seen, settings: Settings) -> tuple[Estimate, Method]:
     if settings.method is None and seen.in_progress and not seen.load.varied and is_new:
         methods.append("kalman")
     for method in methods:
-        calibrator = replace(settings, method=method).calibrator(seen.cell, seen.start)
-        estimate = calibrator.estimate(_with_the_temperature_that_counts(seen.record, settings))
+        estimate = replace(settings, method=method).calibrator(seen.cell, seen.start).estimate(seen.fitted)
         if estimate.settled:
             break
     if reason := seen.start.reason or settings.other_load(mean_current_A(seen.record)):
@@ -191,21 +199,6 @@ def _charge(seen: _Seen, settings: Settings, q_mobile: float, remaining_s: float
     }
 
 
-def _of_few_samples(record: Discharge) -> tuple[Discharge, float]:
-    """A record of more than 100,000 samples is averaged over the step of the model or longer; over how long, s."""
-    if len(record.time_s) <= _MANY_SAMPLES:
-        return record, 0.0
-    stretch_s = max(_MODEL_STEP_S, float(record.time_s[-1] - record.time_s[0]) / _MANY_SAMPLES)
-    return record.averaged(stretch_s), stretch_s
-
-
-def _with_the_temperature_that_counts(record: Discharge, settings: Settings) -> Discharge:
-    """A temperature that is stated, or held, counts more than one that was measured."""
-    if settings.ambient_C is None and settings.thermal:
-        return record
-    return record.without_temperature()
-
-
 def _cell_at_the_temperature(record: Discharge, settings: Settings) -> CellParameters:
     """The constants of the model in the surroundings that are stated, measured at load-on, or known of the record."""
     cell, ambient_C = settings.cell or NEW_CELL, settings.ambient_C
@@ -216,13 +209,6 @@ def _cell_at_the_temperature(record: Discharge, settings: Settings) -> CellParam
     if ambient_C is None or settings.method == "policy":
         return cell
     return cell.replace(Tb0=float(ambient_C) + ZERO_CELSIUS_K)
-
-
-def _start(discharge: Discharge, settings: Settings, cell: CellParameters) -> Start:
-    """The state of charge that a discharge starts with: stated, or told from its rest."""
-    if settings.initial_soc == "rest":
-        return soc_from_rest(discharge, cell, settings.mismatch_V)
-    return Start(*check_initial_soc(settings.initial_soc))
 
 
 def _charge_after(discharge: Discharge, loaded: Discharge, eod_time_s: float, cut_off_V: float) -> float:

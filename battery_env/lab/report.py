@@ -106,9 +106,8 @@ class Calibration:
     @property
     def settled_alone(self) -> str:
         """The parameter that is settled though the other one, which was searched for as well, is not; empty if none is."""
-        if len(self.settings.parameters) < 2 or self.settled_q_mobile == self.settled_r_o:
-            return ""
-        return "q_mobile" if self.settled_q_mobile else "r_o"
+        known = [name for name in self.settings.parameters if getattr(self, f"settled_{name}")]
+        return "" if self.settled else "".join(known)
 
     @property
     def state(self) -> str:

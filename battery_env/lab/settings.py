@@ -17,7 +17,7 @@ from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.parameters import PARAMETER_NAMES, check_parameters
 from battery_env.policies.estimator import PolicyEstimator
-from battery_env.policies.pretrained import policy_of_file, pretrained_policy
+from battery_env.policies.pretrained import policy_of_file
 from battery_env.records import CUT_OFF_V
 
 Method = Literal["least-squares", "kalman", "policy"]
@@ -28,11 +28,8 @@ METHODS: tuple[Method, ...] = get_args(Method)
 _SAME_LOAD = 1.25
 _AMBIENT_LIMITS_C = (-60.0, 100.0)
 # Policies that come with the package, by what they find.
-_PRETRAINED = {
-    frozenset({"q_mobile"}): "BatteryVoltageQmax-v0",
-    frozenset({"r_o"}): "BatteryVoltageRo-v0",
-    frozenset(PARAMETER_NAMES): "BatteryVoltageJoint-v0",
-}
+_PRETRAINED = {"q_mobile": "BatteryVoltageQmax-v0", "r_o": "BatteryVoltageRo-v0"}
+_PRETRAINED_JOINT = "BatteryVoltageJoint-v0"
 # What a policy cannot be told: it has learned on one model.
 _NOT_FOR_POLICIES = ("prior_q_mobile_C", "mismatch_V", "current_gain_sd", "ambient_C", "q_mobile_bounds_C", "initial_soc")
 
@@ -175,24 +172,19 @@ class Settings:
 
     def _policy(self) -> PolicyEstimator:
         if self.policy is None:
-            env_id = _PRETRAINED[frozenset(check_parameters(self.parameters))]
-            policy, options = pretrained_policy(env_id, recorded=True)
-        else:
-            policy, options = policy_of_file(self.policy)
-            env_id = policy.env_id
-            if options.get("cell") != self.cell:
-                raise ValueError(
-                    f"{self.policy} has learned on "
-                    + (
-                        "the constants of a cell, which are others: give its cell (--cell)"
-                        if "cell" in options
-                        else "a new 18650, or the file beside it does not say on which constants ('cell' of its 'options')"
-                    )
-                )
-        estimator = PolicyEstimator(policy, env_id, **options)
+            names = check_parameters(self.parameters)
+            env_id = _PRETRAINED_JOINT if len(names) > 1 else _PRETRAINED[names[0]]
+            return PolicyEstimator.pretrained(env_id, recorded=True)
+        policy, options = policy_of_file(self.policy)
+        if options.get("cell") != self.cell:
+            learned = "a new 18650, or the file beside it does not say on which constants ('cell' of its 'options')"
+            if "cell" in options:
+                learned = "the constants of a cell, which are others: give its cell (--cell)"
+            raise ValueError(f"{self.policy} has learned on {learned}")
+        estimator = PolicyEstimator(policy, policy.env_id, **options)
         if set(estimator.parameters) != set(self.parameters):
             asked, found = " and ".join(self.parameters), " and ".join(estimator.parameters)
-            raise ValueError(f"{self.policy} is a policy of {env_id}, which finds {found}, not {asked}")
+            raise ValueError(f"{self.policy} is a policy of {policy.env_id}, which finds {found}, not {asked}")
         return estimator
 
     @property
