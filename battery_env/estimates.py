@@ -38,9 +38,11 @@ class Estimate:
     settled_r_o: bool = True
 
     def __post_init__(self) -> None:
-        both = self.settled_q_mobile and self.settled_r_o
-        for name in ("settled_q_mobile", "settled_r_o") if both else ("settled",):
-            object.__setattr__(self, name, self.settled and both)
+        if not (self.settled_q_mobile and self.settled_r_o):
+            object.__setattr__(self, "settled", False)
+        elif not self.settled:
+            object.__setattr__(self, "settled_q_mobile", False)
+            object.__setattr__(self, "settled_r_o", False)
 
 
 _COLUMNS = ("q_mobile", "r_o", "sd_q_mobile", "sd_r_o", "settled_q_mobile", "settled_r_o")

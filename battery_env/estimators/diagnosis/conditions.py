@@ -196,10 +196,11 @@ class Verdict(NamedTuple):
         :param said: the text of a condition
         :return: the verdict
         """
-        of_q_mobile, of_r_o = (Condition.numbered(number) for number in first)
-        rows = dict.fromkeys((of_r_o, of_q_mobile) if r_o_comes_first else (of_q_mobile, of_r_o))
-        reason = " ".join(filter(None, map(said, rows)))
-        return cls(of_q_mobile == Condition.SETTLED, of_r_o == Condition.SETTLED, reason)
+        rows = [
+            number for number in dict.fromkeys(reversed(first) if r_o_comes_first else first) if number != Condition.SETTLED
+        ]
+        reason = " ".join(said(Condition.numbered(number)) for number in rows)
+        return cls(first[0] == Condition.SETTLED, first[1] == Condition.SETTLED, reason)
 
 
 class Diagnosis:

@@ -217,7 +217,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
         sample = np.array([[(voltage_V, current_A, dt_s, temperature_K)]], dtype=SAMPLE)
         said = self._follow(self._cells, self._filters, sample)[0, 0]
         shown = measured(self._cells["seen"][0], self.initial_soc[0])
-        verdict = _verdict(said["condition"], said["r_o_comes_first"], shown)
+        verdict = _verdict(said["condition"].tolist(), said["r_o_comes_first"], shown)
         return Estimate(float(said["q_mobile"]), float(said["r_o"]), *said["sd"].tolist(), **verdict._asdict())
 
     def _follow(self, cells: NDArray[np.void], filters: NDArray[np.void], samples: NDArray[np.void]) -> NDArray[np.void]:
