@@ -27,11 +27,13 @@ if TYPE_CHECKING:
         soc_from_rest,
     )
     from battery_env.evaluation import evaluate
-    from battery_env.lab.calibrate import Calibration, Settings, calibrate
+    from battery_env.lab.calibrate import calibrate
     from battery_env.lab.conversions import capacity_Ah, dc_resistance_ohm
     from battery_env.lab.forecast import Forecast, forecast
     from battery_env.lab.life import Life, track_life
     from battery_env.lab.readers.discharges import read_discharge_csv, read_discharges
+    from battery_env.lab.report import Calibration
+    from battery_env.lab.settings import Settings
     from battery_env.policies.estimator import PolicyEstimator
     from battery_env.policies.onnx import OnnxPolicy
     from battery_env.records.discharge import Discharge, load_nasa_discharges
@@ -49,11 +51,13 @@ _MODULES = {
         *("cramer_rao_bound", "fit_cell", "soc_from_rest"),
     ),
     "evaluation": ("evaluate",),
-    "lab.calibrate": ("Calibration", "Settings", "calibrate"),
+    "lab.calibrate": ("calibrate",),
     "lab.conversions": ("capacity_Ah", "dc_resistance_ohm"),
     "lab.forecast": ("Forecast", "forecast"),
     "lab.life": ("Life", "track_life"),
     "lab.readers.discharges": ("read_discharge_csv", "read_discharges"),
+    "lab.report": ("Calibration",),
+    "lab.settings": ("Settings",),
     "policies.estimator": ("PolicyEstimator",),
     "policies.onnx": ("OnnxPolicy",),
     "records.discharge": ("Discharge", "load_nasa_discharges"),

@@ -21,8 +21,11 @@ class Estimate:
     :param sd_q_mobile: its stated standard deviation, C; NaN if the calibrator states none
     :param sd_r_o: likewise, ohm
     :param settled: whether the data determine the estimate, and nothing in the record contradicts it: a fully charged cell
-        says nothing about ``q_mobile``, and a prior alone settles nothing
-    :param reason: why it is not settled, in a sentence or two; empty if it is
+        says nothing about ``q_mobile``, and a prior alone settles nothing. Both numbers are settled then
+    :param reason: why it is not settled, in a sentence or two, the largest doubt first; empty if it is
+    :param settled_q_mobile: whether ``q_mobile`` is settled, though ``r_o`` may not be; where ``settled`` is false and nothing
+        is said of either number, neither is
+    :param settled_r_o: likewise
     """
 
     q_mobile: float
@@ -31,9 +34,18 @@ class Estimate:
     sd_r_o: float = float("nan")
     settled: bool = True
     reason: str = ""
+    settled_q_mobile: bool = True
+    settled_r_o: bool = True
+
+    def __post_init__(self) -> None:
+        if not (self.settled_q_mobile and self.settled_r_o):
+            object.__setattr__(self, "settled", False)
+        elif not self.settled:
+            object.__setattr__(self, "settled_q_mobile", False)
+            object.__setattr__(self, "settled_r_o", False)
 
 
-_COLUMNS = ("q_mobile", "r_o", "sd_q_mobile", "sd_r_o", "settled")
+_COLUMNS = ("q_mobile", "r_o", "sd_q_mobile", "sd_r_o", "settled_q_mobile", "settled_r_o")
 
 
 class Estimates(Sequence[Estimate]):
@@ -44,12 +56,15 @@ class Estimates(Sequence[Estimate]):
     :ivar r_o: ohm
     :ivar sd_q_mobile: standard deviations, C
     :ivar sd_r_o: likewise, ohm
-    :ivar settled: whether each is settled
+    :ivar settled: whether both numbers of each are settled
+    :ivar settled_q_mobile: whether each ``q_mobile`` is
+    :ivar settled_r_o: likewise
     :param q_mobile: as above
     :param r_o: likewise
     :param sd_q_mobile: likewise
     :param sd_r_o: likewise
-    :param settled: likewise
+    :param settled_q_mobile: likewise
+    :param settled_r_o: likewise
     :param reason: of a cell by its number, why its estimate is not settled
     """
 
@@ -59,10 +74,13 @@ class Estimates(Sequence[Estimate]):
         r_o: FloatArray,
         sd_q_mobile: FloatArray,
         sd_r_o: FloatArray,
-        settled: BoolArray,
+        settled_q_mobile: BoolArray,
+        settled_r_o: BoolArray,
         reason: Callable[[int], str],
     ) -> None:
-        self.q_mobile, self.r_o, self.sd_q_mobile, self.sd_r_o, self.settled = q_mobile, r_o, sd_q_mobile, sd_r_o, settled
+        self.q_mobile, self.r_o, self.sd_q_mobile, self.sd_r_o = q_mobile, r_o, sd_q_mobile, sd_r_o
+        self.settled_q_mobile, self.settled_r_o = settled_q_mobile, settled_r_o
+        self.settled: BoolArray = settled_q_mobile & settled_r_o
         self._reason = reason
 
     def __len__(self) -> int:
@@ -78,8 +96,7 @@ class Estimates(Sequence[Estimate]):
         if isinstance(index, slice):
             return [self[n] for n in range(*index.indices(len(self)))]
         n = range(len(self))[index]
-        q_mobile, r_o, sd_q_mobile, sd_r_o = (float(getattr(self, name)[n]) for name in _COLUMNS[:4])
-        return Estimate(q_mobile, r_o, sd_q_mobile, sd_r_o, bool(self.settled[n]), self._reason(n))
+        return Estimate(**{name: getattr(self, name)[n].item() for name in _COLUMNS}, reason=self._reason(n))
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Sequence) and list(self) == list(other)
@@ -99,6 +116,8 @@ class EstimateTrace:
     :param sd_r_o: likewise, ohm
     :param settled: whether the calibrator takes each estimate for settled; ``None`` if it does not say
     :param reason: why each is not settled, strings, empty for those that are; ``None`` if the calibrator does not say
+    :param settled_q_mobile: whether it takes each ``q_mobile`` for settled; ``None`` if it does not say
+    :param settled_r_o: likewise
     """
 
     time_s: FloatArray
@@ -108,6 +127,8 @@ class EstimateTrace:
     sd_r_o: FloatArray | None = None
     settled: BoolArray | None = None
     reason: StringArray | None = None
+    settled_q_mobile: BoolArray | None = None
+    settled_r_o: BoolArray | None = None
 
     @classmethod
     def of(cls, time_s: Sequence[float] | FloatArray, estimates: Sequence[Estimate]) -> EstimateTrace:
@@ -118,19 +139,12 @@ class EstimateTrace:
         :param estimates: as many
         :return: the trace
         """
-        columns = {name: np.array([getattr(estimate, name) for estimate in estimates]) for name in _COLUMNS}
+        names = (*_COLUMNS, "settled")
+        columns = {name: np.array([getattr(estimate, name) for estimate in estimates]) for name in names}
         return cls(np.array(time_s), **columns, reason=np.array([estimate.reason for estimate in estimates], dtype=object))
 
 
 def last_estimate(trace: EstimateTrace) -> Estimate:
     """The last estimate of a trace that states uncertainties and what is settled."""
-    assert trace.sd_q_mobile is not None and trace.sd_r_o is not None
-    assert trace.settled is not None and trace.reason is not None
-    return Estimate(
-        q_mobile=float(trace.q_mobile[-1]),
-        r_o=float(trace.r_o[-1]),
-        sd_q_mobile=float(trace.sd_q_mobile[-1]),
-        sd_r_o=float(trace.sd_r_o[-1]),
-        settled=bool(trace.settled[-1]),
-        reason=str(trace.reason[-1]),
-    )
+    assert trace.reason is not None
+    return Estimate(**{name: getattr(trace, name)[-1].item() for name in _COLUMNS}, reason=str(trace.reason[-1]))

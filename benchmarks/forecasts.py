@@ -26,10 +26,10 @@ from tqdm import tqdm
 
 from battery_env.electrochemistry import UNCERTAIN_CONSTANTS, simulate
 from battery_env.estimators.cell_fit import CellFit, fit_cell
-from battery_env.lab.calibrate import Settings
 from battery_env.lab.forecast import BAND
 from battery_env.lab.life import Life, track_life
 from battery_env.lab.running import forecast_end
+from battery_env.lab.settings import Settings
 from battery_env.loads import Load, RandomPiecewise, RandomWalk, constant
 from battery_env.plotting import coloured, new_figure
 from battery_env.records import Record, drawn

@@ -32,7 +32,7 @@ import battery_env
 import sb3_lac
 from battery_env.evaluation import over_seeds
 from battery_env.files import check_folder, replacing
-from battery_env.lab.many import workers
+from battery_env.lab.workers import workers
 from battery_env.plotting import new_figure, save_figure
 
 Result = TypeVar("Result")

@@ -46,7 +46,8 @@ class ClosedForm(Estimator):
         contradicted = abs(moved_C - drawn_C) > _CHARGE_SHARE * abs(moved_C)
         diagnosis.note(Condition.CHARGE_DIFFERS, contradicted, moved_C=moved_C, drawn_C=drawn_C)
         diagnosis.note(Condition.IMPLAUSIBLE, not is_plausible(q_mobile, self.cell))
-        return Estimate(q_mobile, r_o, settled=not diagnosis.reason, reason=diagnosis.reason)
+        values, sds = {"q_mobile": q_mobile, "r_o": r_o}, {"q_mobile": np.nan, "r_o": np.nan}
+        return Estimate(q_mobile, r_o, **diagnosis.verdict(values, sds)._asdict())
 
     def trace(self, records: Sequence[Trajectory]) -> list[EstimateTrace]:  # type: ignore[override]
         """

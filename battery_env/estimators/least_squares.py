@@ -22,6 +22,7 @@ from battery_env.estimators.diagnosis.conditions import (
     SPARE_SAMPLES,
     Condition,
     Diagnosis,
+    Verdict,
     is_plausible,
     white_noise_V,
 )
@@ -106,7 +107,8 @@ class LeastSquares(Estimator):
     - a prior is within 2.5 standard deviations of what the record says;
     - if no noise is stated, there are at least 10 samples more than parameters.
 
-    Otherwise ``reason`` of the estimate says which of these does not hold. In particular an estimate that rests on a prior is
+    Otherwise ``reason`` of the estimate says which of these does not hold, the largest doubt first, and ``settled_q_mobile``
+    or ``settled_r_o`` whether one of the numbers is settled all the same. In particular an estimate that rests on a prior is
     not settled: it is as good as the prior.
 
     *Nuisance constants.* Constants that are not known exactly can be estimated along with the parameters, each under a prior
@@ -223,10 +225,8 @@ class LeastSquares(Estimator):
             search = search.until_empty()
             starts = search.starts([self.model.cell.q_mobile])[0]
         found = self._fitted(record, search, starts)
-        sd = found.sd(found.fit)
-        reason = self._diagnosis(record, rested, found).reason
-        values = found.fit.values
-        return Estimate(values["q_mobile"], values["r_o"], sd["q_mobile"], sd["r_o"], not reason, reason)
+        sd, values, verdict = found.sd(found.fit), found.fit.values, self._verdict(record, rested, found)
+        return Estimate(values["q_mobile"], values["r_o"], sd["q_mobile"], sd["r_o"], **verdict._asdict())
 
     def _fitted(self, record: Samples, search: Search, starts: list[dict[str, float]]) -> _Fitted:
         """The best fits with and without the prior, and what their standard deviations are made of."""
@@ -269,7 +269,7 @@ class LeastSquares(Estimator):
             for n, name in enumerate(self.parameters)
         }
 
-    def _diagnosis(self, record: Samples, rested: bool, found: _Fitted) -> Diagnosis:
+    def _verdict(self, record: Samples, rested: bool, found: _Fitted) -> Verdict:
         """What speaks against an estimate."""
         fit, alone, cell, diagnosis = found.fit, found.alone, self.model.cell, Diagnosis()
         n, free, (q_mobile, r_o) = len(fit.residual_V), self.parameters, (fit.values[name] for name in PARAMETER_NAMES)
@@ -296,7 +296,7 @@ class LeastSquares(Estimator):
             scaled = found.hidden_sd[name] >= SETTLED_SHARES[name] * fit.values[name]
             diagnosis.note(Condition.Q_SCALE_UNKNOWN.of(name), scaled)
             diagnosis.note(Condition.Q_IMPRECISE.of(name))
-        return diagnosis
+        return diagnosis.verdict(alone.values, own)
 
 
 def _note_end(diagnosis: Diagnosis, record: Samples, found: _Fitted, deviation_V: float) -> None:

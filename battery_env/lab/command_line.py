@@ -30,8 +30,12 @@ import numpy as np
 from battery_env.estimators.cell_fit import CellFit, fit_cell, read_cell
 from battery_env.estimators.diagnosis.rest import InitialSoc
 from battery_env.files import check_new, finite_or_none
-from battery_env.lab.calibrate import METHODS, Settings, line_of, text_of
-from battery_env.lab.many import FileFormat, Outcome, Results, calibrate_all, find_sources, read_source, workers
+from battery_env.lab.many import calibrate_all
+from battery_env.lab.report import line_of, text_of
+from battery_env.lab.results import Outcome, Results
+from battery_env.lab.settings import METHODS, Settings
+from battery_env.lab.sources import FileFormat, find_sources, read_source
+from battery_env.lab.workers import workers
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.records import CUT_OFF_V
 from battery_env.records.discharge import Discharge

@@ -15,6 +15,7 @@ from battery_env.estimators.diagnosis.conditions import (
     SPARE_SAMPLES,
     Condition,
     Diagnosis,
+    Verdict,
     rest_voltage_V,
     start_measured,
 )
@@ -58,8 +59,8 @@ class Confidence:
         known = [name not in self._parameters for name in PARAMETER_NAMES]
         return np.where(known, np.nan, np.hypot(fitted.sd, fitted.estimate - estimate))
 
-    def reason(self, fitted: Fitted, n: int, estimate: FloatArray, sd: FloatArray, record: Samples, rested: bool) -> str:
-        """Why an estimate is not settled."""
+    def verdict(self, fitted: Fitted, n: int, estimate: FloatArray, sd: FloatArray, record: Samples, rested: bool) -> Verdict:
+        """Which numbers of an estimate are settled, and why not both."""
         diagnosis, cell, (q_mobile, r_o) = Diagnosis(), self._model.cell, estimate.tolist()
         readings, white_V, offset_V = int(fitted.readings[n]), float(fitted.white_V[n]), abs(float(fitted.offset_V[n]))
         first_V, full_V = float(record.voltage_V[0]), rest_voltage_V(cell)
@@ -82,7 +83,8 @@ class Confidence:
             diagnosis.note(Condition.Q_AT_BOUND.of(name), estimate[k] in ESTIMATE_RANGES[name])
             diagnosis.note(Condition.Q_DIFFERS.of(name), not differs[k] < share, differs=differs[k])
             diagnosis.note(Condition.Q_IMPRECISE.of(name), not sd[k] < share * estimate[k])
-        return diagnosis.reason
+        values, sds = (dict(zip(PARAMETER_NAMES, each.tolist(), strict=True)) for each in (estimate, sd))
+        return diagnosis.verdict(values, sds)
 
     def _is_sparse(self, time_s: FloatArray, readings: int) -> bool:
         """

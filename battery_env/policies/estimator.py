@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from battery_env.arrays import FloatArray
 from battery_env.electrochemistry import NEW_CELL, STATE_SIZE, UNCERTAIN_CONSTANTS
 from battery_env.estimates import last_estimate
-from battery_env.estimators.diagnosis.conditions import Condition
+from battery_env.estimators.diagnosis.conditions import Condition, Verdict
 from battery_env.estimators.estimator import SURPLUS_SHARE, Estimate, EstimateTrace, ModelNow, OnlineEstimator, Record
 from battery_env.policies.confidence import Confidence
 from battery_env.policies.pretrained import pretrained_policy
@@ -206,11 +206,11 @@ class PolicyEstimator(OnlineEstimator):
     def _judge(self) -> None:
         """Tell how sure the estimate is, of the samples up to the last decision."""
         self._sd = [nan, nan]
-        self._reason = Condition.NO_FIT.text if self._confidence is None else Condition.NOT_YET.text
+        self._verdict = Verdict(False, False, (Condition.NO_FIT if self._confidence is None else Condition.NOT_YET).text)
         if self._confidence is not None and self._fitted is not None:
             samples = self._readings.known(self._decisions * self.decision_s)
             (sd,) = self._confidence.standard_deviations(self._fitted, self._now[None])
-            self._reason = self._confidence.reason(self._fitted, 0, self._now, sd, samples, rested=False)
+            self._verdict = self._confidence.verdict(self._fitted, 0, self._now, sd, samples, rested=False)
             # the same NaN always, so that equal estimates are equal
             self._sd = [nan if isnan(each) else each for each in sd.tolist()]
 
@@ -246,8 +246,7 @@ class PolicyEstimator(OnlineEstimator):
         due = int(readings.time_s[-1] / self.decision_s + 1e-9)
         if due > self._decisions and due * self._every > 1:
             self._decide(due)
-        (q_mobile, r_o), (sd_q_mobile, sd_r_o) = self._now.tolist(), self._sd
-        return Estimate(q_mobile, r_o, sd_q_mobile, sd_r_o, not self._reason, self._reason)
+        return Estimate(*self._now.tolist(), *self._sd, **self._verdict._asdict())
 
     def _follow(self, records: Sequence[Record], every: int) -> CalibrationTask:
         # a data set may know its own constants, of which the policy must not learn
@@ -329,7 +328,7 @@ class PolicyEstimator(OnlineEstimator):
         task = self._follow(records, self._every)
         samples = [] if self._confidence is None else [(Samples.of(record), starts_at_rest(record)) for record in records]
         made: list[FloatArray] = []
-        reasons: list[str] = []
+        verdicts: list[Verdict] = []
         while (running := ~task.truncated()).any():
             (discharge, time_s), fitted = task.seen(), task.fitted()
             action, _ = self.policy.predict(task.observation(), deterministic=True)
@@ -342,15 +341,15 @@ class PolicyEstimator(OnlineEstimator):
                 for n in np.flatnonzero(running).tolist():
                     record, rested = samples[discharge[n]]
                     so_far = record.first(int(np.searchsorted(record.time_s, time_s[n], side="right")))
-                    reasons.append(self._confidence.reason(fitted, n, estimate[n], sd[n], so_far, rested))
+                    verdicts.append(self._confidence.verdict(fitted, n, estimate[n], sd[n], so_far, rested))
             made.append(np.concatenate(columns, axis=1)[running])
             task.drop_ended()
-        rows, texts = np.concatenate(made), np.array(reasons, dtype=object)
+        rows = np.concatenate(made)
         in_order = np.argsort(rows[:, 0], kind="stable")
         of_each = np.split(in_order, np.searchsorted(rows[in_order, 0], np.arange(1, len(records))))
         if self._confidence is None:
             return [EstimateTrace(rows[n, 1], rows[n, 2], rows[n, 3]) for n in of_each]
-        return [
-            EstimateTrace(rows[n, 1], rows[n, 2], rows[n, 3], rows[n, 4], rows[n, 5], texts[n] == "", texts[n])
-            for n in of_each
-        ]
+        settled_q, settled_r_o = np.array([each[:2] for each in verdicts]).T
+        texts = np.array([each.reason for each in verdicts], dtype=object)
+        said = (settled_q & settled_r_o, texts, settled_q, settled_r_o)
+        return [EstimateTrace(*rows[n, 1:4].T, *rows[n, 4:6].T, *(column[n] for column in said)) for n in of_each]

@@ -29,8 +29,9 @@ from battery_env.estimators.cell_fit import (
     read_cell,
     with_equilibrium,
 )
-from battery_env.lab.calibrate import METHODS, Settings, calibrate
+from battery_env.lab.calibrate import calibrate
 from battery_env.lab.running import forecast_end
+from battery_env.lab.settings import METHODS, Settings
 from battery_env.loads import constant as constant_load
 from battery_env.plotting import plot_cell_fit
 from battery_env.policies.pretrained import pretrained_card

@@ -18,9 +18,10 @@ from battery_env.electrochemistry import NEW_CELL, CellParameters, Trajectory, i
 from battery_env.estimators.cell_fit import fit_cell, read_cell
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.lab import many
-from battery_env.lab.calibrate import Calibration, Settings
 from battery_env.lab.calibrate import calibrate as calibrated
 from battery_env.lab.command_line import main
+from battery_env.lab.report import Calibration
+from battery_env.lab.settings import Settings
 from battery_env.policies.estimator import PolicyEstimator
 from battery_env.records.discharge import Discharge, load_nasa_discharges
 
@@ -171,6 +172,20 @@ def test_what_remains_of_a_discharge_in_progress_needs_a_prior_or_the_filter(rec
     filtered = terminal.row(path, "--method", "kalman", status=3)
     assert filtered["settled"] is False and filtered["measured_eod_time_s"] is None
     assert 1500.0 + filtered["remaining_s"] == pytest.approx(end_s, rel=0.2)
+
+
+def test_a_large_cell_at_1C_says_that_its_charge_is_known_though_its_resistance_is_not(tmp_path, terminal):
+    path = write(simulate(5.0, 18_000.0, 0.026, load_unit="current", thermal=True, cut_off_V=2.69), tmp_path / "large.csv")
+    row = terminal.row(path, status=3)
+    assert not row["settled"] and row["settled_q_mobile"] and not row["settled_r_o"]
+    assert row["q_mobile_C"] == pytest.approx(18_000.0, rel=0.01) and row["reason"].startswith("r_o is not known to 30 %")
+    shown = terminal.shows(path, "--out", tmp_path, status=3)
+    assert "no   only q_mobile is" in shown and "Not settled: r_o is not known to 30 %" in shown and "--prior" not in shown
+    (table,) = pd.read_csv(tmp_path / "large_estimate.csv").to_dict(orient="records")
+    assert table["settled_q_mobile"] and not table["settled_r_o"]
+    assert "only q_mobile settled: r_o is not" in repr(battery_env.calibrate(path)[0])
+    # what is held is not known by this record
+    assert "only" not in terminal.shows(path, "--parameters", "r_o", status=3)
 
 
 def test_a_load_that_varied_is_forecast_at_its_mean_and_that_is_said(tmp_path, terminal):

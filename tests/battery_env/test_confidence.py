@@ -60,7 +60,7 @@ def test_two_standard_deviations_cover_nineteen_of_twenty_estimates(mismatch, se
 def test_the_last_of_a_trace_is_the_estimate():
     estimate, trace = estimator().estimate(WHOLE), estimator().trace([WHOLE])[0]
     assert estimate.settled and estimate.q_mobile == pytest.approx(6000.0, rel=0.01)
-    for name in ("q_mobile", "r_o", "sd_q_mobile", "sd_r_o", "settled", "reason"):
+    for name in ("q_mobile", "r_o", "sd_q_mobile", "sd_r_o", "settled", "settled_q_mobile", "settled_r_o", "reason"):
         assert getattr(estimate, name) == getattr(trace, name)[-1]
     assert trace.sd_q_mobile[-1] < 0.05 * trace.sd_q_mobile[0] and not trace.settled[0]
     assert (trace.settled == (trace.reason == "")).all()

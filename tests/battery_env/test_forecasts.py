@@ -11,8 +11,8 @@ import pytest
 
 from battery_env import Estimate, RecordModel, forecast, initial_state, load_nasa_discharges, simulate, track_life
 from battery_env.__main__ import calibrate, main
-from battery_env.lab.calibrate import Settings
 from battery_env.lab.running import forecast_end, read_load
+from battery_env.lab.settings import Settings
 from battery_env.loads import BlockBootstrap, Cycle, Load, RandomPiecewise, constant, steadier_unit
 from battery_env.records import Samples, resample_current
 

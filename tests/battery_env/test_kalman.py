@@ -1,11 +1,12 @@
 """The Kalman filter: accurate, honest about its uncertainty, and hard to lose; and the interface of online calibrators."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 
 from battery_env.electrochemistry import simulate
+from battery_env.estimates import EstimateTrace
 from battery_env.estimators.diagnosis.conditions import SETTLED_SHARES
 from battery_env.estimators.estimator import OnlineEstimator
 from battery_env.estimators.kalman import ExtendedKalmanFilter
@@ -83,9 +84,10 @@ class TestUncertainty:
         (trace,) = ExtendedKalmanFilter().trace([measured()])
         assert trace.sd_q_mobile[10] > 0.1 * trace.q_mobile[10]
         assert not trace.settled[:60].any() and trace.settled[-1]
-        settled = trace.sd_q_mobile < SETTLED_SHARES["q_mobile"] * trace.q_mobile
-        settled &= trace.sd_r_o < SETTLED_SHARES["r_o"] * trace.r_o
-        np.testing.assert_array_equal(trace.settled, settled)
+        for name, share in SETTLED_SHARES.items():
+            is_known = getattr(trace, f"sd_{name}") < share * getattr(trace, name)
+            np.testing.assert_array_equal(getattr(trace, f"settled_{name}"), is_known)
+        np.testing.assert_array_equal(trace.settled, trace.settled_q_mobile & trace.settled_r_o)
 
 
 class TestGuards:
@@ -119,7 +121,7 @@ class TestOnline:
         filter_ = ExtendedKalmanFilter()
         batch, single = filter_.trace(records), OnlineEstimator.trace(filter_, records)
         for one, other in zip(batch, single, strict=True):
-            for name in ("time_s", "q_mobile", "r_o", "sd_q_mobile", "sd_r_o", "settled", "reason"):
+            for name in (field.name for field in fields(EstimateTrace)):
                 np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
         assert filter_.estimate(records[1]).q_mobile == batch[1].q_mobile[-1]
 

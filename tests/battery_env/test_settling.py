@@ -7,8 +7,8 @@ import pytest
 
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate
 from battery_env.estimators import CellFit, Estimate, ExtendedKalmanFilter, LeastSquares, fit_cell
-from battery_env.estimators.diagnosis.conditions import Condition, Diagnosis
-from battery_env.lab.calibrate import METHODS, Settings
+from battery_env.estimators.diagnosis.conditions import Condition, Diagnosis, is_only_imprecise
+from battery_env.lab.settings import METHODS, Settings
 from battery_env.records import expected_current
 from battery_env.records.discharge import Discharge, load_nasa_discharges
 from battery_env.records.model import RecordModel
@@ -146,25 +146,57 @@ VERDICTS = {
     ),
 }  # fmt: skip
 
+#: The number that is settled all the same.
+ALONE = {
+    "noise hides whether it was drawn": "r_o",
+    "switched meanwhile": "r_o",
+    "pulses meanwhile": "r_o",
+    "gain of the current": "r_o",
+    "charge at the start": "r_o",
+    "a small current": "q_mobile",
+    "its gain, for r_o": "q_mobile",
+}
+#: And of the filter, which takes less of the error of the model for common to the record.
+ALONE_FILTERED = {"prior of q_mobile": "r_o", "half a discharge": "r_o", "prior of r_o": "q_mobile"}
+
 
 @pytest.mark.parametrize(
-    ("name", "record", "arguments", "reason"),
-    [(name, *verdict[1:]) for verdict in VERDICTS.values() for name in verdict[0]],
+    ("case", "name", "record", "arguments", "reason"),
+    [(case, name, *verdict[1:]) for case, verdict in VERDICTS.items() for name in verdict[0]],
     ids=[f"{case}, {name}" for case, verdict in VERDICTS.items() for name in verdict[0]],
 )
-def test_each_reason_is_said_of_its_record(name, record, arguments, reason):
+def test_each_reason_is_said_of_its_record(case, name, record, arguments, reason):
     estimate = CALIBRATORS[name](**arguments).estimate(record)
     assert not estimate.settled and estimate.reason.startswith(reason), estimate.reason
+    settled = [each for each in ("q_mobile", "r_o") if getattr(estimate, f"settled_{each}")]
+    alone = ALONE | (ALONE_FILTERED if name == "filter" else {})
+    assert settled == [alone[case]] if case in alone else not settled
 
 
 def test_the_table_decides_what_is_said_first_whoever_notes_it():
-    diagnosis = Diagnosis()
-    assert diagnosis.reason == ""
+    diagnosis, values = Diagnosis(), {"q_mobile": 6000.0, "r_o": 0.1}
+    one_sd, six_sd = {"q_mobile": 240.0, "r_o": 0.06}, {"q_mobile": 240.0, "r_o": 0.18}
+    assert diagnosis.verdict(values, one_sd) == (True, True, "")
     diagnosis.note(Condition.Q_IMPRECISE.of("r_o"))
     diagnosis.note(Condition.MISFIT, False)
-    assert diagnosis.reason.startswith("r_o is not known to 30 %")
+    q_settled, r_o_settled, reason = diagnosis.verdict(values, one_sd)
+    assert q_settled and not r_o_settled and reason == Condition.R_IMPRECISE.text
+    # that of the number that is farther beyond its limit
+    diagnosis.note(Condition.Q_SCALE_UNKNOWN)
+    texts = [Condition.Q_SCALE_UNKNOWN.text, Condition.R_IMPRECISE.text]
+    assert diagnosis.verdict(values, one_sd) == (False, False, " ".join(texts))
+    assert diagnosis.verdict(values, six_sd).reason == " ".join(reversed(texts))
+    assert is_only_imprecise(" ".join(texts)) and is_only_imprecise(texts[0]) and not is_only_imprecise(f"{texts[0]} No.")
+    # one against both hides what is against one
     diagnosis.note(Condition.RISES, size=0.1, fault_s=60.0)
-    assert diagnosis.reason == "The voltage rises by 0.10 V at 60 s, where the current stays as it was."
+    rises = "The voltage rises by 0.10 V at 60 s, where the current stays as it was."
+    assert diagnosis.verdict(values, one_sd) == (False, False, rises)
+
+
+def test_what_speaks_against_both_numbers_comes_before_what_speaks_against_one():
+    *rows, settled = Condition
+    assert settled == Condition.SETTLED == len(rows) + 1
+    assert sorted(rows, key=lambda row: len(row.against), reverse=True) == rows
 
 
 NOISY_REST = discharged(1e-6 + pulsed(30, 60, 2.0, 0.0))

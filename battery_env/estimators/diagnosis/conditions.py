@@ -1,15 +1,17 @@
 """
 What speaks against an estimate: one table of conditions for least squares, the filter, policies and the closed form. Who makes
-an estimate notes which of them hold, and what was measured; the table has their order and their texts.
+an estimate notes which of them hold, and what was measured; the table has their order, their texts, and against which number
+each speaks.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from enum import IntEnum
 from functools import lru_cache
+from itertools import permutations
 from math import comb
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -57,18 +59,20 @@ _IMPRECISE_R = (
 
 class Condition(IntEnum):
     """
-    What speaks against an estimate, in the order in which it counts: the first row that holds is the reason. Braces name what
-    was measured. A row of ``q_mobile`` is followed by that of ``r_o``.
+    What speaks against an estimate, in the order in which it counts: of each number the first row that speaks against it is
+    the reason. Most speak against both numbers, and come before those against one. Braces name what was measured. A row of
+    ``q_mobile`` is followed by that of ``r_o``.
     """
 
-    def __new__(cls, text: str) -> Condition:
+    def __new__(cls, text: str, *against: str) -> Condition:
         number = len(cls.__members__) + 1
         member = int.__new__(cls, number)
         member._value_ = number
-        member.text = text
+        member.text, member.against = text, against or PARAMETER_NAMES
         return member
 
     text: str
+    against: tuple[str, ...]
 
     # a policy that states nothing
     NO_FIT = "A policy whose observation has no fit (option nuisance) states no uncertainty."
@@ -111,7 +115,6 @@ class Condition(IntEnum):
         "no current."
     )
     # what was given does not suffice
-    NO_CURRENT = "No current flows in the last step, so that r_o does not show."
     EMPTY = "The model cell is empty before the record ends: its q_mobile is too small for this record."
     FEW = "These are too few {of} to tell the noise. Record on or more often{or_else}."
     # the fit
@@ -139,21 +142,23 @@ class Condition(IntEnum):
         "{most_mV:.0f} mV at most."
     )
     CONSTANTS = "A constant of the cell is farther from the model's than the policy has learned of (option nuisance)."
-    Q_DIFFERS = _DIFFERS.format("q_mobile")
-    R_DIFFERS = _DIFFERS.format("r_o")
-    # what the record does not tell
     Q_PRIOR_WRONG = _PRIOR_WRONG.format("q_mobile")
     R_PRIOR_WRONG = _PRIOR_WRONG.format("r_o")
+    # what the record does not tell of one number
+    NO_CURRENT = "No current flows in the last step, so that r_o does not show.", "r_o"
+    Q_DIFFERS = _DIFFERS.format("q_mobile"), "q_mobile"
+    R_DIFFERS = _DIFFERS.format("r_o"), "r_o"
     GAP_UNSURE = (
         "No sample lies between {gap_start_s:.0f} s and {gap_end_s:.0f} s, and the voltage does not tell whether the load was "
-        "on: {gap_C:.0f} C are in doubt."
+        "on: {gap_C:.0f} C are in doubt.",
+        "q_mobile",
     )
-    Q_PRIOR_ALONE = _PRIOR_ALONE.format("q_mobile", _IMPRECISE_Q)
-    R_PRIOR_ALONE = _PRIOR_ALONE.format("r_o", _IMPRECISE_R)
-    Q_SCALE_UNKNOWN = _SCALE_UNKNOWN.format("q_mobile")
-    R_SCALE_UNKNOWN = _SCALE_UNKNOWN.format("r_o")
-    Q_IMPRECISE = _IMPRECISE_Q
-    R_IMPRECISE = _IMPRECISE_R
+    Q_PRIOR_ALONE = _PRIOR_ALONE.format("q_mobile", _IMPRECISE_Q), "q_mobile"
+    R_PRIOR_ALONE = _PRIOR_ALONE.format("r_o", _IMPRECISE_R), "r_o"
+    Q_SCALE_UNKNOWN = _SCALE_UNKNOWN.format("q_mobile"), "q_mobile"
+    R_SCALE_UNKNOWN = _SCALE_UNKNOWN.format("r_o"), "r_o"
+    Q_IMPRECISE = _IMPRECISE_Q, "q_mobile"
+    R_IMPRECISE = _IMPRECISE_R, "r_o"
     # none of these
     SETTLED = ""
 
@@ -174,6 +179,30 @@ class Condition(IntEnum):
 _ROWS = tuple(Condition)
 
 
+class Verdict(NamedTuple):
+    """Which numbers of an estimate are settled, and why not both, by the names of :class:`~battery_env.Estimate`."""
+
+    settled_q_mobile: bool
+    settled_r_o: bool
+    reason: str
+
+    @classmethod
+    def of(cls, first: Sequence[int], r_o_comes_first: bool, said: Callable[[Condition], str]) -> Verdict:
+        """
+        What follows from the first condition against each number.
+
+        :param first: these, ``SETTLED`` where there is none
+        :param r_o_comes_first: whether ``r_o`` is the larger doubt
+        :param said: the text of a condition
+        :return: the verdict
+        """
+        rows = [
+            number for number in dict.fromkeys(reversed(first) if r_o_comes_first else first) if number != Condition.SETTLED
+        ]
+        reason = " ".join(said(Condition.numbered(number)) for number in rows)
+        return cls(first[0] == Condition.SETTLED, first[1] == Condition.SETTLED, reason)
+
+
 class Diagnosis:
     """What speaks against one estimate: the conditions that hold, each with what was measured of it."""
 
@@ -185,16 +214,25 @@ class Diagnosis:
         if holds:
             self.measured.setdefault(condition, measured)
 
-    @property
-    def reason(self) -> str:
-        """Why the estimate is not settled; empty if nothing speaks against it."""
-        first = min(self.measured, default=Condition.SETTLED)
-        return first.said(self.measured.get(first, {}))
+    def verdict(self, values: Mapping[str, float], sds: Mapping[str, float]) -> Verdict:
+        """
+        Which numbers are settled, and why not both: first why not the one that is farther beyond its limit.
+
+        :param values: of the numbers, as the record alone has them
+        :param sds: their standard deviations, likewise
+        :return: the verdict
+        """
+        noted = [[row for row in self.measured if name in row.against] for name in PARAMETER_NAMES]
+        first = [min(rows, default=Condition.SETTLED) for rows in noted]
+        limit_q, limit_r_o = (SETTLED_SHARES[name] * values[name] for name in PARAMETER_NAMES)
+        r_o_comes_first = sds["r_o"] * limit_q > sds["q_mobile"] * limit_r_o
+        return Verdict.of(first, r_o_comes_first, lambda row: row.said(self.measured.get(row, {})))
 
 
 def is_only_imprecise(reason: str) -> bool:
     """Return whether an estimate is not settled by its precision alone: nothing in the record contradicts it."""
-    return reason in {row.text for row in Condition if Condition.Q_PRIOR_ALONE <= row < Condition.SETTLED}
+    texts = [row.text for row in Condition if Condition.Q_PRIOR_ALONE <= row < Condition.SETTLED]
+    return reason in {*texts, *map(" ".join, permutations(texts, 2))}
 
 
 def start_measured(first_V: float, rest_V: float, initial_soc: float = 1.0) -> dict[str, Any]:

@@ -39,6 +39,7 @@ from battery_env.estimators.diagnosis.conditions import (
 )
 from battery_env.estimators.diagnosis.samples import Row, start_condition
 from battery_env.estimators.kalman.state import FILTER, OFFSET, Q, R, Settings
+from battery_env.parameters import PARAMETER_NAMES
 
 #: Standard deviations. Innovations count in full within the gate. A filter whose successive innovations are correlated, whose
 #: estimate leaves the range that it stated, or whose offset is beyond the stated one, by more than the limit does not follow
@@ -58,6 +59,8 @@ _SAME_SHARE = 0.25
 # The data must have narrowed a prior by this share of its width before a deviation from it says anything.
 _LEAST_NARROWING = 0.2
 _SHARES = (SETTLED_SHARES["q_mobile"], SETTLED_SHARES["r_o"])
+# By number of a condition, which of both it speaks against.
+_AGAINST = np.array([[False, False], *([name in row.against for name in PARAMETER_NAMES] for row in Condition)])
 # The noise that innovations show is averaged over about this many samples.
 _NOISE_MEMORY = 32.0
 
@@ -305,9 +308,10 @@ def take(
 
 @_compiled
 def _note(estimate: Row, condition: int, holds: bool) -> None:
-    # the row of the table that comes first counts
-    if holds and condition < estimate.condition:
-        estimate.condition = condition
+    # of each number that it speaks against, the row of the table that comes first counts
+    for k in range(2):
+        if holds and _AGAINST[condition, k] and condition < estimate.condition[k]:
+            estimate.condition[k] = condition
 
 
 @_compiled
@@ -319,7 +323,7 @@ def conclude(cell: Row, settings: Settings, estimate: Row) -> None:
     doubt_C = seen.doubt_C + (seen.gap.charge_C if seen.gap.samples > 0.0 else 0.0)
     own_sd = (max(bank.sd[Q], common_sd_q), max(bank.sd[R], 0.0))
     estimate.q_mobile, estimate.r_o = bank.mean[Q], bank.mean[R]
-    estimate.condition = Condition.SETTLED + 0
+    estimate.condition[:] = Condition.SETTLED + 0
     start, fault = start_condition(seen, bank.mean[Q], bank.mean[R]), seen.fault.condition
     _note(estimate, start, start > 0)
     _note(estimate, fault, fault > 0)
@@ -328,13 +332,14 @@ def conclude(cell: Row, settings: Settings, estimate: Row) -> None:
     plausible = least * settings.cell_q_mobile < bank.mean[Q] < most * settings.cell_q_mobile
     _note(estimate, Condition.IMPLAUSIBLE, searched[Q] and not plausible)
     _note(estimate, Condition.MISFIT, bank.trend_sd > LIMIT_SD)
+    estimate.r_o_comes_first, beyond_q = False, 0.0
     for k in range(2):
         if not searched[k]:
             estimate.sd[k] = nan
             continue
         value, (low, high), (mean, prior_sd) = bank.mean[k], settings.bounds[k], settings.carried[k]
         sd = hypot(hypot(own_sd[k], settings.scale_sd[k] * value), doubt_C if k == Q else 0.0)
-        estimate.sd[k] = sd
+        estimate.sd[k], of_data = sd, sd
         _note(estimate, Condition.Q_AT_BOUND + k, not low + bank.sd[k] < value < high - bank.sd[k])
         if prior_sd > 0.0:
             narrowed = max(prior_sd**2 - bank.sd[k] ** 2, (_LEAST_NARROWING * prior_sd) ** 2)
@@ -347,3 +352,7 @@ def conclude(cell: Row, settings: Settings, estimate: Row) -> None:
             _note(estimate, Condition.GAP_UNSURE, k == Q and doubt_C > 0.0)
             _note(estimate, Condition.Q_SCALE_UNKNOWN + k, settings.scale_sd[k] >= _SHARES[k])
             _note(estimate, Condition.Q_IMPRECISE + k, True)
+        # in standard deviations that a settled one may have
+        beyond = max(sd, of_data) / (_SHARES[k] * value)
+        estimate.r_o_comes_first = k == R and beyond > beyond_q
+        beyond_q = beyond

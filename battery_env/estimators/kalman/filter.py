@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from math import inf, isnan, nan
 from typing import Any
@@ -15,7 +15,7 @@ from battery_env.checks import ZERO_CELSIUS_K, check_gain_sd, check_not_negative
 from battery_env.electrochemistry import STATE_SIZE, CellParameters, PackedConstants, check_cell, check_dt
 from battery_env.electrochemistry.tangents import PolynomialDerivatives
 from battery_env.estimates import Estimate, Estimates, EstimateTrace
-from battery_env.estimators.diagnosis.conditions import Condition, rest_voltage_V
+from battery_env.estimators.diagnosis.conditions import Condition, Verdict, rest_voltage_V
 from battery_env.estimators.diagnosis.rest import check_initial_soc
 from battery_env.estimators.diagnosis.samples import begin, examine, follow_gaps, measured, remember
 from battery_env.estimators.estimator import SURPLUS_SHARE, ModelNow, OnlineBatch, OnlineEstimator, check_bounds
@@ -78,8 +78,10 @@ class ExtendedKalmanFilter(OnlineEstimator):
     contradicts it: not the start of the record, the voltage where the load is switched, steady or not logged, a bound, the
     kind of cell, the prior, nor the innovations, which may not go the same way again and again, with twice ``mismatch_V``
     allowed for.
-    Otherwise ``reason`` of the estimate says which of these does not hold, the first one in the order of
-    :class:`~battery_env.estimators.diagnosis.Condition`. An estimate that rests on a prior is not settled: it is as good as
+    Otherwise ``reason`` of the estimate says which of these does not hold: of each number the first one in the order of
+    :class:`~battery_env.estimators.diagnosis.Condition`, and first that of the number that is farther beyond its limit. Of
+    a number that the data determine, while they do not determine the other one, ``settled_q_mobile`` or ``settled_r_o`` says
+    so. An estimate that rests on a prior is not settled: it is as good as
     the prior.
 
     The defaults are those of simulated records. For recorded cells take :func:`battery_env.calibrate`, or
@@ -214,9 +216,9 @@ class ExtendedKalmanFilter(OnlineEstimator):
                 self._begin(temperature_K)
         sample = np.array([[(voltage_V, current_A, dt_s, temperature_K)]], dtype=SAMPLE)
         said = self._follow(self._cells, self._filters, sample)[0, 0]
-        condition, (sd_q_mobile, sd_r_o) = Condition.numbered(said["condition"]), said["sd"].tolist()
-        text = condition.said(measured(self._cells["seen"][0], self.initial_soc[0]))
-        return Estimate(float(said["q_mobile"]), float(said["r_o"]), sd_q_mobile, sd_r_o, not text, text)
+        shown = measured(self._cells["seen"][0], self.initial_soc[0])
+        verdict = _verdict(said["condition"].tolist(), said["r_o_comes_first"], shown)
+        return Estimate(float(said["q_mobile"]), float(said["r_o"]), *said["sd"].tolist(), **verdict._asdict())
 
     def _follow(self, cells: NDArray[np.void], filters: NDArray[np.void], samples: NDArray[np.void]) -> NDArray[np.void]:
         """What filters of these rows estimate after samples, shape (samples, cells)."""
@@ -243,11 +245,13 @@ class ExtendedKalmanFilter(OnlineEstimator):
             check_drawn_charge(float(np.cumsum(np.append(0.0, current_A[:-1]) * dt_s).min()), self.least_drawn_C)
             said = self._follow(self._cells, self._filters, samples)[:, 0]
             shown = measured(self._cells["seen"][0], self.initial_soc[0], float(time_s[0]))
-            texts = {number: Condition.numbered(number).said(shown) for number in np.unique(said["condition"]).tolist()}
+            noted = list(zip(map(tuple, said["condition"].tolist()), said["r_o_comes_first"].tolist(), strict=True))
+            texts = {each: _verdict(*each, shown).reason for each in set(noted)}
             sd_q, sd_r_o = said["sd"].T.copy()
-            reasons = np.array([texts[number] for number in said["condition"].tolist()], dtype=object)
-            columns = (said["q_mobile"].copy(), said["r_o"].copy(), sd_q, sd_r_o, reasons == "", reasons)
-            traces.append(EstimateTrace(time_s, *columns))
+            settled_q, settled_r_o = (said["condition"] == Condition.SETTLED).T
+            reasons = np.array([texts[each] for each in noted], dtype=object)
+            columns = (said["q_mobile"].copy(), said["r_o"].copy(), sd_q, sd_r_o)
+            traces.append(EstimateTrace(time_s, *columns, settled_q & settled_r_o, reasons, settled_q, settled_r_o))
         self.reset()
         return traces
 
@@ -349,10 +353,15 @@ class KalmanBatch(OnlineBatch):
 
         def reason_of(n: int) -> str:
             of_cell = {name: column[n] for name, column in shown.items()}
-            return Condition.numbered(said["condition"][n]).said(measured(of_cell, one.initial_soc[0]))
+            texts = measured(of_cell, one.initial_soc[0])
+            return _verdict(said["condition"][n], said["r_o_comes_first"][n], texts).reason
 
-        settled = said["condition"] == Condition.SETTLED
-        return Estimates(said["q_mobile"], said["r_o"], sd_q_mobile, sd_r_o, settled, reason_of)
+        settled_q_mobile, settled_r_o = (said["condition"] == Condition.SETTLED).T
+        return Estimates(said["q_mobile"], said["r_o"], sd_q_mobile, sd_r_o, settled_q_mobile, settled_r_o, reason_of)
+
+
+def _verdict(first: Sequence[int], r_o_comes_first: bool, shown: Mapping[str, Any]) -> Verdict:
+    return Verdict.of(first, r_o_comes_first, lambda row: row.said(shown))
 
 
 def _checked_noise_V(voltage_noise_V: float | None, mismatch_V: float) -> float:

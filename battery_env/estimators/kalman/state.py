@@ -49,8 +49,9 @@ class Settings(NamedTuple):
 #: One sample of one cell.
 SAMPLE = table("voltage_V current_A dt_s temperature_K")
 
-#: What is said after a sample, with the :class:`~battery_env.estimators.diagnosis.Condition` that speaks first against it.
-ESTIMATE = table([("q_mobile", "f8"), ("r_o", "f8"), ("sd", "f8", 2), ("condition", "i8")])
+#: What is said after a sample, with the :class:`~battery_env.estimators.diagnosis.Condition` that speaks first against each
+#: number, and whether that against ``r_o`` is the larger doubt.
+ESTIMATE = table([("q_mobile", "f8"), ("r_o", "f8"), ("sd", "f8", 2), ("condition", "i8", 2), ("r_o_comes_first", "b1")])
 
 # Sums over the charge drawn, of the derivative of the voltage by q_mobile (V) and of products with that by r_o (V^2/C, V A,
 # A^2 C), and that charge (C)

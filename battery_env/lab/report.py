@@ -1,0 +1,234 @@
+"""What a discharge says: one table of columns, with their names, units and digits, from which each report follows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+
+from battery_env.lab.settings import Settings
+from battery_env.parameters import PARAMETERS
+from battery_env.records.discharge import Discharge
+from battery_env.records.model import VoltageForecast
+
+#: The methods, for readers of a figure.
+METHOD_NAMES = {"least-squares": "least squares", "kalman": "Kalman filter", "policy": "policy"}
+# Columns of the parameters.
+_COLUMN_OF = {name: f"{name}_{parameter.unit}" for name, parameter in PARAMETERS.items()}
+
+
+def quantity(text: str = "", unit: str = "", digits: int = 0, scale: float = 1.0, unknown: str = "nan") -> Any:
+    """
+    A column: its name for readers, of which a line has the last word, its unit, digits, and the scale to that unit, and what
+    stands for NaN.
+    """
+    return field(metadata={"text": text, "unit": unit, "digits": digits, "scale": scale, "unknown": unknown})
+
+
+@dataclass(frozen=True, repr=False)
+class Calibration:
+    """
+    What a discharge says. ``print`` shows it, :meth:`row` gives its columns, and a table of many is
+    ``pd.DataFrame(each.row() for each in found)``. Names of columns end with units; NaN stands for what is not known.
+
+    :param settings: how it was looked at
+    :param record: what was looked at; ``None`` where only the columns are kept
+    :param forecast: the voltage of the model at the estimate; likewise
+    """
+
+    settings: Settings = field(compare=False)
+    cycle: int | None = quantity("discharge")
+    method: str = quantity()
+    q_mobile_C: float = quantity("q_mobile", "C")
+    sd_q_mobile_C: float = quantity("sd", "C")
+    r_o_ohm: float = quantity("r_o", "ohm", 4)
+    sd_r_o_ohm: float = quantity("sd", "ohm", 4)
+    settled: bool = quantity("settled")
+    settled_q_mobile: bool = quantity("q_mobile")
+    settled_r_o: bool = quantity("r_o")
+    reason: str = quantity("Not settled")
+    initial_soc: float = quantity("charge at the start", "%", 1, 100.0)
+    sd_initial_soc: float = quantity("sd", "%", 1, 100.0)
+    samples: int = quantity("samples")
+    averaged_over_s: float = quantity("averaged over", "s")
+    load_on_time_s: float = quantity("load-on at", "s", 1)
+    drawn_Ah: float = quantity("drawn", "Ah", 3)
+    capacity_Ah: float = quantity("capacity", "Ah", 3)
+    predicted_capacity_Ah: float = quantity("predicted capacity", "Ah", 3)
+    sd_predicted_capacity_Ah: float = quantity("sd", "Ah", 3)
+    nominal_Ah: float = quantity("nominal capacity", "Ah", 3)
+    state_of_health: float = quantity("state of health", "", 3, unknown="not known")
+    sd_state_of_health: float = quantity("sd", "", 3)
+    voltage_rmse_V: float = quantity("voltage RMSE", "mV", 1, 1e3)
+    predicted_eod_time_s: float = quantity("{0.cut_off_V:g} V, predicted at", "s")
+    sd_predicted_eod_time_s: float = quantity("sd", "s")
+    measured_eod_time_s: float = quantity("{0.cut_off_V:g} V, measured at", "s")
+    remaining_s: float = quantity("remaining", "s")
+    future_current_A: float = quantity("current to come", "A")
+    load_varied: bool = quantity("load varied")
+    ambient_C: float = quantity("temperature at the start", "degC", 1)
+    end_temperature_C: float = quantity("temperature at the end", "degC", 1)
+    model_end_temperature_C: float = quantity("temperature of the model at the end", "degC", 1)
+    record: Discharge | None = field(default=None, compare=False)
+    forecast: VoltageForecast | None = field(default=None, compare=False)
+
+    def __str__(self) -> str:
+        return text_of(self._name, self)
+
+    def __repr__(self) -> str:
+        return f"<{line_of(self._name, self)}>"
+
+    @property
+    def _name(self) -> str:
+        return "discharge" if self.cycle is None else f"discharge {self.cycle}"
+
+    def row(self) -> dict[str, Any]:
+        """The columns by name."""
+        return {name: getattr(self, name) for name in _HOW}
+
+    def shown(self, name: str, digits: int | None = None, with_unit: bool = True) -> str:
+        """A column for readers."""
+        value, how = getattr(self, name), _HOW[name]
+        if isinstance(value, bool):
+            return "yes" if value else "no"
+        number = how["unknown"]
+        if not np.isnan(value):
+            number = f"{how['scale'] * value:.{how['digits'] if digits is None else digits}f}"
+        return f"{number} {how['unit']}" if how["unit"] and with_unit else number
+
+    def sd_of(self, name: str) -> str:
+        """The standard deviation of a column without its unit, for readers; empty if none is known."""
+        sd = f"sd_{name}"
+        return self.shown(sd, with_unit=False) if sd in _HOW and not np.isnan(getattr(self, sd)) else ""
+
+    @property
+    def settled_alone(self) -> str:
+        """The parameter that is settled though the other one, which was searched for as well, is not; empty if none is."""
+        known = [name for name in self.settings.parameters if getattr(self, f"settled_{name}")]
+        return "" if self.settled else "".join(known)
+
+    @property
+    def state(self) -> str:
+        """What is settled, for readers."""
+        return "settled" if self.settled else f"only {self.settled_alone} settled" if self.settled_alone else "not settled"
+
+    @property
+    def in_progress(self) -> bool:
+        """Whether the record ends above the cut-off."""
+        return bool(np.isnan(self.measured_eod_time_s))
+
+    @property
+    def end_quantiles_s(self) -> tuple[float, float, float] | None:
+        """Of a record in progress, the 5 %, 50 % and 95 % quantiles of its end, s."""
+        if not self.in_progress:
+            return None
+        reach_s = 1.645 * self.sd_predicted_eod_time_s
+        return self.predicted_eod_time_s - reach_s, self.predicted_eod_time_s, self.predicted_eod_time_s + reach_s
+
+
+_HOW = {each.name: each.metadata for each in fields(Calibration) if each.metadata}
+# The columns of a line, with their widths and digits.
+_IN_A_LINE = (
+    ("q_mobile_C", 7, None),
+    ("r_o_ohm", 0, None),
+    ("drawn_Ah", 0, None),
+    ("state_of_health", 0, None),
+    ("voltage_rmse_V", 6, 0),
+)
+
+
+def text_of(name: str, found: Calibration) -> str:
+    """What a discharge says, for reading."""
+    averaged = f", averaged over {found.averaged_over_s:g} s," if found.averaged_over_s else ""
+    lines = [
+        f"{name}: {found.samples} samples{averaged} from load-on at {found.shown('load_on_time_s')}, "
+        f"{3600.0 * found.drawn_Ah:.0f} C drawn"
+    ]
+    if found.method != "least-squares":
+        by = found.settings.calibrated_by if found.method == "policy" else "the Kalman filter"
+        lines.append(f"calibrated by {by}")
+    lines.append("")
+    for column, remark in _told(found):
+        line = f"  {_HOW[column]['text'].format(found.settings):<22}{found.shown(column):>12}"
+        lines.append(f"{line}   {remark}" if remark else line)
+    if not found.settled:
+        lines += ["", f"{_HOW['reason']['text']}: {found.reason}"]
+        if found.in_progress and not found.settled_q_mobile and found.settings.prior_q_mobile_C is None:
+            lines += [
+                "During a discharge give --prior with the q_mobile of an earlier one, or the earlier ones themselves:",
+                "battery-calibrate forecast FILE --life FOLDER",
+            ]
+    return "\n".join(lines)
+
+
+def _told(found: Calibration) -> Iterator[tuple[str, str]]:
+    """The columns that a text has, in their order, each with a remark."""
+    if found.initial_soc < 1.0 or found.sd_initial_soc:
+        yield "initial_soc", f"sd {found.shown('sd_initial_soc')}"
+    for parameter, column in _COLUMN_OF.items():
+        sd = f"sd {found.shown(f'sd_{column}')}" if found.sd_of(column) else "no sd stated"
+        yield column, sd if parameter in found.settings.parameters else "held"
+    yield "settled", f"only {found.settled_alone} is" if found.settled_alone else ""
+    yield "drawn_Ah", _of_the_charge(found)
+    if not np.isnan(found.nominal_Ah):
+        yield "state_of_health", _of_the_health(found)
+    yield "voltage_rmse_V", ""
+    if not np.isnan(found.end_temperature_C):
+        model = f"{found.shown('ambient_C')} to {found.shown('model_end_temperature_C')}"
+        yield "end_temperature_C", f"measured; the model goes from {model}"
+    yield "predicted_eod_time_s", ""
+    if found.in_progress:
+        yield "remaining_s", _of_the_load(found)
+    else:
+        yield "measured_eod_time_s", ""
+
+
+def _of_the_charge(found: Calibration) -> str:
+    cut_off = f"{found.settings.cut_off_V:g} V"
+    if found.in_progress:
+        return "so far"
+    if np.isnan(found.predicted_capacity_Ah):
+        return f"to {cut_off}; not the capacity, as not all of the charge is known"
+    if found.initial_soc < 1.0:
+        return f"to {cut_off}; from full it would have been {found.shown('predicted_capacity_Ah')}"
+    return f"the capacity to {cut_off}"
+
+
+def _of_the_health(found: Calibration) -> str:
+    if np.isnan(found.state_of_health):
+        return "as the capacity is not"
+    how = "predicted" if found.in_progress or found.initial_soc < 1.0 else "drawn"
+    of = "" if found.settings.nominal_Ah is not None else ", what the given cell yields at this load"
+    sd = f"sd {found.shown('sd_predicted_capacity_Ah')}"
+    return f"{found.shown('predicted_capacity_Ah')} ({sd}), {how}, of {found.nominal_Ah:.4g} Ah{of}"
+
+
+def _of_the_load(found: Calibration) -> str:
+    is_sure = "q_mobile" in found.settings.parameters and found.sd_of("predicted_eod_time_s")
+    sd = f"sd {found.shown('sd_predicted_eod_time_s')}, " if is_sure else ""
+    goes_on = "the mean current so far, an assumption: the load varied" if found.load_varied else "to go on"
+    return f"{sd}{found.future_current_A:.3g} A {goes_on}"
+
+
+def line_of(name: str, found: Calibration) -> str:
+    """The same in one line."""
+    parts = []
+    for column, width, digits in _IN_A_LINE:
+        if not np.isnan(getattr(found, column)):
+            sd, label = found.sd_of(column), _HOW[column]["text"].split()[-1]
+            parts.append(f"{label} {found.shown(column, digits):>{width}}" + (f" sd {sd:>3}" if sd else ""))
+    return f"{name:<18} " + "  ".join([*parts, f"{found.state}: {found.reason}".removesuffix(": ")])
+
+
+def title_of(name: str, found: Calibration) -> str:
+    """The same above a figure."""
+    parts = []
+    for parameter, column in _COLUMN_OF.items():
+        spread = f" (sd {found.sd_of(column)})" if found.sd_of(column) else " (held)"
+        # a policy states none
+        value = found.shown(column).replace("ohm", r"$\Omega$")
+        parts.append(f"{PARAMETERS[parameter].symbol} {value}" + ("" if found.method == "policy" else spread))
+    rmse = f"RMSE {found.shown('voltage_rmse_V', 0)}"
+    return f"{name}: {found.state}\n" + ", ".join([*parts, f"{found.shown('drawn_Ah')} drawn", rmse])

@@ -1,0 +1,195 @@
+"""How a discharge of a real cell is looked at: settings that check themselves, and the calibrator that they ask for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from battery_env.checks import check_not_negative, check_positive
+from battery_env.electrochemistry import NEW_CELL, CellParameters
+from battery_env.estimators.cell_fit import UNFITTED_MISMATCH_V, CellFit
+from battery_env.estimators.diagnosis.conditions import Condition
+from battery_env.estimators.diagnosis.rest import InitialSoc, Start
+from battery_env.estimators.kalman import ExtendedKalmanFilter
+from battery_env.estimators.least_squares import LeastSquares
+from battery_env.parameters import PARAMETER_NAMES, check_parameters
+from battery_env.policies.estimator import PolicyEstimator
+from battery_env.policies.pretrained import policy_of_file
+from battery_env.records import CUT_OFF_V
+
+Method = Literal["least-squares", "kalman", "policy"]
+METHODS: tuple[Method, ...] = get_args(Method)
+
+# Constants that were fitted at one load moved q_mobile by 5 % at twice that load, and so by less than the 2 % of a settled
+# estimate within this ratio.
+_SAME_LOAD = 1.25
+_AMBIENT_LIMITS_C = (-60.0, 100.0)
+# Policies that come with the package, by what they find.
+_PRETRAINED = {"q_mobile": "BatteryVoltageQmax-v0", "r_o": "BatteryVoltageRo-v0"}
+_PRETRAINED_JOINT = "BatteryVoltageJoint-v0"
+# What a policy cannot be told: it has learned on one model.
+_NOT_FOR_POLICIES = ("prior_q_mobile_C", "mismatch_V", "current_gain_sd", "ambient_C", "q_mobile_bounds_C", "initial_soc")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """
+    How a discharge of a real cell is looked at. ``Settings().calibrator()`` is least squares, and
+    ``Settings(method="kalman").calibrator()`` the filter, with what such a cell needs.
+
+    :param method: of calibration; ``None``: least squares; and where they do not settle a record in progress at a constant
+        load that goes on, of a cell of which neither a prior nor the constants are known, the filter
+    :param parameters: which to search for; the other is held at the cell's value
+    :param cut_off_V: voltage at which the discharge ends, V
+    :param prior_q_mobile_C: mean and standard deviation of ``q_mobile`` before the discharge, C; ``None``: nothing is known
+    :param mismatch_V: error to expect of the model itself, V
+    :param current_gain_sd: standard deviation of the gain of the current sensor, as a share of it
+    :param future_current_A: current beyond the end of a record, A; ``None``: as
+        :func:`battery_env.records.expected_current` has it
+    :param thermal: whether the temperature of the model moves
+    :param ambient_C: temperature at the start and of the surroundings, degC; ``None``: the first one measured, or what
+        else the record says of its surroundings, or the cell's
+    :param nominal_Ah: nominal capacity, which the state of health refers to, Ah; ``None``: the charge that ``cell``, with its
+        own ``q_mobile`` and ``r_o``, gives from full at the current of the discharge, or not known if there is no ``cell``
+    :param cell: constants of the model; ``None``: those of a new 18650
+    :param cell_currents_A: lowest and highest mean current that these constants were fitted to, A: beyond them by more than a
+        quarter no estimate is settled, and no nominal capacity is told. ``None``: they hold for all
+    :param q_mobile_bounds_C: where to search for ``q_mobile``, C; ``None``: where the calibrator does by default
+    :param initial_soc: state of charge when the load is switched on, after a rest: a number, (mean, standard deviation), or
+        ``"rest"``: told from the voltage of the rest before the load, of a minute at least
+    :param policy: ONNX file of the policy that the method ``"policy"`` follows; ``None``: the one that comes with the package.
+        Its model is at constant temperature, the new cell's or, of a policy of the user's own, ``cell``; and it takes no prior
+    :raises ValueError: for an argument out of range, and for what a policy cannot be told. What the calibrators refuse they
+        refuse when :meth:`calibrator` makes them
+    """
+
+    method: Method | None = None
+    parameters: tuple[str, ...] = PARAMETER_NAMES
+    cut_off_V: float = CUT_OFF_V
+    prior_q_mobile_C: tuple[float, float] | None = None
+    mismatch_V: float = UNFITTED_MISMATCH_V
+    current_gain_sd: float = 0.005
+    future_current_A: float | None = None
+    thermal: bool = True
+    ambient_C: float | None = None
+    nominal_Ah: float | None = None
+    cell: CellParameters | None = None
+    cell_currents_A: tuple[float, float] | None = None
+    q_mobile_bounds_C: tuple[float, float] | None = None
+    initial_soc: InitialSoc | Literal["rest"] = 1.0
+    policy: Path | None = None
+
+    def __post_init__(self) -> None:
+        if self.method not in (None, *METHODS):
+            raise ValueError(f"the method is {' or '.join(METHODS)}, got {self.method!r}")
+        if self.nominal_Ah is not None:
+            check_positive("the nominal capacity in Ah", self.nominal_Ah)
+        low, high = _AMBIENT_LIMITS_C
+        if self.ambient_C is not None and not low <= self.ambient_C <= high:
+            raise ValueError(f"the ambient temperature must lie within {low:g} .. {high:g} degC, got {self.ambient_C!r}")
+        if not 0.0 < self.cut_off_V < np.inf:
+            raise ValueError(f"the cut-off must be a voltage above 0 V, got {self.cut_off_V!r}")
+        if self.future_current_A is not None:
+            check_not_negative(future_current_A=self.future_current_A)
+        if self.method == "policy":
+            defaults = {field.name: field.default for field in fields(self)}
+            for name in _NOT_FOR_POLICIES:
+                if getattr(self, name) != defaults[name]:
+                    raise ValueError(f"a policy takes no {name}: leave it out, or take another method")
+            if self.cell is not None and self.policy is None:
+                raise ValueError(
+                    "the policy that comes with the package takes no cell: it has learned on a new 18650. Take another "
+                    "method, or a policy of your own that was trained with these constants"
+                )
+        elif self.policy is not None:
+            raise ValueError(f"a policy is for the method policy, got {self.method!r}")
+
+    @classmethod
+    def for_cell(cls, cell: CellFit | CellParameters | None = None, **others: Any) -> Settings:
+        """
+        Settings that use all that is known of a cell.
+
+        :param cell: what ``fit_cell`` found; or the constants alone
+        :param others: further settings, which replace what the fit knows
+        :return: the settings
+        """
+        if isinstance(cell, CellFit):
+            known: dict[str, Any] = {"cut_off_V": cell.cell.VEOD}
+            if others.get("method") != "policy":
+                known |= {
+                    "mismatch_V": cell.mismatch_V,
+                    "thermal": cell.thermal,
+                    "cell_currents_A": cell.currents_A,
+                    "q_mobile_bounds_C": cell.q_mobile_bounds_C,
+                }
+            others, cell = {**known, **others}, cell.cell
+        return cls(**{"cell": cell, **others})
+
+    def other_load(self, current_A: float) -> str:
+        """Why the constants may not hold for a mean current; empty if they do."""
+        if self.cell_currents_A is None or not current_A > 0.0:
+            return ""
+        low_A, high_A = self.cell_currents_A
+        if low_A / _SAME_LOAD <= current_A <= high_A * _SAME_LOAD:
+            return ""
+        fitted = f"{low_A:.3g}" if low_A == high_A else f"{low_A:.3g} to {high_A:.3g}"
+        return Condition.OTHER_LOAD.said({"load_A": current_A, "fitted": fitted})
+
+    def tells_new_capacity(self, current_A: float) -> bool:
+        """Whether the constants tell what a new cell yields under a load: where they were fitted to this load alone."""
+        low_A, high_A = self.cell_currents_A or (current_A, current_A)
+        return self.cell is not None and high_A <= low_A * _SAME_LOAD and not self.other_load(current_A)
+
+    def calibrator(
+        self, cell: CellParameters | None = None, start: Start | None = None
+    ) -> LeastSquares | ExtendedKalmanFilter | PolicyEstimator:
+        """
+        The calibrator that is asked for. It refuses options that it cannot use, and a policy that does not suit them.
+
+        :param cell: constants of the model at the temperature of a discharge; ``None``: those of the settings
+        :param start: how the discharge starts; ``None``: as the settings say
+        :return: the calibrator
+        :raises ValueError: for an option out of range, or a policy of another cell or of other parameters
+        """
+        if self.method == "policy":
+            return self._policy()
+        calibrator = ExtendedKalmanFilter if self.method == "kalman" else LeastSquares
+        stated: InitialSoc = 1.0 if self.initial_soc == "rest" else self.initial_soc
+        bounds: dict[str, Any] = {} if self.q_mobile_bounds_C is None else {"q_mobile_bounds_C": self.q_mobile_bounds_C}
+        return calibrator(
+            self.parameters,
+            cell or self.cell or NEW_CELL,
+            thermal=self.thermal,
+            prior_q_mobile_C=self.prior_q_mobile_C,
+            mismatch_V=self.mismatch_V,
+            current_gain_sd=self.current_gain_sd,
+            initial_soc=stated if start is None else (start.soc, start.sd_soc),
+            **bounds,
+        )
+
+    def _policy(self) -> PolicyEstimator:
+        if self.policy is None:
+            names = check_parameters(self.parameters)
+            env_id = _PRETRAINED_JOINT if len(names) > 1 else _PRETRAINED[names[0]]
+            return PolicyEstimator.pretrained(env_id, recorded=True)
+        policy, options = policy_of_file(self.policy)
+        if options.get("cell") != self.cell:
+            learned = "a new 18650, or the file beside it does not say on which constants ('cell' of its 'options')"
+            if "cell" in options:
+                learned = "the constants of a cell, which are others: give its cell (--cell)"
+            raise ValueError(f"{self.policy} has learned on {learned}")
+        estimator = PolicyEstimator(policy, policy.env_id, **options)
+        if set(estimator.parameters) != set(self.parameters):
+            asked, found = " and ".join(self.parameters), " and ".join(estimator.parameters)
+            raise ValueError(f"{self.policy} is a policy of {policy.env_id}, which finds {found}, not {asked}")
+        return estimator
+
+    @property
+    def calibrated_by(self) -> str:
+        """The calibrator, for readers."""
+        if self.method != "policy":
+            return self.method or "least-squares"
+        return "the policy that comes with the package" if self.policy is None else f"the policy of {self.policy}"

@@ -1,0 +1,156 @@
+"""Where discharges come from: files, folders of them, and the bundled cells, by the names that a command line gives."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from battery_env.lab.readers.discharges import Recording, read_recordings
+from battery_env.lab.readers.tables import BINARY_SUFFIXES, PACKED_SUFFIXES, TEXT_SUFFIXES, is_readable
+from battery_env.records.discharge import BUNDLED_CELLS, load_nasa_discharges
+
+#: Results that an earlier command wrote among the records: tables, and voltages, which have their figure beside them.
+TABLES, VOLTAGE = ("estimate.csv", "estimate.parquet"), "_voltage"
+_NASA_SUFFIX = ".mat"
+# What NASA's discharges have beside them, in the layout of the bundled ones, is a table of tests and no record.
+_NO_RECORDS = ("cycles.csv",)
+
+
+class Source(NamedTuple):
+    """
+    Where discharges come from.
+
+    :param path: a file, or the name of a bundled cell
+    :param cycle: which discharge; ``None``: all of them
+    :param stem: what names of results start with
+    :param cell: which cell it is of
+    """
+
+    path: str
+    cycle: int | None
+    stem: str
+    cell: str
+
+    @property
+    def argument(self) -> str:
+        """As on the command line."""
+        return self.path if self.cycle is None else f"{self.path}:{self.cycle}"
+
+
+@dataclass(frozen=True)
+class FileFormat:
+    """
+    What files do not tell of themselves, see :func:`battery_env.read_discharges`.
+
+    :param columns: by quantity, the name of its column
+    :param units: by quantity, its unit
+    :param discharge_is_negative: how the file counts the current of a discharge; ``None``: told from the voltage
+    """
+
+    columns: Mapping[str, str] | None = None
+    units: Mapping[str, str] | None = None
+    discharge_is_negative: bool | None = None
+
+
+def find_sources(arguments: Iterable[str], cell_name: re.Pattern[str] | None = None) -> list[Source]:
+    """
+    What the arguments of a command line name. A cell is called as its file; as its folder, if folders are given and their
+    records lie in several; or as the group that a pattern finds in the name of the file.
+    """
+    arguments = list(arguments)
+    inside = {argument: _records(Path(argument)) for argument in arguments if Path(argument).is_dir()}
+    folders = {file.parent.absolute() for files in inside.values() for file in files}
+    sources = []
+    for argument in arguments:
+        if inside.get(argument):
+            sources += [Source(str(file), None, *_names(file, folders)) for file in inside[argument]]
+            continue
+        name, colon, cycle = argument.rpartition(":")
+        if not (colon and cycle.isdecimal()) or Path(argument).exists():
+            name, cycle = argument, ""
+        stem = name if name in BUNDLED_CELLS else _stem(Path(name))
+        sources.append(Source(name, int(cycle) if cycle else None, stem, stem))
+    if cell_name is None:
+        return sources
+    found = [cell_name.search(Path(source.path).name) for source in sources]
+    return [source._replace(cell=match[1]) if match else source for source, match in zip(sources, found, strict=True)]
+
+
+def _records(folder: Path) -> list[Path]:
+    """The files in a folder, and in those in it, that may be records; their numbers count, so that 2 comes before 10."""
+    records = (
+        path
+        for path in folder.rglob("*")
+        if path.is_file()
+        and not any(part.startswith(".") for part in path.relative_to(folder).parts)
+        and path.name not in _NO_RECORDS
+        and not _is_result(path)
+        and is_readable(path, (_NASA_SUFFIX,))
+    )
+    return sorted(records, key=_by_number)
+
+
+def _by_number(path: Path) -> tuple[list[list[str | int]], Path]:
+    parts = [re.split("([0-9]+)", part) for part in path.parts]
+    return [[int(each) if k % 2 else each for k, each in enumerate(part)] for part in parts], path
+
+
+def _names(file: Path, folders: Collection[Path]) -> tuple[str, str]:
+    """Stem and cell of a file that was found in one of some folders."""
+    if len(folders) == 1:
+        return _stem(file), _stem(file)
+    common = Path(os.path.commonpath(folders))
+    folder = file.parent.absolute()
+    cell = folder.name if folder == common else folder.relative_to(common).as_posix()
+    return f"{cell.replace('/', '_')}_{_stem(file)}", cell
+
+
+def _is_result(path: Path) -> bool:
+    is_table = path.name in TABLES or path.name.endswith(tuple(f"_{name}" for name in TABLES))
+    return is_table or (path.name.endswith(f"{VOLTAGE}.csv") and path.with_suffix(".png").exists())
+
+
+def _stem(path: Path) -> str:
+    name = path.name
+    for suffixes in (PACKED_SUFFIXES, (*TEXT_SUFFIXES, *BINARY_SUFFIXES, _NASA_SUFFIX), (".bdf",)):
+        for suffix in suffixes:
+            if name.lower().endswith(suffix) and len(name) > len(suffix):
+                name = name[: -len(suffix)]
+                break
+    return name
+
+
+def read_source(source: Source, file_format: FileFormat) -> list[Recording]:
+    """Read what a source names."""
+    path, cycle = source.path, source.cycle
+    if path in BUNDLED_CELLS and not Path(path).exists():
+        columns = ("time_s", "voltage_V", "current_A", "temperature_C")
+        recordings = [
+            Recording({name: getattr(each, name) for name in columns}, each.meta) for each in load_nasa_discharges(path)
+        ]
+    elif Path(path).is_dir():
+        endings = ", ".join((*TEXT_SUFFIXES, *BINARY_SUFFIXES, _NASA_SUFFIX))
+        raise ValueError(f"{path} holds no file whose name ends as that of a record ({endings}), nor do the folders in it")
+    elif not Path(path).exists():
+        raise FileNotFoundError(
+            f"no file {source.argument!r}; the bundled cells are given as {BUNDLED_CELLS[0]}:1, {BUNDLED_CELLS[0]}:2, ..."
+        )
+    else:
+        recordings = read_recordings(path, file_format.columns, file_format.units, file_format.discharge_is_negative)
+    if cycle is None:
+        return recordings
+    chosen = [recording for recording in recordings if recording.meta.get("cycle") == cycle]
+    if not chosen:
+        known = sorted({recording.meta["cycle"] for recording in recordings if "cycle" in recording.meta})
+        has = f"has discharges {path}:{known[0]} .. {path}:{known[-1]}" if known else "has one discharge, without a number"
+        raise ValueError(f"{path} {has}, got {source.argument}")
+    return chosen
+
+
+def record_name(stem: str, cycle: int | None) -> str:
+    """How one discharge is called in results."""
+    return stem if cycle is None else f"{stem}_{cycle:03d}"
