@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal, get_args, overload
@@ -22,6 +22,7 @@ from battery_env.estimators.diagnosis.rest import InitialSoc, Start, check_initi
 from battery_env.estimators.diagnosis.samples import start_condition, watched
 from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
+from battery_env.lab.readers.columns import FileFormat
 from battery_env.lab.readers.discharges import each_usable
 from battery_env.parameters import PARAMETER_NAMES, check_parameters
 from battery_env.policies.estimator import PolicyEstimator
@@ -339,6 +340,7 @@ def calibrate(
     columns: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
     discharge_is_negative: bool | None = None,
+    ignore: Collection[str] = (),
     **options: Any,
 ) -> list[Calibration]: ...
 
@@ -350,6 +352,7 @@ def calibrate(
     columns: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
     discharge_is_negative: bool | None = None,
+    ignore: Collection[str] = (),
     **options: Any,
 ) -> Calibration | list[Calibration]:
     """
@@ -370,6 +373,7 @@ def calibrate(
     :param columns: of a table or a file, as ``read_discharges`` takes it
     :param units: likewise
     :param discharge_is_negative: likewise
+    :param ignore: likewise
     :param options: of :class:`Settings`, by name; ``cell`` may be what ``fit_cell`` found
     :return: what a discharge says; of a table or a file a list, in which those that cannot be used are left out with a warning
     :raises ValueError: if none can be used
@@ -377,7 +381,8 @@ def calibrate(
     settings = Settings.for_cell(**options) if settings is None else replace(settings, **options)
     if isinstance(source, Discharge):
         return _calibrated(source, settings)
-    return each_usable(lambda each: _calibrated(each, settings), source, columns, units, discharge_is_negative)
+    file_format = FileFormat(columns, units, discharge_is_negative, ignore)
+    return each_usable(lambda each: _calibrated(each, settings), source, file_format)
 
 
 def _calibrated(discharge: Discharge, settings: Settings) -> Calibration:

@@ -24,7 +24,8 @@ from battery_env.files import check_new, finite_or_none, replacing
 from battery_env.lab.calibrate import Calibration, Settings, calibrate
 from battery_env.lab.forecast import BAND, Forecast, FutureLoad, forecast, quantile
 from battery_env.lab.life import Life, track_life
-from battery_env.lab.many import FileFormat, Source, find_sources, read_source, record_name
+from battery_env.lab.many import Source, find_sources, read_source, record_name
+from battery_env.lab.readers.columns import FileFormat
 from battery_env.loads import Load
 from battery_env.plotting import save_figure
 from battery_env.records import VARIED_SHARE
