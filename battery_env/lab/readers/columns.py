@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
+from unicodedata import normalize
 
 from battery_env.checks import ZERO_CELSIUS_K
 
@@ -17,25 +18,45 @@ REQUIRED = ("time", "voltage", "current")
 # and these before the times of a step; a cell before one of its electrodes.
 _NAMES: dict[str, tuple[str, ...]] = {
     "time": (
-        *("test time", "total time", "elapsed time", "accumulated time", "cumulative time", "run time", "prog time"),
-        *("program time", "program duration", "test", "time", "t", "relative time", "testzeit", "prüfzeit", "gesamtzeit"),
+        *(
+            "test time",
+            "total time",
+            "elapsed time",
+            "accumulated time",
+            "cumulative time",
+            "run time",
+            "elapsed",
+            "prog time",
+        ),
+        *(
+            "program time",
+            "program duration",
+            "programmdauer",
+            "test",
+            "time",
+            "t",
+            "relative time",
+            "testzeit",
+            "prüfzeit",
+            "gesamtzeit",
+        ),
         *("programmzeit", "laufzeit", "zeit", "seconds", "unix time", "date time", "datetime", "timestamp", "absolute time"),
         *("dpt time", "real time", "realtime", "date", "datum", "zeitstempel", "step time", "step duration"),
     ),
     "voltage": (
         *("voltage", "cell voltage", "terminal voltage", "battery voltage", "voltage measured", "measured voltage", "volts"),
         *("volt", "ewe ece", "ecell", "potential", "cell potential", "ewe", "u", "v", "spannung", "zellspannung"),
-        *("klemmenspannung", "u cell", "v cell", "u batt", "v batt", "vf"),
+        *("klemmenspannung", "batteriespannung", "u cell", "v cell", "u bat", "v bat", "u batt", "v batt", "vf"),
     ),
     "current": (
         *("current", "cell current", "battery current", "current measured", "measured current", "cur", "curr", "amps", "amp"),
-        *("i", "strom", "zellstrom", "i cell", "i batt", "im"),
+        *("i", "strom", "zellstrom", "batteriestrom", "i cell", "i bat", "i batt", "im"),
     ),
     "temperature": (
         *("temperature", "cell temperature", "temperature measured", "surface temperature", "surface temperature t1"),
         *("temperature t1", "aux temperature 1", "temp", "temp 1", "t1", "temperatur", "zelltemperatur", "t cell", "t"),
     ),
-    "ambient": ("ambient temperature", "chamber temperature", "umgebungstemperatur"),
+    "ambient": ("ambient temperature", "chamber temperature", "environment temperature", "umgebungstemperatur"),
     "cycle": (
         *("cycle", "cycle index", "cycle number", "cycle no", "cycle count", "cycle id", "cyc", "cyc count", "cycle p"),
         *("zyklus", "zyklusnummer"),
@@ -51,6 +72,10 @@ _NAMES: dict[str, tuple[str, ...]] = {
     "power": ("power", "p", "leistung"),
     "charge_step": ("dq",),
     "counter": ("ece",),
+}
+_RANKS = {
+    quantity: {name.replace(" ", ""): rank for rank, name in reversed(list(enumerate(names)))}
+    for quantity, names in _NAMES.items()
 }
 # Names that are this quantity only where a unit says so: t may be a time, and p or q anything.
 _WITH_UNIT = {("temperature", "t"), ("power", "p"), ("charge_step", "dq"), ("counter", "ece")}
@@ -76,7 +101,7 @@ _UNITS: dict[str, dict[str, tuple[float, float]]] = {
     "current": {
         **dict.fromkeys(("a", "amp", "amps", "ampere", "amperes"), (1.0, 0.0)),
         **dict.fromkeys(("ma", "mamp", "mamps", "milliamp", "milliamps", "milliampere", "milliamperes"), (1e-3, 0.0)),
-        **dict.fromkeys(("ua", "µa", "μa", "microamp", "microamps"), (1e-6, 0.0)),
+        **dict.fromkeys(("ua", "\u03bca", "microamp", "microamps"), (1e-6, 0.0)),
     },
     "temperature": _DEGREES | _KELVIN,
     "ambient": _DEGREES | _KELVIN,
@@ -92,11 +117,12 @@ _IN_BRACKETS = re.compile(r"^(?P<name>.*?)\s*(?:\((?P<round>[^()]*)\)|\[(?P<squa
 _GAP = re.compile(r"(?<=[a-zäöü])(?=[A-ZÄÖÜ])|[_\-\s.#<>~]+")
 # The sign of a degree, and what is left of it after another encoding.
 _DEGREE_SIGN = re.compile("^[Ââ]?[°º˚\ufffd?]")
-# A shorter name that is a unit may be anything, as min.
-_LEAST_UNIT_NAME = 4
+# So long are names that are a unit, as mV; a shorter one may be anything, as min.
+_LEAST_UNIT_NAME = {"time": 4, "voltage": 2, "current": 2}
 # What testers call the steps in which a cell is discharged, and those of other words in which it is charged.
 _DISCHARGE, _CHARGE = re.compile(r"\bd\b|\bdis\b|dch|disch|entlad"), re.compile(r"\bc\b|ch|lad")
-_DIGIT = re.compile(r"^\s*[-+.\d]")
+_NUMBER = re.compile(r"[-+.\d][-+.,:/\deE\sT]*$|nan$|true$|false$", flags=re.IGNORECASE)
+_FEW_WORDS = 20
 
 
 class Column(NamedTuple):
@@ -145,7 +171,7 @@ def find_columns(
 
     :param names: of all columns
     :param file_format: what is known of them
-    :param rows: the first rows, among which words for charge and discharge are looked for
+    :param rows: the first rows; columns of words may say which of them are charges
     :return: by quantity; columns that may serve as well have its name and a number, as ``time 2``
     """
     file_format = file_format or FileFormat()
@@ -156,9 +182,11 @@ def find_columns(
     kept = [name if (name := str(each).strip()) not in ignore else "" for each in names]
     found: dict[str, Column] = {}
     for quantity in _NAMES:
+        if "current" in found and quantity in _INSTEAD["current"]:
+            continue
         places = _places(quantity, kept, chosen.get(quantity), units.get(quantity))
         if quantity == "state":
-            places += [n for n in _with_directions(rows) if kept[n : n + 1] not in ([], [""]) and n not in places]
+            places += [n for n in _of_words(row for row in rows if len(row) == len(kept)) if kept[n] and n not in places]
         for number, place in enumerate(places, start=1):
             words, unit = _split(kept[place], quantity)
             column = Column(place, kept[place], *_scale(quantity, units.get(quantity, unit), kept[place]), words)
@@ -208,18 +236,19 @@ def direction(state: object) -> int:
     return 1 if _DISCHARGE.search(words) else -1 if _CHARGE.search(words) else 0
 
 
-def _with_directions(rows: Iterable[Sequence[str]]) -> list[int]:
-    """Columns of words, some of which are those for charge or discharge."""
-    places = []
-    for place, values in enumerate(zip(*rows, strict=False)):
-        words = {value for value in values if value.strip()}
-        if any(map(direction, words)) and not any(map(_DIGIT.search, words)):
-            places.append(place)
-    return places
+def _of_words(rows: Iterable[Sequence[str]]) -> list[int]:
+    """Columns of a few words."""
+    texts = [{text for value in values if (text := value.strip())} for values in zip(*rows, strict=False)]
+    return [n for n, words in enumerate(texts) if 0 < len(words) <= _FEW_WORDS and not any(map(_NUMBER.match, words))]
 
 
 def _words(name: str) -> str:
     return " ".join(_GAP.sub(" ", name).lower().split())
+
+
+def _rank(quantity: str, words: str) -> int | None:
+    """The place of a name among those of a quantity; words may be written together."""
+    return _RANKS[quantity].get(words.replace(" ", ""))
 
 
 def _split(name: str, quantity: str) -> tuple[str, str]:
@@ -229,19 +258,20 @@ def _split(name: str, quantity: str) -> tuple[str, str]:
         unit = next(group for group in match.group("round", "square", "slash") if group is not None)
         return _words(match["name"]), unit.strip()
     words, known = _words(name).split(), _UNITS.get(quantity, {})
-    if len(name) >= _LEAST_UNIT_NAME and (unit := "".join(words)) in known:
+    if len(name) >= _LEAST_UNIT_NAME.get(quantity, 9) and (unit := "".join(words)) in known:
         return next((each for each in _NAMES[quantity] if each in known), ""), unit
     for cut in (1, -1, -2):  # the unit comes first, last, or last in two words, as in deg c
         name_words, unit_words = (words[cut:], words[:cut]) if cut > 0 else (words[:cut], words[cut:])
-        if " ".join(name_words) in _NAMES[quantity] and (unit := "".join(unit_words)) in known:
+        if _rank(quantity, " ".join(name_words)) is not None and (unit := "".join(unit_words)) in known:
             return " ".join(name_words), unit
     return " ".join(words), ""
 
 
 def _unit(text: str, quantity: str) -> str | None:
     """A unit as the table of units has it; what is said behind it, as in ``Hours in hh:mm:ss``, is left out."""
-    first, *_ = [*text.lower().split(), ""]
-    for unit in ("".join(text.lower().split()), first):
+    text = normalize("NFKC", text).lower()  # of the signs for degrees Celsius and micro there are several
+    first, *_ = [*text.split(), ""]
+    for unit in ("".join(text.split()), first):
         unit = _DEGREE_SIGN.sub("", unit) if quantity in ("temperature", "ambient") else unit
         if unit in _UNITS.get(quantity, {}):
             return unit
@@ -251,7 +281,7 @@ def _unit(text: str, quantity: str) -> str | None:
 def _may_be(quantity: str, name: str) -> bool:
     """Whether a name is among those of a quantity, and its unit not among those of another."""
     words, unit = _split(name, quantity)
-    if words not in _NAMES[quantity] or ((quantity, words) in _WITH_UNIT and _unit(unit, quantity) is None):
+    if _rank(quantity, words) is None or ((quantity, words) in _WITH_UNIT and _unit(unit, quantity) is None):
         return False
     return _unit(unit, quantity) is not None or not any(_unit(unit, other) for other in _UNITS)
 
@@ -263,9 +293,8 @@ def _places(quantity: str, names: Sequence[str], chosen: str | None, unit: str |
         if not places:
             raise ValueError(f"there is no column {chosen!r} for the {quantity} among {', '.join(filter(None, names))}")
         return places[:1]
-    ranks = {name: rank for rank, name in reversed(list(enumerate(_NAMES[quantity])))}
     split = {n: _split(name, quantity) for n, name in enumerate(names) if name and _may_be(quantity, name)}
-    places = sorted(split, key=lambda n: ranks[split[n][0]])
+    places = sorted(split, key=lambda n: _rank(quantity, split[n][0]) or 0)
     known = [n for n in places if unit or not split[n][1] or quantity not in _UNITS or _unit(split[n][1], quantity)]
     if places and not known and quantity not in REQUIRED:
         name = names[places[0]]

@@ -21,7 +21,7 @@ from battery_env.lab.readers.columns import Column, FileFormat, unit_of
 from battery_env.lab.readers.rows import cells_of
 from battery_env.lab.readers.tables import columns_of, read_columns
 from battery_env.records import SWITCH_SHARE, drawn
-from battery_env.records.discharge import Discharge, read_nasa_mat
+from battery_env.records.discharge import LEAST_SAMPLES, Discharge, read_nasa_mat
 
 Made = TypeVar("Made")
 
@@ -43,6 +43,7 @@ _BACK_SHARE = 0.25
 _SENTENCE = re.compile(r"(?<=[^.\s]\.)\s+(?=[A-Z])")
 _UNIT_ADVICE = re.compile(r" in [^,]+, not in \w+ \(command line: --units (\w+)=(\w+)\)(, and)?")
 _SIGN_ADVICE = ": flip the sign"
+_STEP_ADVICE = re.compile(r", or name the column of its step|, and one that does with each step a column of the step")
 
 
 class Recording(NamedTuple):
@@ -51,7 +52,7 @@ class Recording(NamedTuple):
 
     :param arrays: arguments of :class:`~battery_env.Discharge`, by name
     :param meta: what else is known; ``cycle`` is missing if the file holds one discharge and does not number it
-    :param stated: quantities whose unit is known
+    :param stated: quantities whose unit is known, and ``step`` if it has a column
     """
 
     arrays: dict[str, Any]
@@ -60,6 +61,8 @@ class Recording(NamedTuple):
 
     def discharge(self) -> Discharge:
         """Check it; what an error advises is left out where it contradicts what is known, or would not help."""
+        if (count := len(self.arrays["time_s"])) < LEAST_SAMPLES:
+            raise ValueError(f"{count} rows are no discharge. If each is the end of a step, export all that was recorded.")
         try:
             return Discharge(**self.arrays, meta=self.meta)
         except ValueError as error:
@@ -67,6 +70,8 @@ class Recording(NamedTuple):
 
     def _helpful(self, sentence: str) -> str:
         """What is left of a sentence of an error once the option that it advises, if any, was tried."""
+        if "step" in self.stated:
+            sentence = _STEP_ADVICE.sub("", sentence)
         unit = _UNIT_ADVICE.search(sentence)
         if not unit and _SIGN_ADVICE not in sentence:
             return sentence
@@ -183,7 +188,7 @@ def _name_of(source: str | Path | pd.DataFrame) -> str:
 
 
 def _recordings(source: str, table: pd.DataFrame, columns: Mapping[str, Column], file_format: FileFormat) -> list[Recording]:
-    stated = frozenset(quantity for quantity, column in columns.items() if column.unit)
+    stated = frozenset(quantity for quantity, column in columns.items() if column.unit or quantity == "step")
     return [
         recording
         for cell, rows in cells_of(table, columns, file_format).items()
@@ -213,50 +218,40 @@ def _bounds(rows: pd.DataFrame) -> list[int]:
     bounds = [0]
     if "cycle" in rows:
         time_s, voltage_V, current_A = (rows[name].to_numpy() for name in ("time", "voltage", "current"))
-        under_load = np.flatnonzero(np.abs(current_A) > SWITCH_SHARE * np.abs(current_A).max())
-        for n in (np.flatnonzero(np.diff(rows["cycle"])) + 1).tolist():
+        switch_A = SWITCH_SHARE * np.abs(current_A).max()
+        charged = np.zeros(len(rows), dtype=np.bool_)
+        for start, end, _, is_braking in _charges(current_A, _passed_C(time_s, current_A)):
+            charged[start:end] = not is_braking and current_A[start:end].min() < -switch_A
+        under_load = np.flatnonzero(charged | (current_A > switch_A))
+        changes = (np.flatnonzero(np.diff(rows["cycle"])) + 1).tolist()
+        for n, following in itertools.pairwise([*changes, len(rows)]):
             k = int(np.searchsorted(under_load, n))
-            before, after = (under_load[k - 1] if k else -1), (under_load[k] if k < len(under_load) else len(rows))
-            discharged = k < len(under_load) and current_A[after] > 0.0
-            if time_s[n] < time_s[n - 1] or not discharged:
+            before, after = (int(each[0]) if len(each) else None for each in (under_load[:k][-1:], under_load[k : k + 1]))
+            if time_s[n] < time_s[n - 1] or (after is not None and charged[after]):
                 bounds.append(n)
-            elif before < 0 or current_A[before] < 0.0:
+            elif after is not None and (before is None or charged[before]):
                 # a rest that is all in the cycle before belongs to the load
-                bounds.append(int(before) + 1 if after == n else n)
-            elif _comes_back(voltage_V, current_A, bounds[-1], n, int(after)):
-                bounds.append(n)
+                bounds.append(n if after > n else 0 if before is None else before + 1)
+            elif after is not None:
+                low = max(bounds[-1], *(np.flatnonzero(charged[:n])[-1:] + 1), 0)
+                top_V, low_V = voltage_V[low:n].max(), voltage_V[low:n].min()
+                if top_V - voltage_V[n : min(after + 1, following)].max() < _BACK_SHARE * (top_V - low_V):
+                    bounds.append(n)
     return [*sorted({*bounds}), len(rows)]
 
 
-def _comes_back(voltage_V: FloatArray, current_A: FloatArray, low: int, n: int, after: int) -> bool:
-    """Whether the voltage after a row, until the load is on, shows that the cell was charged, which is not in the file."""
-    charged = np.flatnonzero(current_A[low:n] < 0.0)
-    low += int(charged[-1]) + 1 if len(charged) else 0
-    if low >= n:
-        return True
-    top_V, low_V = voltage_V[low:n].max(), voltage_V[low:n].min()
-    back_V = voltage_V[n : after + 1].max()
-    return bool(top_V - back_V < _BACK_SHARE * (top_V - low_V))
+def _passed_C(time_s: FloatArray, current_A: FloatArray) -> FloatArray:
+    """The charge that has passed at each row, on a clock that does not go back."""
+    clock_s = np.append(0.0, np.cumsum(np.maximum(np.diff(time_s), 0.0)))
+    return drawn(clock_s, current_A, clock_s)
 
 
 def _discharges(rows: pd.DataFrame, low: int, high: int) -> list[tuple[slice, float]]:
     """The discharges among some rows, and the charge that each draws, C."""
     time_s, current_A = (rows[name].to_numpy()[low:high] for name in ("time", "current"))
-    clock_s = np.append(0.0, np.cumsum(np.maximum(np.diff(time_s), 0.0)))  # which does not go back
-    passed_C = drawn(clock_s, current_A, clock_s)
+    passed_C = _passed_C(time_s, current_A)
     charges = _charges(current_A, passed_C)
-    least_C = _CHARGED_SHARE * float((passed_C - np.minimum.accumulate(passed_C)).max())
-    found, begin, lowest_C, highest_C = [], 0, passed_C[0], passed_C[0]
-    for start, end in charges:
-        drawn_C, highest_C = passed_C[start] - lowest_C, max(highest_C, passed_C[start])
-        returned_C = passed_C[start] - passed_C[end - 1]
-        # a charge may be logged in many steps, of which each returns little
-        if drawn_C > 0.0 and returned_C > _RETURNED_SHARE * drawn_C and highest_C - passed_C[end - 1] > least_C:
-            found.append((begin, start))
-            begin, lowest_C = start, passed_C[start]
-        if passed_C[end - 1] < lowest_C:
-            lowest_C = highest_C = passed_C[end - 1]
-    found.append((begin, high - low))
+    found = list(itertools.pairwise([0, *(start for start, _, is_end, _ in charges if is_end), high - low]))
     parts = []
     for begin, end in found:
         peak_A = current_A[begin:end].max()
@@ -264,7 +259,7 @@ def _discharges(rows: pd.DataFrame, low: int, high: int) -> list[tuple[slice, fl
             continue
         first = begin + int(np.argmax(current_A[begin:end] > SWITCH_SHARE * peak_A))
         drawn_C = float(passed_C[first:end].max() - passed_C[first])
-        for start, stop in charges:
+        for start, stop, *_ in charges:
             if begin <= start and stop <= first and passed_C[start] - passed_C[stop - 1] > _CHARGED_SHARE * drawn_C:
                 begin = stop
         parts.append((slice(low + begin, low + end), drawn_C))
@@ -289,12 +284,26 @@ def _recording(rows: pd.DataFrame, meta: dict[str, Any], has_own_clock: bool, st
     return Recording(arrays, meta, stated)
 
 
-def _charges(current_A: FloatArray, passed_C: FloatArray) -> list[tuple[int, int]]:
-    """Where the cell is charged, noise at rest left aside: the first sample, and the one after the last."""
+def _charges(current_A: FloatArray, passed_C: FloatArray) -> list[tuple[int, int, bool, bool]]:
+    """
+    Where the cell is charged, noise at rest left aside: the first sample, the one after the last, whether that ends a
+    discharge, and whether it is braking, which returns less than was drawn and ends none.
+    """
     charging = np.concatenate([[False], current_A < 0.0, [False]])
     starts, ends = np.flatnonzero(~charging[:-1] & charging[1:]), np.flatnonzero(charging[:-1] & ~charging[1:])
     counts = passed_C[starts] - passed_C[ends - 1] > _NOTHING_SHARE * float(np.ptp(passed_C))
-    return list(zip(starts[counts].tolist(), ends[counts].tolist(), strict=True))
+    least_C = _CHARGED_SHARE * float((passed_C - np.minimum.accumulate(passed_C)).max())
+    found, lowest_C, highest_C = [], passed_C[0], passed_C[0]
+    for start, end in zip(starts[counts].tolist(), ends[counts].tolist(), strict=True):
+        drawn_C, highest_C = passed_C[start] - lowest_C, max(highest_C, passed_C[start])
+        returned_C = passed_C[start] - passed_C[end - 1]
+        # a charge may be logged in many steps, of which each returns little
+        is_end = drawn_C > 0.0 and returned_C > _RETURNED_SHARE * drawn_C and highest_C - passed_C[end - 1] > least_C
+        found.append((start, end, bool(is_end), bool(not is_end and returned_C < drawn_C)))
+        lowest_C = passed_C[start] if is_end else lowest_C
+        if passed_C[end - 1] < lowest_C:
+            lowest_C = highest_C = passed_C[end - 1]
+    return found
 
 
 def _filled(time_s: FloatArray, temperature_C: FloatArray) -> FloatArray | None:

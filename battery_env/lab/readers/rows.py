@@ -98,7 +98,9 @@ def without_headers(table: pd.DataFrame, columns: Mapping[str, Column]) -> pd.Da
 def without_cut_line(table: pd.DataFrame, columns: Mapping[str, Column]) -> pd.DataFrame:
     """Without the last line where it is incomplete, as in a file that is being written."""
     last = table[_measured(table)].tail(1)
-    if len(last) and (last.isna() | (last.astype(str).apply(lambda each: each.str.strip()) == "-")).any(axis=None):
+    if len(last) and last.apply(lambda each: each if each.name == "time" else pd.to_numeric(each, "coerce")).isna().any(
+        axis=None
+    ):
         _say(f"the last line, row {last.index[0] + 1}, is incomplete, and left out")
         return table.iloc[:-1]
     return table
@@ -354,15 +356,15 @@ def without_repeated(rows: pd.DataFrame) -> pd.DataFrame:
 def with_steps_apart(rows: pd.DataFrame) -> pd.DataFrame:
     """Of two rows at one time, between which the step changes or the load is switched, the second is the later one."""
     time_s, jump_A = rows["time"].to_numpy(), np.diff(rows["current"], prepend=rows["current"].iloc[:1])
-    is_next_later = np.append(time_s[1:] > time_s[:-1] + _STEP_S, True)
-    same = (np.diff(time_s, prepend=np.nan) == 0.0) & is_next_later
+    same = np.diff(time_s, prepend=np.nan) == 0.0
     new_step = _changes(rows, "step")
     switched = same & ~new_step & (np.abs(jump_A) > SWITCH_SHARE * rows["current"].abs().max())
     if switched.any() and np.abs(jump_A[switched]).sum() * _tick_s(time_s) <= _NOTHING_SHARE * _passed_C(rows):
         _say(f"row {_place(rows, switched)} has the time of the row before, and is the later one, as the load is switched")
     else:
         switched[:] = False
-    return rows.assign(time=time_s + _STEP_S * ((same & new_step) | switched))
+    later, n = (same & new_step) | switched, np.arange(len(rows))
+    return rows.assign(time=time_s + _STEP_S * (n - np.maximum.accumulate(np.where(later, 0, n))))
 
 
 def _passed_C(rows: pd.DataFrame) -> float:

@@ -83,8 +83,8 @@ def columns_of(table: pd.DataFrame, file_format: FileFormat) -> tuple[pd.DataFra
 
 
 def _first_rows(table: pd.DataFrame) -> list[list[str]]:
-    first = table.head(_FIRST_ROWS)
-    return [[str(value) for value in row] for row in first.fillna("").astype(object).to_numpy()] if len(first.columns) else []
+    first = table.head(_FIRST_ROWS).astype(object)
+    return [[str(value) for value in row] for row in first.where(first.notna(), "").to_numpy()]
 
 
 def _read_text(source: Path | bytes, file_format: FileFormat) -> tuple[pd.DataFrame, dict[str, Column]]:
