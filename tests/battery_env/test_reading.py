@@ -156,7 +156,7 @@ def test_a_clock_that_starts_anew_with_each_step_is_added_up(starts, first_s):
     steps = np.cumsum(steps)
     start_s = TABLE["time"].groupby(steps).transform("first")
     table = TABLE.assign(time=TABLE["time"] - start_s + first_s, Step=steps)
-    discharge = read(table)
+    discharge = read(table, "the time starts anew with each step, and is added up")
     # what passes between two steps is not in such a file
     lost_s = sum(TABLE["time"].iloc[n] - TABLE["time"].iloc[n - 1] - first_s for n in {LOAD_ON, *starts})
     assert np.ptp(discharge.time_s) == pytest.approx(np.ptp(RECORD.time_s) - lost_s, abs=0.01 * len(starts) + 0.01)
@@ -205,6 +205,13 @@ def test_at_a_switch_the_order_of_the_rows_tells(share, row):
     expected_C = -np.trapezoid(current[:row], RECORD.time_s[:row]) - np.trapezoid(current[row:], RECORD.time_s[row:])
     expected_C -= current.iloc[row] * (RECORD.time_s[row] - RECORD.time_s[row - 1])
     assert found.charge_C == pytest.approx(expected_C, rel=4e-3)
+
+
+def test_a_fault_of_the_voltage_does_not_turn_the_sign():
+    fault = TABLE[99:100].assign(time=RECORD.time_s[99] + 1.0, voltage=0.003, current=0.0)
+    for sign in (1, -1):
+        table = pd.concat([TABLE[:100], fault, TABLE[100:]])
+        assert read(table.assign(current=sign * table["current"])).charge_C > 5000.0
 
 
 def test_what_says_other_things_at_one_time_is_refused():
@@ -296,7 +303,7 @@ def test_a_current_without_a_sign_is_refused(sign, options, order):
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize("cell", ["B0005", "B0006"])
-@pytest.mark.parametrize("rest_V", [0.2, 0.3, 0.6])
+@pytest.mark.parametrize("rest_V", [0.3, 0.45, 0.6])
 def test_the_jumps_at_the_switches_tell_the_sign_though_a_long_rest_follows(sign, cell, rest_V):
     for record in load_nasa_discharges(cell)[::24]:
         loaded = np.flatnonzero(record.current_A > 1.0)[-1] + 1
@@ -324,6 +331,26 @@ def test_the_number_of_the_cycle_parts_no_rest_from_its_load_and_no_discharge(be
         assert discharge.current_A[0] < 0.01
 
 
+def hybrid(counter):
+    """Return nine loops of a pulse of load, one of charge, a discharge and a rest, with a counter that goes up in each."""
+    loop = [(10, 2.0, 1), (40, 0.0, 5), (10, -1.5, 1), (40, 0.0, 5), (360, 2.0, 10), (600, 0.0, 60)]
+    steps = [(600, 0.0, 60), *(9 * loop)]
+    table = pd.DataFrame([(dt, amps, k) for k, (length, amps, dt) in enumerate(steps) for _ in range(length // dt)])
+    table.columns = ["dt", "amps", "step"]
+    charge_C = (table["dt"] * table["amps"]).cumsum()
+    table = pd.DataFrame({"time": table["dt"].cumsum(), "voltage": 4.19 - 1.4 * charge_C / 7200 - 0.1 * table["amps"]}).assign(
+        current=-table["amps"], Cycle=(table["step"] + 5 - counter) // 6
+    )
+    return table, charge_C.iloc[-1]
+
+
+@pytest.mark.parametrize("counter", range(6))
+def test_loops_of_pulses_are_one_discharge_wherever_the_counter_goes_up(counter):
+    table, charge_C = hybrid(counter)
+    (discharge,) = read_discharges(table)
+    assert discharge.charge_C == pytest.approx(charge_C, rel=0.02)
+
+
 @pytest.mark.parametrize("order", ["stacked", "mixed"])
 def test_the_cells_of_a_table_are_told_apart(order, tmp_path, capsys):
     other = load_nasa_discharges("B0005")[99]
@@ -338,6 +365,11 @@ def test_the_cells_of_a_table_are_told_apart(order, tmp_path, capsys):
     outcomes = list(many.calibrate_all([source], many.FileFormat(), Settings()))
     assert [(each.cell, each.record) for each in outcomes] == [("B6", "two_B6"), ("B 5", "two_B_5")]
     assert {each.meta.get("cell") for each in read_discharges(TABLE.assign(cell_id="B6"))} == {None}
+
+
+def test_lines_that_are_quoted_as_a_whole_are_read(tmp_path):
+    (tmp_path / "cell.csv").write_text("".join(f'"{line}"\n' for line in TABLE.to_csv(index=False).splitlines()))
+    same(read(tmp_path / "cell.csv"))
 
 
 def test_layers_of_rows_are_read_as_the_lowest_one(tmp_path):

@@ -186,7 +186,8 @@ def test_neware_counts_time_within_each_step(tmp_path):
         }
     )
     table.to_csv(tmp_path / "cell.csv", index=False)
-    discharge = one(tmp_path / "cell.csv")
+    with pytest.warns(UserWarning, match="the time starts anew with each step, and is added up"):
+        (discharge,) = read_discharges(tmp_path / "cell.csv")
     assert (np.diff(discharge.time_s) > 0.0).all()
     # what passes between the last row of a step and the first one of the next is not in such a file
     np.testing.assert_allclose(np.diff(discharge.time_s[2:-2]), 30.0, atol=2e-3)

@@ -37,7 +37,8 @@ _NOTHING_SHARE = 1e-3
 _LEAST_SHARE = 0.01
 # Over longer gaps than this a temperature that is missing is a guess, s.
 _TEMPERATURE_GAP_S = 600.0
-# Where the voltage comes back so near to that of the start, as a share of its fall, the cell was charged.
+# Where the voltage comes back so near to that of the start, as a share of its fall, the cell was charged; so little of the
+# fall of the whole record is a pulse.
 _BACK_SHARE = 0.25
 # What errors advise.
 _SENTENCE = re.compile(r"(?<=[^.\s]\.)\s+(?=[A-Z])")
@@ -100,15 +101,14 @@ def read_discharges(
 
     A table is a ``pandas.DataFrame``, whose index is a column too if it has a name. A file is text with a header (commas,
     semicolons, tabs or blanks, decimal points or commas, also packed as .gz, .bz2, .xz or .zip), Parquet, one of NASA's .mat
-    files, or with the extra ``cyclers`` a binary file of Neware (.nda, .ndax) or BioLogic (.mpr). Columns go by the names
-    that testers give them, the Battery Data Format's, Arbin's, Maccor's, Neware's and BioLogic's among them; their units are
-    told from the names.
+    files, with the extra ``excel`` a workbook, or with the extra ``cyclers`` a binary file of Neware (.nda, .ndax) or BioLogic
+    (.mpr). Columns go by the names that testers give them; their units are told from the names.
 
-    It may hold charges and rests as well, and many cycles. A discharge is what lies between two charges, with the rest
-    before the load; it is numbered by the cycle that is given, or else counted. If there are several, each has its own
-    clock, which starts at its first sample. Discharges whose charges are not logged are told apart by the column of the cycle
-    alone. Rows that are repeated, and lines below the table, are dropped with a warning. A temperature that is missing in some
-    rows is interpolated.
+    It may hold charges and rests as well, many cycles, and several cells if a column names them. A discharge is what lies
+    between two charges, with the rest before the load; it is numbered by the cycle that is given, or else counted. If there
+    are several, each has its own clock, which starts at its first sample. Discharges whose charges are not logged are told
+    apart by the column of the cycle alone. What is mended is said in a warning. A temperature that is missing in some rows is
+    interpolated.
 
     .. code-block:: python
 
@@ -117,11 +117,12 @@ def read_discharges(
 
     :param source: the file, or the table
     :param columns: by quantity (``time``, ``voltage``, ``current``, ``temperature``, ``ambient``, ``cycle``, ``step``,
-        ``state``), the name of its column, where the names do not tell
+        ``state``, ``cell``), the name of its column, where the names do not tell
     :param units: by quantity, its unit, where the name does not tell: ``s``, ``ms``, ``min``, ``h``; ``V``, ``mV``; ``A``,
         ``mA``; ``degC``, ``K``
-    :param discharge_is_negative: how the current of a discharge is counted; ``None``: told from the voltage, which falls where
-        a load is switched on and as charge is drawn
+    :param discharge_is_negative: how the current of a discharge is counted; ``None``: told from the voltage, which jumps
+        against a load where that is switched, or from words for charge and discharge
+    :param ignore: names of columns that are not looked at
     :return: the discharges; their ``meta`` holds ``source`` and, if there are several or they are numbered, ``cycle``. One
         that fails the checks of :class:`~battery_env.Discharge` is left out with a warning
     :raises ValueError: if there is none, the file is damaged, or it does not tell what is asked for
@@ -235,7 +236,8 @@ def _bounds(rows: pd.DataFrame) -> list[int]:
             elif after is not None:
                 low = max(bounds[-1], *(np.flatnonzero(charged[:n])[-1:] + 1), 0)
                 top_V, low_V = voltage_V[low:n].max(), voltage_V[low:n].min()
-                if top_V - voltage_V[n : min(after + 1, following)].max() < _BACK_SHARE * (top_V - low_V):
+                is_back = top_V - voltage_V[n : min(after + 1, following)].max() < _BACK_SHARE * (top_V - low_V)
+                if is_back and top_V - low_V > _BACK_SHARE * (top_V - voltage_V.min()):
                     bounds.append(n)
     return [*sorted({*bounds}), len(rows)]
 

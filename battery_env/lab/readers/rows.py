@@ -20,8 +20,9 @@ from battery_env.lab.readers.columns import REQUIRED, Column, FileFormat, direct
 from battery_env.records import REST_CURRENT_A, SWITCH_SHARE
 from battery_env.records.discharge import LEAST_SAMPLES
 
-# How plain the sign of the current must be: the correlation of its jumps with those of the voltage, or the sum of the effects
-# of current and charge on the voltage in standard deviations. In the bundled discharges it is -0.84 or clearer.
+# How plain the sign of the current must be: the share of its jumps with which the voltage jumps, less that of the others; or
+# the sum of the effects of current and charge on the voltage in standard deviations, which is -0.84 or clearer in the bundled
+# discharges.
 _CLEAR = 0.5
 # What is worth less than this share of the charge is mended; of two columns that differ by less either may be taken.
 _NOTHING_SHARE = 1e-3
@@ -205,7 +206,7 @@ def numbers(values: pd.Series, column: Column) -> FloatArray:
     if pd.api.types.is_numeric_dtype(values.dtype):
         return column.factor * values.to_numpy(dtype=np.float64, na_value=np.nan) + column.offset
     found = pd.to_numeric(values, errors="coerce")
-    bad = values[found.isna() & values.notna()]
+    bad = values[found.isna() & values.notna() & (values.astype(str).str.strip() != "")]
     if len(bad):
         advice, thousands = "", bad[bad.astype(str).str.match(_THOUSANDS)]
         if len(thousands):
@@ -337,6 +338,7 @@ def on_one_clock(rows: pd.DataFrame) -> pd.DataFrame:
     goes_on_s = time_s[np.minimum(back + 1, len(time_s) - 1)] - time_s[back - 1]
     if ((time_s[back - 1] > after_s) & (goes_on_s > 0.0) & (goes_on_s <= after_s)).any():
         return rows
+    _say("the time starts anew with each step, and is added up")
     offsets_s = np.zeros(len(time_s))
     offsets_s[new] = time_s[new - 1]
     return rows.assign(time=time_s + np.cumsum(offsets_s))
@@ -495,9 +497,9 @@ def _jumps(rows: pd.DataFrame) -> float:
     jump_A = np.diff(current_A)
     n = np.flatnonzero(np.abs(jump_A) > SWITCH_SHARE * np.abs(current_A).max())
     wide_V = voltage_V[np.minimum(n + 2, len(voltage_V) - 1)] - voltage_V[np.maximum(n - 1, 0)]
-    jump_V = voltage_V[n + 1] - voltage_V[n] + wide_V
-    size = float(np.linalg.norm(jump_A[n]) * np.linalg.norm(jump_V))
-    return float(jump_A[n] @ jump_V) / size if size > 0.0 else 0.0
+    jump_V = voltage_V[n + 1] - voltage_V[n]
+    jump_V = np.where(np.abs(wide_V) > np.abs(jump_V), wide_V, jump_V)
+    return float(np.sign(jump_A[n] * jump_V) @ np.abs(jump_A[n]) / max(np.abs(jump_A[n]).sum(), REST_CURRENT_A))
 
 
 def _effect_on_voltage(rows: pd.DataFrame) -> float:

@@ -38,6 +38,8 @@ _NUMBER = re.compile(r"^\s*[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?(?:[;\s]|$)")
 _DECIMAL_POINT = re.compile(r"^\s*[-+]?\d*\.\d+(?:[eE][-+]?\d+)?\s*$")
 # What Excel reads in the first line of a file: the delimiter.
 _DELIMITER_LINE = re.compile(r"^\s*sep=([,;\t|])\s*$", flags=re.IGNORECASE)
+# Some testers put each line as a whole in quotes.
+_QUOTED_LINES = re.compile(rb'^"[^"\n]*"\s*$', flags=re.MULTILINE)
 # So many lines below a table may be no part of it.
 _FOOT_LINES = 50
 # A table is known by so many of its first rows.
@@ -88,7 +90,12 @@ def _first_rows(table: pd.DataFrame) -> list[list[str]]:
 
 
 def _read_text(source: Path | bytes, file_format: FileFormat) -> tuple[pd.DataFrame, dict[str, Column]]:
-    layout = _layout(source[:_HEAD_BYTES] if isinstance(source, bytes) else _head(source), file_format.columns)
+    head = source[:_HEAD_BYTES] if isinstance(source, bytes) else _head(source)
+    if isinstance(source, Path) and not _QUOTED_LINES.sub(b"", head[: head.rfind(b"\n")]).strip():
+        with _open(source) as stream:
+            source = stream.read().replace(b'"', b"")
+            head = source[:_HEAD_BYTES]
+    layout = _layout(head, file_format.columns)
     columns, header_lines = find_columns(layout.names, file_format, layout.rows), layout.header_line + 1
     below = units_below(columns, layout.rows[0] if layout.rows else [])
     if below is not None:
