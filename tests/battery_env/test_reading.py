@@ -79,7 +79,7 @@ def test_a_unit_of_another_quantity_rules_a_column_out(unit, names):
 @pytest.mark.parametrize(
     ("values", "name", "said"),
     [
-        (25.0, "T1(?)", "its unit is not known"),
+        (25.0, "T1(?)", "the unit of 'T1(?)' is not known (--units temperature=UNIT). It is left out"),
         (-2501.7, "Temperature (C)", "must hold temperatures, got -2501.7 degC. It is left out"),
         ("--", "Temperature (C)", "got '--' in row 1. It is left out"),
         (297.0, "Temperature", "in kelvin, --units temperature=K says so. It is left out"),

@@ -14,100 +14,67 @@ from battery_env.checks import ZERO_CELSIUS_K
 #: What a record must have.
 REQUIRED = ("time", "voltage", "current")
 
-# By quantity, the names it goes by, as words in lower case. The first that a table has is taken: elapsed times before dates,
-# and these before the times of a step; a cell before one of its electrodes.
-_NAMES: dict[str, tuple[str, ...]] = {
-    "time": (
-        *(
-            "test time",
-            "total time",
-            "elapsed time",
-            "accumulated time",
-            "cumulative time",
-            "run time",
-            "elapsed",
-            "prog time",
-        ),
-        *(
-            "program time",
-            "program duration",
-            "programmdauer",
-            "test",
-            "time",
-            "t",
-            "relative time",
-            "testzeit",
-            "prüfzeit",
-            "gesamtzeit",
-        ),
-        *("programmzeit", "laufzeit", "zeit", "seconds", "unix time", "date time", "datetime", "timestamp", "absolute time"),
-        *("dpt time", "real time", "realtime", "date", "datum", "zeitstempel", "step time", "step duration"),
-    ),
-    "voltage": (
-        *("voltage", "cell voltage", "terminal voltage", "battery voltage", "voltage measured", "measured voltage", "volts"),
-        *("volt", "ewe ece", "ecell", "potential", "cell potential", "ewe", "u", "v", "spannung", "zellspannung"),
-        *("klemmenspannung", "batteriespannung", "u cell", "v cell", "u bat", "v bat", "u batt", "v batt", "vf"),
-    ),
-    "current": (
-        *("current", "cell current", "battery current", "current measured", "measured current", "cur", "curr", "amps", "amp"),
-        *("i", "strom", "zellstrom", "batteriestrom", "i cell", "i bat", "i batt", "im"),
-    ),
-    "temperature": (
-        *("temperature", "cell temperature", "temperature measured", "surface temperature", "surface temperature t1"),
-        *("temperature t1", "aux temperature 1", "temp", "temp 1", "t1", "temperatur", "zelltemperatur", "t cell", "t"),
-    ),
-    "ambient": ("ambient temperature", "chamber temperature", "environment temperature", "umgebungstemperatur"),
-    "cycle": (
-        *("cycle", "cycle index", "cycle number", "cycle no", "cycle count", "cycle id", "cyc", "cyc count", "cycle p"),
-        *("zyklus", "zyklusnummer"),
-    ),
-    "step": ("step count", "step", "step index", "step number", "step no", "step id", "steps", "ns", "schritt"),
-    "state": ("state", "md", "status", "step type", "mode", "zustand"),
-    "cell": (
-        *("cell id", "cell name", "cell number", "cell no", "cell", "battery id", "battery", "barcode", "serial number"),
-        *("channel", "channel id", "channel number", "zelle"),
-    ),
-    # what a record may have in place of others, or what tells more of them
-    "step_time": ("step time", "step duration", "schrittzeit", "schrittdauer", "t step"),
-    "power": ("power", "p", "leistung"),
-    "charge_step": ("dq",),
-    "counter": ("ece",),
+# By quantity, the names it goes by. The first that a table has is taken: elapsed times before dates, and these before the
+# times of a step; a cell before one of its electrodes. Below them, what may stand in their place, or tells more of them.
+_NAMES = {
+    "time": "test time, total time, elapsed time, accumulated time, cumulative time, run time, elapsed, prog time, "
+    "program time, program duration, programmdauer, test, time, t, relative time, testzeit, prüfzeit, gesamtzeit, "
+    "programmzeit, laufzeit, zeit, seconds, unix time, date time, timestamp, absolute time, dpt time, real time, date, datum, "
+    "zeitstempel, step time, step duration",
+    "voltage": "voltage, cell voltage, terminal voltage, battery voltage, voltage measured, measured voltage, volts, volt, "
+    "ewe ece, ecell, potential, cell potential, ewe, u, v, spannung, zellspannung, klemmenspannung, batteriespannung, u cell, "
+    "v cell, u bat, v bat, u batt, v batt, vf",
+    "current": "current, cell current, battery current, current measured, measured current, cur, curr, amps, amp, i, strom, "
+    "zellstrom, batteriestrom, i cell, i bat, i batt, im",
+    "temperature": "temperature, cell temperature, temperature measured, surface temperature, surface temperature t1, "
+    "temperature t1, aux temperature 1, temp, temp 1, t1, temperatur, zelltemperatur, t cell, t",
+    "ambient": "ambient temperature, chamber temperature, environment temperature, umgebungstemperatur",
+    "cycle": "cycle, cycle index, cycle number, cycle no, cycle count, cycle id, cyc, cyc count, cycle p, zyklus, "
+    "zyklusnummer",
+    "step": "step count, step, step index, step number, step no, step id, steps, ns, schritt",
+    "state": "state, md, status, step type, mode, zustand",
+    "cell": "cell id, cell name, cell number, cell no, cell, battery id, battery, barcode, serial number, channel, "
+    "channel id, channel number, zelle",
+    "step_time": "step time, step duration, schrittzeit, schrittdauer, t step",
+    "power": "power, p, leistung",
+    "charge_step": "dq",
+    "counter": "ece",
 }
 _RANKS = {
-    quantity: {name.replace(" ", ""): rank for rank, name in reversed(list(enumerate(names)))}
-    for quantity, names in _NAMES.items()
+    quantity: {name: rank for rank, name in enumerate(names.replace(" ", "").split(","))} for quantity, names in _NAMES.items()
 }
 # Names that are this quantity only where a unit says so: t may be a time, and p or q anything.
 _WITH_UNIT = {("temperature", "t"), ("power", "p"), ("charge_step", "dq"), ("counter", "ece")}
-_DEGREES = dict.fromkeys(("c", "degc", "degreec", "celsius", "deg"), (1.0, 0.0))
-_KELVIN = dict.fromkeys(("k", "kelvin"), (1.0, -ZERO_CELSIUS_K))
-_TIMES: dict[str, tuple[float, float]] = {
-    **dict.fromkeys(("s", "sec", "secs", "second", "seconds", "sek", "sekunden"), (1.0, 0.0)),
-    **dict.fromkeys(("ms", "msec", "millisecond", "milliseconds"), (1e-3, 0.0)),
-    **dict.fromkeys(("min", "mins", "minute", "minutes", "minuten"), (60.0, 0.0)),
-    **dict.fromkeys(("h", "hr", "hrs", "hour", "hours", "std", "stunden"), (3600.0, 0.0)),
-    **dict.fromkeys(("d", "day", "days", "tage"), (86400.0, 0.0)),
-    # text such as 1:02:03.5, which becomes seconds when it is read
-    **dict.fromkeys(("h:min:s.ms", "h:m:s.ms", "hh:mm:ss", "hh:mm:ss.ms", "h:m:s", "h:min:s"), (1.0, 0.0)),
-}
-_VOLTS: dict[str, tuple[float, float]] = {
-    **dict.fromkeys(("v", "volt", "volts"), (1.0, 0.0)),
-    **dict.fromkeys(("mv", "mvolt", "mvolts", "millivolt", "millivolts"), (1e-3, 0.0)),
-}
+
+
+def _units(factors: Mapping[str, float]) -> dict[str, tuple[float, float]]:
+    return {name: (factor, 0.0) for names, factor in factors.items() for name in names.split()}
+
+
+_TIMES = _units(
+    {
+        "s sec secs second seconds sek sekunden": 1.0,
+        "ms msec millisecond milliseconds": 1e-3,
+        "min mins minute minutes minuten": 60.0,
+        "h hr hrs hour hours std stunden": 3600.0,
+        "d day days tage": 86400.0,
+        # text such as 1:02:03.5, which becomes seconds when it is read
+        "h:min:s.ms h:m:s.ms hh:mm:ss hh:mm:ss.ms h:m:s h:min:s": 1.0,
+    }
+)
+_VOLTS = _units({"v volt volts": 1.0, "mv mvolt mvolts millivolt millivolts": 1e-3})
+_MILLIAMPERES = "ma mamp mamps milliamp milliamps milliampere milliamperes"
+_DEGREES = _units({"c degc degreec celsius deg": 1.0}) | dict.fromkeys(("k", "kelvin"), (1.0, -ZERO_CELSIUS_K))
 # By quantity and unit in lower case without blanks: factor and offset to s, V, A, degC, W and C.
 _UNITS: dict[str, dict[str, tuple[float, float]]] = {
     "time": _TIMES,
     "voltage": _VOLTS,
-    "current": {
-        **dict.fromkeys(("a", "amp", "amps", "ampere", "amperes"), (1.0, 0.0)),
-        **dict.fromkeys(("ma", "mamp", "mamps", "milliamp", "milliamps", "milliampere", "milliamperes"), (1e-3, 0.0)),
-        **dict.fromkeys(("ua", "\u03bca", "microamp", "microamps"), (1e-6, 0.0)),
-    },
-    "temperature": _DEGREES | _KELVIN,
-    "ambient": _DEGREES | _KELVIN,
+    "current": _units({"a amp amps ampere amperes": 1.0, _MILLIAMPERES: 1e-3, "ua \u03bca microamp microamps": 1e-6}),
+    "temperature": _DEGREES,
+    "ambient": _DEGREES,
     "step_time": _TIMES,
-    "power": {"w": (1.0, 0.0), "watt": (1.0, 0.0), "watts": (1.0, 0.0), "mw": (1e-3, 0.0)},
-    "charge_step": {"ma.h": (3.6, 0.0), "mah": (3.6, 0.0), "a.h": (3600.0, 0.0), "ah": (3600.0, 0.0)},
+    "power": _units({"w watt watts": 1.0, "mw": 1e-3}),
+    "charge_step": _units({"ma.h mah": 3.6, "a.h ah": 3600.0}),
     "counter": _VOLTS,
 }
 # What a record may have in place of a quantity.
@@ -134,7 +101,7 @@ class Column(NamedTuple):
     :param factor: what its values are multiplied with to give s, V or A, or differences of temperature in K
     :param offset: what is added then
     :param unit: as its name or the caller says, empty if neither does
-    :param words: its name without the unit, as words in lower case
+    :param words: its name without the unit, in lower case without gaps
     """
 
     position: int
@@ -232,7 +199,7 @@ def unit_of(quantity: str, unit: str) -> tuple[float, float]:
 
 def direction(state: object) -> int:
     """1 for what a tester calls a discharge, -1 for a charge, else 0."""
-    words = _words(str(state))
+    words = " ".join(_words(str(state)))
     return 1 if _DISCHARGE.search(words) else -1 if _CHARGE.search(words) else 0
 
 
@@ -242,29 +209,26 @@ def _of_words(rows: Iterable[Sequence[str]]) -> list[int]:
     return [n for n, words in enumerate(texts) if 0 < len(words) <= _FEW_WORDS and not any(map(_NUMBER.match, words))]
 
 
-def _words(name: str) -> str:
-    return " ".join(_GAP.sub(" ", name).lower().split())
-
-
-def _rank(quantity: str, words: str) -> int | None:
-    """The place of a name among those of a quantity; words may be written together."""
-    return _RANKS[quantity].get(words.replace(" ", ""))
+def _words(name: str) -> list[str]:
+    return _GAP.sub(" ", name).lower().split()
 
 
 def _split(name: str, quantity: str) -> tuple[str, str]:
-    """The words of a name and the unit in it, which may be empty."""
+    """A name in lower case without gaps, and the unit in it, which may be empty."""
     match = _IN_BRACKETS.match(name)
     if match:
         unit = next(group for group in match.group("round", "square", "slash") if group is not None)
-        return _words(match["name"]), unit.strip()
-    words, known = _words(name).split(), _UNITS.get(quantity, {})
-    if len(name) >= _LEAST_UNIT_NAME.get(quantity, 9) and (unit := "".join(words)) in known:
-        return next((each for each in _NAMES[quantity] if each in known), ""), unit
+        return "".join(_words(match["name"])), unit.strip()
+    words, known, ranks = _words(name), _UNITS.get(quantity, {}), _RANKS[quantity]
+    whole = "".join(words)
+    if len(name) >= _LEAST_UNIT_NAME.get(quantity, len(name) + 1) and whole in known:
+        return next(each for each in ranks if each in known), whole
     for cut in (1, -1, -2):  # the unit comes first, last, or last in two words, as in deg c
-        name_words, unit_words = (words[cut:], words[:cut]) if cut > 0 else (words[:cut], words[cut:])
-        if _rank(quantity, " ".join(name_words)) is not None and (unit := "".join(unit_words)) in known:
-            return " ".join(name_words), unit
-    return " ".join(words), ""
+        parts = ["".join(words[:cut]), "".join(words[cut:])]
+        unit, base = parts if cut > 0 else parts[::-1]
+        if base in ranks and unit in known:
+            return base, unit
+    return whole, ""
 
 
 def _unit(text: str, quantity: str) -> str | None:
@@ -281,7 +245,7 @@ def _unit(text: str, quantity: str) -> str | None:
 def _may_be(quantity: str, name: str) -> bool:
     """Whether a name is among those of a quantity, and its unit not among those of another."""
     words, unit = _split(name, quantity)
-    if _rank(quantity, words) is None or ((quantity, words) in _WITH_UNIT and _unit(unit, quantity) is None):
+    if words not in _RANKS[quantity] or ((quantity, words) in _WITH_UNIT and _unit(unit, quantity) is None):
         return False
     return _unit(unit, quantity) is not None or not any(_unit(unit, other) for other in _UNITS)
 
@@ -294,13 +258,11 @@ def _places(quantity: str, names: Sequence[str], chosen: str | None, unit: str |
             raise ValueError(f"there is no column {chosen!r} for the {quantity} among {', '.join(filter(None, names))}")
         return places[:1]
     split = {n: _split(name, quantity) for n, name in enumerate(names) if name and _may_be(quantity, name)}
-    places = sorted(split, key=lambda n: _rank(quantity, split[n][0]) or 0)
+    places = sorted(split, key=lambda n: _RANKS[quantity][split[n][0]])
     known = [n for n in places if unit or not split[n][1] or quantity not in _UNITS or _unit(split[n][1], quantity)]
     if places and not known and quantity not in REQUIRED:
         name = names[places[0]]
-        warnings.warn(
-            f"the column {name!r} is left out: its unit is not known. --units {quantity}=UNIT states it", stacklevel=2
-        )
+        warnings.warn(f"the unit of {name!r} is not known (--units {quantity}=UNIT). It is left out", stacklevel=2)
         return []
     places = known or places
     if quantity in REQUIRED:

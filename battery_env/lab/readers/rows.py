@@ -21,8 +21,7 @@ from battery_env.records import REST_CURRENT_A, SWITCH_SHARE
 from battery_env.records.discharge import LEAST_SAMPLES
 
 # How plain the sign of the current must be: the share of its jumps with which the voltage jumps, less that of the others; or
-# the sum of the effects of current and charge on the voltage in standard deviations, which is -0.84 or clearer in the bundled
-# discharges.
+# the correlation of the voltage with the charge that has passed.
 _CLEAR = 0.5
 # What is worth less than this share of the charge is mended; of two columns that differ by less either may be taken.
 _NOTHING_SHARE = 1e-3
@@ -98,10 +97,9 @@ def without_headers(table: pd.DataFrame, columns: Mapping[str, Column]) -> pd.Da
 
 def without_cut_line(table: pd.DataFrame, columns: Mapping[str, Column]) -> pd.DataFrame:
     """Without the last line where it is incomplete, as in a file that is being written."""
-    last = table[_measured(table)].tail(1)
-    if len(last) and last.apply(lambda each: each if each.name == "time" else pd.to_numeric(each, "coerce")).isna().any(
-        axis=None
-    ):
+    last = table.tail(1)
+    values = [last[each] if each == "time" else pd.to_numeric(last[each], errors="coerce") for each in _measured(table)]
+    if any(each.isna().any() for each in values):
         _say(f"the last line, row {last.index[0] + 1}, is incomplete, and left out")
         return table.iloc[:-1]
     return table
@@ -408,10 +406,8 @@ def _refuse_backwards(rows: pd.DataFrame) -> None:
     step_s = np.diff(time_s, prepend=time_s[:1])
     on_end = (step_s < 0.0) & (np.append(step_s[1:], 0.0) < 0.0)
     hour = np.abs(step_s + 3600.0) <= np.abs(np.median(step_s)) + _STEP_S
-    for which, advice in (
-        (on_end, "Sort the rows by time"),
-        (hour, "Clocks are put back by an hour in autumn: give times of UTC"),
-    ):
+    advice_of_hour = "Clocks are put back by an hour in autumn: give times of UTC"
+    for which, advice in ((on_end, "Sort the rows by time"), (hour, advice_of_hour)):
         if which.any():
             n = int(np.argmax(which))
             raise ValueError(
@@ -444,11 +440,8 @@ def with_signed_current(rows: pd.DataFrame, columns: Mapping[str, Column], is_ne
     """The current of a discharge is positive."""
     current_A = rows["current"]
     if not (current_A.abs() > REST_CURRENT_A).any():
-        advice = (
-            ""
-            if "current" in columns and columns["current"].unit
-            else ". If the cell is larger, state the unit of the current"
-        )
+        is_known = "current" in columns and columns["current"].unit
+        advice = "" if is_known else ". If the cell is larger, state the unit of the current"
         raise ValueError(
             f"no current flows above {REST_CURRENT_A:g} A, below which a cell rests: there is no discharge, or that of a cell "
             f"below some {1e3 * REST_CURRENT_A:g} mAh, which are not supported{advice}"
@@ -460,11 +453,11 @@ def with_signed_current(rows: pd.DataFrame, columns: Mapping[str, Column], is_ne
     if is_negative is None:
         effect = _jumps(rows)
         if not abs(effect) > _CLEAR:
-            effect = _effect_on_voltage(rows)
+            effect = _fall(rows)
         if not abs(effect) > _CLEAR:
             raise ValueError(
                 "whether the current of a discharge is positive or negative cannot be told, as the voltage neither falls "
-                f"nor rises clearly with the current and the charge (by {effect:.2f} standard deviations). State it: "
+                f"nor rises clearly with the current and the charge (correlation {effect:.2f}). State it: "
                 "--discharge-is-negative or --discharge-is-positive (Python: discharge_is_negative)"
             )
         is_negative = effect > 0.0
@@ -502,21 +495,9 @@ def _jumps(rows: pd.DataFrame) -> float:
     return float(np.sign(jump_A[n] * jump_V) @ np.abs(jump_A[n]) / max(np.abs(jump_A[n]).sum(), REST_CURRENT_A))
 
 
-def _effect_on_voltage(rows: pd.DataFrame) -> float:
-    """
-    How the voltage goes with the current, which shows where the load is switched, and with the charge that has passed,
-    which shows where it is steady: the sum of the coefficients of a linear fit within each cycle, all columns in standard
-    deviations.
-    """
-    time_s, voltage_V, current_A = (rows[name].to_numpy() for name in REQUIRED)
-    step_s = np.diff(time_s)
-    charge_C = np.append(0.0, np.cumsum(0.5 * (current_A[1:] + current_A[:-1]) * np.maximum(step_s, 0.0)))
-    cycle = np.append(0, np.cumsum((step_s < 0.0) | _changes(rows, "cycle")[1:]))
-    columns = pd.DataFrame({"current": current_A, "charge": charge_C, "voltage": voltage_V})
-    with np.errstate(over="ignore", invalid="ignore"):  # of columns that are no measurements
-        within = (columns - columns.groupby(cycle).transform("mean")).to_numpy()
-        rounding = np.finfo(np.float64).tiny + 1e-9 * np.abs(columns.to_numpy()).max(axis=0)
-        scaled = within / np.maximum(within.std(axis=0), rounding)
-    if not np.isfinite(scaled).all():
-        return float("nan")
-    return float(np.linalg.lstsq(scaled[:, :2], scaled[:, 2], rcond=None)[0].sum())
+def _fall(rows: pd.DataFrame) -> float:
+    """How the voltage goes with the charge that has passed in each cycle, -1 to 1."""
+    step_s = np.diff(rows["time"], prepend=rows["time"].iloc[0])
+    passed = pd.DataFrame({"charge": np.cumsum(rows["current"] * np.maximum(step_s, 0.0)), "voltage": rows["voltage"]})
+    within = passed - passed.groupby(np.cumsum((step_s < 0.0) | _changes(rows, "cycle"))).transform("mean")
+    return float(within["charge"].corr(within["voltage"]))
