@@ -85,7 +85,8 @@ class Recording(NamedTuple):
             except ValueError:
                 pass
         if unit:
-            return _UNIT_ADVICE.sub(",", sentence) if unit[3] else ""
+            short_or_long = f"That is too {'short' if factor > 1.0 else 'long'} for a discharge."
+            return _UNIT_ADVICE.sub(",", sentence) if unit[3] else short_or_long if quantity == "time" else ""
         return sentence.partition(_SIGN_ADVICE)[0] + "."
 
 

@@ -69,6 +69,7 @@ def _mended(table: pd.DataFrame, columns: Mapping[str, Column], file_format: Fil
         without_missing,
         with_newest_last,
         on_one_clock,
+        with_clock_going_on,
         without_repeated,
         with_steps_apart,
         without_rows_out_of_time,
@@ -342,6 +343,19 @@ def on_one_clock(rows: pd.DataFrame) -> pd.DataFrame:
     return rows.assign(time=time_s + np.cumsum(offsets_s))
 
 
+def with_clock_going_on(rows: pd.DataFrame) -> pd.DataFrame:
+    """A clock that goes back by a few rows' time where the step changes, and goes on from there, goes on from before."""
+    time_s = rows["time"].to_numpy()
+    step_s = np.diff(time_s, prepend=time_s[:1])
+    usual_s = float(np.median(step_s[1:]))
+    most_s, next_s = _MANY_TIMES * usual_s, np.append(step_s[1:], usual_s)
+    back = _changes(rows, "step") & (step_s < 0.0) & (step_s >= -most_s) & (next_s > 0.0) & (next_s <= most_s)
+    if not back.any():
+        return rows
+    _say(f"the clock goes back where the step changes, and is taken to go on by {usual_s:g} s: row {_place(rows, back)}")
+    return rows.assign(time=time_s + np.cumsum(np.where(back, usual_s - step_s, 0.0)))
+
+
 def without_repeated(rows: pd.DataFrame) -> pd.DataFrame:
     """Without rows that were written before; they are compared only where the clock does not go on, as that takes time."""
     if (np.diff(rows["time"]) > 0.0).all():
@@ -394,9 +408,9 @@ def without_rows_out_of_time(rows: pd.DataFrame) -> pd.DataFrame:
     say_other = twice.sum() > few and steps["voltage"][twice].mean() > _MANY_TIMES * usual["voltage"].mean()
     if say_other or worth_C > _NOTHING_SHARE * _passed_C(rows):
         return rows
-    for which, what in ((twice, "has the time of the row before"), (back, "lies before the time of the row before")):
+    for which, what in ((twice, "the time of the row before"), (back, "a time before that of the row before")):
         if which.any():
-            _say(f"row {_place(rows, which)} {what}, and is left out")
+            _say(f"left out with {what}: row {_place(rows, which)}")
     return kept
 
 
