@@ -31,8 +31,6 @@ _PATIENCE_S = 5
 _NO_RECORDS = ("cycles.csv",)
 # Results that an earlier command wrote among the records: tables, and voltages, which have their figure beside them.
 _TABLES, _VOLTAGE, _LIFE = ("estimate.csv", "estimate.parquet"), "_voltage", "life.png"
-
-
 # So many files that are left out are named.
 _MOST_NAMED = 10
 
@@ -93,7 +91,7 @@ def _records(folder: Path) -> list[Path]:
         if path.is_file() and not any(part.startswith(".") for part in path.relative_to(folder).parts) and not _is_result(path)
     ]
     records = [path for path in files if path.name not in _NO_RECORDS and is_readable(path, (_NASA_SUFFIX,))]
-    other = [path.relative_to(folder).as_posix() for path in files if path not in set(records)]
+    other = [path.relative_to(folder).as_posix() for path in sorted({*files} - {*records}, key=_by_number)]
     if records and other:
         more = f" and {len(other) - _MOST_NAMED} more" if len(other) > _MOST_NAMED else ""
         warnings.warn(f"{folder}: {', '.join(other[:_MOST_NAMED])}{more} left out, by their names no records", stacklevel=3)

@@ -2,6 +2,7 @@
 
 import contextlib
 import gzip
+import importlib.util
 import sys
 import types
 import warnings
@@ -168,7 +169,7 @@ def test_a_clock_that_goes_back_a_little_at_a_step_does_not_start_anew(row, back
     after = np.arange(len(TABLE)) >= row
     interval_s = RECORD.time_s[row] - RECORD.time_s[row - 1]
     table = TABLE.assign(time=RECORD.time_s - after * (interval_s + back_s), Step=1 + after)
-    found = read(table, f"the clock goes back where the step changes, and is taken to go on by 9.3")
+    found = read(table, "the clock goes back where the step changes, and is taken to go on by 9.3")
     near(found, 1e-3)
     assert len(found.time_s) == len(TABLE)
     near(read(table.drop(columns="Step"), f"left out with a time before that of the row before: row {row + 1}"), 8e-3)
@@ -386,10 +387,15 @@ def test_layers_of_rows_are_read_as_the_lowest_one(tmp_path):
             part = CYCLE[low:high]
             lines += [f",,{n},{9000 * cycle + t!r},{i!r},{v!r}" for n, (t, v, i) in enumerate(part.to_numpy().tolist())]
     (tmp_path / "cell.csv").write_text("\n".join(lines))
-    found = read_discharges(tmp_path / "cell.csv")
-    assert [each.meta["cycle"] for each in found] == [1, 2]
-    for each in found:
-        np.testing.assert_allclose(each.current_A[10:], RECORD.current_A)
+    paths = [tmp_path / "cell.csv"]
+    if importlib.util.find_spec("openpyxl"):
+        paths.append(tmp_path / "cell.xlsx")
+        pd.DataFrame([line.split(",") for line in lines]).to_excel(paths[1], header=False, index=False)
+    for path in paths:
+        found = read_discharges(path)
+        assert [each.meta["cycle"] for each in found] == [1, 2]
+        for each in found:
+            np.testing.assert_allclose(each.current_A[10:], RECORD.current_A)
 
 
 def test_the_sheet_of_a_workbook_that_holds_the_record_is_read_with_those_that_continue_it(tmp_path):

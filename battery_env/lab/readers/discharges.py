@@ -220,11 +220,11 @@ def _bounds(rows: pd.DataFrame) -> list[int]:
     bounds = [0]
     if "cycle" in rows:
         time_s, voltage_V, current_A = (rows[name].to_numpy() for name in ("time", "voltage", "current"))
-        switch_A = SWITCH_SHARE * np.abs(current_A).max()
+        switch_A, lowest_V = SWITCH_SHARE * np.abs(current_A).max(), voltage_V.min()
         charged = np.zeros(len(rows), dtype=np.bool_)
         for start, end, _, is_braking in _charges(current_A, _passed_C(time_s, current_A)):
             charged[start:end] = not is_braking and current_A[start:end].min() < -switch_A
-        under_load = np.flatnonzero(charged | (current_A > switch_A))
+        charges, under_load = np.flatnonzero(charged), np.flatnonzero(charged | (current_A > switch_A))
         changes = (np.flatnonzero(np.diff(rows["cycle"])) + 1).tolist()
         for n, following in itertools.pairwise([*changes, len(rows)]):
             k = int(np.searchsorted(under_load, n))
@@ -235,10 +235,10 @@ def _bounds(rows: pd.DataFrame) -> list[int]:
                 # a rest that is all in the cycle before belongs to the load
                 bounds.append(n if after > n else 0 if before is None else before + 1)
             elif after is not None:
-                low = max(bounds[-1], *(np.flatnonzero(charged[:n])[-1:] + 1), 0)
+                low = max(bounds[-1], *(charges[: np.searchsorted(charges, n)][-1:] + 1), 0)
                 top_V, low_V = voltage_V[low:n].max(), voltage_V[low:n].min()
                 is_back = top_V - voltage_V[n : min(after + 1, following)].max() < _BACK_SHARE * (top_V - low_V)
-                if is_back and top_V - low_V > _BACK_SHARE * (top_V - voltage_V.min()):
+                if is_back and top_V - low_V > _BACK_SHARE * (top_V - lowest_V):
                     bounds.append(n)
     return [*sorted({*bounds}), len(rows)]
 

@@ -90,6 +90,8 @@ def without_blank_rows(table: pd.DataFrame, columns: Mapping[str, Column]) -> pd
 
 def without_headers(table: pd.DataFrame, columns: Mapping[str, Column]) -> pd.DataFrame:
     """Without the header where it comes again, as in files that were put one behind the other."""
+    if any(pd.api.types.is_numeric_dtype(table[each].dtype) for each in _measured(table)):
+        return table  # no name is among numbers
     again = np.logical_and.reduce([table[each].astype(str).str.strip() == columns[each].name for each in _measured(table)])
     if again.any():
         _say(f"the header comes again, and is left out: row {_place(table, again)}")
@@ -393,11 +395,11 @@ def without_rows_out_of_time(rows: pd.DataFrame) -> pd.DataFrame:
     with a cycle.
     """
     time = rows["time"]
+    if (np.diff(time) > 0.0).all():
+        return rows
     cycle = pd.Series(np.cumsum(_changes(rows, "cycle") & (np.diff(time, prepend=-np.inf) < 0.0)), index=rows.index)
     latest = time.groupby(cycle).cummax().groupby(cycle).shift()
     twice, back = (time == latest).to_numpy(), (time < latest).to_numpy()
-    if not (twice | back).any():
-        return rows
     kept, few = rows[~(twice | back)], max(1.0, _FEW_SHARE * len(rows))
     if back.sum() > max(few, _changes(rows, "step").sum()):
         _refuse_backwards(rows)

@@ -6,6 +6,7 @@ import bz2
 import csv
 import gzip
 import io
+import itertools
 import lzma
 import re
 import warnings
@@ -261,10 +262,11 @@ def _sheet(path: Path, file_format: FileFormat) -> bytes:
         head = [[str(name) for name in row] for row in sheet.head(_HEAD_LINES).to_numpy()]
         counts = [count_required(names, file_format.columns) for names in head] or [0]
         line = int(np.argmax(counts))
-        found.append((counts[line], len(sheet), head[line : line + 1], sheet.iloc[line:]))
-    _, _, names, first = max(found, key=lambda each: each[:2])
-    parts = [sheet for _, _, each, sheet in found if each == names]
-    return pd.concat([first.head(1), *(part.iloc[1:] for part in parts)]).to_csv(header=False, index=False).encode()
+        found.append((counts[line], len(sheet), head[line : line + 1], line, sheet))
+    names = max(found, key=lambda each: each[:2])[2]
+    first, *others = [(line, sheet) for *_, each, line, sheet in found if each == names]
+    parts = [first[1], *(sheet.iloc[line + 1 :] for line, sheet in others)]
+    return pd.concat(parts).to_csv(header=False, index=False).encode()
 
 
 def _read_parquet(path: Path, file_format: FileFormat) -> tuple[pd.DataFrame, dict[str, Column]]:
@@ -279,10 +281,8 @@ def _read_parquet(path: Path, file_format: FileFormat) -> tuple[pd.DataFrame, di
     except Exception as error:
         raise ValueError(f"the file is damaged, or no Parquet: {str(error).strip()}") from error
     with file:
-        first = (
-            next(file.iter_batches(_FIRST_ROWS)).to_pandas(ignore_metadata=True) if file.metadata.num_rows else pd.DataFrame()
-        )
-        columns = find_columns(file.schema_arrow.names, file_format, _first_rows(first))
+        first = [batch.to_pandas() for batch in itertools.islice(file.iter_batches(_FIRST_ROWS), 1)]
+        columns = find_columns(file.schema_arrow.names, file_format, _first_rows(first[0]) if first else ())
         # the metadata of pandas would make an index of a column
         table = file.read(columns=sorted({column.name for column in columns.values()})).to_pandas(ignore_metadata=True)
     return pd.DataFrame({quantity: table[column.name] for quantity, column in columns.items()}), columns
