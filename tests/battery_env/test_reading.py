@@ -390,7 +390,8 @@ def test_layers_of_rows_are_read_as_the_lowest_one(tmp_path):
     paths = [tmp_path / "cell.csv"]
     if importlib.util.find_spec("openpyxl"):
         paths.append(tmp_path / "cell.xlsx")
-        pd.DataFrame([line.split(",") for line in lines]).to_excel(paths[1], header=False, index=False)
+        fields = [(line + 6 * ",").split(",")[:6] for line in lines]
+        pd.DataFrame(fields).replace("", None).to_excel(paths[1], header=False, index=False)
     for path in paths:
         found = read_discharges(path)
         assert [each.meta["cycle"] for each in found] == [1, 2]
