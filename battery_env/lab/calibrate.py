@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, overload
@@ -18,6 +18,7 @@ from battery_env.estimates import Estimate
 from battery_env.estimators.diagnosis.gaps import DRAWN, find_gaps
 from battery_env.estimators.diagnosis.rest import Start, check_initial_soc, soc_from_rest
 from battery_env.estimators.diagnosis.samples import start_condition, watched
+from battery_env.lab.readers.columns import FileFormat
 from battery_env.lab.readers.discharges import each_usable
 from battery_env.lab.report import Calibration
 from battery_env.lab.settings import Method, Settings
@@ -43,7 +44,16 @@ def calibrate(source: Discharge, settings: Settings | None = None, **options: An
 
 
 @overload
-def calibrate(source: pd.DataFrame | str | Path, settings: Settings | None = None, **options: Any) -> list[Calibration]: ...
+def calibrate(
+    source: pd.DataFrame | str | Path,
+    settings: Settings | None = None,
+    *,
+    columns: Mapping[str, str] | None = None,
+    units: Mapping[str, str] | None = None,
+    discharge_is_negative: bool | None = None,
+    ignore: Collection[str] = (),
+    **options: Any,
+) -> list[Calibration]: ...
 
 
 def calibrate(
@@ -53,6 +63,7 @@ def calibrate(
     columns: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
     discharge_is_negative: bool | None = None,
+    ignore: Collection[str] = (),
     **options: Any,
 ) -> Calibration | list[Calibration]:
     """
@@ -73,6 +84,7 @@ def calibrate(
     :param columns: of a table or a file, as ``read_discharges`` takes it
     :param units: likewise
     :param discharge_is_negative: likewise
+    :param ignore: likewise
     :param options: of :class:`Settings`, by name; ``cell`` may be what ``fit_cell`` found
     :return: what a discharge says; of a table or a file a list, in which those that cannot be used are left out with a warning
     :raises ValueError: if none can be used
@@ -80,7 +92,8 @@ def calibrate(
     settings = Settings.for_cell(**options) if settings is None else replace(settings, **options)
     if isinstance(source, Discharge):
         return _calibrated(source, settings)
-    return each_usable(lambda each: _calibrated(each, settings), source, columns, units, discharge_is_negative)
+    file_format = FileFormat(columns, units, discharge_is_negative, ignore)
+    return each_usable(lambda each: _calibrated(each, settings), source, file_format)
 
 
 class _Seen(NamedTuple):

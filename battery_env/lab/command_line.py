@@ -18,7 +18,8 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import fields
 from functools import wraps
 from importlib.resources import files
@@ -31,10 +32,11 @@ from battery_env.estimators.cell_fit import CellFit, fit_cell, read_cell
 from battery_env.estimators.diagnosis.rest import InitialSoc
 from battery_env.files import check_new, finite_or_none
 from battery_env.lab.many import calibrate_all
+from battery_env.lab.readers.columns import FileFormat
 from battery_env.lab.report import line_of, text_of
 from battery_env.lab.results import Outcome, Results
 from battery_env.lab.settings import METHODS, Settings
-from battery_env.lab.sources import FileFormat, find_sources, read_source
+from battery_env.lab.sources import find_sources, read_source
 from battery_env.lab.workers import workers
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.records import CUT_OFF_V
@@ -98,13 +100,19 @@ _FILES: _Options = {
     ("--columns",): {
         "type": _assignments,
         "metavar": "time=NAME,...",
-        "help": "names of the columns of time, voltage, current, temperature, ambient, cycle, step and state, where their "
-        "names do not tell",
+        "help": "names of the columns of time, voltage, current, temperature, ambient, cycle, step, state and cell, where "
+        "their names do not tell",
     },
     ("--units",): {
         "type": _assignments,
         "metavar": "time=UNIT,...",
         "help": "their units, where the names do not tell: s, ms, min, h; V, mV; A, mA; degC, K",
+    },
+    ("--ignore",): {
+        "action": "append",
+        "default": [],
+        "metavar": "COLUMN",
+        "help": "a column that is not looked at; may be given several times",
     },
 }
 _SIGN: _Options = {
@@ -313,8 +321,8 @@ def _add_files(parser: argparse.ArgumentParser, many: bool = True) -> None:
         "records" if many else "record",
         nargs="+" if many else None,
         metavar="FILE",
-        help="text of any delimiter, Parquet, NASA's .mat, Neware's .nda and .ndax, BioLogic's .mpr; a folder of them, or of "
-        "folders; FILE:CYCLE for one discharge of a life; or a bundled cell, B0005, and its discharge, B0005:12",
+        help="text of any delimiter, .xlsx, .xls, Parquet, NASA's .mat, Neware's .nda and .ndax, BioLogic's .mpr; a folder of "
+        "them, or of folders; FILE:CYCLE for one discharge of a life; or a bundled cell, B0005, and its discharge, B0005:12",
     )
     group = parser.add_argument_group("reading")
     _add(group, _FILES)
@@ -367,7 +375,8 @@ def calibrate(arguments: Sequence[str] | None = None, name: str = _INSTALLED) ->
     interrupted = False
     settings = _settings(options)
     settings.calibrator()  # what it refuses it refuses of every file
-    sources = find_sources(options.records, options.cell_name)
+    with _saying():
+        sources = find_sources(options.records, options.cell_name)
     results = Results(options.out, sources, not options.table_only, options.force) if options.out else None
     try:
         with workers(options.jobs, options.scheduler) as executor:
@@ -392,7 +401,7 @@ def calibrate(arguments: Sequence[str] | None = None, name: str = _INSTALLED) ->
 
 
 def _file_format(options: argparse.Namespace) -> FileFormat:
-    return FileFormat(options.columns, options.units, options.discharge_is_negative)
+    return FileFormat(options.columns, options.units, options.discharge_is_negative, options.ignore)
 
 
 def _settings(options: argparse.Namespace) -> Settings:
@@ -450,13 +459,8 @@ def forecast(arguments: Sequence[str] | None = None, name: str = "python -m batt
     if options.life and settings.prior_q_mobile_C is not None:
         raise ValueError("--life and --prior say the same: give one of them")
     files = EndFiles(options.out, options.record) if options.out else None
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        try:
-            end = end_of_record(options.record, settings, file_format, options.life, options.load)
-        finally:
-            for each in caught:
-                print(f"warning: {each.message}", file=sys.stderr)
+    with _saying():
+        end = end_of_record(options.record, settings, file_format, options.life, options.load)
     print(json.dumps(end.row()) if options.json else end.text())
     if files:
         files.write(end)
@@ -465,22 +469,35 @@ def forecast(arguments: Sequence[str] | None = None, name: str = "python -m batt
     return NOT_SETTLED if end.contradicted else SETTLED
 
 
+@contextmanager
+def _saying(name: str = "") -> Iterator[None]:
+    """Prints the warnings of what is done within."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            yield
+        finally:
+            for each in caught:
+                print(f"warning: {name}{each.message}", file=sys.stderr)
+
+
 def _discharges(records: Sequence[str], file_format: FileFormat) -> list[Discharge]:
     """All that the arguments name, each with the name of its file and the number that it is shown by."""
     discharges = []
-    for source in find_sources(records):
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
+    with _saying():
+        sources = find_sources(records)
+    for source in sources:
+        with _saying(f"{source.argument}: "):
             try:
                 recordings = read_source(source, file_format)
+                if len(cells := {str(each.meta.get("cell")) for each in recordings}) > 1:
+                    raise ValueError(f"these are discharges of {' and '.join(sorted(cells))}: give those of one cell")
                 for number, recording in enumerate(recordings, start=1):
                     meta = {"cycle": number, **recording.meta, "cell": source.stem}
                     discharges.append(recording._replace(meta=meta).discharge())
             except Exception as error:  # readers of files raise what they like
                 text = " ".join(str(error).split())
                 raise ValueError(text if source.path in text else f"{source.argument}: {text}") from error
-        for each in caught:
-            print(f"warning: {source.argument}: {each.message}", file=sys.stderr)
     return discharges
 
 

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from typing import Any
 
 from battery_env.lab.calibrate import calibrate
+from battery_env.lab.readers.columns import FileFormat
 from battery_env.lab.readers.discharges import Recording
 from battery_env.lab.report import Calibration
 from battery_env.lab.results import Outcome, Results, voltages_of
 from battery_env.lab.settings import Settings
-from battery_env.lab.sources import FileFormat, Source, find_sources, read_source, record_name
+from battery_env.lab.sources import Source, find_sources, read_source, record_name
 from battery_env.lab.workers import Attempt, InThisProcess, attempt, in_order
 
 __all__ = ["FileFormat", "Outcome", "Source", "calibrate_all", "find_sources"]
@@ -59,10 +61,16 @@ def _recordings(read: Iterable[tuple[tuple[Any, ...], Attempt]]) -> Iterator[tup
     for (source, _), (recordings, notes, error) in read:
         if error and source.path not in error:
             error = f"{source.path}: {error}"
+        is_one = bool(error) or len({each.meta.get("cell") for each in recordings}) == 1
         for recording in [None] if error else recordings:
-            cycle = source.cycle if recording is None else recording.meta.get("cycle")
-            name = _unused(record_name(source.stem, cycle), used)
-            yield Outcome(name, source.path, source.cell, cycle, notes="; ".join(notes), error=error), recording
+            cycle, stem, cell = source.cycle, source.stem, source.cell
+            if recording is not None:
+                cycle = recording.meta.get("cycle")
+                if not is_one:  # a table of several cells names them
+                    cell = recording.meta["cell"]
+                    stem = "_".join((stem, *re.findall(r"[\w.-]+", cell)))
+            name = _unused(record_name(stem, cycle), used)
+            yield Outcome(name, source.path, cell, cycle, notes="; ".join(notes), error=error), recording
 
 
 def _unused(name: str, used: set[str]) -> str:

@@ -13,7 +13,7 @@ import pandas as pd
 
 from battery_env.files import check_folder, replacing
 from battery_env.lab.report import METHOD_NAMES, Calibration, title_of
-from battery_env.lab.sources import TABLES, VOLTAGE, Source, record_name
+from battery_env.lab.sources import LIFE, TABLES, VOLTAGE, Source, record_name
 
 # Discharges that could not be used have no values there.
 _TYPES = {"cycle": "Int64", "settled": "boolean", "settled_q_mobile": "boolean", "settled_r_o": "boolean"}
@@ -26,7 +26,7 @@ class Results:
         self.folder, self.with_voltages = folder, with_voltages
         prefix = f"{record_name(sources[0].stem, sources[0].cycle)}_" if len(sources) == 1 else ""
         self.table, self.parquet = (folder / f"{prefix}{name}" for name in TABLES)
-        self.life = folder / f"{prefix}life.png"
+        self.life = folder / f"{prefix}{LIFE}"
         check_folder(folder)
         existing = self._existing(sources)
         if existing and not replace:

@@ -24,9 +24,10 @@ from battery_env.files import check_new, finite_or_none, replacing
 from battery_env.lab.calibrate import calibrate
 from battery_env.lab.forecast import BAND, Forecast, FutureLoad, forecast, quantile
 from battery_env.lab.life import Life, track_life
+from battery_env.lab.readers.columns import FileFormat
 from battery_env.lab.report import Calibration
 from battery_env.lab.settings import Settings
-from battery_env.lab.sources import FileFormat, Source, find_sources, read_source, record_name
+from battery_env.lab.sources import Source, find_sources, read_source, record_name
 from battery_env.loads import Load
 from battery_env.plotting import save_figure
 from battery_env.records import VARIED_SHARE

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass
+import warnings
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import NamedTuple
 
+from battery_env.lab.readers.columns import FileFormat
 from battery_env.lab.readers.discharges import Recording, read_recordings
-from battery_env.lab.readers.tables import BINARY_SUFFIXES, PACKED_SUFFIXES, TEXT_SUFFIXES, is_readable
+from battery_env.lab.readers.tables import BINARY_SUFFIXES, NUMBERED_SUFFIXES, PACKED_SUFFIXES, TEXT_SUFFIXES, is_readable
 from battery_env.records.discharge import BUNDLED_CELLS, load_nasa_discharges
 
 #: Results that an earlier command wrote among the records: tables, and voltages, which have their figure beside them.
-TABLES, VOLTAGE = ("estimate.csv", "estimate.parquet"), "_voltage"
+TABLES, VOLTAGE, LIFE = ("estimate.csv", "estimate.parquet"), "_voltage", "life.png"
 _NASA_SUFFIX = ".mat"
 # What NASA's discharges have beside them, in the layout of the bundled ones, is a table of tests and no record.
 _NO_RECORDS = ("cycles.csv",)
+# So many files that are left out are named.
+_MOST_NAMED = 10
 
 
 class Source(NamedTuple):
@@ -39,21 +42,6 @@ class Source(NamedTuple):
     def argument(self) -> str:
         """As on the command line."""
         return self.path if self.cycle is None else f"{self.path}:{self.cycle}"
-
-
-@dataclass(frozen=True)
-class FileFormat:
-    """
-    What files do not tell of themselves, see :func:`battery_env.read_discharges`.
-
-    :param columns: by quantity, the name of its column
-    :param units: by quantity, its unit
-    :param discharge_is_negative: how the file counts the current of a discharge; ``None``: told from the voltage
-    """
-
-    columns: Mapping[str, str] | None = None
-    units: Mapping[str, str] | None = None
-    discharge_is_negative: bool | None = None
 
 
 def find_sources(arguments: Iterable[str], cell_name: re.Pattern[str] | None = None) -> list[Source]:
@@ -81,17 +69,21 @@ def find_sources(arguments: Iterable[str], cell_name: re.Pattern[str] | None = N
 
 
 def _records(folder: Path) -> list[Path]:
-    """The files in a folder, and in those in it, that may be records; their numbers count, so that 2 comes before 10."""
-    records = (
+    """
+    The files in a folder, and in those in it, that may be records; their numbers count, so that 2 comes before 10. What is
+    neither a record nor a result is named.
+    """
+    files = [
         path
-        for path in folder.rglob("*")
-        if path.is_file()
-        and not any(part.startswith(".") for part in path.relative_to(folder).parts)
-        and path.name not in _NO_RECORDS
-        and not _is_result(path)
-        and is_readable(path, (_NASA_SUFFIX,))
-    )
-    return sorted(records, key=_by_number)
+        for path in sorted(folder.rglob("*"), key=_by_number)
+        if path.is_file() and not any(part.startswith(".") for part in path.relative_to(folder).parts) and not _is_result(path)
+    ]
+    records = [path for path in files if path.name not in _NO_RECORDS and is_readable(path, (_NASA_SUFFIX,))]
+    other = [path.relative_to(folder).as_posix() for path in sorted({*files} - {*records}, key=_by_number)]
+    if records and other:
+        more = f" and {len(other) - _MOST_NAMED} more" if len(other) > _MOST_NAMED else ""
+        warnings.warn(f"{folder}: {', '.join(other[:_MOST_NAMED])}{more} left out, by their names no records", stacklevel=3)
+    return records
 
 
 def _by_number(path: Path) -> tuple[list[list[str | int]], Path]:
@@ -110,13 +102,15 @@ def _names(file: Path, folders: Collection[Path]) -> tuple[str, str]:
 
 
 def _is_result(path: Path) -> bool:
-    is_table = path.name in TABLES or path.name.endswith(tuple(f"_{name}" for name in TABLES))
-    return is_table or (path.name.endswith(f"{VOLTAGE}.csv") and path.with_suffix(".png").exists())
+    names = (*TABLES, LIFE)
+    is_table = path.name in names or path.name.endswith(tuple(f"_{name}" for name in names))
+    pair = [path.with_suffix(suffix) for suffix in (".csv", ".png")]
+    return is_table or (path.stem.endswith(VOLTAGE) and path in pair and all(each.exists() for each in pair))
 
 
 def _stem(path: Path) -> str:
     name = path.name
-    for suffixes in (PACKED_SUFFIXES, (*TEXT_SUFFIXES, *BINARY_SUFFIXES, _NASA_SUFFIX), (".bdf",)):
+    for suffixes in (PACKED_SUFFIXES, (*TEXT_SUFFIXES, *NUMBERED_SUFFIXES, *BINARY_SUFFIXES, _NASA_SUFFIX), (".bdf",)):
         for suffix in suffixes:
             if name.lower().endswith(suffix) and len(name) > len(suffix):
                 name = name[: -len(suffix)]
@@ -140,7 +134,7 @@ def read_source(source: Source, file_format: FileFormat) -> list[Recording]:
             f"no file {source.argument!r}; the bundled cells are given as {BUNDLED_CELLS[0]}:1, {BUNDLED_CELLS[0]}:2, ..."
         )
     else:
-        recordings = read_recordings(path, file_format.columns, file_format.units, file_format.discharge_is_negative)
+        recordings = read_recordings(path, file_format)
     if cycle is None:
         return recordings
     chosen = [recording for recording in recordings if recording.meta.get("cycle") == cycle]

@@ -99,8 +99,8 @@ def test_columns_go_by_the_names_of_testers_and_units_are_told_from_them(columns
 
 def test_columns_of_unknown_names_with_blanks_are_named_as_the_file_has_them(tmp_path):
     lines = rows(TIME_S / 60, 1e3 * VOLTAGE_V, 1e3 * CURRENT_A, decimal=",", delimiter=";")
-    (tmp_path / "cell.csv").write_text("\n".join(["Zeit [min];Spannung [mV];Strom [mA]", *lines]))
-    with pytest.raises(ValueError, match=re.escape("Zeit [min], Spannung [mV], Strom [mA]")):
+    (tmp_path / "cell.csv").write_text("\n".join(["Tempo [min];Tensione [mV];Corrente [mA]", *lines]))
+    with pytest.raises(ValueError, match=re.escape("Tempo [min], Tensione [mV], Corrente [mA]")):
         read_discharges(tmp_path / "cell.csv")
     # two words of which are names of other files' columns
     (tmp_path / "cell.csv").write_text("Time (s),Cell Voltage (V),Load Current (A)\n0.0,4.2,0.0\n")
@@ -186,7 +186,8 @@ def test_neware_counts_time_within_each_step(tmp_path):
         }
     )
     table.to_csv(tmp_path / "cell.csv", index=False)
-    discharge = one(tmp_path / "cell.csv")
+    with pytest.warns(UserWarning, match="the time starts anew with each step, and is added up"):
+        (discharge,) = read_discharges(tmp_path / "cell.csv")
     assert (np.diff(discharge.time_s) > 0.0).all()
     # what passes between the last row of a step and the first one of the next is not in such a file
     np.testing.assert_allclose(np.diff(discharge.time_s[2:-2]), 30.0, atol=2e-3)
@@ -260,7 +261,7 @@ def test_columns_and_units_can_be_stated(tmp_path):
         ({}, r"no column for the time, the voltage, the current among x, Voltage 1, .*--columns time=NAME"),
         ({"columns": columns | {"time": "y"}}, "there is no column 'y' for the time among x, Voltage 1"),
         ({"columns": columns, "units": {"time": "furlong"}}, "the unit 'furlong' of the column 'x' is not known for the time"),
-        ({"columns": {"power": "x"}}, r"columns knows time, voltage, .*, got power"),
+        ({"columns": {"energy": "x"}}, r"columns knows time, voltage, .*, got energy"),
     ):
         with pytest.raises(ValueError, match=message):
             read_discharges(path, **options)
@@ -341,10 +342,9 @@ def test_discharges_whose_charges_are_not_logged_need_a_number(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"voltage_V": 1e3 * VOLTAGE_V}, r"voltage_V must lie within 0 \.\. 5.5 V, got 4190.*not in mV"),
-        ({"time_s": np.where(TIME_S == 40.0, 10.0, TIME_S)}, "time_s must increase from sample to sample.*each sample once"),
-        ({"time_s": TIME_S / 3600.0}, "Give the time in seconds, not in hours .*--units time=h"),
-        ({"time_s": 1e3 * TIME_S}, "Give the time in seconds, not in milliseconds .*--units time=ms"),
+        ({"voltage_V": 1e3 * VOLTAGE_V}, r"voltage_V must lie within 0 \.\. 5.5 V, got 4190 .*one cell, not that of a pack"),
+        ({"time_s": TIME_S - TIME_S % 300.0}, "time_s must increase from sample to sample.*each sample once"),
+        ({"time_s": TIME_S / 3600.0}, "time_s must span .* got 0.508333 s."),
         (
             {"time_s": [clock(time_s)[:5] for time_s in TIME_S]},
             "time_s must increase .*with a clock that tells it from the next",
@@ -356,9 +356,8 @@ def test_discharges_whose_charges_are_not_logged_need_a_number(tmp_path):
         ),
         ({"current_A": 0.01 * np.sin(TIME_S)}, r"no current flows above 0\.02 A, .*: there is no discharge"),
         ({"voltage_V": 3.7}, "whether the current of a discharge is positive or negative cannot be told"),
-        ({"Voltage(V)": VOLTAGE_V}, "both 'voltage_V' and 'Voltage.V.' may be the voltage"),
+        ({"Voltage(V)": VOLTAGE_V - 0.1}, "both 'voltage_V' and 'Voltage.V.' may be the voltage"),
         ({"current_A": np.abs(np.sin(TIME_S)), "voltage_V": 3.7 + 0.3 * np.cos(TIME_S)}, "cannot be told"),
-        ({"cycle": 1.5}, "the column of the cycle must hold whole numbers"),
         (
             {"time_s": [f"{1e3 * time_s:,.1f}" for time_s in TIME_S]},
             "'time_s' must hold numbers, got '5,000.0' in row 2. Write numbers without separators of thousands",
@@ -391,7 +390,7 @@ CUT_SHORT = gzip.compress(b"time_s,voltage_V,current_A\n" + 200_000 * b"1,4.1,2\
         ("picture.csv", b"\x89PNG\x00\x00", "binary"),
         ("cell.parquet", b"PAR1", "damaged, or no Parquet"),
         ("cell.mat", b"MATLAB", "damaged"),
-        ("cell.xlsx", b"PK", "save the sheet as CSV"),
+        ("cell.h5", b"HDF", "export the records as CSV"),
     ],
 )
 def test_what_is_no_table_is_refused_in_one_line(name, content, message, tmp_path):

@@ -3,57 +3,93 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
+from unicodedata import normalize
 
 from battery_env.checks import ZERO_CELSIUS_K
 
 #: What a record must have.
 REQUIRED = ("time", "voltage", "current")
 
-# By quantity, the names it goes by, written in lower case with single spaces. The first that a table has is taken: elapsed
-# times before those of a step, and times before dates.
-_NAMES: dict[str, tuple[str, ...]] = {
-    "time": (
-        *("test time", "total time", "elapsed time", "accumulated time", "run time", "test", "time", "t", "relative time"),
-        *("unix time", "date time", "datetime", "timestamp", "absolute time", "dpt time", "real time", "realtime", "date"),
-    ),
-    "voltage": ("voltage", "cell voltage", "terminal voltage", "voltage measured", "volts", "volt", "ecell", "ewe", "u", "v"),
-    "current": ("current", "cell current", "current measured", "amps", "amp", "i"),
-    "temperature": (
-        *("temperature", "cell temperature", "temperature measured", "surface temperature", "surface temperature t1"),
-        *("temperature t1", "aux temperature 1", "temp", "temp 1", "t1"),
-    ),
-    "ambient": ("ambient temperature",),
-    "cycle": ("cycle", "cycle index", "cycle number", "cycle count", "cycle id", "cyc", "cycle p"),
-    "step": ("step count", "step", "step index", "step number", "step id", "steps", "ns"),
-    "state": ("state", "md", "status", "step type"),
+# By quantity, the names it goes by. The first that a table has is taken: elapsed times before dates, and these before the
+# times of a step; a cell before one of its electrodes. Below them, what may stand in their place, or tells more of them.
+_NAMES = {
+    "time": "test time, total time, elapsed time, accumulated time, cumulative time, run time, elapsed, prog time, "
+    "program time, program duration, programmdauer, test, time, t, relative time, testzeit, prüfzeit, gesamtzeit, "
+    "programmzeit, laufzeit, zeit, seconds, unix time, date time, timestamp, absolute time, dpt time, real time, date, datum, "
+    "zeitstempel, step time, step duration",
+    "voltage": "voltage, cell voltage, terminal voltage, battery voltage, voltage measured, measured voltage, volts, volt, "
+    "ewe ece, ecell, potential, cell potential, ewe, u, v, spannung, zellspannung, klemmenspannung, batteriespannung, u cell, "
+    "v cell, u bat, v bat, u batt, v batt, vf",
+    "current": "current, cell current, battery current, current measured, measured current, cur, curr, amps, amp, i, strom, "
+    "zellstrom, batteriestrom, i cell, i bat, i batt, im",
+    "temperature": "temperature, cell temperature, temperature measured, surface temperature, surface temperature t1, "
+    "temperature t1, aux temperature 1, temp, temp 1, t1, temperatur, zelltemperatur, t cell, t",
+    "ambient": "ambient temperature, chamber temperature, environment temperature, umgebungstemperatur",
+    "cycle": "cycle, cycle index, cycle number, cycle no, cycle count, cycle id, cyc, cyc count, cycle p, zyklus, "
+    "zyklusnummer",
+    "step": "step count, step, step index, step number, step no, step id, steps, ns, schritt",
+    "state": "state, md, status, step type, mode, zustand",
+    "cell": "cell id, cell name, cell number, cell no, cell, battery id, battery, barcode, serial number, channel, "
+    "channel id, channel number, zelle",
+    "step_time": "step time, step duration, schrittzeit, schrittdauer, t step",
+    "power": "power, p, leistung",
+    "charge_step": "dq",
+    "counter": "ece",
 }
-_DEGREES = dict.fromkeys(("c", "°c", "degc", "deg c", "celsius"), (1.0, 0.0))
-_KELVIN = dict.fromkeys(("k", "kelvin"), (1.0, -ZERO_CELSIUS_K))
-# By quantity and unit in lower case: factor and offset to s, V, A and degC.
-_UNITS: dict[str, dict[str, tuple[float, float]]] = {
-    "time": {
-        **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), (1.0, 0.0)),
-        **dict.fromkeys(("ms", "millisecond", "milliseconds"), (1e-3, 0.0)),
-        **dict.fromkeys(("min", "mins", "minute", "minutes"), (60.0, 0.0)),
-        **dict.fromkeys(("h", "hr", "hrs", "hour", "hours"), (3600.0, 0.0)),
+_RANKS = {
+    quantity: {name: rank for rank, name in enumerate(names.replace(" ", "").split(","))} for quantity, names in _NAMES.items()
+}
+# Names that are this quantity only where a unit says so: t may be a time, and p or q anything.
+_WITH_UNIT = {("temperature", "t"), ("power", "p"), ("charge_step", "dq"), ("counter", "ece")}
+
+
+def _units(factors: Mapping[str, float]) -> dict[str, tuple[float, float]]:
+    return {name: (factor, 0.0) for names, factor in factors.items() for name in names.split()}
+
+
+_TIMES = _units(
+    {
+        "s sec secs second seconds sek sekunden": 1.0,
+        "ms msec millisecond milliseconds": 1e-3,
+        "min mins minute minutes minuten": 60.0,
+        "h hr hrs hour hours std stunden": 3600.0,
+        "d day days tage": 86400.0,
         # text such as 1:02:03.5, which becomes seconds when it is read
-        **dict.fromkeys(("h:min:s.ms", "h:m:s.ms", "hh:mm:ss", "hh:mm:ss.ms", "h:m:s", "h:min:s"), (1.0, 0.0)),
-    },
-    "voltage": {
-        **dict.fromkeys(("v", "volt", "volts"), (1.0, 0.0)),
-        **dict.fromkeys(("mv", "millivolt", "millivolts"), (1e-3, 0.0)),
-    },
-    "current": {
-        **dict.fromkeys(("a", "amp", "amps", "ampere", "amperes"), (1.0, 0.0)),
-        **dict.fromkeys(("ma", "milliamp", "milliamps", "milliampere", "milliamperes"), (1e-3, 0.0)),
-        **dict.fromkeys(("ua", "µa", "μa", "microamp", "microamps"), (1e-6, 0.0)),
-    },
-    "temperature": _DEGREES | _KELVIN,
-    "ambient": _DEGREES | _KELVIN,
+        "h:min:s.ms h:m:s.ms hh:mm:ss hh:mm:ss.ms h:m:s h:min:s": 1.0,
+    }
+)
+_VOLTS = _units({"v volt volts": 1.0, "mv mvolt mvolts millivolt millivolts": 1e-3})
+_MILLIAMPERES = "ma mamp mamps milliamp milliamps milliampere milliamperes"
+_DEGREES = _units({"c degc degreec celsius deg": 1.0}) | dict.fromkeys(("k", "kelvin"), (1.0, -ZERO_CELSIUS_K))
+# By quantity and unit in lower case without blanks: factor and offset to s, V, A, degC, W and C.
+_UNITS: dict[str, dict[str, tuple[float, float]]] = {
+    "time": _TIMES,
+    "voltage": _VOLTS,
+    "current": _units({"a amp amps ampere amperes": 1.0, _MILLIAMPERES: 1e-3, "ua \u03bca microamp microamps": 1e-6}),
+    "temperature": _DEGREES,
+    "ambient": _DEGREES,
+    "step_time": _TIMES,
+    "power": _units({"w watt watts": 1.0, "mw": 1e-3}),
+    "charge_step": _units({"ma.h mah": 3.6, "a.h ah": 3600.0}),
+    "counter": _VOLTS,
 }
-_UNIT = re.compile(r"^(?P<name>.*?)\s*(?:\((?P<round>[^()]*)\)|\[(?P<square>[^][]*)\]|/\s*(?P<slash>[^/]+))\s*$")
+# What a record may have in place of a quantity.
+_INSTEAD = {"current": ("power", "charge_step")}
+_IN_BRACKETS = re.compile(r"^(?P<name>.*?)\s*(?:\((?P<round>[^()]*)\)|\[(?P<square>[^][]*)\]|/\s*(?P<slash>[^/]+))\s*$")
+# Words end at a capital, too, as in TestTime.
+_GAP = re.compile(r"(?<=[a-zäöü])(?=[A-ZÄÖÜ])|[_\-\s.#<>~]+")
+# The sign of a degree, and what is left of it after another encoding.
+_DEGREE_SIGN = re.compile("^[Ââ]?[°º˚\ufffd?]")
+# So long are names that are a unit, as mV; a shorter one may be anything, as min.
+_LEAST_UNIT_NAME = {"time": 4, "voltage": 2, "current": 2}
+# What testers call the steps in which a cell is discharged, and those of other words in which it is charged.
+_DISCHARGE, _CHARGE = re.compile(r"\bd\b|\bdis\b|dch|disch|entlad"), re.compile(r"\bc\b|ch|lad")
+_NUMBER = re.compile(r"[-+.\d][-+.,:/\deE\sT]*$|nan$|true$|false$", flags=re.IGNORECASE)
+_FEW_WORDS = 20
 
 
 class Column(NamedTuple):
@@ -64,36 +100,68 @@ class Column(NamedTuple):
     :param name: as the table has it
     :param factor: what its values are multiplied with to give s, V or A, or differences of temperature in K
     :param offset: what is added then
+    :param unit: as its name or the caller says, empty if neither does
+    :param words: its name without the unit, in lower case without gaps
     """
 
     position: int
     name: str
     factor: float = 1.0
     offset: float = 0.0
+    unit: str = ""
+    words: str = ""
+
+
+@dataclass(frozen=True)
+class FileFormat:
+    """
+    What files do not tell of themselves, see :func:`battery_env.read_discharges`.
+
+    :param columns: by quantity, the name of its column
+    :param units: by quantity, its unit
+    :param discharge_is_negative: how the file counts the current of a discharge; ``None``: told from the voltage
+    :param ignore: names of columns that are not looked at
+    """
+
+    columns: Mapping[str, str] | None = None
+    units: Mapping[str, str] | None = None
+    discharge_is_negative: bool | None = None
+    ignore: Collection[str] = ()
 
 
 def find_columns(
-    names: Sequence[str], chosen: Mapping[str, str] | None = None, units: Mapping[str, str] | None = None
+    names: Sequence[str], file_format: FileFormat | None = None, rows: Iterable[Sequence[str]] = ()
 ) -> dict[str, Column]:
     """
-    The columns of a record. A unit is told from the name, as in ``Current(mA)``, ``Voltage / V``, ``time[min]`` or
-    ``test_time_second``; a name without one is in s, V, A or degC.
+    The columns of a record. A unit is told from the name, as in ``Current(mA)``, ``Voltage / V``, ``mAmps`` or
+    ``test_time_second``; a name without one is in s, V, A or degC. A unit of another quantity rules a column out.
+
+    :param names: of all columns
+    :param file_format: what is known of them
+    :param rows: the first rows; columns of words may say which of them are charges
+    :return: by quantity; columns that may serve as well have its name and a number, as ``time 2``
     """
-    chosen, units = dict(chosen or {}), dict(units or {})
+    file_format = file_format or FileFormat()
+    chosen, units, ignore = file_format.columns or {}, file_format.units or {}, [name.strip() for name in file_format.ignore]
     for option, given in (("columns", chosen), ("units", units)):
         if unknown := set(given) - set(_NAMES):
             raise ValueError(f"{option} knows {', '.join(_NAMES)}, got {', '.join(sorted(unknown))}")
-    split = {quantity: [_split(str(name), quantity) for name in names] for quantity in _NAMES}
+    kept = [name if (name := str(each).strip()) not in ignore else "" for each in names]
     found: dict[str, Column] = {}
-    for quantity, parts in split.items():
-        position = _position(quantity, names, [name for name, _ in parts], chosen.get(quantity))
-        if position is not None:
-            unit = units.get(quantity, parts[position][1])
-            found[quantity] = Column(position, str(names[position]), *_scale(quantity, unit, str(names[position])))
-    missing = [quantity for quantity in REQUIRED if quantity not in found]
+    for quantity in _NAMES:
+        if "current" in found and quantity in _INSTEAD["current"]:
+            continue
+        places = _places(quantity, kept, chosen.get(quantity), units.get(quantity))
+        if quantity == "state":
+            places += [n for n in _of_words(row for row in rows if len(row) == len(kept)) if kept[n] and n not in places]
+        for number, place in enumerate(places, start=1):
+            words, unit = _split(kept[place], quantity)
+            column = Column(place, kept[place], *_scale(quantity, units.get(quantity, unit), kept[place]), words)
+            found[quantity if number == 1 else f"{quantity} {number}"] = column
+    missing = [quantity for quantity in REQUIRED if not {quantity, *_INSTEAD.get(quantity, ())} & set(found)]
     if missing:
         raise ValueError(
-            f"no column for the {', the '.join(missing)} among {', '.join(str(name) for name in names)}. Say which it is: "
+            f"no column for the {', the '.join(missing)} among {', '.join(map(str, names))}. Say which it is: "
             f"--columns {','.join(f'{quantity}=NAME' for quantity in missing)} (Python: columns)"
         )
     return found
@@ -103,12 +171,12 @@ def units_below(columns: Mapping[str, Column], fields: Sequence[str]) -> dict[st
     """The units in the line below a header, where some testers write them."""
     found = {}
     for quantity, column in columns.items():
-        unit = fields[column.position].strip("[]() ").lower() if column.position < len(fields) else ""
-        if unit in _UNITS.get(quantity, {}):
+        unit = _unit(fields[column.position].strip("[]() "), quantity) if column.position < len(fields) else None
+        if unit is not None:
             found[quantity] = unit
         elif quantity in REQUIRED:
             return None
-    return {quantity: unit for quantity, unit in found.items() if not _split(columns[quantity].name, quantity)[1]}
+    return {quantity: unit for quantity, unit in found.items() if quantity in _UNITS and not columns[quantity].unit}
 
 
 def count_required(names: Sequence[str], chosen: Mapping[str, str] | None = None) -> int:
@@ -118,54 +186,97 @@ def count_required(names: Sequence[str], chosen: Mapping[str, str] | None = None
         (
             any(str(name).strip() == chosen[quantity] for name in names)
             if quantity in chosen
-            else any(_split(str(name), quantity)[0] in _NAMES[quantity] for name in names)
+            else any(_may_be(each, str(name)) for each in (quantity, *_INSTEAD.get(quantity, ())) for name in names)
         )
         for quantity in REQUIRED
     )
 
 
+def unit_of(quantity: str, unit: str) -> tuple[float, float]:
+    """What the values of a quantity in some unit are multiplied with, and what is added then."""
+    return _UNITS[quantity][unit.lower()]
+
+
+def direction(state: object) -> int:
+    """1 for what a tester calls a discharge, -1 for a charge, else 0."""
+    words = " ".join(_words(str(state)))
+    return 1 if _DISCHARGE.search(words) else -1 if _CHARGE.search(words) else 0
+
+
+def _of_words(rows: Iterable[Sequence[str]]) -> list[int]:
+    """Columns of a few words."""
+    texts = [{text for value in values if (text := value.strip())} for values in zip(*rows, strict=False)]
+    return [n for n, words in enumerate(texts) if 0 < len(words) <= _FEW_WORDS and not any(map(_NUMBER.match, words))]
+
+
+def _words(name: str) -> list[str]:
+    return _GAP.sub(" ", name).lower().split()
+
+
 def _split(name: str, quantity: str) -> tuple[str, str]:
-    """A name in lower case with single spaces, and the unit in it, which may be empty."""
-    match = _UNIT.match(name)
+    """A name in lower case without gaps, and the unit in it, which may be empty."""
+    match = _IN_BRACKETS.match(name)
     if match:
         unit = next(group for group in match.group("round", "square", "slash") if group is not None)
-        return _plain(match["name"]), unit.strip().lower()
-    plain = _plain(name)
-    base, _, last = plain.rpartition(" ")
-    if base in _NAMES[quantity] and last in _UNITS.get(quantity, {}):
-        return base, last
-    return plain, ""
+        return "".join(_words(match["name"])), unit.strip()
+    words, known, ranks = _words(name), _UNITS.get(quantity, {}), _RANKS[quantity]
+    whole = "".join(words)
+    if len(name) >= _LEAST_UNIT_NAME.get(quantity, len(name) + 1) and whole in known:
+        return next(each for each in ranks if each in known), whole
+    for cut in (1, -1, -2):  # the unit comes first, last, or last in two words, as in deg c
+        parts = ["".join(words[:cut]), "".join(words[cut:])]
+        unit, base = parts if cut > 0 else parts[::-1]
+        if base in ranks and unit in known:
+            return base, unit
+    return whole, ""
 
 
-def _plain(name: str) -> str:
-    return " ".join(re.sub(r"[_\-\s.#<>~]+", " ", name.lower()).split())
-
-
-def _position(quantity: str, names: Sequence[str], plain: Sequence[str], chosen: str | None) -> int | None:
-    if chosen is not None:
-        places = [n for n, name in enumerate(names) if str(name).strip() == chosen.strip()]
-        if not places:
-            raise ValueError(f"there is no column {chosen!r} for the {quantity} among {', '.join(map(str, names))}")
-        return places[0]
-    for known in _NAMES[quantity]:
-        places = [n for n, name in enumerate(plain) if name == known]
-        if len(places) > 1 and quantity in REQUIRED:
-            both = " and ".join(repr(str(names[n])) for n in places[:2])
-            raise ValueError(
-                f"both {both} may be the {quantity}. Say which it is: --columns {quantity}=NAME (Python: columns)"
-            )
-        if places:
-            return places[0]
+def _unit(text: str, quantity: str) -> str | None:
+    """A unit as the table of units has it; what is said behind it, as in ``Hours in hh:mm:ss``, is left out."""
+    text = normalize("NFKC", text).lower()  # of the signs for degrees Celsius and micro there are several
+    first, *_ = [*text.split(), ""]
+    for unit in ("".join(text.split()), first):
+        unit = _DEGREE_SIGN.sub("", unit) if quantity in ("temperature", "ambient") else unit
+        if unit in _UNITS.get(quantity, {}):
+            return unit
     return None
 
 
-def _scale(quantity: str, unit: str, name: str) -> tuple[float, float]:
-    known = _UNITS.get(quantity)
-    if known is None or not unit:
-        return 1.0, 0.0
-    if unit.lower() not in known:
+def _may_be(quantity: str, name: str) -> bool:
+    """Whether a name is among those of a quantity, and its unit not among those of another."""
+    words, unit = _split(name, quantity)
+    if words not in _RANKS[quantity] or ((quantity, words) in _WITH_UNIT and _unit(unit, quantity) is None):
+        return False
+    return _unit(unit, quantity) is not None or not any(_unit(unit, other) for other in _UNITS)
+
+
+def _places(quantity: str, names: Sequence[str], chosen: str | None, unit: str | None) -> list[int]:
+    """The columns that may be a quantity: of clocks all, as one may be finer, of others those of the first name."""
+    if chosen is not None:
+        places = [n for n, name in enumerate(names) if name == chosen.strip()]
+        if not places:
+            raise ValueError(f"there is no column {chosen!r} for the {quantity} among {', '.join(filter(None, names))}")
+        return places[:1]
+    split = {n: _split(name, quantity) for n, name in enumerate(names) if name and _may_be(quantity, name)}
+    places = sorted(split, key=lambda n: _RANKS[quantity][split[n][0]])
+    known = [n for n in places if unit or not split[n][1] or quantity not in _UNITS or _unit(split[n][1], quantity)]
+    if places and not known and quantity not in REQUIRED:
+        name = names[places[0]]
+        warnings.warn(f"the unit of {name!r} is not known (--units {quantity}=UNIT). It is left out", stacklevel=2)
+        return []
+    places = known or places
+    if quantity in REQUIRED:
+        return [n for n in places if quantity == "time" or split[n][0] == split[places[0]][0]]
+    return places[:1]
+
+
+def _scale(quantity: str, unit: str, name: str) -> tuple[float, float, str]:
+    if quantity not in _UNITS or not unit:
+        return 1.0, 0.0, ""
+    known = _unit(unit, quantity)
+    if known is None:
         raise ValueError(
-            f"the unit {unit!r} of the column {name!r} is not known for the {quantity}. Known are {', '.join(known)}. "
-            f"State it: --units {quantity}=UNIT (Python: units)"
+            f"the unit {unit!r} of the column {name!r} is not known for the {quantity}. Known are "
+            f"{', '.join(_UNITS[quantity])}. State it: --units {quantity}=UNIT (Python: units)"
         )
-    return known[unit.lower()]
+    return *_UNITS[quantity][known], known

@@ -1,4 +1,4 @@
-"""Files of measurements as tables: text of any delimiter, Parquet, and the binary files of testers."""
+"""Files of measurements as tables: text of any delimiter, Parquet, workbooks, and the binary files of testers."""
 
 from __future__ import annotations
 
@@ -6,23 +6,27 @@ import bz2
 import csv
 import gzip
 import io
+import itertools
 import lzma
 import re
 import warnings
 import zipfile
 from codecs import getincrementaldecoder
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
-from battery_env.lab.readers.columns import Column, count_required, find_columns, units_below
+from battery_env.lab.readers.columns import Column, FileFormat, count_required, find_columns, units_below
 
 #: Endings of the names of files that can be read, besides those of NASA (.mat); of text also packed (.gz, .bz2, .xz, .zip).
+#: Text of Maccor's is numbered.
 TEXT_SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".mpt", ".bdf")
-BINARY_SUFFIXES = (".parquet", ".nda", ".ndax", ".mpr")
+NUMBERED_SUFFIXES = tuple(f".{number:03d}" for number in range(1000))
+BINARY_SUFFIXES = (".parquet", ".nda", ".ndax", ".mpr", ".xlsx", ".xls")
 PACKED_SUFFIXES = (".gz", ".bz2", ".xz", ".zip")
 
 _OPENERS: dict[str, Callable[[Path], Any]] = {".gz": gzip.open, ".bz2": bz2.open, ".xz": lzma.open}
@@ -35,13 +39,15 @@ _NUMBER = re.compile(r"^\s*[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?(?:[;\s]|$)")
 _DECIMAL_POINT = re.compile(r"^\s*[-+]?\d*\.\d+(?:[eE][-+]?\d+)?\s*$")
 # What Excel reads in the first line of a file: the delimiter.
 _DELIMITER_LINE = re.compile(r"^\s*sep=([,;\t|])\s*$", flags=re.IGNORECASE)
+# Some testers put each line as a whole in quotes.
+_QUOTED_LINES = re.compile(rb'^"[^"\n]*"\s*$', flags=re.MULTILINE)
 # So many lines below a table may be no part of it.
 _FOOT_LINES = 50
-_EXPORT = {
-    ".xls": "save the sheet as CSV",
-    ".xlsx": "save the sheet as CSV",
-    ".res": "export the channel as CSV in MITS Pro",
-}
+# A table is known by so many of its first rows.
+_FIRST_ROWS = 400
+# How workbooks begin; text is called .xls by some testers.
+_WORKBOOKS = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")
+_EXPORT = {".res": "export the channel as CSV in MITS Pro", ".h5": "export the records as CSV"}
 
 
 class _Layout(NamedTuple):
@@ -52,53 +58,62 @@ class _Layout(NamedTuple):
     delimiter: str
     decimal: str
     names: list[str]
-    below: list[str]  # fields of the line below the header
+    layers: int  # so many columns at the left number what lies above a row, as its cycle and its step
+    rows: list[list[str]]  # fields of the first lines below the header
 
 
-def read_columns(
-    path: Path, chosen: Mapping[str, str] | None = None, units: Mapping[str, str] | None = None
-) -> tuple[pd.DataFrame, dict[str, Column]]:
+def read_columns(path: Path, file_format: FileFormat) -> tuple[pd.DataFrame, dict[str, Column]]:
     """Read the columns of a record, and no others."""
     suffix = path.suffix.lower()
     if suffix in _EXPORT:
         raise ValueError(f"{suffix} files cannot be read: {_EXPORT[suffix]}")
     if suffix == ".parquet":
-        return _read_parquet(path, chosen, units)
+        return _read_parquet(path, file_format)
     if suffix in (".nda", ".ndax"):
-        return columns_of(_read_neware(path), chosen, units)
+        return columns_of(_read_neware(path), file_format)
     if suffix == ".mpr":
-        return columns_of(_read_biologic(path), chosen, units)
-    return _read_text(path, chosen, units)
+        return columns_of(_read_biologic(path), file_format)
+    if suffix in (".xlsx", ".xls") and _head(path).startswith(_WORKBOOKS):
+        return _read_text(_sheet(path, file_format), file_format)
+    return _read_text(path, file_format)
 
 
-def columns_of(
-    table: pd.DataFrame, chosen: Mapping[str, str] | None = None, units: Mapping[str, str] | None = None
-) -> tuple[pd.DataFrame, dict[str, Column]]:
+def columns_of(table: pd.DataFrame, file_format: FileFormat) -> tuple[pd.DataFrame, dict[str, Column]]:
     """The columns of a record, of a table; an index with a name is a column too."""
     table = table.reset_index(drop=table.index.names == [None])
-    columns = find_columns([str(name) for name in table.columns], chosen, units)
+    columns = find_columns([str(name) for name in table.columns], file_format, _first_rows(table))
     return pd.DataFrame({quantity: table.iloc[:, column.position] for quantity, column in columns.items()}), columns
 
 
-def _read_text(
-    path: Path, chosen: Mapping[str, str] | None, units: Mapping[str, str] | None
-) -> tuple[pd.DataFrame, dict[str, Column]]:
-    layout = _layout(_head(path), chosen)
-    columns, header_lines = find_columns(layout.names, chosen, units), layout.header_line + 1
-    below = units_below(columns, layout.below)
+def _first_rows(table: pd.DataFrame) -> list[list[str]]:
+    first = table.head(_FIRST_ROWS).astype(object)
+    return [[str(value) for value in row] for row in first.where(first.notna(), "").to_numpy()]
+
+
+def _read_text(source: Path | bytes, file_format: FileFormat) -> tuple[pd.DataFrame, dict[str, Column]]:
+    head = source[:_HEAD_BYTES] if isinstance(source, bytes) else _head(source)
+    if isinstance(source, Path) and not _QUOTED_LINES.sub(b"", head[: head.rfind(b"\n")]).strip():
+        with _open(source) as stream:
+            source = stream.read().replace(b'"', b"")
+            head = source[:_HEAD_BYTES]
+    layout = _layout(head, file_format.columns)
+    columns, header_lines = find_columns(layout.names, file_format, layout.rows), layout.header_line + 1
+    below = units_below(columns, layout.rows[0] if layout.rows else [])
     if below is not None:
-        columns, header_lines = find_columns(layout.names, chosen, {**below, **(units or {})}), header_lines + 1
+        file_format = replace(file_format, units={**below, **(file_format.units or {})})
+        columns, header_lines = find_columns(layout.names, file_format, layout.rows), header_lines + 1
     # one column may serve as two quantities
-    positions = sorted({column.position for column in columns.values()})
+    positions = sorted({*range(layout.layers), *(column.position for column in columns.values())})
 
     def read(rows: int | None = None) -> pd.DataFrame:
         try:
             return pd.read_csv(
-                path,
+                io.BytesIO(source) if isinstance(source, bytes) else source,
                 sep=layout.delimiter,
                 decimal=layout.decimal,
                 encoding=layout.encoding,
                 header=None,
+                names=range(len(layout.names)) if layout.layers else None,
                 skiprows=header_lines,
                 nrows=rows,
                 usecols=positions,
@@ -111,7 +126,10 @@ def _read_text(
             raise ValueError(f"the file is damaged, or no table: {str(error).strip()}") from error
 
     table = read()
-    foot = _foot_lines(table[[columns[quantity].position for quantity in ("voltage", "current")]], layout.decimal)
+    measured = [
+        columns[quantity].position for quantity in ("voltage", "current", "power", "charge_step") if quantity in columns
+    ]
+    foot = 0 if layout.layers else _foot_lines(table[measured], layout.decimal)
     text = table[columns["time"].position].tail(foot).dropna().astype(str).str.strip()
     if len(text):
         warnings.warn(
@@ -119,7 +137,18 @@ def _read_text(
         )
         # once more, as text below a column makes text of it
         table = read(len(table) - foot)
+    table = _lowest_layer(table, layout.layers)
     return pd.DataFrame({quantity: table[column.position] for quantity, column in columns.items()}), columns
+
+
+def _lowest_layer(table: pd.DataFrame, layers: int) -> pd.DataFrame:
+    """The rows of which no layer above has a number, each with the numbers that were given last."""
+    if not layers:
+        return table
+    numbers = list(range(layers))
+    above = table[numbers].notna().any(axis=1)
+    table[numbers] = table[numbers].ffill()
+    return table[~above]
 
 
 def _foot_lines(measured: pd.DataFrame, decimal: str) -> int:
@@ -160,6 +189,21 @@ def _layout(head: bytes, chosen: Mapping[str, str] | None) -> _Layout:
     delimiters: tuple[str, ...] = _DELIMITERS
     if stated := _DELIMITER_LINE.match(lines[0]):
         lines[0], delimiters = "", (stated[1],)
+    number, delimiter = _header(lines, delimiters, chosen)
+    names, rows = _fields(lines[number], delimiter), [_fields(line, delimiter) for line in lines[number + 1 :]]
+    layers = next((n for n, name in enumerate(names) if name), 0) if delimiter != _BLANKS else 0
+    if not any(row[:layers] == [""] * layers and any(row[layers:]) for row in rows):
+        layers = 0
+    for n in range(layers):
+        above = [fields[n] for fields in (_fields(line, delimiter) for line in lines[:number]) if any(fields[n : n + 1])]
+        names[n] = above[-1] if above else ""
+    values = [field for row in rows for field in row]
+    comma = delimiter != _BLANKS and any(map(_DECIMAL_COMMA.match, values)) and not any(map(_DECIMAL_POINT.match, values))
+    return _Layout(encoding, number, delimiter, "," if comma else ".", names, layers, rows)
+
+
+def _header(lines: Sequence[str], delimiters: Sequence[str], chosen: Mapping[str, str] | None) -> tuple[int, str]:
+    """The line with the names of the columns, and the delimiter."""
     best, found = (0, delimiters[0]), -1
     for number, line in enumerate(lines):
         next_line = lines[number + 1] if number + 1 < len(lines) else ""
@@ -169,20 +213,16 @@ def _layout(head: bytes, chosen: Mapping[str, str] | None) -> _Layout:
                 continue
             if (count := count_required(_fields(line, delimiter), chosen)) > found:
                 best, found = (number, delimiter), count
-    number, delimiter = best
-    if found <= 0:
-        number = next((n for n, line in enumerate(lines) if line.strip()), -1)
-        if number < 0:
-            raise ValueError("the file is empty")
-        if any(map(_NUMBER.match, lines[number].split(","))):
-            raise ValueError("there is no line with the names of the columns above the numbers. Add one")
-        # names may hold blanks and units: the numbers below have to come apart as often
-        names, first_row = lines[number], lines[min(number + 1, len(lines) - 1)]
-        delimiter = max(delimiters, key=lambda each: min(len(_fields(names, each)), len(_fields(first_row, each))))
-    values = [field for line in lines[number + 1 :] for field in _fields(line, delimiter)]
-    comma = delimiter != _BLANKS and any(map(_DECIMAL_COMMA.match, values)) and not any(map(_DECIMAL_POINT.match, values))
-    below = _fields(lines[number + 1], delimiter) if number + 1 < len(lines) else []
-    return _Layout(encoding, number, delimiter, "," if comma else ".", _fields(lines[number], delimiter), below)
+    if found > 0:
+        return best
+    number = next((n for n, line in enumerate(lines) if line.strip()), -1)
+    if number < 0:
+        raise ValueError("the file is empty")
+    if any(map(_NUMBER.match, lines[number].split(","))):
+        raise ValueError("there is no line with the names of the columns above the numbers. Add one")
+    # names may hold blanks and units: the numbers below have to come apart as often
+    names, first_row = lines[number], lines[min(number + 1, len(lines) - 1)]
+    return number, max(delimiters, key=lambda each: min(len(_fields(names, each)), len(_fields(first_row, each))))
 
 
 def _decoded(head: bytes) -> tuple[str, str]:
@@ -209,9 +249,27 @@ def _fields(line: str, delimiter: str) -> list[str]:
         return []
 
 
-def _read_parquet(
-    path: Path, chosen: Mapping[str, str] | None, units: Mapping[str, str] | None
-) -> tuple[pd.DataFrame, dict[str, Column]]:
+def _sheet(path: Path, file_format: FileFormat) -> bytes:
+    """The sheet of a workbook that holds the record, and those that continue it, as text."""
+    try:
+        sheets = pd.read_excel(path, sheet_name=None, header=None, dtype=object)
+    except ImportError as error:
+        raise ImportError(f"Workbooks need {error.name or 'openpyxl'}: pip install 'battery_env[excel]'") from error
+    except Exception as error:  # whatever the damage leads to
+        raise ValueError(f"the file is damaged, or no workbook: {str(error).strip()}") from error
+    found = []
+    for sheet in sheets.values():
+        head = [[str(name) for name in row] for row in sheet.head(_HEAD_LINES).to_numpy()]
+        counts = [count_required(names, file_format.columns) for names in head] or [0]
+        line = int(np.argmax(counts))
+        found.append((counts[line], len(sheet), head[line : line + 1], line, sheet))
+    names = max(found, key=lambda each: each[:2])[2]
+    first, *others = [(line, sheet) for *_, each, line, sheet in found if each == names]
+    parts = [first[1], *(sheet.iloc[line + 1 :] for line, sheet in others)]
+    return pd.concat(parts).to_csv(header=False, index=False).encode()
+
+
+def _read_parquet(path: Path, file_format: FileFormat) -> tuple[pd.DataFrame, dict[str, Column]]:
     try:
         from pyarrow import parquet
     except ImportError as error:
@@ -223,7 +281,8 @@ def _read_parquet(
     except Exception as error:
         raise ValueError(f"the file is damaged, or no Parquet: {str(error).strip()}") from error
     with file:
-        columns = find_columns(file.schema_arrow.names, chosen, units)
+        first = [batch.to_pandas() for batch in itertools.islice(file.iter_batches(_FIRST_ROWS), 1)]
+        columns = find_columns(file.schema_arrow.names, file_format, _first_rows(first[0]) if first else ())
         # the metadata of pandas would make an index of a column
         table = file.read(columns=sorted({column.name for column in columns.values()})).to_pandas(ignore_metadata=True)
     return pd.DataFrame({quantity: table[column.name] for quantity, column in columns.items()}), columns
@@ -233,11 +292,14 @@ def _read_neware(path: Path) -> pd.DataFrame:
     try:
         import NewareNDA
     except ImportError as error:
-        raise ImportError("Neware's files need NewareNDA: pip install 'battery_env[cyclers]'") from error
+        missing = "" if error.name in (None, "NewareNDA") else f", which needs {error.name}"
+        raise ImportError(f"Neware's files need NewareNDA{missing}: pip install 'battery_env[cyclers]'") from error
     with path.open("rb"):  # a missing file is that, not a damaged one
         pass
     try:
-        return NewareNDA.read(str(path), log_level="ERROR")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of pandas, about how it is called there
+            return NewareNDA.read(str(path), log_level="ERROR")
     except Exception as error:
         raise ValueError(f"the file is damaged, or none of Neware's: {str(error).strip()}") from error
 
@@ -259,4 +321,4 @@ def is_readable(path: Path, more: Sequence[str] = ()) -> bool:
     suffixes = [suffix.lower() for suffix in path.suffixes]
     if suffixes and suffixes[-1] in PACKED_SUFFIXES:
         return len(suffixes) > 1 and suffixes[-2] in TEXT_SUFFIXES
-    return bool(suffixes) and suffixes[-1] in (*TEXT_SUFFIXES, *BINARY_SUFFIXES, *more)
+    return bool(suffixes) and suffixes[-1] in (*TEXT_SUFFIXES, *NUMBERED_SUFFIXES, *BINARY_SUFFIXES, *more)

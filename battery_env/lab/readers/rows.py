@@ -1,0 +1,519 @@
+"""
+The rows of a table as a record has them: in SI units, in their order, on one clock, and with the current of a discharge
+positive. Each step is a function from table to table that is named after what it mends. What is mended is said; what is not
+clear enough to mend is refused.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from battery_env.arrays import BoolArray, FloatArray, IntArray
+from battery_env.checks import ZERO_CELSIUS_K
+from battery_env.lab.readers.columns import REQUIRED, Column, FileFormat, direction
+from battery_env.records import REST_CURRENT_A, SWITCH_SHARE
+from battery_env.records.discharge import LEAST_SAMPLES
+
+# How plain the sign of the current must be: the share of its jumps with which the voltage jumps, less that of the others; or
+# the correlation of the voltage with the charge that has passed.
+_CLEAR = 0.5
+# What is worth less than this share of the charge is mended; of two columns that differ by less either may be taken.
+_NOTHING_SHARE = 1e-3
+# So few of the rows may be out of time.
+_FEW_SHARE = 0.01
+# A stretch that passes more than this share of the largest charge, and in which the voltage rises by more than this share of
+# its range, is a charge.
+_LONG_SHARE = 0.25
+# Two rows of different steps may have the same time; the second counts as so much later, s.
+_STEP_S = 1e-3
+# What a clock may count in, s.
+_TICKS_S = (3600.0, 60.0, 1.0, 0.1, 0.01)
+# What is so many times what is usual is not usual.
+_MANY_TIMES = 3.0
+# No cell has a voltage below this share of what the record mostly shows.
+_DEAD_SHARE = 0.1
+# Temperatures that a cell may have, degC.
+_TEMPERATURES_C = (-60.0, 150.0)
+_THOUSANDS = re.compile(r"^\s*[-+]?\d{1,3}(?:[,.' ]\d{3})+(?:[.,]\d+)?\s*$")
+
+
+def cells_of(table: pd.DataFrame, columns: Mapping[str, Column], file_format: FileFormat) -> dict[str, pd.DataFrame]:
+    """
+    The rows of each cell.
+
+    :param table: columns by quantity, as they were written; its index counts the rows below the header
+    :param columns: their names and units
+    :param file_format: what the caller says
+    :return: by cell, in SI units; the name is empty where the table holds one
+    """
+    for mend in (without_blank_rows, without_headers, without_cut_line):
+        table = mend(table, columns)
+    if len(table) < LEAST_SAMPLES:
+        raise ValueError(f"a discharge needs {LEAST_SAMPLES} rows below the header, got {len(table)}")
+    cells = table["cell"].ffill().astype(str) if "cell" in table else pd.Series("", index=table.index)
+    if cells.nunique() == 1 or cells.value_counts().min() < LEAST_SAMPLES:
+        return {"": _mended(table, columns, file_format)}
+    return {name: _mended(table[cells == name], columns, file_format) for name in cells.unique()}
+
+
+def _mended(table: pd.DataFrame, columns: Mapping[str, Column], file_format: FileFormat) -> pd.DataFrame:
+    rows = in_si_units(table, columns)
+    for mend in (
+        without_dead_ends,
+        without_missing,
+        with_newest_last,
+        on_one_clock,
+        with_clock_going_on,
+        without_repeated,
+        with_steps_apart,
+        without_rows_out_of_time,
+        with_moments_of_switches,
+    ):
+        rows = mend(rows)
+    return with_signed_current(rows, columns, file_format.discharge_is_negative)
+
+
+def _say(text: str) -> None:
+    warnings.warn(text, stacklevel=3)
+
+
+def without_blank_rows(table: pd.DataFrame, columns: Mapping[str, Column]) -> pd.DataFrame:
+    """Without rows that hold no measurement at all."""
+    return table[~table[_measured(table)].isna().all(axis=1)]
+
+
+def without_headers(table: pd.DataFrame, columns: Mapping[str, Column]) -> pd.DataFrame:
+    """Without the header where it comes again, as in files that were put one behind the other."""
+    if any(pd.api.types.is_numeric_dtype(table[each].dtype) for each in _measured(table)):
+        return table  # no name is among numbers
+    again = np.logical_and.reduce([table[each].astype(str).str.strip() == columns[each].name for each in _measured(table)])
+    if again.any():
+        _say(f"the header comes again, and is left out: row {_place(table, again)}")
+    return table[~again]
+
+
+def without_cut_line(table: pd.DataFrame, columns: Mapping[str, Column]) -> pd.DataFrame:
+    """Without the last line where it is incomplete, as in a file that is being written."""
+    last = table.tail(1)
+    values = [last[each] if each == "time" else pd.to_numeric(last[each], errors="coerce") for each in _measured(table)]
+    if any(each.isna().any() for each in values):
+        _say(f"the last line, row {last.index[0] + 1}, is incomplete, and left out")
+        return table.iloc[:-1]
+    return table
+
+
+def _measured(table: pd.DataFrame) -> list[str]:
+    return [quantity for quantity in (*REQUIRED, "power", "charge_step") if quantity in table]
+
+
+def _place(table: pd.DataFrame, which: BoolArray) -> str:
+    """The first of some rows as a file counts them, and how many more there are."""
+    places = table.index[which]
+    return f"{places[0] + 1}" + (f" and {len(places) - 1} more" if len(places) > 1 else "")
+
+
+def in_si_units(table: pd.DataFrame, columns: Mapping[str, Column]) -> pd.DataFrame:
+    """
+    Numbers in SI units, one column a quantity. Of those that agree the finest is taken. One that is not needed and cannot be
+    read is left out.
+    """
+    found: dict[str, Any] = {quantity: _finest(table, columns, quantity) for quantity in REQUIRED if quantity in table}
+    for quantity, read in _OTHERS.items():
+        if quantity in table:
+            try:
+                found[quantity] = read(table[quantity], columns[quantity])
+            except ValueError as error:
+                if quantity in _measured(table):
+                    raise
+                _say(f"{error}. It is left out")
+    if "step" in table:
+        found["step"] = pd.factorize(table["step"])[0]
+    for key in [key for key in columns if key.partition(" ")[0] == "state"]:
+        directions = _directions(table[key])
+        if {1, -1} <= set(directions):
+            found.setdefault("direction", directions)
+    rows = pd.DataFrame(found, index=table.index)
+    if "counter" in rows and columns["voltage"].words == "ewe":
+        _say(f"the voltage is {columns['voltage'].name} less {columns['counter'].name}, as one electrode is no cell")
+        rows["voltage"] -= rows["counter"]
+    if "current" not in rows:
+        rows["current"] = _current(rows, columns)
+    return rows.drop(columns=["counter", "power", "charge_step"], errors="ignore")
+
+
+def _current(rows: pd.DataFrame, columns: Mapping[str, Column]) -> pd.Series:
+    """The current of a table that holds something in its place."""
+    if "power" in rows:
+        _say(f"the current is {columns['power'].name} over {columns['voltage'].name}, as there is no column for it")
+        return rows["power"] / rows["voltage"].where(rows["voltage"] > 0.0)
+    _say(f"the current is the charge {columns['charge_step'].name} over the time since the row before")
+    step_s = rows["time"].diff()
+    return (rows["charge_step"] / step_s.where(step_s > 0.0)).bfill()
+
+
+def _directions(states: pd.Series) -> IntArray:
+    codes, names = pd.factorize(states)
+    return np.array([*map(direction, names), 0])[codes]
+
+
+def _finest(table: pd.DataFrame, columns: Mapping[str, Column], quantity: str) -> FloatArray:
+    """The column of a quantity. Clocks of other names are asked only if that of the first one has one time twice."""
+    column = columns[quantity]
+    read = seconds if quantity == "time" else numbers
+    best = read(table[quantity], column)
+    for key in [key for key in columns if key.startswith(f"{quantity} ")]:
+        other = columns[key]
+        if other.words != column.words and (np.diff(best) != 0.0).all():
+            break
+        try:
+            values = read(table[key], other)
+        except ValueError:
+            continue
+        is_finer = len(np.unique(values)) > len(np.unique(best))
+        if _agree(best, values, quantity):
+            best = values if is_finer else best
+        elif other.words == column.words:
+            raise ValueError(
+                f"both {column.name!r} and {other.name!r} may be the {quantity}. Say which it is: --columns {quantity}=NAME "
+                "(Python: columns)"
+            )
+        elif is_finer:
+            _say(f"the time is {column.name!r}; {other.name!r} tells more rows apart, but is another clock")
+    return best
+
+
+def _agree(one: FloatArray, other: FloatArray, quantity: str) -> bool:
+    """Whether two columns say the same; clocks do to what the coarser one counts in."""
+    tolerance = _NOTHING_SHARE * float(np.nanmax(np.abs(one), initial=0.0))
+    if quantity == "time":
+        one, other = one - one[0], other - other[0]
+        tolerance = max(_tick_s(one), _tick_s(other))
+    return bool(np.nanmax(np.abs(one - other), initial=0.0) <= tolerance)
+
+
+def _tick_s(time_s: FloatArray) -> float:
+    """What a clock counts in."""
+    return next((tick_s for tick_s in _TICKS_S if np.allclose(time_s / tick_s, np.round(time_s / tick_s), 0.0, 1e-3)), _STEP_S)
+
+
+def numbers(values: pd.Series, column: Column) -> FloatArray:
+    """Numbers in SI units."""
+    if pd.api.types.is_numeric_dtype(values.dtype):
+        return column.factor * values.to_numpy(dtype=np.float64, na_value=np.nan) + column.offset
+    found = pd.to_numeric(values, errors="coerce")
+    bad = values[found.isna() & values.notna() & (values.astype(str).str.strip() != "")]
+    if len(bad):
+        advice, thousands = "", bad[bad.astype(str).str.match(_THOUSANDS)]
+        if len(thousands):
+            advice, bad = ". Write numbers without separators of thousands", thousands
+        text = str(bad.iloc[0])
+        raise ValueError(f"the column {column.name!r} must hold numbers, got {text!r} in row {bad.index[0] + 1}{advice}")
+    return column.factor * found.to_numpy(dtype=np.float64) + column.offset
+
+
+def _temperatures_C(values: pd.Series, column: Column) -> FloatArray:
+    found = numbers(values, column)
+    low_C, high_C = _TEMPERATURES_C
+    bad = np.flatnonzero((found < low_C) | (found > high_C))
+    if len(bad):
+        kelvin = found - ZERO_CELSIUS_K
+        is_kelvin = not column.unit and bool(((kelvin >= low_C) & (kelvin <= high_C)).all())
+        advice = ": if it is in kelvin, --units temperature=K says so" if is_kelvin else ""
+        raise ValueError(f"the column {column.name!r} must hold temperatures, got {found[bad[0]]:g} degC{advice}")
+    return found
+
+
+def _cycles(values: pd.Series, column: Column) -> FloatArray:
+    found = numbers(values, column)
+    if not (np.isfinite(found).all() and (found == np.round(found)).all()):
+        raise ValueError(f"the column {column.name!r} must hold whole numbers of cycles")
+    return found
+
+
+def seconds(values: pd.Series, column: Column) -> FloatArray:
+    """Numbers in their unit; a clock, hours:minutes:seconds, in seconds; dates in seconds since the earliest one."""
+    if pd.api.types.is_numeric_dtype(values.dtype):
+        return numbers(values, column)
+    if pd.api.types.is_datetime64_any_dtype(values.dtype):
+        return (values - values.min()).dt.total_seconds().to_numpy(dtype=np.float64)
+    if pd.api.types.is_timedelta64_dtype(values.dtype):
+        return values.dt.total_seconds().to_numpy(dtype=np.float64)
+    if not values.dropna().astype(str).str.contains(":").all():
+        return numbers(values, column)
+    text = values.astype(str).str.strip().str.replace(",", ".")
+    # UTC, as the clocks of a time zone are put forward and back
+    readings: tuple[tuple[Callable[..., Any], dict[str, Any]], ...] = (
+        (pd.to_timedelta, {}),
+        (pd.to_datetime, {"format": "ISO8601", "utc": True}),
+        (pd.to_datetime, {"utc": True}),
+        (pd.to_datetime, {"utc": True, "dayfirst": True}),
+    )
+    found: list[FloatArray] = []
+    for convert, options in readings:
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of a day that is no month, and of each row with one
+                found.append(seconds(pd.Series(convert(text, **options), index=values.index), column))
+        except ValueError:
+            continue
+        if "utc" not in options or "format" in options:
+            break
+    if not found:
+        raise ValueError(
+            f"the column {column.name!r} must hold times: numbers, hours:minutes:seconds, or dates; got "
+            f"{str(values.iloc[0])!r}"
+        )
+    # a day taken for a month makes a month of midnight
+    return min(found, key=lambda time_s: float(np.abs(np.nan_to_num(np.diff(time_s))).max(initial=0.0)))
+
+
+_OTHERS: dict[str, Callable[[pd.Series, Column], FloatArray]] = {
+    "temperature": _temperatures_C,
+    "ambient": _temperatures_C,
+    "cycle": _cycles,
+    "step_time": seconds,
+    "power": numbers,
+    "charge_step": numbers,
+    "counter": numbers,
+}
+
+
+def without_dead_ends(rows: pd.DataFrame) -> pd.DataFrame:
+    """Without rows at the ends in which no cell was connected."""
+    dead = (rows["voltage"] < _DEAD_SHARE * rows["voltage"].median()) & (rows["current"].abs() <= REST_CURRENT_A)
+    ends = dead & (dead.cummin() | dead[::-1].cummin())
+    if ends.any() and not ends.all():
+        at = int(np.argmax(ends))
+        _say(f"row {_place(rows, ends.to_numpy())} is left out: {rows['voltage'].iloc[at]:g} V without a current is no cell")
+        return rows[~ends]
+    return rows
+
+
+def without_missing(rows: pd.DataFrame) -> pd.DataFrame:
+    """Refuses rows in which a measurement is missing."""
+    for name in REQUIRED:
+        bad = np.flatnonzero(~np.isfinite(rows[name]))
+        if len(bad):
+            place = rows.index[bad[0]] + 1
+            raise ValueError(f"the {name} must be finite, got {rows[name].iloc[bad[0]]} in row {place}. Remove such rows.")
+    return rows
+
+
+def _changes(rows: pd.DataFrame, *names: str) -> BoolArray:
+    """Rows in which a counter differs from the row before."""
+    changes = np.zeros(len(rows), dtype=np.bool_)
+    for name in names:
+        if name in rows:
+            changes[1:] |= np.diff(rows[name]) != 0
+    return changes
+
+
+def with_newest_last(rows: pd.DataFrame) -> pd.DataFrame:
+    """Rows of which the newest comes first are turned."""
+    step_s = np.diff(rows["time"])[~_changes(rows, "cycle", "step")[1:]]
+    if (step_s <= 0.0).all() and (step_s < 0.0).any():
+        _say("the clock runs backwards: the rows are taken from the last one to the first")
+        return rows[::-1]
+    return rows
+
+
+def on_one_clock(rows: pd.DataFrame) -> pd.DataFrame:
+    """Times that start anew, near zero, with each step become times since the start of the test."""
+    time_s, new = rows["time"].to_numpy(), np.flatnonzero(_changes(rows, "step"))
+    back = np.flatnonzero(np.diff(time_s) < 0.0) + 1
+    with_cycles = _changes(rows, "cycle")[back].all()
+    if not len(back) or with_cycles or not np.isin(back, new).all():
+        return rows
+    step_s = np.append(np.diff(time_s), 0.0)
+    usual_s = float(np.median(step_s[step_s > 0.0])) if (step_s > 0.0).any() else 0.0
+    if (time_s[new] > _MANY_TIMES * np.maximum(usual_s, step_s[new])).any():
+        return rows
+    # a row that is out of time, where the next one goes on with the clock of the one before
+    after_s = _MANY_TIMES * step_s[np.minimum(back + 1, len(time_s) - 1)]
+    goes_on_s = time_s[np.minimum(back + 1, len(time_s) - 1)] - time_s[back - 1]
+    if ((time_s[back - 1] > after_s) & (goes_on_s > 0.0) & (goes_on_s <= after_s)).any():
+        return rows
+    _say("the time starts anew with each step, and is added up")
+    offsets_s = np.zeros(len(time_s))
+    offsets_s[new] = time_s[new - 1]
+    return rows.assign(time=time_s + np.cumsum(offsets_s))
+
+
+def with_clock_going_on(rows: pd.DataFrame) -> pd.DataFrame:
+    """A clock that goes back by a few rows' time where the step changes, and goes on from there, goes on from before."""
+    time_s = rows["time"].to_numpy()
+    step_s = np.diff(time_s, prepend=time_s[:1])
+    usual_s = float(np.median(step_s[1:]))
+    most_s, next_s = _MANY_TIMES * usual_s, np.append(step_s[1:], usual_s)
+    back = _changes(rows, "step") & (step_s < 0.0) & (step_s >= -most_s) & (next_s > 0.0) & (next_s <= most_s)
+    if not back.any():
+        return rows
+    _say(f"the clock goes back where the step changes, and is taken to go on by {usual_s:g} s: row {_place(rows, back)}")
+    return rows.assign(time=time_s + np.cumsum(np.where(back, usual_s - step_s, 0.0)))
+
+
+def without_repeated(rows: pd.DataFrame) -> pd.DataFrame:
+    """Without rows that were written before; they are compared only where the clock does not go on, as that takes time."""
+    if (np.diff(rows["time"]) > 0.0).all():
+        return rows
+    names = [name for name in ("cycle", *REQUIRED, "step", "direction") if name in rows]
+    repeated = rows.duplicated(names).to_numpy()
+    if repeated.any():
+        _say(f"{repeated.sum()} of {len(repeated)} rows are repeated, and dropped")
+    return rows[~repeated]
+
+
+def with_steps_apart(rows: pd.DataFrame) -> pd.DataFrame:
+    """Of two rows at one time, between which the step changes or the load is switched, the second is the later one."""
+    time_s, jump_A = rows["time"].to_numpy(), np.diff(rows["current"], prepend=rows["current"].iloc[:1])
+    same = np.diff(time_s, prepend=np.nan) == 0.0
+    new_step = _changes(rows, "step")
+    switched = same & ~new_step & (np.abs(jump_A) > SWITCH_SHARE * rows["current"].abs().max())
+    if switched.any() and np.abs(jump_A[switched]).sum() * _tick_s(time_s) <= _NOTHING_SHARE * _passed_C(rows):
+        _say(f"row {_place(rows, switched)} has the time of the row before, and is the later one, as the load is switched")
+    else:
+        switched[:] = False
+    later, n = (same & new_step) | switched, np.arange(len(rows))
+    return rows.assign(time=time_s + _STEP_S * (n - np.maximum.accumulate(np.where(later, 0, n))))
+
+
+def _passed_C(rows: pd.DataFrame) -> float:
+    """The charge that passes in all, of whatever sign."""
+    step_s = np.maximum(np.diff(rows["time"]), 0.0)
+    return float(step_s @ rows["current"].abs().to_numpy()[1:])
+
+
+def without_rows_out_of_time(rows: pd.DataFrame) -> pd.DataFrame:
+    """
+    Without rows that are not later than all before them, if they are few, or say what the others say. A clock may start anew
+    with a cycle.
+    """
+    time = rows["time"]
+    if (np.diff(time) > 0.0).all():
+        return rows
+    cycle = pd.Series(np.cumsum(_changes(rows, "cycle") & (np.diff(time, prepend=-np.inf) < 0.0)), index=rows.index)
+    latest = time.groupby(cycle).cummax().groupby(cycle).shift()
+    twice, back = (time == latest).to_numpy(), (time < latest).to_numpy()
+    kept, few = rows[~(twice | back)], max(1.0, _FEW_SHARE * len(rows))
+    if back.sum() > max(few, _changes(rows, "step").sum()):
+        _refuse_backwards(rows)
+        return rows
+    steps = rows[["time", "voltage", "current"]].diff().abs()
+    usual = kept[["time", "voltage", "current"]].diff().abs()
+    worth_C = steps["current"][twice].sum() * usual["time"].median()
+    say_other = twice.sum() > few and steps["voltage"][twice].mean() > _MANY_TIMES * usual["voltage"].mean()
+    if say_other or worth_C > _NOTHING_SHARE * _passed_C(rows):
+        return rows
+    for which, what in ((twice, "the time of the row before"), (back, "a time before that of the row before")):
+        if which.any():
+            _say(f"left out with {what}: row {_place(rows, which)}")
+    return kept
+
+
+def _refuse_backwards(rows: pd.DataFrame) -> None:
+    """A clock that starts anew goes back once; one that goes back in two rows on end, or by an hour, does not."""
+    time_s = rows["time"].to_numpy()
+    step_s = np.diff(time_s, prepend=time_s[:1])
+    on_end = (step_s < 0.0) & (np.append(step_s[1:], 0.0) < 0.0)
+    hour = np.abs(step_s + 3600.0) <= np.abs(np.median(step_s)) + _STEP_S
+    advice_of_hour = "Clocks are put back by an hour in autumn: give times of UTC"
+    for which, advice in ((on_end, "Sort the rows by time"), (hour, advice_of_hour)):
+        if which.any():
+            n = int(np.argmax(which))
+            raise ValueError(
+                f"the clock runs backwards: row {rows.index[n] + 1} is at {time_s[n]:g} s, after {time_s[n - 1]:g} s. {advice}"
+            )
+
+
+def with_moments_of_switches(rows: pd.DataFrame) -> pd.DataFrame:
+    """Where no row tells when a rest ended, the time in the step of the first row under load does."""
+    if "step_time" not in rows:
+        return rows
+    time_s, rest = rows["time"].to_numpy(), (rows["current"].abs() <= REST_CURRENT_A).to_numpy()
+    step_s = np.diff(time_s, prepend=np.nan, append=np.nan)
+    first = np.append(False, rest[:-1] & ~rest[1:]) & _changes(rows, "step")
+    moment_s = time_s - rows["step_time"].to_numpy()
+    # as long as one row is missing in between
+    missing = step_s[:-1] > 2.0 * np.fmax(np.append(np.nan, step_s[:-2]), step_s[1:])
+    told = np.flatnonzero(first & missing & (moment_s < time_s) & (moment_s > np.append(np.nan, time_s[:-1])))
+    if not len(told):
+        return rows
+    _say(
+        f"the rest is taken to last until {rows['step_time'].iloc[told[0]]:g} s before row {rows.index[told[0]] + 1}, as the "
+        "time in its step says"
+    )
+    more = rows.iloc[np.insert(np.arange(len(rows)), told, told - 1)]
+    return more.assign(time=np.insert(time_s, told, moment_s[told]))
+
+
+def with_signed_current(rows: pd.DataFrame, columns: Mapping[str, Column], is_negative: bool | None) -> pd.DataFrame:
+    """The current of a discharge is positive."""
+    current_A = rows["current"]
+    if not (current_A.abs() > REST_CURRENT_A).any():
+        is_known = "current" in columns and columns["current"].unit
+        advice = "" if is_known else ". If the cell is larger, state the unit of the current"
+        raise ValueError(
+            f"no current flows above {REST_CURRENT_A:g} A, below which a cell rests: there is no discharge, or that of a cell "
+            f"below some {1e3 * REST_CURRENT_A:g} mAh, which are not supported{advice}"
+        )
+    if "direction" in rows and (current_A >= -REST_CURRENT_A).all():
+        return rows.assign(current=current_A.where(rows["direction"] >= 0, -current_A))
+    if (current_A >= -REST_CURRENT_A).all() or (current_A <= REST_CURRENT_A).all():
+        _refuse_unsigned(rows, columns)
+    if is_negative is None:
+        effect = _jumps(rows)
+        if not abs(effect) > _CLEAR:
+            effect = _fall(rows)
+        if not abs(effect) > _CLEAR:
+            raise ValueError(
+                "whether the current of a discharge is positive or negative cannot be told, as the voltage neither falls "
+                f"nor rises clearly with the current and the charge (correlation {effect:.2f}). State it: "
+                "--discharge-is-negative or --discharge-is-positive (Python: discharge_is_negative)"
+            )
+        is_negative = effect > 0.0
+    return rows.assign(current=-current_A) if is_negative else rows
+
+
+def _refuse_unsigned(rows: pd.DataFrame, columns: Mapping[str, Column]) -> None:
+    """Refuse a current of one sign under which, once it has grown, the voltage rises for long, while elsewhere it falls."""
+    size_A, voltage_V = rows["current"].abs().to_numpy(), rows["voltage"].to_numpy()
+    jump_A = np.diff(size_A, prepend=0.0)
+    begin = np.flatnonzero(np.abs(jump_A) > SWITCH_SHARE * size_A.max())
+    end = np.append(begin[1:], len(rows)) - 1
+    charge_C = np.add.reduceat(size_A * np.maximum(np.diff(rows["time"], prepend=rows["time"].iloc[0]), 0.0), begin)
+    # the first row may have the voltage from before
+    rise_V = voltage_V[end] - voltage_V[np.minimum(begin + 1, end)]
+    rise_V[(charge_C < _LONG_SHARE * charge_C.max()) | (jump_A[begin] < 0.0)] = 0.0
+    long_V = _LONG_SHARE * float(np.ptp(voltage_V))
+    if rise_V.max() > long_V and rise_V.min() < -long_V:
+        known = [repr(column.name) for key, column in columns.items() if key.startswith("state")]
+        raise ValueError(
+            f"the current has no sign: from row {rows.index[begin[np.argmax(rise_V)]] + 1} on the voltage rises for long, and "
+            "elsewhere it falls under a current of the same sign. Name the column that tells charge from discharge: "
+            f"--columns state=NAME (Python: columns){'. The words of ' + ' and '.join(known) + ' do not' if known else ''}"
+        )
+
+
+def _jumps(rows: pd.DataFrame) -> float:
+    """How the voltage jumps with the current where that is switched, -1 to 1; rows next to the switch may mix both sides."""
+    voltage_V, current_A = rows["voltage"].to_numpy(), rows["current"].to_numpy()
+    jump_A = np.diff(current_A)
+    n = np.flatnonzero(np.abs(jump_A) > SWITCH_SHARE * np.abs(current_A).max())
+    wide_V = voltage_V[np.minimum(n + 2, len(voltage_V) - 1)] - voltage_V[np.maximum(n - 1, 0)]
+    jump_V = voltage_V[n + 1] - voltage_V[n]
+    jump_V = np.where(np.abs(wide_V) > np.abs(jump_V), wide_V, jump_V)
+    return float(np.sign(jump_A[n] * jump_V) @ np.abs(jump_A[n]) / max(np.abs(jump_A[n]).sum(), REST_CURRENT_A))
+
+
+def _fall(rows: pd.DataFrame) -> float:
+    """How the voltage goes with the charge that has passed in each cycle, -1 to 1."""
+    step_s = np.diff(rows["time"], prepend=rows["time"].iloc[0])
+    passed = pd.DataFrame({"charge": np.cumsum(rows["current"] * np.maximum(step_s, 0.0)), "voltage": rows["voltage"]})
+    within = passed - passed.groupby(np.cumsum((step_s < 0.0) | _changes(rows, "cycle"))).transform("mean")
+    return float(within["charge"].corr(within["voltage"]))

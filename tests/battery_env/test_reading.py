@@ -1,0 +1,476 @@
+"""Each mend of a table, and how far it goes: a discharge that is written in another way is the same, or it is refused."""
+
+import contextlib
+import gzip
+import importlib.util
+import sys
+import types
+import warnings
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from battery_env import Settings, calibrate, load_nasa_discharges, read_discharges
+from battery_env.lab import many
+from battery_env.lab.command_line import calibrate as command
+
+RECORD = load_nasa_discharges("B0006")[99]
+TABLE = pd.DataFrame({"time": RECORD.time_s, "voltage": RECORD.voltage_V, "current": -RECORD.current_A})
+LOADED = (TABLE["current"] < -1.0).to_numpy()
+LOAD_ON = int(np.argmax(LOADED))
+#: A charge and a rest, as they come before the discharge.
+CHARGE = pd.DataFrame({"time": np.arange(0.0, 3600.0, 60.0), "voltage": np.linspace(3.6, 4.2, 60), "current": 1.5})
+REST = pd.DataFrame({"time": 3600.0 + np.arange(0.0, 600.0, 60.0), "voltage": 4.19, "current": 0.0})
+CYCLE = pd.concat([CHARGE, REST, TABLE.assign(time=4200.0 + TABLE["time"])], ignore_index=True)
+
+
+def read(table, said="", **options):
+    """Return the one discharge of a table, and check what is said of it; nothing by default."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        (discharge,) = read_discharges(table, **options)
+    messages = "; ".join(str(each.message) for each in caught)
+    assert (said in messages) if said else not messages, messages
+    return discharge
+
+
+def same(discharge, rtol=1e-9, atol=1e-6):
+    """Check that it is the record."""
+    np.testing.assert_allclose(discharge.time_s, RECORD.time_s, rtol, atol)
+    np.testing.assert_allclose(discharge.voltage_V, RECORD.voltage_V, rtol, atol)
+    np.testing.assert_allclose(discharge.current_A, RECORD.current_A, rtol, atol)
+
+
+def near(discharge, share=2e-3):
+    assert discharge.charge_C == pytest.approx(RECORD.charge_C, rel=share)
+    assert (np.diff(discharge.time_s) > 0.0).all()
+
+
+SPELT = {
+    "time": ["TestTime", "Test_Time(s)", "TESTTIME/Sec", "Prog Time", "Laufzeit [min]", "Zeit / s", "elapsedTimeS", "Minutes"],
+    "voltage": ["Potential (V)", "CellVoltage", "mVolts", "mV", "Zellspannung [mV]", "Ecell/V", "U(V)"],
+    "current": ["Cur(mA)", "mAmps", "Strom / A", "cellCurrentMilliAmps", "<I>/mA", "I [\N{MICRO SIGN}A]"],
+}
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.fixed_dictionaries({quantity: st.sampled_from(names) for quantity, names in SPELT.items()}))
+def test_names_are_words_in_any_spelling_with_the_unit_first_or_last(names):
+    table = TABLE.rename(columns=names)
+    for quantity, name in names.items():
+        minutes = quantity == "time" and "min" in name.lower()
+        micro, milli = "\N{MICRO SIGN}" in name, any(each in name for each in ("mA", "mV", "Milli"))
+        table[name] = TABLE[quantity] * (1 / 60 if minutes else 1e6 if micro else 1e3 if milli else 1.0)
+    same(read(table))
+
+
+@pytest.mark.parametrize("unit", ["degC", "°C", "\N{DEGREE CELSIUS}", "\ufffdC", "?C", "Â°C", "C"])
+@pytest.mark.parametrize("names", [("t[s]", "U[V]", "I[A]", "T[{}]"), ("Zeit[s]", "U[V]", "I[A]", "T[{}]")])
+def test_a_unit_of_another_quantity_rules_a_column_out(unit, names):
+    table = TABLE.assign(temperature=25.0)
+    table.columns = [name.format(unit) for name in names]
+    assert (read(table).temperature_C == 25.0).all()
+    with pytest.raises(ValueError, match="no column for the time"):
+        read_discharges(table.iloc[:, 1:])
+
+
+@pytest.mark.parametrize(
+    ("values", "name", "said"),
+    [
+        (25.0, "T1(?)", "the unit of 'T1(?)' is not known (--units temperature=UNIT). It is left out"),
+        (-2501.7, "Temperature (C)", "must hold temperatures, got -2501.7 degC. It is left out"),
+        ("--", "Temperature (C)", "got '--' in row 1. It is left out"),
+        (297.0, "Temperature", "in kelvin, --units temperature=K says so. It is left out"),
+        (297.0, "Temperature (C)", "must hold temperatures, got 297 degC. It is left out"),
+        (6.283, "Cycle", "whole numbers of cycles. It is left out"),
+        (np.nan, "Cycle", "whole numbers of cycles. It is left out"),
+        ("first", "Cycle", "got 'first' in row 1. It is left out"),
+    ],
+)
+def test_a_column_that_nobody_needs_never_refuses_a_record(values, name, said):
+    table = TABLE.assign(**{name: values})
+    discharge = read(table, said)
+    same(discharge)
+    assert discharge.temperature_C is None and "cycle" not in discharge.meta
+    same(read(table, ignore=[name]))  # and nothing is said of it
+
+
+def test_a_column_can_be_ignored_on_the_command_line(tmp_path, capsys):
+    TABLE.assign(Voltage=0.5 * TABLE["voltage"]).to_csv(tmp_path / "cell.csv", index=False)
+    assert command([str(tmp_path / "cell.csv")]) == 2
+    assert "both 'voltage' and 'Voltage' may be the voltage" in capsys.readouterr().err
+    assert command([str(tmp_path / "cell.csv"), "--ignore", "Voltage", "--ignore", "other"]) == 0
+    assert calibrate(tmp_path / "cell.csv", ignore=["Voltage"])[0].settled
+
+
+def test_columns_that_agree_need_no_choice_and_the_finest_is_taken():
+    hours, milli = {"time/h": (RECORD.time_s / 3600.0).round(7)}, {"current/mA": -1e3 * RECORD.current_A}
+    table = TABLE.rename(columns={"time": "time/s", "current": "current/A"}).assign(**hours, **milli)
+    same(read(table))
+    same(read(table[table.columns[::-1]]), atol=2e-4)
+    table["time/h"] *= 1.01
+    with pytest.raises(ValueError, match="both 'time/s' and 'time/h' may be the time"):
+        read_discharges(table)
+
+
+def test_a_finer_clock_is_taken_where_one_has_the_same_time_twice_and_else_named():
+    fine_s = np.linspace(0.0, 0.5 * (len(TABLE) - 1), len(TABLE))
+    table = TABLE.assign(time=fine_s).rename(columns={"time": "DPt Time"}).assign(**{"Test Time": np.floor(fine_s)})
+    np.testing.assert_array_equal(read(table).time_s, fine_s)
+    table["DPt Time"] *= 2.0
+    with contextlib.suppress(ValueError), pytest.warns(
+        UserWarning, match="the time is 'Test Time'; 'DPt Time' tells more rows apart"
+    ):
+        read_discharges(table)
+
+
+def test_of_three_electrodes_the_cell_is_taken():
+    table = TABLE.rename(columns={"time": "time/s", "voltage": "Ewe-Ece/V", "current": "I/A"})
+    table["Ece/V"] = np.linspace(0.05, 0.2, len(table))
+    table["Ewe/V"] = table["Ewe-Ece/V"] + table["Ece/V"]
+    same(read(table))
+    same(read(table.drop(columns="Ewe-Ece/V"), "the voltage is Ewe/V less Ece/V"))
+    alone = read(table[["time/s", "Ewe/V", "I/A"]])
+    np.testing.assert_array_equal(alone.voltage_V, table["Ewe/V"])
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("W", 1.0), ("mW", 1e3)])
+def test_a_power_or_a_charge_a_row_tells_the_current(unit, factor):
+    table = TABLE.assign(**{f"Power ({unit})": factor * TABLE["current"] * TABLE["voltage"]}).drop(columns="current")
+    same(read(table, f"the current is Power ({unit}) over voltage"))
+    steps_C = np.diff(TABLE["time"], prepend=TABLE["time"].iloc[0]) * TABLE["current"]
+    table = TABLE.assign(**{"dq/mA.h": steps_C / 3.6}).drop(columns="current")
+    found = read(table, "the current is the charge dq/mA.h over the time since the row before")
+    np.testing.assert_allclose(found.current_A[1:], RECORD.current_A[1:])
+    # nobody needs them beside a current
+    same(read(TABLE.assign(Power="?", **{"dq/mA.h": "?"})))
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.sets(st.integers(3, len(TABLE) - 3), min_size=1, max_size=6), st.floats(0.0, 5.0))
+def test_a_clock_that_starts_anew_with_each_step_is_added_up(starts, first_s):
+    steps = np.zeros(len(TABLE))
+    steps[[LOAD_ON, *starts]] = 1.0
+    steps = np.cumsum(steps)
+    start_s = TABLE["time"].groupby(steps).transform("first")
+    table = TABLE.assign(time=TABLE["time"] - start_s + first_s, Step=steps)
+    discharge = read(table, "the time starts anew with each step, and is added up")
+    # what passes between two steps is not in such a file
+    lost_s = sum(TABLE["time"].iloc[n] - TABLE["time"].iloc[n - 1] - first_s for n in {LOAD_ON, *starts})
+    assert np.ptp(discharge.time_s) == pytest.approx(np.ptp(RECORD.time_s) - lost_s, abs=0.01 * len(starts) + 0.01)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(20, len(TABLE) - 20), st.floats(0.1, 8.0))
+def test_a_clock_that_goes_back_a_little_at_a_step_does_not_start_anew(row, back_s):
+    after = np.arange(len(TABLE)) >= row
+    interval_s = RECORD.time_s[row] - RECORD.time_s[row - 1]
+    table = TABLE.assign(time=RECORD.time_s - after * (interval_s + back_s), Step=1 + after)
+    found = read(table, "the clock goes back where the step changes, and is taken to go on by 9.3")
+    near(found, 1e-3)
+    assert len(found.time_s) == len(TABLE)
+    near(read(table.drop(columns="Step"), f"left out with a time before that of the row before: row {row + 1}"), 8e-3)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.sets(st.integers(20, len(TABLE) - 20), min_size=1, max_size=8))
+def test_first_rows_of_steps_whose_time_is_zero_are_left_out(rows):
+    first = np.isin(np.arange(len(TABLE)), list(rows))
+    table = TABLE.assign(time=np.where(first, 0.0, RECORD.time_s), Step=1 + np.cumsum(first))
+    near(read(table, f"left out with a time before that of the row before: row {min(rows) + 1}"))
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(1, len(TABLE) - 2), st.sampled_from([-5e-4, -1e-4, 1e-4, 5e-4]), st.integers(1, 3))
+def test_a_row_that_comes_again_with_little_else_is_left_out(row, more, times):
+    again = TABLE.iloc[np.repeat(row, times)] + np.outer(np.arange(1, times + 1), [0.0, more, more])
+    table = pd.concat([TABLE[: row + 1], again, TABLE[row + 1 :]], ignore_index=True)
+    same(read(table, "left out with the time of the row before"))
+
+
+def test_two_rows_a_second_on_a_clock_of_seconds_lose_every_second_one():
+    fine_s = np.arange(0.0, RECORD.time_s[-1], 0.5)
+    columns = {name: np.interp(fine_s, TABLE["time"], TABLE[name]) for name in ("voltage", "current")}
+    found = read(pd.DataFrame({"time": np.floor(fine_s)} | columns), "left out with the time of the row before")
+    near(found)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5])
+@pytest.mark.parametrize("row", [100, 200])
+def test_at_a_switch_the_order_of_the_rows_tells(share, row):
+    current = np.where(np.arange(len(TABLE)) >= row, share, 1.0) * TABLE["current"]
+    table = TABLE.assign(current=current)
+    again = table.iloc[[row - 1]].assign(current=current.iloc[row], voltage=TABLE["voltage"].iloc[row - 1] + 0.1)
+    table = pd.concat([table[:row], again, table[row:]], ignore_index=True)
+    found = read(table, f"row {row + 1} has the time of the row before, and is the later one")
+    expected_C = -np.trapezoid(current[:row], RECORD.time_s[:row]) - np.trapezoid(current[row:], RECORD.time_s[row:])
+    expected_C -= current.iloc[row] * (RECORD.time_s[row] - RECORD.time_s[row - 1])
+    assert found.charge_C == pytest.approx(expected_C, rel=4e-3)
+
+
+def test_a_fault_of_the_voltage_does_not_turn_the_sign():
+    fault = TABLE[99:100].assign(time=RECORD.time_s[99] + 1.0, voltage=0.003, current=0.0)
+    for sign in (1, -1):
+        table = pd.concat([TABLE[:100], fault, TABLE[100:]])
+        assert read(table.assign(current=sign * table["current"])).charge_C > 5000.0
+
+
+def test_what_says_other_things_at_one_time_is_refused():
+    other = TABLE.assign(voltage=TABLE["voltage"] - 0.05)
+    with pytest.raises(ValueError, match="Give each sample once"):
+        read_discharges(pd.concat([TABLE, other]).sort_values("time", kind="stable"))
+    with pytest.raises(ValueError, match=r"the column of its step|tells it from the next\.$") as caught:
+        read_discharges(pd.concat([TABLE, other]).sort_values("time", kind="stable").assign(Step=1))
+    assert "step" not in str(caught.value)  # which is there
+
+
+def test_clocks_that_are_put_back_are_told_as_such():
+    times = pd.Timestamp("2026-10-25 02:45") + pd.to_timedelta(TABLE["time"], unit="s")
+    table = TABLE.assign(time=times - pd.to_timedelta(3600.0 * (TABLE["time"] > 900.0), unit="s"))
+    with pytest.raises(ValueError, match="Clocks are put back by an hour in autumn: give times of UTC"):
+        read_discharges(table)
+
+
+@pytest.mark.parametrize("end", ["1508.9,3.37,", "1508.9,3.37,-", "1508.9,3.37,-1.2e", "1508.9,3"])
+def test_a_last_line_that_is_cut_is_left_out(end, tmp_path):
+    lines = TABLE[:160].to_csv(index=False)
+    (tmp_path / "cell.csv").write_text(lines + end)
+    assert len(read(tmp_path / "cell.csv", "the last line, row 161, is incomplete").time_s) == 160
+
+
+@pytest.mark.parametrize("places", [[50], [1, 100, 300]])
+def test_a_header_that_comes_again_is_left_out(places, tmp_path):
+    lines = TABLE.to_csv(index=False).splitlines()
+    for place in reversed(places):
+        lines.insert(place, lines[0])
+    (tmp_path / "cell.csv").write_text("\n".join(lines))
+    same(read(tmp_path / "cell.csv", "the header comes again, and is left out"))
+
+
+@pytest.mark.parametrize("ends", [(1, 0), (0, 1), (3, 2)])
+def test_rows_without_a_cell_at_the_ends_are_named(ends):
+    def dead(count):
+        return pd.DataFrame({"time": np.zeros(count), "voltage": 0.003, "current": 0.0})
+
+    table = pd.concat([dead(ends[0]), TABLE, dead(ends[1])], ignore_index=True)
+    table["time"] = np.concatenate([np.arange(-ends[0], 0), RECORD.time_s, RECORD.time_s[-1] + 1 + np.arange(ends[1])])
+    for sign in (1, -1):
+        same(read(table.assign(current=sign * table["current"]), "is left out: 0.003 V without a current is no cell"))
+
+
+def test_a_row_a_step_is_no_record():
+    step = pd.DataFrame({"time": [3600.0, 4200.0, 6800.0, 7400.0], "voltage": [4.2, 4.19, 2.7, 3.2]})
+    step["current"] = [1.5, 0.0, -2.0, 0.0]
+    table = pd.concat([step.assign(time=step["time"] + 8000.0 * n, Cycle=n) for n in range(3)])
+    with pytest.raises(ValueError, match=r"rows are no discharge\. If each is the end of a step, export all"):
+        read_discharges(table)
+
+
+def test_the_time_in_a_step_tells_when_the_load_was_switched_on():
+    after = RECORD.time_s - RECORD.time_s[LOAD_ON]
+    table = TABLE.assign(time=np.where(LOADED | (after > 0), RECORD.time_s + 100.0, RECORD.time_s))
+    table["Step"] = np.cumsum(np.arange(len(table)) == LOAD_ON)
+    table["Step Time (s)"] = np.where(after >= 0, after + 0.5, RECORD.time_s)
+    found = read(table, "the rest is taken to last until 0.5 s before row")
+    assert found.load_on_time_s == pytest.approx(RECORD.time_s[LOAD_ON] + 100.0, abs=0.5)
+    near(found, 4e-3)
+
+
+WORDS = [("Charge", "Rest", "Discharge"), ("CHA", "PAU", "DCH"), ("Laden", "Ruhe", "Entladen"), ("CC_Chg", "Rest", "CC_DChg")]
+
+
+@pytest.mark.parametrize("words", [*WORDS, ("C", "R", "D"), ("1C charge", "wait", "1C discharge")])
+@pytest.mark.parametrize("name", ["State", "Betriebsart", "what the tester does"])
+def test_an_unsigned_current_takes_its_sign_from_words_in_any_column(words, name, tmp_path):
+    sign = np.sign(CYCLE["current"].where(CYCLE["current"].abs() > 0.1, 0.0)).astype(int)
+    table = CYCLE.assign(current=CYCLE["current"].abs(), **{name: [words[1 - each] for each in sign]}, Comment="no word")
+    table.to_csv(tmp_path / "cell.csv", index=False)
+    table.to_parquet(tmp_path / "cell.parquet")
+    for source in (table, tmp_path / "cell.csv", tmp_path / "cell.parquet"):
+        np.testing.assert_allclose(read(source).current_A[10:], np.abs(RECORD.current_A))
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("options", [{}, {"discharge_is_negative": True}, {"discharge_is_negative": False}])
+@pytest.mark.parametrize("order", [["CHARGE", "REST", "TABLE"], ["TABLE", "REST", "CHARGE"]])
+def test_a_current_without_a_sign_is_refused(sign, options, order):
+    parts = [globals()[name] for name in order]
+    parts = [part.assign(time=part["time"] - part["time"].iloc[0] + 4000.0 * n) for n, part in enumerate(parts)]
+    table = pd.concat(parts, ignore_index=True)
+    table["current"] = sign * table["current"].abs()
+    with pytest.raises(ValueError, match=r"the current has no sign.*--columns state=NAME"):
+        read_discharges(table, **options)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("cell", ["B0005", "B0006"])
+@pytest.mark.parametrize("rest_V", [0.3, 0.45, 0.6])
+def test_the_jumps_at_the_switches_tell_the_sign_though_a_long_rest_follows(sign, cell, rest_V):
+    for record in load_nasa_discharges(cell)[::24]:
+        loaded = np.flatnonzero(record.current_A > 1.0)[-1] + 1
+        rest = np.arange(1, 61) * 10.0
+        table = pd.DataFrame({"time": record.time_s, "voltage": record.voltage_V, "current": sign * record.current_A})[:loaded]
+        low_V = table["voltage"].iloc[-1] + rest_V * (1.0 - 0.5 * np.exp(-rest / 200.0))
+        more = pd.DataFrame({"time": table["time"].iloc[-1] + rest, "voltage": low_V, "current": 0.0})
+        discharge = read(pd.concat([table, more]))
+        assert discharge.charge_C == pytest.approx(record.charge_C, rel=0.01)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 4), st.integers(1, 40), st.booleans())
+def test_the_number_of_the_cycle_parts_no_rest_from_its_load_and_no_discharge(before, loops, with_charge):
+    """``before``: so many rows of the rest count to the cycle of the load; in the load the counter goes up ``loops`` times."""
+    rest = len(CYCLE) - len(TABLE) + LOAD_ON
+    number = 7 + np.cumsum(np.isin(np.arange(len(CYCLE)), [rest - before, *np.linspace(rest, len(CYCLE), loops).astype(int)]))
+    table = CYCLE.assign(Cycle=number)[0 if with_charge else len(CHARGE) :]
+    table = pd.concat([table, table.assign(time=table["time"] + 9000.0, Cycle=table["Cycle"] + 100)])
+    discharges = read_discharges(table)
+    assert len(discharges) == 2
+    for discharge, offset in zip(discharges, (0, 100), strict=True):
+        assert discharge.charge_C == pytest.approx(RECORD.charge_C, rel=3e-3)
+        assert discharge.meta["cycle"] == number[rest] + offset
+        assert discharge.current_A[0] < 0.01
+
+
+def hybrid(counter):
+    """Return nine loops of a pulse of load, one of charge, a discharge and a rest, with a counter that goes up in each."""
+    loop = [(10, 2.0, 1), (40, 0.0, 5), (10, -1.5, 1), (40, 0.0, 5), (360, 2.0, 10), (600, 0.0, 60)]
+    steps = [(600, 0.0, 60), *(9 * loop)]
+    table = pd.DataFrame([(dt, amps, k) for k, (length, amps, dt) in enumerate(steps) for _ in range(length // dt)])
+    table.columns = ["dt", "amps", "step"]
+    charge_C = (table["dt"] * table["amps"]).cumsum()
+    table = pd.DataFrame({"time": table["dt"].cumsum(), "voltage": 4.19 - 1.4 * charge_C / 7200 - 0.1 * table["amps"]}).assign(
+        current=-table["amps"], Cycle=(table["step"] + 5 - counter) // 6
+    )
+    return table, charge_C.iloc[-1]
+
+
+@pytest.mark.parametrize("counter", range(6))
+def test_loops_of_pulses_are_one_discharge_wherever_the_counter_goes_up(counter):
+    table, charge_C = hybrid(counter)
+    (discharge,) = read_discharges(table)
+    assert discharge.charge_C == pytest.approx(charge_C, rel=0.02)
+
+
+@pytest.mark.parametrize("order", ["stacked", "mixed"])
+def test_the_cells_of_a_table_are_told_apart(order, tmp_path, capsys):
+    other = load_nasa_discharges("B0005")[99]
+    second = pd.DataFrame({"time": other.time_s, "voltage": other.voltage_V, "current": -other.current_A, "cell_id": "B 5"})
+    table = pd.concat([TABLE.assign(cell_id="B6"), second])
+    table = table.sort_values("time", kind="stable") if order == "mixed" else table
+    found = read_discharges(table)
+    assert [each.meta["cell"] for each in found] == ["B6", "B 5"]
+    same(found[0])
+    table.to_csv(tmp_path / "two.csv", index=False)
+    (source,) = many.find_sources([str(tmp_path / "two.csv")])
+    outcomes = list(many.calibrate_all([source], many.FileFormat(), Settings()))
+    assert [(each.cell, each.record) for each in outcomes] == [("B6", "two_B6"), ("B 5", "two_B_5")]
+    assert {each.meta.get("cell") for each in read_discharges(TABLE.assign(cell_id="B6"))} == {None}
+
+
+def test_lines_that_are_quoted_as_a_whole_are_read(tmp_path):
+    (tmp_path / "cell.csv").write_text("".join(f'"{line}"\n' for line in TABLE.to_csv(index=False).splitlines()))
+    same(read(tmp_path / "cell.csv"))
+
+
+def test_layers_of_rows_are_read_as_the_lowest_one(tmp_path):
+    """As Neware's software exports cycles, steps and records in one table."""
+    lines = ["Cycle Index,Chg. Cap.(Ah),DChg. Cap.(Ah)", ",Step Index,Step Type,Capacity(Ah),Voltage(V)"]
+    lines += [",,DataPoint,Total Time,Current(A),Voltage(V)"]
+    for cycle in (1, 2):
+        lines += [f"{cycle},1.9,1.4"]
+        for step, (low, high) in enumerate([(0, 60), (60, 70 + LOAD_ON), (70 + LOAD_ON, len(CYCLE))], start=1):
+            lines += [f",{step},CC Chg,1.4,3.9"]
+            part = CYCLE[low:high]
+            lines += [f",,{n},{9000 * cycle + t!r},{i!r},{v!r}" for n, (t, v, i) in enumerate(part.to_numpy().tolist())]
+    (tmp_path / "cell.csv").write_text("\n".join(lines))
+    paths = [tmp_path / "cell.csv"]
+    if importlib.util.find_spec("openpyxl"):
+        paths.append(tmp_path / "cell.xlsx")
+        fields = [(line + 6 * ",").split(",")[:6] for line in lines]
+        pd.DataFrame(fields).replace("", None).to_excel(paths[1], header=False, index=False)
+    for path in paths:
+        found = read_discharges(path)
+        assert [each.meta["cycle"] for each in found] == [1, 2]
+        for each in found:
+            np.testing.assert_allclose(each.current_A[10:], RECORD.current_A)
+
+
+def test_the_sheet_of_a_workbook_that_holds_the_record_is_read_with_those_that_continue_it(tmp_path):
+    pytest.importorskip("openpyxl", reason="the extra excel is not installed")
+    path = tmp_path / "cell.xlsx"
+    half = len(TABLE) // 2
+    table = TABLE.rename(columns={"time": "Test_Time(s)", "voltage": "Voltage(V)", "current": "Current(A)"})
+    with pd.ExcelWriter(path) as writer:
+        pd.DataFrame({"Cell": ["B0006"], "Schedule": ["cc"]}).to_excel(writer, sheet_name="Info", index=False)
+        table[:half].to_excel(writer, sheet_name="Channel_1", index=False, startrow=3)
+        table[half:].to_excel(writer, sheet_name="Channel_2", index=False, startrow=3)
+        table[:1].assign(more=1).to_excel(writer, sheet_name="Statistics", index=False)
+    same(read(path))
+    (tmp_path / "text.xls").write_text(table.to_csv(index=False, sep="\t"))
+    same(read(tmp_path / "text.xls"))  # as some testers call their text
+
+
+@pytest.mark.parametrize("suffix", [".xlsx", ".xls"])
+def test_a_workbook_that_is_damaged_or_needs_an_extra_says_so(suffix, tmp_path, monkeypatch):
+    (tmp_path / f"cell{suffix}").write_bytes({".xlsx": b"PK\x03\x04", ".xls": b"\xd0\xcf\x11\xe0"}[suffix] + bytes(100))
+    with pytest.raises((ValueError, ImportError), match=r"damaged, or no workbook|battery_env\[excel\]"):
+        read_discharges(tmp_path / f"cell{suffix}")
+    monkeypatch.setitem(sys.modules, "openpyxl", None)
+    monkeypatch.setitem(sys.modules, "xlrd", None)
+    with pytest.raises((ValueError, ImportError), match=r"damaged, or no workbook|battery_env\[excel\]"):
+        read_discharges(tmp_path / f"cell{suffix}")
+
+
+def test_a_folder_reads_numbered_text_and_names_what_it_left_out(tmp_path, capsys):
+    lab, results = tmp_path / "lab", tmp_path / "lab" / "results"
+    lab.mkdir()
+    TABLE.to_csv(lab / "cell.001", index=False, sep="\t")
+    (lab / "old.csv.gz").write_bytes(gzip.compress(TABLE.to_csv(index=False).encode()))
+    for name in ("a.res", "b.h5", "photo.png"):
+        (lab / name).write_bytes(b"?")
+    assert command([str(lab), "--out", str(results)]) == 0
+    assert "a.res, b.h5, photo.png left out, by their names no records" in capsys.readouterr().err
+    assert command([str(lab)]) == 0  # results are no records, and need not be named
+    assert "results" not in capsys.readouterr().err
+    assert [source.stem for source in many.find_sources([str(lab / "cell.001")])] == ["cell"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "said", "unsaid"),
+    [
+        ({"time": TABLE["time"] / 3600.0}, "--units time=h", ""),
+        ({"time": TABLE["time"] * 1e3}, "--units time=ms", ""),
+        ({"voltage": TABLE["voltage"] * 1e3}, "--units voltage=mV", ""),
+        ({"time (s)": TABLE["time"] / 3600.0, "time": None}, "got 0.839375 s. That is too short for a discharge.", "--units"),
+        ({"voltage": TABLE["voltage"] * 1e4}, "must lie within 0 .. 5.5 V", "--units"),
+        ({"current": TABLE["current"] * 1e-3}, "state the unit of the current", "--units"),
+        ({"current (A)": TABLE["current"] * 1e-3, "current": None}, "below some 20 mAh", "unit"),
+    ],
+)
+def test_advice_is_given_only_if_it_helps_and_does_not_contradict_what_is_known(changes, said, unsaid):
+    table = TABLE.assign(**changes).dropna(axis="columns", how="all")
+    with pytest.raises(ValueError) as caught:
+        read_discharges(table)
+    assert said in str(caught.value) and not (unsaid and unsaid in str(caught.value)), str(caught.value)
+
+
+def test_a_sign_that_was_stated_is_not_advised_again():
+    with pytest.raises(ValueError, match="--discharge-is-negative"):
+        read_discharges(TABLE.iloc[1:], discharge_is_negative=False)
+
+
+def test_a_dependency_of_a_reader_that_is_missing_is_named_and_its_warnings_are_not_passed_on(tmp_path, monkeypatch):
+    neware = types.ModuleType("NewareNDA")
+
+    def loud(path, log_level):
+        warnings.warn("this will change in pandas 4", FutureWarning, stacklevel=2)
+        return TABLE
+
+    neware.read = loud
+    monkeypatch.setitem(sys.modules, "NewareNDA", neware)
+    (tmp_path / "cell.ndax").write_bytes(b"x")
+    same(read(tmp_path / "cell.ndax"))
