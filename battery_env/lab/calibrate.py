@@ -258,7 +258,7 @@ def _is_all_logged(seen: _Seen, forecast: VoltageForecast, estimate: Estimate) -
     columns = (discharge.time_s, discharge.voltage_V, discharge.current_A)
     shown = watched(Samples(*(column[begin:end] for column in columns)), seen.cell, seen.start.soc, q_mobile, r_o)
     is_lower = shown["start"]["first_V"] < shown["start_V"]
-    if shown["fault"]["condition"] or (is_lower and start_condition(shown, q_mobile, r_o)):
+    if shown["fault"]["condition"] or (is_lower and start_condition(shown)):
         return False
     gaps = find_gaps(record.time_s, record.voltage_V, record.current_A, forecast.at_samples_V, q_mobile)
     return all(gap.verdict == DRAWN for gap in gaps)

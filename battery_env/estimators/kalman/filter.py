@@ -29,7 +29,7 @@ _PRIOR_SD_R_OHM = 0.15
 _HOUR_S = 3600.0
 _NOISE_V = 0.005
 # What reasons are made of
-_SHOWN = ("start", "fault", "gap", "start_V")
+_SHOWN = ("start", "fault", "switch", "gap", "start_V")
 
 
 class ExtendedKalmanFilter(OnlineEstimator):
