@@ -174,7 +174,7 @@ _CALIBRATION: _Options = {
         "dest": "future_current_A",
         "type": float,
         "metavar": "A",
-        "help": "current after the end of a record in progress, A (default: its last one, or its mean if it varied)",
+        "help": "current after the end of a record in progress, A (default: its last one, or as so far if it varied)",
     },
     ("--cell",): {
         "type": Path,

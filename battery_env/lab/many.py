@@ -91,4 +91,4 @@ def _calibrate(
         return None
     found = calibrate(recording.discharge(), settings)
     files = voltages_of(known.record, found) if with_voltages else {}
-    return replace(found, record=None, forecast=None), files
+    return replace(found, record=None, forecast=None, end=None), files

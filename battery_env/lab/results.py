@@ -111,5 +111,5 @@ def voltages_of(name: str, found: Calibration) -> dict[str, bytes]:
     table = pd.DataFrame(columns | {"model_V": forecast.at_samples_V}).to_csv(index=False)
     picture = io.BytesIO()
     shown = {f"model, {METHOD_NAMES[found.method]}": forecast}
-    plot_discharge(record, shown, title_of(name, found), found.end_quantiles_s).savefig(picture, dpi="figure")
+    plot_discharge(record, shown, title_of(name, found), found.end).savefig(picture, dpi="figure")
     return {"csv": table.encode(), "png": picture.getvalue()}
