@@ -14,6 +14,7 @@ from battery_env.tasks.registration import register_environments
 
 if TYPE_CHECKING:
     from battery_env.electrochemistry import NEW_CELL, CellParameters, Trajectory, initial_state, simulate, step, voltage
+    from battery_env.electrochemistry.aging_path import AgingPath
     from battery_env.estimates import Estimate
     from battery_env.estimators import (
         CellFit,
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
         LeastSquares,
         cramer_rao_bound,
         fit_cell,
+        fit_life,
         soc_from_rest,
     )
     from battery_env.evaluation import evaluate
@@ -45,10 +47,11 @@ if TYPE_CHECKING:
 # Type checkers see the imports above instead; a test holds the two together.
 _MODULES = {
     "electrochemistry": ("NEW_CELL", "CellParameters", "Trajectory", "initial_state", "simulate", "step", "voltage"),
+    "electrochemistry.aging_path": ("AgingPath",),
     "estimates": ("Estimate",),
     "estimators": (
         *("CellFit", "ClosedForm", "Estimator", "ExtendedKalmanFilter", "GreedyOneStep", "LeastSquares"),
-        *("cramer_rao_bound", "fit_cell", "soc_from_rest"),
+        *("cramer_rao_bound", "fit_cell", "fit_life", "soc_from_rest"),
     ),
     "evaluation": ("evaluate",),
     "lab.calibrate": ("calibrate",),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import overload
 
@@ -26,6 +26,7 @@ class Estimate:
     :param settled_q_mobile: whether ``q_mobile`` is settled, though ``r_o`` may not be; where ``settled`` is false and nothing
         is said of either number, neither is
     :param settled_r_o: likewise
+    :param constants: what else was found of the cell, by the names of an :class:`~battery_env.AgingPath`; ``None``: nothing
     """
 
     q_mobile: float
@@ -36,6 +37,7 @@ class Estimate:
     reason: str = ""
     settled_q_mobile: bool = True
     settled_r_o: bool = True
+    constants: Mapping[str, float] | None = None
 
     def __post_init__(self) -> None:
         if not (self.settled_q_mobile and self.settled_r_o):

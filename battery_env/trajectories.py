@@ -29,6 +29,8 @@ from battery_env.electrochemistry import (
     check_dt,
     initial_state,
 )
+from battery_env.electrochemistry.aging_path import EQUILIBRIUM_SIZE, AgingPath
+from battery_env.electrochemistry.equilibrium import with_equilibrium
 from battery_env.electrochemistry.kernels import roll_out
 from battery_env.files import load_npz, save_npz
 from battery_env.loads import Load, LoadSampler, constant
@@ -48,10 +50,10 @@ _MIN_SAMPLES = 8
 _LEFT_SAMPLES = 4  # of a discharge that is trimmed
 _LEAST_DT_S = 0.01  # of a discharge that may take a day
 _INDICES = ("load_start", "samples", "first", "stop", "checkpoint_start")
-_PER_TRAJECTORY = ("q_mobile", "r_o", "factors", "eod_time_s", *_INDICES)
+_PER_TRAJECTORY = ("q_mobile", "r_o", "factors", "equilibrium_V", "eod_time_s", *_INDICES)
 _ARRAYS = (*_PER_TRAJECTORY, "load_values", "checkpoint")
 _SETTINGS = ("load_unit", "dt_s", "thermal", "description")
-_KIND, _FORMAT = "data set of simulated discharges", 3
+_KIND, _FORMAT = "data set of simulated discharges", 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,8 +70,9 @@ class TrajectoryDataset(Sequence[Trajectory]):
       train, test = aged.split(test=0.3, seed=0)
       print(len(train), test[0].q_mobile, test[0].eod_time_s)
 
-    Made by :meth:`generate`, :meth:`paper` (the data of Unagar et al.), :meth:`simulated`, :meth:`from_trajectories` or
-    :meth:`load`. ``dataset[i]`` is a :class:`~battery_env.electrochemistry.Trajectory`, ``dataset[:10]`` a data set.
+    Made by :meth:`generate`, :meth:`along` a path of aging cells, :meth:`paper` (the data of Unagar et al.),
+    :meth:`simulated`, :meth:`from_trajectories` or :meth:`load`. ``dataset[i]`` is a
+    :class:`~battery_env.electrochemistry.Trajectory`, ``dataset[:10]`` a data set.
 
     It keeps parameters, loads and a state every 64 steps. States between are simulated again when they are asked for, to the
     same bits.
@@ -78,6 +81,8 @@ class TrajectoryDataset(Sequence[Trajectory]):
     :param r_o: ohm, shape (n,)
     :param factors: what ``UNCERTAIN_CONSTANTS`` (kn, tDiffusion, to, tsn) of each true cell are multiplied by, shape (n, 4);
         ones where the constants of ``cell`` are exact
+    :param equilibrium_V: what is added to the equilibrium voltage of each true cell, as an
+        :class:`~battery_env.AgingPath` has it, V, shape (n, 8); zeros where that of ``cell`` is exact
     :param eod_time_s: end of discharge, s after the first sample of the whole discharge, shape (n,); NaN where unknown
     :param load_values: all load profiles end to end, one value a step
     :param load_start: where in ``load_values`` each trajectory's profile starts, shape (n,); trajectories may share a profile
@@ -96,6 +101,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
     q_mobile: FloatArray
     r_o: FloatArray
     factors: FloatArray
+    equilibrium_V: FloatArray
     eod_time_s: FloatArray
     load_values: FloatArray
     load_start: IntArray
@@ -146,10 +152,6 @@ class TrajectoryDataset(Sequence[Trajectory]):
             raise ValueError(f"n must be at least 1 and seed at least 0, got n = {n} and seed = {seed}")
         if not isinstance(mismatch, Real) or not 0.0 <= mismatch <= MISMATCH_LIMIT:
             raise ValueError(f"mismatch is a relative standard deviation within 0 .. {MISMATCH_LIMIT:g}, got {mismatch!r}")
-        if isinstance(loads, Load) or not (callable(loads) or isinstance(loads, Sequence)):
-            raise TypeError(f"loads must be a list of Loads or a sampler of them, got {type(loads).__name__}")
-        if not callable(loads) and len(loads) == 0:
-            raise ValueError("loads must not be empty")
         q_range, r_range = check_range("q_mobile_range", q_mobile_range), check_range("r_o_range", r_o_range)
         Q_MOBILE.check(q_range)
         R_O.check(r_range)
@@ -157,15 +159,46 @@ class TrajectoryDataset(Sequence[Trajectory]):
         rng = np.random.default_rng(seed)
         q = rng.uniform(*q_range, size=n) if "q_mobile" in aged else np.full(n, cell.q_mobile)
         r = rng.uniform(*r_range, size=n) if "r_o" in aged else np.full(n, cell.r_o)
-        if callable(loads):
-            drawn, index = [loads(rng) for _ in range(n)], np.arange(n)
-        else:
-            drawn, index = list(loads), rng.integers(len(loads), size=n)
+        drawn, index = _drawn_loads(loads, n, rng)
         # drawn last, so that all else is the same with and without a mismatch
         factors = np.exp(np.sqrt(np.log1p(mismatch**2)) * rng.standard_normal((n, len(UNCERTAIN_CONSTANTS))))
         made = TrajectoryDataset.simulated(q, r, drawn, index, dt_s, thermal, cell, factors)
         asked = {"parameters": list(aged), "n": n, "seed": seed, "mismatch": float(mismatch)}
         return replace(made, description={"made_by": "generate", **asked})
+
+    @staticmethod
+    def along(
+        path: AgingPath,
+        n: int,
+        loads: Sequence[Load] | LoadSampler,
+        seed: int,
+        dt_s: float = 1.0,
+        thermal: bool = False,
+    ) -> TrajectoryDataset:
+        """
+        Discharges of ``n`` cells drawn along a path, whose constants age together with ``q_mobile`` and ``r_o``.
+
+        .. code-block:: python
+
+          path = fit_life(load_nasa_discharges("B0006"))
+          cells = TrajectoryDataset.along(path, n=100, loads=[constant(2.0, "current")], seed=0)
+
+        :param path: how cells of the kind age
+        :param n: number of discharges
+        :param loads: loads to choose from at random, or a sampler of loads
+        :param seed: seed of cells and loads
+        :param dt_s: time step, s
+        :param thermal: whether the temperature moves
+        :return: the data set; its ``cell`` has the constants that all ages share, as a calibrator may know them
+        :raises ValueError: for values out of range
+        """
+        if not isinstance(path, AgingPath):
+            raise TypeError(f"path must be an AgingPath, got {type(path).__name__}")
+        cells = path.draw(n, seed)
+        drawn, index = _drawn_loads(loads, n, np.random.default_rng([seed, 1]))
+        known = (cells.factors, cells.equilibrium_V)
+        made = TrajectoryDataset.simulated(cells.q_mobile, cells.r_o, drawn, index, dt_s, thermal, path.cell, *known)
+        return replace(made, description={"made_by": "along", "n": n, "seed": seed})
 
     @staticmethod
     def simulated(
@@ -177,6 +210,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
         thermal: bool = False,
         cell: CellParameters | None = None,
         factors: ArrayLike | None = None,
+        equilibrium_V: ArrayLike | None = None,
     ) -> TrajectoryDataset:
         """
         Discharge cells from full charge to the end of discharge.
@@ -189,6 +223,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
         :param thermal: whether the temperature moves
         :param cell: constants of the cell, as a calibrator may know them; ``None``: the new cell's
         :param factors: what ``UNCERTAIN_CONSTANTS`` of each cell are multiplied by, shape (n, 4); ``None``: ones
+        :param equilibrium_V: what is added to its equilibrium voltage, V, shape (n, 8); ``None``: nothing
         :return: the data set
         :raises ValueError: for values out of range, or a discharge of fewer than eight samples
         """
@@ -201,16 +236,20 @@ class TrajectoryDataset(Sequence[Trajectory]):
         index = np.broadcast_to(check_indices("load_index", load_index, len(loads)), q.shape)
         known = np.ones(1) if factors is None else np.asarray(factors, dtype=np.float64)
         multiples = np.broadcast_to(known, (q.size, len(UNCERTAIN_CONSTANTS))).copy()
+        added_V = np.broadcast_to(
+            0.0 if equilibrium_V is None else np.asarray(equilibrium_V), (q.size, EQUILIBRIUM_SIZE)
+        ).copy()
         cell = check_cell(cell, thermal)
         dt_s = _check_dt(dt_s, cell, multiples)
         if dt_s < _LEAST_DT_S:
             raise ValueError(f"dt_s must be at least {_LEAST_DT_S:g} s (a day of it must fit in memory), got {dt_s!r}")
         options = (dt_s, loads[0].unit == "power", thermal)
-        profiles, samples, checkpoints = _discharged(q, r, loads, index, options, cell, multiples)
+        profiles, samples, checkpoints = _discharged(q, r, loads, index, options, cell, multiples, added_V)
         return TrajectoryDataset(
             q_mobile=np.array(q),
             r_o=np.array(r),
             factors=multiples,
+            equilibrium_V=added_V,
             eod_time_s=np.asarray(samples * dt_s, dtype=np.float64),
             load_values=np.concatenate(profiles),
             load_start=_starts(np.array([len(profile) for profile in profiles]))[index],
@@ -273,6 +312,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
             q_mobile=np.array([trajectory.q_mobile for trajectory in trajectories]),
             r_o=np.array([trajectory.r_o for trajectory in trajectories]),
             factors=np.ones((len(trajectories), len(UNCERTAIN_CONSTANTS))),
+            equilibrium_V=np.zeros((len(trajectories), EQUILIBRIUM_SIZE)),
             eod_time_s=np.array([trajectory.eod_time_s - trajectory.time_s[0] for trajectory in trajectories]),
             load_values=np.concatenate([trajectory.load for trajectory in trajectories]),
             load_start=_starts(samples),
@@ -351,14 +391,20 @@ class TrajectoryDataset(Sequence[Trajectory]):
         """The true constants of a trajectory."""
         known = {name: getattr(self.cell, name) for name in UNCERTAIN_CONSTANTS}
         true = {name: factor * known[name] for name, factor in zip(known, self.factors[n].tolist(), strict=True)}
-        return self.cell.replace(q_mobile=float(self.q_mobile[n]), r_o=float(self.r_o[n]), **true)
+        cell = self.cell.replace(q_mobile=float(self.q_mobile[n]), r_o=float(self.r_o[n]), **true)
+        return with_equilibrium(cell, self.equilibrium_V[n]) if self.equilibrium_V[n].any() else cell
 
     def packed(self, index: IntArray) -> PackedConstants:
-        """The true constants of some trajectories, one row a cell; or one row, where all have those of ``cell``."""
-        return _packed(self.cell, self.factors[index])
+        """
+        The true constants of some trajectories of one equilibrium voltage, one row a cell; or one row, where all have those of
+        ``cell``.
+        """
+        return _packed(self.cell, self.factors[index], self.equilibrium_V[index])
 
     def states_at(self, index: IntArray, sample: IntArray) -> FloatArray:
         """True states of some trajectories at some of their samples, counted from full charge: shape (m, 8)."""
+        if len(index) > 1 and self.equilibrium_V.any():
+            return np.concatenate([self.states_at(index[[k]], sample[[k]]) for k in range(len(index))])
         block, steps = np.divmod(sample, _CHECKPOINT_EVERY)
         state = self.checkpoint[self.checkpoint_start[index] + block]
         advance_in_place(
@@ -451,8 +497,23 @@ def _checkpoints(samples: IntArray) -> IntArray:
     return (samples - 1) // _CHECKPOINT_EVERY + 1
 
 
-def _packed(cell: CellParameters, factors: FloatArray) -> PackedConstants:
+def _packed(cell: CellParameters, factors: FloatArray, equilibrium_V: FloatArray) -> PackedConstants:
+    if equilibrium_V.any():
+        if (equilibrium_V != equilibrium_V[0]).any():
+            raise ValueError("the cells have equilibrium voltages of their own, and only one at a time can be followed")
+        cell = with_equilibrium(cell, equilibrium_V[0])
     return cell.packed if (factors == 1.0).all() else cell.packed_with(factors)
+
+
+def _drawn_loads(loads: Sequence[Load] | LoadSampler, n: int, rng: np.random.Generator) -> tuple[list[Load], IntArray]:
+    """Loads, and which of them each of n cells gets."""
+    if isinstance(loads, Load) or not (callable(loads) or isinstance(loads, Sequence)):
+        raise TypeError(f"loads must be a list of Loads or a sampler of them, got {type(loads).__name__}")
+    if callable(loads):
+        return [loads(rng) for _ in range(n)], np.arange(n)
+    if len(loads) == 0:
+        raise ValueError("loads must not be empty")
+    return list(loads), rng.integers(len(loads), size=n)
 
 
 def aged_parameters(parameters: str | Sequence[str]) -> tuple[str, ...]:
@@ -468,6 +529,7 @@ def _discharged(
     options: tuple[float, bool, bool],
     cell: CellParameters,
     factors: FloatArray,
+    equilibrium_V: FloatArray,
 ) -> tuple[list[FloatArray], IntArray, list[FloatArray]]:
     """The profile of each load as far as it is needed; of each cell the number of samples, and the states to keep."""
     dt_s, is_power, thermal = options
@@ -483,7 +545,7 @@ def _discharged(
         for n in cells.tolist():
             state[0] = start[n]
             run = (profile, q_mobile[n], r_o[n], dt_s, cell.VEOD, is_power, thermal)
-            samples[n] = roll_out(*run, _packed(cell, factors[[n]]), state, columns)
+            samples[n] = roll_out(*run, _packed(cell, factors[[n]], equilibrium_V[[n]]), state, columns)
             if samples[n] < _MIN_SAMPLES:
                 raise ValueError(
                     f"trajectory {n} (q_mobile {q_mobile[n]:g} C, r_o {r_o[n]:g} ohm) ends after {samples[n]} samples, at "
@@ -501,6 +563,7 @@ def _check(data: TrajectoryDataset) -> None:
     n = np.size(data.q_mobile)
     shapes = dict.fromkeys(_PER_TRAJECTORY, (n,)) | {
         "factors": (n, len(UNCERTAIN_CONSTANTS)),
+        "equilibrium_V": (n, EQUILIBRIUM_SIZE),
         "load_values": (np.size(data.load_values),),
         "checkpoint": (np.size(data.checkpoint) // STATE_SIZE, STATE_SIZE),
     }
@@ -513,7 +576,7 @@ def _check(data: TrajectoryDataset) -> None:
     Q_MOBILE.check(data.q_mobile)
     R_O.check(data.r_o)
     check_load(data.load_values, data.load_unit)
-    for name in ("factors", "checkpoint"):
+    for name in ("factors", "equilibrium_V", "checkpoint"):
         if not np.isfinite(getattr(data, name)).all():
             raise ValueError(f"{name} must be finite, got NaN or infinity")
     if not (data.factors > 0.0).all():

@@ -13,13 +13,12 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.polynomial import Legendre, Polynomial
-from numpy.polynomial.legendre import legvander
 from numpy.typing import ArrayLike
 
 from battery_env.arrays import FloatArray, IntArray
 from battery_env.checks import ZERO_CELSIUS_K, check_numbers, check_positive
 from battery_env.electrochemistry import NEW_CELL, CellParameters, check_cell, check_dt
+from battery_env.electrochemistry.equilibrium import equilibrium_slopes, with_equilibrium
 from battery_env.electrochemistry.tangents import BY_Q, BY_R, RATE_CONSTANTS
 from battery_env.estimates import Estimate
 from battery_env.estimators.diagnosis.conditions import FULL_REST_V, MISMATCH_MARGIN, rest_voltage_V
@@ -62,8 +61,6 @@ _FORMAT, _FORMAT_VERSION = "battery_env.CellFit", 2
 _MOST_DISCHARGES, _FEWEST_SAMPLES = 30, 20
 # Longer records are thinned: what the constants shape is slower.
 _MOST_SAMPLES = 2000
-# Mole fractions of the positive electrode at full charge and at none.
-_FRACTIONS_P = (0.4, 1.0)
 # A cell that holds less or more than the new one by this factor is one of another size.
 _OTHER_SIZE = 2.0
 # The charge that can move is about this much more than what a discharge delivers.
@@ -470,27 +467,6 @@ def _prior(records: Sequence[Record], start: CellParameters | None, thermal: boo
     return start.replace(VEOD=float(cut_off_V), **measured)
 
 
-def with_equilibrium(cell: CellParameters, coefficients_V: Sequence[float] | FloatArray) -> CellParameters:
-    """Return a cell with a Legendre series over ``_FRACTIONS_P`` added to its equilibrium voltage."""
-    # as a polynomial in y = 2x - 1, from the highest power down: term k of the Redlich-Kister sum is
-    # A_k / F * ((1 + k / 2) * y^(k + 1) - (k / 2) * y^(k - 1))
-    x = Polynomial([0.5, 0.5])
-    powers = Legendre(coefficients_V).convert(kind=Polynomial)(_on_unit_range(x)).coef
-    terms = np.zeros(max(len(cell.Ap), len(powers) - 1))
-    for k in range(len(powers) - 2, -1, -1):
-        terms[k] = powers[k + 1] / (1.0 + k / 2.0)
-        if k > 0:
-            powers[k - 1] += k / 2.0 * terms[k]
-    terms[: len(cell.Ap)] += np.array(cell.Ap) / cell.F
-    return cell.replace(U0p=cell.U0p + float(powers[0]), Ap=tuple((cell.F * terms).tolist()))
-
-
-def _on_unit_range(fraction: Any) -> Any:
-    # numbers, arrays and polynomials alike
-    low, high = _FRACTIONS_P
-    return (fraction - 0.5 * (high + low)) * (2.0 / (high - low))
-
-
 def _name(record: Record, number: int) -> str:
     meta = getattr(record, "meta", {})
     return f"{meta['cell']}:{meta['cycle']}" if {"cell", "cycle"} <= set(meta) else str(number)
@@ -626,7 +602,7 @@ class JointFit:
             voltage_V, by_parameter, fraction_p = model.tangents(data.current_A, q_mobile, r_o)
             columns = by_parameter[BY_Q] * q_gradient_C[:, None]
             columns[:rates] += self.sd[:rates, None] * by_parameter[BY_R + 1 :]
-            columns[rates:n] = self.sd[rates:, None] * legvander(_on_unit_range(fraction_p), n - rates - 1).T
+            columns[rates:n] = self.sd[rates:, None] * equilibrium_slopes(fraction_p, n - rates)
             columns[r] = _R_O_SCALE_OHM * by_parameter[BY_R]
             seen_V, *by_x = data.at_samples([voltage_V, *columns])
             found.append(AtDischarge(seen_V - data.voltage_V, np.column_stack(by_x), q_mobile, r_o, q_gradient_C))

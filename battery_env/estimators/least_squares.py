@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from battery_env.arrays import FloatArray
 from battery_env.checks import check_gain_sd, check_not_negative, check_positive
 from battery_env.electrochemistry import CellParameters
+from battery_env.electrochemistry.aging_path import PATH_NAMES, AgingPath
 from battery_env.electrochemistry.ends import LONGEST_S
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimates import Estimate, EstimateTrace
@@ -31,9 +32,9 @@ from battery_env.estimators.diagnosis.gaps import DRAWN, Gap, find_gaps, note_ga
 from battery_env.estimators.diagnosis.rest import InitialSoc, check_initial_soc
 from battery_env.estimators.diagnosis.samples import note_samples
 from battery_env.estimators.estimator import Estimator, check_bounds
-from battery_env.estimators.search import Fit, Prior, Search, square
+from battery_env.estimators.search import Fit, JointPrior, Prior, Search, square
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, check_parameters
-from battery_env.records import Record, Samples, check_record, starts_at_rest
+from battery_env.records import Record, Samples, check_record, drawn_charge_C, starts_at_rest
 from battery_env.records.model import RecordModel
 
 # Residuals whose variance is this many of its standard deviations above the one expected are not noise.
@@ -44,6 +45,13 @@ _NEGLIGIBLE_V = 1e-3
 _LEAST_NOISE_V = 1e-4
 # The effect of the charge at the start is taken over this step.
 _SOC_STEP = 1e-3
+# The error of the model at its place on a path drifts as the cell is discharged: a whole discharge has so many of them.
+# Chosen on B0005 along the path of B0006.
+_ERRORS_OF_A_DISCHARGE = 100.0
+# A cell that lies farther beside the path, in standard deviations, is of another kind.
+_BESIDE_LIMIT_SD = 4.0
+# Starts along a path, in standard deviations of its q_mobile; and how far above what the record allows they keep, as a share.
+_STARTS_SD, _START_ABOVE = (-1.5, -0.5, 0.5, 1.5), 0.02
 # The end of a record agrees with an estimate within this share of its duration.
 _END_SHARE = 0.02
 
@@ -138,6 +146,8 @@ class LeastSquares(Estimator):
         ``"offset_V"``
     :param initial_soc: state of charge at the first sample, after a rest: a number, or (mean, standard deviation), which adds
         to those of the parameters. :func:`battery_env.soc_from_rest` tells it from the voltage of the rest before the load
+    :param path: how cells of this kind age (:func:`battery_env.fit_life`): which constants, ``q_mobile`` and ``r_o`` go
+        together before this record is seen. ``cell`` and ``mismatch_V`` are those of the path by default
     :raises ValueError: for an argument out of range
     """
 
@@ -157,9 +167,17 @@ class LeastSquares(Estimator):
         current_gain_sd: float = 0.0,
         nuisance: Mapping[str, float] | None = None,
         initial_soc: InitialSoc = 1.0,
+        path: AgingPath | None = None,
     ) -> None:
         self.parameters = check_parameters(parameters)
         self.nuisance = _check_nuisance({} if nuisance is None else nuisance, self.parameters)
+        self.path = path
+        if path is not None:
+            if self.nuisance or self.parameters != PARAMETER_NAMES or prior_q_mobile_C is not None:
+                raise ValueError("path is of both parameters and of all nuisances: leave parameters, nuisance and prior out")
+            sds = np.sqrt(np.diag(path.moments[1])).tolist()
+            self.nuisance = {name: sd for name, sd in zip(PATH_NAMES, sds, strict=True) if name not in PARAMETER_NAMES}
+            cell, mismatch_V = cell or path.cell, mismatch_V or path.mismatch_V
         self.initial_soc = check_initial_soc(initial_soc)
         self.model = RecordModel(cell, thermal, dt_s, initial, self.initial_soc[0])
         self.bounds = check_bounds(q_mobile_bounds_C, r_o_bounds_ohm)
@@ -220,14 +238,17 @@ class LeastSquares(Estimator):
 
     def _estimate(self, record: Samples, rested: bool, previous: Estimate | None = None) -> Estimate:
         search = Search.of(record, self.model, self.parameters, self.nuisance, self.bounds)
-        if "q_mobile" in self.parameters:
+        if self.path is not None:
+            starts = _starts_along(self.path, search)
+        elif "q_mobile" in self.parameters:
             starts = search.best_starts([] if previous is None else [previous.q_mobile])
         else:
             search = search.until_empty()
             starts = search.starts([self.model.cell.q_mobile])[0]
         found = self._fitted(record, search, starts)
         sd, values, verdict = found.sd(found.fit), found.fit.values, self._verdict(record, rested, found)
-        return Estimate(values["q_mobile"], values["r_o"], sd["q_mobile"], sd["r_o"], **verdict._asdict())
+        constants = None if self.path is None else {name: values[name] for name in self.nuisance}
+        return Estimate(values["q_mobile"], values["r_o"], sd["q_mobile"], sd["r_o"], **verdict._asdict(), constants=constants)
 
     def _fitted(self, record: Samples, search: Search, starts: list[dict[str, float]]) -> _Fitted:
         """The best fits with and without the prior, and what their standard deviations are made of."""
@@ -235,11 +256,20 @@ class LeastSquares(Estimator):
         noise_V = self.voltage_noise_V
         if noise_V is None and self.nuisance:  # their priors are weighed against the white part of the residuals
             noise_V = max(white_noise_V(search.residual(dict.fromkeys(self.nuisance, 0.0) | starts[0])[0]), _LEAST_NOISE_V)
-        weight_V = hypot(noise_V or 0.0, sqrt(n) * self.mismatch_V)
-        priors = [Prior(name, 0.0, weight_V / sd) for name, sd in self.nuisance.items()]
+        mismatch_V = sqrt(n / self._independent_errors(record)) * self.mismatch_V
+        weight_V = hypot(noise_V or 0.0, mismatch_V)
+        priors: list[Prior | JointPrior] = [Prior(name, 0.0, weight_V / sd) for name, sd in self.nuisance.items()]
+        if self.path is not None:
+            mean, covariance = self.path.moments
+            priors = [JointPrior(PATH_NAMES, mean, weight_V * np.linalg.cholesky(np.linalg.inv(covariance)).T)]
         alone = fit = search.best(starts, priors)
+        if self.path is not None:
+            # what goes together along the path is a prior of q_mobile too, on which a settled estimate must not rest
+            data, sds = fit.jacobian[:n], np.array(list(self.nuisance.values()))
+            loose = np.pad(np.diag(weight_V / sds), ((0, 0), (len(self.parameters), 0)))
+            alone = replace(fit, jacobian=np.vstack([data, loose]))
         noise_V2 = noise_V**2 if noise_V else square(alone.residual_V) / (n - len(self.parameters))
-        variance_V2 = noise_V2 + n * self.mismatch_V**2
+        variance_V2 = noise_V2 + mismatch_V**2
         if self.prior_q_mobile_C is not None:
             mean_C, sd_C = self.prior_q_mobile_C
             carried = Prior("q_mobile", mean_C, sqrt(variance_V2) / sd_C)
@@ -247,6 +277,12 @@ class LeastSquares(Estimator):
         model_V = search.data.voltage_V + fit.residual_V - fit.values.get("offset_V", 0.0)
         gaps = find_gaps(*record.first(n), model_V, fit.values["q_mobile"])
         return _Fitted(search, fit, alone, variance_V2, self._hidden_sd(search, fit), gaps)
+
+    def _independent_errors(self, record: Samples) -> float:
+        """How many independent errors of the model a record holds: along a path more than one, as they drift."""
+        if self.path is None:
+            return 1.0
+        return 1.0 + _ERRORS_OF_A_DISCHARGE * drawn_charge_C(record) / self.path.cell.q_mobile
 
     def _hidden_sd(self, search: Search, fit: Fit) -> dict[str, float]:
         """
@@ -289,6 +325,9 @@ class LeastSquares(Estimator):
         diagnosis.note(Condition.MISFIT, square(fit.residual_V) > n * limit_V2)
         diagnosis.note(Condition.IMPLAUSIBLE, "q_mobile" in free and not is_plausible(q_mobile, cell))
         _note_end(diagnosis, record, found, max(2.0 * self.mismatch_V, 3.0 * noise_V, _NEGLIGIBLE_V))
+        if self.path is not None:
+            distance = self.path.distance_sd(fit.values)
+            diagnosis.note(Condition.BESIDE_PATH, distance > _BESIDE_LIMIT_SD, distance=distance)
         diagnosis.note(Condition.Q_PRIOR_WRONG, moved_V2 > PRIOR_LIMIT_SD**2 * found.variance_V2)
         diagnosis.note(Condition.Q_PRIOR_ALONE, "q_mobile" in unknown and self.prior_q_mobile_C is not None)
         for name in fit.at_bound:
@@ -328,6 +367,19 @@ def _check_nuisance(nuisance: Mapping[str, float], parameters: tuple[str, ...]) 
     if "tDiffusion" in nuisance and "q_mobile" not in parameters:
         raise ValueError("tDiffusion can be a nuisance only beside q_mobile: without it the model cell may be empty too early")
     return dict(nuisance)
+
+
+def _starts_along(path: AgingPath, search: Search) -> list[dict[str, float]]:
+    """Where to start along a path: at what it expects of cells of some q_mobile, where the record allows for these."""
+    (mean, covariance), q = path.moments, PATH_NAMES.index("q_mobile")
+    log_least = float(np.log(search.bounds["q_mobile"][0]))
+    log_q = mean[q] + np.sqrt(covariance[q, q]) * np.array(_STARTS_SD)
+    starts = []
+    for each in np.unique(np.maximum(log_q, log_least + _START_ABOVE)):
+        expected = mean + covariance[q] / covariance[q, q] * (each - mean[q])
+        start = dict(zip(PATH_NAMES, expected.tolist(), strict=True))
+        starts.append(start | {name: float(np.exp(start[name])) for name in PARAMETER_NAMES})
+    return starts
 
 
 def _root_inverse_diagonal(jacobian: FloatArray) -> FloatArray:

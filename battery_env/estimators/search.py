@@ -12,7 +12,9 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from battery_env.arrays import BoolArray, FloatArray
+from battery_env.electrochemistry.aging_path import EQUILIBRIUM_NAMES, EQUILIBRIUM_SIZE
 from battery_env.electrochemistry.cell import BULK_RATE, SURFACE_RATE, CellParameters
+from battery_env.electrochemistry.equilibrium import equilibrium_slopes, with_equilibrium
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS, TANGENT_NAMES
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.records import Record, Samples, check_drawn_charge, drawn_charge_C
@@ -24,6 +26,8 @@ MARGIN = 1e-6
 _LOG_LIMIT = 50.0
 # Logarithms of nuisance constants are held within this.
 _REACH = 5.0
+# A resistance that the search takes below zero has no logarithm.
+_LEAST = 1e-6
 _SCALES = {"q_mobile": 1.0, "r_o": 0.1}
 # Where the search for q_mobile may start: this much above its least value. The narrow ones serve whole discharges, the wide
 # ones the first minutes of one.
@@ -100,6 +104,33 @@ class Prior:
     name: str
     mean: float
     weight_V: float  # per unit of the unknown
+
+    def residual(self, values: Mapping[str, float], unknown: Sequence[str]) -> tuple[FloatArray, FloatArray]:
+        """The residual, and its derivatives by all unknowns."""
+        row = np.array([[self.weight_V if name == self.name else 0.0 for name in unknown]])
+        return np.array([self.weight_V * (values[self.name] - self.mean)]), row
+
+
+@dataclass(frozen=True)
+class JointPrior:
+    """What is known of some unknowns together, as one more residual each; of parameters, of their logarithms."""
+
+    names: tuple[str, ...]
+    mean: FloatArray
+    rows_V: FloatArray  # of the residuals, by the unknowns
+
+    def residual(self, values: Mapping[str, float], unknown: Sequence[str]) -> tuple[FloatArray, FloatArray]:
+        """The residuals, and their derivatives by all unknowns."""
+        logarithmic = [name in PARAMETER_NAMES for name in self.names]
+        given = np.array([values[name] for name in self.names])
+        x = np.where(logarithmic, np.log(np.where(logarithmic, np.maximum(given, _LEAST), 1.0)), given)
+        slopes = np.where(logarithmic, 1.0 / np.where(logarithmic, np.maximum(given, _LEAST), 1.0), 1.0)
+        by_unknown = np.zeros((len(self.names), len(unknown)))
+        columns = {name: n for n, name in enumerate(self.names)}
+        for n, name in enumerate(unknown):
+            if name in columns:
+                by_unknown[:, n] = self.rows_V[:, columns[name]] * slopes[columns[name]]
+        return self.rows_V @ (x - self.mean), by_unknown
 
 
 @dataclass(frozen=True)
@@ -214,11 +245,11 @@ class Search:
         minima = (squares_V2 <= beside_V2[:-2]) & (squares_V2 < beside_V2[2:]) & _is_near_best(squares_V2)
         return [starts[order[n]] for n in np.union1d(np.flatnonzero(minima), squares_V2.argmin())]
 
-    def best(self, starts: Sequence[dict[str, float]], priors: Sequence[Prior]) -> Fit:
+    def best(self, starts: Sequence[dict[str, float]], priors: Sequence[Prior | JointPrior]) -> Fit:
         """Return the best fit that is found from any of the starts."""
         return min((self._fit(start, priors) for start in starts), key=lambda fit: fit.square_V2)
 
-    def _fit(self, start: dict[str, float], priors: Sequence[Prior]) -> Fit:
+    def _fit(self, start: dict[str, float], priors: Sequence[Prior | JointPrior]) -> Fit:
         free, values = list(self.unknown), dict.fromkeys(self.nuisance, 0.0) | start
         while True:
             values = self._minimized(values, free, priors)
@@ -232,7 +263,7 @@ class Search:
         at_bound = tuple(name for name in self.parameters if values[name] in self.bounds[name])
         return Fit(values, jacobian, residual_V[: len(self.data.time_s)], square(residual_V), at_bound)
 
-    def _minimized(self, start: dict[str, float], free: list[str], priors: Sequence[Prior]) -> dict[str, float]:
+    def _minimized(self, start: dict[str, float], free: list[str], priors: Sequence[Prior | JointPrior]) -> dict[str, float]:
         unknown = self.unknown
         columns = [unknown.index(name) for name in free]
 
@@ -262,12 +293,16 @@ class Search:
         )
         return values_at(x)[0]
 
-    def residual(self, values: Mapping[str, float], priors: Sequence[Prior] = ()) -> tuple[FloatArray, FloatArray]:
+    def residual(
+        self, values: Mapping[str, float], priors: Sequence[Prior | JointPrior] = ()
+    ) -> tuple[FloatArray, FloatArray]:
         """Return the residuals at the samples, V, with one more for each prior, and their derivatives by all unknowns."""
         q_mobile, r_o = values["q_mobile"], values["r_o"]
         if self.nuisance:
-            model_V, slopes, _ = self.model_at(values).tangents(self.data.current_A, q_mobile, r_o)
+            model_V, slopes, fraction_p = self.model_at(values).tangents(self.data.current_A, q_mobile, r_o)
             by_name = dict(zip(TANGENT_NAMES, slopes, strict=True)) | {"offset_V": np.ones(len(model_V))}
+            if self._has_equilibrium:
+                by_name |= zip(EQUILIBRIUM_NAMES, equilibrium_slopes(fraction_p, EQUILIBRIUM_SIZE), strict=True)
             model_V = model_V + values.get("offset_V", 0.0)
         else:
             model_V, *both = self.model.sensitivities(self.data.current_A, q_mobile, r_o)
@@ -275,9 +310,8 @@ class Search:
         seen_V, *columns = self.data.at_samples([model_V, *(by_name[name] for name in self.unknown)])
         residual_V, jacobian = seen_V - self.data.voltage_V, np.column_stack(columns)
         for prior in priors:
-            row = [prior.weight_V if name == prior.name else 0.0 for name in self.unknown]
-            residual_V = np.append(residual_V, prior.weight_V * (values[prior.name] - prior.mean))
-            jacobian = np.vstack([jacobian, row])
+            known_V, rows = prior.residual(values, self.unknown)
+            residual_V, jacobian = np.append(residual_V, known_V), np.vstack([jacobian, rows])
         return residual_V, jacobian
 
     def model_at(self, values: Mapping[str, float]) -> RecordModel:
@@ -287,7 +321,15 @@ class Search:
             # a step of the search may go far, but explicit Euler is stable only for rates below 2 / dt
             constant = getattr(cell, name) * float(np.exp(_within(values[name], (-_REACH, _REACH))))
             constants[name] = max(constant, self._least_stable(name))
-        return self.model.of_cell(cell.replace(**constants)) if constants else self.model
+        if constants:
+            cell = cell.replace(**constants)
+        if self._has_equilibrium:
+            cell = with_equilibrium(cell, [values[name] for name in EQUILIBRIUM_NAMES])
+        return self.model if cell is self.model.cell else self.model.of_cell(cell)
+
+    @property
+    def _has_equilibrium(self) -> bool:
+        return EQUILIBRIUM_NAMES[0] in self.nuisance
 
     def _least_stable(self, name: str) -> float:
         cell, dt_s = self.model.cell, self.model.dt_s

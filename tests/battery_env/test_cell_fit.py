@@ -21,13 +21,13 @@ from battery_env import (
     load_nasa_discharges,
 )
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate, voltage
+from battery_env.electrochemistry.equilibrium import with_equilibrium
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimators.cell_fit import (
     EQUILIBRIUM_PRIOR_SD_V,
     RATE_PRIOR_SD,
     JointFit,
     read_cell,
-    with_equilibrium,
 )
 from battery_env.lab.calibrate import calibrate
 from battery_env.lab.running import forecast_end

@@ -183,7 +183,7 @@ class TestFiles:
     @pytest.mark.parametrize(
         ("change", "message"),
         [
-            ({"format": 1}, "has format 1, this version reads 3: make it again"),
+            ({"format": 1}, "has format 1, this version reads 4: make it again"),
             ({"load_unit": "kW"}, "holds no valid data set: .*load_unit must be"),
             ({"cell": {"kN": 1.0}}, "holds no valid data set: .*kN"),
         ],

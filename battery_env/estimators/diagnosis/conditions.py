@@ -142,6 +142,10 @@ class Condition(IntEnum):
         "{most_mV:.0f} mV at most."
     )
     CONSTANTS = "A constant of the cell is farther from the model's than the policy has learned of (option nuisance)."
+    BESIDE_PATH = (
+        "The cell lies {distance:.1f} standard deviations beside the path of aging cells: it is of another kind, or its load "
+        "is. Leave the path out."
+    )
     Q_PRIOR_WRONG = _PRIOR_WRONG.format("q_max")
     R_PRIOR_WRONG = _PRIOR_WRONG.format("R_o")
     # what the record does not tell of one number

@@ -122,6 +122,8 @@ class FullStateTask(CalibrationTask):
         self._first_action = self.action_of({name: getattr(NEW_CELL, name) for name in self.parameters})
         self._starts = list(zip(self.dataset.first.tolist(), (self.dataset.stop - 2).tolist(), strict=True))
         self._has_own_constants = bool((self.dataset.factors != 1.0).any())
+        if self.dataset.equilibrium_V.any():
+            raise ValueError("dataset has cells with an equilibrium voltage of their own: take a voltage-only task for them")
         nowhere = np.zeros(cells, dtype=np.int64)
         first = nowhere + self.dataset.first[0]
         self.now = self._begin(nowhere, first, nowhere + self.episode_steps, np.zeros((cells, 4)))

@@ -1,0 +1,198 @@
+"""Cells that age along a path: what their constants, their charge and their resistance may be, all at once."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from battery_env.arrays import FloatArray
+from battery_env.checks import check_positive, check_whole_number
+from battery_env.electrochemistry.cell import UNCERTAIN_CONSTANTS, CellParameters, check_cell
+from battery_env.electrochemistry.equilibrium import with_equilibrium
+from battery_env.files import read_json, write_json
+from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, R_O
+
+#: What is added to the equilibrium voltage has so many coefficients (:func:`with_equilibrium`).
+EQUILIBRIUM_SIZE = 8
+EQUILIBRIUM_NAMES: tuple[str, ...] = tuple(f"equilibrium {k}" for k in range(EQUILIBRIUM_SIZE))
+#: What moves along a path: logarithms of what constants of the cell are multiplied by, what is added to the equilibrium
+#: voltage, V, and the logarithms of ``q_mobile`` in C and ``r_o`` in ohm.
+PATH_NAMES: tuple[str, ...] = (*UNCERTAIN_CONSTANTS, *EQUILIBRIUM_NAMES, *PARAMETER_NAMES)
+#: How far cells lie beside the path: standard deviations of these. Chosen on B0005 along the path of B0006.
+SPREAD_SD: tuple[float, ...] = (*(0.5,) * len(UNCERTAIN_CONSTANTS), *(0.005,) * EQUILIBRIUM_SIZE, 0.03, 0.5)
+#: Cells may be younger and older than those of the path by this share of its length.
+BEYOND_SHARE = 0.2
+
+_FORMAT, _FORMAT_VERSION = "battery_env.AgingPath", 1
+_RATES, _EQUILIBRIUM = slice(0, len(UNCERTAIN_CONSTANTS)), slice(len(UNCERTAIN_CONSTANTS), -len(PARAMETER_NAMES))
+# Beyond its ends a path goes on as over this share of its ages, as single ones scatter.
+_END_SHARE = 0.25
+# Moments of the distribution are those of so many cells.
+_MOMENTS_CELLS, _MOMENTS_SEED = 4000, 0
+
+
+class DrawnCells(NamedTuple):
+    """
+    Cells along a path, each of an age of its own.
+
+    :param place: on the path, 0 at its start and 1 at its end, shape (n,)
+    :param q_mobile: C, shape (n,)
+    :param r_o: ohm, shape (n,)
+    :param factors: what ``UNCERTAIN_CONSTANTS`` are multiplied by, shape (n, 4)
+    :param equilibrium_V: what is added to the equilibrium voltage, V, shape (n, 8)
+    """
+
+    place: FloatArray
+    q_mobile: FloatArray
+    r_o: FloatArray
+    factors: FloatArray
+    equilibrium_V: FloatArray
+
+
+@dataclass(frozen=True)
+class AgingPath:
+    """
+    How cells of one kind age: what :func:`battery_env.fit_life` found along the lives of some of them. Another cell of the
+    kind is thought to be somewhere along one of these lives, a little before its start or beyond its end, and beside it by
+    ``SPREAD_SD``.
+
+    .. code-block:: python
+
+      path = fit_life(load_nasa_discharges("B0006"))
+      path.to_json("b0006_path.json")
+      cells = TrajectoryDataset.along(path, n=100, loads=[constant(2.0, "current")], seed=0)
+      print(LeastSquares(path=path).estimate(load_nasa_discharges("B0005")[80].loaded_part(2.7)))
+
+    :param cell: the constants that all ages share, and those that the others are told from
+    :param lives: of each cell one row of ``PATH_NAMES`` an age, from the youngest on
+    :param mismatch_V: error to expect of the model of a cell at its place, V
+    :raises TypeError: for a value of another kind
+    :raises ValueError: for a life of less than two ages, rows of another length, or values out of range
+    """
+
+    cell: CellParameters
+    lives: tuple[tuple[tuple[float, ...], ...], ...]
+    mismatch_V: float
+
+    def __post_init__(self) -> None:
+        if self.cell is None:
+            raise TypeError("cell must be CellParameters, got None")
+        check_cell(self.cell)
+        check_positive("mismatch_V", self.mismatch_V)
+        if not self.lives:
+            raise ValueError("a path is of at least one life")
+        for life in self.lives:
+            if len(life) < 2 or any(len(row) != len(PATH_NAMES) for row in life):
+                raise ValueError(f"a life must hold at least two ages of {len(PATH_NAMES)} numbers each")
+            if not np.isfinite(np.asarray(life, dtype=np.float64)).all():
+                raise ValueError("a life must hold finite numbers")
+            Q_MOBILE.check([float(np.exp(row[-2])) for row in life])
+            R_O.check([float(np.exp(row[-1])) for row in life])
+
+    def draw(self, n: int, seed: int) -> DrawnCells:
+        """
+        Draw cells: a life, a place along it, uniformly, and how far the cell lies beside it.
+
+        :param n: how many
+        :param seed: seed of the draw
+        :return: the cells
+        :raises ValueError: for no cells, or a negative seed
+        """
+        n, seed = check_whole_number("n", n), check_whole_number("seed", seed)
+        if n < 1 or seed < 0:
+            raise ValueError(f"n must be at least 1 and seed at least 0, got n = {n} and seed = {seed}")
+        rng = np.random.default_rng(seed)
+        life, place = rng.integers(len(self.lives), size=n), rng.uniform(-BEYOND_SHARE, 1.0 + BEYOND_SHARE, size=n)
+        values = np.empty((n, len(PATH_NAMES)))
+        for k, rows in enumerate(self.lives):
+            values[life == k] = _at(np.array(rows), place[life == k])
+        values += np.array(SPREAD_SD) * rng.standard_normal(values.shape)
+        q_mobile = np.clip(np.exp(values[:, -2]), *Q_MOBILE.limits)
+        r_o = np.clip(np.exp(values[:, -1]), *R_O.limits)
+        return DrawnCells(place, q_mobile, r_o, np.exp(values[:, _RATES]), values[:, _EQUILIBRIUM])
+
+    @cached_property
+    def moments(self) -> tuple[FloatArray, FloatArray]:
+        """Mean and covariance of ``PATH_NAMES`` over the cells that are expected, shapes (14,) and (14, 14)."""
+        _, q_mobile, r_o, factors, equilibrium_V = self.draw(_MOMENTS_CELLS, _MOMENTS_SEED)
+        values = np.column_stack([np.log(factors), equilibrium_V, np.log(q_mobile), np.log(r_o)])
+        return values.mean(axis=0), np.cov(values.T)
+
+    def distance_sd(self, values: Mapping[str, float]) -> float:
+        """
+        How far a cell lies from the cells that are expected, as a normal variable is as rarely.
+
+        :param values: by ``PATH_NAMES``; parameters themselves, not their logarithms
+        :return: standard deviations
+        """
+        mean, covariance = self.moments
+        x = np.array([np.log(values[name]) if name in PARAMETER_NAMES else values[name] for name in PATH_NAMES]) - mean
+        return _normal_distance(float(x @ np.linalg.solve(covariance, x)), len(x))
+
+    def to_json(self, path: str | os.PathLike[str]) -> Path:
+        """
+        Save the path.
+
+        :param path: where to
+        :return: the file
+        :raises FileExistsError: if the file exists already
+        """
+        return write_json(path, _FORMAT, _FORMAT_VERSION, {"names": PATH_NAMES, **asdict(self)})
+
+    @classmethod
+    def from_json(cls, path: str | os.PathLike[str]) -> AgingPath:
+        """
+        Load a path.
+
+        :param path: what :meth:`to_json` wrote
+        :return: the path
+        :raises ValueError: if the file is damaged, was not written so, or is of another format version
+        """
+        content = read_json(path, _FORMAT, _FORMAT_VERSION)
+        try:
+            if tuple(content.pop("names")) != PATH_NAMES:
+                raise ValueError(f"its names are not {', '.join(PATH_NAMES)}")
+            lives = tuple(tuple(tuple(map(float, row)) for row in life) for life in content.pop("lives"))
+            return cls(CellParameters.of_mapping(content.pop("cell")), lives, **content)
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"{path} is damaged, or no path saved by AgingPath.to_json: {error}") from error
+
+
+def _normal_distance(square: float, count: int) -> float:
+    """The normal deviate that is as rare as a sum of so many squares of them (Wilson and Hilferty 1931); at least 0."""
+    spread = 2.0 / (9.0 * count)
+    return max(float((square / count) ** (1.0 / 3.0) - (1.0 - spread)) / float(np.sqrt(spread)), 0.0)
+
+
+def cell_with(cell: CellParameters, constants: Mapping[str, float] | None) -> CellParameters:
+    """
+    A cell with constants that were found along a path.
+
+    :param cell: the constants that they are told from
+    :param constants: as an estimate has them, by ``PATH_NAMES``; ``None``: none
+    :return: the cell
+    """
+    if constants is None:
+        return cell
+    rates = {name: getattr(cell, name) * float(np.exp(constants[name])) for name in UNCERTAIN_CONSTANTS}
+    return with_equilibrium(cell.replace(**rates), [constants[name] for name in EQUILIBRIUM_NAMES])
+
+
+def _at(rows: FloatArray, place: FloatArray) -> FloatArray:
+    """Values at places of a life: between two ages on a straight line, beyond the ends as its first and last ages go on."""
+    last = len(rows) - 1
+    at = np.clip(place, 0.0, 1.0) * last
+    left = np.minimum(at.astype(np.int64), last - 1)
+    share = (at - left)[:, None]
+    values = (1.0 - share) * rows[left] + share * rows[left + 1]
+    span = max(round(_END_SHARE * last), 1)
+    before, after = rows[span] - rows[0], rows[last] - rows[last - span]
+    values += np.minimum(place, 0.0)[:, None] * last / span * before
+    values += np.maximum(place - 1.0, 0.0)[:, None] * last / span * after
+    return np.asarray(values)

@@ -1,0 +1,224 @@
+"""Cells that age along a path: how it is found, drawn from, saved, and used as a prior."""
+
+import json
+import warnings
+
+import numpy as np
+import pytest
+
+import battery_env
+from battery_env import AgingPath, LeastSquares, TrajectoryDataset, fit_life, load_nasa_discharges
+from battery_env.electrochemistry import NEW_CELL, UNCERTAIN_CONSTANTS, simulate
+from battery_env.electrochemistry.aging_path import BEYOND_SHARE, PATH_NAMES, SPREAD_SD, cell_with
+from battery_env.electrochemistry.equilibrium import with_equilibrium
+from battery_env.loads import RandomPiecewise, constant
+from battery_env.records import Samples
+from battery_env.records.model import RecordModel
+
+AGES = 5
+LOAD = constant(2.0, "current")
+
+
+def every_tenth(made):
+    """Samples of a simulated discharge, down to its last one."""
+    kept = np.unique(np.append(np.arange(0, len(made.time_s), 10), len(made.time_s) - 1))
+    return Samples(made.time_s[kept], made.voltage_V[kept], made.current_A[kept])
+
+
+def life(cell=NEW_CELL, q_from=7200.0, q_to=5000.0):
+    """Discharges of a simulated cell whose kn and r_o age with its q_mobile."""
+    records = []
+    for share in np.linspace(0.0, 1.0, AGES):
+        aged = cell.replace(kn=1000.0 * np.exp(-2.0 * share))
+        q_mobile, r_o = q_from + share * (q_to - q_from), 0.11 + 0.06 * share
+        made = simulate(LOAD, q_mobile, r_o, load_unit="current", cell=aged, cut_off_V=2.7)
+        records.append(every_tenth(made))
+    return records
+
+
+@pytest.fixture(scope="module")
+def path():
+    return fit_life(life())
+
+
+@pytest.fixture(scope="module")
+def b0006():
+    return fit_life(load_nasa_discharges("B0006"))
+
+
+def until(record, share):
+    n = int(share * len(record.time_s))
+    return Samples(*(column[:n] for column in record))
+
+
+class TestFit:
+    def test_the_path_goes_through_the_cells_that_were_discharged(self, path):
+        (rows,) = np.array(path.lives)
+        np.testing.assert_allclose(np.exp(rows[:, -2]), np.linspace(7200.0, 5000.0, AGES), rtol=0.02)
+        assert path.mismatch_V < 0.005
+        (kn,) = rows[:, [PATH_NAMES.index("kn")]].T
+        assert (np.diff(kn) < 0.0).all() and (np.diff(rows[:, -1]) > 0.0).all()
+
+    def test_several_cells_have_a_life_each(self, path):
+        assert len(path.lives) == 1
+        both = fit_life([life(), life(q_from=6000.0, q_to=4500.0)])
+        assert [len(each) for each in both.lives] == [AGES, AGES]
+        assert np.exp(both.lives[1][0][-2]) == pytest.approx(6000.0, rel=0.03)
+
+    def test_real_ages_are_followed_to_some_millivolts_and_keep_their_q_mobile(self, b0006):
+        assert b0006.mismatch_V < 0.005
+        whole = load_nasa_discharges("B0006")[0].loaded_part(2.7)
+        assert np.exp(b0006.lives[0][0][-2]) == pytest.approx(LeastSquares().estimate(whole).q_mobile, rel=0.005)
+
+    @pytest.mark.parametrize(
+        ("discharges", "error", "message"),
+        [
+            (lambda: life()[:1], ValueError, "at least two discharges"),
+            (lambda: [life(), life()[:1]], ValueError, "at least two discharges"),
+            (lambda: [*life(), life()], TypeError, "both at once"),
+            (lambda: load_nasa_discharges("B0005")[0], TypeError, "must be a list"),
+            (lambda: [until(each, 0.5) for each in life()], ValueError, "in progress"),
+        ],
+    )
+    def test_what_is_no_life_is_refused(self, discharges, error, message):
+        with pytest.raises(error, match=message):
+            fit_life(discharges())
+
+    def test_cells_that_the_equations_cannot_describe_are_refused(self):
+        flat = with_equilibrium(NEW_CELL, [-0.35, 0.33, -0.05, 0.05])
+        with pytest.raises(ValueError, match="do not describe this cell"):
+            fit_life([each._replace(voltage_V=each.voltage_V**3 / 14.0) for each in life(flat)], limit_V=0.002)
+
+
+class TestDraw:
+    def test_cells_lie_along_the_path_and_a_little_beyond_and_beside_it(self, path):
+        cells = path.draw(4000, seed=0)
+        assert cells.place.min() == pytest.approx(-BEYOND_SHARE, abs=0.01)
+        assert cells.place.max() == pytest.approx(1.0 + BEYOND_SHARE, abs=0.01)
+        middle = np.abs(cells.place - 0.5) < 0.02
+        rows = np.array(path.lives[0])
+        assert np.log(cells.q_mobile[middle]).mean() == pytest.approx(rows[AGES // 2, -2], abs=0.02)
+        assert np.log(cells.q_mobile[middle]).std() == pytest.approx(SPREAD_SD[-2], rel=0.3)
+        assert np.corrcoef(cells.place, cells.q_mobile)[0, 1] < -0.9
+
+    def test_the_same_seed_draws_the_same_cells(self, path):
+        for name in ("q_mobile", "factors", "equilibrium_V"):
+            first, again, other = (getattr(path.draw(5, seed), name) for seed in (1, 1, 2))
+            np.testing.assert_array_equal(first, again)
+            assert (first != other).all()
+
+    @pytest.mark.parametrize(("n", "seed"), [(0, 0), (1, -1), (1.5, 0)])
+    def test_wrong_numbers_are_refused(self, path, n, seed):
+        with pytest.raises((TypeError, ValueError)):
+            path.draw(n, seed)
+
+
+class TestDataset:
+    def test_a_trajectory_is_the_simulation_of_its_cell(self, path):
+        data, cells = TrajectoryDataset.along(path, 6, [LOAD], seed=3), path.draw(6, 3)
+        np.testing.assert_array_equal(data.q_mobile, cells.q_mobile)
+        for n in (0, 5):
+            known = dict(zip(UNCERTAIN_CONSTANTS, np.log(cells.factors[n]), strict=True))
+            known |= dict(zip(PATH_NAMES[4:12], cells.equilibrium_V[n], strict=True))
+            cell = cell_with(path.cell, known)
+            alone = simulate(LOAD, cells.q_mobile[n], cells.r_o[n], load_unit="current", cell=cell)
+            np.testing.assert_allclose(data[n].voltage_V, alone.voltage_V, rtol=1e-9)
+            assert data[n].cell.Ap == pytest.approx(cell.Ap)
+
+    def test_states_subsets_and_files_keep_the_cells(self, path, tmp_path):
+        data = TrajectoryDataset.along(path, 6, RandomPiecewise(), seed=3)
+        states = data.states_at(np.array([1, 4]), np.array([70, 65]))
+        np.testing.assert_array_equal(states, [data[1].state[70], data[4].state[65]])
+        again = TrajectoryDataset.load(data.subset([4, 2]).save(tmp_path / "part"))
+        np.testing.assert_array_equal(again[0].voltage_V, data[4].voltage_V)
+        np.testing.assert_array_equal(again.equilibrium_V, data.equilibrium_V[[4, 2]])
+
+    def test_the_tasks_draw_from_it(self, path):
+        import gymnasium as gym
+
+        data = TrajectoryDataset.along(path, 4, [LOAD], seed=3)
+        env = gym.make("BatteryVoltageJoint-v0", dataset=data, cost="state")
+        observation, _ = env.reset(seed=0)
+        assert np.isfinite(observation).all()
+        _, reward, *_, info = env.step(env.action_space.sample())
+        assert reward < 0.0 and info["q_mobile"] in data.q_mobile
+
+    def test_a_task_that_knows_one_equilibrium_voltage_refuses_it(self, path):
+        import gymnasium as gym
+
+        with pytest.raises(ValueError, match="equilibrium voltage"):
+            gym.make("BatteryJoint-v0", dataset=TrajectoryDataset.along(path, 4, [LOAD], seed=3))
+
+    def test_what_is_no_path_is_refused(self):
+        with pytest.raises(TypeError, match="must be an AgingPath"):
+            TrajectoryDataset.along(NEW_CELL, 4, [LOAD], seed=0)
+
+
+class TestFile:
+    def test_round_trip(self, path, tmp_path):
+        file = path.to_json(tmp_path / "path.json")
+        assert AgingPath.from_json(file) == path
+        with pytest.raises(FileExistsError):
+            path.to_json(file)
+
+    @pytest.mark.parametrize(
+        "change",
+        [
+            {"names": ["kn"]},
+            {"lives": []},
+            {"lives": [[[0.0] * 14]]},
+            {"lives": [[[0.0] * 3] * 2]},
+            {"lives": [[[0.0] * 14] * 2]},
+            {"lives": "none"},
+            {"mismatch_V": 0.0},
+            {"cell": {}},
+            {"more": 1},
+        ],
+    )
+    def test_damaged_files_are_refused(self, path, tmp_path, change):
+        content = json.loads(path.to_json(tmp_path / "path.json").read_text())
+        (tmp_path / "damaged.json").write_text(json.dumps(content | change))
+        with pytest.raises(ValueError, match=r"damaged\.json is damaged"):
+            AgingPath.from_json(tmp_path / "damaged.json")
+
+
+class TestPrior:
+    def test_before_the_knee_it_tells_what_the_voltage_alone_does_not(self, path):
+        record = until(life()[3], 0.5)
+        estimate, alone = LeastSquares(path=path).estimate(record), LeastSquares(mismatch_V=path.mismatch_V).estimate(record)
+        assert estimate.q_mobile == pytest.approx(5550.0, rel=0.05)
+        assert abs(estimate.q_mobile - 5550.0) < 0.5 * abs(alone.q_mobile - 5550.0)
+        assert abs(estimate.q_mobile - 5550.0) < 3.0 * estimate.sd_q_mobile
+
+    def test_an_estimate_that_rests_on_the_path_is_not_settled_and_a_whole_discharge_is(self, b0006):
+        whole = load_nasa_discharges("B0005")[100].loaded_part(2.7)
+        part = until(Samples.of(whole), 0.5)
+        found, early = (LeastSquares(path=b0006).estimate(record) for record in (whole, part))
+        assert found.settled and not early.settled
+        assert found.q_mobile == pytest.approx(LeastSquares(mismatch_V=0.05).estimate(whole).q_mobile, rel=0.015)
+
+    def test_the_model_with_what_was_found_follows_the_record(self, b0006):
+        whole = load_nasa_discharges("B0005")[100].loaded_part(2.7)
+        found = LeastSquares(path=b0006).estimate(whole)
+        shown_V = RecordModel(cell_with(b0006.cell, found.constants)).voltage(whole, found)
+        assert np.sqrt(np.mean((shown_V - whole.voltage_V)[1:] ** 2)) < 0.01
+
+    def test_a_cell_that_is_none_of_these_is_not_settled(self, path):
+        large = simulate(4.0, 15000.0, 0.06, load_unit="current", cut_off_V=2.7)
+        flat = with_equilibrium(NEW_CELL, [-0.35, 0.33, -0.05, 0.05])
+        phosphate = simulate(2.0, 6000.0, 0.12, load_unit="current", cell=flat, cut_off_V=2.5)
+        for made in (large, phosphate):
+            assert not LeastSquares(path=path).estimate(every_tenth(made)).settled
+
+    @pytest.mark.parametrize(
+        "others", [{"nuisance": {"kn": 0.2}}, {"parameters": ("q_mobile",)}, {"prior_q_mobile_C": (6000.0, 100.0)}]
+    )
+    def test_it_knows_all_at_once(self, path, others):
+        with pytest.raises(ValueError, match="path is of both parameters"):
+            LeastSquares(path=path, **others)
+
+
+def test_fitting_a_life_warns_of_nothing():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert isinstance(battery_env.fit_life(life()[::2]), AgingPath)
