@@ -160,11 +160,11 @@ def test_nothing_is_fitted_to_bad_input_and_nothing_is_overwritten(
 def test_what_remains_of_a_discharge_in_progress_needs_a_prior_or_the_filter(recorded, tmp_path, terminal):
     path = write(recorded.until(1500.0), tmp_path / "half.csv")
     shown = terminal.shows(path, status=3)
-    assert "remaining" in shown and "Not settled: q_mobile is not known to 2 % yet" in shown
+    assert "remaining" in shown and "Not settled: q_max is not known to 2 % yet" in shown
     assert "give --prior" in shown and "calibrated by the Kalman filter" in shown and "Ah   so far" in shown
     assert terminal.row(path, status=3) == terminal.row(path, "--method", "kalman", status=3)
     shown = terminal.shows(path, "--prior", 5460, 55, "--nominal", 2, "--out", tmp_path, status=3)
-    assert "Not settled: q_mobile rests on its prior" in shown and "give --prior" not in shown and "Kalman" not in shown
+    assert "Not settled: q_max rests on its prior" in shown and "give --prior" not in shown and "Kalman" not in shown
     assert "2.01 A to go on" in shown and "Ah), predicted, of 2 Ah" in shown
     (row,) = pd.read_csv(tmp_path / "half_estimate.csv").to_dict(orient="records")
     end_s, whole_Ah = recorded.eod_time_s(2.7), recorded.loaded_part(2.7).charge_C / 3600.0
@@ -182,12 +182,12 @@ def test_a_large_cell_at_1C_says_that_its_charge_is_known_though_its_resistance_
     path = write(simulate(5.0, 18_000.0, 0.026, load_unit="current", thermal=True, cut_off_V=2.69), tmp_path / "large.csv")
     row = terminal.row(path, status=3)
     assert not row["settled"] and row["settled_q_mobile"] and not row["settled_r_o"]
-    assert row["q_mobile_C"] == pytest.approx(18_000.0, rel=0.01) and row["reason"].startswith("r_o is not known to 30 %")
+    assert row["q_mobile_C"] == pytest.approx(18_000.0, rel=0.01) and row["reason"].startswith("R_o is not known to 30 %")
     shown = terminal.shows(path, "--out", tmp_path, status=3)
-    assert "no   only q_mobile is" in shown and "Not settled: r_o is not known to 30 %" in shown and "--prior" not in shown
+    assert "no   only q_mobile is" in shown and "Not settled: R_o is not known to 30 %" in shown and "--prior" not in shown
     (table,) = pd.read_csv(tmp_path / "large_estimate.csv").to_dict(orient="records")
     assert table["settled_q_mobile"] and not table["settled_r_o"]
-    assert "only q_mobile settled: r_o is not" in repr(battery_env.calibrate(path)[0])
+    assert "only q_mobile settled: R_o is not" in repr(battery_env.calibrate(path)[0])
     # what is held is not known by this record
     assert "only" not in terminal.shows(path, "--parameters", "r_o", status=3)
 

@@ -90,15 +90,15 @@ def without(lost) -> Samples:
 @pytest.mark.parametrize(
     ("record", "options", "message"),
     [
-        (whole_discharge(q_mobile=9500.0), {}, "q_mobile is at a bound of its search"),
+        (whole_discharge(q_mobile=9500.0), {}, "q_max is at a bound of its search"),
         (shifted(0.035), {}, "The record starts at 4.2. V, above the 4.19 V"),
         (shifted(-0.035), {}, "takes the voltage for 3. mV off"),
         (whole_discharge(cell=NEW_CELL.replace(kn=6.0 * NEW_CELL.kn)), {}, "A constant of the cell is farther"),
         (whole_discharge(cell=NEW_CELL.replace(U0p=NEW_CELL.U0p + 0.1)), {}, "The record starts at .* another kind of cell"),
         (shifted(0.02 * np.sin(WHOLE.time_s / 300.0)), {}, "farther off than noise"),
-        (WHOLE.first(500), {}, "q_mobile is not known to 2 % yet"),
+        (WHOLE.first(500), {}, "q_max is not known to 2 % yet"),
         (WHOLE.first(9), {}, "These are too few readings"),
-        (WHOLE, {"policy": Step(beyond=0.15)}, "The policy and the fit in its observation differ by .* in q_mobile"),
+        (WHOLE, {"policy": Step(beyond=0.15)}, "The policy and the fit in its observation differ by .* in q_max"),
         (Samples(*(column[900:] for column in WHOLE)), {}, "The record starts under load|The record starts at rest"),
         (without((SAMPLE > 0) & (SAMPLE < 4)), {}, "farther apart than the 2 s"),
         (without(SAMPLE % 3 != 0), {}, "farther apart than the 2 s"),

@@ -101,9 +101,9 @@ VERDICTS = {
     ),
     "not drawn": (BOTH, jumped(WHOLE, 1700.0, 600.0), {}, "No sample lies between 1700 s and 2301 s, and the voltage does"),
     "empty": (BOTH, WHOLE, {"parameters": ["r_o"], "cell": NEW_CELL.replace(q_mobile=4000.0)}, "The model cell is empty"),
-    "bound of q_mobile": (BOTH, changed(WHOLE, slice(2000)), {"q_mobile_bounds_C": (6500.0, 8000.0)}, "q_mobile is at a"),
-    "bound of r_o": (BOTH, WHOLE, {"r_o_bounds_ohm": (0.0, 0.14)}, "r_o is at a bound"),
-    "minutes": (BOTH, replace(WHOLE, time_s=WHOLE.time_s / 60.0), {}, "No cell of this kind has such a q_mobile. Check that"),
+    "bound of q_mobile": (BOTH, changed(WHOLE, slice(2000)), {"q_mobile_bounds_C": (6500.0, 8000.0)}, "q_max is at a"),
+    "bound of r_o": (BOTH, WHOLE, {"r_o_bounds_ohm": (0.0, 0.14)}, "R_o is at a bound"),
+    "minutes": (BOTH, replace(WHOLE, time_s=WHOLE.time_s / 60.0), {}, "No cell of this kind has such a q_max. Check that"),
     "misfit": (BOTH, REAL.loaded_part(2.7), {"mismatch_V": 0.0}, MISFIT),
     "misfit beyond a known noise": (
         BOTH[:1], WHOLE,
@@ -113,13 +113,13 @@ VERDICTS = {
     "prior of another end": (
         BOTH[:1], WHOLE, {"prior_q_mobile_C": (8000.0, 80.0)}, "The record falls to 2.80 V at 2820 s, where this estimate says"
     ),
-    "wrong prior of q_mobile": (BOTH[:1], WHOLE, {"prior_q_mobile_C": (5400.0, 20.0)}, "The prior of q_mobile contradicts"),
-    "wrong prior, filter": (BOTH[1:], WHOLE, {"prior_q_mobile_C": (5700.0, 60.0)}, "The prior of q_mobile contradicts"),
-    "wrong prior of r_o": (BOTH[1:], WHOLE, {"prior_r_o_ohm": (0.25, 0.02)}, "The prior of r_o contradicts"),
+    "wrong prior of q_mobile": (BOTH[:1], WHOLE, {"prior_q_mobile_C": (5400.0, 20.0)}, "The prior of q_max contradicts"),
+    "wrong prior, filter": (BOTH[1:], WHOLE, {"prior_q_mobile_C": (5700.0, 60.0)}, "The prior of q_max contradicts"),
+    "wrong prior of r_o": (BOTH[1:], WHOLE, {"prior_r_o_ohm": (0.25, 0.02)}, "The prior of R_o contradicts"),
     "prior of q_mobile": (
-        BOTH, changed(WHOLE, slice(120)), {"prior_q_mobile_C": (6100.0, 60.0)}, "q_mobile rests on its prior: the record alone"
+        BOTH, changed(WHOLE, slice(120)), {"prior_q_mobile_C": (6100.0, 60.0)}, "q_max rests on its prior: the record alone"
     ),
-    "prior of r_o": (BOTH[1:], discharged(0.5), {"prior_r_o_ohm": (0.15, 0.01)}, "r_o rests on its prior: the record alone"),
+    "prior of r_o": (BOTH[1:], discharged(0.5), {"prior_r_o_ohm": (0.15, 0.01)}, "R_o rests on its prior: the record alone"),
     "noise hides whether it was drawn": (
         BOTH, lost(changed(discharged(noise_V=0.03), slice(None, None, 10)), 1200.0, 1280.0), {},
         "No sample lies between 1200 s and 1290 s, and the voltage does not tell whether the load was on: 160 C are in doubt",
@@ -132,13 +132,13 @@ VERDICTS = {
         BOTH[:1], lost(discharged(pulsed(30, 60, 3.0, 0.3), noise_V=0.002), 1504.0, 1804.0), {"mismatch_V": 0.02},
         "No sample lies between 1504 s and 1805 s, and the voltage does not tell whether the load was on",
     ),
-    "half a discharge": (BOTH, changed(WHOLE, slice(1400)), {}, "q_mobile is not known to 2 % yet: the voltage shows it at"),
-    "a small current": (BOTH, discharged(0.5), {}, "r_o is not known to 30 %: the error expected of noise and model"),
-    "gain of the current": (BOTH, WHOLE, {"current_gain_sd": 0.03}, "q_mobile is known no better than what scales it"),
-    "charge at the start": (BOTH, WHOLE, {"initial_soc": (1.0, 0.03)}, "q_mobile is known no better than what scales it"),
+    "half a discharge": (BOTH, changed(WHOLE, slice(1400)), {}, "q_max is not known to 2 % yet: the voltage shows it at"),
+    "a small current": (BOTH, discharged(0.5), {}, "R_o is not known to 30 %: the error expected of noise and model"),
+    "gain of the current": (BOTH, WHOLE, {"current_gain_sd": 0.03}, "q_max is known no better than what scales it"),
+    "charge at the start": (BOTH, WHOLE, {"initial_soc": (1.0, 0.03)}, "q_max is known no better than what scales it"),
     "its gain, for r_o": (
         BOTH, WHOLE, {"parameters": ["r_o"], "cell": NEW_CELL.replace(q_mobile=6000.0), "current_gain_sd": 0.4},
-        "r_o is known no better than what scales it",
+        "R_o is known no better than what scales it",
     ),
     "few samples": (
         BOTH[:1], changed(WHOLE, slice(0, 100, 10)),
@@ -366,7 +366,7 @@ class TestPrecision:
         record = load_nasa_discharges("B0006")[64].until(1800.0).loaded_part(2.7)
         stated = Settings.for_cell(young_fit, method="kalman", prior_q_mobile_C=(4700.0, 90.0), mismatch_V=0.0055)
         estimate = stated.calibrator().estimate(record)
-        assert estimate.reason.startswith("q_mobile rests on its prior") and estimate.sd_q_mobile < 90.0
+        assert estimate.reason.startswith("q_max rests on its prior") and estimate.sd_q_mobile < 90.0
 
     @pytest.mark.parametrize("factor", [0.8, 1.2])
     @pytest.mark.parametrize("every", [1, 10])

@@ -47,13 +47,13 @@ _SCALE_UNKNOWN = (
     "(current_gain_sd) and the charge at the start (initial_soc)."
 )
 _IMPRECISE_Q = (
-    "q_mobile is not known to 2 % yet: the voltage shows it at the knee of the discharge, the more the lower the record goes. "
-    "To the same cut-off, a smaller load or constants that were fitted to more of a life of this cell (fit_cell, --cell) tell "
-    "more."
+    "q_max is not known to 2 % yet: the voltage shows it at the knee, the steep end of the discharge, and the record does not "
+    "go far enough into it. Discharge further; to the same cut-off, with less current, or with constants that were fitted to "
+    "more of a life of this cell (fit_cell, --cell)."
 )
 _IMPRECISE_R = (
-    "r_o is not known to 30 %: the error expected of noise and model, divided by the current, is larger. A larger current, or "
-    "a smaller mismatch_V if the model is that good, tells more."
+    "R_o is not known to 30 %: the error expected of noise and model, divided by the current, is larger. Take a larger "
+    "current, or state a smaller mismatch_V if the model is that good."
 )
 
 
@@ -115,17 +115,17 @@ class Condition(IntEnum):
         "no current."
     )
     # what was given does not suffice
-    EMPTY = "The model cell is empty before the record ends: its q_mobile is too small for this record."
+    EMPTY = "The model cell is empty before the record ends: its q_max is too small for this record."
     FEW = "These are too few {of} to tell the noise. Record on or more often{or_else}."
     # the fit
-    Q_AT_BOUND = _AT_BOUND.format("q_mobile")
-    R_AT_BOUND = _AT_BOUND.format("r_o")
+    Q_AT_BOUND = _AT_BOUND.format("q_max")
+    R_AT_BOUND = _AT_BOUND.format("R_o")
     CHARGE_DIFFERS = (
         "The charge that moves in the last step, {moved_C:.4g} C, is not that of the current, {drawn_C:.4g} C: check time, "
         "current and their units."
     )
     IMPLAUSIBLE = (
-        "No cell of this kind has such a q_mobile. Check that time is in s and current in A, and that the record is of one "
+        "No cell of this kind has such a q_max. Check that time is in s and current in A, and that the record is of one "
         "cell; for a cell of another size fit constants (fit_cell, --cell)."
     )
     MISFIT = (
@@ -142,21 +142,21 @@ class Condition(IntEnum):
         "{most_mV:.0f} mV at most."
     )
     CONSTANTS = "A constant of the cell is farther from the model's than the policy has learned of (option nuisance)."
-    Q_PRIOR_WRONG = _PRIOR_WRONG.format("q_mobile")
-    R_PRIOR_WRONG = _PRIOR_WRONG.format("r_o")
+    Q_PRIOR_WRONG = _PRIOR_WRONG.format("q_max")
+    R_PRIOR_WRONG = _PRIOR_WRONG.format("R_o")
     # what the record does not tell of one number
-    NO_CURRENT = "No current flows in the last step, so that r_o does not show.", "r_o"
-    Q_DIFFERS = _DIFFERS.format("q_mobile"), "q_mobile"
-    R_DIFFERS = _DIFFERS.format("r_o"), "r_o"
+    NO_CURRENT = "No current flows in the last step, so that R_o does not show.", "r_o"
+    Q_DIFFERS = _DIFFERS.format("q_max"), "q_mobile"
+    R_DIFFERS = _DIFFERS.format("R_o"), "r_o"
     GAP_UNSURE = (
         "No sample lies between {gap_start_s:.0f} s and {gap_end_s:.0f} s, and the voltage does not tell whether the load was "
         "on: {gap_C:.0f} C are in doubt.",
         "q_mobile",
     )
-    Q_PRIOR_ALONE = _PRIOR_ALONE.format("q_mobile", _IMPRECISE_Q), "q_mobile"
-    R_PRIOR_ALONE = _PRIOR_ALONE.format("r_o", _IMPRECISE_R), "r_o"
-    Q_SCALE_UNKNOWN = _SCALE_UNKNOWN.format("q_mobile"), "q_mobile"
-    R_SCALE_UNKNOWN = _SCALE_UNKNOWN.format("r_o"), "r_o"
+    Q_PRIOR_ALONE = _PRIOR_ALONE.format("q_max", _IMPRECISE_Q), "q_mobile"
+    R_PRIOR_ALONE = _PRIOR_ALONE.format("R_o", _IMPRECISE_R), "r_o"
+    Q_SCALE_UNKNOWN = _SCALE_UNKNOWN.format("q_max"), "q_mobile"
+    R_SCALE_UNKNOWN = _SCALE_UNKNOWN.format("R_o"), "r_o"
     Q_IMPRECISE = _IMPRECISE_Q, "q_mobile"
     R_IMPRECISE = _IMPRECISE_R, "r_o"
     # none of these
