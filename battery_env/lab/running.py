@@ -97,7 +97,9 @@ class End:
             plural = "" if valid.sum() == 1 else "s"
             lines.append(f"life of {valid.sum()} earlier discharge{plural}{left_out}")
         if self.prior_q_mobile_C is not None:
-            lines.append("q_mobile before: {:.0f} C, sd {:.0f} C".format(*self.prior_q_mobile_C))
+            lines.append(
+                "q_max before: {:.3f} Ah, sd {:.3f} Ah".format(*(each_C / 3600.0 for each_C in self.prior_q_mobile_C))
+            )
         return "\n".join([*lines, self.forecast.summary()])
 
 
@@ -167,7 +169,7 @@ def _notes(discharge: Discharge, found: Calibration, other_load: str) -> Iterato
     if float(discharge.time_s[-1]) > seen_s:
         yield f"What was recorded after the last sample under load, at {seen_s:.0f} s, is left out."
     if found.method == "kalman" and settings.prior_q_mobile_C is None and settings.cell is None:
-        yield "The filter expects a cell of some 2 Ah: of another one give the life, a prior of q_mobile or the constants."
+        yield "The filter expects a cell of some 2 Ah: of another one give the life, a prior of q_max or the constants."
     if found.voltage_rmse_V > settings.mismatch_V:
         rmse = found.shown("voltage_rmse_V", 0)
         yield f"The model misses the voltage by {rmse} (RMSE), more than mismatch_V. Other loads make the interval too narrow."
