@@ -272,7 +272,7 @@ def _notes(seen: _Seen, estimate: Estimate, settings: Settings, shown: VoltageFo
     if float(seen.discharge.time_s[-1]) > seen_s:
         yield f"What was recorded after the last sample under load, at {seen_s:.0f} s, is left out."
     if settings.method == "kalman" and settings.prior_q_mobile_C is None and settings.cell is None:
-        yield "The filter expects a cell of some 2 Ah: of another one give the life, a prior of q_mobile or the constants."
+        yield "The filter expects a cell of some 2 Ah: of another one give the life, a prior of q_max or the constants."
     if rmse_V > settings.mismatch_V:
         text = f"The model misses the voltage by {1e3 * rmse_V:.0f} mV (RMSE), more than mismatch_V."
         yield f"{text} Other loads make the interval too narrow."

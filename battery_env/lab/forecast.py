@@ -112,8 +112,8 @@ class Forecast:
             "end of discharge (s)": (self.eod_time_s, "10.0f"),
             "remaining time (s)": (self.remaining_s, "10.0f"),
             "state of charge now (%)": (100.0 * self.soc, "10.1f"),
-            "q_mobile (C)": (self.q_mobile, "10.0f"),
-            "r_o (ohm)": (self.r_o, "10.4f"),
+            "q_max (Ah)": (self.q_mobile / 3600.0, "10.3f"),
+            "R_o (mohm)": (1e3 * self.r_o, "10.0f"),
             "capacity (Ah)": (self.capacity_Ah, "10.3f"),
         }
         if not np.isnan(self.nominal_Ah):

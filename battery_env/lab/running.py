@@ -98,7 +98,9 @@ class End:
             plural = "" if valid.sum() == 1 else "s"
             lines.append(f"life of {valid.sum()} earlier discharge{plural}{left_out}")
         if self.prior_q_mobile_C is not None:
-            lines.append("q_mobile before: {:.0f} C, sd {:.0f} C".format(*self.prior_q_mobile_C))
+            lines.append(
+                "q_max before: {:.3f} Ah, sd {:.3f} Ah".format(*(each_C / 3600.0 for each_C in self.prior_q_mobile_C))
+            )
         return "\n".join([*lines, self.forecast.summary()])
 
 

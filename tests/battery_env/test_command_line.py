@@ -99,7 +99,7 @@ def test_a_file_of_constants_takes_the_place_of_the_new_cell(recorded, tmp_path,
     record = recorded.loaded_part(2.7)
     drawn_Ah = record.charge_C / 3600.0
     (given_Ah,) = fit.model.capacity_Ah(in_steps([constant(record.current_A[-1], "current")], 1.0), 2.7)
-    assert f"{fit.estimate(record).q_mobile:.0f} C" in shown
+    assert f"{fit.estimate(record).q_mobile / 3600.0:.3f} Ah" in shown
     drawn = f"{drawn_Ah:.3f} Ah (sd {0.005 * drawn_Ah:.3f} Ah), drawn"
     health = f"{drawn_Ah / given_Ah:.3f}   {drawn}, of {given_Ah:.4g} Ah, what the given cell yields"
     assert health in shown
@@ -159,10 +159,14 @@ def test_what_remains_of_a_discharge_in_progress_needs_a_prior_or_the_filter(rec
     path = write(recorded.until(1500.0), tmp_path / "half.csv")
     shown = terminal.shows(path, status=3)
     assert "remaining" in shown and "Not settled: q_max is not known to 2 % yet" in shown
-    assert "give --prior" in shown and "calibrated by the Kalman filter" in shown and "Ah   so far" in shown
+    assert (
+        "battery-calibrate forecast FILE --life" in shown
+        and "calibrated by the Kalman filter" in shown
+        and "Ah   so far" in shown
+    )
     assert terminal.row(path, status=3) == terminal.row(path, "--method", "kalman", status=3)
     shown = terminal.shows(path, "--prior", 5460, 55, "--nominal", 2, "--out", tmp_path, status=3)
-    assert "Not settled: q_max rests on its prior" in shown and "give --prior" not in shown and "Kalman" not in shown
+    assert "Not settled: q_max rests on its prior" in shown and "--life" not in shown and "Kalman" not in shown
     assert "2.01 A to go on" in shown and "Ah), predicted, of 2 Ah" in shown
     (row,) = pd.read_csv(tmp_path / "half_estimate.csv").to_dict(orient="records")
     end_s, whole_Ah = recorded.eod_time_s(2.7), recorded.loaded_part(2.7).charge_C / 3600.0
@@ -182,10 +186,10 @@ def test_a_large_cell_at_1C_says_that_its_charge_is_known_though_its_resistance_
     assert not row["settled"] and row["settled_q_mobile"] and not row["settled_r_o"]
     assert row["q_mobile_C"] == pytest.approx(18_000.0, rel=0.01) and row["reason"].startswith("R_o is not known to 30 %")
     shown = terminal.shows(path, "--out", tmp_path, status=3)
-    assert "no   only q_mobile is" in shown and "Not settled: R_o is not known to 30 %" in shown and "--prior" not in shown
+    assert "no   only q_max is" in shown and "Not settled: R_o is not known to 30 %" in shown and "--prior" not in shown
     (table,) = pd.read_csv(tmp_path / "large_estimate.csv").to_dict(orient="records")
     assert table["settled_q_mobile"] and not table["settled_r_o"]
-    assert "only q_mobile settled: R_o is not" in repr(battery_env.calibrate(path)[0])
+    assert "only q_max settled: R_o is not" in repr(battery_env.calibrate(path)[0])
     # what is held is not known by this record
     assert "only" not in terminal.shows(path, "--parameters", "r_o", status=3)
 
@@ -576,7 +580,7 @@ def test_many_samples_are_averaged_and_say_the_same(recorded, tmp_path, terminal
 
 def test_runs_as_a_module():
     done = subprocess.run([sys.executable, "-m", "battery_env", "calibrate", "B0005:1"], capture_output=True, text=True)
-    assert done.returncode == 0 and "q_mobile" in done.stdout and done.stderr == ""
+    assert done.returncode == 0 and "q_max" in done.stdout and done.stderr == ""
 
 
 def test_a_reader_that_leaves_ends_it_in_silence():
