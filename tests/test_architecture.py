@@ -160,7 +160,7 @@ def declared(distributions, extras):
 @pytest.mark.parametrize(
     ("package", "distributions", "extras"),
     [
-        ("battery_env", ("battery_env",), ("cluster", "cyclers", "onnx", "parquet", "sb3")),
+        ("battery_env", ("battery_env",), ("cluster", "cyclers", "onnx", "page", "parquet", "sb3")),
         ("sb3_lac", (".",), ("zoo", "onnx")),
         ("benchmarks", ("battery_env", "."), ("zoo", "peers")),
         ("tests", ("battery_env", "."), ("zoo", "peers", "onnx", "dev")),

@@ -42,6 +42,7 @@ GUIDE = {
     "batteries": [
         "docs/first_discharge",
         "docs/cell_life",
+        "docs/bench_page",
         "docs/which_estimator",
         "docs/parameters",
         "docs/real_cells",

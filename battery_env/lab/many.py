@@ -127,4 +127,4 @@ def _calibrate(
             lost.append(f"{VOLTAGE[1:]}.{suffix} is not made: {made.error}")
         else:
             files[suffix] = made.result
-    return replace(found, record=None, forecast=None), files, lost
+    return replace(found, record=None, forecast=None, end=None), files, lost

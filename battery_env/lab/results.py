@@ -258,5 +258,5 @@ def picture_of(name: str, found: Calibration) -> bytes:
     picture = io.BytesIO()
     shown = {f"model, {METHOD_NAMES[found.method]}": found.forecast}
     title = title_of(literal(name), found)
-    plot_discharge(found.record, shown, title, found.end_quantiles_s).savefig(picture, dpi="figure")
+    plot_discharge(found.record, shown, title, found.end).savefig(picture, dpi="figure")
     return picture.getvalue()
