@@ -83,6 +83,11 @@ def new_figure(width: float, height: float) -> Figure:
     return figure
 
 
+def literal(text: str) -> str:
+    """A text that nothing in is taken for mathematics, as a name with dollars would be."""
+    return text.replace("$", r"\$")
+
+
 def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
     """
     Save a figure; the file is written beside its place and renamed, so that it is never there in part.
@@ -287,7 +292,7 @@ def plot_cell_fit(fit: CellFit, discharges: Sequence[Record]) -> Figure:
             upper.plot(*_drawn_points(since_s, model_V), style, color=colour, lw=1.3, label=f"model, constants {name} the fit")
             lower.plot(*_drawn_points(since_s, error_mV), style, color=colour, lw=1.1)
         meta = getattr(record, "meta", {})
-        name = f"{meta['cell']}:{meta['cycle']}, " if {"cell", "cycle"} <= set(meta) else ""
+        name = literal(f"{meta['cell']}:{meta['cycle']}, ") if {"cell", "cycle"} <= set(meta) else ""
         upper.set_title(f"{name}RMSE {errors_mV[0]:.0f} → {errors_mV[1]:.0f} mV", fontsize=9)
         lower.set_xlabel("time (s)")
     panels[0, 0].set_ylabel("voltage (V)")
@@ -352,7 +357,7 @@ def plot_life(table: pd.DataFrame) -> Figure:
         settled = rows[rows["settled"].astype(bool)]
         for axes, column in zip(panels, _LIFE_COLUMNS, strict=True):
             axes.plot(rows[column], color=colour, lw=0.8, alpha=0.6)
-            axes.plot(settled[column], "o", ms=2.6, color=colour, label=name)
+            axes.plot(settled[column], "o", ms=2.6, color=colour, label=literal(str(name)))
             axes.plot(rows[column].drop(settled.index), "o", ms=3.2, mfc="white", mec=colour, mew=0.8)
             if len(settled) and f"sd_{column}" in settled:
                 reach = 2.0 * settled[f"sd_{column}"].median()

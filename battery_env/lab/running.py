@@ -27,7 +27,7 @@ from battery_env.lab.report import Calibration
 from battery_env.lab.settings import Settings
 from battery_env.lab.sources import Source, find_sources, read_source, record_name
 from battery_env.loads import Load, LoadToCome
-from battery_env.plotting import save_figure
+from battery_env.plotting import literal, save_figure
 from battery_env.records import VARIED_SHARE
 from battery_env.records.discharge import Discharge
 
@@ -249,5 +249,5 @@ class EndFiles:
         with replacing(self.table) as part:
             part.write_text(json.dumps(end.row(), indent=2, allow_nan=False) + "\n", encoding="utf-8")
         figure = end.forecast.plot()
-        figure.suptitle(f"{end.name}, then {end.forecast.load_name}", fontsize=10)
+        figure.suptitle(f"{literal(end.name)}, then {end.forecast.load_name}", fontsize=10)
         save_figure(figure, self.figure)
