@@ -17,10 +17,12 @@ from battery_env.checks import ZERO_CELSIUS_K
 from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.electrochemistry.cell import TB
 from battery_env.electrochemistry.ends import quantile
-from battery_env.estimates import Estimate
+from battery_env.estimates import Estimate, last_estimate
 from battery_env.estimators.diagnosis.gaps import DRAWN, find_gaps
 from battery_env.estimators.diagnosis.rest import Start, check_initial_soc, soc_from_rest
 from battery_env.estimators.diagnosis.samples import start_condition, watched
+from battery_env.estimators.estimator import ModelNow
+from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.lab.forecast import Forecast, forecast
 from battery_env.lab.readers.columns import FileFormat
 from battery_env.lab.readers.discharges import each_usable
@@ -140,12 +142,12 @@ _GOES_ON = Ahead()
 def calibrated(discharge: Discharge, settings: Settings, ahead: Ahead = _GOES_ON) -> Calibration:
     """What one discharge says, and of one in progress what comes after it."""
     seen = _look_at(discharge, settings)
-    estimate, method = _estimate(seen, settings, ahead.load)
+    estimate, method, now = _estimate(seen, settings, ahead.load)
     model = RecordModel(seen.cell, settings.thermal and method != "policy", initial_soc=seen.start.soc)
     # a cell in progress has not ended, however low its model comes in the pulses before
     limits = (-np.inf, 0.0) if seen.in_progress else (settings.cut_off_V, seen.future.mean_A)
     shown = model.forecast(seen.record, estimate, *limits)
-    end = _end(seen, estimate, replace(settings, method=method), model, shown, ahead)
+    end = _end(seen, estimate, replace(settings, method=method), now or model, shown, ahead)
     end_C, model_end_C = _end_temperatures(seen.record, shown)
     charge = _charge(seen, settings, estimate, end)
     if seen.start.reason or seen.more_C or not _is_all_logged(seen, shown, estimate):
@@ -212,8 +214,11 @@ def _look_at(discharge: Discharge, settings: Settings) -> _Seen:
     return _Seen(discharge, loaded, record, fitted, over_s, eod_time_s, in_progress, more_C, cell, start, load, future)
 
 
-def _estimate(seen: _Seen, settings: Settings, load: LoadToCome | None) -> tuple[Estimate, Method]:
-    """The estimate of the first method that settles the discharge, or of the last one; and which it is."""
+def _estimate(seen: _Seen, settings: Settings, load: LoadToCome | None) -> tuple[Estimate, Method, ModelNow | None]:
+    """
+    The estimate of the first method that settles the discharge, or of the last one; which it is; and of the filter where its
+    model stands.
+    """
     methods: list[Method] = [settings.method or "least-squares"]
     # under other loads the filter, which takes the error of the model for noise, is surer than it may be
     goes_on = settings.future_current_A is None and load is None and not seen.load.varied
@@ -226,16 +231,20 @@ def _estimate(seen: _Seen, settings: Settings, load: LoadToCome | None) -> tuple
     ):
         methods.append("kalman")
     for method in methods:
-        estimate = replace(settings, method=method).calibrator(seen.cell, seen.start).estimate(seen.fitted)
+        calibrator = replace(settings, method=method).calibrator(seen.cell, seen.start)
+        if isinstance(calibrator, ExtendedKalmanFilter):
+            estimate, now = last_estimate(calibrator.follow(seen.fitted)), calibrator.now() if goes_on else None
+        else:
+            estimate, now = calibrator.estimate(seen.fitted), None
         if estimate.settled:
             break
     if reason := seen.start.reason or settings.other_load(mean_current_A(seen.record)):
         estimate = replace(estimate, settled_q_mobile=False, settled_r_o=False, reason=reason)
-    return estimate, method
+    return estimate, method, now
 
 
 def _end(
-    seen: _Seen, estimate: Estimate, settings: Settings, model: RecordModel, shown: VoltageForecast, ahead: Ahead
+    seen: _Seen, estimate: Estimate, settings: Settings, model: RecordModel | ModelNow, shown: VoltageForecast, ahead: Ahead
 ) -> Forecast | None:
     """What may come after a record; ``None`` if nothing can be told, or is asked of a record that has ended."""
     if not (seen.in_progress or ahead.is_asked):

@@ -227,34 +227,30 @@ class ExtendedKalmanFilter(OnlineEstimator):
         _follow_all(cells, filters, samples, self._settings, self.cell.packed, self._derivatives, estimates)
         return estimates
 
-    def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:
+    def follow(self, record: Record) -> EstimateTrace:
         """
-        One estimate for every sample of many discharges, in one compiled call each. A temperature that was measured is that of
-        the model, as in a stream.
+        One estimate for every sample of a discharge, in one compiled call. A temperature that was measured is that of the
+        model, as in a stream.
         """
-        traces = []
-        for record in records:
-            stream = Stream.of(record, self.dt_s)
-            self.reset()
-            time_s, voltage_V, current_A, dt_s, temperature_C = stream
-            samples = np.zeros((len(time_s), 1), SAMPLE)
-            samples["voltage_V"][:, 0], samples["current_A"][:, 0], samples["dt_s"][:, 0] = voltage_V, current_A, dt_s
-            samples["temperature_K"][:, 0] = nan if temperature_C is None else temperature_C + ZERO_CELSIUS_K
-            if temperature_C is not None:
-                self._begin(float(samples["temperature_K"][0, 0]))
-            self._cells["seen"]["start"]["at_rest"] = starts_at_rest(record)
-            check_drawn_charge(float(np.cumsum(np.append(0.0, current_A[:-1]) * dt_s).min()), self.least_drawn_C)
-            said = self._follow(self._cells, self._filters, samples)[:, 0]
-            shown = measured(self._cells["seen"][0], self.initial_soc[0], float(time_s[0]))
-            noted = list(zip(map(tuple, said["condition"].tolist()), said["r_o_comes_first"].tolist(), strict=True))
-            texts = {each: _verdict(*each, shown).reason for each in set(noted)}
-            sd_q, sd_r_o = said["sd"].T.copy()
-            settled_q, settled_r_o = (said["condition"] == Condition.SETTLED).T
-            reasons = np.array([texts[each] for each in noted], dtype=object)
-            columns = (said["q_mobile"].copy(), said["r_o"].copy(), sd_q, sd_r_o)
-            traces.append(EstimateTrace(time_s, *columns, settled_q & settled_r_o, reasons, settled_q, settled_r_o))
+        stream = Stream.of(record, self.dt_s)
         self.reset()
-        return traces
+        time_s, voltage_V, current_A, dt_s, temperature_C = stream
+        samples = np.zeros((len(time_s), 1), SAMPLE)
+        samples["voltage_V"][:, 0], samples["current_A"][:, 0], samples["dt_s"][:, 0] = voltage_V, current_A, dt_s
+        samples["temperature_K"][:, 0] = nan if temperature_C is None else temperature_C + ZERO_CELSIUS_K
+        if temperature_C is not None:
+            self._begin(float(samples["temperature_K"][0, 0]))
+        self._cells["seen"]["start"]["at_rest"] = starts_at_rest(record)
+        check_drawn_charge(float(np.cumsum(np.append(0.0, current_A[:-1]) * dt_s).min()), self.least_drawn_C)
+        said = self._follow(self._cells, self._filters, samples)[:, 0]
+        shown = measured(self._cells["seen"][0], self.initial_soc[0], float(time_s[0]))
+        noted = list(zip(map(tuple, said["condition"].tolist()), said["r_o_comes_first"].tolist(), strict=True))
+        texts = {each: _verdict(*each, shown).reason for each in set(noted)}
+        sd_q, sd_r_o = said["sd"].T.copy()
+        settled_q, settled_r_o = (said["condition"] == Condition.SETTLED).T
+        reasons = np.array([texts[each] for each in noted], dtype=object)
+        columns = (said["q_mobile"].copy(), said["r_o"].copy(), sd_q, sd_r_o)
+        return EstimateTrace(time_s, *columns, settled_q & settled_r_o, reasons, settled_q, settled_r_o)
 
     @property
     def least_drawn_C(self) -> float:
