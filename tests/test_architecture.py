@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[1]
 
 # each layer may import the ones before it, and itself; a folder is one
 LAYERS = (
-    ("battery_env.arrays", "battery_env.checks", "battery_env.files"),
+    ("battery_env.arrays", "battery_env.checks", "battery_env.compiled", "battery_env.files"),
     ("battery_env.parameters", "battery_env.estimates"),
     ("battery_env.electrochemistry",),
     ("battery_env.records",),
@@ -118,6 +118,13 @@ def test_importing_a_package_registers_its_environments_and_loads_nothing_slow(p
     code += "print(*set(sys.modules) - before); gymnasium.spec('BatteryRo-v0')"
     result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert not HEAVY & {name.split(".")[0] for name in result.stdout.split()}
+
+
+def test_kernels_are_compiled_where_there_is_no_place_to_keep_them():
+    nowhere = "from numba.core import caching; caching.CompileResultCacheImpl._locator_classes = []"
+    code = f"{nowhere}; from battery_env.electrochemistry.kernels import logarithm; print(logarithm(1.0))"
+    result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert result.stdout == "0.0\n" and not result.stderr
 
 
 def test_every_public_name_of_battery_env_is_the_one_that_type_checkers_see():

@@ -7,11 +7,11 @@ from math import exp, sqrt
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
 from battery_env.arrays import FloatArray, IntArray
 from battery_env.checks import LoadUnit
+from battery_env.compiled import compiled
 from battery_env.electrochemistry.cell import CellParameters, PackedConstants
 from battery_env.electrochemistry.kernels import (
     BLOCK,
@@ -184,7 +184,7 @@ def overfull_error(after_s: float) -> ValueError:
     )
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def _run_on(
     load: FloatArray,
     followed: FloatArray,

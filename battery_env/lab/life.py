@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numba import njit
 from numpy.typing import ArrayLike
 from scipy.optimize import minimize
 from scipy.stats import truncnorm
 
 from battery_env.arrays import BoolArray, FloatArray
 from battery_env.checks import check_positive, check_whole_number
+from battery_env.compiled import compiled
 from battery_env.electrochemistry.ends import BAND, quantile
 from battery_env.estimators.diagnosis.conditions import is_only_imprecise
 from battery_env.estimators.least_squares import LeastSquares
@@ -227,7 +227,7 @@ def _most_common(reasons: pd.Series) -> str:
     return f"Of {count} of {len(kinds)}: {reasons.iloc[kinds.index(kind)]}"
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def _filtered(
     readings: FloatArray,
     valid: BoolArray,

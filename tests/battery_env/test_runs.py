@@ -96,7 +96,7 @@ def test_the_same_command_goes_on_and_nothing_outlives_it(end, lab, undisturbed,
         assert 3 <= done < ROWS
         if end == signal.SIGTERM:
             assert b"the same command goes on" in error and len(pd.read_csv(tmp_path / "estimate.csv")) == done
-        process = started(*arguments)
+        process = started(*arguments[:-2])
         out, error = process.communicate(timeout=120)
         assert process.returncode == 0 and f"going on: {done} discharges are done".encode() in error
         assert out.count(b"\nc") == ROWS - 1 and b"12 discharges: 12 settled" in out

@@ -8,10 +8,10 @@ from math import inf, isnan, nan
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from battery_env.checks import ZERO_CELSIUS_K, check_gain_sd, check_not_negative, check_numbers
+from battery_env.compiled import compiled
 from battery_env.electrochemistry import STATE_SIZE, CellParameters, PackedConstants, check_cell, check_dt
 from battery_env.electrochemistry.ends import SURPLUS_SHARE
 from battery_env.electrochemistry.tangents import PolynomialDerivatives
@@ -379,7 +379,7 @@ def _pair(values: tuple[float, float]) -> tuple[float, float]:
     return float(values[0]), float(values[1])
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def _follow_all(
     cells: NDArray[np.void],
     filters: NDArray[np.void],
