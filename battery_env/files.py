@@ -5,31 +5,100 @@ from __future__ import annotations
 import json
 import math
 import os
+import secrets
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+#: What is packed may become so large, or so many times as large as it is.
+LARGEST_UNPACKED_BYTES, MOST_UNPACKED = 1 << 28, 100
+
 
 class WrongFormatError(ValueError):
     """A file holds something else than what was asked for."""
 
 
+class DamagedError(ValueError):
+    """A file began as one of its kind, and is not whole."""
+
+
 @contextmanager
-def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A place to write a file to, beside where it is to be; it is renamed when the block ends, and removed if it fails."""
+def replacing(path: str | os.PathLike[str], new: bool = False) -> Iterator[Path]:
+    """
+    A place to write a file to, beside where it is to be. When the block ends the content goes to the disk, and then the file
+    takes its name; what is new takes none that another file has. If anything fails, all is as it was before.
+    """
     target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    # Of this process, for another one may write the same file; libraries go by the suffix
-    part = target.with_name(f".{target.stem}.{os.getpid()}.part{target.suffix}")
+    if new:
+        _refuse_if_there(target)
+    _make_folder(target.parent)
+    # A name that no process, thread or machine has but this; libraries go by the suffix
+    part = target.with_name(f".{secrets.token_hex(8)}.part{target.suffix}")
     try:
         yield part
-        os.replace(part, target)
+        with part.open("rb+") as stream:
+            os.fsync(stream.fileno())
+        if new:
+            _take_new_name(part, target)
+        else:
+            os.replace(part, target)
+        _sync_folder(target.parent)
     finally:
         part.unlink(missing_ok=True)
+
+
+def _take_new_name(part: Path, target: Path) -> None:
+    try:
+        os.link(part, target)
+    except OSError:  # it was taken meanwhile; or a file system without links, as of memory sticks
+        _refuse_if_there(target)
+        os.replace(part, target)
+
+
+def _refuse_if_there(target: Path) -> None:
+    if os.path.lexists(target):
+        raise FileExistsError(f"{target} exists already; delete it or choose another name")
+
+
+def _make_folder(folder: Path) -> None:
+    missing = [each for each in (folder, *folder.parents) if not each.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    for each in missing:
+        _sync_folder(each.parent)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Bring the names of files to the disk. Some systems cannot, and the files are whole all the same."""
+    with suppress(OSError):
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+
+
+def set_aside(path: Path) -> Path:
+    """Rename what cannot be used, so that nothing is lost and its name is free."""
+    aside = path.with_name(f"{path.name}.{secrets.token_hex(4)}.damaged")
+    os.replace(path, aside)
+    return aside
+
+
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Hold a file, which need not exist, against other commands; the system lets go of it when the process is gone."""
+    from filelock import FileLock, Timeout
+
+    _make_folder(path.parent)
+    try:
+        with FileLock(path.with_name(f".{path.name}.lock"), timeout=0):
+            yield
+    except Timeout:
+        raise FileExistsError(f"{path} is being written by another command: wait for it, or choose another --out") from None
 
 
 def check_folder(folder: Path) -> None:
@@ -57,9 +126,7 @@ def finite_or_none(value: Any) -> Any:
 def write_json(path: str | os.PathLike[str], file_format: str, version: int, content: Mapping[str, Any]) -> Path:
     """Write a new file in JSON that says what it holds."""
     target = Path(path)
-    if target.exists():
-        raise FileExistsError(f"{target} exists already; delete it or choose another name")
-    with replacing(target) as part:
+    with replacing(target, new=True) as part:
         described = {"format": file_format, "version": version, **content}
         part.write_text(json.dumps(described, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     return target
@@ -68,8 +135,11 @@ def write_json(path: str | os.PathLike[str], file_format: str, version: int, con
 def read_json(path: str | os.PathLike[str], file_format: str, version: int) -> dict[str, Any]:
     """Read what :func:`write_json` wrote."""
     try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
-    except ValueError as error:  # of the encoding, or of JSON
+        # a whole number of hundreds of digits is none of ours, and no float can hold it
+        content = json.loads(
+            Path(path).read_text(encoding="utf-8"), parse_int=lambda text: int(text) if len(text) < 300 else math.inf
+        )
+    except (ValueError, RecursionError) as error:  # of the encoding, of JSON, or of its depth
         raise ValueError(f"{path} is no file in JSON: {error}") from error
     found = content.pop("format", None) if isinstance(content, dict) else None
     if found != file_format:
@@ -88,10 +158,8 @@ def save_npz(
 ) -> Path:
     """Write arrays, and settings as JSON, to a new npz file that says what it holds; no pickle."""
     target = npz_path(path)
-    if target.exists():
-        raise FileExistsError(f"{target} exists already; delete it or choose another name")
     metadata = json.dumps({**settings, "kind": kind, "format": version})
-    with replacing(target) as part:
+    with replacing(target, new=True) as part:
         np.savez_compressed(part, allow_pickle=False, metadata=np.array(metadata), **arrays)
     return target
 
@@ -116,13 +184,29 @@ def read_npz(
 ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """Read arrays and metadata of any format; refuse a damaged file, and one of another kind."""
     with Path(path).open("rb") as stream:
+        head, size = stream.read(128), stream.seek(0, os.SEEK_END)
+        stream.seek(-min(size, 128), os.SEEK_END)
+        # It begins or ends as an archive, or with nothing: what damage, or a power cut, leaves of ours
+        is_ours = head.startswith(b"PK") or b"PK\5\6" in stream.read() or not head.strip(b"\0")
+        refusal = DamagedError if is_ours else WrongFormatError
+        stream.seek(0)
         try:
             with np.load(stream, allow_pickle=False) as file:
+                check_unpacked(size, sum(each.file_size for each in file.zip.infolist()))
                 if damaged := file.zip.testzip():
                     raise ValueError(f"the checksum of {damaged} is wrong")
+                if "metadata" not in file.files:
+                    raise WrongFormatError("it does not say what it is")
                 metadata = json.loads(str(file["metadata"]))
                 if (found := metadata.get("kind", unstated)) != kind or "format" not in metadata:
-                    raise ValueError(f"it is a {found}")
+                    raise WrongFormatError(f"it is a {found}")
                 return {name: np.asarray(file[name]) for name in file.files if name != "metadata"}, metadata
         except Exception as error:  # numpy and zipfile raise whatever the damage leads them to
-            raise ValueError(f"{path} is damaged, or no {kind}: {error}") from error
+            refusal = WrongFormatError if isinstance(error, WrongFormatError) else refusal
+            raise refusal(f"{path} is damaged, or no {kind}: {error}") from error
+
+
+def check_unpacked(packed_bytes: int, unpacked_bytes: int) -> None:
+    """Refuse what would become far larger than it is, as no file of measurements does."""
+    if unpacked_bytes > max(LARGEST_UNPACKED_BYTES, MOST_UNPACKED * packed_bytes):
+        raise ValueError(f"{packed_bytes} bytes would become more than {unpacked_bytes >> 20} MiB: unpack it by hand")

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from functools import cache, partial
 from pathlib import Path
@@ -385,7 +386,8 @@ def simulated(fit: CellFit, cell: str, folder: Path) -> Path:
         data = TrajectoryDataset.generate(
             PARAMETER_NAMES, N_CELLS, loads, 0, **ranges, cell=fit.cell, mismatch=pretrained.MISMATCH
         )
-        data.save(file)
+        with suppress(FileExistsError):  # of another part, which has made the same
+            data.save(file)
     return file
 
 

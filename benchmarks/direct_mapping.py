@@ -15,6 +15,7 @@ those of ``benchmarks.compare``. Finished parts are not run again.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -92,7 +93,8 @@ def training_file(parameter: Parameter, out: Path) -> Path:
     file = out / "data" / f"{parameter}.npz"
     if not file.exists():
         file.parent.mkdir(parents=True, exist_ok=True)
-        divided(parameter, "parameter")[0].save(file)
+        with suppress(FileExistsError):  # of another part, which has made the same
+            divided(parameter, "parameter")[0].save(file)
     return file
 
 

@@ -1,20 +1,33 @@
 """Files that are never there in part."""
 
 import os
+import secrets
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A place to write a file to, beside where it is to be. It is renamed when the block ends, and removed if it fails."""
+    """
+    A place to write a file to, beside where it is to be. When the block ends the content goes to the disk, and then the file
+    takes its name. If anything fails, all is as it was before.
+    """
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
-    # Libraries go by the suffix
-    part = target.with_name(f".{target.stem}.{os.getpid()}.part{target.suffix}")
+    # A name that no process, thread or machine has but this; libraries go by the suffix
+    part = target.with_name(f".{secrets.token_hex(8)}.part{target.suffix}")
     try:
         yield part
+        with part.open("rb+") as stream:
+            os.fsync(stream.fileno())
         os.replace(part, target)
+        # Some systems cannot bring the name to the disk, and the file is whole all the same
+        with suppress(OSError):
+            folder = os.open(target.parent, os.O_RDONLY)
+            try:
+                os.fsync(folder)
+            finally:
+                os.close(folder)
     finally:
         part.unlink(missing_ok=True)

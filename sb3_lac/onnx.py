@@ -6,6 +6,7 @@ import inspect
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -92,7 +93,8 @@ def export_onnx(
 
     Its input is ``observation`` and its output ``action``, both float32. The normalization of the observations by
     ``VecNormalize`` and the scaling of the actions are included. Images are those of the policy, with the channels first. The
-    file is checked with onnxruntime before it takes its name. Needs the extra ``sb3_lac[onnx]``.
+    file is checked with onnxruntime before it takes its name, and ends with its checksum, which ``OnnxPolicy`` of battery_env
+    compares. Needs the extra ``sb3_lac[onnx]``.
 
     :param model: LAC, SAC, TD3, TQC, PPO, ... or a policy
     :param path: Of the file, which must not exist yet; ``.onnx`` is added where it is missing
@@ -156,7 +158,7 @@ def _checked_file(policy: BasePolicy, vec_normalize: VecNormalize | None, env_id
         observations = observations_to_check(policy.observation_space, vec_normalize)
         seen = observations if vec_normalize is None else vec_normalize.normalize_obs(observations)
         expected, _ = policy.predict(seen, deterministic=True)
-        content = graph_of(module, observations, env_id, algorithm).SerializeToString()
+        content = with_checksum(graph_of(module, observations, env_id, algorithm).SerializeToString())
     finally:
         policy.set_training_mode(was_training)
     session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
@@ -197,6 +199,14 @@ def _unchecked_distributions() -> Iterator[None]:
         yield
     finally:
         Distribution.set_default_validate_args(checked)
+
+
+def with_checksum(content: bytes) -> bytes:
+    """Append the entry ``sha256`` of the metadata: messages of protobuf one behind the other are one message."""
+    from onnx import ModelProto, StringStringEntryProto
+
+    entry = StringStringEntryProto(key="sha256", value=sha256(content).hexdigest())
+    return content + ModelProto(metadata_props=[entry]).SerializeToString()
 
 
 def graph_of(module: DeterministicPolicy, observations: np.ndarray, env_id: str | None, algorithm: str) -> ModelProto:

@@ -37,9 +37,13 @@ NOT_APPLICABLE = {
     "test_tensorboard.py::test_tensorboard[sac]": "the folder of the log must have the name of SAC",
     "test_cnn.py::test_features_extractor_target_net[True-PublishedLAC]": "all networks must have one learning rate",
     "test_cnn.py::test_features_extractor_target_net[False-PublishedLAC]": "all networks must have one learning rate",
+    "test_cnn.py::test_feature_extractor_target_net[True-PublishedLAC]": "all networks must have one learning rate",
+    "test_cnn.py::test_feature_extractor_target_net[False-PublishedLAC]": "all networks must have one learning rate",
     "test_custom_policy.py::test_custom_offpolicy[PublishedLAC-net_arch0]": "the critic must do without a layer",
     "test_identity.py::test_continuous[PublishedLAC]": "400 steps must do, of which its learning starts after 1000",
 }
+if LAC is sb3_lac.PublishedLAC:
+    NOT_APPLICABLE["test_save_load.py::test_save_load_pytorch_var"] = "256 steps must do, its learning starts after 1000"
 
 
 class Conformance:

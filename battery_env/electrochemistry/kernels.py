@@ -63,8 +63,9 @@ _L5, _L6, _L7 = 1.818357216161805012e-01, 1.531383769920937332e-01, 1.4798198605
 #: A block of cells is one array: rows of this many values, of states, of what else a step needs, and of constants. Rows start
 #: at multiples that the compiler knows, so that it sees that they do not overlap.
 BLOCK = 64
-_LOAD, _Q, _R_O, _XN, _XP, _VOLTAGE, _CONSTANTS = range(STATE_SIZE, STATE_SIZE + 7)
-#: Where the voltages of a block start, and how long a block is.
+LOAD, _Q, _R_O, _XN, _XP, _VOLTAGE, _CONSTANTS = range(STATE_SIZE, STATE_SIZE + 7)
+#: Where the voltages of a block start, and how long a block is; ``LOAD`` is the row of the loads, and of the currents after a
+#: step.
 VOLTAGE, BLOCK_SIZE = _VOLTAGE * BLOCK, (_CONSTANTS + CONSTANTS_SIZE) * BLOCK
 
 _compiled = njit(cache=True, error_model="numpy")
@@ -277,7 +278,7 @@ def fill_block(
         n = first + j
         for k in range(STATE_SIZE):
             block[k * BLOCK + j] = state[n, k]
-        block[_LOAD * BLOCK + j] = load[n]
+        block[LOAD * BLOCK + j] = load[n]
         block[_Q * BLOCK + j] = q[n]
         block[_R_O * BLOCK + j] = r_o[n]
     if constants.shape[0] > 1:
@@ -329,7 +330,7 @@ def step_of_block(
         _fractions_of_block(block, cells, extended)
     if power:
         for j in range(cells):
-            block[_LOAD * BLOCK + j] = _current(block[_LOAD * BLOCK + j], block[VOLTAGE + j], extended)
+            block[LOAD * BLOCK + j] = _current(block[LOAD * BLOCK + j], block[VOLTAGE + j], extended)
     for j in range(cells):
         x = (
             block[TB * BLOCK + j],
@@ -354,7 +355,7 @@ def step_of_block(
             block[(_CONSTANTS + COOLING) * BLOCK + j],
             block[(_CONSTANTS + SURROUNDINGS) * BLOCK + j],
         )
-        i, r_o = block[_LOAD * BLOCK + j], block[_R_O * BLOCK + j]
+        i, r_o = block[LOAD * BLOCK + j], block[_R_O * BLOCK + j]
         y = _euler(x, i, block[_XN * BLOCK + j], block[_XP * BLOCK + j], r_o, dt, thermal, k)
         block[TB * BLOCK + j] = y[0]
         block[VO * BLOCK + j] = y[1]
@@ -427,7 +428,7 @@ def advance_batch(
             while steps[start + running - 1] <= k:
                 running -= 1
             for j in range(running):
-                block[_LOAD * BLOCK + j] = load[first[start + j] + k]
+                block[LOAD * BLOCK + j] = load[first[start + j] + k]
             step_of_block(block, running, dt, power, power, thermal, False, packed.polynomial_n, packed.polynomial_p)
         states_of_block(block, start, cells, state)
 
@@ -454,11 +455,11 @@ def run_on_batch(
         fill_block(block, first, cells, state, q, q, r_o, packed.constants)  # the load comes below
         for k in range(load.shape[1]):
             for j in range(cells):
-                block[_LOAD * BLOCK + j] = load[0 if shared else first + j, k]
+                block[LOAD * BLOCK + j] = load[0 if shared else first + j, k]
             step_of_block(block, cells, dt, power, True, thermal, False, packed.polynomial_n, packed.polynomial_p)
             for j in range(cells):
                 voltage[k, first + j] = block[VOLTAGE + j]
-                current[k, first + j] = block[_LOAD * BLOCK + j]
+                current[k, first + j] = block[LOAD * BLOCK + j]
         voltage_of_block(block, cells, False, packed.polynomial_n, packed.polynomial_p)
         for j in range(cells):
             voltage[-1, first + j] = block[VOLTAGE + j]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,18 +12,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from battery_env.files import npz_path, read_npz, replacing
+from battery_env.files import DamagedError, npz_path, read_npz, replacing, set_aside
 
 FORMAT_VERSION = 4
 _KIND = "state of an estimator"
 
 
 def save_state(path: str | os.PathLike[str], settings: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Path:
-    """Write a state. It takes the place of an older one, and of no other file."""
+    """Write a state. It takes the place of an older one, and of no other file; a damaged one is renamed, with a warning."""
     target = npz_path(path)
     if target.exists():
         try:
             read_npz(target, _KIND)
+        except DamagedError as error:
+            warnings.warn(f"{error}. It is kept as {set_aside(target).name}, and a new one takes its place.", stacklevel=3)
         except ValueError as error:
             raise FileExistsError(f"{target} exists, and is no state of an estimator: choose another name") from error
     metadata = json.dumps({"kind": _KIND, "format": FORMAT_VERSION, "settings": settings})

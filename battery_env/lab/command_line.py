@@ -15,6 +15,7 @@ page that shows all of it.
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import os
 import re
@@ -23,9 +24,10 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import asdict, fields
 from difflib import get_close_matches
 from functools import wraps
+from hashlib import sha256
 from importlib.resources import files
 from importlib.util import find_spec
 from itertools import chain, islice
@@ -43,8 +45,8 @@ from battery_env.lab.readers.columns import FileFormat
 from battery_env.lab.report import line_of, text_of
 from battery_env.lab.results import Outcome, Results
 from battery_env.lab.settings import METHODS, Settings
-from battery_env.lab.sources import find_sources, read_source
-from battery_env.lab.workers import workers
+from battery_env.lab.sources import Source, find_sources, read_source
+from battery_env.lab.workers import interruptible, workers
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.records import CUT_OFF_V
 from battery_env.records.discharge import Discharge
@@ -183,7 +185,7 @@ _CALIBRATION: _Options = {
         "dest": "future_current_A",
         "type": float,
         "metavar": "A",
-        "help": "current after the end of a record in progress, A (default: its last one, or its mean if it varied)",
+        "help": "current after the end of a record in progress, A (default: its last one, or as so far if it varied)",
     },
     ("--cell",): {
         "type": Path,
@@ -369,12 +371,16 @@ def _ending(command: Callable[_P, int]) -> Callable[_P, int]:
 
     @wraps(command)
     def run(*args: _P.args, **kwargs: _P.kwargs) -> int:
+        for stream in (sys.stdout, sys.stderr):
+            if isinstance(stream, io.TextIOWrapper):  # a console that has not all characters shows their numbers
+                stream.reconfigure(errors="backslashreplace")
         try:
-            status = command(*args, **kwargs)
-            sys.stdout.flush()
-        except KeyboardInterrupt:
+            with interruptible():
+                status = command(*args, **kwargs)
+                sys.stdout.flush()
+        except KeyboardInterrupt as interruption:
             print("interrupted", file=sys.stderr)
-            return INTERRUPTED
+            return getattr(interruption, "status", INTERRUPTED)
         except BrokenPipeError:  # head, or a pager that was left
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is still to be flushed
             return PIPE_CLOSED
@@ -395,33 +401,54 @@ def calibrate(arguments: Sequence[str] | None = None, name: str = _INSTALLED) ->
     if name == _INSTALLED and given and not Path(given[0]).exists() and (meant := get_close_matches(given[0], _OTHERS, 1)):
         raise ValueError(f"no command and no file {given[0]!r}: did you mean {name} {meant[0]}?")
     options = _parser(name).parse_args(given)
-    done: list[Outcome] = []
-    interrupted = False
     settings = _settings(options)
     settings.calibrator()  # what it refuses it refuses of every file
     with _saying():
         sources = find_sources(options.records, options.cell_name)
-    results = Results(options.out, sources, not options.table_only, options.force) if options.out else None
+    file_format = _file_format(options)
+    if options.out is None:
+        return _calibrate(sources, settings, file_format, options, None)
+    made_with = {"battery_env": _VERSION, **asdict(settings), **asdict(file_format), "voltages": not options.table_only}
+    if settings.policy is not None:
+        made_with["policy"] = sha256(settings.policy.read_bytes()).hexdigest()
+    results = Results(options.out, sources, not options.table_only, settings, made_with)
+    with results.opened(sources, options.force):
+        return _calibrate(sources, settings, file_format, options, results)
+
+
+def _calibrate(
+    sources: Sequence[Source],
+    settings: Settings,
+    file_format: FileFormat,
+    options: argparse.Namespace,
+    results: Results | None,
+) -> int:
+    done: list[Outcome] = []
+    status = None
+    if results and results.names:
+        print(f"going on: {len(results.names)} discharges are done, as {results.run} says", file=sys.stderr, flush=True)
     try:
         with workers(options.jobs, options.scheduler) as executor:
             ahead = 64 if options.scheduler or options.jobs == -1 else 2 * options.jobs
-            outcomes = calibrate_all(sources, _file_format(options), settings, results, executor, ahead)
+            outcomes = calibrate_all(sources, file_format, settings, results, executor, ahead)
             with _waiting():
                 first = list(islice(outcomes, 1))
             for outcome in chain(first, outcomes):
                 done.append(outcome)
                 _show(done, options.json)
-    except KeyboardInterrupt:
-        print("interrupted: what is done is kept", file=sys.stderr)
-        interrupted = True
+    except KeyboardInterrupt as interruption:
+        print("interrupted: what is done is kept" + (", and the same command goes on" if results else ""), file=sys.stderr)
+        status = getattr(interruption, "status", INTERRUPTED)
+    finally:
+        if results and results.has_numbers:
+            with _saying():
+                written = results.write_tables()
     if not options.json:
         _conclude(done, settings)
-    if results and any(not each.error for each in done):
-        written = results.write_table(done)
-        if not options.json:
+        if results and results.has_numbers:
             print("\nwritten: " + ", ".join(map(str, written)))
-    if interrupted:
-        return INTERRUPTED
+    if status is not None:
+        return status
     if any(each.error for each in done):
         return REFUSED
     return SETTLED if all(each.found and each.found.settled for each in done) else NOT_SETTLED

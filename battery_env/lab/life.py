@@ -18,9 +18,9 @@ from scipy.stats import truncnorm
 
 from battery_env.arrays import BoolArray, FloatArray
 from battery_env.checks import check_positive, check_whole_number
+from battery_env.electrochemistry.ends import BAND, quantile
 from battery_env.estimators.diagnosis.conditions import is_only_imprecise
 from battery_env.estimators.least_squares import LeastSquares
-from battery_env.lab.forecast import BAND, quantile
 from battery_env.records import drawn, mean_current_A
 from battery_env.records.discharge import Discharge
 

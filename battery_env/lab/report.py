@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from battery_env.estimators.diagnosis.conditions import SETTLED_SHARES
+from battery_env.lab.forecast import Forecast
 from battery_env.lab.settings import Settings
 from battery_env.parameters import PARAMETERS
 from battery_env.records.discharge import Discharge
@@ -37,6 +38,7 @@ class Calibration:
     :param settings: how it was looked at
     :param record: what was looked at; ``None`` where only the columns are kept
     :param forecast: the voltage of the model at the estimate; likewise
+    :param end: what may come after a record in progress; likewise, and of others ``None``
     """
 
     settings: Settings = field(compare=False)
@@ -74,6 +76,7 @@ class Calibration:
     model_end_temperature_C: float = quantity("temperature of the model at the end", "degC", 1)
     record: Discharge | None = field(default=None, compare=False)
     forecast: VoltageForecast | None = field(default=None, compare=False)
+    end: Forecast | None = field(default=None, compare=False)
 
     def __str__(self) -> str:
         return text_of(self._name, self)
@@ -119,14 +122,6 @@ class Calibration:
     def in_progress(self) -> bool:
         """Whether the record ends above the cut-off."""
         return bool(np.isnan(self.measured_eod_time_s))
-
-    @property
-    def end_quantiles_s(self) -> tuple[float, float, float] | None:
-        """Of a record in progress, the 5 %, 50 % and 95 % quantiles of its end, s."""
-        if not self.in_progress:
-            return None
-        reach_s = 1.645 * self.sd_predicted_eod_time_s
-        return self.predicted_eod_time_s - reach_s, self.predicted_eod_time_s, self.predicted_eod_time_s + reach_s
 
 
 _HOW = {each.name: each.metadata for each in fields(Calibration) if each.metadata}
@@ -210,7 +205,7 @@ def _of_the_health(found: Calibration) -> str:
 def _of_the_load(found: Calibration) -> str:
     is_sure = "q_mobile" in found.settings.parameters and found.sd_of("predicted_eod_time_s")
     sd = f"sd {found.shown('sd_predicted_eod_time_s')}, " if is_sure else ""
-    goes_on = "the mean current so far, an assumption: the load varied" if found.load_varied else "to go on"
+    goes_on = "on average, as so far, an assumption: the load varied" if found.load_varied else "to go on"
     return f"{sd}{found.future_current_A:.3g} A {goes_on}"
 
 

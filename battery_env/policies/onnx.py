@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+# An entry ``sha256`` of the metadata at the very end of a file, that of all before it: its tag in the format of protobuf, its
+# length, its name, its value.
+_CHECKSUM = re.compile(rb"\x72\x4a\x0a\x06sha256\x12\x40([0-9a-f]{64})\Z")
 
 
 class OnnxPolicy:
@@ -19,20 +24,19 @@ class OnnxPolicy:
       policy = OnnxPolicy("voltage_joint.onnx")
       estimator = PolicyEstimator(policy, policy.env_id)
 
-    ``sb3_lac.onnx.export_onnx`` writes such files, of any algorithm of Stable-Baselines3. Needs the extra
-    ``battery_env[onnx]``.
+    ``sb3_lac.onnx.export_onnx`` writes such files, of any algorithm of Stable-Baselines3, with a checksum, which is compared.
+    Needs the extra ``battery_env[onnx]``.
 
     :param path: an ONNX file with one float32 input of shape (n, ...) and one output of actions of shape (n, ...)
     :raises FileNotFoundError: if there is no such file
     :raises ImportError: without the extra
-    :raises ValueError: if it is no ONNX file, or has other inputs and outputs
+    :raises ValueError: if it is no ONNX file, is damaged, or has other inputs and outputs
     """
 
     def __init__(self, path: str | Path) -> None:
         # not a dependency of the package
         try:
             from onnxruntime import InferenceSession, SessionOptions
-            from onnxruntime.capi.onnxruntime_pybind11_state import Fail, InvalidGraph, InvalidProtobuf
         except ImportError as error:
             raise ImportError(f"{error}: OnnxPolicy needs pip install 'battery_env[onnx]'") from error
 
@@ -40,9 +44,12 @@ class OnnxPolicy:
         options = SessionOptions()
         options.intra_op_num_threads = 1
         content = path.read_bytes()
+        checksum = _CHECKSUM.search(content[-128:])
+        if checksum and checksum[1].decode() != sha256(content[: -len(checksum[0])]).hexdigest():
+            raise ValueError(f"{path} is damaged: its checksum is wrong")
         try:
             self._session = InferenceSession(content, options, providers=["CPUExecutionProvider"])
-        except (Fail, InvalidGraph, InvalidProtobuf) as error:
+        except Exception as error:  # onnxruntime raises whatever the damage leads it to
             raise ValueError(f"{path} is no ONNX file: {error}") from error
         inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
         if len(inputs) != 1 or len(outputs) != 1:

@@ -52,17 +52,22 @@ def pretrained_policy(env_id: str, recorded: bool = False) -> tuple[OnnxPolicy, 
 def policy_of_file(path: Path) -> tuple[OnnxPolicy, dict[str, Any]]:
     """
     A policy from a file, with the options of its task from ``options`` of a JSON file of the same name beside it, if there is
-    one. The constants of a cell (``cell``) are written there by name.
+    one. The constants of a cell (``cell``) are written there by name, and ``sha256`` of the policy, where it is known.
+
+    :raises ValueError: if the policy is damaged, or not that of the other file
     """
     policy, card = OnnxPolicy(path), path.with_suffix(".json")
     if not card.exists():
         return policy, {}
     try:
-        options = dict(json.loads(card.read_text(encoding="utf-8"))["options"])
+        content = json.loads(card.read_text(encoding="utf-8"))
+        options, sha256 = dict(content["options"]), content.get("sha256", policy.sha256)
         if "cell" in options:
             options["cell"] = CellParameters.of_mapping(options["cell"])
     except (ValueError, TypeError, KeyError) as error:
         raise ValueError(f"{card} has to be an object in JSON with the options of the task as 'options': {error!r}") from error
+    if policy.sha256 != sha256:
+        raise ValueError(f"{path} is damaged, or not the policy that {card} is of: its sha256 is {policy.sha256}")
     return policy, options
 
 

@@ -147,12 +147,17 @@ class TestUncertainty:
     def test_an_offset_that_the_record_shows_goes_on(self):
         record, cut_off_V = self.record, 3.2
         higher = Samples(record.time_s, record.voltage_V + 0.05, record.current_A)
-        point = MODEL.forecast(higher, TRUTH, cut_off_V, in_progress=True)
-        assert point.offset_V == pytest.approx(0.05)
-        assert point.eod_time_s == pytest.approx(MODEL.forecast(record, TRUTH, cut_off_V - 0.05, in_progress=True).eod_time_s)
-        sampled = forecast(higher, TRUTH, cut_off_V=cut_off_V, model=MODEL, mismatch_V=0.02, samples=200)
-        assert sampled.eod_quantile_s(0.5) == pytest.approx(point.eod_time_s, rel=0.01)
-        assert point.eod_time_s > 1.01 * MODEL.forecast(record, TRUTH, cut_off_V).eod_time_s
+        found = forecast(higher, TRUTH, cut_off_V=cut_off_V, model=MODEL, mismatch_V=0.02, samples=200)
+        lower_s = MODEL.forecast(record, TRUTH, cut_off_V - 0.05).eod_time_s
+        assert found.eod_quantile_s(0.5) == pytest.approx(lower_s, rel=0.01)
+        assert lower_s > 1.01 * MODEL.forecast(record, TRUTH, cut_off_V).eod_time_s
+
+    def test_a_cell_in_progress_ends_after_its_record_however_low_its_model_came_before(self):
+        current_A = np.where(np.arange(750) % 25 < 3, 6.0, 1.0)
+        record = discharged(current_A, r_o=0.10, load_unit="current", cut_off_V=3.0)
+        found = forecast(record, TRUTH, 1.0, 3.2, model=MODEL, mismatch_V=0.0, samples=3)
+        assert MODEL.forecast(record, TRUTH, 3.2, 1.0).eod_time_s < record.time_s[-1] - 90.0
+        assert (found.eod_time_s > record.time_s[-1] + 500.0).all()
 
     def test_samples_agree_with_the_record(self):
         whole = discharged(4.0, load_unit="current")
@@ -358,6 +363,22 @@ class TestCommand:
         assert any("a cell of some 2 Ah" in note for note in alone["notes"])
         assert not any("2 Ah" in note for note in carried["notes"])
         assert 0.6 < self.row(capsys, "running.csv", "--nominal", "2")["state_of_health"][1] < 0.9
+
+    @pytest.mark.parametrize(
+        "options", [(), ("--prior", "5460", "55"), ("--cut-off", "3.2"), ("--initial-soc", "0.98,0.01", "--nominal", "2")]
+    )
+    @pytest.mark.parametrize("name", ["running.csv", "pulsed.csv"])
+    def test_both_commands_give_one_end(self, name, options, capsys):
+        pulses = simulate(np.tile([3.0, 1.0], 2000).repeat(30), 6500.0, 0.12, load_unit="current", thermal=True, until=2000.0)
+        columns = {"time_s": pulses.time_s, "voltage_V": pulses.voltage_V, "current_A": pulses.current_A}
+        pd.DataFrame(columns).to_csv("pulsed.csv", index=False)
+        end = self.row(capsys, name, *options)
+        main(["calibrate", name, *options, "--json"])
+        row = json.loads(capsys.readouterr().out)
+        low_s, median_s, high_s = end["eod_time_s"]
+        assert row["predicted_eod_time_s"] == median_s and row["remaining_s"] == end["remaining_s"][1]
+        assert row["predicted_capacity_Ah"] == end["capacity_Ah"][1]
+        assert row["sd_predicted_eod_time_s"] == pytest.approx((high_s - low_s) / 3.29)
 
     def test_a_pause_at_the_end_and_a_poor_model_are_noted(self, capsys):
         table = pd.read_csv("running.csv")

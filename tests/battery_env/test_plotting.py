@@ -1,5 +1,7 @@
 """Figures, and the files they go to."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -7,6 +9,7 @@ import pytest
 from battery_env.electrochemistry import simulate
 from battery_env.estimators import CramerRaoBound, Estimate, EstimateTrace, sensitivities
 from battery_env.files import replacing
+from battery_env.lab.forecast import forecast
 from battery_env.plotting import (
     COLOUR_OF,
     COLOURS,
@@ -203,12 +206,14 @@ def test_pulses_are_drawn_by_their_envelope():
 
 def test_a_discharge_in_progress_ends_in_a_band(record):
     seen = Samples.of(record).first(1000)
-    forecast = RecordModel().forecast(seen, Estimate(6000.0, 0.15), in_progress=True)
-    voltage, *_ = plot_discharge(seen, {"model": forecast}, end_s=(500.0, 2500.0, 9000.0)).axes
-    band, end = voltage.patches[0], voltage.lines[-1]
+    model = {"model": RecordModel().forecast(seen, Estimate(6000.0, 0.15))}
+    expected = forecast(seen, Estimate(6000.0, 0.15), samples=3)
+    ends = replace(expected, eod_time_s=np.array([999.0, 2500.0, 9000.0]))
+    voltage, *_ = plot_discharge(seen, model, end=ends).axes
+    band, end = voltage.patches[0], voltage.lines[-2]
     # from the end of the record, which has not reached it, to what can be shown
     assert (band.get_x(), band.get_x() + band.get_width()) == (999.0, 3750.0) and set(end.get_xdata()) == {2500.0}
-    assert not plot_discharge(seen, {"model": forecast}, end_s=(np.nan, 2500.0, np.nan)).axes[0].patches
+    assert not plot_discharge(seen, model, end=replace(expected, eod_time_s=np.full(3, np.inf))).axes[0].patches
 
 
 def test_of_many_points_the_extremes_are_drawn():

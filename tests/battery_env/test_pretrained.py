@@ -114,7 +114,16 @@ class TestFiles:
         copy.with_suffix(".json").write_text(json.dumps({"options": {"reading_s": 5.0, "cell": asdict(cell)}}))
         assert policy_of_file(copy)[1] == {"reading_s": 5.0, "cell": cell}
 
-    @pytest.mark.parametrize("text", ["{", "[]", "{}", '{"options": 3}', '{"options": {"cell": {"kn": 1000.0}}}'])
+    def test_a_policy_that_its_card_is_not_of_is_refused(self, copy):
+        copy.with_suffix(".json").write_text(FOLDER.joinpath("BatteryVoltageRo-v0.json").read_text())
+        content = bytearray(copy.read_bytes())
+        assert policy_of_file(copy)[1]["reading_s"] == 2.0
+        content[content.index(b"BatteryVoltageRo")] ^= 1
+        copy.write_bytes(content)
+        with pytest.raises(ValueError, match=r"mine\.onnx is damaged, or not the policy that .*mine\.json is of"):
+            policy_of_file(copy)
+
+    @pytest.mark.parametrize("text", ["{", "[]", "{}", "null", '{"options": 3}', '{"options": {"cell": {"kn": 1000.0}}}'])
     def test_a_card_that_is_none_is_refused(self, copy, text):
         copy.with_suffix(".json").write_text(text)
         with pytest.raises(ValueError, match="has to be an object in JSON with the options of the task"):

@@ -109,6 +109,18 @@ def test_a_calibration_policy_runs_without_torch(tmp_path):
     assert estimate.r_o == pytest.approx(PolicyEstimator(model, "BatteryRo-v0").estimate(discharge).r_o, rel=1e-4)
 
 
+def test_no_damaged_file_answers_otherwise(tmp_path):
+    whole = export_onnx(new_model(), tmp_path / "policy").read_bytes()
+    damaged, rng = tmp_path / "damaged.onnx", np.random.default_rng(0)
+    for place in rng.integers(len(whole), size=100):
+        content = bytearray(whole)
+        content[place] ^= 1 << rng.integers(8)
+        damaged.write_bytes(content)
+        if place < len(whole) - 76:  # of all but the checksum itself
+            with pytest.raises(ValueError, match=r"damaged\.onnx is damaged: its checksum is wrong"):
+                OnnxPolicy(damaged)
+
+
 @pytest.mark.parametrize(
     ("make_model", "message"),
     [

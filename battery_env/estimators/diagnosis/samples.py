@@ -39,11 +39,9 @@ _LEAST_JUMP_A, _MOST_RESISTANCE_OHM = 0.05, 0.6
 _NOISES, _SMOOTHED_SHARE = 8.0, 0.67
 # A cell from which this share of its charge was drawn does not come back to the voltage of its first sample without a charge.
 _RECOVERY_SHARE = 0.2
-# A load that was switched for at least this long, s, and this many samples shows in the voltage: the ohmic drop of the model
-# comes to 80 % in 10 s.
-_LEAST_PULSE_S, _LEAST_PULSE_SAMPLES = 10.0, 3
-# So many voltages are kept, about this far apart, s: all that are kept cover the window in which a voltage may not rise.
-_KEPT, _KEPT_EVERY_S = 32, 0.9
+# So many voltages are kept, about this far apart, s: all that are kept cover the window in which a voltage may not rise. This
+# many changes tell the noise.
+_KEPT, _KEPT_EVERY_S, _LEAST_CHANGES = 32, 0.9, 4
 # What model and cell part by is averaged over about so many samples before a gap, and how fast the voltage falls over so long,
 # s; after it the middle voltage of three counts.
 _PARTED_MEMORY, _RATE_MEMORY_S, _PARTED_SAMPLES = 8.0, 100.0, 3
@@ -64,14 +62,18 @@ _START = table([("at_rest", "b1"), *((name, "f8") for name in ("first_V", "first
 # The two voltages before the one at hand, and time and current of the last of them: the middle one of three is examined.
 _BEFORE = table("voltage_2_V voltage_1_V time_1_s current_1_A")
 
-# The last sample that was examined, the current that the ohmic drop stands for then, the largest magnitude of the current, and
-# when the current last jumped.
+# The last sample that was examined and the voltage before it, the current that the ohmic drop stands for then, the largest
+# magnitude of the current, and when the current last jumped.
 _EXAMINED = table(
-    [("count", "i8"), *((f, "f8") for f in ("time_s", "voltage_V", "current_A", "lagging_A", "largest_A", "jump_s"))]
+    [
+        ("count", "i8"),
+        *((f, "f8") for f in ("time_s", "earlier_V", "voltage_V", "current_A", "lagging_A", "largest_A", "jump_s")),
+    ]
 )
 
-# The last switch of the load: the part of its size that the voltage has to follow, the voltages before and since.
-_SWITCH = table("time_s size_A to_follow_A before_V lowest_V highest_V samples")
+# The last switch of the load, 0 A once it was judged: the part of its size that the voltage has to follow, the voltage before
+# and the range since.
+_SWITCH = table("time_s size_A to_follow_A before_V lowest_V highest_V")
 
 # Some samples of the last minute, and the last changes of the voltage from sample to sample, in rings.
 _RING = table(
@@ -110,6 +112,7 @@ SEEN = table(
         ("usual", _USUAL),
         ("gap", _GAP),
         ("doubt_C", "f8"),  # charge of gaps that are in doubt
+        ("pending", "b1"),  # the voltage has not followed the last switch yet
         ("fault", _FAULT),
     ]
 )
@@ -139,19 +142,19 @@ def note_samples(
     """Note what the start of a record and its sensors say against an estimate, as :func:`watched`."""
     seen = watched(record, cell, initial_soc, q_mobile, r_o, rested)
     said = measured(seen, initial_soc or 1.0, float(record.time_s[0]))
-    for number in (start_condition(seen, q_mobile, r_o), int(seen["fault"]["condition"])):
+    for number in (start_condition(seen), fault_condition(seen)):
         if number:
             diagnosis.note(Condition.numbered(number), **said)
 
 
 def measured(seen: Any, initial_soc: float, clock_s: float = 0.0) -> dict[str, Any]:
     """What texts say of samples, by the names in their braces, on a clock of its own."""
-    fault, gap = seen["fault"], seen["gap"]
+    fault, switch, gap = seen["fault"], seen["switch"], seen["gap"]
     end_s = clock_s + gap["end_s"]
     return start_measured(float(seen["start"]["first_V"]), float(seen["start_V"]), initial_soc) | {
-        "fault_s": clock_s + fault["time_s"],
+        "fault_s": clock_s + (fault["time_s"] if fault["condition"] else switch["time_s"]),
         "since_s": clock_s + fault["since_s"],
-        "size": fault["size"],
+        "size": fault["size"] if fault["condition"] else switch["size_A"],
         "gap_start_s": end_s - gap["length_s"],
         "gap_end_s": end_s,
         "gap_C": gap["charge_C"],
@@ -188,10 +191,15 @@ def examine(seen: Row, voltage: float, current: float, q_mobile: float, r_o: flo
     """Look whether one more voltage belongs to its current, beside an estimate and the model's cell."""
     if seen.samples > 1 and not isnan(voltage):
         before, ring = seen.before, seen.ring
-        ring.change_V[ring.n_changes % _KEPT] = abs(voltage - before.voltage_1_V)
+        ring.change_V[ring.n_changes % _KEPT] = voltage - before.voltage_1_V
         ring.n_changes += 1
         middle_V = _middle(before.voltage_2_V, before.voltage_1_V, voltage)
-        _examine_last(seen, middle_V, _least_resistance_ohm(q_mobile, r_o), max(q_mobile, cell_q_mobile))
+        resistance_ohm = _least_resistance_ohm(seen.start, q_mobile, r_o)
+        _examine_last(seen, middle_V, resistance_ohm, max(q_mobile, cell_q_mobile))
+        switch = seen.switch
+        lowest_V, highest_V = min(switch.lowest_V, voltage), max(switch.highest_V, voltage)
+        is_pending = switch.size_A != 0.0 and seen.fault.condition == 0
+        seen.pending = is_pending and not _is_followed(seen, seen.time_s, lowest_V, highest_V, resistance_ohm)
     _note_start(seen, voltage, current)
 
 
@@ -206,9 +214,11 @@ def remember(seen: Row, voltage: float, current: float) -> None:
 
 
 @_compiled
-def _least_resistance_ohm(q_mobile: float, r_o: float) -> float:
-    # of those that a cell can show: of other cells, of larger ones, and of the estimate
-    return max(min(_LEAST_RESISTANCE_OHM, _LEAST_RESISTANCE_OHM * _NEW_Q_C / q_mobile, r_o), 0.0)
+def _least_resistance_ohm(start: Row, q_mobile: float, r_o: float) -> float:
+    # of those that a cell can show: of other cells, of larger ones, and of this one, by its estimate, which a fault may have
+    # spoiled, or by its fall at the start
+    own_ohm = max((start.first_V - start.least_V) / start.most_A, r_o) if start.most_A > 0.0 else r_o
+    return max(min(_LEAST_RESISTANCE_OHM, _LEAST_RESISTANCE_OHM * _NEW_Q_C / q_mobile, own_ohm), 0.0)
 
 
 @_compiled
@@ -225,21 +235,23 @@ def _note_start(seen: Row, voltage: float, current: float) -> None:
 
 
 @_compiled
-def start_condition(seen: Row, q_mobile: float, r_o: float) -> int:
+def start_condition(seen: Row) -> int:
     """
-    Say why a cell cannot have started with the charge expected; 0 if it can. At rest its voltage tells. A first sample
-    under load is corrected by the least ohmic drop that the cell can have: a full cell of a larger resistance cannot be told
-    from one that lacks some charge.
+    Say why a cell need not have started with the charge expected; 0 if its first voltage shows that it did. Under load that
+    is lower than at rest by a drop that nobody knows: a cell with a larger one cannot be told from one that lacks some charge.
     """
     start, (below_V, above_V) = seen.start, FULL_REST_V
-    drop_V = _least_resistance_ohm(q_mobile, r_o) * max(start.first_A, 0.0)
     if start.first_V > seen.start_V + above_V:
         return Condition.START_ABOVE + 0
     if not start.first_V < seen.start_V - below_V:
         return 0
-    if start.first_A <= SWITCH_SHARE * start.most_A or start.first_V - start.least_V >= 0.5 * drop_V:
-        return Condition.START_BELOW + 0
-    return Condition.START_LOADED + 0 if start.first_V + drop_V < seen.start_V - below_V else 0
+    return Condition.START_BELOW + 0 if start.first_A <= SWITCH_SHARE * start.most_A else Condition.START_LOADED + 0
+
+
+@_compiled
+def fault_condition(seen: Row) -> int:
+    """Say what the samples show that no cell does, the first one found; 0 if nothing."""
+    return Condition.NOT_FOLLOWED + 0 if seen.pending else seen.fault.condition
 
 
 @_compiled
@@ -258,9 +270,10 @@ def _change_to_follow_A(switched_A: float, current_A: float, lagging_A: float) -
 def _noise_V(seen: Row) -> float:
     # what is more than noise; infinite as long as there are too few samples to tell
     n = min(seen.ring.n_changes, _KEPT)
-    if n < _KEPT // 4:
+    if n < _LEAST_CHANGES:
         return inf
-    return _NOISES * _SMOOTHED_SHARE * float(np.median(seen.ring.change_V[:n])) / (0.6745 * sqrt(2.0))
+    change_V = seen.ring.change_V[:n]
+    return _NOISES * _SMOOTHED_SHARE * float(np.median(np.abs(change_V - np.median(change_V)))) / (0.6745 * sqrt(2.0))
 
 
 @_compiled
@@ -272,14 +285,19 @@ def _find(seen: Row, condition: int, time_s: float, size: float) -> None:
 
 
 @_compiled
-def _conclude_switch(seen: Row, resistance_ohm: float) -> None:
-    # whether the voltage followed the last switch of the load by half of the least ohmic drop
+def _is_followed(seen: Row, time_s: float, lowest_V: float, highest_V: float, resistance_ohm: float) -> bool:
+    # whether the voltage follows the last switch of the load by half of the least ohmic drop that it can have by then
     switch = seen.switch
-    drop_V = 0.5 * resistance_ohm * switch.to_follow_A
-    if abs(drop_V) > _noise_V(seen):
-        followed_V = switch.before_V - (switch.lowest_V if drop_V > 0.0 else switch.highest_V)
-        if followed_V / drop_V < 1.0:
-            _find(seen, Condition.NOT_FOLLOWED, switch.time_s, switch.size_A)
+    drop_V = -0.5 * resistance_ohm * switch.to_follow_A * expm1((switch.time_s - time_s) / _FOLLOWS_S)
+    followed_V = switch.before_V - (lowest_V if drop_V > 0.0 else highest_V)
+    return abs(drop_V) <= _noise_V(seen) or followed_V / drop_V >= 1.0
+
+
+@_compiled
+def _conclude_switch(seen: Row, time_s: float, resistance_ohm: float) -> None:
+    switch = seen.switch
+    if not _is_followed(seen, time_s, switch.lowest_V, switch.highest_V, resistance_ohm):
+        _find(seen, Condition.NOT_FOLLOWED, switch.time_s, switch.size_A)
     switch.size_A = 0.0
 
 
@@ -295,11 +313,16 @@ def _note_switch(seen: Row, time_s: float, current: float, resistance_ohm: float
     if abs(switched_A) > min(SWITCH_SHARE * last.largest_A, _LEAST_JUMP_A):
         last.jump_s = time_s
     if abs(switched_A) > SWITCH_SHARE * last.largest_A:
-        if switch.size_A != 0.0 and time_s - switch.time_s >= _LEAST_PULSE_S and switch.samples >= _LEAST_PULSE_SAMPLES:
-            _conclude_switch(seen, resistance_ohm)
-        switch.time_s, switch.size_A, switch.before_V = time_s, switched_A, last.voltage_V
-        switch.to_follow_A = _change_to_follow_A(switched_A, current, last.lagging_A)
-        switch.lowest_V, switch.highest_V, switch.samples = inf, -inf, 0.0
+        if switched_A * switch.size_A < 0.0:
+            _conclude_switch(seen, time_s, resistance_ohm)
+        if switch.size_A == 0.0:
+            # the last row before a switch may already have the voltage after it
+            highest_V, lowest_V = max(last.earlier_V, last.voltage_V), min(last.earlier_V, last.voltage_V)
+            switch.time_s, switch.before_V = time_s, highest_V if switched_A > 0.0 else lowest_V
+            switch.lowest_V = switch.highest_V = seen.before.voltage_1_V
+        # steps the same way before it was judged are one switch: a mean over an interval shows a switch as two
+        switch.size_A += switched_A
+        switch.to_follow_A = _change_to_follow_A(switch.size_A, current, last.lagging_A)
     last.lagging_A = _lagging_current_A(last.lagging_A, last.current_A, time_s - last.time_s)
 
 
@@ -325,14 +348,14 @@ def _look_for_rise(seen: Row, time_s: float, voltage: float, current: float) -> 
 @_compiled
 def _examine_last(seen: Row, voltage: float, resistance_ohm: float, most_q: float) -> None:
     # The sample before the one at hand, with the middle voltage of three, which is no single wild one
-    last, switch = seen.examined, seen.switch
-    time_s, current = seen.before.time_1_s, seen.before.current_1_A
-    _note_switch(seen, time_s, current, resistance_ohm)
+    last, switch, before = seen.examined, seen.switch, seen.before
+    time_s, current = before.time_1_s, before.current_1_A
     if switch.size_A != 0.0:
-        switch.lowest_V, switch.highest_V = min(switch.lowest_V, voltage), max(switch.highest_V, voltage)
-        switch.samples += 1.0
-        if time_s - switch.time_s > _START_WINDOW_S and switch.samples >= _LEAST_PULSE_SAMPLES:
-            _conclude_switch(seen, resistance_ohm)
+        # some loggers write a voltage a sample later than its current: the first one after a switch may belong before it
+        switch.lowest_V, switch.highest_V = min(switch.lowest_V, before.voltage_1_V), max(switch.highest_V, before.voltage_1_V)
+    _note_switch(seen, time_s, current, resistance_ohm)
+    if switch.size_A != 0.0 and time_s - switch.time_s > _START_WINDOW_S:
+        _conclude_switch(seen, time_s, resistance_ohm)
     _look_for_rise(seen, time_s, voltage, current)
     # under a steady load the voltage at rest is higher by the ohmic drop at least; a charge that is seen raises it
     drop_V = resistance_ohm * max(current, 0.0) if time_s - switch.time_s > _START_WINDOW_S else 0.0
@@ -340,6 +363,7 @@ def _examine_last(seen: Row, voltage: float, resistance_ohm: float, most_q: floa
     if is_high and seen.drawn_C > _RECOVERY_SHARE * most_q:
         _find(seen, Condition.RECOVERED, time_s, seen.drawn_C)
     last.count += 1
+    last.earlier_V = voltage if last.count == 1 else last.voltage_V
     last.time_s, last.voltage_V, last.current_A = time_s, voltage, current
 
 

@@ -37,7 +37,7 @@ from battery_env.estimators.diagnosis.conditions import (
     SETTLED_SHARES,
     Condition,
 )
-from battery_env.estimators.diagnosis.samples import Row, start_condition
+from battery_env.estimators.diagnosis.samples import Row, fault_condition, start_condition
 from battery_env.estimators.kalman.state import FILTER, OFFSET, Q, R, Settings
 from battery_env.parameters import PARAMETER_NAMES
 
@@ -324,7 +324,7 @@ def conclude(cell: Row, settings: Settings, estimate: Row) -> None:
     own_sd = (max(bank.sd[Q], common_sd_q), max(bank.sd[R], 0.0))
     estimate.q_mobile, estimate.r_o = bank.mean[Q], bank.mean[R]
     estimate.condition[:] = Condition.SETTLED + 0
-    start, fault = start_condition(seen, bank.mean[Q], bank.mean[R]), seen.fault.condition
+    start, fault = start_condition(seen), fault_condition(seen)
     _note(estimate, start, start > 0)
     _note(estimate, fault, fault > 0)
     _note(estimate, Condition.EMPTY, not bank.has_voltage)

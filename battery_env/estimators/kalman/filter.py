@@ -13,12 +13,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from battery_env.checks import ZERO_CELSIUS_K, check_gain_sd, check_not_negative, check_numbers
 from battery_env.electrochemistry import STATE_SIZE, CellParameters, PackedConstants, check_cell, check_dt
+from battery_env.electrochemistry.ends import SURPLUS_SHARE
 from battery_env.electrochemistry.tangents import PolynomialDerivatives
 from battery_env.estimates import Estimate, Estimates, EstimateTrace
 from battery_env.estimators.diagnosis.conditions import Condition, Verdict, rest_voltage_V
 from battery_env.estimators.diagnosis.rest import check_initial_soc
 from battery_env.estimators.diagnosis.samples import begin, examine, follow_gaps, measured, remember
-from battery_env.estimators.estimator import SURPLUS_SHARE, ModelNow, OnlineBatch, OnlineEstimator, check_bounds
+from battery_env.estimators.estimator import ModelNow, OnlineBatch, OnlineEstimator, check_bounds
 from battery_env.estimators.kalman.bank import conclude, filters_of_prior, take
 from battery_env.estimators.kalman.state import CELL, ESTIMATE, FILTER, SAMPLE, Q, R, Settings
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, check_parameters
@@ -29,7 +30,7 @@ _PRIOR_SD_R_OHM = 0.15
 _HOUR_S = 3600.0
 _NOISE_V = 0.005
 # What reasons are made of
-_SHOWN = ("start", "fault", "gap", "start_V")
+_SHOWN = ("start", "fault", "switch", "gap", "start_V")
 
 
 class ExtendedKalmanFilter(OnlineEstimator):

@@ -1,0 +1,185 @@
+"""A file is there as a whole, the old one or the new one, whichever write, sync or renaming fails. Also of two writers."""
+
+import threading
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+import battery_env.files
+import sb3_lac.files
+from battery_env.electrochemistry import NEW_CELL, CellParameters
+from battery_env.estimators.kalman.filter import ExtendedKalmanFilter
+from battery_env.loads import constant
+from battery_env.plotting import save_figure
+from battery_env.trajectories import TrajectoryDataset
+from benchmarks.study import write_text
+from sb3_lac import LAC
+from sb3_lac.envs import reference_controller
+from sb3_lac.stability.fitting import FittedLyapunov, fit_lyapunov
+from tests.faults import Disk, a_full_disk
+
+OLD, NEW = "old", "new"
+
+
+def of_constants(which, path):
+    NEW_CELL.replace(kn=1000.0 if which == OLD else 2000.0).to_json(path)
+
+
+def of_data(which, path):
+    TrajectoryDataset.generate("r_o", 1, [constant(12.0)], seed=which == OLD).save(path)
+
+
+def of_a_state(which, path):
+    estimator = ExtendedKalmanFilter()
+    estimator.update(4.1 if which == OLD else 4.2, 1.0, 0.0)
+    estimator.save(path)
+
+
+def of_a_figure(which, path):
+    save_figure(Figure((1, 1 + (which == OLD))), path)
+
+
+def of_a_table(which, path):
+    write_text(path, 10_000 * which)
+
+
+@pytest.fixture(scope="module")
+def models():
+    made = {which: LAC("MlpPolicy", "LinearCost-v0", buffer_size=200, seed=which == OLD, device="cpu") for which in (OLD, NEW)}
+    made[OLD].learn(50)
+    return made
+
+
+@pytest.fixture(scope="module")
+def functions(models):
+    env = models[OLD].get_env()
+    controller = reference_controller(env.envs[0])
+    return {which: fit_lyapunov(controller, env.envs[0], 2, seed=which == OLD) for which in (OLD, NEW)}
+
+
+# what writes a file, what reads it, and whether it takes the place of an older one
+WRITERS = {
+    "cell.json": (of_constants, CellParameters.from_json, False),
+    "data.npz": (of_data, TrajectoryDataset.load, False),
+    "state.npz": (of_a_state, lambda path: ExtendedKalmanFilter().load(path), True),
+    "figure.png": (of_a_figure, None, True),
+    "table.csv": (of_a_table, None, True),
+    "model.zip": ("save", lambda path: LAC.load(path, device="cpu"), True),
+    "buffer.pkl": ("save_replay_buffer", lambda path: LAC("MlpPolicy", "LinearCost-v0").load_replay_buffer(path), True),
+    "lyapunov.pt": (None, FittedLyapunov.load, True),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_whichever_write_sync_or_renaming_fails_the_file_is_whole(name, tmp_path, request, monkeypatch):
+    write, read, replaces = WRITERS[name]
+    if isinstance(write, str):
+        models, method = request.getfixturevalue("models"), write
+
+        def write(which, path):
+            getattr(models[which], method)(path)
+
+    elif write is None:
+        functions = request.getfixturevalue("functions")
+
+        def write(which, path):
+            functions[which].save(path)
+
+    path = tmp_path / name
+    write(NEW, path)
+    size, new = path.stat().st_size, path.read_bytes()
+    path.unlink()
+    with monkeypatch.context() as patch:
+        disk = Disk(patch)
+        write(NEW, path)
+    assert disk.calls in (["fsync", "replace", "fsync"], ["fsync", "link", "fsync"])
+    path.unlink()
+    old = None
+    if replaces:
+        write(OLD, path)
+        old = path.read_bytes()
+        assert old != new
+
+    def check_whole(failed):
+        found = path.read_bytes() if path.exists() else None
+        assert found == old if failed else len(found) == size
+        assert [each.name for each in tmp_path.iterdir()] == ([] if found is None else [name])
+        if found is not None and read is not None:
+            read(path)
+
+    for after_bytes in (0, 1, size // 3, size - 1):
+        with a_full_disk(after_bytes), pytest.raises((OSError, RuntimeError)):
+            write(NEW, path)
+        check_whole(failed=True)
+    # the sync of the folder comes last, and the file is whole without it; there may be no links
+    fatal = range(2) if replaces else range(1)
+    for number in fatal:
+        with monkeypatch.context() as patch, pytest.raises(OSError, match="Input/output error"):
+            Disk(patch, number)
+            write(NEW, path)
+        check_whole(failed=True)
+    with monkeypatch.context() as patch:
+        Disk(patch, 2 if replaces else 1)
+        write(NEW, path)
+    check_whole(failed=False)
+
+
+@pytest.mark.parametrize("package", [battery_env.files, sb3_lac.files], ids=["battery_env", "sb3_lac"])
+def test_two_writers_of_one_process_id_disturb_each_other_in_nothing(package, tmp_path):
+    both, path, errors = threading.Barrier(2), tmp_path / "new" / "state.bin", []
+
+    def write(content):
+        try:
+            with package.replacing(path) as part:
+                both.wait()
+                part.write_bytes(content)
+                both.wait()
+        except Exception as error:
+            errors.append(error)
+
+    writers = [threading.Thread(target=write, args=(bytes([n]) * 1000,)) for n in (1, 2)]
+    for each in writers:
+        each.start()
+    for each in writers:
+        each.join()
+    assert not errors and len(set(path.read_bytes())) == 1 and list(path.parent.iterdir()) == [path]
+
+
+def test_of_two_writers_of_a_new_file_one_is_told(tmp_path):
+    path = tmp_path / "cell.json"
+    with pytest.raises(FileExistsError, match=r"cell\.json exists already"):
+        with battery_env.files.replacing(path, new=True) as part:
+            NEW_CELL.to_json(path)
+            part.write_text("another")
+    assert CellParameters.from_json(path) == NEW_CELL and list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("damage", [lambda whole: b"", lambda whole: whole[:100], lambda whole: bytes(len(whole))])
+def test_a_damaged_state_is_set_aside_and_a_strangers_file_is_left_alone(damage, tmp_path):
+    path, estimator = tmp_path / "state.npz", ExtendedKalmanFilter()
+    estimator.save(path)
+    damaged = damage(path.read_bytes())
+    path.write_bytes(damaged)
+    with pytest.raises(ValueError, match="is damaged, or no state of an estimator"):
+        estimator.load(path)
+    with pytest.warns(UserWarning, match=r"It is kept as state\.npz\..*\.damaged, and a new one takes its place"):
+        estimator.save(path)
+    estimator.load(path)
+    (aside,) = set(tmp_path.iterdir()) - {path}
+    assert aside.read_bytes() == damaged
+    np.savez(path, of_a_stranger=np.zeros(3))
+    for content in (path.read_bytes(), b"Dear all"):
+        path.write_bytes(content)
+        with pytest.raises(FileExistsError, match="is no state of an estimator"):
+            estimator.save(path)
+        assert path.read_bytes() == content
+
+
+def test_a_file_that_another_command_holds_is_refused(tmp_path):
+    with battery_env.files.locked(tmp_path / "run"):
+        with pytest.raises(FileExistsError, match="is being written by another command"):
+            with battery_env.files.locked(tmp_path / "run"):
+                pass
+    with battery_env.files.locked(tmp_path / "run"):
+        pass
