@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Collection, Mapping
 from dataclasses import replace
+from math import hypot
 from pathlib import Path
 from typing import Any, NamedTuple, overload
 
@@ -17,12 +18,12 @@ from battery_env.electrochemistry.cell import TB
 from battery_env.estimates import Estimate
 from battery_env.estimators.diagnosis.gaps import DRAWN, find_gaps
 from battery_env.estimators.diagnosis.rest import Start, check_initial_soc, soc_from_rest
-from battery_env.estimators.diagnosis.samples import start_condition, watched
+from battery_env.estimators.diagnosis.samples import fault_condition, start_condition, watched
 from battery_env.lab.readers.columns import FileFormat
 from battery_env.lab.readers.discharges import each_usable
 from battery_env.lab.report import Calibration
 from battery_env.lab.settings import Method, Settings
-from battery_env.records import ExpectedCurrent, Samples, drawn, expected_current, mean_current_A
+from battery_env.records import ExpectedCurrent, Samples, drawn, expected_current, mean_current_A, shown_beside
 from battery_env.records.discharge import Discharge
 from battery_env.records.model import RecordModel, VoltageForecast
 
@@ -104,7 +105,7 @@ class _Seen(NamedTuple):
     record: Discharge  # the same, of few samples
     fitted: Discharge  # the same, with the temperature that counts
     averaged_over_s: float
-    eod_time_s: float
+    eod_time_s: float  # NaN: the record ends above the cut-off
     in_progress: bool
     more_C: float  # drawn after the end
     cell: CellParameters
@@ -189,8 +190,9 @@ def _estimate(seen: _Seen, settings: Settings) -> tuple[Estimate, Method]:
     """The estimate of the first method that settles the discharge, or of the last one; and which it is."""
     methods: list[Method] = [settings.method or "least-squares"]
     # under other loads the filter, which takes the error of the model for noise, is surer than it may be
+    is_over = float(seen.discharge.time_s[-1] - seen.loaded.time_s[-1]) > _REST_S
     is_new = settings.prior_q_mobile_C is None and settings.cell is None and settings.future_current_A is None
-    if settings.method is None and seen.in_progress and not seen.load.varied and is_new:
+    if settings.method is None and seen.in_progress and not is_over and not seen.load.varied and is_new:
         methods.append("kalman")
     for method in methods:
         estimate = replace(settings, method=method).calibrator(seen.cell, seen.start).estimate(seen.fitted)
@@ -205,10 +207,12 @@ def _charge(seen: _Seen, settings: Settings, q_mobile: float, remaining_s: float
     """The columns of what was drawn, and of what a full cell would have given: its end comes at the same charge."""
     drawn_Ah, start, future_A = seen.loaded.charge_C / 3600.0, seen.start, seen.future.mean_A
     sd_seen_Ah = sd_eod_s * future_A / 3600.0 if seen.in_progress else settings.current_gain_sd * drawn_Ah
+    shown, duration_s = seen.loaded.shown, float(np.ptp(seen.loaded.time_s))
+    unseen_Ah = float(np.hypot(shown.load_on_C, shown.offset_C(duration_s))) / 3600.0
     return {
         "capacity_Ah": float("nan") if seen.in_progress or start.soc < 1.0 else drawn_Ah,
         "predicted_capacity_Ah": (1.0 - start.soc) * q_mobile / 3600.0 + drawn_Ah + remaining_s * future_A / 3600.0,
-        "sd_predicted_capacity_Ah": float(np.hypot(sd_seen_Ah, start.sd_soc * q_mobile / 3600.0)),
+        "sd_predicted_capacity_Ah": hypot(sd_seen_Ah, start.sd_soc * q_mobile / 3600.0, unseen_Ah),
     }
 
 
@@ -252,13 +256,11 @@ def _is_all_logged(seen: _Seen, forecast: VoltageForecast, estimate: Estimate) -
     Whether all that was drawn is in the record: the cell starts, before or under the load, no lower than with this charge, no
     sensor fails, and the voltage says of each gap that its charge was drawn.
     """
-    discharge, record, q_mobile, r_o = seen.discharge, seen.record, estimate.q_mobile, estimate.r_o
-    begin = int(np.searchsorted(discharge.time_s, discharge.load_on_time_s, side="right")) - 1
-    end = int(np.searchsorted(discharge.time_s, record.time_s[-1], side="right"))
-    columns = (discharge.time_s, discharge.voltage_V, discharge.current_A)
-    shown = watched(Samples(*(column[begin:end] for column in columns)), seen.cell, seen.start.soc, q_mobile, r_o)
-    is_lower = shown["start"]["first_V"] < shown["start_V"]
-    if shown["fault"]["condition"] or (is_lower and start_condition(shown)):
+    record, loaded, q_mobile, r_o = seen.record, seen.loaded, estimate.q_mobile, estimate.r_o
+    shown = watched(Samples.of(loaded), seen.cell, seen.start.soc, q_mobile, r_o, shown_beside(loaded))
+    # a charge that tapered off fills any cell, whatever its voltage at rest
+    is_lower = shown["start"]["first_V"] < shown["start_V"] and not (loaded.shown.charge and loaded.shown.charge.tapered)
+    if fault_condition(shown) or (is_lower and start_condition(shown)):
         return False
     gaps = find_gaps(record.time_s, record.voltage_V, record.current_A, forecast.at_samples_V, q_mobile)
     return all(gap.verdict == DRAWN for gap in gaps)
