@@ -19,17 +19,19 @@ from matplotlib import font_manager
 from PIL import Image, ImageDraw, ImageFont
 from stable_baselines3.common.type_aliases import PolicyPredictor
 
+from benchmarks import control
+from benchmarks.study import EVALUATION_SEED
 from benchmarks.training import train_or_load
-from docs.environment_pictures import PICTURES, in_few_colours, plant_of, save_moving
+from docs.environment_pictures import EPISODES, PICTURES, in_few_colours, plant_of, save_moving
 
-ENV, START = "QuadrotorCost-v0", [-1.1, -1.2, -0.3, 0.0, 0.0, 0.0]
-TIMESTEPS, SEED = 30_000, 0
-STEPS, STRIDE, PICTURE_MS = 200, 4, 80
+ENV, START = "VehicleCost-v0", EPISODES["VehicleCost-v0"].start
+TIMESTEPS, SEED, EPISODES_BESIDE = 30_000, 0, 50
+STEPS, STRIDE, PICTURE_MS = 120, 2, 80
 _TITLE_HEIGHT = 26
 
 
-def roll_out(policy: PolicyPredictor, name: str) -> tuple[list[Image.Image], float]:
-    """Pictures of an episode of the mean action, each under its name and how far off the goal it is; and the last distance."""
+def pictures_of(policy: PolicyPredictor, name: str) -> list[Image.Image]:
+    """Pictures of an episode of the mean action, each under its name and how far off the goal it is."""
     env: Any = gym.make(ENV, render_mode="rgb_array")
     observation, info = env.reset(seed=SEED, options={"state": START})
     pictures = []
@@ -44,9 +46,9 @@ def roll_out(policy: PolicyPredictor, name: str) -> tuple[list[Image.Image], flo
         action, _ = policy.predict(observation, deterministic=True)
         observation, _, terminated, _, info = env.step(action)
         if terminated:
-            break
+            raise RuntimeError(f"{name} left the road: choose another start")
     env.close()
-    return pictures, info["error"]
+    return pictures
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -56,9 +58,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     models = parser.parse_args(arguments).models
     halves = []
     for algo in ("lac", "sac"):
-        pictures, error_m = roll_out(train_or_load(algo, ENV, SEED, TIMESTEPS, models), algo.upper())
-        print(f"{algo.upper()}: {error_m:.3f} m off after {STEPS} steps")
-        halves.append(pictures)
+        policy = train_or_load(algo, ENV, SEED, TIMESTEPS, models)
+        error_m = control.roll_out(policy, lambda: gym.make(ENV), EPISODES_BESIDE, EVALUATION_SEED)["error"]
+        print(f"{algo.upper()}: {error_m.median():.2g} m off at the end, median of {EPISODES_BESIDE} starts")
+        halves.append(pictures_of(policy, algo.upper()))
     both = []
     for left, right in zip(*halves, strict=True):
         picture = Image.new("RGB", (left.width + right.width, left.height), "white")

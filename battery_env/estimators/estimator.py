@@ -94,6 +94,20 @@ class ModelNow(NamedTuple):
     parameters: FloatArray
     deviations: FloatArray
 
+    def draws(self, samples: int, rng: np.random.Generator) -> Cells:
+        """
+        Cells that may be the one that was followed, all equally likely: state, parameters and offset belong together.
+
+        :param samples: how many
+        :param rng: what draws them
+        :return: these
+        """
+        middle = np.concatenate([self.state, self.parameters])
+        points = middle + rng.standard_normal((samples, len(self.deviations))) @ self.deviations
+        for n, parameter in enumerate(PARAMETERS.values(), start=STATE_SIZE):
+            points[:, n] = np.clip(points[:, n], *parameter.limits)
+        return _cells_at(points)
+
 
 class OnlineEstimator(Estimator):
     """
@@ -212,10 +226,8 @@ class OnlineEstimator(Estimator):
         points = np.vstack(
             [middle, *(middle + share[:, None] * each for share, each in zip(shares, now.deviations, strict=True))]
         )
-        cells = Cells(
-            points[:, STATE_SIZE], points[:, STATE_SIZE + 1], points[:, :STATE_SIZE], points[:, -1], 0.0 * points[:, -1]
-        )
-        ends_s = run_down(cells, now, in_steps([given], dt_s), now.cell.VEOD if cut_off_V is None else cut_off_V).time_s
+        end_V = now.cell.VEOD if cut_off_V is None else cut_off_V
+        ends_s = run_down(_cells_at(points), now, in_steps([given], dt_s), end_V).time_s
         if given_s < min(ends_s[0], LONGEST_S):
             raise ValueError(
                 f"load ends after {given_s:g} s, before the discharge does. Append what is to come, or "
@@ -268,16 +280,24 @@ class OnlineEstimator(Estimator):
         :return: one trace per discharge, in the same order
         :raises ValueError: if a record cannot be used
         """
-        traces = []
-        for record in records:
-            stream = Stream.of(record, self.dt_s)
-            measured: Iterable[tuple[float, ...]] = stream.samples()
-            if stream.temperature_C is not None:
-                measured = ((*sample, t_C) for sample, t_C in zip(measured, stream.temperature_C.tolist(), strict=True))
-            self.reset()
-            traces.append(EstimateTrace.of(stream.time_s, [self.update(*sample) for sample in measured]))
+        traces = [self.follow(record) for record in records]
         self.reset()
         return traces
+
+    def follow(self, record: Record) -> EstimateTrace:
+        """
+        One estimate for every sample of a discharge, after which the estimator stands at the last one.
+
+        :param record: one discharge
+        :return: the estimates
+        :raises ValueError: if the record cannot be used
+        """
+        stream = Stream.of(record, self.dt_s)
+        measured: Iterable[tuple[float, ...]] = stream.samples()
+        if stream.temperature_C is not None:
+            measured = ((*sample, t_C) for sample, t_C in zip(measured, stream.temperature_C.tolist(), strict=True))
+        self.reset()
+        return EstimateTrace.of(stream.time_s, [self.update(*sample) for sample in measured])
 
 
 class OnlineBatch:
@@ -371,6 +391,12 @@ def check_bounds(
     """Refuse invalid bounds."""
     given = zip(PARAMETERS.values(), (q_mobile_bounds_C, r_o_bounds_ohm), strict=True)
     return {parameter.name: parameter.check_bounds(f"the bounds of {parameter.name}", bounds) for parameter, bounds in given}
+
+
+def _cells_at(points: FloatArray) -> Cells:
+    """Cells at points of shape (n, 11): the state, ``q_mobile``, ``r_o``, and the offset of the voltage."""
+    state, (q_mobile, r_o, offset_V) = np.ascontiguousarray(points[:, :STATE_SIZE]), points[:, STATE_SIZE:].T.copy()
+    return Cells(q_mobile, r_o, state, offset_V, np.zeros(len(points)))
 
 
 def _slope(shares: FloatArray, ends_s: FloatArray) -> float:
