@@ -293,12 +293,24 @@ def test_no_calibrator_is_sure_of_a_wrong_answer(fault, seed):
             assert found != "wrong", f"{name}: {estimate}, but q_mobile is {case.q_mobile:.0f} C and r_o {case.r_o:.4f} ohm"
 
 
-def test_the_filter_notices_a_current_that_was_gone_for_a_while():
-    """Once answered with r_o = 0.072 ohm for 0.198 ohm, settled."""
-    rng = np.random.default_rng((0, 154))
-    case = broken(drawn(rng, ("B0005", "B0006")), "dropout", rng)
-    found, estimate = outcome(case, calibrators(case)["filter, mismatch"])
-    assert found == "not settled" and "voltage does not follow" in estimate.reason
+@pytest.mark.parametrize("sensor", ["current_A", "voltage_V"])
+@pytest.mark.parametrize(("cell", "n"), [("B0005", 0), ("B0005", 100), ("B0006", 72), ("B0006", 144)])
+def test_no_dropout_of_any_length_leaves_a_wrong_number_settled(cell, n, sensor):
+    """Some of 19 to 55 s once left half of the resistance, settled: two or three samples, or one before the cut-off."""
+    whole, answers = recorded(cell, n), []
+    count = len(whole.time_s)
+    for start in (3, count // 10, count // 2, count - 3, count - 2):
+        for samples in (1, 2, 3, 4, 6):
+            values = getattr(whole, sensor).copy()
+            # a voltage that fails does not fall to the cut-off
+            values[start : start + samples] = 0.0 if sensor == "current_A" else 4.0
+            case = replace(whole, **{sensor: values})
+            filtered = calibrators(case)["filter, mismatch"]
+            made = [outcome(case, filtered, path) for path in ("whole", "stream")]
+            made += [outcome(case, calibrators(case)["least squares"])] if samples in (1, 3) else []
+            answers += [(start, samples, *each) for each in made]
+    assert not [answer for answer in answers if answer[2] == "wrong"]
+    assert any(estimate and "voltage does not follow" in estimate.reason for *_, estimate in answers) or sensor == "voltage_V"
 
 
 @pytest.mark.parametrize("fault", [fault for fault in FAULTS if fault not in UNOBSERVABLE])
