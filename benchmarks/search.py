@@ -40,7 +40,7 @@ from battery_env.policies.estimator import PolicyEstimator
 from battery_env.tasks.full_state.task import FullStateTask
 from benchmarks.control import DISTURBANCES, roll_out
 from benchmarks.study import Study, Tables, command_line, positive, side_by_side
-from benchmarks.training import Recipe, set_up, timesteps_of
+from benchmarks.training import Recipe, set_up
 
 _DISCHARGES = 64  # whole ones, evenly spaced in the training part
 _EPISODES, _SEED = 50, 20_000  # on a cost environment
@@ -191,9 +191,9 @@ def sampled(algo: str, env_id: str, trial: Trial) -> dict[str, Any]:
 def score(algo: str, env_id: str, updates: int, folder: Path, trial: Trial) -> float:
     """Train one policy and score it."""
     family = FAMILIES[env_id]
-    recipe = Recipe.of(algo, env_id, trial.number, hyperparameters=sampled(algo, env_id, trial))
+    recipe = Recipe.of(algo, env_id, trial.number, updates=updates, hyperparameters=sampled(algo, env_id, trial))
     _, model = set_up(recipe, folder)
-    model.learn(timesteps_of(updates, recipe.hyperparameters))
+    model.learn(recipe.timesteps)
     scores = family.scores(model, env_id)
     trial.set_user_attr("updates", model._n_updates)
     trial.set_user_attr("median", float(scores.median()))
