@@ -31,7 +31,7 @@ from tqdm import tqdm
 import battery_env
 import sb3_lac
 from battery_env.evaluation import over_seeds
-from battery_env.files import check_folder, replacing
+from battery_env.files import check_folder, replacing, set_aside
 from battery_env.lab.workers import interruptible, workers
 from battery_env.plotting import new_figure, save_figure
 
@@ -289,11 +289,11 @@ class Study:
         for arguments in parts:
             made_from = {"part": part.__name__, "arguments": arguments, "module": module, "versions": own_versions()}
             files.append(self.out / "parts" / f"{part.__name__}_{digest_of(made_from)}.json")
-        missing = {file: dict(arguments) for file, arguments in zip(files, parts, strict=True) if not file.exists()}
+        missing = {file: dict(arguments) for file, arguments in zip(files, parts, strict=True) if not _tables_of(file)}
         where = list(missing)
         runs = [(partial(importable(part), **places), arguments) for arguments in missing.values()]
         self.each(_make, runs, lambda number, content: write_json(where[number], content))
-        made = [json.loads(file.read_text(encoding="utf-8"))["tables"] for file in files]
+        made = [_tables_of(file) for file in files]
         names = dict.fromkeys(name for tables in made for name in tables)
         return {
             name: pd.concat([pd.DataFrame(tables[name]) for tables in made if name in tables], ignore_index=True)
@@ -365,6 +365,17 @@ def importable(function: Callable[..., Result]) -> Callable[..., Result]:
     if function.__module__ != "__main__" or program is None:
         return function
     return getattr(importlib.import_module(program.name), function.__name__)
+
+
+def _tables_of(file: Path) -> dict[str, Any]:
+    """The tables of a part; none if it is not made. A damaged file is set aside, and its part is made again."""
+    if not file.exists():
+        return {}
+    try:
+        return dict(json.loads(file.read_text(encoding="utf-8"))["tables"])
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        print(f"{file} is damaged ({error!r}): it is kept as {set_aside(file).name}, and made again", file=sys.stderr)
+        return {}
 
 
 def _make(part: Callable[..., Tables], arguments: dict[str, Any]) -> dict[str, Any]:
