@@ -265,7 +265,7 @@ class Training:
     One training, ready to begin or, where the recipe has evaluations, to go on from the checkpoint at the last of them.
 
     :param recipe: what it is made by
-    :param file: where the model is saved
+    :param file: where the model is saved, in a folder of its own if the recipe has evaluations
     :param options: of the manager of the RL Zoo
     """
 
