@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from battery_env.arrays import FloatArray, IntArray
 from battery_env.checks import LoadUnit, check_load, check_numbers, check_positive, check_range
+from battery_env.electrochemistry.ends import Loads
 from battery_env.records import SWITCH_SHARE, Record, drawn, resample_current
 
 _MOST_SEGMENTS = 1e6  # of a random load; beyond, a time is meant in another unit
@@ -29,6 +30,8 @@ class KnownLoad(ABC):
     """A load that is known at all times, with its unit, ``"power"`` or ``"current"``."""
 
     unit: LoadUnit
+    #: After this time it never discharges a cell, s; infinite where that is not known.
+    until_s: float = np.inf
 
     @abstractmethod
     def __call__(self, time_s: ArrayLike) -> FloatArray:
@@ -86,6 +89,12 @@ class Load(KnownLoad):
         """
         bounds = np.append(np.searchsorted(time_s, self.start_s), len(time_s))
         return np.repeat(self.value, np.diff(bounds))
+
+    @property
+    def until_s(self) -> float:  # type: ignore[override]
+        """After this time it never discharges a cell, s."""
+        drawing = np.flatnonzero(self.value > 0.0)
+        return float(np.append(self.start_s, np.inf)[drawing[-1] + 1 if len(drawing) else 0])
 
     @cached_property
     def _totals(self) -> FloatArray:
@@ -175,24 +184,63 @@ class RandomLoad(ABC):
         """Draw one load."""
 
 
-_AnyLoad = TypeVar("_AnyLoad")
-
-
 @dataclass(frozen=True, eq=False)
-class _InSteps:
-    """The mean of a load over each step of a simulation, at the starts of the steps."""
+class _Function(KnownLoad):
+    """A function of time as a load: over each step its value at the start."""
 
-    load: KnownLoad
-    dt_s: float
+    function: Callable[[FloatArray], ArrayLike]
     unit: LoadUnit
 
-    def __call__(self, time_s: FloatArray) -> FloatArray:
-        return self.load.mean(time_s, self.dt_s)
+    def __call__(self, time_s: ArrayLike) -> FloatArray:
+        time = np.asarray(time_s, dtype=np.float64)
+        values = check_load(self.function(time), self.unit)
+        if values.shape not in ((), time.shape):
+            raise ValueError(f"load must return one value for each time, shape {time.shape}, got shape {values.shape}")
+        return np.broadcast_to(values, time.shape)
+
+    def mean(self, time_s: FloatArray, dt_s: float) -> FloatArray:
+        return self(time_s)
 
 
-def in_steps(load: _AnyLoad, dt_s: float) -> _InSteps | _AnyLoad:
-    """A load for a simulation in steps: of a known load the mean over each; functions of time and all else as they are."""
-    return _InSteps(load, dt_s, load.unit) if isinstance(load, KnownLoad) else load
+#: What a load to come can be given as.
+LoadToCome = float | KnownLoad | RandomLoad | Callable[[FloatArray], ArrayLike]
+
+
+def known_load(load: Any, unit: LoadUnit) -> KnownLoad:
+    """
+    A load from what is given of it.
+
+    :param load: a number, a function of time in s that takes an array, or a load of this module
+    :param unit: of a number or a function: ``"power"`` in W or ``"current"`` in A. Others have their own
+    :return: the load
+    :raises TypeError: for another type
+    """
+    if isinstance(load, KnownLoad):
+        return load
+    if callable(load):
+        return _Function(load, unit)
+    value = check_numbers("load", load)
+    if value.ndim:
+        raise TypeError(
+            f"load must be a number, a function of time or a load of battery_env.loads, got an array of shape {value.shape}. "
+            "Give Load(time_s, value, unit), with time_s from 0 at the end of the record."
+        )
+    return constant(float(value), unit)
+
+
+def in_steps(loads: Sequence[KnownLoad], dt_s: float) -> Loads:
+    """
+    Loads for simulations in steps, over each of which their mean flows.
+
+    :param loads: one for all cells, or one a cell, all in one unit
+    :param dt_s: length of the steps, s
+    :return: what :func:`battery_env.electrochemistry.ends.run_down` takes
+    """
+
+    def over(time_s: FloatArray, cells: IntArray) -> FloatArray:
+        return np.array([loads[n].mean(time_s, dt_s) for n in (cells if len(loads) > 1 else [0])], dtype=np.float64)
+
+    return Loads(over, loads[0].unit, np.array([each.until_s for each in loads]))
 
 
 def constant(value: float, unit: LoadUnit = "power") -> Load:

@@ -7,7 +7,7 @@ import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -18,6 +18,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
 from battery_env.arrays import FloatArray
+from battery_env.electrochemistry.ends import BAND
 from battery_env.estimates import Estimate, EstimateTrace
 from battery_env.estimators.cell_fit import CellFit
 from battery_env.estimators.cramer_rao import CramerRaoBound, Sensitivities
@@ -59,7 +60,12 @@ _STRETCHES = 2000
 _FEW_SWITCHES = 60
 # A figure of a discharge in progress goes on for at most this many times its record, or its expected end.
 _LONGEST_SHOWN = 1.5
-_LIFE_COLUMNS = {"q_mobile_C": LABELS["q_mobile"], "r_o_ohm": LABELS["r_o"], "drawn_Ah": "charge drawn (Ah)"}
+# Title of the axis of each panel of a life, in the units of a lab, with the scale to them.
+_LIFE_COLUMNS = {
+    "q_mobile_C": (f"{Q_MOBILE.symbol} (Ah)", 1.0 / 3600.0),
+    "r_o_ohm": (rf"{R_O.symbol} (m$\Omega$)", 1e3),
+    "drawn_Ah": ("charge drawn (Ah)", 1.0),
+}
 # Distance of the bars of cells, as a share of the axis.
 _BAR_STEP = 0.02
 # q_mobile follows the capacity if their correlation is this close over so many discharges or more.
@@ -75,6 +81,11 @@ def new_figure(width: float, height: float) -> Figure:
     figure = Figure(figsize=(width, height), dpi=150, layout="constrained")
     FigureCanvasAgg(figure)
     return figure
+
+
+def literal(text: str) -> str:
+    """A text that nothing in is taken for mathematics, as a name with dollars would be."""
+    return text.replace("$", r"\$")
 
 
 def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
@@ -185,7 +196,7 @@ def plot_learning_curves(
 
 
 def plot_discharge(
-    record: Record, forecasts: Mapping[str, VoltageForecast], title: str = "", end_s: tuple[float, float, float] | None = None
+    record: Record, forecasts: Mapping[str, VoltageForecast], title: str = "", end: Expected | None = None
 ) -> Figure:
     """
     The measured voltage of one discharge with that of the model at some estimates, the current, and the error of the model.
@@ -196,7 +207,7 @@ def plot_discharge(
     :param record: one discharge, simulated or recorded
     :param forecasts: what :meth:`battery_env.RecordModel.forecast` made of estimates, by name for the legend
     :param title: of the figure
-    :param end_s: of a discharge in progress, the 5 %, 50 % and 95 % quantiles of its end, s: drawn as a band and a line
+    :param end: of a discharge in progress what :func:`battery_env.forecast` expects of it
     :return: the figure; a line ends at the cut-off, and that of its error where the model cell is empty
     """
     figure = new_figure(6.4, 5.4)
@@ -210,10 +221,8 @@ def plot_discharge(
         upper.plot(*_drawn_points(forecast.time_s, forecast.voltage_V, stretches), color=colour, lw=1.4, label=name)
         error_mV = 1e3 * (forecast.at_samples_V - record.voltage_V)
         lower.plot(*_drawn_points(record.time_s, error_mV, stretches), color=colour, lw=1.0, label=name)
-    if end_s is not None and np.isfinite(end_s).all():
-        shown_s = np.clip(end_s, record.time_s[-1], _LONGEST_SHOWN * max(record.time_s[-1], end_s[1]))
-        upper.axvspan(shown_s[0], shown_s[2], color=COLOURS[1], alpha=0.2, lw=0, label="end of discharge, 90 %")
-        upper.axvline(shown_s[1], color=COLOURS[1], lw=1.2)
+    if end is not None:
+        draw_end(upper, end)
     figure.suptitle(title, fontsize=10)
     upper.set_ylabel("voltage (V)")
     upper.legend(frameon=False, fontsize=9, loc="lower left")
@@ -221,6 +230,37 @@ def plot_discharge(
     middle.set(ylabel="current (A)", ylim=(min(-0.1 * most_A, 1.1 * float(record.current_A.min())), 1.2 * most_A))
     lower.set(xlabel="time (s)", ylabel="model -\nmeasured (mV)")
     return _finished(figure, *panels)
+
+
+class Expected(Protocol):
+    """What may come of a discharge: a :class:`battery_env.Forecast`."""
+
+    @property
+    def time_s(self) -> FloatArray: ...
+
+    @property
+    def voltage_V(self) -> FloatArray: ...
+
+    def eod_quantile_s(self) -> FloatArray: ...
+
+
+def draw_end(axes: Axes, expected: Expected) -> None:
+    """
+    Draw what may come of a discharge: the voltage to expect, and the interval of its end.
+
+    :param axes: of voltage over time
+    :param expected: what may come
+    """
+    inside = f"{100.0 * (BAND[2] - BAND[0]):.0f} %"
+    time_s, (low_V, median_V, high_V), end_s = expected.time_s, expected.voltage_V, expected.eod_quantile_s()
+    if np.isfinite(end_s).all():
+        last_s = min(end_s[2], _LONGEST_SHOWN * max(time_s[0], end_s[1]))
+        axes.axvspan(min(end_s[0], last_s), last_s, color=COLOURS[1], alpha=0.2, lw=0, label=f"end of discharge, {inside}")
+        axes.axvline(end_s[1], color=COLOURS[1], lw=1.2)
+        seen = time_s <= last_s
+        time_s, low_V, median_V, high_V = (each[seen] for each in (time_s, low_V, median_V, high_V))
+    axes.fill_between(time_s, low_V, high_V, color=COLOURS[0], alpha=0.25, lw=0, label=f"voltage, {inside}")
+    axes.plot(time_s, median_V, color=COLOURS[0], lw=1.4, label="voltage, median")
 
 
 def plot_cell_fit(fit: CellFit, discharges: Sequence[Record]) -> Figure:
@@ -252,7 +292,7 @@ def plot_cell_fit(fit: CellFit, discharges: Sequence[Record]) -> Figure:
             upper.plot(*_drawn_points(since_s, model_V), style, color=colour, lw=1.3, label=f"model, constants {name} the fit")
             lower.plot(*_drawn_points(since_s, error_mV), style, color=colour, lw=1.1)
         meta = getattr(record, "meta", {})
-        name = f"{meta['cell']}:{meta['cycle']}, " if {"cell", "cycle"} <= set(meta) else ""
+        name = literal(f"{meta['cell']}:{meta['cycle']}, ") if {"cell", "cycle"} <= set(meta) else ""
         upper.set_title(f"{name}RMSE {errors_mV[0]:.0f} → {errors_mV[1]:.0f} mV", fontsize=9)
         lower.set_xlabel("time (s)")
     panels[0, 0].set_ylabel("voltage (V)")
@@ -300,6 +340,8 @@ def plot_life(table: pd.DataFrame) -> Figure:
         raise ValueError(
             f"a life is drawn for one method, got {' and '.join(table['method'].unique())}: their r_o differ by up to a third"
         )
+    scales = {f"{sd}{column}": scale for column, (_, scale) in _LIFE_COLUMNS.items() for sd in ("", "sd_")}
+    table = table.assign(**{column: scale * table[column] for column, scale in scales.items() if column in table})
     figure = new_figure(6.8, 6.8)
     panels = figure.subplots(3, 1, sharex=True)
     one_each = "cell" not in table or not table["cell"].duplicated().any()
@@ -315,12 +357,12 @@ def plot_life(table: pd.DataFrame) -> Figure:
         settled = rows[rows["settled"].astype(bool)]
         for axes, column in zip(panels, _LIFE_COLUMNS, strict=True):
             axes.plot(rows[column], color=colour, lw=0.8, alpha=0.6)
-            axes.plot(settled[column], "o", ms=2.6, color=colour, label=name)
+            axes.plot(settled[column], "o", ms=2.6, color=colour, label=literal(str(name)))
             axes.plot(rows[column].drop(settled.index), "o", ms=3.2, mfc="white", mec=colour, mew=0.8)
             if len(settled) and f"sd_{column}" in settled:
                 reach = 2.0 * settled[f"sd_{column}"].median()
                 axes.errorbar(bar_x, settled[column].iloc[-1], reach, fmt="none", color=colour, capsize=2.5, lw=1.2)
-    for axes, (column, label) in zip(panels, _LIFE_COLUMNS.items(), strict=True):
+    for axes, (column, (label, _)) in zip(panels, _LIFE_COLUMNS.items(), strict=True):
         axes.set_ylabel(label)
         if (sd := f"sd_{column}") in table:
             values, reach = table[column].to_numpy(dtype=np.float64), 2.0 * table[sd].to_numpy(dtype=np.float64)
@@ -439,7 +481,7 @@ def plot_sensitivities(slopes: Mapping[str, Sensitivities]) -> Figure:
         upper.plot(slope.time_s, 1e6 * slope.by_q_mobile_V_per_C, color=colour, lw=1.3, label=name)
         lower.plot(slope.time_s, slope.by_r_o_A, color=colour, lw=1.3, label=name)
     upper.set_yscale("symlog", linthresh=1e6 * _LINEAR_SLOPE_V_PER_C, linscale=0.5)
-    upper.set_ylabel(r"$\partial V / \partial q^{max}$ ($\mu$V/C)")
+    upper.set_ylabel(r"$\partial V / \partial q_{max}$ ($\mu$V/C)")
     upper.legend(frameon=False, fontsize=9)
     lower.set(xlabel="time (s)", ylabel=r"$\partial V / \partial R_o$ (mV/m$\Omega$)")
     return _finished(figure, upper, lower)

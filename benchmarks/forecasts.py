@@ -8,7 +8,8 @@ Forecast the end of discharges in progress beside what needs no model, and the e
 *Unchanged load*: NASA's B0005 and B0006 at 2 A, cut off after 25, 50 and 75 % of the time. *Changing loads*: simulated cells
 with the constants that :func:`battery_env.fit_cell` finds of B0005 (seed 0) and of B0006 (seed 1), four of them off by another
 20 %, which the model does not know: it has those of a new 18650. Eight discharges at 2 A are their life; the ninth has a load
-that changes. Voltages have 5 mV of noise, and the current sensor a gain of 0.5 %. The load to come is known, but for one row.
+that changes. Voltages have 5 mV of noise, and the current sensor a gain of 0.5 %. The load to come is known, but for two rows;
+of these the one without a life is what the command says of a file alone.
 *Life*: what was expected of each discharge, and of the life that remains. Constants of the method were chosen with B0005 and
 seed 0; B0006 and seed 1 were not looked at for it.
 """
@@ -25,8 +26,8 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from battery_env.electrochemistry import UNCERTAIN_CONSTANTS, simulate
+from battery_env.electrochemistry.ends import BAND
 from battery_env.estimators.cell_fit import CellFit, fit_cell
-from battery_env.lab.forecast import BAND
 from battery_env.lab.life import Life, track_life
 from battery_env.lab.running import forecast_end
 from battery_env.lab.settings import Settings
@@ -51,7 +52,8 @@ SEEDS = {0: "B0005", 1: "B0006"}
 #: Discharges of it that are fitted.
 FITTED = (0, 83, 167)
 
-FORECAST, UNKNOWN_LOAD, NO_LIFE = "forecast, life known", "the same, load unknown", "forecast, nothing known"
+FORECAST, UNKNOWN_LOAD = "forecast, life known", "the same, load unknown"
+NO_LIFE, NOTHING = "forecast, nothing but the load known", "forecast, nothing known"
 _LONGEST_S = 20_000.0
 
 
@@ -131,7 +133,8 @@ def ends(
         for name, baseline in BASELINES.items():
             yield {"method": name, "share": share, "error_percent": percent * (baseline(last, record, load) - end_s)}
         carried = Settings(cut_off_V=CUT_OFF_V, prior_q_mobile_C=prior_C)
-        cases = {FORECAST: (carried, load), UNKNOWN_LOAD: (carried, None), NO_LIFE: (Settings(cut_off_V=CUT_OFF_V), load)}
+        new = Settings(cut_off_V=CUT_OFF_V)
+        cases = {FORECAST: (carried, load), UNKNOWN_LOAD: (carried, None), NO_LIFE: (new, load), NOTHING: (new, None)}
         for name, (settings, known) in cases.items():
             low_s, median_s, high_s = forecast_end(seen, settings, known, SAMPLES).eod_quantile_s(BAND)
             yield {

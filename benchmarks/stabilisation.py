@@ -327,7 +327,8 @@ def _add_legend(figure: Figure, panels: Sequence[Axes], names: Iterable[str]) ->
     """One entry for each name that any panel has, whichever that is."""
     handles = {label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     shown = [name for name in names if name in handles]
-    figure.legend([handles[name] for name in shown], shown, loc="outside lower center", ncols=min(len(shown), 5), fontsize="small")
+    labels, columns = [handles[name] for name in shown], min(len(shown), 5)
+    figure.legend(labels, shown, loc="outside lower center", ncols=columns, fontsize="small")
 
 
 def plot_learning(learning: pd.DataFrame) -> Figure:

@@ -32,7 +32,7 @@ import battery_env
 import sb3_lac
 from battery_env.evaluation import over_seeds
 from battery_env.files import check_folder, replacing
-from battery_env.lab.workers import workers
+from battery_env.lab.workers import interruptible, workers
 from battery_env.plotting import new_figure, save_figure
 
 Result = TypeVar("Result")
@@ -273,7 +273,7 @@ class Study:
         results: dict[int, Result] = {}
         errors = []
         try:
-            with closing(self._calls(function, runs)) as calls:
+            with interruptible(), closing(self._calls(function, runs)) as calls:
                 for number, result in tqdm(calls, desc="parts", total=len(runs), disable=None):
                     try:
                         results[number] = result()

@@ -42,6 +42,7 @@ GUIDE = {
     "batteries": [
         "docs/first_discharge",
         "docs/cell_life",
+        "docs/bench_page",
         "docs/which_estimator",
         "docs/parameters",
         "docs/real_cells",
@@ -57,7 +58,7 @@ GUIDE = {
         "docs/battery_env",
     ],
     "results": ["docs/results_at_a_glance", "docs/paper_claims"],
-    "about": ["docs/glossary", "docs/faq", "docs/citing"],
+    "about": ["docs/files_and_faults", "docs/glossary", "docs/faq", "docs/citing"],
 }
 STYLED = [name for names in GUIDE.values() for name in names]
 REPORTS = sorted((DOCS / "reports").glob("*.md"))

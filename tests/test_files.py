@@ -1,10 +1,6 @@
 """A file is there as a whole, the old one or the new one, whichever write, sync or renaming fails. Also of two writers."""
 
-import os
-import resource
-import signal
 import threading
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -21,6 +17,7 @@ from benchmarks.study import write_text
 from sb3_lac import LAC
 from sb3_lac.envs import reference_controller
 from sb3_lac.stability.fitting import FittedLyapunov, fit_lyapunov
+from tests.faults import Disk, a_full_disk
 
 OLD, NEW = "old", "new"
 
@@ -72,37 +69,6 @@ WRITERS = {
     "buffer.pkl": ("save_replay_buffer", lambda path: LAC("MlpPolicy", "LinearCost-v0").load_replay_buffer(path), True),
     "lyapunov.pt": (None, FittedLyapunov.load, True),
 }
-
-
-@contextmanager
-def a_full_disk(after_bytes):
-    """No file grows beyond so many bytes, for whoever writes it, compiled code too."""
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (after_bytes, limits[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-        signal.signal(signal.SIGXFSZ, before)
-
-
-class Disk:
-    """Counts syncs, renamings and links, and lets one of them fail."""
-
-    def __init__(self, patch, fails_at=None):
-        self.calls, self.fails_at = [], fails_at
-        for name in ("fsync", "replace", "link"):
-            patch.setattr(os, name, self.counting(name, getattr(os, name)))
-
-    def counting(self, name, function):
-        def counted(*arguments, **named):
-            self.calls.append(name)
-            if len(self.calls) - 1 == self.fails_at:
-                raise OSError(5, "Input/output error")
-            return function(*arguments, **named)
-
-        return counted
 
 
 @pytest.mark.parametrize("name", WRITERS)

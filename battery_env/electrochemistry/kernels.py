@@ -15,9 +15,9 @@ from __future__ import annotations
 from math import sqrt
 
 import numpy as np
-from numba import njit
 
 from battery_env.arrays import FloatArray, IntArray
+from battery_env.compiled import compiled, inlined
 from battery_env.electrochemistry.cell import (
     BULK_RATE,
     CONSTANTS_SIZE,
@@ -63,16 +63,13 @@ _L5, _L6, _L7 = 1.818357216161805012e-01, 1.531383769920937332e-01, 1.4798198605
 #: A block of cells is one array: rows of this many values, of states, of what else a step needs, and of constants. Rows start
 #: at multiples that the compiler knows, so that it sees that they do not overlap.
 BLOCK = 64
-_LOAD, _Q, _R_O, _XN, _XP, _VOLTAGE, _CONSTANTS = range(STATE_SIZE, STATE_SIZE + 7)
-#: Where the voltages of a block start, and how long a block is.
+LOAD, _Q, _R_O, _XN, _XP, _VOLTAGE, _CONSTANTS = range(STATE_SIZE, STATE_SIZE + 7)
+#: Where the voltages of a block start, and how long a block is; ``LOAD`` is the row of the loads, and of the currents after a
+#: step.
 VOLTAGE, BLOCK_SIZE = _VOLTAGE * BLOCK, (_CONSTANTS + CONSTANTS_SIZE) * BLOCK
 
-_compiled = njit(cache=True, error_model="numpy")
-# the compiler makes vector loops only of what is inlined
-_inlined = njit(cache=True, error_model="numpy", forceinline=True)
 
-
-@_inlined
+@inlined
 def logarithm(x: float) -> float:
     # ln(x) within 1 ulp for x >= 2.3e-308, in operations that exist as vector instructions; the C library's has branches, and
     # differs from machine to machine. With that one a step of BatteryQmax takes 1.05 times as long in 16 cells, 1.09 times in
@@ -90,7 +87,7 @@ def logarithm(x: float) -> float:
     return value if x < np.inf else x  # infinity and NaN stay what they are
 
 
-@_inlined
+@inlined
 def polynomial(a: FloatArray, y: float) -> float:
     # degree 13, Estrin's scheme: half the latency of Horner's
     y2 = y * y
@@ -100,7 +97,7 @@ def polynomial(a: FloatArray, y: float) -> float:
     return low + high * (y4 * y4)
 
 
-@_inlined
+@inlined
 def asinh_ratio(a: float, w: float) -> float:
     # asinh(a / sqrt(w)) with one root and one logarithm; absolute error below 1e-15
     root = abs(a) + sqrt(a * a + w)
@@ -108,7 +105,7 @@ def asinh_ratio(a: float, w: float) -> float:
     return magnitude if a >= 0.0 else -magnitude
 
 
-@_inlined
+@inlined
 def _fraction(share: float, charge: float, extended: bool) -> float:
     # comparisons in place of min and max: NaN stays NaN
     fraction = share * charge
@@ -118,31 +115,31 @@ def _fraction(share: float, charge: float, extended: bool) -> float:
     return fraction
 
 
-@_inlined
+@inlined
 def _has_voltage(xn: float, xp: float) -> bool:
     # an empty or overfull electrode has none
     return (xn > 0.0) & (xn < 1.0) & (xp > 0.0) & (xp < 1.0)
 
 
-@_inlined
+@inlined
 def nernst_logarithm(xn: float, xp: float) -> float:
     # of both Nernst terms at once, which R * Tb / F makes a voltage
     return logarithm((1.0 - xp) * xn / (xp * (1.0 - xn)))
 
 
-@_inlined
+@inlined
 def diffusion(bulk: float, surface: float, bulk_rate: float, surface_rate: float) -> float:
     # from the bulk to the surface of an electrode
     return bulk * bulk_rate - surface * surface_rate
 
 
-@_inlined
+@inlined
 def _equilibrium(xn: float, xp: float, tb: float, gas: float, u0: float, poly_n: FloatArray, poly_p: FloatArray) -> float:
     # Vep(xp) - Ven(xn)
     return u0 + gas * tb * nernst_logarithm(xn, xp) + (polynomial(poly_p, 2.0 * xp - 1.0) - polynomial(poly_n, 2.0 * xn - 1.0))
 
 
-@_inlined
+@inlined
 def _current(load: float, voltage: float, extended: bool) -> float:
     # of a load that is power
     if extended:
@@ -150,13 +147,13 @@ def _current(load: float, voltage: float, extended: bool) -> float:
     return load / voltage if voltage > 0.0 else np.nan
 
 
-@_inlined
+@inlined
 def _overpotential(i: float, x: float, scale: float, per_current: float) -> float:
     # what Vsn or Vsp relaxes to: Butler-Volmer with alpha = 1/2, J0 = k * sqrt(x * (1 - x)); scale: 2 * R * Tb / F
     return scale * asinh_ratio(i * per_current, (1.0 - x) * x)
 
 
-@_inlined
+@inlined
 def _euler(
     x: tuple[float, float, float, float, float, float, float, float],
     i: float,
@@ -189,12 +186,12 @@ def _euler(
     )
 
 
-@_inlined
+@inlined
 def mole_fraction(surface_charge: float, q: float, extended: bool, constants: FloatArray) -> float:
     return _fraction(constants[0, FRACTION_PER_SHARE] / q, surface_charge, extended)
 
 
-@_inlined
+@inlined
 def equilibrium_voltage(
     xn: float, xp: float, tb: float, constants: FloatArray, poly_n: FloatArray, poly_p: FloatArray
 ) -> float:
@@ -202,14 +199,14 @@ def equilibrium_voltage(
     return _equilibrium(xn, xp, tb, constants[0, R_OVER_F], constants[0, U0], poly_n, poly_p)
 
 
-@_inlined
+@inlined
 def nominal_overpotentials(i: float, xn: float, xp: float, tb: float, constants: FloatArray) -> tuple[float, float]:
     # for mole fractions inside 0 .. 1
     scale = 2.0 * constants[0, R_OVER_F] * tb
     return _overpotential(i, xn, scale, constants[0, PER_CURRENT_N]), _overpotential(i, xp, scale, constants[0, PER_CURRENT_P])
 
 
-@_inlined
+@inlined
 def cell_voltage(x: FloatArray, n: int, q: float, extended: bool, packed: PackedConstants) -> float:
     # V = Vep(xp) - Ven(xn) - Vo - Vsn - Vsp
     constants, poly_n, poly_p = packed
@@ -221,7 +218,7 @@ def cell_voltage(x: FloatArray, n: int, q: float, extended: bool, packed: Packed
     return equilibrium - x[n, VO] - x[n, VSN] - x[n, VSP]
 
 
-@_inlined
+@inlined
 def cell_step(
     x: FloatArray,
     n: int,
@@ -256,12 +253,12 @@ def cell_step(
     x[m, QNB], x[m, QNS], x[m, QPB], x[m, QPS] = y[4], y[5], y[6], y[7]
 
 
-@_inlined
+@inlined
 def cell_current(load: float, power: bool, voltage: float, extended: bool) -> float:
     return _current(load, voltage, extended) if power else load
 
 
-@_compiled
+@compiled
 def fill_block(
     block: FloatArray,
     first: int,
@@ -277,7 +274,7 @@ def fill_block(
         n = first + j
         for k in range(STATE_SIZE):
             block[k * BLOCK + j] = state[n, k]
-        block[_LOAD * BLOCK + j] = load[n]
+        block[LOAD * BLOCK + j] = load[n]
         block[_Q * BLOCK + j] = q[n]
         block[_R_O * BLOCK + j] = r_o[n]
     if constants.shape[0] > 1:
@@ -290,7 +287,7 @@ def fill_block(
                 block[(_CONSTANTS + k) * BLOCK + j] = constants[0, k]
 
 
-@_compiled
+@compiled
 def voltage_of_block(block: FloatArray, cells: int, extended: bool, poly_n: FloatArray, poly_p: FloatArray) -> None:
     # the voltages are in block[VOLTAGE : VOLTAGE + cells] then
     _fractions_of_block(block, cells, extended)
@@ -302,7 +299,7 @@ def voltage_of_block(block: FloatArray, cells: int, extended: bool, poly_n: Floa
         block[VOLTAGE + j] = volts if _has_voltage(xn, xp) else np.nan
 
 
-@_compiled
+@compiled
 def _fractions_of_block(block: FloatArray, cells: int, extended: bool) -> None:
     for j in range(cells):
         share = block[(_CONSTANTS + FRACTION_PER_SHARE) * BLOCK + j] / block[_Q * BLOCK + j]
@@ -310,7 +307,7 @@ def _fractions_of_block(block: FloatArray, cells: int, extended: bool) -> None:
         block[_XP * BLOCK + j] = _fraction(share, block[QPS * BLOCK + j], extended)
 
 
-@_compiled
+@compiled
 def step_of_block(
     block: FloatArray,
     cells: int,
@@ -329,7 +326,7 @@ def step_of_block(
         _fractions_of_block(block, cells, extended)
     if power:
         for j in range(cells):
-            block[_LOAD * BLOCK + j] = _current(block[_LOAD * BLOCK + j], block[VOLTAGE + j], extended)
+            block[LOAD * BLOCK + j] = _current(block[LOAD * BLOCK + j], block[VOLTAGE + j], extended)
     for j in range(cells):
         x = (
             block[TB * BLOCK + j],
@@ -354,7 +351,7 @@ def step_of_block(
             block[(_CONSTANTS + COOLING) * BLOCK + j],
             block[(_CONSTANTS + SURROUNDINGS) * BLOCK + j],
         )
-        i, r_o = block[_LOAD * BLOCK + j], block[_R_O * BLOCK + j]
+        i, r_o = block[LOAD * BLOCK + j], block[_R_O * BLOCK + j]
         y = _euler(x, i, block[_XN * BLOCK + j], block[_XP * BLOCK + j], r_o, dt, thermal, k)
         block[TB * BLOCK + j] = y[0]
         block[VO * BLOCK + j] = y[1]
@@ -366,14 +363,14 @@ def step_of_block(
         block[QPS * BLOCK + j] = y[7]
 
 
-@_compiled
+@compiled
 def states_of_block(block: FloatArray, first: int, cells: int, out: FloatArray) -> None:
     for j in range(cells):
         for k in range(STATE_SIZE):
             out[first + j, k] = block[k * BLOCK + j]
 
 
-@_compiled
+@compiled
 def voltage_batch(state: FloatArray, q: FloatArray, extended: bool, packed: PackedConstants, out: FloatArray) -> None:
     block = np.empty(BLOCK_SIZE)
     for first in range(0, out.shape[0], BLOCK):
@@ -384,7 +381,7 @@ def voltage_batch(state: FloatArray, q: FloatArray, extended: bool, packed: Pack
             out[first + j] = block[VOLTAGE + j]
 
 
-@_compiled
+@compiled
 def step_batch(
     state: FloatArray,
     load: FloatArray,
@@ -405,7 +402,7 @@ def step_batch(
         states_of_block(block, first, cells, out)
 
 
-@_compiled
+@compiled
 def advance_batch(
     state: FloatArray,
     load: FloatArray,
@@ -427,12 +424,12 @@ def advance_batch(
             while steps[start + running - 1] <= k:
                 running -= 1
             for j in range(running):
-                block[_LOAD * BLOCK + j] = load[first[start + j] + k]
+                block[LOAD * BLOCK + j] = load[first[start + j] + k]
             step_of_block(block, running, dt, power, power, thermal, False, packed.polynomial_n, packed.polynomial_p)
         states_of_block(block, start, cells, state)
 
 
-@_compiled
+@compiled
 def run_on_batch(
     load: FloatArray,
     q: FloatArray,
@@ -454,18 +451,18 @@ def run_on_batch(
         fill_block(block, first, cells, state, q, q, r_o, packed.constants)  # the load comes below
         for k in range(load.shape[1]):
             for j in range(cells):
-                block[_LOAD * BLOCK + j] = load[0 if shared else first + j, k]
+                block[LOAD * BLOCK + j] = load[0 if shared else first + j, k]
             step_of_block(block, cells, dt, power, True, thermal, False, packed.polynomial_n, packed.polynomial_p)
             for j in range(cells):
                 voltage[k, first + j] = block[VOLTAGE + j]
-                current[k, first + j] = block[_LOAD * BLOCK + j]
+                current[k, first + j] = block[LOAD * BLOCK + j]
         voltage_of_block(block, cells, False, packed.polynomial_n, packed.polynomial_p)
         for j in range(cells):
             voltage[-1, first + j] = block[VOLTAGE + j]
         states_of_block(block, first, cells, state)
 
 
-@_compiled
+@compiled
 def roll_out(
     load: FloatArray,
     q: float,

@@ -11,23 +11,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import ndtri
 
-from battery_env.arrays import BoolArray, FloatArray
-from battery_env.checks import check_whole_number
-from battery_env.electrochemistry import STATE_SIZE, CellParameters, LoadUnit, Trajectory, simulate, state_of_charge, voltage
+from battery_env.arrays import FloatArray
+from battery_env.checks import check_numbers, check_whole_number
+from battery_env.electrochemistry import STATE_SIZE, CellParameters, LoadUnit, state_of_charge, voltage
+from battery_env.electrochemistry.ends import BAND, LONGEST_S, Cells, run_down
 from battery_env.estimates import Estimate, EstimateTrace, last_estimate
 from battery_env.estimators.state_files import load_state, save_state
-from battery_env.loads import in_steps
+from battery_env.loads import KnownLoad, Load, in_steps, known_load
 from battery_env.parameters import PARAMETERS
 from battery_env.records import Record, Stream
 
-#: A load to come: a number, one value a step, or a function of time in s.
-LoadToCome = float | ArrayLike | Callable[[FloatArray], ArrayLike]
-
-#: A full cell takes no more charge than this share of its own.
-SURPLUS_SHARE = 0.01
-# A discharge is followed for no longer than a day, s.
-_LONGEST_S = 86_400.0
 # Points between limits keep this far from them, as a share of their distance, so that rounding leaves them within.
 _ROUNDING = 1e-9
 
@@ -54,29 +49,25 @@ class Estimator(ABC):
         return [EstimateTrace.of([record.time_s[-1]], [self.estimate(record)]) for record in records]
 
 
-def is_overfull(soc: FloatArray, first_soc: FloatArray) -> BoolArray:
-    """Whether a load has charged a cell by more than it takes."""
-    return np.asarray(soc > np.maximum(first_soc, 1.0) + SURPLUS_SHARE)
-
-
-def overfull_error(after_s: float) -> ValueError:
-    """What to say of such a load."""
-    return ValueError(
-        f"load charges the cell beyond full, by more than {SURPLUS_SHARE:.0%} of its charge, after {after_s:g} s. Positive "
-        "loads discharge: check its sign, or begin with the discharge."
-    )
-
-
 class Remaining(NamedTuple):
     """
     How long a discharge will go on.
 
-    :param time_s: until the cut-off, s; infinite if it is not reached within a day
+    :param time_s: until the cut-off, s; infinite if it is not reached within a week
     :param sd_s: its standard deviation, from what is not known of the model at hand, s; NaN if the estimator states none
     """
 
     time_s: float
     sd_s: float
+
+    def quantile_s(self, probability: ArrayLike = BAND) -> FloatArray:
+        """
+        Quantiles of that time, which is taken to be normal.
+
+        :param probability: within 0 .. 1, any shape
+        :return: s, same shape; NaN if no standard deviation is stated
+        """
+        return np.maximum(self.time_s + self.sd_s * ndtri(np.asarray(probability, dtype=np.float64)), 0.0)
 
 
 class ModelNow(NamedTuple):
@@ -99,22 +90,19 @@ class ModelNow(NamedTuple):
     parameters: FloatArray
     deviations: FloatArray
 
-    def discharge(self, point: FloatArray, load: LoadToCome, load_unit: LoadUnit, cut_off_V: float) -> Trajectory:
+    def draws(self, samples: int, rng: np.random.Generator) -> Cells:
         """
-        The discharge from a state with some parameters on, a point of shape (11,), down to the cut-off.
+        Cells that may be the one that was followed, all equally likely: state, parameters and offset belong together.
+
+        :param samples: how many
+        :param rng: what draws them
+        :return: these
         """
-        return simulate(
-            load,
-            float(point[STATE_SIZE]),
-            float(point[STATE_SIZE + 1]),
-            dt=self.dt_s,
-            load_unit=load_unit,
-            thermal=self.thermal,
-            cell=self.cell,
-            initial=point[:STATE_SIZE],
-            cut_off_V=cut_off_V - float(point[-1]),
-            max_duration_s=_LONGEST_S,
-        )
+        middle = np.concatenate([self.state, self.parameters])
+        points = middle + rng.standard_normal((samples, len(self.deviations))) @ self.deviations
+        for n, parameter in enumerate(PARAMETERS.values(), start=STATE_SIZE):
+            points[:, n] = np.clip(points[:, n], *parameter.limits)
+        return _cells_at(points)
 
 
 class OnlineEstimator(Estimator):
@@ -201,7 +189,7 @@ class OnlineEstimator(Estimator):
 
     def remaining(
         self,
-        load: LoadToCome,
+        load: float | ArrayLike | KnownLoad | Callable[[FloatArray], ArrayLike],
         cut_off_V: float | None = None,
         load_unit: LoadUnit = "current",
     ) -> Remaining:
@@ -211,42 +199,36 @@ class OnlineEstimator(Estimator):
         what a cell can be. :func:`battery_env.forecast` counts more, and takes random loads; it needs the record.
 
         :param load: a number; an array of one value a step of ``dt_s``; a :class:`battery_env.loads.Load` or a ``Cycle``, of
-            which the mean over each step counts; or any function of time in s, of which its value at the start of each step
-            does. Under a negative number, a charge, the cut-off is never reached
+            which the mean over each step counts, in its own unit; or any function of time in s, of which its value at the
+            start of each step does. Under a negative number, a charge, the cut-off is never reached
         :param cut_off_V: V; ``None``: the ``VEOD`` of the cell
-        :param load_unit: ``"current"`` in A or ``"power"`` in W
+        :param load_unit: of a number, an array or a function: ``"current"`` in A or ``"power"`` in W
         :return: time and standard deviation
         :raises ValueError: for an invalid load, also for one that varies and charges the cell beyond full, and for
             an array that ends before the discharge does
         """
         now = self.now()
-        middle = np.concatenate([now.state, now.parameters])
-        end_V, load = now.cell.VEOD if cut_off_V is None else cut_off_V, in_steps(load, now.dt_s)
-        expected = now.discharge(middle, load, load_unit, end_V)
-        soc = state_of_charge(expected.state, middle[STATE_SIZE])
-        full = np.flatnonzero(is_overfull(soc, soc[:1]))
-        if len(full) and (callable(load) or np.ndim(load)):
-            raise overfull_error(expected.time_s[full[0]])
-        followed_s = len(expected.time_s) * now.dt_s
-        if np.isnan(expected.eod_time_s) and followed_s <= _LONGEST_S:  # of an array alone
+        middle, dt_s = np.concatenate([now.state, now.parameters]), now.dt_s
+        values = np.empty(0) if callable(load) or np.ndim(load) == 0 else check_numbers("load", load)
+        starts_s = dt_s * np.arange(len(values), dtype=np.float64)
+        given_s = len(values) * dt_s if len(values) else np.inf
+        given = Load(starts_s, values, load_unit) if len(values) else known_load(load, load_unit)
+        # to both sides, or as far as parameters go, and the middle
+        shares = np.array([[-_room(middle, -each), 0.0, _room(middle, each)] for each in now.deviations]).reshape(-1, 3)
+        points = np.vstack(
+            [middle, *(middle + share[:, None] * each for share, each in zip(shares, now.deviations, strict=True))]
+        )
+        end_V = now.cell.VEOD if cut_off_V is None else cut_off_V
+        ends_s = run_down(_cells_at(points), now, in_steps([given], dt_s), end_V).time_s
+        if given_s < min(ends_s[0], LONGEST_S):
             raise ValueError(
-                f"load ends after {followed_s:g} s, before the discharge does. Append what is to come, or "
+                f"load ends after {given_s:g} s, before the discharge does. Append what is to come, or "
                 "give a Load of battery_env.loads, whose last value goes on."
             )
-        if len(full) or np.isnan(expected.eod_time_s):
-            return Remaining(float("inf"), float("nan"))
-        if not len(now.deviations):
-            return Remaining(expected.eod_time_s, float("nan"))
-
-        def change_s(deviation: FloatArray) -> float:
-            shares = np.array([-_room(middle, -deviation), 0.0, _room(middle, deviation)])
-            below, above = (now.discharge(middle + share * deviation, load, load_unit, end_V) for share in shares[::2])
-            ends_s = np.array([below.eod_time_s, expected.eod_time_s, above.eod_time_s])
-            reached = np.isfinite(ends_s)
-            (first, last), (first_s, last_s) = shares[reached][[0, -1]], ends_s[reached][[0, -1]]
-            return float((last_s - first_s) / (last - first)) if last > first else float("nan")
-
-        return Remaining(expected.eod_time_s, float(np.linalg.norm([change_s(each) for each in now.deviations])))
+        if np.isinf(ends_s[0]) or not len(shares):
+            return Remaining(float(ends_s[0]), float("nan"))
+        changes_s = [_slope(*each) for each in zip(shares, ends_s[1:].reshape(-1, 3), strict=True)]
+        return Remaining(float(ends_s[0]), float(np.linalg.norm(changes_s)))
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """
@@ -286,16 +268,24 @@ class OnlineEstimator(Estimator):
         :return: one trace per discharge, in the same order
         :raises ValueError: if a record cannot be used
         """
-        traces = []
-        for record in records:
-            stream = Stream.of(record, self.dt_s)
-            measured: Iterable[tuple[float, ...]] = stream.samples()
-            if stream.temperature_C is not None:
-                measured = ((*sample, t_C) for sample, t_C in zip(measured, stream.temperature_C.tolist(), strict=True))
-            self.reset()
-            traces.append(EstimateTrace.of(stream.time_s, [self.update(*sample) for sample in measured]))
+        traces = [self.follow(record) for record in records]
         self.reset()
         return traces
+
+    def follow(self, record: Record) -> EstimateTrace:
+        """
+        One estimate for every sample of a discharge, after which the estimator stands at the last one.
+
+        :param record: one discharge
+        :return: the estimates
+        :raises ValueError: if the record cannot be used
+        """
+        stream = Stream.of(record, self.dt_s)
+        measured: Iterable[tuple[float, ...]] = stream.samples()
+        if stream.temperature_C is not None:
+            measured = ((*sample, t_C) for sample, t_C in zip(measured, stream.temperature_C.tolist(), strict=True))
+        self.reset()
+        return EstimateTrace.of(stream.time_s, [self.update(*sample) for sample in measured])
 
 
 class OnlineBatch:
@@ -371,6 +361,19 @@ def check_bounds(
     """Refuse invalid bounds."""
     given = zip(PARAMETERS.values(), (q_mobile_bounds_C, r_o_bounds_ohm), strict=True)
     return {parameter.name: parameter.check_bounds(f"the bounds of {parameter.name}", bounds) for parameter, bounds in given}
+
+
+def _cells_at(points: FloatArray) -> Cells:
+    """Cells at points of shape (n, 11): the state, ``q_mobile``, ``r_o``, and the offset of the voltage."""
+    state, (q_mobile, r_o, offset_V) = np.ascontiguousarray(points[:, :STATE_SIZE]), points[:, STATE_SIZE:].T.copy()
+    return Cells(q_mobile, r_o, state, offset_V, np.zeros(len(points)))
+
+
+def _slope(shares: FloatArray, ends_s: FloatArray) -> float:
+    """The change of an end over one deviation, from the outermost points that have one."""
+    reached = np.flatnonzero(np.isfinite(ends_s))
+    first, last = reached[0], reached[-1]
+    return float((ends_s[last] - ends_s[first]) / (shares[last] - shares[first])) if last > first else float("nan")
 
 
 def _room(point: FloatArray, deviation: FloatArray) -> float:

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from battery_env.arrays import FloatArray
 from battery_env.checks import check_gain_sd, check_not_negative, check_positive
 from battery_env.electrochemistry import CellParameters
+from battery_env.electrochemistry.ends import LONGEST_S
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimates import Estimate, EstimateTrace
 from battery_env.estimators.diagnosis.conditions import (
@@ -35,7 +36,7 @@ from battery_env.estimators.estimator import Estimator, check_bounds
 from battery_env.estimators.search import Fit, Prior, Search, square
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, check_parameters
 from battery_env.records import Record, Samples, Shown, check_record, shown_beside
-from battery_env.records.model import LONGEST_FORECAST_S, RecordModel
+from battery_env.records.model import RecordModel
 
 # Residuals whose variance is this many of its standard deviations above the one expected are not noise.
 _EXCESS_LIMIT = 5.0
@@ -324,7 +325,7 @@ def _note_end(diagnosis: Diagnosis, record: Samples, found: _Fitted, deviation_V
     n = int(voltage_V.argmin())
     load_A = float(current_A[max(n - 1, 0) : n + 1].max())
     # at rest, with whatever current a sensor shows then, no voltage is reached
-    if n == 0 or load_A * LONGEST_FORECAST_S <= values["q_mobile"]:
+    if n == 0 or load_A * LONGEST_S <= values["q_mobile"]:
         return
     estimate, model = Estimate(values["q_mobile"], values["r_o"]), found.search.model_at(values)
     until, lowest_V = record.first(n + 1), float(voltage_V[n]) - values.get("offset_V", 0.0)

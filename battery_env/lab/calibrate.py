@@ -3,26 +3,33 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from math import hypot
+from numbers import Real
 from pathlib import Path
 from typing import Any, NamedTuple, overload
 
 import numpy as np
 import pandas as pd
 
+from battery_env.arrays import FloatArray
 from battery_env.checks import ZERO_CELSIUS_K
 from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.electrochemistry.cell import TB
-from battery_env.estimates import Estimate
+from battery_env.electrochemistry.ends import quantile
+from battery_env.estimates import Estimate, last_estimate
 from battery_env.estimators.diagnosis.gaps import DRAWN, find_gaps
 from battery_env.estimators.diagnosis.rest import Start, check_initial_soc, soc_from_rest
 from battery_env.estimators.diagnosis.samples import fault_condition, start_condition, watched
+from battery_env.estimators.estimator import ModelNow
+from battery_env.estimators.kalman import ExtendedKalmanFilter
+from battery_env.lab.forecast import Forecast, forecast
 from battery_env.lab.readers.columns import FileFormat
 from battery_env.lab.readers.discharges import each_usable
 from battery_env.lab.report import Calibration
 from battery_env.lab.settings import Method, Settings
+from battery_env.loads import Load, LoadToCome, constant, in_steps
 from battery_env.records import ExpectedCurrent, Samples, drawn, expected_current, mean_current_A, shown_beside
 from battery_env.records.discharge import Discharge
 from battery_env.records.model import RecordModel, VoltageForecast
@@ -38,6 +45,8 @@ _REST_S = 60.0
 # The model of a cell in air warms by 2 K at 2 A, where the bundled cells warm by 16 K: that alone moves q_mobile by less than
 # 0.1 %. What is farther off than this is another cell, load or chamber than these.
 _WARMTH_LIMIT_K = 20.0
+# Nine of ten values of a normal distribution lie within so many standard deviations.
+_BAND_SD = 1.645
 
 
 @overload
@@ -92,9 +101,9 @@ def calibrate(
     """
     settings = Settings.for_cell(**options) if settings is None else replace(settings, **options)
     if isinstance(source, Discharge):
-        return _calibrated(source, settings)
+        return calibrated(source, settings)
     file_format = FileFormat(columns, units, discharge_is_negative, ignore)
-    return each_usable(lambda each: _calibrated(each, settings), source, file_format)
+    return each_usable(lambda each: calibrated(each, settings), source, file_format)
 
 
 class _Seen(NamedTuple):
@@ -114,19 +123,38 @@ class _Seen(NamedTuple):
     future: ExpectedCurrent
 
 
-def _calibrated(discharge: Discharge, settings: Settings) -> Calibration:
-    """What one discharge says."""
+class Ahead(NamedTuple):
+    """
+    What is asked of the time after a record.
+
+    :param load: the load to come; ``None``: as the settings say
+    :param samples: of what may come
+    :param is_asked: whether an end that cannot be told is an error, and not only unknown
+    """
+
+    load: LoadToCome | None = None
+    samples: int = 1000
+    is_asked: bool = False
+
+
+_GOES_ON = Ahead()
+
+
+def calibrated(discharge: Discharge, settings: Settings, ahead: Ahead = _GOES_ON) -> Calibration:
+    """What one discharge says, and of one in progress what comes after it."""
     seen = _look_at(discharge, settings)
-    estimate, method = _estimate(seen, settings)
-    model = RecordModel(seen.cell, settings.thermal and settings.method != "policy", initial_soc=seen.start.soc)
-    forecast = model.forecast(seen.record, estimate, settings.cut_off_V, seen.future.mean_A, seen.in_progress)
-    remaining_s = forecast.eod_time_s - float(seen.record.time_s[-1]) if seen.in_progress else 0.0
-    sd_eod_s = _sd_eod_s(forecast, estimate, remaining_s, seen.future, settings.mismatch_V)
-    end_C, model_end_C = _end_temperatures(seen.record, forecast)
-    charge = _charge(seen, settings, estimate.q_mobile, remaining_s, sd_eod_s)
-    if seen.start.reason or seen.more_C or not _is_all_logged(seen, forecast, estimate):
+    estimate, method, now = _estimate(seen, settings, ahead.load)
+    model = RecordModel(seen.cell, settings.thermal and method != "policy", initial_soc=seen.start.soc)
+    # a cell in progress has not ended, however low its model comes in the pulses before
+    limits = (-np.inf, 0.0) if seen.in_progress else (settings.cut_off_V, seen.future.mean_A)
+    shown = model.forecast(seen.record, estimate, *limits)
+    end = _end(seen, estimate, replace(settings, method=method), now or model, shown, ahead)
+    end_C, model_end_C = _end_temperatures(seen.record, shown)
+    charge = _charge(seen, settings, estimate, end)
+    if seen.start.reason or seen.more_C or not _is_all_logged(seen, shown, estimate):
         charge = dict.fromkeys(charge, float("nan"))
     nominal_Ah = _nominal_Ah(model, settings, seen.future.mean_A if seen.in_progress else seen.load.mean_A)
+    eod_s, sd_eod_s = (shown.eod_time_s, float("nan")) if end is None else _middle(end.eod_time_s, estimate)
     return Calibration(
         cycle=discharge.meta.get("cycle"),
         method=method,
@@ -148,11 +176,11 @@ def _calibrated(discharge: Discharge, settings: Settings) -> Calibration:
         nominal_Ah=nominal_Ah,
         state_of_health=charge["predicted_capacity_Ah"] / nominal_Ah,
         sd_state_of_health=charge["sd_predicted_capacity_Ah"] / nominal_Ah,
-        voltage_rmse_V=float(np.sqrt(np.nanmean((forecast.at_samples_V - seen.record.voltage_V) ** 2))),
-        predicted_eod_time_s=forecast.eod_time_s,
+        voltage_rmse_V=_rmse_V(shown, seen.record),
+        predicted_eod_time_s=eod_s,
         sd_predicted_eod_time_s=sd_eod_s,
         measured_eod_time_s=seen.eod_time_s,
-        remaining_s=remaining_s,
+        remaining_s=eod_s - float(seen.record.time_s[-1]) if seen.in_progress else 0.0,
         future_current_A=seen.future.mean_A,
         load_varied=seen.future.varied,
         ambient_C=seen.cell.Tb0 - ZERO_CELSIUS_K,
@@ -160,7 +188,8 @@ def _calibrated(discharge: Discharge, settings: Settings) -> Calibration:
         model_end_temperature_C=model_end_C,
         settings=settings,
         record=seen.record,
-        forecast=forecast,
+        forecast=shown,
+        end=end,
     )
 
 
@@ -186,33 +215,106 @@ def _look_at(discharge: Discharge, settings: Settings) -> _Seen:
     return _Seen(discharge, loaded, record, fitted, over_s, eod_time_s, in_progress, more_C, cell, start, load, future)
 
 
-def _estimate(seen: _Seen, settings: Settings) -> tuple[Estimate, Method]:
-    """The estimate of the first method that settles the discharge, or of the last one; and which it is."""
+def _estimate(seen: _Seen, settings: Settings, load: LoadToCome | None) -> tuple[Estimate, Method, ModelNow | None]:
+    """
+    The estimate of the first method that settles the discharge, or of the last one; which it is; and of the filter where its
+    model stands.
+    """
     methods: list[Method] = [settings.method or "least-squares"]
     # under other loads the filter, which takes the error of the model for noise, is surer than it may be
     is_over = float(seen.discharge.time_s[-1] - seen.loaded.time_s[-1]) > _REST_S
-    is_new = settings.prior_q_mobile_C is None and settings.cell is None and settings.future_current_A is None
-    if settings.method is None and seen.in_progress and not is_over and not seen.load.varied and is_new:
+    goes_on = settings.future_current_A is None and load is None and not seen.load.varied
+    is_new = settings.prior_q_mobile_C is None and settings.cell is None
+    if settings.method is None and seen.in_progress and not is_over and goes_on and is_new:
         methods.append("kalman")
     for method in methods:
-        estimate = replace(settings, method=method).calibrator(seen.cell, seen.start).estimate(seen.fitted)
+        calibrator = replace(settings, method=method).calibrator(seen.cell, seen.start)
+        if isinstance(calibrator, ExtendedKalmanFilter):
+            estimate, now = last_estimate(calibrator.follow(seen.fitted)), calibrator.now() if goes_on else None
+        else:
+            estimate, now = calibrator.estimate(seen.fitted), None
         if estimate.settled:
             break
     if reason := seen.start.reason or settings.other_load(mean_current_A(seen.record)):
         estimate = replace(estimate, settled_q_mobile=False, settled_r_o=False, reason=reason)
-    return estimate, method
+    return estimate, method, now
 
 
-def _charge(seen: _Seen, settings: Settings, q_mobile: float, remaining_s: float, sd_eod_s: float) -> dict[str, float]:
+def _end(
+    seen: _Seen, estimate: Estimate, settings: Settings, model: RecordModel | ModelNow, shown: VoltageForecast, ahead: Ahead
+) -> Forecast | None:
+    """What may come after a record; ``None`` if nothing can be told, or is asked of a record that has ended."""
+    if not (seen.in_progress or ahead.is_asked):
+        return None
+    load = settings.future_current_A if ahead.load is None else ahead.load
+    try:
+        end = forecast(
+            seen.record,
+            estimate,
+            load,
+            settings.cut_off_V,
+            model=model,
+            mismatch_V=settings.mismatch_V,
+            nominal_Ah=settings.nominal_Ah,
+            samples=ahead.samples,
+        )
+    except ValueError:
+        if ahead.is_asked:
+            raise
+        return None
+    load_A = seen.future.mean_A if load is None else _largest_A(load, settings.cut_off_V)
+    # a cell of which nothing is known has no health
+    is_known = settings.nominal_Ah is not None or settings.tells_new_capacity(load_A)
+    notes = (*end.notes, *_notes(seen, estimate, settings, shown, load_A))
+    return replace(end, nominal_Ah=end.nominal_Ah if is_known else float("nan"), notes=notes)
+
+
+def _notes(seen: _Seen, estimate: Estimate, settings: Settings, shown: VoltageForecast, load_A: float) -> Iterator[str]:
+    """What a forecast rests on, beyond the last sample under load."""
+    other_load, seen_s, rmse_V = settings.other_load(load_A), float(seen.record.time_s[-1]), _rmse_V(shown, seen.record)
+    # which is said where the load so far is another one, too
+    if other_load and other_load not in estimate.reason:
+        yield other_load
+    if float(seen.discharge.time_s[-1]) > seen_s:
+        yield f"What was recorded after the last sample under load, at {seen_s:.0f} s, is left out."
+    if settings.method == "kalman" and settings.prior_q_mobile_C is None and settings.cell is None:
+        yield "The filter expects a cell of some 2 Ah: of another one give the life, a prior of q_max or the constants."
+    if rmse_V > settings.mismatch_V:
+        text = f"The model misses the voltage by {1e3 * rmse_V:.0f} mV (RMSE), more than mismatch_V."
+        yield f"{text} Other loads make the interval too narrow."
+
+
+def _rmse_V(shown: VoltageForecast, record: Discharge) -> float:
+    return float(np.sqrt(np.nanmean((shown.at_samples_V - record.voltage_V) ** 2)))
+
+
+def _largest_A(load: LoadToCome, cut_off_V: float) -> float:
+    """The largest current of a load to come, of a power that at the cut-off; 0 of one that is not known."""
+    if isinstance(load, Load):
+        return float(load.value.max()) / (1.0 if load.unit == "current" else cut_off_V)
+    return float(load) if isinstance(load, Real) else 0.0
+
+
+def _middle(values: FloatArray, estimate: Estimate) -> tuple[float, float]:
+    """
+    The median of samples, and the standard deviation that nine of ten of them show, if the estimate states one.
+    """
+    low, median, high = np.where(np.isfinite(values := quantile(values)), values, np.nan).tolist()
+    return median, (high - low) / (2.0 * _BAND_SD) if np.isfinite(estimate.sd_q_mobile) else float("nan")
+
+
+def _charge(seen: _Seen, settings: Settings, estimate: Estimate, end: Forecast | None) -> dict[str, float]:
     """The columns of what was drawn, and of what a full cell would have given: its end comes at the same charge."""
-    drawn_Ah, start, future_A = seen.loaded.charge_C / 3600.0, seen.start, seen.future.mean_A
-    sd_seen_Ah = sd_eod_s * future_A / 3600.0 if seen.in_progress else settings.current_gain_sd * drawn_Ah
+    drawn_Ah, start, q_mobile = seen.loaded.charge_C / 3600.0, seen.start, estimate.q_mobile
+    predicted_Ah, sd_Ah = (1.0 - start.soc) * q_mobile / 3600.0 + drawn_Ah, settings.current_gain_sd * drawn_Ah
+    if seen.in_progress:
+        predicted_Ah, sd_Ah = (float("nan"),) * 2 if end is None else _middle(end.capacity_Ah, estimate)
     shown, duration_s = seen.loaded.shown, float(np.ptp(seen.loaded.time_s))
-    unseen_Ah = float(np.hypot(shown.load_on_C, shown.offset_C(duration_s))) / 3600.0
+    unseen_C = hypot(shown.load_on_C, shown.offset_C(duration_s), start.sd_soc * q_mobile)
     return {
         "capacity_Ah": float("nan") if seen.in_progress or start.soc < 1.0 else drawn_Ah,
-        "predicted_capacity_Ah": (1.0 - start.soc) * q_mobile / 3600.0 + drawn_Ah + remaining_s * future_A / 3600.0,
-        "sd_predicted_capacity_Ah": hypot(sd_seen_Ah, start.sd_soc * q_mobile / 3600.0, unseen_Ah),
+        "predicted_capacity_Ah": predicted_Ah,
+        "sd_predicted_capacity_Ah": hypot(sd_Ah, unseen_C / 3600.0),
     }
 
 
@@ -272,7 +374,7 @@ def _nominal_Ah(model: RecordModel, settings: Settings, load_A: float) -> float:
     if not load_A > 0.0 or not settings.tells_new_capacity(load_A):
         return float("nan")
     # the cell is empty by then
-    return model.capacity_Ah(load_A, "current", settings.cut_off_V, model.cell.q_mobile / load_A + model.dt_s)
+    return float(model.capacity_Ah(in_steps([constant(load_A, "current")], model.dt_s), settings.cut_off_V)[0])
 
 
 def _end_temperatures(record: Discharge, forecast: VoltageForecast) -> tuple[float, float]:
@@ -291,19 +393,3 @@ def _end_temperatures(record: Discharge, forecast: VoltageForecast) -> tuple[flo
             stacklevel=4,
         )
     return float(record.temperature_C[-1]), float(model_C[-1])
-
-
-def _sd_eod_s(
-    forecast: VoltageForecast, estimate: Estimate, remaining_s: float, future: ExpectedCurrent, mismatch_V: float
-) -> float:
-    """
-    How sure the predicted end is. The charge still to come moves with q_mobile, and is drawn at a current that may not be the
-    one assumed. Where the model is at the cut-off the cell may be higher or lower, by the error of the model and of the ohmic
-    drop; a resistance that is held has no standard deviation.
-    """
-    if not future.mean_A > 0.0:
-        return float("nan")
-    charge_s = float(np.hypot(estimate.sd_q_mobile, remaining_s * future.sd_A)) / future.mean_A
-    deviation_V = float(np.hypot(mismatch_V, future.mean_A * np.nan_to_num(estimate.sd_r_o)))
-    early_s, late_s = (forecast.reached_s(forecast.cut_off_V + each_V) for each_V in (deviation_V, -deviation_V))
-    return float(np.hypot(charge_s, 0.5 * (late_s - early_s)))

@@ -9,9 +9,10 @@ import numpy as np
 from battery_env.checks import LoadUnit, check_load, check_positive
 from battery_env.electrochemistry import NEW_CELL
 from battery_env.estimates import Estimate
+from battery_env.loads import constant, in_steps
 from battery_env.parameters import Q_MOBILE, R_O
 from battery_env.records import CUT_OFF_V
-from battery_env.records.model import LONGEST_FORECAST_S, RecordModel
+from battery_env.records.model import RecordModel
 
 # For its derivatives a capacity is computed again with q_mobile moved by this share, and r_o by this many ohm.
 _STEP_SHARE, _STEP_OHM = 0.01, 0.002
@@ -65,13 +66,11 @@ def capacity_Ah(
     cut_off = check_positive("cut_off_V", model.cell.VEOD if cut_off_V is None else cut_off_V)
     q_C, r_ohm = float(Q_MOBILE.check(estimate.q_mobile)), float(R_O.check(estimate.r_o))
 
-    def of(q_mobile: float, r_o: float) -> float:
-        aged = model.of_cell(model.cell.replace(q_mobile=q_mobile, r_o=r_o))
-        return aged.capacity_Ah(load, load_unit, cut_off, LONGEST_FORECAST_S)
-
-    value, step_C = of(q_C, r_ohm), _STEP_SHARE * q_C
-    by_q = (of(q_C + step_C, r_ohm) - of(q_C - step_C, r_ohm)) / (2.0 * step_C)
-    by_r = (of(q_C, r_ohm + _STEP_OHM) - value) / _STEP_OHM
+    step_C = _STEP_SHARE * q_C
+    q_mobile, r_o = q_C + step_C * np.array([0.0, -1.0, 1.0, 0.0]), r_ohm + np.array([0.0, 0.0, 0.0, _STEP_OHM])
+    loads = in_steps([constant(float(load), load_unit)], model.dt_s)
+    value, less, more, of_r = model.capacity_Ah(loads, cut_off, q_mobile, r_o).tolist()
+    by_q, by_r = (more - less) / (2.0 * step_C), (of_r - value) / _STEP_OHM
     return Derived(value, _sd(estimate, by_q, by_r))
 
 

@@ -6,33 +6,30 @@ import csv
 import json
 import math
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from numbers import Real
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from battery_env.checks import ZERO_CELSIUS_K, LoadUnit
-from battery_env.electrochemistry import NEW_CELL
-from battery_env.estimates import Estimate
+from battery_env.checks import LoadUnit
+from battery_env.electrochemistry.ends import BAND, quantile
 from battery_env.estimators.diagnosis.conditions import is_only_imprecise
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.files import check_new, finite_or_none, replacing
-from battery_env.lab.calibrate import calibrate
-from battery_env.lab.forecast import BAND, Forecast, FutureLoad, forecast, quantile
+from battery_env.lab.calibrate import Ahead, calibrated
+from battery_env.lab.forecast import Forecast
 from battery_env.lab.life import Life, track_life
 from battery_env.lab.readers.columns import FileFormat
 from battery_env.lab.report import Calibration
 from battery_env.lab.settings import Settings
 from battery_env.lab.sources import Source, find_sources, read_source, record_name
-from battery_env.loads import Load
-from battery_env.plotting import save_figure
+from battery_env.loads import Load, LoadToCome
+from battery_env.plotting import literal, save_figure
 from battery_env.records import VARIED_SHARE
 from battery_env.records.discharge import Discharge
-from battery_env.records.model import RecordModel
 
 # By name of the column of a profile: the unit of the load.
 _LOAD_COLUMNS: dict[str, LoadUnit] = {"current_A": "current", "power_W": "power"}
@@ -44,17 +41,21 @@ class End:
     When a discharge in progress will end, and what that rests on.
 
     :param name: what the discharge is called in results
-    :param calibration: what the record says
-    :param forecast: what may come
+    :param calibration: what the record says, and what may come
     :param life: of the cell before; ``None``: not known
     :param prior_q_mobile_C: mean and standard deviation that were carried over, C; ``None``: none were
     """
 
     name: str
     calibration: Calibration
-    forecast: Forecast
     life: Life | None = None
     prior_q_mobile_C: tuple[float, float] | None = None
+
+    @property
+    def forecast(self) -> Forecast:
+        """What may come."""
+        assert self.calibration.end is not None
+        return self.calibration.end
 
     @property
     def contradicted(self) -> bool:
@@ -97,12 +98,14 @@ class End:
             plural = "" if valid.sum() == 1 else "s"
             lines.append(f"life of {valid.sum()} earlier discharge{plural}{left_out}")
         if self.prior_q_mobile_C is not None:
-            lines.append("q_mobile before: {:.0f} C, sd {:.0f} C".format(*self.prior_q_mobile_C))
+            lines.append(
+                "q_max before: {:.3f} Ah, sd {:.3f} Ah".format(*(each_C / 3600.0 for each_C in self.prior_q_mobile_C))
+            )
         return "\n".join([*lines, self.forecast.summary()])
 
 
 def forecast_end(
-    discharge: Discharge, settings: Settings | None = None, load: FutureLoad | None = None, samples: int = 1000
+    discharge: Discharge, settings: Settings | None = None, load: LoadToCome | None = None, samples: int = 1000
 ) -> Forecast:
     """
     The end of a discharge in progress, with all that :class:`~battery_env.Settings` know of it.
@@ -120,57 +123,9 @@ def forecast_end(
     :return: these
     :raises ValueError: if the discharge cannot be used, or a load cannot be meant
     """
-    return _forecast(discharge, Settings() if settings is None else settings, load, samples)[1]
-
-
-def _forecast(
-    discharge: Discharge, settings: Settings, load: FutureLoad | None, samples: int = 1000
-) -> tuple[Calibration, Forecast]:
-    """What a record says, and what comes after it."""
-    # under another load the filter is surer than it may be
-    method = settings.method if load is None else settings.method or "least-squares"
-    found = calibrate(discharge, replace(settings, method=method))
-    assert found.record is not None
-    cell = (settings.cell or NEW_CELL).replace(Tb0=found.ambient_C + ZERO_CELSIUS_K)
-    expected = forecast(
-        found.record,
-        Estimate(found.q_mobile_C, found.r_o_ohm, found.sd_q_mobile_C, found.sd_r_o_ohm, found.settled, found.reason),
-        load,
-        settings.cut_off_V,
-        model=RecordModel(cell, settings.thermal and found.method != "policy", initial_soc=found.initial_soc),
-        mismatch_V=settings.mismatch_V,
-        nominal_Ah=settings.nominal_Ah,
-        samples=samples,
-    )
-    load_A = found.future_current_A if load is None else _largest_A(load, settings.cut_off_V)
-    other_load = settings.other_load(load_A)
-    # a cell of which nothing is known has no health
-    is_known = settings.nominal_Ah is not None or settings.tells_new_capacity(load_A)
-    nominal_Ah = expected.nominal_Ah if is_known else float("nan")
-    return found, replace(expected, nominal_Ah=nominal_Ah, notes=(*expected.notes, *_notes(discharge, found, other_load)))
-
-
-def _largest_A(load: FutureLoad, cut_off_V: float) -> float:
-    """The largest current of a load to come, of a power that at the cut-off; 0 of one that is not known."""
-    if isinstance(load, Load):
-        return float(load.value.max()) / (1.0 if load.unit == "current" else cut_off_V)
-    return float(load) if isinstance(load, Real) else 0.0
-
-
-def _notes(discharge: Discharge, found: Calibration, other_load: str) -> Iterator[str]:
-    """What a forecast from this calibration rests on, beyond its record."""
-    assert found.record is not None
-    # which is said where the load so far is another one, too
-    if other_load not in found.reason:
-        yield other_load
-    settings, seen_s = found.settings, float(found.record.time_s[-1])
-    if float(discharge.time_s[-1]) > seen_s:
-        yield f"What was recorded after the last sample under load, at {seen_s:.0f} s, is left out."
-    if found.method == "kalman" and settings.prior_q_mobile_C is None and settings.cell is None:
-        yield "The filter expects a cell of some 2 Ah: of another one give the life, a prior of q_mobile or the constants."
-    if found.voltage_rmse_V > settings.mismatch_V:
-        rmse = found.shown("voltage_rmse_V", 0)
-        yield f"The model misses the voltage by {rmse} (RMSE), more than mismatch_V. Other loads make the interval too narrow."
+    end = calibrated(discharge, Settings() if settings is None else settings, Ahead(load, samples, True)).end
+    assert end is not None
+    return end
 
 
 def read_load(path: str | Path) -> Load:
@@ -261,13 +216,13 @@ def end_of_record(
         past = track_life(before, settings.cut_off_V, calibrator)
         prior_C = past.prior_q_mobile_C if has_usual_load(past, running, to_come) else past.prior_at_other_loads_C
         settings = replace(settings, prior_q_mobile_C=prior_C)
-    found, expected = _forecast(running, settings, to_come)
+    found = calibrated(running, settings, Ahead(to_come, is_asked=True))
     if not found.in_progress:
         raise ValueError(
             f"{argument} reaches {settings.cut_off_V:g} V at {found.measured_eod_time_s:.0f} s, so that nothing is left to "
             "forecast: calibrate it, or give a lower --cut-off"
         )
-    return End(record_name(source.stem, source.cycle), found, expected, past, settings.prior_q_mobile_C)
+    return End(record_name(source.stem, source.cycle), found, past, settings.prior_q_mobile_C)
 
 
 def has_usual_load(life: Life, running: Discharge, load: Load | None) -> bool:
@@ -294,5 +249,5 @@ class EndFiles:
         with replacing(self.table) as part:
             part.write_text(json.dumps(end.row(), indent=2, allow_nan=False) + "\n", encoding="utf-8")
         figure = end.forecast.plot()
-        figure.suptitle(f"{end.name}, then {end.forecast.load_name}", fontsize=10)
+        figure.suptitle(f"{literal(end.name)}, then {end.forecast.load_name}", fontsize=10)
         save_figure(figure, self.figure)

@@ -47,8 +47,8 @@ class Settings:
     :param prior_q_mobile_C: mean and standard deviation of ``q_mobile`` before the discharge, C; ``None``: nothing is known
     :param mismatch_V: error to expect of the model itself, V
     :param current_gain_sd: standard deviation of the gain of the current sensor, as a share of it
-    :param future_current_A: current beyond the end of a record, A; ``None``: as
-        :func:`battery_env.records.expected_current` has it
+    :param future_current_A: current beyond the end of a record, A; ``None``: the last one of a constant load, and blocks of
+        the record of one that varied
     :param thermal: whether the temperature of the model moves
     :param ambient_C: temperature at the start and of the surroundings, degC; ``None``: the first one measured, or what
         else the record says of its surroundings, or the cell's

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from battery_env.arrays import FloatArray
 from battery_env.electrochemistry import NEW_CELL, STATE_SIZE, UNCERTAIN_CONSTANTS
+from battery_env.electrochemistry.ends import SURPLUS_SHARE
 from battery_env.estimates import last_estimate
 from battery_env.estimators.diagnosis.conditions import Condition, Verdict
-from battery_env.estimators.estimator import SURPLUS_SHARE, Estimate, EstimateTrace, ModelNow, OnlineEstimator, Record
+from battery_env.estimators.estimator import Estimate, EstimateTrace, ModelNow, OnlineEstimator, Record
 from battery_env.policies.confidence import Confidence
 from battery_env.policies.pretrained import pretrained_policy
 from battery_env.records import Samples, Shown, check_drawn_charge, check_record, check_sample, drawn_charge_C, shown_beside

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -26,6 +25,7 @@ from battery_env.electrochemistry import (
     rest_shares,
     simulate,
 )
+from battery_env.electrochemistry.ends import LONGEST_S, Cells, Loads, run_down
 from battery_env.electrochemistry.kernels import run_on_batch
 from battery_env.electrochemistry.tangents import (
     TANGENT_NAMES,
@@ -34,7 +34,7 @@ from battery_env.electrochemistry.tangents import (
     roll_out_with_tangents,
 )
 from battery_env.estimates import Estimate
-from battery_env.parameters import Q_MOBILE
+from battery_env.parameters import Q_MOBILE, R_O
 from battery_env.records.samples import Record, check_record, expected_current, resample_current
 
 # The total of the four charges is q_mobile / 0.6 at all times.
@@ -42,9 +42,6 @@ _Q_PER_CHARGE = 1.0 / float(FULL_CHARGE_SHARES.sum())
 
 #: The error of the model shortly before the end of a record is the mean over this last share of its time.
 RECENT_SHARE = 0.1
-#: No discharge is followed longer than this into the future, s: a current that takes more than a week to empty the cell is
-#: that of a cell at rest.
-LONGEST_FORECAST_S = 604_800.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,26 +52,20 @@ class VoltageForecast:
     :param simulation: the steps of the model on the clock of the record, until its cell is empty or its load is over
     :param cut_off_V: voltage at which the discharge ends, V
     :param at_samples_V: at the samples of the record, also below the cut-off, shape (T,); NaN after the model cell is empty
-    :param not_before_s: end of a record in progress, before which its cell has not ended, s; ``None`` of a whole one
-    :param offset_V: by how much a record in progress was higher than the model at its end, V; it goes on so
     """
 
     simulation: Trajectory
     cut_off_V: float
     at_samples_V: FloatArray
-    not_before_s: float | None = None
-    offset_V: float = 0.0
 
     def reached_s(self, voltage_V: float) -> float:
         """
-        When the voltage falls to a level. After a record in progress it falls for good, as a constant current has no pulses.
+        When the voltage falls to a level.
 
         :param voltage_V: the level, V
         :return: on the clock of the record, s; NaN if it is not reached
         """
-        if self.not_before_s is None:
-            return self.simulation.reached_s(voltage_V)
-        return float(np.maximum(self.simulation.reached_s(voltage_V - self.offset_V, for_good=True), self.not_before_s))
+        return self.simulation.reached_s(voltage_V)
 
     @property
     def eod_time_s(self) -> float:
@@ -99,14 +90,11 @@ class VoltageForecast:
 
     @cached_property
     def _down_to_the_cut_off(self) -> tuple[FloatArray, FloatArray]:
-        time_s, voltage_V = self.simulation.time_s, self.simulation.voltage_V
-        if self.not_before_s is not None:
-            voltage_V = voltage_V + self.offset_V * (time_s > self.not_before_s)
-        reached_s = self.simulation.reached_s(self.cut_off_V - self.offset_V, for_good=self.not_before_s is not None)
-        if np.isnan(reached_s):
+        time_s, voltage_V, end_s = self.simulation.time_s, self.simulation.voltage_V, self.eod_time_s
+        if np.isnan(end_s):
             return time_s, voltage_V
-        before = time_s < reached_s
-        return np.append(time_s[before], self.eod_time_s), np.append(voltage_V[before], self.cut_off_V)
+        before = time_s < end_s
+        return np.append(time_s[before], end_s), np.append(voltage_V[before], self.cut_off_V)
 
 
 class Tangents(NamedTuple):
@@ -271,11 +259,11 @@ class RecordModel:
         at: Estimate,
         cut_off_V: float | None = None,
         future_current_A: float | None = None,
-        in_progress: bool = False,
     ) -> VoltageForecast:
         """
-        The voltage of the model from the first sample of a record down to the cut-off, under the current of the record, and
-        beyond its end under a constant one.
+        The voltage of the model alone from the first sample of a record down to the cut-off, under the current of the record,
+        and beyond its end under a constant one. When a cell in progress will end, :func:`battery_env.forecast` says: its
+        voltage was higher or lower than the model's.
 
         :param record: one discharge, whole or in progress
         :param at: the parameters
@@ -283,9 +271,6 @@ class RecordModel:
         :param future_current_A: current beyond the end of the record, at least 0 A; ``None``: as
             :func:`~battery_env.records.expected_current` has it, the last current of a constant load and the mean of a load
             that varied, which is an assumption
-        :param in_progress: whether the record is known not to have reached the cut-off: then the model does so after its end
-            only, and at its last sample at the earliest, however low it comes in the pulses before; and the cell goes on to
-            be as much higher or lower than the model as it was over the last tenth of the record
         :return: the voltage, and when the cut-off is reached
         :raises ValueError: for a negative future current, parameters out of range, or a record that cannot be used
         """
@@ -295,46 +280,35 @@ class RecordModel:
             future_current_A = expected_current(record.time_s, record.current_A).mean_A
         else:
             check_not_negative(future_current_A=future_current_A)
-        if future_current_A * LONGEST_FORECAST_S > at.q_mobile:
+        if future_current_A * LONGEST_S > at.q_mobile:
             # no cell of this q_mobile lasts longer than this, whatever it had delivered before
             steps = int(at.q_mobile / (future_current_A * self.dt_s)) + 1
             current_A = np.append(current_A[:-1], np.full(steps + 1, future_current_A))
         simulation, start_s = self.simulate(current_A, at.q_mobile, at.r_o), float(record.time_s[0])
-        at_samples_V = _at(samples_s, simulation)
-        recent = samples_s >= (1.0 - RECENT_SHARE) * samples_s[-1]
-        higher_V = (record.voltage_V - at_samples_V)[recent & ~np.isnan(at_samples_V)]
         return VoltageForecast(
             replace(simulation, time_s=start_s + simulation.time_s, eod_time_s=start_s + simulation.eod_time_s),
             self.cell.VEOD if cut_off_V is None else cut_off_V,
-            at_samples_V,
-            float(record.time_s[-1]) if in_progress else None,
-            float(higher_V.mean()) if in_progress and len(higher_V) else 0.0,
+            _at(samples_s, simulation),
         )
 
     def capacity_Ah(
-        self, load: float | Callable[[FloatArray], FloatArray], load_unit: LoadUnit, cut_off_V: float, max_duration_s: float
-    ) -> float:
+        self, loads: Loads, cut_off_V: float, q_mobile: ArrayLike | None = None, r_o: ArrayLike | None = None
+    ) -> FloatArray:
         """
-        The charge that the model's cell, with its own ``q_mobile`` and ``r_o``, gives from full down to the cut-off.
+        The charge that cells give from full down to the cut-off; what a load charges first comes on top.
 
-        :param load: a number, or a function of time in s that takes an array
-        :param load_unit: of the load, ``"power"`` in W or ``"current"`` in A
+        :param loads: of :func:`battery_env.loads.in_steps`, one for all or one a cell
         :param cut_off_V: cut-off voltage, V
-        :param max_duration_s: where to stop if the cut-off is not reached, s; at most a week is followed
-        :return: Ah; NaN if the cut-off is not reached
+        :param q_mobile: charge that can move, C, shape (n,); ``None``: that of ``cell``
+        :param r_o: ohmic resistance, ohm, shape (n,); likewise
+        :return: Ah, shape (n,); NaN if the cut-off is not reached within a week
         """
-        new = simulate(
-            load,
-            dt=self.dt_s,
-            load_unit=load_unit,
-            thermal=self.thermal,
-            cell=self.cell,
-            cut_off_V=-np.inf,
-            max_duration_s=min(max_duration_s, LONGEST_FORECAST_S),
-        )
-        drawn_C = np.append(0.0, np.cumsum(new.current_A)) * self.dt_s
-        steps = new.reached_s(cut_off_V) / self.dt_s
-        return float(np.interp(steps, np.arange(len(drawn_C)), drawn_C)) / 3600.0
+        q_C = Q_MOBILE.check(self.cell.q_mobile if q_mobile is None else q_mobile)
+        r_ohm = R_O.check(self.cell.r_o if r_o is None else r_o)
+        q_C, r_ohm, _ = (np.array(each) for each in np.broadcast_arrays(q_C, r_ohm, loads.until_s))
+        as_model = np.zeros(len(q_C))
+        full = Cells(q_C, r_ohm, initial_state(q_C, self.cell), as_model, as_model)
+        return run_down(full, self, loads, cut_off_V, surplus_share=np.inf).capacity_Ah
 
     def sensitivities(
         self, current_A: FloatArray, q_mobile: float, r_o: float, stride: int = 1

@@ -11,6 +11,9 @@ import pytest
 
 from battery_env import Estimate, RecordModel, forecast, initial_state, load_nasa_discharges, simulate, track_life
 from battery_env.__main__ import calibrate, main
+from battery_env.estimates import last_estimate
+from battery_env.estimators import ExtendedKalmanFilter
+from battery_env.lab.forecast import WHOLE_ERROR
 from battery_env.lab.running import forecast_end, read_load
 from battery_env.lab.settings import Settings
 from battery_env.loads import BlockBootstrap, Cycle, Load, RandomPiecewise, constant, steadier_unit
@@ -135,6 +138,26 @@ class TestUncertainty:
         assert self.width(unknown) < 1.2 * self.width(known)
         assert self.width(unknown, 8.0) > 1.5 * self.width(known, 8.0)
 
+    def test_what_a_resistance_absorbed_of_the_error_of_the_model_comes_out_under_another_load(self):
+        absorbed = Estimate(6000.0, 0.15, 0.0, 0.05 / 4.0)
+        of_model, of_noise = (
+            forecast(self.record, absorbed, 8.0, model=MODEL, mismatch_V=mismatch_V).r_o.std() for mismatch_V in (0.05, 0.0)
+        )
+        assert of_noise == pytest.approx(0.0125, rel=0.1) and of_model == pytest.approx(WHOLE_ERROR * 0.0125, rel=0.1)
+        assert self.width(absorbed, 8.0) > 1.4 * self.width(Estimate(6000.0, 0.15, 0.0, 0.05 / 8.0), 8.0)
+        assert self.width(absorbed) == pytest.approx(self.width(TRUTH), rel=0.1)
+
+    def test_of_a_filter_the_end_is_the_one_that_it_states(self):
+        filter_ = ExtendedKalmanFilter(mismatch_V=0.02, dt_s=4.0, prior_q_mobile_C=(6050.0, 60.0))
+        estimate = last_estimate(filter_.follow(self.record))
+        assert estimate == filter_.estimate(self.record)
+        filter_.follow(self.record)
+        for load in (4.0, 2.0):
+            found, left = forecast(self.record, estimate, load, model=filter_.now(), mismatch_V=0.0), filter_.remaining(load)
+            low_s, median_s, high_s = found.eod_quantile_s() - found.now_s
+            assert median_s == pytest.approx(left.time_s, abs=0.2 * left.sd_s)
+            assert high_s - low_s == pytest.approx(3.29 * left.sd_s, rel=0.1)
+
     def test_nine_of_ten_truths_lie_inside(self):
         rng, inside, n = np.random.default_rng(0), 0, 40
         for q_C in 6000.0 * np.exp(0.03 * rng.standard_normal(n)):
@@ -147,12 +170,17 @@ class TestUncertainty:
     def test_an_offset_that_the_record_shows_goes_on(self):
         record, cut_off_V = self.record, 3.2
         higher = Samples(record.time_s, record.voltage_V + 0.05, record.current_A)
-        point = MODEL.forecast(higher, TRUTH, cut_off_V, in_progress=True)
-        assert point.offset_V == pytest.approx(0.05)
-        assert point.eod_time_s == pytest.approx(MODEL.forecast(record, TRUTH, cut_off_V - 0.05, in_progress=True).eod_time_s)
-        sampled = forecast(higher, TRUTH, cut_off_V=cut_off_V, model=MODEL, mismatch_V=0.02, samples=200)
-        assert sampled.eod_quantile_s(0.5) == pytest.approx(point.eod_time_s, rel=0.01)
-        assert point.eod_time_s > 1.01 * MODEL.forecast(record, TRUTH, cut_off_V).eod_time_s
+        found = forecast(higher, TRUTH, cut_off_V=cut_off_V, model=MODEL, mismatch_V=0.02, samples=200)
+        lower_s = MODEL.forecast(record, TRUTH, cut_off_V - 0.05).eod_time_s
+        assert found.eod_quantile_s(0.5) == pytest.approx(lower_s, rel=0.01)
+        assert lower_s > 1.01 * MODEL.forecast(record, TRUTH, cut_off_V).eod_time_s
+
+    def test_a_cell_in_progress_ends_after_its_record_however_low_its_model_came_before(self):
+        current_A = np.where(np.arange(750) % 25 < 3, 6.0, 1.0)
+        record = discharged(current_A, r_o=0.10, load_unit="current", cut_off_V=3.0)
+        found = forecast(record, TRUTH, 1.0, 3.2, model=MODEL, mismatch_V=0.0, samples=3)
+        assert MODEL.forecast(record, TRUTH, 3.2, 1.0).eod_time_s < record.time_s[-1] - 90.0
+        assert (found.eod_time_s > record.time_s[-1] + 500.0).all()
 
     def test_samples_agree_with_the_record(self):
         whole = discharged(4.0, load_unit="current")
@@ -358,6 +386,22 @@ class TestCommand:
         assert any("a cell of some 2 Ah" in note for note in alone["notes"])
         assert not any("2 Ah" in note for note in carried["notes"])
         assert 0.6 < self.row(capsys, "running.csv", "--nominal", "2")["state_of_health"][1] < 0.9
+
+    @pytest.mark.parametrize(
+        "options", [(), ("--prior", "5460", "55"), ("--cut-off", "3.2"), ("--initial-soc", "0.98,0.01", "--nominal", "2")]
+    )
+    @pytest.mark.parametrize("name", ["running.csv", "pulsed.csv"])
+    def test_both_commands_give_one_end(self, name, options, capsys):
+        pulses = simulate(np.tile([3.0, 1.0], 2000).repeat(30), 6500.0, 0.12, load_unit="current", thermal=True, until=2000.0)
+        columns = {"time_s": pulses.time_s, "voltage_V": pulses.voltage_V, "current_A": pulses.current_A}
+        pd.DataFrame(columns).to_csv("pulsed.csv", index=False)
+        end = self.row(capsys, name, *options)
+        main(["calibrate", name, *options, "--json"])
+        row = json.loads(capsys.readouterr().out)
+        low_s, median_s, high_s = end["eod_time_s"]
+        assert row["predicted_eod_time_s"] == median_s and row["remaining_s"] == end["remaining_s"][1]
+        assert row["predicted_capacity_Ah"] == end["capacity_Ah"][1]
+        assert row["sd_predicted_eod_time_s"] == pytest.approx((high_s - low_s) / 3.29)
 
     def test_a_pause_at_the_end_and_a_poor_model_are_noted(self, capsys):
         table = pd.read_csv("running.csv")

@@ -1,5 +1,7 @@
 """Figures, and the files they go to."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -7,6 +9,7 @@ import pytest
 from battery_env.electrochemistry import simulate
 from battery_env.estimators import CramerRaoBound, Estimate, EstimateTrace, sensitivities
 from battery_env.files import replacing
+from battery_env.lab.forecast import forecast
 from battery_env.plotting import (
     COLOUR_OF,
     COLOURS,
@@ -153,7 +156,7 @@ def test_files_of_one_discharge_each_are_a_life_in_their_order_and_unsettled_one
 
 def test_the_common_error_of_a_cell_is_one_bar_and_its_line_has_no_band():
     upper, lower, _ = plot_life(life(["A", "B"])).axes
-    for axes, last, reach in ((upper, 6100.0, 100.0), (lower, 0.1, 0.04)):
+    for axes, last, reach in ((upper, 6100.0 / 3600.0, 100.0 / 3600.0), (lower, 100.0, 40.0)):
         bars = [bar.get_segments()[0] for bar in axes.collections if len(bar.get_segments())]
         assert len(bars) == 2 and min(bar[0, 0] for bar in bars) > 9.0
         np.testing.assert_allclose(bars[0][:, 1], [last - reach, last + reach])
@@ -175,7 +178,7 @@ def test_the_title_says_that_q_max_follows_the_capacity_only_if_it_does(noise_Ah
     table["q_mobile_C"] = 7000.0 - 10.0 * table["cycle"]
     drawn_Ah = table["q_mobile_C"] / 3800.0 + noise_Ah * np.random.default_rng(0).standard_normal(len(table))
     title = plot_life(table.assign(capacity_Ah=drawn_Ah)).axes[0].get_title()
-    assert title == ("$q^{max}$ follows the measured capacity (r > 0.999)" if follows else "")
+    assert title == ("$q_{max}$ follows the measured capacity (r > 0.999)" if follows else "")
     assert plot_life(table).axes[0].get_title() == ""
 
 
@@ -203,12 +206,14 @@ def test_pulses_are_drawn_by_their_envelope():
 
 def test_a_discharge_in_progress_ends_in_a_band(record):
     seen = Samples.of(record).first(1000)
-    forecast = RecordModel().forecast(seen, Estimate(6000.0, 0.15), in_progress=True)
-    voltage, *_ = plot_discharge(seen, {"model": forecast}, end_s=(500.0, 2500.0, 9000.0)).axes
-    band, end = voltage.patches[0], voltage.lines[-1]
+    model = {"model": RecordModel().forecast(seen, Estimate(6000.0, 0.15))}
+    expected = forecast(seen, Estimate(6000.0, 0.15), samples=3)
+    ends = replace(expected, eod_time_s=np.array([999.0, 2500.0, 9000.0]))
+    voltage, *_ = plot_discharge(seen, model, end=ends).axes
+    band, end = voltage.patches[0], voltage.lines[-2]
     # from the end of the record, which has not reached it, to what can be shown
     assert (band.get_x(), band.get_x() + band.get_width()) == (999.0, 3750.0) and set(end.get_xdata()) == {2500.0}
-    assert not plot_discharge(seen, {"model": forecast}, end_s=(np.nan, 2500.0, np.nan)).axes[0].patches
+    assert not plot_discharge(seen, model, end=replace(expected, eod_time_s=np.full(3, np.inf))).axes[0].patches
 
 
 def test_of_many_points_the_extremes_are_drawn():

@@ -9,6 +9,7 @@ from battery_env.electrochemistry import NEW_CELL, QNS, QPS, initial_state, simu
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS, TANGENT_NAMES
 from battery_env.estimates import Estimate
 from battery_env.estimators import ExtendedKalmanFilter, LeastSquares
+from battery_env.loads import constant, in_steps
 from battery_env.records.model import RecordModel
 
 CURRENT_A = np.repeat(np.random.default_rng(0).uniform(0.5, 2.5, 40), 75)
@@ -142,20 +143,6 @@ class TestForecast:
         expected_s = RecordModel().forecast(RECORD.part(0, 900), TRUTH).eod_time_s + 1000.0
         assert forecast.eod_time_s == pytest.approx(expected_s)
 
-    def test_a_record_in_progress_ends_after_its_last_sample(self):
-        current_A = np.where(np.arange(3000) % 100 < 10, 6.0, 1.0)
-        record = simulate(current_A, 6000.0, 0.10, load_unit="current", cut_off_V=3.0)
-        model, at = RecordModel(), Estimate(6000.0, 0.15)
-        first, later = (model.forecast(record, at, 3.2, 1.0, in_progress) for in_progress in (False, True))
-        assert first.eod_time_s < 2900.0 and later.eod_time_s > 3500.0
-        assert later.voltage_V[:2900].min() < 3.2 == later.voltage_V[-1]
-        assert (np.diff(later.time_s) > 0.0).all()
-        # from 4 V on it is lower for good; at 1000 C it is empty
-        for estimate, cut_off_V in ((at, 4.0), (Estimate(1000.0, 0.15), 0.0)):
-            assert model.forecast(record, estimate, cut_off_V, 1.0).eod_time_s < 1000.0
-            forecast = model.forecast(record, estimate, cut_off_V, 1.0, in_progress=True)
-            assert forecast.eod_time_s == forecast.time_s[-1] == record.time_s[-1]
-
     def test_it_is_unknown_when_the_load_is_off(self):
         current_A = np.where(np.arange(600) < 300, 2.0, 0.0)
         record = simulate(current_A, 6000.0, 0.15, load_unit="current")
@@ -165,7 +152,7 @@ class TestForecast:
         for current_A in (1e-9, 1e-3):  # steps down to the cut-off would not fit in memory, or take minutes
             forecast = RecordModel().forecast(RECORD.part(0, 900), TRUTH, future_current_A=current_A)
             assert np.isnan(forecast.eod_time_s) and len(forecast.time_s) == 900
-            assert np.isnan(RecordModel().capacity_Ah(current_A, "current", 3.0, 6000.0 / current_A))
+            assert np.isnan(RecordModel().capacity_Ah(in_steps([constant(current_A, "current")], 1.0), 3.0)).all()
 
     def test_it_follows_a_slow_discharge_for_days(self):
         eod_time_s = RecordModel(dt_s=2.0).forecast(RECORD.part(0, 900), TRUTH, future_current_A=0.02).eod_time_s

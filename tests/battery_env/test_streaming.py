@@ -153,6 +153,8 @@ class TestModel:
         assert filter_.voltage_V == pytest.approx(whole.voltage_V[half - 1], abs=0.02)
         left = filter_.remaining(2.0)
         assert 5.0 < left.sd_s < 60.0 and abs(left.time_s - (len(whole.time_s) - half)) < 3.0 * left.sd_s
+        low_s, median_s, high_s = left.quantile_s()
+        assert median_s == left.time_s and high_s - low_s == pytest.approx(3.29 * left.sd_s, rel=1e-3)
         assert filter_.remaining(1.0).time_s > 1.9 * left.time_s
         assert filter_.remaining(8.0, load_unit="power").time_s < left.time_s
         assert filter_.remaining(0.0).time_s == np.inf
@@ -177,8 +179,8 @@ class TestModel:
         assert filter_.remaining(np.full(int(left_s) + 100, 2.0)).time_s == left_s
         with pytest.raises(ValueError, match=r"load ends after 600 s, before .* a Load of battery_env\.loads"):
             filter_.remaining(np.full(600, 2.0))
-        # a day of rest is none
-        assert filter_.remaining(np.zeros(86_401)).time_s == np.inf
+        # a week of rest is none
+        assert filter_.remaining(np.zeros(604_801)).time_s == np.inf
 
 
 class TestPolicies:

@@ -12,7 +12,7 @@ from gymnasium import spaces
 
 pytest.importorskip("rl_zoo3")
 
-from benchmarks import certificate, control, cost_units, linear_cost, references, stabilisation
+from benchmarks import certificate, control, linear_cost, references, stabilisation
 from docs.environment_pages import DOCS, environment_page
 from sb3_lac import LAC
 from sb3_lac.envs import LinearCostEnv, reference_controller
@@ -207,26 +207,6 @@ def test_stabilisation_is_written_and_seeds_can_be_added(tmp_path, quick, capsys
     text = (tmp_path / "stabilisation.md").read_text(encoding="utf-8")
     assert text in capsys.readouterr().out and "| LAC (critic)" in text and "nan" not in text
     assert all((tmp_path / name).stat().st_size > 1000 for name in ("costs.png", "disturbances.png", "learning.png"))
-
-
-def test_trainings_in_other_units_are_judged_in_those_of_the_environment(tmp_path, monkeypatch):
-    trained = []
-
-    def train(algo, env_id, seed, timesteps, folder, hyperparameters):
-        ((_, kwargs),) = hyperparameters["env_wrapper"][0].items()
-        scaled = cost_units.ScaledReward(gym.make(env_id), **kwargs)
-        scaled.reset(seed=0)
-        trained.append((kwargs["factor"], scaled.step(scaled.action_space.sample() * 0)[1]))
-        return reference_controller(gym.make(env_id))
-
-    monkeypatch.setattr(cost_units, "train_or_load", train)
-    command = ["--envs", "LinearCost-v0", "--algos", "lac", "--seeds", "0", "--episodes", "2", "--jobs", "1"]
-    cost_units.main([*command, "--out", str(tmp_path)])
-    factors, rewards = zip(*trained, strict=True)
-    assert factors == (0.01, 1.0, 100.0)
-    np.testing.assert_allclose(rewards, np.multiply(factors, rewards[1]))
-    assert pd.read_csv(tmp_path / "cost_units.csv")["cost"].nunique() == 1
-    assert (tmp_path / "cost_units.png").stat().st_size > 1000
 
 
 def test_without_a_number_of_steps_it_is_that_of_the_zoo(tmp_path, quick):

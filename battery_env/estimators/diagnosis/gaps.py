@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from battery_env.arrays import FloatArray, IntArray
+from battery_env.compiled import compiled
 from battery_env.estimators.diagnosis.conditions import Condition, Diagnosis
 from battery_env.records import REST_CURRENT_A, SWITCH_SHARE
 
@@ -48,7 +48,7 @@ class Gap(NamedTuple):
     verdict: int
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def doubtful_charge_C(before_s: float, duration_s: float, after_s: float, load_A: float, q_mobile: float) -> float:
     """Return the charge of an interval between two samples that is in doubt; 0 if the interval is no gap."""
     usual_s = max(before_s, after_s)
@@ -57,7 +57,7 @@ def doubtful_charge_C(before_s: float, duration_s: float, after_s: float, load_A
     return charge_C if is_gap else 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def verdict(missing_V: float, fall_V: float, sd_V: float, most_share: float) -> int:
     """
     Say whether the charge of a gap was drawn. The model falls across the gap by the charge that its current draws. A cell that

@@ -9,10 +9,10 @@ from math import expm1, hypot, inf, isnan, nan, sqrt
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from battery_env.arrays import FloatArray
+from battery_env.compiled import compiled
 from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.estimators.diagnosis import gaps
 from battery_env.estimators.diagnosis.conditions import (
@@ -55,8 +55,6 @@ _KEPT, _KEPT_EVERY_S, _LEAST_CHANGES = 32, 0.9, 4
 _PARTED_MEMORY, _RATE_MEMORY_S, _PARTED_SAMPLES = 8.0, 100.0, 3
 # Standard deviation of the difference of both, as a share of the noise.
 _PARTED_NOISE_SHARE = 0.72
-
-_compiled = njit(cache=True, error_model="numpy")
 
 
 def table(columns: str | list[tuple[Any, ...]]) -> np.dtype[np.void]:
@@ -204,7 +202,7 @@ def measured(seen: Any, initial_soc: float, clock_s: float = 0.0, charge: Charge
     }
 
 
-@_compiled
+@compiled
 def _watch_all(
     rows: NDArray[np.void],
     time_s: FloatArray,
@@ -221,7 +219,7 @@ def _watch_all(
         remember(seen, voltage_V[n], current_A[n])
 
 
-@_compiled
+@compiled
 def begin(seen: Row, duration: float) -> None:
     """Count the time since the sample before, and the charge drawn in it."""
     seen.samples += 1
@@ -230,7 +228,7 @@ def begin(seen: Row, duration: float) -> None:
     seen.drawn_C += seen.current_A * duration
 
 
-@_compiled
+@compiled
 def examine(seen: Row, voltage: float, current: float, q_mobile: float, r_o: float, cell_q_mobile: float) -> None:
     """Look whether one more voltage belongs to its current, beside an estimate and the model's cell."""
     if seen.samples > 1 and not isnan(voltage):
@@ -247,7 +245,7 @@ def examine(seen: Row, voltage: float, current: float, q_mobile: float, r_o: flo
     _note_start(seen, voltage, current)
 
 
-@_compiled
+@compiled
 def remember(seen: Row, voltage: float, current: float) -> None:
     """Keep a sample that was examined."""
     before = seen.before
@@ -258,7 +256,7 @@ def remember(seen: Row, voltage: float, current: float) -> None:
     seen.current_A = current
 
 
-@_compiled
+@compiled
 def _note_rest(rest: Row, time_s: float, interval_s: float, current: float) -> None:
     # what flows before the load, and when that comes on: in an interval of its own samples, unless some are missing before it
     if rest.is_over:
@@ -277,7 +275,7 @@ def _note_rest(rest: Row, time_s: float, interval_s: float, current: float) -> N
         rest.before_s = interval_s
 
 
-@_compiled
+@compiled
 def unseen_C(seen: Row) -> float:
     """The standard deviation of the charge by the moment of load-on, and by what flows at rest."""
     rest = seen.rest
@@ -286,7 +284,7 @@ def unseen_C(seen: Row) -> float:
     return hypot(rest.load_on_C, rest.mean_A * (seen.time_s - rest.over_s))
 
 
-@_compiled
+@compiled
 def _least_resistance_ohm(start: Row, q_mobile: float, r_o: float) -> float:
     # of those that a cell can show: of other cells, of larger ones, and of this one, by its estimate, which a fault may have
     # spoiled, or by its fall at the start
@@ -294,7 +292,7 @@ def _least_resistance_ohm(start: Row, q_mobile: float, r_o: float) -> float:
     return max(min(_LEAST_RESISTANCE_OHM, _LEAST_RESISTANCE_OHM * _NEW_Q_C / q_mobile, own_ohm), 0.0)
 
 
-@_compiled
+@compiled
 def _note_start(seen: Row, voltage: float, current: float) -> None:
     start = seen.start
     if seen.samples == 1:
@@ -307,7 +305,7 @@ def _note_start(seen: Row, voltage: float, current: float) -> None:
             start.least_V = min(start.least_V, voltage)
 
 
-@_compiled
+@compiled
 def start_condition(seen: Row) -> int:
     """
     Say why a cell need not have started with the charge expected; 0 if its first voltage shows that it did. Under load that
@@ -323,25 +321,25 @@ def start_condition(seen: Row) -> int:
     return Condition.START_BELOW + 0 if start.first_A <= SWITCH_SHARE * start.most_A else Condition.START_LOADED + 0
 
 
-@_compiled
+@compiled
 def fault_condition(seen: Row) -> int:
     """Say what the samples show that no cell does, the first one found; 0 if nothing."""
     return Condition.NOT_FOLLOWED + 0 if seen.pending else seen.fault.condition
 
 
-@_compiled
+@compiled
 def _lagging_current_A(before_A: float, current_A: float, duration_s: float) -> float:
     # what the ohmic drop stands for after a while; it follows slowly
     return before_A + (before_A - current_A) * expm1(-duration_s / _FOLLOWS_S)
 
 
-@_compiled
+@compiled
 def _change_to_follow_A(switched_A: float, current_A: float, lagging_A: float) -> float:
     # how much of a current step the ohmic drop must follow: little after a pulse too short for it to build up
     return max(min(current_A - lagging_A, max(switched_A, 0.0)), min(switched_A, 0.0))
 
 
-@_compiled
+@compiled
 def _noise_V(seen: Row) -> float:
     # what is more than noise; infinite as long as there are too few samples to tell
     n = min(seen.ring.n_changes, _KEPT)
@@ -351,7 +349,7 @@ def _noise_V(seen: Row) -> float:
     return _NOISES * _SMOOTHED_SHARE * float(np.median(np.abs(change_V - np.median(change_V)))) / (0.6745 * sqrt(2.0))
 
 
-@_compiled
+@compiled
 def _find(seen: Row, condition: int, time_s: float, size: float) -> None:
     # the first one is kept
     fault = seen.fault
@@ -359,7 +357,7 @@ def _find(seen: Row, condition: int, time_s: float, size: float) -> None:
         fault.condition, fault.time_s, fault.size = condition, time_s, size
 
 
-@_compiled
+@compiled
 def _is_followed(seen: Row, time_s: float, lowest_V: float, highest_V: float, resistance_ohm: float) -> bool:
     # whether the voltage follows the last switch of the load by half of the least ohmic drop that it can have by then
     switch = seen.switch
@@ -368,7 +366,7 @@ def _is_followed(seen: Row, time_s: float, lowest_V: float, highest_V: float, re
     return abs(drop_V) <= _noise_V(seen) or followed_V / drop_V >= 1.0
 
 
-@_compiled
+@compiled
 def _conclude_switch(seen: Row, time_s: float, resistance_ohm: float) -> None:
     switch = seen.switch
     if not _is_followed(seen, time_s, switch.lowest_V, switch.highest_V, resistance_ohm):
@@ -376,7 +374,7 @@ def _conclude_switch(seen: Row, time_s: float, resistance_ohm: float) -> None:
     switch.size_A = 0.0
 
 
-@_compiled
+@compiled
 def _note_switch(seen: Row, time_s: float, current: float, resistance_ohm: float) -> None:
     # whether the load jumped, or was switched, since the last sample that was examined
     switch, last = seen.switch, seen.examined
@@ -401,7 +399,7 @@ def _note_switch(seen: Row, time_s: float, current: float, resistance_ohm: float
     last.lagging_A = _lagging_current_A(last.lagging_A, last.current_A, time_s - last.time_s)
 
 
-@_compiled
+@compiled
 def _look_for_rise(seen: Row, time_s: float, voltage: float, current: float) -> None:
     # since the voltage a little more than the window ago, under a current that has been steady since long before
     ring = seen.ring
@@ -420,7 +418,7 @@ def _look_for_rise(seen: Row, time_s: float, voltage: float, current: float) -> 
         ring.n_kept += 1
 
 
-@_compiled
+@compiled
 def _examine_last(seen: Row, voltage: float, resistance_ohm: float, most_q: float) -> None:
     # The sample before the one at hand, with the middle voltage of three, which is no single wild one
     last, switch, before = seen.examined, seen.switch, seen.before
@@ -446,12 +444,12 @@ def _examine_last(seen: Row, voltage: float, resistance_ohm: float, most_q: floa
     last.time_s, last.voltage_V, last.current_A = time_s, voltage, current
 
 
-@_compiled
+@compiled
 def _middle(a: float, b: float, c: float) -> float:
     return max(min(a, b), min(max(a, b), c))
 
 
-@_compiled
+@compiled
 def _note_interval(seen: Row, interval_s: float, load_A: float) -> None:
     # one that was no gap, or whose charge was drawn
     longest_s = seen.usual.longest_s
@@ -460,7 +458,7 @@ def _note_interval(seen: Row, interval_s: float, load_A: float) -> None:
         longest_s.sort()
 
 
-@_compiled
+@compiled
 def _open_gap(
     seen: Row, voltage: float, current: float, duration: float, expected_V: float, charge_C: float, load_A: float
 ) -> None:
@@ -479,7 +477,7 @@ def _open_gap(
         gap.fall_V = 0.0  # which leaves it in doubt
 
 
-@_compiled
+@compiled
 def _close_gap(seen: Row, voltage: float, load_A: float) -> None:
     gap = seen.gap
     after_V = _middle(gap.after_V, gap.next_V, voltage)
@@ -495,7 +493,7 @@ def _close_gap(seen: Row, voltage: float, load_A: float) -> None:
     gap.samples = 0.0
 
 
-@_compiled
+@compiled
 def follow_gaps(seen: Row, voltage: float, current: float, duration: float, expected_V: float, q_mobile: float) -> None:
     """
     Look whether the charge of gaps was drawn, at one sample that is not the first, of which the model expected a voltage. A

@@ -5,10 +5,10 @@ from __future__ import annotations
 from math import exp, hypot, inf, isnan, log, nan, sqrt
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from battery_env.arrays import FloatArray
+from battery_env.compiled import compiled, inlined
 from battery_env.electrochemistry import (
     QNB,
     QNS,
@@ -65,9 +65,6 @@ _AGAINST = np.array([[False, False], *([name in row.against for name in PARAMETE
 # The noise that innovations show is averaged over about this many samples.
 _NOISE_MEMORY = 32.0
 
-_compiled = njit(cache=True, error_model="numpy")
-_inlined = njit(cache=True, error_model="numpy", forceinline=True)
-
 
 def filters_of_prior(
     means: tuple[float, float],
@@ -92,7 +89,7 @@ def filters_of_prior(
     return filters
 
 
-@_inlined
+@inlined
 def _move(one: Row, q_change: float, r_change: float) -> None:
     # Another estimate is another past: the state goes along with it, by its tangents. For the charges that is exact.
     state, tangents, mean = one.state, one.tangents, one.mean
@@ -102,7 +99,7 @@ def _move(one: Row, q_change: float, r_change: float) -> None:
     mean[R] += r_change
 
 
-@_inlined
+@inlined
 def _keep_alive(one: Row, settings: Settings, constants: FloatArray) -> bool:
     # Raises q_mobile to what the charge drawn so far takes; tells whether the model cell has a voltage then.
     q, least = one.mean[Q], 0.0
@@ -116,7 +113,7 @@ def _keep_alive(one: Row, settings: Settings, constants: FloatArray) -> bool:
     return True
 
 
-@_inlined
+@inlined
 def _predict(one: Row, current: float, duration: float, settings: Settings, constants: FloatArray) -> None:
     q, r_o, p = one.mean[Q], one.mean[R], one.covariance
     steps = int(np.ceil(duration / settings.dt_s - 1e-6))
@@ -127,7 +124,7 @@ def _predict(one: Row, current: float, duration: float, settings: Settings, cons
     p[OFFSET, OFFSET] += settings.offset_growth * duration
 
 
-@_inlined
+@inlined
 def _common_error_sd(one: Row, settings: Settings) -> float:
     # What an error of the model that is common to the discharge leaves open of q_mobile, without its prior, however many
     # samples there are: as much as least squares state. Theirs is the worst error of the stated mean square. Once the knee is
@@ -144,7 +141,7 @@ def _common_error_sd(one: Row, settings: Settings) -> float:
     return spread * sqrt(mismatch_V2 * told.charge_C / beside_r)
 
 
-@_inlined
+@inlined
 def _correct(
     one: Row,
     voltage: float,
@@ -205,7 +202,7 @@ def _correct(
     _move(one, to_q - q, to_r - r_o)
 
 
-@_inlined
+@inlined
 def _heaviest(filters: Row) -> int:
     best = 0
     for m in range(1, len(filters)):
@@ -214,7 +211,7 @@ def _heaviest(filters: Row) -> int:
     return best
 
 
-@_compiled
+@compiled
 def _reduce(filters: Row) -> int:
     # Makes weights relative to the heaviest filter's, gives up light ones and merges equal ones; returns the heaviest.
     best = _heaviest(filters)
@@ -236,7 +233,7 @@ def _reduce(filters: Row) -> int:
     return best
 
 
-@_inlined
+@inlined
 def _mix(bank: Row, filters: Row, best: int, voltage: float) -> None:
     # Moments of the mixture, about the heaviest filter, and what its innovations show
     middle = filters[best].mean
@@ -264,7 +261,7 @@ def _mix(bank: Row, filters: Row, best: int, voltage: float) -> None:
     bank.sd[Q], bank.sd[R] = sqrt(qq / total - q * q), sqrt(rr / total - r * r)
 
 
-@_inlined
+@inlined
 def _doubt(bank: Row, offset_V: float) -> None:
     # An offset beyond the stated one, and an r_o out of the range that was stated before, contradict the filter
     if offset_V**2 > LIMIT_SD**2 * bank.offset_V2:
@@ -276,7 +273,7 @@ def _doubt(bank: Row, offset_V: float) -> None:
             bank.trend_sd = inf
 
 
-@_inlined
+@inlined
 def take(
     cell: Row, filters: Row, sample: Row, settings: Settings, packed: PackedConstants, derivatives: PolynomialDerivatives
 ) -> None:
@@ -307,7 +304,7 @@ def take(
     bank.common_sd_q = _common_error_sd(filters[best], settings)
 
 
-@_compiled
+@compiled
 def _note(estimate: Row, condition: int, holds: bool) -> None:
     # of each number that it speaks against, the row of the table that comes first counts
     for k in range(2):
@@ -315,7 +312,7 @@ def _note(estimate: Row, condition: int, holds: bool) -> None:
             estimate.condition[k] = condition
 
 
-@_compiled
+@compiled
 def conclude(cell: Row, settings: Settings, estimate: Row) -> None:
     """Say what a bank estimates after a sample that was examined, and what speaks against it; unchecked."""
     bank, seen, searched = cell.bank, cell.seen, settings.searched
