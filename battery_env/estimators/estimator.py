@@ -18,13 +18,17 @@ from battery_env.checks import check_numbers, check_whole_number
 from battery_env.electrochemistry import STATE_SIZE, CellParameters, LoadUnit, state_of_charge, voltage
 from battery_env.electrochemistry.ends import BAND, LONGEST_S, Cells, run_down
 from battery_env.estimates import Estimate, EstimateTrace, last_estimate
-from battery_env.estimators.state_files import load_state, save_state
+from battery_env.estimators.state_files import load_state, refusing, save_state
 from battery_env.loads import KnownLoad, Load, in_steps, known_load
 from battery_env.parameters import PARAMETERS
 from battery_env.records import Record, Stream
 
 # Points between limits keep this far from them, as a share of their distance, so that rounding leaves them within.
 _ROUNDING = 1e-9
+
+
+# Of which cells an array of a saved batch is, in place of a number.
+_ALL = "all"
 
 
 class Estimator(ABC):
@@ -171,6 +175,10 @@ class OnlineEstimator(Estimator):
         """What it knows of the discharge, by name."""
         raise NotImplementedError(f"{type(self).__name__} cannot be saved")
 
+    def _check_state(self, arrays: dict[str, NDArray[Any]]) -> None:
+        """Refuse, with a ValueError, what :meth:`_arrays` of no discharge can be."""
+        raise NotImplementedError(f"{type(self).__name__} cannot be saved")
+
     def _restore(self, arrays: dict[str, NDArray[Any]]) -> None:
         """Take :meth:`_arrays` for its own."""
         raise NotImplementedError(f"{type(self).__name__} cannot be saved")
@@ -246,9 +254,13 @@ class OnlineEstimator(Estimator):
 
         :param path: the file
         :raises FileNotFoundError: if there is no such file
-        :raises ValueError: if it is damaged, of another version, or of an estimator with other arguments
+        :raises ValueError: if it is damaged, of another version, of an estimator with other arguments, or holds what no
+            discharge leads to; the estimator is as it was then
         """
-        self._restore(load_state(path, self._made_with()))
+        arrays = load_state(path, self._made_with())
+        with refusing(path):
+            self._check_state(arrays)
+        self._restore(arrays)
 
     def estimate(self, record: Record) -> Estimate:
         """
@@ -341,15 +353,33 @@ class OnlineBatch:
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write what is known of all cells, as :meth:`OnlineEstimator.save`."""
-        arrays = {f"{n}/{name}": array for n, each in enumerate(self.estimators) for name, array in each._arrays().items()}
+        parts, arrays = [each._arrays() for each in self.estimators], {}
+        for name in dict.fromkeys(name for part in parts for name in part):
+            found = [part.get(name, np.empty(0)) for part in parts]
+            if len({(array.dtype, array.shape) for array in found}) == 1:  # one array takes a thousandth of the time
+                arrays[f"{_ALL}/{name}"] = np.stack(found)
+            else:
+                arrays |= {f"{n}/{name}": part[name] for n, part in enumerate(parts) if name in part}
         return save_state(path, self._made_with(), arrays)
 
     def load(self, path: str | os.PathLike[str]) -> None:
         """Go on from what :meth:`save` wrote."""
-        arrays = load_state(path, self._made_with())
-        for n, estimator in enumerate(self.estimators):
-            mark = f"{n}/"
-            estimator._restore({name[len(mark) :]: array for name, array in arrays.items() if name.startswith(mark)})
+        parts: list[dict[str, NDArray[Any]]] = [{} for _ in self.estimators]
+        with refusing(path):
+            for name, array in load_state(path, self._made_with()).items():
+                number, _, own_name = name.partition("/")
+                if number == _ALL and len(array) == len(parts):
+                    for part, own in zip(parts, array, strict=True):
+                        part[own_name] = own
+                elif number.isdecimal() and int(number) < len(parts):
+                    parts[int(number)][own_name] = array
+                else:
+                    raise ValueError(f"arrays that are missing or unknown: {name}")
+            for n, (estimator, part) in enumerate(zip(self.estimators, parts, strict=True)):
+                with refusing(f"cell {n}"):
+                    estimator._check_state(part)
+        for estimator, part in zip(self.estimators, parts, strict=True):
+            estimator._restore(part)
 
     def _made_with(self) -> dict[str, Any]:
         return {"cells": len(self.estimators), **self.estimators[0]._made_with()}

@@ -223,9 +223,9 @@ def _estimate(seen: _Seen, settings: Settings, load: LoadToCome | None) -> tuple
     methods: list[Method] = [settings.method or "least-squares"]
     # under other loads the filter, which takes the error of the model for noise, is surer than it may be
     is_over = float(seen.discharge.time_s[-1] - seen.loaded.time_s[-1]) > _REST_S
-    goes_on = settings.future_current_A is None and load is None and not seen.load.varied
+    goes_on = settings.future_current_A is None and load is None and not seen.load.varied and not is_over
     is_new = settings.prior_q_mobile_C is None and settings.cell is None
-    if settings.method is None and seen.in_progress and not is_over and goes_on and is_new:
+    if settings.method is None and seen.in_progress and goes_on and is_new:
         methods.append("kalman")
     for method in methods:
         calibrator = replace(settings, method=method).calibrator(seen.cell, seen.start)
@@ -310,11 +310,11 @@ def _charge(seen: _Seen, settings: Settings, estimate: Estimate, end: Forecast |
     if seen.in_progress:
         predicted_Ah, sd_Ah = (float("nan"),) * 2 if end is None else _middle(end.capacity_Ah, estimate)
     shown, duration_s = seen.loaded.shown, float(np.ptp(seen.loaded.time_s))
-    unseen_C = hypot(shown.load_on_C, shown.offset_C(duration_s), start.sd_soc * q_mobile)
+    unseen_Ah = float(np.hypot(shown.load_on_C, shown.offset_C(duration_s))) / 3600.0
     return {
         "capacity_Ah": float("nan") if seen.in_progress or start.soc < 1.0 else drawn_Ah,
         "predicted_capacity_Ah": predicted_Ah,
-        "sd_predicted_capacity_Ah": hypot(sd_Ah, unseen_C / 3600.0),
+        "sd_predicted_capacity_Ah": hypot(sd_Ah, start.sd_soc * q_mobile / 3600.0, unseen_Ah),
     }
 
 

@@ -185,9 +185,10 @@ class Discharge:
         a reading that it need not write.
         """
         last = self._loaded[1]
-        (before_V, last_V), (before_A, last_A) = self.voltage_V[last - 1 : last + 1], self.current_A[last - 1 : last + 1]
-        is_steady = abs(last_A - before_A) <= SWITCH_SHARE * self.current_A.max()
-        return bool(last > 0 and is_steady and last_V - cut_off_V <= before_V - last_V)
+        before = max(last - 1, 0)
+        is_steady = abs(self.current_A[last] - self.current_A[before]) <= SWITCH_SHARE * self.current_A.max()
+        fall_V = self.voltage_V[before] - self.voltage_V[last]
+        return bool(is_steady and fall_V > 0.0 and self.voltage_V[last] - cut_off_V <= fall_V)
 
     def _refuse_dip(self, begin: int, back: int, cut_off_V: float) -> None:
         """
