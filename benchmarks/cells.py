@@ -30,8 +30,8 @@ from scipy.stats import spearmanr
 from battery_env.arrays import FloatArray
 from battery_env.electrochemistry import NEW_CELL
 from battery_env.estimates import Estimate
-from battery_env.estimators import Estimator, ExtendedKalmanFilter, LeastSquares
-from battery_env.estimators.cell_fit import UNFITTED_MISMATCH_V, CellFit, fit_cell
+from battery_env.estimators import CellFit, Estimator, ExtendedKalmanFilter, LeastSquares, fit_cell
+from battery_env.estimators.cell_fit import UNFITTED_MISMATCH_V
 from battery_env.loads import recorded
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.plotting import COLOUR_OF, COLOURS, LABELS, coloured, new_figure, plot_cell_fit, title_of_life
