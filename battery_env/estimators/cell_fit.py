@@ -22,7 +22,7 @@ from battery_env.checks import ZERO_CELSIUS_K, check_numbers, check_positive
 from battery_env.electrochemistry import NEW_CELL, CellParameters, check_cell, check_dt
 from battery_env.electrochemistry.tangents import BY_Q, BY_R, RATE_CONSTANTS
 from battery_env.estimates import Estimate
-from battery_env.estimators.diagnosis.conditions import FULL_REST_V, MISMATCH_MARGIN, rest_voltage_V
+from battery_env.estimators.diagnosis.conditions import ABOVE_REST_V, BELOW_REST_V, MISMATCH_MARGIN, rest_voltage_V
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.search import MARGIN, OnGrid, distance_C, minimized, square
 from battery_env.files import WrongFormatError, read_json, write_json
@@ -207,7 +207,7 @@ class CellFit:
 
     def _doubt_of_start(self) -> str:
         before_V = rest_voltage_V(self.start)
-        if self.full_V >= before_V - FULL_REST_V[0]:
+        if self.full_V >= before_V - BELOW_REST_V:
             return ""
         return (
             f"A full cell rests at {self.full_V:.2f} V with these constants, at {before_V:.2f} V with those before. If the "
@@ -447,7 +447,7 @@ def _check_starts_alike(records: Sequence[Record], at_rest: Sequence[bool]) -> N
     found = enumerate(zip(records, at_rest, strict=True), start=1)
     rests = [(float(each.voltage_V[0]), _name(each, n)) for n, (each, rested) in found if rested]
     (low_V, low), (high_V, high) = min(rests, default=(0.0, "")), max(rests, default=(0.0, ""))
-    if high_V - low_V > sum(FULL_REST_V):
+    if high_V - low_V > BELOW_REST_V + ABOVE_REST_V:
         raise ValueError(
             f"discharge {low} starts at rest at {low_V:.2f} V, discharge {high} at {high_V:.2f} V: they "
             "cannot both be of a full cell. Leave out those that do not start full."

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
+from math import hypot
 from numbers import Real
 from pathlib import Path
 from typing import Any, NamedTuple, overload
@@ -20,7 +21,7 @@ from battery_env.electrochemistry.ends import quantile
 from battery_env.estimates import Estimate, last_estimate
 from battery_env.estimators.diagnosis.gaps import DRAWN, find_gaps
 from battery_env.estimators.diagnosis.rest import Start, check_initial_soc, soc_from_rest
-from battery_env.estimators.diagnosis.samples import start_condition, watched
+from battery_env.estimators.diagnosis.samples import fault_condition, start_condition, watched
 from battery_env.estimators.estimator import ModelNow
 from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.lab.forecast import Forecast, forecast
@@ -29,7 +30,7 @@ from battery_env.lab.readers.discharges import each_usable
 from battery_env.lab.report import Calibration
 from battery_env.lab.settings import Method, Settings
 from battery_env.loads import Load, LoadToCome, constant, in_steps
-from battery_env.records import ExpectedCurrent, Samples, drawn, expected_current, mean_current_A
+from battery_env.records import ExpectedCurrent, Samples, drawn, expected_current, mean_current_A, shown_beside
 from battery_env.records.discharge import Discharge
 from battery_env.records.model import RecordModel, VoltageForecast
 
@@ -113,7 +114,7 @@ class _Seen(NamedTuple):
     record: Discharge  # the same, of few samples
     fitted: Discharge  # the same, with the temperature that counts
     averaged_over_s: float
-    eod_time_s: float
+    eod_time_s: float  # NaN: the record ends above the cut-off
     in_progress: bool
     more_C: float  # drawn after the end
     cell: CellParameters
@@ -221,14 +222,10 @@ def _estimate(seen: _Seen, settings: Settings, load: LoadToCome | None) -> tuple
     """
     methods: list[Method] = [settings.method or "least-squares"]
     # under other loads the filter, which takes the error of the model for noise, is surer than it may be
-    goes_on = settings.future_current_A is None and load is None and not seen.load.varied
-    if (
-        settings.method is None
-        and seen.in_progress
-        and goes_on
-        and settings.prior_q_mobile_C is None
-        and settings.cell is None
-    ):
+    is_over = float(seen.discharge.time_s[-1] - seen.loaded.time_s[-1]) > _REST_S
+    goes_on = settings.future_current_A is None and load is None and not seen.load.varied and not is_over
+    is_new = settings.prior_q_mobile_C is None and settings.cell is None
+    if settings.method is None and seen.in_progress and goes_on and is_new:
         methods.append("kalman")
     for method in methods:
         calibrator = replace(settings, method=method).calibrator(seen.cell, seen.start)
@@ -312,10 +309,12 @@ def _charge(seen: _Seen, settings: Settings, estimate: Estimate, end: Forecast |
     predicted_Ah, sd_Ah = (1.0 - start.soc) * q_mobile / 3600.0 + drawn_Ah, settings.current_gain_sd * drawn_Ah
     if seen.in_progress:
         predicted_Ah, sd_Ah = (float("nan"),) * 2 if end is None else _middle(end.capacity_Ah, estimate)
+    shown, duration_s = seen.loaded.shown, float(np.ptp(seen.loaded.time_s))
+    unseen_Ah = float(np.hypot(shown.load_on_C, shown.offset_C(duration_s))) / 3600.0
     return {
         "capacity_Ah": float("nan") if seen.in_progress or start.soc < 1.0 else drawn_Ah,
         "predicted_capacity_Ah": predicted_Ah,
-        "sd_predicted_capacity_Ah": float(np.hypot(sd_Ah, start.sd_soc * q_mobile / 3600.0)),
+        "sd_predicted_capacity_Ah": hypot(sd_Ah, start.sd_soc * q_mobile / 3600.0, unseen_Ah),
     }
 
 
@@ -359,13 +358,11 @@ def _is_all_logged(seen: _Seen, forecast: VoltageForecast, estimate: Estimate) -
     Whether all that was drawn is in the record: the cell starts, before or under the load, no lower than with this charge, no
     sensor fails, and the voltage says of each gap that its charge was drawn.
     """
-    discharge, record, q_mobile, r_o = seen.discharge, seen.record, estimate.q_mobile, estimate.r_o
-    begin = int(np.searchsorted(discharge.time_s, discharge.load_on_time_s, side="right")) - 1
-    end = int(np.searchsorted(discharge.time_s, record.time_s[-1], side="right"))
-    columns = (discharge.time_s, discharge.voltage_V, discharge.current_A)
-    shown = watched(Samples(*(column[begin:end] for column in columns)), seen.cell, seen.start.soc, q_mobile, r_o)
-    is_lower = shown["start"]["first_V"] < shown["start_V"]
-    if shown["fault"]["condition"] or (is_lower and start_condition(shown)):
+    record, loaded, q_mobile, r_o = seen.record, seen.loaded, estimate.q_mobile, estimate.r_o
+    shown = watched(Samples.of(loaded), seen.cell, seen.start.soc, q_mobile, r_o, shown_beside(loaded))
+    # a charge that tapered off fills any cell, whatever its voltage at rest
+    is_lower = shown["start"]["first_V"] < shown["start_V"] and not (loaded.shown.charge and loaded.shown.charge.tapered)
+    if fault_condition(shown) or (is_lower and start_condition(shown)):
         return False
     gaps = find_gaps(record.time_s, record.voltage_V, record.current_A, forecast.at_samples_V, q_mobile)
     return all(gap.verdict == DRAWN for gap in gaps)

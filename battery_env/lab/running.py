@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 import warnings
@@ -138,8 +137,10 @@ def read_load(path: str | Path) -> Load:
     :raises ValueError: if the file holds none
     """
     try:
-        table = pd.read_csv(path, sep=None, engine="python", encoding="utf-8-sig")
-    except (csv.Error, UnicodeDecodeError, pd.errors.ParserError, pd.errors.EmptyDataError) as error:
+        table = pd.read_csv(path, sep=None, engine="python", encoding="utf-8-sig", compression=None)
+    except OSError:
+        raise
+    except Exception as error:  # pandas raises whatever a file leads it to
         raise ValueError(f"{path}: no table: {error}") from error
     table.columns = table.columns.str.strip()
     found = [name for name in _LOAD_COLUMNS if name in table.columns]

@@ -24,12 +24,13 @@ from battery_env.policies.confidence import Confidence
 from battery_env.policies.pretrained import pretrained_policy
 from battery_env.records import (
     Samples,
+    Shown,
     are_plausible,
     check_drawn_charge,
     check_record,
     check_sample,
     drawn_charge_C,
-    starts_at_rest,
+    shown_beside,
 )
 from battery_env.records.model import RecordModel
 from battery_env.tasks.env import CalibrationEnv, task_class
@@ -223,7 +224,7 @@ class PolicyEstimator(OnlineEstimator):
         if self._confidence is not None and self._fitted is not None:
             samples = self._readings.known(self._decisions * self.decision_s)
             (sd,) = self._confidence.standard_deviations(self._fitted, self._now[None])
-            self._verdict = self._confidence.verdict(self._fitted, 0, self._now, sd, samples, rested=False)
+            self._verdict = self._confidence.verdict(self._fitted, 0, self._now, sd, samples, Shown())
             # the same NaN always, so that equal estimates are equal
             self._sd = [nan if isnan(each) else each for each in sd.tolist()]
 
@@ -362,7 +363,7 @@ class PolicyEstimator(OnlineEstimator):
         :return: one trace per discharge, in the same order
         """
         task = self._follow(records, self._every)
-        samples = [] if self._confidence is None else [(Samples.of(record), starts_at_rest(record)) for record in records]
+        samples = [] if self._confidence is None else [(Samples.of(record), shown_beside(record)) for record in records]
         made: list[FloatArray] = []
         verdicts: list[Verdict] = []
         while (running := ~task.truncated()).any():
@@ -375,9 +376,9 @@ class PolicyEstimator(OnlineEstimator):
                 sd = self._confidence.standard_deviations(fitted, estimate)
                 columns.append(sd)
                 for n in np.flatnonzero(running).tolist():
-                    record, rested = samples[discharge[n]]
+                    record, shown = samples[discharge[n]]
                     so_far = record.first(int(np.searchsorted(record.time_s, time_s[n], side="right")))
-                    verdicts.append(self._confidence.verdict(fitted, n, estimate[n], sd[n], so_far, rested))
+                    verdicts.append(self._confidence.verdict(fitted, n, estimate[n], sd[n], so_far, shown))
             made.append(np.concatenate(columns, axis=1)[running])
             task.drop_ended()
         rows = np.concatenate(made)

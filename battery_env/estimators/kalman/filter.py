@@ -16,15 +16,15 @@ from battery_env.electrochemistry import STATE_SIZE, CellParameters, PackedConst
 from battery_env.electrochemistry.ends import SURPLUS_SHARE
 from battery_env.electrochemistry.tangents import PolynomialDerivatives
 from battery_env.estimates import Estimate, Estimates, EstimateTrace
-from battery_env.estimators.diagnosis.conditions import Condition, Verdict, rest_voltage_V
+from battery_env.estimators.diagnosis.conditions import Condition, Verdict
 from battery_env.estimators.diagnosis.rest import check_initial_soc
-from battery_env.estimators.diagnosis.samples import begin, examine, follow_gaps, measured, remember
+from battery_env.estimators.diagnosis.samples import begin, examine, expect, follow_gaps, measured, remember, take_in
 from battery_env.estimators.estimator import ModelNow, OnlineBatch, OnlineEstimator, check_bounds
 from battery_env.estimators.kalman.bank import conclude, filters_of_prior, take
 from battery_env.estimators.kalman.state import CELL, ESTIMATE, FILTER, SAMPLE, Q, R, Settings
 from battery_env.estimators.state_files import check_all, check_like
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, check_parameters
-from battery_env.records import Record, Stream, are_plausible, check_drawn_charge, check_sample, starts_at_rest
+from battery_env.records import Record, Stream, are_plausible, check_drawn_charge, check_sample, shown_beside
 
 _PRIOR_SD_SHARE_Q = 0.25
 _PRIOR_SD_R_OHM = 0.15
@@ -33,7 +33,7 @@ _NOISE_V = 0.005
 # Covariances of a state may be so much larger than their variances allow, as a share.
 _ROUNDED = 1e-6
 # What reasons are made of
-_SHOWN = ("start", "fault", "switch", "gap", "start_V")
+_SHOWN = ("start", "rest", "fault", "switch", "gap", "start_V", "time_s")
 
 
 class ExtendedKalmanFilter(OnlineEstimator):
@@ -193,7 +193,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
         self._cells["ambient_K"] = ambient_K
         cell = self._cell_now()
         self._cells["constants"] = cell.packed.constants
-        self._cells["seen"]["start_V"] = rest_voltage_V(cell, self.initial_soc[0])
+        expect(self._cells["seen"], cell, self.initial_soc[0])
         self._filters[0] = self._start(cell)
 
     def _cell_now(self) -> CellParameters:
@@ -243,10 +243,13 @@ class ExtendedKalmanFilter(OnlineEstimator):
         samples["temperature_K"][:, 0] = nan if temperature_C is None else temperature_C + ZERO_CELSIUS_K
         if temperature_C is not None:
             self._begin(float(samples["temperature_K"][0, 0]))
-        self._cells["seen"]["start"]["at_rest"] = starts_at_rest(record)
+        beside = shown_beside(record)
+        if self.initial_soc[0] < 1.0:
+            beside = beside._replace(charge=None)
+        take_in(self._cells["seen"], beside)
         check_drawn_charge(float(np.cumsum(np.append(0.0, current_A[:-1]) * dt_s).min()), self.least_drawn_C)
         said = self._follow(self._cells, self._filters, samples)[:, 0]
-        shown = measured(self._cells["seen"][0], self.initial_soc[0], float(time_s[0]))
+        shown = measured(self._cells["seen"][0], self.initial_soc[0], float(time_s[0]), beside.charge)
         noted = list(zip(map(tuple, said["condition"].tolist()), said["r_o_comes_first"].tolist(), strict=True))
         texts = {each: _verdict(*each, shown).reason for each in set(noted)}
         sd_q, sd_r_o = said["sd"].T.copy()
