@@ -212,6 +212,26 @@ def test_a_report_answers_before_it_details(page):
     assert answer.count("\n![") == 1 and answer.count("\n\n|") == 1
 
 
+#: Pages that say who is better: each names the rows that it rests on, ``<!-- rests on TABLE: cells of a row; value -->``.
+CLAIMING = ("README", "docs/when_to_take_lac", "docs/results_at_a_glance", "docs/faq", "docs/pretrained")
+
+
+@pytest.mark.parametrize("name", CLAIMING)
+def test_a_claim_of_the_guide_names_the_rows_that_it_rests_on(name):
+    text = (ROOT / f"{name}.md").read_text(encoding="utf-8")
+    named = re.split(r"<!-- rests on ([^:\s]+): ([^>]+) -->", text)
+    # what is said is the paragraph before
+    claims = [(said.rpartition("\n\n")[2], *row) for said, *row in zip(named[:-1:3], named[1::3], named[2::3], strict=True)]
+    assert claims
+    for said, source, cells in claims:
+        *keys, value = cells.split("; ")
+        of_keys = [row for row in published(ROOT / source) if set(keys) <= set(row)]
+        assert any(
+            value in {part for cell in row for part in (cell, *cell.split(" / "), *cell.split(" "))} for row in of_keys
+        ), cells
+        assert re.search(rf"(?<![\d.]){re.escape(value)}(?![\d])", said), f"{value} is not said where {source} is named"
+
+
 @pytest.mark.parametrize("page", [ROOT / f"{name}.md" for name in STYLED] + REPORTS, ids=lambda page: page.name)
 def test_a_table_that_names_its_source_holds_what_was_published(page):
     tables = re.findall(r"<!-- from ([^>]+) -->\n\n((?:\|.*\n)+)", page.read_text(encoding="utf-8"))
