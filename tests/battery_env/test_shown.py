@@ -8,6 +8,7 @@ import pytest
 
 from battery_env import calibrate, load_nasa_discharges, read_discharges
 from battery_env.electrochemistry import initial_state, simulate
+from battery_env.estimators.diagnosis.gaps import DRAWN, find_gaps
 from battery_env.estimators.estimator import OnlineEstimator
 from battery_env.lab.settings import Settings
 from battery_env.records import ChargeBefore, Shown, Stream
@@ -177,3 +178,14 @@ class TestCutOff:
         record = replace(REAL, current_A=np.where(off, 0.0, REAL.current_A), voltage_V=np.where(off, 3.7, REAL.voltage_V))
         with pytest.warns(UserWarning, match="the load ends at"):
             assert calibrate(record).method == "least-squares"
+
+
+class TestGaps:
+    def test_short_ones_on_a_flat_curve_say_nothing_where_a_logger_has_the_habit(self):
+        """Intervals of 5 s between bursts: the voltage of iron phosphate falls in them by less than it is rounded by."""
+        burst_s, fall_V = 0.1 * np.arange(12), np.where(np.arange(30) < 6, 0.01, 2e-4)
+        time_s = (np.cumsum(np.full(30, 6.1))[:, None] + burst_s).ravel()
+        model_V = 3.3 - np.repeat(np.cumsum(fall_V), 12)
+        wander_V = 8e-4 * np.repeat(np.random.default_rng(0).choice([0.0, 1.0], 30), 12)
+        found = find_gaps(time_s, model_V + wander_V, np.full(360, 4.4), model_V, 3900.0)
+        assert len(found) >= 3 and {gap.verdict for gap in found} == {DRAWN}
