@@ -298,9 +298,12 @@ class Training:
         }
 
     def save(self) -> None:
-        """Save the model."""
+        """Save the model, and close its environments and its log."""
         with replacing(self.file) as part:
             self.model.save(part)
+        assert self.model.env is not None
+        self.model.env.close()
+        self.model.logger.close()
 
 
 def train_or_load(
