@@ -51,6 +51,7 @@ from stable_baselines3.common.logger import configure
 from tqdm import tqdm
 
 from battery_env.callbacks import CalibrationCallback
+from battery_env.files import replacing
 from benchmarks.contests import EVALUATION_EPISODES, contest_of, made_by
 from benchmarks.dashboard import dashboard_callbacks
 from benchmarks.study import Study, command_line, digits, markdown, natural, positive, versions, write_json, write_text
@@ -132,9 +133,13 @@ def _train(recipe: Recipe, folder: Path, out: Path, position: int) -> None:
         ProgressCallback(f"{of_env.env_id} {recipe.label} seed {recipe.seed}", recipe.timesteps, calibration, position),
     ]
     model.learn(recipe.timesteps - model.num_timesteps, callback=callbacks, reset_num_timesteps=False)
-    model.save(folder / "model")
+    with replacing(folder / "model.zip") as part:
+        model.save(part)
 
     scores = of_env.scores(model, scored_env)
+    for env in (evaluation_env, scored_env, model.get_env()):
+        if env is not None:
+            env.close()
     write_text(folder / "scores.csv", scores.to_csv(index=False, float_format="%.6g"))
     summary = {"recipe": asdict(recipe), "versions": versions(), "resumed": checkpoint.resumed, "updates": model._n_updates}
     summary |= {"timesteps": model.num_timesteps, "training_minutes": checkpoint.seconds / 60.0, **of_env.summary(scores)}
