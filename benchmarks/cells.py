@@ -42,7 +42,7 @@ from battery_env.trajectories import TrajectoryDataset
 from benchmarks import pretrained
 from benchmarks.calibrators import ENV_ID, SHIPPED, Follow
 from benchmarks.study import Study, Tables, command_line, digest_of, markdown, natural, positive, run_named
-from benchmarks.training import Recipe, timesteps_of, train_or_load
+from benchmarks.training import Recipe, train_or_load
 
 CUT_OFF_V = 2.7
 #: Shares of a discharge, in time, after which its end is predicted.
@@ -423,8 +423,7 @@ NEW_CELLS: dict[str, Callable[[], Estimator]] = {
 def trained(algo: str, seed: int, updates: int, dataset: Path, folder: Path) -> Predictor:
     """A policy for a cell, trained unless that has been done."""
     chosen = {"env_kwargs": {**TRAINED_WITH, "dataset": str(dataset)}}
-    timesteps = timesteps_of(updates, Recipe.of(algo, ENV_ID, seed).hyperparameters)
-    return train_or_load(algo, ENV_ID, seed, timesteps, folder, chosen)
+    return train_or_load(Recipe.of(algo, ENV_ID, seed, updates=updates, hyperparameters=chosen), folder)
 
 
 def scored(cell: str, every: int, calibrator: Estimator, model: RecordModel) -> pd.DataFrame:

@@ -35,7 +35,7 @@ from battery_env.loads import Load, RandomPiecewise, RandomWalk, constant
 from battery_env.plotting import coloured, new_figure
 from battery_env.records import Record, drawn
 from battery_env.records.discharge import BUNDLED_CELLS, NASA_CITATION, Discharge, load_nasa_discharges
-from benchmarks.study import Study, command_line, markdown, natural, positive
+from benchmarks.study import Cell, Study, command_line, markdown, natural, positive, table_of
 
 CUT_OFF_V = 2.7
 #: Shares of a discharge, in time, after which its end is forecast.
@@ -196,23 +196,23 @@ def simulated_rows(kind: str, seed: int, fit: CellFit, count: int) -> list[dict[
 
 def end_of_discharge_table(rows: pd.DataFrame) -> pd.DataFrame:
     """The summary of all forecasts of discharges."""
-    table = []
-    for (load, data, method), part in rows.groupby(["load", "data", "method"], sort=False):
-        error = part.assign(error=part["error_percent"].abs()).groupby("share")["error"]
-        covered = 100.0 * part.groupby("share")["covered"].mean()
-        table.append(
-            {
-                "load": load,
-                "data": data,
-                "method": method,
-                "mean error at 25 / 50 / 75 % (%)": " / ".join(f"{value:.1f}" for value in error.mean()),
-                "worst (%)": " / ".join(f"{value:.0f}" for value in error.max()),
-                "inside 90 % (%)": "" if covered.isna().any() else " / ".join(f"{value:.0f}" for value in covered),
-                "width (%)": "" if covered.isna().any() else f"{part['width_percent'].median():.1f}",
-                "forecasts": len(part),
-            }
-        )
-    return pd.DataFrame(table)
+    rows = rows.assign(error=rows["error_percent"].abs(), inside=100.0 * rows["covered"])
+
+    def at_shares(column: str, how: str, decimals: int) -> Callable[[pd.DataFrame], str]:
+        def said(part: pd.DataFrame) -> str:
+            values = part.groupby("share")[column].agg(how)
+            return "" if values.isna().any() else " / ".join(f"{value:.{decimals}f}" for value in values)
+
+        return said
+
+    cells: dict[str, Cell] = {
+        "mean error at 25 / 50 / 75 % (%)": at_shares("error", "mean", 1),
+        "worst (%)": at_shares("error", "max", 0),
+        "inside 90 % (%)": at_shares("inside", "mean", 0),
+        "width (%)": ("width_percent", lambda widths: "" if widths.isna().any() else f"{widths.median():.1f}"),
+        "forecasts": len,
+    }
+    return table_of(rows, ["load", "data", "method"], cells)
 
 
 def life_rows(cell: str, life: Life) -> list[dict[str, object]]:

@@ -134,6 +134,11 @@ def share_with_range(values: pd.Series) -> str:
     return f"{percent.mean():.0f} %{spread}"
 
 
+def count_of(values: pd.Series) -> str:
+    """How many of a few are true."""
+    return f"{values.sum()} of {len(values)}"
+
+
 def side_by_side(values: Iterable[float]) -> str:
     """Each of a few numbers."""
     return " / ".join(digits(value) for value in values)
@@ -142,6 +147,37 @@ def side_by_side(values: Iterable[float]) -> str:
 def markdown(rows: pd.DataFrame | Sequence[Mapping[str, Any]]) -> str:
     """A table for readers."""
     return pd.DataFrame(rows).to_markdown(index=False, disable_numparse=True) + "\n"
+
+
+#: What a cell says of rows of results, or of one of their columns; of a single row also a template with names of columns.
+Cell = tuple[str, Callable[[Any], Any]] | Callable[[Any], Any] | str
+
+
+def table_of(rows: pd.DataFrame, by: Sequence[str] | Mapping[str, str], cells: Mapping[str, Cell]) -> pd.DataFrame:
+    """
+    A table with a row for each group of rows, in their order.
+
+    :param rows: of results
+    :param by: columns whose values name a group, and what readers call each if it is another name
+    :param cells: what is said of a group, by title
+    """
+    titles = by if isinstance(by, Mapping) else dict(zip(by, by, strict=True))
+    groups = rows.groupby(list(titles), sort=False, dropna=False)
+    return pd.DataFrame([dict(zip(titles.values(), keys, strict=True)) | _said(cells, group) for keys, group in groups])
+
+
+def row_by_row(rows: pd.DataFrame, cells: Mapping[str, Cell]) -> pd.DataFrame:
+    """A table with what is said of each row, by title."""
+    return pd.DataFrame([_said(cells, row) for row in rows.to_dict("records")])
+
+
+def _said(cells: Mapping[str, Cell], of: Any) -> dict[str, Any]:
+    def said(cell: Cell) -> Any:
+        if isinstance(cell, str):
+            return cell.format_map(of)
+        return cell[1](of[cell[0]]) if isinstance(cell, tuple) else cell(of)
+
+    return {title: said(cell) for title, cell in cells.items()}
 
 
 def natural(text: str) -> int:

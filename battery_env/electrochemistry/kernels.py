@@ -430,39 +430,6 @@ def advance_batch(
 
 
 @compiled
-def run_on_batch(
-    load: FloatArray,
-    q: FloatArray,
-    r_o: FloatArray,
-    dt: float,
-    power: bool,
-    thermal: bool,
-    packed: PackedConstants,
-    state: FloatArray,
-    voltage: FloatArray,
-    current: FloatArray,
-) -> None:
-    # load: shape (cells or 1, steps). Fills voltage, before each step and after the last, shape (steps + 1, cells), and
-    # current, over each step, shape (steps, cells); state goes on to the end. Cells that run empty go on without a voltage
-    shared = load.shape[0] == 1
-    block = np.empty(BLOCK_SIZE)
-    for first in range(0, state.shape[0], BLOCK):
-        cells = min(BLOCK, state.shape[0] - first)
-        fill_block(block, first, cells, state, q, q, r_o, packed.constants)  # the load comes below
-        for k in range(load.shape[1]):
-            for j in range(cells):
-                block[LOAD * BLOCK + j] = load[0 if shared else first + j, k]
-            step_of_block(block, cells, dt, power, True, thermal, False, packed.polynomial_n, packed.polynomial_p)
-            for j in range(cells):
-                voltage[k, first + j] = block[VOLTAGE + j]
-                current[k, first + j] = block[LOAD * BLOCK + j]
-        voltage_of_block(block, cells, False, packed.polynomial_n, packed.polynomial_p)
-        for j in range(cells):
-            voltage[-1, first + j] = block[VOLTAGE + j]
-        states_of_block(block, first, cells, state)
-
-
-@compiled
 def roll_out(
     load: FloatArray,
     q: float,

@@ -21,6 +21,14 @@ def test_the_study_writes_its_tables(monkeypatch, tmp_path, capsys):
     assert "| B0005" in capsys.readouterr().out and (tmp_path / "summary.md").stat().st_size > 0
 
 
+def test_published_intervals_of_nine_of_ten_hold_where_life_and_load_are_known():
+    rows = pd.read_csv("docs/results/forecasts/discharges.csv").query("method == @forecasts.FORECAST")
+    covered = rows.groupby(["data", "load"])["covered"].mean()
+    assert len(covered) == 8 and covered.min() > 0.85
+    # they are no wider than the end may be off: at the load of a life by little
+    assert rows[rows["load"] == "2 A"]["width_percent"].max() < 10.0 and rows["width_percent"].median() < 15.0
+
+
 def test_the_life_that_remains_is_compared_with_the_measured_one(tmp_path):
     published = pd.read_csv("docs/results/real_cells/discharges.csv")
     # the second half of its life
