@@ -375,11 +375,13 @@ class CheckpointCallback(BaseCallback):
             for leftover in (part, old):
                 shutil.rmtree(leftover, ignore_errors=True)
             part.mkdir(parents=True)
-            self.model.save(part / "model")
+            with replacing(part / "model.zip") as file:
+                self.model.save(file)
             if isinstance(self.model, OffPolicyAlgorithm):
-                self.model.save_replay_buffer(part / "replay_buffer.pkl")
+                with replacing(part / "replay_buffer.pkl") as file:
+                    self.model.save_replay_buffer(file)
             progress = {"resumed": self.resumed, "seconds": time.perf_counter() - self._start}
-            (part / "progress.json").write_text(json.dumps(progress), encoding="utf-8")
+            write_json(part / "progress.json", progress)
             if self.folder.exists():
                 os.replace(self.folder, old)
             os.replace(part, self.folder)

@@ -30,6 +30,9 @@ from battery_env.lab.workers import attempt, in_order, workers
 from battery_env.records.discharge import load_nasa_discharges
 from tests.faults import a_full_disk, squared_unless_it_ends_its_process
 
+# A file that is not closed
+pytestmark = pytest.mark.filterwarnings("error::ResourceWarning", "error::pytest.PytestUnraisableExceptionWarning")
+
 ROWS = 12
 
 
