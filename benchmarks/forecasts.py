@@ -27,7 +27,7 @@ from tqdm import tqdm
 
 from battery_env.electrochemistry import UNCERTAIN_CONSTANTS, simulate
 from battery_env.electrochemistry.ends import BAND
-from battery_env.estimators.cell_fit import CellFit, fit_cell
+from battery_env.estimators import CellFit, fit_cell
 from battery_env.lab.life import Life, track_life
 from battery_env.lab.running import forecast_end
 from battery_env.lab.settings import Settings

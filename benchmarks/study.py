@@ -134,6 +134,11 @@ def share_with_range(values: pd.Series) -> str:
     return f"{percent.mean():.0f} %{spread}"
 
 
+def share_in_percent(values: pd.Series) -> str:
+    """Which share of them is true."""
+    return f"{100 * values.mean():.0f}"
+
+
 def count_of(values: pd.Series) -> str:
     """How many of a few are true."""
     return f"{values.sum()} of {len(values)}"

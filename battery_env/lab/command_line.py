@@ -37,8 +37,9 @@ from typing import Any, Literal, ParamSpec
 
 import numpy as np
 
-from battery_env.estimators.cell_fit import CellFit, fit_cell, read_cell
+from battery_env.estimators.cell_fit import CellFit, read_cell
 from battery_env.estimators.diagnosis.rest import InitialSoc
+from battery_env.estimators.joint_fit import fit_cell
 from battery_env.files import check_new, finite_or_none
 from battery_env.lab.many import calibrate_all
 from battery_env.lab.readers.columns import FileFormat

@@ -15,7 +15,8 @@ import pytest
 import battery_env
 from battery_env.electrochemistry import NEW_CELL, CellParameters, Trajectory, initial_state, simulate
 from battery_env.electrochemistry.ends import MEMORY_SHARE
-from battery_env.estimators.cell_fit import fit_cell, read_cell
+from battery_env.estimators import fit_cell
+from battery_env.estimators.cell_fit import read_cell
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.lab import many
 from battery_env.lab.calibrate import calibrate as calibrated

@@ -132,15 +132,15 @@ class Condition(IntEnum):
     EMPTY = "The model cell is empty before the record ends: its q_max is too small for this record."
     FEW = "These are too few {of} to tell the noise. Record on or more often{or_else}."
     # the fit
+    IMPLAUSIBLE = (
+        "No cell of this kind has such a q_max. Check that time is in s and current in A, and that the record is of one "
+        "cell; for a cell of another size fit constants (fit_cell, --cell)."
+    )
     Q_AT_BOUND = _AT_BOUND.format("q_max")
     R_AT_BOUND = _AT_BOUND.format("R_o")
     CHARGE_DIFFERS = (
         "The charge that moves in the last step, {moved_C:.4g} C, is not that of the current, {drawn_C:.4g} C: check time, "
         "current and their units."
-    )
-    IMPLAUSIBLE = (
-        "No cell of this kind has such a q_max. Check that time is in s and current in A, and that the record is of one "
-        "cell; for a cell of another size fit constants (fit_cell, --cell)."
     )
     MISFIT = (
         "The voltage of the model is farther off than noise and mismatch_V explain: fit constants to this cell (fit_cell, "
