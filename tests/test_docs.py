@@ -204,6 +204,20 @@ def test_every_picture_has_a_caption(page):
         pytest.fail(f"a line in italics has to follow {picture.strip()}: what to see, who made it, how many seeds")
 
 
+@pytest.mark.parametrize("name", STYLED)
+def test_tables_of_the_guide_fit_the_column_of_the_site(name):
+    for row in published(ROOT / f"{name}.md"):
+        assert len(row) <= 6, row
+
+
+def test_reports_are_short_enough_to_be_read():
+    words = 0
+    for page in REPORTS:
+        words += sum(len(sentence.split()) for sentence in prose(page))
+        words += sum(len(cell.split()) for row in published(page) for cell in row if not re.fullmatch(":?-+:?", cell))
+    assert words < 15_500
+
+
 @pytest.mark.parametrize("page", REPORTS, ids=lambda page: page.name)
 def test_a_report_answers_before_it_details(page):
     text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
