@@ -10,6 +10,7 @@ import battery_env.files
 import sb3_lac.files
 from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.estimators.kalman.filter import ExtendedKalmanFilter
+from battery_env.lab.running import read_load
 from battery_env.loads import constant
 from battery_env.plotting import save_figure
 from battery_env.policies.estimator import PolicyEstimator
@@ -251,3 +252,20 @@ def test_a_batch_is_loaded_as_a_whole_and_fast(tmp_path):
     with pytest.raises(ValueError, match=r"cells\.npz: cell 2: its variance is none that a discharge leads to"):
         other.load(file)
     assert all(each._cells["seen"]["samples"][0] == 0 for each in other.estimators)
+
+
+@pytest.mark.parametrize(
+    "content", [b"[" * 100_000, b"\xff", b"PK\3\4" + bytes(100), b'{"constants": {"kn": 1' + 400 * b"0" + b"}}"]
+)
+def test_no_content_of_a_file_of_constants_or_of_a_load_is_more_than_an_error(content, tmp_path):
+    described = b'{"format": "battery_env.CellParameters", "version": 1, ' + content[1:]
+    for number, text in enumerate((content, described if content.startswith(b"{") else content)):
+        path = tmp_path / f"{number}.json"
+        path.write_bytes(text)
+        with pytest.raises(ValueError, match=path.name):
+            CellParameters.from_json(path)
+    for suffix in (".csv", ".csv.gz", ".zip"):
+        path = tmp_path / f"load{suffix}"
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=path.name):
+            read_load(path)
