@@ -2,6 +2,8 @@
 PYTHON ?= python3
 # the version that the published results were measured with; any torch >= 2.8 does
 TORCH ?= torch==2.13.0
+# where it is from: TORCH_INDEX=https://download.pytorch.org/whl/cpu is the build without CUDA
+TORCH_INDEX ?=
 VENV := .venv
 BIN := $(VENV)/bin
 SOURCES := sb3_lac battery_env benchmarks tests examples docs
@@ -24,7 +26,7 @@ $(VENV)/.installed: setup.cfg pyproject.toml battery_env/setup.cfg battery_env/p
 	@$(call logged,test -x $(BIN)/python || $(PYTHON) -m venv $(VENV))
 	@$(call logged,$(BIN)/python -m pip install --upgrade pip)
 	@echo "installing $(TORCH)"
-	@$(call logged,$(BIN)/python -m pip install "$(TORCH)")
+	@$(call logged,$(BIN)/python -m pip install $(addprefix --index-url ,$(TORCH_INDEX)) "$(TORCH)")
 	@echo "installing battery_env and sb3_lac, with all extras"
 	@$(call logged,$(BIN)/python -m pip install --editable ./battery_env --editable ".[zoo$(comma)peers$(comma)onnx$(comma)dev$(comma)docs]")
 	@touch $@

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 #: What is packed may become so large, or so many times as large as it is.
-LARGEST_UNPACKED_BYTES, MOST_UNPACKED = 1 << 28, 100
+LARGEST_UNPACKED_BYTES, MOST_UNPACKED = 1 << 28, 40
 
 
 class WrongFormatError(ValueError):

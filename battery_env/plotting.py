@@ -60,7 +60,12 @@ _STRETCHES = 2000
 _FEW_SWITCHES = 60
 # A figure of a discharge in progress goes on for at most this many times its record, or its expected end.
 _LONGEST_SHOWN = 1.5
-_LIFE_COLUMNS = {"q_mobile_C": LABELS["q_mobile"], "r_o_ohm": LABELS["r_o"], "drawn_Ah": "charge drawn (Ah)"}
+# Title of the axis of each panel of a life, in the units of a lab, with the scale to them.
+_LIFE_COLUMNS = {
+    "q_mobile_C": (f"{Q_MOBILE.symbol} (Ah)", 1.0 / 3600.0),
+    "r_o_ohm": (rf"{R_O.symbol} (m$\Omega$)", 1e3),
+    "drawn_Ah": ("charge drawn (Ah)", 1.0),
+}
 # Distance of the bars of cells, as a share of the axis.
 _BAR_STEP = 0.02
 # q_mobile follows the capacity if their correlation is this close over so many discharges or more.
@@ -76,6 +81,11 @@ def new_figure(width: float, height: float) -> Figure:
     figure = Figure(figsize=(width, height), dpi=150, layout="constrained")
     FigureCanvasAgg(figure)
     return figure
+
+
+def literal(text: str) -> str:
+    """A text that nothing in is taken for mathematics, as a name with dollars would be."""
+    return text.replace("$", r"\$")
 
 
 def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
@@ -282,7 +292,7 @@ def plot_cell_fit(fit: CellFit, discharges: Sequence[Record]) -> Figure:
             upper.plot(*_drawn_points(since_s, model_V), style, color=colour, lw=1.3, label=f"model, constants {name} the fit")
             lower.plot(*_drawn_points(since_s, error_mV), style, color=colour, lw=1.1)
         meta = getattr(record, "meta", {})
-        name = f"{meta['cell']}:{meta['cycle']}, " if {"cell", "cycle"} <= set(meta) else ""
+        name = literal(f"{meta['cell']}:{meta['cycle']}, ") if {"cell", "cycle"} <= set(meta) else ""
         upper.set_title(f"{name}RMSE {errors_mV[0]:.0f} → {errors_mV[1]:.0f} mV", fontsize=9)
         lower.set_xlabel("time (s)")
     panels[0, 0].set_ylabel("voltage (V)")
@@ -330,6 +340,8 @@ def plot_life(table: pd.DataFrame) -> Figure:
         raise ValueError(
             f"a life is drawn for one method, got {' and '.join(table['method'].unique())}: their r_o differ by up to a third"
         )
+    scales = {f"{sd}{column}": scale for column, (_, scale) in _LIFE_COLUMNS.items() for sd in ("", "sd_")}
+    table = table.assign(**{column: scale * table[column] for column, scale in scales.items() if column in table})
     figure = new_figure(6.8, 6.8)
     panels = figure.subplots(3, 1, sharex=True)
     one_each = "cell" not in table or not table["cell"].duplicated().any()
@@ -345,12 +357,12 @@ def plot_life(table: pd.DataFrame) -> Figure:
         settled = rows[rows["settled"].astype(bool)]
         for axes, column in zip(panels, _LIFE_COLUMNS, strict=True):
             axes.plot(rows[column], color=colour, lw=0.8, alpha=0.6)
-            axes.plot(settled[column], "o", ms=2.6, color=colour, label=name)
+            axes.plot(settled[column], "o", ms=2.6, color=colour, label=literal(str(name)))
             axes.plot(rows[column].drop(settled.index), "o", ms=3.2, mfc="white", mec=colour, mew=0.8)
             if len(settled) and f"sd_{column}" in settled:
                 reach = 2.0 * settled[f"sd_{column}"].median()
                 axes.errorbar(bar_x, settled[column].iloc[-1], reach, fmt="none", color=colour, capsize=2.5, lw=1.2)
-    for axes, (column, label) in zip(panels, _LIFE_COLUMNS.items(), strict=True):
+    for axes, (column, (label, _)) in zip(panels, _LIFE_COLUMNS.items(), strict=True):
         axes.set_ylabel(label)
         if (sd := f"sd_{column}") in table:
             values, reach = table[column].to_numpy(dtype=np.float64), 2.0 * table[sd].to_numpy(dtype=np.float64)
@@ -469,7 +481,7 @@ def plot_sensitivities(slopes: Mapping[str, Sensitivities]) -> Figure:
         upper.plot(slope.time_s, 1e6 * slope.by_q_mobile_V_per_C, color=colour, lw=1.3, label=name)
         lower.plot(slope.time_s, slope.by_r_o_A, color=colour, lw=1.3, label=name)
     upper.set_yscale("symlog", linthresh=1e6 * _LINEAR_SLOPE_V_PER_C, linscale=0.5)
-    upper.set_ylabel(r"$\partial V / \partial q^{max}$ ($\mu$V/C)")
+    upper.set_ylabel(r"$\partial V / \partial q_{max}$ ($\mu$V/C)")
     upper.legend(frameon=False, fontsize=9)
     lower.set(xlabel="time (s)", ylabel=r"$\partial V / \partial R_o$ (mV/m$\Omega$)")
     return _finished(figure, upper, lower)

@@ -55,7 +55,7 @@ from benchmarks.study import (
     positive,
     run_named,
 )
-from benchmarks.training import Recipe, timesteps_of, train_or_load
+from benchmarks.training import Recipe, train_or_load
 
 ENV_ID = "BatteryVoltageJoint-v0"
 NOISE_V = 0.005
@@ -413,8 +413,8 @@ def parts(name: str, n: int) -> list[dict[str, Any]]:
 
 def policy_part(algo: str, seed: int, updates: int, discharges: int, folder: Path) -> Tables:
     """Train a policy, unless that has been done, and score it under all conditions."""
-    timesteps = timesteps_of(updates, Recipe.of(algo, ENV_ID, seed).hyperparameters)
-    model = train_or_load(algo, ENV_ID, seed, timesteps, folder / "models", {"env_kwargs": TRAINED_WITH})
+    recipe = Recipe.of(algo, ENV_ID, seed, updates=updates, hyperparameters={"env_kwargs": TRAINED_WITH})
+    model = train_or_load(recipe, folder / "models")
     estimator, scores = PolicyEstimator(model, ENV_ID, **OPTIONS), []
     for condition in _POLICIES.conditions:
         data = _held_out(condition, PARAMETER_NAMES, discharges)

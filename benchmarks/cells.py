@@ -30,8 +30,8 @@ from scipy.stats import spearmanr
 from battery_env.arrays import FloatArray
 from battery_env.electrochemistry import NEW_CELL
 from battery_env.estimates import Estimate
-from battery_env.estimators import Estimator, ExtendedKalmanFilter, LeastSquares
-from battery_env.estimators.cell_fit import UNFITTED_MISMATCH_V, CellFit, fit_cell
+from battery_env.estimators import CellFit, Estimator, ExtendedKalmanFilter, LeastSquares, fit_cell
+from battery_env.estimators.cell_fit import UNFITTED_MISMATCH_V
 from battery_env.loads import recorded
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.plotting import COLOUR_OF, COLOURS, LABELS, coloured, new_figure, plot_cell_fit, title_of_life
@@ -41,8 +41,20 @@ from battery_env.records.model import RecordModel
 from battery_env.trajectories import TrajectoryDataset
 from benchmarks import pretrained
 from benchmarks.calibrators import ENV_ID, SHIPPED, Follow
-from benchmarks.study import Study, Tables, command_line, digest_of, markdown, natural, positive, run_named
-from benchmarks.training import Recipe, timesteps_of, train_or_load
+from benchmarks.study import (
+    Cell,
+    Study,
+    Tables,
+    command_line,
+    digest_of,
+    markdown,
+    natural,
+    positive,
+    run_named,
+    share_in_percent,
+    table_of,
+)
+from benchmarks.training import Recipe, train_or_load
 
 CUT_OFF_V = 2.7
 #: Shares of a discharge, in time, after which its end is predicted.
@@ -148,68 +160,65 @@ def life_part(cell: str) -> Tables:
 
 def whole_table(whole: pd.DataFrame) -> pd.DataFrame:
     """The summary of whole discharges."""
-    rows = []
-    for cell, part in whole.groupby("cell"):
-        first, last = part.iloc[0], part.iloc[-1]
-        ratio = part["q_mobile_C"] / (3600.0 * part["capacity_Ah"])
-        error_s, rmse_mV = part["eod_error_s"].abs(), 1e3 * part["voltage_rmse_V"]
-        new_error_s = part["new_cell_eod_error_s"]
-        rows.append(
-            {
-                "cell": cell,
-                "discharges": len(part),
-                "voltage RMSE, median / max (mV)": f"{rmse_mV.median():.0f} / {rmse_mV.max():.0f}",
-                "mean abs error of EOD (s)": f"{error_s.mean():.1f}",
-                "(%)": f"{100 * (error_s / part['duration_s']).mean():.2f}",
-                "q_mobile, first -> last (C)": f"{first['q_mobile_C']:.0f} -> {last['q_mobile_C']:.0f}",
-                "q_mobile / (3600 capacity)": f"{ratio.min():.3f} .. {ratio.max():.3f}",
-                "corr(q_mobile, capacity)": f"{part['q_mobile_C'].corr(part['capacity_Ah']):.4f}",
-                "r_o, first -> last (ohm)": f"{first['r_o_ohm']:.3f} -> {last['r_o_ohm']:.3f}",
-                "Spearman(cycle, r_o)": f"{spearmanr(part['cycle'], part['r_o_ohm'])[0]:.3f}",
-                "settled (%)": f"{100 * part['settled'].mean():.0f}",
-                "new cell's parameters: RMSE, median (mV)": f"{1e3 * part['new_cell_voltage_rmse_V'].median():.0f}",
-                "and error of EOD, first / last (s)": f"{new_error_s.iloc[0]:+.0f} / {new_error_s.iloc[-1]:+.0f}",
-            }
-        )
-    return pd.DataFrame(rows)
+    shown = whole.assign(
+        error_s=whole["eod_error_s"].abs(),
+        error_percent=100 * whole["eod_error_s"].abs() / whole["duration_s"],
+        rmse_mV=1e3 * whole["voltage_rmse_V"],
+        ratio=whole["q_mobile_C"] / (3600.0 * whole["capacity_Ah"]),
+    )
+    cells: dict[str, Cell] = {
+        "discharges": len,
+        "voltage RMSE, median / max (mV)": ("rmse_mV", lambda mV: f"{mV.median():.0f} / {mV.max():.0f}"),
+        "mean abs error of EOD (s)": ("error_s", lambda errors: f"{errors.mean():.1f}"),
+        "(%)": ("error_percent", lambda errors: f"{errors.mean():.2f}"),
+        "q_mobile, first -> last (C)": ("q_mobile_C", lambda C: f"{C.iloc[0]:.0f} -> {C.iloc[-1]:.0f}"),
+        "q_mobile / (3600 capacity)": ("ratio", lambda ratio: f"{ratio.min():.3f} .. {ratio.max():.3f}"),
+        "corr(q_mobile, capacity)": lambda part: f"{part['q_mobile_C'].corr(part['capacity_Ah']):.4f}",
+        "r_o, first -> last (ohm)": ("r_o_ohm", lambda ohm: f"{ohm.iloc[0]:.3f} -> {ohm.iloc[-1]:.3f}"),
+        "Spearman(cycle, r_o)": lambda part: f"{spearmanr(part['cycle'], part['r_o_ohm'])[0]:.3f}",
+        "settled (%)": ("settled", share_in_percent),
+        "new cell's parameters: RMSE, median (mV)": ("new_cell_voltage_rmse_V", lambda V: f"{1e3 * V.median():.0f}"),
+        "and error of EOD, first / last (s)": ("new_cell_eod_error_s", lambda s: f"{s.iloc[0]:+.0f} / {s.iloc[-1]:+.0f}"),
+    }
+    return table_of(shown, ["cell"], cells)
 
 
 def progress_table(progress: pd.DataFrame, whole: pd.DataFrame) -> pd.DataFrame:
     """The summary of discharges in progress."""
     known = progress.merge(whole[["cell", "cycle", "q_mobile_C"]], on=["cell", "cycle"], suffixes=("", "_whole"))
-    rows = []
-    for (cell, _, method), part in known.groupby(["cell", "share", "method"]):
-        error = part["eod_error_percent"].abs()
-        misses = (part["q_mobile_C"] - part["q_mobile_C_whole"]).abs()
-        rows.append(
-            {
-                "cell": cell,
-                "seen (%)": f"{100 * part['share'].iloc[0]:.0f}",
-                "method": method,
-                "mean abs error of EOD (%)": f"{error.mean():.1f}",
-                "worst (%)": f"{error.max():.1f}",
-                "stated sd of q_mobile (%)": f"{100 * (part['sd_q_mobile_C'] / part['q_mobile_C']).median():.1f}",
-                "q_mobile within 2 sd (%)": f"{100 * (misses <= 2.0 * part['sd_q_mobile_C']).mean():.0f}",
-                "settled (%)": f"{100 * part['settled'].mean():.0f}",
-            }
-        )
-    return pd.DataFrame(rows)
+    known = known.sort_values(["cell", "share", "method"], kind="stable")
+    shown = known.assign(
+        seen=known["share"].map(lambda share: f"{100 * share:.0f}"),
+        error=known["eod_error_percent"].abs(),
+        sd_percent=100 * known["sd_q_mobile_C"] / known["q_mobile_C"],
+        within=(known["q_mobile_C"] - known["q_mobile_C_whole"]).abs() <= 2.0 * known["sd_q_mobile_C"],
+    )
+    cells: dict[str, Cell] = {
+        "mean abs error of EOD (%)": ("error", lambda errors: f"{errors.mean():.1f}"),
+        "worst (%)": ("error", lambda errors: f"{errors.max():.1f}"),
+        "stated sd of q_mobile (%)": ("sd_percent", lambda percent: f"{percent.median():.1f}"),
+        "q_mobile within 2 sd (%)": ("within", share_in_percent),
+        "settled (%)": ("settled", share_in_percent),
+    }
+    return table_of(shown, {"cell": "cell", "seen": "seen (%)", "method": "method"}, cells)
 
 
 def repetition_table(whole: pd.DataFrame) -> pd.DataFrame:
     """How much a discharge is like the one before: what a prior can rest on, and what it has to compete with."""
-    rows = []
-    for cell, part in whole.groupby("cell"):
-        move = 100.0 * part["q_mobile_C"].pct_change()
-        late = 100.0 * (part["duration_s"].shift() / part["duration_s"] - 1.0).abs()
-        rows.append(
-            {
-                "cell": cell,
-                "step of q_mobile, rms / most (%)": f"{np.sqrt((move**2).mean()):.1f} / {move.abs().max():.1f}",
-                "EOD after as long as the previous one: mean / worst error (%)": f"{late.mean():.1f} / {late.max():.1f}",
-            }
-        )
-    return pd.DataFrame(rows)
+
+    def steps(q_mobile_C: pd.Series) -> str:
+        move = 100.0 * q_mobile_C.pct_change()
+        return f"{np.sqrt((move**2).mean()):.1f} / {move.abs().max():.1f}"
+
+    def late(duration_s: pd.Series) -> str:
+        percent = 100.0 * (duration_s.shift() / duration_s - 1.0).abs()
+        return f"{percent.mean():.1f} / {percent.max():.1f}"
+
+    cells: dict[str, Cell] = {
+        "step of q_mobile, rms / most (%)": ("q_mobile_C", steps),
+        "EOD after as long as the previous one: mean / worst error (%)": ("duration_s", late),
+    }
+    return table_of(whole, ["cell"], cells)
 
 
 def plot_life(whole: pd.DataFrame) -> Figure:
@@ -331,24 +340,21 @@ def fit_part(trained: str, tested: str, every: int) -> Tables:
 
 def fit_table(scores: pd.DataFrame) -> pd.DataFrame:
     """The table for readers."""
-    rows = []
-    for (cell, constants), part in scores.groupby(["cell", "constants"], sort=False):
-        rmse_mV = 1e3 * part["voltage_rmse_V"]
-        row = {
-            "tested on": cell,
-            "constants": constants,
-            "voltage RMSE, median / max (mV)": f"{rmse_mV.median():.0f} / {rmse_mV.max():.0f}",
-        }
-        for share in SHARES:
-            percent = f"{100 * share:.0f}"
-            error = part[f"eod_error_percent_at_{percent}_percent"].abs()
-            row[f"EOD at {percent} %: mean / worst error (%)"] = f"{error.mean():.1f} / {error.max():.0f}"
-            row[f"settled at {percent} % (%)"] = f"{100 * part[f'settled_at_{percent}_percent'].mean():.0f}"
-            row[f"q within 2 sd at {percent} % (%)"] = f"{100 * part[f'within_2_sd_at_{percent}_percent'].mean():.0f}"
-        row["whole: settled (%)"] = f"{100 * part['settled'].mean():.0f}"
-        row["corr(q_mobile, capacity)"] = f"{part['q_mobile_C'].corr(part['capacity_Ah']):.4f}"
-        rows.append(row)
-    return pd.DataFrame(rows)
+
+    def errors_of(error_percent: pd.Series) -> str:
+        return f"{error_percent.abs().mean():.1f} / {error_percent.abs().max():.0f}"
+
+    def rmse_of(rmse_V: pd.Series) -> str:
+        return f"{1e3 * rmse_V.median():.0f} / {1e3 * rmse_V.max():.0f}"
+
+    cells: dict[str, Cell] = {"voltage RMSE, median / max (mV)": ("voltage_rmse_V", rmse_of)}
+    for percent in (f"{100 * share:.0f}" for share in SHARES):
+        cells[f"EOD at {percent} %: mean / worst error (%)"] = (f"eod_error_percent_at_{percent}_percent", errors_of)
+        cells[f"settled at {percent} % (%)"] = (f"settled_at_{percent}_percent", share_in_percent)
+        cells[f"q within 2 sd at {percent} % (%)"] = (f"within_2_sd_at_{percent}_percent", share_in_percent)
+    cells["whole: settled (%)"] = ("settled", share_in_percent)
+    cells["corr(q_mobile, capacity)"] = lambda part: f"{part['q_mobile_C'].corr(part['capacity_Ah']):.4f}"
+    return table_of(scores, {"cell": "tested on", "constants": "constants"}, cells)
 
 
 def fit_of_another(arguments: Sequence[str]) -> None:
@@ -423,8 +429,7 @@ NEW_CELLS: dict[str, Callable[[], Estimator]] = {
 def trained(algo: str, seed: int, updates: int, dataset: Path, folder: Path) -> Predictor:
     """A policy for a cell, trained unless that has been done."""
     chosen = {"env_kwargs": {**TRAINED_WITH, "dataset": str(dataset)}}
-    timesteps = timesteps_of(updates, Recipe.of(algo, ENV_ID, seed).hyperparameters)
-    return train_or_load(algo, ENV_ID, seed, timesteps, folder, chosen)
+    return train_or_load(Recipe.of(algo, ENV_ID, seed, updates=updates, hyperparameters=chosen), folder)
 
 
 def scored(cell: str, every: int, calibrator: Estimator, model: RecordModel) -> pd.DataFrame:

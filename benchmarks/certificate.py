@@ -28,7 +28,7 @@ from tqdm import tqdm
 
 from battery_env.plotting import COLOURS
 from benchmarks.control import CERTIFICATE_ENVS, DISTURBANCES, SETTLED_SHARE, STATEMENTS, controllers, factors, judge
-from benchmarks.study import Study, command_line, digits, markdown, natural, new_panels
+from benchmarks.study import Cell, Study, command_line, count_of, digits, markdown, natural, new_panels, table_of
 from benchmarks.training import Recipe, train_or_load
 from sb3_lac.envs import LinearCostEnv
 
@@ -55,7 +55,7 @@ def policies(chosen: argparse.Namespace, env_id: str) -> list[tuple[str, int | N
                 # a share of what is learned: nothing is before learning_starts
                 steps = starts + round(fraction * (whole - starts))
                 name = algo.upper() if fraction == 1 else f"{algo.upper()}, {100 * fraction:g} % of the updates"
-                found.append((name, seed, train_or_load(algo, env_id, seed, steps, chosen.out / "models")))
+                found.append((name, seed, train_or_load(Recipe.of(algo, env_id, seed, steps), chosen.out / "models")))
     return found
 
 
@@ -90,24 +90,25 @@ def report(table: pd.DataFrame) -> str:
     """The certificates side by side, as Markdown. Numbers of several seeds are their median (least to most of a seed)."""
     text = "The largest feasible `alpha3` of the exact function, and in brackets the largest L / c:\n\n"
     text += markdown(feasible_alpha3())
+    of_critics = table["function"] == "critic"
+    table = table.assign(policy=table["policy"] + np.where(of_critics, " (critic)", ""))
+
+    def bound_of(group: pd.DataFrame) -> str:
+        low, high = group["cost_bound_low"], group["cost_bound_high"]
+        interval = f" [{digits(low.item(), 3)}, {digits(high.item(), 3)}]" if len(group) == 1 else ""
+        return _over_policies(group["cost_bound"]) + interval
+
+    cells: dict[str, Cell] = {
+        "holds": ("holds", count_of),
+        f"settles at {SETTLED_SHARE:g} of the start": ("settles", count_of),
+        "cost at the start": ("start_cost", _over_policies),
+        "mean cost settles below": bound_of,
+        "its alpha3": ("cost_bound_alpha3", _over_policies),
+        "alpha3 without residual": ("largest_feasible_alpha3", _over_policies),
+        **{f"{name.replace('_', ' ')}, at least": (f"{name}_at_least", _over_policies) for name in STATEMENTS},
+    }
     for env_id, of_env in table.groupby("env", sort=False):
-        rows = []
-        for (policy, function), of_policy in of_env.groupby(["policy", "function"], sort=False):
-            bound, low, high = (of_policy[f"cost_bound{end}"] for end in ("", "_low", "_high"))
-            row = {
-                "policy": f"{policy}" + (" (critic)" if function == "critic" else ""),
-                "holds": f"{of_policy['holds'].sum()} of {len(of_policy)}",
-                f"settles at {SETTLED_SHARE:g} of the start": f"{of_policy['settles'].sum()} of {len(of_policy)}",
-                "cost at the start": _over_policies(of_policy["start_cost"]),
-                "mean cost settles below": _over_policies(bound)
-                + (f" [{digits(low.item(), 3)}, {digits(high.item(), 3)}]" if len(of_policy) == 1 else ""),
-                "its alpha3": _over_policies(of_policy["cost_bound_alpha3"]),
-                "alpha3 without residual": _over_policies(of_policy["largest_feasible_alpha3"]),
-            }
-            for statement in STATEMENTS:
-                row[f"{statement.replace('_', ' ')}, at least"] = _over_policies(of_policy[f"{statement}_at_least"])
-            rows.append(row)
-        text += f"\n`{env_id}`:\n\n" + markdown(pd.DataFrame(rows))
+        text += f"\n`{env_id}`:\n\n" + markdown(table_of(of_env, ["policy"], cells))
     return text
 
 

@@ -30,8 +30,6 @@ with the hyperparameters of all of them in one table.
 from __future__ import annotations
 
 import ast
-import contextlib
-import io
 import itertools
 import json
 import shutil
@@ -39,7 +37,7 @@ import sys
 import tempfile
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import asdict, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -47,14 +45,14 @@ import gymnasium as gym
 import pandas as pd
 from filelock import FileLock, Timeout
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
-from stable_baselines3.common.logger import configure
 from tqdm import tqdm
 
-from battery_env.callbacks import CalibrationCallback
+from battery_env.callbacks import CALIBRATION_CHARTS, CalibrationCallback
 from benchmarks.contests import EVALUATION_EPISODES, contest_of, made_by
-from benchmarks.dashboard import dashboard_callbacks
-from benchmarks.study import Study, command_line, digits, markdown, natural, positive, versions, write_json, write_text
-from benchmarks.training import DEFAULTS_TIMESTEPS, CheckpointCallback, Recipe, registered_id, set_up
+from benchmarks.study import Study, command_line, digits, markdown, natural, positive, write_json, write_text
+from benchmarks.training import DEFAULTS_TIMESTEPS, Recipe, Training, registered_id, set_up
+from sb3_lac import DashboardCallback, LyapunovCallback
+from sb3_lac.costs import CostAlgorithm
 
 
 class ProgressCallback(BaseCallback):
@@ -102,21 +100,9 @@ def run(recipe: Recipe, out: Path, position: int = 0) -> None:
 
 
 def _train(recipe: Recipe, folder: Path, out: Path, position: int) -> None:
-    assert recipe.evaluations is not None
-    of_env = contest_of(recipe.env_id)
-    every = max(recipe.timesteps // (recipe.evaluations * recipe.hyperparameters.get("n_envs", 1)), 1)
-    checkpoint = CheckpointCallback(folder / "checkpoint", every)
-    manager, model = set_up(
-        recipe,
-        folder / "zoo",
-        eval_env_kwargs=dict(of_env.options),
-        trained_agent=str(checkpoint.folder / "model.zip") if checkpoint.resumed else "",
-    )
-    with contextlib.redirect_stdout(io.StringIO()):
-        evaluation_env, scored_env = (manager.create_envs(n_envs=1, eval_env=True, no_log=True) for _ in range(2))
-    log = out / "tensorboard" / of_env.env_id / f"{recipe.label.replace(' ', '_')}_seed{recipe.seed}_{recipe.digest}"
-    model.set_logger(configure(str(log), ["tensorboard"]))
-
+    of_env, every = contest_of(recipe.env_id), recipe.evaluation_freq
+    training = Training(recipe, folder / "model.zip", eval_env_kwargs=dict(of_env.options))
+    scored_env = training.evaluation_env()
     calibration = CalibrationCallback(
         lambda candidate: of_env.scores(candidate, scored_env, brief=True),
         eval_freq=every,
@@ -126,20 +112,30 @@ def _train(recipe: Recipe, folder: Path, out: Path, position: int) -> None:
     )
     callbacks: list[BaseCallback] = [
         calibration,
-        EvalCallback(evaluation_env, n_eval_episodes=EVALUATION_EPISODES, eval_freq=every, verbose=0),
-        *dashboard_callbacks(recipe, manager, model, EVALUATION_EPISODES, every),
-        checkpoint,
+        EvalCallback(training.evaluation_env(), n_eval_episodes=EVALUATION_EPISODES, eval_freq=every, verbose=0),
+        *_dashboard(training),
         ProgressCallback(f"{of_env.env_id} {recipe.label} seed {recipe.seed}", recipe.timesteps, calibration, position),
     ]
-    model.learn(recipe.timesteps - model.num_timesteps, callback=callbacks, reset_num_timesteps=False)
-    model.save(folder / "model")
+    log = out / "tensorboard" / of_env.env_id / f"{recipe.label.replace(' ', '_')}_seed{recipe.seed}_{recipe.digest}"
+    made_by = training.run(callbacks, log, ["tensorboard"])
+    training.save()
 
-    scores = of_env.scores(model, scored_env)
+    scores = of_env.scores(training.model, scored_env)
     write_text(folder / "scores.csv", scores.to_csv(index=False, float_format="%.6g"))
-    summary = {"recipe": asdict(recipe), "versions": versions(), "resumed": checkpoint.resumed, "updates": model._n_updates}
-    summary |= {"timesteps": model.num_timesteps, "training_minutes": checkpoint.seconds / 60.0, **of_env.summary(scores)}
-    write_json(folder / "summary.json", summary)
-    shutil.rmtree(checkpoint.folder, ignore_errors=True)
+    write_json(folder / "summary.json", made_by | of_env.summary(scores))
+    shutil.rmtree(training.checkpoint.folder, ignore_errors=True)
+
+
+def _dashboard(training: Training) -> list[BaseCallback]:
+    """What makes a run part of a comparison in TensorBoard, and changes nothing of the training."""
+    recipe = training.recipe
+    about = {"env": recipe.env_id, "recipe": recipe.digest, "timesteps": recipe.timesteps, "source": recipe.source}
+    callbacks: list[BaseCallback] = [DashboardCallback(CALIBRATION_CHARTS, {**recipe.hyperparameters, **about})]
+    if isinstance(training.model, CostAlgorithm):
+        # from the same start states each time, which are not those of the training
+        seed, env = recipe.seed + training.model.n_envs, training.evaluation_env()
+        callbacks.append(LyapunovCallback(env, None, EVALUATION_EPISODES, recipe.evaluation_freq, seed, verbose=0))
+    return callbacks
 
 
 def _folder(recipe: Recipe, out: Path) -> Path:

@@ -37,8 +37,20 @@ from battery_env.plotting import LABELS, coloured, new_figure
 from battery_env.policies.estimator import PolicyEstimator
 from battery_env.tasks.full_state.layout import LITERAL, OBSERVED
 from battery_env.trajectories import TrajectoryDataset
-from benchmarks.study import SYMBOLS, Study, Tables, command_line, digits, markdown, natural, positive, with_spread
-from benchmarks.training import Recipe, timesteps_of, train_or_load
+from benchmarks.study import (
+    SYMBOLS,
+    Cell,
+    Study,
+    Tables,
+    command_line,
+    digits,
+    markdown,
+    natural,
+    positive,
+    table_of,
+    with_spread,
+)
+from benchmarks.training import Recipe, train_or_load
 
 Parameter = Literal["q_mobile", "r_o"]
 Parts = tuple[TrajectoryDataset, TrajectoryDataset]
@@ -82,10 +94,9 @@ def divided(parameter: Parameter, division: str) -> Parts:
 def train_policy(algo: str, parameter: Parameter, seed: int, updates: int | None, out: Path) -> BaseAlgorithm:
     """Train a policy on the less aged cells, or load it if that has been done."""
     env_id = ENV_IDS[parameter]
-    recipe = Recipe.of(algo, env_id, seed)
-    timesteps = recipe.timesteps if updates is None else timesteps_of(updates, recipe.hyperparameters)
-    options = {**recipe.hyperparameters.get("env_kwargs", {}), "dataset": str(training_file(parameter, out))}
-    return train_or_load(algo, env_id, seed, timesteps, out / "models", {"env_kwargs": options})
+    options = Recipe.of(algo, env_id, seed).hyperparameters.get("env_kwargs", {})
+    chosen = {"env_kwargs": {**options, "dataset": str(training_file(parameter, out))}}
+    return train_or_load(Recipe.of(algo, env_id, seed, updates=updates, hyperparameters=chosen), out / "models")
 
 
 def training_file(parameter: Parameter, out: Path) -> Path:
@@ -247,23 +258,23 @@ def exact_part(parameter: Parameter, division: str) -> Tables:
 
 def report(results: pd.DataFrame, configuration: Mapping[str, Any]) -> str:
     """What is compared, and the table."""
-    rows = []
-    for (parameter, division, method), group in results.groupby(["parameter", "division", "method"], sort=False):
-        seeds = [of_seed for _, of_seed in group.groupby("seed", dropna=False)]
-        bias, spread = (100.0 * group[name] / group["true"] for name in ("bias", "spread"))
-        learned = group["seed"].notna().all()
-        rows.append(
-            {
-                "parameter": SYMBOLS[str(parameter)],
-                "tested on": _TESTED[str(division)],
-                "calibrator": str(method),
-                "seeds": str(len(seeds)) if learned else "",
-                "MAPE (%)": with_spread(pd.Series([of_seed["mape_percent"].mean() for of_seed in seeds])),
-                "worst discharge (%)": digits(group["mape_percent"].max()),
-                "bias (%)": f"{bias.mean():+.2g}",
-                "spread (%)": digits(spread.mean()),
-            }
-        )
+
+    def seeds(group: pd.DataFrame) -> pd.Series:
+        return group.groupby("seed", sort=False, dropna=False)["mape_percent"].mean()
+
+    results = results.assign(
+        symbol=results["parameter"].map(SYMBOLS),
+        tested=results["division"].map(_TESTED),
+        **{f"{name}_percent": 100.0 * results[name] / results["true"] for name in ("bias", "spread")},
+    )
+    cells: dict[str, Cell] = {
+        "seeds": lambda group: str(len(seeds(group))) if group["seed"].notna().all() else "",
+        "MAPE (%)": lambda group: with_spread(seeds(group)),
+        "worst discharge (%)": ("mape_percent", lambda errors: digits(errors.max())),
+        "bias (%)": ("bias_percent", lambda biases: f"{biases.mean():+.2g}"),
+        "spread (%)": ("spread_percent", lambda spreads: digits(spreads.mean())),
+    }
+    table = table_of(results, {"symbol": "parameter", "tested": "tested on", "method": "calibrator"}, cells)
     text = f"""The paper's data, the full state, trimmed to 5 to 95 % of each discharge. Other discharges: a random 30 %,
 trained on the other 70 %. Heavier loads: trained up to 12.8 W, tested above {HEAVY_LOAD_W:g} W. More aged cells: trained on
 the 70 % least aged, tested on the others. Mappings learn from {configuration["pairs"]} labelled pairs, shown
@@ -271,7 +282,7 @@ the 70 % least aged, tested on the others. Mappings learn from {configuration["p
 worst: of any seed; spread: standard deviation within a discharge.
 
 """
-    return text + markdown(rows)
+    return text + markdown(table)
 
 
 def plot_errors(results: pd.DataFrame) -> Figure:

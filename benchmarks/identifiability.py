@@ -11,8 +11,7 @@ squares makes of records with noise, with errors that do not average out, and wi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -38,7 +37,7 @@ from battery_env.records.model import RecordModel
 from battery_env.sensors import SensorErrors
 from battery_env.tasks.full_state.layout import ERROR_SCALE, OBSERVED
 from battery_env.trajectories import TrajectoryDataset
-from benchmarks.study import SYMBOLS, Study, Tables, command_line, digits, markdown, positive
+from benchmarks.study import SYMBOLS, Cell, Study, Tables, command_line, digits, markdown, positive, row_by_row, table_of
 
 #: The aged cell of this study.
 TRUE = Estimate(q_mobile=6000.0, r_o=0.15)
@@ -496,81 +495,51 @@ def _shown_within(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def _shown_loads(table: pd.DataFrame) -> pd.DataFrame:
-    rows = []
-    for bounds in table[table["noise_V"] == NOISE_V].to_dict("records"):
-        row = {"load": bounds["load"], "unknown": bounds["unknown"]}
-        for name, label in SYMBOLS.items():
+    def sd_of(name: str) -> Callable[[dict[str, float]], str]:
+        def said(bounds: dict[str, float]) -> str:
             values = [bounds[f"{name}_sd_percent_at_{share:.0%}"] for share in SHARES]
-            known = bool(np.isnan(values).all())
-            row[f"sd of {label} (%) at {_SEEN}"] = "known" if known else " / ".join(f"{value:.2g}" for value in values)
-        rows.append(row)
-    return pd.DataFrame(rows)
+            return "known" if np.isnan(values).all() else " / ".join(f"{value:.2g}" for value in values)
 
+        return said
 
-def _shown_least_squares(table: pd.DataFrame) -> pd.DataFrame:
-    rows = []
-    for found in table.to_dict("records"):
-        row = {"load": found["load"], "noise": f"{1e3 * found['noise_V']:.0f} mV", "seen": f"{found['seen_percent']:.0f} %"}
-        for name, label in SYMBOLS.items():
-            row[f"{label}: error / bound (%)"] = f"{found[f'{name}_rms_percent']:.2g} / {found[f'{name}_bound_percent']:.2g}"
-            row[f"{label}: within 2 sd (%)"] = f"{found[f'{name}_within_2_sd_percent']:.0f}"
-        settled, worst = found["settled_percent"], found["q_mobile_worst_settled_percent"]
-        rows.append(row | {"settled (%)": f"{settled:.0f}", "worst q^max of these (%)": f"{worst:.2g}" if settled else ""})
-    return pd.DataFrame(rows)
+    cells = {f"sd of {label} (%) at {_SEEN}": sd_of(name) for name, label in SYMBOLS.items()}
+    return row_by_row(table[table["noise_V"] == NOISE_V], {"load": "{load}", "unknown": "{unknown}", **cells})
 
 
 def _shown_faults(table: pd.DataFrame) -> pd.DataFrame:
-    rows = []
-    for fault, of_fault in table.groupby("fault", sort=False):
-        row = {f"error at {_SEEN}": fault}
-        for load, part in of_fault.groupby("load", sort=False):
-            for name, label in SYMBOLS.items():
-                row[f"{label} (%), {load} load"] = _at_shares(part, f"{name}_error_percent")
-        rows.append(row)
-    return pd.DataFrame(rows)
+    def error_of(name: str, load: str) -> Cell:
+        return lambda part: _at_shares(part[part["load"] == load], f"{name}_error_percent")
+
+    loads = table["load"].unique()
+    cells = {f"{label} (%), {load} load": error_of(name, load) for load in loads for name, label in SYMBOLS.items()}
+    return table_of(table, {"fault": f"error at {_SEEN}"}, cells)
 
 
 def _shown_offsets(table: pd.DataFrame) -> pd.DataFrame:
-    rows = [
-        {
-            "load": load,
-            "offset that the filter allows for": f"sd {1e3 * float(str(offset_sd_V)):.0f} mV",
-            f"error of q^max (%) at {_SEEN}": _at_shares(part, "q_mobile_error_percent"),
-            "error of R_o (%)": _at_shares(part, "r_o_error_percent"),
-        }
-        for (load, offset_sd_V), part in table.groupby(["load", "offset_sd_V"], sort=False)
-    ]
-    return pd.DataFrame(rows)
+    cells: dict[str, Cell] = {
+        f"error of q^max (%) at {_SEEN}": lambda part: _at_shares(part, "q_mobile_error_percent"),
+        "error of R_o (%)": lambda part: _at_shares(part, "r_o_error_percent"),
+    }
+    shown = table.assign(offset=[f"sd {1e3 * offset_sd_V:.0f} mV" for offset_sd_V in table["offset_sd_V"]])
+    return table_of(shown, {"load": "load", "offset": "offset that the filter allows for"}, cells)
 
 
 def _shown_priors(table: pd.DataFrame) -> pd.DataFrame:
-    rows = [
-        {
-            "prior": prior,
-            "error of the model that is expected": f"{1e3 * float(str(mismatch_V)):.0f} mV",
-            f"error of q^max (%) at {_SEEN}": _at_shares(part, "q_mobile_error_percent"),
-            "stated sd (%)": _at_shares(part, "q_mobile_sd_percent", 2, ""),
-        }
-        for (mismatch_V, prior), part in table.groupby(["expected_mismatch_V", "prior"], sort=False)
-    ]
-    return pd.DataFrame(rows)
+    cells: dict[str, Cell] = {
+        f"error of q^max (%) at {_SEEN}": lambda part: _at_shares(part, "q_mobile_error_percent"),
+        "stated sd (%)": lambda part: _at_shares(part, "q_mobile_sd_percent", 2, ""),
+    }
+    shown = table.assign(expected=[f"{1e3 * mismatch_V:.0f} mV" for mismatch_V in table["expected_mismatch_V"]])
+    return table_of(shown, {"prior": "prior", "expected": "error of the model that is expected"}, cells)
 
 
 def _shown_minima(table: pd.DataFrame) -> pd.DataFrame:
     starts = {name: f"a state {drift_C:g} C off" if drift_C else "the true state" for name, drift_C in DRIFTS_C.items()}
     units = {"si": "all states, V and C", "scaled": "all states, error scales", "task": "Vsp, error scales"}
-    rows = []
-    for cost, part in table.groupby("cost", sort=False):
-        _, start, unit = str(cost).split("_")
-        minima = [
-            f"{q_mobile_C:.0f} C ({value:.2g})" for q_mobile_C, value in zip(part["q_mobile_C"], part["value"], strict=True)
-        ]
-        rows.append({"one-step cost of": units[unit], "from": starts[start], "minima (cost there)": ", ".join(minima)})
-    return pd.DataFrame(rows)
-
-
-def _row_by_row(table: pd.DataFrame, **columns: tuple[str, Callable[[float], str]]) -> pd.DataFrame:
-    return pd.DataFrame({title: table[name].map(shown) for name, (title, shown) in columns.items()})
+    parts = table["cost"].str.split("_", expand=True)
+    shown = table.assign(of=parts[2].map(units), start=parts[1].map(starts))
+    shown["minimum"] = [f"{q_mobile_C:.0f} C ({value:.2g})" for q_mobile_C, value in table[["q_mobile_C", "value"]].to_numpy()]
+    return table_of(shown, {"of": "one-step cost of", "start": "from"}, {"minima (cost there)": ("minimum", ", ".join)})
 
 
 def _response_row(table: pd.DataFrame) -> pd.DataFrame:
@@ -579,60 +548,71 @@ def _response_row(table: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame([row | {f"{time_s:.0f} s": f"{percent:.0f} %" for time_s, percent in shares}])
 
 
-def _percent(value: float) -> str:
-    return f"{value:.0f} %"
+def _worst(share: float) -> str:
+    return f"{PERCENT * share:.1g}"
 
 
-#: The tables as readers see them, by the name of what they show.
-READABLE: tuple[tuple[str, Callable[[pd.DataFrame], pd.DataFrame]], ...] = (
+#: The tables as readers see them, by the name of what they show: cells of each row, or what makes the table.
+READABLE: tuple[tuple[str, Mapping[str, Cell] | Callable[[pd.DataFrame], pd.DataFrame]], ...] = (
     (
         "conservation",
-        partial(
-            _row_by_row,
-            discharges=("discharges", str),
-            samples=("samples", str),
-            q_mobile_worst_relative_error=("largest error of q^max (%)", lambda share: f"{PERCENT * share:.1g}"),
-            r_o_worst_relative_error=("largest error of R_o (%)", lambda share: f"{PERCENT * share:.1g}"),
-        ),
+        {
+            "discharges": "{discharges}",
+            "samples": "{samples}",
+            "largest error of q^max (%)": ("q_mobile_worst_relative_error", _worst),
+            "largest error of R_o (%)": ("r_o_worst_relative_error", _worst),
+        },
     ),
     ("response", _response_row),
     (
         "sensitivity",
-        partial(
-            _row_by_row,
-            seen_percent=("seen", _percent),
-            voltage_V=("voltage (V)", "{:.2f}".format),
-            mV_per_percent_of_q_mobile=("1 % more q^max (mV)", "{:+.1f}".format),
-            mV_per_percent_of_r_o=("1 % more R_o (mV)", "{:+.1f}".format),
-            q_mobile_percent_per_10_mV=("10 mV are worth, in q^max (%)", "{:.2g}".format),
-            r_o_percent_per_10_mV=("in R_o (%)", "{:.2g}".format),
-        ),
+        {
+            "seen": "{seen_percent:.0f} %",
+            "voltage (V)": "{voltage_V:.2f}",
+            "1 % more q^max (mV)": "{mV_per_percent_of_q_mobile:+.1f}",
+            "1 % more R_o (mV)": "{mV_per_percent_of_r_o:+.1f}",
+            "10 mV are worth, in q^max (%)": "{q_mobile_percent_per_10_mV:.2g}",
+            "in R_o (%)": "{r_o_percent_per_10_mV:.2g}",
+        },
     ),
     ("bounds", _shown_within),
     ("bounds", _shown_loads),
     (
         "late",
-        partial(
-            _row_by_row,
-            load=("load", str),
-            start_s=("first reading after", "{:.0f} s".format),
-            q_mobile_sd_percent=("sd of q^max at the end (%)", "{:.2g}".format),
-            r_o_sd_percent=("sd of R_o at the end (%)", lambda percent: f"{percent:#.3g}".rstrip(".")),
-        ),
+        {
+            "load": "{load}",
+            "first reading after": "{start_s:.0f} s",
+            "sd of q^max at the end (%)": "{q_mobile_sd_percent:.2g}",
+            "sd of R_o at the end (%)": ("r_o_sd_percent", lambda percent: f"{percent:#.3g}".rstrip(".")),
+        },
     ),
     ("offsets", _shown_offsets),
     (
         "windows",
-        partial(
-            _row_by_row,
-            seen_percent=("until", _percent),
-            episode_alone_percent=(f"{EPISODE_STEPS} readings, R_o known", digits),
-            episode_joint_percent=(f"{EPISODE_STEPS} readings, R_o unknown", digits),
-            all_so_far_alone_percent=("all so far, R_o known", digits),
-            all_so_far_joint_percent=("all so far, R_o unknown", digits),
-        ),
+        {
+            "until": "{seen_percent:.0f} %",
+            f"{EPISODE_STEPS} readings, R_o known": ("episode_alone_percent", digits),
+            f"{EPISODE_STEPS} readings, R_o unknown": ("episode_joint_percent", digits),
+            "all so far, R_o known": ("all_so_far_alone_percent", digits),
+            "all so far, R_o unknown": ("all_so_far_joint_percent", digits),
+        },
     ),
-    ("least_squares", _shown_least_squares),
+    (
+        "least_squares",
+        {
+            "load": "{load}",
+            "noise": ("noise_V", lambda noise_V: f"{1e3 * noise_V:.0f} mV"),
+            "seen": "{seen_percent:.0f} %",
+            "q^max: error / bound (%)": "{q_mobile_rms_percent:.2g} / {q_mobile_bound_percent:.2g}",
+            "q^max: within 2 sd (%)": "{q_mobile_within_2_sd_percent:.0f}",
+            "R_o: error / bound (%)": "{r_o_rms_percent:.2g} / {r_o_bound_percent:.2g}",
+            "R_o: within 2 sd (%)": "{r_o_within_2_sd_percent:.0f}",
+            "settled (%)": "{settled_percent:.0f}",
+            "worst q^max of these (%)": lambda found: (
+                f"{found['q_mobile_worst_settled_percent']:.2g}" if found["settled_percent"] else ""
+            ),
+        },
+    ),
     ("faults", _shown_faults),
     ("priors", _shown_priors),
     ("minima", _shown_minima),
@@ -641,7 +621,8 @@ READABLE: tuple[tuple[str, Callable[[pd.DataFrame], pd.DataFrame]], ...] = (
 
 def summary(tables: Tables) -> str:
     """The tables as readers see them, as Markdown."""
-    return "\n".join(markdown(shown(tables[name])) for name, shown in READABLE)
+    shown = [how(tables[name]) if callable(how) else row_by_row(tables[name], how) for name, how in READABLE]
+    return "\n".join(markdown(table) for table in shown)
 
 
 #: By name, what makes each table, from the discharges and how often noise is drawn.

@@ -12,9 +12,9 @@ compared with the exact cost-to-go of that linear policy without noise, and the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -22,11 +22,24 @@ import pandas as pd
 from matplotlib.figure import Figure
 from scipy.stats import bootstrap
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.type_aliases import PolicyPredictor
 
-from benchmarks.study import EVALUATION_SEED, Study, Tables, command_line, markdown, natural, new_panels, positive
-from benchmarks.training import train_or_load
+from benchmarks.study import (
+    EVALUATION_SEED,
+    Cell,
+    Study,
+    Tables,
+    command_line,
+    markdown,
+    natural,
+    new_panels,
+    positive,
+    row_by_row,
+)
+from benchmarks.training import Recipe, train_or_load
 from sb3_lac import LAC, evaluate_lyapunov
 from sb3_lac.envs import LinearCostEnv
+from sb3_lac.stability.loop import closed_loop
 
 _ENV_ID = "LinearCost-v0"
 
@@ -47,19 +60,22 @@ def noise_cost(gain: np.ndarray, gamma: float) -> float:
     return gamma / (1 - gamma) * env.noise_std**2 * np.trace(env.value_matrix(gain, gamma))
 
 
-def _linear_actions(gain: np.ndarray, observations: np.ndarray) -> np.ndarray:
-    return -observations @ gain.T
+class LinearPolicy:
+    """The policy ``u = -K s``."""
+
+    def __init__(self, gain: np.ndarray) -> None:
+        self.gain = gain
+
+    def predict(self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False) -> Any:
+        """Predict actions as Stable-Baselines3 does."""
+        return -observation @ self.gain.T, None
 
 
-def episode_costs(act: Callable[[np.ndarray], np.ndarray], episodes: int) -> np.ndarray:
-    """The costs of a policy, with the same starts and noise for each."""
-    env = make_vec_env(_ENV_ID, n_envs=episodes, seed=EVALUATION_SEED)
-    observations, dones, costs = env.reset(), np.zeros(episodes, dtype=bool), []
-    while not dones.any():
-        assert isinstance(observations, np.ndarray)
-        observations, rewards, dones, _ = env.step(act(observations))
-        costs.append(-rewards)
-    return np.array(costs)
+def episode_costs(policy: PolicyPredictor, episodes: int) -> np.ndarray:
+    """The costs of a policy, a column for each episode, with the same starts and noise for each policy."""
+    with closed_loop(policy, make_vec_env(_ENV_ID, n_envs=episodes), None, episodes, seed=EVALUATION_SEED) as loop:
+        transitions = loop.roll_out(episodes).transitions
+    return transitions.pivot(index="step", columns="episode", values="cost").to_numpy()
 
 
 def over_optimum(costs: np.ndarray, optimal: np.ndarray, gamma: float) -> tuple[float, float, float]:
@@ -78,7 +94,7 @@ def over_optimum(costs: np.ndarray, optimal: np.ndarray, gamma: float) -> tuple[
 
 def part(seed: int, timesteps: int, episodes: int, models: Path) -> Tables:
     """Train one policy, and compare it with the exact solution."""
-    model = train_or_load("lac", _ENV_ID, seed, timesteps, models / f"seed{seed}")
+    model = train_or_load(Recipe.of("lac", _ENV_ID, seed, timesteps), models / f"seed{seed}")
     assert isinstance(model, LAC)
     env = LinearCostEnv()
     measured = evaluate_lyapunov(model, gym.make(_ENV_ID), n_eval_episodes=episodes, deterministic=True, seed=EVALUATION_SEED)
@@ -91,10 +107,10 @@ def part(seed: int, timesteps: int, episodes: int, models: Path) -> Tables:
     slope, intercept = np.polyfit(exact, learned, 1)
     # What the noise of the steps adds to all values
     intercept_exact = noise_cost(gain, model.gamma)
-    rolled_out = episode_costs(lambda observed: model.predict(observed, deterministic=True)[0], episodes)
+    rolled_out = episode_costs(model, episodes)
     ratios: dict[str, float] = {}
     for name, gamma in (("discounted", model.gamma), ("per_step", 1.0)):
-        optimal = episode_costs(partial(_linear_actions, env.optimal_gain(gamma) / env.control_max), episodes)
+        optimal = episode_costs(LinearPolicy(env.optimal_gain(gamma) / env.control_max), episodes)
         ratio, low, high = over_optimum(rolled_out, optimal, gamma)
         ratios |= {f"{name}_over_optimum": ratio, f"{name}_over_optimum_low": low, f"{name}_over_optimum_high": high}
     row = {
@@ -138,24 +154,19 @@ def plot(values: pd.DataFrame) -> Figure:
 
 def report(table: pd.DataFrame) -> str:
     """Learned and exact values side by side, as Markdown."""
-    rows = [
-        {
-            "seed": f"{row['seed']:.0f}",
-            "gain K (exact)": f"{row['gain_position']:.3f}, {row['gain_velocity']:.3f} "
-            f"({row['gain_position_exact']:.3f}, {row['gain_velocity_exact']:.3f})",
-            "discounted cost / optimum, 95 % interval": f"{row['discounted_over_optimum']:.3f}, "
-            f"{row['discounted_over_optimum_low']:.3f} to {row['discounted_over_optimum_high']:.3f}",
-            "cost per step / optimum": f"{row['per_step_over_optimum']:.3f}",
-            "of the closest linear policy, exactly": f"{row['linear_over_optimum']:.4f}",
-            "L against exact: slope, intercept, correlation": f"{row['value_slope']:.3f}, {row['value_intercept']:.3f}, "
-            f"{row['value_correlation']:.4f}",
-            "exact intercept": f"{row['value_intercept_exact']:.3f}",
-            "largest feasible alpha3, 95 % interval (exact)": f"{row['alpha3']:.3f}, {row['alpha3_low']:.3f} to "
-            f"{row['alpha3_high']:.3f} ({row['alpha3_exact']:.3f}; optimal policy {row['alpha3_optimum']:.3f})",
-        }
-        for _, row in table.iterrows()
-    ]
-    return markdown(rows)
+    cells: dict[str, Cell] = {
+        "seed": "{seed:.0f}",
+        "gain K (exact)": "{gain_position:.3f}, {gain_velocity:.3f} " "({gain_position_exact:.3f}, {gain_velocity_exact:.3f})",
+        "discounted cost / optimum, 95 % interval": "{discounted_over_optimum:.3f}, "
+        "{discounted_over_optimum_low:.3f} to {discounted_over_optimum_high:.3f}",
+        "cost per step / optimum": "{per_step_over_optimum:.3f}",
+        "of the closest linear policy, exactly": "{linear_over_optimum:.4f}",
+        "L against exact: slope, intercept, correlation": "{value_slope:.3f}, {value_intercept:.3f}, {value_correlation:.4f}",
+        "exact intercept": "{value_intercept_exact:.3f}",
+        "largest feasible alpha3, 95 % interval (exact)": "{alpha3:.3f}, {alpha3_low:.3f} to {alpha3_high:.3f} "
+        "({alpha3_exact:.3f}; optimal policy {alpha3_optimum:.3f})",
+    }
+    return markdown(row_by_row(table, cells))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

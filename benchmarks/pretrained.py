@@ -31,8 +31,21 @@ from battery_env.policies.estimator import PolicyEstimator
 from battery_env.policies.pretrained import file_stem, policy_of_file
 from battery_env.tasks.data import standard_dataset
 from benchmarks.contests import HELD_OUT, SENSORS
-from benchmarks.study import SYMBOLS, Study, Tables, at_most, command_line, markdown, natural, positive, versions, write_json
-from benchmarks.training import Recipe, timesteps_of, train_or_load, training_minutes
+from benchmarks.study import (
+    SYMBOLS,
+    Cell,
+    Study,
+    Tables,
+    at_most,
+    command_line,
+    markdown,
+    natural,
+    positive,
+    row_by_row,
+    versions,
+    write_json,
+)
+from benchmarks.training import Recipe, train_or_load, training_minutes
 from sb3_lac.onnx import export_onnx
 
 #: What each policy finds.
@@ -55,16 +68,14 @@ MISMATCHES = (0.0, 0.1, 0.2)
 
 def recipe_of(env_id: str, seed: int, updates: int, recorded: bool) -> Recipe:
     """What a policy depends on."""
-    timesteps = timesteps_of(updates, Recipe.of("lac", env_id, seed).hyperparameters)
     options = TRAINED_WITH | (RECORDED if recorded else {})
-    return Recipe.of("lac", env_id, seed, timesteps, hyperparameters={"env_kwargs": options})
+    return Recipe.of("lac", env_id, seed, updates=updates, hyperparameters={"env_kwargs": options})
 
 
 def make(env_id: str, seed: int, updates: int, recorded: bool, folder: Path) -> Recipe:
     """Train a policy, unless that has been done, and write it as ONNX, with the options that it needs beside it."""
     recipe = recipe_of(env_id, seed, updates, recorded)
-    chosen = {"env_kwargs": recipe.hyperparameters["env_kwargs"]}
-    model = train_or_load("lac", env_id, seed, recipe.timesteps, folder / "models", chosen)
+    model = train_or_load(recipe, folder / "models")
     file = folder / f"{file_stem(env_id, recorded)}.onnx"
     with replacing(file) as part:
         export_onnx(model, part, env_id)
@@ -126,21 +137,15 @@ def card_of(recipe: Recipe, scores: pd.DataFrame, command: str, file: Path) -> d
 
 def shown(table: pd.DataFrame) -> str:
     """The summary for readers."""
-    return markdown(
-        [
-            {
-                "environment": row.env_id,
-                "constants off by": f"{row.mismatch:g}",
-                "sensor": row.sensor,
-                "parameter": SYMBOLS[str(row.parameter)],
-                "mean ± sd (worst) error, second half (%)": (
-                    f"{row.mean_percent:.2f} ± {row.sd_percent:.2f} ({row.worst_percent:.1f})"
-                ),
-                "last estimate (%)": f"{row.final_percent:.2f}",
-            }
-            for row in table.itertuples(index=False)
-        ]
-    )
+    cells: dict[str, Cell] = {
+        "environment": "{env_id}",
+        "constants off by": "{mismatch:g}",
+        "sensor": "{sensor}",
+        "parameter": ("parameter", SYMBOLS.__getitem__),
+        "mean ± sd (worst) error, second half (%)": "{mean_percent:.2f} ± {sd_percent:.2f} ({worst_percent:.1f})",
+        "last estimate (%)": "{final_percent:.2f}",
+    }
+    return markdown(row_by_row(table, cells))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -32,7 +32,7 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from battery_env.plotting import COLOUR_OF, COLOURS
 from benchmarks.control import roll_out, summary
-from benchmarks.stabilisation import Contender, LearningCurve, undisturbed_table
+from benchmarks.stabilisation import REFERENCE, Contender, in_order, parts_of, undisturbed_table
 from benchmarks.study import (
     Study,
     Tables,
@@ -43,19 +43,18 @@ from benchmarks.study import (
     positive,
     share_with_range,
     side_by_side,
+    table_of,
 )
-from benchmarks.training import record_file, train_or_load, training_minutes
 from sb3_lac import PublishedLAC
 from sb3_lac.envs import CostEnv, OscillatorEnv, reference_controller
 from sb3_lac.stability.plots import format_log_axis
 
-_REFERENCE = "reference"
 #: How policies are drawn: colour and marker.
 STYLES = {
     "LAC as published": (COLOUR_OF["LAC"], "o"),
     "the same, N = inf": (COLOURS[5], "X"),
     "SAC": (COLOUR_OF["SAC"], "s"),
-    _REFERENCE: ("black", "|"),
+    REFERENCE: ("black", "|"),
 }
 #: LAC by horizon: what it is called.
 HORIZONS = {"lac": (5, "LAC as published"), "lac_inf": (None, "the same, N = inf")}
@@ -181,41 +180,19 @@ def part(
     predictor: PolicyPredictor
     described: dict[str, Any] = {"environment": env_id, "policy": policy, "seed": seed}
     learning = None
-    if policy == _REFERENCE:
+    if policy == REFERENCE:
         predictor = reference_controller(gym.make(env_id))
         trained: dict[str, Any] = {"timesteps": None, "updates": None, "lambda": None, "training_minutes": None}
     else:
-        assert seed is not None and timesteps is not None
-        chosen = contender(policy, env_id)
+        assert seed is not None
+        chosen, folder = contender(policy, env_id), models / f"{env_id}_{policy}_seed{seed}"
         made_from = chosen.recipe(env_id, seed, timesteps)
-        if made_from.digest != recipe:
-            raise RuntimeError(f"the settings of {policy} on {env_id} have changed since the study began: start it again")
-        folder = models / f"{env_id}_{policy}_seed{seed}"
-        file = record_file(made_from, folder).with_name(f"learning_{made_from.name}.csv")
-        predictor = model = train_or_load(
-            chosen.algo,
-            env_id,
-            seed,
-            timesteps,
-            folder,
-            dict(chosen.hyperparameters),
-            chosen.settings,
-            callback=LearningCurve(env_id, timesteps, file),
-            compile_update=compiled and chosen.compiles,
-        )
-        learning = pd.read_csv(file)
-        minutes = training_minutes(made_from, folder) - learning.pop("seconds").sum() / 60.0
+        predictor, updates, minutes, learning = chosen.trained(made_from, recipe, folder, compiled)
         described["policy"] = chosen.label
-        weight = model.log_lambda.exp().item() if isinstance(model, PublishedLAC) else None
-        updates = getattr(model, "_n_updates", None)
+        weight = predictor.log_lambda.exp().item() if isinstance(predictor, PublishedLAC) else None
         trained = {"timesteps": timesteps, "updates": updates, "lambda": weight, "training_minutes": minutes}
     results = pd.DataFrame([described | trained | row for row in tried(predictor, env_id, episodes)])
     return {"published": results} | ({} if learning is None else {"learning": learning.assign(**described)})
-
-
-def _in_order(names: pd.Series) -> pd.Series:
-    order = [*DISTURBANCES, *STYLES]
-    return names.map(order.index)
 
 
 def disturbed_table(results: pd.DataFrame) -> pd.DataFrame:
@@ -223,12 +200,9 @@ def disturbed_table(results: pd.DataFrame) -> pd.DataFrame:
     (env_id,) = results["environment"].unique()
     measure, _ = MEASURES[env_id]
     shown = share_with_range if measure == "died" else side_by_side
-    rows = []
-    for (disturbance, setting), group in results.groupby(["disturbance", "setting"], sort=False):
-        row: dict[str, str] = {"disturbance": str(disturbance), "setting": str(setting)}
-        of_policies = group.groupby("policy", sort=False)[measure]
-        rows.append(row | {str(policy): shown(values) for policy, values in of_policies})
-    return pd.DataFrame(rows)
+    policies = results["policy"].unique()
+    cells = {name: lambda tries, name=name: shown(tries.loc[tries["policy"] == name, measure]) for name in policies}
+    return table_of(results, ["disturbance", "setting"], cells)
 
 
 def report(results: pd.DataFrame) -> str:
@@ -272,9 +246,9 @@ def plot_learning(learning: pd.DataFrame, results: pd.DataFrame) -> Figure:
     measures = [(env_id, measure, label) for env_id in envs for measure, label in _LEARNED.items()]
     for axes, (env_id, measure, label) in zip(panels, measures, strict=True):
         _draw(axes, learning[learning["environment"] == env_id], "timesteps", measure)
-        references = results[(results["environment"] == env_id) & (results["policy"] == _REFERENCE)]
+        references = results[(results["environment"] == env_id) & (results["policy"] == REFERENCE)]
         level = references.loc[references["disturbance"] == "none", measure].mean()
-        axes.axhline(level, color=STYLES[_REFERENCE][0], ls="--", lw=1.0, label=_REFERENCE)
+        axes.axhline(level, color=STYLES[REFERENCE][0], ls="--", lw=1.0, label=REFERENCE)
         axes.set(title=env_id, ylabel=label)
         _set_scale(axes, measure, "y")
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
@@ -336,23 +310,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--episodes", type=positive, default=40, help="episodes for each policy and disturbance")
     study = Study(parser, arguments)
     chosen = study.chosen
-    untrained = {"seed": None, "timesteps": None, "recipe": None, "episodes": chosen.episodes}
-    parts: list[dict[str, Any]] = [{"policy": _REFERENCE, "env_id": env_id, **untrained} for env_id in chosen.envs]
-    # seed by seed, so that an interrupted study has whole seeds
-    for seed in chosen.seeds:
-        for env_id in chosen.envs:
-            for policy in chosen.algos:
-                try:
-                    recipe = contender(policy, env_id).recipe(env_id, seed, chosen.timesteps or TIMESTEPS[env_id])
-                except ValueError as error:
-                    parser.error(str(error))
-                made_from = {"seed": seed, "timesteps": recipe.timesteps, "recipe": recipe.digest}
-                parts.append({"policy": policy, "env_id": env_id, **made_from, "episodes": chosen.episodes})
+    try:
+        parts = parts_of(chosen, contender, lambda env_id: chosen.timesteps or TIMESTEPS[env_id])
+    except ValueError as error:
+        parser.error(str(error))
     study.configuration["disturbances"] = {env_id: DISTURBANCES[env_id] for env_id in chosen.envs}
-    tables = {
-        name: table.sort_values(["environment", "policy"], key=_in_order, kind="stable", ignore_index=True)
-        for name, table in study.run(part, parts, models=study.out / "models", compiled=chosen.compile).items()
-    }
+    parts = [each | {"episodes": chosen.episodes} for each in parts]
+    made = study.run(part, parts, models=study.out / "models", compiled=chosen.compile)
+    tables = in_order(made, [*DISTURBANCES, *STYLES])
     results = tables["published"]
     figures = {
         "learning": plot_learning(tables["learning"], results),

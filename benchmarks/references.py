@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from battery_env.plotting import new_figure
 from benchmarks.control import DISTURBANCES, SHARES, draw_shares, tried
-from benchmarks.study import Study, Tables, command_line, digits, markdown, positive
+from benchmarks.study import Cell, Study, Tables, command_line, digits, markdown, positive, row_by_row
 from sb3_lac.envs import reference_controller
 
 
@@ -28,21 +28,16 @@ def part(env_id: str, episodes: int) -> Tables:
 
 def report(results: pd.DataFrame) -> str:
     """One table, as Markdown."""
-    shown = {
-        "environment": results["environment"],
-        "disturbance": results["disturbance"] + [f" ({text})" if text else "" for text in results["arguments"]],
-        "cost per step, mean (worst episode)": [
-            f"{digits(mean)} ({digits(worst)})" for mean, worst in zip(results["cost"], results["cost_worst"], strict=True)
-        ],
-        "error at the end, median (worst)": [
-            f"{digits(median)} ({digits(worst)})"
-            for median, worst in zip(results["error_median"], results["error_worst"], strict=True)
-        ],
-        "tolerance": results["tolerance"],
-        **{title: [f"{share:.0%}" for share in results[column]] for column, title in SHARES.items()},
-        "died": [f"{share:.0%}" for share in results["died"]],
+    cells: dict[str, Cell] = {
+        "environment": ("environment", str),
+        "disturbance": lambda row: row["disturbance"] + (f" ({row['arguments']})" if row["arguments"] else ""),
+        "cost per step, mean (worst episode)": lambda row: f"{digits(row['cost'])} ({digits(row['cost_worst'])})",
+        "error at the end, median (worst)": lambda row: f"{digits(row['error_median'])} ({digits(row['error_worst'])})",
+        "tolerance": ("tolerance", float),
+        **{title: (column, "{:.0%}".format) for column, title in SHARES.items()},
+        "died": ("died", "{:.0%}".format),
     }
-    return markdown(pd.DataFrame(shown))
+    return markdown(row_by_row(results, cells))
 
 
 def plot(results: pd.DataFrame) -> Figure:

@@ -17,12 +17,14 @@ done is not done again when the command is repeated, so that seeds can be added.
 
 from __future__ import annotations
 
+import argparse
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -30,6 +32,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import PolicyPredictor
 
@@ -37,15 +40,18 @@ from battery_env.evaluation import over_seeds
 from battery_env.plotting import COLOUR_OF, COLOURS, new_figure
 from benchmarks.control import DISTURBANCES, SETTLED_SHARE, SHARES, conditions, draw_shares, judge, roll_out, shares_of, tried
 from benchmarks.study import (
+    Cell,
     Study,
     Tables,
     command_line,
+    count_of,
     digits,
     markdown,
     natural,
     new_panels,
     positive,
     share_with_range,
+    table_of,
     with_interval,
     write_text,
 )
@@ -81,8 +87,30 @@ class Contender:
         differing = dict(self.hyperparameters)
         return Recipe.of(self.algo, env_id, seed, timesteps, hyperparameters=differing, settings=self.settings)
 
+    def trained(self, recipe: Recipe, digest: str | None, folder: Path, compiled: bool) -> Trained:
+        """Train it, unless that has been done."""
+        if recipe.digest != digest:
+            who = f"{self.label} on {recipe.env_id}"
+            raise RuntimeError(f"the hyperparameters of {who} have changed since the study began: start it again")
+        file = record_file(recipe, folder).with_name(f"learning_{recipe.name}.csv")
+        curve = LearningCurve(recipe.env_id, recipe.timesteps, file)
+        model = train_or_load(recipe, folder, [curve], compile_update=compiled and self.compiles)
+        learning = pd.read_csv(file)
+        minutes = training_minutes(recipe, folder) - learning.pop("seconds").sum() / 60.0
+        # updates of all algorithms that learn from a replay buffer
+        return Trained(model, getattr(model, "_n_updates", None), minutes, learning)
 
-_REFERENCE = "reference"
+
+class Trained(NamedTuple):
+    """A policy, what its training took without what the learning curve did, and that curve."""
+
+    model: BaseAlgorithm
+    updates: int | None
+    training_minutes: float
+    learning: pd.DataFrame
+
+
+REFERENCE = "reference"
 _METRIC_SAC = "benchmarks.metric_sac:MetricSAC"
 _NOISE = {"noise_type": "normal", "noise_std": 0.1}
 #: Who is judged, by the name on the command line.
@@ -101,7 +129,7 @@ CONTENDERS = {
     "metric_sac": Contender(_METRIC_SAC, "SAC, LAC's metric", COLOURS[4], "v", compiles=True),
 }
 #: How they are drawn: colour and marker.
-STYLES = {each.label: (each.colour, each.marker) for each in CONTENDERS.values()} | {_REFERENCE: ("black", "|")}
+STYLES = {each.label: (each.colour, each.marker) for each in CONTENDERS.values()} | {REFERENCE: ("black", "|")}
 # learning curves, whose episodes have other starts than those of all other judgements
 _POINTS, _CURVE_EPISODES, _CURVE_SEED = 12, 30, 40_000
 
@@ -157,36 +185,15 @@ def part(
 ) -> Tables:
     """Train a policy, or take the reference controller, and judge it."""
     predictor: PolicyPredictor
-    if policy == _REFERENCE:
+    if policy == REFERENCE:
         predictor, updates, minutes = reference_controller(gym.make(env_id)), None, None
         learning = pd.DataFrame([{"timesteps": np.nan, "updates": np.nan, **_cost_of(predictor, env_id)}])
     else:
-        assert seed is not None and timesteps is not None
-        contender = CONTENDERS[policy]
-        made_from = contender.recipe(env_id, seed, timesteps)
-        if made_from.digest != recipe:
-            raise RuntimeError(
-                f"the hyperparameters of {policy} on {env_id} have changed since the study began: start it again"
-            )
-        folder = models / f"{env_id}_{policy}_seed{seed}"
-        file = record_file(made_from, folder).with_name(f"learning_{made_from.name}.csv")
-        curve = LearningCurve(env_id, timesteps, file)
-        model = train_or_load(
-            contender.algo,
-            env_id,
-            seed,
-            timesteps,
-            folder,
-            dict(contender.hyperparameters),
-            contender.settings,
-            callback=curve,
-            compile_update=compiled and contender.compiles,
-        )
-        # of all algorithms that learn from a replay buffer
-        predictor, updates = model, getattr(model, "_n_updates", None)
-        learning = pd.read_csv(file)
-        minutes = training_minutes(made_from, folder) - learning.pop("seconds").sum() / 60.0
-    label = policy if policy == _REFERENCE else CONTENDERS[policy].label
+        assert seed is not None
+        chosen, folder = CONTENDERS[policy], models / f"{env_id}_{policy}_seed{seed}"
+        made_from = chosen.recipe(env_id, seed, timesteps)
+        predictor, updates, minutes, learning = chosen.trained(made_from, recipe, folder, compiled)
+    label = policy if policy == REFERENCE else CONTENDERS[policy].label
     of_policy = {"environment": env_id, "policy": label, "seed": seed}
     described: dict[str, Any] = {
         **of_policy,
@@ -208,39 +215,52 @@ def _beside(described: dict[str, Any], rows: pd.DataFrame) -> pd.DataFrame:
     return pd.concat([pd.DataFrame([described] * len(rows)), rows], axis=1)
 
 
-def _in_order(names: pd.Series) -> pd.Series:
-    order = [*DISTURBANCES, *STYLES]
-    return names.map(order.index)
+def parts_of(
+    chosen: argparse.Namespace, contender: Callable[[str, str], Contender], timesteps: Callable[[str], int | None]
+) -> list[dict[str, Any]]:
+    """The reference in each environment, then seed by seed each policy, so that an interrupted study has whole seeds."""
+    untrained = {"seed": None, "timesteps": None, "recipe": None}
+    parts: list[dict[str, Any]] = [{"policy": REFERENCE, "env_id": env_id, **untrained} for env_id in chosen.envs]
+    for seed, env_id, policy in product(chosen.seeds, chosen.envs, chosen.algos):
+        recipe = contender(policy, env_id).recipe(env_id, seed, timesteps(env_id))
+        made_from = {"seed": seed, "timesteps": recipe.timesteps, "recipe": recipe.digest}
+        parts.append({"policy": policy, "env_id": env_id, **made_from})
+    return parts
+
+
+def in_order(tables: Tables, order: Sequence[str]) -> dict[str, pd.DataFrame]:
+    """Tables by environment and policy."""
+    return {
+        name: table.sort_values(
+            ["environment", "policy"], key=lambda names: names.map(order.index), kind="stable", ignore_index=True
+        )
+        for name, table in tables.items()
+    }
 
 
 def undisturbed_table(results: pd.DataFrame) -> pd.DataFrame:
     """What policies cost and where they end, without disturbances."""
-    rows = []
-    undisturbed = results[results["disturbance"] == "none"]
-    for (env_id, policy), group in undisturbed.groupby(["environment", "policy"], sort=False):
-        rows.append(
-            {
-                "environment": env_id,
-                "policy": policy,
-                "seeds": "" if policy == _REFERENCE else str(len(group)),
-                "updates": "" if policy == _REFERENCE else f"{group['updates'].max():.0f}",
-                "training (min)": "" if policy == _REFERENCE else digits(group["training_minutes"].mean()),
-                "cost per step": with_interval(group["cost"]),
-                "error at the end, median": with_interval(group["error_median"]),
-                **{title: share_with_range(group[column]) for column, title in SHARES.items()},
-                "died": share_with_range(group["died"]),
-            }
-        )
-    return pd.DataFrame(rows)
+
+    def of_trained(said: Callable[[pd.DataFrame], str]) -> Callable[[pd.DataFrame], str]:
+        return lambda group: "" if group["policy"].iloc[0] == REFERENCE else said(group)
+
+    cells: dict[str, Cell] = {
+        "seeds": of_trained(lambda group: str(len(group))),
+        "updates": of_trained(lambda group: f"{group['updates'].max():.0f}"),
+        "training (min)": of_trained(lambda group: digits(group["training_minutes"].mean())),
+        "cost per step": ("cost", with_interval),
+        "error at the end, median": ("error_median", with_interval),
+        **{title: (column, share_with_range) for column, title in SHARES.items()},
+        "died": ("died", share_with_range),
+    }
+    return table_of(results[results["disturbance"] == "none"], ["environment", "policy"], cells)
 
 
 def disturbed_table(results: pd.DataFrame, cell: Callable[[pd.DataFrame], str]) -> pd.DataFrame:
     """What each disturbance does, as one cell says of all tries of a policy."""
-    rows = []
-    for (env_id, policy), group in results.groupby(["environment", "policy"], sort=False):
-        cells = {str(condition): cell(tries) for condition, tries in group.groupby("disturbance", sort=False)}
-        rows.append({"environment": env_id, "policy": policy, **cells})
-    return pd.DataFrame(rows)
+    conditions = results["disturbance"].unique()
+    cells = {name: lambda tries, name=name: cell(tries[tries["disturbance"] == name]) for name in conditions}
+    return table_of(results, ["environment", "policy"], cells)
 
 
 def cost_of(tries: pd.DataFrame) -> str:
@@ -255,24 +275,26 @@ def ends_of(tries: pd.DataFrame) -> str:
 
 def certificate_table(certificates: pd.DataFrame) -> pd.DataFrame:
     """What the certificates say."""
-    rows = []
-    for (env_id, policy, function), group in certificates.groupby(["environment", "policy", "function"], sort=False):
-        held, calibrated = group[group["holds"]], group["calibration_slope"].dropna()
-        rows.append(
-            {
-                "environment": env_id,
-                "policy": f"{policy} (critic)" if function == "critic" else policy,
-                "holds": f"{group['holds'].sum()} of {len(group)}",
-                f"settles at {SETTLED_SHARE:g} of the start": f"{group['settles'].sum()} of {len(group)}",
-                "cost at the start": digits(group["start_cost"].mean()),
-                "where it holds: mean cost settles below": with_interval(held["cost_bound"]) if len(held) else "-",
-                "its alpha3": with_interval(held["cost_bound_alpha3"]) if len(held) else "-",
-                "alpha3 without residual": with_interval(group["largest_feasible_alpha3"]),
-                "cost-to-go by L, slope": with_interval(calibrated) if len(calibrated) else "-",
-                "survives, at least": "-" if function == "critic" else digits(group["survives_at_least"].mean()),
-            }
-        )
-    return pd.DataFrame(rows)
+
+    def known(values: pd.Series) -> str:
+        return with_interval(values.dropna()) if values.notna().any() else "-"
+
+    of_critics = certificates["function"] == "critic"
+    shown = certificates.assign(policy=certificates["policy"] + np.where(of_critics, " (critic)", ""))
+    for column in ("cost_bound", "cost_bound_alpha3"):
+        shown[f"held_{column}"] = shown[column].where(shown["holds"])
+    cells: dict[str, Cell] = {
+        "holds": ("holds", count_of),
+        f"settles at {SETTLED_SHARE:g} of the start": ("settles", count_of),
+        "cost at the start": ("start_cost", lambda costs: digits(costs.mean())),
+        "where it holds: mean cost settles below": ("held_cost_bound", known),
+        "its alpha3": ("held_cost_bound_alpha3", known),
+        "alpha3 without residual": ("largest_feasible_alpha3", with_interval),
+        "cost-to-go by L, slope": ("calibration_slope", known),
+        # stated once for a policy, with the fitted function
+        "survives, at least": ("survives_at_least", lambda shares: digits(shares.mean())),
+    }
+    return table_of(shown, ["environment", "policy"], cells)
 
 
 def report(tables: Tables) -> str:
@@ -301,7 +323,7 @@ def plot_costs(results: pd.DataFrame) -> Figure:
     envs, names = list(undisturbed["environment"].unique()), [name for name in STYLES if name in set(undisturbed["policy"])]
     figure = new_figure(8.6, 1.0 + 0.75 * len(envs))
     costs, goals = figure.subplots(1, 2, sharey=True)
-    yardsticks = undisturbed[undisturbed["policy"] == _REFERENCE].set_index("environment")["cost"]
+    yardsticks = undisturbed[undisturbed["policy"] == REFERENCE].set_index("environment")["cost"]
     for row, env_id in enumerate(envs):
         for number, name in enumerate(names):
             of_policy = undisturbed[(undisturbed["environment"] == env_id) & (undisturbed["policy"] == name)]
@@ -327,7 +349,8 @@ def _add_legend(figure: Figure, panels: Sequence[Axes], names: Iterable[str]) ->
     """One entry for each name that any panel has, whichever that is."""
     handles = {label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     shown = [name for name in names if name in handles]
-    figure.legend([handles[name] for name in shown], shown, loc="outside lower center", ncols=min(len(shown), 5), fontsize="small")
+    labels, columns = [handles[name] for name in shown], min(len(shown), 5)
+    figure.legend(labels, shown, loc="outside lower center", ncols=columns, fontsize="small")
 
 
 def plot_learning(learning: pd.DataFrame) -> Figure:
@@ -341,7 +364,7 @@ def plot_learning(learning: pd.DataFrame) -> Figure:
         of_env = learning[learning["environment"] == env_id]
         for name, (colour, marker) in STYLES.items():
             of_policy = of_env[of_env["policy"] == name]
-            if name == _REFERENCE:
+            if name == REFERENCE:
                 axes.axhline(float(of_policy["cost"].iloc[0]), color=colour, ls="--", lw=1.0, label=name)
             elif not of_policy.empty:
                 costs = of_policy.pivot_table(index="seed", columns="timesteps", values="cost").dropna(axis="columns")
@@ -387,25 +410,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     study = Study(parser, arguments)
     chosen = study.chosen
     judged = {"episodes": chosen.episodes, "certificate_episodes": chosen.certificate_episodes}
-    parts = [
-        {"policy": _REFERENCE, "env_id": env_id, "seed": None, "timesteps": None, "recipe": None, **judged}
-        for env_id in chosen.envs
-    ]
-    # seed by seed, so that an interrupted study has whole seeds
-    for seed in chosen.seeds:
-        for env_id in chosen.envs:
-            for policy in chosen.algos:
-                try:
-                    recipe = CONTENDERS[policy].recipe(env_id, seed, chosen.timesteps)
-                except ValueError as error:
-                    parser.error(str(error))
-                made_from = {"seed": seed, "timesteps": recipe.timesteps, "recipe": recipe.digest}
-                parts.append({"policy": policy, "env_id": env_id, **made_from, **judged})
+    try:
+        parts = parts_of(chosen, lambda policy, env_id: CONTENDERS[policy], lambda env_id: chosen.timesteps)
+    except ValueError as error:
+        parser.error(str(error))
     study.configuration["disturbances"] = {env_id: conditions(env_id) for env_id in chosen.envs}
-    tables = {
-        name: table.sort_values(["environment", "policy"], key=_in_order, kind="stable", ignore_index=True)
-        for name, table in study.run(part, parts, models=study.out / "models", compiled=chosen.compile).items()
-    }
+    made = study.run(part, [each | judged for each in parts], models=study.out / "models", compiled=chosen.compile)
+    tables = in_order(made, [*DISTURBANCES, *STYLES])
     results = tables["stabilisation"]
     figures = {
         "costs": plot_costs(results),

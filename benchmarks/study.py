@@ -31,8 +31,8 @@ from tqdm import tqdm
 import battery_env
 import sb3_lac
 from battery_env.evaluation import over_seeds
-from battery_env.files import check_folder, replacing
-from battery_env.lab.workers import workers
+from battery_env.files import check_folder, replacing, set_aside
+from battery_env.lab.workers import interruptible, workers
 from battery_env.plotting import new_figure, save_figure
 
 Result = TypeVar("Result")
@@ -134,6 +134,16 @@ def share_with_range(values: pd.Series) -> str:
     return f"{percent.mean():.0f} %{spread}"
 
 
+def share_in_percent(values: pd.Series) -> str:
+    """Which share of them is true."""
+    return f"{100 * values.mean():.0f}"
+
+
+def count_of(values: pd.Series) -> str:
+    """How many of a few are true."""
+    return f"{values.sum()} of {len(values)}"
+
+
 def side_by_side(values: Iterable[float]) -> str:
     """Each of a few numbers."""
     return " / ".join(digits(value) for value in values)
@@ -142,6 +152,37 @@ def side_by_side(values: Iterable[float]) -> str:
 def markdown(rows: pd.DataFrame | Sequence[Mapping[str, Any]]) -> str:
     """A table for readers."""
     return pd.DataFrame(rows).to_markdown(index=False, disable_numparse=True) + "\n"
+
+
+#: What a cell says of rows of results, or of one of their columns; of a single row also a template with names of columns.
+Cell = tuple[str, Callable[[Any], Any]] | Callable[[Any], Any] | str
+
+
+def table_of(rows: pd.DataFrame, by: Sequence[str] | Mapping[str, str], cells: Mapping[str, Cell]) -> pd.DataFrame:
+    """
+    A table with a row for each group of rows, in their order.
+
+    :param rows: of results
+    :param by: columns whose values name a group, and what readers call each if it is another name
+    :param cells: what is said of a group, by title
+    """
+    titles = by if isinstance(by, Mapping) else dict(zip(by, by, strict=True))
+    groups = rows.groupby(list(titles), sort=False, dropna=False)
+    return pd.DataFrame([dict(zip(titles.values(), keys, strict=True)) | _said(cells, group) for keys, group in groups])
+
+
+def row_by_row(rows: pd.DataFrame, cells: Mapping[str, Cell]) -> pd.DataFrame:
+    """A table with what is said of each row, by title."""
+    return pd.DataFrame([_said(cells, row) for row in rows.to_dict("records")])
+
+
+def _said(cells: Mapping[str, Cell], of: Any) -> dict[str, Any]:
+    def said(cell: Cell) -> Any:
+        if isinstance(cell, str):
+            return cell.format_map(of)
+        return cell[1](of[cell[0]]) if isinstance(cell, tuple) else cell(of)
+
+    return {title: said(cell) for title, cell in cells.items()}
 
 
 def natural(text: str) -> int:
@@ -248,11 +289,11 @@ class Study:
         for arguments in parts:
             made_from = {"part": part.__name__, "arguments": arguments, "module": module, "versions": own_versions()}
             files.append(self.out / "parts" / f"{part.__name__}_{digest_of(made_from)}.json")
-        missing = {file: dict(arguments) for file, arguments in zip(files, parts, strict=True) if not file.exists()}
+        missing = {file: dict(arguments) for file, arguments in zip(files, parts, strict=True) if not _tables_of(file)}
         where = list(missing)
         runs = [(partial(importable(part), **places), arguments) for arguments in missing.values()]
         self.each(_make, runs, lambda number, content: write_json(where[number], content))
-        made = [json.loads(file.read_text(encoding="utf-8"))["tables"] for file in files]
+        made = [_tables_of(file) for file in files]
         names = dict.fromkeys(name for tables in made for name in tables)
         return {
             name: pd.concat([pd.DataFrame(tables[name]) for tables in made if name in tables], ignore_index=True)
@@ -273,7 +314,7 @@ class Study:
         results: dict[int, Result] = {}
         errors = []
         try:
-            with closing(self._calls(function, runs)) as calls:
+            with interruptible(), closing(self._calls(function, runs)) as calls:
                 for number, result in tqdm(calls, desc="parts", total=len(runs), disable=None):
                     try:
                         results[number] = result()
@@ -324,6 +365,17 @@ def importable(function: Callable[..., Result]) -> Callable[..., Result]:
     if function.__module__ != "__main__" or program is None:
         return function
     return getattr(importlib.import_module(program.name), function.__name__)
+
+
+def _tables_of(file: Path) -> dict[str, Any]:
+    """The tables of a part; none if it is not made. A damaged file is set aside, and its part is made again."""
+    if not file.exists():
+        return {}
+    try:
+        return dict(json.loads(file.read_text(encoding="utf-8"))["tables"])
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        print(f"{file} is damaged ({error!r}): it is kept as {set_aside(file).name}, and made again", file=sys.stderr)
+        return {}
 
 
 def _make(part: Callable[..., Tables], arguments: dict[str, Any]) -> dict[str, Any]:

@@ -14,6 +14,7 @@ import json
 import os
 import shutil
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
 from hashlib import sha256
@@ -28,6 +29,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
 
 from battery_env.files import replacing
 from benchmarks.study import digest_of, own_versions, versions, write_json, write_text
@@ -80,6 +82,7 @@ class Recipe:
         seed: int,
         timesteps: int | None = None,
         *,
+        updates: int | None = None,
         hyperparameters: dict[str, Any] | None = None,
         settings: str | None = None,
         defaults: bool = False,
@@ -87,12 +90,14 @@ class Recipe:
     ) -> Recipe:
         """
         The recipe of a training: with the entry of ``zoo_configs`` for the environment, the ``default`` entry of the algorithm
-        that ``settings`` names, or ``defaults``.
+        that ``settings`` names, or ``defaults``. In place of steps it may be told gradient steps, with one call of ``train()``
+        per step of all environments.
         """
         kind = algorithm(algo)
         if not 0 <= seed < 2**32:
             raise ValueError(f"a seed must lie within 0 .. 2**32 - 1, got {seed}")
         environment, metadata = _environment(env_id)
+        entry: dict[str, Any]
         if defaults:
             of_dicts = environment["observation_space"].startswith("Dict(")
             source, entry = "defaults", {"policy": "MultiInputPolicy" if of_dicts else "MlpPolicy"}
@@ -106,6 +111,10 @@ class Recipe:
             entry = entries[key]
         entry = {**entry, **(hyperparameters or {})}
         in_entry = int(float(entry.pop("n_timesteps", DEFAULTS_TIMESTEPS)))
+        if updates is not None:
+            n_envs = entry["n_envs"]
+            calls = entry["learning_starts"] // n_envs + -(-updates // entry.get("gradient_steps", 1))
+            timesteps = n_envs * calls
         timesteps = in_entry if timesteps is None else timesteps
         arguments = {
             name: parameter.default
@@ -137,6 +146,13 @@ class Recipe:
     def digest(self) -> str:
         """Names the recipe but for its seed."""
         return digest_of({name: value for name, value in asdict(self).items() if name != "seed"})
+
+    @property
+    def evaluation_freq(self) -> int:
+        """Calls of a callback between two evaluations; 0 if there are none."""
+        if self.evaluations is None:
+            return 0
+        return max(self.timesteps // (self.evaluations * self.hyperparameters.get("n_envs", 1)), 1)
 
     @property
     def label(self) -> str:
@@ -244,35 +260,66 @@ def set_up(recipe: Recipe, folder: Path, **options: Any) -> tuple[LACExperimentM
     return manager, model
 
 
+class Training:
+    """
+    One training, ready to begin or, where the recipe has evaluations, to go on from the checkpoint at the last of them.
+
+    :param recipe: what it is made by
+    :param file: where the model is saved, in a folder of its own if the recipe has evaluations
+    :param options: of the manager of the RL Zoo
+    """
+
+    def __init__(self, recipe: Recipe, file: Path, **options: Any) -> None:
+        self.recipe, self.file = recipe, file
+        self.checkpoint = CheckpointCallback(file.with_name("checkpoint"), recipe.evaluation_freq)
+        if self.checkpoint.resumed:
+            options["trained_agent"] = str(self.checkpoint.folder / "model.zip")
+        self.manager, self.model = set_up(recipe, file.parent / "zoo", **options)
+
+    def evaluation_env(self) -> VecEnv:
+        """One more environment."""
+        with contextlib.redirect_stdout(io.StringIO()):
+            return self.manager.create_envs(n_envs=1, eval_env=True, no_log=True)
+
+    def run(self, callbacks: Sequence[BaseCallback], log: Path, formats: Sequence[str]) -> dict[str, Any]:
+        """Train, and return what made the model."""
+        model = self.model
+        model.set_logger(configure(str(log), list(formats)))
+        steps = self.recipe.timesteps - model.num_timesteps
+        model.learn(steps, [*callbacks, self.checkpoint], reset_num_timesteps=False)
+        return {
+            "recipe": asdict(self.recipe),
+            "versions": versions(),
+            "resumed": self.checkpoint.resumed,
+            # of all algorithms that count them
+            "updates": getattr(model, "_n_updates", None),
+            "timesteps": model.num_timesteps,
+            "training_minutes": self.checkpoint.seconds / 60.0,
+        }
+
+    def save(self) -> None:
+        """Save the model, and close its environments and its log."""
+        with replacing(self.file) as part:
+            self.model.save(part)
+        assert self.model.env is not None
+        self.model.env.close()
+        self.model.logger.close()
+
+
 def train_or_load(
-    algo: str,
-    env_id: str,
-    seed: int,
-    timesteps: int,
-    folder: Path,
-    hyperparameters: dict[str, Any] | None = None,
-    settings: str | None = None,
-    callback: BaseCallback | None = None,
-    compile_update: bool = False,
+    recipe: Recipe, folder: Path, callbacks: Sequence[BaseCallback] = (), compile_update: bool = False
 ) -> BaseAlgorithm:
     """
-    Train one policy, or load it if that has been done. A callback that changes nothing, and whether updates are compiled, are
-    no part of the recipe.
+    Train one policy, or load it if that has been done. Callbacks that change nothing, and whether updates are compiled, are no
+    part of the recipe.
     """
-    recipe = Recipe.of(algo, env_id, seed, timesteps, hyperparameters=hyperparameters, settings=settings)
     record = record_file(recipe, folder)
     file = record.with_suffix(".zip")
     if not file.exists():
-        start = time.perf_counter()
-        _, model = set_up(recipe, folder / "zoo", hyperparams={"compile_update": True} if compile_update else {})
-        model.set_logger(configure(str(folder), ["csv", "tensorboard"]))
-        model.learn(timesteps, callback)
-        minutes = (time.perf_counter() - start) / 60.0
-        described = {"recipe": asdict(recipe), "training_minutes": minutes, "versions": versions()}
-        write_json(record, described)
-        with replacing(file) as part:
-            model.save(part)
-    return ALGOS[algo].load(file, device="cpu")
+        training = Training(recipe, file, hyperparams={"compile_update": True} if compile_update else {})
+        write_json(record, training.run(callbacks, folder, ["csv", "tensorboard"]))
+        training.save()
+    return ALGOS[recipe.algo].load(file, device="cpu")
 
 
 def training_minutes(recipe: Recipe, folder: Path) -> float:
@@ -280,14 +327,8 @@ def training_minutes(recipe: Recipe, folder: Path) -> float:
     return float(json.loads(record_file(recipe, folder).read_text(encoding="utf-8"))["training_minutes"])
 
 
-def timesteps_of(updates: int, hyperparameters: dict[str, Any]) -> int:
-    """How long to train for a number of updates, with one call of ``train()`` per step of all environments."""
-    n_envs, starts = hyperparameters["n_envs"], hyperparameters["learning_starts"]
-    return n_envs * (starts // n_envs + -(-updates // hyperparameters.get("gradient_steps", 1)))
-
-
 def record_file(recipe: Recipe, folder: Path) -> Path:
-    """Where :func:`train_or_load` says what made a model: ``recipe``, ``training_minutes``, ``versions``."""
+    """Where :func:`train_or_load` says what made a model."""
     return folder / f"model_{recipe.name}.json"
 
 
@@ -297,7 +338,7 @@ class CheckpointCallback(BaseCallback):
     interrupted; and counts interruptions and time.
 
     :param folder: the folder, of an earlier part of the same training if it exists
-    :param save_freq: calls between checkpoints
+    :param save_freq: calls between checkpoints; 0 for none
     """
 
     def __init__(self, folder: Path, save_freq: int) -> None:
@@ -309,7 +350,7 @@ class CheckpointCallback(BaseCallback):
         self.resumed = 0
         #: Wall time of the training, evaluations included.
         self.seconds = 0.0
-        if folder.exists():
+        if save_freq and folder.exists():
             before = json.loads((folder / "progress.json").read_text(encoding="utf-8"))
             self.resumed, self.seconds = before["resumed"] + 1, before["seconds"]
 
@@ -329,16 +370,18 @@ class CheckpointCallback(BaseCallback):
             os.replace(old, folder)
 
     def _on_step(self) -> bool:
-        if self.n_calls % self.save_freq == 0:
+        if self.save_freq and self.n_calls % self.save_freq == 0:
             part, old = self.folder.with_suffix(".part"), self.folder.with_suffix(".old")
             for leftover in (part, old):
                 shutil.rmtree(leftover, ignore_errors=True)
             part.mkdir(parents=True)
-            self.model.save(part / "model")
+            with replacing(part / "model.zip") as file:
+                self.model.save(file)
             if isinstance(self.model, OffPolicyAlgorithm):
-                self.model.save_replay_buffer(part / "replay_buffer.pkl")
+                with replacing(part / "replay_buffer.pkl") as file:
+                    self.model.save_replay_buffer(file)
             progress = {"resumed": self.resumed, "seconds": time.perf_counter() - self._start}
-            (part / "progress.json").write_text(json.dumps(progress), encoding="utf-8")
+            write_json(part / "progress.json", progress)
             if self.folder.exists():
                 os.replace(self.folder, old)
             os.replace(part, self.folder)

@@ -14,15 +14,27 @@ from sphinx.application import Sphinx
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))  # the packages of this tree, also where others are installed
 
+from docs.environment_pages import CONTROL_IDS, IDS  # noqa: E402
+
 project = "sb3_lac"
 author = "The sb3_lac contributors"
 project_copyright = author
 release = (ROOT / "sb3_lac" / "version.txt").read_text(encoding="utf-8").strip()
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary"]
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.mathjax",
+    "sphinx_copybutton",
+    "sphinx_design",
+]
+myst_enable_extensions = ["colon_fence", "dollarmath"]
 templates_path = ["_templates"]
 exclude_patterns = ["_build"]
 html_theme = "furo"
+html_static_path = ["_static"]
+html_css_files = ["plates.css"]
 html_title = f"sb3_lac and battery_env {release}"
 
 myst_heading_anchors = 4  # as on GitHub
@@ -35,6 +47,28 @@ def entitle_table(app: Sphinx, docname: str, source: list[str]) -> None:
     """The tables in results have no title of their own, and no place in the sidebar: the page of all tables leads to them."""
     if docname.startswith("results/"):
         source[0] = f"---\norphan: true\n---\n\n# {docname.removeprefix('results/')}\n\n{source[0]}"
+
+
+# the pages below a page in the sidebar
+BELOW = {
+    "lac": ("how_lac_works", "stability_metrics", "published_lac"),
+    "train_fast": ("zoo", "tensorboard", "onnx", "own_algorithm", "cluster"),
+    "cost_environments": tuple(f"environments/{env_id}" for env_id in CONTROL_IDS),
+    "real_cells": ("tester_files", "own_cell", "forecasts", "streaming", "pretrained"),
+    "parameters": ("identifiability",),
+    "battery_env": ("compare_calibrators", *(f"environments/{env_id}" for env_id in IDS if env_id not in CONTROL_IDS)),
+    "results_at_a_glance": (
+        *("reports/control_problems", "reports/certificates", "reports/designs", "reports/searches", "reports/speed"),
+        *("reports/real_cells", "reports/voltage", "reports/wrong_constants", "reports/identifiability", "reports/full_state"),
+        "all_tables",
+    ),
+}
+
+
+def nest(app: Sphinx, docname: str, source: list[str]) -> None:
+    """Hang pages below others, which a forge that shows the same files need not see."""
+    if docname in BELOW:
+        source[0] += "\n```{toctree}\n:hidden:\n\n" + "\n".join(f"/{name}" for name in BELOW[docname]) + "\n```\n"
 
 
 # pages that can be downloaded as notebooks
@@ -88,5 +122,6 @@ def refer_to_page(app: Sphinx, what: str, name: str, documented: Any, options: A
 def setup(app: Sphinx) -> None:
     app.connect("source-read", entitle_table)
     app.connect("source-read", offer_notebook)
+    app.connect("source-read", nest)
     app.connect("doctree-read", lead_to_site)
     app.connect("autodoc-process-docstring", refer_to_page)

@@ -9,10 +9,12 @@ docs/pictures/ID.gif moves and shows the plant, and docs/pictures/ID.png is the 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium as gym
+import numpy as np
 from matplotlib.colors import to_rgb
 from PIL import Image
 
@@ -97,22 +99,36 @@ def draw(env_id: str, episode: Episode) -> tuple[list[Image.Image], Image.Image]
             frames.append(env.render())
         observation, _, terminated, truncated, _ = env.step(controller.predict(observation)[0])
         n_steps, done = n_steps + 1, terminated or truncated
-    plants = [Image.fromarray(frame[:, : frame.shape[1] // 2]).resize(_SIZE) for frame in frames]
-    # White, and each colour with two tints of it
+    moving = in_few_colours([plant_of(frame) for frame in frames])
+    return moving, Image.fromarray(env.render()).quantize(128, Image.Quantize.MAXCOVERAGE)
+
+
+def plant_of(frame: np.ndarray) -> Image.Image:
+    """The plant, which is the left half of what ``render()`` draws."""
+    return Image.fromarray(frame[:, : frame.shape[1] // 2]).resize(_SIZE)
+
+
+def in_few_colours(pictures: Sequence[Image.Image]) -> list[Image.Image]:
+    """White, and each colour of the drawings with two tints of it, so that files are small."""
     tints = [value + tint * (1.0 - value) for name in _COLOURS for tint in (0.0, 0.35, 0.7) for value in to_rgb(name)]
     palette = Image.new("P", (1, 1))
     palette.putpalette([255, 255, 255, *(round(255 * value) for value in tints)])
-    moving = [plant.quantize(palette=palette, dither=Image.Dither.NONE) for plant in plants]
-    return moving, Image.fromarray(env.render()).quantize(128, Image.Quantize.MAXCOVERAGE)
+    return [each.quantize(palette=palette, dither=Image.Dither.NONE) for each in pictures]
+
+
+def save_moving(pictures: Sequence[Image.Image], path: Path, picture_ms: int) -> None:
+    """Write a GIF that rests at its end."""
+    first, *others = pictures
+    durations_ms = [picture_ms] * len(others) + [1500]
+    with replacing(path) as part:
+        first.save(part, "GIF", save_all=True, append_images=others, duration=durations_ms, loop=0)
 
 
 def main() -> None:
     """Write all of them."""
     for env_id, episode in EPISODES.items():
-        (first, *others), last = draw(env_id, episode)
-        durations_ms = [episode.picture_ms] * len(others) + [1500]  # to look at the end
-        with replacing(PICTURES / f"{env_id}.gif") as part:
-            first.save(part, "GIF", save_all=True, append_images=others, duration=durations_ms, loop=0)
+        moving, last = draw(env_id, episode)
+        save_moving(moving, PICTURES / f"{env_id}.gif", episode.picture_ms)
         with replacing(PICTURES / f"{env_id}.png") as part:
             last.save(part, "PNG", optimize=True)
 

@@ -43,7 +43,9 @@ NOT_APPLICABLE = {
     "test_identity.py::test_continuous[PublishedLAC]": "400 steps must do, of which its learning starts after 1000",
 }
 if LAC is sb3_lac.PublishedLAC:
-    NOT_APPLICABLE["test_save_load.py::test_save_load_pytorch_var"] = "256 steps must do, of which its learning starts after 1000"
+    NOT_APPLICABLE["test_save_load.py::test_save_load_pytorch_var"] = (
+        "256 steps must do, of which its learning starts after 1000"
+    )
 
 
 class Conformance:

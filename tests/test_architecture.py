@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[1]
 
 # each layer may import the ones before it, and itself; a folder is one
 LAYERS = (
-    ("battery_env.arrays", "battery_env.checks", "battery_env.files"),
+    ("battery_env.arrays", "battery_env.checks", "battery_env.compiled", "battery_env.files"),
     ("battery_env.parameters", "battery_env.estimates"),
     ("battery_env.electrochemistry",),
     ("battery_env.records",),
@@ -120,6 +120,13 @@ def test_importing_a_package_registers_its_environments_and_loads_nothing_slow(p
     assert not HEAVY & {name.split(".")[0] for name in result.stdout.split()}
 
 
+def test_kernels_are_compiled_where_there_is_no_place_to_keep_them():
+    nowhere = "from numba.core import caching; caching.CompileResultCacheImpl._locator_classes = []"
+    code = f"{nowhere}; from battery_env.electrochemistry.kernels import logarithm; print(logarithm(1.0))"
+    result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert result.stdout == "0.0\n" and not result.stderr
+
+
 def test_every_public_name_of_battery_env_is_the_one_that_type_checkers_see():
     tree = ast.parse((ROOT / "battery_env/__init__.py").read_text(encoding="utf-8"))
     typed = next(node for node in tree.body if isinstance(node, ast.If))
@@ -153,7 +160,7 @@ def declared(distributions, extras):
 @pytest.mark.parametrize(
     ("package", "distributions", "extras"),
     [
-        ("battery_env", ("battery_env",), ("cluster", "cyclers", "onnx", "parquet", "sb3")),
+        ("battery_env", ("battery_env",), ("cluster", "cyclers", "onnx", "page", "parquet", "sb3")),
         ("sb3_lac", (".",), ("zoo", "onnx")),
         ("benchmarks", ("battery_env", "."), ("zoo", "peers")),
         ("tests", ("battery_env", "."), ("zoo", "peers", "onnx", "dev")),

@@ -42,6 +42,7 @@ GUIDE = {
     "batteries": [
         "docs/first_discharge",
         "docs/cell_life",
+        "docs/bench_page",
         "docs/which_estimator",
         "docs/parameters",
         "docs/real_cells",
@@ -57,7 +58,7 @@ GUIDE = {
         "docs/battery_env",
     ],
     "results": ["docs/results_at_a_glance", "docs/paper_claims"],
-    "about": ["docs/glossary", "docs/faq", "docs/citing"],
+    "about": ["docs/files_and_faults", "docs/glossary", "docs/faq", "docs/citing"],
 }
 STYLED = [name for names in GUIDE.values() for name in names]
 REPORTS = sorted((DOCS / "reports").glob("*.md"))
@@ -203,12 +204,46 @@ def test_every_picture_has_a_caption(page):
         pytest.fail(f"a line in italics has to follow {picture.strip()}: what to see, who made it, how many seeds")
 
 
+@pytest.mark.parametrize("name", STYLED)
+def test_tables_of_the_guide_fit_the_column_of_the_site(name):
+    for row in published(ROOT / f"{name}.md"):
+        assert len(row) <= 6, row
+
+
+def test_reports_are_short_enough_to_be_read():
+    words = 0
+    for page in REPORTS:
+        words += sum(len(sentence.split()) for sentence in prose(page))
+        words += sum(len(cell.split()) for row in published(page) for cell in row if not re.fullmatch(":?-+:?", cell))
+    assert words < 15_500
+
+
 @pytest.mark.parametrize("page", REPORTS, ids=lambda page: page.name)
 def test_a_report_answers_before_it_details(page):
     text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
     assert re.findall(r"^## (.*)", text, flags=re.MULTILINE) == ["Question", "Answer", "How to repeat it", "Details"]
     answer = text[text.index("## Answer") : text.index("## How to repeat it")]
     assert answer.count("\n![") == 1 and answer.count("\n\n|") == 1
+
+
+#: Pages that say who is better: each names the rows that it rests on, ``<!-- rests on TABLE: cells of a row; value -->``.
+CLAIMING = ("README", "docs/when_to_take_lac", "docs/results_at_a_glance", "docs/faq", "docs/pretrained")
+
+
+@pytest.mark.parametrize("name", CLAIMING)
+def test_a_claim_of_the_guide_names_the_rows_that_it_rests_on(name):
+    text = (ROOT / f"{name}.md").read_text(encoding="utf-8")
+    named = re.split(r"<!-- rests on ([^:\s]+): ([^>]+) -->", text)
+    # what is said is the paragraph before
+    claims = [(said.rpartition("\n\n")[2], *row) for said, *row in zip(named[:-1:3], named[1::3], named[2::3], strict=True)]
+    assert claims
+    for said, source, cells in claims:
+        *keys, value = cells.split("; ")
+        of_keys = [row for row in published(ROOT / source) if set(keys) <= set(row)]
+        assert any(
+            value in {part for cell in row for part in (cell, *cell.split(" / "), *cell.split(" "))} for row in of_keys
+        ), cells
+        assert re.search(rf"(?<![\d.]){re.escape(value)}(?![\d])", said), f"{value} is not said where {source} is named"
 
 
 @pytest.mark.parametrize("page", [ROOT / f"{name}.md" for name in STYLED] + REPORTS, ids=lambda page: page.name)

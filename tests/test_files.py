@@ -1,10 +1,6 @@
 """A file is there as a whole, the old one or the new one, whichever write, sync or renaming fails. Also of two writers."""
 
-import os
-import resource
-import signal
 import threading
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -14,13 +10,17 @@ import battery_env.files
 import sb3_lac.files
 from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.estimators.kalman.filter import ExtendedKalmanFilter
+from battery_env.lab.running import read_load
 from battery_env.loads import constant
 from battery_env.plotting import save_figure
+from battery_env.policies.estimator import PolicyEstimator
+from battery_env.records.discharge import load_nasa_discharges
 from battery_env.trajectories import TrajectoryDataset
 from benchmarks.study import write_text
 from sb3_lac import LAC
 from sb3_lac.envs import reference_controller
 from sb3_lac.stability.fitting import FittedLyapunov, fit_lyapunov
+from tests.faults import Disk, a_full_disk
 
 OLD, NEW = "old", "new"
 
@@ -72,37 +72,6 @@ WRITERS = {
     "buffer.pkl": ("save_replay_buffer", lambda path: LAC("MlpPolicy", "LinearCost-v0").load_replay_buffer(path), True),
     "lyapunov.pt": (None, FittedLyapunov.load, True),
 }
-
-
-@contextmanager
-def a_full_disk(after_bytes):
-    """No file grows beyond so many bytes, for whoever writes it, compiled code too."""
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (after_bytes, limits[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-        signal.signal(signal.SIGXFSZ, before)
-
-
-class Disk:
-    """Counts syncs, renamings and links, and lets one of them fail."""
-
-    def __init__(self, patch, fails_at=None):
-        self.calls, self.fails_at = [], fails_at
-        for name in ("fsync", "replace", "link"):
-            patch.setattr(os, name, self.counting(name, getattr(os, name)))
-
-    def counting(self, name, function):
-        def counted(*arguments, **named):
-            self.calls.append(name)
-            if len(self.calls) - 1 == self.fails_at:
-                raise OSError(5, "Input/output error")
-            return function(*arguments, **named)
-
-        return counted
 
 
 @pytest.mark.parametrize("name", WRITERS)
@@ -217,3 +186,86 @@ def test_a_file_that_another_command_holds_is_refused(tmp_path):
                 pass
     with battery_env.files.locked(tmp_path / "run"):
         pass
+
+
+@pytest.fixture(scope="module", params=[lambda: ExtendedKalmanFilter(thermal=True), PolicyEstimator.pretrained])
+def streamed(request):
+    """An estimator in the middle of a discharge, and how to make another one."""
+    estimator, record = request.param(), load_nasa_discharges("B0005")[0].loaded_part(2.7)
+    for sample in zip(record.voltage_V[:60], record.current_A[:60], np.diff(record.time_s, prepend=0.0)[:60], strict=True):
+        estimator.update(*sample)
+    return estimator, request.param
+
+
+def changed(arrays, rng):
+    """The arrays of a state with one of them, or one number in one of them, changed; and how."""
+    name = str(rng.choice(sorted(arrays)))
+    kind = rng.integers(6)
+    if kind == 0:
+        return {each: array for each, array in arrays.items() if each != name}
+    if kind == 1:
+        return arrays | {name: arrays[name][:-1]}
+    array = arrays[name].copy()
+    part = array
+    while part.dtype.names:
+        part = part[str(rng.choice(part.dtype.names))]
+    if part.size:
+        place = np.unravel_index(rng.integers(part.size), part.shape)
+        with np.errstate(over="ignore"):
+            part[place] = rng.choice([-1e9, -1, 0, 1e9] if part.dtype.kind in "iub" else [np.nan, np.inf, -1e300, -1, 1e300])
+    return arrays | {name: array}
+
+
+def test_contents_under_right_checksums_are_refused_whole_or_gone_on_from(streamed, tmp_path):
+    estimator, make = streamed
+    file, rng, refused = tmp_path / "state.npz", np.random.default_rng(0), 0
+    arrays = {name: array.copy() for name, array in estimator._arrays().items()}
+    for _ in range(200):
+        metadata = np.load(estimator.save(file))["metadata"]
+        other = make()
+        fresh = {name: array.copy() for name, array in other._arrays().items()}
+        np.savez(file, metadata=metadata, **changed(arrays, rng))
+        try:
+            other.load(file)
+        except ValueError as error:
+            assert "state.npz" in str(error)
+            for name, array in other._arrays().items():
+                np.testing.assert_array_equal(array, fresh[name])
+            refused += 1
+            continue
+        try:
+            said = other.update(3.9, 2.0, 10.0)
+        except ValueError:  # the sample does not fit what it was told
+            continue
+        assert np.isfinite([said.q_mobile, said.r_o]).all() or not said.settled
+    assert refused > 50
+
+
+def test_a_batch_is_loaded_as_a_whole_and_fast(tmp_path):
+    batch = ExtendedKalmanFilter().batch(3)
+    batch.update([4.1, 4.1, 4.1], 1.0, 0.0)
+    file = batch.save(tmp_path / "cells.npz")
+    content = dict(np.load(file))
+    content["all/filters"]["covariance"][2, 0, 0, 0, 0] = -1.0
+    np.savez(file, **content)
+    other = ExtendedKalmanFilter().batch(3)
+    with pytest.raises(ValueError, match=r"cells\.npz: cell 2: its variance is none that a discharge leads to"):
+        other.load(file)
+    assert all(each._cells["seen"]["samples"][0] == 0 for each in other.estimators)
+
+
+@pytest.mark.parametrize(
+    "content", [b"[" * 100_000, b"\xff", b"PK\3\4" + bytes(100), b'{"constants": {"kn": 1' + 400 * b"0" + b"}}"]
+)
+def test_no_content_of_a_file_of_constants_or_of_a_load_is_more_than_an_error(content, tmp_path):
+    described = b'{"format": "battery_env.CellParameters", "version": 1, ' + content[1:]
+    for number, text in enumerate((content, described if content.startswith(b"{") else content)):
+        path = tmp_path / f"{number}.json"
+        path.write_bytes(text)
+        with pytest.raises(ValueError, match=path.name):
+            CellParameters.from_json(path)
+    for suffix in (".csv", ".csv.gz", ".zip"):
+        path = tmp_path / f"load{suffix}"
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=path.name):
+            read_load(path)

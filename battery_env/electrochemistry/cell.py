@@ -82,6 +82,11 @@ def _redlich_kister_polynomial(coefficients: tuple[float, ...], faraday: float) 
     return polynomial
 
 
+# How far a constant may be from that of a new 18650, as a factor: two are of nature; large cells are known by the others.
+_FARTHEST = {"R": 1.01, "F": 1.01, "Tb0": 2.0, "VEOD": 10.0}
+_FARTHEST_OF_OTHERS = 1e6
+
+
 @dataclass(frozen=True)
 class CellParameters:
     """
@@ -111,7 +116,7 @@ class CellParameters:
     :param mC: thermal mass of the cell, J/K
     :param tau: time constant of its cooling, s
     :param VEOD: voltage at which the cell counts as discharged, V
-    :raises ValueError: if a value is not finite, or outside the range in which the model means anything
+    :raises ValueError: if a value is not finite, or so far from that of a new cell that no cell has it
     """
 
     q_mobile: float = 7600.0
@@ -157,12 +162,18 @@ class CellParameters:
         for field in fields(self):
             value = getattr(self, field.name)
             numbers = value if field.name in ("An", "Ap") and isinstance(value, tuple) else (value,)
-            if not all(isinstance(number, Real) for number in numbers):
+            if not all(isinstance(number, Real) and not isinstance(number, bool) for number in numbers):
                 raise TypeError(f"CellParameters: {field.name} must be {field.type}, got {value!r}")
             if not all(map(isfinite, numbers)):
                 raise ValueError(f"CellParameters: {field.name} must be finite, got {value!r}")
             if field.name not in ("U0n", "U0p", "An", "Ap", "r_o") and not value > 0.0:
                 raise ValueError(f"CellParameters: {field.name} must be greater than 0, got {value!r}")
+            usual = max(map(abs, field.default if isinstance(field.default, tuple) else (field.default,)))
+            factor = _FARTHEST.get(field.name, _FARTHEST_OF_OTHERS)
+            least = 0.0 if field.name in ("U0n", "U0p", "An", "Ap", "r_o") else usual / factor
+            if not all(least <= abs(number) <= factor * usual for number in numbers):
+                off = f"is more than {factor:g} times off the {usual:g} of a new 18650"
+                raise ValueError(f"CellParameters: {field.name} {off}, got {value!r}")
         for name in ("An", "Ap"):
             if not 1 <= len(getattr(self, name)) < POLYNOMIAL_SIZE:
                 raise ValueError(

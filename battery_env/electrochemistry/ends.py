@@ -7,11 +7,11 @@ from math import exp, sqrt
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
 from battery_env.arrays import FloatArray, IntArray
 from battery_env.checks import LoadUnit
+from battery_env.compiled import compiled
 from battery_env.electrochemistry.cell import CellParameters, PackedConstants
 from battery_env.electrochemistry.kernels import (
     BLOCK,
@@ -22,7 +22,7 @@ from battery_env.electrochemistry.kernels import (
     states_of_block,
     step_of_block,
 )
-from battery_env.electrochemistry.simulation import state_of_charge
+from battery_env.electrochemistry.simulation import state_of_charge, voltage_into
 
 #: The ends and the middle of the intervals that are shown: nine of ten outcomes lie between the outer two.
 BAND = (0.05, 0.5, 0.95)
@@ -147,8 +147,7 @@ def run_down(
     """
     count, dt_s, power = len(cells.q_mobile), model.dt_s, loads.unit == "power"
     until = np.broadcast_to(np.ceil(np.minimum(loads.until_s, LONGEST_S) / dt_s - 1e-9), count)
-    known = (cells.q_mobile, cells.r_o, cells.error_V, cells.drift_V, cells.soc, until)
-    followed = np.vstack([*known, np.repeat(np.array(_AT_FIRST)[:, None], count, axis=1)])
+    followed = _followed(cells, until)
     every = 0 if every_s is None else max(round(every_s / dt_s), 1)
     course: list[tuple[IntArray, FloatArray]] = []
     first, going, state = 0, np.arange(count), cells.state.copy()
@@ -176,6 +175,35 @@ def run_down(
     return Ends(time_s, (1.0 - followed[_END_SOC]) * cells.q_mobile / 3600.0, course_s, course_V)
 
 
+def follow(cells: Cells, model: Model, current_A: FloatArray, shown: int) -> tuple[Cells, FloatArray]:
+    """
+    Take cells through a current that was measured.
+
+    :param cells: at its start
+    :param model: how they are simulated
+    :param current_A: over each step, A, shape (K,)
+    :param shown: the voltages of so many steps are asked for, the last ones
+    :return: the cells at its end; and their voltages before each of these steps, and at the end, V, shape (n, shown + 1), NaN
+        once a cell is empty
+    """
+    count, state, split = len(cells.q_mobile), cells.state.copy(), len(current_A) - shown
+    followed, voltage_V = _followed(cells, np.full(count, np.inf)), np.full((count, shown + 1), np.nan)
+    # nobody asks where these end, nor how full they become
+    limits, packed, part_V = (-np.inf, np.inf, MEMORY_SHARE), model.cell.packed, np.full((count, shown), np.nan)
+    for load, every, seen_V in ((current_A[:split], 0, part_V), (current_A[split:], 1, part_V)):
+        _run_on(load[None], followed, model.dt_s, False, model.thermal, packed, limits, (0, every), state, seen_V)
+    at_end_V = np.empty(count)
+    voltage_into(at_end_V, state, cells.q_mobile, packed)
+    voltage_V[:, :-1], voltage_V[:, -1] = part_V, at_end_V + cells.error_V
+    return cells._replace(state=state), voltage_V
+
+
+def _followed(cells: Cells, until: FloatArray) -> FloatArray:
+    """What is followed of cells, at first."""
+    known = (cells.q_mobile, cells.r_o, cells.error_V, cells.drift_V, cells.soc, until)
+    return np.vstack([*known, np.repeat(np.array(_AT_FIRST)[:, None], len(until), axis=1)])
+
+
 def overfull_error(after_s: float) -> ValueError:
     """What to say of a load that charges a cell by more than it takes."""
     return ValueError(
@@ -184,7 +212,7 @@ def overfull_error(after_s: float) -> ValueError:
     )
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def _run_on(
     load: FloatArray,
     followed: FloatArray,

@@ -15,9 +15,9 @@ from __future__ import annotations
 from math import sqrt
 
 import numpy as np
-from numba import njit
 
 from battery_env.arrays import FloatArray, IntArray
+from battery_env.compiled import compiled, inlined
 from battery_env.electrochemistry.cell import (
     BULK_RATE,
     CONSTANTS_SIZE,
@@ -68,12 +68,8 @@ LOAD, _Q, _R_O, _XN, _XP, _VOLTAGE, _CONSTANTS = range(STATE_SIZE, STATE_SIZE + 
 #: step.
 VOLTAGE, BLOCK_SIZE = _VOLTAGE * BLOCK, (_CONSTANTS + CONSTANTS_SIZE) * BLOCK
 
-_compiled = njit(cache=True, error_model="numpy")
-# the compiler makes vector loops only of what is inlined
-_inlined = njit(cache=True, error_model="numpy", forceinline=True)
 
-
-@_inlined
+@inlined
 def logarithm(x: float) -> float:
     # ln(x) within 1 ulp for x >= 2.3e-308, in operations that exist as vector instructions; the C library's has branches, and
     # differs from machine to machine. With that one a step of BatteryQmax takes 1.05 times as long in 16 cells, 1.09 times in
@@ -91,7 +87,7 @@ def logarithm(x: float) -> float:
     return value if x < np.inf else x  # infinity and NaN stay what they are
 
 
-@_inlined
+@inlined
 def polynomial(a: FloatArray, y: float) -> float:
     # degree 13, Estrin's scheme: half the latency of Horner's
     y2 = y * y
@@ -101,7 +97,7 @@ def polynomial(a: FloatArray, y: float) -> float:
     return low + high * (y4 * y4)
 
 
-@_inlined
+@inlined
 def asinh_ratio(a: float, w: float) -> float:
     # asinh(a / sqrt(w)) with one root and one logarithm; absolute error below 1e-15
     root = abs(a) + sqrt(a * a + w)
@@ -109,7 +105,7 @@ def asinh_ratio(a: float, w: float) -> float:
     return magnitude if a >= 0.0 else -magnitude
 
 
-@_inlined
+@inlined
 def _fraction(share: float, charge: float, extended: bool) -> float:
     # comparisons in place of min and max: NaN stays NaN
     fraction = share * charge
@@ -119,31 +115,31 @@ def _fraction(share: float, charge: float, extended: bool) -> float:
     return fraction
 
 
-@_inlined
+@inlined
 def _has_voltage(xn: float, xp: float) -> bool:
     # an empty or overfull electrode has none
     return (xn > 0.0) & (xn < 1.0) & (xp > 0.0) & (xp < 1.0)
 
 
-@_inlined
+@inlined
 def nernst_logarithm(xn: float, xp: float) -> float:
     # of both Nernst terms at once, which R * Tb / F makes a voltage
     return logarithm((1.0 - xp) * xn / (xp * (1.0 - xn)))
 
 
-@_inlined
+@inlined
 def diffusion(bulk: float, surface: float, bulk_rate: float, surface_rate: float) -> float:
     # from the bulk to the surface of an electrode
     return bulk * bulk_rate - surface * surface_rate
 
 
-@_inlined
+@inlined
 def _equilibrium(xn: float, xp: float, tb: float, gas: float, u0: float, poly_n: FloatArray, poly_p: FloatArray) -> float:
     # Vep(xp) - Ven(xn)
     return u0 + gas * tb * nernst_logarithm(xn, xp) + (polynomial(poly_p, 2.0 * xp - 1.0) - polynomial(poly_n, 2.0 * xn - 1.0))
 
 
-@_inlined
+@inlined
 def _current(load: float, voltage: float, extended: bool) -> float:
     # of a load that is power
     if extended:
@@ -151,13 +147,13 @@ def _current(load: float, voltage: float, extended: bool) -> float:
     return load / voltage if voltage > 0.0 else np.nan
 
 
-@_inlined
+@inlined
 def _overpotential(i: float, x: float, scale: float, per_current: float) -> float:
     # what Vsn or Vsp relaxes to: Butler-Volmer with alpha = 1/2, J0 = k * sqrt(x * (1 - x)); scale: 2 * R * Tb / F
     return scale * asinh_ratio(i * per_current, (1.0 - x) * x)
 
 
-@_inlined
+@inlined
 def _euler(
     x: tuple[float, float, float, float, float, float, float, float],
     i: float,
@@ -190,12 +186,12 @@ def _euler(
     )
 
 
-@_inlined
+@inlined
 def mole_fraction(surface_charge: float, q: float, extended: bool, constants: FloatArray) -> float:
     return _fraction(constants[0, FRACTION_PER_SHARE] / q, surface_charge, extended)
 
 
-@_inlined
+@inlined
 def equilibrium_voltage(
     xn: float, xp: float, tb: float, constants: FloatArray, poly_n: FloatArray, poly_p: FloatArray
 ) -> float:
@@ -203,14 +199,14 @@ def equilibrium_voltage(
     return _equilibrium(xn, xp, tb, constants[0, R_OVER_F], constants[0, U0], poly_n, poly_p)
 
 
-@_inlined
+@inlined
 def nominal_overpotentials(i: float, xn: float, xp: float, tb: float, constants: FloatArray) -> tuple[float, float]:
     # for mole fractions inside 0 .. 1
     scale = 2.0 * constants[0, R_OVER_F] * tb
     return _overpotential(i, xn, scale, constants[0, PER_CURRENT_N]), _overpotential(i, xp, scale, constants[0, PER_CURRENT_P])
 
 
-@_inlined
+@inlined
 def cell_voltage(x: FloatArray, n: int, q: float, extended: bool, packed: PackedConstants) -> float:
     # V = Vep(xp) - Ven(xn) - Vo - Vsn - Vsp
     constants, poly_n, poly_p = packed
@@ -222,7 +218,7 @@ def cell_voltage(x: FloatArray, n: int, q: float, extended: bool, packed: Packed
     return equilibrium - x[n, VO] - x[n, VSN] - x[n, VSP]
 
 
-@_inlined
+@inlined
 def cell_step(
     x: FloatArray,
     n: int,
@@ -257,12 +253,12 @@ def cell_step(
     x[m, QNB], x[m, QNS], x[m, QPB], x[m, QPS] = y[4], y[5], y[6], y[7]
 
 
-@_inlined
+@inlined
 def cell_current(load: float, power: bool, voltage: float, extended: bool) -> float:
     return _current(load, voltage, extended) if power else load
 
 
-@_compiled
+@compiled
 def fill_block(
     block: FloatArray,
     first: int,
@@ -291,7 +287,7 @@ def fill_block(
                 block[(_CONSTANTS + k) * BLOCK + j] = constants[0, k]
 
 
-@_compiled
+@compiled
 def voltage_of_block(block: FloatArray, cells: int, extended: bool, poly_n: FloatArray, poly_p: FloatArray) -> None:
     # the voltages are in block[VOLTAGE : VOLTAGE + cells] then
     _fractions_of_block(block, cells, extended)
@@ -303,7 +299,7 @@ def voltage_of_block(block: FloatArray, cells: int, extended: bool, poly_n: Floa
         block[VOLTAGE + j] = volts if _has_voltage(xn, xp) else np.nan
 
 
-@_compiled
+@compiled
 def _fractions_of_block(block: FloatArray, cells: int, extended: bool) -> None:
     for j in range(cells):
         share = block[(_CONSTANTS + FRACTION_PER_SHARE) * BLOCK + j] / block[_Q * BLOCK + j]
@@ -311,7 +307,7 @@ def _fractions_of_block(block: FloatArray, cells: int, extended: bool) -> None:
         block[_XP * BLOCK + j] = _fraction(share, block[QPS * BLOCK + j], extended)
 
 
-@_compiled
+@compiled
 def step_of_block(
     block: FloatArray,
     cells: int,
@@ -367,14 +363,14 @@ def step_of_block(
         block[QPS * BLOCK + j] = y[7]
 
 
-@_compiled
+@compiled
 def states_of_block(block: FloatArray, first: int, cells: int, out: FloatArray) -> None:
     for j in range(cells):
         for k in range(STATE_SIZE):
             out[first + j, k] = block[k * BLOCK + j]
 
 
-@_compiled
+@compiled
 def voltage_batch(state: FloatArray, q: FloatArray, extended: bool, packed: PackedConstants, out: FloatArray) -> None:
     block = np.empty(BLOCK_SIZE)
     for first in range(0, out.shape[0], BLOCK):
@@ -385,7 +381,7 @@ def voltage_batch(state: FloatArray, q: FloatArray, extended: bool, packed: Pack
             out[first + j] = block[VOLTAGE + j]
 
 
-@_compiled
+@compiled
 def step_batch(
     state: FloatArray,
     load: FloatArray,
@@ -406,7 +402,7 @@ def step_batch(
         states_of_block(block, first, cells, out)
 
 
-@_compiled
+@compiled
 def advance_batch(
     state: FloatArray,
     load: FloatArray,
@@ -433,40 +429,7 @@ def advance_batch(
         states_of_block(block, start, cells, state)
 
 
-@_compiled
-def run_on_batch(
-    load: FloatArray,
-    q: FloatArray,
-    r_o: FloatArray,
-    dt: float,
-    power: bool,
-    thermal: bool,
-    packed: PackedConstants,
-    state: FloatArray,
-    voltage: FloatArray,
-    current: FloatArray,
-) -> None:
-    # load: shape (cells or 1, steps). Fills voltage, before each step and after the last, shape (steps + 1, cells), and
-    # current, over each step, shape (steps, cells); state goes on to the end. Cells that run empty go on without a voltage
-    shared = load.shape[0] == 1
-    block = np.empty(BLOCK_SIZE)
-    for first in range(0, state.shape[0], BLOCK):
-        cells = min(BLOCK, state.shape[0] - first)
-        fill_block(block, first, cells, state, q, q, r_o, packed.constants)  # the load comes below
-        for k in range(load.shape[1]):
-            for j in range(cells):
-                block[LOAD * BLOCK + j] = load[0 if shared else first + j, k]
-            step_of_block(block, cells, dt, power, True, thermal, False, packed.polynomial_n, packed.polynomial_p)
-            for j in range(cells):
-                voltage[k, first + j] = block[VOLTAGE + j]
-                current[k, first + j] = block[LOAD * BLOCK + j]
-        voltage_of_block(block, cells, False, packed.polynomial_n, packed.polynomial_p)
-        for j in range(cells):
-            voltage[-1, first + j] = block[VOLTAGE + j]
-        states_of_block(block, first, cells, state)
-
-
-@_compiled
+@compiled
 def roll_out(
     load: FloatArray,
     q: float,

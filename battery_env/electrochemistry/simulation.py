@@ -177,28 +177,6 @@ def state_of_charge(state: FloatArray, q_mobile: FloatArray) -> FloatArray:
     return np.asarray((state[..., QNB] + state[..., QNS]) / q_mobile)
 
 
-def reached_s(time_s: FloatArray, voltage_V: FloatArray, level_V: float, for_good: bool = False) -> float:
-    """
-    The one way to the end of a discharge: when a voltage falls to a level, interpolated between two steps.
-
-    :param time_s: shape (K,)
-    :param voltage_V: shape (K,); NaN, of an empty cell, is below every level
-    :param level_V: the cut-off, or another voltage, V
-    :param for_good: whether the fall is meant after which the voltage stays below, not the first one
-    :return: s; NaN if the level is not reached
-    """
-    is_below = ~(voltage_V > level_V)
-    if for_good:
-        is_below = np.logical_and.accumulate(is_below[::-1])[::-1]
-    below = np.flatnonzero(is_below)
-    if not len(below):
-        return float("nan")
-    n = below[0]
-    if n == 0 or np.isnan(voltage_V[n]):
-        return float(time_s[n])
-    return float(np.interp(level_V, voltage_V[[n, n - 1]], time_s[[n, n - 1]]))
-
-
 @dataclass(frozen=True)
 class Trajectory:
     """
@@ -238,16 +216,20 @@ class Trajectory:
         """Ohmic resistance, ohm."""
         return self.cell.r_o
 
-    def reached_s(self, voltage_V: float, for_good: bool = False) -> float:
+    def reached_s(self, voltage_V: float) -> float:
         """
-        When the voltage falls to a level, as :func:`reached_s`; an empty cell is below every level.
+        When the voltage first falls to a level, between two samples; an empty cell is below every level.
 
         :param voltage_V: the level, V
-        :param for_good: whether the fall is meant after which the voltage stays below
         :return: on the clock of ``time_s``, s; NaN if the level is not reached
         """
-        at_s = reached_s(self.time_s, self.voltage_V, voltage_V, for_good)
-        return self.eod_time_s if np.isnan(at_s) else at_s
+        below = np.flatnonzero(~(self.voltage_V > voltage_V))
+        if not len(below):
+            return self.eod_time_s
+        n = below[0]
+        if n == 0 or np.isnan(self.voltage_V[n]):
+            return float(self.time_s[n])
+        return float(np.interp(voltage_V, self.voltage_V[[n, n - 1]], self.time_s[[n, n - 1]]))
 
     def part(self, first: int, stop: int) -> Trajectory:
         """

@@ -13,9 +13,9 @@ from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from battery_env.arrays import FloatArray
+from battery_env.compiled import compiled, inlined
 from battery_env.electrochemistry.cell import (
     BULK_RATE,
     COOLING,
@@ -55,9 +55,6 @@ RATE_CONSTANTS: tuple[str, ...] = ("kn", "kp", "tDiffusion", "to", "tsn", "tsp")
 TANGENT_NAMES: tuple[str, ...] = ("q_mobile", "r_o", *RATE_CONSTANTS)
 BY_Q, BY_R, BY_KN, BY_KP, BY_T_DIFFUSION, BY_TO, BY_TSN, BY_TSP = range(len(TANGENT_NAMES))
 
-_compiled = njit(cache=True, error_model="numpy")
-_inlined = njit(cache=True, error_model="numpy", forceinline=True)
-
 
 class PolynomialDerivatives(NamedTuple):
     """
@@ -85,7 +82,7 @@ def _differentiated(coefficients: FloatArray) -> FloatArray:
     return np.append(coefficients[1:] * np.arange(1, len(coefficients)), 0.0)
 
 
-@_inlined
+@inlined
 def equilibrium_slopes(
     xn: float, xp: float, tb: float, constants: FloatArray, derivatives: PolynomialDerivatives
 ) -> tuple[float, float]:
@@ -96,7 +93,7 @@ def equilibrium_slopes(
     return by_xn, by_xp
 
 
-@_inlined
+@inlined
 def equilibrium_curvatures(
     xn: float, xp: float, tb: float, constants: FloatArray, derivatives: PolynomialDerivatives
 ) -> tuple[float, float]:
@@ -107,7 +104,7 @@ def equilibrium_curvatures(
     return by_xn, by_xp
 
 
-@_inlined
+@inlined
 def overpotential_slopes(i: float, xn: float, xp: float, tb: float, constants: FloatArray) -> tuple[float, float]:
     # of kernels.nominal_overpotentials, each with respect to the mole fraction of its own electrode
     scale = 2.0 * constants[0, R_OVER_F] * tb
@@ -118,27 +115,27 @@ def overpotential_slopes(i: float, xn: float, xp: float, tb: float, constants: F
     return by_xn, by_xp
 
 
-@_inlined
+@inlined
 def _fractions(x: FloatArray, n: int, q: float, extended: bool, constants: FloatArray) -> tuple[float, float]:
     # at both surfaces of row n of x
     return mole_fraction(x[n, QNS], q, extended, constants), mole_fraction(x[n, QPS], q, extended, constants)
 
 
-@_inlined
+@inlined
 def _fraction_tangents(dx: FloatArray, n: int, xn: float, xp: float, q: float, constants: FloatArray) -> tuple[float, float]:
     # of xn and xp with respect to q; they do not depend on r_o
     share = constants[0, FRACTION_PER_SHARE] / q
     return share * dx[n, BY_Q, QNS] - xn / q, share * dx[n, BY_Q, QPS] - xp / q
 
 
-@_inlined
+@inlined
 def _rate_fraction_tangents(dx: FloatArray, n: int, row: int, q: float, constants: FloatArray) -> tuple[float, float]:
     # of xn and xp with respect to the logarithm of a rate constant; only tDiffusion moves them
     dxn = mole_fraction(dx[n, row, QNS], q, False, constants)
     return dxn, mole_fraction(dx[n, row, QPS], q, False, constants)
 
 
-@_inlined
+@inlined
 def _voltage_slopes(
     x: FloatArray, n: int, q: float, thermal: bool, packed: PackedConstants, derivatives: PolynomialDerivatives
 ) -> tuple[float, float, float, float, float]:
@@ -149,13 +146,13 @@ def _voltage_slopes(
     return xn, xp, v_xn, v_xp, constants[0, R_OVER_F] * nernst_logarithm(xn, xp) if thermal else 0.0
 
 
-@_inlined
+@inlined
 def _voltage_tangent(dx: FloatArray, n: int, row: int, by_fractions: float, v_tb: float) -> float:
     # by_fractions: what the voltage changes by as the mole fractions do
     return by_fractions - dx[n, row, VO] - dx[n, row, VSN] - dx[n, row, VSP] + v_tb * dx[n, row, TB]
 
 
-@_inlined
+@inlined
 def voltage_tangents(
     x: FloatArray,
     dx: FloatArray,
@@ -171,7 +168,7 @@ def voltage_tangents(
     return _voltage_tangent(dx, n, BY_Q, v_xn * dxn + v_xp * dxp, v_tb), _voltage_tangent(dx, n, BY_R, 0.0, v_tb)
 
 
-@_compiled
+@compiled
 def _voltage_rate_tangents(
     x: FloatArray,
     dx: FloatArray,
@@ -190,7 +187,7 @@ def _voltage_rate_tangents(
         by_parameter[row, k] = _voltage_tangent(dx, n, row, v_xn * dxn + v_xp * dxp, v_tb)
 
 
-@_inlined
+@inlined
 def voltage_curvature(
     x: FloatArray, dx: FloatArray, n: int, q: float, packed: PackedConstants, derivatives: PolynomialDerivatives
 ) -> float:
@@ -206,7 +203,7 @@ def voltage_curvature(
     return of_fractions + 2.0 * nernst * (dxn / (xn * (1.0 - xn)) - dxp / (xp * (1.0 - xp)))
 
 
-@_inlined
+@inlined
 def _diffuse(dx: FloatArray, n: int, row: int, dt: float, constants: FloatArray) -> None:
     # one row of the tangents of the charges over a step; the current does not depend on parameters
     for bulk, surface in ((QNB, QNS), (QPB, QPS)):
@@ -215,7 +212,7 @@ def _diffuse(dx: FloatArray, n: int, row: int, dt: float, constants: FloatArray)
         dx[n, row, surface] += moved
 
 
-@_inlined
+@inlined
 def _diffuse_slower(dx: FloatArray, n: int, row: int, charges: FloatArray, dt: float, constants: FloatArray) -> None:
     # what is moved of these charges over a step, differentiated by the logarithm of tDiffusion: its rate falls
     for bulk, surface in ((QNB, QNS), (QPB, QPS)):
@@ -224,7 +221,7 @@ def _diffuse_slower(dx: FloatArray, n: int, row: int, charges: FloatArray, dt: f
         dx[n, row, surface] -= moved
 
 
-@_inlined
+@inlined
 def _follow(
     dx: FloatArray,
     n: int,
@@ -244,7 +241,7 @@ def _follow(
         dx[n, row, TB] += dt * ((dvo + dvsn + dvsp) * i * constants[0, WARMING] - dx[n, row, TB] * constants[0, COOLING])
 
 
-@_inlined
+@inlined
 def step_with_tangents(
     x: FloatArray,
     dx: FloatArray,
@@ -274,7 +271,7 @@ def step_with_tangents(
     cell_step(x, n, n, i, q, r_o, dt, thermal, extended, constants)
 
 
-@_compiled
+@compiled
 def _step_rate_tangents(
     x: FloatArray, dx: FloatArray, n: int, i: float, q: float, r_o: float, dt: float, thermal: bool, constants: FloatArray
 ) -> None:
@@ -300,7 +297,7 @@ def _step_rate_tangents(
     dx[n, BY_TSP, VSP] -= dt * (vsp - x[n, VSP]) * constants[0, TSP_RATE]
 
 
-@_compiled
+@compiled
 def least_q(charge: float, slope: float, q: float, margin: float, constants: FloatArray) -> float:
     # The least q at which the mole fraction of a surface is this far inside 0 .. 1. Its charge, the one given at q, is linear
     # in q with this slope
@@ -309,7 +306,7 @@ def least_q(charge: float, slope: float, q: float, margin: float, constants: Flo
     return max(-moved / (slope - margin * full), moved / ((1.0 - margin) * full - slope))
 
 
-@_compiled
+@compiled
 def roll_out_with_tangents(
     current: FloatArray,
     q: float,
@@ -344,7 +341,7 @@ def roll_out_with_tangents(
         step_with_tangents(x, dx, 0, current[k], q, r_o, dt, thermal, False, constants)
 
 
-@_compiled
+@compiled
 def least_q_mobile(
     current: FloatArray, q: float, dt: float, constants: FloatArray, start: FloatArray, shares: FloatArray
 ) -> tuple[float, float]:

@@ -18,13 +18,17 @@ from battery_env.checks import check_numbers, check_whole_number
 from battery_env.electrochemistry import STATE_SIZE, CellParameters, LoadUnit, state_of_charge, voltage
 from battery_env.electrochemistry.ends import BAND, LONGEST_S, Cells, run_down
 from battery_env.estimates import Estimate, EstimateTrace, last_estimate
-from battery_env.estimators.state_files import load_state, save_state
+from battery_env.estimators.state_files import load_state, refusing, save_state
 from battery_env.loads import KnownLoad, Load, in_steps, known_load
 from battery_env.parameters import PARAMETERS
 from battery_env.records import Record, Stream
 
 # Points between limits keep this far from them, as a share of their distance, so that rounding leaves them within.
 _ROUNDING = 1e-9
+
+
+# Of which cells an array of a saved batch is, in place of a number.
+_ALL = "all"
 
 
 class Estimator(ABC):
@@ -89,6 +93,20 @@ class ModelNow(NamedTuple):
     state: FloatArray
     parameters: FloatArray
     deviations: FloatArray
+
+    def draws(self, samples: int, rng: np.random.Generator) -> Cells:
+        """
+        Cells that may be the one that was followed, all equally likely: state, parameters and offset belong together.
+
+        :param samples: how many
+        :param rng: what draws them
+        :return: these
+        """
+        middle = np.concatenate([self.state, self.parameters])
+        points = middle + rng.standard_normal((samples, len(self.deviations))) @ self.deviations
+        for n, parameter in enumerate(PARAMETERS.values(), start=STATE_SIZE):
+            points[:, n] = np.clip(points[:, n], *parameter.limits)
+        return _cells_at(points)
 
 
 class OnlineEstimator(Estimator):
@@ -157,6 +175,10 @@ class OnlineEstimator(Estimator):
         """What it knows of the discharge, by name."""
         raise NotImplementedError(f"{type(self).__name__} cannot be saved")
 
+    def _check_state(self, arrays: dict[str, NDArray[Any]]) -> None:
+        """Refuse, with a ValueError, what :meth:`_arrays` of no discharge can be."""
+        raise NotImplementedError(f"{type(self).__name__} cannot be saved")
+
     def _restore(self, arrays: dict[str, NDArray[Any]]) -> None:
         """Take :meth:`_arrays` for its own."""
         raise NotImplementedError(f"{type(self).__name__} cannot be saved")
@@ -204,10 +226,8 @@ class OnlineEstimator(Estimator):
         points = np.vstack(
             [middle, *(middle + share[:, None] * each for share, each in zip(shares, now.deviations, strict=True))]
         )
-        cells = Cells(
-            points[:, STATE_SIZE], points[:, STATE_SIZE + 1], points[:, :STATE_SIZE], points[:, -1], 0.0 * points[:, -1]
-        )
-        ends_s = run_down(cells, now, in_steps([given], dt_s), now.cell.VEOD if cut_off_V is None else cut_off_V).time_s
+        end_V = now.cell.VEOD if cut_off_V is None else cut_off_V
+        ends_s = run_down(_cells_at(points), now, in_steps([given], dt_s), end_V).time_s
         if given_s < min(ends_s[0], LONGEST_S):
             raise ValueError(
                 f"load ends after {given_s:g} s, before the discharge does. Append what is to come, or "
@@ -234,9 +254,13 @@ class OnlineEstimator(Estimator):
 
         :param path: the file
         :raises FileNotFoundError: if there is no such file
-        :raises ValueError: if it is damaged, of another version, or of an estimator with other arguments
+        :raises ValueError: if it is damaged, of another version, of an estimator with other arguments, or holds what no
+            discharge leads to; the estimator is as it was then
         """
-        self._restore(load_state(path, self._made_with()))
+        arrays = load_state(path, self._made_with())
+        with refusing(path):
+            self._check_state(arrays)
+        self._restore(arrays)
 
     def estimate(self, record: Record) -> Estimate:
         """
@@ -256,16 +280,24 @@ class OnlineEstimator(Estimator):
         :return: one trace per discharge, in the same order
         :raises ValueError: if a record cannot be used
         """
-        traces = []
-        for record in records:
-            stream = Stream.of(record, self.dt_s)
-            measured: Iterable[tuple[float, ...]] = stream.samples()
-            if stream.temperature_C is not None:
-                measured = ((*sample, t_C) for sample, t_C in zip(measured, stream.temperature_C.tolist(), strict=True))
-            self.reset()
-            traces.append(EstimateTrace.of(stream.time_s, [self.update(*sample) for sample in measured]))
+        traces = [self.follow(record) for record in records]
         self.reset()
         return traces
+
+    def follow(self, record: Record) -> EstimateTrace:
+        """
+        One estimate for every sample of a discharge, after which the estimator stands at the last one.
+
+        :param record: one discharge
+        :return: the estimates
+        :raises ValueError: if the record cannot be used
+        """
+        stream = Stream.of(record, self.dt_s)
+        measured: Iterable[tuple[float, ...]] = stream.samples()
+        if stream.temperature_C is not None:
+            measured = ((*sample, t_C) for sample, t_C in zip(measured, stream.temperature_C.tolist(), strict=True))
+        self.reset()
+        return EstimateTrace.of(stream.time_s, [self.update(*sample) for sample in measured])
 
 
 class OnlineBatch:
@@ -321,15 +353,33 @@ class OnlineBatch:
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write what is known of all cells, as :meth:`OnlineEstimator.save`."""
-        arrays = {f"{n}/{name}": array for n, each in enumerate(self.estimators) for name, array in each._arrays().items()}
+        parts, arrays = [each._arrays() for each in self.estimators], {}
+        for name in dict.fromkeys(name for part in parts for name in part):
+            found = [part.get(name, np.empty(0)) for part in parts]
+            if len({(array.dtype, array.shape) for array in found}) == 1:  # one array takes a thousandth of the time
+                arrays[f"{_ALL}/{name}"] = np.stack(found)
+            else:
+                arrays |= {f"{n}/{name}": part[name] for n, part in enumerate(parts) if name in part}
         return save_state(path, self._made_with(), arrays)
 
     def load(self, path: str | os.PathLike[str]) -> None:
         """Go on from what :meth:`save` wrote."""
-        arrays = load_state(path, self._made_with())
-        for n, estimator in enumerate(self.estimators):
-            mark = f"{n}/"
-            estimator._restore({name[len(mark) :]: array for name, array in arrays.items() if name.startswith(mark)})
+        parts: list[dict[str, NDArray[Any]]] = [{} for _ in self.estimators]
+        with refusing(path):
+            for name, array in load_state(path, self._made_with()).items():
+                number, _, own_name = name.partition("/")
+                if number == _ALL and len(array) == len(parts):
+                    for part, own in zip(parts, array, strict=True):
+                        part[own_name] = own
+                elif number.isdecimal() and int(number) < len(parts):
+                    parts[int(number)][own_name] = array
+                else:
+                    raise ValueError(f"arrays that are missing or unknown: {name}")
+            for n, (estimator, part) in enumerate(zip(self.estimators, parts, strict=True)):
+                with refusing(f"cell {n}"):
+                    estimator._check_state(part)
+        for estimator, part in zip(self.estimators, parts, strict=True):
+            estimator._restore(part)
 
     def _made_with(self) -> dict[str, Any]:
         return {"cells": len(self.estimators), **self.estimators[0]._made_with()}
@@ -341,6 +391,12 @@ def check_bounds(
     """Refuse invalid bounds."""
     given = zip(PARAMETERS.values(), (q_mobile_bounds_C, r_o_bounds_ohm), strict=True)
     return {parameter.name: parameter.check_bounds(f"the bounds of {parameter.name}", bounds) for parameter, bounds in given}
+
+
+def _cells_at(points: FloatArray) -> Cells:
+    """Cells at points of shape (n, 11): the state, ``q_mobile``, ``r_o``, and the offset of the voltage."""
+    state, (q_mobile, r_o, offset_V) = np.ascontiguousarray(points[:, :STATE_SIZE]), points[:, STATE_SIZE:].T.copy()
+    return Cells(q_mobile, r_o, state, offset_V, np.zeros(len(points)))
 
 
 def _slope(shares: FloatArray, ends_s: FloatArray) -> float:

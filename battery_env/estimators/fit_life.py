@@ -11,7 +11,8 @@ import numpy as np
 
 from battery_env.electrochemistry import UNCERTAIN_CONSTANTS, CellParameters
 from battery_env.electrochemistry.aging_path import EQUILIBRIUM_NAMES, PATH_NAMES, AgingPath
-from battery_env.estimators.cell_fit import EQUILIBRIUM_PRIOR_SD_V, LIMIT_V, RATE_PRIOR_SD, fit_cell
+from battery_env.estimators.cell_fit import RATE_PRIOR_SD
+from battery_env.estimators.joint_fit import EQUILIBRIUM_PRIOR_SD_V, LIMIT_V, fit_cell
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.search import Prior, Search
 from battery_env.parameters import PARAMETER_NAMES, R_O

@@ -7,9 +7,9 @@ from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from battery_env.arrays import FloatArray
+from battery_env.compiled import compiled
 from battery_env.electrochemistry import NEW_CELL, STATE_SIZE, VO, CellParameters, PackedConstants, Trajectory, check_dt
 from battery_env.electrochemistry.kernels import cell_current, cell_step, cell_voltage
 from battery_env.estimates import Estimate, EstimateTrace
@@ -42,10 +42,7 @@ class _Search(NamedTuple):
     model: FloatArray  # state of the model before a step, and after it, which is overwritten, shape (2, 8)
 
 
-_compiled = njit(cache=True, error_model="numpy")
-
-
-@_compiled
+@compiled
 def _cost(value: float, k: int, search: _Search) -> float:
     # distance of the end of step k to the measured state; negative if its vo is too low
     model, measured, packed = search.model, search.measured, search.packed
@@ -59,7 +56,7 @@ def _cost(value: float, k: int, search: _Search) -> float:
     return sqrt(square) if model[1, VO] >= measured[k + 1, VO] else -sqrt(square)
 
 
-@_compiled
+@compiled
 def _brackets(low: float, high: float, k: int, search: _Search, found: FloatArray) -> int:
     # Intervals of a grid that hold a minimum; returns how many they are. A change of the sign is one, which the magnitudes
     # alone do not show where two minima lie near each other; where there is none, the magnitudes of neighbours tell.
@@ -77,7 +74,7 @@ def _brackets(low: float, high: float, k: int, search: _Search, found: FloatArra
     return count
 
 
-@_compiled
+@compiled
 def _golden_section(low: float, high: float, tolerance: float, k: int, search: _Search) -> float:
     left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
     cost_left, cost_right = abs(_cost(left, k, search)), abs(_cost(right, k, search))
@@ -93,7 +90,7 @@ def _golden_section(low: float, high: float, tolerance: float, k: int, search: _
     return left if cost_left < cost_right else right
 
 
-@_compiled
+@compiled
 def _greedy(low: float, high: float, resync: bool, search: _Search, best: FloatArray) -> None:
     # Fills best, the value of each step
     coarse, fine = np.empty((2, _INTERVALS + 1, 2))

@@ -19,9 +19,11 @@ from battery_env.estimates import Estimate, EstimateTrace
 from battery_env.estimators.diagnosis.conditions import (
     EXCESS_LIMIT_UNSTATED,
     MISMATCH_MARGIN,
+    MOST_OF_SD,
     PRIOR_LIMIT_SD,
     SETTLED_SHARES,
     SPARE_SAMPLES,
+    STARTS,
     Condition,
     Diagnosis,
     Verdict,
@@ -34,7 +36,7 @@ from battery_env.estimators.diagnosis.samples import note_samples
 from battery_env.estimators.estimator import Estimator, check_bounds
 from battery_env.estimators.search import Fit, JointPrior, Prior, Search, square
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, check_parameters
-from battery_env.records import Record, Samples, check_record, drawn_charge_C, starts_at_rest
+from battery_env.records import Record, Samples, Shown, check_record, drawn_charge_C, shown_beside
 from battery_env.records.model import RecordModel
 
 # Residuals whose variance is this many of its standard deviations above the one expected are not noise.
@@ -66,13 +68,16 @@ class _Fitted:
     variance_V2: float  # of one residual, with what the error of the model adds
     hidden_sd: Mapping[str, float]  # of what does not show in the voltage, by parameter
     gaps: Sequence[Gap]  # where the record was not written under load
+    load_on_C: float  # standard deviations of the charge, by the moment of load-on
+    offset_C: float  # and by what flows at rest
 
     def sd(self, fit: Fit) -> dict[str, float]:
         """The standard deviations of a fit, with those of what does not show, and with charges that nobody saw."""
         sd = dict.fromkeys(PARAMETER_NAMES, nan)
         for name, root in zip(self.search.parameters, _root_inverse_diagonal(fit.jacobian), strict=False):
             sd[name] = hypot(sqrt(self.variance_V2) * float(root), self.hidden_sd[name])
-        sd["q_mobile"] = hypot(sd["q_mobile"], sum(gap.charge_C for gap in self.gaps if gap.verdict != DRAWN))
+        in_gaps_C = sum(gap.charge_C for gap in self.gaps if gap.verdict != DRAWN)
+        sd["q_mobile"] = hypot(sd["q_mobile"], in_gaps_C, self.load_on_C, self.offset_C)
         return sd
 
 
@@ -206,7 +211,7 @@ class LeastSquares(Estimator):
         :return: the estimate
         :raises ValueError: if the record cannot be used, or the least ``q_mobile`` it allows is outside the bounds
         """
-        return self._estimate(self._samples(record), starts_at_rest(record))
+        return self._estimate(self._samples(record), self._shown(record))
 
     def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:
         """
@@ -230,13 +235,18 @@ class LeastSquares(Estimator):
         stops = np.unique(np.append(samples[samples >= fewest], len(time_s)))
         estimates: list[Estimate] = []
         for stop in stops:
-            estimates.append(self._estimate(whole.first(stop), starts_at_rest(record), *estimates[-1:]))
+            estimates.append(self._estimate(whole.first(stop), self._shown(record), *estimates[-1:]))
         return EstimateTrace.of(time_s[stops - 1], estimates)
 
     def _samples(self, record: Record) -> Samples:
         return check_record(record, least_samples=len(self.parameters) + 1)
 
-    def _estimate(self, record: Samples, rested: bool, previous: Estimate | None = None) -> Estimate:
+    def _shown(self, record: Record) -> Shown:
+        # where another charge is stated, that before the load does not count
+        shown = shown_beside(record)
+        return shown if self.initial_soc[0] == 1.0 else shown._replace(charge=None)
+
+    def _estimate(self, record: Samples, shown: Shown, previous: Estimate | None = None) -> Estimate:
         search = Search.of(record, self.model, self.parameters, self.nuisance, self.bounds)
         if self.path is not None:
             starts = _starts_along(self.path, search)
@@ -245,12 +255,12 @@ class LeastSquares(Estimator):
         else:
             search = search.until_empty()
             starts = search.starts([self.model.cell.q_mobile])[0]
-        found = self._fitted(record, search, starts)
-        sd, values, verdict = found.sd(found.fit), found.fit.values, self._verdict(record, rested, found)
+        found = self._fitted(record, search, starts, shown)
+        sd, values, verdict = found.sd(found.fit), found.fit.values, self._verdict(record, shown, found)
         constants = None if self.path is None else {name: values[name] for name in self.nuisance}
         return Estimate(values["q_mobile"], values["r_o"], sd["q_mobile"], sd["r_o"], **verdict._asdict(), constants=constants)
 
-    def _fitted(self, record: Samples, search: Search, starts: list[dict[str, float]]) -> _Fitted:
+    def _fitted(self, record: Samples, search: Search, starts: list[dict[str, float]], shown: Shown) -> _Fitted:
         """The best fits with and without the prior, and what their standard deviations are made of."""
         n = len(search.data.time_s)
         noise_V = self.voltage_noise_V
@@ -276,7 +286,8 @@ class LeastSquares(Estimator):
             fit = search.best([*starts, alone.values, *search.starts([mean_C])[0]], [*priors, carried])
         model_V = search.data.voltage_V + fit.residual_V - fit.values.get("offset_V", 0.0)
         gaps = find_gaps(*record.first(n), model_V, fit.values["q_mobile"])
-        return _Fitted(search, fit, alone, variance_V2, self._hidden_sd(search, fit), gaps)
+        offset_C = shown.offset_C(float(record.time_s[-1] - record.time_s[0]))
+        return _Fitted(search, fit, alone, variance_V2, self._hidden_sd(search, fit), gaps, shown.load_on_C, offset_C)
 
     def _independent_errors(self, record: Samples) -> float:
         """How many independent errors of the model a record holds: along a path more than one, as they drift."""
@@ -306,14 +317,14 @@ class LeastSquares(Estimator):
             for n, name in enumerate(self.parameters)
         }
 
-    def _verdict(self, record: Samples, rested: bool, found: _Fitted) -> Verdict:
+    def _verdict(self, record: Samples, shown: Shown, found: _Fitted) -> Verdict:
         """What speaks against an estimate."""
         fit, alone, cell, diagnosis = found.fit, found.alone, self.model.cell, Diagnosis()
         n, free, (q_mobile, r_o) = len(fit.residual_V), self.parameters, (fit.values[name] for name in PARAMETER_NAMES)
         own, moved_V2 = found.sd(alone), fit.square_V2 - alone.square_V2
         unknown = [name for name in free if not own[name] < SETTLED_SHARES[name] * alone.values[name]]
         note_gaps(diagnosis, found.gaps, "q_mobile" in unknown)
-        note_samples(diagnosis, record, cell, self.initial_soc[0] if self._at_rest else None, q_mobile, r_o, rested)
+        note_samples(diagnosis, record, cell, self.initial_soc[0] if self._at_rest else None, q_mobile, r_o, shown)
         diagnosis.note(Condition.EMPTY, n < len(record.time_s))
         if self.voltage_noise_V is None:
             noise_V, excess = white_noise_V(fit.residual_V), EXCESS_LIMIT_UNSTATED / sqrt(n)
@@ -323,6 +334,10 @@ class LeastSquares(Estimator):
             noise_V, excess = self.voltage_noise_V, _EXCESS_LIMIT * sqrt(2.0 / n)
         limit_V2 = noise_V**2 * (1.0 + excess) + (MISMATCH_MARGIN * self.mismatch_V) ** 2 + _NEGLIGIBLE_V**2
         diagnosis.note(Condition.MISFIT, square(fit.residual_V) > n * limit_V2)
+        rmse_V, starts = sqrt(square(alone.residual_V) / n), diagnosis.measured.keys() & STARTS
+        if starts and self.mismatch_V and rmse_V**2 > limit_V2:
+            rmse = {"rmse_mV": 1e3 * rmse_V, "mismatch_mV": 1e3 * self.mismatch_V}
+            diagnosis.note(Condition.OTHER_KIND, **rmse, **diagnosis.measured[min(starts)])
         diagnosis.note(Condition.IMPLAUSIBLE, "q_mobile" in free and not is_plausible(q_mobile, cell))
         _note_end(diagnosis, record, found, max(2.0 * self.mismatch_V, 3.0 * noise_V, _NEGLIGIBLE_V))
         if self.path is not None:
@@ -332,6 +347,10 @@ class LeastSquares(Estimator):
         diagnosis.note(Condition.Q_PRIOR_ALONE, "q_mobile" in unknown and self.prior_q_mobile_C is not None)
         for name in fit.at_bound:
             diagnosis.note(Condition.Q_AT_BOUND.of(name))
+        if "q_mobile" in unknown:
+            most_C, load_on_C, offset_C = MOST_OF_SD * own["q_mobile"], found.load_on_C, found.offset_C
+            diagnosis.note(Condition.LOAD_ON_UNSURE, load_on_C > most_C, load_on_C=load_on_C)
+            diagnosis.note(Condition.REST_CURRENT, offset_C > most_C, offset_A=shown.offset_A, offset_C=offset_C)
         for name in unknown:
             scaled = found.hidden_sd[name] >= SETTLED_SHARES[name] * fit.values[name]
             diagnosis.note(Condition.Q_SCALE_UNKNOWN.of(name), scaled)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import os
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -50,3 +51,30 @@ def load_state(path: str | os.PathLike[str], settings: Mapping[str, Any]) -> dic
             f"same arguments (different: {', '.join(different)})"
         )
     return arrays
+
+
+@contextmanager
+def refusing(name: str | os.PathLike[str]) -> Iterator[None]:
+    """Say of what is refused where it comes from."""
+    try:
+        yield
+    except ValueError as error:
+        raise error if str(name) in str(error) else ValueError(f"{name}: {error}") from error
+
+
+def check_like(arrays: Mapping[str, NDArray[Any]], like: Mapping[str, NDArray[Any]], growing: str = "") -> None:
+    """Refuse arrays of other names, kinds and shapes than those that an estimator has itself; one may have grown."""
+    if wrong := arrays.keys() ^ like.keys():
+        raise ValueError(f"arrays that are missing or unknown: {', '.join(sorted(wrong))}")
+    for name, own in like.items():
+        found, axes = arrays[name], own.ndim - (name == growing)
+        is_kind = found.dtype == own.dtype or (own.dtype.names is None and found.dtype.kind == own.dtype.kind)
+        if not is_kind or found.ndim != own.ndim or found.shape[:axes] != own.shape[:axes]:
+            raise ValueError(f"{name} is {found.dtype} of shape {found.shape}, and not {own.dtype} of {own.shape}")
+
+
+def check_all(**conditions: Any) -> None:
+    """Refuse contents of which one of these conditions, named after what it is about, does not hold for all."""
+    for name, holds in conditions.items():
+        if not all(np.all(each) for each in (holds if isinstance(holds, list) else [holds])):
+            raise ValueError(f"its {name} is none that a discharge leads to")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
+from math import hypot
 from numbers import Real
 from pathlib import Path
 from typing import Any, NamedTuple, overload
@@ -17,17 +18,19 @@ from battery_env.checks import ZERO_CELSIUS_K
 from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.electrochemistry.cell import TB
 from battery_env.electrochemistry.ends import quantile
-from battery_env.estimates import Estimate
+from battery_env.estimates import Estimate, last_estimate
 from battery_env.estimators.diagnosis.gaps import DRAWN, find_gaps
 from battery_env.estimators.diagnosis.rest import Start, check_initial_soc, soc_from_rest
-from battery_env.estimators.diagnosis.samples import start_condition, watched
+from battery_env.estimators.diagnosis.samples import fault_condition, start_condition, watched
+from battery_env.estimators.estimator import ModelNow
+from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.lab.forecast import Forecast, forecast
 from battery_env.lab.readers.columns import FileFormat
 from battery_env.lab.readers.discharges import each_usable
 from battery_env.lab.report import Calibration
 from battery_env.lab.settings import Method, Settings
 from battery_env.loads import Load, LoadToCome, constant, in_steps
-from battery_env.records import ExpectedCurrent, Samples, drawn, expected_current, mean_current_A
+from battery_env.records import ExpectedCurrent, Samples, drawn, expected_current, mean_current_A, shown_beside
 from battery_env.records.discharge import Discharge
 from battery_env.records.model import RecordModel, VoltageForecast
 
@@ -111,7 +114,7 @@ class _Seen(NamedTuple):
     record: Discharge  # the same, of few samples
     fitted: Discharge  # the same, with the temperature that counts
     averaged_over_s: float
-    eod_time_s: float
+    eod_time_s: float  # NaN: the record ends above the cut-off
     in_progress: bool
     more_C: float  # drawn after the end
     cell: CellParameters
@@ -140,12 +143,12 @@ _GOES_ON = Ahead()
 def calibrated(discharge: Discharge, settings: Settings, ahead: Ahead = _GOES_ON) -> Calibration:
     """What one discharge says, and of one in progress what comes after it."""
     seen = _look_at(discharge, settings)
-    estimate, method = _estimate(seen, settings, ahead.load)
+    estimate, method, now = _estimate(seen, settings, ahead.load)
     model = RecordModel(seen.cell, settings.thermal and method != "policy", initial_soc=seen.start.soc)
     # a cell in progress has not ended, however low its model comes in the pulses before
     limits = (-np.inf, 0.0) if seen.in_progress else (settings.cut_off_V, seen.future.mean_A)
     shown = model.forecast(seen.record, estimate, *limits)
-    end = _end(seen, estimate, replace(settings, method=method), model, shown, ahead)
+    end = _end(seen, estimate, replace(settings, method=method), now or model, shown, ahead)
     end_C, model_end_C = _end_temperatures(seen.record, shown)
     charge = _charge(seen, settings, estimate, end)
     if seen.start.reason or seen.more_C or not _is_all_logged(seen, shown, estimate):
@@ -212,30 +215,33 @@ def _look_at(discharge: Discharge, settings: Settings) -> _Seen:
     return _Seen(discharge, loaded, record, fitted, over_s, eod_time_s, in_progress, more_C, cell, start, load, future)
 
 
-def _estimate(seen: _Seen, settings: Settings, load: LoadToCome | None) -> tuple[Estimate, Method]:
-    """The estimate of the first method that settles the discharge, or of the last one; and which it is."""
+def _estimate(seen: _Seen, settings: Settings, load: LoadToCome | None) -> tuple[Estimate, Method, ModelNow | None]:
+    """
+    The estimate of the first method that settles the discharge, or of the last one; which it is; and of the filter where its
+    model stands.
+    """
     methods: list[Method] = [settings.method or "least-squares"]
     # under other loads the filter, which takes the error of the model for noise, is surer than it may be
-    goes_on = settings.future_current_A is None and load is None and not seen.load.varied
-    if (
-        settings.method is None
-        and seen.in_progress
-        and goes_on
-        and settings.prior_q_mobile_C is None
-        and settings.cell is None
-    ):
+    is_over = float(seen.discharge.time_s[-1] - seen.loaded.time_s[-1]) > _REST_S
+    goes_on = settings.future_current_A is None and load is None and not seen.load.varied and not is_over
+    is_new = settings.prior_q_mobile_C is None and settings.cell is None
+    if settings.method is None and seen.in_progress and goes_on and is_new:
         methods.append("kalman")
     for method in methods:
-        estimate = replace(settings, method=method).calibrator(seen.cell, seen.start).estimate(seen.fitted)
+        calibrator = replace(settings, method=method).calibrator(seen.cell, seen.start)
+        if isinstance(calibrator, ExtendedKalmanFilter):
+            estimate, now = last_estimate(calibrator.follow(seen.fitted)), calibrator.now() if goes_on else None
+        else:
+            estimate, now = calibrator.estimate(seen.fitted), None
         if estimate.settled:
             break
     if reason := seen.start.reason or settings.other_load(mean_current_A(seen.record)):
         estimate = replace(estimate, settled_q_mobile=False, settled_r_o=False, reason=reason)
-    return estimate, method
+    return estimate, method, now
 
 
 def _end(
-    seen: _Seen, estimate: Estimate, settings: Settings, model: RecordModel, shown: VoltageForecast, ahead: Ahead
+    seen: _Seen, estimate: Estimate, settings: Settings, model: RecordModel | ModelNow, shown: VoltageForecast, ahead: Ahead
 ) -> Forecast | None:
     """What may come after a record; ``None`` if nothing can be told, or is asked of a record that has ended."""
     if not (seen.in_progress or ahead.is_asked):
@@ -272,7 +278,7 @@ def _notes(seen: _Seen, estimate: Estimate, settings: Settings, shown: VoltageFo
     if float(seen.discharge.time_s[-1]) > seen_s:
         yield f"What was recorded after the last sample under load, at {seen_s:.0f} s, is left out."
     if settings.method == "kalman" and settings.prior_q_mobile_C is None and settings.cell is None:
-        yield "The filter expects a cell of some 2 Ah: of another one give the life, a prior of q_mobile or the constants."
+        yield "The filter expects a cell of some 2 Ah: of another one give the life, a prior of q_max or the constants."
     if rmse_V > settings.mismatch_V:
         text = f"The model misses the voltage by {1e3 * rmse_V:.0f} mV (RMSE), more than mismatch_V."
         yield f"{text} Other loads make the interval too narrow."
@@ -303,10 +309,12 @@ def _charge(seen: _Seen, settings: Settings, estimate: Estimate, end: Forecast |
     predicted_Ah, sd_Ah = (1.0 - start.soc) * q_mobile / 3600.0 + drawn_Ah, settings.current_gain_sd * drawn_Ah
     if seen.in_progress:
         predicted_Ah, sd_Ah = (float("nan"),) * 2 if end is None else _middle(end.capacity_Ah, estimate)
+    shown, duration_s = seen.loaded.shown, float(np.ptp(seen.loaded.time_s))
+    unseen_Ah = float(np.hypot(shown.load_on_C, shown.offset_C(duration_s))) / 3600.0
     return {
         "capacity_Ah": float("nan") if seen.in_progress or start.soc < 1.0 else drawn_Ah,
         "predicted_capacity_Ah": predicted_Ah,
-        "sd_predicted_capacity_Ah": float(np.hypot(sd_Ah, start.sd_soc * q_mobile / 3600.0)),
+        "sd_predicted_capacity_Ah": hypot(sd_Ah, start.sd_soc * q_mobile / 3600.0, unseen_Ah),
     }
 
 
@@ -350,13 +358,11 @@ def _is_all_logged(seen: _Seen, forecast: VoltageForecast, estimate: Estimate) -
     Whether all that was drawn is in the record: the cell starts, before or under the load, no lower than with this charge, no
     sensor fails, and the voltage says of each gap that its charge was drawn.
     """
-    discharge, record, q_mobile, r_o = seen.discharge, seen.record, estimate.q_mobile, estimate.r_o
-    begin = int(np.searchsorted(discharge.time_s, discharge.load_on_time_s, side="right")) - 1
-    end = int(np.searchsorted(discharge.time_s, record.time_s[-1], side="right"))
-    columns = (discharge.time_s, discharge.voltage_V, discharge.current_A)
-    shown = watched(Samples(*(column[begin:end] for column in columns)), seen.cell, seen.start.soc, q_mobile, r_o)
-    is_lower = shown["start"]["first_V"] < shown["start_V"]
-    if shown["fault"]["condition"] or (is_lower and start_condition(shown)):
+    record, loaded, q_mobile, r_o = seen.record, seen.loaded, estimate.q_mobile, estimate.r_o
+    shown = watched(Samples.of(loaded), seen.cell, seen.start.soc, q_mobile, r_o, shown_beside(loaded))
+    # a charge that tapered off fills any cell, whatever its voltage at rest
+    is_lower = shown["start"]["first_V"] < shown["start_V"] and not (loaded.shown.charge and loaded.shown.charge.tapered)
+    if fault_condition(shown) or (is_lower and start_condition(shown)):
         return False
     gaps = find_gaps(record.time_s, record.voltage_V, record.current_A, forecast.at_samples_V, q_mobile)
     return all(gap.verdict == DRAWN for gap in gaps)

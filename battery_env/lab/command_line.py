@@ -1,5 +1,6 @@
 """
-The command line: what records of discharges say about their cells, when one in progress ends, and how constants are found.
+The command line: what records of discharges say about their cells, when one in progress ends, how constants are found, and a
+page that shows all of it.
 
 .. code-block:: bash
 
@@ -7,37 +8,46 @@ The command line: what records of discharges say about their cells, when one in 
   python -m battery_env calibrate B0005:12 --out results/B0005
   battery-calibrate lab/ --out results --jobs 2
   battery-calibrate forecast running.csv --life lab/ --load profile.csv
+  battery-calibrate page
   python -m battery_env fit B0005:1 B0005:84 B0005:168 --out my_cell.json
 """
 
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import os
 import re
+import subprocess
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import asdict, fields
+from difflib import get_close_matches
 from functools import wraps
+from hashlib import sha256
 from importlib.resources import files
+from importlib.util import find_spec
+from itertools import chain, islice
 from pathlib import Path
+from threading import Timer
 from typing import Any, Literal, ParamSpec
 
 import numpy as np
 
-from battery_env.estimators.cell_fit import CellFit, fit_cell, read_cell
+from battery_env.estimators.cell_fit import CellFit, read_cell
 from battery_env.estimators.diagnosis.rest import InitialSoc
+from battery_env.estimators.joint_fit import fit_cell
 from battery_env.files import check_new, finite_or_none
 from battery_env.lab.many import calibrate_all
 from battery_env.lab.readers.columns import FileFormat
 from battery_env.lab.report import line_of, text_of
 from battery_env.lab.results import Outcome, Results
 from battery_env.lab.settings import METHODS, Settings
-from battery_env.lab.sources import find_sources, read_source
-from battery_env.lab.workers import workers
+from battery_env.lab.sources import Source, find_sources, read_source
+from battery_env.lab.workers import interruptible, workers
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.records import CUT_OFF_V
 from battery_env.records.discharge import Discharge
@@ -48,6 +58,8 @@ SETTLED, REFUSED, NOT_SETTLED, INTERRUPTED, PIPE_CLOSED = 0, 2, 3, 130, 141
 _VERSION = files("battery_env").joinpath("version.txt").read_text(encoding="utf-8").strip()
 _INSTALLED = "battery-calibrate"
 
+# What lasts longer than this compiles, s.
+_PATIENCE_S = 5.0
 # So many discharges fit beside each other in the figure of a fit.
 _MOST_SHOWN = 4
 
@@ -230,15 +242,27 @@ _RESULTS: _Options = {
 }
 
 
+# What help begins with, before all options.
+_FIRST = """\
+q_max (the charge that can move), R_o (the resistance), health and the end of discharges, each from a full cell at rest.
+
+other commands, each with --help:
+{}
+
+examples:
+  battery-calibrate B0005:100                         a bundled discharge
+  battery-calibrate lab/ --nominal 2.0 --out life     a folder: a table, a figure, health as a share of 2 Ah
+  battery-calibrate forecast running.csv --life lab/  when it will be empty, with an interval
+"""
+
+
 def _parser(name: str) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=name,
-        description=(
-            "Fit the charge that can move, q_mobile, and the ohmic resistance, r_o, of the model to discharges that each "
-            "start with a full cell, or with --initial-soc, and predict when the cut-off voltage is reached."
-        ),
-        epilog="Exit status: 0 if every discharge is settled, 3 if one is not, 2 if one cannot be used. Other commands: "
-        "battery-calibrate forecast --help, battery-calibrate fit --help.",
+        usage=f"{name} FILE [FILE ...] [options]",
+        description=_FIRST.format("\n".join(f"  {_INSTALLED} {other:<10}{what}" for other, (_, what) in _OTHERS.items())),
+        epilog="Exit status: 0 if every discharge is settled, 3 if one is not, 2 if one cannot be used.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
     parser.add_argument("--version", action="version", version=f"battery_env {_VERSION}")
@@ -336,10 +360,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--version", action="version", version=f"battery_env {_VERSION}")
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("calibrate", help="capacity and resistance of cells from their discharges", add_help=False)
-    commands.add_parser("fit", help="the constants of a cell from a few of its discharges", add_help=False)
-    commands.add_parser("forecast", help="the end of a discharge in progress", add_help=False)
-    command = {"calibrate": calibrate, "fit": fit, "forecast": forecast}[parser.parse_args(given[:1]).command]
-    return command(given[1:], f"{parser.prog} {given[0]}")
+    for name, (_, what) in _OTHERS.items():
+        commands.add_parser(name, help=what, add_help=False)
+    asked = parser.parse_args(given[:1]).command
+    command = calibrate if asked == "calibrate" else _OTHERS[asked][0]
+    return command(given[1:], f"{parser.prog} {asked}")
 
 
 def _ending(command: Callable[_P, int]) -> Callable[_P, int]:
@@ -347,12 +372,16 @@ def _ending(command: Callable[_P, int]) -> Callable[_P, int]:
 
     @wraps(command)
     def run(*args: _P.args, **kwargs: _P.kwargs) -> int:
+        for stream in (sys.stdout, sys.stderr):
+            if isinstance(stream, io.TextIOWrapper):  # a console that has not all characters shows their numbers
+                stream.reconfigure(errors="backslashreplace")
         try:
-            status = command(*args, **kwargs)
-            sys.stdout.flush()
-        except KeyboardInterrupt:
+            with interruptible():
+                status = command(*args, **kwargs)
+                sys.stdout.flush()
+        except KeyboardInterrupt as interruption:
             print("interrupted", file=sys.stderr)
-            return INTERRUPTED
+            return getattr(interruption, "status", INTERRUPTED)
         except BrokenPipeError:  # head, or a pager that was left
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is still to be flushed
             return PIPE_CLOSED
@@ -368,33 +397,59 @@ def _ending(command: Callable[_P, int]) -> Callable[_P, int]:
 def calibrate(arguments: Sequence[str] | None = None, name: str = _INSTALLED) -> int:
     """The command ``calibrate``, which is also installed as ``battery-calibrate``, as are others by their names behind it."""
     given = sys.argv[1:] if arguments is None else list(arguments)
-    if name == _INSTALLED and given[:1] in (["fit"], ["forecast"]):
-        return {"fit": fit, "forecast": forecast}[given[0]](given[1:], f"{name} {given[0]}")
+    if name == _INSTALLED and given and given[0] in _OTHERS:
+        return _OTHERS[given[0]][0](given[1:], f"{name} {given[0]}")
+    if name == _INSTALLED and given and not Path(given[0]).exists() and (meant := get_close_matches(given[0], _OTHERS, 1)):
+        raise ValueError(f"no command and no file {given[0]!r}: did you mean {name} {meant[0]}?")
     options = _parser(name).parse_args(given)
-    done: list[Outcome] = []
-    interrupted = False
     settings = _settings(options)
     settings.calibrator()  # what it refuses it refuses of every file
     with _saying():
         sources = find_sources(options.records, options.cell_name)
-    results = Results(options.out, sources, not options.table_only, options.force) if options.out else None
+    file_format = _file_format(options)
+    if options.out is None:
+        return _calibrate(sources, settings, file_format, options, None)
+    made_with = {"battery_env": _VERSION, **asdict(settings), **asdict(file_format), "voltages": not options.table_only}
+    if settings.policy is not None:
+        made_with["policy"] = sha256(settings.policy.read_bytes()).hexdigest()
+    results = Results(options.out, sources, not options.table_only, settings, made_with)
+    with results.opened(sources, options.force):
+        return _calibrate(sources, settings, file_format, options, results)
+
+
+def _calibrate(
+    sources: Sequence[Source],
+    settings: Settings,
+    file_format: FileFormat,
+    options: argparse.Namespace,
+    results: Results | None,
+) -> int:
+    done: list[Outcome] = []
+    status = None
+    if results and results.names:
+        print(f"going on: {len(results.names)} discharges are done, as {results.run} says", file=sys.stderr, flush=True)
     try:
         with workers(options.jobs, options.scheduler) as executor:
             ahead = 64 if options.scheduler or options.jobs == -1 else 2 * options.jobs
-            for outcome in calibrate_all(sources, _file_format(options), settings, results, executor, ahead):
+            outcomes = calibrate_all(sources, file_format, settings, results, executor, ahead)
+            with _waiting():
+                first = list(islice(outcomes, 1))
+            for outcome in chain(first, outcomes):
                 done.append(outcome)
                 _show(done, options.json)
-    except KeyboardInterrupt:
-        print("interrupted: what is done is kept", file=sys.stderr)
-        interrupted = True
+    except KeyboardInterrupt as interruption:
+        print("interrupted: what is done is kept" + (", and the same command goes on" if results else ""), file=sys.stderr)
+        status = getattr(interruption, "status", INTERRUPTED)
+    finally:
+        if results and results.has_numbers:
+            with _saying():
+                written = results.write_tables()
     if not options.json:
         _conclude(done, settings)
-    if results and any(not each.error for each in done):
-        written = results.write_table(done)
-        if not options.json:
+        if results and results.has_numbers:
             print("\nwritten: " + ", ".join(map(str, written)))
-    if interrupted:
-        return INTERRUPTED
+    if status is not None:
+        return status
     if any(each.error for each in done):
         return REFUSED
     return SETTLED if all(each.found and each.found.settled for each in done) else NOT_SETTLED
@@ -433,7 +488,7 @@ def fit(arguments: Sequence[str] | None = None, name: str = "python -m battery_e
     check_new(out, picture)
     discharges = _discharges(options.records, _file_format(options))
     print(f"fitting {len(discharges)} discharges", file=sys.stderr, flush=True)
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), _waiting():
         warnings.simplefilter("ignore", UserWarning)  # of the doubt, which is printed
         found = fit_cell(discharges, options.cut_off, thermal=not options.isothermal)
     print(found.summary())
@@ -459,7 +514,7 @@ def forecast(arguments: Sequence[str] | None = None, name: str = "python -m batt
     if options.life and settings.prior_q_mobile_C is not None:
         raise ValueError("--life and --prior say the same: give one of them")
     files = EndFiles(options.out, options.record) if options.out else None
-    with _saying():
+    with _saying(), _waiting():
         end = end_of_record(options.record, settings, file_format, options.life, options.load)
     print(json.dumps(end.row()) if options.json else end.text())
     if files:
@@ -467,6 +522,51 @@ def forecast(arguments: Sequence[str] | None = None, name: str = "python -m batt
         if not options.json:
             print(f"\nwritten: {files.table}, {files.figure}")
     return NOT_SETTLED if end.contradicted else SETTLED
+
+
+@_ending
+def page(arguments: Sequence[str] | None = None, name: str = "python -m battery_env page") -> int:
+    """The command ``page``: a page of this machine alone in a browser, until Ctrl-C."""
+    parser = argparse.ArgumentParser(
+        prog=name,
+        description="Open a page in the browser: drop files, see q_max, R_o, health and the life, forecast the end.",
+        epilog="Needs the extra page: pip install 'battery_env[page]'. Nothing is stored, and nothing leaves this machine.",
+        allow_abbrev=False,
+    )
+    parser.add_argument("--port", type=int, default=8501, metavar="N", help="of the page (default: %(default)s)")
+    options = parser.parse_args(arguments)
+    if find_spec("streamlit") is None or find_spec("plotly") is None:
+        raise ImportError("the page needs Streamlit and Plotly: pip install 'battery_env[page]'")
+    script = str(files("battery_env") / "lab" / "page.py")
+    local = ["--server.address", "localhost", "--server.port", str(options.port), "--browser.gatherUsageStats", "false"]
+    return subprocess.run([sys.executable, "-m", "streamlit", "run", script, *local], check=False).returncode
+
+
+# The commands beside calibrate, with what they are for.
+_OTHERS: dict[str, tuple[Callable[..., int], str]] = {
+    "forecast": (forecast, "the end of a discharge in progress"),
+    "fit": (fit, "the constants of a cell from a few of its discharges"),
+    "page": (page, "all of it as a page in the browser"),
+}
+
+
+@contextmanager
+def _waiting() -> Iterator[None]:
+    """Says at a terminal, where the first call after an installation compiles, that it does."""
+    text = "compiling, once after an installation: half a minute"
+    timer = Timer(_PATIENCE_S, print, [text], {"file": sys.stderr, "flush": True})
+    if sys.stderr.isatty():
+        timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+def _coloured(text: str, settled: bool) -> str:
+    """What is not settled is yellow at a terminal (https://no-color.org)."""
+    is_plain = settled or not sys.stdout.isatty() or "NO_COLOR" in os.environ
+    return text if is_plain else f"\033[33m{text}\033[0m"
 
 
 @contextmanager
@@ -513,7 +613,7 @@ def _show(done: Sequence[Outcome], as_json: bool) -> None:
     if len(done) > 1 and not as_json:
         for each in done if len(done) == 2 else done[-1:]:
             if each.found:
-                print(line_of(each.record, each.found), flush=True)
+                print(_coloured(line_of(each.record, each.found), each.found.settled), flush=True)
 
 
 def _conclude(done: Sequence[Outcome], settings: Settings) -> None:
@@ -524,4 +624,4 @@ def _conclude(done: Sequence[Outcome], settings: Settings) -> None:
         if settings.method == "policy":
             print(f"calibrated by {settings.calibrated_by}")
     elif done and done[0].found:
-        print(text_of(done[0].record, done[0].found))
+        print(_coloured(text_of(done[0].record, done[0].found), done[0].found.settled))

@@ -11,16 +11,17 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numba import njit
 from numpy.typing import ArrayLike
 from scipy.optimize import minimize
 from scipy.stats import truncnorm
 
 from battery_env.arrays import BoolArray, FloatArray
 from battery_env.checks import check_positive, check_whole_number
+from battery_env.compiled import compiled
 from battery_env.electrochemistry.ends import BAND, quantile
 from battery_env.estimators.diagnosis.conditions import is_only_imprecise
 from battery_env.estimators.least_squares import LeastSquares
+from battery_env.lab.forecast import WHOLE_ERROR
 from battery_env.records import drawn, mean_current_A
 from battery_env.records.discharge import Discharge
 
@@ -88,10 +89,10 @@ class Life:
 
     @property
     def prior_at_other_loads_C(self) -> tuple[float, float]:
-        """The same for a load that is not that of the life: the error that all estimates share counts too."""
+        """The same for a load that is not that of the life: the error that all estimates share counts too, in full."""
         mean_C, sd_C = self.next_q_mobile_C
         last = self.table[self.table["valid"]].iloc[-1]
-        return mean_C, hypot(sd_C, mean_C * last["sd_q_mobile_C"] / last["q_mobile_C"])
+        return mean_C, hypot(sd_C, mean_C * WHOLE_ERROR * last["sd_q_mobile_C"] / last["q_mobile_C"])
 
     def after(self, count: int) -> Life:
         """
@@ -226,7 +227,7 @@ def _most_common(reasons: pd.Series) -> str:
     return f"Of {count} of {len(kinds)}: {reasons.iloc[kinds.index(kind)]}"
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def _filtered(
     readings: FloatArray,
     valid: BoolArray,

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from battery_env.estimators.diagnosis.conditions import SETTLED_SHARES
 from battery_env.lab.forecast import Forecast
 from battery_env.lab.settings import Settings
 from battery_env.parameters import PARAMETERS
@@ -43,13 +44,13 @@ class Calibration:
     settings: Settings = field(compare=False)
     cycle: int | None = quantity("discharge")
     method: str = quantity()
-    q_mobile_C: float = quantity("q_mobile", "C")
-    sd_q_mobile_C: float = quantity("sd", "C")
-    r_o_ohm: float = quantity("r_o", "ohm", 4)
-    sd_r_o_ohm: float = quantity("sd", "ohm", 4)
+    q_mobile_C: float = quantity("q_max", "Ah", 3, 1.0 / 3600.0)
+    sd_q_mobile_C: float = quantity("sd", "Ah", 3, 1.0 / 3600.0)
+    r_o_ohm: float = quantity("R_o", "mohm", 0, 1e3)
+    sd_r_o_ohm: float = quantity("sd", "mohm", 0, 1e3)
     settled: bool = quantity("settled")
-    settled_q_mobile: bool = quantity("q_mobile")
-    settled_r_o: bool = quantity("r_o")
+    settled_q_mobile: bool = quantity("q_max")
+    settled_r_o: bool = quantity("R_o")
     reason: str = quantity("Not settled")
     initial_soc: float = quantity("charge at the start", "%", 1, 100.0)
     sd_initial_soc: float = quantity("sd", "%", 1, 100.0)
@@ -109,8 +110,8 @@ class Calibration:
     @property
     def settled_alone(self) -> str:
         """The parameter that is settled though the other one, which was searched for as well, is not; empty if none is."""
-        known = [name for name in self.settings.parameters if getattr(self, f"settled_{name}")]
-        return "" if self.settled else "".join(known)
+        known = [f"settled_{name}" for name in self.settings.parameters if getattr(self, f"settled_{name}")]
+        return "" if self.settled else "".join(_HOW[name]["text"] for name in known)
 
     @property
     def state(self) -> str:
@@ -126,7 +127,7 @@ class Calibration:
 _HOW = {each.name: each.metadata for each in fields(Calibration) if each.metadata}
 # The columns of a line, with their widths and digits.
 _IN_A_LINE = (
-    ("q_mobile_C", 7, None),
+    ("q_mobile_C", 8, None),
     ("r_o_ohm", 0, None),
     ("drawn_Ah", 0, None),
     ("state_of_health", 0, None),
@@ -139,7 +140,7 @@ def text_of(name: str, found: Calibration) -> str:
     averaged = f", averaged over {found.averaged_over_s:g} s," if found.averaged_over_s else ""
     lines = [
         f"{name}: {found.samples} samples{averaged} from load-on at {found.shown('load_on_time_s')}, "
-        f"{3600.0 * found.drawn_Ah:.0f} C drawn"
+        f"{found.shown('drawn_Ah')} drawn"
     ]
     if found.method != "least-squares":
         by = found.settings.calibrated_by if found.method == "policy" else "the Kalman filter"
@@ -152,8 +153,7 @@ def text_of(name: str, found: Calibration) -> str:
         lines += ["", f"{_HOW['reason']['text']}: {found.reason}"]
         if found.in_progress and not found.settled_q_mobile and found.settings.prior_q_mobile_C is None:
             lines += [
-                "During a discharge give --prior with the q_mobile of an earlier one, or the earlier ones themselves:",
-                "battery-calibrate forecast FILE --life FOLDER",
+                "Or give the earlier discharges of this cell: battery-calibrate forecast FILE --life FOLDER",
             ]
     return "\n".join(lines)
 
@@ -164,7 +164,9 @@ def _told(found: Calibration) -> Iterator[tuple[str, str]]:
         yield "initial_soc", f"sd {found.shown('sd_initial_soc')}"
     for parameter, column in _COLUMN_OF.items():
         sd = f"sd {found.shown(f'sd_{column}')}" if found.sd_of(column) else "no sd stated"
-        yield column, sd if parameter in found.settings.parameters else "held"
+        value, sd_value, needed = getattr(found, column), getattr(found, f"sd_{column}"), SETTLED_SHARES[parameter]
+        too_wide = f", {sd_value / value:.0%}: settled below {needed:.0%}" if sd_value > needed * value > 0.0 else ""
+        yield column, f"{sd}{too_wide}" if parameter in found.settings.parameters else "held"
     yield "settled", f"only {found.settled_alone} is" if found.settled_alone else ""
     yield "drawn_Ah", _of_the_charge(found)
     if not np.isnan(found.nominal_Ah):
@@ -223,7 +225,7 @@ def title_of(name: str, found: Calibration) -> str:
     for parameter, column in _COLUMN_OF.items():
         spread = f" (sd {found.sd_of(column)})" if found.sd_of(column) else " (held)"
         # a policy states none
-        value = found.shown(column).replace("ohm", r"$\Omega$")
+        value = found.shown(column).replace("mohm", r"m$\Omega$")
         parts.append(f"{PARAMETERS[parameter].symbol} {value}" + ("" if found.method == "policy" else spread))
     rmse = f"RMSE {found.shown('voltage_rmse_V', 0)}"
     return f"{name}: {found.state}\n" + ", ".join([*parts, f"{found.shown('drawn_Ah')} drawn", rmse])

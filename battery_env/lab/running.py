@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 import warnings
@@ -27,7 +26,7 @@ from battery_env.lab.report import Calibration
 from battery_env.lab.settings import Settings
 from battery_env.lab.sources import Source, find_sources, read_source, record_name
 from battery_env.loads import Load, LoadToCome
-from battery_env.plotting import save_figure
+from battery_env.plotting import literal, save_figure
 from battery_env.records import VARIED_SHARE
 from battery_env.records.discharge import Discharge
 
@@ -98,7 +97,9 @@ class End:
             plural = "" if valid.sum() == 1 else "s"
             lines.append(f"life of {valid.sum()} earlier discharge{plural}{left_out}")
         if self.prior_q_mobile_C is not None:
-            lines.append("q_mobile before: {:.0f} C, sd {:.0f} C".format(*self.prior_q_mobile_C))
+            lines.append(
+                "q_max before: {:.3f} Ah, sd {:.3f} Ah".format(*(each_C / 3600.0 for each_C in self.prior_q_mobile_C))
+            )
         return "\n".join([*lines, self.forecast.summary()])
 
 
@@ -136,8 +137,10 @@ def read_load(path: str | Path) -> Load:
     :raises ValueError: if the file holds none
     """
     try:
-        table = pd.read_csv(path, sep=None, engine="python", encoding="utf-8-sig")
-    except (csv.Error, UnicodeDecodeError, pd.errors.ParserError, pd.errors.EmptyDataError) as error:
+        table = pd.read_csv(path, sep=None, engine="python", encoding="utf-8-sig", compression=None)
+    except OSError:
+        raise
+    except Exception as error:  # pandas raises whatever a file leads it to
         raise ValueError(f"{path}: no table: {error}") from error
     table.columns = table.columns.str.strip()
     found = [name for name in _LOAD_COLUMNS if name in table.columns]
@@ -247,5 +250,5 @@ class EndFiles:
         with replacing(self.table) as part:
             part.write_text(json.dumps(end.row(), indent=2, allow_nan=False) + "\n", encoding="utf-8")
         figure = end.forecast.plot()
-        figure.suptitle(f"{end.name}, then {end.forecast.load_name}", fontsize=10)
+        figure.suptitle(f"{literal(end.name)}, then {end.forecast.load_name}", fontsize=10)
         save_figure(figure, self.figure)

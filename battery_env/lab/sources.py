@@ -14,8 +14,10 @@ from battery_env.lab.readers.discharges import Recording, read_recordings
 from battery_env.lab.readers.tables import BINARY_SUFFIXES, NUMBERED_SUFFIXES, PACKED_SUFFIXES, TEXT_SUFFIXES, is_readable
 from battery_env.records.discharge import BUNDLED_CELLS, load_nasa_discharges
 
-#: Results that an earlier command wrote among the records: tables, and voltages, which have their figure beside them.
-TABLES, VOLTAGE, LIFE = ("estimate.csv", "estimate.parquet"), "_voltage", "life.png"
+#: Results that an earlier command wrote among the records, as their names end: rows, tables of them, voltages, a figure.
+RUN, TABLES, VOLTAGE, LIFE = "estimate.jsonl", ("estimate.csv", "estimate.parquet"), "_voltage", "life.png"
+# How those begin that a record may be called as.
+_RESULT_HEADS = (b"record,source,cell,cycle,", b"time_s,voltage_V,current_A,model_V\n")
 _NASA_SUFFIX = ".mat"
 # What NASA's discharges have beside them, in the layout of the bundled ones, is a table of tests and no record.
 _NO_RECORDS = ("cycles.csv",)
@@ -62,28 +64,38 @@ def find_sources(arguments: Iterable[str], cell_name: re.Pattern[str] | None = N
             name, cycle = argument, ""
         stem = name if name in BUNDLED_CELLS else _stem(Path(name))
         sources.append(Source(name, int(cycle) if cycle else None, stem, stem))
+    sources = list({source.argument: source for source in sources}.values())  # what is named twice is one
     if cell_name is None:
         return sources
     found = [cell_name.search(Path(source.path).name) for source in sources]
-    return [source._replace(cell=match[1]) if match else source for source, match in zip(sources, found, strict=True)]
+    return [source._replace(cell=_plain(match[1])) if match else source for source, match in zip(sources, found, strict=True)]
 
 
 def _records(folder: Path) -> list[Path]:
     """
-    The files in a folder, and in those in it, that may be records; their numbers count, so that 2 comes before 10. What is
-    neither a record nor a result is named.
+    The files in a folder, and in those in it, that may be records, and folders that cannot be looked into; their numbers
+    count, so that 2 comes before 10. What is neither a record nor a result is named.
     """
-    files = [
-        path
-        for path in sorted(folder.rglob("*"), key=_by_number)
-        if path.is_file() and not any(part.startswith(".") for part in path.relative_to(folder).parts) and not _is_result(path)
+    records, other = [], []
+
+    def unread(error: OSError) -> None:
+        records.append(Path(error.filename))
+
+    for parent, folders, names in os.walk(folder, onerror=unread):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        other += [Path(parent, name) for name in folders if Path(parent, name).is_symlink()]
+        for path in (Path(parent, name) for name in names if not name.startswith(".")):
+            if path.name in _NO_RECORDS or not is_readable(path, (_NASA_SUFFIX,)):
+                other.append(path)
+            elif not _is_result(path):
+                records.append(path)
+    left_out = [
+        printable(path.relative_to(folder).as_posix()) for path in sorted(other, key=_by_number) if not _is_result(path)
     ]
-    records = [path for path in files if path.name not in _NO_RECORDS and is_readable(path, (_NASA_SUFFIX,))]
-    other = [path.relative_to(folder).as_posix() for path in sorted({*files} - {*records}, key=_by_number)]
-    if records and other:
-        more = f" and {len(other) - _MOST_NAMED} more" if len(other) > _MOST_NAMED else ""
-        warnings.warn(f"{folder}: {', '.join(other[:_MOST_NAMED])}{more} left out, by their names no records", stacklevel=3)
-    return records
+    if records and left_out:
+        more = f" and {len(left_out) - _MOST_NAMED} more" if len(left_out) > _MOST_NAMED else ""
+        warnings.warn(f"{folder}: {', '.join(left_out[:_MOST_NAMED])}{more} left out, by their names no records", stacklevel=3)
+    return sorted(records, key=_by_number)
 
 
 def _by_number(path: Path) -> tuple[list[list[str | int]], Path]:
@@ -98,14 +110,22 @@ def _names(file: Path, folders: Collection[Path]) -> tuple[str, str]:
     common = Path(os.path.commonpath(folders))
     folder = file.parent.absolute()
     cell = folder.name if folder == common else folder.relative_to(common).as_posix()
-    return f"{cell.replace('/', '_')}_{_stem(file)}", cell
+    return f"{_plain(cell.replace('/', '_'))}_{_stem(file)}", _plain(cell)
 
 
 def _is_result(path: Path) -> bool:
-    names = (*TABLES, LIFE)
-    is_table = path.name in names or path.name.endswith(tuple(f"_{name}" for name in names))
-    pair = [path.with_suffix(suffix) for suffix in (".csv", ".png")]
-    return is_table or (path.stem.endswith(VOLTAGE) and path in pair and all(each.exists() for each in pair))
+    """Whether an earlier command wrote a file, which its name and its content tell; those that no record has the name of."""
+    if path.suffix == ".csv":
+        if not path.is_file():  # to open a pipe is to wait for it
+            return False
+        try:
+            with path.open("rb") as stream:
+                return stream.read(64).startswith(_RESULT_HEADS)
+        except OSError:
+            return False
+    if path.suffix == ".parquet":
+        return path.name.endswith(TABLES[1]) and _is_result(path.with_suffix(".csv"))
+    return path.name.endswith((RUN, LIFE)) or (path.suffix == ".png" and _is_result(path.with_suffix(".csv")))
 
 
 def _stem(path: Path) -> str:
@@ -115,7 +135,18 @@ def _stem(path: Path) -> str:
             if name.lower().endswith(suffix) and len(name) > len(suffix):
                 name = name[: -len(suffix)]
                 break
-    return name
+    return _plain(name)
+
+
+def _plain(name: str) -> str:
+    """A name of files and of cells in tables: what cannot be printed is a line, and nothing begins as a formula does."""
+    name = "".join(each if each.isprintable() else "_" for each in name)
+    return f"_{name}" if name.startswith(("=", "+", "-", "@")) else name
+
+
+def printable(text: str) -> str:
+    """What terminals and tables may show: of what is no character, as in a name that is no UTF-8, its number."""
+    return "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in text)
 
 
 def read_source(source: Source, file_format: FileFormat) -> list[Recording]:
@@ -127,8 +158,11 @@ def read_source(source: Source, file_format: FileFormat) -> list[Recording]:
             Recording({name: getattr(each, name) for name in columns}, each.meta) for each in load_nasa_discharges(path)
         ]
     elif Path(path).is_dir():
+        os.scandir(path).close()  # which says why, where it cannot be looked into
         endings = ", ".join((*TEXT_SUFFIXES, *BINARY_SUFFIXES, _NASA_SUFFIX))
         raise ValueError(f"{path} holds no file whose name ends as that of a record ({endings}), nor do the folders in it")
+    elif Path(path).exists() and not Path(path).is_file():
+        raise ValueError(f"{path} is no file that can be read twice, as its columns are found first: save it to one")
     elif not Path(path).exists():
         raise FileNotFoundError(
             f"no file {source.argument!r}; the bundled cells are given as {BUNDLED_CELLS[0]}:1, {BUNDLED_CELLS[0]}:2, ..."

@@ -22,7 +22,7 @@ from battery_env.estimators.diagnosis.conditions import (
 from battery_env.estimators.diagnosis.gaps import find_gaps, long_intervals, note_gaps
 from battery_env.estimators.diagnosis.samples import note_samples
 from battery_env.parameters import PARAMETER_NAMES
-from battery_env.records import Samples
+from battery_env.records import Samples, Shown
 from battery_env.records.model import RecordModel
 from battery_env.tasks.voltage.fit import REACH_SD, Fitted
 from battery_env.tasks.voltage.task import ESTIMATE_RANGES, VoltageTask
@@ -59,14 +59,14 @@ class Confidence:
         known = [name not in self._parameters for name in PARAMETER_NAMES]
         return np.where(known, np.nan, np.hypot(fitted.sd, fitted.estimate - estimate))
 
-    def verdict(self, fitted: Fitted, n: int, estimate: FloatArray, sd: FloatArray, record: Samples, rested: bool) -> Verdict:
+    def verdict(self, fitted: Fitted, n: int, estimate: FloatArray, sd: FloatArray, record: Samples, shown: Shown) -> Verdict:
         """Which numbers of an estimate are settled, and why not both."""
         diagnosis, cell, (q_mobile, r_o) = Diagnosis(), self._model.cell, estimate.tolist()
         readings, white_V, offset_V = int(fitted.readings[n]), float(fitted.white_V[n]), abs(float(fitted.offset_V[n]))
         first_V, full_V = float(record.voltage_V[0]), rest_voltage_V(cell)
         is_above = first_V > full_V + self._offset_V + _NOISES * white_V
         diagnosis.note(Condition.START_ABOVE, is_above, **start_measured(first_V, full_V))
-        note_samples(diagnosis, record, cell, 1.0, q_mobile, r_o, rested)
+        note_samples(diagnosis, record, cell, 1.0, q_mobile, r_o, shown)
         diagnosis.note(Condition.SPARSE, self._is_sparse(record.time_s, readings), interval_s=self._interval_s)
         if len(long_intervals(record.time_s)):
             model_V = self._model.voltage(record, Estimate(q_mobile, r_o))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict
 from importlib import import_module
-from math import isnan, nan
+from math import inf, isnan, nan
 from typing import Any, Protocol
 
 import gymnasium as gym
@@ -18,9 +18,20 @@ from battery_env.electrochemistry.ends import SURPLUS_SHARE
 from battery_env.estimates import last_estimate
 from battery_env.estimators.diagnosis.conditions import Condition, Verdict
 from battery_env.estimators.estimator import Estimate, EstimateTrace, ModelNow, OnlineEstimator, Record
+from battery_env.estimators.state_files import check_all, check_like
+from battery_env.parameters import PARAMETERS
 from battery_env.policies.confidence import Confidence
 from battery_env.policies.pretrained import pretrained_policy
-from battery_env.records import Samples, check_drawn_charge, check_record, check_sample, drawn_charge_C, starts_at_rest
+from battery_env.records import (
+    Samples,
+    Shown,
+    are_plausible,
+    check_drawn_charge,
+    check_record,
+    check_sample,
+    drawn_charge_C,
+    shown_beside,
+)
 from battery_env.records.model import RecordModel
 from battery_env.tasks.env import CalibrationEnv, task_class
 from battery_env.tasks.task import CalibrationTask
@@ -30,6 +41,8 @@ from battery_env.tasks.voltage.task import VoltageTask
 
 # Steps in which a stream is followed, s
 _STEP_S = 1.0
+# No number that a fit finds comes near, C, ohm or V.
+_LARGEST = 1e9
 
 
 class Predictor(Protocol):
@@ -211,7 +224,7 @@ class PolicyEstimator(OnlineEstimator):
         if self._confidence is not None and self._fitted is not None:
             samples = self._readings.known(self._decisions * self.decision_s)
             (sd,) = self._confidence.standard_deviations(self._fitted, self._now[None])
-            self._verdict = self._confidence.verdict(self._fitted, 0, self._now, sd, samples, rested=False)
+            self._verdict = self._confidence.verdict(self._fitted, 0, self._now, sd, samples, Shown())
             # the same NaN always, so that equal estimates are equal
             self._sd = [nan if isnan(each) else each for each in sd.tolist()]
 
@@ -294,6 +307,29 @@ class PolicyEstimator(OnlineEstimator):
             "logarithms": self._logarithms,
         }
 
+    def _check_state(self, arrays: dict[str, NDArray[Any]]) -> None:
+        fit = {} if "fitted_readings" not in arrays else {f"fitted_{name}": np.zeros(1) for name in Fitted._fields}
+        fit |= {name: np.zeros((1, 2)) for name in ("fitted_estimate", "fitted_sd") if fit}
+        fit |= {"fitted_readings": np.zeros(1, np.int64)} if fit else {}
+        own = {name: array for name, array in self._arrays().items() if not name.startswith("fitted_")}
+        check_like(arrays, own | fit, growing="samples")
+        time_s, voltage_V, current_A = arrays["samples"]
+        first, drawn_C, decisions = np.arange(len(time_s)) == 0, *arrays["progress"][:2]
+        step_s, before_A = np.diff(time_s, prepend=-1.0), np.append(0.0, current_A[:-1])[: len(time_s)]
+        low, high = np.transpose([parameter.limits for parameter in PARAMETERS.values()])
+        check_all(
+            sample=are_plausible(voltage_V, current_A, np.where(first, 1.0, step_s), None, before_A),
+            start=~first | ((time_s == 0.0) & ~np.isnan(voltage_V)),
+            charge=np.isfinite(drawn_C),
+            fit=[(np.abs(arrays[each]) < _LARGEST) | ((arrays[each] == inf) & (each == "fitted_white_V")) for each in fit],
+            spread=[arrays[each] >= 0.0 for each in fit if each.endswith(("sd", "_noise_V", "white_V"))],
+            readings=[arrays[each] > 0 for each in fit if each == "fitted_readings"],
+            estimate=(arrays["progress"][2:] >= low) & (arrays["progress"][2:] <= high),
+            action=np.abs(arrays["action"]) <= 1.0,
+            logarithms=np.isfinite(arrays["logarithms"]),
+        )
+        check_all(count=decisions in range(int(max(time_s, default=0.0) / self.decision_s + 1e-9) + 1))
+
     def _restore(self, arrays: dict[str, NDArray[Any]]) -> None:
         self._readings = ReadingsSoFar.of(arrays["samples"])
         self._drawn_C, self._decisions = float(arrays["progress"][0]), int(arrays["progress"][1])
@@ -327,7 +363,7 @@ class PolicyEstimator(OnlineEstimator):
         :return: one trace per discharge, in the same order
         """
         task = self._follow(records, self._every)
-        samples = [] if self._confidence is None else [(Samples.of(record), starts_at_rest(record)) for record in records]
+        samples = [] if self._confidence is None else [(Samples.of(record), shown_beside(record)) for record in records]
         made: list[FloatArray] = []
         verdicts: list[Verdict] = []
         while (running := ~task.truncated()).any():
@@ -340,9 +376,9 @@ class PolicyEstimator(OnlineEstimator):
                 sd = self._confidence.standard_deviations(fitted, estimate)
                 columns.append(sd)
                 for n in np.flatnonzero(running).tolist():
-                    record, rested = samples[discharge[n]]
+                    record, shown = samples[discharge[n]]
                     so_far = record.first(int(np.searchsorted(record.time_s, time_s[n], side="right")))
-                    verdicts.append(self._confidence.verdict(fitted, n, estimate[n], sd[n], so_far, rested))
+                    verdicts.append(self._confidence.verdict(fitted, n, estimate[n], sd[n], so_far, shown))
             made.append(np.concatenate(columns, axis=1)[running])
             task.drop_ended()
         rows = np.concatenate(made)

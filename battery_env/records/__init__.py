@@ -25,9 +25,9 @@ from battery_env.records.samples import (
     least_load_A,
     mean_current_A,
     resample_current,
-    starts_at_rest,
     switch_times_s,
 )
+from battery_env.records.shown import ChargeBefore, Shown, shown_beside
 
 __all__ = [
     "CUT_OFF_V",
@@ -38,9 +38,11 @@ __all__ = [
     "SAMPLE_INTERVAL_LIMITS_S",
     "SWITCH_SHARE",
     "VARIED_SHARE",
+    "ChargeBefore",
     "ExpectedCurrent",
     "Record",
     "Samples",
+    "Shown",
     "Stream",
     "are_plausible",
     "check_column",
@@ -54,6 +56,6 @@ __all__ = [
     "least_load_A",
     "mean_current_A",
     "resample_current",
-    "starts_at_rest",
+    "shown_beside",
     "switch_times_s",
 ]

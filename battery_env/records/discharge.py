@@ -34,6 +34,7 @@ from battery_env.records.samples import (
     least_load_A,
     switch_times_s,
 )
+from battery_env.records.shown import Shown, is_mixed, load_on_sd_C, rest_current_A
 
 #: How to cite the bundled data.
 NASA_CITATION = (
@@ -72,6 +73,7 @@ class Discharge:
     :param meta: what else is known, e.g. ``cell``, ``cycle``, ``capacity_Ah``, ``start_time``, ``source``
     :param starts_at_rest: whether the first voltage is that of the cell at rest, and the first current that of the load
         that is switched on then, as in a :meth:`loaded_part`. Calibrators judge by it whether the cell was full
+    :param shown: what else is known beside the samples: the charge before, which says whether the cell was full
     :raises ValueError: for arrays that do not fit together, or invalid values; it says what to do
     """
 
@@ -81,6 +83,7 @@ class Discharge:
     temperature_C: FloatArray | None = None
     meta: dict[str, Any] = field(default_factory=dict)
     starts_at_rest: bool = False
+    shown: Shown = field(default_factory=Shown)
     #: see :func:`battery_env.records.check_record`
     is_checked: ClassVar[bool] = True
 
@@ -169,12 +172,23 @@ class Discharge:
         first, last = self._loaded
         below = np.flatnonzero(self.voltage_V[first : last + 1] <= cut_off_V) + first
         if not len(below):
-            return None
+            return last if self._ends_at(cut_off_V) else None
         begin = int(below[0])
         back = np.flatnonzero(self.voltage_V[begin : last + 1] > cut_off_V) + begin
         if begin > 0 and len(back):
             self._refuse_dip(begin, int(back[0]), cut_off_V)
         return begin
+
+    def _ends_at(self, cut_off_V: float) -> bool:
+        """
+        Whether the last sample under load is as near to the cut-off as the one before it is to that sample: a tester stops by
+        a reading that it need not write.
+        """
+        last = self._loaded[1]
+        before = max(last - 1, 0)
+        is_steady = abs(self.current_A[last] - self.current_A[before]) <= SWITCH_SHARE * self.current_A.max()
+        fall_V = self.voltage_V[before] - self.voltage_V[last]
+        return bool(is_steady and fall_V > 0.0 and self.voltage_V[last] - cut_off_V <= fall_V)
 
     def _refuse_dip(self, begin: int, back: int, cut_off_V: float) -> None:
         """
@@ -202,7 +216,8 @@ class Discharge:
 
     def eod_time_s(self, cut_off_V: float) -> float:
         """
-        When the voltage under load first fell to the cut-off, interpolated between the two samples around it.
+        When the voltage under load first fell to the cut-off, interpolated between the two samples around it. A load that ends
+        above it by no more than the last fall between two samples ends there.
 
         :param cut_off_V: cut-off voltage, V
         :return: the end of discharge on the clock of ``time_s``, s; NaN if the record does not reach it
@@ -214,7 +229,7 @@ class Discharge:
         if n == self._loaded[0]:
             return float(self.time_s[n])
         share = (self.voltage_V[n - 1] - cut_off_V) / (self.voltage_V[n - 1] - self.voltage_V[n])
-        return float(self.time_s[n - 1] + share * (self.time_s[n] - self.time_s[n - 1]))
+        return float(self.time_s[n - 1] + min(share, 1.0) * (self.time_s[n] - self.time_s[n - 1]))
 
     def loaded_part(self, cut_off_V: float) -> Discharge:
         """
@@ -224,11 +239,9 @@ class Discharge:
 
         :param cut_off_V: cut-off voltage, V
         :return: that part, on the same clock
-        :raises ValueError: if it has too few samples, or those are missing that would say when the load was switched on, or
-            the voltage is below the cut-off by a fault of the sensor
+        :raises ValueError: if it has too few samples, or the voltage is below the cut-off by a fault of the sensor
         """
         first, last = self._loaded
-        self._refuse_missing(first)
         start_s, end_s = self.load_on_time_s, self.eod_time_s(cut_off_V)
         if np.isnan(end_s):
             end_s = float(self.time_s[last])
@@ -240,23 +253,16 @@ class Discharge:
             )
         names = ("voltage_V", "current_A") if self.temperature_C is None else ("voltage_V", "current_A", "temperature_C")
         columns = {name: np.interp(time_s, self.time_s, getattr(self, name)) for name in names}
-        columns["voltage_V"][0], columns["current_A"][0] = self.voltage_V[max(first - 1, 0)], self.current_A[first]
-        starts_at_rest = self.starts_at_rest if first == 0 else bool(abs(self.current_A[first - 1]) <= REST_CURRENT_A)
-        return self._derived(time_s=time_s, **columns, starts_at_rest=starts_at_rest)
-
-    def _refuse_missing(self, first: int) -> None:
-        """
-        Refuse a gap between the last sample at rest and the first one under load that is more than twice the interval before
-        and the one after it: the load may have been switched on at any time in it.
-        """
-        if not first or first + 1 == len(self.time_s):
-            return
-        *before_s, gap_s, after_s = np.diff(self.time_s[max(first - 2, 0) : first + 2])
-        if gap_s > 2.0 * max([*before_s, after_s]):
-            raise ValueError(
-                f"samples are missing from {self.time_s[first - 1]:g} s, at rest, to {self.time_s[first]:g} s, under load: "
-                "what was drawn in between is not known. Give the last ones at rest, or remove those before the load"
-            )
+        resting = max(first - 1 - is_mixed(self.voltage_V, first), 0)
+        columns["voltage_V"][0], columns["current_A"][0] = self.voltage_V[resting], self.current_A[first]
+        starts_at_rest, shown = self.starts_at_rest, self.shown
+        if first:
+            starts_at_rest = bool(abs(self.current_A[resting]) <= REST_CURRENT_A)
+            shown = shown._replace(rest_s=float(self.time_s[resting] - self.time_s[0]))
+            shown = shown._replace(load_on_C=load_on_sd_C(self.time_s, self.current_A, first, start_s))
+        if (offset_A := rest_current_A(self.current_A)) is not None:
+            shown = shown._replace(offset_A=offset_A)
+        return self._derived(time_s=time_s, **columns, starts_at_rest=starts_at_rest, shown=shown)
 
     def averaged(self, dt_s: float) -> Discharge:
         """

@@ -11,14 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from battery_env.arrays import FloatArray
-from battery_env.checks import LoadUnit, check_not_negative
+from battery_env.checks import check_not_negative
 from battery_env.electrochemistry import (
     FULL_CHARGE_SHARES,
     QNB,
     STATE_SIZE,
     CellParameters,
     Trajectory,
-    advance_in_place,
     check_cell,
     check_dt,
     initial_state,
@@ -26,7 +25,6 @@ from battery_env.electrochemistry import (
     simulate,
 )
 from battery_env.electrochemistry.ends import LONGEST_S, Cells, Loads, run_down
-from battery_env.electrochemistry.kernels import run_on_batch
 from battery_env.electrochemistry.tangents import (
     TANGENT_NAMES,
     PolynomialDerivatives,
@@ -215,31 +213,6 @@ class RecordModel:
             cut_off_V=-np.inf,
             max_duration_s=len(current_A) * self.dt_s,
         )
-
-    def advance(self, state: FloatArray, current_A: FloatArray, q_mobile: FloatArray, r_o: FloatArray) -> None:
-        """Take cells through a current, shape (K,), in place; unchecked, for inner loops."""
-        first, steps = np.zeros(len(state), dtype=np.int64), np.full(len(state), len(current_A))
-        advance_in_place(state, current_A, first, steps, q_mobile, r_o, self.dt_s, "current", self.thermal, self.cell.packed)
-
-    def run_on(
-        self, state: FloatArray, load: FloatArray, q_mobile: FloatArray, r_o: FloatArray, load_unit: LoadUnit
-    ) -> tuple[FloatArray, FloatArray]:
-        """
-        Take every cell on through a load of its own, or all through one; unchecked, for inner loops.
-
-        :param state: shape (n, 8), overwritten by the states after the last step
-        :param load: over each step, W or A, shape (n, K) or (1, K)
-        :param q_mobile: charge that can move, C, shape (n,)
-        :param r_o: ohmic resistance, ohm, shape (n,)
-        :param load_unit: ``"power"`` or ``"current"``
-        :return: voltage before each step and after the last one, V, shape (K + 1, n), NaN once a cell is empty; and current
-            over each step, A, shape (K, n)
-        """
-        steps, cells = load.shape[1], len(state)
-        voltage_V, current_A = np.empty((steps + 1, cells)), np.empty((steps, cells))
-        is_power, packed = load_unit == "power", self.cell.packed
-        run_on_batch(load, q_mobile, r_o, self.dt_s, is_power, self.thermal, packed, state, voltage_V, current_A)
-        return voltage_V, current_A
 
     def voltage(self, record: Record, at: Estimate) -> FloatArray:
         """

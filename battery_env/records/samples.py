@@ -90,14 +90,6 @@ class Samples(NamedTuple):
         return Samples(*(column[:count] for column in self))
 
 
-def starts_at_rest(record: Record) -> bool:
-    """
-    Whether the first voltage of a record is known to be that of the cell at rest, though the first current may be that of the
-    load that was switched on then.
-    """
-    return bool(getattr(record, "starts_at_rest", False))
-
-
 def check_column(name: str, values: ArrayLike, least_samples: int) -> FloatArray:
     """Refuse an invalid column of a record."""
     if values is None or np.ma.is_masked(values) or np.iscomplexobj(values):

@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-_LABELS = {"voltage": "voltage (V)", "q_mobile": "$q^{max}$ (C)", "r_o": "$R_o$ (ohm)"}
+_LABELS = {"voltage": "voltage (V)", "q_mobile": "$q_{max}$ (C)", "r_o": "$R_o$ (ohm)"}
 
 
 def draw_frame(

@@ -154,6 +154,8 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         """Start an episode, with ``options={"state": ...}`` from a given state; ``info`` holds its ``"error"``."""
         super().reset(seed=seed)
+        if unknown := set(options or {}) - {"state"}:
+            raise ValueError(f"options {sorted(map(str, unknown))} are unknown: there is 'state'.")
         start = self._initial_state()
         if options is not None and "state" in options:
             start = np.array(options["state"], dtype=np.float64)
@@ -172,7 +174,10 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
         """Move on by one step; ``info`` holds ``"cost"``, minus the reward, and ``"error"``."""
         if self.state is None:
             raise gym.error.ResetNeeded("Call reset() before step().")
-        action = np.asarray(action, dtype=np.float64)
+        action = np.asarray(action)
+        if action.dtype.kind not in "fiu":
+            raise ValueError(f"action={action!r} must be real numbers.")
+        action = action.astype(np.float64)
         if action.shape != self.action_space.shape or not np.isfinite(action).all():
             raise ValueError(f"action={action} must be finite numbers in [-1, 1], shape {self.action_space.shape}.")
         action = np.minimum(np.maximum(action, -1.0), 1.0)

@@ -79,12 +79,22 @@ class LyapunovReport:
 
         return pd.DataFrame.from_dict(self.metrics, orient="index", columns=["value", "low", "high"]).rename_axis("metric")
 
-    def summary(self) -> str:
+    def summary(self, full: bool = False) -> str:
         """
-        Say the metrics in a readable form, and what they tell of the decrease condition.
+        Say in a line whether the loop settles, and on what that rests.
 
-        :return: A text of several lines
+        :param full: Also say the metrics, with their intervals, and what they tell of the decrease condition
+        :return: A text of some lines
         """
+        episodes, transitions = len(self.episodes), len(self.transitions)
+        verdict = (
+            f"{'HOLDS' if self.holds else 'NOT SHOWN'}: {self._verdict_with_residual()}\n"
+            f"Seen in {episodes} episodes, {transitions} transitions of this policy in this environment: measured, not proved."
+        )
+        return verdict if not full else f"{verdict}\n\n{self._details()}"
+
+    def _details(self) -> str:
+        """The metrics, and what they tell of the decrease condition."""
         lines = [
             f"Lyapunov function along {len(self.episodes)} episodes, {len(self.transitions)} transitions "
             f"(alpha3={self.alpha3:g}, gamma={self.gamma:g})",
@@ -98,10 +108,9 @@ class LyapunovReport:
         if any(math.isnan(value) for value, _, _ in self.metrics.values()):
             lines.append(
                 "What is not available takes what these roll-outs do not have, like a survivor or costs that fade before the "
-                "time limit: docs/stability_metrics.md lists what each metric takes."
+                "time limit."
             )
         lines.append(f"With alpha3={self.alpha3:g} the decrease condition {self._verdict()}.")
-        lines.append(self._verdict_with_residual())
         if not self.lyapunov_over_cost.empty:
             quantiles = ", ".join(f"{value:.3g}" for value in self.lyapunov_over_cost)
             lines.append(f"L is {quantiles} times the cost (5th, 50th and 95th percentile of the transitions).")
@@ -110,10 +119,6 @@ class LyapunovReport:
             lines.append(f"If L is exact, gamma={self.gamma:g} lets it decrease by {share} of the cost in 95 % of them.")
         if self.n_calibrated > 0:
             lines.append(f"L was compared with the cost-to-go of {self.n_calibrated} transitions.")
-        lines.append(
-            "This is an empirical statement about these roll-outs of this policy in this environment, "
-            "and no proof of stability."
-        )
         return "\n".join(lines)
 
     def _verdict(self) -> str:
@@ -180,12 +185,9 @@ class LyapunovReport:
     def _verdict_with_residual(self) -> str:
         reason = self._why_not()
         if reason is not None:
-            return f"With a residual it does not hold: {reason}."
-        _, low, high = self.metrics["cost_bound"]
-        return (
-            f"With a residual it holds: L decreases where the cost is larger than cost_bound [{low:.3g}, {high:.3g}], "
-            f"which bounds the mean cost in the long run; the starts cost {self.metrics['start_cost'].value:.3g}."
-        )
+            return f"{reason}."
+        bound, start = self.metrics["cost_bound"].high, self.metrics["start_cost"].value
+        return f"the mean cost settles below {bound:.3g} (the starts cost {start:.3g}). L decreases wherever it is larger."
 
     def plot(self) -> Figure:
         """

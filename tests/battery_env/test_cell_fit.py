@@ -23,12 +23,8 @@ from battery_env import (
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate, voltage
 from battery_env.electrochemistry.equilibrium import with_equilibrium
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
-from battery_env.estimators.cell_fit import (
-    EQUILIBRIUM_PRIOR_SD_V,
-    RATE_PRIOR_SD,
-    JointFit,
-    read_cell,
-)
+from battery_env.estimators.cell_fit import RATE_PRIOR_SD, read_cell
+from battery_env.estimators.joint_fit import EQUILIBRIUM_PRIOR_SD_V, JointFit
 from battery_env.lab.calibrate import calibrate
 from battery_env.lab.running import forecast_end
 from battery_env.lab.settings import METHODS, Settings

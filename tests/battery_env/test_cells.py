@@ -73,11 +73,6 @@ class TestDischarge:
         assert discharge.load_on_time_s == loaded_s[0] - 10.0
         assert discharge.loaded_part(2.0).charge_C == pytest.approx(2.0 * 600.0)
 
-    def test_a_load_that_may_have_been_on_for_part_of_a_gap_is_refused(self):
-        time_s, current_A = np.append(-600.0, 10.0 * np.arange(20)), np.repeat([0.0, 2.0], [1, 20])
-        with pytest.raises(ValueError, match="samples are missing from -600 s, at rest, to 0 s, under load"):
-            Discharge(time_s, np.linspace(4.2, 3.0, 21), current_A).loaded_part(2.0)
-
     def test_a_small_load_before_a_larger_one_belongs_to_the_discharge(self):
         time_s = 10.0 * np.arange(400)
         current_A = np.where(time_s < 100.0, 0.004, np.where(time_s < 2000.0, 0.15, 2.0))
@@ -102,7 +97,7 @@ class TestDischarge:
         discharge = Discharge(**recorded())
         assert discharge.eod_time_s(2.7) == pytest.approx(47.5)
         assert discharge.eod_time_s(3.0) == 40.0
-        assert np.isnan(discharge.eod_time_s(2.5))
+        assert np.isnan(discharge.eod_time_s(2.1))
 
     @pytest.mark.parametrize("count", [1, 3])
     @pytest.mark.parametrize("period", [1000, 20, 7])

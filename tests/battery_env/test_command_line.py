@@ -1,7 +1,6 @@
 import json
 import subprocess
 import sys
-from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
 from contextlib import redirect_stdout
 from dataclasses import replace
 from importlib.resources import files
@@ -16,7 +15,8 @@ import pytest
 import battery_env
 from battery_env.electrochemistry import NEW_CELL, CellParameters, Trajectory, initial_state, simulate
 from battery_env.electrochemistry.ends import MEMORY_SHARE
-from battery_env.estimators.cell_fit import fit_cell, read_cell
+from battery_env.estimators import fit_cell
+from battery_env.estimators.cell_fit import read_cell
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.lab import many
 from battery_env.lab.calibrate import calibrate as calibrated
@@ -41,6 +41,11 @@ def write(record: Discharge | Trajectory, path: Path, sign: float = 1.0) -> str:
 
 def seen(record: Discharge | Trajectory, samples: slice) -> Discharge:
     return Discharge(record.time_s[samples], record.voltage_V[samples], record.current_A[samples])
+
+
+def names_in(folder: Path) -> set[str]:
+    """Those that are shown, without the lock."""
+    return {path.name for path in folder.iterdir() if not path.name.startswith(".")}
 
 
 class Terminal:
@@ -78,7 +83,7 @@ def test_calibrates_a_bundled_discharge_and_writes_what_it_found(tmp_path, termi
     assert "1.486 Ah   the capacity to 2.7 V" in shown and "state of health" not in shown
     assert "40.3 degC   measured; the model goes from 24.3 degC to 26.2 degC" in shown
     kinds = ("estimate.csv", "estimate.parquet", "voltage.csv", "voltage.png")
-    assert {path.name for path in folder.iterdir()} == {f"B0005_100_{kind}" for kind in kinds}
+    assert names_in(folder) == {f"B0005_100_{kind}" for kind in (*kinds, "estimate.jsonl")}
     (row,) = pd.read_csv(folder / "B0005_100_estimate.csv").to_dict(orient="records")
     assert row["q_mobile_C"] == pytest.approx(5631.0, abs=5.0)
     assert row["capacity_Ah"] == row["drawn_Ah"] == pytest.approx(1.4857, abs=1e-4) and np.isnan(row["state_of_health"])
@@ -99,7 +104,7 @@ def test_a_file_of_constants_takes_the_place_of_the_new_cell(recorded, tmp_path,
     record = recorded.loaded_part(2.7)
     drawn_Ah = record.charge_C / 3600.0
     (given_Ah,) = fit.model.capacity_Ah(in_steps([constant(record.current_A[-1], "current")], 1.0), 2.7)
-    assert f"{fit.estimate(record).q_mobile:.0f} C" in shown
+    assert f"{fit.estimate(record).q_mobile / 3600.0:.3f} Ah" in shown
     drawn = f"{drawn_Ah:.3f} Ah (sd {0.005 * drawn_Ah:.3f} Ah), drawn"
     health = f"{drawn_Ah / given_Ah:.3f}   {drawn}, of {given_Ah:.4g} Ah, what the given cell yields"
     assert health in shown
@@ -159,10 +164,14 @@ def test_what_remains_of_a_discharge_in_progress_needs_a_prior_or_the_filter(rec
     path = write(recorded.until(1500.0), tmp_path / "half.csv")
     shown = terminal.shows(path, status=3)
     assert "remaining" in shown and "Not settled: q_max is not known to 2 % yet" in shown
-    assert "give --prior" in shown and "calibrated by the Kalman filter" in shown and "Ah   so far" in shown
+    assert (
+        "battery-calibrate forecast FILE --life" in shown
+        and "calibrated by the Kalman filter" in shown
+        and "Ah   so far" in shown
+    )
     assert terminal.row(path, status=3) == terminal.row(path, "--method", "kalman", status=3)
     shown = terminal.shows(path, "--prior", 5460, 55, "--nominal", 2, "--out", tmp_path, status=3)
-    assert "Not settled: q_max rests on its prior" in shown and "give --prior" not in shown and "Kalman" not in shown
+    assert "Not settled: q_max rests on its prior" in shown and "--life" not in shown and "Kalman" not in shown
     assert "2.01 A to go on" in shown and "Ah), predicted, of 2 Ah" in shown
     (row,) = pd.read_csv(tmp_path / "half_estimate.csv").to_dict(orient="records")
     end_s, whole_Ah = recorded.eod_time_s(2.7), recorded.loaded_part(2.7).charge_C / 3600.0
@@ -170,7 +179,9 @@ def test_what_remains_of_a_discharge_in_progress_needs_a_prior_or_the_filter(rec
     assert np.isnan(row["measured_eod_time_s"]) and np.isnan(row["capacity_Ah"])
     assert row["predicted_capacity_Ah"] == pytest.approx(whole_Ah, rel=0.02)
     assert row["state_of_health"] == row["predicted_capacity_Ah"] / 2.0
-    assert row["sd_state_of_health"] == pytest.approx(row["sd_predicted_eod_time_s"] * row["future_current_A"] / 7200.0)
+    # which the moment of load-on widens a little
+    by_end = row["sd_predicted_eod_time_s"] * row["future_current_A"] / 7200.0
+    assert by_end < row["sd_state_of_health"] < 1.01 * by_end
     filtered = terminal.row(path, "--method", "kalman", status=3)
     assert filtered["settled"] is False and filtered["measured_eod_time_s"] is None
     assert 1500.0 + filtered["remaining_s"] == pytest.approx(end_s, rel=0.2)
@@ -182,10 +193,10 @@ def test_a_large_cell_at_1C_says_that_its_charge_is_known_though_its_resistance_
     assert not row["settled"] and row["settled_q_mobile"] and not row["settled_r_o"]
     assert row["q_mobile_C"] == pytest.approx(18_000.0, rel=0.01) and row["reason"].startswith("R_o is not known to 30 %")
     shown = terminal.shows(path, "--out", tmp_path, status=3)
-    assert "no   only q_mobile is" in shown and "Not settled: R_o is not known to 30 %" in shown and "--prior" not in shown
+    assert "no   only q_max is" in shown and "Not settled: R_o is not known to 30 %" in shown and "--prior" not in shown
     (table,) = pd.read_csv(tmp_path / "large_estimate.csv").to_dict(orient="records")
     assert table["settled_q_mobile"] and not table["settled_r_o"]
-    assert "only q_mobile settled: R_o is not" in repr(battery_env.calibrate(path)[0])
+    assert "only q_max settled: R_o is not" in repr(battery_env.calibrate(path)[0])
     # what is held is not known by this record
     assert "only" not in terminal.shows(path, "--parameters", "r_o", status=3)
 
@@ -227,7 +238,7 @@ def test_results_are_only_replaced_when_asked_and_found_before_any_work_is_done(
     result.parent.mkdir()
     result.write_text("precious")
     assert "cell_voltage.csv would be replaced" in terminal.refuses(path, "--out", result.parent)
-    assert list(result.parent.iterdir()) == [result] and result.read_text() == "precious"
+    assert names_in(result.parent) == {result.name} and result.read_text() == "precious"
     assert "is a file" in terminal.refuses(path, "--out", result)
     terminal.shows(path, "--out", result.parent, "--force")
     assert len(pd.read_csv(result)) > 100
@@ -401,7 +412,7 @@ def test_a_folder_becomes_one_table_and_what_cannot_be_used_stops_nothing(lab, t
     assert list(life["cycle"]) == [1, 2, 3] and (np.diff(life["state_of_health"]) < -0.05).all()
     assert pd.read_parquet(tmp_path / "estimate.parquet")["q_mobile_C"].equals(table["q_mobile_C"])
     kinds = [f"{name}_voltage.{kind}" for name in records[1:6] for kind in ("csv", "png")]
-    assert {path.name for path in tmp_path.iterdir()} == {*kinds, "estimate.csv", "estimate.parquet", "life.png"}
+    assert names_in(tmp_path) == {*kinds, "estimate.csv", "estimate.jsonl", "estimate.parquet", "life.png"}
 
 
 @pytest.mark.parametrize("given", [["cells"], ["cells/B7", "cells/B18"]])
@@ -439,7 +450,7 @@ def fleet(lab, tmp_path_factory):
             # as in the other processes: progpy, which other tests import, changes the settings
             matplotlib.rcdefaults()
             assert main(["calibrate", *records, "--json", "--out", str(out), *more]) == 2
-        return printed.getvalue(), {path.name: path.read_bytes() for path in out.iterdir()}
+        return printed.getvalue(), {path.name: path.read_bytes() for path in out.iterdir() if path.suffix != ".lock"}
 
     return calibrate_all
 
@@ -457,25 +468,6 @@ def test_a_fleet_side_by_side_is_the_same_as_one_after_the_other(where, fleet, o
     printed, written = fleet(*chosen)
     assert (printed, written) == one_after_the_other
     assert printed.count("\n") == 3 and "life_002_voltage.png" in written
-
-
-class LosesOne(ThreadPoolExecutor):
-    """Loses the worker of one call."""
-
-    def submit(self, function, *arguments):
-        if "life_002" not in str(arguments):
-            return super().submit(function, *arguments)
-        future = Future()
-        future.set_exception(BrokenExecutor("the worker died"))
-        return future
-
-
-def test_a_lost_worker_stops_no_other_and_results_keep_their_order(lab):
-    sources = many.find_sources([f"{lab}/life.csv"])
-    with LosesOne(2) as executor:
-        found = list(many.calibrate_all(sources, many.FileFormat(), Settings(), executor=executor))
-    assert [each.record for each in found] == ["life_001", "life_002", "life_003"]
-    assert [each.error for each in found] == ["", "life_002: BrokenExecutor: the worker died", ""]
 
 
 def test_a_cluster_needs_an_extra_and_a_scheduler(monkeypatch, terminal):
@@ -576,7 +568,7 @@ def test_many_samples_are_averaged_and_say_the_same(recorded, tmp_path, terminal
 
 def test_runs_as_a_module():
     done = subprocess.run([sys.executable, "-m", "battery_env", "calibrate", "B0005:1"], capture_output=True, text=True)
-    assert done.returncode == 0 and "q_mobile" in done.stdout and done.stderr == ""
+    assert done.returncode == 0 and "q_max" in done.stdout and done.stderr == ""
 
 
 def test_a_reader_that_leaves_ends_it_in_silence():

@@ -11,6 +11,9 @@ import pytest
 
 from battery_env import Estimate, RecordModel, forecast, initial_state, load_nasa_discharges, simulate, track_life
 from battery_env.__main__ import calibrate, main
+from battery_env.estimates import last_estimate
+from battery_env.estimators import ExtendedKalmanFilter
+from battery_env.lab.forecast import WHOLE_ERROR
 from battery_env.lab.running import forecast_end, read_load
 from battery_env.lab.settings import Settings
 from battery_env.loads import BlockBootstrap, Cycle, Load, RandomPiecewise, constant, steadier_unit
@@ -134,6 +137,31 @@ class TestUncertainty:
         unknown, known = Estimate(6000.0, 0.15, 60.0, 0.03), Estimate(6000.0, 0.15, 60.0, 0.0)
         assert self.width(unknown) < 1.2 * self.width(known)
         assert self.width(unknown, 8.0) > 1.5 * self.width(known, 8.0)
+
+    def test_what_a_resistance_absorbed_of_the_error_of_the_model_comes_out_under_another_load(self):
+        absorbed = Estimate(6000.0, 0.15, 0.0, 0.05 / 4.0)
+        # at the load of the record the voltage makes up for a larger resistance, and at a lighter one for too much
+        low_s, high_s = (
+            forecast(self.record, Estimate(6000.0, r_o), 1.0, model=MODEL, mismatch_V=0.05, samples=400).eod_quantile_s(0.5)
+            for r_o in 0.15 + WHOLE_ERROR * 0.05 / 4.0 * np.array([-1.0, 1.0])
+        )
+        drifts = self.width(TRUTH, 1.0, mismatch_V=0.05)
+        expected_s = np.hypot(3.29 * 0.5 * (high_s - low_s), drifts)
+        assert self.width(absorbed, 1.0, mismatch_V=0.05) == pytest.approx(expected_s, rel=0.1) and expected_s > 1.5 * drifts
+        assert self.width(absorbed, mismatch_V=0.05) == pytest.approx(self.width(TRUTH, mismatch_V=0.05), rel=0.1)
+        # what is told of the resistance is the estimate
+        assert forecast(self.record, absorbed, 8.0, model=MODEL).r_o.std() == pytest.approx(0.05 / 4.0, rel=0.1)
+
+    def test_of_a_filter_the_end_is_the_one_that_it_states(self):
+        filter_ = ExtendedKalmanFilter(mismatch_V=0.02, dt_s=4.0, prior_q_mobile_C=(6050.0, 60.0))
+        estimate = last_estimate(filter_.follow(self.record))
+        assert estimate == filter_.estimate(self.record)
+        filter_.follow(self.record)
+        for load in (4.0, 2.0):
+            found, left = forecast(self.record, estimate, load, model=filter_.now(), mismatch_V=0.0), filter_.remaining(load)
+            low_s, median_s, high_s = found.eod_quantile_s() - found.now_s
+            assert median_s == pytest.approx(left.time_s, abs=0.2 * left.sd_s)
+            assert high_s - low_s == pytest.approx(3.29 * left.sd_s, rel=0.1)
 
     def test_nine_of_ten_truths_lie_inside(self):
         rng, inside, n = np.random.default_rng(0), 0, 40

@@ -156,7 +156,7 @@ def test_files_of_one_discharge_each_are_a_life_in_their_order_and_unsettled_one
 
 def test_the_common_error_of_a_cell_is_one_bar_and_its_line_has_no_band():
     upper, lower, _ = plot_life(life(["A", "B"])).axes
-    for axes, last, reach in ((upper, 6100.0, 100.0), (lower, 0.1, 0.04)):
+    for axes, last, reach in ((upper, 6100.0 / 3600.0, 100.0 / 3600.0), (lower, 100.0, 40.0)):
         bars = [bar.get_segments()[0] for bar in axes.collections if len(bar.get_segments())]
         assert len(bars) == 2 and min(bar[0, 0] for bar in bars) > 9.0
         np.testing.assert_allclose(bars[0][:, 1], [last - reach, last + reach])
@@ -178,7 +178,7 @@ def test_the_title_says_that_q_max_follows_the_capacity_only_if_it_does(noise_Ah
     table["q_mobile_C"] = 7000.0 - 10.0 * table["cycle"]
     drawn_Ah = table["q_mobile_C"] / 3800.0 + noise_Ah * np.random.default_rng(0).standard_normal(len(table))
     title = plot_life(table.assign(capacity_Ah=drawn_Ah)).axes[0].get_title()
-    assert title == ("$q^{max}$ follows the measured capacity (r > 0.999)" if follows else "")
+    assert title == ("$q_{max}$ follows the measured capacity (r > 0.999)" if follows else "")
     assert plot_life(table).axes[0].get_title() == ""
 
 

@@ -26,6 +26,9 @@ CHARGE = pd.DataFrame({"time": np.arange(0.0, 3600.0, 60.0), "voltage": np.linsp
 REST = pd.DataFrame({"time": 3600.0 + np.arange(0.0, 600.0, 60.0), "voltage": 4.19, "current": 0.0})
 CYCLE = pd.concat([CHARGE, REST, TABLE.assign(time=4200.0 + TABLE["time"])], ignore_index=True)
 
+# A file that is not closed
+pytestmark = pytest.mark.filterwarnings("error::ResourceWarning", "error::pytest.PytestUnraisableExceptionWarning")
+
 
 def read(table, said="", **options):
     """Return the one discharge of a table, and check what is said of it; nothing by default."""
@@ -448,7 +451,7 @@ def test_a_folder_reads_numbered_text_and_names_what_it_left_out(tmp_path, capsy
         ({"time (s)": TABLE["time"] / 3600.0, "time": None}, "got 0.839375 s. That is too short for a discharge.", "--units"),
         ({"voltage": TABLE["voltage"] * 1e4}, "must lie within 0 .. 5.5 V", "--units"),
         ({"current": TABLE["current"] * 1e-3}, "state the unit of the current", "--units"),
-        ({"current (A)": TABLE["current"] * 1e-3, "current": None}, "below some 20 mAh", "unit"),
+        ({"current (A)": TABLE["current"] * 1e-3, "current": None, "voltage": 4.1}, "a cell rests: no discharge", "unit"),
     ],
 )
 def test_advice_is_given_only_if_it_helps_and_does_not_contradict_what_is_known(changes, said, unsaid):
@@ -456,6 +459,14 @@ def test_advice_is_given_only_if_it_helps_and_does_not_contradict_what_is_known(
     with pytest.raises(ValueError) as caught:
         read_discharges(table)
     assert said in str(caught.value) and not (unsaid and unsaid in str(caught.value)), str(caught.value)
+
+
+@pytest.mark.parametrize("share", [1e-1, 1e-2, 3e-3, 1e-3, 1e-4])
+def test_the_charge_of_a_cell_of_any_size_is_known_and_where_it_is_small_its_constants_are_not(share):
+    (found,) = calibrate(TABLE.assign(current=share * TABLE["current"]).rename(columns={"current": "current (A)"}))
+    assert found.drawn_Ah == pytest.approx(share * RECORD.loaded_part(2.7).charge_C / 3600.0, rel=0.01)
+    assert found.capacity_Ah == pytest.approx(found.drawn_Ah) and not found.settled
+    assert share > 0.05 or found.reason.startswith("No cell of this kind has such a q_max")
 
 
 def test_a_sign_that_was_stated_is_not_advised_again():

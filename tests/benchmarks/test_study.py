@@ -48,6 +48,19 @@ def test_parts_are_made_once_and_come_back_in_order_to_the_bit(tmp_path):
     pd.testing.assert_frame_equal(first["example"].iloc[:3], part(3, 1.0)["example"], check_exact=True)
 
 
+@pytest.mark.parametrize("content", [b"", b"{", b"[]", b"{}", b'{"tables": 3}', b"\xff", b"[" * 100_000])
+def test_a_damaged_part_is_named_set_aside_and_made_again(content, tmp_path, capsys):
+    parts = [{"seed": seed, "scale": 1.0} for seed in (0, 1)]
+    first = a_study(tmp_path).run(part, parts)
+    file, _ = sorted((tmp_path / "parts").iterdir())
+    file.write_bytes(content)
+    again = a_study(tmp_path).run(part, parts)
+    assert len(MADE) == 3 and f"{file} is damaged" in capsys.readouterr().err
+    pd.testing.assert_frame_equal(first["example"], again["example"], check_exact=True)
+    (aside,) = (tmp_path / "parts").glob("*.damaged")
+    assert aside.read_bytes() == content
+
+
 def test_other_arguments_another_version_or_another_module_are_other_parts(tmp_path, monkeypatch):
     a_study(tmp_path).run(part, [{"seed": 0, "scale": 1.0}])
     a_study(tmp_path).run(part, [{"seed": 0, "scale": 2.0}])

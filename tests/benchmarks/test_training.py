@@ -44,26 +44,31 @@ def trainings(tmp_path, monkeypatch):
     return seeds
 
 
+def train(timesteps, folder, algo="lac", seed=0, compile_update=False, **differing):
+    recipe = training.Recipe.of(algo, ENV_ID, seed, timesteps, **differing)
+    return training.train_or_load(recipe, folder, compile_update=compile_update)
+
+
 def parameters(model):
     return np.concatenate([values.detach().numpy().ravel() for values in model.policy.parameters()])
 
 
 def test_a_policy_is_trained_once(tmp_path, trainings):
-    first = training.train_or_load("lac", ENV_ID, 0, 40, tmp_path / "run")
+    first = train(40, tmp_path / "run")
     assert isinstance(first, LAC) and first.num_timesteps == 40 and trainings == [0]
     assert [path.name for path in (tmp_path / "run").glob("*.csv")] == ["progress.csv"]
     assert len(list((tmp_path / "run").glob("model_*.zip"))) == 1
-    again = training.train_or_load("lac", ENV_ID, 0, 40, tmp_path / "run")
+    again = train(40, tmp_path / "run")
     assert trainings == [0]
     np.testing.assert_array_equal(parameters(again), parameters(first))
     # another length is another policy
-    assert training.train_or_load("lac", ENV_ID, 0, 25, tmp_path / "run").num_timesteps == 25
+    assert train(25, tmp_path / "run").num_timesteps == 25
     assert trainings == [0, 0]
 
 
 def test_a_policy_that_would_lose_its_normalization_is_refused(tmp_path):
     with pytest.raises(ValueError, match="policies with `normalize` cannot be scored here"):
-        training.train_or_load("lac", "LinearCost-v0", 0, 2000, tmp_path / "models", {"normalize": True})
+        train(2000, tmp_path / "models", hyperparameters={"normalize": True})
     assert not (tmp_path / "models").exists()
 
 
@@ -71,15 +76,15 @@ def test_the_seed_decides_everything(tmp_path):
     models = []
     for number, seed in enumerate((3, 3, 4)):
         th.rand(number)
-        models.append(training.train_or_load("lac", ENV_ID, seed, 30, tmp_path / f"run{number}"))
+        models.append(train(30, tmp_path / f"run{number}", seed=seed))
     np.testing.assert_array_equal(parameters(models[0]), parameters(models[1]))
     assert (parameters(models[0]) != parameters(models[2])).any()
 
 
 def test_hyperparameters_are_those_of_zoo_configs_where_none_are_given(tmp_path):
-    default = training.train_or_load("lac", ENV_ID, 0, 25, tmp_path / "default")
+    default = train(25, tmp_path / "default")
     assert (default.alpha3, default.batch_size, default.policy_kwargs["net_arch"]) == (0.7, 8, [8])
-    other = training.train_or_load("lac", ENV_ID, 0, 25, tmp_path / "other", {"alpha3": 0.2, "lambda_max": 5.0})
+    other = train(25, tmp_path / "other", hyperparameters={"alpha3": 0.2, "lambda_max": 5.0})
     assert (other.alpha3, other.lambda_max) == (0.2, 5.0)
     assert (other.batch_size, other.policy_kwargs["net_arch"]) == (8, [8])
 
@@ -132,7 +137,7 @@ def test_training_follows_the_recipe_even_if_the_file_has_changed_since(tmp_path
 
 
 def test_beside_a_model_stands_what_made_it(tmp_path):
-    training.train_or_load("lac", ENV_ID, 0, 25, tmp_path)
+    train(25, tmp_path)
     recipe = training.Recipe.of("lac", ENV_ID, 0, 25)
     record = json.loads(training.record_file(recipe, tmp_path).read_text())
     assert training.Recipe(**record["recipe"]) == recipe
@@ -141,16 +146,16 @@ def test_beside_a_model_stands_what_made_it(tmp_path):
 
 def test_compilation_is_no_part_of_the_recipe(tmp_path, monkeypatch, trainings):
     monkeypatch.setattr(compiled, "BACKEND", "eager")
-    model = training.train_or_load("lac", ENV_ID, 0, 25, tmp_path, compile_update=True)
+    model = train(25, tmp_path, compile_update=True)
     assert model.compile_update and not training.set_up(training.Recipe.of("lac", ENV_ID, 0, 25), tmp_path)[1].compile_update
     trainings.clear()
-    assert training.train_or_load("lac", ENV_ID, 0, 25, tmp_path).num_timesteps == 25 and not trainings
+    assert train(25, tmp_path).num_timesteps == 25 and not trainings
 
 
 def test_an_algorithm_may_name_whose_settings_it_has(tmp_path):
     recipe = training.Recipe.of("benchmarks.metric_sac:MetricSAC", ENV_ID, 0)
     assert recipe.hyperparameters == training.Recipe.of("lac", ENV_ID, 0).hyperparameters
-    assert training.train_or_load(recipe.algo, ENV_ID, 0, 25, tmp_path).alpha3 == 0.7
+    assert train(25, tmp_path, recipe.algo).alpha3 == 0.7
     # of this package only the file that is named counts
     source = Path(training.__file__).with_name("metric_sac.py")
     assert recipe.packages["benchmarks.metric_sac"] == digest_of({source.name: sha256(source.read_bytes()).hexdigest()})
@@ -163,9 +168,9 @@ def test_an_interrupted_training_leaves_no_model(tmp_path, monkeypatch, training
     with monkeypatch.context() as patch:
         patch.setattr(LAC, "train", interrupt)
         with pytest.raises(KeyboardInterrupt):
-            training.train_or_load("lac", ENV_ID, 0, 40, tmp_path / "run")
+            train(40, tmp_path / "run")
     assert not list((tmp_path / "run").glob("*.zip"))
-    assert training.train_or_load("lac", ENV_ID, 0, 40, tmp_path / "run").num_timesteps == 40 and trainings == [0, 0]
+    assert train(40, tmp_path / "run").num_timesteps == 40 and trainings == [0, 0]
 
 
 @pytest.mark.parametrize("study", ["compare", "compare_defaults"])

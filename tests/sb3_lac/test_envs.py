@@ -415,6 +415,9 @@ def test_bad_arguments_are_named(make, kwargs, message):
     ("call", "message"),
     [
         (lambda env: env.reset(options={"state": [1.0]}), "must hold 2 numbers"),
+        (lambda env: env.reset(options={"start": [1.0, 0.0]}), r"options \['start'\] are unknown"),
+        (lambda env: env.step(np.array([1j])), "must be real numbers"),
+        (lambda env: env.step(["0.5"]), "must be real numbers"),
         (lambda env: env.reset(options={"state": [np.nan, 0.0]}), "must hold 2 numbers"),
         (lambda env: env.reset(options={"state": [2000.0, 0.0]}), "must hold 2 numbers"),
         (lambda env: env.step(np.array([np.nan])), "must be finite numbers"),

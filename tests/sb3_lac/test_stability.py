@@ -134,9 +134,10 @@ def test_exact_lyapunov_function_is_recognized(make_exact_model, monkeypatch, ga
     _, low, high = report.metrics["mean_cost"]
     assert low < 0.8 * values["mean_cost"] < 1.2 * values["mean_cost"] < high
     verdict = "holds on average" if alpha3 <= feasible else "is violated on average"
-    assert f"With alpha3={alpha3:g} the decrease condition {verdict}" in report.summary()
-    assert "no proof" in report.summary()
-    assert report.holds and "With a residual it holds" in report.summary()
+    assert f"With alpha3={alpha3:g} the decrease condition {verdict}" in report.summary(full=True)
+    first, *others = report.summary().splitlines()
+    assert report.holds and first.startswith("HOLDS: the mean cost settles below") and "not proved" in others[0]
+    assert len(others) == 1 and report.summary(full=True).startswith(report.summary())
 
 
 def test_ends_of_episodes(make_exact_model):
@@ -187,7 +188,8 @@ def test_rewards_above_the_bound_cost_nothing(make_model, make_env):
     np.testing.assert_allclose(report.transitions["cost"], np.maximum(3.0 - rewards, 0.0))
     # Without any cost there is no share of it
     report = evaluate_lyapunov(model, make_env(offset=1000.0), 4, seed=1)
-    assert np.isnan(report.metrics["largest_feasible_alpha3"]).all() and "nan" not in report.summary()
+    assert np.isnan(report.metrics["largest_feasible_alpha3"]).all() and "nan" not in report.summary(full=True)
+    assert not report.holds and report.summary().startswith("NOT SHOWN: ")
 
 
 # Statistics
@@ -258,7 +260,7 @@ def test_what_is_not_available_is_said(make_exact_model, gamma):
     report = evaluate_lyapunov(model, ContractionEnv(lengths=(10,)), 1)
     for name, (_, low, high) in report.metrics.items():
         assert name == "death_rate" or np.isnan([low, high]).all(), name
-    summary = report.summary()
+    summary = report.summary(full=True)
     assert report.n_calibrated == 0 and "calibration_slope       not available" in summary and "nan" not in summary
     assert "is undecided: too few episodes" in summary and "What is not available takes what" in summary
     assert report.plot().axes[2].texts[0].get_text() == "no episode is long enough"
@@ -342,7 +344,7 @@ def test_same_seed_gives_the_same_report(make_model, make_env):
         th.rand(1)
         reports.append(evaluate_lyapunov(model, env, 3, deterministic=False, seed=seed))
     pd.testing.assert_frame_equal(reports[0].transitions, reports[1].transitions)
-    assert reports[0].summary() == reports[1].summary() != reports[2].summary()
+    assert reports[0].summary(full=True) == reports[1].summary(full=True) != reports[2].summary(full=True)
     # The mean action is judged unless asked otherwise: the start is the same, but not the trajectory
     deterministic = evaluate_lyapunov(model, env, 3, seed=5)
     actions, _ = model.predict(deterministic.observations, deterministic=True)
@@ -432,7 +434,7 @@ def test_callback_logs_the_metrics(make_model, make_env, tmp_path, capsys):
     path = tmp_path / "run" / "lyapunov.csv.gz"
     callback = LyapunovCallback(make_env(), AfterEval(), n_eval_episodes=3, eval_freq=10, seed=4, log_path=path)
     model.learn(25, callback=callback, log_interval=None)
-    assert capsys.readouterr().out.count("no proof of stability") == 2
+    assert capsys.readouterr().out.count("measured, not proved") == 2
     report = evaluate_lyapunov(model, make_env(), 3, seed=4)
     assert reports[1].transitions.equals(report.transitions)
     feasible = report.metrics["largest_feasible_alpha3"]

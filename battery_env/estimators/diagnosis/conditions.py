@@ -29,14 +29,17 @@ PLAUSIBLE_Q_SHARES = (0.2, 5.0)
 MISMATCH_MARGIN = 2.0
 #: Where the noise is told from the residuals, their variance may exceed its by this share over the root of their number.
 EXCESS_LIMIT_UNSTATED = 10.0
+#: What makes most of a variance is the reason for it.
+MOST_OF_SD = 0.5**0.5
 #: So many samples more than parameters tell how large the noise is.
 SPARE_SAMPLES = 10
 #: A prior contradicts the record beyond so many standard deviations of their difference. Within it, a prior of the settled
 #: width moves no estimate by more than 5 %.
 PRIOR_LIMIT_SD = 2.5
 #: A full cell may rest so far below and above the model's voltage, V. Real ones of the bundled kind rest at 4.17 to 4.23 V,
-#: the model's at 4.19 V, which falls by 11 mV with each percent of the charge: a cell that lacks 4 % or more is noticed.
-FULL_REST_V = (0.04, 0.06)
+#: the model's at 4.19 V, which falls by 11 mV with each percent of the charge: a cell that lacks 4 % or more is noticed. Where
+#: that share makes less, on a flat curve, a cell may rest no farther below.
+BELOW_REST_V, ABOVE_REST_V, _LACKING_SHARE = 0.04, 0.06, 0.04
 
 _AT_BOUND = "{} is at a bound of its search, where the record does not determine it."
 _DIFFERS = "The policy and the fit in its observation differ by {{differs:.1%}} in {}: it does not trust the fit."
@@ -77,6 +80,13 @@ class Condition(IntEnum):
     # a policy that states nothing
     NO_FIT = "A policy whose observation has no fit (option nuisance) states no uncertainty."
     NOT_YET = "The policy states nothing before its next decision."
+    # a start that constants of another cell cannot judge
+    OTHER_KIND = (
+        "The record starts at {first_V:.2f} V, where {expected} at rest shows {rest_V:.2f} V, and the voltage of the model is "
+        "{rmse_mV:.0f} mV off (RMSE), where {mismatch_mV:.0f} mV are stated (mismatch_V): another kind of cell than these "
+        "constants, or another charge at the start. Fit constants to it (fit_cell, --cell), or state initial_soc "
+        "(--initial-soc)."
+    )
     # the start, and samples that a policy cannot read
     START_UNKNOWN = (
         "The record does not start with a minute at rest, whose voltage would tell the charge. Give the rest before the load, "
@@ -88,6 +98,10 @@ class Condition(IntEnum):
     )
     START_ABOVE = (
         "The record starts at {first_V:.2f} V, above the {rest_V:.2f} V of {expected}: another kind of cell or sensor."
+    )
+    START_CHARGED = (
+        "The charge before the load ended at {charge_V:.2f} V, still under {charge_A:.3g} A: the cell rests below that, and "
+        "{expected} at {rest_V:.2f} V. Charge until the current has tapered off, or state initial_soc (--initial-soc)."
     )
     START_BELOW = "The record starts at {first_V:.2f} V, where {expected} at rest shows {rest_V:.2f} V. {start_advice}"
     START_LOADED = (
@@ -118,15 +132,15 @@ class Condition(IntEnum):
     EMPTY = "The model cell is empty before the record ends: its q_max is too small for this record."
     FEW = "These are too few {of} to tell the noise. Record on or more often{or_else}."
     # the fit
+    IMPLAUSIBLE = (
+        "No cell of this kind has such a q_max. Check that time is in s and current in A, and that the record is of one "
+        "cell; for a cell of another size fit constants (fit_cell, --cell)."
+    )
     Q_AT_BOUND = _AT_BOUND.format("q_max")
     R_AT_BOUND = _AT_BOUND.format("R_o")
     CHARGE_DIFFERS = (
         "The charge that moves in the last step, {moved_C:.4g} C, is not that of the current, {drawn_C:.4g} C: check time, "
         "current and their units."
-    )
-    IMPLAUSIBLE = (
-        "No cell of this kind has such a q_max. Check that time is in s and current in A, and that the record is of one "
-        "cell; for a cell of another size fit constants (fit_cell, --cell)."
     )
     MISFIT = (
         "The voltage of the model is farther off than noise and mismatch_V explain: fit constants to this cell (fit_cell, "
@@ -152,6 +166,16 @@ class Condition(IntEnum):
     NO_CURRENT = "No current flows in the last step, so that R_o does not show.", "r_o"
     Q_DIFFERS = _DIFFERS.format("q_max"), "q_mobile"
     R_DIFFERS = _DIFFERS.format("R_o"), "r_o"
+    LOAD_ON_UNSURE = (
+        "The load came on between two samples, nobody knows when: {load_on_C:.0f} C are in doubt. Give samples around the "
+        "moment.",
+        "q_mobile",
+    )
+    REST_CURRENT = (
+        "{offset_A:.3g} A flow at rest, an offset of the sensor or a load that nobody meant: {offset_C:.0f} C are in doubt. "
+        "Subtract it from the current if it is an offset.",
+        "q_mobile",
+    )
     GAP_UNSURE = (
         "No sample lies between {gap_start_s:.0f} s and {gap_end_s:.0f} s, and the voltage does not tell whether the load was "
         "on: {gap_C:.0f} C are in doubt.",
@@ -181,6 +205,8 @@ class Condition(IntEnum):
 
 
 _ROWS = tuple(Condition)
+#: Those of a first voltage that is not that of the cell expected.
+STARTS = {Condition.START_ABOVE, Condition.START_CHARGED, Condition.START_BELOW, Condition.START_LOADED}
 
 
 class Verdict(NamedTuple):
@@ -252,6 +278,14 @@ def start_measured(first_V: float, rest_V: float, initial_soc: float = 1.0) -> d
 def rest_voltage_V(cell: CellParameters, soc: float = 1.0) -> float:
     """The voltage of a cell at rest."""
     return float(voltage(initial_state(cell=cell, soc=soc), cell=cell))
+
+
+def low_rest_voltage_V(cell: CellParameters, soc: float = 1.0) -> float:
+    """The voltage below which a cell at rest lacks charge."""
+    expected_V = rest_voltage_V(cell, soc)
+    fall_V = expected_V - rest_voltage_V(cell, 1.0 - _LACKING_SHARE)
+    # another charge was stated by whoever knows it, and constants of one load need not have a curve that rises
+    return expected_V - (min(BELOW_REST_V, fall_V) if soc == 1.0 and fall_V > 0.0 else BELOW_REST_V)
 
 
 def is_plausible(q_mobile: ArrayLike, cell: CellParameters) -> BoolArray:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import hypot
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from battery_env.arrays import FloatArray, IntArray
+from battery_env.compiled import compiled
 from battery_env.estimators.diagnosis.conditions import Condition, Diagnosis
 from battery_env.records import REST_CURRENT_A, SWITCH_SHARE
 
@@ -30,6 +31,8 @@ _MOST_DRIFT = 0.3
 MOST_SHARE, MOST_SHARE_SO_FAR = 0.5, 0.7
 # With so many standard deviations to spare it is a verdict.
 _SURE_SD = 1.5
+# Voltages are rounded, and no model is better than this, V: over a flat curve a short gap says nothing.
+_RESOLUTION_V = 1e-3
 
 
 class Gap(NamedTuple):
@@ -48,7 +51,7 @@ class Gap(NamedTuple):
     verdict: int
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def doubtful_charge_C(before_s: float, duration_s: float, after_s: float, load_A: float, q_mobile: float) -> float:
     """Return the charge of an interval between two samples that is in doubt; 0 if the interval is no gap."""
     usual_s = max(before_s, after_s)
@@ -57,7 +60,7 @@ def doubtful_charge_C(before_s: float, duration_s: float, after_s: float, load_A
     return charge_C if is_gap else 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def verdict(missing_V: float, fall_V: float, sd_V: float, most_share: float) -> int:
     """
     Say whether the charge of a gap was drawn. The model falls across the gap by the charge that its current draws. A cell that
@@ -67,7 +70,7 @@ def verdict(missing_V: float, fall_V: float, sd_V: float, most_share: float) -> 
         return UNSURE
     if missing_V + _SURE_SD * sd_V < most_share * fall_V:
         return DRAWN
-    if missing_V - _SURE_SD * sd_V > most_share * fall_V:
+    if missing_V - _SURE_SD * hypot(sd_V, _RESOLUTION_V) > most_share * fall_V:
         return NOT_DRAWN
     return UNSURE
 
@@ -101,7 +104,10 @@ def find_gaps(
         if np.ptp(current_A[first:last]) > SWITCH_SHARE * load_A:
             said = UNSURE  # the load was switched, nobody knows when
         gaps.append(Gap(float(time_s[n]), float(time_s[n + 1]), float(charge_C), said))
-    return gaps
+    # where some were drawn, others as long are the habit of the logger, too
+    drawn_s = sorted(gap.end_s - gap.start_s for gap in gaps if gap.verdict == DRAWN)
+    habit_s = GAP_RATIO * drawn_s[-HABIT] if len(drawn_s) >= HABIT else 0.0
+    return [gap for gap in gaps if gap.verdict != UNSURE or gap.end_s - gap.start_s > habit_s]
 
 
 def note_gaps(diagnosis: Diagnosis, gaps: Sequence[Gap], doubt_counts: bool = True) -> None:

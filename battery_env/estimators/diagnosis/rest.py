@@ -14,8 +14,8 @@ from battery_env.records import REST_CURRENT_A, Record, Stream
 #: What a state of charge can be given as: a number, or (mean, standard deviation).
 InitialSoc = float | tuple[float, float]
 
-# The charge of a cell is told from its voltage after so long a rest, s.
-_LEAST_REST_S = 60.0
+#: The charge of a cell is told from its voltage after so long a rest, s.
+LEAST_REST_S = 60.0
 # Two running means of the resting voltage, over 20 s and 60 s. It is expected to move on by ten times their difference.
 _MEMORIES_S, _STILL_TO_COME = (20.0, 60.0), 10.0
 # States of charge to choose from, where it is told from a voltage, and how far to each side the slope of the voltage is taken.
@@ -95,7 +95,7 @@ def soc_from_rest(
     sensor_sd_V = model_sd_V if voltage_noise_V is None else voltage_noise_V
     sd_V = np.hypot(np.hypot(sensor_sd_V, model_sd_V), _STILL_TO_COME * (fast_V - slow_V))
     rest_s = float(stream.time_s[count - 1] - stream.time_s[0])
-    return Start(soc, float(sd_V / slope_V), count, "" if rest_s >= _LEAST_REST_S else Condition.START_UNKNOWN.text)
+    return Start(soc, float(sd_V / slope_V), count, "" if rest_s >= LEAST_REST_S else Condition.START_UNKNOWN.text)
 
 
 def _running_mean_V(stream: Stream, count: int, memory_s: float) -> float:

@@ -5,18 +5,26 @@ its current. A stream is watched sample by sample, and a whole record in the sam
 
 from __future__ import annotations
 
-from math import expm1, inf, isnan, nan, sqrt
+from math import expm1, hypot, inf, isnan, nan, sqrt
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from battery_env.arrays import FloatArray
+from battery_env.compiled import compiled
 from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.estimators.diagnosis import gaps
-from battery_env.estimators.diagnosis.conditions import FULL_REST_V, Condition, Diagnosis, rest_voltage_V, start_measured
-from battery_env.records import REST_CURRENT_A, SWITCH_SHARE, Samples
+from battery_env.estimators.diagnosis.conditions import (
+    ABOVE_REST_V,
+    Condition,
+    Diagnosis,
+    low_rest_voltage_V,
+    rest_voltage_V,
+    start_measured,
+)
+from battery_env.estimators.diagnosis.rest import LEAST_REST_S
+from battery_env.records import REST_CURRENT_A, SWITCH_SHARE, ChargeBefore, Samples, Shown
 
 #: A row of a table, whose columns numba knows and type checkers do not.
 Row = Any
@@ -48,8 +56,6 @@ _PARTED_MEMORY, _RATE_MEMORY_S, _PARTED_SAMPLES = 8.0, 100.0, 3
 # Standard deviation of the difference of both, as a share of the noise.
 _PARTED_NOISE_SHARE = 0.72
 
-_compiled = njit(cache=True, error_model="numpy")
-
 
 def table(columns: str | list[tuple[Any, ...]]) -> np.dtype[np.void]:
     """The type of a row: numbers by their names, or names with types."""
@@ -57,7 +63,13 @@ def table(columns: str | list[tuple[Any, ...]]) -> np.dtype[np.void]:
 
 
 # The start: the first sample, and within the start window the largest current and the least voltage.
-_START = table([("at_rest", "b1"), *((name, "f8") for name in ("first_V", "first_A", "most_A", "least_V"))])
+_START = table([("at_rest", "b1"), ("charge", "i8"), *((name, "f8") for name in ("first_V", "first_A", "most_A", "least_V"))])
+
+# The current before the load, in the mean: since when it is over, the interval in which the load came on and the one before,
+# and the standard deviation of the charge by that.
+_REST = table(
+    [("samples", "i8"), ("is_over", "b1"), *((f, "f8") for f in ("mean_A", "over_s", "on_s", "before_s", "load_on_C"))]
+)
 
 # The two voltages before the one at hand, and time and current of the last of them: the middle one of three is examined.
 _BEFORE = table("voltage_2_V voltage_1_V time_1_s current_1_A")
@@ -104,7 +116,11 @@ SEEN = table(
         ("current_A", "f8"),  # since the last sample
         ("drawn_C", "f8"),
         ("start_V", "f8"),  # of a cell at rest with the charge expected at the start; NaN: none is
+        ("low_V", "f8"),  # of one that lacks charge
+        ("share_V", "f8"),  # at rest at least, when the share was drawn from which it does not come back; 0: not yet
         ("start", _START),
+        ("interval_s", "f8"),  # the last one
+        ("rest", _REST),
         ("before", _BEFORE),
         ("examined", _EXAMINED),
         ("switch", _SWITCH),
@@ -119,12 +135,12 @@ SEEN = table(
 
 
 def watched(
-    record: Samples, cell: CellParameters, initial_soc: float | None, q_mobile: float, r_o: float, rested: bool = False
+    record: Samples, cell: CellParameters, initial_soc: float | None, q_mobile: float, r_o: float, shown: Shown
 ) -> Any:
     """What the samples of a whole record show, beside an estimate. ``initial_soc`` is ``None`` where no rest is expected."""
     seen = np.zeros(1, SEEN)
-    seen["start_V"] = nan if initial_soc is None else rest_voltage_V(cell, initial_soc)
-    seen["start"]["at_rest"] = rested
+    expect(seen, cell, initial_soc)
+    take_in(seen, shown)
     time_s, voltage_V, current_A = (np.ascontiguousarray(column) for column in record)
     _watch_all(seen, time_s, voltage_V, current_A, q_mobile, r_o, cell.q_mobile)
     return seen[0]
@@ -137,21 +153,46 @@ def note_samples(
     initial_soc: float | None,
     q_mobile: float,
     r_o: float,
-    rested: bool,
+    shown: Shown,
 ) -> None:
     """Note what the start of a record and its sensors say against an estimate, as :func:`watched`."""
-    seen = watched(record, cell, initial_soc, q_mobile, r_o, rested)
-    said = measured(seen, initial_soc or 1.0, float(record.time_s[0]))
+    seen = watched(record, cell, initial_soc, q_mobile, r_o, shown)
+    said = measured(seen, initial_soc or 1.0, float(record.time_s[0]), shown.charge)
     for number in (start_condition(seen), fault_condition(seen)):
         if number:
             diagnosis.note(Condition.numbered(number), **said)
 
 
-def measured(seen: Any, initial_soc: float, clock_s: float = 0.0) -> dict[str, Any]:
+def expect(seen: Any, cell: CellParameters, initial_soc: float | None) -> None:
+    """Expect a cell at rest with some charge, before the first sample; ``None``: none."""
+    seen["start_V"] = seen["low_V"] = nan
+    if initial_soc is not None:
+        seen["start_V"], seen["low_V"] = rest_voltage_V(cell, initial_soc), low_rest_voltage_V(cell, initial_soc)
+
+
+def take_in(seen: Any, shown: Shown) -> None:
+    """Take in what is known beside the samples, before the first of them."""
+    start, rest, charge, full_V = seen["start"], seen["rest"], shown.charge, seen["start_V"]
+    start["at_rest"] = shown.at_rest
+    if charge is not None:
+        # without a rest a charge that did not taper off tells nothing but that the cell is lower
+        is_low = (charge.highest_V < seen["low_V"]) | (not charge.tapered and shown.rest_s < LEAST_REST_S)
+        start["charge"] = np.where(np.isnan(full_V), 0, np.where(is_low, -1, int(charge.tapered)))
+    if shown.load_on_C or shown.offset_A:
+        rest["is_over"], rest["mean_A"], rest["load_on_C"] = True, shown.offset_A, shown.load_on_C
+
+
+def measured(seen: Any, initial_soc: float, clock_s: float = 0.0, charge: ChargeBefore | None = None) -> dict[str, Any]:
     """What texts say of samples, by the names in their braces, on a clock of its own."""
+    charge, rest = charge or ChargeBefore(nan, nan, nan), seen["rest"]
     fault, switch, gap = seen["fault"], seen["switch"], seen["gap"]
     end_s = clock_s + gap["end_s"]
     return start_measured(float(seen["start"]["first_V"]), float(seen["start_V"]), initial_soc) | {
+        "charge_V": charge.highest_V,
+        "charge_A": charge.last_A,
+        "load_on_C": rest["load_on_C"],
+        "offset_A": rest["mean_A"],
+        "offset_C": abs(rest["mean_A"]) * (seen["time_s"] - rest["over_s"]),
         "fault_s": clock_s + (fault["time_s"] if fault["condition"] else switch["time_s"]),
         "since_s": clock_s + fault["since_s"],
         "size": fault["size"] if fault["condition"] else switch["size_A"],
@@ -161,7 +202,7 @@ def measured(seen: Any, initial_soc: float, clock_s: float = 0.0) -> dict[str, A
     }
 
 
-@_compiled
+@compiled
 def _watch_all(
     rows: NDArray[np.void],
     time_s: FloatArray,
@@ -178,15 +219,16 @@ def _watch_all(
         remember(seen, voltage_V[n], current_A[n])
 
 
-@_compiled
+@compiled
 def begin(seen: Row, duration: float) -> None:
     """Count the time since the sample before, and the charge drawn in it."""
     seen.samples += 1
+    seen.interval_s = duration
     seen.time_s += duration
     seen.drawn_C += seen.current_A * duration
 
 
-@_compiled
+@compiled
 def examine(seen: Row, voltage: float, current: float, q_mobile: float, r_o: float, cell_q_mobile: float) -> None:
     """Look whether one more voltage belongs to its current, beside an estimate and the model's cell."""
     if seen.samples > 1 and not isnan(voltage):
@@ -203,17 +245,46 @@ def examine(seen: Row, voltage: float, current: float, q_mobile: float, r_o: flo
     _note_start(seen, voltage, current)
 
 
-@_compiled
+@compiled
 def remember(seen: Row, voltage: float, current: float) -> None:
     """Keep a sample that was examined."""
     before = seen.before
+    _note_rest(seen.rest, seen.time_s, seen.interval_s, current)
     if not isnan(voltage):
         before.voltage_2_V = before.voltage_1_V if seen.samples > 1 else voltage
         before.voltage_1_V, before.time_1_s, before.current_1_A = voltage, seen.time_s, current
     seen.current_A = current
 
 
-@_compiled
+@compiled
+def _note_rest(rest: Row, time_s: float, interval_s: float, current: float) -> None:
+    # what flows before the load, and when that comes on: in an interval of its own samples, unless some are missing before it
+    if rest.is_over:
+        if rest.on_s > 0.0 and rest.on_s <= 2.0 * max(rest.before_s, interval_s):
+            rest.load_on_C *= min(interval_s / rest.on_s, 1.0)
+        rest.on_s = 0.0
+    elif rest.samples > 0 and abs(current - rest.mean_A) > SWITCH_SHARE * max(abs(current), abs(rest.mean_A), REST_CURRENT_A):
+        rest.is_over, rest.over_s = True, time_s
+        if abs(rest.mean_A) <= SWITCH_SHARE * abs(current):
+            rest.on_s, rest.load_on_C = interval_s, interval_s * abs(current - rest.mean_A) / sqrt(3.0)
+        else:
+            rest.mean_A = 0.0  # it was a load
+    else:
+        rest.samples += 1
+        rest.mean_A += (current - rest.mean_A) / rest.samples
+        rest.before_s = interval_s
+
+
+@compiled
+def unseen_C(seen: Row) -> float:
+    """The standard deviation of the charge by the moment of load-on, and by what flows at rest."""
+    rest = seen.rest
+    if not rest.is_over:
+        return 0.0
+    return hypot(rest.load_on_C, rest.mean_A * (seen.time_s - rest.over_s))
+
+
+@compiled
 def _least_resistance_ohm(start: Row, q_mobile: float, r_o: float) -> float:
     # of those that a cell can show: of other cells, of larger ones, and of this one, by its estimate, which a fault may have
     # spoiled, or by its fall at the start
@@ -221,7 +292,7 @@ def _least_resistance_ohm(start: Row, q_mobile: float, r_o: float) -> float:
     return max(min(_LEAST_RESISTANCE_OHM, _LEAST_RESISTANCE_OHM * _NEW_Q_C / q_mobile, own_ohm), 0.0)
 
 
-@_compiled
+@compiled
 def _note_start(seen: Row, voltage: float, current: float) -> None:
     start = seen.start
     if seen.samples == 1:
@@ -234,39 +305,41 @@ def _note_start(seen: Row, voltage: float, current: float) -> None:
             start.least_V = min(start.least_V, voltage)
 
 
-@_compiled
+@compiled
 def start_condition(seen: Row) -> int:
     """
     Say why a cell need not have started with the charge expected; 0 if its first voltage shows that it did. Under load that
     is lower than at rest by a drop that nobody knows: a cell with a larger one cannot be told from one that lacks some charge.
     """
-    start, (below_V, above_V) = seen.start, FULL_REST_V
-    if start.first_V > seen.start_V + above_V:
+    start = seen.start
+    if start.first_V > seen.start_V + ABOVE_REST_V:
         return Condition.START_ABOVE + 0
-    if not start.first_V < seen.start_V - below_V:
+    if start.charge < 0:
+        return Condition.START_CHARGED + 0
+    if start.charge > 0 or not start.first_V < seen.low_V:
         return 0
     return Condition.START_BELOW + 0 if start.first_A <= SWITCH_SHARE * start.most_A else Condition.START_LOADED + 0
 
 
-@_compiled
+@compiled
 def fault_condition(seen: Row) -> int:
     """Say what the samples show that no cell does, the first one found; 0 if nothing."""
     return Condition.NOT_FOLLOWED + 0 if seen.pending else seen.fault.condition
 
 
-@_compiled
+@compiled
 def _lagging_current_A(before_A: float, current_A: float, duration_s: float) -> float:
     # what the ohmic drop stands for after a while; it follows slowly
     return before_A + (before_A - current_A) * expm1(-duration_s / _FOLLOWS_S)
 
 
-@_compiled
+@compiled
 def _change_to_follow_A(switched_A: float, current_A: float, lagging_A: float) -> float:
     # how much of a current step the ohmic drop must follow: little after a pulse too short for it to build up
     return max(min(current_A - lagging_A, max(switched_A, 0.0)), min(switched_A, 0.0))
 
 
-@_compiled
+@compiled
 def _noise_V(seen: Row) -> float:
     # what is more than noise; infinite as long as there are too few samples to tell
     n = min(seen.ring.n_changes, _KEPT)
@@ -276,7 +349,7 @@ def _noise_V(seen: Row) -> float:
     return _NOISES * _SMOOTHED_SHARE * float(np.median(np.abs(change_V - np.median(change_V)))) / (0.6745 * sqrt(2.0))
 
 
-@_compiled
+@compiled
 def _find(seen: Row, condition: int, time_s: float, size: float) -> None:
     # the first one is kept
     fault = seen.fault
@@ -284,7 +357,7 @@ def _find(seen: Row, condition: int, time_s: float, size: float) -> None:
         fault.condition, fault.time_s, fault.size = condition, time_s, size
 
 
-@_compiled
+@compiled
 def _is_followed(seen: Row, time_s: float, lowest_V: float, highest_V: float, resistance_ohm: float) -> bool:
     # whether the voltage follows the last switch of the load by half of the least ohmic drop that it can have by then
     switch = seen.switch
@@ -293,7 +366,7 @@ def _is_followed(seen: Row, time_s: float, lowest_V: float, highest_V: float, re
     return abs(drop_V) <= _noise_V(seen) or followed_V / drop_V >= 1.0
 
 
-@_compiled
+@compiled
 def _conclude_switch(seen: Row, time_s: float, resistance_ohm: float) -> None:
     switch = seen.switch
     if not _is_followed(seen, time_s, switch.lowest_V, switch.highest_V, resistance_ohm):
@@ -301,7 +374,7 @@ def _conclude_switch(seen: Row, time_s: float, resistance_ohm: float) -> None:
     switch.size_A = 0.0
 
 
-@_compiled
+@compiled
 def _note_switch(seen: Row, time_s: float, current: float, resistance_ohm: float) -> None:
     # whether the load jumped, or was switched, since the last sample that was examined
     switch, last = seen.switch, seen.examined
@@ -326,7 +399,7 @@ def _note_switch(seen: Row, time_s: float, current: float, resistance_ohm: float
     last.lagging_A = _lagging_current_A(last.lagging_A, last.current_A, time_s - last.time_s)
 
 
-@_compiled
+@compiled
 def _look_for_rise(seen: Row, time_s: float, voltage: float, current: float) -> None:
     # since the voltage a little more than the window ago, under a current that has been steady since long before
     ring = seen.ring
@@ -345,7 +418,7 @@ def _look_for_rise(seen: Row, time_s: float, voltage: float, current: float) -> 
         ring.n_kept += 1
 
 
-@_compiled
+@compiled
 def _examine_last(seen: Row, voltage: float, resistance_ohm: float, most_q: float) -> None:
     # The sample before the one at hand, with the middle voltage of three, which is no single wild one
     last, switch, before = seen.examined, seen.switch, seen.before
@@ -359,20 +432,24 @@ def _examine_last(seen: Row, voltage: float, resistance_ohm: float, most_q: floa
     _look_for_rise(seen, time_s, voltage, current)
     # under a steady load the voltage at rest is higher by the ohmic drop at least; a charge that is seen raises it
     drop_V = resistance_ohm * max(current, 0.0) if time_s - switch.time_s > _START_WINDOW_S else 0.0
-    is_high = voltage + drop_V > seen.start_V - FULL_REST_V[0] and min(current, last.lagging_A) >= -REST_CURRENT_A
-    if is_high and seen.drawn_C > _RECOVERY_SHARE * most_q:
-        _find(seen, Condition.RECOVERED, time_s, seen.drawn_C)
+    if seen.drawn_C > _RECOVERY_SHARE * most_q:
+        if seen.share_V == 0.0:
+            seen.share_V = voltage + drop_V
+        # on a flat curve, or with a smaller drop than that, it never was much lower
+        is_high = voltage + drop_V > max(seen.low_V, seen.share_V + _RISE_V)
+        if is_high and min(current, last.lagging_A) >= -REST_CURRENT_A:
+            _find(seen, Condition.RECOVERED, time_s, seen.drawn_C)
     last.count += 1
     last.earlier_V = voltage if last.count == 1 else last.voltage_V
     last.time_s, last.voltage_V, last.current_A = time_s, voltage, current
 
 
-@_compiled
+@compiled
 def _middle(a: float, b: float, c: float) -> float:
     return max(min(a, b), min(max(a, b), c))
 
 
-@_compiled
+@compiled
 def _note_interval(seen: Row, interval_s: float, load_A: float) -> None:
     # one that was no gap, or whose charge was drawn
     longest_s = seen.usual.longest_s
@@ -381,7 +458,7 @@ def _note_interval(seen: Row, interval_s: float, load_A: float) -> None:
         longest_s.sort()
 
 
-@_compiled
+@compiled
 def _open_gap(
     seen: Row, voltage: float, current: float, duration: float, expected_V: float, charge_C: float, load_A: float
 ) -> None:
@@ -400,7 +477,7 @@ def _open_gap(
         gap.fall_V = 0.0  # which leaves it in doubt
 
 
-@_compiled
+@compiled
 def _close_gap(seen: Row, voltage: float, load_A: float) -> None:
     gap = seen.gap
     after_V = _middle(gap.after_V, gap.next_V, voltage)
@@ -416,7 +493,7 @@ def _close_gap(seen: Row, voltage: float, load_A: float) -> None:
     gap.samples = 0.0
 
 
-@_compiled
+@compiled
 def follow_gaps(seen: Row, voltage: float, current: float, duration: float, expected_V: float, q_mobile: float) -> None:
     """
     Look whether the charge of gaps was drawn, at one sample that is not the first, of which the model expected a voltage. A

@@ -5,10 +5,10 @@ from __future__ import annotations
 from math import exp, hypot, inf, isnan, log, nan, sqrt
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from battery_env.arrays import FloatArray
+from battery_env.compiled import compiled, inlined
 from battery_env.electrochemistry import (
     QNB,
     QNS,
@@ -32,12 +32,13 @@ from battery_env.electrochemistry.tangents import (
 )
 from battery_env.estimators.diagnosis.conditions import (
     MISMATCH_MARGIN,
+    MOST_OF_SD,
     PLAUSIBLE_Q_SHARES,
     PRIOR_LIMIT_SD,
     SETTLED_SHARES,
     Condition,
 )
-from battery_env.estimators.diagnosis.samples import Row, fault_condition, start_condition
+from battery_env.estimators.diagnosis.samples import Row, fault_condition, start_condition, unseen_C
 from battery_env.estimators.kalman.state import FILTER, OFFSET, Q, R, Settings
 from battery_env.parameters import PARAMETER_NAMES
 
@@ -64,9 +65,6 @@ _AGAINST = np.array([[False, False], *([name in row.against for name in PARAMETE
 # The noise that innovations show is averaged over about this many samples.
 _NOISE_MEMORY = 32.0
 
-_compiled = njit(cache=True, error_model="numpy")
-_inlined = njit(cache=True, error_model="numpy", forceinline=True)
-
 
 def filters_of_prior(
     means: tuple[float, float],
@@ -91,7 +89,7 @@ def filters_of_prior(
     return filters
 
 
-@_inlined
+@inlined
 def _move(one: Row, q_change: float, r_change: float) -> None:
     # Another estimate is another past: the state goes along with it, by its tangents. For the charges that is exact.
     state, tangents, mean = one.state, one.tangents, one.mean
@@ -101,7 +99,7 @@ def _move(one: Row, q_change: float, r_change: float) -> None:
     mean[R] += r_change
 
 
-@_inlined
+@inlined
 def _keep_alive(one: Row, settings: Settings, constants: FloatArray) -> bool:
     # Raises q_mobile to what the charge drawn so far takes; tells whether the model cell has a voltage then.
     q, least = one.mean[Q], 0.0
@@ -115,7 +113,7 @@ def _keep_alive(one: Row, settings: Settings, constants: FloatArray) -> bool:
     return True
 
 
-@_inlined
+@inlined
 def _predict(one: Row, current: float, duration: float, settings: Settings, constants: FloatArray) -> None:
     q, r_o, p = one.mean[Q], one.mean[R], one.covariance
     steps = int(np.ceil(duration / settings.dt_s - 1e-6))
@@ -126,7 +124,7 @@ def _predict(one: Row, current: float, duration: float, settings: Settings, cons
     p[OFFSET, OFFSET] += settings.offset_growth * duration
 
 
-@_inlined
+@inlined
 def _common_error_sd(one: Row, settings: Settings) -> float:
     # What an error of the model that is common to the discharge leaves open of q_mobile, without its prior, however many
     # samples there are: as much as least squares state. Theirs is the worst error of the stated mean square. Once the knee is
@@ -143,7 +141,7 @@ def _common_error_sd(one: Row, settings: Settings) -> float:
     return spread * sqrt(mismatch_V2 * told.charge_C / beside_r)
 
 
-@_inlined
+@inlined
 def _correct(
     one: Row,
     voltage: float,
@@ -204,7 +202,7 @@ def _correct(
     _move(one, to_q - q, to_r - r_o)
 
 
-@_inlined
+@inlined
 def _heaviest(filters: Row) -> int:
     best = 0
     for m in range(1, len(filters)):
@@ -213,7 +211,7 @@ def _heaviest(filters: Row) -> int:
     return best
 
 
-@_compiled
+@compiled
 def _reduce(filters: Row) -> int:
     # Makes weights relative to the heaviest filter's, gives up light ones and merges equal ones; returns the heaviest.
     best = _heaviest(filters)
@@ -235,7 +233,7 @@ def _reduce(filters: Row) -> int:
     return best
 
 
-@_inlined
+@inlined
 def _mix(bank: Row, filters: Row, best: int, voltage: float) -> None:
     # Moments of the mixture, about the heaviest filter, and what its innovations show
     middle = filters[best].mean
@@ -263,7 +261,7 @@ def _mix(bank: Row, filters: Row, best: int, voltage: float) -> None:
     bank.sd[Q], bank.sd[R] = sqrt(qq / total - q * q), sqrt(rr / total - r * r)
 
 
-@_inlined
+@inlined
 def _doubt(bank: Row, offset_V: float) -> None:
     # An offset beyond the stated one, and an r_o out of the range that was stated before, contradict the filter
     if offset_V**2 > LIMIT_SD**2 * bank.offset_V2:
@@ -275,7 +273,7 @@ def _doubt(bank: Row, offset_V: float) -> None:
             bank.trend_sd = inf
 
 
-@_inlined
+@inlined
 def take(
     cell: Row, filters: Row, sample: Row, settings: Settings, packed: PackedConstants, derivatives: PolynomialDerivatives
 ) -> None:
@@ -306,7 +304,7 @@ def take(
     bank.common_sd_q = _common_error_sd(filters[best], settings)
 
 
-@_compiled
+@compiled
 def _note(estimate: Row, condition: int, holds: bool) -> None:
     # of each number that it speaks against, the row of the table that comes first counts
     for k in range(2):
@@ -314,13 +312,14 @@ def _note(estimate: Row, condition: int, holds: bool) -> None:
             estimate.condition[k] = condition
 
 
-@_compiled
+@compiled
 def conclude(cell: Row, settings: Settings, estimate: Row) -> None:
     """Say what a bank estimates after a sample that was examined, and what speaks against it; unchecked."""
     bank, seen, searched = cell.bank, cell.seen, settings.searched
     # what the error of the model leaves open beside the prior, what shows nowhere in the voltage, and what nobody saw
     common_sd_q = (bank.common_sd_q**-2.0 + 1.0 / settings.variance[Q]) ** -0.5
     doubt_C = seen.doubt_C + (seen.gap.charge_C if seen.gap.samples > 0.0 else 0.0)
+    beside_C = unseen_C(seen)
     own_sd = (max(bank.sd[Q], common_sd_q), max(bank.sd[R], 0.0))
     estimate.q_mobile, estimate.r_o = bank.mean[Q], bank.mean[R]
     estimate.condition[:] = Condition.SETTLED + 0
@@ -338,7 +337,7 @@ def conclude(cell: Row, settings: Settings, estimate: Row) -> None:
             estimate.sd[k] = nan
             continue
         value, (low, high), (mean, prior_sd) = bank.mean[k], settings.bounds[k], settings.carried[k]
-        sd = hypot(hypot(own_sd[k], settings.scale_sd[k] * value), doubt_C if k == Q else 0.0)
+        sd = hypot(hypot(own_sd[k], settings.scale_sd[k] * value), hypot(doubt_C, beside_C) if k == Q else 0.0)
         estimate.sd[k], of_data = sd, sd
         _note(estimate, Condition.Q_AT_BOUND + k, not low + bank.sd[k] < value < high - bank.sd[k])
         if prior_sd > 0.0:
@@ -349,6 +348,8 @@ def conclude(cell: Row, settings: Settings, estimate: Row) -> None:
             of_data = max(of_data, bank.common_sd_q if k == Q else 0.0)
             _note(estimate, Condition.Q_PRIOR_ALONE + k, of_data >= _SHARES[k] * value)
         if not sd < _SHARES[k] * value:
+            _note(estimate, Condition.LOAD_ON_UNSURE, k == Q and seen.rest.load_on_C > MOST_OF_SD * sd)
+            _note(estimate, Condition.REST_CURRENT, k == Q and beside_C > MOST_OF_SD * sd)
             _note(estimate, Condition.GAP_UNSURE, k == Q and doubt_C > 0.0)
             _note(estimate, Condition.Q_SCALE_UNKNOWN + k, settings.scale_sd[k] >= _SHARES[k])
             _note(estimate, Condition.Q_IMPRECISE + k, True)

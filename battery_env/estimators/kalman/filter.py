@@ -8,29 +8,32 @@ from math import inf, isnan, nan
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from battery_env.checks import ZERO_CELSIUS_K, check_gain_sd, check_not_negative, check_numbers
+from battery_env.compiled import compiled
 from battery_env.electrochemistry import STATE_SIZE, CellParameters, PackedConstants, check_cell, check_dt
 from battery_env.electrochemistry.ends import SURPLUS_SHARE
 from battery_env.electrochemistry.tangents import PolynomialDerivatives
 from battery_env.estimates import Estimate, Estimates, EstimateTrace
-from battery_env.estimators.diagnosis.conditions import Condition, Verdict, rest_voltage_V
+from battery_env.estimators.diagnosis.conditions import Condition, Verdict
 from battery_env.estimators.diagnosis.rest import check_initial_soc
-from battery_env.estimators.diagnosis.samples import begin, examine, follow_gaps, measured, remember
+from battery_env.estimators.diagnosis.samples import begin, examine, expect, follow_gaps, measured, remember, take_in
 from battery_env.estimators.estimator import ModelNow, OnlineBatch, OnlineEstimator, check_bounds
 from battery_env.estimators.kalman.bank import conclude, filters_of_prior, take
 from battery_env.estimators.kalman.state import CELL, ESTIMATE, FILTER, SAMPLE, Q, R, Settings
+from battery_env.estimators.state_files import check_all, check_like
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, check_parameters
-from battery_env.records import Record, Stream, are_plausible, check_drawn_charge, check_sample, starts_at_rest
+from battery_env.records import Record, Stream, are_plausible, check_drawn_charge, check_sample, shown_beside
 
 _PRIOR_SD_SHARE_Q = 0.25
 _PRIOR_SD_R_OHM = 0.15
 _HOUR_S = 3600.0
 _NOISE_V = 0.005
+# Covariances of a state may be so much larger than their variances allow, as a share.
+_ROUNDED = 1e-6
 # What reasons are made of
-_SHOWN = ("start", "fault", "switch", "gap", "start_V")
+_SHOWN = ("start", "rest", "fault", "switch", "gap", "start_V", "time_s")
 
 
 class ExtendedKalmanFilter(OnlineEstimator):
@@ -190,7 +193,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
         self._cells["ambient_K"] = ambient_K
         cell = self._cell_now()
         self._cells["constants"] = cell.packed.constants
-        self._cells["seen"]["start_V"] = rest_voltage_V(cell, self.initial_soc[0])
+        expect(self._cells["seen"], cell, self.initial_soc[0])
         self._filters[0] = self._start(cell)
 
     def _cell_now(self) -> CellParameters:
@@ -227,34 +230,33 @@ class ExtendedKalmanFilter(OnlineEstimator):
         _follow_all(cells, filters, samples, self._settings, self.cell.packed, self._derivatives, estimates)
         return estimates
 
-    def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:
+    def follow(self, record: Record) -> EstimateTrace:
         """
-        One estimate for every sample of many discharges, in one compiled call each. A temperature that was measured is that of
-        the model, as in a stream.
+        One estimate for every sample of a discharge, in one compiled call. A temperature that was measured is that of the
+        model, as in a stream.
         """
-        traces = []
-        for record in records:
-            stream = Stream.of(record, self.dt_s)
-            self.reset()
-            time_s, voltage_V, current_A, dt_s, temperature_C = stream
-            samples = np.zeros((len(time_s), 1), SAMPLE)
-            samples["voltage_V"][:, 0], samples["current_A"][:, 0], samples["dt_s"][:, 0] = voltage_V, current_A, dt_s
-            samples["temperature_K"][:, 0] = nan if temperature_C is None else temperature_C + ZERO_CELSIUS_K
-            if temperature_C is not None:
-                self._begin(float(samples["temperature_K"][0, 0]))
-            self._cells["seen"]["start"]["at_rest"] = starts_at_rest(record)
-            check_drawn_charge(float(np.cumsum(np.append(0.0, current_A[:-1]) * dt_s).min()), self.least_drawn_C)
-            said = self._follow(self._cells, self._filters, samples)[:, 0]
-            shown = measured(self._cells["seen"][0], self.initial_soc[0], float(time_s[0]))
-            noted = list(zip(map(tuple, said["condition"].tolist()), said["r_o_comes_first"].tolist(), strict=True))
-            texts = {each: _verdict(*each, shown).reason for each in set(noted)}
-            sd_q, sd_r_o = said["sd"].T.copy()
-            settled_q, settled_r_o = (said["condition"] == Condition.SETTLED).T
-            reasons = np.array([texts[each] for each in noted], dtype=object)
-            columns = (said["q_mobile"].copy(), said["r_o"].copy(), sd_q, sd_r_o)
-            traces.append(EstimateTrace(time_s, *columns, settled_q & settled_r_o, reasons, settled_q, settled_r_o))
+        stream = Stream.of(record, self.dt_s)
         self.reset()
-        return traces
+        time_s, voltage_V, current_A, dt_s, temperature_C = stream
+        samples = np.zeros((len(time_s), 1), SAMPLE)
+        samples["voltage_V"][:, 0], samples["current_A"][:, 0], samples["dt_s"][:, 0] = voltage_V, current_A, dt_s
+        samples["temperature_K"][:, 0] = nan if temperature_C is None else temperature_C + ZERO_CELSIUS_K
+        if temperature_C is not None:
+            self._begin(float(samples["temperature_K"][0, 0]))
+        beside = shown_beside(record)
+        if self.initial_soc[0] < 1.0:
+            beside = beside._replace(charge=None)
+        take_in(self._cells["seen"], beside)
+        check_drawn_charge(float(np.cumsum(np.append(0.0, current_A[:-1]) * dt_s).min()), self.least_drawn_C)
+        said = self._follow(self._cells, self._filters, samples)[:, 0]
+        shown = measured(self._cells["seen"][0], self.initial_soc[0], float(time_s[0]), beside.charge)
+        noted = list(zip(map(tuple, said["condition"].tolist()), said["r_o_comes_first"].tolist(), strict=True))
+        texts = {each: _verdict(*each, shown).reason for each in set(noted)}
+        sd_q, sd_r_o = said["sd"].T.copy()
+        settled_q, settled_r_o = (said["condition"] == Condition.SETTLED).T
+        reasons = np.array([texts[each] for each in noted], dtype=object)
+        columns = (said["q_mobile"].copy(), said["r_o"].copy(), sd_q, sd_r_o)
+        return EstimateTrace(time_s, *columns, settled_q & settled_r_o, reasons, settled_q, settled_r_o)
 
     @property
     def least_drawn_C(self) -> float:
@@ -306,6 +308,28 @@ class ExtendedKalmanFilter(OnlineEstimator):
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         return {"cells": self._cells, "filters": self._filters}
+
+    def _check_state(self, arrays: dict[str, NDArray[Any]]) -> None:
+        check_like(arrays, self._arrays())
+        (cell,), seen = arrays["cells"], arrays["cells"]["seen"]
+        filters = arrays["filters"][arrays["filters"]["log_weight"] > -inf]  # the others were given up
+        covariance, (low, high) = filters["covariance"], np.transpose(list(self.bounds.values()))
+        variance = np.diagonal(covariance, axis1=1, axis2=2)
+        most = np.sqrt(np.abs(variance[:, :, None] * variance[:, None, :]))
+        counts = (seen["samples"], seen["examined"]["count"], seen["ring"]["n_kept"], seen["ring"]["n_changes"])
+        check_all(
+            log_weight=np.append(np.isfinite(filters["log_weight"]), len(filters) > 0),
+            state=np.isfinite(filters["state"]),
+            tangents=np.isfinite(filters["tangents"]),
+            mean=np.isfinite(filters["mean"]),
+            estimate=(filters["mean"][:, :2] >= low) & (filters["mean"][:, :2] <= high),
+            variance=variance >= 0.0,
+            covariance=np.abs(covariance) <= (1.0 + _ROUNDED) * most,
+            count=np.array(counts) >= 0,
+            charge=np.isfinite(seen["drawn_C"]) & np.isfinite(seen["current_A"]) & (seen["time_s"] >= 0.0),
+            fault=np.isin(seen["fault"]["condition"], [0, *Condition]),
+            constants=cell["constants"] == self._of_rows(arrays["cells"], arrays["filters"])._cell_now().packed.constants,
+        )
 
     def _restore(self, arrays: dict[str, NDArray[Any]]) -> None:
         self._cells[...], self._filters[...] = arrays["cells"], arrays["filters"]
@@ -383,7 +407,7 @@ def _pair(values: tuple[float, float]) -> tuple[float, float]:
     return float(values[0]), float(values[1])
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def _follow_all(
     cells: NDArray[np.void],
     filters: NDArray[np.void],

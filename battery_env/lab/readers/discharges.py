@@ -20,7 +20,7 @@ from battery_env.arrays import FloatArray
 from battery_env.lab.readers.columns import Column, FileFormat, unit_of
 from battery_env.lab.readers.rows import cells_of
 from battery_env.lab.readers.tables import columns_of, read_columns
-from battery_env.records import SWITCH_SHARE, drawn
+from battery_env.records import LEAST_LOAD_SHARE, SWITCH_SHARE, ChargeBefore, Shown, drawn
 from battery_env.records.discharge import LEAST_SAMPLES, Discharge, read_nasa_mat
 
 Made = TypeVar("Made")
@@ -206,9 +206,10 @@ def _split(rows: pd.DataFrame, meta: dict[str, Any], stated: frozenset[str]) -> 
         raise ValueError("there is no discharge: no charge is drawn. Check the sign of the current")
     least_C = _LEAST_SHARE * max(drawn_C for _, drawn_C in parts)
     stretches = [stretch for stretch, drawn_C in parts if drawn_C >= least_C]
+    charges = [_charge_before(rows, stretch.start) for stretch in stretches]
     return [
-        _recording(rows[stretch], meta | ({"cycle": number} if len(stretches) > 1 else {}), len(stretches) > 1, stated)
-        for number, stretch in enumerate(stretches, start=1)
+        _recording(rows[stretch], charge, meta | ({"cycle": number} if len(stretches) > 1 else {}), len(stretches) > 1, stated)
+        for number, (stretch, charge) in enumerate(zip(stretches, charges, strict=True), start=1)
     ]
 
 
@@ -269,7 +270,19 @@ def _discharges(rows: pd.DataFrame, low: int, high: int) -> list[tuple[slice, fl
     return parts
 
 
-def _recording(rows: pd.DataFrame, meta: dict[str, Any], has_own_clock: bool, stated: frozenset[str]) -> Recording:
+def _charge_before(rows: pd.DataFrame, begin: int) -> ChargeBefore | None:
+    """The charge that ends where a discharge begins, if it is in the table and no mere noise."""
+    current_A = rows["current"].to_numpy()
+    start = int(np.append(-1, np.flatnonzero(current_A[:begin] >= 0.0))[-1]) + 1
+    charging_A = current_A[start:begin]
+    if not (charging_A < -LEAST_LOAD_SHARE * np.abs(current_A).max()).any():
+        return None
+    return ChargeBefore.of(rows["voltage"].to_numpy()[start:begin], charging_A)
+
+
+def _recording(
+    rows: pd.DataFrame, charge: ChargeBefore | None, meta: dict[str, Any], has_own_clock: bool, stated: frozenset[str]
+) -> Recording:
     time_s, current_A = rows["time"].to_numpy(), rows["current"].to_numpy()
     if "cycle" in rows:
         meta["cycle"] = int(rows["cycle"].iloc[int(np.argmax(current_A > SWITCH_SHARE * current_A.max()))])
@@ -284,6 +297,8 @@ def _recording(rows: pd.DataFrame, meta: dict[str, Any], has_own_clock: bool, st
         temperature_C = _filled(time_s, rows["temperature"].to_numpy())
         if temperature_C is not None:
             arrays["temperature_C"] = temperature_C
+    if charge is not None:
+        arrays["shown"] = Shown(charge=charge)
     return Recording(arrays, meta, stated)
 
 

@@ -23,6 +23,8 @@ from battery_env.records.discharge import LEAST_SAMPLES
 # How plain the sign of the current must be: the share of its jumps with which the voltage jumps, less that of the others; or
 # the correlation of the voltage with the charge that has passed.
 _CLEAR = 0.5
+# Below the current at which other cells rest, a voltage that changes by so much is that of a coin cell under load, V.
+_COIN_FALL_V = 0.1
 # What is worth less than this share of the charge is mended; of two columns that differ by less either may be taken.
 _NOTHING_SHARE = 1e-3
 # So few of the rows may be out of time.
@@ -435,7 +437,7 @@ def with_moments_of_switches(rows: pd.DataFrame) -> pd.DataFrame:
     """Where no row tells when a rest ended, the time in the step of the first row under load does."""
     if "step_time" not in rows:
         return rows
-    time_s, rest = rows["time"].to_numpy(), (rows["current"].abs() <= REST_CURRENT_A).to_numpy()
+    time_s, rest = rows["time"].to_numpy(), (rows["current"].abs() <= _rest_A(rows["current"])).to_numpy()
     step_s = np.diff(time_s, prepend=np.nan, append=np.nan)
     first = np.append(False, rest[:-1] & ~rest[1:]) & _changes(rows, "step")
     moment_s = time_s - rows["step_time"].to_numpy()
@@ -454,17 +456,16 @@ def with_moments_of_switches(rows: pd.DataFrame) -> pd.DataFrame:
 
 def with_signed_current(rows: pd.DataFrame, columns: Mapping[str, Column], is_negative: bool | None) -> pd.DataFrame:
     """The current of a discharge is positive."""
-    current_A = rows["current"]
+    current_A, rest_A = rows["current"], _rest_A(rows["current"])
     if not (current_A.abs() > REST_CURRENT_A).any():
         is_known = "current" in columns and columns["current"].unit
-        advice = "" if is_known else ". If the cell is larger, state the unit of the current"
-        raise ValueError(
-            f"no current flows above {REST_CURRENT_A:g} A, below which a cell rests: there is no discharge, or that of a cell "
-            f"below some {1e3 * REST_CURRENT_A:g} mAh, which are not supported{advice}"
-        )
-    if "direction" in rows and (current_A >= -REST_CURRENT_A).all():
+        # under the load of a coin cell the voltage falls
+        if not is_known or not np.ptp(rows["voltage"]) > _COIN_FALL_V:
+            advice = "" if is_known else ", or that of a coin cell: state the unit of the current"
+            raise ValueError(f"no current flows above {REST_CURRENT_A:g} A, below which a cell rests: no discharge{advice}")
+    if "direction" in rows and (current_A >= -rest_A).all():
         return rows.assign(current=current_A.where(rows["direction"] >= 0, -current_A))
-    if (current_A >= -REST_CURRENT_A).all() or (current_A <= REST_CURRENT_A).all():
+    if (current_A >= -rest_A).all() or (current_A <= rest_A).all():
         _refuse_unsigned(rows, columns)
     if is_negative is None:
         effect = _jumps(rows)
@@ -478,6 +479,11 @@ def with_signed_current(rows: pd.DataFrame, columns: Mapping[str, Column], is_ne
             )
         is_negative = effect > 0.0
     return rows.assign(current=-current_A) if is_negative else rows
+
+
+def _rest_A(current_A: pd.Series[float]) -> float:
+    """At most so much flows where a cell rests, A: of a coin cell less."""
+    return min(REST_CURRENT_A, SWITCH_SHARE * float(current_A.abs().max()))
 
 
 def _refuse_unsigned(rows: pd.DataFrame, columns: Mapping[str, Column]) -> None:
@@ -508,7 +514,7 @@ def _jumps(rows: pd.DataFrame) -> float:
     wide_V = voltage_V[np.minimum(n + 2, len(voltage_V) - 1)] - voltage_V[np.maximum(n - 1, 0)]
     jump_V = voltage_V[n + 1] - voltage_V[n]
     jump_V = np.where(np.abs(wide_V) > np.abs(jump_V), wide_V, jump_V)
-    return float(np.sign(jump_A[n] * jump_V) @ np.abs(jump_A[n]) / max(np.abs(jump_A[n]).sum(), REST_CURRENT_A))
+    return float(np.sign(jump_A[n] * jump_V) @ np.abs(jump_A[n]) / np.abs(jump_A[n]).sum()) if len(n) else 0.0
 
 
 def _fall(rows: pd.DataFrame) -> float:

@@ -15,11 +15,12 @@ from codecs import getincrementaldecoder
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import IO, Any, NamedTuple, cast
 
 import numpy as np
 import pandas as pd
 
+from battery_env.files import check_unpacked
 from battery_env.lab.readers.columns import Column, FileFormat, count_required, find_columns, units_below
 
 #: Endings of the names of files that can be read, besides those of NASA (.mat); of text also packed (.gz, .bz2, .xz, .zip).
@@ -43,6 +44,8 @@ _DELIMITER_LINE = re.compile(r"^\s*sep=([,;\t|])\s*$", flags=re.IGNORECASE)
 _QUOTED_LINES = re.compile(rb'^"[^"\n]*"\s*$', flags=re.MULTILINE)
 # So many lines below a table may be no part of it.
 _FOOT_LINES = 50
+# What is packed is read in parts of so many bytes, or rows.
+_CHUNK_BYTES, _BATCH_ROWS = 1 << 20, 1 << 16
 # A table is known by so many of its first rows.
 _FIRST_ROWS = 400
 # How workbooks begin; text is called .xls by some testers.
@@ -67,6 +70,8 @@ def read_columns(path: Path, file_format: FileFormat) -> tuple[pd.DataFrame, dic
     suffix = path.suffix.lower()
     if suffix in _EXPORT:
         raise ValueError(f"{suffix} files cannot be read: {_EXPORT[suffix]}")
+    if suffix in (".ndax", ".xlsx", ".xls"):
+        _check_archive(path)
     if suffix == ".parquet":
         return _read_parquet(path, file_format)
     if suffix in (".nda", ".ndax"):
@@ -107,8 +112,9 @@ def _read_text(source: Path | bytes, file_format: FileFormat) -> tuple[pd.DataFr
 
     def read(rows: int | None = None) -> pd.DataFrame:
         try:
+            packed = isinstance(source, Path) and source.suffix.lower() in PACKED_SUFFIXES
             return pd.read_csv(
-                io.BytesIO(source) if isinstance(source, bytes) else source,
+                io.BytesIO(source) if isinstance(source, bytes) else _open(source) if packed else source,
                 sep=layout.delimiter,
                 decimal=layout.decimal,
                 encoding=layout.encoding,
@@ -172,7 +178,43 @@ def _head(path: Path) -> bytes:
     return head
 
 
+class _Unpacked(io.BufferedIOBase):
+    """What a stream unpacks, refused where it becomes far larger than it was."""
+
+    def __init__(self, stream: IO[bytes], packed_bytes: int) -> None:
+        self._stream, self._packed_bytes, self._count = stream, packed_bytes, 0
+
+    def readable(self) -> bool:
+        return True
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        if size is None or size < 0:
+            return b"".join(iter(lambda: self.read(_CHUNK_BYTES), b""))
+        content = self._stream.read(min(size, _CHUNK_BYTES))
+        self._count += len(content)
+        check_unpacked(self._packed_bytes, self._count)
+        return content
+
+    read1 = read
+
+    def close(self) -> None:
+        self._stream.close()
+        super().close()
+
+
+def _check_archive(path: Path) -> None:
+    """Refuse a file that holds an archive of what is far larger."""
+    if zipfile.is_zipfile(path):
+        with zipfile.ZipFile(path) as archive:
+            check_unpacked(path.stat().st_size, sum(each.file_size for each in archive.infolist()))
+
+
 def _open(path: Path) -> IO[bytes]:
+    stream = _unpacking(path)
+    return stream if path.suffix.lower() not in PACKED_SUFFIXES else cast(IO[bytes], _Unpacked(stream, path.stat().st_size))
+
+
+def _unpacking(path: Path) -> IO[bytes]:
     suffix = path.suffix.lower()
     if suffix == ".zip":
         archive = zipfile.ZipFile(path)
@@ -284,8 +326,22 @@ def _read_parquet(path: Path, file_format: FileFormat) -> tuple[pd.DataFrame, di
         first = [batch.to_pandas() for batch in itertools.islice(file.iter_batches(_FIRST_ROWS), 1)]
         columns = find_columns(file.schema_arrow.names, file_format, _first_rows(first[0]) if first else ())
         # the metadata of pandas would make an index of a column
-        table = file.read(columns=sorted({column.name for column in columns.values()})).to_pandas(ignore_metadata=True)
+        table = _read_batches(file, path.stat().st_size, sorted({column.name for column in columns.values()}))
     return pd.DataFrame({quantity: table[column.name] for quantity, column in columns.items()}), columns
+
+
+def _read_batches(file: Any, packed_bytes: int, names: list[str]) -> pd.DataFrame:
+    from pyarrow import Table
+
+    batches, count = [], 0
+    try:
+        for batch in file.iter_batches(_BATCH_ROWS, columns=names):
+            count += batch.nbytes
+            check_unpacked(packed_bytes, count)
+            batches.append(batch)
+    except OSError as error:  # what pyarrow calls damage
+        raise ValueError(f"the file is damaged: {str(error).strip()}") from error
+    return Table.from_batches(batches, batches[0].schema if batches else file.schema_arrow).to_pandas(ignore_metadata=True)
 
 
 def _read_neware(path: Path) -> pd.DataFrame:

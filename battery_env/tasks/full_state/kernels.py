@@ -11,10 +11,10 @@ from math import sqrt
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from battery_env.arrays import FloatArray
+from battery_env.compiled import compiled, inlined
 from battery_env.electrochemistry.cell import QNB, QNS, STATE_SIZE, VO
 from battery_env.electrochemistry.kernels import (
     BLOCK,
@@ -28,17 +28,14 @@ from battery_env.electrochemistry.kernels import (
 )
 from battery_env.tasks.full_state.layout import Records
 
-_compiled = njit(cache=True, error_model="numpy")
-_inlined = njit(cache=True, error_model="numpy", forceinline=True)
 
-
-@_inlined
+@inlined
 def _clipped(value: float, limit: float) -> float:
     # NaN stays NaN
     return -limit if value < -limit else (limit if value > limit else value)
 
 
-@_inlined
+@inlined
 def _literal_distance(model_state: FloatArray, measured: FloatArray, n: int) -> float:
     voltages, charges = 0.0, 0.0
     for k in range(VO, QNB):
@@ -49,7 +46,7 @@ def _literal_distance(model_state: FloatArray, measured: FloatArray, n: int) -> 
     return 50.0 * distance if distance > 1e-4 else distance
 
 
-@_inlined
+@inlined
 def _cost_of_state(model_state: FloatArray, measured: FloatArray, n: int, task: Any) -> float:
     if task.literal_cost:
         return _clipped(_literal_distance(model_state, measured, n), task.cost_limit)
@@ -62,7 +59,7 @@ def _cost_of_state(model_state: FloatArray, measured: FloatArray, n: int, task: 
     return cost
 
 
-@_inlined
+@inlined
 def _take_action(action: FloatArray, task: Any, cells: Records, n: int) -> float:
     # Set the model's parameters; returns the length of the change of the action
     cell, squared_change, column = cells[n], 0.0, 0
@@ -80,7 +77,7 @@ def _take_action(action: FloatArray, task: Any, cells: Records, n: int) -> float
     return sqrt(squared_change)
 
 
-@_compiled
+@compiled
 def decide(action: FloatArray, settings: Records, cells: Records, cost: FloatArray) -> None:
     # Set the model's parameters, step it, and compare it with the measured state; then go on to the next sample
     task, block = settings[0], np.empty(BLOCK_SIZE)
@@ -105,7 +102,7 @@ def decide(action: FloatArray, settings: Records, cells: Records, cost: FloatArr
                     model_state[n, k] = next_state[n, k]
 
 
-@_compiled
+@compiled
 def look_ahead(settings: Records, load_values: FloatArray, constants: FloatArray, cells: Records) -> None:
     # The load and the cell's next state. At the end of its data a cell stays on its last sample, and is not asked for more
     task, block = settings[0], np.empty(BLOCK_SIZE)
@@ -122,7 +119,7 @@ def look_ahead(settings: Records, load_values: FloatArray, constants: FloatArray
         states_of_block(block, first, size, cells["next_state"])
 
 
-@_compiled
+@compiled
 def model_voltage(settings: Records, cells: Records, out: FloatArray) -> None:
     task, block = settings[0], np.empty(BLOCK_SIZE)
     for first in range(0, len(cells), BLOCK):
@@ -135,7 +132,7 @@ def model_voltage(settings: Records, cells: Records, out: FloatArray) -> None:
             out[first + j] = block[VOLTAGE + j]
 
 
-@_compiled
+@compiled
 def observe(settings: Records, cells: Records, limit: float, out: NDArray[np.float32]) -> None:
     # The observations, into out
     task, block = settings[0], np.empty(BLOCK_SIZE)

@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from battery_env.arrays import FloatArray, IntArray
+from battery_env.compiled import compiled, inlined, reassociating
 from battery_env.electrochemistry.cell import (
     BULK_RATE,
     PER_CURRENT_N,
@@ -63,10 +63,6 @@ _LEAST_NOISE_V = 0.001
 # How often the noise is told anew from what the step leaves of the residuals
 _NOISE_ROUNDS = 3
 
-_compiled = njit(cache=True, error_model="numpy")
-_inlined = njit(cache=True, error_model="numpy", forceinline=True)
-# sums in any order, which vector instructions need
-_reassociating = njit(cache=True, error_model="numpy", fastmath={"reassoc"})
 assert UNCERTAIN_CONSTANTS == ("kn", "tDiffusion", "to", "tsn")
 
 
@@ -156,7 +152,7 @@ class NuisanceFit:
         ]
 
 
-@_compiled
+@compiled
 def _decay(rate: float, factor: float, interval_s: float, dt_s: float) -> tuple[float, float]:
     # what is left after one interval if the time constant is multiplied by a factor, and the derivative by its logarithm
     share = min(dt_s * rate / factor, 0.99)
@@ -165,7 +161,7 @@ def _decay(rate: float, factor: float, interval_s: float, dt_s: float) -> tuple[
     return left, steps * left * share / (1.0 - share)
 
 
-@_compiled
+@compiled
 def _solve(matrix: FloatArray, right: FloatArray, inverse: FloatArray) -> None:
     # Gauss-Jordan without pivots, as the matrix is positive definite; right becomes the solution
     n = len(right)
@@ -187,7 +183,7 @@ def _solve(matrix: FloatArray, right: FloatArray, inverse: FloatArray) -> None:
                 right[m] -= factor * right[j]
 
 
-@_reassociating
+@reassociating
 def _add_products(values: FloatArray, size: int, sums: FloatArray) -> None:
     for j in range(len(values)):
         for m in range(j + 1):
@@ -224,7 +220,7 @@ class _Linear(NamedTuple):
     by_to: float  # of the drop
 
 
-@_inlined
+@inlined
 def _rates(model: Any, logarithms: FloatArray) -> _Rates:
     constants, interval_s, dt_s = model.constants, model.interval_s, model.dt_s
     rate_d = constants[0, BULK_RATE] + constants[0, SURFACE_RATE]
@@ -241,7 +237,7 @@ def _rates(model: Any, logarithms: FloatArray) -> _Rates:
     return _Rates(left_d, slope_d, gain_d, gain_slope_d, left_o, slope_o, left_n, slope_n, left_d0, gain_d0, left_o0)
 
 
-@_inlined
+@inlined
 def _follow_current(block: FloatArray, values: FloatArray, size: int, r_o: float, rates: _Rates, before: _Linear) -> _Linear:
     # From the states of the model's constants, in the block, to those of the fit, and their derivatives
     unequal, unequal_0, ohmic, ohmic_0, by_t_diffusion, by_to = before
@@ -262,7 +258,7 @@ def _follow_current(block: FloatArray, values: FloatArray, size: int, r_o: float
     return _Linear(unequal, unequal_0, ohmic, ohmic_0, by_t_diffusion, by_to)
 
 
-@_inlined
+@inlined
 def _differentiate_vsn(
     block: FloatArray, values: FloatArray, size: int, rates: _Rates, vsn: float, before: tuple[float, float]
 ) -> tuple[float, float]:
@@ -277,7 +273,7 @@ def _differentiate_vsn(
     return by_kn, by_tsn
 
 
-@_inlined
+@inlined
 def _differentiate_nominal(block: FloatArray, values: FloatArray, size: int, q: float, own: FloatArray) -> None:
     # What Vsn tends to, by the logarithm of kn
     scale = 2.0 * own[0, R_OVER_F] * own[0, SURROUNDINGS]
@@ -287,7 +283,7 @@ def _differentiate_nominal(block: FloatArray, values: FloatArray, size: int, q: 
         values[_KN, k] = -scale * argument / np.sqrt(argument * argument + (1.0 - xn) * xn)
 
 
-@_inlined
+@inlined
 def _differentiate_voltage(block: FloatArray, values: FloatArray, size: int, q: float) -> None:
     step_C = q * RELATIVE_STEP
     for k in range(size):
@@ -301,7 +297,7 @@ def _differentiate_voltage(block: FloatArray, values: FloatArray, size: int, q: 
         values[_T_DIFFUSION, k] *= by_moved
 
 
-@_compiled
+@compiled
 def _linearize(
     n: int, end: int, estimate: FloatArray, shown: FloatArray, model: Any, logarithms: FloatArray, sums: FloatArray
 ) -> None:
@@ -328,7 +324,7 @@ def _linearize(
         _add_products(values, size, sums)
 
 
-@_compiled
+@compiled
 def _solve_under_priors(
     sums: FloatArray,
     before: FloatArray,
@@ -364,7 +360,7 @@ def _solve_under_priors(
     found[_NOISE] = np.sqrt(noise2)
 
 
-@_compiled
+@compiled
 def nuisance_step(
     rows: IntArray,
     count: IntArray,

@@ -8,10 +8,10 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from battery_env.arrays import FloatArray, IntArray
+from battery_env.compiled import compiled, inlined
 from battery_env.electrochemistry import (
     FULL_CHARGE_SHARES,
     NEW_CELL,
@@ -60,9 +60,6 @@ MODEL = np.dtype(
         ("dt_s", float),
     ]
 )
-
-_compiled = njit(cache=True, error_model="numpy")
-_inlined = njit(cache=True, error_model="numpy", forceinline=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,14 +260,14 @@ class Overpotentials(NamedTuple):
     further_vsp: float
 
 
-@_inlined
+@inlined
 def take_readings(block: FloatArray, shown: FloatArray, n: int, first: int, size: int) -> None:
     for row in range(SHOWN):
         for k in range(size):
             block[row * BLOCK + k] = shown[row, n, first + k]
 
 
-@_inlined
+@inlined
 def pad_block(block: FloatArray, size: int, moved_before: float) -> int:
     # Repeat the last reading up to the length that is returned, which vector instructions divide without a rest. The
     # overpotentials relax towards their value half way between two readings
@@ -284,13 +281,13 @@ def pad_block(block: FloatArray, size: int, moved_before: float) -> int:
     return padded
 
 
-@_inlined
+@inlined
 def surface_fractions(moved: float, q: float, constants: FloatArray) -> tuple[float, float]:
     xn = mole_fraction(_SURFACE_SHARE_N * q - moved, q, True, constants)
     return xn, mole_fraction(_SURFACE_SHARE_P * q + moved, q, True, constants)
 
 
-@_compiled
+@compiled
 def nominal_overpotentials_of_block(block: FloatArray, size: int, q: float, constants: FloatArray) -> None:
     further_q, temperature_K = q * (1.0 + RELATIVE_STEP), constants[0, SURROUNDINGS]
     for k in range(size):
@@ -303,7 +300,7 @@ def nominal_overpotentials_of_block(block: FloatArray, size: int, q: float, cons
         block[FURTHER_VSN * BLOCK + k], block[FURTHER_VSP * BLOCK + k] = vsn, vsp
 
 
-@_inlined
+@inlined
 def relax_block(block: FloatArray, size: int, relaxed_n: float, relaxed_p: float, before: Overpotentials) -> Overpotentials:
     # From the values that overpotentials tend to to those that they have; returns the last ones
     vsn, vsp, further_vsn, further_vsp = before
@@ -317,7 +314,7 @@ def relax_block(block: FloatArray, size: int, relaxed_n: float, relaxed_p: float
     return Overpotentials(vsn, vsp, further_vsn, further_vsp)
 
 
-@_compiled
+@compiled
 def voltages_of_block(block: FloatArray, size: int, q: float, r_o: float, model: Any) -> None:
     constants, polynomial_n, polynomial_p = model.constants, model.polynomial_n, model.polynomial_p
     further_q, step_C, temperature_K = q * (1.0 + RELATIVE_STEP), q * RELATIVE_STEP, constants[0, SURROUNDINGS]
@@ -334,7 +331,7 @@ def voltages_of_block(block: FloatArray, size: int, q: float, r_o: float, model:
         block[SLOPE * BLOCK + k] = (further - modelled) / step_C
 
 
-@_inlined
+@inlined
 def _mean_of_halves(
     residual: FloatArray, slope: FloatArray, ohmic: FloatArray, low: int, high: int, means: FloatArray
 ) -> None:
@@ -365,7 +362,7 @@ def _mean_of_halves(
     means[2, 0], means[2, 1] = ohmic_0 / count_0, ohmic_1 / count_1
 
 
-@_compiled
+@compiled
 def explain(
     rows: IntArray,
     count: IntArray,

@@ -1,0 +1,424 @@
+"""The constants of your own cell, from a few of its discharges."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from math import hypot
+
+import numpy as np
+
+from battery_env.arrays import FloatArray
+from battery_env.checks import ZERO_CELSIUS_K, check_positive
+from battery_env.electrochemistry import NEW_CELL, CellParameters, check_cell, check_dt
+from battery_env.electrochemistry.equilibrium import equilibrium_slopes, with_equilibrium
+from battery_env.electrochemistry.tangents import BY_Q, BY_R, RATE_CONSTANTS
+from battery_env.estimates import Estimate
+from battery_env.estimators.cell_fit import (
+    RATE_PRIOR_SD,
+    UNFITTED_MISMATCH_V,
+    CellFit,
+    FittedConstant,
+    FittedDischarge,
+    aged_V,
+    groups,
+    unseen_of_life,
+)
+from battery_env.estimators.diagnosis.conditions import ABOVE_REST_V, BELOW_REST_V
+from battery_env.estimators.least_squares import LeastSquares
+from battery_env.estimators.search import MARGIN, OnGrid, distance_C, minimized, square
+from battery_env.parameters import Q_MOBILE, R_O
+from battery_env.records import (
+    CUT_OFF_V,
+    SWITCH_SHARE,
+    Record,
+    check_drawn_charge,
+    check_record,
+    drawn_charge_C,
+    mean_current_A,
+)
+from battery_env.records.discharge import Discharge
+from battery_env.records.model import RecordModel
+
+#: How far the equilibrium voltage may be another one: standard deviations of the coefficients of Legendre polynomials 0, 1,
+#: ... over the mole fractions of the positive electrode that a discharge passes through, V.
+EQUILIBRIUM_PRIOR_SD_V: tuple[float, ...] = (0.3, 0.2, 0.1, 0.1, 0.1, 0.1, 0.05, 0.05)
+#: A fit that is farther from the measured voltages than this (root mean square), V, is refused.
+LIMIT_V = 0.05
+_MOST_DISCHARGES, _FEWEST_SAMPLES = 30, 20
+# Longer records are thinned: what the constants shape is slower.
+_MOST_SAMPLES = 2000
+# A cell that holds less or more than the new one by this factor is one of another size.
+_OTHER_SIZE = 2.0
+# The charge that can move is about this much more than what a discharge delivers.
+_UNDELIVERED = 1.05
+# Rounds of weighing the residuals by how large they turn out, and how large they are taken for in the first one, V.
+_ROUNDS = 3
+_FIRST_MISMATCH_V, _LEAST_MISMATCH_V = 0.02, 1e-3
+# The error of the model drifts slowly: a discharge shows so many independent ones, unless its residuals change sign more
+# often.
+_INDEPENDENT_ERRORS = 50.0
+# The search: how many standard deviations of its prior a constant may move, the logarithm of the distance of q_mobile to its
+# least value, C, and the scale of r_o, ohm.
+_REACH_SD, _LOG_DISTANCE_LIMITS, _R_O_SCALE_OHM = 6.0, (-30.0, 16.0), 0.1
+# Where the search for q_mobile starts beside the fit with the constants known before, and how near that may be to its least
+# value, as shares of it.
+_START_EXCESS, _LEAST_EXCESS = 0.02, 1e-4
+
+
+def fit_cell(
+    discharges: Sequence[Record],
+    cut_off_V: float = CUT_OFF_V,
+    start: CellParameters | None = None,
+    thermal: bool = True,
+    dt_s: float = 1.0,
+    limit_V: float = LIMIT_V,
+) -> CellFit:
+    """
+    Fit the constants of the model to a cell of your own: how fast it follows its load (``kn``, ``kp``, ``tDiffusion``,
+    ``to``, ``tsn``, ``tsp``) and its equilibrium voltage (``U0p``, ``Ap``), to a few of its discharges at once, each with a
+    ``q_mobile`` and ``r_o`` of its own. Three discharges suffice; take them from all ages, and at all loads, that the
+    constants are to hold for. Each must start with a full cell, and reach the cut-off: one in progress is refused.
+
+    *What is minimized* is the sum of squares of the residuals of the voltage and of the distances to the priors: logarithms
+    of the rate constants have ``RATE_PRIOR_SD``, and the change of the equilibrium voltage is a polynomial in the mole
+    fraction of the positive electrode with ``EQUILIBRIUM_PRIOR_SD_V``, which ``U0p`` and ``Ap`` can make exactly. So constants
+    that the discharges do not determine stay near what they were. The voltage at rest of a full cell counts as much as all
+    that follows within a fiftieth of the discharge. The search is scipy's trust region with exact derivatives.
+
+    *How sure it is.* The residuals are the error of the model, and drift slowly: those of a discharge count as 50 independent
+    ones, or as many as they change their sign. Their variance is found along with the constants.
+
+    *The error to expect* of another discharge, ``mismatch_V``, is what discharges show that are left out of the fit: the
+    young, the middle and the old third, one after the other. What none shows, of a life (:data:`LIFE_LOSS` of ``q_mobile``)
+    and of ``q_mobile`` itself, counts in proportion to the error of constants that were not fitted.
+
+    *Other cells.* A cell of another capacity starts with electrodes of another size. Another chemistry works as far as the
+    equations bend; where they do not, the residuals stay large and the fit is refused. A start that is not full is taken for
+    that of another chemistry: a fit whose full cell rests more than 0.04 V below that of ``start`` warns of it (``doubt``). So
+    does a fit of less than half a life, and one that a discharge does not belong to.
+
+    :param discharges: of one cell, each from full charge. Of a :class:`~battery_env.Discharge` the part from load-on to the
+        cut-off is taken; other records are taken whole
+    :param cut_off_V: cut-off voltage, V
+    :param start: what is thought of the constants before; ``None``: the new cell's, at the size of this one
+    :param thermal: whether the temperature of the model moves. It starts at the measured one, if that is known
+    :param dt_s: time step of the model, s
+    :param limit_V: the largest root mean square of the residuals, V
+    :return: the fit
+    :raises TypeError: for what is no sequence of records
+    :raises ValueError: for an argument out of range, records that cannot be used or stay more than 0.05 V above the cut-off,
+        or a cell that the equations cannot describe
+    """
+    records = _records(discharges, cut_off_V)
+    check_positive("limit_V", limit_V)
+    prior = _prior(records, start, thermal, cut_off_V)
+    check_dt(dt_s, prior)
+    # a simulated record is at rest before its first current acts
+    at_rest = [
+        not isinstance(whole, Discharge) or bool(whole.current_A[0] <= SWITCH_SHARE * whole.current_A.max())
+        for whole in discharges
+    ]
+    _check_starts_alike(records, at_rest)
+    fit = JointFit(records, at_rest, prior, thermal, dt_s).solve()
+    if not fit.rmse_V <= limit_V:
+        raise ValueError(
+            f"the equations do not describe this cell: with all constants fitted the voltage is still {1e3 * fit.rmse_V:.0f} "
+            f"mV off (limit_V: {1e3 * limit_V:.0f} mV). Check units, sign and cut_off_V, that all discharges are of one cell "
+            "and start full, and leave out odd ones; or raise limit_V and take the fit for what it is."
+        )
+    if fit.doubt:
+        warnings.warn(fit.doubt, stacklevel=2)
+    return fit
+
+
+def _records(discharges: Sequence[Record], cut_off_V: float) -> list[Record]:
+    if isinstance(discharges, Discharge) or not isinstance(discharges, Sequence):
+        raise TypeError(f"discharges must be a list of discharges, got {type(discharges).__name__}")
+    check_positive("cut_off_V", cut_off_V)
+    if not 1 <= len(discharges) <= _MOST_DISCHARGES:
+        raise ValueError(
+            f"fit_cell takes 1 to {_MOST_DISCHARGES} discharges, got {len(discharges)}. A few of all ages tell as much."
+        )
+    records: list[Record] = []
+    for number, discharge in enumerate(discharges, start=1):
+        try:
+            record = discharge.loaded_part(cut_off_V) if isinstance(discharge, Discharge) else discharge
+            samples = check_record(record, _FEWEST_SAMPLES)
+            check_drawn_charge(drawn_charge_C(samples))
+            _check_ends(float(samples.voltage_V.min()), cut_off_V)
+        except AttributeError as error:
+            raise TypeError(f"discharge {_name(discharge, number)} is no record: {error}") from error
+        except (TypeError, ValueError) as error:
+            raise type(error)(f"discharge {_name(discharge, number)}: {error}") from error
+        records.append(record)
+    return records
+
+
+def _check_ends(lowest_V: float, cut_off_V: float) -> None:
+    """Refuse a discharge in progress: before its knee, a cell that holds less looks like one that follows its load slower."""
+    if lowest_V > cut_off_V + UNFITTED_MISMATCH_V:
+        raise ValueError(
+            f"its lowest voltage is {lowest_V:.4g} V, above the cut-off, {cut_off_V:.4g} V. A discharge in progress does not "
+            "determine the constants: leave it out. If it was discharged no further, state cut_off_V (--cut-off)."
+        )
+
+
+def _check_starts_alike(records: Sequence[Record], at_rest: Sequence[bool]) -> None:
+    """Refuse discharges that cannot all start full: a full cell, of whatever kind, rests at about one voltage."""
+    found = enumerate(zip(records, at_rest, strict=True), start=1)
+    rests = [(float(each.voltage_V[0]), _name(each, n)) for n, (each, rested) in found if rested]
+    (low_V, low), (high_V, high) = min(rests, default=(0.0, "")), max(rests, default=(0.0, ""))
+    if high_V - low_V > BELOW_REST_V + ABOVE_REST_V:
+        raise ValueError(
+            f"discharge {low} starts at rest at {low_V:.2f} V, discharge {high} at {high_V:.2f} V: they "
+            "cannot both be of a full cell. Leave out those that do not start full."
+        )
+
+
+def _prior(records: Sequence[Record], start: CellParameters | None, thermal: bool, cut_off_V: float) -> CellParameters:
+    """Return what is thought of the constants before the data, but for what is measured."""
+    check_cell(start, thermal)
+    q_mobile = float(Q_MOBILE.check(_UNDELIVERED * max(drawn_charge_C(record) for record in records)))
+    if start is None:
+        size = q_mobile / NEW_CELL.q_mobile
+        start = NEW_CELL
+        if not 1.0 / _OTHER_SIZE < size < _OTHER_SIZE:
+            surfaces = {name: size * getattr(NEW_CELL, name) for name in ("Sn", "Sp", "mC")}
+            start = NEW_CELL.replace(q_mobile=q_mobile, r_o=NEW_CELL.r_o / size, **surfaces)
+    known = [getattr(record, "temperature_C", None) for record in records]
+    temperatures_C = [column[0] for column in known if column is not None]
+    measured = {"Tb0": ZERO_CELSIUS_K + float(np.mean(temperatures_C))} if temperatures_C else {}
+    return start.replace(VEOD=float(cut_off_V), **measured)
+
+
+def _name(record: Record, number: int) -> str:
+    meta = getattr(record, "meta", {})
+    return f"{meta['cell']}:{meta['cycle']}" if {"cell", "cycle"} <= set(meta) else str(number)
+
+
+@dataclass(frozen=True)
+class AtDischarge:
+    """The model of one discharge at an x of the search."""
+
+    residual_V: FloatArray  # at the samples
+    jacobian: FloatArray  # of these, by x
+    q_mobile: float
+    r_o: float
+    q_gradient_C: FloatArray  # of q_mobile, by x
+
+
+@dataclass(frozen=True)
+class _Weights:
+    """How much the residuals of each discharge count."""
+
+    mismatch_V: float
+    independent: FloatArray  # errors in each discharge, shape (D,)
+
+
+class JointFit:
+    """
+    The search over the constants and, for each discharge, ``q_mobile`` and ``r_o``. An x holds, in this order: of each
+    constant how many standard deviations of its prior it has moved; of each discharge the logarithm of the distance of
+    ``q_mobile`` to its least value; of each discharge ``r_o`` in units of ``_R_O_SCALE_OHM``.
+    """
+
+    def __init__(
+        self, records: Sequence[Record], at_rest: Sequence[bool], start: CellParameters, thermal: bool, dt_s: float
+    ) -> None:
+        self.model = RecordModel(start, thermal, dt_s)
+        self.names = [_name(record, number) for number, record in enumerate(records, start=1)]
+        self.sd = np.array([*(RATE_PRIOR_SD[name] for name in RATE_CONSTANTS), *EQUILIBRIUM_PRIOR_SD_V])
+        self.records, self.at_rest = records, at_rest  # whether the first sample is the voltage of a full cell at rest
+        self.data = [_thinned(OnGrid.of(record, self.model)) for record in records]
+        self.charges_C = np.array([drawn_charge_C(record) for record in records])
+        self._evaluated = lru_cache(maxsize=1)(self.evaluate)
+
+    @cached_property
+    def before(self) -> list[tuple[Estimate, float]]:
+        """With the constants known before, what fits best to each discharge, and the error left, V."""
+        return [self._alone(self.model.cell, d) for d in range(len(self.data))]
+
+    def _alone(self, cell: CellParameters, d: int) -> tuple[Estimate, float]:
+        """With some constants, what fits best to one discharge, and the error left (root mean square), V."""
+        model, data = self.model.of_cell(cell), self.data[d]
+        estimate = LeastSquares(
+            cell=cell, thermal=model.thermal, dt_s=model.dt_s, q_mobile_bounds_C=Q_MOBILE.limits, r_o_bounds_ohm=R_O.limits
+        ).estimate(self.records[d])
+        (voltage_V,) = data.at_samples([model.tangents(data.current_A, estimate.q_mobile, estimate.r_o).voltage_V])
+        return estimate, _rms(voltage_V - data.voltage_V)
+
+    def cell(self, x: FloatArray) -> CellParameters:
+        """The constants of an x."""
+        start, moved = self.model.cell, x[: len(self.sd)] * self.sd
+        rates = {
+            name: getattr(start, name) * float(np.exp(log))
+            for name, log in zip(RATE_CONSTANTS, moved[: len(RATE_CONSTANTS)], strict=True)
+        }
+        return with_equilibrium(start.replace(**rates), moved[len(RATE_CONSTANTS) :])
+
+    def starts(self) -> list[FloatArray]:
+        """Where to start: at the constants known before."""
+        least_C = np.array([self.model.least_q_mobile_C(data.current_A) for data in self.data])
+        fitted_C = np.array([estimate.q_mobile for estimate, _ in self.before]) - least_C
+        r_o = [estimate.r_o / _R_O_SCALE_OHM for estimate, _ in self.before]
+        return [
+            np.concatenate([np.zeros(len(self.sd)), np.log(np.maximum(above_C, _LEAST_EXCESS * least_C)), r_o])
+            for above_C in (fitted_C, _START_EXCESS * least_C)
+        ]
+
+    def solve(self) -> CellFit:
+        """The best fit that is found from any start, with the weights that its residuals imply."""
+        weights = _Weights(_FIRST_MISMATCH_V, np.full(len(self.data), _INDEPENDENT_ERRORS))
+        found = [self._search(x, weights) for x in self.starts()]
+        best = min(found, key=lambda x: square(self._objective(x, weights)[0]))
+        for _ in range(_ROUNDS):
+            weights = self._weights(best, weights)
+            best = self._search(best, weights)
+        return self._result(best, self._weights(best, weights))
+
+    def _bounds(self) -> tuple[FloatArray, FloatArray]:
+        low, high = np.full(len(self.sd), -_REACH_SD), np.full(len(self.sd), _REACH_SD)
+        for k, name in enumerate(RATE_CONSTANTS):
+            if name in ("to", "tsn", "tsp"):  # the model is stable at twice this step
+                low[k] = max(low[k], np.log(self.model.dt_s / getattr(self.model.cell, name)) / self.sd[k])
+        (least, most), each = _LOG_DISTANCE_LIMITS, np.ones(len(self.data))
+        low_r, high_r = R_O.limits
+        return (
+            np.concatenate([low, least * each, low_r / _R_O_SCALE_OHM * each]),
+            np.concatenate([high, most * each, high_r / _R_O_SCALE_OHM * each]),
+        )
+
+    def _search(self, x: FloatArray, weights: _Weights) -> FloatArray:
+        low, high = self._bounds()
+        room = 1e-6 * (high - low)
+        tolerances = dict.fromkeys(("ftol", "xtol", "gtol"), 1e-7)
+        x = np.clip(x, low + room, high - room)
+        return minimized(lambda x: self._objective(x, weights), x, bounds=(low, high), max_nfev=200, **tolerances)
+
+    def _objective(self, x: FloatArray, weights: _Weights) -> tuple[FloatArray, FloatArray]:
+        """Weighted residuals and distances to the priors, and their derivatives."""
+        n = len(self.sd)
+        residuals, derivatives = [], []
+        for seen, at_rest, count in zip(self._evaluated(tuple(x)), self.at_rest, weights.independent, strict=True):
+            scale = np.full(len(seen.residual_V), np.sqrt(count / len(seen.residual_V)))
+            if at_rest:
+                scale[0] = 1.0  # one sample alone says what a full cell shows, however many follow
+            scale /= weights.mismatch_V
+            residuals.append(scale * seen.residual_V)
+            derivatives.append(scale[:, None] * seen.jacobian)
+        return np.concatenate([*residuals, x[:n]]), np.concatenate([*derivatives, np.eye(n, len(x))])
+
+    def evaluate(self, x: Sequence[float]) -> list[AtDischarge]:
+        """The model of every discharge at an x."""
+        values = np.array(x)
+        model = self.model.of_cell(self.cell(values))
+        n, rates = len(self.sd), len(RATE_CONSTANTS)
+        t_diffusion = RATE_CONSTANTS.index("tDiffusion")
+        found = []
+        for d, data in enumerate(self.data):
+            u, r = n + d, n + len(self.data) + d
+            least_C, least_by_log_C = model.least_q_mobile_tangent_C(data.current_A)
+            above_C, r_o = distance_C(values[u]), _R_O_SCALE_OHM * float(values[r])
+            q_mobile = (1.0 + MARGIN) * least_C + above_C
+            q_gradient_C = np.zeros(len(values))
+            q_gradient_C[u] = above_C
+            q_gradient_C[t_diffusion] = (1.0 + MARGIN) * least_by_log_C * self.sd[t_diffusion]
+            voltage_V, by_parameter, fraction_p = model.tangents(data.current_A, q_mobile, r_o)
+            columns = by_parameter[BY_Q] * q_gradient_C[:, None]
+            columns[:rates] += self.sd[:rates, None] * by_parameter[BY_R + 1 :]
+            columns[rates:n] = self.sd[rates:, None] * equilibrium_slopes(fraction_p, n - rates)
+            columns[r] = _R_O_SCALE_OHM * by_parameter[BY_R]
+            seen_V, *by_x = data.at_samples([voltage_V, *columns])
+            found.append(AtDischarge(seen_V - data.voltage_V, np.column_stack(by_x), q_mobile, r_o, q_gradient_C))
+        return found
+
+    def _covariance(self, x: FloatArray, weights: _Weights) -> FloatArray:
+        jacobian = self._objective(x, weights)[1]
+        return np.asarray(np.linalg.pinv(jacobian.T @ jacobian))
+
+    def _weights(self, x: FloatArray, weights: _Weights) -> _Weights:
+        """What the residuals say about their own size, and how many of them are independent."""
+        residuals_V = [seen.residual_V for seen in self._evaluated(tuple(x))]
+        changes = [float(np.count_nonzero(np.diff(np.signbit(residual)))) for residual in residuals_V]
+        independent = np.maximum(changes, _INDEPENDENT_ERRORS)
+        # what was fitted makes residuals smaller than errors, by as much as the data determine
+        left = np.diag(self._covariance(x, weights))[: len(self.sd)]
+        fitted = float(np.sum(1.0 - left)) + 2.0 * len(residuals_V)
+        square_V2 = sum(count * _rms(residual) ** 2 for count, residual in zip(independent, residuals_V, strict=True))
+        return _Weights(max(float(np.sqrt(square_V2 / (independent.sum() - fitted))), _LEAST_MISMATCH_V), independent)
+
+    def _left_out_V(self, x: FloatArray, weights: _Weights) -> list[float | None]:
+        """
+        How far each discharge is from constants that were fitted without it, and without those of its age (root mean square),
+        V. That is what a discharge shows that nobody has fitted.
+        """
+        count, n = len(self.data), len(self.sd)
+        errors_V: list[float | None] = [None] * count
+        for group, kept in groups([at.q_mobile for at in self._evaluated(tuple(x))]):
+            others = JointFit(
+                [self.records[d] for d in kept],
+                [self.at_rest[d] for d in kept],
+                self.model.cell,
+                self.model.thermal,
+                self.model.dt_s,
+            )
+            own = np.append(np.arange(n), (n + kept, n + count + kept))
+            fitted = others._search(x[own], _Weights(weights.mismatch_V, weights.independent[kept]))
+            for d in group.tolist():
+                try:
+                    errors_V[d] = self._alone(others.cell(fitted), d)[1]
+                except ValueError as error:
+                    raise ValueError(
+                        f"constants fitted to the other discharges cannot follow {self.names[d]}: leave it out"
+                    ) from error
+        return errors_V
+
+    def _expected_V(self, discharges: Sequence[FittedDischarge], residual_V: float) -> float:
+        """The error to expect of any discharge of the cell: of those left out, and of ages and charges that none shows."""
+        q_mobile_C = np.array([each.q_mobile for each in discharges])
+        shown_V = [each.left_out_V for each in discharges if each.left_out_V is not None]
+        undrawn = 1.0 - float((self.charges_C / q_mobile_C).max())
+        unseen_V = hypot(aged_V(unseen_of_life(q_mobile_C)), UNFITTED_MISMATCH_V * max(undrawn, 0.0))
+        return hypot(max(residual_V, _rms(np.array(shown_V or [0.0]))), unseen_V)
+
+    def _result(self, x: FloatArray, weights: _Weights) -> CellFit:
+        """What was found."""
+        start, cell, n, seen = self.model.cell, self.cell(x), len(self.sd), self._evaluated(tuple(x))
+        covariance = self._covariance(x, weights)
+        sds = np.sqrt(np.diag(covariance))
+        before = [getattr(start, name) for name in RATE_CONSTANTS] + [0.0] * len(EQUILIBRIUM_PRIOR_SD_V)
+        after = [getattr(cell, name) for name in RATE_CONSTANTS] + (self.sd * x[:n])[len(RATE_CONSTANTS) :].tolist()
+        names = [*RATE_CONSTANTS, *(f"equilibrium {k}" for k in range(len(EQUILIBRIUM_PRIOR_SD_V)))]
+        rows = zip(names, before, self.sd.tolist(), after, (self.sd * sds[:n]).tolist(), strict=True)
+        discharges = []
+        left_out_V = self._left_out_V(x, weights)
+        rows_of = zip(self.names, self.before, seen, left_out_V, self.records, strict=True)
+        for d, (name, (_, before_V), at, error_V, record) in enumerate(rows_of):
+            sd_q_C = float(np.sqrt(at.q_gradient_C @ covariance @ at.q_gradient_C))
+            sd_r_ohm = float(_R_O_SCALE_OHM * sds[n + len(seen) + d])
+            others = _rms(at.residual_V), before_V, error_V, mean_current_A(record)
+            discharges.append(FittedDischarge(name, at.q_mobile, at.r_o, sd_q_C, sd_r_ohm, *others))
+        largest = max(discharges, key=lambda discharge: discharge.q_mobile)
+        new = {"q_mobile": largest.q_mobile, "r_o": largest.r_o}
+        return CellFit(
+            cell.replace(**new),
+            start.replace(**new),
+            self._expected_V(discharges, weights.mismatch_V),
+            _rms(np.concatenate([at.residual_V for at in seen])),
+            self.model.thermal,
+            tuple(FittedConstant(*row) for row in rows),
+            tuple(discharges),
+        )
+
+
+def _thinned(data: OnGrid) -> OnGrid:
+    samples = len(data.time_s)
+    kept = np.unique(np.linspace(0, samples - 1, min(samples, _MOST_SAMPLES)).round().astype(np.int64))
+    return replace(data, time_s=data.time_s[kept], voltage_V=data.voltage_V[kept])
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))

@@ -1,0 +1,191 @@
+"""What a record shows beside the samples under load: each piece of evidence, over its size."""
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from battery_env import calibrate, load_nasa_discharges, read_discharges
+from battery_env.electrochemistry import initial_state, simulate
+from battery_env.estimators.diagnosis.gaps import DRAWN, find_gaps
+from battery_env.estimators.estimator import OnlineEstimator
+from battery_env.lab.settings import Settings
+from battery_env.records import ChargeBefore, Shown, Stream
+from battery_env.records.discharge import Discharge
+
+METHODS = ("least-squares", "kalman")
+TRUE_Q_C, TRUE_R_OHM, LOAD_A = 7000.0, 0.12, 2.0
+REAL = load_nasa_discharges("B0006")[99]
+
+
+def discharged(every_s: float, rest_s: float, switch_s: float, soc: float = 1.0) -> Discharge:
+    """A row each so many seconds, the load switched so long after the last one at rest."""
+    start = initial_state(TRUE_Q_C, soc=soc)
+    record = simulate(LOAD_A, TRUE_Q_C, TRUE_R_OHM, load_unit="current", thermal=True, cut_off_V=2.6, initial=start)
+    # the model starts at rest: its voltage is that of the cell before the load
+    time_s = np.arange(-rest_s, record.time_s[-1], every_s) + every_s - switch_s
+    current_A = np.where(time_s >= 0.0, LOAD_A, 0.0)
+    voltage_V = np.interp(time_s, record.time_s, record.voltage_V)
+    return Discharge(time_s - time_s[0], voltage_V, current_A)
+
+
+def is_right(found, q_mobile_C: float = TRUE_Q_C, r_o_ohm: float = TRUE_R_OHM) -> bool:
+    """Whether each number that is settled is right, within 5 % or 3 standard deviations."""
+    right_q = abs(found.q_mobile_C - q_mobile_C) <= max(0.05 * q_mobile_C, 3.0 * found.sd_q_mobile_C)
+    right_r_o = abs(found.r_o_ohm - r_o_ohm) <= max(0.05 * r_o_ohm, 3.0 * found.sd_r_o_ohm)
+    return (right_q or not found.settled_q_mobile) and (right_r_o or not found.settled_r_o)
+
+
+class TestLoadOn:
+    @pytest.mark.parametrize("method", METHODS)
+    @pytest.mark.parametrize("every_s", [1.0, 10.0, 60.0, 120.0, 300.0, 600.0])
+    def test_its_doubt_covers_what_it_costs_however_far_apart_the_rows_are(self, every_s, method):
+        for share in (0.02, 0.5, 0.98):
+            found = calibrate(discharged(every_s, 3.0 * every_s, share * every_s), method=method)
+            assert found.record.shown.load_on_C == pytest.approx(LOAD_A * every_s / 12.0**0.5, rel=0.05)
+            assert found.sd_q_mobile_C > found.record.shown.load_on_C
+            assert abs(found.q_mobile_C - TRUE_Q_C) < 2.5 * found.sd_q_mobile_C
+            assert found.settled_q_mobile or every_s > 10.0, found.reason
+            assert not found.settled_q_mobile or every_s < 200.0
+
+    @pytest.mark.parametrize("lost_s", [20.0, 60.0, 300.0, 900.0])
+    def test_rows_that_are_lost_around_it_are_a_doubt_of_their_size_and_no_refusal(self, lost_s):
+        whole = discharged(10.0, 300.0, 5.0)
+        kept = (whole.time_s < 250.0) | (whole.time_s > 250.0 + lost_s)
+        record = Discharge(whole.time_s[kept], whole.voltage_V[kept], whole.current_A[kept])
+        found = calibrate(record)
+        assert found.settled_q_mobile == (lost_s < 200.0) and is_right(found)
+        assert abs(found.drawn_Ah - whole.charge_C / 3600.0) * 3600.0 < 2.5 * found.record.shown.load_on_C + LOAD_A * 10.0
+
+    @pytest.mark.parametrize("rows", [1, 2])
+    def test_a_row_that_mixes_rest_and_load_does_not_decide(self, rows):
+        first = int(np.argmax(REAL.current_A > 1.0))
+        voltage_V = REAL.voltage_V.copy()
+        voltage_V[first - 1] = voltage_V[first] + 0.002
+        mixed, plain = calibrate(replace(REAL, voltage_V=voltage_V)), calibrate(REAL)
+        assert mixed.settled and mixed.capacity_Ah == pytest.approx(plain.capacity_Ah)
+        assert mixed.q_mobile_C == pytest.approx(plain.q_mobile_C, rel=1e-3)
+
+    @pytest.mark.parametrize("every_s", [10.0, 300.0])
+    def test_a_stream_that_begins_at_rest_doubts_it_likewise(self, every_s):
+        filter_ = Settings(method="kalman").calibrator()
+        assert isinstance(filter_, OnlineEstimator)
+        for sample in Stream.of(discharged(every_s, 900.0, 0.5 * every_s), 1.0).samples():
+            estimate = filter_.update(*sample)
+        assert abs(estimate.q_mobile - TRUE_Q_C) < 2.5 * estimate.sd_q_mobile
+        assert estimate.settled_q_mobile == (every_s < 200.0)
+
+
+class TestRest:
+    @pytest.mark.parametrize("method", METHODS)
+    @pytest.mark.parametrize("offset_A", [-0.15, -0.1, -0.05, -0.01, 0.01, 0.05, 0.1, 0.15])
+    def test_what_flows_there_is_counted_as_an_offset(self, offset_A, method):
+        rest_s = 20.0 * np.arange(45)
+        time_s = np.concatenate([REAL.time_s[0] - 900.0 + rest_s, REAL.time_s])
+        voltage_V = np.append(np.full(45, REAL.voltage_V[0]), REAL.voltage_V)
+        record = Discharge(time_s, voltage_V, np.append(np.zeros(45), REAL.current_A) + offset_A)
+        plain, found = calibrate(REAL, method=method), calibrate(record, method=method)
+        assert found.record.shown.offset_A == pytest.approx(offset_A, abs=0.01)
+        assert abs(found.q_mobile_C - plain.q_mobile_C) < 2.0 * found.sd_q_mobile_C
+        assert found.settled_q_mobile == (abs(offset_A) < 0.03)
+        assert found.settled or f"{found.record.shown.offset_A:.3g} A flow at rest" in found.reason
+
+    def test_a_small_load_before_a_larger_one_is_none(self):
+        current_A = REAL.current_A.copy()
+        current_A[:2] = 0.15
+        assert Discharge(REAL.time_s, REAL.voltage_V, current_A).loaded_part(2.7).shown.offset_A == pytest.approx(
+            0.0, abs=0.01
+        )
+
+
+def cycled(highest_V: float, last_A: float, rest_rows: int = 0, soc: float = 1.0) -> pd.DataFrame:
+    """A charge with 3 A, at most so high, which ends at some current; then a discharge."""
+    discharge = discharged(1.0, max(rest_rows, 1), 0.5, soc)
+    rows = slice(0 if rest_rows else 1, None)
+    charge_V = np.concatenate([np.linspace(3.5, highest_V, 200), np.full(200, highest_V)])
+    charge_A = np.concatenate([np.full(200, -3.0), np.geomspace(-3.0, -last_A, 200)])
+    time_s = np.concatenate([10.0 * np.arange(400), 3991.0 + discharge.time_s[rows]])
+    columns = {
+        "time_s": time_s,
+        "voltage_V": np.append(charge_V, discharge.voltage_V[rows]),
+        "current_A": -np.append(charge_A, discharge.current_A[rows]),
+    }
+    return pd.DataFrame(columns)
+
+
+class TestCharge:
+    @pytest.mark.parametrize("method", METHODS)
+    @pytest.mark.parametrize(
+        ("soc", "highest_V"), [(0.97, 4.2), (0.97, 4.25), (0.92, 4.15), (0.85, 4.1), (0.7, 4.0), (0.7, 4.2)]
+    )
+    def test_one_that_did_not_taper_off_proves_no_full_cell(self, soc, highest_V, method):
+        # its voltage under load is that of a full cell with a larger resistance
+        (found,) = calibrate(cycled(highest_V, 3.0, soc=soc), method=method)
+        assert not found.settled and f"ended at {highest_V:.2f} V, still under 3 A" in found.reason
+
+    @pytest.mark.parametrize("method", METHODS)
+    @pytest.mark.parametrize("rest_rows", [0, 1, 100])
+    def test_one_that_tapered_off_proves_a_full_cell_without_a_rest(self, rest_rows, method):
+        table = cycled(4.2, 0.05, rest_rows)
+        (found,) = calibrate(table, method=method)
+        assert found.settled and is_right(found) and found.record.shown.charge.tapered
+        assert found.capacity_Ah == pytest.approx(found.drawn_Ah)
+        # in whichever cycle it is counted
+        counted = table.assign(cycle=np.where(table.current_A <= 0.0, 2, 1) if rest_rows == 0 else 1)
+        assert len(read_discharges(counted)) == 1 and read_discharges(counted)[0].shown.charge is not None
+
+    def test_one_that_tapered_off_too_low_is_none_of_these_constants(self):
+        (found,) = calibrate(cycled(4.1, 0.05, soc=0.92))
+        assert not found.settled and "ended at 4.10 V" in found.reason
+
+    def test_a_rest_of_a_minute_tells_more_than_the_charge(self):
+        (found,) = calibrate(cycled(4.25, 3.0, rest_rows=100))
+        assert found.settled
+
+    def test_another_charge_that_is_stated_counts_more(self):
+        (found,) = calibrate(cycled(4.1, 3.0, 100, soc=0.9), initial_soc=0.9)
+        assert found.settled and is_right(found)
+
+    def test_noise_at_its_end_is_no_taper(self):
+        voltage_V, current_A = np.append(np.linspace(3.8, 4.1, 50), 4.0), -np.append(np.full(50, 3.0), 0.02)
+        assert not ChargeBefore.of(voltage_V, current_A).tapered
+
+    def test_nothing_is_known_of_other_records(self):
+        assert REAL.shown == Shown() and REAL.loaded_part(2.7).shown.charge is None
+
+
+class TestCutOff:
+    @pytest.mark.parametrize("above_V", [8e-6, 1e-3, 2e-3, 4e-3])
+    def test_a_load_that_ends_within_its_last_fall_of_it_ends_there(self, above_V):
+        whole = REAL.until(REAL.eod_time_s(2.7) + 5.0)
+        lowest_V = float(whole.voltage_V[-1])
+        over, plain = calibrate(whole, cut_off_V=lowest_V - above_V), calibrate(whole, cut_off_V=lowest_V)
+        assert not over.in_progress and over.method == plain.method == "least-squares"
+        assert over.capacity_Ah == pytest.approx(plain.capacity_Ah, rel=1e-3)
+        assert over.r_o_ohm == pytest.approx(plain.r_o_ohm, rel=1e-3)
+
+    def test_an_earlier_end_is_none(self):
+        assert calibrate(REAL.until(REAL.time_s[200])).in_progress
+        fall_V = float(REAL.voltage_V[199] - REAL.voltage_V[200])
+        assert np.isnan(REAL.until(REAL.time_s[200]).eod_time_s(float(REAL.voltage_V[200]) - 1.5 * fall_V))
+        # nor is a drop of the load
+        low = replace(REAL, current_A=np.where(np.arange(len(REAL.time_s)) % 2, REAL.current_A, 0.3 * REAL.current_A))
+        assert np.isnan(low.until(low.time_s[201]).eod_time_s(float(low.voltage_V[201]) - 0.001))
+
+    def test_a_load_that_was_switched_off_is_over_and_has_the_method_of_a_whole_one(self):
+        off = np.arange(len(REAL.time_s)) > 200
+        record = replace(REAL, current_A=np.where(off, 0.0, REAL.current_A), voltage_V=np.where(off, 3.7, REAL.voltage_V))
+        with pytest.warns(UserWarning, match="the load ends at"):
+            assert calibrate(record).method == "least-squares"
+
+
+class TestGaps:
+    def test_short_ones_on_a_flat_curve_say_nothing_where_a_logger_has_the_habit(self):
+        """Intervals of 5 s between bursts: the voltage of iron phosphate falls in them by less than it is rounded by."""
+        burst_s, fall_V = 0.1 * np.arange(12), np.where(np.arange(30) < 6, 0.01, 2e-4)
+        time_s = (np.cumsum(np.full(30, 6.1))[:, None] + burst_s).ravel()
+        model_V = 3.3 - np.repeat(np.cumsum(fall_V), 12)
+        wander_V = 8e-4 * np.repeat(np.random.default_rng(0).choice([0.0, 1.0], 30), 12)
+        found = find_gaps(time_s, model_V + wander_V, np.full(360, 4.4), model_V, 3900.0)
+        assert len(found) >= 3 and {gap.verdict for gap in found} == {DRAWN}

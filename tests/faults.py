@@ -1,0 +1,44 @@
+"""Faults below Python, for tests: disks that are full or fail, and processes that are killed. Workers import it fast."""
+
+import os
+import resource
+import signal
+from contextlib import contextmanager
+
+
+@contextmanager
+def a_full_disk(after_bytes):
+    """No file grows beyond so many bytes, for whoever writes it, compiled code too."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (after_bytes, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, before)
+
+
+class Disk:
+    """Counts syncs, renamings and links, and lets one of them fail."""
+
+    def __init__(self, patch, fails_at=None):
+        self.calls, self.fails_at = [], fails_at
+        for name in ("fsync", "replace", "link"):
+            patch.setattr(os, name, self.counting(name, getattr(os, name)))
+
+    def counting(self, name, function):
+        def counted(*arguments, **named):
+            self.calls.append(name)
+            if len(self.calls) - 1 == self.fails_at:
+                raise OSError(5, "Input/output error")
+            return function(*arguments, **named)
+
+        return counted
+
+
+def squared_unless_it_ends_its_process(number, ends):
+    """A call that may kill the worker that makes it."""
+    if number in ends:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number**2
