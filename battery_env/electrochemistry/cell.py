@@ -84,7 +84,7 @@ def _redlich_kister_polynomial(coefficients: tuple[float, ...], faraday: float) 
 
 # How far a constant may be from that of a new 18650, as a factor: two are of nature; large cells are known by the others.
 _FARTHEST = {"R": 1.01, "F": 1.01, "Tb0": 2.0, "VEOD": 10.0}
-_FARTHEST_OF_OTHERS = 1e6
+_FARTHEST_OF_OTHERS = 1e9
 
 
 @dataclass(frozen=True)
