@@ -117,7 +117,7 @@ class Forecast:
             "remaining time (s)": (self.remaining_s, "10.0f"),
             "state of charge now (%)": (100.0 * self.soc, "10.1f"),
             "q_max (Ah)": (self.q_mobile / 3600.0, "10.3f"),
-            "R_o (mohm)": (1e3 * self.r_o, "10.0f"),
+            "R_o (mohm)": (1e3 * self.r_o, "10.1f"),
             "capacity (Ah)": (self.capacity_Ah, "10.3f"),
         }
         if not np.isnan(self.nominal_Ah):

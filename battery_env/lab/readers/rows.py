@@ -460,7 +460,7 @@ def with_signed_current(rows: pd.DataFrame, columns: Mapping[str, Column], is_ne
     if not (current_A.abs() > REST_CURRENT_A).any():
         is_known = "current" in columns and columns["current"].unit
         # under the load of a coin cell the voltage falls
-        if not is_known or not np.ptp(rows["voltage"]) > _COIN_FALL_V:
+        if not is_known or not current_A.any() or not np.ptp(rows["voltage"]) > _COIN_FALL_V:
             advice = "" if is_known else ", or that of a coin cell: state the unit of the current"
             raise ValueError(f"no current flows above {REST_CURRENT_A:g} A, below which a cell rests: no discharge{advice}")
     if "direction" in rows and (current_A >= -rest_A).all():
