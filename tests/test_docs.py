@@ -154,6 +154,17 @@ def test_the_first_page_shows_what_the_calibrator_prints(capsys):
     assert capsys.readouterr().out.strip() == shown.strip()
 
 
+def test_the_tutorial_of_a_life_shows_what_its_forecast_prints(tmp_path, monkeypatch, capsys):
+    page = (DOCS / "cell_life.md").read_text(encoding="utf-8")
+    ((example, shown),) = re.findall(r"^```python\n((?:(?!```).)*?)^```\n\n```text\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    exec(example, {})
+    printed = capsys.readouterr().out
+    assert printed.startswith(shown)
+    low, high = re.search(r"end of discharge \(s\) +(\d+) +\d+ +(\d+)", printed).groups()
+    assert f"lies within {low} to {high} s" in (ROOT / "README.md").read_text(encoding="utf-8")
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_commands_in_pages_exist(page):
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
