@@ -112,12 +112,12 @@ def main() -> None:
     settings, state = Settings(cut_off_V=cut_off_V, nominal_Ah=nominal_Ah or None), st.session_state
     asked = [each.file_id for each in files], folder, one_cell, settings
     if state.get("asked") != asked:
-        state.troubles, state.lives = [], {}
+        names, state.lives = [Path(each.name).name for each in files], {}
+        state.troubles = [f"**{each}**: only one of this name is used" for each in {*names} if names.count(each) > 1]
         with tempfile.TemporaryDirectory() as given:
-            for each in files:
-                Path(given, Path(each.name).name).write_bytes(each.getvalue())
-            paths = [*([given] if files else []), *([folder] if folder else [])]
-            state.found = calibrated(paths, settings, one_cell, state.troubles)
+            for name, each in zip(names, files, strict=True):
+                Path(given, name).write_bytes(each.getvalue())
+            state.found = calibrated([each for each in (files and given, folder) if each], settings, one_cell, state.troubles)
         state.troubles, state.asked = [each.replace(f"{given}/", "") for each in dict.fromkeys(state.troubles)], asked
     if state.troubles:
         st.warning("\n\n".join(state.troubles))

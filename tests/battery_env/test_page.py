@@ -91,9 +91,10 @@ def test_files_are_dropped_and_nothing_is_stored(folder, page, tmp_path_factory,
     monkeypatch.setenv("TMPDIR", str(kept))
     monkeypatch.setattr("tempfile.tempdir", None)
     files = [("a.csv", csv(LIFE[0]).encode(), "text/csv"), ("b.bin", io.BytesIO(b"\0\1").read(), "application/octet-stream")]
+    files.append(("a.csv", csv(LIFE[0]).encode(), "text/csv"))
     page.sidebar.file_uploader[0].set_value(files).run()
     assert page.dataframe[0].value["record"].tolist() == ["a"] and "q_max" in numbers(page)
-    assert any("b.bin" in each.value for each in page.warning)
+    assert any("b.bin" in each.value and "**a.csv**: only one of this name is used" in each.value for each in page.warning)
     assert list(kept.iterdir()) == []
 
 
