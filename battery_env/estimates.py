@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import overload
+from typing import Any, overload
 
 import numpy as np
 
@@ -120,6 +120,7 @@ class EstimateTrace:
     :param reason: why each is not settled, strings, empty for those that are; ``None`` if the calibrator does not say
     :param settled_q_mobile: whether it takes each ``q_mobile`` for settled; ``None`` if it does not say
     :param settled_r_o: likewise
+    :param constants: what else was found with each, as of :class:`Estimate`; ``None``: nothing
     """
 
     time_s: FloatArray
@@ -131,6 +132,7 @@ class EstimateTrace:
     reason: StringArray | None = None
     settled_q_mobile: BoolArray | None = None
     settled_r_o: BoolArray | None = None
+    constants: Sequence[Mapping[str, float]] | None = None
 
     @classmethod
     def of(cls, time_s: Sequence[float] | FloatArray, estimates: Sequence[Estimate]) -> EstimateTrace:
@@ -142,11 +144,13 @@ class EstimateTrace:
         :return: the trace
         """
         names = (*_COLUMNS, "settled")
-        columns = {name: np.array([getattr(estimate, name) for estimate in estimates]) for name in names}
+        columns: dict[str, Any] = {name: np.array([getattr(estimate, name) for estimate in estimates]) for name in names}
         return cls(np.array(time_s), **columns, reason=np.array([estimate.reason for estimate in estimates], dtype=object))
 
 
 def last_estimate(trace: EstimateTrace) -> Estimate:
     """The last estimate of a trace that states uncertainties and what is settled."""
     assert trace.reason is not None
-    return Estimate(**{name: getattr(trace, name)[-1].item() for name in _COLUMNS}, reason=str(trace.reason[-1]))
+    constants = None if trace.constants is None else trace.constants[-1]
+    columns: dict[str, Any] = {name: getattr(trace, name)[-1].item() for name in _COLUMNS}
+    return Estimate(**columns, reason=str(trace.reason[-1]), constants=constants)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from hashlib import sha256
 from pathlib import Path
@@ -74,8 +74,25 @@ class DeterministicPolicy(th.nn.Module):
         return action.clamp(self.low, self.high)
 
 
+class MeanPolicy(th.nn.Module):
+    """
+    The mean of the actions of several policies.
+
+    :param policies: Of the same spaces
+    """
+
+    def __init__(self, policies: Sequence[DeterministicPolicy]) -> None:
+        super().__init__()
+        self.policies = th.nn.ModuleList(policies)
+        self.low, self.high = policies[0].low, policies[0].high
+
+    def forward(self, observation: th.Tensor) -> th.Tensor:
+        """Compute actions of the environment from its observations."""
+        return th.stack([policy(observation) for policy in self.policies]).mean(dim=0)
+
+
 def export_onnx(
-    model: BaseAlgorithm | BasePolicy,
+    model: BaseAlgorithm | BasePolicy | Sequence[BaseAlgorithm],
     path: str | Path,
     env_id: str | None = None,
     vec_normalize: VecNormalize | None = None,
@@ -96,14 +113,16 @@ def export_onnx(
     file is checked with onnxruntime before it takes its name, and ends with its checksum, which ``OnnxPolicy`` of battery_env
     compares. Needs the extra ``sb3_lac[onnx]``.
 
-    :param model: LAC, SAC, TD3, TQC, PPO, ... or a policy
+    :param model: LAC, SAC, TD3, TQC, PPO, ... or a policy; or several models, of several seeds: the file has the mean of their
+        actions
     :param path: Of the file, which must not exist yet; ``.onnx`` is added where it is missing
     :param env_id: Id of the environment that the policy is for, kept in the file; by default that of the model's environment,
         where it is known
     :param vec_normalize: What normalizes the observations; by default the wrapper of the model's environment, if it has one. A
         warning says so where there is no environment, as in a policy or in a model that was loaded without one.
     :return: Path of the file
-    :raises ValueError: If its spaces are not ``Box``, if it has a memory, or if the file does not do what the policy does
+    :raises ValueError: If its spaces are not ``Box``, if it has a memory, if the file does not do what the policy does, or for
+        models of several spaces
     :raises FileExistsError: If the file exists
     :raises ImportError: Without the extra
     """
@@ -118,7 +137,12 @@ def export_onnx(
         path = path.with_name(path.name + ".onnx")
     if path.exists():
         raise FileExistsError(f"{path} exists: move it away, or give another path.")
-    policy = model if isinstance(model, BasePolicy) else model.policy
+    models = list(model) if isinstance(model, Sequence) else [model]
+    policies = [each if isinstance(each, BasePolicy) else each.policy for each in models]
+    model, policy = models[0], policies[0]
+    for other in policies[1:]:
+        if (other.observation_space, other.action_space) != (policy.observation_space, policy.action_space):
+            raise ValueError("The models must have the same spaces of observations and actions.")
     for name, space in (("observation", policy.observation_space), ("action", policy.action_space)):
         if not isinstance(space, spaces.Box):
             raise ValueError(f"The {name} space {space} must be a Box: other spaces have no ONNX export.")
@@ -134,16 +158,19 @@ def export_onnx(
             "without. If they were, pass vec_normalize=VecNormalize.load(...), or load the model with its environment.",
             stacklevel=2,
         )
-    content = _checked_file(policy, vec_normalize, env_id, type(model).__name__)
+    content = _checked_file(policies, vec_normalize, env_id, type(model).__name__)
     with replacing(path) as part:
         part.write_bytes(content)
     return path
 
 
-def _checked_file(policy: BasePolicy, vec_normalize: VecNormalize | None, env_id: str | None, algorithm: str) -> bytes:
-    """Return the content of a file that does what the policy does."""
+def _checked_file(
+    policies: Sequence[BasePolicy], vec_normalize: VecNormalize | None, env_id: str | None, algorithm: str
+) -> bytes:
+    """Return the content of a file that does what the policies do, in the mean."""
     import onnxruntime
 
+    policy = policies[0]
     if vec_normalize is not None and not vec_normalize.norm_obs:
         vec_normalize = None
     if vec_normalize is not None and vec_normalize.observation_space.shape != policy.observation_space.shape:
@@ -151,16 +178,18 @@ def _checked_file(policy: BasePolicy, vec_normalize: VecNormalize | None, env_id
             f"VecNormalize normalizes observations of shape {vec_normalize.observation_space.shape}, and those of the policy "
             f"have {policy.observation_space.shape}: a wrapper around it, like VecFrameStack, has no ONNX export."
         )
-    was_training = policy.training
-    policy.set_training_mode(False)
+    was_training = [each.training for each in policies]
+    for each in policies:
+        each.set_training_mode(False)
     try:
-        module = DeterministicPolicy(policy, vec_normalize).eval()
+        module = MeanPolicy([DeterministicPolicy(each, vec_normalize) for each in policies]).eval()
         observations = observations_to_check(policy.observation_space, vec_normalize)
         seen = observations if vec_normalize is None else vec_normalize.normalize_obs(observations)
-        expected, _ = policy.predict(seen, deterministic=True)
+        expected = np.mean([each.predict(seen, deterministic=True)[0] for each in policies], axis=0)
         content = with_checksum(graph_of(module, observations, env_id, algorithm).SerializeToString())
     finally:
-        policy.set_training_mode(was_training)
+        for each, mode in zip(policies, was_training, strict=True):
+            each.set_training_mode(mode)
     session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
     (action,) = session.run(None, {"observation": observations})
     ranges = (module.high - module.low).cpu().numpy()
@@ -209,7 +238,7 @@ def with_checksum(content: bytes) -> bytes:
     return content + ModelProto(metadata_props=[entry]).SerializeToString()
 
 
-def graph_of(module: DeterministicPolicy, observations: np.ndarray, env_id: str | None, algorithm: str) -> ModelProto:
+def graph_of(module: MeanPolicy, observations: np.ndarray, env_id: str | None, algorithm: str) -> ModelProto:
     """Export a module, and describe it."""
     import onnx
 

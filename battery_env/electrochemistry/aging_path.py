@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,11 +24,20 @@ EQUILIBRIUM_NAMES: tuple[str, ...] = tuple(f"equilibrium {k}" for k in range(EQU
 #: What moves along a path: logarithms of what constants of the cell are multiplied by, what is added to the equilibrium
 #: voltage, V, and the logarithms of ``q_mobile`` in C and ``r_o`` in ohm.
 PATH_NAMES: tuple[str, ...] = (*UNCERTAIN_CONSTANTS, *EQUILIBRIUM_NAMES, *PARAMETER_NAMES)
-#: How far cells lie beside the path: standard deviations of these. Chosen on B0005 along the path of B0006.
-SPREAD_SD: tuple[float, ...] = (*(0.5,) * len(UNCERTAIN_CONSTANTS), *(0.005,) * EQUILIBRIUM_SIZE, 0.03, 0.5)
+#: How far cells lie beside the path: standard deviations of these, of which no cell lies more than two away. Chosen on B0005
+#: along the path of B0006.
+SPREAD_SD: tuple[float, ...] = (*(0.5,) * len(UNCERTAIN_CONSTANTS), *(0.005,) * EQUILIBRIUM_SIZE, 0.03, 0.25)
+#: A cell that lies farther beside the path, in standard deviations, is of another kind.
+BESIDE_LIMIT_SD = 4.0
+#: How ``q_mobile`` goes together with the voltage is known from the lives of few: other cells may lie this many times farther
+#: off than these tell. An estimate is not settled unless it is sure for all that.
+OTHER_LIVES = 2.0
 #: Cells may be younger and older than those of the path by this share of its length.
 BEYOND_SHARE = 0.2
 
+# The error of the model of a cell at its place drifts as it is discharged: all its charge shows so many independent ones.
+# Chosen on B0005 along the path of B0006.
+_ERRORS_OF_A_DISCHARGE = 100.0
 _FORMAT, _FORMAT_VERSION = "battery_env.AgingPath", 1
 _RATES, _EQUILIBRIUM = slice(0, len(UNCERTAIN_CONSTANTS)), slice(len(UNCERTAIN_CONSTANTS), -len(PARAMETER_NAMES))
 # Beyond its ends a path goes on as over this share of its ages, as single ones scatter.
@@ -112,7 +121,7 @@ class AgingPath:
         values = np.empty((n, len(PATH_NAMES)))
         for k, rows in enumerate(self.lives):
             values[life == k] = _at(np.array(rows), place[life == k])
-        values += np.array(SPREAD_SD) * rng.standard_normal(values.shape)
+        values += np.array(SPREAD_SD) * np.clip(rng.standard_normal(values.shape), -2.0, 2.0)
         q_mobile = np.clip(np.exp(values[:, -2]), *Q_MOBILE.limits)
         r_o = np.clip(np.exp(values[:, -1]), *R_O.limits)
         return DrawnCells(place, q_mobile, r_o, np.exp(values[:, _RATES]), values[:, _EQUILIBRIUM])
@@ -124,6 +133,11 @@ class AgingPath:
         values = np.column_stack([np.log(factors), equilibrium_V, np.log(q_mobile), np.log(r_o)])
         return values.mean(axis=0), np.cov(values.T)
 
+    @property
+    def errors_per_C(self) -> float:
+        """How many independent errors of the model a coulomb shows, besides a first one."""
+        return _ERRORS_OF_A_DISCHARGE / self.cell.q_mobile
+
     def distance_sd(self, values: Mapping[str, float]) -> float:
         """
         How far a cell lies from the cells that are expected, as a normal variable is as rarely.
@@ -131,9 +145,19 @@ class AgingPath:
         :param values: by ``PATH_NAMES``; parameters themselves, not their logarithms
         :return: standard deviations
         """
+        row = [np.log(values[name]) if name in PARAMETER_NAMES else values[name] for name in PATH_NAMES]
+        return float(self.distances_sd(np.array([row]))[0])
+
+    def distances_sd(self, values: FloatArray) -> FloatArray:
+        """
+        The same of many cells.
+
+        :param values: by ``PATH_NAMES``, shape (n, 14)
+        :return: standard deviations, shape (n,)
+        """
         mean, covariance = self.moments
-        x = np.array([np.log(values[name]) if name in PARAMETER_NAMES else values[name] for name in PATH_NAMES]) - mean
-        return _normal_distance(float(x @ np.linalg.solve(covariance, x)), len(x))
+        x = values - mean
+        return _normal_distances(np.sum(x * np.linalg.solve(covariance, x.T).T, axis=1), x.shape[1])
 
     def to_json(self, path: str | os.PathLike[str]) -> Path:
         """
@@ -143,7 +167,7 @@ class AgingPath:
         :return: the file
         :raises FileExistsError: if the file exists already
         """
-        return write_json(path, _FORMAT, _FORMAT_VERSION, {"names": PATH_NAMES, **asdict(self)})
+        return write_json(path, _FORMAT, _FORMAT_VERSION, self.to_mapping())
 
     @classmethod
     def from_json(cls, path: str | os.PathLike[str]) -> AgingPath:
@@ -156,18 +180,40 @@ class AgingPath:
         """
         content = read_json(path, _FORMAT, _FORMAT_VERSION)
         try:
-            if tuple(content.pop("names")) != PATH_NAMES:
-                raise ValueError(f"its names are not {', '.join(PATH_NAMES)}")
-            lives = tuple(tuple(tuple(map(float, row)) for row in life) for life in content.pop("lives"))
-            return cls(CellParameters.of_mapping(content.pop("cell")), lives, **content)
+            return cls.of_mapping(content)
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{path} is damaged, or no path saved by AgingPath.to_json: {error}") from error
 
+    def to_mapping(self) -> dict[str, Any]:
+        """
+        The path as JSON holds it.
 
-def _normal_distance(square: float, count: int) -> float:
-    """The normal deviate that is as rare as a sum of so many squares of them (Wilson and Hilferty 1931); at least 0."""
+        :return: what :meth:`of_mapping` takes
+        """
+        return {"names": PATH_NAMES, **asdict(self)}
+
+    @classmethod
+    def of_mapping(cls, content: Mapping[str, Any]) -> AgingPath:
+        """
+        A path as JSON holds it.
+
+        :param content: what :meth:`to_mapping` returned
+        :return: the path
+        :raises KeyError: for a part that is missing
+        :raises TypeError: for a part that is unknown, or a value of another kind
+        :raises ValueError: for values out of range
+        """
+        parts = dict(content)
+        if tuple(parts.pop("names")) != PATH_NAMES:
+            raise ValueError(f"its names are not {', '.join(PATH_NAMES)}")
+        lives = tuple(tuple(tuple(map(float, row)) for row in life) for life in parts.pop("lives"))
+        return cls(CellParameters.of_mapping(parts.pop("cell")), lives, **parts)
+
+
+def _normal_distances(squares: FloatArray, count: int) -> FloatArray:
+    """Normal deviates that are as rare as sums of so many squares of them (Wilson and Hilferty 1931); at least 0."""
     spread = 2.0 / (9.0 * count)
-    return max(float((square / count) ** (1.0 / 3.0) - (1.0 - spread)) / float(np.sqrt(spread)), 0.0)
+    return np.maximum(((squares / count) ** (1.0 / 3.0) - (1.0 - spread)) / np.sqrt(spread), 0.0)
 
 
 def cell_with(cell: CellParameters, constants: Mapping[str, float] | None) -> CellParameters:

@@ -28,7 +28,7 @@ def with_equilibrium(cell: CellParameters, coefficients_V: Sequence[float] | Flo
     # as a polynomial in y = 2x - 1, from the highest power down: term k of the Redlich-Kister sum is
     # A_k / F * ((1 + k / 2) * y^(k + 1) - (k / 2) * y^(k - 1))
     x = Polynomial([0.5, 0.5])
-    powers = Legendre(coefficients_V).convert(kind=Polynomial)(_on_unit_range(x)).coef
+    powers = Legendre(coefficients_V).convert(kind=Polynomial)(on_unit_range(x)).coef
     terms = np.zeros(max(len(cell.Ap), len(powers) - 1))
     for k in range(len(powers) - 2, -1, -1):
         terms[k] = powers[k + 1] / (1.0 + k / 2.0)
@@ -46,10 +46,10 @@ def equilibrium_slopes(fraction_p: FloatArray, count: int) -> FloatArray:
     :param count: of the coefficients
     :return: shape (count, K)
     """
-    return np.asarray(legvander(_on_unit_range(fraction_p), count - 1).T)
+    return np.asarray(legvander(on_unit_range(fraction_p), count - 1).T)
 
 
-def _on_unit_range(fraction: Any) -> Any:
-    # numbers, arrays and polynomials alike
+def on_unit_range(fraction: Any) -> Any:
+    """Mole fractions of the positive electrode as -1 .. 1: numbers, arrays and polynomials alike."""
     low, high = _FRACTIONS_P
     return (fraction - 0.5 * (high + low)) * (2.0 / (high - low))

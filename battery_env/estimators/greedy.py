@@ -184,5 +184,5 @@ class GreedyOneStep(Estimator):
                 np.repeat(record.state[:1], 2, axis=0),
             )
             _greedy(*self.search_range, self.resync, search, values[self.parameter])
-            traces.append(EstimateTrace(time_s=record.time_s[1:], **values))
+            traces.append(EstimateTrace(record.time_s[1:], values["q_mobile"], values["r_o"]))
         return traces

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from battery_env.arrays import FloatArray
 from battery_env.checks import check_gain_sd, check_not_negative, check_positive
 from battery_env.electrochemistry import CellParameters
-from battery_env.electrochemistry.aging_path import PATH_NAMES, AgingPath
+from battery_env.electrochemistry.aging_path import BESIDE_LIMIT_SD, OTHER_LIVES, PATH_NAMES, AgingPath
 from battery_env.electrochemistry.ends import LONGEST_S
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimates import Estimate, EstimateTrace
@@ -47,11 +47,6 @@ _NEGLIGIBLE_V = 1e-3
 _LEAST_NOISE_V = 1e-4
 # The effect of the charge at the start is taken over this step.
 _SOC_STEP = 1e-3
-# The error of the model at its place on a path drifts as the cell is discharged: a whole discharge has so many of them.
-# Chosen on B0005 along the path of B0006.
-_ERRORS_OF_A_DISCHARGE = 100.0
-# A cell that lies farther beside the path, in standard deviations, is of another kind.
-_BESIDE_LIMIT_SD = 4.0
 # Starts along a path, in standard deviations of its q_mobile; and how far above what the record allows they keep, as a share.
 _STARTS_SD, _START_ABOVE = (-1.5, -0.5, 0.5, 1.5), 0.02
 # The end of a record agrees with an estimate within this share of its duration.
@@ -293,7 +288,7 @@ class LeastSquares(Estimator):
         """How many independent errors of the model a record holds: along a path more than one, as they drift."""
         if self.path is None:
             return 1.0
-        return 1.0 + _ERRORS_OF_A_DISCHARGE * drawn_charge_C(record) / self.path.cell.q_mobile
+        return 1.0 + self.path.errors_per_C * drawn_charge_C(record)
 
     def _hidden_sd(self, search: Search, fit: Fit) -> dict[str, float]:
         """
@@ -322,6 +317,8 @@ class LeastSquares(Estimator):
         fit, alone, cell, diagnosis = found.fit, found.alone, self.model.cell, Diagnosis()
         n, free, (q_mobile, r_o) = len(fit.residual_V), self.parameters, (fit.values[name] for name in PARAMETER_NAMES)
         own, moved_V2 = found.sd(alone), fit.square_V2 - alone.square_V2
+        if self.path is not None:
+            own = {**own, "q_mobile": OTHER_LIVES * own["q_mobile"]}
         unknown = [name for name in free if not own[name] < SETTLED_SHARES[name] * alone.values[name]]
         note_gaps(diagnosis, found.gaps, "q_mobile" in unknown)
         note_samples(diagnosis, record, cell, self.initial_soc[0] if self._at_rest else None, q_mobile, r_o, shown)
@@ -342,7 +339,7 @@ class LeastSquares(Estimator):
         _note_end(diagnosis, record, found, max(2.0 * self.mismatch_V, 3.0 * noise_V, _NEGLIGIBLE_V))
         if self.path is not None:
             distance = self.path.distance_sd(fit.values)
-            diagnosis.note(Condition.BESIDE_PATH, distance > _BESIDE_LIMIT_SD, distance=distance)
+            diagnosis.note(Condition.BESIDE_PATH, distance > BESIDE_LIMIT_SD, distance=distance)
         diagnosis.note(Condition.Q_PRIOR_WRONG, moved_V2 > PRIOR_LIMIT_SD**2 * found.variance_V2)
         diagnosis.note(Condition.Q_PRIOR_ALONE, "q_mobile" in unknown and self.prior_q_mobile_C is not None)
         for name in fit.at_bound:

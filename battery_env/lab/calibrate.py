@@ -16,6 +16,7 @@ import pandas as pd
 from battery_env.arrays import FloatArray
 from battery_env.checks import ZERO_CELSIUS_K
 from battery_env.electrochemistry import NEW_CELL, CellParameters
+from battery_env.electrochemistry.aging_path import cell_with
 from battery_env.electrochemistry.cell import TB
 from battery_env.electrochemistry.ends import quantile
 from battery_env.estimates import Estimate, last_estimate
@@ -30,6 +31,7 @@ from battery_env.lab.readers.discharges import each_usable
 from battery_env.lab.report import Calibration
 from battery_env.lab.settings import Method, Settings
 from battery_env.loads import Load, LoadToCome, constant, in_steps
+from battery_env.policies.estimator import PolicyEstimator
 from battery_env.records import ExpectedCurrent, Samples, drawn, expected_current, mean_current_A, shown_beside
 from battery_env.records.discharge import Discharge
 from battery_env.records.model import RecordModel, VoltageForecast
@@ -143,8 +145,7 @@ _GOES_ON = Ahead()
 def calibrated(discharge: Discharge, settings: Settings, ahead: Ahead = _GOES_ON) -> Calibration:
     """What one discharge says, and of one in progress what comes after it."""
     seen = _look_at(discharge, settings)
-    estimate, method, now = _estimate(seen, settings, ahead.load)
-    model = RecordModel(seen.cell, settings.thermal and method != "policy", initial_soc=seen.start.soc)
+    estimate, method, model, now = _estimate(seen, settings, ahead.load)
     # a cell in progress has not ended, however low its model comes in the pulses before
     limits = (-np.inf, 0.0) if seen.in_progress else (settings.cut_off_V, seen.future.mean_A)
     shown = model.forecast(seen.record, estimate, *limits)
@@ -215,10 +216,12 @@ def _look_at(discharge: Discharge, settings: Settings) -> _Seen:
     return _Seen(discharge, loaded, record, fitted, over_s, eod_time_s, in_progress, more_C, cell, start, load, future)
 
 
-def _estimate(seen: _Seen, settings: Settings, load: LoadToCome | None) -> tuple[Estimate, Method, ModelNow | None]:
+def _estimate(
+    seen: _Seen, settings: Settings, load: LoadToCome | None
+) -> tuple[Estimate, Method, RecordModel, ModelNow | None]:
     """
-    The estimate of the first method that settles the discharge, or of the last one; which it is; and of the filter where its
-    model stands.
+    The estimate of the first method that settles the discharge, or of the last one; which it is; the model that it is of; and
+    of the filter where this stands.
     """
     methods: list[Method] = [settings.method or "least-squares"]
     # under other loads the filter, which takes the error of the model for noise, is surer than it may be
@@ -229,15 +232,18 @@ def _estimate(seen: _Seen, settings: Settings, load: LoadToCome | None) -> tuple
         methods.append("kalman")
     for method in methods:
         calibrator = replace(settings, method=method).calibrator(seen.cell, seen.start)
+        cell, thermal, now = seen.cell, settings.thermal, None
         if isinstance(calibrator, ExtendedKalmanFilter):
             estimate, now = last_estimate(calibrator.follow(seen.fitted)), calibrator.now() if goes_on else None
         else:
-            estimate, now = calibrator.estimate(seen.fitted), None
+            estimate = calibrator.estimate(seen.fitted)
+        if isinstance(calibrator, PolicyEstimator):
+            cell, thermal = cell_with(calibrator.cell, estimate.constants), False
         if estimate.settled:
             break
     if reason := seen.start.reason or settings.other_load(mean_current_A(seen.record)):
         estimate = replace(estimate, settled_q_mobile=False, settled_r_o=False, reason=reason)
-    return estimate, method, now
+    return estimate, method, RecordModel(cell, thermal, initial_soc=seen.start.soc), now
 
 
 def _end(

@@ -7,10 +7,12 @@ from math import sqrt
 import numpy as np
 
 from battery_env.arrays import FloatArray
-from battery_env.electrochemistry import CellParameters
+from battery_env.electrochemistry import UNCERTAIN_CONSTANTS, CellParameters
+from battery_env.electrochemistry.aging_path import BESIDE_LIMIT_SD, EQUILIBRIUM_NAMES, OTHER_LIVES, AgingPath, cell_with
 from battery_env.estimates import Estimate
 from battery_env.estimators.diagnosis.conditions import (
     EXCESS_LIMIT_UNSTATED,
+    MISMATCH_MARGIN,
     SETTLED_SHARES,
     SPARE_SAMPLES,
     Condition,
@@ -31,9 +33,7 @@ from battery_env.tasks.voltage.task import ESTIMATE_RANGES, VoltageTask
 _NEGLIGIBLE_V = 2e-3
 # That a constant is at its limit is a matter of rounding
 _NEARLY = 1.0 - 1e-9
-# Samples may be this many times farther apart than readings for this share of them, and of the time
-_LONGER, _SPARSE_SHARE = 1.25, 0.05
-# The first voltage may be this many standard deviations of the noise, and the largest offset, beyond that of a full cell
+# The first voltage may be this many standard deviations of noise and model, and the largest offset, beyond that of a full cell
 _NOISES = 3.0
 # An offset may be this many times the bound that it was trained with
 _OFFSET_MARGIN = 2.0
@@ -51,32 +51,48 @@ class Confidence:
     def __init__(self, task: VoltageTask, cell: CellParameters, dt_s: float) -> None:
         self._parameters = task.parameters
         self._offset_V = task.sensors.offset_V
-        self._interval_s = task.readings.interval_s
-        self._model = RecordModel(cell, dt_s=dt_s)
+        self._path: AgingPath | None = task.path
+        self._cell, self._dt_s = cell, dt_s
 
     def standard_deviations(self, fitted: Fitted, estimate: FloatArray) -> FloatArray:
         """Those of the fit, with the distance of the estimate from it."""
         known = [name not in self._parameters for name in PARAMETER_NAMES]
         return np.where(known, np.nan, np.hypot(fitted.sd, fitted.estimate - estimate))
 
-    def verdict(self, fitted: Fitted, n: int, estimate: FloatArray, sd: FloatArray, record: Samples, shown: Shown) -> Verdict:
-        """Which numbers of an estimate are settled, and why not both."""
-        diagnosis, cell, (q_mobile, r_o) = Diagnosis(), self._model.cell, estimate.tolist()
+    def constants(self, fitted: Fitted, n: int) -> dict[str, float] | None:
+        """What the fit says of the constants along a path, by their names."""
+        if self._path is None:
+            return None
+        return dict(zip((*UNCERTAIN_CONSTANTS, *EQUILIBRIUM_NAMES), fitted.constants[n].tolist(), strict=True))
+
+    def verdict(self, fitted: Fitted, n: int, estimate: FloatArray, record: Samples, shown: Shown) -> Verdict:
+        """
+        Which numbers of an estimate are settled, and why not both. What is known of the parameters before settles nothing.
+        """
+        diagnosis, cell, (q_mobile, r_o) = Diagnosis(), self._cell, estimate.tolist()
+        other_lives = 1.0 if self._path is None else OTHER_LIVES
+        sd = np.hypot(fitted.sd_alone[n] * [other_lives, 1.0], fitted.estimate[n] - estimate)
         readings, white_V, offset_V = int(fitted.readings[n]), float(fitted.white_V[n]), abs(float(fitted.offset_V[n]))
         first_V, full_V = float(record.voltage_V[0]), rest_voltage_V(cell)
-        is_above = first_V > full_V + self._offset_V + _NOISES * white_V
+        mismatch_V = 0.0 if self._path is None else MISMATCH_MARGIN * self._path.mismatch_V
+        is_above = first_V > full_V + self._offset_V + _NOISES * sqrt(white_V**2 + mismatch_V**2)
         diagnosis.note(Condition.START_ABOVE, is_above, **start_measured(first_V, full_V))
         note_samples(diagnosis, record, cell, 1.0, q_mobile, r_o, shown)
-        diagnosis.note(Condition.SPARSE, self._is_sparse(record.time_s, readings), interval_s=self._interval_s)
         if len(long_intervals(record.time_s)):
-            model_V = self._model.voltage(record, Estimate(q_mobile, r_o))
+            model = RecordModel(cell_with(cell, self.constants(fitted, n)), dt_s=self._dt_s)
+            model_V = model.voltage(record, Estimate(q_mobile, r_o))
             note_gaps(diagnosis, find_gaps(*record, model_V, q_mobile))
         diagnosis.note(Condition.FEW, readings < len(self._parameters) + SPARE_SAMPLES, of="readings", or_else="")
         limit_V2 = (1.0 + EXCESS_LIMIT_UNSTATED / sqrt(readings)) * white_V**2 + _NEGLIGIBLE_V**2
+        limit_V2 += mismatch_V**2
         diagnosis.note(Condition.UNEXPLAINED, not fitted.noise_V[n] ** 2 <= limit_V2)
         is_off = offset_V > _OFFSET_MARGIN * self._offset_V
         diagnosis.note(Condition.OFFSET, is_off, offset_mV=1e3 * offset_V, most_mV=1e3 * self._offset_V)
-        diagnosis.note(Condition.CONSTANTS, fitted.constants_sd[n] > _NEARLY * REACH_SD)
+        if self._path is None:
+            diagnosis.note(Condition.CONSTANTS, fitted.constants_sd[n] > _NEARLY * REACH_SD)
+        else:
+            distance = float(fitted.constants_sd[n])
+            diagnosis.note(Condition.BESIDE_PATH, distance > BESIDE_LIMIT_SD, distance=distance)
         differs = np.abs(fitted.estimate[n] / estimate - 1.0)
         for name in self._parameters:
             k, share = PARAMETER_NAMES.index(name), SETTLED_SHARES[name]
@@ -85,13 +101,3 @@ class Confidence:
             diagnosis.note(Condition.Q_IMPRECISE.of(name), not sd[k] < share * estimate[k])
         values, sds = (dict(zip(PARAMETER_NAMES, each.tolist(), strict=True)) for each in (estimate, sd))
         return diagnosis.verdict(values, sds)
-
-    def _is_sparse(self, time_s: FloatArray, readings: int) -> bool:
-        """
-        Whether readings lie between samples at the start, or again and again, or for long. There they lie on a straight line,
-        which no cell follows, least of all when the load is switched on.
-        """
-        step_s = np.diff(np.append(time_s, max(time_s[-1], time_s[0] + readings * self._interval_s)))
-        is_long = step_s > _LONGER * self._interval_s
-        often = len(time_s) < 2 or bool(is_long[0]) or float(is_long.mean()) > _SPARSE_SHARE
-        return often or float(step_s[is_long].sum() / step_s.sum()) > _SPARSE_SHARE

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from importlib import import_module
 from math import inf, isnan, nan
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from battery_env.arrays import FloatArray
-from battery_env.electrochemistry import NEW_CELL, STATE_SIZE, UNCERTAIN_CONSTANTS
+from battery_env.arrays import BoolArray, FloatArray
+from battery_env.checks import check_positive
+from battery_env.electrochemistry import NEW_CELL, STATE_SIZE
+from battery_env.electrochemistry.aging_path import cell_with
 from battery_env.electrochemistry.ends import SURPLUS_SHARE
 from battery_env.estimates import last_estimate
 from battery_env.estimators.diagnosis.conditions import Condition, Verdict
@@ -53,6 +55,15 @@ class Predictor(Protocol):
         ...
 
 
+class OnGrid(NamedTuple):
+    """A record in equal steps, of which only some voltages were measured."""
+
+    time_s: FloatArray
+    voltage_V: FloatArray
+    current_A: FloatArray
+    measured: BoolArray
+
+
 class ReadingsSoFar:
     """
     Samples of one discharge that come in one by one, at any intervals, with missing voltages (NaN) among them.
@@ -73,18 +84,26 @@ class ReadingsSoFar:
         self.voltage_V.append(float(voltage_V))
         self.current_A.append(float(current_A))
 
-    def record(self, dt_s: float) -> Samples:
+    def record(self, dt_s: float) -> OnGrid:
         """
-        The same in equal steps: the mean current over each, so that the charge drawn is kept, and the voltage between the
-        samples that have one.
+        The same in equal steps: the mean current over each, so that the charge drawn is kept, and at the steps nearest to the
+        samples that have a voltage theirs.
         """
         time_s, voltage_V, current_A = self.columns()
-        steps = max(int(np.floor(time_s[-1] / dt_s + 1e-9)), 1)
+        steps = max(int(np.floor(time_s[-1] / dt_s + 0.5)), 1)
         grid_s = dt_s * np.arange(steps + 1, dtype=np.float64)
         drawn_C = np.append(0.0, np.cumsum(current_A[:-1] * np.diff(time_s)))
         mean_A = np.append(np.diff(np.interp(grid_s, time_s, drawn_C)) / dt_s, current_A[-1])
-        known = ~np.isnan(voltage_V)
-        return Samples(grid_s, np.interp(grid_s, time_s[known], voltage_V[known]), mean_A)
+        known = np.flatnonzero(~np.isnan(voltage_V))
+        nearest, first = np.unique(np.rint(time_s[known] / dt_s).astype(np.int64), return_index=True)
+        at_grid_V, measured = np.interp(grid_s, time_s[known], voltage_V[known]), np.zeros(steps + 1, dtype=np.bool_)
+        at_grid_V[nearest], measured[nearest] = voltage_V[known[first]], True
+        return OnGrid(grid_s, at_grid_V, mean_A, measured)
+
+    def are_two(self, until_s: float) -> bool:
+        """Whether two samples after the first one have a voltage."""
+        time_s, voltage_V, _ = self.columns()
+        return int(np.sum(~np.isnan(voltage_V[1:]) & (time_s[1:] <= until_s + 1e-9))) >= 2
 
     def known(self, until_s: float) -> Samples:
         """The samples that have a voltage."""
@@ -113,8 +132,8 @@ def _without_data(env_id: str, options: dict[str, Any]) -> dict[str, Any]:
     kind = None if task is None else task_class(task)
     if kind is None or not issubclass(kind, VoltageTask):
         return options
-    reading_s = float({**kind.options(), **options}["reading_s"])
-    time_s = np.array([0.0, 1.0, 2.0, 3.0]) * reading_s
+    reading_s = {**kind.options(), **options}["reading_s"]
+    time_s = np.array([0.0, 1.0, 2.0, 3.0]) * np.max(reading_s)
     blank = Samples(time_s, np.full(4, NEW_CELL.VEOD), np.zeros(4))
     return {**options, "cost": "misfit", "dataset": [blank] * kind.discharges_of_an_episode(options)}
 
@@ -148,7 +167,7 @@ class PolicyEstimator(OnlineEstimator):
 
     :param policy: what to ask for actions, deterministically
     :param env_id: id of the environment that the policy was trained on
-    :param decision_s: time between two estimates of a voltage-only policy, s, a multiple of the interval between its readings
+    :param decision_s: time between two estimates of a voltage-only policy, s
     :param options: of its task, but for its data and the length of its episodes; ``cell`` among them, the constants that a
         voltage-only policy was trained with, if not the new cell's
     :raises ValueError: if the id is not one of a calibration environment
@@ -162,8 +181,9 @@ class PolicyEstimator(OnlineEstimator):
         self.task_class = type(task)
         self.parameters = task.parameters
         self.cell = task.readings.cell if isinstance(task, VoltageTask) else NEW_CELL
-        self._every = task.steps_between(decision_s)
+        check_positive("decision_s", decision_s)
         self.decision_s = decision_s
+        self._no_constants = task.constants[0] if isinstance(task, VoltageTask) else np.zeros(0)
         self.dt_s = _STEP_S
         self._confidence: Confidence | None = None
         if isinstance(task, VoltageTask) and task.fitted() is not None:
@@ -179,7 +199,7 @@ class PolicyEstimator(OnlineEstimator):
         it is worth says :func:`~battery_env.policies.pretrained.pretrained_card`.
 
         :param env_id: id of a voltage-only environment of single discharges
-        :param decision_s: time between two estimates, s, a multiple of the interval between its readings
+        :param decision_s: time between two estimates, s
         :param recorded: whether for recorded cells: one that has learned on a model whose error wanders. By default one that
             has learned on a model with wrong constants, as simulated cells have
         :return: the estimator
@@ -213,18 +233,19 @@ class PolicyEstimator(OnlineEstimator):
         self._decisions = 0
         self._now = np.array([self.cell.q_mobile, self.cell.r_o])
         self._action = np.zeros(len(self.parameters))
-        self._logarithms = np.zeros(len(UNCERTAIN_CONSTANTS))
+        self._constants = self._no_constants
         self._fitted: Fitted | None = None
         self._judge()
 
     def _judge(self) -> None:
         """Tell how sure the estimate is, of the samples up to the last decision."""
-        self._sd = [nan, nan]
+        self._sd, self._found = [nan, nan], None
         self._verdict = Verdict(False, False, (Condition.NO_FIT if self._confidence is None else Condition.NOT_YET).text)
         if self._confidence is not None and self._fitted is not None:
             samples = self._readings.known(self._decisions * self.decision_s)
             (sd,) = self._confidence.standard_deviations(self._fitted, self._now[None])
-            self._verdict = self._confidence.verdict(self._fitted, 0, self._now, sd, samples, Shown())
+            self._verdict = self._confidence.verdict(self._fitted, 0, self._now, samples, Shown())
+            self._found = self._confidence.constants(self._fitted, 0)
             # the same NaN always, so that equal estimates are equal
             self._sd = [nan if isnan(each) else each for each in sd.tolist()]
 
@@ -258,21 +279,23 @@ class PolicyEstimator(OnlineEstimator):
             self._drawn_C += dt_s * readings.current_A[-1]
         readings.add(voltage_V, current_A, dt_s)
         due = int(readings.time_s[-1] / self.decision_s + 1e-9)
-        if due > self._decisions and due * self._every > 1:
+        if due > self._decisions and self._readings.are_two(due * self.decision_s):
             self._decide(due)
-        return Estimate(*self._now.tolist(), *self._sd, **self._verdict._asdict())
+        (q_mobile, r_o), (sd_q_mobile, sd_r_o), (settled_q, settled_r_o, reason) = self._now.tolist(), self._sd, self._verdict
+        both = settled_q and settled_r_o
+        return Estimate(q_mobile, r_o, sd_q_mobile, sd_r_o, both, reason, settled_q, settled_r_o, self._found)
 
-    def _follow(self, records: Sequence[Record], every: int) -> CalibrationTask:
+    def _follow(self, records: Sequence[Record], decision_s: float) -> CalibrationTask:
         # a data set may know its own constants, of which the policy must not learn
         cell = {"cell": self.cell} if issubclass(self.task_class, VoltageTask) else {}
-        return self.task_class.follow(records, every, **{**self.options, **cell})
+        return self.task_class.follow(records, decision_s, **{**self.options, **cell})
 
     def _decide(self, due: int) -> None:
         """One decision, on all readings up to the time when it was due."""
-        task = self._follow([self._readings.record(self.dt_s)], due * self._every)
+        task = self._follow([self._readings.record(self.dt_s)], due * self.decision_s)
         assert isinstance(task, VoltageTask)  # no other follows a stream
-        task.restore(self._now, self._action, self._logarithms)
-        self._logarithms = task.logarithms[0]
+        task.restore(self._now, self._action, self._constants)
+        self._constants = task.constants[0]
         self._fitted = task.fitted()
         action, _ = self.policy.predict(task.observation(), deterministic=True)
         task.advance(np.asarray(action))
@@ -281,7 +304,8 @@ class PolicyEstimator(OnlineEstimator):
 
     def now(self) -> ModelNow:
         """The model at the last sample, with the estimate as its parameters."""
-        model, (q_mobile, r_o) = RecordModel(self.cell, dt_s=self.dt_s), self._now.tolist()
+        model = RecordModel(cell_with(self.cell, self._found), dt_s=self.dt_s)
+        q_mobile, r_o = self._now.tolist()
         state = model.start(q_mobile)
         if self._readings.time_s and self._readings.time_s[-1] > 0.0:
             state = model.simulate(self._readings.record(self.dt_s).current_A, q_mobile, r_o).state[-1]
@@ -304,12 +328,13 @@ class PolicyEstimator(OnlineEstimator):
             "samples": self._readings.columns(),
             "progress": progress,
             "action": self._action,
-            "logarithms": self._logarithms,
+            "constants": self._constants,
         }
 
     def _check_state(self, arrays: dict[str, NDArray[Any]]) -> None:
         fit = {} if "fitted_readings" not in arrays else {f"fitted_{name}": np.zeros(1) for name in Fitted._fields}
-        fit |= {name: np.zeros((1, 2)) for name in ("fitted_estimate", "fitted_sd") if fit}
+        fit |= {name: np.zeros((1, 2)) for name in ("fitted_estimate", "fitted_sd", "fitted_sd_alone") if fit}
+        fit |= {"fitted_constants": self._no_constants[None]} if fit else {}
         fit |= {"fitted_readings": np.zeros(1, np.int64)} if fit else {}
         own = {name: array for name, array in self._arrays().items() if not name.startswith("fitted_")}
         check_like(arrays, own | fit, growing="samples")
@@ -322,11 +347,11 @@ class PolicyEstimator(OnlineEstimator):
             start=~first | ((time_s == 0.0) & ~np.isnan(voltage_V)),
             charge=np.isfinite(drawn_C),
             fit=[(np.abs(arrays[each]) < _LARGEST) | ((arrays[each] == inf) & (each == "fitted_white_V")) for each in fit],
-            spread=[arrays[each] >= 0.0 for each in fit if each.endswith(("sd", "_noise_V", "white_V"))],
+            spread=[arrays[each] >= 0.0 for each in fit if each.endswith(("sd", "sd_alone", "_noise_V", "white_V"))],
             readings=[arrays[each] > 0 for each in fit if each == "fitted_readings"],
             estimate=(arrays["progress"][2:] >= low) & (arrays["progress"][2:] <= high),
             action=np.abs(arrays["action"]) <= 1.0,
-            logarithms=np.isfinite(arrays["logarithms"]),
+            constants=np.isfinite(arrays["constants"]),
         )
         check_all(count=decisions in range(int(max(time_s, default=0.0) / self.decision_s + 1e-9) + 1))
 
@@ -334,7 +359,7 @@ class PolicyEstimator(OnlineEstimator):
         self._readings = ReadingsSoFar.of(arrays["samples"])
         self._drawn_C, self._decisions = float(arrays["progress"][0]), int(arrays["progress"][1])
         self._now, self._action = arrays["progress"][2:].copy(), arrays["action"].copy()
-        self._logarithms = arrays["logarithms"].copy()
+        self._constants = arrays["constants"].copy()
         names = [f"fitted_{name}" for name in Fitted._fields]
         self._fitted = Fitted(*(arrays[name] for name in names)) if set(names) <= arrays.keys() else None
         self._judge()
@@ -362,10 +387,11 @@ class PolicyEstimator(OnlineEstimator):
         :param records: discharges; a :class:`~battery_env.trajectories.TrajectoryDataset` is such a sequence
         :return: one trace per discharge, in the same order
         """
-        task = self._follow(records, self._every)
+        task = self._follow(records, self.decision_s)
         samples = [] if self._confidence is None else [(Samples.of(record), shown_beside(record)) for record in records]
         made: list[FloatArray] = []
         verdicts: list[Verdict] = []
+        found: list[dict[str, float] | None] = []
         while (running := ~task.truncated()).any():
             (discharge, time_s), fitted = task.seen(), task.fitted()
             action, _ = self.policy.predict(task.observation(), deterministic=True)
@@ -378,7 +404,8 @@ class PolicyEstimator(OnlineEstimator):
                 for n in np.flatnonzero(running).tolist():
                     record, shown = samples[discharge[n]]
                     so_far = record.first(int(np.searchsorted(record.time_s, time_s[n], side="right")))
-                    verdicts.append(self._confidence.verdict(fitted, n, estimate[n], sd[n], so_far, shown))
+                    verdicts.append(self._confidence.verdict(fitted, n, estimate[n], so_far, shown))
+                    found.append(self._confidence.constants(fitted, n))
             made.append(np.concatenate(columns, axis=1)[running])
             task.drop_ended()
         rows = np.concatenate(made)
@@ -389,4 +416,7 @@ class PolicyEstimator(OnlineEstimator):
         settled_q, settled_r_o = np.array([each[:2] for each in verdicts]).T
         texts = np.array([each.reason for each in verdicts], dtype=object)
         said = (settled_q & settled_r_o, texts, settled_q, settled_r_o)
-        return [EstimateTrace(*rows[n, 1:4].T, *rows[n, 4:6].T, *(column[n] for column in said)) for n in of_each]
+        traces = [EstimateTrace(*rows[n, 1:4].T, *rows[n, 4:6].T, *(column[n] for column in said)) for n in of_each]
+        if found[0] is None:
+            return traces
+        return [replace(trace, constants=[found[k] for k in n]) for trace, n in zip(traces, of_each, strict=True)]

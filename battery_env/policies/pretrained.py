@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from battery_env.electrochemistry import CellParameters
+from battery_env.electrochemistry.aging_path import AgingPath
 from battery_env.policies.onnx import OnnxPolicy
 
 _PACKAGE = "battery_env.policies.pretrained_policies"
@@ -52,7 +53,8 @@ def pretrained_policy(env_id: str, recorded: bool = False) -> tuple[OnnxPolicy, 
 def policy_of_file(path: Path) -> tuple[OnnxPolicy, dict[str, Any]]:
     """
     A policy from a file, with the options of its task from ``options`` of a JSON file of the same name beside it, if there is
-    one. The constants of a cell (``cell``) are written there by name, and ``sha256`` of the policy, where it is known.
+    one. The constants of a cell (``cell``) and a path of aging cells (``path``) are written there by name, and ``sha256`` of
+    the policy, where it is known.
 
     :raises ValueError: if the policy is damaged, or not that of the other file
     """
@@ -64,6 +66,8 @@ def policy_of_file(path: Path) -> tuple[OnnxPolicy, dict[str, Any]]:
         options, sha256 = dict(content["options"]), content.get("sha256", policy.sha256)
         if "cell" in options:
             options["cell"] = CellParameters.of_mapping(options["cell"])
+        if "path" in options:
+            options["path"] = AgingPath.of_mapping(options["path"])
     except (ValueError, TypeError, KeyError) as error:
         raise ValueError(f"{card} has to be an object in JSON with the options of the task as 'options': {error!r}") from error
     if policy.sha256 != sha256:

@@ -10,6 +10,7 @@ from typing import Literal, TypeVar, get_args
 import numpy as np
 
 from battery_env.electrochemistry import NEW_CELL, CellParameters
+from battery_env.electrochemistry.aging_path import AgingPath
 from battery_env.loads import Load, LoadSampler, RandomPiecewise, RandomWalk, constant, recorded
 from battery_env.records.discharge import BUNDLED_CELLS, load_nasa_discharges
 from battery_env.trajectories import PAPER_LOADS_W, PAPER_RANGES, PAPER_TRIM, TrajectoryDataset, aged_parameters
@@ -38,6 +39,7 @@ def standard_dataset(
     dt_s: float = 1.0,
     mismatch: float = 0.0,
     cell: CellParameters = NEW_CELL,
+    path: AgingPath | None = None,
 ) -> TrajectoryDataset:
     """
     A data set of cells of which one parameter has aged or both have, or one side of its 70/30 split by trajectory, made once
@@ -55,13 +57,13 @@ def standard_dataset(
 
     ``paper`` is trimmed to 5 .. 95 % of each discharge and, for one parameter of the new cell at 1 s without mismatch, the
     paper's own grid of 5511; the others run from full charge to the end of discharge. A parameter that does not age is that
-    of ``cell``.
+    of ``cell``. With a ``path`` the cells are drawn along it, with constants that age too.
     """
     if load not in get_args(LoadKind):
         raise ValueError(f"load must be one of {get_args(LoadKind)}, got {load!r}")
     if split not in get_args(Split):
         raise ValueError(f"split must be 'train', 'test' or 'all', got {split!r}")
-    return _splits(aged_parameters(parameters), load, dt_s, mismatch, cell)[split]
+    return _splits(aged_parameters(parameters), load, dt_s, mismatch, cell, path)[split]
 
 
 def opened(dataset: _Discharges | str | os.PathLike[str]) -> _Discharges | TrajectoryDataset:
@@ -78,9 +80,17 @@ def _loaded(path: str, modified_ns: int) -> TrajectoryDataset:
 
 @lru_cache(maxsize=6)
 def _splits(
-    parameters: tuple[str, ...], load: LoadKind, dt_s: float, mismatch: float, cell: CellParameters
+    parameters: tuple[str, ...],
+    load: LoadKind,
+    dt_s: float,
+    mismatch: float,
+    cell: CellParameters,
+    path: AgingPath | None,
 ) -> dict[Split, TrajectoryDataset]:
-    whole = _whole(parameters, load, dt_s, mismatch, cell)
+    if path is None:
+        whole = _whole(parameters, load, dt_s, mismatch, cell)
+    else:
+        whole = TrajectoryDataset.along(path, DISCHARGES, _loads(load, dt_s), SEED, dt_s)
     train, test = whole.split(test=TEST_SHARE, seed=SEED)
     return {"train": train, "test": test, "all": whole}
 

@@ -132,25 +132,15 @@ class CalibrationTask(ABC):
 
     @classmethod
     @abstractmethod
-    def follow(cls, records: Sequence[Any], every: int, **options: Any) -> CalibrationTask:
+    def follow(cls, records: Sequence[Any], decision_s: float, **options: Any) -> CalibrationTask:
         """
         Go through whole records from their beginning, for evaluation: every episode is as long as its records, and nothing is
         random but what options ask for.
 
         :param records: the discharges
-        :param every: what :meth:`steps_between` returned
+        :param decision_s: time between two decisions, s, where the task can choose it
         :param options: of the task, but for those of its data and the length of its episodes
         :return: the task, at its first observations
-        """
-
-    @abstractmethod
-    def steps_between(self, decision_s: float) -> int:
-        """
-        How many samples arrive between two decisions on a whole record.
-
-        :param decision_s: time that is asked for between them, s
-        :return: the samples
-        :raises ValueError: for a time that the task cannot keep
         """
 
     @abstractmethod
@@ -173,7 +163,7 @@ class CalibrationTask(ABC):
 
     def fitted(self) -> Fitted | None:
         """
-        What the fit in the observation says (option ``nuisance``).
+        What the fit in the observation says (options ``nuisance`` and ``path``).
 
         :return: of each cell; ``None`` if there is none
         """

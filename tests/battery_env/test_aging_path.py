@@ -7,13 +7,18 @@ import numpy as np
 import pytest
 
 import battery_env
-from battery_env import AgingPath, LeastSquares, TrajectoryDataset, fit_life, load_nasa_discharges
+from battery_env import AgingPath, LeastSquares, PolicyEstimator, TrajectoryDataset, evaluate, fit_life, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, UNCERTAIN_CONSTANTS, simulate
 from battery_env.electrochemistry.aging_path import BEYOND_SHARE, PATH_NAMES, SPREAD_SD, cell_with
 from battery_env.electrochemistry.equilibrium import with_equilibrium
+from battery_env.estimates import last_estimate
 from battery_env.loads import RandomPiecewise, constant
 from battery_env.records import Samples
 from battery_env.records.model import RecordModel
+from battery_env.records.samples import Stream
+from battery_env.sensors import SensorErrors
+from battery_env.tasks.voltage.pages import BatteryVoltageJoint, BatteryVoltageQmax
+from battery_env.tasks.voltage.task import ESTIMATE_RANGES
 
 AGES = 5
 LOAD = constant(2.0, "current")
@@ -216,6 +221,85 @@ class TestPrior:
     def test_it_knows_all_at_once(self, path, others):
         with pytest.raises(ValueError, match="path is of both parameters"):
             LeastSquares(path=path, **others)
+
+
+class Fit:
+    """A policy that leaves the estimate where the fit in its observation puts it."""
+
+    def predict(self, observation, deterministic=False):
+        return np.zeros((len(observation), 2), dtype=np.float32), None
+
+
+@pytest.fixture(scope="module")
+def whole():
+    return [each.loaded_part(2.7) for each in load_nasa_discharges("B0005")[2::40]]
+
+
+@pytest.fixture(scope="module")
+def along(b0006):
+    return PolicyEstimator(Fit(), "BatteryVoltageJoint-v0", path=b0006)
+
+
+class TestTask:
+    """The voltage-only task along a path."""
+
+    def test_the_fit_in_the_observation_says_what_least_squares_say(self, b0006, along, whole):
+        for trace, record in zip(along.trace(whole), whole, strict=True):
+            estimate, found = last_estimate(trace), LeastSquares(path=b0006).estimate(record)
+            assert estimate.settled and found.settled
+            assert estimate.q_mobile == pytest.approx(found.q_mobile, rel=0.005)
+            assert estimate.r_o == pytest.approx(found.r_o, rel=0.08)
+            assert estimate.sd_q_mobile == pytest.approx(found.sd_q_mobile, rel=0.3)
+            shown_V = RecordModel(cell_with(b0006.cell, estimate.constants)).voltage(record, estimate)
+            assert np.sqrt(np.mean((shown_V - record.voltage_V)[1:] ** 2)) < 0.012
+            # what rests on the path is not settled
+            assert not trace.settled_q_mobile[: len(trace.time_s) * 3 // 4].any()
+
+    def test_a_stream_ends_as_its_record_does(self, along, whole):
+        stream = Stream.of(whole[1], 1.0)
+        along.reset()
+        for sample in zip(stream.voltage_V.tolist(), stream.current_A.tolist(), stream.dt_s.tolist(), strict=True):
+            streamed = along.update(*sample)
+        # without the last decision, which comes after the last sample
+        assert streamed.q_mobile == pytest.approx(along.trace([whole[1]])[0].q_mobile[-2], rel=1e-3)
+        assert set(streamed.constants) == set(PATH_NAMES[:-2])
+
+    def test_an_action_goes_beside_the_fit_in_its_standard_deviations(self, path):
+        data = TrajectoryDataset.along(path, 4, [LOAD], seed=3)
+        task = BatteryVoltageJoint(4, dataset=data, path=path, cost="state", new_readings=(0, 0))
+        task.start(np.arange(4), [np.random.default_rng(k) for k in range(4)])
+        assert task.observation().shape == (4, 120)
+        fitted, (low, high) = task.fitted(), np.transpose(list(ESTIMATE_RANGES.values()))
+        task.advance(np.tile([0.25, -0.5], (4, 1)))
+        np.testing.assert_allclose(task.estimate, np.clip(fitted.estimate + [0.5, -1.0] * fitted.sd, low, high))
+
+    def test_intervals_along_the_path_hold(self, path):
+        data = TrajectoryDataset.along(path, 60, [constant(1.5, "current"), LOAD], seed=7)
+        estimator = PolicyEstimator(Fit(), "BatteryVoltageJoint-v0", path=path)
+        scores = evaluate(estimator, data, SensorErrors(0.002), seed=1)
+        assert 88.0 < scores["q_mobile_coverage_percent"].mean() < 99.9
+
+    def test_cells_of_another_kind_are_not_settled(self, along):
+        large = simulate(4.0, 15000.0, 0.06, load_unit="current", cut_off_V=2.7)
+        flat = with_equilibrium(NEW_CELL, [-0.35, 0.33, -0.05, 0.05])
+        phosphate = simulate(2.0, 6000.0, 0.12, load_unit="current", cell=flat, cut_off_V=2.5)
+        for made in (large, phosphate):
+            assert not along.estimate(every_tenth(made)).settled
+
+    def test_it_knows_all_at_once(self, path):
+        for others in ({"nuisance": 0.2}, {"mismatch": 0.2}):
+            with pytest.raises(ValueError, match="path says how far constants are off"):
+                BatteryVoltageJoint(1, path=path, **others)
+        with pytest.raises(ValueError, match="path says how far constants are off"):
+            BatteryVoltageQmax(1, path=path)
+
+    def test_irregular_readings_are_drawn(self, path):
+        data = TrajectoryDataset.along(path, 4, [LOAD], seed=3)
+        steps = np.diff(BatteryVoltageJoint(1, dataset=data, path=path, reading_s=(2.0, 20.0)).readings.time_s)
+        steps = steps[steps > 0.0]
+        assert steps.min() >= 1.0 and steps.max() <= 30.0 and len(np.unique(steps)) > 10
+        with pytest.raises(ValueError, match=r"interval_s must be \(least, most\)"):
+            BatteryVoltageJoint(1, dataset=data, path=path, reading_s=(20.0, 2.0))
 
 
 def test_fitting_a_life_warns_of_nothing():

@@ -5,11 +5,12 @@ import pytest
 
 from battery_env import PolicyEstimator, evaluate
 from battery_env.electrochemistry import NEW_CELL, UNCERTAIN_CONSTANTS, simulate
+from battery_env.electrochemistry.cell import POLYNOMIAL_SIZE
 from battery_env.loads import RandomPiecewise
 from battery_env.records import Samples
 from battery_env.sensors import SensorErrors
 from battery_env.tasks.vector_env import CalibrationVectorEnv
-from battery_env.tasks.voltage.fit import FOUND_SIZE, nuisance_step
+from battery_env.tasks.voltage.fit import Known, found_size, nuisance_step
 from battery_env.tasks.voltage.pages import BatteryVoltageJoint
 from battery_env.tasks.voltage.readings import Readings
 from battery_env.trajectories import TrajectoryDataset
@@ -25,7 +26,8 @@ def data(aged_both):
 
 def step(record, q_mobile, r_o, logarithms=(0.0, 0.0, 0.0, 0.0), prior_sd=KNOWS_NOTHING, count=None):
     """One step for one record, read every two seconds."""
-    readings, found = Readings.of([record], 2.0), np.full((1, FOUND_SIZE), np.nan)
+    readings, found = Readings.of([record], 2.0), np.full((1, found_size(len(UNKNOWNS))), np.nan)
+    nothing = np.eye(len(UNKNOWNS))
     nuisance_step(
         np.arange(1),
         readings.count if count is None else np.array([count]),
@@ -33,8 +35,15 @@ def step(record, q_mobile, r_o, logarithms=(0.0, 0.0, 0.0, 0.0), prior_sd=KNOWS_
         np.ascontiguousarray(readings.shown(0)[:, None]),
         readings.model,
         np.array([logarithms]),
-        np.array([q_mobile, r_o, 0.0, 0.0, 0.0, 0.0, 0.0]),
-        np.array(prior_sd, dtype=np.float64),
+        np.zeros((0, 1 + POLYNOMIAL_SIZE)),
+        Known(
+            np.array([[q_mobile, r_o, 0.0, 0.0, 0.0, 0.0, 0.0]]),
+            np.array([prior_sd], dtype=np.float64),
+            precision=nothing,
+            alone=nothing,
+            mismatch_V=0.0,
+            errors_per_C=0.0,
+        ),
         found,
     )
     return found[0]
@@ -91,7 +100,7 @@ def test_it_states_how_far_off_it_may_be(data):
             for noise in noises
         ]
     )
-    assert found[:, -1] == pytest.approx(0.005, rel=0.1)
+    assert found[:, 2 * len(UNKNOWNS)] == pytest.approx(0.005, rel=0.1)
     for n in (0, 1):
         stated = found[:, len(UNKNOWNS) + n].mean()
         assert 0.6 < found[:, n].std() / stated < 1.6

@@ -116,7 +116,7 @@ def test_other_intervals_and_time_steps():
     assert compare(readings, readings.q_mobile, readings.r_o)[3].max() < 1e-3
     with pytest.raises(ValueError, match=r"interval_s must be a multiple of the time step, 1 s, got 2.5"):
         Readings.of(data, interval_s=2.5)
-    with pytest.raises(ValueError, match="discharge 0 lasts 2 s, at least two intervals of 10 s"):
+    with pytest.raises(ValueError, match="discharge 0 lasts 2 s, at least two readings 10 s apart"):
         Readings.of([data[0].part(0, 5)], interval_s=10.0, dt_s=0.5)
     with pytest.raises(ValueError, match="at least one discharge"):
         Readings.of([])

@@ -131,8 +131,8 @@ class TestTask:
         (generator,) = generators(1, seed=7)
         generator.integers(0, 30, size=8)  # how many readings arrive
         shown = RandomSensorErrors(**sensors).draw(generator).apply(data[3], generator)
-        evaluated = BatteryVoltageJoint.follow([shown], 150, start="true", **sensors)
-        exact = BatteryVoltageJoint.follow([data[3]], 150, start="true", **sensors)
+        evaluated = BatteryVoltageJoint.follow([shown], 1500.0, start="true", **sensors)
+        exact = BatteryVoltageJoint.follow([data[3]], 1500.0, start="true", **sensors)
         np.testing.assert_allclose(task.observation(), evaluated.observation(), atol=0.05)
         assert np.abs(exact.observation() - evaluated.observation()).max() > 0.2
 

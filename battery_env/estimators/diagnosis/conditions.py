@@ -108,10 +108,6 @@ class Condition(IntEnum):
         "The record starts under load at {first_V:.2f} V, which need not be that of {expected}: it rests at {rest_V:.2f} V "
         "then. {start_advice}"
     )
-    SPARSE = (
-        "Samples lie farther apart than the {interval_s:g} s between the readings of the policy, or are missing at the start: "
-        "it reads a straight line between them, which misleads it. Least squares and the filter take such records."
-    )
     OTHER_LOAD = (
         "The load, {load_A:.3g} A, is none of those that the constants were fitted to, {fitted} A, and they hold for these: "
         "fit discharges of this load, too."

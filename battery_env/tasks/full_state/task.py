@@ -230,11 +230,12 @@ class FullStateTask(CalibrationTask):
         return cost
 
     @classmethod
-    def follow(cls, records: Sequence[Trajectory], every: int, **options: Any) -> FullStateTask:
+    def follow(cls, records: Sequence[Trajectory], decision_s: float, **options: Any) -> FullStateTask:
         """
         Go through whole discharges, each with a cell of its own, with the model's state running free from the first sample.
 
         :param records: simulated discharges; no recording has the full state
+        :param decision_s: without meaning: the policy decides at each sample
         """
         dataset = records if isinstance(records, TrajectoryDataset) else TrajectoryDataset.from_trajectories(records)
         samples = dataset.stop - dataset.first
@@ -244,10 +245,6 @@ class FullStateTask(CalibrationTask):
             point = {"trajectory": n, "sample": dataset.first[n]}
             task.start(np.array([row]), [np.random.default_rng(n)], point)
         return task
-
-    def steps_between(self, decision_s: float) -> int:
-        """1: the policy decides at each sample."""
-        return 1
 
     def seen(self) -> tuple[IntArray, FloatArray]:
         """Which data the next decision knows, x_{t+1} among them; times on the clock of the data set."""

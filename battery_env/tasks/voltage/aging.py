@@ -82,7 +82,7 @@ class BatteryAging(VoltageTask):
 
     ``cycles`` (20), ``decisions_per_cycle`` (8), ``split`` (``"train"``; or ``"test"``: 30 other lives), ``dataset``
     (discharges, life after life, each with ``cycles`` of them), and those of ``BatteryVoltageJoint-v0`` but for
-    ``episode_steps``, ``load``, ``dt_s``, ``mismatch`` and ``nuisance``; ``new_readings`` is (10, 60) and ``start``
+    ``episode_steps``, ``load``, ``dt_s``, ``mismatch``, ``nuisance`` and ``path``; ``new_readings`` is (10, 60) and ``start``
     ``"new_cell"`` here. ``reset(options={"discharge": n})`` takes the first discharge of a life.
 
     ## Version history
@@ -132,7 +132,7 @@ class BatteryAging(VoltageTask):
     @classmethod
     def options(cls) -> dict[str, Any]:
         """Its own options, and those of the voltage-only tasks that choose no standard discharges."""
-        decided = ("episode_steps", "load", "dt_s", "mismatch", "nuisance")
+        decided = ("episode_steps", "load", "dt_s", "mismatch", "nuisance", "path")
         inherited = {name: default for name, default in VoltageTask.options().items() if name not in decided}
         return {**inherited, **super(VoltageTask, cls).options()}
 
@@ -156,9 +156,9 @@ class BatteryAging(VoltageTask):
         return self.cycles * int(generator.integers(len(self.readings) // self.cycles))
 
     @classmethod
-    def follow(cls, records: Sequence[Record], every: int, **options: Any) -> BatteryAging:
+    def follow(cls, records: Sequence[Record], decision_s: float, **options: Any) -> BatteryAging:
         """Go through whole lives, each with a cell of its own; see :meth:`VoltageTask.follow`."""
-        task = super().follow(records, every, **options)
+        task = super().follow(records, decision_s, **options)
         assert isinstance(task, BatteryAging)
         task._carried = task._estimate.copy()
         return task

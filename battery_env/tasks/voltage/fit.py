@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,19 +11,26 @@ from numpy.typing import NDArray
 
 from battery_env.arrays import FloatArray, IntArray
 from battery_env.compiled import compiled, inlined, reassociating
+from battery_env.electrochemistry.aging_path import EQUILIBRIUM_NAMES, EQUILIBRIUM_SIZE, PATH_NAMES, AgingPath
 from battery_env.electrochemistry.cell import (
     BULK_RATE,
     PER_CURRENT_N,
+    POLYNOMIAL_SIZE,
     R_OVER_F,
     SURFACE_RATE,
     SURROUNDINGS,
     TO_RATE,
     TSN_RATE,
+    TSP_RATE,
+    U0,
     UNCERTAIN_CONSTANTS,
+    CellParameters,
 )
+from battery_env.electrochemistry.equilibrium import on_unit_range, with_equilibrium
 from battery_env.electrochemistry.kernels import BLOCK
-from battery_env.parameters import columns_of
+from battery_env.parameters import PARAMETER_NAMES, columns_of
 from battery_env.tasks.voltage.readings import (
+    AT_REST,
     BLOCK_SIZE,
     CURRENT,
     FURTHER_VSN,
@@ -33,10 +41,9 @@ from battery_env.tasks.voltage.readings import (
     RELATIVE_STEP,
     RESIDUAL,
     SLOPE,
+    STEPS,
     VSN,
     VSP,
-    Overpotentials,
-    Readings,
     nominal_overpotentials_of_block,
     pad_block,
     relax_block,
@@ -45,16 +52,16 @@ from battery_env.tasks.voltage.readings import (
     voltages_of_block,
 )
 
-# The unknowns: two parameters, the offset of the sensor, and the logarithms of UNCERTAIN_CONSTANTS. In the values of a block
-# they are rows of the derivatives of the voltage, and the residual is the row after them
-_Q, _R, _OFFSET, _KN, _T_DIFFUSION, _TO, _TSN, _RESIDUAL = range(8)
-_UNKNOWNS = 7
-_CONSTANTS = slice(_KN, _UNKNOWNS)
-#: What :func:`nuisance_step` finds: a step and a standard deviation of every unknown, and at last the noise.
-FOUND_SIZE = 2 * _UNKNOWNS + 1
-_NOISE = 2 * _UNKNOWNS
+# The unknowns: two parameters, the offset of the sensor, the logarithms of UNCERTAIN_CONSTANTS, and along a path what is added
+# to the equilibrium voltage. In the values of a block they are rows of the derivatives of the voltage, and the residual is the
+# row after them
+_Q, _R, _OFFSET, _KN, _T_DIFFUSION, _TO, _TSN, _EQUILIBRIUM = range(8)
 #: Logarithms of constants are held within this many of their standard deviations.
 REACH_SD = 3.0
+# Along a path, where constants make the model bend, a step moves q_mobile by this share at most, and all else in proportion.
+_LONGEST_STEP = 0.1
+# What is known of an unknown about which nothing is known, in its unit to the power of -2
+_NOTHING = 1e-6
 # What the parts of an observation are divided by; standard deviations by this share of the range of the estimate
 _VOLTAGE_SCALE_V = 0.010
 _SD_SCALE = 0.01
@@ -62,6 +69,10 @@ _SD_SCALE = 0.01
 _LEAST_NOISE_V = 0.001
 # How often the noise is told anew from what the step leaves of the residuals
 _NOISE_ROUNDS = 3
+
+# mole fractions of the positive electrode as -1 .. 1
+_UNIT_START = float(on_unit_range(0.0))
+_UNIT_SLOPE = float(on_unit_range(1.0)) - _UNIT_START
 
 assert UNCERTAIN_CONSTANTS == ("kn", "tDiffusion", "to", "tsn")
 
@@ -74,14 +85,19 @@ class Fitted(NamedTuple):
     :param sd: their standard deviations under the priors, 0 where one is known, same shape
     :param noise_V: root mean square of the residuals that it leaves, V, shape (cells,)
     :param offset_V: of the voltage sensor, V, shape (cells,)
+    :param sd_alone: what they would be if nothing were known of the parameters before, same shape
+    :param constants: logarithms of what ``UNCERTAIN_CONSTANTS`` are multiplied by, and along a path what is added to the
+        equilibrium voltage, V, shape (cells, 4) or (cells, 12)
     :param constants_sd: how far the constant lies from the model's that is the farthest, as a multiple of its standard
-        deviation, shape (cells,)
+        deviation; along a path how far the cell lies beside it, shape (cells,)
     :param readings: to how many it is a fit, shape (cells,)
     :param white_V: white part of their noise, which no model can explain, V, shape (cells,); infinite where they are too few
     """
 
     estimate: FloatArray
     sd: FloatArray
+    sd_alone: FloatArray
+    constants: FloatArray
     noise_V: FloatArray
     offset_V: FloatArray
     constants_sd: FloatArray
@@ -89,74 +105,188 @@ class Fitted(NamedTuple):
     white_V: FloatArray
 
 
-class NuisanceFit:
+@dataclass(frozen=True, eq=False)
+class FitPrior:
     """
-    A fit for each cell of a batch: of the parameters, of the offset of the voltage sensor, and of the constants of the model
-    that nobody knows exactly, each under a prior. One Gauss-Newton step is taken whenever the estimate moves or readings
-    arrive; it moves the constants, and is shown to the agent, which moves the parameters.
+    What is known of the unknowns before a discharge: normal, in units of their own.
 
-    :param cells: size of the batch
-    :param readings: of the discharges
-    :param parameters: which of both are to be found
-    :param ranges: where they are kept, C and ohm; a prior has the mean and the standard deviation of its range
-    :param offset_V: bound of the offset, V
-    :param nuisance: relative standard deviation of the constants
-    :ivar logarithms: of the factors that the constants of the model are multiplied by, shape (cells, 4)
+    :param mean: of all unknowns, shape (n,)
+    :param units: shape (n,); 0 for a parameter that is known
+    :param precision: the inverse of the covariance, in these units, shape (n, n)
+    :param alone: the same if nothing were known of the parameters, nor of what goes together with them
+    :param shown: what constants are divided by where an agent sees them, shape (n - 3,)
+    :param path: that the mean of parameters is of: their logarithms then, in the order of the unknowns; ``None``: no path
     """
 
-    def __init__(
-        self,
-        cells: int,
-        readings: Readings,
-        parameters: Sequence[str],
-        ranges: Mapping[str, tuple[float, float]],
-        offset_V: float,
-        nuisance: float,
-    ) -> None:
-        self._model = readings.model
-        self._columns = columns_of(parameters)
-        self._nuisance = nuisance
+    mean: FloatArray
+    units: FloatArray
+    precision: FloatArray
+    alone: FloatArray
+    shown: FloatArray
+    path: AgingPath | None = None
+
+    @classmethod
+    def of_ranges(
+        cls, parameters: Sequence[str], ranges: Mapping[str, tuple[float, float]], offset_V: float, nuisance: float
+    ) -> FitPrior:
+        """
+        Each for itself: parameters have the mean and the standard deviation of their ranges.
+
+        :param parameters: which of both are to be found
+        :param ranges: where they are kept, C and ohm
+        :param offset_V: bound of the offset, V
+        :param nuisance: relative standard deviation of the constants
+        """
         limits = np.array(list(ranges.values()))
         unknown = [name in parameters for name in ranges]
         constants = np.full(len(UNCERTAIN_CONSTANTS), np.sqrt(np.log1p(nuisance**2)))
-        self._prior_mean = np.concatenate([limits.mean(axis=1), np.zeros(1 + len(constants))])
         uniform = np.append(np.ptp(limits, axis=1) * unknown, 2.0 * offset_V) / np.sqrt(12.0)
-        self._prior_sd = np.concatenate([uniform, constants])
-        self.logarithms = np.zeros((cells, len(constants)))
-        self._found = np.zeros((cells, FOUND_SIZE))
-        self.observation_size = 2 * len(self._columns) + 2 + len(constants)
+        mean = np.concatenate([limits.mean(axis=1), np.zeros(1 + len(constants))])
+        alone = np.eye(len(mean))
+        alone[[_Q, _R], [_Q, _R]] = np.where(unknown, _NOTHING, 1.0)
+        units = np.concatenate([uniform, constants])
+        return cls(mean, units, np.eye(len(mean)), alone, np.full(len(constants), nuisance))
+
+    @classmethod
+    def along(cls, path: AgingPath, offset_V: float) -> FitPrior:
+        """
+        What goes together along a path.
+
+        :param path: how cells of the kind age
+        :param offset_V: bound of the offset, V
+        """
+        order = [PATH_NAMES.index(name) for name in (*PARAMETER_NAMES, *UNCERTAIN_CONSTANTS, *EQUILIBRIUM_NAMES)]
+        of_path = [k for k in range(len(order) + 1) if k != _OFFSET]
+        mean, covariance = path.moments
+        means, precision = np.zeros(len(of_path) + 1), np.zeros((len(of_path) + 1, len(of_path) + 1))
+        means[of_path] = mean[order]
+        precision[np.ix_(of_path, of_path)] = np.linalg.inv(covariance[np.ix_(order, order)])
+        precision[_OFFSET, _OFFSET] = 3.0 / offset_V**2 if offset_V > 0.0 else 1.0
+        variances = np.diag(np.linalg.inv(precision))
+        alone = np.diag(np.concatenate([[_NOTHING, _NOTHING], 1.0 / variances[_OFFSET:]]))
+        units = np.ones(len(means))
+        units[_OFFSET] = float(offset_V > 0.0)
+        return cls(means, units, precision, alone, np.sqrt(variances[_KN:]), path)
+
+
+class Known(NamedTuple):
+    """
+    What a step knows before the readings.
+
+    :param mean: of all unknowns, shape (n, unknowns)
+    :param units: likewise
+    :param precision: as of :class:`FitPrior`, shape (unknowns, unknowns)
+    :param alone: likewise
+    :param mismatch_V: what the model is expected to be off for all its constants, V
+    :param errors_per_C: how many independent errors of the model a coulomb shows, besides a first one
+    """
+
+    mean: FloatArray
+    units: FloatArray
+    precision: FloatArray
+    alone: FloatArray
+    mismatch_V: float
+    errors_per_C: float
+
+
+class NuisanceFit:
+    """
+    A fit for each cell of a batch: of the parameters, of the offset of the voltage sensor, and of the constants of the model
+    that nobody knows exactly, under a prior. One Gauss-Newton step is taken whenever the estimate moves or readings arrive; it
+    moves the constants, and is shown to the agent, which moves the parameters.
+
+    :param cells: size of the batch
+    :param model: of :attr:`~battery_env.tasks.voltage.readings.Readings.model`
+    :param cell: whose constants it has
+    :param parameters: which of both are to be found
+    :param prior: what is known before
+    :ivar constants: as of :class:`Fitted`
+    """
+
+    def __init__(
+        self, cells: int, model: NDArray[np.void], cell: CellParameters, parameters: Sequence[str], prior: FitPrior
+    ) -> None:
+        self.prior, unknowns = prior, len(prior.mean)
+        self._model, self._columns = model, columns_of(parameters)
+        self._sd = np.sqrt(np.diag(np.linalg.inv(prior.precision))) * prior.units
+        error = (0.0, 0.0) if prior.path is None else (prior.path.mismatch_V, prior.path.errors_per_C)
+        means, units = np.tile(prior.mean, (cells, 1)), np.tile(prior.units, (cells, 1))
+        self._known = Known(means, units, prior.precision, prior.alone, *error)
+        self._first = np.zeros(unknowns - _KN) if prior.path is None else prior.mean[_KN:]
+        self.constants = np.tile(self._first, (cells, 1))
+        self._found = np.zeros((cells, found_size(unknowns)))
+        self._added = _added_by_equilibrium(cell, unknowns - _EQUILIBRIUM)
+        self.observation_size = 2 * len(self._columns) + 2 + unknowns - _KN
 
     def step(self, rows: IntArray, count: IntArray, estimate: FloatArray, shown: FloatArray) -> None:
         """Take one step for some cells; the arguments are those of :func:`nuisance_step`."""
-        priors = self._prior_mean, self._prior_sd
-        nuisance_step(rows, count, estimate, shown, self._model, self.logarithms, *priors, self._found)
-        limit = REACH_SD * self._prior_sd[_CONSTANTS]
-        self.logarithms[rows] = np.clip(self.logarithms[rows] + self._found[rows, _CONSTANTS], -limit, limit)
+        if self.prior.path is not None:  # its normal distribution is one of logarithms
+            self._known.units[rows, : _R + 1] = now = estimate[rows]
+            self._known.mean[rows, : _R + 1] = now * (1.0 + self.prior.mean[: _R + 1] - np.log(now))
+        read = rows, count, estimate, shown, self._model
+        nuisance_step(*read, self.constants, self._added, self._known, self._found)
+        if self.prior.path is not None:
+            share = _LONGEST_STEP * estimate[rows, _Q] / np.maximum(np.abs(self._found[rows, _Q]), 1e-9)
+            self._found[rows, : len(self.prior.mean)] *= np.minimum(share, 1.0)[:, None]
+        reach = REACH_SD * self._sd[_KN:]
+        moved = self.constants[rows] + self._found[rows, _KN : len(self.prior.mean)]
+        self.constants[rows] = np.clip(moved, self._first - reach, self._first + reach)
+
+    def start(self, row: int) -> None:
+        """Forget the constants of a cell."""
+        self.constants[row] = self._first
 
     def found(self, estimate: FloatArray, readings: IntArray, white_V: FloatArray) -> Fitted:
         """What the last step found."""
-        found = self._found.copy()
-        step, sd = (found[:, start : start + 2] for start in (0, _UNKNOWNS))
-        constants_sd = np.abs(self.logarithms / self._prior_sd[_CONSTANTS]).max(axis=1)
-        return Fitted(estimate + step, sd, found[:, _NOISE], found[:, _OFFSET], constants_sd, readings, white_V)
+        found, n = self._found.copy(), len(self.prior.mean)
+        step, sd, sd_alone = (found[:, first : first + 2] for first in (0, n, 2 * n + 1))
+        constants, after = self.constants.copy(), estimate + step
+        if self.prior.path is None:
+            constants_sd = np.abs(constants / self._sd[_KN:]).max(axis=1)
+        else:
+            kept = np.maximum(after, 0.5 * estimate)  # a step so long has no logarithm
+            constants_sd = self.prior.path.distances_sd(np.hstack([constants, np.log(kept)]))
+        return Fitted(after, sd, sd_alone, constants, found[:, 2 * n], found[:, _OFFSET], constants_sd, readings, white_V)
+
+    def beside(self, estimate: FloatArray, distance_sd: FloatArray) -> FloatArray:
+        """Parameters that lie so many standard deviations beside those of the fit, C and ohm, shape (cells, 2)."""
+        n = len(self.prior.mean)
+        return estimate + self._found[:, : _R + 1] + distance_sd * self._found[:, n : n + _R + 1]
 
     def parts(self, largest_step: FloatArray, width: FloatArray) -> list[FloatArray]:
         """What the agent sees."""
-        step, sd = (self._found[:, start : start + 2][:, self._columns] for start in (0, _UNKNOWNS))
+        n = len(self.prior.mean)
+        step, sd = (self._found[:, first : first + 2][:, self._columns] for first in (0, n))
         return [
             np.clip(np.sign(step) * np.sqrt(np.abs(step) / largest_step), -1.0, 1.0),
             np.log(sd / (_SD_SCALE * width)),
-            np.log(self._found[:, _NOISE, None] / _VOLTAGE_SCALE_V),
+            np.log(self._found[:, 2 * n, None] / _VOLTAGE_SCALE_V),
             np.arcsinh(self._found[:, _OFFSET, None] / _VOLTAGE_SCALE_V),
-            self.logarithms / self._nuisance,
+            (self.constants - self._first) / self.prior.shown,
         ]
 
 
+def found_size(unknowns: int) -> int:
+    """Of what :func:`nuisance_step` finds: a step and a standard deviation of each unknown, the noise, and two deviations."""
+    return 2 * unknowns + 3
+
+
+def _added_by_equilibrium(cell: CellParameters, count: int) -> FloatArray:
+    # what each coefficient adds to U0 and to the polynomial of the positive electrode, shape (count, 1 + POLYNOMIAL_SIZE)
+    def packed(coefficients_V: FloatArray) -> FloatArray:
+        made = with_equilibrium(cell, coefficients_V).packed
+        return np.append(made.constants[0, U0], made.polynomial_p)
+
+    nothing = np.zeros(EQUILIBRIUM_SIZE)
+    return np.array([packed(row) - packed(nothing) for row in np.eye(EQUILIBRIUM_SIZE)[:count]]).reshape(
+        count, 1 + POLYNOMIAL_SIZE
+    )
+
+
 @compiled
-def _decay(rate: float, factor: float, interval_s: float, dt_s: float) -> tuple[float, float]:
-    # what is left after one interval if the time constant is multiplied by a factor, and the derivative by its logarithm
+def _decay(rate: float, factor: float, steps: float, dt_s: float) -> tuple[float, float]:
+    # what is left after some steps if the time constant is multiplied by a factor, and the derivative by its logarithm
     share = min(dt_s * rate / factor, 0.99)
-    steps = interval_s / dt_s
     left = (1.0 - share) ** steps
     return left, steps * left * share / (1.0 - share)
 
@@ -196,6 +326,7 @@ def _add_products(values: FloatArray, size: int, sums: FloatArray) -> None:
 class _Rates(NamedTuple):
     """What of charges and drops is left after an interval, and the derivatives by the logarithms of time constants."""
 
+    steps: float  # of the interval
     left_d: float  # of charge that diffuses
     slope_d: float
     gain_d: float  # how much of a current leaves the surface beyond its share at rest
@@ -207,6 +338,16 @@ class _Rates(NamedTuple):
     left_d0: float  # with the constants of the model
     gain_d0: float
     left_o0: float
+
+
+class _Slopes(NamedTuple):
+    """The derivatives of Vsn at one reading by the logarithms of kn and tsn, and what is left after the interval before it."""
+
+    by_kn: float
+    by_tsn: float
+    steps: float
+    left: float
+    slope: float
 
 
 class _Linear(NamedTuple):
@@ -221,27 +362,38 @@ class _Linear(NamedTuple):
 
 
 @inlined
-def _rates(model: Any, logarithms: FloatArray) -> _Rates:
-    constants, interval_s, dt_s = model.constants, model.interval_s, model.dt_s
+def _rates(model: Any, logarithms: FloatArray, steps: float) -> _Rates:
+    constants, dt_s = model.constants, model.dt_s
     rate_d = constants[0, BULK_RATE] + constants[0, SURFACE_RATE]
     at_rest = constants[0, BULK_RATE] / rate_d
     factor_d, factor_o, factor_n = np.exp(logarithms[1]), np.exp(logarithms[2]), np.exp(logarithms[3])
-    left_d0, _ = _decay(rate_d, 1.0, interval_s, dt_s)
-    left_o0, _ = _decay(constants[0, TO_RATE], 1.0, interval_s, dt_s)
-    left_d, slope_d = _decay(rate_d, factor_d, interval_s, dt_s)
-    left_o, slope_o = _decay(constants[0, TO_RATE], factor_o, interval_s, dt_s)
-    left_n, slope_n = _decay(constants[0, TSN_RATE], factor_n, interval_s, dt_s)
+    left_d0, _ = _decay(rate_d, 1.0, steps, dt_s)
+    left_o0, _ = _decay(constants[0, TO_RATE], 1.0, steps, dt_s)
+    left_d, slope_d = _decay(rate_d, factor_d, steps, dt_s)
+    left_o, slope_o = _decay(constants[0, TO_RATE], factor_o, steps, dt_s)
+    left_n, slope_n = _decay(constants[0, TSN_RATE], factor_n, steps, dt_s)
     gain_d0 = (1.0 - at_rest) * (1.0 - left_d0) / rate_d
     gain_d = (1.0 - at_rest) * (1.0 - left_d) * factor_d / rate_d
     gain_slope_d = gain_d - (1.0 - at_rest) * slope_d * factor_d / rate_d
-    return _Rates(left_d, slope_d, gain_d, gain_slope_d, left_o, slope_o, left_n, slope_n, left_d0, gain_d0, left_o0)
+    return _Rates(steps, left_d, slope_d, gain_d, gain_slope_d, left_o, slope_o, left_n, slope_n, left_d0, gain_d0, left_o0)
 
 
 @inlined
-def _follow_current(block: FloatArray, values: FloatArray, size: int, r_o: float, rates: _Rates, before: _Linear) -> _Linear:
+def _follow_current(
+    block: FloatArray,
+    values: FloatArray,
+    size: int,
+    r_o: float,
+    model: Any,
+    logarithms: FloatArray,
+    rates: _Rates,
+    before: _Linear,
+) -> tuple[_Linear, _Rates]:
     # From the states of the model's constants, in the block, to those of the fit, and their derivatives
     unequal, unequal_0, ohmic, ohmic_0, by_t_diffusion, by_to = before
     for k in range(size):
+        if block[STEPS * BLOCK + k] != rates.steps:
+            rates = _rates(model, logarithms, block[STEPS * BLOCK + k])
         current, shown = block[CURRENT * BLOCK + k], block[OHMIC * BLOCK + k]
         # the current that makes this ohmic drop of the one before
         effective = (shown - rates.left_o0 * ohmic_0) / (1.0 - rates.left_o0)
@@ -255,22 +407,25 @@ def _follow_current(block: FloatArray, values: FloatArray, size: int, r_o: float
         block[MOVED * BLOCK + k] = block[MOVED * BLOCK + k] + unequal - unequal_0
         block[OHMIC * BLOCK + k] = ohmic
         values[_T_DIFFUSION, k], values[_TO, k] = by_t_diffusion, -r_o * by_to
-    return _Linear(unequal, unequal_0, ohmic, ohmic_0, by_t_diffusion, by_to)
+    return _Linear(unequal, unequal_0, ohmic, ohmic_0, by_t_diffusion, by_to), rates
 
 
 @inlined
 def _differentiate_vsn(
-    block: FloatArray, values: FloatArray, size: int, rates: _Rates, vsn: float, before: tuple[float, float]
-) -> tuple[float, float]:
+    block: FloatArray, values: FloatArray, size: int, model: Any, factor: float, vsn: float, before: _Slopes
+) -> _Slopes:
     # The derivatives by kn and tsn from the values that Vsn tends to, which values has by kn; returns the last ones
-    by_kn, by_tsn = before
+    by_kn, by_tsn, steps, left, slope = before
     for k in range(size):
+        if block[STEPS * BLOCK + k] != steps:
+            steps = block[STEPS * BLOCK + k]
+            left, slope = _decay(model.constants[0, TSN_RATE], factor, steps, model.dt_s)
         nominal = block[VSN * BLOCK + k]
-        by_tsn = rates.left_n * by_tsn + rates.slope_n * (vsn - nominal)
-        by_kn += (1.0 - rates.left_n) * (values[_KN, k] - by_kn)
-        vsn += (1.0 - rates.left_n) * (nominal - vsn)
+        by_tsn = left * by_tsn + slope * (vsn - nominal)
+        by_kn += (1.0 - left) * (values[_KN, k] - by_kn)
+        vsn += (1.0 - left) * (nominal - vsn)
         values[_KN, k], values[_TSN, k] = -by_kn, -by_tsn
-    return by_kn, by_tsn
+    return _Slopes(by_kn, by_tsn, steps, left, slope)
 
 
 @inlined
@@ -293,35 +448,77 @@ def _differentiate_voltage(block: FloatArray, values: FloatArray, size: int, q: 
         # the equilibrium is a function of moved / q
         by_moved = -(slope + relaxing / step_C) * q / max(moved, 1.0)
         values[_Q, k], values[_R, k] = slope, -block[OHMIC * BLOCK + k]
-        values[_OFFSET, k], values[_RESIDUAL, k] = 1.0, block[RESIDUAL * BLOCK + k]
+        values[_OFFSET, k], values[len(values) - 1, k] = 1.0, block[RESIDUAL * BLOCK + k]
         values[_T_DIFFUSION, k] *= by_moved
+
+
+@inlined
+def _differentiate_equilibrium(block: FloatArray, values: FloatArray, size: int, q: float, constants: FloatArray) -> None:
+    # Legendre polynomials of the mole fraction
+    for k in range(size):
+        _, xp = surface_fractions(block[MOVED * BLOCK + k], q, constants)
+        x = xp * _UNIT_SLOPE + _UNIT_START
+        values[_EQUILIBRIUM, k], values[_EQUILIBRIUM + 1, k] = 1.0, x
+        for j in range(2, len(values) - 1 - _EQUILIBRIUM):
+            last, before = values[_EQUILIBRIUM + j - 1, k], values[_EQUILIBRIUM + j - 2, k]
+            values[_EQUILIBRIUM + j, k] = ((2 * j - 1) * x * last - (j - 1) * before) / j
 
 
 @compiled
 def _linearize(
-    n: int, end: int, estimate: FloatArray, shown: FloatArray, model: Any, logarithms: FloatArray, sums: FloatArray
-) -> None:
-    # The sums of products of the derivatives by all unknowns, and of the residual, over the readings of a cell
-    block, values, own = np.empty(BLOCK_SIZE), np.empty((_UNKNOWNS + 1, BLOCK)), model.constants.copy()
-    q, r = estimate[n, 0], estimate[n, 1]
-    own[0, PER_CURRENT_N] = model.constants[0, PER_CURRENT_N] / np.exp(logarithms[n, 0])
-    rates = _rates(model, logarithms[n])
-    linear, overpotentials = _Linear(0.0, 0.0, 0.0, 0.0, 0.0, 0.0), Overpotentials(0.0, 0.0, 0.0, 0.0)
-    by_constants, moved_before = (0.0, 0.0), 0.0
+    n: int,
+    end: int,
+    estimate: FloatArray,
+    shown: FloatArray,
+    model: Any,
+    constants: FloatArray,
+    added: FloatArray,
+    sums: FloatArray,
+) -> float:
+    # The sums of products of the derivatives by all unknowns, and of the residual, over the readings of a cell; returns the
+    # charge drawn
+    block, values, own = np.empty(BLOCK_SIZE), np.empty((len(sums), BLOCK)), model.constants.copy()
+    q, r, logarithms = estimate[n, 0], estimate[n, 1], constants[n]
+    own[0, PER_CURRENT_N] = model.constants[0, PER_CURRENT_N] / np.exp(logarithms[0])
+    polynomial_p = np.zeros(POLYNOMIAL_SIZE)
+    for k in range(POLYNOMIAL_SIZE):
+        polynomial_p[k] = model.polynomial_p[k]
+    for j in range(len(added)):
+        coefficient_V = logarithms[_EQUILIBRIUM - _KN + j]
+        own[0, U0] += coefficient_V * added[j, 0]
+        for k in range(POLYNOMIAL_SIZE):
+            polynomial_p[k] += coefficient_V * added[j, 1 + k]
+    share_n = min(model.dt_s * own[0, TSN_RATE] / np.exp(logarithms[3]), 0.99)
+    share_p = model.dt_s * own[0, TSP_RATE]
+    linear, rates, overpotentials = _Linear(0.0, 0.0, 0.0, 0.0, 0.0, 0.0), _rates(model, logarithms, 1.0), AT_REST
+    by_constants, moved_before, drawn_C = _Slopes(0.0, 0.0, 0.0, 1.0, 0.0), 0.0, 0.0
     sums[:] = 0.0
     for low in range(0, end, BLOCK):
         size = min(BLOCK, end - low)
         take_readings(block, shown, n, low, size)
-        linear = _follow_current(block, values, size, r, rates, linear)
+        for k in range(size):
+            drawn_C += block[CURRENT * BLOCK + k] * block[STEPS * BLOCK + k] * model.dt_s
+        linear, rates = _follow_current(block, values, size, r, model, logarithms, rates, linear)
         padded = pad_block(block, size, moved_before)
         moved_before = block[MOVED * BLOCK + size - 1]
         nominal_overpotentials_of_block(block, padded, q, own)
         _differentiate_nominal(block, values, padded, q, own)
-        by_constants = _differentiate_vsn(block, values, size, rates, overpotentials.vsn, by_constants)
-        overpotentials = relax_block(block, size, 1.0 - rates.left_n, model.relaxed_p, overpotentials)
-        voltages_of_block(block, padded, q, r, model)
+        factor_n = np.exp(logarithms[3])
+        by_constants = _differentiate_vsn(block, values, size, model, factor_n, overpotentials.vsn, by_constants)
+        overpotentials = relax_block(block, size, share_n, share_p, overpotentials)
+        voltages_of_block(block, padded, q, r, own, model.polynomial_n, polynomial_p)
         _differentiate_voltage(block, values, size, q)
+        if len(added) > 0:
+            _differentiate_equilibrium(block, values, size, q, own)
         _add_products(values, size, sums)
+    return drawn_C
+
+
+@inlined
+def _normal_matrix(sums: FloatArray, noise2: float, units: FloatArray, precision: FloatArray, matrix: FloatArray) -> None:
+    for j in range(len(units)):
+        for m in range(j + 1):
+            matrix[j, m] = matrix[m, j] = units[j] * units[m] * sums[j, m] / noise2 + precision[j, m]
 
 
 @compiled
@@ -329,35 +526,44 @@ def _solve_under_priors(
     sums: FloatArray,
     before: FloatArray,
     readings: int,
-    prior_mean: FloatArray,
-    prior_sd: FloatArray,
+    least_noise_V: float,
+    mean: FloatArray,
+    units: FloatArray,
+    precision: FloatArray,
+    alone: FloatArray,
     found: FloatArray,
 ) -> None:
-    # The step, its standard deviations and the noise, into found of shape (FOUND_SIZE,)
-    matrix, inverse = np.empty((2, _UNKNOWNS, _UNKNOWNS))
-    step = np.empty(_UNKNOWNS)
-    residuals = sums[_RESIDUAL, _RESIDUAL]
-    noise2 = max(residuals / readings, _LEAST_NOISE_V**2)
+    # The step, its standard deviations, the noise, and standard deviations without a prior of the parameters, into found
+    n = len(mean)
+    matrix, inverse = np.empty((2, n, n))
+    step, away = np.empty(n), np.zeros(n)
+    for j in range(n):
+        if units[j] > 0.0:
+            away[j] = (mean[j] - before[j]) / units[j]
+    residuals = sums[n, n]
+    noise2 = max(residuals / readings, least_noise_V**2)
     for _ in range(_NOISE_ROUNDS):
-        for j in range(_UNKNOWNS):
-            for m in range(j + 1):
-                matrix[j, m] = matrix[m, j] = prior_sd[j] * prior_sd[m] * sums[j, m] / noise2
-            matrix[j, j] += 1.0
-            step[j] = prior_sd[j] * sums[_RESIDUAL, j] / noise2
-            if prior_sd[j] > 0.0:
-                step[j] += (prior_mean[j] - before[j]) / prior_sd[j]
+        _normal_matrix(sums, noise2, units, precision, matrix)
+        for j in range(n):
+            step[j] = units[j] * sums[n, j] / noise2
+            for m in range(n):
+                step[j] += precision[j, m] * away[m]
         _solve(matrix, step, inverse)
         left = residuals
-        for j in range(_UNKNOWNS):
-            left -= 2.0 * prior_sd[j] * step[j] * sums[_RESIDUAL, j]
-            for m in range(_UNKNOWNS):
+        for j in range(n):
+            left -= 2.0 * units[j] * step[j] * sums[n, j]
+            for m in range(n):
                 product = sums[max(j, m), min(j, m)]
-                left += prior_sd[j] * step[j] * prior_sd[m] * step[m] * product
-        noise2 = max(left / readings, _LEAST_NOISE_V**2)
-    for j in range(_UNKNOWNS):
-        found[j] = prior_sd[j] * step[j]
-        found[_UNKNOWNS + j] = prior_sd[j] * np.sqrt(inverse[j, j])
-    found[_NOISE] = np.sqrt(noise2)
+                left += units[j] * step[j] * units[m] * step[m] * product
+        noise2 = max(left / readings, least_noise_V**2)
+    for j in range(n):
+        found[j] = units[j] * step[j]
+        found[n + j] = units[j] * np.sqrt(inverse[j, j])
+    found[2 * n] = np.sqrt(noise2)
+    _normal_matrix(sums, noise2, units, alone, matrix)
+    _solve(matrix, step, inverse)
+    for j in range(_R + 1):
+        found[2 * n + 1 + j] = units[j] * np.sqrt(inverse[j, j])
 
 
 @compiled
@@ -367,24 +573,29 @@ def nuisance_step(
     estimate: FloatArray,
     shown: FloatArray,
     model: NDArray[np.void],
-    logarithms: FloatArray,
-    prior_mean: FloatArray,
-    prior_sd: FloatArray,
+    constants: FloatArray,
+    added: FloatArray,
+    known: Known,
     found: FloatArray,
 ) -> None:
     """
     One Gauss-Newton step towards the (q_mobile, r_o), offset and constants that explain the readings of each cell best under
-    their priors; unchecked, all arrays contiguous. The arguments that :func:`battery_env.tasks.voltage.readings.explain` has
+    their prior; unchecked, all arrays contiguous. The arguments that :func:`battery_env.tasks.voltage.readings.explain` has
     too are the same.
 
-    :param logarithms: of the factors that the constants of the model are multiplied by, shape (n, 4)
-    :param prior_mean: of all unknowns, shape (7,)
-    :param prior_sd: their standard deviations, 0 where one is known, same shape
-    :param found: overwritten: step, standard deviations and noise, shape (n, FOUND_SIZE)
+    :param constants: as of :class:`Fitted`, shape (n, constants)
+    :param added: what the coefficients of the equilibrium voltage among them add to the model, shape (coefficients,
+        1 + POLYNOMIAL_SIZE)
+    :param known: what is known before
+    :param found: overwritten: what :func:`found_size` counts, shape (n, found_size)
     """
-    sums, before = np.empty((_UNKNOWNS + 1, _UNKNOWNS + 1)), np.zeros(_UNKNOWNS)
+    unknowns = known.mean.shape[1]
+    sums, before = np.empty((unknowns + 1, unknowns + 1)), np.zeros(unknowns)
     for n in rows:
-        _linearize(n, count[n], estimate, shown, model[0], logarithms, sums)
+        drawn_C = _linearize(n, count[n], estimate, shown, model[0], constants, added, sums)
         before[_Q], before[_R] = estimate[n, 0], estimate[n, 1]
-        before[_KN:] = logarithms[n]
-        _solve_under_priors(sums, before, count[n], prior_mean, prior_sd, found[n])
+        before[_KN:] = constants[n]
+        errors = 1.0 + known.errors_per_C * max(drawn_C, 0.0)
+        least_noise_V = np.sqrt(_LEAST_NOISE_V**2 + known.mismatch_V**2 * count[n] / errors)
+        prior = known.mean[n], known.units[n], known.precision, known.alone
+        _solve_under_priors(sums, before, count[n], least_noise_V, *prior, found[n])

@@ -50,6 +50,11 @@ class BatteryVoltageJoint(VoltageTask):
     | 107   | asinh of the offset over 10 mV |
     | 108-111 | logarithms of the four factors, over ``nuisance`` |
 
+    With a ``path`` of aging cells (``battery_env.fit_life``) the fit allows for all that ages along it, under one prior of what
+    goes together there: both parameters, the four factors, and eight coefficients of the equilibrium voltage. It expects the error
+    of the model that the path states, and moves q_mobile by a tenth at most. 108-119 are the factors and the coefficients, less
+    their means, over their standard deviations.
+
     Not Markov in the strict sense: the next cost depends on readings that have not arrived, and on those so far through more
     than their means. For the estimate of constant parameters the observation is nearly sufficient: residuals and
     sensitivities are what a Gauss-Newton step is made of. Noise, offset and errors of the current sensor are constant within
@@ -58,7 +63,8 @@ class BatteryVoltageJoint(VoltageTask):
     ## Action space
 
     ``Box(-1, 1, (2,), float32)``: the estimate of q_mobile and r_o moves by sign(a) a^2 times 1500 C and 0.12 ohm, and is
-    kept within the ranges above.
+    kept within the ranges above. With a ``path`` the action says how far from the fit's the estimate is to be: it becomes that of
+    the fit plus 2 a of its standard deviations.
 
     ## Reward
 
@@ -86,7 +92,7 @@ class BatteryVoltageJoint(VoltageTask):
     | argument | default | meaning |
     |----------|---------|---------|
     | ``episode_steps`` | 8 | decisions per episode |
-    | ``reading_s`` | 10 | time between two readings, s |
+    | ``reading_s`` | 10 | least time between two readings, s, which are taken at samples; (least, most): simulated discharges have irregular ones, of a mean between both that is drawn for each |
     | ``new_readings`` | (0, 29) | fewest and most readings between two decisions |
     | ``noise_V`` | (0.001, 0.030) | least and greatest standard deviation of the voltage sensor's noise, V |
     | ``offset_V`` | 0.010 | bound of the voltage sensor's offset, V; known to the agent |
@@ -102,6 +108,7 @@ class BatteryVoltageJoint(VoltageTask):
     | ``dt_s`` | 1 | time step of the cell, s |
     | ``mismatch`` | 0 | how far kn, tDiffusion, to and tsn of the cell are from the model's (relative standard deviation) |
     | ``nuisance`` | 0 | how far the agent is to take them to be; above 0 the observation has a fit that allows for it |
+    | ``path`` | none | an ``AgingPath``, or the file of one: the discharges are those of cells along it, and the agent knows what goes together there |
     | ``cell`` | none | constants of the model, an 18650's, as of ``fit_cell``: of the data set, or of a new cell by default |
     | ``dataset`` | none | other discharges from full charge, simulated (or the file of a saved ``TrajectoryDataset``) or recorded, in place of these |
     | ``render_mode`` | none | ``"rgb_array"`` |

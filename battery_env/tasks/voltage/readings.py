@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from battery_env.arrays import FloatArray, IntArray
 from battery_env.compiled import compiled, inlined
@@ -24,7 +24,15 @@ from battery_env.electrochemistry import (
     initial_state,
     simulate,
 )
-from battery_env.electrochemistry.cell import BULK_RATE, CONSTANTS_SIZE, POLYNOMIAL_SIZE, SURFACE_RATE, SURROUNDINGS
+from battery_env.electrochemistry.cell import (
+    BULK_RATE,
+    CONSTANTS_SIZE,
+    POLYNOMIAL_SIZE,
+    SURFACE_RATE,
+    SURROUNDINGS,
+    TSN_RATE,
+    TSP_RATE,
+)
 from battery_env.electrochemistry.kernels import BLOCK, equilibrium_voltage, mole_fraction, nominal_overpotentials
 from battery_env.records import Record, check_record, resample_current
 
@@ -40,23 +48,20 @@ _EQUAL_A = 1e-9
 
 # Readings are compared in blocks: one array, in rows that start at multiples that the compiler knows. It uses vector
 # instructions where it sees that rows do not overlap, and where no reading waits for the one before
-MEASURED, CURRENT, MOVED, OHMIC, HALF, VSN, VSP, FURTHER_VSN, FURTHER_VSP, MODELLED, RESIDUAL, SLOPE = range(12)
-BLOCK_SIZE = 12 * BLOCK
-#: The first rows are what sensors show of a discharge: voltage, V, mean current, A, charge that has left the surface of the
-#: negative electrode, C, and ohmic drop per ohm, A.
-SHOWN = 4
+MEASURED, CURRENT, MOVED, OHMIC, STEPS, HALF, VSN, VSP, FURTHER_VSN, FURTHER_VSP, MODELLED, RESIDUAL, SLOPE = range(13)
+BLOCK_SIZE = 13 * BLOCK
+#: The first rows are what sensors show of a discharge: voltage, V, mean current since the reading before, A, charge that has
+#: left the surface of the negative electrode, C, ohmic drop per ohm, A, and steps of the model since the reading before.
+SHOWN = 5
 # the most numbers that an instruction takes at once (AVX-512)
 _LANES = 8
 
-#: What the kernels know of the model, one record; what Vsn and Vsp go of their way in one interval as shares.
+#: What the kernels know of the model, one record.
 MODEL = np.dtype(
     [
         ("constants", float, (1, CONSTANTS_SIZE)),
         ("polynomial_n", float, (POLYNOMIAL_SIZE,)),
         ("polynomial_p", float, (POLYNOMIAL_SIZE,)),
-        ("relaxed_n", float),
-        ("relaxed_p", float),
-        ("interval_s", float),
         ("dt_s", float),
     ]
 )
@@ -65,7 +70,7 @@ MODEL = np.dtype(
 @dataclass(frozen=True, eq=False)
 class Readings:
     """
-    Discharges that start fully charged, read at a fixed interval, with what the model's linear part makes of their current.
+    Discharges that start fully charged, read at their samples, with what the model's linear part makes of their current.
 
     At a given history of the current the charges of the model are linear in ``q_mobile`` and its ohmic drop is linear in
     ``r_o``; so both follow for every (q_mobile, r_o) from two numbers a reading. Only the surface overpotentials must be
@@ -74,6 +79,7 @@ class Readings:
     :param start: where each discharge starts, shape (n,)
     :param start_s: time of its first sample, s, shape (n,)
     :param count: how many readings it has, shape (n,)
+    :param time_s: of the readings since the first sample, s, shape (total,)
     :param voltage_V: terminal voltage at the readings, shape (total,)
     :param current_A: mean current since the reading before, shape (total,)
     :param drawn_C: charge drawn since the start, shape (total,)
@@ -81,14 +87,15 @@ class Readings:
     :param ohmic_A: ohmic drop per ohm of ``r_o``, shape (total,)
     :param q_mobile: true value, C, NaN where it is not known, shape (n,)
     :param r_o: true value, ohm, NaN where it is not known, shape (n,)
-    :param interval_s: time between readings, s; the first lies one interval after the start
-    :param dt_s: time step at which the current was followed, s
+    :param interval_s: least time between readings, s
+    :param dt_s: time step at which the current was followed, s; readings are taken to lie at whole numbers of them
     :param cell: constants of the model
     """
 
     start: IntArray
     start_s: FloatArray
     count: IntArray
+    time_s: FloatArray
     voltage_V: FloatArray
     current_A: FloatArray
     drawn_C: FloatArray
@@ -102,43 +109,52 @@ class Readings:
 
     @classmethod
     def of(
-        cls, records: Sequence[Record], interval_s: float = 10.0, dt_s: float = 1.0, cell: CellParameters = NEW_CELL
+        cls,
+        records: Sequence[Record],
+        interval_s: float | tuple[float, float] = 10.0,
+        dt_s: float = 1.0,
+        cell: CellParameters = NEW_CELL,
     ) -> Readings:
-        """Read discharges."""
-        steps = round(interval_s / dt_s)
-        if steps < 1 or abs(steps * dt_s - interval_s) > 1e-9 * interval_s:
-            raise ValueError(f"interval_s must be a multiple of the time step, {dt_s:g} s, got {interval_s!r}")
+        """
+        Read discharges at their samples, or at some of them, so that readings lie ``interval_s`` apart at least.
+
+        :param records: discharges; one may say with ``measured`` which of its samples have a voltage, shape (K,)
+        :param interval_s: least time between readings, s; or the range that a mean time is drawn from for each discharge, with
+            intervals of half as long to half as long again, as testers write them
+        :raises ValueError: for an interval that is no whole number of steps, or a discharge without two readings
+        """
+        low_s, high_s = interval_s if isinstance(interval_s, Sequence) else (interval_s, interval_s)
+        least = round(low_s / dt_s)
+        if least < 1 or abs(least * dt_s - low_s) > 1e-9 * low_s:
+            raise ValueError(f"interval_s must be a multiple of the time step, {dt_s:g} s, got {low_s!r}")
+        if not low_s <= high_s < np.inf:
+            raise ValueError(f"interval_s must be (least, most) with least <= most, got {interval_s!r}")
+        rng = np.random.default_rng(0)
         columns: list[tuple[FloatArray, ...]] = []
-        start_s: list[float] = []
         for n, record in enumerate(records):
             samples = check_record(record, least_samples=2)
             time_s = samples.time_s - samples.time_s[0]
-            count = int(np.floor(time_s[-1] / interval_s + 1e-9))
-            if count < 2:
-                raise ValueError(
-                    f"discharge {n} lasts {time_s[-1]:g} s, at least two intervals of {interval_s:g} s are needed"
-                )
-            current_A = resample_current(time_s, samples.current_A, dt_s, count * steps)
-            at_s = interval_s * np.arange(1, count + 1)
-            start_s.append(float(record.time_s[0]))
+            wanted = np.full(len(time_s), float(least))
+            if high_s > low_s:
+                wanted = np.exp(rng.uniform(np.log(low_s), np.log(high_s))) / dt_s * rng.uniform(0.5, 1.5, len(time_s))
+            candidates = np.flatnonzero(getattr(record, "measured", np.ones(len(time_s), dtype=np.bool_)))
+            chosen = candidates[_apart(np.rint(time_s[candidates] / dt_s), wanted)]
+            if len(chosen) < 2:
+                raise ValueError(f"discharge {n} lasts {time_s[-1]:g} s, at least two readings {low_s:g} s apart are needed")
+            steps = np.rint(time_s[chosen] / dt_s).astype(np.int64)
+            current_A = resample_current(time_s, samples.current_A, dt_s, int(steps[-1]))
             drawn_C, moved_C, ohmic_A = _linear_part(current_A, steps, dt_s, cell)
-            columns.append(
-                (
-                    np.interp(at_s, time_s, samples.voltage_V),
-                    current_A.reshape(count, steps).mean(axis=1),
-                    drawn_C,
-                    moved_C,
-                    ohmic_A,
-                )
-            )
+            mean_A = np.diff(drawn_C, prepend=0.0) / (dt_s * np.diff(steps, prepend=0))
+            columns.append((dt_s * steps, samples.voltage_V[chosen], mean_A, drawn_C, moved_C, ohmic_A))
         if not columns:
             raise ValueError("there must be at least one discharge to read")
         counts = np.array([len(column[0]) for column in columns], dtype=np.int64)
-        voltage_V, current_A, drawn_C, moved_C, ohmic_A = (np.concatenate(parts) for parts in zip(*columns, strict=True))
+        at_s, voltage_V, current_A, drawn_C, moved_C, ohmic_A = map(np.concatenate, zip(*columns, strict=True))
         return cls(
             start=np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64),
-            start_s=np.array(start_s),
+            start_s=np.array([float(record.time_s[0]) for record in records]),
             count=counts,
+            time_s=at_s,
             voltage_V=voltage_V,
             current_A=current_A,
             drawn_C=drawn_C,
@@ -146,7 +162,7 @@ class Readings:
             ohmic_A=ohmic_A,
             q_mobile=np.array([r.q_mobile if isinstance(r, Trajectory) else np.nan for r in records]),
             r_o=np.array([r.r_o if isinstance(r, Trajectory) else np.nan for r in records]),
-            interval_s=interval_s,
+            interval_s=low_s,
             dt_s=dt_s,
             cell=cell,
         )
@@ -164,37 +180,36 @@ class Readings:
 
     @cached_property
     def _all_shown(self) -> FloatArray:
-        return np.stack([self.voltage_V, self.current_A, self.moved_C, self.ohmic_A])
+        return np.stack([self.voltage_V, self.current_A, self.moved_C, self.ohmic_A, self._steps])
+
+    @cached_property
+    def _steps(self) -> FloatArray:
+        """Steps of the model since the reading before."""
+        steps = np.diff(self.time_s, prepend=0.0)
+        steps[self.start] = self.time_s[self.start]
+        return np.rint(steps / self.dt_s)
 
     @cached_property
     def model(self) -> NDArray[np.void]:
         """What the kernels know of the model, shape (1,)."""
         model, cell = np.zeros(1, dtype=MODEL), self.cell
-        for name, value in {
-            **cell.packed._asdict(),
-            "relaxed_n": 1.0 - self.decay(cell.tsn),
-            "relaxed_p": 1.0 - self.decay(cell.tsp),
-            "interval_s": self.interval_s,
-            "dt_s": self.dt_s,
-        }.items():
+        for name, value in {**cell.packed._asdict(), "dt_s": self.dt_s}.items():
             model[name] = value
         return model
 
-    def decay(self, time_constant_s: ArrayLike) -> FloatArray:
-        """What is left after one interval of a quantity that decays, in the model's own steps."""
-        return (1.0 - self.dt_s / np.asarray(time_constant_s)) ** round(self.interval_s / self.dt_s)
+    def _left(self, discharge: int, time_constant_s: float) -> FloatArray:
+        """What is left after each interval of a quantity that decays, in the model's own steps."""
+        return np.asarray((1.0 - self.dt_s / time_constant_s) ** self._steps[self.part(discharge)])
 
-    def process_noise_V(self, deviation: float, draws: FloatArray) -> FloatArray:
+    def process_noise_V(self, discharge: int, deviation: float, draws: FloatArray) -> FloatArray:
         """What white noise on Vo, Vsn and Vsp of a cell adds to its voltage at the readings of one discharge."""
-        from scipy.signal import lfilter  # slow to import, and only process noise needs it
-
         cell, dt_s = self.cell, self.dt_s
         total = np.zeros(draws.shape[1])
         for draw, time_constant_s in zip(draws, (cell.to, cell.tsn, cell.tsp), strict=True):
-            left = float(self.decay(time_constant_s))
+            left = self._left(discharge, time_constant_s)
             # the variance of a sum of steps that decay on the way, over one interval
             variance = dt_s * (1.0 - left**2) / (1.0 - (1.0 - dt_s / time_constant_s) ** 2)
-            total -= lfilter([deviation * np.sqrt(variance)], [1.0, -left], draw)
+            total -= _filtered(deviation * np.sqrt(variance) * draw, left)
         return total
 
     def remeasured(self, discharge: int, gain: FloatArray, offset_A: float) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -202,32 +217,55 @@ class Readings:
         What another current sensor makes of one discharge. All is linear in the current: what each interval adds to the
         states is multiplied by its gain, and what a constant current adds is added.
         """
-        from scipy.signal import lfilter  # slow to import, and only another current sensor needs it
-
         part = self.part(discharge)
         constants = self.cell.packed.constants[0]
         rate = constants[BULK_RATE] + constants[SURFACE_RATE]
-        stay, at_rest = float(self.decay(1.0 / rate)), constants[BULK_RATE] / rate
-        steps = round(self.interval_s / self.dt_s)
-        unit = _linear_part(np.ones(steps), steps, self.dt_s, self.cell)
+        stay, at_rest = self._left(discharge, 1.0 / rate), constants[BULK_RATE] / rate
+        steps = self._steps[part].astype(np.int64)
+        unit = _linear_part(np.ones(int(steps.max())), np.arange(1, int(steps.max()) + 1), self.dt_s, self.cell)
+        _, moved_by_unit, ohmic_by_unit = (column[steps - 1] for column in unit)
         before = np.concatenate([[0.0], self.drawn_C[part][:-1]])
 
-        def refiltered(values: FloatArray, left: float, free: FloatArray, by_unit: float, free_now: FloatArray) -> FloatArray:
+        def refiltered(
+            values: FloatArray, left: FloatArray, free: FloatArray, by_unit: FloatArray, free_now: FloatArray
+        ) -> FloatArray:
             added = values - left * np.concatenate([[0.0], values[:-1]]) - free
-            return np.asarray(lfilter([1.0], [1.0, -left], gain * added + offset_A * by_unit + free_now))
+            return np.asarray(_filtered(gain * added + offset_A * by_unit + free_now, left))
 
-        drawn_C = np.cumsum(gain * np.diff(self.drawn_C[part], prepend=0.0) + offset_A * self.interval_s)
+        drawn_C = np.cumsum(gain * np.diff(self.drawn_C[part], prepend=0.0) + offset_A * self.dt_s * steps)
         # charge that is missing in the bulk flows after what has left the surface
         to_rest = (1.0 - stay) * at_rest
         before_now = np.concatenate([[0.0], drawn_C[:-1]])
-        moved_C = refiltered(self.moved_C[part], stay, to_rest * before, unit[1].item(), to_rest * before_now)
+        moved_C = refiltered(self.moved_C[part], stay, to_rest * before, moved_by_unit, to_rest * before_now)
         nothing = np.zeros_like(before)
-        ohmic_A = refiltered(self.ohmic_A[part], float(self.decay(self.cell.to)), nothing, unit[2].item(), nothing)
+        ohmic_A = refiltered(self.ohmic_A[part], self._left(discharge, self.cell.to), nothing, ohmic_by_unit, nothing)
         return gain * self.current_A[part] + offset_A, moved_C, ohmic_A
 
 
+@compiled
+def _apart(steps: FloatArray, wanted: FloatArray) -> IntArray:
+    # which samples lie at least so far apart, and the first of them so long after the start
+    chosen, last = np.empty(len(steps), np.int64), 0.0
+    count = 0
+    for k in range(len(steps)):
+        if steps[k] - last >= wanted[count]:
+            chosen[count], last = k, steps[k]
+            count += 1
+    return chosen[:count]
+
+
+@compiled
+def _filtered(added: FloatArray, left: FloatArray) -> FloatArray:
+    # a quantity that decays, to which each interval adds something
+    values, value = np.empty(len(added)), 0.0
+    for k in range(len(added)):
+        value = left[k] * value + added[k]
+        values[k] = value
+    return values
+
+
 def _linear_part(
-    current_A: FloatArray, steps: int, dt_s: float, cell: CellParameters
+    current_A: FloatArray, steps: IntArray, dt_s: float, cell: CellParameters
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     start = initial_state(_PLENTY_C, cell)
     state = simulate(
@@ -239,25 +277,35 @@ def _linear_part(
         cell=cell,
         cut_off_V=-np.inf,
         max_duration_s=len(current_A) * dt_s,
-    ).state[steps::steps]
+    ).state[steps]
     moved_C = start[QNS] - state[:, QNS]
     return moved_C + start[QNB] - state[:, QNB], moved_C, state[:, VO] / _ONE_OHM
 
 
 class Overpotentials(NamedTuple):
     """
-    Surface overpotentials at a reading, V.
+    Surface overpotentials at a reading, V, and what they went of their way since the one before.
 
     :param vsn: of the negative electrode
     :param vsp: of the positive electrode
     :param further_vsn: of the negative electrode at q (1 + ``RELATIVE_STEP``)
     :param further_vsp: likewise of the positive one
+    :param steps: of the model since the reading before
+    :param relaxed_n: the share that Vsn went in these
+    :param relaxed_p: likewise Vsp
     """
 
     vsn: float
     vsp: float
     further_vsn: float
     further_vsp: float
+    steps: float
+    relaxed_n: float
+    relaxed_p: float
+
+
+#: Before the first reading.
+AT_REST = Overpotentials(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @inlined
@@ -301,22 +349,32 @@ def nominal_overpotentials_of_block(block: FloatArray, size: int, q: float, cons
 
 
 @inlined
-def relax_block(block: FloatArray, size: int, relaxed_n: float, relaxed_p: float, before: Overpotentials) -> Overpotentials:
-    # From the values that overpotentials tend to to those that they have; returns the last ones
-    vsn, vsp, further_vsn, further_vsp = before
+def relax_block(block: FloatArray, size: int, share_n: float, share_p: float, before: Overpotentials) -> Overpotentials:
+    # From the values that overpotentials tend to, a share of the way with each step, to those that they have; returns the last
+    vsn, vsp, further_vsn, further_vsp, steps, relaxed_n, relaxed_p = before
     for k in range(size):
+        if block[STEPS * BLOCK + k] != steps:
+            steps = block[STEPS * BLOCK + k]
+            relaxed_n, relaxed_p = 1.0 - (1.0 - share_n) ** steps, 1.0 - (1.0 - share_p) ** steps
         vsn += relaxed_n * (block[VSN * BLOCK + k] - vsn)
         vsp += relaxed_p * (block[VSP * BLOCK + k] - vsp)
         further_vsn += relaxed_n * (block[FURTHER_VSN * BLOCK + k] - further_vsn)
         further_vsp += relaxed_p * (block[FURTHER_VSP * BLOCK + k] - further_vsp)
         block[VSN * BLOCK + k], block[VSP * BLOCK + k] = vsn, vsp
         block[FURTHER_VSN * BLOCK + k], block[FURTHER_VSP * BLOCK + k] = further_vsn, further_vsp
-    return Overpotentials(vsn, vsp, further_vsn, further_vsp)
+    return Overpotentials(vsn, vsp, further_vsn, further_vsp, steps, relaxed_n, relaxed_p)
 
 
 @compiled
-def voltages_of_block(block: FloatArray, size: int, q: float, r_o: float, model: Any) -> None:
-    constants, polynomial_n, polynomial_p = model.constants, model.polynomial_n, model.polynomial_p
+def voltages_of_block(
+    block: FloatArray,
+    size: int,
+    q: float,
+    r_o: float,
+    constants: FloatArray,
+    polynomial_n: FloatArray,
+    polynomial_p: FloatArray,
+) -> None:
     further_q, step_C, temperature_K = q * (1.0 + RELATIVE_STEP), q * RELATIVE_STEP, constants[0, SURROUNDINGS]
     for k in range(size):
         moved, ohmic_V = block[MOVED * BLOCK + k], r_o * block[OHMIC * BLOCK + k]
@@ -390,18 +448,19 @@ def explain(
     # of all readings of one cell: measured minus modelled voltage, and dV/dq
     residual, slope = np.empty((2, shown.shape[2]))
     cell = model[0]
-    constants, relaxed_n, relaxed_p = cell.constants, cell.relaxed_n, cell.relaxed_p
+    constants = cell.constants
+    share_n, share_p = cell.dt_s * constants[0, TSN_RATE], cell.dt_s * constants[0, TSP_RATE]
     for n in rows:
         end, q, r = count[n], estimate[n, 0], estimate[n, 1]
-        moved_before, overpotentials = 0.0, Overpotentials(0.0, 0.0, 0.0, 0.0)
+        moved_before, overpotentials = 0.0, AT_REST
         for low in range(0, end, BLOCK):
             size = min(BLOCK, end - low)
             take_readings(block, shown, n, low, size)
             padded = pad_block(block, size, moved_before)
             moved_before = block[MOVED * BLOCK + size - 1]
             nominal_overpotentials_of_block(block, padded, q, constants)
-            overpotentials = relax_block(block, size, relaxed_n, relaxed_p, overpotentials)
-            voltages_of_block(block, padded, q, r, cell)
+            overpotentials = relax_block(block, size, share_n, share_p, overpotentials)
+            voltages_of_block(block, padded, q, r, constants, cell.polynomial_n, cell.polynomial_p)
             for k in range(size):
                 residual[low + k] = block[RESIDUAL * BLOCK + k]
                 slope[low + k] = block[SLOPE * BLOCK + k]

@@ -18,14 +18,15 @@ from numpy.typing import NDArray
 
 from battery_env.arrays import FloatArray, IntArray
 from battery_env.checks import check_not_negative
-from battery_env.electrochemistry import UNCERTAIN_CONSTANTS, CellParameters, check_cell
+from battery_env.electrochemistry import CellParameters, check_cell
+from battery_env.electrochemistry.aging_path import AgingPath
 from battery_env.estimators.diagnosis.conditions import white_noise_V
 from battery_env.parameters import PARAMETER_NAMES, columns_of
 from battery_env.records import Record
 from battery_env.sensors import RandomSensorErrors
 from battery_env.tasks.data import LoadKind, Split, opened, standard_dataset
 from battery_env.tasks.task import OBSERVATION_LIMIT, CalibrationTask, check_counts, checked_action
-from battery_env.tasks.voltage.fit import Fitted, NuisanceFit
+from battery_env.tasks.voltage.fit import FitPrior, Fitted, NuisanceFit
 from battery_env.tasks.voltage.readings import CURRENT, MEASURED, OHMIC, SHOWN, Readings, explain
 from battery_env.trajectories import TrajectoryDataset
 
@@ -33,6 +34,9 @@ from battery_env.trajectories import TrajectoryDataset
 ESTIMATE_RANGES: dict[str, tuple[float, float]] = {"q_mobile": (3500.0, 8100.0), "r_o": (0.05, 0.35)}
 #: By how much an action of 1 moves the estimate, C and ohm.
 LARGEST_STEPS: dict[str, float] = {"q_mobile": 1500.0, "r_o": 0.12}
+
+#: Along a path an action of 1 takes the estimate this many standard deviations of the fit away from the fit's.
+FURTHEST_SD = 2.0
 
 #: Equal stretches of the data so far; each is averaged in two halves, of less and of more current.
 STRETCHES = 16
@@ -54,7 +58,9 @@ _TIME_SCALE_S = 3000.0
 
 
 @lru_cache(maxsize=4)
-def _readings_of_a_dataset(dataset: TrajectoryDataset, reading_s: float, cell: CellParameters) -> Readings:
+def _readings_of_a_dataset(
+    dataset: TrajectoryDataset, reading_s: float | tuple[float, float], cell: CellParameters
+) -> Readings:
     if dataset.first.any():
         raise ValueError(
             "dataset leaves out the start of discharges (it is trimmed, as with load='paper'), and voltages are judged from "
@@ -79,6 +85,7 @@ class VoltageTask(CalibrationTask):
 
     :ivar readings: what is read of the discharges
     :ivar sensors: what they are read with
+    :ivar path: along which the fit in the observation looks for the cell, if along one
     :param cells: size of the batch
     :raises ValueError: for values out of range
     """
@@ -88,7 +95,7 @@ class VoltageTask(CalibrationTask):
         cells: int,
         *,
         episode_steps: int = 8,
-        reading_s: float = 10.0,
+        reading_s: float | tuple[float, float] = 10.0,
         new_readings: tuple[int, int] = (0, 29),
         process_noise_V: float = 0.0,
         start: Literal["random", "new_cell", "true"] = "random",
@@ -99,6 +106,7 @@ class VoltageTask(CalibrationTask):
         dt_s: float = 1.0,
         mismatch: float = 0.0,
         nuisance: float = 0.0,
+        path: AgingPath | str | os.PathLike[str] | None = None,
         cell: CellParameters | None = None,
         dataset: Sequence[Record] | str | os.PathLike[str] | None = None,
         **sensors: Any,
@@ -111,7 +119,15 @@ class VoltageTask(CalibrationTask):
             raise ValueError(f"start must be one of ('random', 'new_cell', 'true'), got {start!r}")
         if cost not in get_args(Cost):
             raise ValueError(f"cost must be one of {get_args(Cost)}, got {cost!r}")
-        self._open(dataset, reading_s, cell, {"load": load, "split": split, "dt_s": dt_s, "mismatch": mismatch})
+        if path is not None:
+            path = path if isinstance(path, AgingPath) else AgingPath.from_json(path)
+            if nuisance > 0.0 or mismatch > 0.0 or len(self.parameters) < len(PARAMETER_NAMES):
+                raise ValueError(
+                    "path says how far constants are off, along with both parameters: leave nuisance and mismatch out, and "
+                    "take a task that looks for both"
+                )
+        chosen = {"load": load, "split": split, "dt_s": dt_s, "mismatch": mismatch}
+        self._open(dataset, reading_s, cell, path, chosen)
         self.cells, self.episode_steps, self.new_readings = cells, episode_steps, new_readings
         self.sensors = replace(SENSORS, **sensors)
         self.process_noise_V, self.first_estimate, self.consistency = process_noise_V, start, consistency
@@ -125,33 +141,42 @@ class VoltageTask(CalibrationTask):
                 f"{len(is_unknown)} discharges are not simulated: take cost='misfit' for recorded ones"
             )
         self.observation_size = 6 * STRETCHES + 4 + len(self.parameters) * (2 if consistency > 0.0 else 1)
-        self._fit: NuisanceFit | None = None
-        if nuisance > 0.0:
-            fitted = (self.readings, self.parameters, ESTIMATE_RANGES, self.sensors.offset_V, nuisance)
-            self._fit = NuisanceFit(cells, *fitted)
+        self.path, self._fit = path, None
+        if nuisance > 0.0 or path is not None:
+            prior = (
+                FitPrior.of_ranges(self.parameters, ESTIMATE_RANGES, self.sensors.offset_V, nuisance)
+                if path is None
+                else FitPrior.along(path, self.sensors.offset_V)
+            )
+            self._fit = NuisanceFit(cells, self.readings.model, self.readings.cell, self.parameters, prior)
             self.observation_size += self._fit.observation_size
-        self._every = 0  # readings between two decisions of a whole record; 0: of an episode they are drawn
+        self._every_s = 0.0  # time between two decisions on a whole record; 0: the readings of an episode are drawn
         self._allocate()
 
     def _open(
         self,
         dataset: Sequence[Record] | str | os.PathLike[str] | None,
-        reading_s: float,
+        reading_s: float | tuple[float, float],
         cell: CellParameters | None,
+        path: AgingPath | None,
         chosen: Mapping[str, Any],
     ) -> None:
         """Read the discharges that are given, or else those that are chosen."""
         dataset = opened(dataset)
         if cell is not None:
             self._check_reach(check_cell(cell))
+        elif path is not None:
+            cell = path.cell
         elif isinstance(dataset, TrajectoryDataset):
             cell = dataset.cell
         cell = check_cell(cell)
         if dataset is None:
-            dataset = standard_dataset(self.parameters, **chosen, cell=cell)
+            dataset = standard_dataset(self.parameters, **chosen, cell=cell, path=path)
         else:
             self._refuse_beside_a_dataset(**chosen)
         self.dataset = dataset
+        if isinstance(reading_s, Sequence):
+            reading_s = (reading_s[0], reading_s[1])
         if isinstance(dataset, TrajectoryDataset):
             self.readings = _readings_of_a_dataset(dataset, reading_s, cell)
         else:
@@ -252,24 +277,33 @@ class VoltageTask(CalibrationTask):
 
     def _first_count(self, discharge: int, generator: np.random.Generator | None) -> int:
         """How many readings there are at first: on a whole record as many as arrive between two decisions."""
-        length = int(self.readings.count[discharge])
-        return min(self._every, length) if generator is None else self._draw_count(length, generator)
+        if generator is None:
+            return int(self._due(discharge)[0])
+        return self._draw_count(int(self.readings.count[discharge]), generator)
+
+    def _due(self, discharge: int) -> IntArray:
+        """How many readings each decision on a whole record knows: two at least."""
+        time_s = self.readings.time_s[self.readings.part(discharge)]
+        first, last = (max(int(np.ceil(at_s / self._every_s - 1e-9)), 1) for at_s in time_s[[1, -1]])
+        due_s = self._every_s * np.arange(first, last + 1) * (1.0 + 1e-9)
+        return np.asarray(np.searchsorted(time_s, due_s, side="right"), dtype=np.int64)
 
     def _draw_count(self, length: int, generator: np.random.Generator) -> int:
         return int(generator.integers(_FEWEST_READINGS, length, endpoint=True))
 
     @classmethod
-    def follow(cls, records: Sequence[Record], every: int, **options: Any) -> VoltageTask:
+    def follow(cls, records: Sequence[Record], decision_s: float, **options: Any) -> VoltageTask:
         """
         Go through whole records, each with a cell of its own: from its first readings, measured as they are, and from the
         estimate of a new cell. The cost is the misfit, so that a policy of any cost can be asked about recorded discharges.
 
         :param records: discharges from full charge, simulated or recorded
-        :param every: readings between two decisions, and before the first one
         """
         discharges = cls.discharges_of_an_episode(options)
         task = cls(len(records) // discharges, **{"start": "new_cell", **options, "dataset": records, "cost": "misfit"})
-        task._every = every
+        task._every_s = decision_s
+        decisions = [len(task._due(n)) for n in range(len(records))]
+        task._arrivals = np.zeros((task.cells, sum(decisions)), dtype=np.int64)
         for row in range(task.cells):
             n = row * discharges
             task._place(row, n, task._first_count(n, None), task._first_estimate(n, None))
@@ -281,20 +315,15 @@ class VoltageTask(CalibrationTask):
         """How many discharges an episode goes through."""
         return 1
 
-    def steps_between(self, decision_s: float) -> int:
-        """How many readings arrive between two decisions; only whole numbers of them."""
-        interval_s = self.readings.interval_s
-        every = round(decision_s / interval_s)
-        if every < 1 or abs(every * interval_s - decision_s) > 1e-9 * interval_s:
-            raise ValueError(
-                f"decision_s must be a multiple of the interval between readings, {interval_s:g} s, got {decision_s!r}"
-            )
-        return every
-
     def seen(self) -> tuple[IntArray, FloatArray]:
         """Which readings the next decision knows."""
         readings = self.readings
-        return self.discharge.copy(), readings.start_s[self.discharge] + self.count * readings.interval_s
+        return self.discharge.copy(), readings.start_s[self.discharge] + self._time_s
+
+    @property
+    def _time_s(self) -> FloatArray:
+        """When the last reading was taken, s since the start."""
+        return np.asarray(self.readings.time_s[self.readings.start[self.discharge] + self.count - 1])
 
     @property
     def estimate(self) -> FloatArray:
@@ -302,7 +331,7 @@ class VoltageTask(CalibrationTask):
         return self._estimate.copy()
 
     def fitted(self) -> Fitted | None:
-        """What the fit in the observation says (option ``nuisance``)."""
+        """What the fit in the observation says (options ``nuisance`` and ``path``)."""
         if self._fit is None:
             return None
         # without the ohmic drops, which jump where the load is switched
@@ -323,9 +352,13 @@ class VoltageTask(CalibrationTask):
         self._shown[:, row, :length] = self.readings.shown(discharge)
         self._estimate[row] = estimate
         if self._fit is not None:
-            self._fit.logarithms[row] = 0.0
-        decisions = -(-int(length) // self._every) if self._every else self._decisions_in_a_discharge
-        self._last_step[row] = self._step_of_episode[row] + decisions
+            self._fit.start(row)
+        decisions, step = self._decisions_in_a_discharge, self._step_of_episode[row]
+        if self._every_s:
+            due = self._due(discharge)
+            decisions = len(due)
+            self._arrivals[row, step : step + decisions - 1] = np.diff(due)
+        self._last_step[row] = step + decisions
 
     @property
     def _decisions_in_a_discharge(self) -> int:
@@ -344,14 +377,14 @@ class VoltageTask(CalibrationTask):
         length = int(self.readings.count[discharge])
         voltage_V = self._shown[MEASURED, row, :length]
         if self.process_noise_V > 0.0:
-            voltage_V += self.readings.process_noise_V(self.process_noise_V, generator.standard_normal((3, length)))
+            voltage_V += self.readings.process_noise_V(discharge, self.process_noise_V, generator.standard_normal((3, length)))
         noise_V = self.sensors.draw_noise_V(generator)
         noise = generator.standard_normal(length) if noise_V > 0.0 else np.zeros(length)
         errors = self.sensors.draw_biases(generator, noise_V)
         read_V = errors.read_voltage_V(voltage_V, noise)
         if errors.change_the_current:
             measured = self.readings.remeasured(discharge, errors.gain(voltage_V, read_V), errors.current_offset_A)
-            self._shown[CURRENT:, row, :length] = measured
+            self._shown[CURRENT : OHMIC + 1, row, :length] = measured
         voltage_V[:] = read_V
 
     def _explain(self, rows: NDArray[np.intp] | None = None) -> None:
@@ -365,26 +398,26 @@ class VoltageTask(CalibrationTask):
         self._offset_V = np.clip(residual_V.mean(axis=(1, 2)), -self.sensors.offset_V, self.sensors.offset_V)
         self._misfit_V = np.sqrt(np.mean((residual_V - self._offset_V[:, None, None]) ** 2, axis=(1, 2)))
 
-    def restore(self, estimate: FloatArray, action: FloatArray, logarithms: FloatArray) -> None:
+    def restore(self, estimate: FloatArray, action: FloatArray, constants: FloatArray) -> None:
         """
         Let all cells stand where a policy left off.
 
         :param estimate: (q_mobile, r_o), C and ohm, shape (2,) or (cells, 2)
         :param action: the last one, shape (len(parameters),) or (cells, len(parameters))
-        :param logarithms: as of :attr:`logarithms`
+        :param constants: as of :attr:`constants`
         """
         self._estimate[:], self._action[:] = estimate, action
         if self._fit is not None:
-            self._fit.logarithms[:] = logarithms
+            self._fit.constants[:] = constants
         self._explain()
 
     @property
-    def logarithms(self) -> FloatArray:
+    def constants(self) -> FloatArray:
         """
-        The logarithms of the factors by which the fit in the observation multiplies ``UNCERTAIN_CONSTANTS``, 0 without one,
-        shape (cells, 4); a new array each time.
+        What the fit in the observation says of the constants, as of :class:`~battery_env.tasks.voltage.fit.Fitted`; nothing
+        without one; a new array each time.
         """
-        return np.zeros((self.cells, len(UNCERTAIN_CONSTANTS))) if self._fit is None else self._fit.logarithms.copy()
+        return np.zeros((self.cells, 0)) if self._fit is None else self._fit.constants.copy()
 
     def observation(self) -> NDArray[np.float32]:
         """
@@ -403,7 +436,7 @@ class VoltageTask(CalibrationTask):
             (ohmic_A / _CURRENT_SCALE_A).reshape(self.cells, -1),
             np.log((np.stack([self._misfit_V, self._rms_V], axis=1) + 0.1 * _MISFIT_FLOOR_V) / _MISFIT_SCALE_V),
             np.arcsinh(residual_V.mean(axis=(1, 2)) / _MISFIT_SCALE_V)[:, None],
-            (self.count * (self.readings.interval_s / _TIME_SCALE_S))[:, None],
+            (self._time_s / _TIME_SCALE_S)[:, None],
             self._scaled(self._estimate),
             *([self._action] if self.consistency > 0.0 else []),
             *([] if self._fit is None else self._fit.parts(self._step, self._high - self._low)),
@@ -416,7 +449,10 @@ class VoltageTask(CalibrationTask):
         """Move the estimates, let new readings arrive, and compare all data so far with the model."""
         chosen = checked_action(action, self._action.shape)
         step = np.clip(chosen, -1.0, 1.0)
-        moved = self._estimate[:, self._columns] + np.sign(step) * step**2 * self._step
+        if self._fit is not None and self.path is not None:
+            moved = self._fit.beside(self._estimate, FURTHEST_SD * step)
+        else:
+            moved = self._estimate[:, self._columns] + np.sign(step) * step**2 * self._step
         self._estimate[:, self._columns] = np.clip(moved, self._low, self._high)
         self._arrive()
         self._explain()
@@ -430,8 +466,8 @@ class VoltageTask(CalibrationTask):
         return np.asarray(np.linalg.norm(self._estimate / self._known[self.discharge] - 1.0, axis=1))
 
     def _arrive(self) -> None:
-        step = np.minimum(self._step_of_episode, self.episode_steps - 1)
-        arrived = self._every or self._arrivals[np.arange(self.cells), step]
+        step = np.minimum(self._step_of_episode, self._arrivals.shape[1] - 1)
+        arrived = self._arrivals[np.arange(self.cells), step]
         self.count = np.minimum(self.count + arrived, self.readings.count[self.discharge])
         self._step_of_episode += 1
 
