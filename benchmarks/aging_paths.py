@@ -1,102 +1,277 @@
 """
-How far the ageing of one recorded cell tells of another one: least squares with the path of a life as their prior, on
-discharges of the cell whose life it is not, whole and in progress, beside the filter that knows nothing and the discharge
-before.
+How far the ageing of one recorded cell tells of another one: the path of a life as the prior of least squares and of policies
+that learned on cells along it, on discharges of the cell whose life it is not, whole and in progress. Beside them the filter
+that knows nothing, the discharge before, and a regression that has the capacities of the life for labels.
 
 .. code-block:: bash
 
-  python -m benchmarks.aging_paths --every 4
+  python -m benchmarks.aging_paths --every 4 --algos lac sac published_lac --export
 
-Nothing is random. Settings of the paths were chosen with the path of B0006 on B0005; that of B0005 on B0006 is the test.
+With ``--export`` LAC learns along the paths of both cells, too, and its seeds become one file with its card, as it is shipped
+from ``battery_env/policies/pretrained_policies``.
+
+Settings of the paths were chosen with the path of B0006 on B0005; that of B0005 on B0006 is the test. Policies learn on
+simulated cells of the path, from the error of the simulated state; no recorded discharge is among their training data.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from battery_env import LeastSquares, fit_life, forecast, load_nasa_discharges
-from battery_env.electrochemistry.aging_path import AgingPath, cell_with
+from battery_env import (
+    AgingPath,
+    Estimate,
+    LeastSquares,
+    PolicyEstimator,
+    TrajectoryDataset,
+    fit_life,
+    forecast,
+    load_nasa_discharges,
+)
+from battery_env.arrays import FloatArray
+from battery_env.electrochemistry.aging_path import cell_with
 from battery_env.electrochemistry.ends import BAND
+from battery_env.estimates import last_estimate
+from battery_env.files import replacing
 from battery_env.lab.running import forecast_end
 from battery_env.lab.settings import Settings
+from battery_env.loads import Load, RandomLoad, RandomPiecewise, constant
 from battery_env.plotting import COLOURS
-from battery_env.records.discharge import Discharge
+from battery_env.policies.pretrained import file_stem
+from battery_env.records import drawn
+from battery_env.records.discharge import BUNDLED_CELLS, Discharge
 from battery_env.records.model import RecordModel
-from benchmarks.study import Study, Tables, command_line, digits, markdown, new_panels, positive
+from benchmarks.study import (
+    Study,
+    Tables,
+    command_line,
+    digits,
+    markdown,
+    natural,
+    new_panels,
+    positive,
+    versions,
+    write_json,
+)
+from benchmarks.training import Recipe, train_or_load, training_minutes
+from sb3_lac.onnx import export_onnx
 
 CUT_OFF_V = 2.7
 SHARES = (0.25, 0.5, 0.75, 1.0)
 CELLS = {"B0005": "B0006", "B0006": "B0005"}
+ENV_ID = "BatteryVoltageJoint-v0"
 PATH, FILTER, LAST = "least squares, path of {}", "what the command says, nothing known", "as long as the last"
+LABELLED, FIT = "regression on the labels of {}", "the fit that policies see, path of {}"
+LABELS = {"lac": "LAC", "sac": "SAC", "published_lac": "LAC as published"}
+#: How policies see a discharge along a path: readings that lie 2 to 20 s apart in the mean.
+OPTIONS: dict[str, Any] = {"reading_s": (2.0, 20.0)}
+#: What they learn with: sensors as good as a tester's, and a model whose voltage wanders by 7 mV.
+TRAINED_WITH: dict[str, Any] = {
+    "cost": "state",
+    "new_readings": (0, 29),
+    "noise_V": (0.0002, 0.010),
+    "process_noise_V": 0.0003,
+}
+#: How many cells policies learn on, and with how many updates: few, as they begin with what the fit says.
+TRAINING_CELLS, UPDATES = 700, 2500
+NETWORKS = "dict(net_arch=[64, 64], activation_fn=nn.LeakyReLU)"
+# A regression knows so many voltages, and how much it is held back: chosen on B0005.
+_VOLTAGES, _RIDGE = 16, 0.001
 
 
-def part(judged: str, every: int) -> Tables:
-    """The discharges of a cell by the path of the other one."""
-    path, discharges = fit_life(load_nasa_discharges(CELLS[judged])), load_nasa_discharges(judged)
-    chosen = range(1, len(discharges), every)
-    rows = [row for n in chosen for row in _said(path, CELLS[judged], discharges[n], discharges[n - 1])]
+class Loads(RandomLoad):
+    """Three of five discharges are at a constant current of 1 to 3 A, the others at one that changes again and again."""
+
+    def __call__(self, rng: np.random.Generator) -> Load:
+        """Draw one load."""
+        if rng.random() < 0.6:
+            return constant(float(np.exp(rng.uniform(0.0, np.log(3.0)))), "current")
+        return RandomPiecewise((0.5, 3.0), unit="current")(rng)
+
+
+class Mean:
+    """The mean of the actions of policies; of none at all the action 0, which leaves the estimate to the fit."""
+
+    def __init__(self, policies: Sequence[Any]) -> None:
+        self.policies = policies
+
+    def predict(self, observation: Any, /, *, deterministic: bool = True) -> tuple[FloatArray, None]:
+        """Actions for a batch of observations."""
+        if not self.policies:
+            return np.zeros((len(observation), 2)), None
+        return np.mean([each.predict(observation, deterministic=deterministic)[0] for each in self.policies], axis=0), None
+
+
+def path_of(cells: Sequence[str], folder: Path) -> tuple[AgingPath, Path]:
+    """The path of some lives, and its file."""
+    file = folder / f"path_{'_'.join(cells)}.json"
+    if not file.exists():
+        fit_life([load_nasa_discharges(cell) for cell in cells]).to_json(file)
+    return AgingPath.from_json(file), file
+
+
+def recipe_of(algo: str, cells: Sequence[str], seed: int, folder: Path) -> Recipe:
+    """How a policy learns along the path of some lives."""
+    path, file = path_of(cells, folder)
+    data = file.with_name(file.name.replace("path_", "cells_")).with_suffix(".npz")
+    if not data.exists():
+        TrajectoryDataset.along(path, TRAINING_CELLS, Loads(), seed=0).save(data)
+    options = {**OPTIONS, **TRAINED_WITH, "path": str(file), "dataset": str(data)}
+    own = {"env_kwargs": options, "policy_kwargs": NETWORKS}
+    return Recipe.of(algo, ENV_ID, seed, updates=UPDATES, hyperparameters=own)
+
+
+def part(judged: str, every: int, folder: Path) -> Tables:
+    """The discharges of a cell by what needs no training."""
+    life = CELLS[judged]
+    path, discharges = path_of([life], folder)[0], load_nasa_discharges(judged)
+    labelled = load_nasa_discharges(life)
+    rows = []
+    for n in range(1, len(discharges), every):
+        whole = _Whole(discharges[n])
+        rows += list(_said(path, life, labelled, whole, discharges[n - 1]))
     return {"discharges": pd.DataFrame(rows).assign(cell=judged)}
 
 
-def _said(path: AgingPath, life: str, whole: Discharge, last: Discharge) -> Iterator[dict[str, object]]:
-    """What each method says of a discharge at each share of its time, in per cent of the time or of ``q_mobile``."""
-    start_s, end_s = whole.load_on_time_s, whole.eod_time_s(CUT_OFF_V)
-    percent, known = 100.0 / (end_s - start_s), LeastSquares(mismatch_V=0.05, thermal=True)
-    q_mobile = known.estimate(whole.loaded_part(CUT_OFF_V)).q_mobile
+def learned(judged: str, every: int, method: str, algo: str, seeds: Sequence[int], folder: Path) -> Tables:
+    """The discharges of a cell by policies that learned along the path of the other one, their actions averaged."""
+    path = path_of([CELLS[judged]], folder)[0]
+    policies = [train_or_load(recipe_of(algo, [CELLS[judged]], seed, folder), folder / "models") for seed in seeds]
+    estimator = PolicyEstimator(Mean(policies), ENV_ID, path=path, **OPTIONS)
+    wholes = [_Whole(each) for each in load_nasa_discharges(judged)[1::every]]
+    rows = []
     for share in SHARES:
-        seen = whole.until(start_s + share * (end_s - start_s))
+        records = [whole.seen(share).loaded_part(CUT_OFF_V) for whole in wholes]
+        for whole, record, trace in zip(wholes, records, estimator.trace(records), strict=True):
+            rows.append({"method": method, **_row(path, whole, share, record, last_estimate(trace))})
+    seed = seeds[0] if len(seeds) == 1 else np.nan
+    return {"discharges": pd.DataFrame(rows).assign(cell=judged, seed=seed)}
+
+
+def _train(recipe: Recipe, models: Path) -> None:
+    train_or_load(recipe, models)
+
+
+class _Whole:
+    """A discharge to its end, and what least squares say of it."""
+
+    def __init__(self, discharge: Discharge) -> None:
+        self.discharge = discharge
+        self.start_s, self.end_s = discharge.load_on_time_s, discharge.eod_time_s(CUT_OFF_V)
+        known = LeastSquares(mismatch_V=0.05, thermal=True)
+        self.q_mobile = known.estimate(discharge.loaded_part(CUT_OFF_V)).q_mobile
+
+    def seen(self, share: float) -> Discharge:
+        """What there is of it after a share of its time."""
+        return self.discharge.until(self.start_s + share * (self.end_s - self.start_s))
+
+    def off(self, end_s: float) -> float:
+        """How far an end is off, in per cent of the time."""
+        return 100.0 * (end_s - self.end_s) / (self.end_s - self.start_s)
+
+
+def _row(path: AgingPath, whole: _Whole, share: float, record: Discharge, found: Estimate) -> dict[str, object]:
+    """What an estimate along a path is worth, in per cent of ``q_mobile``, and its end."""
+    row: dict[str, object] = {"share": share, "settled": found.settled_q_mobile}
+    row |= {"q_error_percent": 100.0 * (found.q_mobile / whole.q_mobile - 1.0)}
+    if share == 1.0:
+        return row
+    model = RecordModel(cell_with(path.cell, found.constants or {}))
+    ahead = forecast(record, found, cut_off_V=CUT_OFF_V, model=model, mismatch_V=path.mismatch_V)
+    return row | _end(whole, ahead.eod_quantile_s(BAND))
+
+
+def _end(whole: _Whole, quantiles_s: Sequence[float] | FloatArray) -> dict[str, object]:
+    low_s, median_s, high_s = quantiles_s
+    covered = float(low_s <= whole.end_s <= high_s)
+    width_percent = whole.off(high_s) - whole.off(low_s)
+    return {"error_percent": whole.off(median_s), "width_percent": width_percent, "covered": covered}
+
+
+def _said(
+    path: AgingPath, life: str, labelled: Sequence[Discharge], whole: _Whole, last: Discharge
+) -> Iterator[dict[str, object]]:
+    """What each method says of a discharge at each share of its time."""
+    for share in SHARES:
+        seen = whole.seen(share)
         record = seen.loaded_part(CUT_OFF_V)
-        found = LeastSquares(path=path).estimate(record)
-        row = {"method": PATH.format(life), "share": share, "settled": found.settled_q_mobile}
-        row |= {"q_error_percent": 100.0 * (found.q_mobile / q_mobile - 1.0)}
+        yield {"method": PATH.format(life), **_row(path, whole, share, record, LeastSquares(path=path).estimate(record))}
         if share == 1.0:
-            yield row
             continue
-        model = RecordModel(cell_with(path.cell, found.constants or {}))
-        of_path = forecast(record, found, cut_off_V=CUT_OFF_V, model=model, mismatch_V=path.mismatch_V)
-        for name, ahead in ((PATH.format(life), of_path), (FILTER, forecast_end(seen, Settings(cut_off_V=CUT_OFF_V)))):
-            low_s, median_s, high_s = ahead.eod_quantile_s(BAND)
-            said = {"method": name, "share": share, "error_percent": percent * (median_s - end_s)}
-            said |= {"width_percent": percent * (high_s - low_s), "covered": float(low_s <= end_s <= high_s)}
-            yield row | said if name != FILTER else said
+        ahead = forecast_end(seen, Settings(cut_off_V=CUT_OFF_V))
+        yield {"method": FILTER, "share": share, **_end(whole, ahead.eod_quantile_s(BAND))}
+        yield {"method": LABELLED.format(life), "share": share, "error_percent": _regression(labelled, whole, record)}
         lasted_s = last.eod_time_s(CUT_OFF_V) - last.load_on_time_s
-        yield {"method": LAST, "share": share, "error_percent": percent * (start_s + lasted_s - end_s)}
+        yield {"method": LAST, "share": share, "error_percent": whole.off(whole.start_s + lasted_s)}
+
+
+def _regression(labelled: Sequence[Discharge], whole: _Whole, record: Discharge) -> float:
+    """How far the end is off that a linear map of the voltages tells, learned on capacities that were measured, per cent."""
+    charge_C = record.charge_C
+    loaded = [each.loaded_part(CUT_OFF_V) for each in labelled]
+    usable = [each for each in loaded if each.charge_C > charge_C]
+    features = np.array([_voltages(each, charge_C) for each in usable])
+    targets = np.log([each.charge_C for each in usable])
+    mean, spread = features.mean(axis=0), features.std(axis=0) + 1e-6
+    scaled = (features - mean) / spread
+    held = _RIDGE * len(usable) * np.eye(_VOLTAGES)
+    weights = np.linalg.solve(scaled.T @ scaled + held, scaled.T @ (targets - targets.mean()))
+    told_C = float(np.exp(targets.mean() + (_voltages(record, charge_C) - mean) / spread @ weights))
+    capacity_C = whole.discharge.loaded_part(CUT_OFF_V).charge_C
+    return 100.0 * (told_C / capacity_C - 1.0)
+
+
+def _voltages(record: Discharge, charge_C: float) -> FloatArray:
+    """The voltage at equal steps of charge, up to one."""
+    drawn_C = drawn(record.time_s, record.current_A, record.time_s)
+    return np.interp(charge_C * (np.arange(_VOLTAGES) + 0.5) / _VOLTAGES, drawn_C - drawn_C[0], record.voltage_V)
 
 
 def summary(rows: pd.DataFrame) -> pd.DataFrame:
-    """One line a cell and method: the mean errors at each share."""
+    """One line a cell and method: the mean errors at each share, and over seeds the least and the most of them."""
     lines = []
     for (cell, method), group in rows.groupby(["cell", "method"], sort=False):
-        ends = group[group["share"] < 1.0].groupby("share")
-        line = {
+        ends = [each for _, each in group[group["share"] < 1.0].groupby("share")]
+        line: dict[str, object] = {
             "cell": cell,
             "method": method,
-            "end at 25 / 50 / 75 %: mean error (%)": " / ".join(
-                digits(each["error_percent"].abs().mean()) for _, each in ends
-            ),
-            "worst (%)": " / ".join(digits(each["error_percent"].abs().max()) for _, each in ends),
+            "end at 25 / 50 / 75 %: mean error (%)": " / ".join(_over_seeds(each, "error_percent") for each in ends),
+            "worst (%)": " / ".join(digits(each["error_percent"].abs().max()) for each in ends),
             "inside 90 % (%)": "",
             "whole: q_max off least squares, mean (worst) (%)": "",
             "settled, whole": "",
         }
         if group["covered"].notna().any():
-            line["inside 90 % (%)"] = " / ".join(f"{100.0 * each['covered'].mean():.0f}" for _, each in ends)
+            line["inside 90 % (%)"] = " / ".join(f"{100.0 * each['covered'].mean():.0f}" for each in ends)
         whole = group[group["share"] == 1.0]
         if len(whole):
-            q_error = whole["q_error_percent"].abs()
-            line["whole: q_max off least squares, mean (worst) (%)"] = f"{digits(q_error.mean())} ({digits(q_error.max())})"
+            worst = digits(whole["q_error_percent"].abs().max())
+            line["whole: q_max off least squares, mean (worst) (%)"] = f"{_over_seeds(whole, 'q_error_percent')} ({worst})"
             line["settled, whole"] = f"{whole['settled'].sum()} of {len(whole)}"
         lines.append(line)
     return pd.DataFrame(lines)
 
 
+def _over_seeds(rows: pd.DataFrame, column: str) -> str:
+    """Mean error, with its range over seeds where there are several."""
+    means = rows[column].abs().groupby(rows["seed"]).mean()
+    spread = f" [{digits(means.min())}, {digits(means.max())}]" if len(means) > 1 else ""
+    return digits(rows[column].abs().mean()) + spread
+
+
 def plot(rows: pd.DataFrame) -> Figure:
-    """The error of the end in each discharge of each cell, after half of the time."""
+    """The error of the end in each discharge of each cell, after half of the time; of policies those that act as one."""
+    shown = rows[(rows["share"] == 0.5) & rows["seed"].isna() & ~rows["method"].str.startswith(("regression", "the fit"))]
     figure, panels = new_panels(len(CELLS), 2, (4.2, 2.8), margin=(0.0, 0.4))
-    for axes, (cell, of_cell) in zip(panels, rows[rows["share"] == 0.5].groupby("cell"), strict=True):
+    for axes, (cell, of_cell) in zip(panels, shown.groupby("cell"), strict=True):
         for colour, (method, group) in zip(COLOURS, of_cell.groupby("method", sort=False), strict=False):
             axes.plot(range(len(group)), group["error_percent"], ".-", color=colour, lw=0.8, label=method)
         axes.axhline(0.0, color="black", lw=0.6)
@@ -105,14 +280,57 @@ def plot(rows: pd.DataFrame) -> Figure:
     return figure
 
 
+def export(seeds: Sequence[int], folder: Path, command: str) -> None:
+    """Train LAC along the paths of all bundled cells, and write its seeds as one file with its card."""
+    path, _ = path_of(BUNDLED_CELLS, folder)
+    recipes = [recipe_of("lac", BUNDLED_CELLS, seed, folder) for seed in seeds]
+    models = [train_or_load(recipe, folder / "models") for recipe in recipes]
+    file = folder / f"{file_stem(ENV_ID, recorded=True)}.onnx"
+    with replacing(file) as part_of_file:
+        export_onnx(models, part_of_file, ENV_ID)
+    card = {
+        "env_id": ENV_ID,
+        "options": {**OPTIONS, "path": path.to_mapping()},
+        "sha256": sha256(file.read_bytes()).hexdigest(),
+        "algorithm": "LAC",
+        "command": command,
+        "recipe": {**asdict(recipes[0]), "seed": list(seeds)},
+        "training_data": f"{TRAINING_CELLS} simulated cells along the lives of {' and '.join(BUNDLED_CELLS)}",
+        "training_minutes": sum(training_minutes(recipe, folder / "models") for recipe in recipes),
+        "versions": versions(),
+    }
+    write_json(file.with_suffix(".json"), card)
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command line."""
     parser = command_line("aging_paths", __doc__)
     parser.add_argument("--every", type=positive, default=4, help="take one discharge of so many")
+    parser.add_argument("--algos", nargs="+", default=["lac"], choices=LABELS, help="of policies")
+    parser.add_argument("--seeds", type=natural, nargs="+", default=[0, 1, 2, 3, 4], help="of policies")
+    parser.add_argument("--export", action="store_true", help="write the policy that comes with the package")
     study = Study(parser, arguments)
-    parts = [{"judged": cell, "every": study.chosen.every} for cell in CELLS]
-    rows = study.run(part, parts)["discharges"]
-    study.write({"discharges": rows}, {"ends": plot(rows)}, markdown(summary(rows)))
+    chosen = study.chosen
+    runs = [(algo, [life], seed) for life in BUNDLED_CELLS for algo in chosen.algos for seed in chosen.seeds]
+    runs += [("lac", list(BUNDLED_CELLS), seed) for seed in chosen.seeds if chosen.export]
+    recipes = [recipe_of(algo, lives, seed, study.out) for algo, lives, seed in runs]
+    study.each(_train, [(recipe, study.out / "models") for recipe in recipes])
+    study.configuration |= {"options": OPTIONS, "trained_with": TRAINED_WITH, "cells": TRAINING_CELLS, "updates": UPDATES}
+    known = [{"judged": cell, "every": chosen.every} for cell in CELLS]
+    rows = [study.run(part, known, folder=study.out)["discharges"]]
+    asked: list[dict[str, Any]] = []
+    for judged, life in CELLS.items():
+        of_cell = {"judged": judged, "every": chosen.every}
+        asked.append({**of_cell, "method": FIT.format(life), "algo": "lac", "seeds": []})
+        for algo in chosen.algos:
+            name = f"{LABELS[algo]}, path of {life}"
+            asked += [{**of_cell, "method": name, "algo": algo, "seeds": [seed]} for seed in chosen.seeds]
+            asked.append({**of_cell, "method": f"{name}, {len(chosen.seeds)} as one", "algo": algo, "seeds": chosen.seeds})
+    rows.append(study.run(learned, asked, folder=study.out)["discharges"])
+    table = pd.concat(rows, ignore_index=True).sort_values("cell", kind="stable", ignore_index=True)
+    if chosen.export:
+        export(chosen.seeds, study.out, study.command)
+    study.write({"discharges": table}, {"ends": plot(table)}, markdown(summary(table)))
 
 
 if __name__ == "__main__":
