@@ -16,9 +16,10 @@ from battery_env.electrochemistry import STATE_SIZE, CellParameters, PackedConst
 from battery_env.electrochemistry.ends import SURPLUS_SHARE
 from battery_env.electrochemistry.tangents import PolynomialDerivatives
 from battery_env.estimates import Estimate, Estimates, EstimateTrace
+from battery_env.estimators.diagnosis import gaps
 from battery_env.estimators.diagnosis.conditions import Condition, Verdict
 from battery_env.estimators.diagnosis.rest import check_initial_soc
-from battery_env.estimators.diagnosis.samples import begin, examine, expect, follow_gaps, measured, remember, take_in
+from battery_env.estimators.diagnosis.samples import begin, examine, expect, measured, remember, take_in
 from battery_env.estimators.estimator import ModelNow, OnlineBatch, OnlineEstimator, check_bounds
 from battery_env.estimators.kalman.bank import conclude, filters_of_prior, take
 from battery_env.estimators.kalman.state import CELL, ESTIMATE, FILTER, SAMPLE, Q, R, Settings
@@ -429,6 +430,6 @@ def _follow_all(
             q_mobile, r_o = bank.mean[Q], bank.mean[R]
             examine(seen, voltage, current, q_mobile, r_o, settings.cell_q_mobile)
             if seen.samples > 1 and duration > 0.0:
-                follow_gaps(seen, voltage, current, duration, bank.expected_V, q_mobile)
+                gaps.follow(seen, voltage, current, bank.expected_V, q_mobile)
             conclude(cell, settings, estimates[k, n])
             remember(seen, voltage, current)
