@@ -13,8 +13,8 @@ from battery_env.estimators.diagnosis.rows import NOISES, SMOOTHED_SHARE, STEADY
 from battery_env.records import REST_CURRENT_A, SWITCH_SHARE
 
 # An interval between two samples is a gap where it is so many times longer than the one before, and what its load draws in
-# the time that is longer is above this share of ``q_mobile``. Loggers that write a row on a change of voltage have intervals of
-# all lengths: it is no gap if so many others under load were 1 / _RATIO as long at least, and in no doubt.
+# the time that is longer is above this share of ``q_mobile``. Loggers that write a row on a change of voltage have intervals
+# of all lengths: it is no gap if so many others under load were 1 / _RATIO as long at least, and in no doubt.
 _RATIO, _LEAST_SHARE, _HABIT = 2.5, 0.005, 3
 # Where the charge of a gap was drawn, cell and model part across it by less than this share of the fall of the model.
 _MOST_SHARE = 0.5
@@ -35,8 +35,8 @@ USUAL = table(
 )
 
 #: The last gap, pending until the voltages after it were seen: its charge, the fall of the model within it, the voltage of
-#: the model after it, the first voltages then, and how many; 0: none is pending. And the charge of those that are in doubt, and
-#: how long the longest of them is.
+#: the model after it, the first voltages then, and how many; 0: none is pending. And the charge of those that are in doubt,
+#: and how long the longest of them is.
 GAP = table("length_s end_s charge_C fall_V model_V after_V next_V samples doubt_C doubt_s")
 
 

@@ -19,6 +19,7 @@ from battery_env.estimators.diagnosis import gaps
 from battery_env.estimators.diagnosis.conditions import (
     ABOVE_REST_V,
     MOST_OF_SD,
+    SETTLED_SHARES,
     Condition,
     Diagnosis,
     low_rest_voltage_V,
@@ -44,6 +45,8 @@ _RISE_V = 0.05
 _LEAST_JUMP_A, _MOST_RESISTANCE_OHM = 0.05, 0.6
 # A cell from which this share of its charge was drawn does not come back to the voltage of its first sample without a charge.
 _RECOVERY_SHARE = 0.2
+# What dropouts of the current make of the charge is a fault where an estimate of it would not be settled.
+_MOST_DROPPED_SHARE = SETTLED_SHARES["q_mobile"]
 # Voltages are kept about this far apart, s: all that are kept cover the window in which a voltage may not rise.
 _KEPT_EVERY_S = 0.9
 
@@ -69,8 +72,8 @@ _EXAMINED = table(
 )
 
 # The last switch of the load, 0 A once it was judged: the part of its size that the voltage has to follow, the voltage before
-# and the range since.
-_SWITCH = table("time_s size_A to_follow_A before_V lowest_V highest_V")
+# and the range since, the estimate before and the charge by it until now; and when one was taken back, 0 s if none was.
+_SWITCH = table("time_s size_A to_follow_A before_V lowest_V highest_V before_ohm charge_C back_s")
 
 # Some samples of the last minute, and the last changes of the voltage from sample to sample, in rings.
 _RING = table(
@@ -103,6 +106,8 @@ SEEN = table(
         ("usual", gaps.USUAL),
         ("gap", gaps.GAP),
         ("pending", "b1"),  # the voltage has not followed the last switch yet
+        ("dropped_C", "f8"),  # charge of switches that were taken back, which it did not follow
+        ("dropped_ohm", "f8"),  # by how much they moved an estimate of r_o
         ("fault", _FAULT),
     ]
 )
@@ -187,6 +192,8 @@ def measured(seen: Any, initial_soc: float, clock_s: float = 0.0, charge: Charge
         "fault_s": clock_s + (fault["time_s"] if fault["condition"] else switch["time_s"]),
         "since_s": clock_s + fault["since_s"],
         "size": fault["size"] if fault["condition"] else switch["size_A"],
+        "dropped_C": seen["dropped_C"],
+        "dropped_mohm": 1e3 * seen["dropped_ohm"],
         "gap_start_s": end_s - gap["length_s"],
         "gap_end_s": end_s,
         "gap_C": gap["charge_C"],
@@ -231,7 +238,7 @@ def examine(seen: Row, voltage: float, current: float, q_mobile: float, r_o: flo
         ring.n_changes += 1
         middle_V = middle(before.voltage_2_V, before.voltage_1_V, voltage)
         resistance_ohm = _least_resistance_ohm(seen.start, q_mobile, r_o)
-        _examine_last(seen, middle_V, resistance_ohm, max(q_mobile, cell_q_mobile))
+        _examine_last(seen, middle_V, resistance_ohm, max(q_mobile, cell_q_mobile), r_o)
         switch = seen.switch
         lowest_V, highest_V = min(switch.lowest_V, voltage), max(switch.highest_V, voltage)
         is_pending = switch.size_A != 0.0 and seen.fault.condition == 0
@@ -271,10 +278,10 @@ def _note_rest(rest: Row, time_s: float, interval_s: float, current: float) -> N
 
 @compiled
 def unseen_C(seen: Row) -> float:
-    """The standard deviation of the charge by the moment of load-on, by what flows at rest, and by gaps that are in doubt."""
+    """The standard deviation of the charge by the moment of load-on, what flows at rest, gaps in doubt, and dropouts."""
     rest = seen.rest
     beside_C = hypot(rest.load_on_C, rest.mean_A * (seen.time_s - rest.over_s)) if rest.is_over else 0.0
-    return hypot(beside_C, gaps.doubtful_C(seen))
+    return hypot(beside_C, hypot(gaps.doubtful_C(seen), seen.dropped_C))
 
 
 @compiled
@@ -285,6 +292,8 @@ def doubt_condition(seen: Row, sd_C: float) -> int:
         return Condition.LOAD_ON_UNSURE + 0
     if rest.is_over and abs(rest.mean_A) * (seen.time_s - rest.over_s) > most_C:
         return Condition.REST_CURRENT + 0
+    if seen.dropped_C > most_C:
+        return Condition.Q_DROPPED + 0
     return Condition.GAP_UNSURE + 0 if sd_C < inf and gaps.doubtful_C(seen) > 0.0 else 0
 
 
@@ -332,6 +341,13 @@ def fault_condition(seen: Row) -> int:
 
 
 @compiled
+def belongs(seen: Row) -> bool:
+    """Whether the last voltage belongs to its current: it follows that, and would follow a model of it."""
+    back_s = seen.switch.back_s
+    return not seen.pending and (back_s == 0.0 or seen.time_s > back_s + _START_WINDOW_S)
+
+
+@compiled
 def _lagging_current_A(before_A: float, current_A: float, duration_s: float) -> float:
     # what the ohmic drop stands for after a while; it follows slowly
     return before_A + (before_A - current_A) * expm1(-duration_s / _FOLLOWS_S)
@@ -353,15 +369,21 @@ def _is_followed(seen: Row, time_s: float, lowest_V: float, highest_V: float, re
 
 
 @compiled
-def _conclude_switch(seen: Row, time_s: float, resistance_ohm: float) -> None:
-    switch = seen.switch
-    if not _is_followed(seen, time_s, switch.lowest_V, switch.highest_V, resistance_ohm):
-        find(seen, Condition.NOT_FOLLOWED, switch.time_s, 0.0, switch.size_A)
-    switch.size_A = 0.0
+def _take_back(seen: Row, current: float, most_q: float, r_o: float) -> bool:
+    # A switch that the voltage did not follow, and that was taken back, was none: what it made of the charge is in doubt
+    switch, last = seen.switch, seen.examined
+    if abs(switch.size_A) > SWITCH_SHARE * last.largest_A:
+        return False
+    seen.dropped_C += abs(switch.charge_C)
+    seen.dropped_ohm += abs(r_o - switch.before_ohm)
+    if seen.dropped_C > _MOST_DROPPED_SHARE * most_q:
+        find(seen, Condition.NOT_FOLLOWED, switch.time_s, 0.0, current - last.current_A)
+    last.lagging_A, switch.size_A, switch.back_s = current, 0.0, seen.time_s
+    return True
 
 
 @compiled
-def _note_switch(seen: Row, time_s: float, current: float, resistance_ohm: float) -> None:
+def _note_switch(seen: Row, time_s: float, current: float, resistance_ohm: float, most_q: float, r_o: float) -> None:
     # whether the load jumped, or was switched, since the last sample that was examined
     switch, last = seen.switch, seen.examined
     last.largest_A = max(last.largest_A, abs(current))
@@ -369,18 +391,22 @@ def _note_switch(seen: Row, time_s: float, current: float, resistance_ohm: float
         switch.time_s = last.jump_s = time_s
         return
     switched_A = current - last.current_A
+    switch.charge_C += switch.size_A * (time_s - last.time_s)
     if abs(switched_A) > min(SWITCH_SHARE * last.largest_A, _LEAST_JUMP_A):
         last.jump_s = time_s
     if abs(switched_A) > SWITCH_SHARE * last.largest_A:
-        if switched_A * switch.size_A < 0.0:
-            _conclude_switch(seen, time_s, resistance_ohm)
+        if switched_A * switch.size_A < 0.0 and _is_followed(seen, time_s, switch.lowest_V, switch.highest_V, resistance_ohm):
+            switch.size_A = 0.0
         if switch.size_A == 0.0:
+            switch.charge_C, switch.before_ohm = 0.0, r_o
             # the last row before a switch may already have the voltage after it
             highest_V, lowest_V = max(last.earlier_V, last.voltage_V), min(last.earlier_V, last.voltage_V)
             switch.time_s, switch.before_V = time_s, highest_V if switched_A > 0.0 else lowest_V
             switch.lowest_V = switch.highest_V = seen.before.voltage_1_V
         # steps the same way before it was judged are one switch: a mean over an interval shows a switch as two
         switch.size_A += switched_A
+        if _take_back(seen, current, most_q, r_o):
+            return
         switch.to_follow_A = _change_to_follow_A(switch.size_A, current, last.lagging_A)
     last.lagging_A = _lagging_current_A(last.lagging_A, last.current_A, time_s - last.time_s)
 
@@ -405,16 +431,18 @@ def _look_for_rise(seen: Row, time_s: float, voltage: float, current: float) -> 
 
 
 @compiled
-def _examine_last(seen: Row, voltage: float, resistance_ohm: float, most_q: float) -> None:
+def _examine_last(seen: Row, voltage: float, resistance_ohm: float, most_q: float, r_o: float) -> None:
     # The sample before the one at hand, with the middle voltage of three, which is no single wild one
     last, switch, before = seen.examined, seen.switch, seen.before
     time_s, current = before.time_1_s, before.current_1_A
     if switch.size_A != 0.0:
         # some loggers write a voltage a sample later than its current: the first one after a switch may belong before it
         switch.lowest_V, switch.highest_V = min(switch.lowest_V, before.voltage_1_V), max(switch.highest_V, before.voltage_1_V)
-    _note_switch(seen, time_s, current, resistance_ohm)
+    _note_switch(seen, time_s, current, resistance_ohm, most_q, r_o)
     if switch.size_A != 0.0 and time_s - switch.time_s > _START_WINDOW_S:
-        _conclude_switch(seen, time_s, resistance_ohm)
+        if not _is_followed(seen, time_s, switch.lowest_V, switch.highest_V, resistance_ohm):
+            find(seen, Condition.NOT_FOLLOWED, switch.time_s, 0.0, switch.size_A)
+        switch.size_A = 0.0
     _look_for_rise(seen, time_s, voltage, current)
     # under a steady load the voltage at rest is higher by the ohmic drop at least; a charge that is seen raises it
     drop_V = resistance_ohm * max(current, 0.0) if time_s - switch.time_s > _START_WINDOW_S else 0.0

@@ -32,6 +32,7 @@ from battery_env.electrochemistry.tangents import (
 )
 from battery_env.estimators.diagnosis.conditions import (
     MISMATCH_MARGIN,
+    MOST_OF_SD,
     PLAUSIBLE_Q_SHARES,
     PRIOR_LIMIT_SD,
     SETTLED_SHARES,
@@ -274,10 +275,16 @@ def _doubt(bank: Row, offset_V: float) -> None:
 
 @inlined
 def take(
-    cell: Row, filters: Row, sample: Row, settings: Settings, packed: PackedConstants, derivatives: PolynomialDerivatives
+    cell: Row,
+    filters: Row,
+    sample: Row,
+    voltage: float,
+    settings: Settings,
+    packed: PackedConstants,
+    derivatives: PolynomialDerivatives,
 ) -> None:
-    """Take in one sample of a cell; unchecked."""
-    bank, voltage, duration, temperature = cell.bank, sample.voltage_V, sample.dt_s, sample.temperature_K
+    """Take in one sample of a cell, of which this voltage counts; unchecked."""
+    bank, duration, temperature = cell.bank, sample.dt_s, sample.temperature_K
     constants, current = packed.constants, cell.seen.current_A
     noise, charge = max(bank.noise_V2, settings.noise_V2), abs(current) * duration
     before = _heaviest(filters)
@@ -335,7 +342,7 @@ def conclude(cell: Row, settings: Settings, estimate: Row) -> None:
             estimate.sd[k] = nan
             continue
         value, (low, high), (mean, prior_sd) = bank.mean[k], settings.bounds[k], settings.carried[k]
-        sd = hypot(hypot(own_sd[k], settings.scale_sd[k] * value), unseen if k == Q else 0.0)
+        sd = hypot(hypot(own_sd[k], settings.scale_sd[k] * value), unseen if k == Q else seen.dropped_ohm)
         estimate.sd[k], of_data = sd, sd
         _note(estimate, Condition.Q_AT_BOUND + k, not low + bank.sd[k] < value < high - bank.sd[k])
         if prior_sd > 0.0:
@@ -346,6 +353,7 @@ def conclude(cell: Row, settings: Settings, estimate: Row) -> None:
             of_data = max(of_data, bank.common_sd_q if k == Q else 0.0)
             _note(estimate, Condition.Q_PRIOR_ALONE + k, of_data >= _SHARES[k] * value)
         if not sd < _SHARES[k] * value:
+            _note(estimate, Condition.R_DROPPED, k == R and seen.dropped_ohm > MOST_OF_SD * sd)
             doubt = doubt_condition(seen, sd)
             _note(estimate, doubt, k == Q and doubt > 0)
             _note(estimate, Condition.Q_SCALE_UNKNOWN + k, settings.scale_sd[k] >= _SHARES[k])
