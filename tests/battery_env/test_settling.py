@@ -144,7 +144,7 @@ VERDICTS = {
         {}, "The current changes for a moment, and the voltage does not follow: 140 C are in doubt.",
     ),
     "current lost in noise": (
-        BOTH[1:], lost_now_and_then(WHOLE, 6),
+        BOTH[1:], lost_now_and_then(discharged(noise_V=0.01), 6),
         {}, "The current changes for a moment, and the voltage does not follow: 64 mohm of R_o are in doubt.",
     ),
     "half a discharge": (BOTH, changed(WHOLE, slice(1400)), {}, "q_max is not known to 2 % yet: the voltage shows it at"),
