@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import hypot, nan, sqrt
+from math import hypot, inf, nan, sqrt
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,7 +20,6 @@ from battery_env.estimates import Estimate, EstimateTrace
 from battery_env.estimators.diagnosis.conditions import (
     EXCESS_LIMIT_UNSTATED,
     MISMATCH_MARGIN,
-    MOST_OF_SD,
     PRIOR_LIMIT_SD,
     SETTLED_SHARES,
     SPARE_SAMPLES,
@@ -30,9 +30,8 @@ from battery_env.estimators.diagnosis.conditions import (
     is_plausible,
     white_noise_V,
 )
-from battery_env.estimators.diagnosis.gaps import DRAWN, Gap, find_gaps, note_gaps
 from battery_env.estimators.diagnosis.rest import InitialSoc, check_initial_soc
-from battery_env.estimators.diagnosis.samples import note_samples
+from battery_env.estimators.diagnosis.samples import note_samples, unseen_C, watched
 from battery_env.estimators.estimator import Estimator, check_bounds
 from battery_env.estimators.search import Fit, JointPrior, Prior, Search, square
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, check_parameters
@@ -62,17 +61,14 @@ class _Fitted:
     alone: Fit  # without the prior of q_mobile
     variance_V2: float  # of one residual, with what the error of the model adds
     hidden_sd: Mapping[str, float]  # of what does not show in the voltage, by parameter
-    gaps: Sequence[Gap]  # where the record was not written under load
-    load_on_C: float  # standard deviations of the charge, by the moment of load-on
-    offset_C: float  # and by what flows at rest
+    seen: Any  # what the samples show beside the fit
 
     def sd(self, fit: Fit) -> dict[str, float]:
         """The standard deviations of a fit, with those of what does not show, and with charges that nobody saw."""
         sd = dict.fromkeys(PARAMETER_NAMES, nan)
         for name, root in zip(self.search.parameters, _root_inverse_diagonal(fit.jacobian), strict=False):
             sd[name] = hypot(sqrt(self.variance_V2) * float(root), self.hidden_sd[name])
-        in_gaps_C = sum(gap.charge_C for gap in self.gaps if gap.verdict != DRAWN)
-        sd["q_mobile"] = hypot(sd["q_mobile"], in_gaps_C, self.load_on_C, self.offset_C)
+        sd["q_mobile"] = hypot(sd["q_mobile"], unseen_C(self.seen))
         return sd
 
 
@@ -279,10 +275,14 @@ class LeastSquares(Estimator):
             mean_C, sd_C = self.prior_q_mobile_C
             carried = Prior("q_mobile", mean_C, sqrt(variance_V2) / sd_C)
             fit = search.best([*starts, alone.values, *search.starts([mean_C])[0]], [*priors, carried])
-        model_V = search.data.voltage_V + fit.residual_V - fit.values.get("offset_V", 0.0)
-        gaps = find_gaps(*record.first(n), model_V, fit.values["q_mobile"])
-        offset_C = shown.offset_C(float(record.time_s[-1] - record.time_s[0]))
-        return _Fitted(search, fit, alone, variance_V2, self._hidden_sd(search, fit), gaps, shown.load_on_C, offset_C)
+        return _Fitted(search, fit, alone, variance_V2, self._hidden_sd(search, fit), self._seen(record, shown, fit))
+
+    def _seen(self, record: Samples, shown: Shown, fit: Fit) -> Any:
+        """What the samples of a record show beside a fit, whose model may be empty before they end."""
+        model_V = np.full(len(record.time_s), nan)
+        model_V[: len(fit.residual_V)] = record.voltage_V[: len(fit.residual_V)] + fit.residual_V
+        estimate = [fit.values[name] for name in PARAMETER_NAMES]
+        return watched(record, self.model.cell, self.initial_soc[0] if self._at_rest else None, estimate, shown, model_V)
 
     def _independent_errors(self, record: Samples) -> float:
         """How many independent errors of the model a record holds: along a path more than one, as they drift."""
@@ -315,13 +315,13 @@ class LeastSquares(Estimator):
     def _verdict(self, record: Samples, shown: Shown, found: _Fitted) -> Verdict:
         """What speaks against an estimate."""
         fit, alone, cell, diagnosis = found.fit, found.alone, self.model.cell, Diagnosis()
-        n, free, (q_mobile, r_o) = len(fit.residual_V), self.parameters, (fit.values[name] for name in PARAMETER_NAMES)
+        n, free, q_mobile = len(fit.residual_V), self.parameters, fit.values["q_mobile"]
         own, moved_V2 = found.sd(alone), fit.square_V2 - alone.square_V2
         if self.path is not None:
             own = {**own, "q_mobile": OTHER_LIVES * own["q_mobile"]}
         unknown = [name for name in free if not own[name] < SETTLED_SHARES[name] * alone.values[name]]
-        note_gaps(diagnosis, found.gaps, "q_mobile" in unknown)
-        note_samples(diagnosis, record, cell, self.initial_soc[0] if self._at_rest else None, q_mobile, r_o, shown)
+        unsettled_sd_C = own["q_mobile"] if "q_mobile" in unknown else inf
+        note_samples(diagnosis, found.seen, self.initial_soc[0], record, shown, unsettled_sd_C)
         diagnosis.note(Condition.EMPTY, n < len(record.time_s))
         if self.voltage_noise_V is None:
             noise_V, excess = white_noise_V(fit.residual_V), EXCESS_LIMIT_UNSTATED / sqrt(n)
@@ -344,10 +344,6 @@ class LeastSquares(Estimator):
         diagnosis.note(Condition.Q_PRIOR_ALONE, "q_mobile" in unknown and self.prior_q_mobile_C is not None)
         for name in fit.at_bound:
             diagnosis.note(Condition.Q_AT_BOUND.of(name))
-        if "q_mobile" in unknown:
-            most_C, load_on_C, offset_C = MOST_OF_SD * own["q_mobile"], found.load_on_C, found.offset_C
-            diagnosis.note(Condition.LOAD_ON_UNSURE, load_on_C > most_C, load_on_C=load_on_C)
-            diagnosis.note(Condition.REST_CURRENT, offset_C > most_C, offset_A=shown.offset_A, offset_C=offset_C)
         for name in unknown:
             scaled = found.hidden_sd[name] >= SETTLED_SHARES[name] * fit.values[name]
             diagnosis.note(Condition.Q_SCALE_UNKNOWN.of(name), scaled)

@@ -20,7 +20,7 @@ from battery_env.electrochemistry.aging_path import cell_with
 from battery_env.electrochemistry.cell import TB
 from battery_env.electrochemistry.ends import quantile
 from battery_env.estimates import Estimate, last_estimate
-from battery_env.estimators.diagnosis.gaps import DRAWN, find_gaps
+from battery_env.estimators.diagnosis.gaps import doubtful_C
 from battery_env.estimators.diagnosis.rest import Start, check_initial_soc, soc_from_rest
 from battery_env.estimators.diagnosis.samples import fault_condition, start_condition, watched
 from battery_env.estimators.estimator import ModelNow
@@ -364,14 +364,11 @@ def _is_all_logged(seen: _Seen, forecast: VoltageForecast, estimate: Estimate) -
     Whether all that was drawn is in the record: the cell starts, before or under the load, no lower than with this charge, no
     sensor fails, and the voltage says of each gap that its charge was drawn.
     """
-    record, loaded, q_mobile, r_o = seen.record, seen.loaded, estimate.q_mobile, estimate.r_o
-    shown = watched(Samples.of(loaded), seen.cell, seen.start.soc, q_mobile, r_o, shown_beside(loaded))
+    record, beside, parameters = Samples.of(seen.record), shown_beside(seen.record), (estimate.q_mobile, estimate.r_o)
+    shown = watched(record, seen.cell, seen.start.soc, parameters, beside, forecast.at_samples_V)
     # a charge that tapered off fills any cell, whatever its voltage at rest
-    is_lower = shown["start"]["first_V"] < shown["start_V"] and not (loaded.shown.charge and loaded.shown.charge.tapered)
-    if fault_condition(shown) or (is_lower and start_condition(shown)):
-        return False
-    gaps = find_gaps(record.time_s, record.voltage_V, record.current_A, forecast.at_samples_V, q_mobile)
-    return all(gap.verdict == DRAWN for gap in gaps)
+    is_lower = shown["start"]["first_V"] < shown["start_V"] and not (beside.charge and beside.charge.tapered)
+    return not (fault_condition(shown) or (is_lower and start_condition(shown)) or doubtful_C(shown))
 
 
 def _nominal_Ah(model: RecordModel, settings: Settings, load_A: float) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import sqrt
+from math import inf, sqrt
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from battery_env.arrays import FloatArray
 from battery_env.electrochemistry import UNCERTAIN_CONSTANTS, CellParameters
 from battery_env.electrochemistry.aging_path import BESIDE_LIMIT_SD, EQUILIBRIUM_NAMES, OTHER_LIVES, AgingPath, cell_with
 from battery_env.estimates import Estimate
+from battery_env.estimators.diagnosis import gaps
 from battery_env.estimators.diagnosis.conditions import (
     EXCESS_LIMIT_UNSTATED,
     MISMATCH_MARGIN,
@@ -21,8 +22,7 @@ from battery_env.estimators.diagnosis.conditions import (
     rest_voltage_V,
     start_measured,
 )
-from battery_env.estimators.diagnosis.gaps import find_gaps, long_intervals, note_gaps
-from battery_env.estimators.diagnosis.samples import note_samples
+from battery_env.estimators.diagnosis.samples import note_samples, unseen_C, watched
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.records import Samples, Shown
 from battery_env.records.model import RecordModel
@@ -77,11 +77,13 @@ class Confidence:
         mismatch_V = 0.0 if self._path is None else MISMATCH_MARGIN * self._path.mismatch_V
         is_above = first_V > full_V + self._offset_V + _NOISES * sqrt(white_V**2 + mismatch_V**2)
         diagnosis.note(Condition.START_ABOVE, is_above, **start_measured(first_V, full_V))
-        note_samples(diagnosis, record, cell, 1.0, q_mobile, r_o, shown)
-        if len(long_intervals(record.time_s)):
+        model_V = None
+        if gaps.may_have_any(record.time_s):
             model = RecordModel(cell_with(cell, self.constants(fitted, n)), dt_s=self._dt_s)
             model_V = model.voltage(record, Estimate(q_mobile, r_o))
-            note_gaps(diagnosis, find_gaps(*record, model_V, q_mobile))
+        seen = watched(record, cell, 1.0, (q_mobile, r_o), shown, model_V)
+        sd = np.hypot(sd, [unseen_C(seen), 0.0])
+        note_samples(diagnosis, seen, 1.0, record, shown, inf if sd[0] < SETTLED_SHARES["q_mobile"] * q_mobile else sd[0])
         diagnosis.note(Condition.FEW, readings < len(self._parameters) + SPARE_SAMPLES, of="readings", or_else="")
         limit_V2 = (1.0 + EXCESS_LIMIT_UNSTATED / sqrt(readings)) * white_V**2 + _NEGLIGIBLE_V**2
         limit_V2 += mismatch_V**2

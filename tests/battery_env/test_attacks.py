@@ -310,7 +310,10 @@ def test_no_dropout_of_any_length_leaves_a_wrong_number_settled(cell, n, sensor)
             made += [outcome(case, calibrators(case)["least squares"])] if samples in (1, 3) else []
             answers += [(start, samples, *each) for each in made]
     assert not [answer for answer in answers if answer[2] == "wrong"]
-    assert any(estimate and "voltage does not follow" in estimate.reason for *_, estimate in answers) or sensor == "voltage_V"
+    if sensor == "current_A":
+        assert any(estimate and "voltage does not follow" in estimate.reason for *_, estimate in answers)
+        # a sample that is lost on the way costs what it may have drawn, and no more
+        assert all(found == "right" for start, samples, found, _ in answers if samples == 1 and 3 < start < count - 3)
 
 
 @pytest.mark.parametrize("fault", [fault for fault in FAULTS if fault not in UNOBSERVABLE])

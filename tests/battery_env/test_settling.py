@@ -52,6 +52,13 @@ def stuck(record: Discharge, from_s: float, until_s: float) -> Discharge:
     return replace(record, voltage_V=np.where(failed, record.voltage_V[failed.argmax()], record.voltage_V))
 
 
+def lost_now_and_then(record: Discharge, for_s: float) -> Discharge:
+    """Its current is not logged for a while, five times."""
+    return replace(
+        record, current_A=np.where((record.time_s % 500 >= 400) & (record.time_s % 500 < 400 + for_s), 0.0, record.current_A)
+    )
+
+
 def logged_by_voltage(load_A) -> Discharge:
     """A record as cyclers write it: a row where the voltage has changed, a minute is over, or the load is switched."""
     record, kept = discharged(load_A, noise_V=0.001), [0]
@@ -132,6 +139,14 @@ VERDICTS = {
         BOTH[:1], lost(discharged(pulsed(30, 60, 3.0, 0.3), noise_V=0.002), 1504.0, 1804.0), {"mismatch_V": 0.02},
         "No sample lies between 1504 s and 1805 s, and the voltage does not tell whether the load was on",
     ),
+    "current lost again and again": (
+        BOTH, lost_now_and_then(discharged(noise_V=0.001), 14),
+        {}, "The current changes for a moment, and the voltage does not follow: 140 C are in doubt.",
+    ),
+    "current lost in noise": (
+        BOTH[1:], lost_now_and_then(discharged(noise_V=0.01), 6),
+        {}, "The current changes for a moment, and the voltage does not follow: 64 mohm of R_o are in doubt.",
+    ),
     "half a discharge": (BOTH, changed(WHOLE, slice(1400)), {}, "q_max is not known to 2 % yet: the voltage shows it at"),
     "a small current": (BOTH, discharged(0.5), {}, "R_o is not known to 30 %: the error expected of noise and model"),
     "gain of the current": (BOTH, WHOLE, {"current_gain_sd": 0.03}, "q_max is known no better than what scales it"),
@@ -150,10 +165,12 @@ VERDICTS = {
 ALONE = {
     "noise hides whether it was drawn": "r_o",
     "switched meanwhile": "r_o",
+    "current lost again and again": "r_o",
     "pulses meanwhile": "r_o",
     "gain of the current": "r_o",
     "charge at the start": "r_o",
     "a small current": "q_mobile",
+    "current lost in noise": "q_mobile",
     "its gain, for r_o": "q_mobile",
 }
 #: And of the filter, which takes less of the error of the model for common to the record.

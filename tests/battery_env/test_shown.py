@@ -7,11 +7,12 @@ import pandas as pd
 import pytest
 
 from battery_env import calibrate, load_nasa_discharges, read_discharges
-from battery_env.electrochemistry import initial_state, simulate
-from battery_env.estimators.diagnosis.gaps import DRAWN, find_gaps
+from battery_env.electrochemistry import NEW_CELL, initial_state, simulate
+from battery_env.estimators.diagnosis.gaps import doubtful_C
+from battery_env.estimators.diagnosis.samples import fault_condition, watched
 from battery_env.estimators.estimator import OnlineEstimator
 from battery_env.lab.settings import Settings
-from battery_env.records import ChargeBefore, Shown, Stream
+from battery_env.records import ChargeBefore, Samples, Shown, Stream
 from battery_env.records.discharge import Discharge
 
 METHODS = ("least-squares", "kalman")
@@ -187,5 +188,6 @@ class TestGaps:
         time_s = (np.cumsum(np.full(30, 6.1))[:, None] + burst_s).ravel()
         model_V = 3.3 - np.repeat(np.cumsum(fall_V), 12)
         wander_V = 8e-4 * np.repeat(np.random.default_rng(0).choice([0.0, 1.0], 30), 12)
-        found = find_gaps(time_s, model_V + wander_V, np.full(360, 4.4), model_V, 3900.0)
-        assert len(found) >= 3 and {gap.verdict for gap in found} == {DRAWN}
+        record = Samples(time_s, model_V + wander_V, np.full(360, 4.4))
+        seen = watched(record, NEW_CELL, None, (3900.0, 0.03), Shown(), model_V)
+        assert not doubtful_C(seen) and not fault_condition(seen)

@@ -5,6 +5,7 @@ its current. A stream is watched sample by sample, and a whole record in the sam
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import expm1, hypot, inf, isnan, nan, sqrt
 from typing import Any
 
@@ -17,6 +18,8 @@ from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.estimators.diagnosis import gaps
 from battery_env.estimators.diagnosis.conditions import (
     ABOVE_REST_V,
+    MOST_OF_SD,
+    SETTLED_SHARES,
     Condition,
     Diagnosis,
     low_rest_voltage_V,
@@ -24,10 +27,8 @@ from battery_env.estimators.diagnosis.conditions import (
     start_measured,
 )
 from battery_env.estimators.diagnosis.rest import LEAST_REST_S
+from battery_env.estimators.diagnosis.rows import KEPT, STEADY_S, Row, find, middle, noise_V, table
 from battery_env.records import REST_CURRENT_A, SWITCH_SHARE, ChargeBefore, Samples, Shown
-
-#: A row of a table, whose columns numba knows and type checkers do not.
-Row = Any
 
 # A cell that was at rest at the first sample falls by at least half of its ohmic drop within this time, s. So does one whose
 # load is switched.
@@ -37,30 +38,17 @@ _START_WINDOW_S = 20.0
 _LEAST_RESISTANCE_OHM, _NEW_Q_C = 0.1, NEW_CELL.q_mobile
 # Time constant with which the ohmic drop follows the current at most, s: cells may be twice as slow as the model's.
 _FOLLOWS_S = 2.0 * NEW_CELL.to
-# Under a current that was steady for so long, s, the voltage of a cell does not rise by so much, V.
-_STEADY_S, _RISE_V = 60.0, 0.05
+# Under a steady current the voltage of a cell does not rise by so much, V.
+_RISE_V = 0.05
 # Smaller changes of the current than this, A, hardly show in the voltage. Where a load falls in such steps, a rise of the
 # voltage by this resistance, ohm, says nothing.
 _LEAST_JUMP_A, _MOST_RESISTANCE_OHM = 0.05, 0.6
-# A change of more than so many standard deviations of the noise is not noise. The middle one of three samples has this share
-# of their noise.
-_NOISES, _SMOOTHED_SHARE = 8.0, 0.67
 # A cell from which this share of its charge was drawn does not come back to the voltage of its first sample without a charge.
 _RECOVERY_SHARE = 0.2
-# So many voltages are kept, about this far apart, s: all that are kept cover the window in which a voltage may not rise. This
-# many changes tell the noise.
-_KEPT, _KEPT_EVERY_S, _LEAST_CHANGES = 32, 0.9, 4
-# What model and cell part by is averaged over about so many samples before a gap, and how fast the voltage falls over so long,
-# s; after it the middle voltage of three counts.
-_PARTED_MEMORY, _RATE_MEMORY_S, _PARTED_SAMPLES = 8.0, 100.0, 3
-# Standard deviation of the difference of both, as a share of the noise.
-_PARTED_NOISE_SHARE = 0.72
-
-
-def table(columns: str | list[tuple[Any, ...]]) -> np.dtype[np.void]:
-    """The type of a row: numbers by their names, or names with types."""
-    return np.dtype([(name, "f8") for name in columns.split()] if isinstance(columns, str) else columns, align=True)
-
+# What dropouts of the current make of the charge is a fault where an estimate of it would not be settled.
+_MOST_DROPPED_SHARE = SETTLED_SHARES["q_mobile"]
+# Voltages are kept about this far apart, s: all that are kept cover the window in which a voltage may not rise.
+_KEPT_EVERY_S = 0.9
 
 # The start: the first sample, and within the start window the largest current and the least voltage.
 _START = table([("at_rest", "b1"), ("charge", "i8"), *((name, "f8") for name in ("first_V", "first_A", "most_A", "least_V"))])
@@ -84,26 +72,16 @@ _EXAMINED = table(
 )
 
 # The last switch of the load, 0 A once it was judged: the part of its size that the voltage has to follow, the voltage before
-# and the range since.
-_SWITCH = table("time_s size_A to_follow_A before_V lowest_V highest_V")
+# and the range since, the estimate before and the charge by it until now; and when one was taken back, 0 s if none was.
+_SWITCH = table("time_s size_A to_follow_A before_V lowest_V highest_V before_ohm charge_C back_s")
 
 # Some samples of the last minute, and the last changes of the voltage from sample to sample, in rings.
 _RING = table(
     [
-        *(("n_kept", "i8"), ("time_s", "f8", _KEPT), ("voltage_V", "f8", _KEPT), ("current_A", "f8", _KEPT)),
-        *(("n_changes", "i8"), ("change_V", "f8", _KEPT)),
+        *(("n_kept", "i8"), ("time_s", "f8", KEPT), ("voltage_V", "f8", KEPT), ("current_A", "f8", KEPT)),
+        *(("n_changes", "i8"), ("change_V", "f8", KEPT)),
     ]
 )
-
-# What was expected before a gap: the last interval, the voltage, by how much cell and model part and how fast the voltage
-# falls, both in the mean; the longest intervals under load that were not in doubt, in their order.
-_USUAL = table(
-    [*((name, "f8") for name in ("interval_s", "expected_V", "parted_V", "fall_V_per_s")), ("longest_s", "f8", gaps.HABIT)]
-)
-
-# The last gap, pending until the voltages after it were seen: its charge, the fall of the model within it, the voltage of the
-# model after it, the first voltages then, and how many; 0: none is pending.
-_GAP = table("length_s end_s charge_C fall_V model_V after_V next_V samples")
 
 # The first fault that was found, 0 if there is none: when, and how large it is.
 _FAULT = table([("condition", "i8"), *((name, "f8") for name in ("time_s", "since_s", "size"))])
@@ -125,40 +103,58 @@ SEEN = table(
         ("examined", _EXAMINED),
         ("switch", _SWITCH),
         ("ring", _RING),
-        ("usual", _USUAL),
-        ("gap", _GAP),
-        ("doubt_C", "f8"),  # charge of gaps that are in doubt
+        ("usual", gaps.USUAL),
+        ("gap", gaps.GAP),
         ("pending", "b1"),  # the voltage has not followed the last switch yet
+        ("dropped_C", "f8"),  # charge of switches that were taken back, which it did not follow
+        ("dropped_ohm", "f8"),  # by how much they moved an estimate of r_o
         ("fault", _FAULT),
     ]
 )
 
 
 def watched(
-    record: Samples, cell: CellParameters, initial_soc: float | None, q_mobile: float, r_o: float, shown: Shown
+    record: Samples,
+    cell: CellParameters,
+    initial_soc: float | None,
+    estimate: Sequence[float],
+    shown: Shown,
+    model_V: FloatArray | None = None,
 ) -> Any:
-    """What the samples of a whole record show, beside an estimate. ``initial_soc`` is ``None`` where no rest is expected."""
+    """
+    What the samples of a whole record show, beside an estimate.
+
+    :param record: its samples
+    :param cell: constants of the model
+    :param initial_soc: state of charge at the start; ``None``: no rest is expected
+    :param estimate: ``q_mobile``, C, and ``r_o``, ohm
+    :param shown: what is known beside the samples
+    :param model_V: voltage of the model at the samples, V; ``None``: gaps are not looked at
+    :return: a row of ``SEEN``
+    """
     seen = np.zeros(1, SEEN)
     expect(seen, cell, initial_soc)
     take_in(seen, shown)
-    time_s, voltage_V, current_A = (np.ascontiguousarray(column) for column in record)
-    _watch_all(seen, time_s, voltage_V, current_A, q_mobile, r_o, cell.q_mobile)
+    columns = (np.ascontiguousarray(column) for column in record)
+    _watch_all(seen, *columns, np.empty(0) if model_V is None else model_V, *estimate, cell.q_mobile)
     return seen[0]
 
 
 def note_samples(
-    diagnosis: Diagnosis,
-    record: Samples,
-    cell: CellParameters,
-    initial_soc: float | None,
-    q_mobile: float,
-    r_o: float,
-    shown: Shown,
+    diagnosis: Diagnosis, seen: Any, initial_soc: float, record: Samples, shown: Shown, unsettled_sd_C: float = inf
 ) -> None:
-    """Note what the start of a record and its sensors say against an estimate, as :func:`watched`."""
-    seen = watched(record, cell, initial_soc, q_mobile, r_o, shown)
-    said = measured(seen, initial_soc or 1.0, float(record.time_s[0]), shown.charge)
-    for number in (start_condition(seen), fault_condition(seen)):
+    """
+    Note what the start of a record and its sensors say against an estimate.
+
+    :param diagnosis: of the estimate
+    :param seen: what :func:`watched` saw
+    :param initial_soc: state of charge that was expected at the start
+    :param record: the samples
+    :param shown: what is known beside them
+    :param unsettled_sd_C: standard deviation of a ``q_mobile`` that is not settled, C
+    """
+    said = measured(seen, initial_soc, float(record.time_s[0]), shown.charge)
+    for number in (start_condition(seen), fault_condition(seen), doubt_condition(seen, unsettled_sd_C)):
         if number:
             diagnosis.note(Condition.numbered(number), **said)
 
@@ -196,6 +192,8 @@ def measured(seen: Any, initial_soc: float, clock_s: float = 0.0, charge: Charge
         "fault_s": clock_s + (fault["time_s"] if fault["condition"] else switch["time_s"]),
         "since_s": clock_s + fault["since_s"],
         "size": fault["size"] if fault["condition"] else switch["size_A"],
+        "dropped_C": seen["dropped_C"],
+        "dropped_mohm": 1e3 * seen["dropped_ohm"],
         "gap_start_s": end_s - gap["length_s"],
         "gap_end_s": end_s,
         "gap_C": gap["charge_C"],
@@ -208,6 +206,7 @@ def _watch_all(
     time_s: FloatArray,
     voltage_V: FloatArray,
     current_A: FloatArray,
+    model_V: FloatArray,
     q_mobile: float,
     r_o: float,
     cell_q_mobile: float,
@@ -216,6 +215,8 @@ def _watch_all(
     for n in range(len(time_s)):
         begin(seen, time_s[n] - time_s[max(n - 1, 0)])
         examine(seen, voltage_V[n], current_A[n], q_mobile, r_o, cell_q_mobile)
+        if n > 0 and len(model_V) > 0:
+            gaps.follow(seen, voltage_V[n], current_A[n], model_V[n], q_mobile)
         remember(seen, voltage_V[n], current_A[n])
 
 
@@ -233,11 +234,11 @@ def examine(seen: Row, voltage: float, current: float, q_mobile: float, r_o: flo
     """Look whether one more voltage belongs to its current, beside an estimate and the model's cell."""
     if seen.samples > 1 and not isnan(voltage):
         before, ring = seen.before, seen.ring
-        ring.change_V[ring.n_changes % _KEPT] = voltage - before.voltage_1_V
+        ring.change_V[ring.n_changes % KEPT] = voltage - before.voltage_1_V
         ring.n_changes += 1
-        middle_V = _middle(before.voltage_2_V, before.voltage_1_V, voltage)
+        middle_V = middle(before.voltage_2_V, before.voltage_1_V, voltage)
         resistance_ohm = _least_resistance_ohm(seen.start, q_mobile, r_o)
-        _examine_last(seen, middle_V, resistance_ohm, max(q_mobile, cell_q_mobile))
+        _examine_last(seen, middle_V, resistance_ohm, max(q_mobile, cell_q_mobile), r_o)
         switch = seen.switch
         lowest_V, highest_V = min(switch.lowest_V, voltage), max(switch.highest_V, voltage)
         is_pending = switch.size_A != 0.0 and seen.fault.condition == 0
@@ -277,11 +278,23 @@ def _note_rest(rest: Row, time_s: float, interval_s: float, current: float) -> N
 
 @compiled
 def unseen_C(seen: Row) -> float:
-    """The standard deviation of the charge by the moment of load-on, and by what flows at rest."""
+    """The standard deviation of the charge by the moment of load-on, what flows at rest, gaps in doubt, and dropouts."""
     rest = seen.rest
-    if not rest.is_over:
-        return 0.0
-    return hypot(rest.load_on_C, rest.mean_A * (seen.time_s - rest.over_s))
+    beside_C = hypot(rest.load_on_C, rest.mean_A * (seen.time_s - rest.over_s)) if rest.is_over else 0.0
+    return hypot(beside_C, hypot(gaps.doubtful_C(seen), seen.dropped_C))
+
+
+@compiled
+def doubt_condition(seen: Row, sd_C: float) -> int:
+    """Say which charge that nobody saw makes most of a standard deviation of ``q_mobile``; 0 if none does."""
+    rest, most_C = seen.rest, MOST_OF_SD * sd_C
+    if rest.is_over and rest.load_on_C > most_C:
+        return Condition.LOAD_ON_UNSURE + 0
+    if rest.is_over and abs(rest.mean_A) * (seen.time_s - rest.over_s) > most_C:
+        return Condition.REST_CURRENT + 0
+    if seen.dropped_C > most_C:
+        return Condition.Q_DROPPED + 0
+    return Condition.GAP_UNSURE + 0 if sd_C < inf and gaps.doubtful_C(seen) > 0.0 else 0
 
 
 @compiled
@@ -328,6 +341,13 @@ def fault_condition(seen: Row) -> int:
 
 
 @compiled
+def belongs(seen: Row) -> bool:
+    """Whether the last voltage belongs to its current: it follows that, and would follow a model of it."""
+    back_s = seen.switch.back_s
+    return not seen.pending and (back_s == 0.0 or seen.time_s > back_s + _START_WINDOW_S)
+
+
+@compiled
 def _lagging_current_A(before_A: float, current_A: float, duration_s: float) -> float:
     # what the ohmic drop stands for after a while; it follows slowly
     return before_A + (before_A - current_A) * expm1(-duration_s / _FOLLOWS_S)
@@ -340,42 +360,30 @@ def _change_to_follow_A(switched_A: float, current_A: float, lagging_A: float) -
 
 
 @compiled
-def _noise_V(seen: Row) -> float:
-    # what is more than noise; infinite as long as there are too few samples to tell
-    n = min(seen.ring.n_changes, _KEPT)
-    if n < _LEAST_CHANGES:
-        return inf
-    change_V = seen.ring.change_V[:n]
-    return _NOISES * _SMOOTHED_SHARE * float(np.median(np.abs(change_V - np.median(change_V)))) / (0.6745 * sqrt(2.0))
-
-
-@compiled
-def _find(seen: Row, condition: int, time_s: float, size: float) -> None:
-    # the first one is kept
-    fault = seen.fault
-    if fault.condition == 0:
-        fault.condition, fault.time_s, fault.size = condition, time_s, size
-
-
-@compiled
 def _is_followed(seen: Row, time_s: float, lowest_V: float, highest_V: float, resistance_ohm: float) -> bool:
     # whether the voltage follows the last switch of the load by half of the least ohmic drop that it can have by then
     switch = seen.switch
     drop_V = -0.5 * resistance_ohm * switch.to_follow_A * expm1((switch.time_s - time_s) / _FOLLOWS_S)
     followed_V = switch.before_V - (lowest_V if drop_V > 0.0 else highest_V)
-    return abs(drop_V) <= _noise_V(seen) or followed_V / drop_V >= 1.0
+    return abs(drop_V) <= noise_V(seen) or followed_V / drop_V >= 1.0
 
 
 @compiled
-def _conclude_switch(seen: Row, time_s: float, resistance_ohm: float) -> None:
-    switch = seen.switch
-    if not _is_followed(seen, time_s, switch.lowest_V, switch.highest_V, resistance_ohm):
-        _find(seen, Condition.NOT_FOLLOWED, switch.time_s, switch.size_A)
-    switch.size_A = 0.0
+def _take_back(seen: Row, current: float, most_q: float, r_o: float) -> bool:
+    # A switch that the voltage did not follow, and that was taken back, was none: what it made of the charge is in doubt
+    switch, last = seen.switch, seen.examined
+    if abs(switch.size_A) > SWITCH_SHARE * last.largest_A:
+        return False
+    seen.dropped_C += abs(switch.charge_C)
+    seen.dropped_ohm += abs(r_o - switch.before_ohm)
+    if seen.dropped_C > _MOST_DROPPED_SHARE * most_q:
+        find(seen, Condition.NOT_FOLLOWED, switch.time_s, 0.0, current - last.current_A)
+    last.lagging_A, switch.size_A, switch.back_s = current, 0.0, seen.time_s
+    return True
 
 
 @compiled
-def _note_switch(seen: Row, time_s: float, current: float, resistance_ohm: float) -> None:
+def _note_switch(seen: Row, time_s: float, current: float, resistance_ohm: float, most_q: float, r_o: float) -> None:
     # whether the load jumped, or was switched, since the last sample that was examined
     switch, last = seen.switch, seen.examined
     last.largest_A = max(last.largest_A, abs(current))
@@ -383,18 +391,22 @@ def _note_switch(seen: Row, time_s: float, current: float, resistance_ohm: float
         switch.time_s = last.jump_s = time_s
         return
     switched_A = current - last.current_A
+    switch.charge_C += switch.size_A * (time_s - last.time_s)
     if abs(switched_A) > min(SWITCH_SHARE * last.largest_A, _LEAST_JUMP_A):
         last.jump_s = time_s
     if abs(switched_A) > SWITCH_SHARE * last.largest_A:
-        if switched_A * switch.size_A < 0.0:
-            _conclude_switch(seen, time_s, resistance_ohm)
+        if switched_A * switch.size_A < 0.0 and _is_followed(seen, time_s, switch.lowest_V, switch.highest_V, resistance_ohm):
+            switch.size_A = 0.0
         if switch.size_A == 0.0:
+            switch.charge_C, switch.before_ohm = 0.0, r_o
             # the last row before a switch may already have the voltage after it
             highest_V, lowest_V = max(last.earlier_V, last.voltage_V), min(last.earlier_V, last.voltage_V)
             switch.time_s, switch.before_V = time_s, highest_V if switched_A > 0.0 else lowest_V
             switch.lowest_V = switch.highest_V = seen.before.voltage_1_V
         # steps the same way before it was judged are one switch: a mean over an interval shows a switch as two
         switch.size_A += switched_A
+        if _take_back(seen, current, most_q, r_o):
+            return
         switch.to_follow_A = _change_to_follow_A(switch.size_A, current, last.lagging_A)
     last.lagging_A = _lagging_current_A(last.lagging_A, last.current_A, time_s - last.time_s)
 
@@ -403,32 +415,34 @@ def _note_switch(seen: Row, time_s: float, current: float, resistance_ohm: float
 def _look_for_rise(seen: Row, time_s: float, voltage: float, current: float) -> None:
     # since the voltage a little more than the window ago, under a current that has been steady since long before
     ring = seen.ring
-    for back in range(2, min(ring.n_kept, _KEPT) + 1):
-        n = (ring.n_kept - back) % _KEPT
+    for back in range(2, min(ring.n_kept, KEPT) + 1):
+        n = (ring.n_kept - back) % KEPT
         since_s = time_s - ring.time_s[n]
         if since_s > _START_WINDOW_S:
             rise_V = voltage - ring.voltage_V[n] - _MOST_RESISTANCE_OHM * max(ring.current_A[n] - current, 0.0)
-            was_steady = time_s - since_s - seen.examined.jump_s >= _STEADY_S
-            if was_steady and rise_V > _RISE_V and rise_V > _noise_V(seen):
-                _find(seen, Condition.RISES, time_s - since_s, rise_V)
+            was_steady = time_s - since_s - seen.examined.jump_s >= STEADY_S
+            if was_steady and rise_V > _RISE_V and rise_V > noise_V(seen):
+                find(seen, Condition.RISES, time_s - since_s, 0.0, rise_V)
             break
-    if ring.n_kept == 0 or time_s - ring.time_s[(ring.n_kept - 1) % _KEPT] >= _KEPT_EVERY_S:
-        n = ring.n_kept % _KEPT
+    if ring.n_kept == 0 or time_s - ring.time_s[(ring.n_kept - 1) % KEPT] >= _KEPT_EVERY_S:
+        n = ring.n_kept % KEPT
         ring.time_s[n], ring.voltage_V[n], ring.current_A[n] = time_s, voltage, current
         ring.n_kept += 1
 
 
 @compiled
-def _examine_last(seen: Row, voltage: float, resistance_ohm: float, most_q: float) -> None:
+def _examine_last(seen: Row, voltage: float, resistance_ohm: float, most_q: float, r_o: float) -> None:
     # The sample before the one at hand, with the middle voltage of three, which is no single wild one
     last, switch, before = seen.examined, seen.switch, seen.before
     time_s, current = before.time_1_s, before.current_1_A
     if switch.size_A != 0.0:
         # some loggers write a voltage a sample later than its current: the first one after a switch may belong before it
         switch.lowest_V, switch.highest_V = min(switch.lowest_V, before.voltage_1_V), max(switch.highest_V, before.voltage_1_V)
-    _note_switch(seen, time_s, current, resistance_ohm)
+    _note_switch(seen, time_s, current, resistance_ohm, most_q, r_o)
     if switch.size_A != 0.0 and time_s - switch.time_s > _START_WINDOW_S:
-        _conclude_switch(seen, time_s, resistance_ohm)
+        if not _is_followed(seen, time_s, switch.lowest_V, switch.highest_V, resistance_ohm):
+            find(seen, Condition.NOT_FOLLOWED, switch.time_s, 0.0, switch.size_A)
+        switch.size_A = 0.0
     _look_for_rise(seen, time_s, voltage, current)
     # under a steady load the voltage at rest is higher by the ohmic drop at least; a charge that is seen raises it
     drop_V = resistance_ohm * max(current, 0.0) if time_s - switch.time_s > _START_WINDOW_S else 0.0
@@ -438,91 +452,7 @@ def _examine_last(seen: Row, voltage: float, resistance_ohm: float, most_q: floa
         # on a flat curve, or with a smaller drop than that, it never was much lower
         is_high = voltage + drop_V > max(seen.low_V, seen.share_V + _RISE_V)
         if is_high and min(current, last.lagging_A) >= -REST_CURRENT_A:
-            _find(seen, Condition.RECOVERED, time_s, seen.drawn_C)
+            find(seen, Condition.RECOVERED, time_s, 0.0, seen.drawn_C)
     last.count += 1
     last.earlier_V = voltage if last.count == 1 else last.voltage_V
     last.time_s, last.voltage_V, last.current_A = time_s, voltage, current
-
-
-@compiled
-def _middle(a: float, b: float, c: float) -> float:
-    return max(min(a, b), min(max(a, b), c))
-
-
-@compiled
-def _note_interval(seen: Row, interval_s: float, load_A: float) -> None:
-    # one that was no gap, or whose charge was drawn
-    longest_s = seen.usual.longest_s
-    if interval_s > longest_s[0] and load_A > REST_CURRENT_A:
-        longest_s[0] = interval_s
-        longest_s.sort()
-
-
-@compiled
-def _open_gap(
-    seen: Row, voltage: float, current: float, duration: float, expected_V: float, charge_C: float, load_A: float
-) -> None:
-    gap, usual = seen.gap, seen.usual
-    if gap.samples > 0.0:
-        seen.doubt_C += gap.charge_C
-    gap.length_s, gap.end_s, gap.charge_C, gap.samples = duration, seen.time_s, charge_C, 1.0
-    # the filter gives way to the samples after a gap, so that these are compared with what it had expected before
-    gap.fall_V = usual.expected_V - expected_V
-    if seen.time_s - duration - seen.examined.jump_s >= _STEADY_S:
-        # a model whose q_mobile is not known yet may take its cell for empty: the voltage falls at least as it did before
-        gap.fall_V = min(gap.fall_V, usual.fall_V_per_s * duration)
-    gap.model_V = usual.expected_V + usual.parted_V - gap.fall_V
-    gap.after_V = voltage
-    if isnan(voltage) or abs(current - seen.current_A) > SWITCH_SHARE * load_A:
-        gap.fall_V = 0.0  # which leaves it in doubt
-
-
-@compiled
-def _close_gap(seen: Row, voltage: float, load_A: float) -> None:
-    gap = seen.gap
-    after_V = _middle(gap.after_V, gap.next_V, voltage)
-    sd_V = _PARTED_NOISE_SHARE * _noise_V(seen) / (_NOISES * _SMOOTHED_SHARE)
-    said = gaps.verdict(after_V - gap.model_V, gap.fall_V, sd_V, gaps.MOST_SHARE_SO_FAR)
-    if said == gaps.DRAWN:
-        _note_interval(seen, gap.length_s, load_A)
-    else:
-        seen.doubt_C += gap.charge_C
-    if said == gaps.NOT_DRAWN and seen.fault.condition == 0:
-        seen.fault.since_s = gap.end_s - gap.length_s
-        _find(seen, Condition.NOT_DRAWN, gap.end_s, gap.charge_C)
-    gap.samples = 0.0
-
-
-@compiled
-def follow_gaps(seen: Row, voltage: float, current: float, duration: float, expected_V: float, q_mobile: float) -> None:
-    """
-    Look whether the charge of gaps was drawn, at one sample that is not the first, of which the model expected a voltage. A
-    gap is pending from its end until the voltages after it were seen.
-    """
-    gap, usual = seen.gap, seen.usual
-    load_A = max(abs(seen.current_A), abs(current))
-    if gap.samples > 0.0 and gap.length_s <= gaps.GAP_RATIO * duration and seen.time_s - duration == gap.end_s:
-        gap.samples = 0.0  # the samples are as far apart from now on
-    charge_C = 0.0
-    if duration > gaps.GAP_RATIO * usual.longest_s[0]:  # else the logger has a habit of it
-        charge_C = gaps.doubtful_charge_C(usual.interval_s, duration, 0.0, load_A, q_mobile)
-    if charge_C > 0.0:
-        _open_gap(seen, voltage, current, duration, expected_V, charge_C, load_A)
-    else:
-        _note_interval(seen, duration, min(abs(seen.current_A), abs(current)))
-        if gap.samples > 0.0 and not isnan(voltage):
-            gap.samples += 1.0
-            if gap.samples < _PARTED_SAMPLES:
-                gap.next_V = voltage
-                # by how much it falls from one sample to the next
-                gap.model_V -= gap.fall_V * (seen.time_s - gap.end_s) / gap.length_s
-            else:
-                _close_gap(seen, voltage, load_A)
-    if not isnan(voltage):
-        if gap.samples == 0.0:
-            usual.parted_V += (voltage - expected_V - usual.parted_V) / min(seen.samples - 1.0, _PARTED_MEMORY)
-        usual.expected_V = expected_V
-        if charge_C == 0.0 and seen.samples > 2:
-            fall_V_per_s = (seen.before.voltage_1_V - voltage) / duration
-            usual.fall_V_per_s += -expm1(-duration / _RATE_MEMORY_S) * (fall_V_per_s - usual.fall_V_per_s)
-    usual.interval_s = duration

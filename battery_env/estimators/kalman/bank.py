@@ -38,7 +38,7 @@ from battery_env.estimators.diagnosis.conditions import (
     SETTLED_SHARES,
     Condition,
 )
-from battery_env.estimators.diagnosis.samples import Row, fault_condition, start_condition, unseen_C
+from battery_env.estimators.diagnosis.samples import Row, doubt_condition, fault_condition, start_condition, unseen_C
 from battery_env.estimators.kalman.state import FILTER, OFFSET, Q, R, Settings
 from battery_env.parameters import PARAMETER_NAMES
 
@@ -275,10 +275,16 @@ def _doubt(bank: Row, offset_V: float) -> None:
 
 @inlined
 def take(
-    cell: Row, filters: Row, sample: Row, settings: Settings, packed: PackedConstants, derivatives: PolynomialDerivatives
+    cell: Row,
+    filters: Row,
+    sample: Row,
+    voltage: float,
+    settings: Settings,
+    packed: PackedConstants,
+    derivatives: PolynomialDerivatives,
 ) -> None:
-    """Take in one sample of a cell; unchecked."""
-    bank, voltage, duration, temperature = cell.bank, sample.voltage_V, sample.dt_s, sample.temperature_K
+    """Take in one sample of a cell, of which this voltage counts; unchecked."""
+    bank, duration, temperature = cell.bank, sample.dt_s, sample.temperature_K
     constants, current = packed.constants, cell.seen.current_A
     noise, charge = max(bank.noise_V2, settings.noise_V2), abs(current) * duration
     before = _heaviest(filters)
@@ -318,8 +324,7 @@ def conclude(cell: Row, settings: Settings, estimate: Row) -> None:
     bank, seen, searched = cell.bank, cell.seen, settings.searched
     # what the error of the model leaves open beside the prior, what shows nowhere in the voltage, and what nobody saw
     common_sd_q = (bank.common_sd_q**-2.0 + 1.0 / settings.variance[Q]) ** -0.5
-    doubt_C = seen.doubt_C + (seen.gap.charge_C if seen.gap.samples > 0.0 else 0.0)
-    beside_C = unseen_C(seen)
+    unseen = unseen_C(seen)
     own_sd = (max(bank.sd[Q], common_sd_q), max(bank.sd[R], 0.0))
     estimate.q_mobile, estimate.r_o = bank.mean[Q], bank.mean[R]
     estimate.condition[:] = Condition.SETTLED + 0
@@ -337,7 +342,7 @@ def conclude(cell: Row, settings: Settings, estimate: Row) -> None:
             estimate.sd[k] = nan
             continue
         value, (low, high), (mean, prior_sd) = bank.mean[k], settings.bounds[k], settings.carried[k]
-        sd = hypot(hypot(own_sd[k], settings.scale_sd[k] * value), hypot(doubt_C, beside_C) if k == Q else 0.0)
+        sd = hypot(hypot(own_sd[k], settings.scale_sd[k] * value), unseen if k == Q else seen.dropped_ohm)
         estimate.sd[k], of_data = sd, sd
         _note(estimate, Condition.Q_AT_BOUND + k, not low + bank.sd[k] < value < high - bank.sd[k])
         if prior_sd > 0.0:
@@ -348,9 +353,9 @@ def conclude(cell: Row, settings: Settings, estimate: Row) -> None:
             of_data = max(of_data, bank.common_sd_q if k == Q else 0.0)
             _note(estimate, Condition.Q_PRIOR_ALONE + k, of_data >= _SHARES[k] * value)
         if not sd < _SHARES[k] * value:
-            _note(estimate, Condition.LOAD_ON_UNSURE, k == Q and seen.rest.load_on_C > MOST_OF_SD * sd)
-            _note(estimate, Condition.REST_CURRENT, k == Q and beside_C > MOST_OF_SD * sd)
-            _note(estimate, Condition.GAP_UNSURE, k == Q and doubt_C > 0.0)
+            _note(estimate, Condition.R_DROPPED, k == R and seen.dropped_ohm > MOST_OF_SD * sd)
+            doubt = doubt_condition(seen, sd)
+            _note(estimate, doubt, k == Q and doubt > 0)
             _note(estimate, Condition.Q_SCALE_UNKNOWN + k, settings.scale_sd[k] >= _SHARES[k])
             _note(estimate, Condition.Q_IMPRECISE + k, True)
         # in standard deviations that a settled one may have

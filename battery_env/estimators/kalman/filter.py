@@ -16,9 +16,10 @@ from battery_env.electrochemistry import STATE_SIZE, CellParameters, PackedConst
 from battery_env.electrochemistry.ends import SURPLUS_SHARE
 from battery_env.electrochemistry.tangents import PolynomialDerivatives
 from battery_env.estimates import Estimate, Estimates, EstimateTrace
+from battery_env.estimators.diagnosis import gaps
 from battery_env.estimators.diagnosis.conditions import Condition, Verdict
 from battery_env.estimators.diagnosis.rest import check_initial_soc
-from battery_env.estimators.diagnosis.samples import begin, examine, expect, follow_gaps, measured, remember, take_in
+from battery_env.estimators.diagnosis.samples import begin, belongs, examine, expect, measured, remember, take_in
 from battery_env.estimators.estimator import ModelNow, OnlineBatch, OnlineEstimator, check_bounds
 from battery_env.estimators.kalman.bank import conclude, filters_of_prior, take
 from battery_env.estimators.kalman.state import CELL, ESTIMATE, FILTER, SAMPLE, Q, R, Settings
@@ -33,7 +34,7 @@ _NOISE_V = 0.005
 # Covariances of a state may be so much larger than their variances allow, as a share.
 _ROUNDED = 1e-6
 # What reasons are made of
-_SHOWN = ("start", "rest", "fault", "switch", "gap", "start_V", "time_s")
+_SHOWN = ("start", "rest", "fault", "switch", "gap", "start_V", "time_s", "dropped_C", "dropped_ohm")
 
 
 class ExtendedKalmanFilter(OnlineEstimator):
@@ -425,10 +426,11 @@ def _follow_all(
             sample = samples[k, n]
             voltage, current, duration = sample.voltage_V, sample.current_A, sample.dt_s
             begin(seen, duration)
-            take(cell, filters[n], sample, settings, of_cell, derivatives)
-            q_mobile, r_o = bank.mean[Q], bank.mean[R]
-            examine(seen, voltage, current, q_mobile, r_o, settings.cell_q_mobile)
+            examine(seen, voltage, current, bank.mean[Q], bank.mean[R], settings.cell_q_mobile)
+            # a voltage that does not follow its current corrects nothing
+            belonging_V = voltage if belongs(seen) else nan
+            take(cell, filters[n], sample, belonging_V, settings, of_cell, derivatives)
             if seen.samples > 1 and duration > 0.0:
-                follow_gaps(seen, voltage, current, duration, bank.expected_V, q_mobile)
+                gaps.follow(seen, belonging_V, current, bank.expected_V, bank.mean[Q])
             conclude(cell, settings, estimates[k, n])
             remember(seen, voltage, current)
