@@ -280,8 +280,11 @@ def plot(rows: pd.DataFrame) -> Figure:
     return figure
 
 
-def export(seeds: Sequence[int], folder: Path, command: str) -> None:
-    """Train LAC along the paths of all bundled cells, and write its seeds as one file with its card."""
+def export(seeds: Sequence[int], folder: Path, command: str, scores: pd.DataFrame) -> None:
+    """
+    Train LAC along the paths of all bundled cells, and write its seeds as one file with its card. The scores on this are those
+    of policies that learned along the path of one cell and were judged on the other.
+    """
     path, _ = path_of(BUNDLED_CELLS, folder)
     recipes = [recipe_of("lac", BUNDLED_CELLS, seed, folder) for seed in seeds]
     models = [train_or_load(recipe, folder / "models") for recipe in recipes]
@@ -296,6 +299,7 @@ def export(seeds: Sequence[int], folder: Path, command: str) -> None:
         "command": command,
         "recipe": {**asdict(recipes[0]), "seed": list(seeds)},
         "training_data": f"{TRAINING_CELLS} simulated cells along the lives of {' and '.join(BUNDLED_CELLS)}",
+        "scores": scores[scores["method"].str.match("LAC, .* as one")].to_dict("records"),
         "training_minutes": sum(training_minutes(recipe, folder / "models") for recipe in recipes),
         "versions": versions(),
     }
@@ -328,9 +332,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
             asked.append({**of_cell, "method": f"{name}, {len(chosen.seeds)} as one", "algo": algo, "seeds": chosen.seeds})
     rows.append(study.run(learned, asked, folder=study.out)["discharges"])
     table = pd.concat(rows, ignore_index=True).sort_values("cell", kind="stable", ignore_index=True)
+    shown = summary(table)
     if chosen.export:
-        export(chosen.seeds, study.out, study.command)
-    study.write({"discharges": table}, {"ends": plot(table)}, markdown(summary(table)))
+        export(chosen.seeds, study.out, study.command, shown)
+    study.write({"discharges": table}, {"ends": plot(table)}, markdown(shown))
 
 
 if __name__ == "__main__":

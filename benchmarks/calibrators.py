@@ -179,19 +179,14 @@ class Follow:
         return observation[:, _STEP], None
 
 
-def _pretrained(name: str, recorded: bool = False) -> Calibrator:
-    return Calibrator(
-        name,
-        _POLICY_NEEDS,
-        lambda unknown, told_V: PolicyEstimator.pretrained(ENV_ID, recorded=recorded),
-        policy=pretrained_card(ENV_ID, recorded)["sha256"][:8],
-    )
-
-
-#: The policies that come with ``battery_env``, and what is left without them.
+#: The policy for simulated cells that comes with ``battery_env``, and what is left without it.
 SHIPPED = (
-    _pretrained("LAC, pretrained"),
-    _pretrained("LAC, pretrained for recorded cells", recorded=True),
+    Calibrator(
+        "LAC, pretrained",
+        _POLICY_NEEDS,
+        lambda unknown, told_V: PolicyEstimator.pretrained(ENV_ID),
+        policy=pretrained_card(ENV_ID)["sha256"][:8],
+    ),
     Calibrator(
         "the fit that LAC sees, no policy", "model", lambda unknown, told_V: PolicyEstimator(Follow(), ENV_ID, **OPTIONS)
     ),

@@ -8,8 +8,9 @@ files with a card each that says what made them and what they are worth.
   python -m benchmarks.pretrained --envs BatteryVoltageJoint-v0 --updates 16000 --out results/pretrained_joint
   python -m benchmarks.pretrained --recorded --out results/pretrained_recorded
 
-Files and cards are shipped from ``battery_env/policies/pretrained_policies``, Joint from the second command, and those for
-recorded cells, whose models are wrong in more ways than in their constants, from the third one. The settings are those
+Files and cards are shipped from ``battery_env/policies/pretrained_policies``, Joint from the second command, and those of one
+parameter for recorded cells, whose models are wrong in more ways than in their constants, from the third one
+(:mod:`benchmarks.aging_paths` makes the one of both). The settings are those
 of ``zoo_configs``, with the options of the task below. Scores are of held-out discharges of the same environments (mean error
 over the second half of each), with the constants of the model right and wrong. Training is not repeated, nor is a part of the
 evaluation.

@@ -87,7 +87,7 @@ class ProgpyFilter(Estimator):
         """One estimate for every sample but the first of many discharges."""
         traces = []
         for record in records:
-            values = {name: np.full(len(record.time_s) - 1, getattr(NEW_CELL, name)) for name in _NAMES}
+            values: dict[str, Any] = {name: np.full(len(record.time_s) - 1, getattr(NEW_CELL, name)) for name in _NAMES}
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 values[self.parameter] = self._run(record)

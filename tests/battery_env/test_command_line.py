@@ -581,13 +581,13 @@ def test_a_reader_that_leaves_ends_it_in_silence():
 
 class TestPolicies:
     def test_the_one_that_comes_with_the_package_is_followed_and_named(self, tmp_path, terminal):
-        shown = terminal.shows(*POLICY, "--out", tmp_path, status=3)
+        shown = terminal.shows(*POLICY, "--out", tmp_path)
         assert "calibrated by the policy that comes with the package" in shown and "nan" not in shown
-        assert shown.count("   sd ") == 2 and "Not settled: Samples lie farther apart than the 2 s" in shown
+        assert shown.count("   sd ") == 2 and "Not settled" not in shown
         (row,) = pd.read_csv(tmp_path / "B0005_100_estimate.csv").to_dict(orient="records")
         record = load_nasa_discharges("B0005")[99].loaded_part(2.7)
         assert row["q_mobile_C"] == pytest.approx(PolicyEstimator.pretrained(recorded=True).estimate(record).q_mobile)
-        assert row["method"] == "policy" and row["sd_q_mobile_C"] > 100.0 and not row["settled"]
+        assert row["method"] == "policy" and row["sd_q_mobile_C"] < 100.0 and row["settled"]
 
     def test_one_of_a_file_takes_its_place(self, tmp_path, terminal):
         file = tmp_path / "mine.onnx"
