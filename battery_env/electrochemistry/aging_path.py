@@ -28,9 +28,9 @@ PATH_NAMES: tuple[str, ...] = (*UNCERTAIN_CONSTANTS, *EQUILIBRIUM_NAMES, *PARAME
 #: along the path of B0006.
 SPREAD_SD: tuple[float, ...] = (*(0.5,) * len(UNCERTAIN_CONSTANTS), *(0.005,) * EQUILIBRIUM_SIZE, 0.03, 0.25)
 #: A cell that lies farther beside the path, in standard deviations, is of another kind.
-BESIDE_LIMIT_SD = 4.0
-#: How ``q_mobile`` goes together with the voltage is known from the lives of few: other cells may lie this many times farther
-#: off than these tell. An estimate is not settled unless it is sure for all that.
+BESIDE_LIMIT_SD = 3.0
+#: How all this goes together is known from the lives of few cells: another one may lie this many times farther off. So many
+#: times larger are the standard deviations that are stated, and the one of ``q_mobile`` that has to be small to be settled.
 OTHER_LIVES = 2.0
 #: Cells may be younger and older than those of the path by this share of its length.
 BEYOND_SHARE = 0.2

@@ -248,6 +248,8 @@ class LeastSquares(Estimator):
             starts = search.starts([self.model.cell.q_mobile])[0]
         found = self._fitted(record, search, starts, shown)
         sd, values, verdict = found.sd(found.fit), found.fit.values, self._verdict(record, shown, found)
+        if self.path is not None:
+            sd = {name: OTHER_LIVES * each for name, each in sd.items()}
         constants = None if self.path is None else {name: values[name] for name in self.nuisance}
         return Estimate(values["q_mobile"], values["r_o"], sd["q_mobile"], sd["r_o"], **verdict._asdict(), constants=constants)
 
@@ -340,6 +342,7 @@ class LeastSquares(Estimator):
         if self.path is not None:
             distance = self.path.distance_sd(fit.values)
             diagnosis.note(Condition.BESIDE_PATH, distance > BESIDE_LIMIT_SD, distance=distance)
+            diagnosis.note(Condition.PATH_UNTESTED, "q_mobile" in unknown)
         diagnosis.note(Condition.Q_PRIOR_WRONG, moved_V2 > PRIOR_LIMIT_SD**2 * found.variance_V2)
         diagnosis.note(Condition.Q_PRIOR_ALONE, "q_mobile" in unknown and self.prior_q_mobile_C is not None)
         for name in fit.at_bound:

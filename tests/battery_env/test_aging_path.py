@@ -277,7 +277,8 @@ class TestTask:
         data = TrajectoryDataset.along(path, 60, [constant(1.5, "current"), LOAD], seed=7)
         estimator = PolicyEstimator(Fit(), "BatteryVoltageJoint-v0", path=path)
         scores = evaluate(estimator, data, SensorErrors(0.002), seed=1)
-        assert 88.0 < scores["q_mobile_coverage_percent"].mean() < 99.9
+        # of cells of the path itself the double of what the fit states holds nearly always
+        assert scores["q_mobile_coverage_percent"].mean() > 97.0
 
     def test_cells_of_another_kind_are_not_settled(self, along):
         large = simulate(4.0, 15000.0, 0.06, load_unit="current", cut_off_V=2.7)

@@ -161,6 +161,10 @@ class Condition(IntEnum):
     R_PRIOR_WRONG = _PRIOR_WRONG.format("R_o")
     # what the record does not tell of one number
     NO_CURRENT = "No current flows in the last step, so that R_o does not show.", "r_o"
+    PATH_UNTESTED = (
+        "What the record tells of R_o rests on the path of aging cells, as long as q_max does not show that it fits.",
+        "r_o",
+    )
     Q_DIFFERS = _DIFFERS.format("q_max"), "q_mobile"
     R_DIFFERS = _DIFFERS.format("R_o"), "r_o"
     LOAD_ON_UNSURE = (

@@ -277,7 +277,13 @@ def _linear_part(
         cell=cell,
         cut_off_V=-np.inf,
         max_duration_s=len(current_A) * dt_s,
-    ).state[steps]
+    ).state
+    if len(state) <= steps[-1]:
+        drawn_C = dt_s * float(current_A.sum())
+        raise ValueError(
+            f"a discharge draws {drawn_C:.6g} C, far more than such a cell holds: check the units of current and time"
+        )
+    state = state[steps]
     moved_C = start[QNS] - state[:, QNS]
     return moved_C + start[QNB] - state[:, QNB], moved_C, state[:, VO] / _ONE_OHM
 
