@@ -150,6 +150,10 @@ VERDICTS = {
     "half a discharge": (BOTH, changed(WHOLE, slice(1400)), {}, "q_max is not known to 2 % yet: the voltage shows it at"),
     "a small current": (BOTH, discharged(0.5), {}, "R_o is not known to 30 %: the error expected of noise and model"),
     "gain of the current": (BOTH, WHOLE, {"current_gain_sd": 0.03}, "q_max is known no better than what scales it"),
+    "constants of one load": (
+        BOTH, WHOLE, {"cell_sd_r_o_ohm": 0.05, "mismatch_V": 0.03},
+        "The discharges that the constants were fitted to leave 50 mohm of R_o open: fit such of other loads",
+    ),
     "charge at the start": (BOTH, WHOLE, {"initial_soc": (1.0, 0.03)}, "q_max is known no better than what scales it"),
     "its gain, for r_o": (
         BOTH, WHOLE, {"parameters": ["r_o"], "cell": NEW_CELL.replace(q_mobile=6000.0), "current_gain_sd": 0.4},
@@ -170,6 +174,7 @@ ALONE = {
     "gain of the current": "r_o",
     "charge at the start": "r_o",
     "a small current": "q_mobile",
+    "constants of one load": "q_mobile",
     "current lost in noise": "q_mobile",
     "its gain, for r_o": "q_mobile",
 }
