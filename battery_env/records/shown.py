@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import hypot
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -49,6 +50,7 @@ class Shown(NamedTuple):
     :param charge: the charge before; ``None``: not recorded
     :param load_on_C: standard deviation of the charge by the moment of load-on, which lies between two samples, C
     :param offset_A: what flows at rest, A
+    :param uncounted_C: by how much the charge is another one than the tester counted, C
     """
 
     at_rest: bool = False
@@ -56,10 +58,11 @@ class Shown(NamedTuple):
     charge: ChargeBefore | None = None
     load_on_C: float = 0.0
     offset_A: float = 0.0
+    uncounted_C: float = 0.0
 
-    def offset_C(self, duration_s: float) -> float:
-        """What is counted wrongly in a time under load, if what flows at rest is an offset of the sensor, C."""
-        return abs(self.offset_A) * duration_s
+    def unseen_C(self, duration_s: float) -> float:
+        """Standard deviation of the charge of a time under load, C; what flows at rest may be an offset of the sensor."""
+        return hypot(self.load_on_C, self.offset_A * duration_s, self.uncounted_C)
 
 
 def shown_beside(record: Any) -> Shown:

@@ -179,6 +179,11 @@ class Condition(IntEnum):
         "Subtract it from the current if it is an offset.",
         "q_mobile",
     )
+    UNCOUNTED = (
+        "The tester counted another charge than current and time make: {uncounted_C:.0f} C are in doubt. Check units and "
+        "clock.",
+        "q_mobile",
+    )
     Q_DROPPED = _DROPPED.format("{dropped_C:.0f} C are"), "q_mobile"
     R_DROPPED = _DROPPED.format("{dropped_mohm:.0f} mohm of R_o are"), "r_o"
     GAP_UNSURE = (
