@@ -237,6 +237,7 @@ SOUND = {
     "whole": WHOLE,
     "pulses of charge": charged_now_and_then(0),
     "pulses of charge and rests": charged_now_and_then(40),
+    "a loud sensor": discharged(noise_V=0.02),
     "a small resistance": discharged(pulsed(60, 120, 2.0, 0.4), r_o=0.04),
     "a large cell": discharged(pulsed(60, 120, 5.0, 1.0), 18_900.0, 0.02),
     "pulses too short for the voltage to follow": discharged(pulsed(1, 60, 5.0, 1.0, 100), noise_V=0.002),

@@ -365,11 +365,12 @@ def _change_to_follow_A(switched_A: float, current_A: float, lagging_A: float) -
 
 @compiled
 def _is_followed(seen: Row, time_s: float, lowest_V: float, highest_V: float, resistance_ohm: float) -> bool:
-    # whether the voltage follows the last switch of the load by half of the least ohmic drop that it can have by then
+    # whether the voltage follows the last switch of the load by half of the least ohmic drop that it can have by then, or that
+    # drop is no more than noise
     switch = seen.switch
-    drop_V = -0.5 * resistance_ohm * switch.to_follow_A * expm1((switch.time_s - time_s) / _FOLLOWS_S)
+    drop_V = -resistance_ohm * switch.to_follow_A * expm1((switch.time_s - time_s) / _FOLLOWS_S)
     followed_V = switch.before_V - (lowest_V if drop_V > 0.0 else highest_V)
-    return abs(drop_V) <= noise_V(seen) or followed_V / drop_V >= 1.0
+    return abs(drop_V) <= noise_V(seen) or followed_V / drop_V >= 0.5
 
 
 @compiled
