@@ -207,8 +207,17 @@ class CellFit:
             "thermal": self.thermal,
             "mismatch_V": self.mismatch_V,
             "q_mobile_bounds_C": self.q_mobile_bounds_C,
+            "cell_sd_r_o_ohm": self.sd_r_o_ohm,
         }
         return LeastSquares(**{**own, **arguments})
+
+    @property
+    def sd_r_o_ohm(self) -> float:
+        """
+        What the discharges leave open of any ``r_o`` that is found with the constants, ohm: under one load, without pauses,
+        ``r_o`` and the overpotentials look alike.
+        """
+        return min(each.sd_r_o for each in self.discharges)
 
     @property
     def q_mobile_bounds_C(self) -> tuple[float, float]:

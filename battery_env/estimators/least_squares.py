@@ -20,6 +20,7 @@ from battery_env.estimates import Estimate, EstimateTrace
 from battery_env.estimators.diagnosis.conditions import (
     EXCESS_LIMIT_UNSTATED,
     MISMATCH_MARGIN,
+    MOST_OF_SD,
     PRIOR_LIMIT_SD,
     SETTLED_SHARES,
     SPARE_SAMPLES,
@@ -144,6 +145,7 @@ class LeastSquares(Estimator):
         to those of the parameters. :func:`battery_env.soc_from_rest` tells it from the voltage of the rest before the load
     :param path: how cells of this kind age (:func:`battery_env.fit_life`): which constants, ``q_mobile`` and ``r_o`` go
         together before this record is seen. ``cell`` and ``mismatch_V`` are those of the path by default
+    :param cell_sd_r_o_ohm: what the constants leave open of ``r_o``: its standard deviation by theirs, ohm
     :raises ValueError: for an argument out of range
     """
 
@@ -164,6 +166,7 @@ class LeastSquares(Estimator):
         nuisance: Mapping[str, float] | None = None,
         initial_soc: InitialSoc = 1.0,
         path: AgingPath | None = None,
+        cell_sd_r_o_ohm: float = 0.0,
     ) -> None:
         self.parameters = check_parameters(parameters)
         self.nuisance = _check_nuisance({} if nuisance is None else nuisance, self.parameters)
@@ -184,7 +187,8 @@ class LeastSquares(Estimator):
             if not 0.0 < prior_q_mobile_C[1] < np.inf:
                 raise ValueError(f"prior_q_mobile_C is (mean, sd) with sd > 0, got {prior_q_mobile_C!r}")
         self.prior_q_mobile_C = prior_q_mobile_C
-        check_not_negative(mismatch_V=mismatch_V)
+        check_not_negative(mismatch_V=mismatch_V, cell_sd_r_o_ohm=cell_sd_r_o_ohm)
+        self.cell_sd_r_o_ohm = cell_sd_r_o_ohm
         self.mismatch_V = mismatch_V
         self.current_gain_sd = check_gain_sd(current_gain_sd)
         self._at_rest = initial is None
@@ -309,8 +313,9 @@ class LeastSquares(Estimator):
             change_V = (nearby.residual(moved)[0] - search.residual(values)[0]) / step
             rows = np.nan_to_num(np.append(change_V, np.zeros(len(fit.jacobian) - len(change_V))))
             by_soc -= np.linalg.lstsq(fit.jacobian, rows, rcond=None)[0]
+        of_cell = {"r_o": self.cell_sd_r_o_ohm}
         return {
-            name: hypot(self.current_gain_sd * values[name], sd_soc * float(by_soc[n]))
+            name: hypot(self.current_gain_sd * values[name], sd_soc * float(by_soc[n]), of_cell.get(name, 0.0))
             for n, name in enumerate(self.parameters)
         }
 
@@ -347,6 +352,9 @@ class LeastSquares(Estimator):
         diagnosis.note(Condition.Q_PRIOR_ALONE, "q_mobile" in unknown and self.prior_q_mobile_C is not None)
         for name in fit.at_bound:
             diagnosis.note(Condition.Q_AT_BOUND.of(name))
+        of_cell_mohm, most_ohm = 1e3 * self.cell_sd_r_o_ohm, MOST_OF_SD * own["r_o"]
+        is_of_cell = "r_o" in unknown and self.cell_sd_r_o_ohm > most_ohm
+        diagnosis.note(Condition.R_OF_CONSTANTS, is_of_cell, of_cell_mohm=of_cell_mohm)
         for name in unknown:
             scaled = found.hidden_sd[name] >= SETTLED_SHARES[name] * fit.values[name]
             diagnosis.note(Condition.Q_SCALE_UNKNOWN.of(name), scaled)

@@ -57,6 +57,7 @@ class Settings:
     :param cell: constants of the model; ``None``: those of a new 18650
     :param cell_currents_A: lowest and highest mean current that these constants were fitted to, A: beyond them by more than a
         quarter no estimate is settled, and no nominal capacity is told. ``None``: they hold for all
+    :param cell_sd_r_o_ohm: what the constants leave open of ``r_o``, ohm
     :param q_mobile_bounds_C: where to search for ``q_mobile``, C; ``None``: where the calibrator does by default
     :param initial_soc: state of charge when the load is switched on, after a rest: a number, (mean, standard deviation), or
         ``"rest"``: told from the voltage of the rest before the load, of a minute at least
@@ -78,6 +79,7 @@ class Settings:
     nominal_Ah: float | None = None
     cell: CellParameters | None = None
     cell_currents_A: tuple[float, float] | None = None
+    cell_sd_r_o_ohm: float = 0.0
     q_mobile_bounds_C: tuple[float, float] | None = None
     initial_soc: InitialSoc | Literal["rest"] = 1.0
     policy: Path | None = None
@@ -124,6 +126,7 @@ class Settings:
                     "thermal": cell.thermal,
                     "cell_currents_A": cell.currents_A,
                     "q_mobile_bounds_C": cell.q_mobile_bounds_C,
+                    "cell_sd_r_o_ohm": cell.sd_r_o_ohm,
                 }
             others, cell = {**known, **others}, cell.cell
         return cls(**{"cell": cell, **others})
@@ -166,6 +169,7 @@ class Settings:
             prior_q_mobile_C=self.prior_q_mobile_C,
             mismatch_V=self.mismatch_V,
             current_gain_sd=self.current_gain_sd,
+            cell_sd_r_o_ohm=self.cell_sd_r_o_ohm,
             initial_soc=stated if start is None else (start.soc, start.sd_soc),
             **bounds,
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import hypot
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -49,6 +50,7 @@ class Shown(NamedTuple):
     :param charge: the charge before; ``None``: not recorded
     :param load_on_C: standard deviation of the charge by the moment of load-on, which lies between two samples, C
     :param offset_A: what flows at rest, A
+    :param uncounted_C: by how much the charge is another one than the tester counted, C
     """
 
     at_rest: bool = False
@@ -56,10 +58,11 @@ class Shown(NamedTuple):
     charge: ChargeBefore | None = None
     load_on_C: float = 0.0
     offset_A: float = 0.0
+    uncounted_C: float = 0.0
 
-    def offset_C(self, duration_s: float) -> float:
-        """What is counted wrongly in a time under load, if what flows at rest is an offset of the sensor, C."""
-        return abs(self.offset_A) * duration_s
+    def unseen_C(self, duration_s: float) -> float:
+        """Standard deviation of the charge of a time under load, C; what flows at rest may be an offset of the sensor."""
+        return hypot(self.load_on_C, self.offset_A * duration_s, self.uncounted_C)
 
 
 def shown_beside(record: Any) -> Shown:
@@ -89,10 +92,9 @@ def rest_current_A(current_A: FloatArray) -> float | None:
     What flows at rest, A: what the rests before and after a load have in common, as a small load, or the end of a charge, is
     only before it or after. Where only the one before is recorded, what is drawn in it; ``None``: no rest is.
     """
-    most_A = current_A.max()
-    loaded = np.flatnonzero(current_A > SWITCH_SHARE * most_A)
+    loaded = np.flatnonzero(current_A > SWITCH_SHARE * current_A.max())
     before, after = current_A[: loaded[0]], current_A[loaded[-1] + 1 :]
-    rests = [part[np.abs(part) <= SWITCH_SHARE * most_A] for part in (before, after)]
+    rests = [part[np.abs(part) <= SWITCH_SHARE * np.ptp(current_A)] for part in (before, after)]
     before_A, after_A = (float(np.median(rest)) if len(rest) else 0.0 for rest in rests)
     if not len(rests[1]):
         return max(before_A, 0.0) if len(rests[0]) else None

@@ -485,3 +485,31 @@ def test_a_dependency_of_a_reader_that_is_missing_is_named_and_its_warnings_are_
     monkeypatch.setitem(sys.modules, "NewareNDA", neware)
     (tmp_path / "cell.ndax").write_bytes(b"x")
     same(read(tmp_path / "cell.ndax"))
+
+
+class TestCountedByTheTester:
+    COUNTED = np.append(0.0, np.cumsum(np.maximum(-TABLE["current"], 0.0).to_numpy()[:-1] * np.diff(TABLE["time"]))) / 3600.0
+
+    @pytest.mark.parametrize("name", ["Discharge_Capacity(Ah)", "Capacity(mAh)", "DChg. Cap.(Ah)", "Q discharge/mA.h"])
+    def test_what_agrees_is_not_said_however_it_counts(self, name):
+        counted = self.COUNTED * (1e3 if "mA" in name else 1.0)
+        for values in (
+            counted,
+            -counted,
+            counted + 3.0,
+            np.where(np.arange(len(counted)) > 100, counted - counted[100], counted),
+        ):
+            assert read(TABLE.assign(**{name: values})).shown.uncounted_C == 0.0
+        # nor a column that is no count
+        assert read(TABLE.assign(**{name: 2.0})).shown.uncounted_C == 0.0
+
+    @pytest.mark.parametrize("gain", [0.5, 0.9, 0.97, 1.03, 1.1, 2.0])
+    def test_what_does_not_is_said_and_is_a_doubt_of_its_size(self, gain):
+        discharge = read(TABLE.assign(**{"Capacity(Ah)": gain * self.COUNTED}), "the tester counted")
+        charge_C = 3600.0 * self.COUNTED[-1]
+        assert discharge.shown.uncounted_C == pytest.approx(abs(gain - 1.0) * charge_C, rel=0.1)
+        for method in ("least-squares", "kalman"):
+            found = calibrate(discharge, method=method)
+            assert found.sd_q_mobile_C > discharge.shown.uncounted_C and not found.settled_q_mobile
+            assert "The tester counted another charge" in found.reason
+            assert found.sd_predicted_capacity_Ah > discharge.shown.uncounted_C / 3600.0

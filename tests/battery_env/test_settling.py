@@ -150,6 +150,10 @@ VERDICTS = {
     "half a discharge": (BOTH, changed(WHOLE, slice(1400)), {}, "q_max is not known to 2 % yet: the voltage shows it at"),
     "a small current": (BOTH, discharged(0.5), {}, "R_o is not known to 30 %: the error expected of noise and model"),
     "gain of the current": (BOTH, WHOLE, {"current_gain_sd": 0.03}, "q_max is known no better than what scales it"),
+    "constants of one load": (
+        BOTH, WHOLE, {"cell_sd_r_o_ohm": 0.05, "mismatch_V": 0.03},
+        "The discharges that the constants were fitted to leave 50 mohm of R_o open: fit such of other loads",
+    ),
     "charge at the start": (BOTH, WHOLE, {"initial_soc": (1.0, 0.03)}, "q_max is known no better than what scales it"),
     "its gain, for r_o": (
         BOTH, WHOLE, {"parameters": ["r_o"], "cell": NEW_CELL.replace(q_mobile=6000.0), "current_gain_sd": 0.4},
@@ -170,6 +174,7 @@ ALONE = {
     "gain of the current": "r_o",
     "charge at the start": "r_o",
     "a small current": "q_mobile",
+    "constants of one load": "q_mobile",
     "current lost in noise": "q_mobile",
     "its gain, for r_o": "q_mobile",
 }
@@ -232,6 +237,7 @@ SOUND = {
     "whole": WHOLE,
     "pulses of charge": charged_now_and_then(0),
     "pulses of charge and rests": charged_now_and_then(40),
+    "a loud sensor": discharged(noise_V=0.02),
     "a small resistance": discharged(pulsed(60, 120, 2.0, 0.4), r_o=0.04),
     "a large cell": discharged(pulsed(60, 120, 5.0, 1.0), 18_900.0, 0.02),
     "pulses too short for the voltage to follow": discharged(pulsed(1, 60, 5.0, 1.0, 100), noise_V=0.002),

@@ -98,7 +98,9 @@ class Condition(IntEnum):
         "fit constants to discharges with pauses."
     )
     START_ABOVE = (
-        "The record starts at {first_V:.2f} V, above the {rest_V:.2f} V of {expected}: another kind of cell or sensor."
+        "The record starts at {first_V:.2f} V, above the {rest_V:.2f} V of {expected} at rest: it had not rested since its "
+        "charge, or is another kind of cell or sensor. Give a minute at rest before the load, or fit constants (fit_cell, "
+        "--cell)."
     )
     START_CHARGED = (
         "The charge before the load ended at {charge_V:.2f} V, still under {charge_A:.3g} A: the cell rests below that, and "
@@ -177,6 +179,11 @@ class Condition(IntEnum):
         "Subtract it from the current if it is an offset.",
         "q_mobile",
     )
+    UNCOUNTED = (
+        "The tester counted another charge than current and time make: {uncounted_C:.0f} C are in doubt. Check units and "
+        "clock.",
+        "q_mobile",
+    )
     Q_DROPPED = _DROPPED.format("{dropped_C:.0f} C are"), "q_mobile"
     R_DROPPED = _DROPPED.format("{dropped_mohm:.0f} mohm of R_o are"), "r_o"
     GAP_UNSURE = (
@@ -186,6 +193,11 @@ class Condition(IntEnum):
     )
     Q_PRIOR_ALONE = _PRIOR_ALONE.format("q_max", _IMPRECISE_Q), "q_mobile"
     R_PRIOR_ALONE = _PRIOR_ALONE.format("R_o", _IMPRECISE_R), "r_o"
+    R_OF_CONSTANTS = (
+        "The discharges that the constants were fitted to leave {of_cell_mohm:.0f} mohm of R_o open: fit such of other loads, "
+        "or with pauses, too.",
+        "r_o",
+    )
     Q_SCALE_UNKNOWN = _SCALE_UNKNOWN.format("q_max"), "q_mobile"
     R_SCALE_UNKNOWN = _SCALE_UNKNOWN.format("R_o"), "r_o"
     Q_IMPRECISE = _IMPRECISE_Q, "q_mobile"

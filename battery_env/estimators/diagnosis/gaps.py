@@ -22,16 +22,19 @@ _MOST_SHARE = 0.5
 _SURE_SD = 1.5
 # Voltages are rounded, and no model is better than this, V: over a flat curve a short gap says nothing.
 _RESOLUTION_V = 1e-3
-# What model and cell part by is averaged over about so many samples before a gap, and how fast the voltage falls over so long,
-# s; after it the middle voltage of three counts.
-_PARTED_MEMORY, _RATE_MEMORY_S, _PARTED_SAMPLES = 8.0, 100.0, 3
+# What model and cell part by is averaged over about so many samples before a gap, twice, which tells its trend, and how fast
+# the voltage falls over so long, s; after it the middle voltage of three counts.
+_PARTED_MEMORY, _RATE_MEMORY_S, _PARTED_SAMPLES = 4.0, 100.0, 3
 # Standard deviation of the difference of both, as a share of the noise.
-_PARTED_NOISE_SHARE = 0.72
+_PARTED_NOISE_SHARE = 0.84
 
 #: What was expected before a gap: the last interval, the voltage, by how much cell and model part and how fast the voltage
 #: falls, both in the mean; the longest intervals under load that were not in doubt, in their order.
 USUAL = table(
-    [*((name, "f8") for name in ("interval_s", "expected_V", "parted_V", "fall_V_per_s")), ("longest_s", "f8", _HABIT)]
+    [
+        *((name, "f8") for name in ("interval_s", "expected_V", "parted_V", "parted_twice_V", "fall_V_per_s")),
+        ("longest_s", "f8", _HABIT),
+    ]
 )
 
 #: The last gap, pending until the voltages after it were seen: its charge, the fall of the model within it, the voltage of
@@ -79,7 +82,9 @@ def follow(seen: Row, voltage: float, current: float, expected_V: float, q_mobil
                 _close(seen, voltage, load_A)
     if not isnan(voltage):
         if gap.samples == 0.0:
-            usual.parted_V += (voltage - expected_V - usual.parted_V) / min(seen.samples - 1.0, _PARTED_MEMORY)
+            share = 1.0 / min(seen.samples - 1.0, _PARTED_MEMORY)
+            usual.parted_V += share * (voltage - expected_V - usual.parted_V)
+            usual.parted_twice_V += share * (usual.parted_V - usual.parted_twice_V)
         usual.expected_V = expected_V
         if not is_gap and seen.samples > 2:
             fall_V_per_s = (seen.before.voltage_1_V - voltage) / duration
@@ -116,7 +121,7 @@ def _open(seen: Row, voltage: float, current: float, expected_V: float, charge_C
     if steady_s >= STEADY_S:
         # a model whose q_mobile is not known yet may take its cell for empty: the voltage falls at least as it did before
         gap.fall_V = min(gap.fall_V, usual.fall_V_per_s * duration)
-    gap.model_V = usual.expected_V + usual.parted_V - gap.fall_V
+    gap.model_V = usual.expected_V + 2.0 * usual.parted_V - usual.parted_twice_V - gap.fall_V
     gap.after_V = voltage
     # a load that was switched just before may have been switched again
     is_switched = steady_s < duration and seen.examined.jump_s > seen.rest.over_s

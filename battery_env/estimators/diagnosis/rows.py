@@ -19,7 +19,7 @@ Row = Any
 KEPT = 32
 #: A change of more than so many standard deviations of the noise is not noise. The middle one of three samples has this share
 #: of their noise.
-NOISES, SMOOTHED_SHARE = 4.0, 0.67
+NOISES, SMOOTHED_SHARE = 8.0, 0.67
 #: Under a current that was steady for so long, s, a voltage goes on as before.
 STEADY_S = 60.0
 # This many changes tell the noise.

@@ -106,6 +106,7 @@ SEEN = table(
         ("usual", gaps.USUAL),
         ("gap", gaps.GAP),
         ("pending", "b1"),  # the voltage has not followed the last switch yet
+        ("uncounted_C", "f8"),  # by how much the tester counted another charge
         ("dropped_C", "f8"),  # charge of switches that were taken back, which it did not follow
         ("dropped_ohm", "f8"),  # by how much they moved an estimate of r_o
         ("fault", _FAULT),
@@ -169,7 +170,7 @@ def expect(seen: Any, cell: CellParameters, initial_soc: float | None) -> None:
 def take_in(seen: Any, shown: Shown) -> None:
     """Take in what is known beside the samples, before the first of them."""
     start, rest, charge, full_V = seen["start"], seen["rest"], shown.charge, seen["start_V"]
-    start["at_rest"] = shown.at_rest
+    start["at_rest"], seen["uncounted_C"] = shown.at_rest, shown.uncounted_C
     if charge is not None:
         # without a rest a charge that did not taper off tells nothing but that the cell is lower
         is_low = (charge.highest_V < seen["low_V"]) | (not charge.tapered and shown.rest_s < LEAST_REST_S)
@@ -192,6 +193,7 @@ def measured(seen: Any, initial_soc: float, clock_s: float = 0.0, charge: Charge
         "fault_s": clock_s + (fault["time_s"] if fault["condition"] else switch["time_s"]),
         "since_s": clock_s + fault["since_s"],
         "size": fault["size"] if fault["condition"] else switch["size_A"],
+        "uncounted_C": seen["uncounted_C"],
         "dropped_C": seen["dropped_C"],
         "dropped_mohm": 1e3 * seen["dropped_ohm"],
         "gap_start_s": end_s - gap["length_s"],
@@ -278,10 +280,10 @@ def _note_rest(rest: Row, time_s: float, interval_s: float, current: float) -> N
 
 @compiled
 def unseen_C(seen: Row) -> float:
-    """The standard deviation of the charge by the moment of load-on, what flows at rest, gaps in doubt, and dropouts."""
+    """The standard deviation of the charge by all that nobody saw."""
     rest = seen.rest
     beside_C = hypot(rest.load_on_C, rest.mean_A * (seen.time_s - rest.over_s)) if rest.is_over else 0.0
-    return hypot(beside_C, hypot(gaps.doubtful_C(seen), seen.dropped_C))
+    return hypot(hypot(beside_C, seen.uncounted_C), hypot(gaps.doubtful_C(seen), seen.dropped_C))
 
 
 @compiled
@@ -292,6 +294,8 @@ def doubt_condition(seen: Row, sd_C: float) -> int:
         return Condition.LOAD_ON_UNSURE + 0
     if rest.is_over and abs(rest.mean_A) * (seen.time_s - rest.over_s) > most_C:
         return Condition.REST_CURRENT + 0
+    if seen.uncounted_C > most_C:
+        return Condition.UNCOUNTED + 0
     if seen.dropped_C > most_C:
         return Condition.Q_DROPPED + 0
     return Condition.GAP_UNSURE + 0 if sd_C < inf and gaps.doubtful_C(seen) > 0.0 else 0
@@ -361,11 +365,12 @@ def _change_to_follow_A(switched_A: float, current_A: float, lagging_A: float) -
 
 @compiled
 def _is_followed(seen: Row, time_s: float, lowest_V: float, highest_V: float, resistance_ohm: float) -> bool:
-    # whether the voltage follows the last switch of the load by half of the least ohmic drop that it can have by then
+    # whether the voltage follows the last switch of the load by half of the least ohmic drop that it can have by then, or that
+    # drop is no more than noise
     switch = seen.switch
-    drop_V = -0.5 * resistance_ohm * switch.to_follow_A * expm1((switch.time_s - time_s) / _FOLLOWS_S)
+    drop_V = -resistance_ohm * switch.to_follow_A * expm1((switch.time_s - time_s) / _FOLLOWS_S)
     followed_V = switch.before_V - (lowest_V if drop_V > 0.0 else highest_V)
-    return abs(drop_V) <= noise_V(seen) or followed_V / drop_V >= 1.0
+    return abs(drop_V) <= noise_V(seen) or followed_V / drop_V >= 0.5
 
 
 @compiled

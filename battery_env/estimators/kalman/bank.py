@@ -342,7 +342,9 @@ def conclude(cell: Row, settings: Settings, estimate: Row) -> None:
             estimate.sd[k] = nan
             continue
         value, (low, high), (mean, prior_sd) = bank.mean[k], settings.bounds[k], settings.carried[k]
-        sd = hypot(hypot(own_sd[k], settings.scale_sd[k] * value), unseen if k == Q else seen.dropped_ohm)
+        sd = hypot(
+            hypot(own_sd[k], settings.scale_sd[k] * value), unseen if k == Q else hypot(seen.dropped_ohm, settings.cell_sd_r_o)
+        )
         estimate.sd[k], of_data = sd, sd
         _note(estimate, Condition.Q_AT_BOUND + k, not low + bank.sd[k] < value < high - bank.sd[k])
         if prior_sd > 0.0:
@@ -354,6 +356,7 @@ def conclude(cell: Row, settings: Settings, estimate: Row) -> None:
             _note(estimate, Condition.Q_PRIOR_ALONE + k, of_data >= _SHARES[k] * value)
         if not sd < _SHARES[k] * value:
             _note(estimate, Condition.R_DROPPED, k == R and seen.dropped_ohm > MOST_OF_SD * sd)
+            _note(estimate, Condition.R_OF_CONSTANTS, k == R and settings.cell_sd_r_o > MOST_OF_SD * sd)
             doubt = doubt_condition(seen, sd)
             _note(estimate, doubt, k == Q and doubt > 0)
             _note(estimate, Condition.Q_SCALE_UNKNOWN + k, settings.scale_sd[k] >= _SHARES[k])

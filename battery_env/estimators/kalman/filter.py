@@ -25,7 +25,7 @@ from battery_env.estimators.kalman.bank import conclude, filters_of_prior, take
 from battery_env.estimators.kalman.state import CELL, ESTIMATE, FILTER, SAMPLE, Q, R, Settings
 from battery_env.estimators.state_files import check_all, check_like
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, check_parameters
-from battery_env.records import Record, Stream, are_plausible, check_drawn_charge, check_sample, shown_beside
+from battery_env.records import ChargeBefore, Record, Stream, are_plausible, check_drawn_charge, check_sample, shown_beside
 
 _PRIOR_SD_SHARE_Q = 0.25
 _PRIOR_SD_R_OHM = 0.15
@@ -34,7 +34,7 @@ _NOISE_V = 0.005
 # Covariances of a state may be so much larger than their variances allow, as a share.
 _ROUNDED = 1e-6
 # What reasons are made of
-_SHOWN = ("start", "rest", "fault", "switch", "gap", "start_V", "time_s", "dropped_C", "dropped_ohm")
+_SHOWN = ("start", "rest", "fault", "switch", "gap", "start_V", "time_s", "uncounted_C", "dropped_C", "dropped_ohm")
 
 
 class ExtendedKalmanFilter(OnlineEstimator):
@@ -112,6 +112,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
     :param current_gain_sd: standard deviation of the gain of the current sensor, as a share of it
     :param initial_soc: state of charge at the first sample, after a rest: a number, or (mean, standard deviation), which adds
         to that of ``q_mobile``
+    :param cell_sd_r_o_ohm: what the constants leave open of ``r_o``: its standard deviation by theirs, ohm
     :raises ValueError: for an argument out of range
     """
 
@@ -131,6 +132,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
         drift_per_hour: float = 0.001,
         current_gain_sd: float = 0.0,
         initial_soc: float | tuple[float, float] = 1.0,
+        cell_sd_r_o_ohm: float = 0.0,
     ) -> None:
         self.parameters = check_parameters(parameters)
         self.cell = check_cell(cell, thermal)
@@ -141,6 +143,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
         check_not_negative(offset_sd_V=offset_sd_V, mismatch_V=mismatch_V, drift_per_hour=drift_per_hour)
         voltage_noise_V = _checked_noise_V(voltage_noise_V, mismatch_V)
         self.current_gain_sd = check_gain_sd(current_gain_sd)
+        check_not_negative(cell_sd_r_o_ohm=cell_sd_r_o_ohm)
         self.initial_soc = check_initial_soc(initial_soc)
         q, q_sd = self._prior("q_mobile", prior_q_mobile_C, _PRIOR_SD_SHARE_Q * self.cell.q_mobile)
         r_o, r_o_sd = self._prior("r_o", prior_r_o_ohm, _PRIOR_SD_R_OHM)
@@ -162,6 +165,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
             carried=(_pair(prior_q_mobile_C or (0.0, 0.0)), _pair(prior_r_o_ohm or (0.0, 0.0))),
             scale_sd=(float(np.hypot(self.current_gain_sd, sd_soc / soc)), float(self.current_gain_sd)),
             cell_q_mobile=float(self.cell.q_mobile),
+            cell_sd_r_o=float(cell_sd_r_o_ohm),
         )
         self._derivatives = PolynomialDerivatives.of(self.cell.packed)
         self._cells = np.zeros(1, CELL)
@@ -221,7 +225,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
                 self._begin(temperature_K)
         sample = np.array([[(voltage_V, current_A, dt_s, temperature_K)]], dtype=SAMPLE)
         said = self._follow(self._cells, self._filters, sample)[0, 0]
-        shown = measured(self._cells["seen"][0], self.initial_soc[0])
+        shown = self._measured(self._cells["seen"][0])
         verdict = _verdict(said["condition"].tolist(), said["r_o_comes_first"], shown)
         return Estimate(float(said["q_mobile"]), float(said["r_o"]), *said["sd"].tolist(), **verdict._asdict())
 
@@ -230,6 +234,10 @@ class ExtendedKalmanFilter(OnlineEstimator):
         estimates = np.empty(samples.shape, ESTIMATE)
         _follow_all(cells, filters, samples, self._settings, self.cell.packed, self._derivatives, estimates)
         return estimates
+
+    def _measured(self, seen: Any, clock_s: float = 0.0, charge: ChargeBefore | None = None) -> dict[str, Any]:
+        """What texts say, by the names in their braces."""
+        return measured(seen, self.initial_soc[0], clock_s, charge) | {"of_cell_mohm": 1e3 * self._settings.cell_sd_r_o}
 
     def follow(self, record: Record) -> EstimateTrace:
         """
@@ -250,7 +258,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
         take_in(self._cells["seen"], beside)
         check_drawn_charge(float(np.cumsum(np.append(0.0, current_A[:-1]) * dt_s).min()), self.least_drawn_C)
         said = self._follow(self._cells, self._filters, samples)[:, 0]
-        shown = measured(self._cells["seen"][0], self.initial_soc[0], float(time_s[0]), beside.charge)
+        shown = self._measured(self._cells["seen"][0], float(time_s[0]), beside.charge)
         noted = list(zip(map(tuple, said["condition"].tolist()), said["r_o_comes_first"].tolist(), strict=True))
         texts = {each: _verdict(*each, shown).reason for each in set(noted)}
         sd_q, sd_r_o = said["sd"].T.copy()
@@ -379,8 +387,7 @@ class KalmanBatch(OnlineBatch):
 
         def reason_of(n: int) -> str:
             of_cell = {name: column[n] for name, column in shown.items()}
-            texts = measured(of_cell, one.initial_soc[0])
-            return _verdict(said["condition"][n], said["r_o_comes_first"][n], texts).reason
+            return _verdict(said["condition"][n], said["r_o_comes_first"][n], one._measured(of_cell)).reason
 
         settled_q_mobile, settled_r_o = (said["condition"] == Condition.SETTLED).T
         return Estimates(said["q_mobile"], said["r_o"], sd_q_mobile, sd_r_o, settled_q_mobile, settled_r_o, reason_of)

@@ -30,6 +30,7 @@ class Settings(NamedTuple):
     :param carried: mean and standard deviation of each from an earlier discharge; zeros where none was given
     :param scale_sd: standard deviations of what scales each and does not show in the voltage, as shares
     :param cell_q_mobile: of the model's cell, C
+    :param cell_sd_r_o: what the constants of that cell leave open of ``r_o``, ohm
     """
 
     dt_s: float
@@ -44,6 +45,7 @@ class Settings(NamedTuple):
     carried: tuple[tuple[float, float], tuple[float, float]]
     scale_sd: tuple[float, float]
     cell_q_mobile: float
+    cell_sd_r_o: float
 
 
 #: One sample of one cell.

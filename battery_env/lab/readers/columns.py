@@ -39,12 +39,15 @@ _NAMES = {
     "power": "power, p, leistung",
     "charge_step": "dq",
     "counter": "ece",
+    "capacity": "discharge capacity, dchg capacity, dchg cap, q discharge, discharged capacity, capacity, cap, "
+    "entladekapazität, kapazität",
 }
 _RANKS = {
     quantity: {name: rank for rank, name in enumerate(names.replace(" ", "").split(","))} for quantity, names in _NAMES.items()
 }
 # Names that are this quantity only where a unit says so: t may be a time, and p or q anything.
 _WITH_UNIT = {("temperature", "t"), ("power", "p"), ("charge_step", "dq"), ("counter", "ece")}
+_WITH_UNIT |= {("capacity", name) for name in _RANKS["capacity"]}
 
 
 def _units(factors: Mapping[str, float]) -> dict[str, tuple[float, float]]:
@@ -64,6 +67,7 @@ _TIMES = _units(
 )
 _VOLTS = _units({"v volt volts": 1.0, "mv mvolt mvolts millivolt millivolts": 1e-3})
 _MILLIAMPERES = "ma mamp mamps milliamp milliamps milliampere milliamperes"
+_CHARGES = _units({"ma.h mah": 3.6, "a.h ah": 3600.0})
 _DEGREES = _units({"c degc degreec celsius deg": 1.0}) | dict.fromkeys(("k", "kelvin"), (1.0, -ZERO_CELSIUS_K))
 # By quantity and unit in lower case without blanks: factor and offset to s, V, A, degC, W and C.
 _UNITS: dict[str, dict[str, tuple[float, float]]] = {
@@ -74,8 +78,9 @@ _UNITS: dict[str, dict[str, tuple[float, float]]] = {
     "ambient": _DEGREES,
     "step_time": _TIMES,
     "power": _units({"w watt watts": 1.0, "mw": 1e-3}),
-    "charge_step": _units({"ma.h mah": 3.6, "a.h ah": 3600.0}),
+    "charge_step": _CHARGES,
     "counter": _VOLTS,
+    "capacity": _CHARGES,
 }
 # What a record may have in place of a quantity.
 _INSTEAD = {"current": ("power", "charge_step")}

@@ -37,6 +37,8 @@ _NOTHING_SHARE = 1e-3
 _LEAST_SHARE = 0.01
 # Over longer gaps than this a temperature that is missing is a guess, s.
 _TEMPERATURE_GAP_S = 600.0
+# What the tester counted may be off by this share, as of rows a minute apart.
+_COUNTED_SHARE = 0.01
 # Where the voltage comes back so near to that of the start, as a share of its fall, the cell was charged; so little of the
 # fall of the whole record is a pulse.
 _BACK_SHARE = 0.25
@@ -297,9 +299,36 @@ def _recording(
         temperature_C = _filled(time_s, rows["temperature"].to_numpy())
         if temperature_C is not None:
             arrays["temperature_C"] = temperature_C
-    if charge is not None:
-        arrays["shown"] = Shown(charge=charge)
+    arrays["shown"] = Shown(charge=charge, uncounted_C=_uncounted_C(rows))
     return Recording(arrays, meta, stated)
+
+
+def _uncounted_C(rows: pd.DataFrame) -> float:
+    """By how much the charge under load is another one than the tester counted row by row, if that is worth a word."""
+    time_s, current_A = rows["time"].to_numpy(), rows["current"].to_numpy()
+    loaded = np.flatnonzero(current_A > SWITCH_SHARE * current_A.max())
+    part = slice(loaded[0], loaded[-1] + 1)
+    if "capacity" not in rows or len(loaded) < LEAST_SAMPLES:
+        return 0.0
+    step_C = np.diff(rows["capacity"].to_numpy()[part])
+    # a counter that counts down, or anew with each step of the program
+    step_C = step_C if (step_C > 0.0).sum() > (step_C < 0.0).sum() else -step_C
+    if (step_C > 0.0).mean() < 0.5:
+        return 0.0
+    counted_C = float(step_C[step_C > 0.0].sum())
+    # some count what is drawn alone, others what is returned, too
+    passed_C = [
+        float(np.ptp(drawn(time_s[part], each[part], time_s[part]))) for each in (current_A, np.maximum(current_A, 0.0))
+    ]
+    off_C = min((each - counted_C for each in passed_C), key=abs)
+    if abs(off_C) <= _COUNTED_SHARE * counted_C:
+        return 0.0
+    warnings.warn(
+        f"the tester counted {counted_C / 3600.0:.4g} Ah, where current and time make {(counted_C + off_C) / 3600.0:.4g} Ah: "
+        "check units and clock, and that all rows are there",
+        stacklevel=2,
+    )
+    return abs(off_C)
 
 
 def _charges(current_A: FloatArray, passed_C: FloatArray) -> list[tuple[int, int, bool, bool]]:

@@ -283,6 +283,7 @@ _OTHERS: dict[str, Callable[[pd.Series, Column], FloatArray]] = {
     "power": numbers,
     "charge_step": numbers,
     "counter": numbers,
+    "capacity": numbers,
 }
 
 
