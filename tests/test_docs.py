@@ -226,6 +226,9 @@ def test_every_picture_has_a_caption(page):
 def test_tables_of_the_guide_fit_the_column_of_the_site(name):
     for row in published(ROOT / f"{name}.md"):
         assert len(row) <= 6, row
+        for cell in row:
+            words = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", cell).split()
+            assert len(words) <= 25, f"{len(words)} words: {cell}"
 
 
 def test_reports_are_short_enough_to_be_read():
