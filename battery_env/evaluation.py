@@ -60,10 +60,11 @@ def evaluate(
     ``p_settling_time_1_percent_s``      if the last one is not
     ``p_coverage_percent``               share of the estimates within two stated standard deviations of the truth
     ``p_bound``                          the Cramér-Rao bound: standard deviation that no unbiased calibrator can be below
-                                         with these sensors, from all samples of the voltage. Unknown to it are the
-                                         parameters that it states an uncertainty of (both, if it states none) and the
-                                         offset of the voltage, if there is one
+                                         with these sensors
     ==================================== =============================================================================
+
+    The bound is from all samples of the voltage. Unknown to it are the parameters that the calibrator states an uncertainty of
+    (both, if it states none) and the offset of the voltage, if there is one.
 
     And of each discharge:
 

@@ -14,7 +14,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import MaxNLocator, ScalarFormatter
 from numpy.typing import ArrayLike
 
 from battery_env.arrays import FloatArray
@@ -32,10 +32,14 @@ from battery_env.records.model import VoltageForecast
 
 Thing = TypeVar("Thing")
 
-#: Colours that colour-blind readers can tell apart (the first six of Okabe & Ito, the others of Tol).
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#882255", "#777777", "#999933", "#332288")
+#: Colours that colour-blind readers can tell apart (the first six and black of Okabe & Ito, the others of Tol).
+COLOURS = (
+    *("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9"),
+    *("#882255", "#777777", "#999933", "#332288", "#000000"),
+)
 #: What is drawn in more than one figure has one colour in all of them, wherever its name occurs in a label.
 COLOUR_OF: Mapping[str, str] = {
+    "LAC as published": COLOURS[9],
     "LAC": COLOURS[0],
     "policy": COLOURS[0],
     "SAC": COLOURS[1],
@@ -70,8 +74,8 @@ _LIFE_COLUMNS = {
 _BAR_STEP = 0.02
 # q_mobile follows the capacity if their correlation is this close over so many discharges or more.
 _FOLLOWS, _LEAST_POINTS = 0.99, 5
-# dV/dq is drawn on a scale that is linear within this, V/C, and logarithmic beyond: it spans three decades, from zero.
-_LINEAR_SLOPE_V_PER_C = 1e-6
+# What q_mobile changes is drawn on a scale that is linear within this, mV, and logarithmic beyond: three decades, from zero.
+_LINEAR_MV = 0.1
 _NAMES = re.compile("|".join(rf"\b{name}\b" for name in COLOUR_OF), flags=re.IGNORECASE)
 _COLOUR_OF_LOWER = {name.lower(): colour for name, colour in COLOUR_OF.items()}
 
@@ -121,7 +125,7 @@ def plot_true_against_inferred(scores: Mapping[str, pd.DataFrame], parameter: st
         upper.plot([low, high], [low, high], color="0.6", lw=1.0, zorder=1)
         upper.vlines(true, inferred - spread, inferred + spread, color="0.75", lw=0.6, zorder=2)
         upper.scatter(true, inferred, c=table["load"], s=5, cmap="viridis", zorder=3)
-        upper.set_title(f"{name}\nMAPE {mape.mean():.2g} %, worst {mape.max():.2g} %", fontsize=10)
+        upper.set_title(f"{name}\nMAPE {mape.mean():.3g} %, worst {mape.max():.3g} %", fontsize=10)
         points = lower.scatter(true, mape, c=table["load"], s=3, cmap="viridis")
         lower.set(yscale="log", xlabel=f"true {LABELS[parameter]}")
         lower.grid(alpha=0.25)
@@ -132,11 +136,14 @@ def plot_true_against_inferred(scores: Mapping[str, pd.DataFrame], parameter: st
     return figure
 
 
-def coloured(things: Iterable[Thing]) -> Iterator[tuple[str, Thing]]:
+def coloured(things: Iterable[Thing], variants_alike: bool = False) -> Iterator[tuple[str, Thing]]:
     """
     Things to draw side by side, names or tuples that start with one, each after its colour. The first with a name of
     :data:`COLOUR_OF` has its colour; all others have those of :data:`COLOURS` that are left, which come again when they are
     used up.
+
+    :param things: in the order in which they are drawn
+    :param variants_alike: all with a name of :data:`COLOUR_OF` have its colour, and are told apart by something else
     """
     listed = list(things)
     own = [_own_colour(thing) for thing in listed]
@@ -145,7 +152,7 @@ def coloured(things: Iterable[Thing]) -> Iterator[tuple[str, Thing]]:
     others = itertools.cycle(sorted(left, key=lambda colour: any(own) and colour in COLOUR_OF.values()))
     seen: set[str] = set()
     for thing, colour in zip(listed, own, strict=True):
-        yield next(others) if colour is None or colour in seen else colour, thing
+        yield next(others) if colour is None or (colour in seen and not variants_alike) else colour, thing
         seen.add(colour or "")
 
 
@@ -180,7 +187,7 @@ def plot_learning_curves(
     :param label: what readers call it
     :return: the figure
     """
-    figure = new_figure(7.2, 3.4)
+    figure = new_figure(7.2, 3.7)
     panels = {metric: "mean", f"{metric}_worst": "worst"}
     for axes, (column, panel) in zip(figure.subplots(1, 2, sharex=True), panels.items(), strict=True):
         for colour, (name, tables) in coloured(curves.items()):
@@ -190,8 +197,8 @@ def plot_learning_curves(
         axes.set(yscale="log" if all_positive else "linear", xlabel="environment steps (thousands)", ylabel=label)
         axes.set_title(panel, fontsize=10)
         axes.grid(which="both", alpha=0.25)
-        axes.legend(frameon=False, fontsize=9)
     figure.suptitle(title, fontsize=11)
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False, fontsize=9)
     return figure
 
 
@@ -275,7 +282,7 @@ def plot_cell_fit(fit: CellFit, discharges: Sequence[Record]) -> Figure:
     """
     figure = new_figure(3.2 * len(discharges) + 0.9, 4.8)
     panels = figure.subplots(2, len(discharges), sharey="row", sharex="col", height_ratios=[3, 2], squeeze=False)
-    cells = {"before": (fit.start, "--", COLOURS[1]), "after": (fit.cell, "-", COLOURS[0])}
+    cells = {"before": (fit.start, "--", COLOURS[4]), "after": (fit.cell, "-", COLOUR_OF["least squares"])}
     for (upper, lower), discharge in zip(panels.T, discharges, strict=True):
         record = discharge.loaded_part(fit.cell.VEOD) if isinstance(discharge, Discharge) else discharge
         since_s = record.time_s - record.time_s[0]
@@ -468,22 +475,24 @@ def _limits(shown: Sequence[FloatArray]) -> tuple[float, float]:
     return low - room, high + room
 
 
-def plot_sensitivities(slopes: Mapping[str, Sensitivities]) -> Figure:
+def plot_sensitivities(slopes: Mapping[str, Sensitivities], at: Estimate) -> Figure:
     """
-    How much the voltage says about either parameter over a discharge: its derivatives.
+    How much the voltage says about either parameter over a discharge: what 1 % more of it changes.
 
     :param slopes: what :func:`battery_env.estimators.cramer_rao.sensitivities` returned, by name for the legend
+    :param at: the parameters of the discharges
     :return: the figure
     """
     figure = new_figure(6.4, 4.6)
     upper, lower = figure.subplots(2, 1, sharex=True)
     for colour, (name, slope) in coloured(slopes.items()):
-        upper.plot(slope.time_s, 1e6 * slope.by_q_mobile_V_per_C, color=colour, lw=1.3, label=name)
-        lower.plot(slope.time_s, slope.by_r_o_A, color=colour, lw=1.3, label=name)
-    upper.set_yscale("symlog", linthresh=1e6 * _LINEAR_SLOPE_V_PER_C, linscale=0.5)
-    upper.set_ylabel(r"$\partial V / \partial q_{max}$ ($\mu$V/C)")
+        upper.plot(slope.time_s, 10.0 * at.q_mobile * slope.by_q_mobile_V_per_C, color=colour, lw=1.3, label=name)
+        lower.plot(slope.time_s, 10.0 * at.r_o * slope.by_r_o_A, color=colour, lw=1.3, label=name)
+    upper.set_yscale("symlog", linthresh=_LINEAR_MV, linscale=0.5)
+    upper.yaxis.set_major_formatter(ScalarFormatter())
+    upper.set_ylabel(f"1 % more {Q_MOBILE.symbol} (mV)")
     upper.legend(frameon=False, fontsize=9)
-    lower.set(xlabel="time (s)", ylabel=r"$\partial V / \partial R_o$ (mV/m$\Omega$)")
+    lower.set(xlabel="time (s)", ylabel=f"1 % more {R_O.symbol} (mV)")
     return _finished(figure, upper, lower)
 
 

@@ -22,6 +22,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
+from textwrap import fill
 from typing import Any, Literal
 
 import numpy as np
@@ -96,6 +97,8 @@ _MEASURES = (
 # The mean magnitude of a normal error is this times its standard deviation
 _MEAN_MAGNITUDE = float(np.sqrt(2.0 / np.pi))
 _POLICY_NEEDS = "training on simulated discharges, model"
+# Of the calibrators in a figure.
+_MARKERS = "osD^vP*X<>"
 # Exact estimates are drawn here
 _FLOOR_PERCENT = 1e-4
 # Where an observation with a fit holds its step, as an action
@@ -235,7 +238,7 @@ def _held_out(condition: Condition, unknown: Sequence[str], n: int) -> Trajector
 
 _TRIED = ("least squares, whole discharge", "extended Kalman filter")
 _PEERS = Comparison(
-    """Simulated as progpy does it, with a temperature: cells with a worn q^max of 4000 to 7600 C and cells with a worn R_o of
+    """Simulated as progpy does it, with a temperature: cells with a worn q_max of 4000 to 7600 C and cells with a worn R_o of
 0.117 to 0.35 ohm, the other parameter new and known; then with both worn and unknown. Calibrators with the full state see
 it exactly, all others are told 5 mV of noise; the Kalman filter allows for an offset of the voltage, least squares do not.""",
     (
@@ -328,7 +331,7 @@ constants are off, and by how much. Least squares and filters read every second,
 )
 
 _NUISANCE = Comparison(
-    f"""{_ABOUT_MISMATCH} Least squares for q^max and R_o alone, and
+    f"""{_ABOUT_MISMATCH} Least squares for q_max and R_o alone, and
 with these constants as nuisances under priors that state it.""",
     _off(MISMATCH),
     (
@@ -471,30 +474,41 @@ an unbiased calibrator can have. Times are CPU times on one core.
 
 
 def plot(results: pd.DataFrame, labels: Sequence[str]) -> Figure:
-    """The errors of all discharges, from a table with a row for each parameter."""
-    colours = {name: colour for colour, name in coloured(dict.fromkeys(results["calibrator"]))}
-    rows: list[tuple[str, pd.DataFrame | None]] = []
+    """
+    The mean error and that of the middle 90 % of the discharges, from a table with a row for each parameter: a row for each
+    condition, in it the calibrators one below the other. Variants of a calibrator have its colour and a marker of their own.
+    """
+    styles = {
+        name: (colour, marker)
+        for marker, (colour, name) in zip(
+            _MARKERS, coloured(dict.fromkeys(results["calibrator"]), variants_alike=True), strict=False
+        )
+    }
+    figure = new_figure(9.6, 1.2 + 0.16 * len(results[[*labels, "calibrator"]].drop_duplicates()))
+    panels, ticks, y = figure.subplots(1, len(PARAMETER_NAMES), sharey=True), {}, 0
     for keys, of_condition in results.groupby(list(labels), sort=False):
+        first = y
+        for name, of_calibrator in of_condition.groupby("calibrator", sort=False):
+            colour, marker = styles[name]
+            for axes, parameter in zip(panels, PARAMETER_NAMES, strict=True):
+                errors = of_calibrator.loc[of_calibrator["parameter"] == parameter, "second_half_mape_percent"].dropna()
+                ends = errors.clip(_FLOOR_PERCENT).quantile([0.05, 0.95])
+                axes.plot(ends, [y, y], color=colour, lw=1.6, alpha=0.6)
+                axes.plot(max(errors.mean(), _FLOOR_PERCENT), y, marker, color=colour, ms=5, label=name)
+            y += 1
         named = zip(labels, keys, strict=True)
-        rows.append((", ".join(key if isinstance(key, str) else f"{name} {key:g}" for name, key in named), None))
-        rows += [(str(name), group) for name, group in of_condition.groupby("calibrator", sort=False)]
-    figure = new_figure(10.4, 0.8 + 0.17 * len(rows))
-    panels = figure.subplots(1, len(PARAMETER_NAMES), sharey=True)
+        text = "\n".join(fill(key if isinstance(key, str) else f"{name} {key:g}", 26) for name, key in named)
+        ticks[(first + y - 1) / 2] = text
+        for axes in panels:
+            axes.axhline(y, color="0.8", lw=0.8)
+        y += 1
     for axes, parameter in zip(panels, PARAMETER_NAMES, strict=True):
-        for y, (name, group) in enumerate(rows):
-            if group is None:
-                axes.axhline(y, color="0.8", lw=0.8)
-                continue
-            errors = group[group["parameter"] == parameter]["second_half_mape_percent"]
-            axes.plot(errors.clip(_FLOOR_PERCENT), [y] * len(errors), "o", ms=3, mew=0, alpha=0.35, color=colours[name])
-            if len(errors):
-                axes.plot([max(errors.mean(), _FLOOR_PERCENT)] * 2, [y - 0.4, y + 0.4], color=colours[name], lw=2.2)
         axes.set(xscale="log", xlabel="error in the second half (%)", title=LABELS[parameter].split(" (")[0])
         axes.grid(axis="x", alpha=0.25)
-    panels[0].set_yticks(range(len(rows)), [name for name, _ in rows], fontsize=7)
-    for label, (_, group) in zip(panels[0].get_yticklabels(), rows, strict=True):
-        label.set_fontweight("bold" if group is None else "normal")
-    panels[0].set_ylim(len(rows) - 0.5, -0.5)
+    panels[0].set_yticks(list(ticks), ticks.values(), fontsize=8)
+    panels[0].set_ylim(y - 1, -1)
+    handles = dict(zip(*panels[0].get_legend_handles_labels()[::-1], strict=True))
+    figure.legend(handles.values(), handles, loc="outside lower center", ncols=3, frameon=False, fontsize=8)
     return figure
 
 

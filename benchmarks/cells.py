@@ -226,32 +226,25 @@ def plot_life(whole: pd.DataFrame) -> Figure:
     cells = list(dict.fromkeys(whole["cell"]))
     figure = new_figure(4.2 * len(cells), 5.4)
     panels = figure.subplots(2, len(cells), sharex=True, sharey="row", squeeze=False)
-    limits_C = np.array([0.93 * whole["q_mobile_C"].min(), 1.05 * whole["q_mobile_C"].max()])
-    c_per_Ah = float((whole["q_mobile_C"] / whole["capacity_Ah"]).median())
     fitted, measured = COLOUR_OF["least squares"], COLOUR_OF["measured"]
     for cell, (upper, lower) in zip(cells, panels.T, strict=True):
         part = whole[whole["cell"] == cell]
-        for axes, name, unit in ((upper, "q_mobile", "C"), (lower, "r_o", "ohm")):
-            value, sd = part[f"{name}_{unit}"], part[f"sd_{name}_{unit}"]
+        for axes, name, unit, scale in ((upper, "q_mobile", "C", 1.0 / 3600.0), (lower, "r_o", "ohm", 1e3)):
+            value, sd = scale * part[f"{name}_{unit}"], scale * part[f"sd_{name}_{unit}"]
             symbol = LABELS[name].split(" (")[0]
             axes.fill_between(part["cycle"], value - sd, value + sd, color=fitted, alpha=0.15, lw=0, label="± 1 sd, common")
             axes.plot(part["cycle"], value, color=fitted, lw=1.6, label=f"{symbol}, least squares")
             axes.grid(alpha=0.25)
-        capacity = upper.twinx()
-        capacity.plot(part["cycle"], part["capacity_Ah"], ".", ms=3.5, color=measured)
-        capacity.set_ylim(*(limits_C / c_per_Ah))
-        capacity.set_ylabel("capacity to 2.7 V (Ah)")
-        upper.plot([], [], ".", ms=5, color=measured, label="capacity, measured")
-        impedance_ohm = part["Re_ohm"] + part["Rct_ohm"]
-        lower.plot(part["cycle"], impedance_ohm, ".", ms=3.5, color=measured, label="$R_e + R_{ct}$, impedance tests")
+        upper.plot(part["cycle"], part["capacity_Ah"], ".", ms=3.5, color=measured, label="capacity to 2.7 V, measured")
+        impedance_mohm = 1e3 * (part["Re_ohm"] + part["Rct_ohm"])
+        lower.plot(part["cycle"], impedance_mohm, ".", ms=3.5, color=measured, label="$R_e + R_{ct}$, impedance tests")
         upper.set_title(f"{cell}\n{title_of_life([part])}", fontsize=10)
-        upper.set_ylim(*limits_C)
         lower.set_xlabel("cycle")
         upper.legend(frameon=False, loc="upper right", fontsize=9)
         lower.legend(frameon=False, loc="upper left", fontsize=9)
-    low_ohm, high_ohm = (whole["r_o_ohm"] - whole["sd_r_o_ohm"]).min(), (whole["r_o_ohm"] + whole["sd_r_o_ohm"]).max()
-    panels[1, 0].set(ylim=(0.9 * low_ohm, 1.2 * high_ohm), ylabel=LABELS["r_o"])
-    panels[0, 0].set_ylabel(LABELS["q_mobile"])
+    # room for the legend
+    panels[1, 0].set(ylim=(None, 1.2e3 * (whole["r_o_ohm"] + whole["sd_r_o_ohm"]).max()), ylabel=r"resistance (m$\Omega$)")
+    panels[0, 0].set_ylabel("charge (Ah)")
     figure.align_ylabels(panels[:, 0])
     return figure
 
@@ -270,7 +263,7 @@ def plot_voltages(discharges: Mapping[str, Sequence[Discharge]], whole: pd.DataF
             axes.plot(since_s, record.voltage_V, "o", ms=2.6, color=COLOUR_OF["measured"], label="measured")
             for estimate, style, colour, label in (
                 (Estimate(fit["q_mobile_C"], fit["r_o_ohm"]), "-", COLOUR_OF["least squares"], "model, fitted"),
-                (_NEW, "--", COLOURS[1], "model, new cell's parameters"),
+                (_NEW, "--", COLOURS[4], "model, new cell's parameters"),
             ):
                 forecast = _THERMAL.forecast(record, estimate, CUT_OFF_V)
                 axes.plot(forecast.time_s - start_s, forecast.voltage_V, style, color=colour, lw=1.5, label=label)
@@ -492,8 +485,8 @@ def departure_table(found: pd.DataFrame) -> pd.DataFrame:
         row = {
             "tested on": tested,
             "calibrator": calibrator,
-            "q^max of whole discharges, departure: mean (worst) (%)": _over_seeds(whole, "departure_percent", 2),
-            "corr(q^max, capacity)": f"{mean_C['q_mobile_C'].corr(mean_C['capacity_Ah']):.4f}",
+            "q_max of whole discharges, departure: mean (worst) (%)": _over_seeds(whole, "departure_percent", 2),
+            "corr(q_max, capacity)": f"{mean_C['q_mobile_C'].corr(mean_C['capacity_Ah']):.4f}",
         }
         for share in SHARES:
             at_share = of_both[of_both["share"] == share]

@@ -113,25 +113,25 @@ def report(table: pd.DataFrame) -> str:
 
 
 def plot(table: pd.DataFrame) -> Figure:
-    """Where the mean cost settles against the cost at the start, of each policy."""
+    """Where the mean cost settles against the cost at the start: a row a policy and function, in it a dot a seed."""
     envs = table["env"].unique()
-    height = 0.8 + 0.25 * table.groupby("env").size().max()
-    figure, panels = new_panels(len(envs), 3, (4.6, height), margin=(0.0, 0.6))
+    named = table.assign(who=table["policy"] + np.where(table["function"] == "critic", ", L of the critic", ""))
+    height = 0.9 + 0.25 * named.groupby("env")["who"].nunique().max()
+    figure, panels = new_panels(len(envs), 3, (4.4, height), margin=(0.0, 0.5))
     for axes, env_id in zip(panels, envs, strict=True):
-        of_env = table[table["env"] == env_id].reset_index(drop=True)
-        rows = of_env.index.to_numpy()[::-1]
+        of_env = named[named["env"] == env_id]
+        names = list(dict.fromkeys(of_env["who"]))[::-1]
+        rows = of_env["who"].map(names.index).to_numpy()
         colours = np.where(of_env["settles"], COLOURS[2], np.where(of_env["holds"], COLOURS[0], COLOURS[1])).tolist()
         bounds = of_env[["cost_bound_low", "cost_bound", "cost_bound_high"]]
         # a logarithmic axis has no 0, which is shown a decade below all else
         least = min(of_env["start_cost"].min(), bounds.where(bounds > 1e-9).min(axis=None)) / 10
         low, bound, high = bounds.clip(lower=least).to_numpy().T
         axes.hlines(rows, low, high, colors=colours, lw=3)
-        axes.scatter(bound, rows, c=colours, s=24, label=_MEANING, zorder=3)
+        axes.scatter(bound, rows, c=colours, s=24, alpha=0.7, label=_MEANING, zorder=3)
         axes.scatter(of_env["start_cost"], rows, color="black", marker="|", s=80, label="at the start")
-        seeds = [f" {seed:.0f}" if pd.notna(seed) else "" for seed in of_env["seed"]]
-        functions = np.where(of_env["function"] == "critic", " (critic)", "")
-        axes.set_yticks(rows, of_env["policy"] + seeds + functions, fontsize="small")
-        axes.set_ylim(-0.7, len(rows) - 0.3)
+        axes.set_yticks(range(len(names)), names, fontsize="small")
+        axes.set_ylim(-0.7, len(names) - 0.3)
         zero = f" (0 at {least:.1g})" if (bounds < 1e-9).any(axis=None) else ""
         axes.set(xscale="log", xlabel=f"cost per step{zero}", title=env_id)
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize="small")

@@ -40,11 +40,10 @@ def followed(out: Path) -> str:
     """Calibrate to all discharges of a real cell, and say how it aged."""
     with contextlib.redirect_stdout(io.StringIO()):
         calibrate([CELL, "--table-only", "--jobs", "2", "--force", "--out", str(out)])
-    first, *_, last = pd.read_csv(out / f"{CELL}_estimate.csv").itertuples()
-    return (
-        f"real cell {CELL} over {last.cycle} discharges: q_max {first.q_mobile_C:.0f} -> {last.q_mobile_C:.0f} C, "
-        f"R_o {first.r_o_ohm:.3f} -> {last.r_o_ohm:.3f} ohm"
-    )
+    life = pd.read_csv(out / f"{CELL}_estimate.csv").iloc[[0, -1]]
+    q_max = " -> ".join(f"{q_mobile_C / 3600.0:.3f}" for q_mobile_C in life["q_mobile_C"])
+    r_o = " -> ".join(f"{1e3 * r_o_ohm:.0f}" for r_o_ohm in life["r_o_ohm"])
+    return f"real cell {CELL} over {life['cycle'].iloc[1]} discharges: q_max {q_max} Ah, R_o {r_o} mohm"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.colors import BoundaryNorm
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator
+from matplotlib.ticker import LogLocator, ScalarFormatter
 
 from battery_env.arrays import FloatArray
 from battery_env.electrochemistry import NEW_CELL, QNS, STATE_SIZE, VO, VSP, Trajectory, simulate, step_into
@@ -32,7 +32,7 @@ from battery_env.estimators import (
 )
 from battery_env.loads import RandomPiecewise, constant
 from battery_env.parameters import PARAMETER_NAMES
-from battery_env.plotting import COLOURS, LABELS, coloured, new_figure, plot_estimates, plot_sensitivities
+from battery_env.plotting import COLOURS, LABELS, coloured, new_figure, plot_sensitivities
 from battery_env.records.model import RecordModel
 from battery_env.sensors import SensorErrors
 from battery_env.tasks.full_state.layout import ERROR_SCALE, OBSERVED
@@ -54,7 +54,7 @@ SHARES = (0.25, 0.5, 0.75, 1.0)
 FINE_SHARES = tuple(np.round(np.arange(0.1, 1.001, 0.05), 2).tolist())
 #: What is unknown: parameters, and whether the sensor has an offset as well.
 UNKNOWNS: dict[str, tuple[tuple[str, ...], bool]] = {
-    "q^max alone": (("q_mobile",), False),
+    "q_max alone": (("q_mobile",), False),
     "R_o alone": (("r_o",), False),
     "both": (("q_mobile", "r_o"), False),
     "both and an offset": (("q_mobile", "r_o"), True),
@@ -247,7 +247,7 @@ FAULTS = {
     "tsn of the cell 20 % longer": Fault(cell={"tsn": 1.2}),
     "R_o held 10 % too low": Fault(held={"r_o": 0.9}),
     "R_o held 30 % too low": Fault(held={"r_o": 0.7}),
-    "q^max held 5 % too high": Fault(held={"q_mobile": 1.05}),
+    "q_max held 5 % too high": Fault(held={"q_mobile": 1.05}),
 }
 
 
@@ -426,32 +426,14 @@ def plot_misfits(records: dict[str, Trajectory]) -> Figure:
             error_V = model_V - part.voltage_V + (r_o_ohm[:, None] - TRUE.r_o) * by_r_o_A
             misfit_mV[:, column] = 1e3 * np.sqrt(np.mean(error_V[:, -1:] ** 2 if last_only else error_V**2, axis=1))
         axes.set_facecolor("0.85")
-        drawn = axes.contourf(q_mobile_C, r_o_ohm, misfit_mV, levels, cmap="viridis_r", norm=BoundaryNorm(levels, 256))
-        axes.contour(q_mobile_C, r_o_ohm, misfit_mV, levels, colors="w", linewidths=0.4)
-        axes.plot(TRUE.q_mobile, TRUE.r_o, "+", color=COLOURS[1], ms=9, mew=1.8)
+        of_lab = q_mobile_C / 3600.0, 1e3 * r_o_ohm, misfit_mV
+        drawn = axes.contourf(*of_lab, levels, cmap="viridis_r", norm=BoundaryNorm(levels, 256))
+        axes.contour(*of_lab, levels, colors="w", linewidths=0.4)
+        axes.plot(TRUE.q_mobile / 3600.0, 1e3 * TRUE.r_o, "+", color=COLOURS[1], ms=9, mew=1.8)
         axes.set_title(title, fontsize=9)
-        axes.set_xlabel(LABELS["q_mobile"])
-    panels[0].set_ylabel(LABELS["r_o"])
+        axes.set_xlabel("$q_{max}$ (Ah)")
+    panels[0].set_ylabel(r"$R_o$ (m$\Omega$)")
     figure.colorbar(drawn, ax=panels.tolist(), label="rms misfit (mV)")
-    return figure
-
-
-def plot_one_step(costs: pd.DataFrame) -> Figure:
-    """The one-step cost over q_mobile."""
-    figure = new_figure(10.0, 3.3)
-    panels = figure.subplots(1, 3, sharex=True)
-    titles = {"si": "all states, V and C", "scaled": "all states, error scales", "task": "$V_{sp}$, error scales"}
-    starts = {
-        name: f"{drift_C:g} C off in $q_{{nS}}$" if drift_C else "from the true state" for name, drift_C in DRIFTS_C.items()
-    }
-    for axes, (kind, title) in zip(panels, titles.items(), strict=True):
-        for colour, (start, label) in coloured(starts.items()):
-            axes.plot(costs["q_mobile_C"], costs[f"cost_{start}_{kind}"], color=colour, lw=1.4, label=label)
-        axes.axvline(TRUE.q_mobile, color="0.5", lw=0.8, ls="--")
-        axes.set(yscale="log", xlabel=LABELS["q_mobile"], ylabel="one-step cost")
-        axes.set_title(title, fontsize=10)
-        axes.grid(alpha=0.25)
-    panels[2].legend(frameon=False, fontsize=8, loc="lower left")
     return figure
 
 
@@ -462,12 +444,13 @@ def plot_faults(faults: pd.DataFrame) -> Figure:
     shown = [name for name, fault in FAULTS.items() if name != "nothing" and "q_mobile" not in fault.held]
     for colour, marker, name in zip(COLOURS, "osD^v<>", shown, strict=False):
         part = faults[(faults["load"] == "constant") & (faults["fault"] == name)]
-        axes.plot(
-            part["seen_percent"], part["q_mobile_error_percent"], marker=marker, ms=3.5, lw=1.2, color=colour, label=name
-        )
+        error_percent, label = part["q_mobile_error_percent"], name.replace("R_o", "$R_o$")
+        axes.plot(part["seen_percent"], error_percent, marker=marker, ms=3.5, lw=1.2, color=colour, label=label)
     axes.axhline(0.0, color="0.5", lw=0.8)
     axes.set(xlabel="seen of the discharge, in time (%)", ylabel=f"error of {LABELS['q_mobile'].split(' (')[0]} (%)")
     axes.set_yscale("symlog", linthresh=1.0, linscale=0.6)
+    axes.set_yticks([-20, -10, -5, -2, -1, 0, 1, 2, 5])
+    axes.yaxis.set_major_formatter(ScalarFormatter())
     axes.grid(alpha=0.25)
     figure.legend(loc="outside right upper", frameon=False, fontsize=9)
     return figure
@@ -517,7 +500,7 @@ def _shown_faults(table: pd.DataFrame) -> pd.DataFrame:
 
 def _shown_offsets(table: pd.DataFrame) -> pd.DataFrame:
     cells: dict[str, Cell] = {
-        f"error of q^max (%) at {_SEEN}": lambda part: _at_shares(part, "q_mobile_error_percent"),
+        f"error of q_max (%) at {_SEEN}": lambda part: _at_shares(part, "q_mobile_error_percent"),
         "error of R_o (%)": lambda part: _at_shares(part, "r_o_error_percent"),
     }
     shown = table.assign(offset=[f"sd {1e3 * offset_sd_V:.0f} mV" for offset_sd_V in table["offset_sd_V"]])
@@ -526,7 +509,7 @@ def _shown_offsets(table: pd.DataFrame) -> pd.DataFrame:
 
 def _shown_priors(table: pd.DataFrame) -> pd.DataFrame:
     cells: dict[str, Cell] = {
-        f"error of q^max (%) at {_SEEN}": lambda part: _at_shares(part, "q_mobile_error_percent"),
+        f"error of q_max (%) at {_SEEN}": lambda part: _at_shares(part, "q_mobile_error_percent"),
         "stated sd (%)": lambda part: _at_shares(part, "q_mobile_sd_percent", 2, ""),
     }
     shown = table.assign(expected=[f"{1e3 * mismatch_V:.0f} mV" for mismatch_V in table["expected_mismatch_V"]])
@@ -559,7 +542,7 @@ READABLE: tuple[tuple[str, Mapping[str, Cell] | Callable[[pd.DataFrame], pd.Data
         {
             "discharges": "{discharges}",
             "samples": "{samples}",
-            "largest error of q^max (%)": ("q_mobile_worst_relative_error", _worst),
+            "largest error of q_max (%)": ("q_mobile_worst_relative_error", _worst),
             "largest error of R_o (%)": ("r_o_worst_relative_error", _worst),
         },
     ),
@@ -569,9 +552,9 @@ READABLE: tuple[tuple[str, Mapping[str, Cell] | Callable[[pd.DataFrame], pd.Data
         {
             "seen": "{seen_percent:.0f} %",
             "voltage (V)": "{voltage_V:.2f}",
-            "1 % more q^max (mV)": "{mV_per_percent_of_q_mobile:+.1f}",
+            "1 % more q_max (mV)": "{mV_per_percent_of_q_mobile:+.1f}",
             "1 % more R_o (mV)": "{mV_per_percent_of_r_o:+.1f}",
-            "10 mV are worth, in q^max (%)": "{q_mobile_percent_per_10_mV:.2g}",
+            "10 mV are worth, in q_max (%)": "{q_mobile_percent_per_10_mV:.2g}",
             "in R_o (%)": "{r_o_percent_per_10_mV:.2g}",
         },
     ),
@@ -582,7 +565,7 @@ READABLE: tuple[tuple[str, Mapping[str, Cell] | Callable[[pd.DataFrame], pd.Data
         {
             "load": "{load}",
             "first reading after": "{start_s:.0f} s",
-            "sd of q^max at the end (%)": "{q_mobile_sd_percent:.2g}",
+            "sd of q_max at the end (%)": "{q_mobile_sd_percent:.2g}",
             "sd of R_o at the end (%)": ("r_o_sd_percent", lambda percent: f"{percent:#.3g}".rstrip(".")),
         },
     ),
@@ -603,12 +586,12 @@ READABLE: tuple[tuple[str, Mapping[str, Cell] | Callable[[pd.DataFrame], pd.Data
             "load": "{load}",
             "noise": ("noise_V", lambda noise_V: f"{1e3 * noise_V:.0f} mV"),
             "seen": "{seen_percent:.0f} %",
-            "q^max: error / bound (%)": "{q_mobile_rms_percent:.2g} / {q_mobile_bound_percent:.2g}",
-            "q^max: within 2 sd (%)": "{q_mobile_within_2_sd_percent:.0f}",
+            "q_max: error / bound (%)": "{q_mobile_rms_percent:.2g} / {q_mobile_bound_percent:.2g}",
+            "q_max: within 2 sd (%)": "{q_mobile_within_2_sd_percent:.0f}",
             "R_o: error / bound (%)": "{r_o_rms_percent:.2g} / {r_o_bound_percent:.2g}",
             "R_o: within 2 sd (%)": "{r_o_within_2_sd_percent:.0f}",
             "settled (%)": "{settled_percent:.0f}",
-            "worst q^max of these (%)": lambda found: (
+            "worst q_max of these (%)": lambda found: (
                 f"{found['q_mobile_worst_settled_percent']:.2g}" if found["settled_percent"] else ""
             ),
         },
@@ -660,16 +643,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "seed": SEED,
     }
     records = discharges()
-    noisy = SensorErrors(noise_V=NOISE_V).apply(records["constant"], np.random.default_rng(SEED))
-    trace = LeastSquares(voltage_noise_V=NOISE_V, window_every_s=60.0).trace([noisy])[0]
     figures = {
-        "sensitivity": plot_sensitivities({f"{load} current": sensitivities(record) for load, record in records.items()}),
+        "sensitivity": plot_sensitivities({f"{load} current": sensitivities(of) for load, of in records.items()}, TRUE),
         "bounds": plot_bounds(records),
         "loads": plot_loads(records),
-        "estimates": plot_estimates({"least squares": trace}, TRUE, cramer_rao_bound(noisy, NOISE_V)),
         "faults": plot_faults(tables["faults"]),
         "misfits": plot_misfits(records),
-        "one_step": plot_one_step(one_step_costs()),
     }
     study.write(tables, figures, summary(tables), "summary")
 

@@ -24,6 +24,7 @@ from scipy.stats import bootstrap
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.type_aliases import PolicyPredictor
 
+from battery_env.plotting import COLOUR_OF, new_figure
 from benchmarks.study import (
     EVALUATION_SEED,
     Cell,
@@ -32,7 +33,6 @@ from benchmarks.study import (
     command_line,
     markdown,
     natural,
-    new_panels,
     positive,
     row_by_row,
 )
@@ -139,16 +139,14 @@ def part(seed: int, timesteps: int, episodes: int, models: Path) -> Tables:
 
 
 def plot(values: pd.DataFrame) -> Figure:
-    """Learned against exact values, one panel per seed, five in a row."""
-    seeds = values["seed"].unique()
-    figure, panels = new_panels(len(seeds), 5, (2.8, 2.9), sharex=True, sharey=True)
+    """Learned against exact values of all seeds."""
+    figure = new_figure(4.6, 3.6)
+    axes = figure.subplots()
     top = values[["exact", "learned"]].to_numpy().max()
-    for axes, (seed, of_seed) in zip(panels, values.groupby("seed"), strict=True):
-        axes.plot([0, top], [0, top], color="0.6", lw=1)
-        axes.scatter(of_seed["exact"], of_seed["learned"], s=5, alpha=0.3, lw=0, rasterized=True)
-        axes.set_title(f"seed {seed}")
-    figure.supxlabel("exact cost-to-go")
-    figure.supylabel("learned L(s, a)")
+    axes.plot([0, top], [0, top], color=COLOUR_OF["true"], lw=1, label="equal")
+    axes.scatter(values["exact"], values["learned"], s=5, alpha=0.3, lw=0, color=COLOUR_OF["LAC"], label="LAC, all seeds")
+    axes.set(xlabel="exact cost to come", ylabel="learned L")
+    axes.legend(frameon=False)
     return figure
 
 
@@ -180,7 +178,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parts = [{"seed": seed, "timesteps": chosen.timesteps, "episodes": chosen.episodes} for seed in chosen.seeds]
     tables = study.run(part, parts, models=study.out / "models")
     table = tables["linear_cost"]
-    study.write({"linear_cost": table}, {"linear_cost": plot(tables["values"])}, report(table))
+    study.write(tables, {"linear_cost": plot(tables["values"])}, report(table))
 
 
 if __name__ == "__main__":

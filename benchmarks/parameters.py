@@ -1,5 +1,5 @@
 """
-What q^max and R_o are, beside what a test bench measures on two real cells: pulses, impedance, and capacities to other
+What q_max and R_o are, beside what a test bench measures on two real cells: pulses, impedance, and capacities to other
 voltages.
 
 .. code-block:: bash
@@ -124,10 +124,10 @@ def plot_curves() -> Figure:
     figure = new_figure(6.4, 3.3)
     left, right = figure.subplots(1, 2, sharex=True, sharey=True)
     pairs = ([(q, _R_O_OHM[1]) for q in _Q_MOBILE_C], [(_Q_MOBILE_C[1], r) for r in _R_O_OHM])
-    for axes, parameters, title in ((left, pairs[0], "smaller $q^{max}$"), (right, pairs[1], "larger $R_o$")):
+    for axes, parameters, title in ((left, pairs[0], "smaller $q_{max}$"), (right, pairs[1], "larger $R_o$")):
         for (q_mobile, r_o), shade in zip(parameters, _SHADES, strict=True):
             curve = simulate(2.0, q_mobile, r_o, load_unit="current", cut_off_V=CUT_OFF_V)
-            label = f"{q_mobile:.0f} C" if axes is left else f"{r_o:.2f} $\\Omega$"
+            label = f"{q_mobile / 3600.0:.2f} Ah" if axes is left else f"{1e3 * r_o:.0f} m$\\Omega$"
             axes.plot(curve.time_s / 60.0, curve.voltage_V, color=shade, lw=1.8, label=label)
         axes.set(xlabel="time at 2 A (min)")
         axes.set_title(title, fontsize=11)
@@ -165,7 +165,7 @@ def plot_model() -> Figure:
                 _arrow(axes, (middle - 1.4, 2.5), (middle + 1.4, 2.5), "diffusion, slow", 0.15)
             x += width
         axes.text(x - 2.3, 1.35, name, ha="center", fontsize=10)
-    _arrow(axes, (5.1, 3.2), (10.9, 3.2), "$q^{max}$ from full to empty", 0.2)
+    _arrow(axes, (5.1, 3.2), (10.9, 3.2), "$q_{max}$ from full to empty", 0.2)
     axes.plot([2.6, 2.6, 6.3], [5.0, 6.5, 6.5], color="0.2", lw=1.2)
     axes.plot([9.7, 13.4, 13.4], [6.5, 6.5, 5.0], color="0.2", lw=1.2)
     axes.add_patch(Rectangle((6.3, 6.05), 3.4, 0.9, fc="white", ec=COLOURS[1], lw=1.6))
@@ -187,15 +187,15 @@ def plot_resistances(found: pd.DataFrame) -> Figure:
     panels = figure.subplots(1, len(cells), sharey=True, squeeze=False)[0]
     for axes, cell in zip(panels, cells, strict=True):
         rows = found[found["cell"] == cell].set_index("cycle")
-        axes.plot(rows["least_squares_r_o_ohm"], color=COLOUR_OF["least squares"], lw=1.8, label="$R_o$, least squares")
-        axes.plot(rows["kalman_r_o_ohm"], color=COLOUR_OF["Kalman filter"], lw=1.8, label="$R_o$, Kalman filter")
-        axes.plot(rows["pulse_ohm"], "o", ms=2.4, color="0.35", label="10 s at full charge, measured")
-        axes.plot(rows["Re_ohm"] + rows["Rct_ohm"], "+", ms=4, color="0.35", label="$R_e + R_{ct}$, impedance")
-        axes.plot(rows["Re_ohm"], "x", ms=3, color="0.6", label="$R_e$, impedance")
+        axes.plot(1e3 * rows["least_squares_r_o_ohm"], color=COLOUR_OF["least squares"], lw=1.8, label="$R_o$, least squares")
+        axes.plot(1e3 * rows["kalman_r_o_ohm"], color=COLOUR_OF["Kalman filter"], lw=1.8, label="$R_o$, Kalman filter")
+        axes.plot(1e3 * rows["pulse_ohm"], "o", ms=2.4, color="0.35", label="10 s at full charge, measured")
+        axes.plot(1e3 * (rows["Re_ohm"] + rows["Rct_ohm"]), "+", ms=4, color="0.35", label="$R_e + R_{ct}$, impedance")
+        axes.plot(1e3 * rows["Re_ohm"], "x", ms=3, color="0.6", label="$R_e$, impedance")
         axes.set_title(cell, fontsize=11)
         axes.set_xlabel("cycle")
         axes.grid(alpha=0.25)
-    panels[0].set_ylabel("resistance ($\\Omega$)")
+    panels[0].set_ylabel("resistance (m$\\Omega$)")
     panels[0].set_ylim(bottom=0.0)
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=2, frameon=False, fontsize=9)
     return figure

@@ -31,7 +31,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from battery_env.plotting import new_figure
+from battery_env.plotting import COLOUR_OF, new_figure
 from benchmarks.study import Study, command_line, markdown, positive
 from benchmarks.throughput import race, spread
 from sb3_lac import LAC, GymnasiumVecEnv, PublishedLAC
@@ -263,8 +263,8 @@ def plot_growth(table: pd.DataFrame) -> Figure:
     for position, (over, (x_label, y_label)) in enumerate(panels.items(), start=1):
         axes = figure.add_subplot(1, 3, position)
         speeds = table[table["over"] == over].groupby("value")["speed"].quantile([0.25, 0.5, 0.75]).unstack()
-        axes.fill_between(speeds.index, speeds[0.25], speeds[0.75], alpha=0.3)
-        axes.plot(speeds.index, speeds[0.5], marker="o")
+        axes.fill_between(speeds.index, speeds[0.25], speeds[0.75], color=COLOUR_OF["LAC"], alpha=0.3, lw=0)
+        axes.plot(speeds.index, speeds[0.5], marker="o", color=COLOUR_OF["LAC"])
         axes.set_xscale("log", base=2)
         axes.set_yscale("log")
         axes.set_xticks(speeds.index, [str(value) for value in speeds.index])

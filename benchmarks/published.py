@@ -51,8 +51,8 @@ from sb3_lac.stability.plots import format_log_axis
 
 #: How policies are drawn: colour and marker.
 STYLES = {
-    "LAC as published": (COLOUR_OF["LAC"], "o"),
-    "the same, N = inf": (COLOURS[5], "X"),
+    "LAC as published": (COLOUR_OF["LAC as published"], "P"),
+    "the same, N = inf": (COLOURS[4], "X"),
     "SAC": (COLOUR_OF["SAC"], "s"),
     REFERENCE: ("black", "|"),
 }

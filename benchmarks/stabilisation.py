@@ -116,9 +116,14 @@ _NOISE = {"noise_type": "normal", "noise_std": 0.1}
 #: Who is judged, by the name on the command line.
 CONTENDERS = {
     "lac": Contender("lac", "LAC", COLOUR_OF["LAC"], "o", compiles=True),
-    "published_lac": Contender("published_lac", "LAC as published", COLOURS[5], "P", compiles=True),
+    "published_lac": Contender("published_lac", "LAC as published", COLOUR_OF["LAC as published"], "P", compiles=True),
     "published_lac_paper": Contender(
-        "published_lac", "LAC as published, its setting", COLOURS[5], "X", settings="published_lac", compiles=True
+        "published_lac",
+        "LAC as published, its setting",
+        COLOUR_OF["LAC as published"],
+        "X",
+        settings="published_lac",
+        compiles=True,
     ),
     "sac": Contender("sac", "SAC", COLOUR_OF["SAC"], "s"),
     "sac_common": Contender("sac", "SAC, LAC's setting", COLOUR_OF["SAC"], "8", settings="lac"),

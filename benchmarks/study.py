@@ -40,7 +40,7 @@ Result = TypeVar("Result")
 Tables = Mapping[str, pd.DataFrame]
 
 #: How readers know the parameters.
-SYMBOLS = {"q_mobile": "q^max", "r_o": "R_o"}
+SYMBOLS = {"q_mobile": "q_max", "r_o": "R_o"}
 #: Seed of evaluations; no training seed comes close.
 EVALUATION_SEED = 10_000
 
@@ -88,14 +88,12 @@ def new_panels(
     most_columns: int,
     panel: tuple[float, float],
     margin: tuple[float, float] = (0.0, 0.0),
-    sharex: bool = False,
-    sharey: bool = False,
 ) -> tuple[Figure, list[Axes]]:
     """A figure of panels in rows."""
     n_columns = min(n, most_columns)
     n_rows = -(-n // n_columns)
     figure = new_figure(margin[0] + panel[0] * n_columns, margin[1] + panel[1] * n_rows)
-    panels = figure.subplots(n_rows, n_columns, squeeze=False, sharex=sharex, sharey=sharey).ravel().tolist()
+    panels = figure.subplots(n_rows, n_columns, squeeze=False).ravel().tolist()
     for axes in panels[n:]:
         axes.remove()
     return figure, panels[:n]
@@ -229,8 +227,8 @@ def run_named(
 
 def command_line(name: str, document: str | None, jobs: int | None = 2) -> argparse.ArgumentParser:
     """
-    What the command lines of all studies have in common: ``--jobs``, ``--scheduler`` and ``--out``. The name is that of the
-    module, and of the study if the module has several.
+    What the command lines of all studies have in common: ``--jobs``, ``--scheduler``, ``--redraw`` and ``--out``. The name is
+    that of the module, and of the study if the module has several.
     """
     parser = argparse.ArgumentParser(
         prog=f"python -m benchmarks.{name}", description=document, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -239,6 +237,7 @@ def command_line(name: str, document: str | None, jobs: int | None = 2) -> argpa
         jobs = min(jobs, os.cpu_count() or 1)
         parser.add_argument("--jobs", type=positive, default=jobs, help="parts at the same time, one core each")
         parser.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster that makes the parts, tcp://host:port")
+        parser.add_argument("--redraw", action="store_true", help="figures and text once more, from the tables in --out")
     parser.add_argument("--out", type=Path, default=Path("results") / name.split()[-1], help="folder of all results")
     return parser
 
@@ -267,8 +266,9 @@ class Study:
         except OSError as error:
             parser.error(str(error))
         self.scheduler: str | None = vars(self.chosen).get("scheduler")
+        self.redraws: bool = vars(self.chosen).get("redraw", False)
         self.configuration: dict[str, Any] = {
-            name: value for name, value in vars(self.chosen).items() if name not in ("jobs", "scheduler", "out")
+            name: value for name, value in vars(self.chosen).items() if name not in ("jobs", "scheduler", "redraw", "out")
         }
         if self.scheduler is not None:
             self.out = self.out.absolute()  # workers are elsewhere
@@ -282,8 +282,13 @@ class Study:
         """
         Make all parts, those that were made before from their files in ``<out>/parts``. Such a file stands for its arguments,
         the module of the function, and the versions of this project's packages; what the function needs beside them it has
-        to keep itself.
+        to keep itself. To redraw, no part is made: the tables are those that are written.
         """
+        if self.redraws:
+            written = {file.stem: pd.read_csv(file) for file in sorted(self.out.glob("*.csv"))}
+            # a text that is empty comes back as one
+            texts = {name: table.select_dtypes(exclude=["number", "bool"]).columns for name, table in written.items()}
+            return {name: table.fillna(dict.fromkeys(texts[name], "")) for name, table in written.items()}
         module = Path(inspect.getfile(part)).read_text(encoding="utf-8")
         files = []
         for arguments in parts:
@@ -351,7 +356,7 @@ class Study:
 
     def write(self, tables: Tables, figures: Mapping[str, Figure], text: str, name: str | None = None) -> None:
         """Write what came out, and show the text."""
-        for table_name, table in tables.items():
+        for table_name, table in tables.items() if not self.redraws else ():
             self.write_table(table_name, table)
         for figure_name, figure in figures.items():
             save_figure(figure, self.out / f"{figure_name}.png")

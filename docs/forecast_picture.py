@@ -28,7 +28,7 @@ def main() -> None:
     axes.axvline(found.now_s, color="0.4", lw=1.0, ls="--")
     axes.annotate("seen until here", (found.now_s, 4.0), (-6, 0), textcoords="offset points", ha="right", fontsize=9)
     axes.set_xlim(left=0.0)
-    axes.legend(frameon=False, fontsize=9, loc="lower left")
+    axes.legend(frameon=False, fontsize=9, loc="lower left", bbox_to_anchor=(0.0, 0.06))
     low_s, median_s, high_s = found.eod_quantile_s()
     print(f"{low_s:.0f} {median_s:.0f} {high_s:.0f} s; measured {running.eod_time_s(2.7):.0f} s")
     save_figure(figure, PICTURES / "forecast.png")

@@ -2,7 +2,7 @@
 The charge and the resistance of a real cell by least squares, a Kalman filter, and PyBOP on the same record.
 
 PyBOP fits an equivalent circuit of PyBaMM (a resistor and an RC pair) on the open-circuit voltage of this package's model, so
-that its capacity is what q^max is here: the charge between full and empty. It needs ``pip install '.[pybop]'``.
+that its capacity is what q_max is here: the charge between full and empty. It needs ``pip install '.[pybop]'``.
 """
 
 import time

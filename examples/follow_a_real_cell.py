@@ -1,4 +1,4 @@
-"""q^max, R_o and the end of discharge of a real cell, from its recorded voltage and current, over its life."""
+"""q_max, R_o and the end of discharge of a real cell, from its recorded voltage and current, over its life."""
 
 from battery_env import LeastSquares, load_nasa_discharges
 

@@ -1,4 +1,4 @@
-"""How long a real cell still lasts under pulses, with the q^max that its earlier discharges let expect."""
+"""How long a real cell still lasts under pulses, with the q_max that its earlier discharges let expect."""
 
 import numpy as np
 

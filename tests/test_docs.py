@@ -189,6 +189,13 @@ def test_every_published_table_is_on_the_page_of_all_tables():
     assert sorted(re.findall(r"\]\((results/[^)]+)\)", page)) == tables
 
 
+def test_every_picture_is_on_a_page():
+    text = "".join(page.read_text(encoding="utf-8") for page in (*PAGES, *DOCS.glob("*/*.md")))
+    pictures = [path for suffix in ("png", "gif") for path in DOCS.glob(f"*/**/*.{suffix}") if "_build" not in path.parts]
+    unused = [path.relative_to(DOCS).as_posix() for path in pictures if path.relative_to(DOCS).as_posix() not in text]
+    assert pictures and not unused
+
+
 def test_every_page_is_in_the_guide_or_has_a_form_of_its_own():
     guide = {name for names in GUIDE.values() for name in names}
     own_form = {"docs/index", "docs/api", "docs/architecture", "docs/contributing", "docs/changelog", "docs/all_tables"}
@@ -219,6 +226,9 @@ def test_every_picture_has_a_caption(page):
 def test_tables_of_the_guide_fit_the_column_of_the_site(name):
     for row in published(ROOT / f"{name}.md"):
         assert len(row) <= 6, row
+        for cell in row:
+            words = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", cell).split()
+            assert len(words) <= 25, f"{len(words)} words: {cell}"
 
 
 def test_reports_are_short_enough_to_be_read():

@@ -61,6 +61,8 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012 (as in gym.Env)
     #: Names of the state variables, for pictures and errors
     state_names: tuple[str, ...]
+    # of these the first so many are drawn over time
+    _n_drawn: int | None = None
     #: What ``info["error"]`` is, with its unit
     error_name: str
     #: An ``info["error"]`` up to which an episode has reached the goal
@@ -216,7 +218,7 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
         self._draw(plant_axes, states)
         right = figure.add_subfigure(figure.add_gridspec(1, 2)[1])
         state_axes, cost_axes = right.subplots(2, sharex=True, height_ratios=(2, 1))
-        for name, values in zip(self.state_names, states.T, strict=True):
+        for name, values in list(zip(self.state_names, states.T, strict=True))[: self._n_drawn]:
             state_axes.plot(values, marker="." if len(values) == 1 else None, label=name)
         right.legend(loc="outside upper center", ncols=3, fontsize="small")
         state_axes.set_ylabel("state")

@@ -101,6 +101,7 @@ class VehicleCostEnv(CostEnv):
     """
 
     state_names = ("e (m)", "psi (rad)", "v (m/s)", "r (rad/s)", "delta (rad)", "s (m)")
+    _n_drawn = 5  # the place on the path would dwarf the others, and the plant shows it
     error_name = "offset from the path (m)"
     error_tolerance = 0.01
     mass_kg: float

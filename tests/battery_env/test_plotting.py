@@ -52,7 +52,7 @@ def test_learning_curves_have_a_line_for_each_algorithm_and_a_band_for_several_s
     figure = plot_learning_curves({"LAC": [table, better], "TD3": [table]}, "BatteryRo-v0")
     for axes in figure.axes:
         assert len(axes.lines) == 2 and len(axes.collections) == 1
-        assert [text.get_text() for text in axes.get_legend().get_texts()] == ["LAC", "TD3"]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["LAC", "TD3"]
     lac, td3 = figure.axes[0].lines
     assert lac.get_xydata().tolist() == [[1.0, 4.0], [2.0, 0.75]] and td3.get_ydata().tolist() == [5.0, 1.0]
 
@@ -107,11 +107,11 @@ def test_estimates_have_a_panel_per_parameter_bands_and_a_dotted_part_that_is_no
         plot_estimates(traces, bound=bound)
 
 
-def test_sensitivities_are_drawn_in_microvolts_per_coulomb_and_volts_per_ohm(record):
+def test_sensitivities_are_drawn_as_what_one_percent_more_changes_in_millivolts(record):
     slopes = sensitivities(record)
-    upper, lower = plot_sensitivities({"2 A": slopes}).axes
-    np.testing.assert_allclose(upper.lines[0].get_ydata(), 1e6 * slopes.by_q_mobile_V_per_C)
-    np.testing.assert_allclose(lower.lines[0].get_ydata()[100:], -2.0, atol=1e-3)
+    upper, lower = plot_sensitivities({"2 A": slopes}, Estimate(6000.0, 0.15)).axes
+    np.testing.assert_allclose(upper.lines[0].get_ydata(), 1e3 * 60.0 * slopes.by_q_mobile_V_per_C)
+    np.testing.assert_allclose(lower.lines[0].get_ydata()[100:], 1e3 * 0.0015 * -2.0, atol=1e-3)
 
 
 def test_a_figure_replaces_the_one_before(tmp_path):

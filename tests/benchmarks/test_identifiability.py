@@ -44,7 +44,7 @@ def test_bounds_are_proportional_to_the_noise_and_grow_with_what_is_unknown(reco
     table = measure.bounds_table(records).set_index(["load", "unknown", "noise_V"])
     at_half = table["q_mobile_sd_percent_at_50%"]["constant"]
     np.testing.assert_allclose(at_half["both"].to_numpy(), at_half["both"][0.001] * np.array([1.0, 5.0, 10.0, 30.0]))
-    assert at_half["q^max alone"][0.01] < at_half["both"][0.01] < at_half["both and an offset"][0.01]
+    assert at_half["q_max alone"][0.01] < at_half["both"][0.01] < at_half["both and an offset"][0.01]
     assert np.isinf(table["r_o_within_1_percent_s"]["constant", "both and an offset", 0.01])
     assert np.isfinite(table["r_o_within_1_percent_s"]["varying", "both and an offset", 0.01])
 
@@ -80,7 +80,7 @@ def test_the_cost_of_vsp_points_to_the_truth_from_states_that_have_drifted():
 @pytest.fixture
 def brief(monkeypatch):
     monkeypatch.setattr(measure, "FINE_SHARES", measure.SHARES)
-    few = ("voltage read 10 mV too high", "kn of the cell 20 % lower", "R_o held 10 % too low", "q^max held 5 % too high")
+    few = ("voltage read 10 mV too high", "kn of the cell 20 % lower", "R_o held 10 % too low", "q_max held 5 % too high")
     monkeypatch.setattr(measure, "FAULTS", {name: measure.FAULTS[name] for name in few})
     monkeypatch.setattr(measure, "PRIORS", {"none": None, "right, sd 1 %": (1.0, 0.01)})
 
@@ -96,7 +96,7 @@ def test_the_study_writes_tables_and_figures(brief, tmp_path, capsys):
     faults = pd.read_csv(tmp_path / "faults.csv").set_index(["load", "fault", "seen_percent"]).sort_index()
     held = faults["q_mobile_error_percent"]["constant", "R_o held 10 % too low"]
     assert held[50.0] < -10.0 and abs(held[100.0]) < 1.0
-    assert faults["q_mobile_error_percent"]["constant", "q^max held 5 % too high"].isna().all()
+    assert faults["q_mobile_error_percent"]["constant", "q_max held 5 % too high"].isna().all()
 
 
 def cells(line):

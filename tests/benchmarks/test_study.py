@@ -74,6 +74,21 @@ def test_other_arguments_another_version_or_another_module_are_other_parts(tmp_p
     assert len(MADE) == 4 and len(list((tmp_path / "parts").iterdir())) == 4
 
 
+def test_figures_are_drawn_once_more_from_what_is_written_and_nothing_is_made(tmp_path):
+    first = a_study(tmp_path)
+    tables = first.run(part, [{"seed": 0, "scale": 1.0}])
+    first.write(tables | {"words": pd.DataFrame({"text": ["word", ""]})}, {}, "said\n")
+    written = {path: path.read_bytes() for path in tmp_path.glob("*.*")}
+    again = a_study(tmp_path, "--redraw")
+    read = again.run(part, [{"seed": 1, "scale": 1.0}])
+    again.write(read, {}, "said otherwise\n")
+    assert MADE == [0] and set(read) == {"example", "last", "words"} and again.configuration == first.configuration
+    pd.testing.assert_frame_equal(read["last"], tables["last"])
+    assert read["words"]["text"].tolist() == ["word", ""]
+    changed = [path.name for path, content in written.items() if path.read_bytes() != content]
+    assert changed == ["example.md"]
+
+
 def test_what_is_done_before_an_interruption_is_kept(tmp_path, monkeypatch):
     def interrupted(seed, scale):
         if seed == 1:

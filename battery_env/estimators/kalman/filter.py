@@ -39,8 +39,8 @@ _SHOWN = ("start", "rest", "fault", "switch", "gap", "start_V", "time_s", "uncou
 
 class ExtendedKalmanFilter(OnlineEstimator):
     """
-    Follows (q_mobile, r_o) along a discharge that starts with a cell at rest, fully charged unless ``initial_soc`` says
-    otherwise: one estimate a sample, with its standard deviation.
+    Follows (q_mobile, r_o) along a discharge that starts with a cell at rest: one estimate a sample, with its standard
+    deviation. The cell is fully charged unless ``initial_soc`` says otherwise.
 
     *State.* Given the current, the state of the model is a function of its two parameters; the charges are even linear in
     ``q_mobile``, with slope ``FULL_CHARGE_SHARES``. So the covariance of the augmented state (states and parameters) has the

@@ -11,7 +11,7 @@ class BatteryQmax(FullStateTask):
     ## Description
 
     A Li-ion cell of unknown age is discharged at a constant power of 8 to 16 W, and its whole state is measured once a
-    second. Find q^max (``q_mobile``), the charge that can move, by making NASA's electrochemistry model follow the measured
+    second. Find q_max (``q_mobile``), the charge that can move, by making NASA's electrochemistry model follow the measured
     state. Source: Unagar et al. 2020; no label is used, and the reward does not know the true parameter.
 
     ## Observation space
@@ -135,7 +135,7 @@ class BatteryQmaxPaper(FullStateTask):
     """
     ## Description
 
-    The q^max task in the literal form of the paper and its code, for comparison with ``BatteryQmax-v0``.
+    The q_max task in the literal form of the paper and its code, for comparison with ``BatteryQmax-v0``.
 
     ## Observation space
 
@@ -218,7 +218,7 @@ class BatteryJoint(FullStateTask):
     """
     ## Description
 
-    As ``BatteryQmax-v0``, but q^max and R_o (``r_o``), the ohmic resistance, have both aged and are to be found together.
+    As ``BatteryQmax-v0``, but q_max and R_o (``r_o``), the ohmic resistance, have both aged and are to be found together.
 
     ## Observation space
 

@@ -51,9 +51,9 @@ class BatteryAging(VoltageTask):
     ## Description
 
     The life of a Li-ion cell: 20 cycles, each a discharge from full charge as in ``BatteryVoltageJoint-v0``, with wear
-    between them (``battery_env.tasks.voltage.aging.simulated_lives``: q^max falls by 10 to 40 % and R_o rises by 20 to 100 %
+    between them (``battery_env.tasks.voltage.aging.simulated_lives``: q_max falls by 10 to 40 % and R_o rises by 20 to 100 %
     over a life, in uneven steps). The estimate is carried over from cycle to cycle. Only the readings of the present cycle
-    count in observation and cost, so that early in a discharge, when the data say nothing of q^max, the estimate of the last
+    count in observation and cost, so that early in a discharge, when the data say nothing of q_max, the estimate of the last
     cycle is the best there is.
 
     ## Observation space

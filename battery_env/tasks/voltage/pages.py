@@ -11,7 +11,7 @@ class BatteryVoltageJoint(VoltageTask):
 
     A Li-ion cell of unknown age is discharged from full charge under a power that changes every one or two minutes. Current
     and terminal voltage are read every ten seconds; no state of the cell is measured. Find both parameters that age,
-    q^max (``q_mobile``, the charge that can move) and R_o (``r_o``, the ohmic resistance), by explaining all readings so far
+    q_max (``q_mobile``, the charge that can move) and R_o (``r_o``, the ohmic resistance), by explaining all readings so far
     with one pair of them. The paper (Unagar et al. 2020) names this as future work. By default no label is used: the reward
     knows readings and estimate alone, so that the task can be made of recorded discharges too.
 
@@ -128,7 +128,7 @@ class BatteryVoltageQmax(VoltageTask):
     """
     ## Description
 
-    As ``BatteryVoltageJoint-v0``, but R_o is known (the new cell's in recorded discharges), and q^max (``q_mobile``) is to be
+    As ``BatteryVoltageJoint-v0``, but R_o is known (the new cell's in recorded discharges), and q_max (``q_mobile``) is to be
     found.
 
     ## Observation space
@@ -167,7 +167,7 @@ class BatteryVoltageRo(VoltageTask):
     """
     ## Description
 
-    As ``BatteryVoltageJoint-v0``, but q^max is known (the new cell's in recorded discharges), and R_o (``r_o``) is to be
+    As ``BatteryVoltageJoint-v0``, but q_max is known (the new cell's in recorded discharges), and R_o (``r_o``) is to be
     found.
 
     ## Observation space
