@@ -114,19 +114,25 @@ def test_a_call_that_fails_stops_no_other(tmp_path, capsys):
     assert kept == {1: 1.0} and "part 1 of 2 failed: ZeroDivisionError" in capsys.readouterr().err
 
 
-def dies_once(number, place):
-    if number == 1 and not (place / "died").exists():
-        (place / "died").touch()
+def dies_three_times(number, place):
+    deaths = place / "deaths"
+    if number == 1 and (not deaths.exists() or deaths.stat().st_size < 3):
+        with deaths.open("ab") as file:
+            file.write(b"x")
         os._exit(1)
     return {"example": pd.DataFrame([{"number": number}])}
 
 
-def test_after_a_lost_process_the_same_command_makes_what_is_missing(tmp_path):
-    parts = [{"number": number} for number in range(4)]
+def test_a_lost_process_costs_a_study_nothing_and_one_that_is_lost_twice_its_part_alone(tmp_path, capsys):
+    def run():
+        return a_study(tmp_path / "out", jobs=2).run(dies_three_times, [{"number": n} for n in range(3)], place=tmp_path)
+
     with pytest.raises(BrokenExecutor):
-        a_study(tmp_path / "out", jobs=2).run(dies_once, parts, place=tmp_path)
-    table = a_study(tmp_path / "out").run(dies_once, parts, place=tmp_path)["example"]
-    assert table["number"].tolist() == [0, 1, 2, 3]
+        run()
+    error = capsys.readouterr().err
+    assert "part 2 of 3 failed" in error and "1 of 3 parts failed" in error and "the same command goes on from there" in error
+    assert len(list((tmp_path / "out" / "parts").iterdir())) == 2
+    assert run()["example"]["number"].tolist() == [0, 1, 2] and (tmp_path / "deaths").read_text() == "xxx"
 
 
 def fragile_part(seed, place):
