@@ -1,6 +1,5 @@
 """Parts are made once and side by side, files say what made them, and numbers read well."""
 
-import argparse
 import json
 import operator
 import os
@@ -14,7 +13,7 @@ import pandas as pd
 import pytest
 
 from benchmarks import calibrators, study
-from benchmarks.study import Study, command_line, digits, natural, with_spread
+from benchmarks.study import Study, command_line, digits, with_spread
 
 
 def a_study(tmp_path, *arguments, jobs=1):
@@ -185,20 +184,6 @@ def test_files_say_what_made_them(tmp_path, capsys):
     assert record["command"].startswith("python -m benchmarks.example --seeds 4 5 ")
     assert record["configuration"] == {"seeds": [4, 5]} and {"torch", "sb3_lac"} <= set(record["versions"])
     assert (tmp_path / "example.md").read_text() in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("option", [["--jobs", "0"], ["--jobs", "nan"], ["--jobs", "inf"], ["--jobs", "two"]])
-def test_what_must_be_positive_is(option, capsys):
-    with pytest.raises(SystemExit):
-        Study(command_line("example", None), option)
-    assert f"argument --jobs: must be at least 1, got {option[1]}" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("seed", ["-1", "0.5", "first"])
-def test_seeds_are_natural_numbers(seed):
-    assert natural("0") == 0
-    with pytest.raises(argparse.ArgumentTypeError, match=f"at least 0, got {seed}"):
-        natural(seed)
 
 
 def test_what_is_named_twice_is_there_once(tmp_path):
