@@ -30,6 +30,7 @@ with the hyperparameters of all of them in one table.
 from __future__ import annotations
 
 import ast
+import contextlib
 import itertools
 import json
 import shutil
@@ -117,8 +118,9 @@ def _train(recipe: Recipe, folder: Path, out: Path, position: int) -> None:
         ProgressCallback(f"{of_env.env_id} {recipe.label} seed {recipe.seed}", recipe.timesteps, calibration, position),
     ]
     log = out / "tensorboard" / of_env.env_id / f"{recipe.label.replace(' ', '_')}_seed{recipe.seed}_{recipe.digest}"
-    made_by = training.run(callbacks, log, ["tensorboard"])
-    training.save()
+    with contextlib.closing(training):
+        made_by = training.run(callbacks, log, ["tensorboard"])
+        training.save()
 
     scores = of_env.scores(training.model, scored_env)
     write_text(folder / "scores.csv", scores.to_csv(index=False, float_format="%.6g"))

@@ -13,8 +13,9 @@ import os
 import platform
 import shlex
 import sys
+from collections import deque
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
-from concurrent.futures import as_completed
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
 from contextlib import closing
 from functools import partial
 from hashlib import sha256
@@ -32,7 +33,7 @@ import battery_env
 import sb3_lac
 from battery_env.evaluation import over_seeds
 from battery_env.files import check_folder, replacing, set_aside
-from battery_env.lab.workers import interruptible, workers
+from battery_env.lab.workers import Processes, interruptible, workers
 from battery_env.plotting import new_figure, save_figure
 
 Result = TypeVar("Result")
@@ -314,10 +315,12 @@ class Study:
         """
         Call a function with each of several arguments, with a progress bar: on the cluster, or as many at the same time as
         was chosen, in processes of their own, or all in this one if one at a time. A call that fails stops no other; its
-        error is raised when all are done. An interruption ends the program with a word on what is done.
+        error is raised when all are done. Calls whose process is lost are made once more, each in a process of its own. An
+        interruption ends the program with a word on what is done.
         """
         results: dict[int, Result] = {}
         errors = []
+        goes_on = f"what is done lies in {self.out}, and the same command goes on from there."
         try:
             with interruptible(), closing(self._calls(function, runs)) as calls:
                 for number, result in tqdm(calls, desc="parts", total=len(runs), disable=None):
@@ -329,8 +332,9 @@ class Study:
                         tqdm.write(f"part {number + 1} of {len(runs)} failed: {error!r}", file=sys.stderr)
                         errors.append(error)
         except KeyboardInterrupt:
-            sys.exit(f"\nInterrupted; what is done lies in {self.out}, and the same command goes on from there.")
+            sys.exit(f"\nInterrupted; {goes_on}")
         if errors:
+            print(f"{len(errors)} of {len(runs)} parts failed; {goes_on}", file=sys.stderr)
             raise errors[0]
         return [results[number] for number in range(len(runs))]
 
@@ -342,9 +346,19 @@ class Study:
             yield from ((number, partial(function, *run)) for number, run in enumerate(runs))
         elif runs:
             with workers(self.chosen.jobs, self.scheduler) as executor:
-                numbers = {executor.submit(importable(function), *run): number for number, run in enumerate(runs)}
-                for future in as_completed(numbers):
-                    yield numbers[future], future.result
+                # A process that is lost takes with it all that is under way in others: no more than they can work at
+                most = self.chosen.jobs if isinstance(executor, Processes) else len(runs)
+                waiting, started = deque(enumerate(runs)), dict[Future[Result], int]()
+                while waiting or started:
+                    while waiting and len(started) < most:
+                        number, run = waiting.popleft()
+                        started[executor.submit(importable(function), *run)] = number
+                    for future in wait(started, return_when=FIRST_COMPLETED).done:
+                        number = started.pop(future)
+                        if isinstance(executor, Processes) and isinstance(future.exception(), BrokenExecutor):
+                            yield number, partial(executor.alone, importable(function), *runs[number])
+                        else:
+                            yield number, future.result
 
     def write_table(self, name: str, table: pd.DataFrame, configuration: Mapping[str, Any] | None = None) -> None:
         """Write a table as CSV, and beside it as JSON what made it: command, configuration, versions."""

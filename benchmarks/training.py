@@ -298,9 +298,12 @@ class Training:
         }
 
     def save(self) -> None:
-        """Save the model, and close its environments and its log."""
+        """Save the model."""
         with replacing(self.file) as part:
             self.model.save(part)
+
+    def close(self) -> None:
+        """Close the environments of the model and its log, however the training went."""
         assert self.model.env is not None
         self.model.env.close()
         self.model.logger.close()
@@ -316,9 +319,10 @@ def train_or_load(
     record = record_file(recipe, folder)
     file = record.with_suffix(".zip")
     if not file.exists():
-        training = Training(recipe, file, hyperparams={"compile_update": True} if compile_update else {})
-        write_json(record, training.run(callbacks, folder, ["csv", "tensorboard"]))
-        training.save()
+        hyperparams = {"compile_update": True} if compile_update else {}
+        with contextlib.closing(Training(recipe, file, hyperparams=hyperparams)) as training:
+            write_json(record, training.run(callbacks, folder, ["csv", "tensorboard"]))
+            training.save()
     return ALGOS[recipe.algo].load(file, device="cpu")
 
 

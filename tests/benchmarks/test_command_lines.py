@@ -41,24 +41,31 @@ def test_a_folder_that_cannot_be_is_refused(command, out, tmp_path, capsys):
     assert "is a file: choose another --out" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("line", "words"),
-    [
-        ("calibrators everything", "invalid choice: 'everything'"),
-        ("calibrators peers --discharges 0", "--discharges: must lie within 1 .. 300, got 0"),
-        ("calibrators mismatch --discharges 301", "--discharges: must lie within 1 .. 300, got 301"),
-        ("calibrators mismatch_policies --algos ppo", "invalid choice: 'ppo'"),
-        ("calibrators mismatch_policies --seeds -1", "--seeds: must be a whole number of at least 0, got -1"),
-        ("cells real_cells --cells B0007", "invalid choice: 'B0007'"),
-        ("cells fit_cell --every 0", "--every: must be at least 1, got 0"),
-        ("cells own_cell --updates 0.5", "--updates: must be at least 1, got 0.5"),
-        ("direct_mapping --pairs 0", "--pairs: must be at least 1, got 0"),
-        ("forecasts --every 0", "--every: must be at least 1, got 0"),
-        ("identifiability --draws many", "--draws: must be at least 1, got many"),
-        ("pretrained --discharges 301", "--discharges: must lie within 1 .. 300, got 301"),
-        ("pretrained --envs BatteryQmax-v0", "invalid choice: 'BatteryQmax-v0'"),
+#: What all commands say of a number that is none, by what was given, and where
+REFUSED = {
+    "must be at least 1, got": [
+        *("compare --timesteps 0", "compare --jobs nan", "compare --jobs inf", "linear_cost --episodes two"),
+        *("cells fit_cell --every 0", "cells own_cell --updates 0.5", "direct_mapping --pairs 0", "forecasts --every 0"),
+        *("identifiability --draws many",),
     ],
-)
-def test_what_a_study_cannot_use_is_refused(line, words, tmp_path, capsys):
+    "must be a whole number of at least 0, got": [
+        *("compare --seeds -1", "linear_cost --seeds 0.5", "calibrators mismatch_policies --seeds first"),
+    ],
+    "must lie within 1 .. 300, got": [
+        *("calibrators peers --discharges 0", "calibrators mismatch --discharges 301", "pretrained --discharges 301"),
+    ],
+    "invalid choice:": [
+        *("calibrators everything", "calibrators mismatch_policies --algos ppo", "cells real_cells --cells B0007"),
+        *("pretrained --envs BatteryQmax-v0",),
+    ],
+}
+
+
+@pytest.mark.parametrize(("words", "line"), [(words, line) for words, lines in REFUSED.items() for line in lines])
+def test_what_a_study_cannot_use_is_refused(words, line, tmp_path, capsys):
     assert call(line, "--out", str(tmp_path / "out")) == 2
-    assert words in capsys.readouterr().err and not (tmp_path / "out").exists()
+    *_, option, given = line.split()
+    error = capsys.readouterr().err
+    assert f"{words} {given}" in error or f"{words} '{given}'" in error
+    assert not option.startswith("-") or f"argument {option}: " in error
+    assert not (tmp_path / "out").exists()

@@ -1,6 +1,5 @@
 """Parts are made once and side by side, files say what made them, and numbers read well."""
 
-import argparse
 import json
 import operator
 import os
@@ -14,7 +13,7 @@ import pandas as pd
 import pytest
 
 from benchmarks import calibrators, study
-from benchmarks.study import Study, command_line, digits, natural, with_spread
+from benchmarks.study import Study, command_line, digits, with_spread
 
 
 def a_study(tmp_path, *arguments, jobs=1):
@@ -129,19 +128,25 @@ def test_a_call_that_fails_stops_no_other(tmp_path, capsys):
     assert kept == {1: 1.0} and "part 1 of 2 failed: ZeroDivisionError" in capsys.readouterr().err
 
 
-def dies_once(number, place):
-    if number == 1 and not (place / "died").exists():
-        (place / "died").touch()
+def dies_three_times(number, place):
+    deaths = place / "deaths"
+    if number == 1 and (not deaths.exists() or deaths.stat().st_size < 3):
+        with deaths.open("ab") as file:
+            file.write(b"x")
         os._exit(1)
     return {"example": pd.DataFrame([{"number": number}])}
 
 
-def test_after_a_lost_process_the_same_command_makes_what_is_missing(tmp_path):
-    parts = [{"number": number} for number in range(4)]
+def test_a_lost_process_costs_a_study_nothing_and_one_that_is_lost_twice_its_part_alone(tmp_path, capsys):
+    def run():
+        return a_study(tmp_path / "out", jobs=2).run(dies_three_times, [{"number": n} for n in range(3)], place=tmp_path)
+
     with pytest.raises(BrokenExecutor):
-        a_study(tmp_path / "out", jobs=2).run(dies_once, parts, place=tmp_path)
-    table = a_study(tmp_path / "out").run(dies_once, parts, place=tmp_path)["example"]
-    assert table["number"].tolist() == [0, 1, 2, 3]
+        run()
+    error = capsys.readouterr().err
+    assert "part 2 of 3 failed" in error and "1 of 3 parts failed" in error and "the same command goes on from there" in error
+    assert len(list((tmp_path / "out" / "parts").iterdir())) == 2
+    assert run()["example"]["number"].tolist() == [0, 1, 2] and (tmp_path / "deaths").read_text() == "xxx"
 
 
 def fragile_part(seed, place):
@@ -194,20 +199,6 @@ def test_files_say_what_made_them(tmp_path, capsys):
     assert record["command"].startswith("python -m benchmarks.example --seeds 4 5 ")
     assert record["configuration"] == {"seeds": [4, 5]} and {"torch", "sb3_lac"} <= set(record["versions"])
     assert (tmp_path / "example.md").read_text() in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("option", [["--jobs", "0"], ["--jobs", "nan"], ["--jobs", "inf"], ["--jobs", "two"]])
-def test_what_must_be_positive_is(option, capsys):
-    with pytest.raises(SystemExit):
-        Study(command_line("example", None), option)
-    assert f"argument --jobs: must be at least 1, got {option[1]}" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("seed", ["-1", "0.5", "first"])
-def test_seeds_are_natural_numbers(seed):
-    assert natural("0") == 0
-    with pytest.raises(argparse.ArgumentTypeError, match=f"at least 0, got {seed}"):
-        natural(seed)
 
 
 def test_what_is_named_twice_is_there_once(tmp_path):

@@ -13,6 +13,8 @@ from benchmarks import training
 from benchmarks.study import digest_of
 from sb3_lac import LAC, compiled
 
+pytestmark = pytest.mark.filterwarnings("error::ResourceWarning", "error::pytest.PytestUnraisableExceptionWarning")
+
 ENV_ID = "LinearCost-v0"
 PUBLISHED = Path(__file__).parents[2] / "docs" / "results"
 CONFIG = """
@@ -29,11 +31,16 @@ LinearCost-v0:
 
 @pytest.fixture(autouse=True)
 def trainings(tmp_path, monkeypatch):
-    """Tiny networks, and a list of the seeds that were trained with."""
+    """Tiny networks, whose environments are closed in the end, and a list of the seeds that were trained with."""
     (tmp_path / "zoo_configs").mkdir()
     (tmp_path / "zoo_configs" / "lac.yml").write_text(CONFIG)
     monkeypatch.chdir(tmp_path)
-    seeds = []
+    seeds, models, set_up = [], [], training.set_up
+
+    def kept(*arguments, **named):
+        manager, model = set_up(*arguments, **named)
+        models.append(model)
+        return manager, model
 
     class Manager(training.LACExperimentManager):
         def __init__(self, *args, **kwargs):
@@ -41,7 +48,10 @@ def trainings(tmp_path, monkeypatch):
             super().__init__(*args, **kwargs)
 
     monkeypatch.setattr(training, "LACExperimentManager", Manager)
-    return seeds
+    monkeypatch.setattr(training, "set_up", kept)
+    yield seeds
+    for model in models:
+        model.env.close()
 
 
 def train(timesteps, folder, algo="lac", seed=0, compile_update=False, **differing):

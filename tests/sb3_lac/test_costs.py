@@ -154,21 +154,3 @@ def test_what_is_not_finite_is_refused_before_it_is_stored(make_model, make_env,
         model.learn(20)
     assert model._n_updates == 0 and model.replay_buffer.pos <= 4
     assert np.isfinite(model.replay_buffer.rewards).all()
-
-
-def test_a_file_is_replaced_when_the_new_one_is_whole(make_model, tmp_path, monkeypatch):
-    model = make_model()
-    for save, file in ((model.save, "model.zip"), (model.save_replay_buffer, "buffer.pkl")):
-        save(tmp_path / file.partition(".")[0])
-        before = (tmp_path / file).read_bytes()
-        with monkeypatch.context() as patch:
-
-            def fail_half_way(*args, **kwargs):
-                raise OSError("no space left on device")
-
-            patch.setattr("torch.save", fail_half_way)
-            patch.setattr("pickle.dump", fail_half_way)
-            with pytest.raises(OSError, match="no space left"):
-                save(tmp_path / file)
-        assert (tmp_path / file).read_bytes() == before
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["buffer.pkl", "model.zip"]
