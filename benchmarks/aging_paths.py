@@ -44,7 +44,7 @@ from battery_env.files import replacing
 from battery_env.lab.running import forecast_end
 from battery_env.lab.settings import Settings
 from battery_env.loads import Load, RandomLoad, RandomPiecewise, constant
-from battery_env.plotting import COLOURS
+from battery_env.plotting import coloured
 from battery_env.policies.pretrained import file_stem
 from battery_env.records import drawn
 from battery_env.records.discharge import BUNDLED_CELLS, Discharge
@@ -129,8 +129,18 @@ def recipe_of(algo: str, cells: Sequence[str], seed: int, folder: Path) -> Recip
     return Recipe.of(algo, ENV_ID, seed, updates=UPDATES, hyperparameters=own)
 
 
-def part(judged: str, every: int, folder: Path) -> Tables:
-    """The discharges of a cell by what needs no training."""
+def training(algo: str, lives: Sequence[str], seed: int, folder: Path) -> Tables:
+    """Train one policy, unless that has been done."""
+    recipe = recipe_of(algo, lives, seed, folder)
+    train_or_load(recipe, folder / "models")
+    row = {"algo": algo, "lives": " ".join(lives), "seed": seed, "minutes": training_minutes(recipe, folder / "models")}
+    return {"trainings": pd.DataFrame([row])}
+
+
+def part(judged: str, every: int, folder: Path, method: str | None = None, **policies: Any) -> Tables:
+    """The discharges of a cell by a method that learned along the path of the other one, or by all that need no training."""
+    if method is not None:
+        return learned(judged, every, method, folder=folder, **policies)
     life = CELLS[judged]
     path, discharges = path_of([life], folder)[0], load_nasa_discharges(judged)
     labelled = load_nasa_discharges(life)
@@ -154,10 +164,6 @@ def learned(judged: str, every: int, method: str, algo: str, seeds: Sequence[int
             rows.append({"method": method, **_row(path, whole, share, record, last_estimate(trace))})
     seed = seeds[0] if len(seeds) == 1 else np.nan
     return {"discharges": pd.DataFrame(rows).assign(cell=judged, seed=seed)}
-
-
-def _train(recipe: Recipe, models: Path) -> None:
-    train_or_load(recipe, models)
 
 
 class _Whole:
@@ -255,7 +261,7 @@ def summary(rows: pd.DataFrame) -> pd.DataFrame:
         if len(whole):
             worst = digits(whole["q_error_percent"].abs().max())
             line["whole: q_max off least squares, mean (worst) (%)"] = f"{_over_seeds(whole, 'q_error_percent')} ({worst})"
-            line["settled, whole"] = f"{whole['settled'].sum()} of {len(whole)}"
+            line["settled, whole"] = f"{whole['settled'].astype(str).eq('True').sum()} of {len(whole)}"
         lines.append(line)
     return pd.DataFrame(lines)
 
@@ -270,13 +276,14 @@ def _over_seeds(rows: pd.DataFrame, column: str) -> str:
 def plot(rows: pd.DataFrame) -> Figure:
     """The error of the end in each discharge of each cell, after half of the time; of policies those that act as one."""
     shown = rows[(rows["share"] == 0.5) & rows["seed"].isna() & ~rows["method"].str.startswith(("regression", "the fit"))]
-    figure, panels = new_panels(len(CELLS), 2, (4.2, 2.8), margin=(0.0, 0.4))
+    figure, panels = new_panels(len(CELLS), 2, (4.6, 4.0))
     for axes, (cell, of_cell) in zip(panels, shown.groupby("cell"), strict=True):
-        for colour, (method, group) in zip(COLOURS, of_cell.groupby("method", sort=False), strict=False):
-            axes.plot(range(len(group)), group["error_percent"], ".-", color=colour, lw=0.8, label=method)
+        along = f", path of {CELLS[cell]}"
+        for colour, (method, group) in coloured(of_cell.groupby("method", sort=False)):
+            axes.plot(range(len(group)), group["error_percent"], ".-", color=colour, lw=0.8, label=method.replace(along, ""))
         axes.axhline(0.0, color="black", lw=0.6)
-        axes.set(title=cell, xlabel="discharge, from young to old", ylabel="error of the end, half seen (%)")
-        axes.legend(frameon=False, fontsize=7)
+        axes.set(title=cell + along, xlabel="discharge, from young to old", ylabel="error of the end, half seen (%)")
+        axes.legend(frameon=False, fontsize=7, loc="upper center", bbox_to_anchor=(0.45, -0.16), ncols=2)
     return figure
 
 
@@ -315,23 +322,24 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--export", action="store_true", help="write the policy that comes with the package")
     study = Study(parser, arguments)
     chosen = study.chosen
-    runs = [(algo, [life], seed) for life in BUNDLED_CELLS for algo in chosen.algos for seed in chosen.seeds]
-    runs += [("lac", list(BUNDLED_CELLS), seed) for seed in chosen.seeds if chosen.export]
-    recipes = [recipe_of(algo, lives, seed, study.out) for algo, lives, seed in runs]
-    study.each(_train, [(recipe, study.out / "models") for recipe in recipes])
+    runs = [
+        {"algo": algo, "lives": [life], "seed": seed}
+        for life in BUNDLED_CELLS
+        for algo in chosen.algos
+        for seed in chosen.seeds
+    ]
+    runs += [{"algo": "lac", "lives": list(BUNDLED_CELLS), "seed": seed} for seed in chosen.seeds if chosen.export]
     study.configuration |= {"options": OPTIONS, "trained_with": TRAINED_WITH, "cells": TRAINING_CELLS, "updates": UPDATES}
-    known = [{"judged": cell, "every": chosen.every} for cell in CELLS]
-    rows = [study.run(part, known, folder=study.out)["discharges"]]
+    study.run(training, runs, folder=study.out)
     asked: list[dict[str, Any]] = []
     for judged, life in CELLS.items():
         of_cell = {"judged": judged, "every": chosen.every}
-        asked.append({**of_cell, "method": FIT.format(life), "algo": "lac", "seeds": []})
+        asked += [of_cell, {**of_cell, "method": FIT.format(life), "algo": "lac", "seeds": []}]
         for algo in chosen.algos:
             name = f"{LABELS[algo]}, path of {life}"
             asked += [{**of_cell, "method": name, "algo": algo, "seeds": [seed]} for seed in chosen.seeds]
             asked.append({**of_cell, "method": f"{name}, {len(chosen.seeds)} as one", "algo": algo, "seeds": chosen.seeds})
-    rows.append(study.run(learned, asked, folder=study.out)["discharges"])
-    table = pd.concat(rows, ignore_index=True).sort_values("cell", kind="stable", ignore_index=True)
+    table = study.run(part, asked, folder=study.out)["discharges"]
     shown = summary(table)
     if chosen.export:
         export(chosen.seeds, study.out, study.command, shown)

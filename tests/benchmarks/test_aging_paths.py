@@ -1,16 +1,25 @@
-"""The study of paths judges each cell by the path of the other one, and writes what it finds."""
+"""The study of ageing paths."""
 
 import pandas as pd
 
+from battery_env import PolicyEstimator
+from battery_env.policies.pretrained import policy_of_file
 from benchmarks import aging_paths
 
 
-def test_the_study_writes_its_tables(tmp_path, capsys, monkeypatch):
+def test_few_discharges_of_one_cell_make_its_tables_and_the_policy(tmp_path, monkeypatch):
     monkeypatch.setattr(aging_paths, "CELLS", {"B0005": "B0006"})
-    aging_paths.main(["--every", "80", "--out", str(tmp_path)])
-    rows = pd.read_csv(tmp_path / "discharges.csv")
-    of_path = rows[rows["method"] == "least squares, path of B0006"]
-    assert len(rows) == 3 * (3 * len(aging_paths.SHARES) - 2) and set(rows["cell"]) == {"B0005"}
-    assert of_path["error_percent"].abs().max() < 8.0 and of_path["q_error_percent"].abs().max() < 8.0
-    assert not of_path[of_path["share"] < 1.0]["settled"].any()
-    assert "| B0005" in capsys.readouterr().out and (tmp_path / "ends.png").stat().st_size > 0
+    for name, value in {"UPDATES": 8, "TRAINING_CELLS": 20, "BUNDLED_CELLS": ("B0006",)}.items():
+        monkeypatch.setattr(aging_paths, name, value)
+    asked = ["--every", "80", "--algos", "lac", "--seeds", "0", "1", "--export", "--jobs", "1", "--out", str(tmp_path)]
+    aging_paths.main(asked)
+    rows, shares = pd.read_csv(tmp_path / "discharges.csv"), len(aging_paths.SHARES)
+    # of three discharges, by two methods whole and in progress, by three that tell an end, and by policies alone and as one
+    assert len(rows) == 3 * (2 * shares + 3 * (shares - 1) + 3 * shares) and set(rows["cell"]) == {"B0005"}
+    assert (rows["error_percent"].abs().dropna() < 40.0).all()
+    text = (tmp_path / "aging_paths.md").read_text()
+    assert "| LAC, path of B0006, 2 as one " in text and (tmp_path / "ends.png").stat().st_size > 0
+    policy, options = policy_of_file(tmp_path / "BatteryVoltageJoint-v0_recorded.onnx")
+    assert PolicyEstimator(policy, policy.env_id, **options).parameters == ("q_mobile", "r_o")
+    aging_paths.main([*asked[:-4], "--redraw", *asked[-2:]])
+    assert (tmp_path / "aging_paths.md").read_text() == text
