@@ -112,8 +112,8 @@ def _greedy(low: float, high: float, resync: bool, search: _Search, best: FloatA
 class GreedyOneStep(Estimator):
     """
     At each step the value of one parameter for which the model's next state is closest to the measured one. The other
-    parameter is known. It is the minimum of the paper's cost ``|x̂_{t+1} - x_{t+1}|`` (SI units), which a policy that looks no further
-    ahead can learn at best.
+    parameter is known. It is the minimum of the paper's cost ``|x̂_{t+1} - x_{t+1}|`` (SI units), which a policy that looks no
+    further ahead can learn at best.
 
     In ``q_mobile`` this cost has up to three minima in mid discharge, as the voltage and with it the current for a given
     power is no monotonic function of it. All of them are searched, and the deepest one is taken.
