@@ -28,7 +28,7 @@ PATH_NAMES: tuple[str, ...] = (*UNCERTAIN_CONSTANTS, *EQUILIBRIUM_NAMES, *PARAME
 #: along the path of B0006.
 SPREAD_SD: tuple[float, ...] = (*(0.5,) * len(UNCERTAIN_CONSTANTS), *(0.005,) * EQUILIBRIUM_SIZE, 0.03, 0.25)
 #: A cell that lies farther beside the path, in standard deviations, is of another kind.
-BESIDE_LIMIT_SD = 3.0
+BESIDE_LIMIT_SD = 4.0
 #: How all this goes together is known from the lives of few cells: another one may lie this many times farther off. So many
 #: times larger are the standard deviations that are stated, and the one of ``q_mobile`` that has to be small to be settled.
 OTHER_LIVES = 2.0

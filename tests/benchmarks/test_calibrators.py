@@ -64,7 +64,7 @@ class TestWork:
         assert len(counts["peers"]) == 8 * 2 + 2 * (4 * 2 + 1) and counts["peers"].count(2) == 2 * 2
         # four of five on either parameter, half of the discharges each
         assert len(counts["faults"]) == 7 * 5 + 4 * 2 and counts["faults"].count(15) == 4 * 2
-        assert (len(counts["mismatch"]), len(counts["nuisance"])) == (4 * 7, 2 * 3)
+        assert (len(counts["mismatch"]), len(counts["nuisance"])) == (4 * 6, 2 * 3)
 
 
 def test_peers_are_as_good_as_they_can_be_until_a_sensor_is_wrong(tmp_path, monkeypatch, capsys):
