@@ -158,9 +158,9 @@ class PolicyEstimator(OnlineEstimator):
     - A policy of ``BatteryAging-v0`` takes such records life after life, ``cycles`` of them each, and carries its estimate
       over from one to the next. It takes no stream.
 
-    A policy states standard deviations if its observation has a fit (option ``nuisance``): those of the fit under its priors,
-    with the distance of the estimate from it. It has settled if they are as small as least squares ask for, the fit explains
-    the record, and nothing in the record contradicts it. Other policies state none, and never settle.
+    A policy states standard deviations if its observation has a fit (options ``nuisance`` and ``path``): those of the fit
+    under its priors, with the distance of the estimate from it. It has settled if they are as small as least squares ask for,
+    the fit explains the record, and nothing in the record contradicts it. Other policies state none, and never settle.
 
     What :meth:`save` wrote is refused with another :class:`~battery_env.OnnxPolicy`; models of
     Stable-Baselines3 are not told from each other.
@@ -200,8 +200,9 @@ class PolicyEstimator(OnlineEstimator):
 
         :param env_id: id of a voltage-only environment of single discharges
         :param decision_s: time between two estimates, s
-        :param recorded: whether for recorded cells: one that has learned on a model whose error wanders. By default one that
-            has learned on a model with wrong constants, as simulated cells have
+        :param recorded: whether for recorded cells: of both parameters one that has learned along the lives of the bundled
+            cells, of one of them one that has learned on a model whose error wanders. By default one that has learned on a
+            model with wrong constants, as simulated cells have
         :return: the estimator
         :raises ValueError: for another id, or a time out of range
         :raises ImportError: without the extra ``battery_env[onnx]``

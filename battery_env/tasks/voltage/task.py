@@ -302,8 +302,8 @@ class VoltageTask(CalibrationTask):
         discharges = cls.discharges_of_an_episode(options)
         task = cls(len(records) // discharges, **{"start": "new_cell", **options, "dataset": records, "cost": "misfit"})
         task._every_s = decision_s
-        decisions = [len(task._due(n)) for n in range(len(records))]
-        task._arrivals = np.zeros((task.cells, sum(decisions)), dtype=np.int64)
+        decisions = np.array([len(task._due(n)) for n in range(task.cells * discharges)]).reshape(task.cells, discharges)
+        task._arrivals = np.zeros((task.cells, int(decisions.sum(axis=1).max())), dtype=np.int64)
         for row in range(task.cells):
             n = row * discharges
             task._place(row, n, task._first_count(n, None), task._first_estimate(n, None))
