@@ -157,10 +157,14 @@ def test_the_first_page_shows_what_the_calibrator_prints(capsys):
 def test_the_tutorial_of_a_life_shows_what_its_forecast_prints(tmp_path, monkeypatch, capsys):
     page = (DOCS / "cell_life.md").read_text(encoding="utf-8")
     ((example, shown),) = re.findall(r"^```python\n((?:(?!```).)*?)^```\n\n```text\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    (remaining,) = re.findall(r"^```python\n((?:(?!```).)*remaining_discharges.*?)^```", page, re.MULTILINE | re.DOTALL)
     monkeypatch.chdir(tmp_path)
-    exec(example, {})
+    names: dict[str, object] = {}
+    exec(example, names)
     printed = capsys.readouterr().out
     assert printed.startswith(shown)
+    exec(remaining, names)
+    assert f"`{capsys.readouterr().out.splitlines()[-1]}`" in page
     low, high = re.search(r"end of discharge \(s\) +(\d+) +\d+ +(\d+)", printed).groups()
     assert f"lies within {low} to {high} s" in (ROOT / "README.md").read_text(encoding="utf-8")
 
