@@ -48,6 +48,7 @@ def test_settings_are_those_of_the_paper_and_rates_fall_apart(policy, tmp_path):
     model._current_progress_remaining = 0.5
     model.train(1, model.batch_size)
     assert [optimizer.param_groups[0]["lr"] for optimizer in (model.actor.optimizer, model.critic.optimizer)] == [5e-5, 1.5e-4]
+    model.env.close()
 
 
 def test_two_rates_are_kept_in_files(tmp_path):

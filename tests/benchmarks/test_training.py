@@ -1,6 +1,8 @@
 """A policy is trained once, with the hyperparameters it should have, and known by what it was made from."""
 
+import gc
 import json
+import warnings
 from hashlib import sha256
 from pathlib import Path
 
@@ -32,6 +34,9 @@ LinearCost-v0:
 @pytest.fixture(autouse=True)
 def trainings(tmp_path, monkeypatch):
     """Tiny networks, whose environments are closed in the end, and a list of the seeds that were trained with."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        gc.collect()  # what tests of other modules have left open is not of these
     (tmp_path / "zoo_configs").mkdir()
     (tmp_path / "zoo_configs" / "lac.yml").write_text(CONFIG)
     monkeypatch.chdir(tmp_path)
