@@ -247,6 +247,12 @@ def test_tables_of_the_guide_fit_the_column_of_the_site(name):
             assert len(words) <= 25, f"{len(words)} words: {cell}"
 
 
+@pytest.mark.parametrize("name", STYLED)
+def test_code_of_the_guide_fits_the_column_of_the_site(name):
+    wide = [line for block in blocks(ROOT / f"{name}.md", "python") for line in block.splitlines() if len(line) > 97]
+    assert not wide
+
+
 def test_reports_are_short_enough_to_be_read():
     words = 0
     for page in REPORTS:
