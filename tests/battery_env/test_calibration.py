@@ -10,10 +10,7 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 import battery_env
 from battery_env.electrochemistry import NEW_CELL, QNB, step
-from battery_env.loads import RandomPiecewise
-from battery_env.tasks.full_state.layout import ERROR_SCALE, LITERAL, OBSERVED, SCALED
-from battery_env.tasks.full_state.task import FullStateTask
-from battery_env.trajectories import TrajectoryDataset
+from battery_env.tasks.full_state.layout import ERROR_SCALE, OBSERVED
 
 IDS = ("BatteryQmax-v0", "BatteryRo-v0", "BatteryJoint-v0", "BatteryQmaxPaper-v0", "BatteryRoPaper-v0")
 
@@ -106,34 +103,6 @@ def test_the_perturbation_stays_in_its_bounds_and_conserves_charge():
         draws.append((now["model_state"] - now["state"])[0, OBSERVED][:4] / scale[:4])
         assert now["model_state"][0, QNB:].sum() == pytest.approx(now["state"][0, QNB:].sum(), rel=1e-12)
     assert np.abs(draws).max() <= 10.0 + 1e-6 and np.abs(draws).max(axis=0).min() > 5.0
-
-
-@pytest.mark.parametrize("formulation", [SCALED, LITERAL], ids=["scaled", "literal"])
-@pytest.mark.parametrize("parameters", [("q_mobile",), ("r_o",), ("q_mobile", "r_o")])
-def test_a_batch_is_its_cells_one_by_one(parameters, formulation):
-    kind = type("Task", (FullStateTask,), {"parameters": parameters, "formulation": formulation})
-    data = TrajectoryDataset.generate(("q_mobile", "r_o"), 6, RandomPiecewise(), seed=0)
-    rng = np.random.default_rng(0)
-    actions = rng.uniform(-1.0, 1.0, (30, 6, len(parameters)))
-    samples = rng.integers(0, 500, 6)
-
-    def start(task, row, n):
-        task.start(np.array([row]), [np.random.default_rng()], {"trajectory": n, "sample": samples[n]})
-
-    batch = kind(6, dataset=data)
-    for n in range(6):
-        start(batch, n, n)
-    costs = []
-    for k in range(30):
-        if k == 10:  # going on with some of the cells changes nothing for them
-            batch.keep(np.arange(6) < 4)
-        costs.append(batch.advance(actions[k, : batch.cells])[:4])
-    for n in range(4):
-        one = kind(1, dataset=data)
-        start(one, 0, n)
-        single = [one.advance(actions[k, [n]])[0] for k in range(30)]
-        np.testing.assert_array_equal(single, [c[n] for c in costs])
-        np.testing.assert_array_equal(one.observation()[0], batch.observation()[n])
 
 
 def test_wrong_parameters_never_leave_the_finite_numbers():

@@ -354,16 +354,6 @@ def test_a_load_that_ends_above_the_cut_off_is_told(recorded, tmp_path, terminal
     assert said not in (terminal.row(path, "--discharge-is-positive")["notes"] or "")
 
 
-def test_large_cells_are_fitted_and_calibrated(tmp_path, terminal):
-    load_A = np.append(np.zeros(60), np.full(4000, 2.0))
-    small = simulate(load_A, 6000.0, 0.15, load_unit="current", thermal=True, cut_off_V=2.65)
-    large = Discharge(small.time_s[::10], small.voltage_V[::10], 50.0 * small.current_A[::10])
-    path, cell = write(large, tmp_path / "large.csv"), tmp_path / "cell.json"
-    assert "at least 29" in (said := terminal.refuses(path)) and "--cell" in said
-    assert main(["fit", path, "--out", str(cell)]) == 3  # of one discharge, and so of one age
-    assert terminal.row(path, "--cell", cell)["q_mobile_C"] == pytest.approx(300_000.0, rel=0.01)
-
-
 def test_a_file_with_unknown_columns_lists_them_and_takes_them_from_the_command_line(recorded, tmp_path, terminal):
     path = tmp_path / "cell.csv"
     columns = {"t_min": recorded.time_s / 60.0, "a": 1e3 * recorded.voltage_V, "b": recorded.current_A}
@@ -564,11 +554,6 @@ def test_many_samples_are_averaged_and_say_the_same(recorded, tmp_path, terminal
     assert rows[0]["averaged_over_s"] == 1.0 and rows[1]["averaged_over_s"] == 0.0
     assert rows[0]["q_mobile_C"] == pytest.approx(rows[1]["q_mobile_C"], rel=5e-4)
     assert rows[0]["r_o_ohm"] == pytest.approx(rows[1]["r_o_ohm"], rel=1e-3)
-
-
-def test_runs_as_a_module():
-    done = subprocess.run([sys.executable, "-m", "battery_env", "calibrate", "B0005:1"], capture_output=True, text=True)
-    assert done.returncode == 0 and "q_max" in done.stdout and done.stderr == ""
 
 
 def test_a_reader_that_leaves_ends_it_in_silence():

@@ -1,14 +1,11 @@
 """The bound is the published one, and least squares attain it."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from battery_env.electrochemistry import NEW_CELL, simulate
 from battery_env.estimates import Estimate
 from battery_env.estimators.cramer_rao import CramerRaoBound, Sensitivities, cramer_rao_bound, sensitivities
-from battery_env.estimators.least_squares import LeastSquares
 from battery_env.records.discharge import load_nasa_discharges
 from battery_env.records.model import RecordModel
 
@@ -68,21 +65,6 @@ def test_more_samples_tell_more_and_more_unknowns_less(record, parameters, offse
         assert (sd >= getattr(easier, f"sd_{name}")).all()
     for name in set(BOTH) - set(parameters):
         assert np.isnan(getattr(bound, f"sd_{name}")).all()
-
-
-@pytest.mark.parametrize("share", [0.5, 1.0])
-def test_least_squares_attain_it(share):
-    whole = simulate(np.repeat(np.random.default_rng(1).uniform(4.0, 10.0, 100), 60), 6000.0, 0.15)
-    record = whole.part(0, int(share * len(whole.time_s)))
-    bound = cramer_rao_bound(record, NOISE_V)
-    rng, fit, errors = np.random.default_rng(2), LeastSquares(), []
-    for _ in range(60):
-        noise_V = rng.normal(0.0, NOISE_V, len(record.time_s))
-        estimate = fit.estimate(replace(record, voltage_V=record.voltage_V + noise_V))
-        errors.append([estimate.q_mobile - 6000.0, estimate.r_o - 0.15])
-    spread = np.sqrt(np.mean(np.square(errors), axis=0))
-    # the standard deviation of 60 values is known to 9 %
-    np.testing.assert_allclose(spread, [bound.sd_q_mobile[-1], bound.sd_r_o[-1]], rtol=0.25)
 
 
 def test_recorded_discharges_and_other_models():

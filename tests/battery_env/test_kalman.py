@@ -125,15 +125,6 @@ class TestOnline:
                 np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
         assert filter_.estimate(records[1]).q_mobile == batch[1].q_mobile[-1]
 
-    def test_a_current_of_the_wrong_sign_is_refused(self):
-        filter_ = ExtendedKalmanFilter()
-        with pytest.raises(ValueError, match="this record draws -76 C in total"):
-            for _ in range(60):
-                filter_.update(4.0, -2.0, 1.0)
-        record = measured()
-        with pytest.raises(ValueError, match="current_A is positive in discharge"):
-            filter_.trace([replace(record, current_A=-record.current_A)])
-
     @pytest.mark.parametrize(
         ("arguments", "message"),
         [
