@@ -170,11 +170,6 @@ class TestProgpyFilters:
         np.testing.assert_array_equal(first.r_o, again.r_o)
         np.testing.assert_array_equal(first.q_mobile, NEW_CELL.q_mobile)
 
-    def test_the_unscented_filter_approaches_q_mobile(self, filters):
-        record = simulate(8.0, 6000.0, NEW_CELL.r_o, until=60.0, thermal=True)
-        estimate = filters.ProgpyFilter("q_mobile", "ukf", 1900.0, 0.001).estimate(record)
-        assert estimate.q_mobile == pytest.approx(6000.0, rel=0.05)
-
     def test_progpy_leaves_the_style_of_figures_as_it_is(self, filters):
         check = "from matplotlib import rcParams, rcParamsDefault as d; assert rcParams['font.size'] == d['font.size']"
         subprocess.run([sys.executable, "-c", f"import benchmarks.progpy_filters; {check}"], check=True)
