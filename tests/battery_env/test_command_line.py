@@ -15,7 +15,6 @@ import pytest
 import battery_env
 from battery_env.electrochemistry import NEW_CELL, CellParameters, Trajectory, initial_state, simulate
 from battery_env.electrochemistry.ends import MEMORY_SHARE
-from battery_env.estimators import fit_cell
 from battery_env.estimators.cell_fit import read_cell
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.lab import many
@@ -419,16 +418,6 @@ def test_each_folder_of_records_is_a_cell(given, recorded, tmp_path, monkeypatch
     assert {json.loads(line)["cell"] for line in named} == {"001", "002"}
 
 
-def test_a_file_without_a_discharge_is_a_row_with_an_error(recorded, tmp_path, capsys):
-    write(recorded, tmp_path / "good.csv")
-    pd.DataFrame({"time_s": 10.0 * np.arange(6), "voltage_V": 4.2, "current_A": 5 * [0.0] + [2.0]}).to_csv(
-        tmp_path / "aborted.csv"
-    )
-    assert main(["calibrate", str(tmp_path), "--discharge-is-positive", "--json"]) == 2
-    aborted, good = map(json.loads, capsys.readouterr().out.splitlines())
-    assert aborted["error"].startswith("aborted: only ") and good["settled"]
-
-
 @pytest.fixture(scope="module")
 def fleet(lab, tmp_path_factory):
     """Calibrate several files and return their rows as they are printed, and the bytes of all results."""
@@ -512,12 +501,6 @@ class TestInPython:
         table.loc[table.index[table["cycle"] == 2][50], "Voltage(V)"] = 0.0
         with pytest.warns(UserWarning, match="DataFrame: discharge 2: the voltage falls to 0.00 V .* It is left out"):
             assert [each.cycle for each in battery_env.calibrate(table)] == [1, 3]
-
-    def test_all_that_a_fit_knows_is_used(self, recorded):
-        with pytest.warns(UserWarning, match="one age"):
-            fit = fit_cell([recorded], cut_off_V=2.75)
-        settings = battery_env.calibrate(recorded, cell=fit, method="kalman").settings
-        assert settings.cut_off_V == 2.75 and settings.mismatch_V == fit.mismatch_V
 
 
 def test_the_temperature_is_that_of_the_record_or_the_one_given(recorded, tmp_path, terminal):

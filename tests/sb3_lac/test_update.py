@@ -218,14 +218,6 @@ def test_no_gradient_step_changes_nothing(make_model, train_metrics):
     assert all(th.equal(before[name], tensor) for name, tensor in model.policy.state_dict().items())
 
 
-def test_same_seed_same_result(make_model, n_updates):
-    first, second = (make_model(n_collect=0, seed=3).learn(80) for _ in range(2))
-    assert n_updates(first) == n_updates(second) == 40
-    for parameter, other in zip(first.policy.state_dict().values(), second.policy.state_dict().values(), strict=True):
-        assert th.equal(parameter, other)
-    assert th.equal(first.log_lambda, second.log_lambda)
-
-
 @pytest.mark.parametrize(
     ("algorithm", "kwargs"),
     [
