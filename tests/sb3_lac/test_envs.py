@@ -342,12 +342,45 @@ class TestDisturbances:
         check_env(disturbed)
 
 
+def linear_roll_outs(env, gain, n_episodes, n_steps):
+    """States and costs of many roll-outs of the policy u = -K s, without the environment."""
+    rng = np.random.default_rng(0)
+    states = rng.uniform(-1, 1, (n_episodes, 2))
+    history, costs = [states], []
+    for _ in range(n_steps):
+        controls = -states @ gain.T
+        costs.append(np.sum(states**2, axis=1) + np.sum(controls**2, axis=1))
+        noise = env.noise_std * rng.standard_normal(states.shape)
+        states = states @ env.A.T + controls @ env.B.T + noise
+        history.append(states)
+    return np.array(history), np.array(costs)
+
+
 def test_linear_env_steps_and_costs_like_its_matrices():
     env = LinearCostEnv(noise_std=0.0)
     env.reset(options={"state": [0.5, -1.0]})
     observation, reward, *_ = env.step(np.array([0.5]))
     np.testing.assert_allclose(observation, [0.48 - 0.2, -0.1 - 0.96 + 0.5], rtol=1e-6)
     assert reward == pytest.approx(-(0.25 + 1.0 + 1.0))
+
+
+def test_exact_value_is_the_mean_discounted_sum_of_costs():
+    env = LinearCostEnv(noise_std=0.3)
+    gain = np.array([[-0.1, 0.5]])
+    states, costs = linear_roll_outs(env, gain, n_episodes=20_000, n_steps=300)
+    sums = (GAMMA ** np.arange(300)[:, None] * costs).sum(axis=0)
+    exact = env.cost_to_go(states[0], -states[0] @ gain.T, gain, GAMMA)
+    for quarter in np.array_split(np.argsort(exact), 4):
+        assert exact[quarter].mean() == pytest.approx(sums[quarter].mean(), rel=0.03)
+
+
+def test_largest_feasible_alpha3_is_that_of_roll_outs():
+    env = LinearCostEnv(noise_std=0.1)
+    gain = env.optimal_gain(GAMMA)
+    states, costs = linear_roll_outs(env, gain, n_episodes=5000, n_steps=100)
+    values = np.array([env.cost_to_go(s, -s @ gain.T, gain, GAMMA) for s in states])
+    expected = (values[:-1] - values[1:]).sum() / costs.sum()
+    assert env.largest_feasible_alpha3(gain, GAMMA) == pytest.approx(expected, rel=0.05)
 
 
 @pytest.mark.parametrize(
