@@ -203,12 +203,6 @@ class TestPrior:
         assert found.settled and not early.settled
         assert found.q_mobile == pytest.approx(LeastSquares(mismatch_V=0.05).estimate(whole).q_mobile, rel=0.015)
 
-    def test_the_model_with_what_was_found_follows_the_record(self, b0006):
-        whole = load_nasa_discharges("B0005")[100].loaded_part(2.7)
-        found = LeastSquares(path=b0006).estimate(whole)
-        shown_V = RecordModel(cell_with(b0006.cell, found.constants)).voltage(whole, found)
-        assert np.sqrt(np.mean((shown_V - whole.voltage_V)[1:] ** 2)) < 0.01
-
     @pytest.mark.parametrize(
         "others", [{"nuisance": {"kn": 0.2}}, {"parameters": ("q_mobile",)}, {"prior_q_mobile_C": (6000.0, 100.0)}]
     )

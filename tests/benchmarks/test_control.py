@@ -290,10 +290,12 @@ def exact_model(monkeypatch):
     monkeypatch.setattr(linear_cost, "train_or_load", train_or_load)
 
 
-def test_the_exact_solution_is_recognized(tmp_path, exact_model):
-    tables = linear_cost.part(4, 1230, 20, tmp_path)
-    row, values = tables["linear_cost"].iloc[0], tables["values"]
-    assert row["seed"] == 4 and set(values["seed"]) == {4} and len(values) == 20 * 100
+def test_the_exact_solution_is_recognized_and_written(tmp_path, exact_model, capsys):
+    linear_cost.main(["--seeds", "1", "4", "--timesteps", "5000", "--episodes", "20", "--jobs", "1", "--out", str(tmp_path)])
+    table, values = (pd.read_csv(tmp_path / f"{name}.csv") for name in ("linear_cost", "values"))
+    assert table["seed"].tolist() == [1, 4] and table.notna().all(axis=None)
+    row = table.iloc[1]
+    assert set(values["seed"]) == {1, 4} and len(values) == 2 * 20 * 100
     for name in ("position", "velocity"):
         assert row[f"gain_{name}"] == pytest.approx(row[f"gain_{name}_exact"], rel=1e-5)
     assert row["linear_over_optimum"] == pytest.approx(1.0, abs=1e-9)
@@ -306,6 +308,9 @@ def test_the_exact_solution_is_recognized(tmp_path, exact_model):
     assert row["alpha3_exact"] == pytest.approx(row["alpha3_optimum"], rel=1e-5)
     assert row["alpha3_low"] < row["alpha3_exact"] < row["alpha3_high"]
     np.testing.assert_allclose(values["learned"], values["exact"], rtol=1e-3)
+    assert (tmp_path / "linear_cost.png").stat().st_size > 0
+    text = (tmp_path / "linear_cost.md").read_text(encoding="utf-8")
+    assert text in capsys.readouterr().out and "| 1.000, 1.000 to 1.000 " in text and "| 1.0000 " in text
 
 
 def test_what_noise_costs_is_that_of_roll_outs():
@@ -336,12 +341,3 @@ def test_what_a_policy_costs_too_much_is_seen_in_roll_outs():
         assert 1.0 < low < ratio < high < 10.0
     # the same episodes are paired: their starts do not widen the interval
     assert linear_cost.over_optimum(2 * optimal, optimal, 0.95) == pytest.approx((2.0, 2.0, 2.0))
-
-
-def test_linear_cost_is_written(tmp_path, exact_model, capsys):
-    linear_cost.main(["--seeds", "1", "2", "--timesteps", "5000", "--episodes", "3", "--jobs", "1", "--out", str(tmp_path)])
-    table = pd.read_csv(tmp_path / "linear_cost.csv")
-    assert table["seed"].tolist() == [1, 2] and table.notna().all(axis=None)
-    assert (tmp_path / "linear_cost.png").stat().st_size > 0
-    text = (tmp_path / "linear_cost.md").read_text(encoding="utf-8")
-    assert text in capsys.readouterr().out and "| 1.000, 1.000 to 1.000 " in text and "| 1.0000 " in text
