@@ -15,7 +15,7 @@ pytest.importorskip("rl_zoo3")
 from benchmarks import certificate, control, linear_cost, references, stabilisation
 from docs.environment_pages import DOCS, environment_page
 from sb3_lac import LAC
-from sb3_lac.envs import LinearCostEnv, reference_controller
+from sb3_lac.envs import LinearCostEnv
 from sb3_lac.stability import fitting
 
 IDS = list(control.DISTURBANCES)
@@ -97,15 +97,6 @@ def test_only_some_loops_end_at_the_goal(env_id):
     assert at_goal and max(at_goal.values()) <= 0.2
 
 
-def test_actions_are_multiplied_and_nothing_else():
-    env = gym.make("QuadrotorCost-v0")
-    reference = reference_controller(env)
-    observations = np.array([env.observation_space.sample() for _ in range(20)])
-    actions, state = control.ScaledController(reference, -0.25).predict(observations)
-    np.testing.assert_array_equal(actions, -0.25 * reference.predict(observations)[0])
-    assert state is None and actions.dtype == np.float32
-
-
 def test_references_are_tried_and_shown(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(references, "DISTURBANCES", {env_id: control.DISTURBANCES[env_id] for env_id in IDS[:1]})
     references.main(["--episodes", "3", "--jobs", "1", "--out", str(tmp_path)])
@@ -170,20 +161,6 @@ def test_several_seeds_of_a_certificate_are_shown_from_least_to_most():
     assert cells[4:] == ["1.5 (1 to 3)", "0.5 (0.25 to 0.75), of 2", "0.5", "0.9", "-", "0.1 (0 to 0.2)"]
 
 
-def test_exact_function_decreases_by_the_feasible_share_and_by_no_more():
-    table = certificate.feasible_alpha3().set_index("controller")
-    shares = table.map(lambda cell: float(cell.split()[0]))
-    np.testing.assert_allclose(shares.loc["reference"], [0.14, 0.60, 0.78, 0.95, 1.0], atol=0.005)
-    assert (shares.loc["weak"] <= shares.loc["reference"]).all() and (np.diff(shares, axis=1) > 0).all()
-    env, gamma = LinearCostEnv(), 0.9
-    gain = env.optimal_gain(gamma)
-    p, closed_loop = env.value_matrix(gain, gamma), env.A - env.B @ gain
-    states = np.random.default_rng(0).normal(size=(10_000, 2))
-    costs = np.einsum("ni,ij,nj->n", states, env.Q + gain.T @ env.R @ gain, states)
-    drift = np.einsum("ni,ij,nj->n", states, closed_loop.T @ p @ closed_loop - p, states)
-    assert (-drift / costs).min() == pytest.approx(shares.loc["reference", "discount 0.9"], abs=0.006)
-
-
 def test_stabilisation_is_written_and_seeds_can_be_added(tmp_path, quick, capsys):
     command = ["--envs", "LinearCost-v0", "--algos", "lac", "--timesteps", "20000", "--episodes", "3"]
     command += ["--certificate-episodes", "25", "--jobs", "1", "--out", str(tmp_path)]
@@ -236,22 +213,6 @@ def test_a_learning_curve_is_evenly_spaced_and_changes_no_training(tmp_path, mon
     assert learning["timesteps"].tolist() == [10, 20, 30, 40] and learning["updates"].iloc[-1] == models[1]._n_updates
     last = control.roll_out(models[1], partial(gym.make, "LinearCost-v0"), 2, seed=stabilisation._CURVE_SEED)
     assert learning["cost"].iloc[-1] == pytest.approx(last["cost"].mean())
-
-
-def test_tables_of_stabilisation_count_episodes_and_seeds():
-    common = {"environment": "LinearCost-v0", "policy": "SAC", "updates": 10.0, "training_minutes": 0.5, "error_median": 0.1}
-    rows = [
-        {**common, "seed": seed, "disturbance": disturbance, "cost": cost, "at_goal": at_goal, "died": 1.0 - at_goal}
-        | {"within_1_percent": at_goal / 2, "within_0.1_percent": 0.0}
-        for seed, cost, at_goal in ((0, 1.0, 0.0), (1, 3.0, 0.5))
-        for disturbance in ("none", "impulses")
-    ]
-    row = stabilisation.undisturbed_table(pd.DataFrame(rows)).iloc[0]
-    assert (row["cost per step"], row["at the goal"], row["died"]) == ("2 [1, 3]", "25 % (0 to 50)", "75 % (50 to 100)")
-    assert (row["seeds"], row["updates"], row["within 0.1 %"]) == ("2", "10", "0 % (0 to 0)")
-    for cell, expected in ((stabilisation.ends_of, "25 % (75 %)"), (stabilisation.cost_of, "2")):
-        disturbed = stabilisation.disturbed_table(pd.DataFrame(rows), cell).iloc[0]
-        assert disturbed["none"] == disturbed["impulses"] == expected
 
 
 def test_all_algorithms_have_the_same_budget():
