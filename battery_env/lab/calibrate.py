@@ -315,7 +315,7 @@ def _charge(seen: _Seen, settings: Settings, estimate: Estimate, end: Forecast |
     predicted_Ah, sd_Ah = (1.0 - start.soc) * q_mobile / 3600.0 + drawn_Ah, settings.current_gain_sd * drawn_Ah
     if seen.in_progress:
         predicted_Ah, sd_Ah = (float("nan"),) * 2 if end is None else _middle(end.capacity_Ah, estimate)
-    unseen_Ah = seen.loaded.shown.unseen_C(float(np.ptp(seen.loaded.time_s))) / 3600.0
+    unseen_Ah = seen.loaded.unseen_C / 3600.0
     return {
         "capacity_Ah": float("nan") if seen.in_progress or start.soc < 1.0 else drawn_Ah,
         "predicted_capacity_Ah": predicted_Ah,
