@@ -7,7 +7,16 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from battery_env import AgingPath, LeastSquares, PolicyEstimator, TrajectoryDataset, evaluate, fit_life, load_nasa_discharges
+from battery_env import (
+    AgingPath,
+    LeastSquares,
+    PolicyEstimator,
+    TrajectoryDataset,
+    calibrate,
+    evaluate,
+    fit_life,
+    load_nasa_discharges,
+)
 from battery_env.electrochemistry import NEW_CELL, UNCERTAIN_CONSTANTS, simulate
 from battery_env.electrochemistry.aging_path import BEYOND_SHARE, PATH_NAMES, SPREAD_SD, cell_with
 from battery_env.electrochemistry.equilibrium import with_equilibrium
@@ -219,7 +228,7 @@ class TestCalibrations:
 
     def test_they_say_what_least_squares_say(self, b0006, tmp_path, capsys):
         file, running = b0006.to_json(tmp_path / "path.json"), load_nasa_discharges("B0005")[80].until(1500.0)
-        found = battery_env.calibrate(running, cell=b0006)
+        found = calibrate(running, cell=b0006)
         estimate = LeastSquares(path=b0006, current_gain_sd=0.005).estimate(running.loaded_part(2.7))
         assert (found.q_mobile_C, found.sd_q_mobile_C) == (estimate.q_mobile, estimate.sd_q_mobile)
         # with the constants that were found
