@@ -208,10 +208,10 @@ def _split(rows: pd.DataFrame, meta: dict[str, Any], stated: frozenset[str]) -> 
         raise ValueError("there is no discharge: no charge is drawn. Check the sign of the current")
     least_C = _LEAST_SHARE * max(drawn_C for _, drawn_C in parts)
     stretches = [stretch for stretch, drawn_C in parts if drawn_C >= least_C]
-    charges = [_charge_before(rows, stretch.start) for stretch in stretches]
+    before = [Shown(charge=_charge_before(rows, each.start), load_on_s=_load_on_s(rows, each)) for each in stretches]
     return [
-        _recording(rows[stretch], charge, meta | ({"cycle": number} if len(stretches) > 1 else {}), len(stretches) > 1, stated)
-        for number, (stretch, charge) in enumerate(zip(stretches, charges, strict=True), start=1)
+        _recording(rows[stretch], shown, meta | ({"cycle": number} if len(stretches) > 1 else {}), len(stretches) > 1, stated)
+        for number, (stretch, shown) in enumerate(zip(stretches, before, strict=True), start=1)
     ]
 
 
@@ -282,10 +282,32 @@ def _charge_before(rows: pd.DataFrame, begin: int) -> ChargeBefore | None:
     return ChargeBefore.of(rows["voltage"].to_numpy()[start:begin], charging_A)
 
 
+def _load_on_s(rows: pd.DataFrame, stretch: slice) -> float | None:
+    """When the load of a discharge came on, if the time in the step of its first row says how long ago that was."""
+    time_s, current_A = (rows[name].to_numpy() for name in ("time", "current"))
+    n = stretch.start + int(np.argmax(current_A[stretch] > SWITCH_SHARE * current_A[stretch].max()))
+    if "step_time" not in rows or not 0 < n < len(rows) - 1:
+        return None
+    (ago_s, later_s), interval_s = rows["step_time"].iloc[n : n + 2], time_s[n] - time_s[n - 1]
+    # the two clocks need not agree to the last digit
+    if not (0.0 <= ago_s < later_s and ago_s <= (1.0 + _NOTHING_SHARE) * interval_s):
+        return None
+    told_s = max(float(time_s[n] - ago_s), float(time_s[n - 1]))
+    if interval_s > 2.0 * max(time_s[n + 1] - time_s[n], time_s[n - 1] - time_s[max(n - 2, 0)]):
+        warnings.warn(
+            f"the rest is taken to last until {time_s[n] - told_s:g} s before row {rows.index[n] + 1}, as the time in its "
+            "step says",
+            stacklevel=2,
+        )
+    return told_s
+
+
 def _recording(
-    rows: pd.DataFrame, charge: ChargeBefore | None, meta: dict[str, Any], has_own_clock: bool, stated: frozenset[str]
+    rows: pd.DataFrame, shown: Shown, meta: dict[str, Any], has_own_clock: bool, stated: frozenset[str]
 ) -> Recording:
     time_s, current_A = rows["time"].to_numpy(), rows["current"].to_numpy()
+    if has_own_clock and shown.load_on_s is not None:
+        shown = shown._replace(load_on_s=shown.load_on_s - float(time_s[0]))
     if "cycle" in rows:
         meta["cycle"] = int(rows["cycle"].iloc[int(np.argmax(current_A > SWITCH_SHARE * current_A.max()))])
     if "ambient" in rows and not rows["ambient"].isna().all():
@@ -299,7 +321,7 @@ def _recording(
         temperature_C = _filled(time_s, rows["temperature"].to_numpy())
         if temperature_C is not None:
             arrays["temperature_C"] = temperature_C
-    arrays["shown"] = Shown(charge=charge, uncounted_C=_uncounted_C(rows))
+    arrays["shown"] = shown._replace(uncounted_C=_uncounted_C(rows))
     return Recording(arrays, meta, stated)
 
 
@@ -316,10 +338,9 @@ def _uncounted_C(rows: pd.DataFrame) -> float:
     if (step_C > 0.0).mean() < 0.5:
         return 0.0
     counted_C = float(step_C[step_C > 0.0].sum())
-    # some count what is drawn alone, others what is returned, too
-    passed_C = [
-        float(np.ptp(drawn(time_s[part], each[part], time_s[part]))) for each in (current_A, np.maximum(current_A, 0.0))
-    ]
+    # some count what is drawn alone, others what is returned, too, with its sign or without
+    counts_A = (current_A, np.maximum(current_A, 0.0), np.abs(current_A))
+    passed_C = [float(np.ptp(drawn(time_s[part], each[part], time_s[part]))) for each in counts_A]
     off_C = min((each - counted_C for each in passed_C), key=abs)
     if abs(off_C) <= _COUNTED_SHARE * counted_C:
         return 0.0
