@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from battery_env import Settings, calibrate, load_nasa_discharges, read_discharges
 from battery_env.lab import many
 from battery_env.lab.command_line import calibrate as command
+from battery_env.lab.readers.discharges import Recording
 
 RECORD = load_nasa_discharges("B0006")[99]
 TABLE = pd.DataFrame({"time": RECORD.time_s, "voltage": RECORD.voltage_V, "current": -RECORD.current_A})
@@ -417,6 +418,19 @@ def hybrid(counter):
     return table, charge_C.iloc[-1]
 
 
+@pytest.mark.parametrize(("pulse_s", "found"), [(5, 1), (10, 1), (60, 12)])
+def test_pulses_within_a_charge_are_no_discharges(pulse_s, found):
+    # 270 C and a pulse twelve times, and then the whole discharge; larger ones are cycles
+    minute_s = np.mod(np.arange(0.0, 3600.0, 5.0), 300.0)
+    current_A = np.where(minute_s < 180.0, 1.5, np.where(minute_s < 180 + pulse_s, -1.5, 0.0))
+    voltage_V = 3.6 + 0.6 * np.cumsum(current_A) / np.cumsum(current_A).max() + 0.05 * current_A
+    pulses = pd.DataFrame({"time": np.arange(0.0, 3600.0, 5.0), "voltage": voltage_V, "current": current_A})
+    discharges = read_discharges(pd.concat([pulses, REST, CYCLE[len(CHARGE) + len(REST) :]], ignore_index=True))
+    assert len(discharges) == found
+    np.testing.assert_allclose(discharges[-1].current_A[-len(TABLE) :], RECORD.current_A)
+    assert discharges[-1].charge_C == pytest.approx(RECORD.charge_C, rel=0.03)
+
+
 @pytest.mark.parametrize("counter", range(6))
 def test_loops_of_pulses_are_one_discharge_wherever_the_counter_goes_up(counter):
     table, charge_C = hybrid(counter)
@@ -544,6 +558,14 @@ def test_the_charge_of_a_cell_of_any_size_is_known_and_where_it_is_small_its_con
     assert found.drawn_Ah == pytest.approx(share * RECORD.loaded_part(2.7).charge_C / 3600.0, rel=0.01)
     assert found.capacity_Ah == pytest.approx(found.drawn_Ah) and not found.settled
     assert share > 0.05 or found.reason.startswith("No cell of this kind has such a q_max")
+
+
+@pytest.mark.parametrize(("stated", "advised"), [(frozenset(), True), (frozenset({"sign"}), False)])
+def test_a_sign_that_was_told_from_the_data_is_not_advised_to_be_another(stated, advised):
+    arrays = {"time_s": RECORD.time_s, "voltage_V": RECORD.voltage_V, "current_A": -RECORD.current_A}
+    with pytest.raises(ValueError, match=r"this record draws -\d+") as caught:
+        Recording(arrays, {}, stated).discharge()
+    assert ("--discharge-is-negative" in str(caught.value)) == advised
 
 
 def test_a_sign_that_was_stated_is_not_advised_again():

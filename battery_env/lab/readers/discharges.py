@@ -33,7 +33,8 @@ _RETURNED_SHARE = 0.2
 _CHARGED_SHARE = 0.02
 # What returns less than this share of the charge that passes in all is not looked at.
 _NOTHING_SHARE = 1e-3
-# What draws less than this share of the largest discharge of its file is a pulse between two charges, and left aside.
+# What draws less than this share of the largest discharge of its file is a pulse between two charges, and left aside; so is
+# what draws less than _RETURNED_SHARE of the charge before and of the charge after.
 _LEAST_SHARE = 0.01
 # Over longer gaps than this a temperature that is missing is a guess, s.
 _TEMPERATURE_GAP_S = 600.0
@@ -55,7 +56,7 @@ class Recording(NamedTuple):
 
     :param arrays: arguments of :class:`~battery_env.Discharge`, by name
     :param meta: what else is known; ``cycle`` is missing if the file holds one discharge and does not number it
-    :param stated: quantities whose unit is known, and ``step`` if it has a column
+    :param stated: quantities whose unit is known, ``step`` if it has a column, and ``sign`` if that was told from the data
     """
 
     arrays: dict[str, Any]
@@ -78,6 +79,8 @@ class Recording(NamedTuple):
         unit = _UNIT_ADVICE.search(sentence)
         if not unit and _SIGN_ADVICE not in sentence:
             return sentence
+        if not unit and "sign" in self.stated:
+            return sentence.partition(_SIGN_ADVICE)[0] + "."
         quantity, (factor, offset) = (unit[1], unit_of(unit[1], unit[2])) if unit else ("current", (-1.0, 0.0))
         if not (unit and quantity in self.stated):
             name = next(each for each in self.arrays if each.startswith(quantity))
@@ -193,6 +196,7 @@ def _name_of(source: str | Path | pd.DataFrame) -> str:
 
 def _recordings(source: str, table: pd.DataFrame, columns: Mapping[str, Column], file_format: FileFormat) -> list[Recording]:
     stated = frozenset(quantity for quantity, column in columns.items() if column.unit or quantity == "step")
+    stated |= {"sign"} if file_format.discharge_is_negative is None else set()
     return [
         recording
         for cell, rows in cells_of(table, columns, file_format).items()
@@ -207,7 +211,13 @@ def _split(rows: pd.DataFrame, meta: dict[str, Any], stated: frozenset[str]) -> 
     if not parts:
         raise ValueError("there is no discharge: no charge is drawn. Check the sign of the current")
     least_C = _LEAST_SHARE * max(drawn_C for _, drawn_C in parts)
-    stretches = [stretch for stretch, drawn_C in parts if drawn_C >= least_C]
+    passed_C = _passed_C(rows["time"].to_numpy(), rows["current"].to_numpy())
+    ends_C = [passed_C[[stretch.start, stretch.stop - 1]] for stretch, _ in parts]
+    charged_C = -np.diff(np.concatenate([[0.0], *ends_C, passed_C[-1:]]))[::2]
+    pulses_C = _RETURNED_SHARE * np.minimum(charged_C[:-1], charged_C[1:])
+    stretches = [part for (part, drawn_C), each_C in zip(parts, pulses_C, strict=True) if drawn_C >= max(each_C, least_C)]
+    if not stretches:
+        raise ValueError("there is no discharge: what is drawn are pulses within charges. Check the sign of the current")
     before = [Shown(charge=_charge_before(rows, each.start), load_on_s=_load_on_s(rows, each)) for each in stretches]
     return [
         _recording(rows[stretch], shown, meta | ({"cycle": number} if len(stretches) > 1 else {}), len(stretches) > 1, stated)
@@ -265,10 +275,12 @@ def _discharges(rows: pd.DataFrame, low: int, high: int) -> list[tuple[slice, fl
             continue
         first = begin + int(np.argmax(current_A[begin:end] > SWITCH_SHARE * peak_A))
         drawn_C = float(passed_C[first:end].max() - passed_C[first])
-        for start, stop, *_ in charges:
-            if begin <= start and stop <= first and passed_C[start] - passed_C[stop - 1] > _CHARGED_SHARE * drawn_C:
+        for start, stop, _, is_braking in charges:
+            is_before = begin <= start and stop <= (first if is_braking else end)
+            if is_before and passed_C[start] - passed_C[stop - 1] > _CHARGED_SHARE * drawn_C:
                 begin = stop
-        parts.append((slice(low + begin, low + end), drawn_C))
+        if begin < end:
+            parts.append((slice(low + begin, low + end), float(passed_C[begin:end].max() - passed_C[begin])))
     return parts
 
 
