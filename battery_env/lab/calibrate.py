@@ -238,12 +238,13 @@ def _estimate(
         else:
             estimate = calibrator.estimate(seen.fitted)
         if isinstance(calibrator, PolicyEstimator):
-            cell, thermal = cell_with(calibrator.cell, estimate.constants), False
+            cell, thermal = calibrator.cell, False
         if estimate.settled:
             break
     if reason := seen.start.reason or settings.other_load(mean_current_A(seen.record)):
         estimate = replace(estimate, settled_q_mobile=False, settled_r_o=False, reason=reason)
-    return estimate, method, RecordModel(cell, thermal, initial_soc=seen.start.soc), now
+    model = RecordModel(cell_with(cell, estimate.constants), thermal, initial_soc=seen.start.soc)
+    return estimate, method, model, now
 
 
 def _end(
@@ -324,13 +325,16 @@ def _charge(seen: _Seen, settings: Settings, estimate: Estimate, end: Forecast |
 
 
 def _cell_at_the_temperature(record: Discharge, settings: Settings) -> CellParameters:
-    """The constants of the model in the surroundings that are stated, measured at load-on, or known of the record."""
+    """
+    The constants of the model in the surroundings that are stated, measured at load-on, or known of the record. Those of a
+    path, or that a policy has learned of, hold at one temperature.
+    """
     cell, ambient_C = settings.cell or NEW_CELL, settings.ambient_C
     if ambient_C is None and record.temperature_C is not None:
         ambient_C = float(record.temperature_C[0])
     elif ambient_C is None:
         ambient_C = record.meta.get("ambient_temperature_C")
-    if ambient_C is None or settings.method == "policy":
+    if ambient_C is None or settings.method == "policy" or settings.path is not None:
         return cell
     return cell.replace(Tb0=float(ambient_C) + ZERO_CELSIUS_K)
 

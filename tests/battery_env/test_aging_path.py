@@ -4,13 +4,25 @@ import json
 import warnings
 
 import numpy as np
+import pandas as pd
 import pytest
 
-from battery_env import AgingPath, LeastSquares, PolicyEstimator, TrajectoryDataset, evaluate, fit_life, load_nasa_discharges
+from battery_env import (
+    AgingPath,
+    LeastSquares,
+    PolicyEstimator,
+    TrajectoryDataset,
+    calibrate,
+    evaluate,
+    fit_life,
+    load_nasa_discharges,
+)
 from battery_env.electrochemistry import NEW_CELL, UNCERTAIN_CONSTANTS, simulate
 from battery_env.electrochemistry.aging_path import BEYOND_SHARE, PATH_NAMES, SPREAD_SD, cell_with
 from battery_env.electrochemistry.equilibrium import with_equilibrium
 from battery_env.estimates import last_estimate
+from battery_env.lab.command_line import SETTLED, forecast
+from battery_env.lab.settings import Settings
 from battery_env.loads import RandomPiecewise, constant
 from battery_env.records import Samples
 from battery_env.records.model import RecordModel
@@ -209,6 +221,40 @@ class TestPrior:
     def test_it_knows_all_at_once(self, path, others):
         with pytest.raises(ValueError, match="path is of both parameters"):
             LeastSquares(path=path, **others)
+
+
+class TestCalibrations:
+    """The commands and their Python door, of which a path is the cell."""
+
+    def test_they_say_what_least_squares_say(self, b0006, tmp_path, capsys):
+        file, running = b0006.to_json(tmp_path / "path.json"), load_nasa_discharges("B0005")[80].until(1500.0)
+        found = calibrate(running, cell=b0006)
+        estimate = LeastSquares(path=b0006, current_gain_sd=0.005).estimate(running.loaded_part(2.7))
+        assert (found.q_mobile_C, found.sd_q_mobile_C) == (estimate.q_mobile, estimate.sd_q_mobile)
+        # with the constants that were found
+        assert found.voltage_rmse_V < 0.005 and found.method == "least-squares"
+        measured_s = load_nasa_discharges("B0005")[80].eod_time_s(2.7)
+        assert abs(found.predicted_eod_time_s - measured_s) < 1.64 * found.sd_predicted_eod_time_s
+        csv = tmp_path / "running.csv"
+        pd.DataFrame({name: getattr(running, name) for name in ("time_s", "voltage_V", "current_A")}).to_csv(csv, index=False)
+        assert forecast([str(csv), "--cell", str(file), "--json"]) == SETTLED  # nothing contradicts it
+        told = json.loads(capsys.readouterr().out)
+        assert told["eod_time_s"][1] == pytest.approx(found.predicted_eod_time_s, rel=0.01)
+
+    @pytest.mark.parametrize(
+        ("options", "message"),
+        [
+            ({"method": "kalman"}, "is for least squares"),
+            ({"prior_q_mobile_C": (6000.0, 100.0)}, "takes no prior_q_mobile_C"),
+            ({"parameters": ("r_o",)}, "takes no parameters"),
+            ({"ambient_C": 24.0}, "takes no ambient_C"),
+        ],
+    )
+    def test_what_a_path_tells_is_not_said_twice(self, path, options, message):
+        with pytest.raises(ValueError, match=message):
+            Settings.for_cell(path, **options)
+        with pytest.raises(ValueError, match="comes with its constants"):
+            Settings(path=path)
 
 
 class Fit:

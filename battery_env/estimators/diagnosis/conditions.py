@@ -166,10 +166,6 @@ class Condition(IntEnum):
     R_PRIOR_WRONG = _PRIOR_WRONG.format("R_o")
     # what the record does not tell of one number
     NO_CURRENT = "No current flows in the last step, so that R_o does not show.", "r_o"
-    PATH_UNTESTED = (
-        "What the record tells of R_o rests on the path of aging cells, as long as q_max does not show that it fits.",
-        "r_o",
-    )
     Q_DIFFERS = _DIFFERS.format("q_max"), "q_mobile"
     R_DIFFERS = _DIFFERS.format("R_o"), "r_o"
     LOAD_ON_UNSURE = (
@@ -198,6 +194,10 @@ class Condition(IntEnum):
     )
     Q_PRIOR_ALONE = _PRIOR_ALONE.format("q_max", _IMPRECISE_Q), "q_mobile"
     R_PRIOR_ALONE = _PRIOR_ALONE.format("R_o", _IMPRECISE_R), "r_o"
+    PATH_UNTESTED = (
+        "What the record tells of R_o rests on the path of aging cells, as long as q_max does not show that it fits.",
+        "r_o",
+    )
     R_OF_CONSTANTS = (
         "The discharges that the constants were fitted to leave {of_cell_mohm:.0f} mohm of R_o open: fit such of other loads, "
         "or with pauses, too.",
