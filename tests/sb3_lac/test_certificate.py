@@ -32,7 +32,7 @@ from sb3_lac import (
     fit_lyapunov,
 )
 from sb3_lac.envs import LinearCostEnv, reference_controller
-from sb3_lac.stability import fitting
+from sb3_lac.stability import CriticLyapunov, fitting
 from sb3_lac.stability.fitting import shortest_window, traced_returns
 from sb3_lac.stability.statistics import exact_interval, exact_lower_bound, tightest_drift
 
@@ -522,6 +522,15 @@ def test_random_actions_of_dqn_are_those_of_the_seed():
     assert first.tolist() == second.tolist() and first.nunique() > 1
     np.testing.assert_array_equal(np.random.get_state()[1], before[0])
     assert model.action_space.np_random.bit_generator.state == before[1]
+
+
+def test_critic_is_a_function_of_the_observation(make_model, make_env):
+    model = make_model(n_collect=0)
+    lyapunov = CriticLyapunov(model)
+    observations = np.random.default_rng(0).normal(size=(5, 2)).astype(np.float32)
+    actions, _ = model.predict(observations, deterministic=True)
+    np.testing.assert_array_equal(lyapunov.values(observations), model.policy.predict_lyapunov(observations, actions))
+    assert "lyapunov" in certify(model, make_env(), lyapunov, 3, ultimate_bound=1.0, seed=10).transitions
 
 
 def test_costs_of_other_functions_are_those_of_the_env(make_env):
