@@ -172,6 +172,25 @@ def test_dates_tell_what_a_clock_without_a_unit_counts(unit, in_a_second, beside
     same(read(TABLE.assign(Zeit=1.02 * DAYS * 60.0)))
 
 
+@pytest.mark.parametrize("with_step", [True, False])
+@pytest.mark.parametrize("gap_s", [0.0, 3600.0])
+@pytest.mark.parametrize("dates", ["%Y-%m-%d %H:%M:%S.%f", "%d.%m.%Y %H:%M:%S", None])
+def test_dates_are_the_clock_where_another_one_starts_anew_with_each_step(with_step, gap_s, dates):
+    step = np.searchsorted([60, len(CHARGE) + len(REST) + LOAD_ON], np.arange(len(CYCLE)), side="right")
+    date = pd.Timestamp("2026-02-27 23:50") + pd.to_timedelta(CYCLE["time"] + np.where(step == 2, gap_s, 0.0), unit="s")
+    table = CYCLE.assign(time=CYCLE["time"] - CYCLE.groupby(step)["time"].transform("first"))
+    table["Absolute Time"] = date.dt.strftime(dates) if dates else date
+    if with_step:
+        table["Step"] = step
+    found = read(table, "the time is 'Absolute Time', as 'time' goes back")
+    assert found.time_s[-1] - found.time_s[0] == pytest.approx(600.0 + RECORD.time_s[-1] + gap_s, abs=1.0)
+    assert found.loaded_part(2.7).charge_C == pytest.approx(RECORD.loaded_part(2.7).charge_C, rel=5e-3)
+    # dates that tell fewer rows apart are no better
+    table["Absolute Time"] = date.dt.floor("30s")
+    if with_step:
+        read(table, "the time starts anew with each step, and is added up")
+
+
 @settings(max_examples=40, deadline=None)
 @given(st.sets(st.integers(3, len(TABLE) - 3), min_size=1, max_size=6), st.floats(0.0, 5.0))
 def test_a_clock_that_starts_anew_with_each_step_is_added_up(starts, first_s):

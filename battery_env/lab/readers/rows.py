@@ -173,13 +173,13 @@ def _directions(states: pd.Series) -> IntArray:
 
 
 def _finest(table: pd.DataFrame, columns: Mapping[str, Column], quantity: str) -> FloatArray:
-    """The column of a quantity. Clocks of other names are asked only if that of the first one has one time twice."""
+    """The column of a quantity. Clocks of other names are asked only if the first one has one time twice, or goes back."""
     column = columns[quantity]
     read = seconds if quantity == "time" else numbers
     best = read(table[quantity], column)
     for key in [key for key in columns if key.startswith(f"{quantity} ")]:
         other = columns[key]
-        if other.words != column.words and (np.diff(best) != 0.0).all():
+        if other.words != column.words and (np.diff(best) > 0.0).all():
             break
         try:
             values = read(table[key], other)
@@ -188,6 +188,9 @@ def _finest(table: pd.DataFrame, columns: Mapping[str, Column], quantity: str) -
         is_finer = len(np.unique(values)) > len(np.unique(best))
         if _agree(best, values, quantity):
             best = values if is_finer else best
+        elif (np.diff(best) < 0.0).any() and (np.diff(values) >= 0.0).all() and _stalls(values) <= _stalls(best):
+            _say(f"the time is {other.name!r}, as {column.name!r} goes back")
+            best = values
         elif other.words == column.words:
             raise ValueError(
                 f"both {column.name!r} and {other.name!r} may be the {quantity}. Say which it is: --columns {quantity}=NAME "
@@ -198,10 +201,15 @@ def _finest(table: pd.DataFrame, columns: Mapping[str, Column], quantity: str) -
     return best
 
 
+def _stalls(time_s: FloatArray) -> int:
+    """How often a clock does not go on."""
+    return int((np.diff(time_s) <= 0.0).sum())
+
+
 def _tick_of_dates(table: pd.DataFrame, columns: Mapping[str, Column]) -> float:
     """What a clock counts in whose name has no unit, s, where dates beside it, or days as spreadsheets count, tell."""
     clock, ends = columns["time"], table["time"].iloc[[0, -1]]
-    if clock.unit or not pd.api.types.is_numeric_dtype(ends.dtype):
+    if clock.unit or not pd.api.types.is_numeric_dtype(ends.dtype) or not table["time"].is_monotonic_increasing:
         return 1.0
     ticks = np.ptp(numbers(ends, clock))
     for key in [key for key in columns if key.startswith("time ")]:
