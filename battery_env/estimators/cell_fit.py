@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from battery_env.arrays import FloatArray, IntArray
 from battery_env.checks import check_numbers, check_positive
 from battery_env.electrochemistry import CellParameters, check_cell
+from battery_env.electrochemistry.aging_path import AgingPath
 from battery_env.estimators.diagnosis.conditions import BELOW_REST_V, MISMATCH_MARGIN, rest_voltage_V
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.files import WrongFormatError, read_json, write_json
@@ -299,12 +300,14 @@ class CellFit:
             raise ValueError(f"{path} is damaged, or no fit saved by CellFit.to_json: {error}") from error
 
 
-def read_cell(path: str | os.PathLike[str]) -> CellFit | CellParameters:
-    """Read the constants of a cell."""
-    try:
-        return CellFit.from_json(path)
-    except WrongFormatError:
-        return CellParameters.from_json(path)
+def read_cell(path: str | os.PathLike[str]) -> CellFit | AgingPath | CellParameters:
+    """Read what a file says of the constants of a cell."""
+    for kind in (CellFit, AgingPath):
+        try:
+            return kind.from_json(path)
+        except WrongFormatError:
+            continue
+    return CellParameters.from_json(path)
 
 
 def groups(q_mobile_C: ArrayLike) -> list[tuple[IntArray, IntArray]]:

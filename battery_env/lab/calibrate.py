@@ -238,12 +238,13 @@ def _estimate(
         else:
             estimate = calibrator.estimate(seen.fitted)
         if isinstance(calibrator, PolicyEstimator):
-            cell, thermal = cell_with(calibrator.cell, estimate.constants), False
+            cell, thermal = calibrator.cell, False
         if estimate.settled:
             break
     if reason := seen.start.reason or settings.other_load(mean_current_A(seen.record)):
         estimate = replace(estimate, settled_q_mobile=False, settled_r_o=False, reason=reason)
-    return estimate, method, RecordModel(cell, thermal, initial_soc=seen.start.soc), now
+    model = RecordModel(cell_with(cell, estimate.constants), thermal, initial_soc=seen.start.soc)
+    return estimate, method, model, now
 
 
 def _end(
@@ -315,7 +316,7 @@ def _charge(seen: _Seen, settings: Settings, estimate: Estimate, end: Forecast |
     predicted_Ah, sd_Ah = (1.0 - start.soc) * q_mobile / 3600.0 + drawn_Ah, settings.current_gain_sd * drawn_Ah
     if seen.in_progress:
         predicted_Ah, sd_Ah = (float("nan"),) * 2 if end is None else _middle(end.capacity_Ah, estimate)
-    unseen_Ah = seen.loaded.shown.unseen_C(float(np.ptp(seen.loaded.time_s))) / 3600.0
+    unseen_Ah = seen.loaded.unseen_C / 3600.0
     return {
         "capacity_Ah": float("nan") if seen.in_progress or start.soc < 1.0 else drawn_Ah,
         "predicted_capacity_Ah": predicted_Ah,
@@ -324,13 +325,16 @@ def _charge(seen: _Seen, settings: Settings, estimate: Estimate, end: Forecast |
 
 
 def _cell_at_the_temperature(record: Discharge, settings: Settings) -> CellParameters:
-    """The constants of the model in the surroundings that are stated, measured at load-on, or known of the record."""
+    """
+    The constants of the model in the surroundings that are stated, measured at load-on, or known of the record. Those of a
+    path, or that a policy has learned of, hold at one temperature.
+    """
     cell, ambient_C = settings.cell or NEW_CELL, settings.ambient_C
     if ambient_C is None and record.temperature_C is not None:
         ambient_C = float(record.temperature_C[0])
     elif ambient_C is None:
         ambient_C = record.meta.get("ambient_temperature_C")
-    if ambient_C is None or settings.method == "policy":
+    if ambient_C is None or settings.method == "policy" or settings.path is not None:
         return cell
     return cell.replace(Tb0=float(ambient_C) + ZERO_CELSIUS_K)
 

@@ -191,8 +191,8 @@ _CALIBRATION: _Options = {
     ("--cell",): {
         "type": Path,
         "metavar": "FILE",
-        "help": "constants of the cell, as the command fit saves them, or CellParameters.to_json (default: those of a new "
-        "18650)",
+        "help": "constants of the cell, as the command fit saves them, or CellParameters.to_json; or how cells of its kind "
+        "age, as fit_life finds it and AgingPath.to_json saves it (default: those of a new 18650)",
     },
     ("--nominal",): {
         "dest": "nominal_Ah",
@@ -469,7 +469,7 @@ def _settings(options: argparse.Namespace) -> Settings:
         return Settings(**given)
     if not path.is_file():
         raise FileNotFoundError(
-            f"no file {str(path)!r} for --cell: give what the command fit, or CellParameters.to_json, wrote"
+            f"no file {str(path)!r} for --cell: give what the command fit, CellParameters.to_json or AgingPath.to_json wrote"
         )
     cell = read_cell(path)
     if isinstance(cell, CellFit) and cell.doubt:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from battery_env.checks import check_not_negative, check_positive
 from battery_env.electrochemistry import NEW_CELL, CellParameters
+from battery_env.electrochemistry.aging_path import AgingPath
 from battery_env.estimators.cell_fit import UNFITTED_MISMATCH_V, CellFit
 from battery_env.estimators.diagnosis.conditions import Condition
 from battery_env.estimators.diagnosis.rest import InitialSoc, Start
@@ -32,6 +34,9 @@ _PRETRAINED = {"q_mobile": "BatteryVoltageQmax-v0", "r_o": "BatteryVoltageRo-v0"
 _PRETRAINED_JOINT = "BatteryVoltageJoint-v0"
 # What a policy cannot be told: it has learned on one model.
 _NOT_FOR_POLICIES = ("prior_q_mobile_C", "mismatch_V", "current_gain_sd", "ambient_C", "q_mobile_bounds_C", "initial_soc")
+
+# Nor may be said beside a path: it tells which of all go together, at the temperature of its lives.
+_NOT_WITH_PATH = ("prior_q_mobile_C", "parameters", "ambient_C", "policy")
 
 
 @dataclass(frozen=True)
@@ -58,6 +63,7 @@ class Settings:
     :param cell_currents_A: lowest and highest mean current that these constants were fitted to, A: beyond them by more than a
         quarter no estimate is settled, and no nominal capacity is told. ``None``: they hold for all
     :param cell_sd_r_o_ohm: what the constants leave open of ``r_o``, ohm
+    :param path: how cells of this kind age, which least squares take for a prior; :meth:`for_cell` sets what goes with it
     :param q_mobile_bounds_C: where to search for ``q_mobile``, C; ``None``: where the calibrator does by default
     :param initial_soc: state of charge when the load is switched on, after a rest: a number, (mean, standard deviation), or
         ``"rest"``: told from the voltage of the rest before the load, of a minute at least
@@ -80,6 +86,7 @@ class Settings:
     cell: CellParameters | None = None
     cell_currents_A: tuple[float, float] | None = None
     cell_sd_r_o_ohm: float = 0.0
+    path: AgingPath | None = None
     q_mobile_bounds_C: tuple[float, float] | None = None
     initial_soc: InitialSoc | Literal["rest"] = 1.0
     policy: Path | None = None
@@ -96,11 +103,14 @@ class Settings:
             raise ValueError(f"the cut-off must be a voltage above 0 V, got {self.cut_off_V!r}")
         if self.future_current_A is not None:
             check_not_negative(future_current_A=self.future_current_A)
+        if self.path is not None:
+            if self.method not in (None, "least-squares"):
+                raise ValueError(f"a path of aging cells is for least squares, got the method {self.method!r}")
+            if self.cell != self.path.cell:
+                raise ValueError("a path of aging cells comes with its constants: take Settings.for_cell(path)")
+            self._refuse_stated(_NOT_WITH_PATH, "a path of aging cells", "leave the path out")
         if self.method == "policy":
-            defaults = {field.name: field.default for field in fields(self)}
-            for name in _NOT_FOR_POLICIES:
-                if getattr(self, name) != defaults[name]:
-                    raise ValueError(f"a policy takes no {name}: leave it out, or take another method")
+            self._refuse_stated(_NOT_FOR_POLICIES, "a policy", "take another method")
             if self.cell is not None and self.policy is None:
                 raise ValueError(
                     "the policy that comes with the package takes no cell: it has learned on a new 18650. Take another "
@@ -109,12 +119,17 @@ class Settings:
         elif self.policy is not None:
             raise ValueError(f"a policy is for the method policy, got {self.method!r}")
 
+    def _refuse_stated(self, names: tuple[str, ...], what: str, other: str) -> None:
+        for field in fields(self):
+            if field.name in names and getattr(self, field.name) != field.default:
+                raise ValueError(f"{what} takes no {field.name}: leave it out, or {other}")
+
     @classmethod
-    def for_cell(cls, cell: CellFit | CellParameters | None = None, **others: Any) -> Settings:
+    def for_cell(cls, cell: CellFit | AgingPath | CellParameters | None = None, **others: Any) -> Settings:
         """
         Settings that use all that is known of a cell.
 
-        :param cell: what ``fit_cell`` found; or the constants alone
+        :param cell: what ``fit_cell`` found; of cells of its kind what ``fit_life`` found; or the constants alone
         :param others: further settings, which replace what the fit knows
         :return: the settings
         """
@@ -128,6 +143,9 @@ class Settings:
                     "q_mobile_bounds_C": cell.q_mobile_bounds_C,
                     "cell_sd_r_o_ohm": cell.sd_r_o_ohm,
                 }
+            others, cell = {**known, **others}, cell.cell
+        elif isinstance(cell, AgingPath):
+            known = {"cut_off_V": cell.cell.VEOD, "mismatch_V": cell.mismatch_V, "thermal": False, "path": cell}
             others, cell = {**known, **others}, cell.cell
         return cls(**{"cell": cell, **others})
 
@@ -159,7 +177,7 @@ class Settings:
         """
         if self.method == "policy":
             return self._policy()
-        calibrator = ExtendedKalmanFilter if self.method == "kalman" else LeastSquares
+        calibrator = ExtendedKalmanFilter if self.method == "kalman" else partial(LeastSquares, path=self.path)
         stated: InitialSoc = 1.0 if self.initial_soc == "rest" else self.initial_soc
         bounds: dict[str, Any] = {} if self.q_mobile_bounds_C is None else {"q_mobile_bounds_C": self.q_mobile_bounds_C}
         return calibrator(

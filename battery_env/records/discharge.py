@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, fields
 from datetime import datetime, timedelta
 from functools import cached_property
 from importlib.resources import as_file, files
+from math import hypot
 from numbers import Real
 from pathlib import Path
 from typing import Any, ClassVar, cast
@@ -35,6 +36,7 @@ from battery_env.records.samples import (
     switch_times_s,
 )
 from battery_env.records.shown import Shown, is_mixed, load_on_sd_C, rest_current_A
+from battery_env.records.switches import switched_sd_C
 
 #: How to cite the bundled data.
 NASA_CITATION = (
@@ -134,6 +136,13 @@ class Discharge:
     def charge_C(self) -> float:
         """The charge drawn from the first sample to the last, C."""
         return drawn_charge_C(self)
+
+    @property
+    def unseen_C(self) -> float:
+        """Its standard deviation by all that no sample shows, C; what flows at rest may be an offset of the sensor."""
+        shown = self.shown
+        switched_C = 0.0 if shown.is_counted else switched_sd_C(self.time_s, self.current_A)
+        return hypot(shown.load_on_C, shown.offset_A * float(np.ptp(self.time_s)), shown.uncounted_C, switched_C)
 
     @property
     def load_on_time_s(self) -> float:

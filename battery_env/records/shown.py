@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from math import hypot
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -54,6 +53,7 @@ class Shown(NamedTuple):
     :param load_on_s: when the load came on, as the tester says, on the clock of the record, s; ``None``: it does not
     :param load_on_C: standard deviation of the charge by the moment of load-on, which lies between two samples, C
     :param offset_A: what flows at rest, A
+    :param is_counted: whether the tester counted the charge
     :param uncounted_C: by how much the charge is another one than the tester counted, C
     """
 
@@ -63,11 +63,8 @@ class Shown(NamedTuple):
     load_on_s: float | None = None
     load_on_C: float = 0.0
     offset_A: float = 0.0
+    is_counted: bool = False
     uncounted_C: float = 0.0
-
-    def unseen_C(self, duration_s: float) -> float:
-        """Standard deviation of the charge of a time under load, C; what flows at rest may be an offset of the sensor."""
-        return hypot(self.load_on_C, self.offset_A * duration_s, self.uncounted_C)
 
 
 def shown_beside(record: Any) -> Shown:

@@ -9,11 +9,12 @@ import pytest
 from battery_env import calibrate, load_nasa_discharges, read_discharges
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate
 from battery_env.estimators.diagnosis.gaps import doubtful_C
-from battery_env.estimators.diagnosis.samples import fault_condition, watched
+from battery_env.estimators.diagnosis.samples import fault_condition, unseen_C, watched
 from battery_env.estimators.estimator import OnlineEstimator
 from battery_env.lab.settings import Settings
 from battery_env.records import ChargeBefore, Samples, Shown, Stream
 from battery_env.records.discharge import Discharge
+from battery_env.records.switches import switched_sd_C
 
 METHODS = ("least-squares", "kalman")
 TRUE_Q_C, TRUE_R_OHM, LOAD_A = 7000.0, 0.12, 2.0
@@ -198,3 +199,23 @@ class TestGaps:
         record = Samples(time_s, model_V + wander_V, np.full(360, 4.4))
         seen = watched(record, NEW_CELL, None, (3900.0, 0.03), Shown(), model_V)
         assert not doubtful_C(seen) and not fault_condition(seen)
+
+
+class TestSwitches:
+    def test_like_ones_add_up_and_others_in_quadrature(self):
+        """Errors of rows that meet a load at the same place each time do not cancel."""
+        time_s, one_C = 10.0 * np.arange(41), 10.0 / np.sqrt(12.0)
+        like = np.where(np.arange(41) // 2 % 2, 2.0, 1.0)
+        assert switched_sd_C(time_s, like) == pytest.approx(one_C * np.hypot(10.0, 10.0))
+        growing = 1.0 + np.cumsum(np.where(np.arange(41) % 2, 1.0, -1.0) * 1.3 ** (np.arange(41) / 4.0))
+        sizes = np.abs(np.diff(growing))
+        assert switched_sd_C(time_s, growing) == pytest.approx(one_C * np.sqrt((sizes**2).sum()))
+        assert switched_sd_C(time_s, np.linspace(1.0, 2.0, 41)) == 0.0
+
+    def test_a_count_of_the_tester_leaves_none(self):
+        current_A = np.where(np.arange(len(REAL.time_s)) // 3 % 2, REAL.current_A, 0.3 * REAL.current_A)
+        pulsed = replace(REAL, current_A=current_A)
+        counted = replace(pulsed, shown=Shown(is_counted=True))
+        assert pulsed.unseen_C > 0.02 * pulsed.charge_C and counted.unseen_C == 0.0
+        sure, unsure = (watched(Samples.of(each), NEW_CELL, 1.0, (6000.0, 0.1), each.shown) for each in (counted, pulsed))
+        assert unseen_C(unsure) == pytest.approx(np.hypot(unseen_C(sure), pulsed.unseen_C), rel=0.01)

@@ -44,6 +44,9 @@ BELOW_REST_V, ABOVE_REST_V, _LACKING_SHARE = 0.04, 0.06, 0.04
 _AT_BOUND = "{} is at a bound of its search, where the record does not determine it."
 _DIFFERS = "The policy and the fit in its observation differ by {{differs:.1%}} in {}: it does not trust the fit."
 _DROPPED = "The current changes for a moment, and the voltage does not follow: {} in doubt."
+_SWITCHES = (
+    "The load is switched between two samples, nobody knows when, {{switches}} times: {}. Log a sample at each switch, {}."
+)
 _PRIOR_WRONG = "The prior of {} contradicts what the record says."
 _PRIOR_ALONE = "{} rests on its prior: the record alone does not determine it yet. Without it {}"
 _SCALE_UNKNOWN = (
@@ -163,10 +166,6 @@ class Condition(IntEnum):
     R_PRIOR_WRONG = _PRIOR_WRONG.format("R_o")
     # what the record does not tell of one number
     NO_CURRENT = "No current flows in the last step, so that R_o does not show.", "r_o"
-    PATH_UNTESTED = (
-        "What the record tells of R_o rests on the path of aging cells, as long as q_max does not show that it fits.",
-        "r_o",
-    )
     Q_DIFFERS = _DIFFERS.format("q_max"), "q_mobile"
     R_DIFFERS = _DIFFERS.format("R_o"), "r_o"
     LOAD_ON_UNSURE = (
@@ -186,6 +185,8 @@ class Condition(IntEnum):
     )
     Q_DROPPED = _DROPPED.format("{dropped_C:.0f} C are"), "q_mobile"
     R_DROPPED = _DROPPED.format("{dropped_mohm:.0f} mohm of R_o are"), "r_o"
+    Q_SWITCHES = _SWITCHES.format("{switched_C:.0f} C are in doubt", "and the charge that the tester counts"), "q_mobile"
+    R_SWITCHES = _SWITCHES.format("R_o does not show", "a second after it at most"), "r_o"
     GAP_UNSURE = (
         "No sample lies between {gap_start_s:.0f} s and {gap_end_s:.0f} s, and the voltage does not tell whether the load was "
         "on: {gap_C:.0f} C are in doubt.",
@@ -193,6 +194,10 @@ class Condition(IntEnum):
     )
     Q_PRIOR_ALONE = _PRIOR_ALONE.format("q_max", _IMPRECISE_Q), "q_mobile"
     R_PRIOR_ALONE = _PRIOR_ALONE.format("R_o", _IMPRECISE_R), "r_o"
+    PATH_UNTESTED = (
+        "What the record tells of R_o rests on the path of aging cells, as long as q_max does not show that it fits.",
+        "r_o",
+    )
     R_OF_CONSTANTS = (
         "The discharges that the constants were fitted to leave {of_cell_mohm:.0f} mohm of R_o open: fit such of other loads, "
         "or with pauses, too.",

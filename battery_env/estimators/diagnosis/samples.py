@@ -29,6 +29,7 @@ from battery_env.estimators.diagnosis.conditions import (
 from battery_env.estimators.diagnosis.rest import LEAST_REST_S
 from battery_env.estimators.diagnosis.rows import KEPT, STEADY_S, Row, find, middle, noise_V, table
 from battery_env.records import REST_CURRENT_A, SWITCH_SHARE, ChargeBefore, Samples, Shown
+from battery_env.records.switches import SWITCHES, note_switch, switched_C
 
 # A cell that was at rest at the first sample falls by at least half of its ohmic drop within this time, s. So does one whose
 # load is switched.
@@ -45,8 +46,9 @@ _RISE_V = 0.05
 _LEAST_JUMP_A, _MOST_RESISTANCE_OHM = 0.05, 0.6
 # A cell from which this share of its charge was drawn does not come back to the voltage of its first sample without a charge.
 _RECOVERY_SHARE = 0.2
-# What dropouts of the current make of the charge is a fault where an estimate of it would not be settled.
-_MOST_DROPPED_SHARE = SETTLED_SHARES["q_mobile"]
+# What dropouts of the current, or switches between samples, make of the charge speaks against both numbers where an estimate
+# of it would not be settled.
+_MOST_SHARE = SETTLED_SHARES["q_mobile"]
 # Voltages are kept about this far apart, s: all that are kept cover the window in which a voltage may not rise.
 _KEPT_EVERY_S = 0.9
 
@@ -106,7 +108,9 @@ SEEN = table(
         ("usual", gaps.USUAL),
         ("gap", gaps.GAP),
         ("pending", "b1"),  # the voltage has not followed the last switch yet
-        ("uncounted_C", "f8"),  # by how much the tester counted another charge
+        ("switches", SWITCHES),
+        ("is_counted", "b1"),  # by the tester, which saw what lies between samples
+        ("uncounted_C", "f8"),  # by how much it counted another charge
         ("dropped_C", "f8"),  # charge of switches that were taken back, which it did not follow
         ("dropped_ohm", "f8"),  # by how much they moved an estimate of r_o
         ("fault", _FAULT),
@@ -155,7 +159,8 @@ def note_samples(
     :param unsettled_sd_C: standard deviation of a ``q_mobile`` that is not settled, C
     """
     said = measured(seen, initial_soc, float(record.time_s[0]), shown.charge)
-    for number in (start_condition(seen), fault_condition(seen), doubt_condition(seen, unsettled_sd_C)):
+    smeared = is_smeared(seen) * Condition.R_SWITCHES
+    for number in (start_condition(seen), fault_condition(seen), doubt_condition(seen, unsettled_sd_C), smeared):
         if number:
             diagnosis.note(Condition.numbered(number), **said)
 
@@ -170,7 +175,7 @@ def expect(seen: Any, cell: CellParameters, initial_soc: float | None) -> None:
 def take_in(seen: Any, shown: Shown) -> None:
     """Take in what is known beside the samples, before the first of them."""
     start, rest, charge, full_V = seen["start"], seen["rest"], shown.charge, seen["start_V"]
-    start["at_rest"], seen["uncounted_C"] = shown.at_rest, shown.uncounted_C
+    start["at_rest"], seen["is_counted"], seen["uncounted_C"] = shown.at_rest, shown.is_counted, shown.uncounted_C
     if charge is not None:
         # without a rest a charge that did not taper off tells nothing but that the cell is lower
         is_low = (charge.highest_V < seen["low_V"]) | (not charge.tapered and shown.rest_s < LEAST_REST_S)
@@ -193,6 +198,8 @@ def measured(seen: Any, initial_soc: float, clock_s: float = 0.0, charge: Charge
         "fault_s": clock_s + (fault["time_s"] if fault["condition"] else switch["time_s"]),
         "since_s": clock_s + fault["since_s"],
         "size": fault["size"] if fault["condition"] else switch["size_A"],
+        "switched_C": float(switched_C(seen["switches"])),
+        "switches": seen["switches"]["count"],
         "uncounted_C": seen["uncounted_C"],
         "dropped_C": seen["dropped_C"],
         "dropped_mohm": 1e3 * seen["dropped_ohm"],
@@ -253,6 +260,9 @@ def remember(seen: Row, voltage: float, current: float) -> None:
     """Keep a sample that was examined."""
     before = seen.before
     _note_rest(seen.rest, seen.time_s, seen.interval_s, current)
+    # that of load-on is judged there
+    if seen.samples > 1 and seen.rest.on_s == 0.0:
+        note_switch(seen.switches, seen.current_A, current, seen.interval_s)
     if not isnan(voltage):
         before.voltage_2_V = before.voltage_1_V if seen.samples > 1 else voltage
         before.voltage_1_V, before.time_1_s, before.current_1_A = voltage, seen.time_s, current
@@ -283,7 +293,14 @@ def unseen_C(seen: Row) -> float:
     """The standard deviation of the charge by all that nobody saw."""
     rest = seen.rest
     beside_C = hypot(rest.load_on_C, rest.mean_A * (seen.time_s - rest.over_s)) if rest.is_over else 0.0
-    return hypot(hypot(beside_C, seen.uncounted_C), hypot(gaps.doubtful_C(seen), seen.dropped_C))
+    between_C = hypot(gaps.doubtful_C(seen), 0.0 if seen.is_counted else switched_C(seen.switches))
+    return hypot(hypot(beside_C, seen.uncounted_C), hypot(between_C, seen.dropped_C))
+
+
+@compiled
+def is_smeared(seen: Row) -> bool:
+    """Whether the load is switched between samples so often that they do not tell which current a voltage belongs to."""
+    return bool(switched_C(seen.switches) > _MOST_SHARE * seen.drawn_C)
 
 
 @compiled
@@ -298,6 +315,8 @@ def doubt_condition(seen: Row, sd_C: float) -> int:
         return Condition.UNCOUNTED + 0
     if seen.dropped_C > most_C:
         return Condition.Q_DROPPED + 0
+    if not seen.is_counted and switched_C(seen.switches) > most_C:
+        return Condition.Q_SWITCHES + 0
     return Condition.GAP_UNSURE + 0 if sd_C < inf and gaps.doubtful_C(seen) > 0.0 else 0
 
 
@@ -381,7 +400,7 @@ def _take_back(seen: Row, current: float, most_q: float, r_o: float) -> bool:
         return False
     seen.dropped_C += abs(switch.charge_C)
     seen.dropped_ohm += abs(r_o - switch.before_ohm)
-    if seen.dropped_C > _MOST_DROPPED_SHARE * most_q:
+    if seen.dropped_C > _MOST_SHARE * most_q:
         find(seen, Condition.NOT_FOLLOWED, switch.time_s, 0.0, current - last.current_A)
     last.lagging_A, switch.size_A, switch.back_s = current, 0.0, seen.time_s
     return True

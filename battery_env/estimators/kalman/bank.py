@@ -38,7 +38,14 @@ from battery_env.estimators.diagnosis.conditions import (
     SETTLED_SHARES,
     Condition,
 )
-from battery_env.estimators.diagnosis.samples import Row, doubt_condition, fault_condition, start_condition, unseen_C
+from battery_env.estimators.diagnosis.samples import (
+    Row,
+    doubt_condition,
+    fault_condition,
+    is_smeared,
+    start_condition,
+    unseen_C,
+)
 from battery_env.estimators.kalman.state import FILTER, OFFSET, Q, R, Settings
 from battery_env.parameters import PARAMETER_NAMES
 
@@ -354,6 +361,7 @@ def conclude(cell: Row, settings: Settings, estimate: Row) -> None:
             of_data = max(bank.sd[k] ** -2.0 - prior_sd**-2.0, 0.0) ** -0.5
             of_data = max(of_data, bank.common_sd_q if k == Q else 0.0)
             _note(estimate, Condition.Q_PRIOR_ALONE + k, of_data >= _SHARES[k] * value)
+        _note(estimate, Condition.R_SWITCHES, k == R and is_smeared(seen))
         if not sd < _SHARES[k] * value:
             _note(estimate, Condition.R_DROPPED, k == R and seen.dropped_ohm > MOST_OF_SD * sd)
             _note(estimate, Condition.R_OF_CONSTANTS, k == R and settings.cell_sd_r_o > MOST_OF_SD * sd)

@@ -34,7 +34,19 @@ _NOISE_V = 0.005
 # Covariances of a state may be so much larger than their variances allow, as a share.
 _ROUNDED = 1e-6
 # What reasons are made of
-_SHOWN = ("start", "rest", "fault", "switch", "gap", "start_V", "time_s", "uncounted_C", "dropped_C", "dropped_ohm")
+_SHOWN = (
+    "start",
+    "rest",
+    "fault",
+    "switch",
+    "switches",
+    "gap",
+    "start_V",
+    "time_s",
+    "uncounted_C",
+    "dropped_C",
+    "dropped_ohm",
+)
 
 
 class ExtendedKalmanFilter(OnlineEstimator):

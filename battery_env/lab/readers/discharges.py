@@ -333,22 +333,23 @@ def _recording(
         temperature_C = _filled(time_s, rows["temperature"].to_numpy())
         if temperature_C is not None:
             arrays["temperature_C"] = temperature_C
-    arrays["shown"] = shown._replace(uncounted_C=_uncounted_C(rows))
+    uncounted_C = _uncounted_C(rows)
+    arrays["shown"] = shown._replace(is_counted=uncounted_C is not None, uncounted_C=uncounted_C or 0.0)
     return Recording(arrays, meta, stated)
 
 
-def _uncounted_C(rows: pd.DataFrame) -> float:
-    """By how much the charge under load is another one than the tester counted row by row, if that is worth a word."""
+def _uncounted_C(rows: pd.DataFrame) -> float | None:
+    """By how much the charge under load is another one than the tester counted row by row; ``None``: it did not count."""
     time_s, current_A = rows["time"].to_numpy(), rows["current"].to_numpy()
     loaded = np.flatnonzero(current_A > SWITCH_SHARE * current_A.max())
     part = slice(loaded[0], loaded[-1] + 1)
     if "capacity" not in rows or len(loaded) < LEAST_SAMPLES:
-        return 0.0
+        return None
     step_C = np.diff(rows["capacity"].to_numpy()[part])
     # a counter that counts down, or anew with each step of the program
     step_C = step_C if (step_C > 0.0).sum() > (step_C < 0.0).sum() else -step_C
     if (step_C > 0.0).mean() < 0.5:
-        return 0.0
+        return None
     counted_C = float(step_C[step_C > 0.0].sum())
     # some count what is drawn alone, others what is returned, too, with its sign or without
     counts_A = (current_A, np.maximum(current_A, 0.0), np.abs(current_A))
