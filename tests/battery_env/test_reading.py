@@ -437,15 +437,19 @@ def hybrid(counter):
     return table, charge_C.iloc[-1]
 
 
-@pytest.mark.parametrize(("pulse_s", "found"), [(5, 1), (10, 1), (60, 12)])
+@pytest.mark.parametrize(("pulse_s", "found"), [(5, 1), (10, 1), (40, 1), (55, 12)])
 def test_pulses_within_a_charge_are_no_discharges(pulse_s, found):
-    # 270 C and a pulse twelve times, and then the whole discharge; larger ones are cycles
+    # 360 C and a pulse twelve times, and then the whole discharge; larger ones are cycles
     minute_s = np.mod(np.arange(0.0, 3600.0, 5.0), 300.0)
-    current_A = np.where(minute_s < 180.0, 1.5, np.where(minute_s < 180 + pulse_s, -1.5, 0.0))
+    current_A = np.where(minute_s < 240.0, 1.5, np.where(minute_s < 240.0 + pulse_s, -1.5, 0.0))
     voltage_V = 3.6 + 0.6 * np.cumsum(current_A) / np.cumsum(current_A).max() + 0.05 * current_A
     pulses = pd.DataFrame({"time": np.arange(0.0, 3600.0, 5.0), "voltage": voltage_V, "current": current_A})
-    discharges = read_discharges(pd.concat([pulses, REST, CYCLE[len(CHARGE) + len(REST) :]], ignore_index=True))
+    table = pd.concat([pulses, REST, CYCLE[len(CHARGE) + len(REST) :]], ignore_index=True)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        discharges = read_discharges(table)
     assert len(discharges) == found
+    assert any("within charges" in str(each.message) for each in caught) == (pulse_s == 40)
     np.testing.assert_allclose(discharges[-1].current_A[-len(TABLE) :], RECORD.current_A)
     assert discharges[-1].charge_C == pytest.approx(RECORD.charge_C, rel=0.03)
 

@@ -188,7 +188,7 @@ def _finest(table: pd.DataFrame, columns: Mapping[str, Column], quantity: str) -
         is_finer = len(np.unique(values)) > len(np.unique(best))
         if _agree(best, values, quantity):
             best = values if is_finer else best
-        elif (np.diff(best) < 0.0).any() and (np.diff(values) >= 0.0).all() and _stalls(values) <= _stalls(best):
+        elif _goes_on_where(values, best):
             _say(f"the time is {other.name!r}, as {column.name!r} goes back")
             best = values
         elif other.words == column.words:
@@ -201,9 +201,10 @@ def _finest(table: pd.DataFrame, columns: Mapping[str, Column], quantity: str) -
     return best
 
 
-def _stalls(time_s: FloatArray) -> int:
-    """How often a clock does not go on."""
-    return int((np.diff(time_s) <= 0.0).sum())
+def _goes_on_where(other_s: FloatArray, time_s: FloatArray) -> bool:
+    """Whether a clock goes on where another one goes back, and tells as many rows apart."""
+    other, this = np.diff(other_s), np.diff(time_s)
+    return bool((other >= 0.0).all() and (this < 0.0).any() and (other <= 0.0).sum() <= (this <= 0.0).sum())
 
 
 def _tick_of_dates(table: pd.DataFrame, columns: Mapping[str, Column]) -> float:
@@ -480,7 +481,8 @@ def with_signed_current(rows: pd.DataFrame, columns: Mapping[str, Column], is_ne
         is_known = any(columns[each].unit for each in ("current", "power", "charge_step") if each in columns)
         # under the load of a coin cell the voltage falls
         if not is_known or not current_A.any() or not np.ptp(rows["voltage"][current_A.abs() > rest_A]) > _COIN_FALL_V:
-            advice = "" if is_known else ", or that of a coin cell: state the unit of the current"
+            coin = f", nor that of a coin cell, whose voltage changes by {_COIN_FALL_V:g} V"
+            advice = coin if is_known else ", or that of a coin cell: state the unit of the current"
             raise ValueError(f"no current flows above {REST_CURRENT_A:g} A, below which a cell rests: no discharge{advice}")
     if "direction" in rows and (current_A >= -rest_A).all():
         return rows.assign(current=current_A.where(rows["direction"] >= 0, -current_A))
