@@ -172,6 +172,25 @@ def test_dates_tell_what_a_clock_without_a_unit_counts(unit, in_a_second, beside
     same(read(TABLE.assign(Zeit=1.02 * DAYS * 60.0)))
 
 
+@pytest.mark.parametrize("with_step", [True, False])
+@pytest.mark.parametrize("gap_s", [0.0, 3600.0])
+@pytest.mark.parametrize("dates", ["%Y-%m-%d %H:%M:%S.%f", "%d.%m.%Y %H:%M:%S", None])
+def test_dates_are_the_clock_where_another_one_starts_anew_with_each_step(with_step, gap_s, dates):
+    step = np.searchsorted([60, len(CHARGE) + len(REST) + LOAD_ON], np.arange(len(CYCLE)), side="right")
+    date = pd.Timestamp("2026-02-27 23:50") + pd.to_timedelta(CYCLE["time"] + np.where(step == 2, gap_s, 0.0), unit="s")
+    table = CYCLE.assign(time=CYCLE["time"] - CYCLE.groupby(step)["time"].transform("first"))
+    table["Absolute Time"] = date.dt.strftime(dates) if dates else date
+    if with_step:
+        table["Step"] = step
+    found = read(table, "the time is 'Absolute Time', as 'time' goes back")
+    assert found.time_s[-1] - found.time_s[0] == pytest.approx(600.0 + RECORD.time_s[-1] + gap_s, abs=1.0)
+    assert found.loaded_part(2.7).charge_C == pytest.approx(RECORD.loaded_part(2.7).charge_C, rel=5e-3)
+    # dates that tell fewer rows apart are no better
+    table["Absolute Time"] = date.dt.floor("30s")
+    if with_step:
+        read(table, "the time starts anew with each step, and is added up")
+
+
 @settings(max_examples=40, deadline=None)
 @given(st.sets(st.integers(3, len(TABLE) - 3), min_size=1, max_size=6), st.floats(0.0, 5.0))
 def test_a_clock_that_starts_anew_with_each_step_is_added_up(starts, first_s):
@@ -418,15 +437,19 @@ def hybrid(counter):
     return table, charge_C.iloc[-1]
 
 
-@pytest.mark.parametrize(("pulse_s", "found"), [(5, 1), (10, 1), (60, 12)])
+@pytest.mark.parametrize(("pulse_s", "found"), [(5, 1), (10, 1), (40, 1), (55, 12)])
 def test_pulses_within_a_charge_are_no_discharges(pulse_s, found):
-    # 270 C and a pulse twelve times, and then the whole discharge; larger ones are cycles
+    # 360 C and a pulse twelve times, and then the whole discharge; larger ones are cycles
     minute_s = np.mod(np.arange(0.0, 3600.0, 5.0), 300.0)
-    current_A = np.where(minute_s < 180.0, 1.5, np.where(minute_s < 180 + pulse_s, -1.5, 0.0))
+    current_A = np.where(minute_s < 240.0, 1.5, np.where(minute_s < 240.0 + pulse_s, -1.5, 0.0))
     voltage_V = 3.6 + 0.6 * np.cumsum(current_A) / np.cumsum(current_A).max() + 0.05 * current_A
     pulses = pd.DataFrame({"time": np.arange(0.0, 3600.0, 5.0), "voltage": voltage_V, "current": current_A})
-    discharges = read_discharges(pd.concat([pulses, REST, CYCLE[len(CHARGE) + len(REST) :]], ignore_index=True))
+    table = pd.concat([pulses, REST, CYCLE[len(CHARGE) + len(REST) :]], ignore_index=True)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        discharges = read_discharges(table)
     assert len(discharges) == found
+    assert any("within charges" in str(each.message) for each in caught) == (pulse_s == 40)
     np.testing.assert_allclose(discharges[-1].current_A[-len(TABLE) :], RECORD.current_A)
     assert discharges[-1].charge_C == pytest.approx(RECORD.charge_C, rel=0.03)
 

@@ -218,6 +218,8 @@ def _split(rows: pd.DataFrame, meta: dict[str, Any], stated: frozenset[str]) -> 
     stretches = [part for (part, drawn_C), each_C in zip(parts, pulses_C, strict=True) if drawn_C >= max(each_C, least_C)]
     if not stretches:
         raise ValueError("there is no discharge: what is drawn are pulses within charges. Check the sign of the current")
+    if pulses := sum(least_C <= drawn_C < each_C for (_, drawn_C), each_C in zip(parts, pulses_C, strict=True)):
+        warnings.warn(f"pulses within charges, which are no discharges, are left aside: {pulses}", stacklevel=2)
     before = [Shown(charge=_charge_before(rows, each.start), load_on_s=_load_on_s(rows, each)) for each in stretches]
     return [
         _recording(rows[stretch], shown, meta | ({"cycle": number} if len(stretches) > 1 else {}), len(stretches) > 1, stated)

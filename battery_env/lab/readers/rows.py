@@ -173,13 +173,13 @@ def _directions(states: pd.Series) -> IntArray:
 
 
 def _finest(table: pd.DataFrame, columns: Mapping[str, Column], quantity: str) -> FloatArray:
-    """The column of a quantity. Clocks of other names are asked only if that of the first one has one time twice."""
+    """The column of a quantity. Clocks of other names are asked only if the first one has one time twice, or goes back."""
     column = columns[quantity]
     read = seconds if quantity == "time" else numbers
     best = read(table[quantity], column)
     for key in [key for key in columns if key.startswith(f"{quantity} ")]:
         other = columns[key]
-        if other.words != column.words and (np.diff(best) != 0.0).all():
+        if other.words != column.words and (np.diff(best) > 0.0).all():
             break
         try:
             values = read(table[key], other)
@@ -188,6 +188,9 @@ def _finest(table: pd.DataFrame, columns: Mapping[str, Column], quantity: str) -
         is_finer = len(np.unique(values)) > len(np.unique(best))
         if _agree(best, values, quantity):
             best = values if is_finer else best
+        elif _goes_on_where(values, best):
+            _say(f"the time is {other.name!r}, as {column.name!r} goes back")
+            best = values
         elif other.words == column.words:
             raise ValueError(
                 f"both {column.name!r} and {other.name!r} may be the {quantity}. Say which it is: --columns {quantity}=NAME "
@@ -198,10 +201,16 @@ def _finest(table: pd.DataFrame, columns: Mapping[str, Column], quantity: str) -
     return best
 
 
+def _goes_on_where(other_s: FloatArray, time_s: FloatArray) -> bool:
+    """Whether a clock goes on where another one goes back, and tells as many rows apart."""
+    other, this = np.diff(other_s), np.diff(time_s)
+    return bool((other >= 0.0).all() and (this < 0.0).any() and (other <= 0.0).sum() <= (this <= 0.0).sum())
+
+
 def _tick_of_dates(table: pd.DataFrame, columns: Mapping[str, Column]) -> float:
     """What a clock counts in whose name has no unit, s, where dates beside it, or days as spreadsheets count, tell."""
     clock, ends = columns["time"], table["time"].iloc[[0, -1]]
-    if clock.unit or not pd.api.types.is_numeric_dtype(ends.dtype):
+    if clock.unit or not pd.api.types.is_numeric_dtype(ends.dtype) or not table["time"].is_monotonic_increasing:
         return 1.0
     ticks = np.ptp(numbers(ends, clock))
     for key in [key for key in columns if key.startswith("time ")]:
@@ -472,7 +481,8 @@ def with_signed_current(rows: pd.DataFrame, columns: Mapping[str, Column], is_ne
         is_known = any(columns[each].unit for each in ("current", "power", "charge_step") if each in columns)
         # under the load of a coin cell the voltage falls
         if not is_known or not current_A.any() or not np.ptp(rows["voltage"][current_A.abs() > rest_A]) > _COIN_FALL_V:
-            advice = "" if is_known else ", or that of a coin cell: state the unit of the current"
+            coin = f", nor that of a coin cell, whose voltage changes by {_COIN_FALL_V:g} V"
+            advice = coin if is_known else ", or that of a coin cell: state the unit of the current"
             raise ValueError(f"no current flows above {REST_CURRENT_A:g} A, below which a cell rests: no discharge{advice}")
     if "direction" in rows and (current_A >= -rest_A).all():
         return rows.assign(current=current_A.where(rows["direction"] >= 0, -current_A))
