@@ -130,7 +130,7 @@ CONTENDERS = {
     "td3": Contender("td3", "TD3", COLOUR_OF["TD3"], "^"),
     "td3_common": Contender("td3", "TD3, LAC's setting", COLOUR_OF["TD3"], ">", settings="lac", hyperparameters=_NOISE),
     "tqc": Contender("tqc", "TQC", COLOUR_OF["TQC"], "D"),
-    "tqc_common": Contender("tqc", "TQC, LAC's setting", COLOUR_OF["TQC"], "d", settings="lac"),
+    "tqc_common": Contender("tqc", "TQC, LAC's setting", COLOUR_OF["TQC"], "*", settings="lac"),
     "metric_sac": Contender(_METRIC_SAC, "SAC, LAC's metric", COLOURS[4], "v", compiles=True),
 }
 #: How they are drawn: colour and marker.
