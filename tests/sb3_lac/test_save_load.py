@@ -1,3 +1,5 @@
+import copy
+import pickle
 import random
 
 import numpy as np
@@ -63,6 +65,15 @@ def test_continued_training_is_the_same_as_uninterrupted_training(make_model, ma
     metrics = train_metrics(model, gradient_steps=5, seed=1)
     assert_same(metrics, train_metrics(loaded, gradient_steps=5, seed=1))
     assert_same_learned_state(model, loaded)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda model: pickle.loads(pickle.dumps(model))])
+@pytest.mark.parametrize("algorithm", [LAC, PublishedLAC])
+def test_a_copy_goes_on_like_the_model_itself(make_model, train_metrics, algorithm, copied):
+    model = make_model(n_collect=50, algorithm=algorithm)
+    twin = copied(model)
+    assert_same(*(train_metrics(each, gradient_steps=5) for each in (model, twin)))
+    assert_same_learned_state(model, twin)
 
 
 @pytest.mark.parametrize(
