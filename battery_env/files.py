@@ -32,9 +32,10 @@ def replacing(path: str | os.PathLike[str], new: bool = False) -> Iterator[Path]
     A place to write a file to, beside where it is to be. When the block ends the content goes to the disk, and then the file
     takes its name; what is new takes none that another file has. If anything fails, all is as it was before.
     """
-    target = Path(path)
     if new:
-        _refuse_if_there(target)
+        _refuse_if_there(Path(path))
+    # A link stays one, and what it leads to is replaced
+    target = Path(os.path.realpath(path))
     _make_folder(target.parent)
     # A name that no process, thread or machine has but this; libraries go by the suffix
     part = target.with_name(f".{secrets.token_hex(8)}.part{target.suffix}")

@@ -24,7 +24,8 @@ class HorizonReplayBuffer(ReplayBuffer):
     """
     Replay buffer that tells the sum of the rewards of ``horizon`` steps, from that of the transition on. Behind the end of an
     episode, a time limit or a termination, its last reward goes on, as in the code of Han et al. (2020). The latest
-    transitions, whose horizon is not over yet, are not sampled.
+    transitions, whose horizon is not over yet, are not sampled. While fewer steps than a horizon are stored it is the oldest
+    transition that is, and the latest reward that goes on.
 
     :param args: Arguments of ``ReplayBuffer``
     :param horizon: Number of steps whose rewards are summed
@@ -38,9 +39,7 @@ class HorizonReplayBuffer(ReplayBuffer):
             raise NotImplementedError("HorizonReplayBuffer doesn't support optimize_memory_usage=True")
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> HorizonReplayBufferSamples:  # type: ignore[override]
-        n_known = self.size() - self.horizon + 1
-        if n_known < 1:
-            raise ValueError(f"The {self.size()} stored steps are less than the horizon of {self.horizon}.")
+        n_known = max(self.size() - self.horizon + 1, min(self.size(), 1))
         oldest = self.pos if self.full else 0
         return self._get_samples((oldest + np.random.randint(0, n_known, size=batch_size)) % self.buffer_size, env)
 
@@ -49,10 +48,11 @@ class HorizonReplayBuffer(ReplayBuffer):
     ) -> HorizonReplayBufferSamples:
         # Sample randomly the env idx
         env_indices = np.random.randint(0, high=self.n_envs, size=(len(batch_inds),))
-        steps = (batch_inds[:, None] + np.arange(self.horizon)) % self.buffer_size
+        n_stored = min(self.horizon, self.size())
+        steps = (batch_inds[:, None] + np.arange(n_stored)) % self.buffer_size
         # The step itself or, behind the end of its episode, the last one
         ends = self.dones[steps, env_indices[:, None]] > 0
-        last = np.where(ends.any(axis=1), ends.argmax(axis=1), self.horizon - 1)
+        last = np.where(ends.any(axis=1), ends.argmax(axis=1), n_stored - 1)
         steps = (batch_inds[:, None] + np.minimum(np.arange(self.horizon), last[:, None])) % self.buffer_size
         rewards = self._normalize_reward(self.rewards[steps, env_indices[:, None]], env)
         dones = self.dones[batch_inds, env_indices] * (1 - self.timeouts[batch_inds, env_indices])

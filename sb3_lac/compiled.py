@@ -78,6 +78,18 @@ def actors_of(model: Any) -> list[Actor]:
     return [module for module in model.policy.children() if isinstance(module, Actor)]
 
 
+@contextmanager
+def same_distributions(model: Any) -> Iterator[None]:
+    """Leave action distributions as they are: what an update samples hangs on a graph, which no model can be copied with."""
+    distributions = [vars(actor.action_dist) for actor in actors_of(model)]
+    before = [values.copy() for values in distributions]
+    try:
+        yield
+    finally:
+        for values, old in zip(distributions, before, strict=True):
+            values.update(old)
+
+
 def check_compiler(device: th.device) -> None:
     """Compile something, before a model has collected its first transitions."""
     try:
@@ -116,11 +128,16 @@ class CompiledUpdate:
 
         # PyTorch limits how often a code object is compiled: each model has its own
         run.__code__ = run.__code__.replace()
+        self._made_from = update, device
         self._on_gpu = device.type == "cuda"
         mode = "reduce-overhead" if self._on_gpu else None
         self._run = th.compile(run, fullgraph=True, dynamic=False, backend=BACKEND, mode=mode)
         # One per group of parameters. A number would be a constant of the graph
         self._learning_rates: list[th.Tensor] = []
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # A graph belongs to this process and its model
+        return type(self), self._made_from
 
     @contextmanager
     def ready(self, model: Any, optimizers: Sequence[th.optim.Optimizer]) -> Iterator[Callable[..., Metrics]]:
@@ -131,8 +148,7 @@ class CompiledUpdate:
         from torch import _dynamo as dynamo  # Takes seconds
 
         groups = [group for optimizer in optimizers for group in optimizer.param_groups]
-        changed: list[dict[str, Any]] = [*groups, *(vars(actor.action_dist) for actor in actors_of(model))]
-        before = [values.copy() for values in changed]
+        before = [group.copy() for group in groups]
         if not self._learning_rates:
             self._learning_rates = [th.zeros((), device=model.device) for _ in groups]
             # CUDA graphs read and write them where they are
@@ -161,5 +177,5 @@ class CompiledUpdate:
             with th.no_grad(), dynamo.config.patch(trace_autograd_ops=True):
                 yield update
         finally:
-            for values, old in zip(changed, before, strict=True):
-                values.update(old)
+            for group, old in zip(groups, before, strict=True):
+                group.update(old)

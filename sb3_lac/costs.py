@@ -17,7 +17,7 @@ from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.sac.policies import Actor
 
-from sb3_lac.compiled import CompiledUpdate, Metrics, check_compiler, update_multiplier
+from sb3_lac.compiled import CompiledUpdate, Metrics, check_compiler, same_distributions, update_multiplier
 from sb3_lac.discounts import stated_discount
 from sb3_lac.files import replacing
 from sb3_lac.policies import LyapunovCritic, LyapunovPolicy
@@ -147,6 +147,11 @@ class CostAlgorithm(OffPolicyAlgorithm):
         if not 0 < self.lambda_min <= lambda_max < math.inf or not 0 < self.lambda_init < math.inf:
             limits = f"lambda_min={self.lambda_min}, lambda_init={self.lambda_init} and lambda_max={self.lambda_max}"
             raise ValueError(f"{limits} must be greater than 0 and finite, and the least of them lambda_min.")
+        for name in ("lambda_learning_rate", "critic_learning_rate"):
+            rate = getattr(self, name, None)
+            # Optimizers only check the rate that they are made with, which is ``learning_rate``
+            if rate is not None and not 0 <= FloatSchedule(rate)(1) < math.inf:
+                raise ValueError(f"{name}={rate} must start at a finite rate of at least 0.")
         if not 0 <= (self.reward_bound or 0.0) < math.inf:
             raise ValueError(f"reward_bound={self.reward_bound} must be finite and at least 0, what a termination pays.")
         if self.reward_bound and self.gamma == 1:
@@ -192,7 +197,7 @@ class CostAlgorithm(OffPolicyAlgorithm):
         prepared = super()._setup_learn(*args, **kwargs)
         vec_normalize = self._vec_normalize_env
         first = self._last_obs if vec_normalize is None else vec_normalize.get_original_obs()
-        refuse_what_is_not_finite("first observation", first, self.num_timesteps)
+        refuse_what_is_not_finite("environment gave the first observation", first, self.num_timesteps)
         return prepared
 
     def _store_transition(
@@ -210,8 +215,9 @@ class CostAlgorithm(OffPolicyAlgorithm):
         if vec_normalize is not None:
             said, paid = vec_normalize.get_original_obs(), vec_normalize.get_original_reward()
         last = [infos[index].get("terminal_observation") for index in np.flatnonzero(dones)]
+        refuse_what_is_not_finite("policy gave the action", buffer_action, self.num_timesteps)
         for name, value in (("reward", paid), ("observation", said), *(("last observation", obs) for obs in last)):
-            refuse_what_is_not_finite(name, value, self.num_timesteps)
+            refuse_what_is_not_finite(f"environment gave the {name}", value, self.num_timesteps)
         if self._n_updates == 0:
             self._terminations.see(paid, dones, infos)
         # The largest reward of a step, which n-step returns do not tell
@@ -289,7 +295,8 @@ class CostAlgorithm(OffPolicyAlgorithm):
         names: tuple[str, ...] = ()
         metrics_per_step: list[th.Tensor] = []
 
-        with nullcontext(self._update) if self._compiled is None else self._compiled.ready(self, optimizers) as update:
+        ready = nullcontext(self._update) if self._compiled is None else self._compiled.ready(self, optimizers)
+        with same_distributions(self), ready as update:
             for gradient_step in range(gradient_steps):
                 # Sample replay buffer
                 replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
@@ -402,7 +409,7 @@ def refuse_what_is_not_finite(name: str, value: Any, step: int) -> None:
             refuse_what_is_not_finite(f"{name} {key!r}", part, step)
     elif value is not None and np.asarray(value).dtype.kind == "f" and not np.isfinite(value).all():
         found = np.asarray(value)[~np.isfinite(value)].ravel()[0]
-        raise ValueError(f"The environment gave the {name} {found} at step {step}: all must be finite. See check_env().")
+        raise ValueError(f"The {name} {found} at step {step}: all must be finite. See check_env().")
 
 
 def reward_scale(vec_normalize: VecNormalize | None) -> float:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import inspect
-import math
+import sys
 from collections.abc import Mapping
-from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -63,8 +62,8 @@ def tensorboard_writer(logger: Logger) -> SummaryWriter | None:
 
 
 def _plain(value: Any) -> Any:
-    """A scalar of numpy or PyTorch as one of Python, which is what TensorBoard takes; anything else as it is."""
-    return value.item() if getattr(value, "shape", None) == () else value
+    """A single number of numpy or PyTorch as one of Python, which is what TensorBoard takes; anything else as it is."""
+    return value.item() if getattr(value, "shape", None) in ((), (1,)) else value
 
 
 def hyperparameters_of(model: BaseAlgorithm) -> dict[str, bool | str | float]:
@@ -150,7 +149,7 @@ class DashboardCallback(BaseCallback):
         # not every algorithm hands over what the environment said (ARS does not)
         said = [_plain(info.get("cost")) for info in self.locals.get("infos", ())]
         # Environments of others use that key for other things, too
-        costs = [float(cost) for cost in said if isinstance(cost, Real) and math.isfinite(cost)]
+        costs = [float(cost) for cost in said if isinstance(cost, (int, float)) and abs(cost) <= sys.float_info.max]
         if costs:
             self.logger.record_mean("rollout/cost_mean", float(np.mean(costs)))
         return True

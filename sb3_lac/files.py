@@ -13,7 +13,8 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     A place to write a file to, beside where it is to be. When the block ends the content goes to the disk, and then the file
     takes its name. If anything fails, all is as it was before.
     """
-    target = Path(path)
+    # A link stays one, and what it leads to is replaced
+    target = Path(os.path.realpath(path))
     target.parent.mkdir(parents=True, exist_ok=True)
     # A name that no process, thread or machine has but this; libraries go by the suffix
     part = target.with_name(f".{secrets.token_hex(8)}.part{target.suffix}")

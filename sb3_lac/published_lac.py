@@ -1,5 +1,6 @@
 from typing import Any, ClassVar
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
@@ -161,9 +162,15 @@ class PublishedLAC(CostAlgorithm):
                 raise ValueError("gamma must be smaller than 1 without a horizon: L would be an infinite sum.")
         elif isinstance(self.observation_space, spaces.Dict) or not issubclass(self.replay_buffer_class, HorizonReplayBuffer):  # type: ignore[arg-type]
             raise ValueError(f"horizon={self.horizon} needs a HorizonReplayBuffer, and observations that are no dictionaries.")
-        elif not 1 <= self.horizon <= self.learning_starts // self.n_envs:
-            limit = f"the steps before the first update, learning_starts={self.learning_starts} of {self.n_envs} environments"
-            raise ValueError(f"horizon={self.horizon} must be at least 1, and no more than {limit}.")
+        elif not isinstance(self.horizon, (int, np.integer)) or self.horizon < 1:
+            raise ValueError(f"horizon={self.horizon} must be a whole number of at least 1, or None.")
+
+    def load_replay_buffer(self, path: Any, truncate_last_traj: bool = True) -> None:
+        super().load_replay_buffer(path, truncate_last_traj)
+        if self.horizon is not None:
+            if not isinstance(self.replay_buffer, HorizonReplayBuffer):
+                raise ValueError(f"horizon={self.horizon} needs a HorizonReplayBuffer, and that of {path} is none.")
+            self.replay_buffer.horizon = self.horizon
 
     def _candidate(self, replay_data: Any, costs: th.Tensor) -> th.Tensor:
         """The Lyapunov candidate, the target of ``L``."""

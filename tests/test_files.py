@@ -149,6 +149,17 @@ def test_two_writers_of_one_process_id_disturb_each_other_in_nothing(package, tm
     assert not errors and len(set(path.read_bytes())) == 1 and list(path.parent.iterdir()) == [path]
 
 
+@pytest.mark.parametrize("package", [battery_env.files, sb3_lac.files], ids=["battery_env", "sb3_lac"])
+def test_a_link_stays_one_and_what_it_leads_to_is_replaced(package, tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    file, link = tmp_path / "elsewhere" / "model.zip", tmp_path / "best.zip"
+    file.write_text("old")
+    link.symlink_to(file)
+    with package.replacing(link) as part:
+        part.write_text("new")
+    assert link.is_symlink() and file.read_text() == "new"
+
+
 def test_of_two_writers_of_a_new_file_one_is_told(tmp_path):
     path = tmp_path / "cell.json"
     with pytest.raises(FileExistsError, match=r"cell\.json exists already"):

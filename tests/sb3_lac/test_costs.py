@@ -133,6 +133,14 @@ class Spoilt(gym.Wrapper):
         return obs, reward, terminated, truncated, info
 
 
+def test_the_environment_is_not_blamed_for_an_action(make_model, make_env):
+    env = make_env()
+    # A second action without a width, by which actions are scaled
+    env.action_space = spaces.Box(np.array([-1, 0], np.float32), np.array([1, 0], np.float32))
+    with np.errstate(invalid="ignore"), pytest.raises(ValueError, match="The policy gave the action nan at step 1"):
+        make_model(env)
+
+
 @pytest.mark.parametrize("wrapper", [None, in_dict])
 @pytest.mark.parametrize("normalized", [False, True])
 @pytest.mark.parametrize("number", [float("nan"), float("inf"), -float("inf")])

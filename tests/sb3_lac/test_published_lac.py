@@ -148,7 +148,7 @@ def test_defaults_are_those_of_the_paper_and_the_code():
 def test_horizon_sums_the_next_rewards_and_goes_on_with_the_last_one(data, horizon, n_envs, buffer_size):
     box = spaces.Box(-np.inf, np.inf, (1,), np.float64)
     buffer = HorizonReplayBuffer(buffer_size * n_envs, box, spaces.Box(-1, 1, (1,)), "cpu", n_envs, horizon=horizon)
-    n_steps = data.draw(st.integers(horizon, 3 * buffer_size))
+    n_steps = data.draw(st.integers(1, 3 * buffer_size))
     ends = np.array(
         data.draw(st.lists(st.lists(st.booleans(), min_size=n_envs, max_size=n_envs), min_size=n_steps, max_size=n_steps))
     )
@@ -165,9 +165,9 @@ def test_horizon_sums_the_next_rewards_and_goes_on_with_the_last_one(data, horiz
         summed, at = 0.0, step
         for _ in range(horizon):
             summed += rewards[at, env]
-            at += not ends[at, env]
-        # The steps of a horizon are known, and none was overwritten
-        assert total == summed and n_steps - buffer_size <= step <= n_steps - horizon
+            at += not ends[at, env] and at + 1 < n_steps
+        # The steps of a horizon are known, if there are so many, and none was overwritten
+        assert total == summed and n_steps - buffer_size <= step <= max(n_steps - horizon, 0)
 
 
 def test_normalized_costs_of_a_horizon_are_summed_in_units_of_the_agent(make_model, make_env):
@@ -184,8 +184,10 @@ def test_normalized_costs_of_a_horizon_are_summed_in_units_of_the_agent(make_mod
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
-        ({"horizon": 0}, "horizon=0 must be at least 1"),
-        ({"horizon": 41}, "horizon=41 must be .* no more than the steps before the first update, learning_starts=40"),
+        ({"horizon": 0}, "horizon=0 must be a whole number of at least 1"),
+        ({"horizon": 3.0}, r"horizon=3\.0 must be a whole number"),
+        ({"critic_learning_rate": -1e-3}, "critic_learning_rate=-0.001 must start at a finite rate of at least 0"),
+        ({"lambda_learning_rate": float("nan")}, "lambda_learning_rate=nan must start at a finite rate"),
         ({"gamma": 1.0}, "gamma must be smaller than 1 without a horizon"),
         ({"policy": LyapunovPolicy}, "PublishedLAC needs a policy derived from PublishedPolicy, and this is LyapunovPolicy"),
         ({"horizon": 3, "replay_buffer_class": HerReplayBuffer}, "needs a HorizonReplayBuffer"),
@@ -211,6 +213,20 @@ def test_horizon_can_be_changed_on_loading(make_model, tmp_path):
         env = make_model(n_collect=0).get_env()
         loaded = PublishedLAC.load(tmp_path / "model", env=env, horizon=after).learn(80)
         assert loaded.horizon == after and loaded._n_updates > 0
+
+
+def test_horizon_is_that_of_the_model_with_a_buffer_of_another_one(make_model, tmp_path):
+    model = make_model(algorithm=PublishedLAC, horizon=3)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    # It goes on without the buffer too: a horizon need not be there yet
+    assert PublishedLAC.load(tmp_path / "model", env=model.env).learn(20, reset_num_timesteps=False)._n_updates == 20
+    other = make_model(algorithm=PublishedLAC, n_collect=0, horizon=7)
+    other.load_replay_buffer(tmp_path / "buffer")
+    assert other.replay_buffer.horizon == 7
+    make_model(n_collect=1).save_replay_buffer(tmp_path / "plain")
+    with pytest.raises(ValueError, match="horizon=7 needs a HorizonReplayBuffer"):
+        other.load_replay_buffer(tmp_path / "plain")
 
 
 def test_model_of_another_algorithm_or_version_is_named(make_model, tmp_path):

@@ -1,3 +1,5 @@
+import copy
+import pickle
 import random
 
 import numpy as np
@@ -32,6 +34,15 @@ def assert_same_learned_state(model, other):
     assert_same(model.get_parameters(), other.get_parameters())
     for name in ("log_lambda", "log_ent_coef"):
         assert_same(getattr(model, name), getattr(other, name))
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda model: pickle.loads(pickle.dumps(model))])
+@pytest.mark.parametrize("algorithm", [LAC, PublishedLAC])
+def test_a_copy_goes_on_like_the_model_itself(make_model, train_metrics, algorithm, copied):
+    model = make_model(n_collect=50, algorithm=algorithm)
+    twin = copied(model)
+    assert_same(*(train_metrics(each, gradient_steps=5) for each in (model, twin)))
+    assert_same_learned_state(model, twin)
 
 
 @pytest.mark.parametrize(
