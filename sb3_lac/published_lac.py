@@ -67,8 +67,9 @@ class PublishedLAC(CostAlgorithm):
     :param lambda_max: Upper limit of ``lambda`` [C]. If ``None``, it is 1, or ``lambda_init`` if that is larger.
     :param reward_bound: Largest reward that the environment can pay, see ``LAC``
     :param compile_update: Whether to compile each update to one graph, see ``LAC``
-    :param kwargs: ``use_sde``, ``sde_sample_freq``, ``use_sde_at_warmup``, ``stats_window_size``, ``tensorboard_log``,
-        ``policy_kwargs``, ``verbose``, ``seed`` and ``device``, as those of ``LAC``
+    :param kwargs: ``n_steps`` (not of the paper, and not with a ``horizon``), ``use_sde``, ``sde_sample_freq``,
+        ``use_sde_at_warmup``, ``stats_window_size``, ``tensorboard_log``, ``policy_kwargs``, ``verbose``, ``seed`` and
+        ``device``, as those of ``LAC``
     :param _init_setup_model: Whether or not to build the network at the creation of the instance
     """
 
@@ -177,12 +178,13 @@ class PublishedLAC(CostAlgorithm):
         if self.horizon is not None:
             # A cost is the bound less the reward
             return self.horizon * (costs + replay_data.rewards) - replay_data.horizon_rewards
+        discounts = self.gamma if replay_data.discounts is None else replay_data.discounts
         with th.no_grad():
             next_actions = self.actor_target(replay_data.next_observations)
             next_values = self.critic_target.lyapunov(replay_data.next_observations, next_actions)
             # After a termination, each step costs the bound
             next_values = (1 - replay_data.dones) * next_values + replay_data.dones * self.critic.offset
-            return costs + self.gamma * next_values
+            return costs + discounts * next_values
 
     def _update(self, replay_data: ReplayBufferSamples, costs: th.Tensor, update_targets: bool) -> Metrics:
         # We need to sample because `log_std` may have changed between two gradient steps

@@ -170,6 +170,17 @@ def test_horizon_sums_the_next_rewards_and_goes_on_with_the_last_one(data, horiz
         assert total == summed and n_steps - buffer_size <= step <= max(n_steps - horizon, 0)
 
 
+def test_the_value_behind_n_steps_is_discounted_as_often(make_model, make_env):
+    model = make_model(make_env(episode_length=100), algorithm=PublishedLAC, n_steps=3, gamma=0.5, n_collect=50)
+    batch, seed = model.replay_buffer.sample(16), 0
+    th.manual_seed(seed)
+    targets = model._candidate(batch, -batch.rewards)
+    th.manual_seed(seed)
+    values = model.critic_target.lyapunov(batch.next_observations, model.actor_target(batch.next_observations))
+    assert batch.discounts.min() == 0.125
+    th.testing.assert_close(targets, batch.discounts * values.detach() - batch.rewards)
+
+
 def test_normalized_costs_of_a_horizon_are_summed_in_units_of_the_agent(make_model, make_env):
     env = VecNormalize(DummyVecEnv([lambda: make_env(offset=3.0)]))
     model = make_model(env, algorithm=PublishedLAC, horizon=3)
