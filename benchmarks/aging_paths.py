@@ -49,6 +49,7 @@ from battery_env.policies.pretrained import file_stem
 from battery_env.records import drawn
 from battery_env.records.discharge import BUNDLED_CELLS, Discharge
 from battery_env.records.model import RecordModel
+from benchmarks.cells import Together
 from benchmarks.study import (
     Study,
     Tables,
@@ -97,19 +98,6 @@ class Loads(RandomLoad):
         return RandomPiecewise((0.5, 3.0), unit="current")(rng)
 
 
-class Mean:
-    """The mean of the actions of policies; of none at all the action 0, which leaves the estimate to the fit."""
-
-    def __init__(self, policies: Sequence[Any]) -> None:
-        self.policies = policies
-
-    def predict(self, observation: Any, /, *, deterministic: bool = True) -> tuple[FloatArray, None]:
-        """Actions for a batch of observations."""
-        if not self.policies:
-            return np.zeros((len(observation), 2)), None
-        return np.mean([each.predict(observation, deterministic=deterministic)[0] for each in self.policies], axis=0), None
-
-
 def path_of(cells: Sequence[str], folder: Path) -> tuple[AgingPath, Path]:
     """The path of some lives, and its file."""
     file = folder / f"path_{'_'.join(cells)}.json"
@@ -155,7 +143,7 @@ def learned(judged: str, every: int, method: str, algo: str, seeds: Sequence[int
     """The discharges of a cell by policies that learned along the path of the other one, their actions averaged."""
     path = path_of([CELLS[judged]], folder)[0]
     policies = [train_or_load(recipe_of(algo, [CELLS[judged]], seed, folder), folder / "models") for seed in seeds]
-    estimator = PolicyEstimator(Mean(policies), ENV_ID, path=path, **OPTIONS)
+    estimator = PolicyEstimator(Together(policies), ENV_ID, path=path, **OPTIONS)
     wholes = [_Whole(each) for each in load_nasa_discharges(judged)[1::every]]
     rows = []
     for share in SHARES:

@@ -391,13 +391,15 @@ def simulated(fit: CellFit, cell: str, folder: Path) -> Path:
 
 
 class Together:
-    """Several policies as one: the mean of their actions."""
+    """Several policies as one: the mean of their actions. None at all leave both parameters to the fit that they would see."""
 
     def __init__(self, policies: Sequence[Predictor]) -> None:
         self.policies = policies
 
     def predict(self, observation: FloatArray, /, *, deterministic: bool = False) -> tuple[FloatArray, None]:
         """The mean action."""
+        if not self.policies:
+            return np.zeros((len(observation), len(PARAMETER_NAMES))), None
         actions = [policy.predict(observation, deterministic=deterministic)[0] for policy in self.policies]
         return np.mean(actions, axis=0), None
 

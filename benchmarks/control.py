@@ -5,7 +5,7 @@ that do not, and certificates.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -123,21 +123,22 @@ def summary(outcome: pd.DataFrame, tolerance: float) -> dict[str, float]:
     }
 
 
-def tried(policy: PolicyPredictor, env_id: str, episodes: int) -> pd.DataFrame:
-    """Try a policy under all conditions, and return one row each."""
+def tried_with(
+    policy: PolicyPredictor, env_id: str, episodes: int, arguments: Mapping[str, Any], make: Callable[..., Any] = gym.make
+) -> dict[str, float]:
+    """Try a policy in an environment that is made with some arguments."""
     problem = gym.make(env_id).unwrapped
     assert isinstance(problem, CostEnv)
+    return summary(roll_out(policy, partial(make, env_id, **arguments), episodes), problem.error_tolerance)
+
+
+def tried(policy: PolicyPredictor, env_id: str, episodes: int) -> pd.DataFrame:
+    """Try a policy under all conditions, and return one row each."""
     rows = []
     for condition, arguments in conditions(env_id).items():
-        outcome = roll_out(policy, partial(gym.make, env_id, **arguments), episodes)
-        rows.append(
-            {
-                "environment": env_id,
-                "disturbance": condition,
-                "arguments": ", ".join(f"{name}={value}" for name, value in arguments.items()),
-                **summary(outcome, problem.error_tolerance),
-            }
-        )
+        text = ", ".join(f"{name}={value}" for name, value in arguments.items())
+        described = {"environment": env_id, "disturbance": condition, "arguments": text}
+        rows.append(described | tried_with(policy, env_id, episodes, arguments))
     return pd.DataFrame(rows)
 
 

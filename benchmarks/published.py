@@ -17,7 +17,6 @@ costs. What is done is not done again when the command is repeated, so that seed
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +30,8 @@ from matplotlib.ticker import EngFormatter, PercentFormatter
 from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from battery_env.plotting import COLOUR_OF, COLOURS
-from benchmarks.control import roll_out, summary
-from benchmarks.stabilisation import REFERENCE, Contender, in_order, parts_of, undisturbed_table
+from benchmarks.control import tried_with
+from benchmarks.stabilisation import REFERENCE, Contender, in_order, parts_of, undisturbed_text
 from benchmarks.study import (
     Study,
     Tables,
@@ -46,7 +45,7 @@ from benchmarks.study import (
     table_of,
 )
 from sb3_lac import PublishedLAC
-from sb3_lac.envs import CostEnv, OscillatorEnv, reference_controller
+from sb3_lac.envs import OscillatorEnv, reference_controller
 from sb3_lac.stability.plots import format_log_axis
 
 #: How policies are drawn: colour and marker.
@@ -155,14 +154,11 @@ def contender(policy: str, env_id: str) -> Contender:
 
 def tried(policy: PolicyPredictor, env_id: str, episodes: int) -> list[dict[str, Any]]:
     """Try a policy with all disturbances, and return one row each."""
-    problem = gym.make(env_id).unwrapped
-    assert isinstance(problem, CostEnv)
     rows = []
     for disturbance, settings in DISTURBANCES[env_id].items():
         for setting, arguments in settings.items():
-            outcome = roll_out(policy, partial(make_env, env_id, **arguments), episodes)
             row = {"disturbance": disturbance, "setting": setting, "impulse": arguments.get("impulse", 0.0)}
-            rows.append(row | summary(outcome, problem.error_tolerance))
+            rows.append(row | tried_with(policy, env_id, episodes, arguments, make_env))
     return rows
 
 
@@ -207,11 +203,7 @@ def disturbed_table(results: pd.DataFrame) -> pd.DataFrame:
 
 def report(results: pd.DataFrame) -> str:
     """All tables, as Markdown."""
-    text = [
-        "Without disturbances. Costs and errors are interquartile means over seeds with 95 % intervals, shares of "
-        "episodes are means (least to most of a seed):\n",
-        markdown(undisturbed_table(results)),
-    ]
+    text = undisturbed_text(results)
     for env_id in results["environment"].unique():
         measure, title = MEASURES[env_id]
         seeds = "mean over seeds (least to most of a seed)" if measure == "died" else "each seed"

@@ -130,7 +130,7 @@ CONTENDERS = {
     "td3": Contender("td3", "TD3", COLOUR_OF["TD3"], "^"),
     "td3_common": Contender("td3", "TD3, LAC's setting", COLOUR_OF["TD3"], ">", settings="lac", hyperparameters=_NOISE),
     "tqc": Contender("tqc", "TQC", COLOUR_OF["TQC"], "D"),
-    "tqc_common": Contender("tqc", "TQC, LAC's setting", COLOUR_OF["TQC"], "d", settings="lac"),
+    "tqc_common": Contender("tqc", "TQC, LAC's setting", COLOUR_OF["TQC"], "*", settings="lac"),
     "metric_sac": Contender(_METRIC_SAC, "SAC, LAC's metric", COLOURS[4], "v", compiles=True),
 }
 #: How they are drawn: colour and marker.
@@ -261,6 +261,12 @@ def undisturbed_table(results: pd.DataFrame) -> pd.DataFrame:
     return table_of(results[results["disturbance"] == "none"], ["environment", "policy"], cells)
 
 
+def undisturbed_text(results: pd.DataFrame) -> list[str]:
+    """The same, as Markdown below what its numbers are."""
+    said = "Without disturbances. Costs and errors are interquartile means over seeds with 95 % intervals, shares of episodes "
+    return [f"{said}are means (least to most of a seed):\n", markdown(undisturbed_table(results))]
+
+
 def disturbed_table(results: pd.DataFrame, cell: Callable[[pd.DataFrame], str]) -> pd.DataFrame:
     """What each disturbance does, as one cell says of all tries of a policy."""
     conditions = results["disturbance"].unique()
@@ -307,9 +313,7 @@ def report(tables: Tables) -> str:
     results = tables["stabilisation"]
     return "\n".join(
         [
-            "Without disturbances. Costs and errors are interquartile means over seeds with 95 % intervals, shares of "
-            "episodes are means (least to most of a seed):\n",
-            markdown(undisturbed_table(results)),
+            *undisturbed_text(results),
             "Cost per step with each disturbance, interquartile mean over seeds:\n",
             markdown(disturbed_table(results, cost_of)),
             "Share of the episodes that end at the goal, and in brackets of those that die:\n",

@@ -11,7 +11,6 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
-from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
 from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, update_learning_rate
@@ -43,17 +42,8 @@ class CostAlgorithm(OffPolicyAlgorithm):
         self,
         policy: str | type[LyapunovPolicy],
         env: GymEnv | str,
-        learning_rate: float | Schedule,
-        buffer_size: int,
-        learning_starts: int,
-        batch_size: int,
-        tau: float,
+        *,
         gamma: float | str,
-        train_freq: int | tuple[int, str],
-        gradient_steps: int,
-        action_noise: ActionNoise | None,
-        replay_buffer_class: type[ReplayBuffer] | None,
-        replay_buffer_kwargs: dict[str, Any] | None,
         ent_coef: str | float,
         target_update_interval: int,
         target_entropy: str | float,
@@ -69,17 +59,7 @@ class CostAlgorithm(OffPolicyAlgorithm):
         super().__init__(
             policy,
             env,
-            learning_rate,
-            buffer_size,
-            learning_starts,
-            batch_size,
-            tau,
-            gamma,  # type: ignore[arg-type]  # a number from _setup_model() on
-            train_freq,
-            gradient_steps,
-            action_noise,
-            replay_buffer_class,
-            replay_buffer_kwargs,
+            gamma=gamma,  # type: ignore[arg-type]  # a number from _setup_model() on
             supported_action_spaces=(spaces.Box,),
             support_multi_env=True,
             **kwargs,

@@ -42,3 +42,13 @@ def squared_unless_it_ends_its_process(number, ends):
     if number in ends:
         os.kill(os.getpid(), signal.SIGKILL)
     return number**2
+
+
+def squared_after_ends_of_its_process(number, folder):
+    """A call that kills as many workers as its number says before it is made."""
+    ends = folder / f"ends_{number}"
+    if number > (ends.stat().st_size if ends.exists() else 0):
+        with ends.open("ab") as file:
+            file.write(b"x")
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number**2

@@ -120,6 +120,11 @@ def test_importing_a_package_registers_its_environments_and_loads_nothing_slow(p
     assert not HEAVY & {name.split(".")[0] for name in result.stdout.split()}
 
 
+def test_sb3_lac_does_without_batteries():
+    code = "import sys; sys.modules['battery_env'] = None; import sb3_lac"
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
+
+
 def test_kernels_are_compiled_where_there_is_no_place_to_keep_them():
     nowhere = "from numba.core import caching; caching.CompileResultCacheImpl._locator_classes = []"
     code = f"{nowhere}; from battery_env.electrochemistry.kernels import logarithm; print(logarithm(1.0))"

@@ -121,10 +121,32 @@ def run_briefly(source, name, folder, monkeypatch):
     exec(compile(source, name, "exec"), {"__name__": "__main__"})
 
 
+#: Lines of output that a training of some steps does not reach
+LEARNED = r"HOLDS|NOT SHOWN|  decreases "
+
+
+def form(line):
+    """A line of output without its numbers, which are others after a short training."""
+    return " ".join(re.sub(r"\d[\d.e+-]*", "#", line).split())
+
+
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=lambda page: page.name)
-def test_examples_in_pages_run(page, tmp_path, monkeypatch):
+def test_examples_in_pages_run_and_print_what_they_show(page, tmp_path, monkeypatch, capsys):
     for source in examples(page):
         run_briefly(source, str(page), tmp_path, monkeypatch)
+    printed = capsys.readouterr().out
+    shown = re.findall(r"^```python\n(?:(?!^```).)*^```\n\n```text\n(.*?)^```", page.read_text(encoding="utf-8"), re.M | re.S)
+    for text in shown:
+        if ".learn(" in page.read_text(encoding="utf-8"):
+            forms = {form(line) for line in printed.splitlines()}
+            assert not [line for line in text.splitlines() if not re.match(LEARNED, line) and form(line) not in forms]
+        else:
+            assert text in printed
+
+
+def test_tutorials_show_what_they_print():
+    for name in ("first_controller", "first_discharge", "own_problem", "cell_life"):
+        assert len(blocks(DOCS / f"{name}.md", "text")) >= 1, name
 
 
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda example: example.name)
@@ -154,19 +176,9 @@ def test_the_first_page_shows_what_the_calibrator_prints(capsys):
     assert capsys.readouterr().out.strip() == shown.strip()
 
 
-def test_the_tutorial_of_a_life_shows_what_its_forecast_prints(tmp_path, monkeypatch, capsys):
-    page = (DOCS / "cell_life.md").read_text(encoding="utf-8")
-    ((example, shown),) = re.findall(r"^```python\n((?:(?!```).)*?)^```\n\n```text\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
-    (remaining,) = re.findall(r"^```python\n((?:(?!```).)*remaining_discharges.*?)^```", page, re.MULTILINE | re.DOTALL)
-    monkeypatch.chdir(tmp_path)
-    names: dict[str, object] = {}
-    exec(example, names)
-    printed = capsys.readouterr().out
-    assert printed.startswith(shown)
-    exec(remaining, names)
-    assert f"`{capsys.readouterr().out.splitlines()[-1]}`" in page
-    low, high = re.search(r"end of discharge \(s\) +(\d+) +\d+ +(\d+)", printed).groups()
-    assert f"lies within {low} to {high} s" in (ROOT / "README.md").read_text(encoding="utf-8")
+def test_the_first_screen_names_the_interval_that_the_tutorial_of_a_life_shows():
+    (shown,) = re.findall(r"end of discharge \(s\) +(\d+) +\d+ +(\d+)", (DOCS / "cell_life.md").read_text(encoding="utf-8"))
+    assert f"lies within {shown[0]} to {shown[1]} s" in (ROOT / "README.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -233,6 +245,12 @@ def test_tables_of_the_guide_fit_the_column_of_the_site(name):
         for cell in row:
             words = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", cell).split()
             assert len(words) <= 25, f"{len(words)} words: {cell}"
+
+
+@pytest.mark.parametrize("name", STYLED)
+def test_code_of_the_guide_fits_the_column_of_the_site(name):
+    wide = [line for block in blocks(ROOT / f"{name}.md", "python") for line in block.splitlines() if len(line) > 97]
+    assert not wide
 
 
 def test_reports_are_short_enough_to_be_read():

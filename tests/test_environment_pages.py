@@ -41,11 +41,6 @@ def test_every_environment_has_a_page():
     assert {*TASKS, *DISTURBANCES} == set(environment_pages.IDS)
 
 
-def test_a_page_leads_to_the_pages_that_it_names():
-    page = environment_pages.environment_page("BatteryRo-v0")
-    assert page.startswith("# BatteryRo-v0\n") and "As [`BatteryQmax-v0`](BatteryQmax-v0.md), but R_o" in page
-
-
 def test_every_environment_has_all_sections_of_its_page():
     wanted = ["Description", "Observation space", "Action space", "Reward", "Starting state", "Episode end", "Arguments"]
     for env_id in TASKS:
@@ -112,31 +107,6 @@ def test_columns_in_the_page_are_those_of_the_evaluation(dataset):
 def test_all_plots_are_listed():
     functions = {name for name in vars(plotting) if name.startswith("plot_")}
     assert set(first_cells("compare_calibrators", "Plots")) == functions
-
-
-def documented():
-    """
-    Something.
-
-    ====== =========
-    name   meaning
-    ====== =========
-    ``a``  the first,
-           going on
-    ``b``, both
-    ``c``  of them
-    ====== =========
-
-    ====== =========
-    ``d``  alone
-    ====== =========
-    """
-
-
-def test_tables_of_docstrings_are_read_with_their_continued_lines():
-    one, other = environment_pages.tables_of(documented)
-    assert one == [["name", "meaning"], ["``a``", "the first, going on"], ["``b``, ``c``", "both of them"]]
-    assert other == [["``d``", "alone"]]
 
 
 def test_only_what_stands_between_markers_is_written(tmp_path, capsys):

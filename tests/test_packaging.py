@@ -2,7 +2,6 @@
 
 import configparser
 import email
-import importlib.resources
 import os
 import re
 import shutil
@@ -145,11 +144,6 @@ def test_each_wheel_says_what_it_is(wheels, package):
     assert metadata["Description-Content-Type"] == "text/markdown" and len(metadata.get_payload()) > 500
     assert metadata["License"] == "MIT" and metadata["Author"] and metadata["Summary"] and metadata["Keywords"]
     assert "Typing :: Typed" in metadata.get_all("Classifier") and metadata.get_all("Project-URL")
-
-
-@pytest.mark.parametrize("package", ["sb3_lac", "battery_env"])
-def test_packages_are_typed(package):
-    assert importlib.resources.files(package).joinpath("py.typed").is_file()
 
 
 @pytest.mark.parametrize("algo", ["lac", "sac", "td3"])

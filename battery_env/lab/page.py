@@ -96,7 +96,7 @@ def ahead(chosen: Found, life: Life | None, settings: Settings) -> None:
     figure.add_vrect(first, last, fillcolor=COLOURS[1], opacity=0.3, line_width=0, name="empty, 90 %", showlegend=True)
     figure.add_vline(x=end.now_s / 60.0, line_dash="dash", name="seen until here", showlegend=True)
     st.plotly_chart(figure)
-    st.caption(" ".join(end.notes))
+    st.caption(f"Of the part that was seen: {' '.join(end.notes)}" if end.notes else "")
 
 
 def main() -> None:

@@ -14,7 +14,7 @@ from importlib.resources import as_file, files
 from math import hypot
 from numbers import Real
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import pandas as pd
@@ -147,14 +147,22 @@ class Discharge:
     @property
     def load_on_time_s(self) -> float:
         """
-        When the load was switched on, s: midway between the last sample at rest and the first one under load, as the switch
-        falls between the two, but at most one interval of the samples under load before these. A rest is often logged more
-        seldom than a load.
+        When the load was switched on, s: when the tester says, or else midway between the last sample at rest and the first
+        one under load, as the switch falls between the two, but at most one interval of the samples under load before these. A
+        rest is often logged more seldom than a load.
         """
         first, _ = self._loaded
+        if self._is_load_on_told:
+            return cast(float, self.shown.load_on_s)
         if not first:
             return float(self.time_s[0])
         return float(switch_times_s(self.time_s, self.current_A, np.array([first - 1]))[0])
+
+    @property
+    def _is_load_on_told(self) -> bool:
+        """Whether the tester says when the load was switched on, as the rows may: after the last one at rest."""
+        first, told_s = self._loaded[0], self.shown.load_on_s
+        return told_s is not None and (not first or self.time_s[first - 1] <= told_s) and told_s <= self.time_s[first]
 
     @cached_property
     def _loaded(self) -> tuple[int, int]:
@@ -268,7 +276,8 @@ class Discharge:
         if first:
             starts_at_rest = bool(abs(self.current_A[resting]) <= REST_CURRENT_A)
             shown = shown._replace(rest_s=float(self.time_s[resting] - self.time_s[0]))
-            shown = shown._replace(load_on_C=load_on_sd_C(self.time_s, self.current_A, first, start_s))
+            if not self._is_load_on_told:
+                shown = shown._replace(load_on_C=load_on_sd_C(self.time_s, self.current_A, first, start_s))
         if (offset_A := rest_current_A(self.current_A)) is not None:
             shown = shown._replace(offset_A=offset_A)
         return self._derived(time_s=time_s, **columns, starts_at_rest=starts_at_rest, shown=shown)
@@ -372,20 +381,20 @@ def _bundled(cell: str) -> list[Discharge]:
 
 def read_nasa_mat(path: Path) -> list[tuple[dict[str, Any], dict[str, Any]]]:
     """The discharges of one of NASA's own files before they are checked."""
+    content: dict[str, Any] = {}
     try:
-        return _samples_of_mat(path, loadmat(path, simplify_cells=True))
+        content = loadmat(path, simplify_cells=True)
+        ((cell, value),) = ((name, value) for name, value in content.items() if isinstance(value, dict) and "cycle" in value)
+        return _samples_of_mat(cell, value)
     except FileNotFoundError:
         raise
     except Exception as error:  # scipy raises whatever the damage leads it to, and a field may be missing anywhere
-        raise ValueError(f"{path} is damaged, or not laid out as NASA's battery files: {error!r}") from error
-
-
-def _samples_of_mat(path: Path, content: dict[str, Any]) -> list[tuple[dict[str, Any], dict[str, Any]]]:
-    cells = {name: value for name, value in content.items() if isinstance(value, dict) and "cycle" in value}
-    if len(cells) != 1:
         names = ", ".join(name for name in content if not name.startswith("__"))
-        raise ValueError(f"{path} is not laid out as NASA's battery files: of its variables ({names}) one must be a cell")
-    cell, value = next(iter(cells.items()))
+        where = f"one of its variables ({names}) must be a cell with its cycles" if content else repr(error)
+        raise ValueError(f"{path} is damaged, or not laid out as NASA's battery files: {where}") from error
+
+
+def _samples_of_mat(cell: str, value: dict[str, Any]) -> list[tuple[dict[str, Any], dict[str, Any]]]:
     tests = [(n, test, _start_time(test["time"])) for n, test in enumerate(np.atleast_1d(value["cycle"]))]
     impedances = [(start, test["data"]) for _, test, start in tests if test["type"] == "impedance"]
     discharges = [entry for entry in tests if entry[1]["type"] == "discharge"]

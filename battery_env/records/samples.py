@@ -118,7 +118,9 @@ def check_column(name: str, values: ArrayLike, least_samples: int) -> FloatArray
 
 def _implausible(name: str, value: float, where: str = "") -> str:
     low, high, unit, hint = _PLAUSIBLE[name]
-    return f"{name} must lie within {low:g} .. {high:g} {unit}, got {value:g}{where}. {hint}"
+    # what is too low is of no other unit, as a negative voltage of a half cell
+    advice = f" {hint}" if value > high or low == -high else ""
+    return f"{name} must lie within {low:g} .. {high:g} {unit}, got {value:g}{where}.{advice}"
 
 
 def check_record(record: Record, least_samples: int = 1) -> Samples:

@@ -35,8 +35,11 @@ class ChargeBefore(NamedTuple):
 
     @property
     def tapered(self) -> bool:
-        """Whether the current fell to a tenth while the voltage was held, so that the cell took all that it could."""
-        return self.last_A <= SWITCH_SHARE * self.largest_A
+        """
+        Whether the current fell to a tenth while the voltage was held, so that the cell took all that it could; to a per cent,
+        as a tester stops by a reading that it need not write.
+        """
+        return round(self.last_A / self.largest_A, 2) <= SWITCH_SHARE
 
 
 class Shown(NamedTuple):
@@ -47,6 +50,7 @@ class Shown(NamedTuple):
         that was switched on then
     :param rest_s: how long the cell rested before the load, s
     :param charge: the charge before; ``None``: not recorded
+    :param load_on_s: when the load came on, as the tester says, on the clock of the record, s; ``None``: it does not
     :param load_on_C: standard deviation of the charge by the moment of load-on, which lies between two samples, C
     :param offset_A: what flows at rest, A
     :param is_counted: whether the tester counted the charge
@@ -56,6 +60,7 @@ class Shown(NamedTuple):
     at_rest: bool = False
     rest_s: float = 0.0
     charge: ChargeBefore | None = None
+    load_on_s: float | None = None
     load_on_C: float = 0.0
     offset_A: float = 0.0
     is_counted: bool = False

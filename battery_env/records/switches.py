@@ -12,7 +12,7 @@ from battery_env.compiled import compiled
 from battery_env.records.samples import SWITCH_SHARE
 
 # Samples no farther apart than this, s, are taken as they are: the current of each lasts until the next.
-_EXACT_S = 1.0
+_EXACT_S = 1.1
 
 #: What switches have made of the charge so far: the largest current; the last switch up and the last one down, and the
 #: standard deviations by each of both and by those like it before; the variance by all others; and how many there were.

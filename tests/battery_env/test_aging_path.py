@@ -7,8 +7,16 @@ import numpy as np
 import pandas as pd
 import pytest
 
-import battery_env
-from battery_env import AgingPath, LeastSquares, PolicyEstimator, TrajectoryDataset, evaluate, fit_life, load_nasa_discharges
+from battery_env import (
+    AgingPath,
+    LeastSquares,
+    PolicyEstimator,
+    TrajectoryDataset,
+    calibrate,
+    evaluate,
+    fit_life,
+    load_nasa_discharges,
+)
 from battery_env.electrochemistry import NEW_CELL, UNCERTAIN_CONSTANTS, simulate
 from battery_env.electrochemistry.aging_path import BEYOND_SHARE, PATH_NAMES, SPREAD_SD, cell_with
 from battery_env.electrochemistry.equilibrium import with_equilibrium
@@ -46,7 +54,9 @@ def life(cell=NEW_CELL, q_from=7200.0, q_to=5000.0):
 
 @pytest.fixture(scope="module")
 def path():
-    return fit_life(life())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        return fit_life(life())
 
 
 @pytest.fixture(scope="module")
@@ -205,19 +215,6 @@ class TestPrior:
         assert found.settled and not early.settled
         assert found.q_mobile == pytest.approx(LeastSquares(mismatch_V=0.05).estimate(whole).q_mobile, rel=0.015)
 
-    def test_the_model_with_what_was_found_follows_the_record(self, b0006):
-        whole = load_nasa_discharges("B0005")[100].loaded_part(2.7)
-        found = LeastSquares(path=b0006).estimate(whole)
-        shown_V = RecordModel(cell_with(b0006.cell, found.constants)).voltage(whole, found)
-        assert np.sqrt(np.mean((shown_V - whole.voltage_V)[1:] ** 2)) < 0.01
-
-    def test_a_cell_that_is_none_of_these_is_not_settled(self, path):
-        large = simulate(4.0, 15000.0, 0.06, load_unit="current", cut_off_V=2.7)
-        flat = with_equilibrium(NEW_CELL, [-0.35, 0.33, -0.05, 0.05])
-        phosphate = simulate(2.0, 6000.0, 0.12, load_unit="current", cell=flat, cut_off_V=2.5)
-        for made in (large, phosphate):
-            assert not LeastSquares(path=path).estimate(every_tenth(made)).settled
-
     @pytest.mark.parametrize(
         "others", [{"nuisance": {"kn": 0.2}}, {"parameters": ("q_mobile",)}, {"prior_q_mobile_C": (6000.0, 100.0)}]
     )
@@ -231,7 +228,7 @@ class TestCalibrations:
 
     def test_they_say_what_least_squares_say(self, b0006, tmp_path, capsys):
         file, running = b0006.to_json(tmp_path / "path.json"), load_nasa_discharges("B0005")[80].until(1500.0)
-        found = battery_env.calibrate(running, cell=b0006)
+        found = calibrate(running, cell=b0006)
         estimate = LeastSquares(path=b0006, current_gain_sd=0.005).estimate(running.loaded_part(2.7))
         assert (found.q_mobile_C, found.sd_q_mobile_C) == (estimate.q_mobile, estimate.sd_q_mobile)
         # with the constants that were found
@@ -317,12 +314,13 @@ class TestTask:
         # of cells of the path itself the double of what the fit states holds nearly always
         assert scores["q_mobile_coverage_percent"].mean() > 97.0
 
-    def test_cells_of_another_kind_are_not_settled(self, along):
+    def test_cells_of_another_kind_are_not_settled(self, along, path):
         large = simulate(4.0, 15000.0, 0.06, load_unit="current", cut_off_V=2.7)
         flat = with_equilibrium(NEW_CELL, [-0.35, 0.33, -0.05, 0.05])
         phosphate = simulate(2.0, 6000.0, 0.12, load_unit="current", cell=flat, cut_off_V=2.5)
         for made in (large, phosphate):
-            assert not along.estimate(every_tenth(made)).settled
+            for estimator in (along, LeastSquares(path=path)):
+                assert not estimator.estimate(every_tenth(made)).settled
 
     def test_it_knows_all_at_once(self, path):
         for others in ({"nuisance": 0.2}, {"mismatch": 0.2}):
@@ -338,9 +336,3 @@ class TestTask:
         assert steps.min() >= 1.0 and steps.max() <= 30.0 and len(np.unique(steps)) > 10
         with pytest.raises(ValueError, match=r"interval_s must be \(least, most\)"):
             BatteryVoltageJoint(1, dataset=data, path=path, reading_s=(20.0, 2.0))
-
-
-def test_fitting_a_life_warns_of_nothing():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert isinstance(battery_env.fit_life(life()[::2]), AgingPath)

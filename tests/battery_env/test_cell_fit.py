@@ -30,7 +30,6 @@ from battery_env.lab.running import forecast_end
 from battery_env.lab.settings import METHODS, Settings
 from battery_env.loads import constant as constant_load
 from battery_env.loads import in_steps
-from battery_env.plotting import plot_cell_fit
 from battery_env.policies.pretrained import pretrained_card
 from battery_env.records.discharge import Discharge
 
@@ -228,12 +227,6 @@ class TestRealCells:
         assert [discharge.name for discharge in b0005_fit.discharges] == ["B0005:1", "B0005:85", "B0005:168"]
         assert "B0005:85" in b0005_fit.summary()
         assert len(b0005_fit.constants_table()) == len(RATE_PRIOR_SD) + len(EQUILIBRIUM_PRIOR_SD_V)
-
-    def test_figure(self, b0005_fit):
-        figure = plot_cell_fit(b0005_fit, load_nasa_discharges("B0006")[99:101])
-        assert len(figure.axes) == 4
-        before, after = (np.abs(line.get_ydata()).mean() for line in figure.axes[2].lines[1:])
-        assert before > after > 0.0
 
 
 class TestFiles:

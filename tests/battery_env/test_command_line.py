@@ -15,7 +15,6 @@ import pytest
 import battery_env
 from battery_env.electrochemistry import NEW_CELL, CellParameters, Trajectory, initial_state, simulate
 from battery_env.electrochemistry.ends import MEMORY_SHARE
-from battery_env.estimators import fit_cell
 from battery_env.estimators.cell_fit import read_cell
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.lab import many
@@ -354,16 +353,6 @@ def test_a_load_that_ends_above_the_cut_off_is_told(recorded, tmp_path, terminal
     assert said not in (terminal.row(path, "--discharge-is-positive")["notes"] or "")
 
 
-def test_large_cells_are_fitted_and_calibrated(tmp_path, terminal):
-    load_A = np.append(np.zeros(60), np.full(4000, 2.0))
-    small = simulate(load_A, 6000.0, 0.15, load_unit="current", thermal=True, cut_off_V=2.65)
-    large = Discharge(small.time_s[::10], small.voltage_V[::10], 50.0 * small.current_A[::10])
-    path, cell = write(large, tmp_path / "large.csv"), tmp_path / "cell.json"
-    assert "at least 29" in (said := terminal.refuses(path)) and "--cell" in said
-    assert main(["fit", path, "--out", str(cell)]) == 3  # of one discharge, and so of one age
-    assert terminal.row(path, "--cell", cell)["q_mobile_C"] == pytest.approx(300_000.0, rel=0.01)
-
-
 def test_a_file_with_unknown_columns_lists_them_and_takes_them_from_the_command_line(recorded, tmp_path, terminal):
     path = tmp_path / "cell.csv"
     columns = {"t_min": recorded.time_s / 60.0, "a": 1e3 * recorded.voltage_V, "b": recorded.current_A}
@@ -427,16 +416,6 @@ def test_each_folder_of_records_is_a_cell(given, recorded, tmp_path, monkeypatch
     assert {row["record"]: row["cell"] for row in rows} == cells
     named = terminal.shows(*given, "--json", "--cell-name", "(00[0-9])").splitlines()
     assert {json.loads(line)["cell"] for line in named} == {"001", "002"}
-
-
-def test_a_file_without_a_discharge_is_a_row_with_an_error(recorded, tmp_path, capsys):
-    write(recorded, tmp_path / "good.csv")
-    pd.DataFrame({"time_s": 10.0 * np.arange(6), "voltage_V": 4.2, "current_A": 5 * [0.0] + [2.0]}).to_csv(
-        tmp_path / "aborted.csv"
-    )
-    assert main(["calibrate", str(tmp_path), "--discharge-is-positive", "--json"]) == 2
-    aborted, good = map(json.loads, capsys.readouterr().out.splitlines())
-    assert aborted["error"].startswith("aborted: only ") and good["settled"]
 
 
 @pytest.fixture(scope="module")
@@ -523,12 +502,6 @@ class TestInPython:
         with pytest.warns(UserWarning, match="DataFrame: discharge 2: the voltage falls to 0.00 V .* It is left out"):
             assert [each.cycle for each in battery_env.calibrate(table)] == [1, 3]
 
-    def test_all_that_a_fit_knows_is_used(self, recorded):
-        with pytest.warns(UserWarning, match="one age"):
-            fit = fit_cell([recorded], cut_off_V=2.75)
-        settings = battery_env.calibrate(recorded, cell=fit, method="kalman").settings
-        assert settings.cut_off_V == 2.75 and settings.mismatch_V == fit.mismatch_V
-
 
 def test_the_temperature_is_that_of_the_record_or_the_one_given(recorded, tmp_path, terminal):
     columns = {"time_s": recorded.time_s, "voltage_V": recorded.voltage_V, "current_A": recorded.current_A}
@@ -564,11 +537,6 @@ def test_many_samples_are_averaged_and_say_the_same(recorded, tmp_path, terminal
     assert rows[0]["averaged_over_s"] == 1.0 and rows[1]["averaged_over_s"] == 0.0
     assert rows[0]["q_mobile_C"] == pytest.approx(rows[1]["q_mobile_C"], rel=5e-4)
     assert rows[0]["r_o_ohm"] == pytest.approx(rows[1]["r_o_ohm"], rel=1e-3)
-
-
-def test_runs_as_a_module():
-    done = subprocess.run([sys.executable, "-m", "battery_env", "calibrate", "B0005:1"], capture_output=True, text=True)
-    assert done.returncode == 0 and "q_max" in done.stdout and done.stderr == ""
 
 
 def test_a_reader_that_leaves_ends_it_in_silence():

@@ -35,17 +35,6 @@ def test_resistance_is_that_of_a_simulated_pulse():
         assert dc_resistance_ohm(ESTIMATE, 3.0, duration_s, 0.6).value == pytest.approx(expected_ohm, rel=1e-9)
 
 
-def test_more_resistance_or_current_is_less_capacity_and_a_longer_pulse_more_resistance():
-    worn = Estimate(6000.0, 0.25, 60.0, 0.01)
-    assert capacity_Ah(worn, 2.0).value < capacity_Ah(ESTIMATE, 2.0).value < capacity_Ah(ESTIMATE, 1.0).value
-    # all that can move, as the current vanishes
-    assert capacity_Ah(ESTIMATE, 0.05).value == pytest.approx(6000.0 / 3600.0, rel=0.02)
-    resistances = [dc_resistance_ohm(ESTIMATE, 2.0, duration_s).value for duration_s in (1.0, 10.0, 60.0)]
-    assert resistances == sorted(resistances)
-    more_ohm = dc_resistance_ohm(worn, 2.0, 60.0).value - resistances[-1]
-    assert more_ohm == pytest.approx(0.1, rel=1e-3)
-
-
 @pytest.mark.parametrize("load_unit", ["current", "power"])
 def test_standard_deviations_are_those_of_drawn_parameters(load_unit):
     rng = np.random.default_rng(0)

@@ -163,15 +163,6 @@ class TestUncertainty:
             assert median_s == pytest.approx(left.time_s, abs=0.2 * left.sd_s)
             assert high_s - low_s == pytest.approx(3.29 * left.sd_s, rel=0.1)
 
-    def test_nine_of_ten_truths_lie_inside(self):
-        rng, inside, n = np.random.default_rng(0), 0, 40
-        for q_C in 6000.0 * np.exp(0.03 * rng.standard_normal(n)):
-            whole = discharged(4.0, q_C, load_unit="current")
-            record, estimate = whole.part(0, len(self.record.time_s)), Estimate(6000.0, 0.15, 180.0, 0.0)
-            low_s, _, high_s = forecast(record, estimate, model=MODEL, mismatch_V=0.0, samples=100).eod_quantile_s()
-            inside += low_s <= whole.eod_time_s <= high_s
-        assert 0.8 * n <= inside <= 0.98 * n
-
     def test_an_offset_that_the_record_shows_goes_on(self):
         record, cut_off_V = self.record, 3.2
         higher = Samples(record.time_s, record.voltage_V + 0.05, record.current_A)

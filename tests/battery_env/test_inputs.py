@@ -132,15 +132,15 @@ class TestEnvironments:
         return [env.step(action)[:2] for action in actions]
 
     def test_copies_go_on_as_the_original_does(self, data, env_id):
-        env = gym.make(env_id, dataset=data).unwrapped
-        env.reset(seed=3)
-        env.step(env.action_space.low)
-        twins = [copy.deepcopy(env), pickle.loads(pickle.dumps(env))]
-        expected = self.run(env)
-        for twin in twins:
-            for (observation, reward), (other, other_reward) in zip(expected, self.run(twin), strict=True):
-                np.testing.assert_array_equal(observation, other)
-                assert reward == other_reward
+        for env in (gym.make(env_id, dataset=data).unwrapped, gym.make_vec(env_id, num_envs=3, dataset=data)):
+            env.reset(seed=3)
+            env.step(env.action_space.low)
+            twins = [copy.deepcopy(env), pickle.loads(pickle.dumps(env))]
+            expected = self.run(env)
+            for twin in twins:
+                for (observation, reward), (other, other_reward) in zip(expected, self.run(twin), strict=True):
+                    np.testing.assert_array_equal(observation, other)
+                    np.testing.assert_array_equal(reward, other_reward)
 
     def test_actions_beyond_the_range_count_as_its_ends(self, data, env_id):
         env = gym.make(env_id, dataset=data).unwrapped

@@ -72,12 +72,6 @@ class TestAccuracy:
         far = ExtendedKalmanFilter().estimate(replace(record, voltage_V=record.voltage_V + 0.025))
         assert default.settled and not far.settled and "mismatch_V" in far.reason
 
-    @pytest.mark.parametrize(("thermal", "dt_s"), [(True, 0.5), (False, 2.0)])
-    def test_thermal_model_and_other_time_steps(self, thermal, dt_s):
-        record = measured(load=2.0, load_unit="current", thermal=thermal, dt=dt_s)
-        estimate = ExtendedKalmanFilter(thermal=thermal, dt_s=dt_s).estimate(record)
-        assert (estimate.q_mobile, estimate.r_o) == pytest.approx((6000.0, 0.15), rel=5e-3)
-
 
 class TestUncertainty:
     def test_a_full_cell_says_nothing_about_charge_and_a_whole_discharge_all(self):
@@ -100,14 +94,6 @@ class TestGuards:
         assert (trace.q_mobile > drawn_C).all()
         assert trace.q_mobile[-1] == pytest.approx(6000.0, rel=0.03)
 
-    def test_estimates_stay_within_their_bounds_and_do_not_settle_there(self):
-        filter_ = ExtendedKalmanFilter(
-            prior_q_mobile_C=(7000.0, 300.0), q_mobile_bounds_C=(6500.0, 8000.0), r_o_bounds_ohm=(0.05, 0.14)
-        )
-        (trace,) = filter_.trace([measured()])
-        assert trace.q_mobile.min() >= 6500.0 and trace.r_o.max() <= 0.14
-        assert not trace.settled[-1]
-
     def test_collapse_of_the_voltage_is_survived(self):
         # 16 W at 0.2 ohm: half a minute
         estimate = ExtendedKalmanFilter().estimate(measured(6000.0, 0.2, 16.0))
@@ -124,15 +110,6 @@ class TestOnline:
             for name in (field.name for field in fields(EstimateTrace)):
                 np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
         assert filter_.estimate(records[1]).q_mobile == batch[1].q_mobile[-1]
-
-    def test_a_current_of_the_wrong_sign_is_refused(self):
-        filter_ = ExtendedKalmanFilter()
-        with pytest.raises(ValueError, match="this record draws -76 C in total"):
-            for _ in range(60):
-                filter_.update(4.0, -2.0, 1.0)
-        record = measured()
-        with pytest.raises(ValueError, match="current_A is positive in discharge"):
-            filter_.trace([replace(record, current_A=-record.current_A)])
 
     @pytest.mark.parametrize(
         ("arguments", "message"),

@@ -209,23 +209,8 @@ class TestNuisanceConstants:
             more, less = (search.residual(values | {name: values[name] + sign * step}, priors)[0] for sign in (1, -1))
             np.testing.assert_allclose(column, (more - less) / (2.0 * step), rtol=1e-4, atol=1e-8)
 
-    def test_constants_that_are_known_are_not_moved(self):
-        record = discharged_otherwise()
-        known = LeastSquares(nuisance=dict.fromkeys(OFF, 1e-6), voltage_noise_V=0.005).estimate(record)
-        alone = LeastSquares(voltage_noise_V=0.005).estimate(record)
-        for name in ("q_mobile", "r_o", "sd_q_mobile", "sd_r_o"):
-            assert getattr(known, name) == pytest.approx(getattr(alone, name), rel=1e-4)
-
 
 class TestRealDischarges:
-    @pytest.mark.parametrize("cycle", [1, 90, 168])
-    def test_q_mobile_tracks_the_measured_capacity_and_predicts_the_end(self, b0005, cycle):
-        record, fit = b0005[cycle - 1], LeastSquares(thermal=True, mismatch_V=0.05)
-        estimate = fit.estimate(record)
-        assert 1.03 < estimate.q_mobile / (3600.0 * record.meta["capacity_Ah"]) < 1.07
-        assert 0.09 < estimate.r_o < 0.17
-        assert estimate.settled
-        assert abs(fit.model.forecast(record, estimate, 2.7).eod_time_s - record.time_s[-1]) < 0.01 * record.time_s[-1]
 
     @pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
     def test_an_unfinished_one_is_not_settled_and_a_prior_repairs_it(self, b0005, share):

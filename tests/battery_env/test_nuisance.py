@@ -85,27 +85,6 @@ def test_steps_repeated_find_what_is_off(data, unknown):
         assert not np.delete(found[: len(UNKNOWNS)], n).any()
 
 
-def test_it_states_how_far_off_it_may_be(data):
-    trajectory = data[0]
-    noises = np.random.default_rng(0).normal(0.0, 0.005, (50, len(trajectory.time_s)))
-    prior_sd = (1000.0, 0.1, 1e-9, *[1e-9] * 4)
-    found = np.array(
-        [
-            step(
-                Samples(trajectory.time_s, trajectory.voltage_V + noise, trajectory.current_A),
-                trajectory.q_mobile,
-                trajectory.r_o,
-                prior_sd=prior_sd,
-            )
-            for noise in noises
-        ]
-    )
-    assert found[:, 2 * len(UNKNOWNS)] == pytest.approx(0.005, rel=0.1)
-    for n in (0, 1):
-        stated = found[:, len(UNKNOWNS) + n].mean()
-        assert 0.6 < found[:, n].std() / stated < 1.6
-
-
 class TestTask:
 
     def test_it_is_shown_behind_the_rest_of_the_observation(self, data):

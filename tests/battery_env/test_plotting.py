@@ -8,21 +8,18 @@ import pytest
 
 from battery_env.electrochemistry import simulate
 from battery_env.estimators import CramerRaoBound, Estimate, EstimateTrace, sensitivities
-from battery_env.files import replacing
 from battery_env.lab.forecast import forecast
 from battery_env.plotting import (
     COLOUR_OF,
     COLOURS,
     LABELS,
     coloured,
-    new_figure,
     plot_discharge,
     plot_estimates,
     plot_learning_curves,
     plot_life,
     plot_sensitivities,
     plot_true_against_inferred,
-    save_figure,
 )
 from battery_env.records import Samples
 from battery_env.records.model import RecordModel
@@ -112,22 +109,6 @@ def test_sensitivities_are_drawn_as_what_one_percent_more_changes_in_millivolts(
     upper, lower = plot_sensitivities({"2 A": slopes}, Estimate(6000.0, 0.15)).axes
     np.testing.assert_allclose(upper.lines[0].get_ydata(), 1e3 * 60.0 * slopes.by_q_mobile_V_per_C)
     np.testing.assert_allclose(lower.lines[0].get_ydata()[100:], 1e3 * 0.0015 * -2.0, atol=1e-3)
-
-
-def test_a_figure_replaces_the_one_before(tmp_path):
-    path = tmp_path / "folder" / "figure.png"
-    for _ in range(2):
-        save_figure(new_figure(2.0, 2.0), path)
-        assert path.read_bytes().startswith(b"\x89PNG") and list(path.parent.iterdir()) == [path]
-
-
-def test_a_failed_write_leaves_what_was_there(tmp_path):
-    path = tmp_path / "table.csv"
-    path.write_text("old")
-    with pytest.raises(RuntimeError), replacing(path) as part:
-        part.write_text("half")
-        raise RuntimeError
-    assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
 
 
 def life(cells):

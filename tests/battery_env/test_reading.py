@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from battery_env import Settings, calibrate, load_nasa_discharges, read_discharges
 from battery_env.lab import many
 from battery_env.lab.command_line import calibrate as command
+from battery_env.lab.readers.discharges import Recording
 
 RECORD = load_nasa_discharges("B0006")[99]
 TABLE = pd.DataFrame({"time": RECORD.time_s, "voltage": RECORD.voltage_V, "current": -RECORD.current_A})
@@ -84,6 +85,7 @@ def test_a_unit_of_another_quantity_rules_a_column_out(unit, names):
     ("values", "name", "said"),
     [
         (25.0, "T1(?)", "the unit of 'T1(?)' is not known (--units temperature=UNIT). It is left out"),
+        (0.0, "Temperature (C)", "holds 0 in all rows, as without a sensor. It is left out"),
         (-2501.7, "Temperature (C)", "must hold temperatures, got -2501.7 degC. It is left out"),
         ("--", "Temperature (C)", "got '--' in row 1. It is left out"),
         (297.0, "Temperature", "in kelvin, --units temperature=K says so. It is left out"),
@@ -148,8 +150,45 @@ def test_a_power_or_a_charge_a_row_tells_the_current(unit, factor):
     table = TABLE.assign(**{"dq/mA.h": steps_C / 3.6}).drop(columns="current")
     found = read(table, "the current is the charge dq/mA.h over the time since the row before")
     np.testing.assert_allclose(found.current_A[1:], RECORD.current_A[1:])
+    assert found.shown.uncounted_C == 0.0
+    # which is no matter of the voltage
+    same(read(table.assign(Power=0.0).rename(columns={"Power": "P/W"}), "the current is the charge"), atol=2.0)
     # nobody needs them beside a current
     same(read(TABLE.assign(Power="?", **{"dq/mA.h": "?"})))
+
+
+DAYS = 45000.3 + RECORD.time_s / 86400.0
+DATES = [f"{date:%d.%m.%Y %H:%M:%S}" for date in pd.Timestamp("2026-02-27 23:50") + pd.to_timedelta(RECORD.time_s, unit="s")]
+
+
+@pytest.mark.parametrize(("unit", "in_a_second"), [("minutes", 1 / 60), ("hours", 1 / 3600), ("milliseconds", 1e3), ("", 1.0)])
+@pytest.mark.parametrize("beside", [{"DPT Time": DATES}, {"Zeit": DAYS}, {"Date_Time(s)": 5.0 + RECORD.time_s}])
+def test_dates_tell_what_a_clock_without_a_unit_counts(unit, in_a_second, beside):
+    table = TABLE.assign(time=in_a_second * RECORD.time_s, **beside).rename(columns={"time": "TestTime"})
+    table["Step Time"] = table["TestTime"]
+    same(read(table, f"'TestTime' counts {unit}, as '{next(iter(beside))}' tells" if unit else ""))
+    # a clock that has a unit is believed, and one that nearly agrees tells nothing
+    same(read(TABLE.rename(columns={"time": "Test Time / s"}).assign(**beside)))
+    same(read(TABLE.assign(Zeit=1.02 * DAYS * 60.0)))
+
+
+@pytest.mark.parametrize("with_step", [True, False])
+@pytest.mark.parametrize("gap_s", [0.0, 3600.0])
+@pytest.mark.parametrize("dates", ["%Y-%m-%d %H:%M:%S.%f", "%d.%m.%Y %H:%M:%S", None])
+def test_dates_are_the_clock_where_another_one_starts_anew_with_each_step(with_step, gap_s, dates):
+    step = np.searchsorted([60, len(CHARGE) + len(REST) + LOAD_ON], np.arange(len(CYCLE)), side="right")
+    date = pd.Timestamp("2026-02-27 23:50") + pd.to_timedelta(CYCLE["time"] + np.where(step == 2, gap_s, 0.0), unit="s")
+    table = CYCLE.assign(time=CYCLE["time"] - CYCLE.groupby(step)["time"].transform("first"))
+    table["Absolute Time"] = date.dt.strftime(dates) if dates else date
+    if with_step:
+        table["Step"] = step
+    found = read(table, "the time is 'Absolute Time', as 'time' goes back")
+    assert found.time_s[-1] - found.time_s[0] == pytest.approx(600.0 + RECORD.time_s[-1] + gap_s, abs=1.0)
+    assert found.loaded_part(2.7).charge_C == pytest.approx(RECORD.loaded_part(2.7).charge_C, rel=5e-3)
+    # dates that tell fewer rows apart are no better
+    table["Absolute Time"] = date.dt.floor("30s")
+    if with_step:
+        read(table, "the time starts anew with each step, and is added up")
 
 
 @settings(max_examples=40, deadline=None)
@@ -253,6 +292,17 @@ def test_a_header_that_comes_again_is_left_out(places, tmp_path):
     same(read(tmp_path / "cell.csv", "the header comes again, and is left out"))
 
 
+@pytest.mark.parametrize("around", [(["[Summary]", "Cell: 7", "[Data]"], []), (["99,TABLE"], ["s,V vs. Ref.,A"])])
+def test_what_is_said_around_a_header_that_comes_again_is_left_out_with_it(around, tmp_path):
+    header, *lines = TABLE.rename(columns={"time": "T", "voltage": "Vf", "current": "Im"}).to_csv(index=False).splitlines()
+    above = [f"[Save data when time > {n} seconds]" for n in range(700)]  # as in the protocol of a test
+    (tmp_path / "cell.dta").write_text(
+        "\n".join([*above, header, *around[1], *lines[:100], *around[0], header, *around[1], *lines[100:]])
+    )
+    same(read(tmp_path / "cell.dta", "the header comes again, and is left out: row 10"))
+    assert [source.stem for source in many.find_sources([str(tmp_path)])] == ["cell"]
+
+
 @pytest.mark.parametrize("ends", [(1, 0), (0, 1), (3, 2)])
 def test_rows_without_a_cell_at_the_ends_are_named(ends):
     def dead(count):
@@ -272,17 +322,42 @@ def test_a_row_a_step_is_no_record():
         read_discharges(table)
 
 
-def test_the_time_in_a_step_tells_when_the_load_was_switched_on():
+@pytest.mark.parametrize("gap_s", [0.0, 100.0])
+@pytest.mark.parametrize(("share", "off_s"), [(0.05, 0.0), (0.5, 0.0), (0.9, 0.0), (1.0, 0.6e-3)])
+@pytest.mark.parametrize("with_step", [True, False])
+def test_the_time_in_a_step_tells_when_the_load_was_switched_on(gap_s, share, off_s, with_step):
+    before_s = share * float(np.diff(RECORD.time_s)[LOAD_ON - 1])
     after = RECORD.time_s - RECORD.time_s[LOAD_ON]
-    table = TABLE.assign(time=np.where(LOADED | (after > 0), RECORD.time_s + 100.0, RECORD.time_s))
-    table["Step"] = np.cumsum(np.arange(len(table)) == LOAD_ON)
-    table["Step Time (s)"] = np.where(after >= 0, after + 0.5, RECORD.time_s)
-    found = read(table, "the rest is taken to last until 0.5 s before row")
-    assert found.load_on_time_s == pytest.approx(RECORD.time_s[LOAD_ON] + 100.0, abs=0.5)
-    near(found, 4e-3)
+    table = TABLE.assign(time=RECORD.time_s + np.where(after >= 0.0, gap_s, 0.0))
+    table["Step Time (s)"] = np.where(after >= 0.0, after + before_s + off_s, RECORD.time_s)
+    if with_step:
+        table["Step"] = np.cumsum(np.arange(len(table)) == LOAD_ON)
+    found = read(table, f"the rest is taken to last until {before_s + off_s:g} s before row" if gap_s else "")
+    on_s = RECORD.time_s[LOAD_ON] + gap_s - before_s
+    assert found.load_on_time_s == pytest.approx(on_s, abs=2e-3)
+    part = found.loaded_part(2.7)
+    told_C = before_s * found.current_A[LOAD_ON]
+    usual_C = (RECORD.time_s[LOAD_ON] - RECORD.load_on_time_s) * found.current_A[LOAD_ON]
+    assert part.charge_C == pytest.approx(RECORD.loaded_part(2.7).charge_C + told_C - usual_C, abs=0.1)
+    assert part.shown.load_on_C == 0.0
+    # a step that began elsewhere, or does not count, tells nothing
+    for other in (after + 500.0, 0.0 * after):
+        assert read(table.assign(**{"Step Time (s)": other})).shown.load_on_s is None
 
 
-WORDS = [("Charge", "Rest", "Discharge"), ("CHA", "PAU", "DCH"), ("Laden", "Ruhe", "Entladen"), ("CC_Chg", "Rest", "CC_DChg")]
+def test_a_row_of_the_step_before_its_load_changes_nothing():
+    after = RECORD.time_s - RECORD.time_s[LOAD_ON - 1]
+    table = TABLE.assign(**{"Step": (after >= 0).astype(int), "Step Time (s)": np.where(after >= 0.0, after, RECORD.time_s)})
+    assert read(table).load_on_time_s == pytest.approx(RECORD.time_s[LOAD_ON - 1])
+
+
+WORDS = [
+    ("恒流充电", "搁置", "恒流放电"),
+    ("Charge", "Rest", "Discharge"),
+    ("CHA", "PAU", "DCH"),
+    ("Laden", "Ruhe", "Entladen"),
+    ("CC_Chg", "Rest", "CC_DChg"),
+]
 
 
 @pytest.mark.parametrize("words", [*WORDS, ("C", "R", "D"), ("1C charge", "wait", "1C discharge")])
@@ -322,6 +397,17 @@ def test_the_jumps_at_the_switches_tell_the_sign_though_a_long_rest_follows(sign
         assert discharge.charge_C == pytest.approx(record.charge_C, rel=0.01)
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("every_s", [20.0, 60.0, 200.0])
+def test_a_current_that_falls_while_the_voltage_is_held_does_not_turn_the_sign(sign, every_s):
+    table = TABLE[LOADED & (TABLE["voltage"] > 2.8)]
+    held_s = np.arange(1.0, 20.0) * every_s
+    held = pd.DataFrame({"time": held_s, "voltage": 2.8, "current": table["current"].iloc[-1] * np.exp(-held_s / 300.0)})
+    held["time"] += table["time"].iloc[-1]
+    found = read(pd.concat([table, held]).assign(current=lambda rows: sign * rows["current"]))
+    assert found.current_A.min() > 0.0
+
+
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 4), st.integers(1, 40), st.booleans())
 def test_the_number_of_the_cycle_parts_no_rest_from_its_load_and_no_discharge(before, loops, with_charge):
@@ -351,6 +437,23 @@ def hybrid(counter):
     return table, charge_C.iloc[-1]
 
 
+@pytest.mark.parametrize(("pulse_s", "found"), [(5, 1), (10, 1), (40, 1), (55, 12)])
+def test_pulses_within_a_charge_are_no_discharges(pulse_s, found):
+    # 360 C and a pulse twelve times, and then the whole discharge; larger ones are cycles
+    minute_s = np.mod(np.arange(0.0, 3600.0, 5.0), 300.0)
+    current_A = np.where(minute_s < 240.0, 1.5, np.where(minute_s < 240.0 + pulse_s, -1.5, 0.0))
+    voltage_V = 3.6 + 0.6 * np.cumsum(current_A) / np.cumsum(current_A).max() + 0.05 * current_A
+    pulses = pd.DataFrame({"time": np.arange(0.0, 3600.0, 5.0), "voltage": voltage_V, "current": current_A})
+    table = pd.concat([pulses, REST, CYCLE[len(CHARGE) + len(REST) :]], ignore_index=True)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        discharges = read_discharges(table)
+    assert len(discharges) == found
+    assert any("within charges" in str(each.message) for each in caught) == (pulse_s == 40)
+    np.testing.assert_allclose(discharges[-1].current_A[-len(TABLE) :], RECORD.current_A)
+    assert discharges[-1].charge_C == pytest.approx(RECORD.charge_C, rel=0.03)
+
+
 @pytest.mark.parametrize("counter", range(6))
 def test_loops_of_pulses_are_one_discharge_wherever_the_counter_goes_up(counter):
     table, charge_C = hybrid(counter)
@@ -360,6 +463,8 @@ def test_loops_of_pulses_are_one_discharge_wherever_the_counter_goes_up(counter)
 
 @pytest.mark.parametrize("order", ["stacked", "mixed"])
 def test_the_cells_of_a_table_are_told_apart(order, tmp_path, capsys):
+    for nobody in (None, np.nan, ""):
+        same(read(TABLE.assign(**{"Cell ID": nobody})))
     other = load_nasa_discharges("B0005")[99]
     second = pd.DataFrame({"time": other.time_s, "voltage": other.voltage_V, "current": -other.current_A, "cell_id": "B 5"})
     table = pd.concat([TABLE.assign(cell_id="B6"), second])
@@ -375,7 +480,12 @@ def test_the_cells_of_a_table_are_told_apart(order, tmp_path, capsys):
 
 
 def test_lines_that_are_quoted_as_a_whole_are_read(tmp_path):
-    (tmp_path / "cell.csv").write_text("".join(f'"{line}"\n' for line in TABLE.to_csv(index=False).splitlines()))
+    lines = [f'"{line}"\n' for line in TABLE.to_csv(index=False).splitlines()]
+    for above in ([], ["[Summary]\n", "Cell: 7, of 9\n"]):
+        (tmp_path / "cell.csv").write_text("".join([*above, *lines]))
+        same(read(tmp_path / "cell.csv"))
+    text = TABLE.rename(columns={"time": "总时间(s)", "voltage": "电压(V)", "current": "电流(A)"}).to_csv(index=False)
+    (tmp_path / "cell.csv").write_text(text, encoding="gb18030")
     same(read(tmp_path / "cell.csv"))
 
 
@@ -452,6 +562,10 @@ def test_a_folder_reads_numbered_text_and_names_what_it_left_out(tmp_path, capsy
         ({"voltage": TABLE["voltage"] * 1e4}, "must lie within 0 .. 5.5 V", "--units"),
         ({"current": TABLE["current"] * 1e-3}, "state the unit of the current", "--units"),
         ({"current (A)": TABLE["current"] * 1e-3, "current": None, "voltage": 4.1}, "a cell rests: no discharge", "unit"),
+        # an open-circuit voltage that falls when the cell is taken out
+        ({"current (A)": 1e-6 * (TABLE.index == 7), "current": None}, "a cell rests: no discharge", "unit"),
+        ({"voltage": TABLE["voltage"] - 2.71}, "must lie within 0 .. 5.5 V, got -0.0", "pack"),
+        ({"current": 30.0 + TABLE["time"], "voltage": 1.0}, "cannot be told", "zero-size"),
     ],
 )
 def test_advice_is_given_only_if_it_helps_and_does_not_contradict_what_is_known(changes, said, unsaid):
@@ -467,6 +581,14 @@ def test_the_charge_of_a_cell_of_any_size_is_known_and_where_it_is_small_its_con
     assert found.drawn_Ah == pytest.approx(share * RECORD.loaded_part(2.7).charge_C / 3600.0, rel=0.01)
     assert found.capacity_Ah == pytest.approx(found.drawn_Ah) and not found.settled
     assert share > 0.05 or found.reason.startswith("No cell of this kind has such a q_max")
+
+
+@pytest.mark.parametrize(("stated", "advised"), [(frozenset(), True), (frozenset({"sign"}), False)])
+def test_a_sign_that_was_told_from_the_data_is_not_advised_to_be_another(stated, advised):
+    arrays = {"time_s": RECORD.time_s, "voltage_V": RECORD.voltage_V, "current_A": -RECORD.current_A}
+    with pytest.raises(ValueError, match=r"this record draws -\d+") as caught:
+        Recording(arrays, {}, stated).discharge()
+    assert ("--discharge-is-negative" in str(caught.value)) == advised
 
 
 def test_a_sign_that_was_stated_is_not_advised_again():
@@ -501,11 +623,18 @@ class TestCountedByTheTester:
         ):
             shown = read(TABLE.assign(**{name: values})).shown
             assert shown.is_counted and shown.uncounted_C == 0.0
+        # nor a name that is a unit, nor a count without a sign of what comes back
+        assert read(TABLE.assign(**{"Amp-hr": self.COUNTED})).shown.uncounted_C == 0.0
+        current_A = TABLE["current"].where(TABLE.index != 200, 1.0)
+        passed = np.append(0.0, np.cumsum(np.abs(current_A.to_numpy()[:-1]) * np.diff(TABLE["time"]))) / 3600.0
+        assert read(TABLE.assign(current=current_A, **{"Capacity(Ah)": passed})).shown.uncounted_C == 0.0
         # nor a column that is no count
         assert not read(TABLE.assign(**{name: 2.0})).shown.is_counted
 
     @pytest.mark.parametrize("gain", [0.5, 0.9, 0.97, 1.03, 1.1, 2.0])
     def test_what_does_not_is_said_and_is_a_doubt_of_its_size(self, gain):
+        for name, ticks in (("Amp-hr", 1.0), ("Capacity(mAs)", 3.6e6)):
+            assert read(TABLE.assign(**{name: ticks * gain * self.COUNTED}), "the tester counted").shown.uncounted_C > 0.0
         discharge = read(TABLE.assign(**{"Capacity(Ah)": gain * self.COUNTED}), "the tester counted")
         charge_C = 3600.0 * self.COUNTED[-1]
         assert discharge.shown.uncounted_C == pytest.approx(abs(gain - 1.0) * charge_C, rel=0.1)

@@ -37,11 +37,6 @@ def test_linear_part_is_that_of_the_simulation(aged_both, readings):
         np.testing.assert_allclose(readings.ohmic_A[part] * trajectory.r_o, trajectory.state[at, VO], atol=1e-9)
 
 
-def test_the_true_parameters_explain_a_discharge(readings):
-    rms_V = compare(readings, readings.q_mobile, readings.r_o)[3]
-    assert rms_V.max() < 2e-4  # a step of ten seconds for the overpotentials; the prototype of a fixed table had 1.6 mV
-
-
 def test_misfit_is_that_of_a_whole_simulation(aged_both, readings):
     """Also where the parameters are wrong: against simulations that follow the same current."""
     q_mobile, r_o = np.full(len(readings), 7600.0), np.full(len(readings), 0.15)

@@ -84,6 +84,14 @@ COLUMNS = {
         "elapsed time [min]", "U (mV)", "I [mA]", "Temp (K)", (1.0 / 60.0, 1e3, 1e3), zero_C=273.15
     ),
     "hours": named("Time (h)", "Volts", "Amps", "temperature", (1.0 / 3600.0, 1.0, 1.0)),
+    "Gamry": named("T", "Vf", "Im", "temp 1"),
+    "Basytec": named("~Time[h]", "U[V]", "I[A]", "T1[°C]", (1.0 / 3600.0, 1.0, -1.0)),
+    "Landt": named("test_time_s", "voltage_V", "current_A", "temperature_1_C"),
+    "another Arbin": named("Test_Time(s)", "Voltage(V)", "Current(A)", "Aux_Temperature(℃)_1"),
+    "Chinese": named("总时间\uff08s\uff09", "电压(V)", "电流(mA)", "温度(℃)", (1.0, 1.0, -1e3)),
+    "Portuguese": named("Tempo_s", "Tensão_V", "Corrente_A", "Temperatura_C"),
+    "Spanish": named("Tiempo (min)", "Voltaje (mV)", "Corriente (mA)", "Temperatura (°C)", (1.0 / 60.0, 1e3, 1e3)),
+    "French": named("Temps/s", "Tension/V", "Courant/A", "Température/°C"),
     "a clock": CLOCK | {"Time": list(map(clock, TIME_S))},
     "dates": DATES | {"Date_Time": pd.Timestamp("2026-02-28 23:50") + pd.to_timedelta(TIME_S, unit="s")},
 }
@@ -310,6 +318,7 @@ def test_dates_are_read_as_they_are_written(tmp_path):
         ("[min],[mV],[mA],[°C]", (1.0 / 60.0, 1e3, 1e3)),
         ('"(ms)","(mV)","(A)",""', (1e3, 1e3, 1.0)),
         (",,,", (1.0, 1.0, 1.0)),
+        (",[mV],[mA],[C]", (1.0, 1e3, 1e3)),
     ],
 )
 def test_units_may_stand_below_the_names(units, factors, tmp_path):

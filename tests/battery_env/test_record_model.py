@@ -8,7 +8,6 @@ import pytest
 from battery_env.electrochemistry import NEW_CELL, QNS, QPS, initial_state, simulate
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS, TANGENT_NAMES
 from battery_env.estimates import Estimate
-from battery_env.estimators import ExtendedKalmanFilter, LeastSquares
 from battery_env.loads import constant, in_steps
 from battery_env.records.model import RecordModel
 
@@ -166,8 +165,3 @@ class TestForecast:
         assert np.nanmin(forecast.at_samples_V) < 3.4
         empty_V = model.voltage(RECORD, Estimate(4000.0, 0.15))
         assert np.isnan(empty_V[-1]) and np.isfinite(empty_V[: len(empty_V) // 2]).all()
-
-    @pytest.mark.parametrize("calibrator", [LeastSquares(), ExtendedKalmanFilter()], ids=["least squares", "Kalman filter"])
-    def test_it_takes_the_estimate_of_any_calibrator(self, calibrator):
-        eod_time_s = RecordModel().forecast(RECORD, calibrator.estimate(RECORD)).eod_time_s
-        assert eod_time_s == pytest.approx(RECORD.eod_time_s, rel=1e-3)

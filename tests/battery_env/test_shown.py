@@ -149,6 +149,13 @@ class TestCharge:
         (found,) = calibrate(cycled(4.1, 3.0, 100, soc=0.9), initial_soc=0.9)
         assert found.settled and is_right(found)
 
+    @pytest.mark.parametrize(
+        ("share", "tapered"), [(0.0999, True), (0.1003, True), (0.104, True), (0.11, False), (0.2, False)]
+    )
+    def test_one_that_ended_at_a_tenth_by_a_reading_before_it_tapered_off(self, share, tapered):
+        current_A = -np.append(np.full(50, 3.0), 3.0 * np.linspace(share + 0.02, share, 50))
+        assert ChargeBefore.of(np.append(np.linspace(3.8, 4.2, 50), np.full(50, 4.2)), current_A).tapered == tapered
+
     def test_noise_at_its_end_is_no_taper(self):
         voltage_V, current_A = np.append(np.linspace(3.8, 4.1, 50), 4.0), -np.append(np.full(50, 3.0), 0.02)
         assert not ChargeBefore.of(voltage_V, current_A).tapered

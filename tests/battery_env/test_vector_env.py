@@ -1,8 +1,5 @@
 """The vector environments make the episodes of the scalar ones."""
 
-import copy
-import pickle
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -11,7 +8,6 @@ from gymnasium.vector import AutoresetMode
 from battery_env.loads import RandomPiecewise
 from battery_env.tasks.registration import TASKS
 from battery_env.tasks.task import CalibrationTask
-from battery_env.tasks.voltage.aging import simulated_lives
 from battery_env.trajectories import TrajectoryDataset
 
 IDS = ("BatteryQmax-v0", "BatteryRo-v0", "BatteryJoint-v0", "BatteryQmaxPaper-v0", "BatteryRoPaper-v0")
@@ -25,11 +21,6 @@ NOISY = {"initial_perturbation": 3.0, "continue_probability": 0.5, "first_sample
 @pytest.fixture(scope="module")
 def discharges():
     return TrajectoryDataset.generate(("q_mobile", "r_o"), 6, RandomPiecewise(), seed=0, mismatch=0.1)
-
-
-@pytest.fixture(scope="module")
-def lives():
-    return simulated_lives(3, 4, seed=0)
 
 
 def make_pair(env_id, mode, cells=3, **options):
@@ -108,17 +99,6 @@ def test_without_autoreset_the_caller_says_which_cells_start(discharges):
         batch.step(np.zeros((3, 1)))
     batch.reset(options={"reset_mask": ~mask})
     assert batch.step(np.zeros((3, 1)))[3].tolist() == [False, True, False]
-
-
-def test_environments_can_be_copied_and_pickled_within_episodes(discharges):
-    batch = gym.make_vec("BatteryJoint-v0", num_envs=3, dataset=discharges, episode_steps=3, **NOISY)
-    batch.reset(seed=3)
-    batch.step(np.zeros((3, 2)))
-    twins = [copy.deepcopy(batch), pickle.loads(pickle.dumps(batch))]
-    for _ in range(5):
-        expected = batch.step(np.full((3, 2), 0.3))[0]
-        for twin in twins:
-            np.testing.assert_array_equal(twin.step(np.full((3, 2), 0.3))[0], expected)
 
 
 def test_pictures_of_all_cells(discharges):

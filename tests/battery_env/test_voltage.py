@@ -12,7 +12,7 @@ from battery_env.records.discharge import Discharge, load_nasa_discharges
 from battery_env.sensors import RandomSensorErrors
 from battery_env.tasks.env import CalibrationEnv
 from battery_env.tasks.full_state.pages import BatteryQmax
-from battery_env.tasks.voltage.aging import BatteryAging, simulated_lives
+from battery_env.tasks.voltage.aging import BatteryAging
 from battery_env.tasks.voltage.pages import BatteryVoltageJoint, BatteryVoltageQmax, BatteryVoltageRo
 from battery_env.tasks.voltage.readings import Readings
 from battery_env.tasks.voltage.task import ESTIMATE_RANGES, LARGEST_STEPS
@@ -272,11 +272,6 @@ class TestOwnCell:
         np.testing.assert_array_equal(BatteryQmax(1, dataset=file).dataset.q_mobile, data.q_mobile)
         with pytest.raises(FileNotFoundError, match=r"none\.npz"):
             BatteryVoltageJoint(1, dataset=tmp_path / "none.npz")
-
-
-@pytest.fixture(scope="module")
-def lives():
-    return simulated_lives(3, 4, seed=0)
 
 
 class TestAging:

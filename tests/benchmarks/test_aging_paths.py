@@ -2,7 +2,7 @@
 
 import pandas as pd
 
-from battery_env import PolicyEstimator
+from battery_env import PolicyEstimator, fit_life
 from battery_env.policies.pretrained import policy_of_file
 from benchmarks import aging_paths
 
@@ -11,6 +11,7 @@ def test_few_discharges_of_one_cell_make_its_tables_and_the_policy(tmp_path, mon
     monkeypatch.setattr(aging_paths, "CELLS", {"B0005": "B0006"})
     for name, value in {"UPDATES": 8, "TRAINING_CELLS": 20, "BUNDLED_CELLS": ("B0006",)}.items():
         monkeypatch.setattr(aging_paths, name, value)
+    monkeypatch.setattr(aging_paths, "fit_life", lambda lives: fit_life([life[::24] for life in lives]))
     asked = ["--every", "80", "--algos", "lac", "--seeds", "0", "1", "--export", "--jobs", "1", "--out", str(tmp_path)]
     aging_paths.main(asked)
     rows, shares = pd.read_csv(tmp_path / "discharges.csv"), len(aging_paths.SHARES)

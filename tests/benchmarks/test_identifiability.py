@@ -3,7 +3,6 @@
 import json
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 import pytest
 
@@ -13,68 +12,18 @@ ROOT = Path(__file__).parents[2]
 PUBLISHED = ROOT / "docs" / "results" / "identifiability"
 
 
-@pytest.fixture(scope="module")
-def records():
-    return measure.discharges()
+# without noise, these are the same whenever they are made
+@pytest.mark.parametrize("name", ["conservation", "response", "sensitivity", "bounds", "late", "windows", "minima"])
+def test_what_is_computed_is_what_is_published(name):
+    (found,) = measure.part(name, draws=0).values()
+    published = pd.read_csv(PUBLISHED / f"{name}.csv")
+    pd.testing.assert_frame_equal(found, published, check_dtype=False, rtol=1e-4, atol=1e-9)
 
 
-def test_both_discharges_are_of_the_same_cell_and_reach_the_end(records):
-    assert list(records) == ["constant", "varying"]
-    for record in records.values():
-        assert (record.q_mobile, record.r_o) == (6000.0, 0.15) and np.isfinite(record.eod_time_s)
-    assert np.ptp(records["constant"].current_A) == 0.0 and np.ptp(records["varying"].current_A) > 1.0
-
-
-def test_the_full_state_tells_both_parameters_to_rounding():
-    row = measure.conservation_table().iloc[0]
-    assert row["discharges"] == 50 and row["samples"] > 50_000
-    assert row["q_mobile_worst_relative_error"] < 1e-13 and row["r_o_worst_relative_error"] < 1e-13
-
-
-def test_r_o_shows_at_once_and_q_mobile_at_the_knee(records):
-    response = measure.response_table(records["constant"]).set_index("time_s")["share_of_final_percent"]
-    assert response[6] == pytest.approx(100.0 * (1.0 - (1.0 - 1.0 / 6.08671) ** 6), rel=1e-6) and response[30] > 99.0
-    table = measure.sensitivity_table(records["constant"]).set_index("seen_percent")
-    by_q = table["mV_per_percent_of_q_mobile"]
-    assert by_q[1.0] < 1.0 and by_q[100.0] > 40.0 * by_q[50.0]
-    np.testing.assert_allclose(table["mV_per_percent_of_r_o"][5.0:], -3.0, rtol=1e-2)
-
-
-def test_bounds_are_proportional_to_the_noise_and_grow_with_what_is_unknown(records):
-    table = measure.bounds_table(records).set_index(["load", "unknown", "noise_V"])
-    at_half = table["q_mobile_sd_percent_at_50%"]["constant"]
-    np.testing.assert_allclose(at_half["both"].to_numpy(), at_half["both"][0.001] * np.array([1.0, 5.0, 10.0, 30.0]))
-    assert at_half["q_max alone"][0.01] < at_half["both"][0.01] < at_half["both and an offset"][0.01]
-    assert np.isinf(table["r_o_within_1_percent_s"]["constant", "both and an offset", 0.01])
-    assert np.isfinite(table["r_o_within_1_percent_s"]["varying", "both and an offset", 0.01])
-
-
-def test_a_short_episode_of_voltages_says_little_before_the_knee(records):
-    table = measure.windows_table(records["constant"]).set_index("seen_percent")
-    prior_percent = 100.0 * (7600.0 - 4000.0) / np.sqrt(12.0) / 6000.0
-    assert (table["episode_joint_percent"][:90.0] > prior_percent).all() and table["episode_joint_percent"][100.0] < 1.0
-    assert (table["all_so_far_joint_percent"] <= table["episode_joint_percent"]).all()
-
-
-def test_an_offset_is_lost_by_a_logger_that_starts_late_unless_the_load_varies(records):
-    table = measure.late_table(records).set_index(["load", "start_s"])["r_o_sd_percent"]
-    assert table["constant", 30] > 100.0 * table["constant", 0]
-    assert table["varying", 30] == pytest.approx(table["varying", 0], rel=0.05)
-
-
-def test_a_filter_that_knows_of_the_offset_is_not_misled_by_it(records):
-    table = measure.offsets_table(records).set_index(["load", "offset_sd_V", "seen_percent"])
+def test_a_filter_that_knows_of_the_offset_is_not_misled_by_it():
+    table = measure.offsets_table(measure.discharges()).set_index(["load", "offset_sd_V", "seen_percent"])
     assert abs(table["q_mobile_error_percent"]["varying", 0.0, 25.0]) > 3.0
     assert table.xs(measure.OFFSET_V, level="offset_sd_V").abs().to_numpy().max() < 1.0
-
-
-def test_the_cost_of_vsp_points_to_the_truth_from_states_that_have_drifted():
-    minima = measure.minima_table(measure.one_step_costs()).groupby("cost")["q_mobile_C"].agg(list)
-    assert minima["cost_true_si"] == pytest.approx([5480.0, 5730.0, 6000.0], abs=5.0)
-    assert minima["cost_true_scaled"] == minima["cost_drifted_scaled"] == [6000.0]
-    assert 6000.0 not in minima["cost_drifted_si"]
-    assert abs(minima["cost_far_scaled"][0] - 6000.0) > 20.0
-    assert minima["cost_far_task"] == pytest.approx([6000.0], abs=10.0)
 
 
 @pytest.fixture
@@ -111,8 +60,3 @@ def test_every_row_of_the_page_is_in_the_published_tables():
     shown, published = rows(ROOT / "docs/reports/identifiability.md"), set(rows(PUBLISHED / "summary.md"))
     assert len(shown) >= 6
     assert [row for row in shown if row not in published] == []
-
-
-def test_published_tables_are_shown_as_they_are_published():
-    tables = {name: pd.read_csv(PUBLISHED / f"{name}.csv") for name in measure.TABLES}
-    assert measure.summary(tables) == (PUBLISHED / "summary.md").read_text(encoding="utf-8")

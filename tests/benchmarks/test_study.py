@@ -14,6 +14,7 @@ import pytest
 
 from benchmarks import calibrators, study
 from benchmarks.study import Study, command_line, digits, with_spread
+from tests.faults import squared_after_ends_of_its_process
 
 
 def a_study(tmp_path, *arguments, jobs=1):
@@ -111,16 +112,6 @@ def test_one_job_stays_in_this_process(tmp_path):
         a_study(tmp_path).each(operator.truediv, [(1, 1), (1, 0)])
 
 
-def summed(count):
-    return sum(range(count)), os.getpid()
-
-
-def test_several_jobs_are_other_processes_whose_results_keep_their_order(tmp_path):
-    # the first takes longest
-    sums, processes = zip(*a_study(tmp_path, jobs=2).each(summed, [(3_000_000,), (3,), (4,)]), strict=True)
-    assert sums == (4_499_998_500_000, 3, 6) and os.getpid() not in processes
-
-
 def test_a_call_that_fails_stops_no_other(tmp_path, capsys):
     kept = {}
     with pytest.raises(ZeroDivisionError):
@@ -128,25 +119,13 @@ def test_a_call_that_fails_stops_no_other(tmp_path, capsys):
     assert kept == {1: 1.0} and "part 1 of 2 failed: ZeroDivisionError" in capsys.readouterr().err
 
 
-def dies_three_times(number, place):
-    deaths = place / "deaths"
-    if number == 1 and (not deaths.exists() or deaths.stat().st_size < 3):
-        with deaths.open("ab") as file:
-            file.write(b"x")
-        os._exit(1)
-    return {"example": pd.DataFrame([{"number": number}])}
-
-
 def test_a_lost_process_costs_a_study_nothing_and_one_that_is_lost_twice_its_part_alone(tmp_path, capsys):
-    def run():
-        return a_study(tmp_path / "out", jobs=2).run(dies_three_times, [{"number": n} for n in range(3)], place=tmp_path)
-
+    kept, chosen, calls = {}, a_study(tmp_path, jobs=2), [(n, tmp_path) for n in range(3)]
     with pytest.raises(BrokenExecutor):
-        run()
+        chosen.each(squared_after_ends_of_its_process, calls, kept.__setitem__)
     error = capsys.readouterr().err
-    assert "part 2 of 3 failed" in error and "1 of 3 parts failed" in error and "the same command goes on from there" in error
-    assert len(list((tmp_path / "out" / "parts").iterdir())) == 2
-    assert run()["example"]["number"].tolist() == [0, 1, 2] and (tmp_path / "deaths").read_text() == "xxx"
+    assert "part 3 of 3 failed" in error and "1 of 3 parts failed" in error and "the same command goes on from there" in error
+    assert kept == {0: 0, 1: 1} and chosen.each(squared_after_ends_of_its_process, calls) == [0, 1, 4]
 
 
 def fragile_part(seed, place):

@@ -92,22 +92,12 @@ def n_updates() -> Callable[[LAC], int]:
 
 
 @pytest.fixture
-def make_model_without_env() -> Callable[..., CostAlgorithm]:
-    def _make_model_without_env(
-        n_states: int = 2,
-        n_actions: int = 2,
-        policy_kwargs: dict[str, Any] | None = None,
-        algorithm: type[CostAlgorithm] = LAC,
-        **kwargs: Any
-    ) -> CostAlgorithm:
+def make_model_without_env(make_model: Callable[..., CostAlgorithm]) -> Callable[..., CostAlgorithm]:
+    def _make_model_without_env(n_states: int = 2, n_actions: int = 2, **kwargs: Any) -> CostAlgorithm:
         """A model that never steps its environment, to train on batches of any numbers."""
-        policy_kwargs = {"net_arch": [16, 16], "activation_fn": nn.LeakyReLU, **(policy_kwargs or {})}
-        kwargs = {"buffer_size": 1, "seed": 0, "device": "cpu", **kwargs}
         env = LinearCostEnv(n_dim=n_actions)
         env.observation_space = spaces.Box(-np.inf, np.inf, (n_states,))
-        model = algorithm("MlpPolicy", env, policy_kwargs=policy_kwargs, **kwargs)
-        model.set_logger(Logger(folder=None, output_formats=[]))
-        return model
+        return make_model(env, n_collect=0, **{"buffer_size": 1, **kwargs})
 
     return _make_model_without_env
 

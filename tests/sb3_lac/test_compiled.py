@@ -186,22 +186,18 @@ def test_missing_compiler_is_noticed_before_the_first_step(make_model, monkeypat
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")
-def test_compiled_code_makes_the_same_updates(make_model, monkeypatch):
-    kwargs = {"policy_kwargs": {"net_arch": [4], "optimizer_class": th.optim.SGD}}
+@pytest.mark.parametrize(
+    "device",
+    [
+        pytest.param("cpu", marks=pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")),
+        pytest.param("cuda", marks=pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")),
+    ],
+)
+def test_compiled_code_makes_the_same_updates(device, make_model, monkeypatch):
+    kwargs = {"device": device, "policy_kwargs": {"net_arch": [4], "optimizer_class": th.optim.SGD}}
     monkeypatch.setattr(compiled, "BACKEND", "inductor")
     eager, _ = trained(make_model(**kwargs))
     # Otherwise compiled code has random numbers of its own
-    with inductor.patch(fallback_random=True):
-        model, _ = trained(make_model(compile_update=True, **kwargs))
-    assert_close(model, eager)
-
-
-@pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
-def test_a_gpu_makes_the_same_updates(make_model, monkeypatch):
-    monkeypatch.setattr(compiled, "BACKEND", "inductor")
-    kwargs = {"device": "cuda", "policy_kwargs": {"net_arch": [4], "optimizer_class": th.optim.SGD}}
-    eager, _ = trained(make_model(**kwargs))
     with inductor.patch(fallback_random=True):
         model, _ = trained(make_model(compile_update=True, **kwargs))
     assert_close(model, eager)

@@ -79,30 +79,26 @@ def test_warning_names_the_costs(make_model):
 
 
 @pytest.mark.parametrize(
-    ("env", "kwargs"),
+    ("env", "wrapped", "kwargs"),
     [
         # a time limit; one that the buffer cannot tell from a termination; living pays; each step is an end
-        ({"terminate": False}, {}),
-        ({"terminate": False}, {"replay_buffer_kwargs": {"handle_timeout_termination": False}, "optimize_memory_usage": True}),
-        ({"terminate": True, "offset": 1.0}, {}),
-        ({"terminate": True}, {"reward_bound": 1.0}),
-        ({"terminate": True, "episode_length": 1}, {}),
-    ],
-)
-def test_nothing_to_warn_of(make_model, make_env, env, kwargs):
-    assert warnings_of(make_model(make_env(**{"episode_length": 5, **env}), n_collect=0, **kwargs)) == []
-
-
-@pytest.mark.parametrize(
-    "wrapped",
-    [
+        ({"terminate": False}, None, {}),
+        (
+            {"terminate": False},
+            None,
+            {"replay_buffer_kwargs": {"handle_timeout_termination": False}, "optimize_memory_usage": True},
+        ),
+        ({"offset": 1.0}, None, {}),
+        ({}, None, {"reward_bound": 1.0}),
+        ({"episode_length": 1}, None, {}),
         # a price of more than the dearest step, whose state is (10, 10) at most; steps that cost nothing
-        lambda env: Priced(env, 200.0),
-        lambda env: gym.wrappers.TransformReward(env, lambda reward: 0.0),
+        ({}, lambda env: Priced(env, 200.0), {}),
+        ({}, lambda env: gym.wrappers.TransformReward(env, lambda reward: 0.0), {}),
     ],
 )
-def test_ends_with_a_price_and_free_steps_do_not_warn(make_model, make_env, wrapped):
-    assert warnings_of(make_model(wrapped(make_env(episode_length=5, terminate=True)), n_collect=0)) == []
+def test_nothing_to_warn_of(make_model, make_env, env, wrapped, kwargs):
+    env = make_env(**{"episode_length": 5, "terminate": True, **env})
+    assert warnings_of(make_model(env if wrapped is None else wrapped(env), n_collect=0, **kwargs)) == []
 
 
 @pytest.mark.parametrize(

@@ -118,12 +118,6 @@ def test_cost_is_that_of_the_environment(tmp_path):
     np.testing.assert_allclose(logged, [np.mean(costs[:8]), np.mean(costs[8:])], rtol=1e-6)
 
 
-def test_an_environment_without_costs_has_no_entry_for_them(tmp_path):
-    model = SAC("MlpPolicy", "Pendulum-v1", policy_kwargs={"net_arch": [4]}, tensorboard_log=str(tmp_path), **OPTIONS)
-    model.learn(10, callback=DashboardCallback())
-    assert "rollout/cost_mean" not in model.logger.name_to_value
-
-
 @pytest.mark.parametrize(
     ("said", "logged"),
     [

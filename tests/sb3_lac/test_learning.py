@@ -1,13 +1,11 @@
 """LAC solves what is known exactly, the linear-quadratic regulator: its update to rounding, its networks nearly."""
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import nn
 
-from sb3_lac import LAC, evaluate_lyapunov
 from sb3_lac.envs import LinearCostEnv
 from sb3_lac.policies import RootCritic
 
@@ -175,38 +173,3 @@ def test_critic_networks_learn_the_exact_value_of_a_policy(env, make_model_witho
     assert np.median(np.abs(error / exact)) < 0.2
     assert np.sqrt(np.mean(np.square(error))) < 0.2 * exact.mean()
     assert 0.85 < np.polyfit(exact, learned, 1)[0] < 1.05
-
-
-@pytest.mark.slow
-def test_networks_approach_the_exact_solution():
-    model = LAC(
-        "MlpPolicy",
-        "LinearCost-v0",
-        learning_rate=1e-3,
-        learning_starts=500,
-        gamma=GAMMA,
-        target_entropy=-3.0,
-        policy_kwargs={"net_arch": [64, 64], "activation_fn": nn.LeakyReLU},
-        device="cpu",
-        seed=0,
-    )
-    env = LinearCostEnv()
-
-    def evaluate():
-        """Cost relative to the optimum, slope and correlation of L against the exact values."""
-        report = evaluate_lyapunov(model, gym.make("LinearCost-v0"), n_eval_episodes=20, deterministic=True, seed=1)
-        controls = env.control_max * model.predict(report.observations, deterministic=True)[0]
-        gain = -np.linalg.lstsq(report.observations, controls, rcond=None)[0].T
-        ratio = np.trace(env.value_matrix(gain, GAMMA)) / np.trace(env.value_matrix(env.optimal_gain(GAMMA), GAMMA))
-        exact, learned = env.cost_to_go(report.observations, controls, gain, GAMMA), report.transitions["lyapunov"]
-        return ratio, np.polyfit(exact, learned, 1)[0], np.corrcoef(exact, learned)[0, 1]
-
-    ratio, slope, _ = evaluate()
-    assert ratio > 2.5 and slope < 0.2
-    model.learn(2500)
-    ratio, slope, correlation = evaluate()
-    # What one seed learns differs from processor to processor as from seed to seed. Five seeds reached 1.01 to 1.30,
-    # 0.80 to 0.89 and 0.970 to 0.998: the limits are twice that range beyond the worst.
-    assert 1.0 <= ratio < 2.0
-    assert 0.6 < slope < 1.3
-    assert correlation > 0.9

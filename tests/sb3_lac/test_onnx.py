@@ -10,8 +10,7 @@ from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
-from battery_env import OnnxPolicy, PolicyEstimator, TrajectoryDataset
-from battery_env.loads import constant
+from battery_env import OnnxPolicy
 from sb3_lac import LAC, onnx
 from sb3_lac.onnx import export_onnx
 
@@ -99,14 +98,6 @@ def test_actions_are_those_of_the_mean_in_float32(algorithm, low, high, dtype, k
     observations = np.array([model.observation_space.sample() for _ in range(5)])
     assert policy.predict(observations)[0].dtype == np.float32
     assert_alike(policy, model, observations)
-
-
-def test_a_calibration_policy_runs_without_torch(tmp_path):
-    model = new_model(env="BatteryRo-v0")
-    policy = OnnxPolicy(export_onnx(model, tmp_path / "policy"))
-    discharge = TrajectoryDataset.generate("r_o", 1, [constant(12.0)], seed=0)[0]
-    estimate = PolicyEstimator(policy, policy.env_id).estimate(discharge)
-    assert estimate.r_o == pytest.approx(PolicyEstimator(model, "BatteryRo-v0").estimate(discharge).r_o, rel=1e-4)
 
 
 def test_no_damaged_file_answers_otherwise(tmp_path):

@@ -13,8 +13,9 @@ from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_lac import LAC, LyapunovPolicy, PublishedLAC, PublishedPolicy, certify, evaluate_lyapunov, fit_lyapunov
+from sb3_lac import LAC, LyapunovPolicy, PublishedLAC, PublishedPolicy
 from sb3_lac.buffers import HorizonReplayBuffer
+from tests.sb3_lac.equations import mlp, policy_sample
 
 GAMMA, TAU, ALPHA3 = 0.9, 0.05, 0.3
 RATES = {"actor": 1e-2, "critic": 3e-2}
@@ -34,26 +35,9 @@ class ShortEpisodes(gym.Wrapper):
         return obs, reward + 2.0, self.n_steps == 5, truncated, info
 
 
-def layers(weights, prefix, x, n_layers):
-    for i in range(n_layers):
-        x = th.relu(x @ weights[f"{prefix}.{2 * i}.weight"].T + weights[f"{prefix}.{2 * i}.bias"])
-    return x
-
-
-def action_of(weights, obs):
-    """A sampled action of the squashed Gaussian, and its log probability."""
-    latent = layers(weights, "latent_pi", obs, 2)
-    mean = latent @ weights["mu.weight"].T + weights["mu.bias"]
-    log_std = (latent @ weights["log_std.weight"].T + weights["log_std.bias"]).clamp(-20, 2)
-    noise = th.normal(th.zeros_like(mean), th.ones_like(mean))
-    action = th.tanh(mean + log_std.exp() * noise)
-    log_prob = -0.5 * noise**2 - log_std - 0.5 * math.log(2 * math.pi) - th.log(1 - action**2 + 1e-6)
-    return action, log_prob.sum(dim=1)
-
-
 def lyapunov(weights, obs, actions):
     """The sum of the squares of the last layer."""
-    return (layers(weights, "lf0", th.cat([obs, actions], dim=1), 3) ** 2).sum(dim=1)
+    return (mlp(weights, "lf0", th.cat([obs, actions], dim=1), 3, slope=0) ** 2).sum(dim=1)
 
 
 @pytest.mark.parametrize("horizon", [None, 5])
@@ -97,17 +81,17 @@ def test_step_is_that_of_the_equations(make_model, make_env, horizon):
     model.train(gradient_steps=1, batch_size=32)
 
     th.manual_seed(1)
-    _, log_prob = action_of(actor, obs)
+    _, log_prob = policy_sample(actor, obs, slope=0)
     if horizon is None:
         with th.no_grad():
-            next_actions, _ = action_of(actor_target, next_obs)
+            next_actions, _ = policy_sample(actor_target, next_obs, slope=0)
             after = bound / (1 - GAMMA)  # nothing is paid any more
             next_values = (1 - dones) * lyapunov(critic_target, next_obs, next_actions) + dones * after
             target = costs + GAMMA * next_values
     else:
         target = horizon * bound - batch.horizon_rewards.flatten()
     critic_loss = (0.5 * (lyapunov(critic, obs, actions) - target) ** 2).mean()
-    next_actions, _ = action_of(actor, next_obs)
+    next_actions, _ = policy_sample(actor, next_obs, slope=0)
     d = (lyapunov(critic, next_obs, next_actions) - lyapunov(critic, obs, actions).detach() + ALPHA3 * costs).mean()
     actor_loss = 0.5 * d + 0.7 * log_prob.mean()
     entropy_violation = log_prob.mean() - actions.shape[1]
@@ -254,37 +238,6 @@ def test_horizon_is_that_of_the_model_with_a_buffer_of_another_one(make_model, t
     make_model(n_collect=1).save_replay_buffer(tmp_path / "plain")
     with pytest.raises(ValueError, match="horizon=7 needs a HorizonReplayBuffer"):
         other.load_replay_buffer(tmp_path / "plain")
-
-
-def test_stability_functions_take_it(make_model, make_env):
-    model = make_model(algorithm=PublishedLAC, horizon=3, n_collect=60)
-    report = evaluate_lyapunov(model, make_env(), 4, seed=1)
-    # Its own L, and none negative
-    assert (report.transitions["lyapunov"] >= 0).all()
-    lyapunov_function = fit_lyapunov(model, make_env(), 4, seed=100)
-    assert len(certify(model, make_env(), lyapunov_function, 4, seed=200).statements) > 0
-
-
-def test_it_learns_to_control(make_model, make_env):
-    def mean_cost(model):
-        report = evaluate_lyapunov(model, make_env(n_dim=1), 10, deterministic=True, seed=1000)
-        return report.transitions["cost"].mean()
-
-    for horizon in (None, 5):
-        model = make_model(
-            make_env(n_dim=1),
-            n_collect=0,
-            algorithm=PublishedLAC,
-            horizon=horizon,
-            gamma=0.9,
-            tau=0.02,
-            learning_rate=3e-3,
-            critic_learning_rate=3e-3,
-            ent_coef="auto",
-            buffer_size=2000,
-        ).learn(1500)
-        # Doing nothing costs 1.15 per step, the best controller 0.09
-        assert mean_cost(model) < 0.4, horizon
 
 
 def test_model_of_another_algorithm_or_version_is_named(make_model, tmp_path):

@@ -366,14 +366,6 @@ def test_training_env_is_refused(make_env, algorithm, of_the_model):
     assert model.num_timesteps == 0
 
 
-def test_loaded_model_is_evaluated_without_its_env(make_model, make_env, tmp_path):
-    model = make_model(n_collect=0)
-    model.save(tmp_path / "model")
-    loaded = LAC.load(tmp_path / "model", device="cpu")
-    reports = [evaluate_lyapunov(each, make_env(), 2, seed=1) for each in (loaded, model)]
-    pd.testing.assert_frame_equal(*(report.transitions for report in reports))
-
-
 @pytest.mark.parametrize("judge", [evaluate_lyapunov, certify])
 def test_env_must_be_another_one_of_the_same_kind(make_model, make_env, judge):
     def normalized(**kwargs):

@@ -180,11 +180,6 @@ def test_other_algorithms_and_configs_can_be_chosen(workdir, monkeypatch):
     ]
 
 
-def test_all_learning_rates_take_schedules():
-    rates = LACExperimentManager._preprocess_schedules({"critic_learning_rate": "lin_1e-3", "lambda_learning_rate": None})
-    assert rates["critic_learning_rate"](0.5) == 5e-4 and rates["lambda_learning_rate"] is None
-
-
 def test_the_published_algorithm_needs_a_file_only(workdir):
     arguments = ["--algo", "published_lac", "--env", ENV, "--eval-freq", "-1"]
     settings = {**SETTINGS, "critic_learning_rate": "lin_1e-3", "train_freq": 1, "gradient_steps": 1}

@@ -19,28 +19,30 @@ REQUIRED = ("time", "voltage", "current")
 _NAMES = {
     "time": "test time, total time, elapsed time, accumulated time, cumulative time, run time, elapsed, prog time, "
     "program time, program duration, programmdauer, test, time, t, relative time, testzeit, prüfzeit, gesamtzeit, "
-    "programmzeit, laufzeit, zeit, seconds, unix time, date time, timestamp, absolute time, dpt time, real time, date, datum, "
-    "zeitstempel, step time, step duration",
+    "programmzeit, laufzeit, zeit, tempo, tiempo, temps, 总时间, 测试时间, 累计时间, 时间, 相对时间, seconds, unix time, "
+    "date time, timestamp, absolute time, dpt time, real time, system time, date, datum, zeitstempel, 绝对时间, 系统时间, "
+    "日期, step time, step duration, 步骤时间, 工步时间",
     "voltage": "voltage, cell voltage, terminal voltage, battery voltage, voltage measured, measured voltage, volts, volt, "
     "ewe ece, ecell, potential, cell potential, ewe, u, v, spannung, zellspannung, klemmenspannung, batteriespannung, u cell, "
-    "v cell, u bat, v bat, u batt, v batt, vf",
+    "v cell, u bat, v bat, u batt, v batt, vf, tension, tensión, tensao, tensão, voltaje, 电压",
     "current": "current, cell current, battery current, current measured, measured current, cur, curr, amps, amp, i, strom, "
-    "zellstrom, batteriestrom, i cell, i bat, i batt, im",
+    "zellstrom, batteriestrom, i cell, i bat, i batt, im, courant, corriente, corrente, 电流",
     "temperature": "temperature, cell temperature, temperature measured, surface temperature, surface temperature t1, "
-    "temperature t1, aux temperature 1, temp, temp 1, t1, temperatur, zelltemperatur, t cell, t",
-    "ambient": "ambient temperature, chamber temperature, environment temperature, umgebungstemperatur",
+    "temperature t1, temperature 1, aux temperature, aux temperature 1, temp, temp 1, t1, log temp 001, temperatur, "
+    "zelltemperatur, température, temperatura, 温度, 电池温度, t cell, t",
+    "ambient": "ambient temperature, chamber temperature, environment temperature, ev temp, umgebungstemperatur",
     "cycle": "cycle, cycle index, cycle number, cycle no, cycle count, cycle id, cyc, cyc count, cycle p, zyklus, "
-    "zyklusnummer",
-    "step": "step count, step, step index, step number, step no, step id, steps, ns, schritt",
-    "state": "state, md, status, step type, mode, zustand",
+    "zyklusnummer, ciclo, 循环, 循环号, 循环序号",
+    "step": "step count, step, step index, step number, step no, step id, steps, ns, schritt, 工步, 工步号, 工步序号",
+    "state": "state, md, status, step type, mode, zustand, 状态, 工步类型, 工步状态",
     "cell": "cell id, cell name, cell number, cell no, cell, battery id, battery, barcode, serial number, channel, "
     "channel id, channel number, zelle",
-    "step_time": "step time, step duration, schrittzeit, schrittdauer, t step",
+    "step_time": "step time, step duration, schrittzeit, schrittdauer, t step, 步骤时间, 工步时间",
     "power": "power, p, leistung",
     "charge_step": "dq",
     "counter": "ece",
-    "capacity": "discharge capacity, dchg capacity, dchg cap, q discharge, discharged capacity, capacity, cap, "
-    "entladekapazität, kapazität",
+    "capacity": "discharge capacity, dchg capacity, dchg cap, q discharge, discharged capacity, capacity, cap, ah, "
+    "entladekapazität, kapazität, 放电容量, 容量",
 }
 _RANKS = {
     quantity: {name: rank for rank, name in enumerate(names.replace(" ", "").split(","))} for quantity, names in _NAMES.items()
@@ -67,7 +69,7 @@ _TIMES = _units(
 )
 _VOLTS = _units({"v volt volts": 1.0, "mv mvolt mvolts millivolt millivolts": 1e-3})
 _MILLIAMPERES = "ma mamp mamps milliamp milliamps milliampere milliamperes"
-_CHARGES = _units({"ma.h mah": 3.6, "a.h ah": 3600.0})
+_CHARGES = _units({"ma.h mah mahr mamphr": 3.6, "a.h ah ahr amphr": 3600.0, "mas": 1e-3, "as": 1.0})
 _DEGREES = _units({"c degc degreec celsius deg": 1.0}) | dict.fromkeys(("k", "kelvin"), (1.0, -ZERO_CELSIUS_K))
 # By quantity and unit in lower case without blanks: factor and offset to s, V, A, degC, W and C.
 _UNITS: dict[str, dict[str, tuple[float, float]]] = {
@@ -84,15 +86,17 @@ _UNITS: dict[str, dict[str, tuple[float, float]]] = {
 }
 # What a record may have in place of a quantity.
 _INSTEAD = {"current": ("power", "charge_step")}
-_IN_BRACKETS = re.compile(r"^(?P<name>.*?)\s*(?:\((?P<round>[^()]*)\)|\[(?P<square>[^][]*)\]|/\s*(?P<slash>[^/]+))\s*$")
+_IN_BRACKETS = re.compile(
+    r"^(?P<name>.*?)\s*(?:\((?P<round>[^()]*)\)(?P<number>_\d+)?|\[(?P<square>[^][]*)\]|/\s*(?P<slash>[^/]+))\s*$"
+)
 # Words end at a capital, too, as in TestTime.
 _GAP = re.compile(r"(?<=[a-zäöü])(?=[A-ZÄÖÜ])|[_\-\s.#<>~]+")
 # The sign of a degree, and what is left of it after another encoding.
 _DEGREE_SIGN = re.compile("^[Ââ]?[°º˚\ufffd?]")
 # So long are names that are a unit, as mV; a shorter one may be anything, as min.
-_LEAST_UNIT_NAME = {"time": 4, "voltage": 2, "current": 2}
+_LEAST_UNIT_NAME = {"time": 4, "voltage": 2, "current": 2, "capacity": 5}
 # What testers call the steps in which a cell is discharged, and those of other words in which it is charged.
-_DISCHARGE, _CHARGE = re.compile(r"\bd\b|\bdis\b|dch|disch|entlad"), re.compile(r"\bc\b|ch|lad")
+_DISCHARGE, _CHARGE = re.compile(r"\bd\b|\bdis\b|dch|disch|entlad|放电"), re.compile(r"\bc\b|ch|lad|充电")
 _NUMBER = re.compile(r"[-+.\d][-+.,:/\deE\sT]*$|nan$|true$|false$", flags=re.IGNORECASE)
 _FEW_WORDS = 20
 
@@ -173,25 +177,26 @@ def find_columns(
 
 
 def units_below(columns: Mapping[str, Column], fields: Sequence[str]) -> dict[str, str] | None:
-    """The units in the line below a header, where some testers write them."""
+    """The units in the line below a header, where some testers write them; a clock may have none."""
     found = {}
     for quantity, column in columns.items():
-        unit = _unit(fields[column.position].strip("[]() "), quantity) if column.position < len(fields) else None
+        text = fields[column.position].strip("[]() ") if column.position < len(fields) else ""
+        unit = _unit(text, quantity)
         if unit is not None:
             found[quantity] = unit
-        elif quantity in REQUIRED:
+        elif quantity in REQUIRED and (text or quantity != "time"):
             return None
     return {quantity: unit for quantity, unit in found.items() if quantity in _UNITS and not columns[quantity].unit}
 
 
 def count_required(names: Sequence[str], chosen: Mapping[str, str] | None = None) -> int:
     """How much a line looks like the header of a record."""
-    chosen = chosen or {}
+    chosen, names = chosen or {}, [str(name) for name in names if any(map(str.isalpha, str(name)))]
     return sum(
         (
-            any(str(name).strip() == chosen[quantity] for name in names)
+            any(name.strip() == chosen[quantity] for name in names)
             if quantity in chosen
-            else any(_may_be(each, str(name)) for each in (quantity, *_INSTEAD.get(quantity, ())) for name in names)
+            else any(_is_known(each, name) for each in (quantity, *_INSTEAD.get(quantity, ())) for name in names)
         )
         for quantity in REQUIRED
     )
@@ -220,10 +225,11 @@ def _words(name: str) -> list[str]:
 
 def _split(name: str, quantity: str) -> tuple[str, str]:
     """A name in lower case without gaps, and the unit in it, which may be empty."""
+    name = normalize("NFKC", name)  # brackets may be as wide as a Chinese character
     match = _IN_BRACKETS.match(name)
     if match:
         unit = next(group for group in match.group("round", "square", "slash") if group is not None)
-        return "".join(_words(match["name"])), unit.strip()
+        return "".join(_words(match["name"] + (match["number"] or ""))), unit.strip()
     words, known, ranks = _words(name), _UNITS.get(quantity, {}), _RANKS[quantity]
     whole = "".join(words)
     if len(name) >= _LEAST_UNIT_NAME.get(quantity, len(name) + 1) and whole in known:
@@ -253,6 +259,12 @@ def _may_be(quantity: str, name: str) -> bool:
     if words not in _RANKS[quantity] or ((quantity, words) in _WITH_UNIT and _unit(unit, quantity) is None):
         return False
     return _unit(unit, quantity) is not None or not any(_unit(unit, other) for other in _UNITS)
+
+
+def _is_known(quantity: str, name: str) -> bool:
+    """Whether a name may be that of a quantity, and its unit, if any, is known."""
+    unit = _split(name, quantity)[1]
+    return _may_be(quantity, name) and (not unit or _unit(unit, quantity) is not None)
 
 
 def _places(quantity: str, names: Sequence[str], chosen: str | None, unit: str | None) -> list[int]:

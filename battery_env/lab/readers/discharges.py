@@ -33,7 +33,8 @@ _RETURNED_SHARE = 0.2
 _CHARGED_SHARE = 0.02
 # What returns less than this share of the charge that passes in all is not looked at.
 _NOTHING_SHARE = 1e-3
-# What draws less than this share of the largest discharge of its file is a pulse between two charges, and left aside.
+# What draws less than this share of the largest discharge of its file is a pulse between two charges, and left aside; so is
+# what draws less than _RETURNED_SHARE of the charge before and of the charge after.
 _LEAST_SHARE = 0.01
 # Over longer gaps than this a temperature that is missing is a guess, s.
 _TEMPERATURE_GAP_S = 600.0
@@ -55,7 +56,7 @@ class Recording(NamedTuple):
 
     :param arrays: arguments of :class:`~battery_env.Discharge`, by name
     :param meta: what else is known; ``cycle`` is missing if the file holds one discharge and does not number it
-    :param stated: quantities whose unit is known, and ``step`` if it has a column
+    :param stated: quantities whose unit is known, ``step`` if it has a column, and ``sign`` if that was told from the data
     """
 
     arrays: dict[str, Any]
@@ -78,6 +79,8 @@ class Recording(NamedTuple):
         unit = _UNIT_ADVICE.search(sentence)
         if not unit and _SIGN_ADVICE not in sentence:
             return sentence
+        if not unit and "sign" in self.stated:
+            return sentence.partition(_SIGN_ADVICE)[0] + "."
         quantity, (factor, offset) = (unit[1], unit_of(unit[1], unit[2])) if unit else ("current", (-1.0, 0.0))
         if not (unit and quantity in self.stated):
             name = next(each for each in self.arrays if each.startswith(quantity))
@@ -193,6 +196,7 @@ def _name_of(source: str | Path | pd.DataFrame) -> str:
 
 def _recordings(source: str, table: pd.DataFrame, columns: Mapping[str, Column], file_format: FileFormat) -> list[Recording]:
     stated = frozenset(quantity for quantity, column in columns.items() if column.unit or quantity == "step")
+    stated |= {"sign"} if file_format.discharge_is_negative is None else set()
     return [
         recording
         for cell, rows in cells_of(table, columns, file_format).items()
@@ -207,11 +211,19 @@ def _split(rows: pd.DataFrame, meta: dict[str, Any], stated: frozenset[str]) -> 
     if not parts:
         raise ValueError("there is no discharge: no charge is drawn. Check the sign of the current")
     least_C = _LEAST_SHARE * max(drawn_C for _, drawn_C in parts)
-    stretches = [stretch for stretch, drawn_C in parts if drawn_C >= least_C]
-    charges = [_charge_before(rows, stretch.start) for stretch in stretches]
+    passed_C = _passed_C(rows["time"].to_numpy(), rows["current"].to_numpy())
+    ends_C = [passed_C[[stretch.start, stretch.stop - 1]] for stretch, _ in parts]
+    charged_C = -np.diff(np.concatenate([[0.0], *ends_C, passed_C[-1:]]))[::2]
+    pulses_C = _RETURNED_SHARE * np.minimum(charged_C[:-1], charged_C[1:])
+    stretches = [part for (part, drawn_C), each_C in zip(parts, pulses_C, strict=True) if drawn_C >= max(each_C, least_C)]
+    if not stretches:
+        raise ValueError("there is no discharge: what is drawn are pulses within charges. Check the sign of the current")
+    if pulses := sum(least_C <= drawn_C < each_C for (_, drawn_C), each_C in zip(parts, pulses_C, strict=True)):
+        warnings.warn(f"pulses within charges, which are no discharges, are left aside: {pulses}", stacklevel=2)
+    before = [Shown(charge=_charge_before(rows, each.start), load_on_s=_load_on_s(rows, each)) for each in stretches]
     return [
-        _recording(rows[stretch], charge, meta | ({"cycle": number} if len(stretches) > 1 else {}), len(stretches) > 1, stated)
-        for number, (stretch, charge) in enumerate(zip(stretches, charges, strict=True), start=1)
+        _recording(rows[stretch], shown, meta | ({"cycle": number} if len(stretches) > 1 else {}), len(stretches) > 1, stated)
+        for number, (stretch, shown) in enumerate(zip(stretches, before, strict=True), start=1)
     ]
 
 
@@ -265,10 +277,12 @@ def _discharges(rows: pd.DataFrame, low: int, high: int) -> list[tuple[slice, fl
             continue
         first = begin + int(np.argmax(current_A[begin:end] > SWITCH_SHARE * peak_A))
         drawn_C = float(passed_C[first:end].max() - passed_C[first])
-        for start, stop, *_ in charges:
-            if begin <= start and stop <= first and passed_C[start] - passed_C[stop - 1] > _CHARGED_SHARE * drawn_C:
+        for start, stop, _, is_braking in charges:
+            is_before = begin <= start and stop <= (first if is_braking else end)
+            if is_before and passed_C[start] - passed_C[stop - 1] > _CHARGED_SHARE * drawn_C:
                 begin = stop
-        parts.append((slice(low + begin, low + end), drawn_C))
+        if begin < end:
+            parts.append((slice(low + begin, low + end), float(passed_C[begin:end].max() - passed_C[begin])))
     return parts
 
 
@@ -282,10 +296,32 @@ def _charge_before(rows: pd.DataFrame, begin: int) -> ChargeBefore | None:
     return ChargeBefore.of(rows["voltage"].to_numpy()[start:begin], charging_A)
 
 
+def _load_on_s(rows: pd.DataFrame, stretch: slice) -> float | None:
+    """When the load of a discharge came on, if the time in the step of its first row says how long ago that was."""
+    time_s, current_A = (rows[name].to_numpy() for name in ("time", "current"))
+    n = stretch.start + int(np.argmax(current_A[stretch] > SWITCH_SHARE * current_A[stretch].max()))
+    if "step_time" not in rows or not 0 < n < len(rows) - 1:
+        return None
+    (ago_s, later_s), interval_s = rows["step_time"].iloc[n : n + 2], time_s[n] - time_s[n - 1]
+    # the two clocks need not agree to the last digit
+    if not (0.0 <= ago_s < later_s and ago_s <= (1.0 + _NOTHING_SHARE) * interval_s):
+        return None
+    told_s = max(float(time_s[n] - ago_s), float(time_s[n - 1]))
+    if interval_s > 2.0 * max(time_s[n + 1] - time_s[n], time_s[n - 1] - time_s[max(n - 2, 0)]):
+        warnings.warn(
+            f"the rest is taken to last until {time_s[n] - told_s:g} s before row {rows.index[n] + 1}, as the time in its "
+            "step says",
+            stacklevel=2,
+        )
+    return told_s
+
+
 def _recording(
-    rows: pd.DataFrame, charge: ChargeBefore | None, meta: dict[str, Any], has_own_clock: bool, stated: frozenset[str]
+    rows: pd.DataFrame, shown: Shown, meta: dict[str, Any], has_own_clock: bool, stated: frozenset[str]
 ) -> Recording:
     time_s, current_A = rows["time"].to_numpy(), rows["current"].to_numpy()
+    if has_own_clock and shown.load_on_s is not None:
+        shown = shown._replace(load_on_s=shown.load_on_s - float(time_s[0]))
     if "cycle" in rows:
         meta["cycle"] = int(rows["cycle"].iloc[int(np.argmax(current_A > SWITCH_SHARE * current_A.max()))])
     if "ambient" in rows and not rows["ambient"].isna().all():
@@ -300,7 +336,7 @@ def _recording(
         if temperature_C is not None:
             arrays["temperature_C"] = temperature_C
     uncounted_C = _uncounted_C(rows)
-    arrays["shown"] = Shown(charge=charge, is_counted=uncounted_C is not None, uncounted_C=uncounted_C or 0.0)
+    arrays["shown"] = shown._replace(is_counted=uncounted_C is not None, uncounted_C=uncounted_C or 0.0)
     return Recording(arrays, meta, stated)
 
 
@@ -317,10 +353,9 @@ def _uncounted_C(rows: pd.DataFrame) -> float | None:
     if (step_C > 0.0).mean() < 0.5:
         return None
     counted_C = float(step_C[step_C > 0.0].sum())
-    # some count what is drawn alone, others what is returned, too
-    passed_C = [
-        float(np.ptp(drawn(time_s[part], each[part], time_s[part]))) for each in (current_A, np.maximum(current_A, 0.0))
-    ]
+    # some count what is drawn alone, others what is returned, too, with its sign or without
+    counts_A = (current_A, np.maximum(current_A, 0.0), np.abs(current_A))
+    passed_C = [float(np.ptp(drawn(time_s[part], each[part], time_s[part]))) for each in counts_A]
     off_C = min((each - counted_C for each in passed_C), key=abs)
     if abs(off_C) <= _COUNTED_SHARE * counted_C:
         return 0.0

@@ -36,6 +36,8 @@ _LONG_SHARE = 0.25
 _STEP_S = 1e-3
 # What a clock may count in, s.
 _TICKS_S = (3600.0, 60.0, 1.0, 0.1, 0.01)
+# What a clock without a unit may count in, s; dates count whole seconds.
+_UNITS_S, _DAY_S = {"seconds": 1.0, "milliseconds": 1e-3, "minutes": 60.0, "hours": 3600.0}, 86400.0
 # What is so many times what is usual is not usual.
 _MANY_TIMES = 3.0
 # No cell has a voltage below this share of what the record mostly shows.
@@ -58,7 +60,9 @@ def cells_of(table: pd.DataFrame, columns: Mapping[str, Column], file_format: Fi
         table = mend(table, columns)
     if len(table) < LEAST_SAMPLES:
         raise ValueError(f"a discharge needs {LEAST_SAMPLES} rows below the header, got {len(table)}")
-    cells = table["cell"].ffill().astype(str) if "cell" in table else pd.Series("", index=table.index)
+    cells = (
+        table["cell"].astype(object).ffill().fillna("").astype(str) if "cell" in table else pd.Series("", index=table.index)
+    )
     if cells.nunique() == 1 or cells.value_counts().min() < LEAST_SAMPLES:
         return {"": _mended(table, columns, file_format)}
     return {name: _mended(table[cells == name], columns, file_format) for name in cells.unique()}
@@ -75,7 +79,6 @@ def _mended(table: pd.DataFrame, columns: Mapping[str, Column], file_format: Fil
         without_repeated,
         with_steps_apart,
         without_rows_out_of_time,
-        with_moments_of_switches,
     ):
         rows = mend(rows)
     return with_signed_current(rows, columns, file_format.discharge_is_negative)
@@ -91,12 +94,15 @@ def without_blank_rows(table: pd.DataFrame, columns: Mapping[str, Column]) -> pd
 
 
 def without_headers(table: pd.DataFrame, columns: Mapping[str, Column]) -> pd.DataFrame:
-    """Without the header where it comes again, as in files that were put one behind the other."""
-    if any(pd.api.types.is_numeric_dtype(table[each].dtype) for each in _measured(table)):
+    """Without the header where it comes again, as in files that were put one behind the other, and what is said around it."""
+    measured = _measured(table)
+    if any(pd.api.types.is_numeric_dtype(table[each].dtype) for each in measured):
         return table  # no name is among numbers
-    again = np.logical_and.reduce([table[each].astype(str).str.strip() == columns[each].name for each in _measured(table)])
+    again = np.logical_and.reduce([table[each].astype(str).str.strip() == columns[each].name for each in measured])
     if again.any():
         _say(f"the header comes again, and is left out: row {_place(table, again)}")
+        words = table[measured].drop(columns="time").apply(pd.to_numeric, errors="coerce").isna().all(axis=1)
+        again = words & pd.Series(again, table.index).groupby((words != words.shift()).cumsum()).transform("any")
     return table[~again]
 
 
@@ -140,7 +146,9 @@ def in_si_units(table: pd.DataFrame, columns: Mapping[str, Column]) -> pd.DataFr
         directions = _directions(table[key])
         if {1, -1} <= set(directions):
             found.setdefault("direction", directions)
-    rows = pd.DataFrame(found, index=table.index)
+    rows, tick_s = pd.DataFrame(found, index=table.index), _tick_of_dates(table, columns)
+    for name in {"time", "step_time"} & set(rows):
+        rows[name] *= tick_s if pd.api.types.is_numeric_dtype(table[name].dtype) and not columns[name].unit else 1.0
     if "counter" in rows and columns["voltage"].words == "ewe":
         _say(f"the voltage is {columns['voltage'].name} less {columns['counter'].name}, as one electrode is no cell")
         rows["voltage"] -= rows["counter"]
@@ -150,13 +158,13 @@ def in_si_units(table: pd.DataFrame, columns: Mapping[str, Column]) -> pd.DataFr
 
 
 def _current(rows: pd.DataFrame, columns: Mapping[str, Column]) -> pd.Series:
-    """The current of a table that holds something in its place."""
-    if "power" in rows:
-        _say(f"the current is {columns['power'].name} over {columns['voltage'].name}, as there is no column for it")
-        return rows["power"] / rows["voltage"].where(rows["voltage"] > 0.0)
-    _say(f"the current is the charge {columns['charge_step'].name} over the time since the row before")
-    step_s = rows["time"].diff()
-    return (rows["charge_step"] / step_s.where(step_s > 0.0)).bfill()
+    """The current of a table that holds something in its place; a charge is exact, whatever voltage a power is of."""
+    if "charge_step" in rows:
+        _say(f"the current is the charge {columns['charge_step'].name} over the time since the row before")
+        step_s = rows["time"].diff()
+        return (rows["charge_step"] / step_s.where(step_s > 0.0)).bfill()
+    _say(f"the current is {columns['power'].name} over {columns['voltage'].name}, as there is no column for it")
+    return rows["power"] / rows["voltage"].where(rows["voltage"] > 0.0)
 
 
 def _directions(states: pd.Series) -> IntArray:
@@ -165,13 +173,13 @@ def _directions(states: pd.Series) -> IntArray:
 
 
 def _finest(table: pd.DataFrame, columns: Mapping[str, Column], quantity: str) -> FloatArray:
-    """The column of a quantity. Clocks of other names are asked only if that of the first one has one time twice."""
+    """The column of a quantity. Clocks of other names are asked only if the first one has one time twice, or goes back."""
     column = columns[quantity]
     read = seconds if quantity == "time" else numbers
     best = read(table[quantity], column)
     for key in [key for key in columns if key.startswith(f"{quantity} ")]:
         other = columns[key]
-        if other.words != column.words and (np.diff(best) != 0.0).all():
+        if other.words != column.words and (np.diff(best) > 0.0).all():
             break
         try:
             values = read(table[key], other)
@@ -180,6 +188,9 @@ def _finest(table: pd.DataFrame, columns: Mapping[str, Column], quantity: str) -
         is_finer = len(np.unique(values)) > len(np.unique(best))
         if _agree(best, values, quantity):
             best = values if is_finer else best
+        elif _goes_on_where(values, best):
+            _say(f"the time is {other.name!r}, as {column.name!r} goes back")
+            best = values
         elif other.words == column.words:
             raise ValueError(
                 f"both {column.name!r} and {other.name!r} may be the {quantity}. Say which it is: --columns {quantity}=NAME "
@@ -188,6 +199,33 @@ def _finest(table: pd.DataFrame, columns: Mapping[str, Column], quantity: str) -
         elif is_finer:
             _say(f"the time is {column.name!r}; {other.name!r} tells more rows apart, but is another clock")
     return best
+
+
+def _goes_on_where(other_s: FloatArray, time_s: FloatArray) -> bool:
+    """Whether a clock goes on where another one goes back, and tells as many rows apart."""
+    other, this = np.diff(other_s), np.diff(time_s)
+    return bool((other >= 0.0).all() and (this < 0.0).any() and (other <= 0.0).sum() <= (this <= 0.0).sum())
+
+
+def _tick_of_dates(table: pd.DataFrame, columns: Mapping[str, Column]) -> float:
+    """What a clock counts in whose name has no unit, s, where dates beside it, or days as spreadsheets count, tell."""
+    clock, ends = columns["time"], table["time"].iloc[[0, -1]]
+    if clock.unit or not pd.api.types.is_numeric_dtype(ends.dtype) or not table["time"].is_monotonic_increasing:
+        return 1.0
+    ticks = np.ptp(numbers(ends, clock))
+    for key in [key for key in columns if key.startswith("time ")]:
+        try:
+            span_s = np.ptp(seconds(table[key].iloc[[0, -1]], columns[key]))
+        except ValueError:
+            continue
+        if pd.api.types.is_numeric_dtype(table[key].dtype) and not columns[key].unit:
+            span_s *= _DAY_S
+        for unit, tick_s in _UNITS_S.items():
+            if abs(span_s - tick_s * ticks) <= 1.0 + _NOTHING_SHARE * span_s:
+                if tick_s != 1.0:
+                    _say(f"{clock.name!r} counts {unit}, as {columns[key].name!r} tells")
+                return tick_s
+    return 1.0
 
 
 def _agree(one: FloatArray, other: FloatArray, quantity: str) -> bool:
@@ -221,6 +259,8 @@ def numbers(values: pd.Series, column: Column) -> FloatArray:
 
 def _temperatures_C(values: pd.Series, column: Column) -> FloatArray:
     found = numbers(values, column)
+    if not found.any():
+        raise ValueError(f"the column {column.name!r} holds 0 in all rows, as without a sensor")
     low_C, high_C = _TEMPERATURES_C
     bad = np.flatnonzero((found < low_C) | (found > high_C))
     if len(bad):
@@ -434,35 +474,15 @@ def _refuse_backwards(rows: pd.DataFrame) -> None:
             )
 
 
-def with_moments_of_switches(rows: pd.DataFrame) -> pd.DataFrame:
-    """Where no row tells when a rest ended, the time in the step of the first row under load does."""
-    if "step_time" not in rows:
-        return rows
-    time_s, rest = rows["time"].to_numpy(), (rows["current"].abs() <= _rest_A(rows["current"])).to_numpy()
-    step_s = np.diff(time_s, prepend=np.nan, append=np.nan)
-    first = np.append(False, rest[:-1] & ~rest[1:]) & _changes(rows, "step")
-    moment_s = time_s - rows["step_time"].to_numpy()
-    # as long as one row is missing in between
-    missing = step_s[:-1] > 2.0 * np.fmax(np.append(np.nan, step_s[:-2]), step_s[1:])
-    told = np.flatnonzero(first & missing & (moment_s < time_s) & (moment_s > np.append(np.nan, time_s[:-1])))
-    if not len(told):
-        return rows
-    _say(
-        f"the rest is taken to last until {rows['step_time'].iloc[told[0]]:g} s before row {rows.index[told[0]] + 1}, as the "
-        "time in its step says"
-    )
-    more = rows.iloc[np.insert(np.arange(len(rows)), told, told - 1)]
-    return more.assign(time=np.insert(time_s, told, moment_s[told]))
-
-
 def with_signed_current(rows: pd.DataFrame, columns: Mapping[str, Column], is_negative: bool | None) -> pd.DataFrame:
     """The current of a discharge is positive."""
     current_A, rest_A = rows["current"], _rest_A(rows["current"])
     if not (current_A.abs() > REST_CURRENT_A).any():
-        is_known = "current" in columns and columns["current"].unit
+        is_known = any(columns[each].unit for each in ("current", "power", "charge_step") if each in columns)
         # under the load of a coin cell the voltage falls
-        if not is_known or not current_A.any() or not np.ptp(rows["voltage"]) > _COIN_FALL_V:
-            advice = "" if is_known else ", or that of a coin cell: state the unit of the current"
+        if not is_known or not current_A.any() or not np.ptp(rows["voltage"][current_A.abs() > rest_A]) > _COIN_FALL_V:
+            coin = f", nor that of a coin cell, whose voltage changes by {_COIN_FALL_V:g} V"
+            advice = coin if is_known else ", or that of a coin cell: state the unit of the current"
             raise ValueError(f"no current flows above {REST_CURRENT_A:g} A, below which a cell rests: no discharge{advice}")
     if "direction" in rows and (current_A >= -rest_A).all():
         return rows.assign(current=current_A.where(rows["direction"] >= 0, -current_A))
@@ -491,7 +511,7 @@ def _refuse_unsigned(rows: pd.DataFrame, columns: Mapping[str, Column]) -> None:
     """Refuse a current of one sign under which, once it has grown, the voltage rises for long, while elsewhere it falls."""
     size_A, voltage_V = rows["current"].abs().to_numpy(), rows["voltage"].to_numpy()
     jump_A = np.diff(size_A, prepend=0.0)
-    begin = np.flatnonzero(np.abs(jump_A) > SWITCH_SHARE * size_A.max())
+    begin = np.union1d([0], np.flatnonzero(np.abs(jump_A) > SWITCH_SHARE * size_A.max()))
     end = np.append(begin[1:], len(rows)) - 1
     charge_C = np.add.reduceat(size_A * np.maximum(np.diff(rows["time"], prepend=rows["time"].iloc[0]), 0.0), begin)
     # the first row may have the voltage from before
@@ -508,10 +528,15 @@ def _refuse_unsigned(rows: pd.DataFrame, columns: Mapping[str, Column]) -> None:
 
 
 def _jumps(rows: pd.DataFrame) -> float:
-    """How the voltage jumps with the current where that is switched, -1 to 1; rows next to the switch may mix both sides."""
+    """
+    How the voltage jumps with the current where that is switched, -1 to 1; rows next to the switch may mix both sides. A
+    current that goes on to fall is that of a voltage that is held.
+    """
     voltage_V, current_A = rows["voltage"].to_numpy(), rows["current"].to_numpy()
-    jump_A = np.diff(current_A)
-    n = np.flatnonzero(np.abs(jump_A) > SWITCH_SHARE * np.abs(current_A).max())
+    jump_A, fall_A = np.diff(current_A), -np.diff(np.abs(current_A))
+    most_A = np.abs(current_A).max()
+    held = (current_A[1:] * current_A[:-1] > 0.0) & (fall_A > 0.0) & (np.append(fall_A[1:], 0.0) > _NOTHING_SHARE * most_A)
+    n = np.flatnonzero((np.abs(jump_A) > SWITCH_SHARE * most_A) & ~held)
     wide_V = voltage_V[np.minimum(n + 2, len(voltage_V) - 1)] - voltage_V[np.maximum(n - 1, 0)]
     jump_V = voltage_V[n + 1] - voltage_V[n]
     jump_V = np.where(np.abs(wide_V) > np.abs(jump_V), wide_V, jump_V)

@@ -21,18 +21,18 @@ import numpy as np
 import pandas as pd
 
 from battery_env.files import check_unpacked
-from battery_env.lab.readers.columns import Column, FileFormat, count_required, find_columns, units_below
+from battery_env.lab.readers.columns import REQUIRED, Column, FileFormat, count_required, find_columns, units_below
 
 #: Endings of the names of files that can be read, besides those of NASA (.mat); of text also packed (.gz, .bz2, .xz, .zip).
 #: Text of Maccor's is numbered.
-TEXT_SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".mpt", ".bdf")
+TEXT_SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".mpt", ".dta", ".bdf")
 NUMBERED_SUFFIXES = tuple(f".{number:03d}" for number in range(1000))
 BINARY_SUFFIXES = (".parquet", ".nda", ".ndax", ".mpr", ".xlsx", ".xls")
 PACKED_SUFFIXES = (".gz", ".bz2", ".xz", ".zip")
 
 _OPENERS: dict[str, Callable[[Path], Any]] = {".gz": gzip.open, ".bz2": bz2.open, ".xz": lzma.open}
-# Testers write what they know about a test above the table: so many bytes and lines are searched for its header.
-_HEAD_BYTES, _HEAD_LINES = 1 << 18, 400
+# Testers write what they know about a test above the table: so many bytes are searched for its header.
+_HEAD_BYTES = 1 << 18
 _BLANKS = r"\s+"
 _DELIMITERS = (",", ";", "\t", _BLANKS)
 _DECIMAL_COMMA = re.compile(r"^\s*[-+]?\d+,\d+(?:[eE][-+]?\d+)?\s*$")
@@ -40,8 +40,8 @@ _NUMBER = re.compile(r"^\s*[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?(?:[;\s]|$)")
 _DECIMAL_POINT = re.compile(r"^\s*[-+]?\d*\.\d+(?:[eE][-+]?\d+)?\s*$")
 # What Excel reads in the first line of a file: the delimiter.
 _DELIMITER_LINE = re.compile(r"^\s*sep=([,;\t|])\s*$", flags=re.IGNORECASE)
-# Some testers put each line as a whole in quotes.
-_QUOTED_LINES = re.compile(rb'^"[^"\n]*"\s*$', flags=re.MULTILINE)
+# Some testers put lines as a whole in quotes.
+_QUOTED_LINES = re.compile(rb'^"([^"\n]*)"\s*$', flags=re.MULTILINE)
 # So many lines below a table may be no part of it.
 _FOOT_LINES = 50
 # What is packed is read in parts of so many bytes, or rows.
@@ -97,9 +97,9 @@ def _first_rows(table: pd.DataFrame) -> list[list[str]]:
 
 def _read_text(source: Path | bytes, file_format: FileFormat) -> tuple[pd.DataFrame, dict[str, Column]]:
     head = source[:_HEAD_BYTES] if isinstance(source, bytes) else _head(source)
-    if isinstance(source, Path) and not _QUOTED_LINES.sub(b"", head[: head.rfind(b"\n")]).strip():
+    if isinstance(source, Path) and _QUOTED_LINES.search(head):
         with _open(source) as stream:
-            source = stream.read().replace(b'"', b"")
+            source = _QUOTED_LINES.sub(rb"\1", stream.read())
             head = source[:_HEAD_BYTES]
     layout = _layout(head, file_format.columns)
     columns, header_lines = find_columns(layout.names, file_format, layout.rows), layout.header_line + 1
@@ -227,12 +227,12 @@ def _unpacking(path: Path) -> IO[bytes]:
 
 def _layout(head: bytes, chosen: Mapping[str, str] | None) -> _Layout:
     encoding, text = _decoded(head)
-    lines = io.StringIO(text, newline=None).read().split("\n")[:_HEAD_LINES]
+    lines = io.StringIO(text, newline=None).read().split("\n")
     delimiters: tuple[str, ...] = _DELIMITERS
     if stated := _DELIMITER_LINE.match(lines[0]):
         lines[0], delimiters = "", (stated[1],)
     number, delimiter = _header(lines, delimiters, chosen)
-    names, rows = _fields(lines[number], delimiter), [_fields(line, delimiter) for line in lines[number + 1 :]]
+    names, rows = _fields(lines[number], delimiter), [_fields(line, delimiter) for line in lines[number + 1 :][:_FIRST_ROWS]]
     layers = next((n for n, name in enumerate(names) if name), 0) if delimiter != _BLANKS else 0
     if not any(row[:layers] == [""] * layers and any(row[layers:]) for row in rows):
         layers = 0
@@ -255,6 +255,8 @@ def _header(lines: Sequence[str], delimiters: Sequence[str], chosen: Mapping[str
                 continue
             if (count := count_required(_fields(line, delimiter), chosen)) > found:
                 best, found = (number, delimiter), count
+        if found == len(REQUIRED):
+            break
     if found > 0:
         return best
     number = next((n for n, line in enumerate(lines) if line.strip()), -1)
@@ -277,7 +279,8 @@ def _decoded(head: bytes) -> tuple[str, str]:
         # the head may end within a character
         return "utf-8", getincrementaldecoder("utf-8")().decode(head, final=len(head) < _HEAD_BYTES)
     except UnicodeDecodeError:
-        return "latin-1", head.decode("latin-1")
+        encoding = "gb18030" if "电压".encode("gb18030") in head else "latin-1"
+        return encoding, head.decode(encoding, errors="ignore")
 
 
 def _fields(line: str, delimiter: str) -> list[str]:
@@ -301,7 +304,7 @@ def _sheet(path: Path, file_format: FileFormat) -> bytes:
         raise ValueError(f"the file is damaged, or no workbook: {str(error).strip()}") from error
     found = []
     for sheet in sheets.values():
-        head = [[str(name) for name in row] for row in sheet.head(_HEAD_LINES).to_numpy()]
+        head = [[str(name) for name in row] for row in sheet.head(_FIRST_ROWS).to_numpy()]
         counts = [count_required(names, file_format.columns) for names in head] or [0]
         line = int(np.argmax(counts))
         found.append((counts[line], len(sheet), head[line : line + 1], line, sheet))
@@ -368,6 +371,8 @@ def _read_biologic(path: Path) -> pd.DataFrame:
     with path.open("rb") as stream:
         try:
             return pd.DataFrame(MPRfile(stream).data)
+        except NotImplementedError as error:
+            raise ValueError(f"galvani, which reads BioLogic's files, does not know all of this one: {error}") from error
         except Exception as error:
             raise ValueError(f"the file is damaged, or none of BioLogic's: {str(error).strip()}") from error
 

@@ -1,0 +1,67 @@
+"""What readers see of a study is what its report says of the tables that are published beside it."""
+
+import json
+from functools import partial
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from benchmarks import (
+    calibrators,
+    certificate,
+    direct_mapping,
+    identifiability,
+    linear_cost,
+    published,
+    references,
+    stabilisation,
+    throughput,
+)
+from benchmarks.cells import departure_table
+from benchmarks.study import markdown
+
+PUBLISHED = Path(__file__).parents[2] / "docs" / "results"
+
+
+def of_one(report, name, tables):
+    """A report of one table."""
+    return report(tables[name])
+
+
+def of_comparison(name, tables):
+    comparison, results = calibrators.COMPARISONS[name], tables[name]
+    if not comparison.by_parameter:
+        results = calibrators.by_parameter(results, comparison.conditions[0].labels)
+    return calibrators.report(name, results)
+
+
+def of_mapping(tables):
+    made_by = json.loads((PUBLISHED / "direct_mapping" / "direct_mapping.json").read_text())["configuration"]
+    return direct_mapping.report(tables["direct_mapping"], made_by)
+
+
+REPORTS = {
+    "direct_mapping/direct_mapping": of_mapping,
+    "identifiability/summary": identifiability.summary,
+    "linear_cost/linear_cost": partial(of_one, linear_cost.report, "linear_cost"),
+    "own_cell/own_cell": lambda tables: markdown(departure_table(tables["own_cell"])),
+    "published/published": partial(of_one, published.report, "published"),
+    "published_horizons/published": partial(of_one, published.report, "published"),
+    "references/references": lambda tables: references.report(tables["references"].fillna({"arguments": ""})),
+    "stabilisation/stabilisation": stabilisation.report,
+    "stabilisation_long/stabilisation": stabilisation.report,
+    "throughput/filters": partial(of_one, throughput.report_filters, "filters"),
+    **{f"{name}/{name}": partial(of_comparison, name) for name in ("faults", "mismatch", "mismatch_policies", "peers")},
+}
+
+
+@pytest.mark.parametrize("name", REPORTS)
+def test_what_is_shown_is_what_the_report_says_of_the_published_tables(name):
+    tables = {path.stem: pd.read_csv(path) for path in (PUBLISHED / name).parent.glob("*.csv")}
+    assert REPORTS[name](tables) == (PUBLISHED / f"{name}.md").read_text(encoding="utf-8"), "run the study with --redraw"
+
+
+def test_certificates_begin_with_what_holds_exactly():
+    shown = (PUBLISHED / "certificates" / "certificates.md").read_text(encoding="utf-8")
+    assert markdown(certificate.feasible_alpha3()) in shown
