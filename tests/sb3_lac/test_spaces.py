@@ -75,12 +75,13 @@ def test_parallel_envs_and_gsde(make_model, make_env, n_updates, n_envs, use_sde
     assert n_updates(model) == {1: 20, 3: 24}[n_envs]
 
 
-def test_gsde_noise_of_both_actors_is_sampled_in_each_update(make_model):
-    model = make_model(use_sde=True, algorithm=PublishedLAC)
-    noise = [actor.action_dist.exploration_mat for actor in (model.actor, model.actor_target)]
-    model.train(gradient_steps=1, batch_size=16)
-    for actor, old_noise in zip((model.actor, model.actor_target), noise, strict=True):
-        assert not th.equal(actor.action_dist.exploration_mat, old_noise)
+def test_gsde_noise_of_both_actors_is_sampled_in_each_update(make_model, monkeypatch):
+    model, sampled = make_model(use_sde=True, algorithm=PublishedLAC), []
+    for actor in (model.actor, model.actor_target):
+        sample = actor.reset_noise
+        monkeypatch.setattr(actor, "reset_noise", lambda actor=actor, sample=sample: sampled.append(actor) or sample())
+    model.train(gradient_steps=2, batch_size=16)
+    assert sampled == 2 * [model.actor, model.actor_target]
 
 
 @pytest.mark.parametrize("observation_space", [spaces.Discrete(4), spaces.MultiDiscrete([3, 2]), spaces.MultiBinary(3)])
