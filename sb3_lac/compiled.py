@@ -83,9 +83,11 @@ def same_distributions(model: Any) -> Iterator[None]:
     """Leave action distributions as they are: what an update samples hangs on a graph, which no model can be copied with."""
     distributions = [vars(actor.action_dist) for actor in actors_of(model)]
     before = [values.copy() for values in distributions]
-    yield
-    for values, old in zip(distributions, before, strict=True):
-        values.update(old)
+    try:
+        yield
+    finally:
+        for values, old in zip(distributions, before, strict=True):
+            values.update(old)
 
 
 def check_compiler(device: th.device) -> None:

@@ -147,11 +147,8 @@ class CostAlgorithm(OffPolicyAlgorithm):
         if not 0 < self.lambda_min <= lambda_max < math.inf or not 0 < self.lambda_init < math.inf:
             limits = f"lambda_min={self.lambda_min}, lambda_init={self.lambda_init} and lambda_max={self.lambda_max}"
             raise ValueError(f"{limits} must be greater than 0 and finite, and the least of them lambda_min.")
-        for name in ("lambda_learning_rate", "critic_learning_rate"):
-            rate = getattr(self, name, None)
-            # Optimizers only check the rate that they are made with, which is ``learning_rate``
-            if rate is not None and not 0 <= FloatSchedule(rate)(1) < math.inf:
-                raise ValueError(f"{name}={rate} must start at a finite rate of at least 0.")
+        if self.lambda_learning_rate is not None:
+            check_rate("lambda_learning_rate", self.lambda_learning_rate)
         if not 0 <= (self.reward_bound or 0.0) < math.inf:
             raise ValueError(f"reward_bound={self.reward_bound} must be finite and at least 0, what a termination pays.")
         if self.reward_bound and self.gamma == 1:
@@ -400,6 +397,12 @@ class Terminations:
                 f"{price:.3g} (mean cost per step / (1 - gamma)).",
                 stacklevel=3,
             )
+
+
+def check_rate(name: str, rate: float | Schedule) -> None:
+    """Refuse a learning rate of one's own: optimizers only check the one that they are made with, ``learning_rate``."""
+    if not 0 <= FloatSchedule(rate)(1) < math.inf:
+        raise ValueError(f"{name}={rate} must start at a finite rate of at least 0.")
 
 
 def refuse_what_is_not_finite(name: str, value: Any, step: int) -> None:

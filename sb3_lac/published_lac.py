@@ -13,7 +13,7 @@ from torch.nn import functional as F
 
 from sb3_lac.buffers import HorizonReplayBuffer
 from sb3_lac.compiled import Metrics, set_gradients, step
-from sb3_lac.costs import CostAlgorithm
+from sb3_lac.costs import CostAlgorithm, check_rate
 from sb3_lac.policies import PublishedCnnPolicy, PublishedMultiInputPolicy, PublishedPolicy, largest_value
 
 
@@ -158,6 +158,7 @@ class PublishedLAC(CostAlgorithm):
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
+        check_rate("critic_learning_rate", self.critic_learning_rate)
         if self.horizon is None:
             if self.gamma == 1:
                 raise ValueError("gamma must be smaller than 1 without a horizon: L would be an infinite sum.")
