@@ -139,7 +139,10 @@ class Discharge:
 
     @property
     def unseen_C(self) -> float:
-        """Its standard deviation by all that no sample shows, C; what flows at rest may be an offset of the sensor."""
+        """
+        Standard deviation of the charge drawn by all that no sample shows, C; what flows at rest may be an offset of the
+        sensor.
+        """
         shown = self.shown
         switched_C = 0.0 if shown.is_counted else switched_sd_C(self.time_s, self.current_A)
         return hypot(shown.load_on_C, shown.offset_A * float(np.ptp(self.time_s)), shown.uncounted_C, switched_C)

@@ -11,6 +11,8 @@ from battery_env.records.samples import SWITCH_SHARE
 
 # A charger holds its highest voltage within this, V.
 _HELD_V = 0.01
+# By so much of the largest current the last one written may differ from the one by which a charge was ended.
+_READ_SHARE = 0.005
 
 
 class ChargeBefore(NamedTuple):
@@ -36,10 +38,10 @@ class ChargeBefore(NamedTuple):
     @property
     def tapered(self) -> bool:
         """
-        Whether the current fell to a tenth while the voltage was held, so that the cell took all that it could; to a per cent,
-        as a tester stops by a reading that it need not write.
+        Whether the current fell to a tenth while the voltage was held, so that the cell took all that it could; about so, as a
+        tester stops by a reading that it need not write.
         """
-        return round(self.last_A / self.largest_A, 2) <= SWITCH_SHARE
+        return self.last_A <= (SWITCH_SHARE + _READ_SHARE) * self.largest_A
 
 
 class Shown(NamedTuple):

@@ -37,7 +37,7 @@ from battery_env.lab.command_line import NOT_SETTLED, REFUSED, SETTLED, calibrat
 from battery_env.lab.settings import Settings
 from battery_env.policies.estimator import PolicyEstimator
 from battery_env.policies.pretrained import pretrained_ids
-from battery_env.records import Stream
+from battery_env.records import Samples, Stream
 from battery_env.records.discharge import Discharge, load_nasa_discharges
 from battery_env.tasks.voltage.task import ESTIMATE_RANGES
 
@@ -393,6 +393,15 @@ def test_a_load_that_is_switched_between_rows_leaves_no_wrong_number_settled(ste
     voltage_V = record.voltage_V + np.random.default_rng(9).normal(0.0, 0.002, len(record.voltage_V))
     answers = swept_answers(Case(record.time_s, voltage_V, record.current_A, 6000.0, 0.15, recorded=False), "rows apart")
     assert not [answer for answer in answers if answer[4] == "wrong"]
+    # what is advised settles it
+    for size in SWEEPS["rows apart"][:5] if steady_s > 20 else ():
+        beside = np.flatnonzero(np.diff(current_A[: len(voltage_V)]))
+        rows = np.unique(np.concatenate([np.arange(0, len(voltage_V), size), beside, beside + 1]))
+        sampled = Samples(record.time_s[rows], voltage_V[rows], record.current_A[rows])
+        found = LeastSquares(thermal=True, mismatch_V=0.01).estimate(sampled)
+        assert found.settled and found.q_mobile == pytest.approx(6000.0, rel=0.01)
+        followed = last_estimate(ExtendedKalmanFilter(thermal=True, mismatch_V=0.01).follow(sampled))
+        assert "switched between" not in followed.reason and followed.q_mobile == pytest.approx(6000.0, rel=0.01)
 
 
 @pytest.mark.parametrize("fault", [fault for fault in FAULTS if fault not in UNOBSERVABLE])

@@ -45,7 +45,8 @@ _AT_BOUND = "{} is at a bound of its search, where the record does not determine
 _DIFFERS = "The policy and the fit in its observation differ by {{differs:.1%}} in {}: it does not trust the fit."
 _DROPPED = "The current changes for a moment, and the voltage does not follow: {} in doubt."
 _SWITCHES = (
-    "The load is switched between two samples, nobody knows when, {{switches}} times: {}. Log a sample at each switch, {}."
+    "The load is switched between two samples, nobody knows when, {{switches}} times: {}. Log a sample before and after each "
+    "switch, a second apart{}."
 )
 _PRIOR_WRONG = "The prior of {} contradicts what the record says."
 _PRIOR_ALONE = "{} rests on its prior: the record alone does not determine it yet. Without it {}"
@@ -185,8 +186,8 @@ class Condition(IntEnum):
     )
     Q_DROPPED = _DROPPED.format("{dropped_C:.0f} C are"), "q_mobile"
     R_DROPPED = _DROPPED.format("{dropped_mohm:.0f} mohm of R_o are"), "r_o"
-    Q_SWITCHES = _SWITCHES.format("{switched_C:.0f} C are in doubt", "and the charge that the tester counts"), "q_mobile"
-    R_SWITCHES = _SWITCHES.format("R_o does not show", "a second after it at most"), "r_o"
+    Q_SWITCHES = _SWITCHES.format("{switched_C:.0f} C are in doubt", ", or the charge that the tester counts"), "q_mobile"
+    R_SWITCHES = _SWITCHES.format("R_o does not show", ""), "r_o"
     GAP_UNSURE = (
         "No sample lies between {gap_start_s:.0f} s and {gap_end_s:.0f} s, and the voltage does not tell whether the load was "
         "on: {gap_C:.0f} C are in doubt.",

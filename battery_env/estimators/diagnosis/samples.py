@@ -226,7 +226,7 @@ def _watch_all(
         examine(seen, voltage_V[n], current_A[n], q_mobile, r_o, cell_q_mobile)
         if n > 0 and len(model_V) > 0:
             gaps.follow(seen, voltage_V[n], current_A[n], model_V[n], q_mobile)
-        remember(seen, voltage_V[n], current_A[n])
+        remember(seen, voltage_V[n], current_A[n], current_A[n])
 
 
 @compiled
@@ -256,13 +256,12 @@ def examine(seen: Row, voltage: float, current: float, q_mobile: float, r_o: flo
 
 
 @compiled
-def remember(seen: Row, voltage: float, current: float) -> None:
-    """Keep a sample that was examined."""
+def remember(seen: Row, voltage: float, current: float, read_A: float) -> None:
+    """Keep a sample that was examined: its current until the next, and the one that was read at its time."""
     before = seen.before
     _note_rest(seen.rest, seen.time_s, seen.interval_s, current)
     # that of load-on is judged there
-    if seen.samples > 1 and seen.rest.on_s == 0.0:
-        note_switch(seen.switches, seen.current_A, current, seen.interval_s)
+    note_switch(seen.switches, read_A, seen.interval_s if seen.rest.on_s == 0.0 else 0.0)
     if not isnan(voltage):
         before.voltage_2_V = before.voltage_1_V if seen.samples > 1 else voltage
         before.voltage_1_V, before.time_1_s, before.current_1_A = voltage, seen.time_s, current

@@ -34,19 +34,7 @@ _NOISE_V = 0.005
 # Covariances of a state may be so much larger than their variances allow, as a share.
 _ROUNDED = 1e-6
 # What reasons are made of
-_SHOWN = (
-    "start",
-    "rest",
-    "fault",
-    "switch",
-    "switches",
-    "gap",
-    "start_V",
-    "time_s",
-    "uncounted_C",
-    "dropped_C",
-    "dropped_ohm",
-)
+_SHOWN = "start rest fault switch switches gap start_V time_s uncounted_C dropped_C dropped_ohm".split()
 
 
 class ExtendedKalmanFilter(OnlineEstimator):
@@ -235,7 +223,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
             dt_s = 0.0
             if not isnan(temperature_K):
                 self._begin(temperature_K)
-        sample = np.array([[(voltage_V, current_A, dt_s, temperature_K)]], dtype=SAMPLE)
+        sample = np.array([[(voltage_V, current_A, dt_s, temperature_K, current_A)]], dtype=SAMPLE)
         said = self._follow(self._cells, self._filters, sample)[0, 0]
         shown = self._measured(self._cells["seen"][0])
         verdict = _verdict(said["condition"].tolist(), said["r_o_comes_first"], shown)
@@ -261,6 +249,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
         time_s, voltage_V, current_A, dt_s, temperature_C = stream
         samples = np.zeros((len(time_s), 1), SAMPLE)
         samples["voltage_V"][:, 0], samples["current_A"][:, 0], samples["dt_s"][:, 0] = voltage_V, current_A, dt_s
+        samples["read_A"][:, 0] = record.current_A
         samples["temperature_K"][:, 0] = nan if temperature_C is None else temperature_C + ZERO_CELSIUS_K
         if temperature_C is not None:
             self._begin(float(samples["temperature_K"][0, 0]))
@@ -383,6 +372,7 @@ class KalmanBatch(OnlineBatch):
         samples = np.zeros((1, len(cells)), SAMPLE)
         (of,) = samples
         of["voltage_V"], of["current_A"] = check_numbers("voltage_V", voltage_V), check_numbers("current_A", current_A)
+        of["read_A"] = of["current_A"]
         of["dt_s"] = np.where(is_first, 0.0, check_numbers("dt_s", dt_s))
         degrees_C = None if temperature_C is None else np.asarray(temperature_C, dtype=np.float64)
         of["temperature_K"] = nan if degrees_C is None else degrees_C + ZERO_CELSIUS_K
@@ -452,4 +442,4 @@ def _follow_all(
             if seen.samples > 1 and duration > 0.0:
                 gaps.follow(seen, belonging_V, current, bank.expected_V, bank.mean[Q])
             conclude(cell, settings, estimates[k, n])
-            remember(seen, voltage, current)
+            remember(seen, voltage, current, sample.read_A)

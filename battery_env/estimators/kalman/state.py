@@ -48,8 +48,8 @@ class Settings(NamedTuple):
     cell_sd_r_o: float
 
 
-#: One sample of one cell.
-SAMPLE = table("voltage_V current_A dt_s temperature_K")
+#: One sample of one cell; its current is the mean until the next one, and was read at its time.
+SAMPLE = table("voltage_V current_A dt_s temperature_K read_A")
 
 #: What is said after a sample, with the :class:`~battery_env.estimators.diagnosis.Condition` that speaks first against each
 #: number, and whether that against ``r_o`` is the larger doubt.
