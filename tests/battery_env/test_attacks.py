@@ -409,8 +409,13 @@ def test_a_stream_and_a_trace_say_what_the_whole_record_says(fault):
     rng = np.random.default_rng((3, FAULTS.index(fault)))
     case = broken(drawn(rng, ()), fault, rng)
     make = calibrators(case)["filter, mismatch"]
-    (found, estimate), *others = (outcome(case, make, path) for path in ("whole", "trace", "stream"))
-    assert found != "wrong" and others == [(found, estimate)] * 2
+    (found, estimate), traced, (found_live, live) = (outcome(case, make, path) for path in ("whole", "trace", "stream"))
+    assert found != "wrong" and traced == (found, estimate)
+    # a stream has means between samples, which do not tell in which of them a load was switched: its doubt may differ a little
+    if isinstance(live, Estimate):
+        assert live.sd_q_mobile == pytest.approx(estimate.sd_q_mobile, rel=0.01)
+        live = replace(live, sd_q_mobile=estimate.sd_q_mobile)
+    assert (found_live, live) == (found, estimate)
 
 
 def window_trace(record: Case) -> Estimate:
