@@ -297,6 +297,7 @@ class CostAlgorithm(OffPolicyAlgorithm):
             for gradient_step in range(gradient_steps):
                 # Sample replay buffer
                 replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
+                refuse_samples(replay_data, self.num_timesteps)
                 update_targets = (self._n_updates + gradient_step) % self.target_update_interval == 0
                 names, metrics = update(replay_data, self.costs(replay_data), update_targets)
                 metrics_per_step.append(metrics)
@@ -413,6 +414,16 @@ def refuse_what_is_not_finite(name: str, value: Any, step: int) -> None:
     elif value is not None and np.asarray(value).dtype.kind == "f" and not np.isfinite(value).all():
         found = np.asarray(value)[~np.isfinite(value)].ravel()[0]
         raise ValueError(f"The {name} {found} at step {step}: all must be finite. See check_env().")
+
+
+def refuse_samples(replay_data: ReplayBufferSamples, step: int) -> None:
+    """The same for samples: rewards may be computed only then (HER), and a buffer may have been filled elsewhere."""
+    named = [(name, each.values() if isinstance(each, dict) else [each]) for name, each in replay_data._asdict().items()]
+    parts = [(name, part) for name, each in named for part in each if part is not None]
+    # One question for the whole batch: a sum is finite where all its terms are
+    if not th.isfinite(th.stack([part.sum() for _, part in parts])).all():
+        for name, part in parts:
+            refuse_what_is_not_finite(f"replay buffer gave {name} with", part.numpy(force=True), step)
 
 
 def reward_scale(vec_normalize: VecNormalize | None) -> float:

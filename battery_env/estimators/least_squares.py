@@ -35,7 +35,7 @@ from battery_env.estimators.diagnosis.rest import InitialSoc, check_initial_soc
 from battery_env.estimators.diagnosis.samples import note_samples, unseen_C, watched
 from battery_env.estimators.estimator import Estimator, check_bounds
 from battery_env.estimators.search import Fit, JointPrior, Prior, Search, square
-from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, check_parameters
+from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, R_O, check_parameters
 from battery_env.records import Record, Samples, Shown, check_record, drawn_charge_C, shown_beside
 from battery_env.records.model import RecordModel
 
@@ -156,8 +156,8 @@ class LeastSquares(Estimator):
         thermal: bool = False,
         dt_s: float = 1.0,
         initial: ArrayLike | None = None,
-        q_mobile_bounds_C: tuple[float, float] = (Q_MOBILE.limits[0], 1e5),
-        r_o_bounds_ohm: tuple[float, float] = (0.0, 1.0),
+        q_mobile_bounds_C: tuple[float, float] = Q_MOBILE.limits,
+        r_o_bounds_ohm: tuple[float, float] = R_O.limits,
         prior_q_mobile_C: tuple[float, float] | None = None,
         mismatch_V: float = 0.0,
         voltage_noise_V: float | None = None,

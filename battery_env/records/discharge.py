@@ -52,6 +52,8 @@ _COLUMNS = ("time_s", "voltage_V", "current_A")
 # what cycles.csv tells about each discharge beyond the samples themselves
 _META_COLUMNS = ("test_id", "start_time", "ambient_temperature_C", "capacity_Ah", "Re_ohm", "Rct_ohm")
 _DURATION_LIMITS_S = (10.0, 1e6)
+# What a clock that is not in seconds may be in: what the command line calls it, and s.
+_OTHER_CLOCKS = {"milliseconds": ("ms", 1e-3), "minutes": ("min", 60.0), "hours": ("h", 3600.0), "days": ("d", 86400.0)}
 # What draws no more than this share of the charge before or after the main load is noise, or an offset.
 _LITTLE_SHARE = 5e-3
 # No cell changes its voltage by this much from one sample to the next, and back, but for its load, V.
@@ -105,11 +107,17 @@ class Discharge:
         if len(self.time_s) < LEAST_SAMPLES:
             raise ValueError(f"a discharge needs at least {LEAST_SAMPLES} samples, got {len(self.time_s)}")
         duration_s = self.time_s[-1] - self.time_s[0]
-        if not _DURATION_LIMITS_S[0] <= duration_s <= _DURATION_LIMITS_S[1]:
-            unit, symbol = ("hours", "h") if duration_s < _DURATION_LIMITS_S[0] else ("milliseconds", "ms")
+        least_s, most_s = _DURATION_LIMITS_S
+        if not least_s <= duration_s <= most_s:
+            spans = [
+                f"{factor * duration_s:.0f} s if it is in {unit} (command line: --units time={symbol})"
+                for unit, (symbol, factor) in _OTHER_CLOCKS.items()
+                if least_s <= factor * duration_s <= most_s
+            ]
+            advice = f" Give the time in seconds: {', '.join(spans)}." if spans else ""
             raise ValueError(
-                f"time_s must span {_DURATION_LIMITS_S[0]:g} .. {_DURATION_LIMITS_S[1]:g} s, got {duration_s:g} s. "
-                f"Give the time in seconds, not in {unit} (command line: --units time={symbol})."
+                f"time_s must span {least_s:g} .. {most_s:g} s, got {duration_s:g} s, too "
+                f"{'short' if duration_s < least_s else 'long'} for a discharge.{advice}"
             )
         check_drawn_charge(self.charge_C)
         if self.charge_C > Q_MOBILE.limits[1]:

@@ -256,7 +256,7 @@ class TestBadInput:
             ({"r_o_bounds_ohm": (0.2, 0.1)}, "bounds of r_o must be"),
             ({"r_o_bounds_ohm": (0.0, 80.0)}, "Milliohms"),
             ({"prior_q_mobile_C": (6000.0, 0.0)}, "sd (>|above) 0"),
-            ({"prior_q_mobile_C": (1.9, 0.1)}, "Ampere-hours|mean within 100 .. 100000"),
+            ({"prior_q_mobile_C": (1.9, 0.1)}, "Ampere-hours|mean within 100 .. 1e\\+07"),
             ({"prior_q_mobile_C": (6000.0, 60.0), "parameters": ["r_o"]}, "needs 'q_mobile'"),
             ({"mismatch_V": -0.05}, "mismatch_V must be .*at least 0.*, got -0.05"),
             ({"voltage_noise_V": 0.0}, "voltage_noise_V must be greater than 0"),

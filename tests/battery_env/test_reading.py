@@ -556,9 +556,10 @@ def test_a_folder_reads_numbered_text_and_names_what_it_left_out(tmp_path, capsy
     ("changes", "said", "unsaid"),
     [
         ({"time": TABLE["time"] / 3600.0}, "--units time=h", ""),
+        ({"time": TABLE["time"] / 86400.0}, "3022 s if it is in days (command line: --units time=d)", "minutes"),
         ({"time": TABLE["time"] * 1e3}, "--units time=ms", ""),
         ({"voltage": TABLE["voltage"] * 1e3}, "--units voltage=mV", ""),
-        ({"time (s)": TABLE["time"] / 3600.0, "time": None}, "got 0.839375 s. That is too short for a discharge.", "--units"),
+        ({"time (s)": TABLE["time"] / 3600.0, "time": None}, "got 0.839375 s, too short for a discharge.", "--units"),
         ({"voltage": TABLE["voltage"] * 1e4}, "must lie within 0 .. 5.5 V", "--units"),
         ({"current": TABLE["current"] * 1e-3}, "state the unit of the current", "--units"),
         ({"current (A)": TABLE["current"] * 1e-3, "current": None, "voltage": 4.1}, "a cell rests: no discharge", "unit"),

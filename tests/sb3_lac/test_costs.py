@@ -5,8 +5,11 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
 from gymnasium import spaces
+from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.vec_env import VecNormalize
 
 import sb3_lac.envs  # noqa: F401  # registers the ids
@@ -158,3 +161,27 @@ def test_what_is_not_finite_is_refused_before_it_is_stored(make_model, make_env,
         model.learn(20)
     assert model._n_updates == 0 and model.replay_buffer.pos <= 4
     assert np.isfinite(model.replay_buffer.rewards).all()
+
+
+@pytest.mark.parametrize("where", ["observations", "next_observations", "actions", "rewards"])
+def test_what_was_put_into_the_buffer_elsewhere_reaches_no_weights(make_model, make_env, where):
+    model = make_model(make_env())
+    getattr(model.replay_buffer, where)[:] = float("nan")
+    weights = [parameter.detach().clone() for parameter in model.policy.parameters()]
+    with pytest.raises(ValueError, match=rf"The replay buffer gave {where} with nan at step \d+: all must be finite"):
+        model.train(1)
+    assert all(th.equal(*pair) for pair in zip(weights, model.policy.parameters(), strict=True))
+
+
+def test_rewards_that_are_computed_at_sampling_are_refused_too(make_model):
+    class Undefined(BitFlippingEnv):
+        """Its rewards are numbers only where it is the environment that asks for them."""
+
+        def compute_reward(self, achieved_goal, desired_goal, info):
+            rewards = super().compute_reward(achieved_goal, desired_goal, info)
+            return rewards if np.ndim(achieved_goal) < 2 else rewards + np.inf
+
+    env = Undefined(n_bits=3, continuous=True)
+    model = make_model(env, n_collect=0, policy="MultiInputPolicy", replay_buffer_class=HerReplayBuffer)
+    with pytest.raises(ValueError, match="The replay buffer gave rewards with inf"):
+        model.learn(100)

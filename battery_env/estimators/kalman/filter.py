@@ -24,7 +24,7 @@ from battery_env.estimators.estimator import ModelNow, OnlineBatch, OnlineEstima
 from battery_env.estimators.kalman.bank import conclude, filters_of_prior, take
 from battery_env.estimators.kalman.state import CELL, ESTIMATE, FILTER, SAMPLE, Q, R, Settings
 from battery_env.estimators.state_files import check_all, check_like
-from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, check_parameters
+from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, R_O, check_parameters
 from battery_env.records import ChargeBefore, Record, Stream, are_plausible, check_drawn_charge, check_sample, shown_beside
 
 _PRIOR_SD_SHARE_Q = 0.25
@@ -124,8 +124,8 @@ class ExtendedKalmanFilter(OnlineEstimator):
         dt_s: float = 1.0,
         prior_q_mobile_C: tuple[float, float] | None = None,
         prior_r_o_ohm: tuple[float, float] | None = None,
-        q_mobile_bounds_C: tuple[float, float] = (Q_MOBILE.limits[0], 1e5),
-        r_o_bounds_ohm: tuple[float, float] = (0.0, 1.0),
+        q_mobile_bounds_C: tuple[float, float] = Q_MOBILE.limits,
+        r_o_bounds_ohm: tuple[float, float] = R_O.limits,
         voltage_noise_V: float | None = None,
         offset_sd_V: float | None = None,
         mismatch_V: float = 0.0,

@@ -46,7 +46,7 @@ _BACK_SHARE = 0.25
 # What errors advise.
 _SENTENCE = re.compile(r"(?<=[^.\s]\.)\s+(?=[A-Z])")
 _UNIT_ADVICE = re.compile(r" in [^,]+, not in \w+ \(command line: --units (\w+)=(\w+)\)(, and)?")
-_SIGN_ADVICE = ": flip the sign"
+_CLOCK_ADVICE, _SIGN_ADVICE = "Give the time in seconds: ", ": flip the sign"
 _STEP_ADVICE = re.compile(r", or name the column of its step|, and one that does with each step a column of the step")
 
 
@@ -76,6 +76,8 @@ class Recording(NamedTuple):
         """What is left of a sentence of an error once the option that it advises, if any, was tried."""
         if "step" in self.stated:
             sentence = _STEP_ADVICE.sub("", sentence)
+        if "time" in self.stated and sentence.startswith(_CLOCK_ADVICE):
+            return ""
         unit = _UNIT_ADVICE.search(sentence)
         if not unit and _SIGN_ADVICE not in sentence:
             return sentence
@@ -90,8 +92,7 @@ class Recording(NamedTuple):
             except ValueError:
                 pass
         if unit:
-            short_or_long = f"That is too {'short' if factor > 1.0 else 'long'} for a discharge."
-            return _UNIT_ADVICE.sub(",", sentence) if unit[3] else short_or_long if quantity == "time" else ""
+            return _UNIT_ADVICE.sub(",", sentence) if unit[3] else ""
         return sentence.partition(_SIGN_ADVICE)[0] + "."
 
 
