@@ -1,7 +1,7 @@
 """
 How far the ageing of one recorded cell tells of another one: the path of a life as the prior of least squares and of policies
-that learned on cells along it, on discharges of the cell whose life it is not, whole and in progress. Beside them the filter
-that knows nothing, the discharge before, and a regression that has the capacities of the life for labels.
+that learned on cells along it, on discharges of the cell whose life it is not, whole and in progress. Beside them the filter with
+that prior or with none, a regression that has the capacities of the life for labels, and who knows the cell's own life so far.
 
 .. code-block:: bash
 
@@ -17,7 +17,7 @@ simulated cells of the path, from the error of the simulated state; no recorded 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ from matplotlib.figure import Figure
 from battery_env import (
     AgingPath,
     Estimate,
+    ExtendedKalmanFilter,
     LeastSquares,
     PolicyEstimator,
     TrajectoryDataset,
@@ -37,10 +38,11 @@ from battery_env import (
     load_nasa_discharges,
 )
 from battery_env.arrays import FloatArray
-from battery_env.electrochemistry.aging_path import cell_with
+from battery_env.electrochemistry.aging_path import PATH_NAMES, cell_with
 from battery_env.electrochemistry.ends import BAND
 from battery_env.estimates import last_estimate
 from battery_env.files import replacing
+from battery_env.lab.life import Life, track_life
 from battery_env.lab.running import forecast_end
 from battery_env.lab.settings import Settings
 from battery_env.loads import Load, RandomLoad, RandomPiecewise, constant
@@ -70,6 +72,7 @@ SHARES = (0.25, 0.5, 0.75, 1.0)
 CELLS = {"B0005": "B0006", "B0006": "B0005"}
 ENV_ID = "BatteryVoltageJoint-v0"
 PATH, FILTER, LAST = "least squares, path of {}", "what the command says, nothing known", "as long as the last"
+OWN_LIFE, BOTH, KALMAN = "own life so far", "own life so far, path of {}", "Kalman filter, path of {}"
 LABELLED, FIT = "regression on the labels of {}", "the fit that policies see, path of {}"
 LABELS = {"lac": "LAC", "sac": "SAC", "published_lac": "LAC as published"}
 #: How policies see a discharge along a path: readings that lie 2 to 20 s apart in the mean.
@@ -84,6 +87,8 @@ TRAINED_WITH: dict[str, Any] = {
 #: How many cells policies learn on, and with how many updates: few, as they begin with what the fit says.
 TRAINING_CELLS, UPDATES = 700, 2500
 NETWORKS = "dict(net_arch=[64, 64], activation_fn=nn.LeakyReLU)"
+# What the filter takes for the error of a model with the mean constants of a path, V: chosen on B0005.
+_MEAN_CELL_MISMATCH_V = 0.02
 # A regression knows so many voltages, and how much it is held back: chosen on B0005.
 _VOLTAGES, _RIDGE = 16, 0.001
 
@@ -132,10 +137,14 @@ def part(judged: str, every: int, folder: Path, method: str | None = None, **pol
     life = CELLS[judged]
     path, discharges = path_of([life], folder)[0], load_nasa_discharges(judged)
     labelled = load_nasa_discharges(life)
-    rows = []
+    settings = {OWN_LIFE: Settings(cut_off_V=CUT_OFF_V), BOTH.format(life): Settings.for_cell(path, cut_off_V=CUT_OFF_V)}
+    lives = {name: track_life(discharges, CUT_OFF_V, _least_squares(each)) for name, each in settings.items()}
+    rows: list[dict[str, object]] = []
     for n in range(1, len(discharges), every):
         whole = _Whole(discharges[n])
-        rows += list(_said(path, life, labelled, whole, discharges[n - 1]))
+        rows += _said(path, life, labelled, whole, discharges[n - 1])
+        for method, each in settings.items():
+            rows += _with_own_life(method, each, lives[method].after(n), whole)
     return {"discharges": pd.DataFrame(rows).assign(cell=judged)}
 
 
@@ -172,14 +181,16 @@ class _Whole:
         return 100.0 * (end_s - self.end_s) / (self.end_s - self.start_s)
 
 
-def _row(path: AgingPath, whole: _Whole, share: float, record: Discharge, found: Estimate) -> dict[str, object]:
+def _row(
+    path: AgingPath, whole: _Whole, share: float, record: Discharge, found: Estimate, mismatch_V: float | None = None
+) -> dict[str, object]:
     """What an estimate along a path is worth, in per cent of ``q_mobile``, and its end."""
     row: dict[str, object] = {"share": share, "settled": found.settled_q_mobile}
     row |= {"q_error_percent": 100.0 * (found.q_mobile / whole.q_mobile - 1.0)}
     if share == 1.0:
         return row
     model = RecordModel(cell_with(path.cell, found.constants or {}))
-    ahead = forecast(record, found, cut_off_V=CUT_OFF_V, model=model, mismatch_V=path.mismatch_V)
+    ahead = forecast(record, found, cut_off_V=CUT_OFF_V, model=model, mismatch_V=mismatch_V or path.mismatch_V)
     return row | _end(whole, ahead.eod_quantile_s(BAND))
 
 
@@ -200,11 +211,38 @@ def _said(
         yield {"method": PATH.format(life), **_row(path, whole, share, record, LeastSquares(path=path).estimate(record))}
         if share == 1.0:
             continue
+        yield {"method": KALMAN.format(life), **_row(path, whole, share, record, *_filtered(path, record))}
         ahead = forecast_end(seen, Settings(cut_off_V=CUT_OFF_V))
         yield {"method": FILTER, "share": share, **_end(whole, ahead.eod_quantile_s(BAND))}
         yield {"method": LABELLED.format(life), "share": share, "error_percent": _regression(labelled, whole, record)}
         lasted_s = last.eod_time_s(CUT_OFF_V) - last.load_on_time_s
         yield {"method": LAST, "share": share, "error_percent": whole.off(whole.start_s + lasted_s)}
+
+
+def _filtered(path: AgingPath, record: Discharge) -> tuple[Estimate, float]:
+    """What the filter says that expects the cells of a path, with their mean constants, and the error of that model, V."""
+    (mean, covariance), size = path.moments, len(PATH_NAMES)
+    constants = dict(zip(PATH_NAMES, mean.tolist(), strict=True))
+    priors = [(float(np.exp(mean[n])), float(np.exp(mean[n]) * np.sqrt(covariance[n, n]))) for n in (size - 2, size - 1)]
+    cell = cell_with(path.cell, constants)
+    found = ExtendedKalmanFilter(
+        cell=cell, prior_q_mobile_C=priors[0], prior_r_o_ohm=priors[1], mismatch_V=_MEAN_CELL_MISMATCH_V
+    ).estimate(record)
+    return replace(found, constants=constants), _MEAN_CELL_MISMATCH_V
+
+
+def _least_squares(settings: Settings) -> LeastSquares:
+    calibrator = replace(settings, method="least-squares").calibrator()
+    assert isinstance(calibrator, LeastSquares)
+    return calibrator
+
+
+def _with_own_life(method: str, settings: Settings, before: Life, whole: _Whole) -> Iterator[dict[str, object]]:
+    """What is said of a discharge in progress by those who know the life of its cell so far."""
+    known = replace(settings, prior_q_mobile_C=before.prior_q_mobile_C)
+    for share in SHARES[:-1]:
+        ahead = forecast_end(whole.seen(share), known)
+        yield {"method": method, "share": share, **_end(whole, ahead.eod_quantile_s(BAND))}
 
 
 def _regression(labelled: Sequence[Discharge], whole: _Whole, record: Discharge) -> float:

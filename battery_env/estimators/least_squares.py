@@ -171,9 +171,11 @@ class LeastSquares(Estimator):
         self.parameters = check_parameters(parameters)
         self.nuisance = _check_nuisance({} if nuisance is None else nuisance, self.parameters)
         self.path = path
+        # so many times larger than the fit says are standard deviations, but for that of a prior
+        self._sd_ratio = 1.0 if path is None else OTHER_LIVES
         if path is not None:
-            if self.nuisance or self.parameters != PARAMETER_NAMES or prior_q_mobile_C is not None:
-                raise ValueError("path is of both parameters and of all nuisances: leave parameters, nuisance and prior out")
+            if self.nuisance or self.parameters != PARAMETER_NAMES:
+                raise ValueError("path is of both parameters and of all nuisances: leave parameters and nuisance out")
             sds = np.sqrt(np.diag(path.moments[1])).tolist()
             self.nuisance = {name: sd for name, sd in zip(PATH_NAMES, sds, strict=True) if name not in PARAMETER_NAMES}
             cell, mismatch_V = cell or path.cell, mismatch_V or path.mismatch_V
@@ -252,8 +254,7 @@ class LeastSquares(Estimator):
             starts = search.starts([self.model.cell.q_mobile])[0]
         found = self._fitted(record, search, starts, shown)
         sd, values, verdict = found.sd(found.fit), found.fit.values, self._verdict(record, shown, found)
-        if self.path is not None:
-            sd = {name: OTHER_LIVES * each for name, each in sd.items()}
+        sd = {name: self._sd_ratio * each for name, each in sd.items()}
         constants = None if self.path is None else {name: values[name] for name in self.nuisance}
         return Estimate(values["q_mobile"], values["r_o"], sd["q_mobile"], sd["r_o"], **verdict._asdict(), constants=constants)
 
@@ -279,7 +280,7 @@ class LeastSquares(Estimator):
         variance_V2 = noise_V2 + mismatch_V**2
         if self.prior_q_mobile_C is not None:
             mean_C, sd_C = self.prior_q_mobile_C
-            carried = Prior("q_mobile", mean_C, sqrt(variance_V2) / sd_C)
+            carried = Prior("q_mobile", mean_C, self._sd_ratio * sqrt(variance_V2) / sd_C)
             fit = search.best([*starts, alone.values, *search.starts([mean_C])[0]], [*priors, carried])
         return _Fitted(search, fit, alone, variance_V2, self._hidden_sd(search, fit), self._seen(record, shown, fit))
 
@@ -324,8 +325,7 @@ class LeastSquares(Estimator):
         fit, alone, cell, diagnosis = found.fit, found.alone, self.model.cell, Diagnosis()
         n, free, q_mobile = len(fit.residual_V), self.parameters, fit.values["q_mobile"]
         own, moved_V2 = found.sd(alone), fit.square_V2 - alone.square_V2
-        if self.path is not None:
-            own = {**own, "q_mobile": OTHER_LIVES * own["q_mobile"]}
+        own["q_mobile"] *= self._sd_ratio
         unknown = [name for name in free if not own[name] < SETTLED_SHARES[name] * alone.values[name]]
         unsettled_sd_C = own["q_mobile"] if "q_mobile" in unknown else inf
         note_samples(diagnosis, found.seen, self.initial_soc[0], record, shown, unsettled_sd_C)
@@ -348,7 +348,7 @@ class LeastSquares(Estimator):
             distance = self.path.distance_sd(fit.values)
             diagnosis.note(Condition.BESIDE_PATH, distance > BESIDE_LIMIT_SD, distance=distance)
             diagnosis.note(Condition.PATH_UNTESTED, "q_mobile" in unknown)
-        diagnosis.note(Condition.Q_PRIOR_WRONG, moved_V2 > PRIOR_LIMIT_SD**2 * found.variance_V2)
+        diagnosis.note(Condition.Q_PRIOR_WRONG, moved_V2 > (self._sd_ratio * PRIOR_LIMIT_SD) ** 2 * found.variance_V2)
         diagnosis.note(Condition.Q_PRIOR_ALONE, "q_mobile" in unknown and self.prior_q_mobile_C is not None)
         for name in fit.at_bound:
             diagnosis.note(Condition.Q_AT_BOUND.of(name))

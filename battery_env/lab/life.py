@@ -18,6 +18,7 @@ from scipy.stats import truncnorm
 from battery_env.arrays import BoolArray, FloatArray
 from battery_env.checks import check_positive, check_whole_number
 from battery_env.compiled import compiled
+from battery_env.electrochemistry.aging_path import cell_with
 from battery_env.electrochemistry.ends import BAND, quantile
 from battery_env.estimators.diagnosis.conditions import is_only_imprecise
 from battery_env.estimators.least_squares import LeastSquares
@@ -180,7 +181,8 @@ def _told(discharge: Discharge, cut_off_V: float, calibrator: LeastSquares) -> d
     """What one discharge says alone."""
     record = discharge.loaded_part(cut_off_V)
     estimate = calibrator.estimate(record)
-    end_s = calibrator.model.forecast(record, estimate, cut_off_V).eod_time_s
+    model = calibrator.model.of_cell(cell_with(calibrator.model.cell, estimate.constants))
+    end_s = model.forecast(record, estimate, cut_off_V).eod_time_s
     capacity_Ah = float(drawn(record.time_s, record.current_A, end_s)) / 3600.0
     start_s, measured_s = record.time_s[0], discharge.eod_time_s(cut_off_V)
     return {

@@ -36,7 +36,7 @@ _PRETRAINED_JOINT = "BatteryVoltageJoint-v0"
 _NOT_FOR_POLICIES = ("prior_q_mobile_C", "mismatch_V", "current_gain_sd", "ambient_C", "q_mobile_bounds_C", "initial_soc")
 
 # Nor may be said beside a path: it tells which of all go together, at the temperature of its lives.
-_NOT_WITH_PATH = ("prior_q_mobile_C", "parameters", "ambient_C")
+_NOT_WITH_PATH = ("parameters", "ambient_C")
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 import json
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -22,6 +23,7 @@ from battery_env.electrochemistry.aging_path import BEYOND_SHARE, PATH_NAMES, SP
 from battery_env.electrochemistry.equilibrium import with_equilibrium
 from battery_env.estimates import last_estimate
 from battery_env.lab.command_line import SETTLED, forecast
+from battery_env.lab.life import track_life
 from battery_env.lab.settings import Settings
 from battery_env.loads import RandomPiecewise, constant
 from battery_env.records import Samples
@@ -215,9 +217,21 @@ class TestPrior:
         assert found.settled and not early.settled
         assert found.q_mobile == pytest.approx(LeastSquares(mismatch_V=0.05).estimate(whole).q_mobile, rel=0.015)
 
-    @pytest.mark.parametrize(
-        "others", [{"nuisance": {"kn": 0.2}}, {"parameters": ("q_mobile",)}, {"prior_q_mobile_C": (6000.0, 100.0)}]
-    )
+    @pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
+    def test_what_the_cell_itself_was_found_to_hold_counts_as_it_is_stated(self, b0006, share):
+        whole = load_nasa_discharges("B0005")[80].loaded_part(2.7)
+        known, record = LeastSquares(path=b0006).estimate(whole), until(Samples.of(whole), share)
+        mean_C, sd_C = known.q_mobile, 0.01 * known.q_mobile
+        alone = LeastSquares(path=b0006).estimate(record)
+        both = LeastSquares(path=b0006, prior_q_mobile_C=(mean_C, sd_C)).estimate(record)
+        # as two that do not know of each other, of which that of the path has twice the spread that the fit says
+        weights = np.array([alone.sd_q_mobile, sd_C]) ** -2.0
+        assert both.sd_q_mobile == pytest.approx(weights.sum() ** -0.5, rel=0.3)
+        assert both.q_mobile == pytest.approx(weights @ [alone.q_mobile, mean_C] / weights.sum(), abs=0.5 * sd_C)
+        wrong = LeastSquares(path=b0006, prior_q_mobile_C=(0.7 * mean_C, sd_C)).estimate(record)
+        assert not wrong.settled_q_mobile
+
+    @pytest.mark.parametrize("others", [{"nuisance": {"kn": 0.2}}, {"parameters": ("q_mobile",)}])
     def test_it_knows_all_at_once(self, path, others):
         with pytest.raises(ValueError, match="path is of both parameters"):
             LeastSquares(path=path, **others)
@@ -241,11 +255,20 @@ class TestCalibrations:
         told = json.loads(capsys.readouterr().out)
         assert told["eod_time_s"][1] == pytest.approx(found.predicted_eod_time_s, rel=0.01)
 
+    def test_the_life_of_the_cell_itself_goes_with_it(self, b0006):
+        discharges, settings = load_nasa_discharges("B0005")[76:81], Settings.for_cell(b0006, cut_off_V=2.7)
+        before = track_life(discharges[:-1], 2.7, settings.calibrator())
+        # the model of each discharge is that with the constants that were found
+        assert before.table["lasted_share"].to_numpy() == pytest.approx(1.0, abs=0.01)
+        end_s = discharges[-1].eod_time_s(2.7)
+        for known, most in ((settings, 0.06), (replace(settings, prior_q_mobile_C=before.prior_q_mobile_C), 0.02)):
+            found = calibrate(discharges[-1].until(1500.0), known)
+            assert abs(found.predicted_eod_time_s - end_s) < most * end_s
+
     @pytest.mark.parametrize(
         ("options", "message"),
         [
             ({"method": "kalman"}, "is for least squares"),
-            ({"prior_q_mobile_C": (6000.0, 100.0)}, "takes no prior_q_mobile_C"),
             ({"parameters": ("r_o",)}, "takes no parameters"),
             ({"ambient_C": 24.0}, "takes no ambient_C"),
         ],
