@@ -1,7 +1,7 @@
 """
 How far the ageing of one recorded cell tells of another one: the path of a life as the prior of least squares and of policies
-that learned on cells along it, on discharges of the cell whose life it is not, whole and in progress. Beside them the filter with
-that prior or with none, a regression that has the capacities of the life for labels, and who knows the cell's own life so far.
+that learned on cells along it, on discharges of the cell whose life it is not, whole and in progress. Beside them the filter,
+with that prior and with none, a regression that has the capacities of the life for labels, and who knows the cell's own life.
 
 .. code-block:: bash
 
@@ -301,7 +301,8 @@ def _over_seeds(rows: pd.DataFrame, column: str) -> str:
 
 def plot(rows: pd.DataFrame) -> Figure:
     """The error of the end in each discharge of each cell, after half of the time; of policies those that act as one."""
-    shown = rows[(rows["share"] == 0.5) & rows["seed"].isna() & ~rows["method"].str.startswith(("regression", "the fit"))]
+    left_out = rows["method"].str.startswith(("regression", "the fit", BOTH.format("")))
+    shown = rows[(rows["share"] == 0.5) & rows["seed"].isna() & ~left_out]
     figure, panels = new_panels(len(CELLS), 2, (4.6, 4.0))
     for axes, (cell, of_cell) in zip(panels, shown.groupby("cell"), strict=True):
         along = f", path of {CELLS[cell]}"

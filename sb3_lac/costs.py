@@ -297,7 +297,8 @@ class CostAlgorithm(OffPolicyAlgorithm):
             for gradient_step in range(gradient_steps):
                 # Sample replay buffer
                 replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
-                refuse_samples(replay_data, self.num_timesteps)
+                if self.device.type == "cpu":  # a look at those on another device would wait for all pending work
+                    refuse_samples(replay_data, self.num_timesteps)
                 update_targets = (self._n_updates + gradient_step) % self.target_update_interval == 0
                 names, metrics = update(replay_data, self.costs(replay_data), update_targets)
                 metrics_per_step.append(metrics)

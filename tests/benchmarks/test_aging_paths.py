@@ -2,7 +2,7 @@
 
 import pandas as pd
 
-from battery_env import PolicyEstimator, fit_life
+from battery_env import PolicyEstimator, fit_life, load_nasa_discharges
 from battery_env.policies.pretrained import policy_of_file
 from benchmarks import aging_paths
 
@@ -11,12 +11,13 @@ def test_few_discharges_of_one_cell_make_its_tables_and_the_policy(tmp_path, mon
     monkeypatch.setattr(aging_paths, "CELLS", {"B0005": "B0006"})
     for name, value in {"UPDATES": 8, "TRAINING_CELLS": 20, "BUNDLED_CELLS": ("B0006",)}.items():
         monkeypatch.setattr(aging_paths, name, value)
-    monkeypatch.setattr(aging_paths, "fit_life", lambda lives: fit_life([life[::24] for life in lives]))
-    asked = ["--every", "80", "--algos", "lac", "--seeds", "0", "1", "--export", "--jobs", "1", "--out", str(tmp_path)]
+    monkeypatch.setattr(aging_paths, "fit_life", lambda lives: fit_life([life[::4] for life in lives]))
+    monkeypatch.setattr(aging_paths, "load_nasa_discharges", lambda cell: load_nasa_discharges(cell)[::7])
+    asked = ["--every", "10", "--algos", "lac", "--seeds", "0", "1", "--export", "--jobs", "1", "--out", str(tmp_path)]
     aging_paths.main(asked)
     rows, shares = pd.read_csv(tmp_path / "discharges.csv"), len(aging_paths.SHARES)
-    # of three discharges, by two methods whole and in progress, by three that tell an end, and by policies alone and as one
-    assert len(rows) == 3 * (2 * shares + 3 * (shares - 1) + 3 * shares) and set(rows["cell"]) == {"B0005"}
+    # of three discharges, by two methods whole and in progress, by six that tell an end, and by policies alone and as one
+    assert len(rows) == 3 * (2 * shares + 6 * (shares - 1) + 3 * shares) and set(rows["cell"]) == {"B0005"}
     assert (rows["error_percent"].abs().dropna() < 40.0).all()
     text = (tmp_path / "aging_paths.md").read_text()
     assert "| LAC, path of B0006, 2 as one " in text and (tmp_path / "ends.png").stat().st_size > 0
