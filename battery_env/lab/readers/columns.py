@@ -17,14 +17,15 @@ REQUIRED = ("time", "voltage", "current")
 # By quantity, the names it goes by. The first that a table has is taken: elapsed times before dates, and these before the
 # times of a step; a cell before one of its electrodes. Below them, what may stand in their place, or tells more of them.
 _NAMES = {
-    "time": "test time, total time, elapsed time, accumulated time, cumulative time, run time, elapsed, prog time, "
-    "program time, program duration, programmdauer, test, time, t, relative time, testzeit, prüfzeit, gesamtzeit, "
-    "programmzeit, laufzeit, zeit, tempo, tiempo, temps, 总时间, 测试时间, 累计时间, 时间, 相对时间, seconds, unix time, "
-    "date time, timestamp, absolute time, dpt time, real time, system time, date, datum, zeitstempel, 绝对时间, 系统时间, "
-    "日期, step time, step duration, 步骤时间, 工步时间",
+    "time": "test time, total time, elapsed time, accumulated time, cumulative time, run time, record time, elapsed, "
+    "prog time, program time, program duration, programmdauer, test, time, t, relative time, testzeit, prüfzeit, gesamtzeit, "
+    "programmzeit, laufzeit, zeit, temps total, temps, tempo, tiempo, 总时间, 测试时间, 累计时间, 时间, 相对时间, seconds, "
+    "unix time, date time, timestamp, absolute time, dpt time, real time, system time, date, datum, datum uhrzeit, "
+    "zeitstempel, fecha, 绝对时间, 系统时间, 日期, step time, step duration, schrittzeit, schrittdauer, temps étape, "
+    "步骤时间, 工步时间",
     "voltage": "voltage, cell voltage, terminal voltage, battery voltage, voltage measured, measured voltage, volts, volt, "
     "ewe ece, ecell, potential, cell potential, ewe, u, v, spannung, zellspannung, klemmenspannung, batteriespannung, u cell, "
-    "v cell, u bat, v bat, u batt, v batt, vf, tension, tensión, tensao, tensão, voltaje, 电压",
+    "v cell, u zelle, tension cellule, u bat, v bat, u batt, v batt, vf, tension, tensión, tensao, tensão, voltaje, 电压",
     "current": "current, cell current, battery current, current measured, measured current, cur, curr, amps, amp, i, strom, "
     "zellstrom, batteriestrom, i cell, i bat, i batt, im, courant, corriente, corrente, 电流",
     "temperature": "temperature, cell temperature, temperature measured, surface temperature, surface temperature t1, "
@@ -33,11 +34,12 @@ _NAMES = {
     "ambient": "ambient temperature, chamber temperature, environment temperature, ev temp, umgebungstemperatur",
     "cycle": "cycle, cycle index, cycle number, cycle no, cycle count, cycle id, cyc, cyc count, cycle p, zyklus, "
     "zyklusnummer, ciclo, 循环, 循环号, 循环序号",
-    "step": "step count, step, step index, step number, step no, step id, steps, ns, schritt, 工步, 工步号, 工步序号",
+    "step": "step count, step, step index, step number, step no, step id, steps, ns, schritt, schrittnummer, etape, "
+    "étape, 工步, 工步号, 工步序号",
     "state": "state, md, status, step type, mode, zustand, 状态, 工步类型, 工步状态",
     "cell": "cell id, cell name, cell number, cell no, cell, battery id, battery, barcode, serial number, channel, "
     "channel id, channel number, zelle",
-    "step_time": "step time, step duration, schrittzeit, schrittdauer, t step, 步骤时间, 工步时间",
+    "step_time": "step time, step duration, schrittzeit, schrittdauer, temps étape, t step, 步骤时间, 工步时间",
     "power": "power, p, leistung",
     "charge_step": "dq",
     "counter": "ece",
@@ -89,14 +91,15 @@ _INSTEAD = {"current": ("power", "charge_step")}
 _IN_BRACKETS = re.compile(
     r"^(?P<name>.*?)\s*(?:\((?P<round>[^()]*)\)(?P<number>_\d+)?|\[(?P<square>[^][]*)\]|/\s*(?P<slash>[^/]+))\s*$"
 )
-# Words end at a capital, too, as in TestTime.
-_GAP = re.compile(r"(?<=[a-zäöü])(?=[A-ZÄÖÜ])|[_\-\s.#<>~]+")
+# Words end at a capital, too, as in TestTime; units may be in brackets of any kind, or behind a mark, or "in".
+_GAP = re.compile(r"(?<=[a-zäöü])(?=[A-ZÄÖÜ])|(?:[_\-\s.#<>~,:{}/]|(?<=[_\s])(?:in|IN)(?=[_\s]))+")
 # The sign of a degree, and what is left of it after another encoding.
 _DEGREE_SIGN = re.compile("^[Ââ]?[°º˚\ufffd?]")
 # So long are names that are a unit, as mV; a shorter one may be anything, as min.
 _LEAST_UNIT_NAME = {"time": 4, "voltage": 2, "current": 2, "capacity": 5}
 # What testers call the steps in which a cell is discharged, and those of other words in which it is charged.
-_DISCHARGE, _CHARGE = re.compile(r"\bd\b|\bdis\b|dch|disch|entlad|放电"), re.compile(r"\bc\b|ch|lad|充电")
+_DISCHARGE = re.compile(r"\bd\b|\bdis\b|dch|disch|d[ée]charg|descarg|scaric|entlad|放电")
+_CHARGE = re.compile(r"\bc\b|ch|carg|caric|lad|充电")
 _NUMBER = re.compile(r"[-+.\d][-+.,:/\deE\sT]*$|nan$|true$|false$", flags=re.IGNORECASE)
 _FEW_WORDS = 20
 
@@ -162,7 +165,9 @@ def find_columns(
             continue
         places = _places(quantity, kept, chosen.get(quantity), units.get(quantity))
         if quantity == "state":
-            places += [n for n in _of_words(row for row in rows if len(row) == len(kept)) if kept[n] and n not in places]
+            # a separator may end each row
+            of_words = _of_words(row[: len(kept)] for row in rows if len(row) >= len(kept))
+            places += [n for n in of_words if kept[n] and n not in places]
         for number, place in enumerate(places, start=1):
             words, unit = _split(kept[place], quantity)
             column = Column(place, kept[place], *_scale(quantity, units.get(quantity, unit), kept[place]), words)
@@ -226,15 +231,14 @@ def _words(name: str) -> list[str]:
 def _split(name: str, quantity: str) -> tuple[str, str]:
     """A name in lower case without gaps, and the unit in it, which may be empty."""
     name = normalize("NFKC", name)  # brackets may be as wide as a Chinese character
-    match = _IN_BRACKETS.match(name)
-    if match:
-        unit = next(group for group in match.group("round", "square", "slash") if group is not None)
-        return "".join(_words(match["name"] + (match["number"] or ""))), unit.strip()
-    words, known, ranks = _words(name), _UNITS.get(quantity, {}), _RANKS[quantity]
+    match, words, known, ranks = _IN_BRACKETS.match(name), _words(name), _UNITS.get(quantity, {}), _RANKS[quantity]
     whole = "".join(words)
+    if match and whole not in ranks:
+        unit = next(group for group in match.group("round", "square", "slash") if group is not None)
+        return "".join(_words(match["name"] + (match["number"] or ""))), unit.strip(" _")
     if len(name) >= _LEAST_UNIT_NAME.get(quantity, len(name) + 1) and whole in known:
         return next(each for each in ranks if each in known), whole
-    for cut in (1, -1, -2):  # the unit comes first, last, or last in two words, as in deg c
+    for cut in (1, -2, -1):  # the unit comes first, last in two words, as in deg c or m|A, or last
         parts = ["".join(words[:cut]), "".join(words[cut:])]
         unit, base = parts if cut > 0 else parts[::-1]
         if base in ranks and unit in known:

@@ -336,36 +336,33 @@ def _recording(
         temperature_C = _filled(time_s, rows["temperature"].to_numpy())
         if temperature_C is not None:
             arrays["temperature_C"] = temperature_C
-    uncounted_C = _uncounted_C(rows)
-    arrays["shown"] = shown._replace(is_counted=uncounted_C is not None, uncounted_C=uncounted_C or 0.0)
+    arrays["shown"] = _with_count(shown, rows)
     return Recording(arrays, meta, stated)
 
 
-def _uncounted_C(rows: pd.DataFrame) -> float | None:
-    """By how much the charge under load is another one than the tester counted row by row; ``None``: it did not count."""
+def _with_count(shown: Shown, rows: pd.DataFrame) -> Shown:
+    """With how much the charge under load is another one than the tester counted row by row."""
     time_s, current_A = rows["time"].to_numpy(), rows["current"].to_numpy()
     loaded = np.flatnonzero(current_A > SWITCH_SHARE * current_A.max())
     part = slice(loaded[0], loaded[-1] + 1)
     if "capacity" not in rows or len(loaded) < LEAST_SAMPLES:
-        return None
+        return shown
     step_C = np.diff(rows["capacity"].to_numpy()[part])
-    # a counter that counts down, or anew with each step of the program
-    step_C = step_C if (step_C > 0.0).sum() > (step_C < 0.0).sum() else -step_C
+    step_C = step_C if (step_C > 0.0).sum() > (step_C < 0.0).sum() else -step_C  # a counter may count down
     if (step_C > 0.0).mean() < 0.5:
-        return None
-    counted_C = float(step_C[step_C > 0.0].sum())
-    # some count what is drawn alone, others what is returned, too, with its sign or without
-    counts_A = (current_A, np.maximum(current_A, 0.0), np.abs(current_A))
-    passed_C = [float(np.ptp(drawn(time_s[part], each[part], time_s[part]))) for each in counts_A]
-    off_C = min((each - counted_C for each in passed_C), key=abs)
-    if abs(off_C) <= _COUNTED_SHARE * counted_C:
-        return 0.0
-    warnings.warn(
-        f"the tester counted {counted_C / 3600.0:.4g} Ah, where current and time make {(counted_C + off_C) / 3600.0:.4g} Ah: "
-        "check units and clock, and that all rows are there",
-        stacklevel=2,
-    )
-    return abs(off_C)
+        return shown
+    goes_on = step_C >= 0.0  # and not anew, with each step of the program
+    counted_C = float(step_C[goes_on].sum())
+    # some count what is drawn alone, others what is returned, too
+    passed_C = [drawn(time_s[part], each[part], time_s[part]) for each in (np.maximum(current_A, 0.0), np.abs(current_A))]
+    off_C = min((float(np.diff(each)[goes_on].sum()) - counted_C for each in passed_C), key=abs)
+    if abs(off_C) > _COUNTED_SHARE * counted_C:
+        warnings.warn(
+            f"the tester counted {counted_C / 3600.0:.4g} Ah, where current and time make {(counted_C + off_C) / 3600.0:.4g} "
+            "Ah: check units and clock, and that all rows are there",
+            stacklevel=2,
+        )
+    return shown._replace(is_counted=bool(goes_on.all()), uncounted_C=abs(off_C))
 
 
 def _charges(current_A: FloatArray, passed_C: FloatArray) -> list[tuple[int, int, bool, bool]]:

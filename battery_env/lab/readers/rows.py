@@ -74,6 +74,7 @@ def _mended(table: pd.DataFrame, columns: Mapping[str, Column], file_format: Fil
         without_dead_ends,
         without_missing,
         with_newest_last,
+        over_midnight,
         on_one_clock,
         with_clock_going_on,
         without_repeated,
@@ -366,6 +367,17 @@ def with_newest_last(rows: pd.DataFrame) -> pd.DataFrame:
     return rows
 
 
+def over_midnight(rows: pd.DataFrame) -> pd.DataFrame:
+    """The time of day goes on at midnight."""
+    step_s = np.diff(rows["time"], prepend=rows["time"].iloc[:1])
+    beside_s = np.maximum(np.maximum(np.roll(step_s, 1), np.roll(step_s, -1)), np.median(step_s))
+    midnight = (step_s < 0.0) & (step_s >= -_DAY_S) & (step_s + _DAY_S <= _MANY_TIMES * beside_s)
+    if not midnight.any():
+        return rows
+    _say(f"the clock is that of the day, and goes on at midnight: row {_place(rows, midnight)}")
+    return rows.assign(time=rows["time"] + _DAY_S * np.cumsum(midnight))
+
+
 def on_one_clock(rows: pd.DataFrame) -> pd.DataFrame:
     """Times that start anew, near zero, with each step become times since the start of the test."""
     time_s, new = rows["time"].to_numpy(), np.flatnonzero(_changes(rows, "step"))
@@ -382,7 +394,8 @@ def on_one_clock(rows: pd.DataFrame) -> pd.DataFrame:
     goes_on_s = time_s[np.minimum(back + 1, len(time_s) - 1)] - time_s[back - 1]
     if ((time_s[back - 1] > after_s) & (goes_on_s > 0.0) & (goes_on_s <= after_s)).any():
         return rows
-    _say("the time starts anew with each step, and is added up")
+    lost_s = step_s[np.maximum(new - 2, 0)].max()
+    _say(f"the time starts anew with each step, and is added up; what passed in between, up to {lost_s:g} s each, is unknown")
     offsets_s = np.zeros(len(time_s))
     offsets_s[new] = time_s[new - 1]
     return rows.assign(time=time_s + np.cumsum(offsets_s))
@@ -418,7 +431,8 @@ def with_steps_apart(rows: pd.DataFrame) -> pd.DataFrame:
     same = np.diff(time_s, prepend=np.nan) == 0.0
     new_step = _changes(rows, "step")
     switched = same & ~new_step & (np.abs(jump_A) > SWITCH_SHARE * rows["current"].abs().max())
-    if switched.any() and np.abs(jump_A[switched]).sum() * _tick_s(time_s) <= _NOTHING_SHARE * _passed_C(rows):
+    # which a clock tells to its tick
+    if switched.any() and np.linalg.norm(jump_A[switched]) * _tick_s(time_s) / 12**0.5 <= _NOTHING_SHARE * _passed_C(rows):
         _say(f"row {_place(rows, switched)} has the time of the row before, and is the later one, as the load is switched")
     else:
         switched[:] = False
@@ -485,7 +499,9 @@ def with_signed_current(rows: pd.DataFrame, columns: Mapping[str, Column], is_ne
             advice = coin if is_known else ", or that of a coin cell: state the unit of the current"
             raise ValueError(f"no current flows above {REST_CURRENT_A:g} A, below which a cell rests: no discharge{advice}")
     if "direction" in rows and (current_A >= -rest_A).all():
-        return rows.assign(current=current_A.where(rows["direction"] >= 0, -current_A))
+        # a first row at rest may have the current of the step before
+        towards = rows["direction"].mask((rows["direction"] == 0) & (current_A > rest_A)).ffill()
+        return rows.assign(current=current_A.mask(towards < 0, -current_A))
     if (current_A >= -rest_A).all() or (current_A <= rest_A).all():
         _refuse_unsigned(rows, columns)
     if is_negative is None:
@@ -516,9 +532,9 @@ def _refuse_unsigned(rows: pd.DataFrame, columns: Mapping[str, Column]) -> None:
     charge_C = np.add.reduceat(size_A * np.maximum(np.diff(rows["time"], prepend=rows["time"].iloc[0]), 0.0), begin)
     # the first row may have the voltage from before
     rise_V = voltage_V[end] - voltage_V[np.minimum(begin + 1, end)]
-    rise_V[(charge_C < _LONG_SHARE * charge_C.max()) | (jump_A[begin] < 0.0)] = 0.0
-    long_V = _LONG_SHARE * float(np.ptp(voltage_V))
-    if rise_V.max() > long_V and rise_V.min() < -long_V:
+    is_long, long_V = charge_C >= _LONG_SHARE * charge_C.max(), _LONG_SHARE * float(np.ptp(voltage_V))
+    rise_V[~is_long & (rise_V > 0.0)] = 0.0
+    if rise_V.max() > long_V and np.minimum(rise_V, 0.0).sum() < -long_V:
         known = [repr(column.name) for key, column in columns.items() if key.startswith("state")]
         raise ValueError(
             f"the current has no sign: from row {rows.index[begin[np.argmax(rise_V)]] + 1} on the voltage rises for long, and "

@@ -35,6 +35,7 @@ _OPENERS: dict[str, Callable[[Path], Any]] = {".gz": gzip.open, ".bz2": bz2.open
 _HEAD_BYTES = 1 << 18
 _BLANKS = r"\s+"
 _DELIMITERS = (",", ";", "\t", _BLANKS)
+_ITS_COMMA = re.compile(r"^(\s*[-+]?\d*),(?=\d)")
 _DECIMAL_COMMA = re.compile(r"^\s*[-+]?\d+,\d+(?:[eE][-+]?\d+)?\s*$")
 _NUMBER = re.compile(r"^\s*[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?(?:[;\s]|$)")
 _DECIMAL_POINT = re.compile(r"^\s*[-+]?\d*\.\d+(?:[eE][-+]?\d+)?\s*$")
@@ -97,9 +98,9 @@ def _first_rows(table: pd.DataFrame) -> list[list[str]]:
 
 def _read_text(source: Path | bytes, file_format: FileFormat) -> tuple[pd.DataFrame, dict[str, Column]]:
     head = source[:_HEAD_BYTES] if isinstance(source, bytes) else _head(source)
-    if isinstance(source, Path) and _QUOTED_LINES.search(head):
-        with _open(source) as stream:
-            source = _QUOTED_LINES.sub(rb"\1", stream.read())
+    if isinstance(source, Path) and (b"\n" not in head or _QUOTED_LINES.search(head)):
+        with _open(source) as stream:  # lines may end as on old computers
+            source = _QUOTED_LINES.sub(rb"\1", stream.read() if b"\n" in head else stream.read().replace(b"\r", b"\n"))
             head = source[:_HEAD_BYTES]
     layout = _layout(head, file_format.columns)
     columns, header_lines = find_columns(layout.names, file_format, layout.rows), layout.header_line + 1
@@ -113,7 +114,7 @@ def _read_text(source: Path | bytes, file_format: FileFormat) -> tuple[pd.DataFr
     def read(rows: int | None = None) -> pd.DataFrame:
         try:
             packed = isinstance(source, Path) and source.suffix.lower() in PACKED_SUFFIXES
-            return pd.read_csv(
+            found = pd.read_csv(
                 io.BytesIO(source) if isinstance(source, bytes) else _open(source) if packed else source,
                 sep=layout.delimiter,
                 decimal=layout.decimal,
@@ -130,12 +131,14 @@ def _read_text(source: Path | bytes, file_format: FileFormat) -> tuple[pd.DataFr
             raise ValueError("there are no rows below the header") from error
         except Exception as error:  # pandas and the unpackers raise whatever the damage leads them to
             raise ValueError(f"the file is damaged, or no table: {str(error).strip()}") from error
+        # words among numbers make text of all
+        return found if layout.decimal == "." else found.replace(_ITS_COMMA, r"\1.", regex=True)
 
     table = read()
     measured = [
         columns[quantity].position for quantity in ("voltage", "current", "power", "charge_step") if quantity in columns
     ]
-    foot = 0 if layout.layers else _foot_lines(table[measured], layout.decimal)
+    foot = 0 if layout.layers else _foot_lines(table[measured])
     text = table[columns["time"].position].tail(foot).dropna().astype(str).str.strip()
     if len(text):
         warnings.warn(
@@ -157,10 +160,9 @@ def _lowest_layer(table: pd.DataFrame, layers: int) -> pd.DataFrame:
     return table[~above]
 
 
-def _foot_lines(measured: pd.DataFrame, decimal: str) -> int:
+def _foot_lines(measured: pd.DataFrame) -> int:
     """How many of the last rows hold neither voltage nor current."""
-    tail = measured.tail(_FOOT_LINES).apply(lambda column: column.astype(str).str.strip().str.replace(decimal, "."))
-    nothing = tail.apply(pd.to_numeric, errors="coerce").isna().all(axis=1).to_numpy()
+    nothing = measured.tail(_FOOT_LINES).apply(pd.to_numeric, errors="coerce").isna().all(axis=1).to_numpy()
     return int(np.argmin(nothing[::-1])) if len(nothing) else 0
 
 
@@ -234,14 +236,15 @@ def _layout(head: bytes, chosen: Mapping[str, str] | None) -> _Layout:
     number, delimiter = _header(lines, delimiters, chosen)
     names, rows = _fields(lines[number], delimiter), [_fields(line, delimiter) for line in lines[number + 1 :][:_FIRST_ROWS]]
     layers = next((n for n, name in enumerate(names) if name), 0) if delimiter != _BLANKS else 0
-    if not any(row[:layers] == [""] * layers and any(row[layers:]) for row in rows):
+    below = [any(row[:layers]) for row in rows if any(row)]
+    if sum(below) >= 0.5 * len(below):
         layers = 0
     for n in range(layers):
         above = [fields[n] for fields in (_fields(line, delimiter) for line in lines[:number]) if any(fields[n : n + 1])]
         names[n] = above[-1] if above else ""
     values = [field for row in rows for field in row]
-    comma = delimiter != _BLANKS and any(map(_DECIMAL_COMMA.match, values)) and not any(map(_DECIMAL_POINT.match, values))
-    return _Layout(encoding, number, delimiter, "," if comma else ".", names, layers, rows)
+    commas, points = (sum(map(bool, map(mark.match, values))) for mark in (_DECIMAL_COMMA, _DECIMAL_POINT))
+    return _Layout(encoding, number, delimiter, "," if commas > points and delimiter != _BLANKS else ".", names, layers, rows)
 
 
 def _header(lines: Sequence[str], delimiters: Sequence[str], chosen: Mapping[str, str] | None) -> tuple[int, str]:
