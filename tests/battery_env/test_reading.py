@@ -53,24 +53,6 @@ def near(discharge, share=2e-3):
     assert (np.diff(discharge.time_s) > 0.0).all()
 
 
-SPELT = {
-    "time": ["TestTime", "Test_Time(s)", "TESTTIME/Sec", "Prog Time", "Laufzeit [min]", "Zeit / s", "elapsedTimeS", "Minutes"],
-    "voltage": ["Potential (V)", "CellVoltage", "mVolts", "mV", "Zellspannung [mV]", "Ecell/V", "U(V)"],
-    "current": ["Cur(mA)", "mAmps", "Strom / A", "cellCurrentMilliAmps", "<I>/mA", "I [\N{MICRO SIGN}A]"],
-}
-
-
-@settings(max_examples=60, deadline=None)
-@given(st.fixed_dictionaries({quantity: st.sampled_from(names) for quantity, names in SPELT.items()}))
-def test_names_are_words_in_any_spelling_with_the_unit_first_or_last(names):
-    table = TABLE.rename(columns=names)
-    for quantity, name in names.items():
-        minutes = quantity == "time" and "min" in name.lower()
-        micro, milli = "\N{MICRO SIGN}" in name, any(each in name for each in ("mA", "mV", "Milli"))
-        table[name] = TABLE[quantity] * (1 / 60 if minutes else 1e6 if micro else 1e3 if milli else 1.0)
-    same(read(table))
-
-
 @pytest.mark.parametrize("unit", ["degC", "°C", "\N{DEGREE CELSIUS}", "\ufffdC", "?C", "Â°C", "C"])
 @pytest.mark.parametrize("names", [("t[s]", "U[V]", "I[A]", "T[{}]"), ("Zeit[s]", "U[V]", "I[A]", "T[{}]")])
 def test_a_unit_of_another_quantity_rules_a_column_out(unit, names):
@@ -276,22 +258,6 @@ def test_clocks_that_are_put_back_are_told_as_such():
         read_discharges(table)
 
 
-@pytest.mark.parametrize("end", ["1508.9,3.37,", "1508.9,3.37,-", "1508.9,3.37,-1.2e", "1508.9,3"])
-def test_a_last_line_that_is_cut_is_left_out(end, tmp_path):
-    lines = TABLE[:160].to_csv(index=False)
-    (tmp_path / "cell.csv").write_text(lines + end)
-    assert len(read(tmp_path / "cell.csv", "the last line, row 161, is incomplete").time_s) == 160
-
-
-@pytest.mark.parametrize("places", [[50], [1, 100, 300]])
-def test_a_header_that_comes_again_is_left_out(places, tmp_path):
-    lines = TABLE.to_csv(index=False).splitlines()
-    for place in reversed(places):
-        lines.insert(place, lines[0])
-    (tmp_path / "cell.csv").write_text("\n".join(lines))
-    same(read(tmp_path / "cell.csv", "the header comes again, and is left out"))
-
-
 @pytest.mark.parametrize("around", [(["[Summary]", "Cell: 7", "[Data]"], []), (["99,TABLE"], ["s,V vs. Ref.,A"])])
 def test_what_is_said_around_a_header_that_comes_again_is_left_out_with_it(around, tmp_path):
     header, *lines = TABLE.rename(columns={"time": "T", "voltage": "Vf", "current": "Im"}).to_csv(index=False).splitlines()
@@ -349,26 +315,6 @@ def test_a_row_of_the_step_before_its_load_changes_nothing():
     after = RECORD.time_s - RECORD.time_s[LOAD_ON - 1]
     table = TABLE.assign(**{"Step": (after >= 0).astype(int), "Step Time (s)": np.where(after >= 0.0, after, RECORD.time_s)})
     assert read(table).load_on_time_s == pytest.approx(RECORD.time_s[LOAD_ON - 1])
-
-
-WORDS = [
-    ("恒流充电", "搁置", "恒流放电"),
-    ("Charge", "Rest", "Discharge"),
-    ("CHA", "PAU", "DCH"),
-    ("Laden", "Ruhe", "Entladen"),
-    ("CC_Chg", "Rest", "CC_DChg"),
-]
-
-
-@pytest.mark.parametrize("words", [*WORDS, ("C", "R", "D"), ("1C charge", "wait", "1C discharge")])
-@pytest.mark.parametrize("name", ["State", "Betriebsart", "what the tester does"])
-def test_an_unsigned_current_takes_its_sign_from_words_in_any_column(words, name, tmp_path):
-    sign = np.sign(CYCLE["current"].where(CYCLE["current"].abs() > 0.1, 0.0)).astype(int)
-    table = CYCLE.assign(current=CYCLE["current"].abs(), **{name: [words[1 - each] for each in sign]}, Comment="no word")
-    table.to_csv(tmp_path / "cell.csv", index=False)
-    table.to_parquet(tmp_path / "cell.parquet")
-    for source in (table, tmp_path / "cell.csv", tmp_path / "cell.parquet"):
-        np.testing.assert_allclose(read(source).current_A[10:], np.abs(RECORD.current_A))
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

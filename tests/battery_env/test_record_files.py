@@ -88,10 +88,7 @@ COLUMNS = {
     "Basytec": named("~Time[h]", "U[V]", "I[A]", "T1[°C]", (1.0 / 3600.0, 1.0, -1.0)),
     "Landt": named("test_time_s", "voltage_V", "current_A", "temperature_1_C"),
     "another Arbin": named("Test_Time(s)", "Voltage(V)", "Current(A)", "Aux_Temperature(℃)_1"),
-    "Chinese": named("总时间\uff08s\uff09", "电压(V)", "电流(mA)", "温度(℃)", (1.0, 1.0, -1e3)),
     "Portuguese": named("Tempo_s", "Tensão_V", "Corrente_A", "Temperatura_C"),
-    "Spanish": named("Tiempo (min)", "Voltaje (mV)", "Corriente (mA)", "Temperatura (°C)", (1.0 / 60.0, 1e3, 1e3)),
-    "French": named("Temps/s", "Tension/V", "Courant/A", "Température/°C"),
     "a clock": CLOCK | {"Time": list(map(clock, TIME_S))},
     "dates": DATES | {"Date_Time": pd.Timestamp("2026-02-28 23:50") + pd.to_timedelta(TIME_S, unit="s")},
 }
@@ -117,16 +114,6 @@ def test_columns_of_unknown_names_with_blanks_are_named_as_the_file_has_them(tmp
     (tmp_path / "cell.csv").write_text("Time (s),Cell Voltage (V),Load Current (A)\n0.0,4.2,0.0\n")
     with pytest.raises(ValueError, match=re.escape("Time (s), Cell Voltage (V), Load Current (A)")):
         read_discharges(tmp_path / "cell.csv")
-
-
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "latin-1"])
-@pytest.mark.parametrize(("delimiter", "decimal"), [(",", "."), (";", "."), (";", ","), ("\t", "."), ("\t", ",")])
-def test_delimiters_decimal_marks_and_encodings_are_told(delimiter, decimal, encoding, tmp_path):
-    header = delimiter.join(["Zeit (°C?)", "time (s)", "voltage (V)", "current (A)"])
-    lines = rows(np.ones(len(TIME_S)), TIME_S, VOLTAGE_V, CURRENT_A, decimal=decimal, delimiter=delimiter)
-    text = "\n".join(["Prüfling: Zelle 7", "Bemerkung, mit Komma; und Strichpunkt", "", header, *lines, ""])
-    (tmp_path / "zelle.csv").write_text(text, encoding=encoding)
-    check(one(tmp_path / "zelle.csv"))
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
@@ -160,49 +147,6 @@ def test_blanks_separate_columns_as_numpy_writes_them(comments, tmp_path):
     columns = np.column_stack([TIME_S, VOLTAGE_V, CURRENT_A])
     np.savetxt(tmp_path / "cell.dat", columns, header="time_s voltage_V current_A", comments=comments, fmt="%10.6f")
     check(one(tmp_path / "cell.dat"))
-
-
-def test_maccor_says_the_direction_of_the_current_by_a_letter(tmp_path):
-    charge_s = 60.0 * np.arange(60)
-    names = ["Test (Sec)", "Amps", "Volts", "State", "Step"]
-    charge = (charge_s, np.ones(60), 3.5 + 0.01 * np.arange(60), np.full(60, "C"), np.ones(60, int))
-    steps = np.where(LOADED, 3, np.where(TIME_S < 7.0, 2, 4))
-    discharge = (4000.0 + TIME_S, CURRENT_A, VOLTAGE_V, np.where(LOADED, "D", "R"), steps)
-    table = {name: np.append(*parts) for name, *parts in zip(names, charge, discharge, strict=True)} | {"Cyc#": 1}
-    path = tmp_path / "cell.txt"
-    path.write_text("Today's Date\t02/28/2026\n" + pd.DataFrame(table).to_csv(sep="\t", index=False))
-    found = one(path)
-    np.testing.assert_allclose(found.time_s - 4000.0, TIME_S)
-    np.testing.assert_allclose(found.current_A, CURRENT_A)
-    assert found.meta["cycle"] == 1
-
-
-def test_biologic_text_has_lines_above_its_table(tmp_path):
-    head = ["EC-Lab ASCII FILE", "Nb header lines : 5", "", "Technique : GCPL", "time/s\tI/mA\tEcell/V"]
-    lines = rows(TIME_S, -1e3 * CURRENT_A, VOLTAGE_V, decimal=",", delimiter="\t")
-    (tmp_path / "cell.mpt").write_text("\n".join([*head, *lines]), encoding="latin-1")
-    check(one(tmp_path / "cell.mpt"))
-
-
-def test_neware_counts_time_within_each_step(tmp_path):
-    step_start_s = np.where(TIME_S < 10.0, 0.0, np.where(LOADED, 10.0, 1815.0))
-    # the last row of a step has the time of the first one of the next
-    table = pd.DataFrame(
-        {
-            "Cycle": 1,
-            "Steps": np.where(TIME_S < 10.0, 1, np.where(LOADED, 2, 3)),
-            "Relative Time(h:min:s.ms)": list(map(clock, TIME_S - step_start_s)),
-            "Current(mA)": -1e3 * CURRENT_A,
-            "Voltage(V)": VOLTAGE_V,
-        }
-    )
-    table.to_csv(tmp_path / "cell.csv", index=False)
-    with pytest.warns(UserWarning, match="the time starts anew with each step, and is added up"):
-        (discharge,) = read_discharges(tmp_path / "cell.csv")
-    assert (np.diff(discharge.time_s) > 0.0).all()
-    # what passes between the last row of a step and the first one of the next is not in such a file
-    np.testing.assert_allclose(np.diff(discharge.time_s[2:-2]), 30.0, atol=2e-3)
-    np.testing.assert_allclose(discharge.current_A, CURRENT_A)
 
 
 def life(sign: float = -1.0) -> pd.DataFrame:
@@ -243,23 +187,6 @@ def test_braking_at_once_does_not_end_a_discharge_and_a_charge_in_small_steps_do
     assert len(discharges) == 2
     for discharge in discharges:
         assert np.count_nonzero(discharge.current_A == 6.0) == np.count_nonzero(drive_A == 6.0)
-
-
-@pytest.mark.parametrize("overlap", [1, 20, len(TIME_S)])
-def test_rows_that_a_logger_writes_once_more_are_dropped(overlap, tmp_path):
-    lines = own(tmp_path / "cell.csv").read_text().splitlines()
-    (tmp_path / "cell.csv").write_text("\n".join([*lines, *lines[-overlap:]]))
-    with pytest.warns(UserWarning, match=f"{overlap} of {len(TIME_S) + overlap} rows are repeated, and dropped"):
-        (discharge,) = read_discharges(tmp_path / "cell.csv")
-    check(discharge)
-
-
-def test_a_row_at_the_end_of_one_step_and_one_at_the_start_of_the_next_may_have_one_time(tmp_path):
-    steps = np.where(TIME_S < 7.0, 1, 2)
-    time_s = TIME_S.copy()
-    time_s[2] = time_s[1]
-    discharge = one(own(tmp_path / "cell.csv", time_s=time_s, step=steps))
-    assert discharge.time_s[2] - discharge.time_s[1] == pytest.approx(1e-3)
 
 
 def test_columns_and_units_can_be_stated(tmp_path):
@@ -309,33 +236,6 @@ def test_dates_are_read_as_they_are_written(tmp_path):
         table = pd.DataFrame({"Time (h)": column, "voltage_V": VOLTAGE_V, "current_A": CURRENT_A})
         table.to_csv(tmp_path / "cell.csv", index=False)
         np.testing.assert_allclose(one(tmp_path / "cell.csv").time_s, expected_s, atol=1e-6, err_msg=name)
-
-
-@pytest.mark.parametrize(
-    ("units", "factors"),
-    [
-        ("s,V,A,°C", (1.0, 1.0, 1.0)),
-        ("[min],[mV],[mA],[°C]", (1.0 / 60.0, 1e3, 1e3)),
-        ('"(ms)","(mV)","(A)",""', (1e3, 1e3, 1.0)),
-        (",,,", (1.0, 1.0, 1.0)),
-        (",[mV],[mA],[C]", (1.0, 1e3, 1e3)),
-    ],
-)
-def test_units_may_stand_below_the_names(units, factors, tmp_path):
-    columns = [factor * column for factor, column in zip(factors, (TIME_S, VOLTAGE_V, CURRENT_A), strict=True)]
-    lines = ["Time,Voltage,Current,Temperature", units, *rows(*columns, TEMPERATURE_C)]
-    (tmp_path / "cell.csv").write_text("\n".join(lines))
-    check(one(tmp_path / "cell.csv"), temperature=True)
-
-
-@pytest.mark.parametrize("decimal", [".", ","])
-@pytest.mark.parametrize("foot", ["End of test", "End of test;;;\n\nChecked by;;\n", "Total capacity;;"])
-def test_lines_below_the_table_are_left_out_with_a_word(foot, decimal, tmp_path):
-    lines = rows(TIME_S, VOLTAGE_V, CURRENT_A, decimal=decimal, delimiter=";")
-    (tmp_path / "cell.csv").write_text("\n".join(["sep=;", "Zeit;U/V;I/A", *lines, foot]))
-    with pytest.warns(UserWarning, match=f"lines below the table.*are left out: '{foot[:6]}"):
-        (discharge,) = read_discharges(tmp_path / "cell.csv", columns={"time": "Zeit"})
-    check(discharge)
 
 
 def test_discharges_whose_charges_are_not_logged_need_a_number(tmp_path):

@@ -91,8 +91,9 @@ _INSTEAD = {"current": ("power", "charge_step")}
 _IN_BRACKETS = re.compile(
     r"^(?P<name>.*?)\s*(?:\((?P<round>[^()]*)\)(?P<number>_\d+)?|\[(?P<square>[^][]*)\]|/\s*(?P<slash>[^/]+))\s*$"
 )
-# Words end at a capital, too, as in TestTime; units may be in brackets of any kind, or behind a mark, or "in".
-_GAP = re.compile(r"(?<=[a-zäöü])(?=[A-ZÄÖÜ])|(?:[_\-\s.#<>~,:{}/]|(?<=[_\s])(?:in|IN)(?=[_\s]))+")
+# Words end at a capital, too, as in TestTime; units may be in brackets of any kind, or behind a mark, or "in". A word of a
+# sentence, with a mark at its end, is no name.
+_GAP = re.compile(r"(?<=[a-zäöü])(?=[A-ZÄÖÜ])|(?:[_\-\s.#<>~{}/]|[,:](?=.)|(?<=[_\s])(?:in|IN)(?=[_\s]))+")
 # The sign of a degree, and what is left of it after another encoding.
 _DEGREE_SIGN = re.compile("^[Ââ]?[°º˚\ufffd?]")
 # So long are names that are a unit, as mV; a shorter one may be anything, as min.
@@ -100,7 +101,7 @@ _LEAST_UNIT_NAME = {"time": 4, "voltage": 2, "current": 2, "capacity": 5}
 # What testers call the steps in which a cell is discharged, and those of other words in which it is charged.
 _DISCHARGE = re.compile(r"\bd\b|\bdis\b|dch|disch|d[ée]charg|descarg|scaric|entlad|放电")
 _CHARGE = re.compile(r"\bc\b|ch|carg|caric|lad|充电")
-_NUMBER = re.compile(r"[-+.\d][-+.,:/\deE\sT]*$|nan$|true$|false$", flags=re.IGNORECASE)
+_NUMBER = re.compile(r"[-+.]*\d[-+.,:/\deE\sT]*$|nan$|true$|false$", flags=re.IGNORECASE)
 _FEW_WORDS = 20
 
 
@@ -185,13 +186,13 @@ def units_below(columns: Mapping[str, Column], fields: Sequence[str]) -> dict[st
     """The units in the line below a header, where some testers write them; a clock may have none."""
     found = {}
     for quantity, column in columns.items():
-        text = fields[column.position].strip("[]() ") if column.position < len(fields) else ""
+        text = fields[column.position].strip("[]()- ") if column.position < len(fields) else ""
         unit = _unit(text, quantity)
         if unit is not None:
             found[quantity] = unit
         elif quantity in REQUIRED and (text or quantity != "time"):
             return None
-    return {quantity: unit for quantity, unit in found.items() if quantity in _UNITS and not columns[quantity].unit}
+    return {quantity: unit for quantity, unit in found.items() if quantity in _UNITS}
 
 
 def count_required(names: Sequence[str], chosen: Mapping[str, str] | None = None) -> int:
@@ -238,7 +239,7 @@ def _split(name: str, quantity: str) -> tuple[str, str]:
         return "".join(_words(match["name"] + (match["number"] or ""))), unit.strip(" _")
     if len(name) >= _LEAST_UNIT_NAME.get(quantity, len(name) + 1) and whole in known:
         return next(each for each in ranks if each in known), whole
-    for cut in (1, -2, -1):  # the unit comes first, last in two words, as in deg c or m|A, or last
+    for cut in (1, -3, -2, -1):  # the unit comes first, or last, also in some words, as deg C, m|A and m|A.h
         parts = ["".join(words[:cut]), "".join(words[cut:])]
         unit, base = parts if cut > 0 else parts[::-1]
         if base in ranks and unit in known:

@@ -110,7 +110,7 @@ def without_headers(table: pd.DataFrame, columns: Mapping[str, Column]) -> pd.Da
 def without_cut_line(table: pd.DataFrame, columns: Mapping[str, Column]) -> pd.DataFrame:
     """Without the last line where it is incomplete, as in a file that is being written."""
     last = table.tail(1)
-    values = [last[each] if each == "time" else pd.to_numeric(last[each], errors="coerce") for each in _measured(table)]
+    values = [last[each] if "time" in each else pd.to_numeric(last[each], errors="coerce") for each in _measured(table)]
     if any(each.isna().any() for each in values):
         _say(f"the last line, row {last.index[0] + 1}, is incomplete, and left out")
         return table.iloc[:-1]
@@ -118,7 +118,7 @@ def without_cut_line(table: pd.DataFrame, columns: Mapping[str, Column]) -> pd.D
 
 
 def _measured(table: pd.DataFrame) -> list[str]:
-    return [quantity for quantity in (*REQUIRED, "power", "charge_step") if quantity in table]
+    return [each for each in map(str, table) if each.partition(" ")[0] in (*REQUIRED, "power", "charge_step")]
 
 
 def _place(table: pd.DataFrame, which: BoolArray) -> str:

@@ -251,7 +251,7 @@ def _header(lines: Sequence[str], delimiters: Sequence[str], chosen: Mapping[str
     """The line with the names of the columns, and the delimiter."""
     best, found = (0, delimiters[0]), -1
     for number, line in enumerate(lines):
-        next_line = lines[number + 1] if number + 1 < len(lines) else ""
+        next_line = next(filter(str.strip, itertools.islice(lines, number + 1, None)), "")
         for delimiter in delimiters:
             # blanks within names
             if delimiter == _BLANKS and len(_fields(next_line, delimiter)) < len(_fields(line, delimiter)):
