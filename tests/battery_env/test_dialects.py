@@ -18,7 +18,7 @@ START = pd.Timestamp("2026-02-27 22:50:00")
 NAMES = [
     "Test Time,Date Time,Step Time,Voltage,Current,Temperature,Step,State,Discharge_Capacity",
     "TestTime,DPT_Time,StepTime,Cell_Potential,I,Aux_Temperature_1,Step_Index,what is done,Capacity",
-    "Zeit,Datum/Uhrzeit,Schrittzeit,U,Strom,Temperatur,Schritt,Betriebsart,Entladekapazität",
+    "Zeit,Datum/Uhrzeit,Schrittzeit,U,Strom,T,Schritt,Betriebsart,Entladekapazität",
     "Temps,Date,Temps étape,Tension,Courant,Température,Etape,Etat,Capacité",
     "Tiempo,Fecha,Step Time,Voltaje,Corriente,Temperatura,Step,Estado,Capacidad",
     "总时间,绝对时间,步骤时间,电压,电流,温度,工步号,工步类型,放电容量",

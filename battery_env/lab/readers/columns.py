@@ -6,6 +6,7 @@ import re
 import warnings
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import NamedTuple
 from unicodedata import normalize
 
@@ -102,7 +103,7 @@ _LEAST_UNIT_NAME = {"time": 4, "voltage": 2, "current": 2, "capacity": 5}
 _DISCHARGE = re.compile(r"\bd\b|\bdis\b|dch|disch|d[ée]charg|descarg|scaric|entlad|放电")
 _CHARGE = re.compile(r"\bc\b|ch|carg|caric|lad|充电")
 _NUMBER = re.compile(r"[-+.]*\d[-+.,:/\deE\sT]*$|nan$|true$|false$", flags=re.IGNORECASE)
-_FEW_WORDS = 20
+_FEW_WORDS, _AROUND_UNITS = 20, "[]()- "
 
 
 class Column(NamedTuple):
@@ -159,18 +160,19 @@ def find_columns(
     for option, given in (("columns", chosen), ("units", units)):
         if unknown := set(given) - set(_NAMES):
             raise ValueError(f"{option} knows {', '.join(_NAMES)}, got {', '.join(sorted(unknown))}")
-    kept = [name if (name := str(each).strip()) not in ignore else "" for each in names]
+    kept, rows = [name if (name := str(each).strip()) not in ignore else "" for each in names], list(rows)
+    labels = [_label(name, text) for name, text in zip_longest(kept, rows[0])] if rows and are_units(rows[0]) else kept
     found: dict[str, Column] = {}
     for quantity in _NAMES:
         if "current" in found and quantity in _INSTEAD["current"]:
             continue
-        places = _places(quantity, kept, chosen.get(quantity), units.get(quantity))
+        places = _places(quantity, kept, labels, chosen.get(quantity), units.get(quantity))
         if quantity == "state":
             # a separator may end each row
             of_words = _of_words(row[: len(kept)] for row in rows if len(row) >= len(kept))
             places += [n for n in of_words if kept[n] and n not in places]
         for number, place in enumerate(places, start=1):
-            words, unit = _split(kept[place], quantity)
+            words, unit = _split(labels[place], quantity)
             column = Column(place, kept[place], *_scale(quantity, units.get(quantity, unit), kept[place]), words)
             found[quantity if number == 1 else f"{quantity} {number}"] = column
     missing = [quantity for quantity in REQUIRED if not {quantity, *_INSTEAD.get(quantity, ())} & set(found)]
@@ -182,17 +184,13 @@ def find_columns(
     return found
 
 
-def units_below(columns: Mapping[str, Column], fields: Sequence[str]) -> dict[str, str] | None:
-    """The units in the line below a header, where some testers write them; a clock may have none."""
-    found = {}
-    for quantity, column in columns.items():
-        text = fields[column.position].strip("[]()- ") if column.position < len(fields) else ""
-        unit = _unit(text, quantity)
-        if unit is not None:
-            found[quantity] = unit
-        elif quantity in REQUIRED and (text or quantity != "time"):
-            return None
-    return {quantity: unit for quantity, unit in found.items() if quantity in _UNITS}
+def are_units(fields: Sequence[str]) -> bool:
+    """Whether the line below a header holds units, where some testers write them; a clock may have none."""
+    texts = [text for field in fields if (text := field.strip(_AROUND_UNITS))]
+    needed = (("voltage",), ("current", *_INSTEAD["current"]))
+    return not any(map(_NUMBER.match, texts)) and all(
+        any(_unit(text, quantity) for quantity in quantities for text in texts) for quantities in needed
+    )
 
 
 def count_required(names: Sequence[str], chosen: Mapping[str, str] | None = None) -> int:
@@ -247,6 +245,19 @@ def _split(name: str, quantity: str) -> tuple[str, str]:
     return whole, ""
 
 
+def _label(name: str | None, text: str | None) -> str:
+    """A name with the unit that is written below it, unless it has one itself."""
+    name, unit = name or "", (text or "").strip(_AROUND_UNITS)
+    is_plain = any("".join(_words(name)) in ranks for ranks in _RANKS.values())
+    if (
+        not name
+        or not any(_unit(unit, each) for each in _UNITS)
+        or not (is_plain or not any(_split(name, q)[1] for q in _UNITS))
+    ):
+        return name
+    return f"{name} ({unit})"
+
+
 def _unit(text: str, quantity: str) -> str | None:
     """A unit as the table of units has it; what is said behind it, as in ``Hours in hh:mm:ss``, is left out."""
     text = normalize("NFKC", text).lower()  # of the signs for degrees Celsius and micro there are several
@@ -272,14 +283,14 @@ def _is_known(quantity: str, name: str) -> bool:
     return _may_be(quantity, name) and (not unit or _unit(unit, quantity) is not None)
 
 
-def _places(quantity: str, names: Sequence[str], chosen: str | None, unit: str | None) -> list[int]:
+def _places(quantity: str, names: Sequence[str], labels: Sequence[str], chosen: str | None, unit: str | None) -> list[int]:
     """The columns that may be a quantity: of clocks all, as one may be finer, of others those of the first name."""
     if chosen is not None:
         places = [n for n, name in enumerate(names) if name == chosen.strip()]
         if not places:
             raise ValueError(f"there is no column {chosen!r} for the {quantity} among {', '.join(filter(None, names))}")
         return places[:1]
-    split = {n: _split(name, quantity) for n, name in enumerate(names) if name and _may_be(quantity, name)}
+    split = {n: _split(name, quantity) for n, name in enumerate(labels) if name and _may_be(quantity, name)}
     places = sorted(split, key=lambda n: _RANKS[quantity][split[n][0]])
     known = [n for n in places if unit or not split[n][1] or quantity not in _UNITS or _unit(split[n][1], quantity)]
     if places and not known and quantity not in REQUIRED:

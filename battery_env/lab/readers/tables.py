@@ -13,7 +13,6 @@ import warnings
 import zipfile
 from codecs import getincrementaldecoder
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any, NamedTuple, cast
 
@@ -21,7 +20,7 @@ import numpy as np
 import pandas as pd
 
 from battery_env.files import check_unpacked
-from battery_env.lab.readers.columns import REQUIRED, Column, FileFormat, count_required, find_columns, units_below
+from battery_env.lab.readers.columns import REQUIRED, Column, FileFormat, are_units, count_required, find_columns
 
 #: Endings of the names of files that can be read, besides those of NASA (.mat); of text also packed (.gz, .bz2, .xz, .zip).
 #: Text of Maccor's is numbered.
@@ -104,10 +103,7 @@ def _read_text(source: Path | bytes, file_format: FileFormat) -> tuple[pd.DataFr
             head = source[:_HEAD_BYTES]
     layout = _layout(head, file_format.columns)
     columns, header_lines = find_columns(layout.names, file_format, layout.rows), layout.header_line + 1
-    below = units_below(columns, layout.rows[0] if layout.rows else [])
-    if below is not None:
-        file_format = replace(file_format, units={**below, **(file_format.units or {})})
-        columns, header_lines = find_columns(layout.names, file_format, layout.rows), header_lines + 1
+    header_lines += bool(layout.rows) and are_units(layout.rows[0])
     # one column may serve as two quantities
     positions = sorted({*range(layout.layers), *(column.position for column in columns.values())})
 
