@@ -12,7 +12,6 @@ from numpy.polynomial import Legendre
 from battery_env import (
     CellFit,
     CellParameters,
-    Discharge,
     ExtendedKalmanFilter,
     LeastSquares,
     OnnxPolicy,
