@@ -60,7 +60,7 @@ def calibrated(paths: list[str], settings: Settings, one_cell: bool, troubles: l
 
 
 def over_the_life(table: pd.DataFrame, column: str, label: str, scale: float) -> go.Figure:
-    """A number of all cells over their discharges, with its standard deviation; what is not settled is hollow, and has none."""
+    """A number of all cells over their discharges, with its standard deviation; what is not settled is hollow, without."""
     figure = go.Figure(layout={"yaxis_title": label, "xaxis_title": "discharge", **LAYOUT})
     for colour, (cell, rows) in zip(COLOURS * len(table), table.groupby("cell", sort=False), strict=False):
         number = rows["cycle"].fillna(pd.Series(range(1, len(rows) + 1), rows.index))
