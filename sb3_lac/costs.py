@@ -139,8 +139,9 @@ class CostAlgorithm(OffPolicyAlgorithm):
             raise ValueError(f"{type(self).__name__} needs a policy derived from {needed.__name__}, and this is {named}.")
         if not 0 <= self.gamma <= 1:
             raise ValueError(f"gamma={self.gamma} must lie within 0 .. 1.")
-        if self.gamma == 1 and (self.n_steps > 1 or self.replay_buffer_class is NStepReplayBuffer):
-            raise ValueError("gamma must be smaller than 1 with n-step returns.")
+        buffer_class = self.replay_buffer_class
+        if self.gamma == 1 and (self.n_steps > 1 if buffer_class is None else issubclass(buffer_class, NStepReplayBuffer)):
+            raise ValueError(f"gamma={self.gamma} must be smaller than 1 with n-step returns. Use for instance gamma=0.99.")
         if not 0 < self.alpha3 < math.inf:
             raise ValueError(f"alpha3={self.alpha3} must be greater than 0, and finite.")
         lambda_max = self.lambda_init if self.lambda_max is None else self.lambda_max
@@ -192,8 +193,7 @@ class CostAlgorithm(OffPolicyAlgorithm):
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
         prepared = super()._setup_learn(*args, **kwargs)
-        vec_normalize = self._vec_normalize_env
-        first = self._last_obs if vec_normalize is None else vec_normalize.get_original_obs()
+        first = self._last_obs if self._vec_normalize_env is None else self._last_original_obs
         refuse_what_is_not_finite("environment gave the first observation", first, self.num_timesteps)
         return prepared
 
@@ -347,7 +347,7 @@ class CostAlgorithm(OffPolicyAlgorithm):
     @classmethod
     def load(cls: type[SelfCostAlgorithm], path: Any, *args: Any, **kwargs: Any) -> SelfCostAlgorithm:
         try:
-            return super().load(path, *args, **kwargs)
+            model = super().load(path, *args, **kwargs)
         # What comes of parameters that are not there, or of another shape
         except (AttributeError, KeyError, RuntimeError) as error:
             # The first of them, which Stable-Baselines3 may have met with an attempt of its own
@@ -356,6 +356,9 @@ class CostAlgorithm(OffPolicyAlgorithm):
                 "It is of another version of sb3_lac (see the changelog), of another algorithm, or of other arguments: "
                 "whether ent_coef is learned cannot be changed on loading."
             ) from error
+        # Its limits may be others than those of the file
+        model._project_lambda()
+        return model
 
     def _excluded_save_params(self) -> list[str]:
         own = ["actor", "critic", "critic_target", "batch_norm_stats", "batch_norm_stats_target", "_compiled", "_terminations"]
@@ -372,24 +375,24 @@ class Terminations:
     """What is collected before the first update, which tells whether a termination has a price."""
 
     def __init__(self) -> None:
-        self.costs: list[np.ndarray] = []
-        self.ends: list[np.ndarray] = []
+        # Number, sum, least and largest of the costs of steps that go on, and of those that end an episode
+        self.seen = {ends: (0, 0.0, math.inf, -math.inf) for ends in (False, True)}
 
     def see(self, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
         """Note a step of all environments. A time limit is no termination."""
-        self.costs.append(0.0 - rewards)
-        self.ends.append(dones & [not info.get("TimeLimit.truncated", False) for info in infos])
+        for cost, done, info in zip((0.0 - rewards).tolist(), dones, infos, strict=True):
+            ends = bool(done and not info.get("TimeLimit.truncated", False))
+            number, total, cheapest, dearest = self.seen[ends]
+            self.seen[ends] = number + 1, total + cost, min(cheapest, cost), max(dearest, cost)
 
     def warn_if_free(self, gamma: float, largest_reward: float) -> None:
         """Warn if the last step before a termination costs no more than another step does."""
+        (number, total, cheapest, dearest), (n_ends, total_of_ends, _, _) = self.seen[False], self.seen[True]
         # Where living pays, an end costs the bound for ever
-        if not self.ends or largest_reward > 0:
+        if not number or not n_ends or largest_reward > 0:
             return
-        costs, ends = np.concatenate(self.costs), np.concatenate(self.ends)
-        if not ends.any() or ends.all():
-            return
-        last, cheapest, dearest = costs[ends].mean(), costs[~ends].min(), costs[~ends].max()
-        price = costs[~ends].mean() / (1 - gamma) if gamma < 1 else math.inf
+        last = total_of_ends / n_ends
+        price = total / number / (1 - gamma) if gamma < 1 else math.inf
         # An end that costs less than any other step is a goal
         if cheapest <= last <= dearest and price > 0:
             warnings.warn(
