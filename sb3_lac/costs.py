@@ -87,6 +87,7 @@ class CostAlgorithm(OffPolicyAlgorithm):
         self._check_arguments()
 
         super()._setup_model()
+        self._check_replay_buffer()
         self.actor, self.critic, self.critic_target = self.policy.actor, self.policy.critic, self.policy.critic_target
         # Running mean and running var
         self.batch_norm_stats = get_parameters_by_name(self.critic, ["running_"])
@@ -139,9 +140,6 @@ class CostAlgorithm(OffPolicyAlgorithm):
             raise ValueError(f"{type(self).__name__} needs a policy derived from {needed.__name__}, and this is {named}.")
         if not 0 <= self.gamma <= 1:
             raise ValueError(f"gamma={self.gamma} must lie within 0 .. 1.")
-        buffer_class = self.replay_buffer_class
-        if self.gamma == 1 and (self.n_steps > 1 if buffer_class is None else issubclass(buffer_class, NStepReplayBuffer)):
-            raise ValueError(f"gamma={self.gamma} must be smaller than 1 with n-step returns. Use for instance gamma=0.99.")
         if not 0 < self.alpha3 < math.inf:
             raise ValueError(f"alpha3={self.alpha3} must be greater than 0, and finite.")
         lambda_max = self.lambda_init if self.lambda_max is None else self.lambda_max
@@ -157,6 +155,11 @@ class CostAlgorithm(OffPolicyAlgorithm):
                 f"gamma={self.gamma} must be smaller than 1 with rewards up to {self.reward_bound}: each step below that has "
                 "a cost, and the sum over all time is infinite. Use for instance gamma=0.99."
             )
+
+    def _check_replay_buffer(self) -> None:
+        """Check that an update understands the samples."""
+        if self.gamma == 1 and isinstance(self.replay_buffer, NStepReplayBuffer):
+            raise ValueError(f"gamma={self.gamma} must be smaller than 1 with n-step returns. Use for instance gamma=0.99.")
 
     def _make_multiplier(self, initial: float) -> tuple[th.Tensor, th.optim.Adam]:
         """The logarithm of a Lagrange multiplier, and its optimizer."""
@@ -343,6 +346,15 @@ class CostAlgorithm(OffPolicyAlgorithm):
             return super().save_replay_buffer(path)
         with replacing(with_suffix(path, ".pkl")) as part:
             super().save_replay_buffer(part)
+
+    def load_replay_buffer(self, path: Any, truncate_last_traj: bool = True) -> None:
+        before = self.replay_buffer
+        try:
+            super().load_replay_buffer(path, truncate_last_traj)
+            self._check_replay_buffer()
+        except Exception:
+            self.replay_buffer = before
+            raise
 
     @classmethod
     def load(cls: type[SelfCostAlgorithm], path: Any, *args: Any, **kwargs: Any) -> SelfCostAlgorithm:
