@@ -87,7 +87,7 @@ class CostAlgorithm(OffPolicyAlgorithm):
         self._check_arguments()
 
         super()._setup_model()
-        self._check_replay_buffer()
+        self._adopt_replay_buffer()
         self.actor, self.critic, self.critic_target = self.policy.actor, self.policy.critic, self.policy.critic_target
         # Running mean and running var
         self.batch_norm_stats = get_parameters_by_name(self.critic, ["running_"])
@@ -156,10 +156,13 @@ class CostAlgorithm(OffPolicyAlgorithm):
                 "a cost, and the sum over all time is infinite. Use for instance gamma=0.99."
             )
 
-    def _check_replay_buffer(self) -> None:
-        """Check that an update understands the samples."""
-        if self.gamma == 1 and isinstance(self.replay_buffer, NStepReplayBuffer):
-            raise ValueError(f"gamma={self.gamma} must be smaller than 1 with n-step returns. Use for instance gamma=0.99.")
+    def _adopt_replay_buffer(self) -> None:
+        """Let the replay buffer sample as the model says, or refuse it."""
+        if isinstance(self.replay_buffer, NStepReplayBuffer):
+            if self.gamma == 1:
+                raise ValueError(f"gamma={self.gamma} must be smaller than 1 with n-step returns, for instance 0.99.")
+            # One discount for returns and values
+            self.replay_buffer.gamma = self.gamma
 
     def _make_multiplier(self, initial: float) -> tuple[th.Tensor, th.optim.Adam]:
         """The logarithm of a Lagrange multiplier, and its optimizer."""
@@ -287,9 +290,8 @@ class CostAlgorithm(OffPolicyAlgorithm):
             if schedule is not None:
                 update_learning_rate(optimizer, schedule(self._current_progress_remaining))
 
-        if isinstance(self.replay_buffer, NStepReplayBuffer):
-            # One discount for returns and values
-            self.replay_buffer.gamma = self.gamma
+        # The buffer, or the discount, may have been set by hand
+        self._adopt_replay_buffer()
 
         # Kept on the device until the end: reading one value would wait for all pending work
         names: tuple[str, ...] = ()
@@ -351,7 +353,7 @@ class CostAlgorithm(OffPolicyAlgorithm):
         before = self.replay_buffer
         try:
             super().load_replay_buffer(path, truncate_last_traj)
-            self._check_replay_buffer()
+            self._adopt_replay_buffer()
         except Exception:
             self.replay_buffer = before
             raise

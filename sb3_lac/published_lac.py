@@ -167,8 +167,8 @@ class PublishedLAC(CostAlgorithm):
         elif not isinstance(self.horizon, (int, np.integer)) or self.horizon < 1:
             raise ValueError(f"horizon={self.horizon} must be a whole number of at least 1, or None.")
 
-    def _check_replay_buffer(self) -> None:
-        super()._check_replay_buffer()
+    def _adopt_replay_buffer(self) -> None:
+        super()._adopt_replay_buffer()
         if self.horizon is not None:
             if not isinstance(self.replay_buffer, HorizonReplayBuffer):
                 found = type(self.replay_buffer).__name__
