@@ -138,6 +138,8 @@ class CostAlgorithm(OffPolicyAlgorithm):
         if not (issubclass(self.policy_class, needed) and issubclass(*critics)):
             named = self.policy_class.__name__
             raise ValueError(f"{type(self).__name__} needs a policy derived from {needed.__name__}, and this is {named}.")
+        if not (self.action_space.low < self.action_space.high).all():  # type: ignore[attr-defined]
+            raise ValueError(f"The bounds of {self.action_space} must differ: leave out the actions that cannot be chosen.")
         if not 0 <= self.gamma <= 1:
             raise ValueError(f"gamma={self.gamma} must lie within 0 .. 1.")
         if not 0 < self.alpha3 < math.inf:
