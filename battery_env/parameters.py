@@ -50,7 +50,7 @@ class Parameter:
 _UNIT_SYMBOLS = {"C": "C", "ohm": r"$\Omega$"}
 
 Q_MOBILE = Parameter("q_mobile", "$q_{max}$", "C", (100.0, 1e7), "Ampere-hours become coulombs times 3600.")
-R_O = Parameter("r_o", "$R_o$", "ohm", (0.0, 5.0), "Milliohms become ohms divided by 1000.")
+R_O = Parameter("r_o", "$R_o$", "ohm", (0.0, 50.0), "Milliohms become ohms divided by 1000.")
 
 #: What can be calibrated, by name.
 PARAMETERS: Mapping[str, Parameter] = MappingProxyType({parameter.name: parameter for parameter in (Q_MOBILE, R_O)})

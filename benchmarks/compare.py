@@ -212,7 +212,9 @@ def _check(recipe: Recipe, out: Path) -> None:
     if not (_folder(recipe, out) / "summary.json").exists():
         try:
             with tempfile.TemporaryDirectory() as folder:
-                set_up(recipe, Path(folder))
+                env = set_up(recipe, Path(folder))[1].env
+                assert env is not None
+                env.close()
         except (AssertionError, TypeError, ValueError) as error:
             raise ValueError(f"{recipe.algo} on {recipe.env_id}: {error}") from error
 

@@ -1,11 +1,15 @@
 """Steps of an update, and all of it as one compiled graph. What an update is stands in ``lac.py``."""
 
 import inspect
+import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
 import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BaseModel
+from stable_baselines3.common.preprocessing import preprocess_obs
 from stable_baselines3.sac.policies import Actor
 
 # The first version that traces gradients within a graph
@@ -14,6 +18,8 @@ _OLDEST_TORCH = "2.11"
 BACKEND = "inductor"
 # In place of a learning rate of 0: with Adam's epsilon of 1e-8, no weight changes by it
 _SMALLEST_RATE = 1e-30
+# What networks take in a graph. What the space of the environment needs, as to make images of bytes, no graph goes through
+_NUMBERS = spaces.Box(-math.inf, math.inf, (1,))
 # What sampling leaves behind in an action distribution. The graphs that it belongs to are gone after an update
 _LEFT_BEHIND = ("distribution", "gaussian_actions", "weights_dist", "exploration_mat", "exploration_matrices", "_latent_sde")
 
@@ -134,6 +140,7 @@ class CompiledUpdate:
         self._run = th.compile(run, fullgraph=True, dynamic=False, backend=BACKEND, mode=mode)
         # One per group of parameters. A number would be a constant of the graph
         self._learning_rates: list[th.Tensor] = []
+        self._space: spaces.Space = _NUMBERS
 
     def __reduce__(self) -> tuple[Any, ...]:
         # A graph belongs to this process and its model
@@ -142,14 +149,18 @@ class CompiledUpdate:
     @contextmanager
     def ready(self, model: Any, optimizers: Sequence[th.optim.Optimizer]) -> Iterator[Callable[..., Metrics]]:
         """
-        Have optimizers in a form that can be compiled. All is as it was afterwards, so that models are saved as without
-        compilation.
+        Have optimizers and networks in a form that can be compiled. All is as it was afterwards, so that models are saved as
+        without compilation.
         """
         from torch import _dynamo as dynamo  # Takes seconds
 
+        policy, space = model.policy, model.policy.observation_space
+        networks = [network for network in policy.children() if isinstance(network, BaseModel)]
         groups = [group for optimizer in optimizers for group in optimizer.param_groups]
         before = [group.copy() for group in groups]
         if not self._learning_rates:
+            if isinstance(space, spaces.Dict):
+                self._space = spaces.Dict(dict.fromkeys(space.spaces, _NUMBERS))
             self._learning_rates = [th.zeros((), device=model.device) for _ in groups]
             # CUDA graphs read and write them where they are
             for tensor in (*self._learning_rates, *(parameter for group in groups for parameter in group["params"])):
@@ -167,15 +178,21 @@ class CompiledUpdate:
                     parameter.grad = th.zeros_like(parameter)
                     dynamo.mark_static_address(parameter.grad)
 
-        def update(*args: Any) -> Metrics:
+        def update(replay_data: Any, *args: Any) -> Metrics:
+            parts = {name: getattr(replay_data, name) for name in ("observations", "next_observations")}
+            parts = {name: preprocess_obs(part, space, policy.normalize_images) for name, part in parts.items()}
             # A replay of a CUDA graph overwrites what the one before returned
             th.compiler.cudagraph_mark_step_begin()
-            names, values = self._run(model, *args)
+            names, values = self._run(model, replay_data._replace(**parts), *args)
             return names, values.clone()
 
         try:
+            for network in networks:
+                network.observation_space = self._space
             with th.no_grad(), dynamo.config.patch(trace_autograd_ops=True):
                 yield update
         finally:
+            for network in networks:
+                network.observation_space = space
             for group, old in zip(groups, before, strict=True):
                 group.update(old)

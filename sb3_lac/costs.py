@@ -87,6 +87,7 @@ class CostAlgorithm(OffPolicyAlgorithm):
         self._check_arguments()
 
         super()._setup_model()
+        self._adopt_replay_buffer()
         self.actor, self.critic, self.critic_target = self.policy.actor, self.policy.critic, self.policy.critic_target
         # Running mean and running var
         self.batch_norm_stats = get_parameters_by_name(self.critic, ["running_"])
@@ -137,10 +138,10 @@ class CostAlgorithm(OffPolicyAlgorithm):
         if not (issubclass(self.policy_class, needed) and issubclass(*critics)):
             named = self.policy_class.__name__
             raise ValueError(f"{type(self).__name__} needs a policy derived from {needed.__name__}, and this is {named}.")
+        if not (self.action_space.low < self.action_space.high).all():  # type: ignore[attr-defined]
+            raise ValueError(f"The bounds of {self.action_space} must differ: leave out the actions that cannot be chosen.")
         if not 0 <= self.gamma <= 1:
             raise ValueError(f"gamma={self.gamma} must lie within 0 .. 1.")
-        if self.gamma == 1 and (self.n_steps > 1 or self.replay_buffer_class is NStepReplayBuffer):
-            raise ValueError("gamma must be smaller than 1 with n-step returns.")
         if not 0 < self.alpha3 < math.inf:
             raise ValueError(f"alpha3={self.alpha3} must be greater than 0, and finite.")
         lambda_max = self.lambda_init if self.lambda_max is None else self.lambda_max
@@ -156,6 +157,14 @@ class CostAlgorithm(OffPolicyAlgorithm):
                 f"gamma={self.gamma} must be smaller than 1 with rewards up to {self.reward_bound}: each step below that has "
                 "a cost, and the sum over all time is infinite. Use for instance gamma=0.99."
             )
+
+    def _adopt_replay_buffer(self) -> None:
+        """Let the replay buffer sample as the model says, or refuse it."""
+        if isinstance(self.replay_buffer, NStepReplayBuffer):
+            if self.gamma == 1:
+                raise ValueError(f"gamma={self.gamma} must be smaller than 1 with n-step returns, for instance 0.99.")
+            # One discount for returns and values
+            self.replay_buffer.gamma = self.gamma
 
     def _make_multiplier(self, initial: float) -> tuple[th.Tensor, th.optim.Adam]:
         """The logarithm of a Lagrange multiplier, and its optimizer."""
@@ -192,8 +201,7 @@ class CostAlgorithm(OffPolicyAlgorithm):
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
         prepared = super()._setup_learn(*args, **kwargs)
-        vec_normalize = self._vec_normalize_env
-        first = self._last_obs if vec_normalize is None else vec_normalize.get_original_obs()
+        first = self._last_obs if self._vec_normalize_env is None else self._last_original_obs
         refuse_what_is_not_finite("environment gave the first observation", first, self.num_timesteps)
         return prepared
 
@@ -284,9 +292,8 @@ class CostAlgorithm(OffPolicyAlgorithm):
             if schedule is not None:
                 update_learning_rate(optimizer, schedule(self._current_progress_remaining))
 
-        if isinstance(self.replay_buffer, NStepReplayBuffer):
-            # One discount for returns and values
-            self.replay_buffer.gamma = self.gamma
+        # The buffer, or the discount, may have been set by hand
+        self._adopt_replay_buffer()
 
         # Kept on the device until the end: reading one value would wait for all pending work
         names: tuple[str, ...] = ()
@@ -344,10 +351,19 @@ class CostAlgorithm(OffPolicyAlgorithm):
         with replacing(with_suffix(path, ".pkl")) as part:
             super().save_replay_buffer(part)
 
+    def load_replay_buffer(self, path: Any, truncate_last_traj: bool = True) -> None:
+        before = self.replay_buffer
+        try:
+            super().load_replay_buffer(path, truncate_last_traj)
+            self._adopt_replay_buffer()
+        except Exception:
+            self.replay_buffer = before
+            raise
+
     @classmethod
     def load(cls: type[SelfCostAlgorithm], path: Any, *args: Any, **kwargs: Any) -> SelfCostAlgorithm:
         try:
-            return super().load(path, *args, **kwargs)
+            model = super().load(path, *args, **kwargs)
         # What comes of parameters that are not there, or of another shape
         except (AttributeError, KeyError, RuntimeError) as error:
             # The first of them, which Stable-Baselines3 may have met with an attempt of its own
@@ -356,6 +372,9 @@ class CostAlgorithm(OffPolicyAlgorithm):
                 "It is of another version of sb3_lac (see the changelog), of another algorithm, or of other arguments: "
                 "whether ent_coef is learned cannot be changed on loading."
             ) from error
+        # Its limits may be others than those of the file
+        model._project_lambda()
+        return model
 
     def _excluded_save_params(self) -> list[str]:
         own = ["actor", "critic", "critic_target", "batch_norm_stats", "batch_norm_stats_target", "_compiled", "_terminations"]
@@ -372,24 +391,24 @@ class Terminations:
     """What is collected before the first update, which tells whether a termination has a price."""
 
     def __init__(self) -> None:
-        self.costs: list[np.ndarray] = []
-        self.ends: list[np.ndarray] = []
+        # Number, sum, least and largest of the costs of steps that go on, and of those that end an episode
+        self.seen = {ends: (0, 0.0, math.inf, -math.inf) for ends in (False, True)}
 
     def see(self, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
         """Note a step of all environments. A time limit is no termination."""
-        self.costs.append(0.0 - rewards)
-        self.ends.append(dones & [not info.get("TimeLimit.truncated", False) for info in infos])
+        for cost, done, info in zip((0.0 - rewards).tolist(), dones, infos, strict=True):
+            ends = bool(done and not info.get("TimeLimit.truncated", False))
+            number, total, cheapest, dearest = self.seen[ends]
+            self.seen[ends] = number + 1, total + cost, min(cheapest, cost), max(dearest, cost)
 
     def warn_if_free(self, gamma: float, largest_reward: float) -> None:
         """Warn if the last step before a termination costs no more than another step does."""
+        (number, total, cheapest, dearest), (n_ends, total_of_ends, _, _) = self.seen[False], self.seen[True]
         # Where living pays, an end costs the bound for ever
-        if not self.ends or largest_reward > 0:
+        if not number or not n_ends or largest_reward > 0:
             return
-        costs, ends = np.concatenate(self.costs), np.concatenate(self.ends)
-        if not ends.any() or ends.all():
-            return
-        last, cheapest, dearest = costs[ends].mean(), costs[~ends].min(), costs[~ends].max()
-        price = costs[~ends].mean() / (1 - gamma) if gamma < 1 else math.inf
+        last = total_of_ends / n_ends
+        price = total / number / (1 - gamma) if gamma < 1 else math.inf
         # An end that costs less than any other step is a goal
         if cheapest <= last <= dearest and price > 0:
             warnings.warn(

@@ -294,48 +294,26 @@ class CnnPolicy(LyapunovPolicy):
     """
     Policy class (with both actor and critic) for LAC with image observations.
 
-    :param observation_space: Observation space
-    :param action_space: Action space
-    :param lr_schedule: Learning rate schedule (could be constant)
+    :param args: Arguments of ``LyapunovPolicy``
     :param features_extractor_class: Features extractor to use.
-    :param kwargs: The other arguments of ``LyapunovPolicy``
+    :param kwargs: Arguments of ``LyapunovPolicy``
     """
 
-    def __init__(
-        self,
-        observation_space: spaces.Space,
-        action_space: spaces.Box,
-        lr_schedule: Schedule,
-        features_extractor_class: type[BaseFeaturesExtractor] = NatureCNN,
-        **kwargs: Any,
-    ):
-        super().__init__(
-            observation_space, action_space, lr_schedule, features_extractor_class=features_extractor_class, **kwargs
-        )
+    def __init__(self, *args: Any, features_extractor_class: type[BaseFeaturesExtractor] = NatureCNN, **kwargs: Any):
+        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)  # type: ignore[misc]
 
 
 class MultiInputPolicy(LyapunovPolicy):
     """
     Policy class (with both actor and critic) for LAC with dictionary observations.
 
-    :param observation_space: Observation space
-    :param action_space: Action space
-    :param lr_schedule: Learning rate schedule (could be constant)
+    :param args: Arguments of ``LyapunovPolicy``
     :param features_extractor_class: Features extractor to use.
-    :param kwargs: The other arguments of ``LyapunovPolicy``
+    :param kwargs: Arguments of ``LyapunovPolicy``
     """
 
-    def __init__(
-        self,
-        observation_space: spaces.Space,
-        action_space: spaces.Box,
-        lr_schedule: Schedule,
-        features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor,
-        **kwargs: Any,
-    ):
-        super().__init__(
-            observation_space, action_space, lr_schedule, features_extractor_class=features_extractor_class, **kwargs
-        )
+    def __init__(self, *args: Any, features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor, **kwargs: Any):
+        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)  # type: ignore[misc]
 
 
 class PublishedPolicy(LyapunovPolicy):

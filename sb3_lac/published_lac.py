@@ -167,11 +167,12 @@ class PublishedLAC(CostAlgorithm):
         elif not isinstance(self.horizon, (int, np.integer)) or self.horizon < 1:
             raise ValueError(f"horizon={self.horizon} must be a whole number of at least 1, or None.")
 
-    def load_replay_buffer(self, path: Any, truncate_last_traj: bool = True) -> None:
-        super().load_replay_buffer(path, truncate_last_traj)
+    def _adopt_replay_buffer(self) -> None:
+        super()._adopt_replay_buffer()
         if self.horizon is not None:
             if not isinstance(self.replay_buffer, HorizonReplayBuffer):
-                raise ValueError(f"horizon={self.horizon} needs a HorizonReplayBuffer, and that of {path} is none.")
+                found = type(self.replay_buffer).__name__
+                raise ValueError(f"horizon={self.horizon} needs a HorizonReplayBuffer, and this is a {found}.")
             self.replay_buffer.horizon = self.horizon
 
     def _candidate(self, replay_data: Any, costs: th.Tensor) -> th.Tensor:

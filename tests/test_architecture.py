@@ -2,6 +2,7 @@
 
 import ast
 import configparser
+import os
 import pickle
 import re
 import subprocess
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 
 import battery_env
+from battery_env.compiled import forget_outdated
 
 ROOT = Path(__file__).parents[1]
 
@@ -130,6 +132,15 @@ def test_kernels_are_compiled_where_there_is_no_place_to_keep_them():
     code = f"{nowhere}; from battery_env.electrochemistry.kernels import logarithm; print(logarithm(1.0))"
     result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert result.stdout == "0.0\n" and not result.stderr
+
+
+def test_kernels_are_forgotten_when_a_module_that_they_may_call_has_changed(tmp_path):
+    (tmp_path / "lab").mkdir()
+    for number, name in enumerate(("a.py", "old.nbi", "b.py", "new.nbi", "lab/c.py")):
+        (tmp_path / name).touch()
+        os.utime(tmp_path / name, (number, number))
+    forget_outdated(tmp_path)
+    assert {path.name for path in tmp_path.glob("*.nbi")} == {"new.nbi"}
 
 
 def test_every_public_name_of_battery_env_is_the_one_that_type_checkers_see():

@@ -74,6 +74,8 @@ WRITERS = {
 }
 
 
+# Stable-Baselines3 leaves a file open where a write fails
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("name", WRITERS)
 def test_whichever_write_sync_or_renaming_fails_the_file_is_whole(name, tmp_path, request, monkeypatch):
     write, read, replaces = WRITERS[name]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import floor, inf, log10
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -112,23 +113,25 @@ class Forecast:
 
         :return: a text of several lines
         """
+        q_max_Ah, r_o_mohm = self.q_mobile / 3600.0, 1e3 * self.r_o
         rows = {
-            "end of discharge (s)": (self.eod_time_s, "10.0f"),
-            "remaining time (s)": (self.remaining_s, "10.0f"),
-            "state of charge now (%)": (100.0 * self.soc, "10.1f"),
-            "q_max (Ah)": (self.q_mobile / 3600.0, "10.3f"),
-            "R_o (mohm)": (1e3 * self.r_o, "10.1f"),
-            "capacity (Ah)": (self.capacity_Ah, "10.3f"),
+            "end of discharge (s)": (self.eod_time_s, 0),
+            "remaining time (s)": (self.remaining_s, 0),
+            "state of charge now (%)": (100.0 * self.soc, 1),
+            "q_max (Ah)": (q_max_Ah, decimals(float(np.median(q_max_Ah)), 3)),
+            "R_o (mohm)": (r_o_mohm, decimals(float(np.median(r_o_mohm)), 1)),
+            "capacity (Ah)": (self.capacity_Ah, decimals(float(np.median(self.capacity_Ah)), 3)),
         }
         if not np.isnan(self.nominal_Ah):
-            rows[f"state of health (% of {self.nominal_Ah:.3f} Ah)"] = 100.0 * self.state_of_health, "10.1f"
+            nominal = f"{self.nominal_Ah:.{decimals(self.nominal_Ah, 3)}f} Ah"
+            rows[f"state of health (% of {nominal})"] = 100.0 * self.state_of_health, 1
         head = "".join(f"{'median' if p == 0.5 else f'{100.0 * p:g} %':>10}" for p in BAND)
         lines = [
             f"Discharge to {self.cut_off_V:g} V, {self.now_s:.0f} s seen, then {self.load_name} ({len(self.soc)} samples)",
             f"  {'':<34}{head}",
         ]
-        for name, (values, form) in rows.items():
-            lines.append(f"  {name:<34}" + "".join(f"{value:{form}}" for value in quantile(values, BAND)))
+        for name, (values, digits) in rows.items():
+            lines.append(f"  {name:<34}" + "".join(f"{value:10.{digits}f}" for value in quantile(values, BAND)))
         return "\n".join([*lines, *self.notes])
 
     def plot(self) -> Figure:
@@ -148,6 +151,11 @@ class Forecast:
         axes.grid(alpha=0.25)
         axes.legend(frameon=False, fontsize=9, loc="lower left")
         return figure
+
+
+def decimals(value: float, least: int) -> int:
+    """So many digits behind the point that three digits of a value show, also of a small cell's."""
+    return max(least, 2 - floor(log10(value))) if 0.0 < value < inf else least
 
 
 def forecast(

@@ -60,11 +60,12 @@ def calibrated(paths: list[str], settings: Settings, one_cell: bool, troubles: l
 
 
 def over_the_life(table: pd.DataFrame, column: str, label: str, scale: float) -> go.Figure:
-    """A number of all cells over their discharges, with its standard deviation; what is not settled is hollow."""
+    """A number of all cells over their discharges, with its standard deviation; what is not settled is hollow, without."""
     figure = go.Figure(layout={"yaxis_title": label, "xaxis_title": "discharge", **LAYOUT})
     for colour, (cell, rows) in zip(COLOURS * len(table), table.groupby("cell", sort=False), strict=False):
         number = rows["cycle"].fillna(pd.Series(range(1, len(rows) + 1), rows.index))
-        sd, symbol = rows[f"sd_{column}"], np.where(rows[f"settled_{column.rpartition('_')[0]}"], "circle", "circle-open")
+        settled = rows[f"settled_{column.rpartition('_')[0]}"].astype(bool)
+        sd, symbol = rows[f"sd_{column}"].where(settled), np.where(settled, "circle", "circle-open")
         style = {"name": cell, "line_color": colour, "mode": "lines+markers", "error_y_thickness": 0.4, "error_y_width": 0}
         figure.add_scatter(x=number, y=scale * rows[column], error_y_array=scale * sd, marker_symbol=symbol, **style)
     return figure

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from battery_env.estimators.diagnosis.conditions import SETTLED_SHARES
-from battery_env.lab.forecast import Forecast
+from battery_env.lab.forecast import Forecast, decimals
 from battery_env.lab.settings import Settings
 from battery_env.parameters import PARAMETERS
 from battery_env.records.discharge import Discharge
@@ -99,7 +99,10 @@ class Calibration:
             return "yes" if value else "no"
         number = how["unknown"]
         if not np.isnan(value):
-            number = f"{how['scale'] * value:.{how['digits'] if digits is None else digits}f}"
+            digits = how["digits"] if digits is None else digits
+            if how["unit"] in ("Ah", "mohm"):  # of cells of any size, and a standard deviation as its value
+                digits = decimals(how["scale"] * getattr(self, name.removeprefix("sd_")), digits)
+            number = f"{how['scale'] * value:.{digits}f}"
         return f"{number} {how['unit']}" if how["unit"] and with_unit else number
 
     def sd_of(self, name: str) -> str:

@@ -19,7 +19,7 @@ from battery_env.estimators.diagnosis.conditions import is_only_imprecise
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.files import check_new, finite_or_none, replacing
 from battery_env.lab.calibrate import Ahead, calibrated
-from battery_env.lab.forecast import Forecast
+from battery_env.lab.forecast import Forecast, decimals
 from battery_env.lab.life import Life, track_life
 from battery_env.lab.readers.columns import FileFormat
 from battery_env.lab.report import Calibration
@@ -97,9 +97,9 @@ class End:
             plural = "" if valid.sum() == 1 else "s"
             lines.append(f"life of {valid.sum()} earlier discharge{plural}{left_out}")
         if self.prior_q_mobile_C is not None:
-            lines.append(
-                "q_max before: {:.3f} Ah, sd {:.3f} Ah".format(*(each_C / 3600.0 for each_C in self.prior_q_mobile_C))
-            )
+            mean_Ah, sd_Ah = (each_C / 3600.0 for each_C in self.prior_q_mobile_C)
+            digits = decimals(mean_Ah, 3)
+            lines.append(f"q_max before: {mean_Ah:.{digits}f} Ah, sd {sd_Ah:.{digits}f} Ah")
         return "\n".join([*lines, self.forecast.summary()])
 
 

@@ -163,6 +163,8 @@ class LyapunovReport:
         metrics = self.metrics
         if metrics["death_rate"].value > 0:
             return f"{self.episodes['terminated'].sum()} of {len(self.episodes)} episodes died"
+        if not np.isfinite(self.transitions["lyapunov"]).all():
+            return "L is not finite everywhere, as with gamma=1 and positive rewards"
         if math.isnan(metrics["largest_feasible_alpha3"].low) and metrics["largest_feasible_alpha3"].value > 0:
             return "too few episodes have a cost for an interval, use more"
         if not metrics["largest_feasible_alpha3"].low > 0:

@@ -62,7 +62,9 @@ class Bootstrap:
     ) -> Interval:
         """Estimate a statistic."""
         sums = np.stack([np.bincount(episode, value, minlength=self.n_episodes) for value in values])
-        samples = statistic(*(sums @ self.counts.T))
+        # No sample has a value where a sum is infinite
+        with np.errstate(invalid="ignore"):
+            samples = statistic(*(sums @ self.counts.T))
         return self._interval(float(statistic(*sums.sum(axis=1))), samples)
 
     def estimate_levels(

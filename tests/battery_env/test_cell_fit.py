@@ -175,6 +175,15 @@ class TestRealCells:
         assert np.sum(rmse_V[1::2]) < 0.5 * np.sum(rmse_V[::2])
         assert np.mean(late[1::2]) < 0.5 * np.mean(late[::2])
 
+    @pytest.mark.parametrize("size", [0.02, 120.0])
+    def test_cells_of_any_size_have_constants(self, b0005_fit, size):
+        discharges = load_nasa_discharges("B0005")
+        chosen = [discharges[n] for n in (0, 84, -1, 120)]
+        *fitted, other = (Discharge(each.time_s, each.voltage_V, size * each.current_A) for each in chosen)
+        found, own = calibrate(other, cell=fit_cell(fitted)), calibrate(discharges[120], cell=b0005_fit)
+        assert found.settled and found.q_mobile_C == pytest.approx(size * own.q_mobile_C, rel=0.01)
+        assert found.r_o_ohm * size == pytest.approx(own.r_o_ohm, rel=0.1)
+
     def test_the_error_to_expect_is_what_unseen_discharges_show(self, b0005_fit):
         own = b0005_fit.calibrator()
         shown_V = [discharge.left_out_V for discharge in b0005_fit.discharges]

@@ -522,12 +522,14 @@ def test_advice_is_given_only_if_it_helps_and_does_not_contradict_what_is_known(
     assert said in str(caught.value) and not (unsaid and unsaid in str(caught.value)), str(caught.value)
 
 
-@pytest.mark.parametrize("share", [1e-1, 1e-2, 3e-3, 1e-3, 1e-4])
-def test_the_charge_of_a_cell_of_any_size_is_known_and_where_it_is_small_its_constants_are_not(share):
+@pytest.mark.parametrize("share", [400.0, 22.0, 1e-1, 1e-2, 3e-3, 1e-3, 1e-4])
+def test_the_charge_of_a_cell_of_any_size_is_known_and_where_that_is_another_its_constants_are_not(share):
     (found,) = calibrate(TABLE.assign(current=share * TABLE["current"]).rename(columns={"current": "current (A)"}))
     assert found.drawn_Ah == pytest.approx(share * RECORD.loaded_part(2.7).charge_C / 3600.0, rel=0.01)
     assert found.capacity_Ah == pytest.approx(found.drawn_Ah) and not found.settled
-    assert share > 0.05 or found.reason.startswith("No cell of this kind has such a q_max")
+    assert share == 0.1 or found.reason.startswith("No cell of this kind has such a q_max")
+    drawn = str(found).partition(" Ah drawn")[0].split()[-1]
+    assert float(drawn) == pytest.approx(found.drawn_Ah, rel=0.005)
 
 
 @pytest.mark.parametrize(("stated", "advised"), [(frozenset(), True), (frozenset({"sign"}), False)])

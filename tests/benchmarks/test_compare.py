@@ -298,6 +298,8 @@ def test_algorithms_of_the_zoo_and_ones_own_are_compared_in_any_environment(tmp_
     assert re.search(r"\| Tank-v0 +\| TQC defaults +\|", capsys.readouterr().out)
 
 
+# The RL Zoo leaves the files of its monitors open where a model is refused
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [

@@ -16,8 +16,6 @@ from benchmarks import training
 from benchmarks.study import digest_of
 from sb3_lac import LAC, compiled
 
-pytestmark = pytest.mark.filterwarnings("error::ResourceWarning", "error::pytest.PytestUnraisableExceptionWarning")
-
 ENV_ID = "LinearCost-v0"
 PUBLISHED = Path(__file__).parents[2] / "docs" / "results"
 CONFIG = """

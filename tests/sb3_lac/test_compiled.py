@@ -4,11 +4,13 @@ import copy
 import pickle
 import shutil
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 import torch._dynamo as dynamo
 import torch._inductor.config as inductor
+from gymnasium import spaces
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.utils import ConstantSchedule, LinearSchedule
@@ -64,6 +66,25 @@ def assert_close(model, other):
 SCHEDULES = {"learning_rate": LinearSchedule(1e-2, 1e-4, 1.0), "lambda_learning_rate": LinearSchedule(1e-3, 1e-2, 1.0)}
 
 
+def seen(env):
+    """Its states as an image of bytes and as discrete numbers."""
+    parts = {
+        "image": spaces.Box(0, 255, (36, 36, 1), np.uint8),
+        "digit": spaces.Discrete(3),
+        "pair": spaces.MultiDiscrete([2, 3]),
+    }
+
+    def see(obs):
+        digit = int(abs(obs[0])) % 3
+        return {
+            "image": np.full((36, 36, 1), 10 * abs(obs[1]), np.uint8),
+            "digit": digit,
+            "pair": np.array([digit % 2, digit]),
+        }
+
+    return gym.wrappers.TransformObservation(env, see, spaces.Dict(parts))
+
+
 @pytest.mark.parametrize(
     "kwargs",
     [
@@ -72,10 +93,13 @@ SCHEDULES = {"learning_rate": LinearSchedule(1e-2, 1e-4, 1.0), "lambda_learning_
         {"algorithm": PublishedLAC, "reward_bound": 3.0, "critic_learning_rate": LinearSchedule(1e-2, 1e-3, 1.0)},
         {"algorithm": PublishedLAC, "horizon": 4, "ent_coef": 0.2},
         {"policy_kwargs": {"n_critics": 2, "optimizer_class": th.optim.SGD, "share_features_extractor": True}},
+        {"policy": "MultiInputPolicy", "wrapper": seen},
     ],
-    ids=["schedules", "n_steps", "published", "horizon", "two_critics"],
+    ids=["schedules", "n_steps", "published", "horizon", "two_critics", "images_and_discrete"],
 )
-def test_compiled_and_eager_updates_are_the_same(make_model, kwargs):
+def test_compiled_and_eager_updates_are_the_same(make_model, make_env, kwargs):
+    kwargs = kwargs.copy()
+    kwargs["env"] = kwargs.pop("wrapper", lambda env: env)(make_env())
     eager, eager_logged = trained(make_model(**kwargs))
     model = make_model(compile_update=True, **kwargs)
     dynamo.utils.counters.clear()

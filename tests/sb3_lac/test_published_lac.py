@@ -235,9 +235,23 @@ def test_horizon_is_that_of_the_model_with_a_buffer_of_another_one(make_model, t
     other = make_model(algorithm=PublishedLAC, n_collect=0, horizon=7)
     other.load_replay_buffer(tmp_path / "buffer")
     assert other.replay_buffer.horizon == 7
-    make_model(n_collect=1).save_replay_buffer(tmp_path / "plain")
-    with pytest.raises(ValueError, match="horizon=7 needs a HorizonReplayBuffer"):
-        other.load_replay_buffer(tmp_path / "plain")
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "of_another", "message"),
+    [
+        ({"algorithm": PublishedLAC, "horizon": 7}, {}, "horizon=7 needs a HorizonReplayBuffer, and this is a ReplayBuffer"),
+        ({"gamma": 1.0}, {"n_steps": 3}, "gamma=1.0 must be smaller than 1 with n-step returns"),
+    ],
+)
+def test_a_buffer_that_is_refused_leaves_the_one_that_is_there(make_model, tmp_path, kwargs, of_another, message):
+    make_model(n_collect=1, **of_another).save_replay_buffer(tmp_path / "buffer")
+    model = make_model(**kwargs)
+    with pytest.raises(ValueError, match=message):
+        model.load_replay_buffer(tmp_path / "buffer")
+    assert model.replay_buffer.pos == 40
+    model.learn(10, reset_num_timesteps=False)
+    assert model._n_updates == 10
 
 
 def test_model_of_another_algorithm_or_version_is_named(make_model, tmp_path):

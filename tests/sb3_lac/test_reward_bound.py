@@ -1,5 +1,7 @@
 """Positive rewards: what a termination costs, and the offset that carries the bound of the rewards."""
 
+import warnings
+
 import numpy as np
 import pytest
 import torch as th
@@ -148,3 +150,7 @@ def test_without_discount_a_positive_reward_makes_values_infinite_and_ends_no_tr
     # What is learned is relative
     assert all(th.isfinite(parameter).all() for parameter in model.policy.parameters())
     assert not any(th.equal(*pair) for pair in zip(before, model.actor.parameters(), strict=True))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        report = evaluate_lyapunov(model, make_env(offset=4.0), 4, seed=1)
+    assert "L is not finite" in report.summary() and not report.holds

@@ -90,6 +90,14 @@ def test_interrupted_run_ends_like_an_uninterrupted_one(
     assert_same_learned_state(reference, loaded)
 
 
+def test_running_environments_can_get_a_normalization(make_model, make_env):
+    venv = make_vec_env(make_env)
+    model = make_model(venv)
+    model.set_env(VecNormalize(venv), force_reset=False)
+    model.learn(5, reset_num_timesteps=False)
+    assert model.replay_buffer.pos == 45
+
+
 def test_arguments_are_kept_checked_and_can_be_changed(make_model, tmp_path):
     arguments = {"alpha3": 0.2, "lambda_init": 0.3, "lambda_min": 0.01, "lambda_max": 2.0, "lambda_learning_rate": 1e-4}
     make_model(n_collect=0, **arguments).save(tmp_path / "model")
@@ -97,5 +105,6 @@ def test_arguments_are_kept_checked_and_can_be_changed(make_model, tmp_path):
     assert {name: getattr(loaded, name) for name in arguments} == arguments
     assert loaded.lambda_lr_schedule(0.5) == 1e-4
     assert LAC.load(tmp_path / "model", alpha3=0.5).alpha3 == 0.5
+    assert LAC.load(tmp_path / "model", lambda_max=0.2).log_lambda.exp().item() == pytest.approx(0.2)
     with pytest.raises(ValueError, match="alpha3=-1 must be greater than 0"):
         LAC.load(tmp_path / "model", alpha3=-1)

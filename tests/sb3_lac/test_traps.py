@@ -117,6 +117,14 @@ def test_constant_positive_reward_costs_nothing_over_n_steps(make_model, make_en
     assert model.largest_reward.item() == pytest.approx(5.0, rel=1e-5)
 
 
+def test_n_step_returns_without_a_discount_reach_no_weights(make_model):
+    model = make_model(n_steps=3)
+    model.gamma = 1.0
+    with pytest.raises(ValueError, match=r"gamma=1\.0 must be smaller than 1 with n-step returns"):
+        model.train(1)
+    assert all(th.isfinite(parameter).all() for parameter in model.policy.parameters())
+
+
 def test_everything_that_is_learned_is_saved(make_model, train_metrics):
     model = make_model()
     own_tensors = {name for name, value in vars(model).items() if isinstance(value, th.Tensor)}
@@ -156,7 +164,8 @@ def test_entropy_coefficient_and_target_can_be_written_as_text(make_model):
         ({"lambda_max": math.inf}, "lambda_max=inf must be .* finite"),
         ({"reward_bound": -1.0}, "reward_bound=-1.0 must be finite and at least 0"),
         ({"reward_bound": 0.5, "gamma": 1.0}, "gamma=1.0 must be smaller than 1 with rewards up to 0.5"),
-        ({"n_steps": 3, "gamma": 1.0}, "gamma must be smaller than 1 with n-step returns"),
+        ({"n_steps": 3, "gamma": 1.0}, "gamma=1.0 must be smaller than 1 with n-step returns"),
+        ({"replay_buffer_class": type("Own", (NStepReplayBuffer,), {}), "gamma": 1}, "gamma=1.0 must be smaller than 1"),
         ({"gamma": 1.1}, "gamma=1.1 must lie within 0 .. 1"),
         ({"gamma": math.nan}, "gamma=nan must lie within 0 .. 1"),
         ({"policy_kwargs": {"n_critics": 0}}, "n_critics=0 must be at least 1"),

@@ -151,10 +151,23 @@ def test_trials_on_batteries_are_scored_on_held_out_discharges(workdir):
     assert asked.eval_env_kwargs == {"split": "all"}
 
 
+@pytest.fixture
+def set_up():
+    models = []
+
+    def set_up(manager):
+        models.append(manager.setup_experiment()[0])
+        return models[-1]
+
+    yield set_up
+    for model in models:
+        model.env.close()
+
+
 @pytest.mark.parametrize(("gamma", "of_normalization"), [("auto", 0.99), (0.5, 0.5)])
-def test_discount_of_normalized_rewards(gamma, of_normalization, workdir):
+def test_discount_of_normalized_rewards(gamma, of_normalization, workdir, set_up):
     (workdir / "zoo_configs" / "lac.yml").write_text(yaml.dump({"default": {**SETTINGS, "gamma": gamma}}))
-    model, _ = manager_of(ENV, workdir).setup_experiment()
+    model = set_up(manager_of(ENV, workdir))
     assert model.get_vec_normalize_env().gamma == of_normalization
     model.learn(10)
 
@@ -249,9 +262,9 @@ def test_algorithm_without_a_discount_is_told_none(workdir, stating):
     assert "gamma" not in hyperparameters_of(workdir, stating, "ars", {"default": {"policy": "LinearPolicy"}})
 
 
-def test_model_and_normalization_have_the_stated_discount(workdir, stating):
+def test_model_and_normalization_have_the_stated_discount(workdir, stating, set_up):
     (workdir / "zoo_configs" / "lac.yml").write_text(yaml.dump({"default": {**SETTINGS, "gamma": 0.99}}))
-    model, _ = manager_of(stating, workdir).setup_experiment()
+    model = set_up(manager_of(stating, workdir))
     assert model.gamma == model.get_vec_normalize_env().gamma == 0.8
 
 
@@ -280,14 +293,14 @@ class TestEnvironments:
     """Copies of an environment are stepped by one call where it is registered with a vector environment that can."""
 
     @pytest.fixture
-    def model_of(self, workdir):
+    def model_of(self, workdir, set_up):
         (workdir / "zoo_configs" / "lac.yml").write_text(yaml.dump({"default": {**SETTINGS, "n_envs": 3}}))
 
-        def set_up(env_id):
+        def model_of(env_id):
             manager = manager_of(env_id, workdir)
-            return manager.setup_experiment()[0], Path(manager.save_path)
+            return set_up(manager), Path(manager.save_path)
 
-        return set_up
+        return model_of
 
     def test_one_call_makes_the_episodes_of_single_environments(self, model_of, monkeypatch):
         batched, folder = model_of("BatteryRo-v0")

@@ -468,10 +468,11 @@ def _examine_last(seen: Row, voltage: float, resistance_ohm: float, most_q: floa
         switch.size_A = 0.0
     _look_for_rise(seen, time_s, voltage, current)
     # under a steady load the voltage at rest is higher by the ohmic drop at least; a charge that is seen raises it
-    drop_V = resistance_ohm * max(current, 0.0) if time_s - switch.time_s > _START_WINDOW_S else 0.0
+    whole_V = resistance_ohm * max(current, 0.0)
+    drop_V = whole_V if time_s - switch.time_s > _START_WINDOW_S else 0.0
     if seen.drawn_C > _RECOVERY_SHARE * most_q:
         if seen.share_V == 0.0:
-            seen.share_V = voltage + drop_V
+            seen.share_V = voltage + whole_V
         # on a flat curve, or with a smaller drop than that, it never was much lower
         is_high = voltage + drop_V > max(seen.low_V, seen.share_V + _RISE_V)
         if is_high and min(current, last.lagging_A) >= -REST_CURRENT_A:
