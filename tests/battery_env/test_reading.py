@@ -27,9 +27,6 @@ CHARGE = pd.DataFrame({"time": np.arange(0.0, 3600.0, 60.0), "voltage": np.linsp
 REST = pd.DataFrame({"time": 3600.0 + np.arange(0.0, 600.0, 60.0), "voltage": 4.19, "current": 0.0})
 CYCLE = pd.concat([CHARGE, REST, TABLE.assign(time=4200.0 + TABLE["time"])], ignore_index=True)
 
-# A file that is not closed
-pytestmark = pytest.mark.filterwarnings("error::ResourceWarning", "error::pytest.PytestUnraisableExceptionWarning")
-
 
 def read(table, said="", **options):
     """Return the one discharge of a table, and check what is said of it; nothing by default."""

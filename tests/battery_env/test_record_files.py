@@ -24,9 +24,6 @@ CURRENT_A = np.where(LOADED, 2.0, 0.0)
 VOLTAGE_V = np.round(np.where(LOADED, 4.0 - 0.8 * TIME_S / 1800.0, [4.19] * 2 + [3.4] * (len(TIME_S) - 2)), 6)
 TEMPERATURE_C = np.round(24.0 + TIME_S / 200.0, 4)
 
-# A file that is not closed
-pytestmark = pytest.mark.filterwarnings("error::ResourceWarning", "error::pytest.PytestUnraisableExceptionWarning")
-
 
 def clock(seconds: float) -> str:
     minutes, rest = divmod(seconds, 60.0)
