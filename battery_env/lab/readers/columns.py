@@ -19,8 +19,8 @@ REQUIRED = ("time", "voltage", "current")
 # times of a step; a cell before one of its electrodes. Below them, what may stand in their place, or tells more of them.
 _NAMES = {
     "time": "test time, total time, elapsed time, accumulated time, cumulative time, run time, record time, elapsed, "
-    "prog time, program time, program duration, programmdauer, test, time, t, relative time, testzeit, prüfzeit, gesamtzeit, "
-    "programmzeit, laufzeit, zeit, temps total, temps, tempo, tiempo, 总时间, 测试时间, 累计时间, 时间, 相对时间, seconds, "
+    "prog time, program time, program duration, programmdauer, test, time, relative time, testzeit, prüfzeit, gesamtzeit, "
+    "programmzeit, laufzeit, zeit, temps total, temps, tempo, tiempo, 总时间, 测试时间, 累计时间, 时间, 相对时间, seconds, t, "
     "unix time, date time, timestamp, absolute time, dpt time, real time, system time, date, datum, datum uhrzeit, "
     "zeitstempel, fecha, 绝对时间, 系统时间, 日期, step time, step duration, schrittzeit, schrittdauer, temps étape, "
     "步骤时间, 工步时间",
