@@ -533,7 +533,10 @@ def _refuse_unsigned(rows: pd.DataFrame, columns: Mapping[str, Column]) -> None:
     # the first row may have the voltage from before
     rise_V = voltage_V[end] - voltage_V[np.minimum(begin + 1, end)]
     is_long, long_V = charge_C >= _LONG_SHARE * charge_C.max(), _LONG_SHARE * float(np.ptp(voltage_V))
-    rise_V[~is_long & (rise_V > 0.0)] = 0.0
+    # after a larger load it rises, too, but not above where it was before that
+    before_V = voltage_V[np.maximum(np.append(0, begin[:-1]) - 1, 0)]
+    relaxes = (jump_A[begin] < 0.0) & (voltage_V[end] < before_V)
+    rise_V[(~is_long | relaxes) & (rise_V > 0.0)] = 0.0
     if rise_V.max() > long_V and np.minimum(rise_V, 0.0).sum() < -long_V:
         known = [repr(column.name) for key, column in columns.items() if key.startswith("state")]
         raise ValueError(
