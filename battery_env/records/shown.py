@@ -56,7 +56,8 @@ class Shown(NamedTuple):
     :param load_on_C: standard deviation of the charge by the moment of load-on, which lies between two samples, C
     :param offset_A: what flows at rest, A
     :param is_counted: whether the tester counted the charge
-    :param uncounted_C: by how much the charge is another one than the tester counted, C
+    :param uncounted_C: by how much the charge is another one than the tester counted or, without a count, what a clock that
+        starts anew with each step does not tell, C
     """
 
     at_rest: bool = False

@@ -589,3 +589,22 @@ class TestCountedByTheTester:
             assert found.sd_q_mobile_C > discharge.shown.uncounted_C and not found.settled_q_mobile
             assert "The tester counted another charge" in found.reason
             assert found.sd_predicted_capacity_Ah > discharge.shown.uncounted_C / 3600.0
+
+
+@pytest.mark.parametrize("writes_ends", [False, True])
+@pytest.mark.parametrize("every_s", [1, 2, 5, 10, 20])
+def test_what_a_clock_that_starts_anew_with_each_step_loses_is_in_doubt(every_s, writes_ends):
+    """Loads of two sizes in turn, for 97 s each, with rows every so often, and one at the end of each step or none."""
+    starts_s = 97 * np.arange(20)
+    at_s = [np.unique([*range(0, 97, every_s), *([96] if writes_ends else [])]) for _ in starts_s]
+    step, within_s = np.repeat(np.arange(20), [len(each) for each in at_s]), np.concatenate(at_s)
+    true_s, current_A = starts_s[step] + within_s, np.where(step % 2, 1.0, 3.0)
+    table = {"Step Time (s)": within_s, "Step Index": step, "Current (A)": current_A}
+    table["Voltage (V)"] = 4.1 - 4e-4 * true_s - 0.1 * current_A
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        (found,) = read_discharges(pd.DataFrame(table), discharge_is_negative=False)
+    true_C = float(current_A[:-1] @ np.diff(true_s))
+    assert abs(found.charge_C - true_C) <= 2.0 * found.shown.uncounted_C + 0.012 * true_C  # rows lie a second apart at best
+    assert (found.shown.uncounted_C == 0.0) == (writes_ends and 96 % every_s > 0)
+    assert any("is unknown" in str(each.message) for each in caught) == (found.shown.uncounted_C > 0.0)

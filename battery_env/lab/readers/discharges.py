@@ -341,10 +341,12 @@ def _recording(
 
 
 def _with_count(shown: Shown, rows: pd.DataFrame) -> Shown:
-    """With how much the charge under load is another one than the tester counted row by row."""
+    """With how much the charge under load is another one than the tester counted row by row, or than a clock lost."""
     time_s, current_A = rows["time"].to_numpy(), rows["current"].to_numpy()
     loaded = np.flatnonzero(current_A > SWITCH_SHARE * current_A.max())
     part = slice(loaded[0], loaded[-1] + 1)
+    if "lost" in rows:  # all of it in each step of the program, none, or any part in all alike
+        shown = shown._replace(uncounted_C=float(rows["lost"].to_numpy()[part][1:] @ np.abs(current_A[part][:-1])) / 3.0**0.5)
     if "capacity" not in rows or len(loaded) < LEAST_SAMPLES:
         return shown
     step_C = np.diff(rows["capacity"].to_numpy()[part])
