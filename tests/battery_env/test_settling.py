@@ -348,6 +348,14 @@ class TestPrecision:
         assert abs(filtered.q_mobile - fitted.q_mobile) < 1.5 * filtered.sd_q_mobile
         assert filtered.settled and 0.5 * fitted.sd_q_mobile < filtered.sd_q_mobile < fitted.sd_q_mobile
 
+    @pytest.mark.parametrize("index", [0, 24, 48])
+    def test_a_rest_makes_it_no_surer_of_a_resistance_than_the_error_of_its_model_allows(self, index):
+        """With the rest after the cut-off a stream once settled an R_o of half of the right one, 7 standard deviations off."""
+        record = load_nasa_discharges("B0005")[index]
+        right = CALIBRATORS["least squares"]().estimate(record.loaded_part(2.7))
+        estimate = CALIBRATORS["filter"]().estimate(record)
+        assert abs(estimate.r_o - right.r_o) < 3.0 * estimate.sd_r_o and not estimate.settled_r_o
+
     @pytest.mark.parametrize("share", [0.25, 0.5, 0.75])
     def test_before_the_knee_it_is_no_surer_than_least_squares_with_constants_of_young_discharges(self, young_fit, share):
         """With an error stated too small it answered 4657 +- 84 C at half time; the whole discharge says 5986 C."""

@@ -149,6 +149,13 @@ def _common_error_sd(one: Row, settings: Settings) -> float:
 
 
 @inlined
+def _resistive_error_sd(one: Row, settings: Settings) -> float:
+    # And of r_o: an error that goes with the current is no offset, which a load that varies would tell from it.
+    told = one.told
+    return sqrt(settings.mismatch_V2 * told.charge_C / told.rr) if told.rr > 0.0 else 0.0
+
+
+@inlined
 def _correct(
     one: Row,
     voltage: float,
@@ -314,7 +321,8 @@ def take(
     bank.offset_V2 += settings.offset_growth * duration
     _doubt(bank, filters[best].mean[OFFSET])
     bank.expected_V = filters[before].expected_V  # by the filter that did not know yet
-    bank.common_sd_q = _common_error_sd(filters[best], settings)
+    bank.common_sd[Q] = _common_error_sd(filters[best], settings)
+    bank.common_sd[R] = _resistive_error_sd(filters[best], settings)
 
 
 @compiled
@@ -330,9 +338,7 @@ def conclude(cell: Row, settings: Settings, estimate: Row) -> None:
     """Say what a bank estimates after a sample that was examined, and what speaks against it; unchecked."""
     bank, seen, searched = cell.bank, cell.seen, settings.searched
     # what the error of the model leaves open beside the prior, what shows nowhere in the voltage, and what nobody saw
-    common_sd_q = (bank.common_sd_q**-2.0 + 1.0 / settings.variance[Q]) ** -0.5
     unseen = unseen_C(seen)
-    own_sd = (max(bank.sd[Q], common_sd_q), max(bank.sd[R], 0.0))
     estimate.q_mobile, estimate.r_o = bank.mean[Q], bank.mean[R]
     estimate.condition[:] = Condition.SETTLED + 0
     start, fault = start_condition(seen), fault_condition(seen)
@@ -349,8 +355,9 @@ def conclude(cell: Row, settings: Settings, estimate: Row) -> None:
             estimate.sd[k] = nan
             continue
         value, (low, high), (mean, prior_sd) = bank.mean[k], settings.bounds[k], settings.carried[k]
+        common_sd = (bank.common_sd[k] ** -2.0 + 1.0 / settings.variance[k]) ** -0.5
         sd = hypot(
-            hypot(own_sd[k], settings.scale_sd[k] * value), unseen if k == Q else hypot(seen.dropped_ohm, settings.cell_sd_r_o)
+            hypot(max(bank.sd[k], common_sd), settings.scale_sd[k] * value), unseen if k == Q else hypot(seen.dropped_ohm, settings.cell_sd_r_o)
         )
         estimate.sd[k], of_data = sd, sd
         _note(estimate, Condition.Q_AT_BOUND + k, not low + bank.sd[k] < value < high - bank.sd[k])
@@ -358,8 +365,7 @@ def conclude(cell: Row, settings: Settings, estimate: Row) -> None:
             narrowed = max(prior_sd**2 - bank.sd[k] ** 2, (_LEAST_NARROWING * prior_sd) ** 2)
             _note(estimate, Condition.Q_PRIOR_WRONG + k, (value - mean) ** 2 > PRIOR_LIMIT_SD**2 * narrowed)
             # precisions add up
-            of_data = max(bank.sd[k] ** -2.0 - prior_sd**-2.0, 0.0) ** -0.5
-            of_data = max(of_data, bank.common_sd_q if k == Q else 0.0)
+            of_data = max(max(bank.sd[k] ** -2.0 - prior_sd**-2.0, 0.0) ** -0.5, bank.common_sd[k])
             _note(estimate, Condition.Q_PRIOR_ALONE + k, of_data >= _SHARES[k] * value)
         _note(estimate, Condition.R_SWITCHES, k == R and is_smeared(seen))
         if not sd < _SHARES[k] * value:

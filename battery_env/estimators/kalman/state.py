@@ -77,11 +77,11 @@ FILTER = table(
 # What a bank remembers beside its filters.
 _BANK = table(
     [
-        # after the last sample: moments of the mixture of all filters, the standard deviation of q_mobile that an error of the
+        # after the last sample: moments of the mixture of all filters, the standard deviations of both that an error of the
         # model leaves which is common to the discharge, the voltage that was expected, and whether the model cell has one
         ("mean", "f8", 2),
         ("sd", "f8", 2),
-        ("common_sd_q", "f8"),
+        ("common_sd", "f8", 2),
         ("expected_V", "f8"),
         ("has_voltage", "b1"),
         # of innovations: the noise that they showed in the mean; the last ones, averaged; the sum of the products of each one
