@@ -61,15 +61,14 @@ class _Fitted:
     fit: Fit  # with all priors
     alone: Fit  # without the prior of q_mobile
     variance_V2: float  # of one residual, with what the error of the model adds
-    hidden_sd: Mapping[str, float]  # of what does not show in the voltage, by parameter
+    hidden_sd: Mapping[str, float]  # of what does not show in the voltage, charges that nobody saw among it, by parameter
     seen: Any  # what the samples show beside the fit
 
     def sd(self, fit: Fit) -> dict[str, float]:
-        """The standard deviations of a fit, with those of what does not show, and with charges that nobody saw."""
+        """The standard deviations of a fit, with those of what does not show."""
         sd = dict.fromkeys(PARAMETER_NAMES, nan)
         for name, root in zip(self.search.parameters, _root_inverse_diagonal(fit.jacobian), strict=False):
             sd[name] = hypot(sqrt(self.variance_V2) * float(root), self.hidden_sd[name])
-        sd["q_mobile"] = hypot(sd["q_mobile"], unseen_C(self.seen))
         return sd
 
 
@@ -282,7 +281,8 @@ class LeastSquares(Estimator):
             mean_C, sd_C = self.prior_q_mobile_C
             carried = Prior("q_mobile", mean_C, self._sd_ratio * sqrt(variance_V2) / sd_C)
             fit = search.best([*starts, alone.values, *search.starts([mean_C])[0]], [*priors, carried])
-        return _Fitted(search, fit, alone, variance_V2, self._hidden_sd(search, fit), self._seen(record, shown, fit))
+        seen = self._seen(record, shown, fit)
+        return _Fitted(search, fit, alone, variance_V2, self._hidden_sd(search, fit, unseen_C(seen)), seen)
 
     def _seen(self, record: Samples, shown: Shown, fit: Fit) -> Any:
         """What the samples of a record show beside a fit, whose model may be empty before they end."""
@@ -297,21 +297,25 @@ class LeastSquares(Estimator):
             return 1.0
         return 1.0 + self.path.errors_per_C * drawn_charge_C(record)
 
-    def _hidden_sd(self, search: Search, fit: Fit) -> dict[str, float]:
+    def _hidden_sd(self, search: Search, fit: Fit, unseen_C: float) -> dict[str, float]:
         """
         The standard deviations of what does not show in the voltage: the gain of the current sensor, which scales both
-        parameters, and the charge at the start, which the fit makes up for.
+        parameters, and the charge at the start, which the fit makes up for. A charge that nobody saw is like one of these.
         """
         (soc, sd_soc), values, model = self.initial_soc, fit.values, self.model
+        sd_soc = hypot(sd_soc, unseen_C / values["q_mobile"])
         by_soc = np.zeros(len(search.unknown))
         if sd_soc:
             step = _SOC_STEP if soc < 0.5 else -_SOC_STEP
-            nearby = replace(search, model=RecordModel(model.cell, model.thermal, model.dt_s, initial_soc=soc + step))
+            at, nearby = (
+                replace(search, model=RecordModel(model.cell, model.thermal, model.dt_s, initial_soc=each))
+                for each in (soc, soc + step)
+            )
             moved = dict(values)
             if "q_mobile" in self.parameters:  # along with it, so that the cell ends as full as before
                 moved["q_mobile"] *= soc / (soc + step)
                 by_soc[self.parameters.index("q_mobile")] = (moved["q_mobile"] - values["q_mobile"]) / step
-            change_V = (nearby.residual(moved)[0] - search.residual(values)[0]) / step
+            change_V = (nearby.residual(moved)[0] - at.residual(values)[0]) / step
             rows = np.nan_to_num(np.append(change_V, np.zeros(len(fit.jacobian) - len(change_V))))
             by_soc -= np.linalg.lstsq(fit.jacobian, rows, rcond=None)[0]
         of_cell = {"r_o": self.cell_sd_r_o_ohm}

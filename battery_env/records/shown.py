@@ -95,14 +95,14 @@ def load_on_sd_C(time_s: FloatArray, current_A: FloatArray, first: int, load_on_
 def rest_current_A(current_A: FloatArray) -> float | None:
     """
     What flows at rest, A: what the rests before and after a load have in common, as a small load, or the end of a charge, is
-    only before it or after. Where only the one before is recorded, what is drawn in it; ``None``: no rest is.
+    only before it or after. Where only the one before is recorded, what flows in it; ``None``: no rest is.
     """
     loaded = np.flatnonzero(current_A > SWITCH_SHARE * current_A.max())
     before, after = current_A[: loaded[0]], current_A[loaded[-1] + 1 :]
     rests = [part[np.abs(part) <= SWITCH_SHARE * np.ptp(current_A)] for part in (before, after)]
     before_A, after_A = (float(np.median(rest)) if len(rest) else 0.0 for rest in rests)
     if not len(rests[1]):
-        return max(before_A, 0.0) if len(rests[0]) else None
+        return before_A if len(rests[0]) else None
     return min(before_A, after_A, key=abs) if before_A * after_A > 0.0 else 0.0
 
 

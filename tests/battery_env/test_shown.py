@@ -81,17 +81,20 @@ class TestLoadOn:
 
 class TestRest:
     @pytest.mark.parametrize("method", METHODS)
-    @pytest.mark.parametrize("offset_A", [-0.15, -0.1, -0.05, -0.01, 0.01, 0.05, 0.1, 0.15])
-    def test_what_flows_there_is_counted_as_an_offset(self, offset_A, method):
+    @pytest.mark.parametrize("rests_after", [True, False])
+    @pytest.mark.parametrize("offset_A", [-0.15, -0.05, -0.01, 0.01, 0.05, 0.15])
+    def test_what_flows_there_is_counted_as_an_offset(self, offset_A, rests_after, method):
         rest_s = 20.0 * np.arange(45)
         time_s = np.concatenate([REAL.time_s[0] - 900.0 + rest_s, REAL.time_s])
         voltage_V = np.append(np.full(45, REAL.voltage_V[0]), REAL.voltage_V)
-        record = Discharge(time_s, voltage_V, np.append(np.zeros(45), REAL.current_A) + offset_A)
+        current_A = np.append(np.zeros(45), REAL.current_A) + offset_A
+        kept = slice(None if rests_after else np.flatnonzero(current_A > 1.0)[-1] + 1)
+        record = Discharge(time_s[kept], voltage_V[kept], current_A[kept])
         plain, found = calibrate(REAL, method=method), calibrate(record, method=method)
         assert found.record.shown.offset_A == pytest.approx(offset_A, abs=0.01)
         assert abs(found.q_mobile_C - plain.q_mobile_C) < 2.0 * found.sd_q_mobile_C
         assert found.settled_q_mobile == (abs(offset_A) < 0.03)
-        assert found.settled or f"{found.record.shown.offset_A:.3g} A flow at rest" in found.reason
+        assert found.settled_q_mobile or f"{found.record.shown.offset_A:.3g} A flow at rest" in found.reason
 
     def test_a_small_load_before_a_larger_one_is_none(self):
         current_A = REAL.current_A.copy()

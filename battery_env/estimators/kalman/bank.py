@@ -156,6 +156,14 @@ def _resistive_error_sd(one: Row, settings: Settings) -> float:
 
 
 @inlined
+def _r_by_share(one: Row) -> float:
+    # What r_o makes up for a share of q_mobile that was drawn at first and not counted, beside what q_mobile makes up for.
+    told = one.told
+    both = told.rr * told.qq - told.qr * told.qr
+    return one.mean[Q] ** 2 * abs(told.by_r * told.qq - told.by_q * told.qr) / both if both > 0.0 else 0.0
+
+
+@inlined
 def _correct(
     one: Row,
     voltage: float,
@@ -203,6 +211,9 @@ def _correct(
     told.qr += charge * by_q * by_r
     told.rr += charge * by_r * by_r
     told.charge_C += charge
+    if charge > 0.0:
+        told.by_q += charge * by_q * by_q / told.charge_C
+        told.by_r += charge * by_q * by_r / told.charge_C
     (least_q_C, most_q_C), (least_r, most_r) = settings.bounds
     to_q = min(max(q + gain[Q] * innovation, least_q_C), most_q_C)
     to_r = min(max(r_o + gain[R] * innovation, least_r), most_r)
@@ -213,6 +224,8 @@ def _correct(
         told.q *= scale
         told.qq *= scale * scale
         told.qr *= scale
+        told.by_q *= scale * scale
+        told.by_r *= scale
     _move(one, to_q - q, to_r - r_o)
 
 
@@ -323,6 +336,7 @@ def take(
     bank.expected_V = filters[before].expected_V  # by the filter that did not know yet
     bank.common_sd[Q] = _common_error_sd(filters[best], settings)
     bank.common_sd[R] = _resistive_error_sd(filters[best], settings)
+    bank.r_by_share = _r_by_share(filters[best])
 
 
 @compiled
@@ -337,8 +351,9 @@ def _note(estimate: Row, condition: int, holds: bool) -> None:
 def conclude(cell: Row, settings: Settings, estimate: Row) -> None:
     """Say what a bank estimates after a sample that was examined, and what speaks against it; unchecked."""
     bank, seen, searched = cell.bank, cell.seen, settings.searched
-    # what the error of the model leaves open beside the prior, what shows nowhere in the voltage, and what nobody saw
-    unseen = unseen_C(seen)
+    # what the error of the model leaves open beside the prior, what shows nowhere in the voltage, and what nobody saw, as if it
+    # had been missing at the start
+    gain_sd, unseen_share = settings.gain_sd, hypot(settings.sd_soc, unseen_C(seen) / bank.mean[Q])
     estimate.q_mobile, estimate.r_o = bank.mean[Q], bank.mean[R]
     estimate.condition[:] = Condition.SETTLED + 0
     start, fault = start_condition(seen), fault_condition(seen)
@@ -356,9 +371,10 @@ def conclude(cell: Row, settings: Settings, estimate: Row) -> None:
             continue
         value, (low, high), (mean, prior_sd) = bank.mean[k], settings.bounds[k], settings.carried[k]
         common_sd = (bank.common_sd[k] ** -2.0 + 1.0 / settings.variance[k]) ** -0.5
-        sd = hypot(
-            hypot(max(bank.sd[k], common_sd), settings.scale_sd[k] * value), unseen if k == Q else hypot(seen.dropped_ohm, settings.cell_sd_r_o)
-        )
+        hidden_sd = bank.mean[Q] * unseen_share
+        if k == R:
+            hidden_sd = hypot(bank.r_by_share * unseen_share, hypot(seen.dropped_ohm, settings.cell_sd_r_o))
+        sd = hypot(hypot(max(bank.sd[k], common_sd), gain_sd * value), hidden_sd)
         estimate.sd[k], of_data = sd, sd
         _note(estimate, Condition.Q_AT_BOUND + k, not low + bank.sd[k] < value < high - bank.sd[k])
         if prior_sd > 0.0:
@@ -373,7 +389,7 @@ def conclude(cell: Row, settings: Settings, estimate: Row) -> None:
             _note(estimate, Condition.R_OF_CONSTANTS, k == R and settings.cell_sd_r_o > MOST_OF_SD * sd)
             doubt = doubt_condition(seen, sd)
             _note(estimate, doubt, k == Q and doubt > 0)
-            _note(estimate, Condition.Q_SCALE_UNKNOWN + k, settings.scale_sd[k] >= _SHARES[k])
+            _note(estimate, Condition.Q_SCALE_UNKNOWN + k, hypot(gain_sd, settings.sd_soc * (k == Q)) >= _SHARES[k])
             _note(estimate, Condition.Q_IMPRECISE + k, True)
         # in standard deviations that a settled one may have
         beyond = max(sd, of_data) / (_SHARES[k] * value)

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from battery_env.checks import ZERO_CELSIUS_K, check_gain_sd, check_not_negative, check_numbers
 from battery_env.compiled import compiled
-from battery_env.electrochemistry import STATE_SIZE, CellParameters, PackedConstants, check_cell, check_dt
+from battery_env.electrochemistry import NEW_CELL, STATE_SIZE, CellParameters, PackedConstants, check_cell, check_dt
 from battery_env.electrochemistry.ends import SURPLUS_SHARE
 from battery_env.electrochemistry.tangents import PolynomialDerivatives
 from battery_env.estimates import Estimate, Estimates, EstimateTrace
@@ -28,6 +28,7 @@ from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, R_O, check_paramet
 from battery_env.records import ChargeBefore, Record, Stream, are_plausible, check_drawn_charge, check_sample, shown_beside
 
 _PRIOR_SD_SHARE_Q = 0.25
+# Of a new 18650; a resistance goes with one over the size.
 _PRIOR_SD_R_OHM = 0.15
 _HOUR_S = 3600.0
 _NOISE_V = 0.005
@@ -101,7 +102,8 @@ class ExtendedKalmanFilter(OnlineEstimator):
     :param dt_s: longest time step of the model, s; that of simulated records if these are to be reproduced exactly
     :param prior_q_mobile_C: mean and standard deviation of ``q_mobile`` before the discharge, C; ``None``: ``cell``'s value,
         and a quarter of it
-    :param prior_r_o_ohm: likewise of ``r_o``, ohm; ``None``: ``cell``'s value, and 0.15 ohm
+    :param prior_r_o_ohm: likewise of ``r_o``, ohm; ``None``: ``cell``'s value, and 0.15 ohm for the charge of a
+        new 18650, less for a larger cell
     :param q_mobile_bounds_C: where the estimate stays, C
     :param r_o_bounds_ohm: likewise, ohm
     :param voltage_noise_V: standard deviation of the noise of one voltage sample, V; ``None``: ``mismatch_V``, and at least
@@ -148,7 +150,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
         check_not_negative(cell_sd_r_o_ohm=cell_sd_r_o_ohm)
         self.initial_soc = check_initial_soc(initial_soc)
         q, q_sd = self._prior("q_mobile", prior_q_mobile_C, _PRIOR_SD_SHARE_Q * self.cell.q_mobile)
-        r_o, r_o_sd = self._prior("r_o", prior_r_o_ohm, _PRIOR_SD_R_OHM)
+        r_o, r_o_sd = self._prior("r_o", prior_r_o_ohm, _PRIOR_SD_R_OHM * NEW_CELL.q_mobile / self.cell.q_mobile)
         self._means, self._sds = (q, r_o), (q_sd, r_o_sd, float(offset_sd_V))
         soc, sd_soc = self.initial_soc
         self._settings = Settings(
@@ -165,7 +167,8 @@ class ExtendedKalmanFilter(OnlineEstimator):
             offset_growth=float(mismatch_V) ** 2 / _HOUR_S,
             bounds=(_pair(q_mobile_bounds_C), _pair(r_o_bounds_ohm)),
             carried=(_pair(prior_q_mobile_C or (0.0, 0.0)), _pair(prior_r_o_ohm or (0.0, 0.0))),
-            scale_sd=(float(np.hypot(self.current_gain_sd, sd_soc / soc)), float(self.current_gain_sd)),
+            gain_sd=float(self.current_gain_sd),
+            sd_soc=float(sd_soc / soc),
             cell_q_mobile=float(self.cell.q_mobile),
             cell_sd_r_o=float(cell_sd_r_o_ohm),
         )

@@ -28,7 +28,8 @@ class Settings(NamedTuple):
     :param offset_growth: of the variance of the offset, V^2/s
     :param bounds: where each stays, C and ohm
     :param carried: mean and standard deviation of each from an earlier discharge; zeros where none was given
-    :param scale_sd: standard deviations of what scales each and does not show in the voltage, as shares
+    :param gain_sd: standard deviation of the gain of the current sensor, which scales both and does not show in the voltage
+    :param sd_soc: that of the charge at the start, as a share of it
     :param cell_q_mobile: of the model's cell, C
     :param cell_sd_r_o: what the constants of that cell leave open of ``r_o``, ohm
     """
@@ -43,7 +44,8 @@ class Settings(NamedTuple):
     offset_growth: float
     bounds: tuple[tuple[float, float], tuple[float, float]]
     carried: tuple[tuple[float, float], tuple[float, float]]
-    scale_sd: tuple[float, float]
+    gain_sd: float
+    sd_soc: float
     cell_q_mobile: float
     cell_sd_r_o: float
 
@@ -56,8 +58,9 @@ SAMPLE = table("voltage_V current_A dt_s temperature_K read_A")
 ESTIMATE = table([("q_mobile", "f8"), ("r_o", "f8"), ("sd", "f8", 2), ("condition", "i8", 2), ("r_o_comes_first", "b1")])
 
 # Sums over the charge drawn, of the derivative of the voltage by q_mobile (V) and of products with that by r_o (V^2/C, V A,
-# A^2 C), and that charge (C)
-_INFORMATION = table("q qq qr rr charge_C")
+# A^2 C), and that charge (C); and of products of both with the derivative by q_mobile over the charge, which is that by a charge
+# at the start
+_INFORMATION = table("q qq qr rr charge_C by_q by_r")
 
 #: One filter of a bank, with a model of its own at its estimate.
 FILTER = table(
@@ -78,10 +81,12 @@ FILTER = table(
 _BANK = table(
     [
         # after the last sample: moments of the mixture of all filters, the standard deviations of both that an error of the
-        # model leaves which is common to the discharge, the voltage that was expected, and whether the model cell has one
+        # model leaves which is common to the discharge, what a share of q_mobile that nobody counted makes of r_o, the voltage that was
+        # expected, and whether the model cell has one
         ("mean", "f8", 2),
         ("sd", "f8", 2),
         ("common_sd", "f8", 2),
+        ("r_by_share", "f8"),
         ("expected_V", "f8"),
         ("has_voltage", "b1"),
         # of innovations: the noise that they showed in the mean; the last ones, averaged; the sum of the products of each one
