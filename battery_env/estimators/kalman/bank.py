@@ -351,8 +351,7 @@ def _note(estimate: Row, condition: int, holds: bool) -> None:
 def conclude(cell: Row, settings: Settings, estimate: Row) -> None:
     """Say what a bank estimates after a sample that was examined, and what speaks against it; unchecked."""
     bank, seen, searched = cell.bank, cell.seen, settings.searched
-    # what the error of the model leaves open beside the prior, what shows nowhere in the voltage, and what nobody saw, as if it
-    # had been missing at the start
+    # what shows nowhere in the voltage, and what nobody saw, as if it had been missing at the start
     gain_sd, unseen_share = settings.gain_sd, hypot(settings.sd_soc, unseen_C(seen) / bank.mean[Q])
     estimate.q_mobile, estimate.r_o = bank.mean[Q], bank.mean[R]
     estimate.condition[:] = Condition.SETTLED + 0

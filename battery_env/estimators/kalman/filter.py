@@ -71,8 +71,8 @@ class ExtendedKalmanFilter(OnlineEstimator):
     ``q_mobile`` does not fall below what an error common to the whole discharge leaves open: before the knee what
     :class:`~battery_env.estimators.LeastSquares` state, and at the knee what an error of twice ``mismatch_V`` at every sample
     does, as a larger one would show. On whole discharges of the bundled cells that is about 1.2 % with ``mismatch_V=0.05``.
-    That of ``r_o`` does not fall below ``mismatch_V`` over the current: an error that goes with the current is no offset, which
-    a load that varies would tell.
+    That of ``r_o`` does not fall below ``mismatch_V`` over the current: an error that goes with the current is no offset,
+    which a load that varies would tell.
 
     The gain of the current sensor scales both parameters and does not show in the voltage: state it as ``current_gain_sd``.
 

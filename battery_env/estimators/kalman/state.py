@@ -58,8 +58,8 @@ SAMPLE = table("voltage_V current_A dt_s temperature_K read_A")
 ESTIMATE = table([("q_mobile", "f8"), ("r_o", "f8"), ("sd", "f8", 2), ("condition", "i8", 2), ("r_o_comes_first", "b1")])
 
 # Sums over the charge drawn, of the derivative of the voltage by q_mobile (V) and of products with that by r_o (V^2/C, V A,
-# A^2 C), and that charge (C); and of products of both with the derivative by q_mobile over the charge, which is that by a charge
-# at the start
+# A^2 C), and that charge (C); and of products of both with the derivative by q_mobile over the charge, as that by a charge at
+# the start is
 _INFORMATION = table("q qq qr rr charge_C by_q by_r")
 
 #: One filter of a bank, with a model of its own at its estimate.
@@ -80,9 +80,9 @@ FILTER = table(
 # What a bank remembers beside its filters.
 _BANK = table(
     [
-        # after the last sample: moments of the mixture of all filters, the standard deviations of both that an error of the
-        # model leaves which is common to the discharge, what a share of q_mobile that nobody counted makes of r_o, the voltage that was
-        # expected, and whether the model cell has one
+        # after the last sample: moments of the mixture of all filters, the standard deviations that an error of the model
+        # leaves which is common to the discharge, what a share of q_mobile that nobody counted makes of r_o, the voltage that
+        # was expected, and whether the model cell has one
         ("mean", "f8", 2),
         ("sd", "f8", 2),
         ("common_sd", "f8", 2),
