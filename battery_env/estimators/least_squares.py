@@ -21,6 +21,7 @@ from battery_env.estimators.diagnosis.conditions import (
     EXCESS_LIMIT_UNSTATED,
     MISMATCH_MARGIN,
     MOST_OF_SD,
+    NOISES_AT_START,
     PRIOR_LIMIT_SD,
     SETTLED_SHARES,
     SPARE_SAMPLES,
@@ -276,7 +277,9 @@ class LeastSquares(Estimator):
             loose = np.pad(np.diag(weight_V / sds), ((0, 0), (len(self.parameters), 0)))
             alone = replace(fit, jacobian=np.vstack([data, loose]))
         noise_V2 = noise_V**2 if noise_V else square(alone.residual_V) / (n - len(self.parameters))
-        variance_V2 = noise_V2 + mismatch_V**2
+        # the model is no better than the voltage at rest shows, beyond noise
+        start_V2 = float(alone.residual_V[0]) ** 2 - NOISES_AT_START**2 * noise_V2
+        variance_V2 = noise_V2 + max(mismatch_V**2, n * start_V2)
         if self.prior_q_mobile_C is not None:
             mean_C, sd_C = self.prior_q_mobile_C
             carried = Prior("q_mobile", mean_C, self._sd_ratio * sqrt(variance_V2) / sd_C)
@@ -360,7 +363,8 @@ class LeastSquares(Estimator):
         is_of_cell = "r_o" in unknown and self.cell_sd_r_o_ohm > most_ohm
         diagnosis.note(Condition.R_OF_CONSTANTS, is_of_cell, of_cell_mohm=of_cell_mohm)
         for name in unknown:
-            scaled = found.hidden_sd[name] >= SETTLED_SHARES[name] * fit.values[name]
+            sd_soc = self.initial_soc[1] / self.initial_soc[0] if name == "q_mobile" else 0.0
+            scaled = hypot(self.current_gain_sd, sd_soc) >= SETTLED_SHARES[name]
             diagnosis.note(Condition.Q_SCALE_UNKNOWN.of(name), scaled)
             diagnosis.note(Condition.Q_IMPRECISE.of(name))
         return diagnosis.verdict(alone.values, own)

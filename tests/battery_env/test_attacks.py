@@ -413,8 +413,9 @@ def test_a_stream_and_a_trace_say_what_the_whole_record_says(fault):
     assert found != "wrong" and traced == (found, estimate)
     # a stream has means between samples, which do not tell in which of them a load was switched: its doubt may differ a little
     if isinstance(live, Estimate):
-        assert live.sd_q_mobile == pytest.approx(estimate.sd_q_mobile, rel=0.01)
-        live = replace(live, sd_q_mobile=estimate.sd_q_mobile)
+        sds = {name: getattr(estimate, name) for name in ("sd_q_mobile", "sd_r_o")}
+        assert {name: getattr(live, name) for name in sds} == pytest.approx(sds, rel=0.01)
+        live = replace(live, **sds)
     assert (found_live, live) == (found, estimate)
 
 

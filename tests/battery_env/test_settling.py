@@ -352,6 +352,13 @@ class TestPrecision:
             assert abs(stated.q_mobile - 6000.0) < 3.0 * stated.sd_q_mobile
             assert stated.sd_r_o == pytest.approx(np.hypot(unstated.sd_r_o, 0.015 * stated.r_o))
 
+    @pytest.mark.parametrize("offset_V", [-0.035, -0.025, -0.02, 0.02, 0.025, 0.035, 0.055])
+    def test_what_the_voltage_at_rest_is_off_is_an_error_of_the_model(self, calibrator, offset_V):
+        """An offset of the sensor went into R_o, settled, which was 15 standard deviations off."""
+        seen = replace(WHOLE, voltage_V=WHOLE.voltage_V + offset_V)
+        estimate = calibrator(mismatch_V=0.003).estimate(seen)
+        assert not estimate.settled_r_o or abs(estimate.r_o - 0.15) < 3.0 * estimate.sd_r_o
+
     @pytest.mark.parametrize(("cell", "index"), [("B0005", 80), ("B0006", 160)])
     def test_the_filter_states_what_the_error_of_its_model_leaves_open(self, cell, index):
         record = load_nasa_discharges(cell)[index].loaded_part(2.7)

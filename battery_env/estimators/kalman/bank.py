@@ -33,6 +33,7 @@ from battery_env.electrochemistry.tangents import (
 from battery_env.estimators.diagnosis.conditions import (
     MISMATCH_MARGIN,
     MOST_OF_SD,
+    NOISES_AT_START,
     PLAUSIBLE_Q_SHARES,
     PRIOR_LIMIT_SD,
     SETTLED_SHARES,
@@ -132,11 +133,18 @@ def _predict(one: Row, current: float, duration: float, settings: Settings, cons
 
 
 @inlined
-def _common_error_sd(one: Row, settings: Settings) -> float:
+def _mismatch_V2(seen: Row, settings: Settings) -> float:
+    # The model is no better than the voltage at rest shows, beyond noise.
+    start_V2 = (seen.start.first_V - seen.start_V) ** 2 - NOISES_AT_START**2 * settings.noise_V2
+    return start_V2 if start_V2 > settings.mismatch_V2 else settings.mismatch_V2
+
+
+@inlined
+def _common_error_sd(one: Row, settings: Settings, mismatch_V2: float) -> float:
     # What an error of the model that is common to the discharge leaves open of q_mobile, without its prior, however many
     # samples there are: as much as least squares state. Theirs is the worst error of the stated mean square. Once the knee is
     # seen, almost all of that lies on the few samples there, but an error beyond the margin would show: it is no larger.
-    told, (q_prior, r_prior), mismatch_V2 = one.told, settings.variance, settings.mismatch_V2
+    told, (q_prior, r_prior) = one.told, settings.variance
     if mismatch_V2 == 0.0 or q_prior == 0.0 or told.charge_C == 0.0:
         return 0.0
     beside_r = told.qq
@@ -149,10 +157,10 @@ def _common_error_sd(one: Row, settings: Settings) -> float:
 
 
 @inlined
-def _resistive_error_sd(one: Row, settings: Settings) -> float:
+def _resistive_error_sd(one: Row, mismatch_V2: float) -> float:
     # And of r_o: an error that goes with the current is no offset, which a load that varies would tell from it.
     told = one.told
-    return sqrt(settings.mismatch_V2 * told.charge_C / told.rr) if told.rr > 0.0 else 0.0
+    return sqrt(mismatch_V2 * told.charge_C / told.rr) if told.rr > 0.0 else 0.0
 
 
 @inlined
@@ -334,8 +342,9 @@ def take(
     bank.offset_V2 += settings.offset_growth * duration
     _doubt(bank, filters[best].mean[OFFSET])
     bank.expected_V = filters[before].expected_V  # by the filter that did not know yet
-    bank.common_sd[Q] = _common_error_sd(filters[best], settings)
-    bank.common_sd[R] = _resistive_error_sd(filters[best], settings)
+    mismatch_V2 = _mismatch_V2(cell.seen, settings)
+    bank.common_sd[Q] = _common_error_sd(filters[best], settings, mismatch_V2)
+    bank.common_sd[R] = _resistive_error_sd(filters[best], mismatch_V2)
     bank.r_by_share = _r_by_share(filters[best])
 
 
