@@ -264,7 +264,8 @@ class LeastSquares(Estimator):
         noise_V = self.voltage_noise_V
         if noise_V is None and self.nuisance:  # their priors are weighed against the white part of the residuals
             noise_V = max(white_noise_V(search.residual(dict.fromkeys(self.nuisance, 0.0) | starts[0])[0]), _LEAST_NOISE_V)
-        mismatch_V = sqrt(n / self._independent_errors(record)) * self.mismatch_V
+        errors = self._independent_errors(record)
+        mismatch_V = sqrt(n / errors) * self.mismatch_V
         weight_V = hypot(noise_V or 0.0, mismatch_V)
         priors: list[Prior | JointPrior] = [Prior(name, 0.0, weight_V / sd) for name, sd in self.nuisance.items()]
         if self.path is not None:
@@ -277,9 +278,9 @@ class LeastSquares(Estimator):
             loose = np.pad(np.diag(weight_V / sds), ((0, 0), (len(self.parameters), 0)))
             alone = replace(fit, jacobian=np.vstack([data, loose]))
         noise_V2 = noise_V**2 if noise_V else square(alone.residual_V) / (n - len(self.parameters))
-        # the model is no better than the voltage at rest shows, beyond noise
+        # one error of the model is no smaller than the voltage at rest shows, beyond noise
         start_V2 = float(alone.residual_V[0]) ** 2 - NOISES_AT_START**2 * noise_V2
-        variance_V2 = noise_V2 + max(mismatch_V**2, n * start_V2)
+        variance_V2 = noise_V2 + mismatch_V**2 + n / errors**2 * max(start_V2 - self.mismatch_V**2, 0.0)
         if self.prior_q_mobile_C is not None:
             mean_C, sd_C = self.prior_q_mobile_C
             carried = Prior("q_mobile", mean_C, self._sd_ratio * sqrt(variance_V2) / sd_C)
