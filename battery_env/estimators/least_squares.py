@@ -20,8 +20,8 @@ from battery_env.estimates import Estimate, EstimateTrace
 from battery_env.estimators.diagnosis.conditions import (
     EXCESS_LIMIT_UNSTATED,
     MISMATCH_MARGIN,
+    MOST_NOISE_SD,
     MOST_OF_SD,
-    NOISES_AT_START,
     PRIOR_LIMIT_SD,
     SETTLED_SHARES,
     SPARE_SAMPLES,
@@ -279,7 +279,7 @@ class LeastSquares(Estimator):
             alone = replace(fit, jacobian=np.vstack([data, loose]))
         noise_V2 = noise_V**2 if noise_V else square(alone.residual_V) / (n - len(self.parameters))
         # one error of the model is no smaller than the voltage at rest shows, beyond noise
-        start_V2 = float(alone.residual_V[0]) ** 2 - NOISES_AT_START**2 * noise_V2
+        start_V2 = float(alone.residual_V[0]) ** 2 - MOST_NOISE_SD**2 * noise_V2
         variance_V2 = noise_V2 + mismatch_V**2 + n / errors**2 * max(start_V2 - self.mismatch_V**2, 0.0)
         if self.prior_q_mobile_C is not None:
             mean_C, sd_C = self.prior_q_mobile_C
@@ -351,7 +351,7 @@ class LeastSquares(Estimator):
             rmse = {"rmse_mV": 1e3 * rmse_V, "mismatch_mV": 1e3 * self.mismatch_V}
             diagnosis.note(Condition.OTHER_KIND, **rmse, **diagnosis.measured[min(starts)])
         diagnosis.note(Condition.IMPLAUSIBLE, "q_mobile" in free and not is_plausible(q_mobile, cell))
-        _note_end(diagnosis, record, found, max(2.0 * self.mismatch_V, 3.0 * noise_V, _NEGLIGIBLE_V))
+        _note_end(diagnosis, record, found, max(2.0 * self.mismatch_V, MOST_NOISE_SD * noise_V, _NEGLIGIBLE_V))
         if self.path is not None:
             distance = self.path.distance_sd(fit.values)
             diagnosis.note(Condition.BESIDE_PATH, distance > BESIDE_LIMIT_SD, distance=distance)

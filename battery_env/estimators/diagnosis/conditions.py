@@ -29,9 +29,8 @@ PLAUSIBLE_Q_SHARES = (0.2, 5.0)
 MISMATCH_MARGIN = 2.0
 #: Where the noise is told from the residuals, their variance may exceed its by this share over the root of their number.
 EXCESS_LIMIT_UNSTATED = 10.0
-#: What the voltage at rest is farther off than so many standard deviations of its noise is an error of the model, or of the
-#: sensor, and counts as one where it is more than was stated.
-NOISES_AT_START = 3.0
+#: A voltage farther off than so many standard deviations of its noise shows an error of the model, or of the sensor.
+MOST_NOISE_SD = 3.0
 #: What makes most of a variance is the reason for it.
 MOST_OF_SD = 0.5**0.5
 #: So many samples more than parameters tell how large the noise is.

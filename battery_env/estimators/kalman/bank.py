@@ -32,8 +32,8 @@ from battery_env.electrochemistry.tangents import (
 )
 from battery_env.estimators.diagnosis.conditions import (
     MISMATCH_MARGIN,
+    MOST_NOISE_SD,
     MOST_OF_SD,
-    NOISES_AT_START,
     PLAUSIBLE_Q_SHARES,
     PRIOR_LIMIT_SD,
     SETTLED_SHARES,
@@ -135,7 +135,7 @@ def _predict(one: Row, current: float, duration: float, settings: Settings, cons
 @inlined
 def _mismatch_V2(seen: Row, settings: Settings) -> float:
     # The model is no better than the voltage at rest shows, beyond noise.
-    start_V2 = (seen.start.first_V - seen.start_V) ** 2 - NOISES_AT_START**2 * settings.noise_V2
+    start_V2 = (seen.start.first_V - seen.start_V) ** 2 - MOST_NOISE_SD**2 * settings.noise_V2
     return start_V2 if start_V2 > settings.mismatch_V2 else settings.mismatch_V2
 
 
