@@ -117,7 +117,7 @@ class TestSamples:
             with pytest.raises(error, match=f"^cell 1: {message}"):
                 batch.update(*map(list, zip(good, sample, strict=True)))
         expected = untouched.update(*good)
-        assert [estimator.update(*good), *batch.update(*good)] == [expected] * 3
+        assert repr([estimator.update(*good), *batch.update(*good)]) == repr([expected] * 3)
 
     def test_kelvin_is_refused_and_a_policy_takes_no_temperature(self):
         with pytest.raises(ValueError, match=r"temperature_C must lie within .* not in kelvin"):
@@ -210,7 +210,7 @@ class TestFiles:
         file = one.save(tmp_path / "state")
         assert file.name == "state.npz" and one.save(file) == file  # an older state is replaced
         other.load(file)
-        assert follow(one, record.part(500, 800)) == follow(other, record.part(500, 800))
+        assert repr(follow(one, record.part(500, 800))) == repr(follow(other, record.part(500, 800)))
         assert one.soc == other.soc and list(tmp_path.iterdir()) == [file]
 
     def test_what_does_not_fit_is_refused(self, make, tmp_path):
@@ -227,10 +227,12 @@ class TestBatch:
         batch, alone = make().batch(2), [make(), make()]
         for n in range(300):
             found = batch.update([record.voltage_V[n] for record in records], [record.current_A[n] for record in records], 1.0)
-        assert found == [follow(each, record.part(0, 300)) for each, record in zip(alone, records, strict=True)]
+        # as text, in which what is not stated (NaN) is equal
+        expected = [follow(each, record.part(0, 300)) for each, record in zip(alone, records, strict=True)]
+        assert repr(list(found)) == repr(expected)
         other = make().batch(2)
         other.load(batch.save(tmp_path / "cells"))
-        assert other.update(3.9, 1.0, 1.0) == batch.update(3.9, 1.0, 1.0)
+        assert repr(list(other.update(3.9, 1.0, 1.0))) == repr(list(batch.update(3.9, 1.0, 1.0)))
         batch.reset([1])
         assert batch.estimators[1].soc == 1.0 and batch.estimators[0].soc < 1.0
         with pytest.raises(ValueError, match="cells must be at least 1"):
