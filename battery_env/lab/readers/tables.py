@@ -130,7 +130,16 @@ def _read_text(source: Path | bytes, file_format: FileFormat) -> tuple[pd.DataFr
         # words among numbers make text of all
         return found if layout.decimal == "." else found.replace(_ITS_COMMA, r"\1.", regex=True)
 
-    table = read()
+    try:
+        table = read()
+    except ValueError as error:
+        if "EOF inside string" not in str(error):
+            raise
+        kept, last = _without_last_line(source, layout.encoding)
+        if last.count('"') % 2 == 0:
+            raise
+        warnings.warn("the last line is cut within quotes, and left out", stacklevel=2)
+        return _read_text(kept, file_format)
     measured = [
         columns[quantity].position for quantity in ("voltage", "current", "power", "charge_step") if quantity in columns
     ]
@@ -144,6 +153,14 @@ def _read_text(source: Path | bytes, file_format: FileFormat) -> tuple[pd.DataFr
         table = read(len(table) - foot)
     table = _lowest_layer(table, layout.layers)
     return pd.DataFrame({quantity: table[column.position] for quantity, column in columns.items()}), columns
+
+
+def _without_last_line(source: Path | bytes, encoding: str) -> tuple[bytes, str]:
+    if isinstance(source, Path):
+        with _open(source) as stream:
+            source = stream.read()
+    kept, _, last = source.decode(encoding, errors="ignore").rstrip().rpartition("\n")
+    return kept.encode(encoding), last
 
 
 def _lowest_layer(table: pd.DataFrame, layers: int) -> pd.DataFrame:
