@@ -671,6 +671,37 @@ def test_a_block_of_rows_that_comes_twice_under_a_clock_of_each_step_is_dropped(
     assert found.charge_C == expected.charge_C == pytest.approx(5 * 300 * 2.0, rel=0.04)
 
 
+@pytest.mark.parametrize("separator", [",", ";", "\t", " "])
+def test_titles_are_no_names(separator, tmp_path):
+    rows = TABLE.to_csv(index=False, header=False, sep=separator)
+    titles = "Old cell at end of charge\nstarting voltage: 4.2 V\nload of 350 mA at 5V\n\n"
+    (tmp_path / "cell.txt").write_text(titles + rows)
+    with pytest.raises(ValueError, match="there is no line with the names of the columns above the numbers"):
+        read_discharges(tmp_path / "cell.txt")
+    (tmp_path / "cell.txt").write_text(titles + separator.join("abc") + "\n" + rows)
+    with pytest.raises(ValueError, match="no column for the time, the voltage, the current among a, b, c"):
+        read_discharges(tmp_path / "cell.txt")
+    same(read(tmp_path / "cell.txt", columns={"time": "a", "voltage": "b", "current": "c"}))
+
+
+def test_a_voltage_that_jumps_against_what_passes_leaves_the_sign_open():
+    """The drop over a wire that a load shares with a sensor of a pack can exceed that of the cell."""
+    table = TABLE.assign(voltage=TABLE["voltage"] - 0.3 * TABLE["current"])
+    with pytest.raises(ValueError, match=r"cannot be told.*contradict each other\. State it: --discharge-is-negative"):
+        read_discharges(table)
+    near(read(table, discharge_is_negative=True))
+
+
+def test_charges_alone_without_a_sign_are_no_discharge():
+    """Pulses of charge and rests in turn, in which a little flows by an offset of the sensor."""
+    time_s = np.arange(0.0, 7200.0, 10.0)
+    charges = time_s % 1200.0 < 600.0
+    voltage_V = 3.6 + 1e-4 * np.cumsum(charges) * 10.0 + np.where(charges, 0.1, 0.1 * np.exp(-(time_s % 600.0) / 100.0))
+    table = pd.DataFrame({"time": time_s, "voltage": voltage_V, "current": np.where(charges, 1.0, 0.01)})
+    with pytest.raises(ValueError, match="there is no discharge: no charge is drawn"):
+        read_discharges(table)
+
+
 def test_a_last_line_that_is_cut_within_quotes_is_left_out(tmp_path):
     content = TABLE.astype(str).to_csv(index=False, quoting=csv.QUOTE_ALL)
     for encoding, end in (("utf-8", content.rindex(',"') + 4), ("utf-16", content.rindex('\n"') + 3)):

@@ -548,16 +548,15 @@ def with_signed_current(rows: pd.DataFrame, columns: Mapping[str, Column], is_ne
     if (current_A >= -rest_A).all() or (current_A <= rest_A).all():
         _refuse_unsigned(rows, columns)
     if is_negative is None:
-        effect = _jumps(rows)
-        if not abs(effect) > _CLEAR:
-            effect = _fall(rows)
-        if not abs(effect) > _CLEAR:
+        jumps, fall = _jumps(rows), _fall(rows)
+        clear = [effect for effect in (jumps, fall) if abs(effect) > _CLEAR]
+        if not clear or min(clear) < 0.0 < max(clear):
             raise ValueError(
-                "whether the current of a discharge is positive or negative cannot be told, as the voltage neither falls "
-                f"nor rises clearly with the current and the charge (correlation {effect:.2f}). State it: "
-                "--discharge-is-negative or --discharge-is-positive (Python: discharge_is_negative)"
+                "whether the current of a discharge is positive or negative cannot be told, as the voltage neither falls nor "
+                f"rises clearly with the current ({jumps:.2f}) and the charge ({fall:.2f}), or they contradict each other. "
+                "State it: --discharge-is-negative or --discharge-is-positive (Python: discharge_is_negative)"
             )
-        is_negative = effect > 0.0
+        is_negative = clear[0] > 0.0
     return rows.assign(current=-current_A) if is_negative else rows
 
 
@@ -579,13 +578,14 @@ def _refuse_unsigned(rows: pd.DataFrame, columns: Mapping[str, Column]) -> None:
     # after a larger load it rises, too, but not above where it was before that
     before_V = voltage_V[np.maximum(np.append(0, begin[:-1]) - 1, 0)]
     relaxes = (jump_A[begin] < 0.0) & (voltage_V[end] < before_V)
-    rise_V[(~is_long | relaxes) & (rise_V > 0.0)] = 0.0
+    rests = np.maximum.reduceat(size_A, begin) <= SWITCH_SHARE * size_A.max()
+    rise_V[rests | ((~is_long | relaxes) & (rise_V > 0.0))] = 0.0
     if rise_V.max() > long_V and np.minimum(rise_V, 0.0).sum() < -long_V:
         known = [repr(column.name) for key, column in columns.items() if key.startswith("state")]
         raise ValueError(
             f"the current has no sign: from row {rows.index[begin[np.argmax(rise_V)]] + 1} on the voltage rises for long, and "
             "elsewhere it falls under a current of the same sign. Name the column that tells charge from discharge: "
-            f"--columns state=NAME (Python: columns){'. The words of ' + ' and '.join(known) + ' do not' if known else ''}"
+            f"--columns state=NAME (Python: columns), or leave out the charges{'. The words of ' + ' and '.join(known) + ' do not' if known else ''}"
         )
 
 
@@ -606,8 +606,11 @@ def _jumps(rows: pd.DataFrame) -> float:
 
 
 def _fall(rows: pd.DataFrame) -> float:
-    """How the voltage goes with the charge that has passed in each cycle, -1 to 1."""
+    """How the voltage goes with the charge that has passed in each cycle, whatever the current is, -1 to 1."""
     step_s = np.diff(rows["time"], prepend=rows["time"].iloc[0])
-    passed = pd.DataFrame({"charge": np.cumsum(rows["current"] * np.maximum(step_s, 0.0)), "voltage": rows["voltage"]})
+    passed = rows[["voltage", "current"]].assign(charge=np.cumsum(rows["current"] * np.maximum(step_s, 0.0)))
     within = passed - passed.groupby(np.cumsum((step_s < 0.0) | _changes(rows, "cycle"))).transform("mean")
-    return float(within["charge"].corr(within["voltage"]))
+    by = within.corr().fillna(0.0)
+    (of_voltage, of_both), of_charge = by.loc["charge", ["voltage", "current"]], by.at["voltage", "current"]
+    rest = (1.0 - of_charge**2) * (1.0 - of_both**2)
+    return float((of_voltage - of_charge * of_both) / rest**0.5) if rest > 0.0 else 0.0

@@ -266,23 +266,34 @@ def _header(lines: Sequence[str], delimiters: Sequence[str], chosen: Mapping[str
     for number, line in enumerate(lines):
         next_line = next(filter(str.strip, itertools.islice(lines, number + 1, None)), "")
         for delimiter in delimiters:
-            # blanks within names
-            if delimiter == _BLANKS and len(_fields(next_line, delimiter)) < len(_fields(line, delimiter)):
+            names = _fields(line, delimiter)
+            # blanks within names, or in a sentence
+            if delimiter == _BLANKS and (len(_fields(next_line, delimiter)) < len(names) or _count_numbers(names)):
                 continue
-            if (count := count_required(_fields(line, delimiter), chosen)) > found:
+            if (count := count_required(names, chosen)) > found:
                 best, found = (number, delimiter), count
         if found == len(REQUIRED):
             break
     if found > 0:
         return best
-    number = next((n for n, line in enumerate(lines) if line.strip()), -1)
-    if number < 0:
+    filled = [number for number, line in enumerate(lines) if line.strip()]
+    if not filled:
         raise ValueError("the file is empty")
-    if any(map(_NUMBER.match, lines[number].split(","))):
-        raise ValueError("there is no line with the names of the columns above the numbers. Add one")
-    # names may hold blanks and units: the numbers below have to come apart as often
-    names, first_row = lines[number], lines[min(number + 1, len(lines) - 1)]
-    return number, max(delimiters, key=lambda each: min(len(_fields(names, each)), len(_fields(first_row, each))))
+    # names come apart as often as the first numbers below them
+    for above, number in itertools.pairwise([-1, *filled]):
+        apart = [each for each in delimiters if _count_numbers(_fields(lines[number], each)) > 1]
+        alike = [
+            each for each in apart if above >= 0 and len(_fields(lines[above], each)) == len(_fields(lines[number], each))
+        ]
+        if alike:
+            return above, alike[0]
+        if apart:
+            raise ValueError("there is no line with the names of the columns above the numbers. Add one")
+    return filled[0], delimiters[0]
+
+
+def _count_numbers(fields: Sequence[str]) -> int:
+    return sum(bool(_NUMBER.match(field) or _DECIMAL_COMMA.match(field)) for field in fields)
 
 
 def _decoded(head: bytes) -> tuple[str, str]:
@@ -313,7 +324,9 @@ def _fields(line: str, delimiter: str) -> list[str]:
 def _sheet(path: Path, file_format: FileFormat) -> bytes:
     """The sheet of a workbook that holds the record, and those that continue it, as text."""
     try:
-        sheets = pd.read_excel(path, sheet_name=None, header=None, dtype=object)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of openpyxl, about what is beside the table
+            sheets = pd.read_excel(path, sheet_name=None, header=None, dtype=object)
     except ImportError as error:
         raise ImportError(f"Workbooks need {error.name or 'openpyxl'}: pip install 'battery_env[excel]'") from error
     except Exception as error:  # whatever the damage leads to
