@@ -75,10 +75,9 @@ def _mended(table: pd.DataFrame, columns: Mapping[str, Column], file_format: Fil
         without_missing,
         with_newest_last,
         over_midnight,
-        without_block_again,
+        without_repeated,
         on_one_clock,
         with_clock_going_on,
-        without_repeated,
         with_steps_apart,
         without_rows_out_of_time,
     ):
@@ -441,28 +440,16 @@ def with_clock_going_on(rows: pd.DataFrame) -> pd.DataFrame:
     return rows.assign(time=time_s + np.cumsum(np.where(back, usual_s - step_s, 0.0)))
 
 
-def without_block_again(rows: pd.DataFrame) -> pd.DataFrame:
-    """Without a block of rows that comes twice on end: a clock of each step does not tell its rows apart."""
-    if (np.diff(rows["time"]) > 0.0).all():
-        return rows
-    place = pd.Series(np.arange(len(rows)), rows.index)
-    ago = place - place.groupby([rows[name] for name in _measurements(rows)], sort=False).shift()
-    again = ago.groupby((ago != ago.shift()).cumsum()).transform("size") >= ago
-    return _without_repeated(rows, again.to_numpy())
-
-
 def without_repeated(rows: pd.DataFrame) -> pd.DataFrame:
-    """Without rows that were written before; they are compared only where the clock does not go on, as that takes time."""
+    """
+    Without blocks of rows that come again directly after themselves; alone, rows may be alike under a clock of each step. They
+    are compared only where the clock does not go on, as that takes time.
+    """
     if (np.diff(rows["time"]) > 0.0).all():
         return rows
-    return _without_repeated(rows, rows.duplicated(_measurements(rows)).to_numpy())
-
-
-def _measurements(rows: pd.DataFrame) -> list[str]:
-    return [name for name in ("cycle", *REQUIRED, "step", "direction") if name in rows]
-
-
-def _without_repeated(rows: pd.DataFrame, repeated: BoolArray) -> pd.DataFrame:
+    names, place = ("cycle", *REQUIRED, "step", "direction"), pd.Series(np.arange(len(rows)), rows.index)
+    ago = place - place.groupby([rows[name] for name in names if name in rows], sort=False).shift()
+    repeated = ago.groupby((ago != ago.shift()).cumsum()).transform("size") >= ago
     if repeated.any():
         _say(f"{repeated.sum()} of {len(repeated)} rows are repeated, and dropped")
     return rows[~repeated]
@@ -581,11 +568,11 @@ def _refuse_unsigned(rows: pd.DataFrame, columns: Mapping[str, Column]) -> None:
     rests = np.maximum.reduceat(size_A, begin) <= SWITCH_SHARE * size_A.max()
     rise_V[rests | ((~is_long | relaxes) & (rise_V > 0.0))] = 0.0
     if rise_V.max() > long_V and np.minimum(rise_V, 0.0).sum() < -long_V:
-        known = [repr(column.name) for key, column in columns.items() if key.startswith("state")]
+        known = " and ".join(repr(column.name) for key, column in columns.items() if key.startswith("state"))
         raise ValueError(
             f"the current has no sign: from row {rows.index[begin[np.argmax(rise_V)]] + 1} on the voltage rises for long, and "
-            "elsewhere it falls under a current of the same sign. Name the column that tells charge from discharge: "
-            f"--columns state=NAME (Python: columns), or leave out the charges{'. The words of ' + ' and '.join(known) + ' do not' if known else ''}"
+            "elsewhere it falls under a current of the same sign. Leave out the charges, or name the column that tells them "
+            f"from discharges: --columns state=NAME (Python: columns){f'. The words of {known} do not' if known else ''}"
         )
 
 
