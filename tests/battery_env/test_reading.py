@@ -494,11 +494,11 @@ def test_the_sheet_of_a_workbook_that_holds_the_record_is_read_with_those_that_c
 @pytest.mark.parametrize("suffix", [".xlsx", ".xls"])
 def test_a_workbook_that_is_damaged_or_needs_an_extra_says_so(suffix, tmp_path, monkeypatch):
     (tmp_path / f"cell{suffix}").write_bytes({".xlsx": b"PK\x03\x04", ".xls": b"\xd0\xcf\x11\xe0"}[suffix] + bytes(100))
-    with pytest.raises((ValueError, ImportError), match=r"damaged, or no workbook|battery_env\[excel\]"):
+    with pytest.raises((ValueError, ImportError), match=r"damaged, or no Excel file|Excel files need .*battery_env\[excel\]"):
         read_discharges(tmp_path / f"cell{suffix}")
     monkeypatch.setitem(sys.modules, "openpyxl", None)
     monkeypatch.setitem(sys.modules, "xlrd", None)
-    with pytest.raises((ValueError, ImportError), match=r"damaged, or no workbook|battery_env\[excel\]"):
+    with pytest.raises((ValueError, ImportError), match=r"damaged, or no Excel file|Excel files need .*battery_env\[excel\]"):
         read_discharges(tmp_path / f"cell{suffix}")
 
 

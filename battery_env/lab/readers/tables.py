@@ -12,7 +12,8 @@ import re
 import warnings
 import zipfile
 from codecs import getincrementaldecoder
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any, NamedTuple, cast
 
@@ -98,9 +99,10 @@ def _first_rows(table: pd.DataFrame) -> list[list[str]]:
 def _read_text(source: Path | bytes, file_format: FileFormat) -> tuple[pd.DataFrame, dict[str, Column]]:
     head = source[:_HEAD_BYTES] if isinstance(source, bytes) else _head(source)
     if isinstance(source, Path) and (b"\n" not in head or _QUOTED_LINES.search(head)):
-        with _open(source) as stream:  # lines may end as on old computers
-            source = _QUOTED_LINES.sub(rb"\1", stream.read() if b"\n" in head else stream.read().replace(b"\r", b"\n"))
-            head = source[:_HEAD_BYTES]
+        # lines may end as on old computers
+        content = _content(source) if b"\n" in head else _content(source).replace(b"\r", b"\n")
+        source = _QUOTED_LINES.sub(rb"\1", content)
+        head = source[:_HEAD_BYTES]
     layout = _layout(head, file_format.columns)
     columns, header_lines = find_columns(layout.names, file_format, layout.rows), layout.header_line + 1
     header_lines += bool(layout.rows) and are_units(layout.rows[0])
@@ -135,11 +137,11 @@ def _read_text(source: Path | bytes, file_format: FileFormat) -> tuple[pd.DataFr
     except ValueError as error:
         if "EOF inside string" not in str(error):
             raise
-        kept, last = _without_last_line(source, layout.encoding)
+        kept, _, last = _content(source).decode(layout.encoding, errors="ignore").rstrip().rpartition("\n")
         if last.count('"') % 2 == 0:
             raise
         warnings.warn("the last line is cut within quotes, and left out", stacklevel=2)
-        return _read_text(kept, file_format)
+        return _read_text(kept.encode(layout.encoding), file_format)
     measured = [
         columns[quantity].position for quantity in ("voltage", "current", "power", "charge_step") if quantity in columns
     ]
@@ -155,12 +157,11 @@ def _read_text(source: Path | bytes, file_format: FileFormat) -> tuple[pd.DataFr
     return pd.DataFrame({quantity: table[column.position] for quantity, column in columns.items()}), columns
 
 
-def _without_last_line(source: Path | bytes, encoding: str) -> tuple[bytes, str]:
-    if isinstance(source, Path):
-        with _open(source) as stream:
-            source = stream.read()
-    kept, _, last = source.decode(encoding, errors="ignore").rstrip().rpartition("\n")
-    return kept.encode(encoding), last
+def _content(source: Path | bytes) -> bytes:
+    if isinstance(source, bytes):
+        return source
+    with _open(source) as stream:
+        return stream.read()
 
 
 def _lowest_layer(table: pd.DataFrame, layers: int) -> pd.DataFrame:
@@ -321,16 +322,27 @@ def _fields(line: str, delimiter: str) -> list[str]:
         return []
 
 
-def _sheet(path: Path, file_format: FileFormat) -> bytes:
-    """The sheet of a workbook that holds the record, and those that continue it, as text."""
+@contextmanager
+def _reading(kind: str, extra: str) -> Iterator[None]:
+    """Of what others read: their own warnings are not passed on, and what is missing, or not as it should be, is named."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of openpyxl, about what is beside the table
-            sheets = pd.read_excel(path, sheet_name=None, header=None, dtype=object)
+            warnings.simplefilter("ignore")
+            yield
+    except FileNotFoundError:
+        raise
     except ImportError as error:
-        raise ImportError(f"Workbooks need {error.name or 'openpyxl'}: pip install 'battery_env[excel]'") from error
+        raise ImportError(f"{kind} files need an extra: pip install 'battery_env[{extra}]' ({error})") from error
+    except NotImplementedError as error:
+        raise ValueError(f"what reads {kind} files does not know all of this one: {error}") from error
     except Exception as error:  # whatever the damage leads to
-        raise ValueError(f"the file is damaged, or no workbook: {str(error).strip()}") from error
+        raise ValueError(f"the file is damaged, or no {kind} file: {str(error).strip()}") from error
+
+
+def _sheet(path: Path, file_format: FileFormat) -> bytes:
+    """The sheet of a workbook that holds the record, and those that continue it, as text."""
+    with _reading("Excel", "excel"):
+        sheets = pd.read_excel(path, sheet_name=None, header=None, dtype=object)
     found = []
     for sheet in sheets.values():
         head = [[str(name) for name in row] for row in sheet.head(_FIRST_ROWS).to_numpy()]
@@ -344,16 +356,10 @@ def _sheet(path: Path, file_format: FileFormat) -> bytes:
 
 
 def _read_parquet(path: Path, file_format: FileFormat) -> tuple[pd.DataFrame, dict[str, Column]]:
-    try:
+    with _reading("Parquet", "parquet"):
         from pyarrow import parquet
-    except ImportError as error:
-        raise ImportError("Parquet files need pyarrow: pip install 'battery_env[parquet]'") from error
-    try:
+
         file = parquet.ParquetFile(path)
-    except FileNotFoundError:
-        raise
-    except Exception as error:
-        raise ValueError(f"the file is damaged, or no Parquet: {str(error).strip()}") from error
     with file:
         first = [batch.to_pandas() for batch in itertools.islice(file.iter_batches(_FIRST_ROWS), 1)]
         columns = find_columns(file.schema_arrow.names, file_format, _first_rows(first[0]) if first else ())
@@ -377,33 +383,17 @@ def _read_batches(file: Any, packed_bytes: int, names: list[str]) -> pd.DataFram
 
 
 def _read_neware(path: Path) -> pd.DataFrame:
-    try:
+    with path.open("rb"), _reading("Neware", "cyclers"):
         import NewareNDA
-    except ImportError as error:
-        missing = "" if error.name in (None, "NewareNDA") else f", which needs {error.name}"
-        raise ImportError(f"Neware's files need NewareNDA{missing}: pip install 'battery_env[cyclers]'") from error
-    with path.open("rb"):  # a missing file is that, not a damaged one
-        pass
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of pandas, about how it is called there
-            return NewareNDA.read(str(path), log_level="ERROR")
-    except Exception as error:
-        raise ValueError(f"the file is damaged, or none of Neware's: {str(error).strip()}") from error
+
+        return NewareNDA.read(str(path), log_level="ERROR")
 
 
 def _read_biologic(path: Path) -> pd.DataFrame:
-    try:
+    with path.open("rb") as stream, _reading("BioLogic", "cyclers"):
         from galvani.BioLogic import MPRfile
-    except ImportError as error:
-        raise ImportError("BioLogic's files need galvani: pip install 'battery_env[cyclers]'") from error
-    with path.open("rb") as stream:
-        try:
-            return pd.DataFrame(MPRfile(stream).data)
-        except NotImplementedError as error:
-            raise ValueError(f"galvani, which reads BioLogic's files, does not know all of this one: {error}") from error
-        except Exception as error:
-            raise ValueError(f"the file is damaged, or none of BioLogic's: {str(error).strip()}") from error
+
+        return pd.DataFrame(MPRfile(stream).data)
 
 
 def is_readable(path: Path, more: Sequence[str] = ()) -> bool:
