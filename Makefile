@@ -9,7 +9,7 @@ BIN := $(VENV)/bin
 SOURCES := sb3_lac battery_env benchmarks tests examples docs
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test format lint type-check docs commit-checks clean
+.PHONY: help install demo test test-oldest format lint type-check docs commit-checks clean
 
 help:  ## list the commands
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -17,6 +17,7 @@ help:  ## list the commands
 # pip has much to say: it is shown only if the command fails
 logged = ($(1)) > $(VENV)/install.log 2>&1 || { cat $(VENV)/install.log >&2; exit 1; }
 comma := ,
+EXTRAS := zoo$(comma)peers$(comma)onnx$(comma)dev$(comma)docs
 
 # one stamp per state of the packaging files: made again when they change
 $(VENV)/.installed: setup.cfg pyproject.toml battery_env/setup.cfg battery_env/pyproject.toml
@@ -28,7 +29,7 @@ $(VENV)/.installed: setup.cfg pyproject.toml battery_env/setup.cfg battery_env/p
 	@echo "installing $(TORCH)"
 	@$(call logged,$(BIN)/python -m pip install $(addprefix --index-url ,$(TORCH_INDEX)) "$(TORCH)")
 	@echo "installing battery_env and sb3_lac, with all extras"
-	@$(call logged,$(BIN)/python -m pip install --editable ./battery_env --editable ".[zoo$(comma)peers$(comma)onnx$(comma)dev$(comma)docs]")
+	@$(call logged,$(BIN)/python -m pip install --editable ./battery_env --editable ".[$(EXTRAS)]")
 	@touch $@
 
 install: $(VENV)/.installed  ## make .venv with everything in it
@@ -38,6 +39,14 @@ demo: install  ## LAC, SAC and TD3 learn R_o, then the life of a real cell: some
 
 test: install  ## all tests
 	$(BIN)/python -m pytest -n 2
+
+test-oldest:  ## those of both packages, with the oldest versions that setup.cfg names
+	$(PYTHON) -m venv --clear $(VENV)/oldest
+	$(VENV)/oldest/bin/python -m pip install --quiet uv
+	$(VENV)/oldest/bin/python -m pip install --quiet $(addprefix --index-url ,$(TORCH_INDEX)) "$(TORCH)"
+	VIRTUAL_ENV=$(VENV)/oldest $(VENV)/oldest/bin/uv pip install --quiet --resolution lowest-direct \
+		"$(TORCH)" ./battery_env ".[$(EXTRAS)]" "pyparsing<3.3"  # which old versions of matplotlib do not know
+	$(VENV)/oldest/bin/python -m pytest -n 2 tests/battery_env tests/sb3_lac
 
 format: install  ## black, and what ruff can mend
 	$(BIN)/python -m ruff check --fix $(SOURCES)
@@ -57,4 +66,4 @@ docs: install  ## the documentation site, in docs/_build/html
 commit-checks: lint type-check docs test  ## everything that must pass before a commit
 
 clean:  ## remove what the build left (not .venv, not results)
-	rm -rf build docs/_build docs/_api docs/_notebooks *.egg-info battery_env/build battery_env/*.egg-info .pytest_cache .mypy_cache .ruff_cache
+	rm -rf build docs/_build docs/_api docs/_notebooks *.egg-info battery_env/*.egg-info .pytest_cache .mypy_cache .ruff_cache

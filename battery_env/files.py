@@ -161,7 +161,7 @@ def save_npz(
     target = npz_path(path)
     metadata = json.dumps({**settings, "kind": kind, "format": version})
     with replacing(target, new=True) as part:
-        np.savez_compressed(part, allow_pickle=False, metadata=np.array(metadata), **arrays)
+        np.savez_compressed(part, metadata=np.array(metadata), **arrays)  # type: ignore[arg-type]  # none is named allow_pickle
     return target
 
 

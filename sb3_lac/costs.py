@@ -152,7 +152,7 @@ class CostAlgorithm(OffPolicyAlgorithm):
             check_rate("lambda_learning_rate", self.lambda_learning_rate)
         if not 0 <= (self.reward_bound or 0.0) < math.inf:
             raise ValueError(f"reward_bound={self.reward_bound} must be finite and at least 0, what a termination pays.")
-        if self.reward_bound and self.gamma == 1:
+        if self.reward_bound and self.n_costs == math.inf:
             raise ValueError(
                 f"gamma={self.gamma} must be smaller than 1 with rewards up to {self.reward_bound}: each step below that has "
                 "a cost, and the sum over all time is infinite. Use for instance gamma=0.99."
@@ -180,6 +180,11 @@ class CostAlgorithm(OffPolicyAlgorithm):
         return self.log_lambda >= upper
 
     @property
+    def n_costs(self) -> float:
+        """What ``L`` is where each step costs 1, infinite without a discount."""
+        return 1 / (1 - self.gamma) if self.gamma < 1 else math.inf
+
+    @property
     def largest_reward(self) -> th.Tensor:
         """The largest reward stated or seen, before any normalization, shape (1,). It is part of the policy, as ``L`` is."""
         return self.policy.reward_bound
@@ -193,9 +198,9 @@ class CostAlgorithm(OffPolicyAlgorithm):
         return (bound / reward_scale(vec_normalize)).clamp(max=vec_normalize.clip_reward)
 
     def update_offset(self, vec_normalize: VecNormalize | None) -> None:
-        """Give the critics the value of ``L`` where nothing is ever paid, which is infinite without a discount."""
+        """Give the critics the value of ``L`` where nothing is ever paid."""
         bound = self.cost_bound(vec_normalize)
-        offset = th.where(bound > 0, bound / (1 - self.gamma), 0.0)
+        offset = th.where(bound > 0, bound * self.n_costs, 0.0)
         self.policy.critic.offset.copy_(offset)
         self.policy.critic_target.offset.copy_(offset)
 
@@ -227,7 +232,7 @@ class CostAlgorithm(OffPolicyAlgorithm):
             self._terminations.see(paid, dones, infos)
         # The largest reward of a step, which n-step returns do not tell
         if paid.max() > 0 and paid.max() > self.largest_reward:
-            if self.gamma == 1 and self.largest_reward == 0:
+            if self.n_costs == math.inf and self.largest_reward == 0:
                 warnings.warn(
                     f"With gamma=1 and rewards up to {paid.max():g}, L is infinite: it is learned up to that constant, and "
                     "shown as infinite. Use for instance gamma=0.99.",
@@ -279,7 +284,7 @@ class CostAlgorithm(OffPolicyAlgorithm):
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         if self._n_updates == 0:
-            self._terminations.warn_if_free(self.gamma, float(self.largest_reward))
+            self._terminations.warn_if_free(self.n_costs, float(self.largest_reward))
         # Switch to train mode (this affects batch norm / dropout)
         self.policy.set_training_mode(True)
         # Update learning rates according to their schedules
@@ -401,21 +406,21 @@ class Terminations:
             number, total, cheapest, dearest = self.seen[ends]
             self.seen[ends] = number + 1, total + cost, min(cheapest, cost), max(dearest, cost)
 
-    def warn_if_free(self, gamma: float, largest_reward: float) -> None:
+    def warn_if_free(self, n_costs: float, largest_reward: float) -> None:
         """Warn if the last step before a termination costs no more than another step does."""
         (number, total, cheapest, dearest), (n_ends, total_of_ends, _, _) = self.seen[False], self.seen[True]
         # Where living pays, an end costs the bound for ever
         if not number or not n_ends or largest_reward > 0:
             return
         last = total_of_ends / n_ends
-        price = total / number / (1 - gamma) if gamma < 1 else math.inf
+        price = total / number * n_costs
         # An end that costs less than any other step is a goal
         if cheapest <= last <= dearest and price > 0:
             warnings.warn(
                 f"The last step before a termination costs {last:.3g} on average, no more than another step does (up to "
                 f"{dearest:.3g}). Where the end is the goal, all is well. Where it is a failure, to fail early is the "
                 "cheapest policy of any algorithm: give the last step a cost of its own, above that of going on, here about "
-                f"{price:.3g} (mean cost per step / (1 - gamma)).",
+                f"{price:.3g} (what L is where each step has the mean cost).",
                 stacklevel=3,
             )
 

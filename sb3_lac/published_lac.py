@@ -175,6 +175,10 @@ class PublishedLAC(CostAlgorithm):
                 raise ValueError(f"horizon={self.horizon} needs a HorizonReplayBuffer, and this is a {found}.")
             self.replay_buffer.horizon = self.horizon
 
+    @property
+    def n_costs(self) -> float:
+        return super().n_costs if self.horizon is None else self.horizon
+
     def _candidate(self, replay_data: Any, costs: th.Tensor) -> th.Tensor:
         """The Lyapunov candidate, the target of ``L``."""
         if self.horizon is not None:

@@ -48,7 +48,10 @@ def wheels(tmp_path_factory):
         shutil.copytree(ROOT / folder, source / folder, ignore=shutil.ignore_patterns("__pycache__", "build", "*.egg-info"))
     for file in ("setup.cfg", "pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / file, source)
-    return {"battery_env": build_wheel(source / "battery_env", target), "sb3_lac": build_wheel(source, target)}
+    built = {"battery_env": build_wheel(source / "battery_env", target), "sb3_lac": build_wheel(source, target)}
+    # a copy of a package within it would be one of its parts
+    assert not list(source.glob("*/build"))
+    return built
 
 
 def test_each_wheel_owns_its_files_and_brings_its_data_and_license(wheels):

@@ -31,7 +31,7 @@ def save_state(path: str | os.PathLike[str], settings: Mapping[str, Any], arrays
             raise FileExistsError(f"{target} exists, and is no state of an estimator: choose another name") from error
     metadata = json.dumps({"kind": _KIND, "format": FORMAT_VERSION, "settings": settings})
     with replacing(target) as part:
-        np.savez(part, allow_pickle=False, metadata=np.array(metadata), **arrays)
+        np.savez(part, metadata=np.array(metadata), **arrays)  # type: ignore[arg-type]  # none is named allow_pickle
     return target
 
 

@@ -573,7 +573,7 @@ def _coloured(text: str, settled: bool) -> str:
 def _saying(name: str = "") -> Iterator[None]:
     """Prints the warnings of what is done within."""
     with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+        warnings.simplefilter("always", UserWarning)  # others are for developers
         try:
             yield
         finally:

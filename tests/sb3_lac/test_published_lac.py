@@ -1,6 +1,7 @@
 """The published algorithm: one update, written out a second time from the equations, and the sums of its finite horizon."""
 
 import math
+import warnings
 
 import gymnasium as gym
 import numpy as np
@@ -235,6 +236,13 @@ def test_horizon_is_that_of_the_model_with_a_buffer_of_another_one(make_model, t
     other = make_model(algorithm=PublishedLAC, n_collect=0, horizon=7)
     other.load_replay_buffer(tmp_path / "buffer")
     assert other.replay_buffer.horizon == 7
+
+
+def test_a_horizon_is_a_finite_sum_without_a_discount(make_model, make_env):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model = make_model(make_env(offset=4.0), algorithm=PublishedLAC, horizon=3, gamma=1.0, reward_bound=5.0)
+    assert model.critic.offset.item() == 3 * 5.0
 
 
 @pytest.mark.parametrize(

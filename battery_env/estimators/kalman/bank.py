@@ -320,9 +320,10 @@ def take(
 @compiled
 def _note(estimate: Row, condition: int, holds: bool) -> None:
     # of each number that it speaks against, the row of the table that comes first counts
+    row = condition + 0  # a member of an enumeration is no index in older versions of numba
     for k in range(2):
-        if holds and _AGAINST[condition, k] and condition < estimate.condition[k]:
-            estimate.condition[k] = condition
+        if holds and _AGAINST[row, k] and row < estimate.condition[k]:
+            estimate.condition[k] = row
 
 
 @compiled

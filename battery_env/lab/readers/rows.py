@@ -60,9 +60,8 @@ def cells_of(table: pd.DataFrame, columns: Mapping[str, Column], file_format: Fi
         table = mend(table, columns)
     if len(table) < LEAST_SAMPLES:
         raise ValueError(f"a discharge needs {LEAST_SAMPLES} rows below the header, got {len(table)}")
-    cells = (
-        table["cell"].astype(object).ffill().fillna("").astype(str) if "cell" in table else pd.Series("", index=table.index)
-    )
+    named = table["cell"].astype("string") if "cell" in table else pd.Series("", index=table.index)
+    cells = named.ffill().fillna("").astype(str)
     if cells.nunique() == 1 or cells.value_counts().min() < LEAST_SAMPLES:
         return {"": _mended(table, columns, file_format)}
     return {name: _mended(table[cells == name], columns, file_format) for name in cells.unique()}
