@@ -487,6 +487,14 @@ def test_the_sheet_of_a_workbook_that_holds_the_record_is_read_with_those_that_c
         table[half:].to_excel(writer, sheet_name="Channel_2", index=False, startrow=3)
         table[:1].assign(more=1).to_excel(writer, sheet_name="Statistics", index=False)
     same(read(path))
+    # nor need they continue each other
+    with pd.ExcelWriter(path) as writer:
+        for name, add_s in (("DST", 0.0), ("US06", 0.0), ("FUDS", 30.0)):
+            table.assign(**{"Test_Time(s)": RECORD.time_s + add_s}).to_excel(writer, sheet_name=name, index=False)
+    found = read_discharges(path)
+    assert [each.meta["cycle"] for each in found] == [1, 2, 3]
+    for each in found:
+        np.testing.assert_allclose(each.charge_C, RECORD.charge_C)
     (tmp_path / "text.xls").write_text(table.to_csv(index=False, sep="\t"))
     same(read(tmp_path / "text.xls"))  # as some testers call their text
 

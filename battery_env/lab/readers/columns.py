@@ -207,6 +207,11 @@ def count_required(names: Sequence[str], chosen: Mapping[str, str] | None = None
     )
 
 
+def has(quantity: str, names: Sequence[str]) -> bool:
+    """Whether one of the names may be that of a quantity."""
+    return any(_is_known(quantity, name) for name in names)
+
+
 def unit_of(quantity: str, unit: str) -> tuple[float, float]:
     """What the values of a quantity in some unit are multiplied with, and what is added then."""
     return _UNITS[quantity][unit.lower()]

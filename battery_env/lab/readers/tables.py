@@ -21,7 +21,7 @@ import numpy as np
 import pandas as pd
 
 from battery_env.files import check_unpacked
-from battery_env.lab.readers.columns import REQUIRED, Column, FileFormat, are_units, count_required, find_columns
+from battery_env.lab.readers.columns import REQUIRED, Column, FileFormat, are_units, count_required, find_columns, has
 
 #: Endings of the names of files that can be read, besides those of NASA (.mat); of text also packed (.gz, .bz2, .xz, .zip).
 #: Text of Maccor's is numbered.
@@ -350,8 +350,11 @@ def _sheet(path: Path, file_format: FileFormat) -> bytes:
         line = int(np.argmax(counts))
         found.append((counts[line], len(sheet), head[line : line + 1], line, sheet))
     names = max(found, key=lambda each: each[:2])[2]
-    first, *others = [(line, sheet) for *_, each, line, sheet in found if each == names]
-    parts = [first[1], *(sheet.iloc[line + 1 :] for line, sheet in others)]
+    (top, first), *others = [(line, sheet) for *_, each, line, sheet in found if each == names]
+    parts = [first, *(sheet.iloc[line + 1 :] for line, sheet in others)]
+    if others and not has("cycle", [name for row in names for name in row]):  # each may be a test of its own
+        parts = [part.assign(cycle=str(number)) for number, part in enumerate(parts, start=1)]
+        parts[0].iloc[top, -1] = "Cycle"
     return pd.concat(parts).to_csv(header=False, index=False).encode()
 
 
