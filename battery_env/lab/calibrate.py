@@ -349,8 +349,8 @@ def _charge_after(discharge: Discharge, loaded: Discharge, eod_time_s: float, cu
                 stacklevel=5,
             )
         return 0.0
-    until_C = float(drawn(discharge.time_s, discharge.current_A, eod_time_s))
-    more_C = discharge.charge_C - until_C
+    until_C, in_all_C = drawn(discharge.time_s, discharge.current_A, [eod_time_s, discharge.time_s[-1]]).tolist()
+    more_C = in_all_C - until_C
     if more_C <= _MORE_SHARE * until_C:
         return 0.0
     warnings.warn(

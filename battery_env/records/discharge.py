@@ -52,8 +52,9 @@ _COLUMNS = ("time_s", "voltage_V", "current_A")
 # what cycles.csv tells about each discharge beyond the samples themselves
 _META_COLUMNS = ("test_id", "start_time", "ambient_temperature_C", "capacity_Ah", "Re_ohm", "Rct_ohm")
 _DURATION_LIMITS_S = (10.0, 1e6)
-# What a clock that is not in seconds may be in: what the command line calls it, and s.
-_OTHER_CLOCKS = {"milliseconds": ("ms", 1e-3), "minutes": ("min", 60.0), "hours": ("h", 3600.0), "days": ("d", 86400.0)}
+#: What a clock may count in: what the command line calls it, and s.
+CLOCKS = {"seconds": ("s", 1.0), "milliseconds": ("ms", 1e-3), "minutes": ("min", 60.0), "hours": ("h", 3600.0)}
+CLOCKS["days"] = ("d", 86400.0)
 # What draws no more than this share of the charge before or after the main load is noise, or an offset.
 _LITTLE_SHARE = 5e-3
 # No cell changes its voltage by this much from one sample to the next, and back, but for its load, V.
@@ -111,7 +112,7 @@ class Discharge:
         if not least_s <= duration_s <= most_s:
             spans = [
                 f"{factor * duration_s:.0f} s if it is in {unit} (command line: --units time={symbol})"
-                for unit, (symbol, factor) in _OTHER_CLOCKS.items()
+                for unit, (symbol, factor) in CLOCKS.items()
                 if least_s <= factor * duration_s <= most_s
             ]
             advice = f" Give the time in seconds: {', '.join(spans)}." if spans else ""
@@ -142,8 +143,14 @@ class Discharge:
 
     @property
     def charge_C(self) -> float:
-        """The charge drawn from the first sample to the last, C."""
-        return drawn_charge_C(self)
+        """The charge drawn from the first sample to the last, C; a load comes on when the tester says, if it does."""
+        charge_C = drawn_charge_C(self)
+        if self.shown.load_on_s is not None and self._loaded[0] and self._is_load_on_told:
+            around = slice(self._loaded[0] - 1, self._loaded[0] + 1)
+            (begin_s, end_s), parts_A = self.time_s[around], self.current_A[around]
+            charge_C -= float(np.diff(drawn(self.time_s, self.current_A, [begin_s, end_s]))[0])
+            charge_C += float(parts_A @ np.diff([begin_s, self.shown.load_on_s, end_s]))
+        return charge_C
 
     @property
     def unseen_C(self) -> float:
@@ -151,9 +158,12 @@ class Discharge:
         Standard deviation of the charge drawn by all that no sample shows, C; what flows at rest may be an offset of the
         sensor.
         """
-        shown = self.shown
-        switched_C = 0.0 if shown.is_counted else switched_sd_C(self.time_s, self.current_A)
-        return hypot(shown.load_on_C, shown.offset_A * float(np.ptp(self.time_s)), shown.uncounted_C, switched_C)
+        shown, (first, last) = self.shown, self._loaded
+        # when the load came on may be told, and a count is that of the load alone
+        begin = first if self._is_load_on_told else max(first - 1, 0)
+        unknown = [slice(begin, first + 1), slice(last, last + 2)] if shown.is_counted else [slice(begin, None)]
+        switched_C = [switched_sd_C(self.time_s[rows], self.current_A[rows]) for rows in unknown]
+        return hypot(shown.load_on_C, shown.offset_A * float(np.ptp(self.time_s)), shown.uncounted_C, *switched_C)
 
     @property
     def load_on_time_s(self) -> float:

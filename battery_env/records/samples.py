@@ -40,7 +40,7 @@ _MISSING = {
 _KELVIN = "Give the temperature in degrees Celsius, not in kelvin (command line: --units temperature=K)."
 # name: least and largest plausible value, unit, what a value beyond usually is
 _PLAUSIBLE: dict[str, tuple[float, float, str, str]] = {
-    "voltage_V": (0.0, 5.5, "V", _MILLIVOLT),
+    "voltage_V": (-0.1, 5.5, "V", _MILLIVOLT),  # half cells are driven a little below 0
     "current_A": (
         -LOAD_LIMITS["current"],
         LOAD_LIMITS["current"],

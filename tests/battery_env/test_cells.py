@@ -42,7 +42,7 @@ class TestDischarge:
             ({"time_s": [0.0, 10.0, 20.0, 20.0, 40.0, 50.0, 60.0]}, "sample 3 is at 20 s, after 20 s"),
             ({"time_s": np.arange(7) / 3600.0}, "seconds: 144 s if it is in days"),
             ({"time_s": np.arange(7) * 1e6}, "milliseconds"),
-            ({"voltage_V": np.full(7, 3900.0)}, "voltage_V must lie within 0 .. 5.5 V, got 3900 at sample 0.*not in mV"),
+            ({"voltage_V": np.full(7, 3900.0)}, "voltage_V must lie within -0.1 .. 5.5 V, got 3900 at sample 0.*not in mV"),
             ({"current_A": np.full(7, 2000.0)}, "current_A must lie within -1000 .. 1000 A, got 2000.*not in mA"),
             ({"time_s": 1e4 * np.arange(7), "current_A": np.full(7, 500.0)}, "draws 3e.07 C.*not in mA"),
             ({"temperature_C": np.full(7, 297.0)}, "got 297.*not in kelvin"),

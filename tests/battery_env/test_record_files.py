@@ -251,7 +251,7 @@ def test_discharges_whose_charges_are_not_logged_need_a_number(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"voltage_V": 1e3 * VOLTAGE_V}, r"voltage_V must lie within 0 \.\. 5.5 V, got 4190 .*one cell, not that of a pack"),
+        ({"voltage_V": 1e3 * VOLTAGE_V}, r"voltage_V must lie within -0.1 \.\. 5.5 V, got 4190 .*one cell, not that of a"),
         ({"time_s": TIME_S - TIME_S % 300.0}, "time_s must increase from sample to sample.*each sample once"),
         ({"time_s": TIME_S / 3600.0}, "time_s must span .* got 0.508333 s, too short for a discharge.$"),
         (

@@ -21,12 +21,13 @@ _NAMES = {
     "time": "test time, total time, elapsed time, accumulated time, cumulative time, run time, record time, elapsed, "
     "prog time, program time, program duration, programmdauer, test, time, relative time, testzeit, prüfzeit, gesamtzeit, "
     "programmzeit, laufzeit, zeit, temps total, temps, tempo, tiempo, 总时间, 测试时间, 累计时间, 时间, 相对时间, seconds, t, "
-    "unix time, date time, timestamp, absolute time, dpt time, real time, system time, date, datum, datum uhrzeit, "
+    "unix time, date time, timestamp, absolute time, dpt time, real time, system time, sys time, date, datum, datum uhrzeit, "
     "zeitstempel, fecha, 绝对时间, 系统时间, 日期, step time, step duration, schrittzeit, schrittdauer, temps étape, "
     "步骤时间, 工步时间",
     "voltage": "voltage, cell voltage, terminal voltage, battery voltage, voltage measured, measured voltage, volts, volt, "
-    "ewe ece, ecell, potential, cell potential, ewe, u, v, spannung, zellspannung, klemmenspannung, batteriespannung, u cell, "
-    "v cell, u zelle, tension cellule, u bat, v bat, u batt, v batt, vf, tension, tensión, tensao, tensão, voltaje, 电压",
+    "vol, ewe ece, ecell, potential, cell potential, ewe, u, v, spannung, zellspannung, klemmenspannung, batteriespannung, "
+    "u cell, v cell, u zelle, tension cellule, u bat, v bat, u batt, v batt, vf, tension, tensión, tensao, tensão, "
+    "voltaje, 电压",
     "current": "current, cell current, battery current, current measured, measured current, cur, curr, amps, amp, i, strom, "
     "zellstrom, batteriestrom, i cell, i bat, i batt, im, courant, corriente, corrente, 电流",
     "temperature": "temperature, cell temperature, temperature measured, surface temperature, surface temperature t1, "
@@ -204,6 +205,11 @@ def count_required(names: Sequence[str], chosen: Mapping[str, str] | None = None
         )
         for quantity in REQUIRED
     )
+
+
+def has(quantity: str, names: Sequence[str]) -> bool:
+    """Whether one of the names may be that of a quantity."""
+    return any(_is_known(quantity, name) for name in names)
 
 
 def unit_of(quantity: str, unit: str) -> tuple[float, float]:

@@ -298,21 +298,27 @@ def _charge_before(rows: pd.DataFrame, begin: int) -> ChargeBefore | None:
 
 
 def _load_on_s(rows: pd.DataFrame, stretch: slice) -> float | None:
-    """When the load of a discharge came on, if the time in the step of its first row says how long ago that was."""
+    """When the load of a discharge came on, if its first row says how long ago that was, or how much was drawn since."""
     time_s, current_A = (rows[name].to_numpy() for name in ("time", "current"))
     n = stretch.start + int(np.argmax(current_A[stretch] > SWITCH_SHARE * current_A[stretch].max()))
-    if "step_time" not in rows or not 0 < n < len(rows) - 1:
+    if not 0 < n < len(rows) - 1:
         return None
-    (ago_s, later_s), interval_s = rows["step_time"].iloc[n : n + 2], time_s[n] - time_s[n - 1]
-    # the two clocks need not agree to the last digit
-    if not (0.0 <= ago_s < later_s and ago_s <= (1.0 + _NOTHING_SHARE) * interval_s):
+    interval_s, ago_s, teller = time_s[n] - time_s[n - 1], np.inf, ""
+    if "capacity" in rows:
+        (on_C, next_C), now_C = np.diff(rows["capacity"].iloc[n - 1 : n + 2]), rows["capacity"].iloc[n]
+        if abs(abs(next_C) / current_A[n] - (time_s[n + 1] - time_s[n])) <= SWITCH_SHARE * (time_s[n + 1] - time_s[n]):
+            # a counter may start anew with each step
+            ago_s, teller = abs(on_C if on_C * next_C >= 0.0 else now_C) / current_A[n], "the count of the tester"
+    if "step_time" in rows:
+        step_s, later_s = rows["step_time"].iloc[n : n + 2]
+        ago_s, teller = (step_s, "the time in its step") if 0.0 <= step_s < later_s else (ago_s, teller)
+    # the two clocks need not agree to the last digit, nor a count of few digits
+    if not ago_s <= (1.0 + SWITCH_SHARE) * interval_s:
         return None
     told_s = max(float(time_s[n] - ago_s), float(time_s[n - 1]))
     if interval_s > 2.0 * max(time_s[n + 1] - time_s[n], time_s[n - 1] - time_s[max(n - 2, 0)]):
         warnings.warn(
-            f"the rest is taken to last until {time_s[n] - told_s:g} s before row {rows.index[n] + 1}, as the time in its "
-            "step says",
-            stacklevel=2,
+            f"the load came on {time_s[n] - told_s:g} s before row {rows.index[n] + 1}, as {teller} says", stacklevel=2
         )
     return told_s
 
@@ -353,7 +359,10 @@ def _with_count(shown: Shown, rows: pd.DataFrame) -> Shown:
     step_C = step_C if (step_C > 0.0).sum() > (step_C < 0.0).sum() else -step_C  # a counter may count down
     if (step_C > 0.0).mean() < 0.5:
         return shown
-    goes_on = step_C >= 0.0  # and not anew, with each step of the program
+    goes_on = step_C >= 0.0
+    is_counted = bool(goes_on.all())
+    if not is_counted:  # but anew with each step, of which the last row may be missing
+        goes_on &= np.abs(np.diff(current_A[part])) <= SWITCH_SHARE * current_A.max()
     counted_C = float(step_C[goes_on].sum())
     # some count what is drawn alone, others what is returned, too
     passed_C = [drawn(time_s[part], each[part], time_s[part]) for each in (np.maximum(current_A, 0.0), np.abs(current_A))]
@@ -364,7 +373,7 @@ def _with_count(shown: Shown, rows: pd.DataFrame) -> Shown:
             "Ah: check units and clock, and that all rows are there",
             stacklevel=2,
         )
-    return shown._replace(is_counted=bool(goes_on.all()), uncounted_C=abs(off_C))
+    return shown._replace(is_counted=is_counted, uncounted_C=abs(off_C))
 
 
 def _charges(current_A: FloatArray, passed_C: FloatArray) -> list[tuple[int, int, bool, bool]]:

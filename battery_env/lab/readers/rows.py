@@ -6,6 +6,7 @@ clear enough to mend is refused.
 
 from __future__ import annotations
 
+import itertools
 import re
 import warnings
 from collections.abc import Callable, Mapping
@@ -18,7 +19,7 @@ from battery_env.arrays import BoolArray, FloatArray, IntArray
 from battery_env.checks import ZERO_CELSIUS_K
 from battery_env.lab.readers.columns import REQUIRED, Column, FileFormat, direction
 from battery_env.records import REST_CURRENT_A, SWITCH_SHARE
-from battery_env.records.discharge import LEAST_SAMPLES
+from battery_env.records.discharge import CLOCKS, LEAST_SAMPLES
 
 # How plain the sign of the current must be: the share of its jumps with which the voltage jumps, less that of the others; or
 # the correlation of the voltage with the charge that has passed.
@@ -36,8 +37,7 @@ _LONG_SHARE = 0.25
 _STEP_S = 1e-3
 # What a clock may count in, s.
 _TICKS_S = (3600.0, 60.0, 1.0, 0.1, 0.01)
-# What a clock without a unit may count in, s; dates count whole seconds.
-_UNITS_S, _DAY_S = {"seconds": 1.0, "milliseconds": 1e-3, "minutes": 60.0, "hours": 3600.0}, 86400.0
+_DAY_S = CLOCKS["days"][1]
 # What is so many times what is usual is not usual.
 _MANY_TIMES = 3.0
 # No cell has a voltage below this share of what the record mostly shows.
@@ -74,9 +74,9 @@ def _mended(table: pd.DataFrame, columns: Mapping[str, Column], file_format: Fil
         without_missing,
         with_newest_last,
         over_midnight,
+        without_repeated,
         on_one_clock,
         with_clock_going_on,
-        without_repeated,
         with_steps_apart,
         without_rows_out_of_time,
     ):
@@ -146,7 +146,8 @@ def in_si_units(table: pd.DataFrame, columns: Mapping[str, Column]) -> pd.DataFr
         directions = _directions(table[key])
         if {1, -1} <= set(directions):
             found.setdefault("direction", directions)
-    rows, tick_s = pd.DataFrame(found, index=table.index), _tick_of_dates(table, columns)
+    rows = pd.DataFrame(found, index=table.index)
+    tick_s = _tick_of_clock(table, rows, columns)
     for name in {"time", "step_time"} & set(rows):
         rows[name] *= tick_s if pd.api.types.is_numeric_dtype(table[name].dtype) and not columns[name].unit else 1.0
     if "counter" in rows and columns["voltage"].words == "ewe":
@@ -207,21 +208,38 @@ def _goes_on_where(other_s: FloatArray, time_s: FloatArray) -> bool:
     return bool((other >= 0.0).all() and (this < 0.0).any() and (other <= 0.0).sum() <= (this <= 0.0).sum())
 
 
-def _tick_of_dates(table: pd.DataFrame, columns: Mapping[str, Column]) -> float:
-    """What a clock counts in whose name has no unit, s, where dates beside it, or days as spreadsheets count, tell."""
+def _tick_of_clock(table: pd.DataFrame, rows: pd.DataFrame, columns: Mapping[str, Column]) -> float:
+    """
+    What a clock counts in whose name has no unit, s, where something beside it tells: dates, days as spreadsheets count, or
+    the charge that the tester counted.
+    """
     clock, ends = columns["time"], table["time"].iloc[[0, -1]]
     if clock.unit or not pd.api.types.is_numeric_dtype(ends.dtype) or not table["time"].is_monotonic_increasing:
         return 1.0
-    ticks = np.ptp(numbers(ends, clock))
+    ticks, told = np.ptp(numbers(ends, clock)), []
     for key in [key for key in columns if key.startswith("time ")]:
         try:
             span_s = np.ptp(seconds(table[key].iloc[[0, -1]], columns[key]))
         except ValueError:
             continue
         if pd.api.types.is_numeric_dtype(table[key].dtype) and not columns[key].unit:
+            if abs(span_s - ticks) <= _NOTHING_SHARE * ticks:
+                continue  # both count the same
             span_s *= _DAY_S
-        for unit, tick_s in _UNITS_S.items():
-            if abs(span_s - tick_s * ticks) <= 1.0 + _NOTHING_SHARE * span_s:
+        # dates count whole seconds
+        told.append((key, span_s, 1.0 + _NOTHING_SHARE * span_s))
+    if "capacity" in rows and "current" in rows and columns["current"].unit:
+        step_C, passed_C = np.diff(rows["capacity"]), np.diff(rows["time"]) * rows["current"].to_numpy()[1:]
+        # a counter may count down, and what is drawn alone
+        counted_C, for_C = max(
+            ((way * step_C).clip(0.0) @ (sign * passed_C > 0.0), (sign * passed_C).clip(0.0).sum())
+            for way, sign in itertools.product((1.0, -1.0), repeat=2)
+        )
+        if counted_C > 0.0:
+            told.append(("capacity", counted_C / for_C * ticks, SWITCH_SHARE * counted_C / for_C * ticks))
+    for key, span_s, tolerance_s in told:
+        for unit, (_, tick_s) in CLOCKS.items():
+            if abs(span_s - tick_s * ticks) <= tolerance_s:
                 if tick_s != 1.0:
                     _say(f"{clock.name!r} counts {unit}, as {columns[key].name!r} tells")
                 return tick_s
@@ -288,7 +306,8 @@ def seconds(values: pd.Series, column: Column) -> FloatArray:
         return values.dt.total_seconds().to_numpy(dtype=np.float64)
     if not values.dropna().astype(str).str.contains(":").all():
         return numbers(values, column)
-    text = values.astype(str).str.strip().str.replace(",", ".")
+    # some count days as in 1-02:03:04
+    text = values.astype(str).str.strip().str.replace(",", ".").str.replace(r"^(\d+)-(?=\d+:)", r"\1 days ", regex=True)
     # UTC, as the clocks of a time zone are put forward and back
     readings: tuple[tuple[Callable[..., Any], dict[str, Any]], ...] = (
         (pd.to_timedelta, {}),
@@ -369,8 +388,10 @@ def with_newest_last(rows: pd.DataFrame) -> pd.DataFrame:
 def over_midnight(rows: pd.DataFrame) -> pd.DataFrame:
     """The time of day goes on at midnight."""
     step_s = np.diff(rows["time"], prepend=rows["time"].iloc[:1])
-    beside_s = np.maximum(np.maximum(np.roll(step_s, 1), np.roll(step_s, -1)), np.median(step_s))
-    midnight = (step_s < 0.0) & (step_s >= -_DAY_S) & (step_s + _DAY_S <= _MANY_TIMES * beside_s)
+    before_s, after_s = np.roll(step_s, 1), np.roll(step_s, -1)
+    beside_s = np.maximum(np.maximum(before_s, after_s), np.median(step_s))
+    # after a row that is out of time the clock goes on as before
+    midnight = (step_s < 0.0) & (step_s >= -_DAY_S) & (step_s + _DAY_S <= _MANY_TIMES * beside_s) & (step_s + after_s < 0.0)
     if not midnight.any():
         return rows
     _say(f"the clock is that of the day, and goes on at midnight: row {_place(rows, midnight)}")
@@ -386,7 +407,9 @@ def on_one_clock(rows: pd.DataFrame) -> pd.DataFrame:
         return rows
     step_s = np.append(np.diff(time_s), 0.0)
     usual_s = float(np.median(step_s[step_s > 0.0])) if (step_s > 0.0).any() else 0.0
-    if (time_s[new] > _MANY_TIMES * np.maximum(usual_s, step_s[new])).any():
+    # the first rows of a few steps may be missing
+    late = time_s[new] > _MANY_TIMES * np.maximum(usual_s, step_s[new])
+    if late.mean() > _LONG_SHARE or not np.isin(new[late], back).all():
         return rows
     # a row that is out of time, where the next one goes on with the clock of the one before
     after_s = _MANY_TIMES * step_s[np.minimum(back + 1, len(time_s) - 1)]
@@ -417,11 +440,15 @@ def with_clock_going_on(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def without_repeated(rows: pd.DataFrame) -> pd.DataFrame:
-    """Without rows that were written before; they are compared only where the clock does not go on, as that takes time."""
+    """
+    Without blocks of rows that come again directly after themselves; alone, rows may be alike under a clock of each step. They
+    are compared only where the clock does not go on, as that takes time.
+    """
     if (np.diff(rows["time"]) > 0.0).all():
         return rows
-    names = [name for name in ("cycle", *REQUIRED, "step", "direction") if name in rows]
-    repeated = rows.duplicated(names).to_numpy()
+    names, place = ("cycle", *REQUIRED, "step", "direction"), pd.Series(np.arange(len(rows)), rows.index)
+    ago = place - place.groupby([rows[name] for name in names if name in rows], sort=False).shift()
+    repeated = ago.groupby((ago != ago.shift()).cumsum()).transform("size") >= ago
     if repeated.any():
         _say(f"{repeated.sum()} of {len(repeated)} rows are repeated, and dropped")
     return rows[~repeated]
@@ -507,16 +534,15 @@ def with_signed_current(rows: pd.DataFrame, columns: Mapping[str, Column], is_ne
     if (current_A >= -rest_A).all() or (current_A <= rest_A).all():
         _refuse_unsigned(rows, columns)
     if is_negative is None:
-        effect = _jumps(rows)
-        if not abs(effect) > _CLEAR:
-            effect = _fall(rows)
-        if not abs(effect) > _CLEAR:
+        jumps, fall = _jumps(rows), _fall(rows)
+        clear = [effect for effect in (jumps, fall) if abs(effect) > _CLEAR]
+        if not clear or min(clear) < 0.0 < max(clear):
             raise ValueError(
-                "whether the current of a discharge is positive or negative cannot be told, as the voltage neither falls "
-                f"nor rises clearly with the current and the charge (correlation {effect:.2f}). State it: "
-                "--discharge-is-negative or --discharge-is-positive (Python: discharge_is_negative)"
+                "whether the current of a discharge is positive or negative cannot be told, as the voltage neither falls nor "
+                f"rises clearly with the current ({jumps:.2f}) and the charge ({fall:.2f}), or they contradict each other. "
+                "State it: --discharge-is-negative or --discharge-is-positive (Python: discharge_is_negative)"
             )
-        is_negative = effect > 0.0
+        is_negative = clear[0] > 0.0
     return rows.assign(current=-current_A) if is_negative else rows
 
 
@@ -538,13 +564,14 @@ def _refuse_unsigned(rows: pd.DataFrame, columns: Mapping[str, Column]) -> None:
     # after a larger load it rises, too, but not above where it was before that
     before_V = voltage_V[np.maximum(np.append(0, begin[:-1]) - 1, 0)]
     relaxes = (jump_A[begin] < 0.0) & (voltage_V[end] < before_V)
-    rise_V[(~is_long | relaxes) & (rise_V > 0.0)] = 0.0
+    rests = np.maximum.reduceat(size_A, begin) <= SWITCH_SHARE * size_A.max()
+    rise_V[rests | ((~is_long | relaxes) & (rise_V > 0.0))] = 0.0
     if rise_V.max() > long_V and np.minimum(rise_V, 0.0).sum() < -long_V:
-        known = [repr(column.name) for key, column in columns.items() if key.startswith("state")]
+        known = " and ".join(repr(column.name) for key, column in columns.items() if key.startswith("state"))
         raise ValueError(
             f"the current has no sign: from row {rows.index[begin[np.argmax(rise_V)]] + 1} on the voltage rises for long, and "
-            "elsewhere it falls under a current of the same sign. Name the column that tells charge from discharge: "
-            f"--columns state=NAME (Python: columns){'. The words of ' + ' and '.join(known) + ' do not' if known else ''}"
+            "elsewhere it falls under a current of the same sign. Leave out the charges, or name the column that tells them "
+            f"from discharges: --columns state=NAME (Python: columns){f'. The words of {known} do not' if known else ''}"
         )
 
 
@@ -565,8 +592,11 @@ def _jumps(rows: pd.DataFrame) -> float:
 
 
 def _fall(rows: pd.DataFrame) -> float:
-    """How the voltage goes with the charge that has passed in each cycle, -1 to 1."""
+    """How the voltage goes with the charge that has passed in each cycle, whatever the current is, -1 to 1."""
     step_s = np.diff(rows["time"], prepend=rows["time"].iloc[0])
-    passed = pd.DataFrame({"charge": np.cumsum(rows["current"] * np.maximum(step_s, 0.0)), "voltage": rows["voltage"]})
+    passed = rows[["voltage", "current"]].assign(charge=np.cumsum(rows["current"] * np.maximum(step_s, 0.0)))
     within = passed - passed.groupby(np.cumsum((step_s < 0.0) | _changes(rows, "cycle"))).transform("mean")
-    return float(within["charge"].corr(within["voltage"]))
+    by = within.corr().fillna(0.0)
+    (of_voltage, of_both), of_charge = by.loc["charge", ["voltage", "current"]], by.at["voltage", "current"]
+    rest = (1.0 - of_charge**2) * (1.0 - of_both**2)
+    return float((of_voltage - of_charge * of_both) / rest**0.5) if rest > 0.0 else 0.0

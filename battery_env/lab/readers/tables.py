@@ -12,7 +12,8 @@ import re
 import warnings
 import zipfile
 from codecs import getincrementaldecoder
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any, NamedTuple, cast
 
@@ -20,7 +21,7 @@ import numpy as np
 import pandas as pd
 
 from battery_env.files import check_unpacked
-from battery_env.lab.readers.columns import REQUIRED, Column, FileFormat, are_units, count_required, find_columns
+from battery_env.lab.readers.columns import REQUIRED, Column, FileFormat, are_units, count_required, find_columns, has
 
 #: Endings of the names of files that can be read, besides those of NASA (.mat); of text also packed (.gz, .bz2, .xz, .zip).
 #: Text of Maccor's is numbered.
@@ -98,9 +99,10 @@ def _first_rows(table: pd.DataFrame) -> list[list[str]]:
 def _read_text(source: Path | bytes, file_format: FileFormat) -> tuple[pd.DataFrame, dict[str, Column]]:
     head = source[:_HEAD_BYTES] if isinstance(source, bytes) else _head(source)
     if isinstance(source, Path) and (b"\n" not in head or _QUOTED_LINES.search(head)):
-        with _open(source) as stream:  # lines may end as on old computers
-            source = _QUOTED_LINES.sub(rb"\1", stream.read() if b"\n" in head else stream.read().replace(b"\r", b"\n"))
-            head = source[:_HEAD_BYTES]
+        # lines may end as on old computers
+        content = _content(source) if b"\n" in head else _content(source).replace(b"\r", b"\n")
+        source = _QUOTED_LINES.sub(rb"\1", content)
+        head = source[:_HEAD_BYTES]
     layout = _layout(head, file_format.columns)
     columns, header_lines = find_columns(layout.names, file_format, layout.rows), layout.header_line + 1
     header_lines += bool(layout.rows) and are_units(layout.rows[0])
@@ -130,7 +132,16 @@ def _read_text(source: Path | bytes, file_format: FileFormat) -> tuple[pd.DataFr
         # words among numbers make text of all
         return found if layout.decimal == "." else found.replace(_ITS_COMMA, r"\1.", regex=True)
 
-    table = read()
+    try:
+        table = read()
+    except ValueError as error:
+        if "EOF inside string" not in str(error):
+            raise
+        kept, _, last = _content(source).decode(layout.encoding, errors="ignore").rstrip().rpartition("\n")
+        if last.count('"') % 2 == 0:
+            raise
+        warnings.warn("the last line is cut within quotes, and left out", stacklevel=2)
+        return _read_text(kept.encode(layout.encoding), file_format)
     measured = [
         columns[quantity].position for quantity in ("voltage", "current", "power", "charge_step") if quantity in columns
     ]
@@ -144,6 +155,13 @@ def _read_text(source: Path | bytes, file_format: FileFormat) -> tuple[pd.DataFr
         table = read(len(table) - foot)
     table = _lowest_layer(table, layout.layers)
     return pd.DataFrame({quantity: table[column.position] for quantity, column in columns.items()}), columns
+
+
+def _content(source: Path | bytes) -> bytes:
+    if isinstance(source, bytes):
+        return source
+    with _open(source) as stream:
+        return stream.read()
 
 
 def _lowest_layer(table: pd.DataFrame, layers: int) -> pd.DataFrame:
@@ -249,23 +267,34 @@ def _header(lines: Sequence[str], delimiters: Sequence[str], chosen: Mapping[str
     for number, line in enumerate(lines):
         next_line = next(filter(str.strip, itertools.islice(lines, number + 1, None)), "")
         for delimiter in delimiters:
-            # blanks within names
-            if delimiter == _BLANKS and len(_fields(next_line, delimiter)) < len(_fields(line, delimiter)):
+            names = _fields(line, delimiter)
+            # blanks within names, or in a sentence
+            if delimiter == _BLANKS and (len(_fields(next_line, delimiter)) < len(names) or _count_numbers(names)):
                 continue
-            if (count := count_required(_fields(line, delimiter), chosen)) > found:
+            if (count := count_required(names, chosen)) > found:
                 best, found = (number, delimiter), count
         if found == len(REQUIRED):
             break
     if found > 0:
         return best
-    number = next((n for n, line in enumerate(lines) if line.strip()), -1)
-    if number < 0:
+    filled = [number for number, line in enumerate(lines) if line.strip()]
+    if not filled:
         raise ValueError("the file is empty")
-    if any(map(_NUMBER.match, lines[number].split(","))):
-        raise ValueError("there is no line with the names of the columns above the numbers. Add one")
-    # names may hold blanks and units: the numbers below have to come apart as often
-    names, first_row = lines[number], lines[min(number + 1, len(lines) - 1)]
-    return number, max(delimiters, key=lambda each: min(len(_fields(names, each)), len(_fields(first_row, each))))
+    # names come apart as often as the first numbers below them
+    for above, number in itertools.pairwise([-1, *filled]):
+        apart = [each for each in delimiters if _count_numbers(_fields(lines[number], each)) > 1]
+        alike = [
+            each for each in apart if above >= 0 and len(_fields(lines[above], each)) == len(_fields(lines[number], each))
+        ]
+        if alike:
+            return above, alike[0]
+        if apart:
+            raise ValueError("there is no line with the names of the columns above the numbers. Add one")
+    return filled[0], delimiters[0]
+
+
+def _count_numbers(fields: Sequence[str]) -> int:
+    return sum(bool(_NUMBER.match(field) or _DECIMAL_COMMA.match(field)) for field in fields)
 
 
 def _decoded(head: bytes) -> tuple[str, str]:
@@ -293,14 +322,27 @@ def _fields(line: str, delimiter: str) -> list[str]:
         return []
 
 
+@contextmanager
+def _reading(kind: str, extra: str) -> Iterator[None]:
+    """Of what others read: their own warnings are not passed on, and what is missing, or not as it should be, is named."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    except FileNotFoundError:
+        raise
+    except ImportError as error:
+        raise ImportError(f"{kind} files need an extra: pip install 'battery_env[{extra}]' ({error})") from error
+    except NotImplementedError as error:
+        raise ValueError(f"what reads {kind} files does not know all of this one: {error}") from error
+    except Exception as error:  # whatever the damage leads to
+        raise ValueError(f"the file is damaged, or no {kind} file: {str(error).strip()}") from error
+
+
 def _sheet(path: Path, file_format: FileFormat) -> bytes:
     """The sheet of a workbook that holds the record, and those that continue it, as text."""
-    try:
+    with _reading("Excel", "excel"):
         sheets = pd.read_excel(path, sheet_name=None, header=None, dtype=object)
-    except ImportError as error:
-        raise ImportError(f"Workbooks need {error.name or 'openpyxl'}: pip install 'battery_env[excel]'") from error
-    except Exception as error:  # whatever the damage leads to
-        raise ValueError(f"the file is damaged, or no workbook: {str(error).strip()}") from error
     found = []
     for sheet in sheets.values():
         head = [[str(name) for name in row] for row in sheet.head(_FIRST_ROWS).to_numpy()]
@@ -308,22 +350,19 @@ def _sheet(path: Path, file_format: FileFormat) -> bytes:
         line = int(np.argmax(counts))
         found.append((counts[line], len(sheet), head[line : line + 1], line, sheet))
     names = max(found, key=lambda each: each[:2])[2]
-    first, *others = [(line, sheet) for *_, each, line, sheet in found if each == names]
-    parts = [first[1], *(sheet.iloc[line + 1 :] for line, sheet in others)]
+    (top, first), *others = [(line, sheet) for *_, each, line, sheet in found if each == names]
+    parts = [first, *(sheet.iloc[line + 1 :] for line, sheet in others)]
+    if others and not has("cycle", [name for row in names for name in row]):  # each may be a test of its own
+        parts = [part.assign(cycle=str(number)) for number, part in enumerate(parts, start=1)]
+        parts[0].iloc[top, -1] = "Cycle"
     return pd.concat(parts).to_csv(header=False, index=False).encode()
 
 
 def _read_parquet(path: Path, file_format: FileFormat) -> tuple[pd.DataFrame, dict[str, Column]]:
-    try:
+    with _reading("Parquet", "parquet"):
         from pyarrow import parquet
-    except ImportError as error:
-        raise ImportError("Parquet files need pyarrow: pip install 'battery_env[parquet]'") from error
-    try:
+
         file = parquet.ParquetFile(path)
-    except FileNotFoundError:
-        raise
-    except Exception as error:
-        raise ValueError(f"the file is damaged, or no Parquet: {str(error).strip()}") from error
     with file:
         first = [batch.to_pandas() for batch in itertools.islice(file.iter_batches(_FIRST_ROWS), 1)]
         columns = find_columns(file.schema_arrow.names, file_format, _first_rows(first[0]) if first else ())
@@ -347,33 +386,17 @@ def _read_batches(file: Any, packed_bytes: int, names: list[str]) -> pd.DataFram
 
 
 def _read_neware(path: Path) -> pd.DataFrame:
-    try:
+    with path.open("rb"), _reading("Neware", "cyclers"):
         import NewareNDA
-    except ImportError as error:
-        missing = "" if error.name in (None, "NewareNDA") else f", which needs {error.name}"
-        raise ImportError(f"Neware's files need NewareNDA{missing}: pip install 'battery_env[cyclers]'") from error
-    with path.open("rb"):  # a missing file is that, not a damaged one
-        pass
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of pandas, about how it is called there
-            return NewareNDA.read(str(path), log_level="ERROR")
-    except Exception as error:
-        raise ValueError(f"the file is damaged, or none of Neware's: {str(error).strip()}") from error
+
+        return NewareNDA.read(str(path), log_level="ERROR")
 
 
 def _read_biologic(path: Path) -> pd.DataFrame:
-    try:
+    with path.open("rb") as stream, _reading("BioLogic", "cyclers"):
         from galvani.BioLogic import MPRfile
-    except ImportError as error:
-        raise ImportError("BioLogic's files need galvani: pip install 'battery_env[cyclers]'") from error
-    with path.open("rb") as stream:
-        try:
-            return pd.DataFrame(MPRfile(stream).data)
-        except NotImplementedError as error:
-            raise ValueError(f"galvani, which reads BioLogic's files, does not know all of this one: {error}") from error
-        except Exception as error:
-            raise ValueError(f"the file is damaged, or none of BioLogic's: {str(error).strip()}") from error
+
+        return pd.DataFrame(MPRfile(stream).data)
 
 
 def is_readable(path: Path, more: Sequence[str] = ()) -> bool:
