@@ -145,7 +145,9 @@ class AgingPath:
         :param values: by ``PATH_NAMES``; parameters themselves, not their logarithms
         :return: standard deviations
         """
-        row = [np.log(values[name]) if name in PARAMETER_NAMES else values[name] for name in PATH_NAMES]
+        # a resistance may be 0
+        least = np.finfo(np.float64).tiny
+        row = [np.log(max(values[name], least)) if name in PARAMETER_NAMES else values[name] for name in PATH_NAMES]
         return float(self.distances_sd(np.array([row]))[0])
 
     def distances_sd(self, values: FloatArray) -> FloatArray:

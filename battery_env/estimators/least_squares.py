@@ -410,7 +410,10 @@ def _starts_along(path: AgingPath, search: Search) -> list[dict[str, float]]:
     for each in np.unique(np.maximum(log_q, log_least + _START_ABOVE)):
         expected = mean + covariance[q] / covariance[q, q] * (each - mean[q])
         start = dict(zip(PATH_NAMES, expected.tolist(), strict=True))
-        starts.append(start | {name: float(np.exp(start[name])) for name in PARAMETER_NAMES})
+        start |= {name: float(np.exp(start[name])) for name in PARAMETER_NAMES}
+        # its constants may need more charge than those of the cell
+        start["q_mobile"] = max(start["q_mobile"], search.least_q_at_C(start)[0] * float(np.exp(_START_ABOVE)))
+        starts.append(start)
     return starts
 
 

@@ -251,9 +251,10 @@ class Search:
 
     def _fit(self, start: dict[str, float], priors: Sequence[Prior | JointPrior]) -> Fit:
         free, values = list(self.unknown), dict.fromkeys(self.nuisance, 0.0) | start
+        bounds = {**dict.fromkeys(RATE_CONSTANTS, (-_REACH, _REACH)), **self.bounds}
         while True:
             values = self._minimized(values, free, priors)
-            clipped = {name: _within(values[name], self.bounds[name]) for name in free if name in self.bounds}
+            clipped = {name: _within(values[name], bounds[name]) for name in free if name in bounds}
             inside = [name for name in free if clipped.get(name, values[name]) == values[name]]
             values = values | clipped
             if len(inside) in (0, len(free)):
@@ -269,7 +270,7 @@ class Search:
 
         def values_at(x: Iterable[float]) -> tuple[dict[str, float], float, float]:
             values = start | {name: float(value) for name, value in zip(free, x, strict=True)}
-            least_C, least_by_log_C = self._least_q_C(values)
+            least_C, least_by_log_C = self.least_q_at_C(values)
             if "q_mobile" in free:
                 values["q_mobile"] = least_C + distance_C(values["q_mobile"])
             return values, least_C, least_by_log_C
@@ -283,7 +284,7 @@ class Search:
                 by_x[:, free.index("tDiffusion")] += least_by_log_C * by_unknown[:, unknown.index("q_mobile")]
             return residual_V, by_x
 
-        least_C, _ = self._least_q_C(start)
+        least_C, _ = self.least_q_at_C(start)
         x = minimized(
             evaluate,
             [np.log(start[name] - least_C) if name == "q_mobile" else start[name] for name in free],
@@ -337,7 +338,7 @@ class Search:
             return 0.5 * cell.tDiffusion * dt_s * _diffusion_rate(cell)
         return 0.5 * dt_s if name in ("to", "tsn", "tsp") else 0.0
 
-    def _least_q_C(self, values: Mapping[str, float]) -> tuple[float, float]:
+    def least_q_at_C(self, values: Mapping[str, float]) -> tuple[float, float]:
         """The least q_mobile that the record allows, and its derivative by the logarithm of ``tDiffusion``."""
         if "tDiffusion" not in self.nuisance:
             return self.least_q_C, 0.0
