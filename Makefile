@@ -45,7 +45,7 @@ test-oldest:  ## those of both packages, with the oldest versions that setup.cfg
 	$(VENV)/oldest/bin/python -m pip install --quiet uv
 	$(VENV)/oldest/bin/python -m pip install --quiet $(addprefix --index-url ,$(TORCH_INDEX)) "$(TORCH)"
 	VIRTUAL_ENV=$(VENV)/oldest $(VENV)/oldest/bin/uv pip install --quiet --resolution lowest-direct \
-		"$(TORCH)" ./battery_env ".[$(EXTRAS)]" "pyparsing<3.3"  # which old versions of matplotlib do not know
+		"$(TORCH)" ./battery_env ".[$(EXTRAS)]" "pyparsing==3.2.0"  # later ones warn of old versions of matplotlib
 	$(VENV)/oldest/bin/python -m pytest -n 2 tests/battery_env tests/sb3_lac
 
 format: install  ## black, and what ruff can mend

@@ -5,7 +5,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from battery_env.electrochemistry import simulate
+from battery_env.electrochemistry import NEW_CELL, simulate
 from battery_env.estimates import EstimateTrace
 from battery_env.estimators.diagnosis.conditions import SETTLED_SHARES
 from battery_env.estimators.estimator import OnlineEstimator
@@ -56,6 +56,18 @@ class TestAccuracy:
             )
             assert 0.9 < np.mean(np.abs(deviations) <= 2.0) < 0.999
             assert np.sqrt(np.mean(deviations**2)) > 0.4  # not by stating too much
+
+    @pytest.mark.parametrize("size", [0.02, 0.3, 30.0])
+    def test_of_a_cell_of_any_size_it_says_the_same(self, size):
+        def found(size):
+            cell = NEW_CELL.replace(
+                q_mobile=size * NEW_CELL.q_mobile, r_o=NEW_CELL.r_o / size, kn=size * NEW_CELL.kn, kp=size * NEW_CELL.kp
+            )
+            record = measured(6000.0 * size, 0.15 / size, 2.0 * size, load_unit="current", cell=cell)
+            estimate = ExtendedKalmanFilter(cell=cell).estimate(record)
+            return [estimate.q_mobile / size, estimate.sd_q_mobile / size, estimate.r_o * size, estimate.sd_r_o * size]
+
+        assert found(size) == pytest.approx(found(1.0), rel=1e-3)
 
     def test_noise_that_was_not_stated_is_noticed(self):
         data = TrajectoryDataset.generate(("q_mobile", "r_o"), 6, RandomPiecewise(), seed=2, r_o_range=(0.117, 0.35))
