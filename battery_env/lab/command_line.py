@@ -573,7 +573,8 @@ def _coloured(text: str, settled: bool) -> str:
 def _saying(name: str = "") -> Iterator[None]:
     """Prints the warnings of what is done within."""
     with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", UserWarning)  # others are for developers
+        warnings.simplefilter("ignore")  # those for developers
+        warnings.simplefilter("always", UserWarning)
         try:
             yield
         finally:

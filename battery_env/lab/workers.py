@@ -154,7 +154,8 @@ def attempt(function: Callable[..., Any], *arguments: Any) -> Attempt:
     """Make a call that stops no others, whatever becomes of it."""
     result, error = None, ""
     with _CATCHING, warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", UserWarning)  # others are for developers
+        warnings.simplefilter("ignore")  # those for developers
+        warnings.simplefilter("always", UserWarning)
         try:
             result = function(*arguments)
         except Exception as problem:

@@ -177,7 +177,7 @@ def test_what_remains_of_a_discharge_in_progress_needs_a_prior_or_the_filter(rec
     assert 1500.0 + row["remaining_s"] == pytest.approx(end_s, rel=0.02)
     assert np.isnan(row["measured_eod_time_s"]) and np.isnan(row["capacity_Ah"])
     assert row["predicted_capacity_Ah"] == pytest.approx(whole_Ah, rel=0.02)
-    assert row["state_of_health"] == row["predicted_capacity_Ah"] / 2.0
+    assert row["state_of_health"] == pytest.approx(row["predicted_capacity_Ah"] / 2.0)
     # which the moment of load-on widens a little
     by_end = row["sd_predicted_eod_time_s"] * row["future_current_A"] / 7200.0
     assert by_end < row["sd_state_of_health"] < 1.01 * by_end
