@@ -315,11 +315,12 @@ class LeastSquares(Estimator):
                 replace(search, model=RecordModel(model.cell, model.thermal, model.dt_s, initial_soc=each))
                 for each in (soc, soc + step)
             )
+            at_V = fit.residual_V if self._at_rest else at.residual(values)[0]
             moved = dict(values)
             if "q_mobile" in self.parameters:  # along with it, so that the cell ends as full as before
                 moved["q_mobile"] *= soc / (soc + step)
                 by_soc[self.parameters.index("q_mobile")] = (moved["q_mobile"] - values["q_mobile"]) / step
-            change_V = (nearby.residual(moved)[0] - at.residual(values)[0]) / step
+            change_V = (nearby.residual(moved)[0] - at_V) / step
             rows = np.nan_to_num(np.append(change_V, np.zeros(len(fit.jacobian) - len(change_V))))
             by_soc -= np.linalg.lstsq(fit.jacobian, rows, rcond=None)[0]
         of_cell = {"r_o": self.cell_sd_r_o_ohm}
