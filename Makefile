@@ -40,7 +40,7 @@ demo: install  ## LAC, SAC and TD3 learn R_o, then the life of a real cell: some
 test: install  ## all tests
 	$(BIN)/python -m pytest -n 2
 
-test-oldest:  ## those of both packages, with the oldest versions that setup.cfg names
+test-oldest:  ## those of both packages, with the oldest versions that setup.cfg names of all but torch
 	$(PYTHON) -m venv --clear $(VENV)/oldest
 	$(VENV)/oldest/bin/python -m pip install --quiet uv
 	$(VENV)/oldest/bin/python -m pip install --quiet $(addprefix --index-url ,$(TORCH_INDEX)) "$(TORCH)"

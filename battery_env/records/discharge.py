@@ -53,8 +53,13 @@ _COLUMNS = ("time_s", "voltage_V", "current_A")
 _META_COLUMNS = ("test_id", "start_time", "ambient_temperature_C", "capacity_Ah", "Re_ohm", "Rct_ohm")
 _DURATION_LIMITS_S = (10.0, 1e6)
 #: What a clock may count in: what the command line calls it, and s.
-CLOCKS = {"seconds": ("s", 1.0), "milliseconds": ("ms", 1e-3), "minutes": ("min", 60.0), "hours": ("h", 3600.0)}
-CLOCKS["days"] = ("d", 86400.0)
+CLOCKS = {
+    "seconds": ("s", 1.0),
+    "milliseconds": ("ms", 1e-3),
+    "minutes": ("min", 60.0),
+    "hours": ("h", 3600.0),
+    "days": ("d", 86400.0),
+}
 # What draws no more than this share of the charge before or after the main load is noise, or an offset.
 _LITTLE_SHARE = 5e-3
 # No cell changes its voltage by this much from one sample to the next, and back, but for its load, V.

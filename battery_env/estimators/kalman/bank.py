@@ -172,6 +172,19 @@ def _r_by_share(one: Row) -> float:
 
 
 @inlined
+def _add_to(told: Row, charge: float, by_q: float, by_r: float) -> None:
+    # What a sample tells, by the charge that flowed before it
+    told.q += charge * abs(by_q)
+    told.qq += charge * by_q * by_q
+    told.qr += charge * by_q * by_r
+    told.rr += charge * by_r * by_r
+    told.charge_C += charge
+    if charge > 0.0:
+        told.by_q += charge * by_q * by_q / told.charge_C
+        told.by_r += charge * by_q * by_r / told.charge_C
+
+
+@inlined
 def _correct(
     one: Row,
     voltage: float,
@@ -214,14 +227,7 @@ def _correct(
             p[j, k] += gain[j] * gain[k] * variance - gain[j] * ph[k] - ph[j] * gain[k]
             p[k, j] = p[j, k]
     told = one.told
-    told.q += charge * abs(by_q)
-    told.qq += charge * by_q * by_q
-    told.qr += charge * by_q * by_r
-    told.rr += charge * by_r * by_r
-    told.charge_C += charge
-    if charge > 0.0:
-        told.by_q += charge * by_q * by_q / told.charge_C
-        told.by_r += charge * by_q * by_r / told.charge_C
+    _add_to(told, charge, by_q, by_r)
     (least_q_C, most_q_C), (least_r, most_r) = settings.bounds
     to_q = min(max(q + gain[Q] * innovation, least_q_C), most_q_C)
     to_r = min(max(r_o + gain[R] * innovation, least_r), most_r)

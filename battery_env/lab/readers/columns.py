@@ -254,14 +254,10 @@ def _split(name: str, quantity: str) -> tuple[str, str]:
 def _label(name: str | None, text: str | None) -> str:
     """A name with the unit that is written below it, unless it has one itself."""
     name, unit = name or "", (text or "").strip(_AROUND_UNITS)
+    is_unit = any(_unit(unit, quantity) for quantity in _UNITS)
     is_plain = any("".join(_words(name)) in ranks for ranks in _RANKS.values())
-    if (
-        not name
-        or not any(_unit(unit, each) for each in _UNITS)
-        or not (is_plain or not any(_split(name, q)[1] for q in _UNITS))
-    ):
-        return name
-    return f"{name} ({unit})"
+    has_none = is_plain or not any(_split(name, quantity)[1] for quantity in _UNITS)
+    return f"{name} ({unit})" if name and is_unit and has_none else name
 
 
 def _unit(text: str, quantity: str) -> str | None:
