@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import sqrt
 from typing import Any, overload
 
 import numpy as np
+from scipy.stats import truncnorm
 
 from battery_env.arrays import BoolArray, FloatArray, StringArray
 
@@ -45,6 +47,22 @@ class Estimate:
         elif not self.settled:
             object.__setattr__(self, "settled_q_mobile", False)
             object.__setattr__(self, "settled_r_o", False)
+
+    def within(self, low_C: float, high_C: float) -> Estimate:
+        """
+        Tell the estimate where ``q_mobile`` is known to lie.
+
+        :param low_C: least ``q_mobile``, C
+        :param high_C: largest one, C
+        :return: with the mean and the standard deviation that the logarithm of ``q_mobile`` has there
+        """
+        share = self.sd_q_mobile / self.q_mobile
+        if not 0.0 < share < np.inf:
+            return self
+        ends = np.log([low_C / self.q_mobile, high_C / self.q_mobile]) / share
+        mean, variance = (float(each) for each in truncnorm.stats(*ends))
+        q_mobile = float(np.clip(self.q_mobile * np.exp(share * mean), low_C, high_C))
+        return replace(self, q_mobile=q_mobile, sd_q_mobile=q_mobile * share * sqrt(max(variance, 0.0)))
 
 
 _COLUMNS = ("q_mobile", "r_o", "sd_q_mobile", "sd_r_o", "settled_q_mobile", "settled_r_o")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from math import hypot, log
+from math import exp, hypot, log
 from pathlib import Path
 from typing import Any
 
@@ -224,6 +224,15 @@ class CellFit:
     def q_mobile_bounds_C(self) -> tuple[float, float]:
         """Where to search for ``q_mobile``, C: a cell does not grow."""
         return Q_MOBILE.limits[0], min(_GROWTH * self.cell.q_mobile, Q_MOBILE.limits[1])
+
+    @property
+    def life_q_mobile_C(self) -> tuple[float, float]:
+        """
+        Where ``q_mobile`` lies over the life of such a cell, C: between those fitted, further down by what they leave out of a
+        life, and a fifth beyond both ends, as another cell of the kind may hold more or less.
+        """
+        q_C = np.array([discharge.q_mobile for discharge in self.discharges])
+        return float(q_C.min()) * exp(-unseen_of_life(q_C)) / _GROWTH, self.q_mobile_bounds_C[1]
 
     def constants_table(self) -> pd.DataFrame:
         """

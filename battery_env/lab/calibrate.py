@@ -254,6 +254,8 @@ def _end(
     if not (seen.in_progress or ahead.is_asked):
         return None
     load = settings.future_current_A if ahead.load is None else ahead.load
+    if settings.prior_q_mobile_C is None and settings.cell_q_mobile_C is not None:
+        estimate = estimate.within(*settings.cell_q_mobile_C)
     try:
         end = forecast(
             seen.record,

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import exp, hypot, isnan, log, sqrt
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,8 @@ from battery_env.electrochemistry.ends import BAND, quantile
 from battery_env.estimators.diagnosis.conditions import is_only_imprecise
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.lab.forecast import WHOLE_ERROR
-from battery_env.records import drawn, mean_current_A
+from battery_env.loads import Load, LoadToCome
+from battery_env.records import VARIED_SHARE, drawn, mean_current_A
 from battery_env.records.discharge import Discharge
 
 #: What is believed of a cell before its discharges tell, as shares of q_mobile: the step from one to the next, the error of
@@ -94,6 +96,27 @@ class Life:
         mean_C, sd_C = self.next_q_mobile_C
         last = self.table[self.table["valid"]].iloc[-1]
         return mean_C, hypot(sd_C, mean_C * WHOLE_ERROR * last["sd_q_mobile_C"] / last["q_mobile_C"])
+
+    def prior_for(self, running: Discharge, load: LoadToCome | None = None) -> tuple[float, float]:
+        """
+        The prior that suits a discharge in progress: :attr:`prior_q_mobile_C` where all currents, so far and to come, lie
+        within 5 % of those of the life, and :attr:`prior_at_other_loads_C` anywhere else.
+
+        :param running: the discharge in progress
+        :param load: to come, as :func:`battery_env.forecast` takes it; ``None``: as so far
+        :return: mean and standard deviation of ``q_mobile``, C
+        """
+        if isinstance(load, Load) and load.unit == "current":
+            to_come_A = load.value.tolist()
+        elif load is None or isinstance(load, Real):
+            to_come_A = [] if load is None else [float(load)]
+        else:
+            return self.prior_at_other_loads_C
+        usual_A = self.table["mean_current_A"][self.table["valid"]].iloc[-1]
+        so_far_A = np.quantile(running.current_A[running.time_s > running.load_on_time_s], [0.05, 0.95])
+        currents_A = [usual_A, *so_far_A, *to_come_A]
+        is_usual = np.ptp(currents_A) <= VARIED_SHARE * max(currents_A)
+        return self.prior_q_mobile_C if is_usual else self.prior_at_other_loads_C
 
     def after(self, count: int) -> Life:
         """

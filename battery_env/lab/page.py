@@ -1,7 +1,7 @@
 """The page for the bench, ``battery-calibrate page``: files in, q_max, R_o, health, life and the end of a discharge out."""
 
 import tempfile
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +14,7 @@ from battery_env.lab.calibrate import calibrate
 from battery_env.lab.life import Life, track_life
 from battery_env.lab.many import FileFormat, find_sources
 from battery_env.lab.report import Calibration
-from battery_env.lab.running import forecast_end, has_usual_load
+from battery_env.lab.running import forecast_end
 from battery_env.lab.settings import Settings
 from battery_env.lab.sources import read_source, record_name
 from battery_env.lab.workers import attempt
@@ -78,10 +78,7 @@ def ahead(chosen: Found, life: Life | None, settings: Settings) -> None:
     given_A = st.number_input("load to come (A); 0: as so far", 0.0, value=0.0, step=0.1)
     seen = whole.until(float(whole.time_s[0] + share / 100.0 * np.ptp(whole.time_s)))
     load, count = constant(given_A, "current") if given_A else None, life.table["valid"].sum() if life else 0
-    if life is not None:
-        prior_C = life.prior_q_mobile_C if has_usual_load(life, seen, load) else life.prior_at_other_loads_C
-        settings = replace(settings, prior_q_mobile_C=prior_C)
-    end, _, error = attempt(forecast_end, seen, settings, load)
+    end, _, error = attempt(partial(forecast_end, life=life), seen, settings, load)
     if error:
         st.error(error)
         return

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from battery_env.checks import LoadUnit
@@ -27,7 +26,6 @@ from battery_env.lab.settings import Settings
 from battery_env.lab.sources import Source, find_sources, read_source, record_name
 from battery_env.loads import Load, LoadToCome
 from battery_env.plotting import literal, save_figure
-from battery_env.records import VARIED_SHARE
 from battery_env.records.discharge import Discharge
 
 # By name of the column of a profile: the unit of the load.
@@ -104,25 +102,33 @@ class End:
 
 
 def forecast_end(
-    discharge: Discharge, settings: Settings | None = None, load: LoadToCome | None = None, samples: int = 1000
+    discharge: Discharge,
+    settings: Settings | None = None,
+    load: LoadToCome | None = None,
+    samples: int = 1000,
+    life: Life | None = None,
 ) -> Forecast:
     """
-    The end of a discharge in progress, with all that :class:`~battery_env.Settings` know of it.
+    The end of a discharge in progress, with all that :class:`~battery_env.Settings` and the life of its cell know of it.
 
     .. code-block:: python
 
       life = track_life(read_discharges("life.csv"), cut_off_V=2.7)
-      found = forecast_end(read_discharges("running.csv")[0], Settings(prior_q_mobile_C=life.prior_q_mobile_C), load=1.5)
+      found = forecast_end(read_discharges("running.csv")[0], load=1.5, life=life)
       print(found.eod_quantile_s([0.05, 0.5, 0.95]), found.summary())
 
     :param discharge: what was recorded until now
     :param settings: how to look at it; ``None``: the defaults
     :param load: from the last sample under load on, as :func:`battery_env.forecast` takes it; ``None``: as so far
     :param samples: of what may come
+    :param life: of the cell before, whose prior is taken that suits the load; ``None``: that of the settings, if any
     :return: these
     :raises ValueError: if the discharge cannot be used, or a load cannot be meant
     """
-    end = calibrated(discharge, Settings() if settings is None else settings, Ahead(load, samples, True)).end
+    settings = Settings() if settings is None else settings
+    if life is not None:
+        settings = replace(settings, prior_q_mobile_C=life.prior_for(discharge, load))
+    end = calibrated(discharge, settings, Ahead(load, samples, True)).end
     assert end is not None
     return end
 
@@ -215,8 +221,7 @@ def end_of_record(
         calibrator = replace(settings, method="least-squares", initial_soc=1.0).calibrator()
         assert isinstance(calibrator, LeastSquares)
         past = track_life(before, settings.cut_off_V, calibrator)
-        prior_C = past.prior_q_mobile_C if has_usual_load(past, running, to_come) else past.prior_at_other_loads_C
-        settings = replace(settings, prior_q_mobile_C=prior_C)
+        settings = replace(settings, prior_q_mobile_C=past.prior_for(running, to_come))
     found = calibrated(running, settings, Ahead(to_come, is_asked=True))
     if not found.in_progress:
         raise ValueError(
@@ -224,16 +229,6 @@ def end_of_record(
             "forecast: calibrate it, or give a lower --cut-off"
         )
     return End(record_name(source.stem, source.cycle), found, past, settings.prior_q_mobile_C)
-
-
-def has_usual_load(life: Life, running: Discharge, load: Load | None) -> bool:
-    """Whether a discharge has the constant load of its cell's life within 5 %, so far and under the load to come."""
-    if load is not None and load.unit != "current":
-        return False
-    usual_A = life.table["mean_current_A"][life.table["valid"]].iloc[-1]
-    low_A, high_A = np.quantile(running.current_A[running.time_s > running.load_on_time_s], [0.05, 0.95])
-    currents_A = [usual_A, low_A, high_A, *([] if load is None else load.value)]
-    return bool(np.ptp(currents_A) <= VARIED_SHARE * max(currents_A))
 
 
 class EndFiles:

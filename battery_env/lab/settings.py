@@ -62,6 +62,8 @@ class Settings:
     :param cell: constants of the model; ``None``: those of a new 18650
     :param cell_currents_A: lowest and highest mean current that these constants were fitted to, A: beyond them by more than a
         quarter no estimate is settled, and no nominal capacity is told. ``None``: they hold for all
+    :param cell_q_mobile_C: between which ``q_mobile`` a cell with these constants has over its life, C: what the end of a
+        discharge in progress keeps to, of which no prior is known. ``None``: that is not known
     :param cell_sd_r_o_ohm: what the constants leave open of ``r_o``, ohm
     :param path: how cells of this kind age, which least squares take for a prior; :meth:`for_cell` sets what goes with it
     :param q_mobile_bounds_C: where to search for ``q_mobile``, C; ``None``: where the calibrator does by default
@@ -85,6 +87,7 @@ class Settings:
     nominal_Ah: float | None = None
     cell: CellParameters | None = None
     cell_currents_A: tuple[float, float] | None = None
+    cell_q_mobile_C: tuple[float, float] | None = None
     cell_sd_r_o_ohm: float = 0.0
     path: AgingPath | None = None
     q_mobile_bounds_C: tuple[float, float] | None = None
@@ -140,6 +143,7 @@ class Settings:
                     "mismatch_V": cell.mismatch_V,
                     "thermal": cell.thermal,
                     "cell_currents_A": cell.currents_A,
+                    "cell_q_mobile_C": cell.life_q_mobile_C,
                     "q_mobile_bounds_C": cell.q_mobile_bounds_C,
                     "cell_sd_r_o_ohm": cell.sd_r_o_ohm,
                 }

@@ -192,6 +192,22 @@ class TestUncertainty:
         assert "It rests on its prior." in forecast(self.record, unsettled, model=MODEL, samples=5).summary()
 
 
+@pytest.mark.parametrize("q_mobile", [2000.0, 6000.0, 20000.0])
+@pytest.mark.parametrize("sd_C", [0.0, np.nan, 10.0, 500.0, 3000.0, 1e6, np.inf])
+def test_what_is_known_of_a_cell_narrows_an_estimate_to_it(q_mobile, sd_C):
+    low_C, high_C, estimate = 5000.0, 7000.0, Estimate(q_mobile, 0.1, sd_C, 0.01)
+    told = estimate.within(low_C, high_C)
+    if not 0.0 < sd_C < np.inf:
+        assert told is estimate
+        return
+    assert low_C <= told.q_mobile <= high_C and 0.0 <= told.sd_q_mobile <= sd_C
+    if sd_C == 10.0 and q_mobile == 6000.0:
+        assert (told.q_mobile, told.sd_q_mobile) == pytest.approx((q_mobile, sd_C))
+    if sd_C == 1e6:  # nothing was known but that
+        assert told.q_mobile == pytest.approx(np.sqrt(low_C * high_C), rel=0.01)
+        assert told.sd_q_mobile / told.q_mobile == pytest.approx(np.log(high_C / low_C) / np.sqrt(12.0), rel=0.01)
+
+
 class TestHealth:
     def test_a_new_cell_is_in_full_health(self):
         whole = simulate(4.0, dt=4.0, load_unit="current")
@@ -351,6 +367,14 @@ class TestCommand:
         assert Path("out/run_2.5A_forecast.png").read_bytes().startswith(b"\x89PNG")
         assert main(["forecast", "run_2.5A.csv", "--out", "out"]) == 2
         assert "run_2.5A_forecast.json, out/run_2.5A_forecast.png would be replaced" in capsys.readouterr().err
+
+    def test_a_life_tells_more_of_its_own_load_than_of_any_other(self):
+        life, running = track_life(self.discharges[:10], 2.7), self.discharges[10].until(1200.0)
+        own, other = life.prior_q_mobile_C, life.prior_at_other_loads_C
+        assert own[1] < 0.5 * other[1]
+        loads = {None: own, 2.0: own, 1.5: other, constant(2.0, "current"): own, constant(8.0, "power"): other}
+        assert [life.prior_for(running, load) for load in loads] == list(loads.values())
+        assert life.prior_for(running, read_load("profile.csv")) == life.prior_for(running, lambda time_s: 2.0) == other
 
     def test_of_its_own_folder_only_what_came_before_counts(self, capsys):
         table = pd.read_csv("all.csv")
