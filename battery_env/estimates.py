@@ -8,7 +8,6 @@ from math import sqrt
 from typing import Any, overload
 
 import numpy as np
-from scipy.stats import truncnorm
 
 from battery_env.arrays import BoolArray, FloatArray, StringArray
 
@@ -56,6 +55,8 @@ class Estimate:
         :param high_C: largest one, C
         :return: with the mean and the standard deviation that the logarithm of ``q_mobile`` has there
         """
+        from scipy.stats import truncnorm  # here, as it takes long to import
+
         share = self.sd_q_mobile / self.q_mobile
         if not 0.0 < share < np.inf:
             return self
