@@ -379,9 +379,9 @@ class CostAlgorithm(OffPolicyAlgorithm):
                 "It is of another version of sb3_lac (see the changelog), of another algorithm, or of other arguments: "
                 "whether ent_coef is learned cannot be changed on loading."
             ) from error
-        # Its limits and its discount may be others than those of the file
+        # Its limits may be others than those of the file
         model._project_lambda()
-        if model.env is not None:  # which knows the units of the rewards
+        if model.env is not None and {"gamma", "reward_bound"} & {*kwargs, *(kwargs.get("custom_objects") or ())}:
             model.update_offset(model._vec_normalize_env)
         return model
 

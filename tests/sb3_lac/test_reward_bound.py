@@ -123,7 +123,8 @@ def test_bound_and_offset_are_saved_and_a_larger_bound_can_be_stated_on_loading(
     np.testing.assert_allclose(predictions(changed), predictions(model) + 8.0, rtol=1e-5)
     assert changed.largest_reward.item() == 7.0
     # With one it is at once, that of a new discount too
-    loaded = LAC.load(tmp_path / "model", model.get_env(), reward_bound=7.0, gamma=0.9375, device="cpu")
+    stated = {"reward_bound": 7.0, "custom_objects": {"gamma": 0.9375}}
+    loaded = LAC.load(tmp_path / "model", model.get_env(), device="cpu", **stated)
     np.testing.assert_allclose(predictions(loaded, model.replay_buffer), predictions(model) + 92.0, rtol=1e-5)
     assert loaded.critic_target.offset.item() == 112.0
 
