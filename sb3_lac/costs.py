@@ -82,8 +82,9 @@ class CostAlgorithm(OffPolicyAlgorithm):
     def _setup_model(self) -> None:
         if self.gamma == "auto":
             self.gamma = stated_discount(self.env)
-        # One of numpy would make n-step returns double precision
-        self.gamma = float(self.gamma)
+        # One of numpy would make n-step returns double precision, and YAML takes 1e-3 for a text
+        for name in ("gamma", "alpha3", "lambda_init", "lambda_min", "lambda_max", "reward_bound"):
+            setattr(self, name, None if getattr(self, name) is None else float(getattr(self, name)))
         self._check_arguments()
 
         super()._setup_model()
@@ -357,7 +358,8 @@ class CostAlgorithm(OffPolicyAlgorithm):
             super().save_replay_buffer(part)
 
     def load_replay_buffer(self, path: Any, truncate_last_traj: bool = True) -> None:
-        before = self.replay_buffer
+        # A model may have none, as one that never had an environment
+        before = getattr(self, "replay_buffer", None)
         try:
             super().load_replay_buffer(path, truncate_last_traj)
             self._adopt_replay_buffer()
@@ -379,6 +381,8 @@ class CostAlgorithm(OffPolicyAlgorithm):
             ) from error
         # Its limits may be others than those of the file
         model._project_lambda()
+        if model.env is not None and {"gamma", "reward_bound"} & {*kwargs, *(kwargs.get("custom_objects") or ())}:
+            model.update_offset(model._vec_normalize_env)
         return model
 
     def _excluded_save_params(self) -> list[str]:

@@ -352,15 +352,9 @@ class PublishedPolicy(LyapunovPolicy):
         self.actor_target.set_training_mode(False)
 
 
-class PublishedCnnPolicy(PublishedPolicy):
+class PublishedCnnPolicy(CnnPolicy, PublishedPolicy):
     """``PublishedPolicy`` for image observations, with the arguments of ``CnnPolicy``."""
 
-    def __init__(self, *args: Any, features_extractor_class: type[BaseFeaturesExtractor] = NatureCNN, **kwargs: Any):
-        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
 
-
-class PublishedMultiInputPolicy(PublishedPolicy):
+class PublishedMultiInputPolicy(MultiInputPolicy, PublishedPolicy):
     """``PublishedPolicy`` for dictionary observations, with the arguments of ``MultiInputPolicy``."""
-
-    def __init__(self, *args: Any, features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor, **kwargs: Any):
-        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)

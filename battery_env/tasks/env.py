@@ -34,7 +34,9 @@ def new_task(task: str | type[CalibrationTask], cells: int, options: Mapping[str
     known = kind.options()
     unknown = options.keys() - known.keys()
     if unknown:
-        raise TypeError(f"{', '.join(sorted(unknown))}: no such option. There are {', '.join(sorted(known))}")
+        # In the words of Python, which libraries look for: TorchRL tries each environment with a ``frameskip``
+        named = ", ".join(map(repr, sorted(unknown)))
+        raise TypeError(f"got an unexpected keyword argument {named}. There are {', '.join(sorted(known))}")
     made: CalibrationTask = kind(cells, **options)
     return made
 

@@ -122,8 +122,8 @@ def closed_loop(
         raise ValueError(f"The number of episodes must be a whole number of at least 1, and not {n_episodes!r}.")
     if lyapunov is not None and not isinstance(lyapunov, LyapunovFunction):
         raise ValueError(
-            f"lyapunov={lyapunov!r} must be a LyapunovFunction: that of fit_lyapunov(policy, env), or "
-            "LyapunovFunction(function) for a function of observations."
+            "lyapunov must be a LyapunovFunction: that of fit_lyapunov(policy, env), or LyapunovFunction(function) for a "
+            f"function of observations. This is {lyapunov!r}."
         )
     vec_env = _evaluation_env(policy, env, lyapunov is not None and lyapunov.normalized_rewards)
     if seed is None:
@@ -178,7 +178,7 @@ def _seeds_of(env: VecEnv) -> Collection[int]:
 def _evaluation_env(policy: PolicyPredictor, env: gym.Env | VecEnv, with_rewards: bool) -> VecEnv:
     """Wrap an environment as the policy would, and check that they fit together."""
     if isinstance(policy, type) or not callable(getattr(policy, "predict", None)):
-        raise ValueError(f"{policy!r} has no method predict(observation, deterministic=...), which every policy needs.")
+        raise ValueError(f"Every policy needs a method predict(observation, deterministic=...). None has this: {policy!r}.")
     vec_env = vectorized(env)
     if not isinstance(policy, (BaseAlgorithm, BasePolicy)):
         # A controller that knows nothing of images and their channels

@@ -304,7 +304,7 @@ def critic_of(policy: PolicyPredictor) -> CriticLyapunov:
     """Return the Lyapunov function that LAC has learned, and refuse any other policy."""
     if not isinstance(policy, CostAlgorithm):
         raise ValueError(
-            f"The model must be a LAC or PublishedLAC, which has a Lyapunov function, not {policy!r}. For any other policy, "
-            "learn one with fit_lyapunov(policy, env), and pass it as lyapunov=... (CertificateCallback does so)."
+            "The model must be a LAC or PublishedLAC, which has a Lyapunov function. For any other policy, learn one with "
+            f"fit_lyapunov(policy, env), and pass it as lyapunov=... (CertificateCallback does so). This is {policy!r}."
         )
     return CriticLyapunov(policy)

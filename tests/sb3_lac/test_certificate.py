@@ -615,8 +615,8 @@ def test_what_cannot_be_meant_is_refused(call, env, arguments, message):
 @pytest.mark.parametrize(
     ("policy", "message"),
     [
-        (None, "has no method predict"),
-        (NoController, "has no method predict"),
+        (None, "needs a method predict"),
+        (NoController, "needs a method predict"),
         (NoController(lambda actions: actions), "returned ndarray, and must return two things"),
         (NoController(lambda actions: (actions[0], None)), r"actions of shape \(1,\), and must return one for each of 2 env"),
     ],

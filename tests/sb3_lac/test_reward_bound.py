@@ -117,11 +117,16 @@ def test_bound_and_offset_are_saved_and_a_larger_bound_can_be_stated_on_loading(
     np.testing.assert_array_equal(predictions(loaded, model.replay_buffer), predictions(model))
     changed = LAC.load(tmp_path / "model", reward_bound=7.0, device="cpu")
     assert changed.cost_bound().item() == 7.0
-    # L is that of the new bound from the next update on, which adds 2 / (1 - gamma)
+    # Without an environment L is that of the new bound from the next update on, which adds 2 / (1 - gamma)
     changed.replay_buffer = model.replay_buffer
     changed.costs(model.replay_buffer.sample(4))
     np.testing.assert_allclose(predictions(changed), predictions(model) + 8.0, rtol=1e-5)
     assert changed.largest_reward.item() == 7.0
+    # With one it is at once, that of a new discount too
+    stated = {"reward_bound": 7.0, "custom_objects": {"gamma": 0.9375}}
+    loaded = LAC.load(tmp_path / "model", model.get_env(), device="cpu", **stated)
+    np.testing.assert_allclose(predictions(loaded, model.replay_buffer), predictions(model) + 92.0, rtol=1e-5)
+    assert loaded.critic_target.offset.item() == 112.0
 
 
 def test_report_does_not_change_the_critic(make_model, make_env, train_metrics):
