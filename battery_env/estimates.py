@@ -61,12 +61,6 @@ class Estimates(Sequence[Estimate]):
     :ivar settled: whether both numbers of each are settled
     :ivar settled_q_mobile: whether each ``q_mobile`` is
     :ivar settled_r_o: likewise
-    :param q_mobile: as above
-    :param r_o: likewise
-    :param sd_q_mobile: likewise
-    :param sd_r_o: likewise
-    :param settled_q_mobile: likewise
-    :param settled_r_o: likewise
     :param reason: of a cell by its number, why its estimate is not settled
     """
 
@@ -136,13 +130,7 @@ class EstimateTrace:
 
     @classmethod
     def of(cls, time_s: Sequence[float] | FloatArray, estimates: Sequence[Estimate]) -> EstimateTrace:
-        """
-        A trace of single estimates.
-
-        :param time_s: time of the last sample that each has seen, s
-        :param estimates: as many
-        :return: the trace
-        """
+        """A trace of single estimates, and the time of the last sample that each has seen, s."""
         names = (*_COLUMNS, "settled")
         columns: dict[str, Any] = {name: np.array([getattr(estimate, name) for estimate in estimates]) for name in names}
         return cls(np.array(time_s), **columns, reason=np.array([estimate.reason for estimate in estimates], dtype=object))

@@ -201,7 +201,6 @@ class CellFit:
         that was fitted: a cell does not grow. Without that bound the first quarter of a discharge allows for far larger ones.
 
         :param arguments: others of :class:`~battery_env.LeastSquares`; they replace these
-        :return: the calibrator
         """
         own = {
             "cell": self.cell,
@@ -235,11 +234,7 @@ class CellFit:
         return table.assign(identified=[constant.identified for constant in self.constants])
 
     def summary(self) -> str:
-        """
-        The fit in a few lines.
-
-        :return: text for a terminal
-        """
+        """The fit in a few lines."""
         before_V = np.sqrt(np.mean([discharge.rmse_before_V**2 for discharge in self.discharges]))
         lines = [
             f"{len(self.discharges)} discharges, voltage RMSE {1e3 * before_V:.1f} mV before, {1e3 * self.rmse_V:.1f} mV "
@@ -271,23 +266,14 @@ class CellFit:
         return "\n".join(lines)
 
     def to_json(self, path: str | os.PathLike[str]) -> Path:
-        """
-        Save the fit.
-
-        :param path: where to
-        :return: the file
-        :raises FileExistsError: if the file exists already
-        """
+        """Save the fit to a new file; a ``FileExistsError`` if it exists already."""
         return write_json(path, _FORMAT, _FORMAT_VERSION, asdict(self))
 
     @classmethod
     def from_json(cls, path: str | os.PathLike[str]) -> CellFit:
         """
-        Load a fit.
-
-        :param path: what :meth:`to_json` wrote
-        :return: the fit
-        :raises ValueError: if the file is damaged, was not written so, or is of another format version
+        Load what :meth:`to_json` wrote; a ``ValueError`` for a file that is damaged, another one, or of another format
+        version.
         """
         content = read_json(path, _FORMAT, _FORMAT_VERSION)
         try:

@@ -75,7 +75,6 @@ def sensitivities(record: Record, at: Estimate | None = None, model: RecordModel
     :param record: one discharge, of which only time and current are used
     :param at: the parameters; ``None``: the true ones of a simulated discharge
     :param model: the model; ``None``: isothermal, in steps of 1 s, of a new cell that is full at the first sample
-    :return: voltage and derivatives
     :raises ValueError: for a recorded discharge without parameters
     """
     if at is None:
@@ -98,19 +97,16 @@ def cramer_rao_bound(
     model: RecordModel | None = None,
 ) -> CramerRaoBound:
     """
-    Return the bound for a voltage sensor with white normal noise and an exact current, over time as the record grows:
-    sd^2 = diag((sum over samples of g g^T)^-1) * noise^2, g the derivatives of the voltage with respect to all unknowns.
+    Return the bound for a voltage sensor with white normal noise and an exact current, over time as the record grows: sd^2 =
+    diag((sum over samples of g g^T)^-1) * noise^2, g the derivatives of the voltage with respect to all unknowns
+    (:func:`sensitivities`, which has ``record``, ``at`` and ``model``).
 
     What is known exactly is the current. Were it the power, the current would give the parameters away a little as well, and
     the bound would be lower by 5 to 30 %.
 
-    :param record: one discharge, of which only time and current are used
     :param voltage_noise_V: standard deviation of the noise, V
     :param parameters: which are unknown: ``"q_mobile"``, ``"r_o"`` or both; the other one is known
     :param offset: whether the sensor has an unknown constant offset as well
-    :param at: the parameters; ``None``: the true ones of a simulated discharge
-    :param model: the model; ``None``: isothermal, in steps of 1 s, of a new cell that is full at the first sample
-    :return: the bound
     :raises ValueError: for an argument out of range, or a record that cannot be used
     """
     return CramerRaoBound.of(sensitivities(record, at, model), voltage_noise_V, parameters, offset)

@@ -36,19 +36,12 @@ class Estimator(ABC):
 
     @abstractmethod
     def estimate(self, record: Record) -> Estimate:
-        """
-        The estimate after the whole record.
-
-        :param record: one discharge
-        :return: the estimate
-        """
+        """The estimate after the whole record of one discharge."""
 
     def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:
         """
-        The estimates over time of many discharges; a calibrator that only looks back gives one each, at the end.
-
-        :param records: discharges
-        :return: one trace per discharge, in the same order
+        The estimates over time of many discharges, in their order; a calibrator that only looks back gives one each, at the
+        end.
         """
         return [EstimateTrace.of([record.time_s[-1]], [self.estimate(record)]) for record in records]
 
@@ -95,13 +88,7 @@ class ModelNow(NamedTuple):
     deviations: FloatArray
 
     def draws(self, samples: int, rng: np.random.Generator) -> Cells:
-        """
-        Cells that may be the one that was followed, all equally likely: state, parameters and offset belong together.
-
-        :param samples: how many
-        :param rng: what draws them
-        :return: these
-        """
+        """Cells that may be the one that was followed, all equally likely: state, parameters and offset belong together."""
         middle = np.concatenate([self.state, self.parameters])
         points = middle + rng.standard_normal((samples, len(self.deviations))) @ self.deviations
         for n, parameter in enumerate(PARAMETERS.values(), start=STATE_SIZE):
@@ -140,7 +127,6 @@ class OnlineEstimator(Estimator):
         :param dt_s: time since the previous sample, s; without meaning at the first one. The current of the previous sample
             has flowed all the time
         :param temperature_C: of the cell, degC; ``None``: not measured
-        :return: the estimate
         :raises TypeError: for what is no number
         :raises ValueError: for invalid values; after either error the estimator is as it was
         """
@@ -160,10 +146,8 @@ class OnlineEstimator(Estimator):
 
     def now(self) -> ModelNow:
         """
-        The model at the last sample; what ``soc``, ``voltage_V`` and :meth:`remaining` are told from.
-
-        :return: where it stands
-        :raises NotImplementedError: of an estimator that has none
+        Where the model stands at the last sample, which ``soc``, ``voltage_V`` and :meth:`remaining` are told from, if there
+        is one.
         """
         raise NotImplementedError(f"{type(self).__name__} has no model that follows the discharge")
 
@@ -211,7 +195,6 @@ class OnlineEstimator(Estimator):
             start of each step does. Under a negative number, a charge, the cut-off is never reached
         :param cut_off_V: V; ``None``: the ``VEOD`` of the cell
         :param load_unit: of a number, an array or a function: ``"current"`` in A or ``"power"`` in W
-        :return: time and standard deviation
         :raises ValueError: for an invalid load, also for one that varies and charges the cell beyond full, and for
             an array that ends before the discharge does
         """
@@ -243,7 +226,6 @@ class OnlineEstimator(Estimator):
         Write what the estimator knows of the discharge to a file, from which another one with the same arguments goes on.
 
         :param path: where to; ``.npz`` is added if it is missing. An older state there is replaced, any other file is not
-        :return: the file
         :raises FileExistsError: if there is another file
         """
         return save_state(path, self._made_with(), self._arrays())
@@ -263,35 +245,17 @@ class OnlineEstimator(Estimator):
         self._restore(arrays)
 
     def estimate(self, record: Record) -> Estimate:
-        """
-        The estimate at the last sample of a record.
-
-        :param record: one discharge
-        :return: the estimate
-        :raises ValueError: if the record cannot be used
-        """
+        """The estimate at the last sample of a record; a ``ValueError`` if that cannot be used."""
         return last_estimate(self.trace([record])[0])
 
     def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:
-        """
-        One estimate for every sample of many discharges. A temperature that was measured is taken in with each sample.
-
-        :param records: discharges
-        :return: one trace per discharge, in the same order
-        :raises ValueError: if a record cannot be used
-        """
+        """One estimate for every sample of many discharges. A temperature that was measured is taken in with each sample."""
         traces = [self.follow(record) for record in records]
         self.reset()
         return traces
 
     def follow(self, record: Record) -> EstimateTrace:
-        """
-        One estimate for every sample of a discharge, after which the estimator stands at the last one.
-
-        :param record: one discharge
-        :return: the estimates
-        :raises ValueError: if the record cannot be used
-        """
+        """One estimate for every sample of a discharge, after which the estimator stands at the last one."""
         stream = Stream.of(record, self.dt_s)
         measured: Iterable[tuple[float, ...]] = stream.samples()
         if stream.temperature_C is not None:

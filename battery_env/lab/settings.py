@@ -131,7 +131,6 @@ class Settings:
 
         :param cell: what ``fit_cell`` found; of cells of its kind what ``fit_life`` found; or the constants alone
         :param others: further settings, which replace what the fit knows
-        :return: the settings
         """
         if isinstance(cell, CellFit):
             known: dict[str, Any] = {"cut_off_V": cell.cell.VEOD}
@@ -172,7 +171,6 @@ class Settings:
 
         :param cell: constants of the model at the temperature of a discharge; ``None``: those of the settings
         :param start: how the discharge starts; ``None``: as the settings say
-        :return: the calibrator
         :raises ValueError: for an option out of range, or a policy of another cell or of other parameters
         """
         if self.method == "policy":

@@ -136,7 +136,6 @@ class PolicyEstimator(OnlineEstimator):
         :param recorded: whether for recorded cells: of both parameters one that has learned along the lives of the bundled
             cells, of one of them one that has learned on a model whose error wanders. By default one that has learned on a
             model with wrong constants, as simulated cells have
-        :return: the estimator
         :raises ValueError: for another id, or a time out of range
         :raises ImportError: without the extra ``battery_env[onnx]``
         """
@@ -145,14 +144,7 @@ class PolicyEstimator(OnlineEstimator):
 
     @staticmethod
     def environment(env_id: str, **options: Any) -> CalibrationEnv:
-        """
-        A calibration environment without its wrappers.
-
-        :param env_id: id of a calibration environment
-        :param options: of the environment
-        :return: the environment
-        :raises ValueError: if it is none
-        """
+        """A calibration environment, by its id and options, without its wrappers; a ``ValueError`` if it is none."""
         env = gym.make(env_id, disable_env_checker=True, **options).unwrapped
         if not isinstance(env, CalibrationEnv):
             raise ValueError(f"{env_id} is no calibration environment")
@@ -304,7 +296,6 @@ class PolicyEstimator(OnlineEstimator):
         independent of each other, the mean.
 
         :param record: one discharge; with the full state a simulated one, as no recording has it
-        :return: the estimate
         :raises ValueError: for an invalid record
         """
         check_drawn_charge(drawn_charge_C(check_record(record)))
@@ -315,12 +306,7 @@ class PolicyEstimator(OnlineEstimator):
         return Estimate(q_mobile, r_o, settled=False, reason=Condition.NO_FIT.text)
 
     def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:
-        """
-        The estimates over time of many discharges.
-
-        :param records: discharges; a :class:`~battery_env.trajectories.TrajectoryDataset` is such a sequence
-        :return: one trace per discharge, in the same order
-        """
+        """The estimates over time of many discharges, run as one batch, in their order."""
         task = self._follow(records, self.decision_s)
         samples = [] if self._confidence is None else [(Samples.of(record), shown_beside(record)) for record in records]
         made: list[FloatArray] = []

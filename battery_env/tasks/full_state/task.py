@@ -282,10 +282,8 @@ class FullStateTask(CalibrationTask):
 
     def action_of(self, values: Mapping[str, ArrayLike]) -> FloatArray:
         """
-        The actions that stand for parameters.
-
-        :param values: at least those to be found, by name, C and ohm, shape (...)
-        :return: shape (..., len(parameters)), beyond [-1, 1] for parameters out of the actions' range
+        The actions that stand for parameters by name, C and ohm, beyond [-1, 1] out of their range: shape (...,
+        len(parameters)).
         """
         wanted = np.stack([np.asarray(values[name], dtype=np.float64) for name in self.parameters], axis=-1)
         lowest, highest = np.array([self.formulation.action_ranges[name] for name in self.parameters]).T

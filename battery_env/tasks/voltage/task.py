@@ -223,8 +223,6 @@ class VoltageTask(CalibrationTask):
         """
         What the task can be asked for; its page says what each option means. Errors of the sensors are those of
         :class:`~battery_env.sensors.RandomSensorErrors`.
-
-        :return: default values by name
         """
         return {**super().options(), **asdict(SENSORS)}
 
@@ -399,13 +397,7 @@ class VoltageTask(CalibrationTask):
         self._misfit_V = np.sqrt(np.mean((residual_V - self._offset_V[:, None, None]) ** 2, axis=(1, 2)))
 
     def restore(self, estimate: FloatArray, action: FloatArray, constants: FloatArray) -> None:
-        """
-        Let all cells stand where a policy left off.
-
-        :param estimate: (q_mobile, r_o), C and ohm, shape (2,) or (cells, 2)
-        :param action: the last one, shape (len(parameters),) or (cells, len(parameters))
-        :param constants: as of :attr:`constants`
-        """
+        """Let all cells stand where a policy left off: at its estimate, C and ohm, its last action, and :attr:`constants`."""
         self._estimate[:], self._action[:] = estimate, action
         if self._fit is not None:
             self._fit.constants[:] = constants
@@ -414,8 +406,8 @@ class VoltageTask(CalibrationTask):
     @property
     def constants(self) -> FloatArray:
         """
-        What the fit in the observation says of the constants, as of :class:`~battery_env.tasks.voltage.fit.Fitted`; nothing
-        without one; a new array each time.
+        What the fit in the observation says of the constants, as of :class:`~battery_env.tasks.voltage.fit.NuisanceFit`; a new
+        array.
         """
         return np.zeros((self.cells, 0)) if self._fit is None else self._fit.constants.copy()
 
