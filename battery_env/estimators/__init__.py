@@ -5,7 +5,7 @@ from battery_env.estimators.cell_fit import CellFit
 from battery_env.estimators.closed_form import ClosedForm
 from battery_env.estimators.cramer_rao import CramerRaoBound, Sensitivities, cramer_rao_bound, sensitivities
 from battery_env.estimators.diagnosis.rest import soc_from_rest
-from battery_env.estimators.estimator import Estimator, OnlineBatch, OnlineEstimator, Remaining
+from battery_env.estimators.estimator import Estimator, OnlineEstimator, Remaining
 from battery_env.estimators.fit_life import fit_life
 from battery_env.estimators.greedy import GreedyOneStep
 from battery_env.estimators.joint_fit import fit_cell
@@ -22,7 +22,6 @@ __all__ = [
     "ExtendedKalmanFilter",
     "GreedyOneStep",
     "LeastSquares",
-    "OnlineBatch",
     "OnlineEstimator",
     "Remaining",
     "Sensitivities",

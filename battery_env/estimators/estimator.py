@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
-from copy import copy
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtri
 
 from battery_env.arrays import FloatArray
-from battery_env.checks import check_numbers, check_whole_number
+from battery_env.checks import check_numbers
 from battery_env.electrochemistry import STATE_SIZE, CellParameters, LoadUnit, state_of_charge, voltage
 from battery_env.electrochemistry.ends import BAND, LONGEST_S, Cells, run_down
 from battery_env.estimates import Estimate, EstimateTrace, last_estimate
@@ -25,10 +24,6 @@ from battery_env.records import Record, Stream
 
 # Points between limits keep this far from them, as a share of their distance, so that rounding leaves them within.
 _ROUNDING = 1e-9
-
-
-# Of which cells an array of a saved batch is, in place of a number.
-_ALL = "all"
 
 
 class Estimator(ABC):
@@ -133,16 +128,6 @@ class OnlineEstimator(Estimator):
 
     def check(self, voltage_V: float, current_A: float, dt_s: float, temperature_C: float | None = None) -> None:
         """Refuse a sample that :meth:`update` would refuse, and change nothing."""
-
-    def batch(self, cells: int) -> OnlineBatch:
-        """
-        Estimators like this one, each for a cell of its own.
-
-        :param cells: how many
-        :return: these, before their first samples
-        :raises ValueError: for no cells
-        """
-        return OnlineBatch(self, cells)
 
     def now(self) -> ModelNow:
         """
@@ -262,91 +247,6 @@ class OnlineEstimator(Estimator):
             measured = ((*sample, t_C) for sample, t_C in zip(measured, stream.temperature_C.tolist(), strict=True))
         self.reset()
         return EstimateTrace.of(stream.time_s, [self.update(*sample) for sample in measured])
-
-
-class OnlineBatch:
-    """
-    Cells side by side, each followed by an estimator of its own with the same arguments.
-
-    :ivar estimators: these
-    :param estimator: what to copy; it stays as it is
-    :param cells: how many
-    :raises ValueError: for no cells
-    """
-
-    def __init__(self, estimator: OnlineEstimator, cells: int) -> None:
-        if check_whole_number("cells", cells) < 1:
-            raise ValueError(f"cells must be at least 1, got {cells!r}")
-        self.estimators: Sequence[OnlineEstimator] = self._copies(estimator, cells)
-        self.reset()
-
-    def _copies(self, estimator: OnlineEstimator, cells: int) -> Sequence[OnlineEstimator]:
-        return [copy(estimator) for _ in range(cells)]
-
-    def reset(self, cells: Iterable[int] | None = None) -> None:
-        """Let discharges begin."""
-        for n in range(len(self.estimators)) if cells is None else cells:
-            self.estimators[n].reset()
-
-    def update(
-        self, voltage_V: ArrayLike, current_A: ArrayLike, dt_s: ArrayLike, temperature_C: ArrayLike | None = None
-    ) -> Sequence[Estimate]:
-        """Take in one sample of each cell: of all, or of none if one is refused."""
-        samples = self.check(voltage_V, current_A, dt_s, temperature_C)
-        return [estimator.update(*sample) for estimator, sample in zip(self.estimators, samples, strict=True)]
-
-    def check(
-        self,
-        voltage_V: ArrayLike,
-        current_A: ArrayLike,
-        dt_s: ArrayLike,
-        temperature_C: ArrayLike | None = None,
-        cells: Iterable[int] | None = None,
-    ) -> list[tuple[Any, ...]]:
-        """Refuse what :meth:`update` would refuse, of these cells or of all; return the samples of all."""
-        count = len(self.estimators)
-        # as objects, so that what is no number turns no other one into a text
-        columns = (np.asarray(column, dtype=object) for column in (voltage_V, current_A, dt_s, temperature_C))
-        samples = list(zip(*(np.broadcast_to(column, count).tolist() for column in columns), strict=True))
-        for n in range(count) if cells is None else cells:
-            try:
-                self.estimators[n].check(*samples[n])
-            except (TypeError, ValueError) as error:
-                raise type(error)(f"cell {n}: {error}") from error
-        return samples
-
-    def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write what is known of all cells, as :meth:`OnlineEstimator.save`."""
-        parts, arrays = [each._arrays() for each in self.estimators], {}
-        for name in dict.fromkeys(name for part in parts for name in part):
-            found = [part.get(name, np.empty(0)) for part in parts]
-            if len({(array.dtype, array.shape) for array in found}) == 1:  # one array takes a thousandth of the time
-                arrays[f"{_ALL}/{name}"] = np.stack(found)
-            else:
-                arrays |= {f"{n}/{name}": part[name] for n, part in enumerate(parts) if name in part}
-        return save_state(path, self._made_with(), arrays)
-
-    def load(self, path: str | os.PathLike[str]) -> None:
-        """Go on from what :meth:`save` wrote."""
-        parts: list[dict[str, NDArray[Any]]] = [{} for _ in self.estimators]
-        with refusing(path):
-            for name, array in load_state(path, self._made_with()).items():
-                number, _, own_name = name.partition("/")
-                if number == _ALL and len(array) == len(parts):
-                    for part, own in zip(parts, array, strict=True):
-                        part[own_name] = own
-                elif number.isdecimal() and int(number) < len(parts):
-                    parts[int(number)][own_name] = array
-                else:
-                    raise ValueError(f"arrays that are missing or unknown: {name}")
-            for n, (estimator, part) in enumerate(zip(self.estimators, parts, strict=True)):
-                with refusing(f"cell {n}"):
-                    estimator._check_state(part)
-        for estimator, part in zip(self.estimators, parts, strict=True):
-            estimator._restore(part)
-
-    def _made_with(self) -> dict[str, Any]:
-        return {"cells": len(self.estimators), **self.estimators[0]._made_with()}
 
 
 def check_bounds(

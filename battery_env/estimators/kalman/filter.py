@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from math import inf, isnan, nan
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from battery_env.checks import ZERO_CELSIUS_K, check_gain_sd, check_not_negative, check_numbers
+from battery_env.checks import ZERO_CELSIUS_K, check_gain_sd, check_not_negative, check_numbers, check_whole_number
 from battery_env.compiled import compiled
 from battery_env.electrochemistry import NEW_CELL, STATE_SIZE, CellParameters, PackedConstants, check_cell, check_dt
 from battery_env.electrochemistry.ends import SURPLUS_SHARE
@@ -20,10 +22,10 @@ from battery_env.estimators.diagnosis import gaps
 from battery_env.estimators.diagnosis.conditions import Condition, Verdict
 from battery_env.estimators.diagnosis.rest import check_initial_soc
 from battery_env.estimators.diagnosis.samples import begin, belongs, examine, expect, measured, remember, take_in
-from battery_env.estimators.estimator import ModelNow, OnlineBatch, OnlineEstimator, check_bounds
+from battery_env.estimators.estimator import ModelNow, OnlineEstimator, check_bounds
 from battery_env.estimators.kalman.bank import conclude, filters_of_prior, take
 from battery_env.estimators.kalman.state import CELL, ESTIMATE, FILTER, SAMPLE, Q, R, Settings
-from battery_env.estimators.state_files import check_all, check_like
+from battery_env.estimators.state_files import check_all, check_like, load_state, refusing, save_state
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, R_O, check_parameters
 from battery_env.records import ChargeBefore, Record, Stream, are_plausible, check_drawn_charge, check_sample, shown_beside
 
@@ -350,23 +352,29 @@ class ExtendedKalmanFilter(OnlineEstimator):
         self._cells[...], self._filters[...] = arrays["cells"], arrays["filters"]
 
 
-class KalmanBatch(OnlineBatch):
+class KalmanBatch:
     """
     Cells side by side, each followed by a filter of its own with the same arguments: rows of the same tables, which take their
     samples in one compiled call.
 
+    :ivar estimators: these filters
     :param estimator: what to copy; it stays as it is
     :param cells: how many
     :raises ValueError: for no cells
     """
 
-    estimators: Sequence[ExtendedKalmanFilter]
-
-    def _copies(self, estimator: OnlineEstimator, cells: int) -> Sequence[ExtendedKalmanFilter]:
-        assert isinstance(estimator, ExtendedKalmanFilter)
+    def __init__(self, estimator: ExtendedKalmanFilter, cells: int) -> None:
+        if check_whole_number("cells", cells) < 1:
+            raise ValueError(f"cells must be at least 1, got {cells!r}")
         self._cells = np.zeros(cells, CELL)
         self._filters = np.zeros((cells, estimator._filters.shape[1]), FILTER)
-        return [estimator._of_rows(self._cells[n : n + 1], self._filters[n : n + 1]) for n in range(cells)]
+        self.estimators = [estimator._of_rows(self._cells[n : n + 1], self._filters[n : n + 1]) for n in range(cells)]
+        self.reset()
+
+    def reset(self, cells: Iterable[int] | None = None) -> None:
+        """Let discharges begin."""
+        for n in range(len(self.estimators)) if cells is None else cells:
+            self.estimators[n].reset()
 
     def update(
         self, voltage_V: ArrayLike, current_A: ArrayLike, dt_s: ArrayLike, temperature_C: ArrayLike | None = None
@@ -385,7 +393,14 @@ class KalmanBatch(OnlineBatch):
         good = are_plausible(of["voltage_V"], of["current_A"], of["dt_s"], degrees_C, seen["current_A"])
         doubtful = is_first | ~(good & (drawn_C > one.least_drawn_C))
         if doubtful.any():
-            self.check(voltage_V, current_A, dt_s, temperature_C, np.flatnonzero(doubtful).tolist())
+            # as objects, so that what is no number turns no other one into a text
+            given = (np.asarray(each, dtype=object) for each in (voltage_V, current_A, dt_s, temperature_C))
+            of_cells = list(zip(*(np.broadcast_to(each, len(cells)).tolist() for each in given), strict=True))
+            for n in np.flatnonzero(doubtful).tolist():
+                try:
+                    self.estimators[n].check(*of_cells[n])
+                except (TypeError, ValueError) as error:
+                    raise type(error)(f"cell {n}: {error}") from error
         for n in np.flatnonzero(is_first & ~np.isnan(of["temperature_K"])).tolist():
             self.estimators[n]._begin(float(of["temperature_K"][n]))
         (said,) = one._follow(cells, self._filters, samples)
@@ -398,6 +413,26 @@ class KalmanBatch(OnlineBatch):
 
         settled_q_mobile, settled_r_o = (said["condition"] == Condition.SETTLED).T
         return Estimates(said["q_mobile"], said["r_o"], sd_q_mobile, sd_r_o, settled_q_mobile, settled_r_o, reason_of)
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write what is known of all cells, as :meth:`ExtendedKalmanFilter.save`."""
+        return save_state(path, self._made_with(), self._arrays())
+
+    def load(self, path: str | os.PathLike[str]) -> None:
+        """Go on from what :meth:`save` wrote."""
+        arrays = load_state(path, self._made_with())
+        with refusing(path):
+            check_like(arrays, self._arrays())
+            for n, each in enumerate(self.estimators):
+                with refusing(f"cell {n}"):
+                    each._check_state({name: array[n : n + 1] for name, array in arrays.items()})
+        self._cells[...], self._filters[...] = arrays["cells"], arrays["filters"]
+
+    def _made_with(self) -> dict[str, Any]:
+        return {"cells": len(self.estimators), **self.estimators[0]._made_with()}
+
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        return {"cells": self._cells, "filters": self._filters}
 
 
 def _verdict(first: Sequence[int], r_o_comes_first: bool, shown: Mapping[str, Any]) -> Verdict:
