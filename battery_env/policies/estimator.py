@@ -24,7 +24,7 @@ from battery_env.estimators.state_files import check_all, check_like
 from battery_env.parameters import PARAMETERS
 from battery_env.policies.confidence import Confidence
 from battery_env.policies.pretrained import pretrained_policy
-from battery_env.policies.readings import ReadingsSoFar
+from battery_env.policies.readings import columns, on_grid, with_voltage
 from battery_env.records import (
     Samples,
     Shown,
@@ -154,7 +154,7 @@ class PolicyEstimator(OnlineEstimator):
         """
         Forget all samples: the next one is the first of a discharge, of a fully charged cell at rest.
         """
-        self._readings = ReadingsSoFar()
+        self._samples: list[tuple[float, float, float]] = []
         self._drawn_C = 0.0
         self._decisions = 0
         self._now = np.array([self.cell.q_mobile, self.cell.r_o])
@@ -168,7 +168,7 @@ class PolicyEstimator(OnlineEstimator):
         self._sd, self._found = [nan, nan], None
         self._verdict = Verdict(False, False, (Condition.NO_FIT if self._confidence is None else Condition.NOT_YET).text)
         if self._confidence is not None and self._fitted is not None:
-            samples = self._readings.known(self._decisions * self.decision_s)
+            samples = with_voltage(self._samples, self._decisions * self.decision_s)
             (sd,) = self._confidence.standard_deviations(self._fitted, self._now[None])
             self._verdict = self._confidence.verdict(self._fitted, 0, self._now, samples, Shown())
             self._found = self._confidence.constants(self._fitted, 0)
@@ -181,10 +181,10 @@ class PolicyEstimator(OnlineEstimator):
             raise ValueError(f"a policy of {self.env_id} takes no stream: it needs the full state, or a whole life")
         if temperature_C is not None:
             raise ValueError("a policy takes no temperature: its model is isothermal. Leave temperature_C out.")
-        if not self._readings.time_s:
+        if not self._samples:
             check_sample(voltage_V, current_A, dt_s)
             return
-        before_A = self._readings.current_A[-1]
+        _, _, before_A = self._samples[-1]
         check_sample(voltage_V, current_A, dt_s, previous_A=before_A)
         check_drawn_charge(self._drawn_C + dt_s * before_A, -SURPLUS_SHARE * self.cell.q_mobile)
 
@@ -200,12 +200,15 @@ class PolicyEstimator(OnlineEstimator):
         :raises ValueError: for invalid values, a temperature, or a policy that takes no stream
         """
         self.check(voltage_V, current_A, dt_s, temperature_C)
-        readings = self._readings
-        if readings.time_s:
-            self._drawn_C += dt_s * readings.current_A[-1]
-        readings.add(voltage_V, current_A, dt_s)
-        due = int(readings.time_s[-1] / self.decision_s + 1e-9)
-        if due > self._decisions and self._readings.are_two(due * self.decision_s):
+        time_s = 0.0
+        if self._samples:
+            before_s, _, before_A = self._samples[-1]
+            time_s = before_s + dt_s
+            self._drawn_C += dt_s * before_A
+        self._samples.append((time_s, float(voltage_V), float(current_A)))
+        due = int(time_s / self.decision_s + 1e-9)
+        # two beside the first one
+        if due > self._decisions and len(with_voltage(self._samples, due * self.decision_s).time_s) > 2:
             self._decide(due)
         (q_mobile, r_o), (sd_q_mobile, sd_r_o), (settled_q, settled_r_o, reason) = self._now.tolist(), self._sd, self._verdict
         both = settled_q and settled_r_o
@@ -218,7 +221,7 @@ class PolicyEstimator(OnlineEstimator):
 
     def _decide(self, due: int) -> None:
         """One decision, on all readings up to the time when it was due."""
-        task = self._follow([self._readings.record(self.dt_s)], due * self.decision_s)
+        task = self._follow([on_grid(self._samples, self.dt_s)], due * self.decision_s)
         assert isinstance(task, VoltageTask)  # no other follows a stream
         task.restore(self._now, self._action, self._constants)
         self._constants = task.constants[0]
@@ -233,8 +236,8 @@ class PolicyEstimator(OnlineEstimator):
         model = RecordModel(cell_with(self.cell, self._found), dt_s=self.dt_s)
         q_mobile, r_o = self._now.tolist()
         state = model.start(q_mobile)
-        if self._readings.time_s and self._readings.time_s[-1] > 0.0:
-            state = model.simulate(self._readings.record(self.dt_s).current_A, q_mobile, r_o).state[-1]
+        if self._samples and self._samples[-1][0] > 0.0:
+            state = model.simulate(on_grid(self._samples, self.dt_s).current_A, q_mobile, r_o).state[-1]
         return ModelNow(model.cell, False, self.dt_s, state, np.append(self._now, 0.0), np.zeros((0, STATE_SIZE + 3)))
 
     def _made_with(self) -> dict[str, Any]:
@@ -251,7 +254,7 @@ class PolicyEstimator(OnlineEstimator):
         progress = np.array([self._drawn_C, self._decisions, *self._now])
         fitted = {} if self._fitted is None else {f"fitted_{name}": each for name, each in self._fitted._asdict().items()}
         return fitted | {
-            "samples": self._readings.columns(),
+            "samples": columns(self._samples),
             "progress": progress,
             "action": self._action,
             "constants": self._constants,
@@ -282,7 +285,7 @@ class PolicyEstimator(OnlineEstimator):
         check_all(count=decisions in range(int(max(time_s, default=0.0) / self.decision_s + 1e-9) + 1))
 
     def _restore(self, arrays: dict[str, NDArray[Any]]) -> None:
-        self._readings = ReadingsSoFar.of(arrays["samples"])
+        self._samples = list(map(tuple, arrays["samples"].T.tolist()))
         self._drawn_C, self._decisions = float(arrays["progress"][0]), int(arrays["progress"][1])
         self._now, self._action = arrays["progress"][2:].copy(), arrays["action"].copy()
         self._constants = arrays["constants"].copy()
