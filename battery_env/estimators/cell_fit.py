@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from numpy.typing import ArrayLike
 
 from battery_env.arrays import FloatArray, IntArray
@@ -223,15 +222,6 @@ class CellFit:
     def q_mobile_bounds_C(self) -> tuple[float, float]:
         """Where to search for ``q_mobile``, C: a cell does not grow."""
         return Q_MOBILE.limits[0], min(_GROWTH * self.cell.q_mobile, Q_MOBILE.limits[1])
-
-    def constants_table(self) -> pd.DataFrame:
-        """
-        The constants before and after, and how sure they are.
-
-        :return: one row a constant, the fields of :class:`FittedConstant` and ``identified``
-        """
-        table = pd.DataFrame(self.constants)
-        return table.assign(identified=[constant.identified for constant in self.constants])
 
     def summary(self) -> str:
         """The fit in a few lines."""

@@ -49,24 +49,6 @@ class CramerRaoBound:
     sd_q_mobile: FloatArray
     sd_r_o: FloatArray
 
-    @classmethod
-    def of(
-        cls, slopes: Sensitivities, voltage_noise_V: float, parameters: Sequence[str] = PARAMETER_NAMES, offset: bool = False
-    ) -> CramerRaoBound:
-        """Return the bound that sensitivities imply."""
-        names = check_parameters(parameters)
-        if not 0.0 < voltage_noise_V < np.inf:
-            raise ValueError(f"voltage_noise_V must be greater than 0 V, got {voltage_noise_V!r}")
-        by_parameter = {"q_mobile": slopes.by_q_mobile_V_per_C, "r_o": slopes.by_r_o_A}
-        columns = [by_parameter[name] for name in names]
-        if offset:
-            columns.append(np.ones(len(slopes.time_s)))
-        gradient = np.column_stack(columns) / voltage_noise_V
-        variance = _inverse_diagonals(np.cumsum(gradient[:, :, None] * gradient[:, None, :], axis=0))
-        sd = dict.fromkeys(PARAMETER_NAMES, np.full(len(slopes.time_s), np.nan))
-        sd |= {name: np.sqrt(variance[:, n]) for n, name in enumerate(names)}
-        return cls(slopes.time_s, sd["q_mobile"], sd["r_o"])
-
 
 def sensitivities(record: Record, at: Estimate | None = None, model: RecordModel | None = None) -> Sensitivities:
     """
@@ -109,7 +91,19 @@ def cramer_rao_bound(
     :param offset: whether the sensor has an unknown constant offset as well
     :raises ValueError: for an argument out of range, or a record that cannot be used
     """
-    return CramerRaoBound.of(sensitivities(record, at, model), voltage_noise_V, parameters, offset)
+    names = check_parameters(parameters)
+    if not 0.0 < voltage_noise_V < np.inf:
+        raise ValueError(f"voltage_noise_V must be greater than 0 V, got {voltage_noise_V!r}")
+    slopes = sensitivities(record, at, model)
+    by_parameter = {"q_mobile": slopes.by_q_mobile_V_per_C, "r_o": slopes.by_r_o_A}
+    columns = [by_parameter[name] for name in names]
+    if offset:
+        columns.append(np.ones(len(slopes.time_s)))
+    gradient = np.column_stack(columns) / voltage_noise_V
+    variance = _inverse_diagonals(np.cumsum(gradient[:, :, None] * gradient[:, None, :], axis=0))
+    sd = dict.fromkeys(PARAMETER_NAMES, np.full(len(slopes.time_s), np.nan))
+    sd |= {name: np.sqrt(variance[:, n]) for n, name in enumerate(names)}
+    return CramerRaoBound(slopes.time_s, sd["q_mobile"], sd["r_o"])
 
 
 def _inverse_diagonals(information: FloatArray) -> FloatArray:

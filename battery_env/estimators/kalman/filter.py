@@ -33,6 +33,8 @@ _PRIOR_SD_SHARE_Q = 0.25
 # Of a new 18650; a resistance goes with one over the size.
 _PRIOR_SD_R_OHM = 0.15
 _HOUR_S = 3600.0
+# So far may the parameters wander in an hour, as a share of their prior means: a little keeps a filter awake.
+_DRIFT_PER_HOUR = 0.001
 _NOISE_V = 0.005
 # Covariances of a state may be so much larger than their variances allow, as a share.
 _ROUNDED = 1e-6
@@ -113,8 +115,6 @@ class ExtendedKalmanFilter(OnlineEstimator):
     :param offset_sd_V: standard deviation of a constant offset of sensor and model, V; ``None``: ``mismatch_V``, and at least
         0.005 V. With 0 errors are about half as large if there is no offset, and several percent if there is one of 10 mV
     :param mismatch_V: how far the error of the model itself wanders in an hour (standard deviation of a random walk), V
-    :param drift_per_hour: how far the parameters may wander in an hour, as a share of their prior means. A little keeps the
-        filter awake
     :param current_gain_sd: standard deviation of the gain of the current sensor, as a share of it
     :param initial_soc: state of charge at the first sample, after a rest: a number, or (mean, standard deviation), which adds
         to that of ``q_mobile``
@@ -135,7 +135,6 @@ class ExtendedKalmanFilter(OnlineEstimator):
         voltage_noise_V: float | None = None,
         offset_sd_V: float | None = None,
         mismatch_V: float = 0.0,
-        drift_per_hour: float = 0.001,
         current_gain_sd: float = 0.0,
         initial_soc: float | tuple[float, float] = 1.0,
         cell_sd_r_o_ohm: float = 0.0,
@@ -146,10 +145,9 @@ class ExtendedKalmanFilter(OnlineEstimator):
         self.dt_s = check_dt(dt_s, self.cell)
         self.bounds = check_bounds(q_mobile_bounds_C, r_o_bounds_ohm)
         offset_sd_V = max(_NOISE_V, mismatch_V) if offset_sd_V is None else offset_sd_V
-        check_not_negative(offset_sd_V=offset_sd_V, mismatch_V=mismatch_V, drift_per_hour=drift_per_hour)
+        check_not_negative(offset_sd_V=offset_sd_V, mismatch_V=mismatch_V, cell_sd_r_o_ohm=cell_sd_r_o_ohm)
         voltage_noise_V = _checked_noise_V(voltage_noise_V, mismatch_V)
         self.current_gain_sd = check_gain_sd(current_gain_sd)
-        check_not_negative(cell_sd_r_o_ohm=cell_sd_r_o_ohm)
         self.initial_soc = check_initial_soc(initial_soc)
         q, q_sd = self._prior("q_mobile", prior_q_mobile_C, _PRIOR_SD_SHARE_Q * self.cell.q_mobile)
         r_o, r_o_sd = self._prior("r_o", prior_r_o_ohm, _PRIOR_SD_R_OHM * NEW_CELL.q_mobile / self.cell.q_mobile)
@@ -163,8 +161,8 @@ class ExtendedKalmanFilter(OnlineEstimator):
             searched=("q_mobile" in self.parameters, "r_o" in self.parameters),
             variance=(q_sd**2, r_o_sd**2),
             growth=(
-                (drift_per_hour * q) ** 2 / _HOUR_S if q_sd > 0.0 else 0.0,
-                (drift_per_hour * r_o) ** 2 / _HOUR_S if r_o_sd > 0.0 else 0.0,
+                (_DRIFT_PER_HOUR * q) ** 2 / _HOUR_S if q_sd > 0.0 else 0.0,
+                (_DRIFT_PER_HOUR * r_o) ** 2 / _HOUR_S if r_o_sd > 0.0 else 0.0,
             ),
             offset_growth=float(mismatch_V) ** 2 / _HOUR_S,
             bounds=(_pair(q_mobile_bounds_C), _pair(r_o_bounds_ohm)),
