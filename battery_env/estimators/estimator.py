@@ -17,7 +17,7 @@ from battery_env.checks import check_numbers
 from battery_env.electrochemistry import STATE_SIZE, CellParameters, LoadUnit, state_of_charge, voltage
 from battery_env.electrochemistry.ends import BAND, LONGEST_S, Cells, run_down
 from battery_env.estimates import Estimate, EstimateTrace, last_estimate
-from battery_env.estimators.state_files import load_state, refusing, save_state
+from battery_env.estimators.state_files import load_state, save_state
 from battery_env.loads import KnownLoad, Load, in_steps, known_load
 from battery_env.parameters import PARAMETERS
 from battery_env.records import Record, Stream
@@ -144,10 +144,6 @@ class OnlineEstimator(Estimator):
         """What it knows of the discharge, by name."""
         raise NotImplementedError(f"{type(self).__name__} cannot be saved")
 
-    def _check_state(self, arrays: dict[str, NDArray[Any]]) -> None:
-        """Refuse, with a ValueError, what :meth:`_arrays` of no discharge can be."""
-        raise NotImplementedError(f"{type(self).__name__} cannot be saved")
-
     def _restore(self, arrays: dict[str, NDArray[Any]]) -> None:
         """Take :meth:`_arrays` for its own."""
         raise NotImplementedError(f"{type(self).__name__} cannot be saved")
@@ -224,10 +220,7 @@ class OnlineEstimator(Estimator):
         :raises ValueError: if it is damaged, of another version, of an estimator with other arguments, or holds what no
             discharge leads to; the estimator is as it was then
         """
-        arrays = load_state(path, self._made_with())
-        with refusing(path):
-            self._check_state(arrays)
-        self._restore(arrays)
+        self._restore(load_state(path, self._made_with()))
 
     def estimate(self, record: Record) -> Estimate:
         """The estimate at the last sample of a record; a ``ValueError`` if that cannot be used."""

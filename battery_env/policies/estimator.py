@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from importlib import import_module
-from math import inf, isnan, nan
+from math import isnan, nan
 from typing import Any, Protocol
 
 import gymnasium as gym
@@ -20,15 +20,12 @@ from battery_env.electrochemistry.ends import SURPLUS_SHARE
 from battery_env.estimates import last_estimate
 from battery_env.estimators.diagnosis.conditions import Condition, Verdict
 from battery_env.estimators.estimator import Estimate, EstimateTrace, ModelNow, OnlineEstimator, Record
-from battery_env.estimators.state_files import check_all, check_like
-from battery_env.parameters import PARAMETERS
 from battery_env.policies.confidence import Confidence
 from battery_env.policies.pretrained import pretrained_policy
 from battery_env.policies.readings import columns, on_grid, with_voltage
 from battery_env.records import (
     Samples,
     Shown,
-    are_plausible,
     check_drawn_charge,
     check_record,
     check_sample,
@@ -44,8 +41,6 @@ from battery_env.tasks.voltage.task import VoltageTask
 
 # Steps in which a stream is followed, s
 _STEP_S = 1.0
-# No number that a fit finds comes near, C, ohm or V.
-_LARGEST = 1e9
 
 
 class Predictor(Protocol):
@@ -259,30 +254,6 @@ class PolicyEstimator(OnlineEstimator):
             "action": self._action,
             "constants": self._constants,
         }
-
-    def _check_state(self, arrays: dict[str, NDArray[Any]]) -> None:
-        fit = {} if "fitted_readings" not in arrays else {f"fitted_{name}": np.zeros(1) for name in Fitted._fields}
-        fit |= {name: np.zeros((1, 2)) for name in ("fitted_estimate", "fitted_sd", "fitted_sd_alone") if fit}
-        fit |= {"fitted_constants": self._no_constants[None]} if fit else {}
-        fit |= {"fitted_readings": np.zeros(1, np.int64)} if fit else {}
-        own = {name: array for name, array in self._arrays().items() if not name.startswith("fitted_")}
-        check_like(arrays, own | fit, growing="samples")
-        time_s, voltage_V, current_A = arrays["samples"]
-        first, drawn_C, decisions = np.arange(len(time_s)) == 0, *arrays["progress"][:2]
-        step_s, before_A = np.diff(time_s, prepend=-1.0), np.append(0.0, current_A[:-1])[: len(time_s)]
-        low, high = np.transpose([parameter.limits for parameter in PARAMETERS.values()])
-        check_all(
-            sample=are_plausible(voltage_V, current_A, np.where(first, 1.0, step_s), None, before_A),
-            start=~first | ((time_s == 0.0) & ~np.isnan(voltage_V)),
-            charge=np.isfinite(drawn_C),
-            fit=[(np.abs(arrays[each]) < _LARGEST) | ((arrays[each] == inf) & (each == "fitted_white_V")) for each in fit],
-            spread=[arrays[each] >= 0.0 for each in fit if each.endswith(("sd", "sd_alone", "_noise_V", "white_V"))],
-            readings=[arrays[each] > 0 for each in fit if each == "fitted_readings"],
-            estimate=(arrays["progress"][2:] >= low) & (arrays["progress"][2:] <= high),
-            action=np.abs(arrays["action"]) <= 1.0,
-            constants=np.isfinite(arrays["constants"]),
-        )
-        check_all(count=decisions in range(int(max(time_s, default=0.0) / self.decision_s + 1e-9) + 1))
 
     def _restore(self, arrays: dict[str, NDArray[Any]]) -> None:
         self._samples = list(map(tuple, arrays["samples"].T.tolist()))

@@ -25,7 +25,7 @@ from battery_env.estimators.diagnosis.samples import begin, belongs, examine, ex
 from battery_env.estimators.estimator import ModelNow, OnlineEstimator, check_bounds
 from battery_env.estimators.kalman.bank import conclude, filters_of_prior, take
 from battery_env.estimators.kalman.state import CELL, ESTIMATE, FILTER, SAMPLE, Q, R, Settings
-from battery_env.estimators.state_files import check_all, check_like, load_state, refusing, save_state
+from battery_env.estimators.state_files import load_state, save_state
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, R_O, check_parameters
 from battery_env.records import ChargeBefore, Record, Stream, are_plausible, check_drawn_charge, check_sample, shown_beside
 
@@ -36,8 +36,6 @@ _HOUR_S = 3600.0
 # So far may the parameters wander in an hour, as a share of their prior means: a little keeps a filter awake.
 _DRIFT_PER_HOUR = 0.001
 _NOISE_V = 0.005
-# Covariances of a state may be so much larger than their variances allow, as a share.
-_ROUNDED = 1e-6
 # What reasons are made of
 _SHOWN = "start rest fault switch switches gap start_V time_s uncounted_C dropped_C dropped_ohm".split()
 
@@ -324,28 +322,6 @@ class ExtendedKalmanFilter(OnlineEstimator):
     def _arrays(self) -> dict[str, NDArray[Any]]:
         return {"cells": self._cells, "filters": self._filters}
 
-    def _check_state(self, arrays: dict[str, NDArray[Any]]) -> None:
-        check_like(arrays, self._arrays())
-        (cell,), seen = arrays["cells"], arrays["cells"]["seen"]
-        filters = arrays["filters"][arrays["filters"]["log_weight"] > -inf]  # the others were given up
-        covariance, (low, high) = filters["covariance"], np.transpose(list(self.bounds.values()))
-        variance = np.diagonal(covariance, axis1=1, axis2=2)
-        most = np.sqrt(np.abs(variance[:, :, None] * variance[:, None, :]))
-        counts = (seen["samples"], seen["examined"]["count"], seen["ring"]["n_kept"], seen["ring"]["n_changes"])
-        check_all(
-            log_weight=np.append(np.isfinite(filters["log_weight"]), len(filters) > 0),
-            state=np.isfinite(filters["state"]),
-            tangents=np.isfinite(filters["tangents"]),
-            mean=np.isfinite(filters["mean"]),
-            estimate=(filters["mean"][:, :2] >= low) & (filters["mean"][:, :2] <= high),
-            variance=variance >= 0.0,
-            covariance=np.abs(covariance) <= (1.0 + _ROUNDED) * most,
-            count=np.array(counts) >= 0,
-            charge=np.isfinite(seen["drawn_C"]) & np.isfinite(seen["current_A"]) & (seen["time_s"] >= 0.0),
-            fault=np.isin(seen["fault"]["condition"], [0, *Condition]),
-            constants=cell["constants"] == self._of_rows(arrays["cells"], arrays["filters"])._cell_now().packed.constants,
-        )
-
     def _restore(self, arrays: dict[str, NDArray[Any]]) -> None:
         self._cells[...], self._filters[...] = arrays["cells"], arrays["filters"]
 
@@ -419,11 +395,6 @@ class KalmanBatch:
     def load(self, path: str | os.PathLike[str]) -> None:
         """Go on from what :meth:`save` wrote."""
         arrays = load_state(path, self._made_with())
-        with refusing(path):
-            check_like(arrays, self._arrays())
-            for n, each in enumerate(self.estimators):
-                with refusing(f"cell {n}"):
-                    each._check_state({name: array[n : n + 1] for name, array in arrays.items()})
         self._cells[...], self._filters[...] = arrays["cells"], arrays["filters"]
 
     def _made_with(self) -> dict[str, Any]:
