@@ -14,7 +14,7 @@ from battery_env.lab.calibrate import calibrate
 from battery_env.lab.life import Life, track_life
 from battery_env.lab.many import FileFormat, find_sources
 from battery_env.lab.report import Calibration
-from battery_env.lab.running import forecast_end, has_usual_load
+from battery_env.lab.running import forecast_end, prior_of
 from battery_env.lab.settings import Settings
 from battery_env.lab.sources import read_source, record_name
 from battery_env.lab.workers import attempt
@@ -79,8 +79,7 @@ def ahead(chosen: Found, life: Life | None, settings: Settings) -> None:
     seen = whole.until(float(whole.time_s[0] + share / 100.0 * np.ptp(whole.time_s)))
     load, count = constant(given_A, "current") if given_A else None, life.table["valid"].sum() if life else 0
     if life is not None:
-        prior_C = life.prior_q_mobile_C if has_usual_load(life, seen, load) else life.prior_at_other_loads_C
-        settings = replace(settings, prior_q_mobile_C=prior_C)
+        settings = replace(settings, prior_q_mobile_C=prior_of(life, seen, load))
     end, _, error = attempt(forecast_end, seen, settings, load)
     if error:
         st.error(error)

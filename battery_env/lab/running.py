@@ -211,8 +211,7 @@ def end_of_record(
         calibrator = replace(settings, method="least-squares", initial_soc=1.0).calibrator()
         assert isinstance(calibrator, LeastSquares)
         past = track_life(before, settings.cut_off_V, calibrator)
-        prior_C = past.prior_q_mobile_C if has_usual_load(past, running, to_come) else past.prior_at_other_loads_C
-        settings = replace(settings, prior_q_mobile_C=prior_C)
+        settings = replace(settings, prior_q_mobile_C=prior_of(past, running, to_come))
     found = calibrated(running, settings, Ahead(to_come, is_asked=True))
     if not found.in_progress:
         raise ValueError(
@@ -222,14 +221,16 @@ def end_of_record(
     return End(record_name(source.stem, source.cycle), found, past, settings.prior_q_mobile_C)
 
 
-def has_usual_load(life: Life, running: Discharge, load: Load | None) -> bool:
-    """Whether a discharge has the constant load of its cell's life within 5 %, so far and under the load to come."""
-    if load is not None and load.unit != "current":
-        return False
+def prior_of(life: Life, running: Discharge, load: Load | None) -> tuple[float, float]:
+    """
+    What the life of a cell lets expect of ``q_mobile`` in a discharge, C: as under the usual load where that is the constant
+    load of the discharge within 5 %, so far and under the load to come.
+    """
     usual_A = life.table["mean_current_A"][life.table["valid"]].iloc[-1]
     low_A, high_A = np.quantile(running.current_A[running.time_s > running.load_on_time_s], [0.05, 0.95])
     currents_A = [usual_A, low_A, high_A, *([] if load is None else load.value)]
-    return bool(np.ptp(currents_A) <= VARIED_SHARE * max(currents_A))
+    is_usual = (load is None or load.unit == "current") and np.ptp(currents_A) <= VARIED_SHARE * max(currents_A)
+    return life.prior_q_mobile_C if is_usual else life.prior_at_other_loads_C
 
 
 class EndFiles:
