@@ -137,7 +137,10 @@ def run_down(
         part_V = np.full((len(going), len(rows)), cut_off_V)
         overfull = _run_on(load, part, dt_s, power, model.thermal, model.cell.packed, limits, places, ahead, part_V)
         if overfull >= 0:
-            raise overfull_error(dt_s * overfull)
+            raise ValueError(
+                f"load charges the cell beyond full, by more than {SURPLUS_SHARE:.0%} of its charge, after "
+                f"{dt_s * overfull:g} s. Positive loads discharge: check its sign, or begin with the discharge."
+            )
         followed[:, going], state[going], shown_V[going] = part, ahead, part_V
         course.append((first + rows, quantile(shown_V)))
         first += _CHUNK_STEPS
@@ -174,14 +177,6 @@ def _followed(cells: Cells, until: FloatArray) -> FloatArray:
     """What is followed of cells, at first."""
     known = (cells.q_mobile, cells.r_o, cells.error_V, cells.drift_V, cells.soc, until)
     return np.vstack([*known, np.repeat(np.array(_AT_FIRST)[:, None], len(until), axis=1)])
-
-
-def overfull_error(after_s: float) -> ValueError:
-    """What to say of a load that charges a cell by more than it takes."""
-    return ValueError(
-        f"load charges the cell beyond full, by more than {SURPLUS_SHARE:.0%} of its charge, after {after_s:g} s. Positive "
-        "loads discharge: check its sign, or begin with the discharge."
-    )
 
 
 @compiled

@@ -276,7 +276,8 @@ class PolicyEstimator(OnlineEstimator):
         trace = self.trace([record])[0]
         if trace.sd_q_mobile is not None:
             return last_estimate(trace)
-        q_mobile, r_o = (self.task_class.conclude(values) for values in (trace.q_mobile, trace.r_o))
+        first = 0 if self.task_class.is_averaged else -1
+        q_mobile, r_o = (float(values[first:].mean()) for values in (trace.q_mobile, trace.r_o))
         return Estimate(q_mobile, r_o, settled=False, reason=Condition.NO_FIT.text)
 
     def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:

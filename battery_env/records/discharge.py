@@ -1,8 +1,4 @@
-"""
-Recorded discharges of real cells, and their files.
-
-Two 18650 cells of NASA's battery data set come with the package: ``load_nasa_discharges("B0005")``, ``"B0006"``.
-"""
+"""Recorded discharges of real cells, and NASA's files of them."""
 
 from __future__ import annotations
 

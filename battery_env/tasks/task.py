@@ -58,6 +58,9 @@ class CalibrationTask(ABC):
     #: what :meth:`report` returns
     REPORTED: ClassVar[tuple[str, ...]] = ("q_mobile", "r_o", "q_mobile_hat", "r_o_hat", "voltage", "voltage_hat", "soc")
 
+    #: whether estimates are independent of each other, so that the mean of those over a record counts, and not the last one
+    is_averaged: ClassVar[bool]
+
     parameters: tuple[Literal["q_mobile", "r_o"], ...]
     cells: int
     dataset: Sequence[Record]
@@ -140,11 +143,6 @@ class CalibrationTask(ABC):
         Which data the next decision knows: each cell's discharge, and the time of its last sample, s, new arrays of shape
         (cells,).
         """
-
-    @staticmethod
-    @abstractmethod
-    def conclude(estimates: FloatArray) -> float:
-        """What is left of the estimates of one parameter over a record, one per decision, shape (K,)."""
 
     def fitted(self) -> Fitted | None:
         """What the fit in the observation says of each cell (options ``nuisance`` and ``path``), if there is one."""

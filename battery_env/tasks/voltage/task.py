@@ -1,9 +1,4 @@
-"""
-Calibration from current and voltage alone, for a batch of cells at once: no state of the cell is measured.
-
-The paper names this as future work. The parameters are constant within a discharge, so that the agent is asked to explain all
-data so far with one (q_mobile, r_o): it holds an estimate, sees what the data say against it, and moves it.
-"""
+"""Calibration from current and voltage alone, for a batch of cells at once: no state of the cell is measured."""
 
 from __future__ import annotations
 
@@ -89,6 +84,8 @@ class VoltageTask(CalibrationTask):
     :param cells: size of the batch
     :raises ValueError: for values out of range
     """
+
+    is_averaged = False
 
     def __init__(
         self,
@@ -337,11 +334,6 @@ class VoltageTask(CalibrationTask):
         parts = zip(at_rest_V, self.count, strict=True)
         white_V = [white_noise_V(each[:end], order=2) if end > 2 else np.inf for each, end in parts]
         return self._fit.found(self._estimate, self.count.copy(), np.array(white_V))
-
-    @staticmethod
-    def conclude(estimates: FloatArray) -> float:
-        """The last estimate, which explains all readings."""
-        return float(estimates[-1])
 
     def _place(self, row: int, discharge: int, count: int, estimate: FloatArray) -> None:
         """Put one cell at one point of one discharge, measured without error."""
