@@ -17,6 +17,7 @@ simulated cells of the path, from the error of the simulated state; no recorded 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict, replace
 from hashlib import sha256
 from pathlib import Path
@@ -107,7 +108,8 @@ def path_of(cells: Sequence[str], folder: Path) -> tuple[AgingPath, Path]:
     """The path of some lives, and its file."""
     file = folder / f"path_{'_'.join(cells)}.json"
     if not file.exists():
-        fit_life([load_nasa_discharges(cell) for cell in cells]).to_json(file)
+        with suppress(FileExistsError):  # another process has been faster
+            fit_life([load_nasa_discharges(cell) for cell in cells]).to_json(file)
     return AgingPath.from_json(file), file
 
 
@@ -116,7 +118,8 @@ def recipe_of(algo: str, cells: Sequence[str], seed: int, folder: Path) -> Recip
     path, file = path_of(cells, folder)
     data = file.with_name(file.name.replace("path_", "cells_")).with_suffix(".npz")
     if not data.exists():
-        TrajectoryDataset.along(path, TRAINING_CELLS, Loads(), seed=0).save(data)
+        with suppress(FileExistsError):
+            TrajectoryDataset.along(path, TRAINING_CELLS, Loads(), seed=0).save(data)
     options = {**OPTIONS, **TRAINED_WITH, "path": str(file), "dataset": str(data)}
     own = {"env_kwargs": options, "policy_kwargs": NETWORKS}
     return Recipe.of(algo, ENV_ID, seed, updates=UPDATES, hyperparameters=own)

@@ -29,15 +29,15 @@ PATH_NAMES: tuple[str, ...] = (*UNCERTAIN_CONSTANTS, *EQUILIBRIUM_NAMES, *PARAME
 SPREAD_SD: tuple[float, ...] = (*(0.5,) * len(UNCERTAIN_CONSTANTS), *(0.005,) * EQUILIBRIUM_SIZE, 0.03, 0.25)
 #: A cell that lies farther beside the path, in standard deviations, is of another kind.
 BESIDE_LIMIT_SD = 4.0
-#: How all this goes together is known from the lives of few cells: another one may lie this many times farther off. So many
-#: times larger are the standard deviations that are stated, and the one of ``q_mobile`` that has to be small to be settled.
-OTHER_LIVES = 2.0
 #: Cells may be younger and older than those of the path by this share of its length.
 BEYOND_SHARE = 0.2
 
 # The error of the model of a cell at its place drifts as it is discharged: all its charge shows so many independent ones.
 # Chosen on B0005 along the path of B0006.
 _ERRORS_OF_A_DISCHARGE = 100.0
+# How unsure n lives leave what another cell is: standard deviations are 1 + _FEW_LIVES / n times as large. Chosen on B0006
+# along the path of B0005.
+_FEW_LIVES = 2.0
 _FORMAT, _FORMAT_VERSION = "battery_env.AgingPath", 1
 _RATES, _EQUILIBRIUM = slice(0, len(UNCERTAIN_CONSTANTS)), slice(len(UNCERTAIN_CONSTANTS), -len(PARAMETER_NAMES))
 # Beyond its ends a path goes on as over this share of its ages, as single ones scatter.
@@ -137,6 +137,14 @@ class AgingPath:
     def errors_per_C(self) -> float:
         """How many independent errors of the model a coulomb shows, besides a first one."""
         return _ERRORS_OF_A_DISCHARGE / self.cell.q_mobile
+
+    @property
+    def sd_ratio(self) -> float:
+        """
+        So many times larger than a fit along the path says are the standard deviations that are stated, and the one of
+        ``q_mobile`` that has to be small to be settled: 3 for the path of one life, 2 for that of two.
+        """
+        return 1.0 + _FEW_LIVES / len(self.lives)
 
     def distance_sd(self, values: Mapping[str, float]) -> float:
         """

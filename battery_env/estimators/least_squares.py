@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from battery_env.arrays import FloatArray
 from battery_env.checks import check_gain_sd, check_not_negative, check_positive
 from battery_env.electrochemistry import CellParameters
-from battery_env.electrochemistry.aging_path import BESIDE_LIMIT_SD, OTHER_LIVES, PATH_NAMES, AgingPath
+from battery_env.electrochemistry.aging_path import BESIDE_LIMIT_SD, PATH_NAMES, AgingPath
 from battery_env.electrochemistry.ends import LONGEST_S
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimates import Estimate, EstimateTrace
@@ -172,7 +172,7 @@ class LeastSquares(Estimator):
         self.nuisance = _check_nuisance({} if nuisance is None else nuisance, self.parameters)
         self.path = path
         # so many times larger than the fit says are standard deviations, but for that of a prior
-        self._sd_ratio = 1.0 if path is None else OTHER_LIVES
+        self._sd_ratio = 1.0 if path is None else path.sd_ratio
         if path is not None:
             if self.nuisance or self.parameters != PARAMETER_NAMES:
                 raise ValueError("path is of both parameters and of all nuisances: leave parameters and nuisance out")

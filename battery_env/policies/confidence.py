@@ -8,7 +8,7 @@ import numpy as np
 
 from battery_env.arrays import FloatArray
 from battery_env.electrochemistry import UNCERTAIN_CONSTANTS, CellParameters
-from battery_env.electrochemistry.aging_path import BESIDE_LIMIT_SD, EQUILIBRIUM_NAMES, OTHER_LIVES, AgingPath, cell_with
+from battery_env.electrochemistry.aging_path import BESIDE_LIMIT_SD, EQUILIBRIUM_NAMES, AgingPath, cell_with
 from battery_env.estimates import Estimate
 from battery_env.estimators.diagnosis import gaps
 from battery_env.estimators.diagnosis.conditions import (
@@ -52,13 +52,13 @@ class Confidence:
         self._parameters = task.parameters
         self._offset_V = task.sensors.offset_V
         self._path: AgingPath | None = task.path
-        self._other_lives = 1.0 if task.path is None else OTHER_LIVES
+        self._sd_ratio = 1.0 if task.path is None else task.path.sd_ratio
         self._cell, self._dt_s = cell, dt_s
 
     def standard_deviations(self, fitted: Fitted, estimate: FloatArray) -> FloatArray:
         """Those of the fit, with the distance of the estimate from it."""
         known = [name not in self._parameters for name in PARAMETER_NAMES]
-        return np.where(known, np.nan, np.hypot(self._other_lives * fitted.sd, fitted.estimate - estimate))
+        return np.where(known, np.nan, np.hypot(self._sd_ratio * fitted.sd, fitted.estimate - estimate))
 
     def constants(self, fitted: Fitted, n: int) -> dict[str, float] | None:
         """What the fit says of the constants along a path, by their names."""
@@ -71,7 +71,7 @@ class Confidence:
         Which numbers of an estimate are settled, and why not both. What is known of the parameters before settles nothing.
         """
         diagnosis, cell, (q_mobile, r_o) = Diagnosis(), self._cell, estimate.tolist()
-        sd = np.hypot(fitted.sd_alone[n] * [self._other_lives, 1.0], fitted.estimate[n] - estimate)
+        sd = np.hypot(fitted.sd_alone[n] * [self._sd_ratio, 1.0], fitted.estimate[n] - estimate)
         readings, white_V, offset_V = int(fitted.readings[n]), float(fitted.white_V[n]), abs(float(fitted.offset_V[n]))
         first_V, full_V = float(record.voltage_V[0]), rest_voltage_V(cell)
         mismatch_V = 0.0 if self._path is None else MISMATCH_MARGIN * self._path.mismatch_V

@@ -234,12 +234,20 @@ class TestPrior:
         mean_C, sd_C = known.q_mobile, 0.01 * known.q_mobile
         alone = LeastSquares(path=b0006).estimate(record)
         both = LeastSquares(path=b0006, prior_q_mobile_C=(mean_C, sd_C)).estimate(record)
-        # as two that do not know of each other, of which that of the path has twice the spread that the fit says
+        # as two that do not know of each other, of which that of the path has the spread that is stated
         weights = np.array([alone.sd_q_mobile, sd_C]) ** -2.0
         assert both.sd_q_mobile == pytest.approx(weights.sum() ** -0.5, rel=0.3)
         assert both.q_mobile == pytest.approx(weights @ [alone.q_mobile, mean_C] / weights.sum(), abs=0.5 * sd_C)
         wrong = LeastSquares(path=b0006, prior_q_mobile_C=(0.7 * mean_C, sd_C)).estimate(record)
         assert not wrong.settled_q_mobile
+
+    def test_the_more_lives_the_surer_what_they_tell_of_another_cell(self, b0006):
+        part = until(Samples.of(load_nasa_discharges("B0005")[80].loaded_part(2.7)), 0.5)
+        (life,) = b0006.lives
+        paths = [AgingPath(b0006.cell, (life,) * n, b0006.mismatch_V) for n in (1, 2, 20)]
+        sd_C = [LeastSquares(path=each).estimate(part).sd_q_mobile for each in paths]
+        assert sd_C[0] == pytest.approx(3.0 / 2.0 * sd_C[1], rel=0.1)
+        assert sd_C[1] == pytest.approx(2.0 / 1.1 * sd_C[2], rel=0.1)
 
     @pytest.mark.parametrize("others", [{"nuisance": {"kn": 0.2}}, {"parameters": ("q_mobile",)}])
     def test_it_knows_all_at_once(self, path, others):
